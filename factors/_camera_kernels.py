@@ -1,8 +1,8 @@
-"""Compiled pass over observations by a camera with two lenses: residuals and all Jacobians.
+"""Compiled pass over observations by a camera with two lenses or more: residuals and all Jacobians.
 
 A point X is at d = world_R_rig^T (X - t) in the rig in the middle of the readout. The row that sees
 it is read a fraction s of the readout away from the middle, when the rig has turned by Q = exp(s w)
-and moved by s m: the point is then at e = Q^T (d - s m). Its lens is at o = +-A c, A the axes of
+and moved by s m: the point is then at e = Q^T (d - s m). Its lens is at o = A c_l, A the axes of
 the frame's lenses: the point is along l = e - o from there. A panorama stitched for a radius 1 / k
 shows it in the direction p of unit length where the ray from the lens, towards l / |l|, meets the
 sphere of radius one around the rig, the lens being at n = k o:
@@ -206,7 +206,7 @@ def _scratch():
 
 
 @_part
-def _look(tau, sign, motion, axes, camera, X, pose, turn, d, q, e, own, origin, away, n, moved):
+def _look(tau, centre, motion, axes, camera, X, pose, turn, d, q, e, origin, away, n, moved):
     """Write where a point is: d, e, the lens's o and n, l = e - o, and Q and s w."""
     x, y, z = X[0] - pose[9], X[1] - pose[10], X[2] - pose[11]
     for i in range(3):
@@ -214,9 +214,8 @@ def _look(tau, sign, motion, axes, camera, X, pose, turn, d, q, e, own, origin, 
         moved[i], q[i] = tau * motion[i], d[i] - tau * motion[3 + i]
     _set_rotation(moved[0], moved[1], moved[2], turn)
     _times_transposed(turn, q, e)
-    _times(axes, camera.centre, own)
+    _times(axes, centre, origin)
     for i in range(3):
-        origin[i] = sign * own[i]
         away[i] = e[i] - origin[i]
         n[i] = camera.inverse_radius * origin[i]
 
@@ -229,12 +228,16 @@ def _set_by_lenses(columns, camera, lens, by_lens, turning, own, shared):
         by_lens: (7,) row of `_pixel_residual`.
         turning: (3,) row by a left turn of the lens.
     """
-    start, other = columns.lenses + 7 * lens, columns.lenses + 7 * (1 - lens)
+    first = columns.lenses
+    for i in range(first, first + 7 + 10 * (len(camera.lenses) - 1)):
+        shared[i] = 0.0
+    start = first if lens == 0 else first + 7 + 10 * (lens - 1)
     for i in range(7):
-        shared[start + i], shared[other + i] = by_lens[i] * camera.steps[lens, i], 0.0
-    _times_transposed(camera.by_back_turn, turning, own)
-    for i in range(3):  # the front lens's axes are the rig's
-        shared[columns.lenses + 14 + i] = own[i] if lens == 1 else 0.0
+        shared[start + i] = by_lens[i] * camera.steps[lens, i]
+    if lens > 0:  # the front lens's axes are the rig's
+        _times_transposed(camera.by_lens_turn[lens], turning, own)
+        for i in range(3):
+            shared[start + 7 + i] = own[i]
 
 
 @_part
@@ -249,12 +252,13 @@ def _see(
         turn, d, q, e, own, origin, away, by_away, by_n, by_p, by_lens, by_d, by_origin, n, moved,
         motion_row,
     ) = scratch  # fmt: skip
-    f, sign, tau = sightings.frames[o], sightings.signs[o], sightings.fractions[o]
+    f, lens, tau = sightings.frames[o], sightings.lenses[o], sightings.fractions[o]
     _look(
-        tau, sign, camera.motions[f], camera.axes[f], camera, X, pose, turn, d, q, e, own, origin,
-        away, n, moved,
+        tau, camera.centres[lens], camera.motions[f], camera.axes[f], camera, X, pose, turn, d, q,
+        e, origin, away, n, moved,
     )  # fmt: skip
-    lens, measured, whitener = 0 if sign > 0 else 1, sightings.measured[o], sightings.whiteners[o]
+    measured, whitener = sightings.measured[o], sightings.whiteners[o]
+    last = len(camera.centres) - 1
     if columns.lenses >= 0:
         _pixel_residual(measured, whitener, camera.lenses[lens], away, residual, by_away, by_lens)
     else:
@@ -273,11 +277,14 @@ def _see(
         row[3], row[4], row[5] = -by_d[0], -by_d[1], -by_d[2]
         by_radius = 0.0
         for i in range(3):
-            by_origin[i] = sign * (camera.inverse_radius * by_n[r, i] - by_e[i])
+            by_origin[i] = camera.inverse_radius * by_n[r, i] - by_e[i]
             by_radius += by_n[r, i] * origin[i]
         _times_transposed(camera.axes[f], by_origin, own)
-        for i in range(3):
-            shared[i] = own[i] + by_radius * camera.radius_by_centre[i]
+        for k in range(last):  # the last lens's centre is minus the sum of the others
+            share = 1.0 if lens == k else (-1.0 if lens == last else 0.0)
+            for i in range(3):
+                at = 3 * k + i
+                shared[at] = share * own[i] + by_radius * camera.radius_by_centre[at]
         if columns.radius >= 0:
             shared[columns.radius] = by_radius
         if columns.motion >= 0:
@@ -288,7 +295,7 @@ def _see(
                 slope += motion_row[i] * camera.velocities[f, i]
             shared[columns.readout] = slope
         if columns.turns >= 0:
-            _times_transposed(camera.by_turn[f], by_origin, own)
+            _times_transposed(camera.by_turn[lens, f], by_origin, own)
             row[columns.turns], row[columns.turns + 1] = own[0], own[1]
         if columns.lenses >= 0:
             turning = _array(_cross(by_e, away), q)

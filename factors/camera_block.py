@@ -10,7 +10,7 @@ from factors._observations import covisible_pairs
 from factors._terms import pose_rows
 from factors.bearing import tangent_basis
 from factors.block import PoseSystem
-from factors.camera_rows import DIM, CameraRows, CameraVariables, Columns, Sightings
+from factors.camera_rows import DIM, CameraRows, CameraVariables, Columns, Sightings, lens_sizes
 from factors.elimination import Eliminated
 from factors.robust import RobustLoss
 from factors.threads import balanced_ranges, map_in_threads, run_in_threads
@@ -244,7 +244,7 @@ def sightings_of(
     num_points: int,
     measured: np.ndarray,
     whiteners: np.ndarray,
-    signs: np.ndarray,
+    lenses: np.ndarray,
     fractions: np.ndarray,
 ) -> tuple[Sightings, np.ndarray]:
     """Observations sorted by landmark and frame, and the row each was given in.
@@ -254,34 +254,36 @@ def sightings_of(
     order = np.lexsort((frames, points))
     offsets = np.zeros(num_points + 1, np.int64)
     np.cumsum(np.bincount(points, minlength=num_points), out=offsets[1:])
-    rows = (frames, points, measured, whiteners, signs, fractions)
-    kinds: Sequence[type] = (np.int64, np.int64, float, float, float, float)
+    rows = (frames, points, measured, whiteners, lenses, fractions)
+    kinds: Sequence[type] = (np.int64, np.int64, float, float, np.int64, float)
     sorted_ = [np.asarray(row)[order].astype(kind) for row, kind in zip(rows, kinds, strict=True)]
     return Sightings(offsets, *sorted_), order
 
 
 def pixels_of(
-    directions: np.ndarray, signs: np.ndarray, calibration: np.ndarray
+    directions: np.ndarray, lenses: np.ndarray, calibration: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Pixels (O, 3) that raw lenses show directions in, as `Sightings` has them, and how these
     move, on their tangent_basis, with the pixels (O, 2, 2).
 
     Args:
         directions: (O, 3) unit, rig frame.
-        signs: (O,) of the lenses that see them, 1 = front, -1 = back.
-        calibration: (2, 16) the lenses, as in `CameraRows`.
+        lenses: (O,) int, those that see them.
+        calibration: (L, 16) the lenses, as in `CameraRows`.
     """
     num = len(directions)
     frames, rows = np.zeros(num, np.int64), np.arange(num)
-    plain = np.zeros((num, 3)), np.tile(np.eye(2), (num, 1, 1)), signs, np.zeros(num)
+    plain = np.zeros((num, 3)), np.tile(np.eye(2), (num, 1, 1)), lenses, np.zeros(num)
     sightings, _ = sightings_of(frames, rows, num, *plain)
+    many, free = len(calibration), 3 * (len(calibration) - 1)
     camera = CameraRows(
-        np.zeros((1, 6)), np.zeros((1, 6)), np.eye(3)[None], np.zeros((1, 3, 3)), np.zeros(3), 0.0,
-        np.zeros(3), np.ascontiguousarray(calibration), np.ones((2, 7)), np.eye(3),
+        np.zeros((1, 6)), np.zeros((1, 6)), np.eye(3)[None], np.zeros((many, 1, 3, 3)),
+        np.zeros((many, 3)), 0.0, np.zeros(free), np.ascontiguousarray(calibration),
+        np.ones((many, 7)), np.tile(np.eye(3), (many, 1, 1)),
     )  # fmt: skip
     pose, residuals = np.array([[*np.eye(3).ravel(), 0, 0, 0]]), np.empty((num, 2))
-    by_direction, unused = np.empty((num, 2, 3)), np.empty((num, 2, 20))
-    columns = Columns(-1, -1, -1, 3, -1)
+    by_direction, unused = np.empty((num, 2, 3)), np.empty((num, 2, free + sum(lens_sizes(many))))
+    columns = Columns(-1, -1, -1, free, -1)
     see_range(
         0, num, sightings, camera, columns, np.ascontiguousarray(directions), pose, residuals,
         by_direction, unused, unused,

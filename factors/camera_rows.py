@@ -1,4 +1,4 @@
-"""A camera with two lenses as `_camera_kernels` reads it: observations, variables, columns."""
+"""A camera of several lenses as `_camera_kernels` reads it: observations, variables, columns."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,9 +11,7 @@ from scipy.spatial.transform import Rotation
 
 DIM = 6
 MOTION, TURNS = 6, 2  # coordinates of what frames have of their own
-FRONT, BACK = 7, 10  # coordinates of what raw lenses are: the back one is turned, too
-OF_LENSES = (3, 4, 3, 4, 3)  # of each variable of raw lenses: focal length and principal point,
-# radial terms, those of the back lens, its turn
+FRONT, OTHER = 7, 10  # coordinates of what raw lenses are: all but the front one are turned, too
 
 
 class Sightings(NamedTuple):
@@ -25,7 +23,7 @@ class Sightings(NamedTuple):
     measured: np.ndarray  # (O, 3) float64: unit direction in the panorama, rig frame | of raw
     # pairs the pixel in the fisheye, corner origin, and 0
     whiteners: np.ndarray  # (O, 2, 2) float64: 1/rad on the direction's tangent_basis | 1/pixel
-    signs: np.ndarray  # (O,) float64: 1 = the front lens sees it, -1 = the back one
+    lenses: np.ndarray  # (O,) int64: lens that sees it, 0 = the front one
     fractions: np.ndarray  # (O,) float64: when its row is read, part of the readout from the middle
 
 
@@ -35,13 +33,14 @@ class CameraRows(NamedTuple):
     motions: np.ndarray  # (F, 6): of each frame during its readout, [rotation rad, translation]
     velocities: np.ndarray  # (F, 6): their derivative by the readout's duration
     axes: np.ndarray  # (F, 3, 3): rig_R_lenses
-    by_turn: np.ndarray  # (F, 3, 3): derivative of axes @ centre by the frame's turn
-    centre: np.ndarray  # (3,) of the front lens, lenses' frame, map units
+    by_turn: np.ndarray  # (L, F, 3, 3): derivative of axes @ centre by the frame's turn
+    centres: np.ndarray  # (L, 3) of the lenses, lenses' frame, map units; their mean is zero
     inverse_radius: float  # of the stitching, 1 / map units
-    radius_by_centre: np.ndarray  # (3,) its derivative by the centre, where it goes with that
-    lenses: np.ndarray  # (2, 16) of raw pairs: focal length, principal point, k1 to k4, rig_R_lens
-    steps: np.ndarray  # (2, 7) derivative of (log f, principal point, k1 to k4) by the variables
-    by_back_turn: np.ndarray  # (3, 3) derivative of the back lens's left turn by its variable
+    radius_by_centre: np.ndarray  # (3 (L - 1),) its derivative by the centres but the last one,
+    # where it goes with these
+    lenses: np.ndarray  # (L, 16) raw: focal length, principal point, k1 to k4, rig_R_lens
+    steps: np.ndarray  # (L, 7) derivative of (log f, principal point, k1 to k4) by the variables
+    by_lens_turn: np.ndarray  # (L, 3, 3) derivative of a lens's left turn by its variable
 
 
 class Columns(NamedTuple):
@@ -49,7 +48,7 @@ class Columns(NamedTuple):
 
     motion: int  # of frames; poses have columns 0 to 5
     turns: int
-    radius: int  # of what all frames share; the centre has columns 0 to 2
+    radius: int  # of what all frames share; centres but the last one have the first columns
     lenses: int
     readout: int
 
@@ -60,19 +59,20 @@ class CameraVariables:
     others vectors."""
 
     poses: Sequence[int]  # (F,) keys of world_T_rig
-    centre: int  # key (3,): the front lens's centre, lenses' frame, map units
+    centres: Sequence[int]  # (L - 1) keys (3,): centres of all lenses but the last one, whose is
+    # minus their sum; lenses' frame, map units
     axes: np.ndarray | None = None  # (F, 3, 3) rig_R_lenses at turns of 0; None = the rig's
     turns: Sequence[int] | None = None  # (F,) keys (2,) rad: turns about x and y of these axes
     readout: int | None = None  # key (1,): duration, s
     motions: Sequence[int] | None = None  # (F,) keys (6,): what frames move beside their velocity
     velocities: np.ndarray | None = None  # (F, 6) per s
     radius: int | None = None  # key (1,): inverse of the stitching radius, 1 / map units
-    front_by_radius: float = 0.0  # where it is no variable: the distance of the lens's centre, part
-    # of the stitching radius; 0 = infinity
-    lenses: Sequence[int] | None = None  # 5 keys of raw pairs: changes of the front lens's focal
-    # length and principal point (3,), relative to the focal length, and of its k1 to k4 (4,); the
-    # back lens's changes (3,), (4,), and its rotation (3,) rad
-    calibration: np.ndarray | None = None  # (2, 16) rows as in CameraRows, at no change
+    front_by_radius: float = 0.0  # where it is no variable: half the distance between the first two
+    # lenses, part of the stitching radius; 0 = infinity
+    lenses: Sequence[int] | None = None  # 3 L - 1 keys of raw lenses: changes of the front lens's
+    # focal length and principal point (3,), relative to the focal length, and of its k1 to k4 (4,);
+    # of each other lens its changes (3,), (4,), and its rotation (3,) rad
+    calibration: np.ndarray | None = None  # (L, 16) rows as in CameraRows, at no change
 
     def __post_init__(self) -> None:
         together = [self.readout, self.motions, self.velocities]
@@ -91,11 +91,11 @@ class CameraVariables:
     @cached_property
     def shared(self) -> tuple[tuple[int, int], ...]:
         """Keys of what all frames share, and how many coordinates each has."""
-        found = [(self.centre, 3)]
+        found = [(key, 3) for key in self.centres]
         if self.radius is not None:
             found.append((self.radius, 1))
         if self.lenses is not None:
-            found += zip(self.lenses, OF_LENSES, strict=True)
+            found += zip(self.lenses, lens_sizes(len(self.centres) + 1), strict=True)
         if self.readout is not None:
             found.append((self.readout, 1))
         return tuple(found)
@@ -105,9 +105,10 @@ class CameraVariables:
         """Where they start."""
         motion = -1 if self.motions is None else DIM
         turns = -1 if self.turns is None else DIM + (0 if self.motions is None else MOTION)
-        radius, last = (-1, 3) if self.radius is None else (3, 4)
+        last = 3 * len(self.centres)
+        radius, last = (-1, last) if self.radius is None else (last, last + 1)
         lenses = -1 if self.lenses is None else last
-        last += 0 if self.lenses is None else FRONT + BACK
+        last += 0 if self.lenses is None else FRONT + OTHER * len(self.centres)
         return Columns(motion, turns, radius, lenses, -1 if self.readout is None else last)
 
     @cached_property
@@ -124,46 +125,67 @@ class CameraVariables:
 
     def rows(self, values: gtsam.Values) -> CameraRows:
         """The camera at some values."""
-        num, centre = len(self.poses), vector(values, self.centre)
+        num, given = len(self.poses), [vector(values, key) for key in self.centres]
+        centres = np.array([*given, -np.sum(given, axis=0)])
         motions, velocities = np.zeros((num, 6)), np.zeros((num, 6))
         if self.motions is not None and self.readout is not None and self.velocities is not None:
             velocities = np.ascontiguousarray(self.velocities, dtype=np.float64)
             motions = np.array([vector(values, key) for key in self.motions])
             motions += vector(values, self.readout)[0] * velocities
-        axes, by_turn = np.tile(np.eye(3), (num, 1, 1)), np.zeros((num, 3, 3))
+        axes = np.tile(np.eye(3), (num, 1, 1))
+        by_turn = np.zeros((len(centres), num, 3, 3))
         if self.axes is not None:
             axes = np.ascontiguousarray(self.axes, dtype=np.float64)
         if self.turns is not None:
             turns = np.zeros((num, 3))
             turns[:, :2] = [vector(values, key) for key in self.turns]
             axes = axes @ Rotation.from_rotvec(turns).as_matrix()
-            by_turn = np.ascontiguousarray(-(axes @ _cross(centre) @ _right(turns)))
-        length = float(np.linalg.norm(centre))
-        inverse, by_centre = 0.0, np.zeros(3)
+            by_turn = -(axes @ _cross(centres)[:, None] @ _right(turns))
+        by_given = half_baseline(len(centres))
+        half = by_given @ np.concatenate(given)
+        inverse, by_centre = 0.0, np.zeros(by_given.shape[1])
         if self.radius is not None:
             inverse = float(vector(values, self.radius)[0])
         elif self.front_by_radius:
-            inverse = self.front_by_radius / length
-            by_centre = -inverse * centre / length**2
-        given = motions, velocities, axes, by_turn, centre, inverse, by_centre
-        return CameraRows(*given, *self._lenses(values))
+            inverse = self.front_by_radius / float(np.linalg.norm(half))
+            by_centre = -inverse * (half @ by_given) / float(half @ half)
+        found = motions, velocities, axes, by_turn, centres, inverse, by_centre
+        return CameraRows(*found, *self._lenses(values))
 
     def _lenses(self, values: gtsam.Values) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        num = len(self.centres) + 1
         if self.lenses is None or self.calibration is None:
-            return np.zeros((2, 16)), np.ones((2, 7)), np.eye(3)
+            return np.zeros((num, 16)), np.ones((num, 7)), np.tile(np.eye(3), (num, 1, 1))
         parts = [vector(values, key) for key in self.lenses]
-        changes, lenses = np.array([np.hstack(parts[:2]), np.hstack(parts[2:4])]), []
-        for lens, change in zip(self.calibration, changes, strict=True):
-            moved = lens.copy()
-            moved[0] *= np.exp(change[0])
-            moved[1:3] += lens[0] * change[1:3]
-            moved[3:7] += change[3:]
+        changes = [parts[:2], *(parts[k : k + 3] for k in range(2, len(parts), 3))]
+        lenses, steps, by_turn = [], np.ones((num, 7)), np.zeros((num, 3, 3))
+        for lens, (own, radial, *turn) in enumerate(changes):
+            moved = self.calibration[lens].copy()
+            steps[lens, 1:3] = moved[0]
+            moved[1:3] += moved[0] * own[1:3]
+            moved[0] *= np.exp(own[0])
+            moved[3:7] += radial
+            if turn:
+                rotation = Rotation.from_rotvec(turn[0]).as_matrix()
+                moved[7:] = (rotation @ moved[7:].reshape(3, 3)).ravel()
+                by_turn[lens] = _right(-turn[0][None])[0]
             lenses.append(moved)
-        turn = Rotation.from_rotvec(parts[4]).as_matrix()
-        lenses[1][7:] = (turn @ lenses[1][7:].reshape(3, 3)).ravel()
-        steps = np.ones((2, 7))
-        steps[:, 1:3] = self.calibration[:, :1]
-        return np.array(lenses), steps, np.ascontiguousarray(_right(-parts[4][None])[0])
+        return np.array(lenses), steps, by_turn
+
+
+def lens_sizes(num: int) -> tuple[int, ...]:
+    """Coordinates of each variable of L raw lenses: focal length and principal point, radial
+    terms, and of all but the front one a rotation."""
+    return 3, 4, *((3, 4, 3) * (num - 1))
+
+
+def half_baseline(num: int) -> np.ndarray:
+    """Matrix (3, 3 (L - 1)) that takes the centres of all lenses but the last one to half the
+    vector from the second lens to the front one."""
+    if num == 2:
+        return np.eye(3)
+    rest = np.zeros((3, 3 * (num - 3)))
+    return np.concatenate([0.5 * np.eye(3), -0.5 * np.eye(3), rest], axis=1)
 
 
 def vector(values: gtsam.Values, key: int) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 import os
 from importlib.metadata import EntryPoint, entry_points
+from itertools import pairwise
 from typing import Annotated, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
@@ -229,22 +230,42 @@ _RELATIVE_READOUT_SIGMA = 0.1  # of a published readout time: it differs between
 _RowDirection = Literal["+x", "-x", "+y", "-y"]
 
 
+_MAX_LENS_GAP_DEG = 190.0  # between neighbouring lenses: a fisheye covers about 200 degrees
+
+
 class CameraSettings(_Settings):
-    """Camera model: two lenses back to back with a baseline between them and a rolling shutter."""
+    """Camera model: two lenses back to back, or more around the camera, and a rolling shutter."""
 
     model: Literal["auto", "central", "two_lens"] = "auto"  # auto: two lenses where these predict
     # held-out observations better; panoramas only
     name: Literal[tuple(CAMERAS)] | None = None  # type: ignore[valid-type]  # sets both priors below
+    lens_yaws_deg: tuple[float, ...] | None = None  # directions in which a panorama's lenses look,
+    # from its middle to the right; None = two, front and back, or as a stabiliser turned them
     seam_deg: float = Field(default=4.0, ge=0, le=20)  # from the seam: blended pixels are not used
     baseline_mm: float | None = Field(
         default=None, ge=2, le=200
-    )  # published baseline of the lenses: gives the metric scale
+    )  # published baseline of the lenses (the first two of more): gives the metric scale
     readout_ms: float | None = Field(default=None, gt=0, le=200)  # published, first row to last
     sweep: tuple[_RowDirection, _RowDirection] | None = None  # row directions of the front and the
     # back lens, x right and y down in the panorama's middle; None = estimated
     stitch_radius_m: Annotated[float, Field(gt=0, allow_inf_nan=False)] | Literal["far"] | None = (
         None  # distance at which both lenses' images match at the seam; None = estimated
     )
+
+    @model_validator(mode="after")
+    def _all_around(self) -> "CameraSettings":
+        if self.lens_yaws_deg is None:
+            return self
+        yaws = sorted(yaw % 360 for yaw in self.lens_yaws_deg)
+        gaps = [after - before for before, after in pairwise([*yaws, yaws[0] + 360])]
+        if len(yaws) < 2 or min(gaps) < 10 or max(gaps) > _MAX_LENS_GAP_DEG:
+            raise ValueError(
+                "lens_yaws_deg are degrees from the panorama's middle to the right of two lenses "
+                "or more, 10 to 190 degrees apart, e.g. [0, 120, 240]"
+            )
+        if self.sweep is not None:
+            raise ValueError("sweep is for two lenses, front and back: leave lens_yaws_deg out")
+        return self
 
     @model_validator(mode="after")
     def _measured(self) -> "CameraSettings":

@@ -65,8 +65,9 @@ class FrameSet:
 
     names: tuple[str, ...]  # (F,) unique, without folder or extension; RECORDING/NAME if the frames
     # are of several recordings, whose frames follow one another
-    paths: tuple[tuple[Path, ...], ...]  # (F,)(1) for "erp", (F,)(2) for "fisheye": front and
-    # back, (F,)(2) for "eac": track 0 and the second one, (F,)(len(faces)) for "cube"
+    paths: tuple[tuple[Path, ...], ...]  # (F,)(1) for "erp", (F,)(L) for "fisheye": a picture of
+    # each lens, the front one first, (F,)(2) for "eac": track 0 and the second one,
+    # (F,)(len(faces)) for "cube"
     timestamps: np.ndarray  # (F,) float64, seconds, strictly increasing
     layout: str  # "erp" (2:1 equirectangular), "fisheye" (one image per lens, read as a panorama),
     # "eac" (two tracks of an equi-angular cube map, read as a panorama or as faces) or "cube" (one
@@ -78,8 +79,8 @@ class FrameSet:
     correction: tuple[float, ...] = ()  # stitching field: coefficients of a factors.SphereField,
     # radians; panoramas and masks are read as corrected by it
     timed: bool = True  # True = timestamps are times; False = they only give the order
-    fisheyes: tuple[Fisheye, Fisheye] | None = None  # front and back lens, with which "fisheye"
-    # frames are read as panoramas
+    fisheyes: tuple[Fisheye, ...] | None = None  # L lenses, the front one first, with which
+    # "fisheye" frames are read as panoramas
     tracks: tuple[int, int] | None = None  # width and height, pixels, of either image of "eac"
     # frames; None = of another layout
     lenses_nominal: bool = False  # True = `fisheyes` are initial values that need self-calibration:
@@ -529,7 +530,7 @@ class Reconstruction:
     # each ray; None = the rig's centre
     lens_baseline: tuple[float, float] | None = None  # distance of the two lenses and its standard
     # deviation, map units; None = one centre
-    fisheyes: tuple[Fisheye, Fisheye] | None = None  # self-calibrated lenses: see FrameSet
+    fisheyes: tuple[Fisheye, ...] | None = None  # self-calibrated lenses: see FrameSet
     vertical: np.ndarray | None = None  # (3,) float64, unit, up or down by an accelerometer; None =
     # there was none
     map_scales: np.ndarray | None = None  # (C,) float64, units of each component's world per unit

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
+from scipy.linalg import block_diag
 
 from factors import Block
 from factors.quadratic_block import QuadraticBlock
@@ -15,7 +16,7 @@ from factors.reduced_camera_system import ReducedSystem
 from factors.system_choice import reduced_system
 from gsba.bundle import readout
 from gsba.bundle.adjustment import DRAWS, AdjustmentContext
-from gsba.bundle.camera_variables import OF_LENSES, C, CameraUnknowns, D, N, W
+from gsba.bundle.camera_variables import CameraUnknowns, D, N, W, keys_of_lenses
 from gsba.bundle.optimizer import marginal_covariances
 from gsba.bundle.readout import CameraEstimate
 from gsba.types import JointErrors, Keypoints, Solution
@@ -32,11 +33,12 @@ class CameraCovariances:
 
     poses: np.ndarray  # (F, 6, 6) float64, [rotation rad, translation], rig frame
     joint: JointErrors  # what the poses' errors have in common
-    centre: np.ndarray  # (3, 3) float64, of the front lens
+    centre: np.ndarray  # (3 (L - 1), 3 (L - 1)) float64, of the lenses' centres but the last one;
+    # what different lenses have in common is left out
     readout_sigma: float  # s; NaN = no readout was taken
     inverse_stitch_radius_sigma: float  # 1 / map units; NaN = infinity, or as settings say
-    lens_sigmas: np.ndarray | None = None  # (FREE,) of what lenses of raw pairs are; None = they
-    # are as calibrated
+    lens_sigmas: np.ndarray | None = None  # (K,) of what raw lenses are, see
+    # `self_calibration`; None = they are as calibrated
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,8 +131,10 @@ class CameraSystem:
         readout_sigma, of_radius = (float(sigmas.get(key, nothing)[0]) for key in (D(0), N(0)))
         lenses = None
         if self.camera.lenses.fisheyes is not None:
-            lenses = np.concatenate([sigmas[key] for key in OF_LENSES])
-        centre = found[num + beside.index(C(0)), :3, :3]
+            keys = keys_of_lenses(self.camera.lenses.num_lenses)
+            lenses = np.concatenate([sigmas[key] for key in keys])
+        centres = [beside.index(key) for key in unknowns.variables.centres]
+        centre = np.asarray(block_diag(*(found[num + row, :3, :3] for row in centres)))
         return CameraCovariances(found[:num], joint, centre, readout_sigma, of_radius, lenses)
 
 

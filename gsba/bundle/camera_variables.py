@@ -9,26 +9,24 @@ import numpy as np
 
 from factors import RobustLoss
 from factors.camera_block import CameraBlock, pixels_of, sightings_of
-from factors.camera_rows import CameraVariables, vector
+from factors.camera_rows import CameraVariables, half_baseline, lens_sizes, vector
 from gsba.bundle import lens_axes, readout, self_calibration
 from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.prior_factors import X
 from gsba.bundle.readout import CameraEstimate
-from gsba.camera.fisheye import Pair, rotation_of
-from gsba.camera.lens import facing
+from gsba.camera.fisheye import Rig, rotation_of
 from gsba.types import Keypoints, Landmarks
 
 # Small letters: capital ones are of poses and of families that others add.
 A = partial(gtsam.symbol, "a")  # turn (2,) rad of a frame's lenses, about their x and y
-B = partial(gtsam.symbol, "b")  # turn (3,) rad of the back lens of raw pairs in the rig
-C = partial(gtsam.symbol, "c")  # the front lens's centre (3,), lenses' frame, map units
+B = partial(gtsam.symbol, "b")  # turn (3,) rad of a raw lens but the front one in the rig
+C = partial(gtsam.symbol, "c")  # a lens's centre (3,), but the last one's, lenses' frame, map units
 D = partial(gtsam.symbol, "d")  # duration (1,) of the readout, s
 F = partial(gtsam.symbol, "f")  # relative focal length and principal point (3,) of a lens
 K = partial(gtsam.symbol, "k")  # radial terms (4,) of a lens
 N = partial(gtsam.symbol, "n")  # inverse of the stitching radius (1,), 1 / map units
 W = partial(gtsam.symbol, "w")  # own motion (6,) of a frame, beside that of its velocity
 
-OF_LENSES = F(0), K(0), F(1), K(1), B(0)  # in the order of `self_calibration`
 _LEAST_TURN = 1e-6  # rad, standard deviation
 
 
@@ -77,22 +75,24 @@ class CameraUnknowns:
         """
         lenses, frames = camera.lenses, range(len(world_T_rigs))
         values, graph = gtsam.Values(), gtsam.NonlinearFactorGraph()
-        given: dict = {"poses": [X(f) for f in frames], "centre": C(0), "axes": lenses.axes}
-        values.insert(C(0), np.array(lenses.centre))
+        centres = [C(lens) for lens in range(lenses.num_lenses - 1)]
+        given: dict = {"poses": [X(f) for f in frames], "centres": centres, "axes": lenses.axes}
+        for key, centre in zip(centres, lenses.centres[:-1], strict=True):
+            values.insert(key, np.array(centre))
         if lenses.inverse_stitch_radius:
             if problem.settings.camera.stitch_radius_m is None:
                 given["radius"] = N(0)
                 values.insert(N(0), np.array([lenses.inverse_stitch_radius]))
             else:  # metres: in map units it goes with the distance between the lenses
-                length = float(np.linalg.norm(lenses.centre))
-                given["front_by_radius"] = lenses.inverse_stitch_radius * length
+                given["front_by_radius"] = lenses.inverse_stitch_radius * lenses.baseline / 2
         if lenses.fisheyes is not None:
             assert lenses.reference_calibration is not None
-            given["lenses"] = OF_LENSES
+            keys = keys_of_lenses(lenses.num_lenses)
+            given["lenses"] = keys
             given["calibration"] = _rows(lenses.reference_calibration)
             off = split_lenses(self_calibration.from_calibrated(lenses))
             for key, part, spread in zip(
-                OF_LENSES, off, split_lenses(self_calibration.SPREAD), strict=True
+                keys, off, split_lenses(self_calibration.spread(lenses.num_lenses)), strict=True
             ):
                 _add(values, graph, key, part, spread)
         own = None
@@ -138,7 +138,7 @@ class CameraUnknowns:
         """
         tracks, rows = landmarks.tracks, shown.rows(landmarks.tracks)
         lenses, directions = self.camera.lenses, shown.bearings_rig[rows]
-        signs = facing(lenses.own(directions, tracks.frames))
+        seeing = lenses.facing(directions, tracks.frames)
         fractions = lenses.fractions(directions, tracks.frames)
         roots = np.eye(2) / shown.sigmas_rad[rows, None, None]
         if shown.sqrt_infos is not None:
@@ -146,9 +146,9 @@ class CameraUnknowns:
         measured, roots = directions, roots / noise
         calibration = self.variables.calibration
         if calibration is not None:
-            measured, by_pixel = pixels_of(directions, signs, calibration)
+            measured, by_pixel = pixels_of(directions, seeing, calibration)
             roots = roots @ by_pixel
-        given = tracks.frames, tracks.points, tracks.num_points, measured, roots, signs, fractions
+        given = tracks.frames, tracks.points, tracks.num_points, measured, roots, seeing, fractions
         solver = self.problem.settings.solver
         return CameraBlock(
             self.variables,
@@ -168,12 +168,14 @@ class CameraUnknowns:
     def estimate(self, values: gtsam.Values) -> CameraEstimate:
         """The camera at values of its variables."""
         found, lenses, variables = self.camera, self.camera.lenses, self.variables
-        lenses = replace(lenses, centre=vector(values, C(0)).copy())
+        centres = [vector(values, key) for key in variables.centres]
+        lenses = replace(lenses, centre=np.concatenate(centres))
         if variables.radius is not None:
             inverse = max(float(vector(values, N(0))[0]), 0.0)
             lenses = replace(lenses, inverse_stitch_radius=inverse)
         elif variables.front_by_radius:
-            inverse = variables.front_by_radius / float(np.linalg.norm(lenses.centre))
+            half = half_baseline(lenses.num_lenses) @ lenses.centre
+            inverse = variables.front_by_radius / float(np.linalg.norm(half))
             lenses = replace(lenses, inverse_stitch_radius=inverse)
         if variables.motions is not None and variables.velocities is not None:
             duration = float(vector(values, D(0))[0])
@@ -203,8 +205,15 @@ def velocities_of(
 
 
 def split_lenses(columns: np.ndarray) -> list[np.ndarray]:
-    """Parameters (..., FREE) of raw lenses, split by variable."""
-    return np.split(columns, np.cumsum([3, 4, 3, 4]), axis=-1)
+    """Parameters (..., K) of raw lenses, split by variable."""
+    sizes = lens_sizes(self_calibration.num_lenses_of(columns.shape[-1]))
+    return np.split(columns, np.cumsum(sizes[:-1]), axis=-1)
+
+
+def keys_of_lenses(num: int) -> list[int]:
+    """Keys of the variables of L raw lenses, in the order of `self_calibration`."""
+    others = [[F(lens), K(lens), B(lens - 1)] for lens in range(1, num)]
+    return [F(0), K(0), *(key for keys in others for key in keys)]
 
 
 def _own_motion(
@@ -233,8 +242,8 @@ def _add(
     graph.add(gtsam.PriorFactorVector(key, np.zeros(len(value)), model))
 
 
-def _rows(pair: Pair) -> np.ndarray:
-    """Lenses as `factors.camera_rows` has them (2, 16)."""
+def _rows(rig: Rig) -> np.ndarray:
+    """Lenses as `factors.camera_rows` has them (L, 16)."""
     return np.array(
-        [[lens.focal, *lens.principal, *lens.radial, *rotation_of(lens).ravel()] for lens in pair]
+        [[lens.focal, *lens.principal, *lens.radial, *rotation_of(lens).ravel()] for lens in rig]
     )

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from factors.bearing import tangent_basis
+from factors.camera_rows import half_baseline
 from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.shared_parameters import (
     PARTS,
@@ -37,8 +38,8 @@ class LensCentres:
     """Where the lenses are, as a map says."""
 
     lenses: Lenses  # one centre: none was taken
-    found: np.ndarray  # (3,) float64, front lens in the rig, map units, taken or not
-    covariance: np.ndarray  # (3, 3) float64, poses and points adjusted with it
+    found: np.ndarray  # (3 (L - 1),) float64, centres as `Lenses.centre`, map units, taken or not
+    covariance: np.ndarray  # float64, of these, poses and points adjusted with it
     part_gains: np.ndarray  # (PARTS,) float64, share of the robust cost of each part of the
     # sequence that the centre which other parts give takes off
     reason: str  # why none was taken; empty if one was
@@ -86,11 +87,12 @@ def estimate(
     ):  # raw pairs are of two, also where frames are few
         whole = whole_model_of(landmarks, _MOST, keypoints, solved, problem, by_centre)
     if not systems and whole is None:
-        unknown, nothing = np.full((3, 3), np.nan), np.full(PARTS, np.nan)
+        num = len(so_far.centre)
+        unknown, nothing = np.full((num, num), np.nan), np.full(PARTS, np.nan)
         why = "too few points to tell one lens from the other"
         return LensCentres(so_far, so_far.centre, unknown, nothing, why, counts)
     total = whole or summed(systems)
-    damping = 1e-9 * np.trace(total.hessian) * np.eye(3)
+    damping = 1e-9 * np.trace(total.hessian) * np.eye(len(total.hessian))
     covariance = np.linalg.inv(total.hessian + damping) / total.curvature
     found = so_far.centre + _step([total])
     around = [part.around(so_far.centre) for part in systems]  # as if there were one centre
@@ -114,14 +116,16 @@ def estimate(
         f"{100 * float(shares.mean()):.1f} % of unseen parts' cost" if systems else "few frames"
     )
     logger.info("lens centres: %s, %s%s", where, gained, untaken)
-    taken = replace(so_far, centre=np.zeros(3) if reason else found)
+    taken = replace(so_far, centre=np.zeros_like(found) if reason else found)
     return LensCentres(taken, found, covariance, shares, reason, counts)
 
 
 def baseline_of(centres: LensCentres, scale: float) -> tuple[float, float]:
-    """Distance between the lenses at a scale of the map, and its standard deviation."""
-    length = float(np.linalg.norm(centres.found))
-    along = centres.found / max(length, 1e-300)
+    """Distance between the first two lenses at a scale of the map, and its standard deviation."""
+    by_centres = half_baseline(centres.lenses.num_lenses)
+    half = by_centres @ centres.found
+    length = float(np.linalg.norm(half))
+    along = half @ by_centres / max(length, 1e-300)
     sigma = float(np.sqrt(along @ centres.covariance @ along))
     return 2 * scale * length, 2 * scale * float(np.hypot(sigma, _OF_MODEL * length))
 
@@ -146,7 +150,7 @@ def stitched_for(
         so_far: the lenses.
         problem: loss, settings.
     """
-    said = problem.settings.camera.inverse_stitch_radius(float(np.linalg.norm(so_far.centre)))
+    said = problem.settings.camera.inverse_stitch_radius(so_far.baseline / 2)
     if said is not None:
         reason, unknown = "" if said else "camera.stitch_radius_m says so", np.full(PARTS, np.nan)
         return StitchRadius(replace(so_far, inverse_stitch_radius=said), said, 0.0, unknown, reason)
@@ -161,14 +165,14 @@ def stitched_for(
     systems, _ = models_of(landmarks, _MOST, keypoints, solved, problem, by_both)
     if not systems:
         return StitchRadius(so_far, 0.0, np.nan, np.full(PARTS, np.nan), "too few points")
-    found, total = _step(systems), summed(systems)
-    sigma = float(np.sqrt(np.linalg.inv(total.hessian)[3, 3] / total.curvature))
+    found, total, num = _step(systems), summed(systems), len(so_far.centre)
+    sigma = float(np.sqrt(np.linalg.inv(total.hessian)[num, num] / total.curvature))
     gains = []
     for p, part in enumerate(systems):
         others = systems[:p] + systems[p + 1 :]
-        without = part.gain(_step([each.of(slice(3)) for each in others]))
+        without = part.gain(_step([each.of(slice(num)) for each in others]))
         gains.append(part.gain(_step(others)) - without)
-    inverse_stitch_radius, gains = float(found[3]), np.array(gains)
+    inverse_stitch_radius, gains = float(found[num]), np.array(gains)
     shares = gains / np.array([part.cost for part in systems])
     logger.info(
         "stitched for a inverse_stitch_radius of %.3f (sigma %.3f)", inverse_stitch_radius, sigma
@@ -177,7 +181,7 @@ def stitched_for(
     if not predicts(gains) or inverse_stitch_radius < _SIGNIFICANT * sigma:
         reason = "as well stitched at infinity"
     taken = replace(
-        so_far, centre=so_far.centre + found[:3], inverse_stitch_radius=inverse_stitch_radius
+        so_far, centre=so_far.centre + found[:num], inverse_stitch_radius=inverse_stitch_radius
     )
     return StitchRadius(so_far if reason else taken, inverse_stitch_radius, sigma, shares, reason)
 

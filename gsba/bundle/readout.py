@@ -168,12 +168,18 @@ def _durations(systems: list[SharedModel]) -> tuple[np.ndarray, np.ndarray, np.n
 
 
 def _ways(camera: CameraSettings, lenses: Lenses) -> list[np.ndarray]:
-    """Ways (2, 3) in which the two lenses can be read, up to both reversed."""
+    """Ways (L, 3) in which the lenses can be read, up to all of them reversed."""
+    num = lenses.num_lenses
+    signs = [np.array([[1.0, *rest]]).T for rest in product((1.0, -1.0), repeat=num - 1)]
     if lenses.reference_calibration is not None:
-        down, reversed_back = rows_run(lenses.reference_calibration), np.array([[1.0], [-1.0]])
-        return [down, reversed_back * down]
+        down = rows_run(lenses.reference_calibration)
+        return [sign * down for sign in signs]
     if camera.sweep is not None:
         named = {"+x": _AXES[0], "-x": -_AXES[0], "+y": _AXES[1], "-y": -_AXES[1]}
         return [np.array([named[way] for way in camera.sweep])]
+    if camera.lens_yaws_deg is not None:  # of one make: all read along their own right or down
+        down = np.tile(_AXES[1], (num, 1))
+        right = np.cross(down, lenses.optical_axes)
+        return [sign * axes for axes in (right, down) for sign in signs]
     back = [sign * axis for axis in _AXES for sign in (1.0, -1.0)]
     return [np.array(way) for way in product(_AXES, back)]

@@ -1,10 +1,11 @@
-"""What the lenses of raw pairs are: focal lengths, distortion, and how the back one is turned.
+"""What raw lenses are: focal lengths, distortion, and how all but the front one are turned.
 
 Found from a map as other parameters that all frames share, beside the lenses' centre. What differs
 from a calibration is believed where every part of the sequence gains by what the others give. Plain
 lenses of unknown make are only a start, with priors as wide as such lenses differ: what is found is
 taken where observations determine the focal lengths, in short sequences too. The front lens's axes
-are the rig's, as it was calibrated: a turn of both is one of the poses.
+are the rig's, as it was calibrated: a turn of all lenses is one of the poses. Parameters (K,) are
+those of the front lens but its rotation, then all of each other lens.
 """
 
 import logging
@@ -22,8 +23,8 @@ from gsba.bundle.shared_parameters import (
     summed,
     whole_model_of,
 )
-from gsba.camera.fisheye import PARAMETERS, Pair, by_parameters, changed, difference, recalibrated
-from gsba.camera.lens import Lenses, facing
+from gsba.camera.fisheye import PARAMETERS, Rig, by_parameters, changed, difference, recalibrated
+from gsba.camera.lens import Lenses
 from gsba.types import Counts, Keypoints, Landmarks, Solution
 
 logger = logging.getLogger(__name__)
@@ -31,17 +32,14 @@ logger = logging.getLogger(__name__)
 _MOST = 60_000  # observations that it is found from
 _PLACES = 500  # on the sphere, at which calibrations are compared
 _TURN = 3  # of the parameters of a lens, the last ones
-OF_FRONT, OF_BACK = PARAMETERS - _TURN, PARAMETERS  # parameters that each lens has
-FREE = OF_FRONT + OF_BACK
+OF_FRONT = PARAMETERS - _TURN  # parameters of the front lens
 _SIGMAS = np.array([0.05, 0.02, 0.02, 0.05, 0.02, 0.005, 0.001, 0.03, 0.03, 0.03])  # of a lens
-SPREAD = np.concatenate([_SIGMAS[:OF_FRONT], _SIGMAS])  # (FREE,) standard deviations: how far
-# lenses may be from what they were calibrated as, or from plain ones
 _DETERMINED = 0.5  # of such a standard deviation, at most, that remains of what is determined
-_GROUPS = {
-    "focal lengths": [0, OF_FRONT],
-    "principal points": [1, 2, OF_FRONT + 1, OF_FRONT + 2],
-    "radial terms": [*range(3, OF_FRONT), *range(OF_FRONT + 3, FREE - _TURN)],
-    "the back lens's turn": [*range(FREE - _TURN, FREE)],
+_GROUPS = {  # parameters of each lens
+    "focal lengths": [0],
+    "principal points": [1, 2],
+    "radial terms": [*range(3, OF_FRONT)],
+    "the other lenses' rotations": [*range(OF_FRONT, PARAMETERS)],
 }
 
 
@@ -77,7 +75,7 @@ def estimate(
         problem: priors, loss, settings.
         nominal: whether the lenses so far are plain ones of unknown make, not calibrated.
     """
-    frames = keypoints.frames()
+    frames, num = keypoints.frames(), num_parameters(so_far.num_lenses)
 
     def by_both(rows: np.ndarray, by_origin: np.ndarray, residuals: np.ndarray) -> np.ndarray:
         own = by_lenses(keypoints.bearings_rig[rows], shown[rows], so_far, residuals)
@@ -96,7 +94,7 @@ def estimate(
     gains = []
     for p, part in enumerate(systems):
         others = systems[:p] + systems[p + 1 :]
-        alone = np.concatenate([np.zeros(FREE), _centre_step(others)])
+        alone = np.concatenate([np.zeros(num), _centre_step(others, num)])
         gains.append(part.gain(_step(others, off)) - part.gain(alone))
     found, gains = _step(systems, off), np.array(gains)
     shares = gains / np.array([part.cost for part in systems])
@@ -104,14 +102,14 @@ def estimate(
     if so_far.fisheyes is None and not predicts(gains):
         reason = "it does not predict parts of the sequence that it was not found from"
     logger.info(
-        "lenses: focal lengths %+.3f and %+.3f %%, %.2f %% of unseen parts' cost%s",
-        *(100 * (off + found[:FREE])[[0, OF_FRONT]]),
+        "lenses: focal lengths %s %%, %.2f %% of unseen parts' cost%s",
+        _shown(100 * (off + found[:num])[focals_of(so_far.num_lenses)]),
         100 * float(shares.mean()),
         reason and f"; not taken: {reason}",
     )
-    lenses = so_far if reason else moved(so_far, found[:FREE])
+    lenses = so_far if reason else moved(so_far, found[:num])
     if not reason:
-        lenses = replace(lenses, centre=so_far.centre + found[FREE:])
+        lenses = replace(lenses, centre=so_far.centre + found[num:])
     return SelfCalibration(lenses, shares, reason, counts)
 
 
@@ -122,35 +120,67 @@ def _of_nominal(
 
     Args:
         system: of all observations.
-        off: (FREE,) how far lenses are from the plain ones.
+        off: (K,) how far lenses are from the plain ones.
     """
-    found, sigmas = _step([system], off), _sigmas(system)
-    loose = undetermined(sigmas)
-    focal = 100 * sigmas[[0, OF_FRONT]]
+    num = len(off)
+    found, sigmas = _step([system], off), _sigmas(system, num)
+    loose, focals = undetermined(sigmas), focals_of(so_far.num_lenses)
+    focal = 100 * sigmas[focals]
     reason = ""
     if "focal lengths" in loose:
-        reason = (
-            f"these frames tell focal lengths to {focal[0]:.1f} and {focal[1]:.1f} % only: lenses "
-            "stay plain ones"
-        )
+        shown = " and ".join(f"{one:.1f}" for one in focal)
+        reason = f"these frames tell focal lengths to {shown} % only: lenses stay plain ones"
     logger.info(
-        "lenses: focal lengths %+.3f and %+.3f %% (sigmas %.3f and %.3f)%s%s",
-        *(100 * (off + found[:FREE])[[0, OF_FRONT]]),
-        *focal,
+        "lenses: focal lengths %s %% (sigmas %s)%s%s",
+        _shown(100 * (off + found[:num])[focals]),
+        _shown(focal),
         f"; hardly determined: {', '.join(loose)}" if loose else "",
         reason and f"; not taken: {reason}",
     )
     lenses = so_far
     if not reason:
-        lenses = moved(so_far, found[:FREE])
-        lenses = replace(lenses, centre=so_far.centre + found[FREE:])
+        lenses = moved(so_far, found[:num])
+        lenses = replace(lenses, centre=so_far.centre + found[num:])
     return SelfCalibration(lenses, np.full(PARTS, np.nan), reason, counts, loose)
 
 
 def undetermined(sigmas: np.ndarray) -> tuple[str, ...]:
-    """What standard deviations (FREE,) after an adjustment are hardly smaller of than before."""
-    loose = np.asarray(sigmas) > _DETERMINED * SPREAD
-    return tuple(name for name, rows in _GROUPS.items() if loose[rows].mean() > 0.5)
+    """Groups of parameters whose standard deviations (K,) the adjustment hardly lowers."""
+    num = num_lenses_of(len(sigmas))
+    loose = np.asarray(sigmas) > _DETERMINED * spread(num)
+    starts = [0, *(first_of(lens) for lens in range(1, num))]
+    found = []
+    for name, rows in _GROUPS.items():
+        turn = rows[0] >= OF_FRONT  # the front lens has none
+        whole = [start + row for start in starts[turn:] for row in rows]
+        if loose[whole].mean() > 0.5:
+            found.append(name)
+    return tuple(found)
+
+
+def first_of(lens: int) -> int:
+    """Where the parameters of a lens start."""
+    return 0 if lens == 0 else OF_FRONT + PARAMETERS * (lens - 1)
+
+
+def num_parameters(num_lenses: int) -> int:
+    """K, of raw lenses."""
+    return first_of(num_lenses)
+
+
+def num_lenses_of(num: int) -> int:
+    """L, of raw lenses with K parameters."""
+    return 1 + (num - OF_FRONT) // PARAMETERS
+
+
+def focals_of(num_lenses: int) -> list[int]:
+    """Where the focal lengths of lenses are among the parameters."""
+    return [first_of(lens) for lens in range(num_lenses)]
+
+
+def spread(num_lenses: int) -> np.ndarray:
+    """Standard deviations (K,) of lenses about calibrated or plain ones."""
+    return np.concatenate([_SIGMAS[:OF_FRONT], *[_SIGMAS] * (num_lenses - 1)])
 
 
 def by_lenses(
@@ -159,7 +189,7 @@ def by_lenses(
     lenses: Lenses,
     residuals: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Jacobian (O, 2, FREE) of residuals of bearings by what lenses are.
+    """Jacobian (O, 2, K) of residuals of bearings by what lenses are.
 
     Noise is of pixels: it is an angle that shrinks where a focal length grows, and least squares of
     angles would prefer long ones. Taken where points are predicted, not where they were observed,
@@ -171,35 +201,36 @@ def by_lenses(
         lenses: of raw pairs.
         residuals: (O, 2) of the bearings, from observed to predicted; None = taken as 0.
     """
-    out = np.zeros((len(shown), 2, FREE))
+    out = np.zeros((len(shown), 2, num_parameters(lenses.num_lenses)))
     basis, there = -tangent_basis(bearings_rig), lenses.calibrated(shown)
     if residuals is not None:
         there = there - np.einsum("oij,oi->oj", basis, residuals)
         there /= np.linalg.norm(there, axis=1, keepdims=True)
-    front = facing(shown) > 0
-    for part, lens, columns in zip(
-        (front, ~front), now(lenses), (slice(OF_FRONT), slice(OF_FRONT, FREE)), strict=True
-    ):
-        moves = by_parameters(lens, there[part])[:, :, : columns.stop - (columns.start or 0)]
+    facing = lenses.facing(shown, np.zeros(len(shown), int))
+    for number, lens in enumerate(now(lenses)):
+        part, columns = facing == number, slice(first_of(number), first_of(number + 1))
+        moves = by_parameters(lens, there[part])[:, :, : columns.stop - columns.start]
         out[part, :, columns] = basis[part] @ moves
     return out
 
 
 def moved(lenses: Lenses, step: np.ndarray) -> Lenses:
-    """Lenses after a step (FREE,) of what `by_lenses` differentiates by."""
-    front, back = now(lenses)
-    of_front = np.concatenate([step[:OF_FRONT], np.zeros(_TURN)])
-    return replace(lenses, fisheyes=(changed(front, of_front), changed(back, step[OF_FRONT:])))
+    """Lenses after a step (K,) of what `by_lenses` differentiates by."""
+    front, *others = now(lenses)
+    steps = np.split(step, [first_of(lens) for lens in range(1, lenses.num_lenses)])
+    found = [changed(front, np.concatenate([steps[0], np.zeros(_TURN)]))]
+    found += [changed(lens, own) for lens, own in zip(others, steps[1:], strict=True)]
+    return replace(lenses, fisheyes=tuple(found))
 
 
 def from_calibrated(lenses: Lenses) -> np.ndarray:
-    """How far (FREE,) lenses are from what they were calibrated as."""
+    """How far (K,) lenses are from what they were calibrated as."""
     assert lenses.reference_calibration is not None
-    of_front, of_back = (
+    front, *others = (
         difference(one, before)
         for one, before in zip(now(lenses), lenses.reference_calibration, strict=True)
     )
-    return np.concatenate([of_front[:OF_FRONT], of_back])
+    return np.concatenate([front[:OF_FRONT], *others])
 
 
 def apart(one: Lenses, other: Lenses) -> float:
@@ -212,32 +243,43 @@ def apart(one: Lenses, other: Lenses) -> float:
     return float(np.sqrt(np.mean(np.sum((there - places) ** 2, axis=1))))
 
 
-def now(lenses: Lenses) -> Pair:
-    """What lenses of raw pairs are taken for."""
+def now(lenses: Lenses) -> Rig:
+    """What raw lenses are taken for."""
     assert lenses.reference_calibration is not None
     return lenses.fisheyes or lenses.reference_calibration
 
 
-def _pull() -> np.ndarray:
-    """Information (FREE + 3,) on what lenses are, from what they were calibrated as."""
-    return np.concatenate([SPREAD, np.full(3, np.inf)]) ** -2
+def _pull(num: int, off: np.ndarray) -> np.ndarray:
+    """Information (num,) on lenses and centres, from what lenses were calibrated as."""
+    pull = np.zeros(num)
+    pull[: len(off)] = spread(num_lenses_of(len(off))) ** -2
+    return pull
 
 
 def _step(systems: list[SharedModel], off: np.ndarray) -> np.ndarray:
-    """Change (FREE + 3,) of lenses and centre that the parts ask for."""
-    total, pull = summed(systems), _pull()
-    gradient = total.gradient + pull * np.concatenate([off, np.zeros(3)])
+    """Change (K + 3 (L - 1),) of lenses and centres that the parts ask for."""
+    total = summed(systems)
+    num = len(total.gradient)
+    pull, whole = _pull(num, off), np.zeros(num)
+    whole[: len(off)] = off
+    gradient = total.gradient + pull * whole
     return -np.linalg.solve(total.curvature * total.hessian + np.diag(pull), gradient)
 
 
-def _sigmas(system: SharedModel) -> np.ndarray:
-    """Standard deviations (FREE,) of lenses, adjusted with centre, poses and points."""
-    information = system.curvature * system.hessian + np.diag(_pull())
+def _sigmas(system: SharedModel, num: int) -> np.ndarray:
+    """Standard deviations (K,) of lenses, adjusted with centres, poses and points."""
+    pull = _pull(len(system.gradient), np.zeros(num))
+    information = system.curvature * system.hessian + np.diag(pull)
     information += 1e-12 * np.trace(information) * np.eye(len(information))
-    return np.sqrt(np.diagonal(np.linalg.inv(information))[:FREE])
+    return np.sqrt(np.diagonal(np.linalg.inv(information))[:num])
 
 
-def _centre_step(systems: list[SharedModel]) -> np.ndarray:
-    """Change (3,) of the centre that the parts ask for alone."""
-    total = summed([each.of(slice(FREE, None)) for each in systems])
+def _shown(values: np.ndarray) -> str:
+    return " and ".join(f"{value:+.3f}" for value in values)
+
+
+def _centre_step(systems: list[SharedModel], num: int) -> np.ndarray:
+    """Change (3 (L - 1),) of the centres that the parts ask for alone, K parameters of lenses
+    held."""
+    total = summed([each.of(slice(num, None)) for each in systems])
     return -np.linalg.solve(total.curvature * total.hessian, total.gradient)

@@ -1,8 +1,9 @@
-"""Calibrations of a raw pair's two lenses, read from files.
+"""Calibrations of raw lenses, read from files.
 
 Takes JSON of our own form, whose rig keeps its axes: `rig_T_lens` in metres, unless `unit` names
-cm, mm, in, ft, or "map" for lengths of no known unit. Takes Kalibr's and COLMAP's files too, see
-`gsba.camera.calibration_formats`. The rig's origin is moved into the middle between the lenses.
+cm, mm, in, ft, or "map" for lengths of no known unit. Takes Kalibr's and COLMAP's files of
+pairs too, see `gsba.camera.calibration_formats`. The rig's origin is moved into the middle of the
+lenses.
 """
 
 import json
@@ -21,28 +22,33 @@ from gsba.camera.calibration_formats import (
     lens_of,
     metres_of,
 )
-from gsba.camera.fisheye import Pair, rotation_of
+from gsba.camera.fisheye import Rig, lens_names, rotation_of
+from gsba.camera.lens import all_centres
 from gsba.geometry import pose
 from gsba.log import GsbaError
 from gsba.types import Fisheye
 
 _MODEL = "kannala-brandt: r = f (th + k1 th^3 + k2 th^5 + k3 th^7 + k4 th^9), corner origin"
 _EXPECTED_FORM = (
-    "give lenses.front and lenses.back, each with width, height, f, cx, cy, k and "
-    "rig_T_lens, a Kalibr camchain of cam0 and cam1, or a COLMAP rig"
+    "give lenses.front and lenses.back, or lenses.lens0, lenses.lens1 and so on, each with "
+    "width, height, f, cx, cy, k and rig_T_lens, a Kalibr camchain of cam0 and cam1, or a COLMAP "
+    "rig"
 )
 _MAX_FILE_BYTES = 1 << 18  # YAML takes a second for each hundred thousand
+_MAX_UNSEEN_ANGLE_RAD = np.deg2rad(95.0)  # of a direction from the nearest of more than two axes
+_DIRECTIONS = np.stack(np.meshgrid(*3 * [np.linspace(-1, 1, 12)]), axis=-1).reshape(-1, 3)
+_DIRECTIONS /= np.linalg.norm(_DIRECTIONS, axis=1, keepdims=True)  # (N, 3) float64, all around
 _MAX_AXIS_ANGLE_RAD = np.deg2rad(20.0)  # between a lens's axis and the rig's z axis
 
 
-def read_calibration(path: Path) -> Pair:
-    """The two lenses that a file describes, or the folder of a COLMAP model.
+def read_calibration(path: Path) -> Rig:
+    """The lenses that a file describes, or the folder of a COLMAP model.
 
     Raises:
-        GsbaError: the file is unreadable, or its lenses are not back to back.
+        GsbaError: the file is unreadable, or its lenses do not look all around.
     """
     try:
-        pair = (
+        rig = (
             from_colmap_model(path) if path.is_dir() else _lenses_of_tree(_parsed_file(path), path)
         )
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
@@ -50,23 +56,21 @@ def read_calibration(path: Path) -> Pair:
         why = kind + _one_line(error)
         if isinstance(error, KeyError):
             why = f"it has no {error}"
-        raise GsbaError(
-            f"{path}: not a calibration of two lenses ({why}); {_EXPECTED_FORM}"
-        ) from None
+        raise GsbaError(f"{path}: not a calibration of lenses ({why}); {_EXPECTED_FORM}") from None
     try:
-        return _in_centred_rig(pair)
+        return _in_centred_rig(rig)
     except ValueError as error:
         raise GsbaError(f"{path}: {error}") from None
 
 
 def calibration_json(
-    pair: Pair, centre: np.ndarray, unit: str, more: Mapping[str, Any]
+    rig: Rig, centre: np.ndarray, unit: str, more: Mapping[str, Any]
 ) -> dict[str, Any]:
     """The content of a calibration file.
 
     Args:
-        pair: front and back lens.
-        centre: (3,) centre of the front lens in the rig; the back one is opposite.
+        rig: lenses, the front one first.
+        centre: (3 (L - 1),) centres of all but the last one, see `gsba.camera.lens.Lenses`.
         unit: unit of `centre`, "m" or "map".
         more: further entries of the file.
     """
@@ -81,45 +85,52 @@ def calibration_json(
                 "cx": lens.principal[0],
                 "cy": lens.principal[1],
                 "k": list(lens.radial),
-                "rig_T_lens": pose(rotation_of(lens), sign * centre).tolist(),
+                "rig_T_lens": pose(rotation_of(lens), place).tolist(),
             }
-            for name, lens, sign in zip(("front", "back"), pair, (1, -1), strict=True)
+            for name, lens, place in zip(
+                lens_names(len(rig)), rig, all_centres(centre), strict=True
+            )
         },
         **more,
     }
 
 
-def _in_centred_rig(pair: Pair) -> Pair:
-    """Both lenses in a rig whose origin is the middle between them.
+def _in_centred_rig(rig: Rig) -> Rig:
+    """The lenses in a rig whose origin is the mean of their centres.
 
     Raises:
-        ValueError: the lenses do not look ahead and behind.
+        ValueError: two lenses do not look ahead and behind, or more leave a direction unseen.
     """
-    ways = [rotation_of(lens)[2, 2] for lens in pair]
-    if min(ways[0], -ways[1]) < np.cos(_MAX_AXIS_ANGLE_RAD):
+    axes = np.array([rotation_of(lens)[:, 2] for lens in rig])
+    if len(rig) == 2 and min(axes[0, 2], -axes[1, 2]) < np.cos(_MAX_AXIS_ANGLE_RAD):
         raise ValueError(
             "the front lens must look along z of the rig and the back one the other way, within "
             f"{np.rad2deg(_MAX_AXIS_ANGLE_RAD):.0f} degrees: check their poses"
         )
-    middle = (np.asarray(pair[0].centre) + pair[1].centre) / 2
-    front, back = (replace(lens, centre=_three(np.asarray(lens.centre) - middle)) for lens in pair)
-    return front, back
+    widest = np.arccos(np.clip((_DIRECTIONS @ axes.T).max(axis=1).min(), -1, 1))
+    if len(rig) > 2 and widest > _MAX_UNSEEN_ANGLE_RAD:
+        raise ValueError(
+            f"a direction is {np.rad2deg(widest):.0f} degrees from every lens's axis; lenses must "
+            f"see all around, to {np.rad2deg(_MAX_UNSEEN_ANGLE_RAD):.0f} degrees: check their poses"
+        )
+    middle = np.mean([lens.centre for lens in rig], axis=0)
+    return tuple(replace(lens, centre=_three(np.asarray(lens.centre) - middle)) for lens in rig)
 
 
-def scaled_to_size(pair: Pair, size: tuple[int, int], path: Path) -> Pair:
+def scaled_to_size(rig: Rig, size: tuple[int, int], path: Path) -> Rig:
     """A calibration scaled to pictures of another size.
 
     Raises:
         GsbaError: the pictures have another aspect ratio.
     """
     width, height = size
-    for lens in pair:
+    for lens in rig:
         if abs(width * lens.height - height * lens.width) > 0.01 * width * lens.height:
             raise GsbaError(
                 f"{path}: calibrates pictures of {lens.width}x{lens.height}, but these are "
                 f"{width}x{height}: another aspect ratio; give the calibration of this video mode"
             )
-    front, back = (
+    return tuple(
         replace(
             lens,
             width=width,
@@ -130,9 +141,8 @@ def scaled_to_size(pair: Pair, size: tuple[int, int], path: Path) -> Pair:
                 lens.principal[1] * height / lens.height,
             ),
         )
-        for lens in pair
+        for lens in rig
     )
-    return front, back
 
 
 def _parsed_file(path: Path) -> Any:
@@ -181,8 +191,8 @@ def _yaml(text: str) -> Any:
         raise ValueError(str(error)) from None
 
 
-def _lenses_of_tree(tree: Any, path: Path) -> Pair:
-    """Both lenses, read in the form that the tree's keys show."""
+def _lenses_of_tree(tree: Any, path: Path) -> Rig:
+    """The lenses, read in the form that the tree's keys show."""
     if isinstance(tree, list):
         return from_colmap_config(tree, path)
     if "cameras" in tree:
@@ -190,8 +200,9 @@ def _lenses_of_tree(tree: Any, path: Path) -> Pair:
     if any(re.fullmatch(r"cam\d+", str(name)) for name in tree):
         return from_kalibr(tree, path)
     metres = metres_of(tree.get("unit", "m"))
-    front, back = (_lens_of_entry(tree["lenses"][name], metres) for name in ("front", "back"))
-    return front, back
+    entries = tree["lenses"]
+    names = lens_names(len(entries)) if "lens2" in entries else ("front", "back")
+    return tuple(_lens_of_entry(entries[name], metres) for name in names)
 
 
 def _lens_of_entry(tree: Mapping[str, Any], metres: float) -> Fisheye:

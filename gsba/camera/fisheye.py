@@ -1,8 +1,9 @@
-"""Two raw fisheyes as parts of one panorama: projection of rig directions into their pictures.
+"""Raw fisheyes as parts of one panorama: projection of rig directions into their pictures.
 
-The lens that faces a direction sees it, as in `gsba.camera.lens`: the front one ahead of the rig,
-the back one behind. Lenses may be recalibrated after panoramas were cut by them: then a direction
-of a panorama is one pixel of a fisheye, which has another direction by the new calibration.
+The lens that faces a direction sees it, as in `gsba.camera.lens`: of a pair the front one sees what
+is ahead of the rig, and the back one what is behind it. Lenses may be recalibrated after panoramas
+were cut by them: then a direction of a panorama is one pixel of a fisheye, which has another
+direction by the new calibration.
 """
 
 from dataclasses import replace
@@ -14,6 +15,7 @@ from gsba.camera.projections import FisheyeProjection
 from gsba.types import Fisheye
 
 Pair = tuple[Fisheye, Fisheye]  # front, back
+Rig = tuple[Fisheye, ...]  # two lenses or more, the front one first
 
 PARAMETERS = 10  # of a lens: relative focal length, principal point (2) in units of the focal
 # length, radial terms (4), rotation (3) in the rig
@@ -24,6 +26,27 @@ def rotation_of(lens: Fisheye) -> np.ndarray:
     from scipy.spatial.transform import Rotation
 
     return Rotation.from_rotvec(lens.rotation).as_matrix()
+
+
+def lens_names(num: int) -> tuple[str, ...]:
+    """Names of L lenses in files."""
+    return ("front", "back") if num == 2 else tuple(f"lens{lens}" for lens in range(num))
+
+
+def optical_axes(rig: Rig) -> np.ndarray:
+    """Directions (L, 3), rig frame, by whose nearest one a lens is said to face a direction.
+
+    Of a pair these are z and -z of the rig, between which the seam lies; of more lenses these are
+    their axes as calibrated.
+    """
+    if len(rig) == 2:
+        return np.array([[0.0, 0, 1], [0, 0, -1]])
+    return np.array([rotation_of(lens)[:, 2] for lens in rig])
+
+
+def facing(directions: np.ndarray, axes: np.ndarray) -> np.ndarray:
+    """Lens (...,) int64 that faces directions (..., 3): the one of the nearest axis of (L, 3)."""
+    return np.argmax(directions @ axes.T, axis=-1)
 
 
 def projection_of(lens: Fisheye) -> FisheyeProjection:
@@ -66,14 +89,14 @@ def changed(lens: Fisheye, step: np.ndarray) -> Fisheye:
     return _with_rotation(bent, turn.as_rotvec())
 
 
-def turned(pair: Pair, old_R_new: np.ndarray) -> Pair:
-    """Both lenses in a rig whose axes are rotated by old_R_new (3, 3) against the old ones."""
+def turned(rig: Rig, old_R_new: np.ndarray) -> Rig:
+    """The lenses in a rig whose axes are rotated by old_R_new (3, 3) against the old ones."""
     from scipy.spatial.transform import Rotation
 
-    front, back = (
-        Rotation.from_matrix(old_R_new.T @ rotation_of(lens)).as_rotvec() for lens in pair
+    return tuple(
+        _with_rotation(lens, Rotation.from_matrix(old_R_new.T @ rotation_of(lens)).as_rotvec())
+        for lens in rig
     )
-    return _with_rotation(pair[0], front), _with_rotation(pair[1], back)
 
 
 def difference(lens: Fisheye, before: Fisheye) -> np.ndarray:
@@ -87,29 +110,32 @@ def difference(lens: Fisheye, before: Fisheye) -> np.ndarray:
 
 
 def pixels_of(
-    pair: Pair, directions: np.ndarray, behind: np.ndarray | None = None
+    rig: Rig, directions: np.ndarray, lens: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Lens (...,), 0 or 1, that faces directions (..., 3), and their pixels (..., 2) in it.
+    """Lens (...,) that faces directions (..., 3), and their pixels (..., 2) in it.
 
     Args:
-        behind: (...,) bool, directions to project by the back lens; None = those that it faces.
+        lens: (...,) int, the lens that each direction is projected by; None = that which faces it.
     """
-    lens = (directions[..., 2] < 0 if behind is None else behind).astype(int)
-    both = np.stack([project(one, directions) for one in pair])
-    return lens, np.where(lens[..., None] == 0, both[0], both[1])
+    lens = facing(directions, optical_axes(rig)) if lens is None else lens
+    pixels = project(rig[0], directions)
+    for number, other in enumerate(rig[1:], 1):
+        pixels = np.where(lens[..., None] == number, project(other, directions), pixels)
+    return lens, pixels
 
 
 def recalibrated(
-    directions: np.ndarray, before: Pair, after: Pair, behind: np.ndarray | None = None
+    directions: np.ndarray, before: Rig, after: Rig, lens: np.ndarray | None = None
 ) -> np.ndarray:
     """Directions of pixels by lenses `after`, given their directions (N, 3) by lenses `before`.
 
     Args:
-        behind: (N,) bool, directions of the back lens; None = those that it faces.
+        lens: (N,) int, the lens of each direction; None = that which faces it.
     """
     out = np.empty_like(directions)
-    behind = directions[:, 2] < 0 if behind is None else behind
-    for part, old, new in zip((~behind, behind), before, after, strict=True):
+    lens = facing(directions, optical_axes(before)) if lens is None else lens
+    for number, (old, new) in enumerate(zip(before, after, strict=True)):
+        part = lens == number
         out[part] = unproject(new, project(old, directions[part]))
     return out
 

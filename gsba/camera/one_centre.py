@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from gsba.camera.equiangular import Grid, around_squares
-from gsba.camera.fisheye import project
+from gsba.camera.fisheye import facing, project
 from gsba.camera.lens import Lenses
 from gsba.camera.sphere import around_sphere, bearings_from_erp, erp_from_bearings
 from gsba.camera.straighten import PAD
@@ -35,10 +35,10 @@ class Stitcher:
     """Makes the panorama of one frame."""
 
     def __init__(self, lenses: Lenses, frame: int, scene: np.ndarray) -> None:
-        """Compute the offset from each direction of the rig to its direction in either lens.
+        """Compute the offset from each direction of the rig to its direction in each lens.
 
         Args:
-            lenses: both lenses.
+            lenses: the lenses.
             frame: index of the frame in `lenses`.
             scene: (N, 3) points in the rig frame of this frame, which give the depths.
         """
@@ -50,11 +50,11 @@ class Stitcher:
         rays = bearings_from_erp(pixels, _DEPTH_GRID_WIDTH, _DEPTH_GRID_WIDTH // 2).reshape(-1, 3)
         depths = np.full(len(rays), _FAR_DEPTH)
         if len(scene):
-            nearest = _MIN_DEPTH_IN_LENS_OFFSETS * float(np.linalg.norm(lenses.centre))
+            nearest = _MIN_DEPTH_IN_LENS_OFFSETS * lenses.baseline / 2
             depths = np.maximum(depths_along(rays, scene), nearest)
         same, self._offsets = np.zeros(len(rays), int), []
-        for sign in (1.0, -1.0):
-            shown = self._lenses.seeing(depths[:, None] * rays, same, np.full(len(rays), sign))
+        for lens in range(lenses.num_lenses):
+            shown = self._lenses.seeing(depths[:, None] * rays, same, np.full(len(rays), lens))
             shown /= np.linalg.norm(shown, axis=1, keepdims=True)
             offsets = (
                 (shown - rays)
@@ -92,8 +92,8 @@ class Stitcher:
         return joined[..., 0] == 255
 
     def stitched_raw(self, pictures: list[np.ndarray], width: int) -> np.ndarray:
-        """The panorama (width / 2, width, C) uint8 of both pictures (h, w, C) uint8 of a raw
-        pair."""
+        """The panorama (width / 2, width, C) uint8 of all pictures (h, w, C) uint8 of raw
+        lenses."""
         pair = self._lenses.reference_calibration
         assert pair is not None
 
@@ -107,14 +107,11 @@ class Stitcher:
         return self._joined(width, pictures[0].shape[2], look)
 
     def _joined(self, width: int, channels: int, look: _Look) -> np.ndarray:
-        """The panorama (width / 2, width, C) uint8 joined from both lenses."""
+        """The panorama (width / 2, width, C) uint8 joined from all lenses."""
         parts = []
         for top, rays in _bands(width):
-            ahead, joined = (
-                self._front_weights(rays),
-                np.zeros((*rays.shape[:2], channels), np.float32),
-            )
-            for lens, share in enumerate((ahead, 1 - ahead)):
+            joined = np.zeros((*rays.shape[:2], channels), np.float32)
+            for lens, share in enumerate(self._weights(rays)):
                 columns = np.flatnonzero((share > 0).any(axis=0))
                 moved = self._moved(lens, top, columns, len(rays), width)
                 part = look(lens, rays[:, columns] + moved).reshape(*moved.shape[:2], channels)
@@ -122,14 +119,20 @@ class Stitcher:
             parts.append(np.rint(joined).astype(np.uint8))
         return np.concatenate(parts)
 
-    def _front_weights(self, rays: np.ndarray) -> np.ndarray:
-        """Blending weight (h, w) float32 of the front lens in directions (h, w, 3)."""
-        axes, band = self._lenses.axes, self._lenses.band_rad
-        along = rays[..., 2] if axes is None else rays @ axes[0][:, 2]
+    def _weights(self, rays: np.ndarray) -> list[np.ndarray]:
+        """Blending weights (h, w) float32 of each lens in directions (h, w, 3), of sum 1."""
+        axes, band, looks = self._lenses.axes, self._lenses.band_rad, self._lenses.optical_axes
+        own = rays if axes is None else rays @ axes[0]
         if not band:
-            return (along >= 0).astype(np.float32)
-        angles = np.arcsin(np.clip(along, -1, 1))
-        return np.clip(0.5 + angles / (2 * band), 0, 1).astype(np.float32)
+            nearest = facing(own, looks)
+            return [(nearest == lens).astype(np.float32) for lens in range(len(looks))]
+        sides = []
+        for lens, look in enumerate(looks):  # how far a lens's side of its nearest seam reaches
+            apart = [look - other for k, other in enumerate(looks) if k != lens]
+            sines = np.min([own @ (way / np.linalg.norm(way)) for way in apart], axis=0)
+            sides.append(np.clip(0.5 + np.arcsin(np.clip(sines, -1, 1)) / (2 * band), 0, 1))
+        total = np.sum(sides, axis=0)  # 1 where two lenses meet
+        return [(side / total).astype(np.float32) for side in sides]
 
     def _moved(
         self, lens: int, top: int, columns: np.ndarray, num_rows: int, width: int

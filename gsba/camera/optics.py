@@ -24,7 +24,12 @@ class Optics:
 
     @classmethod
     def of(cls, lenses: Lenses, reconstruction: Reconstruction) -> "Optics":
-        """Lenses of the frames that a reconstruction was made from."""
+        """Lenses of the frames that a reconstruction was made from.
+
+        Of more than two lenses there are no faces of one lens each: they count as one centre.
+        """
+        if lenses.num_lenses > 2:
+            return ONE_EYE
         return cls(lenses, scenes_of(reconstruction))
 
     def views(self, size: int) -> tuple[View, ...]:

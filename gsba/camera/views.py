@@ -21,6 +21,7 @@ from gsba.camera.rig import RIG_R_FACE, CubeRig
 from gsba.camera.sphere import around_sphere, dense_enough, erp_from_bearings, low_passed
 from gsba.camera.straighten import PAD
 from gsba.geometry import pose
+from gsba.log import GsbaError
 from gsba.types import FACES, Fisheye, FrameSet, Reconstruction
 
 _FAR_DEPTH = 1e9  # map units: depth from which both lenses see alike
@@ -85,7 +86,16 @@ def rig_views(rig: CubeRig) -> tuple[View, ...]:
 
 
 def lens_views(lenses: Lenses, size: int) -> tuple[View, ...]:
-    """Ten views of two lenses, with pixels as large as those of cube faces of `size`."""
+    """Ten views of two lenses, with pixels as large as those of cube faces of `size`.
+
+    Raises:
+        GsbaError: there are more than two lenses.
+    """
+    if lenses.num_lenses != 2:
+        raise GsbaError(
+            f"the camera has {lenses.num_lenses} lenses, and faces of one lens each are cut for "
+            "two back to back: use --images cube, panorama or, of raw frames, fisheye"
+        )
     views = []
     for whole in cube_views(FACES, size):
         axis = whole.rig_R_view[:, 2]
@@ -260,7 +270,7 @@ class ViewCutter:
         self._views = views
         self._offsets = [_offsets(view, lenses, frame, scene) for view in views]
         self._turn = np.eye(3) if lenses.axes is None else lenses.axes[frame]
-        self._cut_by, self._front = lenses.reference_calibration, lenses.centre[2]
+        self._cut_by, self._centres = lenses.reference_calibration, lenses.centres
 
     def cut(self, erp: np.ndarray) -> list[np.ndarray]:
         """Images (height, width[, C]) uint8, bicubic, of a panorama (H, 2 H[, C]) uint8."""
@@ -277,11 +287,11 @@ class ViewCutter:
         return self._sampled(padded, cv2.INTER_CUBIC)
 
     def cut_raw(self, pictures: list[np.ndarray]) -> Iterator[np.ndarray]:
-        """Images like those of `cut_padded`, cut directly from both pictures (h, w[, C]) uint8 of a
-        raw pair."""
+        """Images like those of `cut_padded`, cut directly from all pictures (h, w[, C]) uint8 of
+        raw lenses."""
         assert self._cut_by is not None
         for view, offsets in zip(self._views, self._offsets, strict=True):
-            number = int(view.centre[2] * self._front < 0)
+            number = nearest_lens(view, self._centres)
             lens, picture = self._cut_by[number], pictures[number]
             share, scale = min(_MAX_OVERSAMPLING * view.focal / lens.focal, 1.0), np.ones(2)
             if share * _MAX_OVERSAMPLING < 1:
@@ -345,6 +355,11 @@ class ViewCutter:
             found = places(view.rays(pixels) @ self._turn.T + moved)
             maps[:, top : top + len(rows)] = np.moveaxis(found, -1, 0)
         return maps
+
+
+def nearest_lens(view: View, centres: np.ndarray) -> int:
+    """The lens in whose centre, of (L, 3), a view is."""
+    return int(np.argmin(np.linalg.norm(centres - view.centre, axis=1)))
 
 
 def _in_picture(lens: Fisheye, scale: np.ndarray, shown: np.ndarray) -> np.ndarray:

@@ -26,7 +26,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsba.camera.fisheye import project, rotation_of
+from gsba.camera.fisheye import Rig, facing, lens_names, optical_axes, project, rotation_of
 from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.camera.one_centre import seen_from_the_middle
 from gsba.camera.sphere import erp_from_bearings
@@ -34,7 +34,7 @@ from gsba.camera.views import View, scenes_of, seen_from_lenses, shown_in_pictur
 from gsba.export.images import face_size_for, has_masks, panorama_writer, view_writer
 from gsba.export.pictures import Files, FrameWriter
 from gsba.export.ply import write_splat_points
-from gsba.export.raw import LENSES, RawPictures, raw_lenses
+from gsba.export.raw import RawPictures, raw_lenses
 from gsba.geometry import inverse, pose, quaternion_from_rotation
 from gsba.log import GsbaError
 from gsba.types import Fisheye, FrameSet, Reconstruction
@@ -107,7 +107,8 @@ def write_colmap_raw(
     """Write the rig or the flat layout of raw fisheyes into `partial`, without images; returns
     their writer."""
     sensors = _raw_sensors(frames, lenses)
-    files = _files(partial, _FLAT if flat else _BY_VIEW, LENSES, masked=True)
+    of_lenses = lens_names(len(sensors))
+    files = _files(partial, _FLAT if flat else _BY_VIEW, of_lenses, masked=True)
     names, model = _names(files, frames), partial / "sparse" / "0"
     write_model(model, shown_in_pictures(reconstruction, lenses), sensors, names)
     if flat:
@@ -117,7 +118,7 @@ def write_colmap_raw(
             model / "points3D.ply", reconstruction.points_world, reconstruction.point_colors
         )
     else:
-        text = json.dumps(_rig_config(sensors, LENSES), indent=1) + "\n"
+        text = json.dumps(_rig_config(sensors, of_lenses), indent=1) + "\n"
         (partial / "rig_config.json").write_text(text)
     return RawPictures(files, link)
 
@@ -262,9 +263,13 @@ def _project(
 def _project_raw(
     sensors: Sequence[Sensor], bearings: np.ndarray, origins: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Sensor (O,) and pixel (O, 2) of each bearing (O, 3) in the two lenses of raw pairs."""
-    ahead = bearings[:, 2] if origins is None else origins @ sensors[0].rig_T_sensor[:3, 3]
-    which = (ahead < 0).astype(np.int64)
+    """Sensor (O,) and pixel (O, 2) of each bearing (O, 3) in the raw lenses."""
+    if origins is None:
+        which = facing(bearings, optical_axes(_fisheyes(sensors)))
+    else:
+        centres = np.array([sensor.rig_T_sensor[:3, 3] for sensor in sensors])
+        apart = np.linalg.norm(origins[:, None] - centres, axis=2)
+        which = np.argmin(apart, axis=1)
     pixels = np.empty((len(bearings), 2))
     for c, sensor in enumerate(sensors):
         assert sensor.fisheye is not None
@@ -273,18 +278,22 @@ def _project_raw(
 
 
 def _raw_sensors(frames: FrameSet, lenses: Lenses) -> list[Sensor]:
-    """Lenses of raw pairs, front and back, as cameras of the rig."""
+    """Raw lenses as cameras of the rig."""
     return [
         Sensor(
             "OPENCV_FISHEYE",
             lens.width,
             lens.height,
             (lens.focal, lens.focal, *lens.principal, *lens.radial),
-            pose(rotation_of(lens), sign * lenses.centre),
+            pose(rotation_of(lens), centre),
             lens,
         )
-        for lens, sign in zip(raw_lenses(frames), (1.0, -1.0), strict=True)
+        for lens, centre in zip(raw_lenses(frames), lenses.centres, strict=True)
     ]
+
+
+def _fisheyes(sensors: Sequence[Sensor]) -> Rig:
+    return tuple(sensor.fisheye for sensor in sensors if sensor.fisheye is not None)
 
 
 def _pinhole(view: View) -> Sensor:

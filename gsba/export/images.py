@@ -59,7 +59,7 @@ def face_size_for(frames: FrameSet, face_size: int | None) -> int:
 def of_one_lens(images: str, frames: FrameSet) -> bool:
     """True if the setting `images` (`export.images`) gives images of one lens each."""
     return images in ("lenses", "fisheye", "panorama") or (
-        images == "auto" and frames.fisheyes is not None
+        images == "auto" and frames.fisheyes is not None and len(frames.fisheyes) == 2
     )
 
 

@@ -24,14 +24,14 @@ from typing import Any
 
 import numpy as np
 
-from gsba.camera.fisheye import rotation_of
+from gsba.camera.fisheye import lens_names, rotation_of
 from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.camera.views import Scenes, View, scenes_of, seen_from_lenses, views_for
 from gsba.export import motion
 from gsba.export.images import face_size_for, has_masks, panorama_writer, view_writer
 from gsba.export.pictures import Files, FrameWriter
 from gsba.export.ply import write_splat_points
-from gsba.export.raw import LENSES, RawPictures, raw_lenses
+from gsba.export.raw import RawPictures, raw_lenses
 from gsba.geometry import pose
 from gsba.types import Fisheye, FrameSet, Reconstruction
 
@@ -101,9 +101,9 @@ def write_nerfstudio_raw(
 ) -> list[FrameWriter]:
     """Write cloud and transforms.json of raw fisheyes into `partial`, without images; returns
     their writers."""
-    pair = raw_lenses(frames)
+    rig = raw_lenses(frames)
     out_R_world = _write_cloud(partial, reconstruction, z_up)
-    files = _files(partial, LENSES, masked=True)
+    files = _files(partial, lens_names(len(rig)), masked=True)
     moving = lenses.readout_motion is not None and lenses.row_directions is not None
     velocities = motion.rig_velocities(reconstruction, frames, lenses, shutter)
     ways = lenses.rows_down() if moving else (1.0, 1.0)
@@ -111,8 +111,8 @@ def write_nerfstudio_raw(
     for f, world_T_rig in enumerate(reconstruction.world_T_rigs):
         rigs = lenses.swept(f) if moving else None
         images, masks = files.images(frames, f), files.masks(frames, f)
-        for number, (lens, sign) in enumerate(zip(pair, (1.0, -1.0), strict=True)):
-            rig_T_lens = pose(rotation_of(lens), sign * lenses.centre)
+        for number, (lens, centre) in enumerate(zip(rig, lenses.centres, strict=True)):
+            rig_T_lens = pose(rotation_of(lens), centre)
             entry = _entry(images[number], out_R_world, world_T_rig @ rig_T_lens)
             if rigs is not None:
                 for name, rig_T_rig in zip(("start", "end"), rigs[number], strict=True):

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsba.camera.fisheye import Pair, rotation_of, unproject
+from gsba.camera.fisheye import Rig, rotation_of, unproject
 from gsba.camera.sphere import erp_from_bearings
 from gsba.camera.tables import table
 from gsba.export.images import pass_on
@@ -14,16 +14,15 @@ from gsba.frames.files import goes_out_as_it_is
 from gsba.log import GsbaError
 from gsba.types import Fisheye, FrameSet
 
-LENSES = ("front", "back")
 _ROWS_AT_ONCE = 256  # image rows whose coordinates are held in double precision
 SEEN_DEG = 95.0  # largest angle from a lens's axis: image circles and calibrations end there
 
 
-def raw_lenses(frames: FrameSet) -> Pair:
-    """Lenses of raw pairs.
+def raw_lenses(frames: FrameSet) -> Rig:
+    """Lenses of raw frames.
 
     Raises:
-        GsbaError: the frames are no raw pairs.
+        GsbaError: the frames are not raw.
     """
     if frames.fisheyes is None:
         raise GsbaError("--images fisheye is for runs on raw fisheyes: these frames are stitched")
@@ -32,7 +31,7 @@ def raw_lenses(frames: FrameSet) -> Pair:
 
 @dataclass(frozen=True, slots=True)
 class RawPictures(FrameWriter):
-    """Copies both fisheye images of a frame, and writes masks of their image circles.
+    """Copies all fisheye images of a frame, and writes masks of their image circles.
 
     Images side by side in one file, and those that trainers misread, are encoded again.
     """

@@ -1,9 +1,13 @@
-"""Panoramas of raw pairs: the lens that faces a direction shows it; nothing is blended."""
+"""Panoramas of raw fisheyes: the lens that faces a direction shows it; nothing is blended."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
-from gsba.camera.fisheye import Pair, project
+from gsba.camera.fisheye import Rig, facing, optical_axes, project
+from gsba.camera.lens import seam_sines
 from gsba.camera.sphere import bearings_from_erp
 from gsba.camera.tables import table
 from gsba.frames.raw_pairs import decode_pair
@@ -13,13 +17,13 @@ _ROWS_AT_ONCE = 256  # rows whose coordinates are held in double precision at on
 SEAM = np.deg2rad(1.5)  # angle from the seam within which a window shows both lenses
 
 
-def width_of(pair: Pair) -> int:
+def width_of(rig: Rig) -> int:
     """Pixels across a panorama as dense as the middle of a fisheye."""
-    return 16 * round(2 * np.pi * max(lens.focal for lens in pair) / 16)
+    return 16 * round(2 * np.pi * max(lens.focal for lens in rig) / 16)
 
 
 def load_raw(frames: FrameSet, f: int, gray: bool = False) -> list[np.ndarray]:
-    """Pictures (h, w[, 3]) uint8 of both lenses of frame f, as stored on disk."""
+    """Pictures (h, w[, 3]) uint8 of all lenses of frame f, as stored on disk."""
     assert frames.fisheyes is not None
     lens = frames.fisheyes[0]
     return decode_pair(frames.paths[f], (lens.width, lens.height), gray)
@@ -32,38 +36,59 @@ def load_joined(frames: FrameSet, f: int, gray: bool, width: int) -> np.ndarray:
     return join_pictures(pictures, frames.fisheyes, width, width / frames.width)
 
 
-def join_pictures(pictures: list[np.ndarray], pair: Pair, width: int, share: float) -> np.ndarray:
-    """Panorama (width / 2, width[, 3]) uint8 joined from the front and the back lens's picture.
+def join_pictures(pictures: list[np.ndarray], rig: Rig, width: int, share: float) -> np.ndarray:
+    """Panorama (width / 2, width[, 3]) uint8 joined from each lens's picture.
 
     Args:
         pictures: (h, w[, 3]) uint8 of each lens.
-        pair: their lenses.
+        rig: their lenses.
         width: pixels across the panorama.
         share: its width over that of a panorama as dense as the pictures.
     """
-    halves, maps = [], _maps(pair, width)
-    for picture, places in zip(pictures, maps, strict=True):
+    joined = np.empty((width // 2, width, *pictures[0].shape[2:]), np.uint8)
+    for picture, part in zip(pictures, _parts(rig, width), strict=True):
+        places = part.places
         if share < 1:
             size = picture.shape[1::-1]
             picture = _shrunk(picture, share)
             scale = np.array(picture.shape[1::-1]) / size
             places = ((places + 0.5) * scale - 0.5).astype(np.float32)
-        halves.append(_picture_at(picture, places))
-    front, back = halves
-    right, left = np.split(back, [width - _first(width) - width // 2], axis=1)
-    return np.concatenate([left, front, right], axis=1)
+        shown = _picture_at(picture, places)
+        if part.own is None:
+            joined[:, part.columns] = shown
+        else:
+            joined[:, part.columns] = np.where(
+                part.own.reshape(*part.own.shape, *[1] * (shown.ndim - 2)),
+                shown,
+                joined[:, part.columns],
+            )
+    return joined
+
+
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """What one lens shows of a panorama."""
+
+    columns: np.ndarray  # (C,) int of the panorama
+    places: np.ndarray  # (H, C, 2) float32, OpenCV pixels in the lens's picture
+    own: np.ndarray | None  # (H, C) bool, True where this lens faces the direction; None = all
+
+
+def clear_of_seam(height: int, rig: Rig) -> np.ndarray:
+    """Mask (height, 2 height) bool, True where windows of raw fisheyes' panorama show one lens
+    only."""
+    axes = optical_axes(rig)
+    return _clear_of_seam(height, tuple(map(tuple, axes.tolist())))
 
 
 @table(maxsize=2)
-def clear_of_seam(height: int) -> np.ndarray:
-    """Mask (height, 2 height) bool, True where windows of a raw pair's panorama show one lens
-    only."""
-    clear = np.empty((height, 2 * height), bool)
+def _clear_of_seam(height: int, axes: tuple[tuple[float, ...], ...]) -> np.ndarray:
+    clear, of_lenses = np.empty((height, 2 * height), bool), np.array(axes)
     for top in range(0, height, _ROWS_AT_ONCE):
         rows = np.arange(top, min(top + _ROWS_AT_ONCE, height)) + 0.5
         pixels = np.stack(np.meshgrid(np.arange(2 * height) + 0.5, rows), axis=-1)
-        ahead = bearings_from_erp(pixels, 2 * height, height)[..., 2]
-        clear[top : top + len(rows)] = np.abs(ahead) > np.sin(SEAM)
+        bearings = bearings_from_erp(pixels, 2 * height, height)
+        clear[top : top + len(rows)] = seam_sines(bearings, of_lenses) > np.sin(SEAM)
     clear.setflags(write=False)
     return clear
 
@@ -73,28 +98,32 @@ def _picture_at(picture: np.ndarray, places: np.ndarray) -> np.ndarray:
     return cv2.remap(picture, places, nothing, how, borderMode=cv2.BORDER_REPLICATE)
 
 
-def _first(width: int) -> int:
-    """The first column that the front lens faces."""
-    return (width + 1) // 4
-
-
 def _shrunk(picture: np.ndarray, share: float) -> np.ndarray:
     height, width = (max(round(share * size), 1) for size in picture.shape[:2])
     return cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
 
 
 @table(maxsize=2)
-def _maps(pair: Pair, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """OpenCV pixels (H, W / 2, 2) float32 in the front and the back picture of half a panorama
-    each; columns of the back half begin at the right edge of the front half."""
-    height, maps = width // 2, []
-    for lens, first in zip(pair, (_first(width), _first(width) + width // 2), strict=True):
-        columns = (first + np.arange(width // 2) + 0.5) % width
-        places = np.empty((height, width // 2, 2), np.float32)
-        for top in range(0, height, _ROWS_AT_ONCE):
-            rows = np.arange(top, min(top + _ROWS_AT_ONCE, height)) + 0.5
-            pixels = np.stack(np.meshgrid(columns, rows), axis=-1)
-            found = project(lens, bearings_from_erp(pixels, width, height))
-            places[top : top + len(rows)] = found - 0.5
-        maps.append(places)
-    return maps[0], maps[1]
+def _parts(rig: Rig, width: int) -> tuple[_Part, ...]:
+    """What each lens shows of a panorama."""
+    height, axes, faced = width // 2, optical_axes(rig), np.empty((width // 2, width), np.uint8)
+    for top, bearings in _bearings(np.arange(width), width):
+        faced[top : top + len(bearings)] = facing(bearings, axes)
+    parts = []
+    for number, lens in enumerate(rig):
+        own = faced == number
+        columns = np.flatnonzero(own.any(axis=0))
+        places = np.empty((height, len(columns), 2), np.float32)
+        for top, bearings in _bearings(columns, width):
+            places[top : top + len(bearings)] = project(lens, bearings) - 0.5
+        own = own[:, columns]
+        parts.append(_Part(columns, places, None if own.all() else own))
+    return tuple(parts)
+
+
+def _bearings(columns: np.ndarray, width: int) -> Iterator[tuple[int, np.ndarray]]:
+    """First row and directions (h, C, 3) of parts of some columns of a panorama."""
+    for top in range(0, width // 2, _ROWS_AT_ONCE):
+        rows = np.arange(top, min(top + _ROWS_AT_ONCE, width // 2)) + 0.5
+        pixels = np.stack(np.meshgrid(columns + 0.5, rows), axis=-1)
+        yield top, bearings_from_erp(pixels, width, width // 2)

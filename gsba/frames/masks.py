@@ -66,11 +66,11 @@ def load_mask(frames: FrameSet, f: int) -> np.ndarray | None:
 
 
 def load_usable(frames: FrameSet, f: int) -> np.ndarray | None:
-    """Mask like that of `load_mask`, without the seam between the lenses of raw pairs."""
+    """Mask like that of `load_mask`, without the seams between raw lenses."""
     mask = load_mask(frames, f)
     if frames.fisheyes is None:
         return mask
-    clear = clear_of_seam(frames.height)
+    clear = clear_of_seam(frames.height, frames.fisheyes)
     return clear if mask is None else mask & clear
 
 

@@ -1,4 +1,4 @@
-"""Raw dual fisheyes on disk: pairs of pictures, and the initial calibration of their lenses."""
+"""Raw fisheyes on disk: a picture of each lens, and the initial calibration of the lenses."""
 
 import logging
 import re
@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gsba.camera.calibration import read_calibration, scaled_to_size
-from gsba.camera.fisheye import Pair
+from gsba.camera.fisheye import Pair, Rig
 from gsba.frames.files import decode, image_size, is_image
 from gsba.frames.image_circles import CircleSearch, ImageCircle, find_circle
 from gsba.frames.lens_names import FUSION_NAMES, LENS_NAMES, LensNames
@@ -30,20 +30,25 @@ _QUARTER_TURNS = [
 _MAX_FOCAL_CHANGE = 0.025  # relative change of focal lengths from which pictures contradict a
 # calibration; parallax of near things looks like one or two percent
 
-Found = dict[str, tuple[Path, Path]]  # frame -> picture of the front lens, of the back lens
+Found = dict[str, tuple[Path, ...]]  # frame -> picture of each lens, the front one first
+_NUMBERED = re.compile(r"lens(\d+)", re.IGNORECASE)  # folders of more than two lenses
 
 
 _FOLDERS = (("front", "back"), ""), (("lens0", "lens1"), ""), (("fr", "bk"), "GoPro Fusion")
 
 
 def find_pairs(folder: Path) -> Found | None:
-    """Pictures of raw pairs in a folder, one file for each lens; None = it holds something else.
+    """Pictures of raw lenses in a folder, one file for each lens; None = it holds something else.
 
     Raises:
         GsbaError: a picture of one lens has no counterpart.
     """
     entries = sorted(folder.iterdir())
     images = [path for path in entries if is_image(path) and path.is_file()]
+    numbered = {int(m[1]): path for path in entries if (m := _NUMBERED.fullmatch(path.name))}
+    numbered = {lens: path for lens, path in numbered.items() if _images_in(path)}
+    if len(numbered) > 2 and not images:
+        return _of_numbered(folder, numbered)
     known = {*FACES, *(name for names, _ in _FOLDERS for name in names)}
     by_name = {path.name.lower(): path for path in entries if path.name.lower() in known}
     holding = {name: found for name, path in by_name.items() if (found := _images_in(path))}
@@ -74,6 +79,24 @@ def find_pairs(folder: Path) -> Found | None:
         if found is not None:
             return found
     return None
+
+
+def _of_numbered(folder: Path, numbered: Mapping[int, Path]) -> Found:
+    """Pictures of three lenses or more, in folders lens0, lens1, ...
+
+    Raises:
+        GsbaError: a lens or a picture is missing.
+    """
+    if sorted(numbered) != list(range(len(numbered))):
+        held = ", ".join(f"{numbered[lens].name}/" for lens in sorted(numbered))
+        raise GsbaError(
+            f"{folder}: holds pictures in {held}: lenses are numbered from lens0 on without a gap"
+        )
+    found = [_by_frame(folder, _images_in(numbered[lens])) for lens in sorted(numbered)]
+    for lens, other in enumerate(found[1:], 1):
+        kinds = f"{numbered[0].name}/", f"{numbered[lens].name}/"
+        _paired(folder, (found[0], other), kinds)
+    return {name: tuple(of_lens[name] for of_lens in found) for name in found[0]}
 
 
 def _tagged_pairs(folder: Path, images: Sequence[Path], tags: LensNames) -> Found | None:
@@ -107,7 +130,7 @@ def _tagged_pairs(folder: Path, images: Sequence[Path], tags: LensNames) -> Foun
 def decode_pair(
     paths: Sequence[Path], size: tuple[int, int], gray: bool = False
 ) -> list[np.ndarray]:
-    """Pictures (h, w[, 3]) uint8 of the front and of the back lens.
+    """Pictures (h, w[, 3]) uint8 of each lens.
 
     Args:
         paths: of each lens, or twice that of a file with both side by side, perhaps squeezed.
@@ -129,8 +152,8 @@ def lenses_of(
     size: tuple[int, int],
     calibration: Path | None,
     circles: Sequence[ImageCircle] = (),
-) -> tuple[Pair, bool]:
-    """Initial lenses of raw pairs: from a calibration, or from the image circles.
+) -> tuple[Rig, bool]:
+    """Initial lenses of raw frames: from a calibration, or of a pair from the image circles.
 
     Args:
         folder: folder of the pictures.
@@ -144,13 +167,26 @@ def lenses_of(
         pictures contradict.
 
     Raises:
-        GsbaError: a calibration of other pictures, circles outside of the pictures, or pictures
-            without a visible circle.
+        GsbaError: a calibration of other pictures or of another number of lenses, circles outside
+            of the pictures, or pictures without a visible circle.
     """
     rows = np.unique(np.linspace(0, len(pairs) - 1, _NUM_CIRCLE_FRAMES).astype(int))
+    num = len(pairs[0])
+    if calibration is None and num > 2:
+        raise GsbaError(
+            f"{folder}: holds pictures of {num} lenses, and nothing says how these lie: give "
+            f"--calibration FILE with lenses.lens0 to lenses.lens{num - 1}"
+        )
     if calibration is not None:
         known = scaled_to_size(read_calibration(calibration), size, calibration)
-        return _checked_calibration(folder, known, [pairs[f] for f in rows], size, calibration)
+        if len(known) != num:
+            raise GsbaError(
+                f"{calibration}: calibrates {len(known)} lenses, but {folder} has pictures of {num}"
+            )
+        if len(known) > 2:
+            return known, False
+        some = [pairs[f] for f in rows]
+        return _checked_calibration(folder, (known[0], known[-1]), some, size, calibration)
     looks = [decode_pair(pairs[f], size, gray=True) for f in rows]
     front_circle, back_circle = _given_circles(circles, size) or _found_circles(
         folder, pairs[0], looks

@@ -12,7 +12,7 @@ import numpy as np
 
 from gsba.camera.calibration import read_calibration
 from gsba.camera.factory_lenses import FactoryLenses
-from gsba.camera.fisheye import Pair
+from gsba.camera.fisheye import Rig
 from gsba.frames.dual_fisheye import width_of
 from gsba.frames.factory_start import FACTORY_FILE, find_factory_lenses, starting_lenses
 from gsba.frames.files import image_header, image_size, is_image
@@ -190,7 +190,7 @@ def _lenses(
     calibration: Path | None,
     circles: Sequence[ImageCircle],
     factory: FactoryLenses | None,
-) -> tuple[Pair | None, bool]:
+) -> tuple[Rig | None, bool]:
     """Initial lenses of raw fisheyes, None = other layouts; and True if they are to be
     estimated."""
     if layout == "fisheye" and factory is not None and not circles:

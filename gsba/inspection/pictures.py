@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gsba.camera.fisheye import lens_names
 from gsba.frames.exif import ExifTags, read_exif
 from gsba.frames.files import image_size
 from gsba.frames.scan import scan
@@ -13,7 +14,7 @@ from gsba.types import FrameSet
 
 _LAYOUTS = {
     "erp": "stitched panoramas",
-    "fisheye": "raw, two fisheyes a frame",
+    "fisheye": "raw, a fisheye of each lens",
     "cube": "faces of a cube",
     "eac": "equi-angular cube map, two images a frame",
 }
@@ -49,7 +50,10 @@ def _about(frames: FrameSet) -> Facts:
         facts.append(("frames", f"{count}, one every {step:.3g} s, {spoken_seconds(span)}"))
     else:
         facts.append(("frames", f"{count}, in the order of their names: they have no times"))
-    for name, lens in zip(("front lens", "back lens"), frames.fisheyes or (), strict=False):
+    lenses = frames.fisheyes or ()
+    titles = {"front": "front lens", "back": "back lens"}
+    names = [titles.get(name, name) for name in lens_names(len(lenses))]
+    for name, lens in zip(names, lenses, strict=True):
         x, y = lens.principal
         at = f"focal length {lens.focal:.1f} px, principal point ({x:.1f}, {y:.1f})"
         facts.append((name, f"{at} in {lens.width}x{lens.height}"))

@@ -11,7 +11,7 @@ import numpy as np
 
 from gsba.camera.equiangular import squares
 from gsba.camera.factory_lenses import parse_factory_lenses
-from gsba.camera.fisheye import Pair
+from gsba.camera.fisheye import Rig
 from gsba.disk import write_image
 from gsba.frames.dual_fisheye import clear_of_seam, join_pictures, width_of
 from gsba.frames.factory_start import starting_lenses
@@ -74,9 +74,10 @@ def of_frames(frames: FrameSet, source: Path, width: int) -> SmallPanoramas:
             picture = load_erp(frames, row, not colour, width)
             yield row, cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
 
-    raw = frames.fisheyes is not None
     found = SmallPanoramas(source, frames.timestamps, width, read)
-    usable = clear_of_seam(width // 2).copy() if raw else np.ones(size[::-1], bool)
+    usable = np.ones(size[::-1], bool)
+    if frames.fisheyes is not None:
+        usable &= clear_of_seam(width // 2, frames.fisheyes)
     masked = any(path is not None for path in frames.mask_paths)
     looks = np.unique(np.linspace(0, len(frames) - 1, _CARRIER_LOOKS).astype(int))
     for row in looks.tolist() if masked else ():
@@ -122,7 +123,7 @@ def of_video(
     size = (width, width // 2)
     pair = _lenses(recording, rows, calibration) if recording.lenses else None
     share = 1.0 if pair is None else width / width_of(pair)
-    usable = None if pair is None else clear_of_seam(width // 2)
+    usable = None if pair is None else clear_of_seam(width // 2, pair)
 
     def read(chosen: Sequence[int], colour: bool) -> Iterator[tuple[int, np.ndarray]]:
         number = {int(rows[row]): int(row) for row in chosen}
@@ -180,7 +181,7 @@ def _pixels(picture: Picture, colour: bool) -> np.ndarray:
     return np.ascontiguousarray(picture.bgr()[..., ::-1]) if colour else picture.luma()
 
 
-def _lenses(recording: Recording, rows: np.ndarray, calibration: Path | None) -> Pair:
+def _lenses(recording: Recording, rows: np.ndarray, calibration: Path | None) -> Rig:
     """Initial lenses of a raw recording, from a few of its frames."""
     looks = np.unique(np.linspace(0, len(rows) - 1, _LOOKS).astype(int))
     size = (recording.width, recording.width)

@@ -27,7 +27,7 @@ from gsba.bundle.lens_centres import LensCentres, StitchRadius
 from gsba.bundle.readout import CameraEstimate
 from gsba.bundle.reconstruction import world_scale
 from gsba.bundle.self_calibration import SelfCalibration
-from gsba.camera.fisheye import Pair, turned
+from gsba.camera.fisheye import Rig, turned
 from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.frames.dual_fisheye import SEAM
 from gsba.pipeline import backend, frontend
@@ -67,8 +67,9 @@ def find_camera(state: State, prefix: str = "") -> State:
 def _find_two_lenses(state: State, prefix: str) -> State:
     """Lenses on trial, judged by what is matched with them; then the radius of stitching."""
     settings, shown = state.run.settings, state.observed.shown
-    trial, guess = state.through(Lenses()), None
-    if not state.run.frames.lens_axes_known:
+    yaws, guess = settings.camera.lens_yaws_deg, None
+    trial = state.through(Lenses() if yaws is None else Lenses.ring(np.deg2rad(yaws)))
+    if not _axes_known(state.run):
         guess = _from_features(trial, f"{prefix}axes", _guessed_axes, LensAxes)
         trial = trial.through(guess.lenses)
     band, gates = float(np.deg2rad(settings.camera.seam_deg)), settings.rounds.loops
@@ -91,9 +92,11 @@ def _find_two_lenses(state: State, prefix: str) -> State:
 
 
 def _find_raw_camera(state: State) -> State:
-    """The lenses of raw pairs: where they are, then their calibration."""
+    """Raw lenses: where they are, then their calibration."""
     run, shown, gates = state.run, state.observed.shown, state.run.settings.rounds.loops
-    trial = state.through(Lenses(band_rad=float(SEAM), reference_calibration=run.frames.fisheyes))
+    fisheyes = run.frames.fisheyes
+    assert fisheyes is not None
+    trial = state.through(Lenses.of_raw(fisheyes, float(SEAM)))
     for n in range(2):
         found = _from_features(trial, f"lenses{n}", _centres, LensCentres, noted=True)
         trial = backend.adjust(trial.through(found.lenses), f"lensed{n}", gates)
@@ -168,7 +171,7 @@ def take_parts_from_patches(state: State, sighted: Sighted, name: str, number: i
         known = _from_patches(state, sighted, found, _calibration, SelfCalibration, noted=True)
         state = replace(state, map=replace(state.map, calibrated=known))
         state = state.with_camera(replace(state.map.camera(), lenses=known.lenses))
-    if number == 1 and not state.run.frames.lens_axes_known and state.map.lenses.axes is None:
+    if number == 1 and not _axes_known(state.run) and state.map.lenses.axes is None:
         axes = _from_patches(state, sighted, f"axes_{name}", _loose_axes, LensAxes, noted=True)
         state = replace(state, map=replace(state.map, axes=axes))
         state = state.with_camera(replace(state.map.camera(), lenses=axes.lenses))
@@ -235,7 +238,7 @@ def keep_lenses(state: State, result: Reconstruction) -> Lenses:
     return state.run.stage("lenses", [], lambda: lenses, Lenses, noted=False)
 
 
-def better_calibration(coarse: CoarsePoses, map_: Map) -> tuple[Pair, bool] | None:
+def better_calibration(coarse: CoarsePoses, map_: Map) -> tuple[Rig, bool] | None:
     """The calibration to cut raw frames by in the next pass, in the trajectory's axes.
 
     Returns:
@@ -378,10 +381,17 @@ def _from_patches(
     return run.stage(name, _settings_of_camera(run), compute, returns, noted=noted)
 
 
+def _axes_known(run: Run) -> bool:
+    """True if no stabiliser has rotated panoramas against the lenses, or settings give the axes."""
+    return run.frames.lens_axes_known or run.settings.camera.lens_yaws_deg is not None
+
+
 def _settings_of_camera(run: Run) -> list[object]:
     """Settings that estimates of the camera rest on."""
     camera = run.settings.camera
-    given = camera.model_dump(exclude={"name", "baseline_mm", "readout_ms"})
+    left_out = {"name", "baseline_mm", "readout_ms"}
+    left_out |= {"lens_yaws_deg"} if camera.lens_yaws_deg is None else set()
+    given = camera.model_dump(exclude=left_out)
     return [
         run.solving_key(),
         given,

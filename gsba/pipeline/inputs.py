@@ -99,11 +99,11 @@ def coarse_poses(
 
 
 def with_baseline(settings: RefineSettings, calibration: Path | None) -> RefineSettings:
-    """Settings with the distance between the lenses that a calibration says, unless they say it."""
+    """Settings with the distance between the first two lenses by a calibration, unless given."""
     if calibration is None:
         return settings
-    front, back = (np.array(lens.centre) for lens in read_calibration(calibration))
-    millimetres = 1e3 * float(np.linalg.norm(front - back))
+    front, other = (np.array(lens.centre) for lens in read_calibration(calibration)[:2])
+    millimetres = 1e3 * float(np.linalg.norm(front - other))
     if settings.camera.baseline() is not None or not millimetres:
         return settings
     if not 2 <= millimetres <= 200:

@@ -8,7 +8,7 @@ from gsba.bundle.gps_factors import GpsFixes
 from gsba.bundle.gyro_turns import GyroTurns
 from gsba.bundle.reconstruction import world_scale
 from gsba.camera.calibration import calibration_json
-from gsba.camera.fisheye import Pair
+from gsba.camera.fisheye import Rig
 from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.config import RefineSettings
 from gsba.config_file import to_toml
@@ -132,7 +132,7 @@ def _reasons(prior: Prior) -> tuple[str, ...]:
 
 
 def _calibration(
-    pair: Pair, world: Map, result: Reconstruction, lenses: Lenses, settings: RefineSettings
+    rig: Rig, world: Map, result: Reconstruction, lenses: Lenses, settings: RefineSettings
 ) -> dict[str, Any]:
     """The content of calibration.json: raw lenses as found, for another run."""
     baseline, metres = settings.camera.baseline(), None
@@ -141,7 +141,7 @@ def _calibration(
     read = world.camera()
     more = {"readout_s": read.readout_s} if read.lenses.readout_motion is not None else {}
     centre = lenses.centre * (1.0 if metres is None else metres)
-    return calibration_json(pair, centre, "map" if metres is None else "m", more)
+    return calibration_json(rig, centre, "map" if metres is None else "m", more)
 
 
 def _report(state: State, result: Reconstruction) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from threadpoolctl import threadpool_limits
 
 from gsba import video
 from gsba.bundle.families import Family
-from gsba.camera.fisheye import Pair
+from gsba.camera.fisheye import Rig
 from gsba.config import RefineSettings
 from gsba.frames.scan import scan
 from gsba.masks import merging
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-_Cut = tuple[Pair, bool]  # calibration to cut raw frames by, and whether it was estimated
+_Cut = tuple[Rig, bool]  # calibration to cut raw frames by, and whether it was estimated
 _MAX_PASSES = 3  # over raw pairs, from the pictures
 
 __all__ = ["RunResult", "refine", "solve"]

@@ -8,8 +8,9 @@ from gsba.bundle.camera_system import CameraCovariances
 from gsba.bundle.lens_axes import LensAxes
 from gsba.bundle.lens_centres import LensCentres, StitchRadius, baseline_of
 from gsba.bundle.readout import CameraEstimate
-from gsba.bundle.self_calibration import FREE, OF_FRONT, SelfCalibration, undetermined
-from gsba.camera.lens import Lenses
+from gsba.bundle.self_calibration import SelfCalibration, first_of, num_parameters, undetermined
+from gsba.camera.fisheye import lens_names
+from gsba.camera.lens import Lenses, all_centres
 from gsba.config import CameraSettings
 from gsba.placement.placement import metres_per_unit
 
@@ -44,18 +45,21 @@ def of_camera(
     content = {
         "taken": bool(centres.lenses),
         "reason": centres.reason,
-        "front_lens": scale * centres.found,
-        "front_lens_sigmas": scale * np.sqrt(np.diagonal(centres.covariance)),
+        "front_lens": scale * centres.found[:3],
+        "front_lens_sigmas": scale * np.sqrt(np.diagonal(centres.covariance))[:3],
         "baseline": length,
         "baseline_sigma": sigma,
         "gain_of_unseen_parts": centres.part_gains,
     }
-    notes, baseline = [], settings.baseline()
+    notes, baseline, many = [], settings.baseline(), centres.lenses.num_lenses
+    if many > 2:
+        content["lens_centres"] = scale * all_centres(centres.found)
     if not centres.lenses:
         if baseline is not None:
             notes.append(f"two lenses were not found: no scale by the baseline: {centres.reason}")
         return content, notes
-    notes.append(f"the two lenses are {length:.5g} map units apart (sigma {sigma:.1g})")
+    which = "the two lenses" if many == 2 else f"of {many} lenses the first two"
+    notes.append(f"{which} are {length:.5g} map units apart (sigma {sigma:.1g})")
     if baseline is not None:
         metres, of_metres = metres_per_unit((length, sigma), baseline)
         content |= {"metres_per_unit": metres, "metres_per_unit_sigma": of_metres}
@@ -80,7 +84,7 @@ def of_camera(
 def of_lenses(
     lenses: Lenses, voted: SelfCalibration | None, known: CameraCovariances | None
 ) -> tuple[dict[str, Any], list[str]]:
-    """Self-calibrated lenses of raw fisheye pairs.
+    """Self-calibrated lenses of raw fisheyes.
 
     Args:
         lenses: lenses of the map.
@@ -93,12 +97,14 @@ def of_lenses(
     if lenses.fisheyes is None:
         reason = "" if voted is None else voted.reason
         return {"taken": False, "reason": reason}, []
-    sigmas = np.full(FREE, np.nan)
+    num = len(lenses.fisheyes)
+    sigmas = np.full(num_parameters(num), np.nan)
     if known is not None and known.lens_sigmas is not None:
         sigmas = known.lens_sigmas
     content, notes = dict[str, Any](taken=True, reason=""), []
-    of_lens = sigmas[:OF_FRONT], sigmas[OF_FRONT:]
-    for name, lens, own in zip(("front", "back"), lenses.fisheyes, of_lens, strict=True):
+    names = lens_names(num)
+    of_lens = np.split(sigmas, [first_of(lens) for lens in range(1, num)])
+    for name, lens, own in zip(names, lenses.fisheyes, of_lens, strict=True):
         content[name] = {
             "focal": lens.focal,
             "focal_sigma": lens.focal * own[0],
@@ -107,7 +113,8 @@ def of_lenses(
             "radial": lens.radial,
             "radial_sigmas": own[3:7],
         }
-    content["back"]["turn_sigmas_deg"] = np.rad2deg(of_lens[1][7:])
+    for name, own in zip(names[1:], of_lens[1:], strict=True):
+        content[name]["turn_sigmas_deg"] = np.rad2deg(own[7:])
     loose = undetermined(sigmas)
     content["hardly_determined"] = loose
     if loose:
@@ -115,11 +122,11 @@ def of_lenses(
             f"these frames hardly determine some lens parameters: {', '.join(loose)} (they stay "
             "near their initial values)"
         )
-    front, back = (content[name] for name in ("front", "back"))
+    focals = " and ".join(f"{content[name]['focal']:.2f}" for name in names)
+    spreads = " and ".join(f"{content[name]['focal_sigma']:.1g}" for name in names)
     notes.append(
-        f"the lenses were self-calibrated: focal lengths {front['focal']:.2f} and "
-        f"{back['focal']:.2f} pixels (sigmas {front['focal_sigma']:.1g} and "
-        f"{back['focal_sigma']:.1g}); for other runs of this camera use calibration.json"
+        f"the lenses were self-calibrated: focal lengths {focals} pixels (sigmas {spreads}); for "
+        "other runs of this camera use calibration.json"
     )
     return content, notes
 

@@ -10,9 +10,11 @@ from factors import BearingTerm, FaceCameras, LandmarkBlock, RobustLoss
 from factors.splat import RenderedView, SplatBlock
 from gsba.bundle import prior_factors
 from gsba.bundle.optimizer import optimize
+from gsba.camera.fisheye import facing
+from gsba.camera.lens import seam_sines
 from gsba.camera.optics import ONE_EYE, Optics
 from gsba.camera.rig import CubeRig
-from gsba.camera.views import View, rig_views, turned_rigs
+from gsba.camera.views import View, nearest_lens, rig_views, turned_rigs
 from gsba.config import SolverSettings
 from gsba.frames import cubemap
 from gsba.frames.masks import load_weights
@@ -139,8 +141,10 @@ def _capture_of_lenses(frames: FrameSet, which: np.ndarray, size: int, optics: O
     square = {"width": wide.size, "height": wide.size, "principal": (wide.principal,) * 2}
     views = tuple(replace(view, **square) for view in rendered)
     pixels = np.stack(np.meshgrid(*2 * (np.arange(wide.size) + 0.5,)), axis=-1)
-    heights = [np.sign(v.centre @ lenses.centre) * v.rays(pixels)[..., 2] for v in views]
-    clear = np.stack(heights) > np.sin(lenses.band_rad)
+    rays, axes = np.stack([view.rays(pixels) for view in views]), lenses.optical_axes
+    of_view = np.array([nearest_lens(view, lenses.centres) for view in views])
+    clear = facing(rays, axes) == of_view[:, None, None]
+    clear &= seam_sines(rays, axes) > np.sin(lenses.band_rad)
     images, weights = [], []
     for f in track(which, "cutting faces", total=len(which)):
         faces, masks = cut_lens_faces(frames, int(f), views, optics)

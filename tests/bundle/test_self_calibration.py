@@ -8,7 +8,7 @@ from factors.bearing import bearing_residuals
 from gsba.bundle import self_calibration
 from gsba.bundle.camera_system import CameraSystem
 from gsba.bundle.readout import CameraEstimate
-from gsba.bundle.self_calibration import FREE, SelfCalibration
+from gsba.bundle.self_calibration import SelfCalibration, num_parameters
 from gsba.camera.fisheye import Pair, changed, recalibrated
 from gsba.camera.lens import Lenses
 from gsba.types import Fisheye, Solution
@@ -99,7 +99,7 @@ def test_the_graph_settles_lenses_beside_poses_and_says_how_well() -> None:
 
 
 def _step_to(pair: Pair, share: float) -> np.ndarray:
-    """Part of the way (FREE,) from what panoramas are cut by."""
+    """Part of the way (K,) from what panoramas are cut by."""
     return share * self_calibration.from_calibrated(
         Lenses(reference_calibration=CUT, fisheyes=pair)
     )
@@ -119,8 +119,8 @@ def test_residuals_change_with_lenses_as_their_jacobian_says() -> None:
         return bearing_residuals(np.tile(np.eye(4), (40, 1, 1)), points, *rays)[0]
 
     found = self_calibration.by_lenses(bearings, shown, lenses)
-    for k in range(FREE):
-        step = np.zeros(FREE)
+    for k in range(num_parameters(2)):
+        step = np.zeros(num_parameters(2))
         step[k] = 1e-6
         slope = (residuals(step) - residuals(-step)) / 2e-6
         np.testing.assert_allclose(found[:, :, k], slope, atol=1e-5 * np.abs(slope).max())

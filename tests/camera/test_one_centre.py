@@ -57,8 +57,8 @@ def _stitched(lenses: Lenses) -> np.ndarray:
     along = lenses.own(shown, nowhere)[:, 2]
     ahead = np.clip(0.5 + np.arcsin(along) / (2 * lenses.band_rad), 0, 1)[:, None]
     image = 0.0
-    for sign, share in ((1, ahead), (-1, 1 - ahead)):
-        starts = lenses.origins(shown, nowhere, np.full(len(shown), sign))
+    for lens, share in ((0, ahead), (1, 1 - ahead)):
+        starts = lenses.origins(shown, nowhere, np.full(len(shown), lens))
         image = image + share * _seen(starts, unit(shown - lenses.inverse_stitch_radius * starts))
     return np.rint(image).astype(np.uint8).reshape(WIDTH // 2, WIDTH, 3)
 

@@ -74,9 +74,9 @@ def _raw_frames(folder: Path) -> FrameSet:
     names, paths = tuple(f"frame_{f:04d}" for f in range(NUM_FRAMES)), []
     for f, name in enumerate(names):
         of_frame = []
-        for number, (lens, sign) in enumerate(zip(PAIR, (1.0, -1.0), strict=True)):
-            frames, signs = np.full(len(POINTS), f), np.full(len(POINTS), sign)
-            seen = RAW.seeing(_local()[f], frames, signs)
+        for number, lens in enumerate(PAIR):
+            frames, of_lens = np.full(len(POINTS), f), np.full(len(POINTS), number)
+            seen = RAW.seeing(_local()[f], frames, of_lens)
             seen /= np.linalg.norm(seen, axis=1, keepdims=True)
             pixels = np.stack(np.meshgrid(np.arange(240) + 0.5, np.arange(240) + 0.5), axis=-1)
             path = folder / ("front", "back")[number] / f"{name}.png"
@@ -206,8 +206,8 @@ def test_rows_of_raw_fisheyes_have_their_poses(tmp_path: Path) -> None:
             model="OPENCV_FISHEYE", width=240, height=240, params=[entry[key] for key in lengths]
         )
         image, mask = (_image(tmp_path / "out" / entry[key]) for key in ("file_path", "mask_path"))
-        signs = np.full(len(POINTS), 1.0 - 2 * number)
-        shown = RAW.seeing(_local()[f], np.full(len(POINTS), f), signs)
+        of_lens = np.full(len(POINTS), number)
+        shown = RAW.seeing(_local()[f], np.full(len(POINTS), f), of_lens)
         ahead = shown @ Rotation.from_rotvec(lens.rotation).as_matrix()[:, 2]
         facing = np.flatnonzero(ahead > 0.1 * np.linalg.norm(shown, axis=1))
         expected = project(lens, shown[facing])

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from factors import RobustLoss, tangent_basis
 from factors.camera_block import CameraBlock, sightings_of
-from factors.camera_rows import CameraVariables, vector
+from factors.camera_rows import CameraVariables, lens_sizes, vector
 from gsba.bundle.optimizer import optimize
 from gsba.config import SolverSettings
 
@@ -22,22 +22,35 @@ FISHEYES = np.array(
          *Rotation.from_rotvec([0.02, np.pi - 0.03, 0.01]).as_matrix().ravel()],
     ]
 )  # fmt: skip
-LENSES = F(0), K(0), F(1), K(1), B(0)
-KINDS = ["centre", "radius", "said radius", "readout", "turns", "all", "raw"]
+THREE = np.array(
+    [
+        [300.0 + lens, 480, 470, 0.02, -0.01, 0.003, -0.001,
+         *Rotation.from_rotvec([0.01 * lens, 2 * lens * np.pi / 3, 0.02]).as_matrix().ravel()]
+        for lens in range(3)
+    ]
+)  # fmt: skip
+AXES_OF_THREE = THREE[:, [9, 12, 15]]
+KINDS = [
+    "centre", "radius", "said radius", "readout", "turns", "all", "raw", "three lenses",
+    "three lenses, said radius", "three raw lenses",
+]  # fmt: skip
 
 
 def _variables(kind: str) -> tuple[CameraVariables, gtsam.Values]:
     """Variables of a camera, and values at which it is far from plain."""
     rng, values = np.random.default_rng(1), gtsam.Values()
     frames = range(FRAMES)
-    given: dict = {"poses": [X(f) for f in frames], "centre": C(0)}
+    many = 3 if kind.startswith("three") else 2
+    given: dict = {"poses": [X(f) for f in frames], "centres": [C(n) for n in range(many - 1)]}
     values.insert(C(0), np.array([0.01, -0.02, 0.08]))
-    if kind in ("radius", "all"):
+    if many == 3:
+        values.insert(C(1), np.array([0.07, 0.01, -0.04]))
+    if kind in ("radius", "all", "three lenses"):
         given["radius"] = N(0)
         values.insert(N(0), np.array([0.4]))
-    if kind == "said radius":
+    if "said radius" in kind:
         given["front_by_radius"] = 0.03
-    if kind in ("readout", "all", "raw"):
+    if kind in ("readout", "all", "raw", "three raw lenses"):
         velocities = rng.normal(size=(FRAMES, 6)) * np.repeat([0.3, 1.0], 3)
         given |= {"readout": D(0), "motions": [W(f) for f in frames], "velocities": velocities}
         values.insert(D(0), np.array([0.05]))
@@ -48,9 +61,10 @@ def _variables(kind: str) -> tuple[CameraVariables, gtsam.Values]:
         given |= {"axes": axes, "turns": [A(f) for f in frames]}
         for f in frames:
             values.insert(A(f), 0.1 * rng.normal(size=2))
-    if kind == "raw":
-        given |= {"lenses": LENSES, "calibration": FISHEYES}
-        for key, dim in zip(LENSES, (3, 4, 3, 4, 3), strict=True):
+    if "raw" in kind:
+        lenses = [F(0), K(0), *(key for n in range(1, many) for key in (F(n), K(n), B(n - 1)))]
+        given |= {"lenses": lenses, "calibration": FISHEYES if many == 2 else THREE}
+        for key, dim in zip(lenses, lens_sizes(many), strict=True):
             values.insert(key, 0.01 * rng.normal(size=dim))
     for f in frames:
         pose = gtsam.Pose3(gtsam.Rot3.Expmap(0.3 * rng.normal(size=3)), 0.4 * rng.normal(size=3))
@@ -59,7 +73,7 @@ def _variables(kind: str) -> tuple[CameraVariables, gtsam.Values]:
 
 
 def _predicted(
-    camera: CameraVariables, values: gtsam.Values, frame: int, point: np.ndarray, sign: float,
+    camera: CameraVariables, values: gtsam.Values, frame: int, point: np.ndarray, lens: int,
     fraction: float,
 ) -> np.ndarray:  # fmt: skip
     """Where a camera shows a point: a unit direction, or the pixel of a raw lens. Plain numpy."""
@@ -68,26 +82,28 @@ def _predicted(
         motion = vector(values, D(0))[0] * camera.velocities[frame] + vector(values, W(frame))
         turn = Rotation.from_rotvec(fraction * motion[:3]).as_matrix()
         d = turn.T @ (d - fraction * motion[3:])
-    centre = vector(values, C(0))
-    origin = sign * centre
+    given = [vector(values, key) for key in camera.centres]
+    centres = [*given, -np.sum(given, axis=0)]
+    origin = centres[lens]
     if camera.axes is not None:
         turn = Rotation.from_rotvec([*vector(values, A(frame)), 0]).as_matrix()
         origin = camera.axes[frame] @ turn @ origin
     away = d - origin
     if camera.lenses is not None:
-        lens, back = FISHEYES[int(sign < 0)], int(sign < 0)
-        change, radial = vector(values, F(back)), vector(values, K(back))
-        turn = lens[7:].reshape(3, 3)
-        if back:
-            turn = Rotation.from_rotvec(vector(values, B(0))).as_matrix() @ turn
+        assert camera.calibration is not None
+        own = camera.calibration[lens]
+        change, radial = vector(values, F(lens)), vector(values, K(lens))
+        turn = own[7:].reshape(3, 3)
+        if lens:
+            turn = Rotation.from_rotvec(vector(values, B(lens - 1))).as_matrix() @ turn
         x, y, z = turn.T @ away
         across = np.hypot(x, y)
         theta = np.arctan2(across, z)
         powers = theta ** np.array([3, 5, 7, 9])
-        r = lens[0] * np.exp(change[0]) * (theta + (lens[3:7] + radial) @ powers)
-        return lens[1:3] + lens[0] * change[1:] + r * np.array([x, y]) / across
+        r = own[0] * np.exp(change[0]) * (theta + (own[3:7] + radial) @ powers)
+        return own[1:3] + own[0] * change[1:] + r * np.array([x, y]) / across
     inverse = vector(values, N(0))[0] if camera.radius is not None else 0.0
-    inverse += camera.front_by_radius / np.linalg.norm(centre)
+    inverse += camera.front_by_radius / (0.5 * np.linalg.norm(centres[0] - centres[1]))
     unit, near = away / np.linalg.norm(away), inverse * origin
     along = near @ unit
     return near + (np.sqrt(1 + along**2 - near @ near) - along) * unit
@@ -100,23 +116,25 @@ def _world(kind: str, noise: float = 2e-3, loss: RobustLoss | None = None):
     points = rng.normal(size=(POINTS, 3))
     points *= (rng.uniform(2, 5, POINTS) / np.linalg.norm(points, axis=1))[:, None]
     frames, which = np.divmod(np.arange(FRAMES * POINTS), POINTS)
-    signs, fractions = np.where(points[which, 2] > 0, 1.0, -1.0), rng.uniform(-0.5, 0.5, len(which))
+    axes = AXES_OF_THREE if kind.startswith("three") else np.array([[0.0, 0, 1], [0, 0, -1]])
+    seeing = np.argmax(points[which] @ axes.T, axis=1)
+    fractions = rng.uniform(-0.5, 0.5, len(which))
     shown = np.array(
         [
-            _predicted(camera, values, int(f), points[j], float(sign), float(fraction))
-            for f, j, sign, fraction in zip(frames, which, signs, fractions, strict=True)
+            _predicted(camera, values, int(f), points[j], int(lens), float(fraction))
+            for f, j, lens, fraction in zip(frames, which, seeing, fractions, strict=True)
         ]
     )
     measured, whiteners = np.zeros((len(which), 3)), rng.normal(size=(len(which), 2, 2))
     whiteners += 3 * np.eye(2)
-    if kind == "raw":
+    if "raw" in kind:
         measured[:, :2] = shown + 300 * noise * rng.normal(size=shown.shape)
         whiteners /= 300 * noise
     else:
         measured = shown + noise * rng.normal(size=shown.shape)
         measured /= np.linalg.norm(measured, axis=1, keepdims=True)
         whiteners /= noise
-    rows = frames, which, POINTS, measured, whiteners, signs, fractions
+    rows = frames, which, POINTS, measured, whiteners, seeing, fractions
     sightings, order = sightings_of(*rows)
     start = points + 0.02 * rng.normal(size=points.shape)
     return CameraBlock(camera, sightings, start, loss), values, order, rows
@@ -142,12 +160,12 @@ def _slopes(block: CameraBlock, values: gtsam.Values, key: int, dim: int) -> np.
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_residuals_are_those_of_plain_numpy(kind: str) -> None:
-    block, values, order, (frames, which, _, measured, whiteners, signs, fractions) = _world(kind)
+    block, values, order, (frames, which, _, measured, whiteners, seeing, fractions) = _world(kind)
     points = block.points_world[which]
     for row, found in zip(order, block.residuals(values), strict=True):
-        one = int(frames[row]), points[row], float(signs[row]), float(fractions[row])
+        one = int(frames[row]), points[row], int(seeing[row]), float(fractions[row])
         shown = _predicted(block.camera, values, *one)
-        if kind == "raw":
+        if "raw" in kind:
             expected = shown - measured[row, :2]
         else:
             across = tangent_basis(measured[row]) @ shown
@@ -240,10 +258,10 @@ def _priors(values: gtsam.Values, camera: CameraVariables) -> gtsam.NonlinearFac
 
 def _error(camera, one, measured, whitener, raw, keys, _factor, values, jacobians) -> np.ndarray:
     """A sighting as gtsam calls it, its Jacobians by differences."""
-    frame, j, sign, fraction = one
+    frame, j, lens, fraction = one
 
     def residual(at: gtsam.Values) -> np.ndarray:
-        shown = _predicted(camera, at, frame, vector_or_point(at, L(j)), sign, fraction)
+        shown = _predicted(camera, at, frame, vector_or_point(at, L(j)), lens, fraction)
         if raw:
             return whitener @ (shown - measured[:2])
         across = tangent_basis(measured) @ shown
@@ -267,10 +285,10 @@ def vector_or_point(values: gtsam.Values, key: int) -> np.ndarray:
     return np.asarray(values.atPoint3(key))
 
 
-@pytest.mark.parametrize("kind", ["all", "raw"])
+@pytest.mark.parametrize("kind", ["all", "raw", "three raw lenses"])
 def test_optimum_is_that_of_gtsam_on_the_same_factors(kind: str) -> None:
     """Poses, points and the whole camera by GTSAM's own Levenberg-Marquardt, nothing eliminated."""
-    block, values, _order, (frames, which, _, measured, whiteners, signs, fractions) = _world(kind)
+    block, values, _order, (frames, which, _, measured, whiteners, seeing, fractions) = _world(kind)
     camera, graph = block.camera, _priors(values, block.camera)
     tight = SolverSettings(relative_tolerance=1e-13, absolute_tolerance=None, max_iterations=100)
     found = optimize(graph, [block], values, tight)
@@ -280,8 +298,8 @@ def test_optimum_is_that_of_gtsam_on_the_same_factors(kind: str) -> None:
     for row in range(len(frames)):
         f, j = int(frames[row]), int(which[row])
         keys = [keys[f] for keys in camera.of_frames] + [key for key, _ in camera.shared] + [L(j)]
-        one = f, j, signs[row], fractions[row]
-        given = camera, one, measured[row], whiteners[row], kind == "raw", keys
+        one = f, j, seeing[row], fractions[row]
+        given = camera, one, measured[row], whiteners[row], "raw" in kind, keys
         error = partial(_error, *given)
         whole.add(gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(2), keys, error))
     params = gtsam.LevenbergMarquardtParams()

@@ -119,7 +119,7 @@ def test_no_panorama_is_wider_than_the_pictures_are_dense(frames: FrameSet) -> N
 
 
 def test_the_seam_is_where_both_lenses_end() -> None:
-    clear = clear_of_seam(180)
+    clear = clear_of_seam(180, made_pair())
     assert clear.shape == (180, 360) and not clear.flags.writeable
     columns = np.flatnonzero(~clear[90])
     np.testing.assert_array_equal(columns, [88, 89, 90, 91, 268, 269, 270, 271])
