@@ -183,7 +183,7 @@ def lenses_of(
             raise GsbaError(
                 f"{calibration}: calibrates {len(known)} lenses, but {folder} has pictures of {num}"
             )
-        if len(known) > 2:
+        if num > 2:
             return known, False
         some = [pairs[f] for f in rows]
         return _checked_calibration(folder, (known[0], known[-1]), some, size, calibration)
