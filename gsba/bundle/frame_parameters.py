@@ -14,6 +14,7 @@ from scipy.sparse.linalg import splu
 
 from factors.elimination import LinearSystem
 from gsba.bundle.adjustment import AdjustmentContext
+from gsba.bundle.cross_validation import Verdict, cross_validate
 from gsba.bundle.shared_parameters import (
     PARTS,
     Weighted,
@@ -32,6 +33,11 @@ class FrameModel:
 
     system: LinearSystem  # 6 + K variables of each frame, its pose first; by robust weights
     curvature: float  # of that loss, part of its weights'
+
+    @property
+    def cost(self) -> float:
+        """At no step."""
+        return self.system.cost
 
     def gain(self, step: np.ndarray) -> float:
         """Decrease of the cost by a step of all of them."""
@@ -91,11 +97,10 @@ def summed(models: Sequence[FrameModel]) -> FrameModel:
     return FrameModel(total, float(np.mean([model.curvature for model in models])))
 
 
-def part_gains(models: Sequence[FrameModel], sigmas: np.ndarray) -> np.ndarray:
-    """What each part gains (PARTS,) by the parameters that the others give, poses too."""
-    gains = []
-    for p, part in enumerate(models):
-        others = summed([model for q, model in enumerate(models) if q != p])
-        without = part.gain(others.step(np.zeros_like(sigmas)))
-        gains.append(part.gain(others.step(sigmas)) - without)
-    return np.array(gains)
+def validated(models: Sequence[FrameModel], sigmas: np.ndarray) -> Verdict:
+    """What parameters with priors `sigmas` (K,) predict, poses solved for with and without them."""
+    return cross_validate(
+        models,
+        lambda others: summed(others).step(sigmas),
+        lambda others: summed(others).step(np.zeros_like(sigmas)),
+    )

@@ -5,6 +5,7 @@ those of the walk, up to how the camera is held, and what each frame's points sa
 """
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,14 +13,15 @@ from scipy.spatial.transform import Rotation
 
 from gsba.bundle import shared_parameters
 from gsba.bundle.adjustment import AdjustmentContext
-from gsba.bundle.frame_parameters import models_of, part_gains
+from gsba.bundle.cross_validation import cross_validate, predicts
+from gsba.bundle.frame_parameters import models_of, validated
 from gsba.bundle.shared_parameters import (
     PARTS,
     SharedModel,
     Weighted,
     by_origin,
     drawn,
-    predicts,
+    summed,
 )
 from gsba.camera.lens import Lenses
 from gsba.types import Counts, Keypoints, Landmarks, Solution
@@ -77,7 +79,8 @@ def guess(
     if not systems:
         return LensAxes(so_far, np.full(PARTS, np.nan), "too few points", counts)
     starts = range(0, 3 * len(tried), 3)
-    gains = np.array([_gains([part.of(slice(k, k + 3)) for part in systems]) for k in starts])
+    tried_parts = [[part.of(slice(k, k + 3)) for part in systems] for k in starts]
+    gains = np.array([cross_validate(parts, _newton_step).gains for parts in tried_parts])
     best = int(np.argmax(gains.sum(axis=1)))
     shares = gains / np.array([part.cost for part in systems])
     logger.info("lens axes: gains %s %%", (100 * shares.mean(axis=1)).round(2).tolist())
@@ -114,11 +117,11 @@ def loosened(
         return so_far.by_centre(by_start, bearings, there) @ by_turn(so_far)
 
     models = models_of(used, keypoints, solved, problem, by_axes)
-    tried = [part_gains(models, np.full(2, width)) for width in TURNS]
-    gains = max(tried, key=lambda trial: float(trial.sum()))
-    shares = gains / np.array([model.system.cost for model in models])
+    tried = [validated(models, np.full(2, width)) for width in TURNS]
+    verdict = max(tried, key=lambda trial: float(trial.gains.sum()))
+    shares = verdict.shares
     logger.info("lens axes: %s %% of unseen points' cost", (100 * shares).round(2).tolist())
-    if not predicts(gains):
+    if not verdict.predicts:
         return LensAxes(so_far, shares, "turning them does not predict unseen points", counts)
     return LensAxes(replace(so_far, axes=np.tile(np.eye(3), (num, 1, 1))), shares, "", counts)
 
@@ -151,16 +154,11 @@ def upright(directions: np.ndarray) -> np.ndarray:
     return np.stack([np.cross(y, z), y, z], axis=2)
 
 
-def _gains(systems: list[SharedModel]) -> np.ndarray:
-    """What each part gains (PARTS,) by the centre that the others give."""
-    gains = []
-    for p, own in enumerate(systems):
-        others = systems[:p] + systems[p + 1 :]
-        gradient = np.sum([part.gradient for part in others], axis=0)
-        hessian = np.sum([part.hessian for part in others], axis=0)
-        step = -np.linalg.solve(hessian + 1e-9 * np.trace(hessian) * np.eye(3), gradient)
-        gains.append(own.gain(step))
-    return np.array(gains)
+def _newton_step(parts: Sequence[SharedModel]) -> np.ndarray:
+    """Centre (3,) that parts give, the loss's curvature left out."""
+    total = summed(parts)
+    damping = 1e-9 * np.trace(total.hessian) * np.eye(3)
+    return -np.linalg.solve(total.hessian + damping, total.gradient)
 
 
 def _candidates(world_T_rigs: np.ndarray) -> list[np.ndarray]:

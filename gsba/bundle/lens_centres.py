@@ -6,6 +6,7 @@ with them. They are believed where they then predict parts that they were not fo
 """
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,11 +14,11 @@ import numpy as np
 from factors.bearing import tangent_basis
 from factors.camera_rows import half_baseline
 from gsba.bundle.adjustment import AdjustmentContext
+from gsba.bundle.cross_validation import cross_validate
 from gsba.bundle.shared_parameters import (
     PARTS,
     SharedModel,
     models_of,
-    predicts,
     summed,
     whole_model_of,
 )
@@ -95,19 +96,15 @@ def estimate(
     damping = 1e-9 * np.trace(total.hessian) * np.eye(len(total.hessian))
     covariance = np.linalg.inv(total.hessian + damping) / total.curvature
     found = so_far.centre + _step([total])
-    around = [part.around(so_far.centre) for part in systems]  # as if there were one centre
-    gains = np.array(
-        [
-            part.gain(so_far.centre + _step(systems[:p] + systems[p + 1 :]))
-            for p, part in enumerate(around)
-        ]
-    )
-    shares = gains / np.array([part.cost for part in around]) if systems else np.full(PARTS, np.nan)
+    at_one = -so_far.centre  # as if there were one centre
+    verdict = cross_validate(systems, _step, lambda _: at_one)
+    gains = verdict.gains
+    shares = verdict.shares if systems else np.full(PARTS, np.nan)
     strength = float(np.sqrt(found @ np.linalg.solve(covariance, found)))
     reason = ""
     if chosen.model == "auto" and so_far.reference_calibration is None:  # raw pairs are of two
         # Matches that one centre has chosen hide the lenses from some parts of the sequence.
-        if not (predicts(gains) if so_far else gains.sum() > 0):
+        if not (verdict.predicts if so_far else gains.sum() > 0):
             reason = "it does not predict parts of the sequence that it was not found from"
         elif strength < (_SIGNIFICANT if so_far else _ON_TRIAL):
             reason = f"one centre is as likely: {strength:.1f} standard deviations"
@@ -167,18 +164,16 @@ def stitched_for(
         return StitchRadius(so_far, 0.0, np.nan, np.full(PARTS, np.nan), "too few points")
     found, total, num = _step(systems), summed(systems), len(so_far.centre)
     sigma = float(np.sqrt(np.linalg.inv(total.hessian)[num, num] / total.curvature))
-    gains = []
-    for p, part in enumerate(systems):
-        others = systems[:p] + systems[p + 1 :]
-        without = part.gain(_step([each.of(slice(num)) for each in others]))
-        gains.append(part.gain(_step(others)) - without)
-    inverse_stitch_radius, gains = float(found[num]), np.array(gains)
-    shares = gains / np.array([part.cost for part in systems])
+    centres = slice(num)
+    verdict = cross_validate(
+        systems, _step, lambda others: _step([each.of(centres) for each in others])
+    )
+    inverse_stitch_radius, shares = float(found[num]), verdict.shares
     logger.info(
         "stitched for a inverse_stitch_radius of %.3f (sigma %.3f)", inverse_stitch_radius, sigma
     )
     reason = ""
-    if not predicts(gains) or inverse_stitch_radius < _SIGNIFICANT * sigma:
+    if not verdict.predicts or inverse_stitch_radius < _SIGNIFICANT * sigma:
         reason = "as well stitched at infinity"
     taken = replace(
         so_far, centre=so_far.centre + found[:num], inverse_stitch_radius=inverse_stitch_radius
@@ -196,7 +191,7 @@ def by_inverse_stitch_radius(bearings_rig: np.ndarray, origins_rig: np.ndarray) 
     return tangent_basis(bearings_rig) @ origins_rig[:, :, None]
 
 
-def _step(systems: list[SharedModel]) -> np.ndarray:
+def _step(systems: Sequence[SharedModel]) -> np.ndarray:
     """Change of the parameters (K,) that the parts ask for."""
     total = summed(systems)
     hessian = total.curvature * total.hessian

@@ -6,13 +6,15 @@ believed where it predicts; `camera_adjustment` then finds each frame's own moti
 """
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 
 import numpy as np
 
 from gsba.bundle.adjustment import AdjustmentContext
-from gsba.bundle.shared_parameters import PARTS, SharedModel, models_of, predicts
+from gsba.bundle.cross_validation import cross_validate
+from gsba.bundle.shared_parameters import PARTS, SharedModel, models_of, summed
 from gsba.camera.lens import Lenses, rows_run
 from gsba.config import CameraSettings
 from gsba.types import Counts, GyroConstraints, Keypoints, Landmarks, Solution
@@ -81,14 +83,14 @@ def estimate(
     systems, counts = models_of(landmarks, _MOST, keypoints, solved, problem, by_duration)
     if not systems:
         return CameraEstimate(lenses, reason="too few points to tell rows apart", counts=counts)
-    durations, sigmas, gains = _durations(systems)
-    best = int(np.argmax(gains.sum(axis=0)))
-    duration, sigma = float(durations[best]), float(sigmas[best])
+    of_ways = [[part.of(slice(way, way + 1)) for part in systems] for way in range(len(ways))]
+    verdicts = [cross_validate(parts, _newton_step) for parts in of_ways]
+    best = int(np.argmax([verdict.gains.sum() for verdict in verdicts]))
+    verdict, (duration, sigma) = verdicts[best], _duration(of_ways[best])
     sign = -1.0 if duration < 0 else 1.0  # rows are read the other way
-    shares = gains[:, best] / np.array([part.cost for part in systems])
-    found = CameraEstimate(lenses, abs(duration), sigma, gains=shares, counts=counts)
+    found = CameraEstimate(lenses, abs(duration), sigma, gains=verdict.shares, counts=counts)
     logger.info("readout: %.2f ms (sigma %.2f)", 1e3 * abs(duration), 1e3 * sigma)
-    if not predicts(gains[:, best]) or abs(duration) < _SIGNIFICANT * sigma:
+    if not verdict.predicts or abs(duration) < _SIGNIFICANT * sigma:
         return replace(found, reason="motion during the readout does not predict unseen parts")
     if problem.settings.camera.sweep is not None and duration < 0:
         return replace(found, reason="rows are read the other way than camera.sweep says")
@@ -155,16 +157,17 @@ def velocities(
     return np.hstack([rates, local / span])
 
 
-def _durations(systems: list[SharedModel]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Duration and its deviation (W,) for each way of reading alone, and what each part gains
-    (PARTS, W) by what the others say."""
-    gradients = np.array([part.gradient for part in systems])
-    curvatures = np.array([np.diagonal(part.hessian) for part in systems])
-    total, curved = gradients.sum(axis=0), np.maximum(curvatures.sum(axis=0), 1e-300)
-    others = -(total - gradients) / np.maximum(curved - curvatures, 1e-300)
-    gains = -(gradients * others + 0.5 * curvatures * others**2)
-    bend = float(np.mean([part.curvature for part in systems]))
-    return -total / curved / bend, (bend * curved) ** -0.5, gains
+def _newton_step(parts: Sequence[SharedModel]) -> np.ndarray:
+    """Duration (1,) that parts give for one way of reading, the loss's curvature left out."""
+    total = summed(parts)
+    return -total.gradient / np.maximum(total.hessian[0], 1e-300)
+
+
+def _duration(parts: Sequence[SharedModel]) -> tuple[float, float]:
+    """Duration that parts give for one way of reading, and its standard deviation, seconds."""
+    total = summed(parts)
+    curved = max(float(total.hessian[0, 0]), 1e-300)
+    return -float(total.gradient[0]) / curved / total.curvature, (total.curvature * curved) ** -0.5
 
 
 def _ways(camera: CameraSettings, lenses: Lenses) -> list[np.ndarray]:

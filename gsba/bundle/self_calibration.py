@@ -15,11 +15,11 @@ import numpy as np
 
 from factors.bearing import tangent_basis
 from gsba.bundle.adjustment import AdjustmentContext
+from gsba.bundle.cross_validation import cross_validate
 from gsba.bundle.shared_parameters import (
     PARTS,
     SharedModel,
     models_of,
-    predicts,
     summed,
     whole_model_of,
 )
@@ -91,15 +91,14 @@ def estimate(
     if not systems:
         why = "too few points to tell what lenses are"
         return SelfCalibration(so_far, np.full(PARTS, np.nan), why, counts)
-    gains = []
-    for p, part in enumerate(systems):
-        others = systems[:p] + systems[p + 1 :]
-        alone = np.concatenate([np.zeros(num), _centre_step(others, num)])
-        gains.append(part.gain(_step(others, off)) - part.gain(alone))
-    found, gains = _step(systems, off), np.array(gains)
-    shares = gains / np.array([part.cost for part in systems])
+    verdict = cross_validate(
+        systems,
+        lambda others: _step(others, off),
+        lambda others: np.concatenate([np.zeros(num), _centre_step(others, num)]),
+    )
+    found, shares = _step(systems, off), verdict.shares
     reason = ""
-    if so_far.fisheyes is None and not predicts(gains):
+    if so_far.fisheyes is None and not verdict.predicts:
         reason = "it does not predict parts of the sequence that it was not found from"
     logger.info(
         "lenses: focal lengths %s %%, %.2f %% of unseen parts' cost%s",

@@ -25,7 +25,6 @@ PARTS = 4  # of the sequence: each is predicted by what the others give
 _LEAST_FRAMES = 2 * PARTS
 _LEAST_POINTS = 50  # of a part
 _POSE_DAMPING = 1e-4  # of the poses' information, against the map's free similarity
-_SURE = 3.0  # standard deviations
 _LEAST_CURVATURE = 0.3  # or a step would go further than its model holds
 
 
@@ -69,22 +68,6 @@ def summed(models: Sequence[SharedModel]) -> SharedModel:
         np.array(sum(model.hessian for model in models)),
         float(np.mean([model.curvature for model in models])),
     )
-
-
-def predicts(gains: np.ndarray) -> bool:
-    """Whether parameters surely predict parts of a sequence that they were not found from.
-
-    A gain of G in log-likelihood by parameters that are true has a standard deviation of
-    sqrt(2 G): the residuals' noise along their change. The sum of all parts must exceed none by
-    several of these, and no part may surely lose.
-
-    Args:
-        gains: (PARTS,) decrease of each part's robust cost by the parameters that others give.
-    """
-    total = float(gains.sum())
-    sigma = np.sqrt(2 * max(total, 0.0))
-    least = -_SURE * sigma / np.sqrt(len(gains))
-    return bool(total > _SURE * sigma and np.all(gains > least))
 
 
 def drawn(landmarks: Landmarks, most: int, seed: int) -> Landmarks:

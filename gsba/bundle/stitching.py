@@ -9,6 +9,7 @@ from factors.bearing import tangent_basis
 from factors.sphere_field import SphereField, degrees_of, harmonics, num_harmonics
 from gsba.bundle import adjustment
 from gsba.bundle.adjustment import AdjustmentContext
+from gsba.bundle.cross_validation import Verdict, cross_validate
 from gsba.bundle.shared_parameters import PARTS, BySharedParameters, SharedModel, models_of
 from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.camera.rig import CubeRig, owner_faces
@@ -146,7 +147,7 @@ def _fitted(systems: list[SharedModel], degree: int, spread: float) -> np.ndarra
 def _choose(systems: list[SharedModel], max_degree: int) -> tuple[int, float, np.ndarray]:
     """Degree and spread of the smoothest field that predicts parts well, and the parts' gains."""
     tried = [
-        (degree, spread, _gains(systems, degree, spread))
+        (degree, spread, _validated(systems, degree, spread).gains)
         for spread in _SPREADS
         for degree in range(1, max_degree + 1)
     ]
@@ -154,11 +155,6 @@ def _choose(systems: list[SharedModel], max_degree: int) -> tuple[int, float, np
     return next(trial for trial in tried if trial[2].sum() >= min(_GOOD_ENOUGH * best, best))
 
 
-def _gains(systems: list[SharedModel], degree: int, spread: float) -> np.ndarray:
-    """What each part (PARTS,) gains from the field of the others."""
-    return np.array(
-        [
-            part.gain(_fitted(systems[:p] + systems[p + 1 :], degree, spread))
-            for p, part in enumerate(systems)
-        ]
-    )
+def _validated(systems: list[SharedModel], degree: int, spread: float) -> Verdict:
+    """What fields of a degree and a spread predict."""
+    return cross_validate(systems, lambda others: _fitted(others, degree, spread))

@@ -95,7 +95,7 @@ def test_the_graph_settles_lenses_beside_poses_and_says_how_well() -> None:
     assert sigmas is not None
     off = self_calibration.from_calibrated(seeing.lenses) - _step_to(TRUE, 1.0)
     assert np.abs(off[[0, 7]] / sigmas[[0, 7]]).max() < 4
-    assert np.all(sigmas < self_calibration.SPREAD)
+    assert np.all(sigmas < self_calibration.spread(2))
 
 
 def _step_to(pair: Pair, share: float) -> np.ndarray:
