@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gsba.camera.fisheye import Rig, facing, lens_names, rotation_of, unproject
+from gsba.camera.fisheye import Rig, facing, lens_names, projection_of, rotation_of
+from gsba.camera.projections import RadialProjection
 from gsba.camera.sphere import bearings_from_erp, erp_from_bearings
 from gsba.demo.degrade import degrade
 from gsba.demo.gallery import build_gallery
@@ -36,24 +37,28 @@ def distance(num: int) -> float:
     return 2 * RADIUS * float(np.sin(np.pi / num))
 
 
-def write_calibration(path: Path, rig: Rig, axes: np.ndarray) -> None:
-    """A calibration file of lenses whose centres lie along axes (L, 3)."""
+def write_calibration(
+    path: Path, rig: Rig, axes: np.ndarray, own: RadialProjection | None = None, model: str = ""
+) -> None:
+    """A calibration file of lenses whose centres lie along axes (L, 3); `own` is their projection
+    if it is another, named `model`."""
     lenses = {
         name: {
             "width": lens.width,
             "height": lens.height,
-            "f": lens.focal,
+            "f": lens.focal if own is None else own.focal,
             "cx": lens.principal[0],
             "cy": lens.principal[1],
-            "k": list(lens.radial),
+            "k": list(lens.radial if own is None else own.radial),
             "rig_T_lens": pose(rotation_of(lens), RADIUS * axis).tolist(),
         }
         for name, lens, axis in zip(lens_names(len(rig)), rig, axes, strict=True)
     }
-    path.write_text(json.dumps({"unit": "m", "lenses": lenses}))
+    named = {"model": model} if model else {}
+    path.write_text(json.dumps({"unit": "m", "lenses": lenses, **named}))
 
 
-def render(folder: Path, num: int) -> None:
+def render(folder: Path, num: int, own: RadialProjection | None = None, model: str = "") -> None:
     """Write `images/` (stitched), `raw/` (a folder of each lens), calibration, truth and coarse
     trajectories of three seeds."""
     truth, scene, rig = (
@@ -64,7 +69,7 @@ def render(folder: Path, num: int) -> None:
     axes, names = np.array([rotation_of(lens)[:, 2] for lens in rig]), lens_names(num)
     grid = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(WIDTH // 2) + 0.5)
     faced = facing(bearings_from_erp(np.stack(grid, axis=-1), WIDTH, WIDTH // 2), axes)
-    maps = [_maps(lens) for lens in rig]
+    maps = [_maps(lens, own or projection_of(lens)) for lens in rig]
     for part in ("images", *(f"raw/{name}" for name in names)):
         (folder / part).mkdir(parents=True)
     for f, world_T_rig in enumerate(truth.world_T_rigs):
@@ -85,7 +90,7 @@ def render(folder: Path, num: int) -> None:
     write_tum(folder / "truth.tum", truth)
     for seed in range(3):
         write_tum(folder / f"slam{seed}.tum", degrade(truth, seed))
-    write_calibration(folder / "calibration.json", rig, axes)
+    write_calibration(folder / "calibration.json", rig, axes, own, model)
 
 
 def turned_off(rig: Rig) -> Rig:
@@ -112,9 +117,9 @@ def turned_off(rig: Rig) -> Rig:
     return tuple(found)
 
 
-def _maps(lens: Fisheye) -> tuple[np.ndarray, np.ndarray]:
+def _maps(lens: Fisheye, own: RadialProjection) -> tuple[np.ndarray, np.ndarray]:
     """OpenCV pixels (2, h, w) in a panorama of 1024 pixels; True (h, w) beyond the circle."""
     pixels = np.stack(np.meshgrid(*2 * [np.arange(SIZE) + 0.5]), axis=-1)
-    directions = unproject(lens, pixels)
+    directions = own.unproject(pixels) @ rotation_of(lens).T
     maps = np.moveaxis(erp_from_bearings(directions, 1024, 512) - 0.5, -1, 0).astype(np.float32)
     return maps, directions @ rotation_of(lens)[:, 2] < np.cos(_HALF_FOV)

@@ -33,9 +33,7 @@ P = TypeVar("P", bound=Part)
 class Verdict:
     """What parameters are worth to parts that they were not found from."""
 
-    gains: (
-        np.ndarray
-    )  # (PARTS,) float64, decrease of each part's robust cost by what
+    gains: np.ndarray  # (PARTS,) float64, decrease of each part's robust cost by what
     # the other parts give, beyond the baseline
     shares: np.ndarray  # (PARTS,) float64, the same as a share of the cost that the baseline leaves
 

@@ -8,7 +8,7 @@ lenses.
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,9 +21,11 @@ from gsba.camera.calibration_formats import (
     from_kalibr,
     lens_of,
     metres_of,
+    of_projection,
 )
 from gsba.camera.fisheye import Rig, lens_names, rotation_of
 from gsba.camera.lens import all_centres
+from gsba.camera.projections import FisheyeProjection, RadialProjection, projection_of_model
 from gsba.geometry import pose
 from gsba.log import GsbaError
 from gsba.types import Fisheye
@@ -200,16 +202,26 @@ def _lenses_of_tree(tree: Any, path: Path) -> Rig:
     if any(re.fullmatch(r"cam\d+", str(name)) for name in tree):
         return from_kalibr(tree, path)
     metres = metres_of(tree.get("unit", "m"))
-    entries = tree["lenses"]
+    entries, model = tree["lenses"], projection_of_model(tree.get("model", _MODEL))
     names = lens_names(len(entries)) if "lens2" in entries else ("front", "back")
-    return tuple(_lens_of_entry(entries[name], metres) for name in names)
+    return tuple(_lens_of_entry(entries[name], metres, model, f"{path}: {name}") for name in names)
 
 
-def _lens_of_entry(tree: Mapping[str, Any], metres: float) -> Fisheye:
+def _lens_of_entry(
+    tree: Mapping[str, Any],
+    metres: float,
+    model: Callable[..., RadialProjection],
+    where: str,
+) -> Fisheye:
     size = tree.get("width") or tree["size"], tree.get("height") or tree["size"]
     rig_T_lens = np.array(tree["rig_T_lens"], dtype=np.float64).reshape(4, 4)
     rig_T_lens[:3, 3] *= metres
-    return lens_of(size, tree["f"], (tree["cx"], tree["cy"]), tree["k"], rig_T_lens)
+    principal = tree["cx"], tree["cy"]
+    if model is FisheyeProjection:
+        return lens_of(size, tree["f"], principal, tree["k"], rig_T_lens)
+    terms = tuple(float(k) for k in tree.get("k", ()))
+    lens = model(*map(int, size), float(tree["f"]), tuple(map(float, principal)), terms)
+    return of_projection(lens, rig_T_lens, where)
 
 
 def _one_line(error: Exception) -> str:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from gsba.camera.fisheye import Pair
+from gsba.camera.projections import RadialProjection
 from gsba.geometry import inverse, pose, rotation_from_quaternion
 from gsba.log import GsbaError, brief
 from gsba.types import Fisheye
@@ -253,12 +254,7 @@ def _fit_to_omni(
     bent = plane * (1 + k1 * squares + k2 * squares**2)[:, None]
     bent[:, 0] += 2 * p1 * x * y + p2 * (squares + 2 * x * x)
     bent[:, 1] += p1 * (squares + 2 * y * y) + 2 * p2 * x * y
-    powers = angles[:, None] ** np.array([1, 3, 5, 7, 9])
-    radial = (away[:, :, None] * powers[:, None]).reshape(-1, 5)
-    columns = np.hstack([radial, np.tile(np.eye(2), (len(angles), 1))])
-    (f, *terms, dx, dy), *_ = np.linalg.lstsq(columns, (focal * bent).ravel())
-    off = (columns @ [f, *terms, dx, dy] - (focal * bent).ravel()).reshape(-1, 2)
-    worst = float(np.hypot(*off.T).max())
+    (f, *terms), (dx, dy), worst = _fitted(angles, away, focal * bent)
     if not worst <= _MAX_FIT_ERROR_PX:
         raise GsbaError(
             f"{where} is omni with radtan, {worst:.2f} pixels from the best fit of our lens "
@@ -266,6 +262,52 @@ def _fit_to_omni(
             "Kalibr's model pinhole-equi"
         )
     return lens_of(size, f, (principal[0] + dx, principal[1] + dy), np.array(terms) / f)
+
+
+def of_projection(lens: RadialProjection, rig_T_lens: np.ndarray, where: str) -> Fisheye:
+    """Our lens model fitted to a lens of another projection.
+
+    Args:
+        lens: its projection.
+        rig_T_lens: (4, 4), metres.
+        where: file and projection, for error messages.
+
+    Raises:
+        GsbaError: the projection is not close to any lens of our model.
+    """
+    angles = np.linspace(0, min(_MAX_ANGLE_RAD, lens.max_angle), 200)
+    away = np.tile([1.0, 0.0], (len(angles), 1))
+    shown = (lens.focal * lens.radii(angles)[0])[:, None] * away
+    (f, *terms), _, worst = _fitted(angles, away, shown)
+    if not worst <= _MAX_FIT_ERROR_PX:
+        raise GsbaError(
+            f"{where}: {worst:.2f} pixels from the best fit of r = f (a + k1 a^3 + ... + k4 a^9) "
+            f"within {np.rad2deg(angles[-1]):.0f} degrees of the axis: give f and k of that formula"
+        )
+    size = lens.width, lens.height
+    return lens_of(size, f, lens.principal, np.array(terms) / f, rig_T_lens)
+
+
+def _fitted(
+    angles: np.ndarray, away: np.ndarray, shown: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Our lens model fitted to pixels of rays.
+
+    Args:
+        angles: (N,) from the axis, rad.
+        away: (N, 2) unit directions across the axis.
+        shown: (N, 2) pixels from the principal point.
+
+    Returns:
+        The focal length and its products with k1 to k4 (5,), the principal point's shift (2,), and
+        the largest distance, pixels.
+    """
+    powers = angles[:, None] ** np.array([1, 3, 5, 7, 9])
+    radial = (away[:, :, None] * powers[:, None]).reshape(-1, 5)
+    columns = np.hstack([radial, np.tile(np.eye(2), (len(angles), 1))])
+    found, *_ = np.linalg.lstsq(columns, shown.ravel())
+    off = (columns @ found - shown.ravel()).reshape(-1, 2)
+    return found[:5], found[5:], float(np.hypot(*off.T).max())
 
 
 def _checked_rigid(a_T_b: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ distance of a ray's picture from the principal point as a function of its angle 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from importlib.metadata import entry_points
 from typing import ClassVar, Protocol, Self
 
 import numpy as np
@@ -240,17 +241,22 @@ PROJECTIONS: dict[str, Callable[..., RadialProjection]] = {  # by "model" in cal
 }
 
 
-def projection_of_model(model: str) -> Callable[..., RadialProjection]:
+def projection_of_model(model: object) -> Callable[..., RadialProjection]:
     """The projection that a calibration file names; what follows a colon explains it.
+
+    Packages add projections by the entry point group `gsba.projections`.
 
     Raises:
         ValueError: no such projection is known.
     """
-    name = model.split(":")[0].strip().lower()
-    if name not in PROJECTIONS:
-        known = ", ".join(PROJECTIONS)
-        raise ValueError(f"its model is '{name}', which is none of {known}")
-    return PROJECTIONS[name]
+    name = str(model).split(":")[0].strip().lower()
+    if name in PROJECTIONS:
+        return PROJECTIONS[name]
+    others = {entry.name: entry for entry in entry_points(group="gsba.projections")}
+    if name not in others:
+        known = ", ".join((*PROJECTIONS, *others))
+        raise ValueError(f"its model is '{name:.40}', which is none of {known}")
+    return others[name].load()
 
 
 def _odd_polynomial(x: np.ndarray, terms: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:

@@ -14,6 +14,7 @@ from gsba.frames.raw_pairs import decode_pair
 from gsba.types import FrameSet
 
 _ROWS_AT_ONCE = 256  # rows whose coordinates are held in double precision at once
+_ASIDE_PX = 1e-6  # a column that lies exactly on a seam goes whole to the lens on its right
 SEAM = np.deg2rad(1.5)  # angle from the seam within which a window shows both lenses
 
 
@@ -107,7 +108,8 @@ def _shrunk(picture: np.ndarray, share: float) -> np.ndarray:
 def _parts(rig: Rig, width: int) -> tuple[_Part, ...]:
     """What each lens shows of a panorama."""
     height, axes, faced = width // 2, optical_axes(rig), np.empty((width // 2, width), np.uint8)
-    for top, bearings in _bearings(np.arange(width), width):
+    aside = np.arange(width) + _ASIDE_PX
+    for top, bearings in _bearings(aside, width):
         faced[top : top + len(bearings)] = facing(bearings, axes)
     parts = []
     for number, lens in enumerate(rig):

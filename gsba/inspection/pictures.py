@@ -14,7 +14,7 @@ from gsba.types import FrameSet
 
 _LAYOUTS = {
     "erp": "stitched panoramas",
-    "fisheye": "raw, a fisheye of each lens",
+    "fisheye": "raw, two fisheyes a frame",
     "cube": "faces of a cube",
     "eac": "equi-angular cube map, two images a frame",
 }
@@ -42,7 +42,9 @@ def _about(frames: FrameSet) -> Facts:
     """Layout, number, times and lenses."""
     first = frames.paths[0][0]
     width, height = image_size(first)
-    facts = [("layout", f"{_LAYOUTS[frames.layout]}, files of {width}x{height}")]
+    layout, num = _LAYOUTS[frames.layout], len(frames.fisheyes or ())
+    layout = f"raw, {num} fisheyes a frame" if num > 2 else layout
+    facts = [("layout", f"{layout}, files of {width}x{height}")]
     count = str(len(frames))
     if frames.timed:
         span = float(frames.timestamps[-1] - frames.timestamps[0])
