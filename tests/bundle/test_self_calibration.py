@@ -9,7 +9,7 @@ from gsba.bundle import self_calibration
 from gsba.bundle.camera_system import CameraSystem
 from gsba.bundle.readout import CameraEstimate
 from gsba.bundle.self_calibration import SelfCalibration, num_parameters
-from gsba.camera.fisheye import Pair, changed, recalibrated
+from gsba.camera.fisheye import Pair, Rig, changed, recalibrated
 from gsba.camera.lens import Lenses
 from gsba.types import Fisheye, Solution
 
@@ -43,7 +43,7 @@ def _estimated(
     return found, solved
 
 
-def _off_deg(pair: Pair | None) -> float:
+def _off_deg(pair: Rig | None) -> float:
     """How far directions of pixels are from the true ones, rms over the sphere."""
     assert pair is not None
     off = self_calibration.apart(

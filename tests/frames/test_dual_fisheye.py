@@ -9,6 +9,7 @@ from two_fisheyes import colours, made_pair, picture, write
 
 from gsba.camera.sphere import bearings_from_erp
 from gsba.frames.dual_fisheye import clear_of_seam, load_joined, load_raw, width_of
+from gsba.frames.files import decode
 from gsba.frames.pixels import load_erp
 from gsba.types import FrameSet
 
@@ -73,7 +74,7 @@ def test_no_jump_on_the_seam(frames: FrameSet, width: int) -> None:
 
 def test_a_shifted_lens_does_jump(frames: FrameSet) -> None:
     """What the tests above measure is there to be seen."""
-    blunt = [cv2.imread(str(path))[..., ::-1] for path in frames.paths[0]]
+    blunt = [decode(path, (240, 240)) for path in frames.paths[0]]
     folder = frames.paths[0][0].parent
     aside = write(folder / "aside.png", np.roll(blunt[1], 4, axis=1))
     found = load_joined(_frames([(frames.paths[0][0], aside)]), 0, False, WIDTHS[0])
@@ -85,8 +86,8 @@ def test_side_by_side_is_the_same(frames: FrameSet, gray: bool) -> None:
     for one, other in zip(load_raw(frames, 0, gray), load_raw(frames, 1, gray), strict=True):
         assert one.shape[:2] == (240, 240) and one.ndim == (2 if gray else 3)
         np.testing.assert_array_equal(one, other)
-    joined = [load_joined(frames, f, gray, 300) for f in (0, 1)]
-    np.testing.assert_array_equal(*joined)
+    one, other = (load_joined(frames, f, gray, 300) for f in (0, 1))
+    np.testing.assert_array_equal(one, other)
 
 
 def test_side_by_side_is_decoded_once(frames: FrameSet, monkeypatch: pytest.MonkeyPatch) -> None:
