@@ -228,8 +228,6 @@ CAMERAS: dict[str, tuple[tuple[float, float], float | None]] = {
 }
 _RELATIVE_READOUT_SIGMA = 0.1  # of a published readout time: it differs between a camera's modes
 _RowDirection = Literal["+x", "-x", "+y", "-y"]
-
-
 _MAX_LENS_GAP_DEG = 190.0  # between neighbouring lenses: a fisheye covers about 200 degrees
 
 
@@ -257,8 +255,10 @@ class CameraSettings(_Settings):
         if self.lens_yaws_deg is None:
             return self
         yaws = sorted(yaw % 360 for yaw in self.lens_yaws_deg)
-        gaps = [after - before for before, after in pairwise([*yaws, yaws[0] + 360])]
-        if len(yaws) < 2 or min(gaps) < 10 or max(gaps) > _MAX_LENS_GAP_DEG:
+        gaps = [
+            after - before for before, after in pairwise([*yaws, *(yaw + 360 for yaw in yaws[:1])])
+        ]
+        if len(yaws) < 2 or not (min(gaps) >= 10 and max(gaps) <= _MAX_LENS_GAP_DEG):
             raise ValueError(
                 "lens_yaws_deg are degrees from the panorama's middle to the right of two lenses "
                 "or more, 10 to 190 degrees apart, e.g. [0, 120, 240]"

@@ -171,22 +171,14 @@ def lenses_of(
             of the pictures, or pictures without a visible circle.
     """
     rows = np.unique(np.linspace(0, len(pairs) - 1, _NUM_CIRCLE_FRAMES).astype(int))
-    num = len(pairs[0])
-    if calibration is None and num > 2:
-        raise GsbaError(
-            f"{folder}: holds pictures of {num} lenses, and nothing says how these lie: give "
-            f"--calibration FILE with lenses.lens0 to lenses.lens{num - 1}"
-        )
     if calibration is not None:
-        known = scaled_to_size(read_calibration(calibration), size, calibration)
-        if len(known) != num:
-            raise GsbaError(
-                f"{calibration}: calibrates {len(known)} lenses, but {folder} has pictures of {num}"
-            )
-        if num > 2:
-            return known, False
         some = [pairs[f] for f in rows]
-        return _checked_calibration(folder, (known[0], known[-1]), some, size, calibration)
+        return _calibrated(folder, some, size, calibration)
+    if len(pairs[0]) > 2:
+        raise GsbaError(
+            f"{folder}: holds pictures of {len(pairs[0])} lenses, and nothing says how these lie: "
+            f"give --calibration FILE with lenses.lens0 to lenses.lens{len(pairs[0]) - 1}"
+        )
     looks = [decode_pair(pairs[f], size, gray=True) for f in rows]
     front_circle, back_circle = _given_circles(circles, size) or _found_circles(
         folder, pairs[0], looks
@@ -212,6 +204,27 @@ def lenses_of(
         "" if overlap.scale is None else "; degrees by both lenses' overlap at the seam",
     )
     return scaled((front, behind[overlap.turn]), scale), True
+
+
+def _calibrated(
+    folder: Path, chosen: Sequence[Sequence[Path]], size: tuple[int, int], calibration: Path
+) -> tuple[Rig, bool]:
+    """Lenses of a calibration, of a pair checked by the pictures.
+
+    Args:
+        chosen: files of some frames, as for `decode_pair`.
+
+    Raises:
+        GsbaError: it is of other pictures or of another number of lenses.
+    """
+    known, num = scaled_to_size(read_calibration(calibration), size, calibration), len(chosen[0])
+    if len(known) != num:
+        raise GsbaError(
+            f"{calibration}: calibrates {len(known)} lenses, but {folder} has pictures of {num}"
+        )
+    if num > 2:
+        return known, False
+    return _checked_calibration(folder, (known[0], known[-1]), chosen, size, calibration)
 
 
 def _checked_calibration(

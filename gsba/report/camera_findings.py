@@ -52,14 +52,14 @@ def of_camera(
         "gain_of_unseen_parts": centres.part_gains,
     }
     notes, baseline, many = [], settings.baseline(), centres.lenses.num_lenses
-    if many > 2:
-        content["lens_centres"] = scale * all_centres(centres.found)
+    content |= {"lens_centres": scale * all_centres(centres.found)} if many > 2 else {}
     if not centres.lenses:
         if baseline is not None:
             notes.append(f"two lenses were not found: no scale by the baseline: {centres.reason}")
         return content, notes
-    which = "the two lenses" if many == 2 else f"of {many} lenses the first two"
-    notes.append(f"{which} are {length:.5g} map units apart (sigma {sigma:.1g})")
+    notes.append(
+        f"the {'two' if many == 2 else 'first two'} lenses are {length:.5g} map units apart (sigma {sigma:.1g})"
+    )
     if baseline is not None:
         metres, of_metres = metres_per_unit((length, sigma), baseline)
         content |= {"metres_per_unit": metres, "metres_per_unit_sigma": of_metres}
