@@ -255,14 +255,9 @@ class CameraSettings(_Settings):
         if self.lens_yaws_deg is None:
             return self
         yaws = sorted(yaw % 360 for yaw in self.lens_yaws_deg)
-        gaps = [
-            after - before for before, after in pairwise([*yaws, *(yaw + 360 for yaw in yaws[:1])])
-        ]
+        gaps = [after - before for before, after in pairwise([*yaws, *(y + 360 for y in yaws[:1])])]
         if len(yaws) < 2 or not (min(gaps) >= 10 and max(gaps) <= _MAX_LENS_GAP_DEG):
-            raise ValueError(
-                "lens_yaws_deg are degrees from the panorama's middle to the right of two lenses "
-                "or more, 10 to 190 degrees apart, e.g. [0, 120, 240]"
-            )
+            raise ValueError("lens_yaws_deg: give the lenses' angles, e.g. [0, 120, 240]")
         if self.sweep is not None:
             raise ValueError("sweep is for two lenses, front and back: leave lens_yaws_deg out")
         return self

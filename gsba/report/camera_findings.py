@@ -47,19 +47,17 @@ def of_camera(
         "reason": centres.reason,
         "front_lens": scale * centres.found[:3],
         "front_lens_sigmas": scale * np.sqrt(np.diagonal(centres.covariance))[:3],
+        "lens_centres": scale * all_centres(centres.found),
         "baseline": length,
         "baseline_sigma": sigma,
         "gain_of_unseen_parts": centres.part_gains,
     }
-    notes, baseline, many = [], settings.baseline(), centres.lenses.num_lenses
-    content |= {"lens_centres": scale * all_centres(centres.found)} if many > 2 else {}
+    notes, baseline = [], settings.baseline()
     if not centres.lenses:
         if baseline is not None:
             notes.append(f"two lenses were not found: no scale by the baseline: {centres.reason}")
         return content, notes
-    notes.append(
-        f"the {'two' if many == 2 else 'first two'} lenses are {length:.5g} map units apart (sigma {sigma:.1g})"
-    )
+    notes.append(_baseline_note(centres, length, sigma))
     if baseline is not None:
         metres, of_metres = metres_per_unit((length, sigma), baseline)
         content |= {"metres_per_unit": metres, "metres_per_unit_sigma": of_metres}
@@ -129,6 +127,11 @@ def of_lenses(
         "other runs of this camera use calibration.json"
     )
     return content, notes
+
+
+def _baseline_note(centres: LensCentres, length: float, sigma: float) -> str:
+    which = "two" if centres.lenses.num_lenses == 2 else "first two"
+    return f"the {which} lenses are {length:.5g} map units apart (sigma {sigma:.1g})"
 
 
 def _scale_note(metres: float, sigma: float, baseline: float) -> str:
