@@ -55,18 +55,29 @@ class BlockCholesky:
 
     Multifrontal over supernodes (Duff and Reid, 1983), so that dense kernels of BLAS and LAPACK do
     the arithmetic, however many blocks fill in.
+
+    Attributes:
+        complement: (6 K, 6 K) the Schur complement of the system on the blocks that were kept, in
+            the lower triangle; after `factorize`.
     """
 
-    def __init__(self, num_blocks: int, pairs: np.ndarray) -> None:
+    def __init__(self, num_blocks: int, pairs: np.ndarray, num_kept: int = 0) -> None:
         """Choose an elimination order (minimum degree) and find the fill.
 
         Args:
             num_blocks: N block rows.
             pairs: (P, 2) int, i < j, distinct: where off-diagonal blocks may be nonzero.
+            num_kept: K blocks, the last ones, that are not eliminated: `factorize` then leaves
+                their Schur complement, and `reduced` and `substituted` replace `solve`.
         """
-        self.num_blocks = num_blocks
+        self.num_blocks, self.num_kept = num_blocks, num_kept
+        self.complement = _nothing()
         pairs = np.asarray(pairs, dtype=np.int64).reshape(-1, 2)
-        runs = find_supernodes(num_blocks, pairs)
+        pattern = pairs
+        if num_kept:
+            clique = np.column_stack(np.triu_indices(num_kept, 1)) + (num_blocks - num_kept)
+            pattern = np.unique(np.concatenate([pairs, clique]), axis=0)
+        runs = find_supernodes(num_blocks, pattern, num_kept)
         self.order = runs.order  # elimination place -> block
         self._place = np.empty(num_blocks, dtype=np.int64)
         self._place[self.order] = np.arange(num_blocks)
@@ -116,6 +127,9 @@ class BlockCholesky:
             _fill(lower, below, blocks, off_diagonal, front.slots, front.places, front.flips)
             for update, above in updates.pop(s, []):
                 _extend(lower, below, rest, update, above)
+            if self.num_kept and s == len(self._fronts) - 1:
+                self.complement = lower
+                break
             lower, failed = potrf(lower, lower=1, clean=1, overwrite_a=1)
             if failed or not np.isfinite(lower[-1, -1]):
                 return False
@@ -128,11 +142,33 @@ class BlockCholesky:
 
     def solve(self, right: np.ndarray) -> np.ndarray:
         """Solve H x = right, both (N, 6)."""
+        return self._backward(self._forward(right))
+
+    def reduced(self, right: np.ndarray) -> np.ndarray:
+        """Right side (K, 6) of the complement's system, given that of the whole one, (N, 6)."""
+        return self._forward(right).reshape(-1, DIM)[self.num_blocks - self.num_kept :]
+
+    def substituted(self, right: np.ndarray, kept: np.ndarray) -> np.ndarray:
+        """Solve H x = right, both (N, 6), given x at the blocks that were kept, (K, 6)."""
+        x = self._forward(right)
+        x[DIM * (self.num_blocks - self.num_kept) :] = kept.ravel()
+        return self._backward(x)
+
+    @property
+    def _eliminated(self) -> list[_Front]:
+        return self._fronts[:-1] if self.num_kept else self._fronts
+
+    def _forward(self, right: np.ndarray) -> np.ndarray:
+        """L^-1 right (6 N,), by elimination place."""
         x = right[self.order].ravel()
-        for front in self._fronts:
+        for front in self._eliminated:
             x[front.own] = trsv(front.lower, x[front.own], lower=1)
             x[front.under] -= front.below @ x[front.own]
-        for front in reversed(self._fronts):
+        return x
+
+    def _backward(self, x: np.ndarray) -> np.ndarray:
+        """L^-T x (N, 6), by block, of x (6 N,) by elimination place, which changes."""
+        for front in reversed(self._eliminated):
             rest = x[front.own] - front.below.T @ x[front.under]
             x[front.own] = trsv(front.lower, rest, lower=1, trans=1)
         out = np.empty((self.num_blocks, DIM))

@@ -69,8 +69,7 @@ class ReducedSystem(ABC):
 
     def solve(self, damping: float) -> np.ndarray | None:
         """Step (N, 6) of the system damped by `damping` times its diagonal; None if singular."""
-        curvature = np.einsum("nii->ni", self._diagonal)
-        added = damping * np.maximum(curvature, _MIN_DIAGONAL)
+        added = damping_of(self._diagonal, damping)
         found = self._step(added)
         if found is None:
             return None
@@ -103,6 +102,12 @@ class ReducedSystem(ABC):
         for block, rows in zip(layout.blocks, layout.block_rows, strict=True):
             cost += block.propose(values, steps[rows])
         return cost
+
+    def accept(self, values: gtsam.Values) -> None:
+        """Keep the inner variables of the last proposal, and renew what depends on `values`."""
+        for block in self._layout.blocks:
+            block.accept()
+            block.refresh(values)
 
     def costs(self, values: gtsam.Values) -> dict[str, float]:
         """Cost of each family at accepted values."""
@@ -200,6 +205,11 @@ class ReducedSystem(ABC):
         np.add.at(self._diagonal, (block_i[same], offset_i[same], offset_j[same]), x[same])
         slots = np.searchsorted(self._codes, block_i[upper] * layout.num + block_j[upper])
         np.add.at(self._off_diagonal, (slots, offset_i[upper], offset_j[upper]), x[upper])
+
+
+def damping_of(diagonal: np.ndarray, damping: float) -> np.ndarray:
+    """What a damping of part `damping` adds (N, 6) to the diagonal of blocks (N, 6, 6)."""
+    return damping * np.maximum(np.einsum("nii->ni", diagonal), _MIN_DIAGONAL)
 
 
 @_kernel

@@ -23,7 +23,7 @@ class Supernodes:
     parents: np.ndarray  # (S,) run that receives the update of each, -1 = none
 
 
-def find_supernodes(num: int, pairs: np.ndarray) -> Supernodes:
+def find_supernodes(num: int, pairs: np.ndarray, num_kept: int = 0) -> Supernodes:
     """Order a symmetric pattern by minimum degree and find the supernodes of its factor.
 
     Liu, "The role of elimination trees in sparse factorization", 1990; runs are relaxed as in
@@ -32,12 +32,16 @@ def find_supernodes(num: int, pairs: np.ndarray) -> Supernodes:
     Args:
         num: N rows.
         pairs: (P, 2) int, i < j, distinct: entries off the diagonal.
+        num_kept: K rows, the last ones, that come last in the order, as they are, and are a
+            supernode of their own; `pairs` must pair each with each.
     """
-    order = _minimum_degree(num, pairs)
+    order, cut = _minimum_degree(num, pairs), num - num_kept
+    if num_kept:
+        order = np.concatenate([order[order < cut], np.arange(cut, num)])
     order = order[_postorder(_tree(*_upper(num, pairs, order)))]
     starts, columns = _upper(num, pairs, order)
-    firsts, rows = _fundamental(starts, columns)
-    return Supernodes(order, *_relaxed(firsts, rows, num))
+    firsts, rows = _fundamental(starts, columns, cut)
+    return Supernodes(order, *_relaxed(firsts, rows, num, cut))
 
 
 def _minimum_degree(num: int, pairs: np.ndarray) -> np.ndarray:
@@ -122,8 +126,13 @@ def _postorder(parents):
     return out
 
 
-def _fundamental(starts: np.ndarray, columns: np.ndarray) -> tuple[list[int], list[np.ndarray]]:
-    """First columns of the runs of a postordered pattern, and the rows below each run's end."""
+def _fundamental(
+    starts: np.ndarray, columns: np.ndarray, cut: int
+) -> tuple[list[int], list[np.ndarray]]:
+    """First columns of the runs of a postordered pattern, and the rows below each run's end.
+
+    A run starts at column `cut`, whatever is before it.
+    """
     num = len(starts) - 1
     firsts: list[int] = []
     rows: list[np.ndarray] = []  # of each run so far; of the last one from its last column on
@@ -135,7 +144,8 @@ def _fundamental(starts: np.ndarray, columns: np.ndarray) -> tuple[list[int], li
             merged = handed[0][1:]
         else:
             merged = np.unique(np.concatenate([own, *(rest[1:] for rest in handed)]))
-        if firsts and len(rows[-1]) and rows[-1][0] == k and len(merged) == len(rows[-1]) - 1:
+        joins = firsts and k != cut and len(rows[-1]) and rows[-1][0] == k
+        if joins and len(merged) == len(rows[-1]) - 1:
             rows[-1] = merged
         else:
             firsts.append(k)
@@ -146,13 +156,16 @@ def _fundamental(starts: np.ndarray, columns: np.ndarray) -> tuple[list[int], li
 
 
 def _relaxed(
-    firsts: list[int], rows: list[np.ndarray], num: int
+    firsts: list[int], rows: list[np.ndarray], num: int, cut: int
 ) -> tuple[np.ndarray, tuple[np.ndarray, ...], np.ndarray]:
-    """Starts, rows and parents of runs, small ones absorbed by the next if few zeros arise."""
+    """Starts, rows and parents of runs, small ones absorbed by the next if few zeros arise.
+
+    The run that starts at column `cut` absorbs none.
+    """
     kept: list[tuple[int, int, np.ndarray, int]] = []  # first, end, rows, zeros
     for first, end, below in zip(firsts, [*firsts[1:], num], rows, strict=True):
         zeros = 0
-        while kept:
+        while kept and first != cut:
             start, stop, under, hidden = kept[-1]
             if not len(under) or not first <= under[0] < end:
                 break

@@ -5,13 +5,13 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
+from typing import Protocol
 
 import gtsam
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from factors import Block
-from factors.reduced_camera_system import ReducedSystem
 from factors.system_choice import reduced_system
 from gsba.config import SolverSettings
 from gsba.log import GsbaError
@@ -84,7 +84,42 @@ class _History:
         self.since = time.perf_counter()
 
 
-@threadpool_limits.wrap(limits=1, user_api="blas")  # sums keep their order, fronts are small
+class System(Protocol):
+    """Normal equations that `minimize` solves again and again, wherever they lie.
+
+    It calls `linearize` at accepted values; then any number of `solve`, `retract` and `propose`, of
+    which the last is followed by `accept` if its values are accepted.
+    """
+
+    def linearize(self, values: gtsam.Values) -> dict[str, float]:
+        """Model of the cost at accepted values; returns the cost of each family."""
+        ...
+
+    def solve(self, damping: float) -> np.ndarray | None:
+        """Step (N, 6) of the system damped by `damping` times its diagonal; None if singular."""
+        ...
+
+    def retract(self, values: gtsam.Values, steps: np.ndarray) -> gtsam.Values:
+        """Values moved by steps (N, 6)."""
+        ...
+
+    def propose(self, values: gtsam.Values, steps: np.ndarray) -> float:
+        """Total cost at tentative values, `steps (N, 6)` from the linearization point."""
+        ...
+
+    def predicted_decrease(self) -> float:
+        """Decrease of the cost that the undamped model predicts for the last step."""
+        ...
+
+    def accept(self, values: gtsam.Values) -> None:
+        """Keep the values of the last proposal, and what moved along with them."""
+        ...
+
+    def costs(self, values: gtsam.Values) -> dict[str, float]:
+        """Cost of each family at accepted values."""
+        ...
+
+
 def optimize(
     graph: gtsam.NonlinearFactorGraph,
     blocks: Sequence[Block],
@@ -109,7 +144,21 @@ def optimize(
     settings = settings or SolverSettings()
     for block in blocks:
         block.refresh(values)
-    system = reduced_system(graph, blocks, values)
+    return minimize(reduced_system(graph, blocks, values), values, settings, callback)
+
+
+@threadpool_limits.wrap(limits=1, user_api="blas")  # sums keep their order, fronts are small
+def minimize(
+    system: System,
+    values: gtsam.Values,
+    settings: SolverSettings,
+    callback: Callable[[Iteration, gtsam.Values], None] | None = None,
+) -> OptimizeResult:
+    """Minimize the cost of a system by Levenberg-Marquardt: `optimize`, of any system.
+
+    Raises:
+        GsbaError: the cost at the start is not finite.
+    """
     history = _History(callback)
 
     def result(converged: bool, reason: str) -> OptimizeResult:
@@ -132,9 +181,7 @@ def optimize(
             if not damping.raised():
                 return result(False, "no damping gives a good step")
             continue
-        for block in blocks:
-            block.accept()
-            block.refresh(trial)
+        system.accept(trial)
         values, decrease = trial, cost - trial_cost
         damping.lower(decrease / predicted if predicted > 0 else 1.0)
         converged = decrease <= negligible and used <= _FREE_DAMPING
@@ -147,7 +194,7 @@ def optimize(
 
 
 def _attempt(
-    system: ReducedSystem, values: gtsam.Values, damping: float
+    system: System, values: gtsam.Values, damping: float
 ) -> tuple[gtsam.Values, float, float]:
     """Values after one damped step, their cost and the decrease that the model expected."""
     steps = system.solve(damping)

@@ -117,3 +117,22 @@ def test_conjugate_gradients_reach_the_solution_and_say_what_is_left() -> None:
 def flat(x: np.ndarray) -> np.ndarray:
     """Vectors (6 N, R) of (N, 6, R)."""
     return x.reshape(-1, x.shape[2])
+
+
+@pytest.mark.parametrize("num_kept", [1, 3])
+@pytest.mark.parametrize("pattern", [name for name, (num, _) in PATTERNS.items() if num > 3])
+def test_blocks_that_are_kept_get_the_schur_complement(pattern: str, num_kept: int) -> None:
+    system = System(pattern)
+    cut = system.num - num_kept
+    cholesky = BlockCholesky(system.num, system.pairs, num_kept)
+    assert cholesky.factorize(system.diagonal, system.off_diagonal)
+    H, right = system.matrix, system.right.ravel()
+    inner, outer = slice(0, 6 * cut), slice(6 * cut, None)
+    across = np.linalg.solve(H[inner, inner], H[inner, outer]).T
+    expected = H[outer, outer] - across @ H[inner, outer]
+    np.testing.assert_allclose(np.tril(cholesky.complement), np.tril(expected), atol=1e-11)
+    reduced = cholesky.reduced(system.right)
+    np.testing.assert_allclose(reduced.ravel(), right[outer] - across @ right[inner], atol=1e-12)
+    solution = np.linalg.solve(H, right).reshape(-1, 6)
+    found = cholesky.substituted(system.right, solution[cut:])
+    np.testing.assert_allclose(found, solution, atol=1e-13)
