@@ -114,6 +114,19 @@ class LandmarkBlock:
         out[self._point_order] = self._points
         return out
 
+    @property
+    def point_costs(self) -> np.ndarray:
+        """(J,) float64, robust cost of each landmark at the last linearization, in the order that
+        landmarks were given."""
+        out = np.empty_like(self._point_costs)
+        out[self._point_order] = self._point_costs
+        return out
+
+    def restore(self, values: gtsam.Values, point_costs: np.ndarray) -> None:
+        """Take up the linearization of an equal block: at `values`, with these `point_costs`."""
+        self._poses = pose_rows(values, self.keys)
+        self._point_costs = np.asarray(point_costs, np.float64)[self._point_order]
+
     def refresh(self, values: gtsam.Values) -> None:
         """Do nothing: no data depend on accepted values."""
 

@@ -1,0 +1,282 @@
+"""A synthetic city solved in parts, beside the same solver undivided.
+
+    python -m benchmarks.large solve 100000 --out WORK [--part 1000] [--workers 2] [--kill 20]
+    python -m benchmarks.large whole 20000 --out WORK
+    python -m benchmarks.large compare WORK OTHER
+
+`solve` streams the city to WORK/map and solves it there; called again, it goes on where it was
+stopped. `whole` holds all of it and solves it by one factorization. Both print a line for each
+attempt, and write WORK/poses.npy and WORK/figures.json. `--kill` kills a worker every so many
+seconds. `compare` prints how far costs and poses differ.
+"""
+
+import argparse
+import json
+import os
+import random
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import X
+
+from benchmarks.city import City, make_city
+from factors import BearingTerm, LandmarkBlock, RobustLoss
+from factors.direct_system import DirectSystem
+from factors.system_layout import SystemLayout
+from gsba.bundle.optimizer import OptimizeResult, minimize
+from gsba.config import SolverSettings
+from gsba.parts.divided_system import optimize_divided
+from gsba.parts.folder import PartsWriter, Sightings, values_at
+from gsba.store.shards import Job, Spent, Threads, Workers
+
+LOSS_SIGMAS = 2.0
+
+
+@dataclass
+class Counted:
+    """Workers, and what they and the caller wrote to each other."""
+
+    workers: Workers
+    scratch: Path | None
+    traffic: int = 0  # bytes
+    largest: int = 0  # bytes on disk below `folder` after a pass
+    folder: Path = field(default_factory=Path)
+
+    def map_shards(self, job: Job[Any]) -> Iterator[Any]:
+        """See `gsba.store.shards.Workers`."""
+        yield from self.workers.map_shards(job)
+        if self.scratch is not None:
+            self.traffic += size(self.scratch)
+        self.largest = max(self.largest, size(self.folder))
+
+    def spent(self) -> Spent:
+        """See `gsba.store.shards.Workers`."""
+        return self.workers.spent()
+
+    def at_most(self, num: int) -> Workers:
+        """See `gsba.store.shards.Workers`."""
+        return self.workers.at_most(num)
+
+    def must_see(self, paths: Any) -> None:
+        """See `gsba.store.shards.Workers`."""
+        self.workers.must_see(paths)
+
+
+def size(folder: Path) -> int:
+    """Bytes of all files below a folder."""
+    total = 0
+    for path in folder.rglob("*"):
+        with suppress(FileNotFoundError):
+            total += path.stat().st_size
+    return total
+
+
+def peak_mb() -> float:
+    """Peak resident memory of this process."""
+    status = Path("/proc/self/status").read_text()
+    return int(status.split("VmHWM:")[1].split()[0]) / 1024
+
+
+def written(city: City, folder: Path, most: int) -> dict[str, Any]:
+    """Stream a city to the folder of its parts, unless it is there; returns figures."""
+    cpu = time.process_time()
+    writer, observations, points = PartsWriter(folder), 0, 0
+    for sightings, fixes in city.chunks():
+        writer.add(sightings, fixes)
+        observations += len(sightings.frames)
+        points += len(sightings.points_world)
+    index = writer.finish(city.start, most)
+    frames, kept = np.diff(index.starts), index.num_kept
+    return {
+        "points": points,
+        "observations": observations,
+        "write_cpu_s": time.process_time() - cpu,
+        "parts": len(kept),
+        "frames_of_largest_part": int((frames - kept).max()),
+        "cut_frames_of_largest_part": int(kept.max()),
+        "cut_frames": len(index.poses) - int((frames - kept).sum()),
+        "map_mb": size(folder) / 1e6,
+    }
+
+
+@contextmanager
+def hired(num: int, folder: Path, kill_s: float) -> Iterator[tuple[Workers, Callable[[], float]]]:
+    """Workers, and the peak memory of the largest; 0 = this process."""
+    if not num:
+        yield Threads(1), lambda: 0.0
+        return
+    from distributed import Client, LocalCluster
+
+    from gsba.store.cluster import Cluster
+
+    with (
+        LocalCluster(num, threads_per_worker=1, memory_limit=0, dashboard_address=":0") as cluster,
+        Client(cluster) as client,
+    ):
+        ended = threading.Event()
+        killer = threading.Thread(target=_killing, args=(client, kill_s, ended), daemon=True)
+        if kill_s:
+            killer.start()
+        yield (
+            Cluster(client, folder, folder),
+            lambda: max(client.run(peak_mb).values(), default=0.0),
+        )
+        ended.set()
+
+
+def _killing(client: Any, every_s: float, ended: threading.Event) -> None:
+    """Kill one of the workers again and again."""
+    chance = random.Random(0)
+    while not ended.wait(every_s):
+        with suppress(Exception):  # a worker may be starting
+            pid = chance.choice(sorted(client.run(os.getpid).values()))
+            os.kill(pid, signal.SIGKILL)
+            print(f"killed worker process {pid}", flush=True)
+
+
+def solve(options: argparse.Namespace) -> tuple[OptimizeResult, dict[str, Any]]:
+    """Solve a city in parts."""
+    folder, scratch = options.out / "map", options.out / "shards"
+    scratch.mkdir(parents=True, exist_ok=True)
+    figures: dict[str, Any] = {}
+    if not (folder / "index.npz").exists():
+        figures |= written(make_city(options.frames), folder, options.part)
+        print(json.dumps(figures), flush=True)
+        (options.out / "written.json").write_text(json.dumps(figures))
+    figures = json.loads((options.out / "written.json").read_text())
+    figures["peak_mb_after_writing"] = peak_mb()
+    with hired(options.workers, scratch, options.kill) as (workers, peak):
+        counted = Counted(workers, scratch if options.workers else None, folder=options.out)
+        start = time.process_time(), time.perf_counter()
+        result = optimize_divided(
+            folder, counted, settings(options), counted.scratch, Progress(options)
+        )
+        spent = workers.spent()
+        figures |= {
+            "caller_cpu_s": time.process_time() - start[0],
+            "wall_s": time.perf_counter() - start[1],
+            "workers_cpu_s": spent.cpu_seconds,
+            "worker_peak_mb": peak(),
+            "traffic_mb": counted.traffic / 1e6,
+            "disk_mb": counted.largest / 1e6,
+        }
+    return result, figures
+
+
+def whole(options: argparse.Namespace) -> tuple[OptimizeResult, dict[str, Any]]:
+    """Solve a city by one factorization of all frames."""
+    graph, chunks = gtsam.NonlinearFactorGraph(), []
+    city = make_city(options.frames)
+    for sightings, fixes in city.chunks():
+        graph.push_back(fixes)
+        chunks.append(sightings)
+    block = block_of(chunks, options.frames)
+    values = values_at(np.arange(options.frames), city.start)
+    start = time.process_time(), time.perf_counter()
+    system = DirectSystem(SystemLayout(graph, [block], values))
+    result = minimize(system, values, settings(options), Progress(options))
+    return result, {
+        "caller_cpu_s": time.process_time() - start[0],
+        "wall_s": time.perf_counter() - start[1],
+    }
+
+
+def block_of(chunks: list[Sightings], num_frames: int) -> LandmarkBlock:
+    """All observations of a map as one block."""
+    firsts = np.cumsum([0, *(len(chunk.points_world) for chunk in chunks)])
+    term = BearingTerm(
+        np.concatenate([chunk.frames for chunk in chunks]),
+        np.concatenate([c.points + first for c, first in zip(chunks, firsts, strict=False)]),
+        np.concatenate([chunk.bearings_rig for chunk in chunks]),
+        np.concatenate([chunk.sigmas_rad for chunk in chunks]),
+    )
+    points = np.concatenate([chunk.points_world for chunk in chunks])
+    keys = [X(frame) for frame in range(num_frames)]
+    return LandmarkBlock(keys, points, [term], RobustLoss("cauchy", LOSS_SIGMAS), num_threads=1)
+
+
+def settings(options: argparse.Namespace) -> SolverSettings:
+    """Those of all runs."""
+    return SolverSettings(
+        relative_tolerance=options.tolerance, absolute_tolerance=None, loss_sigmas=LOSS_SIGMAS
+    )
+
+
+class Progress:
+    """Prints each attempt."""
+
+    def __init__(self, options: argparse.Namespace) -> None:
+        self._since = time.process_time()
+        self._stop = options.stop_after
+
+    def __call__(self, step: Any, values: gtsam.Values) -> None:
+        now = time.process_time()
+        print(
+            f"attempt {step.number}: cost {step.cost:.12g}, lambda {step.damping:.0e}, "
+            f"accepted {step.accepted}, {step.seconds:.1f} s, CPU here {now - self._since:.1f} s, "
+            f"peak {peak_mb():.0f} MB",
+            flush=True,
+        )
+        self._since = now
+        if self._stop and step.number == self._stop:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+
+def compare(first: Path, other: Path) -> None:
+    """Print how far two solutions differ."""
+    costs = [json.loads((path / "figures.json").read_text())["cost"] for path in (first, other)]
+    a, b = np.load(first / "poses.npy"), np.load(other / "poses.npy")
+    print(
+        f"cost {abs(costs[0] / costs[1] - 1):.1e} of it, rotations {np.abs(a - b)[:, :9].max():.1e}"
+        f", positions {np.abs(a - b)[:, 9:].max():.1e} m, same bytes {np.array_equal(a, b)}"
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    commands = parser.add_subparsers(dest="command", required=True)
+    for name in ("solve", "whole"):
+        command = commands.add_parser(name)
+        command.add_argument("frames", type=int)
+        command.add_argument("--out", type=Path, required=True)
+        command.add_argument("--tolerance", type=float, default=1e-7)
+        command.add_argument("--part", type=int, default=1000)
+        command.add_argument("--workers", type=int, default=0)
+        command.add_argument("--kill", type=float, default=0.0)
+        command.add_argument("--stop-after", type=int, default=0)
+    command = commands.add_parser("compare")
+    command.add_argument("first", type=Path)
+    command.add_argument("other", type=Path)
+    options = parser.parse_args()
+    if options.command == "compare":
+        compare(options.first, options.other)
+        return
+    options.out.mkdir(parents=True, exist_ok=True)
+    result, figures = (solve if options.command == "solve" else whole)(options)
+    truth = make_city(options.frames).truth
+    poses = np.array([result.values.atPose3(X(f)).matrix()[:3] for f in range(options.frames)])
+    rows = np.hstack([poses[:, :, :3].reshape(-1, 9), poses[:, :, 3]])
+    np.save(options.out / "poses.npy", rows)
+    off = np.sqrt(((rows - truth)[:, 9:] ** 2).sum(axis=1).mean())
+    figures |= {
+        "frames": options.frames,
+        "cost": result.cost,
+        "attempts": len(result.history) - 1,
+        "reason": result.reason,
+        "rms_m": float(off),
+        "caller_peak_mb": peak_mb(),
+    }
+    (options.out / "figures.json").write_text(json.dumps(figures, indent=1))
+    print(json.dumps(figures, indent=1))
+
+
+if __name__ == "__main__":
+    main()

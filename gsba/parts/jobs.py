@@ -1,0 +1,207 @@
+"""What is computed of a part where it lies: files in, files out, the same bytes whoever computes.
+
+A version is a number of accepted or tentative poses. `points-V.npz` holds a part's landmarks at a
+version, `equations-V.npz` its normal equations there.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Self
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import X
+
+from factors import BearingTerm, LandmarkBlock, RobustLoss
+from factors.part_system import Condensed, PartElimination, PartEquations, PartSystem
+from factors.system_layout import SystemLayout
+from gsba.parts.folder import Part, deserialized, load, load_part, part_folder, values_at
+from gsba.store.records import save_record
+from gsba.store.shards import even_blocks
+
+
+@dataclass(frozen=True, slots=True)
+class Points:
+    """Landmarks of a part at a version."""
+
+    points_world: np.ndarray  # (J, 3) float64
+    costs: np.ndarray  # (J,) float64, robust cost of each
+
+
+@dataclass(frozen=True, slots=True)
+class Linearized:
+    """What the caller keeps of a part's linearization: about its frames on cuts."""
+
+    costs: Mapping[str, float]  # family -> cost
+    diagonal: np.ndarray  # (K, 6, 6) float64, the part's own share of H, nothing damped
+    gradient: np.ndarray  # (K, 6) float64
+
+
+@dataclass(frozen=True, slots=True)
+class Moved:
+    """A part at tentative poses."""
+
+    cost: float
+    linearized: Linearized  # there
+
+
+@dataclass(frozen=True, slots=True)
+class Reduced:
+    """What a part says of its frames on cuts, at a damping of its own ones."""
+
+    condensed: Condensed | None  # None = its own block is singular
+
+
+@dataclass(frozen=True, slots=True)
+class Substituted:
+    """Steps of a part's own frames."""
+
+    steps: np.ndarray  # (N - K, 6) float64
+    predicted: float  # share of the decrease that the model predicts
+
+
+@dataclass(frozen=True)
+class _PartJob:
+    """A pass over parts; `inputs` has one entry for each of them."""
+
+    folder: Path  # of the map
+    parts: tuple[int, ...]
+    version: int
+
+    def __len__(self) -> int:
+        return len(self.parts)
+
+    def blocks(self) -> Sequence[tuple[int, int]]:
+        """One part for one worker."""
+        return even_blocks(len(self.parts), 1)
+
+    def _file(self, item: int, name: str, version: int) -> Path:
+        return part_folder(self.folder, self.parts[item]) / f"{name}-{version:06d}.npz"
+
+
+@dataclass(frozen=True)
+class Linearize(_PartJob):
+    """Linearizes parts at poses, with the landmarks they have at a version."""
+
+    poses: tuple[np.ndarray, ...]  # (N, 12) rows of each part's frames
+    loss: RobustLoss
+
+    title = "linearizing"
+    returns: Any = Linearized
+
+    def part(self, start: int, stop: int) -> Self:
+        """See `gsba.store.shards.Job`."""
+        chosen = slice(start, stop)
+        return replace(self, parts=self.parts[chosen], poses=self.poses[chosen])
+
+    def __call__(self, item: int) -> Linearized:
+        part = load_part(self.folder, self.parts[item])
+        points = part.sightings.points_world
+        if self.version:
+            points = load(self._file(item, "points", self.version), Points).points_world
+        block, graph = _block(part, points, self.loss), deserialized(part.graph)
+        values = values_at(part.frames, self.poses[item])
+        linearized, equations = _linearized(part, block, graph, values)
+        save_record(self._file(item, "equations", self.version), equations, {})
+        points = Points(block.points_world, block.point_costs)
+        save_record(self._file(item, "points", self.version), points, {})
+        return linearized
+
+
+@dataclass(frozen=True)
+class Move(_PartJob):
+    """Moves parts from a version to another one, and linearizes them there."""
+
+    to: int  # version
+    before: tuple[np.ndarray, ...]  # (N, 12) rows of each part's frames at the version
+    poses: tuple[np.ndarray, ...]  # (N, 12) at the other one
+    steps: tuple[np.ndarray, ...]  # (N, 6) between
+    loss: RobustLoss
+
+    title = "moving"
+    returns: Any = Moved
+
+    def part(self, start: int, stop: int) -> Self:
+        """See `gsba.store.shards.Job`."""
+        chosen = slice(start, stop)
+        return replace(
+            self,
+            parts=self.parts[chosen],
+            before=self.before[chosen],
+            poses=self.poses[chosen],
+            steps=self.steps[chosen],
+        )
+
+    def __call__(self, item: int) -> Moved:
+        part = load_part(self.folder, self.parts[item])
+        points = load(self._file(item, "points", self.version), Points)
+        block, graph = _block(part, points.points_world, self.loss), deserialized(part.graph)
+        block.restore(values_at(part.frames, self.before[item]), points.costs)
+        values = values_at(part.frames, self.poses[item])
+        cost = block.propose(values, self.steps[item])
+        if graph.size():
+            cost += graph.error(values)
+        block.accept()
+        linearized, equations = _linearized(part, block, graph, values)
+        save_record(self._file(item, "equations", self.to), equations, {})
+        moved = Points(block.points_world, block.point_costs)
+        save_record(self._file(item, "points", self.to), moved, {})
+        return Moved(cost, linearized)
+
+
+@dataclass(frozen=True)
+class Eliminate(_PartJob):
+    """Eliminates the own frames of parts."""
+
+    damping: float
+
+    title = "eliminating"
+    returns: Any = Reduced
+
+    def part(self, start: int, stop: int) -> Self:
+        """See `gsba.store.shards.Job`."""
+        return replace(self, parts=self.parts[start:stop])
+
+    def __call__(self, item: int) -> Reduced:
+        equations = load(self._file(item, "equations", self.version), PartEquations)
+        factor = PartElimination(equations, self.damping)
+        return Reduced(factor.condensed() if factor.regular else None)
+
+
+@dataclass(frozen=True)
+class Substitute(_PartJob):
+    """Finds the steps of parts' own frames from those of frames on cuts."""
+
+    damping: float
+    kept: tuple[np.ndarray, ...]  # (K, 6) steps of each part's frames on cuts
+
+    title = "substituting"
+    returns: Any = Substituted
+
+    def part(self, start: int, stop: int) -> Self:
+        """See `gsba.store.shards.Job`."""
+        chosen = slice(start, stop)
+        return replace(self, parts=self.parts[chosen], kept=self.kept[chosen])
+
+    def __call__(self, item: int) -> Substituted:
+        equations = load(self._file(item, "equations", self.version), PartEquations)
+        factor = PartElimination(equations, self.damping)
+        return Substituted(*factor.substituted(self.kept[item]))
+
+
+def _block(part: Part, points_world: np.ndarray, loss: RobustLoss) -> LandmarkBlock:
+    seen = part.sightings
+    term = BearingTerm(seen.frames, seen.points, seen.bearings_rig, seen.sigmas_rad)
+    keys = [X(frame) for frame in part.frames.tolist()]
+    return LandmarkBlock(keys, points_world, [term], loss, num_threads=1)
+
+
+def _linearized(
+    part: Part, block: LandmarkBlock, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values
+) -> tuple[Linearized, PartEquations]:
+    system = PartSystem(SystemLayout(graph, [block], values))
+    costs = system.linearize(values)
+    equations = system.equations(part.num_kept)
+    kept = slice(len(part.frames) - part.num_kept, None)
+    return Linearized(costs, equations.diagonal[kept], equations.gradient[kept]), equations
