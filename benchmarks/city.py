@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import X
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from gsba.parts.folder import Sightings
@@ -44,13 +44,13 @@ class City:
 
     def chunks(self) -> Iterator[tuple[Sightings, gtsam.NonlinearFactorGraph]]:
         """Landmarks and GPS fixes, those of some frames at a time."""
-        tree = cKDTree(self.truth[:, [9, 11]])
+        tree = KDTree(self.truth[:, [9, 11]])
         for first in range(0, len(self.truth), _HOSTS):
             hosts = np.arange(first, min(first + _HOSTS, len(self.truth)))
             rng = np.random.default_rng([self.seed, first])
             yield self._seen(hosts, tree, rng), self._fixes(hosts, rng)
 
-    def _seen(self, hosts: np.ndarray, tree: cKDTree, rng: np.random.Generator) -> Sightings:
+    def _seen(self, hosts: np.ndarray, tree: KDTree, rng: np.random.Generator) -> Sightings:
         """Points on facades beside frames, and all frames that see them."""
         hosts = np.repeat(hosts, _POINTS_A_FRAME)
         num = len(hosts)
@@ -133,7 +133,7 @@ def _wandering(num: int, rng: np.random.Generator) -> np.ndarray:
 
     keep = np.exp(-1 / _DRIFT_FRAMES)
     steps = np.sqrt(1 - keep**2) * rng.normal(size=(num, 6))
-    return lfilter([1.0], [1.0, -keep], steps, axis=0)
+    return np.asarray(lfilter([1.0], [1.0, -keep], steps, axis=0))
 
 
 def _rows(turns: Rotation, positions: np.ndarray) -> np.ndarray:

@@ -119,8 +119,9 @@ def hired(num: int, folder: Path, kill_s: float) -> Iterator[tuple[Workers, Call
 
     with (
         LocalCluster(num, threads_per_worker=1, memory_limit=0, dashboard_address=":0") as cluster,
-        Client(cluster) as client,
+        Client(cluster) as connected,
     ):
+        client: Any = connected  # its methods are typed as coroutines
         ended = threading.Event()
         killer = threading.Thread(target=_killing, args=(client, kill_s, ended), daemon=True)
         if kill_s:

@@ -76,9 +76,7 @@ class PartElimination:
         diagonal += np.swapaxes(np.tril(diagonal, -1), 1, 2)
         rows, columns = np.triu_indices(num, 1)
         off_diagonal = np.swapaxes(lower[columns, :, rows, :], 1, 2).copy()
-        return Condensed(
-            diagonal, off_diagonal, -self._cholesky.reduced(-self._equations.gradient)
-        )
+        return Condensed(diagonal, off_diagonal, -self._cholesky.reduced(-self._equations.gradient))
 
     def substituted(self, kept: np.ndarray) -> tuple[np.ndarray, float]:
         """Steps (N - K, 6) of the own blocks, given those of the shared ones, (K, 6).

@@ -224,9 +224,8 @@ def _serialized(graph: gtsam.NonlinearFactorGraph) -> np.ndarray:
 
 def _frames_of_factors(graph: gtsam.NonlinearFactorGraph) -> list[set[int]]:
     """Frames that each factor is about."""
-    return [
-        {gtsam.Symbol(key).index() for key in graph.at(i).keys()} for i in range(graph.size())
-    ]
+    keys = [graph.at(i).keys() for i in range(graph.size())]
+    return [{gtsam.Symbol(key).index() for key in of_factor} for of_factor in keys]
 
 
 def _codes_among(frames: set[int]) -> np.ndarray:

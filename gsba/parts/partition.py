@@ -88,7 +88,7 @@ def _bisected(num: int, pairs: np.ndarray, positions: np.ndarray | None) -> np.n
     """Side (N,) of each frame: 0, 1, or 2 on the cut; the smallest cut of some orders' best."""
     tied = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(num, num))
     best = None
-    for order in _orders((tied + tied.T).tocsr(), positions):
+    for order in _orders(num, (tied + tied.T).tocsr(), positions):
         sides = _cut(order, pairs)
         size = np.count_nonzero(sides == 2)
         if best is None or size < np.count_nonzero(best == 2):
@@ -97,11 +97,11 @@ def _bisected(num: int, pairs: np.ndarray, positions: np.ndarray | None) -> np.n
     return best
 
 
-def _orders(tied: csr_array, positions: np.ndarray | None) -> list[np.ndarray]:
+def _orders(num: int, tied: csr_array, positions: np.ndarray | None) -> list[np.ndarray]:
     """Orders (N,) of frames along which a cut is looked for."""
     first, _ = breadth_first_order(tied, 0, return_predecessors=True)
     far, _ = breadth_first_order(tied, int(first[-1]), return_predecessors=True)
-    others = np.setdiff1d(np.arange(tied.shape[0]), far)  # what has no tie with these
+    others = np.setdiff1d(np.arange(num), far)  # what has no tie with these
     orders = [np.concatenate([far, others])]
     if positions is not None:
         centred = positions - positions.mean(axis=0)
