@@ -7,6 +7,7 @@ drives of the same street in all of it.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -58,7 +59,8 @@ class City:
         offsets = np.column_stack([aside, rng.uniform(-8, 2, num), rng.uniform(-0.5, 0.5, num)])
         points = _placed(self.truth[hosts], offsets)
         reach = np.abs(aside) + rng.uniform(0.3, 1.5, num)
-        far, near = tree.query(points[:, [0, 2]], k=_MOST)
+        found: tuple[Any, Any] = tree.query(points[:, [0, 2]], k=_MOST)
+        far, near = found
         seen = far < reach[:, None]
         seen &= np.count_nonzero(seen, axis=1)[:, None] > 1
         owners, which = np.nonzero(seen)
