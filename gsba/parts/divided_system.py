@@ -14,15 +14,23 @@ from factors.cholesky import DIM, BlockCholesky
 from factors.reduced_camera_system import damping_of
 from gsba.bundle.optimizer import OptimizeResult, minimize
 from gsba.config import SolverSettings
-from gsba.parts.folder import Index, load, load_index, values_at
-from gsba.parts.jobs import Eliminate, Linearize, Linearized, Move, Substitute
+from gsba.parts.folder import Index, load, load_index, load_part, values_at
+from gsba.parts.jobs import (
+    Eliminate,
+    Linearize,
+    Linearized,
+    Move,
+    Points,
+    Substitute,
+    version_file,
+)
 from gsba.store.records import save_record
 from gsba.store.shards import Job, Workers
 from gsba.types import Iteration
 
 R = TypeVar("R")
 
-_STATE = "state.npz"
+_STATE, _RESULT = "state.npz", "result.npz"
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,6 +174,11 @@ class DividedSystem:
                 total[name] = total.get(name, 0.0) + cost
         return total
 
+    def finish(self, values: gtsam.Values) -> None:
+        """Note that the solution ended at these values, with the landmarks of this version."""
+        state = State(self._version, self._pose_rows(values), np.nan)
+        save_record(self._folder / _RESULT, state, {})
+
     @property
     def _all(self) -> tuple[int, ...]:
         return tuple(range(len(self._frames)))
@@ -229,4 +242,21 @@ def optimize_divided(
     if np.isfinite(start.damping):
         settings = settings.model_copy(update={"lambda_initial": start.damping})
     values = values_at(np.arange(len(start.poses)), start.poses)
-    return minimize(system, values, settings, callback)
+    result = minimize(system, values, settings, callback)
+    system.finish(result.values)
+    return result
+
+
+def read_landmarks(folder: Path, part: int) -> tuple[np.ndarray, np.ndarray]:
+    """The landmarks of a part of a map that `optimize_divided` has solved.
+
+    Returns:
+        (J,) int64, place of each landmark in the stream that the map was written from; (J, 3)
+        float64, world.
+
+    Raises:
+        GsbaError: the map is not solved yet, or a file is damaged.
+    """
+    version = load(folder / _RESULT, State).version
+    points = load(version_file(folder, part, "points", version), Points).points_world
+    return load_part(folder, part).numbers, points

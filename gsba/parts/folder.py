@@ -98,7 +98,7 @@ def load(path: Path, returns: type[T]) -> T:
     try:
         return load_record(path, returns)
     except RecordError as error:
-        raise GsbaError(f"{error}: write the parts of this map again") from error
+        raise GsbaError(f"{error}: write and solve the parts of this map again") from error
 
 
 class PartsWriter:

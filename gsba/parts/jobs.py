@@ -61,9 +61,14 @@ class Substituted:
     predicted: float  # share of the decrease that the model predicts
 
 
+def version_file(folder: Path, part: int, name: str, version: int) -> Path:
+    """File `name` of a part at a version."""
+    return part_folder(folder, part) / f"{name}-{version:06d}.npz"
+
+
 @dataclass(frozen=True)
 class _PartJob:
-    """A pass over parts; `inputs` has one entry for each of them."""
+    """A pass over parts; tuples have an entry for each of them."""
 
     folder: Path  # of the map
     parts: tuple[int, ...]
@@ -77,7 +82,7 @@ class _PartJob:
         return even_blocks(len(self.parts), 1)
 
     def _file(self, item: int, name: str, version: int) -> Path:
-        return part_folder(self.folder, self.parts[item]) / f"{name}-{version:06d}.npz"
+        return version_file(self.folder, self.parts[item], name, version)
 
 
 @dataclass(frozen=True)
