@@ -30,7 +30,7 @@ from benchmarks.camera import TIMEOUT_S, case_of, cell, judged, true_camera
 from benchmarks.common import code_digest, digest, kept_row, refine_command, run_row, write_table
 from benchmarks.raw_peer import MODES
 from gsba.camera.calibration import read_calibration
-from gsba.camera.fisheye import Pair, project, rotation_of, unproject
+from gsba.camera.fisheye import Rig, project, rotation_of, unproject
 from gsba.evaluate.trajectory import evaluate
 from gsba.geometry import nearest_rotation, rotation_angle
 from gsba.similarity import similarity
@@ -120,7 +120,7 @@ def in_axes_of(estimate: Trajectory, truth: Trajectory) -> Trajectory:
     return min(both, key=lambda one: evaluate(estimate, one).rpe_rotation_deg.rmse)
 
 
-def lens_errors(found: Pair, truth: Pair) -> dict[str, float]:
+def lens_errors(found: Rig, truth: Rig) -> dict[str, float]:
     """Errors of estimated lenses: larger relative error of the focal length, rotation of the back
     lens against the front one, degrees, and largest error of a direction, degrees."""
     focal = [a.focal / b.focal - 1 for a, b in zip(found, truth, strict=True)]

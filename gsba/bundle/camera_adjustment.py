@@ -45,18 +45,18 @@ class CameraView:
         return replace(self, shown=shown, keypoints=self.camera.lenses.seen(shown))
 
     def terms(
-        self, solved: Solution, noise: float, problem: AdjustmentContext
+        self, solved: Solution, noise: float, context: AdjustmentContext
     ) -> tuple[Terms, Callable[[gtsam.Values], "CameraView"]]:
         """Poses and camera as variables of one graph."""
         camera = self.camera
         if noise <= solved.noise:  # under wide gates next to nothing contradicts a gyro
-            camera = CameraSystem(solved, self.shown, camera, self.timestamps, problem).prepared()
-        unknowns = CameraUnknowns.of(camera, solved.world_T_rigs, self.timestamps, problem)
-        terms = problem.terms(solved)
+            camera = CameraSystem(solved, self.shown, camera, self.timestamps, context).prepared()
+        unknowns = CameraUnknowns.of(camera, solved.world_T_rigs, self.timestamps, context)
+        terms = context.terms(solved)
         terms.values.insert(unknowns.values)
         graph = gtsam.NonlinearFactorGraph(terms.graph)
         graph.push_back(unknowns.graph)
-        poses, maps = solved.world_T_rigs, problem.maps
+        poses, maps = solved.world_T_rigs, context.maps
         graph.push_back(prior_factors.fixed_scale(poses, maps, _SCALE_SIGMA))
         block = unknowns.block(solved.landmarks, self.shown, noise, curved=True)
 
@@ -74,7 +74,7 @@ def solve_with_camera(
     camera: CameraEstimate,
     timestamps: np.ndarray,
     start: Solution,
-    problem: AdjustmentContext,
+    context: AdjustmentContext,
     gates: Sequence[float],
     final: bool = True,
 ) -> tuple[Solution, CameraEstimate]:
@@ -87,12 +87,12 @@ def solve_with_camera(
         shown: keypoints as pictures show them.
         camera: to start from; what it leaves out (a readout, axes, raw lenses) is left out.
         timestamps: (F,) seconds.
-        start, problem, gates, final: see `adjustment.adjust`.
+        start, context, gates, final: see `adjustment.adjust`.
     """
     wide, last = _split(gates)
     view = CameraView.of(shown, camera, timestamps)
-    found, view = adjust_through(view, tracks, start, problem, wide, final)
-    solved = adjust(tracks, view.keypoints, found, problem, last, final)
+    found, view = adjust_through(view, tracks, start, context, wide, final)
+    solved = adjust(tracks, view.keypoints, found, context, last, final)
     return replace(solved, rounds=found.rounds + solved.rounds), view.camera
 
 
@@ -101,7 +101,7 @@ def solve_sighted_with_camera(
     camera: CameraEstimate,
     timestamps: np.ndarray,
     before: Solution,
-    problem: AdjustmentContext,
+    context: AdjustmentContext,
     gates: Sequence[float],
 ) -> tuple[Solution, Keypoints, CameraEstimate]:
     """As `solve_with_camera`, of aligned and former observations, as `adjust_sighted` takes them.
@@ -114,9 +114,9 @@ def solve_sighted_with_camera(
     """
     wide, last = _split(gates)
     view = CameraView.of(sighted.keypoints, camera, timestamps)
-    found, view = adjust_sighted_through(view, sighted, before, problem, wide)
+    found, view = adjust_sighted_through(view, sighted, before, context, wide)
     seen = replace(sighted, keypoints=view.keypoints)
-    solved, keypoints = adjust_sighted(seen, found, problem, last)
+    solved, keypoints = adjust_sighted(seen, found, context, last)
     solved = replace(solved, rounds=found.rounds + solved.rounds)
     return solved, view.with_noise_of(keypoints).shown, view.camera
 

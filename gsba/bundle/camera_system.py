@@ -49,7 +49,7 @@ class CameraSystem:
     shown: Keypoints  # of its observations, as pictures show them
     camera: CameraEstimate  # so far
     timestamps: np.ndarray  # (F,) seconds
-    problem: AdjustmentContext  # priors, loss
+    context: AdjustmentContext  # priors, loss
 
     def prepared(self) -> CameraEstimate:
         """The camera with a decision on the gyro, and the estimated spread of frames' own motion.
@@ -58,7 +58,7 @@ class CameraSystem:
         """
         if self.camera.lenses.readout_motion is None:
             return self.camera
-        camera, turning = self.camera, readout.turning_of(self.camera.lenses, self.problem)
+        camera, turning = self.camera, readout.turning_of(self.camera.lenses, self.context)
         if turning is not None:
             camera = replace(camera, by_gyro=self._agrees(turning.rates))
         system = replace(self, camera=camera)._linearized()
@@ -88,11 +88,11 @@ class CameraSystem:
 
     def _unknowns(self) -> CameraUnknowns:
         poses = self.solved.world_T_rigs
-        return CameraUnknowns.of(self.camera, poses, self.timestamps, self.problem)
+        return CameraUnknowns.of(self.camera, poses, self.timestamps, self.context)
 
     def _linearized(self) -> "_Linearized":
         """At poses and camera as they are, points at their best."""
-        unknowns, terms = self._unknowns(), self.problem.terms(self.solved)
+        unknowns, terms = self._unknowns(), self.context.terms(self.solved)
         terms.values.insert(unknowns.values)
         block = unknowns.block(self.solved.landmarks, self.shown, self.solved.noise, curved=True)
         block.polish(terms.values)
@@ -106,7 +106,7 @@ class CameraSystem:
         Args:
             components: (F,) map of each frame; None = there is one.
         """
-        unknowns, terms = self._unknowns(), self.problem.covariance_terms(self.solved, components)
+        unknowns, terms = self._unknowns(), self.context.covariance_terms(self.solved, components)
         terms.values.insert(unknowns.values)
         block = unknowns.block(self.solved.landmarks, self.shown, self.solved.noise)
         block.polish(terms.values)
@@ -120,7 +120,7 @@ class CameraSystem:
             terms.values,
             list(unknowns.variables.poses),
             DRAWS,
-            self.problem.settings.seed,
+            self.context.settings.seed,
             beside,
         )
         sigmas = {

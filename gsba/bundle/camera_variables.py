@@ -55,7 +55,7 @@ class CameraUnknowns:
     values: gtsam.Values  # of the camera alone
     shared: gtsam.NonlinearFactorGraph  # priors on these, but for frames' own motion
     own: OwnMotion | None  # None = frames are taken at one instant
-    problem: AdjustmentContext
+    context: AdjustmentContext
 
     @classmethod
     def of(
@@ -63,7 +63,7 @@ class CameraUnknowns:
         camera: CameraEstimate,
         world_T_rigs: np.ndarray,
         timestamps: np.ndarray,
-        problem: AdjustmentContext,
+        context: AdjustmentContext,
     ) -> "CameraUnknowns":
         """Variables of what was taken of a camera: the rest stays as it is.
 
@@ -71,7 +71,7 @@ class CameraUnknowns:
             camera: as found so far.
             world_T_rigs: (F, 4, 4) poses, whose velocities frames have while they are read.
             timestamps: (F,) seconds.
-            problem: settings, and a gyro's rates.
+            context: settings, and a gyro's rates.
         """
         lenses, frames = camera.lenses, range(len(world_T_rigs))
         values, graph = gtsam.Values(), gtsam.NonlinearFactorGraph()
@@ -80,7 +80,7 @@ class CameraUnknowns:
         for key, centre in zip(centres, lenses.centres[:-1], strict=True):
             values.insert(key, np.array(centre))
         if lenses.inverse_stitch_radius:
-            if problem.settings.camera.stitch_radius_m is None:
+            if context.settings.camera.stitch_radius_m is None:
                 given["radius"] = N(0)
                 values.insert(N(0), np.array([lenses.inverse_stitch_radius]))
             else:  # metres: in map units it goes with the distance between the lenses
@@ -97,22 +97,22 @@ class CameraUnknowns:
                 _add(values, graph, key, part, spread)
         own = None
         if lenses.readout_motion is not None:
-            velocities = velocities_of(camera, world_T_rigs, timestamps, problem)
+            velocities = velocities_of(camera, world_T_rigs, timestamps, context)
             given |= {"readout": D(0), "velocities": velocities}
             given["motions"] = [W(f) for f in frames]
-            said = problem.settings.camera.readout()
+            said = context.settings.camera.readout()
             values.insert(D(0), np.array([camera.readout_s]))
             if said is not None:
                 model = gtsam.noiseModel.Isotropic.Sigma(1, said[1])
                 graph.add(gtsam.PriorFactorVector(D(0), np.array([said[0]]), model))
-            own = _own_motion(camera, velocities, problem)
+            own = _own_motion(camera, velocities, context)
             for f in frames:
                 values.insert(W(f), np.array(own.values[f]))
         if lenses.axes is not None:
             given["turns"] = [A(f) for f in frames]
             for f in frames:
                 _add(values, graph, A(f), np.zeros(2), np.full(2, lens_axes.TURNS[-1]))
-        return cls(camera, CameraVariables(**given), values, graph, own, problem)
+        return cls(camera, CameraVariables(**given), values, graph, own, context)
 
     @property
     def graph(self) -> gtsam.NonlinearFactorGraph:
@@ -149,13 +149,13 @@ class CameraUnknowns:
             measured, by_pixel = pixels_of(directions, seeing, calibration)
             roots = roots @ by_pixel
         given = tracks.frames, tracks.points, tracks.num_points, measured, roots, seeing, fractions
-        solver = self.problem.settings.solver
+        solver = self.context.settings.solver
         return CameraBlock(
             self.variables,
             sightings_of(*given)[0],
             landmarks.points_world,
             RobustLoss(solver.loss, solver.loss_sigmas),
-            self.problem.num_threads,
+            self.context.num_threads,
             curved=curved,
         )
 
@@ -197,10 +197,10 @@ def velocities_of(
     camera: CameraEstimate,
     world_T_rigs: np.ndarray,
     timestamps: np.ndarray,
-    problem: AdjustmentContext,
+    context: AdjustmentContext,
 ) -> np.ndarray:
     """Velocities (F, 6) of frames, from poses, and from a gyro that is believed."""
-    turning = problem.turning if camera.by_gyro else None
+    turning = context.turning if camera.by_gyro else None
     return readout.velocities(world_T_rigs, timestamps, turning)
 
 
@@ -217,12 +217,12 @@ def keys_of_lenses(num: int) -> list[int]:
 
 
 def _own_motion(
-    camera: CameraEstimate, velocities: np.ndarray, problem: AdjustmentContext
+    camera: CameraEstimate, velocities: np.ndarray, context: AdjustmentContext
 ) -> OwnMotion:
     """Frames' own motion, its rotation held to what a gyro that is believed tells."""
     assert camera.lenses.readout_motion is not None
     beside = camera.lenses.readout_motion - camera.readout_s * velocities
-    sigmas, turning = readout.own_sigmas(camera, velocities), problem.turning
+    sigmas, turning = readout.own_sigmas(camera, velocities), context.turning
     if turning is None or not camera.by_gyro:
         return OwnMotion(beside, sigmas, np.zeros(len(beside), bool), np.inf)
     sigma = max(camera.readout_s * turning.rate_sigma, _LEAST_TURN)

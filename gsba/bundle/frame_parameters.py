@@ -61,7 +61,7 @@ def models_of(
     landmarks: Landmarks,
     keypoints: Keypoints,
     solved: Solution,
-    problem: AdjustmentContext,
+    context: AdjustmentContext,
     by_parameters: Callable[[Weighted], np.ndarray],
 ) -> list[FrameModel]:
     """Models of the robust cost of parts of some points, at a solution's poses.
@@ -70,19 +70,19 @@ def models_of(
         landmarks: points, moved to their best first, and their observations.
         keypoints: where these really point.
         solved: poses, and the noise of observations.
-        problem: families, loss.
+        context: families, loss.
         by_parameters: Jacobian (O, 2, K) of residuals by parameters of their frames.
     """
-    drawn = np.random.default_rng(problem.settings.seed).permutation(landmarks.tracks.num_points)
+    drawn = np.random.default_rng(context.settings.seed).permutation(landmarks.tracks.num_points)
 
     def model(part: int) -> FrameModel:
         some = of_points(landmarks, drawn % PARTS == part)
-        seen = weighted(some, keypoints, solved, problem)
+        seen = weighted(some, keypoints, solved, context)
         by_frame = np.concatenate([seen.by_pose, by_parameters(seen)], axis=2)
         system = without_points(seen, some.tracks, len(solved.world_T_rigs), by_frame)
         return FrameModel(system, seen.curvature)
 
-    with ThreadPoolExecutor(problem.num_threads) as pool:
+    with ThreadPoolExecutor(context.num_threads) as pool:
         return list(pool.map(model, range(PARTS)))
 
 

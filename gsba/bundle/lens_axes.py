@@ -51,7 +51,7 @@ def guess(
     keypoints: Keypoints,
     solved: Solution,
     so_far: Lenses,
-    problem: AdjustmentContext,
+    context: AdjustmentContext,
 ) -> LensAxes:
     """Lenses with axes that explain most with two centres: the rig's, turned ones, or the walk's.
 
@@ -60,7 +60,7 @@ def guess(
         keypoints: of these, as seen from one centre.
         solved: the map's poses, and the noise of its observations.
         so_far: one centre; `band_rad` is kept.
-        problem: loss, settings.
+        context: loss, settings.
     """
     frames = keypoints.frames()
     tried = [replace(so_far, axes=axes) for axes in _candidates(solved.world_T_rigs)]
@@ -74,7 +74,7 @@ def guess(
         return np.concatenate(columns, axis=2)
 
     systems, counts = shared_parameters.models_of(
-        landmarks, _FIRST, keypoints, solved, problem, by_centres
+        landmarks, _FIRST, keypoints, solved, context, by_centres
     )
     if not systems:
         return LensAxes(so_far, np.full(PARTS, np.nan), "too few points", counts)
@@ -95,7 +95,7 @@ def loosened(
     keypoints: Keypoints,
     solved: Solution,
     so_far: Lenses,
-    problem: AdjustmentContext,
+    context: AdjustmentContext,
 ) -> LensAxes:
     """Axes of each frame's own, the rig's yet, if turning them by some points predicts others.
 
@@ -104,9 +104,9 @@ def loosened(
         keypoints: of these, as rays of the lenses so far.
         solved: the map's poses, solved under these, and the noise of its observations.
         so_far: two lenses whose axes are the rig's.
-        problem: loss, settings.
+        context: loss, settings.
     """
-    used = drawn(landmarks, _MOST, problem.settings.seed)
+    used = drawn(landmarks, _MOST, context.settings.seed)
     counts = Counts(len(landmarks.tracks), len(used.tracks), "observations")
     frames, num = keypoints.frames(), len(solved.world_T_rigs)
 
@@ -116,7 +116,7 @@ def loosened(
         by_start = by_origin(seen, rotations, bearings, so_far.inverse_stitch_radius)
         return so_far.by_centre(by_start, bearings, there) @ by_turn(so_far)
 
-    models = models_of(used, keypoints, solved, problem, by_axes)
+    models = models_of(used, keypoints, solved, context, by_axes)
     tried = [validated(models, np.full(2, width)) for width in TURNS]
     verdict = max(tried, key=lambda trial: float(trial.gains.sum()))
     shares = verdict.shares

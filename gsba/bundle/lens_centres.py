@@ -64,7 +64,7 @@ def estimate(
     keypoints: Keypoints,
     solved: Solution,
     so_far: Lenses,
-    problem: AdjustmentContext,
+    context: AdjustmentContext,
 ) -> LensCentres:
     """Find the lenses' centres from a map, poses and points adjusted with them.
 
@@ -73,20 +73,20 @@ def estimate(
         keypoints: of these, as rays under the lenses so far.
         solved: the map's poses, solved under these, and the noise of its observations.
         so_far: centres that the rays start at; `band_rad` is kept.
-        problem: priors, loss, settings.
+        context: priors, loss, settings.
     """
-    chosen = problem.settings.camera
+    chosen = context.settings.camera
     frames = keypoints.frames()
 
     def by_centre(rows: np.ndarray, by_origin: np.ndarray, _: np.ndarray) -> np.ndarray:
         return so_far.by_centre(by_origin, keypoints.bearings_rig[rows], frames[rows])
 
-    systems, counts = models_of(landmarks, _MOST, keypoints, solved, problem, by_centre)
+    systems, counts = models_of(landmarks, _MOST, keypoints, solved, context, by_centre)
     whole = None
     if (
         not systems and so_far.reference_calibration is not None
     ):  # raw pairs are of two, also where frames are few
-        whole = whole_model_of(landmarks, _MOST, keypoints, solved, problem, by_centre)
+        whole = whole_model_of(landmarks, _MOST, keypoints, solved, context, by_centre)
     if not systems and whole is None:
         num = len(so_far.centre)
         unknown, nothing = np.full((num, num), np.nan), np.full(PARTS, np.nan)
@@ -133,7 +133,7 @@ def stitched_for(
     shown: np.ndarray,
     solved: Solution,
     so_far: Lenses,
-    problem: AdjustmentContext,
+    context: AdjustmentContext,
 ) -> StitchRadius:
     """Find the radius that panoramas are stitched for, centres, poses and points adjusted with it.
 
@@ -145,9 +145,9 @@ def stitched_for(
         shown: (N, 3) directions of the keypoints in their pictures.
         solved: the map's poses, solved under these, and the noise of its observations.
         so_far: the lenses.
-        problem: loss, settings.
+        context: loss, settings.
     """
-    said = problem.settings.camera.inverse_stitch_radius(so_far.baseline / 2)
+    said = context.settings.camera.inverse_stitch_radius(so_far.baseline / 2)
     if said is not None:
         reason, unknown = "" if said else "camera.stitch_radius_m says so", np.full(PARTS, np.nan)
         return StitchRadius(replace(so_far, inverse_stitch_radius=said), said, 0.0, unknown, reason)
@@ -159,7 +159,7 @@ def stitched_for(
         by_near = by_inverse_stitch_radius(keypoints.bearings_rig[rows], starts)
         return np.concatenate([so_far.by_centre(by_origin, directions, there), by_near], axis=2)
 
-    systems, _ = models_of(landmarks, _MOST, keypoints, solved, problem, by_both)
+    systems, _ = models_of(landmarks, _MOST, keypoints, solved, context, by_both)
     if not systems:
         return StitchRadius(so_far, 0.0, np.nan, np.full(PARTS, np.nan), "too few points")
     found, total, num = _step(systems), summed(systems), len(so_far.centre)

@@ -55,7 +55,7 @@ def estimate(
     solved: Solution,
     lenses: Lenses,
     timestamps: np.ndarray,
-    problem: AdjustmentContext,
+    context: AdjustmentContext,
 ) -> CameraEstimate:
     """Find how long the readout takes and which way rows are read, frames moving by velocity.
 
@@ -66,11 +66,11 @@ def estimate(
         solved: poses under these, and the noise of observations.
         lenses: read at one instant so far.
         timestamps: (F,) seconds, whose differences give velocities.
-        problem: loss, settings.
+        context: loss, settings.
     """
-    motion = velocities(solved.world_T_rigs, timestamps, turning_of(lenses, problem))
+    motion = velocities(solved.world_T_rigs, timestamps, turning_of(lenses, context))
     offsets = _offsets(landmarks, keypoints, solved) if motion[:, :3].any() else None
-    ways, frames = _ways(problem.settings.camera, lenses), keypoints.frames()
+    ways, frames = _ways(context.settings.camera, lenses), keypoints.frames()
     times = np.stack([lenses.fractions(shown, frames, way) for way in ways], axis=1)
 
     def by_duration(rows: np.ndarray, by_origin: np.ndarray, _: np.ndarray) -> np.ndarray:
@@ -80,7 +80,7 @@ def estimate(
         moved = np.einsum("oij,oj->oi", by_origin, moving)
         return moved[:, :, None] * times[rows, None, :]
 
-    systems, counts = models_of(landmarks, _MOST, keypoints, solved, problem, by_duration)
+    systems, counts = models_of(landmarks, _MOST, keypoints, solved, context, by_duration)
     if not systems:
         return CameraEstimate(lenses, reason="too few points to tell rows apart", counts=counts)
     of_ways = [[part.of(slice(way, way + 1)) for part in systems] for way in range(len(ways))]
@@ -92,7 +92,7 @@ def estimate(
     logger.info("readout: %.2f ms (sigma %.2f)", 1e3 * abs(duration), 1e3 * sigma)
     if not verdict.predicts or abs(duration) < _SIGNIFICANT * sigma:
         return replace(found, reason="motion during the readout does not predict unseen parts")
-    if problem.settings.camera.sweep is not None and duration < 0:
+    if context.settings.camera.sweep is not None and duration < 0:
         return replace(found, reason="rows are read the other way than camera.sweep says")
     readout_motion = abs(duration) * motion
     return replace(
@@ -130,9 +130,9 @@ def _offsets(landmarks: Landmarks, keypoints: Keypoints, solved: Solution) -> np
     return offsets
 
 
-def turning_of(lenses: Lenses, problem: AdjustmentContext) -> GyroConstraints | None:
+def turning_of(lenses: Lenses, context: AdjustmentContext) -> GyroConstraints | None:
     """What a gyro says of the frames' turning; None where a stabiliser took it out of them."""
-    return None if lenses.axes is not None else problem.turning
+    return None if lenses.axes is not None else context.turning
 
 
 def velocities(

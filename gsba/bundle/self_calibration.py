@@ -61,7 +61,7 @@ def estimate(
     shown: np.ndarray,
     solved: Solution,
     so_far: Lenses,
-    problem: AdjustmentContext,
+    context: AdjustmentContext,
     nominal: bool = False,
 ) -> SelfCalibration:
     """Find what lenses are from a map, poses, points and their centre adjusted with them.
@@ -72,7 +72,7 @@ def estimate(
         shown: (N, 3) directions of the keypoints in their panoramas.
         solved: the map's poses, solved under these, and the noise of its observations.
         so_far: lenses of raw pairs.
-        problem: priors, loss, settings.
+        context: priors, loss, settings.
         nominal: whether the lenses so far are plain ones of unknown make, not calibrated.
     """
     frames, num = keypoints.frames(), num_parameters(so_far.num_lenses)
@@ -81,11 +81,11 @@ def estimate(
         own = by_lenses(keypoints.bearings_rig[rows], shown[rows], so_far, residuals)
         return np.concatenate([own, so_far.by_centre(by_origin, shown[rows], frames[rows])], axis=2)
 
-    systems, counts = models_of(landmarks, _MOST, keypoints, solved, problem, by_both)
+    systems, counts = models_of(landmarks, _MOST, keypoints, solved, context, by_both)
     off = from_calibrated(so_far)
     if nominal:
         whole = summed(systems) if systems else None
-        whole = whole or whole_model_of(landmarks, _MOST, keypoints, solved, problem, by_both)
+        whole = whole or whole_model_of(landmarks, _MOST, keypoints, solved, context, by_both)
         if whole is not None:
             return _of_nominal(whole, so_far, off, counts)
     if not systems:

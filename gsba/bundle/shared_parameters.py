@@ -110,10 +110,10 @@ class Weighted:
 
 
 def weighted(
-    landmarks: Landmarks, keypoints: Keypoints, solved: Solution, problem: AdjustmentContext
+    landmarks: Landmarks, keypoints: Keypoints, solved: Solution, context: AdjustmentContext
 ) -> Weighted:
     """Residuals of some points' bearings at a solution's poses, and their Jacobians."""
-    block = landmark_block(landmarks, keypoints, solved.noise, problem)
+    block = landmark_block(landmarks, keypoints, solved.noise, context)
     block.polish(values_of(solved.world_T_rigs))
     tracks, rows = landmarks.tracks, keypoints.rows(landmarks.tracks)
     residuals, by_pose, by_point = bearing_residuals(
@@ -126,7 +126,7 @@ def weighted(
     if keypoints.sqrt_infos is not None:
         roots = keypoints.sqrt_infos[rows]
     whitened = np.einsum("oij,oj->oi", roots, residuals) / solved.noise
-    solver = problem.settings.solver
+    solver = context.settings.solver
     loss = RobustLoss(solver.loss, solver.loss_sigmas)
     squares = np.sum(whitened**2, axis=1)
     weights = loss.weights(squares)
@@ -140,7 +140,7 @@ def models_of(
     most: int,
     keypoints: Keypoints,
     solved: Solution,
-    problem: AdjustmentContext,
+    context: AdjustmentContext,
     by_shared: BySharedParameters,
 ) -> tuple[list[SharedModel], Counts]:
     """Models of the cost of each part of the sequence, by at most so many observations.
@@ -150,13 +150,13 @@ def models_of(
     Returns:
         (PARTS) models, none where there is too little; and how many observations they rest on.
     """
-    used = drawn(landmarks, most, problem.settings.seed)
-    alone = replace(problem, num_threads=1)  # parts run side by side
+    used = drawn(landmarks, most, context.settings.seed)
+    alone = replace(context, num_threads=1)  # parts run side by side
 
     def model(part: Landmarks) -> SharedModel:
         return model_of(part, keypoints, solved, alone, by_shared)
 
-    with ThreadPoolExecutor(problem.num_threads) as pool:
+    with ThreadPoolExecutor(context.num_threads) as pool:
         models = list(pool.map(model, parts_of(used)))
     return models, Counts(len(landmarks.tracks), len(used.tracks), "observations")
 
@@ -166,24 +166,24 @@ def whole_model_of(
     most: int,
     keypoints: Keypoints,
     solved: Solution,
-    problem: AdjustmentContext,
+    context: AdjustmentContext,
     by_shared: BySharedParameters,
 ) -> SharedModel | None:
     """Model of the cost of a sequence that is too short for parts; None = it has no points.
 
     Args: see `models_of`.
     """
-    used = drawn(landmarks, most, problem.settings.seed)
+    used = drawn(landmarks, most, context.settings.seed)
     if not used.tracks.num_points:
         return None
-    return model_of(used, keypoints, solved, problem, by_shared)
+    return model_of(used, keypoints, solved, context, by_shared)
 
 
 def model_of(
     landmarks: Landmarks,
     keypoints: Keypoints,
     solved: Solution,
-    problem: AdjustmentContext,
+    context: AdjustmentContext,
     by_shared: BySharedParameters,
 ) -> SharedModel:
     """Model of the robust cost of some points and their bearings, at a solution's poses.
@@ -192,11 +192,11 @@ def model_of(
         landmarks: points, moved to their best first, and their observations.
         keypoints: where these really point.
         solved: poses, and the noise of observations.
-        problem: families, loss.
+        context: families, loss.
         by_shared: Jacobian (O, 2, K) of bearings' residuals, from the rows (O,) of keypoints, the
             Jacobian (O, 2, 3) by where each ray starts, and the residuals (O, 2).
     """
-    seen = weighted(landmarks, keypoints, solved, problem)
+    seen = weighted(landmarks, keypoints, solved, context)
     by_origin = -seen.by_point @ solved.world_T_rigs[landmarks.tracks.frames, :3, :3]
     num = len(solved.world_T_rigs)
     system = without_points(

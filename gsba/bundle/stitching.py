@@ -68,7 +68,7 @@ def estimate(
     keypoints: Keypoints,
     before: Solution,
     field: SphereField,
-    problem: AdjustmentContext,
+    context: AdjustmentContext,
     lenses: Lenses = ONE_CENTRE,
 ) -> Stitching:
     """Find the field, by cross-validation over parts of the sequence, and solve the map with it.
@@ -83,17 +83,17 @@ def estimate(
         keypoints: the same with the noise they turned out to have.
         before: the map solved with `field`.
         field: so far.
-        problem: priors, limits, loss, solver.
+        context: priors, limits, loss, solver.
         lenses: that see the observations.
     """
-    settings = problem.settings
+    settings = context.settings
     chosen = settings.stitching
     whole = _MOST, chosen.max_degree, chosen.min_gain
     probe = _PROBE[0], min(_PROBE[1], chosen.max_degree), 0.5 * chosen.min_gain
     now = Stitching(field, before, keypoints, 0, np.zeros(PARTS), Counts(0, 0, "observations"))
     systems, spread = [], 0.0
     for most, max_degree, least in [whole] if field else [probe, whole]:
-        systems, counts = _systems(now, most, max_degree, problem, lenses)
+        systems, counts = _systems(now, most, max_degree, context, lenses)
         if not systems:
             return replace(now, counts=counts)
         degree, spread, gains = _choose(systems, max_degree)
@@ -103,12 +103,12 @@ def estimate(
             return now
     for number in range(chosen.rounds):
         if number:
-            systems, _ = _systems(now, _MOST, chosen.max_degree, problem, lenses)
+            systems, _ = _systems(now, _MOST, chosen.max_degree, context, lenses)
         field = SphereField(_fitted(systems, now.degree, spread))
-        straight = corrected(sighted.keypoints, field, problem.rig)
+        straight = corrected(sighted.keypoints, field, context.rig)
         there = replace(sighted, keypoints=lenses.seen(straight))
         gates = settings.rounds.aligned[-1:]
-        solved, found = adjustment.adjust_sighted(there, now.adjustment, problem, gates)
+        solved, found = adjustment.adjust_sighted(there, now.adjustment, context, gates)
         keypoints = with_noise_of(sighted.keypoints, found)
         now = replace(now, field=field, adjustment=solved, keypoints=keypoints)
     logger.info("stitching: %.4f deg rms, degree %d", np.rad2deg(field.rms_rad), now.degree)
@@ -116,12 +116,12 @@ def estimate(
 
 
 def _systems(
-    now: Stitching, most: int, max_degree: int, problem: AdjustmentContext, lenses: Lenses
+    now: Stitching, most: int, max_degree: int, context: AdjustmentContext, lenses: Lenses
 ) -> tuple[list[SharedModel], Counts]:
     """Models of the cost of each part of the sequence; none where there is too little."""
-    there, solved = lenses.seen(corrected(now.keypoints, now.field, problem.rig)), now.adjustment
+    there, solved = lenses.seen(corrected(now.keypoints, now.field, context.rig)), now.adjustment
     by_field = _by_field(now.keypoints, there, max_degree)
-    models, counts = models_of(solved.landmarks, most, there, solved, problem, by_field)
+    models, counts = models_of(solved.landmarks, most, there, solved, context, by_field)
     return [model.around(now.field.coefficients) for model in models], counts
 
 

@@ -64,7 +64,7 @@ def refine(
     frames: FrameSet,
     keypoints: Keypoints,
     start: Solution,
-    problem: AdjustmentContext,
+    context: AdjustmentContext,
     lenses: Lenses = ONE_CENTRE,
 ) -> PhotometricResult:
     """Refine a solved map by the grey values of patches, level after level.
@@ -73,14 +73,14 @@ def refine(
         frames: panoramas; read twice a level, one at a time.
         keypoints: keypoints of all frames.
         start: the solved map.
-        problem: priors, families, loss, solver, patches.
+        context: priors, families, loss, solver, patches.
         lenses: the camera's lenses.
     """
-    solved, counts, settings = start, [], problem.settings
+    solved, counts, settings = start, [], context.settings
     weights, residuals = np.ones(len(frames)), np.full(len(frames), np.nan)
     for level in settings.photometric.levels:
         pixels, trust, found = _patches(
-            frames, solved, level, settings, problem.num_threads, lenses
+            frames, solved, level, settings, context.num_threads, lenses
         )
         counts += found
         if pixels is None:
@@ -88,7 +88,7 @@ def refine(
                 "no patch is observed twice at level %d: nothing is refined there", level
             )
             continue
-        solved, weights, residuals = _solve(pixels, trust, keypoints, solved, problem)
+        solved, weights, residuals = _solve(pixels, trust, keypoints, solved, context)
     return PhotometricResult(solved, tuple(counts), weights, residuals)
 
 
@@ -210,14 +210,14 @@ def _solve(
     trust: np.ndarray,
     keypoints: Keypoints,
     solved: Solution,
-    problem: AdjustmentContext,
+    context: AdjustmentContext,
 ) -> tuple[Solution, np.ndarray, np.ndarray]:
     """The joint solve, repeated once with lower weights of bad frames: weights, residuals.
 
     It is undone if it fits the map's own observations worse than before.
     """
-    settings, num_threads = problem.settings, problem.num_threads
-    chosen, terms = settings.photometric, problem.terms(solved)
+    settings, num_threads = context.settings, context.num_threads
+    chosen, terms = settings.photometric, context.terms(solved)
     values = terms.values
     looser = {"relative_tolerance": chosen.tolerance, "absolute_tolerance": None}
     solver = settings.solver.model_copy(update=looser)
@@ -227,7 +227,7 @@ def _solve(
     for _ in range(2):
         block = make_block(pixels, start.counted * trust, settings, num_threads, noise)
         block.weigh(weights)
-        landmarks = adjustment.landmark_block(solved.landmarks, keypoints, solved.noise, problem)
+        landmarks = adjustment.landmark_block(solved.landmarks, keypoints, solved.noise, context)
         landmarks.polish(values)
         before, fits = landmarks.error(values), _geometric_fits(landmarks, values)
         result = optimize(terms.graph, [landmarks, block, *terms.blocks], values, solver)

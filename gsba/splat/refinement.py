@@ -88,7 +88,7 @@ def refine(
     frames: FrameSet,
     keypoints: Keypoints,
     start: Solution,
-    problem: AdjustmentContext,
+    context: AdjustmentContext,
     further: Sequence[Block] = (),
     checkpoint: Path | None = None,
     key: str = "",
@@ -100,7 +100,7 @@ def refine(
         frames: panoramas or cube faces; all their faces are held in memory, one size at a time.
         keypoints: keypoints of all frames.
         start: the solved map.
-        problem: priors, families, loss, solver, splat; its threads render, too.
+        context: priors, families, loss, solver, splat; its threads render, too.
         further: further blocks of each move, on the same keys.
         checkpoint: file to store finished turns in and to resume from; None = none.
         key: digest of the inputs; a checkpoint with another key is not resumed.
@@ -109,8 +109,8 @@ def refine(
     Raises:
         GsbaError: all frames are masked, or the splat is no longer finite.
     """
-    chosen = problem.settings.splat
-    usable = start.observations() >= problem.settings.rounds.min_observations
+    chosen = context.settings.splat
+    usable = start.observations() >= context.settings.rounds.min_observations
     if np.count_nonzero(usable) <= chosen.held_out_every:
         few = int(np.count_nonzero(usable))
         logger.warning("%d refined frames are too few for a splat to judge poses by", few)
@@ -118,7 +118,7 @@ def refine(
     split = split_frames(usable, chosen.held_out_every)
     dropped = {"held out": len(split.held_out), "unrefined": int(np.count_nonzero(~usable))}
     counts = Counts(len(frames), len(split.training), "frames", dropped)
-    turns = _Turns(keypoints, start, problem, further, split)
+    turns = _Turns(keypoints, start, context, further, split)
     progress = load_checkpoint(checkpoint, key, _Progress, "the splat refinement starts anew")
     if progress is None:
         cloud = _cloud(start.landmarks, keypoints, chosen.sh_degree)
@@ -154,13 +154,13 @@ class _Turns:
         self,
         keypoints: Keypoints,
         solved: Solution,
-        problem: AdjustmentContext,
+        context: AdjustmentContext,
         further: Sequence[Block],
         split: Split,
     ) -> None:
-        self.keypoints, self.solved, self.problem = keypoints, solved, problem
-        self.settings, self.further, self.split = problem.settings, further, split
-        self.backend = choose_backend(self.settings.splat.backend, problem.num_threads)
+        self.keypoints, self.solved, self.context = keypoints, solved, context
+        self.settings, self.further, self.split = context.settings, further, split
+        self.backend = choose_backend(self.settings.splat.backend, context.num_threads)
         self.faces: Faces
         self.held_out: Faces
         self.captured: Captured
@@ -244,7 +244,7 @@ class _Turns:
     ) -> tuple[np.ndarray, OptimizeResult]:
         """Poses after a few joint steps, and the solver's result."""
         settings = self.settings
-        terms = self.problem.terms(replace(self.solved, world_T_rigs=world_T_rigs))
+        terms = self.context.terms(replace(self.solved, world_T_rigs=world_T_rigs))
         values, landmarks = terms.values, self._block()
         landmarks.polish(values)
         near = near_of(world_T_rigs[self.split.training], SplatSettings())
@@ -257,7 +257,7 @@ class _Turns:
     def _block(self) -> LandmarkBlock:
         solved = self.solved
         return adjustment.landmark_block(
-            solved.landmarks, self.keypoints, solved.noise, self.problem
+            solved.landmarks, self.keypoints, solved.noise, self.context
         )
 
     def _point_costs(self, world_T_rigs: np.ndarray) -> np.ndarray:
@@ -299,7 +299,7 @@ class _Turns:
             world_T_rigs,
             self._gate() * self.solved.noise,
             self.settings.triangulate,
-            self.problem.num_threads,
+            self.context.num_threads,
         )
 
     def _gate(self) -> float:
