@@ -32,7 +32,7 @@ from gsba.bundle.families import Families, Family
 from gsba.bundle.fixes import FrameFixes
 from gsba.bundle.gps_factors import AnchoredFixes, GpsFixes, linear_factors
 from gsba.bundle.optimizer import marginal_covariances
-from gsba.bundle.prior_factors import X, values_of
+from gsba.bundle.pose_variables import X, values_of
 from gsba.bundle.trajectory_prior import TrajectoryPrior
 from gsba.camera.rig import CubeRig, owner_faces
 from gsba.config import GpsSettings, RefineSettings

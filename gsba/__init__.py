@@ -14,7 +14,7 @@ from gsba.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from gsba.bundle.families import Family, MapSnapshot
-    from gsba.bundle.prior_factors import X
+    from gsba.bundle.pose_variables import X
     from gsba.config import RefineSettings
     from gsba.config_file import load_config
     from gsba.localization.localizer import LocalizedFrame, Localizer
@@ -50,7 +50,7 @@ _HOMES = {
     "Recording": "gsba.pipeline.recording",
     "RefineSettings": "gsba.config",
     "RunResult": "gsba.pipeline.outputs",
-    "X": "gsba.bundle.prior_factors",
+    "X": "gsba.bundle.pose_variables",
     "load_config": "gsba.config_file",
     "load_run": "gsba.store.finished",
     "refine": "gsba.pipeline.refine",

@@ -90,8 +90,13 @@ def test_what_lies_beside_the_code_is_packed() -> None:
     for package in ("gsba", "factors"):
         for path in (ROOT / package).rglob("*"):
             if path.is_file() and path.suffix not in (".py", ".pyc", ".nbi", ".nbc"):
-                room = ".".join(path.relative_to(ROOT).parts[:-1])
-                assert any(path.match(pattern) for pattern in data.get(room, ())), path
+                owners = path.relative_to(ROOT).parents[:-1]  # the package, or one that it is in
+                patterns = [
+                    f"{owner}/{pattern}"
+                    for owner in owners
+                    for pattern in data.get(".".join(owner.parts), ())
+                ]
+                assert any(path.match(pattern) for pattern in patterns), path
 
 
 def test_the_changelog_opens_with_this_version() -> None:

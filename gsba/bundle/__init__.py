@@ -7,7 +7,7 @@ Gives solutions with their noise and covariances, and the result in the trajecto
 from gsba.bundle.adjustment import AdjustmentContext, adjust, adjust_sighted, pose_covariances
 from gsba.bundle.map_strength import MapStrength
 from gsba.bundle.optimizer import OptimizeResult, optimize
-from gsba.bundle.prior_factors import X
+from gsba.bundle.pose_variables import X
 from gsba.bundle.reconstruction import assemble
 from gsba.bundle.stitching import Stitching
 from gsba.bundle.triangulation import triangulate

@@ -18,11 +18,11 @@ from factors import (
     RobustLoss,
     tangent_basis,
 )
-from gsba.bundle import prior_factors, triangulation
+from gsba.bundle import pose_variables, triangulation
 from gsba.bundle.families import Families, FamilyTerms
 from gsba.bundle.gyro_turns import GyroTurns
 from gsba.bundle.optimizer import marginal_covariances, optimize
-from gsba.bundle.prior_factors import poses_of, values_of
+from gsba.bundle.pose_variables import poses_of, values_of
 from gsba.camera.rig import RIG_R_FACE, CubeRig
 from gsba.config import RefineSettings, SolverSettings
 from gsba.types import (
@@ -38,15 +38,17 @@ from gsba.types import (
 
 logger = logging.getLogger(__name__)
 
-_LEAST = 1e-3  # times its claimed sigma: no observation is better than that
-_WIDE = 20.0  # gate in sigmas for observations whose noise is not known yet
-DRAWS = 500  # errors of all poses, that tell how those of different ones belong together
-_AT_ONCE = 1 << 18  # observations whose residuals are found together
-_REDUNDANT = 0.1  # least share of residual dimensions left over by the poses
-_FLAT = 1e-12  # of the information of a point, beside it: one that rays leave open has no inverse
+_MIN_NOISE_RATIO = 1e-3  # least noise of an observation over its claimed sigma
+_UNKNOWN_NOISE_GATE = 20.0  # gate in sigmas for observations whose noise is not known yet
+DRAWS = 500  # errors drawn of all poses, from which joint covariances are computed
+_BATCH = 1 << 18  # observations whose residuals are computed together
+_MIN_REDUNDANCY = 0.1  # least share of residual dimensions beyond the unknowns
+_MIN_INFORMATION_SHARE = (
+    1e-12  # of a point's information, added to it: without depth it is singular
+)
 _DRIFT_DAMPING, _DRIFT_TOLERANCE = 1e-9, 1e-7  # first damping and relative tolerance of adjustments
 # with a family that limits drift
-_LEAST_LEFT = 1e-3  # share of a residual that a point leaves over, or it says nothing of noise
+_MIN_RESIDUAL_SHARE = 1e-3  # least share of a residual that its point cannot absorb
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +96,7 @@ class AdjustmentContext:
         """
         own = self.families.covariance_terms(solved, self.maps)
         graph, values = gtsam.NonlinearFactorGraph(own.graph), values_of(solved.world_T_rigs)
-        graph.push_back(prior_factors.fixed_scale(solved.world_T_rigs, maps))
+        graph.push_back(pose_variables.fixed_scale(solved.world_T_rigs, maps))
         values.insert(own.values)
         return Terms(graph, own.blocks, values, own)
 
@@ -189,12 +191,13 @@ def rescale_noise(sighted: Sighted, before: Solution, settings: RefineSettings) 
     """
     tracks, keypoints = sighted.tracks, sighted.keypoints
     poses = before.world_T_rigs
-    placed = triangulation.place(tracks, keypoints, poses, _WIDE, settings.triangulate)
+    gate = _UNKNOWN_NOISE_GATE
+    placed = triangulation.place(tracks, keypoints, poses, gate, settings.triangulate)
     factors = np.ones(len(keypoints.faces))
     for group in (sighted.aligned, ~sighted.aligned):
         chosen = group[keypoints.rows(placed.tracks)]
         if np.count_nonzero(chosen) >= settings.rounds.min_observations:
-            factors[group] = max(_noise(placed, keypoints, poses, chosen), _LEAST)
+            factors[group] = max(_noise(placed, keypoints, poses, chosen), _MIN_NOISE_RATIO)
     infos = keypoints.sqrt_infos
     scaled = replace(
         keypoints,
@@ -328,7 +331,7 @@ def landmark_block(
         term = ReprojectionTerm(tracks.frames, tracks.points, pixels, faces, cameras, sigmas_px)
         terms.append(replace(term, origins_rig=origins))
     return LandmarkBlock(
-        [prior_factors.X(f) for f in range(len(keypoints.starts) - 1)],
+        [pose_variables.X(f) for f in range(len(keypoints.starts) - 1)],
         landmarks.points_world,
         terms,
         RobustLoss(settings.solver.loss, settings.solver.loss_sigmas),
@@ -344,7 +347,7 @@ def pose_covariances(
 ) -> tuple[np.ndarray, JointErrors]:
     """Marginal covariances (F, 6, 6) with the first pose and the extent of each map held fixed."""
     block = landmark_block(solved.landmarks, keypoints, solved.noise, context)
-    keys = [prior_factors.X(f) for f in range(len(solved.world_T_rigs))]
+    keys = [pose_variables.X(f) for f in range(len(solved.world_T_rigs))]
     terms, seed = context.covariance_terms(solved, components), context.settings.seed
     blocks = [block, *terms.blocks]
     return marginal_covariances(terms.graph, blocks, terms.values, keys, DRAWS, seed)
@@ -369,14 +372,15 @@ def _noise(
         chosen: (O,) bool, observations whose spread is asked for.
     """
     tracks, num = landmarks.tracks, len(landmarks.tracks)
-    blocks = [slice(first, first + _AT_ONCE) for first in range(0, num, _AT_ONCE)]
+    blocks = [slice(first, first + _BATCH) for first in range(0, num, _BATCH)]
     informations = np.zeros((tracks.num_points, 3, 3))
     for some in blocks:
         _, jacobians = _by_point(landmarks, keypoints, world_T_rigs, some)
         products = np.swapaxes(jacobians, 1, 2) @ jacobians
         np.add.at(informations, tracks.points[some], products)
     traces = np.einsum("jii->j", informations)
-    informations += (_FLAT * traces + np.finfo(float).tiny)[:, None, None] * np.eye(3)
+    added = _MIN_INFORMATION_SHARE * traces + np.finfo(float).tiny
+    informations += added[:, None, None] * np.eye(3)
     covariances = np.linalg.inv(informations)
     spread = np.empty(num)
     for some in blocks:  # found anew: of all they would take gigabytes
@@ -384,9 +388,9 @@ def _noise(
         taken = jacobians @ covariances[tracks.points[some]] @ np.swapaxes(jacobians, 1, 2)
         left, directions = np.linalg.eigh(np.eye(2) - taken)
         along = np.einsum("oi,oi->o", directions[:, :, 1], residuals)
-        spread[some] = along / np.sqrt(np.maximum(left[:, 1], _LEAST_LEFT))
+        spread[some] = along / np.sqrt(np.maximum(left[:, 1], _MIN_RESIDUAL_SHARE))
     unknowns = 6 * len(world_T_rigs)
-    redundancy = max(1 - unknowns / max(2 * num - 3 * tracks.num_points, 1), _REDUNDANT)
+    redundancy = max(1 - unknowns / max(2 * num - 3 * tracks.num_points, 1), _MIN_REDUNDANCY)
     return float(1.4826 * np.median(np.abs(spread[chosen])) / np.sqrt(redundancy))
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from gsba.bundle import prior_factors
+from gsba.bundle import pose_variables
 from gsba.bundle.adjustment import (
     AdjustmentContext,
     Terms,
@@ -57,7 +57,7 @@ class CameraView:
         graph = gtsam.NonlinearFactorGraph(terms.graph)
         graph.push_back(unknowns.graph)
         poses, maps = solved.world_T_rigs, context.maps
-        graph.push_back(prior_factors.fixed_scale(poses, maps, _SCALE_SIGMA))
+        graph.push_back(pose_variables.fixed_scale(poses, maps, _SCALE_SIGMA))
         block = unknowns.block(solved.landmarks, self.shown, noise, curved=True)
 
         def after(values: gtsam.Values) -> "CameraView":

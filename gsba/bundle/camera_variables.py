@@ -12,7 +12,7 @@ from factors.camera_block import CameraBlock, pixels_of, sightings_of
 from factors.camera_rows import CameraVariables, half_baseline, lens_sizes, vector
 from gsba.bundle import lens_axes, readout, self_calibration
 from gsba.bundle.adjustment import AdjustmentContext
-from gsba.bundle.prior_factors import X
+from gsba.bundle.pose_variables import X
 from gsba.bundle.readout import CameraEstimate
 from gsba.camera.fisheye import Rig, rotation_of
 from gsba.types import Keypoints, Landmarks

@@ -16,7 +16,7 @@ import numpy as np
 
 from factors import Block
 from gsba.bundle.family_variables import kept, restored
-from gsba.bundle.prior_factors import X, values_of
+from gsba.bundle.pose_variables import X, values_of
 from gsba.log import GsbaError
 from gsba.types import FamilyVariables, Landmarks, Solution
 

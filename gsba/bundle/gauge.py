@@ -11,7 +11,7 @@ import numpy as np
 from scipy.sparse import csr_matrix
 
 from gsba.bundle.families import Families, FamilyTerms, numbered
-from gsba.bundle.prior_factors import X, values_of
+from gsba.bundle.pose_variables import X, values_of
 from gsba.similarity import Sim3
 from gsba.types import Solution
 

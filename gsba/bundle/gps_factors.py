@@ -23,7 +23,7 @@ import numpy as np
 
 from gsba.bundle.families import Family, MapSnapshot, digest_of
 from gsba.bundle.fixes import WHITE_SHARE, FrameFixes
-from gsba.bundle.prior_factors import X, values_of
+from gsba.bundle.pose_variables import X, values_of
 from gsba.config import GpsSettings
 from gsba.similarity import NoSimilarityError, Sim3, robust_similarity, similarity
 

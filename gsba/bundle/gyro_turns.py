@@ -7,7 +7,7 @@ import gtsam
 import numpy as np
 
 from gsba.bundle.families import Family, MapSnapshot, digest_of
-from gsba.bundle.prior_factors import X
+from gsba.bundle.pose_variables import X
 from gsba.types import GyroConstraints
 
 _FREE_EXTENTS = 1e4  # sigma of a step's translation, extents of the map: none is measured

@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 
 from gsba.bundle.families import Family, MapSnapshot, digest_of
-from gsba.bundle.prior_factors import X
+from gsba.bundle.pose_variables import X
 from gsba.config import PriorSettings
 from gsba.geometry import inverse
 from gsba.types import StepNoise

@@ -7,7 +7,7 @@ import gtsam
 import numpy as np
 
 from factors import PoseSystem, RobustLoss, tangent_basis
-from gsba.bundle.prior_factors import X
+from gsba.bundle.pose_variables import X
 from gsba.camera.projections import Projection
 
 _BEHIND = 1e3  # whitened residual of a point that the picture cannot show

@@ -8,7 +8,7 @@ import numpy as np
 
 from factors import RobustLoss
 from gsba.bundle.optimizer import marginal_covariances, optimize
-from gsba.bundle.prior_factors import X
+from gsba.bundle.pose_variables import X
 from gsba.camera.projections import Projection
 from gsba.config import SolverSettings
 from gsba.localization.known_points import K, KnownPointBlock, Sightings, num_parameters

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from gsba.bundle.prior_factors import X
+from gsba.bundle.pose_variables import X
 from gsba.geometry import inverse
 from gsba.types import Solution
 

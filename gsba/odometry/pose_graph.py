@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from gsba.bundle.prior_factors import X
+from gsba.bundle.pose_variables import X
 from gsba.geometry import adjoint, inverse, pose
 from gsba.similarity import Sim3
 

@@ -7,7 +7,7 @@ import gtsam
 import numpy as np
 
 from factors import BearingTerm, LandmarkBlock, RobustLoss
-from gsba.bundle import optimize, prior_factors, triangulate
+from gsba.bundle import optimize, pose_variables, triangulate
 from gsba.bundle.adjustment import poses_of, values_of
 from gsba.config import SolverSettings, TriangulateSettings
 from gsba.types import Landmarks, Tracks
@@ -82,7 +82,7 @@ def adjust_window(
     term = BearingTerm(
         marks.tracks.frames, marks.tracks.points, seen.bearings_rig[used], sigmas[used], None
     )
-    keys = [prior_factors.X(k) for k in range(len(world_T_rigs))]
+    keys = [pose_variables.X(k) for k in range(len(world_T_rigs))]
     block = LandmarkBlock(keys, marks.points_world, [term], RobustLoss("cauchy", 2.0), 1)
     graph = _held(world_T_rigs, num_held)
     poses = poses_of(optimize(graph, [block], values_of(world_T_rigs), _SOLVER).values, len(keys))
@@ -103,7 +103,7 @@ def _held(world_T_rigs: np.ndarray, num_held: int) -> gtsam.NonlinearFactorGraph
     graph = gtsam.NonlinearFactorGraph()
     for k in range(num_held):
         pose = gtsam.Pose3(world_T_rigs[k])
-        graph.add(gtsam.PriorFactorPose3(prior_factors.X(k), pose, noise))
+        graph.add(gtsam.PriorFactorPose3(pose_variables.X(k), pose, noise))
     if num_held == 1:
-        graph.push_back(prior_factors.fixed_scale(world_T_rigs))
+        graph.push_back(pose_variables.fixed_scale(world_T_rigs))
     return graph

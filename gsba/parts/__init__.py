@@ -1,5 +1,10 @@
 """Maps too large for one process: cut into parts, whose own unknowns are eliminated where they lie.
 
-`folder.PartsWriter` writes a map's observations part by part, `divided_system.optimize_divided`
-solves for it, by the same normal equations and the same loop as `gsba.bundle.optimizer.optimize`.
+Takes poses, points and observations that `PartsWriter` writes to disk part by part.
+Gives the poses and points that `gsba.bundle.optimizer.optimize` finds undivided.
 """
+
+from gsba.parts.divided_system import optimize_divided
+from gsba.parts.folder import PartsWriter
+
+__all__ = ["PartsWriter", "optimize_divided"]

@@ -10,7 +10,7 @@ from factors import LandmarkBlock, RobustLoss
 from factors.patch_windows import PatchPixels, PatchTable, patch_spans, poor_views
 from factors.photometric import PhotometricBlock
 from factors.sphere_image import SphereImage
-from gsba.bundle import adjustment, prior_factors, triangulation
+from gsba.bundle import adjustment, pose_variables, triangulation
 from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.optimizer import OptimizeResult, optimize
 from gsba.camera.lens import ONE_CENTRE, Lenses
@@ -282,7 +282,7 @@ def make_block(
     contrasts = pixels.templates.std(axis=1).astype(np.float64)
     sigmas = noise * np.hypot(chosen.noise_grey, chosen.noise_contrast * contrasts)
     return PhotometricBlock(
-        [prior_factors.X(f) for f in range(pixels.num_frames)],
+        [pose_variables.X(f) for f in range(pixels.num_frames)],
         pixels,
         sigmas,
         RobustLoss("cauchy", chosen.loss_sigmas / chosen.inflation),

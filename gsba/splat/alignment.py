@@ -8,7 +8,7 @@ import numpy as np
 
 from factors import BearingTerm, FaceCameras, LandmarkBlock, RobustLoss
 from factors.splat import RenderedView, SplatBlock
-from gsba.bundle import prior_factors
+from gsba.bundle import pose_variables
 from gsba.bundle.optimizer import optimize
 from gsba.camera.fisheye import facing
 from gsba.camera.lens import seam_sines
@@ -89,9 +89,9 @@ def align_to_splat(
             blocks.append(bearing_block(reconstruction, poses, gate))
         values = gtsam.Values()
         for f in which:
-            values.insert(prior_factors.X(int(f)), gtsam.Pose3(poses[f]))
+            values.insert(pose_variables.X(int(f)), gtsam.Pose3(poses[f]))
         found = optimize(gtsam.NonlinearFactorGraph(), blocks, values, settings).values
-        poses = np.stack([found.atPose3(prior_factors.X(int(f))).matrix() for f in which])
+        poses = np.stack([found.atPose3(pose_variables.X(int(f))).matrix() for f in which])
     return poses
 
 
@@ -112,7 +112,7 @@ def bearing_block(
     spread = gate_rad / (_GATE_SIGMAS * float(np.median(sigmas))) if len(sigmas) else 1.0
     bearings = reconstruction.observation_bearings[tracks.keypoints]
     term = BearingTerm(tracks.frames, tracks.points, bearings, max(1.0, spread) * sigmas)
-    keys = [prior_factors.X(int(f)) for f in which]
+    keys = [pose_variables.X(int(f)) for f in which]
     return LandmarkBlock(keys, landmarks.points_world, [term], RobustLoss("cauchy", 1.0))
 
 
@@ -186,7 +186,7 @@ def splat_block(
             (world_T_rig,) = turned_rigs(world_T_rig[None], turns[[row]])
         return render_view(gaussians, world_T_rig, captured.rendered, near, backend)
 
-    keys = [prior_factors.X(int(f)) for f in captured.which]
+    keys = [pose_variables.X(int(f)) for f in captured.which]
     cameras = FaceCameras(rotations, focals, principals)
     return SplatBlock(
         keys, captured.images, captured.weights, cameras, render, loss, centres=centres, turns=turns

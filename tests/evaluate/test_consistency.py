@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 from synthetic import RIG, GivenFactors, make_world
 
-from gsba.bundle import adjustment, prior_factors
+from gsba.bundle import adjustment, pose_variables
 from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.families import Families
 from gsba.config import RefineSettings
@@ -40,9 +40,9 @@ def _solved(seed: int) -> tuple[Reconstruction, Trajectory]:
     true = world.world_T_rigs
     held = gtsam.NonlinearFactorGraph()
     gauge = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
-    held.add(gtsam.PriorFactorPose3(prior_factors.X(0), gtsam.Pose3(true[0]), gauge))
+    held.add(gtsam.PriorFactorPose3(pose_variables.X(0), gtsam.Pose3(true[0]), gauge))
     priors = gtsam.NonlinearFactorGraph(held)
-    priors.push_back(prior_factors.fixed_scale(true))
+    priors.push_back(pose_variables.fixed_scale(true))
     start = Solution.without_points(true)
     problem = AdjustmentContext(Families((GivenFactors(priors),)), RIG, settings, 1)
     solved = adjustment.adjust(world.tracks, world.keypoints, start, problem, (8.0,))

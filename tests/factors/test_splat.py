@@ -7,7 +7,7 @@ import pytest
 from factors import FaceCameras, RobustLoss
 from factors.splat import RenderedView, SplatBlock
 from gsba.bundle.optimizer import optimize
-from gsba.bundle.prior_factors import X
+from gsba.bundle.pose_variables import X
 from gsba.camera.rig import RIG_R_FACE, CubeRig
 from gsba.geometry import pose
 

@@ -6,7 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from factors import RobustLoss
-from gsba.bundle.prior_factors import X
+from gsba.bundle.pose_variables import X
 from gsba.camera.projections import PerspectiveProjection
 from gsba.geometry import pose
 from gsba.localization.known_points import K, KnownPointBlock, Sightings, isotropic, residuals_of

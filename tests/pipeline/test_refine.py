@@ -15,7 +15,7 @@ import pytest
 from tiny_run import NUM_FRAMES, SETTINGS, WIDTH, Case, computed_stages
 
 from gsba import Family, MapSnapshot, load_run, refine
-from gsba.bundle.prior_factors import X
+from gsba.bundle.pose_variables import X
 from gsba.camera.rig import CubeRig
 from gsba.config_file import load_config
 from gsba.evaluate.trajectory import evaluate

@@ -6,10 +6,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 from synthetic import loop_walk
 
-from gsba.bundle import prior_factors
+from gsba.bundle import pose_variables
 from gsba.bundle.families import Families
 from gsba.bundle.gyro_turns import GyroTurns
-from gsba.bundle.prior_factors import X
+from gsba.bundle.pose_variables import X
 from gsba.bundle.trajectory_prior import TrajectoryPrior
 from gsba.config import PriorSettings
 from gsba.geometry import inverse, pose, rotation_angle
@@ -141,12 +141,12 @@ def test_step_noise_scales_with_the_map() -> None:
 
 def test_fixed_scale_holds_the_extent() -> None:
     coarse = loop_walk(10)
-    held = prior_factors.fixed_scale(coarse)
+    held = pose_variables.fixed_scale(coarse)
     bigger = coarse.copy()
     bigger[:, :3, 3] = coarse[0, :3, 3] + 1.01 * (coarse[:, :3, 3] - coarse[0, :3, 3])
     assert held.error(_values(coarse)) == pytest.approx(0, abs=1e-9)
     assert held.error(_values(bigger)) == pytest.approx(0.5 * 1e4**2, rel=1e-6)
-    assert prior_factors.fixed_scale(np.stack([np.eye(4)] * 3)).size() == 0
+    assert pose_variables.fixed_scale(np.stack([np.eye(4)] * 3)).size() == 0
 
 
 def test_turns_of_a_gyro_hold_rotations_and_nothing_else() -> None:
