@@ -43,9 +43,7 @@ _UNKNOWN_NOISE_GATE = 20.0  # gate in sigmas for observations whose noise is not
 DRAWS = 500  # errors drawn of all poses, from which joint covariances are computed
 _BATCH = 1 << 18  # observations whose residuals are computed together
 _MIN_REDUNDANCY = 0.1  # least share of residual dimensions beyond the unknowns
-_MIN_INFORMATION_SHARE = (
-    1e-12  # of a point's information, added to it: without depth it is singular
-)
+_MIN_INFORMATION_SHARE = 1e-12  # of a point's information, added to it, as depth may be unknown
 _DRIFT_DAMPING, _DRIFT_TOLERANCE = 1e-9, 1e-7  # first damping and relative tolerance of adjustments
 # with a family that limits drift
 _MIN_RESIDUAL_SHARE = 1e-3  # least share of a residual that its point cannot absorb
