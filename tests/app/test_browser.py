@@ -84,6 +84,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
 def opened(browser: Any, address: str, size: dict[str, int]) -> Any:
     """A page; errors of its console fail the test that looks at `page.faults`."""
     page = browser.new_page(viewport=size)
+    page.set_default_timeout(RUN_MS)  # a busy machine is no fault of the page
     page.faults = []
     page.on("pageerror", lambda error: page.faults.append(str(error)))
     page.on("requestfailed", lambda request: page.faults.append(f"{request.url} failed"))
@@ -99,13 +100,13 @@ def picture(page: Any, name: str) -> None:
 def chosen(page: Any, out: str) -> None:
     """Choose the video on the page of new runs, and name the run."""
     page.get_by_role("button", name="walk.mp4 video").click()
-    page.get_by_text("stitched panoramas, 512x256").wait_for(timeout=60_000)
+    page.get_by_text("stitched panoramas, 512x256").wait_for()
     page.locator("#field-out").fill(out)
     page.locator("#command", has_text=f"--out {out}").wait_for()
 
 
 def status(page: Any, text: str) -> None:
-    page.locator(f".badge.{text}").first.wait_for(timeout=RUN_MS)
+    page.locator(f".badge.{text}").first.wait_for()
 
 
 def fits(page: Any) -> bool:
@@ -123,7 +124,7 @@ def test_from_a_video_to_a_dataset(browser: Any, server: Server) -> None:
     status(page, "running")
     page.get_by_text("From above").wait_for()
     drawn = page.locator("canvas[aria-label*=' poses']")  # the path grows while the run goes on
-    drawn.wait_for(timeout=RUN_MS)
+    drawn.wait_for()
     status(page, "running")
     # A second page shows the same job; on a phone nothing is cut off.
     phone = opened(browser, f"{server.address}#jobs", PHONE)
@@ -131,15 +132,15 @@ def test_from_a_video_to_a_dataset(browser: Any, server: Server) -> None:
     phone.get_by_role("link", name="refine first").click()
     phone.get_by_role("heading", name="Stages").wait_for()
     assert fits(phone)
-    page.locator(".stages li").nth(12).wait_for(timeout=RUN_MS)
+    page.locator(".stages li").nth(12).wait_for()
     picture(page, "app-watch")
     # The server is killed: the run goes on, both pages say so and find the next server.
     server.kill()
     page.locator("#offline").wait_for()
     phone.locator("#offline").wait_for()
     server.start()
-    page.locator("#offline").wait_for(state="hidden", timeout=30_000)
-    phone.locator("#offline").wait_for(state="hidden", timeout=30_000)
+    page.locator("#offline").wait_for(state="hidden")
+    phone.locator("#offline").wait_for(state="hidden")
     status(page, "done")
     page.get_by_text("frames refined").first.wait_for()
     phone.get_by_text("frames refined").first.wait_for()
@@ -182,10 +183,10 @@ def test_a_run_is_stopped_and_goes_on_and_the_next_one_waits(browser: Any, serve
     next_one.get_by_role("button", name="Take out").click()
     next_one.locator(".badge.stopped").wait_for()
     first.get_by_role("button", name="Stop").click()
-    first.locator(".badge.stopped").wait_for(timeout=RUN_MS)
+    first.locator(".badge.stopped").wait_for()
     assert fits(page)
     first.get_by_role("button", name="Go on").click()
-    first.locator(".badge.done").wait_for(timeout=RUN_MS)
+    first.locator(".badge.done").wait_for()
     assert (server.root / "third/report.html").is_file()
     next_one.get_by_role("button", name="Forget").click()
     next_one.wait_for(state="detached")
@@ -197,7 +198,7 @@ def test_what_cannot_be_refined_is_said_in_one_line(browser: Any, server: Server
     page = opened(browser, server.address, PHONE)
     page.get_by_role("button", name="broken.mp4 video").click()
     alert = page.get_by_role("alert").filter(has_text="broken.mp4")
-    alert.wait_for(timeout=60_000)
+    alert.wait_for()
     assert page.locator("#command").count() == 0
     other = opened(browser, server.address.replace(server.address.split("/")[3], "guess"), PHONE)
     assert "Forbidden" in (other.text_content("body") or "")
