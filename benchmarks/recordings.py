@@ -155,7 +155,7 @@ def _files(parts: Sequence[Part]) -> list[Path]:
 
 
 def verdict(row: dict[str, Any], best_mm: float | None, apart: bool) -> str:
-    """What a row shows of the bars, "" where it is not held to one."""
+    """Verdict on a row's error or join; "" where no bar applies to it."""
     if not row.get("errors"):
         return f"refused: {row.get('reason', 'no map')}"
     if any(len(one["flats"]) > 1 for one in row["errors"]):

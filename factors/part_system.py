@@ -1,12 +1,11 @@
 """Normal equations of a part of a map: its own blocks are eliminated, those it shares are kept."""
 
 from dataclasses import dataclass
-from typing import NoReturn
 
 import numpy as np
 
 from factors.cholesky import DIM, BlockCholesky
-from factors.reduced_camera_system import ReducedSystem, damping_of
+from factors.normal_equations import NormalEquations, damping_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,14 +21,14 @@ class PartEquations:
 
 @dataclass(frozen=True, slots=True)
 class Condensed:
-    """What a part says of its K shared blocks, once its own are eliminated."""
+    """Equations of a part on its K shared blocks, its own blocks eliminated."""
 
     diagonal: np.ndarray  # (K, 6, 6) float64, of the Schur complement
     off_diagonal: np.ndarray  # (K (K - 1) / 2, 6, 6) float64, blocks [i, j] of all i < j by rows
     gradient: np.ndarray  # (K, 6) float64
 
 
-class PartSystem(ReducedSystem):
+class PartSystem(NormalEquations):
     """Assembles the equations of a part; the keys that it shares come last in the layout."""
 
     def equations(self, num_kept: int) -> PartEquations:
@@ -37,12 +36,6 @@ class PartSystem(ReducedSystem):
         return PartEquations(
             self._diagonal, self._off_diagonal, self._pairs, self._gradient, num_kept
         )
-
-    def _step(self, added: np.ndarray) -> NoReturn:
-        raise NotImplementedError("a part has no step of its own")
-
-    def _inverse(self, diagonal: np.ndarray, num_draws: int, rng: np.random.Generator) -> NoReturn:
-        raise NotImplementedError("a part has no inverse of its own")
 
 
 class PartElimination:

@@ -1,71 +1,23 @@
-"""The reduced camera system of a graph and its blocks: assembled in 6x6 blocks, damped, solved."""
+"""The reduced camera system of a graph and its blocks: normal equations, damped and solved."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Mapping, Sequence
 
 import gtsam
 import numpy as np
-from scipy.sparse import csr_matrix
 
 from factors.cholesky import DIM
-from factors.compiled import kernel_and_part
-from factors.system_layout import SystemLayout
+from factors.normal_equations import GRAPH, NormalEquations, add_costs, damping_of
 
-_kernel, _ = kernel_and_part()
-
-GRAPH = "graph"  # family under which the cost of the native and user factors is reported
 STEP_TOLERANCE = 1e-2  # tolerance of a step by conjugate gradients: the next linearization
 # corrects the rest
-_MIN_DIAGONAL = 1e-6  # least curvature that damping is relative to, per sigma
 
 
-class ReducedSystem(ABC):
-    """Normal equations over all variables that a graph and blocks name, and their solver.
+class ReducedSystem(NormalEquations, ABC):
+    """Normal equations and their solver.
 
     `factors.system_choice.reduced_system` chooses between the solvers `DirectSystem` and
     `IterativeSystem`, which differ in how they solve, and in which blocks they write out.
     """
-
-    def __init__(self, layout: SystemLayout, factored: Collection[int] = ()) -> None:
-        """Fix the pattern: off-diagonal blocks of the graph, and of all blocks but the `factored`
-        ones (indices of the layout's)."""
-        self._layout = layout
-        placed = [layout.factor_pairs]
-        placed += [
-            rows[block.pairs].reshape(-1, 2)
-            for i, (block, rows) in enumerate(zip(layout.blocks, layout.block_rows, strict=True))
-            if i not in factored
-        ]
-        codes = [self._pair_codes(pairs) for pairs in placed]
-        self._codes = np.unique(np.concatenate(codes))
-        self._pairs = np.column_stack(np.divmod(self._codes, layout.num))
-        self._block_slots = [
-            (np.searchsorted(self._codes, code), pairs[:, 0] > pairs[:, 1])
-            for code, pairs in zip(codes[1:], placed[1:], strict=True)
-        ]
-
-    @property
-    def first_block(self) -> dict[int, int]:
-        """The first 6x6 block of each key."""
-        return self._layout.first_block
-
-    def linearize(self, values: gtsam.Values) -> dict[str, float]:
-        """Assemble H and the gradient at `values`; returns the cost of each family."""
-        layout = self._layout
-        self._diagonal = np.zeros((layout.num, DIM, DIM))
-        self._gradient = np.zeros((layout.num, DIM))
-        self._off_diagonal = np.zeros((0, DIM, DIM))  # frees the previous blocks
-        self._jacobian = csr_matrix((0, len(layout.column_blocks)))  # of the graph
-        costs: dict[str, float] = {}
-        parts: list[np.ndarray] = []
-        for i in range(len(layout.blocks)):
-            _add_costs(costs, self._add_block(i, values, parts))
-        self._off_diagonal = self._gathered(parts)
-        if layout.graph_keys:
-            self._add_graph(values)
-            _add_costs(costs, {GRAPH: layout.graph.error(values)})
-        self._diagonal[layout.padding[0], layout.padding[1], layout.padding[1]] = 1.0
-        return costs
 
     def solve(self, damping: float) -> np.ndarray | None:
         """Step (N, 6) of the system damped by `damping` times its diagonal; None if singular."""
@@ -113,9 +65,9 @@ class ReducedSystem(ABC):
         """Cost of each family at accepted values."""
         costs: dict[str, float] = {}
         for block in self._layout.blocks:
-            _add_costs(costs, block.costs(values))
+            add_costs(costs, block.costs(values))
         if self._layout.graph_keys:
-            _add_costs(costs, {GRAPH: self._layout.graph.error(values)})
+            add_costs(costs, {GRAPH: self._layout.graph.error(values)})
         return costs
 
     def covariances(
@@ -150,78 +102,4 @@ class ReducedSystem(ABC):
     def _inverse(
         self, diagonal: np.ndarray, num_draws: int, rng: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """What `covariances` returns, of H with diagonal blocks `diagonal (N, 6, 6)`."""
-
-    def _add_block(
-        self, i: int, values: gtsam.Values, parts: list[np.ndarray]
-    ) -> Mapping[str, float]:
-        """Add the i-th block's system, its off-diagonal blocks to `parts`; returns its costs."""
-        rows = self._layout.block_rows[i]
-        system = self._layout.blocks[i].linearize(values)
-        self._diagonal[rows] += system.diagonal
-        self._gradient[rows] += system.gradient
-        parts.append(system.off_diagonal)
-        return system.costs
-
-    def _gathered(self, parts: Sequence[np.ndarray]) -> np.ndarray:
-        """Off-diagonal blocks (P, 6, 6) of all factors; a single block of factors that has them
-        all, which may be gigabytes, is not copied."""
-        if len(parts) == 1:
-            slots, flip = self._block_slots[0]
-            if np.array_equal(slots, np.arange(len(self._pairs))) and not flip.any():
-                return parts[0]
-        out = np.zeros((len(self._pairs), DIM, DIM))
-        for part, (slots, flip) in zip(parts, self._block_slots, strict=True):
-            _add_blocks(out, slots, flip, part)
-        return out
-
-    def _pair_codes(self, pairs: np.ndarray) -> np.ndarray:
-        return pairs.min(axis=1, initial=self._layout.num) * self._layout.num + pairs.max(
-            axis=1, initial=0
-        )
-
-    def _add_graph(self, values: gtsam.Values) -> None:
-        """Add the native and user factors, linearized by GTSAM."""
-        layout, num = self._layout, len(self._layout.column_blocks)
-        rows, columns, entries = self._layout.graph.linearize(values).sparseJacobian_()
-        augmented = csr_matrix(
-            (entries, (rows.astype(np.int64) - 1, columns.astype(np.int64) - 1)),
-            shape=(int(rows.max(initial=1)), num + 1),
-        )
-        self._jacobian = augmented[:, :num]
-        product = (augmented.T @ augmented).tocoo()
-        i, j, x = product.row, product.col, product.data
-        right = (j == num) & (i < num)  # the last column is -r
-        np.subtract.at(
-            self._gradient,
-            (layout.column_blocks[i[right]], layout.column_offsets[i[right]]),
-            x[right],
-        )
-        inner = (i < num) & (j < num)
-        i, j, x = i[inner], j[inner], x[inner]
-        block_i, block_j = layout.column_blocks[i], layout.column_blocks[j]
-        offset_i, offset_j = layout.column_offsets[i], layout.column_offsets[j]
-        same, upper = block_i == block_j, block_i < block_j
-        np.add.at(self._diagonal, (block_i[same], offset_i[same], offset_j[same]), x[same])
-        slots = np.searchsorted(self._codes, block_i[upper] * layout.num + block_j[upper])
-        np.add.at(self._off_diagonal, (slots, offset_i[upper], offset_j[upper]), x[upper])
-
-
-def damping_of(diagonal: np.ndarray, damping: float) -> np.ndarray:
-    """What a damping of part `damping` adds (N, 6) to the diagonal of blocks (N, 6, 6)."""
-    return damping * np.maximum(np.einsum("nii->ni", diagonal), _MIN_DIAGONAL)
-
-
-@_kernel
-def _add_blocks(target, slots, flip, blocks):
-    """Add blocks (Q, 6, 6), those to be flipped transposed, to the slots (Q,) of others."""
-    for q in range(len(slots)):
-        to, block = target[slots[q]], blocks[q]
-        for r in range(DIM):
-            for c in range(DIM):
-                to[r, c] += block[c, r] if flip[q] else block[r, c]
-
-
-def _add_costs(total: dict[str, float], costs) -> None:
-    for name, cost in costs.items():
-        total[name] = total.get(name, 0.0) + cost
+        """The results of `covariances` for H with the diagonal blocks `diagonal` (N, 6, 6)."""

@@ -2,6 +2,8 @@
 
 import numpy as np
 
+CV_R_GL = np.diag([1.0, -1, -1])  # axes of an OpenGL camera in ours: x right, y down, z forward
+
 
 def rotation_from_quaternion(wxyz: np.ndarray) -> np.ndarray:
     """Rotation matrices (..., 3, 3) of unit quaternions (..., 4), wxyz."""

@@ -1,4 +1,4 @@
-"""What other systems lack: affinity, /proc, wheels."""
+"""Systems without affinity, /proc or wheels."""
 
 import os
 import resource

@@ -1,8 +1,7 @@
-"""What all pages of a server have in common: the root, the commands, the jobs, the viewers."""
+"""State that all pages of a server share: the root, the commands, the jobs, the viewers."""
 
 import secrets
 import subprocess
-import sys
 import threading
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING
 from gsba.app.forms import Form
 from gsba.app.jobs import Job, Jobs
 from gsba.app.progress import Followed, Progress
-from gsba.app.worker import ensure_worker
+from gsba.app.worker import GSBA, ensure_worker
 from gsba.disk import write_text
 from gsba.log import GsbaError, brief
 from gsba.view import load_scene
@@ -77,10 +76,9 @@ class App:
             GsbaError: it cannot be described.
         """
         name = path.relative_to(self.root).as_posix()
-        line = [sys.executable, "-P", "-c", "from gsba.cli import main; main()"]
         try:
             found = subprocess.run(
-                [*line, "-q", "info", "--json", f"./{name}"],
+                [*GSBA, "-q", "info", "--json", f"./{name}"],
                 cwd=self.root,
                 capture_output=True,
                 text=True,

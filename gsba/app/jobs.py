@@ -32,7 +32,7 @@ FRESH = "--fresh"  # would delete what a job has done so far when the job goes o
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """What a job runs."""
+    """A command line of gsba that a job runs."""
 
     arguments: tuple[str, ...]  # of gsba, the command's name first
     folder: str  # absolute working folder
@@ -41,7 +41,7 @@ class Command:
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """How far a job is."""
+    """Status of a job, and its process."""
 
     status: Status
     pid: int | None = None  # of its process, which leads a process group

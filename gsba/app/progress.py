@@ -36,7 +36,7 @@ def read_events(path: Path, offset: int = 0) -> tuple[list[dict[str, Any]], int]
 
 @dataclass
 class Progress:
-    """What the events of a job's latest start say."""
+    """Stages, speed, warnings and path of a job, by the events since its latest start."""
 
     stages: list[dict[str, Any]] = field(default_factory=list)  # ended ones: name, title, seconds,
     # resumed

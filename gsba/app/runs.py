@@ -1,4 +1,4 @@
-"""What a page shows of a run folder: figures of its report, the camera, its path from above."""
+"""Contents of a run folder for a page: figures of its report, the camera, its path from above."""
 
 import json
 from collections.abc import Sequence
@@ -19,6 +19,7 @@ from gsba.store.records import RecordError, load_arrays, load_record
 T = TypeVar("T")
 
 _MAX_POINTS = 4000  # of a map from above
+_NO_MAP: dict[str, Any] = {"stage": "", "path": [], "points": [], "colors": None, "starts": []}
 _POSES, _POINTS, _COLORS = "world_T_rigs", "points_world", "point_colors"
 _FILES = ("report.html", "trajectory.tum", "points.ply", "poses.csv", "config.toml")
 
@@ -71,16 +72,11 @@ def map_so_far(run: Path, progress: Progress) -> dict[str, Any]:
         rows at which a map of its own begins.
     """
     for name in reversed(progress.names()):
-        path = run / STAGES / f"{name}.npz"
-        try:
-            arrays = load_arrays(path, (_POSES, _POINTS, _COLORS)) if path.is_file() else {}
-        except (RecordError, OSError):
-            continue
-        if _POSES in arrays and arrays[_POSES].shape[1:] == (4, 4) and _POINTS in arrays:
-            at, (axes, _) = arrays[_POSES][:, :3, 3], viewing_axes(arrays[_POSES])
-            return {"stage": name} | _plan(at, arrays[_POINTS], axes, arrays.get(_COLORS), [0])
+        found = _map_of_stage(run, name)
+        if found is not None:
+            return found
     if not progress.keyframes:
-        return {"stage": "", "path": [], "points": [], "colors": None, "starts": []}
+        return _NO_MAP
     maps = [number for number, _ in progress.keyframes]
     starts = [k for k in range(len(maps)) if k == 0 or maps[k] != maps[k - 1]]
     at = np.array([position for _, position in progress.keyframes])
@@ -91,9 +87,20 @@ def map_so_far(run: Path, progress: Progress) -> dict[str, Any]:
 
 def finished_map(run: Path) -> dict[str, Any]:
     """The map of a finished run from above, as `map_so_far` gives it."""
-    progress = Progress()
-    progress.add({"event": "done", "name": "reconstruction"})
-    return map_so_far(run, progress)
+    return _map_of_stage(run, "reconstruction") or _NO_MAP
+
+
+def _map_of_stage(run: Path, name: str) -> dict[str, Any] | None:
+    """The map that a stage has stored, from above; None = it has stored none."""
+    path = run / STAGES / f"{name}.npz"
+    try:
+        arrays = load_arrays(path, (_POSES, _POINTS, _COLORS)) if path.is_file() else {}
+    except (RecordError, OSError):
+        return None
+    if _POSES not in arrays or arrays[_POSES].shape[1:] != (4, 4) or _POINTS not in arrays:
+        return None
+    at, (axes, _) = arrays[_POSES][:, :3, 3], viewing_axes(arrays[_POSES])
+    return {"stage": name} | _plan(at, arrays[_POINTS], axes, arrays.get(_COLORS), [0])
 
 
 def _plan(

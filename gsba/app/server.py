@@ -1,15 +1,13 @@
 """The server of the page: only browsers of this machine that know its address get answers."""
 
 import os
-import socket
 from collections.abc import Callable
 from hashlib import sha256
 from pathlib import Path
 
 from gsba.app.hub import App
 from gsba.log import GsbaError
-
-HOST = "127.0.0.1"  # not reachable from other machines
+from gsba.view.server import HOST, bound_socket
 
 
 def state_folder(root: Path) -> Path:
@@ -36,7 +34,7 @@ def serve(app: App, port: int, started: Callable[[str], None]) -> None:
         from gsba.app.routes import application
     except ImportError as error:
         raise GsbaError(f"gsba app needs {error.name}: pip install 'gsba[app]'") from None
-    listener = _listener(port)
+    listener = bound_socket(port)
     address = f"http://{HOST}:{listener.getsockname()[1]}/{app.token}/"
     config = uvicorn.Config(
         application(app),
@@ -52,19 +50,3 @@ def serve(app: App, port: int, started: Callable[[str], None]) -> None:
     finally:
         listener.close()
         app.close()
-
-
-def _listener(port: int) -> socket.socket:
-    if not 0 <= port <= 65535:
-        raise GsbaError(f"--port {port} is out of range: use 1 to 65535, or 0 for any")
-    listener = socket.socket()
-    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    try:
-        listener.bind((HOST, port))
-    except PermissionError:
-        raise GsbaError(f"port {port} is reserved by the system: pass another --port") from None
-    except OSError:
-        raise GsbaError(
-            f"port {port} of {HOST} is in use: pass another --port, or 0 for any free one"
-        ) from None
-    return listener

@@ -17,7 +17,7 @@ from gsba.app.jobs import ACTIVE, Job, Jobs, alive, born, ending, last_code
 from gsba.app.progress import read_events
 from gsba.log import EVENTS
 
-_GSBA = (sys.executable, "-P", "-c", "from gsba.cli import main; main()")
+GSBA = (sys.executable, "-P", "-c", "from gsba.cli import main; main()")
 _POLL_S = 0.3  # between two looks at a process that another worker started
 
 
@@ -62,7 +62,7 @@ def _start(jobs: Jobs, job: Job) -> tuple[Job, subprocess.Popen[bytes]]:
         events.write(f'{{"event": "start", "time": {began:.3f}}}\n')
     with job.log.open("ab") as log:
         process = subprocess.Popen(
-            [*_GSBA, *job.arguments()],
+            [*GSBA, *job.arguments()],
             cwd=job.command.folder,
             env={**os.environ, EVENTS: str(job.events)},
             stdin=subprocess.DEVNULL,

@@ -86,7 +86,7 @@ class AdjustmentContext:
         return Terms(own.graph, own.blocks, values, own)
 
     def covariance_terms(self, solved: Solution, maps: np.ndarray | None) -> Terms:
-        """As `terms`, for covariances: the first pose and the extent of each map are held fixed.
+        """Terms for covariances: the first pose and the extent of each map are held fixed.
 
         Args:
             solved: poses, and own variables of families.

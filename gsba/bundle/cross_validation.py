@@ -1,4 +1,4 @@
-"""Cross-validation over parts of a sequence: whether a model predicts what it was not found from.
+"""Cross-validation over parts of a sequence: a model is taken if it predicts held-out parts.
 
 Everything that is estimated of the camera is judged here: each part of the sequence is predicted by
 the parameters that the other parts give.
@@ -31,7 +31,7 @@ P = TypeVar("P", bound=Part)
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What parameters are worth to parts that they were not found from."""
+    """Gains of parts by parameters that were found from the other parts."""
 
     gains: np.ndarray  # (PARTS,) float64, decrease of each part's robust cost by what
     # the other parts give, beyond the baseline

@@ -64,7 +64,7 @@ class Family(Protocol):
         return ()
 
     def holds_gauge(self, snapshot: MapSnapshot) -> bool:
-        """Whether its factors determine world and scale of the first frame's map."""
+        """True if its factors determine world and scale of the first frame's map."""
         return self.fixes_gauge
 
     def fitted(self, snapshot: MapSnapshot) -> "Family | None":
@@ -125,7 +125,7 @@ class Families:
 
     @property
     def limit_drift(self) -> bool:
-        """Whether a family limits drift: see `Family.limits_drift`."""
+        """True if a family limits drift: see `Family.limits_drift`."""
         return any(family.limits_drift for family in self.members)
 
     def digests(self) -> list[tuple[str, str]]:
@@ -166,7 +166,7 @@ class Families:
         return _terms_of(self.members, replace(snapshot, gauge_held=held))
 
     def covariance_terms(self, solved: Solution, maps: np.ndarray | None = None) -> FamilyTerms:
-        """As `terms`, for covariances: the trajectory prior holds the first pose."""
+        """Terms for covariances: the trajectory prior holds the first pose. See `terms`."""
         snapshot = self.snapshot(solved, maps)
         return _terms_of([family.for_covariances(snapshot) for family in self.members], snapshot)
 

@@ -98,7 +98,7 @@ def summed(models: Sequence[FrameModel]) -> FrameModel:
 
 
 def validated(models: Sequence[FrameModel], sigmas: np.ndarray) -> Verdict:
-    """What parameters with priors `sigmas` (K,) predict, poses solved for with and without them."""
+    """Verdict on parameters with priors `sigmas` (K,), poses solved for with and without them."""
     return cross_validate(
         models,
         lambda others: summed(others).step(sigmas),

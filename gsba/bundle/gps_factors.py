@@ -184,7 +184,7 @@ class AnchoredFixes(Family):
     digest: str
 
     def holds_gauge(self, snapshot: MapSnapshot) -> bool:
-        """Whether the map of the first frame has fixes."""
+        """True if the map of the first frame has fixes."""
         return self.anchors.holds(0, snapshot.maps)
 
     def graph(self, snapshot: MapSnapshot) -> gtsam.NonlinearFactorGraph:

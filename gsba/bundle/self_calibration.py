@@ -1,4 +1,4 @@
-"""What raw lenses are: focal lengths, distortion, and how all but the front one are turned.
+"""Self-calibration of raw lenses: focal lengths, distortion, rotations of all but the front one.
 
 Found from a map as other parameters that all frames share, beside the lenses' centre. What differs
 from a calibration is believed where every part of the sequence gains by what the others give. Plain
@@ -223,7 +223,7 @@ def moved(lenses: Lenses, step: np.ndarray) -> Lenses:
 
 
 def from_calibrated(lenses: Lenses) -> np.ndarray:
-    """How far (K,) lenses are from what they were calibrated as."""
+    """Step (K,) from the reference calibration to the lenses."""
     assert lenses.reference_calibration is not None
     front, *others = (
         difference(one, before)
@@ -243,7 +243,7 @@ def apart(one: Lenses, other: Lenses) -> float:
 
 
 def now(lenses: Lenses) -> Rig:
-    """What raw lenses are taken for."""
+    """The estimated calibration of raw lenses; the reference where none is estimated."""
     assert lenses.reference_calibration is not None
     return lenses.fisheyes or lenses.reference_calibration
 

@@ -156,5 +156,5 @@ def _choose(systems: list[SharedModel], max_degree: int) -> tuple[int, float, np
 
 
 def _validated(systems: list[SharedModel], degree: int, spread: float) -> Verdict:
-    """What fields of a degree and a spread predict."""
+    """Verdict on fields of a degree and a spread."""
     return cross_validate(systems, lambda others: _fitted(others, degree, spread))

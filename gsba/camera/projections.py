@@ -31,7 +31,7 @@ class Parameter:
 
 
 class Projection(Protocol):
-    """How one lens maps directions in its frame to pixels, (u, v) from the picture's corner."""
+    """Map of one lens from directions in its frame to pixels (u, v), from the picture's corner."""
 
     @property
     def width(self) -> int:
@@ -44,7 +44,7 @@ class Projection(Protocol):
         ...
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """What can be estimated, in the order of `jacobians` and `stepped`."""
+        """Parameters that can be estimated, in the order of `jacobians` and `stepped`."""
         ...
 
     def project(self, directions: np.ndarray) -> np.ndarray:

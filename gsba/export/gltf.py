@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 
 from gsba.disk import write_bytes
-from gsba.geometry import quaternion_from_rotation
+from gsba.geometry import CV_R_GL, quaternion_from_rotation
 from gsba.types import FrameSet, Reconstruction
 
-_CV_R_GL = np.diag([1.0, -1, -1])  # axes of a glTF camera in ours
 _GLTF_R_Y_DOWN = np.diag([1.0, -1, -1])
 _GLTF_R_Z_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 _FLOAT, _UBYTE, _POINTS = 5126, 5121, 0  # glTF's numbers of component types and modes
@@ -38,7 +37,7 @@ def write_gltf(
         GsbaError: the disk cannot be written.
     """
     gltf_R_world = _GLTF_R_Z_UP if z_up else _GLTF_R_Y_DOWN
-    rotations = gltf_R_world @ reconstruction.world_T_rigs[:, :3, :3] @ _CV_R_GL
+    rotations = gltf_R_world @ reconstruction.world_T_rigs[:, :3, :3] @ CV_R_GL
     positions = reconstruction.world_T_rigs[:, :3, 3] @ gltf_R_world.T
     xyzw = _steady(quaternion_from_rotation(rotations))[:, [1, 2, 3, 0]]
     scene = _Buffer()

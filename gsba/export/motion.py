@@ -1,4 +1,4 @@
-"""How the camera moves while it takes each frame, for trainers that model blur and rolling rows.
+"""Velocities of the camera in each frame, for trainers that model blur and rolling rows.
 
 The keys are those of transforms.json of SpectacularAI's 3dgs-deblur (Seiskari et al., ECCV 2024):
 `camera_linear_velocity` and `camera_angular_velocity` of each frame in its camera's OpenGL axes,
@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 
 from gsba.camera.lens import Lenses
-from gsba.geometry import inverse
+from gsba.geometry import CV_R_GL, inverse
 from gsba.types import FrameSet, Reconstruction
 
 _MAX_INTERVAL_S = 0.25  # between frames whose poses tell how fast the camera moves in between
-_CV_R_GL = np.diag([1.0, -1, -1])  # OpenGL camera axes in our camera axes
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +70,7 @@ def velocity_keys(rig_velocity: np.ndarray, rig_T_camera: np.ndarray) -> dict[st
         rig_velocity: (6,) of the rig, see `rig_velocities`.
         rig_T_camera: (4, 4) of a camera with axes x right, y down, z forward.
     """
-    camera_R_rig = (rig_T_camera[:3, :3] @ _CV_R_GL).T
+    camera_R_rig = (rig_T_camera[:3, :3] @ CV_R_GL).T
     turn, move = rig_velocity[:3], rig_velocity[3:]
     moved = move + np.cross(turn, rig_T_camera[:3, 3])
     return {

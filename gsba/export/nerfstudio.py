@@ -32,11 +32,10 @@ from gsba.export.images import face_size_for, has_masks, panorama_writer, view_w
 from gsba.export.pictures import Files, FrameWriter
 from gsba.export.ply import write_splat_points
 from gsba.export.raw import RawPictures, raw_lenses
-from gsba.geometry import pose
+from gsba.geometry import CV_R_GL, pose
 from gsba.types import Fisheye, FrameSet, Reconstruction
 
 NERFSTUDIO_R_WORLD = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-_CV_R_GL = np.diag([1.0, -1, -1])  # OpenGL camera axes in our camera axes
 _CLOUD = "points3D.ply"
 _MAX_AXIS_ANGLE_DEG = 90.0  # of used fisheye pixels: gsplat renders nothing beyond
 _HOLD_OUT_EVERY = 8  # one panorama of so many, which is the interval of splat benchmarks
@@ -226,7 +225,7 @@ def _entry(file_path: str, out_R_world: np.ndarray, world_T_camera: np.ndarray) 
 def _matrix(out_R_world: np.ndarray, world_T_camera: np.ndarray) -> list[list[float]]:
     """Pose (4, 4) of a camera with OpenGL axes in nerfstudio's world."""
     matrix = np.eye(4)
-    matrix[:3, :3] = out_R_world @ world_T_camera[:3, :3] @ _CV_R_GL
+    matrix[:3, :3] = out_R_world @ world_T_camera[:3, :3] @ CV_R_GL
     matrix[:3, 3] = out_R_world @ world_T_camera[:3, 3]
     return matrix.tolist()
 

@@ -16,14 +16,13 @@ import numpy as np
 
 from gsba.disk import disk_errors, write_image
 from gsba.frames.files import decode, goes_out_as_it_is, image_size
-from gsba.geometry import inverse
+from gsba.geometry import CV_R_GL, inverse
 from gsba.log import GsbaError
 from gsba.placement.placement import Placement
 from gsba.store.records import RecordError, typed
 
 LIST = "localized.json"  # of `gsba localize`, in its folder
 FITTING = ("colmap", "colmap-flat", "nerfstudio")  # formats that hold photos
-_CV_R_GL = np.diag([1.0, -1, -1, 1])  # OpenGL camera axes in ours
 _INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "p1", "p2")
 
 
@@ -176,10 +175,12 @@ def _add_to_nerfstudio(path: Path, photos: Photos, poses: np.ndarray, names: Seq
     for photo, pose, name in zip(photos.photos, poses, names, strict=True):
         camera = photos.cameras[photo.camera]
         (cx, cy), (k1, k2) = camera.principal, camera.radial
+        matrix = world @ pose
+        matrix[:3, :3] = matrix[:3, :3] @ CV_R_GL
         frames.append(
             {
                 "file_path": name,
-                "transform_matrix": (world @ pose @ _CV_R_GL).tolist(),
+                "transform_matrix": matrix.tolist(),
                 **{"fl_x": camera.focal, "fl_y": camera.focal, "cx": cx, "cy": cy},
                 **{"w": camera.width, "h": camera.height},
                 **{"k1": k1, "k2": k2, "p1": 0.0, "p2": 0.0},

@@ -68,7 +68,7 @@ def join_pictures(pictures: list[np.ndarray], rig: Rig, width: int, share: float
 
 @dataclass(frozen=True, slots=True)
 class _Part:
-    """What one lens shows of a panorama."""
+    """Part of a panorama that one lens shows."""
 
     columns: np.ndarray  # (C,) int of the panorama
     places: np.ndarray  # (H, C, 2) float32, OpenCV pixels in the lens's picture
@@ -106,7 +106,7 @@ def _shrunk(picture: np.ndarray, share: float) -> np.ndarray:
 
 @table(maxsize=2)
 def _parts(rig: Rig, width: int) -> tuple[_Part, ...]:
-    """What each lens shows of a panorama."""
+    """The part of a panorama that each lens shows."""
     height, axes, faced = width // 2, optical_axes(rig), np.empty((width // 2, width), np.uint8)
     aside = np.arange(width) + _ASIDE_PX
     for top, bearings in _bearings(aside, width):

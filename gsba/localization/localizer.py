@@ -20,7 +20,14 @@ from gsba.localization.known_points import Sightings, isotropic
 from gsba.localization.patch_sightings import PatchAligner
 from gsba.localization.pictures import load_panorama
 from gsba.localization.place_index import PlaceIndex, open_index
-from gsba.localization.pose_fit import COARSE, FINE, PoseFit, fit
+from gsba.localization.pose_fit import (
+    COARSE,
+    FINE,
+    GATE_SIGMAS,
+    PoseFit,
+    fit,
+    is_determined,
+)
 from gsba.localization.pose_search import (
     Candidates,
     FoundPose,
@@ -41,7 +48,6 @@ _MAX_FACE_PX = 288  # across the faces on which keypoints of panoramas are found
 # the place, and cost in proportion to the area
 _WIDE_GATE_RAD, _NARROW_GATE_RAD = np.deg2rad(1.0), np.deg2rad(0.4)  # around predicted bearings
 _MIN_POINTS = 20  # inliers of a fit
-_MAX_POSITION_SIGMA = 0.05  # of a position, in median distances of points
 
 Grey = tuple[np.ndarray, np.ndarray | None]  # (h, 2h) uint8 panorama, and mask, True = use
 
@@ -336,14 +342,10 @@ class Localizer:
         inliers, covariance = fitted.inliers[0], fitted.covariances[0]
         world_T_rig, noise = fitted.world_T_rigs[0], float(fitted.noises[0])
         sigma = noise * typical_sigma(seen.spreads)
-        chance = min((3.5 * sigma / _NARROW_GATE_RAD) ** 2, 0.5)
+        chance = min((GATE_SIGMAS * sigma / _NARROW_GATE_RAD) ** 2, 0.5)
         if not is_significant(candidates.bearings, inliers, chance):
             return LocalizedFrame.refused(name, NO_PLACE)
-        offsets = candidates.points_world[inliers] - world_T_rig[:3, 3]
-        depth = float(np.median(np.linalg.norm(offsets, axis=1)))
-        if not np.isfinite(covariance).all() or (
-            np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1]) > _MAX_POSITION_SIGMA * depth
-        ):
+        if not is_determined(world_T_rig, covariance, candidates.points_world[inliers]):
             return LocalizedFrame.refused(name, NOT_DETERMINED)
         return LocalizedFrame(
             name,

@@ -14,9 +14,8 @@ from gsba.frames.panorama import Greys
 from gsba.localization.run_map import RunMap
 from gsba.photometric.alignment import REJECTIONS, accepted_rows
 from gsba.photometric.frame_jobs import align_to, cut
+from gsba.photometric.references import view_differences
 from gsba.store.shards import Threads
-
-_LOG_RATIO_WEIGHT = 0.25  # of a squared log ratio of distances, relative to a squared angle
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,12 +73,9 @@ class PatchAligner:
         positions = result.points_world[points]
         own = positions - world_T_rig[:3, 3]
         theirs = positions - result.world_T_rigs[hosts, :3, 3]
-        lengths = np.linalg.norm(own, axis=1), np.linalg.norm(theirs, axis=1)
-        cosines = np.sum(own * theirs, axis=1) / np.maximum(lengths[0] * lengths[1], 1e-300)
-        logs = np.log(np.maximum(lengths[0], 1e-300) / np.maximum(lengths[1], 1e-300))
+        cosines, ratios, costs = view_differences(own, theirs)
         likely = cosines > np.cos(np.deg2rad(settings.max_angle_deg))
-        likely &= np.abs(logs) < np.log(settings.max_ratio)
-        costs = 2 * (1 - cosines) + _LOG_RATIO_WEIGHT * logs**2
+        likely &= (ratios < settings.max_ratio) & (ratios * settings.max_ratio > 1)
         rows = np.flatnonzero(likely)
         rows = rows[np.lexsort((costs[rows], points[rows]))]
         _, first = np.unique(points[rows], return_index=True)

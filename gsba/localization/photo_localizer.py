@@ -21,7 +21,15 @@ from gsba.localization.localizer import (
     typical_sigma,
 )
 from gsba.localization.photos import Photo, as_panorama, photo_features, photo_rig
-from gsba.localization.pose_fit import COARSE, FINE, CameraPrior, PoseFit, fit
+from gsba.localization.pose_fit import (
+    COARSE,
+    FINE,
+    GATE_SIGMAS,
+    CameraPrior,
+    PoseFit,
+    fit,
+    is_determined,
+)
 from gsba.localization.pose_search import (
     Candidates,
     is_rivalled,
@@ -39,7 +47,6 @@ _FIELDS_RAD = tuple(np.deg2rad([70.0, 45.0, 105.0]))  # of the longer side, trie
 _MAX_ERROR_RAD = np.deg2rad(0.6)  # of a first pose's inliers: it leaves out the distortion
 _GATES_RAD = tuple(np.deg2rad([2.5, 1.0, 0.5]))  # around predicted bearings, round by round
 _MIN_POINTS = 15  # inliers of a fit
-_MAX_POSITION_SIGMA = 0.05  # of a position, in median distances of points
 _SAMPLE = 4  # points that determine a pose and a focal length
 _FOCALS = (0.1, 20.0)  # least and largest focal length, in longer sides
 _ANNEALED = (32.0, *COARSE, *FINE)  # scales of the loss of the first guided fit: a focal length
@@ -47,7 +54,6 @@ _ANNEALED = (32.0, *COARSE, *FINE)  # scales of the loss of the first guided fit
 _STIFF = 0.1  # share of the priors' standard deviations but the focal length's, in a first fit
 _CELLS_PER_SIDE = 64  # along 90 degrees: keypoints within one are one witness of a guided fit
 _NUM_PATCH_ROUNDS = 2
-_GATE_SIGMAS = 3.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,7 +173,7 @@ def _refine(
         fitted = fit([seen], pose[None], scales, [projection], [belief])
     pose, projection = fitted.world_T_rigs[0], _perspective(fitted.projections[0])
     sigma = float(fitted.noises[0]) * typical_sigma(seen.spreads) / projection.focal
-    chance = min((_GATE_SIGMAS * sigma / _GATES_RAD[-1]) ** 2, 0.5)
+    chance = min((GATE_SIGMAS * sigma / _GATES_RAD[-1]) ** 2, 0.5)
     if not is_significant(candidates.bearings, fitted.inliers[0], chance, _SAMPLE, _CELLS_PER_SIDE):
         return None
     inliers = int(fitted.inliers[0].sum())
@@ -335,11 +341,8 @@ def _judged(
     """A photo with its pose, if that is determined."""
     pose, inliers = fitted.world_T_rigs[number], fitted.inliers[number]
     covariance = fitted.covariances[number]
-    offsets = seen.points_world[inliers] - pose[:3, 3]
-    if inliers.sum() < _MIN_POINTS or not np.isfinite(covariance).all():
-        return LocalizedFrame.refused(name, NOT_DETERMINED)
-    depth = float(np.median(np.linalg.norm(offsets, axis=1)))
-    if np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1]) > _MAX_POSITION_SIGMA * depth:
+    determined = is_determined(pose, covariance, seen.points_world[inliers])
+    if inliers.sum() < _MIN_POINTS or not determined:
         return LocalizedFrame.refused(name, NOT_DETERMINED)
     focal = _perspective(fitted.projections[camera]).focal
     noise = float(fitted.noises[number]) * typical_sigma(seen.spreads) / focal

@@ -18,13 +18,14 @@ COARSE = (8.0,)  # scales of the loss, round by round, standard deviations, of a
 FINE = (2.0, 1.0)  # of the last one
 _KNOWN_NOISE = 2.0  # scale of the loss from which on residuals tell of the noise
 _MEDIAN_OF_SQUARES = 1.3863  # of a chi-square distribution with two degrees of freedom
+_MAX_POSITION_SIGMA = 0.05  # of a determined position, in median distances of points
 _MIN_NOISE = 0.5  # of keypoints, in their own standard deviations
 _SOLVER = SolverSettings(max_iterations=20, relative_tolerance=1e-5, absolute_tolerance=1e-2)
 
 
 @dataclass(frozen=True, slots=True)
 class CameraPrior:
-    """What is known of a camera before pictures are looked at."""
+    """Prior on the parameters of a camera."""
 
     step: np.ndarray  # (K,) step from the initial projection to the one expected
     sigmas: np.ndarray  # (K,) standard deviations of its parameters
@@ -84,6 +85,17 @@ def fit(
     poses = np.array([values.atPose3(key).matrix() for key in keys])
     found = tuple(block.projections(values))
     return PoseFit(poses, covariances[:num], inliers, noises, found, covariances[num:])
+
+
+def is_determined(
+    world_T_rig: np.ndarray, covariance: np.ndarray, points_world: np.ndarray
+) -> bool:
+    """True if a pose (4, 4) with a covariance (6, 6) is precise, relative to the distances of the
+    points (N, 3) that it was fitted to."""
+    if not len(points_world) or not np.isfinite(covariance).all():
+        return False
+    depth = float(np.median(np.linalg.norm(points_world - world_T_rig[:3, 3], axis=1)))
+    return bool(np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1]) <= _MAX_POSITION_SIGMA * depth)
 
 
 def _block(

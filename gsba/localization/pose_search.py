@@ -1,4 +1,4 @@
-"""Search for a picture's pose among candidate points: LO-RANSAC, significance, and rivals."""
+"""Search for a picture's pose among candidate points: its significance, and rivals."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -6,15 +6,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gsba.camera.rig import witnesses
-from gsba.camera.sphere import erp_from_bearings
-from gsba.geometry import inverse, pose, rotation_angle
+from gsba.geometry import inverse, rotation_angle
+from gsba.matching.absolute_pose import FoundPose, camera_pose, panorama_pose
 from gsba.significance import least_agreeing
 
 if TYPE_CHECKING:
     import pycolmap
 
-PANORAMA_WIDTH_PX = 4096  # of the virtual panorama in whose pixels bearings are given to the solver
-_MAX_TRIALS = 10_000
 _MIN_RATIO = 0.02  # least inlier ratio that the number of trials allows for
 _CELLS_PER_SIDE = 16  # along a face's side: keypoints within one, 6 degrees, are one witness
 _MAX_FALSE_ALARMS = 1e-6  # expected number of poses that chance explains as well as an accepted one
@@ -42,15 +40,6 @@ class Candidates:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class FoundPose:
-    """A pose that many candidates agree on."""
-
-    world_T_rig: np.ndarray  # (4, 4) float64
-    inliers: np.ndarray  # (m,) bool
-    focal: float = 0.0  # pixels, if it was estimated
-
-
 def search_pose(
     candidates: Candidates, max_error_rad: float, seed: int, least: int = _MIN_WITNESSES
 ) -> FoundPose | None:
@@ -62,15 +51,8 @@ def search_pose(
         seed: of the sampling.
         least: number of inliers that is enough.
     """
-    import pycolmap
-
-    width, height = PANORAMA_WIDTH_PX, PANORAMA_WIDTH_PX // 2
-    camera = pycolmap.Camera(
-        model="EQUIRECTANGULAR", width=width, height=height, params=(width, height)
-    )
-    pixels = erp_from_bearings(candidates.bearings, width, height)
-    max_error_px = max_error_rad * width / (2 * np.pi)
-    return _ransac(pixels, candidates.points_world, camera, max_error_px, seed, least)
+    given = candidates.bearings, candidates.points_world
+    return panorama_pose(*given, max_error_rad, seed, least, _MIN_RATIO)
 
 
 def search_focal(
@@ -93,35 +75,8 @@ def search_focal(
         seed: of the sampling.
         least: number of inliers that is enough.
     """
-    return _ransac(pixels, points_world, camera, max_error_px, seed, least, not known)
-
-
-def _ransac(
-    pixels: np.ndarray,
-    points_world: np.ndarray,
-    camera: "pycolmap.Camera",
-    max_error_px: float,
-    seed: int,
-    least: int,
-    estimate_focal: bool = False,
-) -> FoundPose | None:
-    import pycolmap
-
-    if len(pixels) < least:
-        return None
-    options = pycolmap.AbsolutePoseEstimationOptions()
-    options.ransac.max_error = max_error_px
-    options.ransac.min_num_trials, options.ransac.max_num_trials = 100, _MAX_TRIALS
-    options.ransac.min_inlier_ratio = max(least / len(pixels), _MIN_RATIO)
-    options.ransac.random_seed = seed
-    options.estimate_focal_length = estimate_focal
-    found = pycolmap.estimate_absolute_pose(pixels, points_world, camera, options)
-    if found is None or found["num_inliers"] < least:
-        return None
-    matrix = found["cam_from_world"].matrix()
-    world_T_rig = inverse(pose(matrix[:, :3], matrix[:, 3]))
-    focal = float(found["camera"].params[0]) if "camera" in found else float(camera.params[0])
-    return FoundPose(world_T_rig, np.asarray(found["inlier_mask"], bool), focal)
+    given = pixels, points_world, camera
+    return camera_pose(*given, max_error_px, seed, least, _MIN_RATIO, estimate_focal=not known)
 
 
 def is_significant(

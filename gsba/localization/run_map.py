@@ -99,13 +99,6 @@ class RunMap:
         weights = learned.find_weights(self.settings)
         return learned.make_extractor(self.settings.features, weights)()
 
-    def median_depth(self) -> float:
-        """Median distance of points from the frames that observe them, map units."""
-        result = self.result
-        offsets = result.points_world[result.observation_points]
-        offsets = offsets - result.world_T_rigs[result.observation_frames, :3, 3]
-        return float(np.median(np.linalg.norm(offsets, axis=1)))
-
 
 def require_own_version(root: Path) -> None:
     """Refuse a run that another version of gsba made.

@@ -7,12 +7,12 @@ from typing import TypeVar
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import X
 
 from factors import RobustLoss
 from factors.cholesky import DIM, BlockCholesky
-from factors.reduced_camera_system import damping_of
+from factors.normal_equations import damping_of
 from gsba.bundle.optimizer import OptimizeResult, minimize
+from gsba.bundle.pose_variables import X, poses_of
 from gsba.config import SolverSettings
 from gsba.parts.folder import Index, load, load_index, load_part, values_at
 from gsba.parts.jobs import (
@@ -188,11 +188,8 @@ class DividedSystem:
         return tuple(rows[frames] for frames in self._frames)
 
     def _pose_rows(self, values: gtsam.Values) -> np.ndarray:
-        rows = np.empty((len(self._index.poses), 12))
-        for frame, row in enumerate(rows):
-            matrix = values.atPose3(X(frame)).matrix()
-            row[:9], row[9:] = matrix[:3, :3].ravel(), matrix[:3, 3]
-        return rows
+        poses = poses_of(values, len(self._index.poses))
+        return np.hstack([poses[:, :3, :3].reshape(-1, 9), poses[:, :3, 3]])
 
     def _results(self, job: Job[R]) -> list[R]:
         found = list(self._workers.map_shards(job))

@@ -8,9 +8,9 @@ from typing import TypeVar
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import X
 from scipy.sparse import csr_array
 
+from gsba.bundle.pose_variables import X
 from gsba.disk import disk_errors
 from gsba.log import GsbaError
 from gsba.parts.partition import Partition, partition
@@ -34,7 +34,7 @@ class Sightings:
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """What a part owns."""
+    """Frames, landmarks and factors that a part owns."""
 
     frames: np.ndarray  # (N,) int32, frames of the map: its own ones, then those on cuts
     num_kept: int  # K frames on cuts
@@ -250,7 +250,7 @@ def _covisible(sightings: Sightings) -> np.ndarray:
 
 
 def _by_parts(chunk: _Chunk, cut: Partition) -> list[tuple[int, _Chunk]]:
-    """What each part owns of a chunk."""
+    """Landmarks and factors of a chunk, by the part that owns them."""
     sightings, graph = chunk.sightings, deserialized(chunk.graph)
     num = len(sightings.points_world)
     owners = cut.owners(sightings.frames.astype(np.int64), sightings.points, num)

@@ -1,4 +1,4 @@
-"""What is computed of a part where it lies: files in, files out, the same bytes whoever computes.
+"""Passes over parts where these lie: files in, files out, the same bytes whoever computes.
 
 A version is a number of accepted or tentative poses. `points-V.npz` holds a part's landmarks at a
 version, `equations-V.npz` its normal equations there.
@@ -11,11 +11,11 @@ from typing import Any, Self
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import X
 
 from factors import BearingTerm, LandmarkBlock, RobustLoss
 from factors.part_system import Condensed, PartElimination, PartEquations, PartSystem
 from factors.system_layout import SystemLayout
+from gsba.bundle.pose_variables import X
 from gsba.parts.folder import Part, deserialized, load, load_part, part_folder, values_at
 from gsba.store.records import save_record
 from gsba.store.shards import even_blocks
@@ -31,7 +31,7 @@ class Points:
 
 @dataclass(frozen=True, slots=True)
 class Linearized:
-    """What the caller keeps of a part's linearization: about its frames on cuts."""
+    """Costs of a part, and its share of the equations of its frames on cuts."""
 
     costs: Mapping[str, float]  # family -> cost
     diagonal: np.ndarray  # (K, 6, 6) float64, the part's own share of H, nothing damped
@@ -48,7 +48,7 @@ class Moved:
 
 @dataclass(frozen=True, slots=True)
 class Reduced:
-    """What a part says of its frames on cuts, at a damping of its own ones."""
+    """Equations of a part on its frames on cuts, its damped own frames eliminated."""
 
     condensed: Condensed | None  # None = its own block is singular
 

@@ -61,6 +61,23 @@ def visible_frames(
     return out[0, :num].copy(), out[1, :num].copy()
 
 
+def view_differences(
+    one: np.ndarray, other: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Differences between pairs of views of points.
+
+    Args:
+        one, other: (N, 3) vectors between each point and either centre.
+
+    Returns:
+        Cosines (N,) of the angles between the views, ratios (N,) of the second distance to the
+        first, and dissimilarities (N,).
+    """
+    out = np.empty((3, len(one)))
+    _differences(one, other, out)
+    return out[0], out[1], out[2]
+
+
 def _starts(landmarks: Landmarks) -> np.ndarray:
     tracks = landmarks.tracks
     return np.searchsorted(tracks.points, np.arange(tracks.num_points + 1))
@@ -75,6 +92,14 @@ def _difference(ax, ay, az, bx, by, bz):
     cosine = (ax * bx + ay * by + az * bz) / np.sqrt(aa * bb)
     ratio = np.sqrt(bb / aa)
     return cosine, ratio, 2.0 * (1.0 - cosine) + _LOG_RATIO_WEIGHT * np.log(ratio) ** 2
+
+
+@_kernel
+def _differences(one, other, out):
+    for n in range(len(one)):
+        a, b = one[n], other[n]
+        found = _difference(a[0], a[1], a[2], b[0], b[1], b[2])
+        out[0, n], out[1, n], out[2, n] = found
 
 
 @_kernel

@@ -34,7 +34,7 @@ def serve(scene: Scene, port: int) -> View:
         GsbaError: viser is missing, or the port is in use or reserved.
     """
     open_server = _server_class()
-    _require_free(port)
+    bound_socket(port).close()  # refuses a port that is not free
     token = secrets.token_urlsafe(16)
     with redirect_stdout(io.StringIO()), guarded(token) as started:  # viser prints a banner
         server = open_server(host=HOST, port=port, label=f"gsba: {scene.name}", verbose=False)
@@ -73,14 +73,24 @@ def _server_class() -> "Callable[..., viser.ViserServer]":
     return LocalServer
 
 
-def _require_free(port: int) -> None:
+def bound_socket(port: int) -> socket.socket:
+    """A socket of this machine's loopback interface, bound to a port.
+
+    Args:
+        port: 1 to 65535, or 0 for any free one.
+
+    Raises:
+        GsbaError: the port is out of range, reserved, or in use.
+    """
     if not 0 <= port <= 65535:
         raise GsbaError(f"--port {port} is out of range: use 1 to 65535, or 0 for any")
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((HOST, port))
-        except PermissionError:
+    bound = socket.socket()
+    bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        bound.bind((HOST, port))
+    except OSError as error:
+        bound.close()
+        if isinstance(error, PermissionError):
             raise GsbaError(f"port {port} is reserved by the system: pass another --port") from None
-        except OSError:
-            raise GsbaError(_IN_USE.format(port=port)) from None
+        raise GsbaError(_IN_USE.format(port=port)) from None
+    return bound

@@ -39,7 +39,7 @@ sys.exit(code)
 
 @pytest.fixture
 def jobs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Jobs]:
-    monkeypatch.setattr(worker, "_GSBA", (sys.executable, "-c", SCRIPT))
+    monkeypatch.setattr(worker, "GSBA", (sys.executable, "-c", SCRIPT))
     # As the worker's own process does: tests may run in the background, where SIGINT is ignored.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield Jobs(tmp_path / "state")

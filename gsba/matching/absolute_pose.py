@@ -1,0 +1,91 @@
+"""Absolute poses from points of a map, by LO-RANSAC on three-point poses.
+
+pycolmap solves on rays: bearings pass through the pixels of a virtual panorama, so that the whole
+sphere contributes and no face is special.
+"""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from gsba.camera.sphere import erp_from_bearings
+from gsba.geometry import inverse, pose
+
+if TYPE_CHECKING:
+    import pycolmap
+
+_PANORAMA_WIDTH_PX = 4096  # of the virtual panorama
+_MIN_TRIALS, _MAX_TRIALS = 100, 10_000
+
+
+@dataclass(frozen=True, slots=True)
+class FoundPose:
+    """A pose that many candidates agree on."""
+
+    world_T_rig: np.ndarray  # (4, 4) float64
+    inliers: np.ndarray  # (m,) bool
+    focal: float = 0.0  # pixels, if it was estimated
+
+
+def panorama_pose(
+    bearings: np.ndarray,
+    points_world: np.ndarray,
+    max_error_rad: float,
+    seed: int,
+    least: int,
+    min_ratio: float = 0.0,
+) -> FoundPose | None:
+    """Pose of a panorama with the most inliers; None if no pose has enough.
+
+    Args:
+        bearings: (m, 3) unit, rig frame.
+        points_world: (m, 3) candidate point of each bearing; many may be wrong.
+        max_error_rad: of an inlier.
+        seed: of the sampling.
+        least: number of inliers that is enough.
+        min_ratio: least inlier ratio that the number of trials allows for.
+    """
+    import pycolmap
+
+    size = _PANORAMA_WIDTH_PX, _PANORAMA_WIDTH_PX // 2
+    camera = pycolmap.Camera(model="EQUIRECTANGULAR", width=size[0], height=size[1], params=size)
+    pixels = erp_from_bearings(bearings, *size)
+    max_error_px = max_error_rad * _PANORAMA_WIDTH_PX / (2 * np.pi)
+    return camera_pose(pixels, points_world, camera, max_error_px, seed, least, min_ratio)
+
+
+def camera_pose(
+    pixels: np.ndarray,
+    points_world: np.ndarray,
+    camera: "pycolmap.Camera",
+    max_error_px: float,
+    seed: int,
+    least: int,
+    min_ratio: float = 0.0,
+    *,
+    estimate_focal: bool = False,
+) -> FoundPose | None:
+    """As `panorama_pose`, of pixels (m, 2), corner origin, of a camera.
+
+    Args:
+        camera: whose first parameter is the focal length.
+        estimate_focal: whether the focal length is estimated with the pose.
+    """
+    import pycolmap
+
+    if len(pixels) < least:
+        return None
+    options = pycolmap.AbsolutePoseEstimationOptions()
+    options.ransac.max_error = max_error_px
+    options.ransac.min_num_trials, options.ransac.max_num_trials = _MIN_TRIALS, _MAX_TRIALS
+    options.ransac.min_inlier_ratio = max(least / len(pixels), min_ratio)
+    options.ransac.random_seed = seed
+    options.estimate_focal_length = estimate_focal
+    found = pycolmap.estimate_absolute_pose(pixels, points_world, camera, options)
+    if found is None or found["num_inliers"] < least:
+        return None
+    matrix = found["cam_from_world"].matrix()
+    world_T_rig = inverse(pose(matrix[:, :3], matrix[:, 3]))
+    focal = float(found["camera"].params[0]) if "camera" in found else float(camera.params[0])
+    return FoundPose(world_T_rig, np.asarray(found["inlier_mask"], bool), focal)
