@@ -142,10 +142,10 @@ def export_all(
     _warn_of_gaps(reconstruction, frames)
     placement = options.placement or Placement(map_number=map_number)
     reconstruction = placement.apply(reconstruction)
-    seen_by, z_up = lenses.scaled(placement.similarity.scale), placement.up == "z"
+    seen_by, up = lenses.scaled(placement.similarity.scale), placement.up
     files = (path for paths in (*frames.paths, frames.mask_paths) for path in paths)
     read = fingerprint(path for path in files if path and path.exists())  # some formats read none
-    key = __version__, reconstruction, frames, read, face_size, z_up, link, seen_by, images
+    key = __version__, reconstruction, frames, read, face_size, up, link, seen_by, images
     key = (*key, options.shutter, options.photos)
     writers: list[FrameWriter] = []
     with ExitStack() as folders:
@@ -155,11 +155,11 @@ def export_all(
             given = partial, reconstruction, frames, to
             shown_as = _images_of(to, images, frames)
             if shown_as == "fisheye":
-                writers += _write_raw(*given, z_up, link, seen_by, options.shutter)
+                writers += _write_raw(*given, up, link, seen_by, options.shutter)
             elif shown_as == "panorama":
-                writers += _write_panoramas(*given, z_up, link, seen_by)
+                writers += _write_panoramas(*given, up, link, seen_by)
             else:
-                writers += _write(*given, face_size, z_up, link, seen_by, options.shutter)
+                writers += _write(*given, face_size, up, link, seen_by, options.shutter)
             if options.photos.photos:
                 add_photos(partial, to.value, options.photos, placement)
             placement.write(partial / "transform.json")
@@ -192,7 +192,7 @@ def _write_raw(
     reconstruction: Reconstruction,
     frames: FrameSet,
     to: ExportFormat,
-    z_up: bool,
+    up: str | None,
     link: bool,
     lenses: Lenses,
     shutter: Shutter,
@@ -200,7 +200,7 @@ def _write_raw(
     from gsba.export import colmap, nerfstudio
 
     if to == ExportFormat.NERFSTUDIO:
-        given = partial, reconstruction, frames, lenses, z_up, link
+        given = partial, reconstruction, frames, lenses, up, link
         return nerfstudio.write_nerfstudio_raw(*given, shutter)
     flat = to == ExportFormat.COLMAP_FLAT
     return [colmap.write_colmap_raw(partial, reconstruction, frames, lenses, flat, link)]
@@ -211,7 +211,7 @@ def _write_panoramas(
     reconstruction: Reconstruction,
     frames: FrameSet,
     to: ExportFormat,
-    z_up: bool,
+    up: str | None,
     link: bool,
     lenses: Lenses,
 ) -> list[FrameWriter]:
@@ -224,7 +224,7 @@ def _write_panoramas(
         case ExportFormat.COLMAP_ERP:
             return [colmap.write_colmap_erp(*given, link, lenses)]
         case ExportFormat.NERFSTUDIO:
-            return nerfstudio.write_nerfstudio_erp(*given, lenses, z_up, link)
+            return nerfstudio.write_nerfstudio_erp(*given, lenses, up, link)
         case _:
             return [panoramas.write_with_poses(*given, lenses, link)]
 
@@ -250,7 +250,7 @@ def _write(
     frames: FrameSet,
     to: ExportFormat,
     face_size: int | None,
-    z_up: bool,
+    up: str | None,
     link: bool,
     lenses: Lenses,
     shutter: Shutter,
@@ -267,11 +267,11 @@ def _write(
         case ExportFormat.COLMAP_ERP:
             return [colmap.write_colmap_erp(*given, link, lenses)]
         case ExportFormat.NERFSTUDIO:
-            return nerfstudio.write_nerfstudio(*given, face_size, z_up, link, lenses, shutter)
+            return nerfstudio.write_nerfstudio(*given, face_size, up, link, lenses, shutter)
         case ExportFormat.METASHAPE:
             return [metashape.write_metashape_faces(*given, face_size, link, lenses)]
         case ExportFormat.GLTF:
-            gltf.write_gltf(partial / "scene.glb", reconstruction, frames, z_up)
+            gltf.write_gltf(partial / "scene.glb", reconstruction, frames, up)
         case ExportFormat.PLY:
             ply.write_splat_points(
                 partial / "points3D.ply", reconstruction.points_world, reconstruction.point_colors

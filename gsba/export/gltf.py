@@ -3,7 +3,7 @@
 It holds the cloud (points with colours), a camera for each frame, which looks along the rig's z
 axis with a field of view of 90 degrees, and the camera `walk`, which moves through all frames at
 their times. glTF's world has y up and its cameras have OpenGL axes. A world without a known
-vertical is taken for one whose y points down, as the world of a camera held level does.
+vertical is turned by the axis that is nearest to the up axes of the rigs.
 """
 
 import json
@@ -17,26 +17,26 @@ from gsba.disk import write_bytes
 from gsba.geometry import CV_R_GL, quaternion_from_rotation
 from gsba.types import FrameSet, Reconstruction
 
-_GLTF_R_Y_DOWN = np.diag([1.0, -1, -1])
-_GLTF_R_Z_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+_RIG_UP = np.array([0.0, -1, 0])  # of a camera that is held level
+_MIN_COMMON_UP = 0.5  # length of the mean of the rigs' up axes; below it, they have none in common
 _FLOAT, _UBYTE, _POINTS = 5126, 5121, 0  # glTF's numbers of component types and modes
 _YFOV_RAD, _NEAR_PER_EXTENT = np.pi / 2, 1e-4
 
 
 def write_gltf(
-    path: Path, reconstruction: Reconstruction, frames: FrameSet, z_up: bool = False
+    path: Path, reconstruction: Reconstruction, frames: FrameSet, up: str | None = None
 ) -> None:
     """Write `path`, a binary glTF file.
 
     Args:
         path: file to write (.glb).
         reconstruction, frames: poses and cloud, and their frames.
-        z_up: the world's z points up.
+        up: axis of the world that points up, "-y", "y" or "z"; None = unknown.
 
     Raises:
         GsbaError: the disk cannot be written.
     """
-    gltf_R_world = _GLTF_R_Z_UP if z_up else _GLTF_R_Y_DOWN
+    gltf_R_world = _gltf_R_world(up, reconstruction.world_T_rigs)
     rotations = gltf_R_world @ reconstruction.world_T_rigs[:, :3, :3] @ CV_R_GL
     positions = reconstruction.world_T_rigs[:, :3, 3] @ gltf_R_world.T
     xyzw = _steady(quaternion_from_rotation(rotations))[:, [1, 2, 3, 0]]
@@ -78,6 +78,22 @@ def write_gltf(
         **scene.tables(),
     }
     write_bytes(path, _glb(document, bytes(scene.content)))
+
+
+def _gltf_R_world(up: str | None, world_T_rigs: np.ndarray) -> np.ndarray:
+    """Rotation (3, 3) that turns the world's up axis to y, by quarter turns about its axes."""
+    if up is None:
+        common = (world_T_rigs[:, :3, :3] @ _RIG_UP).mean(axis=0)
+        if np.linalg.norm(common) < _MIN_COMMON_UP:
+            common = _RIG_UP
+        axis = int(np.argmax(np.abs(common)))
+        up = f"{'-' if common[axis] < 0 else ''}{'xyz'[axis]}"
+    sign = -1.0 if up.startswith("-") else 1.0
+    if up[-1] == "y":
+        return np.diag([1.0, sign, sign])
+    if up[-1] == "z":
+        return np.array([[1.0, 0, 0], [0, 0, sign], [0, -sign, 0]])
+    return np.array([[0, -sign, 0], [sign, 0, 0], [0, 0, 1.0]])
 
 
 class _Buffer:

@@ -36,6 +36,7 @@ from gsba.geometry import CV_R_GL, pose
 from gsba.types import Fisheye, FrameSet, Reconstruction
 
 NERFSTUDIO_R_WORLD = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+_Z_UP_R_WORLD = {"z": np.eye(3), "y": NERFSTUDIO_R_WORLD.T}  # of worlds whose y does not point down
 _CLOUD = "points3D.ply"
 _MAX_AXIS_ANGLE_DEG = 90.0  # of used fisheye pixels: gsplat renders nothing beyond
 _HOLD_OUT_EVERY = 8  # one panorama of so many, which is the interval of splat benchmarks
@@ -46,7 +47,7 @@ def write_nerfstudio(
     reconstruction: Reconstruction,
     frames: FrameSet,
     face_size: int | None,
-    z_up: bool = False,
+    up: str | None = None,
     link: bool = False,
     lenses: Lenses = ONE_CENTRE,
     shutter: motion.Shutter = motion.UNKNOWN,
@@ -58,12 +59,12 @@ def write_nerfstudio(
         partial: folder to write.
         reconstruction, frames: poses and cloud, and their frames.
         face_size: pixels of a cube face; None = see `gsba.export.images.face_size_for`.
-        z_up: the world's z points up, so that it is not rotated.
+        up: axis of the world that points up, "-y", "y" or "z"; None = unknown, taken for "-y".
         link: make hard links to images that are exported unchanged.
         lenses: lenses of the frames.
         shutter: times of the exposure.
     """
-    out_R_world = _write_cloud(partial, reconstruction, z_up)
+    out_R_world = _write_cloud(partial, reconstruction, up)
     views = views_for(frames, face_size_for(frames, face_size), lenses)
     seen = seen_from_lenses(reconstruction, lenses)
     scenes = scenes_of(reconstruction)
@@ -80,12 +81,12 @@ def write_nerfstudio_erp(
     reconstruction: Reconstruction,
     frames: FrameSet,
     lenses: Lenses,
-    z_up: bool = False,
+    up: str | None = None,
     link: bool = False,
 ) -> list[FrameWriter]:
     """Write cloud and transforms.json of panoramas into `partial`, without images; returns their
     writers."""
-    out_R_world = _write_cloud(partial, reconstruction, z_up)
+    out_R_world = _write_cloud(partial, reconstruction, up)
     return [_write_erp_dataset(partial, reconstruction, frames, lenses, out_R_world, link, "")]
 
 
@@ -94,14 +95,14 @@ def write_nerfstudio_raw(
     reconstruction: Reconstruction,
     frames: FrameSet,
     lenses: Lenses,
-    z_up: bool = False,
+    up: str | None = None,
     link: bool = False,
     shutter: motion.Shutter = motion.UNKNOWN,
 ) -> list[FrameWriter]:
     """Write cloud and transforms.json of raw fisheyes into `partial`, without images; returns
     their writers."""
     rig = raw_lenses(frames)
-    out_R_world = _write_cloud(partial, reconstruction, z_up)
+    out_R_world = _write_cloud(partial, reconstruction, up)
     files = _files(partial, lens_names(len(rig)), masked=True)
     moving = lenses.readout_motion is not None and lenses.row_directions is not None
     velocities = motion.rig_velocities(reconstruction, frames, lenses, shutter)
@@ -129,9 +130,9 @@ def write_nerfstudio_raw(
     return [RawPictures(files, link, _MAX_AXIS_ANGLE_DEG)]
 
 
-def _write_cloud(partial: Path, reconstruction: Reconstruction, z_up: bool) -> np.ndarray:
+def _write_cloud(partial: Path, reconstruction: Reconstruction, up: str | None) -> np.ndarray:
     """Write the cloud in nerfstudio's world; returns out_R_world (3, 3)."""
-    out_R_world = np.eye(3) if z_up else NERFSTUDIO_R_WORLD
+    out_R_world = _Z_UP_R_WORLD.get(up or "-y", NERFSTUDIO_R_WORLD)
     points = reconstruction.points_world @ out_R_world.T
     write_splat_points(partial / _CLOUD, points, reconstruction.point_colors)
     return out_R_world

@@ -21,10 +21,13 @@ from export_scene import (
 )
 from scipy.spatial.transform import Rotation, Slerp
 
+from gsba.disk import read_vertices
 from gsba.export import ExportFormat, Shutter, export
 from gsba.export.trainers import PROGRAMS, format_of, how_to_start
 from gsba.geometry import inverse
 from gsba.log import GsbaError
+from gsba.placement.placement import Placement
+from gsba.similarity import Sim3
 from gsba.trajectory.metashape import is_metashape, read_metashape
 
 _CV_R_GL = np.diag([1.0, -1, -1, 1])
@@ -147,27 +150,57 @@ def _cameras_xml(cameras: list[tuple[str, int, int]]) -> str:
     )
 
 
-@pytest.mark.parametrize("up", ["y down", "z"])
-def test_gltf_is_read_by_trimesh(up: str, tmp_path: Path) -> None:
+_WORLD_R_LEVEL = {  # rotations of a world whose y points down, by the axis that then points up
+    "-y": np.eye(3),
+    "y": np.diag([1.0, -1, -1]),
+    "z": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
+    "-z": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
+    "x": np.array([[0, -1.0, 0], [1, 0, 0], [0, 0, 1]]),
+    "-x": np.array([[0, 1.0, 0], [-1, 0, 0], [0, 0, 1]]),
+}
+
+
+@pytest.mark.parametrize("up", _WORLD_R_LEVEL)
+@pytest.mark.parametrize("known", [True, False])
+def test_gltf_stands_upright_in_trimesh(up: str, known: bool, tmp_path: Path) -> None:
+    trimesh = pytest.importorskip("trimesh")
+    from gsba.export.gltf import write_gltf
+
+    frames, level = panoramas(tmp_path / "frames"), reconstruction()
+    placed = Placement(Sim3(rotation=_WORLD_R_LEVEL[up])).apply(level)
+    write_gltf(tmp_path / "scene.glb", placed, frames, up if known else None)
+    read = trimesh.load(tmp_path / "scene.glb")
+    (cloud,) = read.geometry.values()
+    np.testing.assert_array_equal(np.asarray(cloud.colors)[:, :3], COLORS)
+    gltf_R_level = np.linalg.lstsq(POINTS, cloud.vertices, rcond=None)[0].T
+    np.testing.assert_allclose(gltf_R_level @ gltf_R_level.T, np.eye(3), atol=1e-5)
+    np.testing.assert_allclose(gltf_R_level @ [0, -1, 0], [0, 1, 0], atol=1e-5)  # y is up
+    for name, pose in zip(frames.names[:-1], poses()[:-1], strict=True):  # the last camera
+        matrix, _ = read.graph[name]  # becomes the view of trimesh's scene
+        back = np.eye(4)
+        back[:3] = gltf_R_level.T @ matrix[:3] @ _CV_R_GL
+        np.testing.assert_allclose(back, pose, atol=1e-5)
+
+
+def test_rigs_without_a_common_up_stay_in_a_world_whose_y_points_down(tmp_path: Path) -> None:
     trimesh = pytest.importorskip("trimesh")
     from gsba.export.gltf import write_gltf
 
     frames, scene = panoramas(tmp_path / "frames"), reconstruction()
-    write_gltf(tmp_path / "scene.glb", scene, frames, z_up=up == "z")
-    read = trimesh.load(tmp_path / "scene.glb")
-    (cloud,) = read.geometry.values()
-    back = np.diag([1.0, -1, -1]) if up != "z" else np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
-    found, wanted = cloud.vertices @ back.T, POINTS
-    rows = np.argmin(np.linalg.norm(found[:, None] - wanted, axis=-1), axis=0)
-    np.testing.assert_allclose(found[rows], wanted, atol=1e-5)
-    np.testing.assert_array_equal(np.asarray(cloud.colors)[rows][:, :3], COLORS)
-    for name, pose in zip(frames.names[:-1], poses()[:-1], strict=True):  # the last camera
-        matrix, _ = read.graph[name]  # becomes the view of trimesh's scene
-        placed = np.eye(4)
-        placed[:3] = back @ matrix[:3] @ _CV_R_GL
-        np.testing.assert_allclose(placed, pose, atol=1e-5)
-    level = np.array([0, 0, 1.0]) if up == "z" else np.array([0, -1.0, 0])
-    np.testing.assert_allclose(back.T @ level, [0, 1, 0], atol=1e-12)  # glTF's y is up
+    turns = Rotation.from_rotvec(np.arange(NUM_FRAMES)[:, None] * [2 * np.pi / NUM_FRAMES, 0, 0])
+    scene.world_T_rigs[:, :3, :3] = turns.as_matrix()
+    write_gltf(tmp_path / "scene.glb", scene, frames)
+    (cloud,) = trimesh.load(tmp_path / "scene.glb").geometry.values()
+    np.testing.assert_allclose(cloud.vertices, POINTS * (1, -1, -1), atol=1e-5)
+
+
+@pytest.mark.parametrize("up", ["-y", "y", "z"])
+def test_nerfstudio_gets_a_world_whose_z_points_up(up: str, tmp_path: Path) -> None:
+    placement = Placement(Sim3(rotation=_WORLD_R_LEVEL[up]), up=up)
+    frames, out = panoramas(tmp_path / "frames"), tmp_path / "out"
+    export(reconstruction(), frames, out, ExportFormat.NERFSTUDIO, 64, placement)
+    vertices = read_vertices(out / "points3D.ply")
+    np.testing.assert_allclose(np.sort(vertices["z"]), np.sort(-POINTS[:, 1]), atol=1e-5)
 
 
 def test_gltf_camera_walks_through_all_frames(tmp_path: Path) -> None:
