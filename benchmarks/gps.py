@@ -28,6 +28,7 @@ from gsba.bundle.adjustment import (
     landmark_block,
     pose_covariances,
 )
+from gsba.bundle.bearings import Bearings
 from gsba.bundle.families import Families, Family
 from gsba.bundle.fixes import FrameFixes
 from gsba.bundle.gps_factors import AnchoredFixes, GpsFixes, linear_factors
@@ -138,7 +139,8 @@ def problem_of(walk: Walk, world_T_rigs: np.ndarray, fixes: FrameFixes | None) -
     """Context of an adjustment from these poses: priors and fixes."""
     settings = RefineSettings()
     faint, first = settings.priors.faint(), world_T_rigs[0]
-    members: list[Family] = [TrajectoryPrior(walk.coarse_T_rigs, faint, first=first)]
+    prior = TrajectoryPrior(walk.coarse_T_rigs, faint, first=first)
+    members: list[Family] = [Bearings(), prior]
     members += [] if fixes is None else [GpsFixes(fixes, GpsSettings())]
     families = Families(tuple(members)).fitted(Solution.without_points(world_T_rigs))
     return AdjustmentContext(families, RIG, settings, 1)

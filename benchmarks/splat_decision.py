@@ -24,6 +24,7 @@ from unittest import mock
 import numpy as np
 
 from gsba.bundle import adjustment
+from gsba.bundle.bearings import Bearings
 from gsba.bundle.families import Families
 from gsba.bundle.optimizer import optimize
 from gsba.bundle.trajectory_prior import TrajectoryPrior
@@ -92,7 +93,7 @@ def poor_frames(case: Case, seed: int) -> Given:
     )
     rig = CubeRig(SETTINGS.cubemap.face_size, np.pi / 2)  # bearings ask no face
     priors = TrajectoryPrior(case.result.coarse.world_T_rigs, SETTINGS.priors)
-    problem = adjustment.AdjustmentContext(Families((priors,)), rig, SETTINGS, 2)
+    problem = adjustment.AdjustmentContext(Families((Bearings(), priors)), rig, SETTINGS, 2)
     block = adjustment.landmark_block(landmarks, keypoints, 1.0, problem)
     terms = problem.terms(solved)
     block.polish(terms.values)

@@ -23,6 +23,7 @@ from factors.sphere_field import SphereField
 from factors.sphere_image import SphereImage
 from gsba import refine
 from gsba.bundle import adjustment, stitching, triangulation
+from gsba.bundle.bearings import Bearings
 from gsba.bundle.families import Families
 from gsba.bundle.shared_parameters import of_points
 from gsba.bundle.trajectory_prior import TrajectoryPrior
@@ -62,7 +63,7 @@ def solve(run: Path, frames: FrameSet, settings: RefineSettings) -> tuple[list[V
     priors = TrajectoryPrior(start.world_T_rigs, settings.priors)
     used, held = split(start.landmarks, settings.seed)
     none, threads, workers = SphereField.none(), 2, Threads(2)
-    problem = adjustment.AdjustmentContext(Families((priors,)), rig, settings, threads)
+    problem = adjustment.AdjustmentContext(Families((Bearings(), priors)), rig, settings, threads)
 
     bearing = adjustment.adjust(
         used.tracks, keypoints, start, problem, settings.rounds.refined[-1:]

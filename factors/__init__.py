@@ -1,5 +1,6 @@
 """Factors for 360-degree bundle adjustment on GTSAM: reference factors, batched blocks."""
 
+from factors._observations import Term
 from factors.bearing import (
     BearingFactor,
     BearingTerm,
@@ -9,6 +10,7 @@ from factors.bearing import (
 )
 from factors.block import Block, PoseSystem
 from factors.check import jacobian_errors
+from factors.landmark_residual import LandmarkResidual, LandmarkTerm
 from factors.landmarks import LandmarkBlock
 from factors.patch_windows import PatchPixels, PatchTable
 from factors.patches import PatchSet
@@ -29,6 +31,8 @@ __all__ = [
     "Block",
     "FaceCameras",
     "LandmarkBlock",
+    "LandmarkResidual",
+    "LandmarkTerm",
     "LensBearingFactor",
     "PatchPixels",
     "PatchSet",
@@ -40,6 +44,7 @@ __all__ = [
     "ReprojectionTerm",
     "RobustLoss",
     "SphereImage",
+    "Term",
     "bearing_residuals",
     "jacobian_errors",
     "photometric_residuals",

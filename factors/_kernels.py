@@ -8,8 +8,9 @@ changes, not when a function it calls from another file does.
 
 import numpy as np
 
-from factors._observations import BEARING, MIN_DEPTH
+from factors._observations import BEARING, GIVEN, MIN_DEPTH
 from factors.compiled import kernel_and_part
+from factors.landmark_residual import call_residual
 
 _EPS = 1e-300  # guards divisions by a squared norm
 _MIN_RELATIVE_DAMPING = 1e-12  # least damping, part of the trace of a landmark's Hessian
@@ -76,11 +77,13 @@ def whitened_residual(obs, o, dx, dy, dz):
         in u and v as in GTSAM's projection factor; pi), so that it moves nothing and yet no step
         gains by sending points there.
     """
-    measurement, whitener = obs.measurements[o], obs.whiteners[o]
+    kind, measurement, whitener = obs.kinds[o], obs.measurements[o], obs.whiteners[o]
     s00, s01, s11 = whitener[0], whitener[1], whitener[2]
-    if obs.kinds[o] == BEARING:
+    if kind == BEARING:
         mx, my, mz = measurement[0], measurement[1], measurement[2]
         ax, ay, az, bx, by, bz = tangent_axes(mx, my, mz)
+    elif kind >= GIVEN:
+        ax, ay, az, bx, by, bz, mx, my, mz = 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0
     else:
         camera = obs.cameras[int(measurement[2])]
         ax, bx, mx, ay, by, my = camera[0], camera[1], camera[2], camera[3], camera[4], camera[5]
@@ -88,10 +91,16 @@ def whitened_residual(obs, o, dx, dy, dz):
     x = ax * dx + ay * dy + az * dz
     y = bx * dx + by * dy + bz * dz
     z = mx * dx + my * dy + mz * dz
-    if obs.kinds[o] == BEARING:
+    if kind == BEARING:
         if x * x + y * y + z * z < _EPS:
             return False, s00 * np.pi, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         r0, r1, j00, j01, j02, j10, j11, j12 = _log_map(x, y, z)
+    elif kind >= GIVEN:
+        seen, r0, r1, j00, j01, j02, j10, j11, j12 = call_residual(  # type: ignore
+            obs.functions[kind - GIVEN], measurement[0], measurement[1], measurement[2], x, y, z
+        )
+        if seen == 0.0:
+            return False, s00 * r0 + s01 * r1, s11 * r1, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     else:
         if z * z <= MIN_DEPTH * MIN_DEPTH * (x * x + y * y) or z <= _EPS:
             r0 = r1 = 2.0 * camera[9]

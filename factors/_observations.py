@@ -7,9 +7,11 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from scipy.sparse import csr_matrix
 
+from factors.landmark_residual import LandmarkResidual
 from factors.robust import RobustLoss
 
-BEARING, REPROJECTION = 0, 1  # kinds of measurement
+BEARING, REPROJECTION, GIVEN = 0, 1, 2  # kinds of measurement; from GIVEN on one for each residual
+# that others wrote
 MIN_DEPTH = 1e-9  # z of a unit direction below which a point counts as behind the face
 
 
@@ -18,12 +20,14 @@ class Observations(NamedTuple):
 
     offsets: np.ndarray  # (J + 1,) int64: landmark j owns rows offsets[j]:offsets[j + 1]
     frames: np.ndarray  # (O,) int32, row of the poses
-    kinds: np.ndarray  # (O,) uint8, BEARING or REPROJECTION
+    kinds: np.ndarray  # (O,) uint8, BEARING, REPROJECTION, or GIVEN + row of functions
     families: np.ndarray  # (O,) uint8, family whose cost it counts to
-    measurements: np.ndarray  # (O, 3): unit bearing, rig frame | u, v in pixels, row of cameras
+    measurements: np.ndarray  # (O, 3): unit bearing, rig frame | u, v in pixels, row of cameras |
+    # as the function takes it
     whiteners: np.ndarray  # (O, 3): [s00, s01, s11] of the upper triangular 2x2 sqrt information
     origins: np.ndarray  # (O, 3): where the ray starts, rig frame, map units
     cameras: np.ndarray  # (C, 12): [rig_R_face row-major (9), focal, principal u, v in pixels]
+    functions: np.ndarray  # (G,) int64, addresses of residuals that others wrote
     loss: int  # code of the robust loss
     loss_scale: float
 
@@ -58,8 +62,8 @@ class Term(Protocol):
         ...
 
     @property
-    def kind(self) -> int:
-        """BEARING or REPROJECTION."""
+    def kind(self) -> int | LandmarkResidual:
+        """BEARING, REPROJECTION, or a residual that others wrote."""
         ...
 
     def measurements(self) -> np.ndarray:
@@ -110,6 +114,7 @@ def sort_observations(
     offsets = np.zeros(num_points + 1, dtype=np.int64)
     np.cumsum(np.bincount(owners, minlength=num_points), out=offsets[1:])
     names = list(dict.fromkeys(term.name for term in terms))
+    given = [term.kind.address for term in terms if not isinstance(term.kind, int)]
     obs = Observations(
         offsets=offsets,
         frames=frames[order],
@@ -119,13 +124,16 @@ def sort_observations(
         whiteners=np.empty((len(order), 3)),
         origins=np.zeros((len(order), 3)),
         cameras=np.concatenate([np.zeros((0, 12)), *(term.cameras() for term in terms)]),
+        functions=np.array(given, dtype=np.int64),
         loss=loss.code,
         loss_scale=float(loss.scale),
     )
     num_cameras = 0
     for term, span in zip(terms, spans, strict=True):
         rows = place[span]
-        obs.kinds[rows], obs.families[rows] = term.kind, names.index(term.name)
+        kind = term.kind
+        obs.kinds[rows] = kind if isinstance(kind, int) else GIVEN + given.index(kind.address)
+        obs.families[rows] = names.index(term.name)
         obs.measurements[rows] = term.measurements()
         obs.whiteners[rows] = term.whiteners()
         if term.origins_rig is not None:

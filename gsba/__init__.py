@@ -14,6 +14,7 @@ from gsba.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from gsba.bundle.families import Family, MapSnapshot
+    from gsba.bundle.point_observations import PointObservations
     from gsba.bundle.pose_variables import X
     from gsba.config import RefineSettings
     from gsba.config_file import load_config
@@ -31,6 +32,7 @@ __all__ = [
     "LocalizedFrame",
     "Localizer",
     "MapSnapshot",
+    "PointObservations",
     "Recording",
     "RefineSettings",
     "RunResult",
@@ -47,6 +49,7 @@ _HOMES = {
     "LocalizedFrame": "gsba.localization.localizer",
     "Localizer": "gsba.localization.localizer",
     "MapSnapshot": "gsba.bundle.families",
+    "PointObservations": "gsba.bundle.point_observations",
     "Recording": "gsba.pipeline.recording",
     "RefineSettings": "gsba.config",
     "RunResult": "gsba.pipeline.outputs",

@@ -3,7 +3,7 @@
 import os
 from importlib.metadata import EntryPoint, entry_points
 from itertools import pairwise
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
@@ -488,7 +488,13 @@ class PlacementSettings(_Settings):
     )
 
 
-BuiltIn = Literal["bearing", "reprojection", "gps", "photometric", "splat"]  # families of gsba
+BUILT_IN = {  # families of gsba
+    "bearing": "angles to points on the sphere",
+    "reprojection": "pixels of points on cube faces",
+    "gps": "positions of frames, from --gps",
+    "photometric": "grey values of patches in other frames",
+    "splat": "pixels of a Gaussian splat trained on the frames",
+}
 
 
 def installed_families() -> dict[str, EntryPoint]:
@@ -515,8 +521,7 @@ class RefineSettings(_Settings):
     camera: CameraSettings = CameraSettings()
     stitching: StitchingSettings = StitchingSettings()
     solver: SolverSettings = SolverSettings()
-    factors: tuple[BuiltIn | str, ...] = Field(default=("bearing",), min_length=1)  # families of
-    # gsba, and of packages by their entry point, with an argument: NAME or NAME:ARGUMENT
+    factors: tuple[str, ...] = ("bearing",)  # BUILT_IN, and of packages by NAME or NAME:ARGUMENT
     gps: GpsSettings = GpsSettings()
     photometric: PhotometricSettings = PhotometricSettings()
     splat: SplatFactorSettings = SplatFactorSettings()
@@ -530,7 +535,7 @@ class RefineSettings(_Settings):
 
     def package_families(self) -> tuple[str, ...]:
         """Families that packages provide."""
-        return tuple(name for name in self.factors if name not in get_args(BuiltIn))
+        return tuple(name for name in self.factors if name not in BUILT_IN)
 
     def untimed(self) -> "RefineSettings":
         """Settings without a readout time, for frames whose timestamps give only their order."""
@@ -564,23 +569,22 @@ class RefineSettings(_Settings):
     @model_validator(mode="after")
     def _geometry_first(self) -> "RefineSettings":
         for name in self.factors:
-            known = (*get_args(BuiltIn), *installed_families())
+            known = (*BUILT_IN, *installed_families())
             if name.partition(":")[0] not in known:
                 listed = ", ".join(f'"{one}"' for one in known)
                 raise ValueError(f'factors: "{name}" is not installed; installed are {listed}')
-        if not {"bearing", "reprojection"} & set(self.factors):
+        own = {"bearing", "reprojection"} & set(self.factors)
+        if not own and not self.package_families() and self.factors:
             named = " and ".join(self.factors)
             raise ValueError(f"factors: {named} needs bearing or reprojection as well; add one")
         return self
 
     @model_validator(mode="after")
     def _gps_has_fixes(self) -> "RefineSettings":
-        if ("gps" in self.factors) != (self.gps.file is not None):
-            raise ValueError(
-                "factors: gps needs positions: pass --gps FILE, or gps.file"
-                if self.gps.file is None
-                else "gps.file is read by the gps factors: add gps to factors"
-            )
+        if "gps" in self.factors and self.gps.file is None:
+            raise ValueError("factors: gps needs positions: pass --gps FILE, or gps.file")
+        if "gps" not in self.factors and self.gps.file is not None:
+            raise ValueError("gps.file is read by the gps factors: add gps to factors")
         return self
 
     @model_validator(mode="after")

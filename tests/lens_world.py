@@ -8,6 +8,7 @@ from synthetic import RIG, World, make_world, unit, with_noise
 
 from gsba.bundle import adjustment, triangulation
 from gsba.bundle.adjustment import AdjustmentContext
+from gsba.bundle.bearings import Bearings
 from gsba.bundle.camera_adjustment import solve_with_camera
 from gsba.bundle.families import Families
 from gsba.bundle.readout import CameraEstimate
@@ -62,7 +63,7 @@ def times(num_frames: int) -> np.ndarray:
 def problem_of(world: World, camera: CameraSettings | None = None) -> AdjustmentContext:
     priors = TrajectoryPrior(world.world_T_rigs, SETTINGS.priors)
     settings = SETTINGS.model_copy(update={"camera": camera or SETTINGS.camera})
-    return AdjustmentContext(Families((priors,)), RIG, settings, 2)
+    return AdjustmentContext(Families((Bearings(), priors)), RIG, settings, 2)
 
 
 def solved_under(

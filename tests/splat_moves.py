@@ -8,6 +8,7 @@ import numpy as np
 from tiny_run import SETTINGS, Case
 
 from gsba.bundle.adjustment import AdjustmentContext
+from gsba.bundle.bearings import Bearings
 from gsba.bundle.families import Families
 from gsba.bundle.trajectory_prior import TrajectoryPrior
 from gsba.config import RefineSettings
@@ -42,7 +43,7 @@ def run(case: Case, given: Given, settings: RefineSettings, **options) -> SplatR
     priors = TrajectoryPrior(case.result.coarse.world_T_rigs, settings.priors)
     rig = cubemap.rig_for(case.result.frames, settings.cubemap)
     return refinement.refine(
-        *given, AdjustmentContext(Families((priors,)), rig, settings, 2), **options
+        *given, AdjustmentContext(Families((Bearings(), priors)), rig, settings, 2), **options
     )
 
 

@@ -12,7 +12,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 MOST_FLAT = 10  # modules beside the rooms
-FACTORS_MAY_USE = {"factors", "gtsam", "numba", "numpy", "scipy"}
+FACTORS_MAY_USE = {"llvmlite", "factors", "gtsam", "numba", "numpy", "scipy"}
 
 
 def _load() -> ModuleType:

@@ -9,21 +9,13 @@ from typing import Protocol, Self, TypeVar
 import gtsam
 import numpy as np
 
-from factors import (
-    BearingTerm,
-    Block,
-    FaceCameras,
-    LandmarkBlock,
-    ReprojectionTerm,
-    RobustLoss,
-    tangent_basis,
-)
+from factors import Block, LandmarkBlock, RobustLoss, tangent_basis
 from gsba.bundle import pose_variables, triangulation
 from gsba.bundle.families import Families, FamilyTerms
 from gsba.bundle.gyro_turns import GyroTurns
 from gsba.bundle.optimizer import marginal_covariances, optimize
 from gsba.bundle.pose_variables import poses_of, values_of
-from gsba.camera.rig import RIG_R_FACE, CubeRig
+from gsba.camera.rig import CubeRig
 from gsba.config import RefineSettings, SolverSettings
 from gsba.types import (
     GyroConstraints,
@@ -63,9 +55,9 @@ class Terms:
 class AdjustmentContext:
     """Families, settings and faces that all adjustments at one time of a run share."""
 
-    families: Families  # of residuals beside those of landmarks: trajectory prior, sensors, callers
-    rig: CubeRig  # the faces, for the reprojection family
-    settings: RefineSettings  # landmark families, loss, solver, rounds
+    families: Families  # of residuals: of points, trajectory prior, sensors, callers
+    rig: CubeRig  # the faces
+    settings: RefineSettings  # loss, solver, rounds
     num_threads: int  # of the solver
     maps: np.ndarray | None = None  # (F,) map of each frame, for the families; None = there is one
 
@@ -300,39 +292,19 @@ def _solver(settings: RefineSettings, last: bool) -> SolverSettings:
 def landmark_block(
     landmarks: Landmarks, keypoints: Keypoints, noise: float, context: AdjustmentContext
 ) -> LandmarkBlock:
-    """The factor block of the chosen families; several share each observation's information.
+    """The factor block of the families that observe points.
 
     Args:
         landmarks, keypoints: what is observed, where.
         noise: of the observations, in units of the keypoints' own sigmas.
-        context: faces, families, loss.
+        context: families, loss.
     """
-    rig, settings = context.rig, context.settings
-    tracks, rows = landmarks.tracks, keypoints.rows(landmarks.tracks)
-    share = noise * np.sqrt(len({"bearing", "reprojection"} & set(settings.factors)))
-    terms, origins = [], keypoints.origins_of(rows)
-    if "bearing" in settings.factors:
-        sigmas, infos = share * keypoints.sigmas_rad[rows], keypoints.sqrt_infos
-        roots = None if infos is None else infos[rows] / share
-        bearings = keypoints.bearings_rig[rows]
-        term = BearingTerm(tracks.frames, tracks.points, bearings, sigmas, roots)
-        terms.append(replace(term, origins_rig=origins))
-    if "reprojection" in settings.factors:
-        bearings, faces = keypoints.bearings_rig[rows], keypoints.faces[rows]
-        cosines = np.einsum("oi,oi->o", bearings, RIG_R_FACE[faces, :, 2])
-        sigmas_px = share * keypoints.sigmas_rad[rows] * rig.focal / cosines**1.5
-        num = len(RIG_R_FACE)
-        cameras = FaceCameras(RIG_R_FACE, np.full(num, rig.focal), np.full((num, 2), rig.principal))
-        pixels = keypoints.pixels[rows]
-        if origins is not None:  # rays of lenses are elsewhere than where the faces show them
-            pixels = rig.project(bearings, faces)
-        term = ReprojectionTerm(tracks.frames, tracks.points, pixels, faces, cameras, sigmas_px)
-        terms.append(replace(term, origins_rig=origins))
+    solver = context.settings.solver
     return LandmarkBlock(
         [pose_variables.X(f) for f in range(len(keypoints.starts) - 1)],
         landmarks.points_world,
-        terms,
-        RobustLoss(settings.solver.loss, settings.solver.loss_sigmas),
+        context.families.landmark_terms(landmarks, keypoints, noise),
+        RobustLoss(solver.loss, solver.loss_sigmas),
         context.num_threads,
     )
 

@@ -1,9 +1,9 @@
 """Families of residuals: one object adds everything that one source of knowledge contributes.
 
-The trajectory prior, the gyro and GPS are families, and so are those of callers and packages. A
-family has factors, and variables of its own if need be: a barometer has a bias, tags have poses. It
-builds its factors anew whenever the map changes, so that they always belong to the poses that they
-are solved with.
+Bearings, reprojections, the trajectory prior, the gyro and GPS are families, and so are those of
+callers and packages. A family has factors, and variables of its own if need be: a barometer has a
+bias, tags have poses. It builds its factors anew whenever the map changes, so that they always
+belong to the poses that they are solved with.
 """
 
 import hashlib
@@ -14,11 +14,12 @@ from typing import Any, Protocol
 import gtsam
 import numpy as np
 
-from factors import Block
+from factors import Block, Term
 from gsba.bundle.family_variables import kept, restored
+from gsba.bundle.point_observations import PointObservations
 from gsba.bundle.pose_variables import X, values_of
 from gsba.log import GsbaError
-from gsba.types import FamilyVariables, Landmarks, Solution
+from gsba.types import FamilyVariables, Keypoints, Landmarks, Solution
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,9 +40,9 @@ class MapSnapshot:
 class Family(Protocol):
     """Residuals of one kind, their variables, and their part of the report.
 
-    Subclass it; only `name`, `digest` and one of `graph` and `blocks` are needed. Keys of frames
-    are `gsba.X(frame)`; keys of own variables are `gtsam.symbol` with a capital letter. An instance
-    is never changed: `fitted` and `for_covariances` return another one.
+    Subclass it; only `name`, `digest` and one of `graph`, `blocks` and `landmark_terms` are needed.
+    Keys of frames are `gsba.X(frame)`; keys of own variables are `gtsam.symbol` with a capital
+    letter. An instance is never changed: `fitted` and `for_covariances` return another one.
     """
 
     name: str  # in settings, in the report and in messages
@@ -49,6 +50,8 @@ class Family(Protocol):
     fixes_gauge: bool = False  # its scale or world becomes that of the result
     limits_drift: bool = False  # its residuals bend long paths softly: adjustments start with
     # little damping and converge to a finer tolerance
+    observes_points: bool = False  # it gives terms: several families that do share the information
+    # of each observation
     reserved_letters: str = ""  # small letters of own keys, which only families of gsba have
 
     def variables(self, snapshot: MapSnapshot) -> gtsam.Values:
@@ -61,6 +64,14 @@ class Family(Protocol):
 
     def blocks(self, snapshot: MapSnapshot) -> Sequence[Block]:
         """Many residuals held as arrays, see `factors.Block`."""
+        return ()
+
+    def landmark_terms(self, observed: PointObservations) -> Sequence[Term]:
+        """Residuals of the map's points, which are eliminated: see `observes_points`.
+
+        Adjustments in which lenses, readout or motion of the camera are solved for have bearings
+        in their place.
+        """
         return ()
 
     def holds_gauge(self, snapshot: MapSnapshot) -> bool:
@@ -124,9 +135,28 @@ class Families:
         return self.with_members(family for family in self.members if family.fixes_gauge)
 
     @property
+    def observing_points(self) -> "Families":
+        """The families whose residuals are of the map's points."""
+        return self.with_members(family for family in self.members if family.observes_points)
+
+    @property
     def limit_drift(self) -> bool:
         """True if a family limits drift: see `Family.limits_drift`."""
         return any(family.limits_drift for family in self.members)
+
+    def landmark_terms(
+        self, landmarks: Landmarks, keypoints: Keypoints, noise: float
+    ) -> list[Term]:
+        """Residuals of points by all families that observe them.
+
+        Args:
+            landmarks, keypoints: what is observed, where.
+            noise: of the observations, in units of the keypoints' own sigmas.
+        """
+        observing = self.observing_points.members
+        share = noise * np.sqrt(len(observing))
+        observed = PointObservations.of(landmarks, keypoints, share)
+        return [term for family in observing for term in family.landmark_terms(observed)]
 
     def digests(self) -> list[tuple[str, str]]:
         """Names and digests of the families, on which results rest."""

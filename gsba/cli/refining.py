@@ -31,11 +31,27 @@ Overrides = Annotated[
     list[str] | None,
     typer.Option("--set", help="Override a setting; repeatable.", metavar="STAGE.KEY=VALUE"),
 ]
+
+
+def _list_families(value: str | None) -> str | None:
+    """`--factors list`: the installed families, and nothing else is done."""
+    if value == "list":
+        from gsba.config import BUILT_IN, installed_families
+
+        packages = {name: f"of {point.value}" for name, point in installed_families().items()}
+        shown = {**BUILT_IN, **packages}
+        width = max(map(len, shown)) + 2
+        typer.echo("\n".join(f"{name:<{width}}{summary}" for name, summary in shown.items()))
+        raise typer.Exit
+    return value
+
+
 Factors = Annotated[
     str | None,
     typer.Option(
+        callback=_list_families,
         help="Families of residuals, separated by commas: bearing, reprojection, gps, photometric, "
-        "splat, and those of packages, as NAME or NAME:ARGUMENT; list: name all that are installed."
+        "splat, and those of packages, as NAME or NAME:ARGUMENT; list: shows all that there are.",
     ),
 ]
 Weights = Annotated[

@@ -213,7 +213,8 @@ def _of_families(state: State) -> dict[str, Any]:
     """The report of each family of GPS, of packages and of the caller, by its name."""
     families = state.run.families
     snapshot = families.snapshot(state.solution, state.prior.parts)
-    return {family.name: plain(family.report(snapshot)) for family in families.members}
+    reports = {family.name: plain(family.report(snapshot)) for family in families.members}
+    return {name: report for name, report in reports.items() if report}
 
 
 def _gauge(run: Run, prior: Prior) -> str:

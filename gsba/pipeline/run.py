@@ -8,8 +8,10 @@ from typing import TypeVar
 import numpy as np
 
 from gsba import learned
+from gsba.bundle.bearings import Bearings
 from gsba.bundle.families import Families, Family
 from gsba.bundle.gyro_turns import GyroTurns
+from gsba.bundle.reprojections import Reprojections
 from gsba.bundle.trajectory_prior import TrajectoryPrior
 from gsba.camera.rig import CubeRig
 from gsba.config import RefineSettings
@@ -84,7 +86,7 @@ class Run:
     greys: Greys  # pictures for patches
     weights: Mapping[str, Path]  # stage -> file of a learned network
     num_threads: int
-    families: Families  # those of the evidence, bound to the frames
+    families: Families  # those that observe points and those of the evidence, bound to the frames
     lenses_found: bool = False  # whether the calibration that raw pairs are cut by was estimated by
     # a pass before, so that it is free
     suffix: str = ""  # of the names of stages that only see one of several recordings
@@ -104,7 +106,7 @@ class Run:
 
         Raises:
             GsbaError: frames that a chosen family cannot use, a family with a name of gsba's own,
-                or weights that are not there.
+                none that observes points, or weights that are not there.
         """
         direct.check(frames, settings)
         if settings.camera.model == "two_lens" and not frames.panoramic:
@@ -116,6 +118,11 @@ class Run:
         for family in evidence.families:
             if family.name in (TrajectoryPrior.name, GyroTurns.name):
                 raise GsbaError(f"family {family.name}: gsba has one of this name; rename yours")
+        rig = cubemap.rig_for(frames, settings.cubemap)
+        members = (*_of_points(settings, rig), *evidence.families)
+        families = Families(members, frames.names, frames.timestamps)
+        if not families.observing_points.members:
+            raise GsbaError("factors: no family observes points; add bearing or reprojection")
         chain = Chain(store)
         paths = [*(path for group in frames.paths for path in group), *frames.mask_paths]
         start = coarse.world_T_rigs.tolist(), settings.read
@@ -131,11 +138,11 @@ class Run:
             coarse=coarse,
             evidence=evidence,
             settings=settings,
-            rig=cubemap.rig_for(frames, settings.cubemap),
+            rig=rig,
             greys=Greys(frames, settings.patches.max_width),
             weights=learned.find_weights(settings),
             num_threads=settings.solver.threads(),
-            families=Families(evidence.families, frames.names, frames.timestamps),
+            families=families,
             lenses_found=lenses_found,
         )
 
@@ -177,7 +184,7 @@ class Run:
             frames=replace(frames, timestamps=times, clock_shifts=(0.0,) * len(times)),
             coarse=given.coarse,
             evidence=Evidence(given.trajectories, given.imu),
-            families=Families((), frames.names, times),
+            families=replace(self.families.observing_points, names=frames.names, timestamps=times),
             suffix=f"@{given.name}",
         )
 
@@ -203,5 +210,10 @@ class Run:
         """Settings that solutions rest on."""
         settings = self.settings
         relevant = [settings.triangulate, settings.rounds, settings.priors, settings.solver]
-        families = [f for f in settings.factors if f not in ("photometric", "splat")]
-        return [*relevant, families, self.families.digests()]
+        return [*relevant, self.families.digests()]
+
+
+def _of_points(settings: RefineSettings, rig: CubeRig) -> list[Family]:
+    """gsba's own families that observe points, as settings.factors name them."""
+    own: list[Family] = [Bearings(), Reprojections(rig)]
+    return [family for family in own if family.name in settings.factors]

@@ -108,7 +108,8 @@ class State:
     def adjustment_context(self) -> AdjustmentContext:
         """Families and settings of an adjustment of this map."""
         run, prior = self.run, self.prior
-        first = self.solution.world_T_rigs[0] if run.families.members else None
+        guided = any(not family.observes_points for family in run.families.members)
+        first = self.solution.world_T_rigs[0] if guided else None
         own = prior.families(run.settings.priors, first)
         families = run.families.with_members((*own, *run.families.members))
         return self._context(families.fitted(self.solution, prior.parts))
@@ -119,7 +120,9 @@ class State:
         Args:
             noise: of the trajectory's steps and poses.
         """
-        return self._context(self.run.families.with_members(self.prior.families(noise)))
+        observing = self.run.families.observing_points
+        own = self.prior.families(noise)
+        return self._context(observing.with_members((*own, *observing.members)))
 
     def _context(self, families: Families) -> AdjustmentContext:
         run = self.run

@@ -11,8 +11,10 @@ from synthetic import RIG, World, drifted, make_world
 
 from gsba.bundle import adjustment, triangulation
 from gsba.bundle.adjustment import AdjustmentContext
-from gsba.bundle.families import Families
+from gsba.bundle.bearings import Bearings
+from gsba.bundle.families import Families, Family
 from gsba.bundle.optimizer import OptimizeResult
+from gsba.bundle.reprojections import Reprojections
 from gsba.bundle.trajectory_prior import TrajectoryPrior
 from gsba.config import RefineSettings
 from gsba.geometry import inverse, rotation_angle
@@ -32,6 +34,11 @@ def _settings(families: str = "bearing", **changes: object) -> RefineSettings:
     return RefineSettings.model_validate({"factors": FAMILIES[families], **changes})
 
 
+def _observing(settings: RefineSettings) -> list[Family]:
+    own: list[Family] = [Bearings(), Reprojections(RIG)]
+    return [family for family in own if family.name in settings.factors]
+
+
 def _world(seed: int = 0) -> tuple[World, np.ndarray]:
     world = make_world(seed, sigma_rad=SIGMA, claimed_sigma_rad=CLAIMED, false_share=0.05)
     return world, drifted(world.world_T_rigs, np.random.default_rng(seed))
@@ -42,7 +49,7 @@ def _run(
 ) -> Solution:
     priors = TrajectoryPrior(coarse, settings.priors)
     start = Solution.without_points(coarse)
-    problem = AdjustmentContext(Families((priors,)), RIG, settings, 1)
+    problem = AdjustmentContext(Families((*_observing(settings), priors)), RIG, settings, 1)
     return adjustment.adjust(world.tracks, world.keypoints, start, problem, gates)
 
 
@@ -50,7 +57,7 @@ def _covariances(
     solved: Solution, world: World, coarse: np.ndarray, settings: RefineSettings
 ) -> np.ndarray:
     priors = TrajectoryPrior(coarse, settings.priors)
-    problem = AdjustmentContext(Families((priors,)), RIG, settings, 1)
+    problem = AdjustmentContext(Families((*_observing(settings), priors)), RIG, settings, 1)
     return adjustment.pose_covariances(solved, world.keypoints, problem)[0]
 
 

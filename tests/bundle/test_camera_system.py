@@ -13,6 +13,7 @@ from factors.quadratic_block import QuadraticBlock
 from factors.system_choice import reduced_system
 from gsba import Family, MapSnapshot, X
 from gsba.bundle import adjustment
+from gsba.bundle.bearings import Bearings
 from gsba.bundle.camera_system import CameraSystem
 from gsba.bundle.families import Families
 from gsba.bundle.gyro_turns import GyroTurns
@@ -131,7 +132,7 @@ def test_frames_own_motion_does_not_shrink_a_map_of_no_known_scale() -> None:
     gauge, tight = gtsam.NonlinearFactorGraph(), gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
     gauge.add(gtsam.PriorFactorPose3(X(0), gtsam.Pose3(world.world_T_rigs[0]), tight))
     problem, start = problem_of(world), Solution.without_points(world.world_T_rigs)
-    problem = replace(problem, families=Families((GivenFactors(gauge),)))
+    problem = replace(problem, families=Families((Bearings(), GivenFactors(gauge))))
     given = CameraEstimate(LENSES, READOUT_S), start, problem
     solved, found = solved_with(world, shown, *given)
     scale = pose_similarity(solved.world_T_rigs, world.world_T_rigs).scale
@@ -158,7 +159,9 @@ class Duration(Family):
 def test_variables_of_families_are_solved_beside_the_camera() -> None:
     world, shown = seen_through(LENSES)
     names = tuple(str(f) for f in range(24))
-    problem = replace(problem_of(world), families=Families((Duration(),), names, times(24)))
+    problem = replace(
+        problem_of(world), families=Families((Bearings(), Duration()), names, times(24))
+    )
     start = Solution.without_points(world.world_T_rigs)
     solved, found = solved_with(world, shown, CameraEstimate(LENSES, READOUT_S), start, problem)
     assert solved.variables is not None and solved.variables.data == pytest.approx([3.0])

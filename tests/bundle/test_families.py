@@ -12,6 +12,7 @@ from factors.block import PoseSystem
 from gsba import Family, MapSnapshot, X
 from gsba.bundle import adjustment, gauge
 from gsba.bundle.adjustment import AdjustmentContext
+from gsba.bundle.bearings import Bearings
 from gsba.bundle.families import Families
 from gsba.bundle.family_variables import kept, restored
 from gsba.bundle.optimizer import optimize
@@ -138,7 +139,7 @@ class Ranges(Family):
 def _adjusted(world: World, *members: Family) -> tuple[Solution, AdjustmentContext]:
     """The synthetic world from a drifting start, with families."""
     coarse = drifted(world.world_T_rigs, np.random.default_rng(0))
-    every = TrajectoryPrior(coarse, SETTINGS.priors), *members
+    every = Bearings(), TrajectoryPrior(coarse, SETTINGS.priors), *members
     families = Families(every, tuple(map(str, range(len(coarse)))), np.arange(float(len(coarse))))
     problem = AdjustmentContext(families, RIG, SETTINGS, 1)
     start = Solution.without_points(coarse)

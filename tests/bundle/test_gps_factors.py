@@ -11,6 +11,7 @@ from synthetic import RIG, World, drifted, make_world
 
 from gsba.bundle import adjustment, gps_factors
 from gsba.bundle.adjustment import AdjustmentContext, values_of
+from gsba.bundle.bearings import Bearings
 from gsba.bundle.families import Families, Family
 from gsba.bundle.fixes import FrameFixes
 from gsba.bundle.gps_factors import GpsFixes
@@ -35,7 +36,8 @@ def _fixes(world: World, seed: int, noise: float = 1.0) -> FrameFixes:
 def _problem(coarse: np.ndarray, poses: np.ndarray, fixes: FrameFixes | None) -> AdjustmentContext:
     """As `gsba.pipeline.state.State.adjustment_context` has it."""
     settings = RefineSettings()
-    members: list[Family] = [TrajectoryPrior(coarse, settings.priors, first=poses[0])]
+    prior = TrajectoryPrior(coarse, settings.priors, first=poses[0])
+    members: list[Family] = [Bearings(), prior]
     members += [] if fixes is None else [GpsFixes(fixes, GpsSettings())]
     families = Families(tuple(members)).fitted(Solution.without_points(poses))
     return AdjustmentContext(families, RIG, settings, 1)

@@ -10,6 +10,7 @@ from synthetic import RIG, World, make_world
 from factors.sphere_field import SphereField, num_harmonics
 from gsba.bundle import adjustment, stitching
 from gsba.bundle.adjustment import AdjustmentContext
+from gsba.bundle.bearings import Bearings
 from gsba.bundle.families import Families
 from gsba.bundle.optimizer import optimize
 from gsba.bundle.shared_parameters import PARTS, SharedModel, model_of, parts_of
@@ -50,7 +51,7 @@ def _found(bent: bool) -> tuple[World, Solution, Keypoints, Stitching]:
     )
     priors = TrajectoryPrior(world.world_T_rigs, SETTINGS.priors)
     start = Solution.without_points(world.world_T_rigs)
-    problem = AdjustmentContext(Families((priors,)), RIG, SETTINGS, 1)
+    problem = AdjustmentContext(Families((Bearings(), priors)), RIG, SETTINGS, 1)
     solved, calibrated = adjustment.adjust_sighted(sighted, start, problem, (30.0, 6.0))
     found = stitching.estimate(sighted, calibrated, solved, SphereField.none(), problem)
     return world, solved, keypoints, found
@@ -115,7 +116,7 @@ def test_too_little_is_left_alone() -> None:
     small = replace(before, landmarks=landmarks)
     sighted = Sighted(keypoints, np.ones(len(keypoints.faces), bool), some, Counts(0, 0, "o"))
     priors = TrajectoryPrior(world.world_T_rigs, SETTINGS.priors)
-    problem = AdjustmentContext(Families((priors,)), RIG, SETTINGS, 1)
+    problem = AdjustmentContext(Families((Bearings(), priors)), RIG, SETTINGS, 1)
     found = stitching.estimate(sighted, keypoints, small, SphereField.none(), problem)
     assert not found.field and found.adjustment is small
 
@@ -128,7 +129,7 @@ def test_model_predicts_the_cost() -> None:
     )  # fmt: skip
     settings = SETTINGS.model_copy(update={"solver": plain})
     priors = TrajectoryPrior(world.world_T_rigs, settings.priors)
-    problem = AdjustmentContext(Families((priors,)), RIG, settings, 1)
+    problem = AdjustmentContext(Families((Bearings(), priors)), RIG, settings, 1)
     landmarks = Landmarks(world.points_world, world.tracks, Counts(0, 0, "tracks"))
 
     def solved(field: SphereField) -> tuple[Solution, float]:

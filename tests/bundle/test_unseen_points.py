@@ -11,6 +11,7 @@ from synthetic import RIG, World, make_world
 
 from gsba.bundle import shared_parameters, triangulation
 from gsba.bundle.adjustment import AdjustmentContext
+from gsba.bundle.bearings import Bearings
 from gsba.bundle.families import Families
 from gsba.bundle.reconstruction import assemble
 from gsba.camera.lens import Lenses
@@ -20,7 +21,7 @@ from gsba.types import CoarsePoses, Counts, Landmarks, PoseSource, Solution, Tra
 
 NUM_FRAMES, NUM_POINTS = 12, 60
 SETTINGS = RefineSettings()
-PROBLEM = AdjustmentContext(Families(), RIG, SETTINGS, 1)
+PROBLEM = AdjustmentContext(Families((Bearings(),)), RIG, SETTINGS, 1)
 
 
 @cache

@@ -12,6 +12,7 @@ from synthetic import RIG, GivenFactors, make_world
 
 from gsba.bundle import adjustment, pose_variables
 from gsba.bundle.adjustment import AdjustmentContext
+from gsba.bundle.bearings import Bearings
 from gsba.bundle.families import Families
 from gsba.config import RefineSettings
 from gsba.evaluate.consistency import (
@@ -44,10 +45,10 @@ def _solved(seed: int) -> tuple[Reconstruction, Trajectory]:
     priors = gtsam.NonlinearFactorGraph(held)
     priors.push_back(pose_variables.fixed_scale(true))
     start = Solution.without_points(true)
-    problem = AdjustmentContext(Families((GivenFactors(priors),)), RIG, settings, 1)
+    problem = AdjustmentContext(Families((Bearings(), GivenFactors(priors))), RIG, settings, 1)
     solved = adjustment.adjust(world.tracks, world.keypoints, start, problem, (8.0,))
     solved = replace(solved, noise=1.0)
-    problem = replace(problem, families=Families((GivenFactors(held),)))
+    problem = replace(problem, families=Families((Bearings(), GivenFactors(held))))
     covariances, joint = adjustment.pose_covariances(solved, world.keypoints, problem)
     return _result(solved.world_T_rigs, covariances, joint), Trajectory(TIMES, true)
 

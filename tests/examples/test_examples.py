@@ -28,9 +28,12 @@ def _examples_are_modules(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(EXAMPLES))
     settings = RefineSettings.model_validate(LIGHTER)
     refine = sys.modules["gsba.pipeline.refine"].refine
-    monkeypatch.setattr(
-        "gsba.refine", lambda *given, **more: refine(*given, settings, **more), raising=False
-    )
+
+    def lighter(frames, trajectory, out, own=settings, **more):
+        light = settings.model_copy(update={"factors": own.factors})
+        return refine(frames, trajectory, out, light, **more)
+
+    monkeypatch.setattr("gsba.refine", lighter, raising=False)
 
 
 @pytest.fixture(scope="module")
@@ -146,6 +149,21 @@ def test_a_floor_finds_its_plane(walk: Path, tmp_path: Path) -> None:
     assert _scale_and_error(walk, result.reconstruction.world_T_rigs)[1] < 1e-2
 
 
+def test_points_are_refined_by_a_residual_of_ones_own(walk: Path, tmp_path: Path) -> None:
+    import panorama_pixels
+
+    result = panorama_pixels.main(walk, tmp_path / "run")
+    costs = [
+        step["costs"]
+        for stage in result.report["solver"]
+        for one in stage["rounds"]
+        for step in one["iterations"]
+        if step["accepted"]
+    ]
+    assert all("bearing" not in some and some["panorama_pixels"] > 0 for some in costs)
+    assert _scale_and_error(walk, result.reconstruction.world_T_rigs)[1] < 5e-3
+
+
 def test_tags_set_the_scale(walk: Path, tmp_path: Path) -> None:
     import april_tags
 
@@ -160,6 +178,7 @@ def test_jacobians_of_the_examples() -> None:
     import april_tags
     import barometer
     import floor_plane
+    import panorama_pixels
 
     rng, values = np.random.default_rng(0), gtsam.Values()
     x = gtsam.symbol("x", 0)
@@ -169,6 +188,7 @@ def test_jacobians_of_the_examples() -> None:
     values.insert(floor_plane.D, 0.3)
     tag = gtsam.symbol("T", 0)
     values.insert(tag, gtsam.Pose3(gtsam.Rot3.Expmap(rng.normal(size=3)), rng.normal(size=3)))
+    values.insert(gtsam.symbol("l", 0), np.array([3.0, -1.0, 4.0]))
     one, eight = (gtsam.noiseModel.Isotropic.Sigma(n, 0.1) for n in (1, 8))
     bearings = rng.normal(size=(4, 3))
     bearings /= np.linalg.norm(bearings, axis=1)[:, None]
@@ -177,6 +197,9 @@ def test_jacobians_of_the_examples() -> None:
         gtsam.CustomFactor(one, [x, barometer.B], barometer._error_of(0.4)),
         gtsam.CustomFactor(one, [x, floor_plane.N, floor_plane.D], floor_plane._error),
         gtsam.CustomFactor(eight, [x, tag], corners),
+        panorama_pixels.longitude_and_latitude.factor(
+            x, gtsam.symbol("l", 0), bearings[0], gtsam.noiseModel.Isotropic.Sigma(2, 0.1)
+        ),
     ):
         assert max(jacobian_errors(factor, values).values()) < 1e-5
 

@@ -10,6 +10,7 @@ from synthetic import bearings_of
 
 from gsba.bundle import adjustment
 from gsba.bundle.adjustment import AdjustmentContext
+from gsba.bundle.bearings import Bearings
 from gsba.bundle.families import Families
 from gsba.bundle.trajectory_prior import TrajectoryPrior
 from gsba.camera.rig import CubeRig
@@ -173,7 +174,7 @@ def test_poses_become_better_than_the_detector_leaves_them(walk) -> None:
         Solution.without_points(world_T_rigs),
         landmarks=landmarks,
     )
-    problem, gates = AdjustmentContext(Families((priors,)), RIG, settings, 2), (6.0, 3.0)
+    problem, gates = AdjustmentContext(Families((Bearings(), priors)), RIG, settings, 2), (6.0, 3.0)
     before = adjustment.adjust(landmarks.tracks, keypoints, start, problem, gates)
     greys, workers = Greys(frames, 4096), Threads(2)
     sighted = alignment.align(before, Observations(keypoints), greys, RIG, SETTINGS, workers)

@@ -13,6 +13,7 @@ from tiny_run import SETTINGS, Case, computed_stages
 from factors.patch_windows import PatchTable, patch_spans, pixel_grid, planes_from
 from gsba.bundle import adjustment
 from gsba.bundle.adjustment import AdjustmentContext
+from gsba.bundle.bearings import Bearings
 from gsba.bundle.families import Families
 from gsba.bundle.trajectory_prior import TrajectoryPrior
 from gsba.camera.lens import Lenses
@@ -157,7 +158,10 @@ def test_nothing_to_see_changes_nothing(case: Case) -> None:
     )
     frames, keypoints, solved, priors, rig = _start(case, settings)
     result = direct.refine(
-        frames, keypoints, solved, AdjustmentContext(Families((priors,)), rig, settings, 1)
+        frames,
+        keypoints,
+        solved,
+        AdjustmentContext(Families((Bearings(), priors)), rig, settings, 1),
     )
     assert np.array_equal(result.adjustment.world_T_rigs, solved.world_T_rigs)
     assert all(counts.kept == 0 for counts in result.counts)
@@ -198,7 +202,10 @@ def test_a_solve_against_the_map_is_undone(case: Case) -> None:
     )
     frames, keypoints, solved, priors, rig = _start(case, settings)
     result = direct.refine(
-        frames, keypoints, solved, AdjustmentContext(Families((priors,)), rig, settings, 1)
+        frames,
+        keypoints,
+        solved,
+        AdjustmentContext(Families((Bearings(), priors)), rig, settings, 1),
     )
     assert not result.adjustment.rounds[-1].accepted
     assert np.array_equal(result.adjustment.world_T_rigs, solved.world_T_rigs)
@@ -224,7 +231,10 @@ def test_a_small_panorama_has_fewer_levels(case: Case) -> None:
     )
     frames, keypoints, solved, priors, rig = _start(case, settings)
     result = direct.refine(
-        frames, keypoints, solved, AdjustmentContext(Families((priors,)), rig, settings, 1)
+        frames,
+        keypoints,
+        solved,
+        AdjustmentContext(Families((Bearings(), priors)), rig, settings, 1),
     )
     assert np.isfinite(result.adjustment.world_T_rigs).all() and len(result.counts) == 2
 

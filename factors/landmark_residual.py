@@ -1,0 +1,146 @@
+"""Residuals of landmarks that others write: one compiled function, called by its address.
+
+The kernels of `LandmarkBlock` hold bearings and reprojections inline. Any other residual is a
+function that these kernels call where they lie, so that landmarks are still eliminated inside.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import gtsam
+import numpy as np
+from llvmlite import ir
+from numba import cfunc, njit, types
+from numba.core import cgutils
+from numba.extending import intrinsic
+from numba.np.numpy_support import carray
+
+from factors._terms import custom_factor, rig_vectors, whitener_rows
+
+_FLOATS = types.CPointer(types.float64)
+_NUM_OUT = 9  # values that a residual writes: two residuals, six of the Jacobian, validity
+
+ResidualFunction = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], bool]
+
+
+class LandmarkResidual:
+    """A residual of two rows of one observation of one landmark, compiled by Numba.
+
+    Attributes:
+        name: of the function.
+        address: of its compiled code in this process.
+    """
+
+    def __init__(self, function: ResidualFunction) -> None:
+        """Compile a function.
+
+        Args:
+            function: takes the measurement (3,), the vector from the ray's origin to the landmark
+                in the rig frame (3,), and writes the residual (2,), not whitened, and its Jacobian
+                by that vector (2, 3), all float64. Returns False where the landmark cannot be
+                observed, behind a face for instance: the residual is a large constant there, the
+                Jacobian zero. It must be what Numba compiles, and is not called for a warning:
+                division by zero gives inf or nan.
+        """
+        compiled = njit(error_model="numpy")(function)
+
+        @cfunc(types.void(_FLOATS, _FLOATS, _FLOATS), error_model="numpy")
+        def entry(measurement, vector, out):  # type: ignore[no-untyped-def]
+            written = carray(out, (_NUM_OUT,))
+            residual, jacobian = written[:2], written[2:8].reshape((2, 3))
+            valid = compiled(carray(measurement, (3,)), carray(vector, (3,)), residual, jacobian)
+            written[8] = 1.0 if valid else 0.0
+
+        self.name: str = function.__name__
+        self.address = int(entry.address or 0)
+        self._compiled, self._entry = compiled, entry  # their code lives as long as they do
+
+    def evaluate(
+        self, measurements: np.ndarray, vectors: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Residuals (N, 2), Jacobians (N, 2, 3) and validity (N,) bool of measurements (N, 3) and
+        vectors (N, 3), as the function takes and writes them."""
+        num, vectors = len(vectors), np.ascontiguousarray(vectors, dtype=np.float64)
+        measurements = np.ascontiguousarray(measurements, dtype=np.float64)
+        residuals, jacobians = np.zeros((num, 2)), np.zeros((num, 2, 3))
+        valid = np.empty(num, dtype=bool)
+        rows = zip(measurements, vectors, residuals, jacobians, strict=True)
+        for n, (measured, vector, residual, jacobian) in enumerate(rows):
+            valid[n] = self._compiled(measured, vector, residual, jacobian)  # type: ignore
+        return residuals, jacobians, valid
+
+    def factor(
+        self,
+        pose_key: int,
+        point_key: int,
+        measurement: np.ndarray,
+        noise_model: gtsam.noiseModel.Base,
+    ) -> gtsam.CustomFactor:
+        """One observation as an ordinary GTSAM factor, to check the Jacobian by.
+
+        Args:
+            pose_key, point_key: keys of a Pose3 `world_T_rig` and of a Point3.
+            measurement: (3,) as the function takes it.
+            noise_model: of dimension 2.
+        """
+        measured = np.asarray(measurement, dtype=np.float64)[None]
+
+        def residual(
+            world_T_rig: np.ndarray, point: np.ndarray
+        ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            vectors, by_pose, by_point = rig_vectors(world_T_rig, point)
+            residuals, jacobians, _ = self.evaluate(measured, vectors)
+            return residuals, jacobians @ by_pose, jacobians @ by_point
+
+        return custom_factor(pose_key, point_key, noise_model, residual)
+
+
+@dataclass(frozen=True, slots=True)
+class LandmarkTerm:
+    """Observations of the landmarks of a block under a residual that others wrote."""
+
+    frames: np.ndarray  # (O,) int, row of the block's poses
+    points: np.ndarray  # (O,) int, row of the block's landmarks
+    measured: np.ndarray  # (O, 3) float64, as the residual takes them
+    kind: LandmarkResidual
+    sigmas: np.ndarray | float = 1.0  # () or (O,) in the residual's unit, per row
+    sqrt_infos: np.ndarray | None = None  # (O, 2, 2) 1 / the residual's unit; replaces sigmas
+    name: str = "landmarks"  # family that the cost is reported under
+    origins_rig: np.ndarray | None = None  # (O, 3) map units, rig frame: origin of each ray;
+    # None = the rig's own centre
+
+    def measurements(self) -> np.ndarray:
+        """(O, 3) rows as the kernels read them."""
+        return np.asarray(self.measured, dtype=np.float64)
+
+    def whiteners(self) -> np.ndarray:
+        """(O, 3) upper triangles of the square-root information."""
+        return whitener_rows(len(self.frames), self.sigmas, self.sqrt_infos)
+
+    def cameras(self) -> np.ndarray:
+        """Empty: there are no faces, (0, 12)."""
+        return np.zeros((0, 12))
+
+
+@intrinsic
+def call_residual(
+    _typing: Any, address: Any, mx: Any, my: Any, mz: Any, x: Any, y: Any, z: Any
+) -> Any:
+    """Valid (1.0 or 0.0), residual (2) and Jacobian (6) of the function at an address."""
+    signature = types.UniTuple(types.float64, _NUM_OUT)(types.int64, *[types.float64] * 6)
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        double = ir.DoubleType()
+        places = [cgutils.alloca_once(builder, double, size=n) for n in (3, 3, _NUM_OUT)]
+        for n, value in enumerate(args[1:]):
+            builder.store(value, cgutils.gep_inbounds(builder, places[n // 3], n % 3))
+        kind = ir.FunctionType(ir.VoidType(), [double.as_pointer()] * 3)
+        builder.call(builder.inttoptr(args[0], kind.as_pointer()), places)
+        written = [
+            builder.load(cgutils.gep_inbounds(builder, places[2], n))
+            for n in (_NUM_OUT - 1, *range(_NUM_OUT - 1))
+        ]
+        return context.make_tuple(builder, signature.return_type, written)
+
+    return signature, generate
