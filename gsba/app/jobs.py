@@ -2,7 +2,7 @@
 
 A job is a folder: `job.json`, written once, is its command; `state.json` is replaced as a whole
 with every change; `log.txt` is the command's output; `events.jsonl` holds its events
-(`gsba.log.event`).
+(`gsba.log.event`); `alive.lock` is locked for as long as a process of the job runs.
 States change only under a lock, so that a server, its successor and the worker agree.
 """
 
@@ -45,7 +45,6 @@ class State:
 
     status: Status
     pid: int | None = None  # of its process, which leads a process group
-    born: int | None = None  # start time of the process in clock ticks: tells a reused pid
     code: int | None = None  # exit code; None = not ended, or not known
     began: float | None = None  # seconds since 1970, of the latest start
     ended: float | None = None
@@ -71,6 +70,11 @@ class Job:
     def events(self) -> Path:
         """Events of the command, one JSON object a line."""
         return self.path / "events.jsonl"
+
+    @property
+    def alive_lock(self) -> Path:
+        """File that is locked while a process of the job runs."""
+        return self.path / "alive.lock"
 
     def arguments(self) -> list[str]:
         """Arguments of the next start: a job that goes on keeps what it has done."""
@@ -196,19 +200,27 @@ class Jobs:
 
 
 def alive(job: Job) -> bool:
-    """True if the process of a job runs; its pid may meanwhile be another process's."""
-    pid = job.state.pid
-    return pid is not None and job.state.born is not None and born(pid) == job.state.born
-
-
-def born(pid: int) -> int | None:
-    """Start time of a process in clock ticks since the machine started; None = it has ended."""
+    """True if a process of a job runs: the system drops the lock when the last one has ended."""
     try:
-        text = Path(f"/proc/{pid}/stat").read_text()
-    except OSError:
-        return None
-    fields = text.rpartition(")")[2].split()  # the name before may hold spaces
-    return None if fields[0] == "Z" else int(fields[19])
+        with job.alive_lock.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except FileNotFoundError:  # it was never started
+        return False
+    return False
+
+
+@contextmanager
+def alive_lock(job: Job) -> Iterator[int]:
+    """A new lock of a job, for its process to inherit; an earlier one is no longer looked at."""
+    job.alive_lock.unlink(missing_ok=True)
+    file = os.open(job.alive_lock, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield file
+    finally:
+        os.close(file)  # what inherited it holds the lock
 
 
 def ending(code: int, state: State) -> Status:

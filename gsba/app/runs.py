@@ -11,6 +11,7 @@ from gsba.app.progress import Progress
 from gsba.bundle.lens_centres import LensCentres
 from gsba.bundle.readout import CameraEstimate
 from gsba.config import CameraSettings
+from gsba.pipeline.stage_titles import LENS_CENTRES, READOUTS, RECONSTRUCTION, is_one_of
 from gsba.report.camera_findings import of_camera
 from gsba.report.html.figures import viewing_axes
 from gsba.store.folder import STAGES, is_run_folder
@@ -51,10 +52,10 @@ def camera_so_far(run: Path, done: Sequence[str]) -> list[str]:
         run: folder of the run.
         done: names of these stages, in order.
     """
-    centres = _latest(run, done, ("lenses1", "lenses0"), LensCentres)
+    centres = _latest(run, done, LENS_CENTRES, LensCentres)
     if centres is None:
         return []
-    readout = _latest(run, done, ("readout",), CameraEstimate)
+    readout = _latest(run, done, READOUTS, CameraEstimate)
     nothing = (None, None, None, 1.0, CameraSettings(), True)
     content, notes = of_camera(centres, readout, *nothing)
     return notes if content["taken"] else [f"two lenses were not found: {content['reason']}"]
@@ -87,7 +88,7 @@ def map_so_far(run: Path, progress: Progress) -> dict[str, Any]:
 
 def finished_map(run: Path) -> dict[str, Any]:
     """The map of a finished run from above, as `map_so_far` gives it."""
-    return _map_of_stage(run, "reconstruction") or _NO_MAP
+    return _map_of_stage(run, RECONSTRUCTION) or _NO_MAP
 
 
 def _map_of_stage(run: Path, name: str) -> dict[str, Any] | None:
@@ -127,10 +128,10 @@ def _plan(
     }
 
 
-def _latest(run: Path, done: Sequence[str], ends: Sequence[str], returns: type[T]) -> T | None:
-    """Result of the latest stage of this type whose name ends so; None = there is none."""
+def _latest(run: Path, done: Sequence[str], stages: Sequence[str], returns: type[T]) -> T | None:
+    """Result of the latest of these stages, by the patterns of their names; None = none of them."""
     for name in reversed(done):
-        if name.endswith(tuple(ends)) or any(f"{end}_" in name for end in ends):
+        if is_one_of(name, stages):
             try:
                 return load_record(run / STAGES / f"{name}.npz", returns)
             except RecordError:

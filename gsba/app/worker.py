@@ -13,7 +13,7 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-from gsba.app.jobs import ACTIVE, Job, Jobs, alive, born, ending, last_code
+from gsba.app.jobs import ACTIVE, Job, Jobs, alive, alive_lock, ending, last_code
 from gsba.app.progress import read_events
 from gsba.log import EVENTS
 
@@ -60,7 +60,7 @@ def _start(jobs: Jobs, job: Job) -> tuple[Job, subprocess.Popen[bytes]]:
     began = time.time()
     with job.events.open("a") as events:
         events.write(f'{{"event": "start", "time": {began:.3f}}}\n')
-    with job.log.open("ab") as log:
+    with job.log.open("ab") as log, alive_lock(job) as lock:
         process = subprocess.Popen(
             [*GSBA, *job.arguments()],
             cwd=job.command.folder,
@@ -69,8 +69,9 @@ def _start(jobs: Jobs, job: Job) -> tuple[Job, subprocess.Popen[bytes]]:
             stdout=log,
             stderr=log,
             start_new_session=True,
+            pass_fds=(lock,),
         )
-    known = {"pid": process.pid, "born": born(process.pid), "starts": job.state.starts + 1}
+    known = {"pid": process.pid, "starts": job.state.starts + 1}
     times = {"began": began, "ended": None, "code": None}
     return jobs.change(job, status="running", **known, **times), process
 

@@ -21,6 +21,7 @@ from gsba.bundle.shared_parameters import (
     Weighted,
     by_origin,
     drawn,
+    sample_counts,
     summed,
 )
 from gsba.camera.lens import Lenses
@@ -107,7 +108,7 @@ def loosened(
         context: loss, settings.
     """
     used = drawn(landmarks, _MOST, context.settings.seed)
-    counts = Counts(len(landmarks.tracks), len(used.tracks), "observations")
+    counts = sample_counts(landmarks, used)
     frames, num = keypoints.frames(), len(solved.world_T_rigs)
 
     def by_axes(seen: Weighted) -> np.ndarray:

@@ -33,7 +33,7 @@ class MapStrength:
     # that drift
     held_steps: np.ndarray  # (F - 1,) bool, known far better than the trajectory knows them
     noise: StepNoise | None  # of the trajectory's steps; None = too few are held to tell
-    counts: Counts  # of frames
+    counts: Counts  # of priors on the trajectory's steps
 
 
 def measure(
@@ -73,7 +73,9 @@ def measure(
     weak = np.convolve(poor, reach)[weak_frames.reach : weak_frames.reach + num] > 0
     held = seen & _held(world_T_rigs, covariances, joint, priors)
     noise = _noise(world_T_rigs, coarse_world_T_rigs, held & believed, priors)
-    counts = Counts(num, int((~weak).sum()), "frames", {"held loosely": int(weak.sum())})
+    num_held = int(held.sum())
+    dropped = {"images hold the step far better": num_held}
+    counts = Counts(num - 1, num - 1 - num_held, "priors on steps", dropped)
     return MapStrength(sigmas, drift, weak, held, noise, counts)
 
 

@@ -80,6 +80,12 @@ def drawn(landmarks: Landmarks, most: int, seed: int) -> Landmarks:
     return of_points(landmarks, chosen)
 
 
+def sample_counts(landmarks: Landmarks, used: Landmarks) -> Counts:
+    """Counts of all observations and of those of the points that were drawn."""
+    received, kept = len(landmarks.tracks), len(used.tracks)
+    return Counts(received, kept, "observations", {"not in the random sample": received - kept})
+
+
 def of_points(landmarks: Landmarks, chosen: np.ndarray) -> Landmarks:
     """Points `chosen (J,)` and their observations."""
     return Landmarks(landmarks.points_world[chosen], landmarks.tracks.of(chosen), landmarks.counts)
@@ -158,7 +164,7 @@ def models_of(
 
     with ThreadPoolExecutor(context.num_threads) as pool:
         models = list(pool.map(model, parts_of(used)))
-    return models, Counts(len(landmarks.tracks), len(used.tracks), "observations")
+    return models, sample_counts(landmarks, used)
 
 
 def whole_model_of(

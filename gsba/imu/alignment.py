@@ -75,7 +75,9 @@ def align(
         former: the estimate from less accurate rotations; None = try all offsets.
     """
     turns = merged(timestamps, f_R_nexts, known)
-    counts = Counts(len(f_R_nexts), int(known.sum()), "steps")
+    num_known = int(known.sum())
+    dropped = {"rotation not known from images": len(f_R_nexts) - num_known}
+    counts = Counts(len(f_R_nexts), num_known, "steps", dropped)
     if len(turns) < MIN_STEPS:
         return _rejected(timestamps, f"only {len(turns)} rotations are known from images", counts)
     if former is None:

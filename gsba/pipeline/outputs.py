@@ -191,13 +191,14 @@ def _findings(state: State, result: Reconstruction, gps: dict[str, Any] | None) 
     if gps is not None:
         notes += notes_on_gps(gps, len(frames))
     most = run.settings.weak_frames.max_scale_sigma
-    notes += findings.of_frames(frames, prior.coarse, result, map_.frame_weights, most)
+    lists, more = findings.of_frames(frames, prior.coarse, result, map_.frame_weights, most)
+    notes += more
     stitching = map_.stitching and findings.of_field(map_.stitching)
     clocks, sources = [one.clock for one in prior.of_recordings], prior.coarse.sources
     recordings = of_recordings(frames, result, sources, clocks)
     notes += notes_on_recordings(recordings)
     found = Findings(notes, trajectory, stitching, camera, gyro, gps, map_.moves)
-    return replace(found, recordings=recordings, reasons=_reasons(prior))
+    return replace(found, recordings=recordings, reasons=_reasons(prior), frame_lists=lists)
 
 
 def _gyro_steps_used(state: State) -> float | None:

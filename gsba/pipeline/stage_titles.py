@@ -1,6 +1,7 @@
 """Titles of stages: their names in the run's folder are short, the log says what they do."""
 
 import re
+from collections.abc import Sequence
 
 # Name of a stage, and its title. In names, `#` stands for a number that counts from 1, and `+` for
 # one that counts from 0; titles show both from 1.
@@ -83,6 +84,23 @@ _TITLES = {
 _PREFIXES = {"first-": "first solution: ", "again_": "once more: ", "export-": "export "}
 
 
+# Stages whose results tell of the camera.
+LENS_CENTRES = ("lenses+",)  # give a LensCentres
+READOUTS = ("settled_readout", "recalibrated_readout", "calibrated+_readout", "readout_aligned#")
+RECONSTRUCTION = "reconstruction"  # gives the Reconstruction of the run
+
+
+def is_one_of(name: str, patterns: Sequence[str]) -> bool:
+    """True if a stage's name, without what says when or of which recording, fits a pattern."""
+    for prefix in _PREFIXES:
+        name = name.removeprefix(prefix)
+    return any(_matched(pattern, name.partition("@")[0]) for pattern in patterns)
+
+
+def _matched(pattern: str, name: str) -> re.Match[str] | None:
+    return re.fullmatch(re.sub("[#+]", r"(\\d+?)", pattern), name)
+
+
 def title_of(name: str) -> str:
     """What a stage of this name does, in words; its name where there are none."""
     for prefix, words in _PREFIXES.items():
@@ -92,7 +110,7 @@ def title_of(name: str) -> str:
     if recording:
         return f"{title_of(stage)}, recording {recording}"
     for pattern, title in _TITLES.items():
-        found = re.fullmatch(re.sub("[#+]", r"(\\d+?)", pattern), name)
+        found = _matched(pattern, name)
         if found is not None:
             starts = [int(sign == "+") for sign in re.findall("[#+]", pattern)]
             numbers = [int(n) + start for n, start in zip(found.groups(), starts, strict=True)]

@@ -16,7 +16,8 @@ from gsba.types import CoarsePoses, FrameSet, PoseSource, PoseStatus, Reconstruc
 
 logger = logging.getLogger(__name__)
 
-_MAX_NAMED_FRAMES = 5  # frames whose names a line of the log lists
+_MAX_NAMED_FRAMES = 5  # frames whose names a note lists
+_MAX_NAMED_MAPS = 5  # maps that a note describes
 _MAX_FALSE_SHARE = 0.1  # share of contradicted steps; above it, the other steps are in doubt, too
 
 
@@ -134,8 +135,11 @@ def _maps(
         )
     if count > 1:
         parts = "; ".join(
-            f"map {n} from {m[0]} to {m[-1]} ({len(m)} frames)" for n, m in enumerate(maps[1:], 2)
+            f"map {n} from {m[0]} to {m[-1]} ({len(m)} frames)"
+            for n, m in enumerate(maps[1 : 1 + _MAX_NAMED_MAPS], 2)
         )
+        if count > 1 + _MAX_NAMED_MAPS:
+            parts += f"; {count - 1 - _MAX_NAMED_MAPS} more are listed in report.json under maps"
         notes.append(
             f"images do not connect {count} places: each is a map with its own world and scale. "
             f"Map 1 with {len(maps[0])} frames is exported; gsba export --map NUMBER exports the "
@@ -182,8 +186,8 @@ def of_frames(
     reconstruction: Reconstruction,
     frame_weights: np.ndarray,
     max_scale_sigma: float,
-) -> list[str]:
-    """Notes on the frames of a run; the log names only a few frames of a long list.
+) -> tuple[dict[str, list[str]], list[str]]:
+    """Names of frames with a finding, for `frame_lists` of report.json, and notes.
 
     Args:
         frames: frames of the run.
@@ -214,18 +218,20 @@ def of_frames(
         "frames of the video that were added where the map was weak; datasets leave them out "
         "unless export.fetched = true"
     )
-    for finding, rows in (
-        (fetched, np.flatnonzero(frames.fetched)),
-        ("no SLAM pose, the initial pose is interpolated", filled),
-        ("no matches, the pose comes from the trajectory", lost),
-        ("pixels fit badly and were weighted down", doubted),
-        (uncertain, weak),
+    lists = {}
+    for key, finding, rows in (
+        ("fetched", fetched, np.flatnonzero(frames.fetched)),
+        ("interpolated", "no SLAM pose, the initial pose is interpolated", filled),
+        ("unmatched", "no matches, the pose comes from the trajectory", lost),
+        ("weighted_down", "pixels fit badly and were weighted down", doubted),
+        ("uncertain_scale", uncertain, weak),
     ):
-        if len(rows):
-            names = [frames.names[f] for f in rows]
-            notes.append(f"{finding}: {', '.join(names)}")
-            logger.warning("%s: %s", finding, _brief(names, len(frames)))
-    return notes
+        lists[key] = names = [frames.names[f] for f in rows]
+        if names:
+            unit = f"of {len(frames)} frames"
+            notes.append(f"{finding}: {named(names, f'frame_lists.{key}', unit)}")
+            logger.warning(notes[-1])
+    return lists, notes
 
 
 def _weak_places(reconstruction: Reconstruction, max_scale_sigma: float) -> np.ndarray:
@@ -241,10 +247,3 @@ def named(names: Sequence[str], key: str, unit: str = "frames") -> str:
     if len(names) <= _MAX_NAMED_FRAMES:
         return ", ".join(names)
     return f"{len(names)} {unit}, listed in report.json under {key}"
-
-
-def _brief(names: Sequence[str], num_frames: int) -> str:
-    """Names of a few frames; of more, their number, and where they are listed."""
-    if len(names) <= _MAX_NAMED_FRAMES:
-        return ", ".join(names)
-    return f"{len(names)} of {num_frames} frames, listed in the notes of report.json"

@@ -91,6 +91,9 @@ class Findings:
     gps: Mapping[str, Any] | None = None  # see `gps_factors.GpsFixes.report`
     moves: Sequence[object] = ()  # of the poses by a splat, see `gsba.splat.refinement.Move`
     recordings: Sequence[Mapping[str, Any]] = ()  # see `recordings.of_recordings`
+    frame_lists: Mapping[str, Sequence[str]] = dataclasses.field(
+        default_factory=dict
+    )  # names of frames with a finding, see `findings.of_frames`
     reasons: Sequence[str] = ()  # why maps were not joined, see `maps.summarize_maps`
 
 
@@ -148,6 +151,7 @@ def build_report(
         "stages": stages.rows(),
         "solver": stages.solver,
         "splat": found.moves,
+        "frame_lists": found.frame_lists,
         "frames": _frame_rows(frames, coarse, reconstruction, quality),
         "settings": settings,
         "machine": _machine(),

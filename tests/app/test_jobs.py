@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from gsba.app import worker
-from gsba.app.jobs import Command, Job, Jobs, alive, ending
+from gsba.app.jobs import Command, Job, Jobs, alive, alive_lock, ending
 from gsba.app.progress import Followed, Progress, read_events
 from gsba.app.worker import work
 from gsba.log import EVENTS, GsbaError, track
@@ -146,6 +146,37 @@ def test_a_job_outlives_its_worker_and_the_next_one_sees_it_out(jobs: Jobs) -> N
     process.wait(120)
     thread.join(120)
     assert (status(jobs, job), status(jobs, after)) == ("stopped", "done")
+
+
+def test_another_process_with_the_pid_of_a_job_is_not_the_job(jobs: Jobs) -> None:
+    job = added(jobs, "wait")
+    with jobs.locked():
+        job, process = worker._start(jobs, job)
+    until(lambda: has_begun(jobs, job))
+    assert alive(job)
+    process.kill()
+    process.wait(120)
+    assert not alive(job)
+    with jobs.locked():
+        job = jobs.change(job, pid=os.getpid())
+    assert not alive(job)
+    jobs.stop(job.id)  # this process gets no signal
+    assert status(jobs, job) == "running"
+    work(jobs)
+    assert status(jobs, job) == "lost"
+
+
+def test_the_lock_of_an_earlier_start_does_not_hold_up_the_next(jobs: Jobs) -> None:
+    """A process that a killed job left behind."""
+    job = added(jobs, "wait")
+    with alive_lock(job) as left_behind:
+        assert alive(job)
+        thread = at_work(jobs)
+        until(lambda: has_begun(jobs, job))
+        jobs.stop(job.id)
+        thread.join(120)
+        assert status(jobs, job) == "stopped" and not alive(jobs.get(job.id))
+        assert left_behind > 0
 
 
 def test_a_job_that_was_killed_is_lost(jobs: Jobs) -> None:

@@ -10,7 +10,7 @@ from gsba.bundle.map_strength import MapStrength
 from gsba.bundle.trajectory_prior import TrajectoryPrior
 from gsba.config import RefineSettings
 from gsba.geometry import inverse, rotation_angle, step_covariances
-from gsba.types import JointErrors, Solution, StepNoise
+from gsba.types import Counts, JointErrors, Solution, StepNoise
 
 NUM = 24
 POSES = loop_walk(NUM)
@@ -90,7 +90,10 @@ def test_a_trajectory_that_is_not_believed_leaves_weak_places_to_be_found() -> N
 
 
 def test_steps_that_images_hold_far_better_than_priors_go_without() -> None:
-    assert _measured(np.full(NUM - 2, 3e-4)).held_steps.all()
+    found = _measured(np.full(NUM - 2, 3e-4))
+    assert found.held_steps.all()
+    dropped = {"images hold the step far better": NUM - 1}
+    assert found.counts == Counts(NUM - 1, 0, "priors on steps", dropped)
     loose = np.full(NUM - 2, 3e-4)
     loose[11] = 0.2  # all lengths behind it
     assert _measured(loose).held_steps.tolist() == [True] * 12 + [False] * 11

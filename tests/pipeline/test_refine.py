@@ -85,8 +85,12 @@ def test_the_report_tells_what_happened(case: Case) -> None:
     stages = {stage["name"]: stage for stage in report["stages"]}
     assert {"features", "neighbours", "chain", "reconstruction", "export-colmap"} <= stages.keys()
     assert all(stage["seconds"] >= 0 and stage["peak_mb"] > 0 for stage in stages.values())
-    (pairs,) = stages["neighbours"]["counts"]
-    assert pairs["received"] == pairs["kept"] + sum(pairs["dropped"].values())
+    counts = [counted for stage in stages.values() for counted in stage["counts"]]
+    assert len(counts) > 10
+    for counted in counts:  # whatever is dropped has a reason
+        assert counted["received"] == counted["kept"] + sum(counted["dropped"].values()), counted
+    names = ("fetched", "interpolated", "unmatched", "weighted_down", "uncertain_scale")
+    assert report["frame_lists"] == {name: [] for name in names}
     first = report["solver"][0]["rounds"][0]["iterations"]
     assert first[-1]["cost"] < first[0]["cost"] and "bearing" in first[0]["costs"]
 

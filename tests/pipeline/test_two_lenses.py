@@ -9,6 +9,7 @@ import pytest
 from tiny_run import SETTINGS
 from typer.testing import CliRunner
 
+from gsba.app.runs import camera_so_far
 from gsba.camera.sphere import bearings_from_erp
 from gsba.camera.views import lens_views
 from gsba.cli import app
@@ -84,6 +85,8 @@ def test_a_camera_of_two_lenses_is_found_and_gives_the_scale(walk, tmp_path: Pat
     assert errors.scale * camera["baseline"] == pytest.approx(BASELINE, rel=0.02)
     assert camera["metres_per_unit"] == pytest.approx(errors.scale, rel=0.02)  # 1 unit = 1 m here
     assert any(note.startswith("one map unit is") for note in report["notes"])
+    so_far = camera_so_far(tmp_path / "two", [stage["name"] for stage in report["stages"]])
+    assert so_far[0].startswith("the two lenses are")
     placed = place(*load_run(tmp_path / "two"), PlacementSettings(length="lens"), (0.05, 0.0))
     assert placed.similarity.scale == pytest.approx(camera["metres_per_unit"])
     assert placed.unit == "m"

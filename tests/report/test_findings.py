@@ -5,10 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from export_scene import panoramas
+from export_scene import panoramas, poses, reconstruction
 
-from gsba.report.findings import of_trajectory
+from gsba.report.findings import of_frames, of_trajectory
 from gsba.trajectory.judgement import StepChecks
+from gsba.types import CoarsePoses, PoseSource
 
 
 @pytest.mark.parametrize(
@@ -42,3 +43,19 @@ def test_without_a_trajectory_images_contradict_nothing(tmp_path: Path) -> None:
     assert found["unseen_steps"] == [[frames.names[2], frames.names[3]]]
     found, _ = of_trajectory(trust, None, None, (), frames)
     assert len(found["false_steps"]) == num - 1
+
+
+def test_long_lists_of_frames_are_counted_in_notes_and_named_in_the_report(tmp_path: Path) -> None:
+    frames = panoramas(tmp_path, ".png")
+    num, result = len(frames), reconstruction()
+    assert num > 5
+    sources = np.full(num, PoseSource.INTERPOLATED, np.uint8)
+    coarse, weights = CoarsePoses(poses(), sources, 0.0), np.ones(num)
+    weights[2] = 0.5
+    lists, notes = of_frames(frames, coarse, result, weights, 0.01)
+    assert lists["interpolated"] == list(frames.names) and lists["unmatched"] == []
+    assert notes == [
+        f"no SLAM pose, the initial pose is interpolated: {num} of {num} frames, listed in "
+        "report.json under frame_lists.interpolated",
+        f"pixels fit badly and were weighted down: {frames.names[2]}",
+    ]
