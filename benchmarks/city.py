@@ -15,7 +15,7 @@ from gtsam.symbol_shorthand import X
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from gsba.parts.folder import Sightings
+from factors import BearingTerm
 
 BLOCK_M = 100.0  # from crossing to crossing
 SIGMA_RAD = np.radians(0.05)  # of bearings, per axis
@@ -43,15 +43,17 @@ class City:
     start: np.ndarray
     seed: int
 
-    def chunks(self) -> Iterator[tuple[Sightings, gtsam.NonlinearFactorGraph]]:
-        """Landmarks and GPS fixes, those of some frames at a time."""
+    def chunks(self) -> Iterator[tuple[np.ndarray, BearingTerm, gtsam.NonlinearFactorGraph]]:
+        """Landmarks (J, 3), their observations and GPS fixes, those of some frames at a time."""
         tree = KDTree(self.truth[:, [9, 11]])
         for first in range(0, len(self.truth), _HOSTS):
             hosts = np.arange(first, min(first + _HOSTS, len(self.truth)))
             rng = np.random.default_rng([self.seed, first])
-            yield self._seen(hosts, tree, rng), self._fixes(hosts, rng)
+            yield *self._seen(hosts, tree, rng), self._fixes(hosts, rng)
 
-    def _seen(self, hosts: np.ndarray, tree: KDTree, rng: np.random.Generator) -> Sightings:
+    def _seen(
+        self, hosts: np.ndarray, tree: KDTree, rng: np.random.Generator
+    ) -> tuple[np.ndarray, BearingTerm]:
         """Points on facades beside frames, and all frames that see them."""
         hosts = np.repeat(hosts, _POINTS_A_FRAME)
         num = len(hosts)
@@ -71,13 +73,9 @@ class City:
         wild = rng.random(len(bearings)) < _OUTLIERS
         bearings[wild] = _noisy(bearings[wild], np.radians(3.0), rng)
         guess = offsets * (1 + 0.02 * rng.normal(size=(num, 1)))
-        return Sightings(
-            frames,
-            local[owners].astype(np.int32),
-            bearings,
-            np.full(len(bearings), SIGMA_RAD),
-            _placed(self.start[hosts], guess)[kept],
-        )
+        seen_by = frames, local[owners].astype(np.int32)
+        term = BearingTerm(*seen_by, bearings, np.full(len(bearings), SIGMA_RAD))
+        return _placed(self.start[hosts], guess)[kept], term
 
     def _fixes(self, frames: np.ndarray, rng: np.random.Generator) -> gtsam.NonlinearFactorGraph:
         """A GPS fix of each frame."""

@@ -34,7 +34,7 @@ from factors.system_layout import SystemLayout
 from gsba.bundle.optimizer import OptimizeResult, minimize
 from gsba.config import SolverSettings
 from gsba.parts.divided_system import optimize_divided
-from gsba.parts.folder import PartsWriter, Sightings, values_at
+from gsba.parts.folder import PartsWriter, values_at
 from gsba.store.shards import Job, Spent, Threads, Workers
 
 LOSS_SIGMAS = 2.0
@@ -89,11 +89,12 @@ def written(city: City, folder: Path, most: int) -> dict[str, Any]:
     """Stream a city to the folder of its parts, unless it is there; returns figures."""
     cpu = time.process_time()
     writer, observations, points = PartsWriter(folder), 0, 0
-    for sightings, fixes in city.chunks():
-        writer.add(sightings, fixes)
-        observations += len(sightings.frames)
-        points += len(sightings.points_world)
-    index = writer.finish(city.start, most)
+    for landmarks, term, fixes in city.chunks():
+        writer.add(landmarks, [term], fixes)
+        observations += len(term.frames)
+        points += len(landmarks)
+    num = len(city.start)
+    index = writer.finish(values_at(range(num), city.start), num, most)
     frames, kept = np.diff(index.starts), index.num_kept
     return {
         "points": points,
@@ -102,7 +103,7 @@ def written(city: City, folder: Path, most: int) -> dict[str, Any]:
         "parts": len(kept),
         "frames_of_largest_part": int((frames - kept).max()),
         "cut_frames_of_largest_part": int(kept.max()),
-        "cut_frames": len(index.poses) - int((frames - kept).sum()),
+        "cut_frames": num - int((frames - kept).sum()),
         "map_mb": size(folder) / 1e6,
     }
 
@@ -176,9 +177,9 @@ def whole(options: argparse.Namespace) -> tuple[OptimizeResult, dict[str, Any]]:
     """Solve a city by one factorization of all frames."""
     graph, chunks = gtsam.NonlinearFactorGraph(), []
     city = make_city(options.frames)
-    for sightings, fixes in city.chunks():
+    for landmarks, term, fixes in city.chunks():
         graph.push_back(fixes)
-        chunks.append(sightings)
+        chunks.append((landmarks, term))
     block = block_of(chunks, options.frames)
     values = values_at(np.arange(options.frames), city.start)
     start = time.process_time(), time.perf_counter()
@@ -190,16 +191,17 @@ def whole(options: argparse.Namespace) -> tuple[OptimizeResult, dict[str, Any]]:
     }
 
 
-def block_of(chunks: list[Sightings], num_frames: int) -> LandmarkBlock:
+def block_of(chunks: list[tuple[np.ndarray, BearingTerm]], num_frames: int) -> LandmarkBlock:
     """All observations of a map as one block."""
-    firsts = np.cumsum([0, *(len(chunk.points_world) for chunk in chunks)])
+    firsts = np.cumsum([0, *(len(landmarks) for landmarks, _ in chunks)])
+    terms = [term for _, term in chunks]
     term = BearingTerm(
-        np.concatenate([chunk.frames for chunk in chunks]),
-        np.concatenate([c.points + first for c, first in zip(chunks, firsts, strict=False)]),
-        np.concatenate([chunk.bearings_rig for chunk in chunks]),
-        np.concatenate([chunk.sigmas_rad for chunk in chunks]),
+        np.concatenate([term.frames for term in terms]),
+        np.concatenate([t.points + first for t, first in zip(terms, firsts, strict=False)]),
+        np.concatenate([term.bearings_rig for term in terms]),
+        np.concatenate([np.asarray(term.sigmas_rad) for term in terms]),
     )
-    points = np.concatenate([chunk.points_world for chunk in chunks])
+    points = np.concatenate([landmarks for landmarks, _ in chunks])
     keys = [X(frame) for frame in range(num_frames)]
     return LandmarkBlock(keys, points, [term], RobustLoss("cauchy", LOSS_SIGMAS), num_threads=1)
 

@@ -176,17 +176,23 @@ class BlockCholesky:
         return out
 
     def draw(self, normals: np.ndarray) -> np.ndarray:
-        """Vectors (D, N, 6) of covariance H^-1 from as many independent unit normals."""
+        """Vectors (D, N, 6) of covariance H^-1 from as many independent unit normals.
+
+        Where blocks were kept, `normals` holds what was drawn of these, from the covariance of
+        their own system.
+        """
         num = len(normals)
         x = np.ascontiguousarray(normals[:, self.order].reshape(num, DIM * self.num_blocks).T)
-        for front in reversed(self._fronts):
+        for front in reversed(self._eliminated):
             rest = x[front.own] - front.below.T @ x[front.under]
             x[front.own] = trsm(1.0, front.lower, rest, lower=1, trans_a=1)
         out = np.empty((num, self.num_blocks, DIM))
         out[:, self.order] = x.T.reshape(num, self.num_blocks, DIM)
         return out
 
-    def inverse_blocks(self, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def inverse_blocks(
+        self, pairs: np.ndarray, kept: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Blocks of the inverse of H (Takahashi's selected inversion, front by front).
 
         With G = L21 L11^-1, Z21 = -Z22 G and Z11 = (L11 L11^T)^-1 - G^T Z21. Takahashi, Fagan,
@@ -194,6 +200,7 @@ class BlockCholesky:
 
         Args:
             pairs: (Q, 2) int, pairs of the pattern, in either order.
+            kept: (6 K, 6 K) the inverse at the blocks that were kept.
 
         Returns:
             (N, 6, 6) diagonal blocks, (Q, 6, 6) blocks [i, j] of the pairs.
@@ -207,7 +214,10 @@ class BlockCholesky:
         whole: dict[int, np.ndarray] = {}  # of fronts with unprocessed children
         for s in range(len(self._fronts) - 1, -1, -1):
             front, parent = self._fronts[s], int(self._parents[s])
-            Z = self._inverse_of_front(front, whole.get(parent, _nothing()))
+            if kept is not None and s == len(self._fronts) - 1:
+                Z = kept
+            else:
+                Z = self._inverse_of_front(front, whole.get(parent, _nothing()))
             if parent >= 0:
                 waiting[parent] -= 1
                 if not waiting[parent]:

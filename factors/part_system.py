@@ -50,26 +50,36 @@ class PartElimination:
 
         Args:
             equations: of the part.
-            damping: part of the diagonal that is added to it.
+            damping: part of the diagonal that is added to it; 0 = none, and own blocks that
+                nothing constrains count as unit ones.
         """
-        self._equations, num = equations, len(equations.diagonal)
-        self._own = slice(0, num - equations.num_kept)
+        num = len(equations.diagonal)
+        self._own, self._num_kept = slice(0, num - equations.num_kept), equations.num_kept
+        self._gradient = equations.gradient
         self._added = damping_of(equations.diagonal, damping)[self._own]
         damped = equations.diagonal.copy()
         np.einsum("nii->ni", damped)[self._own] += self._added
+        self.idle = ~np.any(equations.diagonal[self._own], axis=(1, 2))
+        if damping == 0:
+            damped[self._own][self.idle] = np.eye(DIM)
         self._cholesky = BlockCholesky(num, equations.pairs, equations.num_kept)
         self.regular = self._cholesky.factorize(damped, equations.off_diagonal)
 
+    @property
+    def num_bytes(self) -> int:
+        """Memory of the factor."""
+        return 8 * (self._cholesky.num_entries + (DIM * self._num_kept) ** 2)
+
     def condensed(self) -> Condensed:
         """The Schur complement on the shared blocks, and its gradient."""
-        num = self._equations.num_kept
+        num = self._num_kept
         lower = self._cholesky.complement.reshape(num, DIM, num, DIM)
         each = np.arange(num)
         diagonal = np.tril(lower[each, :, each, :])
         diagonal += np.swapaxes(np.tril(diagonal, -1), 1, 2)
         rows, columns = np.triu_indices(num, 1)
         off_diagonal = np.swapaxes(lower[columns, :, rows, :], 1, 2).copy()
-        return Condensed(diagonal, off_diagonal, -self._cholesky.reduced(-self._equations.gradient))
+        return Condensed(diagonal, off_diagonal, -self._cholesky.reduced(-self._gradient))
 
     def substituted(self, kept: np.ndarray) -> tuple[np.ndarray, float]:
         """Steps (N - K, 6) of the own blocks, given those of the shared ones, (K, 6).
@@ -77,6 +87,28 @@ class PartElimination:
         Returns:
             The steps, and their share of the decrease that the undamped model predicts.
         """
-        gradient = self._equations.gradient
-        steps = self._cholesky.substituted(-gradient, kept)[self._own]
-        return steps, 0.5 * float((steps * (self._added * steps - gradient[self._own])).sum())
+        steps = self._cholesky.substituted(-self._gradient, kept)[self._own]
+        gradient = self._gradient[self._own]
+        return steps, 0.5 * float((steps * (self._added * steps - gradient)).sum())
+
+    def inverse_blocks(self, pairs: np.ndarray, kept: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Blocks of the inverse of the whole map's system, given it at the shared blocks.
+
+        Args:
+            pairs: (Q, 2) int, pairs of the part's pattern, i < j, i one of its own.
+            kept: (6 K, 6 K).
+
+        Returns:
+            (N - K, 6, 6) diagonal blocks of the own ones, (Q, 6, 6) blocks [i, j] of the pairs.
+        """
+        inverse, between = self._cholesky.inverse_blocks(pairs, kept if self._num_kept else None)
+        return inverse[self._own], between
+
+    def drawn(self, kept: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Errors (D, N - K, 6) of the own blocks, given those drawn of the shared ones, (D, K, 6).
+
+        They have the covariance of the whole map's inverse.
+        """
+        num = len(kept)
+        normals = rng.normal(size=(num, len(self._gradient) - self._num_kept, DIM))
+        return self._cholesky.draw(np.concatenate([normals, kept], axis=1))[:, self._own]

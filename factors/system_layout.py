@@ -34,6 +34,7 @@ class SystemLayout:
         blocks: Sequence[Block],
         values: gtsam.Values,
         pairs: Sequence[tuple[int, int]] = (),
+        order: Sequence[int] = (),
     ) -> None:
         """Place the variables.
 
@@ -42,6 +43,7 @@ class SystemLayout:
             blocks: batched ones.
             values: of all variables.
             pairs: keys of two variables each, whose joint block `covariances` returns.
+            order: keys of variables that come first, in this order; others follow.
 
         Raises:
             ValueError: a variable has no value.
@@ -51,7 +53,7 @@ class SystemLayout:
         self.graph_keys = sorted({key for keys in factor_keys for key in keys})
         block_keys = [key for block in self.blocks for key in block.keys]
         paired = [key for pair in pairs for key in pair]
-        self.keys = list(dict.fromkeys([*block_keys, *self.graph_keys, *paired]))
+        self.keys = list(dict.fromkeys([*order, *block_keys, *self.graph_keys, *paired]))
         all_dims = values.dims()
         for key in self.keys:
             if key not in all_dims:

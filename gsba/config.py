@@ -339,6 +339,10 @@ class SolverSettings(_Settings):
     loss_sigmas: float = Field(default=1.0, gt=0)  # scale of the loss, standard deviations
     lambda_initial: float = Field(default=1e-4, gt=0)  # damping, part of the diagonal
     num_threads: int | None = Field(default=None, ge=1)  # None = all cores
+    part_frames: int | None = Field(
+        default=None, ge=2
+    )  # maps of more frames are solved in parts of at most so many; None = parts of 1,000 where the
+    # whole would take more than a quarter of the machine's memory
 
     def threads(self) -> int:
         """Number of threads to use."""

@@ -7,14 +7,17 @@ import numpy as np
 from gtsam.symbol_shorthand import X
 from scipy.spatial.transform import Rotation
 
-from gsba.parts.folder import PartsWriter, Sightings
+from factors import BearingTerm
+from gsba.parts.folder import PartsWriter, values_at
 
 NUM = 90
 SIGMA = 5e-4
 
 
-def town(seed: int = 0) -> tuple[Sightings, np.ndarray, gtsam.NonlinearFactorGraph]:
-    """Landmarks with observations, pose rows (F, 12) to start from, and factors on poses."""
+def town(
+    seed: int = 0,
+) -> tuple[np.ndarray, BearingTerm, np.ndarray, gtsam.NonlinearFactorGraph]:
+    """Landmarks (J, 3), observations, pose rows (F, 12) to start from, and factors on poses."""
     rng = np.random.default_rng(seed)
     angle = 4 * np.pi * np.arange(NUM) / NUM
     second = np.arange(NUM) >= NUM // 2
@@ -40,14 +43,9 @@ def town(seed: int = 0) -> tuple[Sightings, np.ndarray, gtsam.NonlinearFactorGra
     moved = positions + 0.02 * rng.normal(size=(NUM, 3))
     rows = np.hstack([start.as_matrix().reshape(-1, 9), moved])
     points = points + 0.02 * rng.normal(size=points.shape)
-    sightings = Sightings(
-        frames.astype(np.int32),
-        owners.astype(np.int32),
-        bearings,
-        np.full(len(frames), SIGMA),
-        points,
-    )
-    return sightings, rows, _factors(positions, rng)
+    seen = frames.astype(np.int32), owners.astype(np.int32)
+    term = BearingTerm(*seen, bearings, np.full(len(frames), SIGMA))
+    return points, term, rows, _factors(positions, rng)
 
 
 def _factors(positions: np.ndarray, rng: np.random.Generator) -> gtsam.NonlinearFactorGraph:
@@ -66,20 +64,17 @@ def _factors(positions: np.ndarray, rng: np.random.Generator) -> gtsam.Nonlinear
 
 def write(folder: Path, most: int, num_chunks: int = 4) -> np.ndarray:
     """Write the town by parts, from a stream of a few chunks; returns where it starts."""
-    sightings, rows, graph = town()
+    points, term, rows, graph = town()
     writer = PartsWriter(folder)
-    for chunk in np.array_split(np.arange(len(sightings.points_world)), num_chunks):
-        chosen = np.isin(sightings.points, chunk)
-        writer.add(
-            Sightings(
-                sightings.frames[chosen],
-                sightings.points[chosen] - chunk[0],
-                sightings.bearings_rig[chosen],
-                sightings.sigmas_rad[chosen],
-                sightings.points_world[chunk],
-            ),
-            graph,
+    for chunk in np.array_split(np.arange(len(points)), num_chunks):
+        chosen = np.isin(term.points, chunk)
+        some = BearingTerm(
+            term.frames[chosen],
+            term.points[chosen] - chunk[0],
+            term.bearings_rig[chosen],
+            np.asarray(term.sigmas_rad)[chosen],
         )
+        writer.add(points[chunk], [some], graph)
         graph = gtsam.NonlinearFactorGraph()
-    writer.finish(rows, most)
+    writer.finish(values_at(range(NUM), rows), NUM, most)
     return rows

@@ -11,9 +11,10 @@ import numpy as np
 
 from factors import Block, LandmarkBlock, RobustLoss, tangent_basis
 from gsba.bundle import pose_variables, triangulation
+from gsba.bundle.division import DivisibleMap, Division
 from gsba.bundle.families import Families, FamilyTerms
 from gsba.bundle.gyro_turns import GyroTurns
-from gsba.bundle.optimizer import marginal_covariances, optimize
+from gsba.bundle.optimizer import OptimizeResult, marginal_covariances, optimize
 from gsba.bundle.pose_variables import poses_of, values_of
 from gsba.camera.rig import CubeRig
 from gsba.config import RefineSettings, SolverSettings
@@ -49,6 +50,18 @@ class Terms:
     blocks: tuple[Block, ...]
     values: gtsam.Values  # poses and families' own variables
     own: FamilyTerms  # the part of families
+    observed: "ObservedPoints | None" = None  # landmarks seen along known rays, whose block is not
+    # among `blocks`; None = there are none
+
+    def minimized(self, settings: SolverSettings) -> OptimizeResult:
+        """The best values, in parts where the context divides the map; see `optimizer.optimize`."""
+        blocks, observed = self.blocks, self.observed
+        if observed is not None:
+            found = observed.minimized_in_parts(self, settings)
+            if found is not None:
+                return found
+            blocks = (observed.block(), *blocks)
+        return optimize(self.graph, blocks, self.values, settings)
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +73,7 @@ class AdjustmentContext:
     settings: RefineSettings  # loss, solver, rounds
     num_threads: int  # of the solver
     maps: np.ndarray | None = None  # (F,) map of each frame, for the families; None = there is one
+    division: Division | None = None  # of large maps into parts; None = none is divided
 
     @property
     def turning(self) -> GyroConstraints | None:
@@ -89,6 +103,45 @@ class AdjustmentContext:
         graph.push_back(pose_variables.fixed_scale(solved.world_T_rigs, maps))
         values.insert(own.values)
         return Terms(graph, own.blocks, values, own)
+
+
+@dataclass(frozen=True, slots=True)
+class ObservedPoints:
+    """Landmarks and the known rays that see them."""
+
+    landmarks: Landmarks
+    keypoints: Keypoints
+    noise: float  # of the observations, in units of the keypoints' own sigmas
+    context: AdjustmentContext
+
+    def block(self) -> LandmarkBlock:
+        """Their factor block."""
+        return landmark_block(self.landmarks, self.keypoints, self.noise, self.context)
+
+    def minimized_in_parts(self, terms: Terms, settings: SolverSettings) -> OptimizeResult | None:
+        """The best values of these and of other terms; None where the map is not divided."""
+        division, map_ = self.context.division, self._divisible(terms)
+        return division.minimized(map_, settings) if division and map_ else None
+
+    def covariances_in_parts(self, terms: Terms) -> tuple[np.ndarray, JointErrors] | None:
+        """Covariances of poses, as `pose_covariances`; None where the map is not divided."""
+        division, map_ = self.context.division, self._divisible(terms)
+        seed = self.context.settings.seed
+        return division.covariances(map_, DRAWS, seed) if division and map_ else None
+
+    def _divisible(self, terms: Terms) -> DivisibleMap | None:
+        """These and other terms as a map that may be divided; None = families have blocks."""
+        if terms.blocks:
+            return None
+        solver = self.context.settings.solver
+        return DivisibleMap(
+            self.landmarks,
+            lambda some: replace(self, landmarks=some).block().terms,
+            terms.graph,
+            terms.values,
+            len(self.keypoints.starts) - 1,
+            RobustLoss(solver.loss, solver.loss_sigmas),
+        )
 
 
 class View(Protocol):
@@ -131,12 +184,9 @@ class FixedRays:
     def terms(
         self, solved: Solution, noise: float, context: AdjustmentContext
     ) -> tuple[Terms, Callable[[gtsam.Values], "FixedRays"]]:
-        """Their block beside priors and families; rays stay."""
-        block, terms = (
-            landmark_block(solved.landmarks, self.keypoints, noise, context),
-            context.terms(solved),
-        )
-        return replace(terms, blocks=(block, *terms.blocks)), lambda _: self
+        """These points beside priors and families; rays stay."""
+        observed = ObservedPoints(solved.landmarks, self.keypoints, noise, context)
+        return replace(context.terms(solved), observed=observed), lambda _: self
 
 
 def adjust_sighted(
@@ -248,7 +298,7 @@ def adjust_through(
             solver = solver.model_copy(update=finer)
         here = replace(solved, landmarks=landmarks)
         terms, after = view.terms(here, spread, context)
-        result = optimize(terms.graph, terms.blocks, terms.values, solver)
+        result = terms.minimized(solver)
         poses, then = poses_of(result.values, len(solved.world_T_rigs)), after(result.values)
         new_support = len(place(then.keypoints, poses, last_gate).tracks)
         accepted = new_support >= settings.rounds.min_support * support
@@ -316,10 +366,13 @@ def pose_covariances(
     components: np.ndarray | None = None,
 ) -> tuple[np.ndarray, JointErrors]:
     """Marginal covariances (F, 6, 6) with the first pose and the extent of each map held fixed."""
-    block = landmark_block(solved.landmarks, keypoints, solved.noise, context)
-    keys = [pose_variables.X(f) for f in range(len(solved.world_T_rigs))]
     terms, seed = context.covariance_terms(solved, components), context.settings.seed
-    blocks = [block, *terms.blocks]
+    observed = ObservedPoints(solved.landmarks, keypoints, solved.noise, context)
+    found = observed.covariances_in_parts(terms)
+    if found is not None:
+        return found
+    keys = [pose_variables.X(f) for f in range(len(solved.world_T_rigs))]
+    blocks = [observed.block(), *terms.blocks]
     return marginal_covariances(terms.graph, blocks, terms.values, keys, DRAWS, seed)
 
 

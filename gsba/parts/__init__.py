@@ -4,7 +4,9 @@ Takes poses, points and observations that `PartsWriter` writes to disk part by p
 Gives the poses and points that `gsba.bundle.optimizer.optimize` finds undivided.
 """
 
+from gsba.parts.adjustments import DividedAdjustments
+from gsba.parts.covariances import divided_covariances
 from gsba.parts.divided_system import optimize_divided
 from gsba.parts.folder import PartsWriter
 
-__all__ = ["PartsWriter", "optimize_divided"]
+__all__ = ["DividedAdjustments", "PartsWriter", "divided_covariances", "optimize_divided"]

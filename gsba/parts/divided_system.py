@@ -11,16 +11,19 @@ import numpy as np
 from factors import RobustLoss
 from factors.cholesky import DIM, BlockCholesky
 from factors.normal_equations import damping_of
+from gsba.bundle.family_variables import kept
 from gsba.bundle.optimizer import OptimizeResult, minimize
-from gsba.bundle.pose_variables import X, poses_of
+from gsba.bundle.pose_variables import X
 from gsba.config import SolverSettings
-from gsba.parts.folder import Index, load, load_index, load_part, values_at
+from gsba.parts.folder import At, Index, Part, load, load_index, load_part
 from gsba.parts.jobs import (
+    Covariances,
     Eliminate,
     Linearize,
     Linearized,
     Move,
     Points,
+    Shared,
     Substitute,
     version_file,
 )
@@ -38,21 +41,41 @@ class State:
     """Where a solution stands: what the loop does next depends on nothing else."""
 
     version: int  # of the parts' landmarks
-    poses: np.ndarray  # (F, 12) float64
+    at: At  # all variables
     damping: float  # of the next attempt
+
+
+@dataclass(frozen=True, slots=True)
+class _Variables:
+    """Variables of a part, without what it owns."""
+
+    frames: np.ndarray  # (N,) int32, frames of the map
+    beside: list[int]  # keys of its other variables
+
+    @classmethod
+    def of(cls, part: Part) -> "_Variables":
+        return cls(part.frames, part.beside)
 
 
 class DividedSystem:
     """Normal equations of a map in parts: what a part owns is eliminated where it lies.
 
-    The frames on the cuts are solved for here, by their Schur complement. Nothing is approximated:
-    results differ from those of an undivided system by rounding. They do not depend on the workers.
+    The variables on the cuts are solved for here, by their Schur complement. Nothing is
+    approximated: results differ from those of an undivided system by rounding. They do not depend
+    on the workers.
 
     Args:
         folder: of the map, from `folder.PartsWriter`.
         workers: who computes the parts.
         loss: robust loss of the observations.
         scratch: folder of the workers' own files, emptied after each pass; None = they have none.
+
+    Attributes:
+        start: where an earlier call was stopped, or the map's own start.
+        num_frames: F.
+        nodes: nodes (N,) of each part, its own ones first; frames are the first F of the map.
+        kept: places (K,) in `cut_nodes` of each part's nodes on cuts, ascending.
+        cut_nodes: (C,) nodes on cuts, ascending.
     """
 
     def __init__(
@@ -60,24 +83,35 @@ class DividedSystem:
     ) -> None:
         self._folder, self._workers, self._loss = folder.absolute(), workers, loss
         self._scratch = scratch
-        self._index = index = load_index(folder)
-        self.start = State(0, index.poses, np.nan)
+        index = load_index(folder)
+        self.start = State(0, index.start, np.nan)
         if (folder / _STATE).exists():
             self.start = load(folder / _STATE, State)
         self._version = self._latest = self.start.version
         self._saved: int | None = self._version if self._version else None
-        self._frames = [index.frames_of(p) for p in range(len(index.num_kept))]
+        self.num_frames = len(index.start.poses)
+        self._beside = index.start.beside.keys.tolist()
+        self.nodes = [index.nodes_of(p) for p in range(len(index.num_kept))]
+        self._variables = [_Variables.of(load_part(folder, p)) for p in range(len(self.nodes))]
+        self._set_dims(self.start.at.values(range(self.num_frames)))
         self._set_cuts(index)
         self._tentative: list[Linearized] = []
         self._linearized: list[Linearized] = []
 
+    def _set_dims(self, values: gtsam.Values) -> None:
+        """Note the nodes of variables that are no frames."""
+        dims = values.dims()
+        self._dims = [dims[key] for key in self._beside]
+        firsts = np.cumsum([self.num_frames, *(-(-dim // DIM) for dim in self._dims)])
+        self._firsts, self._num_nodes = firsts[:-1].tolist(), int(firsts[-1])
+
     def _set_cuts(self, index: Index) -> None:
-        """Fix the pattern of the frames on cuts."""
-        kept = [f[len(f) - k :] for f, k in zip(self._frames, index.num_kept, strict=True)]
-        self._cut_frames = np.unique(np.concatenate(kept))
-        self._rows = [np.searchsorted(self._cut_frames, rows) for rows in kept]  # ascending
-        num, codes = len(self._cut_frames), []
-        for rows in self._rows:
+        """Fix the pattern of the nodes on cuts."""
+        kept = [n[len(n) - k :] for n, k in zip(self.nodes, index.num_kept, strict=True)]
+        self.cut_nodes = np.unique(np.concatenate(kept))
+        self.kept = [np.searchsorted(self.cut_nodes, rows) for rows in kept]
+        num, codes = len(self.cut_nodes), []
+        for rows in self.kept:
             i, j = np.triu_indices(len(rows), 1)
             codes.append(rows[i] * num + rows[j])
         self._codes = np.unique(np.concatenate(codes))
@@ -86,22 +120,48 @@ class DividedSystem:
 
     def linearize(self, values: gtsam.Values) -> dict[str, float]:
         """See `gsba.bundle.optimizer.System`; parts that just moved are linearized already."""
-        self._poses = self._pose_rows(values)
+        self._at = self._of(values)
         if not self._linearized:
-            each = self._of_parts(self._poses)
+            each = self._of_parts(values)
             job = Linearize(self._folder, self._all, self._version, each, self._loss)
             self._linearized = self._results(job)
         return self.costs(values)
 
     def solve(self, damping: float) -> np.ndarray | None:
-        """See `gsba.bundle.optimizer.System`."""
+        """See `gsba.bundle.optimizer.System`; steps (N, 6) of frames, then of other variables."""
         self._save(damping)
-        num, pairs = len(self._cut_frames), len(self._codes)
+        factorized = self._factorized(damping)
+        if factorized is None:
+            return None
+        steps = np.zeros((self._num_nodes, DIM))
+        self._predicted = 0.0
+        if self._cholesky is not None:
+            added, gradient, raw = factorized
+            there = self._cholesky.solve(-gradient)
+            steps[self.cut_nodes] = there
+            self._predicted = 0.5 * float((there * (added * there - raw)).sum())
+        kept = tuple(steps[self.cut_nodes[rows]] for rows in self.kept)
+        job = Substitute(self._folder, self._all, self._version, damping, kept)
+        for p, found in enumerate(self._workers.map_shards(job)):
+            nodes = self.nodes[p]
+            steps[nodes[: len(nodes) - len(self.kept[p])]] = found.steps
+            self._predicted += found.predicted
+        self._clear()
+        return steps if np.all(np.isfinite(steps)) else None
+
+    def _factorized(self, damping: float) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+        """Eliminate the parts, and factorize what is left; None if singular.
+
+        Returns:
+            Of the nodes on cuts, (C, 6) each: what was added to the diagonal, the gradient with the
+            parts eliminated, and as it was.
+        """
+        num, pairs = len(self.cut_nodes), len(self._codes)
         diagonal, undamped = np.zeros((2, num, DIM, DIM))
         off_diagonal, gradient, raw = np.zeros((pairs, DIM, DIM)), *np.zeros((2, num, DIM))
         job = Eliminate(self._folder, self._all, self._version, damping)
         for p, reduced in enumerate(self._workers.map_shards(job)):
-            rows, condensed = self._rows[p], reduced.condensed
+            rows, condensed = self.kept[p], reduced.condensed
             if condensed is None:
                 return None
             i, j = np.triu_indices(len(rows), 1)
@@ -115,42 +175,105 @@ class DividedSystem:
         self._clear()
         added = damping_of(undamped, damping)
         np.einsum("nii->ni", diagonal)[:] += added
-        steps = np.zeros((len(self._index.poses), DIM))
-        self._predicted = 0.0
-        if self._cholesky is not None:
-            if not self._cholesky.factorize(diagonal, off_diagonal):
-                return None
-            there = self._cholesky.solve(-gradient)
-            steps[self._cut_frames] = there
-            self._predicted = 0.5 * float((there * (added * there - raw)).sum())
-        kept = tuple(steps[self._cut_frames[rows]] for rows in self._rows)
-        job = Substitute(self._folder, self._all, self._version, damping, kept)
+        self.idle = ~np.any(undamped, axis=(1, 2))
+        if damping == 0:
+            diagonal[self.idle] = np.eye(DIM)
+        if self._cholesky is not None and not self._cholesky.factorize(diagonal, off_diagonal):
+            return None
+        return added, gradient, raw
+
+    def covariances(
+        self, pairs: np.ndarray, num_draws: int, seed: int
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+        """Blocks of H^-1 at the start, and draws from it; None if singular.
+
+        Args:
+            pairs: (Q, 2) nodes that the writer was to tie.
+            num_draws: number of draws, D.
+            seed: of the draws.
+
+        Returns:
+            (N, 6, 6) diagonal blocks, (Q, 6, 6) blocks between the pairs, and vectors (D, N, 6)
+            float32 of covariance H^-1; NaN where nothing constrains a node.
+        """
+        local = [_places(nodes, pairs) for nodes in self.nodes]
+        own = [len(n) - len(k) for n, k in zip(self.nodes, self.kept, strict=True)]
+        asked = [np.flatnonzero((p >= 0).all(axis=1) & (p.min(axis=1) < num))
+                 for p, num in zip(local, own, strict=True)]  # fmt: skip
+        inside = tuple(p[rows] for p, rows in zip(local, asked, strict=True))
+        each = self._of_parts(self.start.at.values(range(self.num_frames)))
+        job = Linearize(self._folder, self._all, self._version, each, self._loss, inside)
+        self._linearized = self._results(job)
+        if self._factorized(0.0) is None:
+            return None
+        inverse = np.empty((self._num_nodes, DIM, DIM))
+        between = np.full((len(pairs), DIM, DIM), np.nan)
+        drawn = np.empty((num_draws, self._num_nodes, DIM), np.float32)
+        self._invert_cuts(pairs, seed, inverse, between, drawn)
+        job = Covariances(self._folder, self._all, self._version, inside, seed)
         for p, found in enumerate(self._workers.map_shards(job)):
-            frames = self._frames[p]
-            steps[frames[: len(frames) - len(self._rows[p])]] = found.steps
-            self._predicted += found.predicted
+            nodes = self.nodes[p][: own[p]]
+            inverse[nodes], drawn[:, nodes], between[asked[p]] = (
+                found.inverse,
+                found.drawn,
+                found.between,
+            )
         self._clear()
-        return steps if np.all(np.isfinite(steps)) else None
+        between[np.isnan(inverse[pairs]).any(axis=(1, 2, 3))] = np.nan
+        return inverse, between, drawn
+
+    def _invert_cuts(
+        self,
+        pairs: np.ndarray,
+        seed: int,
+        inverse: np.ndarray,
+        between: np.ndarray,
+        drawn: np.ndarray,
+    ) -> None:
+        """Fill in the results of `covariances` at the nodes on cuts; parts get theirs in files."""
+        num, codes = len(self.cut_nodes), self._codes
+        on_cuts, joint = np.zeros((num, DIM, DIM)), np.zeros((len(codes), DIM, DIM))
+        errors = np.zeros((len(drawn), num, DIM))
+        if self._cholesky is not None:
+            rng = np.random.default_rng(seed)
+            on_cuts, joint = self._cholesky.inverse_blocks(np.column_stack(np.divmod(codes, num)))
+            errors = self._cholesky.draw(rng.normal(size=errors.shape))
+        for p, rows in enumerate(self.kept):
+            whole = np.zeros((len(rows), DIM, len(rows), DIM))
+            each, (i, j) = np.arange(len(rows)), np.triu_indices(len(rows), 1)
+            blocks = joint[np.searchsorted(codes, rows[i] * num + rows[j])]
+            whole[each, :, each, :], whole[i, :, j, :] = on_cuts[rows], blocks
+            whole[j, :, i, :] = np.swapaxes(blocks, 1, 2)
+            shared = Shared(whole.reshape(2 * (DIM * len(rows),)), errors[:, rows])
+            save_record(version_file(self._folder, p, "shared", self._version), shared, {})
+        on_cuts[self.idle], errors[:, self.idle] = np.nan, np.nan
+        inverse[self.cut_nodes], drawn[:, self.cut_nodes] = on_cuts, errors
+        places = _places(self.cut_nodes, pairs)
+        both = np.flatnonzero((places >= 0).all(axis=1))
+        between[both] = joint[np.searchsorted(codes, places[both] @ [num, 1])]
 
     def retract(self, values: gtsam.Values, steps: np.ndarray) -> gtsam.Values:
         """See `gsba.bundle.optimizer.System`."""
         delta = gtsam.VectorValues()
-        for frame, step in enumerate(steps):
-            delta.insert(X(frame), step)
+        for frame in range(self.num_frames):
+            delta.insert(X(frame), steps[frame])
+        flat = steps.ravel()
+        for key, dim, first in zip(self._beside, self._dims, self._firsts, strict=True):
+            delta.insert(key, flat[DIM * first : DIM * first + dim])
         return values.retract(delta)
 
     def propose(self, values: gtsam.Values, steps: np.ndarray) -> float:
         """See `gsba.bundle.optimizer.System`."""
         self._latest += 1
-        poses = self._pose_rows(values)
+        before = self._of_parts(self._at.values(range(self.num_frames)))
         job = Move(
             self._folder,
             self._all,
             self._version,
             self._latest,
-            self._of_parts(self._poses),
-            self._of_parts(poses),
-            self._of_parts(steps),
+            before,
+            self._of_parts(values),
+            tuple(steps[part.frames] for part in self._variables),
             self._loss,
         )
         moved = self._results(job)
@@ -164,7 +287,7 @@ class DividedSystem:
     def accept(self, values: gtsam.Values) -> None:
         """See `gsba.bundle.optimizer.System`."""
         self._version, self._linearized = self._latest, self._tentative
-        self._poses = self._pose_rows(values)
+        self._at = self._of(values)
 
     def costs(self, values: gtsam.Values) -> dict[str, float]:
         """See `gsba.bundle.optimizer.System`."""
@@ -176,20 +299,23 @@ class DividedSystem:
 
     def finish(self, values: gtsam.Values) -> None:
         """Note that the solution ended at these values, with the landmarks of this version."""
-        state = State(self._version, self._pose_rows(values), np.nan)
+        state = State(self._version, self._of(values), np.nan)
         save_record(self._folder / _RESULT, state, {})
 
     @property
     def _all(self) -> tuple[int, ...]:
-        return tuple(range(len(self._frames)))
+        return tuple(range(len(self.nodes)))
 
-    def _of_parts(self, rows: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Rows of each part's frames, of rows (F, ...) of all frames."""
-        return tuple(rows[frames] for frames in self._frames)
+    def _of(self, values: gtsam.Values) -> At:
+        return At.of(values, range(self.num_frames), self._beside)
 
-    def _pose_rows(self, values: gtsam.Values) -> np.ndarray:
-        poses = poses_of(values, len(self._index.poses))
-        return np.hstack([poses[:, :3, :3].reshape(-1, 9), poses[:, :3, 3]])
+    def _of_parts(self, values: gtsam.Values) -> tuple[At, ...]:
+        """Variables of each part."""
+        poses, nothing = self._of(values).poses, At.of(values, (), ()).beside
+        return tuple(
+            At(poses[part.frames], kept(values, part.beside) if part.beside else nothing)
+            for part in self._variables
+        )
 
     def _results(self, job: Job[R]) -> list[R]:
         found = list(self._workers.map_shards(job))
@@ -204,11 +330,20 @@ class DividedSystem:
     def _save(self, damping: float) -> None:
         """Note where the solution stands, and delete older and rejected versions."""
         if self._saved != self._version:
-            save_record(self._folder / _STATE, State(self._version, self._poses, damping), {})
+            save_record(self._folder / _STATE, State(self._version, self._at, damping), {})
             self._saved = self._version
         for path in self._folder.glob("part-*/*-[0-9]*.npz"):
             if not path.stem.endswith(f"-{self._version:06d}"):
                 path.unlink(missing_ok=True)
+
+
+def _places(nodes: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    """Places (Q, 2) of pairs of nodes in `nodes (N,)`; -1 = not among them."""
+    order = np.argsort(nodes)
+    at = np.minimum(np.searchsorted(nodes, pairs, sorter=order), max(len(nodes) - 1, 0))
+    if not len(nodes):
+        return np.full(pairs.shape, -1)
+    return np.where(nodes[order[at]] == pairs, order[at], -1)
 
 
 def optimize_divided(
@@ -238,7 +373,7 @@ def optimize_divided(
     start = system.start
     if np.isfinite(start.damping):
         settings = settings.model_copy(update={"lambda_initial": start.damping})
-    values = values_at(np.arange(len(start.poses)), start.poses)
+    values = start.at.values(range(system.num_frames))
     result = minimize(system, values, settings, callback)
     system.finish(result.values)
     return result

@@ -12,11 +12,12 @@ from typing import Any, Self
 import gtsam
 import numpy as np
 
-from factors import BearingTerm, LandmarkBlock, RobustLoss
-from factors.part_system import Condensed, PartElimination, PartEquations, PartSystem
+from factors import LandmarkBlock, RobustLoss
+from factors.part_system import Condensed, PartEquations, PartSystem
 from factors.system_layout import SystemLayout
 from gsba.bundle.pose_variables import X
-from gsba.parts.folder import Part, deserialized, load, load_part, part_folder, values_at
+from gsba.parts.eliminations import eliminated, substituting
+from gsba.parts.folder import At, Part, deserialized, load, load_part, part_folder
 from gsba.store.records import save_record
 from gsba.store.shards import even_blocks
 
@@ -31,7 +32,7 @@ class Points:
 
 @dataclass(frozen=True, slots=True)
 class Linearized:
-    """Costs of a part, and its share of the equations of its frames on cuts."""
+    """Costs of a part, and its share of the equations of its nodes on cuts."""
 
     costs: Mapping[str, float]  # family -> cost
     diagonal: np.ndarray  # (K, 6, 6) float64, the part's own share of H, nothing damped
@@ -48,14 +49,14 @@ class Moved:
 
 @dataclass(frozen=True, slots=True)
 class Reduced:
-    """Equations of a part on its frames on cuts, its damped own frames eliminated."""
+    """Equations of a part on its nodes on cuts, its damped own ones eliminated."""
 
     condensed: Condensed | None  # None = its own block is singular
 
 
 @dataclass(frozen=True, slots=True)
 class Substituted:
-    """Steps of a part's own frames."""
+    """Steps of a part's own nodes."""
 
     steps: np.ndarray  # (N - K, 6) float64
     predicted: float  # share of the decrease that the model predicts
@@ -87,10 +88,12 @@ class _PartJob:
 
 @dataclass(frozen=True)
 class Linearize(_PartJob):
-    """Linearizes parts at poses, with the landmarks they have at a version."""
+    """Linearizes parts at values, with the landmarks they have at a version."""
 
-    poses: tuple[np.ndarray, ...]  # (N, 12) rows of each part's frames
+    at: tuple[At, ...]  # each part's variables
     loss: RobustLoss
+    pairs: tuple[np.ndarray, ...] = ()  # (Q, 2) int64, places of frames among each part's keys,
+    # that its pattern pairs as well; () = none
 
     title = "linearizing"
     returns: Any = Linearized
@@ -98,7 +101,7 @@ class Linearize(_PartJob):
     def part(self, start: int, stop: int) -> Self:
         """See `gsba.store.shards.Job`."""
         chosen = slice(start, stop)
-        return replace(self, parts=self.parts[chosen], poses=self.poses[chosen])
+        return replace(self, parts=self.parts[chosen], at=self.at[chosen], pairs=self.pairs[chosen])
 
     def __call__(self, item: int) -> Linearized:
         part = load_part(self.folder, self.parts[item])
@@ -106,8 +109,9 @@ class Linearize(_PartJob):
         if self.version:
             points = load(self._file(item, "points", self.version), Points).points_world
         block, graph = _block(part, points, self.loss), deserialized(part.graph)
-        values = values_at(part.frames, self.poses[item])
-        linearized, equations = _linearized(part, block, graph, values)
+        values = self.at[item].values(part.frames)
+        pairs = part.keys[self.pairs[item]].tolist() if self.pairs else ()
+        linearized, equations = _linearized(part, block, graph, values, pairs)
         save_record(self._file(item, "equations", self.version), equations, {})
         points = Points(block.points_world, block.point_costs)
         save_record(self._file(item, "points", self.version), points, {})
@@ -119,9 +123,9 @@ class Move(_PartJob):
     """Moves parts from a version to another one, and linearizes them there."""
 
     to: int  # version
-    before: tuple[np.ndarray, ...]  # (N, 12) rows of each part's frames at the version
-    poses: tuple[np.ndarray, ...]  # (N, 12) at the other one
-    steps: tuple[np.ndarray, ...]  # (N, 6) between
+    before: tuple[At, ...]  # each part's variables at the version
+    after: tuple[At, ...]  # at the other one
+    steps: tuple[np.ndarray, ...]  # (N, 6) of each part's frames between
     loss: RobustLoss
 
     title = "moving"
@@ -134,7 +138,7 @@ class Move(_PartJob):
             self,
             parts=self.parts[chosen],
             before=self.before[chosen],
-            poses=self.poses[chosen],
+            after=self.after[chosen],
             steps=self.steps[chosen],
         )
 
@@ -142,8 +146,8 @@ class Move(_PartJob):
         part = load_part(self.folder, self.parts[item])
         points = load(self._file(item, "points", self.version), Points)
         block, graph = _block(part, points.points_world, self.loss), deserialized(part.graph)
-        block.restore(values_at(part.frames, self.before[item]), points.costs)
-        values = values_at(part.frames, self.poses[item])
+        block.restore(self.before[item].values(part.frames), points.costs)
+        values = self.after[item].values(part.frames)
         cost = block.propose(values, self.steps[item])
         if graph.size():
             cost += graph.error(values)
@@ -157,7 +161,7 @@ class Move(_PartJob):
 
 @dataclass(frozen=True)
 class Eliminate(_PartJob):
-    """Eliminates the own frames of parts."""
+    """Eliminates the own nodes of parts."""
 
     damping: float
 
@@ -169,17 +173,16 @@ class Eliminate(_PartJob):
         return replace(self, parts=self.parts[start:stop])
 
     def __call__(self, item: int) -> Reduced:
-        equations = load(self._file(item, "equations", self.version), PartEquations)
-        factor = PartElimination(equations, self.damping)
+        factor = eliminated(self._file(item, "equations", self.version), self.damping)
         return Reduced(factor.condensed() if factor.regular else None)
 
 
 @dataclass(frozen=True)
 class Substitute(_PartJob):
-    """Finds the steps of parts' own frames from those of frames on cuts."""
+    """Finds the steps of parts' own nodes from those of nodes on cuts."""
 
     damping: float
-    kept: tuple[np.ndarray, ...]  # (K, 6) steps of each part's frames on cuts
+    kept: tuple[np.ndarray, ...]  # (K, 6) steps of each part's nodes on cuts
 
     title = "substituting"
     returns: Any = Substituted
@@ -190,23 +193,69 @@ class Substitute(_PartJob):
         return replace(self, parts=self.parts[chosen], kept=self.kept[chosen])
 
     def __call__(self, item: int) -> Substituted:
-        equations = load(self._file(item, "equations", self.version), PartEquations)
-        factor = PartElimination(equations, self.damping)
+        factor = substituting(self._file(item, "equations", self.version), self.damping)
         return Substituted(*factor.substituted(self.kept[item]))
 
 
+@dataclass(frozen=True, slots=True)
+class Shared:
+    """What the caller knows of a part's nodes on cuts, for `Covariances`."""
+
+    inverse: np.ndarray  # (6 K, 6 K) float64, of the map's system
+    drawn: np.ndarray  # (D, K, 6) float64, errors of its covariance
+
+
+@dataclass(frozen=True, slots=True)
+class Uncertain:
+    """Covariances of a part's own nodes."""
+
+    inverse: np.ndarray  # (N - K, 6, 6) float64
+    between: np.ndarray  # (Q, 6, 6) float64
+    drawn: np.ndarray  # (D, N - K, 6) float32
+
+
+@dataclass(frozen=True)
+class Covariances(_PartJob):
+    """Blocks of the map's inverse at parts' own nodes, and errors drawn of it.
+
+    `shared-V.npz` holds the inverse at a part's nodes on cuts.
+    """
+
+    pairs: tuple[np.ndarray, ...]  # (Q, 2) int64, places among each part's nodes
+    seed: int  # of the draws, beside the part's number
+
+    title = "covariances"
+    returns: Any = Uncertain
+
+    def part(self, start: int, stop: int) -> Self:
+        """See `gsba.store.shards.Job`."""
+        chosen = slice(start, stop)
+        return replace(self, parts=self.parts[chosen], pairs=self.pairs[chosen])
+
+    def __call__(self, item: int) -> Uncertain:
+        shared = load(self._file(item, "shared", self.version), Shared)
+        factor = substituting(self._file(item, "equations", self.version), 0.0)
+        inverse, between = factor.inverse_blocks(self.pairs[item], shared.inverse)
+        rng = np.random.default_rng([self.seed, self.parts[item]])
+        drawn = factor.drawn(shared.drawn, rng).astype(np.float32)
+        inverse[factor.idle], drawn[:, factor.idle] = np.nan, np.nan
+        return Uncertain(inverse, between, drawn)
+
+
 def _block(part: Part, points_world: np.ndarray, loss: RobustLoss) -> LandmarkBlock:
-    seen = part.sightings
-    term = BearingTerm(seen.frames, seen.points, seen.bearings_rig, seen.sigmas_rad)
     keys = [X(frame) for frame in part.frames.tolist()]
-    return LandmarkBlock(keys, points_world, [term], loss, num_threads=1)
+    return LandmarkBlock(keys, points_world, part.sightings.terms, loss, num_threads=1)
 
 
 def _linearized(
-    part: Part, block: LandmarkBlock, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values
+    part: Part,
+    block: LandmarkBlock,
+    graph: gtsam.NonlinearFactorGraph,
+    values: gtsam.Values,
+    pairs: Sequence[tuple[int, int]] = (),
 ) -> tuple[Linearized, PartEquations]:
-    system = PartSystem(SystemLayout(graph, [block], values))
+    system = PartSystem(SystemLayout(graph, [block], values, pairs, part.keys.tolist()))
     costs = system.linearize(values)
     equations = system.equations(part.num_kept)
-    kept = slice(len(part.frames) - part.num_kept, None)
+    kept = slice(len(equations.diagonal) - part.num_kept, None)
     return Linearized(costs, equations.diagonal[kept], equations.gradient[kept]), equations

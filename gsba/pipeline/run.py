@@ -20,6 +20,7 @@ from gsba.frames.panorama import Greys
 from gsba.frames.recordings import own_timestamps
 from gsba.imu.readings import Readings
 from gsba.log import GsbaError
+from gsba.parts import DividedAdjustments
 from gsba.photometric import direct
 from gsba.store.store import Chain, RunStore, fingerprint
 from gsba.types import CoarsePoses, Counts, FrameSet, Round, Trajectory
@@ -87,6 +88,7 @@ class Run:
     weights: Mapping[str, Path]  # stage -> file of a learned network
     num_threads: int
     families: Families  # those that observe points and those of the evidence, bound to the frames
+    division: DividedAdjustments  # of large maps into parts
     lenses_found: bool = False  # whether the calibration that raw pairs are cut by was estimated by
     # a pass before, so that it is free
     suffix: str = ""  # of the names of stages that only see one of several recordings
@@ -143,6 +145,9 @@ class Run:
             weights=learned.find_weights(settings),
             num_threads=settings.solver.threads(),
             families=families,
+            division=DividedAdjustments(
+                store.parts_folder, store.shards_folder, store.workers, settings.solver.part_frames
+            ),
             lenses_found=lenses_found,
         )
 

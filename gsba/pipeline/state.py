@@ -132,4 +132,5 @@ class State:
             settings=run.settings if run.frames.timed else run.settings.untimed(),
             num_threads=run.num_threads,
             maps=self.prior.parts,
+            division=run.division,
         )

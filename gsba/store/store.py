@@ -11,6 +11,7 @@ import hashlib
 import json
 import logging
 import os
+import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -38,6 +39,7 @@ from gsba.version import __version__
 
 logger = logging.getLogger(__name__)
 _SHARDS = "shards"  # folder of shards of the stage that is being computed
+_PARTS = "parts"  # folder of maps in parts of that stage
 T = TypeVar("T")
 T_co = TypeVar("T_co", covariant=True)
 
@@ -84,7 +86,7 @@ class RunStore:
         self._prefix = ""
         self._lock = open_run_folder(root, origin, fresh)
         try:
-            self.workers = Threads(1) if hire is None else hire(root / STAGES / _SHARDS)
+            self.workers = Threads(1) if hire is None else hire(self.shards_folder)
         except BaseException:
             os.close(self._lock)
             raise
@@ -96,6 +98,16 @@ class RunStore:
         os.close(self._lock)
         if isinstance(error, FullDiskError):
             raise FullDiskError(f"{error}; finished stages are kept") from error
+
+    @property
+    def shards_folder(self) -> Path:
+        """Folder of the workers' files, emptied when a stage is stored."""
+        return self.root / STAGES / _SHARDS
+
+    @property
+    def parts_folder(self) -> Path:
+        """Folder of maps that a stage solves in parts, deleted when the stage is stored."""
+        return self.root / STAGES / _PARTS
 
     @contextmanager
     def named(self, prefix: str) -> Iterator[None]:
@@ -204,9 +216,10 @@ class RunStore:
         _stage_path(self.root, name).unlink(missing_ok=True)
 
     def _forget_shards(self) -> None:
-        """Delete the shards of a stage whose result is stored."""
-        for path in (self.root / STAGES / _SHARDS).glob("*"):
+        """Delete the shards and the maps in parts of a stage whose result is stored."""
+        for path in self.shards_folder.glob("*"):
             path.unlink(missing_ok=True)
+        shutil.rmtree(self.parts_folder, ignore_errors=True)
 
     def claim(self, path: Path) -> None:
         """List a final output (a file, or a folder with all its files) as written by gsba."""

@@ -15,7 +15,7 @@ from dask_workers import some_workers
 from gtsam.symbol_shorthand import X
 from town_in_parts import NUM, town, write
 
-from factors import BearingTerm, LandmarkBlock, RobustLoss
+from factors import LandmarkBlock, RobustLoss
 from gsba import disk
 from gsba.bundle.optimizer import OptimizeResult, optimize
 from gsba.config import SolverSettings
@@ -40,13 +40,10 @@ def poses_of(values: gtsam.Values) -> np.ndarray:
 @pytest.fixture(scope="module")
 def undivided() -> tuple[OptimizeResult, np.ndarray]:
     """The town solved by one system of all frames; its landmarks."""
-    sightings, rows, graph = town()
-    term = BearingTerm(
-        sightings.frames, sightings.points, sightings.bearings_rig, sightings.sigmas_rad
-    )
+    points, term, rows, graph = town()
     loss = RobustLoss(SETTINGS.loss, SETTINGS.loss_sigmas)
     keys = [X(f) for f in range(NUM)]
-    block = LandmarkBlock(keys, sightings.points_world, [term], loss, num_threads=1)
+    block = LandmarkBlock(keys, points, [term], loss, num_threads=1)
     result = optimize(graph, [block], values_at(np.arange(NUM), rows), SETTINGS)
     return result, block.points_world
 
@@ -80,12 +77,12 @@ def test_parts_give_the_undivided_result(most: int, undivided, tmp_path: Path) -
 
 def test_every_observation_and_factor_is_owned_once(tmp_path: Path) -> None:
     write(tmp_path / "map", 15)
-    sightings, _, graph = town()
+    points, term, _, graph = town()
     parts = [
         load_part(tmp_path / "map", p) for p in range(len(load_index(tmp_path / "map").num_kept))
     ]
     numbers = np.concatenate([part.numbers for part in parts])
-    assert sorted(numbers) == list(range(len(sightings.points_world)))
+    assert sorted(numbers) == list(range(len(points)))
     seen = {
         (frame, point)
         for part in parts
@@ -93,7 +90,7 @@ def test_every_observation_and_factor_is_owned_once(tmp_path: Path) -> None:
             part.frames[part.sightings.frames], part.numbers[part.sightings.points], strict=True
         )
     }
-    assert seen == set(zip(sightings.frames.tolist(), sightings.points.tolist(), strict=True))
+    assert seen == set(zip(term.frames.tolist(), term.points.tolist(), strict=True))
     assert sum(parts_folder.deserialized(part.graph).size() for part in parts) == graph.size()
 
 
@@ -172,19 +169,20 @@ def test_damaged_and_foreign_folders_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_writer_starts_anew_where_one_was_interrupted(divided, tmp_path: Path) -> None:
-    PartsWriter(tmp_path / "map").add(town(1)[0])
+    points, term, *_ = town(1)
+    PartsWriter(tmp_path / "map").add(points, [term])
     write(tmp_path / "map", 15)
     found = optimize_divided(tmp_path / "map", Threads(1), SETTINGS)
     np.testing.assert_array_equal(poses_of(found.values), divided)
 
 
 def test_factors_written_in_python_are_refused(tmp_path: Path) -> None:
-    sightings, _, _ = town()
+    points, term, *_ = town()
     graph = gtsam.NonlinearFactorGraph()
     noise = gtsam.noiseModel.Unit.Create(1)
     graph.add(gtsam.CustomFactor(noise, [X(0)], lambda factor, values, jacobians: np.zeros(1)))
     with pytest.raises(GsbaError, match="written in Python cannot be stored"):
-        PartsWriter(tmp_path / "map").add(sightings, graph)
+        PartsWriter(tmp_path / "map").add(points, [term], graph)
 
 
 @pytest.mark.slow

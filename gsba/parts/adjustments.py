@@ -1,0 +1,164 @@
+"""Adjustments of a run in parts: written where its workers see them, solved there, resumed."""
+
+import logging
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import gtsam
+import numpy as np
+
+from gsba.bundle.division import DivisibleMap
+from gsba.bundle.optimizer import OptimizeResult
+from gsba.config import SolverSettings
+from gsba.memory import total_memory_bytes
+from gsba.parts.covariances import divided_covariances
+from gsba.parts.divided_system import optimize_divided
+from gsba.parts.folder import (
+    At,
+    PartsWriter,
+    has_index,
+    keys_beside,
+    load,
+    remove_map,
+    serialized,
+)
+from gsba.parts.observations import NotStorableError, TermRows
+from gsba.store.records import save_record
+from gsba.store.shards import Workers, content_digest
+from gsba.types import Iteration, JointErrors
+from gsba.version import __version__
+
+logger = logging.getLogger(__name__)
+
+_BYTES_PER_OBSERVATION = 400  # of an undivided adjustment, about
+_MEMORY_SHARE = 4  # of the machine's memory, beyond which an adjustment is divided
+_FRAMES = 1000  # of a part, where nothing else is asked for
+_FACTORS_AT_ONCE = 10_000  # of the graph, written together
+_MAX_CUT_SHARE = 0.5  # of all frames; where more are on cuts, parts have little of their own
+
+
+@dataclass(frozen=True, slots=True)
+class _Finished:
+    """An adjustment that was solved, for a call that goes on."""
+
+    at: At
+    history: tuple[Iteration, ...]
+    converged: bool
+    reason: str
+
+
+@dataclass(frozen=True)
+class DividedAdjustments:
+    """Adjusts the maps of a run in parts: a `gsba.bundle.division.Division`."""
+
+    folder: Path  # of the maps that are being adjusted, emptied when their stage is stored
+    scratch: Path  # of the workers' own files
+    workers: Workers
+    part_frames: int | None  # frames of a part; None = by memory
+    told: set[str] = field(default_factory=set)  # reasons that were logged
+
+    def minimized(self, map_: DivisibleMap, settings: SolverSettings) -> OptimizeResult | None:
+        """See `gsba.bundle.division.Division`.
+
+        A call that goes on has what earlier ones solved, and goes on within what they had begun.
+        """
+        most = self._frames_of_parts(map_)
+        if most is None:
+            return None
+        name = self._digest(map_, most, settings.model_dump_json())
+        if name is None:
+            return None
+        folder, finished = self.folder / name, self.folder / f"{name}.npz"
+        if finished.exists():
+            stored = load(finished, _Finished)
+            values = stored.at.values(range(map_.num_frames))
+            result = OptimizeResult(values, stored.history, stored.converged, stored.reason)
+        elif self._written(folder, map_, most):
+            result = optimize_divided(folder, self.workers, settings, self.scratch)
+            at = At.of(result.values, range(map_.num_frames), keys_beside(result.values))
+            stored = _Finished(at, result.history, result.converged, result.reason)
+            save_record(finished, stored, {})
+        else:
+            return None
+        remove_map(folder)
+        values = gtsam.Values(map_.values)
+        values.update(result.values)
+        return OptimizeResult(values, result.history, result.converged, result.reason)
+
+    def covariances(
+        self, map_: DivisibleMap, num_draws: int, seed: int
+    ) -> tuple[np.ndarray, JointErrors] | None:
+        """See `gsba.bundle.division.Division`."""
+        most = self._frames_of_parts(map_)
+        if most is None:
+            return None
+        name = self._digest(map_, most, "covariances")
+        if name is None or not self._written(self.folder / name, map_, most, joint=True):
+            return None
+        how = self.workers, map_.loss, num_draws, seed, self.scratch
+        found = divided_covariances(self.folder / name, *how)
+        remove_map(self.folder / name)
+        return found
+
+    def _frames_of_parts(self, map_: DivisibleMap) -> int | None:
+        """Frames of a part at most; None = the map is not divided."""
+        if self.part_frames is not None:
+            return self.part_frames if map_.num_frames > self.part_frames else None
+        needed = _MEMORY_SHARE * _BYTES_PER_OBSERVATION * map_.num_observations
+        big = needed > total_memory_bytes() and map_.num_frames > _FRAMES
+        return _FRAMES if big else None
+
+    def _digest(self, map_: DivisibleMap, most: int, purpose: str) -> str | None:
+        """Name of a map's folder, by all that its solution depends on; None = files cannot hold
+        it."""
+        parts = [__version__, purpose, most, map_.num_frames, map_.loss]
+        frames = range(map_.num_frames)
+        parts.append(content_digest(At.of(map_.values, frames, keys_beside(map_.values))))
+        try:
+            for graph in _pieces(map_.graph):
+                parts.append(content_digest(serialized(graph)))
+            for points_world, terms in map_.chunks():
+                parts.append(content_digest(points_world, *map(TermRows.of, terms)))
+        except NotStorableError as error:
+            self._tell(str(error))
+            return None
+        return content_digest(*parts)[:24]
+
+    def _written(self, folder: Path, map_: DivisibleMap, most: int, joint: bool = False) -> bool:
+        """Write the parts of a map; False where there would be no gain."""
+        if has_index(folder):
+            return True
+        num = map_.num_frames
+        remove_map(folder)  # what an interrupted call left of it
+        writer = PartsWriter(folder)
+        if joint:
+            writer.tie(np.column_stack([np.arange(num - 1), np.arange(1, num)]))
+        for graph in _pieces(map_.graph):
+            writer.add(np.empty((0, 3)), (), graph)
+        for points_world, terms in map_.chunks():
+            writer.add(points_world, terms)
+        index = writer.finish(map_.values, num, most)
+        cut = num - int(np.sum(np.diff(index.starts) - index.num_kept))
+        if cut > _MAX_CUT_SHARE * num:
+            remove_map(folder)
+            self._tell(f"{cut} of {num} frames would lie on the cuts")
+            return False
+        logger.debug("%d frames in %d parts, %d on cuts", num, len(index.num_kept), cut)
+        return True
+
+    def _tell(self, reason: str) -> None:
+        """Log, once a run, why a map is adjusted undivided."""
+        if reason not in self.told:
+            logger.info("adjusted undivided, not in parts: %s", reason)
+            self.told.add(reason)
+
+
+def _pieces(graph: gtsam.NonlinearFactorGraph) -> list[gtsam.NonlinearFactorGraph]:
+    """A graph in pieces of a few factors."""
+    pieces = []
+    for first in range(0, graph.size(), _FACTORS_AT_ONCE):
+        piece = gtsam.NonlinearFactorGraph()
+        for i in range(first, min(first + _FACTORS_AT_ONCE, graph.size())):
+            piece.push_back(graph.at(i))
+        pieces.append(piece)
+    return pieces

@@ -1,0 +1,166 @@
+"""Adjustments of a run in parts, beside the undivided ones: families, gates, resumed calls."""
+
+import logging
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+from gtsam.symbol_shorthand import X
+from scipy.spatial.transform import Rotation
+from synthetic import RIG, GivenFactors
+from town_in_parts import NUM, SIGMA, town
+
+from gsba.bundle import adjustment
+from gsba.bundle.adjustment import AdjustmentContext
+from gsba.bundle.families import Families
+from gsba.bundle.gyro_turns import GyroTurns
+from gsba.bundle.trajectory_prior import TrajectoryPrior
+from gsba.camera.rig import owner_faces
+from gsba.config import PriorSettings, RefineSettings
+from gsba.geometry import pose
+from gsba.parts import DividedAdjustments
+from gsba.parts import adjustments as parts_adjustments
+from gsba.store.shards import Threads
+from gsba.types import GyroConstraints, Keypoints, Solution, Tracks
+
+GATES = (8.0, 4.0)
+
+
+def town_map() -> tuple[np.ndarray, Keypoints, Tracks]:
+    """Poses (F, 4, 4) to start from, keypoints sharper along one axis, and tracks of the town."""
+    _, term, rows, _ = town()
+    order = np.lexsort((term.points, term.frames))
+    frames, points, bearings = term.frames[order], term.points[order], term.bearings_rig[order]
+    starts = np.searchsorted(frames, np.arange(NUM + 1))
+    faces = owner_faces(bearings)
+    roots = np.tile(np.diag([1.0, 0.5]) / SIGMA, (len(frames), 1, 1))
+    keypoints = Keypoints(
+        starts, RIG.project(bearings, faces), faces, bearings, np.full(len(frames), SIGMA),
+        np.zeros((len(frames), 3), np.uint8), roots, np.full((len(frames), 3), 1e-3),
+    )  # fmt: skip
+    by_point = np.lexsort((frames, points))
+    _, numbers = np.unique(points[by_point], return_inverse=True)
+    tracks = Tracks(
+        numbers.astype(np.int32),
+        frames[by_point].astype(np.int32),
+        (by_point - starts[frames[by_point]]).astype(np.int32),
+        int(numbers.max()) + 1,
+    )
+    return pose(rows[:, :9].reshape(-1, 3, 3), rows[:, 9:]), keypoints, tracks
+
+
+def families(poses: np.ndarray, kind: str) -> Families:
+    """Families of a run, and one that has factors of its own."""
+    prior = TrajectoryPrior(poses, PriorSettings())
+    turns = poses[:-1, :3, :3].transpose(0, 2, 1) @ poses[1:, :3, :3]
+    sigmas = np.full(NUM - 1, 0.01)
+    sigmas[::9] = np.nan
+    turning = GyroConstraints(
+        Rotation.from_matrix(turns).as_rotvec(), sigmas, np.zeros((NUM, 3)), 0.01
+    )
+    members = [prior, GyroTurns(turning, 30.0, 2.0)]
+    if kind == "python":
+        noise = gtsam.noiseModel.Unit.Create(1)
+        graph = gtsam.NonlinearFactorGraph()
+
+        def height(factor, values, jacobians):  # type: ignore[no-untyped-def]
+            if jacobians is not None:
+                jacobians[0] = np.zeros((1, 6), order="F")
+            return np.zeros(1)
+
+        graph.add(gtsam.CustomFactor(noise, [X(0)], height))
+        members.append(GivenFactors(graph))
+    return Families(tuple(members), tuple(map(str, range(NUM))), np.arange(NUM, dtype=float))
+
+
+def context(folder: Path, part_frames: int | None, poses: np.ndarray, kind: str = "bearing"):
+    """Context of an adjustment whose maps are divided."""
+    factors = ("bearing", "reprojection") if kind == "reprojection" else ("bearing",)
+    settings = RefineSettings.model_validate(
+        {"factors": factors, "solver": {"relative_tolerance": 1e-9, "absolute_tolerance": None}}
+    )
+    division = DividedAdjustments(folder / "parts", folder / "shards", Threads(2), part_frames)
+    return AdjustmentContext(families(poses, kind), RIG, settings, 1, division=division)
+
+
+@pytest.mark.parametrize("kind", ["bearing", "reprojection"])
+def test_rounds_in_parts_give_the_undivided_solution(kind: str, tmp_path: Path) -> None:
+    poses, keypoints, tracks = town_map()
+    start, found = Solution.without_points(poses), []
+    for part_frames in (NUM, 15):
+        here = context(tmp_path, part_frames, poses, kind)
+        found.append(adjustment.adjust(tracks, keypoints, start, here, GATES))
+    whole, parts = found
+    for one, other in zip(parts.rounds, whole.rounds, strict=True):
+        assert (one.observations, one.points, one.support) == (
+            other.observations,
+            other.points,
+            other.support,
+        )
+    assert np.abs(whole.world_T_rigs - poses).max() > 1e-2
+    np.testing.assert_allclose(parts.world_T_rigs, whole.world_T_rigs, atol=1e-8)
+    assert parts.noise == pytest.approx(whole.noise, rel=1e-6)
+    expected, joint = adjustment.pose_covariances(
+        whole, keypoints, context(tmp_path, NUM, poses, kind)
+    )
+    covariances, errors = adjustment.pose_covariances(
+        whole, keypoints, context(tmp_path, 15, poses, kind)
+    )
+    scale = np.abs(expected).max()
+    np.testing.assert_allclose(covariances, expected, atol=1e-8 * scale)
+    np.testing.assert_allclose(errors.neighbours, joint.neighbours, atol=1e-8 * scale)
+
+
+def test_a_stopped_adjustment_goes_on_in_another_call(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    poses, keypoints, tracks = town_map()
+    start = Solution.without_points(poses)
+    expected = adjustment.adjust(tracks, keypoints, start, context(tmp_path, 15, poses), GATES)
+    stopped = tmp_path / "stopped"
+    solve, calls = parts_adjustments.optimize_divided, []
+
+    def stop(*args, **options):  # type: ignore[no-untyped-def]
+        calls.append(args)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return solve(*args, **options)
+
+    monkeypatch.setattr(parts_adjustments, "optimize_divided", stop)
+    with pytest.raises(KeyboardInterrupt):
+        adjustment.adjust(tracks, keypoints, start, context(stopped, 15, poses), GATES)
+    found = adjustment.adjust(tracks, keypoints, start, context(stopped, 15, poses), GATES)
+    assert len(calls) == 3  # the first round was not solved again
+    np.testing.assert_array_equal(found.world_T_rigs, expected.world_T_rigs)
+    assert [len(r.iterations) for r in found.rounds] == [len(r.iterations) for r in expected.rounds]
+
+
+def test_factors_written_in_python_are_adjusted_undivided(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    poses, keypoints, tracks = town_map()
+    here = context(tmp_path, 15, poses, "python")
+    with caplog.at_level(logging.INFO):
+        found = adjustment.adjust(tracks, keypoints, Solution.without_points(poses), here, GATES)
+    assert found.rounds[-1].accepted
+    told = [message for message in caplog.messages if "adjusted undivided" in message]
+    assert len(told) == 1 and "written in Python" in told[0]
+
+
+def test_memory_decides_where_nothing_is_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    poses, keypoints, tracks = town_map()
+    monkeypatch.setattr(parts_adjustments, "_FRAMES", 15)
+    asked: list[int] = []
+    monkeypatch.setattr(
+        parts_adjustments.DividedAdjustments,
+        "_digest",
+        lambda self, map_, most, purpose: asked.append(most),
+    )
+    start = Solution.without_points(poses)
+    for memory in (1 << 40, 1 << 20):
+        monkeypatch.setattr(parts_adjustments, "total_memory_bytes", lambda memory=memory: memory)
+        adjustment.adjust(tracks, keypoints, start, context(tmp_path, None, poses), GATES[:1])
+        assert asked == ([] if memory > 1 << 30 else [15])
