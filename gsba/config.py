@@ -332,17 +332,13 @@ class SolverSettings(_Settings):
     max_iterations: int = Field(default=50, ge=1)
     relative_tolerance: float = Field(default=1e-5, gt=0, lt=1)  # smallest relative decrease of the
     # cost; a smaller one ends the solve
-    absolute_tolerance: float | None = Field(
-        default=0.05, gt=0
-    )  # upper limit of that threshold, squared standard deviations; None = no limit
+    absolute_tolerance: float | None = Field(default=0.05, gt=0)  # upper limit of that threshold,
+    # squared standard deviations; None = no limit
     loss: Literal["none", "huber", "cauchy", "geman_mcclure"] = "cauchy"
     loss_sigmas: float = Field(default=1.0, gt=0)  # scale of the loss, standard deviations
     lambda_initial: float = Field(default=1e-4, gt=0)  # damping, part of the diagonal
     num_threads: int | None = Field(default=None, ge=1)  # None = all cores
-    part_frames: int | None = Field(
-        default=None, ge=2
-    )  # maps of more frames are solved in parts of at most so many; None = parts of 1,000 where the
-    # whole would take more than a quarter of the machine's memory
+    part_frames: int | None = Field(default=None, ge=2)  # of a part of a map; None = by memory
 
     def threads(self) -> int:
         """Number of threads to use."""

@@ -9,7 +9,7 @@ from typing import Protocol, Self, TypeVar
 import gtsam
 import numpy as np
 
-from factors import Block, LandmarkBlock, RobustLoss, tangent_basis
+from factors import Block, LandmarkBlock, RobustLoss, Term, tangent_basis
 from gsba.bundle import pose_variables, triangulation
 from gsba.bundle.division import DivisibleMap, Division
 from gsba.bundle.families import Families, FamilyTerms
@@ -129,6 +129,9 @@ class ObservedPoints:
         seed = self.context.settings.seed
         return division.covariances(map_, DRAWS, seed) if division and map_ else None
 
+    def _terms_of(self, landmarks: Landmarks) -> list[Term]:
+        return self.context.families.landmark_terms(landmarks, self.keypoints, self.noise)
+
     def _divisible(self, terms: Terms) -> DivisibleMap | None:
         """These and other terms as a map that may be divided; None = families have blocks."""
         if terms.blocks:
@@ -136,7 +139,7 @@ class ObservedPoints:
         solver = self.context.settings.solver
         return DivisibleMap(
             self.landmarks,
-            lambda some: replace(self, landmarks=some).block().terms,
+            self._terms_of,
             terms.graph,
             terms.values,
             len(self.keypoints.starts) - 1,

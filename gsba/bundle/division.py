@@ -5,12 +5,12 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import gtsam
 import numpy as np
 
-from factors import RobustLoss
+from factors import RobustLoss, Term
 from gsba.bundle.optimizer import OptimizeResult
 from gsba.config import SolverSettings
 from gsba.types import JointErrors, Landmarks, Tracks
@@ -23,7 +23,7 @@ class DivisibleMap:
     """A map to be adjusted, whose residuals of landmarks are made a few at a time."""
 
     landmarks: Landmarks
-    terms_of: Callable[[Landmarks], Sequence[Any]]  # terms of `factors` of some of the landmarks
+    terms_of: Callable[[Landmarks], Sequence[Term]]  # terms of `factors` of some of the landmarks
     graph: gtsam.NonlinearFactorGraph  # of families
     values: gtsam.Values  # to start from: poses, and variables of families
     num_frames: int
@@ -34,7 +34,7 @@ class DivisibleMap:
         """Number of observations."""
         return len(self.landmarks.tracks)
 
-    def chunks(self) -> Iterator[tuple[np.ndarray, Sequence[Any]]]:
+    def chunks(self) -> Iterator[tuple[np.ndarray, Sequence[Term]]]:
         """Landmarks (J, 3) and their terms, a few of them at a time."""
         tracks, points = self.landmarks.tracks, self.landmarks.points_world
         starts = np.searchsorted(tracks.points, np.arange(tracks.num_points + 1))

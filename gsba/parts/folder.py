@@ -5,12 +5,13 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import gtsam
 import numpy as np
 from scipy.sparse import csr_array
 
+from factors import Term
 from gsba.bundle.family_variables import kept, restored
 from gsba.bundle.pose_variables import X
 from gsba.disk import disk_errors
@@ -171,7 +172,7 @@ class PartsWriter:
     def add(
         self,
         points_world: np.ndarray,
-        terms: Sequence[Any],
+        terms: Sequence[Term],
         graph: gtsam.NonlinearFactorGraph | None = None,
     ) -> None:
         """Take landmarks with all their observations, and factors.

@@ -2,10 +2,10 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
+from factors import Term
 from gsba.log import GsbaError
 
 
@@ -27,7 +27,7 @@ class TermRows:
     origins_rig: np.ndarray | None  # (O, 3) float64, map units; None = the rig's own centre
 
     @classmethod
-    def of(cls, term: Any) -> "TermRows":
+    def of(cls, term: Term) -> "TermRows":
         """The arrays of a term of `factors`.
 
         Raises:

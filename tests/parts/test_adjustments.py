@@ -13,8 +13,10 @@ from town_in_parts import NUM, SIGMA, town
 
 from gsba.bundle import adjustment
 from gsba.bundle.adjustment import AdjustmentContext
-from gsba.bundle.families import Families
+from gsba.bundle.bearings import Bearings
+from gsba.bundle.families import Families, Family
 from gsba.bundle.gyro_turns import GyroTurns
+from gsba.bundle.reprojections import Reprojections
 from gsba.bundle.trajectory_prior import TrajectoryPrior
 from gsba.camera.rig import owner_faces
 from gsba.config import PriorSettings, RefineSettings
@@ -52,6 +54,7 @@ def town_map() -> tuple[np.ndarray, Keypoints, Tracks]:
 
 def families(poses: np.ndarray, kind: str) -> Families:
     """Families of a run, and one that has factors of its own."""
+    points = [Bearings(), Reprojections(RIG)][: 2 if kind == "reprojection" else 1]
     prior = TrajectoryPrior(poses, PriorSettings())
     turns = poses[:-1, :3, :3].transpose(0, 2, 1) @ poses[1:, :3, :3]
     sigmas = np.full(NUM - 1, 0.01)
@@ -59,7 +62,7 @@ def families(poses: np.ndarray, kind: str) -> Families:
     turning = GyroConstraints(
         Rotation.from_matrix(turns).as_rotvec(), sigmas, np.zeros((NUM, 3)), 0.01
     )
-    members = [prior, GyroTurns(turning, 30.0, 2.0)]
+    members: list[Family] = [*points, prior, GyroTurns(turning, 30.0, 2.0)]
     if kind == "python":
         noise = gtsam.noiseModel.Unit.Create(1)
         graph = gtsam.NonlinearFactorGraph()
