@@ -16,11 +16,13 @@ from typing import Any
 import numpy as np
 
 from gsba.camera.calibration_formats import (
+    fields_of,
     from_colmap_config,
     from_colmap_model,
     from_kalibr,
     lens_of,
     metres_of,
+    numbers_of,
     of_projection,
 )
 from gsba.camera.fisheye import Rig, lens_names, rotation_of
@@ -30,6 +32,7 @@ from gsba.geometry import pose
 from gsba.log import GsbaError
 from gsba.types import Fisheye
 
+_SIDES = ("width", "height")
 _MODEL = "kannala-brandt: r = f (th + k1 th^3 + k2 th^5 + k3 th^7 + k4 th^9), corner origin"
 _EXPECTED_FORM = (
     "give lenses.front and lenses.back, or lenses.lens0, lenses.lens1 and so on, each with "
@@ -197,31 +200,44 @@ def _lenses_of_tree(tree: Any, path: Path) -> Rig:
     """The lenses, read in the form that the tree's keys show."""
     if isinstance(tree, list):
         return from_colmap_config(tree, path)
+    fields_of(tree, (), "it")
     if "cameras" in tree:
         return from_colmap_config([tree], path)
     if any(re.fullmatch(r"cam\d+", str(name)) for name in tree):
         return from_kalibr(tree, path)
     metres = metres_of(tree.get("unit", "m"))
-    entries, model = tree["lenses"], projection_of_model(tree.get("model", _MODEL))
+    (entries,) = fields_of(tree, ("lenses",), "it")
+    model = projection_of_model(tree.get("model", _MODEL))
     names = lens_names(len(entries)) if "lens2" in entries else ("front", "back")
-    return tuple(_lens_of_entry(entries[name], metres, model, f"{path}: {name}") for name in names)
+    lenses = fields_of(entries, names, "lenses")
+    return tuple(
+        _lens_of_entry(lens, metres, model, name, path)
+        for lens, name in zip(lenses, names, strict=True)
+    )
 
 
 def _lens_of_entry(
     tree: Mapping[str, Any],
     metres: float,
     model: Callable[..., RadialProjection],
-    where: str,
+    name: str,
+    path: Path,
 ) -> Fisheye:
-    size = tree.get("width") or tree["size"], tree.get("height") or tree["size"]
-    rig_T_lens = np.array(tree["rig_T_lens"], dtype=np.float64).reshape(4, 4)
+    where = f"lenses.{name}"
+    fields_of(tree, (), where)
+    # A square picture may be given by its `size`.
+    sides = [side if tree.get(side) or "size" not in tree else "size" for side in _SIDES]
+    width, height, f, cx, cy = (
+        float(numbers_of(tree, field, where, 1)[0]) for field in (*sides, "f", "cx", "cy")
+    )
+    rig_T_lens = numbers_of(tree, "rig_T_lens", where, 16).reshape(4, 4)
     rig_T_lens[:3, 3] *= metres
-    principal = tree["cx"], tree["cy"]
     if model is FisheyeProjection:
-        return lens_of(size, tree["f"], principal, tree["k"], rig_T_lens)
-    terms = tuple(float(k) for k in tree.get("k", ()))
-    lens = model(*map(int, size), float(tree["f"]), tuple(map(float, principal)), terms)
-    return of_projection(lens, rig_T_lens, where)
+        terms = numbers_of(tree, "k", where).tolist()
+        return lens_of((width, height), f, (cx, cy), terms, rig_T_lens)
+    terms = tuple(numbers_of(tree, "k", where).tolist()) if "k" in tree else ()
+    lens = model(int(width), int(height), f, (cx, cy), terms)
+    return of_projection(lens, rig_T_lens, f"{path}: {name}")
 
 
 def _one_line(error: Exception) -> str:

@@ -85,6 +85,42 @@ def metres_of(unit: Any) -> float:
     return _METRES_OF_UNIT[unit]
 
 
+def fields_of(tree: Any, names: Sequence[str], where: str) -> list[Any]:
+    """Values of fields of a file.
+
+    Args:
+        tree: a group of fields, as JSON or YAML gives it.
+        names: of the fields.
+        where: name of the group in the file, for messages.
+
+    Raises:
+        ValueError: this is no group of fields, or one is missing; the message names it.
+    """
+    if not isinstance(tree, Mapping):
+        raise ValueError(f"{where} is {brief(repr(tree))}, not a group of fields")
+    for name in names:
+        if name not in tree:
+            raise ValueError(f"{where} has no {name}")
+    return [tree[name] for name in names]
+
+
+def numbers_of(tree: Any, name: str, where: str, count: int | None = None) -> np.ndarray:
+    """Numbers (N,) float64 of a field of a file, see `fields_of`; nested lists are joined.
+
+    Raises:
+        ValueError: the field is missing, or is not `count` finite numbers; the message names it.
+    """
+    (value,) = fields_of(tree, (name,), where)
+    try:
+        found = np.array(value, np.float64).ravel()
+    except (TypeError, ValueError, OverflowError):
+        found = np.full(1, np.nan)
+    if not np.isfinite(found).all() or count not in (None, len(found)):
+        wanted = {None: "numbers", 1: "a number"}.get(count, f"{count} numbers")
+        raise ValueError(f"{where}: {name} is {brief(repr(value))}, not {wanted}")
+    return found
+
+
 def from_kalibr(tree: Mapping[str, Any], path: Path) -> Pair:
     """The lenses of a camchain: `cam0` is the front one, `cam1` the back one.
 
@@ -99,7 +135,7 @@ def from_kalibr(tree: Mapping[str, Any], path: Path) -> Pair:
             "the front lens, and cam1: calibrate these two"
         )
     front, back = (_kalibr_lens(tree[name], f"{path}: {name}") for name in cameras)
-    cam1_T_cam0 = np.array(tree["cam1"]["T_cn_cnm1"], dtype=np.float64).reshape(4, 4)
+    cam1_T_cam0 = numbers_of(tree["cam1"], "T_cn_cnm1", "cam1", 16).reshape(4, 4)
     return _in_rig((front, back), inverse(_checked_rigid(cam1_T_cam0)), path)
 
 
@@ -113,7 +149,14 @@ def from_colmap_config(tree: Sequence[Any], path: Path) -> Pair:
         GsbaError: the file holds other cameras than these two.
         KeyError, TypeError, ValueError, IndexError: a field is missing, or is something else.
     """
-    cameras = [camera for rig in tree for camera in rig["cameras"]]
+    cameras = []
+    for rig in tree:
+        (listed,) = fields_of(rig, ("cameras",), "a rig")
+        if not isinstance(listed, Sequence) or isinstance(listed, str):
+            raise ValueError(f"cameras of a rig is {brief(repr(listed))}, not a list")
+        cameras += listed
+    for camera in cameras:
+        fields_of(camera, (), "a camera")
     fronts = [camera for camera in cameras if camera.get("ref_sensor")]
     backs = [camera for camera in cameras if not camera.get("ref_sensor")]
     if len(tree) != 1 or len(fronts) != 1 or len(backs) != 1:
@@ -129,14 +172,17 @@ def from_colmap_config(tree: Sequence[Any], path: Path) -> Pair:
                 f"{path}: gives no picture size for the {name} lens: write width "
                 "and height, pixels, beside its camera_params"
             )
-        size, model = (camera["width"], camera["height"]), camera["camera_model_name"]
-        lenses.append(_colmap_lens(model, size, camera["camera_params"], f"{path}: {name} lens"))
+        where = f"the {name} lens"
+        size = [numbers_of(camera, side, where, 1)[0] for side in ("width", "height")]
+        (model,) = fields_of(camera, ("camera_model_name",), where)
+        params = numbers_of(camera, "camera_params", where).tolist()
+        lenses.append(_colmap_lens(model, size, params, f"{path}: {name} lens"))
         wxyz = np.array(camera.get("cam_from_rig_rotation", (1, 0, 0, 0)), dtype=np.float64)
         at = np.array(camera.get("cam_from_rig_translation", (0, 0, 0)), dtype=np.float64)
         if wxyz.shape != (4,) or at.shape != (3,) or not 0.9 < np.linalg.norm(wxyz) < 1.1:
             raise ValueError("cam_from_rig must be a quaternion wxyz and three numbers")
         if name == "back" and "cam_from_rig_rotation" not in camera:
-            raise KeyError("cam_from_rig_rotation")
+            raise ValueError(f"{where} has no cam_from_rig_rotation")
         poses.append(pose(rotation_from_quaternion(wxyz / np.linalg.norm(wxyz)), at))
     front_T_back = _checked_rigid(poses[0]) @ inverse(_checked_rigid(poses[1]))
     front_T_back[:3, 3] *= metres_of(tree[0].get("unit", "m"))
@@ -184,9 +230,11 @@ def from_colmap_model(folder: Path) -> Pair:
 def _kalibr_lens(tree: Mapping[str, Any], where: str) -> Fisheye:
     """A camera of a camchain, its own frame being the rig's; Kalibr's pixel centres are whole
     numbers."""
-    kind = str(tree["camera_model"]), str(tree["distortion_model"])
-    numbers = [float(v) for v in tree["intrinsics"]]
-    terms = [float(v) for v in tree["distortion_coeffs"]]
+    name = where.rpartition(": ")[2]
+    model, distortion = fields_of(tree, ("camera_model", "distortion_model"), name)
+    kind = str(model), str(distortion)
+    numbers = numbers_of(tree, "intrinsics", name).tolist()
+    terms = numbers_of(tree, "distortion_coeffs", name).tolist()
     wanted = {("pinhole", "equidistant"): 4, ("omni", "radtan"): 5}.get(kind)
     if wanted is None:
         raise GsbaError(
@@ -194,9 +242,10 @@ def _kalibr_lens(tree: Mapping[str, Any], where: str) -> Fisheye:
             "model pinhole-equi): calibrate with that"
         )
     if len(numbers) != wanted or len(terms) != 4:
-        raise ValueError(f"{wanted} intrinsics and 4 distortion_coeffs are needed")
+        raise ValueError(f"{name} needs {wanted} intrinsics and 4 distortion_coeffs")
     *xi, fu, fv, pu, pv = numbers
-    size, focal, principal = tree["resolution"], _focal(fu, fv, where), (pu + 0.5, pv + 0.5)
+    size = numbers_of(tree, "resolution", name, 2).tolist()
+    focal, principal = _focal(fu, fv, where), (pu + 0.5, pv + 0.5)
     if kind[0] == "pinhole":
         return lens_of(size, focal, principal, terms)
     return _fit_to_omni(size, (xi[0], focal), principal, terms, where)

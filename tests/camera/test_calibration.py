@@ -265,11 +265,14 @@ def test_kalibr_omni_is_refused_where_it_is_not(tmp_path: Path, distortion: list
 
 
 BAD_OURS = {
-    "no lens": (lambda t: t["lenses"].pop("back"), "it has no 'back'"),
-    "no focal length": (lambda t: t["lenses"]["back"].pop("f"), "it has no 'f'"),
-    "of text": (lambda t: t["lenses"]["back"].update(f="wide"), "could not convert"),
-    "no number": (lambda t: t["lenses"]["back"].update(f=float("nan")), "must be numbers"),
-    "endless": (lambda t: t["lenses"]["back"].update(width=1e999), "OverflowError"),
+    "no lens": (lambda t: t["lenses"].pop("back"), "lenses has no back"),
+    "no focal length": (lambda t: t["lenses"]["back"].pop("f"), r"lenses\.back has no f"),
+    "of text": (
+        lambda t: t["lenses"]["back"].update(f="wide"),
+        r"lenses\.back: f is 'wide', not a number",
+    ),
+    "no number": (lambda t: t["lenses"]["back"].update(f=float("nan")), "f is nan, not a number"),
+    "endless": (lambda t: t["lenses"]["back"].update(width=1e999), "width is inf, not a number"),
     "negative": (lambda t: t["lenses"]["front"].update(f=-3), "f above 0"),
     "too many terms": (lambda t: t["lenses"]["front"].update(k=[0] * 5), "up to four k"),
     "turns over": (lambda t: t["lenses"]["front"].update(k=[-0.3]), "does not grow"),
@@ -277,7 +280,10 @@ BAD_OURS = {
         lambda t: t["lenses"]["back"].update(cx=360.0),
         r"principal point \(360, .*\) is outside the picture of 240x240",
     ),
-    "no pose": (lambda t: t["lenses"]["front"].update(rig_T_lens=[1, 2]), "reshape"),
+    "no pose": (
+        lambda t: t["lenses"]["front"].update(rig_T_lens=[1, 2]),
+        r"is \[1, 2\], not 16 numbers",
+    ),
     "bent pose": (
         lambda t: t["lenses"]["front"].update(rig_T_lens=np.full((4, 4), 0.5).tolist()),
         "no rigid motion",
@@ -294,7 +300,10 @@ BAD_OURS = {
         lambda t: t["lenses"]["back"].update(rig_T_lens=np.eye(4).tolist()),
         "the front lens must look along z of the rig and the back one the other way",
     ),
-    "something else": (lambda t: t.pop("lenses"), "it has no 'lenses'.*Kalibr camchain"),
+    "something else": (lambda t: t.pop("lenses"), "it has no lenses.*Kalibr camchain"),
+    "no width": (lambda t: t["lenses"]["front"].pop("width"), r"lenses\.front has no width"),
+    "a number": (lambda t: t["lenses"].update(back=5), r"lenses\.back is 5, not a group of fields"),
+    "a list": (lambda t: t.update(lenses=[1]), r"lenses is \[1\], not a group of fields"),
 }
 
 
@@ -328,8 +337,10 @@ BAD_KALIBR = {
     "no focal length": (lambda t: t["cam1"].update(intrinsics=[0, 66, 120, 120]), "above 0"),
     "few intrinsics": (lambda t: t["cam1"].update(intrinsics=[70, 120, 120]), "4 intrinsics"),
     "few terms": (lambda t: t["cam0"].update(distortion_coeffs=[0, 0]), "4 distortion_coeffs"),
-    "no motion": (lambda t: t["cam1"].pop("T_cn_cnm1"), "it has no 'T_cn_cnm1'"),
-    "no camera": (lambda t: t.update(cam1=None), "TypeError"),
+    "no motion": (lambda t: t["cam1"].pop("T_cn_cnm1"), "cam1 has no T_cn_cnm1"),
+    "no camera": (lambda t: t.update(cam1=None), "cam1 is None, not a group of fields"),
+    "no resolution": (lambda t: t["cam0"].pop("resolution"), "cam0 has no resolution"),
+    "text": (lambda t: t["cam0"].update(intrinsics="a"), "cam0: intrinsics is 'a', not numbers"),
     "scaled": (
         lambda t: t["cam1"].update(T_cn_cnm1=(2 * np.eye(4)).tolist()),
         "no rigid motion",
@@ -367,19 +378,26 @@ BAD_RIG = {
         lambda t: t[0]["cameras"][0].update(camera_model_name="PINHOLE"),
         "front lens is PINHOLE, but must be OPENCV_FISHEYE",
     ),
-    "no model": (lambda t: t[0]["cameras"][0].pop("camera_model_name"), "camera_model_name"),
+    "no model": (
+        lambda t: t[0]["cameras"][0].pop("camera_model_name"),
+        "front lens has no camera_mo",
+    ),
     "few params": (lambda t: t[0]["cameras"][0]["camera_params"].pop(), "k1, k2, k3, k4"),
     "not square": (
         lambda t: t[0]["cameras"][0].update(camera_params=[60, 70, 120, 120, 0, 0, 0, 0]),
         "front lens has focal lengths 60 and 70",
     ),
-    "no turn": (lambda t: t[0]["cameras"][1].pop("cam_from_rig_rotation"), "cam_from_rig_rotat"),
+    "no turn": (
+        lambda t: t[0]["cameras"][1].pop("cam_from_rig_rotation"),
+        "back lens has no cam_from",
+    ),
     "no quaternion": (
         lambda t: t[0]["cameras"][1].update(cam_from_rig_rotation=[0, 0, 0, 0]),
         "quaternion wxyz",
     ),
     "no rigs": (lambda t: t.clear(), "holds 0 cameras in 0 rigs"),
-    "a list": (lambda t: t.__setitem__(0, 3), "TypeError"),
+    "a number": (lambda t: t.__setitem__(0, 3), "a rig is 3, not a group of fields"),
+    "no list": (lambda t: t[0].update(cameras=3), "cameras of a rig is 3, not a list"),
 }
 
 
@@ -408,13 +426,13 @@ def test_refused_models(tmp_path: Path) -> None:
         ("c.json", b"{", "is neither JSON nor YAML"),
         ("c.json", b"", "is neither JSON nor YAML"),
         ("c.json", b"[" * 100_000, "is neither JSON nor YAML"),
-        ("c.json", b"3", "TypeError"),
-        ("c.json", b"null", "TypeError"),
-        ("c.json", b'"cameras"', "TypeError"),
-        ("c.json", b'{"lenses": []}', "TypeError"),
+        ("c.json", b"3", "it is 3, not a group of fields"),
+        ("c.json", b"null", "it is None, not a group"),
+        ("c.json", b'"cameras"', "it is 'cameras', not a group"),
+        ("c.json", b'{"lenses": []}', r"lenses is \[\], not a group"),
         ("c.json", bytes(range(256)), "is no text"),
         ("c.yaml", b"cam0: [1, 2\ncam1: }", "is neither JSON nor YAML"),
-        ("c.yaml", b"", "TypeError"),
+        ("c.yaml", b"", "it is None, not a group"),
         ("c.txt", b"cam0:\n\t- 3", "is neither JSON nor YAML"),
     ],
 )
