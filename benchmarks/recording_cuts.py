@@ -38,30 +38,49 @@ def cut(walk: Path, out: Path, num: int, exposures: tuple[float, ...] = ()) -> l
         num: number of recordings.
         exposures: factors of the linear light of each recording's pictures; () = as they are.
     """
+    num_frames = len((walk / "images/timestamps.csv").read_text().splitlines()) - 1
+    length = min(int(_SHARE * num_frames / num), num_frames)
+    starts = np.linspace(0, num_frames - length, num).astype(int)
+    phases = [(STEP // 2) * (n % 2) for n in range(num)]
+    return [
+        cut_rows(
+            walk,
+            np.arange(start + phase, start + length, STEP),
+            out / f"part{n + 1}",
+            n,
+            exposures[n] if exposures else 1.0,
+        )
+        for n, (start, phase) in enumerate(zip(starts.tolist(), phases, strict=True))
+    ]
+
+
+def cut_rows(walk: Path, rows: np.ndarray, folder: Path, number: int, exposure: float = 1.0) -> Cut:
+    """Cut frames out of a walk as a recording; its trajectory lies beside its folder.
+
+    Args:
+        walk: see `cut`.
+        rows: (R,) frames of the walk.
+        folder: of the recording.
+        number: decides world, scale and drift of its trajectory.
+        exposure: factor of the linear light of its pictures.
+    """
     truth = read_trajectory(walk / "groundtruth.tum")
     table = (walk / "images/timestamps.csv").read_text().splitlines()[1:]
     names = [row.partition(",")[0] for row in table]
     images = {path.stem: path for path in (walk / "images").iterdir()}
-    length = min(int(_SHARE * len(names) / num), len(names))
-    starts = np.linspace(0, len(names) - length, num).astype(int)
-    cuts = []
-    for n, start in enumerate(starts.tolist()):
-        phase = (STEP // 2) * (n % 2)
-        rows = np.arange(start + phase, start + length, STEP)
-        folder = out / f"part{n + 1}"
-        folder.mkdir(parents=True, exist_ok=True)
-        for row in rows.tolist():
-            _copy(images[names[row]], folder, exposures[n] if exposures else 1.0)
-        times = truth.timestamps[rows] - truth.timestamps[rows[0]]
-        lines = [f"{names[row]},{time:.6f}" for row, time in zip(rows.tolist(), times, strict=True)]
-        (folder / "timestamps.csv").write_text("\n".join(["name,timestamp", *lines, ""]))
-        coarse = degrade(Trajectory(times, truth.world_T_rigs[rows]), n, scale=_SCALES[n % 6])
-        turn = Rotation.from_rotvec([0.3, 1.1 * n, -0.2]).as_matrix()
-        moved = Sim3.of(1.0, pose(turn, np.array([3.0 * n, -2.0, 5.0])))
-        path = out / f"part{n + 1}.tum"
-        write_tum(path, Trajectory(coarse.timestamps, moved.poses(coarse.world_T_rigs)))
-        cuts.append(Cut(folder, path, rows))
-    return cuts
+    folder.mkdir(parents=True, exist_ok=True)
+    for row in rows.tolist():
+        _copy(images[names[row]], folder, exposure)
+    times = truth.timestamps[rows] - truth.timestamps[rows[0]]
+    lines = [f"{names[row]},{time:.6f}" for row, time in zip(rows.tolist(), times, strict=True)]
+    (folder / "timestamps.csv").write_text("\n".join(["name,timestamp", *lines, ""]))
+    given = Trajectory(times, truth.world_T_rigs[rows])
+    coarse = degrade(given, number, scale=_SCALES[number % 6])
+    turn = Rotation.from_rotvec([0.3, 1.1 * number, -0.2]).as_matrix()
+    moved = Sim3.of(1.0, pose(turn, np.array([3.0 * number, -2.0, 5.0])))
+    path = folder.with_name(f"{folder.name}.tum")
+    write_tum(path, Trajectory(coarse.timestamps, moved.poses(coarse.world_T_rigs)))
+    return Cut(folder, path, rows)
 
 
 def _copy(image: Path, folder: Path, exposure: float) -> None:

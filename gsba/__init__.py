@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from gsba.config_file import load_config
     from gsba.localization.localizer import LocalizedFrame, Localizer
     from gsba.log import GsbaError
+    from gsba.pipeline.growing import add_recordings
     from gsba.pipeline.outputs import RunResult
     from gsba.pipeline.recording import Recording
     from gsba.pipeline.recordings import refine_recordings
@@ -37,6 +38,7 @@ __all__ = [
     "RefineSettings",
     "RunResult",
     "X",
+    "add_recordings",
     "load_config",
     "load_run",
     "refine",
@@ -54,6 +56,7 @@ _HOMES = {
     "RefineSettings": "gsba.config",
     "RunResult": "gsba.pipeline.outputs",
     "X": "gsba.bundle.pose_variables",
+    "add_recordings": "gsba.pipeline.growing",
     "load_config": "gsba.config_file",
     "load_run": "gsba.store.finished",
     "refine": "gsba.pipeline.refine",

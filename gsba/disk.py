@@ -1,11 +1,13 @@
 """Atomic writing of files, locks on folders, and disk errors in one line."""
 
+import ctypes
 import errno
 import fcntl
 import json
 import logging
 import os
 import shutil
+import sys
 import uuid
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -20,6 +22,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 _TEMPORARY = ".gsba-tmp-"  # prefix of files still being written
+_AT_FDCWD, _RENAME_EXCHANGE, _RENAME_SWAP_DARWIN = -100, 2, 2  # of renameat2 and renamex_np
 
 
 class FullDiskError(GsbaError):
@@ -146,6 +149,43 @@ def read_vertices(path: Path) -> "np.ndarray":
     if vertices.dtype.hasobject:
         raise GsbaError(f"{path}: a property of its points is a list")
     return vertices
+
+
+def link_or_copy(source: Path, target: Path) -> None:
+    """Give a file a second name, or copy it where the disk knows no hard links.
+
+    Args:
+        source: an ordinary file.
+        target: the new name; a file of this name is replaced.
+
+    Raises:
+        GsbaError: the disk is full, or writing is not permitted.
+    """
+
+    def write(temporary: Path) -> None:
+        try:
+            os.link(source, temporary)
+        except OSError:  # another disk, or a file system without links
+            shutil.copyfile(source, temporary)
+
+    atomic_write(target, write)
+
+
+def exchange_folders(one: Path, other: Path) -> bool:
+    """Exchange two folders of one disk in a single step, so that either is there at any moment.
+
+    Returns:
+        False where the system cannot: nothing was changed.
+    """
+    library = ctypes.CDLL(None, use_errno=True)
+    if sys.platform == "darwin":
+        names = os.fsencode(one), os.fsencode(other)
+        return library.renamex_np(*names, _RENAME_SWAP_DARWIN) == 0
+    try:
+        rename = library.renameat2
+    except AttributeError:  # a C library without it
+        return False
+    return rename(_AT_FDCWD, os.fsencode(one), _AT_FDCWD, os.fsencode(other), _RENAME_EXCHANGE) == 0
 
 
 def remove_temporaries(folder: Path) -> None:

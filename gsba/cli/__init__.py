@@ -2,6 +2,7 @@
 
 from gsba.cli import (
     checking,
+    growing,
     inspecting,
     localizing,
     making,
@@ -19,6 +20,7 @@ from gsba.cli.app import app
 __all__ = [
     "app",
     "checking",
+    "growing",
     "inspecting",
     "localizing",
     "main",

@@ -91,3 +91,24 @@ def extract(
     key = [settings.cubemap, relevant, fingerprint(files), *cut]
     with freed_memory_kept():
         return store.per_frame(name, key, inputs, compute, Features)
+
+
+def adopted(
+    store: RunStore,
+    frames: FrameSet,
+    rig: CubeRig,
+    make_extractor: Callable[[], Extractor],
+    stored: Sequence[Path],
+    name: str = "features",
+) -> PerFrame[Features]:
+    """Features that other runs have stored, by frame name; extracted again where a file is gone.
+
+    Args:
+        store, frames, rig: those of the run.
+        make_extractor: makes an extractor, once for each frame.
+        stored: (F,) file of each frame in the folder of another run.
+        name: name of the stage.
+    """
+    index = {frame: f for f, frame in enumerate(frames.names)}
+    compute = _Extraction(frames, index, rig, make_extractor)
+    return store.adopt(name, dict(zip(frames.names, stored, strict=True)), compute, Features)

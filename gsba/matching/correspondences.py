@@ -141,6 +141,17 @@ def match_known_points(context: MatchContext, solved: Solution, loops_closed: bo
     return context.match(chosen, poses, gates, known, guided_only=True)
 
 
+def match_known_points_across(
+    context: MatchContext, solved: Solution, parts: np.ndarray
+) -> Matches:
+    """Match frames of different parts (F,) of a map around predicted bearings of known points."""
+    poses, settings = solved.world_T_rigs, context.settings.pairs
+    chosen = pairs.across(poses[:, :3, 3], solved.median_depth(), settings, parts)
+    gates = [Gate.around_points(np.deg2rad(settings.point_deg))] * len(chosen)
+    known = solved.points_by_keypoint(context.keypoints)
+    return context.match(chosen, poses, gates, known, guided_only=True)
+
+
 def verified(
     found: Matches,
     gates: Sequence[Gate],

@@ -57,6 +57,26 @@ def covisible(
     return window, _nearest(rigs_in_world, reach, settings, far_in_time)
 
 
+def across(
+    rigs_in_world: np.ndarray, median_depth: float, settings: PairSettings, parts: np.ndarray
+) -> np.ndarray:
+    """Pairs of frames of different parts that should see the same things.
+
+    Args:
+        rigs_in_world, median_depth, settings: as for `covisible`.
+        parts: (F,) part of each frame.
+
+    Returns:
+        Pairs (P, 2) int32, f0 < f1, the closest in space first.
+    """
+    reach = settings.max_baseline_depths * median_depth
+
+    def of_others(f: int, near: np.ndarray, _distances: np.ndarray) -> np.ndarray:
+        return parts[near] != parts[f]
+
+    return _nearest(rigs_in_world, reach, settings, of_others)
+
+
 def closing(rigs_in_world: np.ndarray, median_depth: float, settings: PairSettings) -> np.ndarray:
     """Pairs that close loops while drift between far frames is unknown.
 

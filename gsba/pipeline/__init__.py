@@ -4,6 +4,7 @@ Takes frames, a coarse trajectory, settings and a folder.
 Gives refined poses, a cloud, datasets and a report.
 """
 
+from gsba.pipeline.growing import add_recordings
 from gsba.pipeline.map import Map
 from gsba.pipeline.outputs import RunResult
 from gsba.pipeline.prior import Prior
@@ -21,6 +22,7 @@ __all__ = [
     "Run",
     "RunResult",
     "State",
+    "add_recordings",
     "refine",
     "refine_recordings",
     "solve",

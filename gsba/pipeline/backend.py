@@ -1,6 +1,6 @@
 """The back end of a run: from matches to poses and points, and what refines these further."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -218,8 +218,15 @@ def refine_on_splat(state: State) -> State:
     return replace(state, map=replace(map_, solution=found.adjustment, moves=found.moves))
 
 
-def reconstruct(state: State) -> Reconstruction:
-    """Covariances, and everything back in the trajectory's world; of a turn, rotations alone."""
+def reconstruct(
+    state: State, amended: Callable[[Reconstruction], Reconstruction] | None = None
+) -> Reconstruction:
+    """Covariances, and everything back in the trajectory's world; of a turn, rotations alone.
+
+    Args:
+        state: of the run at its end.
+        amended: gives the result with what else is known of it; None = as it is.
+    """
     run, prior, map_, solution = state.run, state.prior, state.map, state.solution
     if prior.turning_only:
         return _reconstruct_rotations(state)
@@ -252,10 +259,10 @@ def reconstruct(state: State) -> Reconstruction:
             fisheyes=frames.fisheyes,
             vertical=_vertical(state, result),
         )
-        if not map_.lenses or map_.centres is None:
-            return result
-        baseline = baseline_of(map_.centres, world_scale(solution, result))
-        return replace(result, lens_baseline=baseline)
+        if map_.lenses and map_.centres is not None:
+            baseline = baseline_of(map_.centres, world_scale(solution, result))
+            result = replace(result, lens_baseline=baseline)
+        return result if amended is None else amended(result)
 
     return run.stage("reconstruction", run.solving_key(), compute, Reconstruction)
 

@@ -5,7 +5,7 @@ and patches, aligned to a part of a pixel. `_Observations` holds either; an esti
 """
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
@@ -179,7 +179,7 @@ def take_parts_from_patches(state: State, sighted: Sighted, name: str, number: i
 
 
 def adjust_with_patches(
-    state: State, sighted: Sighted, name: str
+    state: State, sighted: Sighted, name: str, gates: Sequence[float] | None = None
 ) -> tuple[Solution, Keypoints, CameraEstimate]:
     """Aligned observations solved for poses, points and camera.
 
@@ -187,11 +187,13 @@ def adjust_with_patches(
         state: of the run; its map has two lenses.
         sighted: observations that patches were aligned to.
         name: of the stage.
+        gates: of the rounds; None = those of aligned patches.
 
     Returns:
         The solution, the keypoints with the noise that they turned out to have, and the camera.
     """
-    run, map_, gates = state.run, state.map, state.run.settings.rounds.aligned
+    run, map_ = state.run, state.map
+    gates = run.settings.rounds.aligned if gates is None else gates
 
     def compute() -> tuple[Solution, Keypoints, CameraEstimate]:
         shown = stitching.corrected(sighted.keypoints, map_.field, run.rig)

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 
@@ -33,6 +34,15 @@ def extract(run: Run) -> State:
     """Keypoints of all frames: the first state of a run."""
     found = _extract(run, run.settings)
     return State.begin(run, _observe(run, "keypoints", [found] * len(run.frames), "features"))
+
+
+def adopt(run: Run, stored: Sequence[Path]) -> ObservedFrames:
+    """Keypoints of all frames from features that other runs have stored, (F,) files."""
+    make = learned.make_extractor(run.settings.features, run.weights)
+    found = extraction.adopted(run.store, run.frames, run.rig, make, stored)
+    load = FrameFeatures([found] * len(run.frames), run.frames.names)
+    keypoints = detection.gather(map(load, range(len(run.frames))))
+    return _matchable(run, [found] * len(run.frames), keypoints)
 
 
 def extract_more(state: State, weak: np.ndarray) -> State:
@@ -216,6 +226,14 @@ def match_known_points(state: State, name: str, loops_closed: bool = True) -> St
     compute = partial(correspondences.match_known_points, context, state.solution, loops_closed)
     found = run.stage(name, run.matching_key(), compute, Matches)
     return replace(state, matches=MapMatches(state.matches.neighbours, known_points=found))
+
+
+def match_known_points_across(state: State, parts: np.ndarray, name: str) -> State:
+    """Matches of the map's points in frames of another part (F,), for those across before."""
+    run, context = state.run, state.observed.context
+    compute = partial(correspondences.match_known_points_across, context, state.solution, parts)
+    found = run.stage(name, run.matching_key(), compute, Matches)
+    return replace(state, matches=replace(state.matches, across=found))
 
 
 def close_loops(state: State) -> State:

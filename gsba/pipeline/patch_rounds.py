@@ -1,6 +1,7 @@
 """Rounds of a run below a pixel: patches aligned, camera and poses solved by them, straightened."""
 
 import logging
+from collections.abc import Sequence
 from dataclasses import replace
 
 from gsba.bundle import adjustment, settling, stitching
@@ -49,7 +50,7 @@ def _adjust_under_lenses(state: State, sighted: Sighted, number: int) -> State |
     """Bundle adjustment of aligned observations, the camera found from them beside it."""
     name = f"aligned{number}"
     if not state.map.lenses:
-        return _adjust_aligned(state, sighted, name)
+        return adjust_aligned(state, sighted, name)
     for n in range(2):
         state = gyro.align_to_map(state, f"imu_{name}_{n}", with_noise=False)
         trial = camera.take_parts_from_patches(state, sighted, name, n)
@@ -57,7 +58,7 @@ def _adjust_under_lenses(state: State, sighted: Sighted, number: int) -> State |
             return trial
         stage = f"{name}_{n}" if n else name
         solved, keypoints, found = camera.adjust_with_patches(trial, sighted, stage)
-        better = _carried(trial, sighted, solved, keypoints)
+        better = carried(trial, sighted, solved, keypoints)
         if better is None:
             return state if n else None
         state = better.with_camera(found)
@@ -84,9 +85,18 @@ def _align(state: State, name: str) -> Sighted:
     return run.stage(name, settings.model_dump(exclude={"rounds"}), compute, Sighted)
 
 
-def _adjust_aligned(state: State, sighted: Sighted, name: str) -> State | None:
-    """Bundle adjustment of aligned observations; None where that explains less."""
-    run, map_, gates = state.run, state.map, state.run.settings.rounds.aligned
+def adjust_aligned(
+    state: State, sighted: Sighted, name: str, gates: Sequence[float] | None = None
+) -> State | None:
+    """Bundle adjustment of aligned observations; None where that explains less.
+
+    Args:
+        state, sighted: the map, and its observations.
+        name: of the stage.
+        gates: of the rounds; None = those of aligned patches.
+    """
+    run, map_ = state.run, state.map
+    gates = run.settings.rounds.aligned if gates is None else gates
 
     def compute() -> tuple[Solution, Keypoints]:
         there = replace(sighted, keypoints=map_.rays(sighted.keypoints, run.rig))
@@ -96,12 +106,10 @@ def _adjust_aligned(state: State, sighted: Sighted, name: str) -> State | None:
 
     key = [run.solving_key(), gates]
     solved, keypoints = run.stage(name, key, compute, tuple[Solution, Keypoints])
-    return _carried(state, sighted, solved, keypoints)
+    return carried(state, sighted, solved, keypoints)
 
 
-def _carried(
-    state: State, sighted: Sighted, solved: Solution, keypoints: Keypoints
-) -> State | None:
+def carried(state: State, sighted: Sighted, solved: Solution, keypoints: Keypoints) -> State | None:
     """The state with the map of aligned observations; None where that explains less."""
     if not solved.carries(state.solution, state.run.settings.rounds.min_observations):
         return None

@@ -55,9 +55,23 @@ def refine_recordings(
     Raises:
         GsbaError: a recording or a setting that cannot be used; the message names the recording.
     """
-    out = Path(out)
     if len(recordings) < 2:
         raise GsbaError("give two recordings or more; gsba.refine refines one")
+    given = {"segment": segment, "fresh": fresh, "families": families, "client": client}
+    return refine_each(recordings, Path(out), settings, **given)
+
+
+def refine_each(
+    recordings: Sequence[Recording],
+    out: Path,
+    settings: RefineSettings | None = None,
+    *,
+    segment: Segment | None = None,
+    fresh: bool = False,
+    families: Sequence[Family] = (),
+    client: "Client | None" = None,
+) -> RunResult:
+    """Refine recordings in one run as `refine_recordings` does; one is enough."""
     given = [
         _Given.of(one, name) for one, name in zip(recordings, names_of(recordings), strict=True)
     ]

@@ -23,6 +23,7 @@ from gsba.pipeline import (
     camera,
     densify,
     each_recording,
+    finished_run,
     frontend,
     gyro,
     inputs,
@@ -158,6 +159,7 @@ def refine_from(
     if walk is not None or state.prior.absent:  # the images alone have to show motion
         acceptance.require_motion(state.run.frames, result)
     lenses = camera.keep_lenses(state, result)
+    finished_run.keep(state)
     written = outputs.write(state, result, lenses)
     if walk is not None:
         add_odometry(written.out / "report.html", walk)

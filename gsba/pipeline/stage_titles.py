@@ -45,6 +45,7 @@ _TITLES = {
     "dense": "adjust with matches of neighbours",
     "registered": "join maps",
     "across": "match frames of joined maps",
+    "across2": "match frames of joined maps, the points that they share known",
     "joined": "adjust joined maps",
     "loops": "match loops",
     "places": "recognise places",
@@ -78,6 +79,7 @@ _TITLES = {
     "camera": "compute covariances of poses and camera",
     "reconstruction": "compute covariances, carry the map to the trajectory's world",
     "lenses": "keep the lenses for exports",
+    "map": "keep the map for runs that start from it",
     "recut+": "choose the calibration that raw frames are cut anew by, after pass {0}",
     "recut+_undone": "take back the frames cut anew after pass {0}",
 }

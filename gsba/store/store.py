@@ -14,7 +14,7 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import NoneType
@@ -22,7 +22,7 @@ from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 from pydantic import BaseModel
 
-from gsba.disk import FullDiskError, write_text
+from gsba.disk import FullDiskError, link_or_copy, write_text
 from gsba.log import GsbaError, brief, event
 from gsba.memory import give_back_freed_memory, peak_memory_bytes
 from gsba.store.folder import (
@@ -202,6 +202,30 @@ class RunStore:
         self._forget_shards()
         self._note(replace(record, key=digest(base, keys), resumed=not missing))
         return frames
+
+    def adopt(
+        self,
+        name: str,
+        files: Mapping[str, Path],
+        compute: Callable[[str], T],
+        returns: type[T],
+    ) -> "PerFrame[T]":
+        """Results of a per-frame stage that another run has stored, as results of this one.
+
+        Args:
+            name: name of the stage.
+            files: frame name -> file in the folder of the other run; computed where it is missing.
+            compute, returns: see `per_frame`.
+        """
+        folder, keys = self.root / STAGES / name, {}
+        for frame, source in files.items():
+            path = folder / f"{frame}.npz"
+            if source.is_file() and not path.is_file():
+                link_or_copy(source, path)
+            with suppress(RecordError):
+                keys[frame] = str(read_info(path).get("key"))
+            keys.setdefault(frame, digest(__version__, FORMAT, name, frame))
+        return PerFrame(folder, keys, compute, returns)
 
     def stored(
         self, name: str, settings: object, returns: type[T], after: Sequence[str] = ()

@@ -1,0 +1,208 @@
+"""A finished run as other runs start from it: its recordings, its map, and the world of its result.
+
+`keep` stores the map at the end of every run; `FinishedRun.load` reads it back with the rest.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from gsba.bundle.reconstruction import world_scale
+from gsba.config import RefineSettings
+from gsba.config_file import load_config
+from gsba.frames.recordings import own_timestamps
+from gsba.localization.run_map import require_own_version
+from gsba.log import GsbaError
+from gsba.pipeline.map import Map
+from gsba.pipeline.state import State
+from gsba.similarity import Sim3
+from gsba.store.finished import load_run
+from gsba.store.folder import STAGES, is_run_folder, read_marker
+from gsba.store.store import load_stage
+from gsba.types import CoarsePoses, FrameSet, Keypoints, Landmarks, Reconstruction, Solution
+
+_STAGE = "map"
+_FEATURES = "features_closer", "features"  # stages that hold a frame's features, the last one first
+
+
+@dataclass(frozen=True, slots=True)
+class KeptMap:
+    """The map at the end of a run, in the solution's world and unit."""
+
+    map: Map
+    coarse: CoarsePoses  # of its frames, in the world of the result
+
+
+def keep(state: State) -> None:
+    """Store the map of a run at its end, for runs that start from it."""
+    map_ = state.map
+    if map_.stitching is not None:  # of its stage, only the field is used again
+        start = map_.solution.world_T_rigs
+        field = replace(
+            map_.stitching,
+            adjustment=Solution.without_points(start),
+            keypoints=_taken(map_.observed, np.zeros(0, np.int64)),
+        )
+        map_ = replace(map_, stitching=field)
+    kept = KeptMap(map_, state.prior.coarse)
+    state.run.stage(_STAGE, [], lambda: kept, KeptMap, noted=False)
+
+
+@dataclass(frozen=True, slots=True)
+class FinishedRun:
+    """A finished run, or some of its frames."""
+
+    root: Path  # its folder
+    origin: dict[str, Path]  # inputs by what they are: "RECORDING: frames", ...
+    frames: FrameSet  # as read, named RECORDING/NAME
+    map: Map  # in the solution's world and unit
+    coarse: CoarsePoses  # before refining, in the world of the result
+    result: Reconstruction  # all maps, each in its own world
+    settings: RefineSettings
+    files: tuple[Path, ...]  # (F,) stored features of each frame; may be missing
+
+    @classmethod
+    def load(cls, root: Path) -> "FinishedRun":
+        """Read a finished run.
+
+        Args:
+            root: folder of the run.
+
+        Raises:
+            GsbaError: no run, one that is not finished, one of another version of gsba, or one
+                without points.
+        """
+        if not is_run_folder(root):
+            raise GsbaError(f"{root} is not a gsba run: give the folder that gsba refine wrote")
+        require_own_version(root)
+        if not (root / "report.json").is_file():
+            raise GsbaError(f"{root} is not finished: run gsba refine with --out {root} to the end")
+        load_run(root)  # checks its arrays
+        result = load_stage(root, "reconstruction", Reconstruction)
+        frames, kept = load_stage(root, "frames", FrameSet), load_stage(root, _STAGE, KeptMap)
+        if not len(result.points_world):
+            raise GsbaError(f"{root} has no points (its camera turned on the spot): it cannot grow")
+        num, points = len(frames), len(kept.map.solution.landmarks.points_world)
+        if len(kept.map.solution.world_T_rigs) != num or points != len(result.points_world):
+            raise GsbaError(f"{root}: its results do not fit together: refine again with --fresh")
+        files = tuple(_features_file(root, name) for name in frames.names)
+        origin = {what: Path(path) for what, path in read_marker(root)["origin"].items()}
+        settings = load_config(root / "config.toml")
+        if not frames.recordings:
+            name = _name_of(origin.get("frames", root))
+            origin = {f"{name}: {what}": path for what, path in origin.items()}
+            frames = replace(
+                frames,
+                names=tuple(f"{name}/{own}" for own in frames.names),
+                clock_shifts=(0.0,) * num,
+            )
+        given = frames, kept.map, kept.coarse, result
+        return cls(root, origin, *given, settings, files)
+
+    def recordings(self) -> dict[str, FrameSet]:
+        """Frames of each recording by its name, on its own clock, under their own names."""
+        times, found = own_timestamps(self.frames), {}
+        for name, rows in self.frames.recordings.items():
+            own = self.frames.taken(rows)
+            names = tuple(one.rpartition("/")[2] for one in own.names)
+            found[name] = replace(own, names=names, timestamps=times[rows], clock_shifts=())
+        return found
+
+    def to_result(self) -> Sim3:
+        """Similarity from the world of the solution to that of the result's largest map."""
+        solved, row = self.map.solution.world_T_rigs, int(self.result.largest_map()[0])
+        scale, start, end = 1.0, solved[row], self.result.world_T_rigs[row]
+        scale = world_scale(self.map.solution, self.result)
+        rotation = end[:3, :3] @ start[:3, :3].T
+        return Sim3(scale, rotation, end[:3, 3] - scale * rotation @ start[:3, 3])
+
+    def without(self, names: Sequence[str]) -> "FinishedRun":
+        """The run without some of its recordings: points that others do not see are left out."""
+        owners = np.array([name.rpartition("/")[0] for name in self.frames.names])
+        rows = np.flatnonzero(~np.isin(owners, list(names)))
+        heads = tuple(f"{name}: " for name in names)
+        origin = {what: path for what, path in self.origin.items() if not what.startswith(heads)}
+        coarse = replace(
+            self.coarse,
+            world_T_rigs=self.coarse.world_T_rigs[rows],
+            sources=self.coarse.sources[rows],
+            segments=None,
+        )
+        components = self.result.components
+        result = replace(
+            self.result.taken(rows),
+            components=None if components is None else components[rows],
+        )
+        given = self.frames.taken(rows), _map_of(self.map, rows), coarse, result
+        files = tuple(self.files[f] for f in rows)
+        return replace(self, origin=origin, **dict(zip(_PARTS, given, strict=True)), files=files)
+
+
+_PARTS = "frames", "map", "coarse", "result"  # fields of a run that hold arrays by frame
+
+
+def _features_file(root: Path, name: str) -> Path:
+    """File of a frame's features, the last ones that were extracted."""
+    paths = [root / STAGES / stage / f"{name}.npz" for stage in _FEATURES]
+    return next((path for path in paths if path.is_file()), paths[-1])
+
+
+def _name_of(path: Path) -> str:
+    """Name of the only recording of a run, by its folder or video."""
+    name = path.stem if path.is_file() else path.name
+    return name or "frames"
+
+
+def _map_of(map_: Map, rows: np.ndarray) -> Map:
+    """The map of frames `rows` (F',), ascending, with the points that two of them or more see."""
+    solution, observed = map_.solution, map_.observed
+    tracks = solution.landmarks.tracks
+    number = np.full(len(solution.world_T_rigs), -1)
+    number[rows] = np.arange(len(rows))
+    seen = number[tracks.frames] >= 0
+    lengths = np.bincount(tracks.points[seen], minlength=tracks.num_points)
+    seen &= lengths[tracks.points] > 1
+    points = np.unique(tracks.points[seen])
+    kept = tracks.of_observations(seen)
+    kept = replace(kept, frames=number[kept.frames].astype(np.int32))
+    counts = replace(solution.counts, kept=len(points))
+    landmarks = Landmarks(solution.landmarks.points_world[points], kept, counts)
+    chosen = number[observed.frames()] >= 0
+    centres, readout = map_.centres, map_.readout
+    return replace(
+        map_,
+        solution=replace(
+            solution,
+            world_T_rigs=solution.world_T_rigs[rows],
+            landmarks=landmarks,
+            rounds=(),
+            variables=None,
+        ),
+        observed=_taken(observed, rows),
+        frame_weights=map_.frame_weights[rows],
+        aligned=None if map_.aligned is None else map_.aligned[chosen],
+        normals_rig=None if map_.normals_rig is None else map_.normals_rig[chosen],
+        centres=centres and replace(centres, lenses=centres.lenses.taken(rows)),
+        readout=readout and replace(readout, lenses=readout.lenses.taken(rows)),
+        covariances=None,
+        moves=(),
+    )
+
+
+def _taken(keypoints: Keypoints, rows: np.ndarray) -> Keypoints:
+    """Keypoints of frames `rows` (F',), ascending."""
+    sizes = np.diff(keypoints.starts)
+    chosen = np.isin(keypoints.frames(), rows)
+    infos, origins = keypoints.sqrt_infos, keypoints.origins_rig
+    return Keypoints(
+        np.concatenate([[0], np.cumsum(sizes[rows])]).astype(np.int64),
+        keypoints.pixels[chosen],
+        keypoints.faces[chosen],
+        keypoints.bearings_rig[chosen],
+        keypoints.sigmas_rad[chosen],
+        keypoints.colors[chosen],
+        None if infos is None else infos[chosen],
+        None if origins is None else origins[chosen],
+    )

@@ -1,0 +1,392 @@
+"""Finished maps made one: joined where they meet, tied by points of both, and solved together.
+
+What a run has solved is where this starts: its poses, its camera, its points with the observations
+that patches were aligned to. New are only the points that frames of different parts share. These
+are matched by features, aligned to patches in all frames that show them, and replace the points of
+either part that they are the same as.
+"""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from gsba.bundle.families import Families
+from gsba.bundle.held_poses import HeldPoses
+from gsba.bundle.lens_centres import baseline_of
+from gsba.config import RefineSettings
+from gsba.log import GsbaError
+from gsba.loop_closure import connectivity, map_merging
+from gsba.loop_closure.merged_map import Registered
+from gsba.photometric import alignment
+from gsba.photometric.alignment import Observations
+from gsba.pipeline import backend, camera, frontend, inputs, patch_rounds
+from gsba.pipeline.joint_map import JointMaps, information_roots
+from gsba.pipeline.prior import Prior
+from gsba.pipeline.run import Evidence, Run
+from gsba.pipeline.state import MapMatches, State
+from gsba.store.store import RunStore
+from gsba.trajectory.judgement import StepChecks
+from gsba.types import CoarsePoses, Keypoints, Matches, PoseSource, Sighted, Solution, Tracks
+
+logger = logging.getLogger(__name__)
+
+_SAME_PLACE_SIGMAS = 6.0  # largest angle between a feature and an observation of a point that is
+# taken for the feature's, standard deviations of the feature
+_SAME_PLACE_RAD = np.deg2rad(0.25)  # and largest such angle
+_SAME_POINT_PX = 1.5  # pixels of a panorama between observations of one point of two maps
+_MIN_SAME_SHARE = 0.5  # share of a point's observations that are another one's, to be the same
+_MAX_SCALE_SIGMAS = 5.0  # by which two maps' units may contradict the distances of their lenses
+_MAX_SCALE_RATIO = 1.15  # and in any case
+
+
+def begin(store: RunStore, maps: JointMaps, settings: RefineSettings) -> State:
+    """The state of maps that nothing ties together yet.
+
+    Args:
+        store: of the run that they become.
+        maps: of finished runs.
+        settings: of that run.
+    """
+    poses = maps.map.solution.world_T_rigs
+    start = CoarsePoses(poses, np.full(len(poses), PoseSource.SLAM, np.uint8), 0.0)
+    families = tuple(inputs.families_of(maps.frames, settings))
+    evidence = Evidence(families=families)
+    run = Run.begin(store, maps.frames, start, settings.with_faint_priors(), evidence)
+    observed = frontend.adopt(run, [path for one in maps.runs for path in one.files])
+    state = replace(State.begin(run, observed), map=maps.map)
+    state = _tied_within(state, maps.parts).through(maps.map.lenses)
+    return replace(state, matches=MapMatches(_matches_of(_by_features(state).landmarks.tracks)))
+
+
+def register(state: State, maps: JointMaps) -> State:
+    """Maps moved to where they meet others, as the test of joins confirms.
+
+    Raises:
+        GsbaError: two maps meet in a scale that the distances of their lenses contradict.
+    """
+    run, solution = state.run, state.solution
+    nothing = np.zeros(len(solution.world_T_rigs) - 1, bool)
+
+    def compute() -> Registered:
+        given = state.observed.context, _by_features(state), maps.parts, nothing, nothing
+        return map_merging.merge(*given, run.frames.timestamps, True)
+
+    merged = run.stage("registered", run.matching_key(), compute, Registered)
+    _check_units(maps, merged)
+    landmarks = solution.landmarks.moved(merged.scales, merged.moves)
+    points = landmarks.points_world + merged.offsets[landmarks.tracks.hosts()]
+    poses = merged.solved.world_T_rigs
+    moved = replace(solution, world_T_rigs=poses, landmarks=replace(landmarks, points_world=points))
+    state = _with_unit(state, merged, int(maps.main_rows(maps.seen_by)[0]))
+    state = _tied_within(state.with_solution(moved), maps.parts, merged)
+    return state
+
+
+def hold(state: State, rows: np.ndarray) -> State:
+    """The state with the poses of frames (H,) held where they are."""
+    run = state.run
+    held = HeldPoses(rows, state.solution.world_T_rigs[rows])
+    members = (*run.families.members, held)
+    families = Families(members, run.frames.names, run.frames.timestamps)
+    return replace(state, run=replace(run, families=families))
+
+
+def tie(state: State, parts: np.ndarray) -> State:
+    """Joined maps tied by the points that frames of different parts (F,) share, and adjusted."""
+    merged, run = state.prior.merged, state.run
+    assert merged is not None
+    state = replace(state, matches=_across(state, parts, merged).matches)
+    ties = _crossing(state, parts)
+    if not len(ties):
+        return state
+    base = _sighted(state)
+    both, order = _interleaved(base.keypoints, state.observed.shown)
+    sizes = np.diff(base.keypoints.starts)
+    everything = Sighted(
+        both,
+        np.concatenate([base.aligned, np.zeros(len(order) - len(base.aligned), bool)])[order],
+        _with_tracks(base.tracks, replace(ties, keypoints=ties.keypoints + sizes[ties.frames])),
+        base.counts,
+    )
+    solved = _solved(state, everything, "joined", run.settings.rounds.loops)
+    if solved is None:
+        logger.info("points that maps share explain less than the maps alone: left as joined")
+        return state
+    if not run.settings.patches.rounds:
+        return solved
+    features = _unravelled(solved.map.observed, order, len(base.aligned), state.observed.shown)
+    state = replace(_with_poses_of(state, solved), matches=state.matches)
+    return _aligned(state, base, features, parts)
+
+
+def _aligned(state: State, base: Sighted, features: Keypoints, parts: np.ndarray) -> State:
+    """Shared points aligned to patches below a pixel, and all solved with them, in rounds.
+
+    Args:
+        state: poses and camera, and matches of features.
+        base: observations of the maps alone.
+        features: of all frames, as pictures show them, with the noise that they turned out to have.
+        parts: (F,) part of each frame.
+    """
+    run, rounds = state.run, state.run.settings.patches.rounds
+    gate = run.settings.rounds.aligned[0]
+    rays = state.map.rays(features, run.rig)
+    placed = state.triangulated(backend.tracks_of(state), rays, gate)
+    known = replace(state.solution, landmarks=placed, noise=1.0)
+    found = frontend.match_known_points_across(state.with_solution(known), parts, "across2")
+    state = replace(state, matches=found.matches)
+    landmarks = state.triangulated(_crossing(state, parts), rays, gate)
+    observed = Observations(features, field=state.map.field)
+    for n in range(1, rounds + 1):
+        start = replace(state.solution, landmarks=landmarks, noise=1.0)
+        shared = _align(state, start, observed, f"align{n}")
+        left = _without_same(base, shared, run.greys.width)
+        everything, own = _joined_sighted(left, shared)
+        solved = _solved(state, everything, f"aligned{n}")
+        if solved is None:
+            return state
+        state, placed = solved, solved.solution.landmarks
+        rows = np.zeros(len(everything.aligned), bool)
+        rows[own] = True
+        tracks = placed.tracks
+        chosen = np.zeros(tracks.num_points, bool)
+        chosen[tracks.points[rows[state.map.observed.rows(tracks)]]] = True
+        landmarks = replace(
+            placed, points_world=placed.points_world[chosen], tracks=tracks.of(chosen)
+        )
+        observed = Observations(
+            state.map.observed, state.map.aligned, state.map.normals_rig, state.map.field
+        )
+    return state
+
+
+def _align(state: State, start: Solution, observed: Observations, name: str) -> Sighted:
+    """Points of a solution observed anew."""
+    run, settings = state.run, state.run.settings.patches
+
+    def compute() -> Sighted:
+        given = run.greys, run.rig, settings, run.store.workers, state.map.lenses, name
+        return alignment.align(start, observed, *given)
+
+    return run.stage(name, settings.model_dump(exclude={"rounds"}), compute, Sighted)
+
+
+def _solved(
+    state: State, sighted: Sighted, name: str, gates: Sequence[float] | None = None
+) -> State | None:
+    """Bundle adjustment of observations, with the camera unless poses are held; None where it
+    explains less."""
+    held = any(isinstance(family, HeldPoses) for family in state.run.families.members)
+    if held or not state.map.lenses:
+        return patch_rounds.adjust_aligned(state, sighted, name, gates)
+    solved, keypoints, found = camera.adjust_with_patches(state, sighted, name, gates)
+    better = patch_rounds.carried(state, sighted, solved, keypoints)
+    return None if better is None else better.with_camera(found)
+
+
+def _with_poses_of(state: State, solved: State) -> State:
+    """The state with the poses and the camera of another one."""
+    poses = solved.solution.world_T_rigs
+    moved = state.with_solution(replace(state.solution, world_T_rigs=poses))
+    return moved if solved.map.readout is None else moved.with_camera(solved.map.camera())
+
+
+def _tied_within(state: State, parts: np.ndarray, merged: Registered | None = None) -> State:
+    """The state whose prior is its own poses, without steps from one part (F,) to another."""
+    poses = state.solution.world_T_rigs
+    components = parts if merged is None else merged.components
+    coarse = replace(state.prior.coarse, world_T_rigs=poses.copy())
+    if merged is not None:
+        coarse.world_T_rigs[:, :3, 3] -= merged.offsets
+    trust = replace(StepChecks.of_all(poses), false_steps=parts[1:] != parts[:-1])
+    apart = connectivity.several(np.asarray(components, np.int64))
+    return replace(state, prior=Prior(coarse, trust, parts=apart, merged=merged))
+
+
+def _with_unit(state: State, merged: Registered, frame: int) -> State:
+    """The state with its camera in the unit of the maps as they were moved: that of `frame`."""
+    if state.map.readout is None or not state.map.lenses:
+        return state
+    found = state.map.camera()
+    scale = float(merged.scales[frame])
+    motion, own = found.lenses.readout_motion, found.own_sigmas
+    lenses = replace(found.lenses, readout_motion=None).scaled(scale)
+    if motion is not None:
+        factors = np.repeat(np.column_stack([np.ones(len(motion)), merged.scales]), 3, axis=1)
+        lenses = replace(lenses, readout_motion=motion * factors)
+    if own is not None:
+        own = own * np.repeat([1.0, scale], 3)
+    return state.with_camera(replace(found, lenses=lenses, own_sigmas=own)).through(lenses)
+
+
+def _check_units(maps: JointMaps, merged: Registered) -> None:
+    """Refuse maps that meet in another scale than their lenses, which are equally far apart."""
+    first = maps.runs[0]
+    for number, run in enumerate(maps.runs[1:], 1):
+        frames = int(maps.main_rows(0)[0]), int(maps.main_rows(number)[0])
+        if merged.components[frames[0]] != merged.components[frames[1]]:
+            continue
+        centres = first.map.centres, run.map.centres
+        if not all(one is not None and one.lenses for one in centres):
+            continue
+        apart = [baseline_of(one, 1.0) for one in centres if one is not None]
+        shares = [sigma / length for length, sigma in apart]
+        off = abs(float(np.log(merged.scales[frames[1]] / merged.scales[frames[0]])))
+        if off > max(_MAX_SCALE_SIGMAS * float(np.linalg.norm(shares)), np.log(_MAX_SCALE_RATIO)):
+            raise GsbaError(
+                f"{run.root} contradicts the camera of {first.root}: where they meet, its lenses "
+                f"are {np.exp(off):.2f} times as far apart, or the inverse; runs of one map must "
+                "be of one camera"
+            )
+
+
+def _by_features(state: State) -> Solution:
+    """The map's points as seen by the features that lie where the map observes them."""
+    from scipy.spatial import KDTree
+
+    seen, shown = state.map.observed, state.observed.shown
+    link = np.full(len(seen.faces), -1)  # feature of its frame at each observation
+    for f in range(len(seen.starts) - 1):
+        own = slice(int(seen.starts[f]), int(seen.starts[f + 1]))
+        there = slice(int(shown.starts[f]), int(shown.starts[f + 1]))
+        if own.start == own.stop or there.start == there.stop:
+            continue
+        gaps, near = KDTree(shown.bearings_rig[there]).query(seen.bearings_rig[own])
+        gaps, near = np.asarray(gaps), np.asarray(near)
+        allowed = np.minimum(_SAME_PLACE_SIGMAS * shown.sigmas_rad[there][near], _SAME_PLACE_RAD)
+        order = np.argsort(gaps, kind="stable")
+        _, first = np.unique(near[order], return_index=True)
+        best = order[first]  # the nearest observation of each feature
+        best = best[gaps[best] < allowed[best]]
+        link[own.start + best] = near[best]
+    solution = state.solution
+    tracks, keypoints = solution.landmarks.tracks, link[seen.rows(solution.landmarks.tracks)]
+    kept = keypoints >= 0
+    found = Tracks(
+        tracks.points[kept],
+        tracks.frames[kept],
+        keypoints[kept].astype(np.int32),
+        tracks.num_points,
+    )
+    return replace(solution, landmarks=replace(solution.landmarks, tracks=found))
+
+
+def _matches_of(tracks: Tracks) -> Matches:
+    """Matches that tracks consist of: each observation with the next one of its point."""
+    following = np.flatnonzero(tracks.points[1:] == tracks.points[:-1])
+    first, second = tracks.frames[following], tracks.frames[following + 1]
+    keypoints = np.column_stack([tracks.keypoints[following], tracks.keypoints[following + 1]])
+    order = np.lexsort((second, first))
+    pairs = np.column_stack([first, second])[order]
+    distinct, counts = np.unique(pairs, axis=0, return_counts=True)
+    offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    return Matches(distinct.astype(np.int32).reshape(-1, 2), offsets, keypoints[order])
+
+
+def _across(state: State, parts: np.ndarray, merged: Registered) -> State:
+    """The state with matches of frames of different parts, around the joined maps' points."""
+    near = state.with_solution(replace(_by_features(state), noise=1.0))
+    return frontend.match_across(near, parts) if merged.met.any() else state
+
+
+def _crossing(state: State, parts: np.ndarray) -> Tracks:
+    """Tracks of features that frames of two parts (F,) or more see."""
+    tracks = backend.tracks_of(state)
+    if not len(tracks):
+        return tracks
+    owners = parts[tracks.frames]
+    starts = np.flatnonzero(np.diff(tracks.points, prepend=-1))
+    mixed = np.minimum.reduceat(owners, starts) != np.maximum.reduceat(owners, starts)
+    chosen = np.zeros(tracks.num_points, bool)
+    chosen[tracks.points[starts]] = mixed
+    return tracks.of(chosen)
+
+
+def _sighted(state: State) -> Sighted:
+    """The map's observations, those of points that were lost included no more."""
+    map_ = state.map
+    aligned = np.zeros(len(map_.observed.faces), bool) if map_.aligned is None else map_.aligned
+    landmarks = map_.solution.landmarks
+    return Sighted(map_.observed, aligned, landmarks.tracks, landmarks.counts, map_.normals_rig)
+
+
+def _interleaved(one: Keypoints, other: Keypoints) -> tuple[Keypoints, np.ndarray]:
+    """Keypoints of both, in each frame those of `one` first, and their order among both (N,)."""
+    frames = np.concatenate([one.frames(), other.frames()])
+    order = np.argsort(frames, kind="stable")
+    infos = None
+    if one.sqrt_infos is not None or other.sqrt_infos is not None:
+        infos = np.concatenate([information_roots(one), information_roots(other)])[order]
+    both = Keypoints(
+        one.starts + other.starts,
+        np.concatenate([one.pixels, other.pixels])[order],
+        np.concatenate([one.faces, other.faces])[order],
+        np.concatenate([one.bearings_rig, other.bearings_rig])[order],
+        np.concatenate([one.sigmas_rad, other.sigmas_rad])[order],
+        np.concatenate([one.colors, other.colors])[order],
+        infos,
+    )
+    return both, order
+
+
+def _unravelled(both: Keypoints, order: np.ndarray, num_first: int, other: Keypoints) -> Keypoints:
+    """The second of two interleaved sets of keypoints, with the noise that it has there."""
+    sigmas = np.empty(len(order))
+    sigmas[order] = both.sigmas_rad
+    return replace(other, sigmas_rad=sigmas[num_first:], sqrt_infos=None)
+
+
+def _with_tracks(one: Tracks, other: Tracks) -> Tracks:
+    """Tracks of both, those of `other` numbered after those of `one`."""
+    return Tracks(
+        np.concatenate([one.points, other.points + one.num_points]).astype(np.int32),
+        np.concatenate([one.frames, other.frames]),
+        np.concatenate([one.keypoints, other.keypoints]).astype(np.int32),
+        one.num_points + other.num_points,
+    )
+
+
+def _joined_sighted(one: Sighted, other: Sighted) -> tuple[Sighted, np.ndarray]:
+    """Observations of both, and the rows (N,) of the other's keypoints among them."""
+    keypoints, order = _interleaved(one.keypoints, other.keypoints)
+    sizes = np.diff(one.keypoints.starts)
+    moved = replace(other.tracks, keypoints=other.tracks.keypoints + sizes[other.tracks.frames])
+    normals = np.concatenate([_normals_of(one), _normals_of(other)])[order]
+    aligned = np.concatenate([one.aligned, other.aligned])[order]
+    tracks = _with_tracks(one.tracks, moved)
+    places = np.empty(len(order), np.int64)
+    places[order] = np.arange(len(order))
+    joined = Sighted(keypoints, aligned, tracks, other.counts, normals)
+    return joined, places[len(one.aligned) :]
+
+
+def _normals_of(sighted: Sighted) -> np.ndarray:
+    normals = sighted.normals_rig
+    return np.zeros((len(sighted.aligned), 3), np.float32) if normals is None else normals
+
+
+def _without_same(base: Sighted, shared: Sighted, width: int) -> Sighted:
+    """Observations without those of points that are observed anew among the shared ones.
+
+    Args:
+        base, shared: observations, as pictures show them.
+        width: of a panorama, pixels.
+    """
+    from scipy.spatial import KDTree
+
+    radius, tracks = _SAME_POINT_PX * 2 * np.pi / width, base.tracks
+    near = np.zeros(len(base.aligned), bool)
+    for f in range(len(base.keypoints.starts) - 1):
+        there = shared.keypoints.bearings_of(f)
+        own = slice(int(base.keypoints.starts[f]), int(base.keypoints.starts[f + 1]))
+        if len(there) and own.start < own.stop:
+            gaps, _ = KDTree(there).query(base.keypoints.bearings_rig[own])
+            near[own] = np.asarray(gaps) < radius
+    lengths = np.bincount(tracks.points, minlength=tracks.num_points)
+    same = np.bincount(
+        tracks.points, near[base.keypoints.rows(tracks)], minlength=tracks.num_points
+    )
+    left = same < _MIN_SAME_SHARE * np.maximum(lengths, 1)
+    return replace(base, tracks=tracks.of(left))

@@ -1,0 +1,178 @@
+"""Finished runs that grow by recordings, what they refuse, and that nothing is lost on the way."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from growing_home import NUM, GrowingHome, make_growing_home, settings
+from typer.testing import CliRunner, Result
+
+from gsba import Recording, add_recordings, load_run, refine_recordings
+from gsba.cli import app
+from gsba.disk import hold_folder
+from gsba.export import ExportFormat
+from gsba.localization import Localizer
+from gsba.log import GsbaError
+from gsba.view import load_scene
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> GrowingHome:
+    return make_growing_home(tmp_path_factory.mktemp("home"))
+
+
+@pytest.fixture(scope="module")
+def grown(home: GrowingHome, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The second recording added from the command line, the finished run left as it is."""
+    out = tmp_path_factory.mktemp("grown") / "run"
+    before = _content(home.run)
+    result = _add(home.run, home.second, home.second_trajectory, "--out", out)
+    assert result.exit_code == 0, result.output
+    assert "20 of 20 frames refined" in result.output
+    assert _content(home.run) == before
+    return out
+
+
+def _add(*arguments: object) -> Result:
+    return CliRunner().invoke(app, ["--quiet", "add", *map(str, arguments)])
+
+
+def _content(folder: Path) -> dict[str, tuple[int, bytes]]:
+    """Times and content of all files of a folder."""
+    paths = (path for path in sorted(folder.rglob("*")) if path.is_file())
+    return {
+        str(path.relative_to(folder)): (path.stat().st_mtime_ns, path.read_bytes())
+        for path in paths
+    }
+
+
+def test_an_added_recording_is_as_good_as_a_joint_solution(
+    grown: Path, home: GrowingHome, tmp_path: Path
+) -> None:
+    reconstruction, frames = load_run(grown)
+    assert reconstruction.num_maps == 1
+    assert frames.names[0] == "ground/000000" and frames.names[NUM] == "upper/000000"
+    both = [Recording(home.first, home.first.with_suffix(".txt")), home.recording()]
+    refine_recordings(both, tmp_path / "joint", settings())
+    assert home.error(grown) < 1.3 * home.error(tmp_path / "joint")
+    seen_by_both = np.zeros((len(reconstruction.points_world), 2), bool)
+    owners = reconstruction.observation_frames // NUM
+    seen_by_both[reconstruction.observation_points, owners] = True
+    assert seen_by_both.all(axis=1).mean() > 0.2
+
+
+def test_only_the_new_recording_is_extracted_and_aligned(grown: Path) -> None:
+    stages = {
+        stage["name"]: stage for stage in json.loads((grown / "report.json").read_text())["stages"]
+    }
+    assert {"registered", "across", "joined", "align1", "reconstruction"} <= set(stages)
+    assert not {"features", "neighbours", "steps"} & set(stages)
+
+
+def test_a_grown_run_needs_no_other_run(grown: Path, home: GrowingHome, tmp_path: Path) -> None:
+    moved = Path(shutil.copytree(grown, tmp_path / "moved"))
+    text = (moved / "gsba.json").read_text() + (moved / "report.json").read_text()
+    assert ".growing" not in text and str(home.run) not in text
+    _, frames = load_run(moved)
+    inside = [path for group in frames.paths for path in group if home.run in path.parents]
+    assert not inside
+    assert not any(path and ".growing" in str(path) for path in frames.mask_paths)
+
+
+def test_report_exports_and_viewer_tell_recordings_apart(grown: Path) -> None:
+    report = json.loads((grown / "report.json").read_text())
+    assert [one["name"] for one in report["recordings"]] == ["ground", "upper"]
+    assert any(note.startswith("recording upper: joined by points") for note in report["notes"])
+    images = {path.parent.name for path in (grown / "colmap-flat/images").rglob("*.jpg")}
+    assert images == {"ground", "upper"}
+    assert {path.name for path in (grown / "trajectories").iterdir()} == {"ground.tum", "upper.tum"}
+    assert list(load_scene(grown).frames.recordings) == ["ground", "upper"]
+    assert (grown / ExportFormat.TUM.value).is_dir()
+
+
+def test_pictures_are_localised_in_a_grown_run(grown: Path, home: GrowingHome) -> None:
+    found = Localizer(grown).localize(home.second / "000003.jpg")
+    assert found.found
+    pose = load_run(grown)[0].world_T_rigs[NUM + 3]
+    assert np.linalg.norm(found.world_T_rig[:3, 3] - pose[:3, 3]) < 0.02
+
+
+def test_fixed_poses_stay_to_the_byte(home: GrowingHome, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    result = add_recordings(home.run, [home.recording()], out, fixed=True)
+    before = load_run(home.run)[0]
+    after = load_run(out)[0]
+    assert after.world_T_rigs[:NUM].tobytes() == before.world_T_rigs.tobytes()
+    assert after.pose_covariances[:NUM].tobytes() == before.pose_covariances.tobytes()
+    kept = (out / "trajectories/ground.tum").read_bytes()
+    assert kept == (home.run / "trajectory.tum").read_bytes()
+    assert len(result.maps) == 1
+    assert home.error(out) < 1.5 * home.error(home.run)
+
+
+def test_a_recording_of_another_place_is_refused(home: GrowingHome, tmp_path: Path) -> None:
+    before, out = _content(home.run), tmp_path / "run"
+    result = _add(home.run, home.elsewhere, home.elsewhere_trajectory, "--out", out)
+    assert result.exit_code == 1 and not out.exists()
+    assert "recording 'elsewhere' does not meet the map of" in result.output
+    assert _content(home.run) == before
+
+
+def test_refusals_are_one_line_and_leave_the_run(home: GrowingHome, tmp_path: Path) -> None:
+    before = _content(home.run)
+    unfinished = Path(shutil.copytree(home.run, tmp_path / "unfinished"))
+    (unfinished / "report.json").unlink()
+    older = Path(shutil.copytree(home.run, tmp_path / "older"))
+    marker = json.loads((older / "gsba.json").read_text())
+    (older / "gsba.json").write_text(json.dumps(marker | {"gsba": "0.0.1"}))
+    cases = [
+        ([home.run], "give the RECORDING to add"),
+        ([home.first, home.second], "is not a gsba run"),
+        ([unfinished, home.second], "is not finished"),
+        ([older, home.second], "is a run of gsba 0.0.1"),
+        ([home.run, home.first], "has recording"),
+        ([home.run, "--recording", f"{home.second},name=ground"], "named 'ground'"),
+        ([home.run, home.second, "--out", home.first], "exists: choose another --out"),
+        ([home.run, home.second, tmp_path / "missing.tum"], "missing.tum"),
+    ]
+    for arguments, told in cases:
+        result = _add(*arguments)
+        assert result.exit_code == 1, arguments
+        assert told in result.output and len(result.output.strip().splitlines()) == 1, told
+    lock = hold_folder(home.run)
+    try:
+        assert "in use by another gsba process" in _add(home.run, home.second).output
+    finally:
+        os.close(lock)
+    assert _content(home.run) == before
+
+
+@pytest.mark.parametrize("stage", ["new/stages/features", "stages/registered.npz"])
+def test_a_killed_call_leaves_the_run_and_goes_on(
+    stage: str, home: GrowingHome, grown: Path, tmp_path: Path
+) -> None:
+    run = Path(shutil.copytree(home.run, tmp_path / "run"))
+    before, work = _content(run), tmp_path / ".run.growing"
+    words = ["add", str(run), str(home.second), str(home.second_trajectory)]
+    command = [sys.executable, "-c", "from gsba.cli import main; main()", *words]
+    process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+    deadline = time.monotonic() + 120
+    while not (work / stage).exists() and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.02)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert _content(run) == before
+    subprocess.run(command, check=True, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+    again = (run / "trajectory.tum").read_bytes()
+    assert again == (grown / "trajectory.tum").read_bytes()
+    assert _content(tmp_path / "run-before") == before
+    assert {path.name for path in tmp_path.iterdir()} == {"run", "run-before"}
+    with pytest.raises(GsbaError, match="already, as 'upper'"):
+        add_recordings(run, [home.recording()])
