@@ -21,7 +21,9 @@ SCALE = 1.7
 MOVE = pose(Rotation.from_rotvec([0.4, -2.0, 0.7]).as_matrix(), np.array([5.0, -3.0, 8.0]))
 
 
-def scene(strange: bool = False) -> tuple[MatchContext, Solution, np.ndarray]:
+def scene(
+    strange: bool = False, truth: np.ndarray = TRUTH
+) -> tuple[MatchContext, Solution, np.ndarray]:
     """Once around, mapped in two halves; `strange`: the second half looks like nothing else.
 
     Returns the map in one world, and the point that each of its landmarks is.
@@ -31,7 +33,7 @@ def scene(strange: bool = False) -> tuple[MatchContext, Solution, np.ndarray]:
     points = near + rng.uniform(0.8, 2.5, (POINTS, 1)) * unit(rng.normal(size=(POINTS, 3)))
     looks = (200 * rng.random((2, POINTS, 64)) ** 4).astype(np.uint8)
     frames, rows = [], []
-    for f, world_T_rig in enumerate(TRUTH):
+    for f, world_T_rig in enumerate(truth):
         seen = np.flatnonzero(np.linalg.norm(points - world_T_rig[:3, 3], axis=1) < 2.6)
         late = int(f >= HALF)
         bearings = with_noise(bearings_of(points[seen], world_T_rig), 3e-4, rng)
@@ -45,7 +47,7 @@ def scene(strange: bool = False) -> tuple[MatchContext, Solution, np.ndarray]:
     landmarks = Landmarks(points[kept // 2], own, Counts(len(kept), len(kept), "tracks"))
     among = SearchableFrames(frames.__getitem__)
     context = MatchContext(among, among, detection.gather(frames), SETTINGS, Threads(1))
-    return context, Solution(TRUTH, landmarks, 1.0, ()), kept % 2 == 1
+    return context, Solution(truth, landmarks, 1.0, ()), kept % 2 == 1
 
 
 def torn(solved: Solution, late: np.ndarray, scale: float, move: np.ndarray) -> Solution:

@@ -12,7 +12,7 @@ import numpy as np
 from factors import Block, LandmarkBlock, RobustLoss, Term, tangent_basis
 from gsba.bundle import pose_variables, triangulation
 from gsba.bundle.division import DivisibleMap, Division
-from gsba.bundle.families import Families, FamilyTerms
+from gsba.bundle.families import Families, Family, FamilyTerms
 from gsba.bundle.gyro_turns import GyroTurns
 from gsba.bundle.optimizer import OptimizeResult, marginal_covariances, optimize
 from gsba.bundle.pose_variables import poses_of, values_of
@@ -80,6 +80,11 @@ class AdjustmentContext:
         """The gyro's measurements of the frames; None where no gyro is used."""
         gyros = (family for family in self.families.members if isinstance(family, GyroTurns))
         return next((gyro.turning for gyro in gyros), None)
+
+    def beside(self, *families: Family) -> "AdjustmentContext":
+        """The same with further families."""
+        members = (*self.families.members, *families)
+        return replace(self, families=self.families.with_members(members))
 
     def terms(self, solved: Solution) -> Terms:
         """Terms of all families for an adjustment that starts from a solution.

@@ -17,7 +17,7 @@ import numpy as np
 from factors import Block, Term
 from gsba.bundle.family_variables import kept, restored
 from gsba.bundle.point_observations import PointObservations
-from gsba.bundle.pose_variables import X, values_of
+from gsba.bundle.pose_variables import X
 from gsba.log import GsbaError
 from gsba.types import FamilyVariables, Keypoints, Landmarks, Solution
 
@@ -217,11 +217,6 @@ def _terms_of(families: Sequence[Family], snapshot: MapSnapshot) -> FamilyTerms:
         values.insert(own)
         graph.push_back(factors)
         blocks += arrays
-    if blocks:
-        start = values_of(snapshot.world_T_rigs)
-        start.insert(values)
-        for block in blocks:
-            block.refresh(start)
     return FamilyTerms(graph, tuple(blocks), values)
 
 

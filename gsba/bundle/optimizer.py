@@ -236,6 +236,8 @@ def marginal_covariances(
         that nothing constrains, and for all where the rest is singular (the gauge is not fixed).
     """
     num = len(keys)
+    for block in blocks:
+        block.refresh(values)
     system = reduced_system(graph, blocks, values, list(pairwise(keys)))
     system.linearize(values)
     found = system.covariances(num_draws, np.random.default_rng(seed))

@@ -39,8 +39,9 @@ _MIN_MAP_FRAMES = 3  # least frames of a part that count as a map
 _MIN_TESTABLE_FRAMES = 6
 _MAX_PACES = 3.0  # largest distance of a single frame from its neighbours, in median paces
 _MAP_SPACING_EXTENTS = 4.0  # distance between unconnected maps, in their extents
-# Largest angle between the verticals of two parts, besides the spread within each.
-_MAX_TILT_RAD = np.deg2rad(5.0)
+# Largest angle between the verticals of two parts, besides the spread within each: of one
+# recording, and of two, whose cameras may be held in another way.
+_MAX_TILT_RAD, _MAX_TILT_BETWEEN_RAD = np.deg2rad(5.0), np.deg2rad(45.0)
 
 
 def merge(
@@ -51,6 +52,7 @@ def merge(
     seen: np.ndarray,
     timestamps: np.ndarray,
     absent: bool = True,
+    recordings: np.ndarray | None = None,
 ) -> Registered:
     """Join the parts of a map where they overlap, and register single frames.
 
@@ -62,9 +64,12 @@ def merge(
         seen: (F - 1,) bool, steps verified by images: they tie frames with too few points.
         timestamps: (F,) seconds.
         absent: True if there is no trajectory; then small maps are not joined.
+        recordings: (F,) int, number of each frame's recording; None = there is one.
     """
     min_testable = _MIN_TESTABLE_FRAMES if absent else _MIN_MAP_FRAMES
-    joining = _Joining(context, solved, parts, held, held | seen, timestamps, min_testable)
+    owners = np.zeros(len(parts), np.int64) if recordings is None else recordings
+    ties = held | seen
+    joining = _Joining(context, solved, parts, held, ties, timestamps, min_testable, owners)
     component = 0
     while joining.begin(component):
         progress = True
@@ -86,6 +91,7 @@ class _Joining:
         ties: np.ndarray,
         timestamps: np.ndarray,
         min_testable: int,
+        recordings: np.ndarray,
     ) -> None:
         num = len(parts)
         self.context, self.solved, self.parts = context, solved, parts
@@ -101,6 +107,7 @@ class _Joining:
         self.test = JoinTest(context, self.poses, self.known, self.depth, self._usual_rates)
         self.usual_anywhere: Rates | None = None
         self.min_testable = min_testable  # frames of a map that joins can be tested by
+        self.recordings = recordings
         self.moves = [Sim3()] * num  # of each frame, from its part to the map
         self.components = np.full(num, -1)
         self.met, self.alone = np.zeros(num, bool), np.zeros(num, bool)
@@ -255,14 +262,17 @@ class _Joining:
 
     def _is_level(self, rows: np.ndarray, inside: np.ndarray, move: Sim3) -> bool:
         """True if a part would stand upright on the map, within the spread of its frames'
-        verticals."""
+        verticals: on its own recording's frames, if there are any."""
+        own = inside[np.isin(self.recordings[inside], self.recordings[rows])]
+        limit = _MAX_TILT_RAD if len(own) else _MAX_TILT_BETWEEN_RAD
+        inside = own if len(own) else inside
         down, theirs = self.poses[rows, :3, 1] @ move.rotation.T, self.poses[inside, :3, 1]
         means = [unit(axes.mean(axis=0)) for axes in (down, theirs)]
         spreads = [
             np.sqrt(np.mean(angles_between(axes, mean) ** 2))
             for axes, mean in zip((down, theirs), means, strict=True)
         ]
-        return bool(angles_between(means[0], means[1]) < _MAX_TILT_RAD + 3 * np.hypot(*spreads))
+        return bool(angles_between(means[0], means[1]) < limit + 3 * np.hypot(*spreads))
 
     def _usual_rates(self) -> Rates:
         """Rates at which points are found again within the original parts."""

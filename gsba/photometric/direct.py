@@ -18,6 +18,7 @@ from gsba.config import PhotometricSettings, RefineSettings
 from gsba.frames.masks import load_weights
 from gsba.log import GsbaError, track
 from gsba.photometric import patches
+from gsba.photometric.patch_greys import PatchGreys
 from gsba.types import Counts, FrameSet, Keypoints, Round, Solution
 
 logger = logging.getLogger(__name__)
@@ -217,8 +218,7 @@ def _solve(
     It is undone if it fits the map's own observations worse than before.
     """
     settings, num_threads = context.settings, context.num_threads
-    chosen, terms = settings.photometric, context.terms(solved)
-    values = terms.values
+    chosen, values = settings.photometric, adjustment.values_of(solved.world_T_rigs)
     looser = {"relative_tolerance": chosen.tolerance, "absolute_tolerance": None}
     solver = settings.solver.model_copy(update=looser)
     start = make_block(pixels, trust, settings, num_threads)
@@ -230,7 +230,8 @@ def _solve(
         landmarks = adjustment.landmark_block(solved.landmarks, keypoints, solved.noise, context)
         landmarks.polish(values)
         before, fits = landmarks.error(values), _geometric_fits(landmarks, values)
-        result = optimize(terms.graph, [landmarks, block, *terms.blocks], values, solver)
+        terms = context.beside(PatchGreys(block)).terms(solved)
+        result = optimize(terms.graph, [landmarks, *terms.blocks], terms.values, solver)
         growth = _geometric_fits(landmarks, result.values) / fits
         doubts, residuals = _frame_weights(block, result.values, growth, chosen)
         if np.all(doubts >= 1) or np.any(weights < 1):
@@ -249,7 +250,7 @@ def joint(
     settings: RefineSettings,
     num_threads: int,
     lenses: Lenses = ONE_CENTRE,
-) -> list[PhotometricBlock]:
+) -> list[PatchGreys]:
     """The patches of a solved map, for a joint solve with another family; none if not selected.
 
     Args:
@@ -267,7 +268,7 @@ def joint(
     noise = _noise(start, values) * settings.photometric.inflation
     block = make_block(pixels, start.counted * trust, settings, num_threads, noise)
     block.weigh(frame_weights)
-    return [block]
+    return [PatchGreys(block)]
 
 
 def make_block(

@@ -140,7 +140,10 @@ def merge_maps(state: State, parts: np.ndarray) -> State:
         context, times = state.observed.context, run.frames.timestamps
         # No trajectory relates recordings: their maps are as free as those of images alone.
         alone = prior.absent or bool(run.evidence.recordings)
-        return map_merging.merge(context, solution, parts, held, shown, times, alone)
+        owners = np.zeros(len(parts), np.int64)
+        for number, rows in enumerate(run.frames.recordings.values()):
+            owners[rows] = number
+        return map_merging.merge(context, solution, parts, held, shown, times, alone, owners)
 
     merged = run.stage("registered", run.matching_key(), compute, Registered)
     coarse, followed, joints = follow(merged, prior.coarse, trust, prior.joints)
@@ -206,8 +209,7 @@ def refine_on_splat(state: State) -> State:
             frames,
             map_.keypoints(run.rig),
             solution,
-            state.adjustment_context(),
-            patches,
+            state.adjustment_context().beside(*patches),
             turns,
             start,
             Optics(lenses, around),

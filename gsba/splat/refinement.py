@@ -17,13 +17,12 @@ faces follow.
 """
 
 import logging
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from factors import Block, LandmarkBlock
+from factors import LandmarkBlock
 from gsba.bundle import adjustment, triangulation
 from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.optimizer import OptimizeResult, optimize
@@ -35,6 +34,7 @@ from gsba.splat.evidence import score, standard_error, together
 from gsba.splat.gaussians import Gaussians, from_cloud
 from gsba.splat.scene import Faces, Split, load_faces, make_views, near_of, split_frames
 from gsba.splat.scores import face_psnrs
+from gsba.splat.splat_greys import SplatGreys
 from gsba.splat.train import State, advance, begin
 from gsba.store.records import load_checkpoint, save_record
 from gsba.types import Counts, FrameSet, Keypoints, Landmarks, Round, Solution
@@ -89,7 +89,6 @@ def refine(
     keypoints: Keypoints,
     start: Solution,
     context: AdjustmentContext,
-    further: Sequence[Block] = (),
     checkpoint: Path | None = None,
     key: str = "",
     optics: Optics = ONE_EYE,
@@ -101,7 +100,6 @@ def refine(
         keypoints: keypoints of all frames.
         start: the solved map.
         context: priors, families, loss, solver, splat; its threads render, too.
-        further: further blocks of each move, on the same keys.
         checkpoint: file to store finished turns in and to resume from; None = none.
         key: digest of the inputs; a checkpoint with another key is not resumed.
         optics: lenses of the frames.
@@ -118,7 +116,7 @@ def refine(
     split = split_frames(usable, chosen.held_out_every)
     dropped = {"held out": len(split.held_out), "unrefined": int(np.count_nonzero(~usable))}
     counts = Counts(len(frames), len(split.training), "frames", dropped)
-    turns = _Turns(keypoints, start, context, further, split)
+    turns = _Turns(keypoints, start, context, split)
     progress = load_checkpoint(checkpoint, key, _Progress, "the splat refinement starts anew")
     if progress is None:
         cloud = _cloud(start.landmarks, keypoints, chosen.sh_degree)
@@ -155,11 +153,10 @@ class _Turns:
         keypoints: Keypoints,
         solved: Solution,
         context: AdjustmentContext,
-        further: Sequence[Block],
         split: Split,
     ) -> None:
         self.keypoints, self.solved, self.context = keypoints, solved, context
-        self.settings, self.further, self.split = context.settings, further, split
+        self.settings, self.split = context.settings, split
         self.backend = choose_backend(self.settings.splat.backend, context.num_threads)
         self.faces: Faces
         self.held_out: Faces
@@ -244,14 +241,13 @@ class _Turns:
     ) -> tuple[np.ndarray, OptimizeResult]:
         """Poses after a few joint steps, and the solver's result."""
         settings = self.settings
-        terms = self.context.terms(replace(self.solved, world_T_rigs=world_T_rigs))
+        near = near_of(world_T_rigs[self.split.training], SplatSettings())
+        greys = SplatGreys(splat_block(gaussians, self.captured, near, self.backend))
+        terms = self.context.beside(greys).terms(replace(self.solved, world_T_rigs=world_T_rigs))
         values, landmarks = terms.values, self._block()
         landmarks.polish(values)
-        near = near_of(world_T_rigs[self.split.training], SplatSettings())
-        pixels = splat_block(gaussians, self.captured, near, self.backend)
         solver = settings.solver.model_copy(update={"max_iterations": settings.splat.solver_steps})
-        blocks = [landmarks, *self.further, pixels, *terms.blocks]
-        result = optimize(terms.graph, blocks, values, solver)
+        result = optimize(terms.graph, [landmarks, *terms.blocks], values, solver)
         return adjustment.poses_of(result.values, len(world_T_rigs)), result
 
     def _block(self) -> LandmarkBlock:

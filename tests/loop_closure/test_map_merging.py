@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from two_maps import HALF, MOVE, NUM, SCALE, TRUTH, scene, torn
 
 from gsba.geometry import inverse, pose, rotation_angle
@@ -76,6 +77,24 @@ def test_two_maps_of_any_scale_are_joined_where_they_meet(scale: float) -> None:
     assert off < 0.02 and turned < 0.2  # of a loop 8 across; bearings have 0.02 degrees of noise
     points = found.solved.landmarks.points_world
     assert np.median(np.linalg.norm(points - whole.landmarks.points_world, axis=1)) < 0.02
+
+
+@pytest.mark.parametrize(("tilt_deg", "joined"), [(25.0, True), (70.0, False)])
+def test_a_camera_may_be_held_in_another_way_in_another_recording(
+    tilt_deg: float, joined: bool
+) -> None:
+    truth, tilt = TRUTH.copy(), Rotation.from_euler("x", tilt_deg, degrees=True).as_matrix()
+    truth[HALF:, :3, :3] = tilt @ truth[HALF:, :3, :3]  # to one side, whatever the heading
+    context, whole, late = scene(truth=truth)
+    owners = np.arange(NUM) // HALF
+    times = TIMES + 1000 * owners
+    given = context, torn(whole, late, SCALE, MOVE), _halves(), NOBODY, ~BREAK, times
+    found = map_merging.merge(*given, recordings=owners)
+    assert found.components.any() != joined
+    if joined:
+        off, turned = _errors(found, truth)
+        assert off < 0.02 and turned < 0.2
+    assert map_merging.merge(*given).components.any()  # of one recording: held in one way
 
 
 def test_strangers_stay_apart() -> None:
