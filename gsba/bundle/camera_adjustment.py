@@ -21,26 +21,26 @@ from gsba.bundle.readout import CameraEstimate
 from gsba.bundle.stitching import with_noise_of
 from gsba.types import Keypoints, Sighted, Solution, Tracks
 
-_SCALE_SIGMA = 1e-3  # of each map's extent about what it was: no image knows it, and frames' own
-# motion, which is drawn to none, would shrink the map
+_SCALE_SIGMA = 1e-3  # of each map's extent about its former one: images leave the scale open, and
+# priors of zero on frames' own motion would shrink the map
 
 
 @dataclass(frozen=True, slots=True)
 class CameraView:
-    """Observations through a camera whose variables are solved for; see `adjustment.View`."""
+    """Observations through a camera that is solved for; an `adjustment.View`."""
 
     shown: Keypoints  # as pictures show them
-    keypoints: Keypoints  # the same as rays of the camera so far
+    keypoints: Keypoints  # these keypoints as rays of the camera so far
     camera: CameraEstimate
     timestamps: np.ndarray  # (F,) seconds
 
     @classmethod
     def of(cls, shown: Keypoints, camera: CameraEstimate, timestamps: np.ndarray) -> "CameraView":
-        """Keypoints as pictures show them, through a camera that was found."""
+        """The view of keypoints, as pictures show them, through a known camera."""
         return cls(shown, camera.lenses.seen(shown), camera, timestamps)
 
     def with_noise_of(self, keypoints: Keypoints) -> "CameraView":
-        """The same, observations as noisy as keypoints of the same rows."""
+        """The view with the noise of other keypoints of the same rows."""
         shown = with_noise_of(self.shown, keypoints)
         return replace(self, shown=shown, keypoints=self.camera.lenses.seen(shown))
 
@@ -78,7 +78,7 @@ def solve_with_camera(
     gates: Sequence[float],
     final: bool = True,
 ) -> tuple[Solution, CameraEstimate]:
-    """Poses, points and all that was taken of a camera, solved for together.
+    """Solve for poses, points and the parts of a camera that were taken, in one graph.
 
     The last round, of the tightest gate, is of poses and points alone.
 
@@ -122,7 +122,7 @@ def solve_sighted_with_camera(
 
 
 def _split(gates: Sequence[float]) -> tuple[Sequence[float], Sequence[float]]:
-    """Gates of the rounds that solve for the camera, and of the last one, that leaves it as it is.
+    """Gates of the rounds that solve for the camera, and of the last, of poses and points alone.
 
     The tightest gate chooses observations by the camera so far, and these would confirm it: raw
     lenses came out worse by them.

@@ -1,4 +1,4 @@
-"""A map and its camera as one system: how widely frames' own motion is spread, and covariances.
+"""A map and its camera as one system: spread of frames' own motion, and covariances.
 
 Points are eliminated. What frames have of their own is drawn to what is typical, by as much as
 frames turn out to differ.
@@ -22,9 +22,10 @@ from gsba.bundle.readout import CameraEstimate
 from gsba.types import JointErrors, Keypoints, Solution
 
 _DAMPING = 1e-6
-_SPREADS = 4  # passes over how widely frames' own motion is spread
-_CONTRADICTED = 4.0  # squares of standard deviations that a gyro's rotations may be off, and
-_EXPLAINED = 0.5  # part of what images show that it may leave over, where they are further off
+_NUM_SPREAD_PASSES = 4  # passes that estimate the spread of frames' own motion
+_MAX_GYRO_SQUARES = 4.0  # largest median square of a gyro's errors, in variances of the motion
+_MAX_UNEXPLAINED_SHARE = 0.5  # largest share of the rotations by images that a gyro which is further
+# off may leave unexplained
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,10 +35,10 @@ class CameraCovariances:
     poses: np.ndarray  # (F, 6, 6) float64, [rotation rad, translation], rig frame
     joint: JointErrors  # what the poses' errors have in common
     centre: np.ndarray  # (3 (L - 1), 3 (L - 1)) float64, of the lenses' centres but the last one;
-    # what different lenses have in common is left out
+    # what is common to different lenses is left out
     readout_sigma: float  # s; NaN = no readout was taken
     inverse_stitch_radius_sigma: float  # 1 / map units; NaN = infinity, or as settings say
-    lens_sigmas: np.ndarray | None = None  # (K,) of what raw lenses are, see
+    lens_sigmas: np.ndarray | None = None  # (K,) of the parameters of raw lenses, see
     # `self_calibration`; None = they are as calibrated
 
 
@@ -46,7 +47,7 @@ class CameraSystem:
     """A map and its camera, linearized together."""
 
     solved: Solution  # poses, points, noise
-    shown: Keypoints  # of its observations, as pictures show them
+    shown: Keypoints  # keypoints of its observations, as pictures show them
     camera: CameraEstimate  # so far
     timestamps: np.ndarray  # (F,) seconds
     context: AdjustmentContext  # priors, loss
@@ -62,14 +63,15 @@ class CameraSystem:
         if turning is not None:
             camera = replace(camera, by_gyro=self._agrees(turning.rates))
         system = replace(self, camera=camera)._linearized()
-        variances = system.own_variances()  # they hardly change with what is typical
-        for _ in range(0 if variances is None else _SPREADS):
+        variances = system.own_variances()  # they hardly depend on the spread
+        for _ in range(0 if variances is None else _NUM_SPREAD_PASSES):
             motion = system.own_motion()
             if motion is None:
                 break
             sigmas = np.sqrt(np.mean(motion**2 + variances, axis=0))
             own = system.unknowns.own
-            if own is not None and own.told.any():  # what a gyro tells is no measure of the others
+            if own is not None and own.told.any():  # rotations by the gyro do not measure the
+                # spread of others
                 sigmas[:3] = own.sigmas[:3]
             system = replace(system, unknowns=system.unknowns.spread_as(sigmas))
         return system.unknowns.camera
@@ -81,17 +83,17 @@ class CameraSystem:
         told = np.isfinite(rates).all(axis=1)
         if motion is None or variances is None or not told.any():
             return False
-        seen = motion[told, :3]  # poses alone say nothing of turns: all is own motion
+        seen = motion[told, :3]  # rotations are own motion alone: velocities of poses give none
         off = seen - self.camera.readout_s * rates[told]
-        near = np.median(off**2 / variances[told, :3]) < _CONTRADICTED
-        return bool(near or np.sum(off**2) < _EXPLAINED * np.sum(seen**2))
+        near = np.median(off**2 / variances[told, :3]) < _MAX_GYRO_SQUARES
+        return bool(near or np.sum(off**2) < _MAX_UNEXPLAINED_SHARE * np.sum(seen**2))
 
     def _unknowns(self) -> CameraUnknowns:
         poses = self.solved.world_T_rigs
         return CameraUnknowns.of(self.camera, poses, self.timestamps, self.context)
 
     def _linearized(self) -> "_Linearized":
-        """At poses and camera as they are, points at their best."""
+        """The quadratic model at these poses and this camera, points at their optimum."""
         unknowns, terms = self._unknowns(), self.context.terms(self.solved)
         terms.values.insert(unknowns.values)
         block = unknowns.block(self.solved.landmarks, self.shown, self.solved.noise, curved=True)
@@ -140,7 +142,7 @@ class CameraSystem:
 
 @dataclass(frozen=True, slots=True)
 class _Linearized:
-    """Bearings' quadratic model over poses and camera, and what is believed of these."""
+    """Quadratic model of bearings over poses and camera, and priors on these."""
 
     unknowns: CameraUnknowns
     graph: gtsam.NonlinearFactorGraph  # of all but the camera

@@ -14,8 +14,8 @@ from scipy.ndimage import gaussian_filter1d
 from gsba.geometry import furthest
 from gsba.types import JointErrors
 
-_SHARE = 1.7  # standard deviation of the errors in common, of that of the others
-_REACH = 3.0  # frames, standard deviation of their smoothing
+_COMMON_RATIO = 1.7  # standard deviation of common errors over that of the others
+_SMOOTHING_FRAMES = 3.0  # frames, standard deviation of their smoothing
 
 
 def added(
@@ -40,11 +40,13 @@ def added(
         rows = np.flatnonzero(known & (groups == group))
         if len(rows) > 1:
             turned = [rotations[rows] @ joint.draws[:, rows, part, None] for part in _PARTS]
-            smooth = gaussian_filter1d(np.concatenate(turned, axis=2)[..., 0], _REACH, axis=1)
+            smooth = gaussian_filter1d(
+                np.concatenate(turned, axis=2)[..., 0], _SMOOTHING_FRAMES, axis=1
+            )
             held = _in_gauge(smooth, world_T_rigs[rows, :3, 3])
             back = np.swapaxes(rotations[rows], 1, 2)
             turned = [back @ held[:, :, part, None] for part in _PARTS]
-            errors[:, rows] = _SHARE * np.concatenate(turned, axis=2)[..., 0]
+            errors[:, rows] = _COMMON_RATIO * np.concatenate(turned, axis=2)[..., 0]
     errors = np.roll(errors, 1, axis=0)  # of other draws than those they are added to
     each = np.einsum("dfi,dfj->fij", errors, errors) / len(errors)
     between = np.einsum("dfi,dfj->fij", errors[:, :-1], errors[:, 1:]) / len(errors)

@@ -10,7 +10,7 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
-_SURE = 3.0  # standard deviations of a gain
+_MIN_GAIN_SIGMAS = 3.0  # least significant gain, in its standard deviations
 
 
 class Part(Protocol):
@@ -33,9 +33,9 @@ P = TypeVar("P", bound=Part)
 class Verdict:
     """Gains of parts by parameters that were found from the other parts."""
 
-    gains: np.ndarray  # (PARTS,) float64, decrease of each part's robust cost by what
-    # the other parts give, beyond the baseline
-    shares: np.ndarray  # (PARTS,) float64, the same as a share of the cost that the baseline leaves
+    gains: np.ndarray  # (PARTS,) float64, decrease of each part's robust cost by the
+    # parameters of the other parts, beyond the baseline
+    shares: np.ndarray  # (PARTS,) float64, gains as shares of the cost that the baseline leaves
 
     @property
     def predicts(self) -> bool:
@@ -74,5 +74,5 @@ def predicts(gains: np.ndarray) -> bool:
     """
     total = float(gains.sum())
     sigma = np.sqrt(2 * max(total, 0.0))
-    least = -_SURE * sigma / np.sqrt(len(gains))
-    return bool(total > _SURE * sigma and np.all(gains > least))
+    least = -_MIN_GAIN_SIGMAS * sigma / np.sqrt(len(gains))
+    return bool(total > _MIN_GAIN_SIGMAS * sigma and np.all(gains > least))

@@ -18,7 +18,7 @@ from gsba.types import Solution
 _MAX_STEPS = 100  # of Levenberg-Marquardt
 _CONVERGED = 1e-9  # relative decrease of the cost
 _MAX_DAMPING = 1e8
-_MIN_CURVATURE = 1e-9  # of what nothing determines, part of the largest
+_MIN_CURVATURE = 1e-9  # least curvature that counts as determined, part of the largest
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Which way the lenses look: as their panorama does, or below one that a stabiliser turned.
+"""Axes of the lenses of each frame: those of the panorama, or turned by a stabiliser.
 
 A stabilised panorama keeps its heading while the camera turns below it: the lenses' axes are then
 those of the walk, up to how the camera is held, and what each frame's points say beside it.
@@ -29,21 +29,21 @@ from gsba.types import Counts, Keypoints, Landmarks, Solution
 
 logger = logging.getLogger(__name__)
 
-_MOST = 60_000  # observations that axes are found from
-_FIRST = 20_000  # the same of a first guess
-_YAWS = np.deg2rad([0.0, 45, 90, 135])  # of the axis that carries both lenses: a line
-TURNS = np.deg2rad([0.5, 1.5, 5.0])  # of frames' axes about where they were, standard deviation
-_STANDING = 0.1  # part of a typical step, below which a frame goes nowhere
+_MAX_OBSERVATIONS = 60_000  # observations that axes are found from
+_MAX_FIRST_OBSERVATIONS = 20_000  # observations for a first guess
+_YAWS_RAD = np.deg2rad([0.0, 45, 90, 135])  # of the line through both lenses, tried at first
+TURNS = np.deg2rad([0.5, 1.5, 5.0])  # prior standard deviations of a frame's turn
+_MIN_STEP_SHARE = 0.1  # part of a typical step, below which a frame counts as standing
 
 
 @dataclass(frozen=True, slots=True)
 class LensAxes:
-    """Where the lenses of each frame look."""
+    """Lenses with the axes of each frame."""
 
     lenses: Lenses  # with axes, if they are not the rig's
     gains: np.ndarray  # (PARTS,) float64, share of the robust cost of each part, of the sequence or
     # of its points, that lenses with these axes take off as others have them
-    reason: str  # why they are taken for the rig's, or for fixed ones; empty if not
+    reason: str  # why axes are those of the rig, or fixed ones; empty if they are not
     counts: Counts  # of observations
 
 
@@ -75,7 +75,7 @@ def guess(
         return np.concatenate(columns, axis=2)
 
     systems, counts = shared_parameters.models_of(
-        landmarks, _FIRST, keypoints, solved, context, by_centres
+        landmarks, _MAX_FIRST_OBSERVATIONS, keypoints, solved, context, by_centres
     )
     if not systems:
         return LensAxes(so_far, np.full(PARTS, np.nan), "too few points", counts)
@@ -86,7 +86,8 @@ def guess(
     shares = gains / np.array([part.cost for part in systems])
     logger.info("lens axes: gains %s %%", (100 * shares.mean(axis=1)).round(2).tolist())
     gain = gains[best] - np.maximum(gains[0], 0)
-    if not predicts(gain.sum(keepdims=True)):  # of all: no part is sure by axes held roughly so
+    if not predicts(gain.sum(keepdims=True)):  # of all parts together: with rough axes none is
+        # significant alone
         return LensAxes(so_far, shares[0], "they look as the panorama does", counts)
     return LensAxes(tried[best], shares[best], "", counts)
 
@@ -107,7 +108,7 @@ def loosened(
         so_far: two lenses whose axes are the rig's.
         context: loss, settings.
     """
-    used = drawn(landmarks, _MOST, context.settings.seed)
+    used = drawn(landmarks, _MAX_OBSERVATIONS, context.settings.seed)
     counts = sample_counts(landmarks, used)
     frames, num = keypoints.frames(), len(solved.world_T_rigs)
 
@@ -156,19 +157,19 @@ def upright(directions: np.ndarray) -> np.ndarray:
 
 
 def _newton_step(parts: Sequence[SharedModel]) -> np.ndarray:
-    """Centre (3,) that parts give, the loss's curvature left out."""
+    """Centre (3,) that minimises the cost of the parts, the loss's curvature left out."""
     total = summed(parts)
     damping = 1e-9 * np.trace(total.hessian) * np.eye(3)
     return -np.linalg.solve(total.hessian + damping, total.gradient)
 
 
 def _candidates(world_T_rigs: np.ndarray) -> list[np.ndarray]:
-    """Axes (F, 3, 3) that are tried, those of the rig first."""
+    """Candidate axes (F, 3, 3), those of the rig first."""
     fixed = np.tile([0.0, 0, 1], (len(world_T_rigs), 1))
     return [
         upright(directions @ Rotation.from_rotvec([0, yaw, 0]).as_matrix().T)
         for directions in (fixed, _headings(world_T_rigs))
-        for yaw in _YAWS
+        for yaw in _YAWS_RAD
     ]
 
 
@@ -178,7 +179,7 @@ def _headings(world_T_rigs: np.ndarray) -> np.ndarray:
     before, after = np.maximum(np.arange(num) - 1, 0), np.minimum(np.arange(num) + 1, num - 1)
     moved = world_T_rigs[after, :3, 3] - world_T_rigs[before, :3, 3]
     lengths = np.linalg.norm(moved, axis=1)
-    going = np.flatnonzero(lengths > _STANDING * np.median(lengths))
+    going = np.flatnonzero(lengths > _MIN_STEP_SHARE * np.median(lengths))
     if not len(going):
         return np.tile([0.0, 0, 1], (num, 1))
     nearest = going[np.abs(np.arange(num)[:, None] - going).argmin(axis=1)]

@@ -1,4 +1,4 @@
-"""The lenses' centres, found by the map: what crosses the seam, and how near and far things move.
+"""Centres of the lenses, estimated from points that cross the seam and from parallax.
 
 Points of the front half of the sphere are seen from one place, those of the back half from another.
 Two centres that parts of the sequence gain by are taken on trial: the map is matched and adjusted
@@ -27,36 +27,37 @@ from gsba.types import Counts, Keypoints, Landmarks, Solution
 
 logger = logging.getLogger(__name__)
 
-_MOST = 60_000  # observations that centres are found from
-_OF_MODEL = 0.005  # of the distance between lenses: its error where residuals promise none, as
-# measured on rendered walks (benchmarks/results/camera.md)
-_SIGNIFICANT = 5.0  # standard deviations from one centre, or there is one
-_ON_TRIAL = 2.0  # the same of centres that matches are found and judged with before they are taken
+_MAX_OBSERVATIONS = 60_000  # observations that centres are found from
+_MODEL_ERROR_SHARE = 0.005  # of the distance between lenses: its error where residuals promise
+# none, as measured on rendered walks (benchmarks/results/camera.md)
+_MIN_SIGMAS = 5.0  # least distance from one centre, in standard deviations
+_MIN_TRIAL_SIGMAS = 2.0  # that of centres on trial, with which matches are found before they are
+# judged
 
 
 @dataclass(frozen=True, slots=True)
 class LensCentres:
-    """Where the lenses are, as a map says."""
+    """Centres of lenses estimated by a map."""
 
-    lenses: Lenses  # one centre: none was taken
+    lenses: Lenses  # with one centre if none was taken
     found: np.ndarray  # (3 (L - 1),) float64, centres as `Lenses.centre`, map units, taken or not
     covariance: np.ndarray  # float64, of these, poses and points adjusted with it
     part_gains: np.ndarray  # (PARTS,) float64, share of the robust cost of each part of the
-    # sequence that the centre which other parts give takes off
-    reason: str  # why none was taken; empty if one was
+    # sequence that the centre of the other parts removes
+    reason: str  # why nothing was taken; empty if it was
     counts: Counts  # of observations
 
 
 @dataclass(frozen=True, slots=True)
 class StitchRadius:
-    """How far away panoramas take things to be."""
+    """Stitching radius: the distance at which panoramas have no parallax between lenses."""
 
     lenses: Lenses  # with inverse_stitch_radius, if it was taken
     inverse_stitch_radius: float  # 1 / map units, inverse of the radius, taken or not
     sigma: float
     part_gains: np.ndarray  # (PARTS,) float64, share of the robust cost of each part of the
-    # sequence that what other parts give takes off, beside centres alone
-    reason: str  # why none was taken; empty if one was
+    # sequence that the radius of the other parts removes, beside centres alone
+    reason: str  # why nothing was taken; empty if it was
 
 
 def estimate(
@@ -81,12 +82,12 @@ def estimate(
     def by_centre(rows: np.ndarray, by_origin: np.ndarray, _: np.ndarray) -> np.ndarray:
         return so_far.by_centre(by_origin, keypoints.bearings_rig[rows], frames[rows])
 
-    systems, counts = models_of(landmarks, _MOST, keypoints, solved, context, by_centre)
+    systems, counts = models_of(landmarks, _MAX_OBSERVATIONS, keypoints, solved, context, by_centre)
     whole = None
     if (
         not systems and so_far.reference_calibration is not None
-    ):  # raw pairs are of two, also where frames are few
-        whole = whole_model_of(landmarks, _MOST, keypoints, solved, context, by_centre)
+    ):  # raw pairs have two lenses, even where frames are few
+        whole = whole_model_of(landmarks, _MAX_OBSERVATIONS, keypoints, solved, context, by_centre)
     if not systems and whole is None:
         num = len(so_far.centre)
         unknown, nothing = np.full((num, num), np.nan), np.full(PARTS, np.nan)
@@ -102,11 +103,11 @@ def estimate(
     shares = verdict.shares if systems else np.full(PARTS, np.nan)
     strength = float(np.sqrt(found @ np.linalg.solve(covariance, found)))
     reason = ""
-    if chosen.model == "auto" and so_far.reference_calibration is None:  # raw pairs are of two
+    if chosen.model == "auto" and so_far.reference_calibration is None:  # raw pairs have two lenses
         # Matches that one centre has chosen hide the lenses from some parts of the sequence.
         if not (verdict.predicts if so_far else gains.sum() > 0):
             reason = "it does not predict parts of the sequence that it was not found from"
-        elif strength < (_SIGNIFICANT if so_far else _ON_TRIAL):
+        elif strength < (_MIN_SIGMAS if so_far else _MIN_TRIAL_SIGMAS):
             reason = f"one centre is as likely: {strength:.1f} standard deviations"
     where, untaken = np.array2string(found, precision=5), reason and f"; not taken: {reason}"
     gained = (
@@ -124,7 +125,7 @@ def baseline_of(centres: LensCentres, scale: float) -> tuple[float, float]:
     length = float(np.linalg.norm(half))
     along = half @ by_centres / max(length, 1e-300)
     sigma = float(np.sqrt(along @ centres.covariance @ along))
-    return 2 * scale * length, 2 * scale * float(np.hypot(sigma, _OF_MODEL * length))
+    return 2 * scale * length, 2 * scale * float(np.hypot(sigma, _MODEL_ERROR_SHARE * length))
 
 
 def stitched_for(
@@ -159,7 +160,7 @@ def stitched_for(
         by_near = by_inverse_stitch_radius(keypoints.bearings_rig[rows], starts)
         return np.concatenate([so_far.by_centre(by_origin, directions, there), by_near], axis=2)
 
-    systems, _ = models_of(landmarks, _MOST, keypoints, solved, context, by_both)
+    systems, _ = models_of(landmarks, _MAX_OBSERVATIONS, keypoints, solved, context, by_both)
     if not systems:
         return StitchRadius(so_far, 0.0, np.nan, np.full(PARTS, np.nan), "too few points")
     found, total, num = _step(systems), summed(systems), len(so_far.centre)
@@ -173,7 +174,7 @@ def stitched_for(
         "stitched for a inverse_stitch_radius of %.3f (sigma %.3f)", inverse_stitch_radius, sigma
     )
     reason = ""
-    if not verdict.predicts or inverse_stitch_radius < _SIGNIFICANT * sigma:
+    if not verdict.predicts or inverse_stitch_radius < _MIN_SIGMAS * sigma:
         reason = "as well stitched at infinity"
     taken = replace(
         so_far, centre=so_far.centre + found[:num], inverse_stitch_radius=inverse_stitch_radius
@@ -192,7 +193,7 @@ def by_inverse_stitch_radius(bearings_rig: np.ndarray, origins_rig: np.ndarray) 
 
 
 def _step(systems: Sequence[SharedModel]) -> np.ndarray:
-    """Change of the parameters (K,) that the parts ask for."""
+    """Change of the parameters (K,) that minimises the cost of the parts."""
     total = summed(systems)
     hessian = total.curvature * total.hessian
     damping = 1e-9 * np.trace(hessian) * np.eye(len(hessian))

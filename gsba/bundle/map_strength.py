@@ -1,4 +1,4 @@
-"""How well the images hold a map: where to look closer, and what is left for the trajectory to say.
+"""Strength of a map: how well images alone determine it, and where the trajectory must help.
 
 Along a path the scale is handed on from step to step by the points that three frames see. Where
 these are few, or far, all that lies behind may be larger or smaller, and turned: a walk that does
@@ -16,23 +16,25 @@ from gsba.config import PriorSettings, RefineSettings
 from gsba.geometry import inverse, rotation_angle, step_covariances
 from gsba.types import Counts, JointErrors, StepNoise
 
-_HELD = 0.25  # of a prior's standard deviation, in any direction: it then has a say of 6 %
-_LEAST_STEPS = 8  # held ones, to estimate a noise from
-_LEAST_NOISE = 0.1  # of the settings' noise
+_MAX_HELD_SHARE = 0.25  # largest share of a prior's standard deviation in any direction: the prior
+# then weighs 6 %
+_MIN_HELD_STEPS = 8  # least number of held steps from which the trajectory's noise is estimated
+_MIN_NOISE_RATIO = 0.1  # least estimate, part of the settings' noise
 
 
 @dataclass(frozen=True, slots=True)
 class MapStrength:
-    """What the images hold of a map, and how well."""
+    """Uncertainty of a map by its images alone."""
 
     scale_sigmas: np.ndarray  # (F - 2,) float64, of the logarithm of a step's length over that of
     # the step before it, at the frame between them; NaN = not known
     drift: np.ndarray  # (C,) float64, rms error of positions to be expected of each map after the
     # best similarity, part of its path
-    weak: np.ndarray  # (F,) bool, frames at or near places that hand the scale on poorly, in maps
+    weak: np.ndarray  # (F,) bool, frames at or near places where the scale is uncertain, in maps
     # that drift
-    held_steps: np.ndarray  # (F - 1,) bool, known far better than the trajectory knows them
-    noise: StepNoise | None  # of the trajectory's steps; None = too few are held to tell
+    held_steps: np.ndarray  # (F - 1,) bool, steps whose covariance is far below the trajectory's
+    noise: StepNoise | None  # of the trajectory's steps; None = too few steps are held to estimate
+    # it
     counts: Counts  # of priors on the trajectory's steps
 
 
@@ -46,7 +48,7 @@ def measure(
     settings: RefineSettings,
     components: np.ndarray | None = None,
 ) -> MapStrength:
-    """Judge a solution by the joint covariance of its poses under priors next to nothing.
+    """Judge a solution by the joint covariance of its poses under negligible priors.
 
     Args:
         world_T_rigs: (F, 4, 4).
@@ -116,14 +118,14 @@ def _held(
     found = found / allowed[:, :, None] / allowed[:, None, :]
     known = np.isfinite(found).all(axis=(1, 2))
     found[~known] = np.eye(6)
-    return known & (np.linalg.eigvalsh(found)[:, -1] < _HELD**2)
+    return known & (np.linalg.eigvalsh(found)[:, -1] < _MAX_HELD_SHARE**2)
 
 
 def _noise(
     world_T_rigs: np.ndarray, coarse: np.ndarray, held: np.ndarray, priors: PriorSettings
 ) -> StepNoise | None:
     """Robust spread of the trajectory's steps about those that the images hold."""
-    if np.count_nonzero(held) < _LEAST_STEPS:
+    if np.count_nonzero(held) < _MIN_HELD_STEPS:
         return None
     found, given = (inverse(some[:-1])[held] @ some[1:][held] for some in (world_T_rigs, coarse))
     turned = rotation_angle(np.swapaxes(given[:, :3, :3], 1, 2) @ found[:, :3, :3])
@@ -134,4 +136,4 @@ def _noise(
     medians = np.median(turned), np.median(off), np.median(np.abs(logs - np.median(logs)))
     spreads = np.array(medians) / (1.5382, 1.1774, 0.6745)  # of normal errors in 3, 2 and 1 axes
     least = np.array([np.deg2rad(priors.rotation_deg), priors.translation, priors.translation])
-    return StepNoise(*np.maximum(spreads, _LEAST_NOISE * least).tolist())
+    return StepNoise(*np.maximum(spreads, _MIN_NOISE_RATIO * least).tolist())

@@ -21,29 +21,31 @@ from gsba.types import Counts, GyroConstraints, Keypoints, Landmarks, Solution
 
 logger = logging.getLogger(__name__)
 
-_MOST = 60_000  # observations that it is found from
-_SIGNIFICANT = 4.0  # standard deviations of the duration, or none was found
-_OWN_TURN = np.deg2rad(0.12)  # rotation during a readout, standard deviation per axis
-_UNTURNED = np.deg2rad(0.005)  # the same where a stabiliser took it out of every row
-_OWN_MOVE = 0.3  # the same of a translation about what velocities say, part of a typical one
-_ROW_SCALE_SIGMA = 0.03  # relative; a stitched picture does not tell the distortion and the field
-# of view of its lenses, on which it hangs how many rows lie between two directions
+_MAX_OBSERVATIONS = 60_000  # observations that the readout is estimated from
+_MIN_SIGMAS = 4.0  # least duration that is taken, in its standard deviations
+_ROTATION_SIGMA_RAD = np.deg2rad(0.12)  # rotation during a readout, standard deviation per axis
+_STABILISED_ROTATION_SIGMA_RAD = np.deg2rad(0.005)  # that where a stabiliser has removed it from
+# every row
+_TRANSLATION_SIGMA_SHARE = 0.3  # standard deviation of a translation about that by the velocity,
+# part of a typical translation
+_ROW_SCALE_SIGMA = 0.03  # relative; the distortion and field of view of lenses, which give the
+# number of rows between two directions, are not known from a stitched picture
 _MIN_PAUSE_INTERVALS = 50.0  # median intervals between frames; a longer one is a pause
 _AXES = np.eye(3)[:2]
 
 
 @dataclass(frozen=True, slots=True)
 class CameraEstimate:
-    """How frames move while they are read."""
+    """Estimate of a camera: its lenses, readout time, and motion of frames during the readout."""
 
     lenses: Lenses  # with row_directions and readout_motion, if they were taken
-    readout_s: float = float("nan")  # from first to last row; NaN = not known
+    readout_s: float = float("nan")  # readout time from the first to the last row; NaN = not known
     readout_sigma: float = float("nan")
-    own_sigmas: np.ndarray | None = None  # (6,) float64, of what frames move beside their velocity,
-    # as found, [rotation rad, translation map units]; None = not found yet
+    own_sigmas: np.ndarray | None = None  # (6,) float64, estimated spread of frames' motion about
+    # their velocity, [rotation rad, translation map units]; None = not estimated yet
     gains: np.ndarray = field(default_factory=lambda: np.full(PARTS, np.nan))  # (PARTS,) float64,
-    # share of the robust cost of each part that the duration which other parts give takes off
-    reason: str = ""  # why none was taken; empty if one was
+    # share of the robust cost of each part that the duration of the other parts removes
+    reason: str = ""  # why no readout was taken; empty if one was
     by_gyro: bool | None = None  # whether rotations are held to a gyro's; None = there is none
     counts: Counts = field(default_factory=lambda: Counts(0, 0, "observations"))
 
@@ -80,7 +82,9 @@ def estimate(
         moved = np.einsum("oij,oj->oi", by_origin, moving)
         return moved[:, :, None] * times[rows, None, :]
 
-    systems, counts = models_of(landmarks, _MOST, keypoints, solved, context, by_duration)
+    systems, counts = models_of(
+        landmarks, _MAX_OBSERVATIONS, keypoints, solved, context, by_duration
+    )
     if not systems:
         return CameraEstimate(lenses, reason="too few points to tell rows apart", counts=counts)
     of_ways = [[part.of(slice(way, way + 1)) for part in systems] for way in range(len(ways))]
@@ -90,7 +94,7 @@ def estimate(
     sign = -1.0 if duration < 0 else 1.0  # rows are read the other way
     found = CameraEstimate(lenses, abs(duration), sigma, gains=verdict.shares, counts=counts)
     logger.info("readout: %.2f ms (sigma %.2f)", 1e3 * abs(duration), 1e3 * sigma)
-    if not verdict.predicts or abs(duration) < _SIGNIFICANT * sigma:
+    if not verdict.predicts or abs(duration) < _MIN_SIGMAS * sigma:
         return replace(found, reason="motion during the readout does not predict unseen parts")
     if context.settings.camera.sweep is not None and duration < 0:
         return replace(found, reason="rows are read the other way than camera.sweep says")
@@ -112,12 +116,12 @@ def total_sigma(found: CameraEstimate, sigma: float) -> float:
 
 
 def own_sigmas(found: CameraEstimate, motion: np.ndarray) -> np.ndarray:
-    """Standard deviations (6,) of what frames move meanwhile beside their velocities (F, 6)."""
+    """Standard deviations (6,) of frames' motion during readout about their velocities (F, 6)."""
     if found.own_sigmas is not None:
         return found.own_sigmas
     likely = found.readout_s * np.linalg.norm(motion[:, 3:], axis=1)
-    move = max(_OWN_MOVE * float(np.median(likely)), 1e-12)
-    turn = _OWN_TURN if found.lenses.axes is None else _UNTURNED
+    move = max(_TRANSLATION_SIGMA_SHARE * float(np.median(likely)), 1e-12)
+    turn = _ROTATION_SIGMA_RAD if found.lenses.axes is None else _STABILISED_ROTATION_SIGMA_RAD
     return np.repeat([turn, move], 3)
 
 
@@ -131,7 +135,7 @@ def _offsets(landmarks: Landmarks, keypoints: Keypoints, solved: Solution) -> np
 
 
 def turning_of(lenses: Lenses, context: AdjustmentContext) -> GyroConstraints | None:
-    """What a gyro says of the frames' turning; None where a stabiliser took it out of them."""
+    """Rotation rates of the frames by a gyro; None where a stabiliser has removed rotations."""
     return None if lenses.axes is not None else context.turning
 
 
@@ -158,20 +162,20 @@ def velocities(
 
 
 def _newton_step(parts: Sequence[SharedModel]) -> np.ndarray:
-    """Duration (1,) that parts give for one way of reading, the loss's curvature left out."""
+    """Duration (1,) by these parts for one row direction, the loss's curvature left out."""
     total = summed(parts)
     return -total.gradient / np.maximum(total.hessian[0], 1e-300)
 
 
 def _duration(parts: Sequence[SharedModel]) -> tuple[float, float]:
-    """Duration that parts give for one way of reading, and its standard deviation, seconds."""
+    """Duration by these parts for one row direction, and its standard deviation, seconds."""
     total = summed(parts)
     curved = max(float(total.hessian[0, 0]), 1e-300)
     return -float(total.gradient[0]) / curved / total.curvature, (total.curvature * curved) ** -0.5
 
 
 def _ways(camera: CameraSettings, lenses: Lenses) -> list[np.ndarray]:
-    """Ways (L, 3) in which the lenses can be read, up to all of them reversed."""
+    """Row directions (L, 3) that lenses may have, up to all of them reversed."""
     num = lenses.num_lenses
     signs = [np.array([[1.0, *rest]]).T for rest in product((1.0, -1.0), repeat=num - 1)]
     if lenses.reference_calibration is not None:

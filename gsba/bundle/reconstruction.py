@@ -15,8 +15,9 @@ from gsba.types import (
     Solution,
 )
 
-_ALIKE = 0.1  # least correlation of refined and coarse positions: a walk and its drift have .8
-_MOST_RESIDUAL_DEG = 10.0  # median: gates leave a tenth of a degree, a failure anything
+_MIN_CORRELATION = 0.1  # least correlation of refined and coarse positions: with usual drift it is
+# .8
+_MAX_RESIDUAL_DEG = 10.0  # largest median residual: gates leave a tenth of a degree
 
 
 def assemble(
@@ -96,7 +97,7 @@ def world_scale(solved: Solution, result: Reconstruction) -> float:
 def _require_small(errors: np.ndarray) -> None:
     """GsbaError for residuals (O,) in radians that cannot be those of a solution."""
     median = float(np.degrees(np.median(errors))) if len(errors) else 0.0
-    if not median <= _MOST_RESIDUAL_DEG:
+    if not median <= _MAX_RESIDUAL_DEG:
         raise GsbaError(
             f"the solution fell apart (median residual {median:.1f} deg): nothing is written; "
             "check that frames and trajectory belong together, or refine without it "
@@ -128,7 +129,7 @@ def _placed(
         inside = groups == group
         chosen = known & inside if np.count_nonzero(known & inside) > 1 else inside
         try:
-            move = pose_similarity(poses[chosen], target_T_rigs[chosen], _ALIKE)
+            move = pose_similarity(poses[chosen], target_T_rigs[chosen], _MIN_CORRELATION)
         except NoSimilarityError as error:
             if group == 0:
                 raise GsbaError(

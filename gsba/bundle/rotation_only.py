@@ -20,8 +20,8 @@ logger = logging.getLogger(__name__)
 _ITERATIONS = 30
 _CONVERGED = 1e-9  # radians
 _LOSS_SIGMAS = 2.0  # Cauchy
-_OUTLIER_SIGMAS = 10.0  # of the loss's scale at the start
-_COLUMNS = 384  # of the inverse at a time
+_OUTLIER_SIGMAS = 10.0  # of the noise, scale of the loss at the start
+_COLUMNS = 384  # columns of the inverse computed at a time
 
 
 def refine(
@@ -124,7 +124,7 @@ def _system(
     values = jacobian.reshape(-1)
     shape = (2 * count, 3 * num)
     whitened = csr_matrix((values, (rows, columns.reshape(-1))), shape=shape)
-    # Each track's direction takes the mean: subtract what it explains.
+    # Each track's direction is eliminated: it is the mean of its rays.
     roots = np.sqrt(weights) / sigmas
     member = 2 * np.repeat(found.points, 2) + np.tile([0, 1], count)
     gather = csr_matrix(

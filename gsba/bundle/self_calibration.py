@@ -29,12 +29,14 @@ from gsba.types import Counts, Keypoints, Landmarks, Solution
 
 logger = logging.getLogger(__name__)
 
-_MOST = 60_000  # observations that it is found from
-_PLACES = 500  # on the sphere, at which calibrations are compared
-_TURN = 3  # of the parameters of a lens, the last ones
+_MAX_OBSERVATIONS = 60_000  # observations that lenses are calibrated from
+_NUM_DIRECTIONS = 500  # directions at which two calibrations are compared
+_TURN = 3  # number of the last parameters of a lens, its rotation
 OF_FRONT = PARAMETERS - _TURN  # parameters of the front lens
-_SIGMAS = np.array([0.05, 0.02, 0.02, 0.05, 0.02, 0.005, 0.001, 0.03, 0.03, 0.03])  # of a lens
-_DETERMINED = 0.5  # of such a standard deviation, at most, that remains of what is determined
+_SIGMAS = np.array([0.05, 0.02, 0.02, 0.05, 0.02, 0.005, 0.001, 0.03, 0.03, 0.03])  # prior standard
+# deviations of a lens
+_MAX_SIGMA_SHARE = 0.5  # largest share of its prior standard deviation that a determined parameter
+# keeps
 _GROUPS = {  # parameters of each lens
     "focal lengths": [0],
     "principal points": [1, 2],
@@ -45,14 +47,15 @@ _GROUPS = {  # parameters of each lens
 
 @dataclass(frozen=True, slots=True)
 class SelfCalibration:
-    """What lenses are, as a map says."""
+    """Lenses calibrated by a map."""
 
-    lenses: Lenses  # with fisheyes of its own, if they were taken
+    lenses: Lenses  # with the estimated fisheyes, if they were taken
     part_gains: np.ndarray  # (PARTS,) float64, share of the robust cost of each part of the
-    # sequence that what other parts give takes off, beside centres alone
-    reason: str  # why none was taken; empty if one was
+    # sequence that the calibration of the other parts removes, beside centres alone
+    reason: str  # why no calibration was taken; empty if one was
     counts: Counts  # of observations
-    undetermined: tuple[str, ...] = ()  # what observations hardly tell more of than priors
+    undetermined: tuple[str, ...] = ()  # parameters that observations hardly determine beyond their
+    # priors
 
 
 def estimate(
@@ -64,7 +67,7 @@ def estimate(
     context: AdjustmentContext,
     nominal: bool = False,
 ) -> SelfCalibration:
-    """Find what lenses are from a map, poses, points and their centre adjusted with them.
+    """Calibrate lenses by a map, poses, points and lens centres adjusted with them.
 
     Args:
         landmarks: points and their observations.
@@ -81,11 +84,13 @@ def estimate(
         own = by_lenses(keypoints.bearings_rig[rows], shown[rows], so_far, residuals)
         return np.concatenate([own, so_far.by_centre(by_origin, shown[rows], frames[rows])], axis=2)
 
-    systems, counts = models_of(landmarks, _MOST, keypoints, solved, context, by_both)
+    systems, counts = models_of(landmarks, _MAX_OBSERVATIONS, keypoints, solved, context, by_both)
     off = from_calibrated(so_far)
     if nominal:
         whole = summed(systems) if systems else None
-        whole = whole or whole_model_of(landmarks, _MOST, keypoints, solved, context, by_both)
+        whole = whole or whole_model_of(
+            landmarks, _MAX_OBSERVATIONS, keypoints, solved, context, by_both
+        )
         if whole is not None:
             return _of_nominal(whole, so_far, off, counts)
     if not systems:
@@ -115,7 +120,7 @@ def estimate(
 def _of_nominal(
     system: SharedModel, so_far: Lenses, off: np.ndarray, counts: Counts
 ) -> SelfCalibration:
-    """What plain lenses of unknown make turn out to be, where focal lengths are determined.
+    """Calibration of plain lenses of unknown make, where focal lengths are determined.
 
     Args:
         system: of all observations.
@@ -146,7 +151,7 @@ def _of_nominal(
 def undetermined(sigmas: np.ndarray) -> tuple[str, ...]:
     """Groups of parameters whose standard deviations (K,) the adjustment hardly lowers."""
     num = num_lenses_of(len(sigmas))
-    loose = np.asarray(sigmas) > _DETERMINED * spread(num)
+    loose = np.asarray(sigmas) > _MAX_SIGMA_SHARE * spread(num)
     starts = [0, *(first_of(lens) for lens in range(1, num))]
     found = []
     for name, rows in _GROUPS.items():
@@ -188,7 +193,7 @@ def by_lenses(
     lenses: Lenses,
     residuals: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Jacobian (O, 2, K) of residuals of bearings by what lenses are.
+    """Jacobian (O, 2, K) of residuals of bearings by the parameters of lenses.
 
     Noise is of pixels: it is an angle that shrinks where a focal length grows, and least squares of
     angles would prefer long ones. Taken where points are predicted, not where they were observed,
@@ -214,7 +219,7 @@ def by_lenses(
 
 
 def moved(lenses: Lenses, step: np.ndarray) -> Lenses:
-    """Lenses after a step (K,) of what `by_lenses` differentiates by."""
+    """Lenses after a step (K,) of the parameters of `by_lenses`."""
     front, *others = now(lenses)
     steps = np.split(step, [first_of(lens) for lens in range(1, lenses.num_lenses)])
     found = [changed(front, np.concatenate([steps[0], np.zeros(_TURN)]))]
@@ -233,10 +238,10 @@ def from_calibrated(lenses: Lenses) -> np.ndarray:
 
 
 def apart(one: Lenses, other: Lenses) -> float:
-    """How differently two calibrations of raw pairs take pixels, radians rms over the sphere."""
+    """Difference of two calibrations of raw lenses in bearings of pixels, radians rms."""
     if one.reference_calibration is None or one.fisheyes == other.fisheyes:
         return 0.0
-    places = np.random.default_rng(0).normal(size=(_PLACES, 3))
+    places = np.random.default_rng(0).normal(size=(_NUM_DIRECTIONS, 3))
     places /= np.linalg.norm(places, axis=1, keepdims=True)
     there = recalibrated(places, now(one), now(other))
     return float(np.sqrt(np.mean(np.sum((there - places) ** 2, axis=1))))
@@ -249,14 +254,14 @@ def now(lenses: Lenses) -> Rig:
 
 
 def _pull(num: int, off: np.ndarray) -> np.ndarray:
-    """Information (num,) on lenses and centres, from what lenses were calibrated as."""
+    """Prior information (num,) on lenses and centres, about their calibration."""
     pull = np.zeros(num)
     pull[: len(off)] = spread(num_lenses_of(len(off))) ** -2
     return pull
 
 
 def _step(systems: list[SharedModel], off: np.ndarray) -> np.ndarray:
-    """Change (K + 3 (L - 1),) of lenses and centres that the parts ask for."""
+    """Change (K + 3 (L - 1),) of lenses and centres that minimises the cost of the parts."""
     total = summed(systems)
     num = len(total.gradient)
     pull, whole = _pull(num, off), np.zeros(num)
@@ -278,7 +283,7 @@ def _shown(values: np.ndarray) -> str:
 
 
 def _centre_step(systems: list[SharedModel], num: int) -> np.ndarray:
-    """Change (3 (L - 1),) of the centres that the parts ask for alone, K parameters of lenses
+    """Change (3 (L - 1),) of the centres that minimises the parts' cost, K parameters of lenses
     held."""
     total = summed([each.of(slice(num, None)) for each in systems])
     return -np.linalg.solve(total.curvature * total.hessian, total.gradient)

@@ -1,4 +1,4 @@
-"""Whether another round of measuring and solving still moves poses by more than their noise."""
+"""Motion of poses by a round of adjustment, in their own standard deviations."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation

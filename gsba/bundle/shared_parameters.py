@@ -1,4 +1,4 @@
-"""Parameters that all frames share: what parts of the sequence say of them, the rest adjusted.
+"""Parameters that all frames share: models of each part of the sequence, poses and points adjusted.
 
 A part's cost is a quadratic function of the parameters once its points and poses are eliminated.
 Sums of other parts' models give parameters, and the part itself says what they are worth: they are
@@ -21,11 +21,11 @@ from gsba.types import Counts, Keypoints, Landmarks, Solution, Tracks
 
 BySharedParameters = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
-PARTS = 4  # of the sequence: each is predicted by what the others give
+PARTS = 4  # parts of the sequence: each is predicted by the others
 _LEAST_FRAMES = 2 * PARTS
-_LEAST_POINTS = 50  # of a part
+_MIN_POINTS = 50  # least number of points of a part
 _POSE_DAMPING = 1e-4  # of the poses' information, against the map's free similarity
-_LEAST_CURVATURE = 0.3  # or a step would go further than its model holds
+_MIN_CURVATURE = 0.3  # lower curvatures give steps beyond the reach of the model
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +35,8 @@ class SharedModel:
     cost: float  # at no parameters
     gradient: np.ndarray  # (K,) there
     hessian: np.ndarray  # (K, K), by the weights of the robust loss
-    curvature: float = 1.0  # of that loss, part of its weights': steps by the Hessian fall as short
+    curvature: float = 1.0  # of the loss, part of its weights: steps by the Hessian are too short
+    # by it
 
     def gain(self, parameters: np.ndarray) -> float:
         """Decrease of the cost by these first parameters."""
@@ -94,7 +95,7 @@ def of_points(landmarks: Landmarks, chosen: np.ndarray) -> Landmarks:
 def parts_of(landmarks: Landmarks) -> list[Landmarks]:
     """The points of each part of the sequence; no part where there is too little."""
     tracks = landmarks.tracks
-    if len(np.unique(tracks.frames)) < _LEAST_FRAMES or tracks.num_points < _LEAST_POINTS * PARTS:
+    if len(np.unique(tracks.frames)) < _LEAST_FRAMES or tracks.num_points < _MIN_POINTS * PARTS:
         return []
     seen = np.bincount(tracks.points, minlength=tracks.num_points)
     means = np.bincount(tracks.points, tracks.frames, tracks.num_points) / np.maximum(seen, 1)
@@ -105,7 +106,7 @@ def parts_of(landmarks: Landmarks) -> list[Landmarks]:
 
 @dataclass(frozen=True, slots=True)
 class Weighted:
-    """Bearings' residuals under a robust loss, points at their best."""
+    """Residuals of bearings under a robust loss, points at their optimum."""
 
     rows: np.ndarray  # (O,) of the keypoints
     residuals: np.ndarray  # (O, 2) radians
@@ -138,7 +139,7 @@ def weighted(
     weights = loss.weights(squares)
     curvature = float(np.sum(loss.curvatures(squares))) / max(float(np.sum(weights)), 1e-300)
     roots = np.sqrt(weights)[:, None, None] * roots / solved.noise
-    return Weighted(rows, residuals, by_pose, by_point, roots, max(curvature, _LEAST_CURVATURE))
+    return Weighted(rows, residuals, by_pose, by_point, roots, max(curvature, _MIN_CURVATURE))
 
 
 def models_of(
@@ -267,7 +268,7 @@ def without_points(
 def by_origin(
     seen: Weighted, world_R_rigs: np.ndarray, bearings_rig: np.ndarray, inverse_stitch_radius: float
 ) -> np.ndarray:
-    """Jacobian (O, 2, 3) of residuals by where rays start, rig frame, and point by what they show.
+    """Jacobian (O, 2, 3) of residuals by the origin of rays, rig frame, and by their direction.
 
     Args:
         seen: the residuals.

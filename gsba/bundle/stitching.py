@@ -1,4 +1,4 @@
-"""What the camera's calibration and stitching bend: a field fixed to the rig, found by the map."""
+"""Stitching field: displacements of bearings by calibration and stitching, fixed to the rig."""
 
 import logging
 from dataclasses import dataclass, replace
@@ -17,10 +17,10 @@ from gsba.types import Counts, Keypoints, Round, Sighted, Solution
 
 logger = logging.getLogger(__name__)
 
-_SPREADS = (1e-4, 3e-4, 1e-3, 3e-3)  # radians: a priori, of coefficients of degree 1; falls with
-# the square of the degree
-_GOOD_ENOUGH = 0.95  # of the best gain: the smoothest field that reaches it is taken
-_MOST = 60_000  # observations that a field is found from
+_PRIOR_SIGMAS_RAD = (1e-4, 3e-4, 1e-3, 3e-3)  # radians: a priori, of coefficients of degree 1;
+# falls with the square of the degree
+_MIN_GAIN_SHARE = 0.95  # share of the best gain: the smoothest field that reaches it is taken
+_MAX_OBSERVATIONS = 60_000  # observations that a field is found from
 _PROBE = 20_000, 4  # observations and degree of a first look: half the gain must show there
 
 
@@ -44,7 +44,7 @@ class Stitching:
 
 
 def corrected(keypoints: Keypoints, field: SphereField, rig: CubeRig) -> Keypoints:
-    """Keypoints where they really point: bearings, faces, pixels and noise."""
+    """Keypoints with the field removed: bearings, faces, pixels and noise."""
     if not field:
         return keypoints
     bearings, roots = field.corrected(keypoints.bearings_rig), keypoints.sqrt_infos
@@ -88,7 +88,7 @@ def estimate(
     """
     settings = context.settings
     chosen = settings.stitching
-    whole = _MOST, chosen.max_degree, chosen.min_gain
+    whole = _MAX_OBSERVATIONS, chosen.max_degree, chosen.min_gain
     probe = _PROBE[0], min(_PROBE[1], chosen.max_degree), 0.5 * chosen.min_gain
     now = Stitching(field, before, keypoints, 0, np.zeros(PARTS), Counts(0, 0, "observations"))
     systems, spread = [], 0.0
@@ -103,7 +103,7 @@ def estimate(
             return now
     for number in range(chosen.rounds):
         if number:
-            systems, _ = _systems(now, _MOST, chosen.max_degree, context, lenses)
+            systems, _ = _systems(now, _MAX_OBSERVATIONS, chosen.max_degree, context, lenses)
         field = SphereField(_fitted(systems, now.degree, spread))
         straight = corrected(sighted.keypoints, field, context.rig)
         there = replace(sighted, keypoints=lenses.seen(straight))
@@ -136,7 +136,7 @@ def _by_field(keypoints: Keypoints, there: Keypoints, max_degree: int) -> ByShar
 
 
 def _fitted(systems: list[SharedModel], degree: int, spread: float) -> np.ndarray:
-    """Coefficients (K,) of the field that the parts ask for, drawn to none."""
+    """Coefficients (K,) of the field that minimise the cost of the parts, with a prior of zero."""
     num = num_harmonics(degree)
     pull = degrees_of(num) ** 4 / spread**2
     gradient = sum(part.gradient[:num] for part in systems)
@@ -148,11 +148,11 @@ def _choose(systems: list[SharedModel], max_degree: int) -> tuple[int, float, np
     """Degree and spread of the smoothest field that predicts parts well, and the parts' gains."""
     tried = [
         (degree, spread, _validated(systems, degree, spread).gains)
-        for spread in _SPREADS
+        for spread in _PRIOR_SIGMAS_RAD
         for degree in range(1, max_degree + 1)
     ]
     best = max(gains.sum() for _, _, gains in tried)
-    return next(trial for trial in tried if trial[2].sum() >= min(_GOOD_ENOUGH * best, best))
+    return next(trial for trial in tried if trial[2].sum() >= min(_MIN_GAIN_SHARE * best, best))
 
 
 def _validated(systems: list[SharedModel], degree: int, spread: float) -> Verdict:

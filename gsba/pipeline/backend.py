@@ -1,4 +1,4 @@
-"""The back end of a run: from matches to poses and points, and what refines these further."""
+"""The back end of a run: from matches to poses and points, and their refinement by pixels."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -153,7 +153,7 @@ def merge_maps(state: State, parts: np.ndarray) -> State:
 
 
 def measure_strength(state: State) -> State:
-    """What images hold well goes without priors; the rest are worth what the others show."""
+    """Measure the map by images alone: well-determined steps lose their prior, others get noise."""
     run, prior, solution = state.run, state.prior, state.solution
     limits, trust = run.settings.weak_frames, prior.trust
 

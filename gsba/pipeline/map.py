@@ -20,10 +20,10 @@ from gsba.types import FrameSet, Keypoints, Solution
 
 @dataclass(frozen=True, slots=True)
 class Map:
-    """Poses, points and what they are made of; optional stages give another one."""
+    """Poses, points, their observations and the camera; optional stages replace it."""
 
     solution: Solution
-    observed: Keypoints  # what it is made of, as observed
+    observed: Keypoints  # keypoints that it is made of, as pictures show them
     frame_weights: np.ndarray  # (F,) float64, of each frame's pixels; below 1 they are doubted
     aligned: np.ndarray | None = None  # (N,) bool, observations that patches have confirmed
     normals_rig: np.ndarray | None = None  # (N, 3) of the surfaces they show, 0 = unknown

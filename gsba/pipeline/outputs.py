@@ -134,7 +134,7 @@ def _reasons(prior: Prior) -> tuple[str, ...]:
 def _calibration(
     rig: Rig, world: Map, result: Reconstruction, lenses: Lenses, settings: RefineSettings
 ) -> dict[str, Any]:
-    """The content of calibration.json: raw lenses as found, for another run."""
+    """Content of calibration.json: the estimated raw lenses, to be given to another run."""
     baseline, metres = settings.camera.baseline(), None
     if baseline is not None and result.lens_baseline is not None:
         metres = metres_per_unit(result.lens_baseline, baseline)[0]

@@ -1,4 +1,4 @@
-"""Rounds of a run below a pixel: patches aligned, camera and poses solved by them, straightened."""
+"""Rounds of patch alignment: patches aligned, camera and poses adjusted, stitching removed."""
 
 import logging
 from collections.abc import Sequence
@@ -14,11 +14,11 @@ from gsba.types import Keypoints, Sighted, Solution
 
 logger = logging.getLogger(__name__)
 
-_SETTLED_SIGMAS = 1.0  # of steps: poses that a round moves by less are left there
+_SETTLED_SIGMAS = 1.0  # rms motion of steps by a round, below which rounds end
 
 
 def align(state: State) -> State:
-    """Rounds of patches aligned and the map solved anew: more where images hold it poorly."""
+    """Align patches and adjust in rounds; more of them where images determine the map poorly."""
     settings, before = state.run.settings.patches, state
     most = settings.rounds
     if most and state.prior.weak_frames().any():
@@ -66,7 +66,7 @@ def _adjust_under_lenses(state: State, sighted: Sighted, number: int) -> State |
 
 
 def _align(state: State, name: str) -> Sighted:
-    """Points observed anew."""
+    """Observations of the map's points by aligned patches."""
     run, map_, settings = state.run, state.map, state.run.settings.patches
 
     def compute() -> Sighted:
@@ -124,7 +124,7 @@ def carried(state: State, sighted: Sighted, solved: Solution, keypoints: Keypoin
 
 
 def _straighten(state: State, sighted: Sighted, number: int) -> State:
-    """The map with what stitching bends taken out, where all frames share it."""
+    """Remove the stitching field that all frames share."""
     run, map_, settings = state.run, state.map, state.run.settings
     looked_for = number == 1 or map_.field
     stitched = run.frames.layout in ("erp", "eac")
@@ -143,7 +143,7 @@ def _straighten(state: State, sighted: Sighted, number: int) -> State:
         return replace(state, map=replace(map_, stitching=found))
     if not found.adjustment.carries(map_.solution, settings.rounds.min_observations):
         return state
-    if map_.stitching is not None:  # what it gained is known best from where none was
+    if map_.stitching is not None:  # its gain is measured against no field
         found = replace(found, part_gains=map_.stitching.part_gains)
     map_ = replace(map_, solution=found.adjustment, observed=found.keypoints, stitching=found)
     return replace(state, map=map_)

@@ -1,4 +1,4 @@
-"""What is believed of the trajectory: what it says itself, and what images add and take away."""
+"""The prior of a run: the trajectory, and the parts of it that images confirm or contradict."""
 
 from dataclasses import dataclass, replace
 
@@ -22,23 +22,23 @@ _MIN_DEFINING_POSES = 3  # of a recording's trajectory, that define the world of
 
 @dataclass(frozen=True, slots=True)
 class Prior:
-    """What is believed of the trajectory; its factors and the start follow from that."""
+    """The trajectory with its checks by images; prior factors and the start follow from it."""
 
     coarse: CoarsePoses  # the trajectory at the frames' times
-    trust: StepChecks  # which of its steps hold, and where to start instead
+    trust: StepChecks  # steps that images confirm, and poses to start from
     clock: ClockEstimate | None = None  # None = not checked
     joints: tuple[SegmentAlignment, ...] = ()  # of pieces of the trajectory
     parts: np.ndarray | None = None  # (F,) int64, parts that nothing ties together; None = one
     merged: Registered | None = None  # parts of the map, joined; None = it never was in parts
     strength: MapStrength | None = None  # of the map, by images alone; None = not measured
     gyro: Alignment | None = None  # of the sensor that rides along; None = there is none
-    turning: GyroConstraints | None = None  # what it says of the frames; None = it is not believed
+    turning: GyroConstraints | None = None  # its constraints on frames; None = images contradict it
     of_recordings: tuple["Prior", ...] = ()  # of each of several recordings, before they were
     # combined: clocks and gyros of their own; () = there is one recording
 
     @classmethod
     def of(cls, coarse: CoarsePoses) -> "Prior":
-        """The trajectory, believed as it is."""
+        """The trajectory as it was read, with all steps confirmed."""
         return cls(coarse, StepChecks.of_all(coarse.world_T_rigs))
 
     @property

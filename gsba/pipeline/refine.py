@@ -143,7 +143,7 @@ def refine_from(
     source: Path,
     walk: Odometry | None,
 ) -> RunResult:
-    """A run from its frames to what it leaves behind.
+    """Run all stages, from frames to written outputs.
 
     Args:
         given: the evidence that does not depend on the frames.
@@ -203,7 +203,7 @@ def _begin(store: RunStore, settings: RefineSettings, chosen: merging.Choice, st
 def _without_distractors(
     store: RunStore, settings: RefineSettings, start: Start, journal: Journal
 ) -> FrameSet:
-    """Frames without what a first solution, plainer than the last, does not explain."""
+    """Mask what a first, plainer solution does not explain."""
     # Drift over the whole path does not show in what frames near one another do not explain.
     near = tuple(family for family in start.evidence.families if not family.limits_drift)
     frames, evidence = start.frames, replace(start.evidence, imu=None, families=near)
@@ -229,7 +229,8 @@ def _solve_raw(run: Run) -> State:
     known = [run.settings.model_dump(exclude={"export", "placement"}), run.families.digests()]
     known += [] if evidence.imu is None else [evidence.imu.digest]
     counts, frames = dict(run.journal.counts), run.frames
-    n, best = 0, None  # the pass before: what it rests on, steps without matches, its result
+    n, best = 0, None  # the pass before: the stage it rests on, number of steps without matches,
+    # state
     while True:
         name, after, better = f"recut{n}", run.chain.latest, None
         kept = run.store.stored(f"{name}_undone", known, bool, after)
@@ -273,7 +274,7 @@ def solve(state: State) -> State:
     if state.prior.turning_only:
         return state
     state = _add_keypoints_where_weak(state)
-    # The map matched anew from itself; lenses that neighbours hide may show in it.
+    # Known points are matched in all frames; lenses that neighbours hide may show then.
     state = _match_from_itself(state)
     if not state.map.lenses and state.run.frames.fisheyes is None:
         state = camera.find_camera(state, "again_")
@@ -290,9 +291,9 @@ def solve(state: State) -> State:
 
 
 def _map_features(state: State) -> State:
-    """One map of all frames' features, the camera that sees them, and how well images hold it."""
+    """One map of all frames' features, its camera, and its strength by images alone."""
     rounds = state.run.settings.rounds
-    # Neighbours in time, and what they say of the trajectory and its clock.
+    # Neighbours in time are matched; they check the trajectory and its clock.
     if state.run.evidence.recordings:
         state = each_recording.match_neighbours(state)
     else:
@@ -301,7 +302,7 @@ def _map_features(state: State) -> State:
         state = gyro.align_to_neighbours(state)
     if state.prior.turning_only:
         return state
-    # A chain of relative poses, then all that neighbours have in common.
+    # A chain of relative poses, then all points that neighbours share.
     state = backend.align_gauge(state, "gauge")
     state = backend.adjust(state, "chain", rounds.chain)
     state = frontend.match_along_epipolars(state)
@@ -319,7 +320,7 @@ def _map_features(state: State) -> State:
 
 
 def _merge_maps(state: State) -> State:
-    """Parts of the map that nothing ties together, joined where they meet; and their matches."""
+    """Join the parts of the map that no step ties together, and match across them."""
     parts = backend.separate_parts(state)
     if parts is None:
         return state
@@ -330,7 +331,7 @@ def _merge_maps(state: State) -> State:
 
 
 def _add_keypoints_where_weak(state: State) -> State:
-    """More keypoints where images hold the map poorly, and the map that these give."""
+    """Extract more keypoints at frames that images determine poorly, and adjust."""
     weak = state.prior.weak_frames()
     if state.run.settings.weak_frames.mode == "off" or not weak.any():
         return state
@@ -342,7 +343,7 @@ def _add_keypoints_where_weak(state: State) -> State:
 
 
 def _match_from_itself(state: State, prefix: str = "") -> State:
-    """The map after its own points were looked for everywhere.
+    """Match the map's points in all frames, and adjust.
 
     Args:
         state: of the run.

@@ -1,4 +1,4 @@
-"""A run: what no stage changes, how a stage is kept, and the journal that the report reads."""
+"""A run: inputs that no stage changes, storage of stages, and the journal for the report."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
@@ -34,13 +34,13 @@ _NOMINAL_PIXELS = 2.0  # the same, pixels
 
 @dataclass(frozen=True, slots=True)
 class Journal:
-    """What stages received, kept and decided; the report reads it, nothing that computes does."""
+    """Counts and rounds of stages, for the report alone."""
 
     counts: dict[str, list[Counts]] = field(default_factory=dict)  # by stage
     rounds: dict[str, tuple[Round, ...]] = field(default_factory=dict)  # of adjustment, by stage
 
     def note(self, name: str, result: object) -> None:
-        """Write down what a stage's result says of itself."""
+        """Note the counts and rounds that a stage's result has."""
         said = result[0] if isinstance(result, tuple) else result
         counts, rounds = getattr(said, "counts", None), getattr(said, "rounds", ())
         if isinstance(result, Counts):
@@ -63,7 +63,7 @@ class RecordingEvidence:
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """What a run is given beside its images."""
+    """Inputs of a run beside its images."""
 
     trajectories: tuple[Trajectory, ...] = ()  # files, in pieces that each have their own world
     imu: Readings | None = None  # of a gyro that rode along; None = there are none
@@ -74,7 +74,7 @@ class Evidence:
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """What no stage changes."""
+    """Inputs, settings and store of a run, which no stage changes."""
 
     store: RunStore
     chain: Chain  # of stages, each resting on the one before
