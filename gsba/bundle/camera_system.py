@@ -24,8 +24,8 @@ from gsba.types import JointErrors, Keypoints, Solution
 _DAMPING = 1e-6
 _NUM_SPREAD_PASSES = 4  # passes that estimate the spread of frames' own motion
 _MAX_GYRO_SQUARES = 4.0  # largest median square of a gyro's errors, in variances of the motion
-_MAX_UNEXPLAINED_SHARE = 0.5  # largest share of the rotations by images that a gyro which is further
-# off may leave unexplained
+_MAX_UNEXPLAINED_SHARE = 0.5  # largest share of the rotations by images that a gyro further off may
+# leave unexplained
 
 
 @dataclass(frozen=True, slots=True)
