@@ -36,7 +36,8 @@ class Command:
 
     arguments: tuple[str, ...]  # of gsba, the command's name first
     folder: str  # absolute working folder
-    run: str | None  # run folder it writes or reads, relative to the working folder; None = none
+    run: str | None  # run folder it writes or reads, or folder of figures that it writes, relative
+    # to the working folder; None = none
 
 
 @dataclass(frozen=True, slots=True)

@@ -166,6 +166,9 @@ def _job(app: App, request: Request) -> Any:
     if job.command.run is not None and job.command.arguments[0] == "refine":
         run = inside(app.root, job.command.run)
         found["camera"] = runs.camera_so_far(run, app.progress(job).names())
+    if job.command.run is not None and job.command.arguments[0] == "plot":
+        drawn = sorted(inside(app.root, job.command.run).glob("*.png"))
+        found["figures"] = [path.relative_to(app.root).as_posix() for path in drawn]
     return found
 
 
@@ -198,7 +201,7 @@ def _add(app: App, request: Request) -> Any:
     arguments = _arguments(app, body)
     app.check(arguments)
     values = body.get("values", {})
-    run = values.get("out") if arguments[0] == "refine" else values.get("run")
+    run = values.get("out") if arguments[0] in ("refine", "plot") else values.get("run")
     if arguments[0] == "refine" and not (values.get("frames") or values.get("recording")):
         raise GsbaError("frames are missing: choose a video or a folder")
     if arguments[0] == "refine" and not run:

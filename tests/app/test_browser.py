@@ -21,6 +21,8 @@ from gsba.demo.film import make_film
 pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
 pytest.importorskip("av")
+pytest.importorskip("viser")
+pytest.importorskip("matplotlib")
 sync_api = pytest.importorskip("playwright.sync_api")
 
 pytestmark = pytest.mark.slow
@@ -113,6 +115,12 @@ def fits(page: Any) -> bool:
     return page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
 
 
+def figures_are_drawn(page: Any) -> None:
+    page.get_by_role("heading", name="Figures", exact=True).wait_for()
+    page.locator("img").last.scroll_into_view_if_needed()
+    page.wait_for_function("[...document.images].every(i => i.complete && i.naturalWidth > 200)")
+
+
 def test_from_a_video_to_a_dataset(browser: Any, server: Server) -> None:
     page = opened(browser, server.address, DESK)
     chosen(page, "first")
@@ -150,6 +158,20 @@ def test_from_a_video_to_a_dataset(browser: Any, server: Server) -> None:
         page.get_by_role("link", name="Report").click()
     report.value.wait_for_load_state()
     assert report.value.locator("svg, canvas").count() > 0  # its script runs in the sandbox
+    done = page.url
+    with page.context.expect_page() as viewer:
+        page.get_by_role("button", name="Open the viewer").click()
+    viewer.value.locator("canvas").first.wait_for()
+    viewer.value.close()
+    page.get_by_role("link", name=re.compile(r"http://127\.0\.0\.1:")).wait_for()
+    page.get_by_role("button", name="Plot", exact=True).click()
+    page.get_by_role("heading", name="plot first").wait_for()
+    status(page, "done")
+    figures_are_drawn(page)
+    page.goto(done)
+    page.locator("main").get_by_role("link", name="Compare", exact=True).click()
+    page.get_by_role("columnheader", name="first").wait_for()
+    page.goto(done)
     page.get_by_role("button", name="nerfstudio", exact=True).click()
     page.get_by_role("heading", name="export first").wait_for()
     status(page, "done")
@@ -166,6 +188,13 @@ def test_from_a_video_to_a_dataset(browser: Any, server: Server) -> None:
         page.get_by_role("button", name="Take this folder").click()
         page.get_by_role("columnheader", name=name).wait_for()
     assert fits(page)
+    picture(page, "app-compare")
+    page.get_by_role("button", name="Plot them side by side").click()
+    page.get_by_role("heading", name="plot compared/first-second").wait_for()
+    status(page, "done")
+    figures_are_drawn(page)
+    assert fits(page)
+    assert [fault for fault in page.faults if not fault.endswith("failed")] == []
 
 
 def test_a_run_is_stopped_and_goes_on_and_the_next_one_waits(browser: Any, server: Server) -> None:

@@ -323,9 +323,9 @@ function job(id) {
   const head = make("div"), now = make("div"), stages = make("ul", { class: "plain stages" });
   const canvas = make("canvas", { role: "img" }), caption = make("p", { class: "faint" });
   const notes = make("div"), log = make("pre", { class: "log" }), after = make("div");
-  const plan = card("From above", canvas, caption);
+  const plan = card("From above", canvas, caption), stageCard = card("Stages", stages);
   show(head, after, make("div", { class: "two" }, make("div", {}, now, plan),
-    make("div", {}, notes, card("Stages", stages))),
+    make("div", {}, notes, stageCard)),
     make("details", { class: "card" }, make("summary", {}, "Output of the command"), log));
   let drawn = "", shownStatus = "";
   follow(async (current) => {
@@ -336,6 +336,7 @@ function job(id) {
     fillHead(head, found);
     fillNow(now, found);
     fillStages(stages, progress);
+    stageCard.hidden = !progress.stages.length;
     fillNotes(notes, found);
     if (log.textContent !== text) log.textContent = text;
     plan.hidden = found.kind !== "refine";
@@ -350,7 +351,8 @@ function job(id) {
     if (found.status !== shownStatus) {
       shownStatus = found.status;
       after.replaceChildren();
-      if (["done", "partial"].includes(found.status) && found.run) await results(after, found.run, current);
+      if (found.figures && found.figures.length) after.append(figureCard(found.figures));
+      else if (["done", "partial"].includes(found.status) && found.run) await results(after, found.run, current);
     }
     return true;
   });
@@ -454,15 +456,22 @@ async function results(where, run, current) {
       make("button", { type: "button", title: `gsba export ${run} --to ${to} --up auto`,
         onclick: add("export", { run, to, up: "auto" }) }, to))),
       make("p", { class: "faint" }, `Datasets are written into ${run}, and stand upright.`)),
-    found.figures.length ? card("Figures", ...found.figures.map((name) =>
-      make("img", { src: link(`${run}/figures/${name}`), alt: name, loading: "lazy" }))) : "");
+    found.figures.length ? figureCard(found.figures.map((name) => `${run}/figures/${name}`)) : "");
+}
+
+function figureCard(paths) {
+  return card("Figures", ...paths.map((path) => make("img", { src: link(path), alt: path.split("/").pop(), loading: "lazy" })));
+}
+
+function degrees(angle) {
+  return angle === null ? "none" : `${angle.toPrecision(3)}°`; // rotations only: there are no points
 }
 
 function figures(found) {
   const summary = found.summary, camera = found.camera;
   const rows = [
     ["points", String(summary.points)],
-    ["median residual", `${summary.median_residual_deg.toPrecision(3)}° (before: ${summary.median_residual_deg_coarse.toPrecision(3)}°)`],
+    ["median residual", `${degrees(summary.median_residual_deg)} (before: ${degrees(summary.median_residual_deg_coarse)})`],
     ["maps", String(summary.maps)],
     ["time of all stages", spoken(found.seconds)],
   ];
