@@ -16,6 +16,7 @@ from gsba.bundle.families import Families, Family, FamilyTerms
 from gsba.bundle.gyro_turns import GyroTurns
 from gsba.bundle.optimizer import OptimizeResult, marginal_covariances, optimize
 from gsba.bundle.pose_variables import poses_of, values_of
+from gsba.bundle.tracks import runs
 from gsba.camera.rig import CubeRig
 from gsba.config import RefineSettings, SolverSettings
 from gsba.types import (
@@ -403,36 +404,32 @@ def _noise(
         chosen: (O,) bool, observations whose spread is asked for.
     """
     tracks, num = landmarks.tracks, len(landmarks.tracks)
-    blocks = [slice(first, first + _BATCH) for first in range(0, num, _BATCH)]
-    informations = np.zeros((tracks.num_points, 3, 3))
-    for some in blocks:
-        _, jacobians = _by_point(landmarks, keypoints, world_T_rigs, some)
-        products = np.swapaxes(jacobians, 1, 2) @ jacobians
-        np.add.at(informations, tracks.points[some], products)
-    traces = np.einsum("jii->j", informations)
-    added = _MIN_INFORMATION_SHARE * traces + np.finfo(float).tiny
-    informations += added[:, None, None] * np.eye(3)
-    covariances = np.linalg.inv(informations)
     spread = np.empty(num)
-    for some in blocks:  # found anew: of all they would take gigabytes
-        residuals, jacobians = _by_point(landmarks, keypoints, world_T_rigs, some)
-        taken = jacobians @ covariances[tracks.points[some]] @ np.swapaxes(jacobians, 1, 2)
+    for points, rows, own in runs(tracks, _BATCH):
+        some = Landmarks(landmarks.points_world[points], own, landmarks.counts)
+        residuals, jacobians = _by_point(some, keypoints, world_T_rigs)
+        informations = np.zeros((own.num_points, 3, 3))
+        np.add.at(informations, own.points, np.swapaxes(jacobians, 1, 2) @ jacobians)
+        traces = np.einsum("jii->j", informations)
+        added = _MIN_INFORMATION_SHARE * traces + np.finfo(float).tiny
+        covariances = np.linalg.inv(informations + added[:, None, None] * np.eye(3))
+        taken = jacobians @ covariances[own.points] @ np.swapaxes(jacobians, 1, 2)
         left, directions = np.linalg.eigh(np.eye(2) - taken)
         along = np.einsum("oi,oi->o", directions[:, :, 1], residuals)
-        spread[some] = along / np.sqrt(np.maximum(left[:, 1], _MIN_RESIDUAL_SHARE))
+        spread[rows] = along / np.sqrt(np.maximum(left[:, 1], _MIN_RESIDUAL_SHARE))
     unknowns = 6 * len(world_T_rigs)
     redundancy = max(1 - unknowns / max(2 * num - 3 * tracks.num_points, 1), _MIN_REDUNDANCY)
     return float(1.4826 * np.median(np.abs(spread[chosen])) / np.sqrt(redundancy))
 
 
 def _by_point(
-    landmarks: Landmarks, keypoints: Keypoints, world_T_rigs: np.ndarray, some: slice
+    landmarks: Landmarks, keypoints: Keypoints, world_T_rigs: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Whitened residuals (O, 2) of some observations, and Jacobians (O, 2, 3) by the point."""
+    """Whitened residuals (O, 2) of observations, and Jacobians (O, 2, 3) by the point."""
     tracks = landmarks.tracks
-    rows = keypoints.starts[tracks.frames[some]] + tracks.keypoints[some]
-    poses, bearings = world_T_rigs[tracks.frames[some]], keypoints.bearings_rig[rows]
-    away = landmarks.points_world[tracks.points[some]] - poses[:, :3, 3]
+    rows = keypoints.rows(tracks)
+    poses, bearings = world_T_rigs[tracks.frames], keypoints.bearings_rig[rows]
+    away = landmarks.points_world[tracks.points] - poses[:, :3, 3]
     offsets = np.einsum("oji,oj->oi", poses[:, :3, :3], away)
     if keypoints.origins_rig is not None:
         offsets -= keypoints.origins_rig[rows]

@@ -12,8 +12,9 @@ import numpy as np
 
 from factors import RobustLoss, Term
 from gsba.bundle.optimizer import OptimizeResult
+from gsba.bundle.tracks import runs
 from gsba.config import SolverSettings
-from gsba.types import JointErrors, Landmarks, Tracks
+from gsba.types import JointErrors, Landmarks
 
 _CHUNK = 1 << 17  # observations whose residuals are made at a time: 20 MB
 
@@ -36,22 +37,10 @@ class DivisibleMap:
 
     def chunks(self) -> Iterator[tuple[np.ndarray, Sequence[Term]]]:
         """Landmarks (J, 3) and their terms, a few of them at a time."""
-        tracks, points = self.landmarks.tracks, self.landmarks.points_world
-        starts = np.searchsorted(tracks.points, np.arange(tracks.num_points + 1))
-        first = 0
-        while first < len(points):
-            last = int(np.searchsorted(starts, starts[first] + _CHUNK, side="right")) - 1
-            last = min(max(last, first + 1), len(points))
-            rows = slice(starts[first], starts[last])
-            own = Tracks(
-                tracks.points[rows] - np.int32(first),
-                tracks.frames[rows],
-                tracks.keypoints[rows],
-                last - first,
-            )
-            some = Landmarks(points[first:last], own, self.landmarks.counts)
+        landmarks = self.landmarks
+        for points, _, own in runs(landmarks.tracks, _CHUNK):
+            some = Landmarks(landmarks.points_world[points], own, landmarks.counts)
             yield some.points_world, self.terms_of(some)
-            first = last
 
 
 class Division(Protocol):

@@ -1,6 +1,6 @@
 """Chain pairwise matches into tracks of one scene point each."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -42,6 +42,24 @@ def build(matches: Sequence[Matches], num_keypoints: np.ndarray) -> Tracks:
         (nodes - first_node[frames]).astype(np.int32),
         int(points[-1]) + 1 if len(points) else 0,
     )
+
+
+def runs(tracks: Tracks, most: int) -> Iterator[tuple[slice, slice, Tracks]]:
+    """Tracks in runs of at most `most` observations, or of a single longer one.
+
+    Yields:
+        The points of a run, its observations, and its tracks, whose points are numbered from 0.
+    """
+    starts = np.searchsorted(tracks.points, np.arange(tracks.num_points + 1))
+    first = 0
+    while first < tracks.num_points:
+        last = int(np.searchsorted(starts, starts[first] + most, side="right")) - 1
+        last = min(max(last, first + 1), tracks.num_points)
+        rows = slice(int(starts[first]), int(starts[last]))
+        points = tracks.points[rows] - np.int32(first)
+        own = Tracks(points, tracks.frames[rows], tracks.keypoints[rows], last - first)
+        yield slice(first, last), rows, own
+        first = last
 
 
 @_kernel

@@ -1,14 +1,18 @@
 """Scene points from bearings and poses, robust to false observations in a track."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from factors.threads import balanced_ranges, run_in_threads
 from gsba.bundle._triangulation_kernels import triangulate_tracks
+from gsba.bundle.tracks import runs
 from gsba.config import TriangulateSettings
 from gsba.geometry import moved_to
 from gsba.types import Counts, Keypoints, Landmarks, Reconstruction, Tracks
 
-_AT_ONCE = 1 << 18  # observations whose poses are looked up: 34 MB
+_AT_ONCE = 1 << 18  # observations whose rays are held: 60 MB
+_NONE = Counts(0, 0, "tracks")
 
 
 def triangulate(
@@ -96,18 +100,42 @@ def place(
     settings: TriangulateSettings,
     num_threads: int = 1,
 ) -> Landmarks:
-    """As `triangulate`, the observations being the tracks' own keypoints."""
-    rows = keypoints.rows(tracks)
-    return triangulate(
-        tracks,
-        keypoints.bearings_rig[rows],
-        keypoints.sigmas_rad[rows],
-        world_T_rigs,
-        max_error_sigmas,
-        settings,
-        num_threads,
-        keypoints.origins_of(rows),
+    """As `triangulate`, the observations being the tracks' own keypoints; some tracks at a time."""
+    found = [Landmarks(np.zeros((0, 3)), tracks.of(np.zeros(tracks.num_points, bool)), _NONE)]
+    for _, _, some in runs(tracks, _AT_ONCE):
+        rows = keypoints.rows(some)
+        landmarks = triangulate(
+            some,
+            keypoints.bearings_rig[rows],
+            keypoints.sigmas_rad[rows],
+            world_T_rigs,
+            max_error_sigmas,
+            settings,
+            num_threads,
+            keypoints.origins_of(rows),
+        )
+        found.append(landmarks)
+    return _joined(found)
+
+
+def _joined(parts: Sequence[Landmarks]) -> Landmarks:
+    """Landmarks one behind the other, their counts added up."""
+    firsts = np.cumsum([0, *(part.tracks.num_points for part in parts)])
+    own = [part.tracks for part in parts]
+    points = [t.points + np.int32(first) for t, first in zip(own, firsts, strict=False)]
+    tracks = Tracks(
+        np.concatenate(points),
+        np.concatenate([t.frames for t in own]),
+        np.concatenate([t.keypoints for t in own]),
+        int(firsts[-1]),
     )
+    dropped: dict[str, int] = {}
+    for part in parts:
+        for reason, number in part.counts.dropped.items():
+            dropped[reason] = dropped.get(reason, 0) + number
+    received = sum(part.counts.received for part in parts)
+    counts = Counts(received, tracks.num_points, "tracks", dropped)
+    return Landmarks(np.concatenate([part.points_world for part in parts]), tracks, counts)
 
 
 def points_under(reconstruction: Reconstruction, world_T_rigs: np.ndarray) -> np.ndarray:

@@ -55,6 +55,8 @@ class StageRecord:
     cpu_seconds: float  # all threads of the process, and of remote workers
     peak_mb: float  # high-water mark of the process's resident memory when the stage ended
     workers: int = 0  # number of remote workers that took part
+    serial_cpu_seconds: float = 0.0  # of cpu_seconds, those of the thread that computed the stage:
+    # where threads share the work, it only waits for them
 
 
 class RunStore:
@@ -463,11 +465,12 @@ class _Clocks:
 
     wall: float  # seconds
     cpu: float  # seconds, of this process
+    own: float  # seconds of CPU, of this thread
     elsewhere: Spent  # work of remote workers
 
     @classmethod
     def now(cls, workers: Workers) -> "_Clocks":
-        return cls(time.perf_counter(), time.process_time(), workers.spent())
+        return cls(time.perf_counter(), time.process_time(), time.thread_time(), workers.spent())
 
     def measured(
         self, name: str, key: str, workers: Workers, spent: StageRecord | None = None
@@ -475,15 +478,17 @@ class _Clocks:
         """Cost since the start, added to the cost `spent` by an interrupted call."""
         elsewhere, before = workers.spent(), self.elsewhere
         seconds = time.perf_counter() - self.wall
-        cpu_seconds = time.process_time() - self.cpu
+        cpu_seconds, serial = time.process_time() - self.cpu, time.thread_time() - self.own
         cpu_seconds += elsewhere.cpu_seconds - before.cpu_seconds
         took_part = [w for w, n in elsewhere.shards.items() if n > before.shards.get(w, 0)]
         peak_mb = peak_memory_bytes() / 2**20
         if spent is not None:
             seconds += spent.seconds
             cpu_seconds += spent.cpu_seconds
+            serial += spent.serial_cpu_seconds
             peak_mb = max(peak_mb, spent.peak_mb)
-        return StageRecord(name, key, False, seconds, cpu_seconds, peak_mb, len(took_part))
+        figures = seconds, cpu_seconds, peak_mb, len(took_part), serial
+        return StageRecord(name, key, False, *figures)
 
 
 def _read_cost(path: Path, key: str) -> StageRecord | None:
