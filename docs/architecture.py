@@ -28,8 +28,9 @@ BACK, ROOM, EDGE, INK, QUIET, ARROW = (
     "#b9b7ae",
 )
 FONT = "system-ui,-apple-system,'Segoe UI',Roboto,Helvetica,Arial,sans-serif"
-WIDTH, MARGIN, GAP, BETWEEN = 1240, 24, 14, 44  # pixels
-TITLE, SMALL, LINE = 15, 10.5, 14
+WIDTH, MARGIN, GAP, BETWEEN = 860, 20, 14, 40  # pixels
+IN_A_ROW = 3  # most rooms of a floor beside each other: pages are narrow
+TITLE, SMALL, LINE = 17, 12.5, 16
 LETTER = 0.54  # width of a letter, part of its size
 
 
@@ -132,11 +133,19 @@ def direct() -> list[tuple[str, str]]:
     ]
 
 
+def _rows() -> Iterator[list[str]]:
+    """Rooms side by side: those of a floor, in rows that are about equally long."""
+    for floor in reversed(table()["floors"]):
+        num = -(-len(floor) // IN_A_ROW)
+        for n in range(num):
+            yield floor[n * len(floor) // num : (n + 1) * len(floor) // num]
+
+
 def boxes() -> dict[str, Box]:
     """Rooms laid out by floors, the highest first."""
-    out, y = {}, 64.0
-    for floor in reversed(table()["floors"]):
-        each = min((WIDTH - 2 * MARGIN - GAP * (len(floor) - 1)) / len(floor), 560)
+    out, y = {}, 84.0
+    for floor in _rows():
+        each = min((WIDTH - 2 * MARGIN - GAP * (len(floor) - 1)) / len(floor), 480)
         letters = int((each - 20) / (SMALL * LETTER))
         texts = {}
         for room in floor:
@@ -216,12 +225,13 @@ def svg() -> str:
     placed = boxes()
     height = max(box.y + box.height for box in placed.values()) + MARGIN
     body = [_text(MARGIN, 34, "gsba, floor by floor", INK, 19, 600)]
-    x = 250.0
+    x = 245.0
     for way in table()["ways"]:
         body.append(f'<circle cx="{x:.1f}" cy="29" r="6" fill="{way["color"]}"/>')
         body.append(_text(x + 12, 33.5, f"the way of {way['what']}", QUIET, 12))
         x += 190
-    body.append(_text(x, 33.5, "grey: imports, unless a longer way implies them", QUIET, 12))
+    grey = "grey: imports, unless a longer way implies them"
+    body.append(_text(MARGIN, 58, grey, QUIET, 12))
     body += [_arrow(placed[above], placed[below]) for above, below in direct()]
     for box in placed.values():
         body.append(
