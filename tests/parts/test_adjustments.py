@@ -1,16 +1,21 @@
 """Adjustments of a run in parts, beside the undivided ones: families, gates, resumed calls."""
 
+import errno
 import logging
+import os
 from pathlib import Path
+from typing import Any
 
 import gtsam
 import numpy as np
 import pytest
+from dask_workers import some_workers
 from gtsam.symbol_shorthand import X
 from scipy.spatial.transform import Rotation
 from synthetic import RIG, GivenFactors
 from town_in_parts import NUM, SIGMA, town
 
+from gsba import disk
 from gsba.bundle import adjustment
 from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.bearings import Bearings
@@ -20,10 +25,12 @@ from gsba.bundle.reprojections import Reprojections
 from gsba.bundle.trajectory_prior import TrajectoryPrior
 from gsba.camera.rig import owner_faces
 from gsba.config import PriorSettings, RefineSettings
+from gsba.disk import FullDiskError
 from gsba.geometry import pose
 from gsba.parts import DividedAdjustments
 from gsba.parts import adjustments as parts_adjustments
-from gsba.store.shards import Threads
+from gsba.store.cluster import Cluster
+from gsba.store.shards import Threads, Workers
 from gsba.types import GyroConstraints, Keypoints, Solution, Tracks
 
 GATES = (8.0, 4.0)
@@ -77,13 +84,20 @@ def families(poses: np.ndarray, kind: str) -> Families:
     return Families(tuple(members), tuple(map(str, range(NUM))), np.arange(NUM, dtype=float))
 
 
-def context(folder: Path, part_frames: int | None, poses: np.ndarray, kind: str = "bearing"):
+def context(
+    folder: Path,
+    part_frames: int | None,
+    poses: np.ndarray,
+    kind: str = "bearing",
+    workers: Workers | None = None,
+) -> AdjustmentContext:
     """Context of an adjustment whose maps are divided."""
     factors = ("bearing", "reprojection") if kind == "reprojection" else ("bearing",)
     settings = RefineSettings.model_validate(
         {"factors": factors, "solver": {"relative_tolerance": 1e-9, "absolute_tolerance": None}}
     )
-    division = DividedAdjustments(folder / "parts", folder / "shards", Threads(2), part_frames)
+    workers = Threads(2) if workers is None else workers
+    division = DividedAdjustments(folder / "parts", folder / "shards", workers, part_frames)
     return AdjustmentContext(families(poses, kind), RIG, settings, 1, division=division)
 
 
@@ -137,6 +151,54 @@ def test_a_stopped_adjustment_goes_on_in_another_call(
     assert len(calls) == 3  # the first round was not solved again
     np.testing.assert_array_equal(found.world_T_rigs, expected.world_T_rigs)
     assert [len(r.iterations) for r in found.rounds] == [len(r.iterations) for r in expected.rounds]
+
+
+@pytest.mark.parametrize("left", [3, 30, 100])
+def test_a_full_disk_ends_an_adjustment_in_one_line_and_costs_nothing_else(
+    left: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    poses, keypoints, tracks = town_map()
+    start = Solution.without_points(poses)
+    expected = adjustment.adjust(tracks, keypoints, start, context(tmp_path, 15, poses), GATES)
+    rename, full = os.replace, tmp_path / "full"
+    written: list[object] = []
+
+    def fill(*args: Any, **options: Any) -> None:
+        written.append(args)
+        if len(written) > left:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        rename(*args, **options)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(disk.os, "replace", fill)
+        with pytest.raises(FullDiskError) as caught:
+            adjustment.adjust(tracks, keypoints, start, context(full, 15, poses), GATES)
+    assert len(str(caught.value).splitlines()) == 1
+    found = adjustment.adjust(tracks, keypoints, start, context(full, 15, poses), GATES)
+    np.testing.assert_array_equal(found.world_T_rigs, expected.world_T_rigs)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("num", [1, 2])
+def test_workers_adjust_to_the_same_bytes(num: int, tmp_path: Path) -> None:
+    pytest.importorskip("distributed", reason="needs the extra cluster")
+    poses, keypoints, tracks = town_map()
+    start = Solution.without_points(poses)
+    here = context(tmp_path / "threads", 15, poses)
+    expected = adjustment.adjust(tracks, keypoints, start, here, GATES)
+    covariances = adjustment.pose_covariances(expected, keypoints, here)
+    there = tmp_path / "workers"
+    (there / "shards").mkdir(parents=True)
+    with some_workers(num) as client:
+        workers = Cluster(client, there / "shards", tmp_path)
+        away = context(there, 15, poses, workers=workers)
+        found = adjustment.adjust(tracks, keypoints, start, away, GATES)
+        elsewhere = adjustment.pose_covariances(found, keypoints, away)
+        assert workers.spent().cpu_seconds > 0
+    np.testing.assert_array_equal(found.world_T_rigs, expected.world_T_rigs)
+    np.testing.assert_array_equal(elsewhere[0], covariances[0])
+    np.testing.assert_array_equal(elsewhere[1].draws, covariances[1].draws)
+    assert not list((there / "shards").iterdir())
 
 
 def test_factors_written_in_python_are_adjusted_undivided(
