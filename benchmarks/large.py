@@ -2,12 +2,15 @@
 
     python -m benchmarks.large solve 100000 --out WORK [--part 1000] [--workers 2] [--kill 20]
     python -m benchmarks.large whole 20000 --out WORK
+    python -m benchmarks.large asleep 2000 --out WORK [--part 1000] [--tasks 140] [--slots 64]
     python -m benchmarks.large compare WORK OTHER
 
 `solve` streams the city to WORK/map and solves it there; called again, it goes on where it was
 stopped. `whole` holds all of it and solves it by one factorization. Both print a line for each
 attempt, and write WORK/poses.npy and WORK/figures.json. `--kill` kills a worker every so many
-seconds. `compare` prints how far costs and poses differ.
+seconds. `asleep` measures a part's CPU seconds in each pass of an attempt, and lets as many tasks
+as a larger city has parts sleep so long on slots of a Dask scheduler. `compare` prints how far
+costs and poses differ.
 """
 
 import argparse
@@ -94,7 +97,8 @@ def written(city: City, folder: Path, most: int) -> dict[str, Any]:
         observations += len(term.frames)
         points += len(landmarks)
     num = len(city.start)
-    index = writer.finish(values_at(range(num), city.start), num, most)
+    values = values_at(range(num), city.start)
+    index = writer.finish(values, num, writer.cut(values, num, most))
     frames, kept = np.diff(index.starts), index.num_kept
     return {
         "points": points,
@@ -233,6 +237,52 @@ class Progress:
             os.kill(os.getpid(), signal.SIGKILL)
 
 
+@dataclass
+class Timed:
+    """One thread of this process, and the CPU seconds of a part in each pass."""
+
+    seconds: dict[str, list[float]] = field(default_factory=dict)  # by title of the pass
+
+    def map_shards(self, job: Job[Any]) -> Iterator[Any]:
+        """See `gsba.store.shards.Workers`."""
+        for item in range(len(job)):
+            start = time.thread_time()
+            result = job(item)
+            self.seconds.setdefault(job.title, []).append(time.thread_time() - start)
+            yield result
+
+    def spent(self) -> Spent:
+        """See `gsba.store.shards.Workers`."""
+        return Spent()
+
+    def at_most(self, num: int) -> "Timed":
+        """See `gsba.store.shards.Workers`."""
+        return self
+
+    def must_see(self, paths: Any) -> None:
+        """See `gsba.store.shards.Workers`."""
+
+
+def asleep(options: argparse.Namespace) -> None:
+    """Print how well slots are used by passes of tasks that sleep as long as a part takes."""
+    from benchmarks.cluster import asleep as sleeping
+
+    timed = Timed()
+    written(make_city(options.frames), options.out / "map", options.part)
+    optimize_divided(options.out / "map", timed, settings(options))
+    used, spent = 0.0, 0.0
+    for title in ("eliminating", "substituting", "moving"):
+        seconds = float(np.mean(timed.seconds[title]))
+        wall, _ = sleeping(options.tasks, options.slots, seconds)
+        used, spent = used + options.tasks * seconds, spent + options.slots * wall
+        print(
+            f"{title}: {seconds:.3f} CPU s a part; {options.tasks} tasks on {options.slots} slots "
+            f"{wall:.2f} s, {options.tasks * seconds / (options.slots * wall):.0%} of them busy",
+            flush=True,
+        )
+    print(f"an attempt: {used / spent:.0%} busy", flush=True)
+
+
 def compare(first: Path, other: Path) -> None:
     """Print how far two solutions differ."""
     costs = [json.loads((path / "figures.json").read_text())["cost"] for path in (first, other)]
@@ -255,12 +305,22 @@ def main() -> None:
         command.add_argument("--workers", type=int, default=0)
         command.add_argument("--kill", type=float, default=0.0)
         command.add_argument("--stop-after", type=int, default=0)
+    command = commands.add_parser("asleep")
+    command.add_argument("frames", type=int)
+    command.add_argument("--out", type=Path, required=True)
+    command.add_argument("--tolerance", type=float, default=1e-5)
+    command.add_argument("--part", type=int, default=1000)
+    command.add_argument("--tasks", type=int, default=140)
+    command.add_argument("--slots", type=int, default=64)
     command = commands.add_parser("compare")
     command.add_argument("first", type=Path)
     command.add_argument("other", type=Path)
     options = parser.parse_args()
     if options.command == "compare":
         compare(options.first, options.other)
+        return
+    if options.command == "asleep":
+        asleep(options)
         return
     options.out.mkdir(parents=True, exist_ok=True)
     result, figures = (solve if options.command == "solve" else whole)(options)

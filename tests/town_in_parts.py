@@ -76,5 +76,6 @@ def write(folder: Path, most: int, num_chunks: int = 4) -> np.ndarray:
         )
         writer.add(points[chunk], [some], graph)
         graph = gtsam.NonlinearFactorGraph()
-    writer.finish(values_at(range(NUM), rows), NUM, most)
+    values = values_at(range(NUM), rows)
+    writer.finish(values, NUM, writer.cut(values, NUM, most))
     return rows

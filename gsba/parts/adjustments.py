@@ -137,13 +137,14 @@ class DividedAdjustments:
             writer.add(np.empty((0, 3)), (), graph)
         for points_world, terms in map_.chunks():
             writer.add(points_world, terms)
-        index = writer.finish(map_.values, num, most)
-        cut = num - int(np.sum(np.diff(index.starts) - index.num_kept))
-        if cut > _MAX_CUT_SHARE * num:
+        cut = writer.cut(map_.values, num, most)
+        on_cuts = int(np.count_nonzero(cut.on_cut[:num]))
+        if on_cuts > _MAX_CUT_SHARE * num:
             remove_map(folder)
-            self._tell(f"{cut} of {num} frames would lie on the cuts")
+            self._tell("more than half of the frames would lie on the cuts")
             return False
-        logger.debug("%d frames in %d parts, %d on cuts", num, len(index.num_kept), cut)
+        writer.finish(map_.values, num, cut)
+        logger.debug("%d frames in %d parts, %d on cuts", num, cut.num_parts, on_cuts)
         return True
 
     def _tell(self, reason: str) -> None:

@@ -204,21 +204,32 @@ class PartsWriter:
         first, second = self._ties.T
         self._codes = np.unique(np.concatenate([self._codes, first << 32 | second]))
 
-    def finish(self, values: gtsam.Values, num_frames: int, most: int) -> Index:
-        """Cut the map and write its parts.
+    def cut(self, values: gtsam.Values, num_frames: int, most: int) -> Partition:
+        """Cut what was added into parts.
 
         Args:
             values: to start from: poses X(frame) of all frames, and other variables of factors.
             num_frames: F.
             most: frames and other variables of a part, without those on cuts.
+
+        Returns:
+            The part of each frame, then of each other variable.
+        """
+        pairs = np.column_stack([self._codes >> 32, self._codes & 0xFFFFFFFF])
+        pairs = np.where(pairs < _BESIDE, pairs, pairs - _BESIDE + num_frames)
+        num, poses = num_frames + len(self._numbers), At.of(values, range(num_frames), ()).poses
+        return partition(num, pairs, most, _places(poses[:, 9:], pairs, num))
+
+    def finish(self, values: gtsam.Values, num_frames: int, cut: Partition) -> Index:
+        """Write the parts of a map, as `cut` has cut it.
+
+        Args:
+            values, num_frames: see `cut`.
+            cut: the part of each variable.
         """
         keys, dims = list(self._numbers), values.dims()
         start = At.of(values, range(num_frames), keys)
         variables = _Variables(num_frames, keys, [dims[key] for key in keys])
-        pairs = np.column_stack([self._codes >> 32, self._codes & 0xFFFFFFFF])
-        pairs = np.where(pairs < _BESIDE, pairs, pairs - _BESIDE + num_frames)
-        num = num_frames + len(keys)
-        cut = partition(num, pairs, most, _places(start.poses[:, 9:], pairs, num))
         chunks: dict[int, int] = defaultdict(int)  # of each part so far
         for number in range(self._num_chunks):
             path = self._incoming / f"{number:06d}.npz"

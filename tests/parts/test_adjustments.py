@@ -3,6 +3,7 @@
 import errno
 import logging
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import pytest
 from dask_workers import some_workers
 from gtsam.symbol_shorthand import X
 from scipy.spatial.transform import Rotation
-from synthetic import RIG, GivenFactors
+from synthetic import RIG, GivenFactors, make_world
 from town_in_parts import NUM, SIGMA, town
 
 from gsba import disk
@@ -211,6 +212,22 @@ def test_factors_written_in_python_are_adjusted_undivided(
     assert found.rounds[-1].accepted
     told = [message for message in caplog.messages if "adjusted undivided" in message]
     assert len(told) == 1 and "written in Python" in told[0]
+
+
+def test_a_map_whose_frames_all_see_one_another_is_adjusted_undivided(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    world = make_world(0)  # a loop of 20 frames around one place
+    start = Solution.without_points(world.world_T_rigs)
+    found = []
+    for part_frames in (20, 5):
+        here = context(tmp_path, part_frames, world.world_T_rigs)
+        here = replace(here, families=here.families.with_members([Bearings()]))
+        with caplog.at_level(logging.INFO):
+            found.append(adjustment.adjust(world.tracks, world.keypoints, start, here, GATES))
+    np.testing.assert_array_equal(found[0].world_T_rigs, found[1].world_T_rigs)
+    assert [m for m in caplog.messages if "more than half of the frames" in m]
+    assert not list((tmp_path / "parts").glob("*"))
 
 
 def test_memory_decides_where_nothing_is_asked_for(

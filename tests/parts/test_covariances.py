@@ -57,7 +57,7 @@ def test_parts_give_the_undivided_covariances(most: int, tmp_path: Path) -> None
     writer = PartsWriter(tmp_path / "map")
     writer.tie(np.column_stack([np.arange(NUM - 1), np.arange(1, NUM)]))
     writer.add(points, [term], graph)
-    writer.finish(values, NUM, most)
+    writer.finish(values, NUM, writer.cut(values, NUM, most))
     keys = [X(f) for f in range(NUM)]
     block = LandmarkBlock(keys, points, [term], LOSS, num_threads=1)
     expected, joint = marginal_covariances(graph, [block], values, keys)
@@ -84,7 +84,7 @@ def test_variables_that_all_share_move_as_undivided(most: int, tmp_path: Path) -
     values.insert(with_biases(graph, values))
     writer = PartsWriter(tmp_path / "map")
     writer.add(points, [term], graph)
-    writer.finish(values, NUM, most)
+    writer.finish(values, NUM, writer.cut(values, NUM, most))
     keys = [X(f) for f in range(NUM)]
     block = LandmarkBlock(keys, points, [term], LOSS, num_threads=1)
     expected = optimize(graph, [block], values, settings)
@@ -102,7 +102,7 @@ def test_what_nothing_constrains_is_not_a_number(tmp_path: Path) -> None:
     writer = PartsWriter(tmp_path / "map")
     writer.tie(np.column_stack([np.arange(NUM), np.arange(1, NUM + 1)]))
     writer.add(points, [term], graph)
-    writer.finish(lonely, NUM + 1, 30)
+    writer.finish(lonely, NUM + 1, writer.cut(lonely, NUM + 1, 30))
     found, joint = divided_covariances(tmp_path / "map", Threads(1), LOSS, 2, 1)
     assert np.isnan(found[NUM]).all() and np.isfinite(found[:NUM]).all()
     assert np.isnan(joint.neighbours[-1]).all() and np.isfinite(joint.neighbours[:-1]).all()
