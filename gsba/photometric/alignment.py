@@ -1,6 +1,7 @@
 """Sub-pixel observations: the patch around each point, aligned to every frame that shows it."""
 
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.camera.rig import CubeRig, owner_faces
 from gsba.config import PatchSettings
 from gsba.frames import panorama
+from gsba.memory import total_memory_bytes
 from gsba.photometric import frame_jobs, surfaces
 from gsba.photometric.references import references, visible_frames
 from gsba.store.shards import Workers
@@ -18,6 +20,8 @@ from gsba.types import Counts, Keypoints, Landmarks, Sighted, Solution, Tracks
 
 _TOO_UNCERTAIN = "position too uncertain"
 _SIGHTINGS_AT_ONCE = 1 << 17  # sightings processed together: some 80 MB
+_BYTES_PER_POINT = 8192  # of a point's patch and its sightings, about
+_MEMORY_SHARE = 16  # of the machine's memory, which the patches of one part take at most
 _ENOUGH_OBSERVATIONS = 100  # aligned observations of a frame from which points without aligned
 # patches are dropped
 _TILTED_STEP_PX = 1.4  # pixels to a step of patches tilted with their surfaces; 1 of patches facing
@@ -37,6 +41,16 @@ class _Observed:
     frames: np.ndarray  # (N,) int64
     bearings_rig: np.ndarray  # (N, 3) float64, unit
     covariances: np.ndarray  # (N, 2, 2) float64, radians squared, on tangent_basis
+
+    @classmethod
+    def joined(cls, parts: "Sequence[_Observed]") -> "_Observed":
+        """All of them."""
+        names = ("points", "frames", "bearings_rig", "covariances")
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+    def of(self, points: np.ndarray) -> "_Observed":
+        """The same of points that are numbered otherwise: n is `points[n]`."""
+        return replace(self, points=points[self.points])
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,6 +106,62 @@ def align(
         Tracks of aligned observations, and of former ones where alignment failed.
     """
     landmarks, world_T_rigs = solved.landmarks, solved.world_T_rigs
+    rows = references(landmarks, world_T_rigs)
+    normals_world = np.zeros((len(rows), 3))
+    found, at_hosts, dropped = [], [], dict.fromkeys(REJECTIONS, 0)
+    for points in _by_hosts(landmarks.tracks.frames[rows]):
+        some = replace(solved, landmarks=_taken(landmarks, points))
+        patches = _align_some(some, observed, greys, settings, workers, lenses, name, dropped)
+        found.append(patches.found.of(points))
+        at_hosts.append(patches.at_hosts.of(points))
+        normals_world[points] = patches.normals_world
+    parts = [_Observed.joined(found), _Observed.joined(at_hosts)]
+    keypoints, aligned = observed.keypoints, len(parts[0].points)
+    parts.append(_former_observations(landmarks, keypoints, solved.noise, parts, greys.num_frames))
+    colors = keypoints.colors[keypoints.rows(landmarks.tracks)[rows]]
+    counts = Counts(aligned + sum(dropped.values()), aligned, "observations", dropped)
+    return _pack(parts, colors, normals_world, world_T_rigs, rig, counts)
+
+
+def _by_hosts(hosts: np.ndarray) -> Iterator[np.ndarray]:
+    """Points (n,), ascending, whose patches are held together: those of hosts that follow one
+    another, of all hosts (J,)."""
+    most = max(total_memory_bytes() // (_MEMORY_SHARE * _BYTES_PER_POINT), 1)
+    order = np.argsort(hosts, kind="stable")
+    for first in range(0, max(len(order), 1), most):
+        yield np.sort(order[first : first + most])
+
+
+def _taken(landmarks: Landmarks, points: np.ndarray) -> Landmarks:
+    """Some points (n,), ascending, and their observations."""
+    chosen = np.zeros(len(landmarks.points_world), bool)
+    chosen[points] = True
+    return replace(
+        landmarks, points_world=landmarks.points_world[points], tracks=landmarks.tracks.of(chosen)
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Aligned:
+    """Observations of some points by their patches."""
+
+    found: _Observed  # in other frames
+    at_hosts: _Observed
+    normals_world: np.ndarray  # (J, 3) of the surfaces, zero = unknown
+
+
+def _align_some(
+    solved: Solution,
+    observed: Observations,
+    greys: panorama.Greys,
+    settings: PatchSettings,
+    workers: Workers,
+    lenses: Lenses,
+    name: str,
+    dropped: dict[str, int],
+) -> _Aligned:
+    """As `align`, of the points of a solution; rejections are added to `dropped`."""
+    landmarks, world_T_rigs = solved.landmarks, solved.world_T_rigs
     keypoints, field = observed.keypoints, observed.field
     rows = references(landmarks, world_T_rigs)
     hosts = landmarks.tracks.frames[rows].astype(np.int64)
@@ -108,16 +178,10 @@ def align(
     title, cut = f"{name}: templates", (planes.origins, planes.tilted)
     patches = frame_jobs.cut(title, greys, hosts, *cut, settings, workers)
     frame_jobs.align(name, greys, seeing, patches, sightings, settings, workers)
-    kept, found, dropped = _accepted(patches, sightings, seeing, pixel, settings)
+    kept, found = _accepted(patches, sightings, seeing, pixel, settings, dropped)
     at_hosts = _at_hosts(patches, sightings, kept, hosts, planes, pixel)
     normals_world = _normals_world(sightings, kept, rays, planes, world_T_rigs[hosts])
-    del patches, sightings, planes, cut, at, across, rays  # gigabytes, of thousands of frames
-    former = _former_observations(
-        landmarks, keypoints, solved.noise, [found, at_hosts], greys.num_frames
-    )
-    parts, colors = [found, at_hosts, former], keypoints.colors[own]
-    counts = Counts(len(seeing), len(found.points), "observations", dropped)
-    return _pack(parts, colors, normals_world, world_T_rigs, rig, counts)
+    return _Aligned(found, at_hosts, normals_world)
 
 
 def _planes(
@@ -195,9 +259,10 @@ def _accepted(
     seeing: np.ndarray,
     pixel: float,
     settings: PatchSettings,
-) -> tuple[np.ndarray, _Observed, dict[str, int]]:
-    """Accepted rows (N,) of the sightings, as observations, and counts of rejections by reason."""
-    parts, dropped = [], dict.fromkeys(REJECTIONS, 0)
+    dropped: dict[str, int],
+) -> tuple[np.ndarray, _Observed]:
+    """Accepted rows (N,) of the sightings, as observations; rejections are added to `dropped`."""
+    parts = []
     for first in range(0, max(len(seeing), 1), _SIGHTINGS_AT_ONCE):
         some = slice(first, first + _SIGHTINGS_AT_ONCE)
         there = Sightings(*(array[some] for array in sightings))
@@ -205,7 +270,7 @@ def _accepted(
         parts.append((first + kept, bearings, covariances))
     kept, bearings, covariances = (np.concatenate(column) for column in zip(*parts, strict=True))
     found = _Observed(sightings.templates[kept], seeing[kept], bearings, covariances)
-    return kept, found, dropped
+    return kept, found
 
 
 def accepted_rows(
@@ -325,10 +390,9 @@ def _pack(
 
     Points observed once are left out.
     """
-    points, frames, bearings, covariances = (
-        np.concatenate([getattr(part, name) for part in parts])
-        for name in ("points", "frames", "bearings_rig", "covariances")
-    )
+    every = _Observed.joined(parts)
+    points, frames, bearings = every.points, every.frames, every.bearings_rig
+    covariances = every.covariances
     seen = np.bincount(points, minlength=len(colors))
     order = np.lexsort((points, frames))
     order = order[seen[points[order]] > 1]

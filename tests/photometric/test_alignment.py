@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,7 +18,7 @@ from gsba.camera.rig import CubeRig
 from gsba.config import PatchSettings, RefineSettings
 from gsba.frames.panorama import Greys
 from gsba.geometry import inverse, pose
-from gsba.photometric import alignment
+from gsba.photometric import alignment, frame_jobs
 from gsba.photometric.alignment import Observations
 from gsba.store.shards import Threads
 from gsba.types import Counts, FrameSet, Keypoints, Landmarks, Sighted, Solution, Tracks
@@ -140,6 +141,31 @@ def test_observations_are_sub_pixel(walk) -> None:
     assert np.median(errors) < 0.06 and np.percentile(errors, 95) < 0.3
     counts = sighted.counts
     assert counts.received == counts.kept + sum(counts.dropped.values())
+
+
+def test_patches_of_some_points_at_a_time_give_the_same_bytes(
+    walk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    expected, cut = _run(walk), frame_jobs.cut
+    held: list[int] = []
+
+    def counting(title: str, greys: Greys, hosts: np.ndarray, *rest: Any) -> Any:
+        held.append(len(hosts))
+        return cut(title, greys, hosts, *rest)
+
+    monkeypatch.setattr(frame_jobs, "cut", counting)
+    monkeypatch.setattr(alignment, "total_memory_bytes", lambda: 16 * 8192 * 90)
+    found = _run(walk)
+    assert held == [90, 90, 90, 90, 40]
+    for name in ("starts", "bearings_rig", "sqrt_infos", "colors", "pixels"):
+        np.testing.assert_array_equal(
+            getattr(found.keypoints, name), getattr(expected.keypoints, name)
+        )
+    for name in ("points", "frames", "keypoints"):
+        np.testing.assert_array_equal(getattr(found.tracks, name), getattr(expected.tracks, name))
+    np.testing.assert_array_equal(found.normals_rig, expected.normals_rig)
+    np.testing.assert_array_equal(found.aligned, expected.aligned)
+    assert found.counts == expected.counts
 
 
 def test_tracks_and_keypoints_belong_together(walk) -> None:
