@@ -57,7 +57,7 @@ def make_map(frames: FrameSet, num_points: int = 50) -> Reconstruction:
 
 def bare(frames: FrameSet, sampled: bool) -> float:
     """CPU seconds per frame of decoding and encoding, and of sampling if `sampled`."""
-    size, buffers, spent = face_size_for(frames, None), Buffers(), 0.0
+    size, buffers, spent = face_size_for(frames.format, None), Buffers(), 0.0
     rig, room = CubeRig(size, np.pi / 2), np.empty((size, size, 3), np.uint8)
     cv2.setNumThreads(1)
     for _ in cut_padded(load_padded(frames, 0, buffers), rig, room):

@@ -155,7 +155,7 @@ def run_case(
         induced = None
         if (walk / "depth").exists():
             ranges = depth_maps(walk / "depth", len(truth.timestamps))
-            induced = induced_errors(found, truth, ranges, result.frames.width)
+            induced = induced_errors(found, truth, ranges, result.frames.format.width)
         stages = result.report["stages"]
         patches = [s["cpu_seconds"] for s in stages if s["name"].startswith("align")]
         yield Row(

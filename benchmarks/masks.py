@@ -162,10 +162,12 @@ def _masks(frames: FrameSet, true_masks: Path | None) -> dict[str, float]:
     inter = union = true_sum = false = masked = 0.0
     for f, name in enumerate(frames.names):
         mask = load_mask(frames, f)
-        found = np.zeros((frames.height, frames.width), bool) if mask is None else ~mask
+        found = (
+            np.zeros((frames.format.height, frames.format.width), bool) if mask is None else ~mask
+        )
         masked += found.mean()
         if true_masks is not None:
-            size = frames.width, frames.height
+            size = frames.format.width, frames.format.height
             true = decode(true_masks / f"{name}.png", size, gray=True) <= 127
             inter, union = inter + np.sum(found & true), union + np.sum(found | true)
             true_sum, false = true_sum + np.sum(true), false + np.mean(found & ~true)
@@ -178,7 +180,7 @@ def _masks(frames: FrameSet, true_masks: Path | None) -> dict[str, float]:
 def carrier_rows(frames: FrameSet, work: Path) -> list[Row]:
     """Rows of a bag and a stick pasted into a walk, fixed in the image and rotating below it."""
     rng = np.random.default_rng(0)
-    height, width = frames.height, frames.width
+    height, width = frames.format.height, frames.format.width
     grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1) + 0.5
     rays = bearings_from_erp(grid, width, height)
     longitude = np.arctan2(rays[..., 0], rays[..., 2])
@@ -210,12 +212,12 @@ def carrier_rows(frames: FrameSet, work: Path) -> list[Row]:
 def apartment_row(folder: Path) -> Row:
     """Row of a real capture's carrier against a hand-drawn outline; recall is of low rows."""
     frames = find_panoramas(folder / "images")
-    corners = np.loadtxt(OUTLINE, delimiter=",") * (frames.width / OUTLINE_WIDTH)
-    drawn = np.zeros((frames.height, frames.width), np.uint8)
+    corners = np.loadtxt(OUTLINE, delimiter=",") * (frames.format.width / OUTLINE_WIDTH)
+    drawn = np.zeros((frames.format.height, frames.format.width), np.uint8)
     true = cv2.fillPoly(drawn, [np.rint(corners).astype(np.int32)], 1) > 0
     carrier = find_carrier(frames)
     found = np.stack([~carrier_mask(carrier, frames, f) for f in range(len(frames))])
-    low = slice(round(LOW_ROWS * frames.height), None)
+    low = slice(round(LOW_ROWS * frames.format.height), None)
     return Row(
         "carrier, apartment",
         masked=carrier.share,

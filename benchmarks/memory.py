@@ -78,7 +78,7 @@ def make_map(num: int, width: int) -> tuple[Landmarks, np.ndarray, Keypoints, Cu
 def run(folder: Path, num_threads: int) -> dict[str, float]:
     """Align all points of the frames in a folder."""
     frames = scan(folder, None, None, None)
-    landmarks, poses, keypoints, rig = make_map(len(frames), frames.width)
+    landmarks, poses, keypoints, rig = make_map(len(frames), frames.format.width)
     settings = PatchSettings()
     greys = panorama.Greys(frames, settings.max_width)
     before = peak_mb()

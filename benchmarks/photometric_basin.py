@@ -122,7 +122,7 @@ def main() -> None:
     settings = PhotometricSettings(spacing_deg=10, depth_reach_deg=4)
     pyramids = [patches.pyramid(frames, f, settings, 2) for f in range(NUM_FRAMES)]
     table = exact_table(options.folder, truth, pyramids, settings)
-    print(f"{len(table)} patches, {len(table.targets)} observations, {frames.width} px wide")
+    print(f"{len(table)} patches, {len(table.targets)} observations, {frames.format.width} px wide")
     print("start px | " + " | ".join(f"{name}: converged, median px" for name in STRATEGIES))
     for error_px in ERRORS_PX:
         cells = []
@@ -130,9 +130,9 @@ def main() -> None:
             left = []
             for trial in range(options.trials):
                 rng = np.random.default_rng(trial)
-                start = disturb(table, truth, error_px, frames.width, rng)
+                start = disturb(table, truth, error_px, frames.format.width, rng)
                 poses = solve(table, pyramids, start, levels, error_px)
-                left.append(off_by(table, truth, poses, frames.width)[HELD:])
+                left.append(off_by(table, truth, poses, frames.format.width)[HELD:])
             share = np.mean(np.concatenate(left) < 0.1)
             cells.append(f"{100 * share:.0f}%, {np.median(left):.3f}")
         print(f"{error_px:g} | " + " | ".join(cells), flush=True)

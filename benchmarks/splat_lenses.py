@@ -51,7 +51,7 @@ from gsba.pipeline.refine import refine
 from gsba.splat.backend import choose_backend
 from gsba.splat.scene import Faces, load_faces, make_views, near_of, refined_frames, split_frames
 from gsba.splat.scores import Score, mean_score, measure
-from gsba.store.finished import load_lenses, load_run
+from gsba.store.finished import load_cameras, load_run
 from gsba.store.store import digest
 from gsba.trajectory.files import read_trajectory
 
@@ -96,7 +96,7 @@ def run_seed(
         make_walk(walk, "rectangle", "forward", width=WIDTH, seed=seed, camera="two-lens")
     runs = {name: refined(walk, out / f"run{seed}-{name}", name) for name in ("auto", "central")}
     reconstruction, frames = load_run(runs["auto"])
-    lenses = load_lenses(runs["auto"], reconstruction)
+    lenses = load_cameras(runs["auto"], reconstruction, frames)
     if not lenses:
         raise GsbaError(f"{runs['auto']}: the run has one centre, not two lenses")
     optics = Optics.of(lenses, reconstruction)

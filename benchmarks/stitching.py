@@ -58,7 +58,10 @@ def split(landmarks: Landmarks, seed: int) -> tuple[Landmarks, Landmarks]:
 def solve(run: Path, frames: FrameSet, settings: RefineSettings) -> tuple[list[Variant], Sighted]:
     """Variants from the other points, and held-out points aligned under the last variant."""
     keypoints = load_stage(run, "keypoints", Keypoints)
-    start, rig = load_stage(run, "refined1", Solution), cubemap.rig_for(frames, settings.cubemap)
+    start, rig = (
+        load_stage(run, "refined1", Solution),
+        cubemap.rig_for(frames.format, settings.cubemap),
+    )
     greys = panorama.Greys(frames, settings.patches.max_width)
     priors = TrajectoryPrior(start.world_T_rigs, settings.priors)
     used, held = split(start.landmarks, settings.seed)

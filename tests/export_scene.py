@@ -12,7 +12,7 @@ from gsba.camera.rig import RIG_R_FACE
 from gsba.camera.sphere import bearings_from_erp
 from gsba.disk import write_image
 from gsba.geometry import inverse, pose
-from gsba.types import FACES, FrameSet, PoseStatus, Reconstruction
+from gsba.types import FACES, FrameSet, PictureFormat, PoseStatus, Reconstruction
 
 NUM_FRAMES = 9
 WIDTH, HEIGHT = 512, 256
@@ -120,11 +120,8 @@ def panoramas(
         names=names,
         paths=tuple((folder / f"{name}{suffix}",) for name in names),
         timestamps=np.arange(NUM_FRAMES) * 0.5,
-        layout="erp",
-        faces=(),
-        width=WIDTH,
-        height=HEIGHT,
         mask_paths=(mask_path,) * NUM_FRAMES,
+        formats=(PictureFormat("erp", WIDTH, HEIGHT),),
     )
 
 
@@ -142,11 +139,8 @@ def cube_frames(folder: Path, size: int = 128) -> FrameSet:
         names=names,
         paths=tuple(tuple(folder / face / f"{name}.png" for face in faces) for name in names),
         timestamps=np.arange(NUM_FRAMES) * 0.5,
-        layout="cube",
-        faces=faces,
-        width=size,
-        height=size,
         mask_paths=(None,) * NUM_FRAMES,
+        formats=(PictureFormat("cube", size, size, faces),),
     )
 
 

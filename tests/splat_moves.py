@@ -41,7 +41,7 @@ def spoiled(case: Case, degrees: float, distance: float, noise: float, seed: int
 
 def run(case: Case, given: Given, settings: RefineSettings, **options) -> SplatResult:
     priors = TrajectoryPrior(case.result.coarse.world_T_rigs, settings.priors)
-    rig = cubemap.rig_for(case.result.frames, settings.cubemap)
+    rig = cubemap.rig_for(case.result.frames.format, settings.cubemap)
     return refinement.refine(
         *given, AdjustmentContext(Families((Bearings(), priors)), rig, settings, 2), **options
     )

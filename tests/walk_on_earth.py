@@ -11,7 +11,7 @@ from gsba.geometry import pose
 from gsba.placement.gps import local_from_geodetic
 from gsba.placement.placement import Placement
 from gsba.similarity import Sim3
-from gsba.types import FrameSet, Reconstruction
+from gsba.types import FrameSet, PictureFormat, Reconstruction
 
 ORIGIN = np.array([48.137, 11.575, 520.0])
 
@@ -19,7 +19,9 @@ ORIGIN = np.array([48.137, 11.575, 520.0])
 def frame_set(num: int = scene.NUM_FRAMES) -> FrameSet:
     names = tuple(f"frame_{f:04d}" for f in range(num))
     paths = tuple((Path(name),) for name in names)
-    return FrameSet(names, paths, np.arange(num) * 0.5, "erp", (), 512, 256, (None,) * num)
+    return FrameSet(
+        names, paths, np.arange(num) * 0.5, (None,) * num, (PictureFormat("erp", 512, 256),)
+    )
 
 
 def walk_result(num: int = 40, straight: bool = False) -> Reconstruction:

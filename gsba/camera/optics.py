@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from gsba.camera.cameras import Cameras
 from gsba.camera.lens import Lenses
 from gsba.camera.rig import CubeRig
 from gsba.camera.views import View, ViewCutter, lens_views, rig_views, scenes_of, turned_rigs
@@ -23,14 +24,15 @@ class Optics:
         return bool(self.lenses)
 
     @classmethod
-    def of(cls, lenses: Lenses, reconstruction: Reconstruction) -> "Optics":
+    def of(cls, cameras: Cameras, reconstruction: Reconstruction) -> "Optics":
         """Lenses of the frames that a reconstruction was made from.
 
-        Of more than two lenses there are no faces of one lens each: they count as one centre.
+        Of more than two lenses there are no faces of one lens each, and of several cameras none
+        that all frames share: they count as one centre.
         """
-        if lenses.num_lenses > 2:
+        if len(cameras.lenses) > 1 or cameras.only.num_lenses > 2:
             return ONE_EYE
-        return cls(lenses, scenes_of(reconstruction))
+        return cls(cameras.only, scenes_of(reconstruction))
 
     def views(self, size: int) -> tuple[View, ...]:
         """Six faces of `size` pixels and 90 degrees, or as dense faces of one lens each."""

@@ -14,6 +14,7 @@ from functools import partial
 import cv2
 import numpy as np
 
+from gsba.camera.cameras import Cameras
 from gsba.camera.equiangular import Grid, around_squares, shrunk
 from gsba.camera.fisheye import project
 from gsba.camera.lens import Lenses
@@ -22,7 +23,7 @@ from gsba.camera.sphere import around_sphere, dense_enough, erp_from_bearings, l
 from gsba.camera.straighten import PAD
 from gsba.geometry import pose
 from gsba.log import GsbaError
-from gsba.types import FACES, Fisheye, FrameSet, Reconstruction
+from gsba.types import FACES, Fisheye, PictureFormat, Reconstruction
 
 _FAR_DEPTH = 1e9  # map units: depth from which both lenses see alike
 _MAX_OVERSAMPLING = 1.5  # largest ratio of a picture's density to a view's: beyond it, detail
@@ -153,9 +154,41 @@ def _side_extents(band_rad: float) -> tuple[float, float]:
     return float(np.tan(low)), along_at(low)
 
 
-def seen_from_lenses(reconstruction: Reconstruction, lenses: Lenses) -> Reconstruction:
+def seen_from_lenses(reconstruction: Reconstruction, cameras: Cameras) -> Reconstruction:
     """Poses with the lenses' axes, and rays from the lenses' centres in the middle of the
     readout."""
+    return _by_camera(reconstruction, cameras, _seen_from_lenses)
+
+
+def _by_camera(
+    reconstruction: Reconstruction,
+    cameras: Cameras,
+    see: Callable[[Reconstruction, Lenses], Reconstruction],
+) -> Reconstruction:
+    """Poses and rays of each camera's frames, as `see` makes them by that camera's lenses."""
+    if not cameras.of_frame:
+        return see(reconstruction, cameras.only)
+    poses = reconstruction.world_T_rigs.copy()
+    bearings = reconstruction.observation_bearings.copy()
+    origins = reconstruction.observation_origins
+    origins = None if origins is None else origins.copy()
+    of_frame = np.array(cameras.of_frame)
+    for number, lenses in enumerate(cameras.lenses):
+        found, frames = see(reconstruction, lenses), of_frame == number
+        rows = frames[reconstruction.observation_frames]
+        poses[frames] = found.world_T_rigs[frames]
+        bearings[rows] = found.observation_bearings[rows]
+        if origins is not None and found.observation_origins is not None:
+            origins[rows] = found.observation_origins[rows]
+    return replace(
+        reconstruction,
+        world_T_rigs=poses,
+        observation_bearings=bearings,
+        observation_origins=origins,
+    )
+
+
+def _seen_from_lenses(reconstruction: Reconstruction, lenses: Lenses) -> Reconstruction:
     if lenses.readout_motion is not None:
         reconstruction = _rays_from_lens_centres(reconstruction, lenses)
     if lenses.axes is None:
@@ -186,8 +219,12 @@ def _rays_from_lens_centres(reconstruction: Reconstruction, lenses: Lenses) -> R
     return replace(reconstruction, observation_bearings=rays, observation_origins=origins)
 
 
-def shown_in_pictures(reconstruction: Reconstruction, lenses: Lenses) -> Reconstruction:
+def shown_in_pictures(reconstruction: Reconstruction, cameras: Cameras) -> Reconstruction:
     """Observed points as bearings along the directions in which pictures show them."""
+    return _by_camera(reconstruction, cameras, _shown_in_pictures)
+
+
+def _shown_in_pictures(reconstruction: Reconstruction, lenses: Lenses) -> Reconstruction:
     if lenses.readout_motion is None:
         return reconstruction
     frames = reconstruction.observation_frames
@@ -309,7 +346,7 @@ class ViewCutter:
 
         Args:
             squares: (6, S, S[, C]) uint8, FACES order.
-            correction: coefficients of the stitching field, see `FrameSet`.
+            correction: coefficients of the stitching field, see `PictureFormat`.
         """
         width = dense_enough(4 * squares.shape[1], self._views[0].focal)
         squares = shrunk(squares, width // 4)
@@ -420,8 +457,8 @@ def _weighted_median(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
     return np.take_along_axis(values, middle, axis=1)[:, 0]
 
 
-def views_for(frames: FrameSet, size: int, lenses: Lenses) -> tuple[View, ...]:
-    """The views of a dataset of frames, faces of `size` pixels."""
-    if lenses and frames.panoramic:
+def views_for(kind: PictureFormat, size: int, lenses: Lenses) -> tuple[View, ...]:
+    """The views of a dataset of one camera's frames, faces of `size` pixels."""
+    if lenses and kind.panoramic:
         return lens_views(lenses, size)
-    return cube_views(frames.faces or FACES, size)
+    return cube_views(kind.faces or FACES, size)

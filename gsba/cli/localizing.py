@@ -56,7 +56,7 @@ def localize(
     if out.resolve() == run.resolve() or run.resolve() in out.resolve().parents:
         raise GsbaError(f"--out {out} is in the run's folder, which stays as it is: choose another")
     localizer = Localizer(run, map_number, precise=not fast)
-    pictures = find_pictures(images, run, localizer.map.frames.layout, out)
+    pictures = find_pictures(images, run, localizer.map.frames.format.layout, out)
     found = localize_all(localizer, pictures)
     for frame in found.frames:
         if not frame.found:

@@ -17,7 +17,7 @@ from gsba.cli.refining import (
     run_folder,
     settings_of,
 )
-from gsba.cli.results import lenses_of, shutter_of
+from gsba.cli.results import cameras_of, shutter_of
 from gsba.cli.splat import BackendName, Iterations, splat_settings, train_on
 from gsba.log import GsbaError
 
@@ -87,7 +87,7 @@ def _write_dataset(run: Path, to: str, face_size: int | None) -> None:
         logger.warning("the dataset is not turned upright: %s", error)
         placement = Placement()
     folder = run / to
-    lenses = lenses_of(run, reconstruction, frames, "auto", 1)
+    lenses = cameras_of(run, reconstruction, frames, "auto", 1)
     given = reconstruction, frames, folder, format_of(to), face_size, placement
     export(*given, lenses=lenses, shutter=shutter_of(run))
     claim(run.resolve(), folder.resolve())

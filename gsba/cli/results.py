@@ -21,7 +21,7 @@ from gsba.cli.splat import (
 from gsba.log import GsbaError
 
 if TYPE_CHECKING:
-    from gsba.camera.lens import Lenses
+    from gsba.camera.cameras import Cameras
     from gsba.config import GpsSettings
     from gsba.evaluate.consistency import Consistency
     from gsba.export import Shutter
@@ -161,7 +161,7 @@ def export(
     from gsba.store.finished import load_run
 
     reconstruction, frames, *_ = load_run(run, map_number)
-    lenses = lenses_of(run, reconstruction, frames, images, map_number)
+    lenses = cameras_of(run, reconstruction, frames, images, map_number)
     folder = out or run / (name if map_number == 1 else f"{name}-map{map_number}")
     known_baseline = _baseline(run, baseline) if scale == "lens" else None
     noise = _gps_noise(run, gps_sigma) if gps is not None else None
@@ -191,21 +191,21 @@ def shutter_of(run: Path, exposure_ms: float | None = None) -> "Shutter":
     return Shutter(*(None if value is None else float(value) / 1e3 for value in given))
 
 
-def lenses_of(
+def cameras_of(
     run: Path, reconstruction: "Reconstruction", frames: "FrameSet", images: str, map_number: int
-) -> "Lenses":
-    """Lenses that exported images are rendered from: one centre, or the run's two lenses."""
+) -> "Cameras":
+    """Cameras that exported images are rendered from: one centre each, or the run's two lenses."""
+    from gsba.camera.cameras import Cameras
     from gsba.camera.lens import ONE_CENTRE
-    from gsba.export import of_one_lens
+    from gsba.export import of_one_lens, seen_by
+    from gsba.store.finished import load_cameras
 
-    if not of_one_lens(images, frames):
-        return ONE_CENTRE
-    from gsba.store.finished import load_lenses
-
-    lenses = load_lenses(run, reconstruction, map_number)
-    if not lenses and images not in ("auto", "panorama"):
+    if not any(of_one_lens(images, kind) for kind in frames.formats):
+        return Cameras.of(ONE_CENTRE, frames)
+    cameras = load_cameras(run, reconstruction, frames, map_number)
+    if not cameras and images in ("lenses", "fisheye"):
         raise GsbaError(f"{run}: the run has one centre: export it without --images {images}")
-    return lenses
+    return seen_by(images, frames, cameras)
 
 
 def _baseline(run: Path, millimetres: float | None) -> tuple[float, float] | None:

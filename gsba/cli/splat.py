@@ -75,7 +75,7 @@ def render(
     from gsba.splat import read_ply, scene
     from gsba.splat.backend import choose_backend
     from gsba.splat.pictures import render_panorama, render_views
-    from gsba.store.finished import load_lenses, load_run
+    from gsba.store.finished import load_cameras, load_run
     from gsba.store.folder import claim
 
     settings = splat_settings(None, face_size, backend)
@@ -84,7 +84,7 @@ def render(
         raise GsbaError(f"{run} has no frame {frame!r}: its first is {frames.names[0]!r}")
     gaussians, renderer = read_ply(splat), choose_backend(settings.backend)
     near = scene.near_of(reconstruction.world_T_rigs, settings)
-    optics = Optics.of(load_lenses(run, reconstruction), reconstruction)
+    optics = Optics.of(load_cameras(run, reconstruction, frames), reconstruction)
     f, folder = frames.names.index(frame), out or run / "renderings"
     pose, views = reconstruction.world_T_rigs[f], optics.views(settings.face_size)
     (rig,) = optics.own(pose[None], np.array([f]))
@@ -126,7 +126,7 @@ def _compare(
     from gsba.evaluate.splats import compare, poses_for
     from gsba.splat.backend import choose_backend
     from gsba.splat.lpips import Lpips
-    from gsba.store.finished import load_lenses, load_run
+    from gsba.store.finished import load_cameras, load_run
     from gsba.store.folder import claim
 
     lpips = Lpips(lpips_weights) if lpips_weights else None
@@ -134,7 +134,7 @@ def _compare(
     sources = {"refined": reconstruction.world_T_rigs}
     sources |= {name: poses_for(frames, trajectory) for name, trajectory in others.items()}
     renderer = choose_backend(settings.backend)
-    optics = Optics.of(load_lenses(run, reconstruction), reconstruction)
+    optics = Optics.of(load_cameras(run, reconstruction, frames), reconstruction)
     results = compare(reconstruction, frames, sources, settings, renderer, out, lpips, optics)
     claim(run.resolve(), out.resolve())
     return results

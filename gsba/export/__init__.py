@@ -5,7 +5,7 @@ Gives a folder that the other program reads without conversion.
 """
 
 from gsba.export.formats import ExportFormat, ExportOptions, export, export_all
-from gsba.export.images import of_one_lens
+from gsba.export.images import of_one_lens, seen_by
 from gsba.export.motion import Shutter
 from gsba.export.ply import write_points
 
@@ -16,5 +16,6 @@ __all__ = [
     "export",
     "export_all",
     "of_one_lens",
+    "seen_by",
     "write_points",
 ]

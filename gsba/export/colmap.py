@@ -16,7 +16,8 @@ Layouts:
   for one centre in the middle (`gsba.camera.one_centre`).
 
 A frame's pose is stored as rig_from_world, where COLMAP's rig frame is that of the first camera.
-Image f * C + c + 1 is face c of frame f, point j + 1 is point j.
+Images are numbered frame after frame, face after face; point j + 1 is point j. Frames of several
+cameras have a rig for each of these.
 """
 
 import json
@@ -26,18 +27,24 @@ from pathlib import Path
 
 import numpy as np
 
+from gsba.camera.cameras import ONE_CAMERA, Cameras
 from gsba.camera.fisheye import Rig, facing, lens_names, optical_axes, project, rotation_of
-from gsba.camera.lens import ONE_CENTRE, Lenses
+from gsba.camera.lens import Lenses
 from gsba.camera.one_centre import seen_from_the_middle
 from gsba.camera.sphere import erp_from_bearings
-from gsba.camera.views import View, scenes_of, seen_from_lenses, shown_in_pictures, views_for
-from gsba.export.images import face_size_for, has_masks, panorama_writer, view_writer
-from gsba.export.pictures import Files, FrameWriter
+from gsba.camera.views import (
+    View,
+    scenes_of,
+    seen_from_lenses,
+    shown_in_pictures,
+)
+from gsba.export.images import has_masks, panorama_writer, view_writer, views_of_cameras
+from gsba.export.pictures import Files, FrameWriter, by_camera
 from gsba.export.ply import write_splat_points
 from gsba.export.raw import RawPictures, raw_lenses
 from gsba.geometry import inverse, pose, quaternion_from_rotation
 from gsba.log import GsbaError
-from gsba.types import Fisheye, FrameSet, Reconstruction
+from gsba.types import Fisheye, FrameSet, PictureFormat, Reconstruction
 
 TEST_EVERY = 8  # one frame of so many is held out, which is the trainers' own interval
 _BY_VIEW, _FLAT = "{view}/{name}{suffix}", "{name}_{view}{suffix}"  # names of images
@@ -61,16 +68,15 @@ def write_colmap(
     frames: FrameSet,
     face_size: int | None,
     link: bool = False,
-    lenses: Lenses = ONE_CENTRE,
+    cameras: Cameras = ONE_CAMERA,
 ) -> FrameWriter:
     """Write the rig layout into `partial`, without images; returns their writer."""
-    views = views_for(frames, face_size_for(frames, face_size), lenses)
-    files = _files(partial, _BY_VIEW, [view.name for view in views], has_masks(frames))
-    seen, sensors = seen_from_lenses(reconstruction, lenses), list(map(_pinhole, views))
-    write_model(partial / "sparse" / "0", seen, sensors, _names(files, frames))
-    text = json.dumps(_rig_config(sensors, files.views), indent=1) + "\n"
-    (partial / "rig_config.json").write_text(text)
-    return view_writer(files, frames, views, lenses, link, scenes_of(reconstruction))
+    views = views_of_cameras(frames, face_size, cameras)
+    files = _files_of_cameras(partial, _BY_VIEW, views, frames)
+    seen, rigs = seen_from_lenses(reconstruction, cameras), _pinholes(views)
+    write_model(partial / "sparse" / "0", seen, rigs, _names(files, frames), frames.cameras)
+    _write_rig_config(partial, rigs, files, frames)
+    return view_writer(files, frames, views, cameras, link, scenes_of(reconstruction))
 
 
 def write_colmap_flat(
@@ -79,38 +85,40 @@ def write_colmap_flat(
     frames: FrameSet,
     face_size: int | None,
     link: bool = False,
-    lenses: Lenses = ONE_CENTRE,
+    cameras: Cameras = ONE_CAMERA,
 ) -> FrameWriter:
     """Write the layout with unique base names into `partial`, without images; returns their
     writer."""
-    views = views_for(frames, face_size_for(frames, face_size), lenses)
-    files = _files(partial, _FLAT, [view.name for view in views], has_masks(frames))
+    views = views_of_cameras(frames, face_size, cameras)
+    files = _files_of_cameras(partial, _FLAT, views, frames)
     names, model = _names(files, frames), partial / "sparse" / "0"
-    seen = seen_from_lenses(reconstruction, lenses)
-    write_model(model, seen, list(map(_pinhole, views)), names)
+    seen = seen_from_lenses(reconstruction, cameras)
+    write_model(model, seen, _pinholes(views), names, frames.cameras)
     write_splat_points(
         model / "points3D.ply", reconstruction.points_world, reconstruction.point_colors
     )
     held_out = [name for of_frame in names[::TEST_EVERY] for name in of_frame]
     (model / "test.txt").write_text("\n".join(held_out) + "\n")
-    return view_writer(files, frames, views, lenses, link, scenes_of(reconstruction))
+    return view_writer(files, frames, views, cameras, link, scenes_of(reconstruction))
 
 
 def write_colmap_raw(
     partial: Path,
     reconstruction: Reconstruction,
     frames: FrameSet,
-    lenses: Lenses,
+    cameras: Cameras,
     flat: bool,
     link: bool = False,
 ) -> FrameWriter:
     """Write the rig or the flat layout of raw fisheyes into `partial`, without images; returns
     their writer."""
-    sensors = _raw_sensors(frames, lenses)
-    of_lenses = lens_names(len(sensors))
-    files = _files(partial, _FLAT if flat else _BY_VIEW, of_lenses, masked=True)
+    own = zip(frames.formats, cameras.lenses, strict=True)
+    rigs = [_raw_sensors(kind, lenses) for kind, lenses in own]
+    pattern = _FLAT if flat else _BY_VIEW
+    files = [_files(partial, pattern, lens_names(len(sensors)), masked=True) for sensors in rigs]
     names, model = _names(files, frames), partial / "sparse" / "0"
-    write_model(model, shown_in_pictures(reconstruction, lenses), sensors, names)
+    seen = shown_in_pictures(reconstruction, cameras)
+    write_model(model, seen, rigs, names, frames.cameras)
     if flat:
         held_out = [name for of_frame in names[::TEST_EVERY] for name in of_frame]
         (model / "test.txt").write_text("\n".join(held_out) + "\n")
@@ -118,9 +126,8 @@ def write_colmap_raw(
             model / "points3D.ply", reconstruction.points_world, reconstruction.point_colors
         )
     else:
-        text = json.dumps(_rig_config(sensors, of_lenses), indent=1) + "\n"
-        (partial / "rig_config.json").write_text(text)
-    return RawPictures(files, link)
+        _write_rig_config(partial, rigs, files, frames)
+    return by_camera([RawPictures(own, link) for own in files], frames)
 
 
 def write_colmap_erp(
@@ -128,67 +135,69 @@ def write_colmap_erp(
     reconstruction: Reconstruction,
     frames: FrameSet,
     link: bool = False,
-    lenses: Lenses = ONE_CENTRE,
+    cameras: Cameras = ONE_CAMERA,
 ) -> FrameWriter:
     """Write the equirectangular layout into `partial`, without images; returns their writer.
 
     Raises:
         GsbaError: the frames are cube faces.
     """
-    if not frames.panoramic:
+    if not all(kind.panoramic for kind in frames.formats):
         raise GsbaError("colmap-erp needs panoramas, these frames are cube faces: use colmap")
-    size = (frames.width, frames.height)
-    sensor = Sensor("EQUIRECTANGULAR", *size, (float(size[0]), float(size[1])), np.eye(4))
+    sizes = [(kind.width, kind.height) for kind in frames.formats]
+    rigs = [
+        [Sensor("EQUIRECTANGULAR", *size, (float(size[0]), float(size[1])), np.eye(4))]
+        for size in sizes
+    ]
     files = _files(partial, "{name}{suffix}", ("",), has_masks(frames))
-    seen = seen_from_the_middle(reconstruction) if lenses else reconstruction
-    write_model(partial / "sparse" / "0", seen, [sensor], _names(files, frames))
-    return panorama_writer(files, frames, link, lenses, scenes_of(reconstruction))
+    seen = seen_from_the_middle(reconstruction) if cameras else reconstruction
+    names = _names([files] * len(rigs), frames)
+    write_model(partial / "sparse" / "0", seen, rigs, names, frames.cameras)
+    return panorama_writer(files, frames, cameras, link, scenes_of(reconstruction))
 
 
 def write_model(
-    folder: Path, reconstruction: Reconstruction, sensors: Sequence[Sensor], names: list[list[str]]
+    folder: Path,
+    reconstruction: Reconstruction,
+    rigs: Sequence[Sequence[Sensor]],
+    names: list[list[str]],
+    rig_of_frame: np.ndarray,
 ) -> None:
     """Write rigs, cameras, frames, images and points3D in binary.
 
     Args:
         folder: made, with its parents.
         reconstruction: poses, points and observations.
-        sensors: the cameras of the rig.
+        rigs: the cameras of each rig.
         names: image names, by frame and sensor.
+        rig_of_frame: (F,) int, rig of each frame.
     """
     import pycolmap
 
-    num_sensors = len(sensors)
     model = pycolmap.Reconstruction()
-    ids = [_add_camera(model, sensor, c + 1) for c, sensor in enumerate(sensors)]
-    rig = pycolmap.Rig(rig_id=1)
-    rig.add_ref_sensor(ids[0])
-    rig_T_ref = sensors[0].rig_T_sensor
-    for c in range(1, num_sensors):
-        rig.add_sensor(ids[c], _rigid(inverse(sensors[c].rig_T_sensor) @ rig_T_ref))
-    model.add_rig(rig)
-
-    which, pixels = _project(
-        sensors, reconstruction.observation_bearings, reconstruction.observation_origins
-    )
-    images = reconstruction.observation_frames * np.int64(num_sensors) + which
+    ids = _add_rigs(model, rigs)
+    counts = np.array([len(sensors) for sensors in rigs])[rig_of_frame]
+    firsts = np.concatenate([[0], np.cumsum(counts)])  # (F + 1,) image of each frame
+    which, pixels = _project_in_rigs(reconstruction, rigs, rig_of_frame)
+    images = firsts[reconstruction.observation_frames] + which
     order = np.argsort(images, kind="stable")
-    starts = np.searchsorted(images[order], np.arange(len(names) * num_sensors + 1))
+    starts = np.searchsorted(images[order], np.arange(firsts[-1] + 1))
     rows = np.empty(len(images), np.int64)  # row of each observation in its image
     rows[order] = np.arange(len(images)) - starts[images[order]]
 
     rigs_T_world = inverse(reconstruction.world_T_rigs)
-    for f, of_frame in enumerate(names):
-        frame = pycolmap.Frame(frame_id=f + 1, rig_id=1)
+    for f, (of_frame, rig) in enumerate(zip(names, rig_of_frame.tolist(), strict=True)):
+        frame = pycolmap.Frame(frame_id=f + 1, rig_id=rig + 1)
+        rig_T_ref = rigs[rig][0].rig_T_sensor
         frame.rig_from_world = _rigid(inverse(rig_T_ref) @ rigs_T_world[f])
-        first = f * num_sensors
-        for c in range(num_sensors):
-            frame.add_data_id(pycolmap.data_t(ids[c], first + c + 1))
+        first = int(firsts[f])
+        for c, sensor_id in enumerate(ids[rig]):
+            frame.add_data_id(pycolmap.data_t(sensor_id, first + c + 1))
         model.add_frame(frame)
         for c, name in enumerate(of_frame):
             seen = order[starts[first + c] : starts[first + c + 1]]
             image = pycolmap.Image(
-                name=name, keypoints=pixels[seen], camera_id=c + 1, image_id=first + c + 1
+                name=name, keypoints=pixels[seen], camera_id=ids[rig][c].id, image_id=first + c + 1
             )
             image.frame_id = f + 1
             model.add_image(image)
@@ -196,6 +205,37 @@ def write_model(
     _add_points(model, reconstruction, images, rows)
     folder.mkdir(parents=True, exist_ok=True)
     model.write_binary(folder)
+
+
+def _add_rigs(model, rigs: Sequence[Sequence[Sensor]]) -> list[list]:
+    """Add all rigs and their cameras to the model; returns the sensor ids, by rig."""
+    import pycolmap
+
+    ids = list[list]()
+    for number, sensors in enumerate(rigs):
+        first = sum(map(len, ids)) + 1
+        ids.append([_add_camera(model, sensor, first + c) for c, sensor in enumerate(sensors)])
+        rig = pycolmap.Rig(rig_id=number + 1)
+        rig.add_ref_sensor(ids[-1][0])
+        rig_T_ref = sensors[0].rig_T_sensor
+        for c in range(1, len(sensors)):
+            rig.add_sensor(ids[-1][c], _rigid(inverse(sensors[c].rig_T_sensor) @ rig_T_ref))
+        model.add_rig(rig)
+    return ids
+
+
+def _project_in_rigs(
+    reconstruction: Reconstruction, rigs: Sequence[Sequence[Sensor]], rig_of_frame: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Sensor (O,) of its frame's rig that sees each observation, and its pixel (O, 2) there."""
+    bearings, origins = reconstruction.observation_bearings, reconstruction.observation_origins
+    which, pixels = np.zeros(len(bearings), np.int64), np.empty((len(bearings), 2))
+    of_observation = rig_of_frame[reconstruction.observation_frames]
+    for number, sensors in enumerate(rigs):
+        rows = np.flatnonzero(of_observation == number)
+        starts = None if origins is None else origins[rows]
+        which[rows], pixels[rows] = _project(sensors, bearings[rows], starts)
+    return which, pixels
 
 
 def _rigid(a_T_b: np.ndarray):
@@ -277,7 +317,7 @@ def _project_raw(
     return which, pixels
 
 
-def _raw_sensors(frames: FrameSet, lenses: Lenses) -> list[Sensor]:
+def _raw_sensors(kind: PictureFormat, lenses: Lenses) -> list[Sensor]:
     """Raw lenses as cameras of the rig."""
     return [
         Sensor(
@@ -288,7 +328,7 @@ def _raw_sensors(frames: FrameSet, lenses: Lenses) -> list[Sensor]:
             pose(rotation_of(lens), centre),
             lens,
         )
-        for lens, centre in zip(raw_lenses(frames), lenses.centres, strict=True)
+        for lens, centre in zip(raw_lenses(kind), lenses.centres, strict=True)
     ]
 
 
@@ -301,11 +341,31 @@ def _pinhole(view: View) -> Sensor:
     return Sensor("PINHOLE", view.width, view.height, params, view.rig_T_view)
 
 
-def _rig_config(sensors: Sequence[Sensor], names: Sequence[str]) -> list[dict]:
-    """Rig in the format of `colmap rig_configurator`; rotations are cam_from_rig, wxyz."""
+def _write_rig_config(
+    partial: Path, rigs: Sequence[Sequence[Sensor]], files: Sequence[Files], frames: FrameSet
+) -> None:
+    """Write `rig_config.json`: one rig, or where rigs differ one for each recording."""
+    if len(rigs) == 1:
+        configs = [_rig_config(rigs[0], files[0].views, "")]
+    else:
+        numbers = {name: frames.cameras[rows[0]] for name, rows in frames.recordings.items()}
+        configs = [
+            _rig_config(rigs[number], files[number].views, f"{recording}/")
+            for recording, number in numbers.items()
+        ]
+    (partial / "rig_config.json").write_text(json.dumps(configs, indent=1) + "\n")
+
+
+def _rig_config(sensors: Sequence[Sensor], names: Sequence[str], folder: str) -> dict:
+    """Rig in the format of `colmap rig_configurator`; rotations are cam_from_rig, wxyz.
+
+    Args:
+        sensors, names: of the rig's cameras.
+        folder: of its images, in that of each camera.
+    """
     configs = []
     for sensor, name in zip(sensors, names, strict=True):
-        config: dict[str, object] = {"image_prefix": f"{name}/"}
+        config: dict[str, object] = {"image_prefix": f"{name}/{folder}"}
         if not configs:
             config["ref_sensor"] = True
         else:
@@ -314,7 +374,20 @@ def _rig_config(sensors: Sequence[Sensor], names: Sequence[str]) -> list[dict]:
             config["cam_from_rig_translation"] = cam_T_ref[:3, 3].tolist()
         config |= {"camera_model_name": sensor.model, "camera_params": sensor.params}
         configs.append(config)
-    return [{"cameras": configs}]
+    return {"cameras": configs}
+
+
+def _files_of_cameras(
+    partial: Path, name: str, views: Sequence[Sequence[View]], frames: FrameSet
+) -> list[Files]:
+    """Files of images and masks of each camera's frames."""
+    masked = has_masks(frames)
+    return [_files(partial, name, [view.name for view in own], masked) for own in views]
+
+
+def _pinholes(views: Sequence[Sequence[View]]) -> list[list[Sensor]]:
+    """The cameras of each rig."""
+    return [list(map(_pinhole, own)) for own in views]
 
 
 def _files(partial: Path, name: str, views: Sequence[str], masked: bool) -> Files:
@@ -322,7 +395,7 @@ def _files(partial: Path, name: str, views: Sequence[str], masked: bool) -> File
     return Files(partial, views, f"images/{name}", f"masks/{name}.png" if masked else "")
 
 
-def _names(files: Files, frames: FrameSet) -> list[list[str]]:
-    """Image names, by frame and view."""
-    every = [files.images(frames, f) for f in range(len(frames))]
+def _names(files: Sequence[Files], frames: FrameSet) -> list[list[str]]:
+    """Image names, by frame and view, from the files of each camera's frames."""
+    every = [files[c].images(frames, f) for f, c in enumerate(frames.cameras.tolist())]
     return [[path.removeprefix("images/") for path in of_frame] for of_frame in every]

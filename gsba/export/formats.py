@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gsba.camera.cameras import Cameras
 from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.config import FORMATS_OF
 from gsba.export.folder import output_folder
@@ -18,7 +19,7 @@ from gsba.export.photos import FITTING, Photos, add_photos
 from gsba.export.pictures import FrameWriter
 from gsba.log import GsbaError
 from gsba.placement.placement import Placement
-from gsba.store.finished import lenses_of_map, one_map
+from gsba.store.finished import cameras_of_map, one_map
 from gsba.store.shards import Workers, content_digest
 from gsba.store.store import fingerprint
 from gsba.types import FrameSet, PoseStatus, Reconstruction
@@ -49,7 +50,8 @@ class ExportOptions:
     face_size: int | None = None  # pixels of a cube face; None = by the frames
     placement: Placement | None = None  # of the exported world; None = the run's world
     link: bool = False  # hard links to unchanged frames
-    lenses: Lenses = ONE_CENTRE  # of the frames, in the unit of the reconstruction
+    lenses: Lenses | Cameras = ONE_CENTRE  # of the frames, in the unit of the reconstruction: of
+    # all frames, or of each camera's
     images: str = "auto"  # the setting `export.images`
     map_number: int = 1  # 1 = the largest map
     fetched: bool = False  # with the frames that were added where the map was weak
@@ -65,7 +67,7 @@ def export(
     face_size: int | None = None,
     placement: Placement | None = None,
     link: bool = False,
-    lenses: Lenses = ONE_CENTRE,
+    lenses: Lenses | Cameras = ONE_CENTRE,
     images: str = "auto",
     workers: Workers | None = None,
     map_number: int = 1,
@@ -88,8 +90,9 @@ def export(
             world.
         link: make hard links to frames that are exported unchanged, not copies: an edit of one is
             an edit of the other.
-        lenses: lenses of the frames, in the unit of the reconstruction: each face is of one lens
-            then, and panoramas are stitched at the map's depth.
+        lenses: lenses of the frames, or cameras of which each has its own, in the unit of the
+            reconstruction: each face is of one lens then, and panoramas are stitched at the map's
+            depth.
         images: the setting `export.images`: fisheye for raw fisheyes, panorama for panoramas alone,
             else faces.
         workers: workers that write images; None = threads of this process.
@@ -128,21 +131,21 @@ def export_all(
     """
     options = options or ExportOptions()
     face_size, link, images = options.face_size, options.link, options.images
-    map_number, lenses = options.map_number, options.lenses
+    map_number = options.map_number
     for to in outs:
         _require_fitting(to, frames, images, options.photos)
     whole = reconstruction
+    cameras = Cameras.of(options.lenses, frames)
     reconstruction, frames = one_map(whole, frames, map_number, "the reconstruction")
-    if lenses:
-        lenses = lenses_of_map(lenses, whole, map_number)
+    cameras = cameras_of_map(cameras, whole, map_number)
     if not options.fetched and any(frames.fetched):
         rows = frames.chosen()
         reconstruction, frames = reconstruction.taken(rows), frames.taken(rows)
-        lenses = lenses.taken(rows)
+        cameras = cameras.taken(rows)
     _warn_of_gaps(reconstruction, frames)
     placement = options.placement or Placement(map_number=map_number)
     reconstruction = placement.apply(reconstruction)
-    seen_by, up = lenses.scaled(placement.similarity.scale), placement.up
+    seen_by, up = cameras.scaled(placement.similarity.scale), placement.up
     files = (path for paths in (*frames.paths, frames.mask_paths) for path in paths)
     read = fingerprint(path for path in files if path and path.exists())  # some formats read none
     key = __version__, reconstruction, frames, read, face_size, up, link, seen_by, images
@@ -171,7 +174,11 @@ def export_all(
 
 def _images_of(to: ExportFormat, images: str, frames: FrameSet) -> str:
     """Setting `export.images` of a format: what `auto` gives differs."""
-    if to == ExportFormat.METASHAPE and images == "auto" and frames.panoramic:
+    if (
+        to == ExportFormat.METASHAPE
+        and images == "auto"
+        and all(kind.panoramic for kind in frames.formats)
+    ):
         return "panorama"
     return images
 
@@ -194,16 +201,16 @@ def _write_raw(
     to: ExportFormat,
     up: str | None,
     link: bool,
-    lenses: Lenses,
+    cameras: Cameras,
     shutter: Shutter,
 ) -> list[FrameWriter]:
     from gsba.export import colmap, nerfstudio
 
     if to == ExportFormat.NERFSTUDIO:
-        given = partial, reconstruction, frames, lenses, up, link
+        given = partial, reconstruction, frames, cameras, up, link
         return nerfstudio.write_nerfstudio_raw(*given, shutter)
     flat = to == ExportFormat.COLMAP_FLAT
-    return [colmap.write_colmap_raw(partial, reconstruction, frames, lenses, flat, link)]
+    return [colmap.write_colmap_raw(partial, reconstruction, frames, cameras, flat, link)]
 
 
 def _write_panoramas(
@@ -213,20 +220,20 @@ def _write_panoramas(
     to: ExportFormat,
     up: str | None,
     link: bool,
-    lenses: Lenses,
+    cameras: Cameras,
 ) -> list[FrameWriter]:
     from gsba.export import colmap, metashape, nerfstudio, panoramas
 
     given = partial, reconstruction, frames
     match to:
         case ExportFormat.METASHAPE:
-            return [metashape.write_metashape_panoramas(*given, link, lenses)]
+            return [metashape.write_metashape_panoramas(*given, link, cameras)]
         case ExportFormat.COLMAP_ERP:
-            return [colmap.write_colmap_erp(*given, link, lenses)]
+            return [colmap.write_colmap_erp(*given, link, cameras)]
         case ExportFormat.NERFSTUDIO:
-            return nerfstudio.write_nerfstudio_erp(*given, lenses, up, link)
+            return nerfstudio.write_nerfstudio_erp(*given, cameras, up, link)
         case _:
-            return [panoramas.write_with_poses(*given, lenses, link)]
+            return [panoramas.write_with_poses(*given, cameras, link)]
 
 
 def _require_fitting(to: ExportFormat, frames: FrameSet, images: str, photos: Photos) -> None:
@@ -240,7 +247,7 @@ def _require_fitting(to: ExportFormat, frames: FrameSet, images: str, photos: Ph
             f"photos go beside cube faces in {', '.join(FITTING)}, not in {to.value} with "
             f"--images {images}"
         )
-    if images == "panorama" and not frames.panoramic:
+    if images == "panorama" and not all(kind.panoramic for kind in frames.formats):
         raise GsbaError("--images panorama needs panoramas, these frames are cube faces: use cube")
 
 
@@ -252,7 +259,7 @@ def _write(
     face_size: int | None,
     up: str | None,
     link: bool,
-    lenses: Lenses,
+    cameras: Cameras,
     shutter: Shutter,
 ) -> list[FrameWriter]:
     from gsba.export import colmap, gltf, metashape, nerfstudio, ply
@@ -261,15 +268,15 @@ def _write(
     given = partial, reconstruction, frames
     match to:
         case ExportFormat.COLMAP:
-            return [colmap.write_colmap(*given, face_size, link, lenses)]
+            return [colmap.write_colmap(*given, face_size, link, cameras)]
         case ExportFormat.COLMAP_FLAT:
-            return [colmap.write_colmap_flat(*given, face_size, link, lenses)]
+            return [colmap.write_colmap_flat(*given, face_size, link, cameras)]
         case ExportFormat.COLMAP_ERP:
-            return [colmap.write_colmap_erp(*given, link, lenses)]
+            return [colmap.write_colmap_erp(*given, link, cameras)]
         case ExportFormat.NERFSTUDIO:
-            return nerfstudio.write_nerfstudio(*given, face_size, up, link, lenses, shutter)
+            return nerfstudio.write_nerfstudio(*given, face_size, up, link, cameras, shutter)
         case ExportFormat.METASHAPE:
-            return [metashape.write_metashape_faces(*given, face_size, link, lenses)]
+            return [metashape.write_metashape_faces(*given, face_size, link, cameras)]
         case ExportFormat.GLTF:
             gltf.write_gltf(partial / "scene.glb", reconstruction, frames, up)
         case ExportFormat.PLY:

@@ -19,12 +19,13 @@ from pathlib import Path
 
 import numpy as np
 
+from gsba.camera.cameras import Cameras
 from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.camera.one_centre import Stitcher
 from gsba.camera.rig import CubeRig
-from gsba.camera.views import Scenes, View, ViewCutter
+from gsba.camera.views import Scenes, View, ViewCutter, views_for
 from gsba.disk import atomic_write
-from gsba.export.pictures import Files, FrameWriter, Pictures, Shown
+from gsba.export.pictures import Files, FrameWriter, Pictures, Shown, by_camera
 from gsba.frames.dual_fisheye import load_raw
 from gsba.frames.files import goes_out_as_it_is
 from gsba.frames.pixels import load_faces
@@ -32,14 +33,14 @@ from gsba.frames.track_pairs import load_squares
 from gsba.log import GsbaError
 from gsba.memory import give_back_freed_memory
 from gsba.store.shards import Threads, Workers
-from gsba.types import FACES, FrameSet
+from gsba.types import FACES, FrameSet, PictureFormat
 
 MIN_FACE_SIZE = 16  # pixels
 _FICLONE = 0x40049409  # ioctl of Linux that clones a file; both share blocks until one is written
 _MAX_FRAMES_AT_ONCE = 4  # an 8K panorama, a face and encoded images take 130 MB
 
 
-def face_size_for(frames: FrameSet, face_size: int | None) -> int:
+def face_size_for(kind: PictureFormat, face_size: int | None) -> int:
     """Pixels of an exported face: `face_size`, or by default a quarter of the panorama's width.
 
     The default is rounded to an even number and keeps the mean resolution: a face centre is sampled
@@ -50,16 +51,29 @@ def face_size_for(frames: FrameSet, face_size: int | None) -> int:
         GsbaError: `face_size` is too small.
     """
     if face_size is None:
-        return 2 * round(frames.width / 8) if frames.panoramic else frames.width
+        return 2 * round(kind.width / 8) if kind.panoramic else kind.width
     if face_size < MIN_FACE_SIZE:
         raise GsbaError(f"face size {face_size} is too small: use {MIN_FACE_SIZE} pixels or more")
     return face_size
 
 
-def of_one_lens(images: str, frames: FrameSet) -> bool:
+def of_one_lens(images: str, kind: PictureFormat) -> bool:
     """True if the setting `images` (`export.images`) gives images of one lens each."""
     return images in ("lenses", "fisheye", "panorama") or (
-        images == "auto" and frames.fisheyes is not None and len(frames.fisheyes) == 2
+        images == "auto" and kind.fisheyes is not None and len(kind.fisheyes) == 2
+    )
+
+
+def seen_by(images: str, frames: FrameSet, cameras: Cameras) -> Cameras:
+    """The cameras that images of a dataset are of: one centre each, or the lenses as they are.
+
+    Args:
+        images: the setting `export.images`.
+        frames, cameras: of the dataset.
+    """
+    own = zip(frames.formats, cameras.lenses, strict=True)
+    return cameras.with_lenses(
+        [lenses if of_one_lens(images, kind) else ONE_CENTRE for kind, lenses in own]
     )
 
 
@@ -68,27 +82,41 @@ def has_masks(frames: FrameSet) -> bool:
     return any(path is not None for path in frames.mask_paths)
 
 
+def views_of_cameras(
+    frames: FrameSet, face_size: int | None, cameras: Cameras
+) -> list[tuple[View, ...]]:
+    """Views (C) of the frames of each camera, faces of `face_size` pixels or by `face_size_for`."""
+    return [
+        views_for(kind, face_size_for(kind, face_size), lenses)
+        for kind, lenses in zip(frames.formats, cameras.lenses, strict=True)
+    ]
+
+
 def view_writer(
-    files: Files,
+    files: Sequence[Files],
     frames: FrameSet,
-    views: tuple[View, ...],
-    lenses: Lenses,
+    views: Sequence[tuple[View, ...]],
+    cameras: Cameras,
     link: bool = False,
     scenes: Scenes | None = None,
 ) -> FrameWriter:
     """Writer of every view of a frame, and of its mask if the frames have masks.
 
     Args:
-        files: files of the images.
+        files: (C,) files of the images of each camera's frames.
         frames: panoramas, or cube faces, of which missing ones are not written.
-        views: views of `gsba.camera.views.views_for`.
-        lenses: lenses of these frames.
+        views: (C,) of each camera, see `views_of_cameras`.
+        cameras: cameras of these frames.
         link: make hard links to images that are exported unchanged.
         scenes: depths of the scene around these frames.
     """
-    if lenses and frames.panoramic:
-        return _LensFaces(files, lenses, scenes, views)
-    return _CubeFaces(files, views[0].width, link)
+    writers = list[FrameWriter]()
+    for own, kind, seen, lenses in zip(files, frames.formats, views, cameras.lenses, strict=True):
+        if lenses and kind.panoramic:
+            writers.append(_LensFaces(own, lenses, scenes, seen))
+        else:
+            writers.append(_CubeFaces(own, seen[0].width, link))
+    return by_camera(writers, frames)
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,16 +129,16 @@ class _CubeFaces(FrameWriter):
 
         f, frames, size, paths = shown.f, shown.frames, self.size, self.images(shown)
         rig = CubeRig(size, np.pi / 2)
-        if frames.tracks is not None:
+        if shown.kind.tracks is not None:
             shown.write(
                 size,
                 paths,
-                lambda: cubemap.cut_squares(load_squares(frames, f), rig, frames.correction),
+                lambda: cubemap.cut_squares(load_squares(frames, f), rig, shown.kind.correction),
             )
-        elif frames.panoramic:
+        elif shown.kind.panoramic:
             room = shown.room("face", (size, size, 3))
             shown.write(size, paths, lambda: cubemap.cut_padded(shown.padded, rig, room))
-        elif size == frames.width and all(map(goes_out_as_it_is, frames.paths[f], paths)):
+        elif size == shown.kind.width and all(map(goes_out_as_it_is, frames.paths[f], paths)):
             for source, path in zip(frames.paths[f], paths, strict=True):
                 pass_on(source, path, self.link)
         else:
@@ -119,7 +147,7 @@ class _CubeFaces(FrameWriter):
         def cut_mask() -> np.ndarray:
             if frames.mask_paths[f] is None:
                 return np.ones((len(masks), size, size), bool)
-            chosen = [FACES.index(face) for face in frames.faces or FACES]
+            chosen = [FACES.index(face) for face in shown.kind.faces or FACES]
             return cubemap.cut_mask(shown.mask, rig)[chosen]
 
         if masks := self.masks(shown):
@@ -148,10 +176,10 @@ class _LensFaces(_OfLenses):
             return ViewCutter(self.views, self.lenses, f, self.scenes and self.scenes(f))
 
         def cut() -> Iterator[np.ndarray]:
-            if frames.fisheyes is not None:
+            if shown.kind.fisheyes is not None:
                 return cutter().cut_raw(load_raw(frames, f))
-            if frames.tracks is not None:
-                return cutter().cut_squares(load_squares(frames, f), frames.correction)
+            if shown.kind.tracks is not None:
+                return cutter().cut_squares(load_squares(frames, f), shown.kind.correction)
             return cutter().cut_padded(shown.padded)
 
         def cut_mask() -> Iterator[np.ndarray]:
@@ -175,7 +203,7 @@ def write_pictures(
     if not writers:
         return
     for writer in writers:
-        writer.files.make_folders(frames)
+        writer.make_folders(frames)
     workers = (workers or Threads(os.cpu_count() or 1)).at_most(_MAX_FRAMES_AT_ONCE)
     workers.must_see([writer.files.folder for writer in writers])
     give_back_freed_memory(0)
@@ -186,8 +214,8 @@ def write_pictures(
 def panorama_writer(
     files: Files,
     frames: FrameSet,
+    cameras: Cameras,
     link: bool = False,
-    lenses: Lenses = ONE_CENTRE,
     scenes: Scenes | None = None,
 ) -> FrameWriter:
     """Writer that copies the panorama of a frame, and writes its mask if the frames have masks.
@@ -198,11 +226,15 @@ def panorama_writer(
     Args:
         files: files of the images.
         frames: panoramas.
+        cameras: cameras of these frames.
         link: make hard links instead of copies.
-        lenses: lenses of these frames.
         scenes: depths of the scene around these frames.
     """
-    return _Stitched(files, lenses, scenes) if lenses else _Panoramas(files, link)
+    writers = [
+        _Stitched(files, lenses, scenes) if lenses else _Panoramas(files, link)
+        for lenses in cameras.lenses
+    ]
+    return by_camera(writers, frames)
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,7 +244,7 @@ class _Panoramas(FrameWriter):
     def __call__(self, shown: Shown) -> None:
         frames, (path,) = shown.frames, self.images(shown)
         source = frames.paths[shown.f][0]
-        as_it_is = frames.layout == "erp" and not frames.correction
+        as_it_is = shown.kind.layout == "erp" and not shown.kind.correction
         if as_it_is and goes_out_as_it_is(source, path):
             pass_on(source, path, self.link)
         else:
@@ -232,11 +264,11 @@ class _Stitched(_OfLenses):
             return Stitcher(self.lenses, f, scene)
 
         def stitched() -> list[np.ndarray]:
-            if frames.fisheyes is not None:
-                return [stitcher().stitched_raw(load_raw(frames, f), frames.width)]
-            if frames.tracks is not None:
+            if shown.kind.fisheyes is not None:
+                return [stitcher().stitched_raw(load_raw(frames, f), shown.kind.width)]
+            if shown.kind.tracks is not None:
                 squares = load_squares(frames, f)
-                return [stitcher().stitched_squares(squares, frames.correction)]
+                return [stitcher().stitched_squares(squares, shown.kind.correction)]
             return [stitcher().stitched(shown.erp)]
 
         def mask() -> list[np.ndarray]:

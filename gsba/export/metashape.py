@@ -10,13 +10,14 @@ the image. The one component has no transform of its own, so that the chunk is t
 
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from gsba.camera.lens import ONE_CENTRE, Lenses
-from gsba.camera.views import View, scenes_of, seen_from_lenses, views_for
-from gsba.export.images import face_size_for, has_masks, panorama_writer, view_writer
+from gsba.camera.cameras import ONE_CAMERA, Cameras
+from gsba.camera.views import View, scenes_of, seen_from_lenses
+from gsba.export.images import has_masks, panorama_writer, view_writer, views_of_cameras
 from gsba.export.pictures import Files, FrameWriter
 from gsba.export.ply import write_splat_points
 from gsba.types import FrameSet, Reconstruction
@@ -29,16 +30,24 @@ def write_metashape_panoramas(
     reconstruction: Reconstruction,
     frames: FrameSet,
     link: bool = False,
-    lenses: Lenses = ONE_CENTRE,
+    cameras: Cameras = ONE_CAMERA,
 ) -> FrameWriter:
     """Write cloud and cameras.xml of panoramas into `partial`, without images; returns their
     writer."""
     mask = "masks/{name}.png" if has_masks(frames) else ""
     files = Files(partial, ("",), "images/{name}{suffix}", mask)
-    sensor = _sensor(0, "panorama", "spherical", frames.width, frames.height)
-    poses = reconstruction.world_T_rigs[:, None]
-    _write(partial, reconstruction, [sensor], files, frames, poses, [0])
-    return panorama_writer(files, frames, link, lenses, scenes_of(reconstruction))
+    sensors = [
+        _sensor(number, "panorama", "spherical", kind.width, kind.height)
+        for number, kind in enumerate(frames.formats)
+    ]
+    taken = [
+        _Taken(files.images(frames, f), pose[None], [camera])
+        for f, (pose, camera) in enumerate(
+            zip(reconstruction.world_T_rigs, frames.cameras.tolist(), strict=True)
+        )
+    ]
+    _write(partial, reconstruction, sensors, taken)
+    return panorama_writer(files, frames, cameras, link, scenes_of(reconstruction))
 
 
 def write_metashape_faces(
@@ -47,21 +56,37 @@ def write_metashape_faces(
     frames: FrameSet,
     face_size: int | None,
     link: bool = False,
-    lenses: Lenses = ONE_CENTRE,
+    cameras: Cameras = ONE_CAMERA,
 ) -> FrameWriter:
     """Write cloud and cameras.xml of pinhole faces into `partial`, without images; returns their
     writer."""
-    views = views_for(frames, face_size_for(frames, face_size), lenses)
+    views = views_of_cameras(frames, face_size, cameras)
     mask = "masks/{name}_{view}.png" if has_masks(frames) else ""
-    names = [view.name for view in views]
-    files = Files(partial, names, "images/{name}_{view}{suffix}", mask)
-    alike = len({(view.width, view.height, view.focal, view.principal) for view in views}) == 1
-    kinds = [0] * len(views) if alike else list(range(len(views)))
-    sensors = [_pinhole(number, views[kinds.index(number)]) for number in sorted(set(kinds))]
-    seen = seen_from_lenses(reconstruction, lenses)
-    poses = seen.world_T_rigs[:, None] @ np.stack([view.rig_T_view for view in views])
-    _write(partial, reconstruction, sensors, files, frames, poses, kinds)
-    return view_writer(files, frames, views, lenses, link, scenes_of(reconstruction))
+    files = [
+        Files(partial, [view.name for view in own], "images/{name}_{view}{suffix}", mask)
+        for own in views
+    ]
+    sensors, kinds = list[ET.Element](), list[list[int]]()
+    for own in views:
+        alike = len({(view.width, view.height, view.focal, view.principal) for view in own}) == 1
+        first = len(sensors)
+        sensors += [_pinhole(first + n, view) for n, view in enumerate(own[:1] if alike else own)]
+        kinds.append([first + n * (not alike) for n in range(len(own))])
+    seen, taken = seen_from_lenses(reconstruction, cameras), list[_Taken]()
+    for f, camera in enumerate(frames.cameras.tolist()):
+        poses = seen.world_T_rigs[f] @ np.stack([view.rig_T_view for view in views[camera]])
+        taken.append(_Taken(files[camera].images(frames, f), poses, kinds[camera]))
+    _write(partial, reconstruction, sensors, taken)
+    return view_writer(files, frames, views, cameras, link, scenes_of(reconstruction))
+
+
+@dataclass(frozen=True, slots=True)
+class _Taken:
+    """The images of one frame."""
+
+    paths: Sequence[str]  # (C,)
+    world_T_cameras: np.ndarray  # (C, 4, 4) float64
+    sensors: Sequence[int]  # (C,) number of each image's sensor
 
 
 def _pinhole(number: int, view: View) -> ET.Element:
@@ -91,16 +116,12 @@ def _write(
     partial: Path,
     reconstruction: Reconstruction,
     sensors: Sequence[ET.Element],
-    files: Files,
-    frames: FrameSet,
-    poses: np.ndarray,
-    kinds: Sequence[int],
+    taken: Sequence[_Taken],
 ) -> None:
     """Write cameras.xml and the cloud.
 
     Args:
-        poses: (F, C, 4, 4) float64, world_T_camera of each frame's images.
-        kinds: number of the sensor of each of a frame's C images.
+        taken: (F,) images of the frames.
     """
     write_splat_points(
         partial / "points3D.ply", reconstruction.points_world, reconstruction.point_colors
@@ -114,15 +135,18 @@ def _write(
     ET.SubElement(transform, "rotation").text = "1 0 0 0 1 0 0 0 1"
     ET.SubElement(transform, "translation").text = "0 0 0"
     ET.SubElement(transform, "scale").text = "1"
-    cameras = ET.SubElement(chunk, "cameras", {"next_id": str(poses.shape[0] * poses.shape[1])})
-    for f, of_frame in enumerate(poses):
-        paths = files.images(frames, f)
-        for c, (path, world_T_camera) in enumerate(zip(paths, of_frame, strict=True)):
-            camera = {"id": str(f * len(of_frame) + c), "sensor_id": str(kinds[c])}
-            camera |= {"component_id": "0", "label": Path(path).stem, "enabled": "true"}
-            entry = ET.SubElement(cameras, "camera", camera)
-            numbers = map(repr, map(float, world_T_camera.ravel()))
-            ET.SubElement(entry, "transform").text = " ".join(numbers)
+    images = [
+        image
+        for one in taken
+        for image in zip(one.paths, one.world_T_cameras, one.sensors, strict=True)
+    ]
+    cameras = ET.SubElement(chunk, "cameras", {"next_id": str(len(images))})
+    for number, (path, world_T_camera, sensor) in enumerate(images):
+        camera = {"id": str(number), "sensor_id": str(sensor)}
+        camera |= {"component_id": "0", "label": Path(path).stem, "enabled": "true"}
+        entry = ET.SubElement(cameras, "camera", camera)
+        numbers = map(repr, map(float, world_T_camera.ravel()))
+        ET.SubElement(entry, "transform").text = " ".join(numbers)
     ET.indent(document)
     tree = ET.ElementTree(document)
     tree.write(partial / _CAMERAS, encoding="UTF-8", xml_declaration=True)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from gsba.camera.lens import Lenses
+from gsba.camera.cameras import Cameras
 from gsba.geometry import CV_R_GL, inverse
 from gsba.types import FrameSet, Reconstruction
 
@@ -31,20 +31,21 @@ UNKNOWN = Shutter()
 
 
 def rig_velocities(
-    reconstruction: Reconstruction, frames: FrameSet, lenses: Lenses, shutter: Shutter
+    reconstruction: Reconstruction, frames: FrameSet, cameras: Cameras, shutter: Shutter
 ) -> np.ndarray | None:
     """Velocities (F, 6), [rotation rad/s, translation map units/s], in the axes of exported rigs.
 
-    They are the motions during the readout where these are known; else the steps between
-    neighbouring frames where all are at most a quarter of a second apart. None = neither.
+    They are the motions during the readout where these are known, of one camera; else the steps
+    between neighbouring frames where all are at most a quarter of a second apart. None = neither.
 
     Args:
         reconstruction: poses of the exported rigs, which have the lenses' axes.
         frames: their frames.
-        lenses: lenses of the frames.
+        cameras: cameras of the frames.
         shutter: times of the exposure.
     """
-    if lenses.readout_motion is not None and shutter.readout_s:
+    lenses = cameras.lenses[0]
+    if len(cameras.lenses) == 1 and lenses.readout_motion is not None and shutter.readout_s:
         parts = lenses.readout_motion.reshape(-1, 2, 3) / shutter.readout_s
         parts = parts if lenses.axes is None else parts @ lenses.axes
         return parts.reshape(-1, 6)

@@ -19,21 +19,23 @@ ROLLING_TOP_TO_BOTTOM, with the inverses (in axes y down, z forward) as `viewmat
 
 import json
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gsba.camera.fisheye import lens_names, rotation_of
-from gsba.camera.lens import ONE_CENTRE, Lenses
-from gsba.camera.views import Scenes, View, scenes_of, seen_from_lenses, views_for
+from gsba.camera.cameras import ONE_CAMERA, Cameras
+from gsba.camera.fisheye import Rig, lens_names, rotation_of
+from gsba.camera.lens import Lenses
+from gsba.camera.views import View, scenes_of, seen_from_lenses
 from gsba.export import motion
-from gsba.export.images import face_size_for, has_masks, panorama_writer, view_writer
-from gsba.export.pictures import Files, FrameWriter
+from gsba.export.images import has_masks, panorama_writer, view_writer, views_of_cameras
+from gsba.export.pictures import Files, FrameWriter, by_camera
 from gsba.export.ply import write_splat_points
 from gsba.export.raw import RawPictures, raw_lenses
 from gsba.geometry import CV_R_GL, pose
-from gsba.types import Fisheye, FrameSet, Reconstruction
+from gsba.types import Fisheye, FrameSet, PictureFormat, Reconstruction
 
 NERFSTUDIO_R_WORLD = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 _Z_UP_R_WORLD = {"z": np.eye(3), "y": NERFSTUDIO_R_WORLD.T}  # of worlds whose y does not point down
@@ -49,7 +51,7 @@ def write_nerfstudio(
     face_size: int | None,
     up: str | None = None,
     link: bool = False,
-    lenses: Lenses = ONE_CENTRE,
+    cameras: Cameras = ONE_CAMERA,
     shutter: motion.Shutter = motion.UNKNOWN,
 ) -> list[FrameWriter]:
     """Write cloud and transforms.json of faces into `partial`, of panoramas transforms_erp.json,
@@ -61,17 +63,18 @@ def write_nerfstudio(
         face_size: pixels of a cube face; None = see `gsba.export.images.face_size_for`.
         up: axis of the world that points up, "-y", "y" or "z"; None = unknown, taken for "-y".
         link: make hard links to images that are exported unchanged.
-        lenses: lenses of the frames.
+        cameras: cameras of the frames.
         shutter: times of the exposure.
     """
     out_R_world = _write_cloud(partial, reconstruction, up)
-    views = views_for(frames, face_size_for(frames, face_size), lenses)
-    seen = seen_from_lenses(reconstruction, lenses)
+    views = views_of_cameras(frames, face_size, cameras)
+    files = [_files(partial, [view.name for view in own], has_masks(frames)) for own in views]
+    seen = seen_from_lenses(reconstruction, cameras)
+    _write_face_dataset(partial, seen, frames, files, views, out_R_world, cameras, shutter)
     scenes = scenes_of(reconstruction)
-    given = partial, seen, frames, views, out_R_world, link, lenses, scenes
-    writers = [_write_face_dataset(*given, shutter)]
-    if frames.panoramic:
-        given = partial, reconstruction, frames, lenses, out_R_world, link
+    writers = [view_writer(files, frames, views, cameras, link, scenes)]
+    if all(kind.panoramic for kind in frames.formats):
+        given = partial, reconstruction, frames, cameras, out_R_world, link
         writers.append(_write_erp_dataset(*given, "_erp"))
     return writers
 
@@ -80,54 +83,86 @@ def write_nerfstudio_erp(
     partial: Path,
     reconstruction: Reconstruction,
     frames: FrameSet,
-    lenses: Lenses,
+    cameras: Cameras,
     up: str | None = None,
     link: bool = False,
 ) -> list[FrameWriter]:
     """Write cloud and transforms.json of panoramas into `partial`, without images; returns their
     writers."""
     out_R_world = _write_cloud(partial, reconstruction, up)
-    return [_write_erp_dataset(partial, reconstruction, frames, lenses, out_R_world, link, "")]
+    return [_write_erp_dataset(partial, reconstruction, frames, cameras, out_R_world, link, "")]
 
 
 def write_nerfstudio_raw(
     partial: Path,
     reconstruction: Reconstruction,
     frames: FrameSet,
-    lenses: Lenses,
+    cameras: Cameras,
     up: str | None = None,
     link: bool = False,
     shutter: motion.Shutter = motion.UNKNOWN,
 ) -> list[FrameWriter]:
     """Write cloud and transforms.json of raw fisheyes into `partial`, without images; returns
     their writers."""
-    rig = raw_lenses(frames)
     out_R_world = _write_cloud(partial, reconstruction, up)
-    files = _files(partial, lens_names(len(rig)), masked=True)
-    moving = lenses.readout_motion is not None and lenses.row_directions is not None
-    velocities = motion.rig_velocities(reconstruction, frames, lenses, shutter)
-    ways = lenses.rows_down() if moving else (1.0, 1.0)
-    entries = []
-    for f, world_T_rig in enumerate(reconstruction.world_T_rigs):
-        rigs = lenses.swept(f) if moving else None
-        images, masks = files.images(frames, f), files.masks(frames, f)
-        for number, (lens, centre) in enumerate(zip(rig, lenses.centres, strict=True)):
+    own = zip(frames.formats, cameras.lenses, strict=True)
+    rigs = [_RawRig.of(kind, lenses) for kind, lenses in own]
+    files = [_files(partial, lens_names(len(one.rig)), masked=True) for one in rigs]
+    velocities = motion.rig_velocities(reconstruction, frames, cameras, shutter)
+    entries = list[list[dict[str, Any]]]()
+    for f, (world_T_rig, c) in enumerate(
+        zip(reconstruction.world_T_rigs, frames.cameras.tolist(), strict=True)
+    ):
+        names = files[c].images(frames, f), files[c].masks(frames, f)
+        velocity = None if velocities is None else velocities[f]
+        entries.append(rigs[c].entries(f, world_T_rig, *names, out_R_world, velocity))
+    camera: dict[str, Any] = {"camera_model": "OPENCV_FISHEYE", "is_fisheye": True}
+    moving = any(one.moving for one in rigs)
+    if moving:
+        camera["rolling_shutter"] = [0, 0, 1, 0]
+    if velocities is not None:
+        camera |= motion.shutter_keys(shutter, rolling=moving)
+    _write_transforms(partial / "transforms.json", camera, entries, out_R_world)
+    return [by_camera([RawPictures(one, link, _MAX_AXIS_ANGLE_DEG) for one in files], frames)]
+
+
+@dataclass(frozen=True, slots=True)
+class _RawRig:
+    """Raw lenses of one camera."""
+
+    rig: Rig
+    lenses: Lenses
+    moving: bool  # True if the motion during the readout is known
+
+    @classmethod
+    def of(cls, kind: PictureFormat, lenses: Lenses) -> "_RawRig":
+        moving = lenses.readout_motion is not None and lenses.row_directions is not None
+        return cls(raw_lenses(kind), lenses, moving)
+
+    def entries(
+        self,
+        f: int,
+        world_T_rig: np.ndarray,
+        images: Sequence[str],
+        masks: Sequence[str],
+        out_R_world: np.ndarray,
+        velocity: np.ndarray | None,
+    ) -> list[dict[str, Any]]:
+        """Entries of a frame in transforms.json, one for each lens."""
+        entries = []
+        rigs = self.lenses.swept(f) if self.moving else None
+        ways = self.lenses.rows_down() if self.moving else (1.0,) * len(self.rig)
+        for number, (lens, centre) in enumerate(zip(self.rig, self.lenses.centres, strict=True)):
             rig_T_lens = pose(rotation_of(lens), centre)
             entry = _entry(images[number], out_R_world, world_T_rig @ rig_T_lens)
             if rigs is not None:
                 for name, rig_T_rig in zip(("start", "end"), rigs[number], strict=True):
                     matrix = _matrix(out_R_world, world_T_rig @ rig_T_rig @ rig_T_lens)
                     entry[f"transform_matrix_{name}"] = matrix
-            if velocities is not None:  # rows are read from the top, at these velocities
-                entry |= motion.velocity_keys(ways[number] * velocities[f], rig_T_lens)
+            if velocity is not None:  # rows are read from the top, at these velocities
+                entry |= motion.velocity_keys(ways[number] * velocity, rig_T_lens)
             entries.append({**entry, **_fisheye(lens), "mask_path": masks[number]})
-    camera: dict[str, Any] = {"camera_model": "OPENCV_FISHEYE", "is_fisheye": True}
-    if moving:
-        camera["rolling_shutter"] = [0, 0, 1, 0]
-    if velocities is not None:
-        camera |= motion.shutter_keys(shutter, rolling=moving)
-    _write_transforms(partial / "transforms.json", camera, entries, len(frames), out_R_world)
-    return [RawPictures(files, link, _MAX_AXIS_ANGLE_DEG)]
+        return entries
 
 
 def _write_cloud(partial: Path, reconstruction: Reconstruction, up: str | None) -> np.ndarray:
@@ -142,67 +177,81 @@ def _write_face_dataset(
     partial: Path,
     reconstruction: Reconstruction,
     frames: FrameSet,
-    views: tuple[View, ...],
+    files: Sequence[Files],
+    views: Sequence[tuple[View, ...]],
     out_R_world: np.ndarray,
-    link: bool,
-    lenses: Lenses,
-    scenes: Scenes,
+    cameras: Cameras,
     shutter: motion.Shutter,
-) -> FrameWriter:
-    files = _files(partial, [view.name for view in views], has_masks(frames))
+) -> None:
     # OPENCV without distortion is a pinhole, by the only name that all readers know.
     camera = {"camera_model": "OPENCV", "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0}
-    if not lenses:
-        camera |= _intrinsics(views[0])
-    velocities = motion.rig_velocities(reconstruction, frames, lenses, shutter)
+    alike = len({_shape(view) for own in views for view in own}) == 1
+    if alike:
+        camera |= _intrinsics(views[0][0])
+    velocities = motion.rig_velocities(reconstruction, frames, cameras, shutter)
     if velocities is not None:
         camera |= motion.shutter_keys(shutter, rolling=False)
-    entries = []
-    for f, world_T_rig in enumerate(reconstruction.world_T_rigs):
-        images, masks = files.images(frames, f), files.masks(frames, f)
-        for number, view in enumerate(views):
+    entries = list[list[dict[str, Any]]]()
+    for f, (world_T_rig, c) in enumerate(
+        zip(reconstruction.world_T_rigs, frames.cameras.tolist(), strict=True)
+    ):
+        images, masks = files[c].images(frames, f), files[c].masks(frames, f)
+        entries.append([])
+        for number, view in enumerate(views[c]):
             entry = _entry(images[number], out_R_world, world_T_rig @ view.rig_T_view)
-            if lenses:  # views have different intrinsics
+            if not alike:
                 entry |= _intrinsics(view)
             if masks:
                 entry["mask_path"] = masks[number]
             if velocities is not None:
                 entry |= motion.velocity_keys(velocities[f], view.rig_T_view)
-            entries.append(entry)
-    _write_transforms(partial / "transforms.json", camera, entries, len(frames), out_R_world)
-    return view_writer(files, frames, views, lenses, link, scenes)
+            entries[-1].append(entry)
+    _write_transforms(partial / "transforms.json", camera, entries, out_R_world)
 
 
 def _write_erp_dataset(
     partial: Path,
     reconstruction: Reconstruction,
     frames: FrameSet,
-    lenses: Lenses,
+    cameras: Cameras,
     out_R_world: np.ndarray,
     link: bool,
     which: str,
 ) -> FrameWriter:
     mask = f"masks{which}/{{name}}.png" if has_masks(frames) else ""
     files = Files(partial, ("",), f"images{which}/{{name}}{{suffix}}", mask)
-    width, height = frames.width, frames.height
-    camera = {"camera_model": "EQUIRECTANGULAR", "fl_x": width / 2, "fl_y": float(height)}
-    camera |= {"cx": width / 2, "cy": height / 2, "w": width, "h": height}
-    entries = []
-    for f, world_T_rig in enumerate(reconstruction.world_T_rigs):
+    shapes = [
+        {"fl_x": kind.width / 2, "fl_y": float(kind.height), "cx": kind.width / 2}
+        | {"cy": kind.height / 2, "w": kind.width, "h": kind.height}
+        for kind in frames.formats
+    ]
+    camera: dict[str, Any] = {"camera_model": "EQUIRECTANGULAR"}
+    camera |= shapes[0] if len(shapes) == 1 else {}
+    entries = list[list[dict[str, Any]]]()
+    for f, (world_T_rig, c) in enumerate(
+        zip(reconstruction.world_T_rigs, frames.cameras.tolist(), strict=True)
+    ):
         (image,), masks = files.images(frames, f), files.masks(frames, f)
         entry = _entry(image, out_R_world, world_T_rig)
+        if len(shapes) > 1:
+            entry |= shapes[c]
         if masks:
             entry["mask_path"] = masks[0]
-        entries.append(entry)
+        entries.append([entry])
     path = partial / f"transforms{which}.json"
-    _write_transforms(path, camera, entries, len(entries), out_R_world)
-    return panorama_writer(files, frames, link, lenses, scenes_of(reconstruction))
+    _write_transforms(path, camera, entries, out_R_world)
+    return panorama_writer(files, frames, cameras, link, scenes_of(reconstruction))
 
 
 def _files(partial: Path, views: Sequence[str], masked: bool) -> Files:
     """Files of images and masks with unique base names."""
     mask = "masks/{name}_{view}.png" if masked else ""
     return Files(partial, views, "images/{name}_{view}{suffix}", mask)
+
+
+def _shape(view: View) -> tuple[object, ...]:
+    """What views of equal intrinsics have in common."""
+    return view.width, view.height, view.focal, view.principal
 
 
 def _intrinsics(view: View) -> dict[str, Any]:
@@ -234,14 +283,13 @@ def _matrix(out_R_world: np.ndarray, world_T_camera: np.ndarray) -> list[list[fl
 def _write_transforms(
     path: Path,
     camera: dict[str, Any],
-    entries: list[dict[str, Any]],
-    num_frames: int,
+    entries: Sequence[Sequence[dict[str, Any]]],
     out_R_world: np.ndarray,
 ) -> None:
-    names = [str(entry["file_path"]) for entry in entries]  # frame by frame
-    per_frame = len(names) // num_frames
-    evaluated = [n for i, n in enumerate(names) if i // per_frame % _HOLD_OUT_EVERY == 0]
-    trained = [n for i, n in enumerate(names) if i // per_frame % _HOLD_OUT_EVERY != 0]
+    """Write transforms.json, with the entries of each frame (F)."""
+    names = [[str(entry["file_path"]) for entry in of_frame] for of_frame in entries]
+    evaluated = [n for f, own in enumerate(names) if f % _HOLD_OUT_EVERY == 0 for n in own]
+    trained = [n for f, own in enumerate(names) if f % _HOLD_OUT_EVERY != 0 for n in own]
     applied = np.column_stack([out_R_world, np.zeros(3)])
     document = {
         **camera,
@@ -250,6 +298,6 @@ def _write_transforms(
         "train_filenames": trained,
         "val_filenames": evaluated,
         "test_filenames": evaluated,
-        "frames": entries,
+        "frames": [entry for of_frame in entries for entry in of_frame],
     }
     path.write_text(json.dumps(document, indent=1) + "\n")

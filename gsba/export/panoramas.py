@@ -7,7 +7,7 @@ from OUT/images/RECORDING.
 import csv
 from pathlib import Path
 
-from gsba.camera.lens import Lenses
+from gsba.camera.cameras import Cameras
 from gsba.camera.views import scenes_of
 from gsba.export.images import has_masks, panorama_writer
 from gsba.export.pictures import Files, FrameWriter
@@ -25,7 +25,7 @@ def write_with_poses(
     partial: Path,
     reconstruction: Reconstruction,
     frames: FrameSet,
-    lenses: Lenses,
+    cameras: Cameras,
     link: bool = False,
 ) -> FrameWriter:
     """Write `trajectory.tum` and `images/timestamps.csv`, one for each recording, into `partial`;
@@ -41,4 +41,4 @@ def write_with_poses(
             writer.writerows(zip(names, map(float, frames.timestamps[rows]), strict=True))
     mask = "masks/{name}.png" if has_masks(frames) else ""
     files = Files(partial, ("",), "images/{name}{suffix}", mask)
-    return panorama_writer(files, frames, link, lenses, scenes_of(reconstruction))
+    return panorama_writer(files, frames, cameras, link, scenes_of(reconstruction))

@@ -3,7 +3,7 @@
 import threading
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import NoneType
 from typing import Any
@@ -74,6 +74,10 @@ class FrameWriter:
         """Writer of frames `rows` (F',), renumbered; it can be pickled."""
         return self
 
+    def make_folders(self, frames: FrameSet) -> None:
+        """Make the folders of all images and masks."""
+        self.files.make_folders(frames)
+
     def images(self, shown: "Shown") -> list[Path]:
         """Files of the frame's images."""
         return [self.files.folder / name for name in self.files.images(shown.frames, shown.f)]
@@ -85,6 +89,44 @@ class FrameWriter:
     def wrote(self, shown: "Shown") -> bool:
         """True if an interrupted export has written all files of this frame."""
         return all(path.exists() for path in (*self.images(shown), *self.masks(shown)))
+
+
+@dataclass(frozen=True, slots=True)
+class _ByCamera(FrameWriter):
+    """Writes each frame as a writer for its camera does; `files` are those of the first one."""
+
+    writers: tuple[FrameWriter, ...]  # (C,)
+    of_frame: tuple[int, ...]  # (F,) index of the camera that took each frame
+
+    def __call__(self, shown: "Shown") -> None:
+        self.writers[self.of_frame[shown.f]](shown)
+
+    def taken(self, rows: np.ndarray) -> FrameWriter:
+        # Every writer keeps its number: only those of frames that are taken are called.
+        writers = tuple(writer.taken(rows) for writer in self.writers)
+        return replace(self, writers=writers, of_frame=tuple(self.of_frame[f] for f in rows))
+
+    def make_folders(self, frames: FrameSet) -> None:
+        for writer in self.writers:
+            writer.make_folders(frames)
+
+    def images(self, shown: "Shown") -> list[Path]:
+        return self.writers[self.of_frame[shown.f]].images(shown)
+
+    def masks(self, shown: "Shown") -> list[Path]:
+        return self.writers[self.of_frame[shown.f]].masks(shown)
+
+
+def by_camera(writers: Sequence[FrameWriter], frames: FrameSet) -> FrameWriter:
+    """Writer of frames of several cameras.
+
+    Args:
+        writers: (C,) of each camera's frames.
+        frames: all frames.
+    """
+    if len(writers) == 1:
+        return writers[0]
+    return _ByCamera(writers[0].files, tuple(writers), frames.camera_of_frame)
 
 
 class Pictures:
@@ -140,6 +182,7 @@ class Shown:
 
     def __init__(self, pictures: Pictures, f: int) -> None:
         self.f, self.frames = f, pictures.frames
+        self.kind = pictures.frames.format_of(f)
         self._pictures = pictures
         self._padded: np.ndarray | None = None
         self._files: dict[Hashable, list[bytes]] = {}
@@ -160,7 +203,7 @@ class Shown:
     def mask(self) -> np.ndarray:
         """Mask of the panorama (h, 2 h) bool, True = use."""
         found = load_mask(self.frames, self.f)
-        size = self.frames.height, self.frames.width
+        size = self.kind.height, self.kind.width
         return np.ones(size, bool) if found is None else found
 
     def room(self, name: str, shape: tuple[int, ...]) -> np.ndarray:

@@ -12,21 +12,21 @@ from gsba.export.pictures import FrameWriter, Shown
 from gsba.frames.dual_fisheye import load_raw
 from gsba.frames.files import goes_out_as_it_is
 from gsba.log import GsbaError
-from gsba.types import Fisheye, FrameSet
+from gsba.types import Fisheye, PictureFormat
 
 _ROWS_AT_ONCE = 256  # image rows whose coordinates are held in double precision
 SEEN_DEG = 95.0  # largest angle from a lens's axis: image circles and calibrations end there
 
 
-def raw_lenses(frames: FrameSet) -> Rig:
+def raw_lenses(kind: PictureFormat) -> Rig:
     """Lenses of raw frames.
 
     Raises:
         GsbaError: the frames are not raw.
     """
-    if frames.fisheyes is None:
+    if kind.fisheyes is None:
         raise GsbaError("--images fisheye is for runs on raw fisheyes: these frames are stitched")
-    return frames.fisheyes
+    return kind.fisheyes
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,8 +49,8 @@ class RawPictures(FrameWriter):
             shown.write("raw", paths, lambda: load_raw(frames, f))
 
         def used() -> list[np.ndarray]:
-            size = frames.width, frames.height
-            circles = [_circle(lens, self.seen_deg, *size) for lens in raw_lenses(frames)]
+            size = shown.kind.width, shown.kind.height
+            circles = [_circle(lens, self.seen_deg, *size) for lens in raw_lenses(shown.kind)]
             if frames.mask_paths[f] is None:
                 return [seen for seen, _ in circles]
             return [seen & shown.mask.ravel()[places] for seen, places in circles]

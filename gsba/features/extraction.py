@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from gsba.camera.rig import CubeRig
-from gsba.config import RefineSettings
+from gsba.config import CubemapSettings, RefineSettings
 from gsba.features import detection
 from gsba.features.detection import Extractor
 from gsba.frames import cubemap
@@ -44,12 +44,18 @@ class _Extraction:
 
     frames: FrameSet
     index: Mapping[str, int]
-    rig: CubeRig
+    rig: CubeRig  # faces that pixels are given on
+    settings: CubemapSettings
     make_extractor: Callable[[], Extractor]
 
     def __call__(self, name: str) -> Features:
-        images, masks = cubemap.load(self.frames, self.index[name], self.rig)
-        return detection.extract(images, masks, self.rig, self.make_extractor())
+        frame = self.index[name]
+        own = cubemap.rig_for(self.frames.format_of(frame), self.settings)
+        images, masks = cubemap.load(self.frames, frame, own)
+        found = detection.extract(images, masks, own, self.make_extractor())
+        if own == self.rig:
+            return found
+        return replace(found, pixels=self.rig.project(found.bearings_rig, found.faces))
 
     def taken(self, names: Sequence[str]) -> "_Extraction":
         frames = self.frames.taken(np.array([self.index[name] for name in names]), absolute=True)
@@ -69,7 +75,8 @@ def extract(
     """Features by frame name; image and mask are read, cut and released one at a time.
 
     Args:
-        store, frames, rig, settings: those of the run.
+        store, frames, rig, settings: those of the run; each camera's frames are searched on faces
+            of their own, and pixels given on the faces of the rig.
         make_extractor: makes an extractor, once for each frame.
         files: that the extractor depends on: weights of a learned one.
         name: name of the stage.
@@ -82,12 +89,12 @@ def extract(
     }
     chosen = settings.features
 
-    compute = _Extraction(frames, index, rig, make_extractor)
+    compute = _Extraction(frames, index, rig, settings.cubemap, make_extractor)
     inputs = {
         frame: fingerprint([*frames.paths[f], frames.mask_paths[f]]) for frame, f in index.items()
     }
     relevant = chosen.model_dump(exclude={"weights", "accept_noncommercial", "download"})
-    cut = [] if frames.fisheyes is None else [list(map(asdict, frames.fisheyes))]
+    cut = [[list(map(asdict, kind.fisheyes or ())) for kind in frames.formats], rig]
     key = [settings.cubemap, relevant, fingerprint(files), *cut]
     with freed_memory_kept():
         return store.per_frame(name, key, inputs, compute, Features)
@@ -97,6 +104,7 @@ def adopted(
     store: RunStore,
     frames: FrameSet,
     rig: CubeRig,
+    settings: CubemapSettings,
     make_extractor: Callable[[], Extractor],
     stored: Sequence[Path],
     name: str = "features",
@@ -104,11 +112,11 @@ def adopted(
     """Features that other runs have stored, by frame name; extracted again where a file is gone.
 
     Args:
-        store, frames, rig: those of the run.
+        store, frames, rig, settings: those of the run.
         make_extractor: makes an extractor, once for each frame.
         stored: (F,) file of each frame in the folder of another run.
         name: name of the stage.
     """
     index = {frame: f for f, frame in enumerate(frames.names)}
-    compute = _Extraction(frames, index, rig, make_extractor)
+    compute = _Extraction(frames, index, rig, settings, make_extractor)
     return store.adopt(name, dict(zip(frames.names, stored, strict=True)), compute, Features)

@@ -14,46 +14,47 @@ from gsba.config import CubemapSettings
 from gsba.frames.masks import load_usable
 from gsba.frames.pixels import load_erp, load_faces
 from gsba.frames.track_pairs import load_squares
-from gsba.types import FACES, FrameSet
+from gsba.types import FACES, FrameSet, PictureFormat
 
 _ROWS_AT_ONCE = 256  # rows whose coordinates are held in double precision at once
 
 
-def rig_for(frames: FrameSet, settings: CubemapSettings) -> CubeRig:
-    """The rig on which features of these frames are found.
+def rig_for(kind: PictureFormat, settings: CubemapSettings) -> CubeRig:
+    """The rig on which features of a camera's frames are found.
 
     Unless a size is set, a face centre has `oversampling` times the pixel density of the
     panorama's equator, within `min_face_size` and `max_face_size`: 0.5 suffices where patches
     refine the keypoints. Frames that come as cube faces keep their own size and
     90 degrees.
     """
-    if not frames.panoramic:
-        return native_rig(frames)
+    if not kind.panoramic:
+        return native_rig(kind)
     hfov = np.deg2rad(settings.hfov_deg)
-    native = 2 * frames.width / (2 * np.pi) * np.tan(hfov / 2)
+    native = 2 * kind.width / (2 * np.pi) * np.tan(hfov / 2)
     wanted = max(round(settings.oversampling * native), settings.min_face_size)
     size = settings.face_size or min(wanted, settings.max_face_size)
     return CubeRig(size, hfov)
 
 
-def native_rig(frames: FrameSet, most: int | None = None) -> CubeRig:
+def native_rig(kind: PictureFormat, most: int | None = None) -> CubeRig:
     """Faces 90 degrees wide, as dense as the frames; of panoramas at most `most` pixels across."""
-    size = frames.native_face_size
-    return CubeRig(min(size, most) if most and frames.panoramic else size, np.pi / 2)
+    size = kind.native_face_size
+    return CubeRig(min(size, most) if most and kind.panoramic else size, np.pi / 2)
 
 
 def load(frames: FrameSet, frame: int, rig: CubeRig) -> tuple[np.ndarray, np.ndarray | None]:
     """Faces (6, size, size, 3) uint8 RGB of a frame and their masks (6, size, size) bool, or
     None."""
+    kind = frames.format_of(frame)
     mask = load_usable(frames, frame)
     masks = None if mask is None else cut_mask(mask, rig)
-    if frames.tracks is not None:
-        return cut_squares(load_squares(frames, frame), rig, frames.correction), masks
-    if frames.panoramic:
-        width = dense_enough(frames.width, rig.focal)
+    if kind.tracks is not None:
+        return cut_squares(load_squares(frames, frame), rig, kind.correction), masks
+    if kind.panoramic:
+        width = dense_enough(kind.width, rig.focal)
         return cut(load_erp(frames, frame, width=width), rig), masks
     images = np.zeros((len(FACES), rig.size, rig.size, 3), np.uint8)
-    present = [FACES.index(name) for name in frames.faces]
+    present = [FACES.index(name) for name in kind.faces]
     images[present] = load_faces(frames, frame)
     usable = np.zeros((len(FACES), rig.size, rig.size), bool)
     usable[present] = True

@@ -25,16 +25,18 @@ def width_of(rig: Rig) -> int:
 
 def load_raw(frames: FrameSet, f: int, gray: bool = False) -> list[np.ndarray]:
     """Pictures (h, w[, 3]) uint8 of all lenses of frame f, as stored on disk."""
-    assert frames.fisheyes is not None
-    lens = frames.fisheyes[0]
+    kind = frames.format_of(f)
+    assert kind.fisheyes is not None
+    lens = kind.fisheyes[0]
     return decode_pair(frames.paths[f], (lens.width, lens.height), gray)
 
 
 def load_joined(frames: FrameSet, f: int, gray: bool, width: int) -> np.ndarray:
     """Panorama (width / 2, width[, 3]) uint8 of frame f, by its current calibration."""
-    assert frames.fisheyes is not None
+    kind = frames.format_of(f)
+    assert kind.fisheyes is not None
     pictures = load_raw(frames, f, gray)
-    return join_pictures(pictures, frames.fisheyes, width, width / frames.width)
+    return join_pictures(pictures, kind.fisheyes, width, width / kind.width)
 
 
 def join_pictures(pictures: list[np.ndarray], rig: Rig, width: int, share: float) -> np.ndarray:

@@ -16,8 +16,9 @@ def cut(frames: FrameSet, f: int, cutter: ViewCutter) -> list[np.ndarray]:
         frames: panoramas; raw pairs and equi-angular cube maps are cut in one step.
         cutter: the cutter for that frame.
     """
-    if frames.fisheyes is not None:
+    kind = frames.format_of(f)
+    if kind.fisheyes is not None:
         return list(cutter.cut_raw(load_raw(frames, f)))
-    if frames.tracks is not None:
-        return list(cutter.cut_squares(load_squares(frames, f), frames.correction))
+    if kind.tracks is not None:
+        return list(cutter.cut_squares(load_squares(frames, f), kind.correction))
     return cutter.cut(load_erp(frames, f))

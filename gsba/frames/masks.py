@@ -58,19 +58,21 @@ def load_mask(frames: FrameSet, f: int) -> np.ndarray | None:
 
     Where the frames have a correction, it is applied.
     """
+    kind = frames.format_of(f)
     levels = _load_levels(frames, f)
     if levels is None:
         return None
     usable = levels > _MAX_UNUSED_LEVEL
-    return straightened(usable, frames.correction) if frames.correction else usable
+    return straightened(usable, kind.correction) if kind.correction else usable
 
 
 def load_usable(frames: FrameSet, f: int) -> np.ndarray | None:
     """Mask like that of `load_mask`, without the seams between raw lenses."""
+    kind = frames.format_of(f)
     mask = load_mask(frames, f)
-    if frames.fisheyes is None:
+    if kind.fisheyes is None:
         return mask
-    clear = clear_of_seam(frames.height, frames.fisheyes)
+    clear = clear_of_seam(kind.height, kind.fisheyes)
     return clear if mask is None else mask & clear
 
 
@@ -79,12 +81,13 @@ def load_weights(frames: FrameSet, f: int) -> np.ndarray | None:
 
     0 is where `load_mask` is False; above, they grow with the grey level to 1 at white.
     """
+    kind = frames.format_of(f)
     levels = _load_levels(frames, f)
     if levels is None:
         return None
     usable = levels > _MAX_UNUSED_LEVEL
-    if frames.correction:
-        usable, levels = (straightened(image, frames.correction) for image in (usable, levels))
+    if kind.correction:
+        usable, levels = (straightened(image, kind.correction) for image in (usable, levels))
     above = np.maximum(levels, _MAX_UNUSED_LEVEL + 1) - np.float32(_MAX_UNUSED_LEVEL)
     return np.where(usable, above / (255 - _MAX_UNUSED_LEVEL), 0).astype(np.float32)
 
@@ -97,10 +100,11 @@ def levels_of(weights: np.ndarray) -> np.ndarray:
 
 def _load_levels(frames: FrameSet, f: int) -> np.ndarray | None:
     """Grey levels (H, 2H) uint8 of the mask file."""
+    kind = frames.format_of(f)
     path = frames.mask_paths[f]
     if path is None:
         return None
-    size = (frames.width, frames.height) if frames.panoramic else image_size(path)
+    size = (kind.width, kind.height) if kind.panoramic else image_size(path)
     written = path.stat().st_mtime_ns if path.exists() else None
     return _levels_in(path, size, written)
 

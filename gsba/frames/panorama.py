@@ -6,21 +6,22 @@ import cv2
 import numpy as np
 
 from gsba.camera.rig import CubeRig, owner_faces
-from gsba.camera.sphere import bearings_from_erp
+from gsba.camera.sphere import around_sphere, bearings_from_erp
+from gsba.camera.straighten import PAD
 from gsba.frames.masks import load_usable
 from gsba.frames.pixels import load_erp, load_faces
-from gsba.types import FACES, FrameSet
+from gsba.types import FACES, FrameSet, PictureFormat
 
 _NUM_BRIGHTNESS_FRAMES = 5  # frames by whose brightness `bright_level` judges all
 _PADDING_PX = 3  # pixels copied from a face's neighbours: the support of bicubic sampling, and one
 
 
-def width_for(frames: FrameSet, max_width: int) -> int:
-    """Width of the panoramas that `load_grey` makes.
+def width_for(kind: PictureFormat, max_width: int) -> int:
+    """Width of the panoramas that `load_grey` makes of a camera's frames without enlarging them.
 
     A panorama of cube faces is at least as dense as these at their centres.
     """
-    width = frames.panorama_width
+    width = kind.panorama_width
     while width > max_width and width % 4 == 0:
         width //= 2
     return width
@@ -30,18 +31,19 @@ def load_grey(frames: FrameSet, frame: int, width: int) -> tuple[np.ndarray, np.
     """Grey panorama of a frame and its mask.
 
     Args:
-        width: pixels across, see `width_for`.
+        width: pixels across, see `width_for`; narrower panoramas are enlarged.
 
     Returns:
         (width / 2, width) uint8 grey; (width / 2, width) bool or None, True = use.
     """
+    kind = frames.format_of(frame)
     mask = load_usable(frames, frame)
-    if frames.panoramic:
-        grey = load_erp(frames, frame, gray=True, width=width)
+    if kind.panoramic:
+        grey = _fit(load_erp(frames, frame, gray=True, width=width), width)
         return grey, None if mask is None else fit_mask(mask, width)
-    size = frames.width
+    size = kind.width
     faces = np.zeros((len(FACES), size, size), np.uint8)
-    present = [FACES.index(name) for name in frames.faces]
+    present = [FACES.index(name) for name in kind.faces]
     faces[present] = load_faces(frames, frame, gray=True)
     native = 4 * size
     maps, owners = _erp_maps(size, native)
@@ -57,20 +59,32 @@ def load_grey(frames: FrameSet, frame: int, width: int) -> tuple[np.ndarray, np.
 
 
 class Greys:
-    """Grey panoramas of frames that are read repeatedly: the first ones stay in memory."""
+    """Grey panoramas of frames that are read repeatedly: the first ones stay in memory.
 
-    def __init__(self, frames: FrameSet, max_width: int, limit_mb: float = 128.0) -> None:
-        self.num_frames, self.width = len(frames), width_for(frames, max_width)
+    All have the width of the widest camera's.
+    """
+
+    def __init__(
+        self, frames: FrameSet, max_width: int, limit_mb: float = 128.0, width: int | None = None
+    ) -> None:
+        self.num_frames = len(frames)
+        self.width = width or max(width_for(kind, max_width) for kind in frames.formats)
         self._frames, self._limit_mb = frames, limit_mb
         self._room = int(limit_mb * 2**20 / self.width**2)  # images of width^2 / 2, and masks
         self._kept: dict[int, tuple[np.ndarray, np.ndarray | None]] = {}
 
     def __reduce__(self) -> tuple[object, ...]:  # workers read the pictures again
-        return Greys, (self._frames, self.width, self._limit_mb)
+        return Greys, (self._frames, self.width, self._limit_mb, self.width)
 
     def taken(self, chosen: np.ndarray) -> "Greys":
         """The panoramas of some frames (F',), ascending, with paths for other processes."""
-        return Greys(self._frames.taken(chosen, absolute=True), self.width, self._limit_mb)
+        frames = self._frames.taken(chosen, absolute=True)
+        return Greys(frames, self.width, self._limit_mb, self.width)
+
+    def enlargements(self) -> np.ndarray:
+        """Factors (F,) float64, 1 or more, by which panoramas are larger than their frames."""
+        own = np.array([kind.panorama_width for kind in self._frames.formats])
+        return np.maximum(self.width / own, 1.0)[self._frames.cameras]
 
     def __getitem__(self, frame: int) -> tuple[np.ndarray, np.ndarray | None]:
         """Panorama and mask like those of `load_grey`, from any thread."""
@@ -92,9 +106,14 @@ def bright_level(greys: Greys) -> int:
 
 
 def _fit(grey: np.ndarray, width: int) -> np.ndarray:
-    """An image averaged down to a width."""
+    """A panorama averaged down to a width, or enlarged to it."""
     if grey.shape[1] == width:
         return grey
+    if grey.shape[1] < width:
+        places = (np.arange(width) + 0.5) * (grey.shape[1] / width) - 0.5 + PAD
+        u, v = np.meshgrid(places, places[: width // 2])
+        maps = u.astype(np.float32), v.astype(np.float32)
+        return cv2.remap(around_sphere(grey, PAD), *maps, cv2.INTER_CUBIC)
     return cv2.resize(grey, (width, width // 2), interpolation=cv2.INTER_AREA)
 
 

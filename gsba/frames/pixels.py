@@ -22,18 +22,19 @@ def load_erp(frames: FrameSet, f: int, gray: bool = False, width: int | None = N
         gray: one channel instead of RGB.
         width: pixels across, even: wider frames are averaged down to it.
     """
+    kind = frames.format_of(f)
     import cv2
 
-    if not frames.panoramic:
+    if not kind.panoramic:
         raise ValueError("load_erp needs equirectangular frames")
-    if frames.fisheyes is not None:
-        return load_joined(frames, f, gray, min(width or frames.width, frames.width))
-    if frames.tracks is not None:
-        return load_panorama(frames, f, gray, min(width or frames.width, frames.width))
-    erp = decode(frames.paths[f][0], (frames.width, frames.height), gray, at_least=width)
+    if kind.fisheyes is not None:
+        return load_joined(frames, f, gray, min(width or kind.width, kind.width))
+    if kind.tracks is not None:
+        return load_panorama(frames, f, gray, min(width or kind.width, kind.width))
+    erp = decode(frames.paths[f][0], (kind.width, kind.height), gray, at_least=width)
     if width is not None and width < erp.shape[1]:
         erp = cv2.resize(erp, (width, width // 2), interpolation=cv2.INTER_AREA)
-    return straightened(erp, frames.correction) if frames.correction else erp
+    return straightened(erp, kind.correction) if kind.correction else erp
 
 
 def load_padded(frames: FrameSet, f: int, buffers: Buffers) -> np.ndarray:
@@ -42,23 +43,25 @@ def load_padded(frames: FrameSet, f: int, buffers: Buffers) -> np.ndarray:
     It lies in the thread's buffers: the next one replaces it. A JPEG is decoded at the end of
     the memory through which it is then moved, so that a frame is held once.
     """
-    shape = (frames.height + 2 * PAD, frames.width + 2 * PAD, 3)
+    kind = frames.format_of(f)
+    shape = (kind.height + 2 * PAD, kind.width + 2 * PAD, 3)
     padded = buffers.array("padded", shape)
-    if frames.layout != "erp":
+    if kind.layout != "erp":
         return around_sphere(load_erp(frames, f), PAD, padded)
-    size = frames.width, frames.height
-    room = padded.reshape(-1)[-3 * frames.width * frames.height :]
+    size = kind.width, kind.height
+    room = padded.reshape(-1)[-3 * kind.width * kind.height :]
     around_sphere(decode(frames.paths[f][0], size, room=room), PAD, padded)
-    if not frames.correction:
+    if not kind.correction:
         return padded
     straight = buffers.array("straight", shape)
     inner = straight[PAD:-PAD, PAD:-PAD]
-    return around_sphere(straightened_inside(padded, frames.correction, inner), PAD, straight)
+    return around_sphere(straightened_inside(padded, kind.correction, inner), PAD, straight)
 
 
 def load_faces(frames: FrameSet, f: int, gray: bool = False) -> np.ndarray:
-    """Cube faces of frame f, (len(frames.faces), height, width[, 3]) uint8, RGB or grey."""
-    if frames.panoramic:
+    """Cube faces of frame f, (len(kind.faces), height, width[, 3]) uint8, RGB or grey."""
+    kind = frames.format_of(f)
+    if kind.panoramic:
         raise ValueError("load_faces needs cube frames")
-    size = frames.width, frames.height
+    size = kind.width, kind.height
     return np.stack([decode(path, size, gray) for path in frames.paths[f]])

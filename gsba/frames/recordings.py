@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 
 from gsba.log import GsbaError
-from gsba.types import NO_FILE_NAME, FrameSet
+from gsba.types import NO_FILE_NAME, FrameSet, PictureFormat
 
 _log = logging.getLogger(__name__)
 
@@ -18,25 +18,29 @@ _GAP_MULTIPLE_S = 100.0  # recordings begin at multiples of this many seconds
 _NUM_COMPARED = 3  # frames of two recordings whose files are compared, to tell one given twice
 
 
-def combine(recordings: Mapping[str, FrameSet]) -> FrameSet:
+def combine(
+    recordings: Mapping[str, FrameSet], cameras: Mapping[str, str] | None = None
+) -> FrameSet:
     """The frames of several recordings, one recording after the other.
 
     Names become `RECORDING/NAME`. Clocks of different recordings say nothing of one another: times
     are shifted so that recordings follow one another, with a gap that no two neighbours have.
+    Recordings of one layout, size and calibration are of one camera, unless they name different
+    ones; the others have cameras of their own.
 
     Args:
         recordings: frames by the name of their recording, in order; each has its own clock.
+        cameras: camera model by the name of a recording that names one.
 
     Raises:
-        GsbaError: names that cannot be folders, one recording given twice, or frames of different
-            layouts or sizes.
+        GsbaError: names that cannot be folders, or one recording given twice.
     """
     _check_names(list(recordings))
     for (name, one), (other_name, other) in combinations(recordings.items(), 2):
         _refuse_same(name, one, other_name, other)
-        _refuse_other_camera(name, one, other_name, other)
         _log_common_times(name, one, other_name, other)
     parts = list(recordings.values())
+    formats, numbers = _cameras_of(recordings, cameras or {})
     gap = _GAP_INTERVALS * max(float(np.median(np.diff(part.timestamps))) for part in parts)
     times, shifts, end = list[np.ndarray](), list[float](), -gap
     for part in parts:
@@ -45,14 +49,18 @@ def combine(recordings: Mapping[str, FrameSet]) -> FrameSet:
         times.append(part.timestamps + shift)
         shifts += [shift] * len(part)
         end = float(times[-1][-1])
-    return replace(
-        parts[0],
+    return FrameSet(
         names=tuple(f"{name}/{own}" for name, part in recordings.items() for own in part.names),
         paths=tuple(paths for part in parts for paths in part.paths),
         timestamps=np.concatenate(times),
         mask_paths=tuple(path for part in parts for path in part.mask_paths),
+        formats=formats,
+        camera_of_frame=tuple(
+            number for number, part in zip(numbers, parts, strict=True) for _ in range(len(part))
+        )
+        if len(formats) > 1
+        else (),
         timed=all(part.timed for part in parts),
-        lenses_nominal=any(part.lenses_nominal for part in parts),
         clock_shifts=tuple(shifts),
     )
 
@@ -102,26 +110,35 @@ def _refuse_same(name: str, one: FrameSet, other_name: str, other: FrameSet) -> 
         )
 
 
-def _refuse_other_camera(name: str, one: FrameSet, other_name: str, other: FrameSet) -> None:
-    """Refuse recordings that one camera cannot have made in one mode."""
-    differing = [
-        what
-        for what, same in (
-            (f"layout ({one.layout} and {other.layout})", one.layout == other.layout),
-            (
-                f"size ({one.width}x{one.height} and {other.width}x{other.height})",
-                (one.width, one.height, one.tracks) == (other.width, other.height, other.tracks),
-            ),
-            ("faces", one.faces == other.faces),
-            (
-                "calibration",
-                one.fisheyes == other.fisheyes or one.lenses_nominal or other.lenses_nominal,
-            ),
-        )
-        if not same
-    ]
-    if differing:
-        raise GsbaError(
-            f"recordings '{name}' and '{other_name}' have frames of another {differing[0]}: "
-            "recordings of one run must be of one camera in one mode; convert one of them"
-        )
+def _cameras_of(
+    recordings: Mapping[str, FrameSet], names: Mapping[str, str]
+) -> tuple[tuple[PictureFormat, ...], list[int]]:
+    """Format (C,) of each camera, and the camera (R,) of each recording.
+
+    Args:
+        recordings: frames of one camera each.
+        names: of camera models, by recording.
+    """
+    formats, models, numbers = list[PictureFormat](), list[str](), list[int]()
+    for recording, frames in recordings.items():
+        own, model = frames.format, names.get(recording, "")
+        for number, (known, other) in enumerate(zip(formats, models, strict=True)):
+            if _one_mode(known, own) and (not model or not other or model == other):
+                nominal = known.lenses_nominal or own.lenses_nominal
+                formats[number] = replace(known, lenses_nominal=nominal)
+                models[number] = other or model
+                break
+        else:
+            number = len(formats)
+            formats.append(own)
+            models.append(model)
+        numbers.append(number)
+    return tuple(formats), numbers
+
+
+def _one_mode(one: PictureFormat, other: PictureFormat) -> bool:
+    """True if one camera in one mode can have made both; lenses that are to be estimated may
+    differ."""
+    if one.lenses_nominal or other.lenses_nominal:
+        other = replace(other, fisheyes=one.fisheyes, lenses_nominal=one.lenses_nominal)
+    return one == other

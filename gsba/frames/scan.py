@@ -24,7 +24,7 @@ from gsba.frames.side_by_side import in_folder, lens_sizes, may_hold_two
 from gsba.frames.times import frame_times
 from gsba.frames.track_pairs import find_tracks, track_size
 from gsba.log import GsbaError, track
-from gsba.types import FACES, FrameSet
+from gsba.types import FACES, FrameSet, PictureFormat
 
 _log = logging.getLogger(__name__)
 
@@ -90,19 +90,14 @@ def scan(
     if fisheyes is not None or tracks is not None:
         width = 4 * tracks[1] if tracks else width_of(fisheyes)  # type: ignore[arg-type]
         height = width // 2
+    kind = PictureFormat(layout, width, height, faces, (), fisheyes, tracks, nominal)
     return FrameSet(
         names=names,
         paths=_absolute(paths),
         timestamps=times,
-        layout=layout,
-        faces=faces,
-        width=width,
-        height=height,
-        mask_paths=find_masks(masks, names, None if layout == "cube" else (width, height)),
+        mask_paths=find_masks(masks, names, (width, height) if kind.panoramic else None),
+        formats=(kind,),
         timed=timed,
-        fisheyes=fisheyes,
-        tracks=tracks,
-        lenses_nominal=nominal,
     )
 
 
@@ -229,11 +224,8 @@ def find_panoramas(folder: Path, masks: Path | None = None) -> FrameSet:
         names=tuple(names),
         paths=_absolute(paths),
         timestamps=np.arange(len(names), dtype=np.float64),
-        layout=layout,
-        faces=(),
-        width=width,
-        height=height,
         mask_paths=find_masks(masks, names, (width, height)),
+        formats=(PictureFormat(layout, width, height),),
         timed=False,
     )
 

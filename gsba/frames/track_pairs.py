@@ -110,13 +110,15 @@ def track_size(folder: Path, pairs: Sequence[tuple[Path, ...]]) -> tuple[int, in
 
 def load_squares(frames: FrameSet, f: int, gray: bool = False) -> np.ndarray:
     """Upright squares (6, S, S[, 3]) uint8 of frame f, FACES order; see `equiangular.squares`."""
-    assert frames.tracks is not None
-    return _decoded(frames.paths[f], frames.tracks, gray)
+    kind = frames.format_of(f)
+    assert kind.tracks is not None
+    return _decoded(frames.paths[f], kind.tracks, gray)
 
 
 def load_panorama(frames: FrameSet, f: int, gray: bool, width: int) -> np.ndarray:
     """Panorama (width / 2, width[, 3]) uint8 of frame f, with the frames' correction."""
-    return panorama_of(load_squares(frames, f, gray), width, frames.correction)
+    kind = frames.format_of(f)
+    return panorama_of(load_squares(frames, f, gray), width, kind.correction)
 
 
 def panorama_of(faces: np.ndarray, width: int, correction: tuple[float, ...] = ()) -> np.ndarray:

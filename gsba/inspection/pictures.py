@@ -42,7 +42,7 @@ def _about(frames: FrameSet) -> Facts:
     """Layout, number, times and lenses."""
     first = frames.paths[0][0]
     width, height = image_size(first)
-    layout, num = _LAYOUTS[frames.layout], len(frames.fisheyes or ())
+    layout, num = _LAYOUTS[frames.format.layout], len(frames.format.fisheyes or ())
     layout = f"raw, {num} fisheyes a frame" if num > 2 else layout
     facts = [("layout", f"{layout}, files of {width}x{height}")]
     count = str(len(frames))
@@ -52,7 +52,7 @@ def _about(frames: FrameSet) -> Facts:
         facts.append(("frames", f"{count}, one every {step:.3g} s, {spoken_seconds(span)}"))
     else:
         facts.append(("frames", f"{count}, in the order of their names: they have no times"))
-    lenses = frames.fisheyes or ()
+    lenses = frames.format.fisheyes or ()
     titles = {"front": "front lens", "back": "back lens"}
     names = [titles.get(name, name) for name in lens_names(len(lenses))]
     for name, lens in zip(names, lenses, strict=True):

@@ -36,7 +36,7 @@ from gsba.localization.pose_search import (
     least_of_rival,
     search_pose,
 )
-from gsba.localization.run_map import RunMap
+from gsba.localization.run_map import RunMap, without_correction
 from gsba.log import GsbaError
 from gsba.matching.guided_search import Gate, Searchable, match_pair, searchable
 from gsba.types import Features, FrameSet, Keypoints
@@ -111,10 +111,10 @@ class Localizer:
         self.map = RunMap.open(Path(run), map_number)
         self.index: PlaceIndex = open_index(self.map)
         self.extractor = self.map.make_extractor()
-        self._field = SphereField(np.array(self.map.result.correction))
+        self._field = SphereField(np.array(self.map.frames.format.correction))
         self._precise = precise
         rig = self.map.rig
-        small = self.map.frames.panoramic and rig.size > _MAX_FACE_PX
+        small = self.map.frames.format.panoramic and rig.size > _MAX_FACE_PX
         self._rig = CubeRig(_MAX_FACE_PX, rig.hfov_rad) if small else rig
         self.aligner = PatchAligner(self.map)
 
@@ -142,9 +142,9 @@ class Localizer:
             frames: of the layout of the run's frames.
             frame: its number.
         """
-        images, masks = cubemap.load(replace(frames, correction=()), frame, self._rig)
+        images, masks = cubemap.load(without_correction(frames), frame, self._rig)
         features = extract(images, masks, self._rig, self.extractor)
-        raw, width = replace(frames, correction=()), self.aligner.width
+        raw, width = without_correction(frames), self.aligner.width
 
         def grey() -> Grey:
             return load_grey(raw, frame, width)

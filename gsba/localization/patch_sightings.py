@@ -57,7 +57,7 @@ class PatchAligner:
     def __init__(self, map_: RunMap) -> None:
         self._map, settings = map_, map_.settings.patches
         self.greys = Greys(map_.frames, settings.max_width)
-        self._field = SphereField(np.array(map_.result.correction))
+        self._field = SphereField(np.array(map_.frames.format.correction))
 
     @property
     def width(self) -> int:

@@ -20,7 +20,7 @@ from gsba.frames import cubemap
 from gsba.geometry import moved_to
 from gsba.log import GsbaError
 from gsba.matching.guided_search import Searchable, principal_axes, searchable
-from gsba.store.finished import load_lenses, load_run
+from gsba.store.finished import load_cameras, load_run
 from gsba.store.folder import STAGES, read_marker
 from gsba.store.records import RecordError, load_record
 from gsba.types import Features, FrameSet, Reconstruction
@@ -80,16 +80,22 @@ class RunMap:
                 f"{root} has no points (its camera turned on the spot): nothing can be localised "
                 "in it"
             )
-        settings, lenses = load_config(root / "config.toml"), load_lenses(root, result, map_number)
-        rig = cubemap.rig_for(frames, settings.cubemap)
+        if len(frames.formats) > 1:
+            raise GsbaError(
+                f"{root} is of recordings of several cameras: nothing can be localised in it yet"
+            )
+        settings = load_config(root / "config.toml")
+        lenses = load_cameras(root, result, frames, map_number).only
+        rig = cubemap.rig_for(frames.format, settings.cubemap)
         reader = _KeypointReader(root, frames, settings, rig)
         first = reader(0).descriptors
         if not len(first):
             raise GsbaError(f"{root}: its first frame has no keypoints: refine again with --fresh")
         axes = principal_axes(first)
         observed = _ObservedPoints.of(result)
+        field = SphereField(np.array(frames.format.correction))
         load = lru_cache(_NUM_KEPT)(
-            lambda f: _keyframe(f, reader(f), observed, result, lenses, settings, rig, axes)
+            lambda f: _keyframe(f, reader(f), observed, result, lenses, field, settings, rig, axes)
         )
         covariances = point_covariances(result)
         return cls(root, frames, result, lenses, settings, rig, covariances, axes, load)
@@ -98,6 +104,11 @@ class RunMap:
         """Extractor of the kind that found the run's keypoints."""
         weights = learned.find_weights(self.settings)
         return learned.make_extractor(self.settings.features, weights)()
+
+
+def without_correction(frames: FrameSet) -> FrameSet:
+    """The frames as their camera's pictures show them."""
+    return frames.with_formats([replace(frames.format, correction=())])
 
 
 def require_own_version(root: Path) -> None:
@@ -132,7 +143,7 @@ class _KeypointReader:
                     return load_record(path, Features)
                 except RecordError:
                     continue
-        raw = replace(self.frames, correction=())  # keypoints are corrected later
+        raw = without_correction(self.frames)  # keypoints are corrected later
         make = learned.make_extractor(self.settings.features, learned.find_weights(self.settings))
         images, masks = cubemap.load(raw, frame, self.rig)
         return extract(images, masks, self.rig, make())
@@ -162,6 +173,7 @@ def _keyframe(
     observed: _ObservedPoints,
     result: Reconstruction,
     lenses: Lenses,
+    field: SphereField,
     settings: RefineSettings,
     rig: CubeRig,
     axes: np.ndarray,
@@ -170,7 +182,7 @@ def _keyframe(
     from scipy.spatial import KDTree
 
     rows = observed.rows(frame)
-    seen = corrected(gather([features]), SphereField(np.array(result.correction)), rig)
+    seen = corrected(gather([features]), field, rig)
     seen = lenses.of_frame(frame).seen(seen) if lenses else seen
     numbers = np.zeros(len(features), np.int64)
     known = np.zeros(len(features), bool)

@@ -69,7 +69,7 @@ def find_carrier(frames: FrameSet) -> Carrier:
     Raises:
         GsbaError: cube faces, too few frames, no texture, or too little motion.
     """
-    if not frames.panoramic:
+    if not frames.format.panoramic:
         raise GsbaError("the carrier is detected in panoramas; these frames are cube faces")
     _require_enough(len(frames))
     chosen = np.unique(np.linspace(0, len(frames) - 1, _MAX_FRAMES).astype(int))
@@ -129,8 +129,10 @@ def _outlined(pictures: np.ndarray, structure: FixedStructure) -> tuple[np.ndarr
 
 def carrier_mask(carrier: Carrier, frames: FrameSet, frame: int) -> np.ndarray:
     """Mask of the world in a frame, (H, 2H) bool, True = use."""
-    full = cv2.resize(carrier.mask.astype(np.float32), (frames.width, frames.height)) > 0.5
-    return np.roll(full, round(carrier.turns[frame] / (2 * np.pi) * frames.width), axis=1)
+    kind = frames.format_of(frame)
+    size = kind.width, kind.height
+    full = cv2.resize(carrier.mask.astype(np.float32), size) > 0.5
+    return np.roll(full, round(carrier.turns[frame] / (2 * np.pi) * kind.width), axis=1)
 
 
 def write_carrier(

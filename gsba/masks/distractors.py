@@ -24,7 +24,7 @@ from gsba.geometry import inverse
 from gsba.masks import _distractor_kernels
 from gsba.store.shards import StoredRecords
 from gsba.store.store import PerFrame
-from gsba.types import FrameSet, Landmarks, Tracks
+from gsba.types import FrameSet, Landmarks, PictureFormat, Tracks
 
 _WIDTH_PX = 512  # pixels across the panoramas that are compared
 _NUM_NEIGHBOURS = 6  # neighbours that each frame is compared with
@@ -123,10 +123,7 @@ class StaticScene:
     ) -> None:
         self._frames, self._poses, self._landmarks = frames, world_T_rigs, landmarks
         self._limit_mb, self._known_neighbours = limit_mb, neighbours or {}
-        whole = frames.panoramic
-        self.width = (
-            min(_WIDTH_PX, frames.width) if whole else panorama.width_for(frames, _WIDTH_PX)
-        )
+        self.width = min(_width_of(kind) for kind in frames.formats)
         self._known, self._rays = known, _rays(self.width)
         self._room = int(limit_mb * 2**20 / (1.5 * self.width**2))
         self._kept: dict[int, np.ndarray] = {}
@@ -261,6 +258,11 @@ class StaticScene:
         return -cv2.resize(low, size) - margin, cv2.resize(high, size) + margin
 
 
+def _width_of(kind: PictureFormat) -> int:
+    """Pixels across small panoramas of a camera's frames."""
+    return min(_WIDTH_PX, kind.width) if kind.panoramic else panorama.width_for(kind, _WIDTH_PX)
+
+
 def _rays(width: int) -> np.ndarray:
     grid = np.stack(np.meshgrid(np.arange(width), np.arange(width // 2)), axis=-1) + 0.5
     return bearings_from_erp(grid, width, width // 2).astype(np.float32)
@@ -268,7 +270,8 @@ def _rays(width: int) -> np.ndarray:
 
 def _load(frames: FrameSet, frame: int, width: int) -> np.ndarray:
     """Small picture (h, w, C + 1) uint8: colours, or grey of cube faces, and the mask."""
-    if frames.panoramic:
+    kind = frames.format_of(frame)
+    if kind.panoramic:
         color = load_erp(frames, frame, width=width)
         mask = load_mask(frames, frame)
         use = np.ones(color.shape[:2], np.uint8)

@@ -213,7 +213,7 @@ def _carrier(store: RunStore, frames: FrameSet, required: bool, name: str = "car
             return no_carrier(frames, str(error))
 
     files = fingerprint(path for group in frames.paths for path in group)
-    found = store.stage(name, (files, frames.fisheyes, required), compute, Carrier)
+    found = store.stage(name, (files, frames.format.fisheyes, required), compute, Carrier)
     if not found.share:
         return found
     path = store.root / f"{name}.png"
@@ -245,7 +245,7 @@ def _merge(
         for f, path in enumerate(track(paths, "writing masks")):
             weights = load_weights(frames, f)
             if weights is None:
-                width = frames.panorama_width
+                width = frames.format_of(f).panorama_width
                 weights = np.ones((width // 2, width), np.float32)
             for part in parts:
                 found = part(f)
@@ -258,7 +258,8 @@ def _merge(
     name = "masks" if folder.parent == store.root else "first-masks"
     if not all(path.exists() for path in paths):
         store.forget(name)
-    inputs = fingerprint(frames.mask_paths), frames.width, frames.layout
+    shapes = [(kind.width, kind.layout) for kind in frames.formats]
+    inputs = fingerprint(frames.mask_paths), shapes, frames.camera_of_frame
     store.stage(name, inputs, compute, Counts, stages)
     if name == "masks":
         store.claim(folder)
@@ -286,7 +287,7 @@ def _write_check(path: Path, frames: FrameSet, shares: np.ndarray) -> None:
     rows = []
     for f in np.sort(np.argsort(-shares, kind="stable")[:_NUM_CHECK_FRAMES]):
         size = (_CHECK_WIDTH_PX, _CHECK_WIDTH_PX // 2)
-        if frames.panoramic:
+        if frames.format_of(int(f)).panoramic:
             shown = cv2.resize(load_erp(frames, int(f), width=_CHECK_WIDTH_PX), size)
         else:
             shown = np.full((size[1], size[0], 3), 128, np.uint8)

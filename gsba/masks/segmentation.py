@@ -23,7 +23,7 @@ from gsba.frames import cubemap
 from gsba.frames.files import decode, image_size
 from gsba.log import GsbaError, track
 from gsba.store.store import PerFrame, RunStore, fingerprint
-from gsba.types import FACES, FrameSet
+from gsba.types import FACES, FrameSet, PictureFormat
 
 Segment = str | Callable[[np.ndarray], np.ndarray]
 """A command line, or a function from a face (N, N, 3) uint8 RGB to (N, N) bool, True = use."""
@@ -52,13 +52,13 @@ def segmented(store: RunStore, frames: FrameSet, segment: Segment) -> PerFrame[S
         GsbaError: the command fails, or a mask is missing or of another size.
     """
     index = {name: f for f, name in enumerate(frames.names)}
-    rig = cubemap.native_rig(frames, _MAX_FACE_PX)
-    size = rig.size
     folder = store.root / "stages" / "segmented-faces"
-    present = [FACES.index(face) for face in frames.faces] or list(range(len(FACES)))
-    ask = _Once(lambda: _run(str(segment), frames, rig, present, folder))
+    ask = _Once(lambda: _run(str(segment), frames, folder))
 
     def compute(name: str) -> Segmented:
+        kind = frames.format_of(index[name])
+        rig, present = cubemap.native_rig(kind, _MAX_FACE_PX), _present(kind)
+        size = rig.size
         use = np.ones((len(FACES), size, size), bool)
         if callable(segment):
             faces, _ = cubemap.load(frames, index[name], rig)
@@ -71,7 +71,8 @@ def segmented(store: RunStore, frames: FrameSet, segment: Segment) -> PerFrame[S
                 use[c] = decode(path, (size, size), gray=True) > 127
         return Segmented(np.packbits(use), size)
 
-    key = [uuid.uuid4().hex if callable(segment) else segment, size]
+    sizes = [cubemap.native_rig(kind, _MAX_FACE_PX).size for kind in frames.formats]
+    key = [uuid.uuid4().hex if callable(segment) else segment, *sizes]
     items = {name: fingerprint(frames.paths[f]) for name, f in index.items()}
     found = store.per_frame("segmented", key, items, compute, Segmented, alone=True)
     shutil.rmtree(folder, ignore_errors=True)
@@ -103,18 +104,27 @@ class _Once:
                 self._done = True
 
 
-def _run(command: str, frames: FrameSet, rig: CubeRig, present: list[int], folder: Path) -> None:
+def _present(kind: PictureFormat) -> list[int]:
+    """Faces that frames of a camera have."""
+    return [FACES.index(face) for face in kind.faces] or list(range(len(FACES)))
+
+
+def _run(command: str, frames: FrameSet, folder: Path) -> None:
     """Write all faces, call the command, and check that it has masked them."""
     images, masks = folder / "images", folder / "masks"
     shutil.rmtree(folder, ignore_errors=True)
     with disk_errors(folder):
         images.mkdir(parents=True)
         masks.mkdir()
-    names = [_face_file(name, c) for name in frames.names for c in present]
+    sizes: dict[str, int] = {}  # pixels across each face
     for f, name in enumerate(track(frames.names, "cutting faces")):
+        kind = frames.format_of(f)
+        rig = cubemap.native_rig(kind, _MAX_FACE_PX)
         faces, _ = cubemap.load(frames, f, rig)
-        for c in present:
+        for c in _present(kind):
+            sizes[_face_file(name, c)] = rig.size
             write_image(images / _face_file(name, c), faces[c])
+    names = list(sizes)
     words = _words(command)
     if any("{image}" in word or "{mask}" in word for word in words):
         for name in track(names, "segmenting"):
@@ -129,12 +139,11 @@ def _run(command: str, frames: FrameSet, rig: CubeRig, present: list[int], folde
             f"--segment {command}: wrote no mask {missing[0]} ({len(missing)} of {len(names)} "
             "missing): it must write one of each face's name"
         )
-    for name in names:
+    for name, size in sizes.items():
         width, height = image_size(masks / name)
-        if (width, height) != (rig.size, rig.size):
+        if (width, height) != (size, size):
             raise GsbaError(
-                f"--segment {command}: mask {name} is {width}x{height}, its face is "
-                f"{rig.size}x{rig.size}"
+                f"--segment {command}: mask {name} is {width}x{height}, its face is {size}x{size}"
             )
 
 
@@ -183,7 +192,7 @@ def _checked(mask: np.ndarray, size: int, where: str) -> np.ndarray:
     return mask
 
 
-@functools.lru_cache(maxsize=1)
+@functools.lru_cache(maxsize=4)
 def _places(size: int) -> np.ndarray:
     """Index (2 size, 4 size) int64 into flat faces of each panorama pixel."""
     width, height = 4 * size, 2 * size

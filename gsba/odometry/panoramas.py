@@ -64,9 +64,9 @@ def of_frames(frames: FrameSet, source: Path, width: int) -> SmallPanoramas:
     Raises:
         GsbaError: cube faces.
     """
-    if not frames.panoramic:
+    if not frames.format.panoramic:
         raise GsbaError(f"{source}: holds cube faces; odometry follows panoramas or raw fisheyes")
-    width = min(width, frames.width)
+    width = min(width, frames.format.width)
     size = (width, width // 2)
 
     def read(rows: Sequence[int], colour: bool) -> Iterator[tuple[int, np.ndarray]]:
@@ -76,8 +76,8 @@ def of_frames(frames: FrameSet, source: Path, width: int) -> SmallPanoramas:
 
     found = SmallPanoramas(source, frames.timestamps, width, read)
     usable = np.ones(size[::-1], bool)
-    if frames.fisheyes is not None:
-        usable &= clear_of_seam(width // 2, frames.fisheyes)
+    if frames.format.fisheyes is not None:
+        usable &= clear_of_seam(width // 2, frames.format.fisheyes)
     masked = any(path is not None for path in frames.mask_paths)
     looks = np.unique(np.linspace(0, len(frames) - 1, _CARRIER_LOOKS).astype(int))
     for row in looks.tolist() if masked else ():

@@ -52,6 +52,11 @@ class _Observed:
         """The same of points that are numbered otherwise: n is `points[n]`."""
         return replace(self, points=points[self.points])
 
+    def enlarged(self, factors: np.ndarray) -> "_Observed":
+        """The observations with the noise of pictures that were enlarged by factors (N,): their
+        pixels' noise is correlated, so that residuals promise more than the pictures hold."""
+        return replace(self, covariances=self.covariances * factors[:, None, None] ** 2)
+
 
 @dataclass(frozen=True, slots=True)
 class _Planes:
@@ -178,8 +183,11 @@ def _align_some(
     title, cut = f"{name}: templates", (planes.origins, planes.tilted)
     patches = frame_jobs.cut(title, greys, hosts, *cut, settings, workers)
     frame_jobs.align(name, greys, seeing, patches, sightings, settings, workers)
+    enlarged = greys.enlargements()
     kept, found = _accepted(patches, sightings, seeing, pixel, settings, dropped)
+    found = found.enlarged(np.maximum(enlarged[seeing[kept]], enlarged[hosts[found.points]]))
     at_hosts = _at_hosts(patches, sightings, kept, hosts, planes, pixel)
+    at_hosts = at_hosts.enlarged(enlarged[at_hosts.frames])
     normals_world = _normals_world(sightings, kept, rays, planes, world_T_rigs[hosts])
     return _Aligned(found, at_hosts, normals_world)
 

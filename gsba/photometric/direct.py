@@ -51,14 +51,22 @@ def check(frames: FrameSet, settings: RefineSettings) -> None:
     Raises:
         GsbaError: cube faces, or panoramas of an odd height.
     """
+    if len({(kind.width, kind.panoramic) for kind in frames.formats}) > 1 and (
+        direct := settings.direct_families()
+    ):
+        raise GsbaError(
+            f"the {' and '.join(sorted(direct))} family compares pictures of one size, these "
+            "recordings have several: leave it out of --factors"
+        )
     if "photometric" not in settings.factors:
         return
-    if not frames.panoramic or frames.height % 2:
-        what = f"{frames.height} rows" if frames.panoramic else "cube faces"
-        raise GsbaError(
-            f"the photometric family reads panoramas of even height, not {what}: leave it out of "
-            "--factors"
-        )
+    for kind in frames.formats:
+        if not kind.panoramic or kind.height % 2:
+            what = f"{kind.height} rows" if kind.panoramic else "cube faces"
+            raise GsbaError(
+                f"the photometric family reads panoramas of even height, not {what}: leave it out "
+                "of --factors"
+            )
 
 
 def refine(

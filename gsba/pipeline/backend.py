@@ -257,8 +257,7 @@ def reconstruct(
         )
         result = replace(
             result,
-            correction=frames.correction,
-            fisheyes=frames.fisheyes,
+            formats=frames.formats,
             vertical=_vertical(state, result),
         )
         if map_.lenses and map_.centres is not None:

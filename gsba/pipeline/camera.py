@@ -27,8 +27,9 @@ from gsba.bundle.lens_centres import LensCentres, StitchRadius
 from gsba.bundle.readout import CameraEstimate
 from gsba.bundle.reconstruction import world_scale
 from gsba.bundle.self_calibration import SelfCalibration
+from gsba.camera.cameras import Cameras
 from gsba.camera.fisheye import Rig, turned
-from gsba.camera.lens import ONE_CENTRE, Lenses
+from gsba.camera.lens import Lenses
 from gsba.frames.dual_fisheye import SEAM
 from gsba.pipeline import backend, frontend
 from gsba.pipeline.map import Map
@@ -57,9 +58,11 @@ def find_camera(state: State, prefix: str = "") -> State:
         prefix: of the names of stages.
     """
     run = state.run
-    if run.settings.camera.model == "central" or not run.frames.panoramic:
+    if len(run.frames.formats) > 1:
         return state
-    raw = run.frames.fisheyes is not None
+    if run.settings.camera.model == "central" or not run.frames.format.panoramic:
+        return state
+    raw = run.frames.format.fisheyes is not None
     found = _find_raw_camera(state) if raw else _find_two_lenses(state, prefix)
     return replace(found, matches=state.matches)
 
@@ -94,7 +97,7 @@ def _find_two_lenses(state: State, prefix: str) -> State:
 def _find_raw_camera(state: State) -> State:
     """Raw lenses: where they are, then their calibration."""
     run, shown, gates = state.run, state.observed.shown, state.run.settings.rounds.loops
-    fisheyes = run.frames.fisheyes
+    fisheyes = run.frames.format.fisheyes
     assert fisheyes is not None
     trial = state.through(Lenses.of_raw(fisheyes, float(SEAM)))
     for n in range(2):
@@ -160,7 +163,7 @@ def take_parts_from_patches(state: State, sighted: Sighted, name: str, number: i
         number: of the estimate in this round. The first finds how rows are read, the second which
             axes and calibration lenses have, as far as these are not known by then.
     """
-    raw = state.run.frames.fisheyes is not None
+    raw = state.run.frames.format.fisheyes is not None
     if number == 0 and state.map.lenses.readout_motion is None:
         found = f"readout_{name}"
         state = state.with_camera(
@@ -232,12 +235,13 @@ def measure_camera(state: State) -> State:
     return state.with_camera(replace(camera, readout_sigma=sigma))
 
 
-def keep_lenses(state: State, result: Reconstruction) -> Lenses:
-    """The lenses of a map in the unit of the result that it became, for later exports."""
-    if not state.map.lenses:
-        return ONE_CENTRE
-    lenses = state.map.lenses.scaled(world_scale(state.solution, result)).cut_anew()
-    return state.run.stage("lenses", [], lambda: lenses, Lenses, noted=False)
+def keep_lenses(state: State, result: Reconstruction) -> Cameras:
+    """The cameras of a map in the unit of the result that it became, for later exports."""
+    cameras = Cameras.of(state.map.lenses, state.run.frames)
+    if not cameras:
+        return cameras
+    cameras = cameras.scaled(world_scale(state.solution, result)).cut_anew()
+    return state.run.stage("lenses", [], lambda: cameras, Cameras, noted=False)
 
 
 def better_calibration(coarse: CoarsePoses, map_: Map) -> tuple[Rig, bool] | None:
@@ -313,7 +317,7 @@ def _calibration(of: _Observations) -> SelfCalibration:
     landmarks, lenses, nominal = (
         of.solution.landmarks,
         of.camera.lenses,
-        of.state.run.frames.lenses_nominal,
+        of.state.run.frames.format.lenses_nominal,
     )
     return self_calibration.estimate(
         landmarks, of.keypoints, of.shown, of.solution, lenses, of.context, nominal
@@ -385,7 +389,7 @@ def _from_patches(
 
 def _axes_known(run: Run) -> bool:
     """True if no stabiliser has rotated panoramas against the lenses, or settings give the axes."""
-    return run.frames.lens_axes_known or run.settings.camera.lens_yaws_deg is not None
+    return run.frames.format.lens_axes_known or run.settings.camera.lens_yaws_deg is not None
 
 
 def _settings_of_camera(run: Run) -> list[object]:

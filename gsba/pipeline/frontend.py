@@ -39,7 +39,7 @@ def extract(run: Run) -> State:
 def adopt(run: Run, stored: Sequence[Path]) -> ObservedFrames:
     """Keypoints of all frames from features that other runs have stored, (F,) files."""
     make = learned.make_extractor(run.settings.features, run.weights)
-    found = extraction.adopted(run.store, run.frames, run.rig, make, stored)
+    found = extraction.adopted(run.store, run.frames, run.rig, run.settings.cubemap, make, stored)
     load = FrameFeatures([found] * len(run.frames), run.frames.names)
     keypoints = detection.gather(map(load, range(len(run.frames))))
     return _matchable(run, [found] * len(run.frames), keypoints)

@@ -125,8 +125,36 @@ def _frames_of(runs: Sequence[FinishedRun]) -> FrameSet:
                 )
             recordings[name] = own
     frames = combine(recordings)
+    for run in runs:
+        if len(run.frames.formats) > 1:
+            raise GsbaError(
+                f"{run.root} has recordings of several cameras: it cannot grow or be merged yet; "
+                "refine all recordings in one call"
+            )
+        differing = [what for what, same in _in_common(runs[0], run) if not same]
+        if differing:
+            raise GsbaError(
+                f"{run.root} has frames of another {differing[0]} than {runs[0].root}: runs that "
+                "are joined must be of one camera; refine all recordings in one call"
+            )
     fetched = [flag for run in runs for flag in run.frames.fetched or (False,) * len(run.frames)]
     return replace(frames, fetched=tuple(fetched) if any(fetched) else ())
+
+
+def _in_common(one: FinishedRun, other: FinishedRun) -> list[tuple[str, bool]]:
+    """What one camera in one mode gives all its frames, and True where two runs have it alike."""
+    first, second = one.frames.format, other.frames.format
+    nominal = first.lenses_nominal or second.lenses_nominal
+    sizes = [(kind.width, kind.height, kind.tracks) for kind in (first, second)]
+    return [
+        (f"layout ({first.layout} and {second.layout})", first.layout == second.layout),
+        (
+            f"size ({first.width}x{first.height} and {second.width}x{second.height})",
+            sizes[0] == sizes[1],
+        ),
+        ("faces", first.faces == second.faces),
+        ("calibration", nominal or first.fisheyes == second.fisheyes),
+    ]
 
 
 def _best_camera(runs: Sequence[FinishedRun]) -> int:

@@ -81,6 +81,10 @@ class Map:
 
     def straightened(self, frames: FrameSet) -> FrameSet:
         """The frames, read without what stitching bends, raw pairs by what their lenses are."""
-        fisheyes = self.lenses.fisheyes or frames.fisheyes
+        if len(frames.formats) > 1:
+            return frames
+        fisheyes = self.lenses.fisheyes or frames.format.fisheyes
         correction = tuple(self.field.coefficients.tolist())
-        return replace(frames, correction=correction, fisheyes=fisheyes)
+        return frames.with_formats(
+            [replace(frames.format, correction=correction, fisheyes=fisheyes)]
+        )

@@ -8,12 +8,13 @@ from gsba.bundle.gps_factors import GpsFixes
 from gsba.bundle.gyro_turns import GyroTurns
 from gsba.bundle.reconstruction import world_scale
 from gsba.camera.calibration import calibration_json
+from gsba.camera.cameras import Cameras
 from gsba.camera.fisheye import Rig
-from gsba.camera.lens import ONE_CENTRE, Lenses
+from gsba.camera.lens import Lenses
 from gsba.config import RefineSettings
 from gsba.config_file import to_toml
 from gsba.disk import write_json, write_text
-from gsba.export import ExportFormat, ExportOptions, export_all, of_one_lens, write_points
+from gsba.export import ExportFormat, ExportOptions, export_all, seen_by, write_points
 from gsba.frames.recordings import own_timestamps
 from gsba.pipeline.map import Map
 from gsba.pipeline.prior import Prior
@@ -78,13 +79,13 @@ class RunResult:
         return is_partial(self.maps, len(self.frames))
 
 
-def write(state: State, result: Reconstruction, lenses: Lenses) -> RunResult:
+def write(state: State, result: Reconstruction, cameras: Cameras) -> RunResult:
     """Poses, cloud, report and datasets; of several maps that nothing ties together the largest.
 
     Args:
         state: of the run at its end.
         result: what its map became in the trajectory's world.
-        lenses: in the result's unit.
+        cameras: in the result's unit.
     """
     run, prior, world = state.run, state.prior, state.map
     store, settings, coarse = run.store, run.settings, prior.coarse
@@ -100,11 +101,12 @@ def write(state: State, result: Reconstruction, lenses: Lenses) -> RunResult:
     write_points(out / "points.ply", main)
     write_text(out / "config.toml", to_toml(settings))
     (out / CALIBRATION).unlink(missing_ok=True)
-    if shown.fisheyes is not None:
-        write_json(out / CALIBRATION, _calibration(shown.fisheyes, world, result, lenses, settings))
+    if len(shown.formats) == 1 and (rig := shown.format.fisheyes) is not None:
+        calibration = _calibration(rig, world, result, cameras.only, settings)
+        write_json(out / CALIBRATION, calibration)
     baseline = settings.camera.baseline()
     placement = place(main, shown, settings.placement, baseline, settings.gps)
-    _export(run, main, shown, placement, lenses.taken(rows))
+    _export(run, main, shown, placement, cameras.taken(rows))
     report = _report(state, result)
     write_json(out / "report.json", report)
     page = report | {"frames": [report["frames"][f] for f in rows]}
@@ -180,10 +182,15 @@ def _findings(state: State, result: Reconstruction, gps: dict[str, Any] | None) 
             run.settings.camera,
             frames.timed,
         )
-        if frames.fisheyes is not None:
+        if frames.format.fisheyes is not None:
             camera["lenses"], of_raw = of_lenses(map_.lenses, map_.calibrated, map_.covariances)
             more += of_raw
         notes += more
+    if len(frames.formats) > 1:
+        notes.append(
+            "the recordings are of several cameras: each is taken as calibrated, with one centre; "
+            "two lenses, readout and stitching were not estimated"
+        )
     gyro = None
     if prior.gyro is not None:
         gyro, more = of_gyro(prior.gyro, _gyro_steps_used(state), map_.readout)
@@ -229,13 +236,13 @@ def _gauge(run: Run, prior: Prior) -> str:
 
 
 def _export(
-    run: Run, main: Reconstruction, shown: FrameSet, placement: Placement, lenses: Lenses
+    run: Run, main: Reconstruction, shown: FrameSet, placement: Placement, cameras: Cameras
 ) -> None:
     """Datasets in all formats; the first that is not there yet has the others written with it."""
     store, size, images = run.store, run.settings.export.face_size, run.settings.export.images
     fetched = run.settings.export.fetched
-    seen_by = lenses if of_one_lens(images, shown) else ONE_CENTRE
-    key = [size, placement.to_json(), *(["of one lens"] if seen_by else [])]
+    shown_by = seen_by(images, shown, cameras)
+    key = [size, placement.to_json(), *(["of one lens"] if shown_by else [])]
     key += ["fetched"] if fetched else []
     key += {"fisheye": ["raw"], "panorama": ["panorama"]}.get(images, [])
     folders = {ExportFormat(name): store.root / name for name in run.settings.export.formats}
@@ -248,7 +255,9 @@ def _export(
 
     def compute() -> Counts:
         if waiting:
-            options = ExportOptions(size, placement, lenses=seen_by, images=images, fetched=fetched)
+            options = ExportOptions(
+                size, placement, lenses=shown_by, images=images, fetched=fetched
+            )
             export_all(main, shown, waiting, options, store.workers)
             waiting.clear()
         apart = len(run.frames) - len(shown)

@@ -127,7 +127,7 @@ def _straighten(state: State, sighted: Sighted, number: int) -> State:
     """Remove the stitching field that all frames share."""
     run, map_, settings = state.run, state.map, state.run.settings
     looked_for = number == 1 or map_.field
-    stitched = run.frames.layout in ("erp", "eac")
+    stitched = len(run.frames.formats) == 1 and run.frames.format.layout in ("erp", "eac")
     if settings.stitching.mode == "off" or not stitched or not looked_for:
         return state
 

@@ -49,7 +49,8 @@ def refine_recordings(
     own. The world is that of the first recording with a trajectory.
 
     Args:
-        recordings: at least two, of one camera in one mode, each on a clock of its own.
+        recordings: at least two, each on a clock of its own. Those of one layout, size and
+            calibration are of one camera, unless they name different ones.
         out, settings, segment, fresh, families, client: see `gsba.refine`.
 
     Raises:
@@ -83,7 +84,8 @@ def refine_each(
     if any(one.followed for one in given):  # no evidence beside the images that they are made of
         settings = settings.with_faint_priors()
     found = {one.name: one.scanned() for one in given}
-    frames = combine(found)
+    cameras = {one.name: one.recording.camera for one in given}
+    frames = combine(found, {name: model for name, model in cameras.items() if model})
     evidence = Evidence(
         families=tuple(families),
         recordings=tuple(one.evidence(found[one.name], settings) for one in given),
@@ -151,20 +153,12 @@ def _named(name: str, error: GsbaError) -> GsbaError:
 
 
 def _with_camera(settings: RefineSettings, given: Sequence[_Given]) -> RefineSettings:
-    """Settings with the camera model that recordings name and the baseline of a calibration.
-
-    Raises:
-        GsbaError: recordings name different camera models.
-    """
-    named = [(one.name, one.recording.camera) for one in given if one.recording.camera is not None]
-    for name, camera in named:
-        if camera != named[0][1]:
-            raise GsbaError(
-                f"recordings '{named[0][0]}' and '{name}' name different cameras "
-                f"({named[0][1]} and {camera}): recordings of one run must be of one camera"
-            )
-    if named:
-        camera = settings.camera.model_dump() | {"name": named[0][1]}
+    """Settings with the camera model that recordings name and the baseline of a calibration."""
+    named = {one.recording.camera for one in given} - {None}
+    if len(named) > 1:
+        return settings
+    for name in named:
+        camera = settings.camera.model_dump() | {"name": name}
         settings = validated(settings.model_dump() | {"camera": camera})
     for one in given:
         settings = inputs.with_baseline(settings, _path(one.recording.calibration))

@@ -234,7 +234,7 @@ def _solve_raw(run: Run) -> State:
     while True:
         name, after, better = f"recut{n}", run.chain.latest, None
         kept = run.store.stored(f"{name}_undone", known, bool, after)
-        if frames.fisheyes is not None and not kept:
+        if any(kind.fisheyes is not None for kind in frames.formats) and not kept:
             better = run.store.stored(name, known, _Cut, after)
         if better is None:
             state = solve(frontend.extract(run))
@@ -250,7 +250,8 @@ def _solve_raw(run: Run) -> State:
             run.store.stage(name, known, lambda found=better: found, _Cut, after)
         n, (fisheyes, found) = n + 1, better
         again = Journal(dict(counts))
-        frames = replace(frames, fisheyes=fisheyes, lenses_nominal=False)
+        recut = replace(frames.format, fisheyes=fisheyes, lenses_nominal=False)
+        frames = frames.with_formats([recut])
         frames = merging.recut(run.store, frames, n)
         run = Run.begin(run.store, frames, run.coarse, run.settings, evidence, again, found)
 
@@ -276,7 +277,8 @@ def solve(state: State) -> State:
     state = _add_keypoints_where_weak(state)
     # Known points are matched in all frames; lenses that neighbours hide may show then.
     state = _match_from_itself(state)
-    if not state.map.lenses and state.run.frames.fisheyes is None:
+    raw = any(kind.fisheyes is not None for kind in state.run.frames.formats)
+    if not state.map.lenses and not raw:
         state = camera.find_camera(state, "again_")
         if state.map.lenses:
             state = _match_from_itself(state, "again_")

@@ -83,7 +83,7 @@ class Run:
     coarse: CoarsePoses  # start poses, as the trajectories say
     evidence: Evidence
     settings: RefineSettings
-    rig: CubeRig  # faces that keypoints are found on
+    rig: CubeRig  # faces that pixels of keypoints are given on: those of the first camera
     greys: Greys  # pictures for patches
     weights: Mapping[str, Path]  # stage -> file of a learned network
     num_threads: int
@@ -111,7 +111,9 @@ class Run:
                 none that observes points, or weights that are not there.
         """
         direct.check(frames, settings)
-        if settings.camera.model == "two_lens" and not frames.panoramic:
+        if settings.camera.model == "two_lens" and not all(
+            kind.panoramic for kind in frames.formats
+        ):
             raise GsbaError("camera.model = two_lens is for panoramas: cube faces hide the seam")
         evidence = evidence or Evidence()
         sensors = [evidence.imu, *(one.imu for one in evidence.recordings)]
@@ -120,7 +122,7 @@ class Run:
         for family in evidence.families:
             if family.name in (TrajectoryPrior.name, GyroTurns.name):
                 raise GsbaError(f"family {family.name}: gsba has one of this name; rename yours")
-        rig = cubemap.rig_for(frames, settings.cubemap)
+        rig = cubemap.rig_for(frames.formats[0], settings.cubemap)
         members = (*_of_points(settings, rig), *evidence.families)
         families = Families(members, frames.names, frames.timestamps)
         if not families.observing_points.members:
@@ -129,8 +131,7 @@ class Run:
         paths = [*(path for group in frames.paths for path in group), *frames.mask_paths]
         start = coarse.world_T_rigs.tolist(), settings.read
         inputs = [fingerprint(paths), frames.timestamps.tolist(), frames.timed, *start]
-        if frames.fisheyes is not None:
-            inputs += [*map(asdict, frames.fisheyes), lenses_found, frames.lenses_nominal]
+        inputs += [frames.camera_of_frame, *map(asdict, frames.formats), lenses_found]
         chain.stage("frames", inputs, lambda: frames, FrameSet)
         return cls(
             store=store,
@@ -196,13 +197,14 @@ class Run:
     @property
     def matching_settings(self) -> RefineSettings:
         """Settings whose gates are as wide as directions of raw pairs are uncertain."""
-        frames, own = self.frames, self.settings.verify.max_error_deg
-        if frames.fisheyes is None:
-            return self.settings
-        focal = min(lens.focal for lens in frames.fisheyes)
-        pixels = _NOMINAL_PIXELS if frames.lenses_nominal else 1.0
-        least = max(float(np.rad2deg(pixels / focal)), _NOMINAL_DEG * frames.lenses_nominal)
-        return self.settings.with_gates(max(1.0, least / own))
+        own, widest = self.settings.verify.max_error_deg, 1.0
+        for kind in self.frames.formats:
+            if kind.fisheyes is not None:
+                focal = min(lens.focal for lens in kind.fisheyes)
+                pixels = _NOMINAL_PIXELS if kind.lenses_nominal else 1.0
+                least = max(float(np.rad2deg(pixels / focal)), _NOMINAL_DEG * kind.lenses_nominal)
+                widest = max(widest, least / own)
+        return self.settings if widest == 1.0 else self.settings.with_gates(widest)
 
     def matching_key(self) -> list[object]:
         """Settings that matches rest on."""

@@ -122,7 +122,7 @@ def _edge_normals(
 def _side_faces(frames: FrameSet, f: int) -> tuple[np.ndarray, np.ndarray | None]:
     """Four faces around the horizon (4, N, N, 3), and masks (4, N, N) bool, True = use."""
     assert FACES[:4] == ("front", "right", "back", "left")
-    images, masks = cubemap.load(frames, f, cubemap.native_rig(frames, _FACE_PX))
+    images, masks = cubemap.load(frames, f, cubemap.native_rig(frames.format_of(f), _FACE_PX))
     return images[:4], None if masks is None else masks[:4]
 
 

@@ -233,9 +233,11 @@ def _edges(depth: np.ndarray) -> np.ndarray:
 
 def _captured_rig(frames: FrameSet, size: int) -> CubeRig:
     """Faces as dense as rendered ones and a little wider; cube frames keep their own faces."""
-    if not frames.panoramic:
-        return cubemap.native_rig(frames)
-    return _wide_rig(size)
+    if all(kind.panoramic for kind in frames.formats):
+        return _wide_rig(size)
+    if len(frames.formats) > 1:  # cube faces among them show no more than 90 degrees
+        return CubeRig(size, np.pi / 2)
+    return cubemap.native_rig(frames.format)
 
 
 def _wide_rig(size: int) -> CubeRig:

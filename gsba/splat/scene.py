@@ -96,10 +96,11 @@ def cut_faces(frames: FrameSet, frame: int, rig: CubeRig) -> tuple[np.ndarray, n
     Returns:
         (6, size, size, 3) uint8 RGB, and their masks, bool or None.
     """
-    if not frames.panoramic:
-        whole = cubemap.native_rig(frames)
+    kind = frames.format_of(frame)
+    if not kind.panoramic:
+        whole = cubemap.native_rig(kind)
     else:
-        times = -(-frames.width / (2 * np.pi) // rig.focal)  # until no denser in the middle
+        times = -(-kind.width / (2 * np.pi) // rig.focal)  # until no denser in the middle
         whole = replace(rig, size=int(np.clip(times, 1, _MAX_OVERSAMPLING)) * rig.size)
     images, mask = cubemap.load(frames, frame, whole)
     if whole.size == rig.size:
@@ -113,7 +114,8 @@ def cut_lens_faces(
     frames: FrameSet, frame: int, views: Sequence[View], optics: Optics
 ) -> tuple[list[np.ndarray], list[np.ndarray] | None]:
     """Like `cut_faces`, of one lens each: images as large as the views, and masks or None."""
-    times = int(np.clip(-(-frames.width / (2 * np.pi) // views[0].focal), 1, _MAX_OVERSAMPLING))
+    kind = frames.format_of(frame)
+    times = int(np.clip(-(-kind.width / (2 * np.pi) // views[0].focal), 1, _MAX_OVERSAMPLING))
     finer = tuple(view.finer(times) for view in views)
     cutter = optics.cutter(finer, frame)
     images, whole = lens_faces.cut(frames, frame, cutter), load_mask(frames, frame)

@@ -1,11 +1,11 @@
 """Reading of a finished run's result."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from gsba.camera.lens import ONE_CENTRE, Lenses
+from gsba.camera.cameras import Cameras
+from gsba.camera.lens import ONE_CENTRE
 from gsba.log import GsbaError
 from gsba.store.store import load_stage
 from gsba.types import FrameSet, Reconstruction
@@ -25,8 +25,7 @@ def load_run(out: Path, map_number: int = 1) -> tuple[Reconstruction, FrameSet]:
     frames = load_stage(out, "frames", FrameSet)
     if not _fit_together(reconstruction, frames):
         raise GsbaError(f"{out}: its results do not fit together: refine again with --fresh")
-    fisheyes = reconstruction.fisheyes or frames.fisheyes
-    frames = replace(frames, correction=reconstruction.correction, fisheyes=fisheyes)
+    frames = frames.with_formats(reconstruction.formats or frames.formats)
     main, shown = one_map(reconstruction, frames, map_number, str(out))
     if not (np.isfinite(main.world_T_rigs).all() and np.isfinite(main.points_world).all()):
         raise GsbaError(f"{out}: its poses or points are not finite: refine again with --fresh")
@@ -57,28 +56,25 @@ def one_map(
     return reconstruction.of_map(map_number), frames.taken(reconstruction.frames_of_map(map_number))
 
 
-def load_lenses(out: Path, main: Reconstruction, map_number: int = 1) -> Lenses:
-    """Lenses of the frames of a finished run's map, in that map's unit; one centre if not two.
+def load_cameras(out: Path, main: Reconstruction, frames: FrameSet, map_number: int = 1) -> Cameras:
+    """Cameras of a finished run's map, in that map's unit; one centre each if none has two lenses.
 
     Args:
         out: folder of the run.
-        main, map_number: the map, as `load_run` gives it.
+        main, frames, map_number: the map, as `load_run` gives it.
 
     Raises:
         GsbaError: the run found two lenses, but their file is missing.
     """
     if main.lens_baseline is None:
-        return ONE_CENTRE
-    lenses, whole = (
-        load_stage(out, "lenses", Lenses),
-        load_stage(out, "reconstruction", Reconstruction),
-    )
-    return lenses_of_map(lenses, whole, map_number)
+        return Cameras.of(ONE_CENTRE, frames)
+    whole = load_stage(out, "reconstruction", Reconstruction)
+    return cameras_of_map(load_stage(out, "lenses", Cameras), whole, map_number)
 
 
-def lenses_of_map(lenses: Lenses, whole: Reconstruction, map_number: int) -> Lenses:
-    """Lenses of one map's frames in its unit, from those of all frames in the largest map's."""
-    return lenses.taken(whole.frames_of_map(map_number)).scaled(whole.map_scale(map_number))
+def cameras_of_map(cameras: Cameras, whole: Reconstruction, map_number: int) -> Cameras:
+    """Cameras of one map's frames in its unit, from those of all frames in the largest map's."""
+    return cameras.taken(whole.frames_of_map(map_number)).scaled(whole.map_scale(map_number))
 
 
 def _fit_together(reconstruction: Reconstruction, frames: FrameSet) -> bool:
@@ -105,6 +101,9 @@ def _fit_together(reconstruction: Reconstruction, frames: FrameSet) -> bool:
     return (
         all(array.shape == shape for array, shape in shapes)
         and len(frames.paths) == len(frames.mask_paths) == num > 0
+        and len(frames.camera_of_frame) in (0, num)
+        and set(frames.cameras.tolist()) == set(range(len(frames.formats)))
+        and len(reconstruction.formats) in (0, len(frames.formats))
         and _numbered(result.components, result.map_scales, num)
         and all(i.size == 0 or (i.min() >= 0 and i.max() < most) for i, most in indices)
     )

@@ -217,7 +217,7 @@ class View:
         if "/frame" not in self.nodes:
             self.nodes["/frame"] = add.add_frame("/frame", show_axes=False)
         self.nodes["/frame"].wxyz, self.nodes["/frame"].position = wxyz, position
-        for view in views_of(self.scene.frames, self.scene.optics):
+        for view in views_of(self.scene.frames, f, self.scene.optics):
             self._place_face(f, view, faces.get(view.name))
         rows = found.observation_points[found.observation_frames == f]
         self.nodes["/seen"] = add.add_point_cloud(

@@ -19,7 +19,7 @@ from gsba.placement.placement import Placement, read_placement
 from gsba.report.html.figures import viewing_axes
 from gsba.splat.gaussians import SH_CONSTANT, Gaussians
 from gsba.splat.ply import read_ply
-from gsba.store.finished import load_lenses, load_run
+from gsba.store.finished import load_cameras, load_run
 from gsba.trajectory.files import read_trajectory
 from gsba.types import FACES, FrameSet, Reconstruction
 
@@ -76,7 +76,7 @@ def load_scene(run: Path) -> Scene:
         _placed_splat(path.parent.name, read_ply(path), placement)
         for path in sorted(run.glob("splat/*/point_cloud.ply"))
     )
-    lenses = load_lenses(run, reconstruction).scaled(placement.similarity.scale)
+    lenses = load_cameras(run, reconstruction, frames).scaled(placement.similarity.scale)
     steps = np.linalg.norm(np.diff(placed.world_T_rigs[:, :3, 3], axis=0), axis=1)
     moving = steps[steps > 1e-9 * (1 + steps.max(initial=0))]
     return Scene(
@@ -127,23 +127,24 @@ def faces_of(
     Raises:
         GsbaError: images are missing or have changed since the run.
     """
+    kind = frames.format_of(f)
     if optics:
         return _lens_faces(frames, f, masked, optics)
-    rig = cubemap.native_rig(frames, _MAX_FACE_PX)
+    rig = cubemap.native_rig(kind, _MAX_FACE_PX)
     images, use = cubemap.load(frames, f, rig)
     if masked and use is not None and frames.mask_paths[f] is not None:
         images = _tinted(images, use)
-    names = frames.faces or FACES
+    names = kind.faces or FACES
     return {name: _shrunk(images[FACES.index(name)]) for name in names}
 
 
-def views_of(frames: FrameSet, optics: Optics) -> tuple[View, ...]:
-    """Views of a frame's shown images."""
-    return optics.views(min(frames.native_face_size, _MAX_FACE_PX))
+def views_of(frames: FrameSet, f: int, optics: Optics) -> tuple[View, ...]:
+    """Views of the shown images of a frame."""
+    return optics.views(min(frames.format_of(f).native_face_size, _MAX_FACE_PX))
 
 
 def _lens_faces(frames: FrameSet, f: int, masked: bool, optics: Optics) -> dict[str, np.ndarray]:
-    views = views_of(frames, optics)
+    views = views_of(frames, f, optics)
     cutter = optics.cutter(views, f)
     images, mask = lens_faces.cut(frames, f, cutter), load_mask(frames, f) if masked else None
     if mask is not None:

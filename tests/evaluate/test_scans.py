@@ -14,7 +14,7 @@ from gsba.geometry import pose
 from gsba.placement import guess_in_scan
 from gsba.scans.search import Guess
 from gsba.scans.types import Scan
-from gsba.types import FrameSet, PoseStatus, Reconstruction
+from gsba.types import FrameSet, PictureFormat, PoseStatus, Reconstruction
 
 
 def _run() -> Reconstruction:
@@ -73,7 +73,9 @@ def test_pairs_tell_where_to_look(tmp_path: Path) -> None:
         "".join(f"{','.join(map(repr, a))} {','.join(map(repr, b))}\n" for a, b in lines)
     )
     names = tuple(f"{f:02}" for f in range(12))
-    frames = FrameSet(names, ((),) * 12, np.arange(12.0), "erp", (), 64, 32, (None,) * 12)
+    frames = FrameSet(
+        names, ((),) * 12, np.arange(12.0), (None,) * 12, (PictureFormat("erp", 64, 32),)
+    )
     offset = np.array([5.0, -7.0, 11.0])
     far = Scan(np.zeros((1, 3)), np.ones((1, 3)), offset)
     known = PlacementSettings(scan="scan.ply", pairs=str(pairs))

@@ -216,7 +216,8 @@ def test_faces_that_were_not_captured_stay_out(tmp_path, face_size):
 
 def test_a_rig_without_front_face_hangs_on_its_first(tmp_path):
     full = cube_frames(tmp_path / "frames")
-    frames = replace(full, faces=full.faces[1:], paths=tuple(paths[1:] for paths in full.paths))
+    fewer = replace(full.format, faces=full.format.faces[1:])
+    frames = replace(full, formats=(fewer,), paths=tuple(paths[1:] for paths in full.paths))
     scene = reconstruction()
     right = np.argmax(scene.observation_bearings, axis=1) == 0
     right &= np.abs(scene.observation_bearings).max(axis=1) == scene.observation_bearings[:, 0]
@@ -250,9 +251,10 @@ def test_masks_of_captured_faces_are_cut_from_their_panorama(tmp_path):
     export(scene, frames, tmp_path / "out", ExportFormat.COLMAP)
     folder = tmp_path / "out" / "masks"
     values = {
-        face: cv2.imread(str(folder / face / "frame_0000.png.png"), -1) for face in frames.faces
+        face: cv2.imread(str(folder / face / "frame_0000.png.png"), -1)
+        for face in frames.format.faces
     }
-    assert sorted(path.name for path in folder.iterdir()) == sorted(frames.faces)
+    assert sorted(path.name for path in folder.iterdir()) == sorted(frames.format.faces)
     assert values["front"].min() == 255 and values["back"].max() == 0
     assert (values["right"][:, :15] == 255).all() and (values["right"][:, 17:] == 0).all()
 

@@ -173,10 +173,10 @@ def test_a_link_to_an_earlier_export_stays_a_link(tmp_path, frames):
 
 
 def test_face_size_defaults_to_a_quarter_and_is_even(frames):
-    assert face_size_for(frames, None) == 128
-    assert face_size_for(frames, 77) == 77
+    assert face_size_for(frames.format, None) == 128
+    assert face_size_for(frames.format, 77) == 77
     with pytest.raises(GsbaError, match="face size 8"):
-        face_size_for(frames, 8)
+        face_size_for(frames.format, 8)
 
 
 @pytest.mark.parametrize("to", ["colmap", "colmap-flat", "nerfstudio"])

@@ -30,7 +30,7 @@ from gsba.export import ExportFormat, Shutter, export
 from gsba.geometry import inverse, pose
 from gsba.log import GsbaError
 from gsba.trajectory.files import read_trajectory
-from gsba.types import FrameSet, Reconstruction
+from gsba.types import FrameSet, PictureFormat, Reconstruction
 
 TWO = Lenses(np.array([0.01, -0.02, 0.2]), band_rad=np.deg2rad(3))
 TURNED = replace(TWO, axes=Rotation.from_rotvec(0.3 * np.eye(3)).as_matrix().repeat(3, axis=0))
@@ -87,12 +87,8 @@ def _raw_frames(folder: Path) -> FrameSet:
         names=names,
         paths=tuple(paths),
         timestamps=np.arange(NUM_FRAMES) * 0.5,
-        layout="erp",
-        faces=(),
-        width=512,
-        height=256,
         mask_paths=(None,) * NUM_FRAMES,
-        fisheyes=PAIR,
+        formats=(PictureFormat("erp", 512, 256, fisheyes=PAIR),),
     )
 
 

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from shard_jobs import Parts
 
 from factors.sphere_field import num_harmonics
+from gsba.camera.cameras import Cameras
 from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.camera.rig import CubeRig
 from gsba.export import ExportFormat, ExportOptions, export, export_all, images, pictures
@@ -40,7 +41,7 @@ PADDED = 3 * (HEIGHT + 8) * (WIDTH + 8)  # bytes
 def _frames(folder: Path, kind: str) -> FrameSet:
     frames = panoramas(folder / "frames", ".jpg", masked=kind != "plain")
     if kind == "corrected":
-        return replace(frames, correction=BENT)
+        return frames.with_formats([replace(frames.format, correction=BENT)])
     if kind == "masks of their own":
         own = [*frames.mask_paths]
         own[3:5] = folder / "own.png", None
@@ -176,7 +177,7 @@ def test_parts_write_what_the_whole_does(tmp_path, kind, lenses, to, chosen):
 def test_whoever_is_late_makes_no_folders(tmp_path):
     """A worker whose frames another one has written meanwhile, or that does not see the disk."""
     files = pictures.Files(tmp_path / "out", ("",), "images/{name}{suffix}", "")
-    writer = images.panorama_writer(files, _frames(tmp_path, "plain"))
+    writer = images.panorama_writer(files, _frames(tmp_path, "plain"), Cameras())
     with pytest.raises(GsbaError, match=r"cannot write .*out/images/frame_0000.jpg: No such file"):
         pictures.Pictures(_frames(tmp_path, "plain"), [writer])(0)
     assert not (tmp_path / "out").exists()

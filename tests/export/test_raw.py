@@ -12,7 +12,7 @@ from two_fisheyes import made_pair, picture, write
 from gsba.export.images import write_pictures
 from gsba.export.pictures import Files
 from gsba.export.raw import RawPictures
-from gsba.types import FrameSet
+from gsba.types import FrameSet, PictureFormat
 
 PAIR = made_pair(120)
 
@@ -28,7 +28,11 @@ def _frames(folder: Path, layout: str) -> tuple[FrameSet, list[np.ndarray]]:
         for path, pixels in zip(paths, shown, strict=True):
             Image.fromarray(pixels).save(path, **({"lossless": True} if layout == "webp" else {}))
     made = FrameSet(
-        base.names, (paths,), base.timestamps, "fisheye", (), 240, 120, (None,), fisheyes=PAIR
+        base.names,
+        (paths,),
+        base.timestamps,
+        (None,),
+        (PictureFormat("fisheye", 240, 120, fisheyes=PAIR),),
     )
     return made, shown
 

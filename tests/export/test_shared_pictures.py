@@ -12,6 +12,7 @@ from shard_jobs import DiesWriting
 from tiny_run import Case
 from typer.testing import CliRunner
 
+from gsba.camera.cameras import Cameras
 from gsba.cli import app
 from gsba.export import ExportFormat, export_all, formats, images, pictures
 from gsba.log import GsbaError
@@ -74,7 +75,7 @@ def test_a_dataset_that_workers_do_not_see_is_named(client, tmp_path: Path, monk
     monkeypatch.setattr(pictures.Files, "make_folders", lambda files, _: files.folder.rmdir())
     files = pictures.Files(tmp_path / "unseen", ("",), "{name}{suffix}", "")
     files.folder.mkdir()
-    writer = images.panorama_writer(files, frames)
+    writer = images.panorama_writer(files, frames, Cameras())
     with (
         hired(client, tmp_path / "out", frames) as workers,
         pytest.raises(GsbaError, match=f"does not see {tmp_path}/unseen: put it on a disk"),

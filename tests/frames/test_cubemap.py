@@ -9,7 +9,7 @@ from gsba.camera.rig import CubeRig
 from gsba.camera.sphere import bearings_from_erp
 from gsba.config import CubemapSettings
 from gsba.frames import cubemap
-from gsba.types import FrameSet
+from gsba.types import FrameSet, PictureFormat
 
 
 def _picture(bearings: np.ndarray, frequency: float = 6.0) -> np.ndarray:
@@ -107,7 +107,7 @@ def test_masks_are_cut_where_they_lie() -> None:
 def _frame_set(layout: str, width: int) -> FrameSet:
     height = width // 2 if layout == "erp" else width
     empty: tuple[Path, ...] = ()
-    return FrameSet(("0",), (empty,), np.zeros(1), layout, (), width, height, mask_paths=(None,))
+    return FrameSet(("0",), (empty,), np.zeros(1), (None,), (PictureFormat(layout, width, height),))
 
 
 @pytest.mark.parametrize("oversampling", [0.5, 1.25])
@@ -115,17 +115,17 @@ def test_automatic_size_follows_the_panoramas_density(oversampling: float) -> No
     settings = CubemapSettings(
         hfov_deg=96, oversampling=oversampling, min_face_size=64, max_face_size=2048
     )
-    rig = cubemap.rig_for(_frame_set("erp", 2048), settings)
+    rig = cubemap.rig_for(_frame_set("erp", 2048).format, settings)
     assert 2 * np.pi * rig.focal == pytest.approx(oversampling * 2048, rel=0.5 / rig.size)
     assert rig.hfov_rad == pytest.approx(np.deg2rad(96))
 
 
 def test_sizes_can_be_set_and_bounded() -> None:
     erp = _frame_set("erp", 8192)
-    assert cubemap.rig_for(erp, CubemapSettings(face_size=300)).size == 300
-    assert cubemap.rig_for(erp, CubemapSettings(max_face_size=700)).size == 700
+    assert cubemap.rig_for(erp.format, CubemapSettings(face_size=300)).size == 300
+    assert cubemap.rig_for(erp.format, CubemapSettings(max_face_size=700)).size == 700
 
 
 def test_cube_frames_keep_their_own_faces() -> None:
-    rig = cubemap.rig_for(_frame_set("cube", 333), CubemapSettings(face_size=100))
+    rig = cubemap.rig_for(_frame_set("cube", 333).format, CubemapSettings(face_size=100))
     assert (rig.size, rig.hfov_rad) == (333, np.pi / 2)

@@ -11,7 +11,7 @@ from gsba.camera.sphere import bearings_from_erp
 from gsba.frames.dual_fisheye import clear_of_seam, load_joined, load_raw, width_of
 from gsba.frames.files import decode
 from gsba.frames.pixels import load_erp
-from gsba.types import FrameSet
+from gsba.types import FrameSet, PictureFormat
 
 PAIR = made_pair()
 WIDTHS = [416, 360, 302, 300, 210, 130]  # the first as dense as the pictures; not all by 4
@@ -22,7 +22,11 @@ def _frames(paths: list[tuple[Path, ...]]) -> FrameSet:
     names = tuple(map(str, range(num)))
     times, masks = np.arange(num, dtype=np.float64), (None,) * num
     return FrameSet(
-        names, tuple(paths), times, "fisheye", (), width, width // 2, masks, fisheyes=PAIR
+        names,
+        tuple(paths),
+        times,
+        masks,
+        (PictureFormat("fisheye", width, width // 2, fisheyes=PAIR),),
     )
 
 
@@ -46,8 +50,8 @@ def _true(width: int) -> np.ndarray:
 
 
 def test_the_widest_panorama_is_as_dense_as_the_pictures(frames: FrameSet) -> None:
-    assert frames.width == WIDTHS[0]
-    assert abs(frames.width / (2 * np.pi) - PAIR[1].focal) < 8 / (2 * np.pi)
+    assert frames.format.width == WIDTHS[0]
+    assert abs(frames.format.width / (2 * np.pi) - PAIR[1].focal) < 8 / (2 * np.pi)
 
 
 @pytest.mark.parametrize("width", WIDTHS)

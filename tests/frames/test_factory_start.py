@@ -30,8 +30,8 @@ def _write(folder: Path, front: np.ndarray, back: np.ndarray) -> None:
 
 def _start(folder: Path, **more) -> Pair:
     found = scan(folder, fps=1, **more)
-    assert found.layout == "fisheye" and found.fisheyes is not None
-    return found.fisheyes
+    assert found.format.layout == "fisheye" and found.format.fisheyes is not None
+    return found.format.fisheyes
 
 
 @pytest.mark.parametrize(

@@ -273,10 +273,10 @@ def test_folders_of_every_kind(tmp_path: Path, suffix: str) -> None:
             else:
                 assert cv2.imwrite(str(path), levels.astype(np.uint16) * 257)
     panoramas = scan(tmp_path / "pano", fps=1)
-    assert (panoramas.width, panoramas.height) == (WIDTH, HEIGHT)
+    assert (panoramas.format.width, panoramas.format.height) == (WIDTH, HEIGHT)
     assert np.array_equal(load_erp(panoramas, 1), picture()[::-1, ::-1])
     cube = scan(tmp_path / "cube", fps=1)
-    assert cube.faces == FACES
+    assert cube.format.faces == FACES
     assert np.array_equal(load_faces(cube, 0), [np.repeat(levels[..., None], 3, axis=2)] * 6)
 
 

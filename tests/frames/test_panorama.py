@@ -9,7 +9,7 @@ import pytest
 from gsba.camera.rig import CubeRig
 from gsba.camera.sphere import bearings_from_erp
 from gsba.frames.panorama import load_grey, width_for
-from gsba.types import FACES, FrameSet
+from gsba.types import FACES, FrameSet, PictureFormat
 
 SIZE = 64
 
@@ -26,7 +26,7 @@ def _erp_bearings(width: int) -> np.ndarray:
 
 def _frames(paths: tuple[Path, ...], layout: str, faces: tuple[str, ...], size: tuple[int, int],
             mask: Path | None = None) -> FrameSet:  # fmt: skip
-    return FrameSet(("a",), (paths,), np.zeros(1), layout, faces, *size, (mask,))
+    return FrameSet(("a",), (paths,), np.zeros(1), (mask,), (PictureFormat(layout, *size, faces),))
 
 
 def _cube(folder: Path, faces: tuple[str, ...], mask: Path | None = None) -> FrameSet:
@@ -42,7 +42,7 @@ def _cube(folder: Path, faces: tuple[str, ...], mask: Path | None = None) -> Fra
 
 def test_cube_faces_join_without_a_seam(tmp_path: Path) -> None:
     frames = _cube(tmp_path, FACES)
-    width = width_for(frames, 4096)
+    width = width_for(frames.format, 4096)
     grey, mask = load_grey(frames, 0, width)
     assert grey.shape == (2 * SIZE, 4 * SIZE) and mask is None
     # Rounded twice, once in the faces and once here; cubic between pixels.
@@ -51,7 +51,7 @@ def test_cube_faces_join_without_a_seam(tmp_path: Path) -> None:
 
 def test_missing_faces_are_masked(tmp_path: Path) -> None:
     frames = _cube(tmp_path, FACES[:4])
-    _, mask = load_grey(frames, 0, width_for(frames, 4096))
+    _, mask = load_grey(frames, 0, width_for(frames.format, 4096))
     around = np.linspace(-np.pi / 4, np.pi / 4, 1001)  # of a face, whose edge is at atan(cos)
     expected = np.mean(np.arctan(np.cos(around))) / (np.pi / 2)
     assert mask is not None and mask.mean() == pytest.approx(expected, abs=0.01)
@@ -67,7 +67,7 @@ def test_wide_panoramas_are_averaged_down(tmp_path: Path) -> None:
     allowed[10, 20] = 0
     cv2.imwrite(str(mask_path), allowed)
     frames = _frames((path,), "erp", (), (128, 64), mask_path)
-    width = width_for(frames, 100)
+    width = width_for(frames.format, 100)
     assert width == 64
     grey, mask = load_grey(frames, 0, width)
     expected = image.reshape(32, 2, 64, 2).mean(axis=(1, 3))
@@ -78,4 +78,4 @@ def test_wide_panoramas_are_averaged_down(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("width", "limit", "expected"), [(1536, 4096, 1536), (5376, 4096, 2688)])
 def test_width(width: int, limit: int, expected: int) -> None:
     frames = _frames((Path("a"),), "erp", (), (width, width // 2))
-    assert width_for(frames, limit) == expected
+    assert width_for(frames.format, limit) == expected

@@ -72,13 +72,17 @@ def _nominal(side: int = SIDE, turn: int = 0) -> Pair:
 def test_every_layout_is_read(tmp_path: Path, layout: str) -> None:
     root = _write_pairs(tmp_path / "raw", layout)
     frames = scan(root, fps=2, calibration=_calibration(tmp_path / "c.json"))
-    assert (frames.layout, frames.faces, frames.panoramic) == ("fisheye", (), True)
-    assert (frames.width, frames.height) == (416, 208)
+    assert (frames.format.layout, frames.format.faces, frames.format.panoramic) == (
+        "fisheye",
+        (),
+        True,
+    )
+    assert (frames.format.width, frames.format.height) == (416, 208)
     assert len(frames) == 3 and all(name.endswith(f"00{f}") for f, name in enumerate(frames.names))
     named = [tuple(root / name.format(f"{f:03d}") for name in LAYOUTS[layout]) for f in range(3)]
     assert list(frames.paths) == named
-    assert frames.fisheyes is not None
-    for found, expected in zip(frames.fisheyes, PAIR, strict=True):
+    assert frames.format.fisheyes is not None
+    for found, expected in zip(frames.format.fisheyes, PAIR, strict=True):
         np.testing.assert_allclose(rotation_of(found), rotation_of(expected), atol=1e-9)
         assert found.focal == pytest.approx(expected.focal)
         assert found.centre == pytest.approx(expected.centre)
@@ -112,7 +116,7 @@ def test_lenses_of_unknown_make(
     pair = _nominal(turn=turn)
     root = _write_pairs(tmp_path, layout, pair)
     with caplog.at_level(logging.INFO):
-        found = scan(root, fps=1).fisheyes
+        found = scan(root, fps=1).format.fisheyes
     assert found is not None
     for lens, true in zip(found, pair, strict=True):
         np.testing.assert_allclose(lens.principal, true.principal, atol=0.5)
@@ -128,7 +132,7 @@ def test_circles_that_the_frame_cuts_off(tmp_path: Path) -> None:
         Fisheye(SIDE, SIDE, 0.54 * SIDE / HALF_FOV, (121.5, 119.0), (0, 0, 0, 0), lens.rotation)
         for lens in _nominal()
     )
-    found = scan(_write_pairs(tmp_path, "front", pair), fps=1).fisheyes  # type: ignore[arg-type]
+    found = scan(_write_pairs(tmp_path, "front", pair), fps=1).format.fisheyes  # type: ignore[arg-type]
     assert found is not None
     for lens, true in zip(found, pair, strict=True):
         np.testing.assert_allclose(lens.principal, true.principal, atol=0.5)
@@ -157,7 +161,9 @@ def test_what_does_not_tell_a_turn_is_refused(tmp_path: Path, seen) -> None:
         GsbaError, match=r"does not determine how one is turned .* --calibration FILE"
     ):
         scan(root, fps=1)
-    assert scan(root, fps=1, calibration=_calibration(tmp_path / "c.json")).fisheyes is not None
+    assert (
+        scan(root, fps=1, calibration=_calibration(tmp_path / "c.json")).format.fisheyes is not None
+    )
 
 
 def test_a_fusion_folder_is_said_to_be_one(
@@ -192,8 +198,8 @@ def test_squeezed_pairs_are_read_unsqueezed(
         frames = scan(tmp_path / "squeezed", fps=1)
     assert "they are ellipses: 480x270 is read as 480x240" in caplog.text
     assert "Samsung Gear 360" in caplog.text
-    assert frames.fisheyes is not None and frames.lenses_nominal
-    for lens, true in zip(frames.fisheyes, pair, strict=True):
+    assert frames.format.fisheyes is not None and frames.format.lenses_nominal
+    for lens, true in zip(frames.format.fisheyes, pair, strict=True):
         assert (lens.width, lens.height) == (SIDE, SIDE)
         np.testing.assert_allclose(lens.principal, true.principal, atol=1)
         assert lens.focal == pytest.approx(true.focal, rel=0.01)
@@ -204,12 +210,12 @@ def test_circles_that_are_given(tmp_path: Path) -> None:
     pair = _nominal()
     root = _write_pairs(tmp_path, "front", pair)
     circles = [ImageCircle(*lens.principal, lens.focal * HALF_FOV) for lens in pair]
-    found = scan(root, fps=1, circles=circles).fisheyes
+    found = scan(root, fps=1, circles=circles).format.fisheyes
     assert found is not None
     for lens, true in zip(found, pair, strict=True):
         assert lens.principal == true.principal
         assert lens.focal == pytest.approx(true.focal, rel=0.005)
-    both = scan(root, fps=1, circles=circles[:1]).fisheyes
+    both = scan(root, fps=1, circles=circles[:1]).format.fisheyes
     assert both is not None and both[0].principal == both[1].principal
     for wrong in (ImageCircle(-5, 100, 90), ImageCircle(100, 300, 90), ImageCircle(100, 100, 400)):
         with pytest.raises(GsbaError, match=r"--circle .*: lies outside of the pictures.* 240x240"):
@@ -234,7 +240,7 @@ def test_the_seam_tells_how_wide_circles_are(tmp_path: Path, degrees: float) -> 
     for frame in range(3):
         for lens, name in zip(pair, ("front", "back"), strict=True):
             write(tmp_path / name / f"{frame}.png", picture(lens, _fine(frame), half_fov))
-    found = scan(tmp_path, fps=1).fisheyes
+    found = scan(tmp_path, fps=1).format.fisheyes
     assert found is not None
     assert found[0].focal == pytest.approx(pair[0].focal, rel=0.01)
 
@@ -247,9 +253,9 @@ def test_a_calibration_that_the_seam_contradicts(
     root = _write_pairs(tmp_path / "raw", "front", pair, seen=_fine)
     given = tuple(replace(lens, focal=off * lens.focal) for lens in pair)
     frames = scan(root, fps=1, calibration=_calibration(tmp_path / "c.json", given))  # type: ignore
-    assert frames.fisheyes is not None
-    assert frames.lenses_nominal == (off != 1)
-    assert frames.fisheyes[0].focal == pytest.approx(pair[0].focal, rel=0.01)
+    assert frames.format.fisheyes is not None
+    assert frames.format.lenses_nominal == (off != 1)
+    assert frames.format.fisheyes[0].focal == pytest.approx(pair[0].focal, rel=0.01)
     assert ("c.json does not fit these pictures" in caplog.text) == (off != 1)
 
 
@@ -328,7 +334,7 @@ def test_other_folders_do_not_hide_the_lenses(tmp_path: Path) -> None:
     root = _write_pairs(tmp_path / "raw", "front")
     write(root / "masks" / "000.png", np.zeros((20, 40, 3), np.uint8))
     frames = scan(root, fps=1, calibration=_calibration(tmp_path / "c.json"))
-    assert frames.layout == "fisheye"
+    assert frames.format.layout == "fisheye"
 
 
 def test_panoramas_and_cubes_named_by_the_clock_stay_such(tmp_path: Path) -> None:
@@ -340,9 +346,9 @@ def test_panoramas_and_cubes_named_by_the_clock_stay_such(tmp_path: Path) -> Non
                 name = f"walk_{minute}_{second}_{face}.jpg"
                 write(tmp_path / "cube" / name, grey[:, :32])
     frames = scan(tmp_path / "erp", order_suffices=True)
-    assert (frames.layout, len(frames)) == ("erp", 6)
+    assert (frames.format.layout, len(frames)) == ("erp", 6)
     frames = scan(tmp_path / "cube", order_suffices=True)
-    assert (frames.layout, len(frames)) == ("cube", 6)
+    assert (frames.format.layout, len(frames)) == ("cube", 6)
 
 
 def test_side_by_side_is_told_from_panoramas(
@@ -353,11 +359,11 @@ def test_side_by_side_is_told_from_panoramas(
         write(raw / f"{dark:03d}.png", np.zeros((SIDE, 2 * SIDE, 3), np.uint8))
     with caplog.at_level(logging.INFO):
         frames = scan(raw, fps=1)
-    assert frames.layout == "fisheye" and all(one == other for one, other in frames.paths)
+    assert frames.format.layout == "fisheye" and all(one == other for one, other in frames.paths)
     assert "two fisheyes side by side, front left and back right" in caplog.text
     lit = np.rint(_moved(0)(np.random.default_rng(0).normal(size=(SIDE, 2 * SIDE, 3)))) / 9
     write(raw / "006.png", np.clip(lit, 60, 250).astype(np.uint8))  # one with lit corners
-    assert scan(raw, fps=1).layout == "erp"
+    assert scan(raw, fps=1).format.layout == "erp"
 
 
 def _panorama(kind: str) -> np.ndarray:
@@ -383,7 +389,7 @@ def test_panoramas_are_no_circles(
     for f in range(3):
         write(tmp_path / f"{f}.png", _panorama(kind))
     with caplog.at_level(logging.INFO):
-        assert scan(tmp_path, fps=1).layout == "erp"
+        assert scan(tmp_path, fps=1).format.layout == "erp"
     black = kind in ("black above and below", "night", "black")
     assert ("around no circles: read as a panorama" in caplog.text) == black
 
@@ -406,7 +412,7 @@ def test_a_damaged_picture_is_refused_when_it_is_used(tmp_path: Path) -> None:
     whole = (raw / "001.png").read_bytes()
     (raw / "001.png").write_bytes(whole[:2000] + bytes(500) + whole[2500:])
     frames = scan(raw, fps=1, calibration=_calibration(tmp_path / "c.json"))
-    assert frames.layout == "fisheye"
+    assert frames.format.layout == "fisheye"
     with pytest.raises(GsbaError, match=r"001\.png: cannot be decoded"):
         load_erp(frames, 1)
 
@@ -415,7 +421,7 @@ def test_a_calibration_settles_that_dark_pictures_are_side_by_side(tmp_path: Pat
     for f in range(3):
         write(tmp_path / "raw" / f"{f}.png", _panorama("night"))
     frames = scan(tmp_path / "raw", fps=1, calibration=_calibration(tmp_path / "c.json"))
-    assert frames.layout == "fisheye"
+    assert frames.format.layout == "fisheye"
 
 
 def test_a_calibration_for_what_is_not_raw(tmp_path: Path) -> None:
@@ -435,7 +441,7 @@ def test_a_calibration_for_what_is_not_raw(tmp_path: Path) -> None:
 def test_a_calibration_of_another_shape_or_size(tmp_path: Path, layout: str) -> None:
     root = _write_pairs(tmp_path / "raw", layout)
     tree = json.loads(_calibration(tmp_path / "c.json", made_pair(480)).read_text())
-    found = scan(root, fps=1, calibration=tmp_path / "c.json").fisheyes
+    found = scan(root, fps=1, calibration=tmp_path / "c.json").format.fisheyes
     assert found is not None and found[0].width == 240
     assert found[0].focal == pytest.approx(PAIR[0].focal)
     for lens in tree["lenses"].values():

@@ -8,7 +8,7 @@ import pytest
 
 from gsba.frames.recordings import combine, own_timestamps
 from gsba.log import GsbaError
-from gsba.types import FrameSet
+from gsba.types import FrameSet, PictureFormat
 
 NUM = 4
 
@@ -20,7 +20,7 @@ def _frames(folder: Path, start: float, interval: float = 0.5) -> FrameSet:
         (folder / f"{name}.jpg").write_text(f"{folder.name} {name}")
     paths = tuple((folder / f"{name}.jpg",) for name in names)
     times = start + interval * np.arange(NUM)
-    return FrameSet(names, paths, times, "erp", (), 512, 256, (None,) * NUM)
+    return FrameSet(names, paths, times, (None,) * NUM, (PictureFormat("erp", 512, 256),))
 
 
 def test_recordings_follow_one_another_whatever_their_clocks(tmp_path: Path) -> None:
@@ -44,10 +44,34 @@ def test_recordings_follow_one_another_whatever_their_clocks(tmp_path: Path) -> 
     np.testing.assert_allclose(own_timestamps(some), own_timestamps(frames)[[1, 5, 6]])
 
 
+def test_recordings_of_one_mode_share_a_camera(tmp_path: Path) -> None:
+    names = "abcd"
+    frames = {name: _frames(tmp_path / name, 0.0) for name in names}
+    frames["b"] = frames["b"].with_formats([PictureFormat("erp", 384, 192)])
+    together = combine(frames)
+    assert together.formats == (PictureFormat("erp", 512, 256), PictureFormat("erp", 384, 192))
+    assert together.cameras.tolist() == [0] * NUM + [1] * NUM + [0] * 2 * NUM
+    assert together.format_of(NUM).width == 384
+    with pytest.raises(ValueError, match="too many values"):
+        _ = together.format
+    one = together.taken(np.arange(NUM, 2 * NUM))  # of one recording: its camera alone
+    assert one.format.width == 384 and one.camera_of_frame == ()
+    some = together.taken(np.array([1, NUM + 1, 3 * NUM]))
+    assert [kind.width for kind in some.formats] == [512, 384]
+    assert some.camera_of_frame == (0, 1, 0)
+
+
+def test_named_models_tell_cameras_of_one_mode_apart(tmp_path: Path) -> None:
+    frames = {name: _frames(tmp_path / name, 0.0) for name in "abc"}
+    together = combine(frames, {"a": "insta360-x3", "b": "insta360-x5"})
+    assert together.cameras.tolist() == [0] * NUM + [1] * NUM + [0] * NUM
+    assert len(set(together.formats)) == 1 and len(together.formats) == 2
+    alike = combine(frames, {"b": "insta360-x5"})  # one name is as good for the others
+    assert len(alike.formats) == 1 and alike.camera_of_frame == ()
+
+
 def test_what_cannot_be_combined_is_refused(tmp_path: Path) -> None:
     first, second = _frames(tmp_path / "a", 0.0), _frames(tmp_path / "b", 0.0)
-    with pytest.raises(GsbaError, match="another layout"):
-        combine({"a": first, "b": replace(second, layout="eac", tracks=(4, 2))})
     with pytest.raises(GsbaError, match="'a' and 'c' are the same"):
         combine({"a": first, "b": second, "c": first})
     with pytest.raises(GsbaError, match="cannot be that of a folder"):

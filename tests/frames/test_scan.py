@@ -68,7 +68,12 @@ def test_erp_folder_in_order_with_other_files_ignored(folder: Path) -> None:
     (folder / "._0000.jpg").write_bytes(b"\0")
     frames = scan(folder, fps=10)
     assert frames.names == ("0000", "0001", "0002", "0003")
-    assert (frames.layout, frames.faces, frames.width, frames.height) == ("erp", (), 64, 32)
+    assert (
+        frames.format.layout,
+        frames.format.faces,
+        frames.format.width,
+        frames.format.height,
+    ) == ("erp", (), 64, 32)
     np.testing.assert_array_equal(frames.timestamps, [0.0, 0.1, 0.2, 0.3])
     assert frames.mask_paths == (None,) * 4
     image = load_erp(frames, 1)
@@ -113,7 +118,12 @@ def test_cube_subfolders(tmp_path: Path, missing: tuple[str, ...]) -> None:
     faces = tuple(face for face in FACES if face not in missing)
     _cube_folders(tmp_path, faces)
     frames = scan(tmp_path, fps=2)
-    assert (frames.layout, frames.faces, frames.width, frames.height) == ("cube", faces, 32, 32)
+    assert (
+        frames.format.layout,
+        frames.format.faces,
+        frames.format.width,
+        frames.format.height,
+    ) == ("cube", faces, 32, 32)
     assert frames.names == ("000", "001", "002")
     images = load_faces(frames, 2)
     assert images.shape == (len(faces), 32, 32, 3)
@@ -125,7 +135,7 @@ def test_cube_files_with_suffixes(tmp_path: Path) -> None:
         for face in FACES[:5]:
             write_image(tmp_path / f"n_{i}_{face}.jpg", 32, 32)
     frames = scan(tmp_path, fps=2)
-    assert frames.names == ("n_0", "n_1", "n_2") and frames.faces == FACES[:5]
+    assert frames.names == ("n_0", "n_1", "n_2") and frames.format.faces == FACES[:5]
     assert [path.name for path in frames.paths[1]] == [f"n_1_{f}.jpg" for f in FACES[:5]]
 
 

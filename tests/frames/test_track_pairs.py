@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from two_fisheyes import colours, write
 
 from factors.sphere_field import num_harmonics
+from gsba.camera.cameras import Cameras
 from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.camera.one_centre import Stitcher
 from gsba.camera.rig import CubeRig
@@ -54,9 +55,11 @@ def test_folders_are_found(tmp_path: Path, second: str) -> None:
     (tmp_path / "STITCHED").mkdir()
     (tmp_path / "LICENSE").write_text("free")
     found = scan(_fill(tmp_path, names), order_suffices=True)
-    assert (found.layout, found.tracks) == ("eac", (3 * SIZE + 2 * OVERLAP, SIZE))
-    assert (found.width, found.height) == (4 * SIZE, 2 * SIZE)
-    assert found.names == ("0", "1", "2") and found.panoramic and found.lens_axes_known
+    assert (found.format.layout, found.format.tracks) == ("eac", (3 * SIZE + 2 * OVERLAP, SIZE))
+    assert (found.format.width, found.format.height) == (4 * SIZE, 2 * SIZE)
+    assert (
+        found.names == ("0", "1", "2") and found.format.panoramic and found.format.lens_axes_known
+    )
     assert [path.parent.name for path in found.paths[1]] == list(names)
 
 
@@ -107,7 +110,10 @@ def test_exports_write_panoramas_and_faces(tmp_path: Path, frames: FrameSet) -> 
     whole = Files(tmp_path, ("",), "erp/{name}{suffix}", "")
     faces = Files(tmp_path, FACES, "cube/{view}/{name}{suffix}", "")
     views = cube_views(FACES, 64)
-    writers = [panorama_writer(whole, frames), view_writer(faces, frames, views, ONE_CENTRE)]
+    writers = [
+        panorama_writer(whole, frames, Cameras()),
+        view_writer([faces], frames, [views], Cameras()),
+    ]
     write_pictures(frames, writers)
     cut, _ = cubemap.load(frames, 2, CubeRig(64, np.pi / 2))
     for path, expected in [
@@ -122,7 +128,8 @@ def test_exports_write_panoramas_and_faces(tmp_path: Path, frames: FrameSet) -> 
 def test_corrections_are_applied_in_the_same_step(frames: FrameSet) -> None:
     """Cut with a field, faces show what a corrected panorama shows, but sharper."""
     rng = np.random.default_rng(3)
-    bent = replace(frames, correction=tuple(0.02 * rng.normal(size=num_harmonics(2))))
+    correction = tuple(0.02 * rng.normal(size=num_harmonics(2)))
+    bent = frames.with_formats([replace(frames.format, correction=correction)])
     rig = CubeRig(96, np.pi / 2)
     twice = cubemap.cut(load_erp(bent, 0), rig)
     once, _ = cubemap.load(bent, 0, rig)
@@ -174,7 +181,7 @@ def test_frames_without_contrast_are_taken(tmp_path: Path) -> None:
     for track in ("track0", "track5"):
         for n in range(3):
             write(tmp_path / track / f"{n}.png", np.full((SIZE, 3 * SIZE + 8, 3), 20, np.uint8))
-    assert scan(tmp_path, order_suffices=True).layout == "eac"
+    assert scan(tmp_path, order_suffices=True).format.layout == "eac"
 
 
 @needs_real

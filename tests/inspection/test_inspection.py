@@ -59,7 +59,7 @@ def test_raw_pairs_and_their_lenses(tmp_path: Path) -> None:
     facts = _facts(inspect(tmp_path))
     assert facts["layout"] == "raw, two fisheyes a frame, files of 240x240"
     assert facts["frames"] == "3, in the order of their names: they have no times"
-    lenses = scan(tmp_path, order_suffices=True).fisheyes
+    lenses = scan(tmp_path, order_suffices=True).format.fisheyes
     assert lenses is not None
     for name, lens in zip(("front lens", "back lens"), lenses, strict=True):
         assert facts[name].startswith(f"focal length {lens.focal:.1f} px")

@@ -110,9 +110,11 @@ def test_a_run_masks_people_in_a_second_pass(case: Case, tmp_path: Path) -> None
 
     result = run()
     seen = erp_from_bearings(
-        result.reconstruction.observation_bearings, frames.width, frames.height
+        result.reconstruction.observation_bearings, frames.format.width, frames.format.height
     )
-    columns, rows = np.minimum(seen.astype(int), [frames.width - 1, frames.height - 1]).T
+    columns, rows = np.minimum(
+        seen.astype(int), [frames.format.width - 1, frames.format.height - 1]
+    ).T
     kept = [load_mask(result.frames, f) for f in range(len(frames))]
     used = np.stack([mask for mask in kept if mask is not None])
     assert used[result.reconstruction.observation_frames, rows, columns].mean() > 0.999
@@ -142,7 +144,7 @@ def test_masks_are_chosen_by_name(tmp_path: Path) -> None:
 def test_weights_are_written_as_grey_levels(tmp_path: Path, case: Case) -> None:
     """Grey above 127 weighs, the rest is masked; the two ways of reading agree."""
     frames = case.result.frames
-    weights = np.linspace(0, 1, frames.width)[None] * np.ones((frames.height, 1))
+    weights = np.linspace(0, 1, frames.format.width)[None] * np.ones((frames.format.height, 1))
     write_image(tmp_path / "grey.png", levels_of(weights))
     masked = dataclasses.replace(frames, mask_paths=(tmp_path / "grey.png",) * len(frames))
     mask, found = load_mask(masked, 0), load_weights(masked, 0)

@@ -21,7 +21,16 @@ from gsba.geometry import inverse, pose
 from gsba.photometric import alignment, frame_jobs
 from gsba.photometric.alignment import Observations
 from gsba.store.shards import Threads
-from gsba.types import Counts, FrameSet, Keypoints, Landmarks, Sighted, Solution, Tracks
+from gsba.types import (
+    Counts,
+    FrameSet,
+    Keypoints,
+    Landmarks,
+    PictureFormat,
+    Sighted,
+    Solution,
+    Tracks,
+)
 
 NUM, WIDTH = 6, 512
 RIG = CubeRig(128, np.pi / 2)
@@ -69,7 +78,9 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> tuple[FrameSet, np.ndarray
         cv2.imwrite(str(paths[-1][0]), np.clip(image * (1 + 0.05 * f) - 5 * f, 0, 255))
     names = tuple(str(f) for f in range(NUM))
     times = np.arange(NUM, dtype=float)
-    frames = FrameSet(names, tuple(paths), times, "erp", (), WIDTH, WIDTH // 2, (None,) * NUM)
+    frames = FrameSet(
+        names, tuple(paths), times, (None,) * NUM, (PictureFormat("erp", WIDTH, WIDTH // 2),)
+    )
     return frames, world_T_rigs
 
 
@@ -306,7 +317,7 @@ def test_cube_faces_are_aligned_like_panoramas(walk, tmp_path: Path) -> None:
             image = _grey(_hit(world_T_rigs[f, :3, 3], rays))
             cv2.imwrite(str(group[-1]), np.clip(image, 0, 255))
         paths.append(tuple(group))
-    cube = replace(frames, paths=tuple(paths), layout="cube", faces=FACES, width=size, height=size)
+    cube = replace(frames, paths=tuple(paths), formats=(PictureFormat("cube", size, size, FACES),))
     sighted = _run((cube, world_T_rigs))
     errors = _errors_px(sighted, world_T_rigs)
     rows = sighted.keypoints.rows(sighted.tracks)
@@ -335,7 +346,9 @@ def test_patches_come_to_lie_on_their_surfaces(tmp_path: Path) -> None:
         paths.append((tmp_path / f"{f}.png",))
         cv2.imwrite(str(paths[-1][0]), np.clip(image, 0, 255))
     names, times = tuple(map(str, range(NUM))), np.arange(NUM, dtype=float)
-    frames = FrameSet(names, tuple(paths), times, "erp", (), WIDTH, WIDTH // 2, (None,) * NUM)
+    frames = FrameSet(
+        names, tuple(paths), times, (None,) * NUM, (PictureFormat("erp", WIDTH, WIDTH // 2),)
+    )
     landmarks, keypoints = _start(world_T_rigs, num=800)
     outwards = landmarks.points_world * np.array([0.4, 1, 1])  # towards the walls beside the walk
     points, true = _walls(np.zeros(3), outwards / np.linalg.norm(outwards, axis=1, keepdims=True))

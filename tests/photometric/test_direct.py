@@ -149,7 +149,7 @@ def _start(case: Case, settings: RefineSettings):
     solved = load_stage(case.out, "refined1", Solution)
     keypoints = load_stage(case.out, "keypoints", Keypoints)
     priors = TrajectoryPrior(case.result.coarse.world_T_rigs, settings.priors)
-    return frames, keypoints, solved, priors, cubemap.rig_for(frames, settings.cubemap)
+    return frames, keypoints, solved, priors, cubemap.rig_for(frames.format, settings.cubemap)
 
 
 def test_nothing_to_see_changes_nothing(case: Case) -> None:
@@ -172,8 +172,8 @@ def test_observations_weigh_what_both_masks_say(case: Case, tmp_path: Path) -> N
         update={"photometric": PhotometricSettings(depth_levels=0, spacing_deg=10)}
     )
     frames, _, solved, *_ = _start(case, settings)
-    half = np.ones((frames.height, frames.width))
-    half[:, : frames.width // 2] = 0.5
+    half = np.ones((frames.format.height, frames.format.width))
+    half[:, : frames.format.width // 2] = 0.5
     write_image(tmp_path / "half.png", levels_of(half))
     masked = replace(frames, mask_paths=(tmp_path / "half.png",) * len(frames))
     plain, ones, _ = direct._patches(frames, solved, 0, settings, 1, Lenses())
@@ -222,7 +222,8 @@ def test_other_frames_are_refused_before_any_work(case: Case, change: dict, mess
     frames, *_ = _start(case, JOINT)
     direct.check(frames, JOINT)
     with pytest.raises(GsbaError, match=message):
-        Run.begin(None, replace(frames, **change), None, JOINT)  # type: ignore[arg-type]
+        other = frames.with_formats([replace(frames.format, **change)])
+        Run.begin(None, other, None, JOINT)  # type: ignore[arg-type]
 
 
 def test_a_small_panorama_has_fewer_levels(case: Case) -> None:

@@ -13,7 +13,7 @@ from gsba.pipeline.acceptance import (
     require_motion,
     step_sigmas,
 )
-from gsba.types import FrameSet, JointErrors, Reconstruction
+from gsba.types import FrameSet, JointErrors, PictureFormat, Reconstruction
 
 NUM, SIGMA = 8, 0.02
 
@@ -49,11 +49,8 @@ def _frames(folder: Path, masked_rows: int) -> FrameSet:
         tuple(f"{n}" for n in range(NUM)),
         ((folder / "0.jpg",),) * NUM,
         np.arange(NUM, dtype=np.float64),
-        "erp",
-        (),
-        64,
-        32,
         (folder / "mask.png",) * NUM,
+        (PictureFormat("erp", 64, 32),),
     )
 
 

@@ -26,7 +26,7 @@ from gsba.frames.files import decode
 from gsba.frames.pixels import load_erp
 from gsba.log import GsbaError
 from gsba.pipeline import refine
-from gsba.store.finished import load_lenses, load_run
+from gsba.store.finished import load_cameras, load_run
 from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.types import Fisheye, Trajectory
 
@@ -127,7 +127,7 @@ def _check_panoramas(walk: Path, run: Path) -> None:
     assert result.exit_code == 0, result.output
     _, frames = load_run(run)
     truth, scene = read_trajectory(walk / "truth.tum"), build_gallery()
-    size, off = (frames.width, frames.height), []
+    size, off = (frames.format.width, frames.format.height), []
     for f in (3, 11):
         image = decode(run / f"panoramas/images/{frames.names[f]}.png", size)
         exact = render_erp(scene, truth.world_T_rigs[f], *size)
@@ -161,7 +161,7 @@ def _check_families(walk: Path, run: Path) -> None:
     result = CliRunner().invoke(app, train)
     assert result.exit_code == 0, result.output
     (picture, *_) = sorted((run / "splat/pictures").iterdir())
-    views = lens_views(load_lenses(run, load_run(run)[0]), 32)
+    views = lens_views(load_cameras(run, *load_run(run)).only, 32)
     shown = cv2.imread(str(picture))
     assert shown is not None and shown.shape[1] == sum(view.width for view in views)
     assert shown[:20].mean() > 40  # captured: nothing of the black around the circles

@@ -22,9 +22,9 @@ from gsba.log import GsbaError
 from gsba.pipeline import refine
 from gsba.pipeline.run import Run
 from gsba.placement.placement import place
-from gsba.store.finished import load_lenses, load_run
+from gsba.store.finished import load_cameras, load_run
 from gsba.trajectory.files import read_trajectory
-from gsba.types import FrameSet
+from gsba.types import FrameSet, PictureFormat
 from gsba.view import faces_of, load_scene
 
 pytestmark = pytest.mark.slow
@@ -107,7 +107,7 @@ def test_a_camera_of_two_lenses_is_found_and_gives_the_scale(walk, tmp_path: Pat
 
 def _export_both(run: Path, scale: float) -> None:
     """Six faces of one centre, or those of one lens each where these are asked for."""
-    lenses = load_lenses(run, load_run(run)[0])
+    lenses = load_cameras(run, *load_run(run)).only
     assert 2 * scale * np.linalg.norm(lenses.centre) == pytest.approx(BASELINE, rel=0.02)
     for images, number in (("--images", "lenses"), 10), ((), 6):
         call = ["-q", "export", str(run), "--to", "colmap", "--face-size", "64", *images]
@@ -133,7 +133,7 @@ def _train_and_look(run: Path) -> None:
     for call in (calls[0], [*calls[1], name]):
         result = CliRunner().invoke(app, ["-q", *call, *size])
         assert result.exit_code == 0, result.output
-    views = [view.name for view in lens_views(load_lenses(run, reconstruction), 32)]
+    views = [view.name for view in lens_views(load_cameras(run, reconstruction, frames).only, 32)]
     rendered = {path.name for path in (run / "renderings").iterdir()}
     assert rendered == {f"{name}_{view}.png" for view in [*views, "erp"]} and len(rendered) == 11
     scene = load_scene(run)
@@ -155,7 +155,7 @@ def test_lenses_that_turn_below_a_stabilised_panorama_are_found(tmp_path: Path) 
 def test_cube_faces_cannot_be_of_two_lenses() -> None:
     one = (Path("a.jpg"),) * 6
     names = ("front", "right", "back", "left", "up", "down")
-    frames = FrameSet(("a",), (one,), np.zeros(1), "cube", names, 64, 64, (None,))
+    frames = FrameSet(("a",), (one,), np.zeros(1), (None,), (PictureFormat("cube", 64, 64, names),))
     settings = RefineSettings.model_validate({"camera": {"model": "two_lens"}})
     with pytest.raises(GsbaError, match="two_lens is for panoramas"):
         Run.begin(None, frames, None, settings)  # type: ignore[arg-type]

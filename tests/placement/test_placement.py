@@ -24,7 +24,7 @@ from gsba.placement.gps import local_from_geodetic, read_gps
 from gsba.placement.placement import Placement, place
 from gsba.similarity import Sim3, level_similarity, robust_similarity, similarity
 from gsba.trajectory.files import read_trajectory, write_tum
-from gsba.types import FrameSet, Trajectory
+from gsba.types import FrameSet, PictureFormat, Trajectory
 
 
 def _gps_csv(path: Path, times: Sequence[float] | np.ndarray, fixes: np.ndarray) -> Path:
@@ -304,7 +304,9 @@ def _posts(folder: Path, tilt: np.ndarray, num: int = 6) -> tuple[FrameSet, np.n
         cv2.imwrite(str(paths[-1][0]), cv2.GaussianBlur(image, (0, 0), 1.0))
     names = tuple(str(f) for f in range(num))
     times = np.arange(float(num))
-    frames = FrameSet(names, tuple(paths), times, "erp", (), width, height, (None,) * num)
+    frames = FrameSet(
+        names, tuple(paths), times, (None,) * num, (PictureFormat("erp", width, height),)
+    )
     return frames, np.array(rotations)
 
 

@@ -220,7 +220,7 @@ def test_frames_that_came_as_faces(tmp_path: Path) -> None:
     assert np.abs(colour - scene.COLORS[0]).max() < 40
     assert not image[0].any()  # no face up
     path, _ = _write(tmp_path, frames, result)
-    assert _data(path.read_text(encoding="utf-8"))["erp_width"] == 4 * frames.width
+    assert _data(path.read_text(encoding="utf-8"))["erp_width"] == 4 * frames.format.width
 
 
 def test_a_picture_that_vanished_is_left_out(tmp_path: Path) -> None:

@@ -20,7 +20,15 @@ from gsba.report.report import (
     write_poses,
 )
 from gsba.store.store import StageRecord
-from gsba.types import CoarsePoses, Counts, FrameSet, PoseSource, PoseStatus, Reconstruction
+from gsba.types import (
+    CoarsePoses,
+    Counts,
+    FrameSet,
+    PictureFormat,
+    PoseSource,
+    PoseStatus,
+    Reconstruction,
+)
 
 NUM_FRAMES, NUM_POINTS, ERROR_DEG = 4, 20, 0.25
 
@@ -66,11 +74,8 @@ def _world() -> tuple[FrameSet, CoarsePoses, Reconstruction]:
         names=names,
         paths=tuple((Path(name),) for name in names),
         timestamps=np.arange(NUM_FRAMES) / 3,
-        layout="erp",
-        faces=(),
-        width=64,
-        height=32,
         mask_paths=(None,) * NUM_FRAMES,
+        formats=(PictureFormat("erp", 64, 32),),
     )
     sources = np.array([0, PoseSource.INTERPOLATED, 0, 0], np.uint8)
     return frames, CoarsePoses(world_T_rigs, sources, 0.0), reconstruction

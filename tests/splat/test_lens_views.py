@@ -20,7 +20,7 @@ from gsba.splat.gaussians import concatenate
 from gsba.splat.pictures import render_panorama
 from gsba.splat.scene import load_faces, make_views
 from gsba.splat.scores import mean_score, measure
-from gsba.types import FrameSet
+from gsba.types import FrameSet, PictureFormat
 
 WIDTH, SIZE, NEAR, NUM_FRAMES = 512, 96, 0.01, 2
 BACKEND, SETTINGS = CpuBackend(2), SplatSettings(sh_degree=0)
@@ -69,7 +69,9 @@ def taken(request: pytest.FixtureRequest, room: Gaussians, tmp_path_factory):
         write_image(path, np.where(directions @ axes[:, 2:] > 0, *halves))
     names, files = tuple(path.stem for path in paths), tuple((path,) for path in paths)
     times, size = np.arange(NUM_FRAMES) / 2, (WIDTH, WIDTH // 2)
-    return FrameSet(names, files, times, "erp", (), *size, (None,) * NUM_FRAMES), lenses
+    return FrameSet(
+        names, files, times, (None,) * NUM_FRAMES, (PictureFormat("erp", *size),)
+    ), lenses
 
 
 def test_a_splat_looks_like_faces_of_each_lens(taken, room: Gaussians) -> None:

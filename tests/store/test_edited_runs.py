@@ -53,8 +53,8 @@ def _edit(path: Path, change: Callable[[dict[str, Any]], Any]) -> None:
         lambda tree: tree["value"].update(world_T_rigs=7),
         lambda tree: tree["value"].update(world_T_rigs="nothing.npy"),
         lambda tree: tree["value"].update(world_T_rigs=["point_errors.npy"]),
-        lambda tree: tree["value"].update(correction=7),
-        lambda tree: tree["value"].update(correction=["x"]),
+        lambda tree: tree["value"].update(formats=7),
+        lambda tree: tree["value"].update(formats=["x"]),
         lambda tree: tree["value"].pop("points_world"),
     ],
 )
@@ -129,7 +129,10 @@ def test_paths_that_no_file_can_have_are_refused(run: Path, path: object) -> Non
 
 
 def test_faces_that_are_none_are_refused(run: Path) -> None:
-    _edit(run / "stages/frames.npz", lambda tree: tree["value"].update(faces=["../front"]))
+    _edit(
+        run / "stages/frames.npz",
+        lambda tree: tree["value"]["formats"][0].update(faces=["../front"]),
+    )
     with pytest.raises(GsbaError, match=r"'\.\./front' is no face of a cube"):
         load_run(run)
 

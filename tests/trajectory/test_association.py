@@ -13,7 +13,7 @@ from gsba.log import GsbaError
 from gsba.pipeline.inputs import coarse_poses
 from gsba.trajectory.association import associate
 from gsba.trajectory.files import read_trajectory
-from gsba.types import CoarsePoses, FrameSet, PoseSource, Trajectory
+from gsba.types import CoarsePoses, FrameSet, PictureFormat, PoseSource, Trajectory
 
 SHARED = Path(__file__).parents[3] / "shared" / "data"
 needs_shared = pytest.mark.skipif(not SHARED.is_dir(), reason="no ../shared/data")
@@ -27,11 +27,8 @@ def frames_at(times: np.ndarray) -> FrameSet:
         names=tuple(f"{i:04d}" for i in range(n)),
         paths=((Path("x.jpg"),),) * n,
         timestamps=np.asarray(times, dtype=np.float64),
-        layout="erp",
-        faces=(),
-        width=64,
-        height=32,
         mask_paths=(None,) * n,
+        formats=(PictureFormat("erp", 64, 32),),
     )
 
 
@@ -168,7 +165,7 @@ def test_real_slam_output_with_a_late_start(name: str, unseen: int) -> None:
 def test_real_frames_with_mask() -> None:
     folder = SHARED / "apartment"
     frames = scan(folder / "images", masks=folder / "mask.png")
-    assert (len(frames), frames.width, frames.height) == (11, 5376, 2688)
+    assert (len(frames), frames.format.width, frames.format.height) == (11, 5376, 2688)
     result = associate(frames, read_trajectory(folder / "coarse.tum"), ReadSettings())
     assert (result.sources == SLAM).all()
 

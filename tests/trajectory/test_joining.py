@@ -13,7 +13,7 @@ from gsba.similarity import Sim3
 from gsba.trajectory import joining
 from gsba.trajectory.joining import GUESS
 from gsba.trajectory.restarts import associate_pieces, split_restarts
-from gsba.types import CoarsePoses, FrameSet, PoseSource, Trajectory
+from gsba.types import CoarsePoses, FrameSet, PictureFormat, PoseSource, Trajectory
 
 NUM, BREAK = 40, 17
 TRUTH = loop_walk(NUM)
@@ -25,7 +25,7 @@ MOVE = pose(Rotation.from_rotvec([0.4, -2.0, 0.7]).as_matrix(), np.array([5.0, -
 def _frames(num: int = NUM) -> FrameSet:
     names = tuple(f"{f:03d}" for f in range(num))
     paths = tuple((Path(name),) for name in names)
-    return FrameSet(names, paths, TIMES[:num], "erp", (), 64, 32, (None,) * num)
+    return FrameSet(names, paths, TIMES[:num], (None,) * num, (PictureFormat("erp", 64, 32),))
 
 
 def _begun_anew(scale: float = SCALE) -> np.ndarray:

@@ -93,7 +93,7 @@ def test_tracks_are_extracted_in_lockstep(tmp_path: Path) -> None:
     left = {path.name for path in (tmp_path / "frames").iterdir()}
     assert left == {"track0", "track5", "timestamps.csv", "extract.json"}
     frames = scan(tmp_path / "frames")
-    assert frames.layout == "eac" and frames.tracks == (WIDTH, SIZE)
+    assert frames.format.layout == "eac" and frames.format.tracks == (WIDTH, SIZE)
     np.testing.assert_allclose(frames.timestamps, np.array(kept) / 30, atol=1e-9)
     for paths, i in zip(frames.paths, kept, strict=True):
         for path, true in zip(paths, _tracks(i), strict=True):

@@ -59,7 +59,7 @@ def _name(folder: Path, lens: str) -> Path:
 def _check(video: Path, out: Path, back_first: bool = False) -> None:
     """Frames of a video start from the lenses of its trailer, and it has its gyro."""
     extract(video, out, EVERY)
-    found = scan(out).fisheyes
+    found = scan(out).format.fisheyes
     known = parse_factory_lenses(replace(KNOWN, back_first=back_first))
     assert found == known.pairs((SIDE, SIDE))[0]
     gyro = read_gyro(None, video)
@@ -102,7 +102,7 @@ def test_its_name_says_that_it_is_raw_where_no_circle_shows(
     caplog.set_level(logging.INFO)
     extract(video, tmp_path / "frames", EVERY)
     assert "raw, two fisheyes side by side, by its suffix" in caplog.text
-    assert scan(tmp_path / "frames").layout == "fisheye"
+    assert scan(tmp_path / "frames").format.layout == "fisheye"
     extract(video.rename(tmp_path / "v.mp4"), tmp_path / "panoramas", EVERY)
     assert not (tmp_path / "panoramas/front").exists()
     assert not (tmp_path / "panoramas" / FACTORY_FILE).exists()

@@ -111,7 +111,7 @@ def test_times_are_those_of_presentation(tmp_path: Path, suffix: str, codec: str
     assert _indices(tmp_path / "frames") == list(range(0, 40, 3))
     frames = scan(tmp_path / "frames")
     np.testing.assert_array_equal(frames.timestamps, list(times.values()))
-    assert (frames.width, frames.height) == (WIDTH, HEIGHT)
+    assert (frames.format.width, frames.format.height) == (WIDTH, HEIGHT)
 
 
 def test_one_frame_a_second_and_the_sharpest_of_it(film: Path, tmp_path: Path) -> None:

@@ -141,8 +141,8 @@ def test_placements_survive_their_file(tmp_path: Path) -> None:
 
 def test_pictures_are_tinted_where_masks_are(case: Case, tmp_path: Path) -> None:
     frames = case.result.frames
-    mask = np.full((frames.height, frames.width), 255, np.uint8)
-    mask[5 * frames.height // 8 :] = 0  # 22.5 degrees below the horizon and further down
+    mask = np.full((frames.format.height, frames.format.width), 255, np.uint8)
+    mask[5 * frames.format.height // 8 :] = 0  # 22.5 degrees below the horizon and further down
     cv2.imwrite(str(tmp_path / "mask.png"), mask)
     masked = replace(frames, mask_paths=(tmp_path / "mask.png",) * len(frames))
     plain, tinted = view.faces_of(masked, 0, False), view.faces_of(masked, 0, True)

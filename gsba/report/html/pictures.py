@@ -66,17 +66,18 @@ def _of_rows(reconstruction: Reconstruction, rows: np.ndarray) -> np.ndarray:
 
 def _small_panorama(frames: FrameSet, f: int) -> np.ndarray:
     """Panorama (H, W, 3) uint8 RGB of a frame, assembled from cube faces if it has faces only."""
+    kind = frames.format_of(f)
     import cv2
 
-    if frames.panoramic:
+    if kind.panoramic:
         erp = load_erp(frames, f, width=_WIDTH)
         return cv2.resize(erp, (_WIDTH, _WIDTH // 2), interpolation=cv2.INTER_AREA)
-    faces, rig = load_faces(frames, f), CubeRig(frames.width, np.pi / 2)
+    faces, rig = load_faces(frames, f), CubeRig(kind.width, np.pi / 2)
     centres = np.stack(np.meshgrid(np.arange(_WIDTH), np.arange(_WIDTH // 2)), axis=-1) + 0.5
     bearings = bearings_from_erp(centres, _WIDTH, _WIDTH // 2)
     owners = owner_faces(bearings)
     out = np.zeros((*owners.shape, 3), np.uint8)
-    for image, name in zip(faces, frames.faces, strict=True):
+    for image, name in zip(faces, kind.faces, strict=True):
         own = owners == FACES.index(name)
         pixels = np.floor(rig.project(bearings[own], FACES.index(name)))
         columns, rows = np.clip(pixels, 0, rig.size - 1).astype(int).T

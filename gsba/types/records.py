@@ -1,15 +1,12 @@
 """Records that stages pass to one another: arrays, with one comment per field."""
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
-from pathlib import Path
 
 import numpy as np
 
-FACES = ("front", "right", "back", "left", "up", "down")
-NO_FILE_NAME = re.compile(r"[/\x00-\x1f\x7f-\x9f\ud800-\udfff]|^\.{0,2}$")
+from gsba.types.frame_set import PictureFormat
 
 
 class PoseSource(IntEnum):
@@ -36,120 +33,6 @@ class Counts:
     kept: int  # items that went on
     unit: str  # name of the items: "frames", "matches", ...
     dropped: Mapping[str, int] = field(default_factory=dict)  # reason -> number of items
-
-
-@dataclass(frozen=True, slots=True)
-class Fisheye:
-    """Intrinsics and extrinsics of one fisheye lens (Kannala and Brandt, PAMI 2006).
-
-    A ray at an angle theta from the axis is seen r pixels from `principal`:
-    r = focal (theta + k1 theta^3 + k2 theta^5 + k3 theta^7 + k4 theta^9).
-    """
-
-    width: int  # pixels of its image
-    height: int  # pixels
-    focal: float  # pixels per radian in the middle
-    principal: tuple[float, float]  # pixels, corner origin
-    radial: tuple[float, float, float, float]  # k1 to k4
-    rotation: tuple[float, float, float]  # rotation vector of rig_R_lens, radians
-    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)  # in the rig, metres; all 0 = not known
-
-
-@dataclass(frozen=True, slots=True)
-class FrameSet:
-    """The captured frames on disk, in time order, without pixels.
-
-    Raises:
-        ValueError: a name or a face that cannot be a file name; exported files carry them.
-    """
-
-    names: tuple[str, ...]  # (F,) unique, without folder or extension; RECORDING/NAME if the frames
-    # are of several recordings, whose frames follow one another
-    paths: tuple[tuple[Path, ...], ...]  # (F,)(1) for "erp", (F,)(L) for "fisheye": a picture of
-    # each lens, the front one first, (F,)(2) for "eac": track 0 and the second one,
-    # (F,)(len(faces)) for "cube"
-    timestamps: np.ndarray  # (F,) float64, seconds, strictly increasing
-    layout: str  # "erp" (2:1 equirectangular), "fisheye" (one image per lens, read as a panorama),
-    # "eac" (two tracks of an equi-angular cube map, read as a panorama or as faces) or "cube" (one
-    # 90-degree image per face)
-    faces: tuple[str, ...]  # faces present, in FACES order; () for panoramas
-    width: int  # pixels of one image (panorama or face)
-    height: int  # pixels
-    mask_paths: tuple[Path | None, ...]  # (F,) ERP masks, white = use; None = use all
-    correction: tuple[float, ...] = ()  # stitching field: coefficients of a factors.SphereField,
-    # radians; panoramas and masks are read as corrected by it
-    timed: bool = True  # True = timestamps are times; False = they only give the order
-    fisheyes: tuple[Fisheye, ...] | None = None  # L lenses, the front one first, with which
-    # "fisheye" frames are read as panoramas
-    tracks: tuple[int, int] | None = None  # width and height, pixels, of either image of "eac"
-    # frames; None = of another layout
-    lenses_nominal: bool = False  # True = `fisheyes` are initial values that need self-calibration:
-    # ideal lenses in the image circles, a factory calibration, or one that images contradict
-    fetched: tuple[bool, ...] = ()  # (F,) frames of a video that were added where the map of the
-    # chosen ones was weak: datasets leave them out; () = none
-    clock_shifts: tuple[float, ...] = ()  # (F,) seconds by which a frame's time on the clock of its
-    # recording was shifted, so that recordings follow one another; () = none was
-
-    def __post_init__(self) -> None:
-        for name in self.names:
-            parts = name.split("/") if self.clock_shifts else [name]
-            if len(parts) > 2 or any(map(NO_FILE_NAME.search, parts)):
-                raise ValueError(f"{name!r:.60} cannot be the name of a frame")
-        for face in self.faces:
-            if face not in FACES:
-                raise ValueError(f"{face!r:.60} is no face of a cube")
-
-    def __len__(self) -> int:
-        return len(self.names)
-
-    def chosen(self) -> np.ndarray:
-        """Frames (F',) int64 that datasets hold: all that were not added later (`fetched`)."""
-        return np.flatnonzero(~np.array(self.fetched or (False,) * len(self), bool))
-
-    @property
-    def recordings(self) -> dict[str, np.ndarray]:
-        """Frames (R,) int64 of each recording by its name, in order; {} if there is only one."""
-        owners = np.array([name.rpartition("/")[0] for name in self.names])
-        return {
-            name: np.flatnonzero(owners == name) for name in dict.fromkeys(owners.tolist()) if name
-        }
-
-    @property
-    def panoramic(self) -> bool:
-        """True if a frame is read as one equirectangular image, not as several faces."""
-        return self.layout != "cube"
-
-    @property
-    def lens_axes_known(self) -> bool:
-        """True if the lenses' axes are along the rig's z: no stabiliser has rotated the images."""
-        return self.layout in ("fisheye", "eac")
-
-    @property
-    def panorama_width(self) -> int:
-        """Width in pixels of a panorama with the frames' angular resolution."""
-        return self.width if self.panoramic else 4 * self.width
-
-    @property
-    def native_face_size(self) -> int:
-        """Width in pixels of a 90-degree face with the frames' angular resolution."""
-        return self.width // 4 if self.panoramic else self.width
-
-    def taken(self, rows: np.ndarray, absolute: bool = False) -> "FrameSet":
-        """Frames `rows` (F',), ascending; `absolute` paths serve processes in other folders."""
-        paths = tuple(self.paths[f] for f in rows)
-        mask_paths = tuple(self.mask_paths[f] for f in rows)
-        if absolute:
-            paths = tuple(tuple(path.absolute() for path in group) for group in paths)
-            mask_paths = tuple(path and path.absolute() for path in mask_paths)
-        return replace(
-            self,
-            names=tuple(self.names[f] for f in rows),
-            paths=paths,
-            timestamps=self.timestamps[rows],
-            mask_paths=mask_paths,
-            fetched=tuple(self.fetched[f] for f in rows) if self.fetched else (),
-            clock_shifts=tuple(self.clock_shifts[f] for f in rows) if self.clock_shifts else (),
-        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -521,7 +404,8 @@ class Reconstruction:
     observation_frames: np.ndarray  # (O,) int32
     observation_bearings: np.ndarray  # (O, 3) float64, unit, rig frame
     observation_sigmas: np.ndarray  # (O,) float64, radians
-    correction: tuple[float, ...] = ()  # stitching field applied to these bearings: see FrameSet
+    formats: tuple[PictureFormat, ...] = ()  # (C,) of each camera's pictures, as calibrated by the
+    # map, which these bearings are read by; () = as the frames were scanned
     components: np.ndarray | None = None  # (F,) int32, map of each frame, 0 = the largest; each map
     # has its own world; frames in no map have numbers of their own after those of the maps; None =
     # there is one map
@@ -530,7 +414,6 @@ class Reconstruction:
     # each ray; None = the rig's centre
     lens_baseline: tuple[float, float] | None = None  # distance of the two lenses and its standard
     # deviation, map units; None = one centre
-    fisheyes: tuple[Fisheye, ...] | None = None  # self-calibrated lenses: see FrameSet
     vertical: np.ndarray | None = None  # (3,) float64, unit, up or down by an accelerometer; None =
     # there was none
     map_scales: np.ndarray | None = None  # (C,) float64, units of each component's world per unit

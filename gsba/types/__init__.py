@@ -1,0 +1,59 @@
+"""Records that stages pass to one another: arrays, with one comment per field.
+
+Takes arrays of one stage.
+Gives them to the next one under names, with shapes and units.
+"""
+
+from gsba.types.frame_set import FACES, NO_FILE_NAME, Fisheye, FrameSet, PictureFormat
+from gsba.types.records import (
+    CoarsePoses,
+    Counts,
+    FamilyVariables,
+    Features,
+    GyroConstraints,
+    Iteration,
+    JointErrors,
+    Keypoints,
+    KnownPoints,
+    Landmarks,
+    Matches,
+    PoseSource,
+    PoseStatus,
+    Reconstruction,
+    Round,
+    Sighted,
+    Solution,
+    StepNoise,
+    Tracks,
+    Trajectory,
+    VerifiedPairs,
+)
+
+__all__ = [
+    "FACES",
+    "NO_FILE_NAME",
+    "CoarsePoses",
+    "Counts",
+    "FamilyVariables",
+    "Features",
+    "Fisheye",
+    "FrameSet",
+    "GyroConstraints",
+    "Iteration",
+    "JointErrors",
+    "Keypoints",
+    "KnownPoints",
+    "Landmarks",
+    "Matches",
+    "PictureFormat",
+    "PoseSource",
+    "PoseStatus",
+    "Reconstruction",
+    "Round",
+    "Sighted",
+    "Solution",
+    "StepNoise",
+    "Tracks",
+    "Trajectory",
+    "VerifiedPairs",
+]
