@@ -5,7 +5,8 @@ import os
 import resource
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from pathlib import Path
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # parameters of mallopt(3), from malloc.h
 _DEFAULT_THRESHOLDS = 32 << 20, 64 << 20  # bytes, glibc's own mapping and trimming thresholds
@@ -13,8 +14,29 @@ _MIN_RETURNED_BYTES = 256 << 20  # fetching and clearing so much again takes a t
 
 
 def total_memory_bytes() -> int:
-    """Memory of the machine."""
-    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    """Memory of the machine, or of the container or job that this process is confined to."""
+    machine = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return min([machine, *_limits_of_control_groups()])
+
+
+def _limits_of_control_groups(root: Path = Path("/")) -> list[int]:
+    """Limits, bytes, that Linux's control groups (versions 1 and 2) set to this process."""
+    limits = []
+    with suppress(OSError, ValueError):
+        for line in (root / "proc/self/cgroup").read_text().splitlines():
+            _, controllers, group = line.split(":", 2)
+            folder, name = root / "sys/fs/cgroup", "memory.max"
+            if controllers:
+                folder, name = folder / "memory", "memory.limit_in_bytes"
+            if controllers and "memory" not in controllers.split(","):
+                continue
+            inner = folder / group.lstrip("/")
+            for place in (inner, *inner.parents):
+                if not place.is_relative_to(folder):
+                    break
+                with suppress(OSError, ValueError):  # "max": no limit
+                    limits.append(int((place / name).read_text()))
+    return limits
 
 
 def peak_memory_bytes() -> int:

@@ -65,7 +65,7 @@ def _memory() -> tuple[int, int]:
     fields = dict(line.split(":")[:2] for line in _text(Path("/proc/meminfo")).splitlines())
     free = int(fields.get("MemAvailable", "0 kB").split()[0]) * 1024 or pages
     limit, used = (_text(_CGROUP / name).strip() for name in ("memory.max", "memory.current"))
-    if limit.isdigit() and int(limit) < pages:
+    if limit.isdigit() and int(limit) <= pages:
         return int(limit), min(free, int(limit) - int(used or 0))
     return pages, free
 
