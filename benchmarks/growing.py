@@ -7,9 +7,10 @@ FLAT and AGAIN are two walks through one flat (`images/` and their timestamps.cs
 `groundtruth.tum`, `mask.png`). The first recording is the first two thirds of FLAT, the second one
 the last two thirds of AGAIN; once more, a short second one of 15 frames. Each has a clock, world
 and scale of its own, and a trajectory with drift. The first is refined, then the second one added
-to its run, with and without `--fixed`. Every run is a process of its own; rows are kept in WORK and
-used again while code and input stay the same. The exit code is 1 if the error of a grown run is
-more than 1.3 times that of the joint solution, or poses that are fixed changed.
+to its run, with and without `--fixed`; the long one is also refined alone, its run merged with that
+of the first, and taken out again. Every run is a process of its own; rows are kept in WORK and
+used again while code and input stay the same. The exit code is 1 if the error of a grown or merged
+run is more than 1.3 times that of the joint solution, or poses that are fixed changed.
 """
 
 import argparse
@@ -85,7 +86,8 @@ class Bench(NamedTuple):
         true = []
         for name in frames.names:
             owner, _, own = name.rpartition("/")
-            true.append(truths[owner or self.parts[0].name].world_T_rigs[int(own)])
+            walk = truths.get(owner, truths[self.parts[int("second" in run.parent.name)].name])
+            true.append(walk.world_T_rigs[int(own)])
         times = np.arange(len(true), dtype=np.float64)
         found = pose_errors(
             Trajectory(times, reconstruction.world_T_rigs), Trajectory(times, np.array(true))
@@ -94,8 +96,8 @@ class Bench(NamedTuple):
         return {"frames": len(true), "ate_mm": ate}
 
 
-def rows_of(bench: Bench) -> list[dict]:
-    """Rows of all runs of two recordings."""
+def rows_of(bench: Bench, short: bool) -> list[dict]:
+    """Rows of all runs of two recordings; those of `add` alone if the second one is short."""
     first, second = bench.parts
     mask = ["--masks", str(first.walk / "mask.png")]
     alone = ["refine", str(first.cut.folder), str(first.cut.trajectory), *mask, "--fresh", *_SET]
@@ -105,10 +107,22 @@ def rows_of(bench: Bench) -> list[dict]:
         bench.row("joint", joint, bench.check),
     ]
     grow = ["add", str(bench.run_of("first alone")), *second.option()]
-    return [
-        *rows,
+    rows += [
         bench.row("add", grow, bench.check),
         bench.row("add --fixed", [*grow, "--fixed"], bench.check),
+    ]
+    if short:
+        return rows
+    files = [str(second.cut.folder), str(second.cut.trajectory)]
+    alone = ["refine", *files, "--masks", str(second.walk / "mask.png"), "--fresh", *_SET]
+    both = ["merge", str(bench.run_of("first alone")), str(bench.run_of("second alone"))]
+    away = ["remove", str(bench.run_of("add")), second.name]
+    return [
+        *rows,
+        bench.row("second alone", alone, bench.check),
+        bench.row("merge", both, bench.check),
+        bench.row("merge --rigid", [*both, "--rigid"], bench.check),
+        bench.row("remove the second", away, bench.check),
     ]
 
 
@@ -116,7 +130,7 @@ def verdict(bench: Bench, row: dict, joint: dict) -> str:
     """Verdict on a grown run; "" for others."""
     if not row.get("errors"):
         return f"**refused**: {row.get('reason', 'no map')}"
-    if row["what"] in ("first alone", "joint"):
+    if row["what"] not in ("add", "add --fixed", "merge"):
         return ""
     if row["what"].endswith("--fixed"):
         before = load_run(bench.run_of("first alone"))[0].world_T_rigs
@@ -141,7 +155,7 @@ def table_of(out: Path, code: str, walk: Path, again: Path, short: bool) -> list
         Part(again, cut_rows(again, second, label / "cuts/second", 1), "second"),
     )
     bench = Bench(label, code, parts)
-    rows = rows_of(bench)
+    rows = rows_of(bench, short)
     joint, lines = rows[1], []
     for row in rows:
         found = verdict(bench, row, joint)

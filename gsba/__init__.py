@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from gsba.config_file import load_config
     from gsba.localization.localizer import LocalizedFrame, Localizer
     from gsba.log import GsbaError
-    from gsba.pipeline.growing import add_recordings
+    from gsba.pipeline.growing import add_recordings, merge_runs, remove_recordings
     from gsba.pipeline.outputs import RunResult
     from gsba.pipeline.recording import Recording
     from gsba.pipeline.recordings import refine_recordings
@@ -41,8 +41,10 @@ __all__ = [
     "add_recordings",
     "load_config",
     "load_run",
+    "merge_runs",
     "refine",
     "refine_recordings",
+    "remove_recordings",
 ]
 
 _HOMES = {
@@ -59,8 +61,10 @@ _HOMES = {
     "add_recordings": "gsba.pipeline.growing",
     "load_config": "gsba.config_file",
     "load_run": "gsba.store.finished",
+    "merge_runs": "gsba.pipeline.growing",
     "refine": "gsba.pipeline.refine",
     "refine_recordings": "gsba.pipeline.recordings",
+    "remove_recordings": "gsba.pipeline.growing",
 }
 
 

@@ -1,4 +1,4 @@
-"""Commands on finished runs that grow: `add`."""
+"""Commands on finished runs that grow: `add`, `merge`, `remove`."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -74,3 +74,46 @@ def add(
         given: dict[str, Any] = {"fixed": fixed, "segment": segment, "client": client}
         result = pipeline.add_recordings(run, recordings, out, **given)
     conclude([result], allow_partial)
+
+
+@command
+def merge(
+    runs: Annotated[
+        list[Path], typer.Argument(help="Folders of finished runs of one camera.", metavar="RUN...")
+    ],
+    out: Annotated[Path, typer.Option(help="Folder of the result.", metavar="DIR")],
+    rigid: Annotated[
+        bool,
+        typer.Option(
+            "--rigid",
+            help="Move each map as it is; report the covariance of the similarity between them.",
+        ),
+    ] = False,
+    cluster: Cluster = None,
+    allow_partial: AllowPartial = False,
+) -> None:
+    """Merge finished runs of one place: join their maps where they meet, and solve them together.
+
+    World, scale and settings are those of the first run. The runs are only read.
+    """
+    with loading():
+        from gsba import pipeline
+        from gsba.store.cluster import connected
+    with connected(cluster) as client:
+        result = pipeline.merge_runs(runs, out, rigid=rigid, client=client)
+    conclude([result], allow_partial)
+
+
+@command
+def remove(
+    run: Run,
+    names: Annotated[
+        list[str], typer.Argument(help="Names of recordings to take out.", metavar="NAME...")
+    ],
+    out: Out = None,
+    allow_partial: AllowPartial = False,
+) -> None:
+    """Take recordings out of a finished run, and solve the rest again from where it was."""
+    with loading():
+        from gsba import pipeline
+    conclude([pipeline.remove_recordings(run, names, out)], allow_partial)

@@ -8,10 +8,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsba.geometry import inverse
 from gsba.loop_closure import join_evidence
 from gsba.loop_closure.join_evidence import JoinEvidence, Places, Rates, around
-from gsba.loop_closure.map_similarity import Meeting, Proposal, alike, refined
+from gsba.loop_closure.map_similarity import (
+    Meeting,
+    Proposal,
+    alike,
+    meetings_of,
+    refined,
+)
 from gsba.matching.guided_search import MatchContext
 from gsba.similarity import Sim3
 from gsba.types import Matches
@@ -82,18 +87,7 @@ class JoinTest:
             outside: frames (N,) outside the map.
             f0_T_f1s: (P, 4, 4) relative poses by bearings, their translations of any length.
         """
-        found = []
-        for p, (f0, f1) in enumerate(matches.pairs.tolist()):
-            matched = matches.of(p)
-            (f, g), columns = ((f0, f1), (0, 1)) if f0 in outside else ((f1, f0), (1, 0))
-            own = self.known[f][matched[:, columns[0]]]
-            theirs = self.known[g][matched[:, columns[1]]]
-            both = np.isfinite(own).all(axis=1) & np.isfinite(theirs).all(axis=1)
-            if both.any():
-                step = None if f0_T_f1s is None else f0_T_f1s[p]
-                g_T_f = inverse(step) if step is not None and f == f0 else step
-                found.append(Meeting(f, g, own[both], theirs[both], g_T_f))
-        return found
+        return meetings_of(self.known, matches, outside, f0_T_f1s)
 
     def _judged(
         self, proposal: Proposal, rows: np.ndarray, inside: np.ndarray, reach: int

@@ -1,5 +1,6 @@
 """Similarities of two maps, proposed by matched frames, and their refinement."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -7,6 +8,7 @@ import numpy as np
 from gsba.geometry import inverse, rotation_angle
 from gsba.loop_closure.loops import AGREE, AGREE_DEG
 from gsba.similarity import Sim3, agreeing_points, relative_similarity, similarity_along
+from gsba.types import Matches
 
 _MAX_LOG_SCALE_DIFFERENCE = 0.15  # largest difference of logarithms of scales that agree
 _LOSS_DEG = 0.2  # scale of the robust loss: points of two maps have correlated errors
@@ -24,6 +26,34 @@ class Meeting:
     theirs: np.ndarray  # (m, 3) the matched points in rig g, unit of the map
     g_T_f: np.ndarray | None = None  # (4, 4) relative pose by bearings, its translation of any
     # length; None = not known
+
+
+def meetings_of(
+    known: Sequence[np.ndarray],
+    matches: Matches,
+    outside: np.ndarray,
+    f0_T_f1s: np.ndarray | None = None,
+) -> list[Meeting]:
+    """Matched points that both frames of pairs know, one of them among those outside.
+
+    Args:
+        known: (F) of (K_f, 3): points of keypoints, rig frames; NaN = unknown.
+        matches: matches of P pairs.
+        outside: frames (N,) outside the map.
+        f0_T_f1s: (P, 4, 4) relative poses by bearings, their translations of any length.
+    """
+    found = []
+    for p, (f0, f1) in enumerate(matches.pairs.tolist()):
+        matched = matches.of(p)
+        (f, g), columns = ((f0, f1), (0, 1)) if f0 in outside else ((f1, f0), (1, 0))
+        own = known[f][matched[:, columns[0]]]
+        theirs = known[g][matched[:, columns[1]]]
+        both = np.isfinite(own).all(axis=1) & np.isfinite(theirs).all(axis=1)
+        if both.any():
+            step = None if f0_T_f1s is None else f0_T_f1s[p]
+            g_T_f = inverse(step) if step is not None and f == f0 else step
+            found.append(Meeting(f, g, own[both], theirs[both], g_T_f))
+    return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,29 +152,80 @@ def refined(meetings: list[Meeting], start: Sim3, poses: np.ndarray) -> Sim3:
         poses: (F, 4, 4) each in its own map.
     """
     from scipy.optimize import least_squares
+
+    shared = _SharedPoints.of(_inliers_of(meetings, start, poses), poses)
+    given = {"loss": "soft_l1", "f_scale": np.deg2rad(_LOSS_DEG)}
+    x = least_squares(lambda x: shared.residuals(nudged(start, x)).ravel(), np.zeros(7), **given).x
+    return nudged(start, x)
+
+
+def similarity_covariance(meetings: list[Meeting], move: Sim3, poses: np.ndarray) -> np.ndarray:
+    """Covariance (7, 7) of a similarity that `refined` has found, of the parameters of `nudged`.
+
+    Points of one meeting have common errors: residuals count as correlated within a meeting, and
+    as independent between meetings (Liang and Zeger, Biometrika 73(1), 1986).
+
+    Args:
+        meetings, poses: those that it was found from.
+        move: the similarity.
+    """
+    step, every = 1e-6, _inliers_of(meetings, move, poses)
+    normal, scores = np.zeros((7, 7)), np.zeros((7, 7))
+    for meeting in every:
+        shared = _SharedPoints.of([meeting], poses)
+        found = shared.residuals(move)
+        if not len(found):
+            continue
+        columns = [
+            (shared.residuals(nudged(move, x)) - shared.residuals(nudged(move, -x))) / (2 * step)
+            for x in step * np.eye(7)
+        ]
+        jacobian = np.stack([column.ravel() for column in columns], axis=1)
+        flat = found.ravel()
+        weights = 1 / np.sqrt(1 + (flat / np.deg2rad(_LOSS_DEG)) ** 2)
+        normal += (jacobian * weights[:, None]).T @ jacobian
+        score = (jacobian * weights[:, None]).T @ flat
+        scores += np.outer(score, score)
+    few = len(every) / max(len(every) - 7, 1)  # residuals of few meetings are fitted away
+    inverse_ = np.linalg.pinv(normal)
+    return few * inverse_ @ scores @ inverse_
+
+
+def nudged(move: Sim3, x: np.ndarray) -> Sim3:
+    """A similarity changed by (7,): rotation vector from the left, radians, change of the
+    translation, and of the logarithm of the scale."""
     from scipy.spatial.transform import Rotation
 
-    inside, outside = [], []  # positions in both worlds, and observing frames
-    for m in _inliers_of(meetings, start, poses):
-        for world, seer, seen in ((outside, m.f, m.own), (inside, m.g, m.theirs)):
-            positions = seen @ poses[seer, :3, :3].T + poses[seer, :3, 3]
-            world.append(np.hstack([positions, np.tile(poses[seer, :3, 3], (len(seen), 1))]))
-    own, theirs = np.concatenate(outside), np.concatenate(inside)
+    rotation = Rotation.from_rotvec(x[:3]).as_matrix() @ move.rotation
+    return Sim3(move.scale * float(np.exp(x[6])), rotation, move.translation + x[3:6])
 
-    def directions(points: np.ndarray, seers: np.ndarray) -> np.ndarray:
-        rays = points - seers
-        return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
-    def moved_by(x: np.ndarray) -> Sim3:
-        rotation = Rotation.from_rotvec(x[:3]).as_matrix() @ start.rotation
-        return Sim3(start.scale * float(np.exp(x[6])), rotation, start.translation + x[3:6])
+@dataclass(frozen=True, slots=True)
+class _SharedPoints:
+    """Points that two maps share, and the positions of the frames that know them."""
 
-    def residuals(x: np.ndarray) -> np.ndarray:
-        move = moved_by(x)
-        there, back = move.points(own[:, :3]), move.points_back(theirs[:, :3])
-        seen = directions(there, theirs[:, 3:]) - directions(theirs[:, :3], theirs[:, 3:])
-        sent = directions(back, own[:, 3:]) - directions(own[:, :3], own[:, 3:])
-        return np.concatenate([seen.ravel(), sent.ravel()])
+    own: np.ndarray  # (N, 3) world of the map that moves
+    own_seers: np.ndarray  # (N, 3)
+    theirs: np.ndarray  # (N, 3) world of the other map
+    their_seers: np.ndarray  # (N, 3)
 
-    x = least_squares(residuals, np.zeros(7), loss="soft_l1", f_scale=np.deg2rad(_LOSS_DEG)).x
-    return moved_by(x)
+    @classmethod
+    def of(cls, meetings: list[Meeting], poses: np.ndarray) -> "_SharedPoints":
+        columns: list[list[np.ndarray]] = [[np.zeros((0, 3))] for _ in range(4)]
+        for m in meetings:
+            for n, (seer, seen) in enumerate(((m.f, m.own), (m.g, m.theirs))):
+                columns[2 * n].append(seen @ poses[seer, :3, :3].T + poses[seer, :3, 3])
+                columns[2 * n + 1].append(np.tile(poses[seer, :3, 3], (len(seen), 1)))
+        return cls(*(np.concatenate(column) for column in columns))
+
+    def residuals(self, move: Sim3) -> np.ndarray:
+        """Differences (2 N, 3) of bearings, in both directions."""
+        there, back = move.points(self.own), move.points_back(self.theirs)
+        seen = _bearings(there, self.their_seers) - _bearings(self.theirs, self.their_seers)
+        sent = _bearings(back, self.own_seers) - _bearings(self.own, self.own_seers)
+        return np.concatenate([seen, sent])
+
+
+def _bearings(points: np.ndarray, seers: np.ndarray) -> np.ndarray:
+    rays = points - seers
+    return rays / np.linalg.norm(rays, axis=1, keepdims=True)

@@ -4,7 +4,7 @@ Takes frames, a coarse trajectory, settings and a folder.
 Gives refined poses, a cloud, datasets and a report.
 """
 
-from gsba.pipeline.growing import add_recordings
+from gsba.pipeline.growing import add_recordings, merge_runs, remove_recordings
 from gsba.pipeline.map import Map
 from gsba.pipeline.outputs import RunResult
 from gsba.pipeline.prior import Prior
@@ -23,7 +23,9 @@ __all__ = [
     "RunResult",
     "State",
     "add_recordings",
+    "merge_runs",
     "refine",
     "refine_recordings",
+    "remove_recordings",
     "solve",
 ]

@@ -15,6 +15,7 @@ from gsba.config_file import load_config
 from gsba.frames.recordings import own_timestamps
 from gsba.localization.run_map import require_own_version
 from gsba.log import GsbaError
+from gsba.loop_closure.connectivity import by_size
 from gsba.pipeline.map import Map
 from gsba.pipeline.state import State
 from gsba.similarity import Sim3
@@ -24,6 +25,7 @@ from gsba.store.store import load_stage
 from gsba.types import CoarsePoses, FrameSet, Keypoints, Landmarks, Reconstruction, Solution
 
 _STAGE = "map"
+_MIN_SHARED_POINTS = 12  # least points that two recordings share, to be tied to one another
 _FEATURES = "features_closer", "features"  # stages that hold a frame's features, the last one first
 
 
@@ -119,7 +121,10 @@ class FinishedRun:
         return Sim3(scale, rotation, end[:3, 3] - scale * rotation @ start[:3, 3])
 
     def without(self, names: Sequence[str]) -> "FinishedRun":
-        """The run without some of its recordings: points that others do not see are left out."""
+        """The run without some of its recordings: points that others do not see are left out.
+
+        Recordings of a map that share no points any more are maps of their own then.
+        """
         owners = np.array([name.rpartition("/")[0] for name in self.frames.names])
         rows = np.flatnonzero(~np.isin(owners, list(names)))
         heads = tuple(f"{name}: " for name in names)
@@ -130,17 +135,49 @@ class FinishedRun:
             sources=self.coarse.sources[rows],
             segments=None,
         )
-        components = self.result.components
-        result = replace(
-            self.result.taken(rows),
-            components=None if components is None else components[rows],
-        )
-        given = self.frames.taken(rows), _map_of(self.map, rows), coarse, result
+        frames, map_ = self.frames.taken(rows), _map_of(self.map, rows)
+        result = _result_of(self.result, rows, _tied(map_, frames))
+        given = frames, map_, coarse, result
         files = tuple(self.files[f] for f in rows)
         return replace(self, origin=origin, **dict(zip(_PARTS, given, strict=True)), files=files)
 
 
 _PARTS = "frames", "map", "coarse", "result"  # fields of a run that hold arrays by frame
+
+
+def _tied(map_: Map, frames: FrameSet) -> np.ndarray:
+    """Number (F,) of the group of recordings, tied by points, that each frame is of."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    owners = np.unique([name.rpartition("/")[0] for name in frames.names], return_inverse=True)[1]
+    tracks = map_.solution.landmarks.tracks
+    points_seen = np.unique(np.column_stack([owners[tracks.frames], tracks.points]), axis=0)
+    seen = coo_matrix((np.ones(len(points_seen)), points_seen.T)).tocsr()
+    shared = (seen @ seen.T).toarray() >= _MIN_SHARED_POINTS
+    return connected_components(shared, directed=False)[1][owners]
+
+
+def _result_of(result: Reconstruction, rows: np.ndarray, groups: np.ndarray) -> Reconstruction:
+    """The result of frames `rows` (F',), ascending, of all maps, the largest one first.
+
+    Args:
+        result: of all frames.
+        rows: the frames.
+        groups: (F',) frames of one map that are of different groups are of different maps now.
+    """
+    num, scales = len(result.world_T_rigs), result.map_scales
+    own = (np.zeros(num, np.int32) if result.components is None else result.components)[rows]
+    components = by_size(np.unique(np.column_stack([own, groups]), axis=0, return_inverse=True)[1])
+    first = np.unique(components, return_index=True)[1]
+    ratios = np.ones(len(first)) if scales is None else scales[own[first]] / scales[own[first[0]]]
+    several = len(first) > 1
+    return replace(
+        result.taken(rows),
+        components=components.astype(np.int32) if several else None,
+        map_scales=ratios if several else None,
+        vertical=result.vertical if own[first[0]] == 0 else None,
+    )
 
 
 def _features_file(root: Path, name: str) -> Path:

@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,7 +15,8 @@ from gsba.log import GsbaError
 from gsba.masks.segmentation import Segment
 from gsba.pipeline import backend, camera, finished_run, grown_folder, map_joining, outputs
 from gsba.pipeline.finished_run import FinishedRun
-from gsba.pipeline.joint_map import JointMaps
+from gsba.pipeline.joint_map import JointMaps, check_grows, check_new
+from gsba.pipeline.map_joining import RigidMoves
 from gsba.pipeline.outputs import RunResult
 from gsba.pipeline.prior import Prior
 from gsba.pipeline.recording import Recording, names_of
@@ -70,18 +72,94 @@ def add_recordings(
         given = {
             f"{name}: frames": Path(one.frames) for name, one in zip(names, recordings, strict=True)
         }
-        with place.store(finished.origin | given, client) as work:
+        with place.store(finished.origin | given, client, finished) as work:
             scratch = grown_folder.scratch_of(work.root)
             named = [replace(one, name=name) for one, name in zip(recordings, names, strict=True)]
             settings = _settings_of_new(finished.settings)
-            refine_each(named, scratch, settings, segment=segment, client=client)
+            given = {"segment": segment, "client": client, "refuse": partial(check_new, finished)}
+            refine_each(named, scratch, settings, **given)
             runs = [finished, FinishedRun.load(scratch)]
             state, maps = _joined(work, runs)
             _require_joined(maps, state)
             if fixed:
                 state = map_joining.hold(state, maps.rows(0))
             state = map_joining.tie(state, maps.parts)
-            return place.finish(work, state, maps, maps.rows(0) if fixed else None)
+            return place.finish(work, state, maps, held=maps.rows(0) if fixed else None)
+
+
+@threadpool_limits.wrap(limits=1, user_api="blas")  # sums keep their order
+def merge_runs(
+    runs: Sequence[Path | str],
+    out: Path | str,
+    *,
+    rigid: bool = False,
+    client: "Client | None" = None,
+) -> RunResult:
+    """Merge finished runs into one: their maps are joined where they meet, and solved together.
+
+    The world, the scale and the settings are those of the first run. Runs that meet no other stay
+    maps of their own.
+
+    Args:
+        runs: folders of finished runs of one camera in one mode, at least two; only read.
+        out: folder of the result, new or empty.
+        rigid: move each map as it is, by a similarity whose covariance is reported.
+        client: see `gsba.refine`.
+
+    Raises:
+        GsbaError: an input that cannot be used, or no two runs that meet.
+    """
+    roots = [Path(run) for run in runs]
+    if len(roots) < 2:
+        raise GsbaError("give two finished runs or more to merge")
+    resolved = [root.resolve() for root in roots]
+    for root, path in zip(roots, resolved, strict=True):
+        if resolved.count(path) > 1:
+            raise GsbaError(f"{root} is given twice: give each run once")
+    place = _Place.of(None, out)
+    with grown_folder.held_runs(roots):
+        finished = [FinishedRun.load(root) for root in roots]
+        _refuse_common(finished)
+        origin = {what: path for run in finished for what, path in run.origin.items()}
+        with place.store(origin, client, finished[0]) as work:
+            state, maps = _joined(work, finished)
+            _require_any_joined(maps, state)
+            if not rigid:
+                return place.finish(work, map_joining.tie(state, maps.parts), maps)
+            moves = map_joining.align_rigidly(state, maps.parts)
+            unit = int(maps.main_rows(maps.seen_by)[0])
+            state = map_joining.moved_rigidly(state, maps.parts, moves, unit)
+            return place.finish(work, state, maps, rigid=moves)
+
+
+@threadpool_limits.wrap(limits=1, user_api="blas")  # sums keep their order
+def remove_recordings(
+    run: Path | str, names: Sequence[str], out: Path | str | None = None
+) -> RunResult:
+    """Take recordings out of a finished run: the rest is solved again from where it was.
+
+    Points that only they saw are left out. What no points tie together any more becomes maps of
+    its own.
+
+    Args:
+        run: folder of a finished run of several recordings.
+        names: of recordings.
+        out: folder of the result, new or empty; None = the folder of the run, which is kept as
+            RUN-before beside it.
+
+    Raises:
+        GsbaError: an input that cannot be used; no such recording, or none that would be left.
+    """
+    root = Path(run)
+    with grown_folder.held_runs([root]):
+        finished = FinishedRun.load(root)
+        _refuse_unknown(finished, names)
+        left = finished.without(names)
+        place = _Place.of(root, out)
+        with place.store(left.origin, None, left) as work:
+            maps = JointMaps.of([left])
+            state = map_joining.begin(work, maps, left.settings)
+            return place.finish(work, map_joining.adjust(state), maps)
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,24 +182,46 @@ class _Place:
         grown_folder.refuse_existing(Path(out))
         return cls(Path(out), False)
 
-    def store(self, origin: dict[str, Path], client: "Client | None") -> RunStore:
-        """Store of the run in a folder beside its place, taken up where a call was interrupted."""
+    def store(
+        self, origin: dict[str, Path], client: "Client | None", first: FinishedRun
+    ) -> RunStore:
+        """Store of the run in a folder beside its place, taken up where a call was interrupted.
+
+        Args:
+            origin: inputs of the run.
+            client: see `gsba.refine`.
+            first: run whose settings it has.
+        """
         work = grown_folder.folder_beside(self.out)
-        grown_folder.forget_other_work(work, origin)
-        hired = cluster.hire(client, work, RefineSettings())
+        grown_folder.forget_other_work(work, origin, self.out)
+        hired = cluster.hire(client, first.frames.paths[0][0], first.settings)
         return RunStore(work, origin, hire=hired, title_of=title_of)
 
     def finish(
-        self, store: RunStore, state: State, maps: JointMaps, held: np.ndarray | None
+        self,
+        store: RunStore,
+        state: State,
+        maps: JointMaps,
+        *,
+        held: np.ndarray | None = None,
+        rigid: RigidMoves | None = None,
     ) -> RunResult:
-        """Write the result, and put it in place."""
-        written = _write(state, maps, held)
+        """Write the result, and put it in place.
+
+        Args:
+            store: of the run, in the folder beside its place.
+            state: of the run at its end.
+            maps: that it is made of.
+            held: (H,) frames of the first run whose poses were held; None = all were solved.
+            rigid: similarities that maps were moved by; None = they were solved together.
+        """
+        written = _write(state, maps, held, rigid)
         sources = [*(run.root for run in maps.runs), store.root]
-        grown_folder.complete(store, state.run.frames, sources, self.out)
+        frames = grown_folder.complete(store, state.run.frames, sources, self.out)
         before = grown_folder.put_in_place(store.root, self.out)
         if before is not None:
             logger.info("the run as it was: %s; delete it whenever you like", before)
-        return replace(written, out=self.out)
+        return replace(written, out=self.out, frames=frames)
 
 
 def _joined(store: RunStore, runs: Sequence[FinishedRun]) -> tuple[State, JointMaps]:
@@ -145,6 +245,7 @@ def _settings_of_new(settings: RefineSettings) -> RefineSettings:
 
 def _refuse_known(run: FinishedRun, recordings: Sequence[Recording], names: Sequence[str]) -> None:
     """Refuse recordings that are in a run already, or whose name is taken there."""
+    check_grows(run)
     taken = list(run.frames.recordings)
     known = {path.resolve(): what.rpartition(": ")[0] for what, path in run.origin.items()}
     for one, name in zip(recordings, names, strict=True):
@@ -163,6 +264,48 @@ def _refuse_known(run: FinishedRun, recordings: Sequence[Recording], names: Sequ
             )
 
 
+def _refuse_common(runs: Sequence[FinishedRun]) -> None:
+    """Refuse runs that have a recording in common."""
+    known: dict[Path, FinishedRun] = {}
+    for run in runs:
+        for what, path in run.origin.items():
+            if not what.endswith(": frames"):
+                continue
+            if (other := known.setdefault(path.resolve(), run)) is not run:
+                raise GsbaError(
+                    f"{other.root} and {run.root} both have recording {path}: take it out of one "
+                    "(gsba remove), or merge others"
+                )
+
+
+def _refuse_unknown(run: FinishedRun, names: Sequence[str]) -> None:
+    """Refuse names that a run does not have, or to take out all that it has."""
+    known = list(run.frames.recordings)
+    if not names:
+        raise GsbaError(f"name the recordings to take out; {run.root} has {', '.join(known)}")
+    for name in names:
+        if name not in known:
+            raise GsbaError(f"{run.root} has no recording '{name}': it has {', '.join(known)}")
+    if set(names) == set(known):
+        raise GsbaError(f"{run.root} has no other recording than {', '.join(known)}: one must stay")
+
+
+def _require_any_joined(maps: JointMaps, state: State) -> None:
+    """Refuse runs of which none meets another."""
+    merged = state.prior.merged
+    assert merged is not None
+    owners = np.repeat(np.arange(len(maps.runs)), np.diff(maps.starts))
+    for component in np.unique(merged.components):
+        if len(np.unique(owners[merged.components == component])) > 1:
+            return
+    reasons = [reason for reason in merged.reasons if reason]
+    raise GsbaError(
+        f"the maps of {' and '.join(str(run.root) for run in maps.runs)} meet nowhere"
+        f"{f' ({reasons[0]})' if reasons else ''}: nothing is merged; maps are joined where they "
+        "show the same place, over six frames or more"
+    )
+
+
 def _require_joined(maps: JointMaps, state: State) -> None:
     """Refuse new recordings of which no frame is in the map that is exported."""
     merged = state.prior.merged
@@ -179,16 +322,53 @@ def _require_joined(maps: JointMaps, state: State) -> None:
             )
 
 
-def _write(state: State, maps: JointMaps, held: np.ndarray | None) -> RunResult:
-    """Covariances, and all that a run leaves behind."""
+def _write(
+    state: State, maps: JointMaps, held: np.ndarray | None, rigid: RigidMoves | None
+) -> RunResult:
+    """Covariances, and all that a run leaves behind; arguments as of `_Place.finish`."""
+
+    def amended(result: Reconstruction) -> Reconstruction:
+        if maps.rows(0)[0] in result.largest_map():
+            result = replace(result, vertical=maps.runs[0].result.vertical)
+        if held is not None:
+            result = _with_held(result, maps, held)
+        return result if rigid is None else _with_rigid(result, state, maps, rigid)
+
     state = replace(state, prior=replace(state.prior, of_recordings=_worlds(state, maps)))
-    if held is None:
+    if held is None and rigid is None:
         state = camera.measure_camera(state)
-    result = backend.reconstruct(state, lambda found: _with_known(found, maps, held))
+    result = backend.reconstruct(state, amended)
     lenses = camera.keep_lenses(state, result)
-    state = _told(state, maps, result)
+    state = _told(state, maps, result, rigid)
     finished_run.keep(state)
     return outputs.write(state, result, lenses)
+
+
+def _with_held(result: Reconstruction, maps: JointMaps, held: np.ndarray) -> Reconstruction:
+    """The result with the poses of the first run as they were."""
+    first = maps.runs[0].result
+    poses, covariances = result.world_T_rigs.copy(), result.pose_covariances.copy()
+    poses[held], covariances[held] = first.world_T_rigs, first.pose_covariances
+    return replace(result, world_T_rigs=poses, pose_covariances=covariances, joint_errors=None)
+
+
+def _with_rigid(
+    result: Reconstruction, state: State, maps: JointMaps, rigid: RigidMoves
+) -> Reconstruction:
+    """The result with the covariances that maps have alone, and those of the moves between them."""
+    own, stretches = list[np.ndarray](), np.ones(len(maps.parts))
+    for number, run in enumerate(maps.runs):
+        own.append(run.result.pose_covariances)
+        for part in np.unique(maps.parts[maps.rows(number)]):
+            rows = np.flatnonzero(maps.parts == part)
+            before = run.result.world_T_rigs[rows - maps.starts[number]]
+            stretches[rows] = pose_similarity(before, result.world_T_rigs[rows]).scale
+    covariances = rigid.pose_covariances(
+        np.concatenate(own), state.solution.world_T_rigs, stretches, maps.parts
+    )
+    poses, first = result.world_T_rigs.copy(), maps.main_rows(0)
+    poses[first] = maps.runs[0].result.world_T_rigs[maps.runs[0].result.largest_map()]
+    return replace(result, world_T_rigs=poses, pose_covariances=covariances, joint_errors=None)
 
 
 def _worlds(state: State, maps: JointMaps) -> tuple[Prior, ...]:
@@ -214,19 +394,7 @@ def _worlds(state: State, maps: JointMaps) -> tuple[Prior, ...]:
     return tuple(Prior.of(CoarsePoses(poses[own], sources[own], 0.0)) for own in rows)
 
 
-def _with_known(result: Reconstruction, maps: JointMaps, held: np.ndarray | None) -> Reconstruction:
-    """The result with the vertical of the first run, and its poses where they were held."""
-    first = maps.runs[0].result
-    if maps.rows(0)[0] in result.largest_map():
-        result = replace(result, vertical=first.vertical)
-    if held is None:
-        return result
-    poses, covariances = result.world_T_rigs.copy(), result.pose_covariances.copy()
-    poses[held], covariances[held] = first.world_T_rigs, first.pose_covariances
-    return replace(result, world_T_rigs=poses, pose_covariances=covariances, joint_errors=None)
-
-
-def _told(state: State, maps: JointMaps, result: Reconstruction) -> State:
+def _told(state: State, maps: JointMaps, result: Reconstruction, rigid: RigidMoves | None) -> State:
     """The state as the report tells of it: trajectories before, in the worlds of the result."""
     poses, sources = list[np.ndarray](), list[np.ndarray]()
     joints = list[SegmentAlignment]()
@@ -244,8 +412,9 @@ def _told(state: State, maps: JointMaps, result: Reconstruction) -> State:
         for name in run.frames.recordings:
             there = state.run.frames.recordings[name]
             if number and joined:
-                alignment = move.scale, move.new_T_old
-                joints.append(SegmentAlignment(int(there[0]), int(there[-1]), *alignment, PLACES))
+                covariance = None if rigid is None else rigid.covariances[maps.parts[rows[0]]]
+                alignment = move.scale, move.new_T_old, PLACES, covariance
+                joints.append(SegmentAlignment(int(there[0]), int(there[-1]), *alignment))
     coarse = CoarsePoses(np.concatenate(poses), np.concatenate(sources), 0.0)
     prior = replace(state.prior, coarse=coarse, joints=tuple(joints))
     run = replace(state.run, settings=maps.runs[0].settings)

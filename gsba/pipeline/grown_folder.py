@@ -66,12 +66,14 @@ def refuse_existing(out: Path) -> None:
         raise GsbaError(f"{out.parent} is no folder: make it, or choose another --out")
 
 
-def forget_other_work(work: Path, origin: dict[str, Path]) -> None:
+def forget_other_work(work: Path, origin: dict[str, Path], out: Path) -> None:
     """Delete what a call with other inputs has left half-written.
 
     Args:
         work: the folder that is being written.
         origin: inputs of this call.
+        out: its place in the end. A finished run in `work`, whose renaming was interrupted, is kept
+            beside it.
     """
     if not work.exists():
         return
@@ -80,14 +82,17 @@ def forget_other_work(work: Path, origin: dict[str, Path]) -> None:
         resolved = {name: str(path.resolve()) for name, path in origin.items()}
         if is_run_folder(work) and read_marker(work)["origin"] == resolved:
             return
-        logger.info("%s: left by another call that was interrupted, deleted", work)
         with disk_errors(work):
+            if (work / "report.json").is_file():
+                work.rename(_free_name(out))
+                return
+            logger.info("%s: left by another call that was interrupted, deleted", work)
             shutil.rmtree(work)
     finally:
         os.close(lock)
 
 
-def complete(store: RunStore, frames: FrameSet, sources: Sequence[Path], out: Path) -> None:
+def complete(store: RunStore, frames: FrameSet, sources: Sequence[Path], out: Path) -> FrameSet:
     """Give a run all files that its frames and masks are read from, so that it needs no other run.
 
     Args:
@@ -95,6 +100,9 @@ def complete(store: RunStore, frames: FrameSet, sources: Sequence[Path], out: Pa
         frames: of the run, as they are read so far.
         sources: folders of runs that frames and masks may lie in.
         out: where the run's folder is put in the end.
+
+    Returns:
+        The frames as they are read then.
     """
     roots = [root.resolve() for root in sources]
 
@@ -124,6 +132,7 @@ def complete(store: RunStore, frames: FrameSet, sources: Sequence[Path], out: Pa
         for name in ("name", "resumed", "seconds", "cpu_seconds", "peak_mb", "workers")
     }
     save_record(store.root / STAGES / "frames.npz", moved, info)
+    return moved
 
 
 def put_in_place(work: Path, out: Path) -> Path | None:

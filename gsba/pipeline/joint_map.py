@@ -4,7 +4,7 @@ Every run's map is carried to the world of its result. All are seen by one camer
 which knows most of it; lengths of the others are such that lenses are as far apart.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +17,7 @@ from gsba.log import GsbaError
 from gsba.pipeline.finished_run import FinishedRun
 from gsba.pipeline.map import Map
 from gsba.similarity import Sim3
-from gsba.types import Counts, FrameSet, Keypoints, Landmarks, Solution, Tracks
+from gsba.types import Counts, FrameSet, Keypoints, Landmarks, PictureFormat, Solution, Tracks
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,6 +101,39 @@ def information_roots(keypoints: Keypoints) -> np.ndarray:
     return np.eye(2) / keypoints.sigmas_rad[:, None, None]
 
 
+def check_grows(run: FinishedRun) -> None:
+    """Refuse a run that no other can be joined to.
+
+    Raises:
+        GsbaError: it is of raw fisheyes, or of several cameras.
+    """
+    if len(run.frames.formats) > 1:
+        raise GsbaError(
+            f"{run.root} has recordings of several cameras: refine all recordings together "
+            "(gsba refine A B --out RUN)"
+        )
+    if run.frames.format.fisheyes is not None:
+        raise GsbaError(
+            f"{run.root} is of raw fisheyes, each of whose runs has a calibration of its own: "
+            "refine all recordings together (gsba refine A B --out RUN)"
+        )
+
+
+def check_new(run: FinishedRun, found: Mapping[str, FrameSet]) -> None:
+    """Refuse recordings that a run has already, or that another camera or mode has made.
+
+    Args:
+        run: a finished run.
+        found: frames of the recordings by their names.
+
+    Raises:
+        GsbaError: there is one; the message names it.
+    """
+    combine({**run.recordings(), **found})
+    for name, frames in found.items():
+        _refuse_other_format(f"recording '{name}'", frames.format, run)
+
+
 def _check_settings(runs: Sequence[FinishedRun]) -> None:
     """Refuse runs whose features cannot be compared."""
     first = runs[0].settings
@@ -125,36 +158,35 @@ def _frames_of(runs: Sequence[FinishedRun]) -> FrameSet:
                 )
             recordings[name] = own
     frames = combine(recordings)
-    for run in runs:
-        if len(run.frames.formats) > 1:
-            raise GsbaError(
-                f"{run.root} has recordings of several cameras: it cannot grow or be merged yet; "
-                "refine all recordings in one call"
-            )
-        differing = [what for what, same in _in_common(runs[0], run) if not same]
-        if differing:
-            raise GsbaError(
-                f"{run.root} has frames of another {differing[0]} than {runs[0].root}: runs that "
-                "are joined must be of one camera; refine all recordings in one call"
-            )
+    for run in runs if len(runs) > 1 else ():
+        check_grows(run)
+        _refuse_other_format(str(run.root), run.frames.format, runs[0])
     fetched = [flag for run in runs for flag in run.frames.fetched or (False,) * len(run.frames)]
     return replace(frames, fetched=tuple(fetched) if any(fetched) else ())
 
 
-def _in_common(one: FinishedRun, other: FinishedRun) -> list[tuple[str, bool]]:
-    """What one camera in one mode gives all its frames, and True where two runs have it alike."""
-    first, second = one.frames.format, other.frames.format
-    nominal = first.lenses_nominal or second.lenses_nominal
-    sizes = [(kind.width, kind.height, kind.tracks) for kind in (first, second)]
-    return [
-        (f"layout ({first.layout} and {second.layout})", first.layout == second.layout),
-        (
-            f"size ({first.width}x{first.height} and {second.width}x{second.height})",
-            sizes[0] == sizes[1],
-        ),
-        ("faces", first.faces == second.faces),
-        ("calibration", nominal or first.fisheyes == second.fisheyes),
+def _refuse_other_format(name: str, own: PictureFormat, run: FinishedRun) -> None:
+    """Refuse pictures, named in the message, that the camera of a run does not make."""
+    known = run.frames.format
+    sizes = [(one.width, one.height, one.tracks) for one in (known, own)]
+    differing = [
+        what
+        for what, same in (
+            (f"layout ({known.layout} and {own.layout})", known.layout == own.layout),
+            (
+                f"size ({known.width}x{known.height} and {own.width}x{own.height})",
+                sizes[0] == sizes[1],
+            ),
+            ("faces", known.faces == own.faces),
+            ("calibration", known.fisheyes == own.fisheyes),
+        )
+        if not same
     ]
+    if differing:
+        raise GsbaError(
+            f"{name} has frames of another {differing[0]} than {run.root}: a run grows by its own "
+            "camera in one mode; refine all recordings together (gsba refine A B --out RUN)"
+        )
 
 
 def _best_camera(runs: Sequence[FinishedRun]) -> int:

@@ -8,7 +8,7 @@ either part that they are the same as.
 
 import logging
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,8 +16,15 @@ from gsba.bundle.families import Families
 from gsba.bundle.held_poses import HeldPoses
 from gsba.bundle.lens_centres import baseline_of
 from gsba.config import RefineSettings
+from gsba.geometry import adjoint, inverse
 from gsba.log import GsbaError
 from gsba.loop_closure import connectivity, map_merging
+from gsba.loop_closure.map_similarity import (
+    Meeting,
+    meetings_of,
+    refined,
+    similarity_covariance,
+)
 from gsba.loop_closure.merged_map import Registered
 from gsba.photometric import alignment
 from gsba.photometric.alignment import Observations
@@ -26,6 +33,7 @@ from gsba.pipeline.joint_map import JointMaps, information_roots
 from gsba.pipeline.prior import Prior
 from gsba.pipeline.run import Evidence, Run
 from gsba.pipeline.state import MapMatches, State
+from gsba.similarity import Sim3
 from gsba.store.store import RunStore
 from gsba.trajectory.judgement import StepChecks
 from gsba.types import CoarsePoses, Keypoints, Matches, PoseSource, Sighted, Solution, Tracks
@@ -79,9 +87,105 @@ def register(state: State, maps: JointMaps) -> State:
     points = landmarks.points_world + merged.offsets[landmarks.tracks.hosts()]
     poses = merged.solved.world_T_rigs
     moved = replace(solution, world_T_rigs=poses, landmarks=replace(landmarks, points_world=points))
-    state = _with_unit(state, merged, int(maps.main_rows(maps.seen_by)[0]))
-    state = _tied_within(state.with_solution(moved), maps.parts, merged)
-    return state
+    state = _with_unit(state, merged.scales, int(maps.main_rows(maps.seen_by)[0]))
+    return _tied_within(state.with_solution(moved), maps.parts, merged)
+
+
+@dataclass(frozen=True, slots=True)
+class RigidMoves:
+    """Similarities that move parts of joined maps as they are, and their covariances."""
+
+    scales: np.ndarray  # (P,) float64, by part: it is moved by scale * R @ x + t
+    moves: np.ndarray  # (P, 4, 4) float64, R and t
+    covariances: np.ndarray  # (P, 7, 7) float64, [rotation rad, translation, logarithm of the
+    # scale], see `SegmentAlignment`; 0 = the part stays, NaN = not known
+
+    def pose_covariances(
+        self, own: np.ndarray, world_T_rigs: np.ndarray, stretches: np.ndarray, parts: np.ndarray
+    ) -> np.ndarray:
+        """Covariances (F, 6, 6) of moved poses, in the map that they were moved to.
+
+        Args:
+            own: (F, 6, 6) covariances in their own maps.
+            world_T_rigs: (F, 4, 4) poses after the moves.
+            stretches: (F,) units of the new map per unit of each frame's own one.
+            parts: (F,) part of each frame.
+        """
+        turned = world_T_rigs.copy()
+        turned[:, :3, 3] -= self.moves[parts, :3, 3]  # what turns and grows under the move
+        back = inverse(turned)
+        by_move = np.zeros((len(own), 6, 7))
+        by_move[:, :, :6] = adjoint(back)
+        by_move[:, 3:, 6] = -back[:, :3, 3]
+        moved = by_move @ self.covariances[parts] @ np.swapaxes(by_move, 1, 2)
+        units = np.repeat(np.column_stack([np.ones(len(own)), stretches]), 3, axis=1)
+        return own * units[:, :, None] * units[:, None, :] + moved
+
+
+def align_rigidly(state: State, parts: np.ndarray) -> RigidMoves:
+    """Parts (F,) of joined maps moved by the points that they share, each as it is.
+
+    The first part of every map stays. Each further one is moved to those before it.
+    """
+    run, merged, num = state.run, state.prior.merged, int(parts.max()) + 1
+    assert merged is not None
+    matches = _across(state, parts, merged).matches.across
+    found = _by_features(state)
+
+    def compute() -> RigidMoves:
+        poses = state.solution.world_T_rigs.copy()
+        points = found.points_by_keypoint(state.observed.keypoints)
+        known = [points[f] for f in range(len(poses))]
+        moves, covariances = [Sim3()] * num, np.zeros((num, 7, 7))
+        for component in np.unique(merged.components):
+            inside = np.unique(parts[merged.components == component]).tolist()
+            for part in inside[1:]:
+                done = np.isin(parts, [one for one in inside if one < part])
+                meetings = _meetings(matches, known, parts == part, done)
+                if not meetings:
+                    covariances[part] = np.nan
+                    continue
+                moves[part] = refined(meetings, Sim3(), poses)
+                covariances[part] = similarity_covariance(meetings, moves[part], poses)
+                rows = np.flatnonzero(parts == part)
+                poses[rows] = moves[part].poses(poses[rows])
+                for f in rows:
+                    known[f] = moves[part].scale * known[f]
+        scales = np.array([move.scale for move in moves])
+        return RigidMoves(scales, np.array([move.new_T_old for move in moves]), covariances)
+
+    return run.stage("similarities", run.matching_key(), compute, RigidMoves, noted=False)
+
+
+def moved_rigidly(state: State, parts: np.ndarray, rigid: RigidMoves, unit: int) -> State:
+    """The state with parts (F,) moved by similarities, its camera in the unit of frame `unit`."""
+    solution, scales, moves = state.solution, rigid.scales[parts], rigid.moves[parts]
+    poses = np.empty_like(solution.world_T_rigs)
+    for part in np.unique(parts):
+        rows = parts == part
+        move = Sim3.of(float(rigid.scales[part]), rigid.moves[part])
+        poses[rows] = move.poses(solution.world_T_rigs[rows])
+    landmarks = solution.landmarks.moved(scales, moves)
+    moved = replace(solution, world_T_rigs=poses, landmarks=landmarks)
+    merged = state.prior.merged
+    return _tied_within(_with_unit(state, scales, unit).with_solution(moved), parts, merged)
+
+
+def adjust(state: State) -> State:
+    """The map adjusted with the observations that it has."""
+    solved = _solved(state, _sighted(state), "aligned1")
+    return state if solved is None else solved
+
+
+def _meetings(
+    matches: Matches | None, known: Sequence[np.ndarray], outside: np.ndarray, done: np.ndarray
+) -> list[Meeting]:
+    """Points that frames outside (F,) bool share with frames that are done (F,) bool."""
+    if matches is None:
+        return []
+    first, second = matches.pairs.T
+    chosen = (outside[first] & done[second]) | (outside[second] & done[first])
+    return meetings_of(known, matches.taken(np.flatnonzero(chosen)), np.flatnonzero(outside))
 
 
 def hold(state: State, rows: np.ndarray) -> State:
@@ -205,16 +309,22 @@ def _tied_within(state: State, parts: np.ndarray, merged: Registered | None = No
     return replace(state, prior=Prior(coarse, trust, parts=apart, merged=merged))
 
 
-def _with_unit(state: State, merged: Registered, frame: int) -> State:
-    """The state with its camera in the unit of the maps as they were moved: that of `frame`."""
+def _with_unit(state: State, scales: np.ndarray, frame: int) -> State:
+    """The state with its camera in the unit of maps that are moved.
+
+    Args:
+        state: of the maps.
+        scales: (F,) by which each frame's map is moved.
+        frame: of the map whose camera it is.
+    """
     if state.map.readout is None or not state.map.lenses:
         return state
     found = state.map.camera()
-    scale = float(merged.scales[frame])
+    scale = float(scales[frame])
     motion, own = found.lenses.readout_motion, found.own_sigmas
     lenses = replace(found.lenses, readout_motion=None).scaled(scale)
     if motion is not None:
-        factors = np.repeat(np.column_stack([np.ones(len(motion)), merged.scales]), 3, axis=1)
+        factors = np.repeat(np.column_stack([np.ones(len(motion)), scales]), 3, axis=1)
         lenses = replace(lenses, readout_motion=motion * factors)
     if own is not None:
         own = own * np.repeat([1.0, scale], 3)

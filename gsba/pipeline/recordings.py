@@ -1,6 +1,6 @@
 """A run from several recordings of a place to one world of refined poses."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -71,8 +71,17 @@ def refine_each(
     fresh: bool = False,
     families: Sequence[Family] = (),
     client: "Client | None" = None,
+    refuse: Callable[[Mapping[str, FrameSet]], None] | None = None,
 ) -> RunResult:
-    """Refine recordings in one run as `refine_recordings` does; one is enough."""
+    """Refine recordings in one run as `refine_recordings` does; one is enough.
+
+    Args:
+        recordings, out, settings, segment, fresh, families, client: see `refine_recordings`.
+        refuse: refuses frames by the name of their recording, before anything is computed.
+
+    Raises:
+        GsbaError: as `refine_recordings`, and what `refuse` raises.
+    """
     given = [
         _Given.of(one, name) for one, name in zip(recordings, names_of(recordings), strict=True)
     ]
@@ -84,6 +93,8 @@ def refine_each(
     if any(one.followed for one in given):  # no evidence beside the images that they are made of
         settings = settings.with_faint_priors()
     found = {one.name: one.scanned() for one in given}
+    if refuse is not None:
+        refuse(found)
     cameras = {one.name: one.recording.camera for one in given}
     frames = combine(found, {name: model for name, model in cameras.items() if model})
     evidence = Evidence(

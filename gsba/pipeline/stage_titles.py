@@ -45,6 +45,7 @@ _TITLES = {
     "dense": "adjust with matches of neighbours",
     "registered": "join maps",
     "across": "match frames of joined maps",
+    "similarities": "estimate similarities between maps",
     "across2": "match frames of joined maps, the points that they share known",
     "joined": "adjust joined maps",
     "loops": "match loops",

@@ -103,6 +103,7 @@ def _maps(
             "world_T_own": joint.world_T_own,
             "how": joint.how,
         }
+        | ({} if joint.covariance is None else {"covariance": joint.covariance})
         for joint in joints
     ]
     for joint in joints:
@@ -111,6 +112,8 @@ def _maps(
         if first.rpartition("/")[0] != before.rpartition("/")[0]:
             piece, begin = "recording", f"recording {first.rpartition('/')[0]}"
         alignment = f"joined by {joint.how}, scale {joint.scale:.4g}"
+        if joint.covariance is not None:
+            alignment += f" (sigma {100 * np.sqrt(joint.covariance[6, 6]):.2g} %)"
         if joint.how == GUESS:
             alignment = f"no images show how this {piece} is aligned to the others"
         notes.append(f"{begin}: {alignment}")

@@ -25,6 +25,8 @@ class SegmentAlignment:
     scale: float
     world_T_own: np.ndarray  # (4, 4) float64, R and t
     how: str  # source of the alignment: PLACES or GUESS
+    covariance: np.ndarray | None = None  # (7, 7) of [rotation rad, translation, logarithm of the
+    # scale], each a change from the left in the new world; None = not known
 
 
 def join(coarse: CoarsePoses) -> tuple[CoarsePoses, tuple[SegmentAlignment, ...]]:

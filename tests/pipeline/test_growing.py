@@ -9,17 +9,26 @@ import sys
 import time
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from growing_home import NUM, GrowingHome, make_growing_home, settings
 from typer.testing import CliRunner, Result
 
-from gsba import Recording, add_recordings, load_run, refine_recordings
+from gsba import (
+    Recording,
+    add_recordings,
+    load_run,
+    merge_runs,
+    refine,
+    refine_recordings,
+)
 from gsba.cli import app
 from gsba.disk import hold_folder
 from gsba.export import ExportFormat
 from gsba.localization import Localizer
 from gsba.log import GsbaError
+from gsba.similarity import Sim3
 from gsba.view import load_scene
 
 
@@ -132,8 +141,16 @@ def test_refusals_are_one_line_and_leave_the_run(home: GrowingHome, tmp_path: Pa
     older = Path(shutil.copytree(home.run, tmp_path / "older"))
     marker = json.loads((older / "gsba.json").read_text())
     (older / "gsba.json").write_text(json.dumps(marker | {"gsba": "0.0.1"}))
+    small = Path(shutil.copytree(home.second, tmp_path / "small"))
+    for path in small.glob("*.jpg"):
+        pixels = cv2.imread(str(path))
+        assert pixels is not None
+        cv2.imwrite(str(path), cv2.resize(pixels, (256, 128)))
+    copied = shutil.copytree(home.first, tmp_path / "copied")
     cases = [
         ([home.run], "give the RECORDING to add"),
+        ([home.run, small], "another size (512x256 and 256x128)"),
+        ([home.run, copied], "hold the same pictures"),
         ([home.first, home.second], "is not a gsba run"),
         ([unfinished, home.second], "is not finished"),
         ([older, home.second], "is a run of gsba 0.0.1"),
@@ -176,3 +193,89 @@ def test_a_killed_call_leaves_the_run_and_goes_on(
     assert {path.name for path in tmp_path.iterdir()} == {"run", "run-before"}
     with pytest.raises(GsbaError, match="already, as 'upper'"):
         add_recordings(run, [home.recording()])
+
+
+@pytest.fixture(scope="module")
+def second_run(home: GrowingHome, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run of the second recording alone."""
+    out = tmp_path_factory.mktemp("second") / "run"
+    refine(home.second, home.second_trajectory, out, settings())
+    return out
+
+
+def _invoke(*arguments: object) -> Result:
+    return CliRunner().invoke(app, ["--quiet", *map(str, arguments)])
+
+
+def test_merged_runs_are_as_good_as_a_grown_one(
+    home: GrowingHome, second_run: Path, grown: Path, tmp_path: Path
+) -> None:
+    before, out = _content(home.run) | _content(second_run), tmp_path / "run"
+    result = _invoke("merge", home.run, second_run, "--out", out)
+    assert result.exit_code == 0, result.output
+    assert home.error(out) < 1.1 * home.error(grown)
+    assert _content(home.run) | _content(second_run) == before
+
+
+def test_rigid_merging_keeps_both_maps_and_tells_how_sure_it_is(
+    home: GrowingHome, second_run: Path, tmp_path: Path
+) -> None:
+    result = merge_runs([home.run, second_run], tmp_path / "run", rigid=True)
+    first, second = load_run(home.run)[0], load_run(second_run)[0]
+    merged = load_run(tmp_path / "run")[0]
+    assert merged.world_T_rigs[:NUM].tobytes() == first.world_T_rigs.tobytes()
+    (joint,) = result.report["trajectory"]["joints"]
+    move = Sim3.of(joint["scale"], np.array(joint["world_T_own"]))
+    assert np.allclose(merged.world_T_rigs[NUM:], move.poses(second.world_T_rigs), atol=1e-9)
+    covariance = np.array(joint["covariance"])
+    assert covariance.shape == (7, 7) and (np.linalg.eigvalsh(covariance) > 0).all()
+    assert 1e-6 < np.sqrt(covariance[6, 6]) < 0.01
+    assert any("scale" in note and "(sigma" in note for note in result.report["notes"])
+    own = np.diagonal(second.pose_covariances, axis1=1, axis2=2)[:, :3]
+    moved = np.diagonal(merged.pose_covariances[NUM:], axis1=1, axis2=2)[:, :3]
+    assert (moved > own).all()
+
+
+def test_runs_that_meet_nowhere_are_not_merged(home: GrowingHome, tmp_path: Path) -> None:
+    other = tmp_path / "other"
+    refine(home.elsewhere, home.elsewhere_trajectory, other, settings())
+    before, out = _content(home.run), tmp_path / "run"
+    result = _invoke("merge", home.run, other, "--out", out)
+    assert result.exit_code == 1 and not out.exists()
+    assert "meet nowhere" in result.output
+    assert _content(home.run) == before
+
+
+def test_a_recording_is_taken_out_again(grown: Path, home: GrowingHome, tmp_path: Path) -> None:
+    run = Path(shutil.copytree(grown, tmp_path / "run"))
+    result = _invoke("remove", run, "upper")
+    assert result.exit_code == 0, result.output
+    reconstruction, frames = load_run(run)
+    assert list(frames.recordings) == ["ground"] and len(frames) == NUM
+    assert set(reconstruction.observation_frames.tolist()) <= set(range(NUM))
+    assert home.error(run) < 1.3 * home.error(home.run)
+    assert {path.name for path in (run / "trajectories").iterdir()} == {"ground.tum"}
+    images = {path.parent.name for path in (run / "colmap-flat/images").rglob("*.jpg")}
+    assert images == {"ground"}
+    assert len(load_run(tmp_path / "run-before")[1]) == 2 * NUM
+    assert "upper" not in (run / "gsba.json").read_text()
+
+
+def test_merge_and_remove_refuse_in_one_line(
+    home: GrowingHome, grown: Path, tmp_path: Path
+) -> None:
+    out = ("--out", tmp_path / "out")
+    cases = [
+        (["merge", home.run, *out], "two finished runs or more"),
+        (["merge", home.run, home.run, *out], "is given twice"),
+        (["merge", home.run, grown, *out], "both have recording"),
+        (["merge", home.run, tmp_path, *out], "is not a gsba run"),
+        (["remove", grown, "attic"], "has no recording 'attic': it has ground, upper"),
+        (["remove", grown, "ground", "upper"], "one must stay"),
+        (["remove", home.run, "ground"], "has no other recording"),
+    ]
+    for arguments, told in cases:
+        result = _invoke(*arguments)
+        assert result.exit_code == 1, arguments
+        assert told in result.output and len(result.output.strip().splitlines()) == 1, told
+    assert not (tmp_path / "out").exists()
