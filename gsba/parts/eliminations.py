@@ -5,7 +5,6 @@ both need the same factor. It is kept in between where memory permits, and compu
 does not, or where another worker has eliminated the part. Results are the same.
 """
 
-import os
 import threading
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from factors.part_system import PartElimination, PartEquations
 from gsba.memory import total_memory_bytes
 from gsba.parts.folder import load
 
-_MEMORY_SHARE = 8  # of the machine's memory and of its cores: a process keeps this part at most
+_MEMORY_SHARE = 64  # of the machine's memory: a process keeps factors of this part of it at most
 
 _Key = tuple[str, int, int, float]  # file, its inode, time of writing, damping
 
@@ -53,8 +52,7 @@ def eliminated(file: Path, damping: float) -> PartElimination:
     """Factorize the equations in a file; the factor is kept for `substituting`."""
     factor = PartElimination(load(file, PartEquations), damping)
     if factor.regular:
-        share = _MEMORY_SHARE * max(os.cpu_count() or 1, 1)
-        _kept.put(_key(file, damping), factor, 2 * total_memory_bytes() // share)
+        _kept.put(_key(file, damping), factor, total_memory_bytes() // _MEMORY_SHARE)
     return factor
 
 
