@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from export_scene import panoramas, poses, reconstruction
 
+from gsba.loop_closure.merged_map import Registered
 from gsba.report.findings import of_frames, of_trajectory
 from gsba.trajectory.judgement import StepChecks
-from gsba.types import CoarsePoses, PoseSource
+from gsba.types import CoarsePoses, Counts, PoseSource, Solution
 
 
 @pytest.mark.parametrize(
@@ -59,3 +60,23 @@ def test_long_lists_of_frames_are_counted_in_notes_and_named_in_the_report(tmp_p
         "report.json under frame_lists.interpolated",
         f"pixels fit badly and were weighted down: {frames.names[2]}",
     ]
+
+
+def test_of_many_maps_a_note_describes_a_few(tmp_path: Path) -> None:
+    frames = panoramas(tmp_path, ".png")
+    num, none = len(frames), np.zeros(len(frames), bool)
+    registered = Registered(
+        solved=Solution.without_points(poses()),
+        components=np.arange(num, dtype=np.int32),
+        scales=np.ones(num),
+        moves=np.tile(np.eye(4), (num, 1, 1)),
+        offsets=np.zeros((num, 3)),
+        met=~none,
+        alone=none,
+        lost=none,
+        counts=Counts(num - 1, 0, "parts"),
+    )
+    found, (note,) = of_trajectory(StepChecks.of_all(poses()), None, registered, (), frames)
+    assert len(found["maps"]) == num > 7
+    assert f"images do not connect {num} places" in note and note.count("; map") == 4
+    assert note.endswith(f"; {num - 6} more are listed in report.json under maps")
