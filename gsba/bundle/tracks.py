@@ -24,16 +24,22 @@ def build(matches: Sequence[Matches], num_keypoints: np.ndarray) -> Tracks:
         Tracks of at least two observations.
     """
     first_node = np.concatenate([[0], np.cumsum(num_keypoints)]).astype(np.int64)
-    edges = [np.zeros((0, 2), np.int64)]
+    number = np.int32 if first_node[-1] < np.iinfo(np.int32).max else np.int64
+    first_node = first_node.astype(number)
+    edges = np.empty((sum(len(part.keypoints) for part in matches), 2), number)
+    first = 0
     for part in matches:
-        lengths = np.diff(part.offsets)
-        edges.append(first_node[np.repeat(part.pairs, lengths, axis=0)] + part.keypoints)
+        rows = slice(first, first + len(part.keypoints))
+        pairs = np.repeat(part.pairs, np.diff(part.offsets), axis=0)
+        edges[rows], first = first_node[pairs] + part.keypoints, rows.stop
     frame_of_node = np.repeat(np.arange(len(num_keypoints), dtype=np.int32), num_keypoints)
-    roots = _merge(np.concatenate(edges), frame_of_node)
-    _, labels, sizes = np.unique(roots, return_inverse=True, return_counts=True)
-    nodes = np.flatnonzero(sizes[labels] > 1)
-    _, points = np.unique(labels[nodes], return_inverse=True)
-    order = np.lexsort((nodes, points))
+    roots = np.arange(len(frame_of_node), dtype=number)
+    _merge(edges, frame_of_node, roots)
+    del edges
+    several = np.bincount(roots, minlength=len(roots)) > 1
+    nodes = np.flatnonzero(several[roots])
+    points = (np.cumsum(several, dtype=number) - 1)[roots[nodes]]
+    order = np.argsort(points, kind="stable")
     nodes, points = nodes[order], points[order]
     frames = frame_of_node[nodes]
     return Tracks(
@@ -63,14 +69,14 @@ def runs(tracks: Tracks, most: int) -> Iterator[tuple[slice, slice, Tracks]]:
 
 
 @_kernel
-def _merge(edges, frame_of_node):
-    """Root node of every node after merging edges that keep frames unique in a component.
+def _merge(edges, frame_of_node, roots):
+    """Merge edges that keep frames unique in a component, and set the root node of every node.
+
+    Each node is its own root at first.
 
     Components are circular linked lists, so that joining two of them swaps two links.
     """
-    roots = np.arange(len(frame_of_node))
-    following = np.arange(len(frame_of_node))
-    sizes = np.ones(len(frame_of_node), np.int64)
+    following, sizes = roots.copy(), np.ones_like(roots)
     for e in range(len(edges)):
         big, small = roots[edges[e, 0]], roots[edges[e, 1]]
         if big == small:
@@ -97,4 +103,3 @@ def _merge(edges, frame_of_node):
             node = following[node]
         sizes[big] += sizes[small]
         following[big], following[small] = following[small], following[big]
-    return roots
