@@ -44,8 +44,9 @@ def serve(app: App, port: int, started: Callable[[str], None]) -> None:
         access_log=False,
         timeout_graceful_shutdown=2,
     )
-    started(address)
     try:
+        listener.listen()  # from here on connections wait for the server
+        started(address)
         uvicorn.Server(config).run(sockets=[listener])
     finally:
         listener.close()

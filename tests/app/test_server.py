@@ -1,5 +1,6 @@
 """The page's requests: who gets answers, what may be chosen, and what is run."""
 
+import socket
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,7 +14,7 @@ pytest.importorskip("httpx")
 
 from starlette.testclient import TestClient
 
-from gsba.app import App, Form
+from gsba.app import App, Form, serve
 from gsba.app.routes import application
 from gsba.cli.serving import COMMANDS, check, choices, form_of
 from gsba.log import GsbaError
@@ -56,6 +57,21 @@ def test_without_the_token_nothing_is_answered(app: App, client: TestClient) -> 
     assert client.get("api/jobs").status_code == 200
     assert app.token == App(app.root, app.jobs.root, [], app.choices, check).token
     assert (app.jobs.root / "token").stat().st_mode & 0o077 == 0
+
+
+def test_the_address_can_be_opened_as_soon_as_it_is_printed(app: App) -> None:
+    pytest.importorskip("uvicorn")
+
+    class Reached(Exception):
+        pass
+
+    def started(address: str) -> None:
+        port = int(address.split(":")[2].split("/")[0])
+        socket.create_connection(("127.0.0.1", port), timeout=10).close()
+        raise Reached
+
+    with pytest.raises(Reached):
+        serve(app, 0, started)
 
 
 @pytest.mark.parametrize(
