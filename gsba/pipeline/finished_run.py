@@ -136,13 +136,15 @@ class FinishedRun:
             segments=None,
         )
         frames, map_ = self.frames.taken(rows), _map_of(self.map, rows)
-        result = _result_of(self.result, rows, _tied(map_, frames))
-        given = frames, map_, coarse, result
-        files = tuple(self.files[f] for f in rows)
-        return replace(self, origin=origin, **dict(zip(_PARTS, given, strict=True)), files=files)
-
-
-_PARTS = "frames", "map", "coarse", "result"  # fields of a run that hold arrays by frame
+        return replace(
+            self,
+            origin=origin,
+            frames=frames,
+            map=map_,
+            coarse=coarse,
+            result=_result_of(self.result, rows, _tied(map_, frames)),
+            files=tuple(self.files[f] for f in rows),
+        )
 
 
 def _tied(map_: Map, frames: FrameSet) -> np.ndarray:

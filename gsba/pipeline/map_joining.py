@@ -47,6 +47,10 @@ _SAME_POINT_PX = 1.5  # pixels of a panorama between observations of one point o
 _MIN_SAME_SHARE = 0.5  # share of a point's observations that are another one's, to be the same
 _MAX_SCALE_SIGMAS = 5.0  # by which two maps' units may contradict the distances of their lenses
 _MAX_SCALE_RATIO = 1.15  # and in any case
+_NOT_TIED = (
+    "the maps meet, but their frames {}: nothing is written; refine all recordings together "
+    "(gsba refine A B --out RUN)"
+)
 
 
 def begin(store: RunStore, maps: JointMaps, settings: RefineSettings) -> State:
@@ -198,13 +202,17 @@ def hold(state: State, rows: np.ndarray) -> State:
 
 
 def tie(state: State, parts: np.ndarray) -> State:
-    """Joined maps tied by the points that frames of different parts (F,) share, and adjusted."""
+    """Joined maps tied by the points that frames of different parts (F,) share, and adjusted.
+
+    Raises:
+        GsbaError: they share no points, or frames lose theirs when maps are adjusted together.
+    """
     merged, run = state.prior.merged, state.run
     assert merged is not None
     state = replace(state, matches=_across(state, parts, merged).matches)
     ties = _crossing(state, parts)
     if not len(ties):
-        return state
+        raise GsbaError(_NOT_TIED.format("share no points there"))
     base = _sighted(state)
     both, order = _interleaved(base.keypoints, state.observed.shown)
     sizes = np.diff(base.keypoints.starts)
@@ -216,17 +224,17 @@ def tie(state: State, parts: np.ndarray) -> State:
     )
     solved = _solved(state, everything, "joined", run.settings.rounds.loops)
     if solved is None:
-        logger.info("points that maps share explain less than the maps alone: left as joined")
-        return state
+        raise GsbaError(_NOT_TIED.format("lose points when they are adjusted together"))
     if not run.settings.patches.rounds:
         return solved
     features = _unravelled(solved.map.observed, order, len(base.aligned), state.observed.shown)
     state = replace(_with_poses_of(state, solved), matches=state.matches)
-    return _aligned(state, base, features, parts)
+    return _aligned(state, base, features, parts) or solved
 
 
-def _aligned(state: State, base: Sighted, features: Keypoints, parts: np.ndarray) -> State:
-    """Shared points aligned to patches below a pixel, and all solved with them, in rounds.
+def _aligned(state: State, base: Sighted, features: Keypoints, parts: np.ndarray) -> State | None:
+    """Shared points aligned to patches below a pixel, and all solved with them, in rounds; None
+    where that explains less.
 
     Args:
         state: poses and camera, and matches of features.
@@ -242,7 +250,7 @@ def _aligned(state: State, base: Sighted, features: Keypoints, parts: np.ndarray
     found = frontend.match_known_points_across(state.with_solution(known), parts, "across2")
     state = replace(state, matches=found.matches)
     landmarks = state.triangulated(_crossing(state, parts), rays, gate)
-    observed = Observations(features, field=state.map.field)
+    observed, better = Observations(features, field=state.map.field), None
     for n in range(1, rounds + 1):
         start = replace(state.solution, landmarks=landmarks, noise=1.0)
         shared = _align(state, start, observed, f"align{n}")
@@ -250,8 +258,8 @@ def _aligned(state: State, base: Sighted, features: Keypoints, parts: np.ndarray
         everything, own = _joined_sighted(left, shared)
         solved = _solved(state, everything, f"aligned{n}")
         if solved is None:
-            return state
-        state, placed = solved, solved.solution.landmarks
+            break
+        state, better, placed = solved, solved, solved.solution.landmarks
         rows = np.zeros(len(everything.aligned), bool)
         rows[own] = True
         tracks = placed.tracks
@@ -263,7 +271,7 @@ def _aligned(state: State, base: Sighted, features: Keypoints, parts: np.ndarray
         observed = Observations(
             state.map.observed, state.map.aligned, state.map.normals_rig, state.map.field
         )
-    return state
+    return better
 
 
 def _align(state: State, start: Solution, observed: Observations, name: str) -> Sighted:
@@ -415,7 +423,7 @@ def _crossing(state: State, parts: np.ndarray) -> Tracks:
 
 
 def _sighted(state: State) -> Sighted:
-    """The map's observations, those of points that were lost included no more."""
+    """The observations of the map's points."""
     map_ = state.map
     aligned = np.zeros(len(map_.observed.faces), bool) if map_.aligned is None else map_.aligned
     landmarks = map_.solution.landmarks
