@@ -10,7 +10,7 @@ import numpy as np
 
 from factors._observations import BEARING, GIVEN, MIN_DEPTH
 from factors.compiled import kernel_and_part
-from factors.landmark_residual import call_residual
+from factors.landmark_residual import call_residual, has_functions
 
 _EPS = 1e-300  # guards divisions by a squared norm
 _MIN_RELATIVE_DAMPING = 1e-12  # least damping, part of the trace of a landmark's Hessian
@@ -82,7 +82,7 @@ def whitened_residual(obs, o, dx, dy, dz):
     if kind == BEARING:
         mx, my, mz = measurement[0], measurement[1], measurement[2]
         ax, ay, az, bx, by, bz = tangent_axes(mx, my, mz)
-    elif kind >= GIVEN:
+    elif has_functions(obs.functions) and kind >= GIVEN:  # type: ignore
         ax, ay, az, bx, by, bz, mx, my, mz = 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0
     else:
         camera = obs.cameras[int(measurement[2])]
@@ -95,9 +95,9 @@ def whitened_residual(obs, o, dx, dy, dz):
         if x * x + y * y + z * z < _EPS:
             return False, s00 * np.pi, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         r0, r1, j00, j01, j02, j10, j11, j12 = _log_map(x, y, z)
-    elif kind >= GIVEN:
+    elif has_functions(obs.functions) and kind >= GIVEN:  # type: ignore
         seen, r0, r1, j00, j01, j02, j10, j11, j12 = call_residual(  # type: ignore
-            obs.functions[kind - GIVEN], measurement[0], measurement[1], measurement[2], x, y, z
+            obs.functions, kind - GIVEN, measurement[0], measurement[1], measurement[2], x, y, z
         )
         if seen == 0.0:
             return False, s00 * r0 + s01 * r1, s11 * r1, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0

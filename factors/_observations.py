@@ -27,7 +27,8 @@ class Observations(NamedTuple):
     whiteners: np.ndarray  # (O, 3): [s00, s01, s11] of the upper triangular 2x2 sqrt information
     origins: np.ndarray  # (O, 3): where the ray starts, rig frame, map units
     cameras: np.ndarray  # (C, 12): [rig_R_face row-major (9), focal, principal u, v in pixels]
-    functions: np.ndarray  # (G,) int64, addresses of residuals that others wrote
+    functions: np.ndarray | None  # (G,) int64, addresses of residuals that others wrote; None =
+    # there are none, and kernels are compiled without calls
     loss: int  # code of the robust loss
     loss_scale: float
 
@@ -124,7 +125,7 @@ def sort_observations(
         whiteners=np.empty((len(order), 3)),
         origins=np.zeros((len(order), 3)),
         cameras=np.concatenate([np.zeros((0, 12)), *(term.cameras() for term in terms)]),
-        functions=np.array(given, dtype=np.int64),
+        functions=np.array(given, dtype=np.int64) if given else None,
         loss=loss.code,
         loss_scale=float(loss.scale),
     )

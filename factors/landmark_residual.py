@@ -124,19 +124,39 @@ class LandmarkTerm:
 
 
 @intrinsic
+def has_functions(_typing: Any, functions: Any) -> Any:
+    """True if there are functions, a constant of the compiled code: kernels without these have no
+    branches for them, and take half the time."""
+    signature = types.boolean(functions)
+
+    def generate(context: Any, _builder: Any, signature: Any, _args: Any) -> Any:
+        there = not isinstance(signature.args[0], types.NoneType)
+        return context.get_constant(types.boolean, there)
+
+    return signature, generate
+
+
+@intrinsic
 def call_residual(
-    _typing: Any, address: Any, mx: Any, my: Any, mz: Any, x: Any, y: Any, z: Any
+    _typing: Any, functions: Any, n: Any, mx: Any, my: Any, mz: Any, x: Any, y: Any, z: Any
 ) -> Any:
-    """Valid (1.0 or 0.0), residual (2) and Jacobian (6) of the function at an address."""
-    signature = types.UniTuple(types.float64, _NUM_OUT)(types.int64, *[types.float64] * 6)
+    """Valid (1.0 or 0.0), residual (2) and Jacobian (6) of the n-th function, of all addresses;
+    zeros where there are none (None)."""
+    signature = types.UniTuple(types.float64, _NUM_OUT)(
+        functions, types.int64, *[types.float64] * 6
+    )
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        if isinstance(signature.args[0], types.NoneType):
+            return cgutils.get_null_value(context.get_value_type(signature.return_type))
         double = ir.DoubleType()
         places = [cgutils.alloca_once(builder, double, size=n) for n in (3, 3, _NUM_OUT)]
-        for n, value in enumerate(args[1:]):
+        for n, value in enumerate(args[2:]):
             builder.store(value, cgutils.gep_inbounds(builder, places[n // 3], n % 3))
+        addresses = context.make_array(signature.args[0])(context, builder, value=args[0])
+        address = builder.load(builder.gep(addresses.data, [args[1]]))
         kind = ir.FunctionType(ir.VoidType(), [double.as_pointer()] * 3)
-        builder.call(builder.inttoptr(args[0], kind.as_pointer()), places)
+        builder.call(builder.inttoptr(address, kind.as_pointer()), places)
         written = [
             builder.load(cgutils.gep_inbounds(builder, places[2], n))
             for n in (_NUM_OUT - 1, *range(_NUM_OUT - 1))
