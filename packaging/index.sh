@@ -5,7 +5,6 @@
 # Needs Python 3.11 or newer (PYTHON, else python3) and the package index for what gsba needs.
 set -euo pipefail
 
-source_folder=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 dist=$(cd "$1" && pwd)
 work=$(mktemp -d)
 python=${PYTHON:-python3}
@@ -33,8 +32,8 @@ echo "== pip install gsba, doctor, demo, tests"
 version=$(basename "$dist"/gsba-*.tar.gz .tar.gz) && version=${version#gsba-}
 "$work/fresh/bin/pip" install --quiet --extra-index-url "http://127.0.0.1:$port/simple" \
   "gsba[test,view]==$version"
-cp -r "$source_folder/tests" "$source_folder/pyproject.toml" "$work/empty"
-cd "$work/empty" # so that the installed package is tested
+cd "$work/empty" # so that the installed package is tested, by the tests of the source archive
+tar -xzf "$dist/gsba-$version.tar.gz" --strip-components=1 --wildcards '*/tests/*' '*/pyproject.toml'
 "$work/fresh/bin/gsba" doctor
 "$work/fresh/bin/gsba" --quiet demo --frames 12 --width 512
 "$work/fresh/bin/python" -m pytest -q -n 0 tests/trajectory tests/app/test_jobs.py \
