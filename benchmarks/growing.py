@@ -14,6 +14,7 @@ run is more than 1.3 times that of the joint solution, or poses that are fixed c
 """
 
 import argparse
+import shutil
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -70,6 +71,7 @@ class Bench(NamedTuple):
             return row
         print(f"running {folder}", file=sys.stderr, flush=True)
         run = folder / "run"
+        shutil.rmtree(run, ignore_errors=True)
         words = [*_GSBA, *command, "--out", str(run), "--allow-partial"]
         return run_row(
             words, folder, {"key": key, "what": what}, lambda: {"errors": check(run)}, TIMEOUT_S

@@ -231,11 +231,20 @@ def _joined(store: RunStore, runs: Sequence[FinishedRun]) -> tuple[State, JointM
 
 
 def _settings_of_new(settings: RefineSettings) -> RefineSettings:
-    """Settings of a run, for recordings that are to join it: without what places its result."""
-    factors = tuple(name for name in settings.factors if name != "gps")
+    """Settings of a run, for recordings that are to join it.
+
+    What places its result is left out, and what makes up for a weak map: the run's holds it then.
+    """
+    direct = settings.direct_families()
+    factors = tuple(name for name in settings.factors if name != "gps" and name not in direct)
+    patches = settings.patches.model_copy(
+        update={"rounds": min(settings.patches.rounds, 1), "weak_rounds": 1}
+    )
     return settings.model_copy(
         update={
             "factors": factors,
+            "patches": patches,
+            "weak_frames": settings.weak_frames.model_copy(update={"mode": "off"}),
             "gps": GpsSettings(),
             "placement": PlacementSettings(),
             "export": settings.export.model_copy(update={"formats": ()}),
