@@ -206,7 +206,9 @@ def _scratch():
 
 
 @_part
-def _look(tau, centre, motion, axes, camera, X, pose, turn, d, q, e, origin, away, n, moved):
+def _look(
+    tau, centre, motion, axes, inverse_radius, X, pose, turn, d, q, e, origin, away, n, moved
+):  # fmt: skip
     """Write where a point is: d, e, the lens's o and n, l = e - o, and Q and s w."""
     x, y, z = X[0] - pose[9], X[1] - pose[10], X[2] - pose[11]
     for i in range(3):
@@ -217,7 +219,7 @@ def _look(tau, centre, motion, axes, camera, X, pose, turn, d, q, e, origin, awa
     _times(axes, centre, origin)
     for i in range(3):
         away[i] = e[i] - origin[i]
-        n[i] = camera.inverse_radius * origin[i]
+        n[i] = inverse_radius * origin[i]
 
 
 @_part
@@ -228,16 +230,22 @@ def _set_by_lenses(columns, camera, lens, by_lens, turning, own, shared):
         by_lens: (7,) row of `_pixel_residual`.
         turning: (3,) row by a left turn of the lens.
     """
-    first = columns.lenses
-    for i in range(first, first + 7 + 10 * (len(camera.lenses) - 1)):
-        shared[i] = 0.0
-    start = first if lens == 0 else first + 7 + 10 * (lens - 1)
+    start = columns.lenses[lens]
     for i in range(7):
         shared[start + i] = by_lens[i] * camera.steps[lens, i]
-    if lens > 0:  # the front lens's axes are the rig's
+    if lens > columns.first[lens]:  # the front lens's axes are the rig's
         _times_transposed(camera.by_lens_turn[lens], turning, own)
         for i in range(3):
             shared[start + 7 + i] = own[i]
+
+
+@_part
+def _clear(row, shared):
+    """Set columns to zero: variables of other cameras do not act on what this one sees."""
+    for i in range(len(row)):
+        row[i] = 0.0
+    for i in range(len(shared)):
+        shared[i] = 0.0
 
 
 @_part
@@ -254,12 +262,12 @@ def _see(
     ) = scratch  # fmt: skip
     f, lens, tau = sightings.frames[o], sightings.lenses[o], sightings.fractions[o]
     _look(
-        tau, camera.centres[lens], camera.motions[f], camera.axes[f], camera, X, pose, turn, d, q,
-        e, origin, away, n, moved,
+        tau, camera.centres[lens], camera.motions[f], camera.axes[f], camera.inverse_radii[lens], X,
+        pose, turn, d, q, e, origin, away, n, moved,
     )  # fmt: skip
     measured, whitener = sightings.measured[o], sightings.whiteners[o]
-    last = len(camera.centres) - 1
-    if columns.lenses >= 0:
+    first, last, inverse = columns.first[lens], columns.last[lens], camera.inverse_radii[lens]
+    if columns.lenses[lens] >= 0:
         _pixel_residual(measured, whitener, camera.lenses[lens], away, residual, by_away, by_lens)
     else:
         _stitched_residual(measured, whitener, n, away, residual, by_away, by_n, by_p)
@@ -273,31 +281,32 @@ def _see(
         if not asked:
             continue
         row, shared = by_frame[r], by_shared[r]
+        _clear(row, shared)
         row[0], row[1], row[2] = _cross(by_d, d)
         row[3], row[4], row[5] = -by_d[0], -by_d[1], -by_d[2]
         by_radius = 0.0
         for i in range(3):
-            by_origin[i] = camera.inverse_radius * by_n[r, i] - by_e[i]
+            by_origin[i] = inverse * by_n[r, i] - by_e[i]
             by_radius += by_n[r, i] * origin[i]
         _times_transposed(camera.axes[f], by_origin, own)
-        for k in range(last):  # the last lens's centre is minus the sum of the others
+        for k in range(first, last):  # the last lens's centre is minus the sum of the others
             share = 1.0 if lens == k else (-1.0 if lens == last else 0.0)
             for i in range(3):
-                at = 3 * k + i
+                at = columns.centres[lens] + 3 * (k - first) + i
                 shared[at] = share * own[i] + by_radius * camera.radius_by_centre[at]
-        if columns.radius >= 0:
-            shared[columns.radius] = by_radius
-        if columns.motion >= 0:
+        if columns.radius[lens] >= 0:
+            shared[columns.radius[lens]] = by_radius
+        if columns.readout[lens] >= 0:
             _by_motion(tau, e, moved, by_e, by_d, motion_row)
             slope = 0.0
             for i in range(6):
-                row[columns.motion + i] = motion_row[i]
+                row[columns.motion[lens] + i] = motion_row[i]
                 slope += motion_row[i] * camera.velocities[f, i]
-            shared[columns.readout] = slope
-        if columns.turns >= 0:
+            shared[columns.readout[lens]] = slope
+        if columns.turns[lens] >= 0:
             _times_transposed(camera.by_turn[lens, f], by_origin, own)
-            row[columns.turns], row[columns.turns + 1] = own[0], own[1]
-        if columns.lenses >= 0:
+            row[columns.turns[lens]], row[columns.turns[lens] + 1] = own[0], own[1]
+        if columns.lenses[lens] >= 0:
             turning = _array(_cross(by_e, away), q)
             _set_by_lenses(columns, camera, lens, by_lens[r], turning, own, shared)
 

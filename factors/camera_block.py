@@ -10,7 +10,15 @@ from factors._observations import covisible_pairs
 from factors._terms import pose_rows
 from factors.bearing import tangent_basis
 from factors.block import PoseSystem
-from factors.camera_rows import DIM, CameraRows, CameraVariables, Columns, Sightings, lens_sizes
+from factors.camera_rows import (
+    DIM,
+    CameraRows,
+    CameraVariables,
+    Columns,
+    LensVariables,
+    Sightings,
+    lens_sizes,
+)
 from factors.elimination import Eliminated
 from factors.robust import RobustLoss
 from factors.threads import balanced_ranges, map_in_threads, run_in_threads
@@ -276,14 +284,16 @@ def pixels_of(
     plain = np.zeros((num, 3)), np.tile(np.eye(2), (num, 1, 1)), lenses, np.zeros(num)
     sightings, _ = sightings_of(frames, rows, num, *plain)
     many, free = len(calibration), 3 * (len(calibration) - 1)
+    width = free + sum(lens_sizes(many))
     camera = CameraRows(
         np.zeros((1, 6)), np.zeros((1, 6)), np.eye(3)[None], np.zeros((many, 1, 3, 3)),
-        np.zeros((many, 3)), 0.0, np.zeros(free), np.ascontiguousarray(calibration),
+        np.zeros((many, 3)), np.zeros(many), np.zeros(width), np.ascontiguousarray(calibration),
         np.ones((many, 7)), np.tile(np.eye(3), (many, 1, 1)),
     )  # fmt: skip
     pose, residuals = np.array([[*np.eye(3).ravel(), 0, 0, 0]]), np.empty((num, 2))
-    by_direction, unused = np.empty((num, 2, 3)), np.empty((num, 2, free + sum(lens_sizes(many))))
-    columns = Columns(-1, -1, -1, free, -1)
+    by_direction, unused = np.empty((num, 2, 3)), np.empty((num, 2, width))
+    plain = LensVariables(range(many - 1), lenses=range(3 * many - 1), calibration=calibration)
+    columns = Columns(*(part.astype(np.int64) for part in plain.columns(-1, -1, 0, 0)))
     see_range(
         0, num, sightings, camera, columns, np.ascontiguousarray(directions), pose, residuals,
         by_direction, unused, unused,

@@ -10,9 +10,11 @@ from gsba.bundle import adjustment, triangulation
 from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.bearings import Bearings
 from gsba.bundle.camera_adjustment import solve_with_camera
+from gsba.bundle.camera_estimates import CameraEstimates
 from gsba.bundle.families import Families
 from gsba.bundle.readout import CameraEstimate
 from gsba.bundle.trajectory_prior import TrajectoryPrior
+from gsba.camera.cameras import Cameras
 from gsba.camera.lens import Lenses
 from gsba.camera.rig import owner_faces
 from gsba.config import CameraSettings, RefineSettings
@@ -27,7 +29,7 @@ INTERVAL_S = 0.5
 
 
 def seen_through(
-    lenses: Lenses, seed: int = 0, world_T_rigs: np.ndarray | None = None
+    lenses: Lenses | Cameras, seed: int = 0, world_T_rigs: np.ndarray | None = None
 ) -> tuple[World, Keypoints]:
     """A world, and its keypoints as these lenses have them, from poses of its own or these."""
     world = make_world(seed, 24, 1200, SIGMA, false_share=0.02)
@@ -86,8 +88,9 @@ def solved_with(
 ) -> tuple[Solution, CameraEstimate]:
     """Map and camera adjusted together, from the tracks that the camera sees."""
     tracks = camera.lenses.clear(world.tracks, camera.lenses.seen(shown))
-    given = tracks, shown, camera, times(len(start.world_T_rigs)), start, problem
-    return solve_with_camera(*given, (30.0, 8.0, 8.0))
+    given = CameraEstimates((camera,)), times(len(start.world_T_rigs)), start, problem
+    solved, found = solve_with_camera(tracks, shown, *given, (30.0, 8.0, 8.0))
+    return solved, found.only
 
 
 def placed(solved: Solution, keypoints: Keypoints, tracks: Tracks) -> Landmarks:

@@ -18,7 +18,7 @@ from gsba.bundle.optimizer import OptimizeResult, marginal_covariances, optimize
 from gsba.bundle.pose_variables import poses_of, values_of
 from gsba.bundle.tracks import runs
 from gsba.camera.rig import CubeRig
-from gsba.config import RefineSettings, SolverSettings
+from gsba.config import CameraSettings, RefineSettings, SolverSettings
 from gsba.types import (
     GyroConstraints,
     JointErrors,
@@ -75,12 +75,20 @@ class AdjustmentContext:
     num_threads: int  # of the solver
     maps: np.ndarray | None = None  # (F,) map of each frame, for the families; None = there is one
     division: Division | None = None  # of large maps into parts; None = none is divided
+    cameras: tuple[CameraSettings, ...] = ()  # (C,) of each camera; () = settings.camera of all
 
     @property
     def turning(self) -> GyroConstraints | None:
         """The gyro's measurements of the frames; None where no gyro is used."""
         gyros = (family for family in self.families.members if isinstance(family, GyroTurns))
         return next((gyro.turning for gyro in gyros), None)
+
+    def of_camera(self, camera: int) -> "AdjustmentContext":
+        """The same with the settings of one camera."""
+        if not self.cameras:
+            return self
+        own = {"camera": self.cameras[camera]}
+        return replace(self, settings=self.settings.model_copy(update=own), cameras=())
 
     def beside(self, *families: Family) -> "AdjustmentContext":
         """The same with further families."""

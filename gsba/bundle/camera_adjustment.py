@@ -15,9 +15,9 @@ from gsba.bundle.adjustment import (
     adjust_sighted_through,
     adjust_through,
 )
+from gsba.bundle.camera_estimates import CameraEstimates
 from gsba.bundle.camera_system import CameraSystem
 from gsba.bundle.camera_variables import CameraUnknowns
-from gsba.bundle.readout import CameraEstimate
 from gsba.bundle.stitching import with_noise_of
 from gsba.types import Keypoints, Sighted, Solution, Tracks
 
@@ -31,27 +31,27 @@ class CameraView:
 
     shown: Keypoints  # as pictures show them
     keypoints: Keypoints  # these keypoints as rays of the camera so far
-    camera: CameraEstimate
+    cameras: CameraEstimates
     timestamps: np.ndarray  # (F,) seconds
 
     @classmethod
-    def of(cls, shown: Keypoints, camera: CameraEstimate, timestamps: np.ndarray) -> "CameraView":
+    def of(cls, shown: Keypoints, cameras: CameraEstimates, timestamps: np.ndarray) -> "CameraView":
         """The view of keypoints, as pictures show them, through a known camera."""
-        return cls(shown, camera.lenses.seen(shown), camera, timestamps)
+        return cls(shown, cameras.cameras.seen(shown), cameras, timestamps)
 
     def with_noise_of(self, keypoints: Keypoints) -> "CameraView":
         """The view with the noise of other keypoints of the same rows."""
         shown = with_noise_of(self.shown, keypoints)
-        return replace(self, shown=shown, keypoints=self.camera.lenses.seen(shown))
+        return replace(self, shown=shown, keypoints=self.cameras.cameras.seen(shown))
 
     def terms(
         self, solved: Solution, noise: float, context: AdjustmentContext
     ) -> tuple[Terms, Callable[[gtsam.Values], "CameraView"]]:
         """Poses and camera as variables of one graph."""
-        camera = self.camera
+        cameras = self.cameras
         if noise <= solved.noise:  # under wide gates next to nothing contradicts a gyro
-            camera = CameraSystem(solved, self.shown, camera, self.timestamps, context).prepared()
-        unknowns = CameraUnknowns.of(camera, solved.world_T_rigs, self.timestamps, context)
+            cameras = CameraSystem(solved, self.shown, cameras, self.timestamps, context).prepared()
+        unknowns = CameraUnknowns.of(cameras, solved.world_T_rigs, self.timestamps, context)
         terms = context.terms(solved)
         terms.values.insert(unknowns.values)
         graph = gtsam.NonlinearFactorGraph(terms.graph)
@@ -62,8 +62,8 @@ class CameraView:
 
         def after(values: gtsam.Values) -> "CameraView":
             found = unknowns.estimate(values)
-            seen = found.lenses.seen(self.shown)
-            return replace(self, keypoints=seen, camera=found)
+            seen = found.cameras.seen(self.shown)
+            return replace(self, keypoints=seen, cameras=found)
 
         return replace(terms, graph=graph, blocks=(block, *terms.blocks)), after
 
@@ -71,13 +71,13 @@ class CameraView:
 def solve_with_camera(
     tracks: Tracks,
     shown: Keypoints,
-    camera: CameraEstimate,
+    cameras: CameraEstimates,
     timestamps: np.ndarray,
     start: Solution,
     context: AdjustmentContext,
     gates: Sequence[float],
     final: bool = True,
-) -> tuple[Solution, CameraEstimate]:
+) -> tuple[Solution, CameraEstimates]:
     """Solve for poses, points and the parts of a camera that were taken, in one graph.
 
     The last round, of the tightest gate, is of poses and points alone.
@@ -85,25 +85,25 @@ def solve_with_camera(
     Args:
         tracks: candidate tracks.
         shown: keypoints as pictures show them.
-        camera: to start from; what it leaves out (a readout, axes, raw lenses) is left out.
+        cameras: to start from; what it leaves out (a readout, axes, raw lenses) is left out.
         timestamps: (F,) seconds.
         start, context, gates, final: see `adjustment.adjust`.
     """
     wide, last = _split(gates)
-    view = CameraView.of(shown, camera, timestamps)
+    view = CameraView.of(shown, cameras, timestamps)
     found, view = adjust_through(view, tracks, start, context, wide, final)
     solved = adjust(tracks, view.keypoints, found, context, last, final)
-    return replace(solved, rounds=found.rounds + solved.rounds), view.camera
+    return replace(solved, rounds=found.rounds + solved.rounds), view.cameras
 
 
 def solve_sighted_with_camera(
     sighted: Sighted,
-    camera: CameraEstimate,
+    cameras: CameraEstimates,
     timestamps: np.ndarray,
     before: Solution,
     context: AdjustmentContext,
     gates: Sequence[float],
-) -> tuple[Solution, Keypoints, CameraEstimate]:
+) -> tuple[Solution, Keypoints, CameraEstimates]:
     """As `solve_with_camera`, of aligned and former observations, as `adjust_sighted` takes them.
 
     Args:
@@ -113,12 +113,12 @@ def solve_sighted_with_camera(
         The solution, the keypoints with the noise that they turned out to have, and the camera.
     """
     wide, last = _split(gates)
-    view = CameraView.of(sighted.keypoints, camera, timestamps)
+    view = CameraView.of(sighted.keypoints, cameras, timestamps)
     found, view = adjust_sighted_through(view, sighted, before, context, wide)
     seen = replace(sighted, keypoints=view.keypoints)
     solved, keypoints = adjust_sighted(seen, found, context, last)
     solved = replace(solved, rounds=found.rounds + solved.rounds)
-    return solved, view.with_noise_of(keypoints).shown, view.camera
+    return solved, view.with_noise_of(keypoints).shown, view.cameras
 
 
 def _split(gates: Sequence[float]) -> tuple[Sequence[float], Sequence[float]]:

@@ -11,14 +11,15 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from factors import Block
+from factors.camera_rows import LensVariables
 from factors.quadratic_block import QuadraticBlock
 from factors.reduced_camera_system import ReducedSystem
 from factors.system_choice import reduced_system
 from gsba.bundle import readout
 from gsba.bundle.adjustment import DRAWS, AdjustmentContext
-from gsba.bundle.camera_variables import CameraUnknowns, D, N, W, keys_of_lenses
+from gsba.bundle.camera_estimates import CameraEstimates
+from gsba.bundle.camera_variables import CameraUnknowns, W
 from gsba.bundle.optimizer import marginal_covariances
-from gsba.bundle.readout import CameraEstimate
 from gsba.types import JointErrors, Keypoints, Solution
 
 _DAMPING = 1e-6
@@ -29,11 +30,9 @@ _MAX_UNEXPLAINED_SHARE = 0.5  # largest share of the rotations by images that a 
 
 
 @dataclass(frozen=True, slots=True)
-class CameraCovariances:
-    """Marginal covariances, camera and poses adjusted together."""
+class CameraSigmas:
+    """Marginal covariances of one camera."""
 
-    poses: np.ndarray  # (F, 6, 6) float64, [rotation rad, translation], rig frame
-    joint: JointErrors  # what the poses' errors have in common
     centre: np.ndarray  # (3 (L - 1), 3 (L - 1)) float64, of the lenses' centres but the last one;
     # what is common to different lenses is left out
     readout_sigma: float  # s; NaN = no readout was taken
@@ -43,54 +42,76 @@ class CameraCovariances:
 
 
 @dataclass(frozen=True, slots=True)
+class CameraCovariances:
+    """Marginal covariances, cameras and poses adjusted together."""
+
+    poses: np.ndarray  # (F, 6, 6) float64, [rotation rad, translation], rig frame
+    joint: JointErrors  # what the poses' errors have in common
+    cameras: tuple[CameraSigmas, ...]  # (C,)
+
+
+@dataclass(frozen=True, slots=True)
 class CameraSystem:
-    """A map and its camera, linearized together."""
+    """A map and its cameras, linearized together."""
 
     solved: Solution  # poses, points, noise
     shown: Keypoints  # keypoints of its observations, as pictures show them
-    camera: CameraEstimate  # so far
+    cameras: CameraEstimates  # so far
     timestamps: np.ndarray  # (F,) seconds
     context: AdjustmentContext  # priors, loss
 
-    def prepared(self) -> CameraEstimate:
-        """The camera with a decision on the gyro, and the estimated spread of frames' own motion.
+    def prepared(self) -> CameraEstimates:
+        """The cameras with a decision on the gyro, and the estimated spread of frames' own motion.
 
         The spread is estimated by expectation maximisation: squared deviations plus variances.
         """
-        if self.camera.lenses.readout_motion is None:
-            return self.camera
-        camera, turning = self.camera, readout.turning_of(self.camera.lenses, self.context)
-        if turning is not None:
-            camera = replace(camera, by_gyro=self._agrees(turning.rates))
-        system = replace(self, camera=camera)._linearized()
+        read = [camera.lenses.readout_motion is not None for camera in self.cameras.each]
+        if not any(read):
+            return self.cameras
+        cameras, num = self.cameras, len(self.solved.world_T_rigs)
+        for number in np.flatnonzero(read).tolist():
+            turning = readout.turning_of(cameras.each[number].lenses, self.context)
+            if turning is not None:
+                by_gyro = self._agrees(number, turning.rates)
+                cameras = cameras.changed(number, lambda one, by=by_gyro: replace(one, by_gyro=by))
+        system = replace(self, cameras=cameras)._linearized()
         variances = system.own_variances()  # they hardly depend on the spread
-        for _ in range(0 if variances is None else _NUM_SPREAD_PASSES):
-            motion = system.own_motion()
-            if motion is None:
+        if variances is None:
+            return cameras
+        for _ in range(_NUM_SPREAD_PASSES):
+            motion, own = system.own_motion(), system.unknowns.own
+            if motion is None or own is None:
                 break
-            sigmas = np.sqrt(np.mean(motion**2 + variances, axis=0))
-            own = system.unknowns.own
-            if own is not None and own.told.any():  # rotations by the gyro do not measure the
-                # spread of others
-                sigmas[:3] = own.sigmas[:3]
+            sigmas = list(own.sigmas)
+            for number in np.flatnonzero(read).tolist():
+                rows = cameras.frames_of(number, num)
+                spread = np.sqrt(np.mean(motion[rows] ** 2 + variances[rows], axis=0))
+                if own.told[rows].any():  # rotations by the gyro do not measure the spread of
+                    # others
+                    spread[:3] = sigmas[number][:3]
+                sigmas[number] = spread
             system = replace(system, unknowns=system.unknowns.spread_as(sigmas))
-        return system.unknowns.camera
+        return system.unknowns.cameras
 
-    def _agrees(self, rates: np.ndarray) -> bool:
-        """True if images alone confirm a gyro's rates (F, 3) of frames during their readout."""
-        alone = replace(self, camera=replace(self.camera, by_gyro=False))._linearized()
+    def _agrees(self, number: int, rates: np.ndarray) -> bool:
+        """True if images alone confirm a gyro's rates (F, 3) of one camera's frames during their
+        readout."""
+        camera, num = self.cameras.each[number], len(rates)
+        without = self.cameras.changed(number, lambda one: replace(one, by_gyro=False))
+        alone = replace(self, cameras=without)._linearized()
         motion, variances = alone.own_motion(), alone.own_variances()
-        told = np.isfinite(rates).all(axis=1)
+        own = np.isin(np.arange(num), self.cameras.frames_of(number, num))
+        told = own & np.all(np.isfinite(rates), axis=1)
         if motion is None or variances is None or not told.any():
             return False
         seen = motion[told, :3]  # rotations are own motion alone: velocities of poses give none
-        off = seen - self.camera.readout_s * rates[told]
+        off = seen - camera.readout_s * rates[told]
         near = np.median(off**2 / variances[told, :3]) < _MAX_GYRO_SQUARES
         return bool(near or np.sum(off**2) < _MAX_UNEXPLAINED_SHARE * np.sum(seen**2))
 
     def _unknowns(self) -> CameraUnknowns:
         poses = self.solved.world_T_rigs
-        return CameraUnknowns.of(self.camera, poses, self.timestamps, self.context)
+        return CameraUnknowns.of(self.cameras, poses, self.timestamps, self.context)
 
     def _linearized(self) -> "_Linearized":
         """The quadratic model at these poses and this camera, points at their optimum."""
@@ -129,15 +150,31 @@ class CameraSystem:
             key: np.sqrt(np.diagonal(found[num + i])[:dim])
             for i, (key, dim) in enumerate(unknowns.variables.shared)
         }
-        nothing = np.array([np.nan])
-        readout_sigma, of_radius = (float(sigmas.get(key, nothing)[0]) for key in (D(0), N(0)))
-        lenses = None
-        if self.camera.lenses.fisheyes is not None:
-            keys = keys_of_lenses(self.camera.lenses.num_lenses)
-            lenses = np.concatenate([sigmas[key] for key in keys])
-        centres = [beside.index(key) for key in unknowns.variables.centres]
-        centre = np.asarray(block_diag(*(found[num + row, :3, :3] for row in centres)))
-        return CameraCovariances(found[:num], joint, centre, readout_sigma, of_radius, lenses)
+        of_centres = {
+            key: found[num + i, :3, :3] for i, (key, _) in enumerate(unknowns.variables.shared)
+        }
+        cameras = [
+            _sigmas_of(variables, sigmas, of_centres) for variables in unknowns.variables.cameras
+        ]
+        return CameraCovariances(found[:num], joint, tuple(cameras))
+
+
+def _sigmas_of(
+    variables: LensVariables, sigmas: dict[int, np.ndarray], covariances: dict[int, np.ndarray]
+) -> CameraSigmas:
+    """Covariances of one camera, from standard deviations and covariances of all by their keys."""
+    nothing = np.array([np.nan])
+    readout_sigma, of_radius = (
+        float(sigmas.get(-1 if key is None else key, nothing)[0])
+        for key in (variables.readout, variables.radius)
+    )
+    lenses = None
+    if variables.lenses is not None:
+        lenses = np.concatenate([sigmas[key] for key in variables.lenses])
+    centre = np.zeros((0, 0))
+    if variables.centres:
+        centre = np.asarray(block_diag(*(covariances[key] for key in variables.centres)))
+    return CameraSigmas(centre, readout_sigma, of_radius, lenses)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,7 @@
 """The camera's unknowns as variables of the graph: their keys, start values, priors, and the block
 of the observations that they act on."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -9,12 +10,20 @@ import numpy as np
 
 from factors import RobustLoss
 from factors.camera_block import CameraBlock, pixels_of, sightings_of
-from factors.camera_rows import CameraVariables, half_baseline, lens_sizes, vector
+from factors.camera_rows import (
+    CameraVariables,
+    LensVariables,
+    half_baseline,
+    lens_sizes,
+    vector,
+)
 from gsba.bundle import lens_axes, readout, self_calibration
 from gsba.bundle.adjustment import AdjustmentContext
+from gsba.bundle.camera_estimates import CameraEstimates
 from gsba.bundle.pose_variables import X
 from gsba.bundle.readout import CameraEstimate
 from gsba.camera.fisheye import Rig, rotation_of
+from gsba.config import CameraSettings
 from gsba.types import Keypoints, Landmarks
 
 # Small letters: capital ones are of poses and of families that others add.
@@ -35,24 +44,26 @@ class OwnMotion:
     """Prior on each frame's motion during its readout, beside that of its velocity."""
 
     values: np.ndarray  # (F, 6) to start from
-    sigmas: np.ndarray  # (6,) about zero
+    sigmas: tuple[np.ndarray, ...]  # (C) of (6,), about zero, of each camera's frames
     told: np.ndarray  # (F,) bool, frames whose rotation a gyro tells
-    told_sigma: float  # rad, about zero, of these
+    told_sigmas: tuple[float, ...]  # (C,) rad, about zero, of these
+    cameras: np.ndarray  # (F,) int64, camera of each frame
 
     def sigmas_of(self, frame: int) -> np.ndarray:
         """Standard deviations (6,) of one frame."""
+        camera = self.cameras[frame]
         if not self.told[frame]:
-            return self.sigmas
-        return np.concatenate([np.full(3, self.told_sigma), self.sigmas[3:]])
+            return self.sigmas[camera]
+        return np.concatenate([np.full(3, self.told_sigmas[camera]), self.sigmas[camera][3:]])
 
 
 @dataclass(frozen=True, slots=True)
 class CameraUnknowns:
-    """The variables of a camera that was found, at some poses."""
+    """The variables of cameras that were found, at some poses."""
 
-    camera: CameraEstimate  # to start from
+    cameras: CameraEstimates  # to start from
     variables: CameraVariables
-    values: gtsam.Values  # of the camera alone
+    values: gtsam.Values  # of the cameras alone
     shared: gtsam.NonlinearFactorGraph  # priors on these, but for frames' own motion
     own: OwnMotion | None  # None = frames are taken at one instant
     context: AdjustmentContext
@@ -60,63 +71,44 @@ class CameraUnknowns:
     @classmethod
     def of(
         cls,
-        camera: CameraEstimate,
+        cameras: CameraEstimates,
         world_T_rigs: np.ndarray,
         timestamps: np.ndarray,
         context: AdjustmentContext,
     ) -> "CameraUnknowns":
-        """Variables of what was taken of a camera: the rest stays as it is.
+        """Variables of what was taken of cameras: the rest stays as it is.
 
         Args:
-            camera: as found so far.
+            cameras: as found so far.
             world_T_rigs: (F, 4, 4) poses, whose velocities frames have while they are read.
             timestamps: (F,) seconds.
             context: settings, and a gyro's rates.
         """
-        lenses, frames = camera.lenses, range(len(world_T_rigs))
+        num, parts, first = len(world_T_rigs), list[LensVariables](), 0
         values, graph = gtsam.Values(), gtsam.NonlinearFactorGraph()
-        centres = [C(lens) for lens in range(lenses.num_lenses - 1)]
-        given: dict = {"poses": [X(f) for f in frames], "centres": centres, "axes": lenses.axes}
-        for key, centre in zip(centres, lenses.centres[:-1], strict=True):
-            values.insert(key, np.array(centre))
-        if lenses.inverse_stitch_radius:
-            if context.settings.camera.stitch_radius_m is None:
-                given["radius"] = N(0)
-                values.insert(N(0), np.array([lenses.inverse_stitch_radius]))
-            else:  # metres: in map units it goes with the distance between the lenses
-                given["front_by_radius"] = lenses.inverse_stitch_radius * lenses.baseline / 2
-        if lenses.fisheyes is not None:
-            assert lenses.reference_calibration is not None
-            keys = keys_of_lenses(lenses.num_lenses)
-            given["lenses"] = keys
-            given["calibration"] = _rows(lenses.reference_calibration)
-            off = split_lenses(self_calibration.from_calibrated(lenses))
-            for key, part, spread in zip(
-                keys, off, split_lenses(self_calibration.spread(lenses.num_lenses)), strict=True
-            ):
-                _add(values, graph, key, part, spread)
-        own = None
-        if lenses.readout_motion is not None:
-            velocities = velocities_of(camera, world_T_rigs, timestamps, context)
-            given |= {"readout": D(0), "velocities": velocities}
-            given["motions"] = [W(f) for f in frames]
-            said = context.settings.camera.readout()
-            values.insert(D(0), np.array([camera.readout_s]))
-            if said is not None:
-                model = gtsam.noiseModel.Isotropic.Sigma(1, said[1])
-                graph.add(gtsam.PriorFactorVector(D(0), np.array([said[0]]), model))
-            own = _own_motion(camera, velocities, context)
-            for f in frames:
-                values.insert(W(f), np.array(own.values[f]))
-        if lenses.axes is not None:
-            given["turns"] = [A(f) for f in frames]
-            for f in frames:
+        for number, camera in enumerate(cameras.each):
+            own = context.of_camera(number).settings.camera
+            parts.append(_lens_variables(camera, own, (number, first), values, graph))
+            first += parts[-1].num_lenses
+        given: dict = {"poses": [X(f) for f in range(num)], "cameras": parts}
+        if cameras.of_frame:
+            given["of_frame"] = np.array(cameras.of_frame)
+        motion = None
+        if any(camera.lenses.readout_motion is not None for camera in cameras.each):
+            velocities = _velocities(cameras, world_T_rigs, timestamps, context)
+            given |= {"velocities": velocities, "motions": [W(f) for f in range(num)]}
+            motion = _own_motion(cameras, velocities, context)
+            for f in range(num):
+                values.insert(W(f), np.array(motion.values[f]))
+        if any(part.turning for part in parts):
+            given |= {"turns": [A(f) for f in range(num)], "axes": _axes(cameras, num)}
+            for f in range(num):
                 _add(values, graph, A(f), np.zeros(2), np.full(2, lens_axes.TURNS[-1]))
-        return cls(camera, CameraVariables(**given), values, graph, own, context)
+        return cls(cameras, CameraVariables(**given), values, graph, motion, context)
 
     @property
     def graph(self) -> gtsam.NonlinearFactorGraph:
-        """Priors on the camera's variables."""
+        """Priors on the cameras' variables."""
         graph, own = gtsam.NonlinearFactorGraph(self.shared), self.own
         if own is None:
             return graph
@@ -128,7 +120,7 @@ class CameraUnknowns:
     def block(
         self, landmarks: Landmarks, shown: Keypoints, noise: float, curved: bool = False
     ) -> CameraBlock:
-        """The observations of some points, to be explained by poses and camera.
+        """The observations of some points, to be explained by poses and cameras.
 
         Args:
             landmarks: points and what observes them.
@@ -137,17 +129,11 @@ class CameraUnknowns:
             curved: see `CameraBlock`.
         """
         tracks, rows = landmarks.tracks, shown.rows(landmarks.tracks)
-        lenses, directions = self.camera.lenses, shown.bearings_rig[rows]
-        seeing = lenses.facing(directions, tracks.frames)
-        fractions = lenses.fractions(directions, tracks.frames)
         roots = np.eye(2) / shown.sigmas_rad[rows, None, None]
         if shown.sqrt_infos is not None:
             roots = shown.sqrt_infos[rows]
-        measured, roots = directions, roots / noise
-        calibration = self.variables.calibration
-        if calibration is not None:
-            measured, by_pixel = pixels_of(directions, seeing, calibration)
-            roots = roots @ by_pixel
+        seen = shown.bearings_rig[rows], tracks.frames, roots / noise
+        measured, roots, seeing, fractions = self._sighted(*seen)
         given = tracks.frames, tracks.points, tracks.num_points, measured, roots, seeing, fractions
         solver = self.context.settings.solver
         return CameraBlock(
@@ -159,38 +145,162 @@ class CameraUnknowns:
             curved=curved,
         )
 
-    def spread_as(self, sigmas: np.ndarray) -> "CameraUnknowns":
-        """The unknowns with other standard deviations (6,) of frames' own motion."""
-        assert self.own is not None
-        camera = replace(self.camera, own_sigmas=sigmas)
-        return replace(self, camera=camera, own=replace(self.own, sigmas=sigmas))
+    def _sighted(
+        self, directions: np.ndarray, frames: np.ndarray, roots: np.ndarray
+    ) -> tuple[np.ndarray, ...]:
+        """Measurements (O, 3), whiteners (O, 2, 2), lenses (O,) and fractions of the readout (O,)
+        of directions (O, 3) in frames (O,), as `Sightings` has them.
 
-    def estimate(self, values: gtsam.Values) -> CameraEstimate:
-        """The camera at values of its variables."""
-        found, lenses, variables = self.camera, self.camera.lenses, self.variables
+        Args:
+            roots: (O, 2, 2) that whiten directions on their tangent_basis.
+        """
+        if not self.cameras.of_frame:
+            return self._sighted_by(0, directions, frames, roots)
+        measured, whiteners = np.empty_like(directions), np.empty_like(roots)
+        seeing, fractions = np.empty(len(frames), np.int64), np.empty(len(frames))
+        cameras = np.array(self.cameras.of_frame)[frames]
+        for number in range(len(self.cameras.each)):
+            rows = np.flatnonzero(cameras == number)
+            found = self._sighted_by(number, directions[rows], frames[rows], roots[rows])
+            measured[rows], whiteners[rows], seeing[rows], fractions[rows] = found
+        return measured, whiteners, seeing, fractions
+
+    def _sighted_by(
+        self, number: int, directions: np.ndarray, frames: np.ndarray, roots: np.ndarray
+    ) -> tuple[np.ndarray, ...]:
+        """As `_sighted`, of frames of one camera."""
+        lenses, variables = self.cameras.each[number].lenses, self.variables.cameras[number]
+        first = int(self.variables.first_lenses[number])
+        if variables.num_lenses == 1:
+            return directions, roots, np.full(len(frames), first), np.zeros(len(frames))
+        seeing = lenses.facing(directions, frames)
+        fractions = lenses.fractions(directions, frames)
+        measured, calibration = directions, variables.calibration
+        if calibration is not None:
+            measured, by_pixel = pixels_of(directions, seeing, calibration)
+            roots = roots @ by_pixel
+        return measured, roots, first + seeing, fractions
+
+    def spread_as(self, sigmas: Sequence[np.ndarray]) -> "CameraUnknowns":
+        """The unknowns with other standard deviations (C) of (6,) of frames' own motion."""
+        assert self.own is not None
+        pairs = zip(self.cameras.each, sigmas, strict=True)
+        each = [
+            one if one.lenses.readout_motion is None else replace(one, own_sigmas=own)
+            for one, own in pairs
+        ]
+        own = replace(self.own, sigmas=tuple(sigmas))
+        return replace(self, cameras=self.cameras.with_each(each), own=own)
+
+    def estimate(self, values: gtsam.Values) -> CameraEstimates:
+        """The cameras at values of their variables."""
+        each = zip(self.cameras.each, self.variables.cameras, strict=True)
+        return self.cameras.with_each(
+            [self._estimate(number, *one, values) for number, one in enumerate(each)]
+        )
+
+    def _estimate(
+        self, number: int, found: CameraEstimate, variables: LensVariables, values: gtsam.Values
+    ) -> CameraEstimate:
+        lenses = found.lenses
+        if variables.num_lenses == 1:
+            return found
         centres = [vector(values, key) for key in variables.centres]
         lenses = replace(lenses, centre=np.concatenate(centres))
         if variables.radius is not None:
-            inverse = max(float(vector(values, N(0))[0]), 0.0)
+            inverse = max(float(vector(values, variables.radius)[0]), 0.0)
             lenses = replace(lenses, inverse_stitch_radius=inverse)
         elif variables.front_by_radius:
             half = half_baseline(lenses.num_lenses) @ lenses.centre
             inverse = variables.front_by_radius / float(np.linalg.norm(half))
             lenses = replace(lenses, inverse_stitch_radius=inverse)
-        if variables.motions is not None and variables.velocities is not None:
-            duration = float(vector(values, D(0))[0])
-            beside = np.array([vector(values, key) for key in variables.motions])
-            lenses = replace(lenses, readout_motion=duration * variables.velocities + beside)
-            sigmas = None if self.own is None else self.own.sigmas
+        motions, velocities = self.variables.motions, self.variables.velocities
+        if variables.readout is not None and motions is not None and velocities is not None:
+            duration = float(vector(values, variables.readout)[0])
+            beside = np.array([vector(values, key) for key in motions])
+            lenses = replace(lenses, readout_motion=duration * velocities + beside)
+            sigmas = None if self.own is None else self.own.sigmas[number]
             found = replace(found, readout_s=duration, own_sigmas=sigmas)
-        if variables.turns is not None:
-            turns = np.array([vector(values, key) for key in variables.turns])
+        if variables.turning and self.variables.turns is not None:
+            turns = np.array([vector(values, key) for key in self.variables.turns])
             lenses = lens_axes.turned(lenses, turns)
         if variables.lenses is not None:
             changes = np.concatenate([vector(values, key) for key in variables.lenses])
             plain = replace(lenses, fisheyes=lenses.reference_calibration)
             lenses = self_calibration.moved(plain, changes)
         return replace(found, lenses=lenses)
+
+
+def _lens_variables(
+    camera: CameraEstimate,
+    settings: CameraSettings,
+    numbers: tuple[int, int],
+    values: gtsam.Values,
+    graph: gtsam.NonlinearFactorGraph,
+) -> LensVariables:
+    """Variables that all frames of a camera share, added to values and graph.
+
+    Args:
+        numbers: of the camera, and of its first lens among those of all cameras.
+    """
+    lenses, (number, first) = camera.lenses, numbers
+    if not lenses:
+        return LensVariables()
+    centres = [C(first + lens) for lens in range(lenses.num_lenses - 1)]
+    given: dict = {"centres": centres, "turning": lenses.axes is not None}
+    for key, centre in zip(centres, lenses.centres[:-1], strict=True):
+        values.insert(key, np.array(centre))
+    if lenses.inverse_stitch_radius:
+        if settings.stitch_radius_m is None:
+            given["radius"] = N(number)
+            values.insert(N(number), np.array([lenses.inverse_stitch_radius]))
+        else:  # metres: in map units it goes with the distance between the lenses
+            given["front_by_radius"] = lenses.inverse_stitch_radius * lenses.baseline / 2
+    if lenses.fisheyes is not None:
+        assert lenses.reference_calibration is not None
+        keys = keys_of_lenses(lenses.num_lenses, first)
+        given["lenses"] = keys
+        given["calibration"] = _rows(lenses.reference_calibration)
+        off = split_lenses(self_calibration.from_calibrated(lenses))
+        for key, part, spread in zip(
+            keys, off, split_lenses(self_calibration.spread(lenses.num_lenses)), strict=True
+        ):
+            _add(values, graph, key, part, spread)
+    if lenses.readout_motion is not None:
+        given["readout"] = D(number)
+        said = settings.readout()
+        values.insert(D(number), np.array([camera.readout_s]))
+        if said is not None:
+            model = gtsam.noiseModel.Isotropic.Sigma(1, said[1])
+            graph.add(gtsam.PriorFactorVector(D(number), np.array([said[0]]), model))
+    return LensVariables(**given)
+
+
+def _velocities(
+    cameras: CameraEstimates,
+    world_T_rigs: np.ndarray,
+    timestamps: np.ndarray,
+    context: AdjustmentContext,
+) -> np.ndarray:
+    """Velocities (F, 6) of frames that are read row by row, 0 of others."""
+    num = len(world_T_rigs)
+    whole = np.zeros((num, 6))
+    for number, camera in enumerate(cameras.each):
+        if camera.lenses.readout_motion is not None:
+            rows = cameras.frames_of(number, num)
+            found = velocities_of(camera, world_T_rigs, timestamps, context)
+            whole[rows] = found[rows]
+    return whole
+
+
+def _axes(cameras: CameraEstimates, num_frames: int) -> np.ndarray:
+    """Axes (F, 3, 3) of each frame's lenses."""
+    whole = np.tile(np.eye(3), (num_frames, 1, 1))
+    for number, camera in enumerate(cameras.each):
+        if camera.lenses.axes is not None:
+            rows = cameras.frames_of(number, num_frames)
+            whole[rows] = camera.lenses.axes[rows]
+    return whole
 
 
 def velocities_of(
@@ -210,23 +320,39 @@ def split_lenses(columns: np.ndarray) -> list[np.ndarray]:
     return np.split(columns, np.cumsum(sizes[:-1]), axis=-1)
 
 
-def keys_of_lenses(num: int) -> list[int]:
-    """Keys of the variables of L raw lenses, in the order of `self_calibration`."""
-    others = [[F(lens), K(lens), B(lens - 1)] for lens in range(1, num)]
-    return [F(0), K(0), *(key for keys in others for key in keys)]
+def keys_of_lenses(num: int, first: int = 0) -> list[int]:
+    """Keys of the variables of L raw lenses, in the order of `self_calibration`.
+
+    Args:
+        num: L.
+        first: number of the camera's first lens among those of all cameras.
+    """
+    others = [[F(lens), K(lens), B(lens - 1)] for lens in range(first + 1, first + num)]
+    return [F(first), K(first), *(key for keys in others for key in keys)]
 
 
 def _own_motion(
-    camera: CameraEstimate, velocities: np.ndarray, context: AdjustmentContext
+    cameras: CameraEstimates, velocities: np.ndarray, context: AdjustmentContext
 ) -> OwnMotion:
     """Frames' own motion, its rotation held to what a gyro that is believed tells."""
-    assert camera.lenses.readout_motion is not None
-    beside = camera.lenses.readout_motion - camera.readout_s * velocities
-    sigmas, turning = readout.own_sigmas(camera, velocities), context.turning
-    if turning is None or not camera.by_gyro:
-        return OwnMotion(beside, sigmas, np.zeros(len(beside), bool), np.inf)
-    sigma = max(camera.readout_s * turning.rate_sigma, _LEAST_TURN)
-    return OwnMotion(beside, sigmas, np.all(np.isfinite(turning.rates), axis=1), sigma)
+    num, turning = len(velocities), context.turning
+    beside, told, of_frame = np.zeros((num, 6)), np.zeros(num, bool), np.zeros(num, np.int64)
+    sigmas, told_sigmas = list[np.ndarray](), list[float]()
+    for number, camera in enumerate(cameras.each):
+        rows, sigma = cameras.frames_of(number, num), np.inf
+        of_frame[rows] = number
+        if camera.lenses.readout_motion is None:
+            sigmas.append(np.ones(6))  # nothing acts on these: they stay at zero
+            told_sigmas.append(sigma)
+            continue
+        own = camera.lenses.readout_motion - camera.readout_s * velocities
+        beside[rows] = own[rows]
+        sigmas.append(readout.own_sigmas(camera, velocities[rows]))
+        if turning is not None and camera.by_gyro:
+            sigma = max(camera.readout_s * turning.rate_sigma, _LEAST_TURN)
+            told[rows] = np.all(np.isfinite(turning.rates), axis=1)[rows]
+        told_sigmas.append(sigma)
+    return OwnMotion(beside, tuple(sigmas), told, tuple(told_sigmas), of_frame)
 
 
 def _add(

@@ -11,7 +11,7 @@ from gsba.bundle import adjustment
 from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.cross_validation import Verdict, cross_validate
 from gsba.bundle.shared_parameters import PARTS, BySharedParameters, SharedModel, models_of
-from gsba.camera.lens import ONE_CENTRE, Lenses
+from gsba.camera.cameras import ONE_CAMERA, Cameras
 from gsba.camera.rig import CubeRig, owner_faces
 from gsba.types import Counts, Keypoints, Round, Sighted, Solution
 
@@ -69,7 +69,7 @@ def estimate(
     before: Solution,
     field: SphereField,
     context: AdjustmentContext,
-    lenses: Lenses = ONE_CENTRE,
+    lenses: Cameras = ONE_CAMERA,
 ) -> Stitching:
     """Find the field, by cross-validation over parts of the sequence, and solve the map with it.
 
@@ -116,7 +116,7 @@ def estimate(
 
 
 def _systems(
-    now: Stitching, most: int, max_degree: int, context: AdjustmentContext, lenses: Lenses
+    now: Stitching, most: int, max_degree: int, context: AdjustmentContext, lenses: Cameras
 ) -> tuple[list[SharedModel], Counts]:
     """Models of the cost of each part of the sequence; none where there is too little."""
     there, solved = lenses.seen(corrected(now.keypoints, now.field, context.rig)), now.adjustment

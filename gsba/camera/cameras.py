@@ -21,6 +21,11 @@ class Cameras:
     of_frame: tuple[int, ...] = ()  # (F,) index of each frame's camera; () = there is one camera
 
     @classmethod
+    def plain(cls, frames: FrameSet) -> "Cameras":
+        """One centre for each camera of some frames."""
+        return cls((ONE_CENTRE,) * len(frames.formats), frames.camera_of_frame)
+
+    @classmethod
     def of(cls, lenses: "Lenses | Cameras", frames: FrameSet) -> "Cameras":
         """The cameras of some frames, given as such or as lenses through which all were taken."""
         if isinstance(lenses, Cameras) and lenses.of_frame == frames.camera_of_frame:
@@ -41,6 +46,11 @@ class Cameras:
         """
         (lenses,) = self.lenses
         return lenses
+
+    @property
+    def baseline(self) -> float:
+        """Largest distance between the first two lenses of a camera, map units."""
+        return max(lenses.baseline if lenses else 0.0 for lenses in self.lenses)
 
     @property
     def parts(self) -> tuple[tuple[bool, ...], ...]:

@@ -348,7 +348,7 @@ def _write_rig_config(
     if len(rigs) == 1:
         configs = [_rig_config(rigs[0], files[0].views, "")]
     else:
-        numbers = {name: frames.cameras[rows[0]] for name, rows in frames.recordings.items()}
+        numbers = {name: int(frames.cameras[rows[0]]) for name, rows in frames.recordings.items()}
         configs = [
             _rig_config(rigs[number], files[number].views, f"{recording}/")
             for recording, number in numbers.items()

@@ -71,6 +71,14 @@ def own_timestamps(frames: FrameSet) -> np.ndarray:
     return frames.timestamps - np.array(shifts) if shifts else frames.timestamps
 
 
+def names_of_cameras(frames: FrameSet) -> list[str]:
+    """Name of each camera: that of the first of its recordings; "" of the only one."""
+    names = [""] * len(frames.formats)
+    for name, rows in reversed(frames.recordings.items()):
+        names[frames.cameras[rows[0]]] = name
+    return names
+
+
 def _check_names(names: list[str]) -> None:
     """Refuse names of recordings that folders cannot have."""
     for name in names:

@@ -86,7 +86,7 @@ def match_along_epipolars(context: MatchContext, solved: Solution) -> Matches:
     refined = settings.pairs.refined
     chosen = pairs.adjacent(len(poses))
     lengths = np.linalg.norm(poses[chosen[:, 1], :3, 3] - poses[chosen[:, 0], :3, 3], axis=1)
-    apart = context.lenses.baseline  # a ray may start at either lens
+    apart = context.cameras.baseline  # a ray may start at either lens
     gates = [
         _gate(refined.rotation_deg, refined.direction + apart / max(length, 1e-12), settings)
         for length in lengths

@@ -13,6 +13,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
+from gsba.camera.cameras import ONE_CAMERA, Cameras
 from gsba.camera.lens import Lenses
 from gsba.camera.rig import cells_of
 from gsba.config import MatchingSettings, RefineSettings
@@ -340,7 +341,7 @@ class MatchContext:
     settings: RefineSettings  # settings of pairs, matching and verification
     workers: Workers  # workers that match pairs
     matcher: Matcher = guided  # compares two frames
-    lenses: Lenses = field(default_factory=Lenses)  # lenses of the keypoints
+    cameras: Cameras = ONE_CAMERA  # cameras of the keypoints
 
     def match(
         self,
@@ -353,9 +354,9 @@ class MatchContext:
         guided_only: bool = False,
     ) -> Matches:
         """Match frame pairs like `match`; `guided_only` replaces the matcher by guided search."""
-        if self.lenses:
+        if self.cameras:
             gates = [
-                replace(gate, lenses=self.lenses.of_frame(int(f1)))
+                replace(gate, lenses=self.cameras.at(int(f1)).of_frame(int(f1)))
                 for gate, (_, f1) in zip(gates, pairs, strict=True)
             ]
         frames = self.strongest if strongest else self.frames

@@ -8,7 +8,7 @@ import numpy as np
 from factors import tangent_basis
 from factors.patches import ALIGNED, REASONS, PatchSet, Sightings, expect, found_at
 from factors.sphere_field import SphereField
-from gsba.camera.lens import ONE_CENTRE, Lenses
+from gsba.camera.cameras import ONE_CAMERA, Cameras
 from gsba.camera.rig import CubeRig, owner_faces
 from gsba.config import PatchSettings
 from gsba.frames import panorama
@@ -88,7 +88,7 @@ def align(
     rig: CubeRig,
     settings: PatchSettings,
     workers: Workers,
-    lenses: Lenses = ONE_CENTRE,
+    lenses: Cameras = ONE_CAMERA,
     name: str = "align",
 ) -> Sighted:
     """Observe every point again, in the frames that should show it.
@@ -161,7 +161,7 @@ def _align_some(
     greys: panorama.Greys,
     settings: PatchSettings,
     workers: Workers,
-    lenses: Lenses,
+    lenses: Cameras,
     name: str,
     dropped: dict[str, int],
 ) -> _Aligned:
@@ -199,7 +199,7 @@ def _planes(
     normals_rig: np.ndarray,
     pixel: float,
     field: SphereField,
-    lenses: Lenses,
+    lenses: Cameras,
 ) -> _Planes:
     """Plane patches around the points (J,), in their hosts.
 
@@ -230,7 +230,7 @@ def _unblended(
     hosts: np.ndarray,
     points: np.ndarray,
     frames: np.ndarray,
-    lenses: Lenses,
+    lenses: Cameras,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Views of points (O,) in frames (O,) outside the band where two pictures are blended."""
     if not lenses:
@@ -246,7 +246,7 @@ def _projected_patches(
     world_T_rigs: np.ndarray,
     points: np.ndarray,
     frames: np.ndarray,
-    lenses: Lenses,
+    lenses: Cameras,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Patches of points (O,) in the rigs of their frames (O,), at unit distance: bearings (O, 3),
     axes (O, 3, 2), and rays (O, 3) to them from their hosts."""

@@ -13,7 +13,7 @@ from factors.sphere_image import SphereImage
 from gsba.bundle import adjustment, pose_variables, triangulation
 from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.optimizer import OptimizeResult, optimize
-from gsba.camera.lens import ONE_CENTRE, Lenses
+from gsba.camera.cameras import ONE_CAMERA, Cameras
 from gsba.config import PhotometricSettings, RefineSettings
 from gsba.frames.masks import load_weights
 from gsba.log import GsbaError, track
@@ -74,7 +74,7 @@ def refine(
     keypoints: Keypoints,
     start: Solution,
     context: AdjustmentContext,
-    lenses: Lenses = ONE_CENTRE,
+    lenses: Cameras = ONE_CAMERA,
 ) -> PhotometricResult:
     """Refine a solved map by the grey values of patches, level after level.
 
@@ -107,7 +107,7 @@ def _patches(
     level: int,
     settings: RefineSettings,
     num_threads: int,
-    lenses: Lenses,
+    lenses: Cameras,
 ) -> tuple[PatchPixels | None, np.ndarray, list[Counts]]:
     """Pixels of the patches and observations that are accepted, if any; weights; the counts."""
     chosen, world_T_rigs = settings.photometric, solved.world_T_rigs
@@ -257,7 +257,7 @@ def joint(
     frame_weights: np.ndarray,
     settings: RefineSettings,
     num_threads: int,
-    lenses: Lenses = ONE_CENTRE,
+    lenses: Cameras = ONE_CAMERA,
 ) -> list[PatchGreys]:
     """The patches of a solved map, for a joint solve with another family; none if not selected.
 

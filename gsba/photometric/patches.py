@@ -8,7 +8,7 @@ import numpy as np
 from scipy.ndimage import correlate1d
 
 from factors.patch_windows import PatchTable, PatchViews, over_poles, patch_axes, pixel_grid
-from gsba.camera.lens import Lenses
+from gsba.camera.cameras import Cameras
 from gsba.camera.sphere import around_seam, bearings_from_erp, erp_from_bearings
 from gsba.config import PhotometricSettings
 from gsba.frames.masks import load_usable
@@ -166,7 +166,7 @@ def table_of(
     landmarks: Landmarks,
     width: int,
     settings: PhotometricSettings,
-    lenses: Lenses,
+    lenses: Cameras,
 ) -> tuple[PatchTable, Counts]:
     """Patches of all frames with planes from the map, and the frames near each host.
 
@@ -212,7 +212,7 @@ def table_of(
     return table, Counts(received, len(plane), "patches", dropped)
 
 
-def views_of(table: PatchTable, world_T_rigs: np.ndarray, lenses: Lenses) -> PatchViews:
+def views_of(table: PatchTable, world_T_rigs: np.ndarray, lenses: Cameras) -> PatchViews:
     """Views of a table's patches through the lenses of host and target frames."""
     rig_T_hosts = lenses.views(table.bearings_rig, table.hosts)
     world_T_hosts = (world_T_rigs[table.hosts] @ rig_T_hosts)[table.owners]

@@ -17,7 +17,6 @@ from gsba.bundle.gauge import Gauge
 from gsba.bundle.lens_centres import baseline_of
 from gsba.bundle.map_strength import MapStrength
 from gsba.bundle.reconstruction import assemble, world_scale
-from gsba.camera.lens import ONE_CENTRE
 from gsba.camera.optics import Optics
 from gsba.camera.views import scenes_around
 from gsba.imu.gravity import up_axis
@@ -28,6 +27,7 @@ from gsba.matching import correspondences
 from gsba.photometric import direct
 from gsba.photometric.direct import PhotometricResult
 from gsba.pipeline.state import MapMatches, State
+from gsba.placement.placement import metres_per_unit
 from gsba.splat import refinement
 from gsba.splat.refinement import SplatResult
 from gsba.store.store import digest
@@ -94,7 +94,7 @@ def tracks_of(state: State) -> Tracks:
     keypoints, parts = state.observed.keypoints, state.prior.parts
     tied = [connectivity.within(matches, parts) for matches in state.matches.sets()]
     found = tracks.build(tied, np.diff(keypoints.starts))
-    return state.observed.lenses.clear(found, keypoints)
+    return state.observed.cameras.clear(found, keypoints)
 
 
 def separate_parts(state: State) -> np.ndarray | None:
@@ -184,8 +184,8 @@ def refine_photometric(state: State) -> State:
 
     def compute() -> PhotometricResult:
         frames, keypoints = map_.straightened(run.frames), map_.keypoints(run.rig)
-        lenses, context = map_.lenses.cut_anew(), state.adjustment_context()
-        return direct.refine(frames, keypoints, solution, context, lenses)
+        cameras, context = map_.lenses.cut_anew(), state.adjustment_context()
+        return direct.refine(frames, keypoints, solution, context, cameras)
 
     found = run.stage("photometric", key, compute, PhotometricResult)
     map_ = replace(map_, solution=found.adjustment, frame_weights=found.frame_weights)
@@ -200,9 +200,9 @@ def refine_on_splat(state: State) -> State:
 
     def compute() -> SplatResult:
         frames, start = map_.straightened(run.frames), digest(key, solution.world_T_rigs.tolist())
-        lenses = map_.lenses.cut_anew() if map_.lenses else ONE_CENTRE
+        cameras = map_.lenses.cut_anew()
         weights = map_.frame_weights
-        patches = direct.joint(frames, solution, weights, settings, run.num_threads, lenses)
+        patches = direct.joint(frames, solution, weights, settings, run.num_threads, cameras)
         places, seen = solution.landmarks.points_world, solution.landmarks.tracks
         around = scenes_around(solution.world_T_rigs, places, seen.points, seen.frames)
         return refinement.refine(
@@ -212,7 +212,7 @@ def refine_on_splat(state: State) -> State:
             state.adjustment_context().beside(*patches),
             turns,
             start,
-            Optics(lenses, around),
+            Optics(cameras.only, around),
         )
 
     found = run.stage("splat", key, compute, SplatResult)
@@ -260,12 +260,35 @@ def reconstruct(
             formats=frames.formats,
             vertical=_vertical(state, result),
         )
-        if map_.lenses and map_.centres is not None:
-            baseline = baseline_of(map_.centres, world_scale(solution, result))
-            result = replace(result, lens_baseline=baseline)
+        baseline = _baseline(state, world_scale(solution, result))
+        result = replace(result, lens_baseline=baseline)
         return result if amended is None else amended(result)
 
     return run.stage("reconstruction", run.solving_key(), compute, Reconstruction)
+
+
+def _baseline(state: State, scale: float) -> tuple[float, float] | None:
+    """Distance of the lenses of the first camera whose distance is published, else of the first
+    one that has two, and its standard deviation; None = none has two.
+
+    Published distances of other cameras say the same of the map's scale: they are averaged.
+
+    Args:
+        scale: units of the result per map unit.
+    """
+    run, found = state.run, list[tuple[tuple[float, float], tuple[float, float] | None]]()
+    for number, camera in enumerate(state.map.cameras):
+        if camera.centres is not None and camera.lenses:
+            published = run.settings_of(number).baseline()
+            found.append((baseline_of(camera.centres, scale), published))
+    known = [(own, published) for own, published in found if published is not None]
+    if len(known) < 2:
+        return None if not found else (known or found)[0][0]
+    metres = np.array([metres_per_unit(own, published) for own, published in known])
+    weights = metres[:, 1] ** -2.0
+    mean = float(weights @ metres[:, 0] / weights.sum())
+    length = known[0][1][0] / mean
+    return length, length * float(weights.sum() ** -0.5) / mean
 
 
 def _vertical(state: State, result: Reconstruction) -> np.ndarray | None:

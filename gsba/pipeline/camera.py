@@ -21,6 +21,7 @@ from gsba.bundle import (
 )
 from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.camera_adjustment import solve_sighted_with_camera, solve_with_camera
+from gsba.bundle.camera_estimates import CameraEstimates, seen_by
 from gsba.bundle.camera_system import CameraCovariances, CameraSystem
 from gsba.bundle.lens_axes import LensAxes
 from gsba.bundle.lens_centres import LensCentres, StitchRadius
@@ -29,8 +30,9 @@ from gsba.bundle.reconstruction import world_scale
 from gsba.bundle.self_calibration import SelfCalibration
 from gsba.camera.cameras import Cameras
 from gsba.camera.fisheye import Rig, turned
-from gsba.camera.lens import Lenses
+from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.frames.dual_fisheye import SEAM
+from gsba.frames.recordings import names_of_cameras
 from gsba.pipeline import backend, frontend
 from gsba.pipeline.map import Map
 from gsba.pipeline.run import Run
@@ -39,6 +41,9 @@ from gsba.trajectory.axes import quarter_turn
 from gsba.types import CoarsePoses, Keypoints, PoseSource, Reconstruction, Sighted, Solution
 
 T = TypeVar("T")
+
+Cuts = tuple[tuple[Rig, bool] | None, ...]  # (C,) calibration to cut raw frames of each camera by,
+# and whether it was estimated; None = they are cut well
 
 logger = logging.getLogger(__name__)
 
@@ -49,98 +54,156 @@ _MIN_RECUT_RAD = np.deg2rad(0.03)  # change of bearings for which raw frames are
 
 
 def find_camera(state: State, prefix: str = "") -> State:
-    """Lenses and readout, before gates take what tells of them; and the map that these give.
+    """Lenses and readout of each camera, before gates take what tells of them; and the map that
+    these give.
 
-    The state's matches stay: the map is matched from itself afterwards.
+    Each camera is judged by what its own frames observe, the rays of others as they are so far;
+    then all cameras are solved for together. The state's matches stay: the map is matched from
+    itself afterwards.
 
     Args:
         state: of the run; it stays as it is where one centre explains the images.
-        prefix: of the names of stages.
+        prefix: of the names of stages. With one, only cameras are looked for that were not found
+            before.
     """
-    run = state.run
-    if len(run.frames.formats) > 1:
-        return state
-    if run.settings.camera.model == "central" or not run.frames.format.panoramic:
-        return state
-    raw = run.frames.format.fisheyes is not None
-    found = _find_raw_camera(state) if raw else _find_two_lenses(state, prefix)
+    sought = sought_cameras(state, again=bool(prefix))
+    found = _find_lenses(state, sought, prefix) if sought else state
     return replace(found, matches=state.matches)
 
 
-def _find_two_lenses(state: State, prefix: str) -> State:
+def sought_cameras(state: State, again: bool = False) -> list[int]:
+    """Cameras that may have several lenses, and are one centre so far.
+
+    Args:
+        state: of the run.
+        again: leave raw lenses out, which are known to be several from the start.
+    """
+    run = state.run
+    if run.settings.camera.model == "central":
+        return []
+    return [
+        number
+        for number, (kind, found) in enumerate(
+            zip(run.frames.formats, state.map.cameras, strict=True)
+        )
+        if kind.panoramic and not found.lenses and not (again and kind.fisheyes is not None)
+    ]
+
+
+def _find_lenses(state: State, sought: Sequence[int], prefix: str) -> State:
     """Lenses on trial, judged by what is matched with them; then the radius of stitching."""
-    settings, shown = state.run.settings, state.observed.shown
-    yaws, guess = settings.camera.lens_yaws_deg, None
-    trial = state.through(Lenses() if yaws is None else Lenses.ring(np.deg2rad(yaws)))
-    if not _axes_known(state.run):
-        guess = _from_features(trial, f"{prefix}axes", _guessed_axes, LensAxes)
-        trial = trial.through(guess.lenses)
-    band, gates = float(np.deg2rad(settings.camera.seam_deg)), settings.rounds.loops
-    trial = trial.through(replace(trial.observed.lenses, band_rad=band))
+    run, settings = state.run, state.run.settings
+    trial, guesses = _on_trial(state, sought, prefix)
+    gates, map_, raw = settings.rounds.loops, state.map, _raw_cameras(run)
+    left = list(sought)
     for n in range(2):
-        name = f"{prefix}lenses{n}"
-        found = _from_features(trial, name, _centres, LensCentres, noted=True)
-        if not found.lenses:
-            return replace(state, map=Map.of(state.solution, shown, found))
-        trial = backend.adjust(trial.through(found.lenses), f"{prefix}lensed{n}", gates)
+        lenses = list(trial.observed.cameras.lenses)
+        for camera in left:
+            name = _named(run, f"{prefix}lenses{n}", camera)
+            centres = _from_features(trial, name, camera, _centres, LensCentres, noted=True)
+            map_, lenses[camera] = map_.changed(camera, centres=centres), centres.lenses
+        left = [camera for camera in left if lenses[camera]]
+        if not left:
+            return replace(state, map=map_)
+        cameras = trial.observed.cameras.with_lenses([one if one else ONE_CENTRE for one in lenses])
+        trial = backend.adjust(trial.through(cameras), f"{prefix}lensed{n}", gates)
         gates = settings.rounds.dense
-        if n == 0:
+        if n == 0 and set(left) - set(raw):
             trial = frontend.match_along_epipolars(trial, f"{prefix}adjacent_lenses")
             trial = frontend.match_known_points(trial, f"{prefix}wide_lenses")
-    radius = _from_features(trial, f"{prefix}stitch_radius", _stitch_radius, StitchRadius)
-    if not radius.reason:
-        trial = backend.adjust(trial.through(radius.lenses), f"{prefix}lensed2", gates)
-    map_ = replace(Map.of(trial.solution, shown, found), axes=guess, radius=radius)
-    return _settle_camera(replace(trial, map=map_), f"{prefix}settled")
+    lenses, bent = list(trial.observed.cameras.lenses), False
+    for camera in left:
+        if camera not in raw:
+            name = _named(run, f"{prefix}stitch_radius", camera)
+            radius = _from_features(trial, name, camera, _stitch_radius, StitchRadius)
+            map_ = map_.changed(camera, axes=guesses.get(camera), radius=radius)
+            if not radius.reason:
+                lenses[camera], bent = radius.lenses, True
+    if bent:
+        cameras = trial.observed.cameras.with_lenses(lenses)
+        trial = backend.adjust(trial.through(cameras), f"{prefix}lensed2", gates)
+    trial = replace(trial, map=replace(map_, solution=trial.solution))
+    trial = _settle_cameras(trial, f"{prefix}settled")
+    return _calibrate_raw(trial, [camera for camera in left if camera in raw])
 
 
-def _find_raw_camera(state: State) -> State:
-    """Raw lenses: where they are, then their calibration."""
-    run, shown, gates = state.run, state.observed.shown, state.run.settings.rounds.loops
-    fisheyes = run.frames.format.fisheyes
-    assert fisheyes is not None
-    trial = state.through(Lenses.of_raw(fisheyes, float(SEAM)))
-    for n in range(2):
-        found = _from_features(trial, f"lenses{n}", _centres, LensCentres, noted=True)
-        trial = backend.adjust(trial.through(found.lenses), f"lensed{n}", gates)
-        gates = run.settings.rounds.dense
-    trial = replace(trial, map=Map.of(trial.solution, shown, found))
-    trial = _settle_camera(trial, "settled")
-    if run.lenses_found:  # patches say more of them than features do
-        camera = trial.map.camera()
-        free = replace(camera.lenses, fisheyes=camera.lenses.reference_calibration)
-        return trial.with_camera(replace(camera, lenses=free))
-    known = _from_features(trial, "calibrated", _calibration, SelfCalibration)
-    trial = replace(trial, map=replace(trial.map, calibrated=known))
-    if known.reason:
+def _on_trial(
+    state: State, sought: Sequence[int], prefix: str
+) -> tuple[State, dict[int, LensAxes]]:
+    """The state seen through lenses that centres are looked for, and guesses of stitched ones'
+    axes."""
+    run, guesses = state.run, dict[int, LensAxes]()
+    trial, raw = state, _raw_cameras(run)
+    for camera in sought:
+        own = run.settings_of(camera)
+        yaws, band = own.lens_yaws_deg, float(np.deg2rad(own.seam_deg))
+        if camera in raw:
+            fisheyes = run.frames.formats[camera].fisheyes
+            assert fisheyes is not None
+            trial = _through(trial, camera, Lenses.of_raw(fisheyes, float(SEAM)))
+            continue
+        lenses = Lenses() if yaws is None else Lenses.ring(np.deg2rad(yaws))
+        trial = _through(trial, camera, lenses)
+        if not _axes_known(run, camera):
+            name = _named(run, f"{prefix}axes", camera)
+            guesses[camera] = _from_features(trial, name, camera, _guessed_axes, LensAxes)
+            lenses = guesses[camera].lenses
+        trial = _through(trial, camera, replace(lenses, band_rad=band))
+    return trial, guesses
+
+
+def _through(state: State, camera: int, lenses: Lenses) -> State:
+    """The state with keypoints of one camera as rays of other lenses."""
+    every = list(state.observed.cameras.lenses)
+    every[camera] = lenses
+    return state.through(state.observed.cameras.with_lenses(every))
+
+
+def _calibrate_raw(trial: State, raw: Sequence[int]) -> State:
+    """The state with the calibration of raw cameras, where images tell it."""
+    run, free = trial.run, False
+    for camera in raw:
+        lenses = trial.map.cameras[camera].lenses
+        if run.lenses_found_of(camera):  # patches say more of them than features do
+            lenses = replace(lenses, fisheyes=lenses.reference_calibration)
+            trial = trial.with_lenses(camera, lenses)
+            continue
+        name = _named(run, "calibrated", camera)
+        known = _from_features(trial, name, camera, _calibration, SelfCalibration)
+        trial = replace(trial, map=trial.map.changed(camera, calibrated=known))
+        if not known.reason:
+            trial, free = trial.with_lenses(camera, known.lenses), True
+    if not free:
         return trial
-    trial = trial.with_camera(replace(trial.map.camera(), lenses=known.lenses))
-    trial = _settle_camera(trial.through(trial.map.lenses), "recalibrated")
+    trial = _settle_cameras(trial.through(trial.map.lenses), "recalibrated")
     for n in range(_MAX_RECALIBRATIONS):
-        before = trial.map.lenses
+        before = trial.map.lenses.lenses
         trial = frontend.match_along_epipolars(trial, f"adjacent_raw{n}")
         trial = frontend.match_known_points(trial, f"wide_raw{n}")
-        trial = _settle_camera(trial, f"calibrated{n}")
-        if self_calibration.apart(before, trial.map.lenses) < _MIN_RECALIBRATION_RAD:
+        trial = _settle_cameras(trial, f"calibrated{n}")
+        pairs = zip(before, trial.map.lenses.lenses, strict=True)
+        if max(self_calibration.apart(*pair) for pair in pairs) < _MIN_RECALIBRATION_RAD:
             break
     return trial
 
 
-def _settle_camera(state: State, name: str) -> State:
-    """Map and camera solved together, after a first estimate of how rows are read."""
-    run, camera = state.run, state.map.camera()
-    if camera.lenses.readout_motion is None:
-        found = f"{name}_readout"
-        camera = _from_features(state, found, _readout, CameraEstimate, noted=True)
+def _settle_cameras(state: State, name: str) -> State:
+    """Map and cameras solved together, after a first estimate of how rows are read."""
+    run, found = state.run, state.map.estimates()
+    for camera, one in enumerate(found.each):
+        if one.lenses and one.lenses.readout_motion is None:
+            stage = _named(run, f"{name}_readout", camera)
+            read = _from_features(state, stage, camera, _readout, CameraEstimate, noted=True)
+            found = found.changed(camera, lambda _, read=read: read)
     rounds = run.settings.rounds
     gates = rounds.gate_scale, *rounds.dense  # a camera that is off throws observations off
-    state = state.through(camera.lenses)
+    state = state.through(found.cameras)
 
-    def compute() -> tuple[Solution, CameraEstimate]:
+    def compute() -> tuple[Solution, CameraEstimates]:
         return solve_with_camera(
             backend.tracks_of(state),
             state.observed.shown,
-            camera,
+            found,
             run.frames.timestamps,
             state.solution,
             state.adjustment_context(),
@@ -148,42 +211,53 @@ def _settle_camera(state: State, name: str) -> State:
             final=False,
         )
 
-    key = [_settings_of_camera(run), gates]
-    solved, camera = run.stage(name, key, compute, tuple[Solution, CameraEstimate])
-    return state.with_solution(solved).with_camera(camera).through(camera.lenses)
+    key = [_settings_of_cameras(run), gates]
+    solved, settled = run.stage(name, key, compute, tuple[Solution, CameraEstimates])
+    return state.with_solution(solved).with_cameras(settled).through(settled.cameras)
 
 
 def take_parts_from_patches(state: State, sighted: Sighted, name: str, number: int) -> State:
-    """The map with the parts of a camera that aligned patches show; its poses are yet to follow.
+    """The map with the parts of cameras that aligned patches show; its poses are yet to follow.
 
     Args:
-        state: of the run; its map has two lenses.
+        state: of the run; its map has two lenses somewhere.
         sighted: observations that patches were aligned to.
         name: of the round's stages.
         number: of the estimate in this round. The first finds how rows are read, the second which
             axes and calibration lenses have, as far as these are not known by then.
     """
-    raw = state.run.frames.format.fisheyes is not None
-    if number == 0 and state.map.lenses.readout_motion is None:
-        found = f"readout_{name}"
-        state = state.with_camera(
-            _from_patches(state, sighted, found, _readout, CameraEstimate, noted=True)
-        )
-    if number == 1 and raw and state.map.lenses.fisheyes is None:  # the rest has settled
-        found = f"calibrated_{name}"
-        known = _from_patches(state, sighted, found, _calibration, SelfCalibration, noted=True)
-        state = replace(state, map=replace(state.map, calibrated=known))
-        state = state.with_camera(replace(state.map.camera(), lenses=known.lenses))
-    if number == 1 and not _axes_known(state.run) and state.map.lenses.axes is None:
-        axes = _from_patches(state, sighted, f"axes_{name}", _loose_axes, LensAxes, noted=True)
-        state = replace(state, map=replace(state.map, axes=axes))
-        state = state.with_camera(replace(state.map.camera(), lenses=axes.lenses))
+    for camera, one in enumerate(state.map.cameras):
+        if one.lenses:
+            state = _take_parts(state, sighted, name, number, camera)
+    return state
+
+
+def _take_parts(state: State, sighted: Sighted, name: str, number: int, camera: int) -> State:
+    """As `take_parts_from_patches`, of one camera."""
+    run, lenses = state.run, state.map.cameras[camera].lenses
+    given = state, sighted
+    if number == 0 and lenses.readout_motion is None:
+        found = _named(run, f"readout_{name}", camera)
+        read = _from_patches(*given, found, camera, _readout, CameraEstimate, noted=True)
+        estimates = state.map.estimates()
+        return state.with_cameras(estimates.changed(camera, lambda _: read))
+    if number == 1 and camera in _raw_cameras(run) and lenses.fisheyes is None:  # the rest has
+        # settled
+        found = _named(run, f"calibrated_{name}", camera)
+        known = _from_patches(*given, found, camera, _calibration, SelfCalibration, noted=True)
+        state = replace(state, map=state.map.changed(camera, calibrated=known))
+        state = state.with_lenses(camera, known.lenses)
+    if number == 1 and not _axes_known(run, camera) and lenses.axes is None:
+        found = _named(run, f"axes_{name}", camera)
+        axes = _from_patches(state, sighted, found, camera, _loose_axes, LensAxes, noted=True)
+        state = replace(state, map=state.map.changed(camera, axes=axes))
+        state = state.with_lenses(camera, axes.lenses)
     return state
 
 
 def adjust_with_patches(
     state: State, sighted: Sighted, name: str, gates: Sequence[float] | None = None
-) -> tuple[Solution, Keypoints, CameraEstimate]:
+) -> tuple[Solution, Keypoints, CameraEstimates]:
     """Aligned observations solved for poses, points and camera.
 
     Args:
@@ -198,11 +272,11 @@ def adjust_with_patches(
     run, map_ = state.run, state.map
     gates = run.settings.rounds.aligned if gates is None else gates
 
-    def compute() -> tuple[Solution, Keypoints, CameraEstimate]:
+    def compute() -> tuple[Solution, Keypoints, CameraEstimates]:
         shown = stitching.corrected(sighted.keypoints, map_.field, run.rig)
         solved, found, camera = solve_sighted_with_camera(
             replace(sighted, keypoints=shown),
-            map_.camera(),
+            map_.estimates(),
             run.frames.timestamps,
             map_.solution,
             state.adjustment_context(),
@@ -210,52 +284,67 @@ def adjust_with_patches(
         )
         return solved, stitching.with_noise_of(sighted.keypoints, found), camera
 
-    returns = tuple[Solution, Keypoints, CameraEstimate]
-    return run.stage(name, [*_settings_of_camera(run), gates], compute, returns)
+    returns = tuple[Solution, Keypoints, CameraEstimates]
+    return run.stage(name, [*_settings_of_cameras(run), gates], compute, returns)
 
 
 def measure_camera(state: State) -> State:
-    """Marginal covariances of poses and camera, adjusted together."""
+    """Marginal covariances of poses and cameras, adjusted together."""
     map_ = state.map
-    if map_.centres is None or not map_.lenses:
+    if not map_.lenses:
         return state
 
     def compute() -> CameraCovariances:
         straight = stitching.corrected(map_.observed, map_.field, state.run.rig)
         times, context = state.run.frames.timestamps, state.adjustment_context()
-        system = CameraSystem(map_.solution, straight, map_.camera(), times, context)
+        system = CameraSystem(map_.solution, straight, map_.estimates(), times, context)
         return system.covariances(state.prior.parts)
 
-    key = _settings_of_camera(state.run)
-    found = state.run.stage("camera", key, compute, CameraCovariances, noted=False)
-    camera = map_.camera()
-    sigma = readout.total_sigma(camera, found.readout_sigma)
-    centres = replace(map_.centres, covariance=found.centre)
-    state = replace(state, map=replace(map_, centres=centres, covariances=found))
-    return state.with_camera(replace(camera, readout_sigma=sigma))
+    key = _settings_of_cameras(state.run)
+    measured = state.run.stage("camera", key, compute, CameraCovariances, noted=False)
+    map_ = replace(map_, covariances=measured)
+    for camera, (one, sigmas) in enumerate(zip(map_.cameras, measured.cameras, strict=True)):
+        if one.centres is None or not one.lenses:
+            continue
+        found = one.estimate()
+        found = replace(found, readout_sigma=readout.total_sigma(found, sigmas.readout_sigma))
+        centres = replace(one.centres, covariance=sigmas.centre)
+        changed = replace(one, centres=centres).with_estimate(found)
+        map_ = map_.changed(camera, centres=changed.centres, readout=changed.readout)
+    return replace(state, map=map_)
 
 
 def keep_lenses(state: State, result: Reconstruction) -> Cameras:
     """The cameras of a map in the unit of the result that it became, for later exports."""
-    cameras = Cameras.of(state.map.lenses, state.run.frames)
+    cameras = state.map.lenses
     if not cameras:
         return cameras
     cameras = cameras.scaled(world_scale(state.solution, result)).cut_anew()
     return state.run.stage("lenses", [], lambda: cameras, Cameras, noted=False)
 
 
-def better_calibration(coarse: CoarsePoses, map_: Map) -> tuple[Rig, bool] | None:
-    """The calibration to cut raw frames by in the next pass, in the trajectory's axes.
+def better_calibration(coarse: CoarsePoses, map_: Map) -> Cuts | None:
+    """The calibrations to cut raw frames by in the next pass, in the trajectory's axes.
 
     Returns:
-        The calibration, and whether it was estimated; None = frames are cut well.
+        For each camera the calibration, and whether it was estimated; None = its frames are cut
+        well, or all are.
     """
-    lenses = map_.lenses
+    found = [_better(coarse, map_, camera) for camera in range(len(map_.cameras))]
+    return tuple(found) if any(found) else None
+
+
+def _better(coarse: CoarsePoses, map_: Map, camera: int) -> tuple[Rig, bool] | None:
+    lenses = map_.cameras[camera].lenses
     if lenses.reference_calibration is None:
         return None
     found, turn = self_calibration.now(lenses), np.eye(3)
-    if (coarse.sources == PoseSource.SLAM).any():
-        turn = quarter_turn(coarse, map_.solution.world_T_rigs)
+    rows = map_.lenses.frames_of(camera, len(coarse.sources))
+    own = replace(
+        coarse, world_T_rigs=coarse.world_T_rigs[rows], sources=coarse.sources[rows], segments=None
+    )
+    if (own.sources == PoseSource.SLAM).any():
+        turn = quarter_turn(own, map_.solution.world_T_rigs[rows])
     off = self_calibration.apart(lenses, replace(lenses, fisheyes=None))
     if off < _MIN_RECUT_RAD and np.array_equal(turn, np.eye(3)):
         return None
@@ -271,6 +360,7 @@ class _Observations:
     keypoints: Keypoints  # of its observations, as rays of the camera so far
     pictured: Keypoints  # these keypoints where pictures show them
     camera: CameraEstimate  # so far
+    number: int  # of the camera
     state: State  # priors, times, settings
 
     @property
@@ -281,7 +371,7 @@ class _Observations:
     @property
     def context(self) -> AdjustmentContext:
         """Priors, loss and settings."""
-        return self.state.adjustment_context()
+        return self.state.adjustment_context().of_camera(self.number)
 
     @property
     def times(self) -> np.ndarray:
@@ -317,7 +407,7 @@ def _calibration(of: _Observations) -> SelfCalibration:
     landmarks, lenses, nominal = (
         of.solution.landmarks,
         of.camera.lenses,
-        of.state.run.frames.format.lenses_nominal,
+        of.state.run.frames.formats[of.number].lenses_nominal,
     )
     return self_calibration.estimate(
         landmarks, of.keypoints, of.shown, of.solution, lenses, of.context, nominal
@@ -334,74 +424,90 @@ def _readout(of: _Observations) -> CameraEstimate:
 def _from_features(
     state: State,
     name: str,
+    number: int,
     estimate: Callable[[_Observations], T],
     returns: type[T],
     *,
     noted: bool = False,
 ) -> T:
-    """An estimate from points of the state's matches with all that is within a gate.
+    """An estimate of one camera from points of the state's matches with all that is within a gate.
 
     Observations that one centre threw off are far: the gate is wide until there are two, and
     poses count as unsure as it is wide.
 
     Args:
         state: of the run.
+        number: of the camera.
         name, returns, noted: of the stage, see `Run.stage`.
         estimate: makes the result.
     """
     run, observed, solution = state.run, state.observed, state.solution
+    lenses = observed.cameras.lenses[number]
     least = run.settings.rounds.gate_scale
-    gate = least if observed.lenses else _WIDE_GATE_SIGMAS
+    gate = least if lenses else _WIDE_GATE_SIGMAS
 
     def compute() -> T:
-        tracks = backend.tracks_of(state)
+        tracks = seen_by(backend.tracks_of(state), observed.cameras.of_frame, number)
         placed = state.triangulated(tracks, observed.keypoints, gate * solution.noise)
         wide = replace(solution, landmarks=placed, noise=solution.noise * gate / least)
-        camera = CameraEstimate(observed.lenses)
-        return estimate(_Observations(wide, observed.keypoints, observed.shown, camera, state))
+        given = observed.keypoints, observed.shown, CameraEstimate(lenses), number, state
+        return estimate(_Observations(wide, *given))
 
-    return run.stage(name, _settings_of_camera(run), compute, returns, noted=noted)
+    return run.stage(name, _settings_of_cameras(run), compute, returns, noted=noted)
 
 
 def _from_patches(
     state: State,
     sighted: Sighted,
     name: str,
+    number: int,
     estimate: Callable[[_Observations], T],
     returns: type[T],
     *,
     noted: bool = False,
 ) -> T:
-    """An estimate from aligned patches; arguments as for `_from_features`."""
+    """An estimate of one camera from aligned patches; arguments as for `_from_features`."""
     run, map_ = state.run, state.map
 
     def compute() -> T:
         there = replace(sighted, keypoints=map_.rays(sighted.keypoints, run.rig))
         there = adjustment.rescale_noise(there, map_.solution, run.settings)
         gate = run.settings.rounds.aligned[0]
-        placed = state.triangulated(there.tracks, there.keypoints, gate)
+        tracks = seen_by(there.tracks, map_.of_frame, number)
+        placed = state.triangulated(tracks, there.keypoints, gate)
         solution = replace(map_.solution, noise=1.0, landmarks=placed)
         shown = stitching.corrected(sighted.keypoints, map_.field, run.rig)
-        return estimate(_Observations(solution, there.keypoints, shown, map_.camera(), state))
+        camera = map_.cameras[number].estimate()
+        return estimate(_Observations(solution, there.keypoints, shown, camera, number, state))
 
-    return run.stage(name, _settings_of_camera(run), compute, returns, noted=noted)
+    return run.stage(name, _settings_of_cameras(run), compute, returns, noted=noted)
 
 
-def _axes_known(run: Run) -> bool:
+def _axes_known(run: Run, camera: int) -> bool:
     """True if no stabiliser has rotated panoramas against the lenses, or settings give the axes."""
-    return run.frames.format.lens_axes_known or run.settings.camera.lens_yaws_deg is not None
+    known = run.frames.formats[camera].lens_axes_known
+    return known or run.settings_of(camera).lens_yaws_deg is not None
 
 
-def _settings_of_camera(run: Run) -> list[object]:
-    """Settings that estimates of the camera rest on."""
-    camera = run.settings.camera
-    left_out = {"name", "baseline_mm", "readout_ms"}
-    left_out |= {"lens_yaws_deg"} if camera.lens_yaws_deg is None else set()
-    given = camera.model_dump(exclude=left_out)
-    return [
-        run.solving_key(),
-        given,
-        camera.readout(),
-        camera.inverse_stitch_radius(1.0),
-        run.settings.seed,
-    ]
+def _raw_cameras(run: Run) -> list[int]:
+    """Cameras whose frames are raw fisheyes."""
+    return [c for c, kind in enumerate(run.frames.formats) if kind.fisheyes is not None]
+
+
+def _named(run: Run, stage: str, camera: int) -> str:
+    """Name of a stage about one camera: of several, with the first recording of that camera."""
+    if len(run.frames.formats) == 1:
+        return stage
+    return f"{stage}@{names_of_cameras(run.frames)[camera]}"
+
+
+def _settings_of_cameras(run: Run) -> list[object]:
+    """Settings that estimates of the cameras rest on."""
+    found = list[object]()
+    for number in range(len(run.frames.formats)):
+        camera = run.settings_of(number)
+        left_out = {"name", "baseline_mm", "readout_ms"}
+        left_out |= {"lens_yaws_deg"} if camera.lens_yaws_deg is None else set()
+        given = camera.model_dump(exclude=left_out)
+        found += [given, camera.readout(), camera.inverse_stitch_radius(1.0)]
+    return [run.solving_key(), *found, run.settings.seed]

@@ -16,7 +16,7 @@ from gsba.frames.recordings import own_timestamps
 from gsba.localization.run_map import require_own_version
 from gsba.log import GsbaError
 from gsba.loop_closure.connectivity import by_size
-from gsba.pipeline.map import Map
+from gsba.pipeline.map import FoundCamera, Map
 from gsba.pipeline.state import State
 from gsba.similarity import Sim3
 from gsba.store.finished import load_run
@@ -209,7 +209,8 @@ def _map_of(map_: Map, rows: np.ndarray) -> Map:
     counts = replace(solution.counts, kept=len(points))
     landmarks = Landmarks(solution.landmarks.points_world[points], kept, counts)
     chosen = number[observed.frames()] >= 0
-    centres, readout = map_.centres, map_.readout
+    of_frame = np.array(map_.of_frame or (0,) * len(number))
+    used, numbers = np.unique(of_frame[rows], return_inverse=True)
     return replace(
         map_,
         solution=replace(
@@ -223,10 +224,20 @@ def _map_of(map_: Map, rows: np.ndarray) -> Map:
         frame_weights=map_.frame_weights[rows],
         aligned=None if map_.aligned is None else map_.aligned[chosen],
         normals_rig=None if map_.normals_rig is None else map_.normals_rig[chosen],
-        centres=centres and replace(centres, lenses=centres.lenses.taken(rows)),
-        readout=readout and replace(readout, lenses=readout.lenses.taken(rows)),
+        cameras=tuple(_camera_of(map_.cameras[c], rows) for c in used),
+        of_frame=tuple(numbers.tolist()) if len(used) > 1 else (),
         covariances=None,
         moves=(),
+    )
+
+
+def _camera_of(found: FoundCamera, rows: np.ndarray) -> FoundCamera:
+    """The camera of frames `rows` (F',)."""
+    centres, readout = found.centres, found.readout
+    return replace(
+        found,
+        centres=centres and replace(centres, lenses=centres.lenses.taken(rows)),
+        readout=readout and replace(readout, lenses=readout.lenses.taken(rows)),
     )
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from gsba import learned
+from gsba.camera.cameras import Cameras
 from gsba.config import RefineSettings
 from gsba.features import detection, extraction
 from gsba.features.extraction import FrameFeatures
@@ -54,7 +55,7 @@ def extract_more(state: State, weak: np.ndarray) -> State:
     found = _extract(run, settings, "features_closer", weak)
     each = [found if more else old for more, old in zip(weak, before.features, strict=True)]
     observed = _observe(run, "keypoints_closer", each, "features_closer")
-    return state.with_keypoints(observed.through(before.lenses))
+    return state.with_keypoints(observed.through(before.cameras))
 
 
 def _extract(
@@ -92,7 +93,7 @@ def _matchable(
         run.store.workers,
         learned.make_matcher(settings, run.weights, run.rig.size),
     )
-    return ObservedFrames(tuple(found), keypoints, context)
+    return ObservedFrames(tuple(found), keypoints, context, Cameras.plain(run.frames))
 
 
 def of_recording(state: State, number: int) -> State:

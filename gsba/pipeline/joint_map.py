@@ -15,7 +15,7 @@ from gsba.camera.lens import Lenses
 from gsba.frames.recordings import combine, own_timestamps
 from gsba.log import GsbaError
 from gsba.pipeline.finished_run import FinishedRun
-from gsba.pipeline.map import Map
+from gsba.pipeline.map import FoundCamera, Map
 from gsba.similarity import Sim3
 from gsba.types import Counts, FrameSet, Keypoints, Landmarks, PictureFormat, Solution, Tracks
 
@@ -51,8 +51,12 @@ class JointMaps:
         aligned = np.concatenate([confirmed for _, confirmed in observed])
         solution = _back_to_back(solutions, starts)
         parts = _parts_of(runs)
-        camera = _camera(runs, moves, solution, frames, seen_by)
-        known = runs[seen_by].map
+        known, scale = runs[seen_by].map, moves[seen_by].scale
+        if len(known.cameras) > 1:  # no other run can be joined to it
+            cameras = tuple(_in_unit(one, _scaled(one, scale), scale) for one in known.cameras)
+        else:
+            camera = _camera(runs, moves, solution, frames, seen_by)
+            cameras = (_in_unit(known.only, camera, scale),)
         map_ = Map(
             solution,
             keypoints,
@@ -60,11 +64,8 @@ class JointMaps:
             aligned,
             np.concatenate([_normals(run) for run in runs]),
             known.stitching,
-            _centres(known.centres, camera, moves[seen_by].scale),
-            known.axes,
-            known.radius and _rescaled(known.radius, moves[seen_by].scale),
-            known.calibrated,
-            camera,
+            cameras,
+            frames.camera_of_frame,
         )
         return cls(tuple(runs), moves, starts, frames, map_, parts, seen_by)
 
@@ -191,7 +192,8 @@ def _refuse_other_format(name: str, own: PictureFormat, run: FinishedRun) -> Non
 
 def _best_camera(runs: Sequence[FinishedRun]) -> int:
     """The run that knows most of the camera; of several the first one."""
-    known = [(bool(run.map.lenses), sum(run.map.lenses.parts)) for run in runs]
+    lenses = [run.map.lenses for run in runs]
+    known = [(bool(one), sum(map(sum, one.parts))) for one in lenses]
     return known.index(max(known))
 
 
@@ -276,14 +278,11 @@ def _camera(
     seen_by: int,
 ) -> CameraEstimate | None:
     """The camera of one run, for the frames of all; None = it has one centre."""
-    known = runs[seen_by].map
-    if not known.lenses:
-        return known.readout
-    found = known.camera()
-    lenses = known.lenses.scaled(moves[seen_by].scale)
-    own_sigmas = found.own_sigmas
-    if own_sigmas is not None:
-        own_sigmas = own_sigmas * np.repeat([1.0, moves[seen_by].scale], 3)
+    known = runs[seen_by].map.only
+    found = _scaled(known, moves[seen_by].scale)
+    if found is None or not known.lenses:
+        return found
+    lenses = found.lenses
     if lenses.readout_motion is not None:
         lenses = replace(
             lenses,
@@ -292,12 +291,31 @@ def _camera(
     if lenses.axes is not None:
         axes = [
             np.tile(np.eye(3), (len(run.frames), 1, 1))
-            if run.map.lenses.axes is None
-            else run.map.lenses.axes
+            if run.map.only.lenses.axes is None
+            else run.map.only.lenses.axes
             for run in runs
         ]
         lenses = replace(lenses, axes=np.concatenate(axes))
-    return replace(found, lenses=lenses, own_sigmas=own_sigmas)
+    return replace(found, lenses=lenses)
+
+
+def _scaled(found: FoundCamera, scale: float) -> CameraEstimate | None:
+    """A camera in another unit: one map unit is `scale` of the new ones; None = it has one centre
+    and was not looked for."""
+    if not found.lenses:
+        return found.readout
+    known = found.estimate()
+    own = known.own_sigmas
+    if own is not None:
+        own = own * np.repeat([1.0, scale], 3)
+    return replace(known, lenses=found.lenses.scaled(scale), own_sigmas=own)
+
+
+def _in_unit(found: FoundCamera, camera: CameraEstimate | None, scale: float) -> FoundCamera:
+    """What is known of a camera in another unit, with its estimate there."""
+    radius = found.radius and _rescaled(found.radius, scale)
+    centres = _centres(found.centres, camera, scale)
+    return FoundCamera(centres, found.axes, radius, found.calibrated, camera)
 
 
 def _readout_motion(
@@ -312,7 +330,7 @@ def _readout_motion(
     begin = 0
     for run, move in zip(runs, moves, strict=True):
         rows = np.arange(begin, begin + len(run.frames))
-        own = run.map.lenses.scaled(move.scale).readout_motion
+        own = run.map.only.lenses.scaled(move.scale).readout_motion
         if own is None:
             own = readout_s * velocities(solution.world_T_rigs[rows], times[rows])
         motion.append(own)

@@ -6,16 +6,47 @@ import numpy as np
 
 from factors.sphere_field import SphereField
 from gsba.bundle import stitching
+from gsba.bundle.camera_estimates import CameraEstimates
 from gsba.bundle.camera_system import CameraCovariances
 from gsba.bundle.lens_axes import LensAxes
 from gsba.bundle.lens_centres import LensCentres, StitchRadius
 from gsba.bundle.readout import CameraEstimate
 from gsba.bundle.self_calibration import SelfCalibration
 from gsba.bundle.stitching import Stitching
+from gsba.camera.cameras import Cameras
 from gsba.camera.lens import Lenses
 from gsba.camera.rig import CubeRig
 from gsba.splat.refinement import Move
 from gsba.types import FrameSet, Keypoints, Solution
+
+
+@dataclass(frozen=True, slots=True)
+class FoundCamera:
+    """One camera of a map, as estimates have found it."""
+
+    centres: LensCentres | None = None  # of the lenses that see it; None = not looked for
+    axes: LensAxes | None = None  # where these look; None = not looked for
+    radius: StitchRadius | None = None  # what panoramas are stitched for; None = not looked for
+    calibrated: SelfCalibration | None = None  # of raw pairs; None = not looked for
+    readout: CameraEstimate | None = None  # how lenses are read; None = not looked for
+
+    @property
+    def lenses(self) -> Lenses:
+        """What sees the observations."""
+        return Lenses() if self.centres is None else self.centres.lenses
+
+    def estimate(self) -> CameraEstimate:
+        """The lenses, and how they are read."""
+        if self.readout is None:
+            return CameraEstimate(self.lenses, reason="not looked for")
+        return replace(self.readout, lenses=self.lenses)
+
+    def with_estimate(self, found: CameraEstimate) -> "FoundCamera":
+        """The camera with other lenses, or read otherwise; one that was not looked for stays."""
+        if self.centres is None:
+            return self
+        centres = replace(self.centres, lenses=found.lenses, found=found.lenses.centre)
+        return replace(self, centres=centres, readout=found)
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,32 +59,42 @@ class Map:
     aligned: np.ndarray | None = None  # (N,) bool, observations that patches have confirmed
     normals_rig: np.ndarray | None = None  # (N, 3) of the surfaces they show, 0 = unknown
     stitching: Stitching | None = None  # with the field that corrects them; None = not looked for
-    centres: LensCentres | None = None  # of the lenses that see them; None = not looked for
-    axes: LensAxes | None = None  # where these look; None = not looked for
-    radius: StitchRadius | None = None  # what panoramas are stitched for; None = not looked for
-    calibrated: SelfCalibration | None = None  # of raw pairs; None = not looked for
-    readout: CameraEstimate | None = None  # how lenses are read; None = not looked for
+    cameras: tuple[FoundCamera, ...] = (FoundCamera(),)  # (C,)
+    of_frame: tuple[int, ...] = ()  # (F,) camera of each frame, as in `Cameras`
     covariances: CameraCovariances | None = None  # with these unknown beside the poses
     moves: tuple[Move, ...] = ()  # of the poses against a splat
 
     @classmethod
-    def of(
-        cls,
-        solution: Solution,
-        keypoints: Keypoints,
-        centres: LensCentres | None = None,
-    ) -> "Map":
-        """A solution of keypoints as features found them, and the lenses it was solved with."""
+    def of(cls, solution: Solution, keypoints: Keypoints, frames: FrameSet) -> "Map":
+        """A solution of keypoints as features found them, its cameras not looked for yet."""
         weights = np.ones(len(solution.world_T_rigs))
-        return cls(solution, keypoints, weights, centres=centres)
+        cameras = (FoundCamera(),) * len(frames.formats)
+        return cls(solution, keypoints, weights, cameras=cameras, of_frame=frames.camera_of_frame)
 
-    def with_camera(self, readout: CameraEstimate) -> "Map":
-        """The same seen by another camera."""
-        if self.centres is None:
-            return self
-        lenses = readout.lenses
-        centres = replace(self.centres, lenses=lenses, found=lenses.centre)
-        return replace(self, centres=centres, readout=readout)
+    @property
+    def only(self) -> FoundCamera:
+        """The only camera.
+
+        Raises:
+            ValueError: there are several.
+        """
+        (found,) = self.cameras
+        return found
+
+    def changed(self, camera: int, **changes: object) -> "Map":
+        """The map with one camera changed."""
+        cameras = list(self.cameras)
+        cameras[camera] = replace(cameras[camera], **changes)  # type: ignore[arg-type]
+        return replace(self, cameras=tuple(cameras))
+
+    def with_cameras(self, found: CameraEstimates) -> "Map":
+        """The same seen by other cameras."""
+        pairs = zip(self.cameras, found.each, strict=True)
+        return replace(self, cameras=tuple(one.with_estimate(own) for one, own in pairs))
+
+    def estimates(self) -> CameraEstimates:
+        """Estimate of each camera."""
+        return CameraEstimates(tuple(one.estimate() for one in self.cameras), self.of_frame)
 
     @property
     def field(self) -> SphereField:
@@ -61,15 +102,9 @@ class Map:
         return SphereField.none() if self.stitching is None else self.stitching.field
 
     @property
-    def lenses(self) -> Lenses:
+    def lenses(self) -> Cameras:
         """What sees the observations."""
-        return Lenses() if self.centres is None else self.centres.lenses
-
-    def camera(self) -> CameraEstimate:
-        """The camera."""
-        if self.readout is None:
-            return CameraEstimate(self.lenses, reason="not looked for")
-        return replace(self.readout, lenses=self.lenses)
+        return Cameras(tuple(one.lenses for one in self.cameras), self.of_frame)
 
     def keypoints(self, rig: CubeRig) -> Keypoints:
         """What it is made of: where it really points, and from where."""
@@ -81,10 +116,10 @@ class Map:
 
     def straightened(self, frames: FrameSet) -> FrameSet:
         """The frames, read without what stitching bends, raw pairs by what their lenses are."""
-        if len(frames.formats) > 1:
-            return frames
-        fisheyes = self.lenses.fisheyes or frames.format.fisheyes
         correction = tuple(self.field.coefficients.tolist())
         return frames.with_formats(
-            [replace(frames.format, correction=correction, fisheyes=fisheyes)]
+            [
+                replace(kind, correction=correction, fisheyes=one.lenses.fisheyes or kind.fisheyes)
+                for kind, one in zip(frames.formats, self.cameras, strict=True)
+            ]
         )

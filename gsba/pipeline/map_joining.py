@@ -15,6 +15,7 @@ import numpy as np
 from gsba.bundle.families import Families
 from gsba.bundle.held_poses import HeldPoses
 from gsba.bundle.lens_centres import baseline_of
+from gsba.bundle.readout import CameraEstimate
 from gsba.config import RefineSettings
 from gsba.geometry import adjoint, inverse
 from gsba.log import GsbaError
@@ -295,14 +296,15 @@ def _solved(
         return patch_rounds.adjust_aligned(state, sighted, name, gates)
     solved, keypoints, found = camera.adjust_with_patches(state, sighted, name, gates)
     better = patch_rounds.carried(state, sighted, solved, keypoints)
-    return None if better is None else better.with_camera(found)
+    return None if better is None else better.with_cameras(found)
 
 
 def _with_poses_of(state: State, solved: State) -> State:
     """The state with the poses and the camera of another one."""
     poses = solved.solution.world_T_rigs
     moved = state.with_solution(replace(state.solution, world_T_rigs=poses))
-    return moved if solved.map.readout is None else moved.with_camera(solved.map.camera())
+    unread = all(one.readout is None for one in solved.map.cameras)
+    return moved if unread else moved.with_cameras(solved.map.estimates())
 
 
 def _tied_within(state: State, parts: np.ndarray, merged: Registered | None = None) -> State:
@@ -325,9 +327,15 @@ def _with_unit(state: State, scales: np.ndarray, frame: int) -> State:
         scales: (F,) by which each frame's map is moved.
         frame: of the map whose camera it is.
     """
-    if state.map.readout is None or not state.map.lenses:
+    if all(one.readout is None for one in state.map.cameras) or not state.map.lenses:
         return state
-    found = state.map.camera()
+    found = state.map.estimates()
+    moved = found.with_each([_in_unit_of(one, scales, frame) for one in found.each])
+    return state.with_cameras(moved).through(moved.cameras)
+
+
+def _in_unit_of(found: CameraEstimate, scales: np.ndarray, frame: int) -> CameraEstimate:
+    """A camera of `_with_unit`."""
     scale = float(scales[frame])
     motion, own = found.lenses.readout_motion, found.own_sigmas
     lenses = replace(found.lenses, readout_motion=None).scaled(scale)
@@ -336,7 +344,7 @@ def _with_unit(state: State, scales: np.ndarray, frame: int) -> State:
         lenses = replace(lenses, readout_motion=motion * factors)
     if own is not None:
         own = own * np.repeat([1.0, scale], 3)
-    return state.with_camera(replace(found, lenses=lenses, own_sigmas=own)).through(lenses)
+    return replace(found, lenses=lenses, own_sigmas=own)
 
 
 def _check_units(maps: JointMaps, merged: Registered) -> None:
@@ -346,7 +354,7 @@ def _check_units(maps: JointMaps, merged: Registered) -> None:
         frames = int(maps.main_rows(0)[0]), int(maps.main_rows(number)[0])
         if merged.components[frames[0]] != merged.components[frames[1]]:
             continue
-        centres = first.map.centres, run.map.centres
+        centres = first.map.only.centres, run.map.only.centres
         if not all(one is not None and one.lenses for one in centres):
             continue
         apart = [baseline_of(one, 1.0) for one in centres if one is not None]

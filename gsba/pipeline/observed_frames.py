@@ -1,8 +1,8 @@
-"""The observed frames of a run: their keypoints, as rays of the lenses that are known so far."""
+"""The observed frames of a run: their keypoints, as rays of the cameras that are known so far."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
-from gsba.camera.lens import Lenses
+from gsba.camera.cameras import Cameras
 from gsba.matching.guided_search import MatchContext
 from gsba.store.store import PerFrame
 from gsba.types import Features, Keypoints
@@ -15,14 +15,14 @@ class ObservedFrames:
     features: tuple[PerFrame[Features], ...]  # (F,) stage that holds each frame's
     shown: Keypoints  # of all frames, where pictures show them
     context: MatchContext  # matches them
-    lenses: Lenses = field(default_factory=Lenses)  # that the keypoints are seen through
+    cameras: Cameras  # that the keypoints are seen through
 
     @property
     def keypoints(self) -> Keypoints:
-        """Of all frames, as rays of the lenses."""
+        """Of all frames, as rays of the cameras."""
         return self.context.keypoints
 
-    def through(self, lenses: Lenses) -> "ObservedFrames":
-        """The frames with their keypoints as rays that start at these lenses."""
-        context = replace(self.context, keypoints=lenses.seen(self.shown), lenses=lenses)
-        return replace(self, context=context, lenses=lenses)
+    def through(self, cameras: Cameras) -> "ObservedFrames":
+        """The frames with their keypoints as rays that start at the lenses of these cameras."""
+        context = replace(self.context, keypoints=cameras.seen(self.shown), cameras=cameras)
+        return replace(self, context=context, cameras=cameras)

@@ -11,12 +11,10 @@ from gsba.camera.calibration import calibration_json
 from gsba.camera.cameras import Cameras
 from gsba.camera.fisheye import Rig
 from gsba.camera.lens import Lenses
-from gsba.config import RefineSettings
 from gsba.config_file import to_toml
 from gsba.disk import write_json, write_text
 from gsba.export import ExportFormat, ExportOptions, export_all, seen_by, write_points
-from gsba.frames.recordings import own_timestamps
-from gsba.pipeline.map import Map
+from gsba.frames.recordings import names_of_cameras, own_timestamps
 from gsba.pipeline.prior import Prior
 from gsba.pipeline.run import Run
 from gsba.pipeline.state import State
@@ -101,9 +99,7 @@ def write(state: State, result: Reconstruction, cameras: Cameras) -> RunResult:
     write_points(out / "points.ply", main)
     write_text(out / "config.toml", to_toml(settings))
     (out / CALIBRATION).unlink(missing_ok=True)
-    if len(shown.formats) == 1 and (rig := shown.format.fisheyes) is not None:
-        calibration = _calibration(rig, world, result, cameras.only, settings)
-        write_json(out / CALIBRATION, calibration)
+    _write_calibrations(state, result, cameras)
     baseline = settings.camera.baseline()
     placement = place(main, shown, settings.placement, baseline, settings.gps)
     _export(run, main, shown, placement, cameras.taken(rows))
@@ -133,14 +129,29 @@ def _reasons(prior: Prior) -> tuple[str, ...]:
     return () if prior.merged is None else prior.merged.reasons
 
 
+def _write_calibrations(state: State, result: Reconstruction, cameras: Cameras) -> None:
+    """Raw lenses as found, for other runs: calibration.json, or of several cameras one for each."""
+    frames, store = state.map.straightened(state.run.frames), state.run.store
+    for path in store.root.glob(f"calibration@*{CALIBRATION[-5:]}"):  # of an earlier call
+        path.unlink()
+    several = len(frames.formats) > 1
+    for number, name in enumerate(names_of_cameras(frames)):
+        rig = frames.formats[number].fisheyes
+        if rig is not None:
+            path = store.root / (f"calibration@{name}.json" if several else CALIBRATION)
+            content = _calibration(rig, state, result, cameras.lenses[number], number)
+            write_json(path, content)
+            store.claim(path)
+
+
 def _calibration(
-    rig: Rig, world: Map, result: Reconstruction, lenses: Lenses, settings: RefineSettings
+    rig: Rig, state: State, result: Reconstruction, lenses: Lenses, number: int
 ) -> dict[str, Any]:
-    """Content of calibration.json: the estimated raw lenses, to be given to another run."""
-    baseline, metres = settings.camera.baseline(), None
+    """The content of calibration.json of one camera."""
+    baseline, metres = state.run.settings.camera.baseline(), None
     if baseline is not None and result.lens_baseline is not None:
         metres = metres_per_unit(result.lens_baseline, baseline)[0]
-    read = world.camera()
+    read = state.map.cameras[number].estimate()
     more = {"readout_s": read.readout_s} if read.lenses.readout_motion is not None else {}
     centre = lenses.centre * (1.0 if metres is None else metres)
     return calibration_json(rig, centre, "map" if metres is None else "m", more)
@@ -156,6 +167,8 @@ def _report(state: State, result: Reconstruction) -> dict[str, Any]:
     coarse = state.prior.coarse
     report = build_report(run.settings, run.frames, coarse, result, stages, gauge, found)
     report["families"] = of_families
+    if len(run.frames.formats) > 1:
+        report["cameras"] = _of_cameras(state, result)
     report["residual_sphere"] = plain(residual_sphere(result), digits=4)
     return report
 
@@ -170,30 +183,17 @@ def _findings(state: State, result: Reconstruction, gps: dict[str, Any] | None) 
     trajectory, notes = findings.of_trajectory(
         prior.trust, prior.clock, prior.merged, prior.joints, frames, prior.absent
     )
-    camera = None
-    if map_.centres is not None:
-        camera, more = of_camera(
-            map_.centres,
-            map_.readout,
-            map_.axes,
-            map_.radius,
-            map_.covariances,
-            world_scale(state.solution, result),
-            run.settings.camera,
-            frames.timed,
-        )
-        if frames.format.fisheyes is not None:
-            camera["lenses"], of_raw = of_lenses(map_.lenses, map_.calibrated, map_.covariances)
-            more += of_raw
-        notes += more
-    if len(frames.formats) > 1:
-        notes.append(
-            "the recordings are of several cameras: each is taken as calibrated, with one centre; "
-            "two lenses, readout and stitching were not estimated"
-        )
+    camera, more = None, list[str]()
+    if len(map_.cameras) == 1:
+        camera, more = _of_camera(state, result, 0)
+    else:
+        for number, name in enumerate(names_of_cameras(frames)):
+            _, found_of_one = _of_camera(state, result, number)
+            more += [f"camera of {name}: {note}" for note in found_of_one]
+    notes += more
     gyro = None
     if prior.gyro is not None:
-        gyro, more = of_gyro(prior.gyro, _gyro_steps_used(state), map_.readout)
+        gyro, more = of_gyro(prior.gyro, _gyro_steps_used(state), map_.cameras[0].readout)
         notes += more
     if gps is not None:
         notes += notes_on_gps(gps, len(frames))
@@ -206,6 +206,44 @@ def _findings(state: State, result: Reconstruction, gps: dict[str, Any] | None) 
     notes += notes_on_recordings(recordings)
     found = Findings(notes, trajectory, stitching, camera, gyro, gps, map_.moves)
     return replace(found, recordings=recordings, reasons=_reasons(prior), frame_lists=lists)
+
+
+def _of_camera(
+    state: State, result: Reconstruction, number: int
+) -> tuple[dict[str, Any] | None, list[str]]:
+    """Section of the report on one camera, None = its lenses were not looked for, and notes."""
+    run, map_ = state.run, state.map
+    found, kind = map_.cameras[number], run.frames.formats[number]
+    if found.centres is None:
+        return None, []
+    known = None if map_.covariances is None else map_.covariances.cameras[number]
+    content, notes = of_camera(
+        found.centres,
+        found.readout,
+        found.axes,
+        found.radius,
+        known,
+        world_scale(state.solution, result),
+        run.settings_of(number),
+        run.frames.timed,
+    )
+    if kind.fisheyes is not None:
+        content["lenses"], of_raw = of_lenses(found.lenses, found.calibrated, known)
+        notes += of_raw
+    return content, notes
+
+
+def _of_cameras(state: State, result: Reconstruction) -> list[dict[str, Any]]:
+    """The report of each of several cameras: its recordings, its pictures and its lenses."""
+    frames = state.run.frames
+    every = list[dict[str, Any]]()
+    for number, kind in enumerate(frames.formats):
+        rows = frames.recordings.items()
+        recordings = [name for name, own in rows if frames.cameras[own[0]] == number]
+        content = {"recordings": recordings, "layout": kind.layout}
+        content |= {"width": kind.width, "height": kind.height}
+        every.append(content | {"lenses": plain(_of_camera(state, result, number)[0])})
+    return every
 
 
 def _gyro_steps_used(state: State) -> float | None:

@@ -61,7 +61,7 @@ def _adjust_under_lenses(state: State, sighted: Sighted, number: int) -> State |
         better = carried(trial, sighted, solved, keypoints)
         if better is None:
             return state if n else None
-        state = better.with_camera(found)
+        state = better.with_cameras(found)
     return state
 
 

@@ -9,7 +9,7 @@ from threadpoolctl import threadpool_limits
 
 from gsba import video
 from gsba.bundle.families import Family
-from gsba.config import RefineSettings
+from gsba.config import CameraSettings, RefineSettings
 from gsba.config_file import validated
 from gsba.frames.recordings import combine
 from gsba.frames.scan import scan
@@ -85,7 +85,8 @@ def refine_each(
     given = [
         _Given.of(one, name) for one, name in zip(recordings, names_of(recordings), strict=True)
     ]
-    settings = _with_camera(settings or RefineSettings(), given)
+    plain = settings or RefineSettings()
+    settings = _with_camera(plain, given)
     check(settings.placement, baseline=settings.camera.baseline())
     chosen = _masks(given, segment)
     origin = {name: path for one in given for name, path in one.files.items()}
@@ -99,7 +100,7 @@ def refine_each(
     frames = combine(found, {name: model for name, model in cameras.items() if model})
     evidence = Evidence(
         families=tuple(families),
-        recordings=tuple(one.evidence(found[one.name], settings) for one in given),
+        recordings=tuple(one.evidence(found[one.name], settings, plain) for one in given),
     )
     start = Start.of(frames, evidence, settings)
     hired = cluster.hire(client, frames.paths[0][0], settings)
@@ -143,15 +144,24 @@ class _Given:
         except GsbaError as error:
             raise _named(self.name, error) from error
 
-    def evidence(self, frames: FrameSet, settings: RefineSettings) -> RecordingEvidence:
-        """Initial poses of its frames, and its gyro."""
+    def camera(self, settings: RefineSettings) -> CameraSettings:
+        """Settings of its camera: the model that it names, the baseline of its calibration."""
+        if self.recording.camera is not None:
+            own = settings.camera.model_dump() | {"name": self.recording.camera}
+            settings = validated(settings.model_dump() | {"camera": own})
+        return inputs.with_baseline(settings, _path(self.recording.calibration)).camera
+
+    def evidence(
+        self, frames: FrameSet, settings: RefineSettings, plain: RefineSettings
+    ) -> RecordingEvidence:
+        """Initial poses of its frames, its gyro, and its camera by the `plain` settings of all."""
         try:
             trajectories = tuple(inputs.timed(self.trajectories, frames))
             coarse = inputs.coarse_poses(frames, trajectories, settings)
             imu = inputs.read_gyro(_path(self.recording.imu), Path(self.recording.frames))
         except GsbaError as error:
             raise _named(self.name, error) from error
-        return RecordingEvidence(self.name, coarse, trajectories, imu)
+        return RecordingEvidence(self.name, coarse, trajectories, imu, self.camera(plain))
 
 
 def _path(given: Path | str | None) -> Path | None:
@@ -164,11 +174,9 @@ def _named(name: str, error: GsbaError) -> GsbaError:
 
 
 def _with_camera(settings: RefineSettings, given: Sequence[_Given]) -> RefineSettings:
-    """Settings with the camera model that recordings name and the baseline of a calibration."""
-    named = {one.recording.camera for one in given} - {None}
-    if len(named) > 1:
-        return settings
-    for name in named:
+    """Settings with the camera model that recordings name first, and the baseline of a
+    calibration."""
+    for name in [one.recording.camera for one in given if one.recording.camera is not None][:1]:
         camera = settings.camera.model_dump() | {"name": name}
         settings = validated(settings.model_dump() | {"camera": camera})
     for one in given:

@@ -10,7 +10,6 @@ from threadpoolctl import threadpool_limits
 
 from gsba import video
 from gsba.bundle.families import Family
-from gsba.camera.fisheye import Rig
 from gsba.config import RefineSettings
 from gsba.frames.scan import scan
 from gsba.masks import merging
@@ -46,7 +45,6 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-_Cut = tuple[Rig, bool]  # calibration to cut raw frames by, and whether it was estimated
 _MAX_PASSES = 3  # over raw pairs, from the pictures
 
 __all__ = ["RunResult", "refine", "solve"]
@@ -235,7 +233,7 @@ def _solve_raw(run: Run) -> State:
         name, after, better = f"recut{n}", run.chain.latest, None
         kept = run.store.stored(f"{name}_undone", known, bool, after)
         if any(kind.fisheyes is not None for kind in frames.formats) and not kept:
-            better = run.store.stored(name, known, _Cut, after)
+            better = run.store.stored(name, known, camera.Cuts, after)
         if better is None:
             state = solve(frontend.extract(run))
             unseen = int(state.prior.trust.unseen_steps.sum())
@@ -247,11 +245,15 @@ def _solve_raw(run: Run) -> State:
             better = None if last else camera.better_calibration(run.coarse, state.map)
             if better is None:
                 return state
-            run.store.stage(name, known, lambda found=better: found, _Cut, after)
-        n, (fisheyes, found) = n + 1, better
+            run.store.stage(name, known, lambda found=better: found, camera.Cuts, after)
+        n, found = n + 1, tuple(bool(cut and cut[1]) for cut in better)
         again = Journal(dict(counts))
-        recut = replace(frames.format, fisheyes=fisheyes, lenses_nominal=False)
-        frames = frames.with_formats([recut])
+        frames = frames.with_formats(
+            [
+                kind if cut is None else replace(kind, fisheyes=cut[0], lenses_nominal=False)
+                for kind, cut in zip(frames.formats, better, strict=True)
+            ]
+        )
         frames = merging.recut(run.store, frames, n)
         run = Run.begin(run.store, frames, run.coarse, run.settings, evidence, again, found)
 
@@ -277,10 +279,10 @@ def solve(state: State) -> State:
     state = _add_keypoints_where_weak(state)
     # Known points are matched in all frames; lenses that neighbours hide may show then.
     state = _match_from_itself(state)
-    raw = any(kind.fisheyes is not None for kind in state.run.frames.formats)
-    if not state.map.lenses and not raw:
+    if camera.sought_cameras(state, again=True):
+        before = [bool(one.lenses) for one in state.map.cameras]
         state = camera.find_camera(state, "again_")
-        if state.map.lenses:
+        if [bool(one.lenses) for one in state.map.cameras] != before:
             state = _match_from_itself(state, "again_")
     # Below a pixel: patches, pixels, splats.
     state = patch_rounds.align(state.without_matches())

@@ -14,7 +14,7 @@ from gsba.bundle.gyro_turns import GyroTurns
 from gsba.bundle.reprojections import Reprojections
 from gsba.bundle.trajectory_prior import TrajectoryPrior
 from gsba.camera.rig import CubeRig
-from gsba.config import RefineSettings
+from gsba.config import CameraSettings, RefineSettings
 from gsba.frames import cubemap
 from gsba.frames.panorama import Greys
 from gsba.frames.recordings import own_timestamps
@@ -59,6 +59,7 @@ class RecordingEvidence:
     coarse: CoarsePoses  # of its frames, in the trajectory's own world and unit
     trajectories: tuple[Trajectory, ...] = ()  # in pieces that each have their own world
     imu: Readings | None = None  # of a gyro that rode along; None = there are none
+    camera: CameraSettings | None = None  # of its camera; None = those of the run
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +90,9 @@ class Run:
     num_threads: int
     families: Families  # those that observe points and those of the evidence, bound to the frames
     division: DividedAdjustments  # of large maps into parts
-    lenses_found: bool = False  # whether the calibration that raw pairs are cut by was estimated by
+    lenses_found: tuple[
+        bool, ...
+    ] = ()  # (C,) whether the calibration that raw pairs are cut by was estimated by
     # a pass before, so that it is free
     suffix: str = ""  # of the names of stages that only see one of several recordings
 
@@ -102,7 +105,7 @@ class Run:
         settings: RefineSettings,
         evidence: Evidence | None = None,
         journal: Journal | None = None,
-        lenses_found: bool = False,
+        lenses_found: tuple[bool, ...] = (),
     ) -> "Run":
         """Start a run, or take it up, on these frames and poses.
 
@@ -193,6 +196,26 @@ class Run:
             families=replace(self.families.observing_points, names=frames.names, timestamps=times),
             suffix=f"@{given.name}",
         )
+
+    @property
+    def camera_settings(self) -> tuple[CameraSettings, ...]:
+        """Settings (C,) of each of several cameras; () = there is one, with those of the run."""
+        if len(self.frames.formats) == 1:
+            return ()
+        found, rows = [self.settings.camera] * len(self.frames.formats), self.frames.recordings
+        for one in reversed(self.evidence.recordings):
+            if one.camera is not None:
+                found[self.frames.cameras[rows[one.name][0]]] = one.camera
+        return tuple(found)
+
+    def settings_of(self, camera: int) -> CameraSettings:
+        """Settings of one camera."""
+        found = self.camera_settings
+        return found[camera] if found else self.settings.camera
+
+    def lenses_found_of(self, camera: int) -> bool:
+        """True if the calibration by which a camera's raw frames are cut was estimated."""
+        return bool(self.lenses_found) and self.lenses_found[camera]
 
     @property
     def matching_settings(self) -> RefineSettings:

@@ -6,8 +6,9 @@ import numpy as np
 
 from gsba.bundle import triangulation
 from gsba.bundle.adjustment import AdjustmentContext
+from gsba.bundle.camera_estimates import CameraEstimates
 from gsba.bundle.families import Families
-from gsba.bundle.readout import CameraEstimate
+from gsba.camera.cameras import Cameras
 from gsba.camera.lens import Lenses
 from gsba.config import PriorSettings
 from gsba.loop_closure import connectivity
@@ -57,7 +58,7 @@ class State:
     def begin(cls, run: Run, observed: ObservedFrames) -> "State":
         """The state before the first match, with the trajectory as it was read as the prior."""
         prior, none = Prior.of(run.coarse), VerifiedPairs.none()
-        start = Map.of(prior.start(), observed.shown)
+        start = Map.of(prior.start(), observed.shown, run.frames)
         return cls(run, prior, observed, start, none, MapMatches(none.matches))
 
     @property
@@ -67,7 +68,9 @@ class State:
 
     def start_from(self, prior: Prior) -> "State":
         """The state with another prior, its map the poses that this prior starts from."""
-        return replace(self, prior=prior, map=Map.of(prior.start(), self.observed.shown))
+        return replace(
+            self, prior=prior, map=Map.of(prior.start(), self.observed.shown, self.run.frames)
+        )
 
     def with_verified(self, verified: VerifiedPairs) -> "State":
         """The state with other matches of neighbours, and none beside these."""
@@ -86,13 +89,18 @@ class State:
         map_ = replace(self.map, observed=observed.shown)
         return replace(self, observed=observed, map=map_)
 
-    def with_camera(self, camera: CameraEstimate) -> "State":
-        """The state with another camera of the map; keypoints stay rays of the lenses before."""
-        return replace(self, map=self.map.with_camera(camera))
+    def with_cameras(self, found: CameraEstimates) -> "State":
+        """The state with other cameras of the map; keypoints stay rays of those before."""
+        return replace(self, map=self.map.with_cameras(found))
 
-    def through(self, lenses: Lenses) -> "State":
-        """The state with its keypoints as rays of these lenses; the map's camera stays."""
-        return replace(self, observed=self.observed.through(lenses))
+    def with_lenses(self, camera: int, lenses: Lenses) -> "State":
+        """The state with other lenses of one camera of the map; keypoints stay as they are."""
+        found = self.map.estimates()
+        return self.with_cameras(found.changed(camera, lambda one: replace(one, lenses=lenses)))
+
+    def through(self, cameras: Cameras) -> "State":
+        """The state with its keypoints as rays of these cameras; the map's cameras stay."""
+        return replace(self, observed=self.observed.through(cameras))
 
     def triangulated(self, tracks: Tracks, keypoints: Keypoints, gate: float) -> Landmarks:
         """Points of tracks under the poses as they are.
@@ -132,5 +140,6 @@ class State:
             settings=run.settings if run.frames.timed else run.settings.untimed(),
             num_threads=run.num_threads,
             maps=self.prior.parts,
+            cameras=run.camera_settings,
             division=run.division,
         )

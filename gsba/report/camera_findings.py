@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from gsba.bundle.camera_system import CameraCovariances
+from gsba.bundle.camera_system import CameraSigmas
 from gsba.bundle.lens_axes import LensAxes
 from gsba.bundle.lens_centres import LensCentres, StitchRadius, baseline_of
 from gsba.bundle.readout import CameraEstimate
@@ -22,7 +22,7 @@ def of_camera(
     readout: CameraEstimate | None,
     axes: LensAxes | None,
     radius: StitchRadius | None,
-    known: CameraCovariances | None,
+    known: CameraSigmas | None,
     scale: float,
     settings: CameraSettings,
     timed: bool,
@@ -80,7 +80,7 @@ def of_camera(
 
 
 def of_lenses(
-    lenses: Lenses, voted: SelfCalibration | None, known: CameraCovariances | None
+    lenses: Lenses, voted: SelfCalibration | None, known: CameraSigmas | None
 ) -> tuple[dict[str, Any], list[str]]:
     """Self-calibrated lenses of raw fisheyes.
 
@@ -144,7 +144,7 @@ def _scale_note(metres: float, sigma: float, baseline: float) -> str:
 def _stitch_radius_row(
     radius: StitchRadius,
     inverse_stitch_radius: float,
-    known: CameraCovariances | None,
+    known: CameraSigmas | None,
     scale: float,
 ) -> dict[str, Any]:
     sigma = radius.sigma if known is None else known.inverse_stitch_radius_sigma

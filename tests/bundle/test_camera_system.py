@@ -5,19 +5,25 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
-from lens_world import motion, problem_of, seen_through, solved_with, times
+from lens_world import motion, placed, problem_of, seen_through, solved_with, times
 from synthetic import GivenFactors, loop_walk
 
 from factors import PoseSystem
+from factors.bearing import bearing_residuals
 from factors.quadratic_block import QuadraticBlock
 from factors.system_choice import reduced_system
 from gsba import Family, MapSnapshot, X
 from gsba.bundle import adjustment
+from gsba.bundle.adjustment import values_of
 from gsba.bundle.bearings import Bearings
+from gsba.bundle.camera_adjustment import solve_with_camera
+from gsba.bundle.camera_estimates import CameraEstimates
 from gsba.bundle.camera_system import CameraSystem
+from gsba.bundle.camera_variables import CameraUnknowns
 from gsba.bundle.families import Families
 from gsba.bundle.gyro_turns import GyroTurns
 from gsba.bundle.readout import CameraEstimate
+from gsba.camera.cameras import Cameras
 from gsba.camera.lens import Lenses
 from gsba.config import CameraSettings
 from gsba.similarity import pose_similarity
@@ -43,7 +49,7 @@ def _settled(
         own = (*problem.families.members, GyroTurns(turning, 1.0, 2.0))
         problem = replace(problem, families=Families(own))
     solved, known = solved_with(world, shown, known, solved, problem)
-    return world, known, (solved, shown, known, times(24), problem)
+    return world, known, (solved, shown, CameraEstimates((known,)), times(24), problem)
 
 
 def test_all_of_a_camera_is_found_from_a_start_that_is_off() -> None:
@@ -74,7 +80,7 @@ def test_a_stitch_radius_that_is_said_goes_with_the_lenses() -> None:
         LENSES.inverse_stitch_radius * front
     )
     np.testing.assert_allclose(scale * found.lenses.centre, CENTRE, atol=0.001)
-    measured = CameraSystem(*given).covariances()
+    (measured,) = CameraSystem(*given).covariances().cameras
     assert np.isnan(measured.inverse_stitch_radius_sigma) and np.isfinite(measured.readout_sigma)
 
 
@@ -114,15 +120,16 @@ def test_covariances_are_those_of_errors_and_wider_than_of_a_known_camera() -> N
     errors = []
     for seed in range(4):
         world, _, given = _settled(LENSES, CameraEstimate(LENSES, READOUT_S), seed)
-        measured = CameraSystem(*given).covariances()
+        whole, camera = CameraSystem(*given).covariances(), given[2].only
+        (measured,) = whole.cameras
         scale = pose_similarity(given[0].world_T_rigs, world.world_T_rigs).scale
-        off = scale * given[2].lenses.centre - CENTRE
+        off = scale * camera.lenses.centre - CENTRE
         errors.append(off / (scale * np.sqrt(np.diagonal(measured.centre))))
-        errors.append([(given[2].readout_s - READOUT_S) / measured.readout_sigma])
+        errors.append([(camera.readout_s - READOUT_S) / measured.readout_sigma])
     spread = float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
     assert 0.5 < spread < 2.0  # of 16
-    alone, _ = adjustment.pose_covariances(given[0], given[2].lenses.seen(given[1]), given[4])
-    ratio = np.trace(measured.poses[1:], axis1=1, axis2=2) / np.trace(alone[1:], axis1=1, axis2=2)
+    alone, _ = adjustment.pose_covariances(given[0], camera.lenses.seen(given[1]), given[4])
+    ratio = np.trace(whole.poses[1:], axis1=1, axis2=2) / np.trace(alone[1:], axis1=1, axis2=2)
     assert (ratio > 1).all()
 
 
@@ -166,8 +173,10 @@ def test_variables_of_families_are_solved_beside_the_camera() -> None:
     solved, found = solved_with(world, shown, CameraEstimate(LENSES, READOUT_S), start, problem)
     assert solved.variables is not None and solved.variables.data == pytest.approx([3.0])
     assert found.readout_s == pytest.approx(READOUT_S, rel=0.05)
-    measured = CameraSystem(solved, shown, found, times(24), problem).covariances()
-    assert np.isfinite(measured.readout_sigma)
+    measured = CameraSystem(
+        solved, shown, CameraEstimates((found,)), times(24), problem
+    ).covariances()
+    assert np.isfinite(measured.cameras[0].readout_sigma)
 
 
 def test_a_quadratic_block_is_what_it_was_made_of() -> None:
@@ -192,3 +201,69 @@ def test_a_quadratic_block_is_what_it_was_made_of() -> None:
     found = system.covariances(0, rng)
     assert found is not None
     np.testing.assert_allclose(found[0][1], np.linalg.inv(hessian)[6:12, 6:12])
+
+
+def test_two_cameras_and_one_centre_are_solved_for_in_one_graph() -> None:
+    """Frames of three cameras take turns: two pairs of lenses, one read row by row, and one centre.
+
+    What is found of each is that of the others' frames beside it: landmarks are seen by all.
+    """
+    of_frame = tuple((np.arange(24) % 3).tolist())
+    other = Lenses(np.array([-0.003, 0.002, 0.03]), band_rad=BAND)
+    true = Cameras((LENSES, other, Lenses()), of_frame)
+    world, shown = seen_through(true)
+    start = CameraEstimates(
+        (
+            CameraEstimate(replace(LENSES, centre=0.8 * CENTRE), READOUT_S),
+            CameraEstimate(replace(other, centre=1.3 * other.centre)),
+            CameraEstimate(Lenses()),
+        ),
+        of_frame,
+    )
+    problem, poses = problem_of(world), Solution.without_points(world.world_T_rigs)
+    seen = start.cameras.seen(shown)
+    tracks = start.cameras.clear(world.tracks, seen)
+    given = tracks, shown, start, times(24), poses, problem
+    solved, found = solve_with_camera(*given, (30.0, 8.0, 8.0))
+    scale = pose_similarity(solved.world_T_rigs, world.world_T_rigs).scale
+    first, second, plain = found.each
+    np.testing.assert_allclose(scale * first.lenses.centre, CENTRE, atol=0.0015)
+    np.testing.assert_allclose(scale * second.lenses.centre, other.centre, atol=0.0015)
+    assert first.readout_s == pytest.approx(READOUT_S, rel=0.1)
+    assert second.lenses.readout_motion is None and plain.lenses == start.each[2].lenses
+    sigmas = CameraSystem(solved, shown, found, times(24), problem).covariances().cameras
+    assert [len(one.centre) for one in sigmas] == [3, 3, 0]
+    assert np.isfinite(sigmas[0].readout_sigma) and np.isnan(sigmas[1].readout_sigma)
+
+
+def test_a_camera_s_unknowns_do_not_act_on_what_others_see() -> None:
+    of_frame = tuple((np.arange(24) % 2).tolist())
+    cameras = CameraEstimates(
+        (CameraEstimate(LENSES, READOUT_S), CameraEstimate(Lenses())), of_frame
+    )
+    world, shown = seen_through(cameras.cameras)
+    problem, poses = problem_of(world), world.world_T_rigs
+    unknowns = CameraUnknowns.of(cameras, poses, times(24), problem)
+    keypoints = cameras.cameras.seen(shown)
+    solved = Solution.without_points(poses)
+    around = placed(solved, keypoints, cameras.cameras.clear(world.tracks, keypoints))
+    values = values_of(poses)
+    values.insert(unknowns.values)
+    block = unknowns.block(around, shown, 1.0)
+    residuals, _, by_frame, by_shared = block.jacobians(values)
+    plain = np.array(of_frame)[block._sightings.frames] == 1
+    assert plain.any() and not by_shared[plain].any() and not by_frame[plain][:, :, 6:].any()
+    assert by_shared[~plain].any(axis=(0, 1)).all()
+    # Rays of the plain camera are those of the block of known rays.
+    tracks = around.tracks
+    rows = keypoints.rows(tracks)
+    known, by_pose, _ = bearing_residuals(
+        poses[tracks.frames], around.points_world[tracks.points], keypoints.bearings_rig[rows], None
+    )
+    order = np.lexsort((tracks.frames, tracks.points))
+    whitened = known[order] / keypoints.sigmas_rad[rows][order, None]
+    np.testing.assert_allclose(residuals[plain], whitened[plain], atol=1e-6)
+    turned = by_pose[order] / keypoints.sigmas_rad[rows][order, None, None]
+    np.testing.assert_allclose(
+        by_frame[plain][:, :, :6], turned[plain], atol=1e-6 * np.abs(turned).max()
+    )

@@ -6,6 +6,7 @@ from lens_world import placed, problem_of, seen_through, solved_under, solved_wi
 
 from factors.bearing import bearing_residuals
 from gsba.bundle import self_calibration
+from gsba.bundle.camera_estimates import CameraEstimates
 from gsba.bundle.camera_system import CameraSystem
 from gsba.bundle.readout import CameraEstimate
 from gsba.bundle.self_calibration import SelfCalibration, num_parameters
@@ -90,8 +91,8 @@ def test_the_graph_settles_lenses_beside_poses_and_says_how_well() -> None:
     seeing = CameraEstimate(near)
     solved, seeing = solved_with(world, shown, seeing, solved, problem)
     assert _off_deg(seeing.lenses.fisheyes) < 0.03
-    system = CameraSystem(solved, shown, seeing, times(24), problem)
-    sigmas = system.covariances().lens_sigmas
+    system = CameraSystem(solved, shown, CameraEstimates((seeing,)), times(24), problem)
+    sigmas = system.covariances().cameras[0].lens_sigmas
     assert sigmas is not None
     off = self_calibration.from_calibrated(seeing.lenses) - _step_to(TRUE, 1.0)
     assert np.abs(off[[0, 7]] / sigmas[[0, 7]]).max() < 4

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from factors import RobustLoss, tangent_basis
 from factors.camera_block import CameraBlock, sightings_of
-from factors.camera_rows import CameraVariables, lens_sizes, vector
+from factors.camera_rows import CameraVariables, LensVariables, lens_sizes, vector
 from gsba.bundle.optimizer import optimize
 from gsba.config import SolverSettings
 
@@ -41,18 +41,20 @@ def _variables(kind: str) -> tuple[CameraVariables, gtsam.Values]:
     rng, values = np.random.default_rng(1), gtsam.Values()
     frames = range(FRAMES)
     many = 3 if kind.startswith("three") else 2
-    given: dict = {"poses": [X(f) for f in frames], "centres": [C(n) for n in range(many - 1)]}
+    given: dict = {"poses": [X(f) for f in frames]}
+    shared: dict = {"centres": [C(n) for n in range(many - 1)], "turning": kind in ("turns", "all")}
     values.insert(C(0), np.array([0.01, -0.02, 0.08]))
     if many == 3:
         values.insert(C(1), np.array([0.07, 0.01, -0.04]))
     if kind in ("radius", "all", "three lenses"):
-        given["radius"] = N(0)
+        shared["radius"] = N(0)
         values.insert(N(0), np.array([0.4]))
     if "said radius" in kind:
-        given["front_by_radius"] = 0.03
+        shared["front_by_radius"] = 0.03
     if kind in ("readout", "all", "raw", "three raw lenses"):
         velocities = rng.normal(size=(FRAMES, 6)) * np.repeat([0.3, 1.0], 3)
-        given |= {"readout": D(0), "motions": [W(f) for f in frames], "velocities": velocities}
+        shared["readout"] = D(0)
+        given |= {"motions": [W(f) for f in frames], "velocities": velocities}
         values.insert(D(0), np.array([0.05]))
         for f in frames:
             values.insert(W(f), 0.02 * rng.normal(size=6))
@@ -63,13 +65,13 @@ def _variables(kind: str) -> tuple[CameraVariables, gtsam.Values]:
             values.insert(A(f), 0.1 * rng.normal(size=2))
     if "raw" in kind:
         lenses = [F(0), K(0), *(key for n in range(1, many) for key in (F(n), K(n), B(n - 1)))]
-        given |= {"lenses": lenses, "calibration": FISHEYES if many == 2 else THREE}
+        shared |= {"lenses": lenses, "calibration": FISHEYES if many == 2 else THREE}
         for key, dim in zip(lenses, lens_sizes(many), strict=True):
             values.insert(key, 0.01 * rng.normal(size=dim))
     for f in frames:
         pose = gtsam.Pose3(gtsam.Rot3.Expmap(0.3 * rng.normal(size=3)), 0.4 * rng.normal(size=3))
         values.insert(X(f), pose)
-    return CameraVariables(**given), values
+    return CameraVariables(cameras=[LensVariables(**shared)], **given), values
 
 
 def _predicted(
@@ -82,28 +84,29 @@ def _predicted(
         motion = vector(values, D(0))[0] * camera.velocities[frame] + vector(values, W(frame))
         turn = Rotation.from_rotvec(fraction * motion[:3]).as_matrix()
         d = turn.T @ (d - fraction * motion[3:])
-    given = [vector(values, key) for key in camera.centres]
+    (own,) = camera.cameras
+    given = [vector(values, key) for key in own.centres]
     centres = [*given, -np.sum(given, axis=0)]
     origin = centres[lens]
     if camera.axes is not None:
         turn = Rotation.from_rotvec([*vector(values, A(frame)), 0]).as_matrix()
         origin = camera.axes[frame] @ turn @ origin
     away = d - origin
-    if camera.lenses is not None:
-        assert camera.calibration is not None
-        own = camera.calibration[lens]
+    if own.lenses is not None:
+        assert own.calibration is not None
+        row = own.calibration[lens]
         change, radial = vector(values, F(lens)), vector(values, K(lens))
-        turn = own[7:].reshape(3, 3)
+        turn = row[7:].reshape(3, 3)
         if lens:
             turn = Rotation.from_rotvec(vector(values, B(lens - 1))).as_matrix() @ turn
         x, y, z = turn.T @ away
         across = np.hypot(x, y)
         theta = np.arctan2(across, z)
         powers = theta ** np.array([3, 5, 7, 9])
-        r = own[0] * np.exp(change[0]) * (theta + (own[3:7] + radial) @ powers)
-        return own[1:3] + own[0] * change[1:] + r * np.array([x, y]) / across
-    inverse = vector(values, N(0))[0] if camera.radius is not None else 0.0
-    inverse += camera.front_by_radius / (0.5 * np.linalg.norm(centres[0] - centres[1]))
+        r = row[0] * np.exp(change[0]) * (theta + (row[3:7] + radial) @ powers)
+        return row[1:3] + row[0] * change[1:] + r * np.array([x, y]) / across
+    inverse = vector(values, N(0))[0] if own.radius is not None else 0.0
+    inverse += own.front_by_radius / (0.5 * np.linalg.norm(centres[0] - centres[1]))
     unit, near = away / np.linalg.norm(away), inverse * origin
     along = near @ unit
     return near + (np.sqrt(1 + along**2 - near @ near) - along) * unit
