@@ -163,7 +163,7 @@ def test_from_a_video_to_a_dataset(browser: Any, server: Server) -> None:
         page.get_by_role("button", name="Open the viewer").click()
     viewer.value.locator("canvas").first.wait_for()
     viewer.value.close()
-    page.get_by_role("link", name=re.compile(r"http://127\.0\.0\.1:")).wait_for()
+    page.locator("main a[href^='http://127.0.0.1:']").wait_for()
     page.get_by_role("button", name="Plot", exact=True).click()
     page.get_by_role("heading", name="plot first").wait_for()
     status(page, "done")
