@@ -237,9 +237,7 @@ def _settings_of_new(settings: RefineSettings) -> RefineSettings:
     """
     direct = settings.direct_families()
     factors = tuple(name for name in settings.factors if name != "gps" and name not in direct)
-    patches = settings.patches.model_copy(
-        update={"rounds": min(settings.patches.rounds, 1), "weak_rounds": 1}
-    )
+    patches = settings.patches.model_copy(update={"weak_rounds": settings.patches.rounds})
     return settings.model_copy(
         update={
             "factors": factors,
