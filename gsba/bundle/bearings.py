@@ -2,9 +2,12 @@
 
 from collections.abc import Sequence
 
-from factors import BearingTerm, Term
+import numpy as np
+
+from factors import BearingTerm, Term, tangent_basis
 from gsba.bundle.families import Family
 from gsba.bundle.point_observations import PointObservations
+from gsba.camera.rig import RIG_R_FACE
 
 
 class Bearings(Family):
@@ -23,7 +26,24 @@ class Bearings(Family):
                 observed.points,
                 observed.bearings_rig,
                 observed.sigmas_rad,
-                observed.sqrt_infos,
+                _face_roots(observed) if observed.sqrt_infos is None else observed.sqrt_infos,
                 origins_rig=observed.origins_rig,
             )
         ]
+
+
+def _face_roots(observed: PointObservations) -> np.ndarray:
+    """Square-root information (O, 2, 2), 1/rad on `factors.tangent_basis`, of keypoints whose noise
+    is equal along both axes of their face.
+
+    At an angle a from the axis of a face of focal length f, a pixel is cos^2(a) / f across the sphere
+    away from the axis, and cos(a) / f around it.
+    """
+    bearings, axes = observed.bearings_rig, RIG_R_FACE[observed.faces, :, 2]
+    cosines = np.einsum("oi,oi->o", bearings, axes)
+    outward = cosines[:, None] * bearings - axes
+    along = np.einsum("oij,oj->oi", tangent_basis(bearings), outward)
+    along /= np.maximum(np.linalg.norm(along, axis=1), 1e-12)[:, None]
+    products = along[:, :, None] * along[:, None, :]
+    root = np.sqrt(np.clip(cosines, 0.1, 1.0))[:, None, None]
+    return (root * np.eye(2) + (1 / root - root) * products) / observed.sigmas_rad[:, None, None]
