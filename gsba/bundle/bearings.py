@@ -19,7 +19,8 @@ class Bearings(Family):
     observes_points = True
 
     def landmark_terms(self, observed: PointObservations) -> Sequence[Term]:
-        """One bearing an observation."""
+        """One bearing an observation, as noisy as on its face: a circle of pixels is an ellipse on
+        the sphere."""
         return [
             BearingTerm(
                 observed.frames,
@@ -36,8 +37,8 @@ def _face_roots(observed: PointObservations) -> np.ndarray:
     """Square-root information (O, 2, 2), 1/rad on `factors.tangent_basis`, of keypoints whose noise
     is equal along both axes of their face.
 
-    At an angle a from the axis of a face of focal length f, a pixel is cos^2(a) / f across the sphere
-    away from the axis, and cos(a) / f around it.
+    At an angle a from the axis of a face of focal length f, a pixel subtends cos^2(a) / f away from
+    the axis and cos(a) / f around it. `sigmas_rad` is the geometric mean of both.
     """
     bearings, axes = observed.bearings_rig, RIG_R_FACE[observed.faces, :, 2]
     cosines = np.einsum("oi,oi->o", bearings, axes)

@@ -8,10 +8,11 @@ from scipy.spatial.transform import Rotation
 from synthetic import World, make_world
 
 from gsba.bundle.reconstruction import assemble
+from gsba.camera.cameras import Cameras
 from gsba.camera.lens import Lenses
 from gsba.geometry import angular_errors, inverse, pose
 from gsba.log import GsbaError
-from gsba.store.finished import lenses_of_map
+from gsba.store.finished import cameras_of_map
 from gsba.types import (
     CoarsePoses,
     Counts,
@@ -199,7 +200,7 @@ def test_each_map_has_its_own_unit(world: World) -> None:
     for part in (largest, other):
         assert part.components is None and part.map_scales is None and part.num_maps == 1
     lenses = Lenses(np.array([0.0, 0, 0.125]), readout_motion=np.arange(60.0).reshape(10, 6))
-    of_other = lenses_of_map(lenses, whole, 2)
+    of_other = cameras_of_map(Cameras((lenses,)), whole, 2).only
     assert 2 * of_other.centre[2] == pytest.approx(other.lens_baseline[0])
     assert of_other.readout_motion is not None and lenses.readout_motion is not None
     np.testing.assert_allclose(of_other.readout_motion[:, :3], lenses.readout_motion[6:, :3])
