@@ -72,7 +72,10 @@ def map_so_far(run: Path, progress: Progress) -> dict[str, Any]:
         "points" (P, 2) in two level axes, "colors" (P, 3) or None, "starts", the
         rows at which a map of its own begins.
     """
-    for name in reversed(progress.names()):
+    names = progress.names()[::-1]
+    if RECONSTRUCTION in names:  # the stage after it has the same poses, without colours
+        names.insert(0, RECONSTRUCTION)
+    for name in names:
         found = _map_of_stage(run, name)
         if found is not None:
             return found

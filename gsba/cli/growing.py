@@ -58,7 +58,9 @@ def add(
     cluster: Cluster = None,
     allow_partial: AllowPartial = False,
 ) -> None:
-    """Add recordings of the same place to a finished run, and solve again from what it has solved.
+    """Add recordings of the same place to a finished run.
+
+    What is solved is the start.
 
     The settings are those of RUN, which is only read until the result is complete.
     """
@@ -92,7 +94,9 @@ def merge(
     cluster: Cluster = None,
     allow_partial: AllowPartial = False,
 ) -> None:
-    """Merge finished runs of one place: join their maps where they meet, and solve them together.
+    """Merge finished runs of one place into one.
+
+    Their maps are joined where they meet, and solved together.
 
     World, scale and settings are those of the first run. The runs are only read.
     """
@@ -113,7 +117,10 @@ def remove(
     out: Out = None,
     allow_partial: AllowPartial = False,
 ) -> None:
-    """Take recordings out of a finished run, and solve the rest again from where it was."""
+    """Take recordings out of a finished run.
+
+    The rest is solved again from where it was.
+    """
     with loading():
         from gsba import pipeline
     conclude([pipeline.remove_recordings(run, names, out)], allow_partial)

@@ -126,7 +126,7 @@ def test_points_are_moved_with_their_hosts(case: Case) -> None:
 @given(_cases())
 def test_parts_hold_every_observation_once(case: Case) -> None:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(shared_parameters, "_LEAST_POINTS", 5)
+        patch.setattr(shared_parameters, "_MIN_POINTS", 5)
         holed, _ = case.landmarks()
         parts = shared_parameters.parts_of(holed)
         drawn = shared_parameters.drawn(holed, max(len(case.holed) // 2, 1), 0)

@@ -175,8 +175,9 @@ def test_what_cannot_be_told_is_refused(tmp_path: Path, case: Case) -> None:
     )
     with pytest.raises(GsbaError, match="5 frames are too few"):
         find_carrier(few)
+    faces = dataclasses.replace(standing.format, layout="cube")
     with pytest.raises(GsbaError, match="these frames are cube faces"):
-        find_carrier(dataclasses.replace(standing, layout="cube"))
+        find_carrier(dataclasses.replace(standing, formats=(faces,)))
 
 
 def test_command_writes_what_can_be_looked_at(tmp_path: Path) -> None:
