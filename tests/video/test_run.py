@@ -23,7 +23,8 @@ def test_video_and_folder_give_the_same(case: Case, tmp_path: Path) -> None:
     walk = case.result.frames
     with av.open(str(video), "w") as container:
         stream = container.add_stream("libx264", rate=30, options={"crf": "12"})
-        stream.width, stream.height, stream.pix_fmt = walk.width, walk.height, "yuv420p"
+        shown = walk.format
+        stream.width, stream.height, stream.pix_fmt = shown.width, shown.height, "yuv420p"
         stream.time_base = stream.codec_context.time_base = Fraction(1, 90_000)
         for (path,), time in zip(walk.paths, walk.timestamps, strict=True):
             picture = cv2.imread(str(path))
