@@ -296,22 +296,19 @@ def compare(first: Path, other: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     commands = parser.add_subparsers(dest="command", required=True)
-    for name in ("solve", "whole"):
+    for name, tolerance in (("solve", 1e-7), ("whole", 1e-7), ("asleep", 1e-5)):
         command = commands.add_parser(name)
         command.add_argument("frames", type=int)
         command.add_argument("--out", type=Path, required=True)
-        command.add_argument("--tolerance", type=float, default=1e-7)
+        command.add_argument("--tolerance", type=float, default=tolerance)
         command.add_argument("--part", type=int, default=1000)
-        command.add_argument("--workers", type=int, default=0)
-        command.add_argument("--kill", type=float, default=0.0)
-        command.add_argument("--stop-after", type=int, default=0)
-    command = commands.add_parser("asleep")
-    command.add_argument("frames", type=int)
-    command.add_argument("--out", type=Path, required=True)
-    command.add_argument("--tolerance", type=float, default=1e-5)
-    command.add_argument("--part", type=int, default=1000)
-    command.add_argument("--tasks", type=int, default=140)
-    command.add_argument("--slots", type=int, default=64)
+        if name == "asleep":
+            command.add_argument("--tasks", type=int, default=140)
+            command.add_argument("--slots", type=int, default=64)
+        else:
+            command.add_argument("--workers", type=int, default=0)
+            command.add_argument("--kill", type=float, default=0.0)
+            command.add_argument("--stop-after", type=int, default=0)
     command = commands.add_parser("compare")
     command.add_argument("first", type=Path)
     command.add_argument("other", type=Path)

@@ -72,8 +72,9 @@ def solved_under(
     world: World, shown: Keypoints, lenses: Lenses, start: Solution
 ) -> tuple[Solution, Keypoints, Tracks]:
     """The map adjusted with a camera, its rays, and the tracks that this one sees."""
-    keypoints = lenses.seen(shown)
-    tracks = lenses.clear(world.tracks, keypoints)
+    cameras = Cameras((lenses,))
+    keypoints = cameras.seen(shown)
+    tracks = cameras.clear(world.tracks, keypoints)
     gates = (30.0, 8.0)
     solved = adjustment.adjust(tracks, keypoints, start, problem_of(world), gates)
     return solved, keypoints, tracks
@@ -87,8 +88,9 @@ def solved_with(
     problem: AdjustmentContext,
 ) -> tuple[Solution, CameraEstimate]:
     """Map and camera adjusted together, from the tracks that the camera sees."""
-    tracks = camera.lenses.clear(world.tracks, camera.lenses.seen(shown))
-    given = CameraEstimates((camera,)), times(len(start.world_T_rigs)), start, problem
+    estimates = CameraEstimates((camera,))
+    tracks = estimates.cameras.clear(world.tracks, estimates.cameras.seen(shown))
+    given = estimates, times(len(start.world_T_rigs)), start, problem
     solved, found = solve_with_camera(tracks, shown, *given, (30.0, 8.0, 8.0))
     return solved, found.only
 

@@ -116,15 +116,29 @@ def make_world(
         np.full(len(bearings), claimed_sigma_rad or sigma_rad),
         np.full((len(bearings), 3), 128, np.uint8),
     )
-    order = np.lexsort((frames, which))
-    _, compact = np.unique(which[order], return_inverse=True)
+    tracks, order = tracks_of(which, frames, starts)
+    return World(world_T_rigs, points[np.unique(which)], keypoints, tracks, false[order])
+
+
+def tracks_of(
+    points: np.ndarray, frames: np.ndarray, starts: np.ndarray
+) -> tuple[Tracks, np.ndarray]:
+    """Tracks of keypoints (N,), of which each shows a point in a frame, and the keypoint (N,) of
+    each observation.
+
+    Args:
+        points, frames: (N,) of each keypoint.
+        starts: (F + 1,) first keypoint of each frame.
+    """
+    order = np.lexsort((frames, points))
+    _, compact = np.unique(points[order], return_inverse=True)
     tracks = Tracks(
         compact.astype(np.int32),
         frames[order].astype(np.int32),
         (order - starts[frames[order]]).astype(np.int32),
         int(compact.max()) + 1,
     )
-    return World(world_T_rigs, points[np.unique(which)], keypoints, tracks, false[order])
+    return tracks, order
 
 
 def features_of(bearings: np.ndarray, descriptors: np.ndarray) -> Features:

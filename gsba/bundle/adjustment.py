@@ -84,14 +84,14 @@ class AdjustmentContext:
         return next((gyro.turning for gyro in gyros), None)
 
     def of_camera(self, camera: int) -> "AdjustmentContext":
-        """The same with the settings of one camera."""
+        """The context with the settings of one camera."""
         if not self.cameras:
             return self
         own = {"camera": self.cameras[camera]}
         return replace(self, settings=self.settings.model_copy(update=own), cameras=())
 
     def beside(self, *families: Family) -> "AdjustmentContext":
-        """The same with further families."""
+        """The context with further families."""
         members = (*self.families.members, *families)
         return replace(self, families=self.families.with_members(members))
 
@@ -255,13 +255,7 @@ def rescale_noise(sighted: Sighted, before: Solution, settings: RefineSettings) 
         chosen = group[keypoints.rows(placed.tracks)]
         if np.count_nonzero(chosen) >= settings.rounds.min_observations:
             factors[group] = max(_noise(placed, keypoints, poses, chosen), _MIN_NOISE_RATIO)
-    infos = keypoints.sqrt_infos
-    scaled = replace(
-        keypoints,
-        sigmas_rad=keypoints.sigmas_rad * factors,
-        sqrt_infos=None if infos is None else infos / factors[:, None, None],
-    )
-    return replace(sighted, keypoints=scaled)
+    return replace(sighted, keypoints=keypoints.scaled_noise(factors))
 
 
 def adjust(
@@ -441,10 +435,6 @@ def _by_point(
     offsets = np.einsum("oji,oj->oi", poses[:, :3, :3], away)
     if keypoints.origins_rig is not None:
         offsets -= keypoints.origins_rig[rows]
-    if keypoints.sqrt_infos is None:
-        whitening = np.eye(2) / keypoints.sigmas_rad[rows, None, None]
-    else:
-        whitening = keypoints.sqrt_infos[rows]
-    axes = whitening @ tangent_basis(bearings)  # the angles are small
+    axes = keypoints.roots(rows) @ tangent_basis(bearings)  # the angles are small
     axes /= np.linalg.norm(offsets, axis=1)[:, None, None]
     return np.einsum("oij,oj->oi", axes, offsets), axes @ np.swapaxes(poses[:, :3, :3], 1, 2)

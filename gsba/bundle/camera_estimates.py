@@ -39,13 +39,13 @@ class CameraEstimates:
         return found
 
     def with_each(self, each: Sequence[CameraEstimate]) -> "CameraEstimates":
-        """The same frames, taken by cameras with other estimates (C,)."""
+        """Other estimates (C,) of the cameras that took these frames."""
         if len(each) != len(self.each):
             raise ValueError(f"estimates of {len(each)} cameras instead of {len(self.each)}")
         return replace(self, each=tuple(each))
 
     def with_lenses(self, lenses: Sequence[Lenses]) -> "CameraEstimates":
-        """The same cameras with other lenses (C,)."""
+        """The estimates with other lenses (C,)."""
         pairs = zip(self.each, lenses, strict=True)
         return self.with_each([replace(one, lenses=own) for one, own in pairs])
 
@@ -62,7 +62,7 @@ class CameraEstimates:
         return self.cameras.frames_of(camera, num_frames)
 
 
-def seen_by(tracks: Tracks, of_frame: Sequence[int], camera: int) -> Tracks:
+def tracks_of_camera(tracks: Tracks, of_frame: Sequence[int], camera: int) -> Tracks:
     """Tracks of what one camera observes: points that it sees twice or more.
 
     Args:
@@ -73,5 +73,4 @@ def seen_by(tracks: Tracks, of_frame: Sequence[int], camera: int) -> Tracks:
     if not of_frame:
         return tracks
     own = np.array(of_frame)[tracks.frames] == camera
-    lengths = np.bincount(tracks.points[own], minlength=tracks.num_points)
-    return tracks.of_observations(own & (lengths[tracks.points] > 1))
+    return tracks.of_observations(tracks.seen_twice(own))

@@ -129,10 +129,7 @@ class CameraUnknowns:
             curved: see `CameraBlock`.
         """
         tracks, rows = landmarks.tracks, shown.rows(landmarks.tracks)
-        roots = np.eye(2) / shown.sigmas_rad[rows, None, None]
-        if shown.sqrt_infos is not None:
-            roots = shown.sqrt_infos[rows]
-        seen = shown.bearings_rig[rows], tracks.frames, roots / noise
+        seen = shown.bearings_rig[rows], tracks.frames, shown.roots(rows) / noise
         measured, roots, seeing, fractions = self._sighted(*seen)
         given = tracks.frames, tracks.points, tracks.num_points, measured, roots, seeing, fractions
         solver = self.context.settings.solver

@@ -49,6 +49,12 @@ class CameraEstimate:
     by_gyro: bool | None = None  # whether rotations are held to a gyro's; None = there is none
     counts: Counts = field(default_factory=lambda: Counts(0, 0, "observations"))
 
+    def scaled(self, scale: float) -> "CameraEstimate":
+        """The estimate in another unit of length: one map unit is `scale` of the new ones."""
+        own = self.own_sigmas
+        own = own if own is None else own * np.repeat([1.0, scale], 3)
+        return replace(self, lenses=self.lenses.scaled(scale), own_sigmas=own)
+
 
 def estimate(
     landmarks: Landmarks,

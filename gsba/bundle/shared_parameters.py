@@ -129,9 +129,7 @@ def weighted(
         keypoints.bearings_rig[rows],
         keypoints.origins_of(rows),
     )
-    roots = np.eye(2) / keypoints.sigmas_rad[rows, None, None]
-    if keypoints.sqrt_infos is not None:
-        roots = keypoints.sqrt_infos[rows]
+    roots = keypoints.roots(rows)
     whitened = np.einsum("oij,oj->oi", roots, residuals) / solved.noise
     solver = context.settings.solver
     loss = RobustLoss(solver.loss, solver.loss_sigmas)

@@ -57,10 +57,8 @@ def corrected(keypoints: Keypoints, field: SphereField, rig: CubeRig) -> Keypoin
 
 def with_noise_of(keypoints: Keypoints, calibrated: Keypoints) -> Keypoints:
     """Keypoints whose noise is scaled as in others of the same rows, where they were corrected."""
-    factors = calibrated.sigmas_rad / keypoints.sigmas_rad
-    roots = keypoints.sqrt_infos
-    scaled = None if roots is None else roots / factors[:, None, None]
-    return replace(keypoints, sigmas_rad=calibrated.sigmas_rad, sqrt_infos=scaled)
+    scaled = keypoints.scaled_noise(calibrated.sigmas_rad / keypoints.sigmas_rad)
+    return replace(scaled, sigmas_rad=calibrated.sigmas_rad)  # to the byte
 
 
 def estimate(

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsba.camera.lens import ONE_CENTRE, Lenses
-from gsba.types import FrameSet, Keypoints, Tracks
+from gsba.types import FrameSet, Keypoints, Tracks, cameras_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +68,7 @@ class Cameras:
         return np.flatnonzero(np.array(self.of_frame) == camera)
 
     def with_lenses(self, lenses: Sequence[Lenses]) -> "Cameras":
-        """The same frames, taken through other lenses (C,)."""
+        """Cameras of these frames with other lenses (C,)."""
         if len(lenses) != len(self.lenses):
             raise ValueError(f"lenses of {len(lenses)} cameras instead of {len(self.lenses)}")
         return replace(self, lenses=tuple(lenses))
@@ -79,11 +79,8 @@ class Cameras:
 
     def taken(self, rows: np.ndarray) -> "Cameras":
         """The cameras of some frames (F',) only: those that took none are left out."""
-        if not self.of_frame:
-            return self.each(lambda lenses: lenses.taken(rows))
-        used, numbers = np.unique(np.array(self.of_frame)[rows], return_inverse=True)
-        lenses = tuple(self.lenses[c].taken(rows) for c in used) or (ONE_CENTRE,)
-        return Cameras(lenses, tuple(numbers.tolist()) if len(used) > 1 else ())
+        used, of_frame = cameras_of(self.of_frame, rows)
+        return Cameras(tuple(self.lenses[c].taken(rows) for c in used) or (ONE_CENTRE,), of_frame)
 
     def scaled(self, scale: float) -> "Cameras":
         """The cameras in another unit of length: one map unit is `scale` of the new ones."""

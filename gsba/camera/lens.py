@@ -15,7 +15,6 @@ import numpy as np
 
 from gsba.camera.fisheye import Rig, facing, optical_axes, pixels_of, recalibrated, rotation_of
 from gsba.geometry import pose
-from gsba.types import Keypoints, Tracks
 
 _HALF_FOV_RAD = np.deg2rad(100.0)  # half field of view of a fisheye that fills its sensor, first to
 # last row
@@ -253,20 +252,6 @@ class Lenses:
         lengths = np.linalg.norm(directions, axis=1)
         apart = seam_sines(self.own(directions, frames), self.optical_axes)
         return apart < np.sin(self.band_rad) * lengths
-
-    def seen(self, keypoints: Keypoints) -> Keypoints:
-        """Keypoints as rays that start at their lens, at the pose of the frame's middle."""
-        if not self:
-            return keypoints
-        directions, origins = self.rays(keypoints.bearings_rig, keypoints.frames())
-        return replace(keypoints, bearings_rig=directions, origins_rig=origins)
-
-    def clear(self, tracks: Tracks, keypoints: Keypoints) -> Tracks:
-        """Tracks without observations in the blended band, nor the points observed only there."""
-        if not self.band_rad:
-            return tracks
-        bearings = keypoints.bearings_rig[keypoints.rows(tracks)]
-        return tracks.of_observations(~self.blended(bearings, tracks.frames))
 
     def scaled(self, scale: float) -> "Lenses":
         """The lenses in another unit of length: one map unit is `scale` of the new ones."""

@@ -55,6 +55,11 @@ class View:
         """(4, 4) float64."""
         return pose(self.rig_R_view, self.centre)
 
+    @property
+    def intrinsics(self) -> tuple[object, ...]:
+        """Key of the intrinsics: equal for views that one camera can stand for."""
+        return self.width, self.height, self.focal, self.principal
+
     def rays(self, pixels: np.ndarray) -> np.ndarray:
         """Unit directions (..., 3), rig frame, of pixels (..., 2)."""
         xy = (pixels - self.principal) / self.focal

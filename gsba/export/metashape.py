@@ -68,7 +68,7 @@ def write_metashape_faces(
     ]
     sensors, kinds = list[ET.Element](), list[list[int]]()
     for own in views:
-        alike = len({(view.width, view.height, view.focal, view.principal) for view in own}) == 1
+        alike = len({view.intrinsics for view in own}) == 1
         first = len(sensors)
         sensors += [_pinhole(first + n, view) for n, view in enumerate(own[:1] if alike else own)]
         kinds.append([first + n * (not alike) for n in range(len(own))])

@@ -185,7 +185,7 @@ def _write_face_dataset(
 ) -> None:
     # OPENCV without distortion is a pinhole, by the only name that all readers know.
     camera = {"camera_model": "OPENCV", "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0}
-    alike = len({_shape(view) for own in views for view in own}) == 1
+    alike = len({view.intrinsics for own in views for view in own}) == 1
     if alike:
         camera |= _intrinsics(views[0][0])
     velocities = motion.rig_velocities(reconstruction, frames, cameras, shutter)
@@ -247,11 +247,6 @@ def _files(partial: Path, views: Sequence[str], masked: bool) -> Files:
     """Files of images and masks with unique base names."""
     mask = "masks/{name}_{view}.png" if masked else ""
     return Files(partial, views, "images/{name}_{view}{suffix}", mask)
-
-
-def _shape(view: View) -> tuple[object, ...]:
-    """What views of equal intrinsics have in common."""
-    return view.width, view.height, view.focal, view.principal
 
 
 def _intrinsics(view: View) -> dict[str, Any]:

@@ -9,6 +9,7 @@ import numpy as np
 from factors.sphere_field import SphereField
 from factors.sphere_image import SphereImage
 from gsba.bundle.stitching import corrected
+from gsba.camera.cameras import Cameras
 from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.camera.rig import CubeRig, owner_faces
 from gsba.camera.sphere import dense_enough
@@ -245,7 +246,7 @@ class Localizer:
         seen: Keypoints = corrected(gather([features]), self._field, self._rig)
         origins = None
         if lenses := self._own_lenses():
-            seen = lenses.seen(seen)
+            seen = Cameras((lenses,)).seen(seen)
             origins = seen.origins_rig
         ready = replace(
             features, bearings_rig=seen.bearings_rig, faces=owner_faces(seen.bearings_rig)

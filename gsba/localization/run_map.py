@@ -11,6 +11,7 @@ from factors import tangent_basis
 from factors.sphere_field import SphereField
 from gsba import learned
 from gsba.bundle.stitching import corrected
+from gsba.camera.cameras import Cameras
 from gsba.camera.lens import Lenses
 from gsba.camera.rig import CubeRig
 from gsba.config import RefineSettings
@@ -183,7 +184,7 @@ def _keyframe(
 
     rows = observed.rows(frame)
     seen = corrected(gather([features]), field, rig)
-    seen = lenses.of_frame(frame).seen(seen) if lenses else seen
+    seen = Cameras((lenses.of_frame(frame),)).seen(seen) if lenses else seen
     numbers = np.zeros(len(features), np.int64)
     known = np.zeros(len(features), bool)
     if len(rows) and len(features):

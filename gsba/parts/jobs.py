@@ -199,7 +199,7 @@ class Substitute(_PartJob):
 
 @dataclass(frozen=True, slots=True)
 class Shared:
-    """What the caller knows of a part's nodes on cuts, for `Covariances`."""
+    """Covariances of a part's nodes on cuts, which `Covariances` starts from."""
 
     inverse: np.ndarray  # (6 K, 6 K) float64, of the map's system
     drawn: np.ndarray  # (D, K, 6) float64, errors of its covariance

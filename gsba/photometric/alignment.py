@@ -49,7 +49,7 @@ class _Observed:
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
     def of(self, points: np.ndarray) -> "_Observed":
-        """The same of points that are numbered otherwise: n is `points[n]`."""
+        """The observations with their points renumbered: n becomes `points[n]`."""
         return replace(self, points=points[self.points])
 
     def enlarged(self, factors: np.ndarray) -> "_Observed":

@@ -21,7 +21,7 @@ from gsba.bundle import (
 )
 from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.camera_adjustment import solve_sighted_with_camera, solve_with_camera
-from gsba.bundle.camera_estimates import CameraEstimates, seen_by
+from gsba.bundle.camera_estimates import CameraEstimates, tracks_of_camera
 from gsba.bundle.camera_system import CameraCovariances, CameraSystem
 from gsba.bundle.lens_axes import LensAxes
 from gsba.bundle.lens_centres import LensCentres, StitchRadius
@@ -447,7 +447,7 @@ def _from_features(
     gate = least if lenses else _WIDE_GATE_SIGMAS
 
     def compute() -> T:
-        tracks = seen_by(backend.tracks_of(state), observed.cameras.of_frame, number)
+        tracks = tracks_of_camera(backend.tracks_of(state), observed.cameras.of_frame, number)
         placed = state.triangulated(tracks, observed.keypoints, gate * solution.noise)
         wide = replace(solution, landmarks=placed, noise=solution.noise * gate / least)
         given = observed.keypoints, observed.shown, CameraEstimate(lenses), number, state
@@ -473,7 +473,7 @@ def _from_patches(
         there = replace(sighted, keypoints=map_.rays(sighted.keypoints, run.rig))
         there = adjustment.rescale_noise(there, map_.solution, run.settings)
         gate = run.settings.rounds.aligned[0]
-        tracks = seen_by(there.tracks, map_.of_frame, number)
+        tracks = tracks_of_camera(there.tracks, map_.of_frame, number)
         placed = state.triangulated(tracks, there.keypoints, gate)
         solution = replace(map_.solution, noise=1.0, landmarks=placed)
         shown = stitching.corrected(sighted.keypoints, map_.field, run.rig)

@@ -20,9 +20,9 @@ from gsba.pipeline.map import FoundCamera, Map
 from gsba.pipeline.state import State
 from gsba.similarity import Sim3
 from gsba.store.finished import load_run
-from gsba.store.folder import STAGES, is_run_folder, read_marker
+from gsba.store.folder import STAGES, read_marker
 from gsba.store.store import load_stage
-from gsba.types import CoarsePoses, FrameSet, Keypoints, Landmarks, Reconstruction, Solution
+from gsba.types import CoarsePoses, FrameSet, Landmarks, Reconstruction, Solution, cameras_of
 
 _STAGE = "map"
 _MIN_SHARED_POINTS = 12  # least points that two recordings share, to be tied to one another
@@ -45,7 +45,7 @@ def keep(state: State) -> None:
         field = replace(
             map_.stitching,
             adjustment=Solution.without_points(start),
-            keypoints=_taken(map_.observed, np.zeros(0, np.int64)),
+            keypoints=map_.observed.of_frames(np.zeros(0, np.int64)),
         )
         map_ = replace(map_, stitching=field)
     kept = KeptMap(map_, state.prior.coarse)
@@ -70,14 +70,12 @@ class FinishedRun:
         """Read a finished run.
 
         Args:
-            root: folder of the run.
+            root: folder of a run, see `grown_folder.held_runs`.
 
         Raises:
-            GsbaError: no run, one that is not finished, one of another version of gsba, or one
-                without points.
+            GsbaError: a run that is not finished, one of another version of gsba, or one without
+                points.
         """
-        if not is_run_folder(root):
-            raise GsbaError(f"{root} is not a gsba run: give the folder that gsba refine wrote")
         require_own_version(root)
         if not (root / "report.json").is_file():
             raise GsbaError(f"{root} is not finished: run gsba refine with --out {root} to the end")
@@ -115,7 +113,7 @@ class FinishedRun:
     def to_result(self) -> Sim3:
         """Similarity from the world of the solution to that of the result's largest map."""
         solved, row = self.map.solution.world_T_rigs, int(self.result.largest_map()[0])
-        scale, start, end = 1.0, solved[row], self.result.world_T_rigs[row]
+        start, end = solved[row], self.result.world_T_rigs[row]
         scale = world_scale(self.map.solution, self.result)
         rotation = end[:3, :3] @ start[:3, :3].T
         return Sim3(scale, rotation, end[:3, 3] - scale * rotation @ start[:3, 3])
@@ -200,17 +198,14 @@ def _map_of(map_: Map, rows: np.ndarray) -> Map:
     tracks = solution.landmarks.tracks
     number = np.full(len(solution.world_T_rigs), -1)
     number[rows] = np.arange(len(rows))
-    seen = number[tracks.frames] >= 0
-    lengths = np.bincount(tracks.points[seen], minlength=tracks.num_points)
-    seen &= lengths[tracks.points] > 1
+    seen = tracks.seen_twice(number[tracks.frames] >= 0)
     points = np.unique(tracks.points[seen])
     kept = tracks.of_observations(seen)
     kept = replace(kept, frames=number[kept.frames].astype(np.int32))
     counts = replace(solution.counts, kept=len(points))
     landmarks = Landmarks(solution.landmarks.points_world[points], kept, counts)
     chosen = number[observed.frames()] >= 0
-    of_frame = np.array(map_.of_frame or (0,) * len(number))
-    used, numbers = np.unique(of_frame[rows], return_inverse=True)
+    used, of_frame = cameras_of(map_.of_frame, rows)
     return replace(
         map_,
         solution=replace(
@@ -220,12 +215,12 @@ def _map_of(map_: Map, rows: np.ndarray) -> Map:
             rounds=(),
             variables=None,
         ),
-        observed=_taken(observed, rows),
+        observed=observed.of_frames(rows),
         frame_weights=map_.frame_weights[rows],
         aligned=None if map_.aligned is None else map_.aligned[chosen],
         normals_rig=None if map_.normals_rig is None else map_.normals_rig[chosen],
         cameras=tuple(_camera_of(map_.cameras[c], rows) for c in used),
-        of_frame=tuple(numbers.tolist()) if len(used) > 1 else (),
+        of_frame=of_frame,
         covariances=None,
         moves=(),
     )
@@ -238,21 +233,4 @@ def _camera_of(found: FoundCamera, rows: np.ndarray) -> FoundCamera:
         found,
         centres=centres and replace(centres, lenses=centres.lenses.taken(rows)),
         readout=readout and replace(readout, lenses=readout.lenses.taken(rows)),
-    )
-
-
-def _taken(keypoints: Keypoints, rows: np.ndarray) -> Keypoints:
-    """Keypoints of frames `rows` (F',), ascending."""
-    sizes = np.diff(keypoints.starts)
-    chosen = np.isin(keypoints.frames(), rows)
-    infos, origins = keypoints.sqrt_infos, keypoints.origins_rig
-    return Keypoints(
-        np.concatenate([[0], np.cumsum(sizes[rows])]).astype(np.int64),
-        keypoints.pixels[chosen],
-        keypoints.faces[chosen],
-        keypoints.bearings_rig[chosen],
-        keypoints.sigmas_rad[chosen],
-        keypoints.colors[chosen],
-        None if infos is None else infos[chosen],
-        None if origins is None else origins[chosen],
     )

@@ -107,25 +107,8 @@ def of_recording(state: State, number: int) -> State:
     rows = state.run.frames.recordings[state.run.evidence.recordings[number].name]
     first, last = int(rows[0]), int(rows[-1])
     features = state.observed.features[first : last + 1]
-    keypoints = _keypoints_of(state.observed.shown, first, last)
+    keypoints = state.observed.shown.of_frames(rows)
     return State.begin(run, _matchable(run, features, keypoints))
-
-
-def _keypoints_of(keypoints: Keypoints, first: int, last: int) -> Keypoints:
-    """Keypoints of frames `first` to `last`, the latter included, which are numbered from 0."""
-    starts = keypoints.starts[first : last + 2]
-    own = slice(int(starts[0]), int(starts[-1]))
-    infos, origins = keypoints.sqrt_infos, keypoints.origins_rig
-    return Keypoints(
-        starts - starts[0],
-        keypoints.pixels[own],
-        keypoints.faces[own],
-        keypoints.bearings_rig[own],
-        keypoints.sigmas_rad[own],
-        keypoints.colors[own],
-        None if infos is None else infos[own],
-        None if origins is None else origins[own],
-    )
 
 
 def match_neighbours(state: State) -> State:

@@ -83,7 +83,7 @@ def joined_keypoints(parts: Sequence[Keypoints]) -> Keypoints:
     sizes = np.concatenate([np.diff(part.starts) for part in parts])
     infos = None
     if any(part.sqrt_infos is not None for part in parts):
-        infos = np.concatenate([information_roots(part) for part in parts])
+        infos = np.concatenate([part.roots() for part in parts])
     return Keypoints(
         np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64),
         np.concatenate([part.pixels for part in parts]),
@@ -93,13 +93,6 @@ def joined_keypoints(parts: Sequence[Keypoints]) -> Keypoints:
         np.concatenate([part.colors for part in parts]),
         infos,
     )
-
-
-def information_roots(keypoints: Keypoints) -> np.ndarray:
-    """Square-root information (N, 2, 2) of keypoints, isotropic where no other is known, 1/rad."""
-    if keypoints.sqrt_infos is not None:
-        return keypoints.sqrt_infos
-    return np.eye(2) / keypoints.sigmas_rad[:, None, None]
 
 
 def check_grows(run: FinishedRun) -> None:
@@ -221,14 +214,8 @@ def _moved(run: FinishedRun, move: Sim3) -> Solution:
 
 def _in_one_noise(run: FinishedRun) -> tuple[Keypoints, np.ndarray]:
     """Keypoints of a run with the noise that its solution found, and which are aligned (N,)."""
-    observed, noise = run.map.observed, run.map.solution.noise
-    infos = observed.sqrt_infos
-    scaled = replace(
-        observed,
-        sigmas_rad=noise * observed.sigmas_rad,
-        sqrt_infos=None if infos is None else infos / noise,
-    )
-    aligned = run.map.aligned
+    observed, aligned = run.map.observed, run.map.aligned
+    scaled = observed.scaled_noise(run.map.solution.noise)
     return scaled, np.zeros(len(observed.faces), bool) if aligned is None else aligned
 
 
@@ -302,13 +289,7 @@ def _camera(
 def _scaled(found: FoundCamera, scale: float) -> CameraEstimate | None:
     """A camera in another unit: one map unit is `scale` of the new ones; None = it has one centre
     and was not looked for."""
-    if not found.lenses:
-        return found.readout
-    known = found.estimate()
-    own = known.own_sigmas
-    if own is not None:
-        own = own * np.repeat([1.0, scale], 3)
-    return replace(known, lenses=found.lenses.scaled(scale), own_sigmas=own)
+    return found.estimate().scaled(scale) if found.lenses else found.readout
 
 
 def _in_unit(found: FoundCamera, camera: CameraEstimate | None, scale: float) -> FoundCamera:

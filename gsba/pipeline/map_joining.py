@@ -30,7 +30,7 @@ from gsba.loop_closure.merged_map import Registered
 from gsba.photometric import alignment
 from gsba.photometric.alignment import Observations
 from gsba.pipeline import backend, camera, frontend, inputs, patch_rounds
-from gsba.pipeline.joint_map import JointMaps, information_roots
+from gsba.pipeline.joint_map import JointMaps, joined_keypoints
 from gsba.pipeline.prior import Prior
 from gsba.pipeline.run import Evidence, Run
 from gsba.pipeline.state import MapMatches, State
@@ -336,15 +336,11 @@ def _with_unit(state: State, scales: np.ndarray, frame: int) -> State:
 
 def _in_unit_of(found: CameraEstimate, scales: np.ndarray, frame: int) -> CameraEstimate:
     """A camera of `_with_unit`."""
-    scale = float(scales[frame])
-    motion, own = found.lenses.readout_motion, found.own_sigmas
-    lenses = replace(found.lenses, readout_motion=None).scaled(scale)
-    if motion is not None:
-        factors = np.repeat(np.column_stack([np.ones(len(motion)), scales]), 3, axis=1)
-        lenses = replace(lenses, readout_motion=motion * factors)
-    if own is not None:
-        own = own * np.repeat([1.0, scale], 3)
-    return replace(found, lenses=lenses, own_sigmas=own)
+    scaled, motion = found.scaled(float(scales[frame])), found.lenses.readout_motion
+    if motion is None:
+        return scaled
+    factors = np.repeat(np.column_stack([np.ones(len(motion)), scales]), 3, axis=1)
+    return replace(scaled, lenses=replace(scaled.lenses, readout_motion=motion * factors))
 
 
 def _check_units(maps: JointMaps, merged: Registered) -> None:
@@ -442,19 +438,7 @@ def _interleaved(one: Keypoints, other: Keypoints) -> tuple[Keypoints, np.ndarra
     """Keypoints of both, in each frame those of `one` first, and their order among both (N,)."""
     frames = np.concatenate([one.frames(), other.frames()])
     order = np.argsort(frames, kind="stable")
-    infos = None
-    if one.sqrt_infos is not None or other.sqrt_infos is not None:
-        infos = np.concatenate([information_roots(one), information_roots(other)])[order]
-    both = Keypoints(
-        one.starts + other.starts,
-        np.concatenate([one.pixels, other.pixels])[order],
-        np.concatenate([one.faces, other.faces])[order],
-        np.concatenate([one.bearings_rig, other.bearings_rig])[order],
-        np.concatenate([one.sigmas_rad, other.sigmas_rad])[order],
-        np.concatenate([one.colors, other.colors])[order],
-        infos,
-    )
-    return both, order
+    return joined_keypoints([one, other]).at(order, one.starts + other.starts), order
 
 
 def _unravelled(both: Keypoints, order: np.ndarray, num_first: int, other: Keypoints) -> Keypoints:

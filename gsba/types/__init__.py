@@ -4,7 +4,7 @@ Takes arrays of one stage.
 Gives them to the next one under names, with shapes and units.
 """
 
-from gsba.types.frame_set import FACES, NO_FILE_NAME, Fisheye, FrameSet, PictureFormat
+from gsba.types.frame_set import FACES, NO_FILE_NAME, Fisheye, FrameSet, PictureFormat, cameras_of
 from gsba.types.records import (
     CoarsePoses,
     Counts,
@@ -56,4 +56,5 @@ __all__ = [
     "Tracks",
     "Trajectory",
     "VerifiedPairs",
+    "cameras_of",
 ]

@@ -77,6 +77,20 @@ class PictureFormat:
         return self.width // 4 if self.panoramic else self.width
 
 
+def cameras_of(of_frame: Sequence[int], rows: np.ndarray) -> tuple[np.ndarray, tuple[int, ...]]:
+    """Cameras (C',) that took frames `rows` (F',), and the one of each frame among these.
+
+    Args:
+        of_frame: (F,) index of each frame's camera; () = there is one camera, here and in the
+            result.
+        rows: frames.
+    """
+    if not of_frame:
+        return np.zeros(1, np.int64), ()
+    used, numbers = np.unique(np.array(of_frame)[rows], return_inverse=True)
+    return used, tuple(numbers.tolist()) if len(used) > 1 else ()
+
+
 @dataclass(frozen=True, slots=True)
 class FrameSet:
     """The captured frames on disk, in time order, without pixels.
@@ -155,7 +169,7 @@ class FrameSet:
         if absolute:
             paths = tuple(tuple(path.absolute() for path in group) for group in paths)
             mask_paths = tuple(path and path.absolute() for path in mask_paths)
-        used, numbers = np.unique(self.cameras[rows], return_inverse=True)
+        used, of_frame = cameras_of(self.camera_of_frame, rows)
         return replace(
             self,
             names=tuple(self.names[f] for f in rows),
@@ -163,7 +177,7 @@ class FrameSet:
             timestamps=self.timestamps[rows],
             mask_paths=mask_paths,
             formats=tuple(self.formats[c] for c in used) or self.formats[:1],
-            camera_of_frame=tuple(numbers.tolist()) if len(used) > 1 else (),
+            camera_of_frame=of_frame,
             fetched=tuple(self.fetched[f] for f in rows) if self.fetched else (),
             clock_shifts=tuple(self.clock_shifts[f] for f in rows) if self.clock_shifts else (),
         )

@@ -129,6 +129,42 @@ class Keypoints:
         """Row (O,) of every observation of the tracks."""
         return self.starts[tracks.frames] + tracks.keypoints
 
+    def roots(self, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
+        """Square-root information (O, 2, 2) of rows (O,) on their tangent_basis, 1/rad."""
+        if self.sqrt_infos is not None:
+            return self.sqrt_infos[rows]
+        return np.eye(2) / self.sigmas_rad[rows][:, None, None]
+
+    def scaled_noise(self, factors: np.ndarray | float) -> "Keypoints":
+        """Keypoints whose noise is `factors`, () or (N,), times as large."""
+        factors = np.asarray(factors)
+        infos = self.sqrt_infos
+        return replace(
+            self,
+            sigmas_rad=self.sigmas_rad * factors,
+            sqrt_infos=None if infos is None else infos / factors[..., None, None],
+        )
+
+    def at(self, rows: np.ndarray, starts: np.ndarray) -> "Keypoints":
+        """Keypoints in rows (N',), which frames own as in `starts` (F' + 1,) int64."""
+        infos = None if self.sqrt_infos is None else self.sqrt_infos[rows]
+        return Keypoints(
+            starts,
+            self.pixels[rows],
+            self.faces[rows],
+            self.bearings_rig[rows],
+            self.sigmas_rad[rows],
+            self.colors[rows],
+            infos,
+            self.origins_of(rows),
+        )
+
+    def of_frames(self, frames: np.ndarray) -> "Keypoints":
+        """Keypoints of frames (F',), ascending, which are numbered from 0."""
+        sizes = np.diff(self.starts)[frames]
+        starts = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
+        return self.at(np.isin(self.frames(), frames), starts)
+
 
 @dataclass(frozen=True, slots=True)
 class Matches:
@@ -234,6 +270,11 @@ class Tracks:
         numbers = (np.cumsum(points) - 1).astype(np.int32)[self.points[rows]]
         num = int(np.count_nonzero(points))
         return Tracks(numbers, self.frames[rows], self.keypoints[rows], num)
+
+    def seen_twice(self, rows: np.ndarray) -> np.ndarray:
+        """Those of the observations `rows` (O,) bool whose point has two of them or more."""
+        lengths = np.bincount(self.points[rows], minlength=self.num_points)
+        return rows & (lengths[self.points] > 1)
 
     def of_observations(self, rows: np.ndarray) -> "Tracks":
         """Tracks of the observations `rows` (O,) bool; points without any are left out."""

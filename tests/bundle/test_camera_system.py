@@ -128,7 +128,8 @@ def test_covariances_are_those_of_errors_and_wider_than_of_a_known_camera() -> N
         errors.append([(camera.readout_s - READOUT_S) / measured.readout_sigma])
     spread = float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
     assert 0.5 < spread < 2.0  # of 16
-    alone, _ = adjustment.pose_covariances(given[0], camera.lenses.seen(given[1]), given[4])
+    seen = given[2].cameras.seen(given[1])
+    alone, _ = adjustment.pose_covariances(given[0], seen, given[4])
     ratio = np.trace(whole.poses[1:], axis1=1, axis2=2) / np.trace(alone[1:], axis1=1, axis2=2)
     assert (ratio > 1).all()
 

@@ -12,6 +12,7 @@ from synthetic import World
 from factors import bearing_residuals
 from gsba.bundle import adjustment, lens_centres
 from gsba.bundle.lens_centres import LensCentres
+from gsba.camera.cameras import Cameras
 from gsba.camera.lens import Lenses
 from gsba.config import CameraSettings
 from gsba.similarity import pose_similarity
@@ -112,8 +113,9 @@ def test_a_step_is_that_of_an_independent_solver() -> None:
     problem = replace(problem_of(world), settings=plain)
     lenses, solved = Lenses(band_rad=BAND), Solution.without_points(world.world_T_rigs)
     for _ in range(6):
-        keypoints = lenses.seen(shown)
-        clear = lenses.clear(tracks, keypoints)
+        cameras = Cameras((lenses,))
+        keypoints = cameras.seen(shown)
+        clear = cameras.clear(tracks, keypoints)
         solved = adjustment.adjust(clear, keypoints, solved, problem, (60.0,))
         landmarks = solved.landmarks
         lenses = lens_centres.estimate(

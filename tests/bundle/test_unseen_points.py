@@ -14,6 +14,7 @@ from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.bearings import Bearings
 from gsba.bundle.families import Families
 from gsba.bundle.reconstruction import assemble
+from gsba.camera.cameras import Cameras
 from gsba.camera.lens import Lenses
 from gsba.config import PatchSettings, RefineSettings
 from gsba.photometric.references import references, visible_frames
@@ -85,7 +86,7 @@ def test_filters_leave_out_points_without_observations(case: Case) -> None:
 def test_what_lenses_blend_leaves_no_point_without_observations(band: float, x: float) -> None:
     turn = np.array([[np.sqrt(1 - x * x), 0, x], [0, 1, 0], [-x, 0, np.sqrt(1 - x * x)]])
     lenses = Lenses(band_rad=band, axes=np.tile(turn, (NUM_FRAMES, 1, 1)))
-    kept = lenses.clear(_world().tracks, _world().keypoints)
+    kept = Cameras((lenses,)).clear(_world().tracks, _world().keypoints)
     np.testing.assert_array_equal(np.unique(kept.points), np.arange(kept.num_points))
     found = triangulation.place(
         kept, _world().keypoints, _world().world_T_rigs, 6.0, SETTINGS.triangulate

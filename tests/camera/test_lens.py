@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from synthetic import RIG, unit
 
+from gsba.camera.cameras import Cameras
 from gsba.camera.lens import Lenses
 from gsba.camera.rig import owner_faces
 from gsba.types import Keypoints, Tracks
@@ -126,18 +127,18 @@ def test_one_centre_changes_nothing() -> None:
     rng = np.random.default_rng(0)
     keypoints = _keypoints(unit(rng.normal(size=(10, 3))))
     tracks = Tracks(np.arange(10), np.repeat([0, 1], 5), np.tile(np.arange(5), 2), 10)
-    assert not Lenses() and Lenses().seen(keypoints) is keypoints
-    assert Lenses().clear(tracks, keypoints) is tracks
+    assert not Lenses() and not Cameras() and Cameras().seen(keypoints) is keypoints
+    assert Cameras().clear(tracks, keypoints) is tracks
 
 
 def test_tracks_lose_what_is_blended() -> None:
     bearings = unit(np.column_stack([np.ones(10), np.zeros(10), np.linspace(-0.5, 0.5, 10)]))
-    keypoints, lenses = _keypoints(bearings), TWO
+    keypoints, cameras = _keypoints(bearings), Cameras((TWO,))
     tracks = Tracks(np.arange(10), np.repeat([0, 1], 5), np.tile(np.arange(5), 2), 10)
-    kept = lenses.clear(tracks, keypoints)
+    kept = cameras.clear(tracks, keypoints)
     assert kept.num_points == 8 and kept.points.tolist() == list(range(8))
     assert kept.frames.tolist() == [0, 0, 0, 0, 1, 1, 1, 1]
     assert kept.keypoints.tolist() == [0, 1, 2, 3, 1, 2, 3, 4]
-    seen = lenses.seen(keypoints)
+    seen = cameras.seen(keypoints)
     assert seen.origins_rig is not None
     np.testing.assert_allclose(seen.origins_rig[:, 2], np.repeat([-0.04, 0.04], 5))

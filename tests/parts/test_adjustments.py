@@ -13,7 +13,7 @@ import pytest
 from dask_workers import some_workers
 from gtsam.symbol_shorthand import X
 from scipy.spatial.transform import Rotation
-from synthetic import RIG, GivenFactors, make_world
+from synthetic import RIG, GivenFactors, make_world, tracks_of
 from town_in_parts import NUM, SIGMA, town
 
 from gsba import disk
@@ -49,14 +49,7 @@ def town_map() -> tuple[np.ndarray, Keypoints, Tracks]:
         starts, RIG.project(bearings, faces), faces, bearings, np.full(len(frames), SIGMA),
         np.zeros((len(frames), 3), np.uint8), roots, np.full((len(frames), 3), 1e-3),
     )  # fmt: skip
-    by_point = np.lexsort((frames, points))
-    _, numbers = np.unique(points[by_point], return_inverse=True)
-    tracks = Tracks(
-        numbers.astype(np.int32),
-        frames[by_point].astype(np.int32),
-        (by_point - starts[frames[by_point]]).astype(np.int32),
-        int(numbers.max()) + 1,
-    )
+    tracks, _ = tracks_of(points, frames, starts)
     return pose(rows[:, :9].reshape(-1, 3, 3), rows[:, 9:]), keypoints, tracks
 
 
