@@ -3,20 +3,19 @@
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Protocol, Self, TypeVar
 
 import gtsam
 import numpy as np
 
-from factors import Block, LandmarkBlock, RobustLoss, Term, tangent_basis
+from factors import Block, LandmarkBlock, RobustLoss, Term
 from gsba.bundle import pose_variables, triangulation
 from gsba.bundle.division import DivisibleMap, Division
 from gsba.bundle.families import Families, Family, FamilyTerms
 from gsba.bundle.gyro_turns import GyroTurns
+from gsba.bundle.observation_noise import observation_noise
 from gsba.bundle.optimizer import OptimizeResult, marginal_covariances, optimize
 from gsba.bundle.pose_variables import poses_of, values_of
-from gsba.bundle.tracks import runs
 from gsba.camera.rig import CubeRig
 from gsba.config import CameraSettings, RefineSettings, SolverSettings
 from gsba.types import (
@@ -35,12 +34,8 @@ logger = logging.getLogger(__name__)
 _MIN_NOISE_RATIO = 1e-3  # least noise of an observation over its claimed sigma
 _UNKNOWN_NOISE_GATE = 20.0  # gate in sigmas for observations whose noise is not known yet
 DRAWS = 500  # errors drawn of all poses, from which joint covariances are computed
-_BATCH = 1 << 16  # observations whose residuals are computed together
-_MIN_REDUNDANCY = 0.1  # least share of residual dimensions beyond the unknowns
-_MIN_INFORMATION_SHARE = 1e-12  # of a point's information, added to it, as depth may be unknown
 _DRIFT_DAMPING, _DRIFT_TOLERANCE = 1e-9, 1e-7  # first damping and relative tolerance of adjustments
 # with a family that limits drift
-_MIN_RESIDUAL_SHARE = 1e-3  # least share of a residual that its point cannot absorb
 
 
 @dataclass(frozen=True, slots=True)
@@ -249,12 +244,14 @@ def rescale_noise(sighted: Sighted, before: Solution, settings: RefineSettings) 
     tracks, keypoints = sighted.tracks, sighted.keypoints
     poses = before.world_T_rigs
     gate = _UNKNOWN_NOISE_GATE
-    placed = triangulation.place(tracks, keypoints, poses, gate, settings.triangulate)
+    threads = settings.solver.threads()
+    placed = triangulation.place(tracks, keypoints, poses, gate, settings.triangulate, threads)
     factors = np.ones(len(keypoints.faces))
     for group in (sighted.aligned, ~sighted.aligned):
         chosen = group[keypoints.rows(placed.tracks)]
         if np.count_nonzero(chosen) >= settings.rounds.min_observations:
-            factors[group] = max(_noise(placed, keypoints, poses, chosen), _MIN_NOISE_RATIO)
+            noise = observation_noise(placed, keypoints, poses, threads, chosen)
+            factors[group] = max(noise, _MIN_NOISE_RATIO)
     return replace(sighted, keypoints=keypoints.scaled_noise(factors))
 
 
@@ -297,7 +294,7 @@ def adjust_through(
         The solution and the view that belongs to it.
     """
     solved, rounds, settings = replace(start, rounds=()), [], context.settings
-    place = partial(_placed, tracks, context=context)
+    place = _Placement(tracks, context)
     last_gate = gates[-1] * start.noise
     support = len(place(view.keypoints, solved.world_T_rigs, last_gate).tracks)
     for number, gate in enumerate(gates, 1):
@@ -319,8 +316,9 @@ def adjust_through(
             solved = replace(solved, world_T_rigs=poses, variables=variables)
             placed = place(view.keypoints, poses, gate * solved.noise)
             if len(placed.tracks):
-                noise = max(_noise(placed, view.keypoints, poses), settings.rounds.min_noise)
-                solved = replace(solved, noise=noise)
+                seen, threads = view.keypoints, context.num_threads
+                noise = observation_noise(placed, seen, poses, threads)
+                solved = replace(solved, noise=max(noise, settings.rounds.min_noise))
         used = len(landmarks.tracks), landmarks.tracks.num_points
         outcome = accepted, result.history, result.reason
         rounds.append(Round(gate, solved.noise, *used, new_support, *outcome))
@@ -329,17 +327,26 @@ def adjust_through(
     return replace(solved, landmarks=placed, rounds=tuple(rounds)), view
 
 
-def _placed(
-    tracks: Tracks,
-    keypoints: Keypoints,
-    world_T_rigs: np.ndarray,
-    gate: float,
-    *,
-    context: AdjustmentContext,
-) -> Landmarks:
-    """Points of tracks within a gate, in the keypoints' own standard deviations."""
-    settings = context.settings.triangulate
-    return triangulation.place(tracks, keypoints, world_T_rigs, gate, settings, context.num_threads)
+class _Placement:
+    """Points of tracks under poses: the last ones are kept, as they are asked for repeatedly."""
+
+    def __init__(self, tracks: Tracks, context: AdjustmentContext) -> None:
+        self._tracks, self._context = tracks, context
+        self._asked: tuple[Keypoints, np.ndarray, float] | None = None
+        self._found: Landmarks | None = None
+
+    def __call__(self, keypoints: Keypoints, world_T_rigs: np.ndarray, gate: float) -> Landmarks:
+        """Points within a gate, in the keypoints' own standard deviations."""
+        if self._found is not None and self._asked is not None:
+            seen, poses, before = self._asked
+            if seen is keypoints and poses is world_T_rigs and before == gate:
+                return self._found
+        settings, threads = self._context.settings.triangulate, self._context.num_threads
+        self._asked = keypoints, world_T_rigs, gate
+        self._found = triangulation.place(
+            self._tracks, keypoints, world_T_rigs, gate, settings, threads
+        )
+        return self._found
 
 
 def _solver(settings: RefineSettings, last: bool) -> SolverSettings:
@@ -385,56 +392,3 @@ def pose_covariances(
     keys = [pose_variables.X(f) for f in range(len(solved.world_T_rigs))]
     blocks = [observed.block(), *terms.blocks]
     return marginal_covariances(terms.graph, blocks, terms.values, keys, DRAWS, seed)
-
-
-def _noise(
-    landmarks: Landmarks,
-    keypoints: Keypoints,
-    world_T_rigs: np.ndarray,
-    chosen: np.ndarray | slice = slice(None),
-) -> float:
-    """Noise in units of the features' sigmas: robust spread of residuals over its expectation.
-
-    The points are placed by least squares: under the robust loss of the adjustment they would lie
-    closer to most of their observations than the noise allows. A residual e of noise sigma has the
-    covariance sigma^2 (I - J (sum J^T J)^-1 J^T), J that of the observation by its point: nothing
-    of it is left along the epipolar line where a point has two observations, nearly all where it
-    has many. So each residual is taken along the direction in which the point leaves the most of
-    it, over the square root of that eigenvalue: all observations then spread alike.
-
-    Args:
-        chosen: (O,) bool, observations whose spread is asked for.
-    """
-    tracks, num = landmarks.tracks, len(landmarks.tracks)
-    spread = np.empty(num)
-    for points, rows, own in runs(tracks, _BATCH):
-        some = Landmarks(landmarks.points_world[points], own, landmarks.counts)
-        residuals, jacobians = _by_point(some, keypoints, world_T_rigs)
-        informations = np.zeros((own.num_points, 3, 3))
-        np.add.at(informations, own.points, np.swapaxes(jacobians, 1, 2) @ jacobians)
-        traces = np.einsum("jii->j", informations)
-        added = _MIN_INFORMATION_SHARE * traces + np.finfo(float).tiny
-        covariances = np.linalg.inv(informations + added[:, None, None] * np.eye(3))
-        taken = jacobians @ covariances[own.points] @ np.swapaxes(jacobians, 1, 2)
-        left, directions = np.linalg.eigh(np.eye(2) - taken)
-        along = np.einsum("oi,oi->o", directions[:, :, 1], residuals)
-        spread[rows] = along / np.sqrt(np.maximum(left[:, 1], _MIN_RESIDUAL_SHARE))
-    unknowns = 6 * len(world_T_rigs)
-    redundancy = max(1 - unknowns / max(2 * num - 3 * tracks.num_points, 1), _MIN_REDUNDANCY)
-    return float(1.4826 * np.median(np.abs(spread[chosen])) / np.sqrt(redundancy))
-
-
-def _by_point(
-    landmarks: Landmarks, keypoints: Keypoints, world_T_rigs: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Whitened residuals (O, 2) of observations, and Jacobians (O, 2, 3) by the point."""
-    tracks = landmarks.tracks
-    rows = keypoints.rows(tracks)
-    poses, bearings = world_T_rigs[tracks.frames], keypoints.bearings_rig[rows]
-    away = landmarks.points_world[tracks.points] - poses[:, :3, 3]
-    offsets = np.einsum("oji,oj->oi", poses[:, :3, :3], away)
-    if keypoints.origins_rig is not None:
-        offsets -= keypoints.origins_rig[rows]
-    axes = keypoints.roots(rows) @ tangent_basis(bearings)  # the angles are small
-    axes /= np.linalg.norm(offsets, axis=1)[:, None, None]
-    return np.einsum("oij,oj->oi", axes, offsets), axes @ np.swapaxes(poses[:, :3, :3], 1, 2)

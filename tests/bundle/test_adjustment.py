@@ -13,6 +13,7 @@ from gsba.bundle import adjustment, triangulation
 from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.bearings import Bearings
 from gsba.bundle.families import Families, Family
+from gsba.bundle.observation_noise import observation_noise
 from gsba.bundle.optimizer import OptimizeResult
 from gsba.bundle.reprojections import Reprojections
 from gsba.bundle.trajectory_prior import TrajectoryPrior
@@ -138,7 +139,7 @@ def test_the_noise_does_not_depend_on_the_length_of_tracks(length: int) -> None:
     placed = triangulation.place(short, world.keypoints, true, 100.0, limits)
     freedom = 2 * len(placed.tracks) - 3 * placed.tracks.num_points
     redundancy = 1 - 6 * len(true) / freedom  # poses that are known take nothing
-    noise = adjustment._noise(placed, world.keypoints, true) * np.sqrt(redundancy)
+    noise = observation_noise(placed, world.keypoints, true, 1) * np.sqrt(redundancy)
     assert noise * CLAIMED == pytest.approx(SIGMA, rel=0.03)
 
 
