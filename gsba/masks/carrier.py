@@ -8,7 +8,9 @@ and undone first.
 """
 
 import logging
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -21,6 +23,8 @@ from gsba.log import GsbaError, track
 from gsba.masks.carrier_outline import certain_places, outline_carrier
 from gsba.masks.carrier_turns import band_of, find_turns
 from gsba.masks.fixed_structure import FixedStructure, measure_fixed_structure
+from gsba.masks.medians import median_picture
+from gsba.memory import usable_cpus
 from gsba.types import FrameSet
 
 logger = logging.getLogger(__name__)
@@ -73,7 +77,9 @@ def find_carrier(frames: FrameSet) -> Carrier:
         raise GsbaError("the carrier is detected in panoramas; these frames are cube faces")
     _require_enough(len(frames))
     chosen = np.unique(np.linspace(0, len(frames) - 1, _MAX_FRAMES).astype(int))
-    pictures = np.stack([_load(frames, f) for f in track(chosen, "looking for the carrier")])
+    with ThreadPoolExecutor(usable_cpus()) as pool:
+        loaded = pool.map(partial(_load, frames), chosen.tolist())
+        pictures = np.stack(list(track(loaded, "looking for the carrier", len(chosen))))
     structure, turns = _measure(pictures, _STRUCTURE_WIDTH_PX), np.zeros(len(frames))
     if not certain_places(structure).any() and len(pictures) >= _MIN_FRAMES_TURNED:
         below = _measure_turned(pictures)
@@ -123,7 +129,7 @@ def _outlined(pictures: np.ndarray, structure: FixedStructure) -> tuple[np.ndarr
         GsbaError: too little moves.
     """
     _check_moving(structure)
-    median = np.median(pictures, axis=0).astype(np.uint8)
+    median = median_picture(pictures).astype(np.uint8)
     return median, outline_carrier(pictures, median, structure)
 
 

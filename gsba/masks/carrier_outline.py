@@ -13,6 +13,7 @@ from scipy.sparse.csgraph import connected_components
 
 from gsba.camera.sphere import around_sphere
 from gsba.masks.fixed_structure import FixedStructure
+from gsba.masks.medians import median_picture
 
 _PADDING_PX = 32  # pixels around the sphere
 _MIN_CERTAIN_STRONG, _MIN_CERTAIN_WEAK = 0.75, 0.6  # least strong and weak correlations that only a
@@ -93,7 +94,7 @@ def _change(pictures: np.ndarray, median: np.ndarray) -> np.ndarray:
     """Median deviation (h, w) float32 of each pixel from the median picture, grey levels."""
     rows = np.array_split(np.arange(len(median)), 8)  # little memory at a time
     parts = [np.abs(pictures[:, r].astype(np.int16) - median[r]).mean(axis=-1) for r in rows]
-    return np.concatenate([np.median(part, axis=0) for part in parts]).astype(np.float32)
+    return np.concatenate([median_picture(part) for part in parts]).astype(np.float32)
 
 
 def _shrunk(places: np.ndarray, pixels: int) -> np.ndarray:

@@ -7,6 +7,8 @@ shift against it are estimated in turn, every pixel weighted by its stability.
 
 import numpy as np
 
+from gsba.masks.medians import median_picture
+
 WIDTH = 256  # pixels across the pictures in which shifts are estimated
 _TOP_ROW_SHARE = 0.7  # part of the height: only rows from here down are compared
 _NUM_REFERENCES = 3  # frames tried as the first template
@@ -53,8 +55,8 @@ def find_turns(bands: np.ndarray) -> np.ndarray:
 
 def _steadiness(bands: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Median (r, WIDTH) of bands, and the weight (r, WIDTH) of each pixel: 1 / its variance."""
-    median = np.median(bands, axis=0)
-    change = np.median(np.abs(bands - median), axis=0)
+    median = median_picture(bands)
+    change = median_picture(np.abs(bands - median))
     return median, 1 / (change**2 + _MIN_CHANGE**2)
 
 

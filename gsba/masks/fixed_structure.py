@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from gsba.camera.sphere import around_sphere
+from gsba.masks.medians import median_picture
 
 _PADDING_PX = 16  # pixels padded around pictures
 _SMOOTHING_PX = 0.7  # pixels, standard deviation, before gradients are taken
@@ -60,7 +61,7 @@ def measure_fixed_structure(pictures: np.ndarray) -> FixedStructure:
         correlations.append((shared / strong_scale, shared_weak / weak_scale))
         energies.append(own)
     worst = np.quantile(np.array(correlations), _WORST_QUANTILE, axis=0).astype(np.float32)
-    textured = np.median(energies, axis=0) > noise
+    textured = median_picture(np.array(energies)) > noise
     return FixedStructure(
         *(x[_PADDING_PX:-_PADDING_PX, _PADDING_PX:-_PADDING_PX] for x in (*worst, textured))
     )
