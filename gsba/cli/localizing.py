@@ -17,7 +17,7 @@ def localize(
     run: Annotated[Path, typer.Argument(help="Folder of a finished run.", metavar="RUN")],
     images: Annotated[
         list[Path],
-        typer.Argument(help="Panoramas of the run's camera, or photos: files, folders, videos."),
+        typer.Argument(help="Pictures of the run's cameras, or photos: files, folders, videos."),
     ],
     out: Annotated[
         Path | None,
@@ -28,6 +28,13 @@ def localize(
     map_number: Annotated[
         int, typer.Option("--map", help="Number of the map; 1: the largest.", metavar="NUMBER")
     ] = 1,
+    camera_of: Annotated[
+        str | None,
+        typer.Option(
+            help="Recording whose camera took the pictures; default: their layout and size tell.",
+            metavar="RECORDING",
+        ),
+    ] = None,
     fast: Annotated[
         bool,
         typer.Option(
@@ -55,8 +62,8 @@ def localize(
     out = out or images[0].with_name(f"{images[0].stem}-localized")
     if out.resolve() == run.resolve() or run.resolve() in out.resolve().parents:
         raise GsbaError(f"--out {out} is in the run's folder, which stays as it is: choose another")
-    localizer = Localizer(run, map_number, precise=not fast)
-    pictures = find_pictures(images, run, localizer.map.frames.format.layout, out)
+    localizer = Localizer(run, map_number, not fast, camera_of)
+    pictures = find_pictures(images, localizer.cameras, out)
     found = localize_all(localizer, pictures)
     for frame in found.frames:
         if not frame.found:

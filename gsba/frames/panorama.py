@@ -39,7 +39,7 @@ def load_grey(frames: FrameSet, frame: int, width: int) -> tuple[np.ndarray, np.
     kind = frames.format_of(frame)
     mask = load_usable(frames, frame)
     if kind.panoramic:
-        grey = _fit(load_erp(frames, frame, gray=True, width=width), width)
+        grey = fitted_to(load_erp(frames, frame, gray=True, width=width), width)
         return grey, None if mask is None else fit_mask(mask, width)
     size = kind.width
     faces = np.zeros((len(FACES), size, size), np.uint8)
@@ -55,7 +55,7 @@ def load_grey(frames: FrameSet, frame: int, width: int) -> tuple[np.ndarray, np.
     if mask is not None:
         usable &= fit_mask(mask, native)
     whole = bool(usable.all())
-    return _fit(grey, width), None if whole else fit_mask(usable, width)
+    return fitted_to(grey, width), None if whole else fit_mask(usable, width)
 
 
 class Greys:
@@ -105,8 +105,8 @@ def bright_level(greys: Greys) -> int:
     return int(np.percentile(values, 99)) if len(values) else 255
 
 
-def _fit(grey: np.ndarray, width: int) -> np.ndarray:
-    """A panorama averaged down to a width, or enlarged to it."""
+def fitted_to(grey: np.ndarray, width: int) -> np.ndarray:
+    """A panorama (h, 2h) uint8 averaged down to a width, or enlarged to it, (width / 2, width)."""
     if grey.shape[1] == width:
         return grey
     if grey.shape[1] < width:

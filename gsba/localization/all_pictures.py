@@ -24,7 +24,8 @@ def localize_all(localizer: Localizer, pictures: Sequence[Picture]) -> Localized
     for picture in track(pictures, "localising", len(pictures)):
         try:
             if picture.frames is not None:
-                found[picture.name] = localizer.localize_frame(picture.frames, picture.frame)
+                given = picture.frames, picture.frame, picture.camera
+                found[picture.name] = localizer.localize_frame(*given)
                 continue
             assert picture.path is not None
             if picture.photo:

@@ -6,19 +6,21 @@ from pathlib import Path
 
 import numpy as np
 
-from factors.sphere_field import SphereField
 from factors.sphere_image import SphereImage
 from gsba.bundle.stitching import corrected
 from gsba.camera.cameras import Cameras
 from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.camera.rig import CubeRig, owner_faces
 from gsba.camera.sphere import dense_enough
+from gsba.config import RefineSettings
 from gsba.features.detection import extract, gather
 from gsba.frames import cubemap
-from gsba.frames.panorama import load_grey
+from gsba.frames.files import image_size
+from gsba.frames.panorama import fitted_to, load_grey
 from gsba.geometry import adjoint, inverse
 from gsba.localization.known_points import Sightings, isotropic
 from gsba.localization.patch_sightings import PatchAligner
+from gsba.localization.picture_cameras import PictureCameras
 from gsba.localization.pictures import load_panorama
 from gsba.localization.place_index import PlaceIndex, open_index
 from gsba.localization.pose_fit import (
@@ -40,7 +42,7 @@ from gsba.localization.pose_search import (
 from gsba.localization.run_map import RunMap, without_correction
 from gsba.log import GsbaError
 from gsba.matching.guided_search import Gate, Searchable, match_pair, searchable
-from gsba.types import Features, FrameSet, Keypoints
+from gsba.types import Features, FrameSet, Keypoints, PictureFormat
 
 _NUM_PLACES = 5  # keyframes that look most like a frame
 _NUM_MORE_PLACES = 16  # where these do not suffice
@@ -95,7 +97,9 @@ class Query:
 
 
 class Localizer:
-    """Localises pictures of the run's camera; open it once, then localise one after the other.
+    """Localises pictures of the run's cameras; open it once, then localise one after the other.
+
+    Of several cameras, a picture is of the one that has its layout and size.
 
     Args:
         run: folder of a finished run, which is only read. The index of its places is kept beside
@@ -103,24 +107,29 @@ class Localizer:
         map_number: number of the map to localise in, 1 = the largest.
         precise: also align patches of the nearest keyframes to each picture, which takes longer
             and is about three times as accurate.
+        camera_of: recording whose camera took the pictures; None = their layout and size tell.
 
     Raises:
-        GsbaError: no finished run, or one of another version of gsba.
+        GsbaError: no finished run, one of another version of gsba, or no such recording.
     """
 
-    def __init__(self, run: Path | str, map_number: int = 1, precise: bool = False) -> None:
+    def __init__(
+        self,
+        run: Path | str,
+        map_number: int = 1,
+        precise: bool = False,
+        camera_of: str | None = None,
+    ) -> None:
         self.map = RunMap.open(Path(run), map_number)
         self.index: PlaceIndex = open_index(self.map)
         self.extractor = self.map.make_extractor()
-        self._field = SphereField(np.array(self.map.frames.format.correction))
+        self.cameras = PictureCameras.of(self.map.root, self.map.frames, camera_of)
         self._precise = precise
-        rig = self.map.rig
-        small = self.map.frames.format.panoramic and rig.size > _MAX_FACE_PX
-        self._rig = CubeRig(_MAX_FACE_PX, rig.hfov_rad) if small else rig
+        self._rigs = [_rig_for(kind, self.map.settings) for kind in self.map.frames.formats]
         self.aligner = PatchAligner(self.map)
 
     def localize(self, image: Path | str | np.ndarray, name: str = "") -> LocalizedFrame:
-        """Pose of one panorama of the run's camera.
+        """Pose of one panorama of a camera of the run.
 
         Args:
             image: file, or (H, 2H, 3) uint8 RGB.
@@ -130,52 +139,65 @@ class Localizer:
             GsbaError: the image cannot be read, or is no panorama like those of the run.
         """
         if isinstance(image, np.ndarray):
-            features = self._features_of(image)
-            return self._localize_features(name or "image", features, lambda: self._grey(image))
-        width = round(2 * np.pi * self._rig.focal)
-        erp = load_panorama(Path(image), max(width, self._precise * self.aligner.width))
-        return self.localize(erp, name or Path(image).stem)
+            if image.ndim != 3 or image.shape[1] != 2 * image.shape[0] or image.shape[2] != 3:
+                raise GsbaError(
+                    f"an image of shape {image.shape} is no panorama: (H, 2H, 3) is needed"
+                )
+            camera = self.cameras.of_panorama(image.shape[1], image.shape[0], name or "image")
+            return self._localize_panorama(image, name or "image", camera)
+        path = Path(image)
+        camera = self.cameras.of_panorama(*image_size(path), str(path))
+        width = round(2 * np.pi * self._rigs[camera].focal)
+        erp = load_panorama(path, max(width, self._precise * self.aligner.width))
+        return self._localize_panorama(erp, name or path.stem, camera)
 
-    def localize_frame(self, frames: FrameSet, frame: int) -> LocalizedFrame:
+    def localize_frame(
+        self, frames: FrameSet, frame: int, camera: int | None = None
+    ) -> LocalizedFrame:
         """Pose of one frame of a scanned folder, with its mask.
 
         Args:
-            frames: of the layout of the run's frames.
+            frames: of the layout of frames of the run.
             frame: its number.
+            camera: of the run, that took it; None = that of its layout and size.
+
+        Raises:
+            GsbaError: images that cannot be read, or are of no camera of the run.
         """
-        images, masks = cubemap.load(without_correction(frames), frame, self._rig)
-        features = extract(images, masks, self._rig, self.extractor)
+        name = frames.names[frame]
+        if camera is None:
+            camera = self.cameras.of_frames(frames.format_of(frame), name)
+        rig = self._rigs[camera]
+        images, masks = cubemap.load(without_correction(frames), frame, rig)
+        features = extract(images, masks, rig, self.extractor)
         raw, width = without_correction(frames), self.aligner.width
 
         def grey() -> Grey:
             return load_grey(raw, frame, width)
 
-        return self._localize_features(frames.names[frame], features, grey)
+        return self._localize_features(name, features, grey, camera)
 
-    def _features_of(self, erp: np.ndarray) -> Features:
-        """Keypoints of a panorama (H, 2H, 3)."""
+    def _localize_panorama(self, erp: np.ndarray, name: str, camera: int) -> LocalizedFrame:
+        """Pose of a panorama (H, 2H, 3) of a camera."""
         import cv2
 
-        if erp.ndim != 3 or erp.shape[1] != 2 * erp.shape[0] or erp.shape[2] != 3:
-            raise GsbaError(f"an image of shape {erp.shape} is no panorama: (H, 2H, 3) is needed")
-        width = dense_enough(erp.shape[1], self._rig.focal)
+        rig, small = self._rigs[camera], erp
+        width = dense_enough(erp.shape[1], rig.focal)
         if width < erp.shape[1]:
-            erp = cv2.resize(erp, (width, width // 2), interpolation=cv2.INTER_AREA)
-        return extract(cubemap.cut(erp, self._rig), None, self._rig, self.extractor)
+            small = cv2.resize(erp, (width, width // 2), interpolation=cv2.INTER_AREA)
+        features = extract(cubemap.cut(small, rig), None, rig, self.extractor)
+        return self._localize_features(name, features, lambda: self._grey(erp), camera)
 
     def _grey(self, erp: np.ndarray) -> Grey:
         """Grey panorama of the aligner's width."""
         import cv2
 
-        grey, width = cv2.cvtColor(erp, cv2.COLOR_RGB2GRAY), self.aligner.width
-        if grey.shape[1] != width:
-            grey = cv2.resize(grey, (width, width // 2), interpolation=cv2.INTER_AREA)
-        return grey, None
+        return fitted_to(cv2.cvtColor(erp, cv2.COLOR_RGB2GRAY), self.aligner.width), None
 
     def _localize_features(
-        self, name: str, features: Features, load: Callable[[], Grey]
+        self, name: str, features: Features, load: Callable[[], Grey], camera: int
     ) -> LocalizedFrame:
-        query = self._query(features)
+        query = self._query(features, camera)
         start, reason = self._recognise(query)
         if start is None:
             return LocalizedFrame.refused(name, reason)
@@ -190,7 +212,7 @@ class Localizer:
         assert fitted is not None and seen is not None
         found = self._judged(name, fitted, seen, candidates)
         if self._precise and found.found:
-            found = self._on_patches(found, load)
+            found = self._on_patches(found, load, camera)
         return self.with_map_error(found) if found.found else found
 
     def with_map_error(self, frame: LocalizedFrame) -> LocalizedFrame:
@@ -203,16 +225,19 @@ class Localizer:
         carried = adjoint(rig_T_keyframe[None])[0]
         return replace(frame, covariance=frame.covariance + carried @ uncertain @ carried.T)
 
-    def _on_patches(self, frame: LocalizedFrame, load: Callable[[], Grey]) -> LocalizedFrame:
-        """The frame fitted to aligned patches; as it was if too few align."""
+    def _on_patches(
+        self, frame: LocalizedFrame, load: Callable[[], Grey], camera: int
+    ) -> LocalizedFrame:
+        """The frame of a camera fitted to aligned patches; as it was if too few align."""
         grey, mask = load()
-        image, lenses = SphereImage.of(grey, smooth=True), self._own_lenses()
+        image, lenses = SphereImage.of(grey, smooth=True), self._own_lenses(camera)
+        field = self.map.fields[camera]
         places = self.nearest_keyframes(frame.world_T_rig)
         expected = self.aligner.expected(frame.world_T_rig, places)
-        found = self.aligner.align(expected, frame.world_T_rig, image, mask, True, lenses)
+        found = self.aligner.align(expected, frame.world_T_rig, image, mask, field, lenses)
         if len(found.points) < _MIN_POINTS:
             return frame
-        bearings, origins = self._field.corrected(found.bearings), None
+        bearings, origins = field.corrected(found.bearings), None
         if lenses:
             bearings, origins = lenses.rays(bearings, np.zeros(len(bearings), np.int64))
         points = self.map.result.points_world[found.points]
@@ -233,19 +258,19 @@ class Localizer:
             nearest=self.nearest_keyframe(world_T_rig),
         )
 
-    def _own_lenses(self) -> Lenses:
+    def _own_lenses(self, camera: int) -> Lenses:
         """Lenses of a picture whose motion during the readout is not known."""
-        lenses = self.map.lenses
+        lenses = self.map.cameras.lenses[camera]
         if not lenses or lenses.axes is not None:  # nothing says how the lenses lie in it
             return ONE_CENTRE
         return replace(lenses, readout_motion=None)
 
-    def _query(self, features: Features) -> Query:
-        """Keypoints ready to be matched, where they really point."""
+    def _query(self, features: Features, camera: int) -> Query:
+        """Keypoints of a camera's picture, ready to be matched, where they really point."""
         map_ = self.map
-        seen: Keypoints = corrected(gather([features]), self._field, self._rig)
+        seen: Keypoints = corrected(gather([features]), map_.fields[camera], self._rigs[camera])
         origins = None
-        if lenses := self._own_lenses():
+        if lenses := self._own_lenses(camera):
             seen = Cameras((lenses,)).seen(seen)
             origins = seen.origins_rig
         ready = replace(
@@ -367,6 +392,14 @@ class Localizer:
         positions = self.map.result.world_T_rigs[:, :3, 3]
         distances = np.linalg.norm(positions - world_T_rig[:3, 3], axis=1)
         return np.argsort(distances, kind="stable")[:_NUM_NEAREST]
+
+
+def _rig_for(kind: PictureFormat, settings: RefineSettings) -> CubeRig:
+    """Faces on which keypoints of pictures of a camera are found."""
+    rig = cubemap.rig_for(kind, settings.cubemap)
+    return (
+        CubeRig(_MAX_FACE_PX, rig.hfov_rad) if kind.panoramic and rig.size > _MAX_FACE_PX else rig
+    )
 
 
 def typical_sigma(covariances: np.ndarray) -> float:

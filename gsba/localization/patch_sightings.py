@@ -11,7 +11,7 @@ from factors.sphere_image import SphereImage
 from gsba.camera.lens import Lenses
 from gsba.camera.projections import Projection
 from gsba.frames.panorama import Greys
-from gsba.localization.run_map import RunMap
+from gsba.localization.run_map import RunMap, without_correction
 from gsba.photometric.alignment import REJECTIONS, accepted_rows
 from gsba.photometric.frame_jobs import align_to, cut
 from gsba.photometric.references import view_differences
@@ -56,8 +56,7 @@ class PatchAligner:
 
     def __init__(self, map_: RunMap) -> None:
         self._map, settings = map_, map_.settings.patches
-        self.greys = Greys(map_.frames, settings.max_width)
-        self._field = SphereField(np.array(map_.frames.format.correction))
+        self.greys = Greys(without_correction(map_.frames), settings.max_width)
 
     @property
     def width(self) -> int:
@@ -88,7 +87,7 @@ class PatchAligner:
         world_T_rig: np.ndarray,
         image: SphereImage,
         mask: np.ndarray | None,
-        panoramic: bool,
+        field: SphereField,
         lenses: Lenses,
     ) -> AlignedPoints:
         """Align the patches of expected points to a picture.
@@ -98,7 +97,7 @@ class PatchAligner:
             world_T_rig: (4, 4) predicted pose, within some pixels.
             image: the picture on the sphere, (width / 2, width).
             mask: (width / 2, width) bool, True = the picture shows it; None = all.
-            panoramic: True if stitching bends the picture like the run's.
+            field: of what stitching bends in the picture.
             lenses: of the picture; one centre by default.
         """
         map_, settings = self._map, self._map.settings.patches
@@ -106,19 +105,17 @@ class PatchAligner:
         pixel, threads = 2 * np.pi / self.width, Threads(1)
         world_T_hosts = map_.result.world_T_rigs[expected.hosts]
         local = np.einsum("nji,nj->ni", world_T_hosts[:, :3, :3], points - world_T_hosts[:, :3, 3])
-        if map_.lenses:
-            local = map_.lenses.seeing(local, expected.hosts)
+        if map_.cameras:
+            local = map_.cameras.seeing(local, expected.hosts)
         depths = np.linalg.norm(local, axis=1)
-        origins = self._field.observed(local / np.maximum(depths, 1e-300)[:, None])
+        origins = map_.shown(local / np.maximum(depths, 1e-300)[:, None], expected.hosts)
         spreads = pixel * np.swapaxes(tangent_basis(origins), 1, 2)
         axes = world_T_hosts[:, :3, :3] @ spreads * depths[:, None, None]
         seen = (points - world_T_rig[:3, 3]) @ world_T_rig[:3, :3]
         if lenses:
             seen = lenses.seeing(seen, np.zeros(len(seen), np.int64))
         distances = np.maximum(np.linalg.norm(seen, axis=1), 1e-300)[:, None]
-        at = seen / distances
-        if panoramic:
-            at = self._field.observed(at)
+        at = field.observed(seen / distances)
         across = world_T_rig[:3, :3].T @ axes / distances[:, :, None]
         sightings = expect(np.arange(len(points)), at, across)
         patches: PatchSet = cut(

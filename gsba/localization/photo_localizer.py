@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from factors import tangent_basis
+from factors.sphere_field import SphereField
 from factors.sphere_image import SphereImage
 from gsba.camera.lens import ONE_CENTRE
 from gsba.camera.projections import PerspectiveProjection
@@ -322,7 +323,8 @@ def _on_patches(
     places = localizer.nearest_keyframes(world_T_camera)
     expected = aligner.expected(world_T_camera, places).shown_by(projection, world_T_camera, map_)
     image = SphereImage.of(grey, smooth=True)
-    found = aligner.align(expected, world_T_camera, image, mask, False, ONE_CENTRE)
+    nothing = SphereField.none(), ONE_CENTRE  # of a photo
+    found = aligner.align(expected, world_T_camera, image, mask, *nothing)
     if len(found.points) < _MIN_POINTS:
         return before
     pixels = projection.project(found.bearings)

@@ -10,12 +10,13 @@ from gsba import video
 from gsba.config import VideoSettings
 from gsba.frames.files import decode, image_size, is_image
 from gsba.frames.scan import scan
+from gsba.frames.side_by_side import lens_sizes
 from gsba.frames.times import frame_times
+from gsba.localization.picture_cameras import PictureCameras
 from gsba.log import GsbaError
 from gsba.types import FrameSet
 
 _TIMES_FILE = "timestamps.csv"
-_CALIBRATION = "calibration.json"  # of raw fisheyes, in a run's folder
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,6 +28,7 @@ class Picture:
     path: Path | None  # a 2:1 panorama or a photo; None = a frame of `frames`
     frames: FrameSet | None = None  # frames of several images each, in the layout of the run's
     frame: int = 0  # its number among them
+    camera: int = 0  # of the run, that took these frames
     photo: bool = False  # True = a perspective photo
 
 
@@ -46,18 +48,18 @@ def load_panorama(path: Path, at_least: int) -> np.ndarray:
     return decode(path, (width, height), at_least=at_least)
 
 
-def find_pictures(sources: Sequence[Path], run: Path, layout: str, work: Path) -> list[Picture]:
+def find_pictures(sources: Sequence[Path], cameras: PictureCameras, work: Path) -> list[Picture]:
     """The pictures of files, folders and videos, in this order; those of one name are refused.
 
     Args:
         sources: pictures, folders of them, or 360-degree videos.
-        run: folder of the run, with the calibration of raw fisheyes.
-        layout: of the run's frames, see `FrameSet`.
+        cameras: of the run, that may have taken them.
         work: folder for the frames of videos, one a second.
 
     Raises:
-        GsbaError: a source is missing, or holds no picture.
+        GsbaError: a source is missing, holds no picture, or frames of no camera of the run.
     """
+    layouts = cameras.layouts()
     found: list[Picture] = []
     for number, source in enumerate(sources):
         if not source.exists():
@@ -66,11 +68,10 @@ def find_pictures(sources: Sequence[Path], run: Path, layout: str, work: Path) -
             folder = work / f"frames-{source.stem}" if number else work / "frames"
             video.extract(source, folder, VideoSettings())
             source = folder
-        in_files = layout == "erp" or (layout == "cube" and source.is_dir() and _images(source))
-        if source.is_dir() and not in_files:
-            found += _frames_of_several_images(source, run)
+        if source.is_dir() and not _is_of_single_images(source, cameras):
+            found += _frames_of_several_images(source, cameras)
         else:
-            found += _single_images(source, layout)
+            found += _single_images(source, "erp" in layouts)
     return _with_own_names(found)
 
 
@@ -78,11 +79,29 @@ def _images(folder: Path) -> list[Path]:
     return sorted(path for path in folder.iterdir() if path.is_file() and is_image(path))
 
 
-def _single_images(source: Path, layout: str) -> list[Picture]:
-    """Panoramas or photos, one file each: 2:1 pictures are panoramas where the run's frames are."""
+def _is_of_single_images(folder: Path, cameras: PictureCameras) -> bool:
+    """True if the pictures of a folder are a file each, not two fisheyes side by side, nor faces
+    or tracks in folders."""
+    layouts = cameras.layouts()
+    if layouts == {"erp"}:
+        return True
+    images = [path for path in _images(folder) if _is_whole(path)]
+    if not images or layouts.isdisjoint(("erp", "cube")):
+        return False
+    size = image_size(images[0])
+    if not cameras.has_raw_lenses(lens_sizes(size)):
+        return True
+    if not cameras.has_panoramas(*size):
+        return False
+    return scan(folder, order_suffices=True, min_frames=1).format.layout == "erp"
+
+
+def _single_images(source: Path, stitched: bool) -> list[Picture]:
+    """Panoramas or photos, one file each: 2:1 pictures are panoramas where frames of the run are
+    stitched ones."""
 
     def picture(path: Path, time: float) -> Picture:
-        panoramic = layout == "erp" and _is_panorama(path)
+        panoramic = stitched and _is_panorama(path)
         return Picture(path.stem, time, path, photo=not panoramic)
 
     if source.is_file():
@@ -116,13 +135,36 @@ def _is_whole(path: Path) -> bool:
     return True
 
 
-def _frames_of_several_images(folder: Path, run: Path) -> list[Picture]:
+def _frames_of_several_images(folder: Path, cameras: PictureCameras) -> list[Picture]:
     """Cube faces, tracks or raw fisheyes."""
-    calibration = run / _CALIBRATION
-    known = calibration if calibration.is_file() else None
-    frames = scan(folder, order_suffices=True, calibration=known, min_frames=1)
+    found = _scanned(folder, cameras)
+    camera = next(iter(found))
+    if len(found) > 1:
+        camera = cameras.of_raw({c: frames.format for c, frames in found.items()}, str(folder))
+    frames = found[camera]
     times = frames.timestamps.tolist()
-    return [Picture(n, times[f], None, frames, f) for f, n in enumerate(frames.names)]
+    return [Picture(n, times[f], None, frames, f, camera) for f, n in enumerate(frames.names)]
+
+
+def _scanned(folder: Path, cameras: PictureCameras) -> dict[int, FrameSet]:
+    """Frames of a folder by camera: read by the calibration of each of raw fisheyes that they can
+    be of; else as what they are, of the camera of their layout and size."""
+    chosen, errors = cameras.chosen, list[GsbaError]()
+    found = dict[int, FrameSet]()
+    for camera, calibration in enumerate(cameras.calibrations):
+        if calibration is None or chosen not in (None, camera):
+            continue
+        try:
+            given = {"calibration": calibration, "min_frames": 1}
+            found[camera] = scan(folder, order_suffices=True, **given)
+        except GsbaError as error:
+            errors.append(error)
+    if found:
+        return found
+    if len(errors) == len(cameras.formats):  # nothing but raw fisheyes
+        raise errors[0]
+    frames = scan(folder, order_suffices=True, min_frames=1)
+    return {cameras.of_frames(frames.format, str(folder)): frames}
 
 
 def _with_own_names(pictures: list[Picture]) -> list[Picture]:

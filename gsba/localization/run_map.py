@@ -56,9 +56,10 @@ class RunMap:
     root: Path  # folder of the run
     frames: FrameSet  # frames of the map
     result: Reconstruction  # their poses, and the points
-    lenses: Lenses  # that see the frames
+    cameras: Cameras  # that see the frames
+    fields: tuple[SphereField, ...]  # (C,) of what stitching bends in each camera's pictures
     settings: RefineSettings  # of the run
-    rig: CubeRig  # faces on which keypoints are found
+    rig: CubeRig  # faces on which keypoints of the first camera's frames are found
     point_covariances: np.ndarray  # (J, 3, 3) float64, map units^2, of points given the poses
     axes: np.ndarray  # (D, D) float32, axes of descriptors, see `searchable`
     load_keyframe: Callable[[int], Keyframe]  # by the number of the frame; recent ones are kept
@@ -81,25 +82,36 @@ class RunMap:
                 f"{root} has no points (its camera turned on the spot): nothing can be localised "
                 "in it"
             )
-        if len(frames.formats) > 1:
-            raise GsbaError(
-                f"{root} is of recordings of several cameras: nothing can be localised in it yet"
-            )
         settings = load_config(root / "config.toml")
-        lenses = load_cameras(root, result, frames, map_number).only
-        rig = cubemap.rig_for(frames.format, settings.cubemap)
-        reader = _KeypointReader(root, frames, settings, rig)
+        cameras = load_cameras(root, result, frames, map_number)
+        rig = cubemap.rig_for(frames.formats[0], settings.cubemap)
+        reader = _KeypointReader(root, frames, settings)
         first = reader(0).descriptors
         if not len(first):
             raise GsbaError(f"{root}: its first frame has no keypoints: refine again with --fresh")
         axes = principal_axes(first)
         observed = _ObservedPoints.of(result)
-        field = SphereField(np.array(frames.format.correction))
-        load = lru_cache(_NUM_KEPT)(
-            lambda f: _keyframe(f, reader(f), observed, result, lenses, field, settings, rig, axes)
-        )
+        fields = tuple(SphereField(np.array(kind.correction)) for kind in frames.formats)
+
+        numbers = frames.cameras
+
+        def keyframe(f: int) -> Keyframe:
+            seen_by = cameras.at(f), fields[numbers[f]]
+            return _keyframe(f, reader(f), observed, result, *seen_by, settings, rig, axes)
+
+        load = lru_cache(_NUM_KEPT)(keyframe)
         covariances = point_covariances(result)
-        return cls(root, frames, result, lenses, settings, rig, covariances, axes, load)
+        return cls(root, frames, result, cameras, fields, settings, rig, covariances, axes, load)
+
+    def shown(self, directions: np.ndarray, frames: np.ndarray) -> np.ndarray:
+        """Directions (N, 3) in which pictures of frames (N,) show unit directions (N, 3)."""
+        if not any(self.fields):
+            return directions
+        cameras, found = self.frames.cameras[frames], directions.copy()
+        for camera, field in enumerate(self.fields):
+            own = cameras == camera
+            found[own] = field.observed(directions[own])
+        return found
 
     def make_extractor(self) -> Extractor:
         """Extractor of the kind that found the run's keypoints."""
@@ -108,8 +120,8 @@ class RunMap:
 
 
 def without_correction(frames: FrameSet) -> FrameSet:
-    """The frames as their camera's pictures show them."""
-    return frames.with_formats([replace(frames.format, correction=())])
+    """The frames as their cameras' pictures show them."""
+    return frames.with_formats([replace(kind, correction=()) for kind in frames.formats])
 
 
 def require_own_version(root: Path) -> None:
@@ -133,7 +145,6 @@ class _KeypointReader:
     root: Path
     frames: FrameSet
     settings: RefineSettings
-    rig: CubeRig
 
     def __call__(self, frame: int) -> Features:
         name = self.frames.names[frame]
@@ -146,8 +157,9 @@ class _KeypointReader:
                     continue
         raw = without_correction(self.frames)  # keypoints are corrected later
         make = learned.make_extractor(self.settings.features, learned.find_weights(self.settings))
-        images, masks = cubemap.load(raw, frame, self.rig)
-        return extract(images, masks, self.rig, make())
+        rig = cubemap.rig_for(raw.format_of(frame), self.settings.cubemap)
+        images, masks = cubemap.load(raw, frame, rig)
+        return extract(images, masks, rig, make())
 
 
 @dataclass(frozen=True, slots=True)

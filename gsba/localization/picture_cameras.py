@@ -1,0 +1,148 @@
+"""The camera of a new picture, of those that a run has: told by its layout and size."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from gsba.frames.recordings import names_of_cameras
+from gsba.log import GsbaError
+from gsba.store.store import load_stage
+from gsba.types import FrameSet, PictureFormat
+
+_CALIBRATION = "calibration.json"  # of the raw fisheyes of a run of one camera, in its folder
+
+
+@dataclass(frozen=True, slots=True)
+class PictureCameras:
+    """Cameras of a map that may have taken new pictures."""
+
+    formats: tuple[PictureFormat, ...]  # (C,)
+    names: tuple[str, ...]  # (C,) a recording of each; "" of the only camera of a run
+    calibrations: tuple[Path | None, ...]  # (C,) file of the lenses of each; None = they are no raw
+    # fisheyes
+    chosen: int | None = None  # that took all pictures; None = their layout and size tell
+
+    @classmethod
+    def of(cls, root: Path, frames: FrameSet, recording: str | None = None) -> "PictureCameras":
+        """Cameras of a map.
+
+        Args:
+            root: folder of the run.
+            frames: of the map.
+            recording: whose camera took all pictures; None = their layout and size tell.
+
+        Raises:
+            GsbaError: the map has no such recording.
+        """
+        whole = load_stage(root, "frames", FrameSet)
+        several, first = len(whole.formats) > 1, names_of_cameras(whole)
+        names, files = list[str](), list[Path | None]()
+        for own in names_of_cameras(frames) if len(frames.formats) > 1 else [""]:
+            name = own or next(iter(frames.recordings), "")
+            number = int(whole.cameras[whole.recordings[name][0]]) if several else 0
+            file = root / (f"calibration@{first[number]}.json" if several else _CALIBRATION)
+            names.append(name if several else "")
+            files.append(file if file.is_file() else None)
+        chosen = None if recording is None else _camera_of(root, frames, recording)
+        return cls(frames.formats, tuple(names), tuple(files), chosen)
+
+    def layouts(self) -> set[str]:
+        """Layouts that pictures may have, see `PictureFormat`."""
+        return {self.formats[c].layout for c in self._those(lambda kind: True)}
+
+    def of_panorama(self, width: int, height: int, name: str) -> int:
+        """Camera of a stitched panorama: that of its size, or the only one of stitched panoramas.
+
+        Args:
+            width, height: of the picture, pixels.
+            name: of the picture, for the message.
+
+        Raises:
+            GsbaError: it can be of several.
+        """
+        stitched = self._those(lambda kind: kind.layout == "erp") or range(len(self.formats))
+        alike = [c for c in stitched if self.formats[c].width == width]
+        return self._only(alike or list(stitched), f"{name}: is {width}x{height}")
+
+    def has_panoramas(self, width: int, height: int) -> bool:
+        """True if a camera's stitched panoramas have this size."""
+        return bool(
+            self._those(
+                lambda kind: (kind.layout, kind.width, kind.height) == ("erp", width, height)
+            )
+        )
+
+    def has_raw_lenses(self, sizes: Sequence[tuple[int, int]]) -> bool:
+        """True if pictures of a camera's raw lenses have one of these sizes, pixels."""
+        return bool(self._those(lambda kind: not set(_sizes(kind)).isdisjoint(sizes)))
+
+    def of_raw(self, read: Mapping[int, PictureFormat], name: str) -> int:
+        """Camera of raw fisheyes that the calibrations of several can read: that of their size.
+
+        Args:
+            read: format of the frames by the camera whose calibration they were read by.
+            name: of their folder, for the message.
+
+        Raises:
+            GsbaError: they can be of several.
+        """
+        alike = [c for c, kind in read.items() if _sizes(kind) == _sizes(self.formats[c])]
+        return self._only(alike or list(read), f"{name}: holds raw fisheyes")
+
+    def of_frames(self, kind: PictureFormat, name: str) -> int:
+        """Camera of frames of several images each: that of their layout and size.
+
+        Args:
+            kind: of the frames.
+            name: of their folder, for the message.
+
+        Raises:
+            GsbaError: it can be of several, or of none.
+        """
+        if len(self.formats) == 1:
+            return 0
+        size = kind.width, kind.height, kind.tracks, _sizes(kind)
+        alike = self._those(
+            lambda one: (
+                one.layout == kind.layout
+                and (one.width, one.height, one.tracks, _sizes(one)) == size
+            )
+        )
+        told = f"{name}: holds frames of layout {kind.layout} and {kind.width}x{kind.height}"
+        return self._only(alike, told)
+
+    def _those(self, fits: Callable[[PictureFormat], bool]) -> list[int]:
+        """Cameras that pictures may be of, whose format fits."""
+        each = enumerate(self.formats)
+        return [c for c, kind in each if self.chosen in (None, c) and fits(kind)]
+
+    def _only(self, alike: list[int], told: str) -> int:
+        """The chosen camera, or the only one that is alike."""
+        if self.chosen is not None:
+            return self.chosen
+        if len(alike) == 1:
+            return alike[0]
+        known = ", ".join(
+            f"{kind.layout} {kind.width}x{kind.height} ({name})"
+            for kind, name in zip(self.formats, self.names, strict=True)
+        )
+        if not alike:
+            raise GsbaError(f"{told}; the run's cameras have {known}: give pictures of one of them")
+        raise GsbaError(
+            f"{told}; the run's cameras have {known}: name a recording of the one that took it "
+            "(--camera-of RECORDING)"
+        )
+
+
+def _sizes(kind: PictureFormat) -> tuple[tuple[int, int], ...]:
+    """Width and height of the picture of each raw lens."""
+    return tuple((lens.width, lens.height) for lens in kind.fisheyes or ())
+
+
+def _camera_of(root: Path, frames: FrameSet, recording: str) -> int:
+    """Camera of a recording."""
+    rows = frames.recordings.get(recording)
+    if rows is None:
+        known = ", ".join(frames.recordings) or "one recording alone"
+        raise GsbaError(f"{root} has no recording '{recording}' in this map: it has {known}")
+    return int(frames.cameras[rows[0]])

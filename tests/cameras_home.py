@@ -1,0 +1,135 @@
+"""Two recordings of one rendered walk whose pictures differ: in size, as faces, as raw fisheyes."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from tiny_run import SETTINGS
+
+from gsba import Recording
+from gsba.camera.calibration import calibration_json
+from gsba.camera.fisheye import unproject
+from gsba.camera.rig import CubeRig
+from gsba.camera.sphere import around_sphere, erp_from_bearings
+from gsba.config import RefineSettings
+from gsba.demo import make_walk
+from gsba.evaluate.trajectory import evaluate
+from gsba.frames.cubemap import cut
+from gsba.store.finished import load_run
+from gsba.trajectory.files import read_trajectory, write_tum
+from gsba.types import FACES, Fisheye, Trajectory
+
+NUM, WIDTH, SMALL = 10, 512, 384  # frames of a recording, and widths of the two cameras
+LENS = Fisheye(240, 240, 73.0, (120.0, 120.0), (0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+PAIR = LENS, Fisheye(240, 240, 73.0, (120.0, 120.0), (0.0, 0.0, 0.0, 0.0), (0.0, np.pi, 0.0))
+
+
+class Home(NamedTuple):
+    """Two halves of a walk: each half's pictures, trajectory and truth."""
+
+    folder: Path
+    pictures: tuple[list[Path], list[Path]]
+    trajectories: tuple[Path, Path]
+    truth: Trajectory  # of both, one after the other
+
+
+def make_home(folder: Path) -> Home:
+    """Every other frame of a walk is of the first recording."""
+    walk = make_walk(folder / "walk", "oval", "locked", 2 * NUM, WIDTH)
+    truth, slam = read_trajectory(walk.truth_path), read_trajectory(walk.slam_path)
+    images, files = sorted(walk.frames_dir.glob("*.jpg")), []
+    times = 0.5 * np.arange(NUM)
+    for n in range(2):
+        files.append(folder / f"{n}.tum")
+        write_tum(files[-1], Trajectory(times, slam.world_T_rigs[n::2]))
+    poses = np.concatenate([truth.world_T_rigs[0::2], truth.world_T_rigs[1::2]])
+    return Home(
+        folder,
+        (images[0::2], images[1::2]),
+        (files[0], files[1]),
+        Trajectory(np.arange(2.0 * NUM), poses),
+    )
+
+
+def _times(folder: Path) -> None:
+    rows = [f"{n:06d},{0.5 * n}" for n in range(NUM)]
+    (folder / "timestamps.csv").write_text("\n".join(["name,timestamp", *rows, ""]))
+
+
+def panoramas(home: Home, which: int, width: int) -> Recording:
+    """A recording as stitched panoramas of a width."""
+    folder = home.folder / f"stitched{which}at{width}"
+    if not folder.exists():
+        folder.mkdir()
+        for n, path in enumerate(home.pictures[which]):
+            if width == WIDTH:
+                shutil.copy(path, folder / f"{n:06d}.jpg")
+            else:
+                size = (width, width // 2)
+                small = cv2.resize(read(path), size, interpolation=cv2.INTER_AREA)
+                cv2.imwrite(str(folder / f"{n:06d}.jpg"), small)
+        _times(folder)
+    return Recording(folder, home.trajectories[which])
+
+
+def faces(home: Home) -> Recording:
+    """The second recording as cube faces."""
+    folder = home.folder / "faces"
+    if folder.exists():
+        return Recording(folder, home.trajectories[1])
+    for n, path in enumerate(home.pictures[1]):
+        for name, image in zip(FACES, cut(read(path), CubeRig(128, np.pi / 2)), strict=True):
+            (folder / name).mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(folder / name / f"{n:06d}.png"), image)
+    _times(folder)
+    return Recording(folder, home.trajectories[1])
+
+
+def fisheyes(home: Home, which: int = 1) -> Recording:
+    """A recording as two raw fisheyes with one centre, and their calibration."""
+    folder = home.folder / ("raw" if which else "stitched0raw")
+    calibration = home.folder / "raw.json"
+    if folder.exists():
+        return Recording(folder, home.trajectories[which], calibration=calibration)
+    for name, lens in zip(("front", "back"), PAIR, strict=True):
+        (folder / name).mkdir(parents=True)
+        grid = np.stack(np.meshgrid(np.arange(240) + 0.5, np.arange(240) + 0.5), axis=-1)
+        places = erp_from_bearings(unproject(lens, grid), WIDTH, WIDTH // 2) - 0.5 + 4
+        u, v = np.moveaxis(places, -1, 0).astype(np.float32)
+        far = np.hypot(*(np.moveaxis(grid, -1, 0) - 120)) > 73 * np.deg2rad(95)
+        for n, path in enumerate(home.pictures[which]):
+            shown = cv2.remap(around_sphere(read(path), 4), u, v, cv2.INTER_CUBIC)
+            shown[far] = 0
+            cv2.imwrite(str(folder / name / f"{n:06d}.png"), shown)
+    _times(folder)
+    tree = calibration_json(PAIR, np.array([0.0, 0.0, 0.001]), "map", {})
+    calibration.write_text(json.dumps(tree))
+    return Recording(folder, home.trajectories[which], calibration=calibration)
+
+
+def read(path: Path) -> np.ndarray:
+    pixels = cv2.imread(str(path))
+    assert pixels is not None
+    return pixels
+
+
+def settings_with(**changes: object) -> RefineSettings:
+    """Light settings with changes of some stages."""
+    given = SETTINGS.model_dump()
+    for stage, values in changes.items():
+        given[stage] |= values
+    return RefineSettings.model_validate(given)
+
+
+def error_of(run: Path, home: Home) -> float:
+    """Error of a run of some of the recordings, all in one map."""
+    reconstruction, frames = load_run(run)
+    assert reconstruction.num_maps == 1
+    halves = [0 if name.startswith("stitched0") else NUM for name in frames.recordings]
+    rows = np.concatenate([first + np.arange(NUM) for first in halves])
+    times = np.arange(float(len(rows)))
+    true = Trajectory(times, home.truth.world_T_rigs[rows])
+    return evaluate(Trajectory(times, reconstruction.world_T_rigs), true).ate.rmse
