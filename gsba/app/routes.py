@@ -26,7 +26,7 @@ from gsba.log import GsbaError
 from gsba.view.guard import allowed
 
 _MAX_BODY, _MAX_LOG = 256 * 1024, 64 * 1024  # bytes
-_PAGE = {"": "index.html", "app.css": "app.css", "app.js": "app.js", "plan.js": "plan.js"}
+_PAGE = {"": "index.html"} | {name: name for name in ("app.css", "app.js", "growing.js", "plan.js")}
 _TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript"}
 _PAGE_POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
@@ -201,7 +201,9 @@ def _add(app: App, request: Request) -> Any:
     arguments = _arguments(app, body)
     app.check(arguments)
     values = body.get("values", {})
-    run = values.get("out") if arguments[0] in ("refine", "plot") else values.get("run")
+    run = values.get("run")
+    if arguments[0] != "export":  # a run that grows is written in place, or elsewhere
+        run = values.get("out") or run
     if arguments[0] == "refine" and not (values.get("frames") or values.get("recording")):
         raise GsbaError("frames are missing: choose a video or a folder")
     if arguments[0] == "refine" and not run:

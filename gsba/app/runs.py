@@ -40,6 +40,11 @@ def overview(run: Path) -> dict[str, Any]:
         "seconds": seconds,
         "notes": report.get("notes", []),
         "camera": report.get("camera"),
+        "recordings": [
+            str(one["name"])
+            for one in report.get("recordings") or ()
+            if isinstance(one, dict) and "name" in one
+        ],
         "files": [name for name in _FILES if (run / name).is_file()],
         "figures": sorted(path.name for path in run.glob("figures/*.png")),
     }

@@ -15,7 +15,7 @@ from gsba.log import GsbaError
 if TYPE_CHECKING:
     from gsba.app import Choices, Field, Form
 
-COMMANDS = ("refine", "export", "plot")  # that pages can run
+COMMANDS = ("refine", "add", "merge", "remove", "export", "plot")  # that pages can run
 _NOT_ON_A_PAGE = ("segment", "help")  # --segment runs any command of the machine
 _USAGE_ERROR: Any = typer.BadParameter.__bases__[0]  # of click, or of the copy of it that typer has
 

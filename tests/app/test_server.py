@@ -184,6 +184,26 @@ def test_forms_come_from_the_commands() -> None:
         Form("refine", "", ()).arguments({"nope": 1})
 
 
+@pytest.mark.parametrize(
+    ("command", "values", "run"),
+    [
+        ("add", {"run": "old", "new": ["frames"]}, "old"),
+        ("add", {"run": "old", "new": ["frames"], "out": "new"}, "new"),
+        ("merge", {"runs": ["old", "other"], "out": "both"}, "both"),
+        ("remove", {"run": "old", "names": ["upper floor"]}, "old"),
+    ],
+)
+def test_a_job_that_grows_a_run_leads_to_its_result(
+    command: str, values: dict[str, Any], run: str, client: TestClient
+) -> None:
+    added = post(client, "api/add", {"command": command, "values": values})
+    assert added["run"] == run and added["command"].startswith(f"gsba {command} old ")
+    assert (
+        wait_for(client, added["id"])["error"]
+        == "old is not a gsba run: give the folder that gsba refine wrote"
+    )
+
+
 def wait_for(client: TestClient, job: str) -> dict[str, Any]:
     for _ in range(1200):
         found = client.get(f"api/jobs/{job}").json()

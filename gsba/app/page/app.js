@@ -149,12 +149,13 @@ function newRun() {
   choose(chooser, "", pick);
 }
 
-function runForm(values) {
-  const form = start.forms.refine, line = make("pre", { class: "command", id: "command" });
+// The line of a command by values of its form, its problem, and the button that starts it.
+function commandLine(command, values) {
+  const line = make("pre", { class: "command", id: "command" });
   const problem = make("p", { class: "error", role: "alert" });
   const button = make("button", { class: "main", type: "submit" }, "Start");
   const update = async () => {
-    const answer = await ask("api/command", { command: "refine", values: filled(values) });
+    const answer = await ask("api/command", { command, values: filled(values) });
     line.textContent = answer.command;
     problem.textContent = answer.error;
     button.disabled = Boolean(answer.error);
@@ -164,24 +165,29 @@ function runForm(values) {
     happening.preventDefault();
     button.disabled = true;
     try {
-      const job = await ask("api/add", { command: "refine", values: filled(values) });
+      const job = await ask("api/add", { command, values: filled(values) });
       location.hash = open("job", job.id);
     } catch (error) {
       problem.textContent = error.message;
       button.disabled = false;
     }
   };
+  const copy = make("button", { type: "button", onclick: () => copied(line.textContent, copy) }, "Copy");
+  return { line, problem, row: make("div", { class: "row" }, button, copy), changed, submit };
+}
+
+function runForm(values) {
+  const form = start.forms.refine, { line, problem, row, changed, submit } = commandLine("refine", values);
   const known = form.fields.filter((field) => field.name !== "frames" && field.name !== "config");
   const first = known.filter((field) => MAIN_FIELDS.includes(field.name));
   const rest = known.filter((field) => !MAIN_FIELDS.includes(field.name));
-  const copy = make("button", { type: "button", onclick: () => copied(line.textContent, copy) }, "Copy");
   const whole = make("form", { onsubmit: submit },
     card("How", presets(values, changed), ...first.map((field) => input(field, values, changed))),
     make("details", { class: "card" }, make("summary", {}, "All options"),
       input(form.fields.find((field) => field.name === "config"), values, changed),
       ...rest.map((field) => input(field, values, changed))),
     card("The command", make("p", { class: "faint" }, `It runs in ${start.root}. The terminal does the same with it.`),
-      line, problem, make("div", { class: "row" }, button, copy)));
+      line, problem, row));
   changed();
   return whole;
 }
@@ -229,7 +235,7 @@ function input(field, values, changed) {
   }
   const shown = values[field.name] || "";
   const box = make("input", {
-    id, value: Array.isArray(shown) ? shown.join(" ") : shown, autocomplete: "off", spellcheck: false,
+    id, value: Array.isArray(shown) ? shown.map(quoted).join(" ") : shown, autocomplete: "off", spellcheck: false,
     "aria-describedby": `${id}-help`, placeholder: field.metavar || "",
     ...(field.kind === "number" ? { inputmode: "decimal" } : {}),
   });
@@ -456,6 +462,7 @@ async function results(where, run, current) {
       make("button", { type: "button", title: `gsba export ${run} --to ${to} --up auto`,
         onclick: add("export", { run, to, up: "auto" }) }, to))),
       make("p", { class: "faint" }, `Datasets are written into ${run}, and stand upright.`)),
+    growing(run, found),
     found.figures.length ? figureCard(found.figures.map((name) => `${run}/figures/${name}`)) : "");
 }
 
