@@ -29,7 +29,7 @@ class MapStrength:
     scale_sigmas: np.ndarray  # (F - 2,) float64, of the logarithm of a step's length over that of
     # the step before it, at the frame between them; NaN = not known
     drift: np.ndarray  # (C,) float64, rms error of positions to be expected of each map after the
-    # best similarity, part of its path
+    # best similarity, part of the path of its longest recording
     weak: np.ndarray  # (F,) bool, frames at or near places where the scale is uncertain, in maps
     # that drift
     held_steps: np.ndarray  # (F - 1,) bool, steps whose covariance is far below the trajectory's
@@ -40,31 +40,37 @@ class MapStrength:
 
 def measure(
     world_T_rigs: np.ndarray,
-    covariances: np.ndarray,
-    joint: JointErrors,
+    errors: tuple[np.ndarray, JointErrors],
     coarse_world_T_rigs: np.ndarray,
     seen: np.ndarray,
     believed: np.ndarray,
     settings: RefineSettings,
     components: np.ndarray | None = None,
+    recordings: np.ndarray | None = None,
 ) -> MapStrength:
     """Judge a solution by the joint covariance of its poses under negligible priors.
 
     Args:
         world_T_rigs: (F, 4, 4).
-        covariances: (F, 6, 6) [rotation rad, translation], rig frames.
-        joint: what errors of poses have in common.
+        errors: covariances (F, 6, 6) [rotation rad, translation], rig frames, and what errors of
+            poses have in common.
         coarse_world_T_rigs: (F, 4, 4) the trajectory.
         seen: (F - 1,) bool, steps that images show.
         believed: (F - 1,) bool, steps of the trajectory that they do not contradict.
         settings: weak_frames: limits, and how far around a weak place frames count as near; priors:
             noise of the trajectory's steps, as far as the images do not know it.
         components: (F,) map of each frame, from 0; None = there is one.
+        recordings: (F,) recording of each frame, from 0; None = there is one.
     """
+    covariances, joint = errors
     num, weak_frames, priors = len(world_T_rigs), settings.weak_frames, settings.priors
     maps = np.zeros(num, np.int32) if components is None else components
+    walks = np.zeros(num, np.int64) if recordings is None else recordings
     drift = np.array(
-        [_drift(world_T_rigs[maps == m], joint.draws[:, maps == m]) for m in range(maps.max() + 1)]
+        [
+            _drift(world_T_rigs[maps == m], joint.draws[:, maps == m], walks[maps == m])
+            for m in range(maps.max() + 1)
+        ]
     )
     drifting = drift[maps] > weak_frames.max_drift
     sigmas = scale_sigmas(world_T_rigs, joint.draws)
@@ -90,8 +96,12 @@ def scale_sigmas(world_T_rigs: np.ndarray, draws: np.ndarray) -> np.ndarray:
     return np.diff(stretches, axis=1).std(axis=0)
 
 
-def _drift(world_T_rigs: np.ndarray, draws: np.ndarray) -> float:
-    """See `MapStrength.drift`; 0 where fewer than three poses are known."""
+def _drift(world_T_rigs: np.ndarray, draws: np.ndarray, walks: np.ndarray) -> float:
+    """See `MapStrength.drift`; 0 where fewer than three poses are known.
+
+    Args:
+        walks: (F,) recording of each frame.
+    """
     known = np.isfinite(draws).all(axis=(0, 2))
     if np.count_nonzero(known) < 3:
         return 0.0
@@ -102,7 +112,9 @@ def _drift(world_T_rigs: np.ndarray, draws: np.ndarray) -> float:
     shifts = [np.tile(axis, (len(poses), 1)) for axis in np.eye(3)]
     basis = np.linalg.qr(np.array([*shifts, *turns, offsets]).reshape(7, -1).T)[0]
     left = errors - errors @ basis @ basis.T
-    path = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum()
+    lengths = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    within = np.diff(walks[known]) == 0  # from one recording to the next is no step
+    path = np.bincount(walks[known][1:][within], lengths[within]).max(initial=0.0)
     return float(np.sqrt(np.mean(left**2) * 3) / max(path, 1e-300))
 
 

@@ -140,9 +140,7 @@ def merge_maps(state: State, parts: np.ndarray) -> State:
         context, times = state.observed.context, run.frames.timestamps
         # No trajectory relates recordings: their maps are as free as those of images alone.
         alone = prior.absent or bool(run.evidence.recordings)
-        owners = np.zeros(len(parts), np.int64)
-        for number, rows in enumerate(run.frames.recordings.values()):
-            owners[rows] = number
+        owners = run.frames.recording_of_frame
         return map_merging.merge(context, solution, parts, held, shown, times, alone, owners)
 
     merged = run.stage("registered", run.matching_key(), compute, Registered)
@@ -159,18 +157,18 @@ def measure_strength(state: State) -> State:
 
     def compute() -> MapStrength:
         context = state.context_of_images(run.settings.priors.faint())
-        covariances, joint = adjustment.pose_covariances(
+        errors = adjustment.pose_covariances(
             solution, state.observed.keypoints, context, prior.parts
         )
         return map_strength.measure(
             solution.world_T_rigs,
-            covariances,
-            joint,
+            errors,
             prior.coarse.world_T_rigs,
             ~trust.unseen_steps,
             ~trust.false_steps,
             run.settings,
             prior.parts,
+            run.frames.recording_of_frame,
         )
 
     strength = run.stage("strength", [run.solving_key(), limits], compute, MapStrength)

@@ -137,6 +137,13 @@ class FrameSet:
         }
 
     @property
+    def recording_of_frame(self) -> np.ndarray:
+        """Index (F,) int64 of the recording of each frame, in the order of `recordings`."""
+        owners = [name.rpartition("/")[0] for name in self.names]
+        numbers = {name: number for number, name in enumerate(dict.fromkeys(owners))}
+        return np.array([numbers[name] for name in owners], np.int64)
+
+    @property
     def cameras(self) -> np.ndarray:
         """Index (F,) int64 of the camera that took each frame."""
         return np.array(self.camera_of_frame or (0,) * len(self), np.int64)

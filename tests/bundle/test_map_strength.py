@@ -34,17 +34,17 @@ def _chained(scale_sigma: np.ndarray, num_draws: int = 2000) -> tuple[np.ndarray
 
 
 def _measured(scale_sigma: np.ndarray, coarse: np.ndarray = POSES) -> MapStrength:
-    return map_strength.measure(POSES, *_chained(scale_sigma), coarse, ALL, ALL, SETTINGS)
+    return map_strength.measure(POSES, _chained(scale_sigma), coarse, ALL, ALL, SETTINGS)
 
 
 def test_a_map_that_hardly_drifts_is_left_alone() -> None:
-    covariances, joint = _chained(np.full(NUM - 2, 2e-3))
+    errors = _chained(np.full(NUM - 2, 2e-3))
     given = POSES, ALL, ALL
-    loose = map_strength.measure(POSES, covariances, joint, *given, SETTINGS)
+    loose = map_strength.measure(POSES, errors, *given, SETTINGS)
     assert loose.drift[0] > CLOSER.max_drift and loose.weak.any()
     calm = CLOSER.model_copy(update={"max_drift": 2 * loose.drift[0]})
     settings = SETTINGS.model_copy(update={"weak_frames": calm})
-    found = map_strength.measure(POSES, covariances, joint, *given, settings)
+    found = map_strength.measure(POSES, errors, *given, settings)
     assert not found.weak.any() and found.held_steps.all()
 
 
@@ -59,7 +59,17 @@ def test_drift_is_what_is_left_after_the_best_similarity() -> None:
         fit = similarity(positions, POSES[:, :3, 3])
         squares.append((fit.points(positions) - POSES[:, :3, 3]) ** 2)
     wanted = np.sqrt(3 * np.mean(squares)) / LENGTHS.sum()
-    assert map_strength._drift(POSES, draws) == pytest.approx(wanted, rel=0.01)
+    one = np.zeros(NUM, np.int64)
+    assert map_strength._drift(POSES, draws, one) == pytest.approx(wanted, rel=0.01)
+
+
+def test_a_place_walked_twice_is_judged_as_if_it_were_walked_once() -> None:
+    errors = _chained(np.full(NUM - 2, 2e-3))
+    twice = np.concatenate([POSES, POSES])
+    draws = np.concatenate([errors[1].draws, errors[1].draws], axis=1)
+    recordings = np.repeat([0, 1], NUM)
+    alone = map_strength._drift(POSES, errors[1].draws, recordings[:NUM])
+    assert map_strength._drift(twice, draws, recordings) == pytest.approx(alone)
 
 
 def test_changes_of_scale_are_as_uncertain_as_they_were_made() -> None:
@@ -78,14 +88,14 @@ def test_nothing_is_looked_for_where_no_image_shows_a_step() -> None:
     made[9] = 2e-3
     seen = ALL.copy()
     seen[10] = False
-    found = map_strength.measure(POSES, *_chained(made), POSES, seen, ALL, SETTINGS)
+    found = map_strength.measure(POSES, _chained(made), POSES, seen, ALL, SETTINGS)
     assert not found.weak.any() and not found.held_steps[10]
 
 
 def test_a_trajectory_that_is_not_believed_leaves_weak_places_to_be_found() -> None:
     made = np.full(NUM - 2, 4e-4)
     made[9] = 2e-3
-    found = map_strength.measure(POSES, *_chained(made), POSES, ALL, ~ALL, SETTINGS)
+    found = map_strength.measure(POSES, _chained(made), POSES, ALL, ~ALL, SETTINGS)
     assert found.weak.any() and found.noise is None
 
 
