@@ -231,18 +231,12 @@ def _joined(store: RunStore, runs: Sequence[FinishedRun]) -> tuple[State, JointM
 
 
 def _settings_of_new(settings: RefineSettings) -> RefineSettings:
-    """Settings of a run, for recordings that are to join it.
-
-    What places its result is left out, and what makes up for a weak map: the run's holds it then.
-    """
+    """Settings of a run, for recordings that are to join it: without what places its result."""
     direct = settings.direct_families()
     factors = tuple(name for name in settings.factors if name != "gps" and name not in direct)
-    patches = settings.patches.model_copy(update={"weak_rounds": settings.patches.rounds})
     return settings.model_copy(
         update={
             "factors": factors,
-            "patches": patches,
-            "weak_frames": settings.weak_frames.model_copy(update={"mode": "off"}),
             "gps": GpsSettings(),
             "placement": PlacementSettings(),
             "export": settings.export.model_copy(update={"formats": ()}),
