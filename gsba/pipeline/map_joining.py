@@ -234,7 +234,7 @@ def tie(state: State, parts: np.ndarray) -> State:
 
 
 def _aligned(state: State, base: Sighted, features: Keypoints, parts: np.ndarray) -> State | None:
-    """Shared points aligned to patches below a pixel, and all solved with them, in rounds; None
+    """Shared points aligned to patches below a pixel, then all around them, solved in rounds; None
     where that explains less.
 
     Args:
@@ -250,29 +250,36 @@ def _aligned(state: State, base: Sighted, features: Keypoints, parts: np.ndarray
     known = replace(state.solution, landmarks=placed, noise=1.0)
     found = frontend.match_known_points_across(state.with_solution(known), parts, "across2")
     state = replace(state, matches=found.matches)
-    landmarks = state.triangulated(_crossing(state, parts), rays, gate)
-    observed, better = Observations(features, field=state.map.field), None
+    start = replace(known, landmarks=state.triangulated(_crossing(state, parts), rays, gate))
+    shared = _align(state, start, Observations(features, field=state.map.field), "align1")
+    left, better = _without_same(base, shared, run.greys.width), None
     for n in range(1, rounds + 1):
-        start = replace(state.solution, landmarks=landmarks, noise=1.0)
-        shared = _align(state, start, observed, f"align{n}")
-        left = _without_same(base, shared, run.greys.width)
-        everything, own = _joined_sighted(left, shared)
-        solved = _solved(state, everything, f"aligned{n}")
+        if n > 1:
+            left, shared = _align_around(state, parts, f"align{n}")
+        solved = _solved(state, _joined_sighted(left, shared), f"aligned{n}")
         if solved is None:
             break
-        state, better, placed = solved, solved, solved.solution.landmarks
-        rows = np.zeros(len(everything.aligned), bool)
-        rows[own] = True
-        tracks = placed.tracks
-        chosen = np.zeros(tracks.num_points, bool)
-        chosen[tracks.points[rows[state.map.observed.rows(tracks)]]] = True
-        landmarks = replace(
-            placed, points_world=placed.points_world[chosen], tracks=tracks.of(chosen)
-        )
-        observed = Observations(
-            state.map.observed, state.map.aligned, state.map.normals_rig, state.map.field
-        )
+        state, better = solved, solved
     return better
+
+
+def _align_around(state: State, parts: np.ndarray, name: str) -> tuple[Sighted, Sighted]:
+    """Observations of points that frames see where different parts meet, these observed anew.
+
+    Returns:
+        Those of all other points, and those of the points that were observed anew.
+    """
+    map_, solution = state.map, state.solution
+    landmarks, tracks = solution.landmarks, solution.landmarks.tracks
+    meeting = np.unique(tracks.frames[_of_several(tracks, parts)[tracks.points]])
+    chosen = np.zeros(tracks.num_points, bool)
+    chosen[tracks.points[np.isin(tracks.frames, meeting)]] = True
+    known, own = _sighted(state), landmarks.points_world[chosen]
+    keypoints = known.keypoints.scaled_noise(solution.noise)
+    left = replace(known, keypoints=keypoints, tracks=tracks.of(~chosen))
+    around = replace(landmarks, points_world=own, tracks=tracks.of(chosen))
+    observed = Observations(map_.observed, map_.aligned, map_.normals_rig, map_.field)
+    return left, _align(state, replace(solution, landmarks=around), observed, name)
 
 
 def _align(state: State, start: Solution, observed: Observations, name: str) -> Sighted:
@@ -416,14 +423,17 @@ def _across(state: State, parts: np.ndarray, merged: Registered) -> State:
 def _crossing(state: State, parts: np.ndarray) -> Tracks:
     """Tracks of features that frames of two parts (F,) or more see."""
     tracks = backend.tracks_of(state)
-    if not len(tracks):
-        return tracks
-    owners = parts[tracks.frames]
-    starts = np.flatnonzero(np.diff(tracks.points, prepend=-1))
-    mixed = np.minimum.reduceat(owners, starts) != np.maximum.reduceat(owners, starts)
+    return tracks.of(_of_several(tracks, parts))
+
+
+def _of_several(tracks: Tracks, parts: np.ndarray) -> np.ndarray:
+    """Points (J,) bool that frames of different parts (F,) see."""
     chosen = np.zeros(tracks.num_points, bool)
-    chosen[tracks.points[starts]] = mixed
-    return tracks.of(chosen)
+    if len(tracks):
+        owners, starts = parts[tracks.frames], np.flatnonzero(np.diff(tracks.points, prepend=-1))
+        mixed = np.minimum.reduceat(owners, starts) != np.maximum.reduceat(owners, starts)
+        chosen[tracks.points[starts]] = mixed
+    return chosen
 
 
 def _sighted(state: State) -> Sighted:
@@ -458,18 +468,14 @@ def _with_tracks(one: Tracks, other: Tracks) -> Tracks:
     )
 
 
-def _joined_sighted(one: Sighted, other: Sighted) -> tuple[Sighted, np.ndarray]:
-    """Observations of both, and the rows (N,) of the other's keypoints among them."""
+def _joined_sighted(one: Sighted, other: Sighted) -> Sighted:
+    """Observations of both."""
     keypoints, order = _interleaved(one.keypoints, other.keypoints)
     sizes = np.diff(one.keypoints.starts)
     moved = replace(other.tracks, keypoints=other.tracks.keypoints + sizes[other.tracks.frames])
     normals = np.concatenate([_normals_of(one), _normals_of(other)])[order]
     aligned = np.concatenate([one.aligned, other.aligned])[order]
-    tracks = _with_tracks(one.tracks, moved)
-    places = np.empty(len(order), np.int64)
-    places[order] = np.arange(len(order))
-    joined = Sighted(keypoints, aligned, tracks, other.counts, normals)
-    return joined, places[len(one.aligned) :]
+    return Sighted(keypoints, aligned, _with_tracks(one.tracks, moved), other.counts, normals)
 
 
 def _normals_of(sighted: Sighted) -> np.ndarray:
