@@ -59,7 +59,7 @@ def settings_of(kind: str, residual: str) -> RefineSettings:
     settings = RefineSettings()
     patches = settings.patches
     if kind == KINDS[0]:
-        patches = patches.model_copy(update={"rounds": 0, "weak_rounds": 0})
+        patches = patches.model_copy(update={"rounds": 0})
     export = settings.export.model_copy(update={"formats": ()})
     changes = {"factors": RESIDUALS[residual], "patches": patches, "export": export}
     return settings.model_copy(update=changes)

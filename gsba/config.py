@@ -190,9 +190,8 @@ class RoundSettings(_Settings):
 class PatchSettings(_Settings):
     """Patches around the map's points, aligned to every frame that shows them."""
 
-    rounds: int = Field(default=2, ge=0)  # rounds of alignment and bundle adjustment; 0 = none
-    weak_rounds: int = Field(default=4, ge=0)  # most rounds of a weakly constrained map: it stops
-    # once the steps between frames no longer change
+    rounds: int = Field(default=4, ge=0)  # most rounds of alignment and bundle adjustment, which
+    # end once the steps between frames no longer change; 0 = none
     patch_size: int = Field(default=15, ge=5, le=41)  # pixels across, odd
     max_width: int = Field(default=4096, ge=64)  # pixels across a panorama; wider ones are halved
     max_views: int = Field(default=16, ge=1)  # most frames that a point is aligned in

@@ -234,8 +234,8 @@ def tie(state: State, parts: np.ndarray) -> State:
 
 
 def _aligned(state: State, base: Sighted, features: Keypoints, parts: np.ndarray) -> State | None:
-    """Shared points aligned to patches below a pixel, then all around them, solved in rounds; None
-    where that explains less.
+    """Shared points aligned to patches below a pixel, then all around them, and solved, until
+    steps move by less than their noise; None where that explains less.
 
     Args:
         state: poses and camera, and matches of features.
@@ -252,14 +252,16 @@ def _aligned(state: State, base: Sighted, features: Keypoints, parts: np.ndarray
     state = replace(state, matches=found.matches)
     start = replace(known, landmarks=state.triangulated(_crossing(state, parts), rays, gate))
     shared = _align(state, start, Observations(features, field=state.map.field), "align1")
-    left, better = _without_same(base, shared, run.greys.width), None
+    left, before, better = _without_same(base, shared, run.greys.width), state, None
     for n in range(1, rounds + 1):
+        if patch_rounds.is_settled(before, state, n):
+            break
         if n > 1:
             left, shared = _align_around(state, parts, f"align{n}")
         solved = _solved(state, _joined_sighted(left, shared), f"aligned{n}")
         if solved is None:
             break
-        state, better = solved, solved
+        before, state, better = state, solved, solved
     return better
 
 

@@ -15,16 +15,14 @@ from gsba.types import Keypoints, Sighted, Solution
 logger = logging.getLogger(__name__)
 
 _SETTLED_SIGMAS = 1.0  # rms motion of steps by a round, below which rounds end
+_MIN_ROUNDS = 2  # of patches that face their hosts, and of patches that lie on their surfaces
 
 
 def align(state: State) -> State:
-    """Align patches and adjust in rounds; more of them where images determine the map poorly."""
-    settings, before = state.run.settings.patches, state
-    most = settings.rounds
-    if most and state.prior.weak_frames().any():
-        most = max(most, settings.weak_rounds)
-    for n in range(1, most + 1):
-        if n > settings.rounds and _is_settled(before, state, n):
+    """Align patches and adjust in rounds, until steps move by less than their noise."""
+    before = state
+    for n in range(1, state.run.settings.patches.rounds + 1):
+        if is_settled(before, state, n):
             break
         if n > 1:
             state = gyro.align_to_map(state, f"imu_aligned{n}")
@@ -149,8 +147,15 @@ def _straighten(state: State, sighted: Sighted, number: int) -> State:
     return replace(state, map=map_)
 
 
-def _is_settled(before: State, state: State, number: int) -> bool:
-    """Whether the last round of aligning patches moved steps by less than their noise."""
+def is_settled(before: State, state: State, number: int) -> bool:
+    """True if the last round of aligning patches moved steps by less than their noise.
+
+    Args:
+        before, state: before that round, and after it.
+        number: of the next round, from 1.
+    """
+    if number <= _MIN_ROUNDS:
+        return False
     run, prior, solution = state.run, state.prior, state.solution
 
     def compute() -> float:
