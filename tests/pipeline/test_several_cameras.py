@@ -39,10 +39,10 @@ def _error(result: RunResult, home: Home) -> float:
 
 
 @pytest.fixture(scope="module")
-def alike(home: Home) -> float:
-    """Error of one camera for all."""
-    recordings = [panoramas(home, n, WIDTH) for n in range(2)]
-    return _error(refine_recordings(recordings, home.folder / "alike", SETTINGS), home)
+def coarser(home: Home) -> float:
+    """Error of the coarser camera for all."""
+    recordings = [panoramas(home, n, SMALL) for n in range(2)]
+    return _error(refine_recordings(recordings, home.folder / "coarser", SETTINGS), home)
 
 
 @pytest.fixture(scope="module")
@@ -53,9 +53,9 @@ def sizes(home: Home) -> RunResult:
     return refine_recordings(recordings, home.folder / "sizes", settings_with(export=formats))
 
 
-def test_pictures_of_two_sizes_make_one_map(sizes: RunResult, alike: float, home: Home) -> None:
+def test_pictures_of_two_sizes_make_one_map(sizes: RunResult, coarser: float, home: Home) -> None:
     assert [kind.width for kind in sizes.frames.formats] == [WIDTH, SMALL]
-    assert _error(sizes, home) < 1.5 * alike
+    assert _error(sizes, home) < 1.5 * coarser
     _, frames = load_run(sizes.out)
     assert frames.camera_of_frame == (0,) * NUM + (1,) * NUM
 
@@ -104,12 +104,12 @@ def test_poses_and_the_report_have_all_frames(sizes: RunResult) -> None:
     assert (sizes.out / "report.html").is_file()
 
 
-def test_stitched_panoramas_and_cube_faces_make_one_map(home: Home, alike: float) -> None:
+def test_stitched_panoramas_and_cube_faces_make_one_map(home: Home, coarser: float) -> None:
     recordings = [panoramas(home, 0, WIDTH), faces(home)]
     settings = settings_with(export={"formats": ("colmap-flat",)})
     result = refine_recordings(recordings, home.folder / "cube", settings)
     assert [kind.layout for kind in result.frames.formats] == ["erp", "cube"]
-    assert _error(result, home) < 1.5 * alike
+    assert _error(result, home) < 1.5 * coarser
     model = pycolmap.Reconstruction(str(result.out / "colmap-flat/sparse/0"))
     assert len(model.images) == 12 * NUM
     with pytest.raises(GsbaError, match="needs panoramas"):
