@@ -80,9 +80,7 @@ def add(
 
 @command
 def merge(
-    runs: Annotated[
-        list[Path], typer.Argument(help="Folders of finished runs of one camera.", metavar="RUN...")
-    ],
+    runs: Annotated[list[Path], typer.Argument(help="Folders of finished runs.", metavar="RUN...")],
     out: Annotated[Path, typer.Option(help="Folder of the result.", metavar="DIR")],
     rigid: Annotated[
         bool,

@@ -12,6 +12,8 @@ from gsba.camera.rig import RIG_R_FACE, CubeRig, owner_faces
 from gsba.config import FeatureSettings
 from gsba.types import FACES, Features, Keypoints
 
+_SAME_PIXEL_PX = 0.01  # pixels of one keypoint on the faces of two rigs differ by more
+
 
 @dataclass(frozen=True, slots=True)
 class FaceKeypoints:
@@ -134,3 +136,17 @@ def gather(frames: Iterable[Features]) -> Keypoints:
         )
     columns = (np.concatenate(column) for column in zip(*fields, strict=True))
     return Keypoints(np.cumsum(lengths), *columns)
+
+
+def on_faces(keypoints: Keypoints, rig: CubeRig) -> Keypoints:
+    """Keypoints whose pixels are given on the faces of a rig, where they were on others.
+
+    Args:
+        keypoints: of frames of several runs, each on the faces of its own rig.
+        rig: the faces.
+    """
+    pixels = rig.project(keypoints.bearings_rig, keypoints.faces)
+    moved = np.abs(pixels - keypoints.pixels).max(axis=1, initial=0.0) > _SAME_PIXEL_PX
+    if not moved.any():
+        return keypoints
+    return replace(keypoints, pixels=np.where(moved[:, None], pixels, keypoints.pixels))

@@ -131,7 +131,7 @@ def _cameras_of(
     for recording, frames in recordings.items():
         own, model = frames.format, names.get(recording, "")
         for number, (known, other) in enumerate(zip(formats, models, strict=True)):
-            if _one_mode(known, own) and (not model or not other or model == other):
+            if one_mode(known, own) and (not model or not other or model == other):
                 nominal = known.lenses_nominal or own.lenses_nominal
                 formats[number] = replace(known, lenses_nominal=nominal)
                 models[number] = other or model
@@ -144,7 +144,7 @@ def _cameras_of(
     return tuple(formats), numbers
 
 
-def _one_mode(one: PictureFormat, other: PictureFormat) -> bool:
+def one_mode(one: PictureFormat, other: PictureFormat) -> bool:
     """True if one camera in one mode can have made both; lenses that are to be estimated may
     differ."""
     if one.lenses_nominal or other.lenses_nominal:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from gsba.bundle.reconstruction import world_scale
-from gsba.config import RefineSettings
+from gsba.config import CameraSettings, RefineSettings
 from gsba.config_file import load_config
 from gsba.frames.recordings import own_timestamps
 from gsba.localization.run_map import require_own_version
@@ -25,6 +25,7 @@ from gsba.store.store import load_stage
 from gsba.types import CoarsePoses, FrameSet, Landmarks, Reconstruction, Solution, cameras_of
 
 _STAGE = "map"
+_CAMERAS = "camera_settings"  # of runs of several cameras, JSON of each
 _MIN_SHARED_POINTS = 12  # least points that two recordings share, to be tied to one another
 _FEATURES = "features_closer", "features"  # stages that hold a frame's features, the last one first
 
@@ -50,6 +51,8 @@ def keep(state: State) -> None:
         map_ = replace(map_, stitching=field)
     kept = KeptMap(map_, state.prior.coarse)
     state.run.stage(_STAGE, [], lambda: kept, KeptMap, noted=False)
+    if settings := tuple(one.model_dump_json() for one in state.run.camera_settings):
+        state.run.stage(_CAMERAS, [], lambda: settings, tuple[str, ...], noted=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +67,7 @@ class FinishedRun:
     result: Reconstruction  # all maps, each in its own world
     settings: RefineSettings
     files: tuple[Path, ...]  # (F,) stored features of each frame; may be missing
+    camera_settings: tuple[CameraSettings, ...]  # (C,)
 
     @classmethod
     def load(cls, root: Path) -> "FinishedRun":
@@ -99,7 +103,11 @@ class FinishedRun:
                 clock_shifts=(0.0,) * num,
             )
         given = frames, kept.map, kept.coarse, result
-        return cls(root, origin, *given, settings, files)
+        cameras = settings.camera, *([settings.camera] * (len(frames.formats) - 1))
+        if len(cameras) > 1:
+            known = load_stage(root, _CAMERAS, tuple[str, ...])
+            cameras = tuple(CameraSettings.model_validate_json(one) for one in known)
+        return cls(root, origin, *given, settings, files, cameras)
 
     def recordings(self) -> dict[str, FrameSet]:
         """Frames of each recording by its name, on its own clock, under their own names."""
@@ -134,8 +142,12 @@ class FinishedRun:
             segments=None,
         )
         frames, map_ = self.frames.taken(rows), _map_of(self.map, rows)
+        used, _ = cameras_of(self.frames.camera_of_frame, rows)
+        cameras = tuple(self.camera_settings[c] for c in used)
         return replace(
             self,
+            settings=self._settings_of(cameras),
+            camera_settings=cameras,
             origin=origin,
             frames=frames,
             map=map_,
@@ -143,6 +155,13 @@ class FinishedRun:
             result=_result_of(self.result, rows, _tied(map_, frames)),
             files=tuple(self.files[f] for f in rows),
         )
+
+    def _settings_of(self, cameras: Sequence[CameraSettings]) -> RefineSettings:
+        """Settings when only some of the cameras are left: those of a model that is left."""
+        if len(cameras) == len(self.camera_settings):
+            return self.settings
+        known = next((one for one in cameras if one.baseline() is not None), cameras[0])
+        return self.settings.model_copy(update={"camera": known})
 
 
 def _tied(map_: Map, frames: FrameSet) -> np.ndarray:

@@ -43,7 +43,7 @@ def adopt(run: Run, stored: Sequence[Path]) -> ObservedFrames:
     found = extraction.adopted(run.store, run.frames, run.rig, run.settings.cubemap, make, stored)
     load = FrameFeatures([found] * len(run.frames), run.frames.names)
     keypoints = detection.gather(map(load, range(len(run.frames))))
-    return _matchable(run, [found] * len(run.frames), keypoints)
+    return _matchable(run, [found] * len(run.frames), detection.on_faces(keypoints, run.rig))
 
 
 def extract_more(state: State, weak: np.ndarray) -> State:

@@ -1,7 +1,7 @@
 """Finished runs that grow: recordings added or taken out, and runs merged, from what is solved."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from gsba.config import GpsSettings, PlacementSettings, RefineSettings
+from gsba.config import CameraSettings, GpsSettings, PlacementSettings, RefineSettings
 from gsba.log import GsbaError
 from gsba.masks.segmentation import Segment
 from gsba.pipeline import backend, camera, finished_run, grown_folder, map_joining, outputs
 from gsba.pipeline.finished_run import FinishedRun
-from gsba.pipeline.joint_map import JointMaps, check_grows, check_new
+from gsba.pipeline.joint_cameras import JointCameras, as_read_by, refuse_fields
+from gsba.pipeline.joint_map import JointMaps, check_new
 from gsba.pipeline.map_joining import RigidMoves
 from gsba.pipeline.outputs import RunResult
 from gsba.pipeline.prior import Prior
@@ -27,7 +28,7 @@ from gsba.similarity import NoSimilarityError, Sim3, pose_similarity
 from gsba.store import cluster
 from gsba.store.store import RunStore
 from gsba.trajectory.joining import PLACES, SegmentAlignment
-from gsba.types import CoarsePoses, PoseSource, Reconstruction
+from gsba.types import CoarsePoses, FrameSet, PoseSource, Reconstruction
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -52,7 +53,9 @@ def add_recordings(
 
     Args:
         run: folder of a finished run.
-        recordings: of the run's camera in its mode, at least one.
+        recordings: at least one. Those of the layout, size and calibration of one of the run's
+            cameras are of this camera, unless they name different models; the others have
+            cameras of their own.
         out: folder of the result, new or empty; None = the folder of the run, which is kept as
             RUN-before beside it.
         fixed: keep the run's poses to the byte, and solve those of the recordings against them.
@@ -76,7 +79,9 @@ def add_recordings(
             scratch = grown_folder.scratch_of(work.root)
             named = [replace(one, name=name) for one, name in zip(recordings, names, strict=True)]
             settings = _settings_of_new(finished.settings)
-            given = {"segment": segment, "client": client, "refuse": partial(check_new, finished)}
+            given = {"segment": segment, "client": client}
+            models = {one.name: one.camera for one in named}
+            given |= {"adapt": partial(_new_as_read_by, finished, models=models)}
             refine_each(named, scratch, settings, **given)
             runs = [finished, FinishedRun.load(scratch)]
             state, maps = _joined(work, runs)
@@ -101,7 +106,8 @@ def merge_runs(
     maps of their own.
 
     Args:
-        runs: folders of finished runs of one camera in one mode, at least two; only read.
+        runs: folders of finished runs, at least two; only read. Their cameras are told apart as
+            recordings' are by `add_recordings`.
         out: folder of the result, new or empty.
         rigid: move each map as it is, by a similarity whose covariance is reported.
         client: see `gsba.refine`.
@@ -120,6 +126,7 @@ def merge_runs(
     with grown_folder.held_runs(roots):
         finished = [FinishedRun.load(root) for root in roots]
         _refuse_common(finished)
+        refuse_fields(finished, len(JointCameras.of(finished).formats) > 1)
         origin = {what: path for run in finished for what, path in run.origin.items()}
         with place.store(origin, client, finished[0]) as work:
             state, maps = _joined(work, finished)
@@ -127,8 +134,7 @@ def merge_runs(
             if not rigid:
                 return place.finish(work, map_joining.tie(state, maps.parts), maps)
             moves = map_joining.align_rigidly(state, maps.parts)
-            unit = int(maps.main_rows(maps.seen_by)[0])
-            state = map_joining.moved_rigidly(state, maps.parts, moves, unit)
+            state = map_joining.moved_rigidly(state, maps.parts, moves, maps.unit_frames())
             return place.finish(work, state, maps, rigid=moves)
 
 
@@ -244,9 +250,16 @@ def _settings_of_new(settings: RefineSettings) -> RefineSettings:
     )
 
 
+def _new_as_read_by(
+    run: FinishedRun, found: Mapping[str, FrameSet], models: Mapping[str, str | None]
+) -> dict[str, tuple[FrameSet, CameraSettings]]:
+    """New recordings as a run reads them, see `as_read_by`; those that it has are refused."""
+    check_new(run, found)
+    return as_read_by(run, found, models)
+
+
 def _refuse_known(run: FinishedRun, recordings: Sequence[Recording], names: Sequence[str]) -> None:
     """Refuse recordings that are in a run already, or whose name is taken there."""
-    check_grows(run)
     taken = list(run.frames.recordings)
     known = {path.resolve(): what.rpartition(": ")[0] for what, path in run.origin.items()}
     for one, name in zip(recordings, names, strict=True):
@@ -257,11 +270,6 @@ def _refuse_known(run: FinishedRun, recordings: Sequence[Recording], names: Sequ
             raise GsbaError(
                 f"{run.root} has another recording named '{name}': give {path} a name of its own "
                 "(--recording PATH,name=NAME)"
-            )
-        if one.camera is not None and run.settings.camera.name not in (None, one.camera):
-            raise GsbaError(
-                f"recording '{name}' is of another camera than {run.root} ({one.camera} and "
-                f"{run.settings.camera.name}): recordings of one run must be of one camera"
             )
 
 

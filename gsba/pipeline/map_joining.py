@@ -32,7 +32,7 @@ from gsba.photometric.alignment import Observations
 from gsba.pipeline import backend, camera, frontend, inputs, patch_rounds
 from gsba.pipeline.joint_map import JointMaps, joined_keypoints
 from gsba.pipeline.prior import Prior
-from gsba.pipeline.run import Evidence, Run
+from gsba.pipeline.run import Evidence, RecordingEvidence, Run
 from gsba.pipeline.state import MapMatches, State
 from gsba.similarity import Sim3
 from gsba.store.store import RunStore
@@ -65,7 +65,7 @@ def begin(store: RunStore, maps: JointMaps, settings: RefineSettings) -> State:
     poses = maps.map.solution.world_T_rigs
     start = CoarsePoses(poses, np.full(len(poses), PoseSource.SLAM, np.uint8), 0.0)
     families = tuple(inputs.families_of(maps.frames, settings))
-    evidence = Evidence(families=families)
+    evidence = Evidence(families=families, recordings=_settings_of_cameras(maps, start))
     run = Run.begin(store, maps.frames, start, settings.with_faint_priors(), evidence)
     observed = frontend.adopt(run, [path for one in maps.runs for path in one.files])
     state = replace(State.begin(run, observed), map=maps.map)
@@ -92,7 +92,7 @@ def register(state: State, maps: JointMaps) -> State:
     points = landmarks.points_world + merged.offsets[landmarks.tracks.hosts()]
     poses = merged.solved.world_T_rigs
     moved = replace(solution, world_T_rigs=poses, landmarks=replace(landmarks, points_world=points))
-    state = _with_unit(state, merged.scales, int(maps.main_rows(maps.seen_by)[0]))
+    state = _with_unit(state, merged.scales, maps.unit_frames())
     return _tied_within(state.with_solution(moved), maps.parts, merged)
 
 
@@ -162,8 +162,11 @@ def align_rigidly(state: State, parts: np.ndarray) -> RigidMoves:
     return run.stage("similarities", run.matching_key(), compute, RigidMoves, noted=False)
 
 
-def moved_rigidly(state: State, parts: np.ndarray, rigid: RigidMoves, unit: int) -> State:
-    """The state with parts (F,) moved by similarities, its camera in the unit of frame `unit`."""
+def moved_rigidly(
+    state: State, parts: np.ndarray, rigid: RigidMoves, units: Sequence[int]
+) -> State:
+    """The state with parts (F,) moved by similarities, each camera in the unit of one of the frames
+    `units` (C,)."""
     solution, scales, moves = state.solution, rigid.scales[parts], rigid.moves[parts]
     poses = np.empty_like(solution.world_T_rigs)
     for part in np.unique(parts):
@@ -173,7 +176,7 @@ def moved_rigidly(state: State, parts: np.ndarray, rigid: RigidMoves, unit: int)
     landmarks = solution.landmarks.moved(scales, moves)
     moved = replace(solution, world_T_rigs=poses, landmarks=landmarks)
     merged = state.prior.merged
-    return _tied_within(_with_unit(state, scales, unit).with_solution(moved), parts, merged)
+    return _tied_within(_with_unit(state, scales, units).with_solution(moved), parts, merged)
 
 
 def adjust(state: State) -> State:
@@ -328,18 +331,19 @@ def _tied_within(state: State, parts: np.ndarray, merged: Registered | None = No
     return replace(state, prior=Prior(coarse, trust, parts=apart, merged=merged))
 
 
-def _with_unit(state: State, scales: np.ndarray, frame: int) -> State:
-    """The state with its camera in the unit of maps that are moved.
+def _with_unit(state: State, scales: np.ndarray, units: Sequence[int]) -> State:
+    """The state with its cameras in the unit of maps that are moved.
 
     Args:
         state: of the maps.
         scales: (F,) by which each frame's map is moved.
-        frame: of the map whose camera it is.
+        units: (C,) frame of the map in whose unit each camera is.
     """
     if all(one.readout is None for one in state.map.cameras) or not state.map.lenses:
         return state
     found = state.map.estimates()
-    moved = found.with_each([_in_unit_of(one, scales, frame) for one in found.each])
+    pairs = zip(found.each, units, strict=True)
+    moved = found.with_each([_in_unit_of(one, scales, frame) for one, frame in pairs])
     return state.with_cameras(moved).through(moved.cameras)
 
 
@@ -353,24 +357,49 @@ def _in_unit_of(found: CameraEstimate, scales: np.ndarray, frame: int) -> Camera
 
 
 def _check_units(maps: JointMaps, merged: Registered) -> None:
-    """Refuse maps that meet in another scale than their lenses, which are equally far apart."""
-    first = maps.runs[0]
-    for number, run in enumerate(maps.runs[1:], 1):
+    """Refuse maps that meet in another scale than the lenses of a camera that both have."""
+    for number in range(1, len(maps.runs)):
         frames = int(maps.main_rows(0)[0]), int(maps.main_rows(number)[0])
-        if merged.components[frames[0]] != merged.components[frames[1]]:
-            continue
-        centres = first.map.only.centres, run.map.only.centres
-        if not all(one is not None and one.lenses for one in centres):
-            continue
-        apart = [baseline_of(one, 1.0) for one in centres if one is not None]
-        shares = [sigma / length for length, sigma in apart]
-        off = abs(float(np.log(merged.scales[frames[1]] / merged.scales[frames[0]])))
-        if off > max(_MAX_SCALE_SIGMAS * float(np.linalg.norm(shares)), np.log(_MAX_SCALE_RATIO)):
-            raise GsbaError(
-                f"{run.root} contradicts the camera of {first.root}: where they meet, its lenses "
-                f"are {np.exp(off):.2f} times as far apart, or the inverse; runs of one map must "
-                "be of one camera"
-            )
+        if merged.components[frames[0]] == merged.components[frames[1]]:
+            for pair in maps.cameras.shared(0, number):
+                _check_unit(maps, merged, (0, number), pair)
+
+
+def _check_unit(
+    maps: JointMaps, merged: Registered, numbers: tuple[int, int], cameras: tuple[int, int]
+) -> None:
+    """Refuse two maps (numbers of their runs) that meet in another scale than the lenses of a
+    camera (its numbers in these runs), which are equally far apart."""
+    lengths, shares = list[float](), list[float]()
+    for number, c in zip(numbers, cameras, strict=True):
+        run, move = maps.runs[number], maps.moves[number]
+        centres = run.map.cameras[c].centres
+        if centres is None or not centres.lenses:
+            return
+        length, sigma = baseline_of(centres, 1.0)
+        scale = merged.scales[int(maps.main_rows(number)[0])]
+        lengths.append(float(scale * move.scale * length))
+        shares.append(sigma / length)
+    off = abs(float(np.log(lengths[1] / lengths[0])))
+    if off > max(_MAX_SCALE_SIGMAS * float(np.linalg.norm(shares)), np.log(_MAX_SCALE_RATIO)):
+        first, run = (maps.runs[number] for number in numbers)
+        raise GsbaError(
+            f"{run.root} contradicts the camera of {first.root}: where they meet, its lenses "
+            f"are {np.exp(off):.2f} times as far apart, or the inverse; recordings of one layout, "
+            "size and calibration must be of one camera, unless they name different models"
+        )
+
+
+def _settings_of_cameras(maps: JointMaps, start: CoarsePoses) -> tuple[RecordingEvidence, ...]:
+    """Settings of the camera of each recording; () = there is one camera."""
+    settings, frames = maps.cameras.settings, maps.frames
+    if len(settings) == 1:
+        return ()
+    found = list[RecordingEvidence]()
+    for name, rows in frames.recordings.items():
+        own = CoarsePoses(start.world_T_rigs[rows], start.sources[rows], 0.0)
+        found.append(RecordingEvidence(name, own, camera=settings[frames.cameras[rows[0]]]))
+    return tuple(found)
 
 
 def _by_features(state: State) -> Solution:

@@ -71,16 +71,18 @@ def refine_each(
     fresh: bool = False,
     families: Sequence[Family] = (),
     client: "Client | None" = None,
-    refuse: Callable[[Mapping[str, FrameSet]], None] | None = None,
+    adapt: Callable[[Mapping[str, FrameSet]], Mapping[str, tuple[FrameSet, CameraSettings]]]
+    | None = None,
 ) -> RunResult:
     """Refine recordings in one run as `refine_recordings` does; one is enough.
 
     Args:
         recordings, out, settings, segment, fresh, families, client: see `refine_recordings`.
-        refuse: refuses frames by the name of their recording, before anything is computed.
+        adapt: gives frames as they are to be read, and settings of their camera, from frames by the
+            name of their recording, before anything is computed; None = as they are, `settings`.
 
     Raises:
-        GsbaError: as `refine_recordings`, and what `refuse` raises.
+        GsbaError: as `refine_recordings`, and what `adapt` raises.
     """
     given = [
         _Given.of(one, name) for one, name in zip(recordings, names_of(recordings), strict=True)
@@ -91,16 +93,24 @@ def refine_each(
     chosen = _masks(given, segment)
     origin = {name: path for one in given for name, path in one.files.items()}
     given, fresh = _with_videos(given, out, origin, settings, fresh)
+    found = {one.name: one.scanned() for one in given}
+    plain_of = dict.fromkeys(found, plain)
+    if adapt is not None:
+        read = adapt(found)
+        found = {name: frames for name, (frames, _) in read.items()}
+        plain_of = {
+            name: plain.model_copy(update={"camera": own}) for name, (_, own) in read.items()
+        }
+        settings = _with_camera(plain_of[given[0].name], given)
     if any(one.followed for one in given):  # no evidence beside the images that they are made of
         settings = settings.with_faint_priors()
-    found = {one.name: one.scanned() for one in given}
-    if refuse is not None:
-        refuse(found)
-    cameras = {one.name: one.recording.camera for one in given}
-    frames = combine(found, {name: model for name, model in cameras.items() if model})
+    models = {one.name: one.recording.camera for one in given}
+    frames = combine(found, {name: model for name, model in models.items() if model})
     evidence = Evidence(
         families=tuple(families),
-        recordings=tuple(one.evidence(found[one.name], settings, plain) for one in given),
+        recordings=tuple(
+            one.evidence(found[one.name], settings, plain_of[one.name]) for one in given
+        ),
     )
     start = Start.of(frames, evidence, settings)
     hired = cluster.hire(client, frames.paths[0][0], settings)

@@ -1,0 +1,286 @@
+"""Cameras of several runs laid together: which are one camera, and the estimate of each for all.
+
+Cameras of different runs are one where one camera in one mode can have made their pictures, unless
+their models have different names. Raw fisheyes must have been read by one calibration, which the
+observations of both are directions by. The run that knows most of a camera lends its estimate.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gsba.bundle.lens_centres import LensCentres, StitchRadius
+from gsba.bundle.readout import CameraEstimate, velocities
+from gsba.camera.lens import Lenses
+from gsba.config import CameraSettings
+from gsba.frames.recordings import one_mode, own_timestamps
+from gsba.log import GsbaError
+from gsba.pipeline.finished_run import FinishedRun
+from gsba.pipeline.map import FoundCamera
+from gsba.similarity import Sim3
+from gsba.types import FrameSet, PictureFormat, Solution
+
+_UNKNOWN_MODEL = {"name": None, "baseline_mm": None, "readout_ms": None}  # changes of settings
+
+
+@dataclass(frozen=True, slots=True)
+class JointCameras:
+    """Cameras of several runs, those that are one counted once."""
+
+    formats: tuple[PictureFormat, ...]  # (C,)
+    settings: tuple[CameraSettings, ...]  # (C,)
+    numbers: tuple[tuple[int, ...], ...]  # for each run, number here of each of its cameras
+    seen_by: tuple[int, ...]  # (C,) run whose estimate of each camera is taken
+
+    @classmethod
+    def of(cls, runs: Sequence[FinishedRun]) -> "JointCameras":
+        """Tell which cameras of runs are one."""
+        formats, settings, numbers = list[PictureFormat](), list[CameraSettings](), []
+        for run in runs:
+            own = list[int]()
+            for kind, chosen in zip(run.frames.formats, run.camera_settings, strict=True):
+                known = zip(formats, settings, strict=True)
+                alike = [
+                    c
+                    for c, (one, other) in enumerate(known)
+                    if c not in own and _one_cut(one, kind) and _one_model(other, chosen)
+                ]
+                if len(alike) != 1:  # none, or nothing tells which
+                    alike = [len(formats)]
+                    formats.append(kind)
+                    settings.append(chosen)
+                elif settings[alike[0]].name is None and chosen.name is not None:
+                    settings[alike[0]] = chosen
+                own.append(alike[0])
+            numbers.append(tuple(own))
+        seen_by = tuple(_best_run(runs, numbers, c) for c in range(len(formats)))
+        return cls(tuple(formats), tuple(settings), tuple(numbers), seen_by)
+
+    def of_frames(self, runs: Sequence[FinishedRun]) -> tuple[int, ...]:
+        """Camera (F,) of all frames of the runs; () = there is one."""
+        if len(self.formats) == 1:
+            return ()
+        pairs = zip(self.numbers, runs, strict=True)
+        return tuple(own[c] for own, run in pairs for c in run.frames.cameras.tolist())
+
+    def in_run(self, camera: int, run: int) -> int | None:
+        """Number of a camera in a run; None = it took none of its frames."""
+        own = self.numbers[run]
+        return own.index(camera) if camera in own else None
+
+    def shared(self, one: int, other: int) -> list[tuple[int, int]]:
+        """Numbers that the cameras of both of two runs have in either."""
+        first, second = self.numbers[one], self.numbers[other]
+        return [(first.index(c), second.index(c)) for c in first if c in second]
+
+    def found(
+        self,
+        runs: Sequence[FinishedRun],
+        moves: Sequence[Sim3],
+        solution: Solution,
+        frames: FrameSet,
+    ) -> tuple[FoundCamera, ...]:
+        """What is known of each camera (C,), for the frames of all runs.
+
+        Args:
+            runs: the runs.
+            moves: similarities of each run's solution to its place in the joint one.
+            solution: the joint one.
+            frames: of all runs.
+        """
+        return tuple(
+            self._found(c, runs, moves, solution, frames) for c in range(len(self.formats))
+        )
+
+    def _found(
+        self,
+        camera: int,
+        runs: Sequence[FinishedRun],
+        moves: Sequence[Sim3],
+        solution: Solution,
+        frames: FrameSet,
+    ) -> FoundCamera:
+        number = self.seen_by[camera]
+        inside = self.in_run(camera, number)
+        assert inside is not None
+        known, scale = runs[number].map.cameras[inside], moves[number].scale
+        each = [(self._lenses_in(camera, n, run), len(run.frames)) for n, run in enumerate(runs)]
+        estimate = _for_all_frames(_scaled(known, scale), known, each, moves, solution, frames)
+        return _in_unit(known, estimate, scale)
+
+    def _lenses_in(self, camera: int, number: int, run: FinishedRun) -> Lenses | None:
+        """Lenses of a camera as a run knows them; None = it took none of its frames."""
+        inside = self.in_run(camera, number)
+        return None if inside is None else run.map.cameras[inside].lenses
+
+
+def as_read_by(
+    run: FinishedRun, found: Mapping[str, FrameSet], models: Mapping[str, str | None]
+) -> dict[str, tuple[FrameSet, CameraSettings]]:
+    """New recordings as a run reads pictures of its cameras, and the settings of their cameras.
+
+    Raw fisheyes without a calibration are read by that of the run, which is better known than what
+    image circles tell. Settings of a camera that the run does not have say nothing of its model.
+
+    Args:
+        run: a finished run.
+        found: frames of the recordings by their names, of one camera each.
+        models: camera model by recording; None = not known.
+
+    Raises:
+        GsbaError: a recording has a camera of its own, and the run a field of stitching errors.
+    """
+    read = dict[str, tuple[FrameSet, CameraSettings]]()
+    for name, frames in found.items():
+        model = run.settings.camera.model_copy(update={"name": models[name]})
+        known = zip(run.frames.formats, run.camera_settings, strict=True)
+        alike = [
+            (kind, own) for kind, own in known if _one_make(kind, frames) and _one_model(own, model)
+        ]
+        if len(alike) != 1:
+            refuse_fields([run], several=True)
+            read[name] = frames, _without_model(run.settings.camera)
+            continue
+        kind, settings = alike[0]
+        if frames.format.lenses_nominal:
+            frames = frames.with_formats([replace(kind, lenses_nominal=False)])
+        read[name] = frames, settings
+    return read
+
+
+def refuse_fields(runs: Sequence[FinishedRun], several: bool) -> None:
+    """Refuse to lay cameras beside one for which a field of stitching errors was found.
+
+    Args:
+        runs: finished runs.
+        several: True if they are to be a run of several cameras.
+
+    Raises:
+        GsbaError: a run has such a field.
+    """
+    for run in runs if several else ():
+        if run.map.field:
+            raise GsbaError(
+                f"{run.root} corrects errors of stitching by a field ([stitching]), which is known "
+                "for one camera only, and there are several here: refine all recordings together "
+                "(gsba refine A B --out RUN)"
+            )
+
+
+def _one_make(kind: PictureFormat, frames: FrameSet) -> bool:
+    """True if a camera with such pictures can have made frames, whatever is known of its lenses."""
+    own = frames.format
+    if not own.lenses_nominal:
+        return one_mode(kind, own)
+    sizes = [[(one.width, one.height) for one in each.fisheyes or ()] for each in (kind, own)]
+    unmasked = all(path is None for path in frames.mask_paths)  # masks have the panorama's size
+    return sizes[0] == sizes[1] and (unmasked or kind.width == own.width)
+
+
+def _one_cut(one: PictureFormat, other: PictureFormat) -> bool:
+    """True if one camera in one mode can have made both, and one calibration has read them."""
+    return one_mode(one, other) and one.fisheyes == other.fisheyes
+
+
+def _one_model(one: CameraSettings, other: CameraSettings) -> bool:
+    """True unless settings name two models."""
+    return one.name is None or other.name is None or one.name == other.name
+
+
+def _without_model(settings: CameraSettings) -> CameraSettings:
+    """Settings that say nothing of the camera's model."""
+    metric = isinstance(settings.stitch_radius_m, float)
+    changes = _UNKNOWN_MODEL | ({"stitch_radius_m": None} if metric else {})
+    return settings.model_copy(update=changes)
+
+
+def _best_run(runs: Sequence[FinishedRun], numbers: Sequence[tuple[int, ...]], camera: int) -> int:
+    """The run that knows most of a camera; of several the first one."""
+    having = [n for n, own in enumerate(numbers) if camera in own]
+    lenses = [runs[n].map.cameras[numbers[n].index(camera)].lenses for n in having]
+    known = [(bool(one), sum(one.parts)) for one in lenses]
+    return having[known.index(max(known))]
+
+
+def _for_all_frames(
+    found: CameraEstimate | None,
+    known: FoundCamera,
+    each: Sequence[tuple[Lenses | None, int]],
+    moves: Sequence[Sim3],
+    solution: Solution,
+    frames: FrameSet,
+) -> CameraEstimate | None:
+    """The estimate of a camera, for the frames of all runs; None = it has one centre.
+
+    Args:
+        found: the estimate in the joint unit.
+        known: what the run that lends it knows.
+        each: for each run, lenses of the camera, None = it took none of its frames; and number of
+            frames.
+        moves, solution, frames: as in `JointCameras.found`.
+    """
+    if found is None or not known.lenses:
+        return found
+    lenses = found.lenses
+    if lenses.readout_motion is not None:
+        motion = _readout_motion(each, moves, solution, frames, found.readout_s)
+        lenses = replace(lenses, readout_motion=motion)
+    if lenses.axes is not None:
+        axes = [
+            np.tile(np.eye(3), (num, 1, 1)) if one is None or one.axes is None else one.axes
+            for one, num in each
+        ]
+        lenses = replace(lenses, axes=np.concatenate(axes))
+    return replace(found, lenses=lenses)
+
+
+def _scaled(found: FoundCamera, scale: float) -> CameraEstimate | None:
+    """A camera in another unit: one map unit is `scale` of the new ones; None = it has one centre
+    and was not looked for."""
+    return found.estimate().scaled(scale) if found.lenses else found.readout
+
+
+def _in_unit(found: FoundCamera, camera: CameraEstimate | None, scale: float) -> FoundCamera:
+    """What is known of a camera in another unit, with its estimate there."""
+    radius = found.radius and _rescaled(found.radius, scale)
+    centres = _centres(found.centres, camera, scale)
+    return FoundCamera(centres, found.axes, radius, found.calibrated, camera)
+
+
+def _readout_motion(
+    each: Sequence[tuple[Lenses | None, int]],
+    moves: Sequence[Sim3],
+    solution: Solution,
+    frames: FrameSet,
+    readout_s: float,
+) -> np.ndarray:
+    """Motion (F, 6) of all frames during the readout: as their run found it, else by velocity."""
+    times, motion = own_timestamps(frames), list[np.ndarray]()
+    begin = 0
+    for (lenses, num), move in zip(each, moves, strict=True):
+        rows = np.arange(begin, begin + num)
+        own = None if lenses is None else lenses.scaled(move.scale).readout_motion
+        if own is None:
+            own = readout_s * velocities(solution.world_T_rigs[rows], times[rows])
+        motion.append(own)
+        begin += num
+    return np.concatenate(motion)
+
+
+def _rescaled(found: StitchRadius, scale: float) -> StitchRadius:
+    """An estimated radius in another unit: one map unit is `scale` of the new ones."""
+    inverse, sigma = found.inverse_stitch_radius / scale, found.sigma / scale
+    lenses = found.lenses.scaled(scale)
+    return replace(found, lenses=lenses, inverse_stitch_radius=inverse, sigma=sigma)
+
+
+def _centres(
+    found: LensCentres | None, camera: CameraEstimate | None, scale: float
+) -> LensCentres | None:
+    """Estimated centres in another unit, with the lenses of a camera."""
+    if found is None:
+        return None
+    lenses = Lenses() if camera is None else camera.lenses
+    covariance = found.covariance * scale**2
+    return replace(found, lenses=lenses, found=scale * found.found, covariance=covariance)

@@ -1,0 +1,196 @@
+"""Finished runs that grow by recordings of their cameras or of others, merged and taken apart."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cameras_home import (
+    NUM,
+    SMALL,
+    WIDTH,
+    Home,
+    error_of,
+    faces,
+    fisheyes,
+    make_home,
+    panoramas,
+    settings_with,
+)
+from typer.testing import CliRunner
+
+from factors.sphere_field import SphereField, num_harmonics
+from gsba import (
+    Localizer,
+    add_recordings,
+    load_run,
+    merge_runs,
+    refine_recordings,
+    remove_recordings,
+)
+from gsba.bundle.stitching import Stitching
+from gsba.cli import app
+from gsba.frames.scan import scan
+from gsba.log import GsbaError
+from gsba.pipeline.finished_run import FinishedRun
+from gsba.pipeline.joint_cameras import as_read_by
+from gsba.pipeline.recordings import refine_each
+from gsba.types import Counts, FrameSet
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Home:
+    return make_home(tmp_path_factory.mktemp("cameras"))
+
+
+SETTINGS = settings_with(export={"formats": ("colmap-flat",), "face_size": 64})
+
+
+@pytest.fixture(scope="module")
+def single(home: Home) -> Path:
+    """A run of the first recording, of one camera."""
+    out = home.folder / "single"
+    refine_each([panoramas(home, 0, WIDTH)], out, SETTINGS)
+    return out
+
+
+@pytest.fixture(scope="module")
+def sizes(home: Home) -> Path:
+    """A run of two recordings of two sizes, made at once."""
+    out = home.folder / "sizes"
+    refine_recordings([panoramas(home, 0, WIDTH), panoramas(home, 1, SMALL)], out, SETTINGS)
+    return out
+
+
+def _widths(run: Path) -> dict[str, int]:
+    """Width of the pictures of each recording, as frames are stored."""
+    frames = load_run(run)[1]
+    return {name: frames.format_of(int(rows[0])).width for name, rows in frames.recordings.items()}
+
+
+@pytest.fixture(scope="module")
+def grown(single: Path, home: Home) -> Path:
+    """The second recording added to the first one's run from the command line."""
+    out, small = home.folder / "grown", panoramas(home, 1, SMALL)
+    words = ["add", str(single), str(small.frames), str(small.trajectory), "--out", str(out)]
+    result = CliRunner().invoke(app, ["--quiet", *words])
+    assert result.exit_code == 0, result.output
+    return out
+
+
+def test_a_run_grows_by_a_camera_of_its_own(grown: Path, sizes: Path, home: Home) -> None:
+    assert _widths(grown) == {"stitched0at512": WIDTH, "stitched1at384": SMALL}
+    assert error_of(grown, home) < 1.5 * error_of(sizes, home)
+    cameras = json.loads((grown / "report.json").read_text())["cameras"]
+    assert [one["recordings"] for one in cameras] == [["stitched0at512"], ["stitched1at384"]]
+    path = Path(panoramas(home, 1, SMALL).frames) / "000003.jpg"
+    found, own = Localizer(grown).localize(path), load_run(grown)[0].world_T_rigs[NUM + 3]
+    assert found.found and np.linalg.norm(found.world_T_rig[:3, 3] - own[:3, 3]) < 0.02
+
+
+def test_recordings_join_the_cameras_that_a_run_has(
+    sizes: Path, home: Home, tmp_path: Path
+) -> None:
+    out = tmp_path / "run"
+    third = panoramas(home, 1, WIDTH)
+    result = add_recordings(sizes, [third], out)
+    assert result.frames.camera_of_frame == (0,) * NUM + (1,) * NUM + (0,) * NUM
+    at_once = [panoramas(home, 0, WIDTH), panoramas(home, 1, SMALL), third]
+    refine_recordings(at_once, tmp_path / "at_once", SETTINGS)
+    assert error_of(out, home) < 1.3 * error_of(tmp_path / "at_once", home)
+    assert (out / "colmap-flat/images").is_dir()
+
+
+def test_fixed_poses_of_a_run_of_several_cameras_stay(
+    sizes: Path, home: Home, tmp_path: Path
+) -> None:
+    out = tmp_path / "run"
+    add_recordings(sizes, [faces(home)], out, fixed=True)
+    before, after = load_run(sizes)[0], load_run(out)[0]
+    assert after.world_T_rigs[: 2 * NUM].tobytes() == before.world_T_rigs.tobytes()
+    assert [kind.layout for kind in load_run(out)[1].formats] == ["erp", "erp", "cube"]
+    assert error_of(out, home) < 1.5 * error_of(sizes, home)
+
+
+@pytest.fixture(scope="module")
+def raw(home: Home) -> Path:
+    """A run of the second recording as raw fisheyes."""
+    out = home.folder / "raw_run"
+    refine_each([fisheyes(home)], out, SETTINGS)
+    return out
+
+
+def test_raw_fisheyes_grow_by_recordings_of_their_calibration(
+    raw: Path, home: Home, tmp_path: Path
+) -> None:
+    out = tmp_path / "run"
+    result = add_recordings(raw, [fisheyes(home, 0)], out)
+    assert [kind.layout for kind in result.frames.formats] == ["fisheye"]  # they share the camera
+    assert error_of(out, home) < 0.003
+    assert (out / "calibration.json").is_file()
+
+
+def test_raw_fisheyes_without_a_calibration_are_read_by_that_of_the_run(
+    raw: Path, home: Home, tmp_path: Path
+) -> None:
+    out = tmp_path / "run"
+    result = add_recordings(raw, [replace(fisheyes(home, 0), calibration=None)], out)
+    before, (kind,) = FinishedRun.load(raw).frames.format, result.frames.formats
+    assert kind.fisheyes == before.fisheyes
+    assert error_of(out, home) < 0.003
+
+
+def test_runs_of_different_cameras_are_merged(
+    single: Path, raw: Path, home: Home, tmp_path: Path
+) -> None:
+    out = tmp_path / "run"
+    merge_runs([single, raw], out)
+    assert [kind.layout for kind in load_run(out)[1].formats] == ["erp", "fisheye"]
+    assert error_of(out, home) < 0.003  # as of one solution, see test_several_cameras.py
+    assert (out / "calibration@raw.json").is_file()
+
+
+@pytest.mark.parametrize("gone", [0, 1])
+def test_a_camera_goes_with_its_recordings(
+    gone: int, grown: Path, home: Home, tmp_path: Path
+) -> None:
+    names, out = list(_widths(grown)), tmp_path / "run"
+    remove_recordings(grown, [names[gone]], out)
+    assert _widths(out) == {names[1 - gone]: (SMALL, WIDTH)[gone]}
+    assert "cameras" not in json.loads((out / "report.json").read_text())
+    refine_each([panoramas(home, 1 - gone, (SMALL, WIDTH)[gone])], tmp_path / "alone", SETTINGS)
+    assert error_of(out, home) < 1.3 * error_of(tmp_path / "alone", home)
+    # What is left grows again, from features that were extracted beside those of another camera.
+    again = tmp_path / "again"
+    add_recordings(out, [panoramas(home, gone, (WIDTH, SMALL)[gone])], again)
+    assert error_of(again, home) < 1.5 * error_of(grown, home)
+
+
+def test_a_run_with_a_field_of_stitching_errors_takes_no_other_camera(
+    single: Path, home: Home
+) -> None:
+    run = FinishedRun.load(single)
+    field = SphereField(np.full(num_harmonics(2), 1e-4))
+    found = Stitching(field, run.map.solution, run.map.observed, 2, np.ones(4), Counts(1, 1, "o"))
+    bent = replace(run, map=replace(run.map, stitching=found))
+    small, same = (scan(Path(panoramas(home, 1, width).frames)) for width in (SMALL, WIDTH))
+    with pytest.raises(GsbaError, match="corrects errors of stitching by a field"):
+        as_read_by(bent, {"small": small}, {"small": None})
+    ((frames, _),) = as_read_by(bent, {"same": same}, {"same": None}).values()
+    assert frames is same
+
+
+def test_recordings_of_two_models_have_two_cameras(home: Home, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    named = SETTINGS.camera.model_copy(update={"name": "insta360-x3"})
+    settings = SETTINGS.model_copy(update={"camera": named})
+    refine_each([panoramas(home, 0, WIDTH)], run, settings)
+    second = panoramas(home, 1, WIDTH)
+    call = f"{second.frames},trajectory={second.trajectory},camera=gopro-max"
+    result = CliRunner().invoke(app, ["--quiet", "add", str(run), "--recording", call])
+    assert result.exit_code == 0, result.output
+    frames: FrameSet = load_run(run)[1]
+    assert frames.camera_of_frame == (0,) * NUM + (1,) * NUM
+    names = [one.name for one in FinishedRun.load(run).camera_settings]
+    assert names == ["insta360-x3", "gopro-max"]
