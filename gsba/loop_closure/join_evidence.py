@@ -4,7 +4,8 @@ If a join is true, frames of one part see points of the other part that lie on s
 know nearby. A repeated poster, window or arch brings matches for a false join, but not the rest of
 the place. So points that are found again are weighed against those that are not, relative to the
 rate at which points are found again within parts under the same change of view. Points of a small
-cell of space count as one witness, and witnesses of one region have correlated errors.
+cell of space count as one witness, and witnesses of one region have correlated errors. Weighed by
+their numbers, points must confirm a join, too.
 """
 
 from collections.abc import Sequence
@@ -175,20 +176,47 @@ def weigh(
     seen, found = predict(context, places, pairs, surfaces)
     if not len(seen.found):
         return JoinEvidence(0.0, np.inf, 0), found
+    return evidence_of(seen, usual, depth), found
+
+
+def evidence_of(seen: Predictions, usual: Rates, depth: float) -> JoinEvidence:
+    """Evidence of predicted points: the weaker of two estimates, if one of them confirms.
+
+    By cells, a look-alike with many points is one witness. By points, so is a place of which only
+    corners of walls and furniture are found again: flats of one plan share these, each in a cell
+    of its own, but not what covers them.
+
+    Args:
+        seen: at least one prediction.
+        usual: see `weigh`.
+        depth: median distance of points, map units.
+    """
     cells = np.floor(seen.points_world / (_CELL_DEPTHS * depth)).astype(np.int64)
     cells, cell_of = np.unique(cells, axis=0, return_inverse=True)
-    numbers = np.bincount(cell_of)
-    excess = np.bincount(cell_of, seen.found - usual.chance) / numbers
-    expected = np.bincount(cell_of, usual.within[seen.bins] - usual.chance) / numbers
+    cell_of = cell_of.ravel()
+    excess = np.bincount(cell_of, seen.found - usual.chance)
+    expected = np.bincount(cell_of, usual.within[seen.bins] - usual.chance)
     regions = np.floor(cells * (_CELL_DEPTHS / _REGION_DEPTHS)).astype(np.int64)
-    region_of = np.unique(regions, axis=0, return_inverse=True)[1]
-    excess, expected = np.bincount(region_of, excess), np.bincount(region_of, expected)
+    region_of = np.unique(regions, axis=0, return_inverse=True)[1].ravel()
+
+    def by(numbers: np.ndarray) -> JoinEvidence:
+        sums = [np.bincount(region_of, some / numbers) for some in (excess, expected)]
+        return JoinEvidence(*_share(*sums), len(cells))
+
+    by_cells, by_points = by(np.bincount(cell_of)), by(np.ones(len(cells)))
+    if by_cells.confirmed and by_points.least < by_cells.least:
+        return by_points
+    return by_cells
+
+
+def _share(excess: np.ndarray, expected: np.ndarray) -> tuple[float, float]:
+    """Share found again and its standard deviation, from sums (R,) of regions."""
     unseen = _PRIOR_REGIONS * float(expected.mean())
     total = float(expected.sum()) + 2 * unseen
     share = (float(excess.sum()) + unseen) / total
     squares = float(np.sum((excess - share * expected) ** 2))
     squares += unseen**2 * (share**2 + (1 - share) ** 2)
-    return JoinEvidence(share, float(np.sqrt(squares)) / total, len(cells)), found
+    return share, float(np.sqrt(squares)) / total
 
 
 def around(frames: np.ndarray, middle: int, reach: int = LOCAL) -> np.ndarray:

@@ -64,7 +64,8 @@ def merge(
         seen: (F - 1,) bool, steps verified by images: they tie frames with too few points.
         timestamps: (F,) seconds.
         absent: True if there is no trajectory; then small maps are not joined.
-        recordings: (F,) int, number of each frame's recording; None = there is one.
+        recordings: (F,) int, number of each frame's recording; None = there is one. Single frames
+            do not join recordings.
     """
     min_testable = _MIN_TESTABLE_FRAMES if absent else _MIN_MAP_FRAMES
     owners = np.zeros(len(parts), np.int64) if recordings is None else recordings
@@ -141,7 +142,7 @@ class _Joining:
                     self.met[rows] = True
                     return True
                 continue
-            placed = [self._register(int(f), inside) for f in rows]
+            placed = [self._is_of_map(f) and self._register(f, inside) for f in rows.tolist()]
             if any(placed):
                 return True
         return False
@@ -314,6 +315,14 @@ class _Joining:
         solved = replace(self.solved, world_T_rigs=poses)
         even = abs(np.log(proposal.move.scale)) < np.log(settings.verify.max_length_ratio)
         return even and loops.within_drift(loop, solved, self.held, settings)
+
+    def _is_of_map(self, f: int) -> bool:
+        """True if the map holds frames of a frame's recording.
+
+        A picture that hangs in two places gives a single frame a pose in either. Between frames of
+        one recording time and path decide; between recordings only the test of joins can.
+        """
+        return bool((self.recordings[self.components == self.current] == self.recordings[f]).any())
 
     def _register(self, f: int, inside: np.ndarray) -> bool:
         """True if a single frame gets an accepted pose from points of the map; the map then holds

@@ -84,7 +84,8 @@ def register(state: State, maps: JointMaps) -> State:
 
     def compute() -> Registered:
         given = state.observed.context, _by_features(state), maps.parts, nothing, nothing
-        return map_merging.merge(*given, run.frames.timestamps, True)
+        owners = run.frames.recording_of_frame
+        return map_merging.merge(*given, run.frames.timestamps, True, owners)
 
     merged = run.stage("registered", run.matching_key(), compute, Registered)
     _check_units(maps, merged)

@@ -57,6 +57,30 @@ def test_a_false_join_is_refuted(degrees: float) -> None:
     assert found.refuted and _weighed(np.eye(4)).beats(found)
 
 
+@pytest.mark.parametrize(
+    ("corners", "textures", "confirmed"),
+    [(4, 4, True), (4, 1, False), (1, 4, False), (1, 1, False)],
+)
+def test_corners_and_what_covers_walls_must_both_be_found_again(
+    corners: int, textures: int, confirmed: bool
+) -> None:
+    """Flats of one plan share corners, each in a cell of its own, and a picture may hang twice.
+
+    4 of 10 points are found within parts, 1 of 10 by chance. Corners: 400 cells of 10 points in 50
+    regions. Textures: 20 cells of 1,000 points in 20 other regions.
+    """
+    depth = 4.0  # cells of 1, regions of 4
+    places = np.stack(np.unravel_index(np.arange(3200), (200, 4, 4)), axis=1)
+    places = places[places[:, 0] % 4 < 2][::4][:400]
+    pictures = 4 * np.stack([np.arange(60, 80), np.zeros(20), np.zeros(20)], axis=1)
+    cells = np.concatenate([np.repeat(places, 10, axis=0), np.repeat(pictures, 1000, axis=0)])
+    tenths = np.where(np.arange(len(cells)) < 4000, corners, textures)
+    found = np.arange(len(cells)) % 10 < tenths
+    seen = join_evidence.Predictions(cells + 0.5, np.zeros(len(cells), np.int64), found)
+    usual = join_evidence.Rates(np.full(24, 0.4), 0.1)
+    assert join_evidence.evidence_of(seen, usual, depth).confirmed == confirmed
+
+
 def test_places_out_of_sight_say_nothing() -> None:
     found = _weighed(pose(np.eye(3), np.array([0.0, 40.0, 0.0])))
     assert found.witnesses == 0

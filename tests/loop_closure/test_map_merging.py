@@ -156,6 +156,23 @@ def test_frames_alone_are_registered_against_the_map() -> None:
     assert not found.lost.any() and not found.components.any()
 
 
+def test_a_single_frame_does_not_join_two_recordings() -> None:
+    """A frame is registered where its recording has frames, and nowhere else."""
+    context, whole, _ = scene()
+    alone = (7, 13, 30)
+    whole, owners = _without_map(whole, alone), np.arange(NUM) // HALF
+    times = TIMES + 1000 * owners
+    parts_of = _halves(alone)
+    given = context, whole, parts_of, NOBODY, NOBODY, times
+    together = map_merging.merge(*given, recordings=owners)
+    np.testing.assert_array_equal(np.flatnonzero(together.alone), alone)
+    stranger = np.where(np.arange(NUM) == 30, 2, owners)  # the only frame of a third recording
+    found = map_merging.merge(*given, recordings=stranger)
+    np.testing.assert_array_equal(np.flatnonzero(found.alone), (7, 13))
+    np.testing.assert_array_equal(np.flatnonzero(found.lost), [30])
+    np.testing.assert_array_equal(found.components, np.arange(NUM) == 30)
+
+
 def test_a_frame_of_elsewhere_is_not_registered() -> None:
     context, whole, _ = scene(strange=True)
     parts_of = (np.arange(NUM) == 30).astype(int)
