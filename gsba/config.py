@@ -91,7 +91,8 @@ class FeatureSettings(_Settings):
 class WeakFrameSettings(_Settings):
     """Frames that get more keypoints, because their first keypoints constrain the map weakly."""
 
-    mode: Literal["auto", "off"] = "auto"  # off: all frames get the same number
+    mode: Literal["auto", "measured", "off"] = "auto"  # measured: only where the map turns out to
+    # be weak; auto: also where few pairs foretell it; off: all frames get the same number
     max_drift: float = Field(
         default=1.1e-4, gt=0
     )  # predicted position error relative to the path; maps below it get no more keypoints

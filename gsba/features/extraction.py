@@ -1,7 +1,8 @@
 """Features of every frame of a run, stored frame by frame."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -47,8 +48,11 @@ class _Extraction:
     rig: CubeRig  # faces that pixels are given on
     settings: CubemapSettings
     make_extractor: Callable[[], Extractor]
+    known: Mapping[str, Features] = field(default_factory=dict)  # of frames searched before
 
     def __call__(self, name: str) -> Features:
+        if name in self.known:
+            return self.known[name]
         frame = self.index[name]
         own = cubemap.rig_for(self.frames.format_of(frame), self.settings)
         images, masks = cubemap.load(self.frames, frame, own)
@@ -59,29 +63,54 @@ class _Extraction:
 
     def taken(self, names: Sequence[str]) -> "_Extraction":
         frames = self.frames.taken(np.array([self.index[name] for name in names]), absolute=True)
-        return replace(self, frames=frames, index={name: f for f, name in enumerate(names)})
+        known = {name: self.known[name] for name in names if name in self.known}
+        index = {name: f for f, name in enumerate(names)}
+        return replace(self, frames=frames, index=index, known=known)
+
+
+@dataclass(frozen=True, slots=True)
+class Search:
+    """Frames, and how they are searched for keypoints."""
+
+    frames: FrameSet  # each camera's are searched on faces of their own
+    rig: CubeRig  # faces that pixels are given on
+    settings: RefineSettings
+    make_extractor: Callable[[], Extractor]  # makes an extractor, once for each frame
+
+    def of(self, rows: Sequence[int]) -> dict[str, Features]:
+        """Features of some frames (F',) by name, which are not stored."""
+        names = [self.frames.names[f] for f in rows]
+        compute = self.job(dict(zip(names, rows, strict=True)))
+        with freed_memory_kept(), ThreadPoolExecutor(self.settings.solver.threads()) as pool:
+            return dict(zip(names, pool.map(compute, names), strict=True))
+
+    def job(
+        self, index: Mapping[str, int], known: Mapping[str, Features] | None = None
+    ) -> _Extraction:
+        """The job of extracting the features of frames by name, some of which are known."""
+        cut = self.settings.cubemap
+        return _Extraction(self.frames, index, self.rig, cut, self.make_extractor, known or {})
 
 
 def extract(
     store: RunStore,
-    frames: FrameSet,
-    rig: CubeRig,
-    settings: RefineSettings,
-    make_extractor: Callable[[], Extractor],
+    search: Search,
     files: Sequence[Path],
     name: str = "features",
     chosen_frames: np.ndarray | None = None,
+    known: Mapping[str, Features] | None = None,
 ) -> PerFrame[Features]:
     """Features by frame name; image and mask are read, cut and released one at a time.
 
     Args:
-        store, frames, rig, settings: those of the run; each camera's frames are searched on faces
-            of their own, and pixels given on the faces of the rig.
-        make_extractor: makes an extractor, once for each frame.
+        store: of the run.
+        search: its frames, and how they are searched.
         files: that the extractor depends on: weights of a learned one.
         name: name of the stage.
         chosen_frames: (F,) bool, frames to extract; None = all.
+        known: features of some of them by name, found by the same search; None = of none.
     """
+    frames, rig, settings = search.frames, search.rig, search.settings
     index = {
         frame: f
         for f, frame in enumerate(frames.names)
@@ -89,7 +118,7 @@ def extract(
     }
     chosen = settings.features
 
-    compute = _Extraction(frames, index, rig, settings.cubemap, make_extractor)
+    compute = search.job(index, known)
     inputs = {
         frame: fingerprint([*frames.paths[f], frames.mask_paths[f]]) for frame, f in index.items()
     }

@@ -1,6 +1,6 @@
 """The front end of a run: keypoints as bearings, their matches, and what these say of the start."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -11,7 +11,7 @@ from gsba import learned
 from gsba.camera.cameras import Cameras
 from gsba.config import RefineSettings
 from gsba.features import detection, extraction
-from gsba.features.extraction import FrameFeatures
+from gsba.features.extraction import FrameFeatures, Search
 from gsba.frames import panorama
 from gsba.log import GsbaError
 from gsba.loop_closure import connectivity, loops
@@ -19,7 +19,7 @@ from gsba.loop_closure.loops import Closed
 from gsba.matching import correspondences, recovery
 from gsba.matching.guided_search import MatchContext, SearchableFrames
 from gsba.matching.recovery import Recovered
-from gsba.pipeline import inputs
+from gsba.pipeline import inputs, weak_start
 from gsba.pipeline.observed_frames import ObservedFrames
 from gsba.pipeline.prior import Prior
 from gsba.pipeline.run import Run
@@ -32,9 +32,22 @@ _DARK = 32  # of 255
 
 
 def extract(run: Run) -> State:
-    """Keypoints of all frames: the first state of a run."""
-    found = _extract(run, run.settings)
-    return State.begin(run, _observe(run, "keypoints", [found] * len(run.frames), "features"))
+    """Keypoints of all frames: the first state of a run.
+
+    Frames of a map that is expected to be weak get as many as weak ones at once.
+    """
+    enlarged = _enlarged(run.settings)
+    drift, known = weak_start.expected_drift(run, _search(run, enlarged))
+    more = drift > run.settings.weak_frames.max_drift
+    found = _extract(run, enlarged, known=known) if more else _extract(run, run.settings)
+    observed = _observe(run, "keypoints", [found] * len(run.frames), "features")
+    return State.begin(run, replace(observed, more=more))
+
+
+def _enlarged(settings: RefineSettings) -> RefineSettings:
+    """Settings with as many keypoints as weak frames get."""
+    more = settings.weak_frames.model_dump(include={"max_per_face", "contrast_threshold"})
+    return settings.model_copy(update={"features": settings.features.model_copy(update=more)})
 
 
 def adopt(run: Run, stored: Sequence[Path]) -> ObservedFrames:
@@ -49,21 +62,26 @@ def adopt(run: Run, stored: Sequence[Path]) -> ObservedFrames:
 def extract_more(state: State, weak: np.ndarray) -> State:
     """More keypoints at some frames (F,) bool, and those of the others as they were."""
     run, before = state.run, state.observed
-    more = run.settings.weak_frames.model_dump(include={"max_per_face", "contrast_threshold"})
-    enlarged = run.settings.features.model_copy(update=more)
-    settings = run.settings.model_copy(update={"features": enlarged})
-    found = _extract(run, settings, "features_closer", weak)
+    found = _extract(run, _enlarged(run.settings), "features_closer", weak)
     each = [found if more else old for more, old in zip(weak, before.features, strict=True)]
     observed = _observe(run, "keypoints_closer", each, "features_closer")
     return state.with_keypoints(observed.through(before.cameras))
 
 
 def _extract(
-    run: Run, settings: RefineSettings, name: str = "features", chosen: np.ndarray | None = None
+    run: Run,
+    settings: RefineSettings,
+    name: str = "features",
+    chosen: np.ndarray | None = None,
+    known: Mapping[str, Features] | None = None,
 ) -> PerFrame[Features]:
-    make = learned.make_extractor(settings.features, run.weights)
     files = [path for stage, path in run.weights.items() if stage == "features"]
-    return extraction.extract(run.store, run.frames, run.rig, settings, make, files, name, chosen)
+    return extraction.extract(run.store, _search(run, settings), files, name, chosen, known)
+
+
+def _search(run: Run, settings: RefineSettings) -> Search:
+    make = learned.make_extractor(settings.features, run.weights)
+    return Search(run.frames, run.rig, settings, make)
 
 
 def _observe(

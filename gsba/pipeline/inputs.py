@@ -98,6 +98,16 @@ def coarse_poses(
     return coarse
 
 
+def for_odometry(settings: RefineSettings) -> RefineSettings:
+    """Settings for frames that the odometry of their own video chose: its poses are no evidence,
+    and more frames are fetched where the map of usual keypoints turns out to be weak."""
+    settings, weak = settings.with_faint_priors(), settings.weak_frames
+    if weak.mode != "auto":
+        return settings
+    measured = weak.model_copy(update={"mode": "measured"})
+    return settings.model_copy(update={"weak_frames": measured})
+
+
 def with_baseline(settings: RefineSettings, calibration: Path | None) -> RefineSettings:
     """Settings with the distance between the first two lenses by a calibration, unless given."""
     if calibration is None:

@@ -16,6 +16,7 @@ class ObservedFrames:
     shown: Keypoints  # of all frames, where pictures show them
     context: MatchContext  # matches them
     cameras: Cameras  # that the keypoints are seen through
+    more: bool = False  # whether all frames got as many keypoints as weak ones from the start
 
     @property
     def keypoints(self) -> Keypoints:

@@ -104,7 +104,7 @@ def refine(
         walk = inputs.extract_frames(out, origin, settings, fps, fresh, by_odometry, calibration)
         frames, timestamps, fps, fresh = out / "frames", None, None, False
     if walk is not None:  # made of these very images: no evidence beside them
-        given, settings = walk.pieces(), settings.with_faint_priors()
+        given, settings = walk.pieces(), inputs.for_odometry(settings)
     image_circles = inputs.given_circles(circles, calibration)
     found = scan(frames, timestamps, fps, chosen.given, not given, calibration, image_circles)
     evidence = Evidence(tuple(inputs.timed(given, found)), readings, families=tuple(families))
@@ -337,7 +337,7 @@ def _merge_maps(state: State) -> State:
 def _add_keypoints_where_weak(state: State) -> State:
     """Extract more keypoints at frames that images determine poorly, and adjust."""
     weak = state.prior.weak_frames()
-    if state.run.settings.weak_frames.mode == "off" or not weak.any():
+    if state.run.settings.weak_frames.mode == "off" or state.observed.more or not weak.any():
         return state
     state = frontend.extract_more(state, weak)
     state = frontend.match_along_epipolars(state, "adjacent_closer")

@@ -15,6 +15,7 @@ _TITLES = {
     "distractors": "find distractors beside those found",
     "masks": "write masks",
     "frames": "list frames",
+    "expected_drift": "foretell how weak the map will be",
     "features": "extract features",
     "features_closer": "extract more features at weak frames",
     "keypoints": "gather keypoints",

@@ -86,7 +86,8 @@ def _kill_in(case: Case, out: Path, module: str, name: str, survived: int = 0) -
 
 def test_a_killed_run_goes_on_where_it_was(case: Case, tmp_path: Path) -> None:
     out = tmp_path / "run"
-    _kill_in(case, out, "gsba.features.detection", "extract", survived=5)
+    compared = 2 * 3  # frames that foretell how weak the map will be: their features are not stored
+    _kill_in(case, out, "gsba.features.detection", "extract", survived=compared + 5)
     stored = {path: path.stat().st_mtime_ns for path in (out / "stages/features").glob("0*.npz")}
     assert 3 <= len(stored) < NUM_FRAMES  # two threads may hold one frame each
     _kill_in(case, out, "gsba.matching.correspondences", "match_loops")
@@ -115,6 +116,7 @@ def test_an_interrupt_leaves_what_is_finished(
 @pytest.mark.slow
 def test_a_weak_map_gets_more_keypoints_and_resumes(case: Case, tmp_path: Path) -> None:
     closer = {"max_drift": 1e-12, "max_scale_sigma": 1e-12, "max_per_face": 600}
+    closer["mode"] = "measured"
     settings = SETTINGS.model_copy(update={"weak_frames": WeakFrameSettings(**closer)})
     out = case.copy(tmp_path / "run")
     result = case.refine(out, settings)
@@ -122,6 +124,23 @@ def test_a_weak_map_gets_more_keypoints_and_resumes(case: Case, tmp_path: Path) 
     dropped = stages["strength"]["counts"][0]["dropped"]
     assert dropped == {"images hold the step far better": NUM_FRAMES - 1}
     assert stages["features"]["resumed"] and not stages["dense_closer"]["resumed"]
+    points = [len(run.reconstruction.points_world) for run in (case.result, result)]
+    assert points[1] > 1.2 * points[0]
+    assert case.errors(out).rpe_rotation_deg.max < 0.1  # ten times what chance leaves
+    assert computed_stages(case.refine(out, settings)) == []
+
+
+@pytest.mark.slow
+def test_a_walk_that_does_not_return_gets_more_keypoints_at_once(
+    case: Case, tmp_path: Path
+) -> None:
+    """Where few matches foretell a weak map: its frames are searched once."""
+    closer = {"max_drift": 1e-12, "max_per_face": 600}
+    settings = SETTINGS.model_copy(update={"weak_frames": WeakFrameSettings(**closer)})
+    out = case.copy(tmp_path / "run")
+    result = case.refine(out, settings)
+    names = [stage["name"] for stage in result.report["stages"]]
+    assert "expected_drift" in names and "features_closer" not in names
     points = [len(run.reconstruction.points_world) for run in (case.result, result)]
     assert points[1] > 1.2 * points[0]
     assert case.errors(out).rpe_rotation_deg.max < 0.1  # ten times what chance leaves
