@@ -129,7 +129,7 @@ class Bench(NamedTuple):
         if (row := kept_row(folder, key, TIMEOUT_S)) and (by != "alone" or run.exists()):
             return row
         print(f"running {folder}", file=sys.stderr, flush=True)
-        shutil.rmtree(run, ignore_errors=True)
+        shutil.rmtree(folder, ignore_errors=True)  # a refused merge would go on where it was
 
         def finish() -> dict[str, Any]:
             return {"errors": check_maps(run, recordings)}
