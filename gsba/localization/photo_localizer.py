@@ -175,7 +175,8 @@ def _refine(
     pose, projection = fitted.world_T_rigs[0], _perspective(fitted.projections[0])
     sigma = float(fitted.noises[0]) * typical_sigma(seen.spreads) / projection.focal
     chance = min((GATE_SIGMAS * sigma / _GATES_RAD[-1]) ** 2, 0.5)
-    if not is_significant(candidates.bearings, fitted.inliers[0], chance, _SAMPLE, _CELLS_PER_SIDE):
+    given = candidates.bearings, fitted.inliers[0], chance  # no sample of them chose the pose
+    if not is_significant(*given, sample=0, per_side=_CELLS_PER_SIDE):
         return None
     inliers = int(fitted.inliers[0].sum())
     return _Placed(photo, image, pose, projection, seen, inliers)

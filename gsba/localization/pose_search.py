@@ -92,7 +92,7 @@ def is_significant(
         bearings: (m, 3) of all candidates.
         inliers: (m,) bool.
         chance: probability that a false candidate agrees with an unrelated pose.
-        sample: candidates that determine a pose.
+        sample: candidates whose pose it is; 0 = it was known without them.
         per_side: cells along a face's side, of 90 degrees: candidates within one are one witness.
     """
     if not inliers.any():
