@@ -46,10 +46,17 @@ class JoinTest:
     measure_rates: Callable[[], Rates]  # measures the rate of points found again; called once
     _usual: Rates | None = None
 
-    def judge(self, proposal: Proposal, rows: np.ndarray, inside: np.ndarray) -> Judged:
-        """Weigh a proposal that carries frames `rows` (N,) to frames `inside` (M,), ascending."""
+    def judge(
+        self, proposal: Proposal, rows: np.ndarray, inside: np.ndarray, apart: bool = False
+    ) -> Judged:
+        """Weigh a proposal that carries frames `rows` (N,) to frames `inside` (M,), ascending.
+
+        Args:
+            proposal, rows, inside: see above.
+            apart: whether the two are of different recordings.
+        """
         found = self._judged(proposal, rows, inside, join_evidence.LOCAL)
-        if found.evidence.decided:
+        if found.evidence.confirms(apart) or found.evidence.refuted:
             return found
         # More frames give more evidence, if drift permits.
         wider = self._judged(proposal, rows, inside, join_evidence.WIDER)

@@ -213,10 +213,11 @@ class _Joining:
         """The similarity that the surroundings of both parts confirm, unless they confirm a rival
         too."""
         weighed: list[Judged] = []
+        apart = not np.isin(self.recordings[inside], self.recordings[rows]).any()
         for proposal in propose(meetings, self.poses, self.depth, self.context.settings.seed):
             if self._is_held_by_trajectory(rows) and not self._plausible(proposal):
                 continue
-            judged = self.test.judge(proposal, rows, inside)
+            judged = self.test.judge(proposal, rows, inside, apart)
             if self._is_level(rows, inside, judged.proposal.move):
                 weighed.append(judged)
         if not weighed:
@@ -225,9 +226,10 @@ class _Joining:
         best = max(weighed, key=lambda one: one.evidence.least)
         frames, why = best.proposal.frames, best.evidence
         logger.info("a part of %d frames overlaps the map at frames %s: %s", len(rows), frames, why)
-        if why.confirmed and not self.test.rivals(best, weighed):
+        certain = why.confirms(apart)
+        if certain and not self.test.rivals(best, weighed):
             return best.proposal.move
-        self.reasons[part] = "it fits two places" if why.confirmed else f"not certain: {why}"
+        self.reasons[part] = "it fits two places" if certain else f"not certain: {why}"
         return None
 
     def _over_break(self, rows: np.ndarray, inside: np.ndarray) -> Sim3 | None:

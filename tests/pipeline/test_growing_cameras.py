@@ -12,7 +12,6 @@ from cameras_home import (
     WIDTH,
     Home,
     error_of,
-    faces,
     fisheyes,
     make_home,
     panoramas,
@@ -106,10 +105,10 @@ def test_fixed_poses_of_a_run_of_several_cameras_stay(
     sizes: Path, home: Home, tmp_path: Path
 ) -> None:
     out = tmp_path / "run"
-    add_recordings(sizes, [faces(home)], out, fixed=True)
+    add_recordings(sizes, [fisheyes(home)], out, fixed=True)
     before, after = load_run(sizes)[0], load_run(out)[0]
     assert after.world_T_rigs[: 2 * NUM].tobytes() == before.world_T_rigs.tobytes()
-    assert [kind.layout for kind in load_run(out)[1].formats] == ["erp", "erp", "cube"]
+    assert [kind.layout for kind in load_run(out)[1].formats] == ["erp", "erp", "fisheye"]
     assert error_of(out, home) < 1.5 * error_of(sizes, home)
 
 
