@@ -25,13 +25,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from common import code_digest, digest, kept_row, run_row, write_table
-from recording_cuts import Cut, cut_rows
+from recording_cuts import Cut, cut_rows, position_errors
 
 from gsba.disk import write_text
-from gsba.evaluate.trajectory import pose_errors
 from gsba.store.finished import load_run
 from gsba.trajectory.files import read_trajectory
-from gsba.types import Trajectory
 
 NUM_FRAMES = 24  # of a recording
 AGAIN_FROM = 12  # first frame of a second recording of a flat
@@ -89,9 +87,7 @@ def check_maps(run: Path, recordings: Sequence[Recording]) -> list[dict[str, Any
             truths = {one.name: read_trajectory(one.walk / "groundtruth.tum") for one in owners}
             pairs = zip(owners, names, strict=True)
             true = np.array([truths[one.name].world_T_rigs[int(name)] for one, (*_, name) in pairs])
-            times = np.arange(len(true), dtype=np.float64)
-            ours = Trajectory(times, reconstruction.world_T_rigs)
-            errors = pose_errors(ours, Trajectory(times, true)).positions
+            errors = position_errors(reconstruction.world_T_rigs, true)
             worst = float(errors.max() / np.linalg.norm(np.ptp(true[:, :3, 3], axis=0)))
         both = len({one.name for one in owners}) > 1
         checked.append({"frames": len(names), "flats": flats, "worst": worst, "joined": both})

@@ -22,12 +22,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from common import code_digest, digest, kept_row, run_row, write_table
-from recording_cuts import Cut, cut_rows
+from recording_cuts import Cut, cut_rows, position_errors
 
-from gsba.evaluate.trajectory import pose_errors
 from gsba.store.finished import load_run
 from gsba.trajectory.files import read_trajectory
-from gsba.types import Trajectory
 
 MAX_RATIO = 1.3  # of a grown run's error to that of the joint solution
 TIMEOUT_S = 3600.0
@@ -90,11 +88,8 @@ class Bench(NamedTuple):
             owner, _, own = name.rpartition("/")
             walk = truths.get(owner, truths[self.parts[int("second" in run.parent.name)].name])
             true.append(walk.world_T_rigs[int(own)])
-        times = np.arange(len(true), dtype=np.float64)
-        found = pose_errors(
-            Trajectory(times, reconstruction.world_T_rigs), Trajectory(times, np.array(true))
-        )
-        ate = 1e3 * float(np.sqrt(np.mean(found.positions**2)))
+        errors = position_errors(reconstruction.world_T_rigs, np.array(true))
+        ate = 1e3 * float(np.sqrt(np.mean(errors**2)))
         return {"frames": len(true), "ate_mm": ate}
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gsba.demo import degrade
+from gsba.evaluate.trajectory import pose_errors
 from gsba.geometry import pose
 from gsba.similarity import Sim3
 from gsba.trajectory.files import read_trajectory, write_tum
@@ -81,6 +82,13 @@ def cut_rows(walk: Path, rows: np.ndarray, folder: Path, number: int, exposure: 
     path = folder.with_name(f"{folder.name}.tum")
     write_tum(path, Trajectory(coarse.timestamps, moved.poses(coarse.world_T_rigs)))
     return Cut(folder, path, rows)
+
+
+def position_errors(found: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """Errors (N,) of positions of poses (N, 4, 4) after one alignment to the truth (N, 4, 4), of
+    frames that may be of several clocks."""
+    times = np.arange(len(true), dtype=np.float64)
+    return pose_errors(Trajectory(times, found), Trajectory(times, true)).positions
 
 
 def _copy(image: Path, folder: Path, exposure: float) -> None:

@@ -22,12 +22,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from common import code_digest, digest, kept_row, run_row, write_table
-from recording_cuts import Cut, cut
+from recording_cuts import Cut, cut, position_errors
 
-from gsba.evaluate.trajectory import pose_errors
 from gsba.store.finished import load_run
 from gsba.trajectory.files import read_trajectory
-from gsba.types import Trajectory
 
 MAX_RATIO = 1.5  # of the error of all recordings to that of the best one alone
 TIMEOUT_S = 3600.0
@@ -85,9 +83,7 @@ def check_maps(run: Path, parts: Sequence[Part]) -> list[dict[str, Any]]:
 def _ate(world_T_rigs: np.ndarray, rows: np.ndarray, walk: Path) -> float:
     """Error in millimetres of poses of frames `rows` of a walk; frames may be given twice."""
     truth = read_trajectory(walk / "groundtruth.tum").world_T_rigs[rows]
-    times = np.arange(len(rows), dtype=np.float64)
-    found = pose_errors(Trajectory(times, world_T_rigs), Trajectory(times, truth))
-    return 1e3 * float(np.sqrt(np.mean(found.positions**2)))
+    return 1e3 * float(np.sqrt(np.mean(position_errors(world_T_rigs, truth) ** 2)))
 
 
 class Bench(NamedTuple):

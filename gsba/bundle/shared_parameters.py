@@ -89,7 +89,7 @@ def sample_counts(landmarks: Landmarks, used: Landmarks) -> Counts:
 
 def of_points(landmarks: Landmarks, chosen: np.ndarray) -> Landmarks:
     """Points `chosen (J,)` and their observations."""
-    return Landmarks(landmarks.points_world[chosen], landmarks.tracks.of(chosen), landmarks.counts)
+    return landmarks.of(chosen)
 
 
 def parts_of(landmarks: Landmarks) -> list[Landmarks]:

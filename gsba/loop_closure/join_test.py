@@ -49,11 +49,12 @@ class JoinTest:
     def judge(
         self, proposal: Proposal, rows: np.ndarray, inside: np.ndarray, apart: bool = False
     ) -> Judged:
-        """Weigh a proposal that carries frames `rows` (N,) to frames `inside` (M,), ascending.
+        """Weigh a proposal to join two parts.
 
         Args:
-            proposal, rows, inside: see above.
-            apart: whether the two are of different recordings.
+            proposal: carries `rows` to `inside`.
+            rows, inside: (N,) and (M,) frames of either part, ascending.
+            apart: whether the two parts are of different recordings.
         """
         found = self._judged(proposal, rows, inside, join_evidence.LOCAL)
         if found.evidence.confirms(apart) or found.evidence.refuted:

@@ -115,7 +115,9 @@ def align(
     normals_world = np.zeros((len(rows), 3))
     found, at_hosts, dropped = [], [], dict.fromkeys(REJECTIONS, 0)
     for points in _by_hosts(landmarks.tracks.frames[rows]):
-        some = replace(solved, landmarks=_taken(landmarks, points))
+        chosen = np.zeros(len(rows), bool)
+        chosen[points] = True
+        some = replace(solved, landmarks=landmarks.of(chosen))
         patches = _align_some(some, observed, greys, settings, workers, lenses, name, dropped)
         found.append(patches.found.of(points))
         at_hosts.append(patches.at_hosts.of(points))
@@ -135,15 +137,6 @@ def _by_hosts(hosts: np.ndarray) -> Iterator[np.ndarray]:
     order = np.argsort(hosts, kind="stable")
     for first in range(0, max(len(order), 1), most):
         yield np.sort(order[first : first + most])
-
-
-def _taken(landmarks: Landmarks, points: np.ndarray) -> Landmarks:
-    """Some points (n,), ascending, and their observations."""
-    chosen = np.zeros(len(landmarks.points_world), bool)
-    chosen[points] = True
-    return replace(
-        landmarks, points_world=landmarks.points_world[points], tracks=landmarks.tracks.of(chosen)
-    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -81,7 +81,7 @@ class JointCameras:
         solution: Solution,
         frames: FrameSet,
     ) -> tuple[FoundCamera, ...]:
-        """What is known of each camera (C,), for the frames of all runs.
+        """Estimate of each camera (C,), for the frames of all runs.
 
         Args:
             runs: the runs.
@@ -242,7 +242,13 @@ def _scaled(found: FoundCamera, scale: float) -> CameraEstimate | None:
 
 
 def _in_unit(found: FoundCamera, camera: CameraEstimate | None, scale: float) -> FoundCamera:
-    """What is known of a camera in another unit, with its estimate there."""
+    """A camera of a map in another unit.
+
+    Args:
+        found: the camera in the old unit.
+        camera: its estimate in the new one; None = it has one centre.
+        scale: new units per old one.
+    """
     radius = found.radius and _rescaled(found.radius, scale)
     centres = _centres(found.centres, camera, scale)
     return FoundCamera(centres, found.axes, radius, found.calibrated, camera)

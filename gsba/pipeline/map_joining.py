@@ -27,7 +27,6 @@ from gsba.loop_closure.map_similarity import (
     similarity_covariance,
 )
 from gsba.loop_closure.merged_map import Registered
-from gsba.photometric import alignment
 from gsba.photometric.alignment import Observations
 from gsba.pipeline import backend, camera, frontend, inputs, patch_rounds
 from gsba.pipeline.joint_map import JointMaps, joined_keypoints
@@ -255,7 +254,8 @@ def _aligned(state: State, base: Sighted, features: Keypoints, parts: np.ndarray
     found = frontend.match_known_points_across(state.with_solution(known), parts, "across2")
     state = replace(state, matches=found.matches)
     start = replace(known, landmarks=state.triangulated(_crossing(state, parts), rays, gate))
-    shared = _align(state, start, Observations(features, field=state.map.field), "align1")
+    seen = Observations(features, field=state.map.field)
+    shared = patch_rounds.observe(state, start, seen, "align1")
     left, before, better = _without_same(base, shared, run.greys.width), state, None
     for n in range(1, rounds + 1):
         if patch_rounds.is_settled(before, state, n):
@@ -275,28 +275,16 @@ def _align_around(state: State, parts: np.ndarray, name: str) -> tuple[Sighted, 
     Returns:
         Those of all other points, and those of the points that were observed anew.
     """
-    map_, solution = state.map, state.solution
+    solution = state.solution
     landmarks, tracks = solution.landmarks, solution.landmarks.tracks
     meeting = np.unique(tracks.frames[_of_several(tracks, parts)[tracks.points]])
     chosen = np.zeros(tracks.num_points, bool)
     chosen[tracks.points[np.isin(tracks.frames, meeting)]] = True
-    known, own = _sighted(state), landmarks.points_world[chosen]
+    known = _sighted(state)
     keypoints = known.keypoints.scaled_noise(solution.noise)
     left = replace(known, keypoints=keypoints, tracks=tracks.of(~chosen))
-    around = replace(landmarks, points_world=own, tracks=tracks.of(chosen))
-    observed = Observations(map_.observed, map_.aligned, map_.normals_rig, map_.field)
-    return left, _align(state, replace(solution, landmarks=around), observed, name)
-
-
-def _align(state: State, start: Solution, observed: Observations, name: str) -> Sighted:
-    """Points of a solution observed anew."""
-    run, settings = state.run, state.run.settings.patches
-
-    def compute() -> Sighted:
-        given = run.greys, run.rig, settings, run.store.workers, state.map.lenses, name
-        return alignment.align(start, observed, *given)
-
-    return run.stage(name, settings.model_dump(exclude={"rounds"}), compute, Sighted)
+    around = replace(solution, landmarks=landmarks.of(chosen))
+    return left, patch_rounds.observe(state, around, patch_rounds.observations(state), name)
 
 
 def _solved(

@@ -35,7 +35,7 @@ def _round(state: State, number: int) -> State:
 
     The map stays as it was where that explains less.
     """
-    sighted = _align(state, f"align{number}")
+    sighted = observe(state, state.solution, observations(state), f"align{number}")
     better = _adjust_under_lenses(state, sighted, number)
     if better is None:
         return state
@@ -63,24 +63,28 @@ def _adjust_under_lenses(state: State, sighted: Sighted, number: int) -> State |
     return state
 
 
-def _align(state: State, name: str) -> Sighted:
-    """Observations of the map's points by aligned patches."""
-    run, map_, settings = state.run, state.map, state.run.settings.patches
+def observe(state: State, start: Solution, observed: Observations, name: str) -> Sighted:
+    """Points of a solution observed anew, by aligned patches.
+
+    Args:
+        state: frames, camera and settings.
+        start: poses and points.
+        observed: observations of these points so far.
+        name: of the stage.
+    """
+    run, settings = state.run, state.run.settings.patches
 
     def compute() -> Sighted:
-        observed = Observations(map_.observed, map_.aligned, map_.normals_rig, map_.field)
-        return alignment.align(
-            map_.solution,
-            observed,
-            run.greys,
-            run.rig,
-            settings,
-            run.store.workers,
-            map_.lenses,
-            name,
-        )
+        given = run.greys, run.rig, settings, run.store.workers, state.map.lenses, name
+        return alignment.align(start, observed, *given)
 
     return run.stage(name, settings.model_dump(exclude={"rounds"}), compute, Sighted)
+
+
+def observations(state: State) -> Observations:
+    """Observations of the map's points."""
+    map_ = state.map
+    return Observations(map_.observed, map_.aligned, map_.normals_rig, map_.field)
 
 
 def adjust_aligned(

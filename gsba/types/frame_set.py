@@ -91,6 +91,11 @@ def cameras_of(of_frame: Sequence[int], rows: np.ndarray) -> tuple[np.ndarray, t
     return used, tuple(numbers.tolist()) if len(used) > 1 else ()
 
 
+def _owner(name: str) -> str:
+    """Recording of a frame by its name; "" = there is only one."""
+    return name.rpartition("/")[0]
+
+
 @dataclass(frozen=True, slots=True)
 class FrameSet:
     """The captured frames on disk, in time order, without pixels.
@@ -131,15 +136,13 @@ class FrameSet:
     @property
     def recordings(self) -> dict[str, np.ndarray]:
         """Frames (R,) int64 of each recording by its name, in order; {} if there is only one."""
-        owners = np.array([name.rpartition("/")[0] for name in self.names])
-        return {
-            name: np.flatnonzero(owners == name) for name in dict.fromkeys(owners.tolist()) if name
-        }
+        owners, numbers = dict.fromkeys(map(_owner, self.names)), self.recording_of_frame
+        return {name: np.flatnonzero(numbers == n) for n, name in enumerate(owners) if name}
 
     @property
     def recording_of_frame(self) -> np.ndarray:
         """Index (F,) int64 of the recording of each frame, in the order of `recordings`."""
-        owners = [name.rpartition("/")[0] for name in self.names]
+        owners = list(map(_owner, self.names))
         numbers = {name: number for number, name in enumerate(dict.fromkeys(owners))}
         return np.array([numbers[name] for name in owners], np.int64)
 

@@ -291,6 +291,10 @@ class Landmarks:
     tracks: Tracks  # their observations; point indices are rows of points_world
     counts: Counts  # of tracks
 
+    def of(self, points: np.ndarray) -> "Landmarks":
+        """Points (J,) bool and their observations."""
+        return Landmarks(self.points_world[points], self.tracks.of(points), self.counts)
+
     def moved(self, scales: np.ndarray, moves: np.ndarray) -> "Landmarks":
         """Points moved by the similarity of their host frames: scales (F,), moves (F, 4, 4)."""
         hosts = self.tracks.hosts()

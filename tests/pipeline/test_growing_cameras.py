@@ -160,7 +160,7 @@ def test_a_camera_goes_with_its_recordings(
     assert "cameras" not in json.loads((out / "report.json").read_text())
     refine_each([panoramas(home, 1 - gone, (SMALL, WIDTH)[gone])], tmp_path / "alone", SETTINGS)
     assert error_of(out, home) < 1.3 * error_of(tmp_path / "alone", home)
-    # What is left grows again, from features that were extracted beside those of another camera.
+    # The remaining run grows again: its features were extracted beside those of another camera.
     again = tmp_path / "again"
     add_recordings(out, [panoramas(home, gone, (WIDTH, SMALL)[gone])], again)
     assert error_of(again, home) < 1.5 * error_of(grown, home)
