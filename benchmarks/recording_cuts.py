@@ -1,5 +1,6 @@
 """Recordings for `benchmarks/recordings.py`: parts of a walk, each with its own clock and world."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,7 +15,6 @@ from gsba.similarity import Sim3
 from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.types import Trajectory
 
-STEP = 4  # frames of the walk from one frame of a recording to the next
 _SHARE = 1.5  # part of the walk that all recordings cover together: neighbours overlap
 _SCALES = (0.4, 0.9, 1.7, 0.6, 1.2, 2.3)  # map units per metre of the trajectories
 
@@ -27,26 +27,30 @@ class Cut(NamedTuple):
     rows: np.ndarray  # (R,) frames of the walk
 
 
-def cut(walk: Path, out: Path, num: int, exposures: tuple[float, ...] = ()) -> list[Cut]:
+def cut(
+    walks: Sequence[Path], out: Path, num: int, step: int, exposures: tuple[float, ...] = ()
+) -> list[Cut]:
     """Cut a walk into recordings that overlap their neighbours.
 
     Recordings see the walk at other frames. Each has a clock from 0, and a trajectory that starts
     at the identity of a tilted world.
 
     Args:
-        walk: folder with `images/` and their timestamps.csv, and `groundtruth.tum`.
+        walks: folder with `images/` and their timestamps.csv, and `groundtruth.tum`; or several of
+            the same walk, which recordings are cut from in turn.
         out: folder of the recordings.
         num: number of recordings.
+        step: frames of the walk from one frame of a recording to the next, even.
         exposures: factors of the linear light of each recording's pictures; () = as they are.
     """
-    num_frames = len((walk / "images/timestamps.csv").read_text().splitlines()) - 1
+    num_frames = len((walks[0] / "images/timestamps.csv").read_text().splitlines()) - 1
     length = min(int(_SHARE * num_frames / num), num_frames)
     starts = np.linspace(0, num_frames - length, num).astype(int)
-    phases = [(STEP // 2) * (n % 2) for n in range(num)]
+    phases = [(step // 2) * (n % 2) for n in range(num)]
     return [
         cut_rows(
-            walk,
-            np.arange(start + phase, start + length, STEP),
+            walks[n % len(walks)],
+            np.arange(start + phase, start + length, step),
             out / f"part{n + 1}",
             n,
             exposures[n] if exposures else 1.0,
@@ -59,7 +63,7 @@ def cut_rows(walk: Path, rows: np.ndarray, folder: Path, number: int, exposure: 
     """Cut frames out of a walk as a recording; its trajectory lies beside its folder.
 
     Args:
-        walk: see `cut`.
+        walk: folder, see `cut`.
         rows: (R,) frames of the walk.
         folder: of the recording.
         number: decides world, scale and drift of its trajectory.

@@ -3,13 +3,15 @@
     python benchmarks/recordings.py --out WORK --markdown benchmarks/results/recordings.md \
         --walk FLAT --other FLAT
 
-A FLAT is a folder with `images/` and their timestamps.csv, `groundtruth.tum` and `mask.png`. Each
-walk is cut into recordings with clocks, worlds and scales of their own (`recording_cuts.py`), which
-are refined from trajectories with drift, from none, and from every other one's; and once more with
-exposures 30 % apart. Each recording is refined alone, too, and COLMAP gets all pictures. A part of
-each walk with a part of each `--other` flat must stay apart. Every run is a process of its own;
-rows are kept in WORK and used again while code and input stay the same. The exit code is 1 if a map
-joins two flats, or the error of all exceeds 1.5 times that of the best recording alone.
+A FLAT is a folder with `images/` and their timestamps.csv, `groundtruth.tum` and, where somebody
+carries the camera, `mask.png`. Each walk is cut into recordings with clocks, worlds and scales of
+their own (`recording_cuts.py`), which are refined from trajectories with drift, from none, and from
+every other one's; and two recordings once more with exposures 30 % apart. Each recording is refined
+alone, too, and COLMAP gets all pictures. `--changed FLAT AGAIN` cuts every other recording from
+AGAIN, the same walk with furniture moved or in another light. A part of each walk with a part of
+each `--other` flat must stay apart. Every run is a process of its own; rows are kept in WORK and
+used again while code and input stay the same. The exit code is 1 if a map joins two flats, frames
+are left out of the map, or its error exceeds 1.5 times that of the best recording alone.
 """
 
 import argparse
@@ -46,6 +48,12 @@ class Part(NamedTuple):
     name: str  # of the recording
     start: bool  # whether it is given its trajectory
 
+    @property
+    def mask(self) -> Path | None:
+        """Mask of who carries the camera, if somebody does."""
+        path = self.walk / "mask.png"
+        return path if path.exists() else None
+
 
 def command(parts: Sequence[Part], run: Path) -> list[str]:
     """Command that refines recordings, one alone as the only one."""
@@ -53,10 +61,11 @@ def command(parts: Sequence[Part], run: Path) -> list[str]:
     if len(parts) == 1:
         (one,) = parts
         files = [str(one.cut.trajectory)] if one.start else []
-        mask = ["--masks", str(one.walk / "mask.png")]
+        mask = ["--masks", str(one.mask)] if one.mask else []
         return [*_GSBA, str(one.cut.folder), *files, *mask, *options]
     for one in parts:
-        text = f"{one.cut.folder},name={one.name},masks={one.walk / 'mask.png'}"
+        text = f"{one.cut.folder},name={one.name}"
+        text += f",masks={one.mask}" if one.mask else ""
         text += f",trajectory={one.cut.trajectory}" if one.start else ""
         options += ["--recording", text]
     return [*_GSBA, *options]
@@ -81,7 +90,7 @@ def check_maps(run: Path, parts: Sequence[Part]) -> list[dict[str, Any]]:
 
 
 def _ate(world_T_rigs: np.ndarray, rows: np.ndarray, walk: Path) -> float:
-    """Error in millimetres of poses of frames `rows` of a walk; frames may be given twice."""
+    """Error in millimetres (1e-3 units) of poses of frames `rows` of a walk, some of them twice."""
     truth = read_trajectory(walk / "groundtruth.tum").world_T_rigs[rows]
     return 1e3 * float(np.sqrt(np.mean(position_errors(world_T_rigs, truth) ** 2)))
 
@@ -145,22 +154,31 @@ def _files(parts: Sequence[Part]) -> list[Path]:
     """Files that a run reads."""
     files = []
     for one in parts:
-        files += [*sorted(one.cut.folder.iterdir()), one.walk / "mask.png"]
+        files += [*sorted(one.cut.folder.iterdir())] + ([one.mask] if one.mask else [])
         files += [one.cut.trajectory] if one.start else []
     return files
 
 
 def verdict(row: dict[str, Any], best_mm: float | None, apart: bool) -> str:
-    """Verdict on a row's error or join; "" where no bar applies to it."""
+    """Verdict on a row's map; "" for the peer.
+
+    Args:
+        row: result of `Bench.row` or `Bench.peer`.
+        best_mm: error of the best recording alone, millimetres; None: not known.
+        apart: whether the recordings are of two flats.
+    """
+    if row["start"] == "COLMAP":
+        return ""
     if not row.get("errors"):
-        return f"refused: {row.get('reason', 'no map')}"
+        return f"**refused: {row.get('reason', 'no map')}**"
     if any(len(one["flats"]) > 1 for one in row["errors"]):
         return "**false join**"
     if apart:
         return "apart"
-    if best_mm is None or row["start"] == "COLMAP":
-        return ""
-    return "right" if row["errors"][0]["ate_mm"] <= MAX_RATIO * best_mm else "**worse**"
+    first = row["errors"][0]
+    if best_mm is not None and not first["ate_mm"] <= MAX_RATIO * best_mm:
+        return "**worse**"
+    return "right" if first["frames"] == row["frames"] else "**frames left out**"
 
 
 def line(flat: str, what: str, row: dict[str, Any], best_mm: float | None, found: str) -> str:
@@ -173,24 +191,37 @@ def line(flat: str, what: str, row: dict[str, Any], best_mm: float | None, found
     return f"| {' | '.join(cells)} |"
 
 
-def of_walk(bench: Bench, walk: Path, num: int, exposures: tuple[float, ...], peer: bool) -> list:
-    """Lines and verdicts of one walk, cut into `num` recordings."""
-    label = f"{walk.name}-{num}" + ("-exposed" if exposures else "")
-    cuts = cut(walk, bench.out / label / "cuts", num, exposures)
+class Variant(NamedTuple):
+    """Recordings that a walk is cut into."""
+
+    num: int
+    step: int  # frames of the walk from one frame of a recording to the next
+    exposures: tuple[float, ...] = ()
+    changed: Path | None = None  # the same walk with things changed, for every other recording
+
+
+def of_walk(bench: Bench, walk: Path, variant: Variant, peer: bool) -> list:
+    """Lines and verdicts of one walk, cut into recordings."""
+    num, step, exposures, changed = variant
+    walks = (walk, changed) if changed else (walk,)
+    label = f"{'+'.join(one.name for one in walks)}-{num}"
+    plain = cut(walks, bench.out / label / "cuts", num, step)
+    alone = [
+        bench.row([Part(walk, one, f"part{n}", True)], f"{label}-part{n}", "alone")
+        for n, one in enumerate(plain)
+    ]
+    label += "-exposed" if exposures else ""
+    cuts = cut(walks, bench.out / label / "cuts", num, step, exposures) if exposures else plain
 
     def parts(start: str) -> list[Part]:
         given = [start == "trajectories" or (start == "half" and n % 2 == 0) for n in range(num)]
         return [Part(walk, one, f"part{n}", given[n]) for n, one in enumerate(cuts)]
 
-    plain = cut(walk, bench.out / f"{walk.name}-{num}" / "cuts", num)
-    alone = [
-        bench.row([Part(walk, one, f"part{n}", True)], f"{walk.name}-{num}-part{n}", "alone")
-        for n, one in enumerate(plain)
-    ]
     known = [row["errors"][0]["ate_mm"] for row in alone if row.get("errors")]
     best = min(known, default=None)
     what = f"{num}, exposures {', '.join(map(str, exposures))}" if exposures else str(num)
-    rows = [bench.row(parts(start), label, start) for start in STARTS[: 1 if exposures else 3]]
+    what += f", every other one of {changed.name}" if changed else ""
+    rows = [bench.row(parts(start), label, start) for start in STARTS[: 2 if exposures else 3]]
     rows += [bench.peer(parts("trajectories"), label)] if peer else []
     lines = []
     for row in rows:
@@ -200,10 +231,10 @@ def of_walk(bench: Bench, walk: Path, num: int, exposures: tuple[float, ...], pe
     return lines
 
 
-def of_pair(bench: Bench, walk: Path, other: Path) -> list:
+def of_pair(bench: Bench, walk: Path, other: Path, step: int) -> list:
     """Lines and verdicts of recordings of two flats in one run."""
     label = f"{walk.name}+{other.name}"
-    cuts = [cut(one, bench.out / label / one.name, 2)[0] for one in (walk, other)]
+    cuts = [cut((one,), bench.out / label / one.name, 2, step)[0] for one in (walk, other)]
     lines = []
     for start in STARTS[:2]:
         given = start == "trajectories"
@@ -219,27 +250,37 @@ def of_pair(bench: Bench, walk: Path, other: Path) -> list:
 def main() -> None:
     """Parse, run, print; exit with 1 if a bar is missed."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--walk", action="append", type=Path, required=True, metavar="FLAT")
+    parser.add_argument("--walk", action="append", type=Path, default=[], metavar="FLAT")
     parser.add_argument("--other", action="append", type=Path, default=[], metavar="FLAT")
-    parser.add_argument("--num", action="append", type=int, help="recordings; default: 2 and 3")
+    parser.add_argument(
+        "--changed", action="append", type=Path, nargs=2, default=[], metavar=("FLAT", "AGAIN")
+    )
+    parser.add_argument("--num", action="append", type=int, help="recordings; default: 2, 3, 6")
+    parser.add_argument("--step", type=int, default=4, help="walk's frames per recording's frame")
     parser.add_argument("--no-peer", action="store_true", help="leave COLMAP out")
     parser.add_argument("--out", type=Path, default=Path("build/recordings"), help="kept rows")
     parser.add_argument("--markdown", type=Path)
     options = parser.parse_args()
-    bench = Bench(options.out.resolve(), code_digest())
+    bench, peer = Bench(options.out.resolve(), code_digest()), not options.no_peer
+    nums = options.num or (2, 3, 6)
     print("\n".join(HEAD), flush=True)
     lines = []
     for walk in (one.resolve() for one in options.walk):
         for other in options.other:
-            lines += of_pair(bench, walk, other.resolve())
-        for num in options.num or (2, 3):
-            lines += of_walk(bench, walk, num, (), peer=not options.no_peer)
-        lines += of_walk(bench, walk, 2, (0.7, 1.3), peer=False)
+            lines += of_pair(bench, walk, other.resolve(), options.step)
+        for num in nums:
+            lines += of_walk(bench, walk, Variant(num, options.step), peer)
+        if 2 in nums:
+            lines += of_walk(bench, walk, Variant(2, options.step, (0.7, 1.3)), peer)
+    for walk, again in options.changed:
+        variant = Variant(2, options.step, changed=again.resolve())
+        lines += of_walk(bench, walk.resolve(), variant, peer)
     foot = (
         "ATE: of all frames of the exported map after one alignment to the truth; other maps: "
-        f"frames of each (its ATE). Right: at most {MAX_RATIO} times the best recording refined "
-        "alone from its trajectory. Start: trajectories = each its own with drift; half = every "
-        "other recording's; none = images alone; COLMAP = spherical, incremental, all pictures."
+        "frames of each (its ATE). Right: all frames in one map, whose error is at most "
+        f"{MAX_RATIO} times that of the best recording refined alone from its trajectory. Start: "
+        "trajectories = each its own with drift; half = every other recording's; none = images "
+        "alone; COLMAP = spherical, incremental, all pictures."
     )
     print("\n" + foot)
     head = ["# Several recordings in one run", "", *HEAD]
