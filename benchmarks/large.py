@@ -4,13 +4,15 @@
     python -m benchmarks.large whole 20000 --out WORK
     python -m benchmarks.large asleep 2000 --out WORK [--part 1000] [--tasks 140] [--slots 64]
     python -m benchmarks.large compare WORK OTHER
+    python -m benchmarks.large again RUN --frames 5000 --out WORK [--part 1000] [--workers 2]
 
 `solve` streams the city to WORK/map and solves it there; called again, it goes on where it was
 stopped. `whole` holds all of it and solves it by one factorization. Both print a line for each
 attempt, and write WORK/poses.npy and WORK/figures.json. `--kill` kills a worker every so many
 seconds. `asleep` measures a part's CPU seconds in each pass of an attempt, and lets as many tasks
 as a larger city has parts sleep so long on slots of a Dask scheduler. `compare` prints how far
-costs and poses differ.
+costs and poses differ. `again` adjusts the matches of neighbours that a run in RUN has stored, and
+finds covariances: of as many frames as asked for, by the run's frames side by side again and again.
 """
 
 import argparse
@@ -22,7 +24,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,13 +36,26 @@ from benchmarks.city import City, make_city
 from factors import BearingTerm, LandmarkBlock, RobustLoss
 from factors.direct_system import DirectSystem
 from factors.system_layout import SystemLayout
+from gsba.bundle import adjustment, tracks
+from gsba.bundle.adjustment import AdjustmentContext
+from gsba.bundle.bearings import Bearings
+from gsba.bundle.families import Families
 from gsba.bundle.optimizer import OptimizeResult, minimize
-from gsba.config import SolverSettings
+from gsba.bundle.trajectory_prior import TrajectoryPrior
+from gsba.config import RefineSettings, SolverSettings
+from gsba.disk import concatenated
+from gsba.frames import cubemap
+from gsba.geometry import inverse
+from gsba.memory import give_back_freed_memory, release_mapped_files
+from gsba.parts import DividedAdjustments
 from gsba.parts.divided_system import optimize_divided
 from gsba.parts.folder import PartsWriter, values_at
 from gsba.store.shards import Job, Spent, Threads, Workers
+from gsba.store.store import load_stage
+from gsba.types import FrameSet, Keypoints, Matches, Solution
 
 LOSS_SIGMAS = 2.0
+COLUMNS = ("pixels", "faces", "bearings_rig", "sigmas_rad", "colors")  # of keypoints
 
 
 @dataclass
@@ -293,6 +308,89 @@ def compare(first: Path, other: Path) -> None:
     )
 
 
+@dataclass(frozen=True)
+class Stored:
+    """Frames of a run before an adjustment, as its stages have stored them, so many copies."""
+
+    keypoints: Keypoints
+    matches: tuple[Matches, ...]
+    start: Solution
+
+    @classmethod
+    def load(cls, run: Path, num_frames: int, folder: Path) -> "Stored":
+        """The first frames of copies side by side, arrays on the disk of `folder`."""
+        keypoints = load_stage(run, "keypoints", Keypoints)
+        matches = [load_stage(run, name, Matches) for name in ("adjacent", "near")]
+        start = load_stage(run, "chain", Solution)
+        num = len(start.world_T_rigs)
+        copies = -(-num_frames // num)
+        starts = np.concatenate([[0], np.cumsum(np.tile(np.diff(keypoints.starts), copies))])
+        last = int(starts[num_frames])
+        columns = concatenated(_copies(keypoints, copies, last), folder)
+        there = Keypoints(starts[: num_frames + 1].astype(np.int64), *columns)
+        poses = [start.world_T_rigs]
+        step = inverse(poses[0][-2]) @ poses[0][-1]
+        for _ in range(copies - 1):
+            poses.append(poses[-1][-1] @ step @ inverse(poses[0][0]) @ poses[0])
+        world_T_rigs = np.concatenate(poses)[:num_frames]
+        both = tuple(_copied(one, copies, num, num_frames) for one in matches)
+        return cls(there, both, replace(Solution.without_points(world_T_rigs), noise=start.noise))
+
+
+def _copies(keypoints: Keypoints, copies: int, last: int) -> Iterator[tuple[np.ndarray, ...]]:
+    """Columns of keypoints, again and again up to a row."""
+    columns = [getattr(keypoints, name) for name in COLUMNS]
+    for copy in range(copies):
+        left = last - copy * len(keypoints.faces)
+        yield tuple(column[:left] for column in columns)
+
+
+def _copied(matches: Matches, copies: int, num: int, num_frames: int) -> Matches:
+    """Matches of copies of `num` frames, both of the first `num_frames`."""
+    pairs = np.concatenate([matches.pairs + np.int32(n * num) for n in range(copies)])
+    rows = [matches.of(p) for p in range(len(matches.pairs))] * copies
+    chosen = np.flatnonzero(pairs.max(axis=1) < num_frames)
+    return Matches.of_rows(pairs[chosen], [rows[p] for p in chosen])
+
+
+def again(options: argparse.Namespace) -> None:
+    """Print what an adjustment and covariances of a run's matches take, in parts."""
+    out = options.out
+    stored = Stored.load(options.run, options.frames, out)
+    chosen, frames = RefineSettings(), load_stage(options.run, "frames", FrameSet)
+    prior = TrajectoryPrior(stored.start.world_T_rigs, chosen.priors)
+    rig = cubemap.rig_for(frames.format, chosen.cubemap)
+    with hired(options.workers, out / "shards", 0.0) as (workers, peak):
+        division = DividedAdjustments(out / "parts", out / "shards", workers, options.part)
+        families = Families((Bearings(), prior))
+        context = AdjustmentContext(families, rig, chosen, 1, division=division, scratch=out)
+        sizes = np.diff(stored.keypoints.starts)
+        print(f"{len(sizes)} frames, {sizes.sum()} keypoints", flush=True)
+        with _taking("adjustment", workers, peak):
+            found = tracks.build(stored.matches, sizes)
+            given = stored.start, context, chosen.rounds.dense, False
+            solved = adjustment.adjust(found, stored.keypoints, *given)
+            print(f"{len(solved.landmarks.tracks)} observations", flush=True)
+        with _taking("covariances", workers, peak):
+            adjustment.pose_covariances(solved, stored.keypoints, context)
+
+
+@contextmanager
+def _taking(what: str, workers: Workers, peak: Callable[[], float]) -> Iterator[None]:
+    """Print what is taken within this context, by this process and by workers."""
+    give_back_freed_memory(0)
+    release_mapped_files()
+    Path("/proc/self/clear_refs").write_text("5")  # the peak is counted from here
+    here, there, before = time.process_time(), workers.spent().cpu_seconds, peak_mb()
+    yield
+    print(
+        f"{what}: CPU s here {time.process_time() - here:.1f}, of workers "
+        f"{workers.spent().cpu_seconds - there:.1f}; MB here before {before:.0f}, peak "
+        f"{peak_mb():.0f}, of a worker {peak():.0f}",
+        flush=True,
+    )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     commands = parser.add_subparsers(dest="command", required=True)
@@ -309,6 +407,12 @@ def main() -> None:
             command.add_argument("--workers", type=int, default=0)
             command.add_argument("--kill", type=float, default=0.0)
             command.add_argument("--stop-after", type=int, default=0)
+    command = commands.add_parser("again")
+    command.add_argument("run", type=Path)
+    command.add_argument("--frames", type=int, required=True)
+    command.add_argument("--out", type=Path, required=True)
+    command.add_argument("--part", type=int, default=1000)
+    command.add_argument("--workers", type=int, default=0)
     command = commands.add_parser("compare")
     command.add_argument("first", type=Path)
     command.add_argument("other", type=Path)
@@ -320,6 +424,9 @@ def main() -> None:
         asleep(options)
         return
     options.out.mkdir(parents=True, exist_ok=True)
+    if options.command == "again":
+        again(options)
+        return
     result, figures = (solve if options.command == "solve" else whole)(options)
     truth = make_city(options.frames).truth
     poses = np.array([result.values.atPose3(X(f)).matrix()[:3] for f in range(options.frames)])

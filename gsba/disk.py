@@ -1,4 +1,4 @@
-"""Atomic writing of files, locks on folders, and disk errors in one line."""
+"""Atomic writing of files, arrays on the disk, locks on folders, and disk errors in one line."""
 
 import ctypes
 import errno
@@ -8,13 +8,16 @@ import logging
 import os
 import shutil
 import sys
+import tempfile
 import uuid
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import IO, TYPE_CHECKING
 
 from gsba.log import GsbaError
+from gsba.memory import mapped_file
 
 if TYPE_CHECKING:
     import numpy as np
@@ -259,3 +262,48 @@ def remove_unheld(folders: Iterable[Path]) -> None:
                 shutil.rmtree(folder, ignore_errors=True)
             finally:
                 os.close(lock)
+
+
+def concatenated(
+    parts: "Iterable[Sequence[np.ndarray]]", folder: Path | None
+) -> "list[np.ndarray]":
+    """Rows of all parts, back to back, in files without a name that end with the arrays.
+
+    Args:
+        parts: at least one, each of C arrays (N, ...); types and shapes of rows are those of the
+            first part.
+        folder: on the disk that takes the files, made if missing; None = arrays are in memory.
+
+    Returns:
+        C arrays, read-only, whose pages are read as they are used.
+
+    Raises:
+        GsbaError: the disk cannot be written.
+    """
+    import numpy as np
+
+    if folder is None:
+        return [np.concatenate(column) for column in zip(*parts, strict=True)]
+    parts = iter(parts)
+    first = next(parts)
+    with ExitStack() as stack:
+        with disk_errors(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+            files = [stack.enter_context(tempfile.TemporaryFile(dir=folder)) for _ in first]
+        for arrays in chain([first], parts):
+            with disk_errors(folder):
+                for file, array, like in zip(files, arrays, first, strict=True):
+                    file.write(np.ascontiguousarray(array, like.dtype).data)
+        with disk_errors(folder):
+            for file in files:
+                file.flush()
+        return [_mapped(file, like) for file, like in zip(files, first, strict=True)]
+
+
+def _mapped(file: IO[bytes], like: "np.ndarray") -> "np.ndarray":
+    """Array (N, ...) of a file's content, rows shaped like those of another one."""
+    import numpy as np
+
+    if not file.tell():
+        return like[:0].copy()
+    return np.frombuffer(mapped_file(file), like.dtype).reshape(-1, *like.shape[1:])

@@ -1,16 +1,20 @@
 """Memory and processors of this machine, on Linux and macOS; settings of glibc's allocator."""
 
 import ctypes
+import mmap
 import os
 import resource
 import sys
+import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import IO
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # parameters of mallopt(3), from malloc.h
 _DEFAULT_THRESHOLDS = 32 << 20, 64 << 20  # bytes, glibc's own mapping and trimming thresholds
 _MIN_RETURNED_BYTES = 256 << 20  # fetching and clearing so much again takes a tenth of a second
+_mapped_files = weakref.WeakSet[mmap.mmap]()
 
 
 def total_memory_bytes() -> int:
@@ -77,6 +81,29 @@ def give_back_freed_memory(least: int = _MIN_RETURNED_BYTES) -> None:
             return
     if hasattr(libc, "malloc_trim"):
         libc.malloc_trim(0)
+
+
+def mapped_file(file: IO[bytes]) -> mmap.mmap:
+    """Content of an open file, read-only, whose pages are read as they are used.
+
+    Raises:
+        OSError: it cannot be read.
+        ValueError: it is empty.
+    """
+    content = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+    _mapped_files.add(content)
+    return content
+
+
+def release_mapped_files() -> None:
+    """Take the pages of all mapped files out of this process's memory.
+
+    They are read again as they are used, from the system's cache of the disk as long as that has
+    them. Nothing is lost, as mapped files are not written.
+    """
+    if hasattr(mmap, "MADV_DONTNEED"):
+        for content in list(_mapped_files):
+            content.madvise(mmap.MADV_DONTNEED)
 
 
 class _Mallinfo(ctypes.Structure):

@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Protocol, Self, TypeVar
 
 import gtsam
@@ -13,7 +14,7 @@ from gsba.bundle import pose_variables, triangulation
 from gsba.bundle.division import DivisibleMap, Division
 from gsba.bundle.families import Families, Family, FamilyTerms
 from gsba.bundle.gyro_turns import GyroTurns
-from gsba.bundle.observation_noise import observation_noise
+from gsba.bundle.observation_noise import observation_noise, with_scaled_noise
 from gsba.bundle.optimizer import OptimizeResult, marginal_covariances, optimize
 from gsba.bundle.pose_variables import poses_of, values_of
 from gsba.camera.rig import CubeRig
@@ -71,6 +72,8 @@ class AdjustmentContext:
     maps: np.ndarray | None = None  # (F,) map of each frame, for the families; None = there is one
     division: Division | None = None  # of large maps into parts; None = none is divided
     cameras: tuple[CameraSettings, ...] = ()  # (C,) of each camera; () = settings.camera of all
+    scratch: Path | None = None  # folder on the disk that takes arrays of all observations; None =
+    # they are in memory
 
     @property
     def turning(self) -> GyroConstraints | None:
@@ -225,16 +228,19 @@ def adjust_sighted_through(
     """
     solved, rounds, settings = before, [], context.settings
     for number, gate in enumerate(gates, 1):
-        there = rescale_noise(replace(sighted, keypoints=view.keypoints), solved, settings)
+        so_far = replace(sighted, keypoints=view.keypoints)
+        there = rescale_noise(so_far, solved, settings, context.scratch)
         view, start = view.with_noise_of(there.keypoints), replace(solved, noise=1.0)
         solver = _solver(settings, last=number == len(gates))
-        so_far = replace(context, settings=settings.model_copy(update={"solver": solver}))
-        solved, view = adjust_through(view, sighted.tracks, start, so_far, (gate,))
+        looser = replace(context, settings=settings.model_copy(update={"solver": solver}))
+        solved, view = adjust_through(view, sighted.tracks, start, looser, (gate,))
         rounds += solved.rounds
     return replace(solved, rounds=tuple(rounds)), view
 
 
-def rescale_noise(sighted: Sighted, before: Solution, settings: RefineSettings) -> Sighted:
+def rescale_noise(
+    sighted: Sighted, before: Solution, settings: RefineSettings, scratch: Path | None = None
+) -> Sighted:
     """Scale new and former observations' noise to what a solution shows of each.
 
     A patch's covariance knows the image's noise and texture, not how far a surface or a lens is
@@ -245,14 +251,15 @@ def rescale_noise(sighted: Sighted, before: Solution, settings: RefineSettings) 
     poses = before.world_T_rigs
     gate = _UNKNOWN_NOISE_GATE
     threads = settings.solver.threads()
-    placed = triangulation.place(tracks, keypoints, poses, gate, settings.triangulate, threads)
+    how = gate, settings.triangulate, threads, scratch
+    placed = triangulation.place(tracks, keypoints, poses, *how)
     factors = np.ones(len(keypoints.faces))
     for group in (sighted.aligned, ~sighted.aligned):
         chosen = group[keypoints.rows(placed.tracks)]
         if np.count_nonzero(chosen) >= settings.rounds.min_observations:
             noise = observation_noise(placed, keypoints, poses, threads, chosen)
             factors[group] = max(noise, _MIN_NOISE_RATIO)
-    return replace(sighted, keypoints=keypoints.scaled_noise(factors))
+    return replace(sighted, keypoints=with_scaled_noise(keypoints, factors, scratch))
 
 
 def adjust(
@@ -343,9 +350,8 @@ class _Placement:
                 return self._found
         settings, threads = self._context.settings.triangulate, self._context.num_threads
         self._asked = keypoints, world_T_rigs, gate
-        self._found = triangulation.place(
-            self._tracks, keypoints, world_T_rigs, gate, settings, threads
-        )
+        given = self._tracks, keypoints, world_T_rigs, gate, settings, threads
+        self._found = triangulation.place(*given, self._context.scratch)
         return self._found
 
 

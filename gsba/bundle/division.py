@@ -14,6 +14,7 @@ from factors import RobustLoss, Term
 from gsba.bundle.optimizer import OptimizeResult
 from gsba.bundle.tracks import runs
 from gsba.config import SolverSettings
+from gsba.memory import release_mapped_files
 from gsba.types import JointErrors, Landmarks
 
 _CHUNK = 1 << 17  # observations whose residuals are made at a time: 20 MB
@@ -41,6 +42,7 @@ class DivisibleMap:
         for points, _, own in runs(landmarks.tracks, _CHUNK):
             some = Landmarks(landmarks.points_world[points], own, landmarks.counts)
             yield some.points_world, self.terms_of(some)
+            release_mapped_files()
 
 
 class Division(Protocol):

@@ -1,11 +1,19 @@
 """Noise of observations, in units of their own sigmas, by what their points leave of residuals."""
 
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 
 from factors.threads import balanced_ranges, run_in_threads
 from gsba.bundle._noise_kernels import standardized_residuals
-from gsba.types import Keypoints, Landmarks
+from gsba.bundle.tracks import runs
+from gsba.disk import concatenated
+from gsba.memory import release_mapped_files
+from gsba.types import Keypoints, Landmarks, Tracks
 
+_AT_ONCE = 1 << 18  # observations whose residuals are held: 25 MB
 _MIN_REDUNDANCY = 0.1  # least share of residual dimensions beyond the unknowns
 
 
@@ -33,18 +41,59 @@ def observation_noise(
         chosen: (O,) bool, observations whose spread is asked for.
     """
     tracks, num = landmarks.tracks, len(landmarks.tracks)
+    spread, poses = np.empty(num), np.ascontiguousarray(world_T_rigs)
+    for points, observations, some in runs(tracks, _AT_ONCE):
+        own = landmarks.points_world[points]
+        spread[observations] = _residuals(own, some, keypoints, poses, num_threads)
+        release_mapped_files()
+    unknowns = 6 * len(world_T_rigs)
+    redundancy = max(1 - unknowns / max(2 * num - 3 * tracks.num_points, 1), _MIN_REDUNDANCY)
+    kept = spread[chosen]
+    np.abs(kept, out=kept)
+    return float(1.4826 * np.median(kept, overwrite_input=True) / np.sqrt(redundancy))
+
+
+def _residuals(
+    points_world: np.ndarray,
+    tracks: Tracks,
+    keypoints: Keypoints,
+    world_T_rigs: np.ndarray,
+    num_threads: int,
+) -> np.ndarray:
+    """Residuals (O,) of the observations of points (J, 3), all of the same spread."""
     starts = np.searchsorted(tracks.points, np.arange(tracks.num_points + 1))
-    rows, spread = keypoints.rows(tracks), np.empty(num)
+    rows, spread = keypoints.rows(tracks), np.empty(len(tracks))
     origins = np.zeros((0, 3)) if keypoints.origins_rig is None else keypoints.origins_rig[rows]
     seen = keypoints.bearings_rig[rows], np.ascontiguousarray(keypoints.roots(rows)), origins
-    ranges, poses = balanced_ranges(starts), np.ascontiguousarray(world_T_rigs)
+    ranges = balanced_ranges(starts)
 
     def work(part: int) -> None:
         standardized_residuals(
-            *ranges[part], starts, landmarks.points_world, tracks.frames, poses, *seen, spread
+            *ranges[part], starts, points_world, tracks.frames, world_T_rigs, *seen, spread
         )
 
     run_in_threads(work, len(ranges), num_threads)
-    unknowns = 6 * len(world_T_rigs)
-    redundancy = max(1 - unknowns / max(2 * num - 3 * tracks.num_points, 1), _MIN_REDUNDANCY)
-    return float(1.4826 * np.median(np.abs(spread[chosen])) / np.sqrt(redundancy))
+    return spread
+
+
+def with_scaled_noise(
+    keypoints: Keypoints, factors: np.ndarray, folder: Path | None = None
+) -> Keypoints:
+    """As `Keypoints.scaled_noise` by factors (N,), of keypoints that may be very many.
+
+    Args:
+        folder: on the disk that takes the noise; None = it is in memory.
+    """
+    if folder is None:
+        return keypoints.scaled_noise(factors)
+    infos = keypoints.sqrt_infos
+
+    def scaled() -> Iterator[tuple[np.ndarray, ...]]:
+        for first in range(0, max(len(factors), 1), _AT_ONCE):
+            some = slice(first, first + _AT_ONCE)
+            sigmas = keypoints.sigmas_rad[some] * factors[some]
+            yield sigmas, *([] if infos is None else [infos[some] / factors[some, None, None]])
+            release_mapped_files()
+
+    sigmas, *roots = concatenated(scaled(), folder)
+    return replace(keypoints, sigmas_rad=sigmas, sqrt_infos=roots[0] if roots else None)

@@ -2,8 +2,10 @@
 
 import numpy as np
 
+from gsba.bundle.tracks import runs
 from gsba.geometry import angular_errors, furthest, moved_to
 from gsba.log import GsbaError
+from gsba.memory import release_mapped_files
 from gsba.similarity import NoSimilarityError, Sim3, pose_similarity
 from gsba.types import (
     CoarsePoses,
@@ -17,6 +19,7 @@ from gsba.types import (
 
 _MIN_CORRELATION = 0.1  # least correlation of refined and coarse positions: with usual drift it is
 # .8
+_AT_ONCE = 1 << 18  # observations whose poses are held together: 35 MB
 _MAX_RESIDUAL_DEG = 10.0  # largest median residual: gates leave a tenth of a degree
 
 
@@ -57,10 +60,11 @@ def assemble(
     rows, points = keypoints.rows(landmarks.tracks), landmarks.tracks.points
     lengths = np.maximum(np.bincount(points, minlength=len(landmarks.points_world)), 1)
     bearings, origins = keypoints.bearings_rig[rows], keypoints.origins_of(rows)
-    poses = moved_to(adjustment.world_T_rigs[landmarks.tracks.frames], origins)
-    errors = angular_errors(poses, landmarks.points_world[points], bearings)
+    errors = _errors(adjustment, bearings, origins)
     _require_small(errors)
-    colors = [np.bincount(points, c, len(lengths)) / lengths for c in keypoints.colors[rows].T]
+    seen_colors = keypoints.colors[rows]
+    release_mapped_files()
+    colors = [np.bincount(points, c, len(lengths)) / lengths for c in seen_colors.T]
     return Reconstruction(
         placed,
         covariances * stretch[:, :, None] * stretch[:, None, :],
@@ -79,6 +83,16 @@ def assemble(
         else stretch[landmarks.tracks.frames, 3:] * origins,
         map_scales=None if components is None else _map_scales(stretch[:, 3], components),
     )
+
+
+def _errors(adjustment: Solution, bearings: np.ndarray, origins: np.ndarray | None) -> np.ndarray:
+    """Angles (O,), radians, between bearings (O, 3) of the points' observations and the points."""
+    landmarks, poses, found = adjustment.landmarks, adjustment.world_T_rigs, [np.empty(0)]
+    for points, rows, some in runs(landmarks.tracks, _AT_ONCE):
+        there = moved_to(poses[some.frames], None if origins is None else origins[rows])
+        ends = landmarks.points_world[points][some.points]
+        found.append(angular_errors(there, ends, bearings[rows]))
+    return np.concatenate(found)
 
 
 def _map_scales(stretches: np.ndarray, components: np.ndarray) -> np.ndarray:

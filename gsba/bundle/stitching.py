@@ -2,6 +2,7 @@
 
 import logging
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from factors.sphere_field import SphereField, degrees_of, harmonics, num_harmoni
 from gsba.bundle import adjustment
 from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.cross_validation import Verdict, cross_validate
+from gsba.bundle.observation_noise import with_scaled_noise
 from gsba.bundle.shared_parameters import PARTS, BySharedParameters, SharedModel, models_of
 from gsba.camera.cameras import ONE_CAMERA, Cameras
 from gsba.camera.rig import CubeRig, owner_faces
@@ -55,9 +57,17 @@ def corrected(keypoints: Keypoints, field: SphereField, rig: CubeRig) -> Keypoin
     return replace(keypoints, bearings_rig=bearings, sqrt_infos=roots, faces=faces, pixels=pixels)
 
 
-def with_noise_of(keypoints: Keypoints, calibrated: Keypoints) -> Keypoints:
-    """Keypoints whose noise is scaled as in others of the same rows, where they were corrected."""
-    scaled = keypoints.scaled_noise(calibrated.sigmas_rad / keypoints.sigmas_rad)
+def with_noise_of(
+    keypoints: Keypoints, calibrated: Keypoints, scratch: Path | None = None
+) -> Keypoints:
+    """Keypoints whose noise is scaled as in others of the same rows, where they were corrected.
+
+    Args:
+        keypoints, calibrated: these, and the others.
+        scratch: folder on the disk that takes the noise of many; None = it is in memory.
+    """
+    factors = calibrated.sigmas_rad / keypoints.sigmas_rad
+    scaled = with_scaled_noise(keypoints, factors, scratch)
     return replace(scaled, sigmas_rad=calibrated.sigmas_rad)  # to the byte
 
 

@@ -5,9 +5,11 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from factors.compiled import kernel_and_part
+from gsba.memory import release_mapped_files
 from gsba.types import Matches, Tracks
 
 _kernel, _ = kernel_and_part()
+_AT_ONCE = 1 << 20  # matches that are numbered together
 
 
 def build(matches: Sequence[Matches], num_keypoints: np.ndarray) -> Tracks:
@@ -26,28 +28,52 @@ def build(matches: Sequence[Matches], num_keypoints: np.ndarray) -> Tracks:
     first_node = np.concatenate([[0], np.cumsum(num_keypoints)]).astype(np.int64)
     number = np.int32 if first_node[-1] < np.iinfo(np.int32).max else np.int64
     first_node = first_node.astype(number)
-    edges = np.empty((sum(len(part.keypoints) for part in matches), 2), number)
-    first = 0
-    for part in matches:
-        rows = slice(first, first + len(part.keypoints))
-        pairs = np.repeat(part.pairs, np.diff(part.offsets), axis=0)
-        edges[rows], first = first_node[pairs] + part.keypoints, rows.stop
-    frame_of_node = np.repeat(np.arange(len(num_keypoints), dtype=np.int32), num_keypoints)
-    roots = np.arange(len(frame_of_node), dtype=number)
+    edges = _edges(matches, first_node)
+    matched = np.zeros(first_node[-1], bool)
+    matched[edges[:, 0]], matched[edges[:, 1]] = True, True
+    nodes = np.flatnonzero(matched).astype(number)  # all others are tracks of their own
+    place = np.cumsum(matched, dtype=number) - 1
+    for some in _slices(len(edges)):
+        edges[some] = place[edges[some]]
+    del matched, place
+    of_frames = np.diff(np.searchsorted(nodes, first_node))
+    frame_of_node = np.repeat(np.arange(len(of_frames), dtype=np.int32), of_frames)
+    roots = np.arange(len(nodes), dtype=number)
     _merge(edges, frame_of_node, roots)
     del edges
-    several = np.bincount(roots, minlength=len(roots)) > 1
-    nodes = np.flatnonzero(several[roots])
-    points = (np.cumsum(several, dtype=number) - 1)[roots[nodes]]
+    several = np.zeros(len(roots), bool)
+    several[roots[roots != np.arange(len(roots), dtype=number)]] = True
+    chosen = np.flatnonzero(several[roots]).astype(number)
+    points = (np.cumsum(several, dtype=number) - 1)[roots[chosen]]
     order = np.argsort(points, kind="stable")
-    nodes, points = nodes[order], points[order]
-    frames = frame_of_node[nodes]
+    chosen, points = chosen[order], points[order]
+    frames = frame_of_node[chosen]
     return Tracks(
         points.astype(np.int32),
         frames,
-        (nodes - first_node[frames]).astype(np.int32),
+        (nodes[chosen] - first_node[frames]).astype(np.int32),
         int(points[-1]) + 1 if len(points) else 0,
     )
+
+
+def _edges(matches: Sequence[Matches], first_node: np.ndarray) -> np.ndarray:
+    """Nodes (M, 2) of all matches, one set after the other; a node is a keypoint of all frames'."""
+    edges = np.empty((sum(len(part.keypoints) for part in matches), 2), first_node.dtype)
+    first = 0
+    for part in matches:
+        pair_of_row = np.repeat(np.arange(len(part.pairs), dtype=np.int32), np.diff(part.offsets))
+        for some in _slices(len(part.keypoints)):
+            rows = slice(first + some.start, first + some.stop)
+            edges[rows] = first_node[part.pairs[pair_of_row[some]]] + part.keypoints[some]
+            release_mapped_files()
+        first += len(part.keypoints)
+    return edges
+
+
+def _slices(num: int) -> Iterator[slice]:
+    """Ranges of at most `_AT_ONCE` of `num` rows."""
+    for first in range(0, num, _AT_ONCE):
+        yield slice(first, min(first + _AT_ONCE, num))
 
 
 def runs(tracks: Tracks, most: int) -> Iterator[tuple[slice, slice, Tracks]]:

@@ -1,6 +1,7 @@
 """Scene points from bearings and poses, robust to false observations in a track."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -8,7 +9,9 @@ from factors.threads import balanced_ranges, run_in_threads
 from gsba.bundle._triangulation_kernels import triangulate_tracks
 from gsba.bundle.tracks import runs
 from gsba.config import TriangulateSettings
+from gsba.disk import concatenated
 from gsba.geometry import moved_to
+from gsba.memory import release_mapped_files
 from gsba.types import Counts, Keypoints, Landmarks, Reconstruction, Tracks
 
 _AT_ONCE = 1 << 18  # observations whose rays are held: 60 MB
@@ -99,55 +102,58 @@ def place(
     max_error_sigmas: float,
     settings: TriangulateSettings,
     num_threads: int = 1,
+    scratch: Path | None = None,
 ) -> Landmarks:
-    """As `triangulate`, the observations being the tracks' own keypoints; some tracks at a time."""
-    found = [Landmarks(np.zeros((0, 3)), tracks.of(np.zeros(tracks.num_points, bool)), _NONE)]
-    for _, _, some in runs(tracks, _AT_ONCE):
-        rows = keypoints.rows(some)
-        landmarks = triangulate(
-            some,
-            keypoints.bearings_rig[rows],
-            keypoints.sigmas_rad[rows],
-            world_T_rigs,
-            max_error_sigmas,
-            settings,
-            num_threads,
-            keypoints.origins_of(rows),
-        )
-        found.append(landmarks)
-    return _joined(found)
+    """As `triangulate`, the observations being the tracks' own keypoints; some tracks at a time.
+
+    Args:
+        tracks, keypoints, world_T_rigs, max_error_sigmas, settings, num_threads: see `triangulate`.
+        scratch: folder on the disk that takes the points of very many tracks; None = they are in
+            memory.
+    """
+    counts = [_NONE]
+
+    def found() -> Iterator[tuple[np.ndarray, ...]]:
+        none = tracks.of(np.zeros(tracks.num_points, bool))
+        yield np.zeros((0, 3)), none.points, none.frames, none.keypoints
+        num = 0
+        for _, _, some in runs(tracks, _AT_ONCE):
+            rows = keypoints.rows(some)
+            rays = keypoints.bearings_rig[rows], keypoints.sigmas_rad[rows]
+            how = max_error_sigmas, settings, num_threads, keypoints.origins_of(rows)
+            own = triangulate(some, *rays, world_T_rigs, *how)
+            counts.append(own.counts)
+            numbers = own.tracks.points + np.int32(num)
+            yield own.points_world, numbers, own.tracks.frames, own.tracks.keypoints
+            num += own.tracks.num_points
+            release_mapped_files()
+
+    folder = scratch if len(tracks) > _AT_ONCE else None
+    points_world, points, frames, rows = concatenated(found(), folder)
+    seen = Tracks(points, frames, rows, len(points_world))
+    return Landmarks(points_world, seen, _sum(counts))
 
 
-def _joined(parts: Sequence[Landmarks]) -> Landmarks:
-    """Landmarks one behind the other, their counts added up."""
-    firsts = np.cumsum([0, *(part.tracks.num_points for part in parts)])
-    own = [part.tracks for part in parts]
-    points = [t.points + np.int32(first) for t, first in zip(own, firsts, strict=False)]
-    tracks = Tracks(
-        np.concatenate(points),
-        np.concatenate([t.frames for t in own]),
-        np.concatenate([t.keypoints for t in own]),
-        int(firsts[-1]),
-    )
+def _sum(parts: Sequence[Counts]) -> Counts:
+    """Counts of tracks added up."""
     dropped: dict[str, int] = {}
     for part in parts:
-        for reason, number in part.counts.dropped.items():
+        for reason, number in part.dropped.items():
             dropped[reason] = dropped.get(reason, 0) + number
-    received = sum(part.counts.received for part in parts)
-    counts = Counts(received, tracks.num_points, "tracks", dropped)
-    return Landmarks(np.concatenate([part.points_world for part in parts]), tracks, counts)
+    received, kept = sum(p.received for p in parts), sum(p.kept for p in parts)
+    return Counts(received, kept, "tracks", dropped)
 
 
 def points_under(reconstruction: Reconstruction, world_T_rigs: np.ndarray) -> np.ndarray:
     """Points (J, 3) nearest to the rays of a reconstruction under other poses (F, 4, 4)."""
-    frames, points = reconstruction.observation_frames, reconstruction.observation_points
-    lenses = moved_to(world_T_rigs[frames], reconstruction.observation_origins)
-    rotations, centres = lenses[:, :3, :3], lenses[:, :3, 3]
-    rays = np.einsum("oij,oj->oi", rotations, reconstruction.observation_bearings)
-    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]  # off the ray
     shape = len(reconstruction.points_world)
     normal, target = np.zeros((shape, 3, 3)), np.zeros((shape, 3))
-    np.add.at(normal, points, across)
-    np.add.at(target, points, np.einsum("oij,oj->oi", across, centres))
+    for some in reconstruction.pieces():
+        lenses = moved_to(world_T_rigs[some.observation_frames], some.observation_origins)
+        rotations, centres = lenses[:, :3, :3], lenses[:, :3, 3]
+        rays = np.einsum("oij,oj->oi", rotations, some.observation_bearings)
+        across = np.eye(3) - rays[:, :, None] * rays[:, None, :]  # off the ray
+        np.add.at(normal, some.observation_points, across)
+        np.add.at(target, some.observation_points, np.einsum("oij,oj->oi", across, centres))
     normal += 1e-9 * np.eye(3)  # parallel rays leave the depth open
     return np.linalg.solve(normal, target[..., None])[..., 0]

@@ -1,8 +1,9 @@
 """Keypoints on cube faces, as bearings of the rig."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from pathlib import Path
 from typing import Protocol
 
 import cv2
@@ -10,6 +11,7 @@ import numpy as np
 
 from gsba.camera.rig import RIG_R_FACE, CubeRig, owner_faces
 from gsba.config import FeatureSettings
+from gsba.disk import concatenated
 from gsba.types import FACES, Features, Keypoints
 
 _SAME_PIXEL_PX = 0.01  # pixels of one keypoint on the faces of two rigs differ by more
@@ -126,16 +128,22 @@ def _feature_fields(
     return pixels, owners, bearings[own], sigmas, found.descriptors[own], colors
 
 
-def gather(frames: Iterable[Features]) -> Keypoints:
-    """Keypoints of all frames in one record, without descriptors."""
-    lengths, fields = [0], []
-    for found in frames:
-        lengths.append(len(found))
-        fields.append(
-            (found.pixels, found.faces, found.bearings_rig, found.sigmas_rad, found.colors)
-        )
-    columns = (np.concatenate(column) for column in zip(*fields, strict=True))
-    return Keypoints(np.cumsum(lengths), *columns)
+def gather(frames: Iterable[Features], folder: Path | None = None) -> Keypoints:
+    """Keypoints of all frames in one record, without descriptors.
+
+    Args:
+        frames: features of each frame.
+        folder: on the disk that holds the arrays while they are used; None = they are in memory.
+    """
+    lengths = [0]
+
+    def columns() -> Iterator[tuple[np.ndarray, ...]]:
+        for found in frames:
+            lengths.append(len(found))
+            yield found.pixels, found.faces, found.bearings_rig, found.sigmas_rad, found.colors
+
+    arrays = concatenated(columns(), folder)
+    return Keypoints(np.cumsum(lengths), *arrays)
 
 
 def on_faces(keypoints: Keypoints, rig: CubeRig) -> Keypoints:

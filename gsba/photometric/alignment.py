@@ -1,7 +1,8 @@
 """Sub-pixel observations: the patch around each point, aligned to every frame that shows it."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -9,19 +10,21 @@ from factors import tangent_basis
 from factors.patches import ALIGNED, REASONS, PatchSet, Sightings, expect, found_at
 from factors.sphere_field import SphereField
 from gsba.camera.cameras import ONE_CAMERA, Cameras
-from gsba.camera.rig import CubeRig, owner_faces
+from gsba.camera.rig import CubeRig
 from gsba.config import PatchSettings
 from gsba.frames import panorama
-from gsba.memory import total_memory_bytes
+from gsba.memory import release_mapped_files, total_memory_bytes
 from gsba.photometric import frame_jobs, surfaces
+from gsba.photometric.packing import Observed, Shown, pack
 from gsba.photometric.references import references, visible_frames
 from gsba.store.shards import Workers
-from gsba.types import Counts, Keypoints, Landmarks, Sighted, Solution, Tracks
+from gsba.types import Counts, Keypoints, Landmarks, Sighted, Solution
 
 _TOO_UNCERTAIN = "position too uncertain"
 _SIGHTINGS_AT_ONCE = 1 << 17  # sightings processed together: some 80 MB
 _BYTES_PER_POINT = 8192  # of a point's patch and its sightings, about
-_MEMORY_SHARE = 16  # of the machine's memory, which the patches of one part take at most
+_MEMORY_SHARE = 64  # of the machine's memory, which the patches of one part take at most
+_POINTS_AT_ONCE = 1 << 17  # whose former observations are looked for together
 _ENOUGH_OBSERVATIONS = 100  # aligned observations of a frame from which points without aligned
 # patches are dropped
 _TILTED_STEP_PX = 1.4  # pixels to a step of patches tilted with their surfaces; 1 of patches facing
@@ -31,31 +34,6 @@ _MIN_SIGMA_PX = 0.03  # pixels, noise of the best patches: sampling, and a plane
 REJECTIONS = (*REASONS.values(), _TOO_UNCERTAIN)  # reasons why alignments are dropped
 
 _STRAIGHT = SphereField.none()
-
-
-@dataclass(frozen=True, slots=True)
-class _Observed:
-    """Observations of points, in any order."""
-
-    points: np.ndarray  # (N,) int64
-    frames: np.ndarray  # (N,) int64
-    bearings_rig: np.ndarray  # (N, 3) float64, unit
-    covariances: np.ndarray  # (N, 2, 2) float64, radians squared, on tangent_basis
-
-    @classmethod
-    def joined(cls, parts: "Sequence[_Observed]") -> "_Observed":
-        """All of them."""
-        names = ("points", "frames", "bearings_rig", "covariances")
-        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
-
-    def of(self, points: np.ndarray) -> "_Observed":
-        """The observations with their points renumbered: n becomes `points[n]`."""
-        return replace(self, points=points[self.points])
-
-    def enlarged(self, factors: np.ndarray) -> "_Observed":
-        """The observations with the noise of pictures that were enlarged by factors (N,): their
-        pixels' noise is correlated, so that residuals promise more than the pictures hold."""
-        return replace(self, covariances=self.covariances * factors[:, None, None] ** 2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +57,7 @@ class Observations:
     normals_rig: np.ndarray | None = None  # (N, 3) of the surfaces that they show, as in `Sighted`;
     # None = unknown
     field: SphereField = _STRAIGHT  # errors of stitching: the map is corrected by it
+    folder: Path | None = None  # on the disk that holds what is found; None = it is in memory
 
 
 def align(
@@ -113,21 +92,29 @@ def align(
     landmarks, world_T_rigs = solved.landmarks, solved.world_T_rigs
     rows = references(landmarks, world_T_rigs)
     normals_world = np.zeros((len(rows), 3))
-    found, at_hosts, dropped = [], [], dict.fromkeys(REJECTIONS, 0)
-    for points in _by_hosts(landmarks.tracks.frames[rows]):
-        chosen = np.zeros(len(rows), bool)
-        chosen[points] = True
-        some = replace(solved, landmarks=landmarks.of(chosen))
-        patches = _align_some(some, observed, greys, settings, workers, lenses, name, dropped)
-        found.append(patches.found.of(points))
-        at_hosts.append(patches.at_hosts.of(points))
-        normals_world[points] = patches.normals_world
-    parts = [_Observed.joined(found), _Observed.joined(at_hosts)]
-    keypoints, aligned = observed.keypoints, len(parts[0].points)
-    parts.append(_former_observations(landmarks, keypoints, solved.noise, parts, greys.num_frames))
-    colors = keypoints.colors[keypoints.rows(landmarks.tracks)[rows]]
-    counts = Counts(aligned + sum(dropped.values()), aligned, "observations", dropped)
-    return _pack(parts, colors, normals_world, world_T_rigs, rig, counts)
+    dropped, num_found = dict.fromkeys(REJECTIONS, 0), 0
+
+    def by_patches() -> Iterator[Observed]:
+        nonlocal num_found
+        for points in _by_hosts(landmarks.tracks.frames[rows]):
+            chosen = np.zeros(len(rows), bool)
+            chosen[points] = True
+            some = replace(solved, landmarks=landmarks.of(chosen))
+            patches = _align_some(some, observed, greys, settings, workers, lenses, name, dropped)
+            normals_world[points] = patches.normals_world
+            num_found += len(patches.found)
+            yield patches.found.of(points)
+            yield patches.at_hosts.of(points)
+            release_mapped_files()
+
+    folder, keypoints = observed.folder, observed.keypoints
+    new = Observed.joined(by_patches(), folder)
+    given = landmarks, keypoints, solved.noise, new, greys.num_frames
+    former = Observed.joined(_former_observations(*given), folder)
+    own = keypoints.starts[landmarks.tracks.frames[rows]] + landmarks.tracks.keypoints[rows]
+    shown = Shown(keypoints.colors[own], normals_world, world_T_rigs)
+    counts = Counts(num_found + sum(dropped.values()), num_found, "observations", dropped)
+    return pack(new, former, shown, rig, counts, folder)
 
 
 def _by_hosts(hosts: np.ndarray) -> Iterator[np.ndarray]:
@@ -143,8 +130,8 @@ def _by_hosts(hosts: np.ndarray) -> Iterator[np.ndarray]:
 class _Aligned:
     """Observations of some points by their patches."""
 
-    found: _Observed  # in other frames
-    at_hosts: _Observed
+    found: Observed  # in other frames
+    at_hosts: Observed
     normals_world: np.ndarray  # (J, 3) of the surfaces, zero = unknown
 
 
@@ -261,7 +248,7 @@ def _accepted(
     pixel: float,
     settings: PatchSettings,
     dropped: dict[str, int],
-) -> tuple[np.ndarray, _Observed]:
+) -> tuple[np.ndarray, Observed]:
     """Accepted rows (N,) of the sightings, as observations; rejections are added to `dropped`."""
     parts = []
     for first in range(0, max(len(seeing), 1), _SIGHTINGS_AT_ONCE):
@@ -270,7 +257,7 @@ def _accepted(
         kept, bearings, covariances = accepted_rows(patches, there, pixel, settings, dropped)
         parts.append((first + kept, bearings, covariances))
     kept, bearings, covariances = (np.concatenate(column) for column in zip(*parts, strict=True))
-    found = _Observed(sightings.templates[kept], seeing[kept], bearings, covariances)
+    found = Observed(sightings.templates[kept], seeing[kept], bearings, covariances)
     return kept, found
 
 
@@ -310,7 +297,7 @@ def _at_hosts(
     hosts: np.ndarray,
     planes: _Planes,
     pixel: float,
-) -> _Observed:
+) -> Observed:
     """Observations of aligned templates in their host frames.
 
     A template's place is exact by definition; its noise, which all its alignments share, is
@@ -324,7 +311,7 @@ def _at_hosts(
     axes = tangent_basis(planes.origins[used]) @ planes.spreads[used]
     covariances = axes @ of_shifts @ np.swapaxes(axes, 1, 2)
     covariances += (_MIN_SIGMA_PX * pixel) ** 2 * np.eye(2)
-    return _Observed(used, hosts[used], planes.origins[used], covariances)
+    return Observed(used, hosts[used], planes.origins[used], covariances)
 
 
 def _normals_world(
@@ -352,72 +339,29 @@ def _confirmed_points(
 
 
 def _former_observations(
-    landmarks: Landmarks,
-    keypoints: Keypoints,
-    noise: float,
-    found: list[_Observed],
-    num_frames: int,
-) -> _Observed:
-    """The former observations of points in frames where alignment failed.
+    landmarks: Landmarks, keypoints: Keypoints, noise: float, found: Observed, num_frames: int
+) -> Iterator[Observed]:
+    """The former observations of points in frames where alignment failed, of some at a time.
 
     Points without an aligned patch are kept only in frames with few aligned ones.
     """
     tracks = landmarks.tracks
-    known = np.concatenate([part.points * num_frames + part.frames for part in found])
-    cells = tracks.points.astype(np.int64) * num_frames + tracks.frames
     wanted = np.zeros(tracks.num_points, bool)
-    wanted[found[0].points] = True
-    scarce = np.bincount(known % num_frames, minlength=num_frames) < _ENOUGH_OBSERVATIONS
+    wanted[found.points] = True
+    scarce = np.bincount(found.frames, minlength=num_frames) < _ENOUGH_OBSERVATIONS
     wanted[tracks.points[scarce[tracks.frames]]] = True
-    chosen = np.flatnonzero(wanted[tracks.points] & ~np.isin(cells, known))
-    rows = keypoints.rows(tracks)[chosen]
-    covariances = keypoints.sigmas_rad[rows, None, None] ** 2 * np.eye(2)
-    if keypoints.sqrt_infos is not None:
-        roots = keypoints.sqrt_infos[rows]
-        covariances = np.linalg.inv(np.swapaxes(roots, 1, 2) @ roots)
-    points, frames = tracks.points[chosen].astype(np.int64), tracks.frames[chosen].astype(np.int64)
-    return _Observed(points, frames, keypoints.bearings_rig[rows], noise**2 * covariances)
-
-
-def _pack(
-    parts: list[_Observed],
-    colors: np.ndarray,
-    normals_world: np.ndarray,
-    world_T_rigs: np.ndarray,
-    rig: CubeRig,
-    counts: Counts,
-) -> Sighted:
-    """Observations, the last part being former ones, as keypoints frame by frame and as tracks.
-
-    Points observed once are left out.
-    """
-    every = _Observed.joined(parts)
-    points, frames, bearings = every.points, every.frames, every.bearings_rig
-    covariances = every.covariances
-    seen = np.bincount(points, minlength=len(colors))
-    order = np.lexsort((points, frames))
-    order = order[seen[points[order]] > 1]
-    is_new = order < len(points) - len(parts[-1].points)
-    points, frames, bearings = points[order], frames[order], bearings[order]
-    starts = np.searchsorted(frames, np.arange(len(world_T_rigs) + 1))
-    faces = owner_faces(bearings)
-    lower = np.linalg.cholesky(np.linalg.inv(covariances[order]))
-    keypoints = Keypoints(
-        starts,
-        rig.project(bearings, faces),
-        faces,
-        bearings,
-        np.linalg.det(covariances[order]) ** 0.25,
-        colors[points],
-        np.ascontiguousarray(np.swapaxes(lower, 1, 2)),
-    )
-    by_point = np.lexsort((frames, points))
-    _, compact = np.unique(points[by_point], return_inverse=True)
-    tracks = Tracks(
-        compact.astype(np.int32),
-        frames[by_point].astype(np.int32),
-        (by_point - starts[frames[by_point]]).astype(np.int32),
-        int(compact[-1]) + 1 if len(compact) else 0,
-    )
-    normals = np.einsum("oba,ob->oa", world_T_rigs[frames, :3, :3], normals_world[points])
-    return Sighted(keypoints, is_new, tracks, counts, normals.astype(np.float32))
+    for first in range(0, max(tracks.num_points, 1), _POINTS_AT_ONCE):
+        bounds = np.searchsorted(tracks.points, [first, first + _POINTS_AT_ONCE])
+        points, frames = (array[slice(*bounds)] for array in (tracks.points, tracks.frames))
+        there = np.flatnonzero((found.points >= first) & (found.points < first + _POINTS_AT_ONCE))
+        known = found.points[there].astype(np.int64) * num_frames + found.frames[there]
+        cells = points.astype(np.int64) * num_frames + frames
+        chosen = np.flatnonzero(wanted[points] & ~np.isin(cells, known))
+        rows = keypoints.starts[frames[chosen]] + tracks.keypoints[bounds[0] + chosen]
+        covariances = keypoints.sigmas_rad[rows, None, None] ** 2 * np.eye(2)
+        if keypoints.sqrt_infos is not None:
+            roots = keypoints.sqrt_infos[rows]
+            covariances = np.linalg.inv(np.swapaxes(roots, 1, 2) @ roots)
+        of = points[chosen], frames[chosen]
+        yield Observed(*of, keypoints.bearings_rig[rows], noise**2 * covariances)
+        release_mapped_files()

@@ -55,7 +55,7 @@ def adopt(run: Run, stored: Sequence[Path]) -> ObservedFrames:
     make = learned.make_extractor(run.settings.features, run.weights)
     found = extraction.adopted(run.store, run.frames, run.rig, run.settings.cubemap, make, stored)
     load = FrameFeatures([found] * len(run.frames), run.frames.names)
-    keypoints = detection.gather(map(load, range(len(run.frames))))
+    keypoints = detection.gather(map(load, range(len(run.frames))), run.store.scratch_folder)
     return _matchable(run, [found] * len(run.frames), detection.on_faces(keypoints, run.rig))
 
 
@@ -92,7 +92,7 @@ def _observe(
     load = FrameFeatures(found, frames.names)
 
     def gather() -> Keypoints:
-        return detection.gather(map(load, range(len(frames))))
+        return detection.gather(map(load, range(len(frames))), run.store.scratch_folder)
 
     keypoints = run.chain.stage(name, None, gather, Keypoints, also=[stage])
     return _matchable(run, found, keypoints)

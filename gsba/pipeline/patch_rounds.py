@@ -83,8 +83,8 @@ def observe(state: State, start: Solution, observed: Observations, name: str) ->
 
 def observations(state: State) -> Observations:
     """Observations of the map's points."""
-    map_ = state.map
-    return Observations(map_.observed, map_.aligned, map_.normals_rig, map_.field)
+    map_, folder = state.map, state.run.store.scratch_folder
+    return Observations(map_.observed, map_.aligned, map_.normals_rig, map_.field, folder)
 
 
 def adjust_aligned(
@@ -104,7 +104,7 @@ def adjust_aligned(
         there = replace(sighted, keypoints=map_.rays(sighted.keypoints, run.rig))
         context = state.adjustment_context()
         solved, found = adjustment.adjust_sighted(there, map_.solution, context, gates)
-        return solved, stitching.with_noise_of(sighted.keypoints, found)
+        return solved, stitching.with_noise_of(sighted.keypoints, found, context.scratch)
 
     key = [run.solving_key(), gates]
     solved, keypoints = run.stage(name, key, compute, tuple[Solution, Keypoints])

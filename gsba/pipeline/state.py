@@ -142,4 +142,5 @@ class State:
             maps=self.prior.parts,
             cameras=run.camera_settings,
             division=run.division,
+            scratch=run.store.scratch_folder,
         )

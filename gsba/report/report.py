@@ -71,12 +71,12 @@ def median_residual_deg(reconstruction: Reconstruction, world_T_rigs: np.ndarray
 
 def angular_residuals(reconstruction: Reconstruction) -> np.ndarray:
     """Angles (O,) in radians between each observed bearing and the direction to its point."""
-    poses = reconstruction.world_T_rigs[reconstruction.observation_frames]
-    return angular_errors(
-        moved_to(poses, reconstruction.observation_origins),
-        reconstruction.points_world[reconstruction.observation_points],
-        reconstruction.observation_bearings,
-    )
+    found = []
+    for some in reconstruction.pieces():
+        poses = moved_to(some.world_T_rigs[some.observation_frames], some.observation_origins)
+        points = some.points_world[some.observation_points]
+        found.append(angular_errors(poses, points, some.observation_bearings))
+    return np.concatenate(found)
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

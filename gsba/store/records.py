@@ -4,12 +4,17 @@ A record is any value built from numpy arrays, numbers, strings, paths, enums, N
 mappings and dataclasses of these. Arrays become members named after their place in the record
 (`points.npy`); all other values are a JSON tree in `manifest.json`. The type that the caller
 expects drives the reading, so that a file can neither name code to run nor have another type. The
-zip checksums reveal truncated or flipped bytes.
+zip checksums reveal truncated or flipped bytes. Arrays begin at multiples of 64 bytes of the file,
+so that they can be used where they lie.
 """
 
 import json
 import logging
+import math
+import mmap
 import os
+import struct
+import time
 import tokenize
 import types
 import typing
@@ -20,11 +25,12 @@ from contextlib import contextmanager
 from dataclasses import MISSING, Field, fields, is_dataclass
 from enum import Enum
 from pathlib import Path
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin
+from typing import IO, Any, Literal, TypeVar, Union, get_args, get_origin
 
 import numpy as np
 
 from gsba.disk import atomic_write
+from gsba.memory import mapped_file, release_mapped_files
 
 T = TypeVar("T")
 
@@ -33,6 +39,14 @@ logger = logging.getLogger(__name__)
 FORMAT = 1  # raised whenever the layout below changes
 HEADER_ERRORS = (SyntaxError, tokenize.TokenError, RecursionError)  # of a damaged .npy or JSON
 _MANIFEST = "manifest.json"
+_ALIGNMENT = 64  # bytes, of arrays in a file: that of .npy headers
+_LOCAL_HEADER, _ZIP64_FIELD = (
+    30,
+    20,
+)  # bytes of a member before its name, and of its sizes behind it
+_PADDING_FIELD = 0xD935  # number of the extra field that zip files are aligned by
+_BYTES_AT_ONCE = 1 << 22  # that are checked, of an array that stays on the disk
+MIN_MAPPED_BYTES = 1 << 22  # of arrays that are worth a mapping
 
 
 class RecordError(Exception):
@@ -53,10 +67,34 @@ def save_record(path: Path, value: object, info: Mapping[str, Any]) -> None:
         with zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
             archive.writestr(_MANIFEST, json.dumps(manifest))
             for name, array in arrays.items():
-                with archive.open(name, "w", force_zip64=True) as member:
-                    np.lib.format.write_array(member, array, allow_pickle=False)
+                with archive.open(_aligned(name, archive), "w", force_zip64=True) as member:
+                    _write_array(member, array)
 
     atomic_write(path, write)
+
+
+def _write_array(member: IO[bytes], array: np.ndarray) -> None:
+    """Write an array as `.npy`; pages of one that lies on the disk are held a few at a time."""
+    plain = array.flags.c_contiguous and not array.dtype.hasobject
+    if array.nbytes < MIN_MAPPED_BYTES or not plain:
+        np.lib.format.write_array(member, array, allow_pickle=False)
+        return
+    np.lib.format.write_array_header_1_0(member, np.lib.format.header_data_from_array_1_0(array))
+    content = array.reshape(-1).view(np.uint8).data
+    for first in range(0, len(content), _BYTES_AT_ONCE):
+        member.write(content[first : first + _BYTES_AT_ONCE])
+        release_mapped_files()
+
+
+def _aligned(name: str, archive: zipfile.ZipFile) -> zipfile.ZipInfo:
+    """Next member of an archive that is being written, which begins at a multiple of 64 bytes."""
+    assert archive.fp is not None
+    header = _LOCAL_HEADER + len(name.encode()) + _ZIP64_FIELD + 4  # of the padding itself
+    missing = -(archive.fp.tell() + header) % _ALIGNMENT
+    member = zipfile.ZipInfo(name, date_time=time.localtime()[:6])
+    member.extra = struct.pack("<HH", _PADDING_FIELD, missing) + bytes(missing)
+    member.external_attr = 0o600 << 16
+    return member
 
 
 def read_info(path: Path) -> dict[str, Any]:
@@ -67,16 +105,18 @@ def read_info(path: Path) -> dict[str, Any]:
         return info
 
 
-def load_record(path: Path, returns: type[T]) -> T:
+def load_record(path: Path, returns: type[T], mapped: bool = False) -> T:
     """Read a record back.
 
     Args:
         path: file written by `save_record`.
         returns: its type, e.g. a dataclass or `tuple[Matches, Counts]`.
+        mapped: leave large arrays on the disk, where they are read as they are used; they cannot be
+            written. The file may be replaced meanwhile, but not changed.
     Raises:
         RecordError: missing, truncated, corrupt, or of another type.
     """
-    with _reading(path) as archive:
+    with _reading(path, _MappedArchive if mapped else zipfile.ZipFile) as archive:
         return _decode(_manifest(archive)["value"], returns, archive)
 
 
@@ -126,10 +166,47 @@ def load_checkpoint(path: Path | None, key: str, returns: type[T], anew: str) ->
     return None
 
 
+class _MappedArchive(zipfile.ZipFile):
+    """Archive whose large arrays are used where they lie."""
+
+    _content: mmap.mmap | None = None
+
+    def array(self, name: str) -> np.ndarray | None:
+        """An array whose bytes agree with their checksum; None = it is to be read.
+
+        Small ones are read, and those of files that did not align them.
+        """
+        member = self.getinfo(name)
+        if member.file_size < MIN_MAPPED_BYTES:
+            return None
+        with self.open(member) as file:
+            version = np.lib.format.read_magic(file)
+            if version != (1, 0):
+                return None
+            shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
+            header = file.tell()
+            if dtype.hasobject:
+                return None
+            while file.read(_BYTES_AT_ONCE):  # compared with the checksum at the end
+                pass
+        if self._content is None:
+            assert self.fp is not None
+            self._content = mapped_file(self.fp)
+        first = member.header_offset
+        name_bytes, extra = struct.unpack_from("<HH", self._content, first + 26)
+        first += _LOCAL_HEADER + name_bytes + extra + header
+        if first % _ALIGNMENT or member.file_size != header + math.prod(shape) * dtype.itemsize:
+            return None
+        flat = np.frombuffer(self._content, dtype, math.prod(shape), first)
+        return flat.reshape(shape, order="F" if fortran else "C")
+
+
 @contextmanager
-def _reading(path: Path) -> Iterator[zipfile.ZipFile]:
+def _reading(
+    path: Path, archive_type: type[zipfile.ZipFile] = zipfile.ZipFile
+) -> Iterator[zipfile.ZipFile]:
     try:
-        with zipfile.ZipFile(path) as archive:
+        with archive_type(path) as archive:
             if any(member.compress_type != zipfile.ZIP_STORED for member in archive.infolist()):
                 raise ValueError("it is compressed, which no record is: it may unpack to any size")
             yield archive
@@ -193,8 +270,10 @@ def _decode(tree: Any, hint: Any, archive: zipfile.ZipFile | None) -> Any:
     """Value of type `hint` from its JSON tree; RecordError if the tree is of another type."""
     origin = get_origin(hint)
     if archive is not None and (hint is np.ndarray or origin is np.ndarray):
-        with archive.open(tree) as member:
-            array = np.lib.format.read_array(member, allow_pickle=False)
+        array = archive.array(tree) if isinstance(archive, _MappedArchive) else None
+        if array is None:
+            with archive.open(tree) as member:
+                array = np.lib.format.read_array(member, allow_pickle=False)
         _require(array.dtype.kind in "biuf", array.dtype, hint)
         return array
     if origin in (Union, types.UnionType):

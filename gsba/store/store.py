@@ -24,7 +24,7 @@ from pydantic import BaseModel
 
 from gsba.disk import FullDiskError, link_or_copy, write_text
 from gsba.log import GsbaError, brief, event
-from gsba.memory import give_back_freed_memory, peak_memory_bytes
+from gsba.memory import give_back_freed_memory, peak_memory_bytes, release_mapped_files
 from gsba.store.folder import (
     MARKER,
     STAGES,
@@ -33,7 +33,15 @@ from gsba.store.folder import (
     open_run_folder,
     refuse_foreign,
 )
-from gsba.store.records import FORMAT, RecordError, load_record, read_info, save_record, typed
+from gsba.store.records import (
+    FORMAT,
+    MIN_MAPPED_BYTES,
+    RecordError,
+    load_record,
+    read_info,
+    save_record,
+    typed,
+)
 from gsba.store.shards import Spent, StoredRecords, Threads, Workers, even_blocks
 from gsba.version import __version__
 
@@ -111,6 +119,11 @@ class RunStore:
         """Folder of maps that a stage solves in parts, deleted when the stage is stored."""
         return self.root / STAGES / _PARTS
 
+    @property
+    def scratch_folder(self) -> Path:
+        """Folder of files without a name, which end with what is in them."""
+        return self.root / STAGES
+
     @contextmanager
     def named(self, prefix: str) -> Iterator[None]:
         """Name stages within this context, and the stages they follow, `prefix-NAME`."""
@@ -159,7 +172,11 @@ class RunStore:
         save_record(path, value, dataclasses.asdict(record))
         self._forget_shards()
         self._note(record)
+        with suppress(OSError, RecordError):  # large arrays stay on the disk from here on
+            if path.stat().st_size >= MIN_MAPPED_BYTES:
+                value = load_record(path, returns, mapped=True)
         give_back_freed_memory()  # freed by this stage's threads: other threads do not reuse it
+        release_mapped_files()
         return value
 
     def per_frame(
@@ -453,7 +470,7 @@ def _load_if_current(path: Path, key: str, returns: type[T]) -> tuple[T, StageRe
         if info.get("key") != key:
             logger.info("%s: settings or inputs changed, computing again", path.stem)
             return None
-        return load_record(path, returns), typed(info, StageRecord)
+        return load_record(path, returns, mapped=True), typed(info, StageRecord)
     except RecordError as error:
         logger.warning("%s: stored result is unusable, computing again (%s)", path.stem, error)
         return None

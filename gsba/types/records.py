@@ -1,12 +1,20 @@
 """Records that stages pass to one another: arrays, with one comment per field."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 
 import numpy as np
 
 from gsba.types.frame_set import PictureFormat
+
+_AT_ONCE = 1 << 18  # observations whose poses are held together: 35 MB
+
+
+def _slices(num: int) -> Iterator[slice]:
+    """Ranges of `num` observations, one at least, of at most `_AT_ONCE`."""
+    for first in range(0, max(num, 1), _AT_ONCE):
+        yield slice(first, min(first + _AT_ONCE, num))
 
 
 class PoseSource(IntEnum):
@@ -374,8 +382,11 @@ class Solution:
     def median_depth(self) -> float:
         """Median distance of points from observing frames, map units; 0 without points."""
         tracks, points = self.landmarks.tracks, self.landmarks.points_world
-        offsets = points[tracks.points] - self.world_T_rigs[tracks.frames, :3, 3]
-        return float(np.median(np.linalg.norm(offsets, axis=1))) if len(offsets) else 0.0
+        depths = np.empty(len(tracks))
+        for some in _slices(len(tracks)):
+            offsets = points[tracks.points[some]] - self.world_T_rigs[tracks.frames[some], :3, 3]
+            depths[some] = np.linalg.norm(offsets, axis=1)
+        return float(np.median(depths, overwrite_input=True)) if len(depths) else 0.0
 
     def points_by_keypoint(self, keypoints: Keypoints) -> "KnownPoints":
         """Points of each frame's keypoints (K_f, 3), rig frame, NaN where unknown."""
@@ -499,6 +510,19 @@ class Reconstruction:
     def map_scale(self, number: int) -> float:
         """Units of a map's world per unit of the largest map's."""
         return 1.0 if self.map_scales is None else float(self.map_scales[number - 1])
+
+    def pieces(self) -> "Iterator[Reconstruction]":
+        """The reconstruction with some of its observations at a time, one piece at least."""
+        origins = self.observation_origins
+        for some in _slices(len(self.observation_frames)):
+            yield replace(
+                self,
+                observation_points=self.observation_points[some],
+                observation_frames=self.observation_frames[some],
+                observation_bearings=self.observation_bearings[some],
+                observation_sigmas=self.observation_sigmas[some],
+                observation_origins=None if origins is None else origins[some],
+            )
 
     def taken(self, rows: np.ndarray) -> "Reconstruction":
         """Reconstruction of frames `rows` (F',), ascending: their poses and observed points."""

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import gtsam
 import numpy as np
@@ -10,6 +11,7 @@ from scipy.stats import chi2
 from synthetic import RIG, World, drifted, make_world
 
 from gsba.bundle import adjustment, triangulation
+from gsba.bundle import observation_noise as observation_noise_module
 from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.bearings import Bearings
 from gsba.bundle.families import Families, Family
@@ -20,7 +22,7 @@ from gsba.bundle.trajectory_prior import TrajectoryPrior
 from gsba.config import RefineSettings
 from gsba.geometry import inverse, rotation_angle
 from gsba.similarity import pose_similarity
-from gsba.types import Solution, Tracks
+from gsba.types import Counts, Sighted, Solution, Tracks
 
 SIGMA, CLAIMED = 5e-4, 3e-4  # radians: true noise of bearings, and what keypoints say of it
 GATES = (200.0, 60.0, 20.0, 8.0, 8.0)  # in claimed sigmas: the start is some 5 degrees off
@@ -274,3 +276,28 @@ def test_without_tracks_the_trajectory_stays() -> None:
     solved = _run(replace(world, tracks=tracks), coarse, _settings())
     np.testing.assert_allclose(solved.world_T_rigs, coarse, atol=1e-9)
     assert solved.noise == 1.0 and len(solved.landmarks.tracks) == 0
+
+
+def test_points_and_noise_on_the_disk_are_those_in_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    world, coarse = _world()
+    aligned = np.arange(len(world.keypoints.faces)) % 3 > 0
+    sighted = Sighted(world.keypoints, aligned, world.tracks, Counts(0, 0, "observations"))
+    settings, start = _settings(), Solution.without_points(coarse)
+    families = Families((Bearings(), TrajectoryPrior(coarse, settings.priors)))
+    context = AdjustmentContext(families, RIG, settings, 1)
+    expected = adjustment.adjust_sighted(sighted, start, context, GATES[:3])
+    monkeypatch.setattr(triangulation, "_AT_ONCE", 500)
+    monkeypatch.setattr(observation_noise_module, "_AT_ONCE", 300)
+    there = replace(context, scratch=tmp_path)
+    solved, keypoints = adjustment.adjust_sighted(sighted, start, there, GATES[:3])
+    assert not keypoints.sigmas_rad.flags.owndata
+    assert not solved.landmarks.points_world.flags.owndata
+    np.testing.assert_array_equal(keypoints.sigmas_rad, expected[1].sigmas_rad)
+    np.testing.assert_array_equal(solved.world_T_rigs, expected[0].world_T_rigs)
+    found, known = solved.landmarks, expected[0].landmarks
+    np.testing.assert_array_equal(found.points_world, known.points_world)
+    for name in ("points", "frames", "keypoints", "num_points"):
+        np.testing.assert_array_equal(getattr(found.tracks, name), getattr(known.tracks, name))
+    assert found.counts == known.counts

@@ -18,7 +18,7 @@ from gsba.camera.rig import CubeRig
 from gsba.config import PatchSettings, RefineSettings
 from gsba.frames.panorama import Greys
 from gsba.geometry import inverse, pose
-from gsba.photometric import alignment, frame_jobs
+from gsba.photometric import alignment, frame_jobs, packing
 from gsba.photometric.alignment import Observations
 from gsba.store.shards import Threads
 from gsba.types import (
@@ -120,10 +120,12 @@ def _run(
     settings: PatchSettings = SETTINGS,
     sigma_px: float = 0.3,
     aligned: np.ndarray | None = None,
+    folder: Path | None = None,
 ) -> Sighted:
     frames, world_T_rigs = walk
     landmarks, keypoints = _start(world_T_rigs, sigma_px)
-    solved, observed = _solved(landmarks, world_T_rigs), Observations(keypoints, aligned)
+    solved = _solved(landmarks, world_T_rigs)
+    observed = Observations(keypoints, aligned, folder=folder)
     return alignment.align(solved, observed, Greys(frames, 4096), RIG, settings, Threads(2))
 
 
@@ -155,7 +157,7 @@ def test_observations_are_sub_pixel(walk) -> None:
 
 
 def test_patches_of_some_points_at_a_time_give_the_same_bytes(
-    walk, monkeypatch: pytest.MonkeyPatch
+    walk, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     expected, cut = _run(walk), frame_jobs.cut
     held: list[int] = []
@@ -165,8 +167,11 @@ def test_patches_of_some_points_at_a_time_give_the_same_bytes(
         return cut(title, greys, hosts, *rest)
 
     monkeypatch.setattr(frame_jobs, "cut", counting)
-    monkeypatch.setattr(alignment, "total_memory_bytes", lambda: 16 * 8192 * 90)
-    found = _run(walk)
+    monkeypatch.setattr(alignment, "total_memory_bytes", lambda: 64 * 8192 * 90)
+    monkeypatch.setattr(alignment, "_POINTS_AT_ONCE", 70)
+    monkeypatch.setattr(packing, "_POINTS_AT_ONCE", 50)
+    monkeypatch.setattr(packing, "_FRAMES_AT_ONCE", 2)
+    found = _run(walk, folder=tmp_path)
     assert held == [90, 90, 90, 90, 40]
     for name in ("starts", "bearings_rig", "sqrt_infos", "colors", "pixels"):
         np.testing.assert_array_equal(

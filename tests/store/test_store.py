@@ -14,11 +14,12 @@ import pytest
 from pydantic import BaseModel
 
 import gsba
-from gsba.disk import atomic_write
+from gsba.disk import atomic_write, concatenated
 from gsba.log import GsbaError
+from gsba.memory import release_mapped_files
 from gsba.store import store as store_module
 from gsba.store.folder import claim
-from gsba.store.records import RecordError, load_record, save_record
+from gsba.store.records import MIN_MAPPED_BYTES, RecordError, load_record, save_record
 from gsba.store.store import RunStore, digest, fingerprint, load_stage
 from gsba.types import Counts, Matches, PoseSource, Tracks
 
@@ -110,6 +111,82 @@ def test_objects_are_refused_not_pickled(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="pickle"):
         save_record(tmp_path / "r.npz", np.array([{}], dtype=object), {})
     assert list(tmp_path.iterdir()) == []
+
+
+def _many_tracks() -> Tracks:
+    rows = np.arange(2 * MIN_MAPPED_BYTES // 4, dtype=np.int32)
+    return Tracks(rows, rows[::-1].copy(), rows // 2, len(rows))
+
+
+def test_large_arrays_stay_on_the_disk(tmp_path: Path) -> None:
+    path, given = tmp_path / "tracks.npz", _many_tracks()
+    save_record(path, given, {})
+    found = load_record(path, Tracks, mapped=True)
+    for name in ("points", "frames", "keypoints"):
+        array = getattr(found, name)
+        np.testing.assert_array_equal(array, getattr(given, name))
+        assert not array.flags.owndata and not array.flags.writeable and array.flags.aligned
+        assert array.ctypes.data % 64 == 0
+    release_mapped_files()
+    np.testing.assert_array_equal(found.frames, given.frames)
+    save_record(path, _tracks(), {})  # replaced while it is used
+    np.testing.assert_array_equal(found.frames, given.frames)
+    assert _peak_of_mapping(tmp_path) < 3 * MIN_MAPPED_BYTES
+
+
+def _peak_of_mapping(folder: Path) -> int:
+    """Memory, bytes, that a process takes to store an array of eight times the size and read it
+    all, beyond what it took before."""
+    code = """
+        import sys
+        from pathlib import Path
+        import numpy as np
+        from gsba.disk import concatenated
+        from gsba.memory import peak_memory_bytes, release_mapped_files
+        from gsba.store.records import MIN_MAPPED_BYTES, load_record, save_record
+        piece = np.zeros(MIN_MAPPED_BYTES, np.uint8)
+        save_record(Path(sys.argv[1]) / "a.npz", (piece,), {})
+        before = peak_memory_bytes()
+        array, = concatenated(((piece,) for _ in range(8)), Path(sys.argv[1]))
+        save_record(Path(sys.argv[1]) / "a.npz", (array,), {})
+        array, = load_record(Path(sys.argv[1]) / "a.npz", tuple[np.ndarray], mapped=True)
+        for first in range(0, len(array), MIN_MAPPED_BYTES):
+            array[first : first + MIN_MAPPED_BYTES].sum()
+            release_mapped_files()
+        print(peak_memory_bytes() - before)
+    """
+    command = [sys.executable, "-c", textwrap.dedent(code), str(folder)]
+    return int(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+
+
+def test_damage_of_an_array_that_stays_on_the_disk_is_seen(tmp_path: Path) -> None:
+    path = tmp_path / "tracks.npz"
+    save_record(path, _many_tracks(), {})
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(RecordError):
+        load_record(path, Tracks, mapped=True)
+
+
+def test_a_large_result_is_the_one_computed(tmp_path: Path) -> None:
+    for compute in (_many_tracks, lambda: pytest.fail("computed again")):
+        with RunStore(tmp_path / "run", {}) as store:
+            found = store.stage("a", 1, compute, Tracks)
+            assert found.num_points == _many_tracks().num_points
+            np.testing.assert_array_equal(found.frames, _many_tracks().frames)
+            assert not found.frames.flags.owndata
+
+
+def test_rows_on_the_disk_are_those_in_memory(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    parts = [(rng.normal(size=(n, 3)), rng.integers(0, 9, n)) for n in (0, 5, 0, 7)]
+    there, here = concatenated(iter(parts), tmp_path), concatenated(iter(parts), None)
+    for one, other in zip(there, here, strict=True):
+        assert one.dtype == other.dtype
+        np.testing.assert_array_equal(one, other)
+    assert [array.shape for array in concatenated(iter(parts[:1]), tmp_path)] == [(0, 3), (0,)]
+    assert not list(tmp_path.iterdir())  # files have no name
 
 
 def test_second_call_resumes_every_stage(tmp_path: Path) -> None:

@@ -153,6 +153,11 @@ def _axes(bearings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def tangent_residuals(reconstruction: Reconstruction) -> np.ndarray:
     """Predicted minus observed direction (O, 2), radians east and south on the sphere."""
+    return np.concatenate([_tangent_residuals(some) for some in reconstruction.pieces()])
+
+
+def _tangent_residuals(reconstruction: Reconstruction) -> np.ndarray:
+    """As `tangent_residuals`, of a few observations."""
     frames = reconstruction.observation_frames
     poses = moved_to(reconstruction.world_T_rigs[frames], reconstruction.observation_origins)
     offsets = reconstruction.points_world[reconstruction.observation_points] - poses[:, :3, 3]
