@@ -16,25 +16,28 @@ from gsba.types import Counts, Landmarks, Solution, Tracks
 
 NUM, POINTS, HALF = 40, 1500, 20
 TRUTH = loop_walk(NUM)
+EVERYTHING = np.ones(NUM)  # share of the points in reach that each frame shows
 SETTINGS = RefineSettings(pairs=PairSettings(window=8, max_baseline_depths=0.8))
 SCALE = 1.7
 MOVE = pose(Rotation.from_rotvec([0.4, -2.0, 0.7]).as_matrix(), np.array([5.0, -3.0, 8.0]))
 
 
 def scene(
-    strange: bool = False, truth: np.ndarray = TRUTH
+    strange: bool = False, truth: np.ndarray = TRUTH, shown: np.ndarray = EVERYTHING
 ) -> tuple[MatchContext, Solution, np.ndarray]:
-    """Once around, mapped in two halves; `strange`: the second half looks like nothing else.
+    """Once around, mapped in two halves; `strange`: the second half looks like nothing else;
+    `shown`: (F,) share of the points in reach that each frame shows.
 
     Returns the map in one world, and the point that each of its landmarks is.
     """
-    rng = np.random.default_rng(0)
+    rng, hiding = np.random.default_rng(0), np.random.default_rng(1)
     near = TRUTH[rng.integers(0, NUM, POINTS), :3, 3]
     points = near + rng.uniform(0.8, 2.5, (POINTS, 1)) * unit(rng.normal(size=(POINTS, 3)))
     looks = (200 * rng.random((2, POINTS, 64)) ** 4).astype(np.uint8)
     frames, rows = [], []
     for f, world_T_rig in enumerate(truth):
         seen = np.flatnonzero(np.linalg.norm(points - world_T_rig[:3, 3], axis=1) < 2.6)
+        seen = seen[hiding.random(len(seen)) < shown[f]]
         late = int(f >= HALF)
         bearings = with_noise(bearings_of(points[seen], world_T_rig), 3e-4, rng)
         frames.append(features_of(bearings, looks[late if strange else 0][seen]))

@@ -135,7 +135,13 @@ class JoinEvidence:
         return self.share - other.share > _NUM_SIGMAS * float(np.hypot(self.sigma, other.sigma))
 
 
-def rates(context: MatchContext, places: Places, parts: np.ndarray, surfaces: bool = True) -> Rates:
+def rates(
+    context: MatchContext,
+    places: Places,
+    parts: np.ndarray,
+    surfaces: bool = True,
+    chosen: np.ndarray | None = None,
+) -> Rates:
     """Rates at which points of a frame are found again in frames of its own part.
 
     Args:
@@ -143,8 +149,10 @@ def rates(context: MatchContext, places: Places, parts: np.ndarray, surfaces: bo
         places: frames and points, each part consistent in itself.
         parts: (F,) int, part of each frame.
         surfaces: see `predict`.
+        chosen: (F,) bool, frames that are compared; None = all.
     """
-    rows = [np.flatnonzero(parts == p) for p in np.unique(parts)]
+    compared = np.ones(len(parts), bool) if chosen is None else chosen
+    rows = [np.flatnonzero(compared & (parts == p)) for p in np.unique(parts[compared])]
     pairs = np.concatenate([nearest_pairs(places, some, some) for some in rows])
     pairs = pairs[np.linspace(0, len(pairs) - 1, min(len(pairs), _MAX_PAIRS)).astype(int)]
     seen = predict(context, places, pairs, surfaces)[0]

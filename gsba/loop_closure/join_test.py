@@ -4,7 +4,7 @@ Joins of maps and loops within one map are tested alike: evidence, and rival pro
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -43,8 +43,11 @@ class JoinTest:
     poses: np.ndarray  # (F, 4, 4) float64, changes while maps grow
     known: Sequence[np.ndarray]  # (F) of (K_f, 3): points of keypoints, rig frames; NaN = unknown
     depth: float  # median distance of points, map units
-    measure_rates: Callable[[], Rates]  # measures the rate of points found again; called once
-    _usual: Rates | None = None
+    owners: np.ndarray  # (F,) int, recording of each frame
+    # Measures the rates at which points of frames (F,) bool are found again: those of the
+    # recordings that meet, as rooms of others may show more or fewer of their points again.
+    measure_rates: Callable[[np.ndarray], Rates]
+    _usual: dict[tuple[int, ...], Rates] = field(default_factory=dict)
 
     def judge(
         self, proposal: Proposal, rows: np.ndarray, inside: np.ndarray, apart: bool = False
@@ -80,10 +83,16 @@ class JoinTest:
         poses[rows] = move.poses(poses[rows])
         for f in rows:
             known[f] = move.scale * known[f]
-        if self._usual is None:
-            self._usual = self.measure_rates()
-        places = Places(poses, known)
-        return join_evidence.weigh(self.context, places, (rows, inside), self._usual, self.depth)
+        usual, places = self._rates(np.concatenate([rows, inside])), Places(poses, known)
+        return join_evidence.weigh(self.context, places, (rows, inside), usual, self.depth)
+
+    def _rates(self, frames: np.ndarray) -> Rates:
+        """Usual rates of the recordings that frames are of; measured once."""
+        owners = np.unique(self.owners[frames])
+        key = tuple(owners.tolist())
+        if key not in self._usual:
+            self._usual[key] = self.measure_rates(np.isin(self.owners, owners))
+        return self._usual[key]
 
     def meetings(
         self, matches: Matches, outside: np.ndarray, f0_T_f1s: np.ndarray | None = None

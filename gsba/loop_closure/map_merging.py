@@ -105,7 +105,9 @@ class _Joining:
         known = solved.points_by_keypoint(context.keypoints)
         self.own_known = [known[f] for f in range(num)]  # rig frames, units of their parts
         self.known = list(self.own_known)  # in the map's unit once moved there
-        self.test = JoinTest(context, self.poses, self.known, self.depth, self._usual_rates)
+        self.test = JoinTest(
+            context, self.poses, self.known, self.depth, recordings, self._usual_rates
+        )
         self.usual_anywhere: Rates | None = None
         self.min_testable = min_testable  # frames of a map that joins can be tested by
         self.recordings = recordings
@@ -277,10 +279,10 @@ class _Joining:
         ]
         return bool(angles_between(means[0], means[1]) < limit + 3 * np.hypot(*spreads))
 
-    def _usual_rates(self) -> Rates:
-        """Rates at which points are found again within the original parts."""
+    def _usual_rates(self, chosen: np.ndarray) -> Rates:
+        """Rates at which points of frames (F,) bool are found again within the original parts."""
         places = Places(self.solved.world_T_rigs, self.own_known)
-        return join_evidence.rates(self.context, places, self.parts)
+        return join_evidence.rates(self.context, places, self.parts, chosen=chosen)
 
     def _meetings(self, context: MatchContext, chosen: np.ndarray) -> list[Meeting]:
         """Matched points that both frames of pairs (P, 2) know, one outside and one inside the

@@ -99,11 +99,12 @@ def _join_test(places: Places) -> JoinTest:
     frames = np.arange(len(places.keyframes))
     known = [by_keypoint[int(f)] for f in frames]
 
-    def rates() -> join_evidence.Rates:
+    def rates(chosen: np.ndarray) -> join_evidence.Rates:
         beside = KnownPlaces(solved.world_T_rigs, known)
-        return join_evidence.rates(context, beside, frames // (2 * LOCAL))
+        return join_evidence.rates(context, beside, frames // (2 * LOCAL), chosen=chosen)
 
-    return JoinTest(context, solved.world_T_rigs, known, solved.median_depth(), rates)
+    poses, depth, one = solved.world_T_rigs, solved.median_depth(), np.zeros_like(frames)
+    return JoinTest(context, poses, known, depth, one, rates)
 
 
 def _meeting_by_meeting(meetings: list[Meeting]) -> list[list[Meeting]]:

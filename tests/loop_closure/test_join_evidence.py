@@ -9,8 +9,10 @@ from two_maps import HALF, NUM, TRUTH, scene
 
 from gsba.geometry import pose
 from gsba.loop_closure import join_evidence
-from gsba.loop_closure.join_evidence import JoinEvidence, Places, around
+from gsba.loop_closure.join_evidence import JoinEvidence, Places, Rates, around
+from gsba.loop_closure.join_test import JoinTest
 from gsba.matching.guided_search import MatchContext
+from gsba.similarity import Sim3
 
 PARTS = (np.arange(NUM) >= HALF).astype(int)
 ENDS = np.arange(6), np.arange(NUM - 6, NUM)  # of a walk around: they see the same place
@@ -79,6 +81,31 @@ def test_corners_and_what_covers_walls_must_both_be_found_again(
     seen = join_evidence.Predictions(cells + 0.5, np.zeros(len(cells), np.int64), found)
     usual = join_evidence.Rates(np.full(24, 0.4), 0.1)
     assert join_evidence.evidence_of(seen, usual, depth).confirmed == confirmed
+
+
+def test_points_are_expected_as_often_as_the_recordings_that_meet_find_them() -> None:
+    """A third recording, in a room that shows all of its points again, says nothing of theirs."""
+    owners = np.digitize(np.arange(NUM), [10, 30])  # both ends, and the third between them
+    context, solved, _ = scene(shown=np.where(owners == 1, 1.0, 0.4))
+    points, depth = solved.points_by_keypoint(context.keypoints), solved.median_depth()
+    known = [points[f] for f in range(NUM)]
+    measured = []
+
+    def rates(chosen: np.ndarray) -> Rates:
+        measured.append(np.unique(owners[chosen]).tolist())
+        return join_evidence.rates(context, Places(TRUTH, known), owners, chosen=chosen)
+
+    three = JoinTest(context, TRUTH, known, depth, owners, rates)
+    found, again = (three.weigh(*ENDS, Sim3())[0] for _ in range(2))
+    assert measured == [[0, 2]] and again == found
+    one = JoinTest(context, TRUTH, known, depth, np.zeros_like(owners), rates)
+    by_all = one.weigh(*ENDS, Sim3())[0]
+    assert measured[1:] == [[0, 1, 2]] and by_all.least < found.least - 0.05
+    assert found.confirms(apart=True)
+    turned = Rotation.from_rotvec([0, np.deg2rad(90), 0]).as_matrix()
+    centre = TRUTH[-1, :3, 3]
+    away = Sim3.of(1.0, pose(turned, centre - turned @ centre))
+    assert three.weigh(ENDS[1], ENDS[0], away)[0].refuted
 
 
 def test_places_out_of_sight_say_nothing() -> None:
