@@ -308,7 +308,7 @@ def velocities_of(
 ) -> np.ndarray:
     """Velocities (F, 6) of frames, from poses, and from a gyro that is believed."""
     turning = context.turning if camera.by_gyro else None
-    return readout.velocities(world_T_rigs, timestamps, turning)
+    return readout.velocities(world_T_rigs, timestamps, turning, context.maps)
 
 
 def split_lenses(columns: np.ndarray) -> list[np.ndarray]:

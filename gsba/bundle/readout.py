@@ -76,7 +76,8 @@ def estimate(
         timestamps: (F,) seconds, whose differences give velocities.
         context: loss, settings.
     """
-    motion = velocities(solved.world_T_rigs, timestamps, turning_of(lenses, context))
+    turning = turning_of(lenses, context)
+    motion = velocities(solved.world_T_rigs, timestamps, turning, context.maps)
     offsets = _offsets(landmarks, keypoints, solved) if motion[:, :3].any() else None
     ways, frames = _ways(context.settings.camera, lenses), keypoints.frames()
     times = np.stack([lenses.fractions(shown, frames, way) for way in ways], axis=1)
@@ -146,18 +147,30 @@ def turning_of(lenses: Lenses, context: AdjustmentContext) -> GyroConstraints | 
 
 
 def velocities(
-    world_T_rigs: np.ndarray, timestamps: np.ndarray, turning: GyroConstraints | None = None
+    world_T_rigs: np.ndarray,
+    timestamps: np.ndarray,
+    turning: GyroConstraints | None = None,
+    maps: np.ndarray | None = None,
 ) -> np.ndarray:
     """Mean velocity (F, 6) around each frame, [rotation rad/s, translation per s], rig frame.
 
     Between frames a walk turns to and fro: rotations say nothing of those during a readout, which
     are 0 where no gyro knows them. Nothing is known of motion across a pause, such as that from
-    one recording to the next.
+    one recording to the next, nor from one map to another, whose worlds nothing relates.
+
+    Args:
+        world_T_rigs: (F, 4, 4) poses.
+        timestamps: (F,) seconds, ascending.
+        turning: rotation rates by a gyro; None = there is none.
+        maps: (F,) map of each frame; None = there is one.
     """
     num = len(timestamps)
     before, after = np.arange(num) - 1, np.arange(num) + 1
     intervals = np.diff(timestamps)
-    pauses = np.flatnonzero(intervals > _MIN_PAUSE_INTERVALS * np.median(intervals))
+    breaks = intervals > _MIN_PAUSE_INTERVALS * np.median(intervals)
+    if maps is not None:
+        breaks |= maps[1:] != maps[:-1]
+    pauses = np.flatnonzero(breaks)
     first, last = np.append(pauses + 1, 0), np.append(pauses, num - 1)
     before[first], after[last] = first, last
     span = np.maximum(timestamps[after] - timestamps[before], intervals.min())[:, None]

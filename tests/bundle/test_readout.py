@@ -61,6 +61,35 @@ def test_velocities_do_not_span_the_pause_between_recordings() -> None:
     np.testing.assert_allclose(readout.velocities(poses, apart), np.concatenate([first, second]))
 
 
+def test_velocities_do_not_span_maps() -> None:
+    """Maps lie side by side, as far apart as they please: their distance is no motion."""
+    poses, moments, maps = loop_walk(24), times(24), np.repeat([0, 1], [10, 14])
+    halves = [readout.velocities(poses[maps == n], moments[maps == n]) for n in (0, 1)]
+    poses[10:, :3, 3] += [500.0, 0.0, 0.0]
+    found = readout.velocities(poses, moments, maps=maps)
+    np.testing.assert_allclose(found, np.concatenate(halves), atol=1e-9)
+
+
+def test_the_duration_is_found_in_two_maps_of_one_recording() -> None:
+    sweeping = replace(LENSES, row_directions=SWEEPS, readout_motion=TWISTS)
+    world, shown = seen_through(sweeping, 0)
+    start, maps = Solution.without_points(world.world_T_rigs), np.repeat([0, 1], 12)
+    solved, keypoints, tracks = solved_under(world, shown, LENSES, start)
+    around = placed(solved, keypoints, tracks)
+    hosts, seen = maps[around.tracks.hosts()], around.tracks
+    strangers = maps[seen.frames] != hosts[seen.points]
+    own = np.bincount(seen.points[strangers], minlength=seen.num_points) == 0
+    poses, points = solved.world_T_rigs.copy(), around.points_world.copy()
+    poses[12:, :3, 3] += [500.0, 0.0, 0.0]
+    points[hosts == 1] += [500.0, 0.0, 0.0]
+    apart, torn = replace(around, points_world=points).of(own), replace(solved, world_T_rigs=poses)
+    problem = replace(problem_of(world), maps=maps)
+    known = keypoints, shown.bearings_rig, torn, LENSES, times(24)
+    found = readout.estimate(apart, *known, problem)
+    assert not found.reason and found.readout_s == pytest.approx(READOUT_S, rel=0.2)
+    assert readout.estimate(apart, *known, replace(problem, maps=None)).readout_s < 0.1 * READOUT_S
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_frames_of_one_instant_have_none(seed: int) -> None:
     found, _ = _found(LENSES, seed)
