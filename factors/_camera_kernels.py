@@ -23,6 +23,7 @@ _LEAST_HESSIAN = 1e-12  # of a landmark's trace
 _BEHIND = 1e-12  # sine of the angle below which no direction leads back to the measured one
 
 _kernel, _part = kernel_and_part(error_model="numpy", fastmath={"contract"})
+_, _allocating = kernel_and_part(allocating=True, error_model="numpy", fastmath={"contract"})
 
 
 @_part
@@ -188,14 +189,7 @@ def _by_motion(tau, e, moved, by_e, by_d, out):
         out[3 + i] = -tau * by_d[i]
 
 
-@_part
-def _array(values, out):
-    """Components as an array (3,), which is written and given back."""
-    out[0], out[1], out[2] = values
-    return out
-
-
-@_part
+@_allocating
 def _scratch():
     """Arrays that `_see` writes to."""
     return (
@@ -307,8 +301,8 @@ def _see(
             _times_transposed(camera.by_turn[lens, f], by_origin, own)
             row[columns.turns[lens]], row[columns.turns[lens] + 1] = own[0], own[1]
         if columns.lenses[lens] >= 0:
-            turning = _array(_cross(by_e, away), q)
-            _set_by_lenses(columns, camera, lens, by_lens[r], turning, own, shared)
+            q[0], q[1], q[2] = _cross(by_e, away)  # by a left turn of the lens
+            _set_by_lenses(columns, camera, lens, by_lens[r], q, own, shared)
 
 
 @_kernel

@@ -250,6 +250,49 @@ def _take_product(Y, W, B):
         B[r, 0], B[r, 1], B[r, 2], B[r, 3], B[r, 4], B[r, 5] = t0, t1, t2, t3, t4, t5
 
 
+@_part
+def _linearize(
+    j, obs, visits, points, poses, W, inverses, roots, shifts, diagonal, gradient, costs, scratch
+):  # fmt: skip
+    """`linearize_range` of landmark j; returns its cost."""
+    a, b, normal = scratch
+    point = points[j]
+    normal[:] = 0.0
+    row = j - visits.first
+    visit, previous, cost = visits.offsets[row] - 1, -1, 0.0
+    for o in range(obs.offsets[j], obs.offsets[j + 1]):
+        f = obs.frames[o]
+        if f != previous:
+            visit, previous = visit + 1, f
+            W[visit] = 0.0
+        pose = poses[f]
+        dx, dy, dz = rig_vector(pose, point)
+        valid, r0, r1, a0, a1, a2, b0, b1, b2 = _residual_from_rig(obs, o, dx, dy, dz)
+        rho, w = rho_and_weight(obs.loss, obs.loss_scale, r0 * r0 + r1 * r1)
+        costs[obs.families[o]] += rho
+        cost += rho
+        if not valid:
+            continue
+        _pose_row(a0, a1, a2, dx, dy, dz, a)
+        _pose_row(b0, b1, b2, dx, dy, dz, b)
+        rows = _add_normal(normal, pose, a0, a1, a2, b0, b1, b2, r0, r1, w)
+        H, g, Wf = diagonal[f], gradient[f], W[visit]
+        for i in range(6):
+            ai, bi = w * a[i], w * b[i]
+            g[i] += ai * r0 + bi * r1
+            for c in range(3):
+                Wf[c, i] += ai * rows[c] + bi * rows[3 + c]
+            for c in range(6):
+                H[i, c] += ai * a[c] + bi * b[c]
+    root = inverse_root(normal, 0.0)
+    inverse = squared_root(root)
+    for c in range(6):
+        roots[row, c], inverses[row, c] = root[c], inverse[c]
+    x, y, z = times_symmetric(inverse, normal[6], normal[7], normal[8])
+    shifts[row, 0], shifts[row, 1], shifts[row, 2] = x, y, z
+    return cost
+
+
 @_kernel
 def linearize_range(
     first, last, obs, visits, points, poses, W, inverses, roots, shifts, diagonal, gradient,
@@ -265,44 +308,32 @@ def linearize_range(
         diagonal (F, 6, 6), gradient (F, 6), costs (T,): accumulated.
         point_costs (J,): written for the range.
     """
-    a, b = np.empty(6), np.empty(6)
-    normal = np.empty(9)
+    scratch = np.empty(6), np.empty(6), np.empty(9)
     for j in range(first, last):
-        point = points[j]
-        normal[:] = 0.0
-        row = j - visits.first
-        visit, previous, cost = visits.offsets[row] - 1, -1, 0.0
-        for o in range(obs.offsets[j], obs.offsets[j + 1]):
-            f = obs.frames[o]
-            if f != previous:
-                visit, previous = visit + 1, f
-                W[visit] = 0.0
-            pose = poses[f]
-            dx, dy, dz = rig_vector(pose, point)
-            valid, r0, r1, a0, a1, a2, b0, b1, b2 = _residual_from_rig(obs, o, dx, dy, dz)
-            rho, w = rho_and_weight(obs.loss, obs.loss_scale, r0 * r0 + r1 * r1)
-            costs[obs.families[o]] += rho
-            cost += rho
-            if not valid:
-                continue
-            _pose_row(a0, a1, a2, dx, dy, dz, a)
-            _pose_row(b0, b1, b2, dx, dy, dz, b)
-            rows = _add_normal(normal, pose, a0, a1, a2, b0, b1, b2, r0, r1, w)
-            H, g, Wf = diagonal[f], gradient[f], W[visit]
-            for i in range(6):
-                ai, bi = w * a[i], w * b[i]
-                g[i] += ai * r0 + bi * r1
-                for c in range(3):
-                    Wf[c, i] += ai * rows[c] + bi * rows[3 + c]
-                for c in range(6):
-                    H[i, c] += ai * a[c] + bi * b[c]
-        point_costs[j] = cost
-        root = inverse_root(normal, 0.0)
-        inverse = squared_root(root)
-        for c in range(6):
-            roots[row, c], inverses[row, c] = root[c], inverse[c]
-        x, y, z = times_symmetric(inverse, normal[6], normal[7], normal[8])
-        shifts[row, 0], shifts[row, 1], shifts[row, 2] = x, y, z
+        point_costs[j] = _linearize(
+            j, obs, visits, points, poses, W, inverses, roots, shifts, diagonal, gradient, costs,
+            scratch,
+        )  # fmt: skip
+
+
+@_part
+def _eliminate_row(
+    f, visits, W, inverses, shifts, row_starts, columns, diagonal, off_diagonal, gradient, slots, Y
+):  # fmt: skip
+    """`eliminate_rows` of frame f."""
+    H, g = diagonal[f], gradient[f]
+    for slot in range(row_starts[f], row_starts[f + 1]):
+        slots[columns[slot]] = slot
+    for e in range(visits.row_offsets[f], visits.row_offsets[f + 1]):
+        visit = visits.by_frame[e]
+        j = visits.owners[visit]
+        inverse, shift, Wf = inverses[j], shifts[j], W[visit]
+        for r in range(6):
+            g[r] -= Wf[0, r] * shift[0] + Wf[1, r] * shift[1] + Wf[2, r] * shift[2]
+            Y[r, 0], Y[r, 1], Y[r, 2] = times_symmetric(inverse, Wf[0, r], Wf[1, r], Wf[2, r])
+        _take_product(Y, Wf, H)
+        for k in range(visit + 1, visits.offsets[j + 1]):
+            _take_product(Y, W[k], off_diagonal[slots[visits.frames[k]]])
 
 
 @_kernel
@@ -322,147 +353,10 @@ def eliminate_rows(
     for f in range(first, last):
         if visits.row_offsets[f] == visits.row_offsets[f + 1]:
             continue
-        H, g = diagonal[f], gradient[f]
-        for slot in range(row_starts[f], row_starts[f + 1]):
-            slots[columns[slot]] = slot
-        for e in range(visits.row_offsets[f], visits.row_offsets[f + 1]):
-            visit = visits.by_frame[e]
-            j = visits.owners[visit]
-            inverse, shift, Wf = inverses[j], shifts[j], W[visit]
-            for r in range(6):
-                g[r] -= Wf[0, r] * shift[0] + Wf[1, r] * shift[1] + Wf[2, r] * shift[2]
-                Y[r, 0], Y[r, 1], Y[r, 2] = times_symmetric(inverse, Wf[0, r], Wf[1, r], Wf[2, r])
-            _take_product(Y, Wf, H)
-            for k in range(visit + 1, visits.offsets[j + 1]):
-                _take_product(Y, W[k], off_diagonal[slots[visits.frames[k]]])
-
-
-@_part
-def _span_of_point(by_point, lo, hi, damping, Q):
-    """Orthonormal columns Q of the range of a landmark's Jacobian with three rows of damping."""
-    rows, squares = 2 * (hi - lo), 1e-200
-    for o in range(lo, hi):
-        for i in range(2):
-            for c in range(3):
-                x = by_point[o, i, c]
-                Q[2 * (o - lo) + i, c] = x
-                squares += x * x
-    for r in range(3):
-        for c in range(3):
-            Q[rows + r, c] = np.sqrt(damping * squares) if r == c else 0.0
-    for c in range(3):
-        for _ in range(2):  # the second pass removes rounding errors
-            for d in range(c):
-                along = 0.0
-                for r in range(rows + 3):
-                    along += Q[r, c] * Q[r, d]
-                for r in range(rows + 3):
-                    Q[r, c] -= along * Q[r, d]
-        norm = 0.0
-        for r in range(rows + 3):
-            norm += Q[r, c] * Q[r, c]
-        norm = np.sqrt(norm)
-        for r in range(rows + 3):
-            Q[r, c] /= norm
-
-
-@_part
-def _add_row(row, r, q, H, g, W):
-    """Add a row of a Jacobian to the normal equations and to its projection on the landmark."""
-    for k in range(len(g)):
-        a = row[k]
-        g[k] += a * r
-        W[0, k] += q[0] * a
-        W[1, k] += q[1] * a
-        W[2, k] += q[2] * a
-        for c in range(len(g)):
-            H[k, c] += a * row[c]
-
-
-@_part
-def _add_linear(residuals, own, common, Q, H, g, T, W, shared, shared_gradient, V, b):
-    """Add an observation's Jacobians by frame variables and by shared ones; returns its cost."""
-    cost = 0.0
-    for i in range(2):
-        r, q = residuals[i], Q[i]
-        cost += 0.5 * r * r
-        for d in range(3):
-            b[d] += q[d] * r
-        _add_row(own[i], r, q, H, g, W)
-        _add_row(common[i], r, q, shared, shared_gradient, V)
-        for k in range(len(g)):
-            for c in range(len(shared)):
-                T[k, c] += own[i, k] * common[i, c]
-    return cost
-
-
-@_part
-def _take_products(A, B, out):
-    """out -= A^T B, for A and B with three rows each."""
-    for k in range(A.shape[1]):
-        x, y, z = A[0, k], A[1, k], A[2, k]
-        for c in range(B.shape[1]):
-            out[k, c] -= x * B[0, c] + y * B[1, c] + z * B[2, c]
-
-
-@_part
-def _take_products_with(A, b, out):
-    """out -= A^T b."""
-    for k in range(A.shape[1]):
-        out[k] -= A[0, k] * b[0] + A[1, k] * b[1] + A[2, k] * b[2]
-
-
-@_kernel
-def eliminate_linear_range(
-    first, last, offsets, frames, residuals, by_point, by_frame, by_shared, damping, longest,
-    row_starts, columns, diagonal, off_diagonal, to_shared, shared, gradient, shared_gradient,
-):  # fmt: skip
-    """Add landmarks first..last of a linear least-squares problem, eliminated; returns the cost.
-
-    A landmark's range is projected out with orthonormal columns: a landmark that its observations
-    hardly constrain in some direction adds no more rounding error than they have themselves.
-
-    Args:
-        offsets (J + 1,), frames (O,): observations by landmark, those of a frame adjacent.
-        residuals (O, 2), by_point (O, 2, 3), by_frame (O, 2, K), by_shared (O, 2, S): whitened.
-        damping: damping of a landmark, part of the sum of squares of its Jacobian.
-        row_starts (F + 1,), columns (P,): covisible frame pairs i < k as sorted CSR rows.
-        diagonal (F, K, K), off_diagonal (P, K, K), to_shared (F, K, S), shared (S, S),
-        gradient (F, K), shared_gradient (S,): accumulated.
-    """
-    seen = np.empty(longest, np.int64)
-    Q, W = np.empty((2 * longest + 3, 3)), np.empty((longest, 3, by_frame.shape[2]))
-    V, b = np.empty((3, by_shared.shape[2])), np.empty(3)
-    cost = 0.0
-    for j in range(first, last):
-        lo, hi = offsets[j], offsets[j + 1]
-        _span_of_point(by_point, lo, hi, damping, Q)
-        V[:], b[:] = 0.0, 0.0
-        num, previous = 0, -1
-        for o in range(lo, hi):
-            f = frames[o]
-            if f != previous:
-                seen[num], previous = f, f
-                W[num] = 0.0
-                num += 1
-            cost += _add_linear(
-                residuals[o], by_frame[o], by_shared[o], Q[2 * (o - lo) : 2 * (o - lo) + 2],
-                diagonal[f], gradient[f], to_shared[f], W[num - 1], shared, shared_gradient, V, b,
-            )  # fmt: skip
-        cost -= 0.5 * (b[0] * b[0] + b[1] * b[1] + b[2] * b[2])
-        _take_products(V, V, shared)
-        _take_products_with(V, b, shared_gradient)
-        for i in range(num):
-            f = seen[i]
-            _take_products(W[i], W[i], diagonal[f])
-            _take_products(W[i], V, to_shared[f])
-            _take_products_with(W[i], b, gradient[f])
-            slot = row_starts[f]
-            for m in range(i + 1, num):
-                while columns[slot] != seen[m]:
-                    slot += 1
-                _take_products(W[i], W[m], off_diagonal[slot])
-    return cost
+        _eliminate_row(
+            f, visits, W, inverses, shifts, row_starts, columns, diagonal, off_diagonal, gradient,
+            slots, Y,
+        )  # fmt: skip
 
 
 @_part
@@ -485,6 +379,41 @@ def _substituted_step(obs, j, point, poses, steps, normal):
     return times_symmetric(invert_symmetric(normal, 0.0), normal[6], normal[7], normal[8])
 
 
+@_part
+def _polish(
+    j, obs, points, poses, old_poses, steps, substitute, num_steps, tolerance, point_costs,
+    trial_points, scratch,
+):  # fmt: skip
+    """`polish_range` of landmark j; returns its cost."""
+    normal, trial_normal, here, there = scratch
+    here[0], here[1], here[2] = points[j, 0], points[j, 1], points[j, 2]
+    if substitute:
+        x, y, z = _substituted_step(obs, j, here, old_poses, steps, normal)
+        here[0], here[1], here[2] = here[0] - x, here[1] - y, here[2] - z
+    cost = _point_normal(obs, j, here, poses, normal)
+    if substitute and not cost <= point_costs[j]:
+        there[0], there[1], there[2] = points[j, 0], points[j, 1], points[j, 2]
+        stay = _point_normal(obs, j, there, poses, trial_normal)
+        if not cost <= stay:
+            cost, here, there, normal, trial_normal = stay, there, here, trial_normal, normal
+    damping = 0.0
+    for _ in range(num_steps):
+        inverse = invert_symmetric(normal, damping)
+        x, y, z = times_symmetric(inverse, normal[6], normal[7], normal[8])
+        gain = 0.5 * (x * normal[6] + y * normal[7] + z * normal[8])
+        if not gain > tolerance * cost:
+            break
+        there[0], there[1], there[2] = here[0] - x, here[1] - y, here[2] - z
+        trial = _point_normal(obs, j, there, poses, trial_normal)
+        if trial < cost:
+            cost, here, there, normal, trial_normal = trial, there, here, trial_normal, normal
+            damping *= 0.1
+        else:
+            damping = max(1e-3, 10.0 * damping)
+    trial_points[j, 0], trial_points[j, 1], trial_points[j, 2] = here[0], here[1], here[2]
+    return cost
+
+
 @_kernel
 def polish_range(
     first, last, obs, points, poses, old_poses, steps, substitute, num_steps, tolerance,
@@ -498,44 +427,27 @@ def polish_range(
     less than `tolerance` of it. Writes `trial_points (J, 3)` and
     `trial_costs (J,)`.
     """
-    normal, trial_normal = np.empty(9), np.empty(9)
-    here, there = np.empty(3), np.empty(3)
+    scratch = np.empty(9), np.empty(9), np.empty(3), np.empty(3)
     for j in range(first, last):
-        here[0], here[1], here[2] = points[j, 0], points[j, 1], points[j, 2]
-        if substitute:
-            x, y, z = _substituted_step(obs, j, here, old_poses, steps, normal)
-            here[0], here[1], here[2] = here[0] - x, here[1] - y, here[2] - z
-        cost = _point_normal(obs, j, here, poses, normal)
-        if substitute and not cost <= point_costs[j]:
-            there[0], there[1], there[2] = points[j, 0], points[j, 1], points[j, 2]
-            stay = _point_normal(obs, j, there, poses, trial_normal)
-            if not cost <= stay:
-                cost, here, there, normal, trial_normal = stay, there, here, trial_normal, normal
-        damping = 0.0
-        for _ in range(num_steps):
-            inverse = invert_symmetric(normal, damping)
-            x, y, z = times_symmetric(inverse, normal[6], normal[7], normal[8])
-            gain = 0.5 * (x * normal[6] + y * normal[7] + z * normal[8])
-            if not gain > tolerance * cost:
-                break
-            there[0], there[1], there[2] = here[0] - x, here[1] - y, here[2] - z
-            trial = _point_normal(obs, j, there, poses, trial_normal)
-            if trial < cost:
-                cost, here, there, normal, trial_normal = trial, there, here, trial_normal, normal
-                damping *= 0.1
-            else:
-                damping = max(1e-3, 10.0 * damping)
-        trial_points[j, 0], trial_points[j, 1], trial_points[j, 2] = here[0], here[1], here[2]
-        trial_costs[j] = cost
+        trial_costs[j] = _polish(
+            j, obs, points, poses, old_poses, steps, substitute, num_steps, tolerance, point_costs,
+            trial_points, scratch,
+        )  # fmt: skip
+
+
+@_part
+def _write_residuals(j, obs, points, poses, residuals, valid):
+    """`residuals_range` of landmark j."""
+    for o in range(obs.offsets[j], obs.offsets[j + 1]):
+        dx, dy, dz = rig_vector(poses[obs.frames[o]], points[j])
+        valid[o], residuals[o, 0], residuals[o, 1] = _residual_from_rig(obs, o, dx, dy, dz)[:3]
 
 
 @_kernel
 def residuals_range(first, last, obs, points, poses, residuals, valid):
     """Write the whitened residuals (O, 2) and validity (O,) of landmarks first..last."""
     for j in range(first, last):
-        for o in range(obs.offsets[j], obs.offsets[j + 1]):
-            dx, dy, dz = rig_vector(poses[obs.frames[o]], points[j])
-            valid[o], residuals[o, 0], residuals[o, 1] = _residual_from_rig(obs, o, dx, dy, dz)[:3]
+        _write_residuals(j, obs, points, poses, residuals, valid)
 
 
 @_part
@@ -545,6 +457,48 @@ def _random_bits(seed):
     x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return x ^ (x >> np.uint64(31))
+
+
+@_part
+def _draw(j, obs, visits, points, poses, U, roots, seed, out, scratch):
+    """`draw_run` of landmark j."""
+    a, b, u, normal = scratch
+    num = out.shape[2]
+    point, row = points[j], j - visits.first
+    u[:], normal[:] = 0.0, 0.0
+    for o in range(obs.offsets[j], obs.offsets[j + 1]):
+        f = obs.frames[o]
+        dx, dy, dz = rig_vector(poses[f], point)
+        valid, r0, r1, a0, a1, a2, b0, b1, b2 = _residual_from_rig(obs, o, dx, dy, dz)
+        if not valid:
+            continue
+        weight = rho_and_weight(obs.loss, obs.loss_scale, r0 * r0 + r1 * r1)[1]
+        w = np.sqrt(weight)
+        _pose_row(a0, a1, a2, dx, dy, dz, a)
+        _pose_row(b0, b1, b2, dx, dy, dz, b)
+        rows = _add_normal(normal, poses[f], a0, a1, a2, b0, b1, b2, r0, r1, weight)
+        bits = _random_bits(seed + np.uint64(o))
+        for r in range(num):
+            s0 = w if (bits >> np.uint64(r)) & np.uint64(1) else -w
+            s1 = w if (bits >> np.uint64(32 + r)) & np.uint64(1) else -w
+            for c in range(3):
+                u[c, r] += s0 * rows[c] + s1 * rows[3 + c]
+            for i in range(6):
+                out[f, i, r] += s0 * a[i] + s1 * b[i]
+    root = roots[row]
+    least = np.sqrt(_MIN_RELATIVE_DAMPING * (normal[0] + normal[3] + normal[5]))
+    bits = _random_bits(~(seed + np.uint64(j)))
+    for r in range(num):
+        for c in range(3):
+            u[c, r] += least if (bits >> np.uint64(3 * r + c)) & np.uint64(1) else -least
+        x, y, z = u[0, r], u[1, r], u[2, r]
+        u[0, r], u[1, r] = root[0] * x, root[1] * x + root[3] * y
+        u[2, r] = root[2] * x + root[4] * y + root[5] * z
+    for e in range(visits.offsets[row], visits.offsets[row + 1]):
+        to, v = out[visits.frames[e]], U[e]
+        for i in range(6):
+            for r in range(num):
+                to[i, r] -= v[0, i] * u[0, r] + v[1, i] * u[1, r] + v[2, i] * u[2, r]
 
 
 @_kernel
@@ -559,42 +513,6 @@ def draw_run(obs, visits, points, poses, U, roots, seed, out):
         roots (L, 6): see `linearize_range`.
         seed: uint64.
     """
-    num = out.shape[2]
-    a, b, u = np.empty(6), np.empty(6), np.empty((3, num))
-    normal = np.empty(9)
+    scratch = np.empty(6), np.empty(6), np.empty((3, out.shape[2])), np.empty(9)
     for j in range(visits.first, visits.first + len(visits.offsets) - 1):
-        point, row = points[j], j - visits.first
-        u[:], normal[:] = 0.0, 0.0
-        for o in range(obs.offsets[j], obs.offsets[j + 1]):
-            f = obs.frames[o]
-            dx, dy, dz = rig_vector(poses[f], point)
-            valid, r0, r1, a0, a1, a2, b0, b1, b2 = _residual_from_rig(obs, o, dx, dy, dz)
-            if not valid:
-                continue
-            weight = rho_and_weight(obs.loss, obs.loss_scale, r0 * r0 + r1 * r1)[1]
-            w = np.sqrt(weight)
-            _pose_row(a0, a1, a2, dx, dy, dz, a)
-            _pose_row(b0, b1, b2, dx, dy, dz, b)
-            rows = _add_normal(normal, poses[f], a0, a1, a2, b0, b1, b2, r0, r1, weight)
-            bits = _random_bits(seed + np.uint64(o))
-            for r in range(num):
-                s0 = w if (bits >> np.uint64(r)) & np.uint64(1) else -w
-                s1 = w if (bits >> np.uint64(32 + r)) & np.uint64(1) else -w
-                for c in range(3):
-                    u[c, r] += s0 * rows[c] + s1 * rows[3 + c]
-                for i in range(6):
-                    out[f, i, r] += s0 * a[i] + s1 * b[i]
-        root = roots[row]
-        least = np.sqrt(_MIN_RELATIVE_DAMPING * (normal[0] + normal[3] + normal[5]))
-        bits = _random_bits(~(seed + np.uint64(j)))
-        for r in range(num):
-            for c in range(3):
-                u[c, r] += least if (bits >> np.uint64(3 * r + c)) & np.uint64(1) else -least
-            x, y, z = u[0, r], u[1, r], u[2, r]
-            u[0, r], u[1, r] = root[0] * x, root[1] * x + root[3] * y
-            u[2, r] = root[2] * x + root[4] * y + root[5] * z
-        for e in range(visits.offsets[row], visits.offsets[row + 1]):
-            to, v = out[visits.frames[e]], U[e]
-            for i in range(6):
-                for r in range(num):
-                    to[i, r] -= v[0, i] * u[0, r] + v[1, i] * u[1, r] + v[2, i] * u[2, r]
+        _draw(j, obs, visits, points, poses, U, roots, seed, out, scratch)

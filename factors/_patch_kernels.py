@@ -17,7 +17,9 @@ _MIN_CORNER_DETERMINANT = 1e-4  # least determinant of the shift's information o
 # trace: excludes edges
 _MIN_GREY_VARIANCE = 1e-3  # variance in grey values squared below which a patch is empty
 
-_kernel, _part = kernel_and_part(error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
+_FAST = {"contract", "reassoc", "nsz"}
+_kernel, _part = kernel_and_part(error_model="numpy", fastmath=_FAST)
+_, _allocating = kernel_and_part(allocating=True, error_model="numpy", fastmath=_FAST)
 
 
 @_part
@@ -109,7 +111,7 @@ def _pixel_map(origin, spread, half, width, height, nodes, quadratics):
     return origin[0] ** 2 + origin[2] ** 2 > size2 * (_POLE_HALF_PATCHES * half) ** 2
 
 
-@_part
+@_allocating
 def _scratch(reach):
     """Scratch for `_sample_grid`: nodes and quadratics, see `_pixel_map`; positions (2, n * n) in
     half patches, columns and rows (2, n * n) before them, weights (8, n * n) of the samples
@@ -232,28 +234,57 @@ def _statistics(window, values):
 
 
 @_part
-def _normal_matrix(templates, t, reach, normal):
-    """Write the normal matrix (8, 8) of a template; False if it does not determine a shift."""
+def _normal_matrix(templates, t, reach, columns, normal):
+    """Write the normal matrix (8, 8) of a template; False if it does not determine a shift.
+
+    columns (8, n * n) is scratch, so that each sum is a loop of its own, which is vectorised.
+    """
     n = 2 * reach + 1
-    c = np.empty(8)
-    normal[:] = 0.0
+    window, grey = templates.window, templates.grey[t]
+    by_x, by_y = templates.by_x[t], templates.by_y[t]
     for k in range(n * n):
         x, y = k // n - reach, k % n - reach
-        c[0], c[1], c[6], c[7] = (
-            templates.by_x[t, k],
-            templates.by_y[t, k],
-            templates.grey[t, k],
-            1.0,
-        )
-        c[2], c[3], c[4], c[5] = c[0] * x, c[1] * x, c[0] * y, c[1] * y
-        for i in range(8):
-            for j in range(8):
-                normal[i, j] += templates.window[k] * c[i] * c[j]
+        columns[0, k], columns[1, k] = by_x[k], by_y[k]
+        columns[2, k], columns[3, k] = by_x[k] * x, by_y[k] * x
+        columns[4, k], columns[5, k] = by_x[k] * y, by_y[k] * y
+        columns[6, k], columns[7, k] = grey[k], 1.0
+    for i in range(8):
+        for j in range(i, 8):
+            one, other, total = columns[i], columns[j], 0.0
+            for k in range(n * n):
+                total += window[k] * one[k] * other[k]
+            normal[i, j] = normal[j, i] = total
     trace = normal[0, 0] + normal[1, 1]
     determinant = normal[0, 0] * normal[1, 1] - normal[0, 1] ** 2
     for r in range(8):
         normal[r, r] += 1e-6 * normal[r, r] + (templates.prior if 2 <= r < 6 else 0.0)
     return determinant > _MIN_CORNER_DETERMINANT * trace * trace
+
+
+@_part
+def _cut(coefficients, mask, t, origin, spread, least_contrast, templates, reach, scratch):
+    """`cut_templates` of one template without its inverse; False if it has none."""
+    samples, ahead, behind, columns, normal = scratch
+    window, values = templates.window, templates.grey[t]
+    num = len(window)
+    for axis in range(2):
+        sx, sy = 0.5 * (1 - axis), 0.5 * axis
+        _sample_grid(coefficients, origin, spread, reach, sx, sy, samples, ahead)
+        _sample_grid(coefficients, origin, spread, reach, -sx, -sy, samples, behind)
+        slopes = templates.by_x[t] if axis == 0 else templates.by_y[t]
+        for k in range(num):
+            slopes[k] = ahead[k] - behind[k]
+    _sample_grid(coefficients, origin, spread, reach, 0.0, 0.0, samples, values)
+    if not _is_usable(mask, samples[0]):
+        templates.states[t] = MASKED
+        return False
+    mass, mean, square = _statistics(window, values)
+    for k in range(num):
+        values[k] -= mean
+    corner = _normal_matrix(templates, t, reach, columns, normal)
+    textured = corner and square > mass * least_contrast * least_contrast
+    templates.states[t] = ALIGNED if textured else FLAT
+    return textured
 
 
 @_kernel
@@ -265,59 +296,44 @@ def cut_templates(coefficients, mask, rows, origins, spreads, least_contrast, te
         origins (T, 3), spreads (T, 3, 2): the plane patches.
         least_contrast: standard deviation in grey values below which there is no texture.
     """
-    window = templates.window
-    num = len(window)
+    num = len(templates.window)
     reach = (int(np.round(np.sqrt(num))) - 1) // 2
-    scratch = _scratch(reach)
-    nodes = scratch[0]
-    ahead, behind = np.empty(num, np.float32), np.empty(num, np.float32)
     normal = np.empty((8, 8))
+    ahead, behind = np.empty(num, np.float32), np.empty(num, np.float32)
+    scratch = _scratch(reach), ahead, behind, np.empty((8, num)), normal
     for t in rows:
-        origin, spread, values = origins[t], spreads[t], templates.grey[t]
-        for axis in range(2):
-            sx, sy = 0.5 * (1 - axis), 0.5 * axis
-            _sample_grid(coefficients, origin, spread, reach, sx, sy, scratch, ahead)
-            _sample_grid(coefficients, origin, spread, reach, -sx, -sy, scratch, behind)
-            slopes = templates.by_x[t] if axis == 0 else templates.by_y[t]
-            for k in range(num):
-                slopes[k] = ahead[k] - behind[k]
-        _sample_grid(coefficients, origin, spread, reach, 0.0, 0.0, scratch, values)
-        if not _is_usable(mask, nodes):
-            templates.states[t] = MASKED
-            continue
-        mass, mean, square = _statistics(window, values)
-        for k in range(num):
-            values[k] -= mean
-        corner = _normal_matrix(templates, t, reach, normal)
-        if corner and square > mass * least_contrast * least_contrast:
+        if _cut(
+            coefficients, mask, t, origins[t], spreads[t], least_contrast, templates, reach, scratch
+        ):
             templates.inverses[t] = np.linalg.inv(normal)
-            templates.states[t] = ALIGNED
-        else:
-            templates.states[t] = FLAT
 
 
 @_part
-def _gradient(templates, t, reach, values, gain, offset, b):
-    """Write the normal equations' right side (8,); returns the residual's weighted square."""
-    n = 2 * reach + 1
-    grey, by_x, by_y = templates.grey[t], templates.by_x[t], templates.by_y[t]
-    b[:] = 0.0
-    cost = 0.0
-    for i in range(n):
-        for j in range(n):
-            k, x, y = i * n + j, i - reach, j - reach
-            e = (values[k] - offset) / gain - grey[k]
-            weighted = templates.window[k] * e
-            cost += weighted * e
-            ex, ey = weighted * by_x[k], weighted * by_y[k]
-            b[0] += ex
-            b[1] += ey
-            b[2] += ex * x
-            b[3] += ey * x
-            b[4] += ex * y
-            b[5] += ey * y
-            b[6] += weighted * grey[k]
-            b[7] += weighted
+def _gradient(templates, t, reach, values, places, gain, offset, b):
+    """Write the normal equations' right side (8,); returns the residual's weighted square.
+
+    Sums are variables of their own and the loop has no others, so that it is vectorised.
+    """
+    window, grey = templates.window, templates.grey[t]
+    by_x, by_y = templates.by_x[t], templates.by_y[t]
+    inverse_gain = 1.0 / gain
+    cost = total = of_grey = along_x = along_y = xx = yx = xy = yy = 0.0
+    for k in range(len(window)):
+        e = (values[k] - offset) * inverse_gain - grey[k]
+        weighted = window[k] * e
+        ex, ey, x, y = weighted * by_x[k], weighted * by_y[k], places[0, k], places[1, k]
+        cost += weighted * e
+        total += weighted
+        of_grey += weighted * grey[k]
+        along_x += ex
+        along_y += ey
+        xx += ex * x
+        yx += ey * x
+        xy += ex * y
+        yy += ey * y
+    half = reach + 1.0
+    b[0], b[1], b[2], b[3] = along_x, along_y, half * xx, half * yx
+    b[4], b[5], b[6], b[7] = half * xy, half * yy, of_grey, total
     return cost
 
 
@@ -333,6 +349,41 @@ def _judge(templates, t, values, mean, square, power, mass):
     return cross / np.sqrt(square * power), rest / (gain * gain * mass * freedom)
 
 
+@_part
+def _align(coefficients, mask, o, sightings, max_shift, steps, tolerance, templates, scratch):
+    """`align_templates` of one sighting; returns its state."""
+    samples, values, origin, spread, b, step = scratch
+    window = templates.window
+    reach = (int(np.round(np.sqrt(len(window)))) - 1) // 2
+    t, warp = sightings.templates[o], sightings.warps[o]
+    power = _statistics(window, templates.grey[t])[2]
+    gain = offset = 0.0
+    settled = False
+    for number in range(steps + 1):
+        _place(sightings, o, origin, spread)
+        _sample_grid(coefficients, origin, spread, reach, 0.0, 0.0, samples, values)
+        if number == 0 or settled:
+            mass, mean, square = _statistics(window, values)
+            if not square > _MIN_GREY_VARIANCE * mass:
+                return FLAT
+            if settled:
+                sightings.scores[o], sightings.variances[o] = _judge(
+                    templates, t, values, mean, square, power, mass
+                )
+                return ALIGNED if _is_usable(mask, samples[0]) else MASKED
+            gain, offset = np.sqrt(square / power), mean
+        cost = _gradient(templates, t, reach, values, samples[2], gain, offset, b)
+        if number >= _TRIAL_STEPS and not cost < power:
+            return UNLIKE
+        _solve(templates, t, warp, b, step)
+        offset += gain * step[7]
+        gain *= max(1.0 + step[6], 0.2)
+        if not _compose(warp, step) or not warp[0] ** 2 + warp[1] ** 2 < max_shift**2:
+            return FAR
+        settled = step[0] ** 2 + step[1] ** 2 < tolerance**2
+    return UNSTEADY
+
+
 @_kernel
 def align_templates(coefficients, mask, rows, sightings, max_shift, steps, tolerance, templates):
     """Align templates to one frame by inverse-compositional Gauss-Newton.
@@ -346,45 +397,15 @@ def align_templates(coefficients, mask, rows, sightings, max_shift, steps, toler
         steps: largest number of steps.
         tolerance: of the shift's last step, template pixels.
     """
-    window = templates.window
-    reach = (int(np.round(np.sqrt(len(window)))) - 1) // 2
-    scratch = _scratch(reach)
-    nodes = scratch[0]
-    values = np.empty(len(window), np.float32)
+    num = len(templates.window)
+    reach = (int(np.round(np.sqrt(num))) - 1) // 2
     origin, spread = np.empty(3), np.empty((3, 2))
-    b, step = np.empty(8), np.empty(8)
+    values = np.empty(num, np.float32)
+    scratch = _scratch(reach), values, origin, spread, np.empty(8), np.empty(8)
     for o in rows:
-        t, warp = sightings.templates[o], sightings.warps[o]
-        power = _statistics(window, templates.grey[t])[2]
-        gain = offset = 0.0
-        settled, state = False, UNSTEADY
-        for number in range(steps + 1):
-            _place(sightings, o, origin, spread)
-            _sample_grid(coefficients, origin, spread, reach, 0.0, 0.0, scratch, values)
-            if number == 0 or settled:
-                mass, mean, square = _statistics(window, values)
-                if not square > _MIN_GREY_VARIANCE * mass:
-                    state = FLAT
-                    break
-                if settled:
-                    state = ALIGNED if _is_usable(mask, nodes) else MASKED
-                    sightings.scores[o], sightings.variances[o] = _judge(
-                        templates, t, values, mean, square, power, mass
-                    )
-                    break
-                gain, offset = np.sqrt(square / power), mean
-            cost = _gradient(templates, t, reach, values, gain, offset, b)
-            if number >= _TRIAL_STEPS and not cost < power:
-                state = UNLIKE
-                break
-            _solve(templates, t, warp, b, step)
-            offset += gain * step[7]
-            gain *= max(1.0 + step[6], 0.2)
-            if not _compose(warp, step) or not warp[0] ** 2 + warp[1] ** 2 < max_shift**2:
-                state = FAR
-                break
-            settled = step[0] ** 2 + step[1] ** 2 < tolerance**2
-        sightings.states[o] = state
+        sightings.states[o] = _align(
+            coefficients, mask, o, sightings, max_shift, steps, tolerance, templates, scratch
+        )
 
 
 @_part
@@ -401,7 +422,8 @@ def _place(sightings, o, origin, spread):
 @_part
 def _solve(templates, t, warp, b, step):
     """Write the Gauss-Newton step (8,), with a zero prior on the affine part."""
-    b[2:6] += templates.prior * warp[2:6]
+    for r in range(2, 6):
+        b[r] += templates.prior * warp[r]
     for r in range(8):
         total = 0.0
         for c in range(8):

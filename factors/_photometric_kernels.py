@@ -23,6 +23,7 @@ import numpy as np
 from factors.compiled import kernel_and_part
 
 _kernel, _part = kernel_and_part(error_model="numpy", fastmath={"contract"})
+_, _allocating = kernel_and_part(allocating=True, error_model="numpy", fastmath={"contract"})
 _, _sums = kernel_and_part(error_model="numpy", fastmath={"contract", "reassoc"})
 
 CODE_SCALE = 28.0  # steps per grey value: spline coefficients of 8-bit images fit int16
@@ -151,7 +152,7 @@ def _relative(host, target, A, c):
         )
 
 
-@_part
+@_allocating
 def _look(data, p, o, plane, A, c, dims, Z):
     """Write rows of Z (10, N): derivatives by the tangent (the first `dims`), grey values (row 9).
 

@@ -5,6 +5,7 @@ import numpy as np
 from factors.compiled import kernel_and_part
 
 _kernel, _part = kernel_and_part(error_model="numpy", fastmath={"contract"})
+_, _allocating = kernel_and_part(allocating=True, error_model="numpy", fastmath={"contract"})
 
 
 @_part
@@ -31,7 +32,7 @@ def _to_poses(host, target, by_host, by_target):
     by_target[5, 0], by_target[5, 1] = -cy, cx
 
 
-@_part
+@_allocating
 def _through(view, J):
     """Map rows J (6, 6) by right perturbations of a lens's pose to those of its rig.
 
@@ -75,7 +76,7 @@ def _invert(V, out):
     out[2, 2] = i22 * i22
 
 
-@_part
+@_allocating
 def _add_product(P, G, Q, out):
     """out += P^T G Q for 6x6 P, Q and the pose part of a (9, 9) Hessian."""
     GQ = np.zeros((6, 6))
@@ -118,7 +119,7 @@ def _add_pair(f, g, block, row_starts, columns, off_diagonal):
             out[i, j] += block[i, j] if f < g else block[j, i]
 
 
-@_part
+@_allocating
 def _reduce(
     host, targets, W, inverse, down, row_starts, columns, diagonal, off_diagonal, gradient
 ):  # fmt: skip

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import block_array, bsr_array, csr_array
 
-from factors._kernels import eliminate_linear_range
+from factors._linear_kernels import eliminate_linear_range
 from factors._observations import covisible_pairs
 
 _RELATIVE_DAMPING = 1e-12  # damping of a landmark, part of the sum of squares of its Jacobian

@@ -29,20 +29,26 @@ def standardized_residuals(
     rows = np.empty((longest, 8))  # residual (2) and its Jacobian by the point (2 x 3)
     normal = np.empty(6)
     for j in range(first, last):
-        normal[:] = 0.0
-        for o in range(starts[j], starts[j + 1]):
-            row = rows[o - starts[j]]
-            _by_point(o, points[j], poses[frames[o]], bearings, roots, origins, row)
-            a0, a1, a2, b0, b1, b2 = row[2], row[3], row[4], row[5], row[6], row[7]
-            normal[0] += a0 * a0 + b0 * b0
-            normal[1] += a0 * a1 + b0 * b1
-            normal[2] += a0 * a2 + b0 * b2
-            normal[3] += a1 * a1 + b1 * b1
-            normal[4] += a1 * a2 + b1 * b2
-            normal[5] += a2 * a2 + b2 * b2
-        covariance = _inverse(normal)
-        for o in range(starts[j], starts[j + 1]):
-            out[o] = _along(rows[o - starts[j]], covariance)
+        _standardize(j, starts, points, frames, poses, bearings, roots, origins, rows, normal, out)
+
+
+@_part
+def _standardize(j, starts, points, frames, poses, bearings, roots, origins, rows, normal, out):
+    """`standardized_residuals` of point j."""
+    normal[:] = 0.0
+    for o in range(starts[j], starts[j + 1]):
+        row = rows[o - starts[j]]
+        _by_point(o, points[j], poses[frames[o]], bearings, roots, origins, row)
+        a0, a1, a2, b0, b1, b2 = row[2], row[3], row[4], row[5], row[6], row[7]
+        normal[0] += a0 * a0 + b0 * b0
+        normal[1] += a0 * a1 + b0 * b1
+        normal[2] += a0 * a2 + b0 * b2
+        normal[3] += a1 * a1 + b1 * b1
+        normal[4] += a1 * a2 + b1 * b2
+        normal[5] += a2 * a2 + b2 * b2
+    covariance = _inverse(normal)
+    for o in range(starts[j], starts[j + 1]):
+        out[o] = _along(rows[o - starts[j]], covariance)
 
 
 @_part

@@ -10,7 +10,9 @@ HEAD = 24  # axes of a descriptor compared before the rest
 _ZERO = np.float32(0)
 _MIN_SINE = np.float32(0.05)  # least sine of the angle to the motion; nearer to it, epipolar
 # planes are undetermined
-_kernel, _part = kernel_and_part(fastmath={"contract", "reassoc", "nsz", "arcp"})
+_FAST = {"contract", "reassoc", "nsz", "arcp"}
+_kernel, _part = kernel_and_part(fastmath=_FAST)
+_, _allocating = kernel_and_part(allocating=True, fastmath=_FAST)
 
 
 class Limits(NamedTuple):
@@ -51,53 +53,84 @@ def search(first, second, cells, targets, only_targets, direction, limits):
         only_targets: search around the targets, not along epipolar lines.
         direction, limits: unit vector of the motion, and Limits.
     """
-    bearings0, descriptors0, tails0 = first
-    bearings1, descriptors1, tails1 = second
-    starts, centres, radii = cells
-    n0, n1, dim = len(bearings0), len(bearings1), descriptors0.shape[1]
+    descriptors0, descriptors1 = first.descriptors, second.descriptors
+    n0, n1, dim = len(descriptors0), len(descriptors1), descriptors0.shape[1]
     head = min(HEAD, dim)
-    heads0 = np.ascontiguousarray(descriptors0[:, :head])  # stays in the cache
-    heads1 = np.ascontiguousarray(descriptors1[:, :head])
-    # A candidate with a lower similarity neither wins nor rivals the weakest winner.
-    floor = 1 - (1 - limits.similarity) / (limits.ratio * limits.ratio)
-    x, y, z = _columns(bearings1)
-    balls = _columns(centres)
-    no_radii = np.zeros(n1, np.float32)
-    marks, worth = np.empty(n1, np.bool_), np.empty(len(radii), np.bool_)
-    best0, top0, next0 = _no_candidates(n0)
-    best1, top1, next1 = _no_candidates(n1)
+    # Contiguous, so that they stay in the cache.
+    heads = (
+        np.ascontiguousarray(descriptors0[:, :head]),
+        np.ascontiguousarray(descriptors1[:, :head]),
+    )
+    columns, balls, no_radii = (
+        _columns(second.bearings),
+        _columns(cells.centres),
+        np.zeros(n1, np.float32),
+    )
+    marks, worth = np.empty(n1, np.bool_), np.empty(len(cells.radii), np.bool_)
+    found0, found1 = _no_candidates(n0), _no_candidates(n1)
     for i in range(n0):
-        if only_targets and np.isnan(targets[i, 0]):
-            continue
-        bearing = bearings0[i, 0], bearings0[i, 1], bearings0[i, 2]
-        target = targets[i, 0], targets[i, 1], targets[i, 2]
-        circle = _great_circle(bearing, direction, limits)
-        rest0 = descriptors0[i, head:]
-        about = target, bearing, direction, circle, limits
-        _mark_balls(balls, radii, only_targets, about, worth)
-        for cell in range(len(radii)):
-            if not worth[cell] or starts[cell] == starts[cell + 1]:
-                continue
-            begin, end = starts[cell], starts[cell + 1]
-            members = x[begin:end], y[begin:end], z[begin:end]
-            _mark_balls(members, no_radii[begin:end], only_targets, about, marks)
-            for j in range(begin, end):
-                if not marks[j - begin]:
-                    continue
-                dot = _ZERO
-                for d in range(head):
-                    dot += heads0[i, d] * heads1[j, d]
-                if dot + tails0[i] * tails1[j] < floor:  # Cauchy-Schwarz on the other axes
-                    continue
-                rest1 = descriptors1[j, head:]
-                for d in range(dim - head):  # a possibly negative index would compile to gathers
-                    dot += rest0[d] * rest1[d]
-                if dot > next0[i]:  # tested here, as calls that pass arrays are expensive
-                    _update_best(best0, top0, next0, i, j, dot, bearings1)
-                if dot > next1[j]:
-                    _update_best(best1, top1, next1, j, i, dot, bearings0)
+        if not (only_targets and np.isnan(targets[i, 0])):
+            _search_row(
+                i, first, second, heads, cells, columns, balls, no_radii, targets, only_targets,
+                direction, limits, marks, worth, found0, found1,
+            )  # fmt: skip
+    best0, top0, next0 = found0
+    best1, _, next1 = found1
     _keep_mutual(best0, top0, next0, best1, next1, limits)
     return best0, top0
+
+
+@_part
+def _search_row(
+    i, first, second, heads, cells, columns, balls, no_radii, targets, only_targets, direction,
+    limits, marks, worth, found0, found1,
+):  # fmt: skip
+    """Compare row i of the first frame with the rows of the second that it may match.
+
+    Args:
+        heads: the first axes of both frames' descriptors.
+        columns, balls: coordinates of the second's bearings, and of its cells' centres.
+        no_radii: zero for each row of the second.
+        marks, worth: scratch, flags of rows and of cells.
+        found0, found1: candidates so far of both frames' rows.
+    """
+    bearings0, descriptors0, tails0 = first
+    bearings1, descriptors1, tails1 = second
+    starts, _, radii = cells
+    heads0, heads1 = heads
+    x, y, z = columns
+    best0, top0, next0 = found0
+    best1, top1, next1 = found1
+    head, dim = heads0.shape[1], descriptors0.shape[1]
+    # A candidate with a lower similarity neither wins nor rivals the weakest winner.
+    floor = 1 - (1 - limits.similarity) / (limits.ratio * limits.ratio)
+    bearing = bearings0[i, 0], bearings0[i, 1], bearings0[i, 2]
+    target = targets[i, 0], targets[i, 1], targets[i, 2]
+    circle = _great_circle(bearing, direction, limits)
+    rest0 = descriptors0[i, head:]
+    about = target, bearing, direction, circle, limits
+    _mark_balls(balls, radii, only_targets, about, worth)
+    for cell in range(len(radii)):
+        if not worth[cell] or starts[cell] == starts[cell + 1]:
+            continue
+        begin, end = starts[cell], starts[cell + 1]
+        members = x[begin:end], y[begin:end], z[begin:end]
+        _mark_balls(members, no_radii[begin:end], only_targets, about, marks)
+        for j in range(begin, end):
+            if not marks[j - begin]:
+                continue
+            dot = _ZERO
+            for d in range(head):
+                dot += heads0[i, d] * heads1[j, d]
+            if dot + tails0[i] * tails1[j] < floor:  # Cauchy-Schwarz on the other axes
+                continue
+            rest1 = descriptors1[j, head:]
+            for d in range(dim - head):  # a possibly negative index would compile to gathers
+                dot += rest0[d] * rest1[d]
+            if dot > next0[i]:
+                _update_best(best0, top0, next0, i, j, dot, bearings1)
+            if dot > next1[j]:
+                _update_best(best1, top1, next1, j, i, dot, bearings0)
 
 
 @_kernel
@@ -122,13 +155,13 @@ def passes(bearings0, bearings1, targets, only_targets, direction, limits):
     return passed
 
 
-@_part
+@_allocating
 def _columns(rows):
     """The coordinates of points (n, 3), each in a row of its own."""
     return rows[:, 0].copy(), rows[:, 1].copy(), rows[:, 2].copy()
 
 
-@_part
+@_allocating
 def _no_candidates(n):
     """Initial best candidate of n rows, its similarity, and that of the best at another place."""
     return np.full(n, -1, np.int32), np.full(n, -1, np.float32), np.full(n, -1, np.float32)

@@ -102,18 +102,30 @@ def _differences(one, other, out):
         out[0, n], out[1, n], out[2, n] = found
 
 
+@_part
+def _view_difference(point, one, other):
+    """`_difference` of the views of a point from two centres."""
+    x, y, z = point[0], point[1], point[2]
+    return _difference(x - one[0], y - one[1], z - one[2], x - other[0], y - other[1], z - other[2])
+
+
+@_part
+def _reference(j, starts, frames, centres, points):
+    """Row of the most central observation of point j."""
+    best, row = np.inf, 0
+    for a in range(starts[j], starts[j + 1]):
+        cost = 0.0
+        for b in range(starts[j], starts[j + 1]):
+            cost += _view_difference(points[j], centres[frames[a]], centres[frames[b]])[2]
+        if cost < best or a == starts[j]:
+            best, row = cost, a
+    return row
+
+
 @_kernel
 def _references(starts, frames, centres, points, out):
     for j in range(len(points)):
-        best = np.inf
-        for a in range(starts[j], starts[j + 1]):
-            va = points[j] - centres[frames[a]]
-            cost = 0.0
-            for b in range(starts[j], starts[j + 1]):
-                vb = points[j] - centres[frames[b]]
-                cost += _difference(va[0], va[1], va[2], vb[0], vb[1], vb[2])[2]
-            if cost < best or a == starts[j]:
-                best, out[j] = cost, a
+        out[j] = _reference(j, starts, frames, centres, points)
 
 
 @_kernel
@@ -127,7 +139,6 @@ def _views(
         if starts[j] == starts[j + 1]:
             continue
         host = frames[rows[j]]
-        va = points[j] - centres[host]
         listed[host] = j
         room = max_views
         for a in range(starts[j], starts[j + 1]):
@@ -141,8 +152,9 @@ def _views(
         for k in range(near.shape[1]):
             costs[k] = np.inf
             if listed[near[host, k]] != j:
-                vb = points[j] - centres[near[host, k]]
-                cosine, ratio, cost = _difference(va[0], va[1], va[2], vb[0], vb[1], vb[2])
+                cosine, ratio, cost = _view_difference(
+                    points[j], centres[host], centres[near[host, k]]
+                )
                 if cosine > min_cosine and ratio < max_ratio and ratio * max_ratio > 1:
                     costs[k] = cost
         for k in np.argsort(costs):

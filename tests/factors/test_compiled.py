@@ -11,8 +11,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from textwrap import dedent
 
+import numpy as np
 import pytest
 from numba.core.dispatcher import Dispatcher
+
+from factors.compiled import kernel_and_part
 
 ROOT = Path(__file__).parents[2]
 MODULES = sorted(
@@ -74,6 +77,17 @@ def test_a_kernel_leaves_no_sums_to_numpy(name: str) -> None:
     used = {node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
     assert not used & ROUNDED_ELSEWHERE
     assert not any(isinstance(node, ast.MatMult) for node in ast.walk(tree))
+
+
+def test_a_part_that_returns_an_array_is_refused() -> None:
+    """It does not count the reference that its caller would release."""
+
+    def given(array: np.ndarray) -> tuple[int, np.ndarray]:
+        return 1, array
+
+    _, part = kernel_and_part()
+    with pytest.raises(TypeError, match="given returns an array"):
+        part(given)(np.zeros(2))
 
 
 def test_compilation_is_announced_once_per_machine(tmp_path: Path) -> None:
