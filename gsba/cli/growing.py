@@ -66,12 +66,12 @@ def add(
     """
     if not new and not recording:
         raise GsbaError("give the RECORDING to add: a folder of frames, or a video")
-    shared: dict[str, Any] = {"odometry": False if no_trajectory else None, "fps": fps}
-    shared |= {"masks": masks or "auto", "calibration": calibration}
-    recordings = recordings_of(new or (), recording or (), shared)
     with loading():
         from gsba import pipeline
         from gsba.store.cluster import connected
+    shared: dict[str, Any] = {"odometry": False if no_trajectory else None, "fps": fps}
+    shared |= {"masks": masks or "auto", "calibration": calibration}
+    recordings = recordings_of(new or (), recording or (), shared)
     with connected(cluster) as client:
         given: dict[str, Any] = {"fixed": fixed, "segment": segment, "client": client}
         result = pipeline.add_recordings(run, recordings, out, **given)

@@ -222,6 +222,9 @@ def refine(
     """
     if frames is None and not recording:
         raise GsbaError("give the FRAMES to refine: a folder or a video")
+    with loading():
+        from gsba import pipeline
+        from gsba.store.cluster import connected
     given = [] if frames is None else [frames, *(trajectory or ())]
     several = bool(recording) or len(grouped(given)) > 1
     if trajectory and no_trajectory and not several:
@@ -234,9 +237,6 @@ def refine(
     shared |= {"masks": masks or "auto", "calibration": calibration}
     shared["circles"] = [_circle(text) for text in circle or ()]
     own: dict[str, Any] = {"keyframes": keyframes, "timestamps": timestamps, "imu": imu}
-    with loading():
-        from gsba import pipeline
-        from gsba.store.cluster import connected
     with connected(cluster) as client:
         run: dict[str, Any] = {"segment": segment, "fresh": fresh, "client": client}
         if several:

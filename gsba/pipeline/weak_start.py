@@ -6,6 +6,7 @@ at once, instead of few first and more later.
 """
 
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
@@ -66,11 +67,15 @@ def _matches(run: Run, found: Mapping[str, Features], steps: np.ndarray) -> floa
     prior, pairs = settings.pairs.prior, settings.pairs
     gate = Gate(np.deg2rad(prior.rotation_deg), prior.direction, np.deg2rad(pairs.max_parallax_deg))
     chance = gate.chance(np.deg2rad(settings.verify.max_error_deg))
-    frames, numbers = SearchableFrames(load, pairs.strongest_per_face), []
-    for f0, f1 in steps.tolist():
+    frames = SearchableFrames(load, pairs.strongest_per_face)
+
+    def verified(step: tuple[int, int]) -> int:
+        f0, f1 = step
         f0_T_f1 = inverse(poses[f0]) @ poses[f1]
         rows = guided_search.guided(frames, (f0, f1), f0_T_f1, gate, settings.matching)
         rays = load(f0).bearings_rig[rows[:, 0]], load(f1).bearings_rig[rows[:, 1]]
         pose = relative_pose(*rays, settings.verify, settings.seed, chance)
-        numbers.append(0 if pose is None else np.count_nonzero(pose.inliers))
-    return float(np.median(numbers))
+        return 0 if pose is None else int(np.count_nonzero(pose.inliers))
+
+    with ThreadPoolExecutor(run.num_threads) as pool:
+        return float(np.median(list(pool.map(verified, map(tuple, steps.tolist())))))
