@@ -25,6 +25,7 @@ _SIGHTINGS_AT_ONCE = 1 << 17  # sightings processed together: some 80 MB
 _BYTES_PER_POINT = 8192  # of a point's patch and its sightings, about
 _MEMORY_SHARE = 64  # of the machine's memory, which the patches of one part take at most
 _POINTS_AT_ONCE = 1 << 17  # whose former observations are looked for together
+_PLACE_BITS = 10  # of a coordinate by which frames are put in order: cells of a 1024th of the map
 _ENOUGH_OBSERVATIONS = 100  # aligned observations of a frame from which points without aligned
 # patches are dropped
 _TILTED_STEP_PX = 1.4  # pixels to a step of patches tilted with their surfaces; 1 of patches facing
@@ -96,7 +97,7 @@ def align(
 
     def by_patches() -> Iterator[Observed]:
         nonlocal num_found
-        for points in _by_hosts(landmarks.tracks.frames[rows]):
+        for points in _by_hosts(landmarks.tracks.frames[rows], world_T_rigs[:, :3, 3]):
             chosen = np.zeros(len(rows), bool)
             chosen[points] = True
             some = replace(solved, landmarks=landmarks.of(chosen))
@@ -117,13 +118,32 @@ def align(
     return pack(new, former, shown, rig, counts, folder)
 
 
-def _by_hosts(hosts: np.ndarray) -> Iterator[np.ndarray]:
-    """Points (n,), ascending, whose patches are held together: those of hosts that follow one
-    another, of all hosts (J,)."""
+def _by_hosts(hosts: np.ndarray, positions: np.ndarray) -> Iterator[np.ndarray]:
+    """Points (n,), ascending, whose patches are held together: those of hosts near one another.
+
+    Each picture is then read for few of these groups, however often its place was visited.
+
+    Args:
+        hosts: (J,) frame of each point's patch.
+        positions: (F, 3) of the frames, world.
+    """
     most = max(total_memory_bytes() // (_MEMORY_SHARE * _BYTES_PER_POINT), 1)
-    order = np.argsort(hosts, kind="stable")
+    order = np.argsort(_numbers_by_place(positions)[hosts], kind="stable")
     for first in range(0, max(len(order), 1), most):
         yield np.sort(order[first : first + most])
+
+
+def _numbers_by_place(positions: np.ndarray) -> np.ndarray:
+    """Numbers (F,) int64 of cells that positions (F, 3) lie in, cells near one another having
+    similar ones: the bits of their coordinates, interleaved (Morton, 1966)."""
+    low, edge = positions.min(axis=0), float(np.ptp(positions, axis=0).max())
+    last = (1 << _PLACE_BITS) - 1
+    cells = ((positions - low) / max(edge, 1e-300) * last).astype(np.int64)
+    numbers = np.zeros(len(positions), np.int64)
+    for bit in range(_PLACE_BITS):
+        for axis in range(3):
+            numbers |= (cells[:, axis] >> bit & 1) << (3 * bit + axis)
+    return numbers
 
 
 @dataclass(frozen=True, slots=True)

@@ -156,6 +156,18 @@ def test_observations_are_sub_pixel(walk) -> None:
     assert counts.received == counts.kept + sum(counts.dropped.values())
 
 
+def test_patches_held_together_are_of_frames_near_one_another(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(alignment, "total_memory_bytes", lambda: 64 * 8192 * 50)
+    along = np.tile(np.linspace(0, 1, 100), 2)  # two laps
+    positions = np.column_stack([along, 0 * along, 0.01 * along])
+    parts = list(alignment._by_hosts(np.arange(200), positions))
+    assert [len(part) for part in parts] == [50] * 4
+    assert np.array_equal(np.sort(np.concatenate(parts)), np.arange(200))
+    assert max(np.ptp(along[part]) for part in parts) < 0.26
+
+
 def test_patches_of_some_points_at_a_time_give_the_same_bytes(
     walk, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
