@@ -13,7 +13,7 @@ from typing import IO
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # parameters of mallopt(3), from malloc.h
 _DEFAULT_THRESHOLDS = 32 << 20, 64 << 20  # bytes, glibc's own mapping and trimming thresholds
-_MIN_RETURNED_BYTES = 256 << 20  # fetching and clearing so much again takes a tenth of a second
+_MIN_RETURNED_BYTES = 64 << 20  # fetching and clearing so much again takes a fortieth of a second
 _mapped_files = weakref.WeakSet[mmap.mmap]()
 
 
