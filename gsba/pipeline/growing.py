@@ -1,7 +1,9 @@
 """Finished runs that grow: recordings added or taken out, and runs merged, from what is solved."""
 
 import logging
-from collections.abc import Mapping, Sequence
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -17,7 +19,7 @@ from gsba.pipeline import backend, camera, finished_run, grown_folder, map_joini
 from gsba.pipeline.finished_run import FinishedRun
 from gsba.pipeline.joint_cameras import JointCameras, as_read_by, refuse_fields
 from gsba.pipeline.joint_map import JointMaps, check_new
-from gsba.pipeline.map_joining import RigidMoves
+from gsba.pipeline.map_joining import ApartError, RigidMoves
 from gsba.pipeline.outputs import RunResult
 from gsba.pipeline.prior import Prior
 from gsba.pipeline.recording import Recording, names_of
@@ -188,10 +190,13 @@ class _Place:
         grown_folder.refuse_existing(Path(out))
         return cls(Path(out), False)
 
+    @contextmanager
     def store(
         self, origin: dict[str, Path], client: "Client | None", first: FinishedRun
-    ) -> RunStore:
+    ) -> Iterator[RunStore]:
         """Store of the run in a folder beside its place, taken up where a call was interrupted.
+
+        The folder is deleted where maps turn out not to be of one place.
 
         Args:
             origin: inputs of the run.
@@ -201,7 +206,12 @@ class _Place:
         work = grown_folder.folder_beside(self.out)
         grown_folder.forget_other_work(work, origin, self.out)
         hired = cluster.hire(client, first.frames.paths[0][0], first.settings)
-        return RunStore(work, origin, hire=hired, title_of=title_of)
+        try:
+            with RunStore(work, origin, hire=hired, title_of=title_of) as store:
+                yield store
+        except ApartError:
+            shutil.rmtree(work, ignore_errors=True)
+            raise
 
     def finish(
         self,
@@ -308,7 +318,7 @@ def _require_any_joined(maps: JointMaps, state: State) -> None:
         if len(np.unique(owners[merged.components == component])) > 1:
             return
     reasons = [reason for reason in merged.reasons if reason]
-    raise GsbaError(
+    raise ApartError(
         f"the maps of {' and '.join(str(run.root) for run in maps.runs)} meet nowhere"
         f"{f' ({reasons[0]})' if reasons else ''}: nothing is merged; maps are joined where they "
         "show the same place, over six frames or more"
@@ -324,7 +334,7 @@ def _require_joined(maps: JointMaps, state: State) -> None:
         if rows[0] >= maps.starts[1] and not (merged.components[rows] == main).any():
             number = int(merged.components[rows].min())
             reason = merged.reasons[number] if number < len(merged.reasons) else ""
-            raise GsbaError(
+            raise ApartError(
                 f"recording '{name}' does not meet the map of {maps.runs[0].root}"
                 f"{f' ({reason})' if reason else ''}: nothing is added; recordings are joined "
                 "where they show the same place, over six frames or more"

@@ -53,6 +53,10 @@ _NOT_TIED = (
 )
 
 
+class ApartError(GsbaError):
+    """Maps that are not joined, however often it is tried."""
+
+
 def begin(store: RunStore, maps: JointMaps, settings: RefineSettings) -> State:
     """The state of maps that nothing ties together yet.
 
@@ -76,7 +80,7 @@ def register(state: State, maps: JointMaps) -> State:
     """Maps moved to where they meet others, as the test of joins confirms.
 
     Raises:
-        GsbaError: two maps meet in a scale that the distances of their lenses contradict.
+        ApartError: two maps meet in a scale that the distances of their lenses contradict.
     """
     run, solution = state.run, state.solution
     nothing = np.zeros(len(solution.world_T_rigs) - 1, bool)
@@ -209,14 +213,14 @@ def tie(state: State, parts: np.ndarray) -> State:
     """Joined maps tied by the points that frames of different parts (F,) share, and adjusted.
 
     Raises:
-        GsbaError: they share no points, or frames lose theirs when maps are adjusted together.
+        ApartError: they share no points, or frames lose theirs when maps are adjusted together.
     """
     merged, run = state.prior.merged, state.run
     assert merged is not None
     state = replace(state, matches=_across(state, parts, merged).matches)
     ties = _crossing(state, parts)
     if not len(ties):
-        raise GsbaError(_NOT_TIED.format("share no points there"))
+        raise ApartError(_NOT_TIED.format("share no points there"))
     base = _sighted(state)
     both, order = _interleaved(base.keypoints, state.observed.shown)
     sizes = np.diff(base.keypoints.starts)
@@ -228,7 +232,7 @@ def tie(state: State, parts: np.ndarray) -> State:
     )
     solved = _solved(state, everything, "joined", run.settings.rounds.loops)
     if solved is None:
-        raise GsbaError(_NOT_TIED.format("lose points when they are adjusted together"))
+        raise ApartError(_NOT_TIED.format("lose points when they are adjusted together"))
     if not run.settings.patches.rounds:
         return solved
     features = _unravelled(solved.map.observed, order, len(base.aligned), state.observed.shown)
@@ -372,7 +376,7 @@ def _check_unit(
     off = abs(float(np.log(lengths[1] / lengths[0])))
     if off > max(_MAX_SCALE_SIGMAS * float(np.linalg.norm(shares)), np.log(_MAX_SCALE_RATIO)):
         first, run = (maps.runs[number] for number in numbers)
-        raise GsbaError(
+        raise ApartError(
             f"{run.root} contradicts the camera of {first.root}: where they meet, its lenses "
             f"are {np.exp(off):.2f} times as far apart, or the inverse; recordings of one layout, "
             "size and calibration must be of one camera, unless they name different models"

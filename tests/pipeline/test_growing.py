@@ -131,7 +131,7 @@ def test_a_recording_of_another_place_is_refused(home: GrowingHome, tmp_path: Pa
     result = _add(home.run, home.elsewhere, home.elsewhere_trajectory, "--out", out)
     assert result.exit_code == 1 and not out.exists()
     assert "recording 'elsewhere' does not meet the map of" in result.output
-    assert _content(home.run) == before
+    assert _content(home.run) == before and not list(tmp_path.iterdir())
 
 
 def test_refusals_are_one_line_and_leave_the_run(home: GrowingHome, tmp_path: Path) -> None:
@@ -237,7 +237,7 @@ def test_runs_that_meet_nowhere_are_not_merged(home: GrowingHome, tmp_path: Path
     result = _invoke("merge", home.run, other, "--out", out)
     assert result.exit_code == 1 and not out.exists()
     assert "meet nowhere" in result.output
-    assert _content(home.run) == before
+    assert _content(home.run) == before and list(tmp_path.iterdir()) == [other]
 
 
 def test_a_recording_is_taken_out_again(grown: Path, home: GrowingHome, tmp_path: Path) -> None:
