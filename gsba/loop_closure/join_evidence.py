@@ -6,6 +6,9 @@ the place. So points that are found again are weighed against those that are not
 rate at which points are found again within parts under the same change of view. Points of a small
 cell of space count as one witness, and witnesses of one region have correlated errors. Weighed by
 their numbers, points must confirm a join, too.
+
+Homes of one plan share walls, doors and furniture. What covers these matches by chance, anywhere
+around where it is expected: between two recordings a point counts by its distance from there.
 """
 
 from collections.abc import Sequence
@@ -14,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import KDTree
 
-from gsba.geometry import inverse
+from gsba.geometry import angles_between, inverse
 from gsba.matching.guided_search import Gate, MatchContext
 from gsba.types import Matches
 
@@ -25,6 +28,9 @@ _NUM_NEAREST = 3  # nearest frames that each frame is compared with
 _MAX_PAIRS = 150  # largest number of compared pairs of frames
 _TRIANGULATION_GAP = 2  # largest gap in frames between matches that make points
 _GATE_RAD = np.deg2rad(4.0)  # radius around a point's predicted bearing
+_PLACE_RAD = np.deg2rad(2.0)  # radius in which true matches lie; chance spreads them over the gate
+_BESIDE = -(_PLACE_RAD**2) / (_GATE_RAD**2 - _PLACE_RAD**2)  # worth of a match outside this radius:
+# matches by chance cancel
 # Chord around the predicted bearing within which a frame must know a surface.
 _SURFACE_CHORD = 2 * np.sin(np.deg2rad(6.0) / 2)
 _NUM_SURFACE_POINTS = 3  # points of the frame nearest to the bearing that represent the surface
@@ -41,9 +47,9 @@ _CELL_DEPTHS, _REGION_DEPTHS = 0.25, 1.0  # edges of cells of space, median dept
 _PRIOR_REGIONS = 1.0  # prior number of regions with nothing found, and of regions with all found
 # Share found again at a look-alike: as much as in a hall of repeated arches, one arch further on.
 _LOOK_ALIKE_SHARE = 0.3
-# Share found again between two homes of one plan with furniture at the same places: 44 to 78 % with
-# a sigma of 3 to 6 % in 16 rendered pairs; lower bounds up to 60 %. Homes filmed twice: 74 to 98 %.
-_ONE_PLAN_SHARE = 0.62
+# Share found at its place between two homes of one plan with furniture at the same places: at most
+# PLACEHOLDER
+_ONE_PLAN_SHARE = 0.5
 _NUM_SIGMAS = 3.09  # standard deviations of a one-sided error rate of 1e-3
 _ABSENT_SHARE = 0.1  # share that counts as nothing found
 
@@ -72,7 +78,19 @@ class Predictions:
 
     points_world: np.ndarray  # (V, 3) float64
     bins: np.ndarray  # (V,) int64, bin of the change of view
-    found: np.ndarray  # (V,) bool: a keypoint near the prediction matches
+    off_rad: np.ndarray  # (V,) float64, angle from the prediction to the keypoint that matches
+    # there; NaN = none does
+
+    @property
+    def found(self) -> np.ndarray:
+        """True (V,) where a keypoint near the prediction matches."""
+        return np.isfinite(self.off_rad)
+
+    @property
+    def placed(self) -> np.ndarray:
+        """Worth (V,) of what is found as evidence that it is at its place; 0 on average for
+        matches by chance."""
+        return np.where(self.found, np.where(self.off_rad < _PLACE_RAD, 1.0, _BESIDE), 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,6 +99,7 @@ class Rates:
 
     within: np.ndarray  # (B,) float64, within parts, by change of view
     chance: float  # rate for predictions rotated away
+    placed: np.ndarray  # (B,) float64, mean of `Predictions.placed` within parts
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,19 +110,29 @@ class JoinEvidence:
     # than by chance
     sigma: float  # infinite: nothing can be predicted
     witnesses: int  # cells of space with predicted points
+    placed: float = 0.0  # share found at its place
+    placed_sigma: float = np.inf
 
     def __str__(self) -> str:
         if not self.witnesses:
             return "no frames of the two maps overlap at this place"
         return (
             f"{100 * self.share:.0f} % (sigma {100 * self.sigma:.0f} %) of the points "
-            f"expected in both maps are found again; look-alikes: {100 * _LOOK_ALIKE_SHARE:.0f} % "
-            f"in one recording, {100 * _ONE_PLAN_SHARE:.0f} % between two"
+            f"expected in both maps are found again, {100 * self.placed:.0f} % (sigma "
+            f"{100 * self.placed_sigma:.0f} %) at their places; look-alikes: "
+            f"{100 * _LOOK_ALIKE_SHARE:.0f} %, between recordings {100 * _ONE_PLAN_SHARE:.0f} % at "
+            "their places"
         )
 
-    @property
-    def least(self) -> float:
-        """Lower bound of the share found again."""
+    def least(self, apart: bool = False) -> float:
+        """Lower bound of the share that tells true joins from look-alikes.
+
+        Args:
+            apart: whether the two sides are of different recordings, as may be of two homes of one
+                plan: the share at its place then, else all that is found again.
+        """
+        if apart:
+            return self.placed - _NUM_SIGMAS * self.placed_sigma
         return self.share - _NUM_SIGMAS * self.sigma
 
     @property
@@ -112,13 +141,10 @@ class JoinEvidence:
         return self.confirms(apart=False)
 
     def confirms(self, apart: bool) -> bool:
-        """True if significantly more is found again than where two places look alike.
-
-        Args:
-            apart: whether the two sides are of different recordings, as may be of two homes of one
-                plan.
-        """
-        return self.least > (_ONE_PLAN_SHARE if apart else _LOOK_ALIKE_SHARE)
+        """True if significantly more is found again than where two places look alike; `apart` as
+        of `least`."""
+        alike = self.least() <= _LOOK_ALIKE_SHARE
+        return not alike and (not apart or self.least(apart) > _ONE_PLAN_SHARE)
 
     @property
     def refuted(self) -> bool:
@@ -130,8 +156,11 @@ class JoinEvidence:
         """True if significantly less than `_ABSENT_SHARE` is found again."""
         return self.share + _NUM_SIGMAS * self.sigma < _ABSENT_SHARE
 
-    def beats(self, other: "JoinEvidence") -> bool:
-        """True if this join is significantly better than another."""
+    def beats(self, other: "JoinEvidence", apart: bool = False) -> bool:
+        """True if this join is significantly better than another; `apart` as of `least`."""
+        if apart:
+            sigma = np.hypot(self.placed_sigma, other.placed_sigma)
+            return self.placed - other.placed > _NUM_SIGMAS * float(sigma)
         return self.share - other.share > _NUM_SIGMAS * float(np.hypot(self.sigma, other.sigma))
 
 
@@ -156,15 +185,20 @@ def rates(
     pairs = np.concatenate([nearest_pairs(places, some, some) for some in rows])
     pairs = pairs[np.linspace(0, len(pairs) - 1, min(len(pairs), _MAX_PAIRS)).astype(int)]
     seen = predict(context, places, pairs, surfaces)[0]
-    numbers, hits = (np.bincount(seen.bins, w, _NUM_BINS) for w in (None, seen.found))
-    mean = (hits.sum() + _PRIOR_COUNT * _DEFAULT_RATE) / (numbers.sum() + _PRIOR_COUNT)
-    within = (hits + _PRIOR_COUNT * mean) / (numbers + _PRIOR_COUNT)
+    numbers = np.bincount(seen.bins, None, _NUM_BINS)
+
+    def by_change_of_view(worth: np.ndarray) -> np.ndarray:
+        hits = np.bincount(seen.bins, worth, _NUM_BINS)
+        mean = (hits.sum() + _PRIOR_COUNT * _DEFAULT_RATE) / (numbers.sum() + _PRIOR_COUNT)
+        return (hits + _PRIOR_COUNT * mean) / (numbers + _PRIOR_COUNT)
+
     poses, odd = places.world_T_rigs.copy(), np.arange(len(parts)) % 2 == 1
     cosine, sine = np.cos(_CHANCE_ROTATION_RAD), np.sin(_CHANCE_ROTATION_RAD)
     poses[odd, :3, :3] = poses[odd, :3, :3] @ [[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]]
     turned = pairs[odd[pairs[:, 0]] != odd[pairs[:, 1]]]
     away = predict(context, replace(places, world_T_rigs=poses), turned, surfaces)[0]
-    return Rates(within, float(away.found.mean()) if len(away.found) else 0.0)
+    chance = float(away.found.mean()) if len(away.found) else 0.0
+    return Rates(by_change_of_view(seen.found), chance, by_change_of_view(seen.placed))
 
 
 def weigh(
@@ -190,7 +224,7 @@ def weigh(
     """
     pairs = nearest_pairs(places, *groups)[:_MAX_PAIRS]
     seen, found = predict(context, places, pairs, surfaces)
-    if not len(seen.found):
+    if not len(seen.bins):
         return JoinEvidence(0.0, np.inf, 0), found
     return evidence_of(seen, usual, depth), found
 
@@ -210,17 +244,21 @@ def evidence_of(seen: Predictions, usual: Rates, depth: float) -> JoinEvidence:
     cells = np.floor(seen.points_world / (_CELL_DEPTHS * depth)).astype(np.int64)
     cells, cell_of = np.unique(cells, axis=0, return_inverse=True)
     cell_of = cell_of.ravel()
-    excess = np.bincount(cell_of, seen.found - usual.chance)
-    expected = np.bincount(cell_of, usual.within[seen.bins] - usual.chance)
+    found = seen.found - usual.chance, usual.within[seen.bins] - usual.chance
+    placed = seen.placed, usual.placed[seen.bins]
     regions = np.floor(cells * (_CELL_DEPTHS / _REGION_DEPTHS)).astype(np.int64)
     region_of = np.unique(regions, axis=0, return_inverse=True)[1].ravel()
 
-    def by(numbers: np.ndarray) -> JoinEvidence:
-        sums = [np.bincount(region_of, some / numbers) for some in (excess, expected)]
-        return JoinEvidence(*_share(*sums), len(cells))
+    def share(counted: tuple[np.ndarray, np.ndarray], numbers: np.ndarray) -> tuple[float, float]:
+        sums = [np.bincount(region_of, np.bincount(cell_of, some) / numbers) for some in counted]
+        return _share(*sums)
 
-    by_cells, by_points = by(np.bincount(cell_of)), by(np.ones(len(cells)))
-    if by_cells.confirmed and by_points.least < by_cells.least:
+    each, one = np.bincount(cell_of), np.ones(len(cells))
+    at_place = share(placed, one)
+    by_cells, by_points = (
+        JoinEvidence(*share(found, numbers), len(cells), *at_place) for numbers in (each, one)
+    )
+    if by_cells.confirmed and by_points.least() < by_cells.least():
         return by_points
     return by_cells
 
@@ -277,19 +315,23 @@ def predict(
     """
     gates = [Gate.around_points(_GATE_RAD)] * len(pairs)
     found = context.match(pairs, places.world_T_rigs, gates, places.known, guided_only=True)
-    parts = [_predicted(places, f, g, found.of(p), surfaces) for p, (f, g) in enumerate(pairs)]
-    points, bins, hits = (
+    seen = context.keypoints.bearings_of
+    parts = [
+        _predicted(places, f, g, found.of(p), seen(g), surfaces)
+        for p, (f, g) in enumerate(pairs.tolist())
+    ]
+    points, bins, off = (
         np.concatenate([empty, *(part[n] for part in parts)])
-        for n, empty in enumerate((np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros(0, bool)))
+        for n, empty in enumerate((np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros(0)))
     )
-    return Predictions(points, bins, hits), found
+    return Predictions(points, bins, off), found
 
 
 def _predicted(
-    places: Places, f: int, g: int, matched: np.ndarray, surfaces: bool
+    places: Places, f: int, g: int, matched: np.ndarray, bearings: np.ndarray, surfaces: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Predictions of one pair: points (V, 3) in the world, bins (V,) of change of view, found
-    (V,)."""
+    """Predictions of one pair: points (V, 3) in the world, bins (V,) of change of view, and the
+    angle (V,) to the keypoint of g, of those seen along bearings (K, 3), that is matched."""
     rows = np.flatnonzero(np.isfinite(places.known[f]).all(axis=1))
     own, g_T_f = places.known[f][rows], inverse(places.world_T_rigs[g]) @ places.world_T_rigs[f]
     there = own @ g_T_f[:3, :3].T + g_T_f[:3, 3]
@@ -303,7 +345,10 @@ def _predicted(
     ratios = np.digitize(np.abs(np.log(before / distances)), _LOG_RATIO_EDGES)
     world_T_f = places.world_T_rigs[f]
     points = own @ world_T_f[:3, :3].T + world_T_f[:3, 3]
-    return points, angles * (len(_LOG_RATIO_EDGES) + 1) + ratios, np.isin(rows, matched[:, 0])
+    seen = np.full((len(places.known[f]), 3), np.nan)
+    seen[matched[:, 0]] = bearings[matched[:, 1]]
+    off = angles_between(seen[rows], there)
+    return points, angles * (len(_LOG_RATIO_EDGES) + 1) + ratios, off
 
 
 def _on_surface(known: np.ndarray, directions: np.ndarray, distances: np.ndarray) -> np.ndarray:

@@ -64,14 +64,15 @@ class JoinTest:
             return found
         # More frames give more evidence, if drift permits.
         wider = self._judged(proposal, rows, inside, join_evidence.WIDER)
-        return max((found, wider), key=lambda one: one.evidence.least)
+        return max((found, wider), key=lambda one: one.evidence.least(apart))
 
-    def rivals(self, best: Judged, others: Sequence[Judged]) -> list[Judged]:
-        """Confirmed proposals for another place that `best` does not significantly beat."""
+    def rivals(self, best: Judged, others: Sequence[Judged], apart: bool = False) -> list[Judged]:
+        """Confirmed proposals for another place that `best` does not significantly beat; `apart`
+        as of `judge`."""
         return [
             other
             for other in others
-            if other.evidence.confirmed and not best.evidence.beats(other.evidence)
+            if other.evidence.confirms(apart) and not best.evidence.beats(other.evidence, apart)
             if not alike(best.proposal, other.proposal, self.poses, self.depth, _SAME_PLACE_FACTOR)
         ]
 

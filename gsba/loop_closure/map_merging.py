@@ -225,11 +225,11 @@ class _Joining:
         if not weighed:
             self.reasons[part] = "no frame of it shares enough points with a frame of another map"
             return None
-        best = max(weighed, key=lambda one: one.evidence.least)
+        best = max(weighed, key=lambda one: one.evidence.least(apart))
         frames, why = best.proposal.frames, best.evidence
         logger.info("a part of %d frames overlaps the map at frames %s: %s", len(rows), frames, why)
         certain = why.confirms(apart)
-        if certain and not self.test.rivals(best, weighed):
+        if certain and not self.test.rivals(best, weighed, apart):
             return best.proposal.move
         self.reasons[part] = "it fits two places" if certain else f"not certain: {why}"
         return None

@@ -77,10 +77,27 @@ def test_corners_and_what_covers_walls_must_both_be_found_again(
     pictures = 4 * np.stack([np.arange(60, 80), np.zeros(20), np.zeros(20)], axis=1)
     cells = np.concatenate([np.repeat(places, 10, axis=0), np.repeat(pictures, 1000, axis=0)])
     tenths = np.where(np.arange(len(cells)) < 4000, corners, textures)
-    found = np.arange(len(cells)) % 10 < tenths
-    seen = join_evidence.Predictions(cells + 0.5, np.zeros(len(cells), np.int64), found)
-    usual = join_evidence.Rates(np.full(24, 0.4), 0.1)
+    off = np.where(np.arange(len(cells)) % 10 < tenths, 0.0, np.nan)
+    seen = join_evidence.Predictions(cells + 0.5, np.zeros(len(cells), np.int64), off)
+    usual = join_evidence.Rates(np.full(24, 0.4), 0.1, np.full(24, 0.4))
     assert join_evidence.evidence_of(seen, usual, depth).confirmed == confirmed
+
+
+@pytest.mark.parametrize(("at_place", "joined"), [(1.0, True), (0.7, True), (0.4, False)])
+def test_what_matches_beside_its_place_does_not_join_recordings(
+    at_place: float, joined: bool, rng: np.random.Generator
+) -> None:
+    """All is found that is found within parts, some of it at its place, the rest by chance."""
+    cells = np.stack(np.unravel_index(np.arange(4000), (100, 40, 1)), axis=1)
+    cells = np.repeat(cells, 5, axis=0)
+    anywhere = np.deg2rad(4.0) * np.sqrt(rng.uniform(size=len(cells)))  # even over a disc
+    off = np.where(rng.uniform(size=len(cells)) < at_place, np.deg2rad(0.3), anywhere)
+    off[rng.uniform(size=len(cells)) > 0.4] = np.nan
+    seen = join_evidence.Predictions(cells + 0.5, np.zeros(len(cells), np.int64), off)
+    usual = join_evidence.Rates(np.full(24, 0.4), 0.0, np.full(24, 0.4))
+    found = join_evidence.evidence_of(seen, usual, 4.0)
+    assert abs(found.placed - at_place) < 0.05
+    assert found.confirmed and found.confirms(apart=True) == joined
 
 
 def test_points_are_expected_as_often_as_the_recordings_that_meet_find_them() -> None:
@@ -100,7 +117,7 @@ def test_points_are_expected_as_often_as_the_recordings_that_meet_find_them() ->
     assert measured == [[0, 2]] and again == found
     one = JoinTest(context, TRUTH, known, depth, np.zeros_like(owners), rates)
     by_all = one.weigh(*ENDS, Sim3())[0]
-    assert measured[1:] == [[0, 1, 2]] and by_all.least < found.least - 0.05
+    assert measured[1:] == [[0, 1, 2]] and by_all.least() < found.least() - 0.05
     assert found.confirms(apart=True)
     turned = Rotation.from_rotvec([0, np.deg2rad(90), 0]).as_matrix()
     centre = TRUTH[-1, :3, 3]
