@@ -12,6 +12,7 @@ from gsba.bundle.tracks import runs
 from gsba.disk import concatenated
 from gsba.memory import release_mapped_files
 from gsba.types import Keypoints, Landmarks, Tracks
+from gsba.types.records import slices
 
 _AT_ONCE = 1 << 18  # observations whose residuals are held: 25 MB
 _MIN_REDUNDANCY = 0.1  # least share of residual dimensions beyond the unknowns
@@ -89,8 +90,7 @@ def with_scaled_noise(
     infos = keypoints.sqrt_infos
 
     def scaled() -> Iterator[tuple[np.ndarray, ...]]:
-        for first in range(0, max(len(factors), 1), _AT_ONCE):
-            some = slice(first, first + _AT_ONCE)
+        for some in slices(len(factors), _AT_ONCE):
             sigmas = keypoints.sigmas_rad[some] * factors[some]
             yield sigmas, *([] if infos is None else [infos[some] / factors[some, None, None]])
             release_mapped_files()

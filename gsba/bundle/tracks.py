@@ -7,6 +7,7 @@ import numpy as np
 from factors.compiled import kernel_and_part
 from gsba.memory import release_mapped_files
 from gsba.types import Matches, Tracks
+from gsba.types.records import slices
 
 _kernel, _ = kernel_and_part()
 _AT_ONCE = 1 << 20  # matches that are numbered together
@@ -33,7 +34,7 @@ def build(matches: Sequence[Matches], num_keypoints: np.ndarray) -> Tracks:
     matched[edges[:, 0]], matched[edges[:, 1]] = True, True
     nodes = np.flatnonzero(matched).astype(number)  # all others are tracks of their own
     place = np.cumsum(matched, dtype=number) - 1
-    for some in _slices(len(edges)):
+    for some in slices(len(edges), _AT_ONCE):
         edges[some] = place[edges[some]]
     del matched, place
     of_frames = np.diff(np.searchsorted(nodes, first_node))
@@ -62,18 +63,12 @@ def _edges(matches: Sequence[Matches], first_node: np.ndarray) -> np.ndarray:
     first = 0
     for part in matches:
         pair_of_row = np.repeat(np.arange(len(part.pairs), dtype=np.int32), np.diff(part.offsets))
-        for some in _slices(len(part.keypoints)):
+        for some in slices(len(part.keypoints), _AT_ONCE):
             rows = slice(first + some.start, first + some.stop)
             edges[rows] = first_node[part.pairs[pair_of_row[some]]] + part.keypoints[some]
             release_mapped_files()
         first += len(part.keypoints)
     return edges
-
-
-def _slices(num: int) -> Iterator[slice]:
-    """Ranges of at most `_AT_ONCE` of `num` rows."""
-    for first in range(0, num, _AT_ONCE):
-        yield slice(first, min(first + _AT_ONCE, num))
 
 
 def runs(tracks: Tracks, most: int) -> Iterator[tuple[slice, slice, Tracks]]:

@@ -13,6 +13,7 @@ from gsba.disk import concatenated
 from gsba.geometry import moved_to
 from gsba.memory import release_mapped_files
 from gsba.types import Counts, Keypoints, Landmarks, Reconstruction, Tracks
+from gsba.types.records import slices
 
 _AT_ONCE = 1 << 18  # observations whose rays are held: 60 MB
 _NONE = Counts(0, 0, "tracks")
@@ -77,8 +78,7 @@ def _rays(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Directions (O, 3) of rays in the world, and where they start (O, 3)."""
     rays, centres = np.empty((len(frames), 3)), np.empty((len(frames), 3))
-    for first in range(0, len(frames), _AT_ONCE):
-        some = slice(first, first + _AT_ONCE)
+    for some in slices(len(frames), _AT_ONCE):
         starts = None if origins is None else origins[some]
         world_T_lenses = moved_to(world_T_rigs[frames[some]], starts)
         rays[some] = np.einsum("oij,oj->oi", world_T_lenses[:, :3, :3], bearings[some])

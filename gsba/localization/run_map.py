@@ -32,7 +32,6 @@ _SAME_PLACE_SIGMAS = 6.0  # largest angle between a keypoint and the observation
 # taken for the keypoint's, standard deviations of the keypoint
 _SAME_PLACE_RAD = np.deg2rad(0.25)  # and largest such angle
 _PRIOR_EXTENTS = 10.0  # standard deviation of a point before any observation, extents of the map
-_NUM_OBSERVATIONS_AT_ONCE = 1 << 18
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,14 +232,12 @@ def point_covariances(result: Reconstruction) -> np.ndarray:
     positions = poses[:, :3, 3]
     extent = max(float(np.linalg.norm(np.ptp(positions, axis=0))), 1e-12)
     informations = np.tile(np.eye(3) / (_PRIOR_EXTENTS * extent) ** 2, (num, 1, 1))
-    for start in range(0, len(result.observation_points), _NUM_OBSERVATIONS_AT_ONCE):
-        some = slice(start, start + _NUM_OBSERVATIONS_AT_ONCE)
-        frames, points = result.observation_frames[some], result.observation_points[some]
-        origins = result.observation_origins
-        lenses = moved_to(poses[frames], None if origins is None else origins[some])
-        distances = np.linalg.norm(result.points_world[points] - lenses[:, :3, 3], axis=1)
-        scales = result.observation_sigmas[some] * np.maximum(distances, 1e-12)
-        axes = tangent_basis(result.observation_bearings[some]) / scales[:, None, None]
+    for some in result.pieces():
+        points = some.observation_points
+        lenses = moved_to(poses[some.observation_frames], some.observation_origins)
+        distances = np.linalg.norm(some.points_world[points] - lenses[:, :3, 3], axis=1)
+        scales = some.observation_sigmas * np.maximum(distances, 1e-12)
+        axes = tangent_basis(some.observation_bearings) / scales[:, None, None]
         axes = axes @ np.swapaxes(lenses[:, :3, :3], 1, 2)
         np.add.at(informations, points, np.swapaxes(axes, 1, 2) @ axes)
     return np.linalg.inv(informations)

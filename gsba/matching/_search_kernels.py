@@ -57,22 +57,17 @@ def search(first, second, cells, targets, only_targets, direction, limits):
     n0, n1, dim = len(descriptors0), len(descriptors1), descriptors0.shape[1]
     head = min(HEAD, dim)
     # Contiguous, so that they stay in the cache.
-    heads = (
-        np.ascontiguousarray(descriptors0[:, :head]),
-        np.ascontiguousarray(descriptors1[:, :head]),
-    )
-    columns, balls, no_radii = (
-        _columns(second.bearings),
-        _columns(cells.centres),
-        np.zeros(n1, np.float32),
-    )
+    head0 = np.ascontiguousarray(descriptors0[:, :head])
+    head1 = np.ascontiguousarray(descriptors1[:, :head])
+    columns, balls = _columns(second.bearings), _columns(cells.centres)
+    no_radii = np.zeros(n1, np.float32)
     marks, worth = np.empty(n1, np.bool_), np.empty(len(cells.radii), np.bool_)
     found0, found1 = _no_candidates(n0), _no_candidates(n1)
     for i in range(n0):
         if not (only_targets and np.isnan(targets[i, 0])):
             _search_row(
-                i, first, second, heads, cells, columns, balls, no_radii, targets, only_targets,
-                direction, limits, marks, worth, found0, found1,
+                i, first, second, (head0, head1), cells, columns, balls, no_radii, targets,
+                only_targets, direction, limits, marks, worth, found0, found1,
             )  # fmt: skip
     best0, top0, next0 = found0
     best1, _, next1 = found1

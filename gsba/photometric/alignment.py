@@ -19,6 +19,7 @@ from gsba.photometric.packing import Observed, Shown, pack
 from gsba.photometric.references import references, visible_frames
 from gsba.store.shards import Workers
 from gsba.types import Counts, Keypoints, Landmarks, Sighted, Solution
+from gsba.types.records import slices
 
 _TOO_UNCERTAIN = "position too uncertain"
 _SIGHTINGS_AT_ONCE = 1 << 17  # sightings processed together: some 80 MB
@@ -129,8 +130,8 @@ def _by_hosts(hosts: np.ndarray, positions: np.ndarray) -> Iterator[np.ndarray]:
     """
     most = max(total_memory_bytes() // (_MEMORY_SHARE * _BYTES_PER_POINT), 1)
     order = np.argsort(_numbers_by_place(positions)[hosts], kind="stable")
-    for first in range(0, max(len(order), 1), most):
-        yield np.sort(order[first : first + most])
+    for some in slices(len(order), most):
+        yield np.sort(order[some])
 
 
 def _numbers_by_place(positions: np.ndarray) -> np.ndarray:
@@ -271,11 +272,10 @@ def _accepted(
 ) -> tuple[np.ndarray, Observed]:
     """Accepted rows (N,) of the sightings, as observations; rejections are added to `dropped`."""
     parts = []
-    for first in range(0, max(len(seeing), 1), _SIGHTINGS_AT_ONCE):
-        some = slice(first, first + _SIGHTINGS_AT_ONCE)
+    for some in slices(len(seeing), _SIGHTINGS_AT_ONCE):
         there = Sightings(*(array[some] for array in sightings))
         kept, bearings, covariances = accepted_rows(patches, there, pixel, settings, dropped)
-        parts.append((first + kept, bearings, covariances))
+        parts.append((some.start + kept, bearings, covariances))
     kept, bearings, covariances = (np.concatenate(column) for column in zip(*parts, strict=True))
     found = Observed(sightings.templates[kept], seeing[kept], bearings, covariances)
     return kept, found

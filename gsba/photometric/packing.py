@@ -28,14 +28,15 @@ class Observed:
     def joined(cls, parts: "Iterator[Observed]", folder: Path | None) -> "Observed":
         """All of at least one part, in files of a folder or in memory (None)."""
         columns = (
-            (part.points.astype(np.int32), part.frames.astype(np.int32), *part._measured)
+            (
+                part.points.astype(np.int32),
+                part.frames.astype(np.int32),
+                part.bearings_rig,
+                part.covariances,
+            )
             for part in parts
         )
         return cls(*concatenated(columns, folder))
-
-    @property
-    def _measured(self) -> tuple[np.ndarray, np.ndarray]:
-        return self.bearings_rig, self.covariances
 
     def __len__(self) -> int:
         return len(self.points)

@@ -6,10 +6,10 @@ at once, instead of few first and more later.
 """
 
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
+from factors.threads import map_in_threads
 from gsba.features.extraction import Search
 from gsba.geometry import inverse
 from gsba.matching import guided_search
@@ -69,13 +69,12 @@ def _matches(run: Run, found: Mapping[str, Features], steps: np.ndarray) -> floa
     chance = gate.chance(np.deg2rad(settings.verify.max_error_deg))
     frames = SearchableFrames(load, pairs.strongest_per_face)
 
-    def verified(step: tuple[int, int]) -> int:
-        f0, f1 = step
+    def verified(step: int) -> int:
+        f0, f1 = steps[step].tolist()
         f0_T_f1 = inverse(poses[f0]) @ poses[f1]
         rows = guided_search.guided(frames, (f0, f1), f0_T_f1, gate, settings.matching)
         rays = load(f0).bearings_rig[rows[:, 0]], load(f1).bearings_rig[rows[:, 1]]
         pose = relative_pose(*rays, settings.verify, settings.seed, chance)
         return 0 if pose is None else int(np.count_nonzero(pose.inliers))
 
-    with ThreadPoolExecutor(run.num_threads) as pool:
-        return float(np.median(list(pool.map(verified, map(tuple, steps.tolist())))))
+    return float(np.median(list(map_in_threads(verified, len(steps), run.num_threads))))

@@ -40,10 +40,8 @@ FORMAT = 1  # raised whenever the layout below changes
 HEADER_ERRORS = (SyntaxError, tokenize.TokenError, RecursionError)  # of a damaged .npy or JSON
 _MANIFEST = "manifest.json"
 _ALIGNMENT = 64  # bytes, of arrays in a file: that of .npy headers
-_LOCAL_HEADER, _ZIP64_FIELD = (
-    30,
-    20,
-)  # bytes of a member before its name, and of its sizes behind it
+_LOCAL_HEADER = 30  # bytes of a member before its name
+_ZIP64_FIELD = 20  # bytes of its sizes behind it
 _PADDING_FIELD = 0xD935  # number of the extra field that zip files are aligned by
 _BYTES_AT_ONCE = 1 << 22  # that are checked, of an array that stays on the disk
 MIN_MAPPED_BYTES = 1 << 22  # of arrays that are worth a mapping

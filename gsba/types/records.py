@@ -11,10 +11,10 @@ from gsba.types.frame_set import PictureFormat
 _AT_ONCE = 1 << 18  # observations whose poses are held together: 35 MB
 
 
-def _slices(num: int) -> Iterator[slice]:
-    """Ranges of `num` observations, one at least, of at most `_AT_ONCE`."""
-    for first in range(0, max(num, 1), _AT_ONCE):
-        yield slice(first, min(first + _AT_ONCE, num))
+def slices(num: int, most: int) -> Iterator[slice]:
+    """Ranges of at most `most` of `num` items that are held together; at least one."""
+    for first in range(0, max(num, 1), most):
+        yield slice(first, min(first + most, num))
 
 
 class PoseSource(IntEnum):
@@ -383,7 +383,7 @@ class Solution:
         """Median distance of points from observing frames, map units; 0 without points."""
         tracks, points = self.landmarks.tracks, self.landmarks.points_world
         depths = np.empty(len(tracks))
-        for some in _slices(len(tracks)):
+        for some in slices(len(tracks), _AT_ONCE):
             offsets = points[tracks.points[some]] - self.world_T_rigs[tracks.frames[some], :3, 3]
             depths[some] = np.linalg.norm(offsets, axis=1)
         return float(np.median(depths, overwrite_input=True)) if len(depths) else 0.0
@@ -514,7 +514,7 @@ class Reconstruction:
     def pieces(self) -> "Iterator[Reconstruction]":
         """The reconstruction with some of its observations at a time, one piece at least."""
         origins = self.observation_origins
-        for some in _slices(len(self.observation_frames)):
+        for some in slices(len(self.observation_frames), _AT_ONCE):
             yield replace(
                 self,
                 observation_points=self.observation_points[some],
