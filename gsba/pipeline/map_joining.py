@@ -439,9 +439,27 @@ def _matches_of(tracks: Tracks) -> Matches:
 
 
 def _across(state: State, parts: np.ndarray, merged: Registered) -> State:
-    """The state with matches of frames of different parts, around the joined maps' points."""
+    """The state with matches of frames of different parts (F,), around the joined maps' points.
+
+    Where frames share few points, no two of them confirm each other, as all together have confirmed
+    the join: then matches are those within the bearings that the join predicts.
+    """
+    if not merged.met.any():
+        return state
     near = state.with_solution(replace(_by_features(state), noise=1.0))
-    return frontend.match_across(near, parts) if merged.met.any() else state
+    found = frontend.match_across(near, parts)
+    across = found.matches.across
+    assert across is not None
+    if set(parts[across.pairs].ravel()) >= _met_parts(parts, merged):
+        return found
+    return frontend.match_known_points_across(found, parts, "across_points")
+
+
+def _met_parts(parts: np.ndarray, merged: Registered) -> set[int]:
+    """Parts of maps that images joined from several ones."""
+    joined = np.unique(np.column_stack([merged.components, parts])[merged.met], axis=0)
+    maps, numbers = np.unique(joined[:, 0], return_counts=True)
+    return set(joined[np.isin(joined[:, 0], maps[numbers > 1]), 1].tolist())
 
 
 def _crossing(state: State, parts: np.ndarray) -> Tracks:

@@ -47,6 +47,7 @@ _TITLES = {
     "registered": "join maps",
     "across": "match frames of joined maps",
     "similarities": "estimate similarities between maps",
+    "across_points": "match points of joined maps whose frames share few",
     "across2": "match frames of joined maps, the points that they share known",
     "joined": "adjust joined maps",
     "loops": "match loops",

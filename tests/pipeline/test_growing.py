@@ -28,6 +28,7 @@ from gsba.export import ExportFormat
 from gsba.localization import Localizer
 from gsba.log import GsbaError
 from gsba.similarity import Sim3
+from gsba.types import VerifiedPairs
 from gsba.view import load_scene
 
 _MAX_ERROR = 0.0015  # of a map of both recordings: an eighteenth of a pixel, two units away
@@ -211,6 +212,15 @@ def test_merged_runs_are_as_good_as_a_grown_one(
     assert result.exit_code == 0, result.output
     assert home.error(out) < _MAX_ERROR  # its ratio to that of `grown` scatters by a fifth
     assert _content(home.run) | _content(second_run) == before
+
+
+def test_maps_are_tied_where_no_two_frames_share_enough_points(
+    home: GrowingHome, second_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    nothing = VerifiedPairs.none()
+    monkeypatch.setattr("gsba.matching.correspondences.match_across", lambda *_: nothing)
+    merge_runs([home.run, second_run], tmp_path / "run")
+    assert home.error(tmp_path / "run") < _MAX_ERROR
 
 
 def test_rigid_merging_keeps_both_maps_and_tells_how_sure_it_is(
