@@ -21,6 +21,7 @@ SETTINGS = RefineSettings.model_validate(  # lighter than the defaults
         "cubemap": {"face_size": 256},
         "features": {"max_per_face": 400},
         "solver": {"num_threads": 2},
+        "weak_frames": {"mode": "off"},
     }
 )
 

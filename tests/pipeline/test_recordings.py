@@ -32,6 +32,7 @@ SET = (
     f"cubemap.face_size={SETTINGS.cubemap.face_size}",
     f"features.max_per_face={SETTINGS.features.max_per_face}",
     f"solver.num_threads={SETTINGS.solver.num_threads}",
+    f"weak_frames.mode={SETTINGS.weak_frames.mode}",
     'export.formats=["colmap-flat", "tum"]',
 )
 
