@@ -16,6 +16,7 @@ meet, or no pair of one flat is joined.
 
 import argparse
 import json
+import re
 import shutil
 import sys
 from collections.abc import Sequence
@@ -38,10 +39,13 @@ MIN_FRAMES = 3  # of a map that is checked: fewer can always be aligned to the t
 TIMEOUT_S = 3600.0
 MEET_NOWHERE = "meet nowhere"  # in the message of `gsba merge` that refuses maps of two places
 HEAD = [
-    "| recordings | by | frames | maps: frames of each (worst frame, of its extent) | CPU s | "
-    "verdict |",
-    "|---|---|---:|---|---:|---|",
+    "| recordings | by | frames | maps: frames of each (worst frame, of its extent) | found again, "
+    "at its place | CPU s | verdict |",
+    "|---|---|---:|---|---:|---:|---|",
 ]
+_SHARES = re.compile(
+    r"(\d+) % \(sigma (\d+) %\) of the points expected.*?(-?\d+) % \(sigma (\d+) %\) at their place"
+)  # that did not suffice for a join
 _GSBA = [sys.executable, "-c", "from gsba.cli import main; main()"]
 _SET = ["--allow-partial", "--set", "export.formats=[]"]
 
@@ -128,7 +132,9 @@ class Bench(NamedTuple):
         shutil.rmtree(folder, ignore_errors=True)  # a refused merge would go on where it was
 
         def finish() -> dict[str, Any]:
-            return {"errors": check_maps(run, recordings)}
+            maps = json.loads((run / "report.json").read_text())["maps"]
+            apart = "; ".join(one["reason"] for one in maps if one["reason"])
+            return {"errors": check_maps(run, recordings), "apart": apart}
 
         row = {"key": key, "by": by, "frames": sum(len(one.cut.rows) for one in recordings)}
         row = run_row([*_GSBA, *words, "--out", str(run)], folder, row, finish, TIMEOUT_S)
@@ -158,7 +164,9 @@ def line(what: str, row: dict[str, Any]) -> str:
         for one in row.get("errors", ())
     ]
     cells = [what, row["by"], str(row["frames"]), ", ".join(maps) or "nothing written"]
-    cells += [f"{row['cpu_s']:.0f}", verdict(row)]
+    shares = _SHARES.findall(row.get("apart", "") or row.get("reason", ""))
+    found = "; ".join("{} ± {} %, {} ± {} %".format(*each) for each in shares)
+    cells += [found, f"{row['cpu_s']:.0f}", verdict(row)]
     return f"| {' | '.join(cells)} |"
 
 
@@ -223,7 +231,9 @@ def main() -> None:
         add(pairs[n], bench.jointly(*pairs[n]), False)
     foot = (
         f"False join: a map has frames of two flats. Wrong map: a frame is off by more than "
-        f"{MAX_ERROR:.0%} of its map's extent after alignment of the map to the truth. Recordings: "
+        f"{MAX_ERROR:.0%} of its map's extent after alignment of the map to the truth. "
+        "Found again: points expected in both recordings, at the best place that was refused, and "
+        "those of them at their place, as shares of a true join's. Recordings: "
         f"{NUM_FRAMES} frames. `merge`: of runs refined alone, from trajectories with drift. "
         "`refine`: both recordings in one run, from images alone."
     )

@@ -46,7 +46,7 @@ def cut(
     header, *rows = (walk / "images/timestamps.csv").read_text().splitlines()
     noise = camera_noise(width, seed) if width else None
     for n, row in enumerate(rows[:num]):
-        name = f"{row.partition(',')[0]}.jpg"
+        name = Path(row.partition(",")[0]).with_suffix(".jpg").name
         if (images / name).exists():
             continue
         if noise is None:
