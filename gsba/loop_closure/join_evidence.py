@@ -28,7 +28,8 @@ _NUM_NEAREST = 3  # nearest frames that each frame is compared with
 _MAX_PAIRS = 150  # largest number of compared pairs of frames
 _TRIANGULATION_GAP = 2  # largest gap in frames between matches that make points
 _GATE_RAD = np.deg2rad(4.0)  # radius around a point's predicted bearing
-_PLACE_RAD = np.deg2rad(2.0)  # radius in which true matches lie; chance spreads them over the gate
+_PLACE_RAD = np.deg2rad(0.7)  # radius in which most true matches lie; chance, and things that only
+# stand at similar places, spread them over the gate
 _BESIDE = -(_PLACE_RAD**2) / (_GATE_RAD**2 - _PLACE_RAD**2)  # worth of a match outside this radius:
 # matches by chance cancel
 # Chord around the predicted bearing within which a frame must know a surface.
@@ -48,8 +49,8 @@ _PRIOR_REGIONS = 1.0  # prior number of regions with nothing found, and of regio
 # Share found again at a look-alike: as much as in a hall of repeated arches, one arch further on.
 _LOOK_ALIKE_SHARE = 0.3
 # Share found at its place, above what two homes of one plan with furniture at the same places have:
-# 15 to 48 % in 16 rendered pairs. Homes filmed twice: 108 to 110 %, in another light 70 %.
-_ONE_PLAN_SHARE = 0.5
+# at most 30 % in rendered pairs. Homes filmed twice: 101 %, in another light 68 to 84 %.
+_ONE_PLAN_SHARE = 0.4
 _NUM_SIGMAS = 3.09  # standard deviations of a one-sided error rate of 1e-3
 _ABSENT_SHARE = 0.1  # share that counts as nothing found
 

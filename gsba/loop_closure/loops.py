@@ -9,6 +9,8 @@ import logging
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.spatial import KDTree
 
 from gsba.config import RefineSettings
 from gsba.geometry import inverse, rotation_angle
@@ -20,10 +22,13 @@ from gsba.loop_closure.retrieval import global_descriptors
 from gsba.matching import recovery
 from gsba.matching.guided_search import MatchContext
 from gsba.similarity import relative_map
-from gsba.types import Counts, Keypoints, Solution, VerifiedPairs
+from gsba.types import Counts, Keypoints, Solution, Tracks, VerifiedPairs
 
 logger = logging.getLogger(__name__)
 _NUM_CANDIDATES = 3  # candidate places for each frame
+_ENOUGH_POINTS = 15  # common points by which two frames are held together in the map
+_NEAR_DEPTHS = 0.25, 0.5  # distances of neighbours that places met again are compared with, depths
+_LEAST_ALIKE_SHARE = 0.01  # share of these neighbours that look less alike
 MIN_GROUP = 3  # least number of pairs that agree
 RIVAL = 1.5  # ratio by which a group must outweigh one that contradicts it
 # Largest rotation error of the map between two frames; of each step without matches besides.
@@ -55,7 +60,8 @@ def close(context: MatchContext, solved: Solution, unseen: np.ndarray) -> Closed
     strongest = replace(context, frames=context.strongest)
     verified = recovery.match_anywhere(strongest, chosen)
     loops = _measured_loops(verified, keypoints, solved, settings.seed)
-    within = [loop for loop in loops if within_drift(loop, solved, unseen, settings)]
+    poses, depth = solved.world_T_rigs, solved.median_depth()
+    within = [loop for loop in loops if within_drift(loop, poses, depth, unseen, settings)]
     agreeing = consistent(within, solved, settings.pairs.window)
     upheld = _not_refuted(context, solved, agreeing)
     believed = met(upheld, solved, unseen)
@@ -83,20 +89,61 @@ def connected(unseen: np.ndarray, pairs: np.ndarray) -> bool:
 def candidates(
     looks: np.ndarray, solved: Solution, unseen: np.ndarray, settings: RefineSettings
 ) -> np.ndarray:
-    """Pairs (P, 2) int32 with the most similar global descriptors within reach of drift."""
+    """Pairs (P, 2) int32 with the most similar global descriptors within reach of drift.
+
+    Frames that see enough points of the map in common are held together already. And where places
+    are met again, some frames look at least as much alike as almost all neighbours along the path
+    do: elsewhere nothing is compared.
+    """
     positions, depth = solved.world_T_rigs[:, :3, 3], solved.median_depth()
-    num = len(positions)
+    num, reach = len(positions), settings.pairs.max_baseline_depths * depth
     drifts = np.concatenate([[0.0], np.cumsum(_max_step_drifts(positions, unseen, settings))])
-    found: set[tuple[int, int]] = set()
+    sharing = _sharing_points(solved.landmarks.tracks, num)
+    least = _least_similarity(looks, solved, unseen, settings.pairs.window)
+    found = dict[tuple[int, int], float]()
     for f in range(num):
-        others = np.arange(num)
-        others = others[np.abs(others - f) > settings.pairs.window // 4]
-        distance = np.linalg.norm(positions[others] - positions[f], axis=1)
-        reach = settings.pairs.max_baseline_depths * depth
-        others = others[distance < reach + np.abs(drifts[others] - drifts[f])]
-        for g in others[np.argsort(-(looks[others] @ looks[f]))[:_NUM_CANDIDATES]]:
-            found.add((min(f, int(g)), max(f, int(g))))
-    return np.array(sorted(found), np.int32).reshape(-1, 2)
+        distance = np.linalg.norm(positions - positions[f], axis=1)
+        chosen = distance < reach + np.abs(drifts - drifts[f])
+        chosen[max(f - settings.pairs.window // 4, 0) : f + settings.pairs.window // 4 + 1] = False
+        chosen[sharing.indices[sharing.indptr[f] : sharing.indptr[f + 1]]] = False
+        others = np.flatnonzero(chosen)
+        alike = looks[others] @ looks[f]
+        for n in np.argsort(-alike)[:_NUM_CANDIDATES]:
+            g = int(others[n])
+            found[min(f, g), max(f, g)] = float(alike[n])
+    pairs = np.array(sorted(found), np.int32).reshape(-1, 2)
+    met = pairs[[found[f, g] >= least for f, g in pairs.tolist()]]
+    gaps = KDTree(met).query(pairs, p=np.inf)[0] if len(met) else np.full(len(pairs), np.inf)
+    return pairs[gaps <= settings.pairs.window]
+
+
+def _sharing_points(tracks: Tracks, num_frames: int) -> csr_matrix:
+    """Sparse matrix (F, F) of the frames that see `_ENOUGH_POINTS` or more in common."""
+    ones = np.ones(len(tracks), np.int32)
+    seen = csr_matrix((ones, (tracks.frames, tracks.points)), (num_frames, tracks.num_points))
+    common = (seen @ seen.T).tocsr()
+    common.data[common.data < _ENOUGH_POINTS] = 0
+    common.eliminate_zeros()
+    return common
+
+
+def _least_similarity(
+    looks: np.ndarray, solved: Solution, unseen: np.ndarray, window: int
+) -> float:
+    """Similarity of almost all frames that are a quarter to a half of the median depth apart along
+    at most `window` steps, which images confirm; of successive ones where none are."""
+    positions, depth = solved.world_T_rigs[:, :3, 3], solved.median_depth()
+    before = np.concatenate([[0], np.cumsum(unseen)])
+    alike, steps = [], []
+    for gap in range(1, min(window, len(positions) - 1) + 1):
+        first = np.flatnonzero(before[gap:] == before[:-gap])
+        found = np.sum(looks[first] * looks[first + gap], axis=1)
+        distances = np.linalg.norm(positions[first + gap] - positions[first], axis=1) / depth
+        alike.append(found[(distances > _NEAR_DEPTHS[0]) & (distances < _NEAR_DEPTHS[1])])
+        steps += [found] if gap == 1 else []
+    some = np.concatenate(alike) if alike else np.zeros(0)
+    some = some if len(some) else np.concatenate(steps)
+    return float(np.quantile(some, _LEAST_ALIKE_SHARE)) if len(some) else -1.0
 
 
 def _max_drift(
@@ -133,16 +180,23 @@ def _measured_loops(
 
 
 def within_drift(
-    loop: Loop, solved: Solution, unseen: np.ndarray, settings: RefineSettings
+    loop: Loop, poses: np.ndarray, depth: float, unseen: np.ndarray, settings: RefineSettings
 ) -> bool:
-    """True if a loop needs no more drift than the path between its frames can have."""
-    poses = solved.world_T_rigs
+    """True if a loop needs no more drift than the path between its frames can have.
+
+    Args:
+        loop: the loop.
+        poses: (F, 4, 4) of the map.
+        depth: median distance of points, map units.
+        unseen: (F - 1,) bool, steps that no images confirm.
+        settings: of the run.
+    """
     slack = _max_drift(loop.f0, loop.f1, poses[:, :3, 3], unseen, settings)
     expected = poses[loop.f0] @ loop.f0_T_f1
     moved = np.linalg.norm(expected[:3, 3] - poses[loop.f1, :3, 3])
     turned = np.degrees(rotation_angle(expected[:3, :3].T @ poses[loop.f1, :3, :3]))
     allowed = _MAX_ROTATION_DEG + _UNSEEN_ROTATION_DEG * np.count_nonzero(unseen[loop.f0 : loop.f1])
-    return bool(moved < slack + AGREE * solved.median_depth() and turned < allowed)
+    return bool(moved < slack + AGREE * depth and turned < allowed)
 
 
 def consistent(loops: list[Loop], solved: Solution, window: int) -> list[Loop]:

@@ -316,9 +316,8 @@ class _Joining:
         first, last = sorted(ends)
         step = inverse(ends[first]) @ ends[last]
         loop = Loop(first, last, step, proposal.support)
-        solved = replace(self.solved, world_T_rigs=poses)
         even = abs(np.log(proposal.move.scale)) < np.log(settings.verify.max_length_ratio)
-        return even and loops.within_drift(loop, solved, self.held, settings)
+        return even and loops.within_drift(loop, poses, self.depth, self.held, settings)
 
     def _is_of_map(self, f: int) -> bool:
         """True if the map holds frames of a frame's recording.

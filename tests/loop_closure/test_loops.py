@@ -96,6 +96,30 @@ def test_the_same_place_looks_most_alike() -> None:
     assert alike[0, NUM_FRAMES - 1] > max(alike[0, f] for f in far)
 
 
+def test_only_places_that_may_be_met_again_are_compared() -> None:
+    strongest, _, whole = _scene()
+    looks = global_descriptors(strongest, NUM_FRAMES, 0, Threads(1))
+    torn = loops.candidates(looks, _split(whole), SEEN, SETTINGS)
+    assert [0, NUM_FRAMES - 1] in torn.tolist()
+    # The map holds these frames together already.
+    assert not len(loops.candidates(looks, whole, SEEN, SETTINGS))
+    # A walk that ends before it comes back.
+    num = NUM_FRAMES // 2
+    before = replace(
+        whole,
+        world_T_rigs=whole.world_T_rigs[:num],
+        landmarks=whole.landmarks.of(_seen_before(whole.landmarks.tracks, num)),
+    )
+    assert not len(loops.candidates(looks[:num], before, SEEN[: num - 1], SETTINGS))
+
+
+def _seen_before(tracks: Tracks, frame: int) -> np.ndarray:
+    """True (J,) for points that no frame from one on sees."""
+    seen = np.ones(tracks.num_points, bool)
+    seen[tracks.points[tracks.frames >= frame]] = False
+    return seen
+
+
 @pytest.mark.parametrize("heading", [0.0, 2.5])
 def test_a_map_torn_in_two_is_joined_where_it_meets(heading: float) -> None:
     strongest, keypoints, whole = _scene(heading)
