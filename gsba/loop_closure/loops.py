@@ -112,9 +112,10 @@ def candidates(
             g = int(others[n])
             found[min(f, g), max(f, g)] = float(alike[n])
     pairs = np.array(sorted(found), np.int32).reshape(-1, 2)
-    met = pairs[[found[f, g] >= least for f, g in pairs.tolist()]]
-    gaps = KDTree(met).query(pairs, p=np.inf)[0] if len(met) else np.full(len(pairs), np.inf)
-    return pairs[gaps <= settings.pairs.window]
+    seeds = pairs[[found[f, g] >= least for f, g in pairs.tolist()]]
+    if not len(seeds):
+        return seeds
+    return pairs[KDTree(seeds).query(pairs, p=np.inf)[0] <= settings.pairs.window]
 
 
 def _sharing_points(tracks: Tracks, num_frames: int) -> csr_matrix:
@@ -134,15 +135,16 @@ def _least_similarity(
     at most `window` steps, which images confirm; of successive ones where none are."""
     positions, depth = solved.world_T_rigs[:, :3, 3], solved.median_depth()
     before = np.concatenate([[0], np.cumsum(unseen)])
-    alike, steps = [], []
+    near, successive = [np.zeros(0)], np.zeros(0)
     for gap in range(1, min(window, len(positions) - 1) + 1):
         first = np.flatnonzero(before[gap:] == before[:-gap])
         found = np.sum(looks[first] * looks[first + gap], axis=1)
-        distances = np.linalg.norm(positions[first + gap] - positions[first], axis=1) / depth
-        alike.append(found[(distances > _NEAR_DEPTHS[0]) & (distances < _NEAR_DEPTHS[1])])
-        steps += [found] if gap == 1 else []
-    some = np.concatenate(alike) if alike else np.zeros(0)
-    some = some if len(some) else np.concatenate(steps)
+        distances = np.linalg.norm(positions[first + gap] - positions[first], axis=1)
+        low, high = (share * depth for share in _NEAR_DEPTHS)
+        near.append(found[(distances > low) & (distances < high)])
+        successive = found if gap == 1 else successive
+    some = np.concatenate(near)
+    some = some if len(some) else successive
     return float(np.quantile(some, _LEAST_ALIKE_SHARE)) if len(some) else -1.0
 
 
