@@ -56,7 +56,8 @@ def close(context: MatchContext, solved: Solution, unseen: np.ndarray) -> Closed
     settings, keypoints = context.settings, context.keypoints
     num = len(solved.world_T_rigs)
     looks = global_descriptors(context.strongest, num, settings.seed, context.workers)
-    chosen = candidates(looks, solved, unseen, settings)
+    held = _sharing_points(solved.landmarks.tracks, num)
+    chosen = candidates(looks, solved, unseen, settings, held)
     strongest = replace(context, frames=context.strongest)
     verified = recovery.match_anywhere(strongest, chosen)
     loops = _measured_loops(verified, keypoints, solved, settings.seed)
@@ -87,25 +88,36 @@ def connected(unseen: np.ndarray, pairs: np.ndarray) -> bool:
 
 
 def candidates(
-    looks: np.ndarray, solved: Solution, unseen: np.ndarray, settings: RefineSettings
+    looks: np.ndarray,
+    solved: Solution,
+    unseen: np.ndarray,
+    settings: RefineSettings,
+    held: csr_matrix | None = None,
 ) -> np.ndarray:
     """Pairs (P, 2) int32 with the most similar global descriptors within reach of drift.
 
-    Frames that see enough points of the map in common are held together already. And where places
-    are met again, some frames look at least as much alike as almost all neighbours along the path
-    do: elsewhere nothing is compared.
+    Where places are met again, some frames look at least as much alike as almost all neighbours
+    along the path do: elsewhere nothing is compared.
+
+    Args:
+        looks: (F, D) global descriptors.
+        solved: poses and points.
+        unseen: (F - 1,) bool, steps that no images confirm.
+        settings: of the run.
+        held: sparse matrix (F, F) of frames that the map holds together already, which are left
+            out; None = none are.
     """
     positions, depth = solved.world_T_rigs[:, :3, 3], solved.median_depth()
     num, reach = len(positions), settings.pairs.max_baseline_depths * depth
     drifts = np.concatenate([[0.0], np.cumsum(_max_step_drifts(positions, unseen, settings))])
-    sharing = _sharing_points(solved.landmarks.tracks, num)
     least = _least_similarity(looks, solved, unseen, settings.pairs.window)
     found = dict[tuple[int, int], float]()
     for f in range(num):
         distance = np.linalg.norm(positions - positions[f], axis=1)
         chosen = distance < reach + np.abs(drifts - drifts[f])
         chosen[max(f - settings.pairs.window // 4, 0) : f + settings.pairs.window // 4 + 1] = False
-        chosen[sharing.indices[sharing.indptr[f] : sharing.indptr[f + 1]]] = False
+        if held is not None:
+            chosen[held.indices[held.indptr[f] : held.indptr[f + 1]]] = False
         others = np.flatnonzero(chosen)
         alike = looks[others] @ looks[f]
         for n in np.argsort(-alike)[:_NUM_CANDIDATES]:

@@ -125,22 +125,22 @@ def _judged(
     poses, seed = places.solved.world_T_rigs, places.context.settings.seed
     found = []
     for proposal in propose(group, poses, test.depth, seed)[:_MAX_TRIED]:
-        if not _plausible(proposal, places, unseen):
+        if not _plausible(proposal, places, unseen, test.depth):
             continue
         one = test.judge(proposal, *_sides(*proposal.frames, len(poses)))
-        if _plausible(one.proposal, places, unseen):
+        if _plausible(one.proposal, places, unseen, test.depth):
             found.append(one)
     return found
 
 
-def _plausible(proposal: Proposal, places: Places, unseen: np.ndarray) -> bool:
+def _plausible(proposal: Proposal, places: Places, unseen: np.ndarray, depth: float) -> bool:
     """True if a loop needs no more drift than the path between its places can have."""
     if abs(np.log(proposal.move.scale)) > np.log(_MAX_SCALE_DRIFT):
         return False
     (f, g), poses = proposal.frames, places.solved.world_T_rigs
     g_T_f = inverse(poses[g]) @ proposal.move.poses(poses[f])
     loop = Loop(g, f, g_T_f, proposal.support)
-    return loops.within_drift(loop, places.solved, unseen, places.context.settings)
+    return loops.within_drift(loop, poses, depth, unseen, places.context.settings)
 
 
 def _rivals(one: Judged, judged: list[Judged], test: JoinTest) -> list[Judged]:
