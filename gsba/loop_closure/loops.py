@@ -97,7 +97,8 @@ def candidates(
     """Pairs (P, 2) int32 with the most similar global descriptors within reach of drift.
 
     Where places are met again, some frames look at least as much alike as almost all neighbours
-    along the path do: elsewhere nothing is compared.
+    along the path do: elsewhere only frames on two sides of a step that no images confirm are
+    compared.
 
     Args:
         looks: (F, D) global descriptors.
@@ -124,10 +125,12 @@ def candidates(
             g = int(others[n])
             found[min(f, g), max(f, g)] = float(alike[n])
     pairs = np.array(sorted(found), np.int32).reshape(-1, 2)
+    before = np.concatenate([[0], np.cumsum(unseen)])
+    kept = before[pairs[:, 0]] < before[pairs[:, 1]]
     seeds = pairs[[found[f, g] >= least for f, g in pairs.tolist()]]
-    if not len(seeds):
-        return seeds
-    return pairs[KDTree(seeds).query(pairs, p=np.inf)[0] <= settings.pairs.window]
+    if len(seeds):
+        kept |= KDTree(seeds).query(pairs, p=np.inf)[0] <= settings.pairs.window
+    return pairs[kept]
 
 
 def _sharing_points(tracks: Tracks, num_frames: int) -> csr_matrix:

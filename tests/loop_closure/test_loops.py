@@ -108,7 +108,11 @@ def test_only_places_that_may_be_met_again_are_compared() -> None:
         world_T_rigs=whole.world_T_rigs[:num],
         landmarks=whole.landmarks.of(_seen_before(whole.landmarks.tracks, num)),
     )
-    assert not len(loops.candidates(looks[:num], before, SEEN[: num - 1], SETTINGS))
+    unseen = SEEN[: num - 1].copy()
+    assert not len(loops.candidates(looks[:num], before, unseen, SETTINGS))
+    unseen[num // 2] = True  # what is on its other side may be anywhere
+    across = loops.candidates(looks[:num], before, unseen, SETTINGS)
+    assert len(across) and (across[:, 0] <= num // 2).all() and (across[:, 1] > num // 2).all()
 
 
 def _seen_before(tracks: Tracks, frame: int) -> np.ndarray:
