@@ -25,6 +25,7 @@ from contextlib import contextmanager
 from dataclasses import MISSING, Field, fields, is_dataclass
 from enum import Enum
 from pathlib import Path
+from threading import Lock
 from typing import IO, Any, Literal, TypeVar, Union, get_args, get_origin
 
 import numpy as np
@@ -45,6 +46,10 @@ _ZIP64_FIELD = 20  # bytes of its sizes behind it
 _PADDING_FIELD = 0xD935  # number of the extra field that zip files are aligned by
 _BYTES_AT_ONCE = 1 << 22  # that are checked, of an array that stays on the disk
 MIN_MAPPED_BYTES = 1 << 22  # of arrays that are worth a mapping
+_PARSING = (
+    Lock()
+)  # headers of arrays are Python literals, which CPython 3.11 fails to parse now and
+# then while another thread does (its issue 106905)
 
 
 class RecordError(Exception):
@@ -181,7 +186,8 @@ class _MappedArchive(zipfile.ZipFile):
             version = np.lib.format.read_magic(file)
             if version != (1, 0):
                 return None
-            shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
+            with _PARSING:
+                shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
             header = file.tell()
             if dtype.hasobject:
                 return None
@@ -270,7 +276,7 @@ def _decode(tree: Any, hint: Any, archive: zipfile.ZipFile | None) -> Any:
     if archive is not None and (hint is np.ndarray or origin is np.ndarray):
         array = archive.array(tree) if isinstance(archive, _MappedArchive) else None
         if array is None:
-            with archive.open(tree) as member:
+            with archive.open(tree) as member, _PARSING:
                 array = np.lib.format.read_array(member, allow_pickle=False)
         _require(array.dtype.kind in "biuf", array.dtype, hint)
         return array

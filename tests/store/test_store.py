@@ -1,11 +1,14 @@
 """The run folder: round trips, resume, damage, ownership."""
 
+import gc
 import os
 import signal
 import subprocess
 import sys
 import textwrap
+import time
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -116,6 +119,31 @@ def test_objects_are_refused_not_pickled(tmp_path: Path) -> None:
 def _many_tracks() -> Tracks:
     rows = np.arange(2 * MIN_MAPPED_BYTES // 4, dtype=np.int32)
     return Tracks(rows, rows[::-1].copy(), rows // 2, len(rows))
+
+
+def test_threads_read_records_at_once(tmp_path: Path) -> None:
+    tracks, path = _tracks(), tmp_path / "record"
+    save_record(path, (tracks,) * 20, {})
+    interval, threshold = sys.getswitchinterval(), gc.get_threshold()
+
+    def yield_to_others(*_: object) -> None:
+        time.sleep(0)
+
+    gc.callbacks.append(yield_to_others)  # threads take turns while headers are parsed
+    sys.setswitchinterval(1e-6)
+    gc.set_threshold(10)
+    gc.freeze()
+    try:
+        with ThreadPoolExecutor(8) as pool:
+            found = list(
+                pool.map(lambda _: load_record(path, tuple[Tracks, ...])[0].num_points, range(64))
+            )
+    finally:
+        gc.unfreeze()
+        gc.set_threshold(*threshold)
+        sys.setswitchinterval(interval)
+        gc.callbacks.remove(yield_to_others)
+    assert found == [tracks.num_points] * 64
 
 
 def test_large_arrays_stay_on_the_disk(tmp_path: Path) -> None:
