@@ -77,7 +77,8 @@ def recording_of(flat: str, walk: Path, first: int, home: Path) -> Recording:
 
 
 def check_maps(run: Path, recordings: Sequence[Recording]) -> list[dict[str, Any]]:
-    """Frames and flats of each map of a run, and its worst frame's error, of the map's extent."""
+    """Frames and flats of each map of a run, its worst frame's error, of the map's extent, and why
+    it was not joined."""
     report = json.loads((run / "report.json").read_text())
     by_name = {one.name: one for one in recordings}
     checked = []
@@ -94,7 +95,8 @@ def check_maps(run: Path, recordings: Sequence[Recording]) -> list[dict[str, Any
             errors = position_errors(reconstruction.world_T_rigs, true)
             worst = float(errors.max() / np.linalg.norm(np.ptp(true[:, :3, 3], axis=0)))
         both = len({one.name for one in owners}) > 1
-        checked.append({"frames": len(names), "flats": flats, "worst": worst, "joined": both})
+        found = {"frames": len(names), "flats": flats, "worst": worst, "joined": both}
+        checked.append(found | {"apart": entry["reason"]})
     return checked
 
 
@@ -132,9 +134,7 @@ class Bench(NamedTuple):
         shutil.rmtree(folder, ignore_errors=True)  # a refused merge would go on where it was
 
         def finish() -> dict[str, Any]:
-            maps = json.loads((run / "report.json").read_text())["maps"]
-            apart = "; ".join(one["reason"] for one in maps if one["reason"])
-            return {"errors": check_maps(run, recordings), "apart": apart}
+            return {"errors": check_maps(run, recordings)}
 
         row = {"key": key, "by": by, "frames": sum(len(one.cut.rows) for one in recordings)}
         row = run_row([*_GSBA, *words, "--out", str(run)], folder, row, finish, TIMEOUT_S)
@@ -164,7 +164,8 @@ def line(what: str, row: dict[str, Any]) -> str:
         for one in row.get("errors", ())
     ]
     cells = [what, row["by"], str(row["frames"]), ", ".join(maps) or "nothing written"]
-    shares = _SHARES.findall(row.get("apart", "") or row.get("reason", ""))
+    reasons = [one["apart"] or "" for one in row.get("errors", ())]
+    shares = _SHARES.findall("; ".join([row.get("reason", ""), *reasons]))
     found = "; ".join("{} ± {} %, {} ± {} %".format(*each) for each in shares)
     cells += [found, f"{row['cpu_s']:.0f}", verdict(row)]
     return f"| {' | '.join(cells)} |"

@@ -111,7 +111,8 @@ def candidates(
     positions, depth = solved.world_T_rigs[:, :3, 3], solved.median_depth()
     num, reach = len(positions), settings.pairs.max_baseline_depths * depth
     drifts = np.concatenate([[0.0], np.cumsum(_max_step_drifts(positions, unseen, settings))])
-    least = _least_similarity(looks, solved, unseen, settings.pairs.window)
+    unseen_before = np.concatenate([[0], np.cumsum(unseen)])
+    least = _least_similarity(looks, solved, unseen_before, settings.pairs.window)
     found = dict[tuple[int, int], float]()
     for f in range(num):
         distance = np.linalg.norm(positions - positions[f], axis=1)
@@ -125,8 +126,7 @@ def candidates(
             g = int(others[n])
             found[min(f, g), max(f, g)] = float(alike[n])
     pairs = np.array(sorted(found), np.int32).reshape(-1, 2)
-    before = np.concatenate([[0], np.cumsum(unseen)])
-    kept = before[pairs[:, 0]] < before[pairs[:, 1]]
+    kept = unseen_before[pairs[:, 0]] < unseen_before[pairs[:, 1]]
     seeds = pairs[[found[f, g] >= least for f, g in pairs.tolist()]]
     if len(seeds):
         kept |= KDTree(seeds).query(pairs, p=np.inf)[0] <= settings.pairs.window
@@ -144,15 +144,17 @@ def _sharing_points(tracks: Tracks, num_frames: int) -> csr_matrix:
 
 
 def _least_similarity(
-    looks: np.ndarray, solved: Solution, unseen: np.ndarray, window: int
+    looks: np.ndarray, solved: Solution, unseen_before: np.ndarray, window: int
 ) -> float:
     """Similarity of almost all frames that are a quarter to a half of the median depth apart along
-    at most `window` steps, which images confirm; of successive ones where none are."""
+    at most `window` steps, which images confirm; of successive ones where none are.
+
+    `unseen_before` (F,) is the number of steps before each frame that no images confirm.
+    """
     positions, depth = solved.world_T_rigs[:, :3, 3], solved.median_depth()
-    before = np.concatenate([[0], np.cumsum(unseen)])
     near, successive = [np.zeros(0)], np.zeros(0)
     for gap in range(1, min(window, len(positions) - 1) + 1):
-        first = np.flatnonzero(before[gap:] == before[:-gap])
+        first = np.flatnonzero(unseen_before[gap:] == unseen_before[:-gap])
         found = np.sum(looks[first] * looks[first + gap], axis=1)
         distances = np.linalg.norm(positions[first + gap] - positions[first], axis=1)
         low, high = (share * depth for share in _NEAR_DEPTHS)

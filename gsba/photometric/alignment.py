@@ -370,10 +370,10 @@ def _former_observations(
     wanted[found.points] = True
     scarce = np.bincount(found.frames, minlength=num_frames) < _ENOUGH_OBSERVATIONS
     wanted[tracks.points[scarce[tracks.frames]]] = True
-    for first in range(0, max(tracks.num_points, 1), _POINTS_AT_ONCE):
-        bounds = np.searchsorted(tracks.points, [first, first + _POINTS_AT_ONCE])
+    for some in slices(tracks.num_points, _POINTS_AT_ONCE):
+        bounds = np.searchsorted(tracks.points, [some.start, some.stop])
         points, frames = (array[slice(*bounds)] for array in (tracks.points, tracks.frames))
-        there = np.flatnonzero((found.points >= first) & (found.points < first + _POINTS_AT_ONCE))
+        there = np.flatnonzero((found.points >= some.start) & (found.points < some.stop))
         known = found.points[there].astype(np.int64) * num_frames + found.frames[there]
         cells = points.astype(np.int64) * num_frames + frames
         chosen = np.flatnonzero(wanted[points] & ~np.isin(cells, known))

@@ -10,6 +10,7 @@ from gsba.camera.rig import CubeRig, owner_faces
 from gsba.disk import concatenated
 from gsba.memory import release_mapped_files
 from gsba.types import Counts, Keypoints, Sighted, Tracks
+from gsba.types.records import slices
 
 _FRAMES_AT_ONCE = 64  # whose observations are held: some 100 MB
 _POINTS_AT_ONCE = 1 << 17
@@ -103,10 +104,10 @@ def _by_frame(
         for origins, of some frames; the number of each frame's goes to `sizes` (F,).
     """
     num = len(sizes)
-    for first in range(0, max(num, 1), _FRAMES_AT_ONCE):
+    for some in slices(num, _FRAMES_AT_ONCE):
         chosen = []
         for part in parts:
-            inside = (part.frames >= first) & (part.frames < first + _FRAMES_AT_ONCE)
+            inside = (part.frames >= some.start) & (part.frames < some.stop)
             rows = np.flatnonzero(inside)
             chosen.append(part.taken(rows[several[part.points[rows]]]))
         every = Observed.joined(iter(chosen), None)
@@ -138,8 +139,8 @@ def _by_point(
     """Points, numbered anew, frames and keypoints of observations (O,), which are ordered by frame,
     ordered by point; of some points at a time."""
     number = 0
-    for first in range(0, max(num_points, 1), _POINTS_AT_ONCE):
-        rows = np.flatnonzero((points >= first) & (points < first + _POINTS_AT_ONCE))
+    for some in slices(num_points, _POINTS_AT_ONCE):
+        rows = np.flatnonzero((points >= some.start) & (points < some.stop))
         rows = rows[np.argsort(points[rows], kind="stable")]
         there, compact = np.unique(points[rows], return_inverse=True)
         seeing = frames[rows]

@@ -46,10 +46,9 @@ _ZIP64_FIELD = 20  # bytes of its sizes behind it
 _PADDING_FIELD = 0xD935  # number of the extra field that zip files are aligned by
 _BYTES_AT_ONCE = 1 << 22  # that are checked, of an array that stays on the disk
 MIN_MAPPED_BYTES = 1 << 22  # of arrays that are worth a mapping
-_PARSING = (
-    Lock()
-)  # headers of arrays are Python literals, which CPython 3.11 fails to parse now and
-# then while another thread does (its issue 106905)
+# Headers of arrays are Python literals: CPython 3.11 fails now and then to parse one while another
+# thread does (its issue 106905).
+_PARSING = Lock()
 
 
 class RecordError(Exception):
