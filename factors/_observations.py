@@ -1,12 +1,13 @@
 """Observations of landmarks: families give them as terms, kernels read them sorted."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise
 from typing import NamedTuple, Protocol
 
 import numpy as np
 from scipy.sparse import csr_matrix
 
+from factors._sorting_kernels import frame_spans, sort_by_owner
 from factors.landmark_residual import LandmarkResidual
 from factors.robust import RobustLoss
 
@@ -103,46 +104,54 @@ def sort_observations(
         frames[span], owners[span] = term.frames, term.points
     first = np.full(num_points, num_frames, dtype=np.int32)
     last = np.full(num_points, -1, dtype=np.int32)
-    np.minimum.at(first, owners, frames)
-    np.maximum.at(last, owners, frames)
+    frame_spans(frames, owners, first, last)
     point_order = np.lexsort((last, first))
     rank = np.empty(num_points, dtype=np.int32)
     rank[point_order] = np.arange(num_points, dtype=np.int32)
     owners = rank[owners]
-    order = np.lexsort((frames, owners)).astype(np.int32)
-    place = np.empty_like(order)
-    place[order] = np.arange(len(order), dtype=np.int32)
     offsets = np.zeros(num_points + 1, dtype=np.int64)
     np.cumsum(np.bincount(owners, minlength=num_points), out=offsets[1:])
+    order = np.empty_like(frames)
+    sort_by_owner(frames, owners, offsets, offsets[:-1].copy(), order)
+
+    def ordered(columns: Iterable[np.ndarray]) -> np.ndarray:
+        return np.concatenate([np.zeros((0, 3)), *columns]).take(order, axis=0)
+
     names = list(dict.fromkeys(term.name for term in terms))
     given = [term.kind.address for term in terms if not isinstance(term.kind, int)]
+    kinds, families = np.zeros(len(frames), np.uint8), np.zeros(len(frames), np.uint8)
+    for term, span in zip(terms, spans, strict=True):
+        kind = term.kind
+        kinds[span] = kind if isinstance(kind, int) else GIVEN + given.index(kind.address)
+        families[span] = names.index(term.name)
     obs = Observations(
         offsets=offsets,
         frames=frames[order],
-        kinds=np.zeros(len(order), dtype=np.uint8),
-        families=np.zeros(len(order), dtype=np.uint8),
-        measurements=np.empty((len(order), 3)),
-        whiteners=np.empty((len(order), 3)),
-        origins=np.zeros((len(order), 3)),
+        kinds=kinds[order],
+        families=families[order],
+        measurements=ordered(_measurements(terms)),
+        whiteners=ordered(term.whiteners() for term in terms),
+        origins=ordered(_origins(term) for term in terms),
         cameras=np.concatenate([np.zeros((0, 12)), *(term.cameras() for term in terms)]),
         functions=np.array(given, dtype=np.int64) if given else None,
         loss=loss.code,
         loss_scale=float(loss.scale),
     )
-    num_cameras = 0
-    for term, span in zip(terms, spans, strict=True):
-        rows = place[span]
-        kind = term.kind
-        obs.kinds[rows] = kind if isinstance(kind, int) else GIVEN + given.index(kind.address)
-        obs.families[rows] = names.index(term.name)
-        obs.measurements[rows] = term.measurements()
-        obs.whiteners[rows] = term.whiteners()
-        if term.origins_rig is not None:
-            obs.origins[rows] = term.origins_rig
-        if len(term.cameras()):
-            obs.measurements[rows, 2] += num_cameras
-            num_cameras += len(term.cameras())
     return obs, order, point_order
+
+
+def _measurements(terms: Sequence[Term]) -> Iterator[np.ndarray]:
+    """Measurements of each term, whose cameras are numbered on from those of the terms before."""
+    num_cameras = 0
+    for term in terms:
+        own = len(term.cameras())
+        yield term.measurements() + np.array([0, 0, num_cameras]) if own else term.measurements()
+        num_cameras += own
+
+
+def _origins(term: Term) -> np.ndarray:
+    """Origins of a term's rays; zero in the rig's own centre."""
+    return np.zeros((len(term.frames), 3)) if term.origins_rig is None else term.origins_rig
 
 
 def visits_of(offsets: np.ndarray, frames: np.ndarray, num_frames: int, most: int) -> list[Visits]:

@@ -71,10 +71,11 @@ def whitener_rows(
     roots = np.asarray(sqrt_infos, dtype=np.float64)
     if roots.shape != (num, 2, 2) or not np.all(np.isfinite(roots)):
         raise ValueError(f"sqrt_infos must be finite, ({num}, 2, 2), not {roots.shape}")
-    information = np.einsum("nki,nkj->nij", roots, roots)
-    rows[:, 0] = np.sqrt(information[:, 0, 0])
-    rows[:, 1] = information[:, 0, 1] / np.maximum(rows[:, 0], 1e-300)
-    rows[:, 2] = np.sqrt(np.maximum(information[:, 1, 1] - rows[:, 1] ** 2, 0.0))
+    x, y = roots[:, :, 0], roots[:, :, 1]
+    rows[:, 0] = np.hypot(x[:, 0], x[:, 1])
+    rows[:, 1] = (x[:, 0] * y[:, 0] + x[:, 1] * y[:, 1]) / np.maximum(rows[:, 0], 1e-300)
+    lengths = y[:, 0] ** 2 + y[:, 1] ** 2
+    rows[:, 2] = np.sqrt(np.maximum(lengths - rows[:, 1] ** 2, 0.0))
     return rows
 
 

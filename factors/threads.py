@@ -5,8 +5,9 @@ order: results are identical to the last bit for any number of threads.
 """
 
 import os
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import lru_cache
 from itertools import pairwise
 from typing import TypeVar
@@ -35,16 +36,42 @@ def balanced_ranges(offsets: np.ndarray, least: int = 8192) -> list[tuple[int, i
 
 
 def map_in_threads(work: Callable[[int], T], num: int, num_threads: int) -> Iterator[T]:
-    """Results of work(0) to work(num - 1) in this order; work must not use threads itself."""
+    """Results of work(0) to work(num - 1) in this order, of which few wait to be taken; work must
+    not use threads itself."""
     if num == 1 or num_threads == 1:
-        return map(work, range(num))
-    return pool(num_threads).map(work, range(num))
+        yield from map(work, range(num))
+        return
+    running: deque[Future[T]] = deque()
+    try:
+        for n in range(num):
+            running.append(pool(num_threads).submit(work, n))
+            if len(running) == 2 * num_threads:
+                yield running.popleft().result()
+        while running:
+            yield running.popleft().result()
+    finally:
+        for one in running:
+            one.cancel()
 
 
 def run_in_threads(work: Callable[[int], None], num: int, num_threads: int) -> None:
     """Call work(0) to work(num - 1) in threads; work must not use threads itself."""
     for _ in map_in_threads(work, num, num_threads):
         pass
+
+
+def rows_in_threads(
+    work: Callable[[slice], Sequence[np.ndarray]], num: int, most: int, num_threads: int
+) -> list[np.ndarray]:
+    """Arrays that work makes of `num` rows, of at most `most` of them at a time, concatenated; work
+    must not use threads itself."""
+    starts = range(0, max(num, 1), most)
+
+    def of_some(n: int) -> Sequence[np.ndarray]:
+        return work(slice(starts[n], min(starts[n] + most, num)))
+
+    parts = map_in_threads(of_some, len(starts), num_threads)
+    return [np.concatenate(column) for column in zip(*parts, strict=True)]
 
 
 @lru_cache(maxsize=4)

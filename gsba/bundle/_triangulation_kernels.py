@@ -9,6 +9,26 @@ _MAX_HYPOTHESES = 12  # pairs of observations tried per track
 
 
 @_kernel
+def cast_rays(first, last, world_T_rigs, frames, bearings, origins, rays, centres):
+    """Directions and starts in the world of the rays of observations first to last - 1.
+
+    `origins` (O, 3) in the rig's frame, or (0, 3) if all rays start in the rig's centre.
+    """
+    for o in range(first, last):
+        f = frames[o]
+        for i in range(3):
+            ray, centre = 0.0, world_T_rigs[f, i, 3]
+            for k in range(3):
+                ray += world_T_rigs[f, i, k] * bearings[o, k]
+            if len(origins):
+                turned = 0.0
+                for k in range(3):
+                    turned += world_T_rigs[f, i, k] * origins[o, k]
+                centre += turned
+            rays[o, i], centres[o, i] = ray, centre
+
+
+@_kernel
 def triangulate_tracks(
     starts, first, last, rays, centres, sigmas, gate, points, inliers, parallaxes
 ):

@@ -64,8 +64,10 @@ def _residuals(
     """Residuals (O,) of the observations of points (J, 3), all of the same spread."""
     starts = np.searchsorted(tracks.points, np.arange(tracks.num_points + 1))
     rows, spread = keypoints.rows(tracks), np.empty(len(tracks))
-    origins = np.zeros((0, 3)) if keypoints.origins_rig is None else keypoints.origins_rig[rows]
-    seen = keypoints.bearings_rig[rows], np.ascontiguousarray(keypoints.roots(rows)), origins
+    origins = keypoints.origins_of(rows)
+    origins = np.zeros((0, 3)) if origins is None else origins
+    bearings = keypoints.bearings_rig.take(rows, axis=0)
+    seen = bearings, np.ascontiguousarray(keypoints.roots(rows)), origins
     ranges = balanced_ranges(starts)
 
     def work(part: int) -> None:

@@ -36,10 +36,10 @@ class PointObservations:
         return cls(
             frames=tracks.frames,
             points=tracks.points,
-            bearings_rig=keypoints.bearings_rig[rows],
+            bearings_rig=keypoints.bearings_rig.take(rows, axis=0),
             sigmas_rad=noise * keypoints.sigmas_rad[rows],
-            sqrt_infos=None if infos is None else infos[rows] / noise,
+            sqrt_infos=None if infos is None else infos.take(rows, axis=0) / noise,
             origins_rig=keypoints.origins_of(rows),
             faces=keypoints.faces[rows],
-            pixels=keypoints.pixels[rows],
+            pixels=keypoints.pixels.take(rows, axis=0),
         )

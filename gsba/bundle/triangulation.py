@@ -6,14 +6,13 @@ from pathlib import Path
 import numpy as np
 
 from factors.threads import balanced_ranges, run_in_threads
-from gsba.bundle._triangulation_kernels import triangulate_tracks
+from gsba.bundle._triangulation_kernels import cast_rays, triangulate_tracks
 from gsba.bundle.tracks import runs
 from gsba.config import TriangulateSettings
 from gsba.disk import concatenated
 from gsba.geometry import moved_to
 from gsba.memory import release_mapped_files
 from gsba.types import Counts, Keypoints, Landmarks, Reconstruction, Tracks
-from gsba.types.records import slices
 
 _AT_ONCE = 1 << 18  # observations whose rays are held: 60 MB
 _NONE = Counts(0, 0, "tracks")
@@ -46,16 +45,20 @@ def triangulate(
         origins_rig: (O, 3) rig frame, where each ray starts; None = the rig's centre.
     """
     starts = np.searchsorted(tracks.points, np.arange(tracks.num_points + 1))
-    rays, centres = _rays(world_T_rigs, tracks.frames, bearings_rig, origins_rig)
+    rays, centres = np.empty((len(tracks), 3)), np.empty((len(tracks), 3))
+    starting = np.zeros((0, 3)) if origins_rig is None else origins_rig
+    bearings = np.asarray(bearings_rig, np.float64)
+    given = np.ascontiguousarray(world_T_rigs), tracks.frames, bearings, starting
     points = np.zeros((tracks.num_points, 3))
     inliers = np.zeros(len(rays), np.int64)
     parallaxes = np.zeros(tracks.num_points)
     ranges = balanced_ranges(starts)
 
     def work(part: int) -> None:
-        gate = float(max_error_sigmas)
+        gate, (first, last) = float(max_error_sigmas), ranges[part]
+        cast_rays(starts[first], starts[last], *given, rays, centres)
         triangulate_tracks(
-            starts, *ranges[part], rays, centres, sigmas_rad, gate, points, inliers, parallaxes
+            starts, first, last, rays, centres, sigmas_rad, gate, points, inliers, parallaxes
         )
 
     run_in_threads(work, len(ranges), num_threads)
@@ -71,19 +74,6 @@ def triangulate(
     numbers = {reason: int(flag.sum()) for reason, flag in dropped.items()}
     counts = Counts(tracks.num_points, survivors.num_points, "tracks", numbers)
     return Landmarks(points[kept], survivors, counts)
-
-
-def _rays(
-    world_T_rigs: np.ndarray, frames: np.ndarray, bearings: np.ndarray, origins: np.ndarray | None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Directions (O, 3) of rays in the world, and where they start (O, 3)."""
-    rays, centres = np.empty((len(frames), 3)), np.empty((len(frames), 3))
-    for some in slices(len(frames), _AT_ONCE):
-        starts = None if origins is None else origins[some]
-        world_T_lenses = moved_to(world_T_rigs[frames[some]], starts)
-        rays[some] = np.einsum("oij,oj->oi", world_T_lenses[:, :3, :3], bearings[some])
-        centres[some] = world_T_lenses[:, :3, 3]
-    return rays, centres
 
 
 def _within_camera(
@@ -119,7 +109,7 @@ def place(
         num = 0
         for _, _, some in runs(tracks, _AT_ONCE):
             rows = keypoints.rows(some)
-            rays = keypoints.bearings_rig[rows], keypoints.sigmas_rad[rows]
+            rays = keypoints.bearings_rig.take(rows, axis=0), keypoints.sigmas_rad[rows]
             how = max_error_sigmas, settings, num_threads, keypoints.origins_of(rows)
             own = triangulate(some, *rays, world_T_rigs, *how)
             counts.append(own.counts)

@@ -9,6 +9,7 @@ import numpy as np
 from factors import tangent_basis
 from factors.patches import ALIGNED, REASONS, PatchSet, Sightings, expect, found_at
 from factors.sphere_field import SphereField
+from factors.threads import map_in_threads, rows_in_threads
 from gsba.camera.cameras import ONE_CAMERA, Cameras
 from gsba.camera.rig import CubeRig
 from gsba.config import PatchSettings
@@ -22,10 +23,10 @@ from gsba.types import Counts, Keypoints, Landmarks, Sighted, Solution
 from gsba.types.records import slices
 
 _TOO_UNCERTAIN = "position too uncertain"
-_SIGHTINGS_AT_ONCE = 1 << 17  # sightings processed together: some 80 MB
+_SIGHTINGS_AT_ONCE = 1 << 15  # sightings that a thread processes together: some 20 MB
 _BYTES_PER_POINT = 8192  # of a point's patch and its sightings, about
 _MEMORY_SHARE = 64  # of the machine's memory, which the patches of one part take at most
-_POINTS_AT_ONCE = 1 << 17  # whose former observations are looked for together
+_POINTS_AT_ONCE = 1 << 15  # whose former observations a thread looks for together
 _PLACE_BITS = 10  # of a coordinate by which frames are put in order: cells of a 1024th of the map
 _ENOUGH_OBSERVATIONS = 100  # aligned observations of a frame from which points without aligned
 # patches are dropped
@@ -111,12 +112,12 @@ def align(
 
     folder, keypoints = observed.folder, observed.keypoints
     new = Observed.joined(by_patches(), folder)
-    given = landmarks, keypoints, solved.noise, new, greys.num_frames
+    given = landmarks, keypoints, solved.noise, new, greys.num_frames, workers.num_threads
     former = Observed.joined(_former_observations(*given), folder)
     own = keypoints.starts[landmarks.tracks.frames[rows]] + landmarks.tracks.keypoints[rows]
     shown = Shown(keypoints.colors[own], normals_world, world_T_rigs)
     counts = Counts(num_found + sum(dropped.values()), num_found, "observations", dropped)
-    return pack(new, former, shown, rig, counts, folder)
+    return pack(new, former, shown, rig, counts, folder, workers.num_threads)
 
 
 def _by_hosts(hosts: np.ndarray, positions: np.ndarray) -> Iterator[np.ndarray]:
@@ -178,18 +179,20 @@ def _align_some(
     planes = _planes(landmarks, world_T_rigs, hosts, normals, pixel, field, lenses)
     extended = _confirmed_points(landmarks, keypoints, observed.aligned, settings.min_track_length)
     views = visible_frames(landmarks, world_T_rigs, rows, extended, settings)
-    points, seeing = _unblended(landmarks, planes, world_T_rigs, hosts, *views, lenses)
-    at, across, rays = _projected_patches(landmarks, planes, world_T_rigs, points, seeing, lenses)
+    map_, threads = (landmarks, planes, world_T_rigs), workers.num_threads
+    points, seeing = _unblended(*map_, hosts, *views, lenses, threads)
+    at, across, rays = _projected_patches(*map_, points, seeing, lenses, threads)
     sightings = expect(points, field.observed(at), across)
     title, cut = f"{name}: templates", (planes.origins, planes.tilted)
     patches = frame_jobs.cut(title, greys, hosts, *cut, settings, workers)
     frame_jobs.align(name, greys, seeing, patches, sightings, settings, workers)
     enlarged = greys.enlargements()
-    kept, found = _accepted(patches, sightings, seeing, pixel, settings, dropped)
+    kept, found = _accepted(patches, sightings, seeing, pixel, settings, dropped, threads)
     found = found.enlarged(np.maximum(enlarged[seeing[kept]], enlarged[hosts[found.points]]))
     at_hosts = _at_hosts(patches, sightings, kept, hosts, planes, pixel)
     at_hosts = at_hosts.enlarged(enlarged[at_hosts.frames])
-    normals_world = _normals_world(sightings, kept, rays, planes, world_T_rigs[hosts])
+    shown = found.bearings_rig, rays[kept]
+    normals_world = _normals_world(sightings, kept, *shown, planes, world_T_rigs[hosts], threads)
     return _Aligned(found, at_hosts, normals_world)
 
 
@@ -232,11 +235,13 @@ def _unblended(
     points: np.ndarray,
     frames: np.ndarray,
     lenses: Cameras,
+    num_threads: int,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Views of points (O,) in frames (O,) outside the band where two pictures are blended."""
     if not lenses:
         return points, frames
-    at, _, _ = _projected_patches(landmarks, planes, world_T_rigs, points, frames, lenses)
+    given = landmarks, planes, world_T_rigs, points, frames, lenses, num_threads
+    at, _, _ = _projected_patches(*given)
     clear = ~(lenses.blended(planes.origins, hosts)[points] | lenses.blended(at, frames))
     return points[clear], frames[clear]
 
@@ -248,18 +253,24 @@ def _projected_patches(
     points: np.ndarray,
     frames: np.ndarray,
     lenses: Cameras,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    num_threads: int,
+) -> list[np.ndarray]:
     """Patches of points (O,) in the rigs of their frames (O,), at unit distance: bearings (O, 3),
     axes (O, 3, 2), and rays (O, 3) to them from their hosts."""
-    rotations = world_T_rigs[frames, :3, :3]
-    away = landmarks.points_world[points] - world_T_rigs[frames, :3, 3]
-    origins = np.einsum("oba,ob->oa", rotations, away)
-    if lenses:
-        origins = lenses.seeing(origins, frames)
-    distances = np.maximum(np.linalg.norm(origins, axis=1), 1e-300)[:, None]
-    across = np.einsum("oba,obc->oac", rotations, planes.axes_world[points]) / distances[:, :, None]
-    rays = np.einsum("oba,ob->oa", rotations, planes.rays_world[points]) / distances
-    return origins / distances, across, rays
+
+    def project(some: slice) -> tuple[np.ndarray, ...]:
+        own, seeing = points[some], frames[some]
+        rotations = world_T_rigs[seeing, :3, :3]
+        away = landmarks.points_world[own] - world_T_rigs[seeing, :3, 3]
+        origins = np.einsum("oba,ob->oa", rotations, away)
+        if lenses:
+            origins = lenses.seeing(origins, seeing)
+        distances = np.maximum(np.linalg.norm(origins, axis=1), 1e-300)[:, None]
+        across = np.einsum("oba,obc->oac", rotations, planes.axes_world[own])
+        rays = np.einsum("oba,ob->oa", rotations, planes.rays_world[own])
+        return origins / distances, across / distances[:, :, None], rays / distances
+
+    return rows_in_threads(project, len(points), _SIGHTINGS_AT_ONCE, num_threads)
 
 
 def _accepted(
@@ -269,14 +280,20 @@ def _accepted(
     pixel: float,
     settings: PatchSettings,
     dropped: dict[str, int],
+    num_threads: int,
 ) -> tuple[np.ndarray, Observed]:
     """Accepted rows (N,) of the sightings, as observations; rejections are added to `dropped`."""
-    parts = []
-    for some in slices(len(seeing), _SIGHTINGS_AT_ONCE):
+
+    def accept(some: slice) -> tuple[np.ndarray, ...]:
         there = Sightings(*(array[some] for array in sightings))
-        kept, bearings, covariances = accepted_rows(patches, there, pixel, settings, dropped)
-        parts.append((some.start + kept, bearings, covariances))
-    kept, bearings, covariances = (np.concatenate(column) for column in zip(*parts, strict=True))
+        own = dict.fromkeys(dropped, 0)
+        kept, bearings, covariances = accepted_rows(patches, there, pixel, settings, own)
+        return some.start + kept, bearings, covariances, np.array([list(own.values())])
+
+    columns = rows_in_threads(accept, len(seeing), _SIGHTINGS_AT_ONCE, num_threads)
+    kept, bearings, covariances, rejected = columns
+    for reason, number in zip(dropped, rejected.sum(axis=0).tolist(), strict=True):
+        dropped[reason] += number
     found = Observed(sightings.templates[kept], seeing[kept], bearings, covariances)
     return kept, found
 
@@ -337,14 +354,27 @@ def _at_hosts(
 def _normals_world(
     sightings: Sightings,
     kept: np.ndarray,
+    bearings: np.ndarray,
     rays: np.ndarray,
     planes: _Planes,
     world_T_hosts: np.ndarray,
+    num_threads: int,
 ) -> np.ndarray:
-    """Normals (J, 3) of the surfaces, from the patches' alignments, zero = unknown."""
+    """Normals (J, 3) of the surfaces, from the patches' alignments, zero = unknown.
+
+    Args:
+        kept: (N,) accepted sightings.
+        bearings (N, 3), rays (N, 3): where they were found, and from their hosts to them.
+    """
+
+    def depths(some: slice) -> tuple[np.ndarray, ...]:
+        there = Sightings(*(column[kept[some]] for column in sightings))
+        return surfaces.shown_depths(there, bearings[some], rays[some])
+
+    shown = rows_in_threads(depths, len(kept), _SIGHTINGS_AT_ONCE, num_threads)
     laid = planes.slopes, planes.origins, planes.spreads
-    shown = surfaces.normals(sightings, kept, rays[kept], *laid)
-    return np.einsum("jab,jb->ja", world_T_hosts[:, :3, :3], shown)
+    normals = surfaces.normals(sightings.templates[kept], *shown, *laid)
+    return np.einsum("jab,jb->ja", world_T_hosts[:, :3, :3], normals)
 
 
 def _confirmed_points(
@@ -359,7 +389,12 @@ def _confirmed_points(
 
 
 def _former_observations(
-    landmarks: Landmarks, keypoints: Keypoints, noise: float, found: Observed, num_frames: int
+    landmarks: Landmarks,
+    keypoints: Keypoints,
+    noise: float,
+    found: Observed,
+    num_frames: int,
+    num_threads: int,
 ) -> Iterator[Observed]:
     """The former observations of points in frames where alignment failed, of some at a time.
 
@@ -370,18 +405,23 @@ def _former_observations(
     wanted[found.points] = True
     scarce = np.bincount(found.frames, minlength=num_frames) < _ENOUGH_OBSERVATIONS
     wanted[tracks.points[scarce[tracks.frames]]] = True
-    for some in slices(tracks.num_points, _POINTS_AT_ONCE):
+    parts = list(slices(tracks.num_points, _POINTS_AT_ONCE))
+
+    def left(n: int) -> Observed:
+        some = parts[n]
         bounds = np.searchsorted(tracks.points, [some.start, some.stop])
         points, frames = (array[slice(*bounds)] for array in (tracks.points, tracks.frames))
         there = np.flatnonzero((found.points >= some.start) & (found.points < some.stop))
         known = found.points[there].astype(np.int64) * num_frames + found.frames[there]
         cells = points.astype(np.int64) * num_frames + frames
-        chosen = np.flatnonzero(wanted[points] & ~np.isin(cells, known))
+        chosen = np.flatnonzero(wanted[points] & ~np.isin(cells, known, kind="sort"))
         rows = keypoints.starts[frames[chosen]] + tracks.keypoints[bounds[0] + chosen]
         covariances = keypoints.sigmas_rad[rows, None, None] ** 2 * np.eye(2)
         if keypoints.sqrt_infos is not None:
             roots = keypoints.sqrt_infos[rows]
             covariances = np.linalg.inv(np.swapaxes(roots, 1, 2) @ roots)
-        of = points[chosen], frames[chosen]
-        yield Observed(*of, keypoints.bearings_rig[rows], noise**2 * covariances)
+        bearings, of = keypoints.bearings_rig[rows], (points[chosen], frames[chosen])
         release_mapped_files()
+        return Observed(*of, bearings, noise**2 * covariances)
+
+    yield from map_in_threads(left, len(parts), num_threads)

@@ -6,13 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
+from factors.threads import map_in_threads
 from gsba.camera.rig import CubeRig, owner_faces
 from gsba.disk import concatenated
 from gsba.memory import release_mapped_files
 from gsba.types import Counts, Keypoints, Sighted, Tracks
 from gsba.types.records import slices
 
-_FRAMES_AT_ONCE = 64  # whose observations are held: some 100 MB
+_FRAMES_AT_ONCE = 32  # whose observations a thread holds: some 50 MB
 _POINTS_AT_ONCE = 1 << 17
 
 
@@ -49,7 +50,10 @@ class Observed:
     def taken(self, rows: np.ndarray) -> "Observed":
         """The observations of some rows (n,)."""
         return Observed(
-            self.points[rows], self.frames[rows], self.bearings_rig[rows], self.covariances[rows]
+            self.points[rows],
+            self.frames[rows],
+            self.bearings_rig.take(rows, axis=0),
+            self.covariances.take(rows, axis=0),
         )
 
     def enlarged(self, factors: np.ndarray) -> "Observed":
@@ -68,7 +72,13 @@ class Shown:
 
 
 def pack(
-    new: Observed, former: Observed, shown: Shown, rig: CubeRig, counts: Counts, folder: Path | None
+    new: Observed,
+    former: Observed,
+    shown: Shown,
+    rig: CubeRig,
+    counts: Counts,
+    folder: Path | None,
+    num_threads: int,
 ) -> Sighted:
     """Observations as keypoints, frame by frame, and as tracks. Points observed once are left out.
 
@@ -78,13 +88,15 @@ def pack(
         rig: faces that pixels are given on.
         counts: of observations.
         folder: of the arrays' files; None = they are in memory.
+        num_threads: that share the frames.
     """
     num_points, num_frames = len(shown.colors), len(shown.world_T_rigs)
     times = np.zeros(num_points, np.int64)
     for part in (new, former):
         times += np.bincount(part.points, minlength=num_points)
     sizes = np.zeros(num_frames, np.int64)
-    columns = concatenated(_by_frame((new, former), times > 1, sizes, shown, rig), folder)
+    by_frame = _by_frame((new, former), times > 1, sizes, shown, rig, num_threads)
+    columns = concatenated(by_frame, folder)
     points, frames, is_new, normals = columns[:4]
     starts = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
     keypoints = Keypoints(starts, *columns[4:])
@@ -95,7 +107,12 @@ def pack(
 
 
 def _by_frame(
-    parts: Sequence[Observed], several: np.ndarray, sizes: np.ndarray, shown: Shown, rig: CubeRig
+    parts: Sequence[Observed],
+    several: np.ndarray,
+    sizes: np.ndarray,
+    shown: Shown,
+    rig: CubeRig,
+    num_threads: int,
 ) -> Iterator[tuple[np.ndarray, ...]]:
     """Observations of points seen several times (J,), ordered by frame and point.
 
@@ -103,9 +120,10 @@ def _by_frame(
         Points, frames, True for those of the first part, normals, and the columns of keypoints but
         for origins, of some frames; the number of each frame's goes to `sizes` (F,).
     """
-    num = len(sizes)
-    for some in slices(num, _FRAMES_AT_ONCE):
-        chosen = []
+    groups = list(slices(len(sizes), _FRAMES_AT_ONCE))
+
+    def ordered(n: int) -> tuple[np.ndarray, ...]:
+        some, chosen = groups[n], []
         for part in parts:
             inside = (part.frames >= some.start) & (part.frames < some.stop)
             rows = np.flatnonzero(inside)
@@ -113,24 +131,29 @@ def _by_frame(
         every = Observed.joined(iter(chosen), None)
         order = np.lexsort((every.points, every.frames))
         is_new, every = order < len(chosen[0]), every.taken(order)
-        sizes += np.bincount(every.frames, minlength=num)
-        bearings, faces = every.bearings_rig, owner_faces(every.bearings_rig)
-        lower = np.linalg.cholesky(np.linalg.inv(every.covariances))
-        rotations = shown.world_T_rigs[every.frames, :3, :3]
-        normals = np.einsum("oba,ob->oa", rotations, shown.normals_world[every.points])
-        yield (
-            every.points,
-            every.frames,
-            is_new,
-            normals.astype(np.float32),
-            rig.project(bearings, faces),
-            faces,
-            bearings,
-            np.linalg.det(every.covariances) ** 0.25,
-            shown.colors[every.points],
-            np.ascontiguousarray(np.swapaxes(lower, 1, 2)),
-        )
         release_mapped_files()
+        return every.points, every.frames, is_new, *_columns(every, shown, rig)
+
+    for found in map_in_threads(ordered, len(groups), num_threads):
+        sizes += np.bincount(found[1], minlength=len(sizes))
+        yield found
+
+
+def _columns(every: Observed, shown: Shown, rig: CubeRig) -> tuple[np.ndarray, ...]:
+    """Normals of observations, and the columns of keypoints but for origins."""
+    bearings, faces = every.bearings_rig, owner_faces(every.bearings_rig)
+    lower = np.linalg.cholesky(np.linalg.inv(every.covariances))
+    rotations = shown.world_T_rigs[every.frames, :3, :3]
+    normals = np.einsum("oba,ob->oa", rotations, shown.normals_world[every.points])
+    return (
+        normals.astype(np.float32),
+        rig.project(bearings, faces),
+        faces,
+        bearings,
+        np.linalg.det(every.covariances) ** 0.25,
+        shown.colors[every.points],
+        np.ascontiguousarray(np.swapaxes(lower, 1, 2)),
+    )
 
 
 def _by_point(

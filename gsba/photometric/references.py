@@ -47,8 +47,8 @@ def visible_frames(
     frames, points = landmarks.tracks.frames, landmarks.points_world
     num_near = min(settings.near_frames, len(centres) - 1)
     near = np.empty((len(centres), num_near), np.int64)
-    for f, centre in enumerate(centres):
-        distances = np.linalg.norm(centres - centre, axis=1)
+    for f in np.unique(frames[rows]):
+        distances = np.linalg.norm(centres - centres[f], axis=1)
         distances[f] = -1
         near[f] = np.argsort(distances, kind="stable")[1 : num_near + 1]
     room = len(frames) + settings.max_views * len(points)

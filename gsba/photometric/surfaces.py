@@ -11,7 +11,7 @@ terms: always the same way along a floor or a wall, which bends maps.
 import numpy as np
 
 from factors import tangent_basis
-from factors.patches import Sightings, found_at
+from factors.patches import Sightings
 
 _AFFINE_SIGMA = 0.07  # noise of an alignment's affine part
 _SLOPE_SIGMA = 0.7  # prior of surface slopes, tangents of their tilt
@@ -36,10 +36,28 @@ def slopes_of(normals_rig: np.ndarray, origins: np.ndarray, spreads: np.ndarray)
     return np.where(known[:, None], slopes, 0.0)
 
 
+def shown_depths(
+    sightings: Sightings, bearings: np.ndarray, rays: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Shifts (N, 2) in template steps by which relative depth along the host's ray appears in each
+    aligned sighting, and their products (N, 2) with the affine part.
+
+    Args:
+        sightings: accepted ones, N of them.
+        bearings: (N, 3) where they were found, rig frame of the observing frame.
+        rays: (N, 3) from the host to the template's point, in the observing frame, in units of its
+            distance there.
+    """
+    axes = tangent_basis(bearings)
+    shifts = np.linalg.solve(axes @ sightings.spreads, axes @ rays[:, :, None])[:, :, 0]
+    affine = np.swapaxes(sightings.warps[:, 2:].reshape(-1, 2, 2), 1, 2)
+    return shifts, np.einsum("oij,oi->oj", affine, shifts)
+
+
 def normals(
-    sightings: Sightings,
-    kept: np.ndarray,
-    rays: np.ndarray,
+    templates: np.ndarray,
+    shifts: np.ndarray,
+    products: np.ndarray,
     slopes: np.ndarray,
     origins: np.ndarray,
     spreads: np.ndarray,
@@ -47,23 +65,17 @@ def normals(
     """Normals (J, 3) of the surfaces, rig frames of the hosts, from their patches' alignments.
 
     Args:
-        sightings: aligned sightings of the templates.
-        kept: (N,) accepted rows.
-        rays: (N, 3) from the host to the template's point, in the observing frame, in units of its
-            distance there.
+        templates: (N,) template of each accepted sighting.
+        shifts (N, 2), products (N, 2): see `shown_depths`.
         slopes: (J, 2) slopes by which the patches were projected.
         origins (J, 3), spreads (J, 3, 2): the patches in their hosts, before slopes.
 
     Returns:
         Normals of any length, zero where they are undetermined.
     """
-    there = Sightings(*(column[kept] for column in sightings))
-    axes = tangent_basis(found_at(there)[0])
-    shown = np.linalg.solve(axes @ there.spreads, axes @ rays[:, :, None])[:, :, 0]
-    affine = np.swapaxes(there.warps[:, 2:].reshape(-1, 2, 2), 1, 2)
-    pulls, weights = np.zeros_like(slopes), np.zeros(len(slopes))
-    np.add.at(pulls, there.templates, np.einsum("oij,oi->oj", affine, shown))
-    np.add.at(weights, there.templates, np.einsum("oi,oi->o", shown, shown))
+    num = len(slopes)
+    pulls = np.stack([np.bincount(templates, column, num) for column in products.T], axis=1)
+    weights = np.bincount(templates, np.einsum("oi,oi->o", shifts, shifts), num)
     sizes = np.linalg.norm(spreads[:, :, 0], axis=1)
     prior = (_AFFINE_SIGMA / (_SLOPE_SIGMA * np.maximum(sizes, 1e-300))) ** 2
     found = slopes + (pulls - prior[:, None] * slopes) / (weights + prior)[:, None]

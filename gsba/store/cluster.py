@@ -69,7 +69,7 @@ def hire(
     def make(folder: Path) -> Workers:
         if client is None:
             return shards.Threads(settings.solver.threads())
-        return Cluster(client, folder, frames)
+        return Cluster(client, folder, frames, settings.solver.threads())
 
     return make
 
@@ -212,12 +212,14 @@ class Cluster:
         client: client of the scheduler.
         folder: folder of shards, in the run's folder.
         frames: frames of the run.
+        num_threads: of this process, for what is not shared out.
 
     Raises:
         GsbaError: a worker does not see these, or has another version of gsba.
     """
 
-    def __init__(self, client: "Client", folder: Path, frames: Path) -> None:
+    def __init__(self, client: "Client", folder: Path, frames: Path, num_threads: int = 1) -> None:
+        self.num_threads = num_threads
         self._client: Any = client  # its methods are typed as coroutines
         self._folder = folder.absolute()
         self._cpu_seconds = 0.0

@@ -79,6 +79,11 @@ class Spent:
 class Workers(Protocol):
     """Threads or remote workers that compute jobs."""
 
+    @property
+    def num_threads(self) -> int:
+        """Threads of this process, for what is not shared out."""
+        ...
+
     def map_shards(self, job: Job[R]) -> Iterator[R]:
         """Result of each item, in order; its bytes do not depend on the worker."""
         ...
@@ -104,7 +109,7 @@ class Workers(Protocol):
 class Threads:
     """Threads of this process."""
 
-    num_threads: int  # items at a time
+    num_threads: int  # as many items at a time
 
     def map_shards(self, job: Job[R]) -> Iterator[R]:
         """See `Workers`."""

@@ -119,7 +119,7 @@ class Keypoints:
 
     def origins_of(self, rows: np.ndarray) -> np.ndarray | None:
         """Origins (O, 3) of the rays of rows (O,), rig frame; None = the rig's centre."""
-        return None if self.origins_rig is None else self.origins_rig[rows]
+        return None if self.origins_rig is None else self.origins_rig.take(rows, axis=0)
 
     def frames(self) -> np.ndarray:
         """Frame (N,) of each keypoint."""
@@ -155,12 +155,12 @@ class Keypoints:
 
     def at(self, rows: np.ndarray, starts: np.ndarray) -> "Keypoints":
         """Keypoints in rows (N',), which frames own as in `starts` (F' + 1,) int64."""
-        infos = None if self.sqrt_infos is None else self.sqrt_infos[rows]
+        infos = None if self.sqrt_infos is None else self.sqrt_infos.take(rows, axis=0)
         return Keypoints(
             starts,
-            self.pixels[rows],
+            self.pixels.take(rows, axis=0),
             self.faces[rows],
-            self.bearings_rig[rows],
+            self.bearings_rig.take(rows, axis=0),
             self.sigmas_rad[rows],
             self.colors[rows],
             infos,
@@ -171,7 +171,7 @@ class Keypoints:
         """Keypoints of frames (F',), ascending, which are numbered from 0."""
         sizes = np.diff(self.starts)[frames]
         starts = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
-        return self.at(np.isin(self.frames(), frames), starts)
+        return self.at(np.flatnonzero(np.isin(self.frames(), frames)), starts)
 
 
 @dataclass(frozen=True, slots=True)

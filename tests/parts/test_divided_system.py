@@ -97,6 +97,8 @@ def test_every_observation_and_factor_is_owned_once(tmp_path: Path) -> None:
 class Failing:
     """Threads of this process that fail at the n-th result."""
 
+    num_threads = 1
+
     def __init__(self, at: int, error: BaseException) -> None:
         self._left, self._error = at, error
 

@@ -5,8 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from factors import tangent_basis
-from factors.patches import expect
-from gsba.photometric.surfaces import normals, slopes_of
+from factors.patches import Sightings, expect
+from gsba.photometric.surfaces import normals, shown_depths, slopes_of
 
 STEP = 2 * np.pi / 1536
 POINT = np.array([0.4, -0.3, 2.0])  # seen from the host at the origin
@@ -50,8 +50,14 @@ def _normal(surface: np.ndarray, slopes: np.ndarray) -> np.ndarray:
     sightings = expect(np.zeros(3, np.int64), origins, axes)
     for warp, part in zip(sightings.warps, parts, strict=True):
         warp[2:] = part[0].T.ravel()
-    every, own = np.arange(3), (ORIGIN[None], SPREAD[None])
-    return normals(sightings, every, rays, slopes[None], *own)[0]
+    return _from_sightings(sightings, rays, slopes)
+
+
+def _from_sightings(sightings: Sightings, rays: np.ndarray, slopes: np.ndarray) -> np.ndarray:
+    """The normal from sightings of one template, none of them shifted."""
+    shown = shown_depths(sightings, sightings.origins, rays)
+    own = slopes[None], ORIGIN[None], SPREAD[None]
+    return normals(sightings.templates, *shown, *own)[0]
 
 
 @pytest.mark.parametrize("tilt", [0, 20, 45, 65])
@@ -89,5 +95,4 @@ def test_a_point_without_parallax_tells_nothing() -> None:
     affine, origin, axes, ray = _affine(_surface(50, 0), np.zeros(2), np.eye(3), 0.3 * ORIGIN)
     sightings = expect(np.zeros(1, np.int64), origin[None], axes[None])
     sightings.warps[0, 2:] = affine.T.ravel()
-    every, own = np.arange(1), (ORIGIN[None], SPREAD[None])
-    assert not normals(sightings, every, ray[None], np.zeros((1, 2)), *own).any()
+    assert not _from_sightings(sightings, ray[None], np.zeros(2)).any()
