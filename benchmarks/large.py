@@ -68,6 +68,11 @@ class Counted:
     largest: int = 0  # bytes on disk below `folder` after a pass
     folder: Path = field(default_factory=Path)
 
+    @property
+    def num_threads(self) -> int:
+        """See `gsba.store.shards.Workers`."""
+        return self.workers.num_threads
+
     def map_shards(self, job: Job[Any]) -> Iterator[Any]:
         """See `gsba.store.shards.Workers`."""
         yield from self.workers.map_shards(job)
@@ -257,6 +262,7 @@ class Timed:
     """One thread of this process, and the CPU seconds of a part in each pass."""
 
     seconds: dict[str, list[float]] = field(default_factory=dict)  # by title of the pass
+    num_threads: int = 1
 
     def map_shards(self, job: Job[Any]) -> Iterator[Any]:
         """See `gsba.store.shards.Workers`."""

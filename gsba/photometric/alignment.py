@@ -371,9 +371,9 @@ def _normals_world(
         there = Sightings(*(column[kept[some]] for column in sightings))
         return surfaces.shown_depths(there, bearings[some], rays[some])
 
-    shown = rows_in_threads(depths, len(kept), _SIGHTINGS_AT_ONCE, num_threads)
+    shifts, products = rows_in_threads(depths, len(kept), _SIGHTINGS_AT_ONCE, num_threads)
     laid = planes.slopes, planes.origins, planes.spreads
-    normals = surfaces.normals(sightings.templates[kept], *shown, *laid)
+    normals = surfaces.normals(sightings.templates[kept], shifts, products, *laid)
     return np.einsum("jab,jb->ja", world_T_hosts[:, :3, :3], normals)
 
 
