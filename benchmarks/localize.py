@@ -1,6 +1,7 @@
 """Frames and photos localised in a finished run: errors against the truth, and CPU seconds.
 
     python -m benchmarks.localize [--work DIR] [--markdown benchmarks/results/localize.md]
+    python -m benchmarks.localize --large RUN WALK [--lanes 8] [--work DIR]
 
 A walk through the demo's gallery is rendered, and every fourth frame is held out. The others are
 refined; frames held out and photos rendered at new places are then localised in that run. Photos
@@ -9,6 +10,9 @@ middle; in the last row they are of three cameras whose tags give a rounded foca
 are those of the gallery, whose rooms are four units wide. Errors are those of poses carried to the
 truth by the similarity of the run's own frames. NEES is over six degrees of freedom: 1 =
 covariances are right.
+
+`--large`: WALK is of `benchmarks.streets`, RUN its refined poses. Frames rendered halfway between
+some of its frames are localised, and carried to the truth by the frames around each.
 """
 
 import argparse
@@ -17,7 +21,7 @@ import json
 import shutil
 import time
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 
 import cv2
@@ -26,12 +30,14 @@ import numpy as np
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from benchmarks import streets
 from gsba import Localizer, refine
 from gsba.camera.projections import PerspectiveProjection
 from gsba.camera.sphere import erp_from_bearings
 from gsba.demo import make_walk
 from gsba.demo.gallery import build_gallery
 from gsba.demo.render import render_erp
+from gsba.demo.walk import write_frames
 from gsba.geometry import rotation_angle
 from gsba.localization import LocalizedFrame, LocalizedPhotos, localize_photos, read_photo
 from gsba.similarity import Sim3, pose_similarity
@@ -44,6 +50,7 @@ FIELDS = (40, 50, 60, 68, 75, 90, 110, 120)  # degrees, of a photo's longer side
 SIZES = ((960, 720), (720, 960))  # landscape, portrait
 SHARED = ((60, (960, 720)), (75, (720, 960)), (100, (960, 720)))  # cameras that photos share
 PHOTOS_OF_EACH = 4
+BETWEEN, AROUND = 20, 10  # frames rendered between those of a large map; frames around each
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +81,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--work", type=Path, default=Path("bench-localize"))
     parser.add_argument("--markdown", type=Path)
+    parser.add_argument("--large", type=Path, nargs=2, metavar=("RUN", "WALK"))
+    parser.add_argument("--lanes", type=int, default=8, help="of WALK")
     options = parser.parse_args()
+    if options.large is not None:
+        print(_table([_large_row(*options.large, options.work / "between", options.lanes)]))
+        return
     held, truth = _walk(options.work)
     run = options.work / "run"
     if not (run / "trajectory.tum").is_file():
@@ -90,6 +102,41 @@ def main() -> None:
     if options.markdown is not None:
         text = (__doc__ or "").split("\n\n", 2)[2]
         options.markdown.write_text(f"# Localisation\n\n{text}\n{table}\n", encoding="utf-8")
+
+
+def _large_row(run: Path, walk: Path, work: Path, lanes: int) -> list[str]:
+    """Row of frames between those of a walk through lanes."""
+    truth = read_trajectory(walk / "groundtruth.tum")
+    poses, result = truth.world_T_rigs, Localizer(run).map.result
+    num = len(poses)
+    before = np.linspace(AROUND, num - AROUND, BETWEEN).astype(int)
+    halfway = []
+    for f in before:
+        one, after = gtsam.Pose3(poses[f]), gtsam.Pose3(poses[f + 1])
+        halfway.append(one.retract(0.5 * one.localCoordinates(after)).matrix())
+    (work / "images").mkdir(parents=True, exist_ok=True)
+    between = Trajectory(np.arange(float(BETWEEN)), np.array(halfway))
+    first = cv2.imread(str(next((walk / "images").glob("*.jpg"))))
+    assert first is not None
+    height, width = first.shape[0], first.shape[1]
+    scene = streets.built(streets.crossings(num, lanes, 0), 0)
+    pictures = (render_erp(scene, pose, width, height) for pose in halfway)
+    write_frames(work, between, pictures, 1)
+    localizer = Localizer(run)
+    images = sorted((work / "images").glob("*.jpg"))
+    localizer.localize(images[0])  # kernels are compiled, keyframes read
+    begin = time.process_time()
+    found = [localizer.localize(image) for image in images]
+    cpu = (time.process_time() - begin) / BETWEEN
+    errors = []
+    for one, f, true in zip(found, before, halfway, strict=True):
+        if one.found:
+            rows = slice(f - AROUND + 1, f + AROUND + 1)
+            move = pose_similarity(result.world_T_rigs[rows], poses[rows])
+            errors.append(_errors(move, [(one.world_T_rig, one.covariance, true)]))
+    every = Errors(*(np.concatenate(column) for column in zip(*map(astuple, errors), strict=True)))
+    title = f"between {num} frames of lanes, {width} px"
+    return [title, f"{len(errors)} of {BETWEEN}", *every.cells(), "", f"{cpu:.2f}"]
 
 
 def _walk(work: Path) -> tuple[list[int], Trajectory]:

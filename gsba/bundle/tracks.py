@@ -10,7 +10,7 @@ from gsba.types import Matches, Tracks
 from gsba.types.records import slices
 
 _kernel, _ = kernel_and_part()
-_AT_ONCE = 1 << 20  # matches that are numbered together
+_AT_ONCE = 1 << 18  # matches that are numbered together
 
 
 def build(matches: Sequence[Matches], num_keypoints: np.ndarray) -> Tracks:
@@ -29,19 +29,18 @@ def build(matches: Sequence[Matches], num_keypoints: np.ndarray) -> Tracks:
     first_node = np.concatenate([[0], np.cumsum(num_keypoints)]).astype(np.int64)
     number = np.int32 if first_node[-1] < np.iinfo(np.int32).max else np.int64
     first_node = first_node.astype(number)
-    edges = _edges(matches, first_node)
     matched = np.zeros(first_node[-1], bool)
-    matched[edges[:, 0]], matched[edges[:, 1]] = True, True
+    for edges in _edges(matches, first_node):
+        matched[edges] = True
     nodes = np.flatnonzero(matched).astype(number)  # all others are tracks of their own
     place = np.cumsum(matched, dtype=number) - 1
-    for some in slices(len(edges), _AT_ONCE):
-        edges[some] = place[edges[some]]
-    del matched, place
     of_frames = np.diff(np.searchsorted(nodes, first_node))
     frame_of_node = np.repeat(np.arange(len(of_frames), dtype=np.int32), of_frames)
     roots = np.arange(len(nodes), dtype=number)
-    _merge(edges, frame_of_node, roots)
-    del edges
+    following, sizes = roots.copy(), np.ones_like(roots)
+    for edges in _edges(matches, first_node):
+        _merge(place[edges], frame_of_node, roots, following, sizes)
+    del matched, place, following, sizes
     several = np.zeros(len(roots), bool)
     several[roots[roots != np.arange(len(roots), dtype=number)]] = True
     chosen = np.flatnonzero(several[roots]).astype(number)
@@ -57,18 +56,17 @@ def build(matches: Sequence[Matches], num_keypoints: np.ndarray) -> Tracks:
     )
 
 
-def _edges(matches: Sequence[Matches], first_node: np.ndarray) -> np.ndarray:
-    """Nodes (M, 2) of all matches, one set after the other; a node is a keypoint of all frames'."""
-    edges = np.empty((sum(len(part.keypoints) for part in matches), 2), first_node.dtype)
-    first = 0
+def _edges(matches: Sequence[Matches], first_node: np.ndarray) -> Iterator[np.ndarray]:
+    """Nodes (M, 2) of all matches in their order, some at a time; a node is a keypoint of all
+    frames'."""
     for part in matches:
-        pair_of_row = np.repeat(np.arange(len(part.pairs), dtype=np.int32), np.diff(part.offsets))
         for some in slices(len(part.keypoints), _AT_ONCE):
-            rows = slice(first + some.start, first + some.stop)
-            edges[rows] = first_node[part.pairs[pair_of_row[some]]] + part.keypoints[some]
+            first = int(np.searchsorted(part.offsets, some.start, side="right")) - 1
+            last = int(np.searchsorted(part.offsets, some.stop))
+            lengths = np.diff(np.clip(part.offsets[first : last + 1], some.start, some.stop))
+            frames = np.repeat(part.pairs[first:last], lengths, axis=0)
+            yield first_node[frames] + part.keypoints[some]
             release_mapped_files()
-        first += len(part.keypoints)
-    return edges
 
 
 def runs(tracks: Tracks, most: int) -> Iterator[tuple[slice, slice, Tracks]]:
@@ -90,14 +88,12 @@ def runs(tracks: Tracks, most: int) -> Iterator[tuple[slice, slice, Tracks]]:
 
 
 @_kernel
-def _merge(edges, frame_of_node, roots):
+def _merge(edges, frame_of_node, roots, following, sizes):
     """Merge edges that keep frames unique in a component, and set the root node of every node.
 
-    Each node is its own root at first.
-
-    Components are circular linked lists, so that joining two of them swaps two links.
+    Components are circular linked lists, so that joining two of them swaps two links. At first,
+    each node is a component: its own root, followed by itself, of size one.
     """
-    following, sizes = roots.copy(), np.ones_like(roots)
     for e in range(len(edges)):
         big, small = roots[edges[e, 0]], roots[edges[e, 1]]
         if big == small:

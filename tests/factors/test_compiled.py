@@ -30,7 +30,8 @@ from gsba.log import show_log
 show_log()
 from gsba.bundle.tracks import _merge
 for kind in (np.int32, np.int64):
-    _merge(np.zeros((1, 2), kind), np.zeros(2, np.int32), np.arange(2, dtype=kind))
+    nodes = np.arange(2, dtype=kind)
+    _merge(np.zeros((1, 2), kind), np.zeros(2, np.int32), nodes, nodes.copy(), np.ones_like(nodes))
 """
 
 ROUNDED_ELSEWHERE = {"sum", "mean", "dot", "cross", "std", "var", "prod", "trace", "outer", "norm"}
