@@ -85,7 +85,8 @@ def main() -> None:
     parser.add_argument("--lanes", type=int, default=8, help="of WALK")
     options = parser.parse_args()
     if options.large is not None:
-        print(_table([_large_row(*options.large, options.work / "between", options.lanes)]))
+        of_map, walk = options.large
+        print(_table([_large_row(of_map, walk, options.work / "between", options.lanes)]))
         return
     held, truth = _walk(options.work)
     run = options.work / "run"
