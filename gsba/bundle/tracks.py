@@ -40,20 +40,16 @@ def build(matches: Sequence[Matches], num_keypoints: np.ndarray) -> Tracks:
     following, sizes = roots.copy(), np.ones_like(roots)
     for edges in _edges(matches, first_node):
         _merge(place[edges], frame_of_node, roots, following, sizes)
-    del matched, place, following, sizes
-    several = np.zeros(len(roots), bool)
-    several[roots[roots != np.arange(len(roots), dtype=number)]] = True
-    chosen = np.flatnonzero(several[roots]).astype(number)
-    points = (np.cumsum(several, dtype=number) - 1)[roots[chosen]]
-    order = np.argsort(points, kind="stable")
-    chosen, points = chosen[order], points[order]
-    frames = frame_of_node[chosen]
-    return Tracks(
-        points.astype(np.int32),
-        frames,
-        (nodes[chosen] - first_node[frames]).astype(np.int32),
-        int(points[-1]) + 1 if len(points) else 0,
-    )
+    del matched, place, following
+    several = (sizes > 1) & (roots == np.arange(len(roots), dtype=number))
+    lengths = sizes[several].astype(np.int64)
+    del sizes
+    numbers = np.cumsum(several, dtype=np.int32) - np.int32(1)  # of tracks, by their root
+    rows = np.cumsum(lengths) - lengths
+    points, frames, keypoints = np.empty((3, int(lengths.sum())), np.int32)
+    members = nodes, frame_of_node, roots, several
+    _collect(*members, numbers, first_node, rows, points, frames, keypoints)
+    return Tracks(points, frames, keypoints, len(lengths))
 
 
 def _edges(matches: Sequence[Matches], first_node: np.ndarray) -> Iterator[np.ndarray]:
@@ -120,3 +116,18 @@ def _merge(edges, frame_of_node, roots, following, sizes):
             node = following[node]
         sizes[big] += sizes[small]
         following[big], following[small] = following[small], following[big]
+
+
+@_kernel
+def _collect(
+    nodes, frame_of_node, roots, several, numbers, first_node, rows, points, frames, keypoints
+):
+    """Write the observations of all tracks, by track, then by frame; `rows` (J,) begins as the
+    first row of each."""
+    for n in range(len(roots)):
+        if several[roots[n]]:
+            track, frame = numbers[roots[n]], frame_of_node[n]
+            row = rows[track]
+            points[row], frames[row] = track, frame
+            keypoints[row] = nodes[n] - first_node[frame]
+            rows[track] += 1
