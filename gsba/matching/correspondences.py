@@ -16,6 +16,8 @@ _ROTATION_GAPS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)  # gaps in 
 # matched pairs
 _MAX_JOIN_ERROR_RAD = np.deg2rad(4.0)  # largest error of a joined part's pose, as an angle at the
 # median depth
+_UNPREDICTED_RAD = np.deg2rad(60.0)  # radius of a search from which it is of all points
+_UNPREDICTED_NEIGHBOURS = 2  # frames that each frame is matched with then
 _ROTATION_RADIUS_DEG = 2.0  # radius of the search around a keypoint's rotated bearing
 
 
@@ -57,7 +59,9 @@ def match_loops(context: MatchContext, solved: Solution) -> VerifiedPairs:
     """Match frames close in space but far in time, as far as drift leaves them predictable.
 
     Only known points are searched, within the distance from their predicted bearing that drift
-    allows. Repeated structure in the distance, arches or columns, is further off than that.
+    allows. Repeated structure in the distance, arches or columns, is further off than that. After
+    so long a way that drift predicts nothing, all points of both frames are compared, and the
+    nearest few frames are enough: the rest is found when the loop is closed.
 
     Args:
         context: features and settings of the run.
@@ -70,10 +74,10 @@ def match_loops(context: MatchContext, solved: Solution) -> VerifiedPairs:
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     along = np.concatenate([[0], np.cumsum(steps)])
     drifts = settings.pairs.drift * (along[chosen[:, 1]] - along[chosen[:, 0]])
-    gates = [
-        Gate.around_points(np.deg2rad(settings.pairs.loop_deg) + 2 * drift / max(depth, 1e-12))
-        for drift in drifts
-    ]
+    radii = np.deg2rad(settings.pairs.loop_deg) + 2 * drifts / max(depth, 1e-12)
+    few = pairs.thinned(chosen, radii > _UNPREDICTED_RAD, _UNPREDICTED_NEIGHBOURS)
+    chosen, drifts = chosen[few], drifts[few]
+    gates = [Gate.around_points(radius) for radius in radii[few]]
     known = solved.points_by_keypoint(keypoints)
     found = context.match(chosen, world_T_rigs, gates, known)
     f0_T_f1s = inverse(world_T_rigs[chosen[:, 0]]) @ world_T_rigs[chosen[:, 1]]

@@ -101,6 +101,21 @@ def closing(rigs_in_world: np.ndarray, median_depth: float, settings: PairSettin
     return _nearest(rigs_in_world, reach, settings, next_visits)
 
 
+def thinned(pairs: np.ndarray, unpredicted: np.ndarray, most: int) -> np.ndarray:
+    """True (P,) for pairs to match, of which many would show the same without any prediction.
+
+    Args:
+        pairs: (P, 2) frames, the most promising first.
+        unpredicted: (P,) bool, pairs whose geometry is not predicted; all others are kept.
+        most: of these, kept for each frame, and more where its partner has fewer.
+    """
+    kept, times = ~unpredicted, np.zeros(pairs.max(initial=-1) + 1, int)
+    for p in np.flatnonzero(unpredicted):
+        kept[p] = times[pairs[p]].min() < most
+        times[pairs[p]] += kept[p]
+    return kept
+
+
 def by_place(pairs: np.ndarray, num_frames: int) -> tuple[np.ndarray, np.ndarray]:
     """An order of pairs in which each frame is needed for a short while only.
 

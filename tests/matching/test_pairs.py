@@ -131,3 +131,15 @@ def _reads(chosen: np.ndarray, kept: int) -> int:
 def test_no_pairs_have_an_order() -> None:
     order, places = pairs.by_place(np.zeros((0, 2), np.int32), 3)
     assert len(order) == len(places) == 0
+
+
+def test_each_frame_keeps_its_first_pairs_where_nothing_is_predicted() -> None:
+    chosen = np.array([[f, g] for f in range(5) for g in range(10, 16)])
+    chosen = chosen[np.argsort(chosen.sum(axis=1), kind="stable")]
+    unpredicted = chosen[:, 1] > 11
+    kept = pairs.thinned(chosen, unpredicted, 2)
+    assert kept[~unpredicted].all()
+    left = chosen[kept & unpredicted]
+    assert len(left) < np.count_nonzero(unpredicted)
+    assert all(np.count_nonzero(left == f) >= 2 for f in (*range(5), *range(12, 16)))
+    np.testing.assert_array_equal(pairs.thinned(chosen, unpredicted, 6), np.ones(len(chosen), bool))
