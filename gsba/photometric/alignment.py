@@ -420,8 +420,9 @@ def _former_observations(
         if keypoints.sqrt_infos is not None:
             roots = keypoints.sqrt_infos[rows]
             covariances = np.linalg.inv(np.swapaxes(roots, 1, 2) @ roots)
-        bearings, of = keypoints.bearings_rig[rows], (points[chosen], frames[chosen])
-        release_mapped_files()
-        return Observed(*of, bearings, noise**2 * covariances)
+        of = points[chosen], frames[chosen]
+        return Observed(*of, keypoints.bearings_rig[rows], noise**2 * covariances)
 
-    yield from map_in_threads(left, len(parts), num_threads)
+    for one in map_in_threads(left, len(parts), num_threads):
+        yield one
+        release_mapped_files()

@@ -131,12 +131,12 @@ def _by_frame(
         every = Observed.joined(iter(chosen), None)
         order = np.lexsort((every.points, every.frames))
         is_new, every = order < len(chosen[0]), every.taken(order)
-        release_mapped_files()
         return every.points, every.frames, is_new, *_columns(every, shown, rig)
 
     for found in map_in_threads(ordered, len(groups), num_threads):
         sizes += np.bincount(found[1], minlength=len(sizes))
         yield found
+        release_mapped_files()
 
 
 def _columns(every: Observed, shown: Shown, rig: CubeRig) -> tuple[np.ndarray, ...]:
