@@ -10,6 +10,7 @@ from gsba.types import FrameSet, Reconstruction
 
 MIN_STEP_SIGMAS = 3.0  # median length of a map's steps, in standard deviations; maps of real and
 # rendered walks have 40 and more
+MIN_SHARE_AHEAD = 0.8  # of a vehicle's way: a tenth of it may go backwards
 
 
 def refuse_vehicle_in_pieces(frames: FrameSet) -> None:
@@ -38,7 +39,7 @@ def require_motion(frames: FrameSet, result: Reconstruction) -> None:
 
     A camera on a vehicle whose surroundings are blurred or far sees the vehicle stand still. Its
     turns look like those of a camera on a tripod, and its positions come from false matches: these
-    are no better known than steps are long.
+    are no better known than steps are long, or go to and fro.
 
     Args:
         frames: of the run, with their masks.
@@ -58,7 +59,14 @@ def require_motion(frames: FrameSet, result: Reconstruction) -> None:
             "shows no parallax: it is blurred or far away, or the vehicle stands; give more "
             "frames per second, --masks of the vehicle, or a trajectory"
         )
-    sigmas = step_sigmas(main)
+    sigmas, ahead = step_sigmas(main), share_ahead(main)
+    if share >= VEHICLE_SHARE and ahead < MIN_SHARE_AHEAD:
+        raise GsbaError(
+            f"the images determine no positions: {where}, and {100 * ahead:.0f} % of the way that "
+            f"was found go the same way as seen from there, where {100 * MIN_SHARE_AHEAD:.0f} % "
+            "and more of a vehicle's do; nothing is written: give more frames per second, --masks "
+            "of the vehicle, or a trajectory"
+        )
     if not len(sigmas) or np.median(sigmas) >= MIN_STEP_SIGMAS:
         return
     cause = where if share >= VEHICLE_SHARE else "the camera hardly moves, or little matches"
@@ -82,6 +90,23 @@ def step_sigmas(result: Reconstruction) -> np.ndarray:
     variances = np.trace(spread, axis1=1, axis2=2)
     known = np.isfinite(variances) & (variances > 0)
     return np.linalg.norm(steps[known, :3, 3], axis=1) / np.sqrt(variances[known])
+
+
+def share_ahead(result: Reconstruction) -> float:
+    """Share of a map's way that adds up if each step is seen from the camera, at most 1.
+
+    A vehicle goes where it faces. Steps from false matches go to and fro: of n of them, about one
+    over the root of n adds up. No step counts for more than the median one, as false ones are of
+    any length. 1 for a map without steps.
+    """
+    poses = result.world_T_rigs
+    steps = (inverse(poses[:-1]) @ poses[1:])[:, :3, 3]
+    lengths = np.linalg.norm(steps, axis=1)
+    weights = np.minimum(lengths, np.median(lengths)) if len(lengths) else lengths
+    if not weights.sum() > 0:
+        return 1.0
+    directions = steps / np.maximum(lengths, 1e-300)[:, None]
+    return float(np.linalg.norm(weights @ directions) / weights.sum())
 
 
 def _masked_share(frames: FrameSet) -> float:

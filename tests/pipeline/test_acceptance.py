@@ -1,5 +1,6 @@
 """A run whose images determine no positions is refused, and one on a vehicle is named so."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -11,6 +12,7 @@ from gsba.pipeline.acceptance import (
     MIN_STEP_SIGMAS,
     refuse_vehicle_in_pieces,
     require_motion,
+    share_ahead,
     step_sigmas,
 )
 from gsba.types import FrameSet, JointErrors, PictureFormat, Reconstruction
@@ -68,6 +70,32 @@ def test_positions_that_images_do_not_determine_are_refused(tmp_path: Path) -> N
     vehicle = _frames(tmp_path, 16)
     with pytest.raises(GsbaError, match="50 % of the picture turn with the camera, as a vehicle"):
         require_motion(vehicle, _result(0.0))
+
+
+def _driven(turn_deg: float, backwards: int) -> Reconstruction:
+    """Steps ahead of a camera that turns at each, the last few back again."""
+    result, poses = _result(1.0), [np.eye(4)]
+    cosine, sine = np.cos(np.deg2rad(turn_deg)), np.sin(np.deg2rad(turn_deg))
+    for n in range(NUM - 1):
+        step = np.array([[cosine, 0, sine, 0], [0, 1, 0, 0], [-sine, 0, cosine, 0], [0, 0, 0, 1]])
+        step[2, 3] = -1.0 if n >= NUM - 1 - backwards else 1.0
+        poses.append(poses[-1] @ step)
+    return replace(result, world_T_rigs=np.array(poses))
+
+
+def test_a_vehicle_does_not_go_to_and_fro(tmp_path: Path) -> None:
+    assert share_ahead(_driven(40.0, 0)) == pytest.approx(1)
+    assert share_ahead(_driven(0.0, 3)) == pytest.approx(1 / 7)
+    hand = _frames(tmp_path, 4)
+    require_motion(hand, _driven(0.0, 3))
+    vehicle = _frames(tmp_path, 16)
+    for turn_deg in (0.0, 40.0):
+        require_motion(vehicle, _driven(turn_deg, 0))
+    with pytest.raises(GsbaError, match=r"50 % of the picture.*14 % of the way.*go the same way"):
+        require_motion(vehicle, _driven(0.0, 3))
+    poses = _driven(0.0, 3).world_T_rigs
+    poses[3:, 2, 3] += 1000  # one long step does not outweigh the others
+    assert share_ahead(replace(_result(1.0), world_T_rigs=poses)) == pytest.approx(1 / 7)
 
 
 def test_turns_alone_are_a_result_but_not_on_a_vehicle(tmp_path: Path) -> None:
