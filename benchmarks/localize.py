@@ -108,7 +108,7 @@ def main() -> None:
 def _large_row(run: Path, walk: Path, work: Path, lanes: int) -> list[str]:
     """Row of frames between those of a walk through lanes."""
     truth = read_trajectory(walk / "groundtruth.tum")
-    poses, result = truth.world_T_rigs, Localizer(run).map.result
+    poses, localizer = truth.world_T_rigs, Localizer(run)
     num = len(poses)
     before = np.linspace(AROUND, num - AROUND, BETWEEN).astype(int)
     halfway = []
@@ -123,7 +123,6 @@ def _large_row(run: Path, walk: Path, work: Path, lanes: int) -> list[str]:
     scene = streets.built(streets.crossings(num, lanes, 0), 0)
     pictures = (render_erp(scene, pose, width, height) for pose in halfway)
     write_frames(work, between, pictures, 1)
-    localizer = Localizer(run)
     images = sorted((work / "images").glob("*.jpg"))
     localizer.localize(images[0])  # kernels are compiled, keyframes read
     begin = time.process_time()
@@ -133,7 +132,7 @@ def _large_row(run: Path, walk: Path, work: Path, lanes: int) -> list[str]:
     for one, f, true in zip(found, before, halfway, strict=True):
         if one.found:
             rows = slice(f - AROUND + 1, f + AROUND + 1)
-            move = pose_similarity(result.world_T_rigs[rows], poses[rows])
+            move = pose_similarity(localizer.map.result.world_T_rigs[rows], poses[rows])
             errors.append(_errors(move, [(one.world_T_rig, one.covariance, true)]))
     every = Errors(*(np.concatenate(column) for column in zip(*map(astuple, errors), strict=True)))
     title = f"between {num} frames of lanes, {width} px"

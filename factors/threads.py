@@ -6,7 +6,7 @@ order: results are identical to the last bit for any number of threads.
 
 import os
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import lru_cache
 from itertools import pairwise
@@ -61,16 +61,12 @@ def run_in_threads(work: Callable[[int], None], num: int, num_threads: int) -> N
 
 
 def rows_in_threads(
-    work: Callable[[slice], Sequence[np.ndarray]], num: int, most: int, num_threads: int
+    work: Callable[[slice], Sequence[np.ndarray]], ranges: Iterable[slice], num_threads: int
 ) -> list[np.ndarray]:
-    """Arrays that work makes of `num` rows, of at most `most` of them at a time, concatenated; work
-    must not use threads itself."""
-    starts = range(0, max(num, 1), most)
-
-    def of_some(n: int) -> Sequence[np.ndarray]:
-        return work(slice(starts[n], min(starts[n] + most, num)))
-
-    parts = map_in_threads(of_some, len(starts), num_threads)
+    """Arrays that work makes of each of at least one range of rows, concatenated; work must not use
+    threads itself."""
+    every = list(ranges)
+    parts = map_in_threads(lambda n: work(every[n]), len(every), num_threads)
     return [np.concatenate(column) for column in zip(*parts, strict=True)]
 
 

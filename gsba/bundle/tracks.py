@@ -44,11 +44,11 @@ def build(matches: Sequence[Matches], num_keypoints: np.ndarray) -> Tracks:
     several = (sizes > 1) & (roots == np.arange(len(roots), dtype=number))
     lengths = sizes[several].astype(np.int64)
     del sizes
-    numbers = np.cumsum(several, dtype=np.int32) - np.int32(1)  # of tracks, by their root
+    numbers = np.cumsum(several, dtype=np.int32) - np.int32(1)
+    numbers[~several] = -1
     rows = np.cumsum(lengths) - lengths
     points, frames, keypoints = np.empty((3, int(lengths.sum())), np.int32)
-    members = nodes, frame_of_node, roots, several
-    _collect(*members, numbers, first_node, rows, points, frames, keypoints)
+    _collect(nodes, frame_of_node, roots, numbers, first_node, rows, points, frames, keypoints)
     return Tracks(points, frames, keypoints, len(lengths))
 
 
@@ -119,14 +119,15 @@ def _merge(edges, frame_of_node, roots, following, sizes):
 
 
 @_kernel
-def _collect(
-    nodes, frame_of_node, roots, several, numbers, first_node, rows, points, frames, keypoints
-):
-    """Write the observations of all tracks, by track, then by frame; `rows` (J,) begins as the
-    first row of each."""
+def _collect(nodes, frame_of_node, roots, numbers, first_node, rows, points, frames, keypoints):
+    """Write the observations of all tracks, by track, then by frame.
+
+    `numbers` are those of tracks, by their root, -1 for single nodes; `rows` (J,) begins as the
+    first row of each track.
+    """
     for n in range(len(roots)):
-        if several[roots[n]]:
-            track, frame = numbers[roots[n]], frame_of_node[n]
+        track, frame = numbers[roots[n]], frame_of_node[n]
+        if track >= 0:
             row = rows[track]
             points[row], frames[row] = track, frame
             keypoints[row] = nodes[n] - first_node[frame]

@@ -14,7 +14,7 @@ from gsba.geometry import moved_to
 from gsba.memory import release_mapped_files
 from gsba.types import Counts, Keypoints, Landmarks, Reconstruction, Tracks
 
-_AT_ONCE = 1 << 18  # observations whose rays are held: 60 MB
+_AT_ONCE = 1 << 18  # observations whose rays are held: 30 MB
 _NONE = Counts(0, 0, "tracks")
 
 

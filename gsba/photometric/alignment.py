@@ -270,7 +270,7 @@ def _projected_patches(
         rays = np.einsum("oba,ob->oa", rotations, planes.rays_world[own])
         return origins / distances, across / distances[:, :, None], rays / distances
 
-    return rows_in_threads(project, len(points), _SIGHTINGS_AT_ONCE, num_threads)
+    return rows_in_threads(project, slices(len(points), _SIGHTINGS_AT_ONCE), num_threads)
 
 
 def _accepted(
@@ -290,8 +290,8 @@ def _accepted(
         kept, bearings, covariances = accepted_rows(patches, there, pixel, settings, own)
         return some.start + kept, bearings, covariances, np.array([list(own.values())])
 
-    columns = rows_in_threads(accept, len(seeing), _SIGHTINGS_AT_ONCE, num_threads)
-    kept, bearings, covariances, rejected = columns
+    some = slices(len(seeing), _SIGHTINGS_AT_ONCE)
+    kept, bearings, covariances, rejected = rows_in_threads(accept, some, num_threads)
     for reason, number in zip(dropped, rejected.sum(axis=0).tolist(), strict=True):
         dropped[reason] += number
     found = Observed(sightings.templates[kept], seeing[kept], bearings, covariances)
@@ -368,10 +368,11 @@ def _normals_world(
     """
 
     def depths(some: slice) -> tuple[np.ndarray, ...]:
-        there = Sightings(*(column[kept[some]] for column in sightings))
-        return surfaces.shown_depths(there, bearings[some], rays[some])
+        seen = sightings.spreads[kept[some]], sightings.warps[kept[some]]
+        return surfaces.shown_depths(*seen, bearings[some], rays[some])
 
-    shifts, products = rows_in_threads(depths, len(kept), _SIGHTINGS_AT_ONCE, num_threads)
+    some = slices(len(kept), _SIGHTINGS_AT_ONCE)
+    shifts, products = rows_in_threads(depths, some, num_threads)
     laid = planes.slopes, planes.origins, planes.spreads
     normals = surfaces.normals(sightings.templates[kept], shifts, products, *laid)
     return np.einsum("jab,jb->ja", world_T_hosts[:, :3, :3], normals)

@@ -11,7 +11,6 @@ terms: always the same way along a floor or a wall, which bends maps.
 import numpy as np
 
 from factors import tangent_basis
-from factors.patches import Sightings
 
 _AFFINE_SIGMA = 0.07  # noise of an alignment's affine part
 _SLOPE_SIGMA = 0.7  # prior of surface slopes, tangents of their tilt
@@ -37,20 +36,20 @@ def slopes_of(normals_rig: np.ndarray, origins: np.ndarray, spreads: np.ndarray)
 
 
 def shown_depths(
-    sightings: Sightings, bearings: np.ndarray, rays: np.ndarray
+    spreads: np.ndarray, warps: np.ndarray, bearings: np.ndarray, rays: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Shifts (N, 2) in template steps by which relative depth along the host's ray appears in each
     aligned sighting, and their products (N, 2) with the affine part.
 
     Args:
-        sightings: accepted ones, N of them.
+        spreads (N, 3, 2), warps (N, 6): of the sightings, see `factors.patches.Sightings`.
         bearings: (N, 3) where they were found, rig frame of the observing frame.
         rays: (N, 3) from the host to the template's point, in the observing frame, in units of its
             distance there.
     """
     axes = tangent_basis(bearings)
-    shifts = np.linalg.solve(axes @ sightings.spreads, axes @ rays[:, :, None])[:, :, 0]
-    affine = np.swapaxes(sightings.warps[:, 2:].reshape(-1, 2, 2), 1, 2)
+    shifts = np.linalg.solve(axes @ spreads, axes @ rays[:, :, None])[:, :, 0]
+    affine = np.swapaxes(warps[:, 2:].reshape(-1, 2, 2), 1, 2)
     return shifts, np.einsum("oij,oi->oj", affine, shifts)
 
 

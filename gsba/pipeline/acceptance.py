@@ -3,7 +3,7 @@
 import numpy as np
 
 from gsba.frames.masks import load_mask
-from gsba.geometry import inverse, step_covariances
+from gsba.geometry import inverse, step_covariances, unit
 from gsba.log import GsbaError
 from gsba.masks.carrier import VEHICLE_SHARE
 from gsba.types import FrameSet, Reconstruction
@@ -105,8 +105,7 @@ def share_ahead(result: Reconstruction) -> float:
     weights = np.minimum(lengths, np.median(lengths)) if len(lengths) else lengths
     if not weights.sum() > 0:
         return 1.0
-    directions = steps / np.maximum(lengths, 1e-300)[:, None]
-    return float(np.linalg.norm(weights @ directions) / weights.sum())
+    return float(np.linalg.norm(weights @ unit(steps)) / weights.sum())
 
 
 def _masked_share(frames: FrameSet) -> float:

@@ -55,7 +55,7 @@ def _normal(surface: np.ndarray, slopes: np.ndarray) -> np.ndarray:
 
 def _from_sightings(sightings: Sightings, rays: np.ndarray, slopes: np.ndarray) -> np.ndarray:
     """The normal from sightings of one template, none of them shifted."""
-    shown = shown_depths(sightings, sightings.origins, rays)
+    shown = shown_depths(sightings.spreads, sightings.warps, sightings.origins, rays)
     own = slopes[None], ORIGIN[None], SPREAD[None]
     return normals(sightings.templates, *shown, *own)[0]
 
