@@ -1,13 +1,14 @@
-"""Similarities of two maps from single pairs of frames across a short break between them.
+"""Maps on either side of a short break of a recording, across which the camera moved on.
 
-Two overlapping frames give their relative rotation, the direction from one to the other, and
-distances of points in units of that step. Points of one of the maps give the step's length in its
-unit; so both maps together give the ratio of their units.
+Similarities of both maps follow from single pairs of frames across the break. Two overlapping
+frames give their relative rotation, the direction from one to the other, and distances of points in
+units of that step. Points of one of the maps give the step's length in its unit; so both maps
+together give the ratio of their units.
 """
 
 import numpy as np
 
-from gsba.geometry import inverse
+from gsba.geometry import inverse, rotation_angle
 from gsba.loop_closure.map_similarity import Proposal, alike, carrying
 from gsba.similarity import Sim3
 from gsba.trajectory.steps import ray_depths
@@ -17,6 +18,9 @@ _MIN_SHARED_POINTS = 8  # points of a pair that either map must hold
 # Largest standard deviation of the logarithm of a length: far points determine no scale.
 _MAX_LOG_LENGTH_SIGMA = 0.1
 MIN_AGREEING = 3  # least number of pairs
+_REACH = 4  # steps of the map before or after a break that tell how fast the camera moves
+_MAX_PACES = 2.0  # fastest motion over a break, in that of the fastest of these steps
+_MAX_TURN_RAD = np.deg2rad(60.0)  # largest turn over a break
 
 
 def crossing(
@@ -68,6 +72,37 @@ def agreed(proposals: list[Proposal], poses: np.ndarray, depth: float) -> Propos
     if max(counts, default=0) < max(MIN_AGREEING, len(proposals) // 2 + 1):
         return None
     return proposals[int(np.argmax(counts))]
+
+
+def continues(
+    move: Sim3,
+    breaks: list[tuple[int, int]],
+    inside: np.ndarray,
+    poses: np.ndarray,
+    timestamps: np.ndarray,
+) -> bool:
+    """True if a part, once moved, follows the map as a camera that walks on: at each break less
+    far away and less turned than a camera gets in that time.
+
+    Args:
+        move: carries the part to the map.
+        breaks: a frame outside the map and one inside, next to one another in time.
+        inside: (M,) frames of the map, ascending.
+        poses: (F, 4, 4), each frame's in its own map.
+        timestamps: (F,) seconds.
+    """
+    for f, g in breaks:
+        before = np.arange(g - _REACH, g) if g < f else np.arange(g, g + _REACH)
+        before = before[np.isin(before, inside) & np.isin(before + 1, inside)]
+        lengths = np.linalg.norm(poses[before + 1, :3, 3] - poses[before, :3, 3], axis=1)
+        paces = lengths / (timestamps[before + 1] - timestamps[before])
+        fastest = _MAX_PACES * paces.max(initial=0.0)
+        g_T_f = inverse(poses[g]) @ move.poses(poses[[f]])[0]
+        if np.linalg.norm(g_T_f[:3, 3]) > fastest * abs(timestamps[f] - timestamps[g]):
+            return False
+        if rotation_angle(g_T_f[:3, :3]) > _MAX_TURN_RAD:
+            return False
+    return bool(breaks)
 
 
 def _step_length(known: np.ndarray, depths: np.ndarray) -> float | None:

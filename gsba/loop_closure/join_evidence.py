@@ -52,6 +52,7 @@ _LOOK_ALIKE_SHARE = 0.3
 # at most 30 % in rendered pairs. Homes filmed twice: 101 %, in another light 68 to 84 %.
 _ONE_PLAN_SHARE = 0.4
 _NUM_SIGMAS = 3.09  # standard deviations of a one-sided error rate of 1e-3
+_NUM_SIGMAS_LIKELY = 1.64  # of 5 %
 _ABSENT_SHARE = 0.1  # share that counts as nothing found
 
 
@@ -146,6 +147,13 @@ class JoinEvidence:
         of `least`."""
         alike = self.least() <= _LOOK_ALIKE_SHARE
         return not alike and (not apart or self.least(apart) > _ONE_PLAN_SHARE)
+
+    @property
+    def likely(self) -> bool:
+        """True if more is found again than at a look-alike in one recording, and more at its place
+        than in two homes of one plan, each at a one-sided error rate of 5 %."""
+        found = self.share - _NUM_SIGMAS_LIKELY * self.sigma > _LOOK_ALIKE_SHARE
+        return found and self.placed - _NUM_SIGMAS_LIKELY * self.placed_sigma > _ONE_PLAN_SHARE
 
     @property
     def refuted(self) -> bool:

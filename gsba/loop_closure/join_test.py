@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from gsba.geometry import rotation_angle
 from gsba.loop_closure import join_evidence
 from gsba.loop_closure.join_evidence import JoinEvidence, Places, Rates, around
 from gsba.loop_closure.map_similarity import (
@@ -24,6 +25,10 @@ from gsba.types import Matches
 # Times the differences of two estimates of one join within which proposals are of one place:
 # drifting parts meet a little differently at either end.
 _SAME_PLACE_FACTOR = 2.0
+# Points found again improve a proposal, and a better one finds other points again: repeated until
+# it hardly changes, at most so many times.
+_MAX_REFINEMENTS = 8
+_SETTLED_RAD = np.deg2rad(0.1)  # largest change of a bearing to a point at median depth
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,16 +68,16 @@ class JoinTest:
         if found.evidence.confirms(apart) or found.evidence.refuted:
             return found
         # More frames give more evidence, if drift permits.
-        wider = self._judged(proposal, rows, inside, join_evidence.WIDER)
+        wider = self._judged(found.proposal, rows, inside, join_evidence.WIDER)
         return max((found, wider), key=lambda one: one.evidence.least(apart))
 
     def rivals(self, best: Judged, others: Sequence[Judged], apart: bool = False) -> list[Judged]:
-        """Confirmed proposals for another place that `best` does not significantly beat; `apart`
-        as of `judge`."""
+        """Accepted proposals for another place that `best` does not significantly beat; `apart` as
+        of `judge`."""
         return [
             other
             for other in others
-            if other.evidence.confirms(apart) and not best.evidence.beats(other.evidence, apart)
+            if not best.evidence.beats(other.evidence, apart)
             if not alike(best.proposal, other.proposal, self.poses, self.depth, _SAME_PLACE_FACTOR)
         ]
 
@@ -114,8 +119,22 @@ class JoinTest:
         f, g = proposal.frames
         groups = around(rows, f, reach), around(inside, g, reach)
         evidence, found = self.weigh(*groups, proposal.move)
-        again = self.meetings(found, rows)
-        if again:
-            proposal = replace(proposal, move=refined(again, proposal.move, self.poses))
-            evidence, _ = self.weigh(*groups, proposal.move)
+        for _ in range(_MAX_REFINEMENTS):
+            again = self.meetings(found, rows)
+            if not again:
+                break
+            move = refined(again, proposal.move, self.poses)
+            settled = self._change(proposal.move, move, groups[0]) < _SETTLED_RAD
+            proposal = replace(proposal, move=move)
+            evidence, found = self.weigh(*groups, move)
+            if settled:
+                break
         return Judged(proposal, evidence)
+
+    def _change(self, one: Sim3, other: Sim3, rows: np.ndarray) -> float:
+        """Largest change of a bearing, radians, to a point at median depth from frames (N,) that
+        move otherwise."""
+        first, second = one.poses(self.poses[rows]), other.poses(self.poses[rows])
+        off = np.linalg.norm(first[:, :3, 3] - second[:, :3, 3], axis=1).max() / self.depth
+        turned = rotation_angle(first[:, :3, :3].swapaxes(1, 2) @ second[:, :3, :3]).max()
+        return float(off + turned + abs(np.log(one.scale / other.scale)))

@@ -14,7 +14,7 @@ import numpy as np
 
 from gsba.geometry import angles_between, inverse, unit
 from gsba.loop_closure import join_evidence, loops
-from gsba.loop_closure.break_crossing import agreed, crossing
+from gsba.loop_closure.break_crossing import agreed, continues, crossing
 from gsba.loop_closure.connectivity import by_size
 from gsba.loop_closure.join_evidence import Places, Rates
 from gsba.loop_closure.join_test import JoinTest, Judged
@@ -225,14 +225,36 @@ class _Joining:
         if not weighed:
             self.reasons[part] = "no frame of it shares enough points with a frame of another map"
             return None
-        best = max(weighed, key=lambda one: one.evidence.least(apart))
+        accepted = [one for one in weighed if one.evidence.confirms(apart)]
+        accepted = accepted or self._following(weighed, rows, inside)
+        best = max(accepted or weighed, key=lambda one: one.evidence.least(apart))
         frames, why = best.proposal.frames, best.evidence
         logger.info("a part of %d frames overlaps the map at frames %s: %s", len(rows), frames, why)
-        certain = why.confirms(apart)
-        if certain and not self.test.rivals(best, weighed, apart):
+        if accepted and not self.test.rivals(best, accepted, apart):
             return best.proposal.move
-        self.reasons[part] = "it fits two places" if certain else f"not certain: {why}"
+        self.reasons[part] = "it fits two places" if accepted else f"not certain: {why}"
         return None
+
+    def _following(
+        self, weighed: list[Judged], rows: np.ndarray, inside: np.ndarray
+    ) -> list[Judged]:
+        """Likely proposals that let the camera walk on at each break between a part and the map:
+        look-alikes are elsewhere, or turned about."""
+        breaks = self._breaks(rows, inside)
+        return [
+            one
+            for one in weighed
+            if one.evidence.likely
+            and continues(one.proposal.move, breaks, inside, self.poses, self.times)
+        ]
+
+    def _breaks(self, rows: np.ndarray, inside: np.ndarray) -> list[tuple[int, int]]:
+        """Neighbours in time in one recording, one of a part and one of the map."""
+        near = pairs.without_pause(self.times)
+        near = near[self.recordings[near[:, 0]] == self.recordings[near[:, 1]]]
+        near = np.concatenate([near, near[:, ::-1]])
+        near = near[np.isin(near[:, 0], rows) & np.isin(near[:, 1], inside)]
+        return sorted(((int(f), int(g)) for f, g in near), key=min)
 
     def _over_break(self, rows: np.ndarray, inside: np.ndarray) -> Sim3 | None:
         """The similarity that several pairs of frames across a short break agree on; None if its
@@ -240,13 +262,12 @@ class _Joining:
 
         The camera cannot have moved far in between, so that a look-alike is unlikely here.
         """
-        for f, after in pairs.without_pause(self.times).tolist():
-            if not ((f in rows and after in inside) or (f in inside and after in rows)):
-                continue
-            earlier, later = (rows, inside) if f in rows else (inside, rows)
+        for outer, inner in self._breaks(rows, inside):
+            earlier, later = (rows, inside) if outer < inner else (inside, rows)
+            last = min(outer, inner)
             ends = (
-                earlier[earlier <= f][-_BREAK_REACH_FRAMES:],
-                later[later > f][:_BREAK_REACH_FRAMES],
+                earlier[earlier <= last][-_BREAK_REACH_FRAMES:],
+                later[later > last][:_BREAK_REACH_FRAMES],
             )
             chosen = np.array(
                 [(a, b) for a in ends[0] for b in ends[1] if b - a <= _BREAK_REACH_FRAMES]
@@ -256,7 +277,7 @@ class _Joining:
             best = agreed(crossing(*given), self.poses, self.depth)
             if best is None or (self._is_held_by_trajectory(rows) and not self._plausible(best)):
                 continue
-            own, theirs = ends if f in rows else ends[::-1]
+            own, theirs = ends if outer < inner else ends[::-1]
             evidence = self.test.weigh(own, theirs, best.move)[0]
             logger.info(
                 "a part of %d frames continues the map across a break: %s", len(rows), evidence

@@ -58,7 +58,8 @@ def find_loops(places: Places, unseen: np.ndarray) -> list[Constraint]:
         for group in _meeting_by_meeting(meetings)
         for one in _judged(group, places, unseen, test)
     ]
-    kept = [one for one in judged if one.evidence.confirmed and not _rivals(one, judged, test)]
+    confirmed = [one for one in judged if one.evidence.confirmed]
+    kept = [one for one in confirmed if not _rivals(one, confirmed, test)]
     for one in judged:
         logger.debug("a loop of places %s: %s", one.proposal.frames, one.evidence)
     sides = [_sides(*one.proposal.frames, num) for one in kept]

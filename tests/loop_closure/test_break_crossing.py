@@ -4,9 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from two_maps import HALF, MOVE, NUM, SCALE, TRUTH, scene, torn
 
-from gsba.loop_closure.break_crossing import MIN_AGREEING, agreed, crossing
+from gsba.geometry import inverse
+from gsba.loop_closure.break_crossing import MIN_AGREEING, agreed, continues, crossing
 from gsba.loop_closure.map_similarity import Proposal
 from gsba.matching import recovery
 from gsba.similarity import Sim3
@@ -59,3 +61,31 @@ def test_too_few_pairs_or_none_that_agree_join_nothing() -> None:
 
     apart = [scaled(one, 1.3**n) for n, one in enumerate(proposals)]
     assert agreed(apart, *given) is None
+
+
+@pytest.mark.parametrize(
+    ("shift", "turn_deg", "expected"),
+    [(0.0, 0, True), (0.0, 50, True), (0.0, 90, False), (4.0, 0, False)],
+)
+def test_a_part_follows_a_map_only_as_a_camera_walks_on(
+    shift: float, turn_deg: float, expected: bool
+) -> None:
+    step = np.linalg.norm(TRUTH[HALF, :3, 3] - TRUTH[HALF - 1, :3, 3])
+    turn = Rotation.from_euler("y", turn_deg, degrees=True).as_matrix()
+    first = TRUTH[HALF]
+    moved = first.copy()
+    moved[:3, :3] = first[:3, :3] @ turn
+    moved[0, 3] += shift * step
+    move = Sim3.of(1.0, moved @ inverse(first))
+    inside, times = np.arange(HALF), np.arange(NUM, dtype=float)
+    assert continues(move, [(HALF, HALF - 1)], inside, TRUTH, times) == expected
+    # Reversed in time, the same.
+    backward = TRUTH[::-1], np.arange(NUM, dtype=float)
+    after = NUM - 1 - HALF
+    assert continues(move, [(after, after + 1)], NUM - 1 - inside[::-1], *backward) == expected
+
+
+def test_a_part_follows_nothing_without_a_break_or_steps_of_the_map() -> None:
+    times = np.arange(NUM, dtype=float)
+    assert not continues(Sim3(), [], np.arange(HALF), TRUTH, times)
+    assert not continues(Sim3(), [(HALF, HALF - 1)], np.array([0, HALF - 1]), TRUTH, times)

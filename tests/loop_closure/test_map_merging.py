@@ -8,12 +8,13 @@ from scipy.spatial.transform import Rotation
 from two_maps import HALF, MOVE, NUM, SCALE, TRUTH, scene, torn
 
 from gsba.geometry import inverse, pose, rotation_angle
-from gsba.loop_closure import connectivity, map_merging
+from gsba.loop_closure import connectivity, join_evidence, map_merging
+from gsba.loop_closure.join_evidence import JoinEvidence
 from gsba.loop_closure.merged_map import Registered, follow
 from gsba.similarity import Sim3
 from gsba.trajectory.joining import GUESS, PLACES, SegmentAlignment
 from gsba.trajectory.judgement import StepChecks
-from gsba.types import CoarsePoses, PoseSource, Solution, Tracks
+from gsba.types import CoarsePoses, Matches, PoseSource, Solution, Tracks
 
 TIMES = np.arange(NUM, dtype=float)
 NOBODY = np.zeros(NUM - 1, bool)
@@ -95,6 +96,39 @@ def test_a_camera_may_be_held_in_another_way_in_another_recording(
         off, turned = _errors(found, truth)
         assert off < 0.02 and turned < 0.2
     assert map_merging.merge(*given).components.any()  # of one recording: held in one way
+
+
+@pytest.mark.parametrize(
+    ("what", "joined"),
+    [("walks on", True), ("pause", False), ("turned", False), ("carried", False)],
+)
+def test_a_likely_join_is_taken_where_the_camera_walks_on(
+    what: str, joined: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The images give some evidence that the second half is where it was, but not enough."""
+    truth = TRUTH.copy()
+    if what == "turned":
+        about = Rotation.from_euler("y", 70, degrees=True).as_matrix()
+        truth[HALF:, :3, :3] = truth[HALF:, :3, :3] @ about
+    if what == "carried":  # a recording that begins elsewhere, whatever its clock says
+        truth[HALF:] = np.roll(truth[HALF:], -5, axis=0)
+    context, whole, late = scene(truth=truth)
+    likely = JoinEvidence(0.5, 0.1, 200, 0.6, 0.08)
+    assert likely.likely and not likely.confirmed
+    weigh = join_evidence.weigh
+
+    def weighed(*given) -> tuple[JoinEvidence, Matches]:
+        evidence, found = weigh(*given)
+        return (likely if evidence.confirmed else evidence), found
+
+    monkeypatch.setattr(join_evidence, "weigh", weighed)
+    times = TIMES + (5.0 if what == "pause" else 0.0) * (np.arange(NUM) >= HALF)
+    monkeypatch.setattr(map_merging, "agreed", lambda *_: None)  # no pair over the break matches
+    given = torn(whole, late, SCALE, MOVE), _halves(), NOBODY, ~BREAK, times
+    found = map_merging.merge(context, *given)
+    assert found.components.any() != joined
+    if joined:
+        assert _errors(found, truth)[0] < 0.02
 
 
 def test_strangers_stay_apart() -> None:
