@@ -7,8 +7,9 @@ rate at which points are found again within parts under the same change of view.
 cell of space count as one witness, and witnesses of one region have correlated errors. Weighed by
 their numbers, points must confirm a join, too.
 
-Homes of one plan share walls, doors and furniture. What covers these matches by chance, anywhere
-around where it is expected: between two recordings a point counts by its distance from there.
+Homes of one plan share walls, doors and furniture, and the bays of a hall their columns. What is
+found there matches by chance, anywhere around where it is expected, or stands at a place that is
+only similar: how near a point is to where it is expected counts, too.
 """
 
 from collections.abc import Sequence
@@ -50,7 +51,7 @@ _PRIOR_REGIONS = 1.0  # prior number of regions with nothing found, and of regio
 _LOOK_ALIKE_SHARE = 0.3
 # Share found at its place, above what two homes of one plan with furniture at the same places have:
 # at most 30 % in rendered pairs. Homes filmed twice: 101 %, in another light 68 to 84 %.
-_ONE_PLAN_SHARE = 0.4
+_LOOK_ALIKE_PLACED = 0.4
 _NUM_SIGMAS = 3.09  # standard deviations of a one-sided error rate of 1e-3
 _NUM_SIGMAS_LIKELY = 1.64  # of 5 %
 _ABSENT_SHARE = 0.1  # share that counts as nothing found
@@ -122,38 +123,24 @@ class JoinEvidence:
             f"{100 * self.share:.0f} % (sigma {100 * self.sigma:.0f} %) of the points "
             f"expected in both maps are found again, {100 * self.placed:.0f} % (sigma "
             f"{100 * self.placed_sigma:.0f} %) at their places; look-alikes: "
-            f"{100 * _LOOK_ALIKE_SHARE:.0f} %, between recordings {100 * _ONE_PLAN_SHARE:.0f} % at "
-            "their places"
+            f"{100 * _LOOK_ALIKE_SHARE:.0f} %, {100 * _LOOK_ALIKE_PLACED:.0f} % at their places"
         )
 
-    def least(self, apart: bool = False) -> float:
-        """Lower bound of the share that tells true joins from look-alikes.
-
-        Args:
-            apart: whether the two sides are of different recordings, as may be of two homes of one
-                plan: the share at its place then, else all that is found again.
-        """
-        if apart:
-            return self.placed - _NUM_SIGMAS * self.placed_sigma
-        return self.share - _NUM_SIGMAS * self.sigma
+    def margin(self, num_sigmas: float = _NUM_SIGMAS) -> float:
+        """Lower bounds of both shares, less what look-alikes have: the lesser of the two."""
+        found = self.share - num_sigmas * self.sigma - _LOOK_ALIKE_SHARE
+        return min(found, self.placed - num_sigmas * self.placed_sigma - _LOOK_ALIKE_PLACED)
 
     @property
     def confirmed(self) -> bool:
-        """True if significantly more is found again than at a look-alike in one recording."""
-        return self.confirms(apart=False)
-
-    def confirms(self, apart: bool) -> bool:
-        """True if significantly more is found again than where two places look alike; `apart` as
-        of `least`."""
-        alike = self.least() <= _LOOK_ALIKE_SHARE
-        return not alike and (not apart or self.least(apart) > _ONE_PLAN_SHARE)
+        """True if significantly more is found again, and at its place, than where two places look
+        alike."""
+        return self.margin() > 0
 
     @property
     def likely(self) -> bool:
-        """True if more is found again than at a look-alike in one recording, and more at its place
-        than in two homes of one plan, each at a one-sided error rate of 5 %."""
-        found = self.share - _NUM_SIGMAS_LIKELY * self.sigma > _LOOK_ALIKE_SHARE
-        return found and self.placed - _NUM_SIGMAS_LIKELY * self.placed_sigma > _ONE_PLAN_SHARE
+        """`confirmed` at a one-sided error rate of 5 % of each share."""
+        return self.margin(_NUM_SIGMAS_LIKELY) > 0
 
     @property
     def refuted(self) -> bool:
@@ -165,12 +152,10 @@ class JoinEvidence:
         """True if significantly less than `_ABSENT_SHARE` is found again."""
         return self.share + _NUM_SIGMAS * self.sigma < _ABSENT_SHARE
 
-    def beats(self, other: "JoinEvidence", apart: bool = False) -> bool:
-        """True if this join is significantly better than another; `apart` as of `least`."""
-        if apart:
-            sigma = np.hypot(self.placed_sigma, other.placed_sigma)
-            return self.placed - other.placed > _NUM_SIGMAS * float(sigma)
-        return self.share - other.share > _NUM_SIGMAS * float(np.hypot(self.sigma, other.sigma))
+    def beats(self, other: "JoinEvidence") -> bool:
+        """True if significantly more is at its place than under another join."""
+        sigma = float(np.hypot(self.placed_sigma, other.placed_sigma))
+        return self.placed - other.placed > _NUM_SIGMAS * sigma
 
 
 def rates(
@@ -239,7 +224,7 @@ def weigh(
 
 
 def evidence_of(seen: Predictions, usual: Rates, depth: float) -> JoinEvidence:
-    """Evidence of predicted points: the weaker of two estimates, if one of them confirms.
+    """Evidence of predicted points: the weaker of two estimates, unless it is little anyway.
 
     By cells, a look-alike with many points is one witness. By points, so is a place of which only
     corners of walls and furniture are found again: flats of one plan share these, each in a cell
@@ -267,8 +252,8 @@ def evidence_of(seen: Predictions, usual: Rates, depth: float) -> JoinEvidence:
     by_cells, by_points = (
         JoinEvidence(*share(found, numbers), len(cells), *at_place) for numbers in (each, one)
     )
-    if by_cells.confirmed and by_points.least() < by_cells.least():
-        return by_points
+    if by_cells.likely:
+        return min(by_cells, by_points, key=lambda one: one.share - _NUM_SIGMAS * one.sigma)
     return by_cells
 
 

@@ -54,30 +54,26 @@ class JoinTest:
     measure_rates: Callable[[np.ndarray], Rates]
     _usual: dict[tuple[int, ...], Rates] = field(default_factory=dict)
 
-    def judge(
-        self, proposal: Proposal, rows: np.ndarray, inside: np.ndarray, apart: bool = False
-    ) -> Judged:
+    def judge(self, proposal: Proposal, rows: np.ndarray, inside: np.ndarray) -> Judged:
         """Weigh a proposal to join two parts.
 
         Args:
             proposal: carries `rows` to `inside`.
             rows, inside: (N,) and (M,) frames of either part, ascending.
-            apart: whether the two parts are of different recordings.
         """
         found = self._judged(proposal, rows, inside, join_evidence.LOCAL)
-        if found.evidence.confirms(apart) or found.evidence.refuted:
+        if found.evidence.confirmed or found.evidence.refuted:
             return found
         # More frames give more evidence, if drift permits.
         wider = self._judged(found.proposal, rows, inside, join_evidence.WIDER)
-        return max((found, wider), key=lambda one: one.evidence.least(apart))
+        return max((found, wider), key=lambda one: one.evidence.margin())
 
-    def rivals(self, best: Judged, others: Sequence[Judged], apart: bool = False) -> list[Judged]:
-        """Accepted proposals for another place that `best` does not significantly beat; `apart` as
-        of `judge`."""
+    def rivals(self, best: Judged, others: Sequence[Judged]) -> list[Judged]:
+        """Accepted proposals for another place that `best` does not significantly beat."""
         return [
             other
             for other in others
-            if not best.evidence.beats(other.evidence, apart)
+            if not best.evidence.beats(other.evidence)
             if not alike(best.proposal, other.proposal, self.poses, self.depth, _SAME_PLACE_FACTOR)
         ]
 

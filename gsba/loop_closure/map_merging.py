@@ -215,22 +215,21 @@ class _Joining:
         """The similarity that the surroundings of both parts confirm, unless they confirm a rival
         too."""
         weighed: list[Judged] = []
-        apart = not np.isin(self.recordings[inside], self.recordings[rows]).any()
         for proposal in propose(meetings, self.poses, self.depth, self.context.settings.seed):
             if self._is_held_by_trajectory(rows) and not self._plausible(proposal):
                 continue
-            judged = self.test.judge(proposal, rows, inside, apart)
+            judged = self.test.judge(proposal, rows, inside)
             if self._is_level(rows, inside, judged.proposal.move):
                 weighed.append(judged)
         if not weighed:
             self.reasons[part] = "no frame of it shares enough points with a frame of another map"
             return None
-        accepted = [one for one in weighed if one.evidence.confirms(apart)]
+        accepted = [one for one in weighed if one.evidence.confirmed]
         accepted = accepted or self._following(weighed, rows, inside)
-        best = max(accepted or weighed, key=lambda one: one.evidence.least(apart))
+        best = max(accepted or weighed, key=lambda one: one.evidence.margin())
         frames, why = best.proposal.frames, best.evidence
         logger.info("a part of %d frames overlaps the map at frames %s: %s", len(rows), frames, why)
-        if accepted and not self.test.rivals(best, accepted, apart):
+        if accepted and not self.test.rivals(best, accepted):
             return best.proposal.move
         self.reasons[part] = "it fits two places" if accepted else f"not certain: {why}"
         return None

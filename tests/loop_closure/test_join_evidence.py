@@ -97,7 +97,7 @@ def test_what_matches_beside_its_place_does_not_join_recordings(
     usual = join_evidence.Rates(np.full(24, 0.4), 0.0, np.full(24, 0.4))
     found = join_evidence.evidence_of(seen, usual, 4.0)
     assert abs(found.placed - at_place) < 0.05
-    assert found.confirmed and found.confirms(apart=True) == joined
+    assert found.share > 0.95 and found.confirmed == joined
 
 
 def test_points_are_expected_as_often_as_the_recordings_that_meet_find_them() -> None:
@@ -117,8 +117,8 @@ def test_points_are_expected_as_often_as_the_recordings_that_meet_find_them() ->
     assert measured == [[0, 2]] and again == found
     one = JoinTest(context, TRUTH, known, depth, np.zeros_like(owners), rates)
     by_all = one.weigh(*ENDS, Sim3())[0]
-    assert measured[1:] == [[0, 1, 2]] and by_all.least() < found.least() - 0.05
-    assert found.confirms(apart=True)
+    assert measured[1:] == [[0, 1, 2]] and by_all.margin() < found.margin() - 0.05
+    assert found.confirmed
     turned = Rotation.from_rotvec([0, np.deg2rad(90), 0]).as_matrix()
     centre = TRUTH[-1, :3, 3]
     away = Sim3.of(1.0, pose(turned, centre - turned @ centre))
