@@ -19,7 +19,11 @@ _MIN_SHARED_POINTS = 8  # points of a pair that either map must hold
 _MAX_LOG_LENGTH_SIGMA = 0.1
 MIN_AGREEING = 3  # least number of pairs
 _REACH = 4  # steps of the map before or after a break that tell how fast the camera moves
-_MAX_PACES = 2.0  # fastest motion over a break, in that of the fastest of these steps
+_PACES = (
+    0.5,
+    1.5,
+)  # slowest and fastest motion over a break, in that of the median of these steps: one
+# bay of an arcade further on is another length
 _MAX_TURN_RAD = np.deg2rad(60.0)  # largest turn over a break
 
 
@@ -81,8 +85,8 @@ def continues(
     poses: np.ndarray,
     timestamps: np.ndarray,
 ) -> bool:
-    """True if a part, once moved, follows the map as a camera that walks on: at each break less
-    far away and less turned than a camera gets in that time.
+    """True if a part, once moved, follows the map as a camera that walks on: at each break about as
+    far away as it goes in that time, and not turned about.
 
     Args:
         move: carries the part to the map.
@@ -95,10 +99,12 @@ def continues(
         before = np.arange(g - _REACH, g) if g < f else np.arange(g, g + _REACH)
         before = before[np.isin(before, inside) & np.isin(before + 1, inside)]
         lengths = np.linalg.norm(poses[before + 1, :3, 3] - poses[before, :3, 3], axis=1)
-        paces = lengths / (timestamps[before + 1] - timestamps[before])
-        fastest = _MAX_PACES * paces.max(initial=0.0)
+        if not len(lengths):
+            return False
+        pace = np.median(lengths / (timestamps[before + 1] - timestamps[before]))
+        usual = pace * abs(timestamps[f] - timestamps[g])
         g_T_f = inverse(poses[g]) @ move.poses(poses[[f]])[0]
-        if np.linalg.norm(g_T_f[:3, 3]) > fastest * abs(timestamps[f] - timestamps[g]):
+        if not _PACES[0] * usual < np.linalg.norm(g_T_f[:3, 3]) < _PACES[1] * usual:
             return False
         if rotation_angle(g_T_f[:3, :3]) > _MAX_TURN_RAD:
             return False

@@ -239,7 +239,8 @@ class _Joining:
     ) -> list[Judged]:
         """Likely proposals that let the camera walk on at each break between a part and the map:
         look-alikes are elsewhere, or turned about."""
-        breaks = self._breaks(rows, inside)
+        owners = self.recordings
+        breaks = [(f, g) for f, g in self._breaks(rows, inside) if owners[f] == owners[g]]
         return [
             one
             for one in weighed
@@ -248,9 +249,8 @@ class _Joining:
         ]
 
     def _breaks(self, rows: np.ndarray, inside: np.ndarray) -> list[tuple[int, int]]:
-        """Neighbours in time in one recording, one of a part and one of the map."""
+        """Neighbours in time without a pause between them, one of a part and one of the map."""
         near = pairs.without_pause(self.times)
-        near = near[self.recordings[near[:, 0]] == self.recordings[near[:, 1]]]
         near = np.concatenate([near, near[:, ::-1]])
         near = near[np.isin(near[:, 0], rows) & np.isin(near[:, 1], inside)]
         return sorted(((int(f), int(g)) for f, g in near), key=min)

@@ -14,6 +14,7 @@ _MAX_LOG_SCALE_DIFFERENCE = 0.15  # largest difference of logarithms of scales t
 _LOSS_DEG = 0.2  # scale of the robust loss: points of two maps have correlated errors
 _MIN_COMMON_POINTS = 6  # least common inliers of two frames that propose a similarity
 _MAX_PROPOSALS = 6  # largest number of proposals that are tested
+_BESIDE = 3  # frames to either side of a meeting whose points it may count
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,25 +69,52 @@ class Proposal:
 def propose(meetings: list[Meeting], poses: np.ndarray, depth: float, seed: int) -> list[Proposal]:
     """Similarities given by pairs of frames, those with the most inliers first.
 
+    Where no pair shares enough points, each counts those of the pairs beside it, too.
+
     Args:
         meetings: meetings of frames outside and inside the map.
         poses: (F, 4, 4) each in its own map.
         depth: median distance of points, units of the map.
         seed: of the sampling.
     """
+    found = _proposed(meetings, meetings, poses, seed)
+    if not found:
+        found = _proposed([_pooled(m, meetings, poses) for m in meetings], meetings, poses, seed)
+    distinct: list[Proposal] = []
+    for one in sorted(found, key=lambda proposal: -proposal.support):
+        if not any(alike(one, other, poses, depth) for other in distinct):
+            distinct.append(one)
+    return distinct[:_MAX_PROPOSALS]
+
+
+def _proposed(
+    given: list[Meeting], meetings: list[Meeting], poses: np.ndarray, seed: int
+) -> list[Proposal]:
+    """A proposal of each meeting given that has one, supported by all meetings."""
     found = []
-    for m in meetings:
+    for m in given:
         similarity = _similarity_of_meeting(m, seed)
         if similarity is None:
             continue
         move = carrying(similarity, poses[m.f], poses[m.g])
         support = sum(len(each.own) for each in _inliers_of(meetings, move, poses))
         found.append(Proposal(move, (m.f, m.g), support))
-    distinct: list[Proposal] = []
-    for one in sorted(found, key=lambda proposal: -proposal.support):
-        if not any(alike(one, other, poses, depth) for other in distinct):
-            distinct.append(one)
-    return distinct[:_MAX_PROPOSALS]
+    return found
+
+
+def _pooled(meeting: Meeting, meetings: list[Meeting], poses: np.ndarray) -> Meeting:
+    """A meeting with the points of those at most `_BESIDE` frames away, each point once."""
+    near = [m for m in meetings if max(abs(m.f - meeting.f), abs(m.g - meeting.g)) <= _BESIDE]
+
+    def seen_from(rig: int, seer: int, points: np.ndarray) -> np.ndarray:
+        rig_T_seer = inverse(poses[rig]) @ poses[seer]
+        return points @ rig_T_seer[:3, :3].T + rig_T_seer[:3, 3]
+
+    own = np.concatenate([seen_from(meeting.f, m.f, m.own) for m in near])
+    theirs = np.concatenate([seen_from(meeting.g, m.g, m.theirs) for m in near])
+    smallest = 1e-6 * np.median(np.linalg.norm(own, axis=1))
+    _, once = np.unique(np.round(own / smallest), axis=0, return_index=True)
+    return replace(meeting, own=own[once], theirs=theirs[once])
 
 
 def carrying(g_T_f: Sim3, world_T_f: np.ndarray, world_T_g: np.ndarray) -> Sim3:

@@ -25,6 +25,7 @@ from gsba.pipeline.prior import Prior
 from gsba.pipeline.run import Run
 from gsba.pipeline.state import MapMatches, State
 from gsba.store.store import PerFrame
+from gsba.trajectory import judgement, steps
 from gsba.trajectory.clock import ClockEstimate
 from gsba.types import Features, Keypoints, Matches, VerifiedPairs
 
@@ -189,6 +190,23 @@ def judge_trajectory(state: State) -> State:
     if prior.absent:
         coarse = replace(coarse, world_T_rigs=trust.world_T_rigs)
     return state.start_from(replace(prior, coarse=coarse)).with_verified(near)
+
+
+def drop_contradicted(state: State) -> State:
+    """The state before the map, without matches over steps whose length in the map contradicts the
+    trajectory; the same state if there are none.
+
+    The trajectory gives these steps, unless images confirm elsewhere how the map goes on there.
+    """
+    prior, verify = state.prior, state.run.settings.verify
+    given = prior.coarse, prior.trust, state.solution.world_T_rigs, verify.max_length_ratio
+    wrong = judgement.contradicted_lengths(*given)
+    if not wrong.any():
+        return state
+    near = steps.without_steps(state.verified, set(np.flatnonzero(wrong).tolist()))
+    trust = replace(prior.trust, unseen_steps=prior.trust.unseen_steps | wrong)
+    parts = connectivity.parted(near.matches.pairs, trust.held_steps)
+    return state.start_from(replace(prior, trust=trust, parts=parts)).with_verified(near)
 
 
 def _hindrance(run: Run) -> str:

@@ -308,7 +308,7 @@ def _map_features(state: State) -> State:
         return state
     # A chain of relative poses, then all points that neighbours share.
     state = backend.align_gauge(state, "gauge")
-    state = backend.adjust(state, "chain", rounds.chain)
+    state = _adjust_chain(state)
     state = frontend.match_along_epipolars(state)
     state = frontend.match_known_points(state, "near", loops_closed=False)
     state = backend.adjust(state, "dense", rounds.dense)
@@ -321,6 +321,14 @@ def _map_features(state: State) -> State:
     state = camera.find_camera(state)
     state = gyro.align_to_map(state, "imu_camera", with_noise=bool(state.map.lenses))
     return backend.measure_strength(state)
+
+
+def _adjust_chain(state: State) -> State:
+    """Adjust the chain of relative poses, without steps that the trajectory contradicts in it."""
+    gates = state.run.settings.rounds.chain
+    chain = backend.adjust(state, "chain", gates)
+    kept = frontend.drop_contradicted(chain)
+    return chain if kept is chain else backend.adjust(kept, "chain2", gates)
 
 
 def _merge_maps(state: State) -> State:

@@ -27,6 +27,8 @@ _JUMP_COST = 1.5  # cost of a jump, in false frames
 _NOISE_QUANTILE = 0.25  # share of steps free of outliers: quantile from which noise is estimated
 # Multiple of the quantile from which an error is an outlier: drift exceeds it once in 1000 steps.
 _OUTLIER_RATIO = 4.0
+_STEPS_AROUND = 6  # steps to either side whose lengths a step's is compared with
+_MIN_JUDGED_STEPS = 6  # least steps of which any length is compared
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,6 +127,39 @@ def confirmed(coarse: CoarsePoses, found: Steps, priors: PriorSettings) -> np.nd
     close = turned < _MAX_PRIOR_SIGMAS * np.deg2rad(priors.rotation_deg)
     close &= off < np.arctan(_MAX_PRIOR_SIGMAS * priors.translation) + 3 * found.direction_sigmas
     return found.directed & close & own[:-1] & own[1:]
+
+
+def contradicted_lengths(
+    coarse: CoarsePoses, trust: StepChecks, world_T_rigs: np.ndarray, max_ratio: float
+) -> np.ndarray:
+    """Steps (F - 1,) bool that a map of the images makes far longer or shorter than the trajectory.
+
+    No third frame measured such a length, or `check_steps` would have known: where the view
+    changes much from one frame to the next, repeated structure matches one bay further on.
+
+    Args:
+        coarse: the trajectory.
+        trust: its checks.
+        world_T_rigs: (F, 4, 4) poses in the map.
+        max_ratio: of the lengths of a step in both, relative to steps around it.
+    """
+    own = coarse.sources == PoseSource.SLAM
+    slam, found = (
+        np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+        for poses in (coarse.world_T_rigs, world_T_rigs)
+    )
+    judged = own[:-1] & own[1:] & ~trust.false_steps & ~trust.unseen_steps
+    judged &= (found > 0) & (
+        slam > np.median(slam) / max_ratio
+    )  # who stands still measures nothing
+    rows, wrong = np.flatnonzero(judged), np.zeros(len(slam), bool)
+    if len(rows) < _MIN_JUDGED_STEPS:
+        return wrong
+    logs = np.log(found[rows] / slam[rows])
+    for n, step in enumerate(rows.tolist()):
+        around = logs[max(n - _STEPS_AROUND, 0) : n + _STEPS_AROUND + 1]
+        wrong[step] = abs(logs[n] - np.median(around)) > np.log(max_ratio)
+    return wrong
 
 
 def _from_images_alone(

@@ -100,6 +100,22 @@ def test_what_matches_beside_its_place_does_not_join_recordings(
     assert found.share > 0.95 and found.confirmed == joined
 
 
+@pytest.mark.parametrize(("strange", "joined"), [(0.0, True), (0.1, True), (0.33, False)])
+def test_an_exact_copy_of_a_place_shows_nothing_in_some_regions(
+    strange: float, joined: bool, rng: np.random.Generator
+) -> None:
+    """All that is found is at its place, but in some regions nothing is."""
+    cells = np.stack(np.unravel_index(np.arange(4000), (100, 40, 1)), axis=1)
+    cells = np.repeat(cells, 5, axis=0)
+    off = np.where(rng.uniform(size=len(cells)) < 0.4, np.deg2rad(0.3), np.nan)
+    off[cells[:, 0] < 100 * strange] = np.nan
+    seen = join_evidence.Predictions(cells + 0.5, np.zeros(len(cells), np.int64), off)
+    usual = join_evidence.Rates(np.full(24, 0.4), 0.0, np.full(24, 0.4))
+    found = join_evidence.evidence_of(seen, usual, 4.0)
+    assert abs(found.strange - strange) < 0.05 and found.margin() > 0.05
+    assert found.confirmed == found.likely == joined
+
+
 def test_points_are_expected_as_often_as_the_recordings_that_meet_find_them() -> None:
     """A third recording, in a room that shows all of its points again, says nothing of theirs."""
     owners = np.digitize(np.arange(NUM), [10, 30])  # both ends, and the third between them

@@ -1,4 +1,4 @@
-"""The covariance of a similarity between two maps, against many drawn ones."""
+"""Similarities between two maps: proposals, and the covariance against many drawn ones."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -7,6 +7,7 @@ from gsba.geometry import inverse, pose
 from gsba.loop_closure.map_similarity import (
     Meeting,
     nudged,
+    propose,
     refined,
     similarity_covariance,
 )
@@ -53,3 +54,30 @@ def test_nudging_by_nothing_changes_nothing() -> None:
     move = Sim3.of(2.0, pose(Rotation.from_rotvec([0.3, 0.1, 0.2]).as_matrix(), np.arange(3.0)))
     same = nudged(move, np.zeros(7))
     assert same.scale == move.scale and np.allclose(same.new_T_old, move.new_T_old)
+
+
+def test_pairs_beside_one_another_that_share_few_points_propose_together() -> None:
+    """Three pairs of neighbours share four points each, of which two are the same in all."""
+    rng = np.random.default_rng(0)
+    move = Sim3.of(1.4, pose(Rotation.from_rotvec([0.1, 0.5, 0.0]).as_matrix(), np.ones(3)))
+    world = 4 * rng.normal(size=(8, 3))  # of the map
+    poses = np.tile(np.eye(4), (20, 1, 1))
+    poses[:, :3, 3] = rng.uniform(-1, 1, (20, 3))
+
+    def seen(f: int, points: np.ndarray) -> np.ndarray:
+        back = inverse(poses[f])
+        return points @ back[:3, :3].T + back[:3, 3]
+
+    meetings = []
+    for n in range(3):
+        shared = world[[0, 1, 2 + 2 * n, 3 + 2 * n]]
+        own = seen(10 + n, move.inverse().points(shared))
+        meetings.append(Meeting(10 + n, n, own, seen(n, shared)))
+    (found,) = propose(meetings, poses, 4.0, seed=0)
+    assert np.isclose(found.move.scale, move.scale)
+    np.testing.assert_allclose(found.move.new_T_old, move.new_T_old, atol=1e-6)
+    # The two that all see are no six points, and pairs far from one another propose nothing.
+    twice = [Meeting(m.f, m.g, m.own[:2], m.theirs[:2]) for m in meetings]
+    assert not propose(twice, poses, 4.0, seed=0)
+    apart = [Meeting(4 * n + 8, 4 * n, m.own, m.theirs) for n, m in enumerate(meetings)]
+    assert not propose(apart, poses, 4.0, seed=0)

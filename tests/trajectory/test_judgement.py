@@ -1,5 +1,7 @@
 """Steps of the trajectory before the court of the images."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -258,3 +260,30 @@ def test_a_pair_is_as_far_off_steps_as_its_direction_surely_is(sigma: float) -> 
     pairs, keypoints = _over_two_steps(7, direction, sigma)
     off = off_steps(pairs, image_steps(pairs, keypoints))[-1]
     assert off == pytest.approx(max(angle - 3 * sigma, 0), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("factor", "expected"), [(1.0, False), (1.3, False), (0.55, True), (1.8, True)]
+)
+def test_a_length_that_the_map_contradicts_is_told_from_drift(
+    factor: float, expected: bool
+) -> None:
+    """The trajectory's scale drifts by half; the map has one step shorter or longer than that."""
+    slam = TRUTH.copy()
+    slam[:, :3, 3] = np.cumsum(
+        np.diff(TRUTH[:, :3, 3], axis=0, prepend=0) * np.geomspace(1, 1.5, NUM_FRAMES)[:, None], 0
+    )
+    found, step = TRUTH.copy(), NUM_FRAMES // 2
+    found[step + 1 :, :3, 3] += (factor - 1) * (TRUTH[step + 1, :3, 3] - TRUTH[step, :3, 3])
+    coarse = CoarsePoses(slam, np.full(NUM_FRAMES, PoseSource.SLAM, np.uint8), 0.0)
+    trust = StepChecks.of_all(slam)
+    wrong = judgement.contradicted_lengths(coarse, trust, found, VERIFY.max_length_ratio)
+    np.testing.assert_array_equal(np.flatnonzero(wrong), [step] if expected else [])
+    # Steps that images replaced, or do not show, and poses between tracked frames say nothing.
+    others = (
+        (coarse, replace(trust, false_steps=wrong)),
+        (coarse, replace(trust, unseen_steps=wrong)),
+        (replace(coarse, sources=np.full(NUM_FRAMES, PoseSource.INTERPOLATED, np.uint8)), trust),
+    )
+    for one in others:
+        assert not judgement.contradicted_lengths(*one, found, VERIFY.max_length_ratio).any()
