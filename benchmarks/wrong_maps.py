@@ -1,9 +1,11 @@
 """Search for wrong maps: walks through ambiguous places, with every map of every run checked.
 
-    python benchmarks/wrong_maps.py --out WORK --markdown benchmarks/results/wrong_maps.md WALK...
+    python benchmarks/wrong_maps.py --out WORK --markdown benchmarks/results/wrong_maps.md \
+        WALK... WALK:0-27,31-53
 
 A WALK is a folder with `images/` and their timestamps.csv, `groundtruth.tum` and perhaps a mask:
-white-walled flats, similar rooms, dim rooms. Each is refined without a trajectory and from one with
+white-walled flats, similar rooms, dim rooms. WALK:A-B,C-D takes only these frames of it, A to B - 1
+and C to D - 1: a video that was paused. Each is refined without a trajectory and from one with
 drift and jumps. All maps of a run are aligned to the truth, each by itself: a map is wrong if the
 error of one of its frames exceeds 3 % of the map's extent. Left-out frames and several maps are not
 wrong. Every run is a separate process; rows are kept in WORK and used again while code, options and
@@ -12,6 +14,7 @@ input stay the same. The exit code is 1 if a map is wrong.
 
 import argparse
 import json
+import shutil
 import sys
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -123,6 +126,32 @@ class Bench(NamedTuple):
         return run_row(command, home, row, finish, TIMEOUT_S)
 
 
+def paused(text: str, out: Path) -> Path:
+    """Folder of a walk; of WALK:A-B,C-D a copy with these frames only."""
+    name, _, spans = text.partition(":")
+    walk = Path(name).resolve()
+    if not spans:
+        return walk
+    home = (out / f"{walk.name}_{spans.replace(',', '_')}").resolve()
+    shutil.rmtree(home, ignore_errors=True)
+    (home / "images").mkdir(parents=True)
+    ends = [tuple(map(int, span.split("-"))) for span in spans.split(",")]
+    rows = [row for first, last in ends for row in range(first, last)]
+    pictures = sorted(p for p in (walk / "images").iterdir() if p.suffix != ".csv")
+    for row in rows:
+        shutil.copy(pictures[row], home / "images")
+    head, *lines = (walk / "images/timestamps.csv").read_text().splitlines()
+    kept = [head, *(lines[row] for row in rows)]
+    (home / "images/timestamps.csv").write_text("\n".join(kept) + "\n")
+    truth = read_trajectory(walk / "groundtruth.tum")
+    write_tum(
+        home / "groundtruth.tum", Trajectory(truth.timestamps[rows], truth.world_T_rigs[rows])
+    )
+    if (walk / "mask.png").exists():
+        shutil.copy(walk / "mask.png", home)
+    return home
+
+
 def is_wrong(row: dict[str, Any]) -> bool:
     """True if a run has a wrong map."""
     return any(one["worst"] > MAX_ERROR for one in row.get("errors", ()))
@@ -152,7 +181,7 @@ def line(walk: str, row: dict[str, Any]) -> str:
 def main() -> None:
     """Parse, run, print; exit with 1 if a map is wrong."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("walks", nargs="+", type=Path, metavar="WALK")
+    parser.add_argument("walks", nargs="+", metavar="WALK")
     parser.add_argument("--set", action="append", default=[], dest="sets", metavar="KEY=VALUE")
     parser.add_argument(
         "--seed", action="append", type=int, help="seeds of the trajectories' errors"
@@ -163,8 +192,8 @@ def main() -> None:
     bench = Bench(options.out.resolve(), code_digest(), options.sets, options.seed or [101])
     print("\n".join(HEAD), flush=True)
     lines, rows = [], []
-    for walk in options.walks:
-        for row in bench.rows(walk.resolve()):
+    for walk in (paused(text, bench.out / "walks") for text in options.walks):
+        for row in bench.rows(walk):
             rows.append(row)
             lines.append(line(walk.name, row))
             print(lines[-1], flush=True)

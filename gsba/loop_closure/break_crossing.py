@@ -19,11 +19,9 @@ _MIN_SHARED_POINTS = 8  # points of a pair that either map must hold
 _MAX_LOG_LENGTH_SIGMA = 0.1
 MIN_AGREEING = 3  # least number of pairs
 _REACH = 4  # steps of the map before or after a break that tell how fast the camera moves
-_PACES = (
-    0.5,
-    1.5,
-)  # slowest and fastest motion over a break, in that of the median of these steps: one
-# bay of an arcade further on is another length
+# Slowest and fastest motion over a break, in the median of these steps: to the next bay of an arcade
+# it is another length.
+_MIN_PACES, _MAX_PACES = 0.5, 1.5
 _MAX_TURN_RAD = np.deg2rad(60.0)  # largest turn over a break
 
 
@@ -96,15 +94,15 @@ def continues(
         timestamps: (F,) seconds.
     """
     for f, g in breaks:
-        before = np.arange(g - _REACH, g) if g < f else np.arange(g, g + _REACH)
-        before = before[np.isin(before, inside) & np.isin(before + 1, inside)]
-        lengths = np.linalg.norm(poses[before + 1, :3, 3] - poses[before, :3, 3], axis=1)
-        if not len(lengths):
+        beside = np.arange(g - _REACH, g) if g < f else np.arange(g, g + _REACH)
+        beside = beside[np.isin(beside, inside) & np.isin(beside + 1, inside)]
+        if not len(beside):
             return False
-        pace = np.median(lengths / (timestamps[before + 1] - timestamps[before]))
+        lengths = np.linalg.norm(poses[beside + 1, :3, 3] - poses[beside, :3, 3], axis=1)
+        pace = np.median(lengths / (timestamps[beside + 1] - timestamps[beside]))
         usual = pace * abs(timestamps[f] - timestamps[g])
         g_T_f = inverse(poses[g]) @ move.poses(poses[[f]])[0]
-        if not _PACES[0] * usual < np.linalg.norm(g_T_f[:3, 3]) < _PACES[1] * usual:
+        if not _MIN_PACES * usual < np.linalg.norm(g_T_f[:3, 3]) < _MAX_PACES * usual:
             return False
         if rotation_angle(g_T_f[:3, :3]) > _MAX_TURN_RAD:
             return False
