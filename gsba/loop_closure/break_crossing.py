@@ -19,8 +19,7 @@ _MIN_SHARED_POINTS = 8  # points of a pair that either map must hold
 _MAX_LOG_LENGTH_SIGMA = 0.1
 MIN_AGREEING = 3  # least number of pairs
 _REACH = 4  # steps of the map before or after a break that tell how fast the camera moves
-# Slowest and fastest motion over a break, in the median of these steps: to the next bay of an arcade
-# it is another length.
+# Slowest and fastest motion over a break, in the median of these steps: other bays are elsewhere.
 _MIN_PACES, _MAX_PACES = 0.5, 1.5
 _MAX_TURN_RAD = np.deg2rad(60.0)  # largest turn over a break
 

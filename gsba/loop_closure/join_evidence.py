@@ -130,9 +130,9 @@ class JoinEvidence:
             f"{100 * self.share:.0f} % (sigma {100 * self.sigma:.0f} %) of the points "
             f"expected in both maps are found again, {100 * self.placed:.0f} % (sigma "
             f"{100 * self.placed_sigma:.0f} %) at their places, none in "
-            f"{100 * self.strange:.0f} % of the regions; look-alikes: {100 * _LOOK_ALIKE_SHARE:.0f} %, "
-            f"{100 * _LOOK_ALIKE_PLACED:.0f} % at their places, none in "
-            f"{100 * _LOOK_ALIKE_STRANGE:.0f} % of the regions"
+            f"{100 * self.strange:.0f} % of the regions; look-alikes: "
+            f"{100 * _LOOK_ALIKE_SHARE:.0f} %, {100 * _LOOK_ALIKE_PLACED:.0f} % at their places, "
+            f"none in {100 * _LOOK_ALIKE_STRANGE:.0f} % of the regions"
         )
 
     def margin(self, num_sigmas: float = _NUM_SIGMAS) -> float:

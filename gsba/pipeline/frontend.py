@@ -192,19 +192,19 @@ def judge_trajectory(state: State) -> State:
     return state.start_from(replace(prior, coarse=coarse)).with_verified(near)
 
 
-def drop_contradicted(state: State) -> State:
-    """The state before the map, without matches over steps whose length in the map contradicts the
-    trajectory; the same state if there are none.
+def drop_implausible_steps(state: State) -> State:
+    """The state before the map, without matches over steps that have a less plausible length in the
+    map than in the trajectory; the same state if there are none.
 
     The trajectory gives these steps, unless images confirm elsewhere how the map goes on there.
     """
-    prior, verify = state.prior, state.run.settings.verify
-    given = prior.coarse, prior.trust, state.solution.world_T_rigs, verify.max_length_ratio
-    wrong = judgement.contradicted_lengths(*given)
+    run, prior, poses = state.run, state.prior, state.solution.world_T_rigs
+    coarse, ratio = prior.coarse, run.settings.verify.max_length_ratio
+    wrong = judgement.implausible_steps(coarse, prior.trust, poses, run.frames.timestamps, ratio)
     if not wrong.any():
         return state
     near = steps.without_steps(state.verified, set(np.flatnonzero(wrong).tolist()))
-    trust = replace(prior.trust, unseen_steps=prior.trust.unseen_steps | wrong)
+    trust = judgement.without_steps(coarse, prior.trust, wrong)
     parts = connectivity.parted(near.matches.pairs, trust.held_steps)
     return state.start_from(replace(prior, trust=trust, parts=parts)).with_verified(near)
 

@@ -324,10 +324,10 @@ def _map_features(state: State) -> State:
 
 
 def _adjust_chain(state: State) -> State:
-    """Adjust the chain of relative poses, without steps that the trajectory contradicts in it."""
+    """Adjust the chain of relative poses, without steps less plausible than the trajectory's."""
     gates = state.run.settings.rounds.chain
     chain = backend.adjust(state, "chain", gates)
-    kept = frontend.drop_contradicted(chain)
+    kept = frontend.drop_implausible_steps(chain)
     return chain if kept is chain else backend.adjust(kept, "chain2", gates)
 
 

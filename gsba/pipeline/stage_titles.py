@@ -33,7 +33,7 @@ _TITLES = {
     "gauge": "align the trajectory to the families' world",
     "gauge_closed": "align the map to the families' world",
     "chain": "adjust the chain of relative poses",
-    "chain2": "adjust it without steps of contradicted length",
+    "chain2": "adjust it without implausible steps",
     "adjacent": "match neighbours along epipolar lines",
     "adjacent2": "match neighbours along epipolar lines, maps joined",
     "adjacent_lenses": "match neighbours along epipolar lines, under two lenses",

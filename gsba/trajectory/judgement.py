@@ -7,7 +7,7 @@ trajectory that images contradict lose their prior, and initial poses are chaine
 """
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -129,18 +129,24 @@ def confirmed(coarse: CoarsePoses, found: Steps, priors: PriorSettings) -> np.nd
     return found.directed & close & own[:-1] & own[1:]
 
 
-def contradicted_lengths(
-    coarse: CoarsePoses, trust: StepChecks, world_T_rigs: np.ndarray, max_ratio: float
+def implausible_steps(
+    coarse: CoarsePoses,
+    trust: StepChecks,
+    world_T_rigs: np.ndarray,
+    timestamps: np.ndarray,
+    max_ratio: float,
 ) -> np.ndarray:
-    """Steps (F - 1,) bool that a map of the images makes far longer or shorter than the trajectory.
+    """Steps (F - 1,) bool whose length in a map of the images contradicts the trajectory, though it
+    has the more usual speed.
 
-    No third frame measured such a length, or `check_steps` would have known: where the view
-    changes much from one frame to the next, repeated structure matches one bay further on.
+    Where the view changes much from one frame to the next, repeated structure matches one bay
+    further on, in three frames, too. A trajectory that jumps has an unusual speed itself.
 
     Args:
         coarse: the trajectory.
         trust: its checks.
         world_T_rigs: (F, 4, 4) poses in the map.
+        timestamps: (F,) seconds.
         max_ratio: of the lengths of a step in both, relative to steps around it.
     """
     own = coarse.sources == PoseSource.SLAM
@@ -148,18 +154,37 @@ def contradicted_lengths(
         np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
         for poses in (coarse.world_T_rigs, world_T_rigs)
     )
-    judged = own[:-1] & own[1:] & ~trust.false_steps & ~trust.unseen_steps
-    judged &= (found > 0) & (
-        slam > np.median(slam) / max_ratio
-    )  # who stands still measures nothing
+    judged = own[:-1] & own[1:] & ~trust.unseen_steps
+    judged &= (found > 0) & (slam > np.median(slam) / max_ratio)  # standing still measures nothing
     rows, wrong = np.flatnonzero(judged), np.zeros(len(slam), bool)
     if len(rows) < _MIN_JUDGED_STEPS:
         return wrong
-    logs = np.log(found[rows] / slam[rows])
+    ratios = np.log(found[rows] / slam[rows])
+    speeds = np.log(found[rows] / np.diff(timestamps)[rows])
     for n, step in enumerate(rows.tolist()):
-        around = logs[max(n - _STEPS_AROUND, 0) : n + _STEPS_AROUND + 1]
-        wrong[step] = abs(logs[n] - np.median(around)) > np.log(max_ratio)
+        around = slice(max(n - _STEPS_AROUND, 0), n + _STEPS_AROUND + 1)
+        off = ratios[n] - np.median(ratios[around])
+        unusual = speeds[n] - np.median(speeds[around])
+        wrong[step] = abs(off) > np.log(max_ratio) and abs(unusual - off) < abs(unusual)
     return wrong
+
+
+def without_steps(coarse: CoarsePoses, trust: StepChecks, steps: np.ndarray) -> StepChecks:
+    """Checks after some steps (F - 1,) bool of the images were given up for the trajectory's."""
+    slam, chosen = (
+        inverse(poses[:-1]) @ poses[1:] for poses in (coarse.world_T_rigs, trust.world_T_rigs)
+    )
+    chosen[steps] = slam[steps]
+    named = trust.false_frames.copy()
+    named[:-1] &= ~steps
+    named[1:] &= ~steps
+    return replace(
+        trust,
+        world_T_rigs=_chain(coarse.world_T_rigs, chosen, coarse.sources == PoseSource.SLAM),
+        false_steps=trust.false_steps & ~steps,
+        false_frames=named,
+        unseen_steps=trust.unseen_steps | steps,
+    )
 
 
 def _from_images_alone(

@@ -262,28 +262,43 @@ def test_a_pair_is_as_far_off_steps_as_its_direction_surely_is(sigma: float) -> 
     assert off == pytest.approx(max(angle - 3 * sigma, 0), abs=1e-6)
 
 
+@pytest.mark.parametrize("known", [True, False])
 @pytest.mark.parametrize(
-    ("factor", "expected"), [(1.0, False), (1.3, False), (0.55, True), (1.8, True)]
+    ("seen", "jump", "pause", "expected"),
+    [
+        (1.0, 1.0, 1.0, False),
+        (1.3, 1.0, 1.0, False),
+        (0.55, 1.0, 1.0, True),  # a bay too short
+        (1.8, 1.0, 1.0, True),
+        (1.0, 2.0, 1.0, False),  # the trajectory jumps
+        (0.2, 1.0, 4.0, True),  # four times as far in a pause of four steps, says the trajectory
+    ],
 )
-def test_a_length_that_the_map_contradicts_is_told_from_drift(
-    factor: float, expected: bool
+def test_of_two_lengths_of_a_step_the_more_usual_speed_is_taken(
+    seen: float, jump: float, pause: float, expected: bool, known: bool
 ) -> None:
-    """The trajectory's scale drifts by half; the map has one step shorter or longer than that."""
-    slam = TRUTH.copy()
-    slam[:, :3, 3] = np.cumsum(
-        np.diff(TRUTH[:, :3, 3], axis=0, prepend=0) * np.geomspace(1, 1.5, NUM_FRAMES)[:, None], 0
-    )
-    found, step = TRUTH.copy(), NUM_FRAMES // 2
-    found[step + 1 :, :3, 3] += (factor - 1) * (TRUTH[step + 1, :3, 3] - TRUTH[step, :3, 3])
+    """The trajectory's scale drifts by half, besides."""
+    step, true = NUM_FRAMES // 2, TRUTH.copy()
+    motion = TRUTH[step + 1, :3, 3] - TRUTH[step, :3, 3]
+    true[step + 1 :, :3, 3] += (pause - 1) * motion
+    slam, found = true.copy(), true.copy()
+    slam[step + 1 :, :3, 3] += (jump - 1) * pause * motion
+    found[step + 1 :, :3, 3] += (seen - 1) * pause * motion
+    drift = np.geomspace(1, 1.5, NUM_FRAMES)[:, None]
+    slam[:, :3, 3] = np.cumsum(np.diff(slam[:, :3, 3], axis=0, prepend=0) * drift, 0)
+    times = np.arange(NUM_FRAMES) + np.where(np.arange(NUM_FRAMES) > step, pause - 1, 0)
     coarse = CoarsePoses(slam, np.full(NUM_FRAMES, PoseSource.SLAM, np.uint8), 0.0)
-    trust = StepChecks.of_all(slam)
-    wrong = judgement.contradicted_lengths(coarse, trust, found, VERIFY.max_length_ratio)
+    contradicted = (np.arange(NUM_FRAMES - 1) == step) & known
+    trust = replace(StepChecks.of_all(found), false_steps=contradicted)
+    given = found, times, VERIFY.max_length_ratio
+    wrong = judgement.implausible_steps(coarse, trust, *given)
     np.testing.assert_array_equal(np.flatnonzero(wrong), [step] if expected else [])
-    # Steps that images replaced, or do not show, and poses between tracked frames say nothing.
-    others = (
-        (coarse, replace(trust, false_steps=wrong)),
-        (coarse, replace(trust, unseen_steps=wrong)),
-        (replace(coarse, sources=np.full(NUM_FRAMES, PoseSource.INTERPOLATED, np.uint8)), trust),
-    )
-    for one in others:
-        assert not judgement.contradicted_lengths(*one, found, VERIFY.max_length_ratio).any()
+    after = judgement.without_steps(coarse, trust, wrong)
+    steps = [inverse(one[:-1]) @ one[1:] for one in (after.world_T_rigs, found, slam)]
+    np.testing.assert_allclose(steps[0], np.where(wrong[:, None, None], *steps[:0:-1]), atol=1e-9)
+    assert after.held_steps[step] == expected
+    # Steps that images do not show, and poses between tracked frames say nothing.
+    unseen = replace(trust, unseen_steps=wrong)
+    assert not judgement.implausible_steps(coarse, unseen, *given).any()
+    untracked = replace(coarse, sources=np.full(NUM_FRAMES, PoseSource.INTERPOLATED, np.uint8))
+    assert not judgement.implausible_steps(untracked, trust, *given).any()
