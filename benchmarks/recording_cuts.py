@@ -70,15 +70,8 @@ def cut_rows(walk: Path, rows: np.ndarray, folder: Path, number: int, exposure: 
         exposure: factor of the linear light of its pictures.
     """
     truth = read_trajectory(walk / "groundtruth.tum")
-    table = (walk / "images/timestamps.csv").read_text().splitlines()[1:]
-    names = [row.partition(",")[0] for row in table]
-    images = {path.stem: path for path in (walk / "images").iterdir()}
-    folder.mkdir(parents=True, exist_ok=True)
-    for row in rows.tolist():
-        _copy(images[names[row]], folder, exposure)
     times = truth.timestamps[rows] - truth.timestamps[rows[0]]
-    lines = [f"{names[row]},{time:.6f}" for row, time in zip(rows.tolist(), times, strict=True)]
-    (folder / "timestamps.csv").write_text("\n".join(["name,timestamp", *lines, ""]))
+    take_frames(walk, rows, times, folder, exposure)
     given = Trajectory(times, truth.world_T_rigs[rows])
     coarse = degrade(given, number, scale=_SCALES[number % 6])
     turn = Rotation.from_rotvec([0.3, 1.1 * number, -0.2]).as_matrix()
@@ -86,6 +79,21 @@ def cut_rows(walk: Path, rows: np.ndarray, folder: Path, number: int, exposure: 
     path = folder.with_name(f"{folder.name}.tum")
     write_tum(path, Trajectory(coarse.timestamps, moved.poses(coarse.world_T_rigs)))
     return Cut(folder, path, rows)
+
+
+def take_frames(
+    walk: Path, rows: np.ndarray, times: np.ndarray, folder: Path, exposure: float = 1.0
+) -> None:
+    """Put some frames (R,) of a walk, at times (R,) in seconds, and their timestamps.csv into a
+    folder."""
+    table = (walk / "images/timestamps.csv").read_text().splitlines()[1:]
+    names = [Path(row.partition(",")[0]).stem for row in table]
+    images = {path.stem: path for path in (walk / "images").iterdir()}
+    folder.mkdir(parents=True, exist_ok=True)
+    for row in rows.tolist():
+        _copy(images[names[row]], folder, exposure)
+    lines = [f"{names[row]},{time:.6f}" for row, time in zip(rows.tolist(), times, strict=True)]
+    (folder / "timestamps.csv").write_text("\n".join(["name,timestamp", *lines, ""]))
 
 
 def position_errors(found: np.ndarray, true: np.ndarray) -> np.ndarray:

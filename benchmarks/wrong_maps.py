@@ -28,6 +28,7 @@ from common import (
     run_row,
     write_table,
 )
+from recording_cuts import take_frames
 
 from gsba.demo import degrade
 from gsba.evaluate.trajectory import pose_errors
@@ -134,19 +135,12 @@ def paused(text: str, out: Path) -> Path:
         return walk
     home = (out / f"{walk.name}_{spans.replace(',', '_')}").resolve()
     shutil.rmtree(home, ignore_errors=True)
-    (home / "images").mkdir(parents=True)
     ends = [tuple(map(int, span.split("-"))) for span in spans.split(",")]
-    rows = [row for first, last in ends for row in range(first, last)]
-    pictures = sorted(p for p in (walk / "images").iterdir() if p.suffix != ".csv")
-    for row in rows:
-        shutil.copy(pictures[row], home / "images")
-    head, *lines = (walk / "images/timestamps.csv").read_text().splitlines()
-    kept = [head, *(lines[row] for row in rows)]
-    (home / "images/timestamps.csv").write_text("\n".join(kept) + "\n")
+    rows = np.concatenate([np.arange(first, last) for first, last in ends])
     truth = read_trajectory(walk / "groundtruth.tum")
-    write_tum(
-        home / "groundtruth.tum", Trajectory(truth.timestamps[rows], truth.world_T_rigs[rows])
-    )
+    kept = Trajectory(truth.timestamps[rows], truth.world_T_rigs[rows])
+    take_frames(walk, rows, kept.timestamps, home / "images")
+    write_tum(home / "groundtruth.tum", kept)
     if (walk / "mask.png").exists():
         shutil.copy(walk / "mask.png", home)
     return home

@@ -8,13 +8,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from gsba.geometry import rotation_angle
 from gsba.loop_closure import join_evidence
 from gsba.loop_closure.join_evidence import JoinEvidence, Places, Rates, around
 from gsba.loop_closure.map_similarity import (
     Meeting,
     Proposal,
     alike,
+    difference,
     meetings_of,
     refined,
 )
@@ -120,17 +120,10 @@ class JoinTest:
             if not again:
                 break
             move = refined(again, proposal.move, self.poses)
-            settled = self._change(proposal.move, move, groups[0]) < _SETTLED_RAD
+            off, turned, stretched = difference(proposal.move, move, self.poses[groups[0]])
+            settled = off / self.depth + turned + stretched < _SETTLED_RAD
             proposal = replace(proposal, move=move)
             evidence, found = self.weigh(*groups, move)
             if settled:
                 break
         return Judged(proposal, evidence)
-
-    def _change(self, one: Sim3, other: Sim3, rows: np.ndarray) -> float:
-        """Largest change of a bearing, radians, to a point at median depth from frames (N,) that
-        move otherwise."""
-        first, second = one.poses(self.poses[rows]), other.poses(self.poses[rows])
-        off = np.linalg.norm(first[:, :3, 3] - second[:, :3, 3], axis=1).max() / self.depth
-        turned = rotation_angle(first[:, :3, :3].swapaxes(1, 2) @ second[:, :3, :3]).max()
-        return float(off + turned + abs(np.log(one.scale / other.scale)))

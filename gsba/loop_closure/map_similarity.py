@@ -107,8 +107,7 @@ def _pooled(meeting: Meeting, meetings: list[Meeting], poses: np.ndarray) -> Mee
     near = [m for m in meetings if max(abs(m.f - meeting.f), abs(m.g - meeting.g)) <= _BESIDE]
 
     def seen_from(rig: int, seer: int, points: np.ndarray) -> np.ndarray:
-        rig_T_seer = inverse(poses[rig]) @ poses[seer]
-        return points @ rig_T_seer[:3, :3].T + rig_T_seer[:3, 3]
+        return Sim3.of(1.0, inverse(poses[rig]) @ poses[seer]).points(points)
 
     own = np.concatenate([seen_from(meeting.f, m.f, m.own) for m in near])
     theirs = np.concatenate([seen_from(meeting.g, m.g, m.theirs) for m in near])
@@ -162,13 +161,19 @@ def alike(
         slack: tolerance, in typical differences of two estimates of one similarity.
     """
     frames = poses[[one.frames[0], other.frames[0]]]
-    first, second = one.move.poses(frames), other.move.poses(frames)
-    turned = rotation_angle(first[0, :3, :3].T @ second[0, :3, :3])
-    off = np.linalg.norm(first[:, :3, 3] - second[:, :3, 3], axis=1).max()
-    stretched = abs(np.log(one.move.scale / other.move.scale))
+    off, turned, stretched = difference(one.move, other.move, frames)
     near = off < slack * AGREE * max(depth, 1e-12)
     near &= turned < slack * np.deg2rad(AGREE_DEG)
     return bool(near and stretched < _MAX_LOG_SCALE_DIFFERENCE)
+
+
+def difference(one: Sim3, other: Sim3, poses: np.ndarray) -> tuple[float, float, float]:
+    """Largest distance, angle in radians and logarithm of the ratio of scales between poses
+    (F, 4, 4) moved by two similarities."""
+    first, second = one.poses(poses), other.poses(poses)
+    off = np.linalg.norm(first[:, :3, 3] - second[:, :3, 3], axis=1).max()
+    turned = rotation_angle(first[0, :3, :3].T @ second[0, :3, :3])  # of all poses alike
+    return float(off), float(turned), float(abs(np.log(one.scale / other.scale)))
 
 
 def refined(meetings: list[Meeting], start: Sim3, poses: np.ndarray) -> Sim3:

@@ -12,7 +12,6 @@ from dataclasses import replace
 import numpy as np
 
 from gsba.log import GsbaError
-from gsba.loop_closure import connectivity
 from gsba.pipeline import frontend, gyro
 from gsba.pipeline.prior import Prior
 from gsba.pipeline.state import State
@@ -39,9 +38,7 @@ def match_neighbours(state: State) -> State:
     begins = np.cumsum([0, *(len(one.run.frames) for one in apart)]).tolist()
     near = [_renumbered(one.verified, f) for one, f in zip(apart, begins, strict=False)]
     verified = VerifiedPairs.joined(near)
-    prior = _combined([one.prior for one in apart])
-    parts = connectivity.parted(verified.matches.pairs, prior.trust.held_steps)
-    return state.start_from(replace(prior, parts=parts)).with_verified(verified)
+    return state.begun(_combined([one.prior for one in apart]), verified)
 
 
 def _match(state: State, number: int) -> State:

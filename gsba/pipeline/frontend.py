@@ -14,7 +14,7 @@ from gsba.features import detection, extraction
 from gsba.features.extraction import FrameFeatures, Search
 from gsba.frames import panorama
 from gsba.log import GsbaError
-from gsba.loop_closure import connectivity, loops
+from gsba.loop_closure import loops
 from gsba.loop_closure.loops import Closed
 from gsba.matching import correspondences, recovery
 from gsba.matching.guided_search import MatchContext, SearchableFrames
@@ -185,11 +185,9 @@ def judge_trajectory(state: State) -> State:
             f"no two neighbouring frames match ({near.counts.received} pairs, with and "
             f"without the trajectory): {_hindrance(run)}"
         )
-    parts = connectivity.parted(near.matches.pairs, trust.held_steps)
-    prior = replace(prior, coarse=coarse, trust=trust, joints=found.joints, parts=parts)
-    if prior.absent:
+    if coarse.absent:
         coarse = replace(coarse, world_T_rigs=trust.world_T_rigs)
-    return state.start_from(replace(prior, coarse=coarse)).with_verified(near)
+    return state.begun(replace(prior, coarse=coarse, trust=trust, joints=found.joints), near)
 
 
 def drop_implausible_steps(state: State) -> State:
@@ -205,8 +203,7 @@ def drop_implausible_steps(state: State) -> State:
         return state
     near = steps.without_steps(state.verified, set(np.flatnonzero(wrong).tolist()))
     trust = judgement.without_steps(coarse, prior.trust, wrong)
-    parts = connectivity.parted(near.matches.pairs, trust.held_steps)
-    return state.start_from(replace(prior, trust=trust, parts=parts)).with_verified(near)
+    return state.begun(replace(prior, trust=trust), near)
 
 
 def _hindrance(run: Run) -> str:

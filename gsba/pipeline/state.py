@@ -72,6 +72,12 @@ class State:
             self, prior=prior, map=Map.of(prior.start(), self.observed.shown, self.run.frames)
         )
 
+    def begun(self, prior: Prior, near: VerifiedPairs) -> "State":
+        """The state before its map: another prior, in the parts that these matches of neighbours
+        and the trajectory tie together."""
+        parts = connectivity.parted(near.matches.pairs, prior.trust.held_steps)
+        return self.start_from(replace(prior, parts=parts)).with_verified(near)
+
     def with_verified(self, verified: VerifiedPairs) -> "State":
         """The state with other matches of neighbours, and none beside these."""
         return replace(self, verified=verified, matches=MapMatches(verified.matches))

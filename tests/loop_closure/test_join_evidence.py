@@ -83,19 +83,26 @@ def test_corners_and_what_covers_walls_must_both_be_found_again(
     assert join_evidence.evidence_of(seen, usual, depth).confirmed == confirmed
 
 
+CELLS = np.repeat(np.stack(np.unravel_index(np.arange(4000), (100, 40, 1)), axis=1), 5, axis=0)
+
+
+def _of_cells(off: np.ndarray) -> JoinEvidence:
+    """Evidence of a point in each of `CELLS`, found `off` radians from its place or not at all;
+    within parts, 4 of 10 are found."""
+    seen = join_evidence.Predictions(CELLS + 0.5, np.zeros(len(CELLS), np.int64), off)
+    usual = join_evidence.Rates(np.full(24, 0.4), 0.0, np.full(24, 0.4))
+    return join_evidence.evidence_of(seen, usual, 4.0)
+
+
 @pytest.mark.parametrize(("at_place", "joined"), [(1.0, True), (0.7, True), (0.4, False)])
 def test_what_matches_beside_its_place_does_not_join_recordings(
     at_place: float, joined: bool, rng: np.random.Generator
 ) -> None:
     """All is found that is found within parts, some of it at its place, the rest by chance."""
-    cells = np.stack(np.unravel_index(np.arange(4000), (100, 40, 1)), axis=1)
-    cells = np.repeat(cells, 5, axis=0)
-    anywhere = np.deg2rad(4.0) * np.sqrt(rng.uniform(size=len(cells)))  # even over a disc
-    off = np.where(rng.uniform(size=len(cells)) < at_place, np.deg2rad(0.3), anywhere)
-    off[rng.uniform(size=len(cells)) > 0.4] = np.nan
-    seen = join_evidence.Predictions(cells + 0.5, np.zeros(len(cells), np.int64), off)
-    usual = join_evidence.Rates(np.full(24, 0.4), 0.0, np.full(24, 0.4))
-    found = join_evidence.evidence_of(seen, usual, 4.0)
+    anywhere = np.deg2rad(4.0) * np.sqrt(rng.uniform(size=len(CELLS)))  # even over a disc
+    off = np.where(rng.uniform(size=len(CELLS)) < at_place, np.deg2rad(0.3), anywhere)
+    off[rng.uniform(size=len(CELLS)) > 0.4] = np.nan
+    found = _of_cells(off)
     assert abs(found.placed - at_place) < 0.05
     assert found.share > 0.95 and found.confirmed == joined
 
@@ -105,13 +112,9 @@ def test_an_exact_copy_of_a_place_shows_nothing_in_some_regions(
     strange: float, joined: bool, rng: np.random.Generator
 ) -> None:
     """All that is found is at its place, but in some regions nothing is."""
-    cells = np.stack(np.unravel_index(np.arange(4000), (100, 40, 1)), axis=1)
-    cells = np.repeat(cells, 5, axis=0)
-    off = np.where(rng.uniform(size=len(cells)) < 0.4, np.deg2rad(0.3), np.nan)
-    off[cells[:, 0] < 100 * strange] = np.nan
-    seen = join_evidence.Predictions(cells + 0.5, np.zeros(len(cells), np.int64), off)
-    usual = join_evidence.Rates(np.full(24, 0.4), 0.0, np.full(24, 0.4))
-    found = join_evidence.evidence_of(seen, usual, 4.0)
+    off = np.where(rng.uniform(size=len(CELLS)) < 0.4, np.deg2rad(0.3), np.nan)
+    off[CELLS[:, 0] < 100 * strange] = np.nan
+    found = _of_cells(off)
     assert abs(found.strange - strange) < 0.05 and found.margin() > 0.05
     assert found.confirmed == found.likely == joined
 

@@ -65,8 +65,7 @@ def test_pairs_beside_one_another_that_share_few_points_propose_together() -> No
     poses[:, :3, 3] = rng.uniform(-1, 1, (20, 3))
 
     def seen(f: int, points: np.ndarray) -> np.ndarray:
-        back = inverse(poses[f])
-        return points @ back[:3, :3].T + back[:3, 3]
+        return Sim3.of(1.0, inverse(poses[f])).points(points)
 
     meetings = []
     for n in range(3):
