@@ -3,10 +3,12 @@
 import csv
 import json
 import xml.etree.ElementTree as ET
+from pathlib import Path
 
 import numpy as np
 import pycolmap
 import pytest
+from accuracy import assert_as_accurate
 from cameras_home import (
     NUM,
     SMALL,
@@ -39,10 +41,10 @@ def _error(result: RunResult, home: Home) -> float:
 
 
 @pytest.fixture(scope="module")
-def coarser(home: Home) -> float:
-    """Error of the coarser camera for all."""
+def coarser(home: Home) -> Path:
+    """A run of the coarser camera for all."""
     recordings = [panoramas(home, n, SMALL) for n in range(2)]
-    return _error(refine_recordings(recordings, home.folder / "coarser", SETTINGS), home)
+    return refine_recordings(recordings, home.folder / "coarser", SETTINGS).out
 
 
 @pytest.fixture(scope="module")
@@ -53,9 +55,9 @@ def sizes(home: Home) -> RunResult:
     return refine_recordings(recordings, home.folder / "sizes", settings_with(export=formats))
 
 
-def test_pictures_of_two_sizes_make_one_map(sizes: RunResult, coarser: float, home: Home) -> None:
+def test_pictures_of_two_sizes_make_one_map(sizes: RunResult, coarser: Path, home: Home) -> None:
     assert [kind.width for kind in sizes.frames.formats] == [WIDTH, SMALL]
-    assert _error(sizes, home) < 1.5 * coarser
+    assert_as_accurate(sizes.out, _error(sizes, home), coarser, 1.25)
     _, frames = load_run(sizes.out)
     assert frames.camera_of_frame == (0,) * NUM + (1,) * NUM
 
@@ -104,12 +106,12 @@ def test_poses_and_the_report_have_all_frames(sizes: RunResult) -> None:
     assert (sizes.out / "report.html").is_file()
 
 
-def test_stitched_panoramas_and_cube_faces_make_one_map(home: Home, coarser: float) -> None:
+def test_stitched_panoramas_and_cube_faces_make_one_map(home: Home, coarser: Path) -> None:
     recordings = [panoramas(home, 0, WIDTH), faces(home)]
     settings = settings_with(export={"formats": ("colmap-flat",)})
     result = refine_recordings(recordings, home.folder / "cube", settings)
     assert [kind.layout for kind in result.frames.formats] == ["erp", "cube"]
-    assert _error(result, home) < 1.5 * coarser
+    assert_as_accurate(result.out, _error(result, home), coarser, 1.25)
     model = pycolmap.Reconstruction(str(result.out / "colmap-flat/sparse/0"))
     assert len(model.images) == 12 * NUM
     with pytest.raises(GsbaError, match="needs panoramas"):
