@@ -34,7 +34,7 @@ _SETTLED_RAD = np.deg2rad(0.1)  # largest change of a bearing to a point at medi
 @dataclass(frozen=True, slots=True)
 class Judged:
     """A proposal refined with all points that both sides share around its meeting, and its
-    evidence."""
+    evidence before the last, small step."""
 
     proposal: Proposal
     evidence: JoinEvidence
@@ -54,19 +54,26 @@ class JoinTest:
     measure_rates: Callable[[np.ndarray], Rates]
     _usual: dict[tuple[int, ...], Rates] = field(default_factory=dict)
 
-    def judge(self, proposal: Proposal, rows: np.ndarray, inside: np.ndarray) -> Judged:
+    def judge(
+        self, proposal: Proposal, rows: np.ndarray, inside: np.ndarray, judged: Sequence[Judged]
+    ) -> Judged | None:
         """Weigh a proposal to join two parts.
 
         Args:
             proposal: carries `rows` to `inside`.
             rows, inside: (N,) and (M,) frames of either part, ascending.
+            judged: those judged before.
+
+        Returns:
+            None if the proposal leads to the place of one that is confirmed already.
         """
-        found = self._judged(proposal, rows, inside, join_evidence.LOCAL)
-        if found.evidence.confirmed or found.evidence.refuted:
+        known = [one.proposal for one in judged if one.evidence.confirmed]
+        found = self._judged(proposal, (rows, inside), join_evidence.LOCAL, known)
+        if found is None or found.evidence.confirmed or found.evidence.refuted:
             return found
         # More frames give more evidence, if drift permits.
-        wider = self._judged(found.proposal, rows, inside, join_evidence.WIDER)
-        return max((found, wider), key=lambda one: one.evidence.margin())
+        wider = self._judged(found.proposal, (rows, inside), join_evidence.WIDER, known)
+        return wider and max((found, wider), key=lambda one: one.evidence.margin())
 
     def rivals(self, best: Judged, others: Sequence[Judged]) -> list[Judged]:
         """Accepted proposals for another place that `best` does not significantly beat."""
@@ -109,10 +116,15 @@ class JoinTest:
         return meetings_of(self.known, matches, outside, f0_T_f1s)
 
     def _judged(
-        self, proposal: Proposal, rows: np.ndarray, inside: np.ndarray, reach: int
-    ) -> Judged:
-        """The proposal tested with frames at most `reach` to either side of the meeting."""
-        f, g = proposal.frames
+        self,
+        proposal: Proposal,
+        sides: tuple[np.ndarray, np.ndarray],
+        reach: int,
+        known: Sequence[Proposal],
+    ) -> Judged | None:
+        """The proposal tested with frames at most `reach` to either side of the meeting; None if
+        it leads to the place of a known one."""
+        (f, g), (rows, inside) = proposal.frames, sides
         groups = around(rows, f, reach), around(inside, g, reach)
         evidence, found = self.weigh(*groups, proposal.move)
         for _ in range(_MAX_REFINEMENTS):
@@ -121,9 +133,10 @@ class JoinTest:
                 break
             move = refined(again, proposal.move, self.poses)
             off, turned, stretched = difference(proposal.move, move, self.poses[groups[0]])
-            settled = off / self.depth + turned + stretched < _SETTLED_RAD
             proposal = replace(proposal, move=move)
-            evidence, found = self.weigh(*groups, move)
-            if settled:
+            if any(alike(proposal, other, self.poses, self.depth) for other in known):
+                return None
+            if off / self.depth + turned + stretched < _SETTLED_RAD:
                 break
+            evidence, found = self.weigh(*groups, move)
         return Judged(proposal, evidence)

@@ -218,8 +218,8 @@ class _Joining:
         for proposal in propose(meetings, self.poses, self.depth, self.context.settings.seed):
             if self._is_held_by_trajectory(rows) and not self._plausible(proposal):
                 continue
-            judged = self.test.judge(proposal, rows, inside)
-            if self._is_level(rows, inside, judged.proposal.move):
+            judged = self.test.judge(proposal, rows, inside, weighed)
+            if judged and self._is_level(rows, inside, judged.proposal.move):
                 weighed.append(judged)
         if not weighed:
             self.reasons[part] = "no frame of it shares enough points with a frame of another map"

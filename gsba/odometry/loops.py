@@ -128,8 +128,8 @@ def _judged(
     for proposal in propose(group, poses, test.depth, seed)[:_MAX_TRIED]:
         if not _plausible(proposal, places, unseen, test.depth):
             continue
-        one = test.judge(proposal, *_sides(*proposal.frames, len(poses)))
-        if _plausible(one.proposal, places, unseen, test.depth):
+        one = test.judge(proposal, *_sides(*proposal.frames, len(poses)), found)
+        if one and _plausible(one.proposal, places, unseen, test.depth):
             found.append(one)
     return found
 
