@@ -23,7 +23,7 @@ MaxGaussians = Annotated[
     typer.Option(help="Most Gaussians; default: set by pixels and memory.", metavar="N"),
 ]
 BackendName = Annotated[
-    str, typer.Option(help="Renderer: auto, gsplat (CUDA; untested on a GPU) or cpu.")
+    str, typer.Option(help="Renderer: auto, gsplat (CUDA) or cpu.")
 ]
 
 

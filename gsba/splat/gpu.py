@@ -1,8 +1,8 @@
 """gsplat on CUDA, classic pinhole path, behind the interface of `gsba.splat.backend`.
 
 A stretch of training stays on the device: parameters and moments are copied to it and back once.
-Untested on a GPU: tests run the Python side of gsplat 1.5.3 on its own PyTorch versions of its CUDA
-kernels (tests/splat/test_gsplat.py), not these kernels.
+tests/splat/test_gsplat.py compares it with the CPU renderer: with gsplat's kernels where there is a
+CUDA device (gsplat 1.5.3 on an NVIDIA H200), else with its own PyTorch versions of them.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
