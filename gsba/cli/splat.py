@@ -22,9 +22,7 @@ MaxGaussians = Annotated[
     int | None,
     typer.Option(help="Most Gaussians; default: set by pixels and memory.", metavar="N"),
 ]
-BackendName = Annotated[
-    str, typer.Option(help="Renderer: auto, gsplat (CUDA) or cpu.")
-]
+BackendName = Annotated[str, typer.Option(help="Renderer: auto, gsplat (CUDA) or cpu.")]
 
 
 @command

@@ -4,6 +4,8 @@ import numpy as np
 
 from gsba.types import Matches, Solution, Tracks
 
+MIN_MAP_FRAMES = 3  # least frames of a part that count as a map
+
 
 def parted(
     pairs: np.ndarray, held: np.ndarray, scarce: np.ndarray | None = None
@@ -23,6 +25,15 @@ def parted(
         rows, columns = rows[fed], columns[fed]
     graph = coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(num, num))
     return several(by_size(connected_components(graph, directed=False)[1]))
+
+
+def maps_of_images(pairs: np.ndarray, num_frames: int) -> np.ndarray:
+    """Map (F,) int64 of each frame that pairs (P, 2) of images tie together; -1 = of too few
+    frames."""
+    parts = parted(pairs, np.zeros(num_frames - 1, bool))
+    if parts is None:
+        return np.zeros(num_frames, np.int64)
+    return np.where(np.bincount(parts)[parts] < MIN_MAP_FRAMES, -1, parts)
 
 
 def several(found: np.ndarray) -> np.ndarray | None:

@@ -53,6 +53,8 @@ class JoinTest:
     # recordings that meet, as rooms of others may show more or fewer of their points again.
     measure_rates: Callable[[np.ndarray], Rates]
     _usual: dict[tuple[int, ...], Rates] = field(default_factory=dict)
+    # What was tested already, by proposals and frames: their poses stay until the part moves.
+    _tested: dict[tuple[object, ...], Judged] = field(default_factory=dict)
 
     def judge(
         self, proposal: Proposal, rows: np.ndarray, inside: np.ndarray, judged: Sequence[Judged]
@@ -124,19 +126,40 @@ class JoinTest:
     ) -> Judged | None:
         """The proposal tested with frames at most `reach` to either side of the meeting; None if
         it leads to the place of a known one."""
-        (f, g), (rows, inside) = proposal.frames, sides
-        groups = around(rows, f, reach), around(inside, g, reach)
+        (f, g), move = proposal.frames, proposal.move
+        groups = around(sides[0], f, reach), around(sides[1], g, reach)
+        given = f, g, move.scale, move.new_T_old.tobytes(), *(rows.tobytes() for rows in groups)
+        if given not in self._tested:
+            found = self._settled(proposal, groups, known)
+            if found is None:
+                return None
+            self._tested[given] = found
+        found = self._tested[given]
+        return None if self._leads_to(found.proposal, known) else found
+
+    def _settled(
+        self,
+        proposal: Proposal,
+        groups: tuple[np.ndarray, np.ndarray],
+        known: Sequence[Proposal],
+    ) -> Judged | None:
+        """The proposal refined by frames of both sides until it hardly changes; None once it leads
+        to the place of a known one."""
         evidence, found = self.weigh(*groups, proposal.move)
         for _ in range(_MAX_REFINEMENTS):
-            again = self.meetings(found, rows)
+            again = self.meetings(found, groups[0])
             if not again:
                 break
             move = refined(again, proposal.move, self.poses)
             off, turned, stretched = difference(proposal.move, move, self.poses[groups[0]])
             proposal = replace(proposal, move=move)
-            if any(alike(proposal, other, self.poses, self.depth) for other in known):
+            if self._leads_to(proposal, known):
                 return None
             if off / self.depth + turned + stretched < _SETTLED_RAD:
                 break
             evidence, found = self.weigh(*groups, move)
         return Judged(proposal, evidence)
+
+    def _leads_to(self, proposal: Proposal, known: Sequence[Proposal]) -> bool:
+        """True if a proposal is for the place of a known one."""
+        return any(alike(proposal, other, self.poses, self.depth) for other in known)

@@ -15,7 +15,7 @@ import numpy as np
 from gsba.geometry import angles_between, inverse, unit
 from gsba.loop_closure import join_evidence, loops
 from gsba.loop_closure.break_crossing import agreed, continues, crossing
-from gsba.loop_closure.connectivity import by_size
+from gsba.loop_closure.connectivity import MIN_MAP_FRAMES, by_size
 from gsba.loop_closure.join_evidence import Places, Rates
 from gsba.loop_closure.join_test import JoinTest, Judged
 from gsba.loop_closure.map_similarity import Meeting, Proposal, propose
@@ -33,7 +33,6 @@ _NUM_CANDIDATES = 3  # candidate places for each frame of a part; twice as many 
 _NUM_SAMPLED_FRAMES = 24  # frames of a part for which candidates are searched
 _BREAK_REACH_FRAMES = 3  # frames from a break that are compared in any case
 _NUM_BEST_MEETINGS = 2  # best meetings whose neighbours are compared too
-_MIN_MAP_FRAMES = 3  # least frames of a part that count as a map
 # Least frames of a map for the test of joins: two small parts in rooms with one floor look like one
 # place all around.
 _MIN_TESTABLE_FRAMES = 6
@@ -67,7 +66,7 @@ def merge(
         recordings: (F,) int, number of each frame's recording; None = there is one. Single frames
             do not join recordings.
     """
-    min_testable = _MIN_TESTABLE_FRAMES if absent else _MIN_MAP_FRAMES
+    min_testable = _MIN_TESTABLE_FRAMES if absent else MIN_MAP_FRAMES
     owners = np.zeros(len(parts), np.int64) if recordings is None else recordings
     ties = held | seen
     joining = _Joining(context, solved, parts, held, ties, timestamps, min_testable, owners)
@@ -122,7 +121,7 @@ class _Joining:
         """Start a map from the largest free part; False if there is no such part."""
         free = self.components < 0
         sizes = np.bincount(self.parts[free], minlength=1)
-        if not free.any() or (component > 0 and sizes.max() < _MIN_MAP_FRAMES):
+        if not free.any() or (component > 0 and sizes.max() < MIN_MAP_FRAMES):
             return False
         base = self.parts == int(np.argmax(sizes))
         self.components[base], self.met[base], self.current = component, True, component
@@ -137,7 +136,7 @@ class _Joining:
                 continue
             self.tried.add((part, len(inside)))
             rows = np.flatnonzero(self.parts == part)
-            if len(rows) >= _MIN_MAP_FRAMES and any(np.isfinite(self.known[f]).any() for f in rows):
+            if len(rows) >= MIN_MAP_FRAMES and any(np.isfinite(self.known[f]).any() for f in rows):
                 move = self._similarity(part, rows, inside)
                 if move is not None:
                     self._carry(rows, move)
@@ -164,7 +163,7 @@ class _Joining:
 
     def _is_refuted(self, part: int, rows: np.ndarray, move: Sim3) -> bool:
         """True if images contradict the pose of a part by the trajectory."""
-        if len(rows) < _MIN_MAP_FRAMES:
+        if len(rows) < MIN_MAP_FRAMES:
             return False
         inside = np.flatnonzero(self.components == self.current)
         evidence = self.test.weigh(rows, inside, move)[0]

@@ -84,11 +84,25 @@ def match_loops(context: MatchContext, solved: Solution) -> VerifiedPairs:
     return verified(found, gates, f0_T_f1s, drifts, context)
 
 
-def match_along_epipolars(context: MatchContext, solved: Solution) -> Matches:
-    """Match neighbours in time again, along the epipolar lines of poses that are nearly right."""
+def match_along_epipolars(
+    context: MatchContext, solved: Solution, maps: np.ndarray | None = None
+) -> Matches:
+    """Match neighbours in time again, along the epipolar lines of poses that are nearly right.
+
+    Neighbours of different maps are left out: repeated structure along the epipolar lines of a
+    step that only the trajectory gives agrees on another length of it.
+
+    Args:
+        context: features and settings of the run.
+        solved: the current solution.
+        maps: (F,) int, map of each frame; -1 = a frame of none; None = there is one map.
+    """
     poses, settings = solved.world_T_rigs, context.settings
     refined = settings.pairs.refined
     chosen = pairs.adjacent(len(poses))
+    if maps is not None:
+        first, second = maps[chosen].T
+        chosen = chosen[(first == second) | (np.minimum(first, second) < 0)]
     lengths = np.linalg.norm(poses[chosen[:, 1], :3, 3] - poses[chosen[:, 0], :3, 3], axis=1)
     apart = context.cameras.baseline  # a ray may start at either lens
     gates = [

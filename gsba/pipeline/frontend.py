@@ -197,8 +197,9 @@ def drop_implausible_steps(state: State) -> State:
     The trajectory gives these steps, unless images confirm elsewhere how the map goes on there.
     """
     run, prior, poses = state.run, state.prior, state.solution.world_T_rigs
-    coarse, ratio = prior.coarse, run.settings.verify.max_length_ratio
-    wrong = judgement.implausible_steps(coarse, prior.trust, poses, run.frames.timestamps, ratio)
+    coarse, times = prior.coarse, run.frames.timestamps
+    limits = run.settings.verify.max_length_ratio, run.settings.priors.translation
+    wrong = judgement.implausible_steps(coarse, prior.trust, poses, times, *limits)
     if not wrong.any():
         return state
     near = steps.without_steps(state.verified, set(np.flatnonzero(wrong).tolist()))
@@ -220,7 +221,8 @@ def _hindrance(run: Run) -> str:
 def match_along_epipolars(state: State, name: str = "adjacent") -> State:
     """Matches of neighbours in time along their solved epipolar lines, for those before."""
     run, context = state.run, state.observed.context
-    compute = partial(correspondences.match_along_epipolars, context, state.solution)
+    maps = state.maps_of_images()
+    compute = partial(correspondences.match_along_epipolars, context, state.solution, maps)
     found = run.stage(name, run.matching_key(), compute, Matches)
     return replace(state, matches=replace(state.matches, neighbours=found))
 

@@ -108,6 +108,15 @@ class State:
         """The state with its keypoints as rays of these cameras; the map's cameras stay."""
         return replace(self, observed=self.observed.through(cameras))
 
+    def maps_of_images(self) -> np.ndarray:
+        """Map (F,) of each frame, as images tie frames together, not the trajectory; -1 = of too
+        few frames."""
+        merged = self.prior.merged
+        maps = connectivity.maps_of_images(self.verified.matches.pairs, len(self.run.frames))
+        if merged is not None:
+            maps[merged.met] = len(maps) + merged.components[merged.met]
+        return maps
+
     def triangulated(self, tracks: Tracks, keypoints: Keypoints, gate: float) -> Landmarks:
         """Points of tracks under the poses as they are.
 

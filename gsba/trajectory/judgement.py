@@ -27,6 +27,8 @@ _JUMP_COST = 1.5  # cost of a jump, in false frames
 _NOISE_QUANTILE = 0.25  # share of steps free of outliers: quantile from which noise is estimated
 # Multiple of the quantile from which an error is an outlier: drift exceeds it once in 1000 steps.
 _OUTLIER_RATIO = 4.0
+# Standard deviations of the trajectory by which a step may be off that only frames around it show.
+_UNSEEN_SIGMAS = 2.0
 _STEPS_AROUND = 6  # steps to either side whose lengths a step's is compared with
 _MIN_JUDGED_STEPS = 6  # least steps of which any length is compared
 
@@ -135,12 +137,15 @@ def implausible_steps(
     world_T_rigs: np.ndarray,
     timestamps: np.ndarray,
     max_ratio: float,
+    noise: float,
 ) -> np.ndarray:
     """Steps (F - 1,) bool whose length in a map of the images contradicts the trajectory, though it
     has the more usual speed.
 
     Where the view changes much from one frame to the next, repeated structure matches one bay
-    further on, in three frames, too. A trajectory that jumps has an unusual speed itself.
+    further on, in three frames, too. A trajectory that jumps has an unusual speed itself. A step
+    whose two frames do not match while frames around it do is less sure: there the trajectory's
+    noise is the limit.
 
     Args:
         coarse: the trajectory.
@@ -148,24 +153,26 @@ def implausible_steps(
         world_T_rigs: (F, 4, 4) poses in the map.
         timestamps: (F,) seconds.
         max_ratio: of the lengths of a step in both, relative to steps around it.
+        noise: standard deviation of the trajectory's steps, part of the step.
     """
     own = coarse.sources == PoseSource.SLAM
     slam, found = (
         np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
         for poses in (coarse.world_T_rigs, world_T_rigs)
     )
-    judged = own[:-1] & own[1:] & ~trust.unseen_steps
+    judged = own[:-1] & own[1:]
     judged &= (found > 0) & (slam > np.median(slam) / max_ratio)  # standing still measures nothing
     rows, wrong = np.flatnonzero(judged), np.zeros(len(slam), bool)
     if len(rows) < _MIN_JUDGED_STEPS:
         return wrong
     ratios = np.log(found[rows] / slam[rows])
     speeds = np.log(found[rows] / np.diff(timestamps)[rows])
+    limits = np.where(trust.unseen_steps, _UNSEEN_SIGMAS * noise, np.log(max_ratio))
     for n, step in enumerate(rows.tolist()):
         around = slice(max(n - _STEPS_AROUND, 0), n + _STEPS_AROUND + 1)
         off = ratios[n] - np.median(ratios[around])
         unusual = speeds[n] - np.median(speeds[around])
-        wrong[step] = abs(off) > np.log(max_ratio) and abs(unusual - off) < abs(unusual)
+        wrong[step] = abs(off) > limits[step] and abs(unusual - off) < abs(unusual)
     return wrong
 
 
