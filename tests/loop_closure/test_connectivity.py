@@ -1,4 +1,5 @@
-"""Points that hand the scale on from step to step, and steps given up without them."""
+"""Points that hand the scale on from step to step, steps given up without them, and maps of frames
+that images tie together."""
 
 import numpy as np
 
@@ -24,3 +25,10 @@ def test_the_step_that_parts_most_is_given_up_then_that_of_fewer_matches() -> No
     assert given_up({1, 2}, matches) == {1}
     assert given_up({1, 3}, matches) == {1, 2}
     assert given_up(set(), matches) == set()
+
+
+def test_too_few_frames_are_no_map_of_images() -> None:
+    tied = np.array([(0, 1), (1, 2), (3, 4), (5, 6), (6, 7), (7, 8)])
+    assert connectivity.maps_of_images(tied, 10).tolist() == [1, 1, 1, -1, -1, 0, 0, 0, 0, -1]
+    whole = np.column_stack([np.arange(3), np.arange(1, 4)])
+    assert connectivity.maps_of_images(whole, 4).tolist() == [0, 0, 0, 0]

@@ -11,6 +11,7 @@ from gsba.geometry import pose
 from gsba.loop_closure import join_evidence
 from gsba.loop_closure.join_evidence import JoinEvidence, Places, Rates, around
 from gsba.loop_closure.join_test import JoinTest
+from gsba.loop_closure.map_similarity import Proposal
 from gsba.matching.guided_search import MatchContext
 from gsba.similarity import Sim3
 
@@ -142,6 +143,29 @@ def test_points_are_expected_as_often_as_the_recordings_that_meet_find_them() ->
     centre = TRUTH[-1, :3, 3]
     away = Sim3.of(1.0, pose(turned, centre - turned @ centre))
     assert three.weigh(ENDS[1], ENDS[0], away)[0].refuted
+
+
+def test_what_leads_to_a_confirmed_place_is_not_tested_to_its_end(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    context, places, depth = _places()
+    owners = np.zeros(NUM, int)
+    usual = join_evidence.rates(context, places, PARTS)
+    test = JoinTest(context, TRUTH, places.known, depth, owners, lambda _: usual)
+    tests, weigh = [], JoinTest.weigh
+    monkeypatch.setattr(JoinTest, "weigh", lambda *given: tests.append(0) or weigh(*given))
+
+    def moved(shift: float) -> Proposal:
+        frames = int(ENDS[1][0]), int(ENDS[0][0])
+        return Proposal(Sim3.of(1.0, pose(np.eye(3), np.array([shift, 0, 0]) * depth)), frames, 9)
+
+    first = test.judge(moved(0.03), *ENDS[::-1], [])
+    assert first is not None and first.evidence.confirmed
+    off = first.proposal.move.points(np.zeros((1, 3))) / depth
+    assert np.linalg.norm(off) < 0.01  # refined until it settles
+    once = len(tests)
+    assert test.judge(moved(0.03), *ENDS[::-1], []) is first and len(tests) == once
+    assert test.judge(moved(-0.03), *ENDS[::-1], [first]) is None and len(tests) == once + 1
 
 
 def test_places_out_of_sight_say_nothing() -> None:

@@ -51,6 +51,17 @@ def _loops_to_last(shift: float, loop_deg: float = 2.0) -> tuple[VerifiedPairs, 
     return found, np.flatnonzero(found.matches.pairs[:, 1] == LAST)
 
 
+def test_neighbours_of_different_maps_are_not_matched_along_epipolars() -> None:
+    frames, keypoints, solved = _scene(shift=0)
+    context = MatchContext(frames, frames, keypoints, RefineSettings(), Threads(1))
+    whole = correspondences.match_along_epipolars(context, solved)
+    maps = np.array([0, 0, 0, -1, 1, 1])
+    found = correspondences.match_along_epipolars(context, solved, maps)
+    apart = [[2, 4]]  # frame 3 is of no map
+    assert [pair for pair in whole.pairs.tolist() if pair not in apart] == found.pairs.tolist()
+    assert apart[0] in whole.pairs.tolist() and len(found.of(0)) > NUM / 2
+
+
 def test_points_are_known_where_tracks_see_them() -> None:
     _, keypoints, solved = _scene(shift=0)
     turned = solved.world_T_rigs.copy()
