@@ -129,13 +129,11 @@ class JoinTest:
         (f, g), move = proposal.frames, proposal.move
         groups = around(sides[0], f, reach), around(sides[1], g, reach)
         given = f, g, move.scale, move.new_T_old.tobytes(), *(rows.tobytes() for rows in groups)
-        if given not in self._tested:
-            found = self._settled(proposal, groups, known)
-            if found is None:
-                return None
-            self._tested[given] = found
-        found = self._tested[given]
-        return None if self._leads_to(found.proposal, known) else found
+        found = self._tested.get(given) or self._settled(proposal, groups, known)
+        if found is None or self._leads_to(found.proposal, known):
+            return None
+        self._tested[given] = found
+        return found
 
     def _settled(
         self,
