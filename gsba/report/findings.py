@@ -82,7 +82,7 @@ def _steps(trust: StepChecks, frames: FrameSet, absent: bool) -> tuple[dict[str,
         if wrong > _MAX_FALSE_SHARE * num:
             doubt = f" (images contradict {wrong} of its other {num} steps)"
         notes.append(
-            f"no matches, the step comes from the trajectory{doubt}: "
+            f"no reliable matches: the step comes from the trajectory{doubt}: "
             f"{named(steps, 'trajectory.unseen_steps', 'steps')}"
         )
     for note in notes:

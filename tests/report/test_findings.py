@@ -29,7 +29,7 @@ def test_steps_that_no_image_shows_are_in_doubt_where_others_are_wrong(
     )
     found, notes = of_trajectory(trust, None, None, (), frames)
     assert found["unseen_steps"] == [[frames.names[-2], frames.names[-1]]]
-    alone = f"no matches, the step comes from the trajectory{doubt.format(num - 2)}"
+    alone = f"no reliable matches: the step comes from the trajectory{doubt.format(num - 2)}"
     assert notes == [f"{alone}: {frames.names[-2]} to {frames.names[-1]}"]
 
 
