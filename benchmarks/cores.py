@@ -4,7 +4,8 @@
 
 RUN was computed by two threads or more, in one call. The serial part of a stage is the CPU time
 of the thread that computes it, which only waits where others share the work; so it does not depend
-on what else the machine does. The rest is taken to be shared evenly.
+on what else the machine does. The rest is taken to be shared evenly: that is a bound, as threads of
+Python code take turns, and hyper-threads share a core (results/cores.md has what 16 cores gained).
 """
 
 import argparse
