@@ -53,7 +53,8 @@ class JoinTest:
     # recordings that meet, as rooms of others may show more or fewer of their points again.
     measure_rates: Callable[[np.ndarray], Rates]
     _usual: dict[tuple[int, ...], Rates] = field(default_factory=dict)
-    # What was tested already, by proposals and frames: their poses stay until the part moves.
+    # Proposals judged before, by their similarity and the frames compared. A part is tested again
+    # whenever the map has grown; until it is joined, poses of these frames do not change.
     _tested: dict[tuple[object, ...], Judged] = field(default_factory=dict)
 
     def judge(
