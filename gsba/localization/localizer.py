@@ -22,7 +22,7 @@ from gsba.localization.known_points import Sightings, isotropic
 from gsba.localization.patch_sightings import PatchAligner
 from gsba.localization.picture_cameras import PictureCameras
 from gsba.localization.pictures import load_panorama
-from gsba.localization.place_index import PlaceIndex, open_index
+from gsba.localization.place_index import open_index
 from gsba.localization.pose_fit import (
     COARSE,
     FINE,
@@ -31,22 +31,19 @@ from gsba.localization.pose_fit import (
     fit,
     is_determined,
 )
-from gsba.localization.pose_search import (
-    Candidates,
-    FoundPose,
-    is_rivalled,
-    is_significant,
-    least_of_rival,
-    search_pose,
-)
+from gsba.localization.pose_search import Candidates, is_significant, search_poses
+from gsba.localization.query import Query
+from gsba.localization.rival_poses import PlacedPose, best_of
 from gsba.localization.run_map import RunMap, without_correction
+from gsba.localization.surroundings import Surroundings, open_rates
 from gsba.log import GsbaError
-from gsba.matching.guided_search import Gate, Searchable, match_pair, searchable
+from gsba.matching.guided_search import Gate, match_pair, searchable
 from gsba.types import Features, FrameSet, Keypoints, PictureFormat
 
 _NUM_PLACES = 5  # keyframes that look most like a frame
 _NUM_MORE_PLACES = 16  # where these do not suffice
-_NUM_NEAREST = 10  # keyframes whose points are searched along predicted bearings
+_NUM_POSES = 5  # poses that are compared
+NUM_NEAREST = 10  # keyframes whose points are searched along predicted bearings
 _MAX_FACE_PX = 288  # across the faces on which keypoints of panoramas are found: they serve to find
 # the place, and cost in proportion to the area
 _WIDE_GATE_RAD, _NARROW_GATE_RAD = np.deg2rad(1.0), np.deg2rad(0.4)  # around predicted bearings
@@ -55,7 +52,6 @@ _MIN_POINTS = 20  # inliers of a fit
 Grey = tuple[np.ndarray, np.ndarray | None]  # (h, 2h) uint8 panorama, and mask, True = use
 
 NO_PLACE = "no place of the map looks like it"
-TWO_PLACES = "two places of the map look like it"
 NOT_DETERMINED = "the points that it shows do not determine its pose"
 
 
@@ -85,17 +81,6 @@ class LocalizedFrame:
         return cls(name, *nothing, 0, np.nan, "", reason)
 
 
-@dataclass(frozen=True, slots=True)
-class Query:
-    """Keypoints of a picture to localise."""
-
-    features: Features
-    bearings: np.ndarray  # (K, 3) unit, corrected directions of the keypoints, rig frame
-    origins_rig: np.ndarray | None  # (K, 3) origins of their rays; None = the centre
-    strongest: Searchable  # prepared for matching
-    all: Searchable
-
-
 class Localizer:
     """Localises pictures of the run's cameras; open it once, then localise one after the other.
 
@@ -121,11 +106,17 @@ class Localizer:
         camera_of: str | None = None,
     ) -> None:
         self.map = RunMap.open(Path(run), map_number)
-        self.index: PlaceIndex = open_index(self.map)
+        self.index = open_index(self.map)
         self.extractor = self.map.make_extractor()
         self.cameras = PictureCameras.of(self.map.root, self.map.frames, camera_of)
         self._precise = precise
-        self._rigs = [_rig_for(kind, self.map.settings) for kind in self.map.frames.formats]
+        self.surroundings = Surroundings(self.map)
+        rigs = [_rig_for(kind, self.map.settings) for kind in self.map.frames.formats]
+        self.usual = open_rates(self.surroundings, rigs, self._extract, self._query)
+        self._rigs = [
+            CubeRig(size, rig.hfov_rad)
+            for size, rig in zip(self.usual.face_px.tolist(), rigs, strict=True)
+        ]
         self.aligner = PatchAligner(self.map)
 
     def localize(self, image: Path | str | np.ndarray, name: str = "") -> LocalizedFrame:
@@ -167,15 +158,18 @@ class Localizer:
         name = frames.names[frame]
         if camera is None:
             camera = self.cameras.of_frames(frames.format_of(frame), name)
-        rig = self._rigs[camera]
-        images, masks = cubemap.load(without_correction(frames), frame, rig)
-        features = extract(images, masks, rig, self.extractor)
+        features = self._extract(frames, frame, self._rigs[camera])
         raw, width = without_correction(frames), self.aligner.width
 
         def grey() -> Grey:
             return load_grey(raw, frame, width)
 
         return self._localize_features(name, features, grey, camera)
+
+    def _extract(self, frames: FrameSet, frame: int, rig: CubeRig) -> Features:
+        """Keypoints of a frame as its picture shows it, on faces of a rig."""
+        images, masks = cubemap.load(without_correction(frames), frame, rig)
+        return extract(images, masks, rig, self.extractor)
 
     def _localize_panorama(self, erp: np.ndarray, name: str, camera: int) -> LocalizedFrame:
         """Pose of a panorama (H, 2H, 3) of a camera."""
@@ -197,27 +191,58 @@ class Localizer:
     def _localize_features(
         self, name: str, features: Features, load: Callable[[], Grey], camera: int
     ) -> LocalizedFrame:
-        query = self._query(features, camera)
-        start, reason = self._recognise(query)
-        if start is None:
-            return LocalizedFrame.refused(name, reason)
-        world_T_rig, fitted, seen = start.world_T_rig, None, None
-        for gate, scales in ((_WIDE_GATE_RAD, COARSE), (_NARROW_GATE_RAD, FINE)):
-            candidates = self.candidates_around(query, world_T_rig, gate)
-            if len(candidates) < _MIN_POINTS:
-                return LocalizedFrame.refused(name, NO_PLACE)
-            seen = self._sightings(query, candidates)
-            fitted = fit([seen], world_T_rig[None], scales)
-            world_T_rig = fitted.world_T_rigs[0]
-        assert fitted is not None and seen is not None
-        found = self._judged(name, fitted, seen, candidates)
+        query = self._query(features, camera, self._rigs[camera])
+        found = self._recognise(name, query, camera)
         if self._precise and found.found:
             found = self._on_patches(found, load, camera)
         return self.with_map_error(found) if found.found else found
 
+    def _recognise(self, name: str, query: Query, camera: int) -> LocalizedFrame:
+        """A camera's frame at the place that explains it best of those that look like it."""
+        settings, reason = self.map.settings, NO_PLACE
+        places = self.index.nearest_panoramas(query.all.descriptors, _NUM_MORE_PLACES)
+        max_error = np.deg2rad(settings.verify.max_error_deg)
+        frames, poses = list[LocalizedFrame](), list[PlacedPose]()
+        for strongest, chosen in ((True, places[:_NUM_PLACES]), (False, places)):
+            candidates = self.candidates_of(query, chosen, strongest)
+            for start in search_poses(candidates, max_error, settings.seed, _NUM_POSES):
+                frame, placed = self._placed(name, query, start.world_T_rig, camera)
+                if placed is None:
+                    reason = frame.reason
+                    continue
+                frames.append(frame)
+                poses.append(placed)
+            if poses:
+                best, reason = best_of(poses)
+                if not reason:
+                    return frames[best]
+        return LocalizedFrame.refused(name, reason)
+
+    def _placed(
+        self, name: str, query: Query, world_T_rig: np.ndarray, camera: int
+    ) -> tuple[LocalizedFrame, PlacedPose | None]:
+        """A camera's frame fitted to the points around a pose; None if they do not determine it."""
+        fitted, seen, candidates = None, None, None
+        for gate, scales in ((_WIDE_GATE_RAD, COARSE), (_NARROW_GATE_RAD, FINE)):
+            candidates = self.candidates_around(query, world_T_rig, gate)
+            if len(candidates) < _MIN_POINTS:
+                return LocalizedFrame.refused(name, NO_PLACE), None
+            seen = self._sightings(query, candidates)
+            fitted = fit([seen], world_T_rig[None], scales)
+            world_T_rig = fitted.world_T_rigs[0]
+        assert fitted is not None and seen is not None and candidates is not None
+        frame = self._judged(name, fitted, seen, candidates)
+        if not frame.found:
+            return frame, None
+        usual = self.usual.of_camera(camera)
+        evidence = self.surroundings.evidence(query, world_T_rig, usual)
+        agreeing = candidates.taken(fitted.inliers[0])
+        given = world_T_rig, agreeing.points_world, agreeing.bearings, evidence
+        return frame, PlacedPose.of(*given)
+
     def with_map_error(self, frame: LocalizedFrame) -> LocalizedFrame:
         """The frame with the uncertainty of the map around it, which its nearest keyframe has."""
-        nearest, result = int(self.nearest_keyframes(frame.world_T_rig)[0]), self.map.result
+        nearest, result = int(self.map.nearest(frame.world_T_rig, 1)[0]), self.map.result
         uncertain = result.pose_covariances[nearest]
         if not np.isfinite(uncertain).all():
             return frame
@@ -232,7 +257,7 @@ class Localizer:
         grey, mask = load()
         image, lenses = SphereImage.of(grey, smooth=True), self._own_lenses(camera)
         field = self.map.fields[camera]
-        places = self.nearest_keyframes(frame.world_T_rig)
+        places = self.map.nearest(frame.world_T_rig, NUM_NEAREST)
         expected = self.aligner.expected(frame.world_T_rig, places)
         found = self.aligner.align(expected, frame.world_T_rig, image, mask, field, lenses)
         if len(found.points) < _MIN_POINTS:
@@ -265,10 +290,11 @@ class Localizer:
             return ONE_CENTRE
         return replace(lenses, readout_motion=None)
 
-    def _query(self, features: Features, camera: int) -> Query:
-        """Keypoints of a camera's picture, ready to be matched, where they really point."""
+    def _query(self, features: Features, camera: int, rig: CubeRig) -> Query:
+        """Keypoints of a camera's picture on faces of a rig, ready to be matched, where they
+        really point."""
         map_ = self.map
-        seen: Keypoints = corrected(gather([features]), map_.fields[camera], self._rigs[camera])
+        seen: Keypoints = corrected(gather([features]), map_.fields[camera], rig)
         origins = None
         if lenses := self._own_lenses(camera):
             seen = Cameras((lenses,)).seen(seen)
@@ -279,25 +305,6 @@ class Localizer:
         strongest = map_.settings.pairs.strongest_per_face
         few, every = searchable(features, map_.axes, strongest), searchable(ready, map_.axes)
         return Query(features, seen.bearings_rig, origins, few, every)
-
-    def _recognise(self, query: Query) -> tuple[FoundPose | None, str]:
-        """A first pose by the places that look most like a frame; or None, and the reason."""
-        settings, reason = self.map.settings, NO_PLACE
-        descriptors = query.all.descriptors
-        places = self.index.nearest_panoramas(descriptors, _NUM_MORE_PLACES)
-        max_error = np.deg2rad(settings.verify.max_error_deg)
-        for strongest, chosen in ((True, places[:_NUM_PLACES]), (False, places)):
-            candidates = self.candidates_of(query, chosen, strongest)
-            found = search_pose(candidates, max_error, settings.seed)
-            chance = (1 - np.cos(max_error)) / 2  # a disc's share of the sphere
-            if found is None or not is_significant(candidates.bearings, found.inliers, chance):
-                continue
-            left = candidates.taken(~found.inliers)
-            rival = search_pose(left, max_error, settings.seed, least_of_rival(found))
-            if not is_rivalled(found, rival, candidates):
-                return found, ""
-            reason = TWO_PLACES
-        return None, reason
 
     def candidates_of(self, query: Query, places: np.ndarray, strongest: bool) -> Candidates:
         """Points of keyframes (N,) that look like keypoints, wherever they are."""
@@ -326,7 +333,7 @@ class Localizer:
             gate_rad: around the prediction.
             recognised: (N,) keyframes whose points are searched, too; None = no others.
         """
-        poses, places = self.map.result.world_T_rigs, self.nearest_keyframes(world_T_rig)
+        poses, places = self.map.result.world_T_rigs, self.map.nearest(world_T_rig, NUM_NEAREST)
         if recognised is not None:
             places = np.union1d(places, recognised)
         gate, chosen = Gate.around_points(gate_rad), self.map.settings.matching
@@ -385,13 +392,7 @@ class Localizer:
 
     def nearest_keyframe(self, world_T_rig: np.ndarray) -> str:
         """Name of the keyframe nearest to a pose (4, 4)."""
-        return self.map.frames.names[int(self.nearest_keyframes(world_T_rig)[0])]
-
-    def nearest_keyframes(self, world_T_rig: np.ndarray) -> np.ndarray:
-        """The keyframes (N,) nearest to a pose (4, 4), the nearest first."""
-        positions = self.map.result.world_T_rigs[:, :3, 3]
-        distances = np.linalg.norm(positions - world_T_rig[:3, 3], axis=1)
-        return np.argsort(distances, kind="stable")[:_NUM_NEAREST]
+        return self.map.frames.names[int(self.map.nearest(world_T_rig, 1)[0])]
 
 
 def _rig_for(kind: PictureFormat, settings: RefineSettings) -> CubeRig:

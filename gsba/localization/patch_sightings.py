@@ -9,8 +9,9 @@ from factors.patches import PatchSet, expect
 from factors.sphere_field import SphereField
 from factors.sphere_image import SphereImage
 from gsba.camera.lens import Lenses
-from gsba.camera.projections import Projection
+from gsba.camera.projections import PerspectiveProjection
 from gsba.frames.panorama import Greys
+from gsba.localization.photos import shows
 from gsba.localization.run_map import RunMap, without_correction
 from gsba.photometric.alignment import REJECTIONS, accepted_rows
 from gsba.photometric.frame_jobs import align_to, cut
@@ -26,15 +27,11 @@ class Expected:
     hosts: np.ndarray  # (N,) int64, frame of the map with the most similar view of each
 
     def shown_by(
-        self, projection: Projection, world_T_camera: np.ndarray, map_: RunMap
+        self, projection: PerspectiveProjection, world_T_camera: np.ndarray, map_: RunMap
     ) -> "Expected":
         """Those of the points that lie in a photo taken from a pose (4, 4)."""
         points = map_.result.points_world[self.points]
-        local = (points - world_T_camera[:3, 3]) @ world_T_camera[:3, :3]
-        ahead = local[:, 2] > 0
-        pixels = projection.project(np.where(ahead[:, None], local, [0.0, 0.0, 1.0]))
-        size = np.array([projection.width, projection.height])
-        shown = ahead & (pixels > 0).all(axis=1) & (pixels < size).all(axis=1)
+        shown = shows(projection, (points - world_T_camera[:3, 3]) @ world_T_camera[:3, :3])
         return Expected(self.points[shown], self.hosts[shown])
 
 

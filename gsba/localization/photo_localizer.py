@@ -15,13 +15,12 @@ from gsba.localization.known_points import Sightings
 from gsba.localization.localizer import (
     NO_PLACE,
     NOT_DETERMINED,
-    TWO_PLACES,
+    NUM_NEAREST,
     LocalizedFrame,
     Localizer,
-    Query,
     typical_sigma,
 )
-from gsba.localization.photos import Photo, as_panorama, photo_features, photo_rig
+from gsba.localization.photos import Photo, as_panorama, photo_features, photo_rig, shows
 from gsba.localization.pose_fit import (
     COARSE,
     FINE,
@@ -38,7 +37,11 @@ from gsba.localization.pose_search import (
     least_of_rival,
     search_focal,
 )
+from gsba.localization.query import Query
+from gsba.localization.rival_poses import LOOK_ALIKE, TWO_PLACES
+from gsba.localization.surroundings import is_contradicted
 from gsba.log import GsbaError, track
+from gsba.loop_closure.join_evidence import JoinEvidence
 from gsba.matching.guided_search import searchable
 from gsba.types import Features
 
@@ -86,6 +89,7 @@ class _Placed:
     projection: PerspectiveProjection
     seen: Sightings  # points that it shows, camera 0
     num_inliers: int
+    evidence: JoinEvidence  # for and against its pose
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +147,9 @@ def _place(localizer: Localizer, photo: Photo) -> _Placed | str:
         found = _refine(localizer, photo, image, start)
         if found is not None and (best is None or found.num_inliers > best.num_inliers):
             best = found
-    return best or reason
+    if best is None:
+        return reason
+    return LOOK_ALIKE if is_contradicted(best.evidence) else best
 
 
 def _refine(
@@ -178,8 +184,11 @@ def _refine(
     given = candidates.bearings, fitted.inliers[0], chance  # no sample of them chose the pose
     if not is_significant(*given, sample=0, per_side=_CELLS_PER_SIDE):
         return None
+    evidence = localizer.surroundings.evidence(
+        query, pose, localizer.usual.of_photos, lambda points: shows(projection, points)
+    )
     inliers = int(fitted.inliers[0].sum())
-    return _Placed(photo, image, pose, projection, seen, inliers)
+    return _Placed(photo, image, pose, projection, seen, inliers, evidence)
 
 
 def _plausible(projection: PerspectiveProjection) -> bool:
@@ -321,7 +330,7 @@ def _on_patches(
     """Points that patches find in a photo; the sightings before if they are too few."""
     aligner, map_ = localizer.aligner, localizer.map
     grey, mask = as_panorama(placed.image, projection, aligner.width)
-    places = localizer.nearest_keyframes(world_T_camera)
+    places = localizer.map.nearest(world_T_camera, NUM_NEAREST)
     expected = aligner.expected(world_T_camera, places).shown_by(projection, world_T_camera, map_)
     image = SphereImage.of(grey, smooth=True)
     nothing = SphereField.none(), ONE_CENTRE  # of a photo

@@ -12,6 +12,7 @@ from gsba.camera.sphere import bearings_from_erp
 from gsba.features.detection import Extractor, extract
 from gsba.frames.exif import read_exif
 from gsba.frames.files import decode, image_size
+from gsba.geometry import unit
 from gsba.log import GsbaError
 from gsba.types import FACES, Features
 
@@ -142,6 +143,11 @@ def as_panorama(
             found = slice(top, top + len(rows))
             out[found], mask[found] = _sampled(grey, scales, pixels), inside
     return out, mask
+
+
+def shows(projection: PerspectiveProjection, points: np.ndarray) -> np.ndarray:
+    """True (N,) for points (N, 3) of a photo's frame that lie within it."""
+    return _pixels_of(unit(points), projection)[1]
 
 
 def _pixels_of(

@@ -1,8 +1,10 @@
 """Index of a map's places: global descriptors of keyframes and their faces, kept beside the run."""
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -19,6 +21,8 @@ from gsba.types import FACES
 from gsba.version import __version__
 
 logger = logging.getLogger(__name__)
+
+T = TypeVar("T")
 
 _LEVELS = 127  # of a component of a stored descriptor, to either side of zero
 _MIN_ROWS = 8  # keypoints without which a face has no descriptor
@@ -49,17 +53,22 @@ class PlaceIndex:
 
 def open_index(map_: RunMap) -> PlaceIndex:
     """The index of a map: the one kept beside the run if it is the run's, else made and kept."""
-    path = index_path(map_.root)
+    return kept(map_, index_path(map_.root), PlaceIndex, lambda: _make(map_))
+
+
+def kept(map_: RunMap, path: Path, kind: type[T], make: Callable[[], T]) -> T:
+    """What is known of a map from its run alone: the record of a kind that is kept beside the run
+    in a file if it is the run's, else made and kept there."""
     key = _key(map_)
-    found = load_checkpoint(path, key, PlaceIndex, "the map is indexed again")
+    found = load_checkpoint(path, key, kind, "the map is indexed again")
     if found is not None:
         return found
-    index = _make(map_)
+    made = make()
     try:
-        save_record(path, index, {"key": key})
+        save_record(path, made, {"key": key})
     except GsbaError as error:
         logger.warning("the index of the map is not kept: %s", error)
-    return index
+    return made
 
 
 def index_path(root: Path) -> Path:

@@ -14,9 +14,10 @@ if TYPE_CHECKING:
     import pycolmap
 
 _MIN_RATIO = 0.02  # least inlier ratio that the number of trials allows for
-_CELLS_PER_SIDE = 16  # along a face's side: keypoints within one, 6 degrees, are one witness
+CELLS_PER_SIDE = 16  # along a face's side: keypoints within one, 6 degrees, are one witness
 _MAX_FALSE_ALARMS = 1e-6  # expected number of poses that chance explains as well as an accepted one
 _MIN_WITNESSES = 10  # fewer may be of one moving object
+_MIN_SHARE = 0.25  # of the first pose's inliers, that further poses must have
 _MIN_RIVAL_RATIO = 1.5  # ratio by which a pose must outweigh the best one at another place
 _RIVAL_DISTANCE = 0.3  # distance of another place, in median depths or radians
 
@@ -55,6 +56,27 @@ def search_pose(
     return panorama_pose(*given, max_error_rad, seed, least, _MIN_RATIO)
 
 
+def search_poses(
+    candidates: Candidates, max_error_rad: float, seed: int, most: int
+) -> list[FoundPose]:
+    """Significant poses of a panorama, each of the candidates that those before leave over.
+
+    Args:
+        candidates, max_error_rad, seed: see `search_pose`.
+        most: number of poses.
+    """
+    found, least = list[FoundPose](), _MIN_WITNESSES
+    chance = (1 - np.cos(max_error_rad)) / 2  # a disc's share of the sphere
+    while len(found) < most:
+        one = search_pose(candidates, max_error_rad, seed, least)
+        if one is None or not is_significant(candidates.bearings, one.inliers, chance):
+            break
+        least = max(least, int(_MIN_SHARE * one.inliers.sum()))
+        found.append(one)
+        candidates = candidates.taken(~one.inliers)
+    return found
+
+
 def search_focal(
     pixels: np.ndarray,
     points_world: np.ndarray,
@@ -84,7 +106,7 @@ def is_significant(
     inliers: np.ndarray,
     chance: float,
     sample: int = 3,
-    per_side: int = _CELLS_PER_SIDE,
+    per_side: int = CELLS_PER_SIDE,
 ) -> bool:
     """True if chance does not explain a pose's inliers, counted in independent witnesses.
 
@@ -121,6 +143,11 @@ def is_rivalled(found: FoundPose, rival: FoundPose | None, candidates: Candidate
         return False
     offsets = candidates.points_world[found.inliers] - found.world_T_rig[:3, 3]
     depth = float(np.median(np.linalg.norm(offsets, axis=1)))
-    moved = inverse(found.world_T_rig) @ rival.world_T_rig
+    return are_apart(found.world_T_rig, rival.world_T_rig, depth)
+
+
+def are_apart(one: np.ndarray, other: np.ndarray, depth: float) -> bool:
+    """True if two poses (4, 4) are of different places, for points at a median depth."""
+    moved = inverse(one) @ other
     turned = float(rotation_angle(moved[:3, :3]))
     return max(float(np.linalg.norm(moved[:3, 3])) / depth, turned) > _RIVAL_DISTANCE

@@ -61,6 +61,8 @@ class RunMap:
     rig: CubeRig  # faces on which keypoints of the first camera's frames are found
     point_covariances: np.ndarray  # (J, 3, 3) float64, map units^2, of points given the poses
     axes: np.ndarray  # (D, D) float32, axes of descriptors, see `searchable`
+    load_features: Callable[[int], Features]  # keypoints of a frame, by its number, as they are
+    # found in a picture without a closer look
     load_keyframe: Callable[[int], Keyframe]  # by the number of the frame; recent ones are kept
 
     @classmethod
@@ -84,7 +86,7 @@ class RunMap:
         settings = load_config(root / "config.toml")
         cameras = load_cameras(root, result, frames, map_number)
         rig = cubemap.rig_for(frames.formats[0], settings.cubemap)
-        reader = _KeypointReader(root, frames, settings)
+        reader = _KeypointReader(root, frames, settings, ("features_closer", "features"))
         first = reader(0).descriptors
         if not len(first):
             raise GsbaError(f"{root}: its first frame has no keypoints: refine again with --fresh")
@@ -100,7 +102,15 @@ class RunMap:
 
         load = lru_cache(_NUM_KEPT)(keyframe)
         covariances = point_covariances(result)
-        return cls(root, frames, result, cameras, fields, settings, rig, covariances, axes, load)
+        first_look = replace(reader, stages=("features",))
+        known = rig, covariances, axes
+        return cls(root, frames, result, cameras, fields, settings, *known, first_look, load)
+
+    def nearest(self, world_T_rig: np.ndarray, most: int) -> np.ndarray:
+        """The keyframes (N,) nearest to a pose (4, 4), the nearest first."""
+        positions = self.result.world_T_rigs[:, :3, 3]
+        distances = np.linalg.norm(positions - world_T_rig[:3, 3], axis=1)
+        return np.argsort(distances, kind="stable")[:most]
 
     def shown(self, directions: np.ndarray, frames: np.ndarray) -> np.ndarray:
         """Directions (N, 3) in which pictures of frames (N,) show unit directions (N, 3)."""
@@ -144,10 +154,11 @@ class _KeypointReader:
     root: Path
     frames: FrameSet
     settings: RefineSettings
+    stages: tuple[str, ...]  # that may have stored them, the first that has is read
 
     def __call__(self, frame: int) -> Features:
         name = self.frames.names[frame]
-        for stage in ("features_closer", "features"):
+        for stage in self.stages:
             path = self.root / STAGES / stage / f"{name}.npz"
             if path.is_file():
                 try:

@@ -28,10 +28,10 @@ _MAX_DISTANCE_DEPTHS = 2.0  # largest distance of two compared frames, local dep
 _NUM_NEAREST = 3  # nearest frames that each frame is compared with
 _MAX_PAIRS = 150  # largest number of compared pairs of frames
 _TRIANGULATION_GAP = 2  # largest gap in frames between matches that make points
-_GATE_RAD = np.deg2rad(4.0)  # radius around a point's predicted bearing
+GATE_RAD = np.deg2rad(4.0)  # radius around a point's predicted bearing
 _PLACE_RAD = np.deg2rad(0.7)  # radius in which most true matches lie; chance, and things that only
 # stand at similar places, spread them over the gate
-_BESIDE = -(_PLACE_RAD**2) / (_GATE_RAD**2 - _PLACE_RAD**2)  # worth of a match outside this radius:
+_BESIDE = -(_PLACE_RAD**2) / (GATE_RAD**2 - _PLACE_RAD**2)  # worth of a match outside this radius:
 # matches by chance cancel
 # Chord around the predicted bearing within which a frame must know a surface.
 _SURFACE_CHORD = 2 * np.sin(np.deg2rad(6.0) / 2)
@@ -40,7 +40,7 @@ _MAX_SURFACE_RATIO = 1.25  # largest ratio of the distances of a surface and of 
 # Edges of bins of the angle between two views.
 _ANGLE_EDGES_RAD = np.deg2rad([6.0, 12.0, 20.0, 30.0, 45.0])
 _LOG_RATIO_EDGES = np.log([1.15, 1.35, 1.7])  # edges of bins of the ratio of distances
-_NUM_BINS = (len(_ANGLE_EDGES_RAD) + 1) * (len(_LOG_RATIO_EDGES) + 1)
+NUM_BINS = (len(_ANGLE_EDGES_RAD) + 1) * (len(_LOG_RATIO_EDGES) + 1)
 _PRIOR_COUNT = 20.0  # prior count of points in each bin, found at the mean rate of all bins
 _DEFAULT_RATE = 0.3  # rate assumed if no two frames of one part can be compared
 # Rotation about the vertical after which predictions are found by chance only.
@@ -58,7 +58,7 @@ _LOOK_ALIKE_STRANGE = 0.2
 _MIN_SEEN_SHARE = 0.15  # of what is expected in a region at its place: less is next to nothing
 _MIN_EXPECTED = 2.0  # points that a region must be expected to show at their places
 _NUM_SIGMAS = 3.09  # standard deviations of a one-sided error rate of 1e-3
-_NUM_SIGMAS_LIKELY = 1.64  # of 5 %
+NUM_SIGMAS_LIKELY = 1.64  # of 5 %
 _ABSENT_SHARE = 0.1  # share that counts as nothing found
 
 
@@ -88,6 +88,17 @@ class Predictions:
     bins: np.ndarray  # (V,) int64, bin of the change of view
     off_rad: np.ndarray  # (V,) float64, angle from the prediction to the keypoint that matches
     # there; NaN = none does
+
+    @classmethod
+    def joined(cls, parts: Sequence["Predictions"]) -> "Predictions":
+        """All of several."""
+        nothing = cls(np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros(0))
+        every = (nothing, *parts)
+        return cls(
+            np.concatenate([part.points_world for part in every]),
+            np.concatenate([part.bins for part in every]),
+            np.concatenate([part.off_rad for part in every]),
+        )
 
     @property
     def found(self) -> np.ndarray:
@@ -149,7 +160,7 @@ class JoinEvidence:
     @property
     def likely(self) -> bool:
         """`confirmed` at a one-sided error rate of 5 % of each share."""
-        return self.margin(_NUM_SIGMAS_LIKELY) > 0 and self.strange < _LOOK_ALIKE_STRANGE
+        return self.margin(NUM_SIGMAS_LIKELY) > 0 and self.strange < _LOOK_ALIKE_STRANGE
 
     @property
     def refuted(self) -> bool:
@@ -188,18 +199,31 @@ def rates(
     pairs = np.concatenate([nearest_pairs(places, some, some) for some in rows])
     pairs = pairs[np.linspace(0, len(pairs) - 1, min(len(pairs), _MAX_PAIRS)).astype(int)]
     seen = predict(context, places, pairs, surfaces)[0]
-    numbers = np.bincount(seen.bins, None, _NUM_BINS)
+    poses, odd = places.world_T_rigs.copy(), np.arange(len(parts)) % 2 == 1
+    poses[odd] = turned_away(poses[odd])
+    turned = pairs[odd[pairs[:, 0]] != odd[pairs[:, 1]]]
+    away = predict(context, replace(places, world_T_rigs=poses), turned, surfaces)[0]
+    return rates_of(seen, away)
+
+
+def turned_away(world_T_rigs: np.ndarray) -> np.ndarray:
+    """Poses (..., 4, 4) turned about the rig's vertical, so that predictions are found by chance
+    only."""
+    cosine, sine = np.cos(_CHANCE_ROTATION_RAD), np.sin(_CHANCE_ROTATION_RAD)
+    poses = world_T_rigs.copy()
+    poses[..., :3, :3] = poses[..., :3, :3] @ [[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]]
+    return poses
+
+
+def rates_of(seen: Predictions, away: Predictions) -> Rates:
+    """Rates of predictions at true poses, and of others at poses that are `turned_away`."""
+    numbers = np.bincount(seen.bins, None, NUM_BINS)
 
     def by_change_of_view(worth: np.ndarray) -> np.ndarray:
-        hits = np.bincount(seen.bins, worth, _NUM_BINS)
+        hits = np.bincount(seen.bins, worth, NUM_BINS)
         mean = (hits.sum() + _PRIOR_COUNT * _DEFAULT_RATE) / (numbers.sum() + _PRIOR_COUNT)
         return (hits + _PRIOR_COUNT * mean) / (numbers + _PRIOR_COUNT)
 
-    poses, odd = places.world_T_rigs.copy(), np.arange(len(parts)) % 2 == 1
-    cosine, sine = np.cos(_CHANCE_ROTATION_RAD), np.sin(_CHANCE_ROTATION_RAD)
-    poses[odd, :3, :3] = poses[odd, :3, :3] @ [[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]]
-    turned = pairs[odd[pairs[:, 0]] != odd[pairs[:, 1]]]
-    away = predict(context, replace(places, world_T_rigs=poses), turned, surfaces)[0]
     chance = float(away.found.mean()) if len(away.found) else 0.0
     return Rates(by_change_of_view(seen.found), chance, by_change_of_view(seen.placed))
 
@@ -328,25 +352,28 @@ def predict(
     Returns:
         Predictions, and the matches that were found.
     """
-    gates = [Gate.around_points(_GATE_RAD)] * len(pairs)
+    gates = [Gate.around_points(GATE_RAD)] * len(pairs)
     found = context.match(pairs, places.world_T_rigs, gates, places.known, guided_only=True)
     seen = context.keypoints.bearings_of
     parts = [
-        _predicted(places, f, g, found.of(p), seen(g), surfaces)
+        predicted(places, f, g, found.of(p), seen(g), surfaces)
         for p, (f, g) in enumerate(pairs.tolist())
     ]
-    points, bins, off = (
-        np.concatenate([empty, *(part[n] for part in parts)])
-        for n, empty in enumerate((np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros(0)))
-    )
-    return Predictions(points, bins, off), found
+    return Predictions.joined(parts), found
 
 
-def _predicted(
+def predicted(
     places: Places, f: int, g: int, matched: np.ndarray, bearings: np.ndarray, surfaces: bool
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Predictions of one pair: points (V, 3) in the world, bins (V,) of change of view, and the
-    angle (V,) to the keypoint of g, of those seen along bearings (K, 3), that is matched."""
+) -> Predictions:
+    """Points of frame f, predicted in frame g.
+
+    Args:
+        places: frames and points.
+        f, g: numbers of the frames.
+        matched: (M, 2) keypoints of f and of g that match near a prediction.
+        bearings: (K, 3) unit, rig frame of g, of its keypoints.
+        surfaces: see `predict`.
+    """
     rows = np.flatnonzero(np.isfinite(places.known[f]).all(axis=1))
     own, g_T_f = places.known[f][rows], inverse(places.world_T_rigs[g]) @ places.world_T_rigs[f]
     there = own @ g_T_f[:3, :3].T + g_T_f[:3, 3]
@@ -363,7 +390,7 @@ def _predicted(
     seen = np.full((len(places.known[f]), 3), np.nan)
     seen[matched[:, 0]] = bearings[matched[:, 1]]
     off = angles_between(seen[rows], there)
-    return points, angles * (len(_LOG_RATIO_EDGES) + 1) + ratios, off
+    return Predictions(points, angles * (len(_LOG_RATIO_EDGES) + 1) + ratios, off)
 
 
 def _on_surface(known: np.ndarray, directions: np.ndarray, distances: np.ndarray) -> np.ndarray:

@@ -1,0 +1,69 @@
+"""The choice among poses of a picture at several places that look like it.
+
+In a hall whose bays repeat, the matches with the map agree on one pose for each bay. Fitted to all
+that the map has around each, the true one shows what is expected around, and explains keypoints
+that the others leave: what does not repeat.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsba.camera.rig import cells_of
+from gsba.localization.pose_search import CELLS_PER_SIDE, are_apart
+from gsba.localization.surroundings import is_look_alike
+from gsba.loop_closure.join_evidence import JoinEvidence
+
+_NUM_SIGMAS = 3.09  # of a sign test, one-sided error rate of 1e-3
+
+TWO_PLACES = "two places of the map look like it"
+LOOK_ALIKE = "the place that it looks like shows other things around"
+
+
+@dataclass(frozen=True, slots=True)
+class PlacedPose:
+    """A pose fitted to the points around it."""
+
+    world_T_rig: np.ndarray  # (4, 4)
+    depth: float  # median distance of the points that agree, map units
+    cells: np.ndarray  # (N,) int64, ascending, cells of the sphere with keypoints that agree
+    evidence: JoinEvidence  # of its surroundings
+
+    @classmethod
+    def of(
+        cls,
+        world_T_rig: np.ndarray,
+        points_world: np.ndarray,
+        bearings: np.ndarray,
+        evidence: JoinEvidence,
+    ) -> "PlacedPose":
+        """A pose, the points (N, 3) that agree with it, and their keypoints' bearings (N, 3)."""
+        depth = float(np.median(np.linalg.norm(points_world - world_T_rig[:3, 3], axis=1)))
+        return cls(world_T_rig, depth, np.unique(cells_of(bearings, CELLS_PER_SIDE)), evidence)
+
+    def explains_more_than(self, other: "PlacedPose") -> bool:
+        """True if significantly more cells agree with this pose alone than with the other alone:
+        a sign test."""
+        common = len(np.intersect1d(self.cells, other.cells, assume_unique=True))
+        own, others = len(self.cells) - common, len(other.cells) - common
+        return own - others > _NUM_SIGMAS * np.sqrt(own + others)
+
+
+def best_of(poses: Sequence[PlacedPose]) -> tuple[int, str]:
+    """The pose that most cells agree with, and the reason why it is not accepted; "" = it is.
+
+    It must show its surroundings, and explain more than any other one that may show its own.
+
+    Args:
+        poses: at least one.
+    """
+    best = max(range(len(poses)), key=lambda n: len(poses[n].cells))
+    one = poses[best]
+    if not one.evidence.confirmed:
+        return best, LOOK_ALIKE
+    for other in poses:
+        apart = are_apart(one.world_T_rig, other.world_T_rig, one.depth)
+        if apart and not is_look_alike(other.evidence) and not one.explains_more_than(other):
+            return best, TWO_PLACES
+    return best, ""

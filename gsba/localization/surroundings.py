@@ -1,0 +1,204 @@
+"""What a picture shows of the surroundings that a map has at its pose: the test of that pose.
+
+Bays of a hall, both of its sides, and arches that repeat show enough of the same for a pose that
+many points agree on, with a tight covariance, where the picture was not taken. Of all that frames
+of the map around that pose know, a picture from there shows as much as frames of the map show of
+what the others know; at a look-alike it shows little, and nothing at all in some directions. See
+`gsba.loop_closure.join_evidence`, which tests joins of maps so.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsba.camera.rig import CubeRig
+from gsba.frames import cubemap
+from gsba.geometry import inverse
+from gsba.localization.place_index import index_path, kept
+from gsba.localization.query import Query
+from gsba.localization.run_map import RunMap
+from gsba.log import GsbaError
+from gsba.loop_closure.join_evidence import (
+    GATE_RAD,
+    NUM_SIGMAS_LIKELY,
+    JoinEvidence,
+    Places,
+    Predictions,
+    Rates,
+    evidence_of,
+    predicted,
+    rates_of,
+    turned_away,
+)
+from gsba.matching.guided_search import Gate, match_pair
+from gsba.types import Features, FrameSet
+
+_NUM_NEAREST = 6  # keyframes whose points are expected in a picture
+_NUM_MEASURED = 16  # frames of a camera whose pictures are compared with the map
+_MIN_OTHERS = 2  # observers without which a point is not of a map that lacks one of its frames
+# Share in regions that show next to nothing of what is expected there: at least .41 where places
+# look alike, at most .30 at true poses beyond the ends of a map.
+_LOOK_ALIKE_STRANGE = 0.35
+
+Shown = Callable[[np.ndarray], np.ndarray]  # True (N,) for points (N, 3) of the picture's frame
+# that lie within it
+
+
+@dataclass(frozen=True, slots=True)
+class PictureRates:
+    """Rates at which pictures show what a map expects, by camera; those of photos come last, as
+    faces of the first camera's frames show it."""
+
+    within: np.ndarray  # (C + 1, B) float64, see `Rates`
+    chance: np.ndarray  # (C + 1,) float64
+    placed: np.ndarray  # (C + 1, B) float64
+    face_px: np.ndarray  # (C,) int64, across the faces on which keypoints are to be found
+
+    def of_camera(self, camera: int) -> Rates:
+        """Rates of a camera's panoramas."""
+        return Rates(self.within[camera], float(self.chance[camera]), self.placed[camera])
+
+    @property
+    def of_photos(self) -> Rates:
+        """Rates of photos."""
+        return self.of_camera(len(self.face_px))
+
+
+class Surroundings:
+    """Points that a picture taken from some pose is expected to show."""
+
+    def __init__(self, map_: RunMap) -> None:
+        self.map = map_
+        num = len(map_.result.points_world)
+        self._num_observers = np.bincount(map_.result.observation_points, None, num)
+
+    def rates(self, frames: Sequence[int], seen: Sequence[Query]) -> Rates:
+        """Rates at which frames of the map show what the map without them would expect.
+
+        Args:
+            frames: numbers (N) of the frames.
+            seen: (N) their keypoints, found as those of the pictures to test.
+        """
+        poses = self.map.result.world_T_rigs
+        at, away = [], []
+        for frame, picture in zip(frames, seen, strict=True):
+            at.append(self._predictions(picture, poses[frame], frame))
+            away.append(self._predictions(picture, turned_away(poses[frame]), frame))
+        return rates_of(Predictions.joined(at), Predictions.joined(away))
+
+    def evidence(
+        self, seen: Query, world_T_rig: np.ndarray, usual: Rates, shown: Shown | None = None
+    ) -> JoinEvidence:
+        """Evidence for and against a pose.
+
+        Args:
+            seen: keypoints of the picture.
+            world_T_rig: (4, 4) its pose.
+            usual: rates for pictures of its kind.
+            shown: tells the points that lie within a picture with edges.
+        """
+        found = self._predictions(seen, world_T_rig, shown=shown)
+        if not len(found.bins):
+            return JoinEvidence(0.0, np.inf, 0)
+        depth = float(np.median(np.linalg.norm(found.points_world - world_T_rig[:3, 3], axis=1)))
+        return evidence_of(found, usual, depth)
+
+    def _predictions(
+        self,
+        seen: Query,
+        world_T_rig: np.ndarray,
+        left_out: int | None = None,
+        shown: Shown | None = None,
+    ) -> Predictions:
+        """Points of the nearest keyframes predicted in a picture. Without one of the frames the map
+        would lack points that fewer than `_MIN_OTHERS` others observe."""
+        map_ = self.map
+        result, num_observers = map_.result, self._num_observers
+        nearest = map_.nearest(world_T_rig, _NUM_NEAREST)
+        if left_out is not None:
+            nearest = map_.nearest(world_T_rig, _NUM_NEAREST + 1)
+            nearest = nearest[nearest != left_out]
+            num_observers = num_observers.copy()
+            num_observers[result.observation_points[result.observation_frames == left_out]] -= 1
+        of_map = num_observers >= _MIN_OTHERS
+        keyframes = [map_.load_keyframe(int(f)) for f in nearest]
+        points = np.unique(np.concatenate([keyframe.points for keyframe in keyframes]))
+        points = result.points_world[points[of_map[points]]]
+        around = (points - world_T_rig[:3, 3]) @ world_T_rig[:3, :3]
+        gate, chosen, found = Gate.around_points(GATE_RAD), map_.settings.matching, []
+        for f, keyframe in zip(nearest, keyframes, strict=True):
+            f_T_rig = inverse(result.world_T_rigs[f]) @ world_T_rig
+            own = keyframe.points_rig
+            expected = of_map[keyframe.points]
+            if shown is not None:
+                expected &= shown((own - f_T_rig[:3, 3]) @ f_T_rig[:3, :3])
+            matched = match_pair(keyframe.all, seen.all, f_T_rig, gate, chosen, own)
+            poses = np.array([result.world_T_rigs[f], world_T_rig])
+            places = Places(poses, [np.where(expected[:, None], own, np.nan), around])
+            found.append(predicted(places, 0, 1, matched, seen.bearings, surfaces=True))
+        return Predictions.joined(found)
+
+
+def open_rates(
+    surroundings: Surroundings,
+    rigs: Sequence[CubeRig],
+    extract: Callable[[FrameSet, int, CubeRig], Features],
+    query_of: Callable[[Features, int, CubeRig], Query],
+) -> PictureRates:
+    """Rates of a map: those kept beside the run if they are the run's, else measured and kept.
+
+    Where pictures of the run are gone, its stored keypoints are taken: on faces of the run's size.
+
+    Args:
+        surroundings: of the map.
+        rigs: (C) faces on which keypoints of each camera's panoramas are found, if they can be.
+        extract: finds keypoints of a frame.
+        query_of: prepares keypoints of a camera's frame.
+    """
+    map_ = surroundings.map
+
+    def rates_of_camera(camera: int) -> tuple[Rates, Rates, int]:
+        """Rates of a camera's panoramas, of photos by its frames, and pixels across faces."""
+        frames, rig = _some(np.flatnonzero(map_.frames.cameras == camera)), rigs[camera]
+        own = cubemap.rig_for(map_.frames.formats[camera], map_.settings.cubemap)
+        stored = [query_of(map_.load_features(f), camera, own) for f in frames]
+        as_stored = surroundings.rates(frames, stored)
+        if rig == own:
+            return as_stored, as_stored, own.size
+        try:
+            found = [query_of(extract(map_.frames, f, rig), camera, rig) for f in frames]
+        except GsbaError:
+            return as_stored, as_stored, own.size
+        return surroundings.rates(frames, found), as_stored, rig.size
+
+    def measure() -> PictureRates:
+        panoramas, photos, face_px = zip(*map(rates_of_camera, range(len(rigs))), strict=True)
+        rows = *panoramas, photos[0]
+        return PictureRates(
+            np.array([row.within for row in rows]),
+            np.array([row.chance for row in rows]),
+            np.array([row.placed for row in rows]),
+            np.array(face_px, np.int64),
+        )
+
+    return kept(map_, index_path(map_.root).with_name("rates.npz"), PictureRates, measure)
+
+
+def _some(frames: np.ndarray) -> list[int]:
+    """At most `_NUM_MEASURED` of the frames (N,), evenly."""
+    chosen = np.linspace(0, len(frames) - 1, min(len(frames), _NUM_MEASURED)).astype(int)
+    return [int(f) for f in frames[chosen]]
+
+
+def is_look_alike(evidence: JoinEvidence) -> bool:
+    """True unless a panorama shows significantly more than where places look alike, and hardly a
+    direction is strange."""
+    margin = evidence.margin(NUM_SIGMAS_LIKELY)
+    return not (margin > 0 and evidence.strange < _LOOK_ALIKE_STRANGE)
+
+
+def is_contradicted(evidence: JoinEvidence) -> bool:
+    """True if a photo shows significantly less than it would at its pose, or a part of it is
+    strange. One that shows nothing but what repeats elsewhere cannot be told from a look-alike."""
+    return evidence.refuted or evidence.strange >= _LOOK_ALIKE_STRANGE
