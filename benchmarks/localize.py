@@ -2,6 +2,7 @@
 
     python -m benchmarks.localize [--work DIR] [--markdown benchmarks/results/localize.md]
     python -m benchmarks.localize --large RUN WALK [--lanes 8] [--work DIR]
+    python -m benchmarks.localize --repeated WALK... [--work DIR]
 
 A walk through the demo's gallery is rendered, and every fourth frame is held out. The others are
 refined; frames held out and photos rendered at new places are then localised in that run. Photos
@@ -13,6 +14,10 @@ covariances are right.
 
 `--large`: WALK is of `benchmarks.streets`, RUN its refined poses. Frames rendered halfway between
 some of its frames are localised, and carried to the truth by the frames around each.
+
+`--repeated`: walks through halls whose bays repeat. The map is of the first third of a walk without
+every fourth frame; these and the frames beyond that third are localised. Right: nearer to the truth
+than a quarter of a step.
 """
 
 import argparse
@@ -50,6 +55,7 @@ FIELDS = (40, 50, 60, 68, 75, 90, 110, 120)  # degrees, of a photo's longer side
 SIZES = ((960, 720), (720, 960))  # landscape, portrait
 SHARED = ((60, (960, 720)), (75, (720, 960)), (100, (960, 720)))  # cameras that photos share
 PHOTOS_OF_EACH = 4
+REPEATED = ["walk", "frames", "right", "elsewhere", "refused", "CPU s each"]
 BETWEEN, AROUND = 20, 10  # frames rendered between those of a large map; frames around each
 
 
@@ -83,7 +89,12 @@ def main() -> None:
     parser.add_argument("--markdown", type=Path)
     parser.add_argument("--large", type=Path, nargs=2, metavar=("RUN", "WALK"))
     parser.add_argument("--lanes", type=int, default=8, help="of WALK")
+    parser.add_argument("--repeated", type=Path, nargs="+", metavar="WALK")
     options = parser.parse_args()
+    if options.repeated is not None:
+        rows = [row for walk in options.repeated for row in _repeated(walk, options.work)]
+        print(_lines([REPEATED, ["---", "---", *["---:"] * 4], *rows]))
+        return
     if options.large is not None:
         of_map, walk = options.large
         print(_table([_large_row(of_map, walk, options.work / "between", options.lanes)]))
@@ -137,6 +148,35 @@ def _large_row(run: Path, walk: Path, work: Path, lanes: int) -> list[str]:
     every = Errors(*(np.concatenate(column) for column in zip(*map(astuple, errors), strict=True)))
     title = f"between {num} frames of lanes, {width} px"
     return [title, f"{len(errors)} of {BETWEEN}", *every.cells(), "", f"{cpu:.2f}"]
+
+
+def _repeated(walk: Path, work: Path) -> list[list[str]]:
+    """Rows of the frames between those of a map of a part of a walk, and of those beyond it."""
+    truth = read_trajectory(walk / "groundtruth.tum").world_T_rigs
+    images = sorted(path for path in (walk / "images").iterdir() if path.suffix in (".jpg", ".png"))
+    third = len(images) // 3
+    kept = [f for f in range(third) if f % HELD_OUT or f == 0]
+    folder, run = work / walk.name / "map", work / walk.name / "run"
+    folder.mkdir(parents=True, exist_ok=True)
+    for f in kept:
+        shutil.copyfile(images[f], folder / images[f].name)
+    refine(folder, None, run)
+    localizer = Localizer(run)
+    poses = localizer.map.result.world_T_rigs
+    stems = [path.stem for path in images]
+    move = pose_similarity(poses, truth[[stems.index(name) for name in localizer.map.frames.names]])
+    near = float(np.median(np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1))) / 4
+    held, rows = [f for f in range(third) if f not in kept], []
+    localizer.localize(images[held[0]])  # kernels are compiled, keyframes read
+    for what, frames in (("between", held), ("beyond", range(third, len(images)))):
+        begin = time.process_time()
+        found = [(localizer.localize(images[f]), truth[f]) for f in frames]
+        cpu = (time.process_time() - begin) / len(found)
+        placed = [(move.poses(one.world_T_rig[None])[0], true) for one, true in found if one.found]
+        right = sum(np.linalg.norm((a - b)[:3, 3]) < near for a, b in placed)
+        counts = right, len(placed) - right, len(found) - len(placed)
+        rows.append([walk.name, f"{len(found)} {what}", *map(str, counts), f"{cpu:.2f}"])
+    return rows
 
 
 def _walk(work: Path) -> tuple[list[int], Trajectory]:
@@ -293,8 +333,11 @@ def _tag(path: Path, camera: PerspectiveProjection | None) -> None:
 def _table(rows: list[list[str]]) -> str:
     header = ["", "localised", "position, 1e-3, median", "worst", "rotation, deg, median", "worst"]
     header += ["NEES", "focal length, %, median / worst", "CPU s each"]
-    lines = [header, ["---", *["---:"] * (len(header) - 1)], *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    return _lines([header, ["---", *["---:"] * (len(header) - 1)], *rows])
+
+
+def _lines(rows: list[list[str]]) -> str:
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
 
 
 if __name__ == "__main__":

@@ -112,7 +112,7 @@ class Localizer:
         self._precise = precise
         self.surroundings = Surroundings(self.map)
         rigs = [_rig_for(kind, self.map.settings) for kind in self.map.frames.formats]
-        self.usual = open_rates(self.surroundings, rigs, self._extract, self._query)
+        self.usual = open_rates(self.surroundings, rigs, self._extract, self.query_of)
         self._rigs = [
             CubeRig(size, rig.hfov_rad)
             for size, rig in zip(self.usual.face_px.tolist(), rigs, strict=True)
@@ -191,7 +191,7 @@ class Localizer:
     def _localize_features(
         self, name: str, features: Features, load: Callable[[], Grey], camera: int
     ) -> LocalizedFrame:
-        query = self._query(features, camera, self._rigs[camera])
+        query = self.query_of(features, camera, self._rigs[camera])
         found = self._recognise(name, query, camera)
         if self._precise and found.found:
             found = self._on_patches(found, load, camera)
@@ -290,7 +290,7 @@ class Localizer:
             return ONE_CENTRE
         return replace(lenses, readout_motion=None)
 
-    def _query(self, features: Features, camera: int, rig: CubeRig) -> Query:
+    def query_of(self, features: Features, camera: int, rig: CubeRig) -> Query:
         """Keypoints of a camera's picture on faces of a rig, ready to be matched, where they
         really point."""
         map_ = self.map
