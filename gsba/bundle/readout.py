@@ -13,7 +13,7 @@ from itertools import product
 import numpy as np
 
 from gsba.bundle.adjustment import AdjustmentContext
-from gsba.bundle.cross_validation import cross_validate
+from gsba.bundle.cross_validation import cross_validate, predicts
 from gsba.bundle.shared_parameters import PARTS, SharedModel, models_of, summed
 from gsba.camera.lens import Lenses, rows_run
 from gsba.config import CameraSettings
@@ -67,6 +67,8 @@ def estimate(
 ) -> CameraEstimate:
     """Find how long the readout takes and which way rows are read, frames moving by velocity.
 
+    No readout is taken while another way of reading rows predicts unseen parts nearly as well.
+
     Args:
         landmarks: points and their observations.
         keypoints: of these, as rays of the lenses.
@@ -103,6 +105,9 @@ def estimate(
     logger.info("readout: %.2f ms (sigma %.2f)", 1e3 * abs(duration), 1e3 * sigma)
     if not verdict.predicts or abs(duration) < _MIN_SIGMAS * sigma:
         return replace(found, reason="motion during the readout does not predict unseen parts")
+    others = [other for way, other in enumerate(verdicts) if way != best]
+    if not all(predicts(verdict.gains - other.gains) for other in others):
+        return replace(found, reason="rows may be read in other directions as well")
     if context.settings.camera.sweep is not None and duration < 0:
         return replace(found, reason="rows are read the other way than camera.sweep says")
     readout_motion = abs(duration) * motion

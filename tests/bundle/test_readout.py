@@ -96,6 +96,23 @@ def test_frames_of_one_instant_have_none(seed: int) -> None:
     assert found.reason and found.lenses.readout_motion is None
 
 
+def test_no_way_is_taken_while_another_explains_as_much() -> None:
+    """Points that only the front lens sees do not tell which way the back one is read."""
+    sweeping = replace(LENSES, row_directions=SWEEPS, readout_motion=TWISTS)
+    world, shown = seen_through(sweeping, 0)
+    start = Solution.without_points(world.world_T_rigs)
+    solved, keypoints, tracks = solved_under(world, shown, LENSES, start)
+    around = placed(solved, keypoints, tracks)
+    seen = around.tracks
+    behind = shown.bearings_rig[keypoints.rows(seen), 2] < 0
+    ahead = around.of(np.bincount(seen.points[behind], minlength=seen.num_points) == 0)
+    known = keypoints, shown.bearings_rig, solved, LENSES, times(24), problem_of(world)
+    found = readout.estimate(ahead, *known)
+    assert found.reason == "rows may be read in other directions as well"
+    assert found.lenses.row_directions is None and found.lenses.readout_motion is None
+    assert readout.estimate(around, *known).lenses.row_directions is not None
+
+
 def test_rows_of_stitched_pictures_are_known_to_three_per_cent() -> None:
     """How many rows lie between two directions hangs on lenses that a panorama does not tell."""
     stitched = CameraEstimate(Lenses(), readout_s=0.012)
