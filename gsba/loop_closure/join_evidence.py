@@ -40,7 +40,7 @@ _MAX_SURFACE_RATIO = 1.25  # largest ratio of the distances of a surface and of 
 # Edges of bins of the angle between two views.
 _ANGLE_EDGES_RAD = np.deg2rad([6.0, 12.0, 20.0, 30.0, 45.0])
 _LOG_RATIO_EDGES = np.log([1.15, 1.35, 1.7])  # edges of bins of the ratio of distances
-NUM_BINS = (len(_ANGLE_EDGES_RAD) + 1) * (len(_LOG_RATIO_EDGES) + 1)
+_NUM_BINS = (len(_ANGLE_EDGES_RAD) + 1) * (len(_LOG_RATIO_EDGES) + 1)
 _PRIOR_COUNT = 20.0  # prior count of points in each bin, found at the mean rate of all bins
 _DEFAULT_RATE = 0.3  # rate assumed if no two frames of one part can be compared
 # Rotation about the vertical after which predictions are found by chance only.
@@ -217,10 +217,10 @@ def turned_away(world_T_rigs: np.ndarray) -> np.ndarray:
 
 def rates_of(seen: Predictions, away: Predictions) -> Rates:
     """Rates of predictions at true poses, and of others at poses that are `turned_away`."""
-    numbers = np.bincount(seen.bins, None, NUM_BINS)
+    numbers = np.bincount(seen.bins, None, _NUM_BINS)
 
     def by_change_of_view(worth: np.ndarray) -> np.ndarray:
-        hits = np.bincount(seen.bins, worth, NUM_BINS)
+        hits = np.bincount(seen.bins, worth, _NUM_BINS)
         mean = (hits.sum() + _PRIOR_COUNT * _DEFAULT_RATE) / (numbers.sum() + _PRIOR_COUNT)
         return (hits + _PRIOR_COUNT * mean) / (numbers + _PRIOR_COUNT)
 
