@@ -25,7 +25,7 @@ import csv
 import json
 import shutil
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import astuple, dataclass
 from pathlib import Path
 
@@ -157,9 +157,7 @@ def _repeated(walk: Path, work: Path) -> list[list[str]]:
     third = len(images) // 3
     kept = [f for f in range(third) if f % HELD_OUT or f == 0]
     folder, run = work / walk.name / "map", work / walk.name / "run"
-    folder.mkdir(parents=True, exist_ok=True)
-    for f in kept:
-        shutil.copyfile(images[f], folder / images[f].name)
+    _copy(walk / "images", kept, folder)
     refine(folder, None, run)
     localizer = Localizer(run)
     poses = localizer.map.result.world_T_rigs
@@ -184,16 +182,20 @@ def _walk(work: Path) -> tuple[list[int], Trajectory]:
     held = list(range(HELD_OUT - 1, NUM_FRAMES, HELD_OUT))
     if not (work / "walk/groundtruth.tum").is_file():
         make_walk(work / "walk", "rectangle", "forward", NUM_FRAMES, WIDTH)
-    folder, images = work / "map", work / "walk/images"
-    folder.mkdir(exist_ok=True)
+    _copy(work / "walk/images", [f for f in range(NUM_FRAMES) if f not in held], work / "map")
+    return held, read_trajectory(work / "walk/groundtruth.tum")
+
+
+def _copy(images: Path, kept: Sequence[int], folder: Path) -> None:
+    """Copy some of a folder's images, by their numbers in its table of times, and their times."""
+    folder.mkdir(parents=True, exist_ok=True)
     with (images / "timestamps.csv").open() as file:
         header, *times = list(csv.reader(file))
-    kept = [row for f, row in enumerate(times) if f not in held]
-    for name, _ in kept:
-        shutil.copyfile(images / name, folder / name)
+    for f in kept:
+        path = next(images.glob(f"{Path(times[f][0]).stem}.*"))
+        shutil.copyfile(path, folder / path.name)
     with (folder / "timestamps.csv").open("w", newline="") as file:
-        csv.writer(file).writerows([header, *kept])
-    return held, read_trajectory(work / "walk/groundtruth.tum")
+        csv.writer(file).writerows([header, *(times[f] for f in kept)])
 
 
 def _to_truth(localizer: Localizer, truth: Trajectory) -> Sim3:
