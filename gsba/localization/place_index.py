@@ -53,12 +53,18 @@ class PlaceIndex:
 
 def open_index(map_: RunMap) -> PlaceIndex:
     """The index of a map: the one kept beside the run if it is the run's, else made and kept."""
-    return kept(map_, index_path(map_.root), PlaceIndex, lambda: _make(map_))
+    return load_or_make(map_, index_path(map_.root), PlaceIndex, lambda: _make(map_))
 
 
-def kept(map_: RunMap, path: Path, kind: type[T], make: Callable[[], T]) -> T:
-    """What is known of a map from its run alone: the record of a kind that is kept beside the run
-    in a file if it is the run's, else made and kept there."""
+def load_or_make(map_: RunMap, path: Path, kind: type[T], make: Callable[[], T]) -> T:
+    """Load a record that depends on a map's run alone; make and save it if this run has none.
+
+    Args:
+        map_: the map.
+        path: file beside the run.
+        kind: type of the record.
+        make: computes the record.
+    """
     key = _key(map_)
     found = load_checkpoint(path, key, kind, "the map is indexed again")
     if found is not None:

@@ -53,7 +53,8 @@ class PlacedPose:
 def best_of(poses: Sequence[PlacedPose]) -> tuple[int, str]:
     """The pose that most cells agree with, and the reason why it is not accepted; "" = it is.
 
-    It must show its surroundings, and explain more than any other one that may show its own.
+    Its surroundings must confirm it, and it must explain significantly more cells than every pose
+    at another place that is no look-alike.
 
     Args:
         poses: at least one.

@@ -61,8 +61,8 @@ class RunMap:
     rig: CubeRig  # faces on which keypoints of the first camera's frames are found
     point_covariances: np.ndarray  # (J, 3, 3) float64, map units^2, of points given the poses
     axes: np.ndarray  # (D, D) float32, axes of descriptors, see `searchable`
-    load_features: Callable[[int], Features]  # keypoints of a frame, by its number, as they are
-    # found in a picture without a closer look
+    load_features: Callable[[int], Features]  # keypoints of a frame, by its number, without those
+    # that are extracted at weak frames later
     load_keyframe: Callable[[int], Keyframe]  # by the number of the frame; recent ones are kept
 
     @classmethod

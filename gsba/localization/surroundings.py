@@ -1,10 +1,10 @@
-"""What a picture shows of the surroundings that a map has at its pose: the test of that pose.
+"""Test of a localised pose by the points of the map that a picture taken there should show.
 
-Bays of a hall, both of its sides, and arches that repeat show enough of the same for a pose that
-many points agree on, with a tight covariance, where the picture was not taken. Of all that frames
-of the map around that pose know, a picture from there shows as much as frames of the map show of
-what the others know; at a look-alike it shows little, and nothing at all in some directions. See
-`gsba.loop_closure.join_evidence`, which tests joins of maps so.
+In a hall whose bays or sides repeat, hundreds of matches can agree on a pose where the picture was
+not taken, with a small covariance. A picture at its true pose shows the points of the nearest
+keyframes at the rate at which frames of the map show those of one another. At a look-alike it shows
+few of them, and none in some directions. `gsba.loop_closure.join_evidence` tests joins of maps by
+the same evidence.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,7 +15,7 @@ import numpy as np
 from gsba.camera.rig import CubeRig
 from gsba.frames import cubemap
 from gsba.geometry import inverse
-from gsba.localization.place_index import index_path, kept
+from gsba.localization.place_index import index_path, load_or_make
 from gsba.localization.query import Query
 from gsba.localization.run_map import RunMap
 from gsba.log import GsbaError
@@ -115,10 +115,9 @@ class Surroundings:
         would lack points that fewer than `_MIN_OTHERS` others observe."""
         map_ = self.map
         result, num_observers = map_.result, self._num_observers
-        nearest = map_.nearest(world_T_rig, _NUM_NEAREST)
+        nearest = map_.nearest(world_T_rig, _NUM_NEAREST + 1)
+        nearest = nearest[nearest != left_out][:_NUM_NEAREST]
         if left_out is not None:
-            nearest = map_.nearest(world_T_rig, _NUM_NEAREST + 1)
-            nearest = nearest[nearest != left_out]
             num_observers = num_observers.copy()
             num_observers[result.observation_points[result.observation_frames == left_out]] -= 1
         of_map = num_observers >= _MIN_OTHERS
@@ -182,7 +181,8 @@ def open_rates(
             np.array(face_px, np.int64),
         )
 
-    return kept(map_, index_path(map_.root).with_name("rates.npz"), PictureRates, measure)
+    path = index_path(map_.root).with_name("rates.npz")
+    return load_or_make(map_, path, PictureRates, measure)
 
 
 def _some(frames: np.ndarray) -> list[int]:
