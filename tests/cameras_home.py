@@ -7,22 +7,24 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from one_gallery import OVAL_FRAMES, OVAL_WIDTH
 from tiny_run import SETTINGS
 
-from gsba import Recording
+from gsba import Recording, refine_recordings
 from gsba.camera.calibration import calibration_json
 from gsba.camera.fisheye import unproject
 from gsba.camera.rig import CubeRig
 from gsba.camera.sphere import around_sphere, erp_from_bearings
 from gsba.config import RefineSettings
-from gsba.demo import make_walk
+from gsba.demo import DemoWalk
 from gsba.evaluate.trajectory import evaluate
 from gsba.frames.cubemap import cut
 from gsba.store.finished import load_run
 from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.types import FACES, Fisheye, Trajectory
 
-NUM, WIDTH, SMALL = 10, 512, 384  # frames of a recording, and widths of the two cameras
+NUM = OVAL_FRAMES // 2  # frames of a recording
+WIDTH, SMALL = OVAL_WIDTH, 384  # of the two cameras
 LENS = Fisheye(240, 240, 73.0, (120.0, 120.0), (0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 PAIR = LENS, Fisheye(240, 240, 73.0, (120.0, 120.0), (0.0, 0.0, 0.0, 0.0), (0.0, np.pi, 0.0))
 
@@ -36,9 +38,8 @@ class Home(NamedTuple):
     truth: Trajectory  # of both, one after the other
 
 
-def make_home(folder: Path) -> Home:
+def make_home(folder: Path, walk: DemoWalk) -> Home:
     """Every other frame of a walk is of the first recording."""
-    walk = make_walk(folder / "walk", "oval", "locked", 2 * NUM, WIDTH)
     truth, slam = read_trajectory(walk.truth_path), read_trajectory(walk.slam_path)
     images, files = sorted(walk.frames_dir.glob("*.jpg")), []
     times = 0.5 * np.arange(NUM)
@@ -54,8 +55,8 @@ def make_home(folder: Path) -> Home:
     )
 
 
-def _times(folder: Path) -> None:
-    rows = [f"{n:06d},{0.5 * n}" for n in range(NUM)]
+def _times(folder: Path, num: int = NUM) -> None:
+    rows = [f"{n:06d},{0.5 * n}" for n in range(num)]
     (folder / "timestamps.csv").write_text("\n".join(["name,timestamp", *rows, ""]))
 
 
@@ -73,6 +74,15 @@ def panoramas(home: Home, which: int, width: int) -> Recording:
                 cv2.imwrite(str(folder / f"{n:06d}.jpg"), small)
         _times(folder)
     return Recording(folder, home.trajectories[which])
+
+
+def beginning(recording: Recording, num: int, folder: Path) -> Recording:
+    """The first few frames of panoramas, in a folder of their own."""
+    folder.mkdir()
+    for n in range(num):
+        shutil.copy(Path(recording.frames) / f"{n:06d}.jpg", folder)
+    _times(folder, num)
+    return Recording(folder, recording.trajectory)
 
 
 def faces(home: Home) -> Recording:
@@ -133,3 +143,13 @@ def error_of(run: Path, home: Home) -> float:
     times = np.arange(float(len(rows)))
     true = Trajectory(times, home.truth.world_T_rigs[rows])
     return evaluate(Trajectory(times, reconstruction.world_T_rigs), true).ate.rmse
+
+
+SMALL_EXPORT = settings_with(export={"formats": ("colmap-flat",), "face_size": 64})
+
+
+def make_two_sizes(home: Home) -> Path:
+    """A run of both recordings as panoramas of two sizes, made at once."""
+    out = home.folder / "sizes"
+    refine_recordings([panoramas(home, 0, WIDTH), panoramas(home, 1, SMALL)], out, SMALL_EXPORT)
+    return out

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from one_gallery import gallery
 
 from gsba.camera.sphere import around_sphere, bearings_from_erp, erp_from_bearings
-from gsba.demo.gallery import build_gallery
 from gsba.demo.render import render_erp
 from gsba.demo.walk import walk_poses
 
@@ -47,7 +47,7 @@ def turn(grey: np.ndarray, rig_R_turned: np.ndarray) -> np.ndarray:
 
 
 def render_walk() -> RenderedWalk:
-    scene, truth = build_gallery(), walk_poses("open", "locked", STEPS_OF_WALK, 0)
+    scene, truth = gallery(), walk_poses("open", "locked", STEPS_OF_WALK, 0)
     poses = truth.world_T_rigs[:NUM_FRAMES].copy()
     frames = []
     for pose in poses:

@@ -6,11 +6,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from one_gallery import OVAL_FRAMES
 from scipy.spatial.transform import Rotation
 from tiny_run import SETTINGS
 
 from gsba import Recording, RefineSettings, refine
-from gsba.demo import make_walk
+from gsba.demo import DemoWalk
 from gsba.evaluate.trajectory import evaluate
 from gsba.geometry import pose
 from gsba.similarity import Sim3
@@ -18,8 +19,9 @@ from gsba.store.finished import load_run
 from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.types import Trajectory
 
-NUM = 10  # frames of a recording
+NUM = OVAL_FRAMES // 2  # frames of a recording
 FORMATS = ("colmap-flat", "tum")
+MAX_ERROR = 0.0015  # of a map of both recordings: an eighteenth of a pixel, two units away
 SCALES = 1.0, 1.7  # of the trajectories
 WORLD = pose(Rotation.from_rotvec([0.4, -2.0, 0.7]).as_matrix(), np.array([5.0, -3.0, 8.0]))
 
@@ -53,9 +55,8 @@ class GrowingHome:
         return evaluate(Trajectory(frames.timestamps, reconstruction.world_T_rigs), true).ate.rmse
 
 
-def make_growing_home(folder: Path) -> GrowingHome:
-    """Render the walks into a folder and refine the first recording."""
-    walk = make_walk(folder / "walk", "oval", "locked", 2 * NUM, 512)
+def make_growing_home(folder: Path, walk: DemoWalk) -> GrowingHome:
+    """Divide the frames of a walk into recordings and refine the first one."""
     slam, truth = read_trajectory(walk.slam_path), read_trajectory(walk.truth_path)
     images = sorted(walk.frames_dir.glob("*.jpg"))
     folders, files = [], []

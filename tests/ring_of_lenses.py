@@ -6,13 +6,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from one_gallery import gallery
 from scipy.spatial.transform import Rotation
 
 from gsba.camera.fisheye import Rig, facing, lens_names, projection_of, rotation_of
 from gsba.camera.projections import RadialProjection
 from gsba.camera.sphere import bearings_from_erp, erp_from_bearings
 from gsba.demo.degrade import degrade
-from gsba.demo.gallery import build_gallery
 from gsba.demo.render import render_erp
 from gsba.demo.walk import walk_poses
 from gsba.geometry import pose
@@ -63,7 +63,7 @@ def render(folder: Path, num: int, own: RadialProjection | None = None, model: s
     trajectories of three seeds."""
     truth, scene, rig = (
         walk_poses("rectangle", "forward", NUM_FRAMES, 0),
-        build_gallery(),
+        gallery(),
         ring(num),
     )
     axes, names = np.array([rotation_of(lens)[:, 2] for lens in rig]), lens_names(num)

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from one_gallery import walk_in_gallery
 
 from gsba import refine
 from gsba.config import RefineSettings
-from gsba.demo import make_walk
 from gsba.demo.walk import Heading, WalkPath, walk_poses
 from gsba.evaluate.trajectory import TrajectoryErrors, evaluate
 from gsba.pipeline import RunResult
@@ -66,7 +66,7 @@ def make_case(folder: Path) -> Case:
     """Render the walk into a folder and refine it."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("gsba.demo.walk.walk_poses", _first_third)
-        walk = make_walk(folder / "walk", "open", "locked", NUM_FRAMES, WIDTH)
+        walk = walk_in_gallery(folder / "walk", "open", "locked", NUM_FRAMES, WIDTH)
     out = folder / "run"
     result = refine(walk.frames_dir, walk.slam_path, out, SETTINGS)
     return Case(walk.frames_dir, walk.slam_path, read_trajectory(walk.truth_path), out, result)

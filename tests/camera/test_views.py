@@ -5,12 +5,12 @@ from functools import cache
 import cv2
 import numpy as np
 import pytest
+from one_gallery import gallery
 from scipy.spatial.transform import Rotation
 
 from gsba.camera.lens import Lenses
 from gsba.camera.sphere import bearings_from_erp, erp_from_bearings
 from gsba.camera.views import View, ViewCutter, lens_views
-from gsba.demo.gallery import build_gallery
 from gsba.demo.render import render_erp
 from gsba.demo.walk import walk_poses
 from gsba.geometry import pose
@@ -23,13 +23,8 @@ RIG = walk_poses("rectangle", "locked", 20, 0).world_T_rigs[4]
 VIEWS = {view.name: view for view in lens_views(TURNED, SIZE)}
 
 
-@cache
-def _gallery():
-    return build_gallery()
-
-
 def _render(world_T_camera: np.ndarray) -> np.ndarray:
-    return np.asarray(render_erp(_gallery(), world_T_camera, *SHAPE), np.float32)
+    return np.asarray(render_erp(gallery(), world_T_camera, *SHAPE), np.float32)
 
 
 def _lens(view: View) -> np.ndarray:

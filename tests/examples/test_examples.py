@@ -8,12 +8,11 @@ import cv2
 import gtsam
 import numpy as np
 import pytest
+from one_gallery import gallery, walk_in_gallery
 
 from factors.check import jacobian_errors
 from gsba import RefineSettings
 from gsba.camera.sphere import bearings_from_erp
-from gsba.demo import make_walk
-from gsba.demo.gallery import build_gallery
 from gsba.demo.raycast import ranges
 from gsba.similarity import pose_similarity
 from gsba.trajectory.files import read_trajectory
@@ -40,7 +39,7 @@ def _examples_are_modules(monkeypatch: pytest.MonkeyPatch) -> None:
 def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The demo's gallery, with tags on the walls beside the way."""
     folder = tmp_path_factory.mktemp("examples") / "walk"
-    make_walk(folder, "open", "locked", NUM_FRAMES, WIDTH)
+    walk_in_gallery(folder, "open", "locked", NUM_FRAMES, WIDTH)
     truth = read_trajectory(folder / "groundtruth.tum").world_T_rigs
     tags = _hung(truth[2::4])
     for world_T_rig, path in zip(truth, sorted((folder / "images").glob("*.jpg")), strict=True):
@@ -52,13 +51,12 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def _hung(world_T_rigs: np.ndarray) -> list[np.ndarray]:
     """Poses of tags before what frames see to their left and right, turned towards them."""
-    scene, tags = build_gallery(), []
+    scene, tags = gallery(), []
     for world_T_rig in world_T_rigs:
-        for side in (-1.0, 1.0):
-            toward = world_T_rig[:3, :3] @ np.array([side, 0.0, 0.0])
-            toward[1] = 0.0
-            toward /= np.linalg.norm(toward)
-            away = float(ranges(scene, world_T_rig[:3, 3], toward[None])[0])
+        sides = np.array([-1.0, 1.0])[:, None] * world_T_rig[:3, 0]
+        sides[:, 1] = 0.0
+        sides /= np.linalg.norm(sides, axis=1, keepdims=True)
+        for toward, away in zip(sides, ranges(scene, world_T_rig[:3, 3], sides), strict=True):
             y = np.array([0.0, -1.0, 0.0])
             pose = np.eye(4)
             pose[:3, :3] = np.stack([np.cross(y, -toward), y, -toward], axis=1)
@@ -71,23 +69,30 @@ def _with_tags(image: np.ndarray, world_T_rig: np.ndarray, tags: list[np.ndarray
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
     v, u = np.mgrid[: 2 * image.shape[0], : 2 * image.shape[1]] / 2 + 0.25
     rays = bearings_from_erp(np.stack([u, v], -1), image.shape[1], image.shape[0])
-    rays = rays @ world_T_rig[:3, :3].T
     fine = cv2.resize(image, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
     for number, tag in enumerate(tags):
+        offset = (tag[:3, 3] - world_T_rig[:3, 3]) @ tag[:3, 2]
+        if offset >= 0:  # seen from behind
+            continue
         picture = cv2.aruco.generateImageMarker(dictionary, number, 800)
         picture = cv2.copyMakeBorder(picture, 100, 100, 100, 100, cv2.BORDER_CONSTANT, value=255)
-        offset = (tag[:3, 3] - world_T_rig[:3, 3]) @ tag[:3, 2]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            far = offset / (rays @ tag[:3, 2])
-        inside = (far > 0) & (offset < 0)
-        far = np.where(inside, far, 0)
-        hits = world_T_rig[:3, 3] + far[..., None] * rays - tag[:3, 3]
+        rows, columns = np.nonzero(_around(rays, world_T_rig, tag))
+        near = rays[rows, columns] @ world_T_rig[:3, :3].T
+        far = offset / (near @ tag[:3, 2])
+        hits = world_T_rig[:3, 3] + far[:, None] * near - tag[:3, 3]
         x, y = hits @ tag[:3, 0] / TAG, hits @ tag[:3, 1] / TAG
-        inside &= (np.abs(x) < 0.625) & (np.abs(y) < 0.625)
+        inside = (far > 0) & (np.abs(x) < 0.625) & (np.abs(y) < 0.625)
         s = np.clip((x[inside] + 0.5) * 800 + 100, 0, 999).astype(int)
         t = np.clip((0.5 - y[inside]) * 800 + 100, 0, 999).astype(int)
-        fine[inside] = picture[t, s][:, None]
+        fine[rows[inside], columns[inside]] = picture[t, s][:, None]
     return cv2.resize(fine, (image.shape[1], image.shape[0]), interpolation=cv2.INTER_AREA)
+
+
+def _around(rays: np.ndarray, world_T_rig: np.ndarray, tag: np.ndarray) -> np.ndarray:
+    """Whether rays (H, W, 3) of the rig pass through the sphere around a tag and its border."""
+    centre = world_T_rig[:3, :3].T @ (tag[:3, 3] - world_T_rig[:3, 3])
+    from_centre = centre @ centre - (rays @ centre) ** 2  # squared
+    return (from_centre < (0.9 * TAG) ** 2) & (rays @ centre > -TAG)
 
 
 def _scale_and_error(walk: Path, world_T_rigs: np.ndarray) -> tuple[float, float]:

@@ -57,25 +57,28 @@ def _pictures(drawn: Drawn, rng: np.random.Generator, num: int = 6) -> list[np.n
     u = (np.arange(drawn.width)[:, None] + offsets).ravel()[None]
     away = np.hypot(u - drawn.x, v - drawn.y) / drawn.radius
     around = np.arctan2(v - drawn.y, u - drawn.x)
-    shadow = np.abs(around - np.pi / 2) < np.pi * drawn.dark_share
+    shadow = (np.abs(around - np.pi / 2) < np.pi * drawn.dark_share) & (away > 0.5)
+    least = np.where(shadow, -np.inf, 30).astype(np.float32)
+    most = np.where(shadow, 45, np.inf).astype(np.float32)
+    inside = away < 1
+    vignetting = drawn.dim * (1 - 0.35 * np.minimum(away, 1) ** 4)
+    fade = 1.0 if drawn.sharp_end else np.clip((1.35 - away) / 0.35, 0, 1)
+    end = drawn.glow_end if drawn.sharp_end else 1.35
+    side = 0.7 + 0.3 * np.cos(around - 2.0)  # a housing glows towards the sun
+    outside = np.where(away < end, np.maximum(drawn.glow * side * fade, 3), 3).astype(np.float32)
+    flare = np.zeros(1, np.float32)
+    if drawn.flare:
+        flare = 160 * np.exp(-((away - 1.05) ** 2) / 0.02 - (around + 2.2) ** 2 / 0.02)
+        flare = flare.astype(np.float32)
     out = []
     for _ in range(num):
         coarse = rng.uniform(70, 220, (14, 14)).astype(np.float32)
         scene = cv2.resize(coarse, away.shape[::-1], interpolation=cv2.INTER_CUBIC)
         fine = rng.uniform(-1, 1, (60, 60)).astype(np.float32)
         scene = scene + 25 * cv2.resize(fine, away.shape[::-1], interpolation=cv2.INTER_CUBIC)
-        scene *= drawn.dim * (1 - 0.35 * np.minimum(away, 1) ** 4)  # vignetting
-        scene = np.where(shadow & (away > 0.5), np.minimum(scene, 45), np.maximum(scene, 30))
-        outside = np.full_like(scene, 3)
-        fade = 1.0 if drawn.sharp_end else np.clip((1.35 - away) / 0.35, 0, 1)
-        end = drawn.glow_end if drawn.sharp_end else 1.35
-        side = 0.7 + 0.3 * np.cos(around - 2.0)  # a housing glows towards the sun
-        outside = np.where(away < end, np.maximum(drawn.glow * side * fade, 3), outside)
-        picture = np.where(away < 1, scene, outside)
-        if drawn.flare:
-            spot = np.exp(-((away - 1.05) ** 2) / 0.02 - (around + 2.2) ** 2 / 0.02)
-            picture = picture + 160 * spot
-        small = picture.reshape(drawn.height, 2, drawn.width, 2).mean(axis=(1, 3))
+        scene *= vignetting
+        picture = np.where(inside, np.clip(scene, least, most), outside) + flare
+        small = cv2.resize(picture, (drawn.width, drawn.height), interpolation=cv2.INTER_AREA)
         noisy = small + rng.normal(0, 1.5, small.shape)
         out.append(np.clip(np.rint(noisy), 0, 255).astype(np.uint8))
     return out

@@ -8,12 +8,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from one_gallery import gallery
 from tiny_run import NUM_FRAMES, WIDTH, Case
 from typer.testing import CliRunner
 
 from gsba import GsbaError, Localizer
 from gsba.cli import app
-from gsba.demo.gallery import build_gallery
 from gsba.demo.render import render_erp
 from gsba.demo.walk import walk_poses
 from gsba.localization import LocalizedFrame
@@ -30,7 +30,7 @@ def new(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Trajectory]:
     """Folder of frames halfway between those of the walk, and their true poses."""
     folder = tmp_path_factory.mktemp("new")
     walk = walk_poses("open", "locked", 6 * NUM_FRAMES, 0)  # twice as dense as the tiny run
-    scene, rng = build_gallery(), np.random.default_rng(0)
+    scene, rng = gallery(), np.random.default_rng(0)
     truth = Trajectory(walk.timestamps[list(TIMES)], walk.world_T_rigs[list(TIMES)])
     for time, world_T_rig in zip(TIMES, truth.world_T_rigs, strict=True):
         image = render_erp(scene, world_T_rig, WIDTH, WIDTH // 2)

@@ -5,6 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from one_gallery import gallery
 from PIL import Image
 from scipy.spatial.transform import Rotation
 from tiny_run import Case
@@ -13,7 +14,6 @@ from gsba import Localizer
 from gsba.camera.projections import PerspectiveProjection
 from gsba.camera.rig import CubeRig
 from gsba.camera.sphere import bearings_from_erp, erp_from_bearings
-from gsba.demo.gallery import build_gallery
 from gsba.demo.render import render_erp
 from gsba.geometry import rotation_angle
 from gsba.localization import localize_photos, read_photo
@@ -30,7 +30,7 @@ _WIDTH = 2048  # pixels of the panoramas that photos are cut from
 def taken(case: Case, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
     """Folder of photos, and their true poses and cameras by name."""
     folder, truth = tmp_path_factory.mktemp("photos"), {}
-    rng, scene = np.random.default_rng(1), build_gallery()
+    rng, scene = np.random.default_rng(1), gallery()
     for n, (frame, yaw, camera) in enumerate(
         [(2, 20, CAMERA), (4, 110, CAMERA), (5, 40, CAMERA), (3, 300, UPRIGHT)]
     ):

@@ -14,7 +14,6 @@ from cameras_home import (
     Home,
     faces,
     fisheyes,
-    make_home,
     panoramas,
     read,
     settings_with,
@@ -27,17 +26,14 @@ from gsba.store.finished import load_run
 
 
 @pytest.fixture(scope="module")
-def home(tmp_path_factory: pytest.TempPathFactory) -> Home:
-    return make_home(tmp_path_factory.mktemp("cameras"))
+def home(cameras_home: Home) -> Home:
+    return cameras_home
 
 
 @pytest.fixture(scope="module")
-def sizes(home: Home) -> Path:
+def sizes(two_sizes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of panoramas of two sizes."""
-    out = home.folder / "sizes"
-    recordings = [panoramas(home, 0, WIDTH), panoramas(home, 1, SMALL)]
-    refine_recordings(recordings, out, settings_with(export={"formats": ()}))
-    return out
+    return Path(shutil.copytree(two_sizes, tmp_path_factory.mktemp("localized") / "sizes"))
 
 
 def _distance(run: Path, frame: int, pose: np.ndarray) -> float:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from dense_walk import WIDTH, RenderedWalk, turn
+from one_gallery import gallery
 from scipy.spatial.transform import Rotation
 
 from gsba.camera.sphere import bearings_from_erp
@@ -100,11 +101,10 @@ def test_a_frame_is_placed_by_descriptors_in_the_unit_of_the_map(walk: RenderedW
     one, other = (cutter.cut(walk.frames[n], np.eye(3)) for n in (0, 6))
     key, frame = describe(LAYOUT, one, None), describe(LAYOUT, other, None)
     true_T = inverse(walk.world_T_rigs[0]) @ walk.world_T_rigs[6]
-    from gsba.demo.gallery import build_gallery
     from gsba.demo.raycast import ranges
 
     world = key.bearings_rig @ walk.world_T_rigs[0][:3, :3].T
-    distances = ranges(build_gallery(), walk.world_T_rigs[0][:3, 3], world)
+    distances = ranges(gallery(), walk.world_T_rigs[0][:3, 3], world)
     found = placed(key, frame, key.bearings_rig, distances, seed=0)
     assert found is not None
     assert np.rad2deg(rotation_angle(found[:3, :3].T @ true_T[:3, :3])) < 0.5

@@ -95,14 +95,25 @@ def context(
     return AdjustmentContext(families(poses, kind), RIG, settings, 1, division=division)
 
 
-@pytest.mark.parametrize("kind", ["bearing", "reprojection"])
-def test_rounds_in_parts_give_the_undivided_solution(kind: str, tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Solution:
+    """The town adjusted in parts of 15 frames without any mishap."""
     poses, keypoints, tracks = town_map()
-    start, found = Solution.without_points(poses), []
-    for part_frames in (NUM, 15):
-        here = context(tmp_path, part_frames, poses, kind)
-        found.append(adjustment.adjust(tracks, keypoints, start, here, GATES))
-    whole, parts = found
+    here = context(tmp_path_factory.mktemp("undisturbed"), 15, poses)
+    return adjustment.adjust(tracks, keypoints, Solution.without_points(poses), here, GATES)
+
+
+@pytest.mark.parametrize("kind", ["bearing", "reprojection"])
+def test_rounds_in_parts_give_the_undivided_solution(
+    kind: str, undisturbed: Solution, tmp_path: Path
+) -> None:
+    poses, keypoints, tracks = town_map()
+    start, parts = Solution.without_points(poses), undisturbed
+    here = context(tmp_path, NUM, poses, kind)
+    whole = adjustment.adjust(tracks, keypoints, start, here, GATES)
+    if kind != "bearing":
+        here = context(tmp_path, 15, poses, kind)
+        parts = adjustment.adjust(tracks, keypoints, start, here, GATES)
     for one, other in zip(parts.rounds, whole.rounds, strict=True):
         assert (one.observations, one.points, one.support) == (
             other.observations,
@@ -124,12 +135,10 @@ def test_rounds_in_parts_give_the_undivided_solution(kind: str, tmp_path: Path) 
 
 
 def test_a_stopped_adjustment_goes_on_in_another_call(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    undisturbed: Solution, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     poses, keypoints, tracks = town_map()
-    start = Solution.without_points(poses)
-    expected = adjustment.adjust(tracks, keypoints, start, context(tmp_path, 15, poses), GATES)
-    stopped = tmp_path / "stopped"
+    start, stopped = Solution.without_points(poses), tmp_path / "stopped"
     solve, calls = parts_adjustments.optimize_divided, []
 
     def stop(*args, **options):  # type: ignore[no-untyped-def]
@@ -143,33 +152,34 @@ def test_a_stopped_adjustment_goes_on_in_another_call(
         adjustment.adjust(tracks, keypoints, start, context(stopped, 15, poses), GATES)
     found = adjustment.adjust(tracks, keypoints, start, context(stopped, 15, poses), GATES)
     assert len(calls) == 3  # the first round was not solved again
-    np.testing.assert_array_equal(found.world_T_rigs, expected.world_T_rigs)
-    assert [len(r.iterations) for r in found.rounds] == [len(r.iterations) for r in expected.rounds]
+    np.testing.assert_array_equal(found.world_T_rigs, undisturbed.world_T_rigs)
+    counts = [[len(one.iterations) for one in each.rounds] for each in (found, undisturbed)]
+    assert counts[0] == counts[1]
 
 
-@pytest.mark.parametrize("left", [3, 30, 100])
 def test_a_full_disk_ends_an_adjustment_in_one_line_and_costs_nothing_else(
-    left: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    undisturbed: Solution, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Three times in one adjustment, each time after more files."""
     poses, keypoints, tracks = town_map()
-    start = Solution.without_points(poses)
-    expected = adjustment.adjust(tracks, keypoints, start, context(tmp_path, 15, poses), GATES)
-    rename, full = os.replace, tmp_path / "full"
-    written: list[object] = []
+    start, full, rename = Solution.without_points(poses), tmp_path / "full", os.replace
+    left = 0
 
     def fill(*args: Any, **options: Any) -> None:
-        written.append(args)
-        if len(written) > left:
+        nonlocal left
+        left -= 1
+        if left < 0:
             raise OSError(errno.ENOSPC, "No space left on device")
         rename(*args, **options)
 
-    with monkeypatch.context() as patched:
-        patched.setattr(disk.os, "replace", fill)
-        with pytest.raises(FullDiskError) as caught:
-            adjustment.adjust(tracks, keypoints, start, context(full, 15, poses), GATES)
-    assert len(str(caught.value).splitlines()) == 1
+    for left in (3, 30, 100):  # noqa: B007 (`fill` counts it down)
+        with monkeypatch.context() as patched:
+            patched.setattr(disk.os, "replace", fill)
+            with pytest.raises(FullDiskError) as caught:
+                adjustment.adjust(tracks, keypoints, start, context(full, 15, poses), GATES)
+        assert len(str(caught.value).splitlines()) == 1
     found = adjustment.adjust(tracks, keypoints, start, context(full, 15, poses), GATES)
-    np.testing.assert_array_equal(found.world_T_rigs, expected.world_T_rigs)
+    np.testing.assert_array_equal(found.world_T_rigs, undisturbed.world_T_rigs)
 
 
 @pytest.mark.slow

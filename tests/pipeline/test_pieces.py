@@ -7,13 +7,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from one_gallery import gallery
 from scipy.spatial.transform import Rotation
 from tiny_run import NUM_FRAMES, SETTINGS, Case
 from typer.testing import CliRunner, Result
 
 from gsba import load_run
 from gsba.cli import app
-from gsba.demo.gallery import build_gallery
 from gsba.demo.render import render_erp
 from gsba.demo.walk import walk_poses
 from gsba.export import ExportFormat, export
@@ -205,9 +205,9 @@ def test_a_tripod_gives_rotations_only(tmp_path: Path) -> None:
     frames.mkdir()
     turns = [[0.1 * np.sin(f), 0.5 * f, 0.05 * np.cos(f)] for f in range(num)]
     rotations, place = Rotation.from_rotvec(turns).as_matrix(), np.array([-4.4, -1.5, 0.0])
-    gallery, rng = build_gallery(), np.random.default_rng(0)
+    scene, rng = gallery(), np.random.default_rng(0)
     for f, rotation in enumerate(rotations):
-        image = render_erp(gallery, pose(rotation, place), 512, 256)
+        image = render_erp(scene, pose(rotation, place), 512, 256)
         image = image + 2 * rng.standard_normal(image.shape)
         cv2.imwrite(str(frames / f"{f}.png"), np.clip(image[..., ::-1], 0, 255).astype(np.uint8))
     out = tmp_path / "run"

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from one_gallery import gallery
 from tiny_run import SETTINGS
 from typer.testing import CliRunner
 
@@ -18,7 +19,6 @@ from gsba.camera.views import lens_views
 from gsba.cli import app
 from gsba.config import RefineSettings
 from gsba.demo.degrade import degrade
-from gsba.demo.gallery import build_gallery
 from gsba.demo.render import render_erp
 from gsba.demo.walk import walk_poses
 from gsba.evaluate import TrajectoryErrors, evaluate
@@ -43,7 +43,7 @@ RAW_SETTINGS = SETTINGS.model_copy(update={"patches": RefineSettings().patches})
 def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder of front/, back/ and what the walk is beside it."""
     folder = tmp_path_factory.mktemp("raw")
-    truth, scene = walk_poses("rectangle", "forward", NUM_FRAMES, 0), build_gallery()
+    truth, scene = walk_poses("rectangle", "forward", NUM_FRAMES, 0), gallery()
     for name, lens, side in zip(("front", "back"), LENSES, (1, -1), strict=True):
         (folder / "frames" / name).mkdir(parents=True)
         maps = _maps(lens)
@@ -126,7 +126,7 @@ def _check_panoramas(walk: Path, run: Path) -> None:
     result = CliRunner().invoke(app, [*call, "--out", str(run / "panoramas")])
     assert result.exit_code == 0, result.output
     _, frames = load_run(run)
-    truth, scene = read_trajectory(walk / "truth.tum"), build_gallery()
+    truth, scene = read_trajectory(walk / "truth.tum"), gallery()
     size, off = (frames.format.width, frames.format.height), []
     for f in (3, 11):
         image = decode(run / f"panoramas/images/{frames.names[f]}.png", size)

@@ -8,13 +8,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from growing_home import MAX_ERROR
+from one_gallery import OVAL_FRAMES
 from scipy.spatial.transform import Rotation
 from tiny_run import SETTINGS
 from typer.testing import CliRunner, Result
 
 from gsba import Recording, load_run, refine_recordings
 from gsba.cli import app
-from gsba.demo import make_walk
+from gsba.demo import DemoWalk
 from gsba.evaluate.trajectory import evaluate
 from gsba.geometry import pose
 from gsba.log import GsbaError
@@ -23,7 +25,7 @@ from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.types import Trajectory
 from gsba.view import load_scene
 
-NUM = 10  # frames of a recording
+NUM = OVAL_FRAMES // 2  # frames of a recording
 SCALES = 1.0, 1.7  # of the trajectories
 TURN = Rotation.from_rotvec([0.4, -2.0, 0.7]).as_matrix()
 WORLDS = np.eye(4), pose(TURN, np.array([5.0, -3.0, 8.0]))
@@ -47,12 +49,11 @@ class Home:
 
 
 @pytest.fixture(scope="module")
-def home(tmp_path_factory: pytest.TempPathFactory) -> Home:
+def home(oval: DemoWalk, tmp_path_factory: pytest.TempPathFactory) -> Home:
     """Every other frame of a walk: names and times of both recordings begin anew."""
     folder = tmp_path_factory.mktemp("recordings")
-    walk = make_walk(folder / "walk", "oval", "locked", 2 * NUM, 512)
-    truth, slam = read_trajectory(walk.truth_path), read_trajectory(walk.slam_path)
-    images = sorted(walk.frames_dir.glob("*.jpg"))
+    truth, slam = read_trajectory(oval.truth_path), read_trajectory(oval.slam_path)
+    images = sorted(oval.frames_dir.glob("*.jpg"))
     folders, files, truths = [], [], []
     for n, name in enumerate(("ground", "upper")):
         own = folder / name
@@ -103,6 +104,7 @@ def test_recordings_are_one_map_with_one_scale(run: Path, home: Home) -> None:
     ]
     assert [one.num_matched for one in alone] == [NUM, NUM]
     assert abs(np.log(alone[0].scale / alone[1].scale)) < 2e-3
+    assert errors.ate.rmse < MAX_ERROR  # as that of a run that grew, see test_growing.py
     assert errors.ate.rmse < 1.5 * max(one.ate.rmse for one in alone)
     before = evaluate(read_trajectory(home.trajectories[0]), home.truths[0])
     assert errors.ate.rmse < 0.3 * before.ate.rmse

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -17,7 +18,6 @@ from cameras_home import (
     error_of,
     faces,
     fisheyes,
-    make_home,
     panoramas,
     read,
     settings_with,
@@ -31,8 +31,8 @@ from gsba.store.finished import load_run
 
 
 @pytest.fixture(scope="module")
-def home(tmp_path_factory: pytest.TempPathFactory) -> Home:
-    return make_home(tmp_path_factory.mktemp("cameras"))
+def home(cameras_home: Home) -> Home:
+    return cameras_home
 
 
 def _error(result: RunResult, home: Home) -> float:
@@ -48,11 +48,12 @@ def coarser(home: Home) -> Path:
 
 
 @pytest.fixture(scope="module")
-def sizes(home: Home) -> RunResult:
-    """A recording at 512 pixels and one at 384."""
+def sizes(two_sizes: Path, home: Home, tmp_path_factory: pytest.TempPathFactory) -> RunResult:
+    """A recording at 512 pixels and one at 384, in several formats."""
+    out = Path(shutil.copytree(two_sizes, tmp_path_factory.mktemp("several") / "sizes"))
     formats = {"formats": ("colmap", "colmap-erp", "nerfstudio", "metashape")}
     recordings = [panoramas(home, 0, WIDTH), panoramas(home, 1, SMALL)]
-    return refine_recordings(recordings, home.folder / "sizes", settings_with(export=formats))
+    return refine_recordings(recordings, out, settings_with(export=formats))
 
 
 def test_pictures_of_two_sizes_make_one_map(sizes: RunResult, coarser: Path, home: Home) -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+from one_gallery import walk_in_gallery
 from tiny_run import SETTINGS
 from typer.testing import CliRunner
 
@@ -14,7 +15,6 @@ from gsba.camera.sphere import bearings_from_erp
 from gsba.camera.views import lens_views
 from gsba.cli import app
 from gsba.config import PlacementSettings, RefineSettings
-from gsba.demo import make_walk
 from gsba.demo.render import render_erp
 from gsba.demo.walk import walk_poses
 from gsba.evaluate import TrajectoryErrors, evaluate
@@ -62,7 +62,7 @@ def _stabilised(scene, world_T_rig: np.ndarray, width: int, height: int) -> np.n
 def _walk(out: Path, camera, heading: str):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("gsba.demo.render.render_erp", camera)
-        return make_walk(out, "rectangle", heading, NUM_FRAMES, WIDTH)
+        return walk_in_gallery(out, "rectangle", heading, NUM_FRAMES, WIDTH)
 
 
 @pytest.fixture(scope="module")
