@@ -2,6 +2,7 @@
 
 import ast
 import sys
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -67,8 +68,7 @@ def _hung(world_T_rigs: np.ndarray) -> list[np.ndarray]:
 
 def _with_tags(image: np.ndarray, world_T_rig: np.ndarray, tags: list[np.ndarray]) -> np.ndarray:
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
-    v, u = np.mgrid[: 2 * image.shape[0], : 2 * image.shape[1]] / 2 + 0.25
-    rays = bearings_from_erp(np.stack([u, v], -1), image.shape[1], image.shape[0])
+    rays = _fine_rays(image.shape[1], image.shape[0])
     fine = cv2.resize(image, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
     for number, tag in enumerate(tags):
         offset = (tag[:3, 3] - world_T_rig[:3, 3]) @ tag[:3, 2]
@@ -88,11 +88,18 @@ def _with_tags(image: np.ndarray, world_T_rig: np.ndarray, tags: list[np.ndarray
     return cv2.resize(fine, (image.shape[1], image.shape[0]), interpolation=cv2.INTER_AREA)
 
 
+@cache
+def _fine_rays(width: int, height: int) -> np.ndarray:
+    """Directions of the pixels of a panorama of twice the size, (2 height, 2 width, 3)."""
+    v, u = np.mgrid[: 2 * height, : 2 * width] / 2 + 0.25
+    return bearings_from_erp(np.stack([u, v], -1), width, height)
+
+
 def _around(rays: np.ndarray, world_T_rig: np.ndarray, tag: np.ndarray) -> np.ndarray:
     """Whether rays (H, W, 3) of the rig pass through the sphere around a tag and its border."""
     centre = world_T_rig[:3, :3].T @ (tag[:3, 3] - world_T_rig[:3, 3])
-    from_centre = centre @ centre - (rays @ centre) ** 2  # squared
-    return (from_centre < (0.9 * TAG) ** 2) & (rays @ centre > -TAG)
+    along = rays @ centre
+    return (centre @ centre - along**2 < (0.9 * TAG) ** 2) & (along > 0)
 
 
 def _scale_and_error(walk: Path, world_T_rigs: np.ndarray) -> tuple[float, float]:
