@@ -27,6 +27,7 @@ _MAX_TIME_S = 1e20  # upper bound; even nanoseconds since 1970 read as seconds a
 _FPS_RANGE = (1e-6, 1e6)  # range of --fps, frames per second
 _MIN_INTERVAL_S = 1e-3  # frame intervals shorter than this are numbering, not times
 _ADVICE = "pass --timestamps FILE or --fps F, or put a timestamps.csv (name,timestamp) beside them"
+_DATE = r"(19|20)[0-9]{2}[-_]?(0[1-9]|1[0-2])[-_]?([0-2][0-9]|3[01])"  # in a name
 
 
 class NoTimesError(GsbaError):
@@ -137,7 +138,8 @@ def frame_times(
         names: (F,) frame names without extension, in name order.
         table: file that `read_times` understands; a plain list is in name order.
         fps: frames per second of these very frames: frame i is at i / fps.
-        order_suffices: use name order where no source gives times.
+        order_suffices: use the order of the names, and numbers that they skip, where no source
+            gives times.
         pictures: (F,) files of each frame, whose EXIF tags are read last.
 
     Returns:
@@ -162,7 +164,7 @@ def frame_times(
         if not order_suffices:
             raise
         _log.info("frames are taken in the order of their names (%s)", error)
-        return np.arange(len(names)) / (fps or 1.0), False
+        return _relative_times(names) / (fps or 1.0), False
     return given, True
 
 
@@ -223,6 +225,24 @@ def _times_at_rate(names: Sequence[str], fps: float) -> np.ndarray:
             "their times; pass --timestamps FILE"
         )
     return np.arange(len(names)) / fps
+
+
+def _relative_times(names: Sequence[str]) -> np.ndarray:
+    """Numbers (F,) that names end in, from 0 and in their usual difference: where some are skipped,
+    frames are missing. The order of the names where most do not differ by the same, or names are
+    dates."""
+    order = np.arange(len(names), dtype=np.float64)
+    split = [re.fullmatch(r"(.*?)([0-9]{1,15})", name) for name in names]
+    found = [m.groups() for m in split if m]
+    if len(found) < len(names) or len({prefix for prefix, _ in found}) != 1 or len(names) < 2:
+        return order
+    if any(re.search(_DATE, name) for name in names):
+        return order
+    numbers = np.array([float(digits) for _, digits in found])
+    steps = np.diff(numbers)
+    usual = float(np.median(steps))
+    even = usual > 0 and 2 * np.count_nonzero(steps == usual) > len(steps) and steps.min() > 0
+    return (numbers - numbers[0]) / usual if even else order
 
 
 def _times_from_names(names: Sequence[str]) -> np.ndarray | None:

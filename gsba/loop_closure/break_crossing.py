@@ -6,6 +6,8 @@ units of that step. Points of one of the maps give the step's length in its unit
 together give the ratio of their units.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from gsba.geometry import inverse, rotation_angle
@@ -22,6 +24,7 @@ _REACH = 4  # steps of the map before or after a break that tell how fast the ca
 # Slowest and fastest motion over a break, in the median of these steps: other bays are elsewhere.
 _MIN_PACES, _MAX_PACES = 0.5, 1.5
 _MAX_TURN_RAD = np.deg2rad(60.0)  # largest turn over a break
+_PACES = 0.8, 0.9, 1.0, 1.1, 1.25  # lengths of a step over a break that are tried, in the usual one
 
 
 def crossing(
@@ -78,34 +81,100 @@ def agreed(proposals: list[Proposal], poses: np.ndarray, depth: float) -> Propos
 def continues(
     move: Sim3,
     breaks: list[tuple[int, int]],
-    inside: np.ndarray,
+    sides: tuple[np.ndarray, np.ndarray],
     poses: np.ndarray,
     timestamps: np.ndarray,
 ) -> bool:
     """True if a part, once moved, follows the map as a camera that walks on: at each break about as
-    far away as it goes in that time, and not turned about.
+    far away as it goes in that time, not back, and not turned about.
 
     Args:
         move: carries the part to the map.
         breaks: a frame outside the map and one inside, next to one another in time.
-        inside: (M,) frames of the map, ascending.
+        sides: frames (N,) of the part and (M,) of the map, ascending.
         poses: (F, 4, 4), each frame's in its own map.
         timestamps: (F,) seconds.
     """
     for f, g in breaks:
-        beside = np.arange(g - _REACH, g) if g < f else np.arange(g, g + _REACH)
-        beside = beside[np.isin(beside, inside) & np.isin(beside + 1, inside)]
-        if not len(beside):
+        usual = _velocities(move, (f, g), sides, poses, timestamps)
+        if not len(usual):
             return False
-        lengths = np.linalg.norm(poses[beside + 1, :3, 3] - poses[beside, :3, 3], axis=1)
-        pace = np.median(lengths / (timestamps[beside + 1] - timestamps[beside]))
-        usual = pace * abs(timestamps[f] - timestamps[g])
-        g_T_f = inverse(poses[g]) @ move.poses(poses[[f]])[0]
-        if not _MIN_PACES * usual < np.linalg.norm(g_T_f[:3, 3]) < _MAX_PACES * usual:
+        step = move.poses(poses[[f]])[0, :3, 3] - poses[g, :3, 3]
+        velocity = step / (timestamps[f] - timestamps[g])
+        paces = np.linalg.norm(velocity) / np.linalg.norm(usual[0])
+        if velocity @ usual[0] < 0 or not _MIN_PACES < paces < _MAX_PACES:
             return False
-        if rotation_angle(g_T_f[:3, :3]) > _MAX_TURN_RAD:
+        if rotation_angle(poses[g, :3, :3].T @ move.poses(poses[[f]])[0, :3, :3]) > _MAX_TURN_RAD:
             return False
     return bool(breaks)
+
+
+def at_usual_pace(
+    move: Sim3,
+    breaks: list[tuple[int, int]],
+    sides: tuple[np.ndarray, np.ndarray],
+    poses: np.ndarray,
+    timestamps: np.ndarray,
+) -> list[Sim3]:
+    """Similarities that move a part as one does, and then along the camera's way until it walks on
+    over a break at about the usual pace.
+
+    In a hall of bays, matches over a break agree on steps that are one bay too short, or lead back.
+
+    Args:
+        move, breaks, sides, poses, timestamps: see `continues`.
+    """
+    found = list[Sim3]()
+    for f, g in breaks:
+        step = move.poses(poses[[f]])[0, :3, 3] - poses[g, :3, 3]
+        for velocity in _velocities(move, (f, g), sides, poses, timestamps):
+            expected = velocity * (timestamps[f] - timestamps[g])
+            along = expected / np.linalg.norm(expected)
+            across = step - (step @ along) * along
+            found += [
+                replace(move, translation=move.translation + across + paces * expected - step)
+                for paces in _PACES
+            ]
+    return found
+
+
+def _velocities(
+    move: Sim3,
+    step: tuple[int, int],
+    sides: tuple[np.ndarray, np.ndarray],
+    poses: np.ndarray,
+    timestamps: np.ndarray,
+) -> list[np.ndarray]:
+    """Velocities (3,) that a camera may have over a break: at the usual speed of the map beside it,
+    in the mean direction of the steps before and behind, and in that of either; none where the map
+    does not move.
+
+    Args:
+        step: a frame outside the map and one inside.
+        move, sides, poses, timestamps: see `continues`.
+    """
+    f, g = step
+    theirs = _beside(g, f, sides[1], poses, timestamps)
+    ours = move.scale * _beside(f, g, sides[0], poses, timestamps) @ move.rotation.T
+    speed = float(np.median(np.linalg.norm(theirs, axis=1))) if len(theirs) else 0.0
+    ways = [
+        some[0] / np.linalg.norm(some[0]) for some in (theirs, ours) if len(some) and some[0].any()
+    ]
+    if not speed or not ways:
+        return []
+    ways = [np.mean(ways, axis=0), *ways] if len(ways) > 1 else ways
+    return [speed * way / np.linalg.norm(way) for way in ways if way.any()]
+
+
+def _beside(
+    g: int, f: int, rows: np.ndarray, poses: np.ndarray, timestamps: np.ndarray
+) -> np.ndarray:
+    """Velocities (n, 3) of at most `_REACH` steps of frames `rows` beside g, on the side away from
+    f, the nearest first."""
+    ends = g + np.sign(g - f) * np.arange(_REACH + 1)
+    ends = ends[: int(np.argmin(np.append(np.isin(ends, rows), False)))]
+    steps = np.diff(poses[ends, :3, 3], axis=0)
+    return steps / np.diff(timestamps[ends])[:, None]
 
 
 def _step_length(known: np.ndarray, depths: np.ndarray) -> float | None:

@@ -155,12 +155,22 @@ class JoinEvidence:
     def confirmed(self) -> bool:
         """True if significantly more is found again, and at its place, than where two places look
         alike, and hardly a region is strange."""
-        return self.margin() > 0 and self.strange < _LOOK_ALIKE_STRANGE
+        return self.margin() > 0 and not self.is_strange
 
     @property
     def likely(self) -> bool:
         """`confirmed` at a one-sided error rate of 5 % of each share."""
-        return self.margin(NUM_SIGMAS_LIKELY) > 0 and self.strange < _LOOK_ALIKE_STRANGE
+        return self.margin(NUM_SIGMAS_LIKELY) > 0 and not self.is_strange
+
+    @property
+    def is_strange(self) -> bool:
+        """True if as large a share is strange as where two places look alike."""
+        return self.strange >= _LOOK_ALIKE_STRANGE
+
+    @property
+    def doubted(self) -> bool:
+        """True if it is refuted or strange."""
+        return self.refuted or self.is_strange
 
     @property
     def refuted(self) -> bool:

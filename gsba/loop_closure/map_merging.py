@@ -14,19 +14,20 @@ import numpy as np
 
 from gsba.geometry import angles_between, inverse, unit
 from gsba.loop_closure import join_evidence, loops
-from gsba.loop_closure.break_crossing import agreed, continues, crossing
+from gsba.loop_closure.break_crossing import agreed, at_usual_pace, continues, crossing
 from gsba.loop_closure.connectivity import MIN_MAP_FRAMES, by_size
-from gsba.loop_closure.join_evidence import Places, Rates
+from gsba.loop_closure.join_evidence import GATE_RAD, Places, Rates
 from gsba.loop_closure.join_test import JoinTest, Judged
 from gsba.loop_closure.map_similarity import Meeting, Proposal, propose
 from gsba.loop_closure.merged_map import Registered
 from gsba.loop_closure.pose_graph import Loop
-from gsba.loop_closure.registration import resect
+from gsba.loop_closure.registration import Resection, resect
 from gsba.loop_closure.retrieval import global_descriptors
 from gsba.matching import pairs, recovery
 from gsba.matching.guided_search import Gate, MatchContext
 from gsba.similarity import Sim3
-from gsba.types import Counts, Solution
+from gsba.trajectory.judgement import over_missing_frames
+from gsba.types import Counts, Matches, Solution
 
 logger = logging.getLogger(__name__)
 _NUM_CANDIDATES = 3  # candidate places for each frame of a part; twice as many for a single frame
@@ -143,8 +144,7 @@ class _Joining:
                     self.met[rows] = True
                     return True
                 continue
-            placed = [self._is_of_map(f) and self._register(f, inside) for f in rows.tolist()]
-            if any(placed):
+            if self._register_each(rows, inside):
                 return True
         return False
 
@@ -206,7 +206,7 @@ class _Joining:
         if meetings and found is None:  # perhaps too few: search around the best
             meetings += self._meetings(self.context, self._around(meetings, rows, inside, chosen))
             found = self._best(part, meetings, rows, inside)
-        return found or self._over_break(rows, inside)
+        return found or self._over_break(part, rows, inside)
 
     def _best(
         self, part: int, meetings: list[Meeting], rows: np.ndarray, inside: np.ndarray
@@ -229,7 +229,7 @@ class _Joining:
         frames, why = best.proposal.frames, best.evidence
         logger.info("a part of %d frames overlaps the map at frames %s: %s", len(rows), frames, why)
         if accepted and not self.test.rivals(best, accepted):
-            return best.proposal.move
+            return self._at_pace(best, rows, inside).proposal.move
         self.reasons[part] = "it fits two places" if accepted else f"not certain: {why}"
         return None
 
@@ -238,14 +238,39 @@ class _Joining:
     ) -> list[Judged]:
         """Likely proposals that let the camera walk on at each break between a part and the map:
         look-alikes are elsewhere, or turned about."""
-        owners = self.recordings
-        breaks = [(f, g) for f, g in self._breaks(rows, inside) if owners[f] == owners[g]]
+        breaks = self._breaks_of_recording(rows, inside)
         return [
             one
             for one in weighed
             if one.evidence.likely
-            and continues(one.proposal.move, breaks, inside, self.poses, self.times)
+            and continues(one.proposal.move, breaks, (rows, inside), self.poses, self.times)
         ]
+
+    def _at_pace(self, found: Judged, rows: np.ndarray, inside: np.ndarray) -> Judged:
+        """What was found; or where it lets the camera walk on at an unusual pace, what continues
+        the map at the usual one, unless its surroundings speak against that."""
+        given = self._breaks_of_recording(rows, inside), (rows, inside), self.poses, self.times
+        held = self._is_held_by_trajectory(rows)  # which knows more than the pace
+        if held or not given[0] or continues(found.proposal.move, *given):
+            return found
+        meetings, usual = list[Meeting](), list[Judged]()
+        for move in at_usual_pace(found.proposal.move, *given):
+            meetings += self.test.meetings(self.test.weigh(rows, inside, move)[1], rows)
+        for proposal in propose(meetings, self.poses, self.depth, self.context.settings.seed):
+            one = self.test.judge(proposal, rows, inside, usual)
+            if (
+                one
+                and not one.evidence.doubted
+                and continues(one.proposal.move, *given)
+                and self._is_level(rows, inside, one.proposal.move)
+            ):
+                usual.append(one)
+        return max(usual, key=lambda one: one.evidence.margin(), default=found)
+
+    def _breaks_of_recording(self, rows: np.ndarray, inside: np.ndarray) -> list[tuple[int, int]]:
+        """Breaks between frames of one recording."""
+        owners = self.recordings
+        return [(f, g) for f, g in self._breaks(rows, inside) if owners[f] == owners[g]]
 
     def _breaks(self, rows: np.ndarray, inside: np.ndarray) -> list[tuple[int, int]]:
         """Neighbours in time without a pause between them, one of a part and one of the map."""
@@ -254,11 +279,12 @@ class _Joining:
         near = near[np.isin(near[:, 0], rows) & np.isin(near[:, 1], inside)]
         return sorted(((int(f), int(g)) for f, g in near), key=min)
 
-    def _over_break(self, rows: np.ndarray, inside: np.ndarray) -> Sim3 | None:
-        """The similarity that several pairs of frames across a short break agree on; None if its
-        surroundings refute it, or the part is not next to the map in time.
+    def _over_break(self, part: int, rows: np.ndarray, inside: np.ndarray) -> Sim3 | None:
+        """The similarity that several pairs of frames across a short break agree on; None if the
+        part is not next to the map in time, or its surroundings speak against it.
 
-        The camera cannot have moved far in between, so that a look-alike is unlikely here.
+        The camera cannot have moved far in between. A bay of a hall can be as near as the next one
+        is, though: what the surroundings do not confirm must continue the map at its pace.
         """
         for outer, inner in self._breaks(rows, inside):
             earlier, later = (rows, inside) if outer < inner else (inside, rows)
@@ -280,8 +306,14 @@ class _Joining:
             logger.info(
                 "a part of %d frames continues the map across a break: %s", len(rows), evidence
             )
-            if not evidence.refuted:
-                return best.move
+            judged = self._at_pace(Judged(best, evidence), rows, inside)
+            evidence, move = judged.evidence, judged.proposal.move
+            if evidence.likely or (
+                not evidence.doubted
+                and continues(move, [(outer, inner)], (rows, inside), self.poses, self.times)
+            ):
+                return move
+            self.reasons[part] = f"not certain: {evidence}"
         return None
 
     def _is_level(self, rows: np.ndarray, inside: np.ndarray, move: Sim3) -> bool:
@@ -346,30 +378,72 @@ class _Joining:
         """
         return bool((self.recordings[self.components == self.current] == self.recordings[f]).any())
 
+    def _register_each(self, rows: np.ndarray, inside: np.ndarray) -> bool:
+        """True if any of some frames gets a pose from points of the map. Those next to the map in
+        time come first: the others walk on from them."""
+        num, away = len(inside), np.abs(rows[:, None] - inside).min(axis=1)
+        for f in rows[np.argsort(away, kind="stable")].tolist():
+            if self._is_of_map(f) and self._register(f, inside):
+                inside = np.sort(np.append(inside, f))
+        return len(inside) > num
+
     def _register(self, f: int, inside: np.ndarray) -> bool:
         """True if a single frame gets an accepted pose from points of the map; the map then holds
         it."""
         chosen = self._candidates(np.array([f]), inside, 2 * _NUM_CANDIDATES)
         for strongest in (True, False):
-            rows, points = self._sightings(f, chosen, strongest)
-            if len(rows) == 0:
+            found = self._resected(f, *self._sightings(f, chosen, strongest))
+            if found is None:
                 continue
-            bearings = self.context.keypoints.bearings_of(f)[rows]
-            settings = self.context.settings
-            found = resect(bearings, points, settings.verify, settings.seed)
-            if found is None or found.reason or not self._in_reach(f, found.world_T_rig):
-                continue
-            if self._shows_map(f, inside, found.world_T_rig):
-                self.moves[f] = Sim3.of(1.0, found.world_T_rig @ inverse(self.poses[f]))
-                self.poses[f] = found.world_T_rig
+            world_T_rig = self._resected_at_pace(f, inside, found.world_T_rig)
+            if world_T_rig is not None and self._shows_map(f, inside, world_T_rig):
+                self.moves[f] = Sim3.of(1.0, world_T_rig @ inverse(self.poses[f]))
+                self.poses[f] = world_T_rig
                 self.components[f] = self.current
                 self.met[f] = self.alone[f] = True
                 return True
         return False
 
+    def _resected(self, f: int, rows: np.ndarray, points: np.ndarray) -> Resection | None:
+        """Accepted pose of a frame whose keypoints (m,) may observe points (m, 3)."""
+        if len(rows) == 0:
+            return None
+        settings, bearings = self.context.settings, self.context.keypoints.bearings_of(f)[rows]
+        found = resect(bearings, points, settings.verify, settings.seed)
+        if found is None or found.reason or not self._in_reach(f, found.world_T_rig):
+            return None
+        return found
+
+    def _resected_at_pace(self, f: int, inside: np.ndarray, found: np.ndarray) -> np.ndarray | None:
+        """A frame's pose (4, 4) as found; or where the camera would walk on to it at an unusual
+        pace, one at the usual pace. None if there is none over missing frames."""
+        rows = np.array([f])
+        given = self._breaks_of_recording(rows, inside), (rows, inside), self.poses, self.times
+        move = Sim3.of(1.0, found @ inverse(self.poses[f]))
+        if not given[0] or continues(move, *given):
+            return found
+        missing = over_missing_frames(self.times, self.recordings)
+        if self._is_held_by_trajectory(rows) or not any(missing[min(step)] for step in given[0]):
+            return found
+        poses, best, most = self.poses.copy(), None, 0
+        for moved in at_usual_pace(move, *given):
+            poses[f] = moved.poses(self.poses[rows])[0]
+            near = np.argsort(np.linalg.norm(poses[inside, :3, 3] - poses[f, :3, 3], axis=1))
+            near = inside[near[: 2 * _NUM_CANDIDATES]]
+            chosen = np.column_stack([near, np.full(len(near), f)])
+            gates = [Gate.around_points(GATE_RAD)] * len(chosen)
+            matches = self.context.match(chosen, poses, gates, self.known, guided_only=True)
+            other = self._resected(f, *_each_once(*self._points_seen(matches, 1), self.depth))
+            if other is not None and other.inliers.sum() > most:
+                there = Sim3.of(1.0, other.world_T_rig @ inverse(self.poses[f]))
+                if continues(there, *given):
+                    best, most = other.world_T_rig, int(other.inliers.sum())
+        return best
+
     def _shows_map(self, f: int, inside: np.ndarray, world_T_rig: np.ndarray) -> bool:
         """True unless a single frame shows next to nothing of the map around it: a look-alike
-        poster brings no surroundings."""
+        poster brings no surroundings. One that is not next to the map in time must show as much as
+        a place of the map does: a look-alike bay brings some."""
         poses = self.poses.copy()
         poses[f] = world_T_rig
         if self.usual_anywhere is None:
@@ -378,7 +452,9 @@ class _Joining:
             self.usual_anywhere = usual
         groups, places = (np.array([f]), inside), Places(poses, self.known)
         given = self.context, places, groups, self.usual_anywhere, self.depth
-        return not join_evidence.weigh(*given, surfaces=False)[0].absent
+        evidence = join_evidence.weigh(*given, surfaces=False)[0]
+        beside = self._breaks_of_recording(groups[0], inside)
+        return not evidence.absent if beside else evidence.likely
 
     def _sightings(
         self, f: int, chosen: np.ndarray, strongest: bool
@@ -387,17 +463,19 @@ class _Joining:
         nowhere = np.tile(np.eye(4), (len(self.parts), 1, 1))
         gates = [Gate.anywhere()] * len(chosen)
         found = self.context.match(chosen, nowhere, gates, strongest=strongest)
+        return _each_once(*self._points_seen(found, 0), self.depth)
+
+    def _points_seen(self, matches: Matches, column: int) -> tuple[np.ndarray, np.ndarray]:
+        """Keypoints (m,) of the frame in one column of all pairs, and points (m, 3) of the map that
+        the other frames' matched keypoints observe."""
         rows, points = [np.zeros(0, np.int32)], [np.zeros((0, 3))]
-        for p, (_, g) in enumerate(chosen.tolist()):
-            matched = found.of(p)
-            known = self.known[g][matched[:, 1]]
+        for p, pair in enumerate(matches.pairs.tolist()):
+            matched, g = matches.of(p), pair[1 - column]
+            known = self.known[g][matched[:, 1 - column]]
             seen = np.isfinite(known).all(axis=1)
-            rows.append(matched[seen, 0])
+            rows.append(matched[seen, column])
             points.append(known[seen] @ self.poses[g, :3, :3].T + self.poses[g, :3, 3])
-        rows, points = np.concatenate(rows), np.concatenate(points)
-        once = np.round(points / max(1e-6 * self.depth, 1e-12))
-        _, first = np.unique(np.column_stack([rows, once]), axis=0, return_index=True)
-        return rows[first], points[first]
+        return np.concatenate(rows), np.concatenate(points)
 
     def _in_reach(self, f: int, world_T_rig: np.ndarray) -> bool:
         """True if a frame is no further from its neighbours in time than the camera can have
@@ -476,6 +554,13 @@ class _Joining:
             offsets[group] = positions[groups[0]].mean(axis=0) + away
             offsets[group] -= positions[group].mean(axis=0)
         return offsets
+
+
+def _each_once(rows: np.ndarray, points: np.ndarray, depth: float) -> tuple[np.ndarray, np.ndarray]:
+    """Sightings, keypoints (m,) and points (m, 3), without those that occur twice."""
+    once = np.round(points / max(1e-6 * depth, 1e-12))
+    _, first = np.unique(np.column_stack([rows, once]), axis=0, return_index=True)
+    return rows[first], points[first]
 
 
 def _moved(

@@ -31,7 +31,7 @@ from gsba.placement.placement import metres_per_unit
 from gsba.splat import refinement
 from gsba.splat.refinement import SplatResult
 from gsba.store.store import digest
-from gsba.trajectory import steps
+from gsba.trajectory import judgement, steps
 from gsba.types import PoseStatus, Reconstruction, Solution, Tracks
 
 _MIN_BRIDGING = 12  # points of three frames, without which the scale is open: in rendered tours up
@@ -100,7 +100,8 @@ def tracks_of(state: State) -> Tracks:
 def separate_parts(state: State) -> np.ndarray | None:
     """Parts (F,) of the map that no step ties together; None = it is in one piece.
 
-    Without a trajectory, steps also part where too few points see both: the scale is open there.
+    Without a trajectory, steps also part where too few points see both, as the scale is open there,
+    and where they are walked at an unusual pace over missing frames.
 
     Raises:
         GsbaError: there is no map at all, so that nothing could be registered against it.
@@ -124,7 +125,15 @@ def separate_parts(state: State) -> np.ndarray | None:
         loose[[0, -1]] = False
         open_at = set(np.flatnonzero(loose).tolist())
         near = steps.without_steps(near, steps.given_up(open_at, matches))
+        near = steps.without_steps(near, set(np.flatnonzero(_unusual_paces(state)).tolist()))
     return connectivity.parted(near.matches.pairs, nothing, scarce)
+
+
+def _unusual_paces(state: State) -> np.ndarray:
+    """Unguided steps (F - 1,) bool over missing frames, walked at an unusual pace in the map."""
+    frames, unguided = state.run.frames, state.prior.unguided
+    given = state.solution.world_T_rigs, frames.timestamps, frames.recording_of_frame
+    return judgement.unusual_paces(*given) & unguided[1:] & unguided[:-1]
 
 
 def merge_maps(state: State, parts: np.ndarray) -> State:
@@ -132,7 +141,7 @@ def merge_maps(state: State, parts: np.ndarray) -> State:
     run, prior, trust, solution = state.run, state.prior, state.prior.trust, state.solution
 
     def compute() -> Registered:
-        held, shown = trust.held_steps, ~trust.unseen_steps
+        held, shown = trust.held_steps, ~(trust.unseen_steps | _unusual_paces(state))
         open_scale = prior.unguided[1:] & prior.unguided[:-1]
         if open_scale.any():  # images show a step between parts, but not how long it is
             fed = ~connectivity.starving(solution, run.settings.rounds.min_observations)

@@ -30,6 +30,9 @@ _OUTLIER_RATIO = 4.0
 # Standard deviations of the trajectory by which a step may be off that only frames around it show.
 _UNSEEN_SIGMAS = 2.0
 _STEPS_AROUND = 6  # steps to either side whose lengths a step's is compared with
+_MIN_INTERVAL_RATIO = 1.5  # interval over missing frames, in median ones
+_STEPS_BESIDE = 4  # nearest steps whose direction is compared
+_PACES = 0.6, 1.6  # slowest and fastest speed of such a step, in that of the steps around
 _MIN_JUDGED_STEPS = 6  # least steps of which any length is compared
 
 
@@ -174,6 +177,51 @@ def implausible_steps(
         unusual = speeds[n] - np.median(speeds[around])
         wrong[step] = abs(off) > limits[step] and abs(unusual - off) < abs(unusual)
     return wrong
+
+
+def over_missing_frames(timestamps: np.ndarray, recordings: np.ndarray) -> np.ndarray:
+    """Steps (F - 1,) bool within recordings that take longer than usual there.
+
+    Args:
+        timestamps: (F,) seconds.
+        recordings: (F,) int, number of each frame's recording.
+    """
+    found = np.zeros(len(timestamps) - 1, bool)
+    for number in np.unique(recordings):
+        rows = np.flatnonzero(recordings == number)
+        intervals = np.diff(timestamps[rows])
+        if len(intervals):
+            found[rows[:-1]] = intervals > _MIN_INTERVAL_RATIO * np.median(intervals)
+    return found
+
+
+def unusual_paces(
+    world_T_rigs: np.ndarray, timestamps: np.ndarray, recordings: np.ndarray
+) -> np.ndarray:
+    """Steps (F - 1,) bool over missing frames that are walked much slower or faster than those
+    around, or back.
+
+    Where frames are missing, the view changes more, and in a hall of bays the next bay may match
+    better than the same one: then hundreds of matches agree on a step that is a bay too short.
+
+    Args:
+        world_T_rigs: (F, 4, 4) poses in a map of the images.
+        timestamps, recordings: see `over_missing_frames`.
+    """
+    missing = over_missing_frames(timestamps, recordings)
+    usual = ~missing & (recordings[1:] == recordings[:-1])
+    velocities = np.diff(world_T_rigs[:, :3, 3], axis=0) / np.diff(timestamps)[:, None]
+    speeds = np.linalg.norm(velocities, axis=1)
+    unusual = np.zeros(len(missing), bool)
+    for step in np.flatnonzero(missing).tolist():
+        around = np.arange(max(step - _STEPS_AROUND, 0), min(step + _STEPS_AROUND + 1, len(speeds)))
+        around = around[usual[around] & (recordings[around] == recordings[step])]
+        if len(around):
+            speed = float(np.median(speeds[around]))
+            near = around[np.argsort(np.abs(around - step), kind="stable")][:_STEPS_BESIDE]
+            back = velocities[step] @ velocities[near].sum(axis=0) < 0
+            unusual[step] = back or not _PACES[0] * speed < speeds[step] < _PACES[1] * speed
+    return unusual
 
 
 def without_steps(coarse: CoarsePoses, trust: StepChecks, steps: np.ndarray) -> StepChecks:

@@ -303,13 +303,31 @@ def test_the_order_of_names_suffices_without_a_trajectory(tmp_path: Path) -> Non
         write_image(tmp_path / f"{name}.jpg")
     frames = scan(tmp_path, order_suffices=True)
     assert frames.names == ("f1", "f2", "f10", "f11") and not frames.timed
-    np.testing.assert_array_equal(frames.timestamps, [0, 1, 2, 3])
+    np.testing.assert_array_equal(frames.timestamps, [0, 1, 9, 10])  # seven are missing
     frames = scan(tmp_path, fps=2, order_suffices=True)
     assert not frames.timed
-    np.testing.assert_array_equal(frames.timestamps, [0, 0.5, 1, 1.5])
+    np.testing.assert_array_equal(frames.timestamps, [0, 0.5, 4.5, 5])
     (tmp_path / "timestamps.csv").write_text("f1,5\nf2,6\nf10,9\nf11,7\n")
     frames = scan(tmp_path, order_suffices=True)
     assert frames.timed and frames.names == ("f1", "f2", "f11", "f10")
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        ("0030 0060 0120 0150 0180", [0, 1, 3, 4, 5]),
+        ("0 1 2 7 11 12 20", [0, 1, 2, 3, 4, 5, 6]),  # half of them skip: they count otherwise
+        ("a1 a2 b1 b3", [0, 1, 2, 3]),
+        ("20261126_101558 20261126_101559 20261126_101600 20261126_101601", [0, 1, 2, 3]),
+        ("one three two", [0, 1, 2]),
+    ],
+)
+def test_numbers_that_names_skip_are_missing_frames(
+    names: str, expected: list[float], tmp_path: Path
+) -> None:
+    for name in names.split():
+        write_image(tmp_path / f"{name}.jpg")
+    np.testing.assert_array_equal(scan(tmp_path, order_suffices=True).timestamps, expected)
 
 
 @pytest.mark.parametrize("name", [b"a\xff.jpg", b"a\n.jpg"])

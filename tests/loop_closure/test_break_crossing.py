@@ -8,7 +8,13 @@ from scipy.spatial.transform import Rotation
 from two_maps import HALF, MOVE, NUM, SCALE, TRUTH, scene, torn
 
 from gsba.geometry import inverse
-from gsba.loop_closure.break_crossing import MIN_AGREEING, agreed, continues, crossing
+from gsba.loop_closure.break_crossing import (
+    MIN_AGREEING,
+    agreed,
+    at_usual_pace,
+    continues,
+    crossing,
+)
 from gsba.loop_closure.map_similarity import Proposal
 from gsba.matching import recovery
 from gsba.similarity import Sim3
@@ -63,29 +69,61 @@ def test_too_few_pairs_or_none_that_agree_join_nothing() -> None:
     assert agreed(apart, *given) is None
 
 
+BEFORE, TIMES = np.arange(HALF), np.arange(NUM, dtype=float)
+
+
+def _carried(paces: float, turn_deg: float = 0.0) -> Sim3:
+    """The second half turned, and moved along the step before it until that is some usual steps
+    long."""
+    step = TRUTH[HALF, :3, 3] - TRUTH[HALF - 1, :3, 3]
+    moved = TRUTH[HALF].copy()
+    moved[:3, :3] = moved[:3, :3] @ Rotation.from_euler("y", turn_deg, degrees=True).as_matrix()
+    moved[:3, 3] += (paces - 1) * step
+    return Sim3.of(1.0, moved @ inverse(TRUTH[HALF]))
+
+
 @pytest.mark.parametrize(
-    ("shift", "turn_deg", "expected"),
-    [(0.0, 0, True), (0.0, 50, True), (0.0, 90, False), (4.0, 0, False)],
+    ("paces", "turn_deg", "expected"),
+    [
+        (1.0, 0, True),
+        (1.0, 50, True),
+        (1.0, 90, False),
+        (5.0, 0, False),
+        (0.3, 0, False),
+        (-1.0, 0, False),
+    ],
 )
 def test_a_part_follows_a_map_only_as_a_camera_walks_on(
-    shift: float, turn_deg: float, expected: bool
+    paces: float, turn_deg: float, expected: bool
 ) -> None:
-    step = np.linalg.norm(TRUTH[HALF, :3, 3] - TRUTH[HALF - 1, :3, 3])
-    turn = Rotation.from_euler("y", turn_deg, degrees=True).as_matrix()
-    first = TRUTH[HALF]
-    moved = first.copy()
-    moved[:3, :3] = first[:3, :3] @ turn
-    moved[0, 3] += shift * step
-    move = Sim3.of(1.0, moved @ inverse(first))
-    inside, times = np.arange(HALF), np.arange(NUM, dtype=float)
-    assert continues(move, [(HALF, HALF - 1)], inside, TRUTH, times) == expected
+    move, breaks = _carried(paces, turn_deg), [(HALF, HALF - 1)]
+    assert continues(move, breaks, (OUTSIDE, BEFORE), TRUTH, TIMES) == expected
     # Reversed in time, the same.
-    backward = TRUTH[::-1], np.arange(NUM, dtype=float)
-    after = NUM - 1 - HALF
-    assert continues(move, [(after, after + 1)], NUM - 1 - inside[::-1], *backward) == expected
+    after, sides = NUM - 1 - HALF, tuple(NUM - 1 - rows[::-1] for rows in (OUTSIDE, BEFORE))
+    assert continues(move, [(after, after + 1)], sides, TRUTH[::-1], TIMES) == expected
+
+
+@pytest.mark.parametrize("paces", [0.3, -0.6, 2.6])
+@pytest.mark.parametrize("pause", [1.0, 2.0])
+def test_a_part_a_bay_away_is_moved_to_where_the_camera_walks_on(
+    paces: float, pause: float
+) -> None:
+    times = TIMES + (pause - 1) * (TIMES >= HALF)
+    given = [(HALF, HALF - 1)], (OUTSIDE, BEFORE), TRUTH, times
+    moves = at_usual_pace(_carried(paces), *given)
+    assert moves and all(continues(move, *given) for move in moves)
+    step, true = TRUTH[HALF, :3, 3] - TRUTH[HALF - 1, :3, 3], TRUTH[HALF, :3, 3]
+    off = [
+        np.linalg.norm(move.poses(TRUTH[[HALF]])[0, :3, 3] - true - (pause - 1) * step)
+        for move in moves
+    ]
+    assert min(off) < 0.1 * pause * np.linalg.norm(step)
+    alone = np.array([HALF])  # a single frame has no direction of its own
+    assert len(at_usual_pace(_carried(paces), given[0], (alone, BEFORE), *given[2:])) < len(moves)
 
 
 def test_a_part_follows_nothing_without_a_break_or_steps_of_the_map() -> None:
-    times = np.arange(NUM, dtype=float)
-    assert not continues(Sim3(), [], np.arange(HALF), TRUTH, times)
-    assert not continues(Sim3(), [(HALF, HALF - 1)], np.array([0, HALF - 1]), TRUTH, times)
+    apart = np.array([0, HALF - 1])
+    for breaks, inside in (([], BEFORE), ([(HALF, HALF - 1)], apart)):
+        given = breaks, (OUTSIDE, inside), TRUTH, TIMES
+        assert not continues(Sim3(), *given) and not at_usual_pace(Sim3(), *given)

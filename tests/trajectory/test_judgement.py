@@ -303,3 +303,22 @@ def test_of_two_lengths_of_a_step_the_more_usual_speed_is_taken(
     np.testing.assert_array_equal(np.flatnonzero(wrong), [] if expected is False else [step])
     untracked = replace(coarse, sources=np.full(NUM_FRAMES, PoseSource.INTERPOLATED, np.uint8))
     assert not judgement.implausible_steps(untracked, trust, *given).any()
+
+
+@pytest.mark.parametrize("interval", [1.0, 2.0])
+@pytest.mark.parametrize(
+    ("paces", "unusual"), [(1.0, False), (0.7, False), (0.4, True), (2.0, True), (-0.7, True)]
+)
+def test_a_step_over_missing_frames_is_walked_at_the_usual_pace_or_doubted(
+    paces: float, unusual: bool, interval: float
+) -> None:
+    step, times = NUM_FRAMES // 2, np.arange(NUM_FRAMES, dtype=float)
+    times[step + 1 :] += interval - 1
+    found = TRUTH.copy()
+    motion = TRUTH[step + 1, :3, 3] - TRUTH[step, :3, 3]
+    found[step + 1 :, :3, 3] += (paces * interval - 1) * motion
+    doubted = judgement.unusual_paces(found, times, np.zeros(NUM_FRAMES, int))
+    expected = [step] if unusual and interval > 1 else []
+    np.testing.assert_array_equal(np.flatnonzero(doubted), expected)
+    other = np.arange(NUM_FRAMES) > step  # a recording of its own
+    assert not judgement.unusual_paces(found, times, other.astype(int)).any()
