@@ -10,7 +10,9 @@ from two_maps import HALF, MOVE, NUM, SCALE, TRUTH, scene, torn
 from gsba.geometry import inverse, pose, rotation_angle
 from gsba.loop_closure import connectivity, join_evidence, map_merging
 from gsba.loop_closure.join_evidence import JoinEvidence
+from gsba.loop_closure.map_similarity import Proposal
 from gsba.loop_closure.merged_map import Registered, follow
+from gsba.loop_closure.registration import Resection
 from gsba.similarity import Sim3
 from gsba.trajectory.joining import GUESS, PLACES, SegmentAlignment
 from gsba.trajectory.judgement import StepChecks
@@ -129,6 +131,51 @@ def test_a_likely_join_is_taken_where_the_camera_walks_on(
     assert found.components.any() != joined
     if joined:
         assert _errors(found, truth)[0] < 0.02
+
+
+@pytest.mark.parametrize("held", [False, True])
+def test_a_join_a_bay_off_is_left_for_one_at_the_usual_pace(
+    held: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Pairs over the break agree on a step that leads back; a trajectory would know better."""
+    context, whole, late = scene()
+    parts, true = torn(whole, late, SCALE, MOVE), Sim3.of(SCALE, MOVE).inverse()
+    step = TRUTH[HALF, :3, 3] - TRUTH[HALF - 1, :3, 3]
+    bay_off = replace(true, translation=true.translation - 1.4 * step)
+    false = Proposal(bay_off, (HALF, HALF - 1), 100)
+    monkeypatch.setattr(map_merging, "agreed", lambda *_: false)
+    monkeypatch.setattr(map_merging._Joining, "_meetings", lambda *_: [])
+    monkeypatch.setattr(map_merging._Joining, "_plausible", lambda *_: True)
+    found = map_merging.merge(context, parts, _halves(), BREAK & held, ~BREAK, TIMES)
+    assert not found.components.any()
+    assert (_errors(found)[0] < 0.05) != held
+
+
+@pytest.mark.parametrize("missing", [True, False])
+def test_a_frame_a_bay_off_is_registered_at_the_usual_pace(
+    missing: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where frames are missing beside it; else it is where its points say."""
+    context, whole, _ = scene()
+    whole, f = _without_map(whole, (7,)), 7
+    times = TIMES + 0.55 * missing * ((TIMES >= f).astype(float) + (TIMES > f))
+    step, calls = TRUTH[f, :3, 3] - TRUTH[f - 1, :3, 3], list[int]()
+    resect = map_merging.resect
+
+    def misled(*given) -> Resection | None:
+        found = resect(*given)
+        calls.append(f)
+        if found is None or len(calls) > 1:
+            return found
+        moved = found.world_T_rig.copy()
+        moved[:3, 3] -= 1.4 * step
+        return replace(found, world_T_rig=moved)
+
+    monkeypatch.setattr(map_merging, "resect", misled)
+    monkeypatch.setattr(map_merging._Joining, "_shows_map", lambda *_: True)
+    found = map_merging.merge(context, whole, _halves((f,)), NOBODY, NOBODY, times)
+    off = _errors(found)[0]
+    assert found.alone[f] and (off < 0.02) == missing
 
 
 def test_strangers_stay_apart() -> None:
