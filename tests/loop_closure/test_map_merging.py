@@ -158,7 +158,7 @@ def test_a_frame_a_bay_off_is_registered_at_the_usual_pace(
     """Where frames are missing beside it; else it is where its points say."""
     context, whole, _ = scene()
     whole, f = _without_map(whole, (7,)), 7
-    times = TIMES + 0.55 * missing * ((TIMES >= f).astype(float) + (TIMES > f))
+    times = TIMES + 0.55 * missing * ((f <= TIMES).astype(float) + (f < TIMES))
     step, calls = TRUTH[f, :3, 3] - TRUTH[f - 1, :3, 3], list[int]()
     resect = map_merging.resect
 
