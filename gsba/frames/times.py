@@ -231,18 +231,23 @@ def _relative_times(names: Sequence[str]) -> np.ndarray:
     """Numbers (F,) that names end in, from 0 and in their usual difference: where some are skipped,
     frames are missing. The order of the names where most do not differ by the same, or names are
     dates."""
-    order = np.arange(len(names), dtype=np.float64)
-    split = [re.fullmatch(r"(.*?)([0-9]{1,15})", name) for name in names]
-    found = [m.groups() for m in split if m]
-    if len(found) < len(names) or len({prefix for prefix, _ in found}) != 1 or len(names) < 2:
+    order, digits = np.arange(len(names), dtype=np.float64), _last_digits(names)
+    if len(names) < 2 or digits is None or any(re.search(_DATE, name) for name in names):
         return order
-    if any(re.search(_DATE, name) for name in names):
-        return order
-    numbers = np.array([float(digits) for _, digits in found])
+    numbers = np.array([float(int(one) - int(digits[0])) for one in digits])
     steps = np.diff(numbers)
     usual = float(np.median(steps))
     even = usual > 0 and 2 * np.count_nonzero(steps == usual) > len(steps) and steps.min() > 0
-    return (numbers - numbers[0]) / usual if even else order
+    return numbers / usual if even else order
+
+
+def _last_digits(names: Sequence[str]) -> list[str] | None:
+    """Digits (F,) that names end in after a common prefix; None = other names."""
+    split = [re.fullmatch(r"(.*?)([0-9]+)", name) for name in names]
+    found = [m.groups() for m in split if m]
+    if len(found) < len(names) or len({prefix for prefix, _ in found}) != 1:
+        return None
+    return [digits for _, digits in found]
 
 
 def _times_from_names(names: Sequence[str]) -> np.ndarray | None:
@@ -256,13 +261,11 @@ def _times_from_names(names: Sequence[str]) -> np.ndarray | None:
             raise NoTimesError(f"names like '{names[0]}' are too close to be seconds; {_ADVICE}")
         _log.info("frame times are the file names, in seconds")
         return times
-    split = [re.fullmatch(r"(.*?)([0-9]+)", name) for name in names]
-    found = [m.groups() for m in split if m]
-    units = {unix_unit(digits) for _, digits in found}
-    prefixes = {prefix for prefix, _ in found}
-    if len(found) == len(names) and len(prefixes) == 1 and len(units) == 1 and None not in units:
+    digits = _last_digits(names) or []
+    units = {unix_unit(one) for one in digits}
+    if len(units) == 1 and None not in units:
         _log.info("frame times are the file names, Unix time in %s", units.pop())
-        return np.array([seconds(digits) for _, digits in found])
+        return np.array([seconds(one) for one in digits])
     return None
 
 

@@ -6,7 +6,7 @@ units of that step. Points of one of the maps give the step's length in its unit
 together give the ratio of their units.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,7 +24,7 @@ _REACH = 4  # steps of the map before or after a break that tell how fast the ca
 # Slowest and fastest motion over a break, in the median of these steps: other bays are elsewhere.
 _MIN_PACES, _MAX_PACES = 0.5, 1.5
 _MAX_TURN_RAD = np.deg2rad(60.0)  # largest turn over a break
-_PACES = 0.8, 0.9, 1.0, 1.1, 1.25  # lengths of a step over a break that are tried, in the usual one
+_TRIED_PACES = 0.8, 0.9, 1.0, 1.1, 1.25  # lengths of a step over a break, in the usual one
 
 
 def crossing(
@@ -78,103 +78,74 @@ def agreed(proposals: list[Proposal], poses: np.ndarray, depth: float) -> Propos
     return proposals[int(np.argmax(counts))]
 
 
-def continues(
-    move: Sim3,
-    breaks: list[tuple[int, int]],
-    sides: tuple[np.ndarray, np.ndarray],
-    poses: np.ndarray,
-    timestamps: np.ndarray,
-) -> bool:
-    """True if a part, once moved, follows the map as a camera that walks on: at each break about as
-    far away as it goes in that time, not back, and not turned about.
+@dataclass(frozen=True, slots=True)
+class Breaks:
+    """Breaks between a part and the map: where a camera that walks on can be behind them."""
 
-    Args:
-        move: carries the part to the map.
-        breaks: a frame outside the map and one inside, next to one another in time.
-        sides: frames (N,) of the part and (M,) of the map, ascending.
-        poses: (F, 4, 4), each frame's in its own map.
-        timestamps: (F,) seconds.
-    """
-    for f, g in breaks:
-        usual = _velocities(move, (f, g), sides, poses, timestamps)
-        if not len(usual):
-            return False
-        step = move.poses(poses[[f]])[0, :3, 3] - poses[g, :3, 3]
-        velocity = step / (timestamps[f] - timestamps[g])
-        paces = np.linalg.norm(velocity) / np.linalg.norm(usual[0])
-        if velocity @ usual[0] < 0 or not _MIN_PACES < paces < _MAX_PACES:
-            return False
-        if rotation_angle(poses[g, :3, :3].T @ move.poses(poses[[f]])[0, :3, :3]) > _MAX_TURN_RAD:
-            return False
-    return bool(breaks)
+    steps: list[tuple[int, int]]  # a frame of the part and one of the map, next to one another in
+    # time
+    part: np.ndarray  # (N,) frames of the part, ascending
+    inside: np.ndarray  # (M,) frames of the map, ascending
+    poses: np.ndarray  # (F, 4, 4), each frame's in its own map
+    timestamps: np.ndarray  # (F,) seconds
 
+    def continued_by(self, move: Sim3) -> bool:
+        """True if a similarity lets the part follow the map as a camera that walks on: at each
+        break about as far away as it goes in that time, not back, and not turned about."""
+        for f, g in self.steps:
+            usual = self._velocities(move, f, g)
+            if not usual:
+                return False
+            moved, last = move.poses(self.poses[[f]])[0], self.poses[g]
+            velocity = (moved[:3, 3] - last[:3, 3]) / (self.timestamps[f] - self.timestamps[g])
+            paces = np.linalg.norm(velocity) / np.linalg.norm(usual[0])
+            if velocity @ usual[0] < 0 or not _MIN_PACES < paces < _MAX_PACES:
+                return False
+            if rotation_angle(last[:3, :3].T @ moved[:3, :3]) > _MAX_TURN_RAD:
+                return False
+        return bool(self.steps)
 
-def at_usual_pace(
-    move: Sim3,
-    breaks: list[tuple[int, int]],
-    sides: tuple[np.ndarray, np.ndarray],
-    poses: np.ndarray,
-    timestamps: np.ndarray,
-) -> list[Sim3]:
-    """Similarities that move a part as one does, and then along the camera's way until it walks on
-    over a break at about the usual pace.
+    def at_usual_pace(self, move: Sim3) -> list[Sim3]:
+        """Similarities that move the part as one does, and then along the camera's way until it
+        walks on over a break at about the usual pace.
 
-    In a hall of bays, matches over a break agree on steps that are one bay too short, or lead back.
+        In a hall of bays, matches over a break agree on steps that are one bay too short, or lead
+        back.
+        """
+        found = list[Sim3]()
+        for f, g in self.steps:
+            step = move.poses(self.poses[[f]])[0, :3, 3] - self.poses[g, :3, 3]
+            for velocity in self._velocities(move, f, g):
+                expected = velocity * (self.timestamps[f] - self.timestamps[g])
+                along = expected / np.linalg.norm(expected)
+                across = step - (step @ along) * along
+                found += [
+                    replace(move, translation=move.translation + across + paces * expected - step)
+                    for paces in _TRIED_PACES
+                ]
+        return found
 
-    Args:
-        move, breaks, sides, poses, timestamps: see `continues`.
-    """
-    found = list[Sim3]()
-    for f, g in breaks:
-        step = move.poses(poses[[f]])[0, :3, 3] - poses[g, :3, 3]
-        for velocity in _velocities(move, (f, g), sides, poses, timestamps):
-            expected = velocity * (timestamps[f] - timestamps[g])
-            along = expected / np.linalg.norm(expected)
-            across = step - (step @ along) * along
-            found += [
-                replace(move, translation=move.translation + across + paces * expected - step)
-                for paces in _PACES
-            ]
-    return found
+    def _velocities(self, move: Sim3, f: int, g: int) -> list[np.ndarray]:
+        """Velocities (3,) that the camera may have between frame f of the part, once moved, and
+        frame g of the map: at the usual speed of the map there, in the mean direction of the steps
+        before and behind, and in that of either; none where the map does not move."""
+        theirs = self._beside(g, f, self.inside)
+        ours = move.scale * self._beside(f, g, self.part) @ move.rotation.T
+        speed = float(np.median(np.linalg.norm(theirs, axis=1))) if len(theirs) else 0.0
+        nearest = [some[0] for some in (theirs, ours) if len(some) and some[0].any()]
+        ways = [first / np.linalg.norm(first) for first in nearest]
+        if not speed or not ways:
+            return []
+        ways = [np.mean(ways, axis=0), *ways] if len(ways) > 1 else ways
+        return [speed * way / np.linalg.norm(way) for way in ways if way.any()]
 
-
-def _velocities(
-    move: Sim3,
-    step: tuple[int, int],
-    sides: tuple[np.ndarray, np.ndarray],
-    poses: np.ndarray,
-    timestamps: np.ndarray,
-) -> list[np.ndarray]:
-    """Velocities (3,) that a camera may have over a break: at the usual speed of the map beside it,
-    in the mean direction of the steps before and behind, and in that of either; none where the map
-    does not move.
-
-    Args:
-        step: a frame outside the map and one inside.
-        move, sides, poses, timestamps: see `continues`.
-    """
-    f, g = step
-    theirs = _beside(g, f, sides[1], poses, timestamps)
-    ours = move.scale * _beside(f, g, sides[0], poses, timestamps) @ move.rotation.T
-    speed = float(np.median(np.linalg.norm(theirs, axis=1))) if len(theirs) else 0.0
-    ways = [
-        some[0] / np.linalg.norm(some[0]) for some in (theirs, ours) if len(some) and some[0].any()
-    ]
-    if not speed or not ways:
-        return []
-    ways = [np.mean(ways, axis=0), *ways] if len(ways) > 1 else ways
-    return [speed * way / np.linalg.norm(way) for way in ways if way.any()]
-
-
-def _beside(
-    g: int, f: int, rows: np.ndarray, poses: np.ndarray, timestamps: np.ndarray
-) -> np.ndarray:
-    """Velocities (n, 3) of at most `_REACH` steps of frames `rows` beside g, on the side away from
-    f, the nearest first."""
-    ends = g + np.sign(g - f) * np.arange(_REACH + 1)
-    ends = ends[: int(np.argmin(np.append(np.isin(ends, rows), False)))]
-    steps = np.diff(poses[ends, :3, 3], axis=0)
-    return steps / np.diff(timestamps[ends])[:, None]
+    def _beside(self, g: int, f: int, rows: np.ndarray) -> np.ndarray:
+        """Velocities (n, 3) of at most `_REACH` steps of frames `rows` beside g, on the side away
+        from f, the nearest first."""
+        ends = g + np.sign(g - f) * np.arange(_REACH + 1)
+        ends = ends[: int(np.argmin(np.append(np.isin(ends, rows), False)))]
+        steps = np.diff(self.poses[ends, :3, 3], axis=0)
+        return steps / np.diff(self.timestamps[ends])[:, None]
 
 
 def _step_length(known: np.ndarray, depths: np.ndarray) -> float | None:

@@ -14,7 +14,7 @@ import numpy as np
 
 from gsba.geometry import angles_between, inverse, unit
 from gsba.loop_closure import join_evidence, loops
-from gsba.loop_closure.break_crossing import agreed, at_usual_pace, continues, crossing
+from gsba.loop_closure.break_crossing import Breaks, agreed, crossing
 from gsba.loop_closure.connectivity import MIN_MAP_FRAMES, by_size
 from gsba.loop_closure.join_evidence import GATE_RAD, Places, Rates
 from gsba.loop_closure.join_test import JoinTest, Judged
@@ -240,37 +240,35 @@ class _Joining:
         look-alikes are elsewhere, or turned about."""
         breaks = self._breaks_of_recording(rows, inside)
         return [
-            one
-            for one in weighed
-            if one.evidence.likely
-            and continues(one.proposal.move, breaks, (rows, inside), self.poses, self.times)
+            one for one in weighed if one.evidence.likely and breaks.continued_by(one.proposal.move)
         ]
 
     def _at_pace(self, found: Judged, rows: np.ndarray, inside: np.ndarray) -> Judged:
-        """What was found; or where it lets the camera walk on at an unusual pace, what continues
-        the map at the usual one, unless its surroundings speak against that."""
-        given = self._breaks_of_recording(rows, inside), (rows, inside), self.poses, self.times
+        """The proposal found; or where it lets the camera walk on at an unusual pace, one that
+        continues the map at the usual pace, unless its surroundings speak against that."""
+        breaks = self._breaks_of_recording(rows, inside)
         held = self._is_held_by_trajectory(rows)  # which knows more than the pace
-        if held or not given[0] or continues(found.proposal.move, *given):
+        if held or not breaks.steps or breaks.continued_by(found.proposal.move):
             return found
         meetings, usual = list[Meeting](), list[Judged]()
-        for move in at_usual_pace(found.proposal.move, *given):
+        for move in breaks.at_usual_pace(found.proposal.move):
             meetings += self.test.meetings(self.test.weigh(rows, inside, move)[1], rows)
         for proposal in propose(meetings, self.poses, self.depth, self.context.settings.seed):
             one = self.test.judge(proposal, rows, inside, usual)
             if (
                 one
                 and not one.evidence.doubted
-                and continues(one.proposal.move, *given)
+                and breaks.continued_by(one.proposal.move)
                 and self._is_level(rows, inside, one.proposal.move)
             ):
                 usual.append(one)
         return max(usual, key=lambda one: one.evidence.margin(), default=found)
 
-    def _breaks_of_recording(self, rows: np.ndarray, inside: np.ndarray) -> list[tuple[int, int]]:
+    def _breaks_of_recording(self, rows: np.ndarray, inside: np.ndarray) -> Breaks:
         """Breaks between frames of one recording."""
         owners = self.recordings
-        return [(f, g) for f, g in self._breaks(rows, inside) if owners[f] == owners[g]]
+        steps = [(f, g) for f, g in self._breaks(rows, inside) if owners[f] == owners[g]]
+        return Breaks(steps, rows, inside, self.poses, self.times)
 
     def _breaks(self, rows: np.ndarray, inside: np.ndarray) -> list[tuple[int, int]]:
         """Neighbours in time without a pause between them, one of a part and one of the map."""
@@ -308,10 +306,8 @@ class _Joining:
             )
             judged = self._at_pace(Judged(best, evidence), rows, inside)
             evidence, move = judged.evidence, judged.proposal.move
-            if evidence.likely or (
-                not evidence.doubted
-                and continues(move, [(outer, inner)], (rows, inside), self.poses, self.times)
-            ):
+            here = Breaks([(outer, inner)], rows, inside, self.poses, self.times)
+            if evidence.likely or (not evidence.doubted and here.continued_by(move)):
                 return move
             self.reasons[part] = f"not certain: {evidence}"
         return None
@@ -397,7 +393,7 @@ class _Joining:
                 continue
             world_T_rig = self._resected_at_pace(f, inside, found.world_T_rig)
             if world_T_rig is not None and self._shows_map(f, inside, world_T_rig):
-                self.moves[f] = Sim3.of(1.0, world_T_rig @ inverse(self.poses[f]))
+                self.moves[f] = self._move_of(f, world_T_rig)
                 self.poses[f] = world_T_rig
                 self.components[f] = self.current
                 self.met[f] = self.alone[f] = True
@@ -415,18 +411,19 @@ class _Joining:
         return found
 
     def _resected_at_pace(self, f: int, inside: np.ndarray, found: np.ndarray) -> np.ndarray | None:
-        """A frame's pose (4, 4) as found; or where the camera would walk on to it at an unusual
+        """The pose (4, 4) found of a frame; or where the camera would walk on to it at an unusual
         pace, one at the usual pace. None if there is none over missing frames."""
-        rows = np.array([f])
-        given = self._breaks_of_recording(rows, inside), (rows, inside), self.poses, self.times
-        move = Sim3.of(1.0, found @ inverse(self.poses[f]))
-        if not given[0] or continues(move, *given):
+        rows, move = np.array([f]), self._move_of(f, found)
+        breaks = self._breaks_of_recording(rows, inside)
+        if not breaks.steps or breaks.continued_by(move):
             return found
         missing = over_missing_frames(self.times, self.recordings)
-        if self._is_held_by_trajectory(rows) or not any(missing[min(step)] for step in given[0]):
+        if self._is_held_by_trajectory(rows) or not any(
+            missing[min(step)] for step in breaks.steps
+        ):
             return found
         poses, best, most = self.poses.copy(), None, 0
-        for moved in at_usual_pace(move, *given):
+        for moved in breaks.at_usual_pace(move):
             poses[f] = moved.poses(self.poses[rows])[0]
             near = np.argsort(np.linalg.norm(poses[inside, :3, 3] - poses[f, :3, 3], axis=1))
             near = inside[near[: 2 * _NUM_CANDIDATES]]
@@ -434,11 +431,15 @@ class _Joining:
             gates = [Gate.around_points(GATE_RAD)] * len(chosen)
             matches = self.context.match(chosen, poses, gates, self.known, guided_only=True)
             other = self._resected(f, *_each_once(*self._points_seen(matches, 1), self.depth))
-            if other is not None and other.inliers.sum() > most:
-                there = Sim3.of(1.0, other.world_T_rig @ inverse(self.poses[f]))
-                if continues(there, *given):
-                    best, most = other.world_T_rig, int(other.inliers.sum())
+            if other is None or other.inliers.sum() <= most:
+                continue
+            if breaks.continued_by(self._move_of(f, other.world_T_rig)):
+                best, most = other.world_T_rig, int(other.inliers.sum())
         return best
+
+    def _move_of(self, f: int, world_T_rig: np.ndarray) -> Sim3:
+        """The similarity that carries a single frame to a pose (4, 4)."""
+        return Sim3.of(1.0, world_T_rig @ inverse(self.poses[f]))
 
     def _shows_map(self, f: int, inside: np.ndarray, world_T_rig: np.ndarray) -> bool:
         """True unless a single frame shows next to nothing of the map around it: a look-alike
@@ -453,7 +454,7 @@ class _Joining:
         groups, places = (np.array([f]), inside), Places(poses, self.known)
         given = self.context, places, groups, self.usual_anywhere, self.depth
         evidence = join_evidence.weigh(*given, surfaces=False)[0]
-        beside = self._breaks_of_recording(groups[0], inside)
+        beside = self._breaks_of_recording(groups[0], inside).steps
         return not evidence.absent if beside else evidence.likely
 
     def _sightings(

@@ -32,7 +32,7 @@ _UNSEEN_SIGMAS = 2.0
 _STEPS_AROUND = 6  # steps to either side whose lengths a step's is compared with
 _MIN_INTERVAL_RATIO = 1.5  # interval over missing frames, in median ones
 _STEPS_BESIDE = 4  # nearest steps whose direction is compared
-_PACES = 0.6, 1.6  # slowest and fastest speed of such a step, in that of the steps around
+_USUAL_PACES = 0.6, 1.6  # slowest and fastest speed of such a step, in that of the steps around
 _MIN_JUDGED_STEPS = 6  # least steps of which any length is compared
 
 
@@ -212,7 +212,7 @@ def unusual_paces(
     usual = ~missing & (recordings[1:] == recordings[:-1])
     velocities = np.diff(world_T_rigs[:, :3, 3], axis=0) / np.diff(timestamps)[:, None]
     speeds = np.linalg.norm(velocities, axis=1)
-    unusual = np.zeros(len(missing), bool)
+    unusual, (slowest, fastest) = np.zeros(len(missing), bool), _USUAL_PACES
     for step in np.flatnonzero(missing).tolist():
         around = np.arange(max(step - _STEPS_AROUND, 0), min(step + _STEPS_AROUND + 1, len(speeds)))
         around = around[usual[around] & (recordings[around] == recordings[step])]
@@ -220,7 +220,7 @@ def unusual_paces(
             speed = float(np.median(speeds[around]))
             near = around[np.argsort(np.abs(around - step), kind="stable")][:_STEPS_BESIDE]
             back = velocities[step] @ velocities[near].sum(axis=0) < 0
-            unusual[step] = back or not _PACES[0] * speed < speeds[step] < _PACES[1] * speed
+            unusual[step] = back or not slowest * speed < speeds[step] < fastest * speed
     return unusual
 
 

@@ -96,7 +96,7 @@ def _fine_rays(width: int, height: int) -> np.ndarray:
 
 
 def _around(rays: np.ndarray, world_T_rig: np.ndarray, tag: np.ndarray) -> np.ndarray:
-    """Whether rays (H, W, 3) of the rig pass through the sphere around a tag and its border."""
+    """Pixels (H, W) bool whose rays (H, W, 3) of the rig meet the sphere around a tag."""
     centre = world_T_rig[:3, :3].T @ (tag[:3, 3] - world_T_rig[:3, 3])
     along = rays @ centre
     return (centre @ centre - along**2 < (0.9 * TAG) ** 2) & (along > 0)

@@ -10,9 +10,8 @@ from two_maps import HALF, MOVE, NUM, SCALE, TRUTH, scene, torn
 from gsba.geometry import inverse
 from gsba.loop_closure.break_crossing import (
     MIN_AGREEING,
+    Breaks,
     agreed,
-    at_usual_pace,
-    continues,
     crossing,
 )
 from gsba.loop_closure.map_similarity import Proposal
@@ -96,11 +95,13 @@ def _carried(paces: float, turn_deg: float = 0.0) -> Sim3:
 def test_a_part_follows_a_map_only_as_a_camera_walks_on(
     paces: float, turn_deg: float, expected: bool
 ) -> None:
-    move, breaks = _carried(paces, turn_deg), [(HALF, HALF - 1)]
-    assert continues(move, breaks, (OUTSIDE, BEFORE), TRUTH, TIMES) == expected
+    move = _carried(paces, turn_deg)
+    breaks = Breaks([(HALF, HALF - 1)], OUTSIDE, BEFORE, TRUTH, TIMES)
+    assert breaks.continued_by(move) == expected
     # Reversed in time, the same.
-    after, sides = NUM - 1 - HALF, tuple(NUM - 1 - rows[::-1] for rows in (OUTSIDE, BEFORE))
-    assert continues(move, [(after, after + 1)], sides, TRUTH[::-1], TIMES) == expected
+    after, sides = NUM - 1 - HALF, [NUM - 1 - rows[::-1] for rows in (OUTSIDE, BEFORE)]
+    backward = Breaks([(after, after + 1)], *sides, TRUTH[::-1], TIMES)
+    assert backward.continued_by(move) == expected
 
 
 @pytest.mark.parametrize("paces", [0.3, -0.6, 2.6])
@@ -109,21 +110,21 @@ def test_a_part_a_bay_away_is_moved_to_where_the_camera_walks_on(
     paces: float, pause: float
 ) -> None:
     times = TIMES + (pause - 1) * (TIMES >= HALF)
-    given = [(HALF, HALF - 1)], (OUTSIDE, BEFORE), TRUTH, times
-    moves = at_usual_pace(_carried(paces), *given)
-    assert moves and all(continues(move, *given) for move in moves)
+    breaks = Breaks([(HALF, HALF - 1)], OUTSIDE, BEFORE, TRUTH, times)
+    moves = breaks.at_usual_pace(_carried(paces))
+    assert moves and all(map(breaks.continued_by, moves))
     step, true = TRUTH[HALF, :3, 3] - TRUTH[HALF - 1, :3, 3], TRUTH[HALF, :3, 3]
     off = [
         np.linalg.norm(move.poses(TRUTH[[HALF]])[0, :3, 3] - true - (pause - 1) * step)
         for move in moves
     ]
     assert min(off) < 0.1 * pause * np.linalg.norm(step)
-    alone = np.array([HALF])  # a single frame has no direction of its own
-    assert len(at_usual_pace(_carried(paces), given[0], (alone, BEFORE), *given[2:])) < len(moves)
+    alone = replace(breaks, part=np.array([HALF]))  # a single frame has no direction of its own
+    assert len(alone.at_usual_pace(_carried(paces))) < len(moves)
 
 
 def test_a_part_follows_nothing_without_a_break_or_steps_of_the_map() -> None:
     apart = np.array([0, HALF - 1])
-    for breaks, inside in (([], BEFORE), ([(HALF, HALF - 1)], apart)):
-        given = breaks, (OUTSIDE, inside), TRUTH, TIMES
-        assert not continues(Sim3(), *given) and not at_usual_pace(Sim3(), *given)
+    for steps, inside in (([], BEFORE), ([(HALF, HALF - 1)], apart)):
+        breaks = Breaks(steps, OUTSIDE, inside, TRUTH, TIMES)
+        assert not breaks.continued_by(Sim3()) and not breaks.at_usual_pace(Sim3())

@@ -120,7 +120,7 @@ def raw(home: Home) -> Path:
 def test_raw_fisheyes_grow_by_recordings_of_their_calibration(
     raw: Path, home: Home, tmp_path: Path
 ) -> None:
-    """Whether it is given with them or not: then they are read by that of the run."""
+    """Without a calibration of their own they are read by that of the run."""
     run, given, out = FinishedRun.load(raw), fisheyes(home, 0), tmp_path / "run"
     result = add_recordings(raw, [replace(given, calibration=None)], out)
     (kind,) = result.frames.formats  # they share the camera

@@ -34,7 +34,7 @@ def test_no_step_over_a_missing_frame_is_a_bay_too_short(timed: bool, tmp_path: 
     refine(tmp_path / "frames", None, tmp_path / "run")
     reconstruction, frames = load_run(tmp_path / "run")
     rows = [int(name) for name in frames.names]
-    assert len(rows) >= len(kept) // 2  # others may be left out, and are said to be
+    assert len(rows) >= len(kept) // 2  # the report lists the others as left out
     times = np.arange(float(len(rows)))
     found = Trajectory(times, reconstruction.world_T_rigs)
     true = Trajectory(times, truth.world_T_rigs[rows])
