@@ -26,7 +26,7 @@ from gsba.loop_closure.retrieval import global_descriptors
 from gsba.matching import pairs, recovery
 from gsba.matching.guided_search import Gate, MatchContext
 from gsba.similarity import Sim3
-from gsba.trajectory.judgement import over_missing_frames
+from gsba.trajectory.judgement import long_steps, over_missing_frames
 from gsba.types import Counts, Matches, Solution
 
 logger = logging.getLogger(__name__)
@@ -111,6 +111,9 @@ class _Joining:
         self.usual_anywhere: Rates | None = None
         self.min_testable = min_testable  # frames of a map that joins can be tested by
         self.recordings = recordings
+        # Steps over which bays of a hall may be taken for one another.
+        self.wide = long_steps(solved.world_T_rigs, self.depth) & ~ties
+        self.wide |= over_missing_frames(timestamps, recordings)
         self.moves = [Sim3()] * num  # of each frame, from its part to the map
         self.components = np.full(num, -1)
         self.met, self.alone = np.zeros(num, bool), np.zeros(num, bool)
@@ -412,15 +415,13 @@ class _Joining:
 
     def _resected_at_pace(self, f: int, inside: np.ndarray, found: np.ndarray) -> np.ndarray | None:
         """The pose (4, 4) found of a frame; or where the camera would walk on to it at an unusual
-        pace, one at the usual pace. None if there is none over missing frames."""
+        pace, one at the usual pace. None if there is none, and steps to it or from it are wide."""
         rows, move = np.array([f]), self._move_of(f, found)
         breaks = self._breaks_of_recording(rows, inside)
-        if not breaks.steps or breaks.continued_by(move):
+        if breaks.continued_by(move) or self._is_held_by_trajectory(rows):
             return found
-        missing = over_missing_frames(self.times, self.recordings)
-        if self._is_held_by_trajectory(rows) or not any(
-            missing[min(step)] for step in breaks.steps
-        ):
+        steps = [min(step) for step in breaks.steps] or [max(f - 1, 0), min(f, len(self.wide) - 1)]
+        if not self.wide[steps].any():
             return found
         poses, best, most = self.poses.copy(), None, 0
         for moved in breaks.at_usual_pace(move):

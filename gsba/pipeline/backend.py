@@ -125,15 +125,19 @@ def separate_parts(state: State) -> np.ndarray | None:
         loose[[0, -1]] = False
         open_at = set(np.flatnonzero(loose).tolist())
         near = steps.without_steps(near, steps.given_up(open_at, matches))
-        near = steps.without_steps(near, set(np.flatnonzero(_unusual_paces(state)).tolist()))
+        near = steps.without_steps(near, set(np.flatnonzero(_doubtful_steps(state)).tolist()))
     return connectivity.parted(near.matches.pairs, nothing, scarce)
 
 
-def _unusual_paces(state: State) -> np.ndarray:
-    """Unguided steps (F - 1,) bool over missing frames, walked at an unusual pace in the map."""
-    frames, unguided = state.run.frames, state.prior.unguided
-    given = state.solution.world_T_rigs, frames.timestamps, frames.recording_of_frame
-    return judgement.unusual_paces(*given) & unguided[1:] & unguided[:-1]
+def _doubtful_steps(state: State) -> np.ndarray:
+    """Unguided steps (F - 1,) bool over missing frames that are walked at an unusual pace in the
+    map, and long ones back and forth."""
+    frames, unguided, solution = state.run.frames, state.prior.unguided, state.solution
+    times, poses = (frames.timestamps, frames.recording_of_frame), solution.world_T_rigs
+    found = judgement.unusual_paces(poses, *times)
+    shown = ~(state.prior.trust.unseen_steps | judgement.over_missing_frames(*times))
+    found |= judgement.back_and_forth(poses, shown, solution.median_depth())
+    return found & unguided[1:] & unguided[:-1]
 
 
 def merge_maps(state: State, parts: np.ndarray) -> State:
@@ -141,7 +145,7 @@ def merge_maps(state: State, parts: np.ndarray) -> State:
     run, prior, trust, solution = state.run, state.prior, state.prior.trust, state.solution
 
     def compute() -> Registered:
-        held, shown = trust.held_steps, ~(trust.unseen_steps | _unusual_paces(state))
+        held, shown = trust.held_steps, ~(trust.unseen_steps | _doubtful_steps(state))
         open_scale = prior.unguided[1:] & prior.unguided[:-1]
         if open_scale.any():  # images show a step between parts, but not how long it is
             fed = ~connectivity.starving(solution, run.settings.rounds.min_observations)

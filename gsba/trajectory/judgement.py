@@ -33,6 +33,8 @@ _STEPS_AROUND = 6  # steps to either side whose lengths a step's is compared wit
 _MIN_INTERVAL_RATIO = 1.5  # interval over missing frames, in median ones
 _STEPS_BESIDE = 4  # nearest steps whose direction is compared
 _USUAL_PACES = 0.6, 1.6  # slowest and fastest speed of such a step, in that of the steps around
+_LONG_STEP_DEPTHS = 0.3  # steps from which bays of a hall are taken for one another, median depths
+_BACK_COSINE = -0.5  # largest cosine between two steps that lead forth and back
 _MIN_JUDGED_STEPS = 6  # least steps of which any length is compared
 
 
@@ -195,6 +197,22 @@ def over_missing_frames(timestamps: np.ndarray, recordings: np.ndarray) -> np.nd
     return found
 
 
+def long_steps(world_T_rigs: np.ndarray, depth: float) -> np.ndarray:
+    """Steps (F - 1,) bool where those around are so long that the view changes much.
+
+    Args:
+        world_T_rigs: (F, 4, 4) poses in a map of the images.
+        depth: median distance of points, map units.
+    """
+    lengths = np.linalg.norm(np.diff(world_T_rigs[:, :3, 3], axis=0), axis=1)
+    around = [
+        lengths[max(step - _STEPS_AROUND, 0) : step + _STEPS_AROUND + 1]
+        for step in range(len(lengths))
+    ]
+    usual = np.array([np.median(some) for some in around])
+    return usual > _LONG_STEP_DEPTHS * depth
+
+
 def unusual_paces(
     world_T_rigs: np.ndarray, timestamps: np.ndarray, recordings: np.ndarray
 ) -> np.ndarray:
@@ -222,6 +240,32 @@ def unusual_paces(
             back = velocities[step] @ velocities[near].sum(axis=0) < 0
             unusual[step] = back or not slowest * speed < speeds[step] < fastest * speed
     return unusual
+
+
+def back_and_forth(world_T_rigs: np.ndarray, shown: np.ndarray, depth: float) -> np.ndarray:
+    """Steps (F - 1,) bool before and behind a frame at which the camera goes back the way that it
+    came, without turning, where frames are far apart.
+
+    There, too, the next bay of a hall may match better than the same one. Which of two such steps
+    is false does not show.
+
+    Args:
+        world_T_rigs: (F, 4, 4) poses in a map of the images.
+        shown: (F - 1,) bool, steps that images show, over no missing frame.
+        depth: median distance of points, map units.
+    """
+    steps = np.diff(world_T_rigs[:, :3, 3], axis=0)
+    lengths = np.linalg.norm(steps, axis=1)
+    found = np.zeros(len(steps), bool)
+    at_rig = np.einsum("fji,fj->fi", world_T_rigs[:-1, :3, :3], steps)
+    far = _BACK_COSINE * lengths[:-1] * lengths[1:]
+    back = np.sum(steps[:-1] * steps[1:], axis=1) < far
+    back &= np.sum(at_rig[:-1] * at_rig[1:], axis=1) < far
+    back &= np.maximum(lengths[:-1], lengths[1:]) > _LONG_STEP_DEPTHS * depth
+    back &= shown[:-1] & shown[1:]
+    found[:-1] |= back
+    found[1:] |= back
+    return found
 
 
 def without_steps(coarse: CoarsePoses, trust: StepChecks, steps: np.ndarray) -> StepChecks:

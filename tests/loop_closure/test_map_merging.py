@@ -14,6 +14,7 @@ from gsba.loop_closure.map_similarity import Proposal
 from gsba.loop_closure.merged_map import Registered, follow
 from gsba.loop_closure.registration import Resection
 from gsba.similarity import Sim3
+from gsba.trajectory import judgement
 from gsba.trajectory.joining import GUESS, PLACES, SegmentAlignment
 from gsba.trajectory.judgement import StepChecks
 from gsba.types import CoarsePoses, Matches, PoseSource, Solution, Tracks
@@ -151,12 +152,15 @@ def test_a_join_a_bay_off_is_left_for_one_at_the_usual_pace(
     assert (_errors(found)[0] < 0.05) != held
 
 
-@pytest.mark.parametrize("missing", [True, False])
+@pytest.mark.parametrize(
+    ("missing", "far", "at_pace"), [(True, False, True), (False, True, True), (False, False, False)]
+)
 def test_a_frame_a_bay_off_is_registered_at_the_usual_pace(
-    missing: bool, monkeypatch: pytest.MonkeyPatch
+    missing: bool, far: bool, at_pace: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Where frames are missing beside it; else it is where its points say."""
+    """Where frames are missing beside it or far apart; else it is where its points say."""
     context, whole, _ = scene()
+    monkeypatch.setattr(judgement, "_LONG_STEP_DEPTHS", 0.01 if far else 10.0)
     whole, f = _without_map(whole, (7,)), 7
     times = TIMES + 0.55 * missing * ((f <= TIMES).astype(float) + (f < TIMES))
     step, calls = TRUTH[f, :3, 3] - TRUTH[f - 1, :3, 3], list[int]()
@@ -175,7 +179,7 @@ def test_a_frame_a_bay_off_is_registered_at_the_usual_pace(
     monkeypatch.setattr(map_merging._Joining, "_shows_map", lambda *_: True)
     found = map_merging.merge(context, whole, _halves((f,)), NOBODY, NOBODY, times)
     off = _errors(found)[0]
-    assert found.alone[f] and (off < 0.02) == missing
+    assert found.alone[f] and (off < 0.02) == at_pace
 
 
 def test_strangers_stay_apart() -> None:

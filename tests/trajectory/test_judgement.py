@@ -322,3 +322,25 @@ def test_a_step_over_missing_frames_is_walked_at_the_usual_pace_or_doubted(
     np.testing.assert_array_equal(np.flatnonzero(doubted), expected)
     other = np.arange(NUM_FRAMES) > step  # a recording of its own
     assert not judgement.unusual_paces(found, times, other.astype(int)).any()
+
+
+@pytest.mark.parametrize("depths", [0.2, 0.5])
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("shown", [True, False])
+def test_long_steps_back_and_forth_are_doubted_on_both_sides_of_the_frame(
+    depths: float, turned: bool, shown: bool
+) -> None:
+    """One who turns about turns the camera, too; where images show no step, nothing is known."""
+    poses, there = np.tile(np.eye(4), (NUM_FRAMES, 1, 1)), NUM_FRAMES // 2
+    along = np.arange(NUM_FRAMES, dtype=float)
+    along[there + 1 :] = 2 * there - along[there + 1 :]
+    poses[:, 2, 3] = along
+    if turned:
+        poses[there + 1 :, :3, :3] = np.diag([-1.0, 1.0, -1.0])
+        poses[there, :3, :3] = np.diag([-1.0, 1.0, -1.0])
+    seen = np.ones(NUM_FRAMES - 1, bool)
+    seen[there] = shown
+    found = judgement.back_and_forth(poses, seen, 1 / depths)
+    doubted = depths > 0.3 and not turned and shown
+    np.testing.assert_array_equal(np.flatnonzero(found), [there - 1, there] if doubted else [])
+    assert judgement.long_steps(poses, 1 / depths).all() == (depths > 0.3)
