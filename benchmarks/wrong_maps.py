@@ -5,15 +5,17 @@
 
 A WALK is a folder with `images/` and their timestamps.csv, `groundtruth.tum` and perhaps a mask:
 white-walled flats, similar rooms, dim rooms. WALK:A-B,C-D takes only these frames of it, A to B - 1
-and C to D - 1: a video that was paused. Each is refined without a trajectory and from one with
-drift and jumps. All maps of a run are aligned to the truth, each by itself: a map is wrong if the
-error of one of its frames exceeds 3 % of the map's extent. Left-out frames and several maps are not
-wrong. Every run is a separate process; rows are kept in WORK and used again while code, options and
-input stay the same. The exit code is 1 if a map is wrong.
+and C to D - 1: a video that was paused. A-B/K takes every K-th of them: frames far apart. Each is
+refined without a trajectory and from one with drift and jumps. All maps of a run are aligned to the
+truth, each by itself: a map is wrong if the error of one of its frames exceeds 3 % of the map's
+extent. Left-out frames and several maps are not wrong. Every run is a separate process; rows are
+kept in WORK and used again while code, options and input stay the same. The exit code is 1 if a map
+is wrong.
 """
 
 import argparse
 import json
+import re
 import shutil
 import sys
 from pathlib import Path
@@ -128,15 +130,15 @@ class Bench(NamedTuple):
 
 
 def paused(text: str, out: Path) -> Path:
-    """Folder of a walk; of WALK:A-B,C-D a copy with these frames only."""
+    """Folder of a walk; of WALK:A-B,C-D/K a copy with these frames only."""
     name, _, spans = text.partition(":")
     walk = Path(name).resolve()
     if not spans:
         return walk
-    home = (out / f"{walk.name}_{spans.replace(',', '_')}").resolve()
+    home = (out / f"{walk.name}_{spans.replace(',', '_').replace('/', 'by')}").resolve()
     shutil.rmtree(home, ignore_errors=True)
-    ends = [tuple(map(int, span.split("-"))) for span in spans.split(",")]
-    rows = np.concatenate([np.arange(first, last) for first, last in ends])
+    ends = [tuple(map(int, re.split("[-/]", f"{span}/1")[:3])) for span in spans.split(",")]
+    rows = np.concatenate([np.arange(*each) for each in ends])
     truth = read_trajectory(walk / "groundtruth.tum")
     kept = Trajectory(truth.timestamps[rows], truth.world_T_rigs[rows])
     take_frames(walk, rows, kept.timestamps, home / "images")

@@ -279,12 +279,11 @@ def evidence_of(seen: Predictions, usual: Rates, depth: float) -> JoinEvidence:
         depth: median distance of points, map units.
     """
     cells = np.floor(seen.points_world / (_CELL_DEPTHS * depth)).astype(np.int64)
-    cells, cell_of = np.unique(cells, axis=0, return_inverse=True)
-    cell_of = cell_of.ravel()
+    cells, cell_of = _distinct(cells)
     found = seen.found - usual.chance, usual.within[seen.bins] - usual.chance
     placed = seen.placed, usual.placed[seen.bins]
     regions = np.floor(cells * (_CELL_DEPTHS / _REGION_DEPTHS)).astype(np.int64)
-    region_of = np.unique(regions, axis=0, return_inverse=True)[1].ravel()
+    region_of = _distinct(regions)[1]
 
     def sums(
         counted: tuple[np.ndarray, np.ndarray], numbers: np.ndarray
@@ -302,6 +301,18 @@ def evidence_of(seen: Predictions, usual: Rates, depth: float) -> JoinEvidence:
     if by_cells.likely:
         return min(by_cells, by_points, key=lambda one: one.share - _NUM_SIGMAS * one.sigma)
     return by_cells
+
+
+def _distinct(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distinct rows (D, 3) of rows (N, 3) int64, in ascending order, and the number (N,) of each
+    row's. Several times faster than `np.unique` along an axis."""
+    number_of = np.zeros(len(rows), np.int64)
+    for column in rows.T:
+        values, each = np.unique(column, return_inverse=True)
+        firsts, number_of = np.unique(
+            number_of * len(values) + each, return_index=True, return_inverse=True
+        )[1:]
+    return rows[firsts], number_of
 
 
 def _share(excess: np.ndarray, expected: np.ndarray) -> tuple[float, float]:

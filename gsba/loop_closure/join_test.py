@@ -71,11 +71,17 @@ class JoinTest:
             None if the proposal leads to the place of one that is confirmed already.
         """
         known = [one.proposal for one in judged if one.evidence.confirmed]
-        found = self._judged(proposal, (rows, inside), join_evidence.LOCAL, known)
+        near, far = (
+            [around(side, f, reach) for side, f in zip((rows, inside), proposal.frames, strict=True)]
+            for reach in (join_evidence.LOCAL, join_evidence.WIDER)
+        )
+        found = self._judged(proposal, near, known)
         if found is None or found.evidence.confirmed or found.evidence.refuted:
             return found
+        if all(map(np.array_equal, near, far)):
+            return found
         # More frames give more evidence, if drift permits.
-        wider = self._judged(found.proposal, (rows, inside), join_evidence.WIDER, known)
+        wider = self._judged(found.proposal, far, known)
         return wider and max((found, wider), key=lambda one: one.evidence.margin())
 
     def rivals(self, best: Judged, others: Sequence[Judged]) -> list[Judged]:
@@ -121,14 +127,12 @@ class JoinTest:
     def _judged(
         self,
         proposal: Proposal,
-        sides: tuple[np.ndarray, np.ndarray],
-        reach: int,
+        groups: Sequence[np.ndarray],
         known: Sequence[Proposal],
     ) -> Judged | None:
-        """The proposal tested with frames at most `reach` to either side of the meeting; None if
-        it leads to the place of a known one."""
+        """The proposal tested with frames of both sides; None if it leads to the place of a known
+        one."""
         (f, g), move = proposal.frames, proposal.move
-        groups = around(sides[0], f, reach), around(sides[1], g, reach)
         given = f, g, move.scale, move.new_T_old.tobytes(), *(rows.tobytes() for rows in groups)
         found = self._tested.get(given) or self._settled(proposal, groups, known)
         if found is None or self._leads_to(found.proposal, known):
@@ -139,24 +143,25 @@ class JoinTest:
     def _settled(
         self,
         proposal: Proposal,
-        groups: tuple[np.ndarray, np.ndarray],
+        groups: Sequence[np.ndarray],
         known: Sequence[Proposal],
     ) -> Judged | None:
         """The proposal refined by frames of both sides until it hardly changes; None once it leads
         to the place of a known one."""
-        evidence, found = self.weigh(*groups, proposal.move)
+        rows, inside = groups
+        evidence, found = self.weigh(rows, inside, proposal.move)
         for _ in range(_MAX_REFINEMENTS):
-            again = self.meetings(found, groups[0])
+            again = self.meetings(found, rows)
             if not again:
                 break
             move = refined(again, proposal.move, self.poses)
-            off, turned, stretched = difference(proposal.move, move, self.poses[groups[0]])
+            off, turned, stretched = difference(proposal.move, move, self.poses[rows])
             proposal = replace(proposal, move=move)
             if self._leads_to(proposal, known):
                 return None
             if off / self.depth + turned + stretched < _SETTLED_RAD:
                 break
-            evidence, found = self.weigh(*groups, move)
+            evidence, found = self.weigh(rows, inside, move)
         return Judged(proposal, evidence)
 
     def _leads_to(self, proposal: Proposal, known: Sequence[Proposal]) -> bool:
