@@ -71,10 +71,9 @@ class JoinTest:
             None if the proposal leads to the place of one that is confirmed already.
         """
         known = [one.proposal for one in judged if one.evidence.confirmed]
-        near, far = (
-            [around(side, f, reach) for side, f in zip((rows, inside), proposal.frames, strict=True)]
-            for reach in (join_evidence.LOCAL, join_evidence.WIDER)
-        )
+        (f, g), (reach, wider_reach) = proposal.frames, (join_evidence.LOCAL, join_evidence.WIDER)
+        near = around(rows, f, reach), around(inside, g, reach)
+        far = around(rows, f, wider_reach), around(inside, g, wider_reach)
         found = self._judged(proposal, near, known)
         if found is None or found.evidence.confirmed or found.evidence.refuted:
             return found

@@ -15,11 +15,13 @@ from gsba.trajectory.joining import SegmentAlignment
 from gsba.trajectory.judgement import StepChecks
 from gsba.trajectory.steps import (
     Steps,
+    chained,
     given_up,
     image_steps,
     length_ratios,
     matches_of_steps,
     off_steps,
+    ray_depths,
     without_steps,
 )
 from gsba.types import CoarsePoses, Counts, Keypoints, Trajectory, VerifiedPairs
@@ -28,6 +30,7 @@ _WIDER_GAPS = 2, 4, 8  # gaps in frames of additional pairs
 _MIN_LOST_SHARE = 0.2  # share of lost neighbours from which whole panoramas are compared
 _MIN_COMMON_POINTS = 5  # common points that suffice for the ratio of two steps' lengths
 _MAX_STEP_RATIO = 4.0  # largest ratio of consecutive steps; a repeated pattern exceeds it
+_FAR_STEP_DEPTHS = 0.5  # steps from which repeated structure misleads, median depths
 _REMATCHING_GATE = Gate(np.deg2rad(1.5), 0.03, np.pi)  # around relative poses estimated from few
 # matches
 
@@ -53,8 +56,8 @@ def recover(
     """Match the neighbours that guided matching lost, check the trajectory, and match guided by it.
 
     Frames next to one another are compared without prediction: they share so much that repetition
-    does not mislead. Frames two apart, or with a pause between them, where it would, are only
-    matched guided by the steps found or the trajectory.
+    does not mislead. Frames two apart, far apart, or with a pause between them, where it would, are
+    only matched guided by the steps found or the trajectory.
 
     Frames of two pieces of the trajectory are not compared here. Two views do not determine a
     scale, and the points of both may move with the camera or be far away: the relative pose of two
@@ -74,7 +77,10 @@ def recover(
     guided = guided.within(coarse.segments)
     lost = guided.missing(_pairs_of_one_piece(pairs.without_pause(timestamps), coarse))
     absent = coarse.absent
-    alone = VerifiedPairs.joined([guided, match_anywhere(context, lost)])
+    found = match_anywhere(context, lost)
+    if not absent and _are_far_apart(guided, keypoints):
+        found = _match_along(context, _walked_on(coarse, lost, found, timestamps), lost)
+    alone = VerifiedPairs.joined([guided, found])
     alone = _with_wider_pairs(context, alone).within(coarse.segments)
     alone = _with_consistent_scale(context, alone) if absent else alone
     steps = image_steps(alone, keypoints)
@@ -104,6 +110,39 @@ def recover(
     guessed |= trust.unseen_steps & judgement.leaps(coarse.world_T_rigs, timestamps)
     trust = replace(trust, false_steps=trust.false_steps | guessed)
     return Recovered(neighbours, trust, coarse, joints)
+
+
+def _are_far_apart(guided: VerifiedPairs, keypoints: Keypoints) -> bool:
+    """True if steps are so long, in the distances of what they show, that look-alikes mislead.
+
+    Repeated structure makes a step look too short. So a quarter of the steps decides.
+    """
+    found = list[float]()
+    for p, (f0, f1) in enumerate(guided.matches.pairs.tolist()):
+        if f1 - f0 == 1 and np.isfinite(guided.direction_sigmas[p]):
+            rays = keypoints.matched(guided.matches.pairs[p], guided.matches.of(p))
+            depths = ray_depths(*rays, guided.f0_T_f1s[p])
+            if np.isfinite(depths).any():
+                found.append(1 / float(np.nanmedian(depths)))
+    return bool(found) and float(np.quantile(found, 0.75)) > _FAR_STEP_DEPTHS
+
+
+def _walked_on(
+    coarse: CoarsePoses, lost: np.ndarray, found: VerifiedPairs, timestamps: np.ndarray
+) -> np.ndarray:
+    """Poses (F, 4, 4) chained along the trajectory; at its lost steps (P, 2), where it may have
+    jumped, the camera turns as in pairs found without it, and walks on as before and behind."""
+    poses, intervals = coarse.world_T_rigs, np.diff(timestamps)
+    steps = inverse(poses[:-1]) @ poses[1:]
+    steps[found.matches.pairs[:, 0], :3, :3] = found.f0_T_f1s[:, :3, :3]
+    world_R_rigs = poses[0, :3, :3] @ chained(steps)[:, :3, :3]
+    velocities = np.diff(poses[:, :3, 3], axis=0) / intervals[:, None]
+    one_piece = _pairs_of_one_piece(pairs.adjacent(len(poses), 1), coarse)
+    known = np.setdiff1d(one_piece[:, 0], lost[:, 0])
+    for f in lost[:, 0].tolist() if len(known) else []:
+        beside = [*known[known < f][-1:], *known[known > f][:1]]
+        steps[f, :3, 3] = world_R_rigs[f].T @ velocities[beside].mean(axis=0) * intervals[f]
+    return chained(steps)
 
 
 def _missing_two_apart(found: VerifiedPairs, steps: Steps, absent: bool) -> np.ndarray:

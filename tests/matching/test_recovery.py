@@ -166,3 +166,48 @@ def test_steps_are_matched_again_with_all_keypoints() -> None:
     again = recovery.match_again(context, few, {2})
     assert len(few.matches.of(0)) < 45 and len(again.matches.of(0)) > 0.9 * NUM
     assert len(recovery.match_again(context, few, {3}).matches.of(0)) < 45
+
+
+def test_at_lost_steps_of_frames_far_apart_the_camera_walks_on() -> None:
+    """Look-alikes mislead there; turns that images show replace the trajectory's."""
+    slam = TRUTH.copy()
+    slam[4] = slam[4] @ pose(Rotation.from_rotvec([0, 1.5, 0]).as_matrix(), np.array([0, 2.0, 0]))
+    lost = np.array([[3, 4], [4, 5]], np.int32)
+    context = _context()
+    found = recovery.match_anywhere(context, lost)
+    coarse = CoarsePoses(slam, np.full(NUM_FRAMES, PoseSource.SLAM, np.uint8), 0.0)
+    walked = recovery._walked_on(coarse, lost, found, TIMES)
+    np.testing.assert_allclose(walked, inverse(TRUTH[0]) @ TRUTH, atol=2e-3)
+
+
+def test_frames_are_far_apart_if_a_quarter_of_the_steps_is_long() -> None:
+    """Steps are a tenth of the distances; a repeated pattern makes three of four look shorter."""
+    guided = correspondences.match_neighbours(_context(), Solution.without_points(TRUTH))
+    assert not recovery._are_far_apart(guided, _context().keypoints)
+    with patch.object(recovery, "_FAR_STEP_DEPTHS", 0.05):
+        assert recovery._are_far_apart(guided, _context().keypoints)
+
+
+def test_a_look_alike_at_a_lost_step_is_not_taken_where_frames_are_far_apart() -> None:
+    """Where they are near one another, it is what images say."""
+    slam = TRUTH.copy()
+    slam[4, :3, 3] += [0, 2.0, 0]
+    misleading = TRUTH.copy()
+    misleading[4, :3, 3] -= [0.5, 0, 0]  # a bay back
+    asked = recovery.match_anywhere
+
+    def misled(context: MatchContext, chosen: np.ndarray, rivals: bool = True) -> VerifiedPairs:
+        found = asked(context, chosen, rivals)
+        poses = inverse(misleading[found.matches.pairs[:, 0]])
+        poses = poses @ misleading[found.matches.pairs[:, 1]]
+        poses[:, :3, 3] = unit(poses[:, :3, 3])
+        return replace(found, f0_T_f1s=poses)
+
+    for far in (False, True):
+        with (
+            patch.object(recovery, "match_anywhere", misled),
+            patch.object(recovery, "_FAR_STEP_DEPTHS", 0.01 if far else 10.0),
+        ):
+            recovered = _run(slam)
+        step = inverse(recovered.trust.world_T_rigs[3]) @ recovered.trust.world_T_rigs[4]
+        assert (unit(step[:3, 3]) @ unit(TRUTH[4, :3, 3] - TRUTH[3, :3, 3]) > 0.99) == far
