@@ -78,7 +78,7 @@ def recover(
     lost = guided.missing(_pairs_of_one_piece(pairs.without_pause(timestamps), coarse))
     absent = coarse.absent
     found = match_anywhere(context, lost)
-    if not absent and _are_far_apart(guided, keypoints):
+    if len(lost) and not absent and _are_far_apart(guided, keypoints):
         found = _match_along(context, _walked_on(coarse, lost, found, timestamps), lost)
     alone = VerifiedPairs.joined([guided, found])
     alone = _with_wider_pairs(context, alone).within(coarse.segments)
