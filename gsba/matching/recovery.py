@@ -30,7 +30,10 @@ _WIDER_GAPS = 2, 4, 8  # gaps in frames of additional pairs
 _MIN_LOST_SHARE = 0.2  # share of lost neighbours from which whole panoramas are compared
 _MIN_COMMON_POINTS = 5  # common points that suffice for the ratio of two steps' lengths
 _MAX_STEP_RATIO = 4.0  # largest ratio of consecutive steps; a repeated pattern exceeds it
-_FAR_STEP_DEPTHS = 0.5  # steps from which repeated structure misleads, median depths
+_FAR_STEP_DEPTHS = 0.5  # steps from which repeated structure may mislead, median depths
+_NUM_TRIED_STEPS = 24  # steps that show whether it does
+_MAX_MISLED_SHARE = 0.15  # largest share of steps not found with which matches are believed: at
+# most .08 in flats, .33 and more in most halls of bays
 _REMATCHING_GATE = Gate(np.deg2rad(1.5), 0.03, np.pi)  # around relative poses estimated from few
 # matches
 
@@ -56,7 +59,7 @@ def recover(
     """Match the neighbours that guided matching lost, check the trajectory, and match guided by it.
 
     Frames next to one another are compared without prediction: they share so much that repetition
-    does not mislead. Frames two apart, far apart, or with a pause between them, where it would, are
+    does not mislead. Frames so far apart that it does, two apart, or with a pause between them are
     only matched guided by the steps found or the trajectory.
 
     Frames of two pieces of the trajectory are not compared here. Two views do not determine a
@@ -78,7 +81,7 @@ def recover(
     lost = guided.missing(_pairs_of_one_piece(pairs.without_pause(timestamps), coarse))
     absent = coarse.absent
     found = match_anywhere(context, lost)
-    if len(lost) and not absent and _are_far_apart(guided, keypoints):
+    if len(lost) and not absent and _misleads(context, guided):
         found = _match_along(context, _walked_on(coarse, lost, found, timestamps), lost)
     alone = VerifiedPairs.joined([guided, found])
     alone = _with_wider_pairs(context, alone).within(coarse.segments)
@@ -112,19 +115,33 @@ def recover(
     return Recovered(neighbours, trust, coarse, joints)
 
 
-def _are_far_apart(guided: VerifiedPairs, keypoints: Keypoints) -> bool:
-    """True if steps are so long, in the distances of what they show, that look-alikes mislead.
+def _misleads(context: MatchContext, guided: VerifiedPairs) -> bool:
+    """True if matching without guidance often does not find the steps that guided matching knows.
 
-    Repeated structure makes a step look too short. So a quarter of the steps decides.
+    Only steps that are long in the distances of what they show are in danger. Repeated structure
+    makes a step look too short: a quarter of the steps decides whether they are.
     """
-    found = list[float]()
+    steps, lengths = list[int](), list[float]()
     for p, (f0, f1) in enumerate(guided.matches.pairs.tolist()):
         if f1 - f0 == 1 and np.isfinite(guided.direction_sigmas[p]):
-            rays = keypoints.matched(guided.matches.pairs[p], guided.matches.of(p))
+            rays = context.keypoints.matched(guided.matches.pairs[p], guided.matches.of(p))
             depths = ray_depths(*rays, guided.f0_T_f1s[p])
-            if np.isfinite(depths).any():
-                found.append(1 / float(np.nanmedian(depths)))
-    return bool(found) and float(np.quantile(found, 0.75)) > _FAR_STEP_DEPTHS
+            steps.append(p)
+            lengths.append(1 / float(np.nanmedian(np.append(depths, np.inf))))
+    if not steps or np.quantile(lengths, 0.75) < _FAR_STEP_DEPTHS:
+        return False
+    tried = np.unique(np.linspace(0, len(steps) - 1, _NUM_TRIED_STEPS).astype(int))
+    known = guided.taken([steps[n] for n in tried.tolist()])
+    directions = dict(
+        zip(known.matches.pairs[:, 0].tolist(), known.f0_T_f1s[:, :3, 3], strict=True)
+    )
+    found = match_anywhere(context, known.matches.pairs)
+    least = np.cos(np.deg2rad(context.settings.verify.max_direction_deg))
+    agreeing = sum(
+        bool(directions[f] @ f0_T_f1[:3, 3] > least)
+        for f, f0_T_f1 in zip(found.matches.pairs[:, 0].tolist(), found.f0_T_f1s, strict=True)
+    )
+    return len(directions) - agreeing > _MAX_MISLED_SHARE * len(directions)
 
 
 def _walked_on(

@@ -4,6 +4,7 @@ from dataclasses import replace
 from unittest.mock import patch
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 from synthetic import bearings_of, features_of, unit, with_noise
 
@@ -180,16 +181,32 @@ def test_at_lost_steps_of_frames_far_apart_the_camera_walks_on() -> None:
     np.testing.assert_allclose(walked, inverse(TRUTH[0]) @ TRUTH, atol=2e-3)
 
 
-def test_frames_are_far_apart_if_a_quarter_of_the_steps_is_long() -> None:
-    """Steps are a tenth of the distances; a repeated pattern makes three of four look shorter."""
-    guided = correspondences.match_neighbours(_context(), Solution.without_points(TRUTH))
-    assert not recovery._are_far_apart(guided, _context().keypoints)
-    with patch.object(recovery, "_FAR_STEP_DEPTHS", 0.05):
-        assert recovery._are_far_apart(guided, _context().keypoints)
+@pytest.mark.parametrize(
+    ("far", "misled", "expected"),
+    [(True, 0.5, True), (True, 0.05, False), (False, 0.5, False)],
+)
+def test_known_steps_of_frames_far_apart_tell_whether_matching_is_misled(
+    far: bool, misled: float, expected: bool
+) -> None:
+    context = _context()
+    guided = correspondences.match_neighbours(context, Solution.without_points(TRUTH))
+    asked = recovery.match_anywhere
+
+    def answer(context: MatchContext, chosen: np.ndarray) -> VerifiedPairs:
+        found = asked(context, chosen)
+        poses = found.f0_T_f1s.copy()
+        poses[: round(misled * len(poses)), :3, 3] *= -1  # in the other direction
+        return replace(found, f0_T_f1s=poses)
+
+    with (
+        patch.object(recovery, "match_anywhere", answer),
+        patch.object(recovery, "_FAR_STEP_DEPTHS", 0.05 if far else 0.5),
+    ):
+        assert recovery._misleads(context, guided) == expected
 
 
-def test_a_look_alike_at_a_lost_step_is_not_taken_where_frames_are_far_apart() -> None:
-    """Where they are near one another, it is what images say."""
+def test_a_look_alike_at_a_lost_step_is_not_taken_where_matching_misleads() -> None:
+    """Where matching does not mislead, it is what images say."""
     slam = TRUTH.copy()
     slam[4, :3, 3] += [0, 2.0, 0]
     misleading = TRUTH.copy()
@@ -203,11 +220,13 @@ def test_a_look_alike_at_a_lost_step_is_not_taken_where_frames_are_far_apart() -
         poses[:, :3, 3] = unit(poses[:, :3, 3])
         return replace(found, f0_T_f1s=poses)
 
-    for far in (False, True):
+    for misleading_walk in (False, True):
         with (
             patch.object(recovery, "match_anywhere", misled),
-            patch.object(recovery, "_FAR_STEP_DEPTHS", 0.01 if far else 10.0),
+            patch.object(recovery, "_misleads", return_value=misleading_walk),
         ):
             recovered = _run(slam)
         step = inverse(recovered.trust.world_T_rigs[3]) @ recovered.trust.world_T_rigs[4]
-        assert (unit(step[:3, 3]) @ unit(TRUTH[4, :3, 3] - TRUTH[3, :3, 3]) > 0.99) == far
+        assert (
+            unit(step[:3, 3]) @ unit(TRUTH[4, :3, 3] - TRUTH[3, :3, 3]) > 0.99
+        ) == misleading_walk
