@@ -80,16 +80,15 @@ def recover(
     guided = guided.within(coarse.segments)
     lost = guided.missing(_pairs_of_one_piece(pairs.without_pause(timestamps), coarse))
     absent = coarse.absent
+    pieces, (coarse, joints) = coarse, joining.join(coarse)
     found = match_anywhere(context, lost)
+    alone = _all_neighbours(context, guided, found, pieces)
+    misread.refuse_misfit(coarse, image_steps(alone, keypoints), settings.verify)
     if len(lost) and not absent and _misleads(context, guided):
-        found = _match_along(context, _walked_on(coarse, lost, found, timestamps), lost)
-    alone = VerifiedPairs.joined([guided, found])
-    alone = _with_wider_pairs(context, alone).within(coarse.segments)
-    alone = _with_consistent_scale(context, alone) if absent else alone
+        found = _match_along(context, _walked_on(pieces, lost, found, timestamps), lost)
+        alone = _all_neighbours(context, guided, found, pieces)
     steps = image_steps(alone, keypoints)
     alone, guided = (_consistent(some, steps, keypoints, settings) for some in (alone, guided))
-    coarse, joints = joining.join(coarse)
-    misread.refuse_misfit(coarse, steps, settings.verify)
     trust = _check_steps(alone, keypoints, coarse, settings)
     if trust.sound and not joints:
         return Recovered(guided, trust, coarse)
@@ -113,6 +112,15 @@ def recover(
     guessed |= trust.unseen_steps & judgement.leaps(coarse.world_T_rigs, timestamps)
     trust = replace(trust, false_steps=trust.false_steps | guessed)
     return Recovered(neighbours, trust, coarse, joints)
+
+
+def _all_neighbours(
+    context: MatchContext, guided: VerifiedPairs, found: VerifiedPairs, coarse: CoarsePoses
+) -> VerifiedPairs:
+    """Neighbours found with and without guidance, and wider pairs where these are too short."""
+    found = VerifiedPairs.joined([guided, found])
+    found = _with_wider_pairs(context, found).within(coarse.segments)
+    return _with_consistent_scale(context, found) if coarse.absent else found
 
 
 def _misleads(context: MatchContext, guided: VerifiedPairs) -> bool:
