@@ -22,6 +22,7 @@ from gsba.trajectory.steps import (
     matches_of_steps,
     off_steps,
     ray_depths,
+    step_errors,
     without_steps,
 )
 from gsba.types import CoarsePoses, Counts, Keypoints, Trajectory, VerifiedPairs
@@ -83,11 +84,12 @@ def recover(
     pieces, (coarse, joints) = coarse, joining.join(coarse)
     found = match_anywhere(context, lost)
     alone = _all_neighbours(context, guided, found, pieces)
-    misread.refuse_misfit(coarse, image_steps(alone, keypoints), settings.verify)
+    steps = image_steps(alone, keypoints)
+    misread.refuse_misfit(coarse, steps, settings.verify)
     if len(lost) and not absent and _misleads(context, guided):
         found = _match_along(context, _walked_on(pieces, lost, found, timestamps), lost)
         alone = _all_neighbours(context, guided, found, pieces)
-    steps = image_steps(alone, keypoints)
+        steps = image_steps(alone, keypoints)
     alone, guided = (_consistent(some, steps, keypoints, settings) for some in (alone, guided))
     trust = _check_steps(alone, keypoints, coarse, settings)
     if trust.sound and not joints:
@@ -140,16 +142,12 @@ def _misleads(context: MatchContext, guided: VerifiedPairs) -> bool:
         return False
     tried = np.unique(np.linspace(0, len(steps) - 1, _NUM_TRIED_STEPS).astype(int))
     known = guided.taken([steps[n] for n in tried.tolist()])
-    directions = dict(
-        zip(known.matches.pairs[:, 0].tolist(), known.f0_T_f1s[:, :3, 3], strict=True)
-    )
     found = match_anywhere(context, known.matches.pairs)
-    least = np.cos(np.deg2rad(context.settings.verify.max_direction_deg))
-    agreeing = sum(
-        bool(directions[f] @ f0_T_f1[:3, 3] > least)
-        for f, f0_T_f1 in zip(found.matches.pairs[:, 0].tolist(), found.f0_T_f1s, strict=True)
-    )
-    return len(directions) - agreeing > _MAX_MISLED_SHARE * len(directions)
+    true, seen = (image_steps(some, context.keypoints) for some in (known, found))
+    off = step_errors(true.f_T_nexts, seen)[1]
+    agreeing = seen.verified & (off < np.deg2rad(context.settings.verify.max_direction_deg))
+    missed = np.count_nonzero(true.verified & ~agreeing)
+    return bool(missed > _MAX_MISLED_SHARE * len(tried))
 
 
 def _walked_on(

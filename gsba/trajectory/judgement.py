@@ -13,7 +13,7 @@ import numpy as np
 
 from gsba.config import PriorSettings, VerifySettings
 from gsba.geometry import inverse, nearest_rotation, pose, rotation_angle
-from gsba.trajectory.steps import Steps, chained, step_lengths
+from gsba.trajectory.steps import Steps, chained, step_errors, step_lengths
 from gsba.types import CoarsePoses, PoseSource
 
 logger = logging.getLogger(__name__)
@@ -87,7 +87,7 @@ def check_steps(
     slam = inverse(coarse.world_T_rigs[:-1]) @ coarse.world_T_rigs[1:]
     slam_lengths = np.linalg.norm(slam[:, :3, 3], axis=1)
     own = coarse.sources == PoseSource.SLAM
-    turned, off = _step_errors(slam, found)
+    turned, off = step_errors(slam, found)
     if not own.any() or (found.verified.any() and not found.directed.any()):
         return _from_images_alone(coarse, slam, found, logs, sigmas)
     wrong = found.verified & (turned > np.deg2rad(verify.max_rotation_deg))
@@ -129,7 +129,7 @@ def check_steps(
 def confirmed(coarse: CoarsePoses, found: Steps, priors: PriorSettings) -> np.ndarray:
     """Steps (F - 1,) bool on which images and trajectory agree within the latter's noise."""
     slam = inverse(coarse.world_T_rigs[:-1]) @ coarse.world_T_rigs[1:]
-    turned, off = _step_errors(slam, found)
+    turned, off = step_errors(slam, found)
     own = coarse.sources == PoseSource.SLAM
     close = turned < _MAX_PRIOR_SIGMAS * np.deg2rad(priors.rotation_deg)
     close &= off < np.arctan(_MAX_PRIOR_SIGMAS * priors.translation) + 3 * found.direction_sigmas
@@ -317,14 +317,6 @@ def leaps(world_T_rigs: np.ndarray, timestamps: np.ndarray) -> np.ndarray:
     return (
         speeds > _MIN_LEAP_RATIO * np.median(moving) if len(moving) else np.zeros(len(speeds), bool)
     )
-
-
-def _step_errors(slam: np.ndarray, found: Steps) -> tuple[np.ndarray, np.ndarray]:
-    """Angles (F - 1,) in radians between both rotations and both directions of each step."""
-    turned = rotation_angle(np.swapaxes(slam[:, :3, :3], 1, 2) @ found.f_T_nexts[:, :3, :3])
-    moved, seen = slam[:, :3, 3], found.f_T_nexts[:, :3, 3]
-    across = np.linalg.norm(np.cross(moved, seen), axis=1)
-    return turned, np.arctan2(across, np.einsum("fi,fi->f", moved, seen))
 
 
 def _chain(world_T_rigs: np.ndarray, chosen: np.ndarray, own: np.ndarray) -> np.ndarray:

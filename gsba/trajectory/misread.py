@@ -3,9 +3,9 @@
 import numpy as np
 
 from gsba.config import VerifySettings
-from gsba.geometry import inverse, rotation_angle
+from gsba.geometry import inverse
 from gsba.log import GsbaError
-from gsba.trajectory.steps import Steps
+from gsba.trajectory.steps import Steps, step_errors
 from gsba.types import CoarsePoses, PoseSource
 
 _MIN_STEPS = 5  # least number of steps that judge a whole trajectory
@@ -158,10 +158,7 @@ def _agreeing_share(
     steps: np.ndarray, found: Steps, judged: np.ndarray, settings: VerifySettings
 ) -> float:
     """Share of the judged steps that agree with the images."""
-    between = np.swapaxes(steps[:, :3, :3], 1, 2) @ found.f_T_nexts[:, :3, :3]
-    moved, seen = steps[:, :3, 3], found.f_T_nexts[:, :3, 3]
-    across = np.linalg.norm(np.cross(moved, seen), axis=1)
-    off = np.arctan2(across, np.einsum("fi,fi->f", moved, seen))
-    agree = rotation_angle(between) < np.deg2rad(settings.max_rotation_deg)
+    turned, off = step_errors(steps, found)
+    agree = turned < np.deg2rad(settings.max_rotation_deg)
     agree &= off < np.deg2rad(settings.max_direction_deg)
     return float(agree[judged].mean())

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsba.geometry import inverse, nearest_rotation
+from gsba.geometry import inverse, nearest_rotation, rotation_angle
 from gsba.types import Keypoints, VerifiedPairs
 
 _MIN_COMMON = 8  # least common points of two steps whose lengths are compared
@@ -97,6 +97,15 @@ def _set_short_directions(
         spread = 2 * (1 - lengths / counts[known])
         sigmas[known] = np.sqrt(squares[known] / counts[known] + spread)
         short = short & ~known
+
+
+def step_errors(steps: np.ndarray, found: Steps) -> tuple[np.ndarray, np.ndarray]:
+    """Angles (F - 1,) in radians between rotations and directions of steps (F - 1, 4, 4) and those
+    found in images."""
+    turned = rotation_angle(np.swapaxes(steps[:, :3, :3], 1, 2) @ found.f_T_nexts[:, :3, :3])
+    moved, seen = steps[:, :3, 3], found.f_T_nexts[:, :3, 3]
+    across = np.linalg.norm(np.cross(moved, seen), axis=1)
+    return turned, np.arctan2(across, np.einsum("fi,fi->f", moved, seen))
 
 
 def off_steps(pairs: VerifiedPairs, found: Steps) -> np.ndarray:
