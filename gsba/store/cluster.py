@@ -51,6 +51,7 @@ _LATE_RATIO = 4.0  # of a shard's time over the median; a late shard is also giv
 _MIN_LATE_S = 60.0  # shortest time after which a shard is late
 _POLL_S = 5.0  # between checks for late shards
 _SCHEDULER_TIMEOUT_S = 20.0  # for a scheduler's first answer
+_CLOSING_TIMEOUT_S = 60.0  # for workers that this process has started
 _MAX_LOCAL, _MAX_QUEUED = 256, 100_000  # workers that may be requested
 _DISK_TIMEOUT_S = 30.0  # until a shared disk shows a file that another machine has written
 
@@ -113,7 +114,7 @@ def connected(address: str | None) -> Iterator["Client | None"]:
         with suppress(Exception):  # workers or scheduler may have ended before
             client.close()
             if cluster is not None:
-                cluster.close()
+                cluster.close(timeout=_CLOSING_TIMEOUT_S)  # a worker that restarts may not answer
 
 
 def connect(address: str) -> "Client":
