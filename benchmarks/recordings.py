@@ -18,7 +18,7 @@ import argparse
 import json
 import shutil
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,13 +29,14 @@ from recording_cuts import Cut, cut, position_errors
 from gsba.store.finished import load_run
 from gsba.trajectory.files import read_trajectory
 
+MIN_ALIGNED = 3  # frames of a recording whose own error is computed
 MAX_RATIO = 1.5  # of the error of all recordings to that of the best one alone
 TIMEOUT_S = 3600.0
 STARTS = ("trajectories", "none", "half")
 HEAD = [
     "| flat | recordings | start | in the exported map | other maps | ATE mm | best alone mm | "
-    "CPU s | verdict |",
-    "|---|---|---|---:|---|---:|---:|---:|---|",
+    "each, of alone | CPU s | verdict |",
+    "|---|---|---|---:|---|---:|---:|---:|---:|---|",
 ]
 _GSBA = [sys.executable, "-c", "from gsba.cli import main; main()", "refine"]
 
@@ -72,7 +73,8 @@ def command(parts: Sequence[Part], run: Path) -> list[str]:
 
 
 def check_maps(run: Path, parts: Sequence[Part]) -> list[dict[str, Any]]:
-    """Frames, flats and error in millimetres of each map of a run, the exported one first."""
+    """Frames, flats and error in millimetres of each map of a run, the exported one first; and of
+    each recording's frames in it, aligned by themselves."""
     report = json.loads((run / "report.json").read_text())
     walks = {one.name: one.walk for one in parts}
     checked = []
@@ -82,10 +84,14 @@ def check_maps(run: Path, parts: Sequence[Part]) -> list[dict[str, Any]]:
         owners = [walks.get(owner, parts[0].walk) for owner, _, _ in names]
         rows = np.array([int(name) for _, _, name in names])
         flats = sorted({walk.name for walk in owners})
-        ate = np.nan
+        ate, each = np.nan, {}
         if len(flats) == 1:
             ate = _ate(reconstruction.world_T_rigs, rows, owners[0])
-        checked.append({"frames": len(frames), "flats": flats, "ate_mm": ate})
+            for owner in walks:
+                own = np.array([name[0] == owner for name in names])
+                if np.count_nonzero(own) >= MIN_ALIGNED:
+                    each[owner] = _ate(reconstruction.world_T_rigs[own], rows[own], owners[0])
+        checked.append({"frames": len(frames), "flats": flats, "ate_mm": ate, "each_mm": each})
     return checked
 
 
@@ -181,12 +187,17 @@ def verdict(row: dict[str, Any], best_mm: float | None, apart: bool) -> str:
     return "right" if first["frames"] == row["frames"] else "**frames left out**"
 
 
-def line(flat: str, what: str, row: dict[str, Any], best_mm: float | None, found: str) -> str:
-    """Line of the table."""
+def line(
+    flat: str, what: str, row: dict[str, Any], alone_mm: Mapping[str, float], found: str
+) -> str:
+    """Line of the table; `alone_mm`: error of each recording alone, by its name."""
     first, *others = row.get("errors") or [{"frames": 0, "ate_mm": np.nan}]
     cells = [flat, what, row["start"], f"{first['frames']} of {row['frames']}"]
     cells.append(", ".join(f"{one['frames']} ({one['ate_mm']:.1f})" for one in others))
-    cells += [f"{first['ate_mm']:.2f}", "" if best_mm is None else f"{best_mm:.2f}"]
+    cells += [f"{first['ate_mm']:.2f}", f"{min(alone_mm.values()):.2f}" if alone_mm else ""]
+    own_mm = first.get("each_mm", {})
+    ratios = [own_mm[name] / alone_mm[name] for name in own_mm.keys() & alone_mm]
+    cells.append(f"{min(ratios):.2f} to {max(ratios):.2f}" if ratios else "")
     cells += [f"{row['cpu_s']:.0f}", found]
     return f"| {' | '.join(cells)} |"
 
@@ -217,8 +228,10 @@ def of_walk(bench: Bench, walk: Path, variant: Variant, peer: bool) -> list:
         given = [start == "trajectories" or (start == "half" and n % 2 == 0) for n in range(num)]
         return [Part(walk, one, f"part{n}", given[n]) for n, one in enumerate(cuts)]
 
-    known = [row["errors"][0]["ate_mm"] for row in alone if row.get("errors")]
-    best = min(known, default=None)
+    known = {
+        f"part{n}": row["errors"][0]["ate_mm"] for n, row in enumerate(alone) if row.get("errors")
+    }
+    best = min(known.values(), default=None)
     what = f"{num}, exposures {', '.join(map(str, exposures))}" if exposures else str(num)
     what += f", every other one of {changed.name}" if changed else ""
     rows = [bench.row(parts(start), label, start) for start in STARTS[: 2 if exposures else 3]]
@@ -226,7 +239,7 @@ def of_walk(bench: Bench, walk: Path, variant: Variant, peer: bool) -> list:
     lines = []
     for row in rows:
         found = verdict(row, best, apart=False)
-        lines.append((line(walk.name, what, row, best, found), found))
+        lines.append((line(walk.name, what, row, known, found), found))
         print(lines[-1][0], flush=True)
     return lines
 
@@ -242,7 +255,7 @@ def of_pair(bench: Bench, walk: Path, other: Path, step: int) -> list:
         parts = [Part(one, own, f"part{n}", given) for n, (one, own) in enumerate(pairs)]
         row = bench.row(parts, label, start)
         found = verdict(row, None, apart=True)
-        lines.append((line(label, "1 of each flat", row, None, found), found))
+        lines.append((line(label, "1 of each flat", row, {}, found), found))
         print(lines[-1][0], flush=True)
     return lines
 
@@ -278,7 +291,9 @@ def main() -> None:
     foot = (
         "ATE: of all frames of the exported map after one alignment to the truth; other maps: "
         "frames of each (its ATE). Right: all frames in one map, whose error is at most "
-        f"{MAX_RATIO} times that of the best recording refined alone from its trajectory. Start: "
+        f"{MAX_RATIO} times that of the best recording refined alone from its trajectory. Each, of "
+        "alone: error of each recording's frames in that map, aligned by themselves, over that of "
+        "the recording refined alone, least and largest. Start: "
         "trajectories = each its own with drift; half = every other recording's; none = images "
         "alone; COLMAP = spherical, incremental, all pictures."
     )
