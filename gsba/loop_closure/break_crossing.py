@@ -65,7 +65,8 @@ def crossing(
 
 
 def agreed(proposals: list[Proposal], poses: np.ndarray, depth: float) -> Proposal | None:
-    """The proposal that most others agree with; None if these are too few, or no majority.
+    """The proposal that most others agree with, of several the one with most matches; None if the
+    others are too few, or no majority.
 
     Args:
         proposals: proposals of single pairs.
@@ -75,7 +76,9 @@ def agreed(proposals: list[Proposal], poses: np.ndarray, depth: float) -> Propos
     counts = [sum(alike(one, other, poses, depth) for other in proposals) for one in proposals]
     if max(counts, default=0) < max(MIN_AGREEING, len(proposals) // 2 + 1):
         return None
-    return proposals[int(np.argmax(counts))]
+    most = max(counts)
+    best = [one for one, count in zip(proposals, counts, strict=True) if count == most]
+    return max(best, key=lambda one: one.support)
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,6 +33,7 @@ logger = logging.getLogger(__name__)
 _NUM_CANDIDATES = 3  # candidate places for each frame of a part; twice as many for a single frame
 _NUM_SAMPLED_FRAMES = 24  # frames of a part for which candidates are searched
 _BREAK_REACH_FRAMES = 3  # frames from a break that are compared in any case
+_MAX_PAUSE_INTERVALS = 6.0  # longest pause over which these are compared, in median intervals
 _NUM_BEST_MEETINGS = 2  # best meetings whose neighbours are compared too
 # Least frames of a map for the test of joins: two small parts in rooms with one floor look like one
 # place all around.
@@ -241,7 +242,7 @@ class _Joining:
     ) -> list[Judged]:
         """Likely proposals that let the camera walk on at each break between a part and the map:
         look-alikes are elsewhere, or turned about."""
-        breaks = self._breaks_of_recording(rows, inside)
+        breaks = self._breaks(rows, inside)
         return [
             one for one in weighed if one.evidence.likely and breaks.continued_by(one.proposal.move)
         ]
@@ -249,7 +250,7 @@ class _Joining:
     def _at_pace(self, found: Judged, rows: np.ndarray, inside: np.ndarray) -> Judged:
         """The proposal found; or where it lets the camera walk on at an unusual pace, one that
         continues the map at the usual pace, unless its surroundings speak against that."""
-        breaks = self._breaks_of_recording(rows, inside)
+        breaks = self._breaks(rows, inside)
         held = self._is_held_by_trajectory(rows)  # which knows more than the pace
         if held or not breaks.steps or breaks.continued_by(found.proposal.move):
             return found
@@ -267,27 +268,30 @@ class _Joining:
                 usual.append(one)
         return max(usual, key=lambda one: one.evidence.margin(), default=found)
 
-    def _breaks_of_recording(self, rows: np.ndarray, inside: np.ndarray) -> Breaks:
-        """Breaks between frames of one recording."""
-        owners = self.recordings
-        steps = [(f, g) for f, g in self._breaks(rows, inside) if owners[f] == owners[g]]
+    def _breaks(self, rows: np.ndarray, inside: np.ndarray) -> Breaks:
+        """Breaks between a part and the map without a pause."""
+        steps = self._next_in_time(rows, inside, pairs.MAX_INTERVALS)
         return Breaks(steps, rows, inside, self.poses, self.times)
 
-    def _breaks(self, rows: np.ndarray, inside: np.ndarray) -> list[tuple[int, int]]:
-        """Neighbours in time without a pause between them, one of a part and one of the map."""
-        near = pairs.without_pause(self.times)
+    def _next_in_time(
+        self, rows: np.ndarray, inside: np.ndarray, max_intervals: float
+    ) -> list[tuple[int, int]]:
+        """Neighbours in time of one recording, one of a part and one of the map."""
+        near = pairs.without_pause(self.times, max_intervals)
+        near = near[self.recordings[near[:, 0]] == self.recordings[near[:, 1]]]
         near = np.concatenate([near, near[:, ::-1]])
         near = near[np.isin(near[:, 0], rows) & np.isin(near[:, 1], inside)]
         return sorted(((int(f), int(g)) for f, g in near), key=min)
 
     def _over_break(self, part: int, rows: np.ndarray, inside: np.ndarray) -> Sim3 | None:
-        """The similarity that several pairs of frames across a short break agree on; None if the
-        part is not next to the map in time, or its surroundings speak against it.
+        """The similarity that several pairs of frames across a short break or pause agree on; None
+        if the part is not next to the map in time, or its surroundings speak against it.
 
-        The camera cannot have moved far in between. A bay of a hall can be as near as the next one
-        is, though: what the surroundings do not confirm must continue the map at its pace.
+        A camera that walks on cannot have moved far in between. A bay of a hall can be as near as
+        the next one is, though: what the surroundings do not confirm must continue the map at its
+        pace.
         """
-        for outer, inner in self._breaks(rows, inside):
+        for outer, inner in self._next_in_time(rows, inside, _MAX_PAUSE_INTERVALS):
             earlier, later = (rows, inside) if outer < inner else (inside, rows)
             last = min(outer, inner)
             ends = (
@@ -417,7 +421,7 @@ class _Joining:
         """The pose (4, 4) found of a frame; or where the camera would walk on to it at an unusual
         pace, one at the usual pace. None if there is none, and steps to it or from it are wide."""
         rows, move = np.array([f]), self._move_of(f, found)
-        breaks = self._breaks_of_recording(rows, inside)
+        breaks = self._breaks(rows, inside)
         if breaks.continued_by(move) or self._is_held_by_trajectory(rows):
             return found
         steps = [min(step) for step in breaks.steps] or [max(f - 1, 0), min(f, len(self.wide) - 1)]
@@ -455,7 +459,7 @@ class _Joining:
         groups, places = (np.array([f]), inside), Places(poses, self.known)
         given = self.context, places, groups, self.usual_anywhere, self.depth
         evidence = join_evidence.weigh(*given, surfaces=False)[0]
-        beside = self._breaks_of_recording(groups[0], inside).steps
+        beside = self._breaks(groups[0], inside).steps
         return not evidence.absent if beside else evidence.likely
 
     def _sightings(

@@ -8,7 +8,7 @@ from gsba.config import PairSettings
 
 _FRAME_GAPS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
 _SAME_PLACE_SHARE = 0.125  # part of the reach within which a position counts as the same place
-_MAX_INTERVAL_RATIO = 2.5  # largest interval between neighbours, in median intervals
+MAX_INTERVALS = 2.5  # largest interval between neighbours, in median intervals
 
 
 def adjacent(num_frames: int, reach: int = 2) -> np.ndarray:
@@ -17,14 +17,15 @@ def adjacent(num_frames: int, reach: int = 2) -> np.ndarray:
     return np.array(rows, np.int32).reshape(-1, 2)
 
 
-def without_pause(timestamps: np.ndarray) -> np.ndarray:
+def without_pause(timestamps: np.ndarray, max_intervals: float = MAX_INTERVALS) -> np.ndarray:
     """Pairs (P, 2) int64 of neighbours in time without a pause between them.
 
     Args:
         timestamps: (F,) seconds.
+        max_intervals: largest interval that is no pause, in median intervals.
     """
     intervals = np.diff(timestamps)
-    close = np.flatnonzero(intervals <= _MAX_INTERVAL_RATIO * np.median(intervals))
+    close = np.flatnonzero(intervals <= max_intervals * np.median(intervals))
     return np.column_stack([close, close + 1])
 
 
