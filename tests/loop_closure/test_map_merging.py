@@ -134,6 +134,21 @@ def test_a_likely_join_is_taken_where_the_camera_walks_on(
         assert _errors(found, truth)[0] < 0.02
 
 
+@pytest.mark.parametrize(("seconds", "joined"), [(4.0, True), (8.0, False)])
+def test_pairs_over_a_pause_join_what_the_surroundings_confirm(
+    seconds: float, joined: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No look-alike place is searched for; frames are compared over a pause that is not too long."""
+    context, whole, late = scene()
+    monkeypatch.setattr(map_merging._Joining, "_meetings", lambda *_: [])
+    times = TIMES + seconds * (np.arange(NUM) >= HALF)
+    given = torn(whole, late, SCALE, MOVE), _halves(), NOBODY, ~BREAK, times
+    found = map_merging.merge(context, *given)
+    assert found.components.any() != joined
+    if joined:
+        assert _errors(found)[0] < 0.05
+
+
 @pytest.mark.parametrize("held", [False, True])
 def test_a_join_a_bay_off_is_left_for_one_at_the_usual_pace(
     held: bool, monkeypatch: pytest.MonkeyPatch
