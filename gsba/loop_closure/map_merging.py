@@ -9,6 +9,7 @@ has one, and become maps of their own otherwise.
 
 import logging
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from gsba.loop_closure.connectivity import MIN_MAP_FRAMES, by_size
 from gsba.loop_closure.join_evidence import GATE_RAD, Places, Rates
 from gsba.loop_closure.join_test import JoinTest, Judged
 from gsba.loop_closure.map_similarity import Meeting, Proposal, propose
-from gsba.loop_closure.merged_map import Registered
+from gsba.loop_closure.merged_map import Registered, carried, laid_out
 from gsba.loop_closure.pose_graph import Loop
 from gsba.loop_closure.registration import Resection, resect
 from gsba.loop_closure.retrieval import global_descriptors
@@ -39,7 +40,6 @@ _NUM_BEST_MEETINGS = 2  # best meetings whose neighbours are compared too
 # place all around.
 _MIN_TESTABLE_FRAMES = 6
 _MAX_PACES = 3.0  # largest distance of a single frame from its neighbours, in median paces
-_MAP_SPACING_EXTENTS = 4.0  # distance between unconnected maps, in their extents
 # Largest angle between the verticals of two parts, besides the spread within each: of one
 # recording, and of two, whose cameras may be held in another way.
 _MAX_TILT_RAD, _MAX_TILT_BETWEEN_RAD = np.deg2rad(5.0), np.deg2rad(45.0)
@@ -74,10 +74,10 @@ def merge(
     joining = _Joining(context, solved, parts, held, ties, timestamps, min_testable, owners)
     component = 0
     while joining.begin(component):
-        progress = True
-        while progress:
-            progress = joining.by_images() or joining.by_ties()
+        joining.grow()
         component += 1
+    while joining.by_grown_maps():
+        joining.grow()
     return joining.result()
 
 
@@ -119,7 +119,8 @@ class _Joining:
         self.components = np.full(num, -1)
         self.met, self.alone = np.zeros(num, bool), np.zeros(num, bool)
         self.reasons: dict[int, str] = {}  # why a part was not joined to the map
-        self.tried: set[tuple[int, int]] = set()  # part, size of the map it was compared with
+        # Parts and maps that were compared with a map: its first frame and size, and theirs.
+        self.compared: set[tuple[int, int, int, int]] = set()
         self.current = 0
 
     def begin(self, component: int) -> bool:
@@ -132,15 +133,44 @@ class _Joining:
         self.components[base], self.met[base], self.current = component, True, component
         return True
 
+    def grow(self) -> None:
+        """Move all parts to the map that can be."""
+        while self.by_images() or self.by_ties():
+            pass
+
+    def by_grown_maps(self) -> bool:
+        """Move one map to where it overlaps a larger one that it was not compared with while it
+        grew; False if none does."""
+        maps = [np.flatnonzero(self.components == c) for c in range(self.components.max() + 1)]
+        order = sorted(range(len(maps)), key=lambda c: -len(maps[c]))
+        for larger, smaller in combinations(order, 2):
+            rows, inside = maps[smaller], maps[larger]
+            if not self._is_new(rows, inside):
+                continue
+            self.current = larger
+            move = self._similarity(int(self.parts[rows[0]]), rows, inside)
+            if move is not None:
+                self._carry(rows, move)
+                self.components[self.components > smaller] -= 1
+                self.current = int(self.components[inside[0]])
+                return True
+        return False
+
+    def _is_new(self, rows: np.ndarray, inside: np.ndarray) -> bool:
+        """True the first time that frames outside a map are compared with it."""
+        both = int(rows[0]), len(rows), int(inside[0]), len(inside)
+        new = both not in self.compared
+        self.compared.add(both)
+        return new
+
     def by_images(self) -> bool:
         """Move one more part to where it overlaps the map; False if none does."""
         inside = np.flatnonzero(self.components == self.current)
         free = self.components < 0
         for part in np.unique(self.parts[free]).tolist():
-            if (part, len(inside)) in self.tried:
-                continue
-            self.tried.add((part, len(inside)))
             rows = np.flatnonzero(self.parts == part)
+            if not self._is_new(rows, inside):
+                continue
             if len(rows) >= MIN_MAP_FRAMES and any(np.isfinite(self.known[f]).any() for f in rows):
                 move = self._similarity(part, rows, inside)
                 if move is not None:
@@ -179,7 +209,7 @@ class _Joining:
         self.poses[rows] = move.poses(self.poses[rows])
         for f in rows:
             self.known[f] = move.scale * self.known[f]
-            self.moves[f] = move
+            self.moves[f] = move.after(self.moves[f])
         self.components[rows] = self.current
 
     def _candidates(self, rows: np.ndarray, inside: np.ndarray, looks: int) -> np.ndarray:
@@ -512,14 +542,15 @@ class _Joining:
             self.moves[f] = self.moves[nearest]
             self.poses[f] = self.moves[f].poses(self.poses[f])
         reasons = self._reasons(order := by_size(self.components))
-        offsets = self._side_by_side(order)
+        reach = self.context.settings.pairs.max_baseline_depths * self.depth
+        offsets = laid_out(self.poses[:, :3, 3], order, reach)
         scales = np.array([move.scale for move in self.moves])
         moves = np.array([move.new_T_old for move in self.moves])
         num, alone = int(self.parts.max()) + 1, int(lost.sum())
         dropped = {"frames alone": alone, "apart": maps - 1}
         kept = num - maps - alone
         return Registered(
-            _moved(self.solved, self.poses, scales, moves, offsets),
+            carried(self.solved, self.poses, scales, moves, offsets),
             order.astype(np.int32),
             scales,
             moves,
@@ -549,36 +580,9 @@ class _Joining:
             "" if f == first[0] else self.reasons.get(int(self.parts[f]), "") for f in first
         )
 
-    def _side_by_side(self, components: np.ndarray) -> np.ndarray:
-        """Offsets (F, 3) that separate maps: no frame of one is near a point of another."""
-        positions, offsets = self.poses[:, :3, 3], np.zeros((len(components), 3))
-        groups = [components == c for c in range(int(components.max()) + 1)]
-        extent = max(float(np.linalg.norm(np.ptp(positions[group], axis=0))) for group in groups)
-        extent += self.context.settings.pairs.max_baseline_depths * self.depth
-        for number, group in enumerate(groups[1:], 1):
-            away = np.array([number * _MAP_SPACING_EXTENTS * extent, 0, 0])
-            offsets[group] = positions[groups[0]].mean(axis=0) + away
-            offsets[group] -= positions[group].mean(axis=0)
-        return offsets
-
 
 def _each_once(rows: np.ndarray, points: np.ndarray, depth: float) -> tuple[np.ndarray, np.ndarray]:
     """Sightings, keypoints (m,) and points (m, 3), without those that occur twice."""
     once = np.round(points / max(1e-6 * depth, 1e-12))
     _, first = np.unique(np.column_stack([rows, once]), axis=0, return_index=True)
     return rows[first], points[first]
-
-
-def _moved(
-    solved: Solution,
-    world_T_rigs: np.ndarray,
-    scales: np.ndarray,
-    moves: np.ndarray,
-    offsets: np.ndarray,
-) -> Solution:
-    """The new poses with their offsets; each point moves with its first frame."""
-    landmarks = solved.landmarks.moved(scales, moves)
-    points = landmarks.points_world + offsets[landmarks.tracks.hosts()]
-    poses = world_T_rigs.copy()
-    poses[:, :3, 3] += offsets
-    return replace(solved, world_T_rigs=poses, landmarks=replace(landmarks, points_world=points))

@@ -9,6 +9,8 @@ from gsba.trajectory.joining import PLACES, SegmentAlignment
 from gsba.trajectory.judgement import StepChecks
 from gsba.types import CoarsePoses, Counts, PoseSource, Solution
 
+_MAP_SPACING_EXTENTS = 4.0  # distance between unconnected maps, in their extents
+
 
 @dataclass(frozen=True, slots=True)
 class Registered:
@@ -29,6 +31,45 @@ class Registered:
     def move(self, f: int) -> Sim3:
         """The similarity by which a frame was moved, before its map was laid beside others."""
         return Sim3.of(float(self.scales[f]), self.moves[f])
+
+
+def carried(
+    solved: Solution,
+    world_T_rigs: np.ndarray,
+    scales: np.ndarray,
+    moves: np.ndarray,
+    offsets: np.ndarray,
+) -> Solution:
+    """A map whose frames were moved; each point moves with its first frame.
+
+    Args:
+        solved: the map before.
+        world_T_rigs: (F, 4, 4) poses after.
+        scales, moves, offsets: see `Registered`.
+    """
+    landmarks = solved.landmarks.moved(scales, moves)
+    points = landmarks.points_world + offsets[landmarks.tracks.hosts()]
+    poses = world_T_rigs.copy()
+    poses[:, :3, 3] += offsets
+    return replace(solved, world_T_rigs=poses, landmarks=replace(landmarks, points_world=points))
+
+
+def laid_out(positions: np.ndarray, components: np.ndarray, reach: float) -> np.ndarray:
+    """Offsets (F, 3) that separate maps: no frame of one is near a point of another.
+
+    Args:
+        positions: (F, 3) of the frames, each in its map.
+        components: (F,) int, map of each frame.
+        reach: largest distance of points from frames, map units.
+    """
+    offsets = np.zeros((len(components), 3))
+    groups = [components == c for c in range(int(components.max()) + 1)]
+    extent = max(float(np.linalg.norm(np.ptp(positions[group], axis=0))) for group in groups)
+    for number, group in enumerate(groups[1:], 1):
+        away = np.array([number * _MAP_SPACING_EXTENTS * (extent + reach), 0, 0])
+        offsets[group] = positions[groups[0]].mean(axis=0) + away
+        offsets[group] -= positions[group].mean(axis=0)
+    return offsets
 
 
 def side_by_side(world_T_rigs: np.ndarray, registered: Registered | None) -> np.ndarray:
