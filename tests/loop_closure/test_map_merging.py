@@ -138,7 +138,7 @@ def test_a_likely_join_is_taken_where_the_camera_walks_on(
 def test_pairs_over_a_pause_join_what_the_surroundings_confirm(
     seconds: float, joined: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """No look-alike place is searched for; frames are compared over a pause that is not too long."""
+    """No other place is searched for; frames are compared over a pause that is not too long."""
     context, whole, late = scene()
     monkeypatch.setattr(map_merging._Joining, "_meetings", lambda *_: [])
     times = TIMES + seconds * (np.arange(NUM) >= HALF)
@@ -195,6 +195,39 @@ def test_a_frame_a_bay_off_is_registered_at_the_usual_pace(
     found = map_merging.merge(context, whole, _halves((f,)), NOBODY, NOBODY, times)
     off = _errors(found)[0]
     assert found.alone[f] and (off < 0.02) == at_pace
+
+
+def test_maps_that_have_grown_are_compared_with_one_another(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of four parts two meet, then the first one what has grown; the last one meets none."""
+    context, whole, _ = scene()
+    size = NUM // 4
+    own = [Sim3.of(SCALE**n, np.linalg.matrix_power(MOVE, n)) for n in range(4)]
+    poses = [own[n].poses(TRUTH[n * size : (n + 1) * size]) for n in range(4)]
+    torn_up, asked = replace(whole, world_T_rigs=np.concatenate(poses)), []
+
+    def similarity(
+        joining: map_merging._Joining, part: int, rows: np.ndarray, inside: np.ndarray
+    ) -> Sim3 | None:
+        asked.append((part, int(inside[0]), len(inside)))
+        if 3 in np.append(joining.parts[inside], part):
+            return None
+        if 0 in np.append(joining.parts[inside], part) and len(rows) + len(inside) < 3 * size:
+            return None
+        ends = (joining.moves[f].after(own[f // size]) for f in (rows[0], inside[0]))
+        from_truth, to_truth = ends
+        return to_truth.after(from_truth.inverse())
+
+    monkeypatch.setattr(map_merging._Joining, "_similarity", similarity)
+    parts = np.repeat(np.arange(4), size)
+    found = map_merging.merge(context, torn_up, parts, NOBODY, NOBODY, TIMES)
+    np.testing.assert_array_equal(found.components, parts == 3)
+    assert len(set(asked)) == len(asked)  # nothing is compared twice
+    start = inverse(found.solved.world_T_rigs[0]) @ found.solved.world_T_rigs[: 3 * size]
+    np.testing.assert_allclose(start, inverse(TRUTH[0]) @ TRUTH[: 3 * size], atol=1e-9)
+    for n in range(3):
+        np.testing.assert_allclose(found.scales[n * size], SCALE**-n, rtol=1e-12)
 
 
 def test_strangers_stay_apart() -> None:
