@@ -230,6 +230,9 @@ class _Joining:
         if len(inside) < self.min_testable and not self._is_held_by_trajectory(rows):
             self.reasons[part] = f"a map of {len(inside)} frames is too small to test a join"
             return None
+        of_first_map = self.current == 0 and self.components[rows[0]] < 0
+        if not of_first_map and not self._looks_like(rows, inside):
+            return self._over_break(part, rows, inside)
         sampled = np.linspace(0, len(rows) - 1, _NUM_SAMPLED_FRAMES).astype(int)
         sampled = rows[
             np.unique([*sampled, *range(_BREAK_REACH_FRAMES), *range(-_BREAK_REACH_FRAMES, 0)])
@@ -241,6 +244,12 @@ class _Joining:
             meetings += self._meetings(self.context, self._around(meetings, rows, inside, chosen))
             found = self._best(part, meetings, rows, inside)
         return found or self._over_break(part, rows, inside)
+
+    def _looks_like(self, rows: np.ndarray, inside: np.ndarray) -> bool:
+        """True if a frame of a part looks more like one of the map than like any other."""
+        others = np.setdiff1d(np.arange(len(self.parts)), rows)
+        nearest = np.argmax(self.looks[rows] @ self.looks[others].T, axis=1)
+        return bool(np.isin(others[nearest], inside).any())
 
     def _best(
         self, part: int, meetings: list[Meeting], rows: np.ndarray, inside: np.ndarray
