@@ -230,8 +230,9 @@ class _Joining:
         if len(inside) < self.min_testable and not self._is_held_by_trajectory(rows):
             self.reasons[part] = f"a map of {len(inside)} frames is too small to test a join"
             return None
-        of_first_map = self.current == 0 and self.components[rows[0]] < 0
-        if not of_first_map and not self._looks_like(rows, inside):
+        # Beside the first map there may be many: only what looks most like them is searched.
+        first = self.current == 0 and self.components[rows[0]] < 0
+        if not first and not self._looks_like(rows, inside):
             return self._over_break(part, rows, inside)
         sampled = np.linspace(0, len(rows) - 1, _NUM_SAMPLED_FRAMES).astype(int)
         sampled = rows[

@@ -230,6 +230,26 @@ def test_maps_that_have_grown_are_compared_with_one_another(
         np.testing.assert_allclose(found.scales[n * size], SCALE**-n, rtol=1e-12)
 
 
+def test_maps_beside_the_first_are_searched_for_what_looks_like_them(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Once around in four parts, each of which looks like the two beside it."""
+    context, whole, _ = scene()
+    searched = []
+
+    def best(_: object, part: int, meetings: list, rows: np.ndarray, inside: np.ndarray) -> None:
+        searched.append((part, int(inside[0])))
+
+    monkeypatch.setattr(map_merging._Joining, "_best", best)
+    monkeypatch.setattr(map_merging._Joining, "_meetings", lambda *_: [])
+    monkeypatch.setattr(map_merging, "agreed", lambda *_: None)
+    size = NUM // 4
+    parts = np.repeat(np.arange(4), size)
+    found = map_merging.merge(context, whole, parts, NOBODY, NOBODY, TIMES)
+    np.testing.assert_array_equal(found.components, parts)
+    assert sorted(searched) == [(1, 0), (2, 0), (2, size), (3, 0), (3, 2 * size)]
+
+
 def test_strangers_stay_apart() -> None:
     context, whole, late = scene(strange=True)
     found = map_merging.merge(
