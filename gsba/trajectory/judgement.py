@@ -165,7 +165,7 @@ def implausible_steps(
         np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
         for poses in (coarse.world_T_rigs, world_T_rigs)
     )
-    judged = own[:-1] & own[1:]
+    judged = own[:-1] & own[1:] & ~(trust.unseen_steps & trust.false_steps)  # those are guesses
     judged &= (found > 0) & (slam > np.median(slam) / max_ratio)  # standing still measures nothing
     rows, wrong = np.flatnonzero(judged), np.zeros(len(slam), bool)
     if len(rows) < _MIN_JUDGED_STEPS:
