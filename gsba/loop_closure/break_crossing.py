@@ -76,9 +76,7 @@ def agreed(proposals: list[Proposal], poses: np.ndarray, depth: float) -> Propos
     counts = [sum(alike(one, other, poses, depth) for other in proposals) for one in proposals]
     if max(counts, default=0) < max(MIN_AGREEING, len(proposals) // 2 + 1):
         return None
-    most = max(counts)
-    best = [one for one, count in zip(proposals, counts, strict=True) if count == most]
-    return max(best, key=lambda one: one.support)
+    return proposals[max(range(len(counts)), key=lambda n: (counts[n], proposals[n].support))]
 
 
 @dataclass(frozen=True, slots=True)

@@ -215,9 +215,8 @@ def test_maps_that_have_grown_are_compared_with_one_another(
             return None
         if 0 in np.append(joining.parts[inside], part) and len(rows) + len(inside) < 3 * size:
             return None
-        ends = (joining.moves[f].after(own[f // size]) for f in (rows[0], inside[0]))
-        from_truth, to_truth = ends
-        return to_truth.after(from_truth.inverse())
+        old, new = (joining.moves[f].after(own[f // size]) for f in (rows[0], inside[0]))
+        return new.after(old.inverse())
 
     monkeypatch.setattr(map_merging._Joining, "_similarity", similarity)
     parts = np.repeat(np.arange(4), size)
