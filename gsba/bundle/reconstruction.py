@@ -1,8 +1,12 @@
 """The result of a run, in the world and scale of the coarse trajectory."""
 
+from collections.abc import Iterator
+from pathlib import Path
+
 import numpy as np
 
 from gsba.bundle.tracks import runs
+from gsba.disk import concatenated
 from gsba.geometry import angular_errors, furthest, moved_to
 from gsba.log import GsbaError
 from gsba.memory import release_mapped_files
@@ -19,7 +23,7 @@ from gsba.types import (
 
 _MIN_CORRELATION = 0.1  # least correlation of refined and coarse positions: with usual drift it is
 # .8
-_AT_ONCE = 1 << 18  # observations whose poses are held together: 35 MB
+_AT_ONCE = 1 << 17  # observations whose poses are held together: 17 MB
 _MAX_RESIDUAL_DEG = 10.0  # largest median residual: gates leave a tenth of a degree
 
 
@@ -32,6 +36,7 @@ def assemble(
     false_frames: np.ndarray | None = None,
     components: np.ndarray | None = None,
     joint_errors: JointErrors | None = None,
+    scratch: Path | None = None,
 ) -> Reconstruction:
     """Carry the solution back to the trajectory's world and gather what exports need.
 
@@ -45,6 +50,8 @@ def assemble(
         false_frames: (F,) bool, frames whose coarse pose has no say either.
         components: (F,) map of each frame, each carried to its own coarse poses; None = one map.
         joint_errors: of the poses; None = not known.
+        scratch: folder on the disk that takes arrays of all observations; None = they are in
+            memory.
 
     Raises:
         GsbaError: not where the trajectory has its frames, or residuals that no solution leaves.
@@ -57,42 +64,60 @@ def assemble(
         known, targets = known & (coarse.sources == PoseSource.SLAM), coarse.world_T_rigs
     groups = np.zeros(len(seen), np.int32) if components is None else components
     placed, points_world, stretch = _placed(adjustment, targets, known, groups)
-    rows, points = keypoints.rows(landmarks.tracks), landmarks.tracks.points
+    points = landmarks.tracks.points
     lengths = np.maximum(np.bincount(points, minlength=len(landmarks.points_world)), 1)
-    bearings, origins = keypoints.bearings_rig[rows], keypoints.origins_of(rows)
-    errors = _errors(adjustment, bearings, origins)
+    colors = np.zeros((len(lengths), 3), np.uint8)
+    pieces = _observations(adjustment, keypoints, stretch[:, 3], colors)
+    bearings, sigmas, errors, *origins = concatenated(pieces, scratch)
     _require_small(errors)
-    seen_colors = keypoints.colors[rows]
-    release_mapped_files()
-    colors = [np.bincount(points, c, len(lengths)) / lengths for c in seen_colors.T]
     return Reconstruction(
         placed,
         covariances * stretch[:, :, None] * stretch[:, None, :],
         np.where(refined, PoseStatus.REFINED, PoseStatus.UNREFINED).astype(np.uint8),
         points_world,
-        np.rint(np.stack(colors, axis=1)).astype(np.uint8),
+        colors,
         np.bincount(points, errors, len(lengths)) / lengths,
         points,
         landmarks.tracks.frames,
         bearings,
-        adjustment.noise * keypoints.sigmas_rad[rows],
+        sigmas,
         components=components,
         joint_errors=joint_errors and joint_errors.scaled(stretch),
-        observation_origins=None
-        if origins is None
-        else stretch[landmarks.tracks.frames, 3:] * origins,
+        observation_origins=origins[0] if origins else None,
         map_scales=None if components is None else _map_scales(stretch[:, 3], components),
     )
 
 
-def _errors(adjustment: Solution, bearings: np.ndarray, origins: np.ndarray | None) -> np.ndarray:
-    """Angles (O,), radians, between bearings (O, 3) of the points' observations and the points."""
-    landmarks, poses, found = adjustment.landmarks, adjustment.world_T_rigs, [np.empty(0)]
-    for points, rows, some in runs(landmarks.tracks, _AT_ONCE):
-        there = moved_to(poses[some.frames], None if origins is None else origins[rows])
+def _observations(
+    adjustment: Solution, keypoints: Keypoints, scales: np.ndarray, colors: np.ndarray
+) -> Iterator[tuple[np.ndarray, ...]]:
+    """Columns of the points' observations, those of some points at a time.
+
+    Args:
+        adjustment: the last solution.
+        keypoints: of all frames.
+        scales: (F,) units of the result per map unit, of each frame's map.
+        colors: (J, 3) uint8, the points' mean colors, which are written here.
+
+    Yields:
+        Bearings (O, 3), their standard deviations (O,) and angles (O,) to the points, radians; and
+        where rays have origins of their own, these, (O, 3) in units of the result.
+    """
+    landmarks, poses = adjustment.landmarks, adjustment.world_T_rigs
+    nothing, none = np.empty((0, 3)), np.empty(0)
+    yield (nothing, none, none, *([] if keypoints.origins_rig is None else [nothing]))
+    for points, _, some in runs(landmarks.tracks, _AT_ONCE):
+        rows = keypoints.rows(some)
+        bearings, origins = keypoints.bearings_rig[rows], keypoints.origins_of(rows)
         ends = landmarks.points_world[points][some.points]
-        found.append(angular_errors(there, ends, bearings[rows]))
-    return np.concatenate(found)
+        errors = angular_errors(moved_to(poses[some.frames], origins), ends, bearings)
+        lengths = np.maximum(np.bincount(some.points, minlength=some.num_points), 1)
+        seen = keypoints.colors[rows].T
+        sums = [np.bincount(some.points, color, some.num_points) for color in seen]
+        colors[points] = np.rint(np.stack(sums, axis=1) / lengths[:, None])
+        moved = [] if origins is None else [scales[some.frames][:, None] * origins]
+        yield (bearings, adjustment.noise * keypoints.sigmas_rad[rows], errors, *moved)
+        release_mapped_files()
 
 
 def _map_scales(stretches: np.ndarray, components: np.ndarray) -> np.ndarray:

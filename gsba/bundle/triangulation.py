@@ -136,14 +136,17 @@ def _sum(parts: Sequence[Counts]) -> Counts:
 
 def points_under(reconstruction: Reconstruction, world_T_rigs: np.ndarray) -> np.ndarray:
     """Points (J, 3) nearest to the rays of a reconstruction under other poses (F, 4, 4)."""
-    shape = len(reconstruction.points_world)
-    normal, target = np.zeros((shape, 3, 3)), np.zeros((shape, 3))
+    placed = np.zeros((len(reconstruction.points_world), 3))
     for some in reconstruction.pieces():
         lenses = moved_to(world_T_rigs[some.observation_frames], some.observation_origins)
         rotations, centres = lenses[:, :3, :3], lenses[:, :3, 3]
         rays = np.einsum("oij,oj->oi", rotations, some.observation_bearings)
         across = np.eye(3) - rays[:, :, None] * rays[:, None, :]  # off the ray
-        np.add.at(normal, some.observation_points, across)
-        np.add.at(target, some.observation_points, np.einsum("oij,oj->oi", across, centres))
-    normal += 1e-9 * np.eye(3)  # parallel rays leave the depth open
-    return np.linalg.solve(normal, target[..., None])[..., 0]
+        points, which = np.unique(some.observation_points, return_inverse=True)
+        normal, target = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
+        np.add.at(normal, which, across)
+        np.add.at(target, which, np.einsum("oij,oj->oi", across, centres))
+        normal += 1e-9 * np.eye(3)  # parallel rays leave the depth open
+        placed[points] = np.linalg.solve(normal, target[..., None])[..., 0]
+        release_mapped_files()
+    return placed

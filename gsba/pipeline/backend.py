@@ -265,6 +265,7 @@ def reconstruct(
             prior.trust.false_frames,
             prior.parts,
             joint,
+            run.store.scratch_folder,
         )
         result = replace(
             result,

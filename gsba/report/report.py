@@ -18,8 +18,9 @@ from pydantic import BaseModel
 from gsba.bundle.triangulation import points_under
 from gsba.disk import atomic_write
 from gsba.geometry import angular_errors, moved_to, quaternion_from_rotation
-from gsba.memory import total_memory_bytes, usable_cpus
+from gsba.memory import release_mapped_files, total_memory_bytes, usable_cpus
 from gsba.report.maps import summarize_maps
+from gsba.report.medians import medians_by_group
 from gsba.store.store import StageRecord
 from gsba.types import CoarsePoses, Counts, FrameSet, PoseSource, PoseStatus, Reconstruction
 from gsba.version import __version__
@@ -46,12 +47,7 @@ def frame_quality(reconstruction: Reconstruction) -> FrameQuality:
     num_frames = len(reconstruction.world_T_rigs)
     residuals = angular_residuals(reconstruction)
     counts = np.bincount(frames, minlength=num_frames)
-    medians = np.full(num_frames, np.nan)
-    seen = counts > 0
-    ordered = residuals[np.lexsort((residuals, frames))]
-    starts = (np.cumsum(counts) - counts)[seen]
-    middles = ordered[starts + (counts[seen] - 1) // 2] + ordered[starts + counts[seen] // 2]
-    medians[seen] = np.degrees(middles / 2)
+    medians = np.degrees(medians_by_group(residuals, frames, num_frames))
     variances = np.diagonal(reconstruction.pose_covariances, axis1=1, axis2=2)
     deviations = np.sqrt(np.where(variances >= 0, variances, np.nan))
     return FrameQuality(counts, medians, np.degrees(deviations[:, :3]), deviations[:, 3:])
@@ -71,12 +67,15 @@ def median_residual_deg(reconstruction: Reconstruction, world_T_rigs: np.ndarray
 
 def angular_residuals(reconstruction: Reconstruction) -> np.ndarray:
     """Angles (O,) in radians between each observed bearing and the direction to its point."""
-    found = []
+    found, done = np.empty(len(reconstruction.observation_frames)), 0
     for some in reconstruction.pieces():
         poses = moved_to(some.world_T_rigs[some.observation_frames], some.observation_origins)
         points = some.points_world[some.observation_points]
-        found.append(angular_errors(poses, points, some.observation_bearings))
-    return np.concatenate(found)
+        errors = angular_errors(poses, points, some.observation_bearings)
+        found[done : done + len(errors)] = errors
+        done += len(errors)
+        release_mapped_files()
+    return found
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

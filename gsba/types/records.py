@@ -512,17 +512,27 @@ class Reconstruction:
         return 1.0 if self.map_scales is None else float(self.map_scales[number - 1])
 
     def pieces(self) -> "Iterator[Reconstruction]":
-        """The reconstruction with some of its observations at a time, one piece at least."""
-        origins = self.observation_origins
-        for some in slices(len(self.observation_frames), _AT_ONCE):
+        """The reconstruction with some of its observations at a time, all of a point together; one
+        piece at least."""
+        origins, points = self.observation_origins, self.observation_points
+        stop = 0
+        while True:
+            start, stop = stop, min(stop + _AT_ONCE, len(points))
+            if stop < len(points):
+                before = int(np.searchsorted(points, points[stop]))
+                after = int(np.searchsorted(points, points[start], side="right"))
+                stop = max(before, after)
+            some = slice(start, stop)
             yield replace(
                 self,
-                observation_points=self.observation_points[some],
+                observation_points=points[some],
                 observation_frames=self.observation_frames[some],
                 observation_bearings=self.observation_bearings[some],
                 observation_sigmas=self.observation_sigmas[some],
                 observation_origins=None if origins is None else origins[some],
             )
+            if stop == len(points):
+                return
 
     def taken(self, rows: np.ndarray) -> "Reconstruction":
         """Reconstruction of frames `rows` (F',), ascending: their poses and observed points."""

@@ -187,13 +187,6 @@ def test_residuals_have_a_direction() -> None:
     assert np.isnan(sphere["median_deg"][0]).all()  # nothing was seen at the zenith
 
 
-def test_cell_medians() -> None:
-    cells = np.array([0, 0, 0, 0, 0, 0, 2, 2, 2, 2, 2, 1])
-    values = np.array([6.0, 1, 2, 3, 4, 5, 9, 8, 7, 5, 6, 1])
-    found = figures._medians(values, cells, np.bincount(cells, minlength=4))
-    np.testing.assert_array_equal(found, [3.5, np.nan, 7, np.nan])
-
-
 def test_many_frames_share_a_cell() -> None:
     result = scene.reconstruction()
     num = 1000

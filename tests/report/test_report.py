@@ -3,6 +3,7 @@
 import csv
 import json
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from gsba.geometry import inverse, pose, rotation_from_quaternion
 from gsba.report.report import (
     Findings,
     StageLog,
+    angular_residuals,
     build_report,
     frame_quality,
     median_residual_deg,
@@ -99,6 +101,23 @@ def test_residual_under_other_poses_places_the_points_anew() -> None:
     assert median_residual_deg(reconstruction, moved) == pytest.approx(same, abs=1e-6)
     moved[1, :3, 3] += 6.0  # two units of the map as it was
     assert median_residual_deg(reconstruction, moved) > 10 * same
+
+
+@pytest.mark.parametrize("most", [1, 7, 30])
+def test_observations_some_at_a_time(monkeypatch: pytest.MonkeyPatch, most: int) -> None:
+    """Points keep their observations together, whatever fits: nothing changes."""
+    _, coarse, whole = _world()
+    moved = coarse.world_T_rigs.copy()
+    moved[1, :3, 3] += 6.0
+    residuals, under = angular_residuals(whole), median_residual_deg(whole, moved)
+    monkeypatch.setattr("gsba.types.records._AT_ONCE", most)
+    pieces = list(whole.pieces())
+    assert len(pieces) > 1
+    assert max(len(one.observation_points) for one in pieces) <= max(most, 3)
+    for before, after in pairwise(pieces):
+        assert before.observation_points[-1] < after.observation_points[0]
+    np.testing.assert_array_equal(angular_residuals(whole), residuals)
+    assert median_residual_deg(whole, moved) == pytest.approx(under, rel=1e-12)
 
 
 def test_report_is_valid_json(tmp_path: Path) -> None:

@@ -6,6 +6,8 @@ import numpy as np
 
 from gsba.camera.sphere import bearings_from_erp
 from gsba.geometry import moved_to, rotation_angle
+from gsba.memory import release_mapped_files
+from gsba.report.medians import medians_by_group
 from gsba.types import CoarsePoses, Reconstruction
 
 _MAX_POINTS = 4000  # points of the cloud on the map
@@ -101,24 +103,34 @@ def residual_sphere(reconstruction: Reconstruction) -> dict[str, Any]:
         "count". NaN where there are too few.
     """
     rows, columns = round(180 / _SPHERE_CELL_DEG), round(360 / _SPHERE_CELL_DEG)
-    bearings = reconstruction.observation_bearings
-    residuals = np.degrees(tangent_residuals(reconstruction))
-    longitude = np.arctan2(bearings[:, 0], bearings[:, 2])
-    latitude = np.arcsin(np.clip(bearings[:, 1], -1, 1))
-    column = np.clip(((longitude / np.pi + 1) / 2 * columns).astype(int), 0, columns - 1)
-    row = np.clip(((latitude / np.pi + 0.5) * rows).astype(int), 0, rows - 1)
-    cell = row * columns + column
-    lengths = np.linalg.norm(residuals, axis=1)
-    count = np.bincount(cell, minlength=rows * columns)
-    values = [lengths, residuals[:, 0], residuals[:, 1]]
-    medians = [_medians(value, cell, count).reshape(rows, columns) for value in values]
+    cells, values = [], []
+    for some in reconstruction.pieces():
+        cells.append(_cells(some.observation_bearings, rows, columns))
+        residuals = np.degrees(tangent_residuals(some)).T
+        values.append(np.stack([np.hypot(*residuals), *residuals]).astype(np.float32))
+        release_mapped_files()
+    cell, num = np.concatenate(cells), rows * columns
+    parts = zip(*values, strict=True)
+    medians = [
+        medians_by_group(np.concatenate(part), cell, num, _MIN_IN_CELL).reshape(rows, columns)
+        for part in parts
+    ]
     names = ("median_deg", "east_deg", "south_deg")
     return {
         "rows": rows,
         "columns": columns,
-        "count": count.reshape(rows, columns),
+        "count": np.bincount(cell, minlength=num).reshape(rows, columns),
         **dict(zip(names, medians, strict=True)),
     }
+
+
+def _cells(bearings: np.ndarray, rows: int, columns: int) -> np.ndarray:
+    """Cell (O,) uint16 of an equirectangular grid that each bearing (O, 3) points to."""
+    longitude = np.arctan2(bearings[:, 0], bearings[:, 2])
+    latitude = np.arcsin(np.clip(bearings[:, 1], -1, 1))
+    column = np.clip(((longitude / np.pi + 1) / 2 * columns).astype(int), 0, columns - 1)
+    row = np.clip(((latitude / np.pi + 0.5) * rows).astype(int), 0, rows - 1)
+    return (row * columns + column).astype(np.uint16)
 
 
 def field_sphere(correction: tuple[float, ...]) -> dict[str, Any] | None:
@@ -153,11 +165,6 @@ def _axes(bearings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def tangent_residuals(reconstruction: Reconstruction) -> np.ndarray:
     """Predicted minus observed direction (O, 2), radians east and south on the sphere."""
-    return np.concatenate([_tangent_residuals(some) for some in reconstruction.pieces()])
-
-
-def _tangent_residuals(reconstruction: Reconstruction) -> np.ndarray:
-    """As `tangent_residuals`, of a few observations."""
     frames = reconstruction.observation_frames
     poses = moved_to(reconstruction.world_T_rigs[frames], reconstruction.observation_origins)
     offsets = reconstruction.points_world[reconstruction.observation_points] - poses[:, :3, 3]
@@ -168,14 +175,3 @@ def _tangent_residuals(reconstruction: Reconstruction) -> np.ndarray:
     sine = np.linalg.norm(across, axis=1, keepdims=True)
     angle = np.arctan2(sine, np.einsum("oi,oi->o", predicted, bearings)[:, None])
     return across * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 1.0)
-
-
-def _medians(values: np.ndarray, cells: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Median of the values of each cell; NaN for cells with fewer than `_MIN_IN_CELL`."""
-    ordered = values[np.lexsort((values, cells))]
-    starts = np.cumsum(count) - count
-    enough = count >= _MIN_IN_CELL
-    low, high = starts + (count - 1) // 2, starts + count // 2
-    out = np.full(len(count), np.nan)
-    out[enough] = (ordered[low[enough]] + ordered[high[enough]]) / 2
-    return out
