@@ -118,6 +118,8 @@ class BlockCholesky:
             diagonal: (N, 6, 6), symmetric blocks H[i, i].
             off_diagonal: (P, 6, 6), blocks H[i, j] of the pairs.
         """
+        for front in self._fronts:  # the factor before is not held beside the new one
+            front.lower = front.below = _nothing()
         updates: dict[int, list[tuple[np.ndarray, np.ndarray]]] = {}
         for s, front in enumerate(self._fronts):
             width, num = DIM * front.width, DIM * len(front.rows)
@@ -143,6 +145,14 @@ class BlockCholesky:
     def solve(self, right: np.ndarray) -> np.ndarray:
         """Solve H x = right, both (N, 6)."""
         return self._backward(self._forward(right))
+
+    def solve_all(self, rights: np.ndarray) -> np.ndarray:
+        """Solve H x = right for several right sides at once, both (D, N, 6)."""
+        x = self._by_place(rights)
+        for front in self._fronts:
+            x[front.own] = trsm(1.0, front.lower, x[front.own], lower=1)
+            x[front.under] -= front.below @ x[front.own]
+        return self._all_backward(x)
 
     def reduced(self, right: np.ndarray) -> np.ndarray:
         """Right side (K, 6) of the complement's system, given that of the whole one, (N, 6)."""
@@ -181,13 +191,20 @@ class BlockCholesky:
         Where blocks were kept, `normals` holds what was drawn of these, from the covariance of
         their own system.
         """
-        num = len(normals)
-        x = np.ascontiguousarray(normals[:, self.order].reshape(num, DIM * self.num_blocks).T)
+        return self._all_backward(self._by_place(normals))
+
+    def _by_place(self, vectors: np.ndarray) -> np.ndarray:
+        """Columns (6 N, D), by elimination place, of vectors (D, N, 6)."""
+        rows = vectors[:, self.order].reshape(len(vectors), DIM * self.num_blocks)
+        return np.ascontiguousarray(rows.T)
+
+    def _all_backward(self, x: np.ndarray) -> np.ndarray:
+        """L^-T x (D, N, 6), by block, of columns x (6 N, D) by elimination place, which change."""
         for front in reversed(self._eliminated):
             rest = x[front.own] - front.below.T @ x[front.under]
             x[front.own] = trsm(1.0, front.lower, rest, lower=1, trans_a=1)
-        out = np.empty((num, self.num_blocks, DIM))
-        out[:, self.order] = x.T.reshape(num, self.num_blocks, DIM)
+        out = np.empty((x.shape[1], self.num_blocks, DIM))
+        out[:, self.order] = x.T.reshape(out.shape)
         return out
 
     def inverse_blocks(

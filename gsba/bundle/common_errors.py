@@ -8,14 +8,18 @@ residuals show them, enlarged and smoothed along the path; both numbers are meas
 (`benchmarks/covariances.py`), not derived.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from gsba.geometry import furthest
 from gsba.types import JointErrors
+from gsba.types.records import slices
 
 _COMMON_RATIO = 1.7  # standard deviation of common errors over that of the others
 _SMOOTHING_FRAMES = 3.0  # frames, standard deviation of their smoothing
+_AT_ONCE = 20  # errors drawn of all poses, in float64
 
 
 def added(
@@ -34,12 +38,28 @@ def added(
             furthest position are held; None = there is one.
     """
     groups = np.zeros(len(world_T_rigs), int) if components is None else components
-    known = np.isfinite(joint.draws).all(axis=(0, 2))
-    rotations, errors = world_T_rigs[:, :3, :3], np.zeros(joint.draws.shape)
-    for group in np.unique(groups):
-        rows = np.flatnonzero(known & (groups == group))
+    known, num = np.isfinite(joint.draws).all(axis=(0, 2)), len(joint.draws)
+    parts = [np.flatnonzero(known & (groups == group)) for group in np.unique(groups)]
+    each, between = np.zeros_like(covariances), np.zeros_like(joint.neighbours)
+    draws = joint.draws.copy()
+    for some in slices(num, _AT_ONCE):
+        errors = _in_common(joint.draws[some], world_T_rigs, parts)
+        each += np.einsum("dfi,dfj->fij", errors, errors) / num
+        between += np.einsum("dfi,dfj->fij", errors[:, :-1], errors[:, 1:]) / num
+        others = (np.arange(some.start, some.stop) + 1) % num  # of which these are independent
+        draws[others] += errors.astype(np.float32)
+    return covariances + each, JointErrors(joint.neighbours + between, draws)
+
+
+def _in_common(
+    draws: np.ndarray, world_T_rigs: np.ndarray, parts: Sequence[np.ndarray]
+) -> np.ndarray:
+    """Errors in common (D, F, 6), enlarged and smoothed from errors drawn of the poses of each
+    part's frames (F',); none for a part of one frame."""
+    rotations, errors = world_T_rigs[:, :3, :3], np.zeros(draws.shape)
+    for rows in parts:
         if len(rows) > 1:
-            turned = [rotations[rows] @ joint.draws[:, rows, part, None] for part in _PARTS]
+            turned = [rotations[rows] @ draws[:, rows, part, None] for part in _PARTS]
             smooth = gaussian_filter1d(
                 np.concatenate(turned, axis=2)[..., 0], _SMOOTHING_FRAMES, axis=1
             )
@@ -47,11 +67,7 @@ def added(
             back = np.swapaxes(rotations[rows], 1, 2)
             turned = [back @ held[:, :, part, None] for part in _PARTS]
             errors[:, rows] = _COMMON_RATIO * np.concatenate(turned, axis=2)[..., 0]
-    errors = np.roll(errors, 1, axis=0)  # of other draws than those they are added to
-    each = np.einsum("dfi,dfj->fij", errors, errors) / len(errors)
-    between = np.einsum("dfi,dfj->fij", errors[:, :-1], errors[:, 1:]) / len(errors)
-    draws = (joint.draws + errors).astype(np.float32)
-    return covariances + each, JointErrors(joint.neighbours + between, draws)
+    return errors
 
 
 _PARTS = slice(3), slice(3, 6)  # rotation, translation

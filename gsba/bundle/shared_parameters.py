@@ -236,8 +236,7 @@ def _solve_poses(of_poses: csr_array, right: np.ndarray) -> np.ndarray:
     cholesky = BlockCholesky(len(diagonal), np.column_stack([rows[upper], blocks.indices[upper]]))
     if not cholesky.factorize(diagonal, blocks.data[upper]):
         raise ArithmeticError("a damped Hessian of poses is not positive definite")
-    columns = [cholesky.solve(column.reshape(-1, 6)).ravel() for column in right.T]
-    return np.column_stack(columns)
+    return cholesky.solve_all(right.T.reshape(-1, len(diagonal), 6)).reshape(right.T.shape).T
 
 
 def without_points(

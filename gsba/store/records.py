@@ -8,6 +8,7 @@ zip checksums reveal truncated or flipped bytes. Arrays begin at multiples of 64
 so that they can be used where they lie.
 """
 
+import io
 import json
 import logging
 import math
@@ -24,6 +25,7 @@ from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import MISSING, Field, fields, is_dataclass
 from enum import Enum
+from functools import lru_cache
 from pathlib import Path
 from threading import Lock
 from typing import IO, Any, Literal, TypeVar, Union, get_args, get_origin
@@ -118,8 +120,21 @@ def load_record(path: Path, returns: type[T], mapped: bool = False) -> T:
     Raises:
         RecordError: missing, truncated, corrupt, or of another type.
     """
-    with _reading(path, _MappedArchive if mapped else zipfile.ZipFile) as archive:
+    with _reading(path, _MappedArchive if mapped else _Archive) as archive:
         return _decode(_manifest(archive)["value"], returns, archive)
+
+
+def load_keyed(path: Path, key: str, returns: type[T]) -> T | None:
+    """Read a record back if its info has this `key`; None if it has another.
+
+    Raises:
+        RecordError: as for `load_record`.
+    """
+    with _reading(path) as archive:
+        manifest = _manifest(archive)
+        if manifest["info"].get("key") != key:
+            return None
+        return _decode(manifest["value"], returns, archive)
 
 
 def load_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
@@ -160,33 +175,49 @@ def load_checkpoint(path: Path | None, key: str, returns: type[T], anew: str) ->
     if path is None or not path.exists():
         return None
     try:
-        if read_info(path).get("key") == key:
-            return load_record(path, returns)
+        found = load_keyed(path, key, returns)
+        if found is not None:
+            return found
         logger.info("%s was made with other inputs or settings: %s", path, anew)
     except RecordError as error:
         logger.warning("%s: %s", anew, error)
     return None
 
 
-class _MappedArchive(zipfile.ZipFile):
+class _Archive(zipfile.ZipFile):
+    """Archive of arrays."""
+
+    def array(self, name: str) -> np.ndarray:
+        """An array whose bytes agree with their checksum, read as a whole.
+
+        Raises:
+            ValueError: it is of Python objects, or longer or shorter than its header says.
+        """
+        content = self.read(name)
+        file = io.BytesIO(content)
+        shape, fortran, dtype = _header(file)
+        if dtype.hasobject or len(content) != file.tell() + math.prod(shape) * dtype.itemsize:
+            raise ValueError(f"{name} is no array of numbers, or is truncated")
+        flat = np.frombuffer(content, dtype, offset=file.tell()).copy()
+        return flat.reshape(shape, order="F" if fortran else "C")
+
+
+class _MappedArchive(_Archive):
     """Archive whose large arrays are used where they lie."""
 
     _content: mmap.mmap | None = None
 
-    def array(self, name: str) -> np.ndarray | None:
-        """An array whose bytes agree with their checksum; None = it is to be read.
-
-        Small ones are read, and those of files that did not align them.
-        """
+    def array(self, name: str) -> np.ndarray:
+        """As that of any archive; small ones are read, and those of files that did not align
+        them."""
         member = self.getinfo(name)
-        if member.file_size < MIN_MAPPED_BYTES:
-            return None
+        mapped = self._mapped(member) if member.file_size >= MIN_MAPPED_BYTES else None
+        return super().array(name) if mapped is None else mapped
+
+    def _mapped(self, member: zipfile.ZipInfo) -> np.ndarray | None:
+        """An array in its place; None = it is not aligned there."""
         with self.open(member) as file:
-            version = np.lib.format.read_magic(file)
-            if version != (1, 0):
-                return None
-            with _PARSING:
-                shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
+            shape, fortran, dtype = _header(file)
             header = file.tell()
             if dtype.hasobject:
                 return None
@@ -204,10 +235,23 @@ class _MappedArchive(zipfile.ZipFile):
         return flat.reshape(shape, order="F" if fortran else "C")
 
 
+def _header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Shape, order and type of an array from the beginning of its file.
+
+    Raises:
+        ValueError: it is no header, or not of the version that is written here.
+    """
+    version = np.lib.format.read_magic(file)
+    if version != (1, 0):
+        raise ValueError(f"an array of version {version}")
+    with _PARSING:
+        return np.lib.format.read_array_header_1_0(file)
+
+
 @contextmanager
 def _reading(
-    path: Path, archive_type: type[zipfile.ZipFile] = zipfile.ZipFile
-) -> Iterator[zipfile.ZipFile]:
+    path: Path, archive_type: "type[_Archive]" = _Archive
+) -> Iterator[_Archive]:
     try:
         with archive_type(path) as archive:
             if any(member.compress_type != zipfile.ZIP_STORED for member in archive.infolist()):
@@ -219,7 +263,7 @@ def _reading(
         raise RecordError(f"{path}: {error}") from error  # damaged archives
 
 
-def _manifest(archive: zipfile.ZipFile) -> dict[str, Any]:
+def _manifest(archive: _Archive) -> dict[str, Any]:
     manifest = json.loads(archive.read(_MANIFEST))
     if manifest["format"] != FORMAT:
         raise RecordError(f"{archive.filename}: format {manifest['format']}, expected {FORMAT}")
@@ -269,14 +313,11 @@ def typed(tree: Any, returns: type[T]) -> T:
         raise RecordError(str(error)) from error
 
 
-def _decode(tree: Any, hint: Any, archive: zipfile.ZipFile | None) -> Any:
+def _decode(tree: Any, hint: Any, archive: _Archive | None) -> Any:
     """Value of type `hint` from its JSON tree; RecordError if the tree is of another type."""
     origin = get_origin(hint)
     if archive is not None and (hint is np.ndarray or origin is np.ndarray):
-        array = archive.array(tree) if isinstance(archive, _MappedArchive) else None
-        if array is None:
-            with archive.open(tree) as member, _PARSING:
-                array = np.lib.format.read_array(member, allow_pickle=False)
+        array = archive.array(tree)
         _require(array.dtype.kind in "biuf", array.dtype, hint)
         return array
     if origin in (Union, types.UnionType):
@@ -313,7 +354,7 @@ def _decode_scalar(tree: Any, hint: Any) -> Any:
     raise TypeError(f"records cannot hold {hint}")
 
 
-def _decode_union(tree: Any, hints: tuple[Any, ...], archive: zipfile.ZipFile | None) -> Any:
+def _decode_union(tree: Any, hints: tuple[Any, ...], archive: _Archive | None) -> Any:
     if tree is None and type(None) in hints:
         return None
     for hint in hints:
@@ -325,7 +366,7 @@ def _decode_union(tree: Any, hints: tuple[Any, ...], archive: zipfile.ZipFile | 
     raise RecordError(f"{tree!r:.60} is none of {hints}")
 
 
-def _decode_sequence(tree: Any, hint: Any, archive: zipfile.ZipFile | None) -> Any:
+def _decode_sequence(tree: Any, hint: Any, archive: _Archive | None) -> Any:
     _require(isinstance(tree, list), tree, hint)
     items = get_args(hint)
     if get_origin(hint) is list:
@@ -336,14 +377,20 @@ def _decode_sequence(tree: Any, hint: Any, archive: zipfile.ZipFile | None) -> A
     return tuple(_decode(value, item, archive) for value, item in zip(tree, items, strict=True))
 
 
-def _decode_dataclass(tree: Any, cls: type[T], archive: zipfile.ZipFile | None) -> T:
-    names = {entry.name for entry in fields(cls)}  # type: ignore[arg-type]
-    younger = {entry.name for entry in fields(cls) if _has_default(entry)}  # type: ignore[arg-type]
-    if not isinstance(tree, dict) or not names - younger <= set(tree) <= names:
+def _decode_dataclass(tree: Any, cls: type[T], archive: _Archive | None) -> T:
+    needed, hints = _fields_of(cls)
+    if not isinstance(tree, dict) or not needed <= set(tree) <= set(hints):
         where = f"{archive.filename}: " if archive is not None else ""
         raise RecordError(f"{where}not a {cls.__name__} of this version")
-    hints = typing.get_type_hints(cls)
     return cls(**{name: _decode(value, hints[name], archive) for name, value in tree.items()})
+
+
+@lru_cache(maxsize=256)
+def _fields_of(cls: type) -> tuple[frozenset[str], dict[str, Any]]:
+    """Names of a dataclass's fields that have no default, and the types of all."""
+    own, hints = fields(cls), typing.get_type_hints(cls)
+    needed = frozenset(entry.name for entry in own if not _has_default(entry))
+    return needed, {entry.name: hints[entry.name] for entry in own}
 
 
 def _has_default(entry: Field) -> bool:

@@ -27,7 +27,7 @@ import numpy as np
 from gsba.disk import write_bytes
 from gsba.log import GsbaError, track
 from gsba.memory import freed_memory_kept
-from gsba.store.records import RecordError, load_record, read_info, save_record
+from gsba.store.records import RecordError, load_keyed, save_record
 from gsba.version import __version__
 
 R = TypeVar("R")
@@ -161,10 +161,11 @@ class StoredRecords(Generic[R]):
         """
         path = self.paths[number]
         try:
-            if read_info(path).get("key") == self.keys[number]:
-                return load_record(path, self.returns)
+            found = load_keyed(path, self.keys[number], self.returns)
         except RecordError as error:
             raise GsbaError(f"{error}: run again to compute it again") from error
+        if found is not None:
+            return found
         raise GsbaError(f"{path} has changed while a run used it: run again")
 
 
@@ -234,12 +235,9 @@ def run_shard(path: str, digest: str) -> Manifest:
 def load_shard(shard: Path, returns: Any) -> tuple[Any, ...] | None:
     """Results of a shard's items; None if there is no usable result."""
     try:
-        path = result_path(shard)
-        if read_info(path).get("key") == shard.stem:
-            return load_record(path, tuple[returns, ...])
+        return load_keyed(result_path(shard), shard.stem, tuple[returns, ...])
     except RecordError:
-        pass
-    return None
+        return None
 
 
 class _Pickler(pickle.Pickler):

@@ -37,6 +37,7 @@ from gsba.store.records import (
     FORMAT,
     MIN_MAPPED_BYTES,
     RecordError,
+    load_keyed,
     load_record,
     read_info,
     save_record,
@@ -347,14 +348,16 @@ class PerFrame(Generic[T]):
         return iter(self._keys)
 
     def __getitem__(self, name: str) -> T:
-        path = self._path(name)
-        if self.is_stored(name):
+        path, key = self._path(name), self._keys[name]
+        if path.exists():
             try:
-                return load_record(path, self._returns)
+                found = load_keyed(path, key, self._returns)
+                if found is not None:
+                    return found
             except RecordError as error:
                 logger.warning("computing again: %s", error)
         value = self._compute(name)
-        save_record(path, value, {"key": self._keys[name]})
+        save_record(path, value, {"key": key})
         return value
 
     def is_stored(self, name: str) -> bool:

@@ -53,6 +53,9 @@ def test_cholesky_solves_inverts_and_draws(pattern: str) -> None:
     assert cholesky.factorize(system.diagonal, system.off_diagonal)
     solution = cholesky.solve(system.right)
     assert np.allclose(system.matrix @ solution.ravel(), system.right.ravel(), atol=1e-12)
+    rights = np.random.default_rng(2).normal(size=(3, num, 6))
+    each = [cholesky.solve(right) for right in rights]
+    np.testing.assert_allclose(cholesky.solve_all(rights), each, atol=1e-14)
     inverse = np.linalg.inv(system.matrix).reshape(num, 6, num, 6)
     both = np.concatenate([pairs, pairs[:, ::-1]])
     on_diagonal, between = cholesky.inverse_blocks(both)

@@ -52,11 +52,11 @@ def viewing_axes(world_T_rigs: np.ndarray) -> tuple[np.ndarray, float]:
     if upright > 0.5:
         up = mean_up / upright
     else:
-        up = np.linalg.svd(np.vstack([positions, np.zeros((3, 3))]))[2][2]
+        up = np.linalg.svd(np.vstack([positions, np.zeros((3, 3))]), full_matrices=False)[2][2]
     level = positions - np.outer(positions @ up, up)
     # A path without extent does not determine the first axis: any level one is used.
     anywhere = 1e-9 * (np.eye(3) - np.outer(up, up))
-    first = np.linalg.svd(np.vstack([level, anywhere]))[2][0]
+    first = np.linalg.svd(np.vstack([level, anywhere]), full_matrices=False)[2][0]
     first -= up * (first @ up)
     first /= np.linalg.norm(first)
     return np.array([first, np.cross(up, first), up]), upright
