@@ -14,6 +14,7 @@ import logging
 import math
 import mmap
 import os
+import re
 import struct
 import time
 import tokenize
@@ -27,7 +28,6 @@ from dataclasses import MISSING, Field, fields, is_dataclass
 from enum import Enum
 from functools import lru_cache
 from pathlib import Path
-from threading import Lock
 from typing import IO, Any, Literal, TypeVar, Union, get_args, get_origin
 
 import numpy as np
@@ -48,9 +48,9 @@ _ZIP64_FIELD = 20  # bytes of its sizes behind it
 _PADDING_FIELD = 0xD935  # number of the extra field that zip files are aligned by
 _BYTES_AT_ONCE = 1 << 22  # that are checked, of an array that stays on the disk
 MIN_MAPPED_BYTES = 1 << 22  # of arrays that are worth a mapping
-# Headers of arrays are Python literals: CPython 3.11 fails now and then to parse one while another
-# thread does (its issue 106905).
-_PARSING = Lock()
+_HEADER = re.compile(
+    rb"\{'descr': '([<>|][biuf]\d+)', 'fortran_order': (True|False), 'shape': \(([\d, ]*)\), \}\s*"
+)
 
 
 class RecordError(Exception):
@@ -191,13 +191,13 @@ class _Archive(zipfile.ZipFile):
         """An array whose bytes agree with their checksum, read as a whole.
 
         Raises:
-            ValueError: it is of Python objects, or longer or shorter than its header says.
+            ValueError: it is not of numbers, or longer or shorter than its header says.
         """
         content = self.read(name)
         file = io.BytesIO(content)
         shape, fortran, dtype = _header(file)
-        if dtype.hasobject or len(content) != file.tell() + math.prod(shape) * dtype.itemsize:
-            raise ValueError(f"{name} is no array of numbers, or is truncated")
+        if len(content) != file.tell() + math.prod(shape) * dtype.itemsize:
+            raise ValueError(f"{name} is longer or shorter than its header says")
         flat = np.frombuffer(content, dtype, offset=file.tell()).copy()
         return flat.reshape(shape, order="F" if fortran else "C")
 
@@ -219,8 +219,6 @@ class _MappedArchive(_Archive):
         with self.open(member) as file:
             shape, fortran, dtype = _header(file)
             header = file.tell()
-            if dtype.hasobject:
-                return None
             while file.read(_BYTES_AT_ONCE):  # compared with the checksum at the end
                 pass
         if self._content is None:
@@ -236,22 +234,26 @@ class _MappedArchive(_Archive):
 
 
 def _header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
-    """Shape, order and type of an array from the beginning of its file.
+    """Shape, order and type of an array of numbers from the beginning of its `.npy` file.
+
+    numpy's own reader takes the header for Python code, and its interpreter's lock.
 
     Raises:
-        ValueError: it is no header, or not of the version that is written here.
+        ValueError: it is no header of such an array, or not of the version that is written here.
     """
     version = np.lib.format.read_magic(file)
     if version != (1, 0):
         raise ValueError(f"an array of version {version}")
-    with _PARSING:
-        return np.lib.format.read_array_header_1_0(file)
+    found = _HEADER.fullmatch(file.read(int.from_bytes(file.read(2), "little")))
+    if found is None:
+        raise ValueError("not the header of an array of numbers")
+    kind, fortran, sizes = (part.decode() for part in found.groups())
+    shape = tuple(int(size) for size in sizes.split(",") if size.strip())
+    return shape, fortran == "True", np.dtype(kind)
 
 
 @contextmanager
-def _reading(
-    path: Path, archive_type: "type[_Archive]" = _Archive
-) -> Iterator[_Archive]:
+def _reading(path: Path, archive_type: "type[_Archive]" = _Archive) -> Iterator[_Archive]:
     try:
         with archive_type(path) as archive:
             if any(member.compress_type != zipfile.ZIP_STORED for member in archive.infolist()):
@@ -317,9 +319,7 @@ def _decode(tree: Any, hint: Any, archive: _Archive | None) -> Any:
     """Value of type `hint` from its JSON tree; RecordError if the tree is of another type."""
     origin = get_origin(hint)
     if archive is not None and (hint is np.ndarray or origin is np.ndarray):
-        array = archive.array(tree)
-        _require(array.dtype.kind in "biuf", array.dtype, hint)
-        return array
+        return archive.array(tree)
     if origin in (Union, types.UnionType):
         return _decode_union(tree, get_args(hint), archive)
     if origin in (tuple, list):
