@@ -5,8 +5,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from factors.threads import rows_in_threads
 from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.types import FrameSet, Keypoints, Tracks, cameras_of
+from gsba.types.records import slices
+
+_AT_ONCE = 1 << 16  # observations of one thread
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,12 +127,18 @@ class Cameras:
         directions, origins = self.rays(keypoints.bearings_rig, keypoints.frames())
         return replace(keypoints, bearings_rig=directions, origins_rig=origins)
 
-    def clear(self, tracks: Tracks, keypoints: Keypoints) -> Tracks:
+    def clear(self, tracks: Tracks, keypoints: Keypoints, num_threads: int = 1) -> Tracks:
         """Tracks without observations in blended bands, nor the points observed only there."""
         if not any(lenses.band_rad for lenses in self.lenses):
             return tracks
-        bearings = keypoints.bearings_rig[keypoints.rows(tracks)]
-        return tracks.of_observations(~self.blended(bearings, tracks.frames))
+
+        def blended(some: slice) -> Sequence[np.ndarray]:
+            frames = tracks.frames[some]
+            rows = keypoints.starts[frames] + tracks.keypoints[some]
+            return [self.blended(keypoints.bearings_rig[rows], frames)]
+
+        (hidden,) = rows_in_threads(blended, slices(len(tracks), _AT_ONCE), num_threads)
+        return tracks.of_observations(~hidden)
 
     def _by_camera(
         self,

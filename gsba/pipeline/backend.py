@@ -94,7 +94,7 @@ def tracks_of(state: State) -> Tracks:
     keypoints, parts = state.observed.keypoints, state.prior.parts
     tied = [connectivity.within(matches, parts) for matches in state.matches.sets()]
     found = tracks.build(tied, np.diff(keypoints.starts))
-    return state.observed.cameras.clear(found, keypoints)
+    return state.observed.cameras.clear(found, keypoints, state.run.num_threads)
 
 
 def separate_parts(state: State) -> np.ndarray | None:
