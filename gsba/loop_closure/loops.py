@@ -7,11 +7,13 @@ more drift than the path can have, or contradict one another.
 
 import logging
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.spatial import KDTree
 
+from factors.threads import map_in_threads
 from gsba.config import RefineSettings
 from gsba.geometry import inverse, rotation_angle
 from gsba.loop_closure import join_evidence
@@ -21,14 +23,18 @@ from gsba.loop_closure.pose_graph import Loop, bend, met
 from gsba.loop_closure.retrieval import global_descriptors
 from gsba.matching import recovery
 from gsba.matching.guided_search import MatchContext
+from gsba.memory import release_mapped_files
 from gsba.similarity import relative_map
 from gsba.types import Counts, Keypoints, Solution, Tracks, VerifiedPairs
+from gsba.types.records import slices
 
 logger = logging.getLogger(__name__)
 _NUM_CANDIDATES = 3  # candidate places for each frame
 _ENOUGH_POINTS = 15  # common points by which two frames are held together in the map
 _NEAR_DEPTHS = 0.25, 0.5  # distances of neighbours that places met again are compared with, depths
 _LEAST_ALIKE_SHARE = 0.01  # share of these neighbours that look less alike
+_FRAMES_AT_ONCE, _ROWS_AT_ONCE = 32, 512  # frames compared together, each with so many others at a
+# time: 16 MB of global descriptors
 MIN_GROUP = 3  # least number of pairs that agree
 RIVAL = 1.5  # ratio by which a group must outweigh one that contradicts it
 # Largest rotation error of the map between two frames; of each step without matches besides.
@@ -45,17 +51,20 @@ class Closed:
     counts: Counts  # of pairs compared
 
 
-def close(context: MatchContext, solved: Solution, unseen: np.ndarray) -> Closed:
+def close(
+    context: MatchContext, solved: Solution, unseen: np.ndarray, scratch: Path | None = None
+) -> Closed:
     """Find revisited places, and deform the map so that they coincide.
 
     Args:
         context: of the run; its strongest features are compared.
         solved: poses and points, accurate between neighbours.
         unseen: (F - 1,) bool, steps that no images confirm: their error may be their length.
+        scratch: folder on the disk that takes the global descriptors; None = they are in memory.
     """
     settings, keypoints = context.settings, context.keypoints
     num = len(solved.world_T_rigs)
-    looks = global_descriptors(context.strongest, num, settings.seed, context.workers)
+    looks = global_descriptors(context.strongest, num, settings.seed, context.workers, scratch)
     held = _sharing_points(solved.landmarks.tracks, num)
     chosen = candidates(looks, solved, unseen, settings, held)
     strongest = replace(context, frames=context.strongest)
@@ -113,24 +122,55 @@ def candidates(
     drifts = np.concatenate([[0.0], np.cumsum(_max_step_drifts(positions, unseen, settings))])
     unseen_before = np.concatenate([[0], np.cumsum(unseen)])
     least = _least_similarity(looks, solved, unseen_before, settings.pairs.window)
+    blocks = list(slices(num, _FRAMES_AT_ONCE))
+    compared = _Compared(looks, positions, drifts, reach, settings.pairs.window // 4, held)
+    each = map_in_threads(
+        lambda n: compared.most_alike(blocks[n]), len(blocks), settings.solver.threads()
+    )
     found = dict[tuple[int, int], float]()
-    for f in range(num):
-        distance = np.linalg.norm(positions - positions[f], axis=1)
-        chosen = distance < reach + np.abs(drifts - drifts[f])
-        chosen[max(f - settings.pairs.window // 4, 0) : f + settings.pairs.window // 4 + 1] = False
-        if held is not None:
-            chosen[held.indices[held.indptr[f] : held.indptr[f + 1]]] = False
-        others = np.flatnonzero(chosen)
-        alike = looks[others] @ looks[f]
-        for n in np.argsort(-alike)[:_NUM_CANDIDATES]:
-            g = int(others[n])
-            found[min(f, g), max(f, g)] = float(alike[n])
+    for best in each:
+        found |= {(min(f, g), max(f, g)): similarity for f, g, similarity in best}
+        release_mapped_files()
     pairs = np.array(sorted(found), np.int32).reshape(-1, 2)
     kept = unseen_before[pairs[:, 0]] < unseen_before[pairs[:, 1]]
     seeds = pairs[[found[f, g] >= least for f, g in pairs.tolist()]]
     if len(seeds):
         kept |= KDTree(seeds).query(pairs, p=np.inf)[0] <= settings.pairs.window
     return pairs[kept]
+
+
+@dataclass(frozen=True, slots=True)
+class _Compared:
+    """Frames that are compared by their looks, each with those within reach of drift."""
+
+    looks: np.ndarray  # (F, D) global descriptors
+    positions: np.ndarray  # (F, 3)
+    drifts: np.ndarray  # (F,) largest error since the first frame, map units
+    reach: float  # map units
+    apart: int  # frames along the path that are too near to be compared
+    held: csr_matrix | None  # (F, F) frames that are left out; None = none are
+
+    def others(self, f: int) -> np.ndarray:
+        """Frames that one is compared with."""
+        distance = np.linalg.norm(self.positions - self.positions[f], axis=1)
+        chosen = distance < self.reach + np.abs(self.drifts - self.drifts[f])
+        chosen[max(f - self.apart, 0) : f + self.apart + 1] = False
+        if self.held is not None:
+            chosen[self.held.indices[self.held.indptr[f] : self.held.indptr[f + 1]]] = False
+        return np.flatnonzero(chosen)
+
+    def most_alike(self, frames: slice) -> list[tuple[int, int, float]]:
+        """Some frames, each with those that look most like it, and how much."""
+        others = [self.others(f) for f in range(frames.start, frames.stop)]
+        every, best = np.unique(np.concatenate(others)), []
+        alike = np.empty((len(every), len(others)), self.looks.dtype)
+        for some in slices(len(every), _ROWS_AT_ONCE):
+            alike[some] = self.looks[every[some]] @ self.looks[frames].T
+        for n, rows in enumerate(others):
+            own = alike[np.searchsorted(every, rows), n]
+            first = np.argsort(-own, kind="stable")[:_NUM_CANDIDATES]
+            best += [(frames.start + n, int(rows[k]), float(own[k])) for k in first]
+        return best
 
 
 def _sharing_points(tracks: Tracks, num_frames: int) -> csr_matrix:
@@ -155,7 +195,12 @@ def _least_similarity(
     near, successive = [np.zeros(0)], np.zeros(0)
     for gap in range(1, min(window, len(positions) - 1) + 1):
         first = np.flatnonzero(unseen_before[gap:] == unseen_before[:-gap])
-        found = np.sum(looks[first] * looks[first + gap], axis=1)
+        found = np.concatenate(
+            [
+                np.einsum("fd,fd->f", looks[first[some]], looks[first[some] + gap])
+                for some in slices(len(first), _ROWS_AT_ONCE)
+            ]
+        )
         distances = np.linalg.norm(positions[first + gap] - positions[first], axis=1)
         low, high = (share * depth for share in _NEAR_DEPTHS)
         near.append(found[(distances > low) & (distances < high)])

@@ -7,11 +7,13 @@ normalised word by word as in Arandjelovic and Zisserman, CVPR 2013) over whole 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_matrix
 
+from gsba.disk import concatenated
 from gsba.matching.guided_search import SearchableFrames
 from gsba.store.shards import Workers, blocks_of_frames
 
@@ -22,15 +24,25 @@ _MIN_SUM_LENGTH = 1e-5
 
 
 def global_descriptors(
-    frames: SearchableFrames, num_frames: int, seed: int, workers: Workers
+    frames: SearchableFrames,
+    num_frames: int,
+    seed: int,
+    workers: Workers,
+    scratch: Path | None = None,
 ) -> np.ndarray:
-    """Global descriptors (F, D) float32 of all panoramas, of unit length, invariant to heading."""
+    """Global descriptors (F, D) float32 of all panoramas, of unit length, invariant to heading.
+
+    Args:
+        frames: the panoramas' features.
+        num_frames: F.
+        seed: of the sample that the visual words are made of.
+        workers: threads or processes that run it.
+        scratch: folder on the disk that takes the descriptors; None = they are in memory.
+    """
     words, everyone = visual_words(frames, num_frames, seed, workers), np.arange(num_frames)
     job = _DescriptorJob("looks", frames, everyone, partial(_descriptor_of, words=words))
-    looks = np.empty((num_frames, words.size), np.float32)
-    for row, look in zip(looks, workers.map_shards(job), strict=True):
-        row[:] = look
-    return looks
+    looks = ((look[None].astype(np.float32),) for look in workers.map_shards(job))
+    return concatenated(looks, scratch)[0]
 
 
 def visual_words(

@@ -278,7 +278,8 @@ def _meet_places(state: State, near: VerifiedPairs) -> State:
     pairs = near.matches.pairs
     if loops.connected(unseen, pairs) and len(pairs):
         return state
-    compute = partial(loops.close, state.observed.context, state.solution, unseen)
+    known = state.observed.context, state.solution, unseen, run.store.scratch_folder
+    compute = partial(loops.close, *known)
     closed = run.stage("places", run.matching_key(), compute, Closed)
     if len(closed.pairs) == 0:
         return state
