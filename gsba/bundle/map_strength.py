@@ -15,10 +15,12 @@ import numpy as np
 from gsba.config import PriorSettings, RefineSettings
 from gsba.geometry import inverse, rotation_angle, step_covariances
 from gsba.types import Counts, JointErrors, StepNoise
+from gsba.types.records import slices
 
 _MAX_HELD_SHARE = 0.25  # largest share of a prior's standard deviation in any direction: the prior
 # then weighs 6 %
 _MIN_HELD_STEPS = 8  # least number of held steps from which the trajectory's noise is estimated
+_DRAWS_AT_ONCE = 50  # errors drawn of all poses, in float64
 _MIN_NOISE_RATIO = 0.1  # least estimate, part of the settings' noise
 
 
@@ -91,8 +93,11 @@ def scale_sigmas(world_T_rigs: np.ndarray, draws: np.ndarray) -> np.ndarray:
     """See `MapStrength.scale_sigmas`; to first order in the errors `draws (D, F, 6)`."""
     steps = np.diff(world_T_rigs[:, :3, 3], axis=0)
     squares = np.maximum(np.einsum("fi,fi->f", steps, steps), 1e-300)
-    moved = np.einsum("fij,dfj->dfi", world_T_rigs[:, :3, :3], draws[:, :, 3:])
-    stretches = np.einsum("fi,dfi->df", steps / squares[:, None], np.diff(moved, axis=1))
+    stretches = np.empty((len(draws), len(steps)))
+    for some in slices(len(draws), _DRAWS_AT_ONCE):
+        moved = np.einsum("fij,dfj->dfi", world_T_rigs[:, :3, :3], draws[some, :, 3:])
+        along = np.einsum("fi,dfi->df", steps / squares[:, None], np.diff(moved, axis=1))
+        stretches[some] = along
     return np.diff(stretches, axis=1).std(axis=0)
 
 
@@ -105,17 +110,20 @@ def _drift(world_T_rigs: np.ndarray, draws: np.ndarray, walks: np.ndarray) -> fl
     known = np.isfinite(draws).all(axis=(0, 2))
     if np.count_nonzero(known) < 3:
         return 0.0
-    poses, errors = world_T_rigs[known], draws[:, known, 3:]
-    errors = np.einsum("fij,dfj->dfi", poses[:, :3, :3], errors).reshape(len(draws), -1)
+    poses = world_T_rigs[known]
     offsets = poses[:, :3, 3] - poses[:, :3, 3].mean(axis=0)
     turns = [np.cross(axis, offsets) for axis in np.eye(3)]
     shifts = [np.tile(axis, (len(poses), 1)) for axis in np.eye(3)]
     basis = np.linalg.qr(np.array([*shifts, *turns, offsets]).reshape(7, -1).T)[0]
-    left = errors - errors @ basis @ basis.T
+    squares = 0.0
+    for some in slices(len(draws), _DRAWS_AT_ONCE):
+        errors = np.einsum("fij,dfj->dfi", poses[:, :3, :3], draws[some][:, known, 3:])
+        errors = errors.reshape(-1, 3 * len(poses))
+        squares += float(np.sum((errors - errors @ basis @ basis.T) ** 2))
     lengths = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     within = np.diff(walks[known]) == 0  # from one recording to the next is no step
     path = np.bincount(walks[known][1:][within], lengths[within]).max(initial=0.0)
-    return float(np.sqrt(np.mean(left**2) * 3) / max(path, 1e-300))
+    return float(np.sqrt(squares / (len(draws) * len(poses))) / max(path, 1e-300))
 
 
 def _held(

@@ -437,7 +437,9 @@ class JointErrors:
     def scaled(self, factors: np.ndarray) -> "JointErrors":
         """Distribution of errors that are multiplied by factors (F, 6)."""
         neighbours = factors[:-1, :, None] * self.neighbours * factors[1:, None, :]
-        return JointErrors(neighbours, (self.draws * factors).astype(np.float32))
+        draws = np.empty_like(self.draws)
+        np.multiply(self.draws, factors, out=draws, casting="same_kind")
+        return JointErrors(neighbours, draws)
 
     def taken(self, rows: np.ndarray) -> "JointErrors":
         """Distribution of poses `rows` (F',), ascending; NaN across poses that are left out."""
