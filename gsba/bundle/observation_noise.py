@@ -6,15 +6,17 @@ from pathlib import Path
 
 import numpy as np
 
-from factors.threads import balanced_ranges, run_in_threads
+from factors.threads import map_in_threads
 from gsba.bundle._noise_kernels import standardized_residuals
-from gsba.bundle.tracks import runs
+from gsba.bundle.tracks import bounds_of_runs, run_of
 from gsba.disk import concatenated
 from gsba.memory import release_mapped_files
 from gsba.types import Keypoints, Landmarks, Tracks
 from gsba.types.records import slices
 
-_AT_ONCE = 1 << 18  # observations whose residuals are held: 25 MB
+_OF_THREAD = 1 << 14  # observations whose residuals one thread computes: 2 MB
+_RELEASED_EVERY = 16  # of these runs, pages of files that they have read
+_AT_ONCE = 1 << 18  # keypoints whose noise is scaled together: 17 MB
 _MIN_REDUNDANCY = 0.1  # least share of residual dimensions beyond the unknowns
 
 
@@ -43,10 +45,16 @@ def observation_noise(
     """
     tracks, num = landmarks.tracks, len(landmarks.tracks)
     spread, poses = np.empty(num), np.ascontiguousarray(world_T_rigs)
-    for points, observations, some in runs(tracks, _AT_ONCE):
-        own = landmarks.points_world[points]
-        spread[observations] = _residuals(own, some, keypoints, poses, num_threads)
-        release_mapped_files()
+    bounds = bounds_of_runs(tracks, _OF_THREAD)
+
+    def work(n: int) -> None:
+        points, rows = bounds[n]
+        own, some = landmarks.points_world[points], run_of(tracks, points, rows)
+        spread[rows] = _residuals(own, some, keypoints, poses)
+
+    for n, _ in enumerate(map_in_threads(work, len(bounds), num_threads)):
+        if n % _RELEASED_EVERY == 0:
+            release_mapped_files()
     unknowns = 6 * len(world_T_rigs)
     redundancy = max(1 - unknowns / max(2 * num - 3 * tracks.num_points, 1), _MIN_REDUNDANCY)
     kept = spread[chosen]
@@ -59,7 +67,6 @@ def _residuals(
     tracks: Tracks,
     keypoints: Keypoints,
     world_T_rigs: np.ndarray,
-    num_threads: int,
 ) -> np.ndarray:
     """Residuals (O,) of the observations of points (J, 3), all of the same spread."""
     starts = np.searchsorted(tracks.points, np.arange(tracks.num_points + 1))
@@ -68,14 +75,9 @@ def _residuals(
     origins = np.zeros((0, 3)) if origins is None else origins
     bearings = keypoints.bearings_rig.take(rows, axis=0)
     seen = bearings, np.ascontiguousarray(keypoints.roots(rows)), origins
-    ranges = balanced_ranges(starts)
-
-    def work(part: int) -> None:
-        standardized_residuals(
-            *ranges[part], starts, points_world, tracks.frames, world_T_rigs, *seen, spread
-        )
-
-    run_in_threads(work, len(ranges), num_threads)
+    standardized_residuals(
+        0, tracks.num_points, starts, points_world, tracks.frames, world_T_rigs, *seen, spread
+    )
     return spread
 
 

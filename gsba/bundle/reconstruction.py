@@ -23,7 +23,7 @@ from gsba.types import (
 
 _MIN_CORRELATION = 0.1  # least correlation of refined and coarse positions: with usual drift it is
 # .8
-_AT_ONCE = 1 << 17  # observations whose poses are held together: 17 MB
+_AT_ONCE = 1 << 16  # observations whose poses are held together: 9 MB
 _MAX_RESIDUAL_DEG = 10.0  # largest median residual: gates leave a tenth of a degree
 
 

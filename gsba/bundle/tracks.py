@@ -71,16 +71,26 @@ def runs(tracks: Tracks, most: int) -> Iterator[tuple[slice, slice, Tracks]]:
     Yields:
         The points of a run, its observations, and its tracks, whose points are numbered from 0.
     """
+    for points, rows in bounds_of_runs(tracks, most):
+        yield points, rows, run_of(tracks, points, rows)
+
+
+def bounds_of_runs(tracks: Tracks, most: int) -> list[tuple[slice, slice]]:
+    """Points and observations of each of the `runs`."""
     starts = np.searchsorted(tracks.points, np.arange(tracks.num_points + 1))
-    first = 0
+    first, found = 0, []
     while first < tracks.num_points:
         last = int(np.searchsorted(starts, starts[first] + most, side="right")) - 1
         last = min(max(last, first + 1), tracks.num_points)
-        rows = slice(int(starts[first]), int(starts[last]))
-        points = tracks.points[rows] - np.int32(first)
-        own = Tracks(points, tracks.frames[rows], tracks.keypoints[rows], last - first)
-        yield slice(first, last), rows, own
+        found.append((slice(first, last), slice(int(starts[first]), int(starts[last]))))
         first = last
+    return found
+
+
+def run_of(tracks: Tracks, points: slice, rows: slice) -> Tracks:
+    """Tracks of the points of a run, numbered from 0."""
+    numbers = tracks.points[rows] - np.int32(points.start)
+    return Tracks(numbers, tracks.frames[rows], tracks.keypoints[rows], points.stop - points.start)
 
 
 @_kernel

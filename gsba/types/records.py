@@ -8,7 +8,7 @@ import numpy as np
 
 from gsba.types.frame_set import PictureFormat
 
-_AT_ONCE = 1 << 18  # observations whose poses are held together: 35 MB
+_AT_ONCE = 1 << 16  # observations whose poses are held together: 9 MB
 
 
 def slices(num: int, most: int) -> Iterator[slice]:

@@ -288,9 +288,11 @@ def test_points_and_noise_on_the_disk_are_those_in_memory(
     families = Families((Bearings(), TrajectoryPrior(coarse, settings.priors)))
     context = AdjustmentContext(families, RIG, settings, 1)
     expected = adjustment.adjust_sighted(sighted, start, context, GATES[:3])
-    monkeypatch.setattr(triangulation, "_AT_ONCE", 500)
-    monkeypatch.setattr(observation_noise_module, "_AT_ONCE", 300)
-    there = replace(context, scratch=tmp_path)
+    for name, value in {"_AT_ONCE": 500, "_IN_MEMORY": 500, "_RELEASED_EVERY": 2}.items():
+        monkeypatch.setattr(triangulation, name, value)
+    for name, value in {"_AT_ONCE": 300, "_OF_THREAD": 300, "_RELEASED_EVERY": 2}.items():
+        monkeypatch.setattr(observation_noise_module, name, value)
+    there = replace(context, scratch=tmp_path, num_threads=2)
     solved, keypoints = adjustment.adjust_sighted(sighted, start, there, GATES[:3])
     assert not keypoints.sigmas_rad.flags.owndata
     assert not solved.landmarks.points_world.flags.owndata
