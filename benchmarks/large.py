@@ -373,7 +373,7 @@ def again(options: argparse.Namespace) -> None:
         sizes = np.diff(stored.keypoints.starts)
         print(f"{len(sizes)} frames, {sizes.sum()} keypoints", flush=True)
         with _taking("adjustment", workers, peak):
-            found = tracks.build(stored.matches, sizes)
+            found = tracks.build(stored.matches, sizes, out)
             given = stored.start, context, chosen.rounds.dense, False
             solved = adjustment.adjust(found, stored.keypoints, *given)
             print(f"{len(solved.landmarks.tracks)} observations", flush=True)

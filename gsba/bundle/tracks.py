@@ -1,19 +1,24 @@
 """Chain pairwise matches into tracks of one scene point each."""
 
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 import numpy as np
 
 from factors.compiled import kernel_and_part
+from gsba.disk import concatenated
 from gsba.memory import release_mapped_files
 from gsba.types import Matches, Tracks
 from gsba.types.records import slices
 
 _kernel, _ = kernel_and_part()
 _AT_ONCE = 1 << 18  # matches that are numbered together
+_IN_MEMORY = 1 << 18  # observations of which the tracks are in memory in any case
 
 
-def build(matches: Sequence[Matches], num_keypoints: np.ndarray) -> Tracks:
+def build(
+    matches: Sequence[Matches], num_keypoints: np.ndarray, scratch: Path | None = None
+) -> Tracks:
     """Merge matches into tracks that see a frame at most once.
 
     Matches are taken in the order given, the most trusted first: one that would give a track two
@@ -22,6 +27,7 @@ def build(matches: Sequence[Matches], num_keypoints: np.ndarray) -> Tracks:
     Args:
         matches: sets of verified matches, the most trusted set and pair first.
         num_keypoints: (F,) keypoints in each frame.
+        scratch: folder on the disk that takes very many tracks; None = they are in memory.
 
     Returns:
         Tracks of at least two observations.
@@ -49,6 +55,9 @@ def build(matches: Sequence[Matches], num_keypoints: np.ndarray) -> Tracks:
     rows = np.cumsum(lengths) - lengths
     points, frames, keypoints = np.empty((3, int(lengths.sum())), np.int32)
     _collect(nodes, frame_of_node, roots, numbers, first_node, rows, points, frames, keypoints)
+    del nodes, frame_of_node, roots, numbers, several, rows
+    if scratch is not None and len(points) > _IN_MEMORY:
+        points, frames, keypoints = concatenated([(points, frames, keypoints)], scratch)
     return Tracks(points, frames, keypoints, len(lengths))
 
 
@@ -77,7 +86,8 @@ def runs(tracks: Tracks, most: int) -> Iterator[tuple[slice, slice, Tracks]]:
 
 def bounds_of_runs(tracks: Tracks, most: int) -> list[tuple[slice, slice]]:
     """Points and observations of each of the `runs`."""
-    starts = np.searchsorted(tracks.points, np.arange(tracks.num_points + 1))
+    numbers = np.arange(tracks.num_points + 1, dtype=tracks.points.dtype)  # else points are copied
+    starts = np.searchsorted(tracks.points, numbers)
     first, found = 0, []
     while first < tracks.num_points:
         last = int(np.searchsorted(starts, starts[first] + most, side="right")) - 1

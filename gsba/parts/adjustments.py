@@ -10,7 +10,7 @@ import numpy as np
 from gsba.bundle.division import DivisibleMap
 from gsba.bundle.optimizer import OptimizeResult
 from gsba.config import SolverSettings
-from gsba.memory import total_memory_bytes
+from gsba.memory import give_back_freed_memory, total_memory_bytes
 from gsba.parts.covariances import divided_covariances
 from gsba.parts.divided_system import optimize_divided
 from gsba.parts.folder import (
@@ -144,6 +144,7 @@ class DividedAdjustments:
             self._tell("more than half of the frames would lie on the cuts")
             return False
         writer.finish(map_.values, num, cut)
+        give_back_freed_memory()  # of writing, beside what solving takes
         logger.debug("%d frames in %d parts, %d on cuts", num, cut.num_parts, on_cuts)
         return True
 

@@ -93,7 +93,7 @@ def tracks_of(state: State) -> Tracks:
     """Tracks that matches make, within parts that nothing ties together yet."""
     keypoints, parts = state.observed.keypoints, state.prior.parts
     tied = [connectivity.within(matches, parts) for matches in state.matches.sets()]
-    found = tracks.build(tied, np.diff(keypoints.starts))
+    found = tracks.build(tied, np.diff(keypoints.starts), state.run.store.scratch_folder)
     return state.observed.cameras.clear(found, keypoints, state.run.num_threads)
 
 
