@@ -185,10 +185,10 @@ def load_checkpoint(path: Path | None, key: str, returns: type[T], anew: str) ->
 
 
 class _Archive(zipfile.ZipFile):
-    """Archive of arrays."""
+    """Archive whose arrays are read as a whole."""
 
     def array(self, name: str) -> np.ndarray:
-        """An array whose bytes agree with their checksum, read as a whole.
+        """An array whose bytes agree with their checksum.
 
         Raises:
             ValueError: it is not of numbers, or longer or shorter than its header says.
@@ -236,7 +236,8 @@ class _MappedArchive(_Archive):
 def _header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
     """Shape, order and type of an array of numbers from the beginning of its `.npy` file.
 
-    numpy's own reader takes the header for Python code, and its interpreter's lock.
+    numpy's own reader parses the header as Python code: one thread at a time, and CPython 3.11 fails
+    now and then where another one parses, too (its issue 106905).
 
     Raises:
         ValueError: it is no header of such an array, or not of the version that is written here.
