@@ -236,8 +236,8 @@ class _MappedArchive(_Archive):
 def _header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
     """Shape, order and type of an array of numbers from the beginning of its `.npy` file.
 
-    numpy's own reader parses the header as Python code: one thread at a time, and CPython 3.11 fails
-    now and then where another one parses, too (its issue 106905).
+    numpy's own reader parses the header as Python code: one thread at a time, and CPython 3.11
+    fails now and then where another one parses, too (its issue 106905).
 
     Raises:
         ValueError: it is no header of such an array, or not of the version that is written here.
