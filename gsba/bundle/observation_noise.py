@@ -6,16 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from factors.threads import map_in_threads
 from gsba.bundle._noise_kernels import standardized_residuals
-from gsba.bundle.tracks import bounds_of_runs, run_of
+from gsba.bundle.tracks import map_runs
 from gsba.disk import concatenated
 from gsba.memory import release_mapped_files
 from gsba.types import Keypoints, Landmarks, Tracks
 from gsba.types.records import slices
 
-_OF_THREAD = 1 << 14  # observations whose residuals one thread computes: 2 MB
-_RELEASED_EVERY = 16  # of these runs, pages of files that they have read
 _AT_ONCE = 1 << 18  # keypoints whose noise is scaled together: 17 MB
 _MIN_REDUNDANCY = 0.1  # least share of residual dimensions beyond the unknowns
 
@@ -45,16 +42,12 @@ def observation_noise(
     """
     tracks, num = landmarks.tracks, len(landmarks.tracks)
     spread, poses = np.empty(num), np.ascontiguousarray(world_T_rigs)
-    bounds = bounds_of_runs(tracks, _OF_THREAD)
 
-    def work(n: int) -> None:
-        points, rows = bounds[n]
-        own, some = landmarks.points_world[points], run_of(tracks, points, rows)
-        spread[rows] = _residuals(own, some, keypoints, poses)
+    def work(points: slice, rows: slice, some: Tracks) -> None:
+        spread[rows] = _residuals(landmarks.points_world[points], some, keypoints, poses)
 
-    for n, _ in enumerate(map_in_threads(work, len(bounds), num_threads)):
-        if n % _RELEASED_EVERY == 0:
-            release_mapped_files()
+    for _ in map_runs(work, tracks, num_threads):
+        pass
     unknowns = 6 * len(world_T_rigs)
     redundancy = max(1 - unknowns / max(2 * num - 3 * tracks.num_points, 1), _MIN_REDUNDANCY)
     kept = spread[chosen]

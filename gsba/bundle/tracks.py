@@ -1,18 +1,23 @@
 """Chain pairwise matches into tracks of one scene point each."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
 from factors.compiled import kernel_and_part
+from factors.threads import map_in_threads
 from gsba.disk import concatenated
 from gsba.memory import release_mapped_files
 from gsba.types import Matches, Tracks
 from gsba.types.records import slices
 
+T = TypeVar("T")
 _kernel, _ = kernel_and_part()
 _AT_ONCE = 1 << 18  # matches that are numbered together
+_OF_THREAD = 1 << 14  # observations that one thread works on: 2 MB of rays
+_RELEASED_EVERY = 16  # of these runs, pages of files that they have read
 _IN_MEMORY = 1 << 18  # observations of which the tracks are in memory in any case
 
 
@@ -80,11 +85,26 @@ def runs(tracks: Tracks, most: int) -> Iterator[tuple[slice, slice, Tracks]]:
     Yields:
         The points of a run, its observations, and its tracks, whose points are numbered from 0.
     """
-    for points, rows in bounds_of_runs(tracks, most):
-        yield points, rows, run_of(tracks, points, rows)
+    for points, rows in _bounds_of_runs(tracks, most):
+        yield points, rows, _run_of(tracks, points, rows)
 
 
-def bounds_of_runs(tracks: Tracks, most: int) -> list[tuple[slice, slice]]:
+def map_runs(
+    work: Callable[[slice, slice, Tracks], T], tracks: Tracks, num_threads: int
+) -> Iterator[T]:
+    """Results of work on each of the `runs`, in order, computed in threads, between which pages of
+    files are released; work must not use threads itself."""
+    bounds = _bounds_of_runs(tracks, _OF_THREAD)
+    found = map_in_threads(
+        lambda n: work(*bounds[n], _run_of(tracks, *bounds[n])), len(bounds), num_threads
+    )
+    for n, one in enumerate(found):
+        yield one
+        if n % _RELEASED_EVERY == 0:
+            release_mapped_files()
+
+
+def _bounds_of_runs(tracks: Tracks, most: int) -> list[tuple[slice, slice]]:
     """Points and observations of each of the `runs`."""
     numbers = np.arange(tracks.num_points + 1, dtype=tracks.points.dtype)  # else points are copied
     starts = np.searchsorted(tracks.points, numbers)
@@ -97,7 +117,7 @@ def bounds_of_runs(tracks: Tracks, most: int) -> list[tuple[slice, slice]]:
     return found
 
 
-def run_of(tracks: Tracks, points: slice, rows: slice) -> Tracks:
+def _run_of(tracks: Tracks, points: slice, rows: slice) -> Tracks:
     """Tracks of the points of a run, numbered from 0."""
     numbers = tracks.points[rows] - np.int32(points.start)
     return Tracks(numbers, tracks.frames[rows], tracks.keypoints[rows], points.stop - points.start)

@@ -5,17 +5,15 @@ from pathlib import Path
 
 import numpy as np
 
-from factors.threads import balanced_ranges, map_in_threads, run_in_threads
+from factors.threads import balanced_ranges, run_in_threads
 from gsba.bundle._triangulation_kernels import cast_rays, triangulate_tracks
-from gsba.bundle.tracks import bounds_of_runs, run_of
+from gsba.bundle.tracks import map_runs
 from gsba.config import TriangulateSettings
 from gsba.disk import concatenated
 from gsba.geometry import moved_to
 from gsba.memory import release_mapped_files
 from gsba.types import Counts, Keypoints, Landmarks, Reconstruction, Tracks
 
-_AT_ONCE = 1 << 14  # observations of one thread: 2 MB of rays
-_RELEASED_EVERY = 16  # of these runs, pages of files that they have read
 _IN_MEMORY = 1 << 18  # observations of which the tracks are in memory in any case
 _NONE = Counts(0, 0, "tracks")
 
@@ -103,10 +101,9 @@ def place(
         scratch: folder on the disk that takes the points of very many tracks; None = they are in
             memory.
     """
-    counts, bounds = [_NONE], bounds_of_runs(tracks, _AT_ONCE)
+    counts = [_NONE]
 
-    def placed(n: int) -> Landmarks:
-        some = run_of(tracks, *bounds[n])
+    def placed(_: slice, __: slice, some: Tracks) -> Landmarks:
         rows = keypoints.rows(some)
         rays = keypoints.bearings_rig.take(rows, axis=0), keypoints.sigmas_rad[rows]
         how = max_error_sigmas, settings, 1, keypoints.origins_of(rows)
@@ -116,13 +113,11 @@ def place(
         none = tracks.of(np.zeros(tracks.num_points, bool))
         yield np.zeros((0, 3)), none.points, none.frames, none.keypoints
         num = 0
-        for n, own in enumerate(map_in_threads(placed, len(bounds), num_threads)):
+        for own in map_runs(placed, tracks, num_threads):
             counts.append(own.counts)
             numbers = own.tracks.points + np.int32(num)
             yield own.points_world, numbers, own.tracks.frames, own.tracks.keypoints
             num += own.tracks.num_points
-            if n % _RELEASED_EVERY == 0:
-                release_mapped_files()
 
     folder = scratch if len(tracks) > _IN_MEMORY else None
     points_world, points, frames, rows = concatenated(found(), folder)

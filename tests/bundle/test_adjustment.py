@@ -12,6 +12,7 @@ from synthetic import RIG, World, drifted, make_world
 
 from gsba.bundle import adjustment, triangulation
 from gsba.bundle import observation_noise as observation_noise_module
+from gsba.bundle import tracks as tracks_module
 from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.bearings import Bearings
 from gsba.bundle.families import Families, Family
@@ -288,10 +289,10 @@ def test_points_and_noise_on_the_disk_are_those_in_memory(
     families = Families((Bearings(), TrajectoryPrior(coarse, settings.priors)))
     context = AdjustmentContext(families, RIG, settings, 1)
     expected = adjustment.adjust_sighted(sighted, start, context, GATES[:3])
-    for name, value in {"_AT_ONCE": 500, "_IN_MEMORY": 500, "_RELEASED_EVERY": 2}.items():
-        monkeypatch.setattr(triangulation, name, value)
-    for name, value in {"_AT_ONCE": 300, "_OF_THREAD": 300, "_RELEASED_EVERY": 2}.items():
-        monkeypatch.setattr(observation_noise_module, name, value)
+    for name, value in {"_OF_THREAD": 300, "_RELEASED_EVERY": 2}.items():
+        monkeypatch.setattr(tracks_module, name, value)
+    monkeypatch.setattr(triangulation, "_IN_MEMORY", 500)
+    monkeypatch.setattr(observation_noise_module, "_AT_ONCE", 300)
     there = replace(context, scratch=tmp_path, num_threads=2)
     solved, keypoints = adjustment.adjust_sighted(sighted, start, there, GATES[:3])
     assert not keypoints.sigmas_rad.flags.owndata
