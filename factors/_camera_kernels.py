@@ -17,13 +17,14 @@ measured one, whitened.
 import numpy as np
 
 from factors.compiled import kernel_and_part
+from factors.robust import rho_and_weight
 
 _EPS = 1e-300  # guards divisions by a squared norm
 _LEAST_HESSIAN = 1e-12  # of a landmark's trace
 _BEHIND = 1e-12  # sine of the angle below which no direction leads back to the measured one
 
-_kernel, _part = kernel_and_part(error_model="numpy", fastmath={"contract"})
-_, _allocating = kernel_and_part(allocating=True, error_model="numpy", fastmath={"contract"})
+_kernel, _part = kernel_and_part(fastmath={"contract"})
+_, _allocating = kernel_and_part(allocating=True, fastmath={"contract"})
 
 
 @_part
@@ -326,21 +327,6 @@ def see_range(
 
 
 @_part
-def _rho_and_weight(code, scale, squared):
-    """As `factors._kernels.rho_and_weight`."""
-    c2 = scale * scale
-    if code == 1 and squared > c2:
-        norm = np.sqrt(squared)
-        return scale * (norm - 0.5 * scale), scale / norm
-    if code == 2:
-        return 0.5 * c2 * np.log1p(squared / c2), c2 / (c2 + squared)
-    if code == 3:
-        weight = c2 / (c2 + squared)
-        return 0.5 * squared * weight, weight * weight
-    return 0.5 * squared, 1.0
-
-
-@_part
 def _add_normal(normal, residual, by_point, weight):
     """Add to a landmark's Hessian (00 01 02 11 12 22) and gradient (3) in `normal (9,)`."""
     for r in range(2):
@@ -389,7 +375,7 @@ def _substitute(
             by_shared, True,
         )  # fmt: skip
         squared = residual[0] * residual[0] + residual[1] * residual[1]
-        weight = _rho_and_weight(loss, scale, squared)[1]
+        weight = rho_and_weight(loss, scale, squared)[1]
         for r in range(2):
             for k in range(own_steps.shape[1]):
                 residual[r] += by_frame[r, k] * own_steps[f, k]
@@ -438,7 +424,7 @@ def polish_range(
                     residual, by_point, by_frame, by_shared, False,
                 )  # fmt: skip
                 squared = residual[0] * residual[0] + residual[1] * residual[1]
-                rho, weight = _rho_and_weight(loss, scale, squared)
+                rho, weight = rho_and_weight(loss, scale, squared)
                 trial += rho
                 _add_normal(trial_normal, residual, by_point, weight)
             if trial < cost or cost == np.inf:

@@ -1,8 +1,7 @@
 """Compiled passes over panoramas: the spline's inverse filter, and samples with gradients.
 
-All passes share a file because numba renews a cached kernel when its file changes, not when a
-function it calls from another file does. Images are spline coefficients (H, 2H) float32; pixels
-(u, v) have the centre of the top-left one at (0.5, 0.5).
+Images are spline coefficients (H, 2H) float32; pixels (u, v) have the centre of the top-left one
+at (0.5, 0.5).
 """
 
 import numpy as np
@@ -12,7 +11,7 @@ from factors.compiled import kernel_and_part
 _POLE = np.sqrt(3.0) - 2.0  # pole of the cubic B-spline's inverse filter
 _NUM_TERMS = 16  # terms of its geometric series: further ones are below float32's resolution
 
-_kernel, _part = kernel_and_part(error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
+_kernel, _part = kernel_and_part(fastmath={"contract", "reassoc", "nsz"})
 
 
 @_kernel

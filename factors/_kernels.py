@@ -2,8 +2,7 @@
 
 Poses are rows `(12,)` = `[world_R_rig row-major (9), rig_in_world (3)]`. Each pass handles a range
 of landmarks and releases the GIL, so that threads share the work; each thread accumulates into
-arrays of its own. All passes share a file because numba renews a cached kernel when its file
-changes, not when a function it calls from another file does.
+arrays of its own.
 """
 
 import numpy as np
@@ -11,26 +10,12 @@ import numpy as np
 from factors._observations import BEARING, GIVEN, MIN_DEPTH
 from factors.compiled import kernel_and_part
 from factors.landmark_residual import call_residual, has_functions
+from factors.robust import rho_and_weight
 
 _EPS = 1e-300  # guards divisions by a squared norm
 _MIN_RELATIVE_DAMPING = 1e-12  # least damping, part of the trace of a landmark's Hessian
 
-_kernel, _part = kernel_and_part(error_model="numpy", fastmath={"contract"})
-
-
-@_part
-def rho_and_weight(code, scale, squared):
-    """Loss rho(s), near zero s / 2 as in GTSAM, and weight 2 rho'(s) of s = |residual|^2."""
-    c2 = scale * scale
-    if code == 1 and squared > c2:
-        norm = np.sqrt(squared)
-        return scale * (norm - 0.5 * scale), scale / norm
-    if code == 2:
-        return 0.5 * c2 * np.log1p(squared / c2), c2 / (c2 + squared)
-    if code == 3:
-        weight = c2 / (c2 + squared)
-        return 0.5 * squared * weight, weight * weight
-    return 0.5 * squared, 1.0
+_kernel, _part = kernel_and_part(fastmath={"contract"})
 
 
 @_part

@@ -1,13 +1,10 @@
-"""Compiled elimination of landmarks from a linear least-squares problem.
-
-All passes share a file, see `factors.compiled`.
-"""
+"""Compiled elimination of landmarks from a linear least-squares problem."""
 
 import numpy as np
 
 from factors.compiled import kernel_and_part
 
-_kernel, _part = kernel_and_part(error_model="numpy", fastmath={"contract"})
+_kernel, _part = kernel_and_part(fastmath={"contract"})
 
 
 @_part

@@ -2,7 +2,7 @@
 
 A patch is a plane piece of scene: the rays origin + spread @ (x, y) of an n x n grid of unit
 spacing, row-major in (x, y), x and y from -reach to reach. Images are spline coefficients
-(H, 2H) float32. All passes share a file, see `factors.compiled`.
+(H, 2H) float32.
 """
 
 import numpy as np
@@ -18,8 +18,8 @@ _MIN_CORNER_DETERMINANT = 1e-4  # least determinant of the shift's information o
 _MIN_GREY_VARIANCE = 1e-3  # variance in grey values squared below which a patch is empty
 
 _FAST = {"contract", "reassoc", "nsz"}
-_kernel, _part = kernel_and_part(error_model="numpy", fastmath=_FAST)
-_, _allocating = kernel_and_part(allocating=True, error_model="numpy", fastmath=_FAST)
+_kernel, _part = kernel_and_part(fastmath=_FAST)
+_, _allocating = kernel_and_part(allocating=True, fastmath=_FAST)
 
 
 @_part
@@ -96,7 +96,7 @@ def _pixel_map(origin, spread, half, width, height, nodes, quadratics):
     centre = nodes[1, 1, 0]
     for i in range(3):
         for j in range(3):
-            nodes[i, j, 0] -= width * np.round((nodes[i, j, 0] - centre) / width)
+            nodes[i, j, 0] -= width * np.floor((nodes[i, j, 0] - centre) / width + 0.5)
     for k in range(2):
         q = quadratics[k]
         for j in range(3):
@@ -135,28 +135,29 @@ def _sample_grid(coefficients, origin, spread, reach, shift_x, shift_y, scratch,
     nodes, quadratics, places, before, weights = scratch
     height, width = coefficients.shape
     n, half = 2 * reach + 1, reach + 1.0
-    if not _pixel_map(origin, spread, half, width, height, nodes, quadratics):
-        for i in range(n):
-            for j in range(n):
-                x, y = i - reach + shift_x, j - reach + shift_y
-                u, v = _ray_pixel(origin, spread, x, y, width, height)
-                out[i * n + j] = _sample(coefficients, u, v)
-        return
-    inside = _find_taps(
+    smooth = _pixel_map(origin, spread, half, width, height, nodes, quadratics)
+    if smooth and _find_taps(
         quadratics, places, shift_x / half, shift_y / half, width, height, before, weights
-    )
-    if inside:
+    ):
         _sum_inside(coefficients, before, weights, out)
         return
     p, q = quadratics[0], quadratics[1]
     for i in range(n):
-        x = (i - reach + shift_x) / half
-        u0, v0 = p[0, 0] + x * (p[1, 0] + x * p[2, 0]), q[0, 0] + x * (q[1, 0] + x * q[2, 0])
-        u1, v1 = p[0, 1] + x * (p[1, 1] + x * p[2, 1]), q[0, 1] + x * (q[1, 1] + x * q[2, 1])
-        u2, v2 = p[0, 2] + x * (p[1, 2] + x * p[2, 2]), q[0, 2] + x * (q[1, 2] + x * q[2, 2])
         for j in range(n):
-            y = (j - reach + shift_y) / half
-            out[i * n + j] = _sample(coefficients, u0 + y * (u1 + y * u2), v0 + y * (v1 + y * v2))
+            x, y = i - reach + shift_x, j - reach + shift_y
+            if smooth:
+                x, y = x / half, y / half
+                u = _quadratic(p, x, 0) + y * (_quadratic(p, x, 1) + y * _quadratic(p, x, 2))
+                v = _quadratic(q, x, 0) + y * (_quadratic(q, x, 1) + y * _quadratic(q, x, 2))
+            else:
+                u, v = _ray_pixel(origin, spread, x, y, width, height)
+            out[i * n + j] = _sample(coefficients, u, v)
+
+
+@_part
+def _quadratic(coefficients, x, j):
+    """Value at x of column j of a biquadratic."""
+    return coefficients[0, j] + x * (coefficients[1, j] + x * coefficients[2, j])
 
 
 @_part
@@ -172,7 +173,8 @@ def _find_taps(quadratics, places, shift_x, shift_y, width, height, before, weig
     q00, q01, q02 = q[0, 0] - 0.5, q[0, 1], q[0, 2]
     q10, q11, q12 = q[1, 0], q[1, 1], q[1, 2]
     q20, q21, q22 = q[2, 0], q[2, 1], q[2, 2]
-    left, right, top, bottom = width, -1, height, -1
+    left, right = np.int32(width), np.int32(-1)
+    top, bottom = np.int32(height), np.int32(-1)
     for k in range(places.shape[1]):
         x, y = places[0, k] + shift_x, places[1, k] + shift_y
         u0, v0 = p00 + x * (p10 + x * p20), q00 + x * (q10 + x * q20)
@@ -264,17 +266,16 @@ def _normal_matrix(templates, t, reach, columns, normal):
 @_part
 def _cut(coefficients, mask, t, origin, spread, least_contrast, templates, reach, scratch):
     """`cut_templates` of one template without its inverse; False if it has none."""
-    samples, ahead, behind, columns, normal = scratch
+    samples, grids, columns, normal = scratch
     window, values = templates.window, templates.grey[t]
+    by_x, by_y = templates.by_x[t], templates.by_y[t]
     num = len(window)
-    for axis in range(2):
-        sx, sy = 0.5 * (1 - axis), 0.5 * axis
-        _sample_grid(coefficients, origin, spread, reach, sx, sy, samples, ahead)
-        _sample_grid(coefficients, origin, spread, reach, -sx, -sy, samples, behind)
-        slopes = templates.by_x[t] if axis == 0 else templates.by_y[t]
-        for k in range(num):
-            slopes[k] = ahead[k] - behind[k]
-    _sample_grid(coefficients, origin, spread, reach, 0.0, 0.0, samples, values)
+    for g in range(5):  # half a pixel along x and y, half a pixel back, and the patch itself
+        sx, sy = 0.5 * ((g == 0) - (g == 2)), 0.5 * ((g == 1) - (g == 3))
+        _sample_grid(coefficients, origin, spread, reach, sx, sy, samples, grids[g])
+    for k in range(num):
+        by_x[k], by_y[k] = grids[0, k] - grids[2, k], grids[1, k] - grids[3, k]
+        values[k] = grids[4, k]
     if not _is_usable(mask, samples[0]):
         templates.states[t] = MASKED
         return False
@@ -297,15 +298,39 @@ def cut_templates(coefficients, mask, rows, origins, spreads, least_contrast, te
         least_contrast: standard deviation in grey values below which there is no texture.
     """
     num = len(templates.window)
-    reach = (int(np.round(np.sqrt(num))) - 1) // 2
+    reach = int(np.sqrt(num)) // 2
     normal = np.empty((8, 8))
-    ahead, behind = np.empty(num, np.float32), np.empty(num, np.float32)
-    scratch = _scratch(reach), ahead, behind, np.empty((8, num)), normal
+    scratch = _scratch(reach), np.empty((5, num), np.float32), np.empty((8, num)), normal
     for t in rows:
         if _cut(
             coefficients, mask, t, origins[t], spreads[t], least_contrast, templates, reach, scratch
         ):
-            templates.inverses[t] = np.linalg.inv(normal)
+            _invert(normal, templates.inverses[t])
+
+
+@_part
+def _invert(matrix, inverse):
+    """Write the inverse (8, 8) of a symmetric positive definite matrix, which is overwritten by
+    its Cholesky factor and that factor's inverse below and on the diagonal."""
+    for c in range(8):
+        for r in range(c, 8):
+            total = matrix[r, c]
+            for k in range(c):
+                total -= matrix[r, k] * matrix[c, k]
+            matrix[r, c] = np.sqrt(total) if r == c else total / matrix[c, c]
+    for c in range(8):
+        matrix[c, c] = 1.0 / matrix[c, c]
+        for r in range(c + 1, 8):
+            total = 0.0
+            for k in range(c, r):
+                total -= matrix[r, k] * matrix[k, c]
+            matrix[r, c] = total / matrix[r, r]
+    for r in range(8):
+        for c in range(8):
+            total = 0.0
+            for k in range(max(r, c), 8):
+                total += matrix[k, r] * matrix[k, c]
+            inverse[r, c] = total
 
 
 @_part
@@ -354,7 +379,7 @@ def _align(coefficients, mask, o, sightings, max_shift, steps, tolerance, templa
     """`align_templates` of one sighting; returns its state."""
     samples, values, origin, spread, b, step = scratch
     window = templates.window
-    reach = (int(np.round(np.sqrt(len(window)))) - 1) // 2
+    reach = int(np.sqrt(len(window))) // 2
     t, warp = sightings.templates[o], sightings.warps[o]
     power = _statistics(window, templates.grey[t])[2]
     gain = offset = 0.0
@@ -398,7 +423,7 @@ def align_templates(coefficients, mask, rows, sightings, max_shift, steps, toler
         tolerance: of the shift's last step, template pixels.
     """
     num = len(templates.window)
-    reach = (int(np.round(np.sqrt(num))) - 1) // 2
+    reach = int(np.sqrt(num)) // 2
     origin, spread = np.empty(3), np.empty((3, 2))
     values = np.empty(num, np.float32)
     scratch = _scratch(reach), values, origin, spread, np.empty(8), np.empty(8)

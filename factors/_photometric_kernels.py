@@ -12,8 +12,7 @@ There is no division and nothing special at infinity. The tangent of an observat
 of theta, then of the pose of the host relative to the target: a rotation phi and a translation
 tau in the target's rig frame, `dd = phi x A(...) + theta . (1, x, y) tau + c (1, x, y) . dtheta`.
 
-The pass handles a range of patches and releases the GIL. All passes share a file, because numba
-renews a cached kernel when its own file changes only.
+The pass handles a range of patches and releases the GIL.
 """
 
 from typing import NamedTuple
@@ -21,10 +20,11 @@ from typing import NamedTuple
 import numpy as np
 
 from factors.compiled import kernel_and_part
+from factors.robust import rho_and_weight
 
-_kernel, _part = kernel_and_part(error_model="numpy", fastmath={"contract"})
-_, _allocating = kernel_and_part(allocating=True, error_model="numpy", fastmath={"contract"})
-_, _sums = kernel_and_part(error_model="numpy", fastmath={"contract", "reassoc"})
+_kernel, _part = kernel_and_part(fastmath={"contract"})
+_, _allocating = kernel_and_part(allocating=True, fastmath={"contract"})
+_, _sums = kernel_and_part(fastmath={"contract", "reassoc"})
 
 CODE_SCALE = 28.0  # steps per grey value: spline coefficients of 8-bit images fit int16
 CODE_ZERO = 127.5  # grey value of code 0
@@ -50,21 +50,6 @@ class PatchData(NamedTuple):
     loss: int  # code of the robust loss
     loss_scale: float  # root mean square of a patch's whitened residuals at which the loss turns
     # flat
-
-
-@_part
-def rho_and_weight(code, scale, squared):
-    """Loss rho(s), near zero s / 2 as in GTSAM, and weight 2 rho'(s)."""
-    c2 = scale * scale
-    if code == 1 and squared > c2:
-        norm = np.sqrt(squared)
-        return scale * (norm - 0.5 * scale), scale / norm
-    if code == 2:
-        return 0.5 * c2 * np.log1p(squared / c2), c2 / (c2 + squared)
-    if code == 3:
-        weight = c2 / (c2 + squared)
-        return 0.5 * squared * weight, weight * weight
-    return 0.5 * squared, 1.0
 
 
 @_part

@@ -4,8 +4,8 @@ import numpy as np
 
 from factors.compiled import kernel_and_part
 
-_kernel, _part = kernel_and_part(error_model="numpy", fastmath={"contract"})
-_, _allocating = kernel_and_part(allocating=True, error_model="numpy", fastmath={"contract"})
+_kernel, _part = kernel_and_part(fastmath={"contract"})
+_, _allocating = kernel_and_part(allocating=True, fastmath={"contract"})
 
 
 @_part

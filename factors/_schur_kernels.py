@@ -11,7 +11,7 @@ from factors.compiled import kernel_and_part
 
 GROUP_DIM = 7  # degrees of freedom of a group of frames: rotation, translation, scale
 
-_kernel, _part = kernel_and_part(error_model="numpy", fastmath={"contract"})
+_kernel, _part = kernel_and_part(fastmath={"contract"})
 
 
 @_part

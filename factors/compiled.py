@@ -1,72 +1,205 @@
-"""Compilation of kernels: each one as a whole, with all its parts inlined.
+"""Compilation of kernels by Numba: each kernel as a whole, with its parts inlined.
 
-A kernel that calls another compiled function uses the copy that was loaded first: the function's
-own while kernels are being compiled, but the kernel's own, or another kernel's, once they come from
-the cache. Copies are optimised in their context, so they may round differently. Parts are therefore
-inlined, and kernels leave no sums or products of arrays to numpy. `tests/factors/test_compiled.py`
-tests both.
+A kernel is called from Python; parts are what kernels are made of. Parts are linked into each
+kernel as they are, and optimised there alone: a function that is optimised and turned into machine
+code by itself, to be inlined afterwards, costs Numba most of the time that it takes to compile.
+Since each kernel holds its own copy of its parts, kernels leave no sums or products of arrays to
+numpy, whose copies would be shared and round differently. `tests/factors/test_compiled.py` tests
+both.
 
-Compiling takes half a minute in all, which the log announces.
+`factors.kernel_cache` keeps compiled kernels between processes, `factors.compile_ahead` compiles
+them before they are needed.
 """
 
+import gc
 import logging
-from collections.abc import Callable
-from functools import cache
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
-from numba import njit, types
-from numba.core import event
+from numba.core import compiler, config, types
+from numba.core.codegen import JITCodeLibrary
+from numba.core.dispatcher import _FunctionCompiler
+from numba.core.registry import CPUDispatcher
+
+from factors.kernel_cache import KernelCache
 
 logger = logging.getLogger(__name__)
+
+_FLAGS_HASH = hash(compiler.Flags())  # Numba hashes only the names of flags
 
 
 def kernel_and_part(
     *, allocating: bool = False, **options: Any
 ) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """Decorators of one file's kernels, called from Python, and of the parts they are made of.
+    """Decorators of kernels, called from Python, and of the parts they are made of.
 
-    Both are cached and release the GIL. All parts of a kernel must be in its file: numba renews
-    a cached kernel when its own file changes, not when a part in another file does.
+    Kernels are cached on disk and release the GIL. Calling a part from Python runs its Python code.
 
     Kernels count references to arrays, atomically: each row of an array that is taken in a loop
     costs more than the arithmetic on it, and more still where threads count the same array. Parts
     do not count, so that loops belong in parts; they neither allocate arrays nor return any.
 
+    Slices that are written to, array expressions, `np.linalg` and sorts by numpy bring hundreds of
+    lines of Numba's own into a kernel, each of them compiled anew: loops over scalars do not.
+
     Args:
         allocating: the parts may allocate and return arrays, and count references, too.
-        options: of `numba.njit`, such as fastmath.
+        options: of `numba.njit`, such as fastmath. Division by zero gives inf or nan.
     """
-    _watch()
-    options |= {"cache": True, "nogil": True}
-    inlined: dict[str, Any] = {"forceinline": True, "_nrt": allocating}
-    return njit(**options), njit(**(options | inlined))
+    usual = {"nopython": True, "nogil": True, "boundscheck": None, "error_model": "numpy"}
+    options = usual | options
+
+    def kernel(function: Callable[..., Any]) -> Any:
+        return function if config.DISABLE_JIT else Kernel(function, {}, dict(options))
+
+    def part(function: Callable[..., Any]) -> Any:
+        inlined = options | {"forceinline": True, "_nrt": allocating}
+        return function if config.DISABLE_JIT else Part(function, {}, inlined)
+
+    return kernel, part
 
 
-class _Compilations(event.Listener):
-    """Logs the first compilation of a process, and refuses parts that return arrays they do not
-    count; loading a kernel from disk is no compilation."""
+class Kernel(CPUDispatcher):
+    """A function compiled with its parts inlined, kept on disk."""
 
-    announced = False
+    def __init__(self, function: Callable[..., Any], local: dict, options: dict) -> None:
+        super().__init__(function, local, options)
+        self._compiler = _KernelCompiler(
+            function, self.targetdescr, options, local, compiler.Compiler
+        )
+        self._cache = KernelCache(self)
 
-    def on_start(self, event: Any) -> None:
-        if not self.announced:
-            logger.info("compiling kernels, once per machine: this takes a while")
-        self.announced = True
+    def compile(self, sig: Any) -> Any:
+        try:
+            return super().compile(sig)
+        finally:
+            self._cache.release()
 
-    def on_end(self, event: Any) -> None:
-        function, arguments = event.data["dispatcher"], tuple(event.data["args"])
-        options, compiled = function.targetoptions, function.overloads.get(arguments)
-        if compiled is None or not options.get("forceinline") or options.get("_nrt", True):
-            return
-        if _holds_arrays(compiled.signature.return_type):
-            raise TypeError(f"{function.__name__} returns an array, which its caller would release")
+
+class Part(CPUDispatcher):
+    """A function that is compiled only as a part of kernels."""
+
+    def __init__(self, function: Callable[..., Any], local: dict, options: dict) -> None:
+        super().__init__(function, local, options)
+        self._compiler = _PartCompiler(
+            function, self.targetdescr, options, local, compiler.Compiler
+        )
+
+    def __call__(self, *args: Any) -> Any:
+        return self.py_func(*args)
+
+
+class _Flags(compiler.Flags):
+    """Numba's flags, compared at once where the same ones are set.
+
+    Numba compares flags for each call that it resolves, by all values, set or not.
+    """
+
+    def __hash__(self) -> int:
+        return _FLAGS_HASH
+
+    def __eq__(self, other: object) -> bool:
+        if isinstance(other, _Flags) and self._values == other._values:
+            return True
+        return super().__eq__(other)
+
+
+class _KernelCompiler(_FunctionCompiler):
+    """Compiles a function, and what it calls only to be linked into it."""
+
+    _announced = False
+
+    def _compile_core(self, args: tuple, return_type: Any) -> Any:
+        if not _KernelCompiler._announced:
+            logger.info("compiling kernels, once per machine: this takes some seconds")
+            _KernelCompiler._announced = True
+        codegen = self.targetdescr.target_context.codegen()
+        library = codegen.create_library(self.py_func.__qualname__)
+        library.enable_object_caching()
+        with _collecting_no_garbage(), _linking_callees(codegen):
+            return self._compile(args, return_type, library)
+
+    def _compile(self, args: tuple, return_type: Any, library: Any, *, part: bool = False) -> Any:
+        flags = _Flags()
+        self.targetdescr.options.parse_as_flags(flags, self.targetoptions)
+        flags.no_cfunc_wrapper = True
+        flags.no_cpython_wrapper = flags.no_compile = part
+        return compiler.compile_extra(
+            self.targetdescr.typing_context,
+            self.targetdescr.target_context,
+            self.py_func,
+            args,
+            return_type,
+            flags,
+            self.locals,
+            library=library,
+            pipeline_class=self.pipeline_class,
+        )
+
+
+class _PartCompiler(_KernelCompiler):
+    """Compiles a function that is always inlined into its callers."""
+
+    def _compile_core(self, args: tuple, return_type: Any) -> Any:
+        context = self.targetdescr.target_context
+        library = _LinkedLibrary(context.codegen(), self.py_func.__qualname__)
+        result = self._compile(args, return_type, library, part=True)
+        counts = self.targetoptions["_nrt"]
+        if not counts and _holds_arrays(result.signature.return_type):
+            name = self.py_func.__name__
+            raise TypeError(f"{name} returns an array, which its caller would release")
+        # Numba finds the code of a call by its entry point. Parts have none: this one is unique.
+        result = result._replace(entry_point=[].index)
+        context.insert_user_function(result.entry_point, result.fndesc, [result.library])
+        return result
+
+
+class _LinkedLibrary(JITCodeLibrary):
+    """Code to be linked into kernels: neither optimised nor turned into machine code."""
+
+    @property
+    def codegen(self) -> Any:
+        return self
+
+    def set_env(self, _name: str, _environment: Any) -> None:
+        """Nothing: code that does not exist yet has no address of its environment."""
+
+    def _optimize_functions(self, ll_module: Any) -> None:
+        ll_module.data_layout = self._codegen._data_layout
+
+    def finalize(self) -> None:
+        self._raise_if_finalized()
+        for library in dict.fromkeys(self._linking_libraries):
+            self._reload_init.update(library._reload_init)
+            self._final_module.link_in(library._get_module_for_linking(), preserve=True)
+        self._finalize_dynamic_globals()
+        self._finalized = True
 
 
 def _holds_arrays(kind: Any) -> bool:
-    """True if values of a numba type are arrays or hold some."""
+    """True if values of a Numba type are arrays or hold some."""
     return isinstance(kind, types.Array) or any(map(_holds_arrays, getattr(kind, "types", ())))
 
 
-@cache
-def _watch() -> None:
-    event.register("numba:compile", _Compilations())
+@contextmanager
+def _collecting_no_garbage() -> Iterator[None]:
+    """Pauses the garbage collector, which Numba's many small objects keep busy for nothing."""
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()
+
+
+@contextmanager
+def _linking_callees(codegen: Any) -> Iterator[None]:
+    """Keeps Numba from optimising its own functions that a kernel calls apart from the kernel."""
+    usual = codegen._library_class
+    codegen._library_class = _LinkedLibrary
+    try:
+        yield
+    finally:
+        codegen._library_class = usual

@@ -6,6 +6,10 @@ from typing import Literal
 import gtsam
 import numpy as np
 
+from factors.compiled import kernel_and_part
+
+_, _part = kernel_and_part(fastmath={"contract"})
+
 LossKind = Literal["none", "huber", "cauchy", "geman_mcclure"]
 _CODES: dict[str, int] = {"none": 0, "huber": 1, "cauchy": 2, "geman_mcclure": 3}
 
@@ -68,3 +72,18 @@ class RobustLoss:
         step = 1e-4  # of a squared residual
         weights = self.weights(squared)
         return weights + (self.weights(squared * (1 + step)) - weights) / step
+
+
+@_part
+def rho_and_weight(code, scale, squared):
+    """Loss rho(s), near zero s / 2 as in GTSAM, and weight 2 rho'(s) of s = |residual|^2."""
+    c2 = scale * scale
+    if code == 1 and squared > c2:
+        norm = np.sqrt(squared)
+        return scale * (norm - 0.5 * scale), scale / norm
+    if code == 2:
+        return 0.5 * c2 * np.log1p(squared / c2), c2 / (c2 + squared)
+    if code == 3:
+        weight = c2 / (c2 + squared)
+        return 0.5 * squared * weight, weight * weight
+    return 0.5 * squared, 1.0

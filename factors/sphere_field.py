@@ -17,7 +17,7 @@ _MAX_STEPS = 20  # fixed-point steps that invert a field; each reduces the error
 # slope
 _CONVERGED_STEP = 1e-12  # step of a direction below which iteration ends
 
-_kernel, _part = kernel_and_part(error_model="numpy")
+_kernel, _part = kernel_and_part()
 
 
 def num_harmonics(degree: int) -> int:

@@ -21,7 +21,7 @@ from factors.reprojection import FaceCameras
 from factors.robust import RobustLoss
 
 NAME = "splat"
-_kernel, _part = kernel_and_part(error_model="numpy")
+_kernel, _part = kernel_and_part()
 _MIN_SAMPLES = 50  # least samples that constrain a pose
 _MIN_SPREAD = 1e-3  # least spread of the residuals, grey values 0..1
 

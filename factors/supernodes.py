@@ -69,23 +69,27 @@ def _upper(num: int, pairs: np.ndarray, order: np.ndarray) -> tuple[np.ndarray, 
     placed = placed[np.lexsort((placed[:, 1], placed[:, 0]))]
     starts = np.zeros(num + 1, dtype=np.int64)
     np.cumsum(np.bincount(placed[:, 0], minlength=num), out=starts[1:])
-    return starts, placed[:, 1]
+    return starts, np.ascontiguousarray(placed[:, 1])
 
 
 @_kernel
 def _tree(starts, columns):
     """Parents (N,) in the elimination tree, -1 for a root, of a pattern given by `_upper`."""
     num = len(starts) - 1
-    counts = np.zeros(num + 1, np.int64)
-    for j in columns:
-        counts[j + 1] += 1
-    offsets = np.cumsum(counts)
-    filled, earlier = offsets[:-1].copy(), np.empty(len(columns), np.int64)
+    offsets, filled = np.empty(num + 1, np.int64), np.empty(num, np.int64)
+    parents, ancestors = np.empty(num, np.int64), np.empty(num, np.int64)
+    earlier = np.empty(len(columns), np.int64)
+    for j in range(num + 1):
+        offsets[j] = 0
+    for s in range(len(columns)):
+        offsets[columns[s] + 1] += 1
+    for j in range(num):
+        offsets[j + 1] += offsets[j]
+        filled[j], parents[j], ancestors[j] = offsets[j], -1, -1
     for i in range(num):
         for s in range(starts[i], starts[i + 1]):
             earlier[filled[columns[s]]] = i
             filled[columns[s]] += 1
-    parents, ancestors = np.full(num, -1), np.full(num, -1)
     for j in range(num):
         for s in range(offsets[j], offsets[j + 1]):
             node = earlier[s]
@@ -102,12 +106,14 @@ def _tree(starts, columns):
 def _postorder(parents):
     """Nodes (N,) of a tree, children before parents and each with its subtree in one run."""
     num = len(parents)
-    first, following = np.full(num, -1), np.full(num, -1)
+    first, following = np.empty(num, np.int64), np.empty(num, np.int64)
+    out, stack, count = np.empty(num, np.int64), np.empty(num, np.int64), 0
+    for k in range(num):
+        first[k] = following[k] = -1
     for k in range(num - 1, -1, -1):
         if parents[k] != -1:
             following[k] = first[parents[k]]
             first[parents[k]] = k
-    out, stack, count = np.empty(num, np.int64), np.empty(num, np.int64), 0
     for root in range(num):
         if parents[root] != -1:
             continue

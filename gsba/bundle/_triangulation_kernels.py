@@ -36,7 +36,7 @@ def triangulate_tracks(
 
     Rays are in the world frame. A hypothesis that all observations support ends the search.
     """
-    best = np.zeros(3)
+    best = np.empty(3)
     for j in range(first, last):
         lo, hi = starts[j], starts[j + 1]
         best_count, best_cost = 0, np.inf
@@ -62,7 +62,7 @@ def triangulate_tracks(
             continue
         for _ in range(3):
             _gauss_newton_step(rays, centres, sigmas, lo, hi, best, gate)
-        x, y, z = best
+        x, y, z = best[0], best[1], best[2]
         cosine = 1.0
         for o in range(lo, hi):
             if _squared_error(rays, centres, o, x, y, z) < (gate * sigmas[o]) ** 2:
@@ -70,7 +70,7 @@ def triangulate_tracks(
                 for p in range(lo, o):
                     if inliers[p]:
                         cosine = min(cosine, _cosine(centres, o, p, x, y, z))
-        points[j] = best
+        points[j, 0], points[j, 1], points[j, 2] = x, y, z
         parallaxes[j] = np.arccos(max(cosine, -1.0))
 
 

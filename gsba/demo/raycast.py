@@ -10,7 +10,7 @@ import numpy as np
 
 from factors.compiled import kernel_and_part
 
-kernel, part = kernel_and_part(error_model="numpy")
+kernel, part = kernel_and_part()
 _NUM_BANDS = 64  # independent of the number of threads
 
 

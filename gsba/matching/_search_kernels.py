@@ -57,10 +57,10 @@ def search(first, second, cells, targets, only_targets, direction, limits):
     n0, n1, dim = len(descriptors0), len(descriptors1), descriptors0.shape[1]
     head = min(HEAD, dim)
     # Contiguous, so that they stay in the cache.
-    head0 = np.ascontiguousarray(descriptors0[:, :head])
-    head1 = np.ascontiguousarray(descriptors1[:, :head])
+    head0 = _first_axes(descriptors0, head, np.empty((n0, head), np.float32))
+    head1 = _first_axes(descriptors1, head, np.empty((n1, head), np.float32))
     columns, balls = _columns(second.bearings), _columns(cells.centres)
-    no_radii = np.zeros(n1, np.float32)
+    no_radii = _filled(n1, 0.0)
     marks, worth = np.empty(n1, np.bool_), np.empty(len(cells.radii), np.bool_)
     found0, found1 = _no_candidates(n0), _no_candidates(n1)
     for i in range(n0):
@@ -153,13 +153,38 @@ def passes(bearings0, bearings1, targets, only_targets, direction, limits):
 @_allocating
 def _columns(rows):
     """The coordinates of points (n, 3), each in a row of its own."""
-    return rows[:, 0].copy(), rows[:, 1].copy(), rows[:, 2].copy()
+    n = len(rows)
+    x, y, z = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
+    for i in range(n):
+        x[i], y[i], z[i] = rows[i, 0], rows[i, 1], rows[i, 2]
+    return x, y, z
+
+
+@_allocating
+def _first_axes(rows, head, out):
+    """Copy the first axes of descriptors (n, D) to `out` (n, head)."""
+    for i in range(len(rows)):
+        for d in range(head):
+            out[i, d] = rows[i, d]
+    return out
+
+
+@_allocating
+def _filled(n, value):
+    """Array (n,) of one value."""
+    out = np.empty(n, np.float32)
+    for i in range(n):
+        out[i] = value
+    return out
 
 
 @_allocating
 def _no_candidates(n):
     """Initial best candidate of n rows, its similarity, and that of the best at another place."""
-    return np.full(n, -1, np.int32), np.full(n, -1, np.float32), np.full(n, -1, np.float32)
+    best = np.empty(n, np.int32)
+    for i in range(n):
+        best[i] = -1
+    return best, _filled(n, -1.0), _filled(n, -1.0)
 
 
 @_part

@@ -128,11 +128,23 @@ def _references(starts, frames, centres, points, out):
         out[j] = _reference(j, starts, frames, centres, points)
 
 
+@_part
+def _least(costs):
+    """Index of the first of the least costs."""
+    least = 0
+    for k in range(1, len(costs)):
+        if costs[k] < costs[least]:
+            least = k
+    return least
+
+
 @_kernel
 def _views(
     starts, frames, centres, points, rows, near, min_cosine, max_ratio, max_views, extended, out
 ):
-    listed = np.full(len(centres), -1)  # last point that listed each frame
+    listed = np.empty(len(centres), np.int64)  # last point that listed each frame
+    for frame in range(len(centres)):
+        listed[frame] = -1
     costs = np.empty(near.shape[1])
     num = 0
     for j in range(len(points)):
@@ -157,9 +169,11 @@ def _views(
                 )
                 if cosine > min_cosine and ratio < max_ratio and ratio * max_ratio > 1:
                     costs[k] = cost
-        for k in np.argsort(costs):
-            if room <= 0 or costs[k] == np.inf:
+        while room > 0:
+            k = _least(costs)
+            if costs[k] == np.inf:
                 break
+            costs[k] = np.inf
             out[0, num], out[1, num] = j, near[host, k]
             num += 1
             room -= 1

@@ -1,8 +1,7 @@
 """Compiled passes over Gaussians: to splats of one pinhole camera, and gradients back.
 
 Projection by a local affine map (EWA: Zwicker et al., 2001) with the dilation and the guard band
-of Kerbl et al., 3D Gaussian Splatting, 2023; colours by real spherical harmonics. All passes share
-a file because numba renews a cached kernel only when its own file changes.
+of Kerbl et al., 3D Gaussian Splatting, 2023; colours by real spherical harmonics.
 """
 
 import numpy as np
@@ -24,7 +23,7 @@ _C3 = (
     1.445305721320277,
 )
 
-_kernel, _part = kernel_and_part(error_model="numpy", fastmath={"contract"})
+_kernel, _part = kernel_and_part(fastmath={"contract"})
 
 
 @_part

@@ -5,7 +5,6 @@ A projected splat is a row of ten float32, here and in its gradient:
 `[[a, b], [b, c]]`. A tile is 16 x 16 pixels. All loops over pixels run along whole tiles in one
 flat buffer at constant offsets, so that the compiler makes vector code of them; no tile and no
 (splat, tile) entry is written by two threads, so that results do not depend on their number.
-All passes share a file because numba renews a cached kernel only when its own file changes.
 """
 
 import numpy as np

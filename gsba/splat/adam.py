@@ -7,7 +7,7 @@ import numpy as np
 from factors.compiled import kernel_and_part
 from gsba.splat.gaussians import Gaussians, concatenate, zeros_like
 
-_kernel, _ = kernel_and_part(error_model="numpy", fastmath={"contract"})
+_kernel, _ = kernel_and_part(fastmath={"contract"})
 BETA1, BETA2, EPS = 0.9, 0.999, 1e-15
 
 
