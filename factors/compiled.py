@@ -76,6 +76,10 @@ class Kernel(CPUDispatcher):
         finally:
             self._cache.release()
 
+    def is_missing(self, sig: Any) -> bool:
+        """True if the form of a signature is not on disk, nor being compiled by any process."""
+        return self._cache.is_missing(sig, self.targetctx)
+
 
 class Part(CPUDispatcher):
     """A function that is compiled only as a part of kernels."""

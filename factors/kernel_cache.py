@@ -28,6 +28,7 @@ from typing import Any
 import llvmlite
 import numba
 import numpy as np
+from llvmlite.binding import get_host_cpu_name
 from numba.core import config
 from numba.core.caching import _Cache
 from numba.core.compiler import CompileResult
@@ -80,6 +81,19 @@ class KernelCache(_Cache):
         finally:
             self.release()
 
+    def is_missing(self, sig: Any, target_context: Any) -> bool:
+        """True if a form is not in the cache, nor being compiled by any process."""
+        target_context.refresh()
+        path = self._path(sig, target_context.codegen())
+        if path.exists():
+            return False
+        lock = _lock(path.with_suffix(".lock"), wait=False)
+        if lock is None:
+            return False
+        os.unlink(lock.name)
+        lock.close()
+        return True
+
     def release(self) -> None:
         """Let other processes compile this kernel: it is saved, or could not be compiled."""
         if self._lock is not None:
@@ -90,7 +104,7 @@ class KernelCache(_Cache):
 
     def _path(self, sig: Any, codegen: Any) -> Path:
         args = getattr(sig, "args", sig)
-        facts = (digest(self._kernel), str(tuple(args)), codegen.magic_tuple(), _versions())
+        facts = (digest(self._kernel), str(tuple(args)), codegen.magic_tuple(), versions())
         name = hashlib.sha256(repr(facts).encode()).hexdigest()[:24]
         return cache_folder() / f"{self._kernel.py_func.__name__.strip('_')}-{name}.kernel"
 
@@ -102,6 +116,15 @@ def cache_folder() -> Path:
     if sys.platform == "darwin":
         return Path.home() / "Library" / "Caches" / "gsba" / "kernels"
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "gsba" / "kernels"
+
+
+def can_keep() -> bool:
+    """True if compiled kernels can be written to the folder, which is made."""
+    try:
+        cache_folder().mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return False
+    return os.access(cache_folder(), os.W_OK)
 
 
 def digest(kernel: Dispatcher) -> str:
@@ -159,8 +182,10 @@ def _text(value: Any) -> str:
 
 
 @cache
-def _versions() -> tuple[str, ...]:
-    return (sys.version, numba.__version__, llvmlite.__version__, np.__version__)
+def versions() -> tuple[str, ...]:
+    """Versions of all that compiles, and the processor that it compiles for."""
+    processor = config.CPU_NAME or get_host_cpu_name()
+    return (sys.version, numba.__version__, llvmlite.__version__, np.__version__, processor)
 
 
 def _load(path: Path, target_context: Any) -> CompileResult | None:
@@ -193,8 +218,9 @@ def _save(path: Path, payload: bytes) -> None:
             unfinished.unlink()
 
 
-def _lock(path: Path) -> Any:
-    """A locked file, closed to unlock it; None where files cannot be locked."""
+def _lock(path: Path, *, wait: bool = True) -> Any:
+    """A locked file, closed to unlock it; None where files cannot be locked, or if another process
+    has locked it and is not waited for."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         file = path.open("w")
@@ -202,7 +228,7 @@ def _lock(path: Path) -> Any:
         _tell_trouble(error.strerror or str(error))
         return None
     try:
-        fcntl.flock(file, fcntl.LOCK_EX)
+        fcntl.flock(file, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:  # a file system without locks
         file.close()
         return None

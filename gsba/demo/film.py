@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from gsba.compilation import compile_ahead
 from gsba.demo.two_lenses import TwoLenses
 from gsba.demo.walk import (
     Camera,
@@ -74,6 +75,7 @@ def make_film(
     truth = Trajectory(whole.timestamps[:num_frames], whole.world_T_rigs[:num_frames])
     scene = build_gallery()
     logger.info("gallery of %d faces, %d frames of %d px", len(scene.corners), num_frames, width)
+    compile_ahead("demo", "odometry", "refine")  # films are made to be refined
     with replaced_folder(out) as partial:
         pictures = render_walk(scene, truth, width, seed, lenses)
         _encode(av, partial / "walk.mp4", exposed(truth, pictures, seed), width)

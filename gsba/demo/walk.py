@@ -13,6 +13,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from gsba.camera.sphere import bearings_from_erp
+from gsba.compilation import compile_ahead
 from gsba.demo.degrade import degrade
 from gsba.demo.two_lenses import TwoLenses
 from gsba.geometry import pose
@@ -95,6 +96,7 @@ def make_walk(
 @contextmanager
 def walk_folder(out: Path, truth: Trajectory, seed: int) -> Iterator[Path]:
     """Folder to write a walk's images into; adds its trajectories and replaces `out` at the end."""
+    compile_ahead("demo", "refine")  # walks are made to be refined
     with replaced_folder(out) as partial:
         (partial / "images").mkdir()
         yield partial

@@ -11,6 +11,7 @@ from gsba.bundle.families import Family
 from gsba.bundle.fixes import FrameFixes
 from gsba.bundle.gps_factors import MIN_FIXES, GpsFixes
 from gsba.camera.calibration import read_calibration
+from gsba.compilation import compile_ahead
 from gsba.config import RefineSettings, VideoSettings, installed_families
 from gsba.frames.image_circles import ImageCircle
 from gsba.frames.lens_names import lens_files
@@ -292,6 +293,7 @@ def extract_video(
         settings, fps, by_odometry, calibration: see `extract_frames`.
         name: of one of several recordings, whose frames go to `frames`/`name`; "" = the only one.
     """
+    compile_ahead(*([] if by_odometry is None else ["odometry"]), "refine")
     chosen, folder = settings.video, store.root / "frames" / name
     if fps is not None:
         chosen = chosen.model_copy(update={"fps": check_fps(fps), "every": None, "at": None})

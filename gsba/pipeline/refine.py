@@ -10,6 +10,7 @@ from threadpoolctl import threadpool_limits
 
 from gsba import video
 from gsba.bundle.families import Family
+from gsba.compilation import compile_ahead
 from gsba.config import RefineSettings
 from gsba.frames.scan import scan
 from gsba.masks import merging
@@ -150,6 +151,7 @@ def refine_from(
         walk: the odometry of the video; None = frames were not chosen by it.
         store, settings, chosen: of the run.
     """
+    compile_ahead("refine")
     if walk is not None:
         start = _with_fetched(store, settings, chosen, given, start, source, walk)
     state = _solve_raw(_begin(store, settings, chosen, start))
