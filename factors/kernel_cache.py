@@ -88,18 +88,14 @@ class KernelCache(_Cache):
         if path.exists():
             return False
         lock = _lock(path.with_suffix(".lock"), wait=False)
-        if lock is None:
-            return False
-        os.unlink(lock.name)
-        lock.close()
-        return True
+        if lock is not None:
+            _unlock(lock)
+        return lock is not None
 
     def release(self) -> None:
         """Let other processes compile this kernel: it is saved, or could not be compiled."""
         if self._lock is not None:
-            with contextlib.suppress(OSError):
-                os.unlink(self._lock.name)
-            self._lock.close()
+            _unlock(self._lock)
             self._lock = None
 
     def _path(self, sig: Any, codegen: Any) -> Path:
@@ -113,9 +109,13 @@ def cache_folder() -> Path:
     """Folder of this user's compiled kernels; it may not exist yet."""
     if config.CACHE_DIR:
         return Path(config.CACHE_DIR) / "gsba"
+    try:
+        home = Path.home()
+    except RuntimeError:  # a user whom the system does not know: nothing can be kept
+        home = Path(os.devnull)
     if sys.platform == "darwin":
-        return Path.home() / "Library" / "Caches" / "gsba" / "kernels"
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "gsba" / "kernels"
+        return home / "Library" / "Caches" / "gsba" / "kernels"
+    return Path(os.environ.get("XDG_CACHE_HOME") or home / ".cache") / "gsba" / "kernels"
 
 
 def can_keep() -> bool:
@@ -127,6 +127,7 @@ def can_keep() -> bool:
     return os.access(cache_folder(), os.W_OK)
 
 
+@cache
 def digest(kernel: Dispatcher) -> str:
     """Digest of a kernel's code and of all code and constants that it uses."""
     found = hashlib.sha256()
@@ -192,13 +193,14 @@ def _load(path: Path, target_context: Any) -> CompileResult | None:
     """A kernel from its file; None if there is none, or it is damaged."""
     try:
         content = path.read_bytes()
-        if time.time() - path.stat().st_mtime > _DAY_S:
-            os.utime(path)
     except FileNotFoundError:
         return None
     except OSError as error:
         _tell_trouble(error.strerror or str(error))
         return None
+    with contextlib.suppress(OSError):  # of another user, perhaps
+        if time.time() - path.stat().st_mtime > _DAY_S:
+            os.utime(path)
     checksum, payload = content[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
     if hashlib.sha256(payload).digest() != checksum:
         return None
@@ -236,6 +238,12 @@ def _lock(path: Path, *, wait: bool = True) -> Any:
         file.close()
         raise
     return file
+
+
+def _unlock(file: Any) -> None:
+    with contextlib.suppress(OSError):
+        os.unlink(file.name)
+    file.close()
 
 
 @cache

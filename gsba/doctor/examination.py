@@ -128,8 +128,7 @@ def _remedy(faulty: Sequence[Package], wanted: Sequence[Requirement]) -> str:
         return f"build {', '.join(sorted(unbuilt))} from source: {_ON_ARM}"
     ranges = [f"'{one.name}{one.range}'" for one in wanted if one.name in names]
     if not ranges:  # all packages work, but gsba's own code does not
-        no_place = any("cannot cache" in package.fault for package in faulty)
-        return "export NUMBA_CACHE_DIR=/tmp/numba" if no_place else "gsba doctor --json"
+        return "gsba doctor --json"
     return f"pip install --force-reinstall {' '.join(ranges)}"
 
 

@@ -168,11 +168,6 @@ def test_a_broken_extra_is_no_failure(site: Path, monkeypatch: pytest.MonkeyPatc
     assert text.exit_code == 0 and "BROKEN  view" in text.stdout
 
 
-def test_gsbas_own_kernels_need_a_place(monkeypatch: pytest.MonkeyPatch) -> None:
-    package = examination.Package("gsba", "1", "RuntimeError: cannot cache function 'a': no")
-    assert examination._remedy([package], []).startswith("export NUMBA_CACHE_DIR=")
-
-
 @pytest.mark.parametrize(
     ("changed", "told", "remedy"),
     [
