@@ -122,7 +122,10 @@ class _KernelCompiler(_FunctionCompiler):
         library = codegen.create_library(self.py_func.__qualname__)
         library.enable_object_caching()
         with _collecting_no_garbage(), _linking_callees(codegen):
-            return self._compile(args, return_type, library)
+            result = self._compile(args, return_type, library)
+        for environment in result._find_referenced_environments():  # of callees that raise errors
+            codegen.set_env(environment.env_name, environment)
+        return result
 
     def _compile(self, args: tuple, return_type: Any, library: Any, *, part: bool = False) -> Any:
         flags = _Flags()

@@ -94,3 +94,27 @@ def test_compilation_is_announced_once_per_machine(tmp_path: Path) -> None:
     first, second = (subprocess.run(command, **given).stderr for _ in range(2))
     assert first.count("compiling kernels, once per machine") == 1
     assert second == ""
+
+
+def test_errors_of_numbas_own_functions_reach_the_caller() -> None:
+    """They are linked into the kernel, as parts are."""
+    kernel, _ = kernel_and_part()
+
+    @kernel
+    def copied(array: np.ndarray, other: np.ndarray) -> None:
+        array[:] = other
+
+    for _ in range(2):
+        with pytest.raises(ValueError, match=r"cannot assign slice of shape \(3,\)"):
+            copied(np.zeros(3), np.zeros(4))
+        copied._reset_overloads()  # the second time from the disk
+
+
+def test_a_part_called_from_python_runs_as_python() -> None:
+    _, part = kernel_and_part()
+
+    @part
+    def doubled(x: float) -> float:
+        return 2 * x
+
+    assert doubled(1.5) == 3.0
