@@ -12,6 +12,35 @@ from tiny_run import Case, make_case
 
 from gsba.demo import DemoWalk
 
+# Files and folders whose tests take longest begin first, so that no worker is left alone with them.
+# While the first file compiles the pipeline's kernels, the next ones need none of them.
+_FIRST = (
+    "pipeline/test_growing_cameras.py",
+    "scans",
+    "loop_closure",
+    "pipeline",
+    "localization",
+    "examples",
+    "demo",
+    "odometry",
+    "parts",
+    "masks",
+    "placement",
+    "bundle",
+    "factors",
+)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Order files by how long they take; each file's tests stay in one worker and in order."""
+    items.sort(key=lambda item: _place_in_queue(item.path))
+
+
+def _place_in_queue(path: Path) -> int:
+    tests = Path(__file__).parent
+    found = (n for n, first in enumerate(_FIRST) if path.is_relative_to(tests / first))
+    return next(found, len(_FIRST))
+
 
 @pytest.fixture(scope="session")
 def made_once(tmp_path_factory: pytest.TempPathFactory) -> MadeOnce:
