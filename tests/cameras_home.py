@@ -2,6 +2,8 @@
 
 import json
 import shutil
+import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -46,6 +48,8 @@ def make_home(folder: Path, walk: DemoWalk) -> Home:
     for n in range(2):
         files.append(folder / f"{n}.tum")
         write_tum(files[-1], Trajectory(times, slam.world_T_rigs[n::2]))
+    tree = calibration_json(PAIR, np.array([0.0, 0.0, 0.001]), "map", {})
+    (folder / "raw.json").write_text(json.dumps(tree))
     poses = np.concatenate([truth.world_T_rigs[0::2], truth.world_T_rigs[1::2]])
     return Home(
         folder,
@@ -55,6 +59,18 @@ def make_home(folder: Path, walk: DemoWalk) -> Home:
     )
 
 
+def _filled(folder: Path, fill: Callable[[Path], None]) -> Path:
+    """The folder, filled by the first worker that needs it and seen by others once it is whole."""
+    if not folder.exists():
+        own = Path(tempfile.mkdtemp(dir=folder.parent))
+        fill(own)
+        try:
+            own.rename(folder)
+        except OSError:  # another worker was first
+            shutil.rmtree(own)
+    return folder
+
+
 def _times(folder: Path, num: int = NUM) -> None:
     rows = [f"{n:06d},{0.5 * n}" for n in range(num)]
     (folder / "timestamps.csv").write_text("\n".join(["name,timestamp", *rows, ""]))
@@ -62,9 +78,8 @@ def _times(folder: Path, num: int = NUM) -> None:
 
 def panoramas(home: Home, which: int, width: int) -> Recording:
     """A recording as stitched panoramas of a width."""
-    folder = home.folder / f"stitched{which}at{width}"
-    if not folder.exists():
-        folder.mkdir()
+
+    def fill(folder: Path) -> None:
         for n, path in enumerate(home.pictures[which]):
             if width == WIDTH:
                 shutil.copy(path, folder / f"{n:06d}.jpg")
@@ -73,6 +88,8 @@ def panoramas(home: Home, which: int, width: int) -> Recording:
                 small = cv2.resize(read(path), size, interpolation=cv2.INTER_AREA)
                 cv2.imwrite(str(folder / f"{n:06d}.jpg"), small)
         _times(folder)
+
+    folder = _filled(home.folder / f"stitched{which}at{width}", fill)
     return Recording(folder, home.trajectories[which])
 
 
@@ -87,37 +104,35 @@ def beginning(recording: Recording, num: int, folder: Path) -> Recording:
 
 def faces(home: Home) -> Recording:
     """The second recording as cube faces."""
-    folder = home.folder / "faces"
-    if folder.exists():
-        return Recording(folder, home.trajectories[1])
-    for n, path in enumerate(home.pictures[1]):
-        for name, image in zip(FACES, cut(read(path), CubeRig(128, np.pi / 2)), strict=True):
-            (folder / name).mkdir(parents=True, exist_ok=True)
-            cv2.imwrite(str(folder / name / f"{n:06d}.png"), image)
-    _times(folder)
-    return Recording(folder, home.trajectories[1])
+
+    def fill(folder: Path) -> None:
+        for n, path in enumerate(home.pictures[1]):
+            for name, image in zip(FACES, cut(read(path), CubeRig(128, np.pi / 2)), strict=True):
+                (folder / name).mkdir(parents=True, exist_ok=True)
+                cv2.imwrite(str(folder / name / f"{n:06d}.png"), image)
+        _times(folder)
+
+    return Recording(_filled(home.folder / "faces", fill), home.trajectories[1])
 
 
 def fisheyes(home: Home, which: int = 1) -> Recording:
     """A recording as two raw fisheyes with one centre, and their calibration."""
-    folder = home.folder / ("raw" if which else "stitched0raw")
-    calibration = home.folder / "raw.json"
-    if folder.exists():
-        return Recording(folder, home.trajectories[which], calibration=calibration)
-    for name, lens in zip(("front", "back"), PAIR, strict=True):
-        (folder / name).mkdir(parents=True)
-        grid = np.stack(np.meshgrid(np.arange(240) + 0.5, np.arange(240) + 0.5), axis=-1)
-        places = erp_from_bearings(unproject(lens, grid), WIDTH, WIDTH // 2) - 0.5 + 4
-        u, v = np.moveaxis(places, -1, 0).astype(np.float32)
-        far = np.hypot(*(np.moveaxis(grid, -1, 0) - 120)) > 73 * np.deg2rad(95)
-        for n, path in enumerate(home.pictures[which]):
-            shown = cv2.remap(around_sphere(read(path), 4), u, v, cv2.INTER_CUBIC)
-            shown[far] = 0
-            cv2.imwrite(str(folder / name / f"{n:06d}.png"), shown)
-    _times(folder)
-    tree = calibration_json(PAIR, np.array([0.0, 0.0, 0.001]), "map", {})
-    calibration.write_text(json.dumps(tree))
-    return Recording(folder, home.trajectories[which], calibration=calibration)
+
+    def fill(folder: Path) -> None:
+        for name, lens in zip(("front", "back"), PAIR, strict=True):
+            (folder / name).mkdir()
+            grid = np.stack(np.meshgrid(np.arange(240) + 0.5, np.arange(240) + 0.5), axis=-1)
+            places = erp_from_bearings(unproject(lens, grid), WIDTH, WIDTH // 2) - 0.5 + 4
+            u, v = np.moveaxis(places, -1, 0).astype(np.float32)
+            far = np.hypot(*(np.moveaxis(grid, -1, 0) - 120)) > 73 * np.deg2rad(95)
+            for n, path in enumerate(home.pictures[which]):
+                shown = cv2.remap(around_sphere(read(path), 4), u, v, cv2.INTER_CUBIC)
+                shown[far] = 0
+                cv2.imwrite(str(folder / name / f"{n:06d}.png"), shown)
+        _times(folder)
+
+    folder = _filled(home.folder / ("raw" if which else "stitched0raw"), fill)
+    return Recording(folder, home.trajectories[which], calibration=home.folder / "raw.json")
 
 
 def read(path: Path) -> np.ndarray:
@@ -148,8 +163,8 @@ def error_of(run: Path, home: Home) -> float:
 SMALL_EXPORT = settings_with(export={"formats": ("colmap-flat",), "face_size": 64})
 
 
-def make_two_sizes(home: Home) -> Path:
+def make_two_sizes(home: Home, folder: Path) -> Path:
     """A run of both recordings as panoramas of two sizes, made at once."""
-    out = home.folder / "sizes"
+    out = folder / "sizes"
     refine_recordings([panoramas(home, 0, WIDTH), panoramas(home, 1, SMALL)], out, SMALL_EXPORT)
     return out

@@ -23,7 +23,12 @@ class Texture:
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
         """Grey values (...,) at points (..., 3) of the ball."""
-        return 127 + 8 * np.sin(points / RADIUS @ self.waves.T + self.phases).sum(axis=-1)
+        rows, sums = points.reshape(-1, 3), np.empty(points.shape[:-1]).reshape(-1)
+        for first in range(0, len(rows), 512):  # the waves of so many points fit in a CPU's cache
+            waves = rows[first : first + 512] / RADIUS @ self.waves.T
+            waves += self.phases
+            np.sin(waves, out=waves).sum(axis=-1, out=sums[first : first + 512])
+        return 127 + 8 * sums.reshape(points.shape[:-1])
 
 
 class CodedImage:

@@ -22,6 +22,7 @@ SETTINGS = RefineSettings.model_validate(  # lighter than the defaults
         "features": {"max_per_face": 400},
         "solver": {"num_threads": 2},
         "weak_frames": {"mode": "off"},
+        "patches": {"rounds": 2},
     }
 )
 

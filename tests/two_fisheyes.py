@@ -1,6 +1,7 @@
 """Pictures of two fisheyes that see a sphere of smooth colours, and what these are."""
 
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -45,10 +46,16 @@ def colours(directions: np.ndarray) -> np.ndarray:
     return 155 + 95 * np.stack(waves, axis=-1)
 
 
+@lru_cache(maxsize=8)
+def _directions(lens: Fisheye) -> np.ndarray:
+    """Directions (h, w, 3) of the pixels of a lens, which takes many pictures."""
+    pixels = np.stack(np.meshgrid(np.arange(lens.width), np.arange(lens.height)), axis=-1) + 0.5
+    return unproject(lens, pixels)
+
+
 def picture(lens: Fisheye, seen=colours, half_fov: float = HALF_FOV) -> np.ndarray:
     """What a lens sees, (h, w, 3) uint8 RGB, black beyond its circle."""
-    pixels = np.stack(np.meshgrid(np.arange(lens.width), np.arange(lens.height)), axis=-1) + 0.5
-    directions = unproject(lens, pixels)
+    directions = _directions(lens)
     axis = Rotation.from_rotvec(lens.rotation).as_matrix()[:, 2]
     within = directions @ axis > np.cos(half_fov)
     return np.where(within[..., None], np.rint(seen(directions)), 0).astype(np.uint8)

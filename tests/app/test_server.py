@@ -220,7 +220,7 @@ def test_a_run_of_the_page_is_that_of_the_command_line(case: Case, tmp_path: Pat
     client = TestClient(application(app), base_url=f"http://127.0.0.1:8360/{app.token}/")
     out = f"of-page-{tmp_path.name}"
     light = ["cubemap.face_size=256", "features.max_per_face=400"]
-    light += ["solver.num_threads=2", "weak_frames.mode=off"]
+    light += ["solver.num_threads=2", "weak_frames.mode=off", "patches.rounds=2"]
     values = {"frames": case.frames.name, "trajectory": [case.slam.name], "out": out}
     values |= {"overrides": light}
     added = post(client, "api/add", {"command": "refine", "values": values})

@@ -1,6 +1,7 @@
 """Photometric family: Jacobians, block against reference factors, recovery of exact worlds."""
 
 from dataclasses import replace
+from functools import cache
 
 import gtsam
 import numpy as np
@@ -22,6 +23,12 @@ LOSS = RobustLoss("cauchy", 2.0)
 TIGHT = SolverSettings(relative_tolerance=1e-10, max_iterations=100)
 PLANE = 1000  # first key of a plane
 STEP = 1e-6  # of differences: the spline has kinks in its third derivative
+
+
+@cache
+def small_world(seed: int, num_frames: int, num_patches: int, spread: float = 0.3) -> BallWorld:
+    """A world that several tests read and none changes."""
+    return make_ball_world(seed, num_frames, num_patches, spread=spread)
 
 
 def block_of(world: BallWorld, loss: RobustLoss = LOSS, **options) -> PhotometricBlock:
@@ -113,11 +120,11 @@ def pose_errors(world: BallWorld, values: gtsam.Values) -> tuple[float, float]:
 )
 @pytest.mark.parametrize("spread", [0.3, 1e-4], ids=["parallax", "no parallax"])
 def test_jacobians(bearing: tuple[float, ...], spread: float) -> None:
-    world = make_ball_world(1, 2, 1, spread=spread)
+    world = small_world(1, 2, 1, spread)
     table = table_of(
         world.world_T_rigs, np.array([0]), unit(np.array([bearing], dtype=float)), 512, 9
     )
-    world.pixels = PatchPixels(table, world.world_T_rigs, 512)
+    world = replace(world, pixels=PatchPixels(table, world.world_T_rigs, 512))
     for f, image in enumerate(world.images):
         world.pixels.take(f, image)
     values = world.values()
@@ -142,7 +149,7 @@ def test_jacobians_through_lenses() -> None:
 
 @pytest.mark.parametrize("lenses", [False, True])
 def test_block_costs_what_the_reference_factors_do(lenses: bool) -> None:
-    world = make_ball_world(2, 3, 20)
+    world = small_world(2, 3, 20)
     world = through_lenses(world) if lenses else world
     block = block_of(world)
     assert block.counted.all() and not any(block.dropped.values())
@@ -157,7 +164,7 @@ def test_block_costs_what_the_reference_factors_do(lenses: bool) -> None:
 
 @pytest.mark.parametrize("lenses", [False, True])
 def test_gradient_is_that_of_the_eliminated_cost(lenses: bool) -> None:
-    world = make_ball_world(3, 3, 25)
+    world = small_world(3, 3, 25)
     world = through_lenses(world) if lenses else world
     block = block_of(world, RobustLoss())
     poses = moved(world, 1, 1e-3, 4e-3)
@@ -333,7 +340,7 @@ def test_a_frame_can_be_weighted_down() -> None:
     ],
 )
 def test_wrong_tables_are_refused(change: dict, message: str) -> None:
-    world = make_ball_world(14, 2, 1)
+    world = small_world(14, 2, 1)
     table = replace(world.pixels.table, hosts=np.array([0]), targets=np.array([1]))
     with pytest.raises(ValueError, match=message):
         PatchPixels(replace(table, **change), world.world_T_rigs, 512)

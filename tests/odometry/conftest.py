@@ -2,9 +2,10 @@
 
 import pytest
 from dense_walk import RenderedWalk, render_walk
+from made_once import MadeOnce
 
 
 @pytest.fixture(scope="session")
-def walk() -> RenderedWalk:
+def walk(made_once: MadeOnce) -> RenderedWalk:
     """Rendered once for all tests."""
-    return render_walk()
+    return made_once("dense-walk", lambda _: render_walk())

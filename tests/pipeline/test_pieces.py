@@ -31,6 +31,7 @@ MOVE = pose(Rotation.from_rotvec([0.4, -2.0, 0.7]).as_matrix(), np.array([5.0, -
 SET = (
     f"cubemap.face_size={SETTINGS.cubemap.face_size}",
     f"features.max_per_face={SETTINGS.features.max_per_face}",
+    f"patches.rounds={SETTINGS.patches.rounds}",
     'export.formats=["colmap-flat"]',
 )
 

@@ -35,6 +35,7 @@ SET = (
     f"features.max_per_face={SETTINGS.features.max_per_face}",
     f"solver.num_threads={SETTINGS.solver.num_threads}",
     f"weak_frames.mode={SETTINGS.weak_frames.mode}",
+    f"patches.rounds={SETTINGS.patches.rounds}",
     'export.formats=["colmap-flat", "tum"]',
 )
 
