@@ -7,8 +7,7 @@ Since each kernel holds its own copy of its parts, kernels leave no sums or prod
 numpy, whose copies would be shared and round differently. `tests/factors/test_compiled.py` tests
 both.
 
-`factors.kernel_cache` keeps compiled kernels between processes, `factors.compile_ahead` compiles
-them before they are needed.
+`factors.kernel_cache` keeps compiled kernels between processes.
 """
 
 import gc
