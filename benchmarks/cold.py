@@ -1,6 +1,7 @@
 """The first run after an installation: how long it takes to compile kernels, and to start.
 
     python benchmarks/cold.py --markdown benchmarks/results/cold.md
+    python benchmarks/cold.py --beside OTHER/bin/python   # another gsba, in turn
     python benchmarks/cold.py --record        # after a change of kernels: renews the signatures
 
 `gsba demo`, and `gsba refine` of its walk, with an empty cache of kernels and with a full one, in
@@ -15,7 +16,10 @@ import subprocess
 import sys
 import tempfile
 import time
+from itertools import product
 from pathlib import Path
+
+Measured = dict[tuple[str, str, str], list[tuple[float, float]]]
 
 _LISTENER = """
 import atexit, pickle, sys
@@ -45,19 +49,23 @@ def main() -> None:
     parser.add_argument("--record", action="store_true", help="write gsba/compilation/signatures")
     parser.add_argument("--runs", type=int, default=3, help="of each command in each state")
     parser.add_argument("--markdown", type=Path)
+    parser.add_argument("--beside", type=Path, help="interpreter that imports another gsba")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         if arguments.record:
             _record(Path(folder))
         else:
-            table = _table(_measure(Path(folder), arguments.runs))
+            pythons = {"this": Path(sys.executable)}
+            if arguments.beside:
+                pythons["the other"] = arguments.beside.absolute()
+            table = _table(_measure(Path(folder), pythons, arguments.runs))
             print(table)
             if arguments.markdown:
                 arguments.markdown.write_text(table)
 
 
-def _measure(folder: Path, runs: int) -> dict[tuple[str, str], list[tuple[float, float]]]:
-    """Wall and CPU seconds of all runs, by command and state of the cache."""
+def _measure(folder: Path, pythons: dict[str, Path], runs: int) -> Measured:
+    """Wall and CPU seconds of all runs, by code, command and state of the cache."""
     walk = folder / "walk"
     commands = {
         "gsba demo": ["demo", "--out", str(walk)],
@@ -66,27 +74,27 @@ def _measure(folder: Path, runs: int) -> dict[tuple[str, str], list[tuple[float,
             "--out", str(folder / "run"), "--fresh",
         ],
     }  # fmt: skip
-    found: dict[tuple[str, str], list[tuple[float, float]]] = {}
+    found: Measured = {}
     for n in range(runs):
-        for name, command in commands.items():
-            cache = folder / f"{name}-{n}"
+        for (name, command), (code, python) in product(commands.items(), pythons.items()):
+            cache = folder / f"{code}-{name}-{n}"
             for state in ("empty", "full"):
                 before, start = _cpu_s(), time.perf_counter()
-                _run(["-c", "from gsba.cli import main; main()", *command], cache)
+                _run(["-c", "from gsba.cli import main; main()", *command], cache, python)
                 wall = time.perf_counter() - start
-                found.setdefault((name, state), []).append((wall, _cpu_s() - before))
+                found.setdefault((name, code, state), []).append((wall, _cpu_s() - before))
     return found
 
 
-def _table(found: dict[tuple[str, str], list[tuple[float, float]]]) -> str:
+def _table(found: Measured) -> str:
     lines = [
-        "| command | cache | wall s, median (least to most) | CPU s | runs |",
-        "|---|---|---:|---:|---:|",
+        "| command | code | cache | wall s, median (least to most) | CPU s | runs |",
+        "|---|---|---|---:|---:|---:|",
     ]
-    for (name, state), runs in found.items():
+    for (name, code, state), runs in sorted(found.items()):
         walls, cpus = zip(*runs, strict=True)
         wall = f"{statistics.median(walls):.1f} ({min(walls):.1f} to {max(walls):.1f})"
-        cells = [f"`{name}`", state, wall, f"{statistics.median(cpus):.1f}", str(len(runs))]
+        cells = [f"`{name}`", code, state, wall, f"{statistics.median(cpus):.1f}", str(len(runs))]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 
@@ -113,8 +121,8 @@ def _record(folder: Path) -> None:
     signatures.write({"demo": rendering, "refine": refine, "odometry": odometry})
 
 
-def _run(arguments: list[str], cache: Path) -> None:
-    command = [sys.executable, *arguments]
+def _run(arguments: list[str], cache: Path, python: Path = Path(sys.executable)) -> None:
+    command = [str(python), "-P", *arguments]
     environment = os.environ | {"NUMBA_CACHE_DIR": str(cache)}
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     if done.returncode:
