@@ -245,11 +245,9 @@ def relative_similarity(
     if len(points0) < least:
         return None
     rng = np.random.default_rng(seed)
-    best = np.zeros(len(points0), bool)
-    for _ in range(_NUM_TRIALS):
-        three = rng.choice(len(points0), 3, replace=False)
-        agree = _agree(points0, points1, three)
-        best = agree if agree.sum() > best.sum() else best
+    draws = [rng.choice(len(points0), 3, replace=False) for _ in range(_NUM_TRIALS)]
+    inliers = _agree_with_triples(points0, points1, np.array(draws))
+    best = inliers[np.argmax(inliers.sum(axis=1))]
     for _ in range(3):
         if best.sum() < least:
             return None
@@ -317,13 +315,35 @@ def _agree(points0: np.ndarray, points1: np.ndarray, chosen: np.ndarray) -> np.n
     return agreeing_points(points0, points1, fit)
 
 
+def _agree_with_triples(
+    points0: np.ndarray, points1: np.ndarray, triples: np.ndarray
+) -> np.ndarray:
+    """Inliers (T, m) bool of the similarities that fit three points each, rows (T, 3); none where
+    no similarity does. See `similarity`."""
+    source, target = points1[triples], points0[triples]
+    s, t = source - source.mean(axis=1, keepdims=True), target - target.mean(axis=1, keepdims=True)
+    u, _, vt = np.linalg.svd(np.swapaxes(t, 1, 2) @ s)
+    u[:, :, 2] *= np.sign(np.linalg.det(u) * np.linalg.det(vt))[:, None]
+    rotations = u @ vt
+    s = s @ np.swapaxes(rotations, 1, 2)
+    spread, across, wanted = (np.sum(a * b, axis=(1, 2)) for a, b in ((s, s), (s, t), (t, t)))
+    fits = across > np.maximum(_MIN_CORRELATION * np.sqrt(spread * wanted), 0.0)
+    scales = np.divide(across, spread, out=np.ones_like(across), where=fits)[:, None, None]
+    turned = source.mean(axis=1, keepdims=True) @ np.swapaxes(rotations, 1, 2)
+    shifts = target.mean(axis=1, keepdims=True) - scales * turned
+    agree = are_aligned(scales * (points1 @ np.swapaxes(rotations, 1, 2)) + shifts, points0)
+    agree &= are_aligned((points0 - shifts) @ rotations / scales, points1)
+    return agree & fits[:, None]
+
+
 def agreeing_points(points0: np.ndarray, points1: np.ndarray, fit: Sim3) -> np.ndarray:
     """Inliers (m,) bool: points (m, 3) whose bearings agree in both rigs; `fit`: rig 1 to rig 0."""
     in0, in1 = fit.points(points1), fit.points_back(points0)
+    return are_aligned(in0, points0) & are_aligned(in1, points1)
+
+
+def are_aligned(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """True (..., m) where vectors (..., m, 3) and (m, 3) are less than `_MAX_ANGLE_DEG` apart."""
+    lengths = np.linalg.norm(one, axis=-1) * np.linalg.norm(other, axis=-1)
     limit = np.cos(np.deg2rad(_MAX_ANGLE_DEG))
-    return (_cosines(in0, points0) > limit) & (_cosines(in1, points1) > limit)
-
-
-def _cosines(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    lengths = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
-    return np.einsum("mi,mi->m", a, b) / np.maximum(lengths, 1e-12)
+    return np.einsum("...mi,...mi->...m", one, other) > limit * np.maximum(lengths, 1e-12)

@@ -7,7 +7,13 @@ import numpy as np
 
 from gsba.geometry import inverse, rotation_angle
 from gsba.loop_closure.loops import AGREE, AGREE_DEG
-from gsba.similarity import Sim3, agreeing_points, relative_similarity, similarity_along
+from gsba.similarity import (
+    Sim3,
+    agreeing_points,
+    are_aligned,
+    relative_similarity,
+    similarity_along,
+)
 from gsba.types import Matches
 
 _MAX_LOG_SCALE_DIFFERENCE = 0.15  # largest difference of logarithms of scales that agree
@@ -91,15 +97,29 @@ def _proposed(
     given: list[Meeting], meetings: list[Meeting], poses: np.ndarray, seed: int
 ) -> list[Proposal]:
     """A proposal of each meeting given that has one, supported by all meetings."""
+    if not meetings:
+        return []
     found = []
+    at_f, own = _in_world(poses, [(m.f, m.own) for m in meetings])
+    at_g, theirs = _in_world(poses, [(m.g, m.theirs) for m in meetings])
     for m in given:
         similarity = _similarity_of_meeting(m, seed)
         if similarity is None:
             continue
         move = carrying(similarity, poses[m.f], poses[m.g])
-        support = sum(len(each.own) for each in _inliers_of(meetings, move, poses))
-        found.append(Proposal(move, (m.f, m.g), support))
+        agree = are_aligned(move.points(own) - at_g, theirs - at_g)
+        agree &= are_aligned(move.points_back(theirs) - at_f, own - at_f)
+        found.append(Proposal(move, (m.f, m.g), int(agree.sum())))
     return found
+
+
+def _in_world(
+    poses: np.ndarray, seen: list[tuple[int, np.ndarray]]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (N, 3) of rigs, and the points (N, 3) that they see, each in its map's world."""
+    at = [np.broadcast_to(poses[rig, :3, 3], points.shape) for rig, points in seen]
+    world = [Sim3.of(1.0, poses[rig]).points(points) for rig, points in seen]
+    return np.concatenate(at), np.concatenate(world)
 
 
 def _pooled(meeting: Meeting, meetings: list[Meeting], poses: np.ndarray) -> Meeting:

@@ -7,7 +7,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 from two_maps import HALF, MOVE, NUM, SCALE, TRUTH, scene, torn
 
-from gsba import similarity
 from gsba.geometry import inverse, pose, rotation_angle
 from gsba.loop_closure import connectivity, join_evidence, map_merging
 from gsba.loop_closure.join_evidence import JoinEvidence
@@ -23,12 +22,6 @@ from gsba.types import CoarsePoses, Matches, PoseSource, Solution, Tracks
 TIMES = np.arange(NUM, dtype=float)
 NOBODY = np.zeros(NUM - 1, bool)
 BREAK = np.arange(NUM - 1) == HALF - 1
-
-
-@pytest.fixture(autouse=True)
-def _few_samples(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Matches of the scene have noise and hardly an outlier: few samples give the similarity."""
-    monkeypatch.setattr(similarity, "_NUM_TRIALS", 12)
 
 
 def _halves(alone: tuple[int, ...] = ()) -> np.ndarray:
@@ -169,8 +162,6 @@ def test_a_join_a_bay_off_is_left_for_one_at_the_usual_pace(
     monkeypatch.setattr(map_merging, "agreed", lambda *_: false)
     monkeypatch.setattr(map_merging._Joining, "_meetings", lambda *_: [])
     monkeypatch.setattr(map_merging._Joining, "_plausible", lambda *_: True)
-    propose = map_merging.propose  # whose time grows with the square of the number of meetings
-    monkeypatch.setattr(map_merging, "propose", lambda met, *given: propose(met[::5], *given))
     found = map_merging.merge(context, parts, _halves(), BREAK & held, ~BREAK, TIMES)
     assert not found.components.any()
     assert (_errors(found)[0] < 0.05) != held
