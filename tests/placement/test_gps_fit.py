@@ -9,7 +9,6 @@ from lasting_errors import SIGMAS_M, fixes_at, lasting_errors
 from scipy.spatial.transform import Rotation
 from walk_on_earth import frame_set, geodetic_of, walk_result
 
-from gsba import similarity
 from gsba.config import GpsSettings, PlacementSettings
 from gsba.log import GsbaError
 from gsba.placement.gps_fit import GpsFit, fit_fixes
@@ -61,16 +60,9 @@ def _errors(
     ],
 )
 def test_errors_are_as_standard_deviations_say(
-    num: int,
-    metres: float,
-    up: bool,
-    scale_sigma: float | None,
-    tau: float,
-    wild: float,
-    monkeypatch: pytest.MonkeyPatch,
+    num: int, metres: float, up: bool, scale_sigma: float | None, tau: float, wild: float
 ) -> None:
     """Over walks long and short, up known or not, also where errors last 40 or 100 s, not 60."""
-    monkeypatch.setattr(similarity, "_NUM_DRAWS", 100)  # at most a tenth of the fixes is false
     rng, true, found = np.random.default_rng(num), _walk(num, metres), []
     times = _times(true)
     for _ in range(DRAWS):
