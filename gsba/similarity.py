@@ -18,6 +18,7 @@ _OUTLIER_SIGMAS = 4.6  # 99.99% of such vectors are shorter
 _NUM_TRIALS = 200  # samples of three points each
 _MAX_ANGLE_DEG = 1.0  # largest angle between a point's bearing and the other frame's point
 _MIN_POINTS = 15
+_RATIOS_AT_ONCE = 64  # lengths of a step tried in one array
 
 
 @dataclass(frozen=True, slots=True)
@@ -281,11 +282,17 @@ def similarity_along(
     squares = np.sum(across**2, axis=1)
     ratios = -np.sum(across * normal, axis=1) / np.maximum(squares, 1e-24)
     best, agree = None, np.zeros(len(points0), bool)
-    for ratio in [0.0, *ratios]:
-        fit = _scaled(points0, turned + ratio * direction, rotation, ratio * direction)
-        fits = agreeing_points(points0, points1, fit)
-        if fits.sum() > agree.sum():
-            best, agree = fit, fits
+    tried = np.concatenate([[0.0], ratios])
+    for some in np.split(tried, range(_RATIOS_AT_ONCE, len(tried), _RATIOS_AT_ONCE)):
+        at = turned + some[:, None, None] * direction
+        lengths = np.maximum(np.linalg.norm(at, axis=2), 1e-12)
+        scales = np.median(np.linalg.norm(points0, axis=1) / lengths, axis=1)
+        in1 = (points0 / scales[:, None, None] - some[:, None, None] * direction) @ rotation
+        inliers = are_aligned(at, points0) & are_aligned(in1, points1)
+        n = int(np.argmax(inliers.sum(axis=1)))
+        if inliers[n].sum() > agree.sum():
+            step = scales[n] * some[n] * direction
+            best, agree = Sim3(float(scales[n]), rotation, step), inliers[n]
     for _ in range(2 if agree.sum() >= least else 0):
         ratio = float(np.median(ratios[agree]))
         at = turned[agree] + ratio * direction
