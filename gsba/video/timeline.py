@@ -18,6 +18,8 @@ from gsba.log import GsbaError
 
 _SUFFIXES = {".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi", ".ts", ".insv", ".360", ".lrv"}
 _UNSPECIFIED = 2  # AVCOL_SPC_UNSPECIFIED
+_FULL_RANGE = np.clip(np.rint((np.arange(256) - 16) * 255 / 219), 0, 255).astype(np.uint8)  # grey
+# values of a limited-range luma
 _MAX_EXCESS_S = 1.0  # of the duration that a container claims over that of its frames
 
 
@@ -158,8 +160,22 @@ def decode(track: Track, timeline: Timeline, chosen: Sequence[int]) -> Iterator[
 
 
 def luma(frame: Any) -> np.ndarray:
-    """Brightness (H, W) uint8 of an av.VideoFrame."""
-    return frame.reformat(format="gray").to_ndarray()
+    """Brightness (H, W) uint8 of an av.VideoFrame, over the full range from black 0 to white 255.
+
+    YUV frames give their luma plane, whatever their colour matrix: equal matrices on both sides
+    save FFmpeg the way over RGB. Limited range (16 to 235) is stretched; untagged frames have it.
+    """
+    import cv2
+    from av.video.reformatter import ColorRange, Colorspace
+
+    kind = frame.format
+    options = {"src_colorspace": Colorspace.ITU601, "dst_colorspace": Colorspace.ITU601}
+    is_plain = len(kind.components) > 2 and not kind.is_rgb and kind.components[0].bits == 8
+    if is_plain:  # FFmpeg copies the plane; the range is applied faster below
+        options |= {"src_color_range": ColorRange.JPEG, "dst_color_range": ColorRange.JPEG}
+    grey = frame.reformat(format="gray", **options).to_ndarray()
+    full_range = frame.color_range == ColorRange.JPEG or kind.name.startswith("yuvj")
+    return cv2.LUT(grey, _FULL_RANGE) if is_plain and not full_range else grey
 
 
 def bgr(frame: Any) -> np.ndarray:

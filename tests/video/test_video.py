@@ -17,6 +17,7 @@ from gsba.trajectory.files import write_tum
 from gsba.types import Trajectory
 from gsba.video import extract, extraction
 from gsba.video.likeness import apparent_motion_deg, miniature, sharpness
+from gsba.video.timeline import luma
 
 av = pytest.importorskip("av", reason="PyAV is not installed")
 
@@ -349,3 +350,26 @@ def test_missing_library_is_one_line(
     monkeypatch.setitem(__import__("sys").modules, "av", None)
     result = _gsba("extract", film, "--out", tmp_path / "f")
     _fails(result, "reading video needs PyAV: pip install 'gsba[video]'")
+
+
+@pytest.mark.parametrize("kind", ["yuv420p", "yuvj420p", "nv12", "yuv420p10le"])
+@pytest.mark.parametrize("matrix", [1, 2, 5])  # BT.709, untagged, BT.601
+@pytest.mark.parametrize("extent", [0, 1, 2])  # untagged, limited, full range
+def test_luma_is_the_luma_plane_in_full_range(kind: str, matrix: int, extent: int) -> None:
+    rng = np.random.default_rng(0)
+    frame = av.VideoFrame(64, 32, kind)
+    frame.colorspace, frame.color_range = matrix, extent
+    kinds = np.uint16 if kind.endswith("10le") else np.uint8
+    scale = 4 if kinds == np.uint16 else 1
+    for plane in frame.planes:
+        shape = plane.height, plane.line_size // np.dtype(kinds).itemsize
+        plane.update(rng.integers(100 * scale, 156 * scale, shape, dtype=kinds).tobytes())
+    levels = rng.integers(16, 236, (32, frame.planes[0].line_size // np.dtype(kinds).itemsize))
+    frame.planes[0].update((scale * levels).astype(kinds).tobytes())
+    levels = levels[:, :64]
+    stretched = np.rint((levels - 16) * 255 / 219)
+    wanted = levels if extent == 2 or kind == "yuvj420p" else stretched
+    found = luma(frame)
+    assert np.abs(found - wanted).max() <= (scale > 1)  # 10 bits are rounded once more
+    if matrix == 2:
+        assert np.array_equal(found, frame.reformat(format="gray").to_ndarray())
