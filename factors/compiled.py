@@ -20,12 +20,15 @@ from numba.core import compiler, config, types
 from numba.core.codegen import JITCodeLibrary
 from numba.core.dispatcher import _FunctionCompiler
 from numba.core.registry import CPUDispatcher
+from numba.core.untyped_passes import LiteralPropagationSubPipelinePass, LiteralUnroll
 
 from factors.kernel_cache import KernelCache
 
 logger = logging.getLogger(__name__)
 
+_DEFAULT_FLAGS = compiler.Flags().values()
 _FLAGS_HASH = hash(compiler.Flags())  # Numba hashes only the names of flags
+_FOR_LITERALS = {LiteralUnroll, LiteralPropagationSubPipelinePass}
 
 
 def kernel_and_part(
@@ -64,9 +67,7 @@ class Kernel(CPUDispatcher):
 
     def __init__(self, function: Callable[..., Any], local: dict, options: dict) -> None:
         super().__init__(function, local, options)
-        self._compiler = _KernelCompiler(
-            function, self.targetdescr, options, local, compiler.Compiler
-        )
+        self._compiler = _KernelCompiler(function, self.targetdescr, options, local, _Pipeline)
         self._cache = KernelCache(self)
 
     def compile(self, sig: Any) -> Any:
@@ -85,27 +86,34 @@ class Part(CPUDispatcher):
 
     def __init__(self, function: Callable[..., Any], local: dict, options: dict) -> None:
         super().__init__(function, local, options)
-        self._compiler = _PartCompiler(
-            function, self.targetdescr, options, local, compiler.Compiler
-        )
+        self._compiler = _PartCompiler(function, self.targetdescr, options, local, _Pipeline)
 
     def __call__(self, *args: Any) -> Any:
         return self.py_func(*args)
 
 
 class _Flags(compiler.Flags):
-    """Numba's flags, compared at once where the same ones are set.
-
-    Numba compares flags for each call that it resolves, by all values, set or not.
-    """
+    """Numba's flags, which it hashes and compares for each call that it resolves, in less time."""
 
     def __hash__(self) -> int:
         return _FLAGS_HASH
 
     def __eq__(self, other: object) -> bool:
-        if isinstance(other, _Flags) and self._values == other._values:
-            return True
         return super().__eq__(other)
+
+    def values(self) -> dict[str, Any]:
+        return _DEFAULT_FLAGS | self._values
+
+
+class _Pipeline(compiler.CompilerBase):
+    """Numba's passes without those for literal arguments, which infer all types once more."""
+
+    def define_pipelines(self) -> list[Any]:
+        passes = compiler.DefaultPassBuilder.define_nopython_pipeline(self.state)
+        passes.passes = [one for one in passes.passes if one[0] not in _FOR_LITERALS]
+        passes._finalized = False
+        passes.finalize()
+        return [passes]
 
 
 class _KernelCompiler(_FunctionCompiler):

@@ -156,7 +156,8 @@ def _facts(thing: Any, seen: set[int]) -> Iterator[str]:
         for value in values + [thing.__globals__[x] for x in names if x in thing.__globals__]:
             yield from _facts(value, seen)
     else:  # a module, a record, or code made for Numba by hand
-        yield Path(str(module.__file__)).read_text()
+        file = getattr(module, "__file__", None)
+        yield hashlib.sha256(Path(file).read_bytes()).hexdigest() if file else _text(thing)
 
 
 def _codes(code: CodeType) -> Iterator[CodeType]:
