@@ -10,6 +10,9 @@ both.
 `factors.kernel_cache` keeps compiled kernels between processes.
 """
 
+# pyright: reportAttributeAccessIssue=false
+# Numba declares neither its settings nor the inside of its compiler.
+
 import gc
 import logging
 from collections.abc import Callable, Iterator

@@ -10,6 +10,9 @@ that another process is compiling is waited for. Whatever goes wrong with the fo
 compiled.
 """
 
+# pyright: reportAttributeAccessIssue=false
+# Numba declares neither its settings nor the inside of its compiler.
+
 import contextlib
 import fcntl
 import hashlib

@@ -1,5 +1,8 @@
 """Processes that compile kernels while the one that needs them reads its first frames."""
 
+# pyright: reportAttributeAccessIssue=false
+# Numba declares neither its settings nor the inside of its compiler.
+
 import atexit
 import contextlib
 import hashlib

@@ -6,6 +6,9 @@ named tuple `{"module.class": [types]}`, a tuple the list of its types. Kernels 
 their first call; `benchmarks/cold.py --record` writes them.
 """
 
+# pyright: reportAttributeAccessIssue=false
+# Numba declares neither its settings nor the inside of its compiler.
+
 import importlib
 import json
 from pathlib import Path
@@ -56,7 +59,7 @@ def _encode(kind: types.Type) -> Any:
     return str(kind)
 
 
-def _decode(text: Any) -> types.Type:
+def _decode(text: Any) -> Any:
     if isinstance(text, dict):
         ((name, members),) = text.items()
         return types.BaseNamedTuple.from_types(list(map(_decode, members)), find(name))
