@@ -42,7 +42,7 @@ def test_compiling_kernels_changes_nothing(case: Case, tmp_path: Path) -> None:
     environment = {**os.environ, "PYTHONPATH": path, "NUMBA_CACHE_DIR": str(cache)}
     runs = [tmp_path / name for name in ("compiled", "cached")]
     for out in runs:
-        assert any(cache.rglob("*.nbc")) == (out.name == "cached")
+        assert any(cache.rglob("*.kernel")) == (out.name == "cached")
         words = [SETTINGS.model_dump_json(), case.frames, case.slam, out]
         call = [sys.executable, "-c", _REFINE, *map(str, words)]
         subprocess.run(call, env=environment, check=True)
