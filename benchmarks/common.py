@@ -109,6 +109,15 @@ def refine_command(frames: Path, run: Path, options: Sequence[str]) -> list[str]
     return [*command, *options, "--set", "export.formats=[]"]
 
 
+def link_frames(frames: Iterable[Path], folder: Path) -> Path:
+    """The folder, with links to these frames and nothing else, as the peer reads a folder."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    for path in frames:
+        (folder / path.name).symlink_to(path.resolve())
+    return folder
+
+
 def last_line(log: Path) -> str:
     """Last line of a command's output."""
     lines = [line for line in log.read_text(errors="replace").splitlines() if line.strip()]

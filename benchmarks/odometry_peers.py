@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from common import code_digest, digest, kept_row, refine_command, run_row, write_table
+from common import code_digest, digest, kept_row, link_frames, refine_command, run_row, write_table
 from wrong_maps import MAX_ERROR
 
 from gsba.evaluate.trajectory import pose_errors
@@ -125,12 +125,7 @@ def peer(walk: Walk, home: Path, mode: str) -> dict[str, Any]:
     if row := kept_row(folder, key, TIMEOUT_S):
         return row
     print(f"{walk.name}: running {mode}", file=sys.stderr, flush=True)
-    links = folder / "images"  # nothing but the frames
-    links.mkdir(parents=True, exist_ok=True)
-    for path in links.iterdir():
-        path.unlink()
-    for path in frames:
-        (links / path.name).symlink_to(path.resolve())
+    links = link_frames(frames, folder / "images")
     numbers = np.array([int(path.stem) for path in frames])
 
     def finish() -> dict[str, Any]:

@@ -24,6 +24,7 @@ from common import (
     digest,
     kept_row,
     last_line,
+    link_frames,
     machine,
     measure,
     outcome,
@@ -157,11 +158,7 @@ class Bench:
         head = {**_head(walk, mode, None), "peer": True}
         folder = self.out / walk.name / mode
         key = {"pycolmap": version("pycolmap"), "input": digest(_images(frames))}
-        links = self.out / walk.name / "images"  # nothing but the frames
-        links.mkdir(parents=True, exist_ok=True)
-        for path in _images(frames):
-            (links / path.name).unlink(missing_ok=True)
-            (links / path.name).symlink_to(path.resolve())
+        links = link_frames(_images(frames), self.out / walk.name / "images")
         script = str(Path(__file__).with_name("peer.py"))
         command = [sys.executable, script, mode, str(links), str(folder / "model")]
 

@@ -14,7 +14,7 @@ import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
-from common import Case, Measurement, cut_short, measure, refine_command, write_table
+from common import Case, Measurement, cut_short, link_frames, measure, refine_command, write_table
 
 from gsba.demo import make_walk
 from gsba.evaluate.trajectory import evaluate
@@ -96,18 +96,13 @@ def _spread(values: list[float], digits: int = 1) -> str:
 
 
 def _refine(case: Case, folder: Path) -> tuple[Measurement, float]:
-    command = refine_command(case.images, folder / "run", [])
-    command.insert(command.index(str(case.images)) + 1, str(case.trajectory))
+    command = refine_command(case.images, folder / "run", [str(case.trajectory)])
     cost = _measured(command, folder / "ours.log")
     return cost, _ate(read_trajectory(folder / "run/trajectory.tum"), case)
 
 
 def _reconstruct(mode: str, case: Case, folder: Path) -> tuple[Measurement, float]:
-    out, frames = folder / mode, folder / "frames"  # nothing but the frames
-    frames.mkdir(exist_ok=True)
-    for image in case.images.glob("*.jpg"):
-        if not (frames / image.name).exists():
-            (frames / image.name).symlink_to(image.resolve())
+    out, frames = folder / mode, link_frames(case.images.glob("*.jpg"), folder / "frames")
     command = [sys.executable, str(_PEER), mode, str(frames), str(out)]
     cost = _measured(command, folder / f"{mode}.log")
     found = read_trajectory(out / "trajectory.tum")

@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import machine
+from common import link_frames, machine
 
 from gsba.config import RefineSettings, SplatSettings
 from gsba.demo import make_walk
@@ -118,12 +118,9 @@ def _refined(row: str, folder: Path, coarse: Path, out: Path) -> Path:
 
 def _peer(folder: Path, out: Path, frames: FrameSet) -> np.ndarray:
     """Poses of COLMAP's panorama pipeline on the frames, without a trajectory."""
-    model, links = out / PEER / "model", out / "images"
+    model = out / PEER / "model"
     if not (model / "trajectory.tum").is_file():
-        links.mkdir(parents=True, exist_ok=True)
-        for (path,) in frames.paths:
-            (links / path.name).unlink(missing_ok=True)
-            (links / path.name).symlink_to(path.resolve())
+        links = link_frames([path for (path,) in frames.paths], out / "images")
         script = str(Path(__file__).with_name("peer.py"))
         subprocess.run([sys.executable, script, PEER, str(links), str(model)], check=True)
     posed = read_trajectory(model / "trajectory.tum")

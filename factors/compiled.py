@@ -101,9 +101,6 @@ class _Flags(compiler.Flags):
     def __hash__(self) -> int:
         return _FLAGS_HASH
 
-    def __eq__(self, other: object) -> bool:
-        return super().__eq__(other)
-
     def values(self) -> dict[str, Any]:
         return _DEFAULT_FLAGS | self._values
 

@@ -172,7 +172,8 @@ def _codes(code: CodeType) -> Iterator[CodeType]:
 
 
 def _code_text(code: CodeType) -> str:
-    """What a code object does: all but its place in a file. Docstrings count, comments do not."""
+    """Byte code, constants and names of a code object: they change with docstrings, but not with
+    comments or line numbers."""
     constants = [_text(each) for each in code.co_consts if not isinstance(each, CodeType)]
     return f"{code.co_code.hex()} {constants} {code.co_names} {code.co_varnames}"
 

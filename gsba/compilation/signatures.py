@@ -24,13 +24,12 @@ Signature = tuple[types.Type, ...]
 
 def names(kind: str) -> list[str]:
     """Full names of the kernels of a kind of work."""
-    return [name for name, _ in json.loads(FILE.read_text(encoding="utf-8"))[kind]]
+    return [name for name, _ in _recorded(kind)]
 
 
 def read(kind: str) -> list[tuple[str, Signature]]:
     """Kernels of a kind of work and their signatures."""
-    recorded = json.loads(FILE.read_text(encoding="utf-8"))[kind]
-    return [(name, tuple(map(_decode, signature))) for name, signature in recorded]
+    return [(name, tuple(map(_decode, signature))) for name, signature in _recorded(kind)]
 
 
 def write(recorded: dict[str, list[tuple[str, Signature]]]) -> None:
@@ -40,6 +39,11 @@ def write(recorded: dict[str, list[tuple[str, Signature]]]) -> None:
         rows = [json.dumps([name, list(map(_encode, signature))]) for name, signature in kernels]
         lines.append(f'"{kind}": [\n' + ",\n".join(rows) + "\n]")
     FILE.write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")
+
+
+def _recorded(kind: str) -> list[list[Any]]:
+    """Names and encoded signatures of a kind of work."""
+    return json.loads(FILE.read_text(encoding="utf-8"))[kind]
 
 
 def find(name: str) -> Any:
