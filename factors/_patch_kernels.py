@@ -28,8 +28,26 @@ def _ray_pixel(origin, spread, x, y, width, height):
     a = origin[0] + spread[0, 0] * x + spread[0, 1] * y
     b = origin[1] + spread[1, 0] * x + spread[1, 1] * y
     c = origin[2] + spread[2, 0] * x + spread[2, 1] * y
-    u = width * (np.arctan2(a, c) / (2 * np.pi) + 0.5)
-    return u, height * (0.5 + np.arctan2(b, np.sqrt(a * a + c * c)) / np.pi)
+    u = width * (_arctan2(a, c) / (2 * np.pi) + 0.5)
+    return u, height * (0.5 + _arctan2(b, np.sqrt(a * a + c * c)) / np.pi)
+
+
+@_part
+def _arctan2(y, x):
+    """Angle of (x, y) to 2e-8 rad, free of branches so that loops of it are vectorised.
+
+    Abramowitz & Stegun, "Handbook of Mathematical Functions", 1964, 4.4.49.
+    """
+    p, q = np.abs(x), np.abs(y)
+    t = min(p, q) / max(p, q, 1e-300)
+    t2 = t * t
+    series = -0.0161657367 + t2 * 0.0028662257
+    series = 0.1065626393 + t2 * (-0.0752896400 + t2 * (0.0429096138 + t2 * series))
+    series = -0.3333314528 + t2 * (0.1999355085 + t2 * (-0.1420889944 + t2 * series))
+    angle = t + t * t2 * series
+    angle = np.pi / 2 - angle if q > p else angle
+    angle = np.pi - angle if x < 0 else angle
+    return -angle if y < 0 else angle
 
 
 @_part
@@ -54,43 +72,22 @@ def _tap(coefficients, row, column):
 
 
 @_part
-def _sample(coefficients, u, v):
-    """Value at pixel (u, v); u may be off by any number of turns, v by a patch off the image."""
-    height, width = coefficients.shape
-    u, v = u - 0.5, v - 0.5
-    column, row = int(np.floor(u)), int(np.floor(v))
-    a0, a1, a2, a3 = _weights(np.float32(u - column))
-    b0, b1, b2, b3 = _weights(np.float32(v - row))
-    inside = column >= 1 and column < width - 2 and row >= 1 and row < height - 2
-    value = np.float32(0.0)
-    for k in range(4):
-        b = b0 if k == 0 else (b1 if k == 1 else (b2 if k == 2 else b3))
-        r = row - 1 + k
-        if inside:
-            c = coefficients[r]
-            c0, c1, c2, c3 = c[column - 1], c[column], c[column + 1], c[column + 2]
-        else:
-            c0, c1 = _tap(coefficients, r, column - 1), _tap(coefficients, r, column)
-            c2, c3 = _tap(coefficients, r, column + 1), _tap(coefficients, r, column + 2)
-        value += b * (a0 * c0 + a1 * c1 + a2 * c2 + a3 * c3)
-    return value
-
-
-@_part
-def _pixel_map(origin, spread, half, width, height, nodes, quadratics):
-    """Pixels of the rays origin + spread @ (x, y), |x|, |y| <= half, as biquadratics.
+def _map_pixels(origin, spread, square, width, height, nodes, quadratics):
+    """Pixels of the rays origin + spread @ (x, y) in a square of a plane patch, as biquadratics.
 
     Args:
         origin (3,), spread (3, 2): a plane patch seen from the rig; rig frame, any length.
-        nodes (3, 3, 2): scratch, pixels of the patch's corners, edges and centre, x by rows.
-        quadratics (2, 3, 3): of u and v; coefficient [i, j] is of (x / half)^i (y / half)^j.
+        square (3,): centre x and y, and half the width.
+        nodes (3, 3, 2): scratch, pixels of the square's corners, edges and centre, x by rows.
+        quadratics (2, 3, 3): of u and v; coefficient [i, j] is of the i-th power of x and the j-th
+            of y, both from the centre in halves of the square.
 
     Returns:
         False if a pole is too near for the polynomial: then each ray needs its own pixel.
     """
     for i in range(3):
         for j in range(3):
-            x, y = (i - 1) * half, (j - 1) * half
+            x, y = square[0] + (i - 1) * square[2], square[1] + (j - 1) * square[2]
             u, v = _ray_pixel(origin, spread, x, y, width, height)
             nodes[i, j, 0], nodes[i, j, 1] = u, v
     centre = nodes[1, 1, 0]
@@ -105,82 +102,116 @@ def _pixel_map(origin, spread, half, width, height, nodes, quadratics):
         for i in range(3):
             before, at, after = q[i, 0], q[i, 1], q[i, 2]
             q[i, 0], q[i, 1], q[i, 2] = at, 0.5 * (after - before), 0.5 * (after + before) - at
-    size2 = 0.0  # two squared steps, at least the square of the longest
+    size2 = from_pole2 = 0.0  # two squared steps, at least the square of the longest
     for i in range(3):
         size2 += spread[i, 0] ** 2 + spread[i, 1] ** 2
-    return origin[0] ** 2 + origin[2] ** 2 > size2 * (_POLE_HALF_PATCHES * half) ** 2
+        across = origin[i] + spread[i, 0] * square[0] + spread[i, 1] * square[1]
+        from_pole2 += across * across if i != 1 else 0.0
+    return from_pole2 > size2 * (_POLE_HALF_PATCHES * square[2]) ** 2
 
 
 @_allocating
 def _scratch(reach):
-    """Scratch for `_sample_grid`: nodes and quadratics, see `_pixel_map`; positions (2, n * n) in
-    half patches, columns and rows (2, n * n) before them, weights (8, n * n) of the samples
-    around."""
+    """Scratch for `_sample_patch`: nodes, quadratics and square, see `_map_pixels`; places
+    (2, n * n) in the patch, pixels (2, n * n), columns and rows (2, n * n) before them, weights
+    (8, n * n) of the samples around."""
     n = 2 * reach + 1
     places = np.empty((2, n * n))
     for i in range(n):
         for j in range(n):
-            places[0, i * n + j] = (i - reach) / (reach + 1.0)
-            places[1, i * n + j] = (j - reach) / (reach + 1.0)
+            places[0, i * n + j], places[1, i * n + j] = i - reach, j - reach
     before, weights = np.empty((2, n * n), np.int32), np.empty((8, n * n), np.float32)
-    return np.empty((3, 3, 2)), np.empty((2, 3, 3)), places, before, weights
+    square = np.zeros(3)
+    return (
+        np.empty((3, 3, 2)),
+        np.empty((2, 3, 3)),
+        square,
+        places,
+        np.empty((2, n * n)),
+        before,
+        (weights),
+    )
 
 
 @_part
-def _sample_grid(coefficients, origin, spread, reach, shift_x, shift_y, scratch, out):
-    """Values (n * n,) of a shifted n x n grid of unit spacing on the plane patch.
+def _sample_patch(coefficients, origin, spread, warp, reach, smooth, scratch, out):
+    """Values (n * n,) of an n x n grid of unit spacing on a plane patch, under a warp.
 
-    `out[i * n + j]` is at x = i - reach + shift_x, y = j - reach + shift_y, n = 2 reach + 1.
+    `out[i * n + j]` is at shift + (1 + affine) @ (i - reach, j - reach), n = 2 reach + 1.
+
+    Args:
+        warp: (6,) shift and affine part, by columns.
+        smooth: what the last call for this patch returned; True for the first one.
+        scratch: of `_scratch`; `square[2] = 0` before the first call for a patch.
+
+    Returns:
+        False if a pole is too near for the polynomial.
     """
-    nodes, quadratics, places, before, weights = scratch
+    nodes, quadratics, square, places, pixels, before, weights = scratch
     height, width = coefficients.shape
-    n, half = 2 * reach + 1, reach + 1.0
-    smooth = _pixel_map(origin, spread, half, width, height, nodes, quadratics)
-    if smooth and _find_taps(
-        quadratics, places, shift_x / half, shift_y / half, width, height, before, weights
-    ):
+    a, b, c, d = 1.0 + warp[2], warp[3], warp[4], 1.0 + warp[5]
+    extent = reach * max(abs(a) + abs(c), abs(b) + abs(d))
+    off = max(abs(warp[0] - square[0]), abs(warp[1] - square[1]))
+    if off + extent > square[2]:  # the warp has left the square that pixels are mapped in
+        square[0], square[1], square[2] = warp[0], warp[1], extent + 1.0
+        smooth = _map_pixels(origin, spread, square, width, height, nodes, quadratics)
+    if smooth:
+        _find_pixels(quadratics, square, places, warp, pixels)
+    else:
+        _project_pixels(origin, spread, places, warp, nodes[1, 1, 0], width, height, pixels)
+    if _find_taps(pixels, width, height, before, weights):
         _sum_inside(coefficients, before, weights, out)
-        return
-    p, q = quadratics[0], quadratics[1]
-    for i in range(n):
-        for j in range(n):
-            x, y = i - reach + shift_x, j - reach + shift_y
-            if smooth:
-                x, y = x / half, y / half
-                u = _quadratic(p, x, 0) + y * (_quadratic(p, x, 1) + y * _quadratic(p, x, 2))
-                v = _quadratic(q, x, 0) + y * (_quadratic(q, x, 1) + y * _quadratic(q, x, 2))
-            else:
-                u, v = _ray_pixel(origin, spread, x, y, width, height)
-            out[i * n + j] = _sample(coefficients, u, v)
+    else:
+        _sum_anywhere(coefficients, before, weights, out)
+    return smooth
 
 
 @_part
-def _quadratic(coefficients, x, j):
-    """Value at x of column j of a biquadratic."""
-    return coefficients[0, j] + x * (coefficients[1, j] + x * coefficients[2, j])
-
-
-@_part
-def _find_taps(quadratics, places, shift_x, shift_y, width, height, before, weights):
-    """Write columns and rows before places, and weights; False if samples lie beyond an edge.
+def _find_pixels(quadratics, square, places, warp, pixels):
+    """Write pixels of places under a warp, by biquadratics.
 
     Free of branches and of arrays that may alias its output, so that it is vectorised.
     """
     p, q = quadratics[0], quadratics[1]
-    p00, p01, p02 = p[0, 0] - 0.5, p[0, 1], p[0, 2]
+    p00, p01, p02 = p[0, 0], p[0, 1], p[0, 2]
     p10, p11, p12 = p[1, 0], p[1, 1], p[1, 2]
     p20, p21, p22 = p[2, 0], p[2, 1], p[2, 2]
-    q00, q01, q02 = q[0, 0] - 0.5, q[0, 1], q[0, 2]
+    q00, q01, q02 = q[0, 0], q[0, 1], q[0, 2]
     q10, q11, q12 = q[1, 0], q[1, 1], q[1, 2]
     q20, q21, q22 = q[2, 0], q[2, 1], q[2, 2]
-    left, right = np.int32(width), np.int32(-1)
-    top, bottom = np.int32(height), np.int32(-1)
+    scale = 1.0 / square[2]
+    shift_x, shift_y = scale * (warp[0] - square[0]), scale * (warp[1] - square[1])
+    a, b, c, d = scale + scale * warp[2], scale * warp[3], scale * warp[4], scale + scale * warp[5]
     for k in range(places.shape[1]):
-        x, y = places[0, k] + shift_x, places[1, k] + shift_y
+        x = shift_x + a * places[0, k] + c * places[1, k]
+        y = shift_y + b * places[0, k] + d * places[1, k]
         u0, v0 = p00 + x * (p10 + x * p20), q00 + x * (q10 + x * q20)
         u1, v1 = p01 + x * (p11 + x * p21), q01 + x * (q11 + x * q21)
         u2, v2 = p02 + x * (p12 + x * p22), q02 + x * (q12 + x * q22)
-        u, v = u0 + y * (u1 + y * u2), v0 + y * (v1 + y * v2)
+        pixels[0, k], pixels[1, k] = u0 + y * (u1 + y * u2), v0 + y * (v1 + y * v2)
+
+
+@_part
+def _project_pixels(origin, spread, places, warp, centre, width, height, pixels):
+    """Write pixels of places under a warp, each of its own ray; u within half a turn of a
+    centre."""
+    a, b, c, d = 1.0 + warp[2], warp[3], warp[4], 1.0 + warp[5]
+    shift_x, shift_y = warp[0], warp[1]
+    for k in range(places.shape[1]):
+        x = shift_x + a * places[0, k] + c * places[1, k]
+        y = shift_y + b * places[0, k] + d * places[1, k]
+        u, v = _ray_pixel(origin, spread, x, y, width, height)
+        pixels[0, k] = u - width * np.floor((u - centre) / width + 0.5)
+        pixels[1, k] = v
+
+
+@_part
+def _find_taps(pixels, width, height, before, weights):
+    """Write columns and rows before pixels, and weights; False if samples lie beyond an edge."""
+    left, right = np.int32(width), np.int32(-1)
+    top, bottom = np.int32(height), np.int32(-1)
+    for k in range(pixels.shape[1]):
+        u, v = pixels[0, k] - 0.5, pixels[1, k] - 0.5
         column, row = np.floor(u), np.floor(v)
         a0, a1, a2, a3 = _weights(np.float32(u - column))
         b0, b1, b2, b3 = _weights(np.float32(v - row))
@@ -206,6 +237,18 @@ def _sum_inside(coefficients, before, weights, out):
                 + weights[2, k] * c[first + np.uint32(2)]
                 + weights[3, k] * c[first + np.uint32(3)]
             )
+        out[k] = value
+
+
+@_part
+def _sum_anywhere(coefficients, before, weights, out):
+    """Values at places whose samples may lie beyond the seam or a pole."""
+    for k in range(len(out)):
+        value = np.float32(0.0)
+        for i in range(4):
+            for j in range(4):
+                tap = _tap(coefficients, before[1, k] - 1 + i, before[0, k] - 1 + j)
+                value += weights[4 + i, k] * weights[j, k] * tap
         out[k] = value
 
 
@@ -266,16 +309,17 @@ def _normal_matrix(templates, t, reach, columns, normal):
 @_part
 def _cut(coefficients, mask, t, origin, spread, least_contrast, templates, reach, scratch):
     """`cut_templates` of one template without its inverse; False if it has none."""
-    samples, grids, columns, normal = scratch
+    samples, grids, columns, normal, warp = scratch
     window, values = templates.window, templates.grey[t]
     by_x, by_y = templates.by_x[t], templates.by_y[t]
-    num = len(window)
-    for g in range(5):  # half a pixel along x and y, half a pixel back, and the patch itself
-        sx, sy = 0.5 * ((g == 0) - (g == 2)), 0.5 * ((g == 1) - (g == 3))
-        _sample_grid(coefficients, origin, spread, reach, sx, sy, samples, grids[g])
+    num, smooth = len(window), True
+    samples[2][2] = 0.0
+    for g in range(5):  # the patch itself, half a pixel along x and y, half a pixel back
+        warp[0], warp[1] = 0.5 * ((g == 1) - (g == 3)), 0.5 * ((g == 2) - (g == 4))
+        smooth = _sample_patch(coefficients, origin, spread, warp, reach, smooth, samples, grids[g])
     for k in range(num):
-        by_x[k], by_y[k] = grids[0, k] - grids[2, k], grids[1, k] - grids[3, k]
-        values[k] = grids[4, k]
+        by_x[k], by_y[k] = grids[1, k] - grids[3, k], grids[2, k] - grids[4, k]
+        values[k] = grids[0, k]
     if not _is_usable(mask, samples[0]):
         templates.states[t] = MASKED
         return False
@@ -300,7 +344,8 @@ def cut_templates(coefficients, mask, rows, origins, spreads, least_contrast, te
     num = len(templates.window)
     reach = int(np.sqrt(num)) // 2
     normal = np.empty((8, 8))
-    scratch = _scratch(reach), np.empty((5, num), np.float32), np.empty((8, num)), normal
+    grids, columns = np.empty((5, num), np.float32), np.empty((8, num))
+    scratch = _scratch(reach), grids, columns, normal, np.zeros(6)
     for t in rows:
         if _cut(
             coefficients, mask, t, origins[t], spreads[t], least_contrast, templates, reach, scratch
@@ -334,7 +379,7 @@ def _invert(matrix, inverse):
 
 
 @_part
-def _gradient(templates, t, reach, values, places, gain, offset, b):
+def _gradient(templates, t, values, places, gain, offset, b):
     """Write the normal equations' right side (8,); returns the residual's weighted square.
 
     Sums are variables of their own and the loop has no others, so that it is vectorised.
@@ -356,9 +401,8 @@ def _gradient(templates, t, reach, values, places, gain, offset, b):
         yx += ey * x
         xy += ex * y
         yy += ey * y
-    half = reach + 1.0
-    b[0], b[1], b[2], b[3] = along_x, along_y, half * xx, half * yx
-    b[4], b[5], b[6], b[7] = half * xy, half * yy, of_grey, total
+    b[0], b[1], b[2], b[3] = along_x, along_y, xx, yx
+    b[4], b[5], b[6], b[7] = xy, yy, of_grey, total
     return cost
 
 
@@ -377,16 +421,17 @@ def _judge(templates, t, values, mean, square, power, mass):
 @_part
 def _align(coefficients, mask, o, sightings, max_shift, steps, tolerance, templates, scratch):
     """`align_templates` of one sighting; returns its state."""
-    samples, values, origin, spread, b, step = scratch
+    samples, values, b, step = scratch
     window = templates.window
     reach = int(np.sqrt(len(window))) // 2
     t, warp = sightings.templates[o], sightings.warps[o]
+    origin, spread = sightings.origins[o], sightings.spreads[o]
     power = _statistics(window, templates.grey[t])[2]
     gain = offset = 0.0
-    settled = False
+    settled, smooth = False, True
+    samples[2][2] = 0.0
     for number in range(steps + 1):
-        _place(sightings, o, origin, spread)
-        _sample_grid(coefficients, origin, spread, reach, 0.0, 0.0, samples, values)
+        smooth = _sample_patch(coefficients, origin, spread, warp, reach, smooth, samples, values)
         if number == 0 or settled:
             mass, mean, square = _statistics(window, values)
             if not square > _MIN_GREY_VARIANCE * mass:
@@ -397,7 +442,7 @@ def _align(coefficients, mask, o, sightings, max_shift, steps, tolerance, templa
                 )
                 return ALIGNED if _is_usable(mask, samples[0]) else MASKED
             gain, offset = np.sqrt(square / power), mean
-        cost = _gradient(templates, t, reach, values, samples[2], gain, offset, b)
+        cost = _gradient(templates, t, values, samples[3], gain, offset, b)
         if number >= _TRIAL_STEPS and not cost < power:
             return UNLIKE
         _solve(templates, t, warp, b, step)
@@ -424,24 +469,11 @@ def align_templates(coefficients, mask, rows, sightings, max_shift, steps, toler
     """
     num = len(templates.window)
     reach = int(np.sqrt(num)) // 2
-    origin, spread = np.empty(3), np.empty((3, 2))
-    values = np.empty(num, np.float32)
-    scratch = _scratch(reach), values, origin, spread, np.empty(8), np.empty(8)
+    scratch = _scratch(reach), np.empty(num, np.float32), np.empty(8), np.empty(8)
     for o in rows:
         sightings.states[o] = _align(
             coefficients, mask, o, sightings, max_shift, steps, tolerance, templates, scratch
         )
-
-
-@_part
-def _place(sightings, o, origin, spread):
-    """Write the plane patch (3,), (3, 2) of a sighting under its warp."""
-    warp = sightings.warps[o]
-    for i in range(3):
-        p, q = sightings.spreads[o, i, 0], sightings.spreads[o, i, 1]
-        origin[i] = sightings.origins[o, i] + p * warp[0] + q * warp[1]
-        spread[i, 0] = p * (1.0 + warp[2]) + q * warp[3]
-        spread[i, 1] = p * warp[4] + q * (1.0 + warp[5])
 
 
 @_part

@@ -1,7 +1,11 @@
 """Fixtures that several files share."""
 
 import logging
+import os
 from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read as NumPy loads: workers fill the cores
+
 
 import numpy as np
 import pytest

@@ -37,10 +37,10 @@ def extract(run: Run) -> State:
 
     Frames of a map that is expected to be weak get as many as weak ones at once.
     """
-    enlarged = _enlarged(run.settings)
-    drift, known = weak_start.expected_drift(run, _search(run, enlarged))
+    drift, known = weak_start.expected_drift(run, _search(run, run.settings))
     more = drift > run.settings.weak_frames.max_drift
-    found = _extract(run, enlarged, known=known) if more else _extract(run, run.settings)
+    enlarged = _enlarged(run.settings)
+    found = _extract(run, enlarged) if more else _extract(run, run.settings, known=known)
     observed = _observe(run, "keypoints", [found] * len(run.frames), "features")
     return State.begin(run, replace(observed, more=more))
 

@@ -29,7 +29,7 @@ def expected_drift(run: Run, search: Search) -> tuple[float, dict[str, Features]
 
     Args:
         run: the run.
-        search: of its frames, for as many keypoints as weak ones get.
+        search: of its frames.
 
     Returns:
         The drift, 0 where nothing foretells it; and keypoints of the frames that were compared, by
@@ -52,7 +52,7 @@ def expected_drift(run: Run, search: Search) -> tuple[float, dict[str, Features]
         found.update(search.of(np.unique(steps).tolist()))
         return _DRIFT_PER_FRAME * num / max(_matches(run, found, steps), 1.0) ** 2
 
-    key = [run.matching_key(), settings.features, settings.weak_frames, settings.cubemap]
+    key = [run.matching_key(), settings.features, settings.cubemap]
     drift = run.store.stage("expected_drift", key, compute, float, run.chain.latest)
     return drift, found
 
