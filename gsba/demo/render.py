@@ -59,43 +59,61 @@ def render_eye(scene: Scene, eye: Eye, width: int, height: int) -> np.ndarray:
     eye = eye._replace(world_T_eyes=np.ascontiguousarray(eye.world_T_eyes, dtype=np.float64))
     faces = np.full((height, width), -1, dtype=np.int64)
     image = np.zeros((height, width, 3), dtype=np.float32)
-    in_bands(_find_faces, height, scene, eye, faces)
-    in_bands(_shade, height, scene, eye, faces, image)
+    longitudes = (np.arange(width) + 0.5) * (np.pi / height) - np.pi
+    columns = np.column_stack([np.sin(longitudes), np.cos(longitudes)])
+    in_bands(_find_faces, height, scene, eye, columns, faces)
+    in_bands(_shade, height, scene, eye, columns, faces, image)
     return image
 
 
 @kernel
-def _find_faces(start, stop, scene, eye, faces):
-    """Write the face at each pixel's centre, -1 = none, into rows of faces (H, W)."""
+def _find_faces(start, stop, scene, eye, columns, faces):
+    """Write the face at each pixel's centre, -1 = none, into rows of faces (H, W).
+
+    columns: (W, 2) sine and cosine of their longitudes.
+    """
     height, width = faces.shape
     step = np.pi / height
     least = eye.least - _MARGIN * step
     for row in range(start, stop):
+        latitude = np.pi / 2 - (row + 0.5) * step
+        cp, sp = np.cos(latitude), np.sin(latitude)
+        before = -1
         for column in range(width):
-            x, y, z = _direction((column + 0.5) * step - np.pi, np.pi / 2 - (row + 0.5) * step)
+            x, y, z = cp * columns[column, 0], -sp, cp * columns[column, 1]
             if eye.facing * z >= least:
                 R, o = _pose(eye, x, y, z)
-                faces[row, column] = nearest(scene, o, _rotate(R, x, y, z), np.inf)[1]
+                d, limit = _rotate(R, x, y, z), np.inf
+                if before >= 0:  # mostly seen again: what lies behind it is left out
+                    limit = face_distance(scene, before, o, d, np.inf)
+                nearer = nearest(scene, o, d, limit)[1]
+                if nearer >= 0 or limit == np.inf:
+                    before = nearer
+                faces[row, column] = before
 
 
 @kernel
-def _shade(start, stop, scene, eye, faces, image):
-    """Write colours into rows of image (H, W, 3)."""
+def _shade(start, stop, scene, eye, columns, faces, image):
+    """Write colours into rows of image (H, W, 3); columns as for `_find_faces`."""
     height, width = faces.shape
     step = np.pi / height
     for row in range(start, stop):
+        latitude = np.pi / 2 - (row + 0.5) * step
+        cp, sp = np.cos(latitude), np.sin(latitude)
         for column in range(width):
-            longitude, latitude = (column + 0.5) * step - np.pi, np.pi / 2 - (row + 0.5) * step
-            if eye.facing * _direction(longitude, latitude)[2] < eye.least:
+            sy, cy = columns[column, 0], columns[column, 1]
+            if eye.facing * cp * cy < eye.least:
                 continue
             if _uniform(faces, row, column):
-                color = _color(scene, eye, longitude, latitude, step, faces[row, column])
+                color = _color(scene, eye, cp, sp, cy, sy, step, faces[row, column])
                 red, green, blue = color
             else:
                 red, green, blue = 0.0, 0.0, 0.0
                 for k in range(4):
-                    x, y = step * EDGE_SAMPLES[k][0], step * EDGE_SAMPLES[k][1]
-                    color = _color(scene, eye, longitude + x, latitude + y, step / 2, -1)
+                    x = (column + 0.5 + EDGE_SAMPLES[k][0]) * step - np.pi
+                    y = latitude + step * EDGE_SAMPLES[k][1]
+                    cosines = np.cos(y), np.sin(y), np.cos(x), np.sin(x)
+                    color = _color(scene, eye, *cosines, step / 2, -1)
                     red, green, blue = red + color[0], green + color[1], blue + color[2]
                 red, green, blue = red / 4, green / 4, blue / 4
             image[row, column, 0] = red
@@ -162,16 +180,11 @@ def _rotate(R, x, y, z):
 
 
 @part
-def _direction(longitude, latitude):
-    c = np.cos(latitude)
-    return c * np.sin(longitude), -np.sin(latitude), c * np.cos(longitude)
+def _color(scene, eye, cp, sp, cy, sy, step, known):
+    """Colour (3), 0..255, of the square of angle `step` at this ray, on face `known` if >= 0.
 
-
-@part
-def _color(scene, eye, longitude, latitude, step, known):
-    """Colour (3), 0..255, of the square of angle `step` at this ray, on face `known` if >= 0."""
-    cy, sy = np.cos(longitude), np.sin(longitude)
-    cp, sp = np.cos(latitude), np.sin(latitude)
+    cp, sp, cy, sy: cosine and sine of the ray's latitude and longitude.
+    """
     R, o = _pose(eye, cp * sy, -sp, cp * cy)
     d = _rotate(R, cp * sy, -sp, cp * cy)
     if known >= 0:
