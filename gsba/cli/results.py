@@ -142,6 +142,10 @@ def export(
     map_number: MapNumber = 1,
     photos: Located = None,
     exposure_ms: Exposure = None,
+    split: Annotated[
+        bool,
+        typer.Option(help="Hold one panorama in eight out of the training, with all its faces."),
+    ] = True,
     cluster: Cluster = None,
 ) -> None:
     """Write a finished run as a dataset for another program."""
@@ -170,7 +174,7 @@ def export(
     given = reconstruction, frames, folder, to, face_size, placed, link, lenses
     beside = read_photos(photos, run)
     with connected(cluster) as client, hired(client, folder, frames) as workers:
-        write(*given, images=images, workers=workers, shutter=shutter, photos=beside)
+        write(*given, images=images, workers=workers, shutter=shutter, photos=beside, split=split)
     if folder.resolve().is_relative_to(run.resolve()):
         claim(run.resolve(), folder.resolve())
     typer.echo("\n".join([f"{to}: {folder}", *how_to_start(name, folder)]))

@@ -5,10 +5,10 @@ Layouts:
 * `colmap`: PINHOLE faces in one rig, `images/front/NAME.jpg`, `masks/front/NAME.jpg.png`,
   `sparse/0`, and `rig_config.json` for COLMAP's own tools: six of one centre, or the ten of
   `gsba.camera.views` where two lenses are known.
-* `colmap-flat`: the cameras of `colmap`, `images/NAME_front.jpg`. For trainers that resolve images
-  by their base name. `sparse/0/points3D.ply` is INRIA's start cloud, and `sparse/0/test.txt` lists
-  all faces of every eighth frame: if single faces were held out, training would show the other
-  faces of the same panorama.
+* `colmap-flat`: the cameras of `colmap`, `images/00012_NAME_front.jpg` in an order by which
+  trainers hold out whole panoramas (`gsba.export.split`); `images/NAME_front.jpg` without a split.
+  For trainers that resolve images by their base name. `sparse/0/points3D.ply` is INRIA's start
+  cloud.
 * `colmap` and `colmap-flat` of raw fisheyes (`--images fisheye`): two OPENCV_FISHEYE cameras and
   `images/front`, `images/back`; masks leave out pixels beyond the image circles; the rolling
   shutter is not corrected.
@@ -16,7 +16,8 @@ Layouts:
   for one centre in the middle (`gsba.camera.one_centre`).
 
 A frame's pose is stored as rig_from_world, where COLMAP's rig frame is that of the first camera.
-Images are numbered frame after frame, face after face; point j + 1 is point j. Frames of several
+Images are numbered frame after frame, face after face, or in the split's order; point j + 1 is
+point j. Frames of several
 cameras have a rig for each of these.
 """
 
@@ -42,11 +43,12 @@ from gsba.export.images import has_masks, panorama_writer, view_writer, views_of
 from gsba.export.pictures import Files, FrameWriter, by_camera
 from gsba.export.ply import write_splat_points
 from gsba.export.raw import RawPictures, raw_lenses
+from gsba.export.split import split_of
 from gsba.geometry import inverse, pose, quaternion_from_rotation
 from gsba.log import GsbaError
 from gsba.types import Fisheye, FrameSet, PictureFormat, Reconstruction
 
-TEST_EVERY = 8  # one frame of so many is held out, which is the trainers' own interval
+_SUFFIX = "{suffix}"  # of an image; masks keep it where COLMAP looks for it
 _BY_VIEW, _FLAT = "{view}/{name}{suffix}", "{name}_{view}{suffix}"  # names of images
 
 
@@ -86,19 +88,14 @@ def write_colmap_flat(
     face_size: int | None,
     link: bool = False,
     cameras: Cameras = ONE_CAMERA,
+    split: bool = True,
 ) -> FrameWriter:
     """Write the layout with unique base names into `partial`, without images; returns their
     writer."""
     views = views_of_cameras(frames, face_size, cameras)
     files = _files_of_cameras(partial, _FLAT, views, frames)
-    names, model = _names(files, frames), partial / "sparse" / "0"
     seen = seen_from_lenses(reconstruction, cameras)
-    write_model(model, seen, _pinholes(views), names, frames.cameras)
-    write_splat_points(
-        model / "points3D.ply", reconstruction.points_world, reconstruction.point_colors
-    )
-    held_out = [name for of_frame in names[::TEST_EVERY] for name in of_frame]
-    (model / "test.txt").write_text("\n".join(held_out) + "\n")
+    files = _write_flat_model(partial, seen, _pinholes(views), files, frames, split)
     return view_writer(files, frames, views, cameras, link, scenes_of(reconstruction))
 
 
@@ -109,6 +106,7 @@ def write_colmap_raw(
     cameras: Cameras,
     flat: bool,
     link: bool = False,
+    split: bool = True,
 ) -> FrameWriter:
     """Write the rig or the flat layout of raw fisheyes into `partial`, without images; returns
     their writer."""
@@ -116,18 +114,35 @@ def write_colmap_raw(
     rigs = [_raw_sensors(kind, lenses) for kind, lenses in own]
     pattern = _FLAT if flat else _BY_VIEW
     files = [_files(partial, pattern, lens_names(len(sensors)), masked=True) for sensors in rigs]
-    names, model = _names(files, frames), partial / "sparse" / "0"
     seen = shown_in_pictures(reconstruction, cameras)
-    write_model(model, seen, rigs, names, frames.cameras)
     if flat:
-        held_out = [name for of_frame in names[::TEST_EVERY] for name in of_frame]
-        (model / "test.txt").write_text("\n".join(held_out) + "\n")
-        write_splat_points(
-            model / "points3D.ply", reconstruction.points_world, reconstruction.point_colors
-        )
+        files = _write_flat_model(partial, seen, rigs, files, frames, split)
     else:
+        write_model(partial / "sparse" / "0", seen, rigs, _names(files, frames), frames.cameras)
         _write_rig_config(partial, rigs, files, frames)
     return by_camera([RawPictures(own, link) for own in files], frames)
+
+
+def _write_flat_model(
+    partial: Path,
+    seen: Reconstruction,
+    rigs: Sequence[Sequence[Sensor]],
+    files: Sequence[Files],
+    frames: FrameSet,
+    wanted: bool,
+) -> Sequence[Files]:
+    """Write the model with INRIA's start cloud, in the order of a split if one is wanted; returns
+    the files of each camera's frames in that order."""
+    rig_of_frame = frames.cameras.tolist()
+    split = split_of(seen, [len(rigs[rig]) for rig in rig_of_frame]) if wanted else None
+    if split is not None:
+        files = [split.files(own, frames) for own in files]
+    names, model = _names(files, frames), partial / "sparse" / "0"
+    write_model(model, seen, rigs, names, frames.cameras, None if split is None else split.numbers)
+    write_splat_points(model / "points3D.ply", seen.points_world, seen.point_colors)
+    if split is not None:
+        split.write_lists(partial, names, model)
+    return files
 
 
 def write_colmap_erp(
@@ -162,6 +177,7 @@ def write_model(
     rigs: Sequence[Sequence[Sensor]],
     names: list[list[str]],
     rig_of_frame: np.ndarray,
+    order: Sequence[Sequence[int]] | None = None,
 ) -> None:
     """Write rigs, cameras, frames, images and points3D in binary.
 
@@ -171,33 +187,37 @@ def write_model(
         rigs: the cameras of each rig.
         names: image names, by frame and sensor.
         rig_of_frame: (F,) int, rig of each frame.
+        order: numbers of the images from 0, by frame and sensor, -1 = left out of the model; None =
+            frame after frame.
     """
     import pycolmap
 
     model = pycolmap.Reconstruction()
     ids = _add_rigs(model, rigs)
-    counts = np.array([len(sensors) for sensors in rigs])[rig_of_frame]
-    firsts = np.concatenate([[0], np.cumsum(counts)])  # (F + 1,) image of each frame
+    firsts = np.concatenate([[0], np.cumsum([len(own) for own in names])])  # (F + 1,) image of each
+    # frame, frame after frame
+    numbers = np.arange(firsts[-1]) if order is None else np.concatenate(list(map(list, order)))
     which, pixels = _project_in_rigs(reconstruction, rigs, rig_of_frame)
-    images = firsts[reconstruction.observation_frames] + which
-    order = np.argsort(images, kind="stable")
-    starts = np.searchsorted(images[order], np.arange(firsts[-1] + 1))
+    images = numbers[firsts[reconstruction.observation_frames] + which]
+    by_image = np.argsort(images, kind="stable")
+    starts = np.searchsorted(images[by_image], np.arange(len(numbers) + 1))
     rows = np.empty(len(images), np.int64)  # row of each observation in its image
-    rows[order] = np.arange(len(images)) - starts[images[order]]
+    rows[by_image] = np.arange(len(images)) - starts[np.maximum(images[by_image], 0)]
 
     rigs_T_world = inverse(reconstruction.world_T_rigs)
     for f, (of_frame, rig) in enumerate(zip(names, rig_of_frame.tolist(), strict=True)):
         frame = pycolmap.Frame(frame_id=f + 1, rig_id=rig + 1)
         rig_T_ref = rigs[rig][0].rig_T_sensor
         frame.rig_from_world = _rigid(inverse(rig_T_ref) @ rigs_T_world[f])
-        first = int(firsts[f])
-        for c, sensor_id in enumerate(ids[rig]):
-            frame.add_data_id(pycolmap.data_t(sensor_id, first + c + 1))
+        own = zip(ids[rig], of_frame, numbers[firsts[f] : firsts[f + 1]].tolist(), strict=True)
+        kept = [(sensor_id, name, number) for sensor_id, name, number in own if number >= 0]
+        for sensor_id, _, number in kept:
+            frame.add_data_id(pycolmap.data_t(sensor_id, number + 1))
         model.add_frame(frame)
-        for c, name in enumerate(of_frame):
-            seen = order[starts[first + c] : starts[first + c + 1]]
+        for sensor_id, name, number in kept:
+            seen = by_image[starts[number] : starts[number + 1]]
             image = pycolmap.Image(
-                name=name, keypoints=pixels[seen], camera_id=ids[rig][c].id, image_id=first + c + 1
+                name=name, keypoints=pixels[seen], camera_id=sensor_id.id, image_id=number + 1
             )
             image.frame_id = f + 1
             model.add_image(image)
@@ -268,7 +288,8 @@ def _add_points(
     points = reconstruction.points_world
     ends = np.searchsorted(reconstruction.observation_points, np.arange(len(points) + 1))
     for j, (xyz, color) in enumerate(zip(points, reconstruction.point_colors, strict=True)):
-        of_point = slice(ends[j], ends[j + 1])
+        of_point = np.arange(ends[j], ends[j + 1])
+        of_point = of_point[images[of_point] >= 0]
         image_ids, indices = (images[of_point] + 1).tolist(), rows[of_point].tolist()
         track = pycolmap.Track(list(map(pycolmap.TrackElement, image_ids, indices)))
         model.add_point3D_with_id(j + 1, pycolmap.Point3D(xyz=xyz, color=color, track=track))
@@ -392,7 +413,8 @@ def _pinholes(views: Sequence[Sequence[View]]) -> list[list[Sensor]]:
 
 def _files(partial: Path, name: str, views: Sequence[str], masked: bool) -> Files:
     """Files of images and masks by the pattern of their names."""
-    return Files(partial, views, f"images/{name}", f"masks/{name}.png" if masked else "")
+    mask = f"masks/{name.removesuffix(_SUFFIX) if name == _FLAT else name}.png" if masked else ""
+    return Files(partial, views, f"images/{name}", mask)
 
 
 def _names(files: Sequence[Files], frames: FrameSet) -> list[list[str]]:

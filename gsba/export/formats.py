@@ -57,6 +57,7 @@ class ExportOptions:
     fetched: bool = False  # with the frames that were added where the map was weak
     shutter: Shutter = UNKNOWN  # for trainers that model blur and rolling rows
     photos: Photos = NO_PHOTOS  # localised photos, as cameras of their own
+    split: bool = True  # hold panoramas out of the training, in formats of trainers
 
 
 def export(
@@ -74,6 +75,7 @@ def export(
     fetched: bool = False,
     shutter: Shutter = UNKNOWN,
     photos: Photos = NO_PHOTOS,
+    split: bool = True,
 ) -> None:
     """Write one map of a reconstruction in another program's format.
 
@@ -100,13 +102,15 @@ def export(
         fetched: also write the frames that were added where the map was weak (see `FrameSet`).
         shutter: times of the exposure, which nerfstudio's format states.
         photos: localised photos, as cameras of their own beside the faces.
+        split: hold panoramas out of the training (colmap-flat, nerfstudio); False = all are for
+            training.
 
     Raises:
         GsbaError: `out` is in use or not seen by a worker, the format does not fit the frames,
             there is no such map, or the disk cannot be written; nothing is left behind then.
     """
     options = ExportOptions(
-        face_size, placement, link, lenses, images, map_number, fetched, shutter, photos
+        face_size, placement, link, lenses, images, map_number, fetched, shutter, photos, split
     )
     export_all(reconstruction, frames, {to: out}, options, workers)
 
@@ -149,7 +153,7 @@ def export_all(
     files = (path for paths in (*frames.paths, frames.mask_paths) for path in paths)
     read = fingerprint(path for path in files if path and path.exists())  # some formats read none
     key = __version__, reconstruction, frames, read, face_size, up, link, seen_by, images
-    key = (*key, options.shutter, options.photos)
+    key = (*key, options.shutter, options.photos, options.split)
     writers: list[FrameWriter] = []
     with ExitStack() as folders:
         for to, out in outs.items():
@@ -158,11 +162,11 @@ def export_all(
             given = partial, reconstruction, frames, to
             shown_as = _images_of(to, images, frames)
             if shown_as == "fisheye":
-                writers += _write_raw(*given, up, link, seen_by, options.shutter)
+                writers += _write_raw(*given, up, link, seen_by, options)
             elif shown_as == "panorama":
-                writers += _write_panoramas(*given, up, link, seen_by)
+                writers += _write_panoramas(*given, up, link, seen_by, options.split)
             else:
-                writers += _write(*given, face_size, up, link, seen_by, options.shutter)
+                writers += _write(*given, up, link, seen_by, options)
             if options.photos.photos:
                 add_photos(partial, to.value, options.photos, placement)
             placement.write(partial / "transform.json")
@@ -202,15 +206,14 @@ def _write_raw(
     up: str | None,
     link: bool,
     cameras: Cameras,
-    shutter: Shutter,
+    options: ExportOptions,
 ) -> list[FrameWriter]:
     from gsba.export import colmap, nerfstudio
 
+    given, split = (partial, reconstruction, frames, cameras), options.split
     if to == ExportFormat.NERFSTUDIO:
-        given = partial, reconstruction, frames, cameras, up, link
-        return nerfstudio.write_nerfstudio_raw(*given, shutter)
-    flat = to == ExportFormat.COLMAP_FLAT
-    return [colmap.write_colmap_raw(partial, reconstruction, frames, cameras, flat, link)]
+        return nerfstudio.write_nerfstudio_raw(*given, up, link, options.shutter, split)
+    return [colmap.write_colmap_raw(*given, to == ExportFormat.COLMAP_FLAT, link, split)]
 
 
 def _write_panoramas(
@@ -221,6 +224,7 @@ def _write_panoramas(
     up: str | None,
     link: bool,
     cameras: Cameras,
+    split: bool,
 ) -> list[FrameWriter]:
     from gsba.export import colmap, metashape, nerfstudio, panoramas
 
@@ -231,7 +235,7 @@ def _write_panoramas(
         case ExportFormat.COLMAP_ERP:
             return [colmap.write_colmap_erp(*given, link, cameras)]
         case ExportFormat.NERFSTUDIO:
-            return nerfstudio.write_nerfstudio_erp(*given, cameras, up, link)
+            return nerfstudio.write_nerfstudio_erp(*given, cameras, up, link, split)
         case _:
             return [panoramas.write_with_poses(*given, cameras, link)]
 
@@ -256,25 +260,25 @@ def _write(
     reconstruction: Reconstruction,
     frames: FrameSet,
     to: ExportFormat,
-    face_size: int | None,
     up: str | None,
     link: bool,
     cameras: Cameras,
-    shutter: Shutter,
+    options: ExportOptions,
 ) -> list[FrameWriter]:
     from gsba.export import colmap, gltf, metashape, nerfstudio, ply
     from gsba.export.panoramas import write_poses
 
-    given = partial, reconstruction, frames
+    given, face_size = (partial, reconstruction, frames), options.face_size
     match to:
         case ExportFormat.COLMAP:
             return [colmap.write_colmap(*given, face_size, link, cameras)]
         case ExportFormat.COLMAP_FLAT:
-            return [colmap.write_colmap_flat(*given, face_size, link, cameras)]
+            return [colmap.write_colmap_flat(*given, face_size, link, cameras, options.split)]
         case ExportFormat.COLMAP_ERP:
             return [colmap.write_colmap_erp(*given, link, cameras)]
         case ExportFormat.NERFSTUDIO:
-            return nerfstudio.write_nerfstudio(*given, face_size, up, link, cameras, shutter)
+            given = *given, face_size, up, link, cameras
+            return nerfstudio.write_nerfstudio(*given, options.shutter, options.split)
         case ExportFormat.METASHAPE:
             return [metashape.write_metashape_faces(*given, face_size, link, cameras)]
         case ExportFormat.GLTF:

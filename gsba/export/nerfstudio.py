@@ -3,7 +3,7 @@ by the setting `export.images`, panoramas alone or raw fisheyes alone in transfo
 
 nerfstudio's cameras have OpenGL axes (y up, z backward) and its world has z up, so the world and
 the cloud are rotated by NERFSTUDIO_R_WORLD, which `applied_transform` states. Base names are
-unique, because nerfstudio looks for down-scaled images by base name. Every eighth panorama is held
+unique, because nerfstudio looks for down-scaled images by base name. One panorama in eight is held
 out with all its faces: a face in the training would show what the other faces are tested on. Splat
 trainers need the faces; the panoramas are for models that take equirectangular rays:
 `ns-train nerfacto --data OUT/transforms_erp.json`. nerfstudio applies top-level intrinsics to all
@@ -34,6 +34,7 @@ from gsba.export.images import has_masks, panorama_writer, view_writer, views_of
 from gsba.export.pictures import Files, FrameWriter, by_camera
 from gsba.export.ply import write_splat_points
 from gsba.export.raw import RawPictures, raw_lenses
+from gsba.export.split import held_out_frames
 from gsba.geometry import CV_R_GL, pose
 from gsba.types import Fisheye, FrameSet, PictureFormat, Reconstruction
 
@@ -41,7 +42,6 @@ NERFSTUDIO_R_WORLD = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 _Z_UP_R_WORLD = {"z": np.eye(3), "y": NERFSTUDIO_R_WORLD.T}  # of worlds whose y does not point down
 _CLOUD = "points3D.ply"
 _MAX_AXIS_ANGLE_DEG = 90.0  # of used fisheye pixels: gsplat renders nothing beyond
-_HOLD_OUT_EVERY = 8  # one panorama of so many, which is the interval of splat benchmarks
 
 
 def write_nerfstudio(
@@ -53,6 +53,7 @@ def write_nerfstudio(
     link: bool = False,
     cameras: Cameras = ONE_CAMERA,
     shutter: motion.Shutter = motion.UNKNOWN,
+    split: bool = True,
 ) -> list[FrameWriter]:
     """Write cloud and transforms.json of faces into `partial`, of panoramas transforms_erp.json,
     too, without images; returns their writers.
@@ -65,17 +66,19 @@ def write_nerfstudio(
         link: make hard links to images that are exported unchanged.
         cameras: cameras of the frames.
         shutter: times of the exposure.
+        split: hold panoramas out of the training.
     """
     out_R_world = _write_cloud(partial, reconstruction, up)
     views = views_of_cameras(frames, face_size, cameras)
     files = [_files(partial, [view.name for view in own], has_masks(frames)) for own in views]
     seen = seen_from_lenses(reconstruction, cameras)
-    _write_face_dataset(partial, seen, frames, files, views, out_R_world, cameras, shutter)
+    given = partial, seen, frames, files, views, out_R_world, cameras, shutter
+    _write_face_dataset(*given, split)
     scenes = scenes_of(reconstruction)
     writers = [view_writer(files, frames, views, cameras, link, scenes)]
     if all(kind.panoramic for kind in frames.formats):
         given = partial, reconstruction, frames, cameras, out_R_world, link
-        writers.append(_write_erp_dataset(*given, "_erp"))
+        writers.append(_write_erp_dataset(*given, "_erp", split))
     return writers
 
 
@@ -86,11 +89,13 @@ def write_nerfstudio_erp(
     cameras: Cameras,
     up: str | None = None,
     link: bool = False,
+    split: bool = True,
 ) -> list[FrameWriter]:
     """Write cloud and transforms.json of panoramas into `partial`, without images; returns their
     writers."""
     out_R_world = _write_cloud(partial, reconstruction, up)
-    return [_write_erp_dataset(partial, reconstruction, frames, cameras, out_R_world, link, "")]
+    given = partial, reconstruction, frames, cameras, out_R_world, link
+    return [_write_erp_dataset(*given, "", split)]
 
 
 def write_nerfstudio_raw(
@@ -101,6 +106,7 @@ def write_nerfstudio_raw(
     up: str | None = None,
     link: bool = False,
     shutter: motion.Shutter = motion.UNKNOWN,
+    split: bool = True,
 ) -> list[FrameWriter]:
     """Write cloud and transforms.json of raw fisheyes into `partial`, without images; returns
     their writers."""
@@ -122,7 +128,8 @@ def write_nerfstudio_raw(
         camera["rolling_shutter"] = [0, 0, 1, 0]
     if velocities is not None:
         camera |= motion.shutter_keys(shutter, rolling=moving)
-    _write_transforms(partial / "transforms.json", camera, entries, out_R_world)
+    parts = held_out_frames(reconstruction), split
+    _write_transforms(partial / "transforms.json", camera, entries, out_R_world, *parts)
     return [by_camera([RawPictures(one, link, _MAX_AXIS_ANGLE_DEG) for one in files], frames)]
 
 
@@ -182,6 +189,7 @@ def _write_face_dataset(
     out_R_world: np.ndarray,
     cameras: Cameras,
     shutter: motion.Shutter,
+    split: bool,
 ) -> None:
     # OPENCV without distortion is a pinhole, by the only name that all readers know.
     camera = {"camera_model": "OPENCV", "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0}
@@ -206,7 +214,8 @@ def _write_face_dataset(
             if velocities is not None:
                 entry |= motion.velocity_keys(velocities[f], view.rig_T_view)
             entries[-1].append(entry)
-    _write_transforms(partial / "transforms.json", camera, entries, out_R_world)
+    parts = held_out_frames(reconstruction), split
+    _write_transforms(partial / "transforms.json", camera, entries, out_R_world, *parts)
 
 
 def _write_erp_dataset(
@@ -217,6 +226,7 @@ def _write_erp_dataset(
     out_R_world: np.ndarray,
     link: bool,
     which: str,
+    split: bool,
 ) -> FrameWriter:
     mask = f"masks{which}/{{name}}.png" if has_masks(frames) else ""
     files = Files(partial, ("",), f"images{which}/{{name}}{{suffix}}", mask)
@@ -239,7 +249,8 @@ def _write_erp_dataset(
             entry["mask_path"] = masks[0]
         entries.append([entry])
     path = partial / f"transforms{which}.json"
-    _write_transforms(path, camera, entries, out_R_world)
+    held_out = held_out_frames(reconstruction)
+    _write_transforms(path, camera, entries, out_R_world, held_out, split)
     return panorama_writer(files, frames, cameras, link, scenes_of(reconstruction))
 
 
@@ -280,11 +291,17 @@ def _write_transforms(
     camera: dict[str, Any],
     entries: Sequence[Sequence[dict[str, Any]]],
     out_R_world: np.ndarray,
+    held_out: np.ndarray,
+    split: bool,
 ) -> None:
-    """Write transforms.json, with the entries of each frame (F)."""
+    """Write transforms.json, with the entries of each frame (F).
+
+    Images of frames `held_out` (F,) are for evaluation, and without a split for training, too.
+    """
     names = [[str(entry["file_path"]) for entry in of_frame] for of_frame in entries]
-    evaluated = [n for f, own in enumerate(names) if f % _HOLD_OUT_EVERY == 0 for n in own]
-    trained = [n for f, own in enumerate(names) if f % _HOLD_OUT_EVERY != 0 for n in own]
+    evaluated = [n for held, own in zip(held_out, names, strict=True) if held for n in own]
+    apart = held_out & split
+    trained = [n for held, own in zip(apart, names, strict=True) if not held for n in own]
     applied = np.column_stack([out_R_world, np.zeros(3)])
     document = {
         **camera,

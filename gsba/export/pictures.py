@@ -44,10 +44,10 @@ class Files:
 
     def make_folders(self, frames: FrameSet) -> None:
         """Make the folders of all images and masks."""
-        firsts = [int(rows[0]) for rows in frames.recordings.values()] or [0]
-        for f in firsts:
-            for path in {*self.images(frames, f), *self.masks(frames, f)}:
-                (self.folder / path).parent.mkdir(parents=True, exist_ok=True)
+        every = range(len(frames))
+        files = (path for f in every for path in (*self.images(frames, f), *self.masks(frames, f)))
+        for parent in {Path(path).parent for path in files}:
+            (self.folder / parent).mkdir(parents=True, exist_ok=True)
 
     def _filled(self, pattern: str, frames: FrameSet, f: int) -> list[str]:
         known = {"name": frames.names[f], "suffix": suffix_of(frames, f)}

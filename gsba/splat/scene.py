@@ -11,6 +11,7 @@ from gsba.camera.rig import CubeRig
 from gsba.camera.views import View, turned_rigs
 from gsba.config import SplatSettings, TriangulateSettings
 from gsba.frames import cubemap, lens_faces
+from gsba.frames.held_out import held_out_rows
 from gsba.frames.masks import load_mask
 from gsba.log import GsbaError, track
 from gsba.splat.camera import view_camera
@@ -46,7 +47,7 @@ class Split:
 
 
 def split_frames(usable: np.ndarray, every: int) -> Split:
-    """Hold out whole panoramas: every `every`-th usable frame, starting half-way.
+    """Hold out whole panoramas, as exports do.
 
     Args:
         usable: (F,) bool.
@@ -56,10 +57,10 @@ def split_frames(usable: np.ndarray, every: int) -> Split:
         GsbaError: too few frames for both parts.
     """
     rows = np.flatnonzero(usable)
-    held = np.arange(len(rows)) % every == every // 2
-    if not held.any() or held.all():
+    held = held_out_rows(len(rows), every)
+    if len(rows) - len(held) < 2:
         raise GsbaError(f"{len(rows)} frames with poses are too few to hold one of {every} out")
-    return Split(rows[~held], rows[held])
+    return Split(np.delete(rows, held), rows[held])
 
 
 def refined_frames(reconstruction: Reconstruction) -> np.ndarray:

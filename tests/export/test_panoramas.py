@@ -231,4 +231,4 @@ def test_rows_of_raw_fisheyes_have_their_poses(tmp_path: Path) -> None:
             if mask[tuple(np.floor(pixel[::-1]).astype(int))]:
                 looked += assert_blob(image, pixel, reconstruction().point_colors[j], entry["fl_x"])
         assert mask[0, 0] == 0 and mask[120, 120] == 255
-    assert looked > 6 * NUM_FRAMES and moved > 0.5
+    assert looked >= 6 * NUM_FRAMES and moved > 0.5

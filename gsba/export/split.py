@@ -1,0 +1,134 @@
+"""Images of a dataset in an order by which its reader holds out whole panoramas.
+
+Trainers that read COLMAP models hold out every eighth image: INRIA's (`--eval`), gsplat, LichtFeld
+and Brush (`--eval`, `--eval-split-every 8`) in the order of names, 3DGRUT and nerfstudio's COLMAP
+parser in the order of the model. A face whose siblings are trained on tells nothing, as all faces
+of a panorama share their centre. Here images are numbered so that both orders agree and every
+eighth one is a face of a held-out panorama; faces of held-out panoramas beyond those are left out.
+Readers of lists (`train_list.txt`, `val_list.txt`, `test_list.txt` of nerfstudio's COLMAP parser,
+`sparse/0/test.txt` of forks of INRIA's) get the same split.
+"""
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from gsba.export.pictures import Files, suffix_of
+from gsba.frames.held_out import HOLD_OUT_EVERY, held_out_rows
+from gsba.types import FrameSet, PoseStatus, Reconstruction
+
+logger = logging.getLogger(__name__)
+
+LEFT_OUT = "left_out"  # folder of faces of held-out panoramas that no reader may see
+_MIN_TRAINING = 2  # panoramas
+_MIN_DIGITS = 5  # of an image's place in its name
+
+
+@dataclass(frozen=True, slots=True)
+class Split:
+    """Held-out panoramas of a dataset, and the order of its images."""
+
+    held_out: np.ndarray  # (F,) bool
+    numbers: tuple[tuple[int, ...], ...]  # (F, views) place of each image in the order; -1 = left
+    # out of the dataset
+
+    def files(self, plain: Files, frames: FrameSet) -> Files:
+        """Files of the same images, in folders without others, under names in this order."""
+        places = dict(zip(frames.names, self.numbers, strict=True))
+        given = plain.folder, plain.views, plain.image, plain.mask
+        digits = max(_MIN_DIGITS, len(str(max(map(max, self.numbers)))))
+        return _OrderedFiles(*given, places=places, digits=digits)
+
+    def write_lists(self, folder: Path, names: Sequence[Sequence[str]], model: Path) -> None:
+        """Write the lists that some readers hold images out by.
+
+        Args:
+            folder: of the dataset.
+            names: (F, views) of the images, in the model.
+            model: folder of the model.
+        """
+        every = [
+            (number, name, held)
+            for held, numbers, own in zip(self.held_out, self.numbers, names, strict=True)
+            for number, name in zip(numbers, own, strict=True)
+            if number >= 0
+        ]
+        training = "".join(f"{name}\n" for _, name, held in sorted(every) if not held)
+        test = "".join(f"{name}\n" for _, name, held in sorted(every) if held)
+        (model / "test.txt").write_text(test)
+        (folder / "train_list.txt").write_text(training)
+        for name in ("val_list.txt", "test_list.txt"):
+            (folder / name).write_text(test)
+
+
+def split_of(reconstruction: Reconstruction, num_views: Sequence[int]) -> Split | None:
+    """Split of a dataset by whole panoramas; None = too few are left to train on.
+
+    Args:
+        reconstruction: poses of the frames; unrefined ones are not held out.
+        num_views: (F,) images of each frame.
+    """
+    held_out = _held_out(reconstruction.pose_statuses == PoseStatus.REFINED, np.array(num_views))
+    if held_out is None:
+        logger.warning(
+            "too few panoramas to hold one of %d out: all images are for training", HOLD_OUT_EVERY
+        )
+        return None
+    images = [(view, f) for f, num in enumerate(num_views) for view in range(num)]
+    training = sorted((f, view) for view, f in images if not held_out[f])
+    # The first views of all held-out frames: what is left out is below or above the camera.
+    test = sorted(image for image in images if held_out[image[1]])[: _num_test(len(training))]
+    numbers = [[-1] * num for num in num_views]
+    for place, (f, view) in enumerate(sorted((f, view) for view, f in test)):
+        numbers[f][view] = HOLD_OUT_EVERY * place
+    for place, (f, view) in enumerate(training):
+        numbers[f][view] = place + place // (HOLD_OUT_EVERY - 1) + 1
+    return Split(held_out, tuple(map(tuple, numbers)))
+
+
+def held_out_frames(reconstruction: Reconstruction) -> np.ndarray:
+    """Frames (F,) bool to hold out, where all faces of each can be."""
+    chosen = np.zeros(len(reconstruction.pose_statuses), bool)
+    usable = np.flatnonzero(reconstruction.pose_statuses == PoseStatus.REFINED)
+    if len(usable) > _MIN_TRAINING:
+        chosen[usable[held_out_rows(len(usable))]] = True
+    return chosen
+
+
+def _held_out(usable: np.ndarray, num_views: np.ndarray) -> np.ndarray | None:
+    """Frames (F,) bool to hold out whose faces are enough for one image in eight."""
+    rows = np.flatnonzero(usable)
+    for num in range(1, len(rows)):
+        chosen = np.zeros(len(usable), bool)
+        chosen[rows[held_out_rows(len(rows), at_least=num)]] = True
+        if np.count_nonzero(~chosen) < _MIN_TRAINING:
+            return None
+        if num_views[chosen].sum() >= _num_test(int(num_views[~chosen].sum())):
+            return chosen
+    return None
+
+
+def _num_test(num_training: int) -> int:
+    """Number of images that are held out beside so many."""
+    return -(-num_training // (HOLD_OUT_EVERY - 1))
+
+
+@dataclass(frozen=True, slots=True)
+class _OrderedFiles(Files):
+    """Files whose names begin with their place in an order."""
+
+    places: Mapping[str, Sequence[int]]  # by frame name and view, see `Split.numbers`
+    digits: int  # of a place
+
+    def _filled(self, pattern: str, frames: FrameSet, f: int) -> list[str]:
+        folder, _, name = pattern.partition("/")
+        known = {"name": frames.names[f].replace("/", "_"), "suffix": suffix_of(frames, f)}
+        return [
+            f"{folder}/{number:0{self.digits}d}_{name.format(view=view, **known)}"
+            if number >= 0
+            else f"{LEFT_OUT}/{folder}/{name.format(view=view, **known)}"
+            for view, number in zip(self.views, self.places[frames.names[f]], strict=True)
+        ]

@@ -1,0 +1,86 @@
+"""Held-out panoramas, by the rules of the programs that read an export."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from export_scene import panoramas, reconstruction
+
+from gsba.export import ExportFormat, export
+from gsba.export.split import Split, split_of
+from gsba.frames.held_out import held_out_rows
+from gsba.types import PoseStatus, Reconstruction
+
+
+def _numbers(split: Split) -> tuple[np.ndarray, np.ndarray]:
+    """Frame of each image in order, and whether a reader holds it out."""
+    images = sorted((n, f) for f, own in enumerate(split.numbers) for n in own if n >= 0)
+    places, frames = np.array(images).T
+    assert places.tolist() == list(range(len(places)))
+    return frames, places % 8 == 0
+
+
+def _of_frames(num: int) -> Reconstruction:
+    statuses = np.full(num, PoseStatus.REFINED, np.uint8)
+    return replace(reconstruction(), pose_statuses=statuses)
+
+
+@pytest.mark.parametrize("views", [(6,), (10,), (2,), (6, 10, 2)])
+def test_every_eighth_image_is_of_a_held_out_panorama_and_no_other_is(views: tuple) -> None:
+    for num in range(3, 60):
+        num_views = [views[f % len(views)] for f in range(num)]
+        split = split_of(_of_frames(num), num_views)
+        assert split is not None
+        frames, held = _numbers(split)
+        assert set(frames[held]) == set(np.flatnonzero(split.held_out))
+        assert not split.held_out[frames[~held]].any()
+        training = sum(n for n, out in zip(num_views, split.held_out, strict=True) if not out)
+        assert np.count_nonzero(~held) == training  # nothing is lost that is trained on
+        assert len(views) > 1 or np.count_nonzero(split.held_out) == -(-num // 8)
+
+
+def test_unrefined_frames_are_not_held_out() -> None:
+    scene = _of_frames(24)
+    scene.pose_statuses[:10] = PoseStatus.UNREFINED
+    split = split_of(scene, [6] * 24)
+    assert split is not None and not split.held_out[:10].any()
+    frames, held = _numbers(split)
+    assert set(frames[held]) == set(np.flatnonzero(split.held_out))
+
+
+def test_two_panoramas_are_both_for_training(caplog: pytest.LogCaptureFixture) -> None:
+    assert split_of(_of_frames(2), [6, 6]) is None
+    assert "too few panoramas to hold one of 8 out: all images are for training" in caplog.text
+
+
+def test_held_out_rows_are_spread_and_at_no_end() -> None:
+    assert held_out_rows(16).tolist() == [4, 12] and held_out_rows(41).tolist()[-1] == 37
+    assert held_out_rows(0).tolist() == []
+
+
+def test_readers_by_name_by_number_and_by_list_hold_the_same_panoramas_out(tmp_path: Path) -> None:
+    frames, scene = panoramas(tmp_path / "frames", masked=True), reconstruction()
+    chosen = np.arange(len(frames) - 1)  # 7: no multiple of eight images
+    frames, scene = frames.taken(chosen), scene.taken(chosen)
+    out = tmp_path / "out"
+    export(scene, frames, out, ExportFormat.COLMAP_FLAT, face_size=16)
+    images = pycolmap.Reconstruction(out / "sparse/0").images
+    by_name = sorted(image.name for image in images.values())
+    assert by_name == [images[number].name for number in sorted(images)]
+    assert by_name == sorted(path.name for path in (out / "images").iterdir())
+    assert by_name == sorted(path.name for path in (out / "masks").iterdir())
+    test, training = by_name[::8], [name for n, name in enumerate(by_name) if n % 8]
+    assert {name.split("_")[2] for name in test} == {"0003"}
+    assert len(training) == 36 and not any("frame_0003" in name for name in training)
+    for path in ("val_list.txt", "test_list.txt", "sparse/0/test.txt"):
+        assert (out / path).read_text().split() == test
+    assert (out / "train_list.txt").read_text().split() == training
+
+
+def test_without_a_split_names_are_those_of_frames(tmp_path: Path) -> None:
+    frames, out = panoramas(tmp_path / "frames"), tmp_path / "out"
+    export(reconstruction(), frames, out, ExportFormat.COLMAP_FLAT, face_size=16, split=False)
+    assert (out / "images/frame_0000_front.png").is_file()
+    assert not (out / "test_list.txt").exists() and not (out / "sparse/0/test.txt").exists()
