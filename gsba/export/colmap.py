@@ -42,7 +42,7 @@ from gsba.camera.views import (
 from gsba.export.images import has_masks, panorama_writer, view_writer, views_of_cameras
 from gsba.export.pictures import Files, FrameWriter, by_camera
 from gsba.export.ply import write_splat_points
-from gsba.export.raw import RawPictures, raw_lenses
+from gsba.export.raw import SEEN_DEG, RawPictures, raw_lenses
 from gsba.export.split import split_of
 from gsba.geometry import inverse, pose, quaternion_from_rotation
 from gsba.log import GsbaError
@@ -198,7 +198,8 @@ def write_model(
     # frame, frame after frame
     numbers = np.arange(firsts[-1]) if order is None else np.concatenate(list(map(list, order)))
     which, pixels = _project_in_rigs(reconstruction, rigs, rig_of_frame)
-    images = numbers[firsts[reconstruction.observation_frames] + which]
+    images = numbers[firsts[reconstruction.observation_frames] + np.maximum(which, 0)]
+    images[which < 0] = -1
     by_image = np.argsort(images, kind="stable")
     starts = np.searchsorted(images[by_image], np.arange(len(numbers) + 1))
     rows = np.empty(len(images), np.int64)  # row of each observation in its image
@@ -247,7 +248,8 @@ def _add_rigs(model, rigs: Sequence[Sequence[Sensor]]) -> list[list]:
 def _project_in_rigs(
     reconstruction: Reconstruction, rigs: Sequence[Sequence[Sensor]], rig_of_frame: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Sensor (O,) of its frame's rig that sees each observation, and its pixel (O, 2) there."""
+    """Sensor (O,) of its frame's rig that sees each observation, -1 = its camera model reaches less
+    far, and its pixel (O, 2) there."""
     bearings, origins = reconstruction.observation_bearings, reconstruction.observation_origins
     which, pixels = np.zeros(len(bearings), np.int64), np.empty((len(bearings), 2))
     of_observation = rig_of_frame[reconstruction.observation_frames]
@@ -324,7 +326,7 @@ def _project(
 def _project_raw(
     sensors: Sequence[Sensor], bearings: np.ndarray, origins: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Sensor (O,) and pixel (O, 2) of each bearing (O, 3) in the raw lenses."""
+    """Sensor (O,) and pixel (O, 2) of each bearing (O, 3) in the raw lenses; -1 beyond SEEN_DEG."""
     if origins is None:
         which = facing(bearings, optical_axes(_fisheyes(sensors)))
     else:
@@ -334,7 +336,10 @@ def _project_raw(
     pixels = np.empty((len(bearings), 2))
     for c, sensor in enumerate(sensors):
         assert sensor.fisheye is not None
-        pixels[which == c] = project(sensor.fisheye, bearings[which == c])
+        own = which == c
+        pixels[own] = project(sensor.fisheye, bearings[own])
+        far = bearings @ rotation_of(sensor.fisheye)[:, 2] < np.cos(np.deg2rad(SEEN_DEG))
+        which[own & far] = -1
     return which, pixels
 
 

@@ -14,7 +14,9 @@ also has `transform_matrix_start` and `transform_matrix_end`, the poses of the t
 edge of the image in the format of instant-ngp, and `rolling_shutter` is [0, 0, 1, 0]: the pose of a
 pixel is interpolated between them by its row over the height. That is gsplat's
 ROLLING_TOP_TO_BOTTOM, with the inverses (in axes y down, z forward) as `viewmats` and
-`viewmats_rs`, and k1 to k4 as `radial_coeffs`. Velocities for 3dgs-deblur: `gsba.export.motion`.
+`viewmats_rs`, and k1 to k4 as `radial_coeffs`. instant-ngp reads `is_fisheye` and k1 to k4 in each
+frame's entry, and the size of its box from `aabb_scale`. Velocities for 3dgs-deblur:
+`gsba.export.motion`.
 """
 
 import json
@@ -41,7 +43,8 @@ from gsba.types import Fisheye, FrameSet, PictureFormat, Reconstruction
 NERFSTUDIO_R_WORLD = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 _Z_UP_R_WORLD = {"z": np.eye(3), "y": NERFSTUDIO_R_WORLD.T}  # of worlds whose y does not point down
 _CLOUD = "points3D.ply"
-_MAX_AXIS_ANGLE_DEG = 90.0  # of used fisheye pixels: gsplat renders nothing beyond
+_NGP_SCALE = 0.33  # of instant-ngp's unit cube, in this world's units, about the origin
+_NGP_MAX_BOXES = 128  # largest `aabb_scale`, a power of two
 
 
 def write_nerfstudio(
@@ -130,7 +133,7 @@ def write_nerfstudio_raw(
         camera |= motion.shutter_keys(shutter, rolling=moving)
     parts = held_out_frames(reconstruction), split
     _write_transforms(partial / "transforms.json", camera, entries, out_R_world, *parts)
-    return [by_camera([RawPictures(one, link, _MAX_AXIS_ANGLE_DEG) for one in files], frames)]
+    return [by_camera([RawPictures(one, link) for one in files], frames)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -270,7 +273,7 @@ def _fisheye(lens: Fisheye) -> dict[str, Any]:
     cx, cy = lens.principal
     lengths = {"fl_x": lens.focal, "fl_y": lens.focal, "cx": cx, "cy": cy}
     radial = dict(zip(("k1", "k2", "k3", "k4"), lens.radial, strict=True))
-    return {**lengths, "w": lens.width, "h": lens.height, **radial}
+    return {**lengths, "w": lens.width, "h": lens.height, **radial, "is_fisheye": True}
 
 
 def _entry(file_path: str, out_R_world: np.ndarray, world_T_camera: np.ndarray) -> dict[str, Any]:
@@ -302,10 +305,12 @@ def _write_transforms(
     evaluated = [n for held, own in zip(held_out, names, strict=True) if held for n in own]
     apart = held_out & split
     trained = [n for held, own in zip(apart, names, strict=True) if not held for n in own]
+    every = [entry["transform_matrix"] for of_frame in entries for entry in of_frame]
     applied = np.column_stack([out_R_world, np.zeros(3)])
     document = {
         **camera,
         "applied_transform": applied.tolist(),
+        "aabb_scale": _ngp_boxes(np.array(every)[:, :3, 3]),
         "ply_file_path": _CLOUD,
         "train_filenames": trained,
         "val_filenames": evaluated,
@@ -313,3 +318,9 @@ def _write_transforms(
         "frames": [entry for of_frame in entries for entry in of_frame],
     }
     path.write_text(json.dumps(document, indent=1) + "\n")
+
+
+def _ngp_boxes(centres: np.ndarray) -> int:
+    """Scale of instant-ngp's box that holds all camera centres (N, 3)."""
+    half = _NGP_SCALE * np.abs(centres).max(initial=0.0)
+    return int(min(2.0 ** np.ceil(np.log2(max(2 * half, 1.0))), _NGP_MAX_BOXES))

@@ -15,7 +15,8 @@ from gsba.log import GsbaError
 from gsba.types import Fisheye, PictureFormat
 
 _ROWS_AT_ONCE = 256  # image rows whose coordinates are held in double precision
-SEEN_DEG = 95.0  # largest angle from a lens's axis: image circles and calibrations end there
+SEEN_DEG = 90.0  # largest angle from a lens's axis: beyond, COLMAP's fisheye cameras give no ray or
+# a wrong one, and gsplat renders nothing
 
 
 def raw_lenses(kind: PictureFormat) -> Rig:
@@ -37,7 +38,6 @@ class RawPictures(FrameWriter):
     """
 
     link: bool = False  # make hard links instead of copies
-    seen_deg: float = SEEN_DEG  # largest angle from a lens's axis that masks keep
 
     def __call__(self, shown: Shown) -> None:
         f, frames, paths = shown.f, shown.frames, self.images(shown)
@@ -50,19 +50,17 @@ class RawPictures(FrameWriter):
 
         def used() -> list[np.ndarray]:
             size = shown.kind.width, shown.kind.height
-            circles = [_circle(lens, self.seen_deg, *size) for lens in raw_lenses(shown.kind)]
+            circles = [_circle(lens, *size) for lens in raw_lenses(shown.kind)]
             if frames.mask_paths[f] is None:
                 return [seen for seen, _ in circles]
             return [seen & shown.mask.ravel()[places] for seen, places in circles]
 
-        shown.write_masks(("raw", self.seen_deg), self.masks(shown), used)
+        shown.write_masks("raw", self.masks(shown), used)
 
 
 @table(maxsize=4)
-def _circle(
-    lens: Fisheye, seen_deg: float, width: int, height: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Mask (h, w) bool of a lens's image, True within `seen_deg`; and the panorama's pixel that
+def _circle(lens: Fisheye, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
+    """Mask (h, w) bool of a lens's image, True within SEEN_DEG; and the panorama's pixel that
     each pixel shows, (h, w) int32, counted row by row."""
     seen = np.empty((lens.height, lens.width), bool)
     pixels = np.empty((lens.height, lens.width), np.int32)
@@ -71,7 +69,7 @@ def _circle(
         grid = np.meshgrid(np.arange(lens.width) + 0.5, rows)
         directions = unproject(lens, np.stack(grid, axis=-1))
         part = slice(top, top + len(rows))
-        seen[part] = directions @ rotation_of(lens)[:, 2] > np.cos(np.deg2rad(seen_deg))
+        seen[part] = directions @ rotation_of(lens)[:, 2] > np.cos(np.deg2rad(SEEN_DEG))
         places = erp_from_bearings(directions.astype(np.float32), width, height)
         u, v = np.moveaxis(np.minimum(places, (width - 1, height - 1)), -1, 0).astype(int)
         pixels[part] = v * width + u

@@ -130,5 +130,5 @@ class _OrderedFiles(Files):
             f"{folder}/{number:0{self.digits}d}_{name.format(view=view, **known)}"
             if number >= 0
             else f"{LEFT_OUT}/{folder}/{name.format(view=view, **known)}"
-            for view, number in zip(self.views, self.places[frames.names[f]], strict=True)
-        ]
+            for view, number in zip(self.views, self.places[frames.names[f]], strict=False)
+        ]  # frames of other cameras have other numbers of views

@@ -13,22 +13,29 @@ class Program:
 
     to: ExportFormat
     start: str  # how it reads the folder {out}
+    masks: bool = True  # False: it reads none
 
 
 PROGRAMS = {
-    "inria": Program(ExportFormat.COLMAP_FLAT, "python train.py -s {out} --eval"),
+    "inria": Program(ExportFormat.COLMAP_FLAT, "python train.py -s {out} --eval", masks=False),
     "postshot": Program(
         ExportFormat.COLMAP_FLAT, "drop {out}/images and {out}/sparse/0 into Postshot together"
     ),
-    "brush": Program(ExportFormat.COLMAP_FLAT, "brush {out}"),
-    "lichtfeld": Program(ExportFormat.COLMAP_FLAT, "LichtFeld-Studio -d {out} -o {out}-splat"),
+    "brush": Program(ExportFormat.COLMAP_FLAT, "brush {out} --eval-split-every 8"),
+    "lichtfeld": Program(
+        ExportFormat.COLMAP_FLAT,
+        "LichtFeld-Studio -d {out} -o {out}-splat --eval --mask-mode ignore",
+    ),
     "gsplat": Program(
         ExportFormat.COLMAP_FLAT,
         "python examples/simple_trainer.py default --data_dir {out} --data_factor 1",
+        masks=False,
     ),
-    "opensplat": Program(ExportFormat.COLMAP_FLAT, "opensplat {out} -n 30000"),
+    "opensplat": Program(ExportFormat.COLMAP_FLAT, "opensplat {out} -n 30000", masks=False),
     "nerfstudio": Program(ExportFormat.NERFSTUDIO, "ns-train splatfacto --data {out}"),
-    "instant-ngp": Program(ExportFormat.NERFSTUDIO, "instant-ngp {out}"),
+    "instant-ngp": Program(
+        ExportFormat.NERFSTUDIO, "instant-ngp {out}/transforms.json", masks=False
+    ),
     "3dgs-deblur": Program(ExportFormat.NERFSTUDIO, "python train.py {out}"),
     "blender": Program(ExportFormat.GLTF, "File > Import > glTF 2.0: {out}/scene.glb"),
 }
@@ -55,4 +62,10 @@ def format_of(name: str) -> ExportFormat:
 
 def how_to_start(name: str, out: Path) -> list[str]:
     """Lines on how the program of this name reads an export; [] = it is the name of a format."""
-    return [f"{name}: {PROGRAMS[name].start.format(out=out)}"] if name in PROGRAMS else []
+    if name not in PROGRAMS:
+        return []
+    program = PROGRAMS[name]
+    lines = [f"{name}: {program.start.format(out=out)}"]
+    if (out / "masks").is_dir() and not program.masks:
+        lines.append(f"{name} reads no masks: it trains on pixels that they hide")
+    return lines

@@ -235,7 +235,8 @@ def test_gltf_camera_walks_through_all_frames(tmp_path: Path) -> None:
 def test_each_program_reads_the_format_that_its_name_gives(name: str, tmp_path: Path) -> None:
     frames, out = panoramas(tmp_path / "frames"), tmp_path / name
     export(reconstruction(), frames, out, format_of(name), face_size=64)
-    assert str(out) in how_to_start(name, out)[0]
+    (start,) = how_to_start(name, out)
+    assert str(out) in start
     if format_of(name) == ExportFormat.COLMAP_FLAT:
         model = pycolmap.Reconstruction(out / "sparse/0")
         assert {camera.model.name for camera in model.cameras.values()} == {"PINHOLE"}
@@ -248,6 +249,13 @@ def test_each_program_reads_the_format_that_its_name_gives(name: str, tmp_path: 
         assert meta["ply_file_path"] == "points3D.ply" and meta["camera_model"] == "OPENCV"
     else:
         assert (out / "scene.glb").is_file()
+
+
+def test_programs_that_read_no_masks_are_named(tmp_path: Path) -> None:
+    (tmp_path / "masks").mkdir()
+    silent = [name for name in PROGRAMS if len(how_to_start(name, tmp_path)) == 1]
+    assert silent == ["postshot", "brush", "lichtfeld", "nerfstudio", "3dgs-deblur", "blender"]
+    assert how_to_start("gsplat", tmp_path)[1].startswith("gsplat reads no masks")
 
 
 def test_unknown_names_are_refused() -> None:

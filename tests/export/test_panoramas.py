@@ -192,6 +192,7 @@ def test_rows_of_raw_fisheyes_have_their_poses(tmp_path: Path) -> None:
     assert meta["rolling_shutter_time"] == 0.02
     assert meta["camera_model"] == "OPENCV_FISHEYE" and meta["rolling_shutter"] == [0, 0, 1, 0]
     assert not {"fl_x", "cx", "w", "k1"} & set(meta)  # nerfstudio would take them for all frames
+    assert meta["aabb_scale"] == 1 and all(entry["is_fisheye"] for entry in meta["frames"])
     points = POINTS @ np.array(meta["applied_transform"])[:, :3].T
     assert len(meta["frames"]) == 2 * NUM_FRAMES
     looked, moved = 0, 0.0
@@ -232,3 +233,28 @@ def test_rows_of_raw_fisheyes_have_their_poses(tmp_path: Path) -> None:
                 looked += assert_blob(image, pixel, reconstruction().point_colors[j], entry["fl_x"])
         assert mask[0, 0] == 0 and mask[120, 120] == 255
     assert looked >= 6 * NUM_FRAMES and moved > 0.5
+
+
+def test_colmap_holds_nothing_beyond_a_right_angle_of_a_lens(tmp_path: Path) -> None:
+    """COLMAP's fisheye cameras give no ray there, or a wrong one."""
+    frames, scene = _raw_frames(tmp_path / "frames"), _scene(RAW)
+    assert scene.observation_origins is not None
+    front = scene.observation_origins[:, 2] > 0
+    axis = Rotation.from_rotvec(PAIR[0].rotation).as_matrix()[:, 2]
+    across = np.cross(axis, [0.0, 1.0, 0.0])
+    beyond = np.flatnonzero(front)[:3]
+    scene.observation_bearings[beyond] = np.cos(np.deg2rad(92)) * axis + across
+    to = ExportFormat.COLMAP_FLAT
+    export(scene, frames, tmp_path / "out", to, lenses=RAW, images="fisheye", split=False)
+    model = pycolmap.Reconstruction(tmp_path / "out/sparse/0")
+    assert model.compute_num_observations() == len(front) - 3
+    for image in model.images.values():
+        mask = _image(tmp_path / "out/masks" / f"{image.name[:-4]}.png")
+        rows, columns = np.nonzero(mask)
+        pixels = np.column_stack([columns, rows])[::97] + 0.5
+        rays = model.cameras[image.camera_id].cam_from_img(pixels)
+        assert np.isfinite(rays).all()
+        back = model.cameras[image.camera_id].img_from_cam(
+            np.column_stack([rays, np.ones(len(rays))])
+        )
+        np.testing.assert_allclose(back, pixels, atol=1e-3)
