@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from gsba.bundle.fixes import FrameFixes
+from gsba.bundle.fixes import MAX_DRIFT_SHARE, FrameFixes
 from gsba.config import GpsSettings, PlacementSettings
 from gsba.geometry import pose
 from gsba.log import GsbaError, brief
@@ -25,6 +25,7 @@ from gsba.scans.search import Guess
 from gsba.scans.types import Scan, cloud_of
 from gsba.similarity import (
     Sim3,
+    extent_of,
     extents,
     naming,
     pose_similarity,
@@ -45,10 +46,11 @@ _TOLERANCE_S = 0.02  # largest time from a frame to its true pose
 _SCALE_RANGE = (1e-12, 1e12)  # of a placed run; others come from wrong input
 _MAX_COORDINATE = 1e12  # in the placed unit
 _MAX_FLOAT32_COORDINATE = 1e4  # larger ones lose digits as float32: an offset is split off
-_MIN_GPS_EXTENT_M = 1e-3  # of positions: a working receiver scatters by more
 _MAX_LENS_SCALE_SIGMA = 0.1  # relative, of a scale by the lenses
 _MAX_GPS_SCALE_SIGMA = 0.3  # relative, of a scale by GPS
 _MAX_GPS_ANGLE_SIGMA_DEG = 25.0  # of heading and tilt by GPS
+_MAX_SCALE_SIGMAS = 4.0  # of two scales that agree: true ones differ by more once in 16,000 runs
+_NUM_NAMED = 5  # false positions that a message names
 _SIGMA_BY_EDGES_DEG = 0.2  # of a vertical by edges, see docs/gyro.md
 _SIGMA_BY_FORCES_DEG = 0.5  # of a vertical by an accelerometer, for its bias
 _SIGMA_BY_RIGS_DEG = 3.0  # of a vertical by the rigs' up axes
@@ -385,11 +387,6 @@ def _on_earth(
             f"{path}: {len(fixes)} of its positions are of refined frames; 3 are needed: check "
             "that they are of this recording and on the frames' clock"
         )
-    if np.ptp(fixes.positions, axis=0).max() < _MIN_GPS_EXTENT_M:
-        raise GsbaError(
-            f"{path}: all {len(fixes)} positions are equal: the receiver repeated one fix; leave "
-            "out --gps"
-        )
     positions, level, up_sigma = reconstruction.world_T_rigs[fixes.frames, :3, 3], np.eye(3), None
     if upright.up is not None:
         level = _least_turn(_UP_WORLD, np.array([0.0, 0, 1])) @ upright.similarity.rotation
@@ -400,7 +397,13 @@ def _on_earth(
         )
     with naming(path):
         found = fit_fixes(positions @ level.T, fixes, up_sigma, scale)
+    off = residuals_of(found.similarity, positions @ level.T, fixes.positions)
+    _require_majority(
+        path, found.used, off, frames, fixes.frames, "a noisier receiver needs --gps-sigma"
+    )
     _require_determined(path, found, fixes)
+    if scale is not None:
+        _require_one_scale(path, positions @ level.T, fixes, up_sigma, scale)
     fit = dataclasses.replace(found.similarity, rotation=found.similarity.rotation @ level)
     grounds = {**upright.grounds, "gps": {"file": str(path), **_claims(found, positions @ level.T)}}
     logger.info(
@@ -417,6 +420,55 @@ def _on_earth(
     )
     where = (float(fixes.origin[0]), float(fixes.origin[1]), float(fixes.origin[2]))
     return Placement(fit, unit="m", up="z", origin=where, grounds=grounds)
+
+
+def _require_majority(
+    path: Path,
+    used: np.ndarray,
+    off: np.ndarray,
+    frames: FrameSet,
+    rows: np.ndarray,
+    advice: str,
+) -> None:
+    """Raise GsbaError, naming them, if no more than half of a file's positions agree with the run.
+
+    Args:
+        path: the file.
+        used: (N,) bool, inliers.
+        off: (N,) residuals, placed units.
+        frames, rows: frames of the run, and rows (N,) of those that the positions are of.
+        advice: what else may help.
+    """
+    if 2 * used.sum() > len(used):
+        return
+    false = rows[~used]
+    names = [f"{frames.names[f]} ({frames.timestamps[f]:.3f} s)" for f in false[:_NUM_NAMED]]
+    more = f" and {len(false) - _NUM_NAMED} more" if len(false) > _NUM_NAMED else ""
+    raise GsbaError(
+        f"{path}: {len(false)} of {len(used)} positions contradict the run, by "
+        f"{np.median(off[~used]):.3g} units in the median, more than their noise and the run's "
+        f"drift allow: those of frames {', '.join(names)}{more}; remove false positions, or check "
+        f"that the file is of this recording and on the frames' clock; {advice}"
+    )
+
+
+def _require_one_scale(
+    path: Path,
+    positions: np.ndarray,
+    fixes: FrameFixes,
+    up_sigma: float | None,
+    scale: tuple[float, float],
+) -> None:
+    """Raise GsbaError if the scale by GPS alone contradicts a known one, see `fit_fixes`."""
+    alone = fit_fixes(positions, fixes, up_sigma)
+    off = abs(np.log(alone.similarity.scale / scale[0]))
+    if off > _MAX_SCALE_SIGMAS * np.hypot(alone.scale_sigma, scale[1] / scale[0]):
+        raise GsbaError(
+            f"{path}: its positions give {alone.similarity.scale:.4g} m per map unit (sigma "
+            f"{100 * alone.scale_sigma:.2g} %), the lenses {scale[0]:.4g} (sigma "
+            f"{100 * scale[1] / scale[0]:.2g} %): check --baseline and the positions, and pass "
+            "one of --gps and --scale lens"
+        )
 
 
 def _claims(found: GpsFit, positions: np.ndarray) -> dict[str, Any]:
@@ -491,13 +543,17 @@ def _aligned(reconstruction: Reconstruction, frames: FrameSet, path: Path) -> Pl
     true_T_rigs[:, :3, 3] -= offset
     world_T_rigs = reconstruction.world_T_rigs[rows]
     source, target = world_T_rigs[:, :3, 3], true_T_rigs[:, :3, 3]
+    straight = extents(source)[1] <= _MIN_EXTENT_RATIO
     with naming(path):
-        if extents(source)[1] > _MIN_EXTENT_RATIO:
-            fit, used, sigma = robust_similarity(source, target, similarity, 3)
-        else:  # the positions of a straight path determine no roll, but orientations do
+        if straight:  # its positions determine no roll, but orientations do
             fit = pose_similarity(world_T_rigs, true_T_rigs)
-            residuals = residuals_of(fit, source, target)
-            used, sigma = np.ones(len(rows), bool), float(np.sqrt(np.mean(residuals**2)))
+            used = residuals_of(fit, source, target) <= MAX_DRIFT_SHARE * extent_of(target)
+        else:
+            limits = np.zeros(len(rows)), MAX_DRIFT_SHARE
+            fit, used, _ = robust_similarity(source, target, similarity, 3, *limits)
+    residuals = residuals_of(fit, source, target)
+    _require_majority(path, used, residuals, frames, rows, "its positions count as exact")
+    sigma = float(np.sqrt(np.mean(residuals[slice(None) if straight else used] ** 2)))
     grounds = {"file": str(path), "poses": len(rows), "outliers": int(np.sum(~used)), "rmse": sigma}
     unit = "units of the true poses"
     return Placement(fit, unit=unit, offset=offset, grounds={"align": grounds})
