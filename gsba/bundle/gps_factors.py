@@ -148,7 +148,7 @@ def contradiction(anchors: Anchors, world_T_rigs: np.ndarray, draws: np.ndarray)
     known, weights = np.isfinite(draws).all(axis=(0, 2)), anchors.weights(world_T_rigs)
     worst = 0.0
     for number in anchors.level_from_map:
-        rows = np.flatnonzero((anchors.maps == number) & known[anchors.frames])
+        rows = np.flatnonzero(np.logical_and(anchors.maps == number, known[anchors.frames]))
         if len(rows) < MIN_FIXES:
             continue
         frames, places = anchors.frames[rows], anchors.positions[rows]

@@ -25,10 +25,8 @@ _TURNING_SIGMAS, _AGREEING_SIGMAS = 4.0, 3.0  # standard deviations: least rotat
 _MIN_TURNS = 4  # least number of steps that turn
 _MIN_EXPLAINED = 0.4  # least share of the turns that the right clock explains
 _SURE_EXPLAINED = 0.6  # share of the turns from which no other clocks are searched
-_MAX_NOISE_RAD = np.deg2rad(
-    2.0
-)  # largest noise of a trajectory's steps per axis: by three times as
-# much, steps contradict the images (verify.max_rotation_deg)
+_MAX_NOISE_RAD = np.deg2rad(2.0)  # largest noise of a trajectory's steps per axis: by three
+# times as much, steps contradict the images (verify.max_rotation_deg)
 _MIN_GAIN = 0.2  # share of the turns by which another clock must explain more
 _MAX_RIVAL_SHARE = 0.75  # share of the best clock's explained turns that no rival may reach
 
