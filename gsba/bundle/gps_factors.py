@@ -145,7 +145,8 @@ def contradiction(anchors: Anchors, world_T_rigs: np.ndarray, draws: np.ndarray)
     Returns:
         Ratio of both, of the map that is bent most; about 1 or less if errors are as claimed.
     """
-    known, weights = np.isfinite(draws).all(axis=(0, 2)), anchors.weights(world_T_rigs)
+    known: np.ndarray = np.isfinite(draws).all(axis=(0, 2))
+    weights = anchors.weights(world_T_rigs)
     worst = 0.0
     for number in anchors.level_from_map:
         rows = np.flatnonzero(np.logical_and(anchors.maps == number, known[anchors.frames]))

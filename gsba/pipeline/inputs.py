@@ -28,6 +28,7 @@ from gsba.store.store import RunStore, fingerprint
 from gsba.trajectory.association import without_trajectory
 from gsba.trajectory.files import read_trajectory
 from gsba.trajectory.keyframes import follow_keyframes
+from gsba.trajectory.lost_frames import without_lost_frames
 from gsba.trajectory.metashape import NamedPoses, is_metashape, read_metashape
 from gsba.trajectory.misread import refuse_useless
 from gsba.trajectory.restarts import associate_pieces, split_restarts
@@ -69,7 +70,7 @@ def read_trajectories(
                 "were aligned, not a video"
             )
         return [component for path in given for component in read_metashape(path)]
-    pieces = [read_trajectory(path, timestamps) for path in given]
+    pieces = [without_lost_frames(read_trajectory(path, timestamps)) for path in given]
     if "keyframes" in origin:
         keyframes = read_trajectory(origin["keyframes"], timestamps)
         pieces = [follow_keyframes(pieces[0], keyframes)]
