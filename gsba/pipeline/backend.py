@@ -312,7 +312,7 @@ def reconstruct(
             vertical=_vertical(state, result),
         )
         baseline = _baseline(state, world_scale(solution, result))
-        result = replace(result, lens_baseline=baseline)
+        result = replace(result, lens_baseline=baseline, origin=_origin(run, result))
         return result if amended is None else amended(result)
 
     return run.stage("reconstruction", run.solving_key(), compute, Reconstruction)
@@ -344,6 +344,12 @@ def _baseline(state: State, scale: float) -> tuple[float, float] | None:
     return length, length * float((max(misfit, 1.0) / weights.sum()) ** 0.5) / mean
 
 
+def _origin(run: Run, result: Reconstruction) -> np.ndarray | None:
+    """Origin of the largest map's world, if it is that of the first trajectory."""
+    another = result.components is not None and result.components[0] != 0
+    return None if another or run.families.fixing_gauge.members else run.coarse.origin
+
+
 def _vertical(state: State, result: Reconstruction) -> np.ndarray | None:
     """The vertical in the world of a result, by an accelerometer that rode along."""
     readings, gyro = state.run.evidence.imu, state.prior.gyro
@@ -364,6 +370,7 @@ def _reconstruct_rotations(state: State) -> Reconstruction:
     def compute() -> Reconstruction:
         matches = correspondences.match_for_rotations(observed.context, poses)
         found = tracks.build([matches], np.diff(observed.keypoints.starts))
-        return rotation_only.refine(found, observed.keypoints, poses, prior.coarse, least)
+        result = rotation_only.refine(found, observed.keypoints, poses, prior.coarse, least)
+        return replace(result, origin=_origin(run, result))
 
     return run.stage("reconstruction", [run.settings.matching, least], compute, Reconstruction)

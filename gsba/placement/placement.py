@@ -42,7 +42,6 @@ UPS = {"z": np.array([0.0, 0, 1]), "y": np.array([0.0, 1, 0])}  # up axes of sca
 _TOLERANCE_S = 0.02  # largest time from a frame to its true pose
 _SCALE_RANGE = (1e-12, 1e12)  # of a placed run; others come from wrong input
 _MAX_COORDINATE = 1e12  # in the placed unit
-_MAX_FLOAT32_COORDINATE = 1e4  # larger ones lose digits as float32: an offset is split off
 _MAX_LENS_SCALE_SIGMA = 0.1  # relative, of a scale by the lenses
 _MAX_GPS_SCALE_SIGMA = 0.3  # relative, of a scale by GPS
 _MAX_GPS_ANGLE_SIGMA_DEG = 25.0  # of heading and tilt by GPS
@@ -88,7 +87,9 @@ def place(
             f"the placed run would have a scale of {scale:g} and coordinates up to {far:g}: check "
             "the values of --scale, --between, --gps, --align or --align-scan"
         )
-    return placement
+    if settings.gps is None and settings.align is None and settings.scan is None:
+        return placement.of_trajectory(reconstruction.origin)
+    return placement.near_origin(placed)
 
 
 def _placement(
@@ -427,7 +428,7 @@ def _up_sigma(upright: Placement) -> float:
 
 
 def _aligned(reconstruction: Reconstruction, frames: FrameSet, path: Path) -> Placement:
-    """Placement in the world of true poses; an offset is split off large coordinates."""
+    """Placement in the world of true poses."""
     truth = read_trajectory(path)
     _require_times(path, frames)
     run = Trajectory(frames.timestamps, reconstruction.world_T_rigs)
@@ -439,11 +440,7 @@ def _aligned(reconstruction: Reconstruction, frames: FrameSet, path: Path) -> Pl
             f"{path}: {len(rows)} of its poses are within {_TOLERANCE_S} s of a refined frame; 3 "
             "are needed: check that both use one clock"
         )
-    true_T_rigs = truth.world_T_rigs[of_truth].copy()
-    middle = np.median(true_T_rigs[:, :3, 3], axis=0)
-    large = np.abs(middle).max() > _MAX_FLOAT32_COORDINATE
-    offset = np.round(middle, -2) if large else np.zeros(3)
-    true_T_rigs[:, :3, 3] -= offset
+    true_T_rigs = truth.world_T_rigs[of_truth]
     world_T_rigs = reconstruction.world_T_rigs[rows]
     source, target = world_T_rigs[:, :3, 3], true_T_rigs[:, :3, 3]
     straight = extents(source)[1] <= _MIN_EXTENT_RATIO
@@ -459,7 +456,7 @@ def _aligned(reconstruction: Reconstruction, frames: FrameSet, path: Path) -> Pl
     sigma = float(np.sqrt(np.mean(residuals[slice(None) if straight else used] ** 2)))
     grounds = {"file": str(path), "poses": len(rows), "outliers": int(np.sum(~used)), "rmse": sigma}
     unit = "units of the true poses"
-    return Placement(fit, unit=unit, offset=offset, grounds={"align": grounds})
+    return Placement(fit, unit=unit, grounds={"align": grounds})
 
 
 def _in_scan(

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gsba.geometry import pose
+from gsba.geometry import local_origin, pose
 from gsba.log import GsbaError
 from gsba.similarity import Sim3
 from gsba.types import Reconstruction
@@ -55,6 +55,24 @@ class Placement:
             observation_origins=None if origins is None else move.scale * origins,
             lens_baseline=lenses and (move.scale * lenses[0], move.scale * lenses[1]),
         )
+
+    def of_trajectory(self, origin: np.ndarray | None) -> "Placement":
+        """With the offset to the world of the trajectory, whose origin (3,) the run's world is at.
+
+        See `Reconstruction.origin`.
+        """
+        if origin is None:
+            return self
+        move = self.similarity
+        return dataclasses.replace(self, offset=move.scale * move.rotation @ origin)
+
+    def near_origin(self, placed: np.ndarray) -> "Placement":
+        """With the offset split off, where placed positions (N, 3) are far from the origin."""
+        origin, move = local_origin(placed), self.similarity
+        if origin is None:
+            return self
+        move = dataclasses.replace(move, translation=move.translation - origin)
+        return dataclasses.replace(self, similarity=move, offset=self.offset + origin)
 
     def to_json(self) -> dict[str, Any]:
         """Content of transform.json."""

@@ -8,7 +8,7 @@ clock than the given one is accepted only if rotations determine it, no third cl
 well, and it explains the images markedly better.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -46,7 +46,7 @@ class Clock:
     def on_frames(self, trajectory: Trajectory) -> Trajectory:
         """A trajectory with its times on the frames' clock."""
         times = self.start + (trajectory.timestamps - self.start - self.offset) / self.rate
-        return Trajectory(times, trajectory.world_T_rigs)
+        return replace(trajectory, timestamps=times)
 
 
 @dataclass(frozen=True, slots=True)

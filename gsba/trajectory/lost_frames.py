@@ -9,17 +9,20 @@ import logging
 
 import numpy as np
 
+from gsba.geometry import rotation_angle
 from gsba.types import Trajectory
 
 _log = logging.getLogger(__name__)
 
+_MIN_TURN_RAD = np.deg2rad(0.5)  # a smaller one is noise
 _MIN_JUMP_PACES = 4.0  # median speeds: faster than any step of the walk itself
 
 
 def without_lost_frames(trajectory: Trajectory) -> Trajectory:
     """A trajectory without rows that repeat a pose because the frame was lost.
 
-    A repeated identity is lost where the path goes on from where it was before, and at the end.
+    An identity is lost where it is repeated, at the end, and where the path goes on from where it
+    was before: in motion and turn together, as a new map has a scale of its own.
     Another repeated pose is lost at the end, and where the step behind it makes up for the time in
     which it was repeated; where the path goes on at its usual pace, the camera stood.
 
@@ -55,7 +58,15 @@ def without_lost_frames(trajectory: Trajectory) -> Trajectory:
 def _speed(trajectory: Trajectory, before: int, after: int) -> float:
     """Mean speed from one entry to another, units per second."""
     step = np.diff(trajectory.world_T_rigs[[before, after], :3, 3], axis=0)
-    return float(np.linalg.norm(step) / np.diff(trajectory.timestamps[[before, after]])[0])
+    duration = np.diff(trajectory.timestamps[[before, after]])[0]
+    return max(float(np.linalg.norm(step) / duration), 1e-300)
+
+
+def _turn(trajectory: Trajectory, before: int, after: int) -> float:
+    """Mean angular velocity from one entry to another, radians per second."""
+    first, second = trajectory.world_T_rigs[[before, after], :3, :3]
+    duration = np.diff(trajectory.timestamps[[before, after]])[0]
+    return max(float(rotation_angle(first.T @ second)), _MIN_TURN_RAD) / float(duration)
 
 
 def _lost_identity(trajectory: Trajectory, first: int, last: int, pace: float) -> np.ndarray:
@@ -63,10 +74,12 @@ def _lost_identity(trajectory: Trajectory, first: int, last: int, pace: float) -
     rows = np.ones(last - first + 1, bool)
     if last + 1 == len(trajectory.timestamps):
         return rows
-    onward = _speed(trajectory, last, last + 1)
+    # Of equal rows, the last one may be the first frame of a map.
+    rows[-1] = _speed(trajectory, last, last + 1) > _MIN_JUMP_PACES * pace
     if first > 0:
-        return rows & (_speed(trajectory, first - 1, last + 1) < onward)
-    rows[-1] = onward > _MIN_JUMP_PACES * pace  # the map's first frame is at the identity
+        moved = _speed(trajectory, first - 1, last + 1) / _speed(trajectory, last, last + 1)
+        turned = _turn(trajectory, first - 1, last + 1) / _turn(trajectory, last, last + 1)
+        rows[-1] |= moved * turned < 1
     return rows
 
 
