@@ -145,7 +145,7 @@ def contradiction(anchors: Anchors, world_T_rigs: np.ndarray, draws: np.ndarray)
     Returns:
         Ratio of both, of the map that is bent most; about 1 or less if errors are as claimed.
     """
-    known: np.ndarray = np.isfinite(draws).all(axis=(0, 2))
+    known = np.asarray(np.isfinite(draws).all(axis=(0, 2)))
     weights = anchors.weights(world_T_rigs)
     worst = 0.0
     for number in anchors.level_from_map:
