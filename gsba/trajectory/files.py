@@ -101,7 +101,7 @@ def _tracked(
     turned: np.ndarray,
     where: Sequence[str],
 ) -> np.ndarray:
-    """Rows (M,) of N that have a pose; others are logged.
+    """Rows (M,) of N that have a pose, at least 2 unless N is less; others are logged.
 
     Args:
         path: of the file.
@@ -113,6 +113,11 @@ def _tracked(
     known = np.isfinite(values).all(axis=1) & turned
     known &= (np.abs(np.where(known[:, None], positions, 0)) <= _MAX_COORDINATE).all(axis=1)
     lost = np.flatnonzero(~known)
+    if len(lost) and known.sum() < 2:
+        raise GsbaError(
+            f"{where[lost[0]]}: no pose (NaN, zeros, or a position beyond {_MAX_COORDINATE:g}), as "
+            f"in {len(lost)} of {len(known)} rows; at least 2 poses are needed"
+        )
     if len(lost):
         _log.warning(
             "%s: %d of %d rows have no pose, as of lost frames (NaN, zeros, or positions beyond "
