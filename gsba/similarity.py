@@ -152,24 +152,30 @@ def robust_similarity(
     target: np.ndarray,
     solve: Callable[[np.ndarray, np.ndarray], Sim3],
     num_needed: int,
+    tolerances: np.ndarray,
+    drift: float,
 ) -> tuple[Sim3, np.ndarray, float]:
-    """Similarity of corresponding points, fewer than half of which may be outliers.
+    """Similarity of corresponding points, some of which are outliers.
 
-    Least median of squares over random draws (Rousseeuw, JASA 79, 1984), then least squares over
-    the inliers until these no longer change.
+    The largest consensus under a truncated loss over random draws (Torr and Zisserman, MLESAC,
+    CVIU 78, 2000), then least squares over the inliers until these no longer change. No residual
+    of an inlier exceeds what both sides claim, so that outliers cannot widen the gate. The inliers
+    may be the smaller part: callers decide whether they suffice.
 
     Args:
         source, target: (N, 3) float64.
         solve: least-squares similarity of some of them.
         num_needed: smallest number of points that `solve` takes.
+        tolerances: (N,) largest error of each target, target units.
+        drift: largest error of the sources, part of their extent.
 
     Returns:
         the similarity, its inliers (N,) bool, and their RMS residual in target units.
 
     Raises:
-        NoSimilarityError: the inliers of both worlds are barely correlated.
+        NoSimilarityError: too few agree, or the inliers of both worlds are barely correlated.
     """
-    rng = np.random.default_rng(_SEED)
+    rng, reach = np.random.default_rng(_SEED), drift * extent_of(source)
     best, fit = np.inf, None
     draws = (rng.choice(len(source), num_needed, replace=False) for _ in range(_NUM_DRAWS))
     for draw in draws if len(source) > num_needed else [np.arange(len(source))]:
@@ -177,16 +183,20 @@ def robust_similarity(
             candidate = solve(source[draw], target[draw])
         except NoSimilarityError:
             continue
-        median = float(np.median(residuals_of(candidate, source, target)))
-        if median < best:
-            best, fit = median, candidate
+        shares = residuals_of(candidate, source, target) / (tolerances + reach * candidate.scale)
+        loss = float(np.sum(np.minimum(shares**2, 1.0)))
+        if loss < best:
+            best, fit = loss, candidate
     fit = fit or solve(source, target)
-    extent = float(np.linalg.norm(np.ptp(target, axis=0)))
+    extent = extent_of(target)
     used = np.ones(len(source), bool)
     for _ in range(20):
         residuals = residuals_of(fit, source, target)
         sigma = max(float(np.median(residuals)) / _MEDIAN_LENGTH, 1e-9 * extent)
-        before, used = used, residuals <= _OUTLIER_SIGMAS * sigma
+        gates = np.minimum(_OUTLIER_SIGMAS * sigma, tolerances + reach * fit.scale)
+        before, used = used, residuals <= gates
+        if used.sum() < num_needed:
+            raise NoSimilarityError(f"only {used.sum()} of {len(used)} positions agree")
         fit = solve(source[used], target[used])
         if np.array_equal(before, used):
             break
@@ -198,6 +208,11 @@ def robust_similarity(
 def residuals_of(fit: Sim3, source: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Distances (N,) between targets and transformed sources."""
     return np.linalg.norm(fit.points(source) - target, axis=1)
+
+
+def extent_of(positions: np.ndarray) -> float:
+    """Diagonal of the box around positions (N, 3)."""
+    return float(np.linalg.norm(np.ptp(positions, axis=0)))
 
 
 def extents(positions: np.ndarray) -> np.ndarray:

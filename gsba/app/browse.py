@@ -20,6 +20,8 @@ def inside(root: Path, name: str) -> Path:
     """
     if "\0" in name:
         raise GsbaError("a path holds no NUL characters")
+    if any(0xD800 <= ord(character) < 0xE000 for character in name):
+        raise GsbaError("a path holds no half characters")
     base = root.resolve()
     path = (base / name).resolve()
     if not path.is_relative_to(base):

@@ -1,11 +1,14 @@
 """Forms of commands: their options as fields of a page, and arguments from the values of fields."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 from gsba.log import GsbaError, brief
 
+_ADDRESS = re.compile(r"[a-z]+://[^/,=]*")
+_SEPARATORS = re.compile(r"[,=:]")
 Kind = Literal["flag", "path", "number", "text"]
 
 
@@ -61,6 +64,21 @@ class Form:
                 options += [part for text in texts for part in _typed(field.option, text)]
         return [self.command, *positional, *options]
 
+    def paths(self, values: Mapping[str, Any]) -> list[str]:
+        """Paths in the values of fields, as `arguments` passes them on.
+
+        Any part of a text may be one, as in `--gps FILE` and `PATH,name=NAME`; addresses such as
+        tcp://HOST:PORT hold none.
+        """
+        found = list[str]()
+        for field in self.fields:
+            for text in _texts(field, values.get(field.name)):
+                if field.kind == "path":
+                    found.append(text)
+                elif field.kind == "text" and not _ADDRESS.fullmatch(text):
+                    found += [text, *(part.strip() for part in _SEPARATORS.split(text))]
+        return found
+
 
 def _texts(field: Field, value: Any) -> list[str]:
     """Values of a field as texts."""
@@ -83,6 +101,8 @@ def _text(field: Field, value: Any) -> str:
     text = str(value).strip()
     if any(ord(character) < 32 for character in text):
         raise GsbaError(f"{field.option or field.name}: control characters are not allowed")
+    if any(0xD800 <= ord(character) < 0xE000 for character in text):
+        raise GsbaError(f"{field.option or field.name}: half characters are not allowed")
     return text
 
 

@@ -7,7 +7,6 @@ from dataclasses import asdict
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote
 
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
@@ -219,11 +218,8 @@ def _arguments(app: App, body: dict[str, Any]) -> list[str]:
     if form is None or not isinstance(values, dict):
         raise GsbaError("the request names no command of the page")
     arguments = form.arguments(values)
-    for field in form.fields:
-        given = values.get(field.name)
-        for text in given if isinstance(given, list) else [given]:
-            if field.kind == "path" and isinstance(text, str):
-                inside(app.root, text)
+    for path in form.paths(values):
+        inside(app.root, path)
     return arguments
 
 
@@ -256,7 +252,7 @@ def _view(app: App, request: Request) -> Any:
 
 def _file(app: App, request: Request) -> Response:
     """A file of a run: shown if it is a report or a figure, else a download."""
-    path = inside(app.root, unquote(request.path_params["path"]))
+    path = inside(app.root, request.path_params["path"])
     if not path.is_file():
         return PlainTextResponse("Not found\n", 404)
     kind = _SHOWN.get(path.suffix.lower())

@@ -7,6 +7,13 @@ import numpy as np
 
 WHITE_SHARE = 0.1  # of the variance of a fix: independent from fix to fix, the rest lasts
 _UNTIMED_STEP = 0.5  # correlation times between fixes whose times are not known
+_MEDIAN_LENGTH = 1.538  # median length of a 3-vector of independent unit normals
+_OUTLIER_SIGMAS = 4.6  # 99.99 % of such vectors are shorter
+# Largest ratio of the true noise of fixes to the claimed one. Claims hold under an open sky: with
+# the default of 3 m it is 10.5 m per axis, a mean horizontal error of 13 m, the largest that
+# Merry and Bettinger (PLoS ONE 14(7), e0219890, 2019) measured with a phone in a town.
+_MAX_NOISE_RATIO = 3.5
+MAX_DRIFT_SHARE = 0.05  # largest error of a map's positions, part of their extent
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +49,33 @@ class FrameFixes:
             self.origin,
             self.correlation_s,
         )
+
+    def tolerances(self) -> np.ndarray:
+        """Largest error (G,) of a fix, metres, by its claimed noise."""
+        return _OUTLIER_SIGMAS * np.sqrt(np.mean(self.sigmas**2, axis=1))
+
+    def inliers(self, residuals: np.ndarray, extent: float) -> tuple[np.ndarray, float]:
+        """Fixes that agree with a map, and the scatter of all.
+
+        The gate is 4.6 standard deviations, or 4.6 times the scatter of all fixes if that is
+        larger. Where the scatter exceeds the largest noise of receivers and the largest drift of a
+        map, most fixes are false: the gate is then the median that these two allow, which fewer
+        than half of the fixes pass.
+
+        Args:
+            residuals: (G, 3) fixes less the transformed positions of their frames, metres.
+            extent: of the frames' transformed positions, metres.
+
+        Returns:
+            (G,) bool, and the scatter in standard deviations of the fixes, at least 1.
+        """
+        distances = np.linalg.norm(residuals / self.sigmas, axis=1)
+        drift = MAX_DRIFT_SHARE * extent / _OUTLIER_SIGMAS / float(np.median(self.sigmas[:, 0]))
+        most = float(np.hypot(_MAX_NOISE_RATIO, drift))
+        scatter = max(1.0, float(np.median(distances)) / _MEDIAN_LENGTH)
+        if scatter > most:
+            return distances < _MEDIAN_LENGTH * most, most
+        return distances <= _OUTLIER_SIGMAS * scatter, scatter
 
     def digest(self) -> str:
         """Fingerprint of all that results rest on."""

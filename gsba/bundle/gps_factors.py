@@ -22,14 +22,12 @@ import gtsam
 import numpy as np
 
 from gsba.bundle.families import Family, MapSnapshot, digest_of
-from gsba.bundle.fixes import WHITE_SHARE, FrameFixes
+from gsba.bundle.fixes import MAX_DRIFT_SHARE, WHITE_SHARE, FrameFixes
 from gsba.bundle.pose_variables import X, values_of
 from gsba.config import GpsSettings
-from gsba.similarity import NoSimilarityError, Sim3, robust_similarity, similarity
+from gsba.similarity import NoSimilarityError, Sim3, extent_of, robust_similarity, similarity
 
 MIN_FIXES = 5  # in a map: seven unknowns leave little of fewer
-_MEDIAN_LENGTH = 1.538  # of a 3-vector of independent unit normals
-_OUTLIER_SIGMAS = 4.6  # 99.99 % of such vectors are shorter
 _ROUNDS = 10  # of choosing fixes
 
 S: Callable[[int], int] = gtsam.symbol_shorthand.S  # what a map's similarity changes by (7,)
@@ -68,8 +66,8 @@ def anchor(
 ) -> Anchors | None:
     """Fixes carried into the world of these poses, each map by a similarity of its own.
 
-    Fixes further from the poses than 4.6 standard deviations are left out; where most are further
-    off, as poses drift, so are the limit and the scale of the loss.
+    Fixes outside of the gate are left out, see `FrameFixes.inliers`; the scale of the loss is as
+    wide as the gate.
 
     Args:
         world_T_rigs: (F, 4, 4) poses so far.
@@ -78,7 +76,7 @@ def anchor(
         maps: (F,) map of each frame; None = there is one.
 
     Returns:
-        None where no map has enough fixes that lie as its frames do.
+        None where no map has enough fixes of which most lie as its frames do.
     """
     positions, of_fix = world_T_rigs[fixes.frames, :3, 3], np.zeros(len(fixes), np.int64)
     if maps is not None:
@@ -114,19 +112,72 @@ def _level_from_map(positions: np.ndarray, fixes: FrameFixes) -> tuple[Sim3, np.
     scatter, at least 1.
 
     Raises:
-        NoSimilarityError: they do not lie as the frames do.
+        NoSimilarityError: most of them do not lie as the frames do.
     """
-    fit, used, _ = robust_similarity(positions, fixes.positions, similarity, 3)
-    wide = 1.0
+    limits = fixes.tolerances(), MAX_DRIFT_SHARE
+    fit, used, _ = robust_similarity(positions, fixes.positions, similarity, 3, *limits)
+    scatter = 1.0
     for _ in range(_ROUNDS):
-        off = (fixes.positions - fit.points(positions)) / fixes.sigmas
-        distances = np.linalg.norm(off, axis=1)
-        wide = max(1.0, float(np.median(distances)) / _MEDIAN_LENGTH)
-        before, used = used, distances <= _OUTLIER_SIGMAS * wide
+        extent = fit.scale * extent_of(positions)
+        before = used
+        used, scatter = fixes.inliers(fixes.positions - fit.points(positions), extent)
+        if 2 * used.sum() <= len(used):
+            raise NoSimilarityError(f"only {used.sum()} of {len(used)} positions agree")
         if np.array_equal(before, used):
             break
         fit = similarity(positions[used], fixes.positions[used])
-    return fit, used, wide
+    return fit, used, scatter
+
+
+def contradiction(anchors: Anchors, world_T_rigs: np.ndarray, draws: np.ndarray) -> float:
+    """How many times more than expected the fixes bend a map that was adjusted with them.
+
+    The pull of the fixes at the optimum is that of the images, with the other sign: without fixes,
+    the map would move by the images' covariance times this pull. The square of that motion, in
+    standard deviations of the images, is expected to be at most the number of independent motions
+    that fixes know better than images.
+
+    Args:
+        anchors: fixes in the world of the poses.
+        world_T_rigs: (F, 4, 4) adjusted poses.
+        draws: (D, F, 6) errors of the poses by images alone, rig frames; NaN = none.
+
+    Returns:
+        Ratio of both, of the map that is bent most; about 1 or less if errors are as claimed.
+    """
+    known = np.asarray(np.isfinite(draws).all(axis=(0, 2)))
+    weights = anchors.weights(world_T_rigs)
+    worst = 0.0
+    for number in anchors.level_from_map:
+        rows = np.flatnonzero(np.logical_and(anchors.maps == number, known[anchors.frames]))
+        if len(rows) < MIN_FIXES:
+            continue
+        frames, places = anchors.frames[rows], anchors.positions[rows]
+        information = np.linalg.inv(anchors.covariances[rows]) * weights[rows, None, None]
+        arms = places - places.mean(axis=0)
+        gauge = np.stack([arms, *np.cross(np.eye(3)[:, None], arms), *_shifts(len(rows))], axis=2)
+        pulled = np.einsum("aij,ajk->aik", information, gauge)
+        inverse = np.linalg.pinv(np.einsum("aik,ail->kl", gauge, pulled), hermitian=True)
+
+        def in_shape(
+            off: np.ndarray, pulled: np.ndarray = pulled, back: np.ndarray = gauge @ inverse
+        ) -> np.ndarray:
+            """Offsets (D, A, 3) after the best similarity."""
+            return off - np.einsum("aik,dk->dai", back, np.einsum("aik,dai->dk", pulled, off))
+
+        off = in_shape((world_T_rigs[frames, :3, 3] - places)[None])[0]
+        turns = world_T_rigs[frames, :3, :3]
+        moved = in_shape(np.einsum("aij,daj->dai", turns, draws[:, frames, 3:]))
+        pull = np.einsum("aij,aj->ai", information, off)
+        bent = np.mean(np.einsum("ai,dai->d", pull, moved) ** 2)
+        expected = np.mean(np.einsum("dai,aij,daj->d", moved, information, moved))
+        worst = max(worst, float(bent / np.clip(expected, 1.0, 3 * len(rows))))
+    return worst
+
+
+def _shifts(num: int) -> np.ndarray:
+    """Unit shifts (3, N, 3) along each axis."""
+    return np.repeat(np.eye(3)[:, None], num, axis=1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,24 +189,35 @@ class GpsFixes(Family):
 
     fixes: FrameFixes
     settings: GpsSettings  # scale of the loss
+    contradicted: bool = False  # by the images: they are left out, and only reported
 
     @property
     def digest(self) -> str:
         """Digest of the fixes and of the scale of the loss."""
-        return digest_of(self.fixes.digest(), self.settings.loss_sigmas)
+        return digest_of(self.fixes.digest(), self.settings.loss_sigmas, self.contradicted)
 
     def fitted(self, snapshot: MapSnapshot) -> "AnchoredFixes | None":
-        """The fixes in the world of these poses; None where they are not correlated with them."""
-        anchors = anchor(snapshot.world_T_rigs, self.fixes, self.settings, snapshot.maps)
+        """The fixes in the world of these poses; None where these contradict them."""
+        anchors = self._anchors(snapshot)
         return None if anchors is None else AnchoredFixes(anchors, self.digest)
+
+    def contradiction(self, snapshot: MapSnapshot, draws: np.ndarray) -> float:
+        """How far the fixes bend a map that was adjusted with them, see `contradiction`."""
+        anchors = self._anchors(snapshot)
+        return 0.0 if anchors is None else contradiction(anchors, snapshot.world_T_rigs, draws)
+
+    def _anchors(self, snapshot: MapSnapshot) -> Anchors | None:
+        if self.contradicted:
+            return None
+        return anchor(snapshot.world_T_rigs, self.fixes, self.settings, snapshot.maps)
 
     def report(self, snapshot: MapSnapshot) -> Mapping[str, Any]:
         """Used and false fixes, and their residuals in metres."""
         fixes, poses = self.fixes, snapshot.world_T_rigs
-        anchors = anchor(poses, fixes, self.settings, snapshot.maps)
+        anchors = self._anchors(snapshot)
         content: dict[str, Any] = {"fixes": len(fixes), "taken": anchors is not None}
         if anchors is None:
-            return content | {"used": 0}
+            return content | {"used": 0, "contradicted": self.contradicted}
         used = np.flatnonzero(anchors.used)
         off = np.empty((len(used), 3))
         for number, fit in anchors.level_from_map.items():

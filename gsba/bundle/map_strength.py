@@ -38,6 +38,7 @@ class MapStrength:
     noise: StepNoise | None  # of the trajectory's steps; None = too few steps are held to estimate
     # it
     counts: Counts  # of priors on the trajectory's steps
+    contradiction: float = 0.0  # of GPS fixes by the images, see `gps_factors.contradiction`
 
 
 def measure(

@@ -85,7 +85,7 @@ def _write_dataset(run: Path, to: str, face_size: int | None) -> None:
         placement = place(reconstruction, frames, PlacementSettings(up="auto"))
     except GsbaError as error:
         logger.warning("the dataset is not turned upright: %s", error)
-        placement = Placement()
+        placement = Placement().of_trajectory(reconstruction.origin)
     folder = run / to
     lenses = cameras_of(run, reconstruction, frames, "auto", 1)
     given = reconstruction, frames, folder, format_of(to), face_size, placement

@@ -147,7 +147,8 @@ def export_all(
         reconstruction, frames = reconstruction.taken(rows), frames.taken(rows)
         cameras = cameras.taken(rows)
     _warn_of_gaps(reconstruction, frames)
-    placement = options.placement or Placement(map_number=map_number)
+    own = Placement(map_number=map_number).of_trajectory(reconstruction.origin)
+    placement = options.placement or own
     reconstruction = placement.apply(reconstruction)
     seen_by, up = cameras.scaled(placement.similarity.scale), placement.up
     files = (path for paths in (*frames.paths, frames.mask_paths) for path in paths)

@@ -1,5 +1,6 @@
 """The back end of a run: from matches to poses and points, and their refinement by pixels."""
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -14,6 +15,7 @@ from gsba.bundle import (
     tracks,
 )
 from gsba.bundle.gauge import Gauge
+from gsba.bundle.gps_factors import GpsFixes
 from gsba.bundle.lens_centres import baseline_of
 from gsba.bundle.map_strength import MapStrength
 from gsba.bundle.reconstruction import assemble, world_scale
@@ -26,14 +28,21 @@ from gsba.loop_closure.merged_map import Registered, follow
 from gsba.matching import correspondences
 from gsba.photometric import direct
 from gsba.photometric.direct import PhotometricResult
+from gsba.pipeline.run import Run
+from gsba.pipeline.stage_titles import WITHOUT_GPS
 from gsba.pipeline.state import MapMatches, State
 from gsba.placement.placement import metres_per_unit
 from gsba.splat import refinement
 from gsba.splat.refinement import SplatResult
-from gsba.store.store import digest
+from gsba.store.store import Chain, digest
 from gsba.trajectory import judgement, steps
 from gsba.types import PoseStatus, Reconstruction, Solution, Tracks
 
+logger = logging.getLogger(__name__)
+
+# Fixes bend a map by this many times the square that their noise and that of the images explain. In
+# simulations with right claims the ratio is at most .25, and images err by twice their claims.
+_MAX_CONTRADICTION = 4.0
 _MIN_BRIDGING = 12  # points of three frames, without which the scale is open: in rendered tours up
 # to 8 left it wrong by a fifth, 16 and more right
 
@@ -173,7 +182,7 @@ def measure_strength(state: State) -> State:
         errors = adjustment.pose_covariances(
             solution, state.observed.keypoints, context, prior.parts
         )
-        return map_strength.measure(
+        strength = map_strength.measure(
             solution.world_T_rigs,
             errors,
             prior.coarse.world_T_rigs,
@@ -183,9 +192,39 @@ def measure_strength(state: State) -> State:
             prior.parts,
             run.frames.recording_of_frame,
         )
+        snapshot = run.families.snapshot(solution, prior.parts)
+        bent = [fixes.contradiction(snapshot, errors[1].draws) for fixes in _fixes_of(run)]
+        return replace(strength, contradiction=max(bent, default=0.0))
 
     strength = run.stage("strength", [run.solving_key(), limits], compute, MapStrength)
     return replace(state, prior=replace(prior, strength=strength))
+
+
+def contradicts_fixes(state: State) -> bool:
+    """True if GPS fixes bend the measured map by more than its images allow."""
+    strength = state.prior.strength
+    return strength is not None and strength.contradiction > _MAX_CONTRADICTION
+
+
+def without_fixes(state: State, latest: Sequence[str]) -> State:
+    """The state without GPS fixes, which its images contradict.
+
+    Args:
+        state: before its map.
+        latest: names of the stages that it rests on.
+    """
+    logger.warning("the images contradict the GPS fixes: the map is made anew without these")
+    run = state.run
+    members = [
+        replace(one, contradicted=True) if isinstance(one, GpsFixes) else one
+        for one in run.families.members
+    ]
+    chain, families = Chain(run.store, latest), run.families.with_members(members)
+    return replace(state, run=replace(run, chain=chain, families=families, suffix=WITHOUT_GPS))
+
+
+def _fixes_of(run: Run) -> list[GpsFixes]:
+    return [family for family in run.families.members if isinstance(family, GpsFixes)]
 
 
 def refine_photometric(state: State) -> State:
@@ -273,7 +312,7 @@ def reconstruct(
             vertical=_vertical(state, result),
         )
         baseline = _baseline(state, world_scale(solution, result))
-        result = replace(result, lens_baseline=baseline)
+        result = replace(result, lens_baseline=baseline, origin=_origin(run, result))
         return result if amended is None else amended(result)
 
     return run.stage("reconstruction", run.solving_key(), compute, Reconstruction)
@@ -283,7 +322,8 @@ def _baseline(state: State, scale: float) -> tuple[float, float] | None:
     """Distance of the lenses of the first camera whose distance is published, else of the first
     one that has two, and its standard deviation; None = none has two.
 
-    Published distances of other cameras say the same of the map's scale: they are averaged.
+    Published distances of other cameras say the same of the map's scale: they are averaged. Where
+    they contradict one another, the standard deviation is as much larger as they scatter.
 
     Args:
         scale: units of the result per map unit.
@@ -300,7 +340,14 @@ def _baseline(state: State, scale: float) -> tuple[float, float] | None:
     weights = metres[:, 1] ** -2.0
     mean = float(weights @ metres[:, 0] / weights.sum())
     length = known[0][1][0] / mean
-    return length, length * float(weights.sum() ** -0.5) / mean
+    misfit = float(weights @ (metres[:, 0] - mean) ** 2) / (len(known) - 1)
+    return length, length * float((max(misfit, 1.0) / weights.sum()) ** 0.5) / mean
+
+
+def _origin(run: Run, result: Reconstruction) -> np.ndarray | None:
+    """Origin of the largest map's world, if it is that of the first trajectory."""
+    another = result.components is not None and result.components[0] != 0
+    return None if another or run.families.fixing_gauge.members else run.coarse.origin
 
 
 def _vertical(state: State, result: Reconstruction) -> np.ndarray | None:
@@ -323,6 +370,7 @@ def _reconstruct_rotations(state: State) -> Reconstruction:
     def compute() -> Reconstruction:
         matches = correspondences.match_for_rotations(observed.context, poses)
         found = tracks.build([matches], np.diff(observed.keypoints.starts))
-        return rotation_only.refine(found, observed.keypoints, poses, prior.coarse, least)
+        result = rotation_only.refine(found, observed.keypoints, poses, prior.coarse, least)
+        return replace(result, origin=_origin(run, result))
 
     return run.stage("reconstruction", [run.settings.matching, least], compute, Reconstruction)

@@ -100,6 +100,7 @@ def joined_poses(parts: Sequence[CoarsePoses]) -> CoarsePoses:
         np.concatenate([part.sources for part in parts]),
         0.0,
         np.repeat(np.arange(len(parts), dtype=np.int32), sizes),
+        parts[0].origin,
     )
 
 

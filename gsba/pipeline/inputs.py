@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from gsba.config import RefineSettings, VideoSettings, installed_families
 from gsba.frames.image_circles import ImageCircle
 from gsba.frames.lens_names import lens_files
 from gsba.frames.times import check_fps
+from gsba.geometry import local_origin
 from gsba.imu.files import read_imu, read_telemetry
 from gsba.imu.readings import Readings
 from gsba.log import GsbaError
@@ -28,6 +30,7 @@ from gsba.store.store import RunStore, fingerprint
 from gsba.trajectory.association import without_trajectory
 from gsba.trajectory.files import read_trajectory
 from gsba.trajectory.keyframes import follow_keyframes
+from gsba.trajectory.lost_frames import without_lost_frames
 from gsba.trajectory.metashape import NamedPoses, is_metashape, read_metashape
 from gsba.trajectory.misread import refuse_useless
 from gsba.trajectory.restarts import associate_pieces, split_restarts
@@ -69,7 +72,7 @@ def read_trajectories(
                 "were aligned, not a video"
             )
         return [component for path in given for component in read_metashape(path)]
-    pieces = [read_trajectory(path, timestamps) for path in given]
+    pieces = [without_lost_frames(read_trajectory(path, timestamps)) for path in given]
     if "keyframes" in origin:
         keyframes = read_trajectory(origin["keyframes"], timestamps)
         pieces = [follow_keyframes(pieces[0], keyframes)]
@@ -77,12 +80,29 @@ def read_trajectories(
 
 
 def timed(given: Sequence[Trajectory | NamedPoses], frames: FrameSet) -> list[Trajectory]:
-    """Trajectories with the times of frames, where their poses go by file names.
+    """Trajectories with the times of frames, where their poses go by file names, each in a world
+    whose origin is near it.
 
     Raises:
         GsbaError: fewer than two frames have a pose of a file.
     """
-    return [one.timed(frames) if isinstance(one, NamedPoses) else one for one in given]
+    known = [one.timed(frames) if isinstance(one, NamedPoses) else one for one in given]
+    return [_near_origin(one) for one in known]
+
+
+def _near_origin(trajectory: Trajectory) -> Trajectory:
+    """A trajectory whose world is shifted if it is far from the origin, as ECEF and UTM are."""
+    origin = local_origin(trajectory.world_T_rigs[:, :3, 3])
+    if origin is None:
+        return trajectory
+    logger.info(
+        "the trajectory is far from its origin: the run's world is shifted by %s, which "
+        "transform.json states",
+        ", ".join(f"{value:.12g}" for value in origin),
+    )
+    poses = trajectory.world_T_rigs.copy()
+    poses[:, :3, 3] -= origin
+    return replace(trajectory, world_T_rigs=poses, origin=origin)
 
 
 def coarse_poses(

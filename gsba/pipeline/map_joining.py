@@ -66,7 +66,12 @@ def begin(store: RunStore, maps: JointMaps, settings: RefineSettings) -> State:
         settings: of that run.
     """
     poses = maps.map.solution.world_T_rigs
-    start = CoarsePoses(poses, np.full(len(poses), PoseSource.SLAM, np.uint8), 0.0)
+    start = CoarsePoses(
+        poses,
+        np.full(len(poses), PoseSource.SLAM, np.uint8),
+        0.0,
+        origin=maps.runs[0].result.origin,
+    )
     families = tuple(inputs.families_of(maps.frames, settings))
     evidence = Evidence(families=families, recordings=_settings_of_cameras(maps, start))
     run = Run.begin(store, maps.frames, start, settings.with_faint_priors(), evidence)

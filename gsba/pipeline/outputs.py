@@ -54,6 +54,7 @@ _OUTPUTS = (
     "coarse.tum",
     "poses.csv",
     "points.ply",
+    "transform.json",
     "config.toml",
     "report.json",
     "report.html",
@@ -97,6 +98,9 @@ def write(state: State, result: Reconstruction, cameras: Cameras) -> RunResult:
     _write_trajectories(store, shown, main)
     write_poses(out / "poses.csv", frames, coarse, result)
     write_points(out / "points.ply", main)
+    (out / "transform.json").unlink(missing_ok=True)
+    if main.origin is not None:
+        Placement().of_trajectory(main.origin).write(out / "transform.json")
     write_text(out / "config.toml", to_toml(settings))
     (out / CALIBRATION).unlink(missing_ok=True)
     _write_calibrations(state, result, cameras)

@@ -297,6 +297,16 @@ def solve(state: State) -> State:
 
 
 def _map_features(state: State) -> State:
+    """The map of all frames' features, without GPS fixes that its images contradict."""
+    latest, run = list(state.run.chain.latest), state.run
+    mapped = _map_all(state)
+    if not backend.contradicts_fixes(mapped):
+        return mapped
+    mapped = _map_all(backend.without_fixes(state, latest))
+    return replace(mapped, run=replace(mapped.run, suffix=run.suffix))
+
+
+def _map_all(state: State) -> State:
     """One map of all frames' features, its camera, and its strength by images alone."""
     rounds = state.run.settings.rounds
     # Neighbours in time are matched; they check the trajectory and its clock.

@@ -87,6 +87,7 @@ _TITLES = {
     "recut+": "choose the calibration that raw frames are cut anew by, after pass {0}",
     "recut+_undone": "take back the frames cut anew after pass {0}",
 }
+WITHOUT_GPS = "@without_gps"  # suffix of stages of a map whose images contradict the GPS fixes
 _PREFIXES = {"first-": "first solution: ", "again_": "once more: ", "export-": "export "}
 
 
@@ -112,6 +113,8 @@ def title_of(name: str) -> str:
     for prefix, words in _PREFIXES.items():
         if name.startswith(prefix):
             return words + title_of(name.removeprefix(prefix))
+    if name.endswith(WITHOUT_GPS):
+        return f"{title_of(name.removesuffix(WITHOUT_GPS))}, without GPS"
     stage, _, recording = name.partition("@")
     if recording:
         return f"{title_of(stage)}, recording {recording}"

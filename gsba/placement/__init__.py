@@ -7,7 +7,8 @@ Gives a `Placement`, which moves poses, points and covariances.
 from gsba.placement.exif import read_exif_gps
 from gsba.placement.frame_fixes import EXIF, fixes_of_frames, read_fixes
 from gsba.placement.gps import GpsFixes, fixes_of, local_from_geodetic, read_gps
-from gsba.placement.placement import Placement, check, guess_in_scan, place, read_placement
+from gsba.placement.placement import check, guess_in_scan, place
+from gsba.placement.world import Placement, read_placement
 
 __all__ = [
     "EXIF",

@@ -1,5 +1,7 @@
 """GPS fixes of a run's frames, from files of all kinds, interpolated at the frames' times."""
 
+import logging
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +14,8 @@ from gsba.placement.exif import read_exif_gps
 from gsba.placement.gps import GpsFixes, local_from_geodetic, read_gps
 from gsba.placement.gps_video import is_recording, read_video_gps
 from gsba.types import FrameSet
+
+logger = logging.getLogger(__name__)
 
 EXIF = "exif"  # in place of a file: positions in the EXIF data of the images
 _ACCELERATION = 1.0  # m/s^2, of pedestrians: bounds the deviation from the line between fixes
@@ -41,6 +45,9 @@ def fixes_of_frames(
 ) -> FrameFixes:
     """Fixes of frames by name, or interpolated between the fixes before and after.
 
+    A receiver without a lock writes latitude 0 and longitude 0, or its last place again and again:
+    both are left out, so that of equal places in a row the first remains.
+
     Between fixes that are `d` seconds apart, a pedestrian deviates from the straight line by up to
     `a d^2 / 8`, a = 1 m/s^2. This deviation is added to the noise; frames where it exceeds the
     noise of the fixes have no fix.
@@ -51,11 +58,13 @@ def fixes_of_frames(
         settings: smallest noise, and correlation time of the errors.
 
     Raises:
-        GsbaError: the source cannot be read, or its times do not overlap with the frames'.
+        GsbaError: the source cannot be read, its receiver had no lock, or its times do not overlap
+            with the frames'.
     """
     settings = settings or GpsSettings()
     fixes = read_fixes(source, frames, settings)
     assert fixes is not None  # frames are known
+    fixes = _locked(source, fixes)
     if fixes.names is None:
         rows, geodetic, sigmas = _between(source, fixes, frames)
     else:
@@ -68,6 +77,40 @@ def fixes_of_frames(
     times = frames.timestamps[rows] if frames.timed else None
     origin[1] = (origin[1] + 180) % 360 - 180
     return FrameFixes(rows, local, sigmas, times, origin, settings.correlation_s)
+
+
+def _locked(source: str, fixes: GpsFixes) -> GpsFixes:
+    """Fixes without those that a receiver writes while it has no lock."""
+    places = fixes.geodetic[:, :2]
+    locked = (places != 0).any(axis=1)
+    if not locked.any():
+        raise GsbaError(
+            f"{source}: all {len(places)} positions are latitude 0, longitude 0: the receiver had "
+            "no fix; leave out --gps"
+        )
+    locked[1:] &= (places[1:] != places[:-1]).any(axis=1)
+    if len(places) > 1 and locked.sum() == 1:
+        raise GsbaError(
+            f"{source}: all {len(places)} positions are equal: the receiver repeated one fix; "
+            "leave out --gps"
+        )
+    if locked.all():
+        return fixes
+    logger.warning(
+        "--gps %s: %d of %d positions are no fixes: they are latitude 0, longitude 0, or repeat "
+        "the position before",
+        source,
+        np.sum(~locked),
+        len(places),
+    )
+    rows = np.flatnonzero(locked).tolist()
+    return replace(
+        fixes,
+        names=None if fixes.names is None else tuple(fixes.names[g] for g in rows),
+        timestamps=None if fixes.timestamps is None else fixes.timestamps[locked],
+        geodetic=fixes.geodetic[locked],
+        sigmas=fixes.sigmas[locked],
+    )
 
 
 def _between(

@@ -5,11 +5,16 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gsba.bundle.fixes import FrameFixes
-from gsba.similarity import Sim3, level_similarity, robust_similarity, similarity
+from gsba.bundle.fixes import MAX_DRIFT_SHARE, FrameFixes
+from gsba.similarity import (
+    NoSimilarityError,
+    Sim3,
+    extent_of,
+    level_similarity,
+    robust_similarity,
+    similarity,
+)
 
-_MEDIAN_LENGTH = 1.538  # median length of a 3-vector of independent unit normals
-_OUTLIER_SIGMAS = 4.6  # 99.99 % of such vectors are shorter
 _MAX_ROUNDS, _MAX_STEPS = 20, 20  # selections of inliers, and Gauss-Newton steps in each
 _MIN_STEP = 1e-10  # in units of the unknowns' own scale; a smaller one ends the fit
 _LEVEL_UNKNOWNS = (0, 3, 4, 5, 6)  # unknowns that are free if up is known
@@ -58,8 +63,7 @@ def fit_fixes(
     """Maximum-likelihood similarity from a map to GPS fixes with correlated errors and outliers.
 
     Least squares with the inverse covariance of all fixes (`gsba.bundle.fixes`), initialised by
-    `gsba.similarity.robust_similarity`. A fix is an outlier if its residual exceeds 4.6 standard
-    deviations, or 4.6 times the scatter of all fixes if that is larger.
+    `gsba.similarity.robust_similarity`. For the gate of outliers see `FrameFixes.inliers`.
 
     Args:
         positions: (G, 3) positions of the fixes' frames, map units, not all on one point.
@@ -72,15 +76,17 @@ def fit_fixes(
         NoSimilarityError: positions and fixes are barely correlated.
     """
     solve, num = (similarity, 3) if up_sigma is None else (level_similarity, 2)
-    fit, used, _ = robust_similarity(positions, fixes.positions, solve, num)
+    limits = fixes.tolerances(), MAX_DRIFT_SHARE
+    fit, used, _ = robust_similarity(positions, fixes.positions, solve, num, *limits)
     centre = positions[used].mean(axis=0)
     free = _ALL_UNKNOWNS if up_sigma is None else _LEVEL_UNKNOWNS
     information = np.zeros((7, 7))
     for _ in range(_MAX_ROUNDS):
         fit, information = _most_probable(fit, positions, fixes, used, centre, free, scale)
-        distances = np.linalg.norm(_residuals(fit, positions, fixes) / fixes.sigmas, axis=1)
-        wide = max(1.0, float(np.median(distances)) / _MEDIAN_LENGTH)
-        before, used = used, distances <= _OUTLIER_SIGMAS * wide
+        extent = fit.scale * extent_of(positions)
+        before, (used, _) = used, fixes.inliers(_residuals(fit, positions, fixes), extent)
+        if used.sum() < num:
+            raise NoSimilarityError(f"only {used.sum()} of {len(used)} positions agree")
         if np.array_equal(before, used):
             break
     off = _residuals(fit, positions, fixes)[used]

@@ -5,26 +5,25 @@ export; `transform.json` in it states the similarity and its inverse.
 """
 
 import dataclasses
-import json
 import logging
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gsba.bundle.fixes import FrameFixes
+from gsba.bundle.fixes import MAX_DRIFT_SHARE, FrameFixes
 from gsba.config import GpsSettings, PlacementSettings
-from gsba.geometry import pose
 from gsba.log import GsbaError, brief
 from gsba.placement.frame_fixes import fixes_of_frames, read_fixes
 from gsba.placement.gps_fit import GpsFit, fit_fixes
+from gsba.placement.world import Placement
 from gsba.scans.files import check_scan, normals_of, read_pairs, read_scan, upwards
 from gsba.scans.registration import in_file, register
 from gsba.scans.search import Guess
 from gsba.scans.types import Scan, cloud_of
 from gsba.similarity import (
     Sim3,
+    extent_of,
     extents,
     naming,
     pose_similarity,
@@ -35,7 +34,6 @@ from gsba.similarity import (
 from gsba.trajectory.association import matched_in_time
 from gsba.trajectory.files import read_trajectory
 from gsba.types import FrameSet, PoseStatus, Reconstruction, Trajectory
-from gsba.version import __version__
 
 logger = logging.getLogger(__name__)
 
@@ -44,109 +42,15 @@ UPS = {"z": np.array([0.0, 0, 1]), "y": np.array([0.0, 1, 0])}  # up axes of sca
 _TOLERANCE_S = 0.02  # largest time from a frame to its true pose
 _SCALE_RANGE = (1e-12, 1e12)  # of a placed run; others come from wrong input
 _MAX_COORDINATE = 1e12  # in the placed unit
-_MAX_FLOAT32_COORDINATE = 1e4  # larger ones lose digits as float32: an offset is split off
-_MIN_GPS_EXTENT_M = 1e-3  # of positions: a working receiver scatters by more
 _MAX_LENS_SCALE_SIGMA = 0.1  # relative, of a scale by the lenses
 _MAX_GPS_SCALE_SIGMA = 0.3  # relative, of a scale by GPS
 _MAX_GPS_ANGLE_SIGMA_DEG = 25.0  # of heading and tilt by GPS
+_MAX_SCALE_SIGMAS = 4.0  # of two scales that agree: true ones differ by more once in 16,000 runs
+_NUM_NAMED = 5  # false positions that a message names
 _SIGMA_BY_EDGES_DEG = 0.2  # of a vertical by edges, see docs/gyro.md
 _SIGMA_BY_FORCES_DEG = 0.5  # of a vertical by an accelerometer, for its bias
 _SIGMA_BY_RIGS_DEG = 3.0  # of a vertical by the rigs' up axes
 _MIN_EXTENT_RATIO = 0.02  # of a path's second extent to its first: less determines no roll
-
-
-@dataclass(frozen=True, slots=True)
-class Placement:
-    """Transform of a run's world: placed = similarity of the run; world = placed + offset."""
-
-    similarity: Sim3 = field(default_factory=Sim3)
-    unit: str = "map units"  # of the placed world
-    up: str | None = None  # axis of the placed world that points up: "-y", "y", "z"; None = unknown
-    offset: np.ndarray = field(default_factory=lambda: np.zeros(3))  # (3,), unit of the placed
-    origin: tuple[float, float, float] | None = None  # latitude, longitude, altitude of placed 0
-    grounds: dict[str, Any] = field(default_factory=dict)  # data it was computed from, and sigmas
-    map_number: int = 1  # map of the run that is placed, 1 = the largest
-
-    @property
-    def matrix(self) -> np.ndarray:
-        """(4, 4) float64: placed = matrix @ run, homogeneous."""
-        move = self.similarity
-        return pose(move.scale * move.rotation, move.translation)
-
-    @property
-    def inverse(self) -> np.ndarray:
-        """(4, 4) float64: run = inverse @ placed, homogeneous."""
-        move = self.similarity
-        back = move.rotation.T / move.scale
-        return pose(back, -back @ move.translation)
-
-    def apply(self, reconstruction: Reconstruction) -> Reconstruction:
-        """Reconstruction in the placed world; bearings and rotation sigmas do not change."""
-        poses, move = reconstruction.world_T_rigs, self.similarity
-        stretch = np.array([1.0, 1, 1, *[move.scale] * 3])  # tangents are in the rig frame
-        joint, origins = reconstruction.joint_errors, reconstruction.observation_origins
-        lenses = reconstruction.lens_baseline
-        return dataclasses.replace(
-            reconstruction,
-            world_T_rigs=move.poses(poses),
-            points_world=move.points(reconstruction.points_world),
-            pose_covariances=reconstruction.pose_covariances * stretch[:, None] * stretch,
-            joint_errors=joint and joint.scaled(np.tile(stretch, (len(poses), 1))),
-            observation_origins=None if origins is None else move.scale * origins,
-            lens_baseline=lenses and (move.scale * lenses[0], move.scale * lenses[1]),
-        )
-
-    def to_json(self) -> dict[str, Any]:
-        """Content of transform.json."""
-        names = ("latitude", "longitude", "altitude")
-        return {
-            "gsba": __version__,
-            "meaning": "placed = scale * rotation @ run + translation; world = placed + offset",
-            "scale": self.similarity.scale,
-            "rotation": self.similarity.rotation.tolist(),
-            "translation": self.similarity.translation.tolist(),
-            "matrix": self.matrix.tolist(),
-            "inverse": self.inverse.tolist(),
-            "unit": self.unit,
-            "up": self.up,
-            "offset": self.offset.tolist(),
-            "origin": None if self.origin is None else dict(zip(names, self.origin, strict=True)),
-            "grounds": self.grounds,
-            "map": self.map_number,
-        }
-
-    def write(self, path: Path) -> None:
-        """Write transform.json."""
-        text = json.dumps(self.to_json(), indent=1, allow_nan=False) + "\n"
-        path.write_text(text, encoding="utf-8")
-
-
-def read_placement(path: Path) -> Placement:
-    """Placement of an export, from its transform.json.
-
-    Raises:
-        GsbaError: the file is missing, or gsba did not write it.
-    """
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        scale, rotation = float(content["scale"]), np.array(content["rotation"], np.float64)
-        translation = np.array(content["translation"], np.float64)
-        origin, up = content["origin"], content["up"]
-        if origin is not None:
-            origin = origin["latitude"], origin["longitude"], origin["altitude"]
-        return Placement(
-            Sim3(scale, rotation.reshape(3, 3), translation.reshape(3)),
-            str(content["unit"]),
-            up,
-            np.array(content["offset"], np.float64).reshape(3),
-            origin,
-            content["grounds"],
-            int(content.get("map", 1)),
-        )
-    except OSError as error:
-        raise GsbaError(f"{path}: cannot be read ({error.strerror})") from None
-    except (ValueError, TypeError, KeyError, OverflowError, RecursionError):
-        raise GsbaError(f"{path} is not a transform.json of gsba: export again") from None
 
 
 def place(
@@ -183,7 +87,9 @@ def place(
             f"the placed run would have a scale of {scale:g} and coordinates up to {far:g}: check "
             "the values of --scale, --between, --gps, --align or --align-scan"
         )
-    return placement
+    if settings.gps is None and settings.align is None and settings.scan is None:
+        return placement.of_trajectory(reconstruction.origin)
+    return placement.near_origin(placed)
 
 
 def _placement(
@@ -385,11 +291,6 @@ def _on_earth(
             f"{path}: {len(fixes)} of its positions are of refined frames; 3 are needed: check "
             "that they are of this recording and on the frames' clock"
         )
-    if np.ptp(fixes.positions, axis=0).max() < _MIN_GPS_EXTENT_M:
-        raise GsbaError(
-            f"{path}: all {len(fixes)} positions are equal: the receiver repeated one fix; leave "
-            "out --gps"
-        )
     positions, level, up_sigma = reconstruction.world_T_rigs[fixes.frames, :3, 3], np.eye(3), None
     if upright.up is not None:
         level = _least_turn(_UP_WORLD, np.array([0.0, 0, 1])) @ upright.similarity.rotation
@@ -400,7 +301,13 @@ def _on_earth(
         )
     with naming(path):
         found = fit_fixes(positions @ level.T, fixes, up_sigma, scale)
+    off = residuals_of(found.similarity, positions @ level.T, fixes.positions)
+    _require_majority(
+        path, found.used, off, frames, fixes.frames, "a noisier receiver needs --gps-sigma"
+    )
     _require_determined(path, found, fixes)
+    if scale is not None:
+        _require_one_scale(path, positions @ level.T, fixes, up_sigma, scale)
     fit = dataclasses.replace(found.similarity, rotation=found.similarity.rotation @ level)
     grounds = {**upright.grounds, "gps": {"file": str(path), **_claims(found, positions @ level.T)}}
     logger.info(
@@ -417,6 +324,55 @@ def _on_earth(
     )
     where = (float(fixes.origin[0]), float(fixes.origin[1]), float(fixes.origin[2]))
     return Placement(fit, unit="m", up="z", origin=where, grounds=grounds)
+
+
+def _require_majority(
+    path: Path,
+    used: np.ndarray,
+    off: np.ndarray,
+    frames: FrameSet,
+    rows: np.ndarray,
+    advice: str,
+) -> None:
+    """Raise GsbaError, naming them, if no more than half of a file's positions agree with the run.
+
+    Args:
+        path: the file.
+        used: (N,) bool, inliers.
+        off: (N,) residuals, placed units.
+        frames, rows: frames of the run, and rows (N,) of those that the positions are of.
+        advice: what else may help.
+    """
+    if 2 * used.sum() > len(used):
+        return
+    false = rows[~used]
+    names = [f"{frames.names[f]} ({frames.timestamps[f]:.3f} s)" for f in false[:_NUM_NAMED]]
+    more = f" and {len(false) - _NUM_NAMED} more" if len(false) > _NUM_NAMED else ""
+    raise GsbaError(
+        f"{path}: {len(false)} of {len(used)} positions contradict the run, by "
+        f"{np.median(off[~used]):.3g} units in the median, more than their noise and the run's "
+        f"drift allow: those of frames {', '.join(names)}{more}; remove false positions, or check "
+        f"that the file is of this recording and on the frames' clock; {advice}"
+    )
+
+
+def _require_one_scale(
+    path: Path,
+    positions: np.ndarray,
+    fixes: FrameFixes,
+    up_sigma: float | None,
+    scale: tuple[float, float],
+) -> None:
+    """Raise GsbaError if the scale by GPS alone contradicts a known one, see `fit_fixes`."""
+    alone = fit_fixes(positions, fixes, up_sigma)
+    off = abs(np.log(alone.similarity.scale / scale[0]))
+    if off > _MAX_SCALE_SIGMAS * np.hypot(alone.scale_sigma, scale[1] / scale[0]):
+        raise GsbaError(
+            f"{path}: its positions give {alone.similarity.scale:.4g} m per map unit (sigma "
+            f"{100 * alone.scale_sigma:.2g} %), the lenses {scale[0]:.4g} (sigma "
+            f"{100 * scale[1] / scale[0]:.2g} %): check --baseline and the positions, and pass "
+            "one of --gps and --scale lens"
+        )
 
 
 def _claims(found: GpsFit, positions: np.ndarray) -> dict[str, Any]:
@@ -472,7 +428,7 @@ def _up_sigma(upright: Placement) -> float:
 
 
 def _aligned(reconstruction: Reconstruction, frames: FrameSet, path: Path) -> Placement:
-    """Placement in the world of true poses; an offset is split off large coordinates."""
+    """Placement in the world of true poses."""
     truth = read_trajectory(path)
     _require_times(path, frames)
     run = Trajectory(frames.timestamps, reconstruction.world_T_rigs)
@@ -484,23 +440,23 @@ def _aligned(reconstruction: Reconstruction, frames: FrameSet, path: Path) -> Pl
             f"{path}: {len(rows)} of its poses are within {_TOLERANCE_S} s of a refined frame; 3 "
             "are needed: check that both use one clock"
         )
-    true_T_rigs = truth.world_T_rigs[of_truth].copy()
-    middle = np.median(true_T_rigs[:, :3, 3], axis=0)
-    large = np.abs(middle).max() > _MAX_FLOAT32_COORDINATE
-    offset = np.round(middle, -2) if large else np.zeros(3)
-    true_T_rigs[:, :3, 3] -= offset
+    true_T_rigs = truth.world_T_rigs[of_truth]
     world_T_rigs = reconstruction.world_T_rigs[rows]
     source, target = world_T_rigs[:, :3, 3], true_T_rigs[:, :3, 3]
+    straight = extents(source)[1] <= _MIN_EXTENT_RATIO
     with naming(path):
-        if extents(source)[1] > _MIN_EXTENT_RATIO:
-            fit, used, sigma = robust_similarity(source, target, similarity, 3)
-        else:  # the positions of a straight path determine no roll, but orientations do
+        if straight:  # its positions determine no roll, but orientations do
             fit = pose_similarity(world_T_rigs, true_T_rigs)
-            residuals = residuals_of(fit, source, target)
-            used, sigma = np.ones(len(rows), bool), float(np.sqrt(np.mean(residuals**2)))
+            used = residuals_of(fit, source, target) <= MAX_DRIFT_SHARE * extent_of(target)
+        else:
+            limits = np.zeros(len(rows)), MAX_DRIFT_SHARE
+            fit, used, _ = robust_similarity(source, target, similarity, 3, *limits)
+    residuals = residuals_of(fit, source, target)
+    _require_majority(path, used, residuals, frames, rows, "its positions count as exact")
+    sigma = float(np.sqrt(np.mean(residuals[slice(None) if straight else used] ** 2)))
     grounds = {"file": str(path), "poses": len(rows), "outliers": int(np.sum(~used)), "rmse": sigma}
     unit = "units of the true poses"
-    return Placement(fit, unit=unit, offset=offset, grounds={"align": grounds})
+    return Placement(fit, unit=unit, grounds={"align": grounds})
 
 
 def _in_scan(

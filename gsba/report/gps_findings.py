@@ -18,10 +18,15 @@ def notes_on_gps(content: Mapping[str, Any], num_frames: int) -> list[str]:
         num_frames: frames of the run.
     """
     if not content["taken"]:
+        why = (
+            "most of them are further from where the images put the frames than their noise and a "
+            "map's drift allow, or the path is shorter than their error"
+        )
+        if content["contradicted"]:
+            why = "they would bend the map by more than its images and their noise allow"
         note = (
-            f"GPS was not used: its {content['fixes']} positions and the frames' are not "
-            "correlated; check its clock, and that the path is longer than the error of the "
-            "positions"
+            f"GPS was not used: the images contradict its {content['fixes']} positions: {why}; "
+            "check the positions, their noise and their clock"
         )
         logger.warning(note)
         return [note]

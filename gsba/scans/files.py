@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from gsba.frames.times import read_lines
+from gsba.geometry import local_origin
 from gsba.log import GsbaError, brief
 from gsba.scans.claims import check_claims
 from gsba.scans.surfaces import on_planes
@@ -24,7 +25,6 @@ SUFFIXES = (".ply", *CLOUDS, *LASER, *MESHES)
 _MAX_POINTS = 400_000  # of a thinned scan
 _NUM_MESH_SAMPLES = 1_000_000  # points sampled on a mesh, before it is thinned
 _MAX_COORDINATE = 1e9  # in a scan's file
-_MAX_FLOAT32_COORDINATE = 1e4  # larger ones lose digits as float32: an offset is split off
 _MIN_POINTS = 1000
 _MIN_PAIRS = 3
 
@@ -115,12 +115,12 @@ def read_scan(path: Path) -> Scan:
     o3d, (mesh, points, colors) = open3d(), _content(path)
     if mesh is not None:
         vertices = np.asarray(mesh.vertices)
-        offset = _offset(vertices)
+        offset = _origin_of(vertices)
         mesh.vertices = o3d.utility.Vector3dVector(vertices - offset)
         o3d.utility.random.seed(0)
         cloud = mesh.sample_points_uniformly(_NUM_MESH_SAMPLES, use_triangle_normal=True)
     else:
-        offset = _offset(points)
+        offset = _origin_of(points)
         cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points - offset))
         if colors is not None:
             cloud.colors = o3d.utility.Vector3dVector(colors)
@@ -243,13 +243,10 @@ def _of_laser(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     return points, colors / max(colors.max(initial=0), 1.0)
 
 
-def _offset(points: np.ndarray) -> np.ndarray:
-    """Offset (3,) that is split off large coordinates; 0 for others."""
-    if not len(points):
-        return np.zeros(3)
-    middle = np.median(points, axis=0)
-    large = np.abs(middle).max() > _MAX_FLOAT32_COORDINATE
-    return np.round(middle, -2) if large else np.zeros(3)
+def _origin_of(points: np.ndarray) -> np.ndarray:
+    """Origin (3,) that is split off points far from 0, see `local_origin`; 0 for others."""
+    origin = local_origin(points)
+    return np.zeros(3) if origin is None else origin
 
 
 def _thinned(cloud: Any, path: Path) -> Any:

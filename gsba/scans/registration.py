@@ -12,7 +12,7 @@ import numpy as np
 from gsba.log import GsbaError
 from gsba.scans.fit import Fit, approach, settle
 from gsba.scans.judge import Grid, Verdict, verdict
-from gsba.scans.noise import noise_of
+from gsba.scans.noise import noise_of, reach_of
 from gsba.scans.search import Guess, candidates, distance
 from gsba.scans.types import Cloud, Scan
 from gsba.similarity import Sim3
@@ -111,7 +111,7 @@ def register(cloud: Cloud, scan: Scan, guess: Guess | None = None) -> Registrati
             evidence.contradicted.mean(),
             doubts[best, n],
         )
-    _check(found)
+    _check(found, reach_of(found.fit.similarity, cloud))
     if guess.similarity is None:
         _check_handed(found, cloud, scan, guess, grid)
     _check_alone(found)
@@ -135,9 +135,18 @@ _ADVICE = (
 )
 
 
-def _check(found: Registration) -> None:
-    """Refuse a placement that explains too little."""
-    evidence = found.verdict
+def _check(found: Registration, reach: float) -> None:
+    """Refuse a placement that explains too little, or only by a noise that no run has.
+
+    Args:
+        reach: largest noise of a run, unit of the scan.
+    """
+    evidence, sigma = found.verdict, found.fit.noise.sigma
+    if sigma > reach:
+        raise NoPlacementError(
+            f"no placement explains the run: in the best, its points are {sigma:.3g} units (rms) "
+            f"off the scan's surfaces, and {reach:.3g} are allowed: " + _ADVICE
+        )
     if evidence.share < _MIN_SHARE or evidence.agreement < _MIN_AGREEMENT:
         raise NoPlacementError(
             f"no placement explains the run: in the best, {100 * evidence.share:.0f} % of its "

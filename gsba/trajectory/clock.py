@@ -8,7 +8,7 @@ clock than the given one is accepted only if rotations determine it, no third cl
 well, and it explains the images markedly better.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,6 +25,8 @@ _TURNING_SIGMAS, _AGREEING_SIGMAS = 4.0, 3.0  # standard deviations: least rotat
 _MIN_TURNS = 4  # least number of steps that turn
 _MIN_EXPLAINED = 0.4  # least share of the turns that the right clock explains
 _SURE_EXPLAINED = 0.6  # share of the turns from which no other clocks are searched
+_MAX_NOISE_RAD = np.deg2rad(2.0)  # largest noise of a trajectory's steps per axis: by three
+# times as much, steps contradict the images (verify.max_rotation_deg)
 _MIN_GAIN = 0.2  # share of the turns by which another clock must explain more
 _MAX_RIVAL_SHARE = 0.75  # share of the best clock's explained turns that no rival may reach
 
@@ -44,7 +46,7 @@ class Clock:
     def on_frames(self, trajectory: Trajectory) -> Trajectory:
         """A trajectory with its times on the frames' clock."""
         times = self.start + (trajectory.timestamps - self.start - self.offset) / self.rate
-        return Trajectory(times, trajectory.world_T_rigs)
+        return replace(trajectory, timestamps=times)
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,7 +151,7 @@ def _with_verdict(
         _MAX_SIGMA_INTERVALS * interval, _MAX_SIGMA_S
     ):
         note = f"the camera turns too little to check the clock (uncertain by {certain:.2g} s)"
-    elif after < _MIN_EXPLAINED:
+    elif after < _MIN_EXPLAINED or noise(fit.residuals(best)) > _MAX_NOISE_RAD:
         note = "the trajectory's rotations fit the images at no clock offset: clock not checked"
     elif same:
         verdict = "agrees"

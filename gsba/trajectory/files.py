@@ -1,5 +1,6 @@
 """Trajectory files as `world_T_rigs`: TUM, KITTI, stella_vslam's map; writing TUM."""
 
+import logging
 import math
 import os
 from collections.abc import Callable, Sequence
@@ -16,6 +17,8 @@ from gsba.types import Trajectory
 if TYPE_CHECKING:
     import msgpack
 
+_log = logging.getLogger(__name__)
+
 _MAX_COORDINATE = 1e12  # largest coordinate, in any unit: beyond, differences lose precision
 _UNIT_TOLERANCE = 1e-3  # largest deviation of a quaternion's norm, or of a matrix from a rotation
 
@@ -28,6 +31,9 @@ def read_trajectory(path: Path, timestamps: Path | None = None) -> Trajectory:
 
     After a loop closure of stella_vslam, give its keyframes: the frame poses still hang on relative
     poses from before the closure, and interpolating the keyframes was three times more accurate.
+
+    Rows by which a SLAM says that it lost a frame are rows without a pose, and left out: NaN or
+    infinite values, a quaternion of zeros, positions beyond 1e12.
 
     Raises:
         GsbaError: a line cannot be used; the message names file and line.
@@ -81,9 +87,48 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
 def _read_tum(path: Path, rows: Sequence[tuple[int, str]]) -> Trajectory:
     where, cells = _split(path, rows, 8)
     times = np.array([_number(c[0], w, seconds) for c, w in zip(cells, where, strict=True)])
-    values = np.array([[_number(v, w) for v in c[1:]] for c, w in zip(cells, where, strict=True)])
+    values = np.array([[_value(v, w) for v in c[1:]] for c, w in zip(cells, where, strict=True)])
+    tracked = _tracked(path, values, values[:, :3], (values[:, 3:] != 0).any(axis=1), where)
+    where, times, values = [where[i] for i in tracked], times[tracked], values[tracked]
     rotations = _rotations(values[:, [6, 3, 4, 5]], where)
     return _trajectory(path, times, pose(rotations, values[:, :3]), where)
+
+
+def _tracked(
+    path: Path,
+    values: np.ndarray,
+    positions: np.ndarray,
+    turned: np.ndarray,
+    where: Sequence[str],
+) -> np.ndarray:
+    """Rows (M,) of N that have a pose, at least 2 unless N is less; others are logged.
+
+    Args:
+        path: of the file.
+        values: (N, V) numbers of a row.
+        positions: (N, 3) among them.
+        turned: (N,) bool, rows whose rotation is not all zeros.
+        where: (N) place of each row.
+    """
+    known = np.isfinite(values).all(axis=1) & turned
+    known &= (np.abs(np.where(known[:, None], positions, 0)) <= _MAX_COORDINATE).all(axis=1)
+    lost = np.flatnonzero(~known)
+    if len(lost) and known.sum() < 2:
+        raise GsbaError(
+            f"{where[lost[0]]}: no pose (NaN, zeros, or a position beyond {_MAX_COORDINATE:g}), as "
+            f"in {len(lost)} of {len(known)} rows; at least 2 poses are needed"
+        )
+    if len(lost):
+        _log.warning(
+            "%s: %d of %d rows have no pose, as of lost frames (NaN, zeros, or positions beyond "
+            "%g; the first is %s): left out",
+            path,
+            len(lost),
+            len(known),
+            _MAX_COORDINATE,
+            where[lost[0]],
+        )
+    return np.flatnonzero(known)
 
 
 def _read_kitti(path: Path, rows: Sequence[tuple[int, str]], timestamps: Path | None) -> Trajectory:
@@ -99,8 +144,12 @@ def _read_kitti(path: Path, rows: Sequence[tuple[int, str]], timestamps: Path | 
             "SLAM have no row in a KITTI file, so give the TUM file or a matching list"
         )
     where, cells = _split(path, rows, 12)
-    values = np.array([[_number(v, w) for v in c] for c, w in zip(cells, where, strict=True)])
+    values = np.array([[_value(v, w) for v in c] for c, w in zip(cells, where, strict=True)])
     world_P_rigs = values.reshape(-1, 3, 4)
+    turned = (world_P_rigs[:, :, :3] != 0).any(axis=(1, 2))
+    tracked = _tracked(path, values, world_P_rigs[:, :, 3], turned, where)
+    where, times = [where[i] for i in tracked], times[tracked]
+    world_P_rigs = world_P_rigs[tracked]
     u, _, vt = np.linalg.svd(world_P_rigs[:, :, :3])
     nearest = u @ vt
     off = np.abs(nearest - world_P_rigs[:, :, :3]).max(axis=(1, 2))
@@ -176,6 +225,14 @@ def _number(text: str, where: str, parse: Callable[[str], float] = float) -> flo
     if not math.isfinite(value):
         raise GsbaError(f"{where}: '{brief(text)}' is not a finite number")
     return value
+
+
+def _value(text: str, where: str) -> float:
+    """A number of a pose, which may be NaN or infinite."""
+    try:
+        return float(text)
+    except ValueError:
+        raise GsbaError(f"{where}: '{brief(text)}' is not a number") from None
 
 
 def _rotations(wxyz: np.ndarray, where: Sequence[str]) -> np.ndarray:

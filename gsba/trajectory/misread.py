@@ -1,9 +1,11 @@
 """Detection of trajectories in another convention, or of another recording."""
 
+import itertools
+
 import numpy as np
 
 from gsba.config import VerifySettings
-from gsba.geometry import inverse
+from gsba.geometry import inverse, pose, quaternion_from_rotation, rotation_from_quaternion
 from gsba.log import GsbaError
 from gsba.trajectory.steps import Steps, step_errors
 from gsba.types import CoarsePoses, PoseSource
@@ -14,6 +16,7 @@ _LOOSE_LIMITS = {"max_rotation_deg": 20.0, "max_direction_deg": 60.0}  # thresho
 # agreement
 _DOUBTFUL_SHARE = 0.6  # share of agreeing steps below which another convention is accepted
 _MIN_EXPLAINED_SHARE = 0.7  # least share of steps that another convention must explain
+_WAYS = {0: {1: "right", -1: "left"}, 1: {1: "down", -1: "up"}, 2: {1: "forward", -1: "back"}}
 _ADVICE = "or refine without it (--no-trajectory)"
 
 
@@ -44,11 +47,16 @@ def refuse_misread(coarse: CoarsePoses, found: Steps, settings: VerifySettings) 
     judged = _judged_steps(coarse, found)
     if judged.sum() < _MIN_STEPS:
         return
+    readings = _steps_in_other_conventions(coarse.world_T_rigs)
     shares = {
         reading: _agreeing_share(steps, found, judged, settings)
-        for reading, steps in _steps_in_other_conventions(coarse.world_T_rigs).items()
+        for reading, steps in readings.items()
     }
-    best = max(shares, key=lambda reading: shares[reading])
+    most = max(shares.values())
+    likely = [
+        reading for reading in shares if shares[reading] * judged.sum() > most * judged.sum() - 1
+    ]
+    best = min(likely, key=lambda reading: _mean_error(readings[reading], found, judged))
     if not best or shares[best] < _MIN_EXPLAINED_SHARE or shares[""] >= _DOUBTFUL_SHARE:
         return
     late, explained = _delay_in_frames(coarse, found, judged, settings)
@@ -130,8 +138,9 @@ def _steps(poses: np.ndarray) -> np.ndarray:
 
 
 def _steps_in_other_conventions(world_T_rigs: np.ndarray) -> dict[str, np.ndarray]:
-    """Steps (F - 1,) of a trajectory in other conventions."""
+    """Steps (F - 1,) of a trajectory in other conventions, the commoner ones first."""
     steps = _steps(world_T_rigs)
+    w_first = pose(_w_first(world_T_rigs[:, :3, :3]), world_T_rigs[:, :3, 3])
     readings = {
         "": steps,
         "reversed in time: check its timestamps": _steps(world_T_rigs[::-1]),
@@ -142,11 +151,45 @@ def _steps_in_other_conventions(world_T_rigs: np.ndarray) -> dict[str, np.ndarra
         "turned by half about the vertical axis: its x and z point the other way": _flipped(
             steps, [-1, 1, -1]
         ),
+        "turned by half about the forward axis: its x and y point the other way": _flipped(
+            steps, [-1, -1, 1]
+        ),
     }
     for name, axis in zip("xyz", np.eye(3), strict=True):
         mirrored = f"mirrored along {name}: it is no rigid motion of this camera, flip that axis"
         readings[mirrored] = _flipped(steps, 1 - 2 * axis)
+    order = "in quaternions of the order w, x, y, z: write them as x, y, z, w"
+    readings[order] = _steps(w_first)
+    for axes, rotation in _turned_axes().items():
+        into = f"in axes of {axes}: convert it to x right, y down, z forward"
+        readings[into] = _in_axes(steps, rotation)
+        readings[f"{order}; and {into}"] = _in_axes(_steps(w_first), rotation)
     return readings
+
+
+def _w_first(rotations: np.ndarray) -> np.ndarray:
+    """Rotations (F, 3, 3) whose quaternions were written w, x, y, z and read as x, y, z, w."""
+    wxyz = quaternion_from_rotation(rotations)
+    return rotation_from_quaternion(wxyz[:, [1, 2, 3, 0]])
+
+
+def _turned_axes() -> dict[str, np.ndarray]:
+    """Rotations (3, 3) from camera axes of other programs to ours, by what these axes are."""
+    found = {}
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1, -1), repeat=3):
+            rotation = np.eye(3)[:, order] * signs  # column n: axis n of theirs, in ours
+            if np.linalg.det(rotation) > 0 and not np.array_equal(rotation, np.eye(3)):
+                ways = (_WAYS[axis][sign] for axis, sign in zip(order, signs, strict=True))
+                found[", ".join(map(" ".join, zip("xyz", ways, strict=True)))] = rotation
+    return found
+
+
+def _in_axes(steps: np.ndarray, ours_R_theirs: np.ndarray) -> np.ndarray:
+    """Steps (F - 1, 4, 4) of a camera in our axes, from those in other axes."""
+    turn = np.eye(4)
+    turn[:3, :3] = ours_R_theirs
+    return turn @ steps @ turn.T
 
 
 def _flipped(steps: np.ndarray, signs: np.ndarray | list[int]) -> np.ndarray:
@@ -162,3 +205,10 @@ def _agreeing_share(
     agree = turned < np.deg2rad(settings.max_rotation_deg)
     agree &= off < np.deg2rad(settings.max_direction_deg)
     return float(agree[judged].mean())
+
+
+def _mean_error(steps: np.ndarray, found: Steps, judged: np.ndarray) -> float:
+    """Mean error of the judged steps' rotation and direction, radians: it decides between readings
+    that differ in a motion which is small in all steps, as that up and down."""
+    turned, off = step_errors(steps, found)
+    return float(np.mean((turned + off)[judged]))

@@ -80,6 +80,7 @@ def associate_pieces(
     times = np.concatenate([piece.timestamps for piece in pieces])
     poses = np.concatenate([piece.world_T_rigs for piece in pieces])
     coarse = associate(frames, Trajectory(times, poses), settings)
+    coarse = replace(coarse, origin=pieces[0].origin)
     if len(pieces) == 1:
         return coarse
     owners = np.repeat(np.arange(len(pieces)), [len(piece.timestamps) for piece in pieces])
@@ -105,7 +106,8 @@ def _in_turn(pieces: Sequence[Trajectory]) -> list[Trajectory]:
     kept: list[Trajectory] = []
     for piece in sorted(pieces, key=lambda piece: float(piece.timestamps[0])):
         later = piece.timestamps > kept[-1].timestamps[-1] if kept else slice(None)
-        trimmed = Trajectory(piece.timestamps[later], piece.world_T_rigs[later])
+        rows = piece.timestamps[later], piece.world_T_rigs[later]
+        trimmed = Trajectory(*rows, piece.origin)
         if len(trimmed.timestamps) >= 2:
             kept.append(trimmed)
         else:

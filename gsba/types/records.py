@@ -49,6 +49,8 @@ class Trajectory:
 
     timestamps: np.ndarray  # (N,) float64, seconds, strictly increasing
     world_T_rigs: np.ndarray  # (N, 4, 4) float64, map units
+    origin: np.ndarray | None = None  # (3,) float64: world of the file = this world + origin; None
+    # = the same
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +62,7 @@ class CoarsePoses:
     time_offset: float  # seconds added to frame times to reach the trajectory's clock
     segments: np.ndarray | None = None  # (F,) int32, trajectory piece of each frame, ascending;
     # each piece has its own world until pieces are joined; None = there is one
+    origin: np.ndarray | None = None  # (3,) float64, of the first piece, see Trajectory
 
     @property
     def absent(self) -> bool:
@@ -476,6 +479,8 @@ class Reconstruction:
     # there was none
     map_scales: np.ndarray | None = None  # (C,) float64, units of each component's world per unit
     # of the largest map's; None = there is one map
+    origin: np.ndarray | None = None  # (3,) float64: world of the trajectory's file = world of the
+    # largest map + origin; None = the same
 
     @property
     def num_maps(self) -> int:
@@ -506,8 +511,8 @@ class Reconstruction:
         baseline, scale = self.lens_baseline, self.map_scale(number)
         if baseline is not None:
             found = replace(found, lens_baseline=(scale * baseline[0], scale * baseline[1]))
-        return replace(found, vertical=None)  # the vertical is known in the world of the largest
-        # map
+        # Vertical and origin are known in the world of the largest map.
+        return replace(found, vertical=None, origin=None)
 
     def map_scale(self, number: int) -> float:
         """Units of a map's world per unit of the largest map's."""

@@ -15,7 +15,7 @@ from gsba.frames import cubemap, lens_faces
 from gsba.frames.masks import load_mask
 from gsba.geometry import rotation_from_quaternion
 from gsba.log import GsbaError
-from gsba.placement.placement import Placement, read_placement
+from gsba.placement.world import Placement, read_placement
 from gsba.report.html.figures import viewing_axes
 from gsba.splat.gaussians import SH_CONSTANT, Gaussians
 from gsba.splat.ply import read_ply

@@ -1,5 +1,6 @@
 """The page's requests: who gets answers, what may be chosen, and what is run."""
 
+import json
 import socket
 import time
 from collections.abc import Iterator
@@ -119,6 +120,32 @@ def test_the_chooser_stays_below_its_root(client: TestClient, tmp_path: Path) ->
     for values in ({"frames": "../x", "out": "r"}, {"frames": "walk", "out": "../r"}):
         answer = post(client, "api/add", {"command": "refine", "values": values})
         assert "outside" in answer["error"]
+
+
+def test_values_are_confined_as_they_are_used(client: TestClient) -> None:
+    """Without blanks around them, and in texts, too."""
+    for values in (
+        {"out": " ../x "},
+        {"gps": "/etc/passwd"},
+        {"gps": " out/secret.txt"},
+        {"recording": ["walk,name=a", "/elsewhere,name=x"]},
+        {"recording": ["walk,trajectory=../x.tum"]},
+        {"overrides": ["gps.file=/etc/passwd"]},
+        {"factors": "bearing,gps:/etc/x"},
+    ):
+        given = {"frames": "walk", "out": "r"} | values
+        answer = post(client, "api/add", {"command": "refine", "values": given})
+        assert "outside" in answer["error"], values
+    near = {"frames": "walk", "out": " r ", "gps": "walk/gps.csv", "cluster": "tcp://10.0.0.1:8786"}
+    answer = post(client, "api/command", {"command": "refine", "values": near})
+    assert "outside" not in answer["error"] and "--out r " in answer["command"]
+    assert client.get("files/%252e%252e/secret.txt").status_code in (400, 404)
+    half = {"command": "refine", "values": {"frames": "\ud800", "out": "r"}}
+    for request in ("api/add", "api/command"):
+        content = json.dumps(half).encode()
+        kind = {"content-type": "application/json"}
+        answer = client.post(request, content=content, headers=kind)
+        assert answer.status_code < 500 and "half characters" in answer.json()["error"]
 
 
 def test_info_of_a_file_that_is_no_video_is_one_line(client: TestClient) -> None:

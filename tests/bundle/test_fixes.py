@@ -44,3 +44,20 @@ def test_fixes_without_times_are_neither_alike_nor_independent() -> None:
     assert np.all(claimed > 1.5 * SIGMAS_M / 20) and np.all(claimed < 5 * SIGMAS_M / 20)
     one = fixes_at(np.zeros((1, 3)), None)
     np.testing.assert_array_equal(one.independent_sigmas(), [SIGMAS_M])
+
+
+def test_false_fixes_cannot_widen_the_gate() -> None:
+    """However many are false: a gate as wide as their median would take all."""
+    num, rng = 20, np.random.default_rng(4)
+    fixes = fixes_at(np.zeros((num, 3)), None)
+    off = SIGMAS_M * rng.normal(size=(num, 3))
+    used, scatter = fixes.inliers(off, 100.0)
+    assert used.all() and scatter < 1.5
+    noisy, scatter = fixes.inliers(3 * off, 100.0)  # as in streets
+    assert noisy.all() and 2 < scatter < 3.5
+    off[:8] += [500.0, 0, 0]
+    used, _ = fixes.inliers(off, 100.0)
+    assert not used[:8].any() and used[8:].all()
+    off[:12] += [500.0, 0, 0]
+    used, scatter = fixes.inliers(off, 100.0)
+    assert not used[:12].any() and used.sum() <= num / 2 and scatter < 4

@@ -136,6 +136,27 @@ def test_fixes_do_not_move_what_images_know_better() -> None:
     assert off < np.sqrt(np.mean(np.einsum("fii->f", claimed[1:, 3:, 3:])))
 
 
+def test_images_contradict_fixes_that_bend_their_map() -> None:
+    """A precise receiver's: right fixes pull as their noise says, stretched ones far more."""
+    world = make_world(1, 24)
+    coarse = drifted(world.world_T_rigs, np.random.default_rng(1))
+    level = LEVEL.points(world.world_T_rigs[:, :3, 3])
+    ratios = []
+    for stretch in (1.0, 1.15):
+        noisy = level * [stretch, 1, 1] + 0.01 * (_fixes(world, 1).positions - level)
+        fixes = replace(_fixes(world, 1), positions=noisy)
+        fixes = replace(fixes, sigmas=0.01 * fixes.sigmas)
+        solved = _solve(world, coarse, fixes)
+        problem = _problem(coarse, solved.world_T_rigs, None)
+        _, joint = adjustment.pose_covariances(solved, world.keypoints, problem)
+        snapshot = Families().snapshot(solved)
+        family = GpsFixes(fixes, GpsSettings())
+        ratios.append(family.contradiction(snapshot, joint.draws))
+        muted = replace(family, contradicted=True)
+        assert muted.fitted(snapshot) is None and muted.digest != family.digest
+    assert ratios[0] < 0.5 and ratios[1] > 5
+
+
 def test_linear_factors_leave_the_gauge_free() -> None:
     """Any similar set of poses is as good: what moves all alike costs nothing."""
     world = make_world(0, 24)

@@ -173,11 +173,9 @@ def test_lengths_of_unknown_units_are_refused(tmp_path: Path, unit: Any) -> None
 
 
 def test_aliases_of_yaml_are_refused(tmp_path: Path) -> None:
-    """Nine lines of them stand for a list of a billion."""
-    lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x, x]"]
-    lines += [f"a{k}: &a{k} [{', '.join(10 * [f'*a{k - 1}'])}]" for k in range(1, 10)]
+    """Nine lines of them can stand for a list of a billion: the first one is refused."""
     path = tmp_path / "cam.yaml"
-    path.write_text("\n".join([*lines, "cam0: *a9"]))
+    path.write_text("a0: &a0 [x]\ncam0: *a0\n")
     with pytest.raises(GsbaError, match=r"line 2 holds an alias; write out what it stands for"):
         read_calibration(path)
 

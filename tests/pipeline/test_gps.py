@@ -23,11 +23,19 @@ def _with_gps(file: Path, **options: float) -> RefineSettings:
     return RefineSettings.model_validate(tree | {"gps": {"file": str(file), **options}})
 
 
-def _table(path: Path, case: Case, metres: float, seed: int = 0, shift_s: float = 0.0) -> Path:
-    """Fixes of the true positions, blown up to metres, with .3 m of noise."""
+def _table(
+    path: Path,
+    case: Case,
+    metres: float,
+    seed: int = 0,
+    shift_s: float = 0.0,
+    stretch: float = 1.0,
+) -> Path:
+    """Fixes of the true positions, blown up to metres and along north, with .3 m of noise."""
     times, upright = case.truth.timestamps, np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     level = metres * case.truth.world_T_rigs[:, :3, 3] @ upright
     level += np.random.default_rng(seed).normal(0, 0.3, level.shape)
+    level[:, 1] *= stretch
     rows = [
         f"{t + shift_s!r},{lat:.10f},{lon:.10f},{alt:.4f}"
         for t, (lat, lon, alt) in zip(times.tolist(), geodetic_of(level), strict=True)
@@ -107,6 +115,17 @@ def test_positions_elsewhere_have_no_say(case: Case, without: Path, tmp_path: Pa
     assert not report["gps"]["taken"]
     assert any(note.startswith("GPS was not used") for note in report["notes"])
     assert _apart(out, without) < 1e-4
+
+
+def test_fixes_that_images_contradict_are_left_out(
+    case: Case, without: Path, tmp_path: Path
+) -> None:
+    """Precise by their claim, but stretched: they would bend the map."""
+    table, out = _table(tmp_path / "gps.csv", case, 300.0, stretch=1.1), tmp_path / "run"
+    report = case.refine(out, _with_gps(table, sigma_m=0.05, sigma_up_m=0.05)).report
+    assert report["gps"] | {"taken": False, "contradicted": True} == report["gps"]
+    assert any("would bend the map" in note for note in report["notes"])
+    assert _apart(out, without) < 1e-3
 
 
 def test_settings_name_both_or_none() -> None:

@@ -3,7 +3,7 @@
 import csv
 import json
 import shutil
-from dataclasses import astuple, replace
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -36,7 +36,8 @@ def _greyed(case: Case, to: Path, frames: list[int]) -> Path:
 
 
 def _without(trajectory: Trajectory, frame: int) -> Trajectory:
-    return Trajectory(*(np.delete(x, frame, 0) for x in astuple(trajectory)))
+    both = trajectory.timestamps, trajectory.world_T_rigs
+    return Trajectory(*(np.delete(x, frame, 0) for x in both))
 
 
 def test_poses_become_better_by_far(case: Case) -> None:

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from gsba import load_run
 from gsba.cli import app
 from gsba.log import GsbaError
-from gsba.placement.placement import read_placement
+from gsba.placement.world import read_placement
 from gsba.store.folder import open_run_folder
 from gsba.store.records import RecordError, load_record, save_record, typed
 from gsba.store.store import RunStore, StageRecord

@@ -59,15 +59,11 @@ def test_tum_whole_nanoseconds(tmp_path: Path) -> None:
         ("0.5 1 2 3 0 0 0", "7 values where others have 8"),
         ("0.5 1 2 3 0 0 0 1 9", "9 values where others have 8"),
         ("0.5,1,2,3,0,0,0,1", "1 values where others have 8"),
-        ("0.5 1e155 2 3 0 0 0 1", "a position further than 1e\\+12 from the origin"),
         ("1e300 1 2 3 0 0 0 1", "'1e300' is not a finite number"),
-        ("0.5 1 2 " + "x" * 5000 + " 0 0 0 1", "'x+\\.\\.\\.x+' is not a finite number"),
-        ("0.5 1 2 x 0 0 0 1", "'x' is not a finite number"),
+        ("0.5 1 2 " + "x" * 5000 + " 0 0 0 1", "'x+\\.\\.\\.x+' is not a number"),
+        ("0.5 1 2 x 0 0 0 1", "'x' is not a number"),
         ("t 1 2 3 0 0 0 1", "'t' is not a finite number"),
         ("nan 1 2 3 0 0 0 1", "'nan' is not a finite number"),
-        ("0.5 1 inf 3 0 0 0 1", "'inf' is not a finite number"),
-        ("0.5 1 2 3 0 0 NaN 1", "'NaN' is not a finite number"),
-        ("0.5 1 2 3 0 0 0 0", "quaternion is zero"),
         ("0.5 1 2 3 0 0 0 1.01", "quaternion has norm 1.01, not 1"),
         ("0.5 1 2 3 0 0 0 1e300", "quaternion has norm inf, not 1"),
         ("0 1 2 3 0 0 0 1", "timestamp 0.0 occurs twice"),
@@ -79,6 +75,19 @@ def test_refused_tum_lines(tmp_path: Path, line: str, message: str) -> None:
     path = saved(tmp_path, f"# header\n{TUM[0]}\n{line}\n{TUM[2]}\n")
     with pytest.raises(GsbaError, match=rf"traj\.txt:3: {message}"):
         read_trajectory(path)
+
+
+@pytest.mark.parametrize(
+    "row",
+    ["nan nan nan nan nan nan nan", "1 2 3 0 0 0 0", "1e27 0 0 0 0 0 1", "0 inf 0 0 0 0 1"],
+)
+def test_rows_of_lost_frames_have_no_pose(tmp_path: Path, row: str) -> None:
+    lines = [f"{n} {n} 0 0 0 0 0 1" for n in range(4)]
+    trajectory = read_trajectory(saved(tmp_path, "\n".join([*lines[:2], f"2 {row}", lines[3]])))
+    np.testing.assert_array_equal(trajectory.timestamps, [0, 1, 3])
+    np.testing.assert_array_equal(trajectory.world_T_rigs[:, 0, 3], [0, 1, 3])
+    with pytest.raises(GsbaError, match=r"traj\.txt:2: no pose .* in 2 of 3 rows; at least 2"):
+        read_trajectory(saved(tmp_path, f"{lines[0]}\n1 {row}\n2 {row}\n"))
 
 
 @pytest.mark.parametrize(
@@ -129,7 +138,7 @@ def test_refused_kitti(tmp_path: Path) -> None:
         read_trajectory(path, saved(tmp_path, "1\n2\n3\n", "times.txt"))
     with pytest.raises(GsbaError, match=r"traj\.txt:2: timestamp 1\.0 occurs twice"):
         read_trajectory(path, saved(tmp_path, "1\n1\n", "times.txt"))
-    for row in ("-1 0 0 5 0 1 0 6 0 0 1 7", "2 0 0 5 0 1 0 6 0 0 1 7", " ".join("0" * 12)):
+    for row in ("-1 0 0 5 0 1 0 6 0 0 1 7", "2 0 0 5 0 1 0 6 0 0 1 7"):
         path = saved(tmp_path, f"{KITTI[0]}\n{row}\n")
         with pytest.raises(GsbaError, match=r"traj\.txt:2: the left 3x3 block is not a rotation"):
             read_trajectory(path, saved(tmp_path, "1\n2\n", "times.txt"))

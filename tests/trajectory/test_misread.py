@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from synthetic import drifted, loop_walk, unit
 
 from gsba.config import RefineSettings, VerifySettings
@@ -17,6 +18,18 @@ from gsba.types import CoarsePoses, PoseSource, Trajectory, VerifiedPairs
 NUM = 30
 SLAM = drifted(loop_walk(NUM), np.random.default_rng(0))
 MIRROR, OPENGL = np.diag([-1.0, 1, 1, 1]), np.diag([1.0, -1, -1, 1])
+
+
+TURNED, ROLLED = np.diag([-1.0, 1, -1, 1]), np.diag([-1.0, -1, 1, 1])
+ROS = np.array(
+    [[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]]
+)  # ours_T_forward-left-up
+
+
+def _w_first(world_T_rigs: np.ndarray) -> np.ndarray:
+    """Poses as read where their file has quaternions w, x, y, z."""
+    xyzw = Rotation.from_matrix(world_T_rigs[:, :3, :3]).as_quat()
+    return pose(Rotation.from_quat(xyzw[:, [3, 0, 1, 2]]).as_matrix(), world_T_rigs[:, :3, 3])
 
 
 def _coarse(world_T_rigs: np.ndarray) -> CoarsePoses:
@@ -44,6 +57,11 @@ def _another() -> np.ndarray:
         (inverse(SLAM), "camera-from-world"),
         (MIRROR @ SLAM @ MIRROR, "mirrored along x"),
         (OPENGL @ SLAM @ OPENGL, "y up and z backward"),
+        (TURNED @ SLAM @ TURNED, "half about the vertical axis: its x and z"),
+        (ROLLED @ SLAM @ ROLLED, "half about the forward axis: its x and y"),
+        (SLAM @ ROS, "axes of x forward, y left, z up: convert it to x right, y down, z forward"),
+        (_w_first(SLAM), "order w, x, y, z: write them as x, y, z, w, or"),
+        (_w_first(SLAM @ ROS), "order w, x, y, z: .*; and in axes of x forward, y left, z up"),
         (_another(), "another recording"),
     ],
 )

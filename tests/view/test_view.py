@@ -26,7 +26,7 @@ from gsba.camera.rig import RIG_R_FACE, CubeRig
 from gsba.cli import app
 from gsba.geometry import rotation_from_quaternion
 from gsba.log import GsbaError
-from gsba.placement.placement import Placement, read_placement
+from gsba.placement.world import Placement, read_placement
 from gsba.similarity import Sim3
 from gsba.splat import Gaussians, write_ply
 from gsba.types import FACES
