@@ -9,7 +9,7 @@ from gsba.geometry import inverse
 from gsba.matching import pairs
 from gsba.matching.correspondences import verified
 from gsba.matching.guided_search import Gate, MatchContext
-from gsba.trajectory import clock, joining, judgement, misread
+from gsba.trajectory import clock, joining, judgement, misread, turning
 from gsba.trajectory.clock import ClockEstimate
 from gsba.trajectory.joining import SegmentAlignment
 from gsba.trajectory.judgement import StepChecks
@@ -25,6 +25,7 @@ from gsba.trajectory.steps import (
     step_errors,
     without_steps,
 )
+from gsba.trajectory.turning import Turn
 from gsba.types import CoarsePoses, Counts, Keypoints, Trajectory, VerifiedPairs
 
 _WIDER_GAPS = 2, 4, 8  # gaps in frames of additional pairs
@@ -47,6 +48,7 @@ class Recovered:
     trust: StepChecks
     coarse: CoarsePoses  # the trajectory, its pieces in one world
     joints: tuple[SegmentAlignment, ...] = ()  # alignments of those pieces
+    turn: Turn | None = None  # rotations, as far as matches prove them without any position
 
     @property
     def counts(self) -> Counts:
@@ -113,7 +115,8 @@ def recover(
     guessed = joining.guessed(joints, len(coarse.sources))
     guessed |= trust.unseen_steps & judgement.leaps(coarse.world_T_rigs, timestamps)
     trust = replace(trust, false_steps=trust.false_steps | guessed)
-    return Recovered(neighbours, trust, coarse, joints)
+    turn = turning.prove(neighbours, keypoints, settings.verify)
+    return Recovered(neighbours, trust, coarse, joints, turn)
 
 
 def _all_neighbours(
@@ -302,7 +305,9 @@ def _check_steps(
 ) -> StepChecks:
     steps = image_steps(found, keypoints)
     logs, sigmas = _length_ratios(found, steps, keypoints, coarse.absent)
-    return judgement.check_steps(coarse, steps, logs, sigmas, settings.verify, settings.priors)
+    moved, verify = steps.directed.any(), settings.verify
+    turn = None if moved else turning.prove(found, keypoints, verify)
+    return judgement.check_steps(coarse, steps, logs, sigmas, verify, settings.priors, turn)
 
 
 def _length_ratios(
