@@ -25,7 +25,6 @@ from gsba.trajectory.steps import (
     step_errors,
     without_steps,
 )
-from gsba.trajectory.turning import Turn
 from gsba.types import CoarsePoses, Counts, Keypoints, Trajectory, VerifiedPairs
 
 _WIDER_GAPS = 2, 4, 8  # gaps in frames of additional pairs
@@ -48,7 +47,6 @@ class Recovered:
     trust: StepChecks
     coarse: CoarsePoses  # the trajectory, its pieces in one world
     joints: tuple[SegmentAlignment, ...] = ()  # alignments of those pieces
-    turn: Turn | None = None  # rotations, as far as matches prove them without any position
 
     @property
     def counts(self) -> Counts:
@@ -115,8 +113,7 @@ def recover(
     guessed = joining.guessed(joints, len(coarse.sources))
     guessed |= trust.unseen_steps & judgement.leaps(coarse.world_T_rigs, timestamps)
     trust = replace(trust, false_steps=trust.false_steps | guessed)
-    turn = turning.prove(neighbours, keypoints, settings.verify)
-    return Recovered(neighbours, trust, coarse, joints, turn)
+    return Recovered(neighbours, trust, coarse, joints)
 
 
 def _all_neighbours(

@@ -193,7 +193,7 @@ def judge_trajectory(state: State) -> State:
                 f"{seen} of {num} pairs of neighbouring frames match, by so little that they show "
                 f"neither a way nor a turn on the spot: {_hindrance(run)}"
             )
-    prior = replace(prior, coarse=coarse, trust=trust, joints=found.joints, turn=found.turn)
+    prior = replace(prior, coarse=coarse, trust=trust, joints=found.joints)
     return state.begun(prior, near)
 
 

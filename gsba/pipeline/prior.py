@@ -15,7 +15,6 @@ from gsba.loop_closure.merged_map import Registered, side_by_side
 from gsba.trajectory.clock import ClockEstimate
 from gsba.trajectory.joining import SegmentAlignment
 from gsba.trajectory.judgement import StepChecks
-from gsba.trajectory.turning import Turn
 from gsba.types import CoarsePoses, GyroConstraints, PoseSource, Solution
 
 _MIN_DEFINING_POSES = 3  # of a recording's trajectory, that define the world of a map
@@ -34,9 +33,6 @@ class Prior:
     strength: MapStrength | None = None  # of the map, by images alone; None = not measured
     gyro: Alignment | None = None  # of the sensor that rides along; None = there is none
     turning: GyroConstraints | None = None  # its constraints on frames; None = images contradict it
-    turn: Turn | None = (
-        None  # rotations that matches prove without any position; None = they do not
-    )
     of_recordings: tuple["Prior", ...] = ()  # of each of several recordings, before they were
     # combined: clocks and gyros of their own; () = there is one recording
 

@@ -60,7 +60,7 @@ def prove(pairs: VerifiedPairs, keypoints: Keypoints, settings: VerifySettings) 
         rotations[p], off = rotation_of_most(*rays)
         alike = off < MAX_PARALLAX_RAD
         counts[p] = [witnesses(rays[0][some], CELLS_PER_SIDE) for some in (alike, ~alike)]
-    proved = np.array([_is_turn(*count, settings) for count in counts.tolist()], bool)
+    proved = np.array([_is_turn(own, others, settings) for own, others in counts.tolist()], bool)
     turn = _tied(frames[proved], rotations[proved], num_frames)
     if np.count_nonzero(turn.frames) < min(_MIN_FRAMES, num_frames):
         return None
