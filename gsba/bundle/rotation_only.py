@@ -30,6 +30,7 @@ def refine(
     world_T_rigs: np.ndarray,
     coarse: CoarsePoses,
     min_observations: int,
+    parts: np.ndarray | None = None,
 ) -> Reconstruction:
     """Refine the rotations of frames that were taken from one place.
 
@@ -39,6 +40,7 @@ def refine(
         world_T_rigs: (F, 4, 4) rotations right but for the drift of a chain; positions are kept.
         coarse: poses that define the world.
         min_observations: frames with fewer count as unrefined.
+        parts: (F,) int, 0 = frames that matches tie together, others alone; None = all are tied.
 
     Returns:
         A result without points; covariances are of rotations, NaN for positions.
@@ -47,7 +49,7 @@ def refine(
     six = np.full((len(rotations), 6, 6), np.nan)
     six[:, :3, :3] = covariances
     solved = Solution.without_points(pose(rotations, world_T_rigs[:, :3, 3]))
-    result = assemble(solved, six, keypoints, coarse, min_observations)
+    result = assemble(solved, six, keypoints, coarse, min_observations, components=parts)
     refined = np.where(used >= min_observations, PoseStatus.REFINED, PoseStatus.UNREFINED)
     return replace(result, pose_statuses=refined.astype(np.uint8))
 

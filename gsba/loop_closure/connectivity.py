@@ -36,6 +36,12 @@ def maps_of_images(pairs: np.ndarray, num_frames: int) -> np.ndarray:
     return np.where(np.bincount(parts)[parts] < MIN_MAP_FRAMES, -1, parts)
 
 
+def apart(lonely: np.ndarray) -> np.ndarray | None:
+    """Component (F,) int64 of each frame where those `lonely` (F,) bool are components of their
+    own, behind all others; None = there is none."""
+    return np.where(lonely, np.cumsum(lonely), 0) if lonely.any() else None
+
+
 def several(found: np.ndarray) -> np.ndarray | None:
     """Labels, or None if all are equal."""
     return found if (found != found[0]).any() else None

@@ -9,7 +9,7 @@ from gsba.geometry import inverse
 from gsba.matching import pairs
 from gsba.matching.correspondences import verified
 from gsba.matching.guided_search import Gate, MatchContext
-from gsba.trajectory import clock, joining, judgement, misread
+from gsba.trajectory import clock, joining, judgement, misread, turning
 from gsba.trajectory.clock import ClockEstimate
 from gsba.trajectory.joining import SegmentAlignment
 from gsba.trajectory.judgement import StepChecks
@@ -302,7 +302,9 @@ def _check_steps(
 ) -> StepChecks:
     steps = image_steps(found, keypoints)
     logs, sigmas = _length_ratios(found, steps, keypoints, coarse.absent)
-    return judgement.check_steps(coarse, steps, logs, sigmas, settings.verify, settings.priors)
+    moved, verify = steps.directed.any(), settings.verify
+    turn = None if moved else turning.prove(found, keypoints, verify)
+    return judgement.check_steps(coarse, steps, logs, sigmas, verify, settings.priors, turn)
 
 
 def _length_ratios(

@@ -12,14 +12,13 @@ import numpy as np
 
 from gsba.camera.rig import witnesses
 from gsba.config import VerifySettings
-from gsba.geometry import inverse, nearest_rotation, pose, rotation_angle
+from gsba.geometry import inverse, pose, rotation_angle
 from gsba.significance import least_agreeing, outweighs
 from gsba.store.shards import ITEMS, Workers, even_blocks
+from gsba.trajectory.turning import CELLS_PER_SIDE, rotation_of_most
 from gsba.types import Counts, Keypoints, Matches, VerifiedPairs
 
 _SAMPLE_SIZE = 5  # size of a minimal sample
-_CELLS_PER_SIDE = 16  # cells along a face's side: all matches within one, 6 degrees, count as one
-# witness
 _RIVAL_FREE_BAND = 3.0  # inlier thresholds around a pose's epipolar planes within which matches
 # support no rival
 _MODEL_SIGMA_RAD = np.deg2rad(0.15)  # noise of bearings assumed to have one centre: lenses are
@@ -30,7 +29,6 @@ _LOG_MEDIAN_RATIO_SIGMA = 2.75  # standard deviation of the logarithm of the rat
 # sample medians, times the root of the sample's size
 _MIN_TRANSLATION_SIGMAS = 4.75  # threshold on that ratio: one rotation in a million passes for a
 # translation
-_NUM_ROTATION_REFITS = 5  # refits of a rotation without the matches that are furthest off
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,7 +197,7 @@ def _significant_pose(
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """f0_T_f1 (4, 4) with unit translation and inliers (m,) bool of the best pose; None if chance
     explains as many."""
-    largest, num = np.sin(np.deg2rad(settings.max_error_deg)), witnesses(bearings0, _CELLS_PER_SIDE)
+    largest, num = np.sin(np.deg2rad(settings.max_error_deg)), witnesses(bearings0, CELLS_PER_SIDE)
 
     def needed(of_match: float) -> int:
         of_witness = 1 - (1 - of_match) ** (len(bearings0) / num)
@@ -214,7 +212,7 @@ def _significant_pose(
     sines = _normals(found[0], bearings0) @ (found[0][:3, :3] @ bearings1.T)
     np.fill_diagonal(sines, np.inf)
     agreeing = np.count_nonzero(np.abs(sines) < largest) / (sines.size - len(sines))
-    enough = witnesses(bearings0[found[1]], _CELLS_PER_SIDE) >= needed(
+    enough = witnesses(bearings0[found[1]], CELLS_PER_SIDE) >= needed(
         max(chance, agreeing, largest)
     )
     return found if enough else None
@@ -264,7 +262,7 @@ def _is_rivalled(
     if rival is None:
         return False
     support, against = bearings0[inliers], bearings0[rest][rival[1]]
-    numbers = witnesses(support, _CELLS_PER_SIDE), witnesses(against, _CELLS_PER_SIDE)
+    numbers = witnesses(support, CELLS_PER_SIDE), witnesses(against, CELLS_PER_SIDE)
     return not outweighs(*numbers, settings.max_error_rate)
 
 
@@ -276,25 +274,14 @@ def _direction_sigma(f0_T_f1: np.ndarray, bearings0: np.ndarray, bearings1: np.n
     """
     rotation, planes = f0_T_f1[:3, :3], _normals(f0_T_f1, bearings0)
     across = np.sum(planes * (bearings1 @ rotation.T), axis=1)
-    turned = bearings1 @ _rotation(bearings0, bearings1).T
-    left = np.median(np.sum((bearings0 - turned) ** 2, axis=1)) / _CHI_SQUARE_MEDIANS[0]
+    off = rotation_of_most(bearings0, bearings1)[1]
+    left = np.median(off**2) / _CHI_SQUARE_MEDIANS[0]
     noise = np.median(across**2) / _CHI_SQUARE_MEDIANS[1]
     noise, left = noise + _MODEL_SIGMA_RAD**2, left + _MODEL_SIGMA_RAD**2
-    num = witnesses(bearings0, _CELLS_PER_SIDE)
+    num = witnesses(bearings0, CELLS_PER_SIDE)
     if np.log(left / noise) < _MIN_TRANSLATION_SIGMAS * _LOG_MEDIAN_RATIO_SIGMA / np.sqrt(num):
         return np.inf
     return _direction_error(f0_T_f1, bearings0, bearings1) * np.sqrt(noise * len(bearings0) / num)
-
-
-def _rotation(bearings0: np.ndarray, bearings1: np.ndarray) -> np.ndarray:
-    """f0_R_f1 (3, 3) that best rotates most bearings (m, 3) of frame 1 onto those of frame 0."""
-    near = np.ones(len(bearings0), bool)
-    rotation = np.eye(3)
-    for _ in range(_NUM_ROTATION_REFITS):
-        rotation = nearest_rotation(bearings0[near].T @ bearings1[near])
-        off = np.linalg.norm(bearings0 - bearings1 @ rotation.T, axis=1)
-        near = off <= np.median(off)
-    return rotation
 
 
 def _direction_error(f0_T_f1: np.ndarray, bearings0: np.ndarray, bearings1: np.ndarray) -> float:

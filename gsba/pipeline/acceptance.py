@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from gsba.bundle.predicted_steps import step_deviations
 from gsba.frames.masks import load_mask
 from gsba.geometry import inverse, step_covariances, unit
 from gsba.log import GsbaError
@@ -10,6 +11,9 @@ from gsba.types import FrameSet, Reconstruction
 
 MIN_STEP_SIGMAS = 3.0  # median length of a map's steps, in standard deviations; maps of real and
 # rendered walks have 40 and more
+MAX_STEP_DEVIATION = 0.5  # of a step from the one that far frames predict, part of its length: true
+# walks deviate by .006 at most, true positions of a turn by hand by .05
+MAX_CONTRADICTED_SHARE = 0.1  # of steps
 MIN_SHARE_AHEAD = 0.8  # of a vehicle's way: a tenth of it may go backwards
 
 
@@ -68,6 +72,7 @@ def require_motion(frames: FrameSet, result: Reconstruction) -> None:
             "of the vehicle, or a trajectory"
         )
     if not len(sigmas) or np.median(sigmas) >= MIN_STEP_SIGMAS:
+        _require_prediction(main)
         return
     cause = where if share >= VEHICLE_SHARE else "the camera hardly moves, or little matches"
     raise GsbaError(
@@ -75,6 +80,24 @@ def require_motion(frames: FrameSet, result: Reconstruction) -> None:
         f"deviations long, and {MIN_STEP_SIGMAS:g} are needed: {cause}; nothing is written: give "
         "sharper frames, other frames per second, or a trajectory"
     )
+
+
+def _require_prediction(main: Reconstruction) -> None:
+    """Refuse a map whose steps differ from those that frames further away predict.
+
+    Raises:
+        GsbaError: more than `MAX_CONTRADICTED_SHARE` of the steps do.
+    """
+    deviations = step_deviations(main)
+    tested = deviations[np.isfinite(deviations)]
+    wrong = np.count_nonzero(tested > MAX_STEP_DEVIATION)
+    if wrong > MAX_CONTRADICTED_SHARE * len(tested):
+        raise GsbaError(
+            f"the images determine no positions: {wrong} of {len(tested)} steps differ by more "
+            f"than {100 * MAX_STEP_DEVIATION:.0f} % from those that frames further away predict: "
+            "the camera hardly moves but turns; nothing is written: give frames of a walk, the "
+            "camera's calibration, or a trajectory"
+        )
 
 
 def step_sigmas(result: Reconstruction) -> np.ndarray:

@@ -366,11 +366,16 @@ def _reconstruct_rotations(state: State) -> Reconstruction:
     """Rotations alone, of a camera that stayed in one place."""
     run, prior, observed = state.run, state.prior, state.observed
     least, poses = run.settings.rounds.min_observations, prior.start().world_T_rigs
+    turn = prior.trust.turn
+    assert turn is not None
+    parts = connectivity.apart(~turn.frames)
 
     def compute() -> Reconstruction:
         matches = correspondences.match_for_rotations(observed.context, poses)
-        found = tracks.build([matches], np.diff(observed.keypoints.starts))
-        result = rotation_only.refine(found, observed.keypoints, poses, prior.coarse, least)
+        tied = connectivity.within(matches, parts)
+        found = tracks.build([tied], np.diff(observed.keypoints.starts))
+        given = found, observed.keypoints, poses, prior.coarse, least, parts
+        result = rotation_only.refine(*given)
         return replace(result, origin=_origin(run, result))
 
     return run.stage("reconstruction", [run.settings.matching, least], compute, Reconstruction)

@@ -80,7 +80,7 @@ def _combined(priors: Sequence[Prior]) -> Prior:
         np.concatenate([one.false_frames for one in trusts]),
         _steps([one.unseen_steps for one in trusts], True),
         _steps([move.scale * one.lengths for move, one in zip(moves, trusts, strict=True)], 0.0),
-        False,
+        None,
     )
     joints = _joints(priors, guesses, moves)
     return Prior(

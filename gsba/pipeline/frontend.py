@@ -187,7 +187,14 @@ def judge_trajectory(state: State) -> State:
         )
     if coarse.absent:
         coarse = replace(coarse, world_T_rigs=trust.world_T_rigs)
-    return state.begun(replace(prior, coarse=coarse, trust=trust, joints=found.joints), near)
+        if not (trust.turning_only or np.isfinite(near.direction_sigmas).any()):
+            seen, num = np.count_nonzero(~trust.unseen_steps), len(trust.unseen_steps)
+            raise GsbaError(
+                f"{seen} of {num} pairs of neighbouring frames match, by so little that they show "
+                f"neither a way nor a turn on the spot: {_hindrance(run)}"
+            )
+    prior = replace(prior, coarse=coarse, trust=trust, joints=found.joints)
+    return state.begun(prior, near)
 
 
 def drop_implausible_steps(state: State) -> State:

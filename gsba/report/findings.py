@@ -70,10 +70,17 @@ def _steps(trust: StepChecks, frames: FrameSet, absent: bool) -> tuple[dict[str,
             f"images contradict the trajectory at {named(false, 'trajectory.false_frames')}: its "
             "poses there are not used"
         )
-    if trust.turning_only:
+    if trust.turn is not None:
         notes.append(
-            "no two frames have parallax: only rotations are refined, and there are no points"
+            "matches show a turn on the spot and no parallax: only rotations are refined, and "
+            "there are no points"
         )
+        judgement["not_tied"] = apart = names[~trust.turn.frames].tolist()
+        if apart:
+            notes.append(
+                "no matches tie these frames to the others: they have no rotation and are not "
+                f"exported: {named(apart, 'trajectory.not_tied', f'of {len(names)} frames')}"
+            )
     if trust.held_steps.any():
         steps = [f"{a} to {b}" for a, b in between(trust.held_steps)]
         seen = ~trust.unseen_steps

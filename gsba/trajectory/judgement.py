@@ -14,6 +14,7 @@ import numpy as np
 from gsba.config import PriorSettings, VerifySettings
 from gsba.geometry import inverse, nearest_rotation, pose, rotation_angle
 from gsba.trajectory.steps import Steps, chained, step_errors, step_lengths
+from gsba.trajectory.turning import Turn
 from gsba.types import CoarsePoses, PoseSource
 
 logger = logging.getLogger(__name__)
@@ -47,14 +48,19 @@ class StepChecks:
     false_frames: np.ndarray  # (F,) bool, both steps at a frame are false, but not around it
     unseen_steps: np.ndarray  # (F - 1,) bool, not estimated from images: the trajectory alone
     lengths: np.ndarray  # (F - 1,) float64, map units, of the steps
-    turning_only: bool  # no two frames have parallax: only rotations can be estimated
+    turn: Turn | None  # rotations of a camera that turned on the spot; None = it moved
 
     @classmethod
     def of_all(cls, world_T_rigs: np.ndarray) -> "StepChecks":
         """Checks of a trajectory (F, 4, 4) that nothing contradicts."""
         none = np.zeros(max(len(world_T_rigs) - 1, 0), bool)
         lengths = np.linalg.norm(np.diff(world_T_rigs[:, :3, 3], axis=0), axis=1)
-        return cls(world_T_rigs, none, np.zeros(len(world_T_rigs), bool), none, lengths, False)
+        return cls(world_T_rigs, none, np.zeros(len(world_T_rigs), bool), none, lengths, None)
+
+    @property
+    def turning_only(self) -> bool:
+        """True if only rotations can be estimated."""
+        return self.turn is not None
 
     @property
     def sound(self) -> bool:
@@ -74,6 +80,7 @@ def check_steps(
     sigmas: np.ndarray,
     verify: VerifySettings,
     priors: PriorSettings,
+    turn: Turn | None = None,
 ) -> StepChecks:
     """Compare the trajectory's steps with those of the images.
 
@@ -83,12 +90,15 @@ def check_steps(
         logs, sigmas: (F - 2,) logarithms of ratios of lengths, and standard deviations.
         verify: thresholds of contradiction.
         priors: noise of the trajectory's steps.
+        turn: proof that the camera turned on the spot; None = there is none, or it moved.
     """
     slam = inverse(coarse.world_T_rigs[:-1]) @ coarse.world_T_rigs[1:]
     slam_lengths = np.linalg.norm(slam[:, :3, 3], axis=1)
     own = coarse.sources == PoseSource.SLAM
     turned, off = step_errors(slam, found)
-    if not own.any() or (found.verified.any() and not found.directed.any()):
+    if turn is not None:
+        return _turned(coarse, slam, found, turn)
+    if not own.any():
         return _from_images_alone(coarse, slam, found, logs, sigmas)
     wrong = found.verified & (turned > np.deg2rad(verify.max_rotation_deg))
     unsure = 3 * np.where(found.directed, found.direction_sigmas, 0.0)
@@ -123,7 +133,7 @@ def check_steps(
     named = false_frames(
         wrong, slam, chosen, own, outlier_limits(slam, seen, known & found.directed, verify)
     )
-    return StepChecks(start, wrong, named, unseen, lengths, False)
+    return StepChecks(start, wrong, named, unseen, lengths, None)
 
 
 def confirmed(coarse: CoarsePoses, found: Steps, priors: PriorSettings) -> np.ndarray:
@@ -299,13 +309,25 @@ def _from_images_alone(
     chosen[found.verified, :3, :3] = found.f_T_nexts[found.verified, :3, :3]
     moved = found.directed
     chosen[moved, :3, 3] = lengths[moved, None] * found.f_T_nexts[moved, :3, 3]
-    own = coarse.sources == PoseSource.SLAM
-    turning_only = bool(found.verified.any() and not moved.any())
-    if turning_only and not own.any():
+    start = _chain(coarse.world_T_rigs, chosen, coarse.sources == PoseSource.SLAM)
+    return _without_priors(start, found, lengths)
+
+
+def _turned(coarse: CoarsePoses, slam: np.ndarray, found: Steps, turn: Turn) -> StepChecks:
+    """Initial poses with the rotations of a turn, positions those of the trajectory if any."""
+    own, chosen = coarse.sources == PoseSource.SLAM, slam.copy()
+    chosen[:, :3, :3] = np.swapaxes(turn.world_R_rigs[:-1], 1, 2) @ turn.world_R_rigs[1:]
+    if not own.any():
         chosen[:, :3, 3] = 0
     start = _chain(coarse.world_T_rigs, chosen, own)
-    every, nobody = np.ones(len(slam), bool), np.zeros(len(slam) + 1, bool)
-    return StepChecks(start, every, nobody, ~found.verified, lengths, turning_only)
+    lengths = np.linalg.norm(slam[:, :3, 3], axis=1)
+    return replace(_without_priors(start, found, lengths), turn=turn)
+
+
+def _without_priors(start: np.ndarray, found: Steps, lengths: np.ndarray) -> StepChecks:
+    """Checks after which no step of the trajectory keeps its prior."""
+    every, nobody = np.ones(len(lengths), bool), np.zeros(len(start), bool)
+    return StepChecks(start, every, nobody, ~found.verified, lengths, None)
 
 
 def leaps(world_T_rigs: np.ndarray, timestamps: np.ndarray) -> np.ndarray:

@@ -255,6 +255,8 @@ def step_lengths(
     positive = slam_lengths[slam_lengths > 0]
     typical = float(np.median(positive)) if len(positive) else 1.0
     target = np.log(np.maximum(slam_lengths, 1e-3 * typical))
+    if not len(logs):
+        return np.exp(target)
     links = np.where(
         np.isfinite(sigmas), 1 / np.minimum(sigmas, 1e3) ** 2, _PRIOR_LOG_RATIO_SIGMA**-2
     )

@@ -345,7 +345,7 @@ def test_a_frame_with_too_few_points_stays_where_its_steps_have_it() -> None:
 
 def _trust(poses: np.ndarray, unseen: np.ndarray) -> StepChecks:
     nobody = np.zeros(NUM, bool)
-    return StepChecks(poses, unseen.copy(), nobody, unseen, np.ones(NUM - 1), False)
+    return StepChecks(poses, unseen.copy(), nobody, unseen, np.ones(NUM - 1), None)
 
 
 def test_a_piece_of_the_trajectory_goes_where_its_frames_were_carried() -> None:

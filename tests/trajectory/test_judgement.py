@@ -9,7 +9,7 @@ from synthetic import RIG, bearings_of, drifted, loop_walk, unit, with_noise
 
 from gsba.config import PriorSettings, VerifySettings
 from gsba.geometry import inverse, pose, rotation_angle
-from gsba.trajectory import judgement
+from gsba.trajectory import judgement, turning
 from gsba.trajectory.judgement import StepChecks
 from gsba.trajectory.steps import chained, image_steps, length_ratios, off_steps, step_lengths
 from gsba.types import CoarsePoses, Counts, Keypoints, Matches, PoseSource, VerifiedPairs
@@ -201,7 +201,9 @@ def test_a_turn_on_the_spot_is_seen_as_one() -> None:
     assert error < 0.01  # 80 bearings of 0.017 degrees
     slam = np.stack([np.eye(4), pose(np.eye(3), np.array([0.0, 0, 2]))])
     coarse = CoarsePoses(slam, np.full(2, PoseSource.SLAM, np.uint8), 0.0)
-    trust = judgement.check_steps(coarse, found, np.zeros(0), np.zeros(0), VERIFY, PRIORS)
+    given = coarse, found, np.zeros(0), np.zeros(0), VERIFY, PRIORS
+    assert not judgement.check_steps(*given).turning_only  # no parallax is no proof of a turn
+    trust = judgement.check_steps(*given, turning.prove(pairs, keypoints, VERIFY))
     assert trust.turning_only and trust.false_steps.all()
     between = trust.world_T_rigs[0, :3, :3].T @ trust.world_T_rigs[1, :3, :3]
     assert np.degrees(rotation_angle(between.T @ turn)) < 0.01

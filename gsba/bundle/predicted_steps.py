@@ -1,0 +1,67 @@
+"""Steps predicted by far frames: poses from points that frames further away in time determine.
+
+Frames that stand close together may hold a tiny map of their own inside a large one: their steps
+shrink, residuals stay small, and covariances do not tell. Points that frames outside such a group
+see then give another pose to each of its frames. On walks both poses agree.
+"""
+
+import numpy as np
+
+from factors import tangent_basis
+from gsba.geometry import inverse, pose
+from gsba.types import Reconstruction
+
+_REACH = 3  # frames to either side that do not count as far
+_MIN_FAR_FRAMES = 2  # that see a point
+_MIN_OBSERVATIONS = 12  # of such points, in a frame
+_STANDING_RATIO = 0.1  # of the rms step: shorter ones are of a camera that stands, and mere noise
+_ITERATIONS = 10
+
+
+def step_deviations(result: Reconstruction) -> np.ndarray:
+    """Deviation (F - 1,) of each step from the one that far frames predict, part of the longer of
+    both, and at least a tenth of the rms step; NaN = they predict none.
+
+    Args:
+        result: one map.
+    """
+    poses, frames = result.world_T_rigs, result.observation_frames
+    predicted, known = poses.copy(), np.zeros(len(poses), bool)
+    for f in range(len(poses)):
+        far = np.abs(frames - f) > _REACH
+        num_far = np.bincount(result.observation_points[far], minlength=len(result.points_world))
+        rows = (frames == f) & (num_far[result.observation_points] >= _MIN_FAR_FRAMES)
+        known[f] = np.count_nonzero(rows) >= _MIN_OBSERVATIONS
+        if known[f]:
+            predicted[f] = _resected(result, f, rows)
+    steps = [(inverse(some[:-1]) @ some[1:])[:, :3, 3] for some in (poses, predicted)]
+    lengths = np.linalg.norm(steps, axis=2)
+    least = _STANDING_RATIO * np.sqrt(np.mean(lengths[0] ** 2))
+    off = np.linalg.norm(steps[0] - steps[1], axis=1) / np.maximum(lengths.max(axis=0), least)
+    return np.where(known[1:] & known[:-1], off, np.nan)
+
+
+def _resected(result: Reconstruction, frame: int, rows: np.ndarray) -> np.ndarray:
+    """Pose (4, 4) of a frame that its observations `rows` (O,) bool of known points give, by
+    Gauss-Newton under a Cauchy loss from its pose in the map."""
+    from scipy.spatial.transform import Rotation
+
+    points = result.points_world[result.observation_points[rows]]
+    bearings, sigmas = result.observation_bearings[rows], result.observation_sigmas[rows]
+    origins = 0.0 if result.observation_origins is None else result.observation_origins[rows]
+    bases, world_T_rig = tangent_basis(bearings), result.world_T_rigs[frame]
+    for _ in range(_ITERATIONS):
+        at_rig = (points - world_T_rig[:3, 3]) @ world_T_rig[:3, :3]
+        depths = np.linalg.norm(at_rig - origins, axis=1)
+        rays = (at_rig - origins) / depths[:, None]
+        residuals = np.einsum("mij,mj->mi", bases, rays) / sigmas[:, None]
+        weights = 1 / (1 + np.sum(residuals**2, axis=1))
+        across = (np.eye(3) - rays[:, :, None] * rays[:, None, :]) / depths[:, None, None]
+        by_ray = bases @ across / sigmas[:, None, None]
+        jacobian = np.concatenate([np.cross(by_ray, at_rig[:, None, :]), -by_ray], axis=2)
+        weighted = weights[:, None, None] * jacobian
+        system = np.einsum("mij,mik->jk", weighted, jacobian)
+        step = np.linalg.lstsq(system, -np.einsum("mij,mi->j", weighted, residuals), rcond=None)[0]
+        turn = Rotation.from_rotvec(step[:3]).as_matrix()
+        world_T_rig = world_T_rig @ pose(turn, step[3:])
+    return world_T_rig
