@@ -198,9 +198,11 @@ def _read(path: Path, file: BinaryIO, telemetry: bool) -> Insta360Trailer | None
     if signature != _SIGNATURE:
         return None
     if version != _VERSION:
-        raise GsbaError(
-            f"{path}: its Insta360 trailer has version {version}; only version {_VERSION} is known"
+        note = (
+            f"the Insta360 trailer has version {version}, and only version {_VERSION} is known: its "
+            "gyro, exposures, positions and lenses are not read"
         )
+        return _trailer(version, _Contents(notes=[note]))
     contents, start = _Contents(), length - size
     if not _HEADER.size <= size <= length:
         start = 0

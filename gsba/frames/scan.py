@@ -19,8 +19,9 @@ from gsba.frames.files import image_header, image_size, is_image
 from gsba.frames.headers import Header
 from gsba.frames.image_circles import ImageCircle
 from gsba.frames.masks import find_masks
+from gsba.frames.panorama_checks import NUM_LOOKS, REMEDIES, unlike_panorama
 from gsba.frames.raw_pairs import find_pairs, lenses_of
-from gsba.frames.side_by_side import in_folder, lens_sizes, may_hold_two
+from gsba.frames.side_by_side import in_folder, lens_sizes, may_hold_two, readable
 from gsba.frames.times import frame_times
 from gsba.frames.track_pairs import find_tracks, track_size
 from gsba.log import GsbaError, track
@@ -174,7 +175,29 @@ def _pair_size(
         return lens_sizes(size)[-1]
     if found.lens_size is None and size[0] != 2 * size[1]:
         raise _no_panorama(images[0], image_header(images[0]), "; nor are there two image circles")
+    if found.lens_size is None:
+        _refuse_others(folder, images, size)
     return found.lens_size
+
+
+def _refuse_others(folder: Path, images: Sequence[Path], size: tuple[int, int]) -> None:
+    """Refuse 2:1 pictures that are no panoramas by their tags, or by what they show without any.
+
+    Raises:
+        GsbaError: they are named as what they are.
+    """
+    tags = image_header(images[0]).tags
+    if tags is not None and tags.projection not in ("", "equirectangular"):
+        raise GsbaError(
+            f"{images[0]}: its GPano tags say '{tags.projection}'; gsba reads equirectangular "
+            "panoramas"
+        )
+    if tags is not None and (tags.whole or image_header(images[0]).crop is not None):
+        return
+    chosen = sorted({(2 * k + 1) * len(images) // (2 * NUM_LOOKS) for k in range(NUM_LOOKS)})
+    kind = unlike_panorama(readable([images[k] for k in chosen], size))
+    if kind:
+        raise GsbaError(f"{folder} holds no panoramas but {kind}: {REMEDIES[kind]}")
 
 
 def _lenses(

@@ -9,17 +9,20 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from gsba.log import GsbaError
+from gsba.video.claims import PictureClaims, claims_of
 
-_SUFFIXES = {".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi", ".ts", ".insv", ".360", ".lrv"}
-_UNSPECIFIED = 2  # AVCOL_SPC_UNSPECIFIED
-_FULL_RANGE = np.clip(np.rint((np.arange(256) - 16) * 255 / 219), 0, 255).astype(np.uint8)  # grey
-# values of a limited-range luma
+VIDEO_SUFFIXES = frozenset(
+    (".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi", ".ts", ".insv", ".360", ".lrv", ".osv")
+)
+_STILL_CODECS = {"mjpeg", "png"}  # of cover pictures, beside tracks of other codecs
+_MAX_CLAIM_PACKETS = 60  # of a track until the first picture, which may be damaged
 _MAX_EXCESS_S = 1.0  # of the duration that a container claims over that of its frames
 
 
@@ -63,7 +66,7 @@ class Timeline:
 
 def is_video(path: Path) -> bool:
     """True if a path is a file with a video's suffix."""
-    return path.suffix.lower() in _SUFFIXES and path.is_file()
+    return path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()
 
 
 def track_sizes(video: Path) -> list[tuple[int, int]]:
@@ -128,6 +131,25 @@ def read_timeline(track: Track) -> Timeline:
         )
 
 
+def read_claims(track: Track) -> PictureClaims:
+    """Claims of a track about its pictures; none if its first second cannot be decoded.
+
+    Raises:
+        GsbaError: the file is no video, or there is no decoder for it.
+    """
+    av = _pyav()
+    with _opened(track.path) as (container, streams):
+        stream = streams[track.number]
+        for packet in islice(container.demux(stream), _MAX_CLAIM_PACKETS):
+            try:
+                pictures = packet.decode()
+            except av.error.InvalidDataError:
+                continue
+            if pictures:
+                return claims_of(pictures[0], stream.sample_aspect_ratio)
+    return PictureClaims()
+
+
 def decode(track: Track, timeline: Timeline, chosen: Sequence[int]) -> Iterator[tuple[int, Any]]:
     """Yield (index, av.VideoFrame) of chosen frames in order; damaged ones are left out.
 
@@ -159,33 +181,6 @@ def decode(track: Track, timeline: Timeline, chosen: Sequence[int]) -> Iterator[
                     break
 
 
-def luma(frame: Any) -> np.ndarray:
-    """Brightness (H, W) uint8 of an av.VideoFrame, over the full range from black 0 to white 255.
-
-    YUV frames give their luma plane, whatever their colour matrix: equal matrices on both sides
-    save FFmpeg the way over RGB. Limited range (16 to 235) is stretched; untagged frames have it.
-    """
-    import cv2
-    from av.video.reformatter import ColorRange, Colorspace
-
-    kind = frame.format
-    options = {"src_colorspace": Colorspace.ITU601, "dst_colorspace": Colorspace.ITU601}
-    is_plain = len(kind.components) > 2 and not kind.is_rgb and kind.components[0].bits == 8
-    if is_plain:  # FFmpeg copies the plane; the range is applied faster below
-        options |= {"src_color_range": ColorRange.JPEG, "dst_color_range": ColorRange.JPEG}
-    grey = frame.reformat(format="gray", **options).to_ndarray()
-    full_range = frame.color_range == ColorRange.JPEG or kind.name.startswith("yuvj")
-    return cv2.LUT(grey, _FULL_RANGE) if is_plain and not full_range else grey
-
-
-def bgr(frame: Any) -> np.ndarray:
-    """Colours (H, W, 3) uint8 BGR of an av.VideoFrame; the default colour matrix is BT.709."""
-    from av.video.reformatter import Colorspace
-
-    matrix = Colorspace.ITU709 if int(frame.colorspace) == _UNSPECIFIED else None
-    return frame.reformat(format="bgr24", src_colorspace=matrix).to_ndarray()
-
-
 def _pyav() -> Any:
     try:
         import av
@@ -204,7 +199,7 @@ def _opened(video: Path) -> Iterator[tuple[Any, list[Any]]]:
     av = _pyav()
     try:
         with av.open(str(video), metadata_errors="replace") as container:
-            streams = [s for s in container.streams.video if not _is_cover(s)]
+            streams = _without_covers(container.streams.video)
             if not streams:
                 raise GsbaError(f"{video} holds no video stream")
             if streams[0].codec_context is None:
@@ -221,9 +216,11 @@ def _opened(video: Path) -> Iterator[tuple[Any, list[Any]]]:
         ) from error
 
 
-def _is_cover(stream: Any) -> bool:
-    """True for a still image that is stored with the video."""
-    return bool(stream.disposition & type(stream.disposition).attached_pic)
+def _without_covers(streams: Sequence[Any]) -> list[Any]:
+    """Video streams without still images that are stored beside them, marked as such or not."""
+    moving = [s for s in streams if not s.disposition & type(s.disposition).attached_pic]
+    stills = [s for s in moving if s.codec_context and s.codec_context.name in _STILL_CODECS]
+    return [s for s in moving if s not in stills] or moving
 
 
 def _claimed_end(container: Any, stream: Any) -> float | None:
