@@ -8,7 +8,7 @@ none is refused, of 292 stereo pairs of each kind none is accepted, and of panor
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import cv2
 import numpy as np
@@ -25,13 +25,17 @@ REMEDIES = {  # of what `unlike_panorama` names
     CROPPED: "pad it with black to 360 x 180 degrees, or keep the GPano tags of its maker",
 }
 
-_WIDTH = 256  # pixels across the pictures that are judged
+_WIDTH = 256  # pixels across, to which pictures are made smaller
+_MIN_WIDTH = 512  # pixels across pictures that are judged: noise of smaller ones is not averaged
 _DETAIL_SIGMA_PX = 6.0  # blur whose difference from a picture is its detail
 _MIN_LIT_LEVEL, _LIT_BORDER_PX = 16, 13  # black areas and their edges repeat without stereo
 _MIN_COMPARED_SHARE = 0.2  # part of a half that must be lit in both
+_MIN_DETAIL = 1.0  # grey levels, standard deviation; with less, noise or nothing is compared
 _MAX_DISPARITY_PX = 6  # between two eyes
 _MIN_REPEAT = 0.65  # correlation of the details of both eyes; 0.46 at most in panoramas
 _MIN_SEAM = 0.5  # step between both edges over that between far columns
+_MIN_SEAM_OF_HALVES = 0.4  # the same where halves repeat: tells half spheres from whole ones
+_MIN_MIDDLE_STEP = 1.1  # one eye's nadir does not continue in the other's zenith
 _CERTAIN_SEAM = 0.3  # edges with a smaller step meet, so that one picture is enough
 _MIN_POLE_DETAIL = 0.45  # gradient along the rows over that across them; 0.44 at most at the more
 # constant pole of panoramas whose edges do not meet
@@ -45,8 +49,10 @@ class _Evidence:
 
     beside: float  # correlation of the left and the right half
     above: float  # correlation of the upper and the lower half
-    seam: float  # step between both edges over that between far columns; 0 = no contrast
+    seam: float  # step between both edges over that between far columns, medians over rows; 0 = no
+    # contrast
     poles: float  # detail of the more constant pole
+    middle: float  # step between the middle rows over the 95th percentile of steps between rows
 
 
 def unlike_panorama(greys: Iterable[np.ndarray]) -> str:
@@ -54,11 +60,11 @@ def unlike_panorama(greys: Iterable[np.ndarray]) -> str:
 
     Args:
         greys: (h, w) uint8 each, of one sequence; NUM_LOOKS suffice, and fewer are taken if the
-            first one is clearly a panorama. Those narrower than 256 pixels are not judged.
+            first one is clearly a panorama. Those narrower than 512 pixels are not judged.
     """
     found = list[_Evidence]()
     for grey in greys:
-        if grey.shape[1] < _WIDTH:
+        if grey.shape[1] < _MIN_WIDTH:
             return ""
         found.append(_measure(grey))
         first = found[0]
@@ -66,12 +72,10 @@ def unlike_panorama(greys: Iterable[np.ndarray]) -> str:
             return ""
     if not found:
         return ""
-    beside, above, seam, poles = np.median(
-        [(one.beside, one.above, one.seam, one.poles) for one in found], axis=0
-    )
+    beside, above, seam, poles, middle = np.median([astuple(one) for one in found], axis=0)
     if beside >= max(_MIN_REPEAT, above):
-        return VR180 if seam >= _MIN_SEAM else SIDE_BY_SIDE
-    if above >= _MIN_REPEAT:
+        return VR180 if seam >= _MIN_SEAM_OF_HALVES else SIDE_BY_SIDE
+    if above >= _MIN_REPEAT and middle >= _MIN_MIDDLE_STEP:
         return OVER_UNDER
     return CROPPED if seam >= _MIN_SEAM and poles >= _MIN_POLE_DETAIL else ""
 
@@ -87,11 +91,13 @@ def _measure(grey: np.ndarray) -> _Evidence:
     )
     columns = cv2.blur(small, (1, 5))
     shifts = (_WIDTH * np.array([3, 5, 7, 8])) // 16
-    far = np.mean([np.abs(columns - np.roll(columns, s, 1)).mean() for s in shifts])
-    seam = np.abs(columns[:, 0] - columns[:, -1]).mean() / far if far > _MIN_CONTRAST else 0.0
+    far = np.mean([np.median(np.abs(columns - np.roll(columns, s, 1))) for s in shifts])
+    seam = np.median(np.abs(columns[:, 0] - columns[:, -1])) / far if far > _MIN_CONTRAST else 0.0
     blurred = cv2.GaussianBlur(small, (0, 0), _POLE_SIGMA_PX, borderType=cv2.BORDER_REPLICATE)
     poles = min(_pole_detail(blurred[:_POLE_ROWS]), _pole_detail(blurred[-_POLE_ROWS:]))
-    return _Evidence(beside, above, float(seam), poles)
+    steps = np.abs(np.diff(small, axis=0)).mean(axis=1)
+    middle = float(steps[len(steps) // 2] / max(np.percentile(steps, 95), 1e-6))
+    return _Evidence(beside, above, float(seam), poles, middle)
 
 
 def _repeat(one: np.ndarray, other: np.ndarray, lit: np.ndarray, other_lit: np.ndarray) -> float:
@@ -104,7 +110,7 @@ def _repeat(one: np.ndarray, other: np.ndarray, lit: np.ndarray, other_lit: np.n
             continue
         x, y = one[inner][both], np.roll(other, shift, 1)[inner][both]
         norm = float(x.std() * y.std())
-        if norm > 0:
+        if norm > _MIN_DETAIL**2:
             best = max(best, float(((x - x.mean()) * (y - y.mean())).mean()) / norm)
     return best
 

@@ -58,9 +58,7 @@ def load_padded(frames: FrameSet, f: int, buffers: Buffers) -> np.ndarray:
     return around_sphere(straightened_inside(padded, kind.correction, inner), PAD, straight)
 
 
-def load_faces(
-    frames: FrameSet, f: int, gray: bool = False, size: int | None = None
-) -> np.ndarray:
+def load_faces(frames: FrameSet, f: int, gray: bool = False, size: int | None = None) -> np.ndarray:
     """Cube faces of frame f, (len(kind.faces), height, width[, 3]) uint8, RGB or grey.
 
     Args:

@@ -136,9 +136,12 @@ def read_recording(video: Path) -> Recording:
         note = f"{files[0]}: raw, of the front lens; of the back one is {files[1]}"
         return _of_two_tracks((Track(files[0]), Track(files[1])), size, note)
     if others:
-        _check_tracks(video, [size, *others])
+        sizes = [size, *others]
+        pair = _lens_tracks(sizes)
+        size = sizes[pair[0]]
+        _check_tracks(video, sizes if len(pair) > 2 else [sizes[n] for n in pair])
         note = f"{video}: raw, two tracks of {size[0]}x{size[1]}: front lens, back lens"
-        return _of_two_tracks((Track(video), Track(video, 1)), size, note)
+        return _of_two_tracks((Track(video, pair[0]), Track(video, pair[1])), size, note)
     return _of_one_track(Track(video), size)
 
 
@@ -211,6 +214,14 @@ def _check_pair(files: tuple[Path, ...], size: tuple[int, int]) -> None:
             f"{back} is {shapes}, but {front.name}, the front lens's file, is {size[0]}x{size[1]}: "
             f"they are no pair; copy both again from the camera, or {_STITCH}"
         )
+
+
+def _lens_tracks(sizes: Sequence[tuple[int, int]]) -> list[int]:
+    """Numbers of the tracks that lenses may have: the two largest, if they are square and equal,
+    beside covers and previews (DJI's `.osv`); else all."""
+    largest = max(sizes, key=lambda size: size[0] * size[1])
+    pair = [n for n, size in enumerate(sizes) if size == largest]
+    return pair if len(pair) == 2 and _is_nearly_square(largest) else list(range(len(sizes)))
 
 
 def _check_tracks(video: Path, sizes: list[tuple[int, int]]) -> None:

@@ -21,7 +21,6 @@ from gsba.video.claims import PictureClaims, claims_of
 VIDEO_SUFFIXES = frozenset(
     (".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi", ".ts", ".insv", ".360", ".lrv", ".osv")
 )
-_STILL_CODECS = {"mjpeg", "png"}  # of cover pictures, beside tracks of other codecs
 _MAX_CLAIM_PACKETS = 60  # of a track until the first picture, which may be damaged
 _MAX_EXCESS_S = 1.0  # of the duration that a container claims over that of its frames
 
@@ -199,7 +198,7 @@ def _opened(video: Path) -> Iterator[tuple[Any, list[Any]]]:
     av = _pyav()
     try:
         with av.open(str(video), metadata_errors="replace") as container:
-            streams = _without_covers(container.streams.video)
+            streams = [s for s in container.streams.video if not _is_cover(s)]
             if not streams:
                 raise GsbaError(f"{video} holds no video stream")
             if streams[0].codec_context is None:
@@ -216,11 +215,9 @@ def _opened(video: Path) -> Iterator[tuple[Any, list[Any]]]:
         ) from error
 
 
-def _without_covers(streams: Sequence[Any]) -> list[Any]:
-    """Video streams without still images that are stored beside them, marked as such or not."""
-    moving = [s for s in streams if not s.disposition & type(s.disposition).attached_pic]
-    stills = [s for s in moving if s.codec_context and s.codec_context.name in _STILL_CODECS]
-    return [s for s in moving if s not in stills] or moving
+def _is_cover(stream: Any) -> bool:
+    """True for a still image that is stored with the video."""
+    return bool(stream.disposition & type(stream.disposition).attached_pic)
 
 
 def _claimed_end(container: Any, stream: Any) -> float | None:

@@ -211,5 +211,5 @@ def test_two_fisheyes_one_above_the_other_are_read(tmp_path: Path) -> None:
 
 
 def test_a_size_rounded_by_an_encoder_is_named(tmp_path: Path) -> None:
-    with pytest.raises(GsbaError, match="256x130, nearly 2:1: .*scale=256:128"):
+    with pytest.raises(GsbaError, match=r"256x130, nearly 2:1: .*scale=256:128"):
         read_recording(_write(tmp_path / "a.mp4", [_panorama()[np.r_[0, :HEIGHT, -1]]] * 3))
