@@ -7,7 +7,7 @@ import math
 import re
 from dataclasses import dataclass
 
-_TAG = re.compile(rb"GPano:(\w+)\s*(?:=\s*[\"']\s*([^\"'<]*)[\"']|>([^<]*)<)")
+_TAG = re.compile(rb"(?<!/)GPano:(\w+)\s*(?:=\s*[\"']\s*([^\"'<]*)[\"']|>([^<]*)<)")
 _MAX_SCALE_DIFFERENCE = 0.01  # between both sides of a picture that was made smaller
 
 

@@ -2,6 +2,7 @@
 
 import logging
 import re
+import shlex
 import unicodedata
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -15,13 +16,20 @@ from gsba.camera.factory_lenses import FactoryLenses
 from gsba.camera.fisheye import Rig
 from gsba.frames.dual_fisheye import width_of
 from gsba.frames.factory_start import FACTORY_FILE, find_factory_lenses, starting_lenses
-from gsba.frames.files import image_header, image_size, is_image
+from gsba.frames.files import decode, image_header, image_size, is_image
 from gsba.frames.headers import Header
 from gsba.frames.image_circles import ImageCircle
 from gsba.frames.masks import find_masks
-from gsba.frames.panorama_checks import NUM_LOOKS, REMEDIES, unlike_panorama
+from gsba.frames.panorama_checks import NUM_LOOKS, OVER_UNDER, REMEDIES, unlike_panorama
 from gsba.frames.raw_pairs import find_pairs, lenses_of
-from gsba.frames.side_by_side import in_folder, lens_sizes, may_hold_two, readable
+from gsba.frames.side_by_side import (
+    in_folder,
+    lens_sizes,
+    may_hold_two,
+    one_beside_other,
+    readable,
+    two_circles,
+)
 from gsba.frames.times import frame_times
 from gsba.frames.track_pairs import find_tracks, track_size
 from gsba.log import GsbaError, track
@@ -34,6 +42,7 @@ _SIDE_FACES = ("front", "right", "back", "left")
 _TIMES_FILE = "timestamps.csv"
 _UNSUPPORTED_FORMATS = {  # images that are not read, by suffix
     ".avif": "AVIF",
+    ".36p": "GoPro .36P",
     ".bmp": "BMP",
     ".dng": "DNG",
     ".exr": "EXR",
@@ -310,6 +319,9 @@ def _find_frames(folder: Path) -> tuple[str, tuple[str, ...], dict[str, tuple[Pa
     if not images:
         counts = Counter(Path(name).suffix.lower() or Path(name).name for name in others)
         held = ", ".join(f"{n} {kind}" for kind, n in sorted(counts.items())[:5]) or "nothing"
+        folders = [path for path in entries if path.is_dir() and path.name[0] != "."]
+        if below := [path for path in folders if any(map(is_image, _entries(path)))]:
+            raise GsbaError(_recordings_below(folder, below))
         raise GsbaError(
             f"{folder}: no JPEG, PNG, WebP or TIFF images (it holds {held}); extract the video's "
             "frames there first"
@@ -328,6 +340,18 @@ def _find_frames(folder: Path) -> tuple[str, tuple[str, ...], dict[str, tuple[Pa
         if face in tags
     }
     return "cube", *_cube_frames(folder, by_face)
+
+
+def _recordings_below(folder: Path, below: Sequence[Path]) -> str:
+    """The refusal of a folder whose pictures lie in folders of recordings."""
+    names = ", ".join(path.name for path in below[:5]) + (", ..." if len(below) > 5 else "")
+    if len(below) == 1:
+        return f"{folder}: its pictures are in {below[0]}: give that folder"
+    paths = " ".join(shlex.quote(str(path)) for path in below[:3]) + (" ..." if below[3:] else "")
+    return (
+        f"{folder}: its pictures are in {len(below)} folders ({names}): give one of them, or "
+        f"all as recordings of one place (gsba refine {paths} --out RUN)"
+    )
 
 
 _TAGGED = re.compile(rf"(?P<name>.+)_(?P<face>{'|'.join(FACES)})", re.IGNORECASE)
@@ -389,7 +413,7 @@ def _common_size(paths: Sequence[tuple[Path, ...]], layout: str) -> tuple[int, i
             header = image_header(path)
             w, h = header.size
             if layout == "erp" and not may_hold_two((w, h)):
-                raise _no_panorama(path, header)
+                raise _no_panorama(path, header, _stacked(path, (w, h)))
             if layout == "cube" and (w != h or h == 0):
                 raise GsbaError(f"{path}: is {w}x{h}; a cube face is square")
             if (w, h) != (width, height) and layout == "fisheye":
@@ -400,6 +424,24 @@ def _common_size(paths: Sequence[tuple[Path, ...]], layout: str) -> tuple[int, i
             if (w, h) != (width, height):
                 raise GsbaError(f"{path}: is {w}x{h}, but '{first.name}' is {width}x{height}")
     return width, height
+
+
+def _stacked(path: Path, size: tuple[int, int]) -> str:
+    """Name of a picture of 1:2 or 1:1 that holds two pictures one above the other; "" = unknown."""
+    width, height = size
+    if height not in (width, 2 * width):
+        return ""
+    try:
+        grey = decode(path, size, gray=True, at_least=512)
+    except GsbaError:
+        return ""
+    if height == 2 * width and two_circles([one_beside_other(grey)], path)[0]:
+        return (
+            ". It holds two fisheyes one above the other: save each as a picture of its own, in "
+            "folders front/ and back/"
+        )
+    kind = unlike_panorama([grey])
+    return f". It is {kind}: {REMEDIES[kind]}" if kind == OVER_UNDER else ""
 
 
 def _no_panorama(path: Path, header: Header, more: str = "") -> GsbaError:

@@ -112,6 +112,12 @@ def two_circles(greys: Iterable[np.ndarray], where: Path) -> tuple[bool, tuple[s
     return True, (note,)
 
 
+def one_beside_other(grey: np.ndarray) -> np.ndarray:
+    """Upper and lower half (h, w) of a picture (2h, w) beside each other."""
+    half = grey.shape[0] // 2
+    return np.concatenate([grey[:half], grey[half : 2 * half]], axis=1)
+
+
 def in_folder(
     folder: Path,
     paths: Sequence[Path],

@@ -27,6 +27,7 @@ from gsba.frames.side_by_side import (
     SideBySide,
     lens_sizes,
     may_hold_two,
+    one_beside_other,
     recognise,
     two_circles,
 )
@@ -292,7 +293,7 @@ def _of_one_track(track: Track, size: tuple[int, int]) -> Recording:
     shown, looks = claims.shown_size(size), tee(_looks(track, timeline), 3)
     num, side = len(timeline.ticks), min(size[0], size[1] // 2)
     everything = np.ones(num, bool), np.arange(num)
-    if 2 * size[0] == size[1] and two_circles(map(_side_by_side, looks[0]), track.path)[0]:
+    if 2 * size[0] == size[1] and two_circles(map(one_beside_other, looks[0]), track.path)[0]:
         note = f"{track.path}: raw, two fisheyes one above the other, front above"
         places = tuple((slice(at, at + side), slice(None)) for at in (0, side))
         return Recording((track,), (timeline,), places, side, *everything, (note,))
@@ -364,12 +365,6 @@ def _claim_notes(video: Path, claims: PictureClaims) -> list[str]:
             "stored"
         )
     return notes
-
-
-def _side_by_side(grey: np.ndarray) -> np.ndarray:
-    """Upper and lower half (h, w) of a picture (2h, w) beside each other."""
-    half = grey.shape[0] // 2
-    return np.concatenate([grey[:half], grey[half : 2 * half]], axis=1)
 
 
 def _of_two_tracks(

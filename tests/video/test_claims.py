@@ -3,6 +3,7 @@
 import struct
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -152,7 +153,7 @@ def test_a_claimed_pose_is_noted_and_pixels_stay_as_stored(tmp_path: Path) -> No
     assert np.abs(_first(recording).bgr()[..., ::-1].astype(int) - shown).mean() < 3
 
 
-def _hdr_frame(signal: np.ndarray, transfer: int) -> "av.VideoFrame":
+def _hdr_frame(signal: np.ndarray, transfer: int) -> Any:
     """Frame of 10 bits, BT.2020, with an HDR signal (H, W) 0..1 for grey."""
     frame = av.VideoFrame(signal.shape[1], signal.shape[0], "yuv444p10le")
     for plane, values in zip(frame.planes, (64 + 876 * signal, 512, 512), strict=True):
