@@ -312,20 +312,8 @@ def _find_frames(folder: Path) -> tuple[str, tuple[str, ...], dict[str, tuple[Pa
             if face in subfolders
         }
         return "cube", *_cube_frames(folder, by_face)
-    if not images and foreign:
-        raise GsbaError(
-            f"{folder}: no JPEG, PNG, WebP or TIFF images, but {foreign}: convert them first"
-        )
     if not images:
-        counts = Counter(Path(name).suffix.lower() or Path(name).name for name in others)
-        held = ", ".join(f"{n} {kind}" for kind, n in sorted(counts.items())[:5]) or "nothing"
-        folders = [path for path in entries if path.is_dir() and path.name[0] != "."]
-        if below := [path for path in folders if any(map(is_image, _entries(path)))]:
-            raise GsbaError(_recordings_below(folder, below))
-        raise GsbaError(
-            f"{folder}: no JPEG, PNG, WebP or TIFF images (it holds {held}); extract the video's "
-            "frames there first"
-        )
+        raise _no_images(folder, entries, others, foreign)
     tagged = {path: m for path in images if (m := re.fullmatch(_TAGGED, path.stem))}
     tags = {match["face"].lower() for match in tagged.values()}
     if not tags.issuperset(_SIDE_FACES) and len(tagged) < len(images):
@@ -340,6 +328,32 @@ def _find_frames(folder: Path) -> tuple[str, tuple[str, ...], dict[str, tuple[Pa
         if face in tags
     }
     return "cube", *_cube_frames(folder, by_face)
+
+
+def _no_images(
+    folder: Path, entries: Sequence[Path], others: Sequence[str], foreign: str
+) -> GsbaError:
+    """The refusal of a folder without pictures.
+
+    Args:
+        folder: the folder.
+        entries: all files and folders in it.
+        others: names of those that are no images.
+        foreign: number and format of images in unsupported formats.
+    """
+    if foreign:
+        return GsbaError(
+            f"{folder}: no JPEG, PNG, WebP or TIFF images, but {foreign}: convert them first"
+        )
+    folders = [path for path in entries if path.is_dir() and path.name[0] != "."]
+    if below := [path for path in folders if any(map(is_image, _entries(path)))]:
+        return GsbaError(_recordings_below(folder, below))
+    counts = Counter(Path(name).suffix.lower() or Path(name).name for name in others)
+    held = ", ".join(f"{n} {kind}" for kind, n in sorted(counts.items())[:5]) or "nothing"
+    return GsbaError(
+        f"{folder}: no JPEG, PNG, WebP or TIFF images (it holds {held}); extract the video's "
+        "frames there first"
+    )
 
 
 def _recordings_below(folder: Path, below: Sequence[Path]) -> str:
