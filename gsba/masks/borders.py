@@ -44,7 +44,7 @@ def find_borders(frames: FrameSet) -> Borders:
     count, labels, stats, _ = cv2.connectedComponentsWithStats(black, connectivity=4)
     large = stats[:, cv2.CC_STAT_AREA] >= _MIN_SHARE * black.size
     large[0] = False
-    found = np.take(large, labels) if count > 1 else np.zeros(black.shape, bool)
+    found = large[labels.astype(np.intp)] if count > 1 else np.zeros(black.shape, bool)
     share = float(found.mean())
     if not 0 < share <= _MAX_SHARE:
         return Borders(everything, 0.0)
