@@ -470,6 +470,7 @@ class GpsSettings(_Settings):
     )  # horizontal standard deviation per axis, metres: floor for all fixes, times DOP where given
     sigma_up_m: float = Field(default=5.0, gt=0)  # vertical standard deviation, metres
     correlation_s: float = Field(default=60.0, gt=0)  # correlation time of the errors
+    offset_s: float = 0.0  # seconds, added to the times of a file to give the frames' clock
     loss_sigmas: float = Field(default=2.0, gt=0)  # Cauchy scale of the gps factors
 
 
@@ -483,9 +484,7 @@ class PlacementSettings(_Settings):
     gps: _Text | None = None  # CSV, GPX, a video, or "exif": export in metres, east-north-up
     align: _Text | None = None  # TUM file of true poses: export in its world and unit
     scan: _Text | None = None  # PLY, PCD, LAS, LAZ, OBJ or GLB: export in its world and unit
-    pairs: _Text | None = (
-        None  # file of three or more point pairs, run and scan, that start the fit
-    )
+    pairs: _Text | None = None  # file of three or more pairs of points that start the scan's fit
 
 
 BUILT_IN = {  # families of gsba

@@ -4,12 +4,12 @@ import os
 from pathlib import Path
 from typing import Any
 
+from gsba.frames.files import IMAGE_SUFFIXES
 from gsba.log import GsbaError, brief
 from gsba.store.folder import is_run_folder
+from gsba.video.timeline import VIDEO_SUFFIXES
 
 _MAX_ENTRIES = 1000
-_VIDEOS = {".mp4", ".mov", ".mkv", ".insv", ".360", ".avi", ".webm", ".m4v", ".lrv"}
-_IMAGES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".insp"}
 
 
 def inside(root: Path, name: str) -> Path:
@@ -63,7 +63,7 @@ def _kind(path: Path) -> str:
     if path.is_dir():
         return "run" if is_run_folder(path) else "folder"
     suffix = path.suffix.lower()
-    return "video" if suffix in _VIDEOS else "image" if suffix in _IMAGES else "file"
+    return "video" if suffix in VIDEO_SUFFIXES else "image" if suffix in IMAGE_SUFFIXES else "file"
 
 
 def _relative(base: Path, path: Path) -> str:

@@ -173,7 +173,7 @@ def read_trailer(path: Path, telemetry: bool = True) -> Insta360Trailer | None:
         telemetry: also read gyro, exposures and GPS; the metadata is always read.
 
     Raises:
-        GsbaError: the file cannot be read, or no record of its trailer can.
+        GsbaError: the file cannot be read, or no record of a trailer of the known version can.
     """
     try:
         with path.open("rb") as file:
@@ -198,9 +198,11 @@ def _read(path: Path, file: BinaryIO, telemetry: bool) -> Insta360Trailer | None
     if signature != _SIGNATURE:
         return None
     if version != _VERSION:
-        raise GsbaError(
-            f"{path}: its Insta360 trailer has version {version}; only version {_VERSION} is known"
+        note = (
+            f"the Insta360 trailer has version {version}, and only version {_VERSION} is known: "
+            "its gyro, exposures, positions and lenses are not read"
         )
+        return _trailer(version, _Contents(notes=[note]))
     contents, start = _Contents(), length - size
     if not _HEADER.size <= size <= length:
         start = 0

@@ -24,11 +24,12 @@ def rig_for(kind: PictureFormat, settings: CubemapSettings) -> CubeRig:
 
     Unless a size is set, a face centre has `oversampling` times the pixel density of the
     panorama's equator, within `min_face_size` and `max_face_size`: 0.5 suffices where patches
-    refine the keypoints. Frames that come as cube faces keep their own size and
-    90 degrees.
+    refine the keypoints. Frames that come as cube faces keep 90 degrees, and their own size up to
+    `max_face_size`.
     """
     if not kind.panoramic:
-        return native_rig(kind)
+        most = settings.face_size or settings.max_face_size
+        return CubeRig(min(kind.native_face_size, most), np.pi / 2)
     hfov = np.deg2rad(settings.hfov_deg)
     native = 2 * kind.width / (2 * np.pi) * np.tan(hfov / 2)
     wanted = max(round(settings.oversampling * native), settings.min_face_size)
@@ -55,7 +56,7 @@ def load(frames: FrameSet, frame: int, rig: CubeRig) -> tuple[np.ndarray, np.nda
         return cut(load_erp(frames, frame, width=width), rig), masks
     images = np.zeros((len(FACES), rig.size, rig.size, 3), np.uint8)
     present = [FACES.index(name) for name in kind.faces]
-    images[present] = load_faces(frames, frame)
+    images[present] = load_faces(frames, frame, size=rig.size)
     usable = np.zeros((len(FACES), rig.size, rig.size), bool)
     usable[present] = True
     return images, usable if masks is None else usable & masks

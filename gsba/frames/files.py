@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from gsba.frames.gpano import Crop
 from gsba.frames.headers import JPEG_END, Header, header_of
 from gsba.log import GsbaError
 
@@ -91,6 +92,8 @@ def decode(
         raise GsbaError(
             f"{path}: is {header.width}x{header.height}, was {size[0]}x{size[1]} when the run began"
         )
+    if header.crop is not None:
+        return _padded(_stored(encoded, path, header, gray), header.crop)
     if header.kind == "JPEG":
         part = max(k for k in (1, 2, 4, 8) if k == 1 or size[0] >= k * (at_least or size[0]))
         stored = (size[1], size[0]) if header.swapped else size
@@ -98,10 +101,25 @@ def decode(
     else:
         pixels = _decoded(encoded, path, gray)
     upright = header.kind == "TIFF"  # OpenCV turns TIFFs by their tag in any case
-    return pixels if upright else _turned(pixels, header.orientation)
+    return pixels if upright else turned(pixels, header.orientation)
 
 
-def _turned(pixels: np.ndarray, orientation: int) -> np.ndarray:
+def _stored(encoded: bytes, path: Path, header: Header, gray: bool) -> np.ndarray:
+    """Pixels of the part of a panorama that a file holds."""
+    if header.kind != "JPEG":
+        return _decoded(encoded, path, gray)
+    return _decoded_jpeg(encoded, path, (0, 0), 1, gray, None)
+
+
+def _padded(pixels: np.ndarray, crop: Crop) -> np.ndarray:
+    """Whole panorama (H, 2H[, 3]) uint8, black where a part (h, w[, 3]) does not show it."""
+    whole = np.zeros((crop.height, crop.width, *pixels.shape[2:]), np.uint8)
+    rows, columns = pixels.shape[:2]
+    whole[crop.top : crop.top + rows, crop.left : crop.left + columns] = pixels
+    return whole
+
+
+def turned(pixels: np.ndarray, orientation: int) -> np.ndarray:
     """Stored pixels (h, w[, 3]) turned for display. Exif 3.0, section 4.6.5, tag 0x0112."""
     if orientation == 1:
         return pixels

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gsba.frames.gpano import Crop, PanoramaTags, read_tags
 from gsba.log import GsbaError
 
 MAX_PIXELS = 1 << 28  # pixels of one image: 768 MB of colours
@@ -27,6 +28,7 @@ _JPEG_BARE = {0x01, *range(0xD0, 0xD9)}  # markers without a segment: TEM, RST0-
 _JPEG_FRAME = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # SOF0-15; not DHT, JPG, DAC
 _JPEG_SCAN, _JPEG_APP1 = 0xDA, 0xE1  # SOS; where EXIF is
 _EXIF = b"Exif\0\0"
+_XMP, _PNG_XMP = b"http://ns.adobe.com/xap/1.0/\0", b"XML:com.adobe.xmp\0"
 _WEBP_ANIMATED = 0x02  # flag of an extended file
 _TIFF_STARTS = b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"  # with +: BigTIFF
 _TIFF_TYPES = {1: 1, 3: 2, 4: 4, 16: 8}  # bytes of an unsigned number
@@ -55,6 +57,8 @@ class Header:
     height: int  # pixels as shown
     orientation: int = 1  # EXIF's, 1 (as stored) to 8
     plain: bool = False  # True for 8 bits of red, green and blue, which any program reads
+    crop: Crop | None = None  # place of the stored picture in the panorama that is shown
+    tags: PanoramaTags | None = None  # None = none
 
     @property
     def size(self) -> tuple[int, int]:
@@ -117,11 +121,20 @@ def _header(data: Bytes) -> Header:
     raise _Unsupported("not a JPEG, PNG, WebP or TIFF image; remove or convert it")
 
 
-def _shown(kind: str, width: int, height: int, orientation: int, plain: bool) -> Header:
-    """A header with the size on display, of a stored width and height."""
+def _shown(
+    kind: str, width: int, height: int, orientation: int, plain: bool, xmp: bytes = b""
+) -> Header:
+    """A header with the size on display, of a stored width and height.
+
+    A panorama of which a part is stored is shown as a whole.
+    """
     if orientation > 4:
         width, height = height, width
-    return Header(kind, width, height, orientation, plain and orientation == 1)
+    tags = read_tags(xmp) if xmp else None
+    crop = tags.crop((width, height)) if tags and orientation == 1 else None
+    if crop is not None:
+        return Header(kind, crop.width, crop.height, orientation, False, crop, tags)
+    return Header(kind, width, height, orientation, plain and orientation == 1, None, tags)
 
 
 def _png(data: Bytes) -> Header:
@@ -132,7 +145,20 @@ def _png(data: Bytes) -> Header:
         raise _Truncated
     width, height = (int.from_bytes(data[at : at + 4], "big") for at in (16, 20))
     plain = data[24] == 8 and data[25] in _PNG_COLOURS
-    return _shown("PNG", width, height, _orientation(_png_exif(data)), plain)
+    turn = _orientation(_png_exif(data))
+    return _shown("PNG", width, height, turn, plain, _png_xmp(data))
+
+
+def _png_xmp(data: Bytes) -> bytes:
+    """The text chunk of XMP before the pixels."""
+    position = 8
+    while (kind := data[position + 4 : position + 8]) not in (b"IDAT", b"IEND", b""):
+        length = int.from_bytes(data[position : position + 4], "big")
+        start = position + 8
+        if kind == b"iTXt" and data[start : start + len(_PNG_XMP)] == _PNG_XMP:
+            return data[start : start + length]
+        position += 12 + length
+    return b""
 
 
 def _png_exif(data: Bytes) -> bytes:
@@ -156,7 +182,7 @@ def _jpeg(data: Bytes) -> Header:
     The end marker cannot occur inside entropy-coded data, but does occur in EXIF thumbnails, so
     it only counts after the first scan has begun; cameras may append data after it.
     """
-    position, size, exif, components = 2, None, b"", 0
+    position, size, exif, xmp, components = 2, None, b"", b"", 0
     while True:
         if data[position] != 0xFF:
             raise ValueError
@@ -178,12 +204,14 @@ def _jpeg(data: Bytes) -> Header:
             size, components = (width, height), data[position + 7]
         elif marker == _JPEG_APP1 and not exif and data[position + 2 : position + 8] == _EXIF:
             exif = data[position + 8 : position + length]
+        elif marker == _JPEG_APP1 and data[position + 2 : position + 2 + len(_XMP)] == _XMP:
+            xmp = xmp or data[position + 2 + len(_XMP) : position + length]
         elif marker == _JPEG_SCAN:
             if size is None:
                 raise ValueError
             if data.rfind(JPEG_END, position) <= 0:
                 raise _Truncated
-            return _shown("JPEG", *size, _orientation(exif), components == 3)
+            return _shown("JPEG", *size, _orientation(exif), components == 3, xmp)
         position += max(length, 2)
 
 

@@ -58,10 +58,22 @@ def load_padded(frames: FrameSet, f: int, buffers: Buffers) -> np.ndarray:
     return around_sphere(straightened_inside(padded, kind.correction, inner), PAD, straight)
 
 
-def load_faces(frames: FrameSet, f: int, gray: bool = False) -> np.ndarray:
-    """Cube faces of frame f, (len(kind.faces), height, width[, 3]) uint8, RGB or grey."""
+def load_faces(frames: FrameSet, f: int, gray: bool = False, size: int | None = None) -> np.ndarray:
+    """Cube faces of frame f, (len(kind.faces), height, width[, 3]) uint8, RGB or grey.
+
+    Args:
+        frames: cube faces.
+        f: index of the frame.
+        gray: one channel instead of RGB.
+        size: pixels across: larger faces are averaged down to it.
+    """
+    import cv2
+
     kind = frames.format_of(f)
     if kind.panoramic:
         raise ValueError("load_faces needs cube frames")
-    size = kind.width, kind.height
-    return np.stack([decode(path, size, gray) for path in frames.paths[f]])
+    stored = kind.width, kind.height
+    faces = [decode(path, stored, gray, at_least=size) for path in frames.paths[f]]
+    if size is not None and size < kind.width:
+        faces = [cv2.resize(face, (size, size), interpolation=cv2.INTER_AREA) for face in faces]
+    return np.stack(faces)

@@ -2,6 +2,7 @@
 
 import logging
 import re
+import shlex
 import unicodedata
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -15,12 +16,20 @@ from gsba.camera.factory_lenses import FactoryLenses
 from gsba.camera.fisheye import Rig
 from gsba.frames.dual_fisheye import width_of
 from gsba.frames.factory_start import FACTORY_FILE, find_factory_lenses, starting_lenses
-from gsba.frames.files import image_header, image_size, is_image
+from gsba.frames.files import decode, image_header, image_size, is_image
 from gsba.frames.headers import Header
 from gsba.frames.image_circles import ImageCircle
 from gsba.frames.masks import find_masks
+from gsba.frames.panorama_checks import NUM_LOOKS, OVER_UNDER, REMEDIES, unlike_panorama
 from gsba.frames.raw_pairs import find_pairs, lenses_of
-from gsba.frames.side_by_side import in_folder, lens_sizes, may_hold_two
+from gsba.frames.side_by_side import (
+    in_folder,
+    lens_sizes,
+    may_hold_two,
+    one_beside_other,
+    readable,
+    two_circles,
+)
 from gsba.frames.times import frame_times
 from gsba.frames.track_pairs import find_tracks, track_size
 from gsba.log import GsbaError, track
@@ -33,6 +42,7 @@ _SIDE_FACES = ("front", "right", "back", "left")
 _TIMES_FILE = "timestamps.csv"
 _UNSUPPORTED_FORMATS = {  # images that are not read, by suffix
     ".avif": "AVIF",
+    ".36p": "GoPro .36P",
     ".bmp": "BMP",
     ".dng": "DNG",
     ".exr": "EXR",
@@ -174,7 +184,29 @@ def _pair_size(
         return lens_sizes(size)[-1]
     if found.lens_size is None and size[0] != 2 * size[1]:
         raise _no_panorama(images[0], image_header(images[0]), "; nor are there two image circles")
+    if found.lens_size is None:
+        _refuse_others(folder, images, size)
     return found.lens_size
+
+
+def _refuse_others(folder: Path, images: Sequence[Path], size: tuple[int, int]) -> None:
+    """Refuse 2:1 pictures that are no panoramas by their tags, or by what they show without any.
+
+    Raises:
+        GsbaError: they are named as what they are.
+    """
+    tags = image_header(images[0]).tags
+    if tags is not None and tags.projection not in ("", "equirectangular"):
+        raise GsbaError(
+            f"{images[0]}: its GPano tags say '{tags.projection}'; gsba reads equirectangular "
+            "panoramas"
+        )
+    if tags is not None and (tags.whole or image_header(images[0]).crop is not None):
+        return
+    chosen = sorted({(2 * k + 1) * len(images) // (2 * NUM_LOOKS) for k in range(NUM_LOOKS)})
+    kind = unlike_panorama(readable([images[k] for k in chosen], size))
+    if kind:
+        raise GsbaError(f"{folder} holds no panoramas but {kind}: {REMEDIES[kind]}")
 
 
 def _lenses(
@@ -280,17 +312,8 @@ def _find_frames(folder: Path) -> tuple[str, tuple[str, ...], dict[str, tuple[Pa
             if face in subfolders
         }
         return "cube", *_cube_frames(folder, by_face)
-    if not images and foreign:
-        raise GsbaError(
-            f"{folder}: no JPEG, PNG, WebP or TIFF images, but {foreign}: convert them first"
-        )
     if not images:
-        counts = Counter(Path(name).suffix.lower() or Path(name).name for name in others)
-        held = ", ".join(f"{n} {kind}" for kind, n in sorted(counts.items())[:5]) or "nothing"
-        raise GsbaError(
-            f"{folder}: no JPEG, PNG, WebP or TIFF images (it holds {held}); extract the video's "
-            "frames there first"
-        )
+        raise _no_images(folder, entries, others, foreign)
     tagged = {path: m for path in images if (m := re.fullmatch(_TAGGED, path.stem))}
     tags = {match["face"].lower() for match in tagged.values()}
     if not tags.issuperset(_SIDE_FACES) and len(tagged) < len(images):
@@ -305,6 +328,44 @@ def _find_frames(folder: Path) -> tuple[str, tuple[str, ...], dict[str, tuple[Pa
         if face in tags
     }
     return "cube", *_cube_frames(folder, by_face)
+
+
+def _no_images(
+    folder: Path, entries: Sequence[Path], others: Sequence[str], foreign: str
+) -> GsbaError:
+    """The refusal of a folder without pictures.
+
+    Args:
+        folder: the folder.
+        entries: all files and folders in it.
+        others: names of those that are no images.
+        foreign: number and format of images in unsupported formats.
+    """
+    if foreign:
+        return GsbaError(
+            f"{folder}: no JPEG, PNG, WebP or TIFF images, but {foreign}: convert them first"
+        )
+    folders = [path for path in entries if path.is_dir() and path.name[0] != "."]
+    if below := [path for path in folders if any(map(is_image, _entries(path)))]:
+        return GsbaError(_recordings_below(folder, below))
+    counts = Counter(Path(name).suffix.lower() or Path(name).name for name in others)
+    held = ", ".join(f"{n} {kind}" for kind, n in sorted(counts.items())[:5]) or "nothing"
+    return GsbaError(
+        f"{folder}: no JPEG, PNG, WebP or TIFF images (it holds {held}); extract the video's "
+        "frames there first"
+    )
+
+
+def _recordings_below(folder: Path, below: Sequence[Path]) -> str:
+    """The refusal of a folder whose pictures lie in folders of recordings."""
+    names = ", ".join(path.name for path in below[:5]) + (", ..." if len(below) > 5 else "")
+    if len(below) == 1:
+        return f"{folder}: its pictures are in {below[0]}: give that folder"
+    paths = " ".join(shlex.quote(str(path)) for path in below[:3]) + (" ..." if below[3:] else "")
+    return (
+        f"{folder}: its pictures are in {len(below)} folders ({names}): give one of them, or "
+        f"all as recordings of one place (gsba refine {paths} --out RUN)"
+    )
 
 
 _TAGGED = re.compile(rf"(?P<name>.+)_(?P<face>{'|'.join(FACES)})", re.IGNORECASE)
@@ -366,7 +427,7 @@ def _common_size(paths: Sequence[tuple[Path, ...]], layout: str) -> tuple[int, i
             header = image_header(path)
             w, h = header.size
             if layout == "erp" and not may_hold_two((w, h)):
-                raise _no_panorama(path, header)
+                raise _no_panorama(path, header, _stacked(path, (w, h)))
             if layout == "cube" and (w != h or h == 0):
                 raise GsbaError(f"{path}: is {w}x{h}; a cube face is square")
             if (w, h) != (width, height) and layout == "fisheye":
@@ -377,6 +438,24 @@ def _common_size(paths: Sequence[tuple[Path, ...]], layout: str) -> tuple[int, i
             if (w, h) != (width, height):
                 raise GsbaError(f"{path}: is {w}x{h}, but '{first.name}' is {width}x{height}")
     return width, height
+
+
+def _stacked(path: Path, size: tuple[int, int]) -> str:
+    """Name of a picture of 1:2 or 1:1 that holds two pictures one above the other; "" = unknown."""
+    width, height = size
+    if height not in (width, 2 * width):
+        return ""
+    try:
+        grey = decode(path, size, gray=True, at_least=512)
+    except GsbaError:
+        return ""
+    if height == 2 * width and two_circles([one_beside_other(grey)], path)[0]:
+        return (
+            ". It holds two fisheyes one above the other: save each as a picture of its own, in "
+            "folders front/ and back/"
+        )
+    kind = unlike_panorama([grey])
+    return f". It is {kind}: {REMEDIES[kind]}" if kind == OVER_UNDER else ""
 
 
 def _no_panorama(path: Path, header: Header, more: str = "") -> GsbaError:

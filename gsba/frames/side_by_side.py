@@ -112,6 +112,12 @@ def two_circles(greys: Iterable[np.ndarray], where: Path) -> tuple[bool, tuple[s
     return True, (note,)
 
 
+def one_beside_other(grey: np.ndarray) -> np.ndarray:
+    """Upper and lower half (h, w) of a picture (2h, w) beside each other."""
+    half = grey.shape[0] // 2
+    return np.concatenate([grey[:half], grey[half : 2 * half]], axis=1)
+
+
 def in_folder(
     folder: Path,
     paths: Sequence[Path],
@@ -136,7 +142,7 @@ def in_folder(
         return SideBySide(None)
     spread = [(2 * i + 1) * len(paths) // (2 * LOOKED_AT) for i in range(LOOKED_AT)]
     rows = dict.fromkeys([len(paths) // 2, *spread])  # the middle one suffices for most panoramas
-    greys = _readable([paths[row] for row in rows], size)
+    greys = readable([paths[row] for row in rows], size)
     maker = next((name for named, name in _MAKERS if named.match(paths[0].stem)), "")
     if shape is None:
         found = recognise(greys, size, folder)
@@ -200,7 +206,7 @@ def _collected(greys: Iterator[np.ndarray], taken: list[np.ndarray]) -> Iterator
         yield grey
 
 
-def _readable(paths: Iterable[Path], size: tuple[int, int]) -> Iterator[np.ndarray]:
+def readable(paths: Iterable[Path], size: tuple[int, int]) -> Iterator[np.ndarray]:
     """Grey pictures, small ones where that is fast; damaged ones are skipped here and refused
     later."""
     for path in paths:

@@ -1,13 +1,17 @@
 """Facts about an image, or about a folder of frames."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from gsba.camera.fisheye import lens_names
 from gsba.frames.exif import ExifTags, read_exif
-from gsba.frames.files import image_size
+from gsba.frames.files import decode, image_size
+from gsba.frames.image_circles import find_circle
+from gsba.frames.panorama_checks import unlike_panorama
 from gsba.frames.scan import scan
+from gsba.frames.side_by_side import cut, one_beside_other, recognise, two_circles
 from gsba.inspection.facts import Facts, Found, spoken_seconds
 from gsba.log import GsbaError
 from gsba.types import FrameSet
@@ -32,10 +36,51 @@ def of_folder(folder: Path) -> Found:
 
 def of_picture(path: Path) -> Found:
     """Facts about one image, which alone cannot be refined."""
-    width, height = image_size(path)
+    size = image_size(path)
     tags = _tags(path)
-    facts = (*_camera([tags] if tags else []), ("size", f"{width}x{height}"))
+    facts = (
+        *_camera([tags] if tags else []),
+        ("size", f"{size[0]}x{size[1]}"),
+        *_shown(path, size),
+    )
     return Found(facts, f"{path} is one image: give the folder of all images of the place")
+
+
+def _shown(path: Path, size: tuple[int, int]) -> Facts:
+    """Layout of one image, and its image circles."""
+    width, height = size
+    grey = decode(path, size, gray=True)
+    if height == 2 * width and two_circles([one_beside_other(grey)], path)[0]:
+        halves = grey[:width], grey[width:]
+        return (
+            ("layout", "raw, two fisheyes one above the other"),
+            *_circles(halves, "upper", "lower"),
+        )
+    found = recognise([grey], size, path).lens_size
+    if found is not None:
+        return (
+            ("layout", "raw, two fisheyes side by side"),
+            *_circles(cut(grey, found), "left", "right"),
+        )
+    if width == 2 * height:
+        kind = unlike_panorama([grey])
+        return (("layout", kind or "stitched panorama"),)
+    circle = find_circle([grey]).circle if max(size) <= 1.1 * min(size) else None
+    if circle is None:
+        return (("layout", "no panorama (2:1), and no image circles are found"),)
+    return (("layout", "raw, one fisheye"), *_circles([grey], "lens"))
+
+
+def _circles(lenses: Sequence[np.ndarray], *names: str) -> Facts:
+    """Image circle of each lens's picture (h, w) uint8."""
+    facts = []
+    for name, picture in zip(names, lenses, strict=True):
+        circle = find_circle([picture]).circle
+        text = "not found"
+        if circle is not None:
+            text = f"radius {circle.radius:.0f} px around ({circle.x:.0f}, {circle.y:.0f})"
+        facts.append((f"{name} circle", text))
+    return tuple(facts)
 
 
 def _about(frames: FrameSet) -> Facts:

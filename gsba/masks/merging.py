@@ -16,6 +16,7 @@ from gsba.disk import write_bytes, write_image
 from gsba.frames.masks import levels_of, load_mask, load_weights
 from gsba.frames.pixels import load_erp
 from gsba.log import GsbaError, track
+from gsba.masks.borders import Borders, find_borders, padded
 from gsba.masks.carrier import (
     Carrier,
     carrier_mask,
@@ -83,7 +84,7 @@ def choose(masks: Masks, segment: Segment | None = None) -> Choice:
 
 
 def before(store: RunStore, frames: FrameSet, choice: Choice) -> FrameSet:
-    """Frames with masks known before any solution: segmentation, and the carrier.
+    """Frames with masks known before any solution: segmentation, black borders, the carrier.
 
     Raises:
         GsbaError: a segmentation fails; or the carrier is required and cannot be detected.
@@ -94,6 +95,10 @@ def before(store: RunStore, frames: FrameSet, choice: Choice) -> FrameSet:
         found = segmented(store, frames, choice.segment)
         parts.append(lambda f: load_segmented(found, frames, f))
         names.append("segmented")
+    if choice.carrier or padded(frames):
+        for name, mask in _borders(store, frames).items():
+            parts.append(mask)
+            names.append(name)
     if choice.carrier and frames.recordings:
         frames, more, stages = _carriers(store, frames, choice, alone=not parts)
         parts += more
@@ -110,6 +115,23 @@ def before(store: RunStore, frames: FrameSet, choice: Choice) -> FrameSet:
     final = not choice.distractors
     folder = store.root / (_FOLDER if final else f"stages/first-{_FOLDER}")
     return _merge(store, folder, frames, parts, names)
+
+
+def _borders(store: RunStore, frames: FrameSet) -> dict[str, Callable[[int], np.ndarray | None]]:
+    """Masks of areas that are black in all frames of a recording, by the name of their stage."""
+    parts: dict[str, Callable[[int], np.ndarray | None]] = {}
+    for name, rows in (frames.recordings or {"": np.arange(len(frames))}).items():
+        own = frames.taken(rows) if frames.recordings else frames
+        found = find_borders(own)
+        if not found.share:
+            continue
+        stage = f"borders@{name}" if name else "borders"
+        files = fingerprint(path for group in own.paths for path in group)
+        store.stage(stage, files, lambda found=found: found, Borders)
+        logger.info("%s: %.1f%% of the picture is black in all frames", stage, 100 * found.share)
+        within = frozenset(map(int, rows))
+        parts[stage] = lambda f, found=found, within=within: found.mask if f in within else None
+    return parts
 
 
 def _carriers(

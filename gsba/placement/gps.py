@@ -2,6 +2,7 @@
 
 import csv
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -119,7 +120,8 @@ def read_gps(path: Path, settings: GpsSettings | None = None) -> GpsFixes:
     A table's header names its columns: latitude and longitude, altitude if known, either the
     frame's name or the time in seconds on the frames' clock, and the noise of fixes: `hdop`,
     `vdop`, `pdop`, or `sigma`, `accuracy` and `sigma_up` in metres. Times of a GPX track are UTC
-    and become Unix time; its `hdop`, `vdop` and `pdop` are read.
+    and become Unix time; its `hdop`, `vdop` and `pdop` are read. Points that share a whole second
+    are spread over it. The settings' offset is added to all times.
 
     Args:
         path: the file.
@@ -213,7 +215,23 @@ def _read_gpx(path: Path, settings: GpsSettings) -> GpsFixes:
         noise.append([_noise(dop, "hdop", place), _noise(up, "vdop", place), math.nan, math.nan])
     if not rows:
         raise GsbaError(f"{path}: the GPX file holds no track points")
-    return _checked_fixes(path, times, rows, noise, settings)
+    return _checked_fixes(path, _spread(times), rows, noise, settings)
+
+
+def _spread(times: list[float]) -> list[float]:
+    """Times of a GPX track whose points share whole seconds, spread over these seconds.
+
+    Apps that record several points a second write the time without its fraction.
+    """
+    if any(time % 1 for time in times):
+        return times
+    shares = Counter(times)
+    seen = Counter[float]()
+    spread = []
+    for time in times:
+        spread.append(time + seen[time] / shares[time])
+        seen[time] += 1
+    return spread
 
 
 def _checked_fixes(
@@ -225,7 +243,16 @@ def _checked_fixes(
 ) -> GpsFixes:
     """Fixes of a file; `noise` holds a row of `_NOISE_COLUMNS` for each."""
     if not isinstance(keys[0], str) and len(set(keys)) < len(keys):
-        raise GsbaError(f"{path} holds two positions at one time")
+        times = np.array(keys, np.float64)
+        order = np.argsort(times, kind="stable")
+        same = int(np.flatnonzero(np.diff(times[order]) == 0)[0])
+        one, other = int(order[same]), int(order[same + 1])
+        raise GsbaError(
+            f"{path} holds two positions at one time, {keys[one]!r} s: positions {one + 1} and "
+            f"{other + 1}; remove one of them"
+        )
+    if not isinstance(keys[0], str):
+        keys = [float(key) + settings.offset_s for key in keys]
     dop, dop_up, error, error_up = np.array(noise).T
     known = {"dop_up": dop_up, "error_m": error, "error_up_m": error_up}
     return fixes_of(keys, np.array(rows), sigmas_of(settings, dop, **known), settings)

@@ -11,6 +11,7 @@ rotation in which the camera stores them. GoPro's `.360` holds two tracks of a c
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import tee
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +19,23 @@ import numpy as np
 
 from gsba.camera.factory_lenses import FactoryCalibration
 from gsba.frames.factory_start import factory_calibration
+from gsba.frames.files import turned
 from gsba.frames.lens_names import lens_files
-from gsba.frames.side_by_side import LOOKED_AT, SideBySide, lens_sizes, may_hold_two, recognise
+from gsba.frames.panorama_checks import OVER_UNDER, REMEDIES, unlike_panorama
+from gsba.frames.side_by_side import (
+    LOOKED_AT,
+    SideBySide,
+    lens_sizes,
+    may_hold_two,
+    one_beside_other,
+    recognise,
+    two_circles,
+)
 from gsba.log import GsbaError
+from gsba.video.claims import PictureClaims
+from gsba.video.colours import bgr, luma
 from gsba.video.cube_tracks import TRACKS, cube_tracks
-from gsba.video.timeline import Timeline, Track, bgr, decode, luma, read_timeline, track_sizes
+from gsba.video.timeline import Timeline, Track, decode, read_claims, read_timeline, track_sizes
 
 LENSES = ("front", "back")
 EXACT_S = 1e-6  # closer times are equal
@@ -30,6 +43,7 @@ EXACT_S = 1e-6  # closer times are equal
 _RAW_SUFFIX = ".insv"  # of videos that hold fisheyes even if no image circle is detected
 _STITCH = "stitch it in the camera's app and export an equirectangular (2:1) video"
 _MAX_SQUARE_RATIO = 1.1  # of the longer to the shorter side of a nearly square image
+_MAX_ROUNDING = 0.02  # of the width by which encoders miss 2:1
 _MAX_MISSING_SHARE = 0.1  # of the longer track's duration that the shorter one may lack
 
 
@@ -40,16 +54,18 @@ class Picture:
     frame: Any  # av.VideoFrame
     place: tuple[slice, slice]  # its rows and columns in the frame
     height: int | None = None  # pixels, to which a squeezed image is stretched; None = not squeezed
+    orientation: int = 1  # of EXIF, in which the stored image is shown
 
     def luma(self) -> np.ndarray:
         """Brightness (H, W) uint8."""
-        return self._unsqueezed(luma(self.frame)[self.place])
+        return self._shown(luma(self.frame)[self.place])
 
     def bgr(self) -> np.ndarray:
         """Colours (H, W, 3) uint8 BGR."""
-        return self._unsqueezed(bgr(self.frame)[self.place])
+        return self._shown(bgr(self.frame)[self.place])
 
-    def _unsqueezed(self, pixels: np.ndarray) -> np.ndarray:
+    def _shown(self, pixels: np.ndarray) -> np.ndarray:
+        pixels = turned(pixels, self.orientation)
         if self.height is None:
             return np.ascontiguousarray(pixels)
         import cv2
@@ -71,6 +87,7 @@ class Recording:
     notes: tuple[str, ...] = ()  # recognised layout, and left-out parts
     cube: bool = False  # True = two tracks of an equi-angular cube map, not two lenses
     height: int | None = None  # pixels, to which squeezed images are stretched; None = not squeezed
+    orientation: int = 1  # of EXIF, in which stored panoramas are shown
 
     @property
     def times(self) -> np.ndarray:
@@ -120,11 +137,12 @@ def read_recording(video: Path) -> Recording:
         note = f"{files[0]}: raw, of the front lens; of the back one is {files[1]}"
         return _of_two_tracks((Track(files[0]), Track(files[1])), size, note)
     if others:
-        _check_tracks(video, [size, *others])
+        sizes = [size, *others]
+        pair = _lens_tracks(sizes)
+        size = sizes[pair[0]]
+        _check_tracks(video, sizes if len(pair) > 2 else [sizes[n] for n in pair])
         note = f"{video}: raw, two tracks of {size[0]}x{size[1]}: front lens, back lens"
-        return _of_two_tracks((Track(video), Track(video, 1)), size, note)
-    if not may_hold_two(size):
-        _check_panorama(video, size)
+        return _of_two_tracks((Track(video, pair[0]), Track(video, pair[1])), size, note)
     return _of_one_track(Track(video), size)
 
 
@@ -145,7 +163,8 @@ def shots(recording: Recording, chosen: Sequence[int]) -> Iterator[tuple[int, tu
     if len(recording.tracks) == 1:
         for index, frame in frames:
             places = recording.places
-            yield index, tuple(Picture(frame, place, recording.height) for place in places)
+            shape = recording.height, recording.orientation
+            yield index, tuple(Picture(frame, place, *shape) for place in places)
         return
     partners = recording.partners[list(chosen)].tolist()
     instants = dict(zip(partners, chosen, strict=True))
@@ -198,6 +217,14 @@ def _check_pair(files: tuple[Path, ...], size: tuple[int, int]) -> None:
         )
 
 
+def _lens_tracks(sizes: Sequence[tuple[int, int]]) -> list[int]:
+    """Numbers of the tracks that lenses may have: the two largest, if they are square and equal,
+    beside covers and previews (DJI's `.osv`); else all."""
+    largest = max(sizes, key=lambda size: size[0] * size[1])
+    pair = [n for n, size in enumerate(sizes) if size == largest]
+    return pair if len(pair) == 2 and _is_nearly_square(largest) else list(range(len(sizes)))
+
+
 def _check_tracks(video: Path, sizes: list[tuple[int, int]]) -> None:
     """Refuse several tracks that are not of two lenses."""
     (width, height), shapes = sizes[0], " and ".join(f"{w}x{h}" for w, h in sizes)
@@ -239,6 +266,16 @@ def _check_panorama(video: Path, size: tuple[int, int]) -> None:
             f"{video} is {width}x{height}, square: one lens of a raw dual-fisheye recording, or "
             f"a stereo pair; {_STITCH}"
         )
+    if abs(width - 2 * height) <= _MAX_ROUNDING * width:
+        raise GsbaError(
+            f"{video} is {width}x{height}, nearly 2:1: if it is a whole panorama, scale it "
+            f"(ffmpeg -i {video.name} -vf scale={width}:{width // 2} ONE.mp4)"
+        )
+    if height == 2 * width:
+        raise GsbaError(
+            f"{video} is {width}x{height}, a panorama on its side, or two pictures one above the "
+            "other that show no image circles: turn it, or export an equirectangular (2:1) video"
+        )
     raise GsbaError(
         f"{video} is {width}x{height}; an equirectangular video is 2:1. If it is raw "
         f"dual-fisheye or a reframed cut of the recording, {_STITCH}"
@@ -246,22 +283,34 @@ def _check_panorama(video: Path, size: tuple[int, int]) -> None:
 
 
 def _of_one_track(track: Track, size: tuple[int, int]) -> Recording:
-    """Recording of panoramas, or of two lenses side by side.
+    """Recording of panoramas, or of two lenses side by side or one above the other.
 
     Raises:
         GsbaError: the track holds neither.
     """
-    timeline = read_timeline(track)
-    num, (width, height) = len(timeline.ticks), size
-    found = _find_circles(track, timeline, size)
+    claims, timeline = read_claims(track), read_timeline(track)
+    _refuse_claims(track.path, claims)
+    shown, looks = claims.shown_size(size), tee(_looks(track, timeline), 3)
+    num, side = len(timeline.ticks), min(size[0], size[1] // 2)
+    everything = np.ones(num, bool), np.arange(num)
+    if 2 * size[0] == size[1] and two_circles(map(one_beside_other, looks[0]), track.path)[0]:
+        note = f"{track.path}: raw, two fisheyes one above the other, front above"
+        places = tuple((slice(at, at + side), slice(None)) for at in (0, side))
+        return Recording((track,), (timeline,), places, side, *everything, (note,))
+    found = recognise(looks[1], size, track.path)
     if found.lens_size is None and track.path.suffix.lower() == _RAW_SUFFIX and may_hold_two(size):
         note = f"{track.path}: raw, two fisheyes side by side, by its suffix"
         found = SideBySide(lens_sizes(size)[0], (note,))
-    everything = np.ones(num, bool), np.arange(num)
     if found.lens_size is None:
-        _check_panorama(track.path, size)
+        if not claims.whole:
+            _refuse_stereo(track.path, shown, (turned(g, claims.orientation) for g in looks[2]))
+        _check_panorama(track.path, shown)
         places = ((slice(None), slice(None)),)
-        return Recording((track,), (timeline,), places, width, *everything, found.notes)
+        notes = (*found.notes, *_claim_notes(track.path, claims))
+        height = None if claims.pixel_aspect == 1 else shown[1]
+        how = {"height": height, "orientation": claims.orientation}
+        return Recording((track,), (timeline,), places, shown[0], *everything, notes, **how)
+    width, height = size
     side, unsqueezed = width // 2, None
     rows = slice(found.top, found.top + side)
     if found.lens_size[1] < height:
@@ -270,6 +319,52 @@ def _of_one_track(track: Track, size: tuple[int, int]) -> Recording:
     return Recording(
         (track,), (timeline,), places, side, *everything, found.notes, height=unsqueezed
     )
+
+
+def _refuse_claims(video: Path, claims: PictureClaims) -> None:
+    """Refuse pictures that are no panoramas by their file's own claims."""
+    left, top, right, bottom = claims.bounds
+    kind = ""
+    if claims.stereo:
+        kind = f"stereo, {claims.stereo}"
+    elif claims.projection:
+        kind = f"the projection '{claims.projection}', not equirectangular"
+    elif any(claims.bounds):
+        across, high = 360 * (1 - left - right), 180 * (1 - top - bottom)
+        kind = f"a cropped panorama of {across:.0f} x {high:.0f} degrees"
+    if kind:
+        raise GsbaError(
+            f"{video} holds {kind}, by its spherical video tags; gsba reads whole panoramas of one "
+            "eye: export it so"
+        )
+
+
+def _refuse_stereo(video: Path, size: tuple[int, int], greys: Iterator[np.ndarray]) -> None:
+    """Refuse pictures in 2:1, or square ones, that are no panoramas by what they show."""
+    width, height = size
+    kind = unlike_panorama(greys) if height in (width, width // 2) else ""
+    if kind and (width == 2 * height or kind == OVER_UNDER):
+        raise GsbaError(f"{video} holds no panoramas but {kind}: {REMEDIES[kind]}")
+
+
+def _claim_notes(video: Path, claims: PictureClaims) -> list[str]:
+    """Notes on claims that changed pixels, or that are left to the player."""
+    notes = []
+    if claims.orientation > 1:
+        notes.append(
+            f"{video}: turned by its display matrix, EXIF orientation {claims.orientation}"
+        )
+    if claims.pixel_aspect != 1:
+        notes.append(f"{video}: pixels of {claims.pixel_aspect} are made square")
+    if claims.hdr:
+        notes.append(f"{video}: HDR ({claims.hdr}), converted to sRGB; brighter than white clips")
+    if any(claims.pose_deg):
+        turn = ", ".join(f"{angle:g}" for angle in claims.pose_deg)
+        notes.append(
+            f"{video}: players turn its panoramas by yaw, pitch, roll {turn} deg; they are read as "
+            "stored"
+        )
+    return notes
 
 
 def _of_two_tracks(
@@ -309,11 +404,11 @@ def _nearest(times: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     return np.where(np.abs(wanted - times[before]) <= np.abs(times[after] - wanted), before, after)
 
 
-def _find_circles(track: Track, timeline: Timeline, size: tuple[int, int]) -> SideBySide:
-    """Layout of frames: two image circles side by side, or not."""
+def _looks(track: Track, timeline: Timeline) -> Iterator[np.ndarray]:
+    """Grey pictures from all over a track, the middle one first: it suffices for most panoramas."""
     num = len(timeline.ticks)
     middle = num // 2
     others = {(2 * i + 1) * num // (2 * LOOKED_AT) for i in range(LOOKED_AT)} - {middle}
-    parts = [middle], sorted(others)  # for most panoramas the middle frame suffices
-    greys = (luma(frame) for part in parts for _, frame in decode(track, timeline, part))
-    return recognise(greys, size, track.path)
+    for part in ([middle], sorted(others)):
+        for _, frame in decode(track, timeline, part):
+            yield luma(frame)

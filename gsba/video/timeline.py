@@ -9,17 +9,19 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from gsba.log import GsbaError
+from gsba.video.claims import PictureClaims, claims_of
 
-_SUFFIXES = {".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi", ".ts", ".insv", ".360", ".lrv"}
-_UNSPECIFIED = 2  # AVCOL_SPC_UNSPECIFIED
-_FULL_RANGE = np.clip(np.rint((np.arange(256) - 16) * 255 / 219), 0, 255).astype(np.uint8)  # grey
-# values of a limited-range luma
+VIDEO_SUFFIXES = frozenset(
+    (".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi", ".ts", ".insv", ".360", ".lrv", ".osv")
+)
+_MAX_CLAIM_PACKETS = 60  # of a track until the first picture, which may be damaged
 _MAX_EXCESS_S = 1.0  # of the duration that a container claims over that of its frames
 
 
@@ -63,7 +65,7 @@ class Timeline:
 
 def is_video(path: Path) -> bool:
     """True if a path is a file with a video's suffix."""
-    return path.suffix.lower() in _SUFFIXES and path.is_file()
+    return path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()
 
 
 def track_sizes(video: Path) -> list[tuple[int, int]]:
@@ -128,6 +130,25 @@ def read_timeline(track: Track) -> Timeline:
         )
 
 
+def read_claims(track: Track) -> PictureClaims:
+    """Claims of a track about its pictures; none if its first second cannot be decoded.
+
+    Raises:
+        GsbaError: the file is no video, or there is no decoder for it.
+    """
+    av = _pyav()
+    with _opened(track.path) as (container, streams):
+        stream = streams[track.number]
+        for packet in islice(container.demux(stream), _MAX_CLAIM_PACKETS):
+            try:
+                pictures = packet.decode()
+            except av.error.InvalidDataError:
+                continue
+            if pictures:
+                return claims_of(pictures[0], stream.sample_aspect_ratio)
+    return PictureClaims()
+
+
 def decode(track: Track, timeline: Timeline, chosen: Sequence[int]) -> Iterator[tuple[int, Any]]:
     """Yield (index, av.VideoFrame) of chosen frames in order; damaged ones are left out.
 
@@ -157,33 +178,6 @@ def decode(track: Track, timeline: Timeline, chosen: Sequence[int]) -> Iterator[
                         yield wanted.pop(frame.pts), frame
                 if pictures and pictures[-1].pts is not None and pictures[-1].pts >= last:
                     break
-
-
-def luma(frame: Any) -> np.ndarray:
-    """Brightness (H, W) uint8 of an av.VideoFrame, over the full range from black 0 to white 255.
-
-    YUV frames give their luma plane, whatever their colour matrix: equal matrices on both sides
-    save FFmpeg the way over RGB. Limited range (16 to 235) is stretched; untagged frames have it.
-    """
-    import cv2
-    from av.video.reformatter import ColorRange, Colorspace
-
-    kind = frame.format
-    options = {"src_colorspace": Colorspace.ITU601, "dst_colorspace": Colorspace.ITU601}
-    is_plain = len(kind.components) > 2 and not kind.is_rgb and kind.components[0].bits == 8
-    if is_plain:  # FFmpeg copies the plane; the range is applied faster below
-        options |= {"src_color_range": ColorRange.JPEG, "dst_color_range": ColorRange.JPEG}
-    grey = frame.reformat(format="gray", **options).to_ndarray()
-    full_range = frame.color_range == ColorRange.JPEG or kind.name.startswith("yuvj")
-    return cv2.LUT(grey, _FULL_RANGE) if is_plain and not full_range else grey
-
-
-def bgr(frame: Any) -> np.ndarray:
-    """Colours (H, W, 3) uint8 BGR of an av.VideoFrame; the default colour matrix is BT.709."""
-    from av.video.reformatter import Colorspace
-
-    matrix = Colorspace.ITU709 if int(frame.colorspace) == _UNSPECIFIED else None
-    return frame.reformat(format="bgr24", src_colorspace=matrix).to_ndarray()
 
 
 def _pyav() -> Any:

@@ -175,13 +175,12 @@ def test_other_files_have_no_trailer(tmp_path: Path, content: bytes) -> None:
         read_trailer(tmp_path / "missing.insv")
 
 
-def test_another_version_is_named(tmp_path: Path) -> None:
+def test_another_version_is_a_note(tmp_path: Path) -> None:
     path = tmp_path / "v.insv"
     path.write_bytes(made.trailer(made.usual_records(), version=2))
-    with pytest.raises(
-        GsbaError, match=r"v\.insv: its Insta360 trailer has version 2; only version 3"
-    ):
-        read_trailer(path)
+    found = read_trailer(path)
+    assert found is not None and (found.version, found.gyro, found.lens_strings) == (2, None, ())
+    assert found.notes[0].startswith("the Insta360 trailer has version 2, and only version 3 is")
 
 
 def test_damage_leaves_what_can_still_be_read(tmp_path: Path) -> None:

@@ -126,6 +126,7 @@ def test_sizes_can_be_set_and_bounded() -> None:
     assert cubemap.rig_for(erp.format, CubemapSettings(max_face_size=700)).size == 700
 
 
-def test_cube_frames_keep_their_own_faces() -> None:
-    rig = cubemap.rig_for(_frame_set("cube", 333).format, CubemapSettings(face_size=100))
-    assert (rig.size, rig.hfov_rad) == (333, np.pi / 2)
+def test_cube_frames_keep_their_own_faces_up_to_the_size_of_panoramas() -> None:
+    for own, size in ((333, 333), (2048, CubemapSettings().max_face_size)):
+        rig = cubemap.rig_for(_frame_set("cube", own).format, CubemapSettings())
+        assert (rig.size, rig.hfov_rad) == (size, np.pi / 2)

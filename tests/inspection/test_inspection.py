@@ -127,3 +127,25 @@ def test_the_command_prints_text_or_json(tmp_path: Path) -> None:
 )
 def test_real_footage_is_told(name: str, layout: str) -> None:
     assert _facts(inspect(REAL / name))["layout"].startswith(layout)
+
+
+def test_one_raw_still_shows_its_layout_and_circles(tmp_path: Path) -> None:
+    front, back = (picture(lens) for lens in made_pair())
+    cases = {
+        "one.png": (front, "raw, one fisheye", ["lens circle"]),
+        "beside.png": (
+            np.concatenate([front, back], 1),
+            "raw, two fisheyes side by side",
+            ["left circle", "right circle"],
+        ),
+        "stacked.png": (
+            np.concatenate([front, back]),
+            "raw, two fisheyes one above the other",
+            ["upper circle", "lower circle"],
+        ),
+    }
+    for name, (pixels, layout, circles) in cases.items():
+        cv2.imwrite(str(tmp_path / name), np.ascontiguousarray(pixels[..., ::-1]))
+        facts = _facts(inspect(tmp_path / name))
+        assert facts["layout"] == layout
+        assert all(facts[circle].startswith("radius 1") for circle in circles)

@@ -70,7 +70,8 @@ def _walk(folder: Path, look: np.ndarray | None, plain_floor: bool = False, spee
 def _looks() -> dict[str, np.ndarray]:
     rng = np.random.default_rng(1)
     cells = rng.uniform(0, 255, (HEIGHT // 8, WIDTH // 8, 3)).astype(np.float32)
-    texture = cv2.resize(cells, (WIDTH, HEIGHT))
+    twice = cv2.resize(np.tile(cells, (1, 2, 1)), (2 * WIDTH, HEIGHT))
+    texture = twice[:, WIDTH // 2 : WIDTH // 2 + WIDTH]  # its edges meet
     return {"dark": 10 + 0.15 * texture, "bright": 205 + 0.1 * texture, "coloured": texture}
 
 
@@ -129,7 +130,8 @@ def _noise_frames(folder: Path, mask: np.ndarray, look: np.ndarray, num: int = 1
     """Panoramas of a world that is new in every frame, with `look` where `mask`."""
     rng = np.random.default_rng(5)
     for f in range(num):
-        world = cv2.GaussianBlur(rng.normal(size=(HEIGHT, WIDTH, 3)), (0, 0), 3)
+        noise = np.tile(rng.normal(size=(HEIGHT, WIDTH, 3)), (1, 2, 1))  # its edges meet
+        world = np.roll(cv2.GaussianBlur(noise, (0, 0), 3), -WIDTH // 2, 1)[:, :WIDTH]
         image = np.clip(128 + 45 * world / world.std(), 0, 255)
         image[mask] = look[mask] + rng.normal(0, 2, look[mask].shape)
         write_image(folder / f"{f:03d}.png", np.clip(image, 0, 255).astype(np.uint8))

@@ -234,3 +234,17 @@ def test_fixes_of_insta360_are_on_the_clock_of_the_video(tmp_path: Path) -> None
     path.write_bytes(b"pictures" + insta360_files.trailer(records[1:]))
     with pytest.raises(GsbaError, match="holds no GPS"):
         read_video_gps(path)
+
+
+def test_points_of_a_gpx_track_that_share_seconds_are_spread(tmp_path: Path) -> None:
+    points = "".join(
+        f'<trkpt lat="48" lon="{11 + 1e-5 * n}"><time>2024-05-01T10:00:0{n // 3}Z</time></trkpt>'
+        for n in range(6)
+    )
+    path = tmp_path / "a.gpx"
+    path.write_text(f'<gpx xmlns="http://www.topografix.com/GPX/1/1"><trk>{points}</trk></gpx>')
+    times = read_gps(path).timestamps
+    assert times is not None
+    np.testing.assert_allclose(times - times[0], np.arange(6) / 3, atol=1e-6)
+    shifted = read_gps(path, GpsSettings(offset_s=-3600)).timestamps
+    assert shifted is not None and shifted[0] == times[0] - 3600

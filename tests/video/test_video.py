@@ -16,8 +16,8 @@ from gsba.log import GsbaError
 from gsba.trajectory.files import write_tum
 from gsba.types import Trajectory
 from gsba.video import extract, extraction
+from gsba.video.colours import luma
 from gsba.video.likeness import apparent_motion_deg, miniature, sharpness
-from gsba.video.timeline import luma
 
 av = pytest.importorskip("av", reason="PyAV is not installed")
 

@@ -1,0 +1,125 @@
+"""Detection of 2:1 pictures that are no panorama: stereo pairs and cropped panoramas.
+
+The left and right edge of a panorama meet, its first and last row are stretched points, and its
+halves differ. Thresholds lie beyond the extremes of 3,476 pictures of true panoramas, blurred,
+dark, overexposed, with seams 1 degree off, carriers and patches over the poles among them: of these
+none is refused, of 316 stereo pairs of each kind 4 are accepted, and of panoramas cropped to
+270 x 135 degrees 7 in 10 pictures are recognised, the median of 5 more often.
+"""
+
+from collections.abc import Iterable
+from dataclasses import astuple, dataclass
+
+import cv2
+import numpy as np
+
+NUM_LOOKS = 5  # pictures of a sequence that suffice
+SIDE_BY_SIDE = "stereo, an eye on the left and one on the right"
+VR180 = "stereo side by side of half the sphere each (VR180)"
+OVER_UNDER = "stereo, one eye above the other"
+CROPPED = "a cropped panorama: its left and right edge do not meet, and its poles are missing"
+REMEDIES = {  # of what `unlike_panorama` names
+    SIDE_BY_SIDE: "cut out the left half and scale it to 2:1",
+    VR180: "half the sphere is missing; gsba needs 360-degree panoramas",
+    OVER_UNDER: "cut out the upper half and scale it to 2:1",
+    CROPPED: "pad it with black to 360 x 180 degrees, or keep the GPano tags of its maker",
+}
+
+_WIDTH = 256  # pixels across, to which pictures are made smaller
+_MIN_WIDTH = 512  # pixels across pictures that are judged: noise of smaller ones is not averaged
+_DETAIL_SIGMA_PX = 6.0  # blur whose difference from a picture is its detail
+_MIN_LIT_LEVEL, _LIT_BORDER_PX = 16, 13  # black areas and their edges repeat without stereo
+_MIN_COMPARED_SHARE = 0.2  # part of a half that must be lit in both
+_MIN_DETAIL = 1.0  # grey levels, standard deviation; with less, noise or nothing is compared
+_MAX_DISPARITY_PX = 6  # between two eyes
+_MIN_REPEAT = 0.65  # correlation of the details of both eyes; 0.46 at most in panoramas
+_MIN_SEAM = 0.5  # step between both edges over that between far columns
+_MIN_SEAM_OF_HALVES = 0.4  # the same where halves repeat: tells half spheres from whole ones
+_MIN_MIDDLE_STEP = 1.1  # one eye's nadir does not continue in the other's zenith
+_CERTAIN_SEAM = 0.3  # edges with a smaller step meet, so that one picture is enough
+_MIN_POLE_DETAIL = 0.45  # gradient along the rows over that across them; 0.44 at most at the more
+# constant pole of panoramas whose edges do not meet
+_POLE_ROWS, _POLE_SIGMA_PX, _MIN_GRADIENT = 6, 1.5, 0.3  # rows; blur; grey levels a pixel
+_MIN_CONTRAST = 6.0  # grey levels between far columns; with less, noise is compared
+
+
+@dataclass(frozen=True, slots=True)
+class _Evidence:
+    """Measures of one picture."""
+
+    beside: float  # correlation of the left and the right half
+    above: float  # correlation of the upper and the lower half
+    seam: float  # step between both edges over that between far columns, medians over rows; 0 = no
+    # contrast
+    poles: float  # detail of the more constant pole
+    middle: float  # step between the middle rows over the 95th percentile of steps between rows
+
+
+def unlike_panorama(greys: Iterable[np.ndarray]) -> str:
+    """Name of what 2:1 pictures hold instead of panoramas; "" = nothing speaks against panoramas.
+
+    Args:
+        greys: (h, w) uint8 each, of one sequence; NUM_LOOKS suffice, and fewer are taken if the
+            first one is clearly a panorama. Those narrower than 512 pixels are not judged.
+    """
+    found = list[_Evidence]()
+    for grey in greys:
+        if grey.shape[1] < _MIN_WIDTH:
+            return ""
+        found.append(_measure(grey))
+        first = found[0]
+        if max(first.beside, first.above) < _MIN_REPEAT and first.seam < _CERTAIN_SEAM:
+            return ""
+    if not found:
+        return ""
+    beside, above, seam, poles, middle = np.median([astuple(one) for one in found], axis=0)
+    if beside >= max(_MIN_REPEAT, above):
+        return VR180 if seam >= _MIN_SEAM_OF_HALVES else SIDE_BY_SIDE
+    if above >= _MIN_REPEAT and middle >= _MIN_MIDDLE_STEP:
+        return OVER_UNDER
+    return CROPPED if seam >= _MIN_SEAM and poles >= _MIN_POLE_DETAIL else ""
+
+
+def _measure(grey: np.ndarray) -> _Evidence:
+    size = _WIDTH, _WIDTH // 2
+    small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    detail = small - cv2.GaussianBlur(small, (0, 0), _DETAIL_SIGMA_PX)
+    border = np.ones((_LIT_BORDER_PX, _LIT_BORDER_PX), np.uint8)
+    lit = cv2.erode((small > _MIN_LIT_LEVEL).astype(np.uint8), border) > 0
+    beside, above = (
+        _repeat(*np.split(detail, 2, axis), *np.split(lit, 2, axis)) for axis in (1, 0)
+    )
+    columns = cv2.blur(small, (1, 5))
+    shifts = (_WIDTH * np.array([3, 5, 7, 8])) // 16
+    far = np.mean([np.median(np.abs(columns - np.roll(columns, s, 1))) for s in shifts])
+    seam = np.median(np.abs(columns[:, 0] - columns[:, -1])) / far if far > _MIN_CONTRAST else 0.0
+    blurred = cv2.GaussianBlur(small, (0, 0), _POLE_SIGMA_PX, borderType=cv2.BORDER_REPLICATE)
+    poles = min(_pole_detail(blurred[:_POLE_ROWS]), _pole_detail(blurred[-_POLE_ROWS:]))
+    steps = np.abs(np.diff(small, axis=0)).mean(axis=1)
+    middle = float(steps[len(steps) // 2] / max(np.percentile(steps, 95), 1e-6))
+    return _Evidence(beside, above, float(seam), poles, middle)
+
+
+def _repeat(one: np.ndarray, other: np.ndarray, lit: np.ndarray, other_lit: np.ndarray) -> float:
+    """Largest correlation of two halves (h, w) over shifts of some columns; 0 = not comparable."""
+    most, best = _MAX_DISPARITY_PX, 0.0
+    inner = (slice(None), slice(most, -most))
+    for shift in range(-most, most + 1):
+        both = (lit & np.roll(other_lit, shift, 1))[inner]
+        if both.mean() < _MIN_COMPARED_SHARE:
+            continue
+        x, y = one[inner][both], np.roll(other, shift, 1)[inner][both]
+        norm = float(x.std() * y.std())
+        if norm > _MIN_DETAIL**2:
+            best = max(best, float(((x - x.mean()) * (y - y.mean())).mean()) / norm)
+    return best
+
+
+def _pole_detail(rows: np.ndarray) -> float:
+    """Mean gradient along rows at a pole over that across them; 0 = nothing to be seen there.
+
+    In a panorama the ratio is the cosine of the latitude, a few per cent, and more with noise.
+    """
+    along = float(np.abs(np.diff(rows[:-1, 1:-1], axis=1)).mean())
+    across = float(np.abs(np.diff(rows[:, 1:-1], axis=0)).mean())
+    return along / across if along > _MIN_GRADIENT and across > 0 else 0.0
