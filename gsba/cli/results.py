@@ -106,6 +106,9 @@ Pairs = Annotated[
     ),
 ]
 
+HoldOut = Annotated[
+    bool, typer.Option(help="Hold one panorama in eight out of the training, with all its faces.")
+]
 Located = Annotated[
     Path | None,
     typer.Option(
@@ -142,10 +145,7 @@ def export(
     map_number: MapNumber = 1,
     photos: Located = None,
     exposure_ms: Exposure = None,
-    split: Annotated[
-        bool,
-        typer.Option(help="Hold one panorama in eight out of the training, with all its faces."),
-    ] = True,
+    split: HoldOut = True,
     cluster: Cluster = None,
 ) -> None:
     """Write a finished run as a dataset for another program."""

@@ -112,9 +112,8 @@ def check_steps(
     linked[1:] |= np.isfinite(sigmas)
     wrong |= found.directed & linked & (strain > np.log(verify.max_length_ratio))
     unseen = ~found.verified
-    rough = wrong | (
-        found.verified & (turned > _MAX_PRIOR_SIGMAS * np.deg2rad(priors.rotation_deg))
-    )
+    most_turned = _MAX_PRIOR_SIGMAS * np.deg2rad(priors.rotation_deg)
+    rough = wrong | (found.verified & (turned > most_turned))
     rough |= found.directed & (off > np.arctan(_MAX_PRIOR_SIGMAS * priors.translation) + unsure)
     rough |= found.directed & linked & (strain > _MAX_PRIOR_SIGMAS * priors.translation)
     chosen = slam.copy()
