@@ -14,7 +14,7 @@ from gsba.disk import write_image
 from gsba.geometry import inverse, pose
 from gsba.types import FACES, FrameSet, PictureFormat, PoseStatus, Reconstruction
 
-NUM_FRAMES = 8
+NUM_FRAMES = 9
 WIDTH, HEIGHT = 512, 256
 BLOB_RAD = 0.025  # spread of a point's picture; a panorama's pixel is 0.012
 

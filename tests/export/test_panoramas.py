@@ -26,7 +26,7 @@ from two_fisheyes import made_pair
 from gsba.camera.fisheye import project, unproject
 from gsba.camera.lens import Lenses, rows_run
 from gsba.disk import write_image
-from gsba.export import ExportFormat, Shutter, export
+from gsba.export import ExportFormat, Shutter, colmap, export
 from gsba.geometry import inverse, pose
 from gsba.log import GsbaError
 from gsba.trajectory.files import read_trajectory
@@ -232,29 +232,25 @@ def test_rows_of_raw_fisheyes_have_their_poses(tmp_path: Path) -> None:
             if mask[tuple(np.floor(pixel[::-1]).astype(int))]:
                 looked += assert_blob(image, pixel, reconstruction().point_colors[j], entry["fl_x"])
         assert mask[0, 0] == 0 and mask[120, 120] == 255
-    assert looked >= 6 * NUM_FRAMES and moved > 0.5
+    assert looked > 6 * NUM_FRAMES and moved > 0.5
 
 
 def test_colmap_holds_nothing_beyond_a_right_angle_of_a_lens(tmp_path: Path) -> None:
     """COLMAP's fisheye cameras give no ray there, or a wrong one."""
-    frames, scene = _raw_frames(tmp_path / "frames"), _scene(RAW)
-    assert scene.observation_origins is not None
-    front = scene.observation_origins[:, 2] > 0
-    axis = Rotation.from_rotvec(PAIR[0].rotation).as_matrix()[:, 2]
-    across = np.cross(axis, [0.0, 1.0, 0.0])
-    beyond = np.flatnonzero(front)[:3]
-    scene.observation_bearings[beyond] = np.cos(np.deg2rad(92)) * axis + across
-    to = ExportFormat.COLMAP_FLAT
-    export(scene, frames, tmp_path / "out", to, lenses=RAW, images="fisheye", split=False)
+    frames, to = _raw_frames(tmp_path / "frames"), ExportFormat.COLMAP_FLAT
+    export(_scene(RAW), frames, tmp_path / "out", to, lenses=RAW, images="fisheye", split=False)
     model = pycolmap.Reconstruction(tmp_path / "out/sparse/0")
-    assert model.compute_num_observations() == len(front) - 3
-    for image in model.images.values():
-        mask = _image(tmp_path / "out/masks" / f"{image.name[:-4]}.png")
-        rows, columns = np.nonzero(mask)
+    for image in list(model.images.values())[:2]:
+        camera = model.cameras[image.camera_id]
+        rows, columns = np.nonzero(_image(tmp_path / "out/masks" / f"{image.name[:-4]}.png"))
         pixels = np.column_stack([columns, rows])[::97] + 0.5
-        rays = model.cameras[image.camera_id].cam_from_img(pixels)
-        assert np.isfinite(rays).all()
-        back = model.cameras[image.camera_id].img_from_cam(
-            np.column_stack([rays, np.ones(len(rays))])
-        )
-        np.testing.assert_allclose(back, pixels, atol=1e-3)
+        rays = np.column_stack([camera.cam_from_img(pixels), np.ones(len(pixels))])
+        assert np.isfinite(rays).all() and len(rays) > 100
+        np.testing.assert_allclose(camera.img_from_cam(rays), pixels, atol=1e-3)
+    axis = Rotation.from_rotvec(PAIR[0].rotation).as_matrix()[:, 2]
+    angles = np.deg2rad([[88.0], [92.0]])
+    aside = np.cross(axis, [0.0, 1.0, 0.0])
+    bearings_rig = np.cos(angles) * axis + np.sin(angles) * aside / np.linalg.norm(aside)
+    sensors = colmap._raw_sensors(frames.formats[0], RAW)
+    which, _ = colmap._project_raw(sensors, bearings_rig, np.tile(RAW.centres[0], (2, 1)))
+    assert which.tolist() == [0, -1]

@@ -62,7 +62,7 @@ def test_held_out_rows_are_spread_and_at_no_end() -> None:
 
 def test_readers_by_name_by_number_and_by_list_hold_the_same_panoramas_out(tmp_path: Path) -> None:
     frames, scene = panoramas(tmp_path / "frames", masked=True), reconstruction()
-    chosen = np.arange(len(frames) - 1)  # 7: no multiple of eight images
+    chosen = np.arange(7)  # no multiple of eight images
     frames, scene = frames.taken(chosen), scene.taken(chosen)
     out = tmp_path / "out"
     export(scene, frames, out, ExportFormat.COLMAP_FLAT, face_size=16)

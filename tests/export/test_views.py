@@ -54,7 +54,7 @@ def written(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
     lenses, folder = request.param, tmp_path_factory.mktemp("lenses")
     frames = panoramas(folder / "frames", masked=True, lenses=lenses)
     for to in (ExportFormat.COLMAP, ExportFormat.COLMAP_FLAT, ExportFormat.NERFSTUDIO):
-        export(scene(lenses), frames, folder / to, to, lenses=lenses)
+        export(scene(lenses), frames, folder / to, to, lenses=lenses, split=False)
     return lenses, folder
 
 
