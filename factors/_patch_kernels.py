@@ -13,6 +13,8 @@ from factors.compiled import kernel_and_part
 _TRIAL_STEPS = 4  # steps after which a patch must correlate somewhat to go on
 _POLE_HALF_PATCHES = 8.0  # distance from a pole, in half patches, within which each ray needs its
 # own pixel
+_MAX_OFF_CENTRE = 0.25  # pixels between a patch's centre and that of the square its pixels are
+# mapped in; the map is exact there
 _MIN_CORNER_DETERMINANT = 1e-4  # least determinant of the shift's information over its squared
 # trace: excludes edges
 _MIN_GREY_VARIANCE = 1e-3  # variance in grey values squared below which a patch is empty
@@ -152,7 +154,7 @@ def _sample_patch(coefficients, origin, spread, warp, reach, smooth, scratch, ou
     a, b, c, d = 1.0 + warp[2], warp[3], warp[4], 1.0 + warp[5]
     extent = reach * max(abs(a) + abs(c), abs(b) + abs(d))
     off = max(abs(warp[0] - square[0]), abs(warp[1] - square[1]))
-    if off + extent > square[2]:  # the warp has left the square that pixels are mapped in
+    if off > _MAX_OFF_CENTRE or extent + _MAX_OFF_CENTRE > square[2]:
         square[0], square[1], square[2] = warp[0], warp[1], extent + 1.0
         smooth = _map_pixels(origin, spread, square, width, height, nodes, quadratics)
     if smooth:
