@@ -122,17 +122,10 @@ def _scratch(reach):
     for i in range(n):
         for j in range(n):
             places[0, i * n + j], places[1, i * n + j] = i - reach, j - reach
-    before, weights = np.empty((2, n * n), np.int32), np.empty((8, n * n), np.float32)
-    square = np.zeros(3)
-    return (
-        np.empty((3, 3, 2)),
-        np.empty((2, 3, 3)),
-        square,
-        places,
-        np.empty((2, n * n)),
-        before,
-        (weights),
-    )
+    nodes, quadratics, square = np.empty((3, 3, 2)), np.empty((2, 3, 3)), np.zeros(3)
+    pixels, before = np.empty((2, n * n)), np.empty((2, n * n), np.int32)
+    weights = np.empty((8, n * n), np.float32)
+    return nodes, quadratics, square, places, pixels, before, weights
 
 
 @_part

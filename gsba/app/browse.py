@@ -4,6 +4,7 @@ import os
 from pathlib import Path
 from typing import Any
 
+from gsba.app.forms import holds_half_characters
 from gsba.frames.files import IMAGE_SUFFIXES
 from gsba.log import GsbaError, brief
 from gsba.store.folder import is_run_folder
@@ -20,7 +21,7 @@ def inside(root: Path, name: str) -> Path:
     """
     if "\0" in name:
         raise GsbaError("a path holds no NUL characters")
-    if any(0xD800 <= ord(character) < 0xE000 for character in name):
+    if holds_half_characters(name):
         raise GsbaError("a path holds no half characters")
     base = root.resolve()
     path = (base / name).resolve()

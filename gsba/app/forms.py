@@ -80,6 +80,11 @@ class Form:
         return found
 
 
+def holds_half_characters(text: str) -> bool:
+    """True if a text has surrogates, which no file name and no argument can hold."""
+    return any(0xD800 <= ord(character) < 0xE000 for character in text)
+
+
 def _texts(field: Field, value: Any) -> list[str]:
     """Values of a field as texts."""
     if field.kind == "flag":
@@ -101,7 +106,7 @@ def _text(field: Field, value: Any) -> str:
     text = str(value).strip()
     if any(ord(character) < 32 for character in text):
         raise GsbaError(f"{field.option or field.name}: control characters are not allowed")
-    if any(0xD800 <= ord(character) < 0xE000 for character in text):
+    if holds_half_characters(text):
         raise GsbaError(f"{field.option or field.name}: half characters are not allowed")
     return text
 

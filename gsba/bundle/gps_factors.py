@@ -130,7 +130,7 @@ def _level_from_map(positions: np.ndarray, fixes: FrameFixes) -> tuple[Sim3, np.
 
 
 def contradiction(anchors: Anchors, world_T_rigs: np.ndarray, draws: np.ndarray) -> float:
-    """How many times more than expected the fixes bend a map that was adjusted with them.
+    """Ratio of the observed to the expected bending of a map by the fixes it was adjusted with.
 
     The pull of the fixes at the optimum is that of the images, with the other sign: without fixes,
     the map would move by the images' covariance times this pull. The square of that motion, in
@@ -202,7 +202,7 @@ class GpsFixes(Family):
         return None if anchors is None else AnchoredFixes(anchors, self.digest)
 
     def contradiction(self, snapshot: MapSnapshot, draws: np.ndarray) -> float:
-        """How far the fixes bend a map that was adjusted with them, see `contradiction`."""
+        """Ratio by which the fixes bend a map that was adjusted with them, see `contradiction`."""
         anchors = self._anchors(snapshot)
         return 0.0 if anchors is None else contradiction(anchors, snapshot.world_T_rigs, draws)
 

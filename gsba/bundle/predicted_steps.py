@@ -25,13 +25,14 @@ def step_deviations(result: Reconstruction) -> np.ndarray:
     Args:
         result: one map.
     """
-    poses, frames = result.world_T_rigs, result.observation_frames
+    poses = result.world_T_rigs
     predicted, known = poses.copy(), np.zeros(len(poses), bool)
+    usable = np.flatnonzero(_num_far(result) >= _MIN_FAR_FRAMES)
+    usable = usable[np.argsort(result.observation_frames[usable], kind="stable")]
+    bounds = np.searchsorted(result.observation_frames[usable], np.arange(len(poses) + 1))
     for f in range(len(poses)):
-        far = np.abs(frames - f) > _REACH
-        num_far = np.bincount(result.observation_points[far], minlength=len(result.points_world))
-        rows = (frames == f) & (num_far[result.observation_points] >= _MIN_FAR_FRAMES)
-        known[f] = np.count_nonzero(rows) >= _MIN_OBSERVATIONS
+        rows = usable[bounds[f] : bounds[f + 1]]
+        known[f] = len(rows) >= _MIN_OBSERVATIONS
         if known[f]:
             predicted[f] = _resected(result, f, rows)
     steps = [(inverse(some[:-1]) @ some[1:])[:, :3, 3] for some in (poses, predicted)]
@@ -41,8 +42,18 @@ def step_deviations(result: Reconstruction) -> np.ndarray:
     return np.where(known[1:] & known[:-1], off, np.nan)
 
 
+def _num_far(result: Reconstruction) -> np.ndarray:
+    """Number (O,) of observations of each observation's point in frames out of reach."""
+    frames, num = result.observation_frames.astype(np.int64), len(result.world_T_rigs)
+    first = result.observation_points.astype(np.int64) * num
+    keys = np.sort(first + frames)  # by point, then frame
+    last = np.searchsorted(keys, first + np.minimum(frames + _REACH, num - 1), side="right")
+    near = last - np.searchsorted(keys, first + np.maximum(frames - _REACH, 0))
+    return np.bincount(result.observation_points)[result.observation_points] - near
+
+
 def _resected(result: Reconstruction, frame: int, rows: np.ndarray) -> np.ndarray:
-    """Pose (4, 4) of a frame that its observations `rows` (O,) bool of known points give, by
+    """Pose (4, 4) of a frame that its observations `rows` (O,) of known points give, by
     Gauss-Newton under a Cauchy loss from its pose in the map."""
     from scipy.spatial.transform import Rotation
 

@@ -17,8 +17,7 @@ Layouts:
 
 A frame's pose is stored as rig_from_world, where COLMAP's rig frame is that of the first camera.
 Images are numbered frame after frame, face after face, or in the split's order; point j + 1 is
-point j. Frames of several
-cameras have a rig for each of these.
+point j. Frames of several cameras have a rig for each of these.
 """
 
 import json
@@ -48,8 +47,8 @@ from gsba.geometry import inverse, pose, quaternion_from_rotation
 from gsba.log import GsbaError
 from gsba.types import Fisheye, FrameSet, PictureFormat, Reconstruction
 
-_SUFFIX = "{suffix}"  # of an image; masks keep it where COLMAP looks for it
 _BY_VIEW, _FLAT = "{view}/{name}{suffix}", "{name}_{view}{suffix}"  # names of images
+_FLAT_MASK = "{name}_{view}.png"  # others keep the image's suffix before .png, as COLMAP does
 
 
 @dataclass(frozen=True, slots=True)
@@ -418,8 +417,8 @@ def _pinholes(views: Sequence[Sequence[View]]) -> list[list[Sensor]]:
 
 def _files(partial: Path, name: str, views: Sequence[str], masked: bool) -> Files:
     """Files of images and masks by the pattern of their names."""
-    mask = f"masks/{name.removesuffix(_SUFFIX) if name == _FLAT else name}.png" if masked else ""
-    return Files(partial, views, f"images/{name}", mask)
+    mask = _FLAT_MASK if name == _FLAT else f"{name}.png"
+    return Files(partial, views, f"images/{name}", f"masks/{mask}" if masked else "")
 
 
 def _names(files: Sequence[Files], frames: FrameSet) -> list[list[str]]:

@@ -131,8 +131,8 @@ def write_nerfstudio_raw(
         camera["rolling_shutter"] = [0, 0, 1, 0]
     if velocities is not None:
         camera |= motion.shutter_keys(shutter, rolling=moving)
-    parts = held_out_frames(reconstruction), split
-    _write_transforms(partial / "transforms.json", camera, entries, out_R_world, *parts)
+    path = partial / "transforms.json"
+    _write_transforms(path, camera, entries, out_R_world, reconstruction, split)
     return [by_camera([RawPictures(one, link) for one in files], frames)]
 
 
@@ -217,8 +217,8 @@ def _write_face_dataset(
             if velocities is not None:
                 entry |= motion.velocity_keys(velocities[f], view.rig_T_view)
             entries[-1].append(entry)
-    parts = held_out_frames(reconstruction), split
-    _write_transforms(partial / "transforms.json", camera, entries, out_R_world, *parts)
+    path = partial / "transforms.json"
+    _write_transforms(path, camera, entries, out_R_world, reconstruction, split)
 
 
 def _write_erp_dataset(
@@ -252,8 +252,7 @@ def _write_erp_dataset(
             entry["mask_path"] = masks[0]
         entries.append([entry])
     path = partial / f"transforms{which}.json"
-    held_out = held_out_frames(reconstruction)
-    _write_transforms(path, camera, entries, out_R_world, held_out, split)
+    _write_transforms(path, camera, entries, out_R_world, reconstruction, split)
     return panorama_writer(files, frames, cameras, link, scenes_of(reconstruction))
 
 
@@ -294,13 +293,14 @@ def _write_transforms(
     camera: dict[str, Any],
     entries: Sequence[Sequence[dict[str, Any]]],
     out_R_world: np.ndarray,
-    held_out: np.ndarray,
+    reconstruction: Reconstruction,
     split: bool,
 ) -> None:
     """Write transforms.json, with the entries of each frame (F).
 
-    Images of frames `held_out` (F,) are for evaluation, and without a split for training, too.
+    Images of held-out frames are for evaluation, and without a split for training, too.
     """
+    held_out = held_out_frames(reconstruction)
     names = [[str(entry["file_path"]) for entry in of_frame] for of_frame in entries]
     evaluated = [n for held, own in zip(held_out, names, strict=True) if held for n in own]
     apart = held_out & split

@@ -91,24 +91,27 @@ def split_of(reconstruction: Reconstruction, num_views: Sequence[int]) -> Split 
 
 def held_out_frames(reconstruction: Reconstruction) -> np.ndarray:
     """Frames (F,) bool to hold out, where all faces of each can be."""
-    chosen = np.zeros(len(reconstruction.pose_statuses), bool)
-    usable = np.flatnonzero(reconstruction.pose_statuses == PoseStatus.REFINED)
-    if len(usable) > _MIN_TRAINING:
-        chosen[usable[held_out_rows(len(usable))]] = True
-    return chosen
+    usable = reconstruction.pose_statuses == PoseStatus.REFINED
+    enough = np.count_nonzero(usable) > _MIN_TRAINING
+    return _spread(usable) if enough else np.zeros(len(usable), bool)
 
 
 def _held_out(usable: np.ndarray, num_views: np.ndarray) -> np.ndarray | None:
     """Frames (F,) bool to hold out whose faces are enough for one image in eight."""
-    rows = np.flatnonzero(usable)
-    for num in range(1, len(rows)):
-        chosen = np.zeros(len(usable), bool)
-        chosen[rows[held_out_rows(len(rows), at_least=num)]] = True
+    for num in range(1, np.count_nonzero(usable)):
+        chosen = _spread(usable, num)
         if np.count_nonzero(~chosen) < _MIN_TRAINING:
             return None
         if num_views[chosen].sum() >= _num_test(int(num_views[~chosen].sum())):
             return chosen
     return None
+
+
+def _spread(usable: np.ndarray, at_least: int = 0) -> np.ndarray:
+    """Frames (F,) bool to hold out, spread over the usable ones."""
+    rows, chosen = np.flatnonzero(usable), np.zeros(len(usable), bool)
+    chosen[rows[held_out_rows(len(rows), at_least=at_least)]] = True
+    return chosen
 
 
 def _num_test(num_training: int) -> int:

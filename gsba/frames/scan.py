@@ -34,6 +34,7 @@ from gsba.frames.times import frame_times
 from gsba.frames.track_pairs import find_tracks, track_size
 from gsba.log import GsbaError, track
 from gsba.types import FACES, FrameSet, PictureFormat
+from gsba.types.records import spread_rows
 
 _log = logging.getLogger(__name__)
 
@@ -203,7 +204,7 @@ def _refuse_others(folder: Path, images: Sequence[Path], size: tuple[int, int]) 
         )
     if tags is not None and (tags.whole or image_header(images[0]).crop is not None):
         return
-    chosen = sorted({(2 * k + 1) * len(images) // (2 * NUM_LOOKS) for k in range(NUM_LOOKS)})
+    chosen = np.unique(spread_rows(len(images), NUM_LOOKS)).tolist()
     kind = unlike_panorama(readable([images[k] for k in chosen], size))
     if kind:
         raise GsbaError(f"{folder} holds no panoramas but {kind}: {REMEDIES[kind]}")

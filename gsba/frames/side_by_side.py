@@ -16,6 +16,7 @@ import numpy as np
 from gsba.frames.files import decode
 from gsba.frames.image_circles import CircleSearch, find_circle
 from gsba.log import GsbaError
+from gsba.types.records import spread_rows
 
 LOOKED_AT = 5  # pictures in which two image circles side by side are searched
 
@@ -140,7 +141,7 @@ def in_folder(
     """
     if not may_hold_two(size):
         return SideBySide(None)
-    spread = [(2 * i + 1) * len(paths) // (2 * LOOKED_AT) for i in range(LOOKED_AT)]
+    spread = spread_rows(len(paths), LOOKED_AT).tolist()
     rows = dict.fromkeys([len(paths) // 2, *spread])  # the middle one suffices for most panoramas
     greys = readable([paths[row] for row in rows], size)
     maker = next((name for named, name in _MAKERS if named.match(paths[0].stem)), "")

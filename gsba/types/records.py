@@ -17,6 +17,11 @@ def slices(num: int, most: int) -> Iterator[slice]:
         yield slice(first, min(first + most, num))
 
 
+def spread_rows(num: int, count: int) -> np.ndarray:
+    """Rows (count,) of `num` in the middles of equal parts; some repeat if there are fewer."""
+    return (2 * np.arange(count) + 1) * num // max(2 * count, 1)
+
+
 class PoseSource(IntEnum):
     """Source of a frame's coarse pose."""
 

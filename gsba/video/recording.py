@@ -32,6 +32,7 @@ from gsba.frames.side_by_side import (
     two_circles,
 )
 from gsba.log import GsbaError
+from gsba.types.records import spread_rows
 from gsba.video.claims import PictureClaims
 from gsba.video.colours import bgr, luma
 from gsba.video.cube_tracks import TRACKS, cube_tracks
@@ -408,7 +409,7 @@ def _looks(track: Track, timeline: Timeline) -> Iterator[np.ndarray]:
     """Grey pictures from all over a track, the middle one first: it suffices for most panoramas."""
     num = len(timeline.ticks)
     middle = num // 2
-    others = {(2 * i + 1) * num // (2 * LOOKED_AT) for i in range(LOOKED_AT)} - {middle}
+    others = set(spread_rows(num, LOOKED_AT).tolist()) - {middle}
     for part in ([middle], sorted(others)):
         for _, frame in decode(track, timeline, part):
             yield luma(frame)
