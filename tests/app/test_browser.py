@@ -234,6 +234,25 @@ def test_a_run_is_stopped_and_goes_on_and_the_next_one_waits(browser: Any, serve
     assert page.faults == []
 
 
+def test_the_command_is_of_the_newest_values_though_an_older_answer_comes_last(
+    browser: Any, server: Server
+) -> None:
+    page = opened(browser, server.address, DESK)
+    held: list[Any] = []
+
+    def hold_the_first(route: Any) -> None:
+        held.append(route)
+        if len(held) > 1:
+            route.continue_()
+
+    page.route("**/api/command", hold_the_first)
+    chosen(page, "later")
+    with page.expect_response("**/api/command"):
+        held[0].continue_()
+    page.wait_for_timeout(100)
+    assert "--out later" in page.locator("#command").text_content()
+
+
 def test_what_cannot_be_refined_is_said_in_one_line(browser: Any, server: Server) -> None:
     (server.root / "broken.mp4").write_bytes(b"no video")
     page = opened(browser, server.address, PHONE)

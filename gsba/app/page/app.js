@@ -154,13 +154,20 @@ function commandLine(command, values) {
   const line = make("pre", { class: "command", id: "command" });
   const problem = make("p", { class: "error", role: "alert" });
   const button = make("button", { class: "main", type: "submit" }, "Start");
-  const update = async () => {
-    const answer = await ask("api/command", { command, values: filled(values) });
+  let newest = 0; // answers may arrive in another order than their questions
+  const changed = async () => {
+    const own = ++newest;
+    let answer;
+    try {
+      answer = await ask("api/command", { command, values: filled(values) });
+    } catch (error) {
+      answer = { command: "", error: error.message };
+    }
+    if (own !== newest) return;
     line.textContent = answer.command;
     problem.textContent = answer.error;
     button.disabled = Boolean(answer.error);
   };
-  const changed = () => update().catch(() => undefined);
   const submit = async (happening) => {
     happening.preventDefault();
     button.disabled = true;
