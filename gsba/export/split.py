@@ -10,21 +10,24 @@ Readers of lists (`train_list.txt`, `val_list.txt`, `test_list.txt` of nerfstudi
 """
 
 import logging
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import count, islice
 from pathlib import Path
 
 import numpy as np
 
-from gsba.export.pictures import Files, suffix_of
+from gsba.export.pictures import Files
 from gsba.frames.held_out import HOLD_OUT_EVERY, held_out_rows
+from gsba.log import GsbaError
 from gsba.types import FrameSet, PoseStatus, Reconstruction
 
 logger = logging.getLogger(__name__)
 
 LEFT_OUT = "left_out"  # folder of faces of held-out panoramas that no reader may see
 _MIN_TRAINING = 2  # panoramas
-_MIN_DIGITS = 5  # of an image's place in its name
+MIN_DIGITS = 5  # of an image's place in its name
+TRAIN_LIST = "train_list.txt"  # names of images for training, if there is a split
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,8 +41,8 @@ class Split:
     def files(self, plain: Files, frames: FrameSet) -> Files:
         """Files of the same images, in folders without others, under names in this order."""
         places = dict(zip(frames.names, self.numbers, strict=True))
-        given = plain.folder, plain.views, plain.image, plain.mask
-        digits = max(_MIN_DIGITS, len(str(max(map(max, self.numbers)))))
+        given = plain.folder, plain.views, plain.image, plain.mask, plain.style, plain.names
+        digits = max(MIN_DIGITS, len(str(max(map(max, self.numbers)))))
         return _OrderedFiles(*given, places=places, digits=digits)
 
     def write_lists(self, folder: Path, names: Sequence[Sequence[str]], model: Path) -> None:
@@ -59,19 +62,23 @@ class Split:
         training = "".join(f"{name}\n" for _, name, held in sorted(every) if not held)
         test = "".join(f"{name}\n" for _, name, held in sorted(every) if held)
         (model / "test.txt").write_text(test)
-        (folder / "train_list.txt").write_text(training)
+        (folder / TRAIN_LIST).write_text(training)
         for name in ("val_list.txt", "test_list.txt"):
             (folder / name).write_text(test)
 
 
-def split_of(reconstruction: Reconstruction, num_views: Sequence[int]) -> Split | None:
+def split_of(
+    reconstruction: Reconstruction, num_views: Sequence[int], num_photos: int = 0
+) -> Split | None:
     """Split of a dataset by whole panoramas; None = too few are left to train on.
 
     Args:
         reconstruction: poses of the frames; unrefined ones are not held out.
         num_views: (F,) images of each frame.
+        num_photos: images for training that come later, and take `free_numbers`.
     """
-    held_out = _held_out(reconstruction.pose_statuses == PoseStatus.REFINED, np.array(num_views))
+    usable = reconstruction.pose_statuses == PoseStatus.REFINED
+    held_out = _held_out(usable, np.array(num_views), num_photos)
     if held_out is None:
         logger.warning(
             "too few panoramas to hold one of %d out: all images are for training", HOLD_OUT_EVERY
@@ -80,13 +87,28 @@ def split_of(reconstruction: Reconstruction, num_views: Sequence[int]) -> Split 
     images = [(view, f) for f, num in enumerate(num_views) for view in range(num)]
     training = sorted((f, view) for view, f in images if not held_out[f])
     # The first views of all held-out frames: what is left out is below or above the camera.
-    test = sorted(image for image in images if held_out[image[1]])[: _num_test(len(training))]
+    num_test = _num_test(len(training) + num_photos)
+    test = sorted(image for image in images if held_out[image[1]])[:num_test]
     numbers = [[-1] * num for num in num_views]
     for place, (f, view) in enumerate(sorted((f, view) for view, f in test)):
         numbers[f][view] = HOLD_OUT_EVERY * place
     for place, (f, view) in enumerate(training):
         numbers[f][view] = place + place // (HOLD_OUT_EVERY - 1) + 1
     return Split(held_out, tuple(map(tuple, numbers)))
+
+
+def require_held_out(reconstruction: Reconstruction) -> None:
+    """Refuse a split that leaves too few panoramas to train on.
+
+    Raises:
+        GsbaError: it does.
+    """
+    if not held_out_frames(reconstruction).any():
+        num = np.count_nonzero(reconstruction.pose_statuses == PoseStatus.REFINED)
+        raise GsbaError(
+            f"--split: {num} refined panoramas are too few to hold one out and train on "
+            f"{_MIN_TRAINING}: use --no-split"
+        )
 
 
 def held_out_frames(reconstruction: Reconstruction) -> np.ndarray:
@@ -96,13 +118,19 @@ def held_out_frames(reconstruction: Reconstruction) -> np.ndarray:
     return _spread(usable) if enough else np.zeros(len(usable), bool)
 
 
-def _held_out(usable: np.ndarray, num_views: np.ndarray) -> np.ndarray | None:
+def free_numbers(taken: Collection[int], num: int) -> list[int]:
+    """The first numbers from 0 that no image has, and that no reader holds out."""
+    known, free = set(taken), (n for n in count() if n % HOLD_OUT_EVERY)
+    return list(islice((n for n in free if n not in known), num))
+
+
+def _held_out(usable: np.ndarray, num_views: np.ndarray, num_photos: int) -> np.ndarray | None:
     """Frames (F,) bool to hold out whose faces are enough for one image in eight."""
     for num in range(1, np.count_nonzero(usable)):
         chosen = _spread(usable, num)
         if np.count_nonzero(~chosen) < _MIN_TRAINING:
             return None
-        if num_views[chosen].sum() >= _num_test(int(num_views[~chosen].sum())):
+        if num_views[chosen].sum() >= _num_test(int(num_views[~chosen].sum()) + num_photos):
             return chosen
     return None
 
@@ -123,12 +151,13 @@ def _num_test(num_training: int) -> int:
 class _OrderedFiles(Files):
     """Files whose names begin with their place in an order."""
 
-    places: Mapping[str, Sequence[int]]  # by frame name and view, see `Split.numbers`
-    digits: int  # of a place
+    places: Mapping[str, Sequence[int]] = field(default_factory=dict)  # by frame name and view, see
+    # `Split.numbers`
+    digits: int = MIN_DIGITS  # of a place
 
     def _filled(self, pattern: str, frames: FrameSet, f: int) -> list[str]:
         folder, _, name = pattern.partition("/")
-        known = {"name": frames.names[f].replace("/", "_"), "suffix": suffix_of(frames, f)}
+        known = self.known(frames, f)
         return [
             f"{folder}/{number:0{self.digits}d}_{name.format(view=view, **known)}"
             if number >= 0

@@ -9,8 +9,9 @@ import pytest
 from export_scene import panoramas, reconstruction
 
 from gsba.export import ExportFormat, export
-from gsba.export.split import Split, split_of
+from gsba.export.split import Split, free_numbers, split_of
 from gsba.frames.held_out import held_out_rows
+from gsba.log import GsbaError
 from gsba.types import PoseStatus, Reconstruction
 
 
@@ -53,6 +54,25 @@ def test_unrefined_frames_are_not_held_out() -> None:
 def test_two_panoramas_are_both_for_training(caplog: pytest.LogCaptureFixture) -> None:
     assert split_of(_of_frames(2), [6, 6]) is None
     assert "too few panoramas to hold one of 8 out: all images are for training" in caplog.text
+
+
+def test_a_split_that_is_asked_for_is_not_dropped(tmp_path: Path) -> None:
+    frames, scene = panoramas(tmp_path / "frames").taken(np.arange(2)), reconstruction()
+    scene, out = scene.taken(np.arange(2)), tmp_path / "out"
+    for to in (ExportFormat.COLMAP_FLAT, ExportFormat.NERFSTUDIO):
+        with pytest.raises(GsbaError, match=r"2 refined panoramas are too few.*use --no-split"):
+            export(scene, frames, out, to, face_size=16, split=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["frames"]
+
+
+def test_photos_take_places_that_no_reader_holds_out() -> None:
+    for photos in (1, 5, 30, 300):
+        split = split_of(_of_frames(20), [6] * 20, photos)
+        assert split is not None
+        numbers = [n for own in split.numbers for n in own if n >= 0]
+        free = free_numbers(numbers, photos)
+        assert sorted(numbers + free) == list(range(len(numbers) + photos))
+        assert all(n % 8 for n in free)
 
 
 def test_held_out_rows_are_spread_and_at_no_end() -> None:
