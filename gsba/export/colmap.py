@@ -233,8 +233,26 @@ def write_model(
             model.add_image(image)
         model.register_frame(f + 1)
     _add_points(model, reconstruction, images, rows)
+    write_in_order(model, folder)
+
+
+def write_in_order(model, folder: Path) -> None:
+    """Write a pycolmap model in binary, with images in the order of their numbers, as some readers
+    count them: pycolmap writes frame after frame."""
     folder.mkdir(parents=True, exist_ok=True)
-    model.write_binary(folder)
+    model.write_binary(str(folder))
+    content = (folder / "images.bin").read_bytes()
+    view, records, start = memoryview(content), list[memoryview](), 8
+    while start < len(content):
+        name_end = content.index(b"\0", start + 64)  # behind number, pose and camera
+        num_points = int.from_bytes(view[name_end + 1 : name_end + 9], "little")
+        end = name_end + 9 + 24 * num_points
+        records.append(view[start:end])
+        start = end
+    records.sort(key=lambda record: int.from_bytes(record[:4], "little"))
+    with (folder / "images.bin").open("wb") as file:
+        file.write(view[:8])
+        file.writelines(records)
 
 
 def _add_rigs(model, rigs: Sequence[Sequence[Sensor]]) -> list[list]:

@@ -173,8 +173,9 @@ def export_all(
             given = partial, reconstruction, frames, to, up, link, seen_by, options
             writers += write(*given)
             if options.photos.photos:
-                readable = not options.cameras or "RADIAL" in options.cameras
-                add_photos(partial, to.value, options.photos, placement, undistort=not readable)
+                undistort = bool(options.cameras) and "RADIAL" not in options.cameras
+                masked = has_masks(frames) and not options.masks.path
+                add_photos(partial, to.value, options.photos, placement, undistort, masked)
             placement.write(partial / "transform.json")
         write_pictures(frames, writers, workers)
     for to, out in outs.items():

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from gsba.disk import disk_errors, write_image
+from gsba.export.colmap import write_in_order
 from gsba.export.split import MIN_DIGITS, TRAIN_LIST, free_numbers
 from gsba.frames.files import decode, goes_out_as_it_is, image_size
 from gsba.geometry import CV_R_GL, inverse
@@ -109,7 +110,12 @@ def _photo(entry: dict[str, Any]) -> PlacedPhoto:
 
 
 def add_photos(
-    partial: Path, to: str, photos: Photos, placement: Placement, undistort: bool = False
+    partial: Path,
+    to: str,
+    photos: Photos,
+    placement: Placement,
+    undistort: bool = False,
+    masked: bool = False,
 ) -> None:
     """Add photos to a dataset that is being written.
 
@@ -119,6 +125,7 @@ def add_photos(
         photos: in the run's world.
         placement: of the exported world.
         undistort: write photos of pinhole cameras.
+        masked: write masks that hide nothing: nerfstudio wants one of each image, or none.
 
     Raises:
         GsbaError: two photos would have one name, or one cannot be read.
@@ -135,7 +142,8 @@ def add_photos(
             )
     if to == "nerfstudio":
         _write_photos(partial, photos, names, undistort=False)
-        _add_to_nerfstudio(partial / "transforms.json", photos, poses, names)
+        masks = _write_masks(partial, photos, names) if masked else ()
+        _add_to_nerfstudio(partial / "transforms.json", photos, poses, names, masks)
         return
     import pycolmap
 
@@ -151,8 +159,10 @@ def add_photos(
         with (partial / TRAIN_LIST).open("a", encoding="utf-8") as file:
             file.writelines(name.removeprefix("images/") + "\n" for name in names)
     _write_photos(partial, photos, names, undistort)
+    if masked and to == "colmap-flat":
+        _write_masks(partial, photos, names)
     _add_to_colmap(model, photos, poses, names, numbers, undistort)
-    model.write_binary(str(partial / "sparse" / "0"))
+    write_in_order(model, partial / "sparse" / "0")
 
 
 def _suffix(photo: PlacedPhoto) -> str:
@@ -172,6 +182,15 @@ def _write_photos(partial: Path, photos: Photos, names: Sequence[str], undistort
                 shutil.copyfile(photo.path, target)
             else:
                 write_image(target, decode(photo.path, image_size(photo.path)))
+
+
+def _write_masks(partial: Path, photos: Photos, names: Sequence[str]) -> list[str]:
+    """Write masks that hide nothing; returns their paths in the dataset."""
+    masks = [name.replace("images/", "masks/", 1).rpartition(".")[0] + ".png" for name in names]
+    for photo, mask in zip(photos.photos, masks, strict=True):
+        camera = photos.cameras[photo.camera]
+        write_image(partial / mask, np.full((camera.height, camera.width), 255, np.uint8))
+    return masks
 
 
 def _opencv(camera: PhotoCamera) -> tuple[np.ndarray, np.ndarray]:
@@ -228,7 +247,9 @@ def _add_to_colmap(
         model.add_image_with_trivial_frame(image, rigid)
 
 
-def _add_to_nerfstudio(path: Path, photos: Photos, poses: np.ndarray, names: Sequence[str]) -> None:
+def _add_to_nerfstudio(
+    path: Path, photos: Photos, poses: np.ndarray, names: Sequence[str], masks: Sequence[str]
+) -> None:
     document = json.loads(path.read_text(encoding="utf-8"))
     # Readers apply intrinsics above the frames to all frames: each gets its own.
     common = {key: document.pop(key) for key in _INTRINSICS if key in document}
@@ -249,5 +270,7 @@ def _add_to_nerfstudio(path: Path, photos: Photos, poses: np.ndarray, names: Seq
                 **{"k1": k1, "k2": k2, "p1": 0.0, "p2": 0.0},
             }
         )
+    for entry, mask in zip(frames[len(frames) - len(masks) :], masks, strict=True):
+        entry["mask_path"] = mask
     document["train_filenames"] = [*document["train_filenames"], *names]
     path.write_text(json.dumps(document | {"frames": frames}, indent=1) + "\n", encoding="utf-8")

@@ -1,10 +1,11 @@
 """Images of a dataset in an order by which its reader holds out whole panoramas.
 
-Trainers that read COLMAP models hold out every eighth image: INRIA's (`--eval`), gsplat, LichtFeld
-and Brush (`--eval`, `--eval-split-every 8`) in the order of names, 3DGRUT and nerfstudio's COLMAP
-parser in the order of the model. A face whose siblings are trained on tells nothing, as all faces
-of a panorama share their centre. Here images are numbered so that both orders agree and every
-eighth one is a face of a held-out panorama; faces of held-out panoramas beyond those are left out.
+Trainers that read COLMAP models hold out every eighth image: INRIA's (`--eval`), gsplat, 3DGRUT and
+Brush (`--eval-split-every 8`) in the order of names, nerfstudio's COLMAP parser in that of numbers,
+LichtFeld (`--eval`) as they come in the file. A face whose siblings are trained on tells nothing,
+as all faces of a panorama share their centre. Here images are numbered so that all orders agree and
+every eighth one is a face of a held-out panorama; faces of held-out panoramas beyond those are left
+out.
 Readers of lists (`train_list.txt`, `val_list.txt`, `test_list.txt` of nerfstudio's COLMAP parser,
 `sparse/0/test.txt` of forks of INRIA's) get the same split.
 """

@@ -117,6 +117,22 @@ def test_photos_are_undistorted_for_programs_that_read_pinholes(
         np.testing.assert_allclose(image[pixel[1], pixel[0], :2] / [4, 5], seen, atol=0.6)
 
 
+@pytest.mark.parametrize("to", [ExportFormat.COLMAP_FLAT, ExportFormat.NERFSTUDIO])
+def test_photos_have_masks_where_all_images_must_have_one(
+    to: ExportFormat, located: Path, tmp_path: Path
+) -> None:
+    photos, out = read_photos(located, tmp_path / "run"), tmp_path / "out"
+    frames = panoramas(tmp_path / "frames", masked=True)
+    export(reconstruction(), frames, out, to, face_size=16, photos=photos)
+    images = {path.stem for path in (out / "images").iterdir()}
+    assert images == {path.stem for path in (out / "masks").iterdir()}
+    (mask,) = (out / "masks").glob("*photo_shot0.png")
+    assert (cv2.imread(str(mask), cv2.IMREAD_UNCHANGED) == np.full((48, 64), 255)).all()
+    if to == ExportFormat.NERFSTUDIO:
+        entries = json.loads((out / "transforms.json").read_text())["frames"]
+        assert all((out / entry["mask_path"]).is_file() for entry in entries)
+
+
 def test_photos_that_would_overwrite_one_another_are_refused(located: Path, tmp_path: Path) -> None:
     photos = read_photos(located, tmp_path / "run")
     twice = replace(photos, photos=(photos.photos[0], replace(photos.photos[1], name="shot0")))

@@ -1,5 +1,6 @@
 """Held-out panoramas, by the rules of the programs that read an export."""
 
+import struct
 from dataclasses import replace
 from pathlib import Path
 
@@ -97,6 +98,21 @@ def test_readers_by_name_by_number_and_by_list_hold_the_same_panoramas_out(tmp_p
     for path in ("val_list.txt", "test_list.txt", "sparse/0/test.txt"):
         assert (out / path).read_text().split() == test
     assert (out / "train_list.txt").read_text().split() == training
+
+
+def test_images_of_the_file_are_in_the_order_of_the_split(tmp_path: Path) -> None:
+    """LichtFeld counts images as they come in images.bin."""
+    frames, out = panoramas(tmp_path / "frames"), tmp_path / "out"
+    export(reconstruction(), frames, out, ExportFormat.COLMAP_FLAT, face_size=16)
+    content = (out / "sparse/0/images.bin").read_bytes()
+    (num,), at, names = struct.unpack_from("<Q", content), 8, list[str]()
+    for _ in range(num):
+        end = content.index(b"\0", at + 64)  # behind id, pose and camera
+        names.append(content[at + 64 : end].decode())
+        (num_points,) = struct.unpack_from("<Q", content, end + 1)
+        at = end + 9 + 24 * num_points
+    assert at == len(content) and names == sorted(names)
+    assert names[::8] == (out / "test_list.txt").read_text().split()
 
 
 def test_without_a_split_names_are_those_of_frames(tmp_path: Path) -> None:
