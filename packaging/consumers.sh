@@ -20,7 +20,7 @@ if ! "$work/venv/bin/pip" install --quiet --retries 1 --timeout 20 "${readers[@]
   echo "not run: the package index cannot be reached, or lacks one of the readers"
   exit 0
 fi
-if command -v npm >/dev/null && npm install --silent --no-audit --no-fund --prefix "$work/node" \
+if command -v npm >/dev/null && npm install --silent --no-audit --no-fund --fetch-retries 0 --prefix "$work/node" \
   gltf-validator@2.0.0-dev.3.10; then
   export GSBA_NODE_MODULES="$work/node/node_modules"
 fi
