@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Exports read by programs they are for: pytest -m consumers, in an environment of its own that adds
 # pinned readers to the packages of the current one (PYTHON, else python3). Readers that need more
-# are tested where that is installed (torch, open3d, bpy). Without the package index nothing is run.
+# are tested where that is installed (torch, open3d). Without the package index nothing is run.
 #   packaging/consumers.sh
 set -euo pipefail
 

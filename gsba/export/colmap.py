@@ -149,7 +149,7 @@ def _write_flat_model(
     write_model(model, seen, rigs, names, frames.cameras, None if split is None else split.numbers)
     write_splat_points(model / "points3D.ply", seen.points_world, seen.point_colors)
     if split is not None:
-        split.write_lists(partial, names, model)
+        split.write_lists(partial, names)
     return files
 
 

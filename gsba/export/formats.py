@@ -63,6 +63,7 @@ class ExportOptions:
     # if enough are left to train on
     masks: MaskStyle = MASK_FILES
     cameras: tuple[str, ...] = ()  # COLMAP's camera models that the reader knows; () = all
+    panoramas: bool = True  # also panoramas beside faces, in nerfstudio's format
 
 
 def export(
@@ -164,6 +165,7 @@ def export_all(
     read = fingerprint(path for path in files if path and path.exists())  # some formats read none
     key = __version__, reconstruction, frames, read, face_size, up, link, seen_by, images
     key = (*key, options.shutter, options.photos, options.split, options.masks, options.cameras)
+    key = (*key, options.panoramas)
     writers: list[FrameWriter] = []
     with ExitStack() as folders:
         for to, out in outs.items():
@@ -301,7 +303,8 @@ def _write(
             return [colmap.write_colmap_erp(*given, link, cameras, masks)]
         case ExportFormat.NERFSTUDIO:
             given = *given, face_size, up, link, cameras
-            return nerfstudio.write_nerfstudio(*given, options.shutter, split, masks)
+            last = options.shutter, split, masks, options.panoramas
+            return nerfstudio.write_nerfstudio(*given, *last)
         case ExportFormat.METASHAPE:
             return [metashape.write_metashape_faces(*given, face_size, link, cameras, masks)]
         case ExportFormat.GLTF:

@@ -15,8 +15,8 @@ edge of the image in the format of instant-ngp, and `rolling_shutter` is [0, 0, 
 pixel is interpolated between them by its row over the height. That is gsplat's
 ROLLING_TOP_TO_BOTTOM, with the inverses (in axes y down, z forward) as `viewmats` and
 `viewmats_rs`, and k1 to k4 as `radial_coeffs`. instant-ngp reads `is_fisheye` and k1 to k4 in each
-frame's entry, and the size of its box from `aabb_scale`. Velocities for 3dgs-deblur:
-`gsba.export.motion`.
+frame's entry, and the size of its box from `aabb_scale`; of a folder it loads all JSON files with
+frames, panoramas as pinholes. Velocities for 3dgs-deblur: `gsba.export.motion`.
 """
 
 import json
@@ -60,6 +60,7 @@ def write_nerfstudio(
     shutter: motion.Shutter = motion.UNKNOWN,
     split: bool = True,
     masks: MaskStyle = MASK_FILES,
+    panoramas: bool = True,
 ) -> list[FrameWriter]:
     """Write cloud and transforms.json of faces into `partial`, of panoramas transforms_erp.json,
     too, without images; returns their writers.
@@ -74,6 +75,7 @@ def write_nerfstudio(
         shutter: times of the exposure.
         split: hold panoramas out of the training.
         masks: how masks are written.
+        panoramas: write transforms_erp.json.
     """
     out_R_world = _write_cloud(partial, reconstruction, up)
     views = views_of_cameras(frames, face_size, cameras)
@@ -84,7 +86,7 @@ def write_nerfstudio(
     _write_face_dataset(*given, split)
     scenes = scenes_of(reconstruction)
     writers = [view_writer(files, frames, views, cameras, link, scenes)]
-    if all(kind.panoramic for kind in frames.formats):
+    if panoramas and all(kind.panoramic for kind in frames.formats):
         given = partial, reconstruction, frames, cameras, out_R_world, link
         writers.append(_write_erp_dataset(*given, "_erp", split, masks))
     return writers

@@ -4,7 +4,7 @@ COLMAP's `RADIAL` camera is the one of photos: focal length, principal point, tw
 programs that cannot read it photos are undistorted, and their camera is `PINHOLE`.
 Photos are `images/photos/NAME`, in flat layouts and nerfstudio's `images/photo_NAME`, with a number
 before it where readers hold images out by their order; they have poses but no observations of
-points. All are for training: none is held out.
+points. They are for training, but for those that such readers hold out (`gsba.export.split`).
 """
 
 import json
@@ -18,7 +18,7 @@ import numpy as np
 
 from gsba.disk import disk_errors, write_image
 from gsba.export.colmap import write_in_order
-from gsba.export.split import MIN_DIGITS, TRAIN_LIST, free_numbers
+from gsba.export.split import TRAIN_LIST, add_images
 from gsba.frames.files import decode, goes_out_as_it_is, image_size
 from gsba.geometry import CV_R_GL, inverse
 from gsba.log import GsbaError
@@ -151,13 +151,9 @@ def add_photos(
     last = max(model.images, default=0)
     numbers = list(range(last, last + len(names)))
     if (partial / TRAIN_LIST).is_file():
-        numbers = free_numbers([number - 1 for number in model.images], len(names))
-        names = [
-            name.replace("photo_", f"{number:0{MIN_DIGITS}d}_photo_", 1)
-            for name, number in zip(names, numbers, strict=True)
-        ]
-        with (partial / TRAIN_LIST).open("a", encoding="utf-8") as file:
-            file.writelines(name.removeprefix("images/") + "\n" for name in names)
+        taken = [number - 1 for number in model.images]
+        numbered = add_images(partial, taken, [name.removeprefix("images/") for name in names])
+        names, numbers = [f"images/{name}" for name in numbered], list(numbered.values())
     _write_photos(partial, photos, names, undistort)
     if masked and to == "colmap-flat":
         _write_masks(partial, photos, names)

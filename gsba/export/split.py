@@ -29,6 +29,7 @@ LEFT_OUT = "left_out"  # folder of faces of held-out panoramas that no reader ma
 _MIN_TRAINING = 2  # panoramas
 MIN_DIGITS = 5  # of an image's place in its name
 TRAIN_LIST = "train_list.txt"  # names of images for training, if there is a split
+_TEST_LISTS = ("val_list.txt", "test_list.txt", "sparse/0/test.txt")  # and of those held out
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,13 +47,12 @@ class Split:
         digits = max(MIN_DIGITS, len(str(max(map(max, self.numbers)))))
         return _OrderedFiles(*given, places=places, digits=digits)
 
-    def write_lists(self, folder: Path, names: Sequence[Sequence[str]], model: Path) -> None:
+    def write_lists(self, folder: Path, names: Sequence[Sequence[str]]) -> None:
         """Write the lists that some readers hold images out by.
 
         Args:
-            folder: of the dataset.
+            folder: of the dataset, with the model's.
             names: (F, views) of the images, in the model.
-            model: folder of the model.
         """
         every = [
             (number, name, held)
@@ -62,10 +62,9 @@ class Split:
         ]
         training = "".join(f"{name}\n" for _, name, held in sorted(every) if not held)
         test = "".join(f"{name}\n" for _, name, held in sorted(every) if held)
-        (model / "test.txt").write_text(test)
         (folder / TRAIN_LIST).write_text(training)
-        for name in ("val_list.txt", "test_list.txt"):
-            (folder / name).write_text(test)
+        for path in _TEST_LISTS:
+            (folder / path).write_text(test)
 
 
 def split_of(
@@ -76,10 +75,10 @@ def split_of(
     Args:
         reconstruction: poses of the frames; unrefined ones are not held out.
         num_views: (F,) images of each frame.
-        num_photos: images for training that come later, and take `free_numbers`.
+        num_photos: images that come later and take free numbers, see `add_images`.
     """
     usable = reconstruction.pose_statuses == PoseStatus.REFINED
-    held_out = _held_out(usable, np.array(num_views), num_photos)
+    held_out = _held_out(usable, np.array(num_views))
     if held_out is None:
         logger.warning(
             "too few panoramas to hold one of %d out: all images are for training", HOLD_OUT_EVERY
@@ -119,19 +118,37 @@ def held_out_frames(reconstruction: Reconstruction) -> np.ndarray:
     return _spread(usable) if enough else np.zeros(len(usable), bool)
 
 
-def free_numbers(taken: Collection[int], num: int) -> list[int]:
-    """The first numbers from 0 that no image has, and that no reader holds out."""
-    known, free = set(taken), (n for n in count() if n % HOLD_OUT_EVERY)
-    return list(islice((n for n in free if n not in known), num))
+def add_images(folder: Path, taken: Collection[int], names: Sequence[str]) -> dict[str, int]:
+    """Number images that belong to no panorama, and add them to the lists of a split.
+
+    They are for training, but for those whose number readers hold out.
+
+    Args:
+        folder: of the dataset, whose lists `Split.write_lists` wrote.
+        taken: numbers of the other images.
+        names: of the images, in the model.
+
+    Returns:
+        Number of each image by its name, which begins with it.
+    """
+    known = set(taken)
+    free = islice((n for n in count() if n not in known), len(names))
+    numbers = {f"{n:0{MIN_DIGITS}d}_{name}": n for n, name in zip(free, names, strict=True)}
+    for path in (TRAIN_LIST, *_TEST_LISTS):
+        held_out = path != TRAIN_LIST
+        with (folder / path).open("a", encoding="utf-8") as file:
+            own = [name for name, n in numbers.items() if (n % HOLD_OUT_EVERY == 0) == held_out]
+            file.writelines(f"{name}\n" for name in own)
+    return numbers
 
 
-def _held_out(usable: np.ndarray, num_views: np.ndarray, num_photos: int) -> np.ndarray | None:
+def _held_out(usable: np.ndarray, num_views: np.ndarray) -> np.ndarray | None:
     """Frames (F,) bool to hold out whose faces are enough for one image in eight."""
     for num in range(1, np.count_nonzero(usable)):
         chosen = _spread(usable, num)
         if np.count_nonzero(~chosen) < _MIN_TRAINING:
             return None
-        if num_views[chosen].sum() >= _num_test(int(num_views[~chosen].sum()) + num_photos):
+        if num_views[chosen].sum() >= _num_test(int(num_views[~chosen].sum())):
             return chosen
     return None
 

@@ -22,6 +22,7 @@ class Program:
     masks: MaskStyle | None = MASK_FILES  # None = it reads none
     cameras: tuple[str, ...] = ()  # COLMAP's camera models that it reads; () = all that are written
     alpha: bool = True  # False: it cannot read images with an alpha channel
+    panoramas: bool = True  # False: it takes panoramas beside faces for pinholes
 
 
 PROGRAMS = {
@@ -63,6 +64,7 @@ PROGRAMS = {
         ExportFormat.NERFSTUDIO,
         "instant-ngp {out}/transforms.json",
         masks=MaskStyle(path="{folder}/dynamic_mask_{stem}.png", hidden=255),
+        panoramas=False,
     ),
     "3dgs-deblur": Program(ExportFormat.NERFSTUDIO, "python train.py {out}"),
     "blender": Program(ExportFormat.GLTF, "File > Import > glTF 2.0: {out}/scene.glb"),
@@ -107,7 +109,8 @@ def options_for(name: str, options: ExportOptions, paint: str = "files") -> Expo
     if paint == "alpha" and not program.alpha:
         raise GsbaError(f"--masks alpha: {name} reads no images with an alpha channel: use files")
     style = replace(program.masks or MASK_FILES, paint=paint)
-    return replace(options, masks=style, cameras=program.cameras)
+    cameras, panoramas = program.cameras, program.panoramas
+    return replace(options, masks=style, cameras=cameras, panoramas=panoramas)
 
 
 def how_to_start(name: str, out: Path, paint: str = "files") -> list[str]:

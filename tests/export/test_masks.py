@@ -43,6 +43,8 @@ def test_3dgrut_and_instant_ngp_find_masks_beside_images(tmp_path: Path) -> None
     meta = json.loads((ngp / "transforms.json").read_text())
     assert not any("mask_path" in entry for entry in meta["frames"])  # others read them upside down
     assert not (grut / "masks").exists() and not (ngp / "masks").exists()
+    loaded = [path.name for path in ngp.glob("*.json") if "frames" in json.loads(path.read_text())]
+    assert loaded == ["transforms.json"]
 
 
 @pytest.mark.parametrize("name", ["opensplat", "nerfstudio", "metashape", "colmap"])

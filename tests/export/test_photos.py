@@ -77,7 +77,7 @@ def test_colmap_has_photos_as_cameras_of_their_own(
         np.testing.assert_allclose(seen, CAMERA.project(local)[0], atol=1e-9)
 
 
-def test_readers_that_hold_out_every_eighth_image_train_on_all_photos(
+def test_photos_are_in_the_order_by_which_readers_hold_images_out(
     located: Path, tmp_path: Path
 ) -> None:
     photos, out = read_photos(located, tmp_path / "run"), tmp_path / "out"

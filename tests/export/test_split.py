@@ -10,7 +10,7 @@ import pytest
 from export_scene import panoramas, reconstruction
 
 from gsba.export import ExportFormat, export
-from gsba.export.split import Split, free_numbers, split_of
+from gsba.export.split import TRAIN_LIST, Split, add_images, split_of
 from gsba.frames.held_out import held_out_rows
 from gsba.log import GsbaError
 from gsba.types import PoseStatus, Reconstruction
@@ -66,14 +66,27 @@ def test_a_split_that_is_asked_for_is_not_dropped(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["frames"]
 
 
-def test_photos_take_places_that_no_reader_holds_out() -> None:
-    for photos in (1, 5, 30, 300):
-        split = split_of(_of_frames(20), [6] * 20, photos)
-        assert split is not None
-        numbers = [n for own in split.numbers for n in own if n >= 0]
-        free = free_numbers(numbers, photos)
-        assert sorted(numbers + free) == list(range(len(numbers) + photos))
-        assert all(n % 8 for n in free)
+def test_photos_hold_no_other_panoramas_out(tmp_path: Path) -> None:
+    """Photos fill the order up: faces of held-out panoramas come first, then every eighth photo."""
+    (tmp_path / "sparse/0").mkdir(parents=True)
+    alone = split_of(_of_frames(20), [6] * 20)
+    for num in (1, 5, 30, 300):
+        split = split_of(_of_frames(20), [6] * 20, num)
+        assert split is not None and alone is not None
+        np.testing.assert_array_equal(split.held_out, alone.held_out)
+        split.write_lists(tmp_path, [[f"{n:05d}" for n in own] for own in split.numbers])
+        taken = [n for own in split.numbers for n in own if n >= 0]
+        photos = add_images(tmp_path, taken, [f"photo_{k}" for k in range(num)])
+        order = sorted(taken + list(photos.values()))
+        assert order == list(range(len(taken) + num))
+        frame_of = {n: f for f, own in enumerate(split.numbers) for n in own}
+        held = [n for n in order if n % 8 == 0]
+        assert all(split.held_out[frame_of[n]] for n in held if n in frame_of)
+        tested, trained = (
+            sorted(int(name[:5]) for name in (tmp_path / path).read_text().split())
+            for path in ("test_list.txt", TRAIN_LIST)
+        )
+        assert tested == held and trained == [n for n in order if n % 8]
 
 
 def test_held_out_rows_are_spread_and_at_no_end() -> None:
