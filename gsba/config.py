@@ -402,7 +402,7 @@ class SplatFactorSettings(_Settings):
 # Formats that can store each kind of image other than cube faces.
 FORMATS_OF: dict[str, tuple[str, ...]] = {
     "fisheye": ("colmap", "colmap-flat", "nerfstudio"),
-    "panorama": ("colmap-erp", "nerfstudio", "metashape", "tum"),
+    "panorama": ("colmap-erp", "nerfstudio", "metashape", "gltf", "tum"),
 }
 
 

@@ -38,7 +38,7 @@ class ExportFormat(StrEnum):
     COLMAP_ERP = "colmap-erp"  # one equirectangular camera
     NERFSTUDIO = "nerfstudio"  # transforms.json: pinhole faces, and panoramas
     METASHAPE = "metashape"  # cameras.xml: panoramas, or pinhole faces
-    GLTF = "gltf"  # scene.glb: cameras and cloud, no images
+    GLTF = "gltf"  # scene.glb: cameras and cloud, and panoramas on request
     PLY = "ply"  # points3D.ply, the start cloud of splat trainers
     TUM = "tum"  # trajectory.tum, and panoramas on request
 
@@ -227,7 +227,7 @@ def _write_panoramas(
     cameras: Cameras,
     split: bool,
 ) -> list[FrameWriter]:
-    from gsba.export import colmap, metashape, nerfstudio, panoramas
+    from gsba.export import colmap, gltf, metashape, nerfstudio, panoramas
 
     given = partial, reconstruction, frames
     match to:
@@ -237,6 +237,8 @@ def _write_panoramas(
             return [colmap.write_colmap_erp(*given, link, cameras)]
         case ExportFormat.NERFSTUDIO:
             return nerfstudio.write_nerfstudio_erp(*given, cameras, up, link, split)
+        case ExportFormat.GLTF:
+            return gltf.write_blender(*given, up, link, cameras, panoramas=True)
         case _:
             return [panoramas.write_with_poses(*given, cameras, link)]
 
@@ -283,7 +285,7 @@ def _write(
         case ExportFormat.METASHAPE:
             return [metashape.write_metashape_faces(*given, face_size, link, cameras)]
         case ExportFormat.GLTF:
-            gltf.write_gltf(partial / "scene.glb", reconstruction, frames, up)
+            gltf.write_blender(*given, up)
         case ExportFormat.PLY:
             ply.write_splat_points(
                 partial / "points3D.ply", reconstruction.points_world, reconstruction.point_colors
