@@ -109,6 +109,19 @@ Pairs = Annotated[
 HoldOut = Annotated[
     bool, typer.Option(help="Hold one panorama in eight out of the training, with all its faces.")
 ]
+Align = Annotated[
+    str | None, typer.Option(help="True poses: export in their world.", metavar="TRUTH.tum")
+]
+Link = Annotated[
+    bool, typer.Option("--link", help="Make hard links to unchanged frames, not copies.")
+]
+Depths = Annotated[
+    bool,
+    typer.Option(
+        "--depths",
+        help="Also write the depths of the map's points in each face, with standard deviations.",
+    ),
+]
 Located = Annotated[
     Path | None,
     typer.Option(
@@ -134,18 +147,15 @@ def export(
     between: Between = None,
     gps: Gps = None,
     gps_sigma: GpsSigma = None,
-    align: Annotated[
-        str | None, typer.Option(help="True poses: export in their world.", metavar="TRUTH.tum")
-    ] = None,
+    align: Align = None,
     align_scan: AlignScan = None,
     pairs: Pairs = None,
-    link: Annotated[
-        bool, typer.Option("--link", help="Make hard links to unchanged frames, not copies.")
-    ] = False,
+    link: Link = False,
     map_number: MapNumber = 1,
     photos: Located = None,
     exposure_ms: Exposure = None,
     split: HoldOut = True,
+    depths: Depths = False,
     cluster: Cluster = None,
 ) -> None:
     """Write a finished run as a dataset for another program."""
@@ -174,7 +184,8 @@ def export(
     given = reconstruction, frames, folder, to, face_size, placed, link, lenses
     beside = read_photos(photos, run)
     with connected(cluster) as client, hired(client, folder, frames) as workers:
-        write(*given, images=images, workers=workers, shutter=shutter, photos=beside, split=split)
+        more = {"shutter": shutter, "photos": beside, "split": split, "depths": depths}
+        write(*given, images=images, workers=workers, **more)
     if folder.resolve().is_relative_to(run.resolve()):
         claim(run.resolve(), folder.resolve())
     typer.echo("\n".join([f"{to}: {folder}", *how_to_start(name, folder)]))

@@ -58,6 +58,7 @@ class ExportOptions:
     shutter: Shutter = UNKNOWN  # for trainers that model blur and rolling rows
     photos: Photos = NO_PHOTOS  # localised photos, as cameras of their own
     split: bool = True  # hold panoramas out of the training, in formats of trainers
+    depths: bool = False  # with the depths of points in the images
 
 
 def export(
@@ -76,6 +77,7 @@ def export(
     shutter: Shutter = UNKNOWN,
     photos: Photos = NO_PHOTOS,
     split: bool = True,
+    depths: bool = False,
 ) -> None:
     """Write one map of a reconstruction in another program's format.
 
@@ -104,13 +106,15 @@ def export(
         photos: localised photos, as cameras of their own beside the faces.
         split: hold panoramas out of the training (colmap-flat, nerfstudio); False = all are for
             training.
+        depths: also write the depths of points in pinhole faces, see `gsba.export.depths`.
 
     Raises:
         GsbaError: `out` is in use or not seen by a worker, the format does not fit the frames,
             there is no such map, or the disk cannot be written; nothing is left behind then.
     """
     options = ExportOptions(
-        face_size, placement, link, lenses, images, map_number, fetched, shutter, photos, split
+        *(face_size, placement, link, lenses, images, map_number, fetched, shutter, photos),
+        *(split, depths),
     )
     export_all(reconstruction, frames, {to: out}, options, workers)
 
@@ -137,7 +141,7 @@ def export_all(
     face_size, link, images = options.face_size, options.link, options.images
     map_number = options.map_number
     for to in outs:
-        _require_fitting(to, frames, images, options.photos)
+        _require_fitting(to, frames, images, options)
     whole = reconstruction
     cameras = Cameras.of(options.lenses, frames)
     reconstruction, frames = one_map(whole, frames, map_number, "the reconstruction")
@@ -154,7 +158,7 @@ def export_all(
     files = (path for paths in (*frames.paths, frames.mask_paths) for path in paths)
     read = fingerprint(path for path in files if path and path.exists())  # some formats read none
     key = __version__, reconstruction, frames, read, face_size, up, link, seen_by, images
-    key = (*key, options.shutter, options.photos, options.split)
+    key = (*key, options.shutter, options.photos, options.split, options.depths)
     writers: list[FrameWriter] = []
     with ExitStack() as folders:
         for to, out in outs.items():
@@ -243,13 +247,22 @@ def _write_panoramas(
             return [panoramas.write_with_poses(*given, cameras, link)]
 
 
-def _require_fitting(to: ExportFormat, frames: FrameSet, images: str, photos: Photos) -> None:
+def _require_fitting(
+    to: ExportFormat, frames: FrameSet, images: str, options: ExportOptions
+) -> None:
     """Refuse images that the format cannot hold, and panoramas of frames that are cube faces."""
+    photos = options.photos
     fitting = FORMATS_OF.get(images, (to.value,))
     if to.value not in fitting:
         choices = ", ".join(fitting)
         raise GsbaError(f"--images {images} goes with {choices}, not with {to.value}")
-    if photos.photos and (to.value not in FITTING or images in ("fisheye", "panorama")):
+    with_faces = to.value in FITTING and images not in ("fisheye", "panorama")
+    if options.depths and not with_faces:
+        raise GsbaError(
+            f"depths are those of cube faces in {', '.join(FITTING)}, not of {to.value} with "
+            f"--images {images}"
+        )
+    if photos.photos and not with_faces:
         raise GsbaError(
             f"photos go beside cube faces in {', '.join(FITTING)}, not in {to.value} with "
             f"--images {images}"
@@ -274,14 +287,16 @@ def _write(
     given, face_size = (partial, reconstruction, frames), options.face_size
     match to:
         case ExportFormat.COLMAP:
-            return [colmap.write_colmap(*given, face_size, link, cameras)]
+            return [colmap.write_colmap(*given, face_size, link, cameras, options.depths)]
         case ExportFormat.COLMAP_FLAT:
-            return [colmap.write_colmap_flat(*given, face_size, link, cameras, options.split)]
+            given = *given, face_size, link, cameras
+            return [colmap.write_colmap_flat(*given, options.split, options.depths)]
         case ExportFormat.COLMAP_ERP:
             return [colmap.write_colmap_erp(*given, link, cameras)]
         case ExportFormat.NERFSTUDIO:
             given = *given, face_size, up, link, cameras
-            return nerfstudio.write_nerfstudio(*given, options.shutter, options.split)
+            more = options.shutter, options.split, options.depths
+            return nerfstudio.write_nerfstudio(*given, *more)
         case ExportFormat.METASHAPE:
             return [metashape.write_metashape_faces(*given, face_size, link, cameras)]
         case ExportFormat.GLTF:

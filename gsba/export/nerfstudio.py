@@ -32,6 +32,7 @@ from gsba.camera.fisheye import Rig, lens_names, rotation_of
 from gsba.camera.lens import Lenses
 from gsba.camera.views import View, scenes_of, seen_from_lenses
 from gsba.export import motion
+from gsba.export.depths import map_path, write_depths
 from gsba.export.images import has_masks, panorama_writer, view_writer, views_of_cameras
 from gsba.export.pictures import Files, FrameWriter, by_camera
 from gsba.export.ply import write_splat_points
@@ -57,6 +58,7 @@ def write_nerfstudio(
     cameras: Cameras = ONE_CAMERA,
     shutter: motion.Shutter = motion.UNKNOWN,
     split: bool = True,
+    depths: bool = False,
 ) -> list[FrameWriter]:
     """Write cloud and transforms.json of faces into `partial`, of panoramas transforms_erp.json,
     too, without images; returns their writers.
@@ -70,13 +72,16 @@ def write_nerfstudio(
         cameras: cameras of the frames.
         shutter: times of the exposure.
         split: hold panoramas out of the training.
+        depths: with the depths of the faces, see `gsba.export.depths`.
     """
     out_R_world = _write_cloud(partial, reconstruction, up)
     views = views_of_cameras(frames, face_size, cameras)
     files = [_files(partial, [view.name for view in own], has_masks(frames)) for own in views]
     seen = seen_from_lenses(reconstruction, cameras)
     given = partial, seen, frames, files, views, out_R_world, cameras, shutter
-    _write_face_dataset(*given, split)
+    if depths:
+        write_depths(partial, seen, frames, files, views, maps=True)
+    _write_face_dataset(*given, split, depths)
     scenes = scenes_of(reconstruction)
     writers = [view_writer(files, frames, views, cameras, link, scenes)]
     if all(kind.panoramic for kind in frames.formats):
@@ -193,6 +198,7 @@ def _write_face_dataset(
     cameras: Cameras,
     shutter: motion.Shutter,
     split: bool,
+    depths: bool,
 ) -> None:
     # OPENCV without distortion is a pinhole, by the only name that all readers know.
     camera = {"camera_model": "OPENCV", "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0}
@@ -214,6 +220,8 @@ def _write_face_dataset(
                 entry |= _intrinsics(view)
             if masks:
                 entry["mask_path"] = masks[number]
+            if depths:
+                entry["depth_file_path"] = map_path(images[number])
             if velocities is not None:
                 entry |= motion.velocity_keys(velocities[f], view.rig_T_view)
             entries[-1].append(entry)
