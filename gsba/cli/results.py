@@ -84,8 +84,8 @@ MapNumber = Annotated[
 Target = Annotated[
     str,
     typer.Option(
-        help="colmap, colmap-flat, colmap-erp, nerfstudio, metashape, gltf, ply or tum; or a "
-        "program: inria, postshot, brush, lichtfeld, gsplat, opensplat, nerfstudio, "
+        help="colmap, colmap-flat, colmap-erp, nerfstudio, opensfm, metashape, gltf, ply or tum; "
+        "or a program: inria, postshot, brush, lichtfeld, gsplat, opensplat, nerfstudio, "
         "instant-ngp, 3dgs-deblur, blender.",
         metavar="FORMAT",
     ),

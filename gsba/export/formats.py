@@ -37,6 +37,7 @@ class ExportFormat(StrEnum):
     COLMAP_FLAT = "colmap-flat"  # pinhole faces with unique base names, for splat trainers
     COLMAP_ERP = "colmap-erp"  # one equirectangular camera
     NERFSTUDIO = "nerfstudio"  # transforms.json: pinhole faces, and panoramas
+    OPENSFM = "opensfm"  # reconstruction.json, tracks.csv: panoramas
     METASHAPE = "metashape"  # cameras.xml: panoramas, or pinhole faces
     GLTF = "gltf"  # scene.glb: cameras and cloud, and panoramas on request
     PLY = "ply"  # points3D.ply, the start cloud of splat trainers
@@ -153,7 +154,7 @@ def export_all(
     _warn_of_gaps(reconstruction, frames)
     own = Placement(map_number=map_number).of_trajectory(reconstruction.origin)
     placement = options.placement or own
-    reconstruction = placement.apply(reconstruction)
+    unplaced, reconstruction = reconstruction, placement.apply(reconstruction)
     seen_by, up = cameras.scaled(placement.similarity.scale), placement.up
     files = (path for paths in (*frames.paths, frames.mask_paths) for path in paths)
     read = fingerprint(path for path in files if path and path.exists())  # some formats read none
@@ -164,21 +165,42 @@ def export_all(
         for to, out in outs.items():
             folder = output_folder(out, to.value, content_digest(to.value, *key))
             partial = folders.enter_context(folder)
-            given = partial, reconstruction, frames, to
-            shown_as = _images_of(to, images, frames)
-            if shown_as == "fisheye":
-                writers += _write_raw(*given, up, link, seen_by, options)
-            elif shown_as == "panorama":
-                writers += _write_panoramas(*given, up, link, seen_by, options.split)
-            else:
-                writers += _write(*given, up, link, seen_by, options)
-            if options.photos.photos:
-                add_photos(partial, to.value, options.photos, placement)
-            placement.write(partial / "transform.json")
+            writers += _write_dataset(partial, unplaced, frames, to, placement, seen_by, options)
         write_pictures(frames, writers, workers)
     for to, out in outs.items():
         num_points = len(reconstruction.points_world)
         logger.info("%s: %d frames, %d points, in %s", to, len(frames), num_points, out)
+
+
+def _write_dataset(
+    partial: Path,
+    unplaced: Reconstruction,
+    frames: FrameSet,
+    to: ExportFormat,
+    placement: Placement,
+    cameras: Cameras,
+    options: ExportOptions,
+) -> list[FrameWriter]:
+    """Write a dataset of an unplaced map with its placement, without images; returns the writers
+    of these."""
+    from gsba.export import opensfm
+
+    if to == ExportFormat.OPENSFM:
+        placement = opensfm.z_up(placement)
+    reconstruction, up, link = placement.apply(unplaced), placement.up, options.link
+    given = partial, reconstruction, frames
+    placement.write(partial / "transform.json")
+    shown_as = _images_of(to, options.images, frames)
+    if to == ExportFormat.OPENSFM:
+        return [opensfm.write_opensfm(*given, placement, link, cameras)]
+    if shown_as == "fisheye":
+        return _write_raw(*given, to, up, link, cameras, options)
+    if shown_as == "panorama":
+        return _write_panoramas(*given, to, up, link, cameras, options.split)
+    writers = _write(*given, to, up, link, cameras, options)
+    if options.photos.photos:
+        add_photos(partial, to.value, options.photos, placement)
+    return writers
 
 
 def _images_of(to: ExportFormat, images: str, frames: FrameSet) -> str:

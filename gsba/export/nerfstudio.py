@@ -180,9 +180,14 @@ class _RawRig:
         return entries
 
 
+def z_up_R_world(up: str | None) -> np.ndarray:
+    """Rotation (3, 3) of a world to one whose z points up, see `write_nerfstudio`."""
+    return _Z_UP_R_WORLD.get(up or "-y", NERFSTUDIO_R_WORLD)
+
+
 def _write_cloud(partial: Path, reconstruction: Reconstruction, up: str | None) -> np.ndarray:
     """Write the cloud in nerfstudio's world; returns out_R_world (3, 3)."""
-    out_R_world = _Z_UP_R_WORLD.get(up or "-y", NERFSTUDIO_R_WORLD)
+    out_R_world = z_up_R_world(up)
     points = reconstruction.points_world @ out_R_world.T
     write_splat_points(partial / _CLOUD, points, reconstruction.point_colors)
     return out_R_world
