@@ -122,6 +122,13 @@ Depths = Annotated[
         help="Also write the depths of the map's points in each face, with standard deviations.",
     ),
 ]
+Exposures = Annotated[
+    bool,
+    typer.Option(
+        "--exposures",
+        help="Also estimate how frames are exposed, as EXIF of their images (colmap, colmap-flat).",
+    ),
+]
 Located = Annotated[
     Path | None,
     typer.Option(
@@ -156,6 +163,7 @@ def export(
     exposure_ms: Exposure = None,
     split: HoldOut = True,
     depths: Depths = False,
+    exposures: Exposures = False,
     cluster: Cluster = None,
 ) -> None:
     """Write a finished run as a dataset for another program."""
@@ -185,7 +193,8 @@ def export(
     beside = read_photos(photos, run)
     with connected(cluster) as client, hired(client, folder, frames) as workers:
         more = {"shutter": shutter, "photos": beside, "split": split, "depths": depths}
-        write(*given, images=images, workers=workers, **more)
+        more |= {"images": images, "exposures": exposures}
+        write(*given, workers=workers, **more)
     if folder.resolve().is_relative_to(run.resolve()):
         claim(run.resolve(), folder.resolve())
     typer.echo("\n".join([f"{to}: {folder}", *how_to_start(name, folder)]))

@@ -12,6 +12,7 @@ import numpy as np
 from gsba.camera.cameras import Cameras
 from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.config import FORMATS_OF
+from gsba.export.exposures import write_exposures
 from gsba.export.folder import output_folder
 from gsba.export.images import write_pictures
 from gsba.export.motion import UNKNOWN, Shutter
@@ -60,6 +61,7 @@ class ExportOptions:
     photos: Photos = NO_PHOTOS  # localised photos, as cameras of their own
     split: bool = True  # hold panoramas out of the training, in formats of trainers
     depths: bool = False  # with the depths of points in the images
+    exposures: bool = False  # with the exposures of the frames
 
 
 def export(
@@ -79,6 +81,7 @@ def export(
     photos: Photos = NO_PHOTOS,
     split: bool = True,
     depths: bool = False,
+    exposures: bool = False,
 ) -> None:
     """Write one map of a reconstruction in another program's format.
 
@@ -108,6 +111,7 @@ def export(
         split: hold panoramas out of the training (colmap-flat, nerfstudio); False = all are for
             training.
         depths: also write the depths of points in pinhole faces, see `gsba.export.depths`.
+        exposures: also estimate the exposures of frames, see `gsba.export.exposures`.
 
     Raises:
         GsbaError: `out` is in use or not seen by a worker, the format does not fit the frames,
@@ -115,7 +119,7 @@ def export(
     """
     options = ExportOptions(
         *(face_size, placement, link, lenses, images, map_number, fetched, shutter, photos),
-        *(split, depths),
+        *(split, depths, exposures),
     )
     export_all(reconstruction, frames, {to: out}, options, workers)
 
@@ -160,13 +164,17 @@ def export_all(
     read = fingerprint(path for path in files if path and path.exists())  # some formats read none
     key = __version__, reconstruction, frames, read, face_size, up, link, seen_by, images
     key = (*key, options.shutter, options.photos, options.split, options.depths)
+    datasets: list[Path] = []
     writers: list[FrameWriter] = []
     with ExitStack() as folders:
         for to, out in outs.items():
             folder = output_folder(out, to.value, content_digest(to.value, *key))
             partial = folders.enter_context(folder)
+            datasets.append(partial)
             writers += _write_dataset(partial, unplaced, frames, to, placement, seen_by, options)
         write_pictures(frames, writers, workers)
+        for partial in datasets if options.exposures else ():
+            write_exposures(partial)
     for to, out in outs.items():
         num_points = len(reconstruction.points_world)
         logger.info("%s: %d frames, %d points, in %s", to, len(frames), num_points, out)
@@ -284,6 +292,8 @@ def _require_fitting(
             f"depths are those of cube faces in {', '.join(FITTING)}, not of {to.value} with "
             f"--images {images}"
         )
+    if options.exposures and to not in (ExportFormat.COLMAP, ExportFormat.COLMAP_FLAT):
+        raise GsbaError(f"exposures go with colmap and colmap-flat, not with {to.value}")
     if photos.photos and not with_faces:
         raise GsbaError(
             f"photos go beside cube faces in {', '.join(FITTING)}, not in {to.value} with "
