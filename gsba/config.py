@@ -399,22 +399,20 @@ class SplatFactorSettings(_Settings):
     backend: Literal["auto", "gsplat", "cpu"] = "auto"
 
 
+_TrainingFormat = Literal["colmap", "colmap-flat", "colmap-erp", "nerfstudio"]
 # Formats that can store each kind of image other than cube faces.
 FORMATS_OF: dict[str, tuple[str, ...]] = {
     "fisheye": ("colmap", "colmap-flat", "nerfstudio"),
-    "panorama": ("colmap-erp", "nerfstudio", "metashape", "tum"),
+    "panorama": ("colmap-erp", "nerfstudio", "opensfm", "metashape", "gltf", "tum"),
 }
 
 
 class ExportSettings(_Settings):
     """Datasets written at the end of a run."""
 
-    formats: tuple[
-        Literal[
-            "colmap", "colmap-flat", "colmap-erp", "nerfstudio", "metashape", "gltf", "ply", "tum"
-        ],
-        ...,
-    ] = ("colmap",)
+    formats: tuple[Literal[_TrainingFormat, "opensfm", "metashape", "gltf", "ply", "tum"], ...] = (
+        "colmap",
+    )
     face_size: int | None = Field(
         default=None, ge=16, le=_MAX_FACE_PX
     )  # pixels; None = a quarter of the panorama's width

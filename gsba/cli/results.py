@@ -84,8 +84,8 @@ MapNumber = Annotated[
 Target = Annotated[
     str,
     typer.Option(
-        help="colmap, colmap-flat, colmap-erp, nerfstudio, metashape, gltf, ply or tum; or a "
-        "program: inria, postshot, brush, lichtfeld, gsplat, 3dgrut, opensplat, nerfstudio, "
+        help="colmap, colmap-flat, colmap-erp, nerfstudio, opensfm, metashape, gltf, ply or tum; "
+        "or a program: inria, postshot, brush, lichtfeld, gsplat, 3dgrut, opensplat, nerfstudio, "
         "instant-ngp, 3dgs-deblur, blender.",
         metavar="FORMAT",
     ),
@@ -122,6 +122,26 @@ Masks = Annotated[
         metavar="files|alpha|black",
     ),
 ]
+Align = Annotated[
+    str | None, typer.Option(help="True poses: export in their world.", metavar="TRUTH.tum")
+]
+Link = Annotated[
+    bool, typer.Option("--link", help="Make hard links to unchanged frames, not copies.")
+]
+Depths = Annotated[
+    bool,
+    typer.Option(
+        "--depths",
+        help="Also write the depths of the map's points in each face, with standard deviations.",
+    ),
+]
+Exposures = Annotated[
+    bool,
+    typer.Option(
+        "--exposures",
+        help="Also estimate how frames are exposed, as EXIF of their images (colmap, colmap-flat).",
+    ),
+]
 Located = Annotated[
     Path | None,
     typer.Option(
@@ -147,19 +167,17 @@ def export(
     between: Between = None,
     gps: Gps = None,
     gps_sigma: GpsSigma = None,
-    align: Annotated[
-        str | None, typer.Option(help="True poses: export in their world.", metavar="TRUTH.tum")
-    ] = None,
+    align: Align = None,
     align_scan: AlignScan = None,
     pairs: Pairs = None,
-    link: Annotated[
-        bool, typer.Option("--link", help="Make hard links to unchanged frames, not copies.")
-    ] = False,
+    link: Link = False,
     map_number: MapNumber = 1,
     photos: Located = None,
     exposure_ms: Exposure = None,
     split: HoldOut = None,
     masks: Masks = "files",
+    depths: Depths = False,
+    exposures: Exposures = False,
     cluster: Cluster = None,
 ) -> None:
     """Write a finished run as a dataset for another program."""
@@ -186,7 +204,8 @@ def export(
     noise = _gps_noise(run, gps_sigma) if gps is not None else None
     placed = replace(place(reconstruction, frames, settings, known, noise), map_number=map_number)
     options = replace(options, placement=placed, lenses=lenses, photos=read_photos(photos, run))
-    options = replace(options, shutter=shutter_of(run, exposure_ms), split=split)
+    options = replace(options, shutter=shutter_of(run, exposure_ms), split=split, depths=depths)
+    options = replace(options, exposures=exposures)
     with connected(cluster) as client, hired(client, folder, frames) as workers:
         export_all(reconstruction, frames, {to: folder}, options, workers)
     if folder.resolve().is_relative_to(run.resolve()):

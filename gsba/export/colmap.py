@@ -22,47 +22,34 @@ point j. Frames of several cameras have a rig for each of these.
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from gsba.camera.cameras import ONE_CAMERA, Cameras
-from gsba.camera.fisheye import Rig, facing, lens_names, optical_axes, project, rotation_of
-from gsba.camera.lens import Lenses
+from gsba.camera.fisheye import lens_names
 from gsba.camera.one_centre import seen_from_the_middle
-from gsba.camera.sphere import erp_from_bearings
 from gsba.camera.views import (
     View,
     scenes_of,
     seen_from_lenses,
     shown_in_pictures,
 )
+from gsba.export.depths import write_depths
 from gsba.export.images import has_masks, panorama_writer, view_writer, views_of_cameras
 from gsba.export.masks import MASK_FILES, MaskStyle
 from gsba.export.names import base_names, padded_names
 from gsba.export.pictures import Files, FrameWriter, by_camera
 from gsba.export.ply import write_splat_points
-from gsba.export.raw import SEEN_DEG, RawPictures, raw_lenses
+from gsba.export.raw import RawPictures
+from gsba.export.sensors import Sensor, pinholes, project_in_rigs, raw_sensors
 from gsba.export.split import split_of
-from gsba.geometry import inverse, pose, quaternion_from_rotation
+from gsba.geometry import inverse, quaternion_from_rotation
 from gsba.log import GsbaError
-from gsba.types import Fisheye, FrameSet, PictureFormat, Reconstruction
+from gsba.types import FrameSet, Reconstruction
 
 _BY_VIEW, _FLAT = "{view}/{name}{suffix}", "{name}_{view}{suffix}"  # names of images
 _FLAT_MASK = "{name}_{view}.png"  # others keep the image's suffix before .png, as COLMAP does
-
-
-@dataclass(frozen=True, slots=True)
-class Sensor:
-    """A camera of the rig."""
-
-    model: str  # COLMAP's name
-    width: int  # pixels
-    height: int  # pixels
-    params: tuple[float, ...]  # parameters of COLMAP's model, corner origin
-    rig_T_sensor: np.ndarray  # (4, 4) float64
-    fisheye: Fisheye | None = None  # lens of an OPENCV_FISHEYE camera
 
 
 def write_colmap(
@@ -73,11 +60,14 @@ def write_colmap(
     link: bool = False,
     cameras: Cameras = ONE_CAMERA,
     masks: MaskStyle = MASK_FILES,
+    depths: bool = False,
 ) -> FrameWriter:
     """Write the rig layout into `partial`, without images; returns their writer."""
     views = views_of_cameras(frames, face_size, cameras)
     files = _files_of_cameras(partial, _BY_VIEW, views, frames, masks)
-    seen, rigs = seen_from_lenses(reconstruction, cameras), _pinholes(views)
+    seen, rigs = seen_from_lenses(reconstruction, cameras), pinholes(views)
+    if depths:
+        write_depths(partial, seen, frames, files, views)
     write_model(partial / "sparse" / "0", seen, rigs, _names(files, frames), frames.cameras)
     _write_rig_config(partial, rigs, files, frames)
     return view_writer(files, frames, views, cameras, link, scenes_of(reconstruction))
@@ -93,14 +83,17 @@ def write_colmap_flat(
     split: bool = True,
     masks: MaskStyle = MASK_FILES,
     num_photos: int = 0,
+    depths: bool = False,
 ) -> FrameWriter:
     """Write the layout with unique base names into `partial`, without images; returns their
     writer. A split leaves room for photos, see `gsba.export.photos.add_photos`."""
     views = views_of_cameras(frames, face_size, cameras)
     files = _files_of_cameras(partial, _FLAT, views, frames, masks)
     seen = seen_from_lenses(reconstruction, cameras)
-    given = partial, seen, _pinholes(views), files, frames, split
+    given = partial, seen, pinholes(views), files, frames, split
     files = _write_flat_model(*given, num_photos)
+    if depths:
+        write_depths(partial, seen, frames, files, views)
     return view_writer(files, frames, views, cameras, link, scenes_of(reconstruction))
 
 
@@ -117,7 +110,7 @@ def write_colmap_raw(
     """Write the rig or the flat layout of raw fisheyes into `partial`, without images; returns
     their writer."""
     own = zip(frames.formats, cameras.lenses, strict=True)
-    rigs = [_raw_sensors(kind, lenses) for kind, lenses in own]
+    rigs = [raw_sensors(kind, lenses) for kind, lenses in own]
     pattern = _FLAT if flat else _BY_VIEW
     views = [lens_names(len(sensors)) for sensors in rigs]
     files = [_files(partial, pattern, own, frames, True, masks) for own in views]
@@ -206,7 +199,7 @@ def write_model(
     firsts = np.concatenate([[0], np.cumsum([len(own) for own in names])])  # (F + 1,) image of each
     # frame, frame after frame
     numbers = np.arange(firsts[-1]) if order is None else np.concatenate(list(map(list, order)))
-    which, pixels = _project_in_rigs(reconstruction, rigs, rig_of_frame)
+    which, pixels = project_in_rigs(reconstruction, rigs, rig_of_frame)
     images = numbers[firsts[reconstruction.observation_frames] + np.maximum(which, 0)]
     images[which < 0] = -1
     by_image = np.argsort(images, kind="stable")
@@ -272,21 +265,6 @@ def _add_rigs(model, rigs: Sequence[Sequence[Sensor]]) -> list[list]:
     return ids
 
 
-def _project_in_rigs(
-    reconstruction: Reconstruction, rigs: Sequence[Sequence[Sensor]], rig_of_frame: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Sensor (O,) of its frame's rig that sees each observation, -1 = its camera model reaches less
-    far, and its pixel (O, 2) there."""
-    bearings, origins = reconstruction.observation_bearings, reconstruction.observation_origins
-    which, pixels = np.zeros(len(bearings), np.int64), np.empty((len(bearings), 2))
-    of_observation = rig_of_frame[reconstruction.observation_frames]
-    for number, sensors in enumerate(rigs):
-        rows = np.flatnonzero(of_observation == number)
-        starts = None if origins is None else origins[rows]
-        which[rows], pixels[rows] = _project(sensors, bearings[rows], starts)
-    return which, pixels
-
-
 def _rigid(a_T_b: np.ndarray):
     import pycolmap
 
@@ -323,75 +301,6 @@ def _add_points(
         track = pycolmap.Track(list(map(pycolmap.TrackElement, image_ids, indices)))
         model.add_point3D_with_id(j + 1, pycolmap.Point3D(xyz=xyz, color=color, track=track))
     model.update_point_3d_errors()
-
-
-def _project(
-    sensors: Sequence[Sensor], bearings: np.ndarray, origins: np.ndarray | None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Sensor (O,) that sees each bearing (O, 3) from its origin, and its pixel (O, 2) there.
-
-    Among the sensors of the origin's lens it is the one with the pixel furthest from the border.
-    """
-    if sensors[0].fisheye is not None:
-        return _project_raw(sensors, bearings, origins)
-    if sensors[0].model == "EQUIRECTANGULAR":
-        pixels = erp_from_bearings(bearings, sensors[0].width, sensors[0].height)
-        return np.zeros(len(bearings), np.int64), pixels
-    found, off = np.empty((len(sensors), len(bearings), 2)), np.empty((len(sensors), len(bearings)))
-    for c, sensor in enumerate(sensors):
-        local = bearings @ sensor.rig_T_sensor[:3, :3]
-        depths = np.where(local[:, 2:] > 0, local[:, 2:], np.nan)
-        found[c] = sensor.params[:2] * local[:, :2] / depths + sensor.params[2:]
-        half = np.array([sensor.width, sensor.height]) / 2
-        off[c] = np.abs(found[c] / half - 1).max(axis=1)
-        if origins is not None:
-            off[c, origins[:, 2] * sensor.rig_T_sensor[2, 3] < 0] = np.nan  # the other lens
-    which = np.argmin(np.where(np.isnan(off), np.inf, off), axis=0)
-    return which, found[which, np.arange(len(bearings))]
-
-
-def _project_raw(
-    sensors: Sequence[Sensor], bearings: np.ndarray, origins: np.ndarray | None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Sensor (O,) and pixel (O, 2) of each bearing (O, 3) in the raw lenses; -1 beyond SEEN_DEG."""
-    if origins is None:
-        which = facing(bearings, optical_axes(_fisheyes(sensors)))
-    else:
-        centres = np.array([sensor.rig_T_sensor[:3, 3] for sensor in sensors])
-        apart = np.linalg.norm(origins[:, None] - centres, axis=2)
-        which = np.argmin(apart, axis=1)
-    pixels = np.empty((len(bearings), 2))
-    for c, sensor in enumerate(sensors):
-        assert sensor.fisheye is not None
-        own = which == c
-        pixels[own] = project(sensor.fisheye, bearings[own])
-        far = bearings @ rotation_of(sensor.fisheye)[:, 2] < np.cos(np.deg2rad(SEEN_DEG))
-        which[own & far] = -1
-    return which, pixels
-
-
-def _raw_sensors(kind: PictureFormat, lenses: Lenses) -> list[Sensor]:
-    """Raw lenses as cameras of the rig."""
-    return [
-        Sensor(
-            "OPENCV_FISHEYE",
-            lens.width,
-            lens.height,
-            (lens.focal, lens.focal, *lens.principal, *lens.radial),
-            pose(rotation_of(lens), centre),
-            lens,
-        )
-        for lens, centre in zip(raw_lenses(kind), lenses.centres, strict=True)
-    ]
-
-
-def _fisheyes(sensors: Sequence[Sensor]) -> Rig:
-    return tuple(sensor.fisheye for sensor in sensors if sensor.fisheye is not None)
-
-
-def _pinhole(view: View) -> Sensor:
-    params = (view.focal, view.focal, *view.principal)
-    return Sensor("PINHOLE", view.width, view.height, params, view.rig_T_view)
 
 
 def _write_rig_config(
@@ -441,11 +350,6 @@ def _files_of_cameras(
     masked = has_masks(frames)
     names = [[view.name for view in own] for own in views]
     return [_files(partial, name, own, frames, masked, style) for own in names]
-
-
-def _pinholes(views: Sequence[Sequence[View]]) -> list[list[Sensor]]:
-    """The cameras of each rig."""
-    return [list(map(_pinhole, own)) for own in views]
 
 
 def _files(

@@ -12,6 +12,7 @@ import numpy as np
 from gsba.camera.cameras import Cameras
 from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.config import FORMATS_OF
+from gsba.export.exposures import write_exposures
 from gsba.export.folder import output_folder
 from gsba.export.images import has_masks, write_pictures
 from gsba.export.masks import MASK_FILES, MaskStyle
@@ -39,8 +40,9 @@ class ExportFormat(StrEnum):
     COLMAP_FLAT = "colmap-flat"  # pinhole faces with unique base names, for splat trainers
     COLMAP_ERP = "colmap-erp"  # one equirectangular camera
     NERFSTUDIO = "nerfstudio"  # transforms.json: pinhole faces, and panoramas
+    OPENSFM = "opensfm"  # reconstruction.json, tracks.csv: panoramas
     METASHAPE = "metashape"  # cameras.xml: panoramas, or pinhole faces
-    GLTF = "gltf"  # scene.glb: cameras and cloud, no images
+    GLTF = "gltf"  # scene.glb: cameras and cloud, and panoramas on request
     PLY = "ply"  # points3D.ply, the start cloud of splat trainers
     TUM = "tum"  # trajectory.tum, and panoramas on request
 
@@ -64,6 +66,8 @@ class ExportOptions:
     masks: MaskStyle = MASK_FILES
     cameras: tuple[str, ...] = ()  # COLMAP's camera models that the reader knows; () = all
     panoramas: bool = True  # also panoramas beside faces, in nerfstudio's format
+    depths: bool = False  # with the depths of points in the images
+    exposures: bool = False  # with the exposures of the frames
 
 
 def export(
@@ -83,6 +87,8 @@ def export(
     photos: Photos = NO_PHOTOS,
     split: bool | None = None,
     masks: MaskStyle = MASK_FILES,
+    depths: bool = False,
+    exposures: bool = False,
 ) -> None:
     """Write one map of a reconstruction in another program's format.
 
@@ -112,6 +118,8 @@ def export(
         split: hold panoramas out of the training (colmap-flat, nerfstudio); False = all are for
             training; None = if at least two panoramas are left to train on.
         masks: how masks are written, and whether images are painted where they hide.
+        depths: also write the depths of points in pinhole faces, see `gsba.export.depths`.
+        exposures: also estimate the exposures of frames, see `gsba.export.exposures`.
 
     Raises:
         GsbaError: `out` is in use or not seen by a worker, the format does not fit the frames,
@@ -119,7 +127,7 @@ def export(
             those to hold out, or the disk cannot be written; nothing is left behind then.
     """
     given = face_size, placement, link, lenses, images, map_number, fetched, shutter
-    options = ExportOptions(*given, photos, split, masks)
+    options = ExportOptions(*given, photos, split, masks, depths=depths, exposures=exposures)
     export_all(reconstruction, frames, {to: out}, options, workers)
 
 
@@ -159,30 +167,60 @@ def export_all(
     _warn_of_gaps(reconstruction, frames, options)
     own = Placement(map_number=map_number).of_trajectory(reconstruction.origin)
     placement = options.placement or own
-    reconstruction = placement.apply(reconstruction)
+    unplaced, reconstruction = reconstruction, placement.apply(reconstruction)
     seen_by, up = cameras.scaled(placement.similarity.scale), placement.up
     files = (path for paths in (*frames.paths, frames.mask_paths) for path in paths)
     read = fingerprint(path for path in files if path and path.exists())  # some formats read none
     key = __version__, reconstruction, frames, read, face_size, up, link, seen_by, images
     key = (*key, options.shutter, options.photos, options.split, options.masks, options.cameras)
-    key = (*key, options.panoramas)
+    key = (*key, options.panoramas, options.depths)
+    datasets: list[Path] = []
     writers: list[FrameWriter] = []
     with ExitStack() as folders:
         for to, out in outs.items():
             folder = output_folder(out, to.value, content_digest(to.value, *key))
             partial = folders.enter_context(folder)
-            write = _WRITERS.get(_images_of(to, images, frames), _write)
-            given = partial, reconstruction, frames, to, up, link, seen_by, options
-            writers += write(*given)
-            if options.photos.photos:
-                undistort = bool(options.cameras) and "RADIAL" not in options.cameras
-                masked = has_masks(frames) and not options.masks.path
-                add_photos(partial, to.value, options.photos, placement, undistort, masked)
-            placement.write(partial / "transform.json")
+            datasets.append(partial)
+            writers += _write_dataset(partial, unplaced, frames, to, placement, seen_by, options)
         write_pictures(frames, writers, workers)
+        for partial in datasets if options.exposures else ():
+            write_exposures(partial)
     for to, out in outs.items():
         num_points = len(reconstruction.points_world)
         logger.info("%s: %d frames, %d points, in %s", to, len(frames), num_points, out)
+
+
+def _write_dataset(
+    partial: Path,
+    unplaced: Reconstruction,
+    frames: FrameSet,
+    to: ExportFormat,
+    placement: Placement,
+    cameras: Cameras,
+    options: ExportOptions,
+) -> list[FrameWriter]:
+    """Write a dataset of an unplaced map with its placement, without images; returns the writers
+    of these."""
+    from gsba.export import opensfm
+
+    if to == ExportFormat.OPENSFM:
+        placement = opensfm.z_up(placement)
+    reconstruction, up, link = placement.apply(unplaced), placement.up, options.link
+    given = partial, reconstruction, frames
+    placement.write(partial / "transform.json")
+    shown_as = _images_of(to, options.images, frames)
+    if to == ExportFormat.OPENSFM:
+        return [opensfm.write_opensfm(*given, placement, link, cameras, options.masks)]
+    if shown_as == "fisheye":
+        return _write_raw(*given, to, up, link, cameras, options)
+    if shown_as == "panorama":
+        return _write_panoramas(*given, to, up, link, cameras, options)
+    writers = _write(*given, to, up, link, cameras, options)
+    if options.photos.photos:
+        undistort = bool(options.cameras) and "RADIAL" not in options.cameras
+        masked = has_masks(frames) and not options.masks.path
+        add_photos(partial, to.value, options.photos, placement, undistort, masked)
+    return writers
 
 
 def _images_of(to: ExportFormat, images: str, frames: FrameSet) -> str:
@@ -241,7 +279,7 @@ def _write_panoramas(
     cameras: Cameras,
     options: ExportOptions,
 ) -> list[FrameWriter]:
-    from gsba.export import colmap, metashape, nerfstudio, panoramas
+    from gsba.export import colmap, gltf, metashape, nerfstudio, panoramas
 
     given, masks = (partial, reconstruction, frames), options.masks
     match to:
@@ -252,6 +290,8 @@ def _write_panoramas(
         case ExportFormat.NERFSTUDIO:
             last = _splits(options), masks
             return nerfstudio.write_nerfstudio_erp(*given, cameras, up, link, *last)
+        case ExportFormat.GLTF:
+            return gltf.write_blender(*given, up, link, cameras, panoramas=True)
         case _:
             return [panoramas.write_with_poses(*given, cameras, link, masks)]
 
@@ -264,7 +304,15 @@ def _require_fitting(to: ExportFormat, frames: FrameSet, options: ExportOptions)
     if to.value not in fitting:
         choices = ", ".join(fitting)
         raise GsbaError(f"--images {images} goes with {choices}, not with {to.value}")
-    if photos.photos and (to.value not in FITTING or images in ("fisheye", "panorama")):
+    with_faces = to.value in FITTING and images not in ("fisheye", "panorama")
+    if options.depths and not with_faces:
+        raise GsbaError(
+            f"depths are those of cube faces in {', '.join(FITTING)}, not of {to.value} with "
+            f"--images {images}"
+        )
+    if options.exposures and to not in (ExportFormat.COLMAP, ExportFormat.COLMAP_FLAT):
+        raise GsbaError(f"exposures go with colmap and colmap-flat, not with {to.value}")
+    if photos.photos and not with_faces:
         raise GsbaError(
             f"photos go beside cube faces in {', '.join(FITTING)}, not in {to.value} with "
             f"--images {images}"
@@ -295,20 +343,21 @@ def _write(
     split, masks, num_photos = _splits(options), options.masks, len(options.photos.photos)
     match to:
         case ExportFormat.COLMAP:
-            return [colmap.write_colmap(*given, face_size, link, cameras, masks)]
+            given = *given, face_size, link, cameras, masks
+            return [colmap.write_colmap(*given, depths=options.depths)]
         case ExportFormat.COLMAP_FLAT:
-            given = *given, face_size, link, cameras
-            return [colmap.write_colmap_flat(*given, split, masks, num_photos)]
+            given = *given, face_size, link, cameras, split, masks, num_photos
+            return [colmap.write_colmap_flat(*given, depths=options.depths)]
         case ExportFormat.COLMAP_ERP:
             return [colmap.write_colmap_erp(*given, link, cameras, masks)]
         case ExportFormat.NERFSTUDIO:
             given = *given, face_size, up, link, cameras
-            last = options.shutter, split, masks, options.panoramas
+            last = options.shutter, split, masks, options.panoramas, options.depths
             return nerfstudio.write_nerfstudio(*given, *last)
         case ExportFormat.METASHAPE:
             return [metashape.write_metashape_faces(*given, face_size, link, cameras, masks)]
         case ExportFormat.GLTF:
-            gltf.write_gltf(partial / "scene.glb", reconstruction, frames, up)
+            gltf.write_blender(*given, up)
         case ExportFormat.PLY:
             ply.write_splat_points(
                 partial / "points3D.ply", reconstruction.points_world, reconstruction.point_colors
@@ -316,6 +365,3 @@ def _write(
         case ExportFormat.TUM:
             write_poses(partial, reconstruction, frames)
     return []
-
-
-_WRITERS = {"fisheye": _write_raw, "panorama": _write_panoramas}  # by the setting `export.images`

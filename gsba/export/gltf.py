@@ -1,30 +1,78 @@
 """The walk as glTF 2.0: scene.glb, which Blender, Unreal and other programs import as it is.
 
 It holds the cloud (points with colours), a camera for each frame, which looks along the rig's z
-axis with a field of view of 90 degrees, and the camera `walk`, which moves through all frames at
-their times. glTF's world has y up and its cameras have OpenGL axes. A world without a known
-vertical is turned by the axis that is nearest to the up axes of the rigs.
+axis with a field of view of 90 degrees across a picture of 16:9 (Blender keeps the vertical field
+and takes the shape from its scene, which is 16:9), and the camera `walk`, which moves through all
+frames at their times. glTF's world has y up and its cameras have OpenGL axes. A world without a
+known vertical is turned by the axis that is nearest to the up axes of the rigs.
+
+`open_in_blender.py` beside it sets what glTF cannot say. It reads `extras`: of the scene `fps`,
+and `width` and `height` of the panoramas in pixels; of each frame's node `frame`, its place on the
+timeline, and `picture`, the path of its panorama. `fps` is an integer, as Blender 4.5 and 5.0
+import times by fps * fps_base, and play them by fps / fps_base.
 """
 
 import json
+import shutil
 import struct
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from gsba.camera.cameras import ONE_CAMERA, Cameras
+from gsba.camera.views import scenes_of
 from gsba.disk import write_bytes
+from gsba.export.images import panorama_writer
+from gsba.export.pictures import Files, FrameWriter
 from gsba.geometry import CV_R_GL, quaternion_from_rotation
 from gsba.types import FrameSet, Reconstruction
 
 _RIG_UP = np.array([0.0, -1, 0])  # of a camera that is held level
 _MIN_COMMON_UP = 0.5  # length of the mean of the rigs' up axes; below it, they have none in common
 _FLOAT, _UBYTE, _POINTS = 5126, 5121, 0  # glTF's numbers of component types and modes
-_YFOV_RAD, _NEAR_PER_EXTENT = np.pi / 2, 1e-4
+_ASPECT = 16 / 9  # width to height of Blender's scenes
+_YFOV_RAD = 2 * np.arctan(1 / _ASPECT)  # vertical field, for a horizontal one of 90 degrees
+_NEAR_PER_EXTENT, _FAR_PER_DISTANCE = 1e-4, 10.0  # of the cameras' extent, of the furthest thing
+_SCRIPT = "open_in_blender.py"
+_MIN_FPS, _MAX_FPS = 24, 240  # of Blender's timeline
+
+
+def write_blender(
+    partial: Path,
+    reconstruction: Reconstruction,
+    frames: FrameSet,
+    up: str | None = None,
+    link: bool = False,
+    cameras: Cameras = ONE_CAMERA,
+    panoramas: bool = False,
+) -> list[FrameWriter]:
+    """Write scene.glb and the script that opens it in Blender into `partial`; returns the writer
+    of the panoramas.
+
+    Args:
+        partial: folder to write.
+        reconstruction, frames, up: see `write_gltf`.
+        link: make hard links to panoramas that are exported unchanged.
+        cameras: cameras of the frames.
+        panoramas: with the panoramas, as backgrounds of the cameras.
+    """
+    files = Files(partial, ("",), "images/{name}{suffix}", "")
+    pictures = [files.images(frames, f)[0] for f in range(len(frames))] if panoramas else None
+    write_gltf(partial / "scene.glb", reconstruction, frames, up, pictures)
+    shutil.copyfile(Path(__file__).with_name(_SCRIPT), partial / _SCRIPT)
+    if not panoramas:
+        return []
+    return [panorama_writer(files, frames, cameras, link, scenes_of(reconstruction))]
 
 
 def write_gltf(
-    path: Path, reconstruction: Reconstruction, frames: FrameSet, up: str | None = None
+    path: Path,
+    reconstruction: Reconstruction,
+    frames: FrameSet,
+    up: str | None = None,
+    pictures: Sequence[str] | None = None,
 ) -> None:
     """Write `path`, a binary glTF file.
 
@@ -32,6 +80,8 @@ def write_gltf(
         path: file to write (.glb).
         reconstruction, frames: poses and cloud, and their frames.
         up: axis of the world that points up, "-y", "y" or "z"; None = unknown.
+        pictures: (F,) paths of the frames' panoramas, relative to the file's folder; None = there
+            are none.
 
     Raises:
         GsbaError: the disk cannot be written.
@@ -41,13 +91,13 @@ def write_gltf(
     positions = reconstruction.world_T_rigs[:, :3, 3] @ gltf_R_world.T
     xyzw = _steady(quaternion_from_rotation(rotations))[:, [1, 2, 3, 0]]
     scene = _Buffer()
-    extent = max(float(np.ptp(positions, axis=0).max()), 1e-3)
-    perspective = {"yfov": _YFOV_RAD, "aspectRatio": 1.0, "znear": _NEAR_PER_EXTENT * extent}
     nodes: list[dict[str, Any]] = [
         {"name": "walk", "camera": 0, **_placed(positions[0], xyzw[0])},
         *(
-            {"name": name, "camera": 0, **_placed(at, turn)}
-            for name, at, turn in zip(frames.names, positions, xyzw, strict=True)
+            {"name": name, "camera": 0, **_placed(at, turn), "extras": about}
+            for name, at, turn, about in zip(
+                frames.names, positions, xyzw, _extras(frames, pictures), strict=True
+            )
         ),
     ]
     meshes = []
@@ -58,7 +108,28 @@ def write_gltf(
         attributes = {"POSITION": scene.add(points, "VEC3"), "COLOR_0": scene.add(colors, "VEC4")}
         meshes = [{"name": "cloud", "primitives": [{"attributes": attributes, "mode": _POINTS}]}]
         nodes.append({"name": "cloud", "mesh": 0})
-    times = scene.add((frames.timestamps - frames.timestamps[0])[:, None], "SCALAR")
+    walk = _walk(scene, frames.timestamps - frames.timestamps[0], positions, xyzw)
+    about = {"fps": _fps(frames)}
+    if pictures is not None:
+        about |= {"width": frames.formats[0].width, "height": frames.formats[0].height}
+    document = {
+        "asset": {"version": "2.0", "generator": "gsba"},
+        "scene": 0,
+        "scenes": [{"name": "gsba", "nodes": list(range(len(nodes))), "extras": about}],
+        "nodes": nodes,
+        "cameras": [{"type": "perspective", "perspective": _perspective(reconstruction)}],
+        "animations": [walk],
+        **({"meshes": meshes} if meshes else {}),
+        **scene.tables(),
+    }
+    write_bytes(path, _glb(document, bytes(scene.content)))
+
+
+def _walk(
+    scene: "_Buffer", seconds: np.ndarray, positions: np.ndarray, xyzw: np.ndarray
+) -> dict[str, Any]:
+    """Animation of node 0, through positions (F, 3) and quaternions (F, 4) at their times (F,)."""
+    times = scene.add(seconds[:, None], "SCALAR")
     samplers = [
         {"input": times, "output": scene.add(values, kind), "interpolation": "LINEAR"}
         for values, kind in ((positions, "VEC3"), (xyzw, "VEC4"))
@@ -67,17 +138,34 @@ def write_gltf(
         {"sampler": number, "target": {"node": 0, "path": what}}
         for number, what in enumerate(("translation", "rotation"))
     ]
-    document = {
-        "asset": {"version": "2.0", "generator": "gsba"},
-        "scene": 0,
-        "scenes": [{"name": "gsba", "nodes": list(range(len(nodes)))}],
-        "nodes": nodes,
-        "cameras": [{"type": "perspective", "perspective": perspective}],
-        "animations": [{"name": "walk", "channels": channels, "samplers": samplers}],
-        **({"meshes": meshes} if meshes else {}),
-        **scene.tables(),
-    }
-    write_bytes(path, _glb(document, bytes(scene.content)))
+    return {"name": "walk", "channels": channels, "samplers": samplers}
+
+
+def _perspective(reconstruction: Reconstruction) -> dict[str, float]:
+    """Lens of the cameras; everything is between its near and its far plane."""
+    centres = reconstruction.world_T_rigs[:, :3, 3]
+    extent = max(float(np.ptp(centres, axis=0).max()), 1e-3)
+    things = np.concatenate([centres, reconstruction.points_world])
+    far = _FAR_PER_DISTANCE * max(float(np.linalg.norm(np.ptp(things, axis=0))), extent)
+    near = _NEAR_PER_EXTENT * extent
+    return {"yfov": _YFOV_RAD, "aspectRatio": _ASPECT, "znear": near, "zfar": far}
+
+
+def _fps(frames: FrameSet) -> int:
+    """Frames per second of a timeline on which each picture has a frame of its own."""
+    shortest = float(np.diff(frames.timestamps).min(initial=1.0))
+    return int(np.clip(np.ceil(1 / shortest - 1e-3), _MIN_FPS, _MAX_FPS))
+
+
+def _extras(frames: FrameSet, pictures: Sequence[str] | None) -> list[dict[str, Any]]:
+    """Entries (F,) of the frames for Blender: frame of the timeline, and picture."""
+    places = np.rint((frames.timestamps - frames.timestamps[0]) * _fps(frames)).astype(int)
+    order = np.arange(len(places))
+    places = np.maximum.accumulate(places - order) + order  # each later than the one before
+    entries: list[dict[str, Any]] = [{"frame": place} for place in places.tolist()]
+    for entry, picture in zip(entries, pictures or (), strict=False):
+        entry["picture"] = picture
+    return entries
 
 
 def _gltf_R_world(up: str | None, world_T_rigs: np.ndarray) -> np.ndarray:

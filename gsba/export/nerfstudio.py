@@ -32,6 +32,7 @@ from gsba.camera.fisheye import Rig, lens_names, rotation_of
 from gsba.camera.lens import Lenses
 from gsba.camera.views import View, scenes_of, seen_from_lenses
 from gsba.export import motion
+from gsba.export.depths import map_path, write_depths
 from gsba.export.images import has_masks, panorama_writer, view_writer, views_of_cameras
 from gsba.export.masks import MASK_FILES, MaskStyle
 from gsba.export.names import base_names, padded_names
@@ -61,6 +62,7 @@ def write_nerfstudio(
     split: bool = True,
     masks: MaskStyle = MASK_FILES,
     panoramas: bool = True,
+    depths: bool = False,
 ) -> list[FrameWriter]:
     """Write cloud and transforms.json of faces into `partial`, of panoramas transforms_erp.json,
     too, without images; returns their writers.
@@ -76,6 +78,7 @@ def write_nerfstudio(
         split: hold panoramas out of the training.
         masks: how masks are written.
         panoramas: write transforms_erp.json.
+        depths: with the depths of the faces, see `gsba.export.depths`.
     """
     out_R_world = _write_cloud(partial, reconstruction, up)
     views = views_of_cameras(frames, face_size, cameras)
@@ -83,7 +86,9 @@ def write_nerfstudio(
     files = [_files(partial, [view.name for view in own], frames, masked, masks) for own in views]
     seen = seen_from_lenses(reconstruction, cameras)
     given = partial, seen, frames, files, views, out_R_world, cameras, shutter
-    _write_face_dataset(*given, split)
+    if depths:
+        write_depths(partial, seen, frames, files, views, maps=True)
+    _write_face_dataset(*given, split, depths)
     scenes = scenes_of(reconstruction)
     writers = [view_writer(files, frames, views, cameras, link, scenes)]
     if panoramas and all(kind.panoramic for kind in frames.formats):
@@ -185,9 +190,14 @@ class _RawRig:
         return entries
 
 
+def z_up_R_world(up: str | None) -> np.ndarray:
+    """Rotation (3, 3) of a world to one whose z points up, see `write_nerfstudio`."""
+    return _Z_UP_R_WORLD.get(up or "-y", NERFSTUDIO_R_WORLD)
+
+
 def _write_cloud(partial: Path, reconstruction: Reconstruction, up: str | None) -> np.ndarray:
     """Write the cloud in nerfstudio's world; returns out_R_world (3, 3)."""
-    out_R_world = _Z_UP_R_WORLD.get(up or "-y", NERFSTUDIO_R_WORLD)
+    out_R_world = z_up_R_world(up)
     points = reconstruction.points_world @ out_R_world.T
     write_splat_points(partial / _CLOUD, points, reconstruction.point_colors)
     return out_R_world
@@ -203,6 +213,7 @@ def _write_face_dataset(
     cameras: Cameras,
     shutter: motion.Shutter,
     split: bool,
+    depths: bool,
 ) -> None:
     # OPENCV without distortion is a pinhole, by the only name that all readers know.
     camera = {"camera_model": "OPENCV", "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0}
@@ -224,6 +235,8 @@ def _write_face_dataset(
                 entry |= _intrinsics(view)
             if hidden:
                 entry["mask_path"] = hidden[number]
+            if depths:
+                entry["depth_file_path"] = map_path(images[number])
             if velocities is not None:
                 entry |= motion.velocity_keys(velocities[f], view.rig_T_view)
             entries[-1].append(entry)

@@ -18,6 +18,7 @@ import numpy as np
 
 from gsba.disk import disk_errors, write_image
 from gsba.export.colmap import write_in_order
+from gsba.export.depths import map_path, write_empty_map
 from gsba.export.split import TRAIN_LIST, add_images
 from gsba.frames.files import decode, goes_out_as_it_is, image_size
 from gsba.geometry import CV_R_GL, inverse
@@ -26,7 +27,7 @@ from gsba.placement.placement import Placement
 from gsba.store.records import RecordError, typed
 
 LIST = "localized.json"  # of `gsba localize`, in its folder
-FITTING = ("colmap", "colmap-flat", "nerfstudio")  # formats that hold photos
+FITTING = ("colmap", "colmap-flat", "nerfstudio")  # formats of faces, that hold photos and depths
 _INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "p1", "p2")
 
 
@@ -247,6 +248,7 @@ def _add_to_nerfstudio(
     path: Path, photos: Photos, poses: np.ndarray, names: Sequence[str], masks: Sequence[str]
 ) -> None:
     document = json.loads(path.read_text(encoding="utf-8"))
+    with_depths = any("depth_file_path" in entry for entry in document["frames"])
     # Readers apply intrinsics above the frames to all frames: each gets its own.
     common = {key: document.pop(key) for key in _INTRINSICS if key in document}
     frames = [common | entry for entry in document["frames"]]
@@ -266,6 +268,9 @@ def _add_to_nerfstudio(
                 **{"k1": k1, "k2": k2, "p1": 0.0, "p2": 0.0},
             }
         )
+        if with_depths:  # readers want them of all images or of none
+            frames[-1]["depth_file_path"] = map_path(name)
+            write_empty_map(path.parent / map_path(name), camera.width, camera.height)
     for entry, mask in zip(frames[len(frames) - len(masks) :], masks, strict=True):
         entry["mask_path"] = mask
     document["train_filenames"] = [*document["train_filenames"], *names]

@@ -67,7 +67,7 @@ PROGRAMS = {
         panoramas=False,
     ),
     "3dgs-deblur": Program(ExportFormat.NERFSTUDIO, "python train.py {out}"),
-    "blender": Program(ExportFormat.GLTF, "File > Import > glTF 2.0: {out}/scene.glb"),
+    "blender": Program(ExportFormat.GLTF, "blender --python {out}/open_in_blender.py"),
 }
 
 

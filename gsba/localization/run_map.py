@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from factors import tangent_basis
 from factors.sphere_field import SphereField
 from gsba import learned
+from gsba.bundle.point_covariances import point_covariances
 from gsba.bundle.stitching import corrected
 from gsba.camera.cameras import Cameras
 from gsba.camera.lens import Lenses
@@ -18,7 +18,6 @@ from gsba.config import RefineSettings
 from gsba.config_file import load_config
 from gsba.features.detection import Extractor, extract, gather
 from gsba.frames import cubemap
-from gsba.geometry import moved_to
 from gsba.log import GsbaError
 from gsba.matching.guided_search import Searchable, principal_axes, searchable
 from gsba.store.finished import load_cameras, load_run
@@ -31,7 +30,6 @@ _NUM_KEPT = 64  # keyframes kept in memory
 _SAME_PLACE_SIGMAS = 6.0  # largest angle between a keypoint and the observation of a point that is
 # taken for the keypoint's, standard deviations of the keypoint
 _SAME_PLACE_RAD = np.deg2rad(0.25)  # and largest such angle
-_PRIOR_EXTENTS = 10.0  # standard deviation of a point before any observation, extents of the map
 
 
 @dataclass(frozen=True, slots=True)
@@ -235,20 +233,3 @@ def taken(features: Features, rows: np.ndarray) -> Features:
         features.colors[rows],
         None if scores is None else scores[rows],
     )
-
-
-def point_covariances(result: Reconstruction) -> np.ndarray:
-    """Covariances (J, 3, 3) of points by their observations, the poses given, map units^2."""
-    poses, num = result.world_T_rigs, len(result.points_world)
-    positions = poses[:, :3, 3]
-    extent = max(float(np.linalg.norm(np.ptp(positions, axis=0))), 1e-12)
-    informations = np.tile(np.eye(3) / (_PRIOR_EXTENTS * extent) ** 2, (num, 1, 1))
-    for some in result.pieces():
-        points = some.observation_points
-        lenses = moved_to(poses[some.observation_frames], some.observation_origins)
-        distances = np.linalg.norm(some.points_world[points] - lenses[:, :3, 3], axis=1)
-        scales = some.observation_sigmas * np.maximum(distances, 1e-12)
-        axes = tangent_basis(some.observation_bearings) / scales[:, None, None]
-        axes = axes @ np.swapaxes(lenses[:, :3, :3], 1, 2)
-        np.add.at(informations, points, np.swapaxes(axes, 1, 2) @ axes)
-    return np.linalg.inv(informations)

@@ -26,7 +26,7 @@ from two_fisheyes import made_pair
 from gsba.camera.fisheye import project, unproject
 from gsba.camera.lens import Lenses, rows_run
 from gsba.disk import write_image
-from gsba.export import ExportFormat, Shutter, colmap, export
+from gsba.export import ExportFormat, Shutter, export, sensors
 from gsba.export.masks import MaskStyle
 from gsba.geometry import inverse, pose
 from gsba.log import GsbaError
@@ -252,8 +252,8 @@ def test_colmap_holds_nothing_beyond_a_right_angle_of_a_lens(tmp_path: Path) -> 
     angles = np.deg2rad([[88.0], [92.0]])
     aside = np.cross(axis, [0.0, 1.0, 0.0])
     bearings_rig = np.cos(angles) * axis + np.sin(angles) * aside / np.linalg.norm(aside)
-    sensors = colmap._raw_sensors(frames.formats[0], RAW)
-    which, _ = colmap._project_raw(sensors, bearings_rig, np.tile(RAW.centres[0], (2, 1)))
+    own = sensors.raw_sensors(frames.formats[0], RAW)
+    which, _ = sensors._project_raw(own, bearings_rig, np.tile(RAW.centres[0], (2, 1)))
     assert which.tolist() == [0, -1]
 
 

@@ -1,0 +1,152 @@
+"""OpenSfM projects of panoramas: poses, cloud, tracks, camera models, images and masks.
+
+As OpenSfM's `io.py` and `tracks_manager.cc` read them (023d057): a shot's `rotation` (a rotation
+vector) and `translation` take the world to its camera, with axes x right, y down, z forward; a
+`spherical` camera shows what is straight ahead in the middle of its picture; `tracks.csv` (v2)
+holds, tab by tab, shot, track, feature, x and y from the picture's middle in widths of the picture,
+the feature's scale (here the observation's standard deviation, in widths), red, green, blue,
+segmentation and instance (-1 = none). The world is metric if the export is, z points up, and, where
+the export is placed by GPS, it lies around `reference_lla.json`. Shots go by their file names, all
+in one folder.
+"""
+
+import dataclasses
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsba.camera.cameras import ONE_CAMERA, Cameras
+from gsba.camera.one_centre import seen_from_the_middle
+from gsba.camera.sphere import erp_from_bearings
+from gsba.camera.views import scenes_of
+from gsba.export.images import has_masks, panorama_writer
+from gsba.export.masks import MASK_FILES, MaskStyle
+from gsba.export.names import base_names
+from gsba.export.nerfstudio import z_up_R_world
+from gsba.export.pictures import Files, FrameWriter
+from gsba.geometry import inverse
+from gsba.log import GsbaError
+from gsba.placement.placement import Placement
+from gsba.similarity import Sim3
+from gsba.types import FrameSet, Reconstruction
+
+_NO_SEMANTICS = "-1\t-1"
+
+
+def z_up(placement: Placement) -> Placement:
+    """The placement, turned by a quarter turn or not at all to a world whose z points up."""
+    turn = Sim3(rotation=z_up_R_world(placement.up))
+    return dataclasses.replace(
+        placement,
+        similarity=turn.after(placement.similarity),
+        up=placement.up and "z",
+        offset=turn.rotation @ placement.offset,
+    )
+
+
+def write_opensfm(
+    partial: Path,
+    reconstruction: Reconstruction,
+    frames: FrameSet,
+    placement: Placement,
+    link: bool = False,
+    cameras: Cameras = ONE_CAMERA,
+    masks: MaskStyle = MASK_FILES,
+) -> FrameWriter:
+    """Write a project into `partial`, without images; returns their writer.
+
+    Args:
+        partial: folder to write.
+        reconstruction, frames: poses and cloud in a world whose z points up, and their frames.
+        placement: of that world.
+        link: make hard links to panoramas that are exported unchanged.
+        cameras: cameras of the frames.
+        masks: how masks are written.
+
+    Raises:
+        GsbaError: the frames are cube faces, or two of them get one file name.
+    """
+    if not all(kind.panoramic for kind in frames.formats):
+        raise GsbaError("opensfm needs panoramas, these frames are cube faces: use colmap")
+    mask = "masks/{name}{suffix}.png" if has_masks(frames) else ""
+    names = base_names(frames.names)  # OpenSfM looks into no subfolder
+    files = Files(partial, ("",), "images/{name}{suffix}", mask, masks, names)
+    shots = [files.images(frames, f)[0].removeprefix("images/") for f in range(len(frames))]
+    models = {
+        _camera_name(kind.width, kind.height): {
+            "projection_type": "spherical",
+            "width": kind.width,
+            "height": kind.height,
+        }
+        for kind in frames.formats
+    }
+    seen = seen_from_the_middle(reconstruction) if cameras else reconstruction
+    document: dict[str, Any] = {"cameras": models, "shots": _shots(seen, frames, shots)}
+    document["points"] = {
+        str(j): {"coordinates": xyz, "color": color}
+        for j, (xyz, color) in enumerate(
+            zip(seen.points_world.tolist(), seen.point_colors.tolist(), strict=True)
+        )
+    }
+    if placement.origin is not None and not placement.offset.any():
+        keys = ("latitude", "longitude", "altitude")
+        document["reference_lla"] = dict(zip(keys, placement.origin, strict=True))
+        _write_json(partial / "reference_lla.json", document["reference_lla"])
+    _write_json(partial / "reconstruction.json", [document])
+    _write_json(partial / "camera_models.json", models)
+    with (partial / "tracks.csv").open("w", encoding="utf-8") as file:
+        file.write("OPENSFM_TRACKS_VERSION_v2\n")
+        file.writelines(_tracks(seen, frames, shots))
+    return panorama_writer(files, frames, cameras, link, scenes_of(reconstruction))
+
+
+def _camera_name(width: int, height: int) -> str:
+    return f"v2 gsba panorama {width} {height} spherical 0"
+
+
+def _shots(
+    reconstruction: Reconstruction, frames: FrameSet, names: list[str]
+) -> dict[str, dict[str, Any]]:
+    from scipy.spatial.transform import Rotation
+
+    cameras_T_world = inverse(reconstruction.world_T_rigs)
+    rotations = Rotation.from_matrix(cameras_T_world[:, :3, :3]).as_rotvec()
+    return {
+        name: {
+            "camera": _camera_name(frames.format_of(f).width, frames.format_of(f).height),
+            "rotation": rotations[f].tolist(),
+            "translation": cameras_T_world[f, :3, 3].tolist(),
+            "orientation": 1,
+            **({"capture_time": float(frames.timestamps[f])} if frames.timed else {}),
+        }
+        for f, name in enumerate(names)
+    }
+
+
+def _tracks(reconstruction: Reconstruction, frames: FrameSet, names: list[str]) -> Iterator[str]:
+    """Lines of tracks.csv, shot after shot."""
+    order = np.argsort(reconstruction.observation_frames, kind="stable")
+    ends = np.searchsorted(reconstruction.observation_frames[order], np.arange(len(frames) + 1))
+    for f, name in enumerate(names):
+        rows = order[ends[f] : ends[f + 1]]
+        points = reconstruction.observation_points[rows]
+        kind = frames.format_of(f)
+        pixels = erp_from_bearings(
+            reconstruction.observation_bearings[rows], kind.width, kind.height
+        )
+        xy = (pixels - np.array([kind.width, kind.height]) / 2) / kind.width
+        scales = reconstruction.observation_sigmas[rows] / (2 * np.pi)
+        colors = reconstruction.point_colors[points]
+        columns = zip(points.tolist(), xy.tolist(), scales.tolist(), colors.tolist(), strict=True)
+        for feature, (point, (x, y), scale, (red, green, blue)) in enumerate(columns):
+            yield (
+                f"{name}\t{point}\t{feature}\t{x:.9g}\t{y:.9g}\t{scale:.6g}\t{red}\t{green}\t{blue}"
+                f"\t{_NO_SEMANTICS}\n"
+            )
+
+
+def _write_json(path: Path, content: object) -> None:
+    path.write_text(json.dumps(content) + "\n", encoding="utf-8")

@@ -1,0 +1,156 @@
+"""Depths of points in exported faces, read by the rules of the programs that use them."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from export_scene import HEIGHT, NUM_FRAMES, POINTS, WIDTH, panoramas, reconstruction
+
+from gsba.bundle.point_covariances import point_covariances
+from gsba.export import ExportFormat, export
+from gsba.export.photos import PhotoCamera, Photos, PlacedPhoto
+from gsba.geometry import inverse
+from gsba.log import GsbaError
+from gsba.types import Reconstruction
+
+
+def _nerfstudio_map(path: Path, width: int, height: int, scale_factor: float = 1e-3) -> np.ndarray:
+    """Depth map as nerfstudio 1.1.5 reads it (`get_depth_image_from_path`), in map units."""
+    image = cv2.imread(str(path), cv2.IMREAD_ANYDEPTH)
+    assert image is not None
+    image = image.astype(np.float32) * scale_factor
+    return cv2.resize(image, (width, height), interpolation=cv2.INTER_NEAREST)
+
+
+def test_nerfstudio_reads_the_depth_of_each_point(tmp_path: Path) -> None:
+    frames, out = panoramas(tmp_path / "frames"), tmp_path / "out"
+    export(reconstruction(), frames, out, ExportFormat.NERFSTUDIO, 96, depths=True)
+    meta = json.loads((out / "transforms.json").read_text())
+    world = np.array(meta["applied_transform"])[:, :3]
+    found = 0
+    for entry in meta["frames"]:
+        depths = _nerfstudio_map(out / entry["depth_file_path"], meta["w"], meta["h"])
+        local = np.column_stack([POINTS @ world.T, np.ones(len(POINTS))])
+        local = local @ inverse(np.array(entry["transform_matrix"]))[:3].T
+        u = meta["cx"] - meta["fl_x"] * local[:, 0] / local[:, 2]
+        v = meta["cy"] + meta["fl_y"] * local[:, 1] / local[:, 2]
+        rows, columns = np.nonzero(depths)
+        for row, column in zip(rows, columns, strict=True):
+            off = np.hypot(u - column - 0.5, v - row - 0.5)
+            (point,) = np.flatnonzero((off <= np.sqrt(0.5)) & (local[:, 2] < 0))
+            assert depths[row, column] == pytest.approx(-local[point, 2], rel=1e-6)
+        found += len(rows)
+    assert found == len(POINTS) * NUM_FRAMES  # each in one face of each frame
+
+
+@pytest.mark.parametrize("to", ["colmap", "colmap-flat"])
+def test_depths_beside_a_colmap_model_are_those_of_its_points(to: str, tmp_path: Path) -> None:
+    """Of each image of the model, the same points in the same pixels as in images.bin."""
+    frames, out = panoramas(tmp_path / "frames"), tmp_path / "out"
+    export(reconstruction(), frames, out, ExportFormat(to), 64, depths=True)
+    model = pycolmap.Reconstruction(out / "sparse/0")
+    files = {
+        path.relative_to(out / "sparse_depths") for path in out.rglob("sparse_depths/**/*.npz")
+    }
+    assert files == {Path(image.name).with_suffix(".npz") for image in model.images.values()}
+    assert not (out / "depths").exists()
+    for image in model.images.values():
+        with np.load(out / "sparse_depths" / Path(image.name).with_suffix(".npz")) as seen:
+            told = {int(point): row for row, point in enumerate(seen["point"])}
+            keypoints = [p for p in image.points2D if p.has_point3D()]
+            assert sorted(told) == sorted(p.point3D_id - 1 for p in keypoints)
+            for keypoint in keypoints:
+                row = told[keypoint.point3D_id - 1]
+                local = image.cam_from_world() * model.points3D[keypoint.point3D_id].xyz
+                np.testing.assert_allclose(seen["uv"][row], keypoint.xy, atol=1e-4)
+                assert seen["depth"][row] == pytest.approx(local[2], rel=1e-6)
+                assert 0 < seen["sigma"][row] < 0.1 * local[2]
+
+
+def test_standard_deviations_of_points_are_those_of_their_errors() -> None:
+    """Points estimated from noisy bearings: errors over standard deviations have variance 1."""
+    scene, rng = reconstruction(), np.random.default_rng(0)
+    points = np.tile(scene.points_world, (40, 1)) * rng.uniform(0.5, 3, (360, 1))
+    frames = np.tile(np.arange(NUM_FRAMES, dtype=np.int32), len(points))
+    numbers = np.repeat(np.arange(len(points), dtype=np.int32), NUM_FRAMES)
+    poses, sigma = scene.world_T_rigs, 2e-3
+    rays = points[numbers] - poses[frames, :3, 3]
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    noise = rng.normal(0, sigma, rays.shape)
+    noisy = rays + noise - np.sum(noise * rays, axis=1, keepdims=True) * rays
+    noisy /= np.linalg.norm(noisy, axis=1, keepdims=True)
+    found = _triangulated(poses[frames, :3, 3], noisy, numbers, points)
+    bearings = np.einsum("oji,oj->oi", poses[frames][:, :3, :3], noisy)
+    estimated = replace(_observed(scene, numbers, frames, bearings, sigma), points_world=found)
+    deviations = np.linalg.cholesky(np.linalg.inv(point_covariances(estimated)))
+    whitened = np.einsum("jba,jb->ja", deviations, found - points)
+    # 1080 numbers: the standard deviation of their mean square is 0.043.
+    assert np.mean(whitened**2) == pytest.approx(1, abs=0.17)
+
+
+def _observed(
+    scene: Reconstruction,
+    points: np.ndarray,
+    frames: np.ndarray,
+    bearings: np.ndarray,
+    sigma: float,
+) -> Reconstruction:
+    sigmas = np.full(len(points), sigma)
+    return replace(
+        scene,
+        observation_points=points,
+        observation_frames=frames,
+        observation_bearings=bearings,
+        observation_sigmas=sigmas,
+    )
+
+
+def _triangulated(
+    centres: np.ndarray, rays: np.ndarray, numbers: np.ndarray, points: np.ndarray
+) -> np.ndarray:
+    """Points (J, 3) nearest to their rays by angle: weighted distances, from true depths."""
+    reaches = np.linalg.norm(points[numbers] - centres, axis=1)
+    across = (np.eye(3) - rays[:, :, None] * rays[:, None]) / np.square(reaches)[:, None, None]
+    left, right = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
+    np.add.at(left, numbers, across)
+    np.add.at(right, numbers, np.einsum("oij,oj->oi", across, centres))
+    return np.linalg.solve(left, right[..., None])[..., 0]
+
+
+def test_uncertain_depths_are_in_no_map(tmp_path: Path) -> None:
+    scene = reconstruction()
+    scene.observation_sigmas[scene.observation_points == 4] = 1.0  # radians
+    frames, out = panoramas(tmp_path / "frames"), tmp_path / "out"
+    export(scene, frames, out, ExportFormat.NERFSTUDIO, 64, depths=True)
+    mapped = sum(
+        np.count_nonzero(_nerfstudio_map(path, 64, 64)) for path in (out / "depths").iterdir()
+    )
+    assert mapped == (len(POINTS) - 1) * NUM_FRAMES
+    listed = sum(len(np.load(path)["depth"]) for path in (out / "sparse_depths").iterdir())
+    assert listed == len(POINTS) * NUM_FRAMES
+
+
+def test_a_photo_has_an_empty_depth_map(tmp_path: Path) -> None:
+    """nerfstudio wants depth maps of all images or of none."""
+    frames, out = panoramas(tmp_path / "frames"), tmp_path / "out"
+    camera = PhotoCamera(80, 60, 70.0, (40.0, 30.0), (0.0, 0.0))
+    cv2.imwrite(str(tmp_path / "p.jpg"), np.zeros((60, 80, 3), np.uint8))
+    photos = Photos((PlacedPhoto("p", tmp_path / "p.jpg", np.eye(4), 0),), (camera,))
+    to = ExportFormat.NERFSTUDIO
+    export(reconstruction(), frames, out, to, 64, depths=True, photos=photos)
+    entries = json.loads((out / "transforms.json").read_text())["frames"]
+    assert all("depth_file_path" in entry for entry in entries)
+    assert not _nerfstudio_map(out / entries[-1]["depth_file_path"], 80, 60).any()
+
+
+@pytest.mark.parametrize(("to", "images"), [("nerfstudio", "panorama"), ("gltf", "auto")])
+def test_depths_are_those_of_faces(to: str, images: str, tmp_path: Path) -> None:
+    frames, out = panoramas(tmp_path / "frames"), tmp_path / "out"
+    assert (frames.format.width, frames.format.height) == (WIDTH, HEIGHT)
+    with pytest.raises(GsbaError, match=f"depths are those of cube faces in colmap.*not of {to}"):
+        export(reconstruction(), frames, out, ExportFormat(to), images=images, depths=True)
+    assert not out.exists()
