@@ -203,7 +203,7 @@ def write_model(
     images = numbers[firsts[reconstruction.observation_frames] + np.maximum(which, 0)]
     images[which < 0] = -1
     by_image = np.argsort(images, kind="stable")
-    starts = np.searchsorted(images[by_image], np.arange(len(numbers) + 1))
+    starts = np.searchsorted(images[by_image], np.arange(max(numbers, default=-1) + 2))
     rows = np.empty(len(images), np.int64)  # row of each observation in its image
     rows[by_image] = np.arange(len(images)) - starts[np.maximum(images[by_image], 0)]
 
