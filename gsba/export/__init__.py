@@ -1,4 +1,4 @@
-"""Datasets for other programs: COLMAP, nerfstudio, Metashape, glTF, PLY, TUM.
+"""Datasets for other programs: COLMAP, nerfstudio, OpenSfM, Metashape, glTF, PLY, TUM.
 
 Takes a result, its frames, and its placement.
 Gives a folder that the other program reads without conversion.

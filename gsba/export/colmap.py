@@ -67,7 +67,7 @@ def write_colmap(
     files = _files_of_cameras(partial, _BY_VIEW, views, frames, masks)
     seen, rigs = seen_from_lenses(reconstruction, cameras), pinholes(views)
     if depths:
-        write_depths(partial, seen, frames, files, views)
+        write_depths(partial, reconstruction, seen, frames, files, views)
     write_model(partial / "sparse" / "0", seen, rigs, _names(files, frames), frames.cameras)
     _write_rig_config(partial, rigs, files, frames)
     return view_writer(files, frames, views, cameras, link, scenes_of(reconstruction))
@@ -93,7 +93,7 @@ def write_colmap_flat(
     given = partial, seen, pinholes(views), files, frames, split
     files = _write_flat_model(*given, num_photos)
     if depths:
-        write_depths(partial, seen, frames, files, views)
+        write_depths(partial, reconstruction, seen, frames, files, views)
     return view_writer(files, frames, views, cameras, link, scenes_of(reconstruction))
 
 

@@ -2,8 +2,8 @@
 
 `sparse_depths/NAME.npz` holds, of each point that an image shows: `uv` (N, 2) float32, its observed
 pixel, corner origin; `depth` (N,) float32, its distance along the camera's axis in the unit of the
-exported world; `sigma` (N,) float32, the depth's standard deviation by the point's covariance, the
-poses given; `point` (N,) int32, its number in the exported cloud.
+exported world; `sigma` (N,) float32, the depth's standard deviation, errors of poses included;
+`point` (N,) int32, its number in the exported cloud.
 
 `depths/NAME.tiff` are the maps that nerfstudio 1.1.5 reads by `depth_file_path`: float32, depths in
 thousandths of the unit (its `depth_unit_scale_factor`) in the pixels of points, 0 elsewhere, which
@@ -20,7 +20,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from gsba.bundle.point_covariances import point_covariances
+from gsba.bundle.point_covariances import depth_variances
 from gsba.camera.views import View
 from gsba.disk import write_bytes
 from gsba.export.pictures import Files
@@ -62,6 +62,7 @@ def map_path(image: str) -> str:
 def write_depths(
     partial: Path,
     reconstruction: Reconstruction,
+    seen: Reconstruction,
     frames: FrameSet,
     files: Sequence[Files],
     views: Sequence[tuple[View, ...]],
@@ -71,7 +72,8 @@ def write_depths(
 
     Args:
         partial: folder of the dataset.
-        reconstruction: as seen from the dataset's cameras, see `seen_from_lenses`.
+        reconstruction: in the dataset's world.
+        seen: the same as seen from the dataset's cameras, see `seen_from_lenses`.
         frames: its frames.
         files: (C,) files of the images of each camera's frames.
         views: (C,) of each camera.
@@ -80,11 +82,10 @@ def write_depths(
     Raises:
         GsbaError: the disk cannot be written.
     """
-    which, pixels = project_in_rigs(reconstruction, pinholes(views), frames.cameras)
-    covariances = point_covariances(reconstruction)
-    order = np.argsort(reconstruction.observation_frames, kind="stable")
-    bounds = np.searchsorted(reconstruction.observation_frames[order], np.arange(len(frames) + 1))
-
+    which, pixels = project_in_rigs(seen, pinholes(views), frames.cameras)
+    depths, sigmas = _depths(reconstruction, seen, frames, views, which)
+    order = np.argsort(seen.observation_frames, kind="stable")
+    bounds = np.searchsorted(seen.observation_frames[order], np.arange(len(frames) + 1))
     num_shown = num_mapped = 0
     for f, camera in enumerate(frames.cameras.tolist()):
         rows = order[bounds[f] : bounds[f + 1]]
@@ -93,20 +94,41 @@ def write_depths(
             if image.startswith(f"{LEFT_OUT}/"):
                 continue
             own = rows[which[rows] == number]
-            points = reconstruction.observation_points[own]
-            world_T_view = reconstruction.world_T_rigs[f] @ view.rig_T_view
-            cloud = reconstruction.points_world, covariances
-            seen = _seen(*cloud, points, world_T_view, pixels[own])
+            shown = _Depths(*(all_[own].astype(np.float32) for all_ in (pixels, depths, sigmas)))
+            points = seen.observation_points[own]
             name = Path("sparse_depths", Path(image).relative_to("images")).with_suffix(".npz")
             (partial / name).parent.mkdir(parents=True, exist_ok=True)
-            np.savez(partial / name, uv=seen.uv, depth=seen.depth, sigma=seen.sigma, point=points)
+            given = shown.uv, shown.depth, shown.sigma
+            np.savez(partial / name, uv=given[0], depth=given[1], sigma=given[2], point=points)
             num_shown += len(own)
             if maps:
-                shown = seen.map(view.width, view.height)
-                _write_map(partial / map_path(image), shown)
-                num_mapped += np.count_nonzero(shown)
+                image_of_depths = shown.map(view.width, view.height)
+                _write_map(partial / map_path(image), image_of_depths)
+                num_mapped += np.count_nonzero(image_of_depths)
     more = f", {num_mapped} of them in maps" if maps else ""
     logger.info("depths of %d points in %d frames%s", num_shown, len(frames), more)
+
+
+def _depths(
+    reconstruction: Reconstruction,
+    seen: Reconstruction,
+    frames: FrameSet,
+    views: Sequence[tuple[View, ...]],
+    which: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Depths (O,) of observed points from the views (O,) that show them, and their standard
+    deviations (O,)."""
+    poses, of_frame = seen.world_T_rigs, seen.observation_frames
+    axes, depths = np.empty((len(which), 3)), np.empty(len(which))
+    for camera, own in enumerate(views):
+        taken = frames.cameras[of_frame] == camera
+        for number, view in enumerate(own):
+            rows = np.flatnonzero(taken & (which == number))
+            world_T_view = poses[of_frame[rows]] @ view.rig_T_view
+            axes[rows] = world_T_view[:, :3, 2]
+            reaches = seen.points_world[seen.observation_points[rows]] - world_T_view[:, :3, 3]
+            depths[rows] = np.sum(reaches * axes[rows], axis=1)
+    return depths, np.sqrt(depth_variances(reconstruction, axes))
 
 
 def write_empty_map(path: Path, width: int, height: int) -> None:
@@ -119,18 +141,3 @@ def _write_map(path: Path, image: np.ndarray) -> None:
     # 1.3 ms and 64 KB for a face of 960; Adobe's deflate takes 37 ms for 27 KB.
     flags = [cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_PACKBITS]
     write_bytes(path, cv2.imencode(".tiff", image, flags)[1].tobytes())
-
-
-def _seen(
-    points_world: np.ndarray,
-    covariances: np.ndarray,
-    points: np.ndarray,
-    world_T_view: np.ndarray,
-    pixels: np.ndarray,
-) -> _Depths:
-    """Depths of points (N,) at their pixels (N, 2), from the camera at a pose (4, 4)."""
-    axis = world_T_view[:3, 2]
-    depths = (points_world[points] - world_T_view[:3, 3]) @ axis
-    variances = np.einsum("i,nij,j->n", axis, covariances[points], axis)
-    numbers = depths.astype(np.float32), np.sqrt(variances).astype(np.float32)
-    return _Depths(pixels.astype(np.float32), *numbers)

@@ -87,7 +87,7 @@ def write_nerfstudio(
     seen = seen_from_lenses(reconstruction, cameras)
     given = partial, seen, frames, files, views, out_R_world, cameras, shutter
     if depths:
-        write_depths(partial, seen, frames, files, views, maps=True)
+        write_depths(partial, reconstruction, seen, frames, files, views, maps=True)
     _write_face_dataset(*given, split, depths)
     scenes = scenes_of(reconstruction)
     writers = [view_writer(files, frames, views, cameras, link, scenes)]

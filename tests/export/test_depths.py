@@ -9,13 +9,14 @@ import numpy as np
 import pycolmap
 import pytest
 from export_scene import HEIGHT, NUM_FRAMES, POINTS, WIDTH, panoramas, reconstruction
+from scipy.spatial.transform import Rotation
 
-from gsba.bundle.point_covariances import point_covariances
+from gsba.bundle.point_covariances import depth_variances, point_covariances
 from gsba.export import ExportFormat, export
 from gsba.export.photos import PhotoCamera, Photos, PlacedPhoto
 from gsba.geometry import inverse
 from gsba.log import GsbaError
-from gsba.types import Reconstruction
+from gsba.types import JointErrors, Reconstruction
 
 
 def _nerfstudio_map(path: Path, width: int, height: int, scale_factor: float = 1e-3) -> np.ndarray:
@@ -90,6 +91,33 @@ def test_standard_deviations_of_points_are_those_of_their_errors() -> None:
     whitened = np.einsum("jba,jb->ja", deviations, found - points)
     # 1080 numbers: the standard deviation of their mean square is 0.043.
     assert np.mean(whitened**2) == pytest.approx(1, abs=0.17)
+
+
+def test_errors_of_poses_are_errors_of_depths() -> None:
+    """Points triangulated from exact rays by poses in error, seen from these poses."""
+    scene, rng = reconstruction(), np.random.default_rng(1)
+    points, poses = scene.points_world, scene.world_T_rigs
+    numbers, frames = scene.observation_points, scene.observation_frames
+    draws = rng.normal(0, 1e-3, (16, NUM_FRAMES, 6)) * [1, 1, 1, 5, 5, 5]
+    draws[:, :, 3:] += 0.02 * (poses[:, :3, 3] - poses[:, :3, 3].mean(axis=0))  # a wrong scale
+    axes, errors = poses[frames, :3, 2], []
+    for draw in draws:
+        moved = poses.copy()
+        moved[:, :3, :3] = poses[:, :3, :3] @ Rotation.from_rotvec(draw[:, :3]).as_matrix()
+        moved[:, :3, 3] += np.einsum("fij,fj->fi", poses[:, :3, :3], draw[:, 3:])
+        rays = np.einsum("oij,oj->oi", moved[frames][:, :3, :3], scene.observation_bearings)
+        found = _triangulated(moved[frames, :3, 3], rays, numbers, points)
+        around = poses[:, :3, 3] - poses[:, :3, 3].mean(axis=0)
+        scale = np.sum(around * (moved - poses)[:, :3, 3]) / np.sum(around**2)
+        depths = np.einsum("oi,oi->o", moved[frames, :3, 2], found[numbers] - moved[frames, :3, 3])
+        expected = np.einsum("oi,oi->o", axes, points[numbers] - poses[frames, :3, 3])
+        errors.append(depths - expected * (1 + scale))
+    joint = JointErrors(np.zeros((NUM_FRAMES - 1, 6, 6)), draws.astype(np.float32))
+    exact = _observed(scene, numbers, frames, scene.observation_bearings, 1e-6)
+    alone = depth_variances(exact, axes)
+    found = depth_variances(replace(exact, joint_errors=joint), axes)
+    assert alone.max() < 1e-4 * found.min()
+    np.testing.assert_allclose(np.sqrt(found), np.sqrt(np.mean(np.square(errors), 0)), rtol=0.1)
 
 
 def _observed(
