@@ -19,7 +19,7 @@ VR180 = "stereo side by side of half the sphere each (VR180)"
 OVER_UNDER = "stereo, one eye above the other"
 CROPPED = "a cropped panorama: its left and right edge do not meet, and its poles are missing"
 REMEDIES = {  # of what `unlike_panorama` names
-    SIDE_BY_SIDE: "cut out the left half and scale it to 2:1",
+    SIDE_BY_SIDE: "cut out the left half and scale it to 2:1, if it shows the whole sphere",
     VR180: "half the sphere is missing; gsba needs 360-degree panoramas",
     OVER_UNDER: "cut out the upper half and scale it to 2:1",
     CROPPED: "pad it with black to 360 x 180 degrees, or keep the GPano tags of its maker",
@@ -74,7 +74,9 @@ def unlike_panorama(greys: Iterable[np.ndarray]) -> str:
         return ""
     beside, above, seam, poles, middle = np.median([astuple(one) for one in found], axis=0)
     if beside >= max(_MIN_REPEAT, above):
-        return VR180 if seam >= _MIN_SEAM_OF_HALVES else SIDE_BY_SIDE
+        of_contrast = [one.seam for one in found if one.seam > 0]
+        whole = not of_contrast or np.median(of_contrast) < _MIN_SEAM_OF_HALVES
+        return SIDE_BY_SIDE if whole else VR180
     if above >= _MIN_REPEAT and middle >= _MIN_MIDDLE_STEP:
         return OVER_UNDER
     return CROPPED if seam >= _MIN_SEAM and poles >= _MIN_POLE_DETAIL else ""

@@ -39,7 +39,7 @@ from gsba.placement import check
 from gsba.report.html import add_odometry
 from gsba.store import cluster
 from gsba.store.store import RunStore
-from gsba.types import CoarsePoses, FrameSet
+from gsba.types import CoarsePoses, FrameSet, Reconstruction
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -154,16 +154,41 @@ def refine_from(
     compile_ahead("refine")
     if walk is not None:
         start = _with_fetched(store, settings, chosen, given, start, source, walk)
-    state = _solve_raw(_begin(store, settings, chosen, start))
-    result = backend.reconstruct(state)
-    if walk is not None or state.prior.absent:  # the images alone have to show motion
-        acceptance.require_motion(state.run.frames, result)
+    state, result = _solve_or_turn(_begin(store, settings, chosen, start), walk is not None)
     lenses = camera.keep_lenses(state, result)
     finished_run.keep(state)
     written = outputs.write(state, result, lenses)
     if walk is not None:
         add_odometry(written.out / "report.html", walk)
     return written
+
+
+def _solve_or_turn(run: Run, followed: bool) -> tuple[State, Reconstruction]:
+    """The last state and its result; rotations alone where images determine no positions, but prove
+    that the camera turned on the spot.
+
+    Args:
+        run: at its start.
+        followed: True if the trajectory is an odometry of the same images.
+
+    Raises:
+        GsbaError: images that determine neither.
+    """
+    try:
+        state = _solve_raw(run)
+        result = backend.reconstruct(state)
+        if followed or state.prior.absent:  # the images alone have to show motion
+            acceptance.require_motion(run.frames, result)
+        return state, result
+    except acceptance.NoPositions as error:
+        if run.evidence.recordings or not (followed or run.coarse.absent):
+            raise
+        turn = frontend.prove_turn(frontend.extract(run))
+        if turn is None:
+            raise
+        logger.warning("%s", error)
+    logger.warning("most matches agree on rotations, over all gaps: rotations alone are refined")
+    return turn, backend.reconstruct(turn)
 
 
 def _with_fetched(

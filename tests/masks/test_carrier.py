@@ -20,6 +20,7 @@ from gsba.frames.scan import find_panoramas
 from gsba.log import GsbaError
 from gsba.masks.carrier import carrier_mask, find_carrier, write_carrier
 from gsba.masks.merging import choose
+from gsba.pipeline.acceptance import masked_scene_share
 from gsba.types import FrameSet
 
 WIDTH, HEIGHT, NUM = 512, 256, 14
@@ -156,6 +157,18 @@ def test_a_rail_that_moves_along_itself_is_not_the_carrier(tmp_path: Path) -> No
     rail = np.abs(v - HEIGHT / 2) < 6
     carrier = find_carrier(_noise_frames(tmp_path, rail, np.full((HEIGHT, WIDTH, 3), 20.0)))
     assert carrier.mask.all()
+
+
+def test_areas_without_pixels_do_not_ride_along(tmp_path: Path) -> None:
+    """A crop of 270 x 135 degrees, padded with black, is no vehicle."""
+    outside = np.ones((HEIGHT, WIDTH), bool)
+    outside[HEIGHT // 8 : -HEIGHT // 8, WIDTH // 8 : -WIDTH // 8] = False
+    frames = _noise_frames(tmp_path, outside, np.full((HEIGHT, WIDTH, 3), -50.0))
+    carrier = find_carrier(frames)
+    assert carrier.mask.all() and carrier.reason == "nothing turns with the camera"
+    mask_paths = (tmp_path / "m" / "mask.png",) * NUM
+    write_image(mask_paths[0], np.where(outside, 0, 255).astype(np.uint8))
+    assert masked_scene_share(dataclasses.replace(frames, mask_paths=mask_paths)) < 0.01
 
 
 def test_a_vehicle_that_fills_the_view_is_said(tmp_path: Path) -> None:
