@@ -182,7 +182,7 @@ def _load(frames: FrameSet, f: int) -> np.ndarray:
 
 
 def _measure(pictures: np.ndarray, width: int) -> FixedStructure:
-    """Fixed structure of pictures; the rims of areas without pixels, which ride along, have none."""
+    """Fixed structure of pictures; rims of areas without pixels, which ride along, have none."""
     size = width, width // 2
     small = [cv2.resize(p, size, interpolation=cv2.INTER_AREA) for p in pictures]
     found = measure_fixed_structure(np.stack(small))

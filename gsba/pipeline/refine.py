@@ -39,6 +39,7 @@ from gsba.placement import check
 from gsba.report.html import add_odometry
 from gsba.store import cluster
 from gsba.store.store import RunStore
+from gsba.trajectory.conventions import Convention
 from gsba.types import CoarsePoses, FrameSet, Reconstruction
 
 if TYPE_CHECKING:
@@ -99,7 +100,8 @@ def refine(
     check(settings.placement, baseline=settings.camera.baseline())
     chosen, readings = merging.choose(masks, segment), inputs.read_gyro(imu, frames)
     origin = {"frames": frames} | inputs.trajectory_files(trajectory, keyframes)
-    given, walk = inputs.read_trajectories(origin, timestamps), None  # fails before decoding
+    convention, walk = Convention.parse(settings.read.trajectory_format), None
+    given = inputs.read_trajectories(origin, timestamps, convention)  # fails before decoding
     if video.is_video(frames):
         by_odometry = chosen if inputs.follows(settings.video, fps, odometry, given) else None
         walk = inputs.extract_frames(out, origin, settings, fps, fresh, by_odometry, calibration)
