@@ -45,6 +45,7 @@ _STRUCTURE_WIDTH_PX, _TURNED_STRUCTURE_WIDTH_PX = 256, 128  # width in pixels of
 # the camera's tilt, which remains when turns are undone, moves the carrier by a pixel of the latter
 _BLACK_RIM_PX = 6  # of structure pictures, within which edges of black areas are compared
 _MIN_TURN_RAD = np.deg2rad(2.0)  # smaller turns are estimation noise
+_ROWS_ABOVE_SHARE = 0.55  # part of the height, from the zenith, where the world is seen
 _MIN_FRAMES_TURNED = 12  # fewer agree by chance once turns are free
 
 
@@ -196,7 +197,7 @@ def _measure(pictures: np.ndarray, width: int) -> FixedStructure:
 
 def _measure_turned(pictures: np.ndarray) -> tuple[np.ndarray, FixedStructure] | None:
     """Pictures rotated so that the carrier keeps its direction, and their structure; None = no
-    turns."""
+    turns, or those of the camera itself: the world above the carrier turns likewise."""
     turns = find_turns(np.stack([band_of(picture) for picture in pictures]))
     if np.ptp(turns) < _MIN_TURN_RAD:
         return None
@@ -206,8 +207,18 @@ def _measure_turned(pictures: np.ndarray) -> tuple[np.ndarray, FixedStructure] |
     coarse = _measure(turned, _TURNED_STRUCTURE_WIDTH_PX)
     if not certain_places(coarse).any():
         return None
+    as_taken = _measure(pictures, _TURNED_STRUCTURE_WIDTH_PX)
+    if _steadiness_above(coarse) > _steadiness_above(as_taken):
+        return None
     fine = _measure(turned, _STRUCTURE_WIDTH_PX)
     return turned, fine if certain_places(fine).any() else coarse
+
+
+def _steadiness_above(structure: FixedStructure) -> float:
+    """Mean correlation of the textured directions above the carrier; 0 = there are none."""
+    rows = int(_ROWS_ABOVE_SHARE * len(structure.strong))
+    textured = structure.textured[:rows]
+    return float(structure.strong[:rows][textured].mean()) if textured.any() else 0.0
 
 
 def _check_moving(structure: FixedStructure) -> None:

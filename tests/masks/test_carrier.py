@@ -277,3 +277,17 @@ def test_raw_pairs_are_taken(tmp_path: Path) -> None:
     grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1) + 0.5
     cone = bearings_from_erp(grid, width, height)[..., 2] > np.cos(0.5)
     assert width == 2 * height and _overlap(found, cone) >= 0.8
+
+
+def test_a_camera_that_turns_is_no_carrier_that_turns(tmp_path: Path) -> None:
+    """On the spot, the floor turns like a carrier below a picture that keeps its heading."""
+    (first, *_), *_ = _walk(tmp_path / "walk", None, speed=0.0).paths
+    rng, picture = np.random.default_rng(2), cv2.imread(str(first)).astype(np.float32)
+    for f in range(NUM):
+        turned = np.roll(picture, 41 * f, axis=1)
+        near = cv2.GaussianBlur(rng.normal(0, 60, turned.shape), (0, 0), 3.0)  # people around
+        turned[90:140, 200:360] += 5 * near[90:140, 200:360]
+        noisy = np.clip(turned + rng.normal(0, 2, turned.shape), 0, 255).astype(np.uint8)
+        write_image(tmp_path / f"turn/{f:03d}.png", noisy)
+    carrier = find_carrier(find_panoramas(tmp_path / "turn"))
+    assert carrier.mask.all() and not carrier.turns.any()
