@@ -120,13 +120,24 @@ def _stereo(axis: int) -> np.ndarray:
     ("pixels", "name"),
     [
         (_panorama()[ROWS, COLUMNS], "a cropped panorama"),
+        (_panorama()[:384, COLUMNS], "a cropped panorama"),
+        (_panorama()[128:, COLUMNS], "a cropped panorama"),
         (_stereo(0), "stereo, one eye above the other"),
         (_stereo(1), "stereo, an eye on the left"),
         (np.tile(_panorama()[:, 256:768], (1, 2, 1)), "VR180"),
         (np.concatenate([_panorama(), np.roll(_panorama(), -8, 1)]), "one eye above the other"),
         (np.concatenate([picture(lens) for lens in made_pair()]), "two fisheyes one above"),
     ],
-    ids=["cropped", "over-under", "side by side", "vr180", "square", "stacked"],
+    ids=[
+        "cropped",
+        "zenith kept",
+        "nadir kept",
+        "over-under",
+        "side by side",
+        "vr180",
+        "square",
+        "stacked",
+    ],
 )
 def test_what_pictures_show_is_named(tmp_path: Path, pixels: np.ndarray, name: str) -> None:
     folder = _folder(tmp_path / "a", [pixels] * 3, None, ".jpg")
