@@ -23,6 +23,7 @@ class ReadSettings(_Settings):
     max_interpolation_s: float = Field(
         default=10.0, gt=0
     )  # poses in longer gaps are interpolated, too, and reported
+    trajectory_format: _Text | None = None  # convention of trajectories, see `--trajectory-format`
     clock_offset_s: float | None = None  # s to add to frame times; None = clocks agree or one fits
     clock: Literal["auto", "given"] = "auto"  # auto: an offset is estimated from the camera's
     # rotation, and applied where it is certain
