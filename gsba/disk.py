@@ -92,7 +92,8 @@ def write_image(path: Path, image: "np.ndarray", jpeg_quality: int = 95) -> None
 
 
 def encoded_image(image: "np.ndarray", path: Path, jpeg_quality: int = 95) -> bytes:
-    """Encode (H, W, 3) RGB or (H, W) uint8 as the content of an image file with this suffix.
+    """Encode (H, W, 3) RGB, (H, W, 4) RGBA or (H, W) uint8 as the content of an image file with
+    this suffix.
 
     Raises:
         GsbaError: the image cannot be encoded in the format of the suffix.
@@ -100,7 +101,8 @@ def encoded_image(image: "np.ndarray", path: Path, jpeg_quality: int = 95) -> by
     import cv2
 
     options = [] if path.suffix.lower() == ".png" else [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality]
-    pixels = cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image
+    orders = {3: cv2.COLOR_RGB2BGR, 4: cv2.COLOR_RGBA2BGRA}
+    pixels = cv2.cvtColor(image, orders[image.shape[2]]) if image.ndim == 3 else image
     done, encoded = cv2.imencode(path.suffix, pixels, options)
     if not done:
         height, width = image.shape[:2]

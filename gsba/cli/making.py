@@ -74,8 +74,8 @@ def splat(
 def _write_dataset(run: Path, to: str, face_size: int | None) -> None:
     """Write the run for a program, upright where that can be told."""
     from gsba.config import PlacementSettings
-    from gsba.export import export
-    from gsba.export.trainers import format_of, how_to_start
+    from gsba.export import ExportOptions, export_all
+    from gsba.export.trainers import format_of, how_to_start, options_for
     from gsba.placement.placement import Placement, place
     from gsba.store.finished import load_run
     from gsba.store.folder import claim
@@ -88,7 +88,7 @@ def _write_dataset(run: Path, to: str, face_size: int | None) -> None:
         placement = Placement().of_trajectory(reconstruction.origin)
     folder = run / to
     lenses = cameras_of(run, reconstruction, frames, "auto", 1)
-    given = reconstruction, frames, folder, format_of(to), face_size, placement
-    export(*given, lenses=lenses, shutter=shutter_of(run))
+    options = ExportOptions(face_size, placement, lenses=lenses, shutter=shutter_of(run))
+    export_all(reconstruction, frames, {format_of(to): folder}, options_for(to, options))
     claim(run.resolve(), folder.resolve())
     typer.echo("\n".join([f"{to}: {folder}", *how_to_start(to, folder)]))

@@ -92,7 +92,7 @@ Target = Annotated[
     str,
     typer.Option(
         help="colmap, colmap-flat, colmap-erp, nerfstudio, metashape, gltf, ply or tum; or a "
-        "program: inria, postshot, brush, lichtfeld, gsplat, opensplat, nerfstudio, "
+        "program: inria, postshot, brush, lichtfeld, gsplat, 3dgrut, opensplat, nerfstudio, "
         "instant-ngp, 3dgs-deblur, blender.",
         metavar="FORMAT",
     ),
@@ -114,7 +114,20 @@ Pairs = Annotated[
 ]
 
 HoldOut = Annotated[
-    bool, typer.Option(help="Hold one panorama in eight out of the training, with all its faces.")
+    bool | None,
+    typer.Option(
+        "--split/--no-split",
+        help="Hold one panorama in eight out of the training, with all its faces; default: if two "
+        "are left to train on.",
+    ),
+]
+Masks = Annotated[
+    str,
+    typer.Option(
+        help="files: masks beside the images, by the names that the program reads; alpha, black: "
+        "images are painted where masks hide them, too, for programs that read none.",
+        metavar="files|alpha|black",
+    ),
 ]
 Located = Annotated[
     Path | None,
@@ -153,17 +166,19 @@ def export(
     map_number: MapNumber = 1,
     photos: Located = None,
     exposure_ms: Exposure = None,
-    split: HoldOut = True,
+    split: HoldOut = None,
+    masks: Masks = "files",
     cluster: Cluster = None,
 ) -> None:
     """Write a finished run as a dataset for another program."""
     from gsba.config_file import validated
-    from gsba.export import export as write
+    from gsba.export import ExportOptions, export_all
     from gsba.export.photos import read_photos
-    from gsba.export.trainers import format_of, how_to_start
+    from gsba.export.trainers import format_of, how_to_start, options_for
     from gsba.store.folder import claim
 
     name, to = to, format_of(to)
+    options = options_for(name, ExportOptions(face_size, link=link, images=images), masks)
     world = {"up": up, "length": _length(scale), "between": between, "gps": gps, "align": align}
     world |= {"scan": align_scan, "pairs": pairs}
     dataset = {"face_size": face_size, "images": images, "formats": [to]}
@@ -175,17 +190,16 @@ def export(
     reconstruction, frames, *_ = load_run(run, map_number)
     lenses = cameras_of(run, reconstruction, frames, images, map_number)
     folder = out or run / (name if map_number == 1 else f"{name}-map{map_number}")
-    known_baseline = _baseline(run, baseline) if scale == "lens" else None
+    known = _baseline(run, baseline) if scale == "lens" else None
     noise = _gps_settings(run, gps_sigma, gps_offset) if gps is not None else None
-    placed = place(reconstruction, frames, settings, known_baseline, noise)
-    placed, shutter = replace(placed, map_number=map_number), shutter_of(run, exposure_ms)
-    given = reconstruction, frames, folder, to, face_size, placed, link, lenses
-    beside = read_photos(photos, run)
+    placed = replace(place(reconstruction, frames, settings, known, noise), map_number=map_number)
+    options = replace(options, placement=placed, lenses=lenses, photos=read_photos(photos, run))
+    options = replace(options, shutter=shutter_of(run, exposure_ms), split=split)
     with connected(cluster) as client, hired(client, folder, frames) as workers:
-        write(*given, images=images, workers=workers, shutter=shutter, photos=beside, split=split)
+        export_all(reconstruction, frames, {to: folder}, options, workers)
     if folder.resolve().is_relative_to(run.resolve()):
         claim(run.resolve(), folder.resolve())
-    typer.echo("\n".join([f"{to}: {folder}", *how_to_start(name, folder)]))
+    typer.echo("\n".join([f"{to}: {folder}", *how_to_start(name, folder, masks)]))
 
 
 def shutter_of(run: Path, exposure_ms: float | None = None) -> "Shutter":

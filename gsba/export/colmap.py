@@ -39,6 +39,8 @@ from gsba.camera.views import (
     shown_in_pictures,
 )
 from gsba.export.images import has_masks, panorama_writer, view_writer, views_of_cameras
+from gsba.export.masks import MASK_FILES, MaskStyle
+from gsba.export.names import base_names, padded_names
 from gsba.export.pictures import Files, FrameWriter, by_camera
 from gsba.export.ply import write_splat_points
 from gsba.export.raw import SEEN_DEG, RawPictures, raw_lenses
@@ -70,10 +72,11 @@ def write_colmap(
     face_size: int | None,
     link: bool = False,
     cameras: Cameras = ONE_CAMERA,
+    masks: MaskStyle = MASK_FILES,
 ) -> FrameWriter:
     """Write the rig layout into `partial`, without images; returns their writer."""
     views = views_of_cameras(frames, face_size, cameras)
-    files = _files_of_cameras(partial, _BY_VIEW, views, frames)
+    files = _files_of_cameras(partial, _BY_VIEW, views, frames, masks)
     seen, rigs = seen_from_lenses(reconstruction, cameras), _pinholes(views)
     write_model(partial / "sparse" / "0", seen, rigs, _names(files, frames), frames.cameras)
     _write_rig_config(partial, rigs, files, frames)
@@ -88,13 +91,16 @@ def write_colmap_flat(
     link: bool = False,
     cameras: Cameras = ONE_CAMERA,
     split: bool = True,
+    masks: MaskStyle = MASK_FILES,
+    num_photos: int = 0,
 ) -> FrameWriter:
     """Write the layout with unique base names into `partial`, without images; returns their
-    writer."""
+    writer. A split leaves room for photos, see `gsba.export.photos.add_photos`."""
     views = views_of_cameras(frames, face_size, cameras)
-    files = _files_of_cameras(partial, _FLAT, views, frames)
+    files = _files_of_cameras(partial, _FLAT, views, frames, masks)
     seen = seen_from_lenses(reconstruction, cameras)
-    files = _write_flat_model(partial, seen, _pinholes(views), files, frames, split)
+    given = partial, seen, _pinholes(views), files, frames, split
+    files = _write_flat_model(*given, num_photos)
     return view_writer(files, frames, views, cameras, link, scenes_of(reconstruction))
 
 
@@ -106,13 +112,15 @@ def write_colmap_raw(
     flat: bool,
     link: bool = False,
     split: bool = True,
+    masks: MaskStyle = MASK_FILES,
 ) -> FrameWriter:
     """Write the rig or the flat layout of raw fisheyes into `partial`, without images; returns
     their writer."""
     own = zip(frames.formats, cameras.lenses, strict=True)
     rigs = [_raw_sensors(kind, lenses) for kind, lenses in own]
     pattern = _FLAT if flat else _BY_VIEW
-    files = [_files(partial, pattern, lens_names(len(sensors)), masked=True) for sensors in rigs]
+    views = [lens_names(len(sensors)) for sensors in rigs]
+    files = [_files(partial, pattern, own, frames, True, masks) for own in views]
     seen = shown_in_pictures(reconstruction, cameras)
     if flat:
         files = _write_flat_model(partial, seen, rigs, files, frames, split)
@@ -129,18 +137,19 @@ def _write_flat_model(
     files: Sequence[Files],
     frames: FrameSet,
     wanted: bool,
+    num_photos: int = 0,
 ) -> Sequence[Files]:
     """Write the model with INRIA's start cloud, in the order of a split if one is wanted; returns
     the files of each camera's frames in that order."""
-    rig_of_frame = frames.cameras.tolist()
-    split = split_of(seen, [len(rigs[rig]) for rig in rig_of_frame]) if wanted else None
+    num_views = [len(rigs[rig]) for rig in frames.cameras.tolist()]
+    split = split_of(seen, num_views, num_photos) if wanted else None
     if split is not None:
         files = [split.files(own, frames) for own in files]
     names, model = _names(files, frames), partial / "sparse" / "0"
     write_model(model, seen, rigs, names, frames.cameras, None if split is None else split.numbers)
     write_splat_points(model / "points3D.ply", seen.points_world, seen.point_colors)
     if split is not None:
-        split.write_lists(partial, names, model)
+        split.write_lists(partial, names)
     return files
 
 
@@ -150,6 +159,7 @@ def write_colmap_erp(
     frames: FrameSet,
     link: bool = False,
     cameras: Cameras = ONE_CAMERA,
+    masks: MaskStyle = MASK_FILES,
 ) -> FrameWriter:
     """Write the equirectangular layout into `partial`, without images; returns their writer.
 
@@ -163,7 +173,7 @@ def write_colmap_erp(
         [Sensor("EQUIRECTANGULAR", *size, (float(size[0]), float(size[1])), np.eye(4))]
         for size in sizes
     ]
-    files = _files(partial, "{name}{suffix}", ("",), has_masks(frames))
+    files = _files(partial, "{name}{suffix}", ("",), frames, has_masks(frames), masks)
     seen = seen_from_the_middle(reconstruction) if cameras else reconstruction
     names = _names([files] * len(rigs), frames)
     write_model(partial / "sparse" / "0", seen, rigs, names, frames.cameras)
@@ -200,7 +210,7 @@ def write_model(
     images = numbers[firsts[reconstruction.observation_frames] + np.maximum(which, 0)]
     images[which < 0] = -1
     by_image = np.argsort(images, kind="stable")
-    starts = np.searchsorted(images[by_image], np.arange(len(numbers) + 1))
+    starts = np.searchsorted(images[by_image], np.arange(max(numbers, default=-1) + 2))
     rows = np.empty(len(images), np.int64)  # row of each observation in its image
     rows[by_image] = np.arange(len(images)) - starts[np.maximum(images[by_image], 0)]
 
@@ -223,8 +233,26 @@ def write_model(
             model.add_image(image)
         model.register_frame(f + 1)
     _add_points(model, reconstruction, images, rows)
+    write_in_order(model, folder)
+
+
+def write_in_order(model, folder: Path) -> None:
+    """Write a pycolmap model in binary, with images in the order of their numbers, as some readers
+    count them: pycolmap writes frame after frame."""
     folder.mkdir(parents=True, exist_ok=True)
-    model.write_binary(folder)
+    model.write_binary(str(folder))
+    content = (folder / "images.bin").read_bytes()
+    view, records, start = memoryview(content), list[memoryview](), 8
+    while start < len(content):
+        name_end = content.index(b"\0", start + 64)  # behind number, pose and camera
+        num_points = int.from_bytes(view[name_end + 1 : name_end + 9], "little")
+        end = name_end + 9 + 24 * num_points
+        records.append(view[start:end])
+        start = end
+    records.sort(key=lambda record: int.from_bytes(record[:4], "little"))
+    with (folder / "images.bin").open("wb") as file:
+        file.write(view[:8])
+        file.writelines(records)
 
 
 def _add_rigs(model, rigs: Sequence[Sequence[Sensor]]) -> list[list]:
@@ -403,11 +431,16 @@ def _rig_config(sensors: Sequence[Sensor], names: Sequence[str], folder: str) ->
 
 
 def _files_of_cameras(
-    partial: Path, name: str, views: Sequence[Sequence[View]], frames: FrameSet
+    partial: Path,
+    name: str,
+    views: Sequence[Sequence[View]],
+    frames: FrameSet,
+    style: MaskStyle,
 ) -> list[Files]:
     """Files of images and masks of each camera's frames."""
     masked = has_masks(frames)
-    return [_files(partial, name, [view.name for view in own], masked) for own in views]
+    names = [[view.name for view in own] for own in views]
+    return [_files(partial, name, own, frames, masked, style) for own in names]
 
 
 def _pinholes(views: Sequence[Sequence[View]]) -> list[list[Sensor]]:
@@ -415,10 +448,19 @@ def _pinholes(views: Sequence[Sequence[View]]) -> list[list[Sensor]]:
     return [list(map(_pinhole, own)) for own in views]
 
 
-def _files(partial: Path, name: str, views: Sequence[str], masked: bool) -> Files:
+def _files(
+    partial: Path,
+    name: str,
+    views: Sequence[str],
+    frames: FrameSet,
+    masked: bool,
+    style: MaskStyle,
+) -> Files:
     """Files of images and masks by the pattern of their names."""
     mask = _FLAT_MASK if name == _FLAT else f"{name}.png"
-    return Files(partial, views, f"images/{name}", f"masks/{mask}" if masked else "")
+    names = padded_names(frames.names)
+    names = base_names(names) if name == _FLAT else names
+    return Files(partial, views, f"images/{name}", f"masks/{mask}" if masked else "", style, names)
 
 
 def _names(files: Sequence[Files], frames: FrameSet) -> list[list[str]]:

@@ -13,10 +13,12 @@ from gsba.camera.cameras import Cameras
 from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.config import FORMATS_OF
 from gsba.export.folder import output_folder
-from gsba.export.images import write_pictures
+from gsba.export.images import has_masks, write_pictures
+from gsba.export.masks import MASK_FILES, MaskStyle
 from gsba.export.motion import UNKNOWN, Shutter
 from gsba.export.photos import FITTING, Photos, add_photos
 from gsba.export.pictures import FrameWriter
+from gsba.export.split import require_held_out
 from gsba.log import GsbaError
 from gsba.placement.placement import Placement
 from gsba.store.finished import cameras_of_map, one_map
@@ -57,7 +59,11 @@ class ExportOptions:
     fetched: bool = False  # with the frames that were added where the map was weak
     shutter: Shutter = UNKNOWN  # for trainers that model blur and rolling rows
     photos: Photos = NO_PHOTOS  # localised photos, as cameras of their own
-    split: bool = True  # hold panoramas out of the training, in formats of trainers
+    split: bool | None = None  # hold panoramas out of the training, in formats of trainers; None =
+    # if enough are left to train on
+    masks: MaskStyle = MASK_FILES
+    cameras: tuple[str, ...] = ()  # COLMAP's camera models that the reader knows; () = all
+    panoramas: bool = True  # also panoramas beside faces, in nerfstudio's format
 
 
 def export(
@@ -75,7 +81,8 @@ def export(
     fetched: bool = False,
     shutter: Shutter = UNKNOWN,
     photos: Photos = NO_PHOTOS,
-    split: bool = True,
+    split: bool | None = None,
+    masks: MaskStyle = MASK_FILES,
 ) -> None:
     """Write one map of a reconstruction in another program's format.
 
@@ -103,15 +110,16 @@ def export(
         shutter: times of the exposure, which nerfstudio's format states.
         photos: localised photos, as cameras of their own beside the faces.
         split: hold panoramas out of the training (colmap-flat, nerfstudio); False = all are for
-            training.
+            training; None = if at least two panoramas are left to train on.
+        masks: how masks are written, and whether images are painted where they hide.
 
     Raises:
         GsbaError: `out` is in use or not seen by a worker, the format does not fit the frames,
-            there is no such map, or the disk cannot be written; nothing is left behind then.
+            there is no such map, two images would have one name, too few panoramas are left beside
+            those to hold out, or the disk cannot be written; nothing is left behind then.
     """
-    options = ExportOptions(
-        face_size, placement, link, lenses, images, map_number, fetched, shutter, photos, split
-    )
+    given = face_size, placement, link, lenses, images, map_number, fetched, shutter
+    options = ExportOptions(*given, photos, split, masks)
     export_all(reconstruction, frames, {to: out}, options, workers)
 
 
@@ -137,7 +145,7 @@ def export_all(
     face_size, link, images = options.face_size, options.link, options.images
     map_number = options.map_number
     for to in outs:
-        _require_fitting(to, frames, images, options.photos)
+        _require_fitting(to, frames, options)
     whole = reconstruction
     cameras = Cameras.of(options.lenses, frames)
     reconstruction, frames = one_map(whole, frames, map_number, "the reconstruction")
@@ -146,7 +154,9 @@ def export_all(
         rows = frames.chosen()
         reconstruction, frames = reconstruction.taken(rows), frames.taken(rows)
         cameras = cameras.taken(rows)
-    _warn_of_gaps(reconstruction, frames)
+    if options.split:
+        require_held_out(reconstruction)
+    _warn_of_gaps(reconstruction, frames, options)
     own = Placement(map_number=map_number).of_trajectory(reconstruction.origin)
     placement = options.placement or own
     reconstruction = placement.apply(reconstruction)
@@ -154,22 +164,20 @@ def export_all(
     files = (path for paths in (*frames.paths, frames.mask_paths) for path in paths)
     read = fingerprint(path for path in files if path and path.exists())  # some formats read none
     key = __version__, reconstruction, frames, read, face_size, up, link, seen_by, images
-    key = (*key, options.shutter, options.photos, options.split)
+    key = (*key, options.shutter, options.photos, options.split, options.masks, options.cameras)
+    key = (*key, options.panoramas)
     writers: list[FrameWriter] = []
     with ExitStack() as folders:
         for to, out in outs.items():
             folder = output_folder(out, to.value, content_digest(to.value, *key))
             partial = folders.enter_context(folder)
-            given = partial, reconstruction, frames, to
-            shown_as = _images_of(to, images, frames)
-            if shown_as == "fisheye":
-                writers += _write_raw(*given, up, link, seen_by, options)
-            elif shown_as == "panorama":
-                writers += _write_panoramas(*given, up, link, seen_by, options.split)
-            else:
-                writers += _write(*given, up, link, seen_by, options)
+            write = _WRITERS.get(_images_of(to, images, frames), _write)
+            given = partial, reconstruction, frames, to, up, link, seen_by, options
+            writers += write(*given)
             if options.photos.photos:
-                add_photos(partial, to.value, options.photos, placement)
+                undistort = bool(options.cameras) and "RADIAL" not in options.cameras
+                masked = has_masks(frames) and not options.masks.path
+                add_photos(partial, to.value, options.photos, placement, undistort, masked)
             placement.write(partial / "transform.json")
         write_pictures(frames, writers, workers)
     for to, out in outs.items():
@@ -188,8 +196,10 @@ def _images_of(to: ExportFormat, images: str, frames: FrameSet) -> str:
     return images
 
 
-def _warn_of_gaps(reconstruction: Reconstruction, frames: FrameSet) -> None:
-    """Warn of unrefined poses and of a missing point cloud."""
+def _warn_of_gaps(reconstruction: Reconstruction, frames: FrameSet, options: ExportOptions) -> None:
+    """Warn of unrefined poses, of a missing point cloud, and of masks to paint that are missing."""
+    if options.masks.paints and not has_masks(frames) and options.images != "fisheye":
+        logger.warning("no frame has a mask: images are not painted")
     unrefined = np.flatnonzero(reconstruction.pose_statuses == PoseStatus.UNREFINED)
     if len(unrefined):
         names = ", ".join(frames.names[f] for f in unrefined[:5])
@@ -211,10 +221,14 @@ def _write_raw(
 ) -> list[FrameWriter]:
     from gsba.export import colmap, nerfstudio
 
-    given, split = (partial, reconstruction, frames, cameras), options.split
+    given, last = (partial, reconstruction, frames, cameras), (_splits(options), options.masks)
     if to == ExportFormat.NERFSTUDIO:
-        return nerfstudio.write_nerfstudio_raw(*given, up, link, options.shutter, split)
-    return [colmap.write_colmap_raw(*given, to == ExportFormat.COLMAP_FLAT, link, split)]
+        return nerfstudio.write_nerfstudio_raw(*given, up, link, options.shutter, *last)
+    return [colmap.write_colmap_raw(*given, to == ExportFormat.COLMAP_FLAT, link, *last)]
+
+
+def _splits(options: ExportOptions) -> bool:
+    return options.split is not False
 
 
 def _write_panoramas(
@@ -225,24 +239,27 @@ def _write_panoramas(
     up: str | None,
     link: bool,
     cameras: Cameras,
-    split: bool,
+    options: ExportOptions,
 ) -> list[FrameWriter]:
     from gsba.export import colmap, metashape, nerfstudio, panoramas
 
-    given = partial, reconstruction, frames
+    given, masks = (partial, reconstruction, frames), options.masks
     match to:
         case ExportFormat.METASHAPE:
-            return [metashape.write_metashape_panoramas(*given, link, cameras)]
+            return [metashape.write_metashape_panoramas(*given, link, cameras, masks)]
         case ExportFormat.COLMAP_ERP:
-            return [colmap.write_colmap_erp(*given, link, cameras)]
+            return [colmap.write_colmap_erp(*given, link, cameras, masks)]
         case ExportFormat.NERFSTUDIO:
-            return nerfstudio.write_nerfstudio_erp(*given, cameras, up, link, split)
+            last = _splits(options), masks
+            return nerfstudio.write_nerfstudio_erp(*given, cameras, up, link, *last)
         case _:
-            return [panoramas.write_with_poses(*given, cameras, link)]
+            return [panoramas.write_with_poses(*given, cameras, link, masks)]
 
 
-def _require_fitting(to: ExportFormat, frames: FrameSet, images: str, photos: Photos) -> None:
-    """Refuse images that the format cannot hold, and panoramas of frames that are cube faces."""
+def _require_fitting(to: ExportFormat, frames: FrameSet, options: ExportOptions) -> None:
+    """Refuse images that the format cannot hold or its reader cannot read, and panoramas of frames
+    that are cube faces."""
+    images, photos = options.images, options.photos
     fitting = FORMATS_OF.get(images, (to.value,))
     if to.value not in fitting:
         choices = ", ".join(fitting)
@@ -251,6 +268,11 @@ def _require_fitting(to: ExportFormat, frames: FrameSet, images: str, photos: Ph
         raise GsbaError(
             f"photos go beside cube faces in {', '.join(FITTING)}, not in {to.value} with "
             f"--images {images}"
+        )
+    if images == "fisheye" and options.cameras and "OPENCV_FISHEYE" not in options.cameras:
+        known = ", ".join(options.cameras)
+        raise GsbaError(
+            f"--images fisheye: the program reads cameras {known} alone: use --images lenses"
         )
     if images == "panorama" and not all(kind.panoramic for kind in frames.formats):
         raise GsbaError("--images panorama needs panoramas, these frames are cube faces: use cube")
@@ -270,18 +292,21 @@ def _write(
     from gsba.export.panoramas import write_poses
 
     given, face_size = (partial, reconstruction, frames), options.face_size
+    split, masks, num_photos = _splits(options), options.masks, len(options.photos.photos)
     match to:
         case ExportFormat.COLMAP:
-            return [colmap.write_colmap(*given, face_size, link, cameras)]
+            return [colmap.write_colmap(*given, face_size, link, cameras, masks)]
         case ExportFormat.COLMAP_FLAT:
-            return [colmap.write_colmap_flat(*given, face_size, link, cameras, options.split)]
+            given = *given, face_size, link, cameras
+            return [colmap.write_colmap_flat(*given, split, masks, num_photos)]
         case ExportFormat.COLMAP_ERP:
-            return [colmap.write_colmap_erp(*given, link, cameras)]
+            return [colmap.write_colmap_erp(*given, link, cameras, masks)]
         case ExportFormat.NERFSTUDIO:
             given = *given, face_size, up, link, cameras
-            return nerfstudio.write_nerfstudio(*given, options.shutter, options.split)
+            last = options.shutter, split, masks, options.panoramas
+            return nerfstudio.write_nerfstudio(*given, *last)
         case ExportFormat.METASHAPE:
-            return [metashape.write_metashape_faces(*given, face_size, link, cameras)]
+            return [metashape.write_metashape_faces(*given, face_size, link, cameras, masks)]
         case ExportFormat.GLTF:
             gltf.write_gltf(partial / "scene.glb", reconstruction, frames, up)
         case ExportFormat.PLY:
@@ -291,3 +316,6 @@ def _write(
         case ExportFormat.TUM:
             write_poses(partial, reconstruction, frames)
     return []
+
+
+_WRITERS = {"fisheye": _write_raw, "panorama": _write_panoramas}  # by the setting `export.images`

@@ -2,17 +2,12 @@
 
 Faces are cut with bicubic sampling, after a low pass if they are much coarser than the panorama.
 They are written with 8 bits and three colours: as PNG if the frame is PNG or TIFF, else as JPEG of
-quality 95. Images that are exported unchanged (panoramas, and input faces of the exported size, in
-formats that every trainer reads correctly) are copies. Copies share blocks with the original on
-file systems that can (reflinks), so that an export may be moved and edited. On request they are
-hard links: then an edit of one is an edit of the other.
+quality 95. Panoramas, and input faces of the exported size, are exported unchanged where they are
+in formats that every trainer reads correctly.
 """
 
-import fcntl
 import os
-import shutil
-from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -24,10 +19,8 @@ from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.camera.one_centre import Stitcher
 from gsba.camera.rig import CubeRig
 from gsba.camera.views import Scenes, View, ViewCutter, views_for
-from gsba.disk import atomic_write
 from gsba.export.pictures import Files, FrameWriter, Pictures, Shown, by_camera
 from gsba.frames.dual_fisheye import load_raw
-from gsba.frames.files import goes_out_as_it_is
 from gsba.frames.pixels import load_faces
 from gsba.frames.track_pairs import load_squares
 from gsba.log import GsbaError
@@ -36,7 +29,6 @@ from gsba.store.shards import Threads, Workers
 from gsba.types import FACES, FrameSet, PictureFormat
 
 MIN_FACE_SIZE = 16  # pixels
-_FICLONE = 0x40049409  # ioctl of Linux that clones a file; both share blocks until one is written
 _MAX_FRAMES_AT_ONCE = 4  # an 8K panorama, a face and encoded images take 130 MB
 
 
@@ -127,31 +119,26 @@ class _CubeFaces(FrameWriter):
     def __call__(self, shown: Shown) -> None:
         from gsba.frames import cubemap
 
-        f, frames, size, paths = shown.f, shown.frames, self.size, self.images(shown)
+        f, frames, size = shown.f, shown.frames, self.size
         rig = CubeRig(size, np.pi / 2)
-        if shown.kind.tracks is not None:
-            shown.write(
-                size,
-                paths,
-                lambda: cubemap.cut_squares(load_squares(frames, f), rig, shown.kind.correction),
-            )
-        elif shown.kind.panoramic:
-            room = shown.room("face", (size, size, 3))
-            shown.write(size, paths, lambda: cubemap.cut_padded(shown.padded, rig, room))
-        elif size == shown.kind.width and all(map(goes_out_as_it_is, frames.paths[f], paths)):
-            for source, path in zip(frames.paths[f], paths, strict=True):
-                pass_on(source, path, self.link)
-        else:
-            shown.write(size, paths, lambda: _resized(load_faces(frames, f), size))
+        originals: Sequence[Path] = ()
+
+        def cut() -> Iterable[np.ndarray]:
+            if shown.kind.tracks is not None:
+                return cubemap.cut_squares(load_squares(frames, f), rig, shown.kind.correction)
+            if shown.kind.panoramic:
+                return cubemap.cut_padded(shown.padded, rig, shown.room("face", (size, size, 3)))
+            return _resized(load_faces(frames, f), size)
 
         def cut_mask() -> np.ndarray:
-            if frames.mask_paths[f] is None:
-                return np.ones((len(masks), size, size), bool)
             chosen = [FACES.index(face) for face in shown.kind.faces or FACES]
+            if frames.mask_paths[f] is None:
+                return np.ones((len(chosen), size, size), bool)
             return cubemap.cut_mask(shown.mask, rig)[chosen]
 
-        if masks := self.masks(shown):
-            shown.write_masks(size, masks, cut_mask)
+        if not shown.kind.panoramic and size == shown.kind.width:
+            originals = frames.paths[f]
+        self.write(shown, size, cut, cut_mask, originals=originals, link=self.link)
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,11 +170,9 @@ class _LensFaces(_OfLenses):
             return cutter().cut_padded(shown.padded)
 
         def cut_mask() -> Iterator[np.ndarray]:
-            return (part.astype(np.uint8) * 255 for part in cutter().cut_mask(shown.mask))
+            return iter(cutter().cut_mask(shown.mask))
 
-        shown.write(("of lenses", size), self.images(shown), cut)
-        if masks := self.masks(shown):
-            shown.write(("masks of lenses", size), masks, cut_mask)
+        self.write(shown, ("of lenses", size), cut, cut_mask, masks_differ=True)
 
 
 def write_pictures(
@@ -242,15 +227,10 @@ class _Panoramas(FrameWriter):
     link: bool
 
     def __call__(self, shown: Shown) -> None:
-        frames, (path,) = shown.frames, self.images(shown)
-        source = frames.paths[shown.f][0]
         as_it_is = shown.kind.layout == "erp" and not shown.kind.correction
-        if as_it_is and goes_out_as_it_is(source, path):
-            pass_on(source, path, self.link)
-        else:
-            shown.write("panorama", [path], lambda: [shown.erp])
-        if masks := self.masks(shown):
-            shown.write_masks("panorama", masks, lambda: [shown.mask])
+        originals = shown.frames.paths[shown.f] if as_it_is else ()
+        given = shown, "panorama", lambda: [shown.erp], lambda: [shown.mask]
+        self.write(*given, originals=originals, link=self.link)
 
 
 @dataclass(frozen=True, slots=True)
@@ -272,29 +252,9 @@ class _Stitched(_OfLenses):
             return [stitcher().stitched(shown.erp)]
 
         def mask() -> list[np.ndarray]:
-            return [stitcher().stitched_mask(shown.mask).astype(np.uint8) * 255]
+            return [stitcher().stitched_mask(shown.mask)]
 
-        shown.write("stitched", self.images(shown), stitched)
-        if masks := self.masks(shown):
-            shown.write("stitched mask", masks, mask)
-
-
-def pass_on(source: Path, path: Path, link: bool) -> None:
-    """Copy `source` to `path`, sharing its blocks on disk if the file system can."""
-    if not source.is_file():
-        raise GsbaError(f"{source} is missing; it existed when the run began: restore it")
-    atomic_write(path, lambda temporary: _pass_on(source, temporary, link), parents=False)
-
-
-def _pass_on(source: Path, path: Path, link: bool) -> None:
-    if link:
-        with suppress(OSError):  # another file system
-            os.link(source.resolve(), path)
-            return
-    with suppress(OSError), source.open("rb") as original, path.open("wb") as clone:
-        fcntl.ioctl(clone, _FICLONE, original.fileno())
-        return
-    shutil.copyfile(source, path)
+        self.write(shown, "stitched", stitched, mask, masks_differ=True)
 
 
 def _resized(faces: np.ndarray, size: int) -> np.ndarray:

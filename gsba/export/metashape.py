@@ -5,6 +5,7 @@ calibration: the panorama's middle column looks along z. Other images give frame
 faces), one where all faces are alike. A camera's transform is its pose in the chunk, row by row,
 with axes x right, y down, z forward, which are ours; `cx` and `cy` are offsets from the middle of
 the image. The one component has no transform of its own, so that the chunk is the exported world.
+Labels are names of files without folders, by which Metashape finds images.
 `gsba.trajectory.metashape` reads the file back.
 """
 
@@ -18,6 +19,8 @@ import numpy as np
 from gsba.camera.cameras import ONE_CAMERA, Cameras
 from gsba.camera.views import View, scenes_of, seen_from_lenses
 from gsba.export.images import has_masks, panorama_writer, view_writer, views_of_cameras
+from gsba.export.masks import MASK_FILES, MaskStyle
+from gsba.export.names import base_names
 from gsba.export.pictures import Files, FrameWriter
 from gsba.export.ply import write_splat_points
 from gsba.types import FrameSet, Reconstruction
@@ -31,11 +34,13 @@ def write_metashape_panoramas(
     frames: FrameSet,
     link: bool = False,
     cameras: Cameras = ONE_CAMERA,
+    masks: MaskStyle = MASK_FILES,
 ) -> FrameWriter:
     """Write cloud and cameras.xml of panoramas into `partial`, without images; returns their
     writer."""
     mask = "masks/{name}.png" if has_masks(frames) else ""
-    files = Files(partial, ("",), "images/{name}{suffix}", mask)
+    names = base_names(frames.names)
+    files = Files(partial, ("",), "images/{name}{suffix}", mask, masks, names)
     sensors = [
         _sensor(number, "panorama", "spherical", kind.width, kind.height)
         for number, kind in enumerate(frames.formats)
@@ -57,14 +62,15 @@ def write_metashape_faces(
     face_size: int | None,
     link: bool = False,
     cameras: Cameras = ONE_CAMERA,
+    masks: MaskStyle = MASK_FILES,
 ) -> FrameWriter:
     """Write cloud and cameras.xml of pinhole faces into `partial`, without images; returns their
     writer."""
     views = views_of_cameras(frames, face_size, cameras)
     mask = "masks/{name}_{view}.png" if has_masks(frames) else ""
+    pattern, names = "images/{name}_{view}{suffix}", base_names(frames.names)
     files = [
-        Files(partial, [view.name for view in own], "images/{name}_{view}{suffix}", mask)
-        for own in views
+        Files(partial, [view.name for view in own], pattern, mask, masks, names) for own in views
     ]
     sensors, kinds = list[ET.Element](), list[list[int]]()
     for own in views:

@@ -15,8 +15,8 @@ edge of the image in the format of instant-ngp, and `rolling_shutter` is [0, 0, 
 pixel is interpolated between them by its row over the height. That is gsplat's
 ROLLING_TOP_TO_BOTTOM, with the inverses (in axes y down, z forward) as `viewmats` and
 `viewmats_rs`, and k1 to k4 as `radial_coeffs`. instant-ngp reads `is_fisheye` and k1 to k4 in each
-frame's entry, and the size of its box from `aabb_scale`. Velocities for 3dgs-deblur:
-`gsba.export.motion`.
+frame's entry, and the size of its box from `aabb_scale`; of a folder it loads all JSON files with
+frames, panoramas as pinholes. Velocities for 3dgs-deblur: `gsba.export.motion`.
 """
 
 import json
@@ -33,6 +33,8 @@ from gsba.camera.lens import Lenses
 from gsba.camera.views import View, scenes_of, seen_from_lenses
 from gsba.export import motion
 from gsba.export.images import has_masks, panorama_writer, view_writer, views_of_cameras
+from gsba.export.masks import MASK_FILES, MaskStyle
+from gsba.export.names import base_names, padded_names
 from gsba.export.pictures import Files, FrameWriter, by_camera
 from gsba.export.ply import write_splat_points
 from gsba.export.raw import RawPictures, raw_lenses
@@ -57,6 +59,8 @@ def write_nerfstudio(
     cameras: Cameras = ONE_CAMERA,
     shutter: motion.Shutter = motion.UNKNOWN,
     split: bool = True,
+    masks: MaskStyle = MASK_FILES,
+    panoramas: bool = True,
 ) -> list[FrameWriter]:
     """Write cloud and transforms.json of faces into `partial`, of panoramas transforms_erp.json,
     too, without images; returns their writers.
@@ -70,18 +74,21 @@ def write_nerfstudio(
         cameras: cameras of the frames.
         shutter: times of the exposure.
         split: hold panoramas out of the training.
+        masks: how masks are written.
+        panoramas: write transforms_erp.json.
     """
     out_R_world = _write_cloud(partial, reconstruction, up)
     views = views_of_cameras(frames, face_size, cameras)
-    files = [_files(partial, [view.name for view in own], has_masks(frames)) for own in views]
+    masked = has_masks(frames)
+    files = [_files(partial, [view.name for view in own], frames, masked, masks) for own in views]
     seen = seen_from_lenses(reconstruction, cameras)
     given = partial, seen, frames, files, views, out_R_world, cameras, shutter
     _write_face_dataset(*given, split)
     scenes = scenes_of(reconstruction)
     writers = [view_writer(files, frames, views, cameras, link, scenes)]
-    if all(kind.panoramic for kind in frames.formats):
+    if panoramas and all(kind.panoramic for kind in frames.formats):
         given = partial, reconstruction, frames, cameras, out_R_world, link
-        writers.append(_write_erp_dataset(*given, "_erp", split))
+        writers.append(_write_erp_dataset(*given, "_erp", split, masks))
     return writers
 
 
@@ -93,12 +100,13 @@ def write_nerfstudio_erp(
     up: str | None = None,
     link: bool = False,
     split: bool = True,
+    masks: MaskStyle = MASK_FILES,
 ) -> list[FrameWriter]:
     """Write cloud and transforms.json of panoramas into `partial`, without images; returns their
     writers."""
     out_R_world = _write_cloud(partial, reconstruction, up)
     given = partial, reconstruction, frames, cameras, out_R_world, link
-    return [_write_erp_dataset(*given, "", split)]
+    return [_write_erp_dataset(*given, "", split, masks)]
 
 
 def write_nerfstudio_raw(
@@ -110,19 +118,20 @@ def write_nerfstudio_raw(
     link: bool = False,
     shutter: motion.Shutter = motion.UNKNOWN,
     split: bool = True,
+    masks: MaskStyle = MASK_FILES,
 ) -> list[FrameWriter]:
     """Write cloud and transforms.json of raw fisheyes into `partial`, without images; returns
     their writers."""
     out_R_world = _write_cloud(partial, reconstruction, up)
     own = zip(frames.formats, cameras.lenses, strict=True)
     rigs = [_RawRig.of(kind, lenses) for kind, lenses in own]
-    files = [_files(partial, lens_names(len(one.rig)), masked=True) for one in rigs]
+    files = [_files(partial, lens_names(len(one.rig)), frames, True, masks) for one in rigs]
     velocities = motion.rig_velocities(reconstruction, frames, cameras, shutter)
     entries = list[list[dict[str, Any]]]()
     for f, (world_T_rig, c) in enumerate(
         zip(reconstruction.world_T_rigs, frames.cameras.tolist(), strict=True)
     ):
-        names = files[c].images(frames, f), files[c].masks(frames, f)
+        names = files[c].images(frames, f), _mask_paths(files[c], frames, f)
         velocity = None if velocities is None else velocities[f]
         entries.append(rigs[c].entries(f, world_T_rig, *names, out_R_world, velocity))
     camera: dict[str, Any] = {"camera_model": "OPENCV_FISHEYE", "is_fisheye": True}
@@ -171,7 +180,8 @@ class _RawRig:
                     entry[f"transform_matrix_{name}"] = matrix
             if velocity is not None:  # rows are read from the top, at these velocities
                 entry |= motion.velocity_keys(ways[number] * velocity, rig_T_lens)
-            entries.append({**entry, **_fisheye(lens), "mask_path": masks[number]})
+            entry |= _fisheye(lens)
+            entries.append({**entry, "mask_path": masks[number]} if masks else entry)
         return entries
 
 
@@ -206,14 +216,14 @@ def _write_face_dataset(
     for f, (world_T_rig, c) in enumerate(
         zip(reconstruction.world_T_rigs, frames.cameras.tolist(), strict=True)
     ):
-        images, masks = files[c].images(frames, f), files[c].masks(frames, f)
+        images, hidden = files[c].images(frames, f), _mask_paths(files[c], frames, f)
         entries.append([])
         for number, view in enumerate(views[c]):
             entry = _entry(images[number], out_R_world, world_T_rig @ view.rig_T_view)
             if not alike:
                 entry |= _intrinsics(view)
-            if masks:
-                entry["mask_path"] = masks[number]
+            if hidden:
+                entry["mask_path"] = hidden[number]
             if velocities is not None:
                 entry |= motion.velocity_keys(velocities[f], view.rig_T_view)
             entries[-1].append(entry)
@@ -230,9 +240,11 @@ def _write_erp_dataset(
     link: bool,
     which: str,
     split: bool,
+    masks: MaskStyle,
 ) -> FrameWriter:
     mask = f"masks{which}/{{name}}.png" if has_masks(frames) else ""
-    files = Files(partial, ("",), f"images{which}/{{name}}{{suffix}}", mask)
+    names = base_names(padded_names(frames.names))
+    files = Files(partial, ("",), f"images{which}/{{name}}{{suffix}}", mask, masks, names)
     shapes = [
         {"fl_x": kind.width / 2, "fl_y": float(kind.height), "cx": kind.width / 2}
         | {"cy": kind.height / 2, "w": kind.width, "h": kind.height}
@@ -244,22 +256,30 @@ def _write_erp_dataset(
     for f, (world_T_rig, c) in enumerate(
         zip(reconstruction.world_T_rigs, frames.cameras.tolist(), strict=True)
     ):
-        (image,), masks = files.images(frames, f), files.masks(frames, f)
+        (image,), hidden = files.images(frames, f), _mask_paths(files, frames, f)
         entry = _entry(image, out_R_world, world_T_rig)
         if len(shapes) > 1:
             entry |= shapes[c]
-        if masks:
-            entry["mask_path"] = masks[0]
+        if hidden:
+            entry["mask_path"] = hidden[0]
         entries.append([entry])
     path = partial / f"transforms{which}.json"
     _write_transforms(path, camera, entries, out_R_world, reconstruction, split)
     return panorama_writer(files, frames, cameras, link, scenes_of(reconstruction))
 
 
-def _files(partial: Path, views: Sequence[str], masked: bool) -> Files:
+def _files(
+    partial: Path, views: Sequence[str], frames: FrameSet, masked: bool, style: MaskStyle
+) -> Files:
     """Files of images and masks with unique base names."""
     mask = "masks/{name}_{view}.png" if masked else ""
-    return Files(partial, views, "images/{name}_{view}{suffix}", mask)
+    names = base_names(padded_names(frames.names))
+    return Files(partial, views, "images/{name}_{view}{suffix}", mask, style, names)
+
+
+def _mask_paths(files: Files, frames: FrameSet, f: int) -> list[str]:
+    """Paths of a frame's masks; [] = there are none with 0 for pixels to ignore."""
+    return files.masks(frames, f) if files.style.hidden == 0 else []
 
 
 def _intrinsics(view: View) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from pathlib import Path
 from gsba.camera.cameras import Cameras
 from gsba.camera.views import scenes_of
 from gsba.export.images import has_masks, panorama_writer
+from gsba.export.masks import MASK_FILES, MaskStyle
 from gsba.export.pictures import Files, FrameWriter
 from gsba.trajectory.files import write_tum
 from gsba.types import FrameSet, Reconstruction, Trajectory
@@ -27,6 +28,7 @@ def write_with_poses(
     frames: FrameSet,
     cameras: Cameras,
     link: bool = False,
+    masks: MaskStyle = MASK_FILES,
 ) -> FrameWriter:
     """Write `trajectory.tum` and `images/timestamps.csv`, one for each recording, into `partial`;
     returns the writer of the images and masks."""
@@ -40,5 +42,5 @@ def write_with_poses(
             names = (frames.names[f].rpartition("/")[2] for f in rows)
             writer.writerows(zip(names, map(float, frames.timestamps[rows]), strict=True))
     mask = "masks/{name}.png" if has_masks(frames) else ""
-    files = Files(partial, ("",), "images/{name}{suffix}", mask)
+    files = Files(partial, ("",), "images/{name}{suffix}", mask, masks)
     return panorama_writer(files, frames, cameras, link, scenes_of(reconstruction))

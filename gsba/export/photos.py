@@ -1,8 +1,10 @@
 """Localised photos in datasets, as cameras of their own beside the faces of panoramas.
 
-COLMAP's `RADIAL` camera is the one of photos: focal length, principal point, two radial terms.
-Photos are `images/photos/NAME`, in flat layouts and nerfstudio's `images/photo_NAME`; they have
-poses but no observations of points. All are for training: none is held out.
+COLMAP's `RADIAL` camera is the one of photos: focal length, principal point, two radial terms. For
+programs that cannot read it photos are undistorted, and their camera is `PINHOLE`.
+Photos are `images/photos/NAME`, in flat layouts and nerfstudio's `images/photo_NAME`, with a number
+before it where readers hold images out by their order; they have poses but no observations of
+points. They are for training, but for those that such readers hold out (`gsba.export.split`).
 """
 
 import json
@@ -15,6 +17,8 @@ from typing import Any
 import numpy as np
 
 from gsba.disk import disk_errors, write_image
+from gsba.export.colmap import write_in_order
+from gsba.export.split import TRAIN_LIST, add_images
 from gsba.frames.files import decode, goes_out_as_it_is, image_size
 from gsba.geometry import CV_R_GL, inverse
 from gsba.log import GsbaError
@@ -105,7 +109,14 @@ def _photo(entry: dict[str, Any]) -> PlacedPhoto:
     return PlacedPhoto(name, Path(typed(entry["file"], str)), pose, camera)
 
 
-def add_photos(partial: Path, to: str, photos: Photos, placement: Placement) -> None:
+def add_photos(
+    partial: Path,
+    to: str,
+    photos: Photos,
+    placement: Placement,
+    undistort: bool = False,
+    masked: bool = False,
+) -> None:
     """Add photos to a dataset that is being written.
 
     Args:
@@ -113,59 +124,128 @@ def add_photos(partial: Path, to: str, photos: Photos, placement: Placement) -> 
         to: its format, one of FITTING.
         photos: in the run's world.
         placement: of the exported world.
+        undistort: write photos of pinhole cameras.
+        masked: write masks that hide nothing: nerfstudio wants one of each image, or none.
+
+    Raises:
+        GsbaError: two photos would have one name, or one cannot be read.
     """
     move = placement.similarity
     poses = move.poses(np.array([photo.world_T_camera for photo in photos.photos]))
+    pattern = "images/photos/{}{}" if to == "colmap" else "images/photo_{}{}"
+    names = [pattern.format(photo.name, _suffix(photo)) for photo in photos.photos]
+    for n, name in enumerate(names):
+        if name in names[:n]:
+            first, second = (photos.photos[k].path for k in (names.index(name), n))
+            raise GsbaError(
+                f"{first} and {second} would both be {name}: rename one, localise again"
+            )
     if to == "nerfstudio":
-        names = _copied(partial, photos.photos, "images/photo_{name}{suffix}")
-        _add_to_nerfstudio(partial / "transforms.json", photos, poses, names)
+        _write_photos(partial, photos, names, undistort=False)
+        masks = _write_masks(partial, photos, names) if masked else ()
+        _add_to_nerfstudio(partial / "transforms.json", photos, poses, names, masks)
         return
-    flat = to == "colmap-flat"
-    pattern = "images/photo_{name}{suffix}" if flat else "images/photos/{name}{suffix}"
-    names = _copied(partial, photos.photos, pattern)
-    shown = [name.removeprefix("images/") for name in names]
-    _add_to_colmap(partial / "sparse" / "0", photos, poses, shown)
+    import pycolmap
+
+    model = pycolmap.Reconstruction(str(partial / "sparse" / "0"))
+    last = max(model.images, default=0)
+    numbers = list(range(last, last + len(names)))
+    if (partial / TRAIN_LIST).is_file():
+        taken = [number - 1 for number in model.images]
+        numbered = add_images(partial, taken, [name.removeprefix("images/") for name in names])
+        names, numbers = [f"images/{name}" for name in numbered], list(numbered.values())
+    _write_photos(partial, photos, names, undistort)
+    if masked and to == "colmap-flat":
+        _write_masks(partial, photos, names)
+    _add_to_colmap(model, photos, poses, names, numbers, undistort)
+    write_in_order(model, partial / "sparse" / "0")
 
 
-def _copied(partial: Path, photos: Sequence[PlacedPhoto], pattern: str) -> list[str]:
-    """Write the photos, upright and in eight bits; their paths within the dataset."""
-    names = []
-    for photo in photos:
-        suffix = ".png" if photo.path.suffix.lower() == ".png" else ".jpg"
-        name = pattern.format(name=photo.name, suffix=suffix)
-        target = partial / name
+def _suffix(photo: PlacedPhoto) -> str:
+    return ".png" if photo.path.suffix.lower() == ".png" else ".jpg"
+
+
+def _write_photos(partial: Path, photos: Photos, names: Sequence[str], undistort: bool) -> None:
+    """Write the photos to paths in the dataset, upright and in eight bits."""
+    for photo, name in zip(photos.photos, names, strict=True):
+        target, camera = partial / name, photos.cameras[photo.camera]
         with disk_errors(target):
             target.parent.mkdir(parents=True, exist_ok=True)
-            if goes_out_as_it_is(photo.path, target):
+            if undistort:
+                image = decode(photo.path, image_size(photo.path))
+                write_image(target, _undistorted(image, camera))
+            elif goes_out_as_it_is(photo.path, target):
                 shutil.copyfile(photo.path, target)
             else:
                 write_image(target, decode(photo.path, image_size(photo.path)))
-        names.append(name)
-    return names
 
 
-def _add_to_colmap(folder: Path, photos: Photos, poses: np.ndarray, names: Sequence[str]) -> None:
+def _write_masks(partial: Path, photos: Photos, names: Sequence[str]) -> list[str]:
+    """Write masks that hide nothing; returns their paths in the dataset."""
+    masks = [name.replace("images/", "masks/", 1).rpartition(".")[0] + ".png" for name in names]
+    for photo, mask in zip(photos.photos, masks, strict=True):
+        camera = photos.cameras[photo.camera]
+        write_image(partial / mask, np.full((camera.height, camera.width), 255, np.uint8))
+    return masks
+
+
+def _opencv(camera: PhotoCamera) -> tuple[np.ndarray, np.ndarray]:
+    """Matrix (3, 3) and distortion (4,) in OpenCV, where centres of pixels are integers."""
+    cx, cy = np.array(camera.principal) - 0.5
+    matrix = np.array([[camera.focal, 0, cx], [0, camera.focal, cy], [0, 0, 1]])
+    return matrix, np.array([*camera.radial, 0.0, 0.0])
+
+
+def _pinhole(camera: PhotoCamera) -> np.ndarray:
+    """Matrix (3, 3) in OpenCV of the pinhole camera whose pixels all lie within the photo."""
+    import cv2
+
+    size = camera.width, camera.height
+    return cv2.getOptimalNewCameraMatrix(*_opencv(camera), size, alpha=0)[0]
+
+
+def _undistorted(image: np.ndarray, camera: PhotoCamera) -> np.ndarray:
+    import cv2
+
+    return cv2.undistort(image, *_opencv(camera), newCameraMatrix=_pinhole(camera))
+
+
+def _add_to_colmap(
+    model,
+    photos: Photos,
+    poses: np.ndarray,
+    names: Sequence[str],
+    numbers: Sequence[int],
+    undistort: bool,
+) -> None:
     import pycolmap
 
-    model = pycolmap.Reconstruction(str(folder))
     first = max(model.cameras, default=0) + 1
     for c, camera in enumerate(photos.cameras):
-        params = (camera.focal, *camera.principal, *camera.radial)
+        kind, params = "RADIAL", (camera.focal, *camera.principal, *camera.radial)
+        if undistort:
+            matrix = _pinhole(camera)
+            principal = matrix[:2, 2] + 0.5
+            kind, params = "PINHOLE", (matrix[0, 0], matrix[1, 1], *principal)
         size = {"width": camera.width, "height": camera.height}
         model.add_camera_with_trivial_rig(
-            pycolmap.Camera(model="RADIAL", params=params, camera_id=first + c, **size)
+            pycolmap.Camera(model=kind, params=params, camera_id=first + c, **size)
         )
-    number = max(model.images, default=0) + 1
-    for n, (photo, pose, name) in enumerate(zip(photos.photos, poses, names, strict=True)):
+    for photo, pose, name, number in zip(photos.photos, poses, names, numbers, strict=True):
         camera_T_world = inverse(pose)
         rotation = pycolmap.Rotation3d(camera_T_world[:3, :3])
-        image = pycolmap.Image(name=name, camera_id=first + photo.camera, image_id=number + n)
+        image = pycolmap.Image(
+            name=name.removeprefix("images/"),
+            camera_id=first + photo.camera,
+            image_id=number + 1,
+        )
         rigid = pycolmap.Rigid3d(rotation, camera_T_world[:3, 3])
         model.add_image_with_trivial_frame(image, rigid)
-    model.write_binary(str(folder))
 
 
-def _add_to_nerfstudio(path: Path, photos: Photos, poses: np.ndarray, names: Sequence[str]) -> None:
+def _add_to_nerfstudio(
+    path: Path, photos: Photos, poses: np.ndarray, names: Sequence[str], masks: Sequence[str]
+) -> None:
     document = json.loads(path.read_text(encoding="utf-8"))
     # Readers apply intrinsics above the frames to all frames: each gets its own.
     common = {key: document.pop(key) for key in _INTRINSICS if key in document}
@@ -186,5 +266,7 @@ def _add_to_nerfstudio(path: Path, photos: Photos, poses: np.ndarray, names: Seq
                 **{"k1": k1, "k2": k2, "p1": 0.0, "p2": 0.0},
             }
         )
+    for entry, mask in zip(frames[len(frames) - len(masks) :], masks, strict=True):
+        entry["mask_path"] = mask
     document["train_filenames"] = [*document["train_filenames"], *names]
     path.write_text(json.dumps(document | {"frames": frames}, indent=1) + "\n", encoding="utf-8")

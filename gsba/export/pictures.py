@@ -1,9 +1,18 @@
-"""Images of a frame for all datasets of an export: each is read, cut and encoded once."""
+"""Images of a frame for all datasets of an export: each is read, cut and encoded once.
 
+Images that are exported unchanged are copies. Copies share blocks with the original on file systems
+that can (reflinks), so that an export may be moved and edited. On request they are hard links: then
+an edit of one is an edit of the other.
+"""
+
+import fcntl
+import os
+import shutil
 import threading
 from collections import Counter
-from collections.abc import Callable, Hashable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import NoneType
 from typing import Any
@@ -11,13 +20,17 @@ from typing import Any
 import numpy as np
 
 from gsba.camera.straighten import PAD
-from gsba.disk import encoded_image, write_bytes
+from gsba.disk import atomic_write, encoded_image, write_bytes
+from gsba.export.masks import MASK_FILES, MaskStyle
 from gsba.frames.buffers import Buffers
+from gsba.frames.files import goes_out_as_it_is
 from gsba.frames.masks import load_mask
 from gsba.frames.pixels import load_padded
+from gsba.log import GsbaError
 from gsba.store.shards import even_blocks
 from gsba.types import FrameSet
 
+_FICLONE = 0x40049409  # ioctl of Linux that clones a file; both share blocks until one is written
 _EXPORTED_SUFFIX = {".insp": ".jpg", ".webp": ".jpg", ".tif": ".png", ".tiff": ".png"}
 
 
@@ -32,7 +45,17 @@ class Files:
     folder: Path  # folder of the dataset, absolute
     views: Sequence[str]  # views of a frame; one "" if the pattern has no view
     image: str  # pattern of the images' paths in the folder
-    mask: str  # pattern of the masks' paths (PNG, 0 = ignore, 255 = use); "" = there are none
+    mask: str  # pattern of the masks' paths (PNG, by default 0 = ignore, 255 = use); "" = there
+    # are none
+    style: MaskStyle = MASK_FILES
+    names: Mapping[str, str] = field(
+        default_factory=dict
+    )  # by frame name, where images have others
+
+    @property
+    def paints(self) -> bool:
+        """True if images are painted where masks hide them."""
+        return bool(self.mask) and self.style.paints
 
     def images(self, frames: FrameSet, f: int) -> list[str]:
         """Paths of a frame's images in the folder, by view."""
@@ -40,6 +63,8 @@ class Files:
 
     def masks(self, frames: FrameSet, f: int) -> list[str]:
         """Paths of a frame's masks in the folder, by view; [] = there are none."""
+        if self.mask and self.style.path:
+            return list(map(self.style.path_beside, self.images(frames, f)))
         return self._filled(self.mask, frames, f) if self.mask else []
 
     def make_folders(self, frames: FrameSet) -> None:
@@ -49,15 +74,18 @@ class Files:
         for parent in {Path(path).parent for path in files}:
             (self.folder / parent).mkdir(parents=True, exist_ok=True)
 
+    def known(self, frames: FrameSet, f: int) -> dict[str, str]:
+        """Name of a frame's images, and their suffix: that of the input, or one that holds the
+        image and that all programs read."""
+        suffix, name = frames.paths[f][0].suffix, frames.names[f]
+        suffix = _EXPORTED_SUFFIX.get(suffix.lower(), suffix)
+        if self.paints and self.style.paint == "alpha":
+            suffix = ".png"
+        return {"name": self.names.get(name, name), "suffix": suffix}
+
     def _filled(self, pattern: str, frames: FrameSet, f: int) -> list[str]:
-        known = {"name": frames.names[f], "suffix": suffix_of(frames, f)}
+        known = self.known(frames, f)
         return [pattern.format(view=view, **known) for view in self.views]
-
-
-def suffix_of(frames: FrameSet, f: int) -> str:
-    """Suffix of a frame's exported images: that of the input, or one that all programs read."""
-    suffix = frames.paths[f][0].suffix
-    return _EXPORTED_SUFFIX.get(suffix.lower(), suffix)
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +113,40 @@ class FrameWriter:
     def masks(self, shown: "Shown") -> list[Path]:
         """Files of the frame's masks; [] = there are none."""
         return [self.files.folder / name for name in self.files.masks(shown.frames, shown.f)]
+
+    def write(
+        self,
+        shown: "Shown",
+        key: Hashable,
+        images: Callable[[], Iterable[np.ndarray]],
+        masks: Callable[[], Iterable[np.ndarray]],
+        masks_differ: bool = False,
+        originals: Sequence[Path] = (),
+        link: bool = False,
+    ) -> None:
+        """Write a frame's images, painted where masks hide them if wanted, and its masks.
+
+        Args:
+            shown: the frame.
+            key: of these images, one for all datasets that have the same.
+            images: makes the images (h, w, 3) uint8 RGB, by view.
+            masks: makes the masks (h, w) bool, True = use, by view.
+            masks_differ: masks depend on the frame beyond its mask file.
+            originals: files with the same pixels, by view, to be copied if readers understand
+                them; () = there are none.
+            link: make hard links instead of copies.
+        """
+        paths, hidden, style = self.images(shown), self.masks(shown), self.files.style
+        if self.files.paints:
+            painted = style.paint, masks_differ
+            shown.write((key, painted), paths, lambda: map(style.painted, images(), masks()))
+        elif originals and all(map(goes_out_as_it_is, originals, paths)):
+            for source, path in zip(originals, paths, strict=True):
+                _pass_on(source, path, link)
+        else:
+            shown.write(key, paths, images)
+        if hidden:
+            shown.write_masks(key, hidden, masks, style, masks_differ)
 
     def wrote(self, shown: "Shown") -> bool:
         """True if an interrupted export has written all files of this frame."""
@@ -225,21 +287,47 @@ class Shown:
             write_bytes(path, content, parents=False)
 
     def write_masks(
-        self, key: Hashable, paths: Sequence[Path], make: Callable[[], Iterable[np.ndarray]]
+        self,
+        key: Hashable,
+        paths: Sequence[Path],
+        make: Callable[[], Iterable[np.ndarray]],
+        style: MaskStyle,
+        differ: bool,
     ) -> None:
-        """Write masks (h, w) bool that depend only on the frame's mask file and on the key."""
+        """Write masks (h, w) bool that depend only on the key, and on the frame's mask file or, if
+        they differ, on the frame."""
+
+        def drawn() -> Iterable[np.ndarray]:
+            return map(style.drawn, make())
 
         def encode() -> list[bytes]:
-            pairs = zip(make(), paths, strict=True)
-            return [encoded_image(part.astype(np.uint8) * 255, path) for part, path in pairs]
+            return list(map(encoded_image, drawn(), paths))
 
-        key = "mask", key, self.frames.mask_paths[self.f]
-        if self._pictures.same_mask(self.f):
+        key = "mask", key, style.hidden, self.frames.mask_paths[self.f]
+        if self._pictures.same_mask(self.f) and not differ:
             _write(paths, self._pictures.masks(key, encode))
         else:
-            self.write(key, paths, lambda: (part.astype(np.uint8) * 255 for part in make()))
+            self.write(key, paths, drawn)
 
 
 def _write(paths: Sequence[Path], contents: Sequence[bytes]) -> None:
     for path, content in zip(paths, contents, strict=True):
         write_bytes(path, content, parents=False)
+
+
+def _pass_on(source: Path, path: Path, link: bool) -> None:
+    """Copy `source` to `path`, sharing its blocks on disk if the file system can."""
+    if not source.is_file():
+        raise GsbaError(f"{source} is missing; it existed when the run began: restore it")
+    atomic_write(path, lambda temporary: _copy(source, temporary, link), parents=False)
+
+
+def _copy(source: Path, path: Path, link: bool) -> None:
+    if link:
+        with suppress(OSError):  # another file system
+            os.link(source.resolve(), path)
+            return
+    with suppress(OSError), source.open("rb") as original, path.open("wb") as clone:
+        fcntl.ioctl(clone, _FICLONE, original.fileno())
+        return
+    shutil.copyfile(source, path)

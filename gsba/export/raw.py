@@ -7,10 +7,8 @@ import numpy as np
 from gsba.camera.fisheye import Rig, rotation_of, unproject
 from gsba.camera.sphere import erp_from_bearings
 from gsba.camera.tables import table
-from gsba.export.images import pass_on
 from gsba.export.pictures import FrameWriter, Shown
 from gsba.frames.dual_fisheye import load_raw
-from gsba.frames.files import goes_out_as_it_is
 from gsba.log import GsbaError
 from gsba.types import Fisheye, PictureFormat
 
@@ -40,13 +38,8 @@ class RawPictures(FrameWriter):
     link: bool = False  # make hard links instead of copies
 
     def __call__(self, shown: Shown) -> None:
-        f, frames, paths = shown.f, shown.frames, self.images(shown)
-        sources = frames.paths[f]
-        if sources[0] != sources[1] and all(map(goes_out_as_it_is, sources, paths)):
-            for source, path in zip(sources, paths, strict=True):
-                pass_on(source, path, self.link)
-        else:
-            shown.write("raw", paths, lambda: load_raw(frames, f))
+        f, frames = shown.f, shown.frames
+        two = frames.paths[f][0] != frames.paths[f][1]
 
         def used() -> list[np.ndarray]:
             size = shown.kind.width, shown.kind.height
@@ -55,7 +48,9 @@ class RawPictures(FrameWriter):
                 return [seen for seen, _ in circles]
             return [seen & shown.mask.ravel()[places] for seen, places in circles]
 
-        shown.write_masks("raw", self.masks(shown), used)
+        originals = frames.paths[f] if two else ()
+        given = shown, "raw", lambda: load_raw(frames, f), used
+        self.write(*given, originals=originals, link=self.link)
 
 
 @table(maxsize=4)

@@ -1,30 +1,35 @@
 """Images of a dataset in an order by which its reader holds out whole panoramas.
 
-Trainers that read COLMAP models hold out every eighth image: INRIA's (`--eval`), gsplat, LichtFeld
-and Brush (`--eval`, `--eval-split-every 8`) in the order of names, 3DGRUT and nerfstudio's COLMAP
-parser in the order of the model. A face whose siblings are trained on tells nothing, as all faces
-of a panorama share their centre. Here images are numbered so that both orders agree and every
-eighth one is a face of a held-out panorama; faces of held-out panoramas beyond those are left out.
+Trainers that read COLMAP models hold out every eighth image: INRIA's (`--eval`), gsplat, 3DGRUT and
+Brush (`--eval-split-every 8`) in the order of names, nerfstudio's COLMAP parser in that of numbers,
+LichtFeld (`--eval`) as they come in the file. A face whose siblings are trained on tells nothing,
+as all faces of a panorama share their centre. Here images are numbered so that all orders agree and
+every eighth one is a face of a held-out panorama; faces of held-out panoramas beyond those are left
+out.
 Readers of lists (`train_list.txt`, `val_list.txt`, `test_list.txt` of nerfstudio's COLMAP parser,
 `sparse/0/test.txt` of forks of INRIA's) get the same split.
 """
 
 import logging
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import count, islice
 from pathlib import Path
 
 import numpy as np
 
-from gsba.export.pictures import Files, suffix_of
+from gsba.export.pictures import Files
 from gsba.frames.held_out import HOLD_OUT_EVERY, held_out_rows
+from gsba.log import GsbaError
 from gsba.types import FrameSet, PoseStatus, Reconstruction
 
 logger = logging.getLogger(__name__)
 
 LEFT_OUT = "left_out"  # folder of faces of held-out panoramas that no reader may see
 _MIN_TRAINING = 2  # panoramas
-_MIN_DIGITS = 5  # of an image's place in its name
+MIN_DIGITS = 5  # of an image's place in its name
+TRAIN_LIST = "train_list.txt"  # names of images for training, if there is a split
+_TEST_LISTS = ("val_list.txt", "test_list.txt", "sparse/0/test.txt")  # and of those held out
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,17 +43,16 @@ class Split:
     def files(self, plain: Files, frames: FrameSet) -> Files:
         """Files of the same images, in folders without others, under names in this order."""
         places = dict(zip(frames.names, self.numbers, strict=True))
-        given = plain.folder, plain.views, plain.image, plain.mask
-        digits = max(_MIN_DIGITS, len(str(max(map(max, self.numbers)))))
+        given = plain.folder, plain.views, plain.image, plain.mask, plain.style, plain.names
+        digits = max(MIN_DIGITS, len(str(max(map(max, self.numbers)))))
         return _OrderedFiles(*given, places=places, digits=digits)
 
-    def write_lists(self, folder: Path, names: Sequence[Sequence[str]], model: Path) -> None:
+    def write_lists(self, folder: Path, names: Sequence[Sequence[str]]) -> None:
         """Write the lists that some readers hold images out by.
 
         Args:
-            folder: of the dataset.
+            folder: of the dataset, with the model's.
             names: (F, views) of the images, in the model.
-            model: folder of the model.
         """
         every = [
             (number, name, held)
@@ -58,20 +62,23 @@ class Split:
         ]
         training = "".join(f"{name}\n" for _, name, held in sorted(every) if not held)
         test = "".join(f"{name}\n" for _, name, held in sorted(every) if held)
-        (model / "test.txt").write_text(test)
-        (folder / "train_list.txt").write_text(training)
-        for name in ("val_list.txt", "test_list.txt"):
-            (folder / name).write_text(test)
+        (folder / TRAIN_LIST).write_text(training)
+        for path in _TEST_LISTS:
+            (folder / path).write_text(test)
 
 
-def split_of(reconstruction: Reconstruction, num_views: Sequence[int]) -> Split | None:
+def split_of(
+    reconstruction: Reconstruction, num_views: Sequence[int], num_photos: int = 0
+) -> Split | None:
     """Split of a dataset by whole panoramas; None = too few are left to train on.
 
     Args:
         reconstruction: poses of the frames; unrefined ones are not held out.
         num_views: (F,) images of each frame.
+        num_photos: images that come later and take free numbers, see `add_images`.
     """
-    held_out = _held_out(reconstruction.pose_statuses == PoseStatus.REFINED, np.array(num_views))
+    usable = reconstruction.pose_statuses == PoseStatus.REFINED
+    held_out = _held_out(usable, np.array(num_views))
     if held_out is None:
         logger.warning(
             "too few panoramas to hold one of %d out: all images are for training", HOLD_OUT_EVERY
@@ -80,7 +87,8 @@ def split_of(reconstruction: Reconstruction, num_views: Sequence[int]) -> Split 
     images = [(view, f) for f, num in enumerate(num_views) for view in range(num)]
     training = sorted((f, view) for view, f in images if not held_out[f])
     # The first views of all held-out frames: what is left out is below or above the camera.
-    test = sorted(image for image in images if held_out[image[1]])[: _num_test(len(training))]
+    num_test = _num_test(len(training) + num_photos)
+    test = sorted(image for image in images if held_out[image[1]])[:num_test]
     numbers = [[-1] * num for num in num_views]
     for place, (f, view) in enumerate(sorted((f, view) for view, f in test)):
         numbers[f][view] = HOLD_OUT_EVERY * place
@@ -89,11 +97,49 @@ def split_of(reconstruction: Reconstruction, num_views: Sequence[int]) -> Split 
     return Split(held_out, tuple(map(tuple, numbers)))
 
 
+def require_held_out(reconstruction: Reconstruction) -> None:
+    """Refuse a split that leaves too few panoramas to train on.
+
+    Raises:
+        GsbaError: it does.
+    """
+    if not held_out_frames(reconstruction).any():
+        num = np.count_nonzero(reconstruction.pose_statuses == PoseStatus.REFINED)
+        raise GsbaError(
+            f"--split: {num} refined panoramas are too few to hold one out and train on "
+            f"{_MIN_TRAINING}: use --no-split"
+        )
+
+
 def held_out_frames(reconstruction: Reconstruction) -> np.ndarray:
     """Frames (F,) bool to hold out, where all faces of each can be."""
     usable = reconstruction.pose_statuses == PoseStatus.REFINED
     enough = np.count_nonzero(usable) > _MIN_TRAINING
     return _spread(usable) if enough else np.zeros(len(usable), bool)
+
+
+def add_images(folder: Path, taken: Collection[int], names: Sequence[str]) -> dict[str, int]:
+    """Number images that belong to no panorama, and add them to the lists of a split.
+
+    They are for training, but for those whose number readers hold out.
+
+    Args:
+        folder: of the dataset, whose lists `Split.write_lists` wrote.
+        taken: numbers of the other images.
+        names: of the images, in the model.
+
+    Returns:
+        Number of each image by its name, which begins with it.
+    """
+    known = set(taken)
+    free = islice((n for n in count() if n not in known), len(names))
+    numbers = {f"{n:0{MIN_DIGITS}d}_{name}": n for n, name in zip(free, names, strict=True)}
+    for path in (TRAIN_LIST, *_TEST_LISTS):
+        held_out = path != TRAIN_LIST
+        with (folder / path).open("a", encoding="utf-8") as file:
+            own = [name for name, n in numbers.items() if (n % HOLD_OUT_EVERY == 0) == held_out]
+            file.writelines(f"{name}\n" for name in own)
+    return numbers
 
 
 def _held_out(usable: np.ndarray, num_views: np.ndarray) -> np.ndarray | None:
@@ -123,12 +169,13 @@ def _num_test(num_training: int) -> int:
 class _OrderedFiles(Files):
     """Files whose names begin with their place in an order."""
 
-    places: Mapping[str, Sequence[int]]  # by frame name and view, see `Split.numbers`
-    digits: int  # of a place
+    places: Mapping[str, Sequence[int]] = field(default_factory=dict)  # by frame name and view, see
+    # `Split.numbers`
+    digits: int = MIN_DIGITS  # of a place
 
     def _filled(self, pattern: str, frames: FrameSet, f: int) -> list[str]:
         folder, _, name = pattern.partition("/")
-        known = {"name": frames.names[f].replace("/", "_"), "suffix": suffix_of(frames, f)}
+        known = self.known(frames, f)
         return [
             f"{folder}/{number:0{self.digits}d}_{name.format(view=view, **known)}"
             if number >= 0

@@ -33,13 +33,14 @@ class NamedPoses:
     world_T_rigs: np.ndarray  # (N, 4, 4) float64, chunk units
 
     def timed(self, frames: FrameSet) -> Trajectory:
-        """The poses of the frames with these names, at the frames' times.
+        """The poses of the frames with these names, with `_` for folders, at the frames' times.
 
         Raises:
             GsbaError: fewer than two frames have a pose.
         """
         rows = {name: row for row, name in enumerate(self.names)}
-        known = [(f, rows[name]) for f, name in enumerate(frames.names) if name in rows]
+        named = [name if name in rows else name.replace("/", "_") for name in frames.names]
+        known = [(f, rows[name]) for f, name in enumerate(named) if name in rows]
         if len(known) < 2:
             raise GsbaError(
                 f"{self.path}: {len(known)} of {len(self.names)} cameras are frames of this run: "

@@ -4,6 +4,7 @@ import json
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import cv2
 import numpy as np
@@ -21,6 +22,7 @@ from export_scene import (
 )
 from scipy.spatial.transform import Rotation, Slerp
 
+from gsba.cli.results import Target
 from gsba.disk import read_vertices
 from gsba.export import ExportFormat, Shutter, export
 from gsba.export.trainers import PROGRAMS, format_of, how_to_start
@@ -251,11 +253,17 @@ def test_each_program_reads_the_format_that_its_name_gives(name: str, tmp_path: 
         assert (out / "scene.glb").is_file()
 
 
-def test_programs_that_read_no_masks_are_named(tmp_path: Path) -> None:
-    (tmp_path / "masks").mkdir()
-    silent = [name for name in PROGRAMS if len(how_to_start(name, tmp_path)) == 1]
-    assert silent == ["postshot", "brush", "lichtfeld", "nerfstudio", "3dgs-deblur", "blender"]
-    assert how_to_start("gsplat", tmp_path)[1].startswith("gsplat reads no masks")
+def test_programs_hold_out_only_what_an_export_holds_out(tmp_path: Path) -> None:
+    assert [line.count("--eval") for line in how_to_start("inria", tmp_path)] == [0]
+    (tmp_path / "test_list.txt").write_text("")
+    assert [line.count("--eval") for line in how_to_start("inria", tmp_path)] == [1]
+
+
+def test_programs_are_listed_in_help_and_docs() -> None:
+    listed = " ".join((get_args(Target)[1].help or "").split())
+    page = (Path(__file__).parents[2] / "docs/exports.md").read_text()
+    for name in PROGRAMS:
+        assert name in listed and f"`gsba export RUN --to {name}" in page, name
 
 
 def test_unknown_names_are_refused() -> None:

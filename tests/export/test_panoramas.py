@@ -27,6 +27,7 @@ from gsba.camera.fisheye import project, unproject
 from gsba.camera.lens import Lenses, rows_run
 from gsba.disk import write_image
 from gsba.export import ExportFormat, Shutter, colmap, export
+from gsba.export.masks import MaskStyle
 from gsba.geometry import inverse, pose
 from gsba.log import GsbaError
 from gsba.trajectory.files import read_trajectory
@@ -254,3 +255,17 @@ def test_colmap_holds_nothing_beyond_a_right_angle_of_a_lens(tmp_path: Path) -> 
     sensors = colmap._raw_sensors(frames.formats[0], RAW)
     which, _ = colmap._project_raw(sensors, bearings_rig, np.tile(RAW.centres[0], (2, 1)))
     assert which.tolist() == [0, -1]
+
+
+def test_raw_lenses_are_painted_where_masks_hide(tmp_path: Path) -> None:
+    frames, to, masks = (
+        _raw_frames(tmp_path / "frames"),
+        ExportFormat.NERFSTUDIO,
+        MaskStyle("alpha"),
+    )
+    export(_scene(RAW), frames, tmp_path / "out", to, lenses=RAW, images="fisheye", masks=masks)
+    entry = json.loads((tmp_path / "out/transforms.json").read_text())["frames"][0]
+    shown = cv2.imread(str(tmp_path / "out" / entry["file_path"]), cv2.IMREAD_UNCHANGED)
+    assert shown is not None
+    np.testing.assert_array_equal(shown[..., 3], _image(tmp_path / "out" / entry["mask_path"]))
+    assert (shown[0, 0] == 0).all() and shown[120, 120, 3] == 255

@@ -1,6 +1,7 @@
 """Localised photos in datasets, read back: poses, cameras, pictures, and lists that are refused."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -10,8 +11,9 @@ import pytest
 from export_scene import NUM_FRAMES, POINTS, panoramas, reconstruction
 
 from gsba.camera.projections import PerspectiveProjection
-from gsba.export import ExportFormat, export
+from gsba.export import ExportFormat, ExportOptions, export, export_all
 from gsba.export.photos import read_photos
+from gsba.export.trainers import options_for
 from gsba.geometry import pose
 from gsba.log import GsbaError
 from gsba.placement.placement import Placement
@@ -57,7 +59,8 @@ def test_colmap_has_photos_as_cameras_of_their_own(
 ) -> None:
     photos = read_photos(located, tmp_path / "run")
     frames, out = panoramas(tmp_path / "frames"), tmp_path / "out"
-    export(reconstruction(), frames, out, to, placement=Placement(MOVE), photos=photos)
+    given = reconstruction(), frames, out, to
+    export(*given, placement=Placement(MOVE), photos=photos, split=False)
     model = pycolmap.Reconstruction(str(out / "sparse/0"))
     assert model.num_reg_frames() == NUM_FRAMES + 2
     assert model.num_points3D() == len(POINTS)
@@ -72,6 +75,74 @@ def test_colmap_has_photos_as_cameras_of_their_own(
         local = ahead - [0.1 * n, 0.2, -1.0]
         seen = image.project_point(MOVE.points(ahead)[0])
         np.testing.assert_allclose(seen, CAMERA.project(local)[0], atol=1e-9)
+
+
+@pytest.mark.parametrize("num", [2, 60])
+def test_photos_are_in_the_order_by_which_readers_hold_images_out(
+    num: int, located: Path, tmp_path: Path
+) -> None:
+    photos, out = read_photos(located, tmp_path / "run"), tmp_path / "out"
+    more = (replace(photos.photos[0], name=f"shot{n}") for n in range(num))
+    photos = replace(photos, photos=tuple(more))
+    frames = panoramas(tmp_path / "frames")
+    export(reconstruction(), frames, out, ExportFormat.COLMAP_FLAT, face_size=16, photos=photos)
+    images = pycolmap.Reconstruction(out / "sparse/0").images
+    by_name = sorted(image.name for image in images.values())
+    assert by_name == [images[number].name for number in sorted(images)]
+    assert sum("photo_shot" in name for name in by_name) == num
+    assert (out / "test_list.txt").read_text().split() == by_name[::8]
+    training = [name for n, name in enumerate(by_name) if n % 8]
+    assert sorted((out / "train_list.txt").read_text().split()) == training
+    held = {name.split("_")[2] for name in by_name[::8] if "photo" not in name}
+    assert held and not held & {name.split("_")[2] for name in training}
+    assert all((out / "images" / name).is_file() for name in by_name)
+
+
+def test_photos_are_undistorted_for_programs_that_read_pinholes(
+    located: Path, tmp_path: Path
+) -> None:
+    """A line through the distorted photo is where the pinhole camera has the same rays."""
+    columns, rows = np.meshgrid(np.arange(64) + 0.5, np.arange(48) + 0.5)
+    ramp = np.dstack([4 * columns, 5 * rows, np.full_like(rows, 90)]).astype(np.uint8)
+    cv2.imwrite(str(tmp_path / "shot0.jpg"), ramp, [cv2.IMWRITE_JPEG_QUALITY, 100])
+    photos, out = read_photos(located, tmp_path / "run"), tmp_path / "out"
+    frames, options = panoramas(tmp_path / "frames"), ExportOptions(face_size=16, photos=photos)
+    options = replace(options_for("opensplat", options), split=False)
+    export_all(reconstruction(), frames, {ExportFormat.COLMAP_FLAT: out}, options)
+    model = pycolmap.Reconstruction(out / "sparse/0")
+    assert {camera.model.name for camera in model.cameras.values()} == {"PINHOLE"}
+    (shot,) = (image for image in model.images.values() if image.name == "photo_shot0.jpg")
+    image = cv2.imread(str(out / "images/photo_shot0.jpg"))
+    assert image is not None
+    for pixel in ([8, 8], [56, 8], [30, 40], [8, 40]):
+        ray = np.append(shot.camera.cam_from_img(np.array(pixel) + 0.5), 1.0)
+        seen = CAMERA.project(ray[None])[0]
+        np.testing.assert_allclose(image[pixel[1], pixel[0], :2] / [4, 5], seen, atol=0.6)
+
+
+@pytest.mark.parametrize("to", [ExportFormat.COLMAP_FLAT, ExportFormat.NERFSTUDIO])
+def test_photos_have_masks_where_all_images_must_have_one(
+    to: ExportFormat, located: Path, tmp_path: Path
+) -> None:
+    photos, out = read_photos(located, tmp_path / "run"), tmp_path / "out"
+    frames = panoramas(tmp_path / "frames", masked=True)
+    export(reconstruction(), frames, out, to, face_size=16, photos=photos)
+    images = {path.stem for path in (out / "images").iterdir()}
+    assert images == {path.stem for path in (out / "masks").iterdir()}
+    (mask,) = (out / "masks").glob("*photo_shot0.png")
+    assert (cv2.imread(str(mask), cv2.IMREAD_UNCHANGED) == np.full((48, 64), 255)).all()
+    if to == ExportFormat.NERFSTUDIO:
+        entries = json.loads((out / "transforms.json").read_text())["frames"]
+        assert all((out / entry["mask_path"]).is_file() for entry in entries)
+
+
+def test_photos_that_would_overwrite_one_another_are_refused(located: Path, tmp_path: Path) -> None:
+    photos = read_photos(located, tmp_path / "run")
+    twice = replace(photos, photos=(photos.photos[0], replace(photos.photos[1], name="shot0")))
+    given = reconstruction(), panoramas(tmp_path / "frames"), tmp_path / "out"
+    with pytest.raises(GsbaError, match=r"shot0.jpg and .*shot1.jpg would both be images/photo_sh"):
+        export(*given, ExportFormat.COLMAP_FLAT, face_size=16, photos=twice)
+    assert not (tmp_path / "out").exists()
 
 
 def test_nerfstudio_has_intrinsics_of_each_frame(located: Path, tmp_path: Path) -> None:
