@@ -22,7 +22,7 @@ class ExtractorTraits:
 TRAITS = {
     "sift": ExtractorTraits(0.8, 0.9),
     "aliked": ExtractorTraits(0.55, 0.95, 0.28, (-0.35, 0.1)),
-    "disk": ExtractorTraits(0.55, 0.95, 0.28),
+    "disk": ExtractorTraits(0.55, 0.95, 0.37, (-0.45, -0.35)),
     "xfeat": ExtractorTraits(0.78, 0.97, 0.42, (-0.1, 1.05)),
     "superpoint": ExtractorTraits(0.8, 0.9, 0.5),  # not measured
 }

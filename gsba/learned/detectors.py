@@ -6,7 +6,7 @@ import kornia.feature  # pyright: ignore[reportMissingImports]
 import numpy as np
 import torch  # pyright: ignore[reportMissingImports]
 
-from gsba.learned.device import device
+from gsba.learned.device import device, inference
 from gsba.learned.interfaces import Detector
 from gsba.learned.weights import load_into, read_state
 
@@ -28,19 +28,15 @@ def aliked(weights: Path, num: int) -> Detector:
     """ALIKED (Zhao et al., TIM 2023), with subpixel keypoints; N(16), N(16) trained with rotations,
     N(32) or T(16), as the weights are."""
     state = read_state(weights)
-    aggregation = getattr(state.get("desc_head.agg_weights"), "shape", None)
-    name = _ALIKED_MODELS.get(tuple(aggregation[1::-1]) if aggregation else (), "aliked-n16")
+    samples, channels = getattr(state.get("desc_head.agg_weights"), "shape", (16, 128, 128))[:2]
+    name = _ALIKED_MODELS.get((channels, samples), "aliked-n16")
     model = kornia.feature.ALIKED(name, max_num_keypoints=num)
     model = load_into(model, state, "aliked", weights)
 
     def detect(image: np.ndarray) -> tuple[np.ndarray, ...]:
-        with torch.inference_mode():
+        with inference():
             found = model(to_tensor(image))[0]
-        return (
-            found.keypoints.cpu().numpy(),
-            found.keypoint_scores.cpu().numpy(),
-            found.descriptors.cpu().numpy(),
-        )
+        return _arrays(found.keypoints, found.keypoint_scores, found.descriptors)
 
     return detect
 
@@ -51,13 +47,9 @@ def disk(weights: Path, num: int) -> Detector:
     model = load_into(kornia.feature.DISK(), state.get("extractor", state), "disk", weights)
 
     def detect(image: np.ndarray) -> tuple[np.ndarray, ...]:
-        with torch.inference_mode():
+        with inference():
             found = model(to_tensor(image), n=num)[0]
-        return (
-            found.keypoints.cpu().numpy(),
-            found.detection_scores.cpu().numpy(),
-            found.descriptors.cpu().numpy(),
-        )
+        return _arrays(found.keypoints, found.detection_scores, found.descriptors)
 
     return detect
 
@@ -68,12 +60,8 @@ def xfeat(weights: Path, num: int) -> Detector:
     load_into(model.net, read_state(weights), "xfeat", weights)
 
     def detect(image: np.ndarray) -> tuple[np.ndarray, ...]:
-        with torch.inference_mode():
+        with inference():
             found = model.detectAndCompute(to_tensor(image))[0]
-        return (
-            found["keypoints"].cpu().numpy(),
-            found["scores"].cpu().numpy(),
-            found["descriptors"].cpu().numpy(),
-        )
+        return _arrays(found["keypoints"], found["scores"], found["descriptors"])
 
     return detect

@@ -8,7 +8,7 @@ import numpy as np
 import torch  # pyright: ignore[reportMissingImports]
 
 from gsba.features.detection import FaceKeypoints
-from gsba.learned.device import device
+from gsba.learned.device import device, inference
 from gsba.learned.weights import load_into, read_state
 
 _MIN_SCORE = 0.1  # published value
@@ -51,7 +51,7 @@ class LightGlue:
         self, first: FaceKeypoints, second: FaceKeypoints, size: int
     ) -> tuple[np.ndarray, np.ndarray]:
         """Matches (m, 2) of keypoints of two faces of `size` pixels, and their scores (m,)."""
-        with torch.inference_mode():
+        with inference():
             found = self._model({"image0": _image(first, size), "image1": _image(second, size)})
         return found["matches"][0].cpu().numpy(), found["scores"][0].cpu().numpy()
 

@@ -19,7 +19,7 @@ from transformers import (  # pyright: ignore[reportMissingImports]
 )
 
 from gsba.features.detection import FaceKeypoints
-from gsba.learned.device import device
+from gsba.learned.device import device, inference
 from gsba.learned.interfaces import Detector
 from gsba.learned.weights import load_into, read_state
 
@@ -41,7 +41,7 @@ def superpoint(weights: Path, num: int) -> Detector:
 
     def detect(image: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) / 255
-        with torch.inference_mode():
+        with inference():
             found = model(pixel_values=torch.from_numpy(grey)[None, None].to(device()))
         keypoints, scores, descriptors = (
             values[0].cpu().numpy() for values in (found.keypoints, found.scores, found.descriptors)
@@ -86,7 +86,7 @@ class SuperGlue:
         n0, n1 = len(first.pixels), len(second.pixels)
         mask = torch.zeros((1, 2, max(n0, n1)), dtype=torch.int)
         mask[0, 0, :n0] = mask[0, 1, :n1] = 1
-        with torch.inference_mode():
+        with inference():
             matches, scores = self._model._match_image_pair(
                 _together(first.pixels - 0.5, second.pixels - 0.5),
                 _together(first.descriptors, second.descriptors),
