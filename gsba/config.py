@@ -23,6 +23,7 @@ class ReadSettings(_Settings):
     max_interpolation_s: float = Field(
         default=10.0, gt=0
     )  # poses in longer gaps are interpolated, too, and reported
+    trajectory_format: _Text | None = None  # convention of trajectories, see `--trajectory-format`
     clock_offset_s: float | None = None  # s to add to frame times; None = clocks agree or one fits
     clock: Literal["auto", "given"] = "auto"  # auto: an offset is estimated from the camera's
     # rotation, and applied where it is certain
@@ -109,8 +110,8 @@ class MatchingSettings(_Settings):
 
     matcher: Literal["guided", "lightglue", "superglue"] = "guided"
     weights: _Text | None = None  # of a learned matcher: file, or folder with the official file
-    min_similarity: float = Field(default=0.8, ge=-1, le=1)  # cosine of both descriptors
-    max_ratio: float = Field(default=0.9, gt=0, le=1)  # ratio test: best over second-best distance
+    min_similarity: Annotated[float, Field(ge=-1, le=1)] | None = None  # cosine of descriptors
+    max_ratio: Annotated[float, Field(gt=0, le=1)] | None = None  # ratio test; None = by extractor
 
 
 class GateSettings(_Settings):

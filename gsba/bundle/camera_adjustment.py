@@ -21,6 +21,7 @@ from gsba.bundle.camera_variables import CameraUnknowns
 from gsba.bundle.stitching import with_noise_of
 from gsba.types import Keypoints, Sighted, Solution, Tracks
 
+_MAX_REPEATS = 8  # of a round; three to six settle it
 _SCALE_SIGMA = 1e-3  # of each map's extent about its former one: images leave the scale open, and
 # priors of zero on frames' own motion would shrink the map
 
@@ -91,7 +92,11 @@ def solve_with_camera(
     """
     wide, last = _split(gates)
     view = CameraView.of(shown, cameras, timestamps)
-    found, view = adjust_through(view, tracks, start, context, wide, final)
+
+    def adjust_once(so_far: Solution, seen: CameraView, gate: float) -> tuple[Solution, CameraView]:
+        return adjust_through(seen, tracks, so_far, context, (gate,), final)
+
+    found, view = _settled(start, view, wide, adjust_once)
     solved = adjust(tracks, view.keypoints, found, context, last, final)
     return replace(solved, rounds=found.rounds + solved.rounds), view.cameras
 
@@ -114,11 +119,37 @@ def solve_sighted_with_camera(
     """
     wide, last = _split(gates)
     view = CameraView.of(sighted.keypoints, cameras, timestamps)
-    found, view = adjust_sighted_through(view, sighted, before, context, wide)
+
+    def adjust_once(so_far: Solution, seen: CameraView, gate: float) -> tuple[Solution, CameraView]:
+        return adjust_sighted_through(seen, sighted, so_far, context, (gate,))
+
+    found, view = _settled(before, view, wide, adjust_once)
     seen = replace(sighted, keypoints=view.keypoints)
     solved, keypoints = adjust_sighted(seen, found, context, last)
     solved = replace(solved, rounds=found.rounds + solved.rounds)
     return solved, view.with_noise_of(keypoints).shown, view.cameras
+
+
+def _settled(
+    start: Solution,
+    view: CameraView,
+    gates: Sequence[float],
+    adjust_once: Callable[[Solution, CameraView, float], tuple[Solution, CameraView]],
+) -> tuple[Solution, CameraView]:
+    """Solve for the camera under each gate until it takes in what it was solved with.
+
+    Few observations, of near points that both lenses see, tell how far apart the lenses are. Under
+    a wrong distance the gate leaves them out, and what is left confirms it.
+    """
+    solved, rounds = start, ()
+    for gate in gates:
+        for _ in range(_MAX_REPEATS):
+            solved, view = adjust_once(solved, view, gate)
+            rounds += solved.rounds
+            last = solved.rounds[-1]
+            if not last.accepted or last.support == last.observations:
+                break
+    return replace(solved, rounds=rounds), view
 
 
 def _split(gates: Sequence[float]) -> tuple[Sequence[float], Sequence[float]]:

@@ -122,6 +122,15 @@ Keyframes = Annotated[
     Path | None,
     typer.Option(help="Keyframe trajectory of the same SLAM run.", metavar="FILE"),
 ]
+TrajectoryFormat = Annotated[
+    str | None,
+    typer.Option(
+        help="Convention of the trajectory, where it is not x right, y down, z forward with "
+        "quaternions x, y, z, w: wxyz, camera-from-world, ways of the camera's x, y and z as "
+        "forward-left-up; several with commas between.",
+        metavar="WORDS",
+    ),
+]
 Masks = Annotated[
     list[Path] | None,
     typer.Option(
@@ -196,6 +205,7 @@ def refine(
     out: Out = None,
     recording: Recordings = None,
     keyframes: Keyframes = None,
+    trajectory_format: TrajectoryFormat = None,
     no_trajectory: NoTrajectory = False,
     config: Config = None,
     overrides: Overrides = None,
@@ -232,6 +242,8 @@ def refine(
     if keyframes is not None and not (trajectory or several):
         raise GsbaError("--keyframes needs the TRAJECTORY of the same SLAM run: pass that, too")
     overrides = [*_networks(weights, accept_noncommercial, download), *(overrides or ())]
+    if trajectory_format is not None:
+        overrides = [*overrides, f"read.trajectory_format={json.dumps(trajectory_format)}"]
     settings = settings_of(config, *_with_sensors(overrides, factors, camera, gps))
     shared: dict[str, Any] = {"odometry": False if no_trajectory else None, "fps": fps}
     shared |= {"masks": masks or "auto", "calibration": calibration}

@@ -66,6 +66,13 @@ GpsSigma = Annotated[
         help="With --gps: smallest horizontal sigma of a fix in metres; default: 3.", metavar="M"
     ),
 ]
+GpsOffset = Annotated[
+    float | None,
+    typer.Option(
+        help="With --gps: seconds to add to the file's times to reach the frames' clock.",
+        metavar="SECONDS",
+    ),
+]
 AlignScan = Annotated[
     str | None,
     typer.Option(
@@ -167,6 +174,7 @@ def export(
     between: Between = None,
     gps: Gps = None,
     gps_sigma: GpsSigma = None,
+    gps_offset: GpsOffset = None,
     align: Align = None,
     align_scan: AlignScan = None,
     pairs: Pairs = None,
@@ -201,7 +209,7 @@ def export(
     lenses = cameras_of(run, reconstruction, frames, images, map_number)
     folder = out or run / (name if map_number == 1 else f"{name}-map{map_number}")
     known = _baseline(run, baseline) if scale == "lens" else None
-    noise = _gps_noise(run, gps_sigma) if gps is not None else None
+    noise = _gps_settings(run, gps_sigma, gps_offset) if gps is not None else None
     placed = replace(place(reconstruction, frames, settings, known, noise), map_number=map_number)
     options = replace(options, placement=placed, lenses=lenses, photos=read_photos(photos, run))
     options = replace(options, shutter=shutter_of(run, exposure_ms), split=split, depths=depths)
@@ -254,17 +262,17 @@ def _baseline(run: Path, millimetres: float | None) -> tuple[float, float] | Non
     return validated({"camera": {"baseline_mm": millimetres}}).camera.baseline()
 
 
-def _gps_noise(run: Path, sigma: float | None) -> "GpsSettings":
-    """GPS noise of the run's settings; `sigma` (metres) scales its horizontal and vertical part."""
+def _gps_settings(run: Path, sigma: float | None, offset_s: float | None) -> "GpsSettings":
+    """GPS settings of the run; `sigma` (metres) scales their horizontal and vertical noise."""
     from gsba.config_file import load_config, validated
 
-    known = load_config(run / "config.toml").gps.model_copy(update={"file": None})
-    if sigma is None:
-        return known
-    up = sigma * known.sigma_up_m / known.sigma_m
-    changed = known.model_dump() | {"sigma_m": sigma, "sigma_up_m": up}
-    gps = {"gps": {key: value for key, value in changed.items() if value is not None}}
-    return validated(gps).gps
+    known = load_config(run / "config.toml").gps
+    changed = known.model_dump(exclude_none=True, exclude={"file"})
+    if sigma is not None:
+        changed |= {"sigma_m": sigma, "sigma_up_m": sigma * known.sigma_up_m / known.sigma_m}
+    if offset_s is not None:
+        changed["offset_s"] = offset_s
+    return validated({"gps": changed}).gps
 
 
 def _length(text: str | None) -> float | str | None:

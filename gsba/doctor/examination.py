@@ -146,7 +146,8 @@ def _conclusions(answers: dict[str, Any]) -> tuple[list[str], str]:
             remedy = "pip install --force-reinstall --only-binary av av"
     if "weights" in answers:
         at_hand = ", ".join(answers["weights"])
-        notes.append(f"weights of {at_hand}" if at_hand else "no weights yet: see --download")
+        advice = "no weights yet: see docs/learned.md"
+        notes.append(f"weights of {at_hand}" if at_hand else advice)
     if "torch_cuda" in answers:
         note, remedy = _gpu_note(answers)
         notes.append(note)

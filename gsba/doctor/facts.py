@@ -39,10 +39,10 @@ def splat() -> dict[str, Any]:
 
 
 def learned() -> dict[str, Any]:
-    """Networks whose weights are in the caches."""
-    from gsba.learned.weights import cached_weights
+    """Networks whose weights are at hand, with their licences."""
+    from gsba.learned.weights import SOURCES, weights_at_hand
 
-    return {"weights": sorted(cached_weights())}
+    return {"weights": [f"{key} ({SOURCES[key].licence})" for key in sorted(weights_at_hand())]}
 
 
 def scan() -> dict[str, Any]:

@@ -15,7 +15,8 @@ from packaging import requirements as requirements_of
 
 NEEDED = ""  # in place of an extra: packages that every run needs
 _MODULES = {"opencv-python-headless": "cv2", "pillow": "PIL", "pyyaml": "yaml"}
-_NOT_EXAMINED = ("all", "docs", "test", "dev")  # unions of others, and extras for developers
+# Unions of others, extras for developers, and files of weights, whose modules are not imported.
+_NOT_EXAMINED = ("all", "docs", "test", "dev", "weights")
 
 
 @dataclass(frozen=True, slots=True)

@@ -36,6 +36,7 @@ from gsba.log import GsbaError, track
 from gsba.types import FACES, FrameSet, PictureFormat
 from gsba.types.records import spread_rows
 
+MAX_ROUNDING = 0.02  # of the width by which encoders miss 2:1
 _log = logging.getLogger(__name__)
 
 MIN_FRAMES = 3
@@ -121,7 +122,8 @@ def _factory_lenses(
 
 def _check_number(folder: Path, num: int, least: int) -> None:
     if num < least:
-        raise GsbaError(f"{folder}: {num} frames; at least {least} are needed")
+        frames = "1 frame" if num == 1 else f"{num} frames"
+        raise GsbaError(f"{folder}: {frames}; at least {least} are needed")
 
 
 def _check_times(timestamps: Path | None, fps: float | None) -> None:
@@ -465,6 +467,8 @@ def _no_panorama(path: Path, header: Header, more: str = "") -> GsbaError:
     turned = header.swapped and h == 2 * w
     why = f" as its EXIF orientation {header.orientation} shows it" if turned else ""
     what = ": remove that tag" if turned else more
+    if abs(w - 2 * h) <= MAX_ROUNDING * w:
+        what = f", and this is nearly so: if it is a whole panorama, scale it to {w}x{w // 2}"
     return GsbaError(f"{path}: is {w}x{h}{why}; an equirectangular frame is 2:1{what}")
 
 

@@ -8,10 +8,10 @@ import numpy as np
 
 from gsba.config import FeatureSettings
 from gsba.features.detection import Extractor, FaceKeypoints, SiftExtractor
+from gsba.features.extractor_traits import TRAITS
 from gsba.learned.interfaces import Detector
 from gsba.learned.weights import missing_library
 
-SIGMA_PX = 0.5  # per-axis noise of all keypoints; only equal weights matter
 _SIZE_MULTIPLE_PX = 32  # of network inputs, which are halved several times
 
 
@@ -41,7 +41,7 @@ class LearnedExtractor:
     """
 
     def __init__(self, settings: FeatureSettings, weights: Path) -> None:
-        self._most = settings.max_per_face
+        self._most, self._traits = settings.max_per_face, TRAITS[settings.extractor]
         self._detect = _load(settings.extractor, weights, settings.max_per_face)
 
     def __call__(self, face_rgb: np.ndarray, mask: np.ndarray | None) -> FaceKeypoints:
@@ -50,6 +50,7 @@ class LearnedExtractor:
         padded = np.pad(face_rgb, ((0, side - size), (0, side - size), (0, 0)), mode="edge")
         centred, scores, descriptors = self._detect(padded)
         pixels = centred.astype(np.float64).reshape(-1, 2) + 0.5  # corner origin
+        pixels += self._traits.offset_px
         allowed = (pixels >= 0).all(axis=1) & (pixels < size).all(axis=1)
         columns, rows = np.minimum(np.maximum(pixels, 0), size - 1).astype(int).T
         if mask is not None:
@@ -58,7 +59,7 @@ class LearnedExtractor:
         kept = kept[np.argsort(-scores[kept], kind="stable")][: self._most]
         return FaceKeypoints(
             pixels[kept],
-            np.full(len(kept), SIGMA_PX),
+            np.full(len(kept), self._traits.sigma_px),
             descriptors[kept].astype(np.float32),
             scores[kept].astype(np.float32),
         )

@@ -10,7 +10,7 @@ from gsba.features.detection import FaceKeypoints
 class Detector(Protocol):
     """Network that detects and describes keypoints on one image."""
 
-    def __call__(self, image: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def __call__(self, image: np.ndarray) -> tuple[np.ndarray, ...]:
         """Keypoints of an image (N, N, 3) uint8, N a multiple of 32.
 
         Returns:

@@ -1,5 +1,6 @@
 """LightGlue (Lindenberger et al., ICCV 2023) by kornia, on stored keypoints."""
 
+import re
 from pathlib import Path
 
 import kornia.feature  # pyright: ignore[reportMissingImports]
@@ -7,9 +8,11 @@ import numpy as np
 import torch  # pyright: ignore[reportMissingImports]
 
 from gsba.features.detection import FaceKeypoints
+from gsba.learned.device import device, inference
 from gsba.learned.weights import load_into, read_state
 
 _MIN_SCORE = 0.1  # published value
+_UNUSED = re.compile(r"log_assignment\.\d+\.r")  # tensors of disk_lightglue.pth that nothing reads
 
 
 class LightGlue:
@@ -37,23 +40,27 @@ class LightGlue:
                     for name, value in state.items()
                 }
         parts = {name for name, _ in model.named_children()} | {"confidence_thresholds"}
-        state = {name: v for name, v in state.items() if name.partition(".")[0] in parts}
+        state = {
+            name: value
+            for name, value in state.items()
+            if name.partition(".")[0] in parts and not _UNUSED.fullmatch(name)
+        }
         self._model = load_into(model, state, f"{extractor}-lightglue", weights)
 
     def __call__(
         self, first: FaceKeypoints, second: FaceKeypoints, size: int
     ) -> tuple[np.ndarray, np.ndarray]:
         """Matches (m, 2) of keypoints of two faces of `size` pixels, and their scores (m,)."""
-        with torch.inference_mode():
+        with inference():
             found = self._model({"image0": _image(first, size), "image1": _image(second, size)})
-        return found["matches"][0].numpy(), found["scores"][0].numpy()
+        return found["matches"][0].cpu().numpy(), found["scores"][0].cpu().numpy()
 
 
 def _image(face: FaceKeypoints, size: int) -> dict[str, torch.Tensor]:
     """Input of LightGlue for a face, with pixels from the centre of the first."""
     pixels = np.clip(face.pixels - 0.5, 0, size - 1).astype(np.float32)
     return {
-        "keypoints": torch.from_numpy(pixels)[None],
-        "descriptors": torch.from_numpy(face.descriptors)[None],
-        "image_size": torch.tensor([[size, size]]),
+        "keypoints": torch.from_numpy(pixels)[None].to(device()),
+        "descriptors": torch.from_numpy(face.descriptors)[None].to(device()),
+        "image_size": torch.tensor([[size, size]], device=device()),
     }

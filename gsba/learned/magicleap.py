@@ -19,6 +19,7 @@ from transformers import (  # pyright: ignore[reportMissingImports]
 )
 
 from gsba.features.detection import FaceKeypoints
+from gsba.learned.device import device, inference
 from gsba.learned.interfaces import Detector
 from gsba.learned.weights import load_into, read_state
 
@@ -40,10 +41,12 @@ def superpoint(weights: Path, num: int) -> Detector:
 
     def detect(image: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) / 255
-        with torch.inference_mode():
-            found = model(pixel_values=torch.from_numpy(grey)[None, None])
-        pixels = np.rint(found.keypoints[0].numpy() * image.shape[0])  # relative to the size
-        return pixels, found.scores[0].numpy(), found.descriptors[0].numpy()
+        with inference():
+            found = model(pixel_values=torch.from_numpy(grey)[None, None].to(device()))
+        keypoints, scores, descriptors = (
+            values[0].cpu().numpy() for values in (found.keypoints, found.scores, found.descriptors)
+        )
+        return np.rint(keypoints * image.shape[0]), scores, descriptors  # relative to the size
 
     return detect
 
@@ -83,18 +86,18 @@ class SuperGlue:
         n0, n1 = len(first.pixels), len(second.pixels)
         mask = torch.zeros((1, 2, max(n0, n1)), dtype=torch.int)
         mask[0, 0, :n0] = mask[0, 1, :n1] = 1
-        with torch.inference_mode():
+        with inference():
             matches, scores = self._model._match_image_pair(
                 _together(first.pixels - 0.5, second.pixels - 0.5),
                 _together(first.descriptors, second.descriptors),
                 _together(_scores(first), _scores(second)),
                 size,
                 size,
-                mask=mask,
+                mask=mask.to(device()),
             )[:2]
-        partners = matches[0, 0, :n0].numpy()
+        partners = matches[0, 0, :n0].cpu().numpy()
         rows = np.flatnonzero((partners >= 0) & (partners < n1))
-        return np.column_stack([rows, partners[rows]]), scores[0, 0].numpy()[rows]
+        return np.column_stack([rows, partners[rows]]), scores[0, 0].cpu().numpy()[rows]
 
 
 def _scores(face: FaceKeypoints) -> np.ndarray:
@@ -107,7 +110,7 @@ def _together(first: np.ndarray, second: np.ndarray) -> torch.Tensor:
     longest = max(len(first), len(second))
     both = np.zeros((1, 2, longest, *first.shape[1:]), np.float32)
     both[0, 0, : len(first)], both[0, 1, : len(second)] = first, second
-    return torch.from_numpy(both)
+    return torch.from_numpy(both).to(device())
 
 
 def _superglue_tensor(name: str, value: Any) -> tuple[str, Any]:

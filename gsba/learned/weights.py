@@ -1,8 +1,9 @@
 """Weights of learned networks: files, authors, licences, and search paths.
 
-They are searched at the path of the settings (a file, or a folder that holds the file under its
-official name), then in the download caches of torch and Hugging Face. They are downloaded only if
-the settings allow it. Weights for non-commercial use are used only if that licence is accepted.
+They are searched at the path of the settings (a file, a folder that holds the file under an
+official name, or such a name), then in the download caches of torch and Hugging Face, then in the
+packages of the extra `weights`. They are downloaded only if the settings allow it. Weights for
+non-commercial use are used only if that licence is accepted.
 """
 
 import logging
@@ -16,6 +17,7 @@ from typing import Any
 
 from gsba.config import RefineSettings
 from gsba.disk import atomic_write
+from gsba.learned.weight_packages import install_command, packaged
 from gsba.log import GsbaError
 
 logger = logging.getLogger(__name__)
@@ -56,7 +58,7 @@ def _lightglue(extractor: str) -> Source:
 SOURCES = {
     "aliked": Source(
         "ALIKED",
-        ("aliked-n16.pth",),
+        ("aliked-n16.pth", "aliked-n16rot.pth", "aliked-n32.pth", "aliked-t16.pth"),
         "BSD-3-Clause",
         "https://github.com/Shiaoming/ALIKED (models/)",
         (
@@ -67,7 +69,7 @@ SOURCES = {
     ),
     "disk": Source(
         "DISK",
-        ("depth-save.pth",),
+        ("depth-save.pth", "disk-depth-save.pth"),
         "Apache-2.0",
         "https://github.com/cvlab-epfl/disk",
         (
@@ -156,38 +158,49 @@ def _check_licence(source: Source, accepted: bool) -> None:
 
 def _find(source: Source, given: str | None, setting: str, download: bool) -> Path:
     advice = f"get {source.files[0]} ({source.licence}) from {source.place}"
-    folders = [*_torch_cache(), *_hub_cache(source.hub)]
+    folders, names = [*_torch_cache(), *_hub_cache(source.hub)], source.files
     if given is not None:
         path = Path(given).expanduser()
         if path.is_file():
             return path
-        if not path.is_dir():
+        if path.is_dir():
+            folders.insert(0, path)
+        elif given in names:
+            names = (given,)
+        else:
             raise GsbaError(f"{path}: no such weights file; {advice}")
-        folders.insert(0, path)
-    at_hand = _held(source, folders)
+    at_hand = _held(names, folders) or packaged(names)
     if at_hand is not None:
         return at_hand
-    if download:
+    if download and names is source.files:
         return _download(source)
+    command = install_command(names)
+    if given in names:
+        raise GsbaError(f"no {given} at hand: {command}, or pass the path of the file")
     where = f"{given} holds no weights of" if given else "no weights of"
     raise GsbaError(
-        f"{where} {source.network}; {advice} and pass it by --weights ({setting}), "
-        "or pass --download"
+        f"{where} {source.network}; {command and f'{command}, or '}{advice} and pass it by "
+        f"--weights ({setting}), or pass --download"
     )
 
 
-def cached_weights() -> dict[str, Path]:
-    """Files of weights that are in the caches, by key in SOURCES."""
+def weights_at_hand() -> dict[str, Path]:
+    """Files of weights in caches and installed packages, by key in SOURCES.
+
+    Raises:
+        GsbaError: a package's file is incomplete or of another version.
+    """
     found = {
-        key: _held(source, [*_torch_cache(), *_hub_cache(source.hub)])
+        key: _held(source.files, [*_torch_cache(), *_hub_cache(source.hub)])
+        or packaged(source.files)
         for key, source in SOURCES.items()
     }
     return {key: path for key, path in found.items() if path is not None}
 
 
-def _held(source: Source, folders: Iterable[Path]) -> Path | None:
+def _held(names: Iterable[str], folders: Iterable[Path]) -> Path | None:
     """File of weights in the first of several folders that holds one; None = none does."""
-    paths = (folder / name for folder in folders for name in source.files)
+    paths = (folder / name for folder in folders for name in names)
     return next((path for path in paths if path.is_file()), None)
 
 
@@ -281,7 +294,9 @@ def load_into(model: Any, state: dict[str, Any], key: str, path: Path) -> Any:
         usual = SOURCES[key].files[0]
         raise GsbaError(f"{path} holds weights of another network than {key} ({usual})")
     model.load_state_dict({n: v for n, v in state.items() if n in known}, strict=False)
-    return model.eval().requires_grad_(False)
+    from gsba.learned.device import device
+
+    return model.eval().requires_grad_(False).to(device())
 
 
 def missing_library(what: str) -> GsbaError:

@@ -14,6 +14,7 @@ from gsba.camera.rig import CubeRig, owner_faces
 from gsba.camera.sphere import dense_enough
 from gsba.config import RefineSettings
 from gsba.features.detection import extract, gather
+from gsba.features.extractor_traits import search_settings
 from gsba.frames import cubemap
 from gsba.frames.files import image_size
 from gsba.frames.panorama import fitted_to, load_grey
@@ -308,7 +309,7 @@ class Localizer:
 
     def candidates_of(self, query: Query, places: np.ndarray, strongest: bool) -> Candidates:
         """Points of keyframes (N,) that look like keypoints, wherever they are."""
-        chosen = self.map.settings.matching
+        chosen = search_settings(self.map.settings)
 
         def match(place: int) -> np.ndarray:
             keyframe = self.map.load_keyframe(place)
@@ -336,7 +337,7 @@ class Localizer:
         poses, places = self.map.result.world_T_rigs, self.map.nearest(world_T_rig, NUM_NEAREST)
         if recognised is not None:
             places = np.union1d(places, recognised)
-        gate, chosen = Gate.around_points(gate_rad), self.map.settings.matching
+        gate, chosen = Gate.around_points(gate_rad), search_settings(self.map.settings)
 
         def match(place: int) -> np.ndarray:
             keyframe, f0_T_f1 = self.map.load_keyframe(place), inverse(poses[place]) @ world_T_rig

@@ -40,18 +40,32 @@ def find_borders(frames: FrameSet) -> Borders:
         np.maximum(brightest, cv2.resize(grey, everything.shape[::-1]), out=brightest)
         if not (brightest <= _MAX_BLACK_LEVEL).any():
             return Borders(everything, 0.0)
+    found = black_areas(brightest)
+    share = float(found.mean())
+    if not share:
+        return Borders(everything, 0.0)
+    return Borders(~widened(found, _RIM_PX), share)
+
+
+def widened(places: np.ndarray, pixels: int) -> np.ndarray:
+    """Places (h, 2h) bool and those within some pixels of them, over the seam, too."""
+    size, left, right = 2 * pixels + 1, pixels, -pixels
+    around = cv2.copyMakeBorder(places.astype(np.uint8), 0, 0, left, left, cv2.BORDER_WRAP)
+    return cv2.dilate(around, np.ones((size, size), np.uint8))[:, left:right] > 0
+
+
+def black_areas(brightest: np.ndarray) -> np.ndarray:
+    """Large areas (h, 2h) bool of no pixels; none if most of the picture is as dark.
+
+    Args:
+        brightest: (h, 2h) uint8, largest grey level of each pixel in all pictures.
+    """
     black = (brightest <= _MAX_BLACK_LEVEL).astype(np.uint8)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(black, connectivity=4)
     large = stats[:, cv2.CC_STAT_AREA] >= _MIN_SHARE * black.size
     large[0] = False
     found = large[labels.astype(np.intp)] if count > 1 else np.zeros(black.shape, bool)
-    share = float(found.mean())
-    if not 0 < share <= _MAX_SHARE:
-        return Borders(everything, 0.0)
-    size = 2 * _RIM_PX + 1
-    around = cv2.copyMakeBorder(found.astype(np.uint8), 0, 0, _RIM_PX, _RIM_PX, cv2.BORDER_WRAP)
-    wide = cv2.dilate(around, np.ones((size, size), np.uint8))[:, _RIM_PX:-_RIM_PX] > 0
-    return Borders(~wide, share)
+    return found if found.mean() <= _MAX_SHARE else np.zeros_like(found)
 
 
 def padded(frames: FrameSet) -> bool:

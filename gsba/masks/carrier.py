@@ -20,6 +20,7 @@ from gsba.disk import write_image
 from gsba.frames.masks import load_mask
 from gsba.frames.pixels import load_erp
 from gsba.log import GsbaError, track
+from gsba.masks.borders import black_areas, widened
 from gsba.masks.carrier_outline import certain_places, outline_carrier
 from gsba.masks.carrier_turns import band_of, find_turns
 from gsba.masks.fixed_structure import FixedStructure, measure_fixed_structure
@@ -42,7 +43,9 @@ VEHICLE_SHARE = 1 / 3  # share of the picture from which the carrier is a vehicl
 _MIN_TEXTURED_SHARE = 0.02  # share of all directions
 _STRUCTURE_WIDTH_PX, _TURNED_STRUCTURE_WIDTH_PX = 256, 128  # width in pixels of compared pictures:
 # the camera's tilt, which remains when turns are undone, moves the carrier by a pixel of the latter
+_BLACK_RIM_PX = 6  # of structure pictures, within which edges of black areas are compared
 _MIN_TURN_RAD = np.deg2rad(2.0)  # smaller turns are estimation noise
+_ROWS_ABOVE_SHARE = 0.55  # part of the height, from the zenith, where the world is seen
 _MIN_FRAMES_TURNED = 12  # fewer agree by chance once turns are free
 
 
@@ -180,14 +183,21 @@ def _load(frames: FrameSet, f: int) -> np.ndarray:
 
 
 def _measure(pictures: np.ndarray, width: int) -> FixedStructure:
+    """Fixed structure of pictures; rims of areas without pixels, which ride along, have none."""
     size = width, width // 2
     small = [cv2.resize(p, size, interpolation=cv2.INTER_AREA) for p in pictures]
-    return measure_fixed_structure(np.stack(small))
+    found = measure_fixed_structure(np.stack(small))
+    black = black_areas(pictures.max(axis=(0, 3)))
+    if not black.any():
+        return found
+    small = cv2.resize(black.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0
+    scene = ~widened(small, _BLACK_RIM_PX)
+    return FixedStructure(found.strong * scene, found.weak * scene, found.textured & scene)
 
 
 def _measure_turned(pictures: np.ndarray) -> tuple[np.ndarray, FixedStructure] | None:
     """Pictures rotated so that the carrier keeps its direction, and their structure; None = no
-    turns."""
+    turns, or those of the camera itself: the world above the carrier turns likewise."""
     turns = find_turns(np.stack([band_of(picture) for picture in pictures]))
     if np.ptp(turns) < _MIN_TURN_RAD:
         return None
@@ -197,8 +207,18 @@ def _measure_turned(pictures: np.ndarray) -> tuple[np.ndarray, FixedStructure] |
     coarse = _measure(turned, _TURNED_STRUCTURE_WIDTH_PX)
     if not certain_places(coarse).any():
         return None
+    as_taken = _measure(pictures, _TURNED_STRUCTURE_WIDTH_PX)
+    if _steadiness_above(coarse) > _steadiness_above(as_taken):
+        return None
     fine = _measure(turned, _STRUCTURE_WIDTH_PX)
     return turned, fine if certain_places(fine).any() else coarse
+
+
+def _steadiness_above(structure: FixedStructure) -> float:
+    """Mean correlation of the textured directions above the carrier; 0 = there are none."""
+    rows = int(_ROWS_ABOVE_SHARE * len(structure.strong))
+    textured = structure.textured[:rows]
+    return float(structure.strong[:rows][textured].mean()) if textured.any() else 0.0
 
 
 def _check_moving(structure: FixedStructure) -> None:

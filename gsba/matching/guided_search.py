@@ -18,6 +18,7 @@ from gsba.camera.lens import Lenses
 from gsba.camera.rig import cells_of
 from gsba.config import MatchingSettings, RefineSettings
 from gsba.features.extraction import FrameFeatures
+from gsba.features.extractor_traits import search_settings
 from gsba.geometry import inverse
 from gsba.matching._search_kernels import HEAD, Cells, Limits, Rows, passes, search
 from gsba.matching.pairs import by_place
@@ -174,7 +175,8 @@ def within_gate(
 ) -> np.ndarray:
     """True (m,) for matches (m, 2) that `match_pair` would compare under the gate."""
     rotation = f0_T_f1[:3, :3].astype(np.float32)
-    direction, limits = _limits(f0_T_f1, gate, MatchingSettings())
+    any_likeness = MatchingSettings(min_similarity=-1, max_ratio=1)
+    direction, limits = _limits(f0_T_f1, gate, any_likeness)
     return passes(
         first.bearings_rig[pairs[:, 0]].astype(np.float32),
         second.bearings_rig[pairs[:, 1]].astype(np.float32) @ rotation.T,
@@ -189,6 +191,7 @@ def _limits(
     f0_T_f1: np.ndarray, gate: Gate, settings: MatchingSettings
 ) -> tuple[tuple[np.float32, ...], Limits]:
     """Unit vector of the predicted motion, and a gate as the compiled search takes it."""
+    assert settings.min_similarity is not None and settings.max_ratio is not None
     length = np.linalg.norm(f0_T_f1[:3, 3])
     limits = Limits(
         np.float32(gate.rotation_rad),
@@ -360,7 +363,7 @@ class MatchContext:
                 for gate, (_, f1) in zip(gates, pairs, strict=True)
             ]
         frames = self.strongest if strongest else self.frames
-        how = self.settings.matching, self.workers
+        how = search_settings(self.settings), self.workers
         matcher = guided if guided_only else self.matcher
         return match(pairs, world_T_rigs, gates, frames, *how, points_rig, matcher)
 
@@ -382,7 +385,7 @@ def match(
         world_T_rigs: (F, 4, 4) poses that predict the pairs' geometry.
         gates: (P) uncertainty of each prediction.
         frames: features of the frames.
-        settings: thresholds on similarity and distinctiveness.
+        settings: thresholds on similarity and distinctiveness, see `search_settings`.
         workers: threads or processes that run it.
         points_rig: points (K_f, 3) of each frame, see `match_pair`.
         matcher: compares two frames.

@@ -6,6 +6,7 @@ from gsba.bundle.predicted_steps import step_deviations
 from gsba.frames.masks import load_mask
 from gsba.geometry import inverse, step_covariances, unit
 from gsba.log import GsbaError
+from gsba.masks.borders import find_borders
 from gsba.masks.carrier import VEHICLE_SHARE
 from gsba.types import FrameSet, Reconstruction
 
@@ -15,6 +16,10 @@ MAX_STEP_DEVIATION = 0.5  # of a step from the one that far frames predict, part
 # walks deviate by .006 at most, true positions of a turn by hand by .05
 MAX_CONTRADICTED_SHARE = 0.1  # of steps
 MIN_SHARE_AHEAD = 0.8  # of a vehicle's way: a tenth of it may go backwards
+
+
+class NoPositions(GsbaError):
+    """The images determine no positions; they may still show a turn on the spot."""
 
 
 def refuse_vehicle_in_pieces(frames: FrameSet) -> None:
@@ -29,7 +34,7 @@ def refuse_vehicle_in_pieces(frames: FrameSet) -> None:
     Raises:
         GsbaError: a vehicle carries the camera.
     """
-    share = _masked_share(frames)
+    share = masked_scene_share(frames)
     if share >= VEHICLE_SHARE:
         raise GsbaError(
             f"{_riding_along(share)}, and the camera was lost on the way: how its parts lie to one "
@@ -50,10 +55,11 @@ def require_motion(frames: FrameSet, result: Reconstruction) -> None:
         result: what was solved from the images alone.
 
     Raises:
-        GsbaError: the images determine no positions.
+        NoPositions: the images determine no positions, and no vehicle is to blame.
+        GsbaError: a vehicle is.
     """
     main = result.of_map(1)
-    share = _masked_share(frames)
+    share = masked_scene_share(frames)
     where = _riding_along(share)
     if not len(main.points_world):
         if share < VEHICLE_SHARE:
@@ -74,8 +80,10 @@ def require_motion(frames: FrameSet, result: Reconstruction) -> None:
     if not len(sigmas) or np.median(sigmas) >= MIN_STEP_SIGMAS:
         _require_prediction(main)
         return
-    cause = where if share >= VEHICLE_SHARE else "the camera hardly moves, or little matches"
-    raise GsbaError(
+    vehicle = share >= VEHICLE_SHARE
+    cause = where if vehicle else "the camera hardly moves, or little matches"
+    refusal = GsbaError if vehicle else NoPositions
+    raise refusal(
         f"the images determine no positions: the median step is {np.median(sigmas):.1f} standard "
         f"deviations long, and {MIN_STEP_SIGMAS:g} are needed: {cause}; nothing is written: give "
         "sharper frames, other frames per second, or a trajectory"
@@ -86,13 +94,13 @@ def _require_prediction(main: Reconstruction) -> None:
     """Refuse a map whose steps differ from those that frames further away predict.
 
     Raises:
-        GsbaError: more than `MAX_CONTRADICTED_SHARE` of the steps do.
+        NoPositions: more than `MAX_CONTRADICTED_SHARE` of the steps do.
     """
     deviations = step_deviations(main)
     tested = deviations[np.isfinite(deviations)]
     wrong = np.count_nonzero(tested > MAX_STEP_DEVIATION)
     if wrong > MAX_CONTRADICTED_SHARE * len(tested):
-        raise GsbaError(
+        raise NoPositions(
             f"the images determine no positions: {wrong} of {len(tested)} steps differ by more "
             f"than {100 * MAX_STEP_DEVIATION:.0f} % from those that frames further away predict: "
             "the camera hardly moves but turns; nothing is written: give frames of a walk, the "
@@ -131,10 +139,13 @@ def share_ahead(result: Reconstruction) -> float:
     return float(np.linalg.norm(weights @ unit(steps)) / weights.sum())
 
 
-def _masked_share(frames: FrameSet) -> float:
-    """Part of the sphere's panorama that the mask of the first frame leaves out."""
+def masked_scene_share(frames: FrameSet) -> float:
+    """Part of the sphere's panorama that the mask of the first frame leaves out, without areas that
+    have no pixels in any frame."""
     mask = load_mask(frames, 0)
-    return 0.0 if mask is None else 1 - float(np.mean(mask))
+    if mask is None or (share := 1 - float(np.mean(mask))) < VEHICLE_SHARE:
+        return 0.0 if mask is None else share
+    return share - find_borders(frames).share
 
 
 def _riding_along(share: float) -> str:

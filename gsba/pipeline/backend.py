@@ -21,6 +21,7 @@ from gsba.bundle.map_strength import MapStrength
 from gsba.bundle.reconstruction import assemble, world_scale
 from gsba.camera.optics import Optics
 from gsba.camera.views import scenes_around
+from gsba.features.extractor_traits import search_settings
 from gsba.imu.gravity import up_axis
 from gsba.log import GsbaError
 from gsba.loop_closure import connectivity, map_merging
@@ -378,4 +379,6 @@ def _reconstruct_rotations(state: State) -> Reconstruction:
         result = rotation_only.refine(*given)
         return replace(result, origin=_origin(run, result))
 
-    return run.stage("reconstruction", [run.settings.matching, least], compute, Reconstruction)
+    return run.stage(
+        "reconstruction", [search_settings(run.settings), least], compute, Reconstruction
+    )

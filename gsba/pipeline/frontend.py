@@ -25,9 +25,9 @@ from gsba.pipeline.prior import Prior
 from gsba.pipeline.run import Run
 from gsba.pipeline.state import MapMatches, State
 from gsba.store.store import PerFrame
-from gsba.trajectory import judgement, steps
+from gsba.trajectory import judgement, steps, turning
 from gsba.trajectory.clock import ClockEstimate
-from gsba.types import Features, Keypoints, Matches, VerifiedPairs
+from gsba.types import CoarsePoses, Features, Keypoints, Matches, PoseSource, VerifiedPairs
 
 _DARK = 32  # of 255
 
@@ -195,6 +195,36 @@ def judge_trajectory(state: State) -> State:
             )
     prior = replace(prior, coarse=coarse, trust=trust, joints=found.joints)
     return state.begun(prior, near)
+
+
+def prove_turn(state: State) -> State | None:
+    """The state before a map of rotations alone, of a camera whose positions images do not
+    determine; None = that it turned on the spot is not proved either.
+
+    Frames one, two, four, ... apart are matched without any prediction, over the whole sequence: a
+    slow walk adds up to parallax over the widest gaps.
+
+    Args:
+        state: keypoints of all frames, as `extract` gives them.
+    """
+    run, context, num = state.run, state.observed.context, len(state.run.frames)
+    nowhere = np.tile(np.eye(4), (num, 1, 1))
+    absent = CoarsePoses(nowhere, np.full(num, PoseSource.NONE, np.uint8), run.coarse.time_offset)
+
+    def compute() -> Recovered:
+        apart = 2 ** np.arange(max(num - 1, 1).bit_length())
+        chosen = [(f, f + gap) for gap in apart.tolist() for f in range(num - gap)]
+        found = recovery.match_anywhere(context, np.array(chosen, np.int32).reshape(-1, 2))
+        verify = run.settings.verify
+        turn = turning.prove(found, context.keypoints, verify)
+        seen, none = steps.image_steps(found, context.keypoints), np.zeros(0)
+        trust = judgement.check_steps(absent, seen, none, none, verify, run.settings.priors, turn)
+        return Recovered(found, trust, absent)
+
+    found = run.stage("turn", run.matching_key(), compute, Recovered)
+    if not found.trust.turning_only:
+        return None
+    return state.begun(replace(state.prior, coarse=absent, trust=found.trust), found.neighbours)
 
 
 def drop_implausible_steps(state: State) -> State:

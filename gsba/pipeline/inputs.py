@@ -28,6 +28,7 @@ from gsba.pipeline.stage_titles import title_of
 from gsba.placement import EXIF, check, fixes_of_frames, read_fixes
 from gsba.store.store import RunStore, fingerprint
 from gsba.trajectory.association import without_trajectory
+from gsba.trajectory.conventions import Convention
 from gsba.trajectory.files import read_trajectory
 from gsba.trajectory.keyframes import follow_keyframes
 from gsba.trajectory.lost_frames import without_lost_frames
@@ -56,12 +57,14 @@ def trajectory_files(
 
 
 def read_trajectories(
-    origin: Mapping[str, Path], timestamps: Path | None
+    origin: Mapping[str, Path], timestamps: Path | None, convention: Convention
 ) -> list[Trajectory | NamedPoses]:
     """The trajectories of the files of a run, in pieces that each have a world of their own; poses
-    of Metashape's cameras get their times by `timed`."""
+    of Metashape's cameras, whose convention is known, get their times by `timed`."""
     given = [path for name, path in origin.items() if name.startswith("trajectory")]
     if any(map(is_metashape, given)):
+        if convention != Convention():
+            raise GsbaError("--trajectory-format is of text files; that of cameras.xml is known")
         if "keyframes" in origin:
             raise GsbaError("--keyframes goes with a SLAM's trajectory, not with cameras.xml")
         if not all(map(is_metashape, given)):
@@ -72,11 +75,15 @@ def read_trajectories(
                 "were aligned, not a video"
             )
         return [component for path in given for component in read_metashape(path)]
-    pieces = [without_lost_frames(read_trajectory(path, timestamps)) for path in given]
+
+    def read(path: Path) -> Trajectory:
+        return convention.poses(read_trajectory(path, timestamps))
+
+    pieces = [without_lost_frames(read(path)) for path in given]
     if "keyframes" in origin:
-        keyframes = read_trajectory(origin["keyframes"], timestamps)
-        pieces = [follow_keyframes(pieces[0], keyframes)]
-    return [part for piece in pieces for part in split_restarts(piece)]
+        pieces = [follow_keyframes(pieces[0], read(origin["keyframes"]))]
+    # A new map begins at the identity, in the camera axes of the file.
+    return [convention.in_our_axes(part) for piece in pieces for part in split_restarts(piece)]
 
 
 def timed(given: Sequence[Trajectory | NamedPoses], frames: FrameSet) -> list[Trajectory]:

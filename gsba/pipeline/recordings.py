@@ -25,6 +25,7 @@ from gsba.pipeline.stage_titles import title_of
 from gsba.placement import check
 from gsba.store import cluster
 from gsba.store.store import RunStore
+from gsba.trajectory.conventions import Convention
 from gsba.trajectory.metashape import NamedPoses
 from gsba.types import FrameSet, Trajectory
 
@@ -84,10 +85,12 @@ def refine_each(
     Raises:
         GsbaError: as `refine_recordings`, and what `adapt` raises.
     """
-    given = [
-        _Given.of(one, name) for one, name in zip(recordings, names_of(recordings), strict=True)
-    ]
     plain = settings or RefineSettings()
+    convention = Convention.parse(plain.read.trajectory_format)
+    given = [
+        _Given.of(one, name, convention)
+        for one, name in zip(recordings, names_of(recordings), strict=True)
+    ]
     settings = _with_camera(plain, given)
     check(settings.placement, baseline=settings.camera.baseline())
     chosen = _masks(given, segment)
@@ -131,12 +134,12 @@ class _Given:
     followed: bool = False  # True if the trajectory is odometry of its own images
 
     @classmethod
-    def of(cls, recording: Recording, name: str) -> "_Given":
+    def of(cls, recording: Recording, name: str, convention: Convention) -> "_Given":
         """A recording whose trajectory files are read, before any video is decoded."""
         folder = Path(recording.frames)
         poses = inputs.trajectory_files(recording.trajectory, _path(recording.keyframes))
         try:
-            pieces = inputs.read_trajectories(poses, _path(recording.timestamps))
+            pieces = inputs.read_trajectories(poses, _path(recording.timestamps), convention)
         except GsbaError as error:
             raise _named(name, error) from error
         files = {f"{name}: {what}": path for what, path in ({"frames": folder} | poses).items()}

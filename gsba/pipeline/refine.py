@@ -39,7 +39,8 @@ from gsba.placement import check
 from gsba.report.html import add_odometry
 from gsba.store import cluster
 from gsba.store.store import RunStore
-from gsba.types import CoarsePoses, FrameSet
+from gsba.trajectory.conventions import Convention
+from gsba.types import CoarsePoses, FrameSet, Reconstruction
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -99,7 +100,8 @@ def refine(
     check(settings.placement, baseline=settings.camera.baseline())
     chosen, readings = merging.choose(masks, segment), inputs.read_gyro(imu, frames)
     origin = {"frames": frames} | inputs.trajectory_files(trajectory, keyframes)
-    given, walk = inputs.read_trajectories(origin, timestamps), None  # fails before decoding
+    convention, walk = Convention.parse(settings.read.trajectory_format), None
+    given = inputs.read_trajectories(origin, timestamps, convention)  # fails before decoding
     if video.is_video(frames):
         by_odometry = chosen if inputs.follows(settings.video, fps, odometry, given) else None
         walk = inputs.extract_frames(out, origin, settings, fps, fresh, by_odometry, calibration)
@@ -154,16 +156,41 @@ def refine_from(
     compile_ahead("refine")
     if walk is not None:
         start = _with_fetched(store, settings, chosen, given, start, source, walk)
-    state = _solve_raw(_begin(store, settings, chosen, start))
-    result = backend.reconstruct(state)
-    if walk is not None or state.prior.absent:  # the images alone have to show motion
-        acceptance.require_motion(state.run.frames, result)
+    state, result = _solve_or_turn(_begin(store, settings, chosen, start), walk is not None)
     lenses = camera.keep_lenses(state, result)
     finished_run.keep(state)
     written = outputs.write(state, result, lenses)
     if walk is not None:
         add_odometry(written.out / "report.html", walk)
     return written
+
+
+def _solve_or_turn(run: Run, followed: bool) -> tuple[State, Reconstruction]:
+    """The last state and its result; rotations alone where images determine no positions, but prove
+    that the camera turned on the spot.
+
+    Args:
+        run: at its start.
+        followed: True if the trajectory is an odometry of the same images.
+
+    Raises:
+        GsbaError: images that determine neither.
+    """
+    try:
+        state = _solve_raw(run)
+        result = backend.reconstruct(state)
+        if followed or state.prior.absent:  # the images alone have to show motion
+            acceptance.require_motion(run.frames, result)
+        return state, result
+    except acceptance.NoPositions as error:
+        if run.evidence.recordings or not (followed or run.coarse.absent):
+            raise
+        turn = frontend.prove_turn(frontend.extract(run))
+        if turn is None:
+            raise
+        logger.warning("%s", error)
+    logger.warning("most matches agree on rotations, over all gaps: rotations alone are refined")
+    return turn, backend.reconstruct(turn)
 
 
 def _with_fetched(

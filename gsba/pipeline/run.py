@@ -15,6 +15,7 @@ from gsba.bundle.reprojections import Reprojections
 from gsba.bundle.trajectory_prior import TrajectoryPrior
 from gsba.camera.rig import CubeRig
 from gsba.config import CameraSettings, RefineSettings
+from gsba.features.extractor_traits import search_settings
 from gsba.frames import cubemap
 from gsba.frames.panorama import Greys
 from gsba.frames.recordings import own_timestamps
@@ -233,7 +234,7 @@ class Run:
         """Settings that matches rest on."""
         settings = self.matching_settings
         files = fingerprint(path for stage, path in self.weights.items() if stage == "matching")
-        how = settings.matching.model_dump(exclude={"weights"}), files
+        how = search_settings(settings).model_dump(exclude={"weights"}), files
         return [settings.pairs, how, settings.verify, settings.seed]
 
     def solving_key(self) -> list[object]:

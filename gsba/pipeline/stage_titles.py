@@ -23,6 +23,7 @@ _TITLES = {
     "neighbours": "match neighbours",
     "neighbours_on_time": "match neighbours, the clock corrected",
     "clock": "check the trajectory's clock",
+    "turn": "prove a turn on the spot",
     "steps": "check the trajectory's steps",
     "imu": "align the gyro to matches of neighbours",
     "imu_closed": "align the gyro to the map, its loops closed",

@@ -11,6 +11,7 @@ import numpy as np
 
 from factors.threads import map_in_threads
 from gsba.features.extraction import Search
+from gsba.features.extractor_traits import search_settings
 from gsba.geometry import inverse
 from gsba.matching import guided_search
 from gsba.matching.guided_search import Gate, SearchableFrames
@@ -72,7 +73,7 @@ def _matches(run: Run, found: Mapping[str, Features], steps: np.ndarray) -> floa
     def verified(step: int) -> int:
         f0, f1 = steps[step].tolist()
         f0_T_f1 = inverse(poses[f0]) @ poses[f1]
-        rows = guided_search.guided(frames, (f0, f1), f0_T_f1, gate, settings.matching)
+        rows = guided_search.guided(frames, (f0, f1), f0_T_f1, gate, search_settings(settings))
         rays = load(f0).bearings_rig[rows[:, 0]], load(f1).bearings_rig[rows[:, 1]]
         pose = relative_pose(*rays, settings.verify, settings.seed, chance)
         return 0 if pose is None else int(np.count_nonzero(pose.inliers))

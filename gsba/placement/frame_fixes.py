@@ -129,7 +129,8 @@ def _between(
         raise GsbaError(
             f"{source}: no overlap in time: positions span {entries[0]:.3f} to {entries[-1]:.3f} "
             f"s, frames {times[0]:.3f} to {times[-1]:.3f} s; give both on one clock, "
-            "or the seconds to add to the positions' times by --set gps.offset_s=SECONDS"
+            "or the seconds to add to the positions' times (--gps-offset SECONDS; of refine, --set "
+            "gps.offset_s=SECONDS)"
         )
     after = np.clip(np.searchsorted(entries, times[inside]), 1, max(len(entries) - 1, 1))
     after = np.minimum(after, len(entries) - 1)

@@ -1,4 +1,4 @@
-"""Direction of gravity by an accelerometer or the rigs' mean up axis, refined by vertical edges."""
+"""Direction of gravity by an accelerometer, tags or the rigs, refined by vertical edges."""
 
 import logging
 from dataclasses import dataclass
@@ -8,6 +8,7 @@ import numpy as np
 
 from gsba.camera.rig import CubeRig
 from gsba.frames import cubemap
+from gsba.frames.files import image_header
 from gsba.geometry import median_direction
 from gsba.types import FACES, FrameSet, PoseStatus, Reconstruction
 
@@ -22,6 +23,9 @@ _MIN_SPREAD = 0.1  # of the edges' directions around the vertical: 0 = all in on
 _MAX_RIG_ANGLE_DEG = 10.0  # largest angle of the edges' vertical to the rigs' up axis
 _MAX_SPREAD_DEG = 30.0  # of the rigs' up axes; above it, they have no common axis
 _MAX_FORCE_ANGLE_DEG = 2.0  # largest angle of the edges' vertical to the accelerometer's
+_MIN_TAGGED = 3  # frames
+_MAX_TAG_ANGLE_DEG = 4.0  # largest angle of the edges' vertical to that of GPano tags
+_MAX_TAG_SPREAD_DEG = 4.0  # of the up axes by tags; above it, they contradict the poses
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +37,8 @@ class Gravity:
     spread_deg: float  # median angle of a rig's up axis to the common one
     num_edges: int  # number of inlier edges; 0 = up is that of the rigs or the accelerometer
     by_forces: np.ndarray | None = None  # (3,) float64, unit, by an accelerometer; None = none
+    by_tags: np.ndarray | None = None  # (3,) float64, unit, by GPano tags; None = none, or an
+    # accelerometer rode along
 
     @property
     def turn_deg(self) -> float:
@@ -44,7 +50,8 @@ def estimate_gravity(reconstruction: Reconstruction, frames: FrameSet) -> Gravit
     """Direction of up; None if there is no accelerometer and the rigs have no common up axis.
 
     The initial direction is that of an accelerometer, accurate to its bias of some tenths of a
-    degree, else the geometric median of the rigs' up axes, accurate to some degrees. Vertical edges
+    degree, else by pitch and roll in GPano tags, if these agree with the poses, else the geometric
+    median of the rigs' up axes, accurate to some degrees. Vertical edges
     (doors, walls, posts) refine it: the plane through the camera and such an edge holds the
     vertical, so that its normal is level. The refined direction is the smallest principal axis of
     the normals of edges from all around, in tightening gates (after Kosecka and Zhang, Video
@@ -62,7 +69,8 @@ def estimate_gravity(reconstruction: Reconstruction, frames: FrameSet) -> Gravit
     spread = float(np.degrees(np.median(np.arccos(np.clip(ups @ by_rigs, -1, 1)))))
     if forces is not None and forces @ by_rigs < 0 and spread <= _MAX_SPREAD_DEG:
         forces = -forces  # its sign differs between makers
-    if spread > _MAX_SPREAD_DEG and forces is None:
+    tags = _up_by_tags(reconstruction, frames, good, spread) if forces is None else None
+    if spread > _MAX_SPREAD_DEG and forces is None and tags is None:
         logger.warning("the rigs have no common up axis (median deviation %.0f degrees)", spread)
         return None
     chosen = good[np.unique(np.linspace(0, len(good) - 1, _MAX_FRAMES).astype(int))]
@@ -71,13 +79,15 @@ def estimate_gravity(reconstruction: Reconstruction, frames: FrameSet) -> Gravit
     start, most, source = by_rigs, _MAX_RIG_ANGLE_DEG, "the rigs' up axis"
     if forces is not None:
         start, most, source = forces, _MAX_FORCE_ANGLE_DEG, "the accelerometer"
+    elif tags is not None:
+        start, most, source = tags, _MAX_TAG_ANGLE_DEG, "the GPano tags"
     up, num_edges = _level_axis(normals, weights, start)
-    gravity = Gravity(up, by_rigs, spread, num_edges, forces)
+    gravity = Gravity(up, by_rigs, spread, num_edges, forces, tags)
     if (off := _degrees(up, start)) > most:
         logger.warning(
             "vertical edges are not used: they deviate by %.1f degrees from %s", off, source
         )
-        gravity = Gravity(start, by_rigs, spread, 0, forces)
+        gravity = Gravity(start, by_rigs, spread, 0, forces, tags)
     logger.info(
         "up: %d vertical edges, %.2f degrees from the rigs' up axis (median deviation %.2f)",
         gravity.num_edges,
@@ -85,6 +95,44 @@ def estimate_gravity(reconstruction: Reconstruction, frames: FrameSet) -> Gravit
         spread,
     )
     return gravity
+
+
+def _up_by_tags(
+    reconstruction: Reconstruction, frames: FrameSet, good: np.ndarray, spread_deg: float
+) -> np.ndarray | None:
+    """Up axis (3,) by pitch and roll in the GPano tags of frames `good` (G,); None = there are
+    none, or they contradict the poses.
+
+    Signs differ between makers, and some tag a pose that they have already undone: of both signs
+    of each angle those are taken under which the frames' up axes agree best, and better than the
+    rigs' own axes, which deviate by `spread_deg`.
+    """
+    angles = np.radians([_tilt_deg(frames, f) for f in good.tolist()])
+    known = np.isfinite(angles).all(axis=1)
+    if np.count_nonzero(known) < _MIN_TAGGED or not np.ptp(angles[known], axis=0).any():
+        return None
+    (pitch, roll), found = angles[known].T, []
+    for ahead, aside in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+        ups = np.column_stack(
+            [
+                aside * np.sin(roll) * np.cos(pitch),
+                -np.cos(roll) * np.cos(pitch),
+                ahead * np.sin(pitch),
+            ]
+        )
+        ups = np.einsum("gij,gj->gi", reconstruction.world_T_rigs[good[known], :3, :3], ups)
+        up = median_direction(ups)
+        found.append((float(np.degrees(np.median(np.arccos(np.clip(ups @ up, -1, 1))))), up))
+    off, up = min(found, key=lambda one: one[0])
+    return up if off < min(spread_deg, _MAX_TAG_SPREAD_DEG) else None
+
+
+def _tilt_deg(frames: FrameSet, f: int) -> tuple[float, float]:
+    """Pitch and roll of a panorama by its GPano tags; NaN = not given."""
+    if frames.format_of(f).layout != "erp":
+        return np.nan, np.nan
+    tags = image_header(frames.paths[f][0]).tags
+    return (np.nan, np.nan) if tags is None else tags.attitude_deg[1:]
 
 
 def _degrees(one: np.ndarray, other: np.ndarray) -> float:

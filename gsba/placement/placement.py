@@ -185,9 +185,10 @@ def _upright(reconstruction: Reconstruction, frames: FrameSet) -> Placement:
         "edges_to_rigs_deg": round(gravity.turn_deg, 4),
         "rigs_spread_deg": round(gravity.spread_deg, 4),
     }
-    if gravity.by_forces is not None:
-        off = float(np.degrees(np.arccos(np.clip(gravity.up @ gravity.by_forces, -1, 1))))
-        grounds["edges_to_accelerometer_deg"] = round(off, 4)
+    for name, up in (("accelerometer", gravity.by_forces), ("tags", gravity.by_tags)):
+        if up is not None:
+            off = float(np.degrees(np.arccos(np.clip(gravity.up @ up, -1, 1))))
+            grounds[f"edges_to_{name}_deg"] = round(off, 4)
     rotation = _least_turn(gravity.up, _UP_WORLD)
     return Placement(Sim3(rotation=rotation), up="-y", grounds={"gravity": grounds})
 

@@ -1,12 +1,11 @@
 """Detection of trajectories in another convention, or of another recording."""
 
-import itertools
-
 import numpy as np
 
 from gsba.config import VerifySettings
-from gsba.geometry import inverse, pose, quaternion_from_rotation, rotation_from_quaternion
+from gsba.geometry import inverse, pose
 from gsba.log import GsbaError
+from gsba.trajectory.conventions import CAMERA_FROM_WORLD, OURS, WXYZ, axis_systems, w_first
 from gsba.trajectory.steps import Steps, step_errors
 from gsba.types import CoarsePoses, PoseSource
 
@@ -16,7 +15,8 @@ _LOOSE_LIMITS = {"max_rotation_deg": 20.0, "max_direction_deg": 60.0}  # thresho
 # agreement
 _DOUBTFUL_SHARE = 0.6  # share of agreeing steps below which another convention is accepted
 _MIN_EXPLAINED_SHARE = 0.7  # least share of steps that another convention must explain
-_WAYS = {0: {1: "right", -1: "left"}, 1: {1: "down", -1: "up"}, 2: {1: "forward", -1: "back"}}
+_COMMON_SYSTEMS = "right-up-back", "left-down-back", "left-up-forward"  # half turns: of graphics,
+# about the vertical axis, about the forward axis
 _ADVICE = "or refine without it (--no-trajectory)"
 
 
@@ -64,7 +64,7 @@ def refuse_misread(coarse: CoarsePoses, found: Steps, settings: VerifySettings) 
         return  # on a loop, the way back looks reversed
     text, other = _contradiction_text(shares[""], judged), ""
     if late:
-        other = f" or on another clock, by about {abs(late)} frames"
+        other = f"; or it is on another clock, by about {abs(late)} frames"
     raise GsbaError(f"{text}: the trajectory is {best}{other}, {_ADVICE}")
 
 
@@ -140,49 +140,33 @@ def _steps(poses: np.ndarray) -> np.ndarray:
 def _steps_in_other_conventions(world_T_rigs: np.ndarray) -> dict[str, np.ndarray]:
     """Steps (F - 1,) of a trajectory in other conventions, the commoner ones first."""
     steps = _steps(world_T_rigs)
-    w_first = pose(_w_first(world_T_rigs[:, :3, :3]), world_T_rigs[:, :3, 3])
+    reordered = _steps(pose(w_first(world_T_rigs[:, :3, :3]), world_T_rigs[:, :3, 3]))
     readings = {
         "": steps,
         "reversed in time: check its timestamps": _steps(world_T_rigs[::-1]),
-        "camera-from-world: invert its poses": _steps(inverse(world_T_rigs)),
-        "in axes of y up and z backward: convert it to y down and z forward": _flipped(
-            steps, [1, -1, -1]
-        ),
-        "turned by half about the vertical axis: its x and z point the other way": _flipped(
-            steps, [-1, 1, -1]
-        ),
-        "turned by half about the forward axis: its x and y point the other way": _flipped(
-            steps, [-1, -1, 1]
-        ),
+        f"{CAMERA_FROM_WORLD}: {_pass(CAMERA_FROM_WORLD)}": _steps(inverse(world_T_rigs)),
     }
+    systems = {name: rotation for name, rotation in axis_systems() if name != OURS}
+    for name in sorted(systems, key=lambda name: name not in _COMMON_SYSTEMS):
+        readings[f"{_axes(name)}: {_pass(name)}"] = _in_axes(steps, systems[name])
     for name, axis in zip("xyz", np.eye(3), strict=True):
         mirrored = f"mirrored along {name}: it is no rigid motion of this camera, flip that axis"
         readings[mirrored] = _flipped(steps, 1 - 2 * axis)
-    order = "in quaternions of the order w, x, y, z: write them as x, y, z, w"
-    readings[order] = _steps(w_first)
-    for axes, rotation in _turned_axes().items():
-        into = f"in axes of {axes}: convert it to x right, y down, z forward"
-        readings[into] = _in_axes(steps, rotation)
-        readings[f"{order}; and {into}"] = _in_axes(_steps(w_first), rotation)
+    order = "in quaternions of the order w, x, y, z"
+    readings[f"{order}: {_pass(WXYZ)}"] = reordered
+    for name, rotation in systems.items():
+        both = f"{order}, and {_axes(name)}: {_pass(f'{WXYZ},{name}')}"
+        readings[both] = _in_axes(reordered, rotation)
     return readings
 
 
-def _w_first(rotations: np.ndarray) -> np.ndarray:
-    """Rotations (F, 3, 3) whose quaternions were written w, x, y, z and read as x, y, z, w."""
-    wxyz = quaternion_from_rotation(rotations)
-    return rotation_from_quaternion(wxyz[:, [1, 2, 3, 0]])
+def _pass(words: str) -> str:
+    return f"pass --trajectory-format {words}"
 
 
-def _turned_axes() -> dict[str, np.ndarray]:
-    """Rotations (3, 3) from camera axes of other programs to ours, by what these axes are."""
-    found = {}
-    for order in itertools.permutations(range(3)):
-        for signs in itertools.product((1, -1), repeat=3):
-            rotation = np.eye(3)[:, order] * signs  # column n: axis n of theirs, in ours
-            if np.linalg.det(rotation) > 0 and not np.array_equal(rotation, np.eye(3)):
-                ways = (_WAYS[axis][sign] for axis, sign in zip(order, signs, strict=True))
-                found[", ".join(map(" ".join, zip("xyz", ways, strict=True)))] = rotation
-    return found
+def _axes(system: str) -> str:
+    """A clause that names camera axes by their ways."""
+    return "in axes of " + ", ".join(map(" ".join, zip("xyz", system.split("-"), strict=True)))
 
 
 def _in_axes(steps: np.ndarray, ours_R_theirs: np.ndarray) -> np.ndarray:

@@ -22,6 +22,7 @@ from gsba.frames.factory_start import factory_calibration
 from gsba.frames.files import turned
 from gsba.frames.lens_names import lens_files
 from gsba.frames.panorama_checks import OVER_UNDER, REMEDIES, unlike_panorama
+from gsba.frames.scan import MAX_ROUNDING
 from gsba.frames.side_by_side import (
     LOOKED_AT,
     SideBySide,
@@ -44,7 +45,6 @@ EXACT_S = 1e-6  # closer times are equal
 _RAW_SUFFIX = ".insv"  # of videos that hold fisheyes even if no image circle is detected
 _STITCH = "stitch it in the camera's app and export an equirectangular (2:1) video"
 _MAX_SQUARE_RATIO = 1.1  # of the longer to the shorter side of a nearly square image
-_MAX_ROUNDING = 0.02  # of the width by which encoders miss 2:1
 _MAX_MISSING_SHARE = 0.1  # of the longer track's duration that the shorter one may lack
 
 
@@ -267,7 +267,7 @@ def _check_panorama(video: Path, size: tuple[int, int]) -> None:
             f"{video} is {width}x{height}, square: one lens of a raw dual-fisheye recording, or "
             f"a stereo pair; {_STITCH}"
         )
-    if abs(width - 2 * height) <= _MAX_ROUNDING * width:
+    if abs(width - 2 * height) <= MAX_ROUNDING * width:
         raise GsbaError(
             f"{video} is {width}x{height}, nearly 2:1: if it is a whole panorama, scale it "
             f"(ffmpeg -i {video.name} -vf scale={width}:{width // 2} ONE.mp4)"

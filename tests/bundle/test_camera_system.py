@@ -66,6 +66,23 @@ def test_all_of_a_camera_is_found_from_a_start_that_is_off() -> None:
     assert found.readout_s == pytest.approx(READOUT_S, rel=0.05)
 
 
+@pytest.mark.parametrize("start", [0.5, 2.0])
+def test_a_tight_gate_does_not_confirm_the_start(start: float) -> None:
+    """It leaves out what contradicts the start, which is what tells the distance of the lenses."""
+    world, shown = seen_through(LENSES)
+    solved = Solution.without_points(world.world_T_rigs)
+    seen = CameraEstimates((CameraEstimate(LENSES, READOUT_S),)).cameras
+    tracks, found = seen.clear(world.tracks, seen.seen(shown)), []
+    for ratio in (1.0, start):
+        known = CameraEstimate(replace(LENSES, centre=ratio * CENTRE), READOUT_S)
+        given = times(24), solved, problem_of(world)
+        found.append(
+            solve_with_camera(tracks, shown, CameraEstimates((known,)), *given, (6.0, 3.0))[1]
+        )
+    centres = [one.only.lenses.centre for one in found]
+    np.testing.assert_allclose(*centres, atol=1e-5)  # a standard deviation is 7e-5
+
+
 def test_a_stitch_radius_that_is_said_goes_with_the_lenses() -> None:
     """Both pictures meet 5 m away, the lenses are as far apart as they are said to be."""
     front = float(np.linalg.norm(CENTRE))

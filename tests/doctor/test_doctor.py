@@ -41,7 +41,7 @@ def test_what_gsba_asks_for_is_what_its_project_says() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     wanted = requirements()
     assert len([one for one in wanted if one.extra == NEEDED]) == len(project["dependencies"])
-    extras = set(project["optional-dependencies"]) - {"all", "docs", "test", "dev"}
+    extras = set(project["optional-dependencies"]) - {"all", "docs", "test", "dev", "weights"}
     assert {one.extra for one in wanted} == {NEEDED, *extras}
     for one in wanted:
         if one.extra == NEEDED:
@@ -189,8 +189,9 @@ def test_notes_on_extras() -> None:
     codecs = dict.fromkeys(facts.CODECS, True) | {"av1": False}
     notes, remedy = examination._conclusions({"codecs": codecs})
     assert notes[1] == "cannot decode av1" and remedy.startswith("pip install")
-    assert examination._conclusions({"weights": []})[0] == ["no weights yet: see --download"]
-    assert examination._conclusions({"weights": ["disk"]}) == (["weights of disk"], "")
+    advice = examination._conclusions({"weights": []})[0][0]
+    assert advice.startswith("no weights yet: see docs/learned")
+    assert examination._conclusions({"weights": ["disk (MIT)"]}) == (["weights of disk (MIT)"], "")
     assert examination._conclusions({"laz": False}) == (["reads LAS, not LAZ"], "pip install lazrs")
     assert examination._conclusions({"trouble": "OSError: x"}) == (["OSError: x"], "")
 
@@ -205,11 +206,12 @@ def test_weights_in_the_caches_are_seen(tmp_path: Path, monkeypatch: pytest.Monk
     for name in ("TORCH_HOME", "HF_HOME", "HF_HUB_CACHE"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr("gsba.learned.weights.packaged", lambda names: None)
     assert facts.learned() == {"weights": []}
     folder = tmp_path / "torch" / "hub" / "checkpoints"
     folder.mkdir(parents=True)
     (folder / "depth-save.pth").write_bytes(b"x")
-    assert facts.learned() == {"weights": ["disk"]}
+    assert facts.learned() == {"weights": ["disk (Apache-2.0)"]}
 
 
 def test_the_limits_of_a_container_are_those_of_the_machine(

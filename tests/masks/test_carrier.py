@@ -20,6 +20,7 @@ from gsba.frames.scan import find_panoramas
 from gsba.log import GsbaError
 from gsba.masks.carrier import carrier_mask, find_carrier, write_carrier
 from gsba.masks.merging import choose
+from gsba.pipeline.acceptance import masked_scene_share
 from gsba.types import FrameSet
 
 WIDTH, HEIGHT, NUM = 512, 256, 14
@@ -158,6 +159,18 @@ def test_a_rail_that_moves_along_itself_is_not_the_carrier(tmp_path: Path) -> No
     assert carrier.mask.all()
 
 
+def test_areas_without_pixels_do_not_ride_along(tmp_path: Path) -> None:
+    """A crop of 270 x 135 degrees, padded with black, is no vehicle."""
+    outside = np.ones((HEIGHT, WIDTH), bool)
+    outside[HEIGHT // 8 : -HEIGHT // 8, WIDTH // 8 : -WIDTH // 8] = False
+    frames = _noise_frames(tmp_path, outside, np.full((HEIGHT, WIDTH, 3), -50.0))
+    carrier = find_carrier(frames)
+    assert carrier.mask.all() and carrier.reason == "nothing turns with the camera"
+    mask_paths = (tmp_path / "m" / "mask.png",) * NUM
+    write_image(mask_paths[0], np.where(outside, 0, 255).astype(np.uint8))
+    assert masked_scene_share(dataclasses.replace(frames, mask_paths=mask_paths)) < 0.01
+
+
 def test_a_vehicle_that_fills_the_view_is_said(tmp_path: Path) -> None:
     v, _ = np.mgrid[:HEIGHT, :WIDTH]
     frames = _noise_frames(tmp_path / "car", v > 0.3 * HEIGHT, _looks()["coloured"])
@@ -264,3 +277,17 @@ def test_raw_pairs_are_taken(tmp_path: Path) -> None:
     grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1) + 0.5
     cone = bearings_from_erp(grid, width, height)[..., 2] > np.cos(0.5)
     assert width == 2 * height and _overlap(found, cone) >= 0.8
+
+
+def test_a_camera_that_turns_is_no_carrier_that_turns(tmp_path: Path) -> None:
+    """On the spot, the floor turns like a carrier below a picture that keeps its heading."""
+    (first, *_), *_ = _walk(tmp_path / "walk", None, speed=0.0).paths
+    rng, picture = np.random.default_rng(2), cv2.imread(str(first)).astype(np.float32)
+    for f in range(NUM):
+        turned = np.roll(picture, 41 * f, axis=1)
+        near = cv2.GaussianBlur(rng.normal(0, 60, turned.shape), (0, 0), 3.0)  # people around
+        turned[90:140, 200:360] += 5 * near[90:140, 200:360]
+        noisy = np.clip(turned + rng.normal(0, 2, turned.shape), 0, 255).astype(np.uint8)
+        write_image(tmp_path / f"turn/{f:03d}.png", noisy)
+    carrier = find_carrier(find_panoramas(tmp_path / "turn"))
+    assert carrier.mask.all() and not carrier.turns.any()

@@ -20,7 +20,7 @@ NUM = 400
 F0_T_F1 = pose(Rotation.from_rotvec([0.05, 0.3, -0.02]).as_matrix(), np.array([0.4, 0.05, 0.6]))
 BAND = Gate(np.deg2rad(0.5), 0.01, np.deg2rad(80))
 POINT = Gate(np.pi, 1.0, np.pi, np.deg2rad(0.5))
-SETTINGS = MatchingSettings()
+SETTINGS = MatchingSettings(min_similarity=0.8, max_ratio=0.9)
 
 
 class Scene:
@@ -276,7 +276,7 @@ def test_ratio_and_similarity_are_those_of_the_descriptors(ratio: float) -> None
         assert len(found) == expected
     alone = features_of(bearings[:1], _directions(best))
     for similarity, expected in ((np.cos(best) - 0.01, 1), (np.cos(best) + 0.01, 0)):
-        settings = MatchingSettings(min_similarity=similarity)
+        settings = MatchingSettings(min_similarity=similarity, max_ratio=0.9)
         found = _match(first, alone, everything, f0_T_f1=np.eye(4), settings=settings)
         assert len(found) == expected
 

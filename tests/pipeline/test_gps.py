@@ -70,9 +70,10 @@ def test_fixes_hold_a_run_and_are_reported(case: Case, without: Path, tmp_path: 
     assert _apart(out, without) < 1e-4
     assert case.errors(out).scale == pytest.approx(case.errors(without).scale, rel=1e-3)
     claims = []
-    for more in ((), ("--gps-sigma", "0.3")):
+    late = _table(tmp_path / "late.csv", case, 30.0, shift_s=1000.0)
+    for file, more in ((table, ()), (late, ("--gps-sigma", "0.3", "--gps-offset", "-1000"))):
         folder = tmp_path / f"export{len(more)}"
-        command = ["export", out, "--to", "tum", "--out", folder, "--gps", table, *more]
+        command = ["export", out, "--to", "tum", "--out", folder, "--gps", file, *more]
         done = CliRunner().invoke(app, [str(part) for part in command])
         assert done.exit_code == 0, done.stderr
         said = json.loads((folder / "transform.json").read_text())

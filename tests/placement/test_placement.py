@@ -395,3 +395,26 @@ def test_bad_options(tmp_path: Path) -> None:
     ):
         out = _gsba("export", tmp_path, "--to", "tum", *options)
         assert out.exit_code == 1 and message in out.stderr and len(out.stderr.splitlines()) == 1
+
+
+@pytest.mark.parametrize("true", [True, False])
+def test_tags_of_attitude_make_up_where_they_agree_with_poses(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, true: bool
+) -> None:
+    """A camera held at all angles; its maker counts roll the other way round."""
+    frames, level = scene.panoramas(tmp_path / "frames"), scene.reconstruction()
+    num, rng = len(frames), np.random.default_rng(4)
+    yaws, pitches, rolls = rng.uniform(-1, 1, (3, num)) * [[180], [60], [50]]
+    turns = Rotation.from_euler("YXZ", np.column_stack([yaws, pitches, rolls]), degrees=True)
+    world = Rotation.from_rotvec([0.5, 0.2, -0.4])
+    poses = pose((world * turns).as_matrix(), level.world_T_rigs[:, :3, 3])
+    tags = np.column_stack([pitches, -rolls]) + rng.normal(0, 0.5, (num, 2))
+    shown = tags if true else rng.permutation(tags)
+    monkeypatch.setattr(gravity, "_tilt_deg", lambda _, f: tuple(shown[f]))
+    found = gravity.estimate_gravity(dataclasses.replace(level, world_T_rigs=poses), frames)
+    if not true:
+        assert found is None
+        return
+    assert found is not None and found.by_tags is not None
+    error = np.degrees(np.arccos(np.clip(found.by_tags @ world.apply([0, -1, 0]), -1, 1)))
+    assert error < 0.5

@@ -54,14 +54,23 @@ def _another() -> np.ndarray:
     ("poses", "said"),
     [
         (SLAM[::-1], "reversed in time"),
-        (inverse(SLAM), "camera-from-world"),
+        (inverse(SLAM), "is camera-from-world: pass --trajectory-format camera-from-world, or"),
         (MIRROR @ SLAM @ MIRROR, "mirrored along x"),
-        (OPENGL @ SLAM @ OPENGL, "y up and z backward"),
-        (TURNED @ SLAM @ TURNED, "half about the vertical axis: its x and z"),
-        (ROLLED @ SLAM @ ROLLED, "half about the forward axis: its x and y"),
-        (SLAM @ ROS, "axes of x forward, y left, z up: convert it to x right, y down, z forward"),
-        (_w_first(SLAM), "order w, x, y, z: write them as x, y, z, w, or"),
-        (_w_first(SLAM @ ROS), "order w, x, y, z: .*; and in axes of x forward, y left, z up"),
+        (OPENGL @ SLAM @ OPENGL, "y up, z back: pass --trajectory-format right-up-back, or"),
+        (
+            TURNED @ SLAM @ TURNED,
+            "pass --trajectory-format left-down-back; or it is on another clock",
+        ),
+        (ROLLED @ SLAM @ ROLLED, "pass --trajectory-format left-up-forward, or"),
+        (
+            SLAM @ ROS,
+            "x forward, y left, z up: pass --trajectory-format forward-left-up, or",
+        ),
+        (_w_first(SLAM), "order w, x, y, z: pass --trajectory-format wxyz, or"),
+        (
+            _w_first(SLAM @ ROS),
+            "z up: pass --trajectory-format wxyz,forward-left-up, or",
+        ),
         (_another(), "another recording"),
     ],
 )
