@@ -193,6 +193,9 @@ def export(
     from gsba.export import ExportOptions, export_all
     from gsba.export.photos import read_photos
     from gsba.export.trainers import format_of, how_to_start, options_for
+    from gsba.placement.placement import place
+    from gsba.store.cluster import connected, hired
+    from gsba.store.finished import load_run
     from gsba.store.folder import claim
 
     name, to = to, format_of(to)
@@ -201,10 +204,6 @@ def export(
     world |= {"scan": align_scan, "pairs": pairs}
     dataset = {"face_size": face_size, "images": images, "formats": [to]}
     settings = validated({"placement": world, "export": dataset}).placement
-    from gsba.placement.placement import place
-    from gsba.store.cluster import connected, hired
-    from gsba.store.finished import load_run
-
     reconstruction, frames, *_ = load_run(run, map_number)
     lenses = cameras_of(run, reconstruction, frames, images, map_number)
     folder = out or run / (name if map_number == 1 else f"{name}-map{map_number}")
