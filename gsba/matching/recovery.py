@@ -313,8 +313,10 @@ def _matched_within(
     for p, before in enumerate(steps.f0_T_f1s):
         rays = context.keypoints.matched(chosen[p], matches.of(p))
         fit = verification.relative_pose(*rays, settings, context.settings.seed, chance, sample=0)
-        better = fit is not None and fit.inliers.sum() > len(steps.matches.of(p))
-        estimates.append(fit if better and _is_near(fit.f0_T_f1, before, gate) else None)
+        if fit is not None and fit.inliers.sum() <= len(steps.matches.of(p)):
+            fit = None
+        near = fit is not None and _is_near(fit.f0_T_f1, before, gate)
+        estimates.append(fit if near else None)
     again = verification.agree_with_prior(matches, estimates, None, None, settings)
     return again, [p for p, fit in enumerate(estimates) if fit is not None]
 
