@@ -24,5 +24,10 @@ if command -v npm >/dev/null && npm install --silent --no-audit --no-fund --fetc
   gltf-validator@2.0.0-dev.3.10; then
   export GSBA_NODE_MODULES="$work/node/node_modules"
 fi
+# Blender has its own NumPy, older than ours, and wants Python 3.11.
+if "$python" -m venv "$work/blender" &&
+  "$work/blender/bin/pip" install --quiet --retries 1 --timeout 20 bpy==4.5.15; then
+  export BLENDER_PYTHON="$work/blender/bin/python"
+fi
 cd "$root"
-"$work/venv/bin/python" -m pytest -n 0 -m consumers -rs tests/export/test_consumers.py
+"$work/venv/bin/python" -m pytest -n 0 -m consumers -rs tests/export/test_consumers.py tests/export/test_blender.py

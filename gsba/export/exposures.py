@@ -58,8 +58,9 @@ def write_exposures(partial: Path) -> None:
     found = relative_exposures(np.concatenate(brightness), rows, np.concatenate(points))
     known = {f: ev for f, ev in zip(numbers.tolist(), found.tolist(), strict=True) if ev == ev}
     told = {i.name: known[i.frame_id] for i in model.images.values() if i.frame_id in known}
-    for name, exposure in told.items():
-        _insert_exposure(partial / "images" / name, exposure)
+    inserted = [_insert_exposure(partial / "images" / name, ev) for name, ev in told.items()]
+    if not any(inserted):
+        logger.warning("exposures are in exposures.json alone: no image is a JPEG")
     write_json(partial / "exposures.json", {name: round(ev, 4) for name, ev in told.items()})
     range_ = f"{min(known.values()):+.2f} to {max(known.values()):+.2f}" if known else "none"
     logger.info("exposures of %d frames: %s EV", len(known), range_)
@@ -117,17 +118,20 @@ def _brightness(path: Path, pixels: np.ndarray) -> np.ndarray:
     return np.where(known, np.log2(np.maximum(linear @ _LUMINANCE, 1e-6)), np.nan)
 
 
-def _insert_exposure(path: Path, exposure: float) -> None:
-    """Write an exposure in stops into a JPEG without EXIF; other files stay as they are."""
+def _insert_exposure(path: Path, exposure: float) -> bool:
+    """Write an exposure in stops into a JPEG, if it has no EXIF; False = it is no JPEG."""
     from PIL import Image
     from PIL.TiffImagePlugin import IFDRational
 
     content = path.read_bytes()
-    if not content.startswith(b"\xff\xd8") or b"Exif\0\0" in content[: 1 << 16]:
-        return
+    if not content.startswith(b"\xff\xd8"):
+        return False
+    if b"Exif\0\0" in content[: 1 << 16]:
+        return True
     exif = Image.Exif()
     parts = round(_MEAN_EXPOSURE_S * 2**exposure * _PER_SECOND)
     exif.get_ifd(_EXIF_IFD)[_EXPOSURE_TIME] = IFDRational(parts, _PER_SECOND)
     segment = exif.tobytes()
     header = b"\xff\xe1" + (len(segment) + 2).to_bytes(2, "big")
     write_bytes(path, content[:2] + header + segment + content[2:])
+    return True

@@ -37,6 +37,7 @@ _YFOV_RAD = 2 * np.arctan(1 / _ASPECT)  # vertical field, for a horizontal one o
 _NEAR_PER_EXTENT, _FAR_PER_DISTANCE = 1e-4, 10.0  # of the cameras' extent, of the furthest thing
 _SCRIPT = "open_in_blender.py"
 _MIN_FPS, _MAX_FPS = 24, 240  # of Blender's timeline
+_MAX_FRAME = 1_000_000  # of Blender's timeline, which ends at 1,048,574
 
 
 def write_blender(
@@ -154,7 +155,9 @@ def _perspective(reconstruction: Reconstruction) -> dict[str, float]:
 def _fps(frames: FrameSet) -> int:
     """Frames per second of a timeline on which each picture has a frame of its own."""
     shortest = float(np.diff(frames.timestamps).min(initial=1.0))
-    return int(np.clip(np.ceil(1 / shortest - 1e-3), _MIN_FPS, _MAX_FPS))
+    fps = np.clip(np.ceil(1 / shortest - 1e-3), _MIN_FPS, _MAX_FPS)
+    longest = float(frames.timestamps[-1] - frames.timestamps[0])
+    return int(min(fps, max(_MAX_FRAME // max(longest, 1.0), 1)))
 
 
 def _extras(frames: FrameSet, pictures: Sequence[str] | None) -> list[dict[str, Any]]:

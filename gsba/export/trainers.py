@@ -113,6 +113,14 @@ def options_for(name: str, options: ExportOptions, paint: str = "files") -> Expo
     return replace(options, masks=style, cameras=cameras, panoramas=panoramas)
 
 
+_DEPTHS = {  # how programs take depths
+    "nerfstudio": "takes depths by ns-train depth-nerfacto --data {out}; splatfacto takes none",
+    "gsplat": "takes depths from {out}/sparse/0, by --depth_loss",
+    "inria": "takes dense depths, which its make_depth_scale.py fits to {out}/sparse/0",
+}
+_READ_EXPOSURES = ("gsplat", "3dgrut")
+
+
 def how_to_start(name: str, out: Path, paint: str = "files") -> list[str]:
     """Lines on how the program of this name reads an export; [] = it is the name of a format."""
     if name not in PROGRAMS:
@@ -125,4 +133,9 @@ def how_to_start(name: str, out: Path, paint: str = "files") -> list[str]:
             f"{name} reads no masks: it trains on pixels that they hide; --masks alpha or black "
             "paints these"
         )
+    if (out / "sparse_depths").is_dir():
+        reads = _DEPTHS.get(name, "reads none of the depths").format(out=out)
+        lines.append(f"{name} {reads}")
+    if (out / "exposures.json").is_file() and name not in _READ_EXPOSURES:
+        lines.append(f"{name} reads no exposures")
     return lines

@@ -81,6 +81,15 @@ def test_the_scene_tells_blender_its_timeline_and_pictures(tmp_path: Path) -> No
             assert (out / node["extras"]["picture"]).read_bytes() == source.read_bytes()
 
 
+def test_a_day_fits_blenders_timeline(tmp_path: Path) -> None:
+    frames = panoramas(tmp_path / "frames")
+    frames = replace(frames, timestamps=np.linspace(0, 86400, len(frames)))
+    export(reconstruction(), frames, tmp_path / "out", ExportFormat.GLTF)
+    document = _document(tmp_path / "out/scene.glb")
+    assert document["scenes"][0]["extras"]["fps"] == 11
+    assert document["nodes"][-2]["extras"]["frame"] == 11 * 86400
+
+
 @pytest.mark.consumers
 def test_blender_shows_points_where_the_pictures_do(tmp_path: Path) -> None:
     """Panoramic cameras render each point within a fifth of a pixel of its place."""

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from gsba.bundle.point_covariances import depth_variances, point_covariances
 from gsba.export import ExportFormat, export
 from gsba.export.photos import PhotoCamera, Photos, PlacedPhoto
+from gsba.export.trainers import how_to_start
 from gsba.geometry import inverse
 from gsba.log import GsbaError
 from gsba.types import JointErrors, Reconstruction
@@ -46,6 +47,8 @@ def test_nerfstudio_reads_the_depth_of_each_point(tmp_path: Path) -> None:
             assert depths[row, column] == pytest.approx(-local[point, 2], rel=1e-6)
         found += len(rows)
     assert found == len(POINTS) * NUM_FRAMES  # each in one face of each frame
+    assert "depth-nerfacto" in how_to_start("nerfstudio", out)[-1]
+    assert how_to_start("instant-ngp", out)[-1] == "instant-ngp reads none of the depths"
 
 
 @pytest.mark.parametrize("to", ["colmap", "colmap-flat"])

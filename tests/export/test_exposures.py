@@ -12,6 +12,7 @@ from PIL import Image
 from gsba.disk import write_image
 from gsba.export import ExportFormat, export
 from gsba.export.exposures import relative_exposures
+from gsba.export.trainers import how_to_start
 from gsba.log import GsbaError
 
 
@@ -67,6 +68,17 @@ def test_trainers_read_how_frames_were_exposed(tmp_path: Path) -> None:
     assert np.ptp(by_frame, axis=1).max() < 1e-6  # all faces of a frame have one exposure
     np.testing.assert_allclose(by_frame[:, 0], stops, atol=0.1)
     assert cv2.imread(str(out / "images" / images[0])) is not None
+
+
+def test_images_that_hold_no_exif_are_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    frames, out = panoramas(tmp_path / "frames"), tmp_path / "out"
+    export(reconstruction(), frames, out, ExportFormat.COLMAP_FLAT, 64, exposures=True)
+    assert json.loads((out / "exposures.json").read_text())
+    assert "exposures are in exposures.json alone: no image is a JPEG" in caplog.text
+    assert how_to_start("gsplat", out)[1:] == []
+    assert how_to_start("brush", out)[1:] == ["brush reads no exposures"]
 
 
 @pytest.mark.parametrize("to", ["nerfstudio", "opensfm"])
