@@ -7,6 +7,7 @@ give several candidates.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import permutations, product
 
 import numpy as np
@@ -91,6 +92,7 @@ def score(fit: Sim3, cloud: Cloud, scan: Scan, points: int = 400) -> float:
     return float(np.sum((1 - gaps[found] / reach) * alike)) / len(rows)
 
 
+@cache
 def _rows(num: int, most: int) -> np.ndarray:
     """Random sample, with a fixed seed, of at most `most` rows of `num`, ascending."""
     return np.sort(np.random.default_rng(0).permutation(num)[:most])
@@ -174,7 +176,7 @@ def _by_axes(cloud: Cloud, scan: Scan, guess: Guess) -> Iterator[Sim3]:
         flips = (turn[range(3), axes] < 0).astype(int)
         x, y, z = (values[axes[j], flips[j], j] for j in range(3))
         sums = x[:, :, None, None] + y[:, None, :, None] + z[:, None, None, :]
-        for at in np.argsort(-sums, axis=None, kind="stable")[:_CANDIDATES_PER_ROTATION]:
+        for at in _largest(sums, _CANDIDATES_PER_ROTATION):
             n, *peaks = (int(k) for k in np.unravel_index(at, sums.shape))
             shift = [shifts[axes[j], flips[j], j, n, peaks[j]] for j in range(3)]
             moved = of_scan.T @ np.array(shift) - scales[n] * rotation @ (of_cloud.T @ middle)
@@ -182,6 +184,16 @@ def _by_axes(cloud: Cloud, scan: Scan, guess: Guess) -> Iterator[Sim3]:
             if not guess.allows(fit):
                 break
             yield fit
+
+
+def _largest(values: np.ndarray, most: int) -> np.ndarray:
+    """Flat indices of the largest values, at most `most`, the largest first."""
+    flat = values.ravel()
+    if len(flat) <= most:
+        return np.argsort(-flat, kind="stable")
+    least = np.partition(flat, -most)[-most]
+    rows = np.flatnonzero(flat >= least)
+    return rows[np.argsort(-flat[rows], kind="stable")[:most]]
 
 
 def _peaks(correlated: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
