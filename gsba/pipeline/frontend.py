@@ -20,6 +20,7 @@ from gsba.matching import correspondences, recovery
 from gsba.matching.guided_search import MatchContext, SearchableFrames
 from gsba.matching.recovery import Recovered
 from gsba.pipeline import inputs, weak_start
+from gsba.pipeline.acceptance import NoPositions
 from gsba.pipeline.observed_frames import ObservedFrames
 from gsba.pipeline.prior import Prior
 from gsba.pipeline.run import Run
@@ -172,6 +173,7 @@ def judge_trajectory(state: State) -> State:
     """The trajectory without what images contradict; neighbours once more where it misled.
 
     Raises:
+        NoPositions: neighbours match, but show neither a way nor a turn.
         GsbaError: images contradict most of the trajectory, or match nowhere.
     """
     run, prior, times = state.run, state.prior, state.run.frames.timestamps
@@ -189,7 +191,7 @@ def judge_trajectory(state: State) -> State:
         coarse = replace(coarse, world_T_rigs=trust.world_T_rigs)
         if not (trust.turning_only or np.isfinite(near.direction_sigmas).any()):
             seen, num = np.count_nonzero(~trust.unseen_steps), len(trust.unseen_steps)
-            raise GsbaError(
+            raise NoPositions(
                 f"{seen} of {num} pairs of neighbouring frames match, by so little that they show "
                 f"neither a way nor a turn on the spot: {_hindrance(run)}"
             )
@@ -216,7 +218,8 @@ def prove_turn(state: State) -> State | None:
         chosen = [(f, f + gap) for gap in apart.tolist() for f in range(num - gap)]
         found = recovery.match_anywhere(context, np.array(chosen, np.int32).reshape(-1, 2))
         verify = run.settings.verify
-        turn = turning.prove(found, context.keypoints, verify)
+        most = turning.MAX_HAND_PARALLAX_RAD
+        turn = turning.prove(found, context.keypoints, verify, most)
         seen, none = steps.image_steps(found, context.keypoints), np.zeros(0)
         trust = judgement.check_steps(absent, seen, none, none, verify, run.settings.priors, turn)
         return Recovered(found, trust, absent)
