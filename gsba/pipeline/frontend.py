@@ -16,7 +16,7 @@ from gsba.frames import panorama
 from gsba.log import GsbaError
 from gsba.loop_closure import loops
 from gsba.loop_closure.loops import Closed
-from gsba.matching import correspondences, recovery
+from gsba.matching import correspondences, pairs, recovery
 from gsba.matching.guided_search import MatchContext, SearchableFrames
 from gsba.matching.recovery import Recovered
 from gsba.pipeline import inputs, weak_start
@@ -31,6 +31,7 @@ from gsba.trajectory.clock import ClockEstimate
 from gsba.types import CoarsePoses, Features, Keypoints, Matches, PoseSource, VerifiedPairs
 
 _DARK = 32  # of 255
+_NUM_WIDE_PAIRS = 60  # pairs of frames of each wider gap that show whether a camera walks
 
 
 def extract(run: Run) -> State:
@@ -204,7 +205,8 @@ def prove_turn(state: State) -> State | None:
     determine; None = that it turned on the spot is not proved either.
 
     Frames one, two, four, ... apart are matched without any prediction, over the whole sequence: a
-    slow walk adds up to parallax over the widest gaps.
+    slow walk adds up to parallax over the widest gaps. Neighbours tie frames together; of the wider
+    gaps of a long sequence, some pairs suffice.
 
     Args:
         state: keypoints of all frames, as `extract` gives them.
@@ -214,9 +216,11 @@ def prove_turn(state: State) -> State | None:
     absent = CoarsePoses(nowhere, np.full(num, PoseSource.NONE, np.uint8), run.coarse.time_offset)
 
     def compute() -> Recovered:
-        apart = 2 ** np.arange(max(num - 1, 1).bit_length())
-        chosen = [(f, f + gap) for gap in apart.tolist() for f in range(num - gap)]
-        found = recovery.match_anywhere(context, np.array(chosen, np.int32).reshape(-1, 2))
+        chosen = [pairs.adjacent(num, 1)]
+        for gap in 2 ** np.arange(1, max(num - 1, 1).bit_length()):
+            first = np.unique(np.linspace(0, num - 1 - gap, _NUM_WIDE_PAIRS).astype(np.int32))
+            chosen.append(np.column_stack([first, first + gap]))
+        found = recovery.match_anywhere(context, np.concatenate(chosen).astype(np.int32))
         verify = run.settings.verify
         most = turning.MAX_HAND_PARALLAX_RAD
         turn = turning.prove(found, context.keypoints, verify, most)
