@@ -92,6 +92,8 @@ def solve(
     covariances = np.zeros((num, 3, 3))
     if system is not None:
         covariances[1:] = noise**2 * _diagonal_blocks(system)
+        turned = found, bearings, bases, residuals, weights / sigmas
+        covariances *= _excess(rotations, sigmas, noise, turned)[:, None, None]
     used = np.bincount(found.frames[weights > 0.1], minlength=num)
     logger.info("rotations of %d frames from %d observations", num, int(used.sum()))
     return rotations, covariances, used
@@ -139,6 +141,42 @@ def _system(
     system = (whitened.T @ whitened - explained).tocsc()[3:, 3:]
     right = (np.sqrt(weights)[:, None] * residuals).reshape(-1)
     return system, whitened.T @ right - shared.T @ (inverses * (gather @ right))
+
+
+def _excess(
+    rotations: np.ndarray,
+    sigmas: np.ndarray,
+    noise: float,
+    turned: tuple[Tracks, np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+) -> np.ndarray:
+    """Factors (F,), at least 1, by which covariances of rotations grow as residuals of a region of
+    the sphere are alike: those of a hand that moves are the parallax of what is seen there.
+
+    The variance that sums of residuals over regions give (the cluster-robust estimator of Liang and
+    Zeger, Biometrika 1986) relative to that of independent ones.
+
+    Args:
+        rotations: (F, 3, 3) solved.
+        sigmas: (O,) of the observations, radians.
+        noise: their factor.
+        turned: tracks, bearings (O, 3), bases (O, 2, 3), residuals (O, 2) in sigmas, and weights
+            over sigmas (O,), of the last iteration.
+    """
+    found, bearings, bases, residuals, pulls = turned
+    axes = np.cross(np.eye(3)[None], bearings[:, None, :])
+    jacobian = np.einsum("oij,ojl,okl->oik", bases, rotations[found.frames], axes)
+    gradients = np.einsum("oik,oi,o->ok", jacobian, residuals, pulls)
+    information = np.einsum("oik,oil,o->okl", jacobian, jacobian, pulls / sigmas)
+    octants = (bearings > 0) @ np.array([1, 2, 4])
+    num, blocks = len(rotations), np.zeros((len(rotations), 3, 3))
+    sums = np.zeros((num, 8, 3))
+    np.add.at(sums, (found.frames, octants), gradients)
+    np.add.at(blocks, found.frames, information)
+    inverses = np.linalg.pinv(blocks)
+    robust = np.einsum("fij,fcj->fci", inverses, sums)
+    alike = np.sum(robust**2, axis=(1, 2)) * 8 / (8 - 3)  # degrees of freedom of a rotation
+    independent = noise**2 * np.trace(inverses, axis1=1, axis2=2)
+    return np.maximum(alike / np.maximum(independent, 1e-300), 1.0)
 
 
 def _solved(system, right: np.ndarray) -> np.ndarray:

@@ -23,12 +23,12 @@ from gsba.camera.optics import Optics
 from gsba.camera.views import scenes_around
 from gsba.features.extractor_traits import search_settings
 from gsba.imu.gravity import up_axis
-from gsba.log import GsbaError
 from gsba.loop_closure import connectivity, map_merging
 from gsba.loop_closure.merged_map import Registered, follow
 from gsba.matching import correspondences
 from gsba.photometric import direct
 from gsba.photometric.direct import PhotometricResult
+from gsba.pipeline.acceptance import NoPositions
 from gsba.pipeline.run import Run
 from gsba.pipeline.stage_titles import WITHOUT_GPS
 from gsba.pipeline.state import MapMatches, State
@@ -114,11 +114,11 @@ def separate_parts(state: State) -> np.ndarray | None:
     and where they are walked at an unusual pace over missing frames.
 
     Raises:
-        GsbaError: there is no map at all, so that nothing could be registered against it.
+        NoPositions: there is no map at all, so that nothing could be registered against it.
     """
     solution, near = state.solution, state.verified
     if not len(solution.landmarks.points_world):
-        raise GsbaError(
+        raise NoPositions(
             "no scene point is seen from enough frames, with enough parallax: frames must "
             "follow one another closely (or lower triangulate.min_track_length or "
             "triangulate.min_parallax_deg)"

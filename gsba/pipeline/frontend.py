@@ -16,10 +16,11 @@ from gsba.frames import panorama
 from gsba.log import GsbaError
 from gsba.loop_closure import loops
 from gsba.loop_closure.loops import Closed
-from gsba.matching import correspondences, recovery
+from gsba.matching import correspondences, pairs, recovery
 from gsba.matching.guided_search import MatchContext, SearchableFrames
 from gsba.matching.recovery import Recovered
 from gsba.pipeline import inputs, weak_start
+from gsba.pipeline.acceptance import NoPositions
 from gsba.pipeline.observed_frames import ObservedFrames
 from gsba.pipeline.prior import Prior
 from gsba.pipeline.run import Run
@@ -30,6 +31,7 @@ from gsba.trajectory.clock import ClockEstimate
 from gsba.types import CoarsePoses, Features, Keypoints, Matches, PoseSource, VerifiedPairs
 
 _DARK = 32  # of 255
+_NUM_WIDE_PAIRS = 60  # pairs of frames of each wider gap that show whether a camera walks
 
 
 def extract(run: Run) -> State:
@@ -172,6 +174,7 @@ def judge_trajectory(state: State) -> State:
     """The trajectory without what images contradict; neighbours once more where it misled.
 
     Raises:
+        NoPositions: neighbours match, but show neither a way nor a turn.
         GsbaError: images contradict most of the trajectory, or match nowhere.
     """
     run, prior, times = state.run, state.prior, state.run.frames.timestamps
@@ -189,7 +192,7 @@ def judge_trajectory(state: State) -> State:
         coarse = replace(coarse, world_T_rigs=trust.world_T_rigs)
         if not (trust.turning_only or np.isfinite(near.direction_sigmas).any()):
             seen, num = np.count_nonzero(~trust.unseen_steps), len(trust.unseen_steps)
-            raise GsbaError(
+            raise NoPositions(
                 f"{seen} of {num} pairs of neighbouring frames match, by so little that they show "
                 f"neither a way nor a turn on the spot: {_hindrance(run)}"
             )
@@ -202,7 +205,8 @@ def prove_turn(state: State) -> State | None:
     determine; None = that it turned on the spot is not proved either.
 
     Frames one, two, four, ... apart are matched without any prediction, over the whole sequence: a
-    slow walk adds up to parallax over the widest gaps.
+    slow walk adds up to parallax over the widest gaps. Neighbours tie frames together; of the wider
+    gaps of a long sequence, some pairs suffice.
 
     Args:
         state: keypoints of all frames, as `extract` gives them.
@@ -212,11 +216,14 @@ def prove_turn(state: State) -> State | None:
     absent = CoarsePoses(nowhere, np.full(num, PoseSource.NONE, np.uint8), run.coarse.time_offset)
 
     def compute() -> Recovered:
-        apart = 2 ** np.arange(max(num - 1, 1).bit_length())
-        chosen = [(f, f + gap) for gap in apart.tolist() for f in range(num - gap)]
-        found = recovery.match_anywhere(context, np.array(chosen, np.int32).reshape(-1, 2))
+        chosen = [pairs.adjacent(num, 1)]
+        for gap in 2 ** np.arange(1, max(num - 1, 1).bit_length()):
+            first = np.unique(np.linspace(0, num - 1 - gap, _NUM_WIDE_PAIRS).astype(np.int32))
+            chosen.append(np.column_stack([first, first + gap]))
+        found = recovery.match_anywhere(context, np.concatenate(chosen).astype(np.int32))
         verify = run.settings.verify
-        turn = turning.prove(found, context.keypoints, verify)
+        most = turning.MAX_HAND_PARALLAX_RAD
+        turn = turning.prove(found, context.keypoints, verify, most)
         seen, none = steps.image_steps(found, context.keypoints), np.zeros(0)
         trust = judgement.check_steps(absent, seen, none, none, verify, run.settings.priors, turn)
         return Recovered(found, trust, absent)

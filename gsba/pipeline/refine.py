@@ -190,7 +190,9 @@ def _solve_or_turn(run: Run, followed: bool) -> tuple[State, Reconstruction]:
             raise
         logger.warning("%s", error)
     logger.warning("most matches agree on rotations, over all gaps: rotations alone are refined")
-    return turn, backend.reconstruct(turn)
+    result = backend.reconstruct(turn)
+    acceptance.require_motion(run.frames, result)  # a vehicle seems to turn on the spot
+    return turn, result
 
 
 def _with_fetched(

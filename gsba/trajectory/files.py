@@ -56,8 +56,11 @@ def read_trajectory(path: Path, timestamps: Path | None = None) -> Trajectory:
         return _read_tum(path, rows)
     if columns == 12:
         return _read_kitti(path, rows, timestamps)
+    found = f"{columns} values"
+    if columns == 1 and "," in rows[0][1]:
+        found = "values separated by commas"
     raise GsbaError(
-        f"{path}:{rows[0][0]}: {columns} values; want 8 separated by blanks (TUM: timestamp tx ty "
+        f"{path}:{rows[0][0]}: {found}; want 8 separated by blanks (TUM: timestamp tx ty "
         "tz qx qy qz qw) or 12 (KITTI)"
     )
 
@@ -260,6 +263,8 @@ def _trajectory(
     late = np.flatnonzero(np.diff(times) <= 0)
     if len(late):
         before, after = float(times[late[0]]), float(times[late[0] + 1])
-        what = "occurs twice" if before == after else f"comes after {before!r}; sort the file"
+        what = f"comes after {before!r}; sort the file"
+        if before == after:
+            what = "occurs twice: write each once, with all digits"
         raise GsbaError(f"{where[late[0] + 1]}: timestamp {after!r} {what}")
     return Trajectory(times, world_T_rigs)

@@ -20,6 +20,8 @@ CELLS_PER_SIDE = 16  # cells along a face's side: all matches within one, 6 degr
 # witness
 MAX_PARALLAX_RAD = np.deg2rad(1.0)  # largest angle between the bearings of a match that a rotation
 # explains: 5 cm of a hand or of two lenses, seen from 3 m; no depth follows from less
+MAX_HAND_PARALLAX_RAD = np.deg2rad(3.0)  # the same where images determine no positions: 12 cm
+# between two frames of a hand, seen from 2.3 m
 _SAMPLE_SIZE = 2  # matches that determine a rotation
 _NUM_REFITS = 5  # refits of a rotation without the matches that are furthest off
 _MIN_FRAMES = 3  # least frames of a turn, unless there are only two
@@ -45,22 +47,29 @@ def rotation_of_most(rays0: np.ndarray, rays1: np.ndarray) -> tuple[np.ndarray, 
     return rotation, off
 
 
-def prove(pairs: VerifiedPairs, keypoints: Keypoints, settings: VerifySettings) -> Turn | None:
+def prove(
+    pairs: VerifiedPairs,
+    keypoints: Keypoints,
+    settings: VerifySettings,
+    max_parallax: float = MAX_PARALLAX_RAD,
+) -> Turn | None:
     """The largest part of the frames that turned on the spot; None = that is not proved.
 
     Args:
-        pairs: pairs of frames at most a few apart, the closest first.
+        pairs: pairs of frames, the closest first.
         keypoints: keypoints of all frames.
         settings: error rates.
+        max_parallax: radians between bearings that a rotation explains.
     """
     frames, num_frames = pairs.matches.pairs, len(keypoints.starts) - 1
     rotations, counts = np.empty((len(frames), 3, 3)), np.empty((len(frames), 2), int)
     for p, pair in enumerate(frames):
         rays = keypoints.matched(pair, pairs.matches.of(p))
         rotations[p], off = rotation_of_most(*rays)
-        alike = off < MAX_PARALLAX_RAD
+        alike = off < max_parallax
         counts[p] = [witnesses(rays[0][some], CELLS_PER_SIDE) for some in (alike, ~alike)]
-    proved = np.array([_is_turn(own, others, settings) for own, others in counts.tolist()], bool)
+    chance = max_parallax / np.pi  # a false match lies anywhere along its epipolar line
+    proved = np.array([_is_turn(a, b, chance, settings) for a, b in counts.tolist()], bool)
     turn = _tied(frames[proved], rotations[proved], num_frames)
     if np.count_nonzero(turn.frames) < min(_MIN_FRAMES, num_frames):
         return None
@@ -72,16 +81,14 @@ def prove(pairs: VerifiedPairs, keypoints: Keypoints, settings: VerifySettings) 
     return turn
 
 
-def _is_turn(support: int, against: int, settings: VerifySettings) -> bool:
+def _is_turn(support: int, against: int, chance: float, settings: VerifySettings) -> bool:
     """True if matches surely agree on a rotation, and no translation explains as many more.
-
-    A false match, or one of a camera that moved, lies anywhere along its epipolar line.
 
     Args:
         support, against: numbers of witnesses that the rotation explains, and of others.
+        chance: that it explains a false match, or one of a camera that moved.
         settings: error rates.
     """
-    chance = MAX_PARALLAX_RAD / np.pi
     alarms = log10_false_alarms(support + against, support, chance, _SAMPLE_SIZE)
     significant = alarms < np.log10(settings.max_false_alarms)
     return bool(significant) and outweighs(support, against, settings.max_error_rate)

@@ -9,6 +9,7 @@ rotation in which the camera stores them. GoPro's `.360` holds two tracks of a c
 `gsba.video.cube_tracks`.
 """
 
+import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import tee
@@ -297,7 +298,8 @@ def _of_one_track(track: Track, size: tuple[int, int]) -> Recording:
     if 2 * size[0] == size[1] and two_circles(map(one_beside_other, looks[0]), track.path)[0]:
         note = f"{track.path}: raw, two fisheyes one above the other, front above"
         places = tuple((slice(at, at + side), slice(None)) for at in (0, side))
-        return Recording((track,), (timeline,), places, side, *everything, (note,))
+        notes = (note, *_hdr_notes(track.path, claims))
+        return Recording((track,), (timeline,), places, side, *everything, notes)
     found = recognise(looks[1], size, track.path)
     if found.lens_size is None and track.path.suffix.lower() == _RAW_SUFFIX and may_hold_two(size):
         note = f"{track.path}: raw, two fisheyes side by side, by its suffix"
@@ -317,9 +319,8 @@ def _of_one_track(track: Track, size: tuple[int, int]) -> Recording:
     if found.lens_size[1] < height:
         rows, unsqueezed = slice(None), side
     places = (rows, slice(side)), (rows, slice(side, None))
-    return Recording(
-        (track,), (timeline,), places, side, *everything, found.notes, height=unsqueezed
-    )
+    notes = (*found.notes, *_hdr_notes(track.path, claims))
+    return Recording((track,), (timeline,), places, side, *everything, notes, height=unsqueezed)
 
 
 def _refuse_claims(video: Path, claims: PictureClaims) -> None:
@@ -357,8 +358,7 @@ def _claim_notes(video: Path, claims: PictureClaims) -> list[str]:
         )
     if claims.pixel_aspect != 1:
         notes.append(f"{video}: pixels of {claims.pixel_aspect} are made square")
-    if claims.hdr:
-        notes.append(f"{video}: HDR ({claims.hdr}), converted to sRGB; brighter than white clips")
+    notes += _hdr_notes(video, claims)
     if any(claims.pose_deg):
         turn = ", ".join(f"{angle:g}" for angle in claims.pose_deg)
         notes.append(
@@ -366,6 +366,13 @@ def _claim_notes(video: Path, claims: PictureClaims) -> list[str]:
             "stored"
         )
     return notes
+
+
+def _hdr_notes(video: Path, claims: PictureClaims) -> list[str]:
+    """Note on pictures of HDR, which raw lenses may have, too."""
+    if not claims.hdr:
+        return []
+    return [f"{video}: HDR ({claims.hdr}), converted to sRGB; brighter than white clips"]
 
 
 def _of_two_tracks(
@@ -388,7 +395,9 @@ def _of_two_tracks(
             f"{ours[-1]:.3f} s, {other} {theirs[0]:.3f} to {theirs[-1]:.3f} s): they are not of "
             "one recording; copy it again from the camera"
         )
-    notes, num = [note], int(shown.sum())
+    paths = dict.fromkeys(track.path for track in tracks)
+    hdr = {path: _hdr_notes(path, read_claims(Track(path))) for path in paths}
+    notes, num = [note, *itertools.chain(*hdr.values())], int(shown.sum())
     if num < max(len(ours), len(theirs)):
         notes.append(
             f"{where}: {len(ours) + len(theirs) - 2 * num} instants are left out, which only one "

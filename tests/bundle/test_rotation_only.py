@@ -1,5 +1,7 @@
 """A camera that only turns: rotations and their covariances, without any point."""
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 from synthetic import RIG, unit, with_noise
@@ -63,3 +65,22 @@ def test_exact_rays_give_exact_rotations() -> None:
                           keypoints.colors)  # fmt: skip
     found, _, _ = rotation_only.solve(_drifting(rotations), tracks, keypoints)
     assert rotation_angle(np.swapaxes(rotations, 1, 2) @ found).max() < 1e-8
+
+
+def test_covariances_cover_the_parallax_of_a_hand() -> None:
+    """In a room, what a hand of 3 cm moves looks alike all over a wall: no noise of a point."""
+    rotations, tracks, keypoints = _scene(false_share=0.0)
+    rng = np.random.default_rng(3)
+    rays, corner = unit(rng.normal(size=(DIRECTIONS, 3))), np.array([1.2, 1.0, 3.0])
+    walls = np.where(rays > 0, corner, 4.5 - corner)
+    points = rays * np.min(walls / np.abs(rays), axis=1)[:, None]
+    hand = rng.normal(0, 0.03, (NUM, 3))
+    seen = [
+        with_noise(unit(points - at) @ turn, SIGMA, rng)
+        for at, turn in zip(hand, rotations, strict=True)
+    ]
+    moved = replace(keypoints, bearings_rig=np.concatenate(seen))
+    found, covariances, _ = rotation_only.solve(_drifting(rotations), tracks, moved)
+    errors = Rotation.from_matrix(np.swapaxes(rotations, 1, 2) @ found).as_rotvec()
+    squares = [e @ np.linalg.solve(c, e) for e, c in zip(errors[1:], covariances[1:], strict=True)]
+    assert 0.1 < np.mean(squares) / 3 < 3

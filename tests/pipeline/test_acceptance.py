@@ -1,7 +1,9 @@
 """A run whose images determine no positions is refused, and one on a vehicle is named so."""
 
+import importlib
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -10,6 +12,7 @@ import pytest
 from gsba.log import GsbaError
 from gsba.pipeline.acceptance import (
     MIN_STEP_SIGMAS,
+    NoPositions,
     refuse_vehicle_in_pieces,
     require_motion,
     share_ahead,
@@ -108,3 +111,35 @@ def test_a_way_in_pieces_is_refused_on_a_vehicle(tmp_path: Path) -> None:
     refuse_vehicle_in_pieces(_frames(tmp_path, 8))
     with pytest.raises(GsbaError, match=r"the camera was lost on the way.*a part that holds"):
         refuse_vehicle_in_pieces(_frames(tmp_path, 16))
+
+
+@pytest.mark.parametrize(
+    ("guided", "followed", "proved", "rotations"),
+    [
+        (False, False, True, True),
+        (True, True, True, True),  # the odometry of the same images
+        (True, False, True, False),  # a trajectory of the user's
+        (False, False, False, False),
+    ],
+)
+def test_rotations_alone_are_refined_where_a_turn_is_proved(
+    monkeypatch: pytest.MonkeyPatch, guided: bool, followed: bool, proved: bool, rotations: bool
+) -> None:
+    turn, result = SimpleNamespace(prior=None), object()
+
+    def no_map(_: object) -> None:
+        raise NoPositions("the images determine no positions")
+
+    module = importlib.import_module("gsba.pipeline.refine")
+    monkeypatch.setattr(module, "_solve_raw", no_map)
+    monkeypatch.setattr(module.frontend, "extract", lambda run: run)
+    monkeypatch.setattr(module.frontend, "prove_turn", lambda _: turn if proved else None)
+    monkeypatch.setattr(module.backend, "reconstruct", lambda _: result)
+    monkeypatch.setattr(module.acceptance, "require_motion", lambda *_: None)
+    evidence, coarse = SimpleNamespace(recordings=()), SimpleNamespace(absent=not guided)
+    run = SimpleNamespace(evidence=evidence, coarse=coarse, frames=None)
+    if rotations:
+        assert module._solve_or_turn(run, followed) == (turn, result)
+        return
+    with pytest.raises(NoPositions, match="determine no positions"):
+        module._solve_or_turn(run, followed)

@@ -21,6 +21,7 @@ from gsba.geometry import pose, rotation_angle
 from gsba.log import GsbaError
 from gsba.similarity import Sim3
 from gsba.store.store import load_stage
+from gsba.trajectory import turning
 from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.trajectory.joining import PLACES
 from gsba.types import FrameSet, PoseStatus, Reconstruction, Trajectory
@@ -201,7 +202,14 @@ def test_the_viewer_shows_the_largest_map_where_its_own_export_is(
     assert len(after.frames) == NUM_FRAMES
 
 
-def test_a_tripod_gives_rotations_only(tmp_path: Path) -> None:
+@pytest.mark.parametrize("at_once", [True, False])
+def test_a_tripod_gives_rotations_only(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at_once: bool
+) -> None:
+    """Proved by neighbours at once, or where a map was tried in vain."""
+    prove = turning.prove
+    if not at_once:
+        monkeypatch.setattr(turning, "prove", lambda *a: prove(*a) if len(a) == 4 else None)
     frames, num = tmp_path / "frames", 5
     frames.mkdir()
     turns = [[0.1 * np.sin(f), 0.5 * f, 0.05 * np.cos(f)] for f in range(num)]

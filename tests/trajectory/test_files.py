@@ -97,6 +97,7 @@ def test_rows_of_lost_frames_have_no_pose(tmp_path: Path, row: str) -> None:
         ("# only a comment\n", "holds no poses"),
         (TUM[0], "1 poses; at least 2"),
         ("1 2 3\n", "traj.txt:1: 3 values; want 8"),
+        ("1,2,3,4,0,0,0,1\n", "traj.txt:1: values separated by commas; want 8"),
         ("0,1,2,3,0,0,0,1\n", "separated by blanks"),
     ],
 )
@@ -192,7 +193,7 @@ def test_refused_stella_maps(tmp_path: Path) -> None:
     for key, value, message in [
         ("rot_cw", [0.0] * 4, "keyframe 1: quaternion is zero"),
         ("trans_cw", [0.0, float("nan"), 0.0], "keyframe 1: holds a number that is not finite"),
-        ("ts", 0.0, "timestamp 0.0 occurs twice"),
+        ("ts", 0.0, "timestamp 0.0 occurs twice: write each once, with all digits"),
     ]:
         bad = stella_map(np.stack([np.eye(4)] * 3), [0.0, 1.0, 2.0])
         bad["keyframes"]["1"][key] = value

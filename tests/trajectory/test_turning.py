@@ -17,16 +17,22 @@ EVERY_PAIR = [(f, f + gap) for gap in (1, 2, 4) for f in range(NUM_FRAMES - gap)
 
 
 def _seen(
-    step: float, num: int = 60, frames: list[tuple[int, int]] = EVERY_PAIR, nearest: float = 1.5
+    step: float,
+    num: int = 60,
+    frames: list[tuple[int, int]] = EVERY_PAIR,
+    nearest: float = 1.5,
+    hand: float = 0.0,
 ) -> tuple[VerifiedPairs, Keypoints]:
     """Pairs that match all of `num` points at 1.5 to 5 units, and their keypoints.
 
-    The camera moves by `step` units a frame. Relative poses are not needed for a proof.
+    The camera moves by `step` units a frame, the hand that holds it by `hand`, per axis. Relative
+    poses are not needed for a proof.
     """
     rng = np.random.default_rng(5)
     points = unit(rng.normal(size=(num, 3))) * rng.uniform(nearest, 5, (num, 1))
+    at = rng.normal(0, hand, (NUM_FRAMES, 3)) + np.outer(np.arange(NUM_FRAMES), [step, 0, 0])
     rays = [
-        with_noise(unit(points - [step * f, 0, 0]) @ rotation, SIGMA, rng)
+        with_noise(unit(points - at[f]) @ rotation, SIGMA, rng)
         for f, rotation in enumerate(ROTATIONS)
     ]
     bearings, count = np.concatenate(rays), num * NUM_FRAMES
@@ -67,6 +73,17 @@ def test_parallax_that_adds_up_over_several_frames_is_no_turn() -> None:
     near = [p for p, (f0, f1) in enumerate(pairs.matches.pairs) if f1 - f0 == 1]
     assert _prove(pairs.taken(near), keypoints) is not None  # .2 to .8 deg: no step shows it
     assert _prove(pairs, keypoints) is None
+
+
+def test_a_hand_may_move_where_no_position_is_claimed_but_not_walk() -> None:
+    """Over all gaps: a walk of 4 cm a frame, seen from 1.5 to 5 m, has 12 degrees of parallax."""
+    frames = [(f, f + gap) for gap in (1, 2, 4, 8) for f in range(NUM_FRAMES - gap)]
+    hand, walk = _seen(0.0, frames=frames, hand=0.05), _seen(0.04, frames=frames)
+    assert _prove(*hand) is None
+    most = turning.MAX_HAND_PARALLAX_RAD
+    turn = turning.prove(*hand, VerifySettings(), most)
+    assert turn is not None and turn.frames.all()
+    assert turning.prove(*walk, VerifySettings(), most) is None
 
 
 def test_few_matches_prove_a_turn_only_if_all_agree() -> None:

@@ -15,7 +15,8 @@ from gsba.config import RefineSettings, VideoSettings
 from gsba.log import GsbaError
 from gsba.pipeline.inputs import extract_frames
 from gsba.store.store import RunStore
-from gsba.video import extract, extraction, is_video
+from gsba.video import extract, extraction, is_video, recording
+from gsba.video.claims import PictureClaims
 from gsba.video.recording import read_recording
 
 av = pytest.importorskip("av", reason="PyAV is not installed")
@@ -131,6 +132,12 @@ def test_two_tracks(tmp_path: Path, suffix: str) -> None:
     counts = extract(video, tmp_path / "frames", VideoSettings(every=3, standing_deg=0))
     assert (counts.received, counts.kept) == (40, 14)
     _check_shown(tmp_path / "frames", list(range(0, 40, 3)), ticks)
+
+
+def test_hdr_of_raw_lenses_is_noted(film: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recording, "read_claims", lambda _: PictureClaims(hdr="HLG"))
+    notes = read_recording(film).notes
+    assert f"{film}: HDR (HLG), converted to sRGB; brighter than white clips" in notes
 
 
 def test_tracks_out_of_step(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
