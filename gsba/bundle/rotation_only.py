@@ -92,8 +92,8 @@ def solve(
     covariances = np.zeros((num, 3, 3))
     if system is not None:
         covariances[1:] = noise**2 * _diagonal_blocks(system)
-        turned = found, bearings, bases, residuals, weights / sigmas
-        covariances *= _excess(rotations, sigmas, noise, turned)[:, None, None]
+        linearised = found, bearings, bases, residuals, weights / sigmas
+        covariances *= _excess(rotations, sigmas, noise, linearised)[:, None, None]
     used = np.bincount(found.frames[weights > 0.1], minlength=num)
     logger.info("rotations of %d frames from %d observations", num, int(used.sum()))
     return rotations, covariances, used
@@ -147,7 +147,7 @@ def _excess(
     rotations: np.ndarray,
     sigmas: np.ndarray,
     noise: float,
-    turned: tuple[Tracks, np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+    linearised: tuple[Tracks, np.ndarray, np.ndarray, np.ndarray, np.ndarray],
 ) -> np.ndarray:
     """Factors (F,), at least 1, by which covariances of rotations grow as residuals of a region of
     the sphere are alike: those of a hand that moves are the parallax of what is seen there.
@@ -159,10 +159,10 @@ def _excess(
         rotations: (F, 3, 3) solved.
         sigmas: (O,) of the observations, radians.
         noise: their factor.
-        turned: tracks, bearings (O, 3), bases (O, 2, 3), residuals (O, 2) in sigmas, and weights
-            over sigmas (O,), of the last iteration.
+        linearised: tracks, bearings (O, 3), bases (O, 2, 3), residuals (O, 2) in sigmas, and
+            weights over sigmas (O,), of the last iteration.
     """
-    found, bearings, bases, residuals, pulls = turned
+    found, bearings, bases, residuals, pulls = linearised
     axes = np.cross(np.eye(3)[None], bearings[:, None, :])
     jacobian = np.einsum("oij,ojl,okl->oik", bases, rotations[found.frames], axes)
     gradients = np.einsum("oik,oi,o->ok", jacobian, residuals, pulls)
