@@ -1,6 +1,7 @@
 """Learned matchers between overlapping faces of two frames."""
 
 from collections.abc import Mapping
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,8 @@ from gsba.types import FACES, Features
 _PARALLAX_RAD = np.deg2rad(10.0)  # assumed for near points, to find overlapping faces
 _MIN_OVERLAP = 0.05  # share of a face's keypoints that should be on the other one
 _MIN_KEYPOINTS = 8  # on either face
+# Pairs of faces that may show the same where the heading is unknown, as cameras are held upright.
+_UPRIGHT_FACES = [*product(range(4), range(4)), (4, 4), (5, 5)]
 
 
 def make_matcher(settings: RefineSettings, weights: Mapping[str, Path], size: int) -> Matcher:
@@ -55,11 +58,12 @@ def make_matcher(settings: RefineSettings, weights: Mapping[str, Path], size: in
 class FaceMatcher:
     """Matcher (`gsba.matching.guided_search`) that applies a network to pairs of faces.
 
-    It replaces guided search between neighbours in time, along epipolar lines, and at loops. The
-    network gets only pairs of faces that overlap by the predicted pose, and only its matches inside
-    the gate are kept, so that the gate and then two-view verification remove matches of repetitive
-    structure. Known points with a gate of a fraction of a degree, and pairs without a predicted
-    pose, are matched by `guided`.
+    It replaces guided search between neighbours in time, along epipolar lines, at loops, and where
+    nothing predicts the pose of neighbours. The network gets only pairs of faces that overlap by
+    the predicted pose, and only its matches inside the gate are kept, so that the gate and then
+    two-view verification remove matches of repetitive structure. Without a prediction, each side
+    is compared with all sides, up with up and down with down. Known points with a gate of a
+    fraction of a degree are matched by `guided`.
     """
 
     def __init__(self, network: FaceNetwork, size: int) -> None:
@@ -78,7 +82,8 @@ class FaceMatcher:
         chosen = [strongest_of(found, frames.strongest) for found in (first, second)]
         bearings = first.bearings_rig[chosen[0]], second.bearings_rig[chosen[1]]
         rows, scores = [np.zeros((0, 2), np.int64)], [np.zeros(0)]
-        for faces in overlapping_faces(*bearings, f0_T_f1):
+        predicted = gate.is_prediction or points_f0 is not None
+        for faces in overlapping_faces(*bearings, f0_T_f1) if predicted else _UPRIGHT_FACES:
             k0, k1 = (
                 some[found.faces[some] == face]
                 for some, found, face in zip(chosen, (first, second), faces, strict=True)

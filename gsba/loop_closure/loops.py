@@ -6,7 +6,7 @@ more drift than the path can have, or contradict one another.
 """
 
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -67,7 +67,7 @@ def close(
     looks = global_descriptors(context.strongest, num, settings.seed, context.workers, scratch)
     held = _sharing_points(solved.landmarks.tracks, num)
     chosen = candidates(looks, solved, unseen, settings, held)
-    strongest = replace(context, frames=context.strongest)
+    strongest = context.of_strongest()
     verified = recovery.match_anywhere(strongest, chosen)
     loops = _measured_loops(verified, keypoints, solved, settings.seed)
     poses, depth = solved.world_T_rigs, solved.median_depth()

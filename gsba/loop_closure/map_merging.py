@@ -25,7 +25,7 @@ from gsba.loop_closure.pose_graph import Loop
 from gsba.loop_closure.registration import Resection, resect
 from gsba.loop_closure.retrieval import global_descriptors
 from gsba.matching import pairs, recovery
-from gsba.matching.guided_search import Gate, MatchContext
+from gsba.matching.guided_search import Gate, MatchContext, guided
 from gsba.similarity import Sim3
 from gsba.trajectory.judgement import long_steps, over_missing_frames
 from gsba.types import Counts, Matches, Solution
@@ -239,10 +239,11 @@ class _Joining:
             np.unique([*sampled, *range(_BREAK_REACH_FRAMES), *range(-_BREAK_REACH_FRAMES, 0)])
         ]
         chosen = self._candidates(sampled, inside, _NUM_CANDIDATES)
-        meetings = self._meetings(replace(self.context, frames=self.context.strongest), chosen)
+        meetings = self._meetings(self.context.of_strongest(), chosen)
         found = self._best(part, meetings, rows, inside)
         if meetings and found is None:  # perhaps too few: search around the best
-            meetings += self._meetings(self.context, self._around(meetings, rows, inside, chosen))
+            searched = replace(self.context, matcher=guided)
+            meetings += self._meetings(searched, self._around(meetings, rows, inside, chosen))
             found = self._best(part, meetings, rows, inside)
         return found or self._over_break(part, rows, inside)
 
@@ -508,7 +509,8 @@ class _Joining:
         """Keypoints (m,) of a frame and the map points (m, 3) that each may observe."""
         nowhere = np.tile(np.eye(4), (len(self.parts), 1, 1))
         gates = [Gate.anywhere()] * len(chosen)
-        found = self.context.match(chosen, nowhere, gates, strongest=strongest)
+        how = {"strongest": strongest, "guided_only": True}
+        found = self.context.match(chosen, nowhere, gates, **how)
         return _each_once(*self._points_seen(found, 0), self.depth)
 
     def _points_seen(self, matches: Matches, column: int) -> tuple[np.ndarray, np.ndarray]:

@@ -109,7 +109,8 @@ def match_along_epipolars(
         _gate(refined.rotation_deg, refined.direction + apart / max(length, 1e-12), settings)
         for length in lengths
     ]
-    return context.match(chosen, poses, gates)
+    # A learned matcher adds nothing where poses are known this well.
+    return context.match(chosen, poses, gates, guided_only=True)
 
 
 def match_across(

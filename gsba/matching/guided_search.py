@@ -51,13 +51,18 @@ class Gate:
         """A gate around predicted points only."""
         return cls(np.pi, 1.0, np.pi, min(radius_rad, np.pi))
 
+    @property
+    def is_prediction(self) -> bool:
+        """False if every rotation passes."""
+        return self.rotation_rad < np.pi
+
     def chance(self, max_error_rad: float) -> float:
         """Probability that a false match within the gate lies within `max_error_rad` of the
         predicted epipolar plane; 0 = nothing is predicted."""
         if self.point_rad > 0:
             return min(4 * max_error_rad / (np.pi * self.point_rad), 1.0)  # area of a strip of a
             # disc
-        return 0.0 if self.rotation_rad >= np.pi else min(max_error_rad / self.rotation_rad, 1.0)
+        return min(max_error_rad / self.rotation_rad, 1.0) if self.is_prediction else 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -345,6 +350,10 @@ class MatchContext:
     workers: Workers  # workers that match pairs
     matcher: Matcher = guided  # compares two frames
     cameras: Cameras = ONE_CAMERA  # cameras of the keypoints
+
+    def of_strongest(self) -> "MatchContext":
+        """Guided search among the strongest keypoints, for pairs of which few show one place."""
+        return replace(self, frames=self.strongest, matcher=guided)
 
     def match(
         self,

@@ -6,7 +6,7 @@ import numpy as np
 
 from gsba.config import RefineSettings
 from gsba.geometry import angles_between, inverse, rotation_angle
-from gsba.matching import pairs, verification
+from gsba.matching import guided_search, pairs, verification
 from gsba.matching.correspondences import verified
 from gsba.matching.guided_search import Gate, MatchContext
 from gsba.trajectory import clock, joining, judgement, misread, turning
@@ -253,7 +253,8 @@ def _match_along(
 def match_anywhere(context: MatchContext, chosen: np.ndarray, rivals: bool = True) -> VerifiedPairs:
     """Match whole panoramas without any prediction, and verify their geometry.
 
-    The strongest features are tried first, then all for pairs that these leave open.
+    The strongest features are tried first, then all for pairs that these leave open. A learned
+    matcher, whose matches of all features are few and right, gets all at once.
 
     Args:
         context: features and settings of the run.
@@ -264,12 +265,12 @@ def match_anywhere(context: MatchContext, chosen: np.ndarray, rivals: bool = Tru
 
     def match(some: np.ndarray, strongest: bool) -> VerifiedPairs:
         gates = [Gate.anywhere()] * len(some)
-        # Nothing predicts which faces a learned matcher should compare.
-        found = context.match(some, nowhere, gates, strongest=strongest, guided_only=True)
+        found = context.match(some, nowhere, gates, strongest=strongest)
         return verified(found, gates, None, None, context, rivals)
 
-    first = match(chosen, strongest=True)
-    if context.strongest is context.frames:
+    guided = context.matcher is guided_search.guided
+    first = match(chosen, strongest=guided)
+    if context.strongest is context.frames or not guided:
         return first
     rest = first.missing(chosen)
     return VerifiedPairs.joined([first, match(rest, strongest=False)]) if len(rest) else first

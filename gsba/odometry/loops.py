@@ -1,7 +1,6 @@
 """Loops within one map, accepted by the test that judges joins of maps."""
 
 import logging
-from dataclasses import replace
 
 import numpy as np
 
@@ -47,7 +46,7 @@ def find_loops(places: Places, unseen: np.ndarray) -> list[Constraint]:
     solved, context, num = places.solved, places.context, len(places.keyframes)
     looks = global_descriptors(context.strongest, num, context.settings.seed, context.workers)
     chosen = loops.candidates(looks, solved, unseen, context.settings)
-    strongest = replace(context, frames=context.strongest)
+    strongest = context.of_strongest()
     verified = recovery.match_anywhere(strongest, chosen, rivals=False)
     test = _join_test(places)
     none = np.zeros(0, np.int64)  # the later place of each pair moves to the earlier one
