@@ -10,6 +10,7 @@ import torch  # pyright: ignore[reportMissingImports]
 from gsba.features.detection import FaceKeypoints
 from gsba.learned.device import device, inference
 from gsba.learned.weights import load_into, read_state
+from gsba.log import GsbaError
 
 _MIN_SCORE = 0.1  # published value
 _UNUSED = re.compile(r"log_assignment\.\d+\.r")  # tensors of disk_lightglue.pth that nothing reads
@@ -50,7 +51,17 @@ class LightGlue:
     def __call__(
         self, first: FaceKeypoints, second: FaceKeypoints, size: int
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Matches (m, 2) of keypoints of two faces of `size` pixels, and their scores (m,)."""
+        """Matches (m, 2) of keypoints of two faces of `size` pixels, and their scores (m,).
+
+        Raises:
+            GsbaError: descriptors of another length than the network's (ALIKED-T16's).
+        """
+        given, taken = first.descriptors.shape[1], self._model.conf.input_dim
+        if given != taken:
+            raise GsbaError(
+                f"LightGlue takes descriptors of {taken} values, but features.weights gives "
+                f"{given}: use another model, e.g. --weights aliked-n16.pth"
+            )
         with inference():
             found = self._model({"image0": _image(first, size), "image1": _image(second, size)})
         return found["matches"][0].cpu().numpy(), found["scores"][0].cpu().numpy()

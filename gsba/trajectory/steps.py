@@ -17,7 +17,7 @@ _MIN_COMMON = 8  # least common points of two steps whose lengths are compared
 _MAX_LOG_DEVIATION = 0.15  # largest deviation of log ratios: points of rigid scenes are within it,
 # half of them within .02
 _CHANCE_OF_RATIO = 0.1  # probability that the ratio of a false match is within it of another one
-_MAX_FALSE_RATIOS = 1e-3  # expected number of such ratios by chance
+_MAX_FALSE_RATIOS = 1e-2  # expected number of such ratios by chance, if each had ten solutions
 _MIN_TRIANGULATION_ANGLE_RAD = np.deg2rad(1.0)  # least triangulation angle of a point whose depth
 # is compared
 _MAX_STILL_RESIDUAL_RAD = np.deg2rad(0.1)  # median bearing residual after a mere rotation, below

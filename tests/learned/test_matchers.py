@@ -122,7 +122,7 @@ def test_contract(
 
 
 def _asked(
-    found: tuple[Features, Features], f0_T_f1: np.ndarray
+    found: tuple[Features, Features], f0_T_f1: np.ndarray, gate: Gate = GATE
 ) -> tuple[list[tuple[str, str]], list[tuple]]:
     """Pairs of faces that the network was shown, in order, and what it was shown."""
     shown = []
@@ -132,7 +132,7 @@ def _asked(
         return np.zeros((0, 2), int), np.zeros(0)
 
     FaceMatcher(network, RIG.size)(
-        _frames(found), (0, 1), f0_T_f1, GATE, _settings("sift").matching
+        _frames(found), (0, 1), f0_T_f1, gate, _settings("sift").matching
     )
     names = [
         tuple(
@@ -163,6 +163,23 @@ def test_only_faces_that_should_overlap_are_compared() -> None:
     asked = _asked(views, half)[0]
     assert ("front", "front") in asked and ("right", "front") in asked
     assert ("back", "front") not in asked and ("front", "right") not in asked
+
+
+def test_without_a_prediction_each_side_meets_all_sides() -> None:
+    sides, views = FACES[:4], (_all_around(0), _all_around(1))
+    asked = _asked(views, np.eye(4), Gate.anywhere())[0]
+    assert sorted(asked) == sorted(
+        [*((one, other) for one in sides for other in sides), ("up", "up"), ("down", "down")]
+    )
+
+
+def test_descriptors_of_another_length_are_one_line(
+    matcher_file: Callable[[str, str], Path],
+) -> None:
+    short = detection.FaceKeypoints(np.full((9, 2), 5.0), np.ones(9), np.ones((9, 64), np.float32))
+    network = LightGlue("aliked", matcher_file("lightglue", "aliked"))
+    with pytest.raises(GsbaError, match=r"128 values, but features\.weights gives 64.*aliked-n16"):
+        network(short, short, 96)
 
 
 def test_near_points_may_cross_to_the_next_face() -> None:

@@ -11,7 +11,7 @@ from synthetic import bearings_of, features_of, unit, with_noise
 from gsba.config import RefineSettings
 from gsba.features import detection
 from gsba.geometry import inverse, pose, rotation_angle
-from gsba.matching import correspondences, recovery
+from gsba.matching import correspondences, guided_search, recovery
 from gsba.matching.guided_search import MatchContext, SearchableFrames
 from gsba.matching.recovery import Recovered
 from gsba.similarity import Sim3
@@ -230,3 +230,21 @@ def test_a_look_alike_at_a_lost_step_is_not_taken_where_matching_misleads() -> N
         assert (
             unit(step[:3, 3]) @ unit(TRUTH[4, :3, 3] - TRUTH[3, :3, 3]) > 0.99
         ) == misleading_walk
+
+
+def test_a_learned_matcher_gets_all_keypoints_of_unpredicted_pairs_at_once() -> None:
+    context, asked = _context(), []
+
+    def matcher(frames, *given):
+        asked.append(frames)
+        return guided_search.guided(frames, *given)
+
+    frames = context.frames
+    strongest = SearchableFrames(_scene()[0].features, 10)
+    context = replace(context, strongest=strongest, matcher=matcher)
+    pairs = np.array([[0, 1], [1, 2]])
+    assert len(recovery.match_anywhere(context, pairs).matches.pairs) == 2
+    assert len(asked) == 2 and all(one is frames for one in asked)
+    asked.clear()
+    recovery.match_anywhere(context.of_strongest(), pairs)
+    assert not asked
