@@ -93,7 +93,7 @@ def measure(name: str, path: Path, size: int) -> str:
     settings = RefineSettings.model_validate({"features": chosen})
     extractor = make_extractor(settings.features, find_weights(settings))()
     rig = CubeRig(size, np.deg2rad(settings.cubemap.hfov_deg))
-    panorama = cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB)
+    panorama = np.asarray(cv2.imread(str(path), cv2.IMREAD_COLOR_RGB))
     start = time.process_time()
     first = detection.extract(cubemap.cut(panorama, rig), None, rig, extractor)
     cost = (time.process_time() - start) / 6

@@ -509,8 +509,8 @@ class _Joining:
         """Keypoints (m,) of a frame and the map points (m, 3) that each may observe."""
         nowhere = np.tile(np.eye(4), (len(self.parts), 1, 1))
         gates = [Gate.anywhere()] * len(chosen)
-        how = {"strongest": strongest, "guided_only": True}
-        found = self.context.match(chosen, nowhere, gates, **how)
+        searched = replace(self.context, matcher=guided)
+        found = searched.match(chosen, nowhere, gates, strongest=strongest)
         return _each_once(*self._points_seen(found, 0), self.depth)
 
     def _points_seen(self, matches: Matches, column: int) -> tuple[np.ndarray, np.ndarray]:
