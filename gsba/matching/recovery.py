@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsba.config import RefineSettings
-from gsba.geometry import angles_between, inverse, rotation_angle
-from gsba.matching import guided_search, pairs, verification
+from gsba.geometry import inverse
+from gsba.matching import guided_search, pairs
 from gsba.matching.correspondences import verified
 from gsba.matching.guided_search import Gate, MatchContext
 from gsba.trajectory import clock, joining, judgement, misread, turning
@@ -35,13 +35,8 @@ _FAR_STEP_DEPTHS = 0.5  # steps from which repeated structure may mislead, media
 _NUM_TRIED_STEPS = 24  # steps that show whether it does
 _MAX_MISLED_SHARE = 0.15  # largest share of steps not found with which matches are believed: at
 # most .08 in flats, .33 and more in most halls of bays
-# Gates around a relative pose, each around the pose that matches of the one before determine: one
-# estimated from twenty matches is off by up to 2 degrees, and its direction by 4.
-_REMATCHING_GATES = (
-    Gate(np.deg2rad(3.0), 0.06, np.pi),
-    Gate(np.deg2rad(1.5), 0.03, np.pi),
-    Gate(np.deg2rad(0.7), 0.03, np.pi),
-)
+_REMATCHING_GATE = Gate(np.deg2rad(1.5), 0.03, np.pi)  # around relative poses estimated from few
+# matches
 
 
 @dataclass(frozen=True, slots=True)
@@ -277,56 +272,30 @@ def match_anywhere(context: MatchContext, chosen: np.ndarray, rivals: bool = Tru
 
 
 def match_again(context: MatchContext, found: VerifiedPairs, steps: set[int]) -> VerifiedPairs:
-    """Match steps again with all keypoints along the epipolar lines found, and fit them anew.
-
-    The matches found have proved each pose: those within a gate around it need only be more than
-    chance brings there.
+    """Match steps again with all keypoints along the epipolar lines found, and verify them anew.
 
     Args:
         context: features and settings of the run.
         found: neighbours.
         steps: first frames of the steps; each keeps the pose with more inliers.
     """
-    for gate in _REMATCHING_GATES:
-        rows = [
-            p
-            for p, (f0, f1) in enumerate(found.matches.pairs.tolist())
-            if f1 - f0 == 1 and f0 in steps and np.isfinite(found.direction_sigmas[p])
-        ]
-        if not rows:
-            break
-        again, replaced = _matched_within(context, found.taken(rows), gate)
-        before = {rows[n] for n in replaced}
-        kept = found.taken([p for p in range(len(found.matches.pairs)) if p not in before])
-        found = VerifiedPairs.joined([kept, again])
-    return found
-
-
-def _matched_within(
-    context: MatchContext, steps: VerifiedPairs, gate: Gate
-) -> tuple[VerifiedPairs, list[int]]:
-    """Steps (n,) with more inliers among all matches within a gate, and their rows."""
-    settings, chosen = context.settings.verify, steps.matches.pairs
-    along = np.tile(np.eye(4), (len(context.keypoints.starts) - 2, 1, 1))
-    along[chosen[:, 0]] = steps.f0_T_f1s
-    matches = context.match(chosen, chained(along), [gate] * len(chosen), guided_only=True)
-    chance, estimates = gate.chance(np.deg2rad(settings.max_error_deg)), []
-    for p, before in enumerate(steps.f0_T_f1s):
-        rays = context.keypoints.matched(chosen[p], matches.of(p))
-        fit = verification.relative_pose(*rays, settings, context.settings.seed, chance, sample=0)
-        if fit is not None and fit.inliers.sum() <= len(steps.matches.of(p)):
-            fit = None
-        near = fit is not None and _is_near(fit.f0_T_f1, before, gate)
-        estimates.append(fit if near else None)
-    again = verification.agree_with_prior(matches, estimates, None, None, settings)
-    return again, [p for p, fit in enumerate(estimates) if fit is not None]
-
-
-def _is_near(pose: np.ndarray, before: np.ndarray, gate: Gate) -> bool:
-    """True if a relative pose (4, 4) lies within the gate around the one before."""
-    turned = rotation_angle(pose[:3, :3].T @ before[:3, :3])
-    moved = angles_between(pose[:3, 3], before[:3, 3])
-    return bool(turned < gate.rotation_rad and np.tan(moved) < gate.direction + gate.rotation_rad)
+    chosen = [
+        p
+        for p, (f0, f1) in enumerate(found.matches.pairs.tolist())
+        if f1 - f0 == 1 and f0 in steps and np.isfinite(found.direction_sigmas[p])
+    ]
+    better = []
+    for p in chosen:
+        poses = np.tile(np.eye(4), (len(context.keypoints.starts) - 1, 1, 1))
+        poses[found.matches.pairs[p, 1]] = found.f0_T_f1s[p]
+        pair, gates = found.matches.pairs[p : p + 1], [_REMATCHING_GATE]
+        matches = context.match(pair, poses, gates, guided_only=True)
+        again = verified(matches, gates, None, None, context, rivals=True)
+        if len(again.matches.pairs) and len(again.matches.of(0)) > len(found.matches.of(p)):
+            better.append((p, again))
+    replaced = {p for p, _ in better}
+    kept = found.taken([p for p in range(len(found.matches.pairs)) if p not in replaced])
+    return VerifiedPairs.joined([kept, *(again for _, again in better)])
 
 
 def _check_steps(

@@ -170,7 +170,6 @@ def relative_pose(
     seed: int,
     chance: float = 0.0,
     rivals: bool = False,
-    sample: int = _SAMPLE_SIZE,
 ) -> RelativePose | None:
     """The relative pose with the most inliers, or None if chance explains as many.
 
@@ -179,10 +178,8 @@ def relative_pose(
         settings: thresholds.
         seed: of the sampling.
         chance, rivals: see `estimate_relative_poses`.
-        sample: matches that choose the pose; 0 = other matches have proved the pose within whose
-            gate these were found.
     """
-    found = _significant_pose(bearings0, bearings1, settings, seed, chance, sample)
+    found = _significant_pose(bearings0, bearings1, settings, seed, chance)
     if found is None:
         return None
     f0_T_f1, inliers = found
@@ -197,7 +194,6 @@ def _significant_pose(
     settings: VerifySettings,
     seed: int,
     chance: float = 0.0,
-    sample: int = _SAMPLE_SIZE,
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """f0_T_f1 (4, 4) with unit translation and inliers (m,) bool of the best pose; None if chance
     explains as many."""
@@ -205,7 +201,7 @@ def _significant_pose(
 
     def needed(of_match: float) -> int:
         of_witness = 1 - (1 - of_match) ** (len(bearings0) / num)
-        return least_agreeing(num, of_witness, sample, settings.max_false_alarms)
+        return least_agreeing(num, of_witness, _SAMPLE_SIZE, settings.max_false_alarms)
 
     if len(bearings0) <= _SAMPLE_SIZE or needed(max(chance, largest)) > num:
         return None

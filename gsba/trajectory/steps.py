@@ -10,14 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsba.geometry import inverse, nearest_rotation, rotation_angle
-from gsba.significance import least_agreeing
 from gsba.types import Keypoints, VerifiedPairs
 
 _MIN_COMMON = 8  # least common points of two steps whose lengths are compared
 _MAX_LOG_DEVIATION = 0.15  # largest deviation of log ratios: points of rigid scenes are within it,
 # half of them within .02
-_CHANCE_OF_RATIO = 0.1  # probability that the ratio of a false match is within it of another one
-_MAX_FALSE_RATIOS = 1e-2  # expected number of such ratios by chance, if each had ten solutions
 _MIN_TRIANGULATION_ANGLE_RAD = np.deg2rad(1.0)  # least triangulation angle of a point whose depth
 # is compared
 _MAX_STILL_RESIDUAL_RAD = np.deg2rad(0.1)  # median bearing residual after a mere rotation, below
@@ -152,8 +149,8 @@ def length_ratios(
         pairs: pairs of frames at most a few apart.
         found: steps of these pairs.
         keypoints: keypoints of all frames.
-        least_alike: points that suffice if they agree on one ratio to 15 %, and more do than chance
-            explains; None = eight points, however they agree.
+        least_alike: points that suffice if they agree on one ratio to 15 %; None = eight points,
+            however they agree.
 
     Returns:
         Logarithms (F - 2,) of the ratios and their standard deviations, infinite where unknown.
@@ -179,24 +176,13 @@ def length_ratios(
         ratios = np.log(back / ahead)
         ratios = ratios[np.isfinite(ratios)]
         if least_alike is not None and len(ratios):
-            ratios = _most_alike(ratios)
+            ratios = ratios[np.abs(ratios - np.median(ratios)) < _MAX_LOG_DEVIATION]
         if len(ratios) < (_MIN_COMMON if least_alike is None else least_alike):
             continue
         logs[f - 1] = np.median(ratios)
         spread = 1.4826 * np.median(np.abs(ratios - logs[f - 1]))
         sigmas[f - 1] = max(1.25 * spread / np.sqrt(len(ratios)), _MIN_LOG_RATIO_SIGMA)
     return logs, sigmas
-
-
-def _most_alike(logs: np.ndarray) -> np.ndarray:
-    """The largest number of logarithms (n,) of ratios that agree on one; none if chance explains
-    it."""
-    ordered = np.sort(logs)
-    ends = np.searchsorted(ordered, ordered + 2 * _MAX_LOG_DEVIATION, side="right")
-    first = int(np.argmax(ends - np.arange(len(ordered))))
-    alike = ordered[first : ends[first]]
-    least = least_agreeing(len(logs), _CHANCE_OF_RATIO, 1, _MAX_FALSE_RATIOS)
-    return alike if len(alike) >= least else alike[:0]
 
 
 def given_up(open_at: set[int], matches: np.ndarray) -> set[int]:

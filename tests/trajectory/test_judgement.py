@@ -9,7 +9,7 @@ from synthetic import RIG, bearings_of, drifted, loop_walk, unit, with_noise
 
 from gsba.config import PriorSettings, VerifySettings
 from gsba.geometry import inverse, pose, rotation_angle
-from gsba.trajectory import judgement, steps, turning
+from gsba.trajectory import judgement, turning
 from gsba.trajectory.judgement import StepChecks
 from gsba.trajectory.steps import chained, image_steps, length_ratios, off_steps, step_lengths
 from gsba.types import CoarsePoses, Counts, Keypoints, Matches, PoseSource, VerifiedPairs
@@ -347,13 +347,3 @@ def test_long_steps_back_and_forth_are_doubted_on_both_sides_of_the_frame(
     doubted = depths > 0.3 and not turned and shown
     np.testing.assert_array_equal(np.flatnonzero(found), [there - 1, there] if doubted else [])
     assert judgement.long_steps(poses, 1 / depths).all() == (depths > 0.3)
-
-
-def test_the_ratio_of_lengths_is_that_of_most_points() -> None:
-    rng = np.random.default_rng(0)
-    true, false = 0.5 + rng.uniform(-0.1, 0.1, 15), rng.uniform(-4, 4, 15)
-    found = steps._most_alike(np.concatenate([true, false]))
-    assert np.isin(true, found).all() and np.abs(found - 0.5).max() < 0.3
-    assert len(steps._most_alike(true[:5])) == 5 and len(steps._most_alike(true[:2])) == 0
-    alone = [len(steps._most_alike(rng.uniform(-4, 4, 20))) for _ in range(200)]
-    assert np.count_nonzero(alone) <= 1
