@@ -46,6 +46,7 @@ class LightGlue:
             for name, value in state.items()
             if name.partition(".")[0] in parts and not _UNUSED.fullmatch(name)
         }
+        self._length = model.conf.input_dim  # of a descriptor
         self._model = load_into(model, state, f"{extractor}-lightglue", weights)
 
     def __call__(
@@ -56,7 +57,7 @@ class LightGlue:
         Raises:
             GsbaError: descriptors of another length than the network's (ALIKED-T16's).
         """
-        given, taken = first.descriptors.shape[1], self._model.conf.input_dim
+        given, taken = first.descriptors.shape[1], self._length
         if given != taken:
             raise GsbaError(
                 f"LightGlue takes descriptors of {taken} values, but features.weights gives "
