@@ -44,7 +44,8 @@ class LightGlue:
         state = {
             name: value
             for name, value in state.items()
-            if name.partition(".")[0] in parts and not _UNUSED.fullmatch(name)
+            if name.partition(".")[0] in parts
+            and not (extractor == "disk" and _UNUSED.fullmatch(name))
         }
         self._length = model.conf.input_dim  # of a descriptor
         self._model = load_into(model, state, f"{extractor}-lightglue", weights)

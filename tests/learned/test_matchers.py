@@ -313,6 +313,17 @@ def test_lightglue_counts_pixels_from_the_first_centre(
     assert sent["image_size"].tolist() == [[96, 96]] and scores.tolist() == [0.5]
 
 
+def test_lightglue_of_disk_is_known_by_its_unused_tensors(
+    matcher_file: Callable[[str, str], Path], tmp_path: Path
+) -> None:
+    state = torch.load(matcher_file("lightglue", "disk"), weights_only=True)
+    path = tmp_path / "disk_lightglue.pth"
+    torch.save(state | {f"log_assignment.{n}.r": torch.ones(1) for n in range(9)}, path)
+    LightGlue("disk", path)
+    with pytest.raises(GsbaError, match="weights of another network than aliked-lightglue"):
+        LightGlue("aliked", path)
+
+
 @pytest.mark.parametrize("num", [40, 25])
 def test_superglue_is_that_of_the_paper(num: int, tmp_path: Path) -> None:
     """Random weights in the authors' layout give the probabilities of the paper's network, also
