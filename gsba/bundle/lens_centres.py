@@ -138,11 +138,12 @@ def stitched_for(
 ) -> StitchRadius:
     """Find the radius that panoramas are stitched for, centres, poses and points adjusted with it.
 
-    Where settings say it, that is it.
+    Where settings say it, that is it. Around lenses that were solved for without a radius it is a
+    first estimate: their distance is wrong where there is one.
 
     Args:
         landmarks: points and their observations.
-        keypoints: of these, as rays of two lenses, stitched at infinity.
+        keypoints: of these, as rays of the lenses so far.
         shown: (N, 3) directions of the keypoints in their pictures.
         solved: the map's poses, solved under these, and the noise of its observations.
         so_far: the lenses.
@@ -152,34 +153,28 @@ def stitched_for(
     if said is not None:
         reason, unknown = "" if said else "camera.stitch_radius_m says so", np.full(PARTS, np.nan)
         return StitchRadius(replace(so_far, inverse_stitch_radius=said), said, 0.0, unknown, reason)
-    frames = keypoints.frames()
+    frames, before = keypoints.frames(), so_far.inverse_stitch_radius
 
     def by_both(rows: np.ndarray, by_origin: np.ndarray, _: np.ndarray) -> np.ndarray:
-        directions, there = shown[rows], frames[rows]
-        starts = so_far.origins(directions, there)
-        by_near = by_inverse_stitch_radius(keypoints.bearings_rig[rows], starts)
+        directions, there, bearings = shown[rows], frames[rows], keypoints.bearings_rig[rows]
+        by_near = by_inverse_stitch_radius(bearings, so_far.origins(directions, there))
+        by_origin = by_origin + before * tangent_basis(bearings)
         return np.concatenate([so_far.by_centre(by_origin, directions, there), by_near], axis=2)
 
     systems, _ = models_of(landmarks, _MAX_OBSERVATIONS, keypoints, solved, context, by_both)
     if not systems:
         return StitchRadius(so_far, 0.0, np.nan, np.full(PARTS, np.nan), "too few points")
-    found, total, num = _step(systems), summed(systems), len(so_far.centre)
+    num = len(so_far.centre)
+    found, total = _step(systems), summed(systems)
     sigma = float(np.sqrt(np.linalg.inv(total.hessian)[num, num] / total.curvature))
-    centres = slice(num)
-    verdict = cross_validate(
-        systems, _step, lambda others: _step([each.of(centres) for each in others])
-    )
-    inverse_stitch_radius, shares = float(found[num]), verdict.shares
-    logger.info(
-        "stitched for a inverse_stitch_radius of %.3f (sigma %.3f)", inverse_stitch_radius, sigma
-    )
+    verdict = cross_validate(systems, _step, lambda others: _step_to(others, -before))
+    inverse_stitch_radius, shares = before + float(found[num]), verdict.shares
+    logger.info("inverse of the stitching radius: %.3f (sigma %.3f)", inverse_stitch_radius, sigma)
     reason = ""
     if not verdict.predicts or inverse_stitch_radius < _MIN_SIGMAS * sigma:
         reason = "as well stitched at infinity"
-    taken = replace(
-        so_far, centre=so_far.centre + found[:num], inverse_stitch_radius=inverse_stitch_radius
-    )
-    return StitchRadius(so_far if reason else taken, inverse_stitch_radius, sigma, shares, reason)
+    lenses = replace(so_far, inverse_stitch_radius=0.0 if reason else inverse_stitch_radius)
+    return StitchRadius(lenses, inverse_stitch_radius, sigma, shares, reason)
 
 
 def by_inverse_stitch_radius(bearings_rig: np.ndarray, origins_rig: np.ndarray) -> np.ndarray:
@@ -194,7 +189,19 @@ def by_inverse_stitch_radius(bearings_rig: np.ndarray, origins_rig: np.ndarray) 
 
 def _step(systems: Sequence[SharedModel]) -> np.ndarray:
     """Change of the parameters (K,) that minimises the cost of the parts."""
+    hessian, gradient = _second_order(systems)
+    return -np.linalg.solve(hessian, gradient)
+
+
+def _step_to(systems: Sequence[SharedModel], last: float) -> np.ndarray:
+    """As `_step`, where the last parameter changes by `last`."""
+    hessian, gradient = _second_order(systems)
+    rest = -np.linalg.solve(hessian[:-1, :-1], gradient[:-1] + last * hessian[:-1, -1])
+    return np.r_[rest, last]
+
+
+def _second_order(systems: Sequence[SharedModel]) -> tuple[np.ndarray, np.ndarray]:
+    """Hessian (K, K) and gradient (K,) of the parts' cost."""
     total = summed(systems)
     hessian = total.curvature * total.hessian
-    damping = 1e-9 * np.trace(hessian) * np.eye(len(hessian))
-    return -np.linalg.solve(hessian + damping, total.gradient)
+    return hessian + 1e-9 * np.trace(hessian) * np.eye(len(hessian)), total.gradient

@@ -111,20 +111,45 @@ def _find_lenses(state: State, sought: Sequence[int], prefix: str) -> State:
         if n == 0 and set(left) - set(raw):
             trial = frontend.match_along_epipolars(trial, f"{prefix}adjacent_lenses")
             trial = frontend.match_known_points(trial, f"{prefix}wide_lenses")
-    lenses, bent = list(trial.observed.cameras.lenses), False
     for camera in left:
-        if camera not in raw:
-            name = _named(run, f"{prefix}stitch_radius", camera)
-            radius = _from_features(trial, name, camera, _stitch_radius, StitchRadius)
-            map_ = map_.changed(camera, axes=guesses.get(camera), radius=radius)
-            if not radius.reason:
-                lenses[camera], bent = radius.lenses, True
-    if bent:
-        cameras = trial.observed.cameras.with_lenses(lenses)
-        trial = backend.adjust(trial.through(cameras), f"{prefix}lensed2", gates)
+        map_ = map_.changed(camera, axes=guesses.get(camera))
     trial = replace(trial, map=replace(map_, solution=trial.solution))
-    trial = _settle_cameras(trial, f"{prefix}settled")
+    trial = _with_stitch_radii(trial, [camera for camera in left if camera not in raw], prefix)
     return _calibrate_raw(trial, [camera for camera in left if camera in raw])
+
+
+def _with_stitch_radii(start: State, stitched: Sequence[int], prefix: str) -> State:
+    """Map and cameras solved together, with the radius that panoramas of cameras are stitched for.
+
+    The distance between lenses is wrong where the radius is left out, and the first estimate of the
+    radius with it: it is on trial where it is more than its standard deviation from infinity, and
+    judged once all is solved with it.
+    """
+    run, tried = start.run, list[int]()
+    for camera in stitched:
+        name = _named(run, f"{prefix}stitch_radius", camera)
+        first = _from_features(start, name, camera, _stitch_radius, StitchRadius)
+        start = replace(start, map=start.map.changed(camera, radius=first))
+        if not first.reason or first.inverse_stitch_radius > first.sigma:
+            tried.append(camera)
+            start = _stitched_for(start, camera, first.inverse_stitch_radius)
+    trial = _settle_cameras(start, f"{prefix}settled")
+    refused = list[int]()
+    for camera in tried:
+        name = _named(run, f"{prefix}stitch_radius_tried", camera)
+        radius = _from_features(trial, name, camera, _stitch_radius, StitchRadius)
+        trial = replace(trial, map=trial.map.changed(camera, radius=radius))
+        if radius.reason:
+            refused.append(camera)
+            start = replace(start, map=start.map.changed(camera, radius=radius))
+            start = _stitched_for(start, camera, 0.0)
+    return _settle_cameras(start, f"{prefix}settled_far") if refused else trial
+
+
+def _stitched_for(state: State, camera: int, inverse: float) -> State:
+    """The state with one camera's panoramas stitched for another radius, 1 / map units."""
+    lenses = replace(state.observed.cameras.lenses[camera], inverse_stitch_radius=inverse)
+    return _through(state, camera, lenses).with_lenses(camera, lenses)
 
 
 def _on_trial(

@@ -60,8 +60,11 @@ _TITLES = {
     "lenses+": "estimate lens centres, round {0}",
     "lensed+": "adjust under two lenses, round {0}",
     "stitch_radius": "estimate the stitching radius",
+    "stitch_radius_tried": "judge the stitching radius on trial",
     "settled_readout": "estimate the readout",
     "settled": "adjust poses and camera",
+    "settled_far_readout": "estimate the readout, stitched at infinity",
+    "settled_far": "adjust poses and camera, stitched at infinity",
     "calibrated": "calibrate raw lenses",
     "recalibrated": "adjust poses and calibrated lenses",
     "recalibrated_readout": "estimate the readout, with calibrated lenses",
@@ -94,7 +97,13 @@ _PREFIXES = {"first-": "first solution: ", "again_": "once more: ", "export-": "
 
 # Stages whose results tell of the camera.
 LENS_CENTRES = ("lenses+",)  # give a LensCentres
-READOUTS = ("settled_readout", "recalibrated_readout", "calibrated+_readout", "readout_aligned#")
+READOUTS = (
+    "settled_readout",
+    "settled_far_readout",
+    "recalibrated_readout",
+    "calibrated+_readout",
+    "readout_aligned#",
+)
 RECONSTRUCTION = "reconstruction"  # gives the Reconstruction of the run
 
 
