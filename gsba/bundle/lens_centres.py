@@ -59,6 +59,20 @@ class StitchRadius:
     # sequence that the radius of the other parts removes, beside centres alone
     reason: str  # why nothing was taken; empty if it was
 
+    def on_trial(self, lenses: Lenses) -> Lenses | None:
+        """The lenses (solved for without a radius) to solve with before the radius is judged; None
+        where they are stitched at infinity.
+
+        Where most points lie beyond the radius, their parallax is reversed: the lenses come out in
+        one another's place, and the radius negative.
+        """
+        inverse = self.inverse_stitch_radius
+        if not self.reason or inverse > self.sigma:
+            return replace(lenses, inverse_stitch_radius=inverse)
+        if inverse < -_MIN_SIGMAS * self.sigma:
+            return replace(lenses, centre=-lenses.centre, inverse_stitch_radius=-inverse)
+        return None
+
 
 def estimate(
     landmarks: Landmarks,

@@ -122,34 +122,36 @@ def _with_stitch_radii(start: State, stitched: Sequence[int], prefix: str) -> St
     """Map and cameras solved together, with the radius that panoramas of cameras are stitched for.
 
     The distance between lenses is wrong where the radius is left out, and the first estimate of the
-    radius with it: it is on trial where it is more than its standard deviation from infinity, and
-    judged once all is solved with it.
+    radius with it: it is judged once all is solved with it.
     """
-    run, tried = start.run, list[int]()
+    tried = dict[int, Lenses]()
+
+    def asked(state: State, stage: str, camera: int) -> StitchRadius:
+        name = _named(state.run, prefix + stage, camera)
+        return _from_features(state, name, camera, _stitch_radius, StitchRadius)
+
     for camera in stitched:
-        name = _named(run, f"{prefix}stitch_radius", camera)
-        first = _from_features(start, name, camera, _stitch_radius, StitchRadius)
+        first = asked(start, "stitch_radius", camera)
         start = replace(start, map=start.map.changed(camera, radius=first))
-        if not first.reason or first.inverse_stitch_radius > first.sigma:
-            tried.append(camera)
-            start = _stitched_for(start, camera, first.inverse_stitch_radius)
-    trial = _settle_cameras(start, f"{prefix}settled")
-    refused = list[int]()
-    for camera in tried:
-        name = _named(run, f"{prefix}stitch_radius_tried", camera)
-        radius = _from_features(trial, name, camera, _stitch_radius, StitchRadius)
+        lenses = first.on_trial(start.observed.cameras.lenses[camera])
+        if lenses is not None:
+            tried[camera] = lenses
+    trial = _settle_cameras(_with_lenses(start, tried), f"{prefix}settled")
+    judged = {camera: asked(trial, "stitch_radius_tried", camera) for camera in tried}
+    for camera, radius in judged.items():
+        start = replace(start, map=start.map.changed(camera, radius=radius))
         trial = replace(trial, map=trial.map.changed(camera, radius=radius))
-        if radius.reason:
-            refused.append(camera)
-            start = replace(start, map=start.map.changed(camera, radius=radius))
-            start = _stitched_for(start, camera, 0.0)
-    return _settle_cameras(start, f"{prefix}settled_far") if refused else trial
+    taken = {camera: tried[camera] for camera, radius in judged.items() if not radius.reason}
+    if len(taken) == len(tried):
+        return trial
+    return _settle_cameras(_with_lenses(start, taken), f"{prefix}settled_far")
 
 
-def _stitched_for(state: State, camera: int, inverse: float) -> State:
-    """The state with one camera's panoramas stitched for another radius, 1 / map units."""
-    lenses = replace(state.observed.cameras.lenses[camera], inverse_stitch_radius=inverse)
-    return _through(state, camera, lenses).with_lenses(camera, lenses)
+def _with_lenses(state: State, lenses: dict[int, Lenses]) -> State:
+    """The state with other lenses of some cameras, and its keypoints as their rays."""
+    for camera, own in lenses.items():
+        state = _through(state, camera, own).with_lenses(camera, own)
+    return state
 
 
 def _on_trial(
