@@ -150,7 +150,6 @@ def export_all(
         GsbaError: see `export`; none of the folders is written then.
     """
     options = options or ExportOptions()
-    face_size, link, images = options.face_size, options.link, options.images
     map_number = options.map_number
     for to in outs:
         _require_fitting(to, frames, options)
@@ -171,9 +170,7 @@ def export_all(
     seen_by, up = cameras.scaled(placement.similarity.scale), placement.up
     files = (path for paths in (*frames.paths, frames.mask_paths) for path in paths)
     read = fingerprint(path for path in files if path and path.exists())  # some formats read none
-    key = __version__, reconstruction, frames, read, face_size, up, link, seen_by, images
-    key = (*key, options.shutter, options.photos, options.split, options.masks, options.cameras)
-    key = (*key, options.panoramas, options.depths)
+    key = __version__, reconstruction, frames, read, up, seen_by, options
     datasets: list[Path] = []
     writers: list[FrameWriter] = []
     with ExitStack() as folders:

@@ -70,6 +70,22 @@ def test_trainers_read_how_frames_were_exposed(tmp_path: Path) -> None:
     assert cv2.imread(str(out / "images" / images[0])) is not None
 
 
+def test_an_interrupted_export_does_not_go_on_as_one_without_exposures(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frames, out = panoramas(tmp_path / "frames", ".jpg"), tmp_path / "out"
+
+    def stopped(partial: Path) -> None:
+        (partial / "exposures.json").write_text("{}\n")
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr("gsba.export.formats.write_exposures", stopped)
+        export(reconstruction(), frames, out, ExportFormat.COLMAP, 64, exposures=True)
+    export(reconstruction(), frames, out, ExportFormat.COLMAP, 64)
+    assert not (out / "exposures.json").exists()
+
+
 def test_images_that_hold_no_exif_are_told(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
