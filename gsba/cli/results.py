@@ -210,9 +210,16 @@ def export(
     known = _baseline(run, baseline) if scale == "lens" else None
     noise = _gps_settings(run, gps_sigma, gps_offset) if gps is not None else None
     placed = replace(place(reconstruction, frames, settings, known, noise), map_number=map_number)
-    options = replace(options, placement=placed, lenses=lenses, photos=read_photos(photos, run))
-    options = replace(options, shutter=shutter_of(run, exposure_ms), split=split, depths=depths)
-    options = replace(options, exposures=exposures)
+    options = replace(
+        options,
+        placement=placed,
+        lenses=lenses,
+        photos=read_photos(photos, run),
+        shutter=shutter_of(run, exposure_ms),
+        split=split,
+        depths=depths,
+        exposures=exposures,
+    )
     with connected(cluster) as client, hired(client, folder, frames) as workers:
         export_all(reconstruction, frames, {to: folder}, options, workers)
     if folder.resolve().is_relative_to(run.resolve()):

@@ -84,16 +84,13 @@ def write_depths(
     """
     which, pixels = project_in_rigs(seen, pinholes(views), frames.cameras)
     depths, sigmas = _depths(reconstruction, seen, frames, views, which)
-    order = np.argsort(seen.observation_frames, kind="stable")
-    bounds = np.searchsorted(seen.observation_frames[order], np.arange(len(frames) + 1))
-    num_shown = num_mapped = 0
+    observed, num_shown, num_mapped = seen.observations_by_frame(), 0, 0
     for f, camera in enumerate(frames.cameras.tolist()):
-        rows = order[bounds[f] : bounds[f + 1]]
         images = zip(views[camera], files[camera].images(frames, f), strict=True)
         for number, (view, image) in enumerate(images):
             if image.startswith(f"{LEFT_OUT}/"):
                 continue
-            own = rows[which[rows] == number]
+            own = observed[f][which[observed[f]] == number]
             shown = _Depths(*(all_[own].astype(np.float32) for all_ in (pixels, depths, sigmas)))
             points = seen.observation_points[own]
             name = Path("sparse_depths", Path(image).relative_to("images")).with_suffix(".npz")

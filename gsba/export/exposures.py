@@ -56,7 +56,9 @@ def write_exposures(partial: Path) -> None:
         return
     numbers, rows = np.unique(np.concatenate(frames), return_inverse=True)
     found = relative_exposures(np.concatenate(brightness), rows, np.concatenate(points))
-    known = {f: ev for f, ev in zip(numbers.tolist(), found.tolist(), strict=True) if ev == ev}
+    known = {
+        f: ev for f, ev in zip(numbers.tolist(), found.tolist(), strict=True) if np.isfinite(ev)
+    }
     told = {i.name: known[i.frame_id] for i in model.images.values() if i.frame_id in known}
     inserted = [_insert_exposure(partial / "images" / name, ev) for name, ev in told.items()]
     if not any(inserted):

@@ -11,7 +11,7 @@ Paint = Literal["files", "alpha", "black"]  # mask files alone; or images are pa
 
 @dataclass(frozen=True, slots=True)
 class MaskStyle:
-    """How the masks of a dataset are written."""
+    """Paths and values of a dataset's masks, and whether its images are painted by them."""
 
     paint: str = "files"  # one of Paint
     path: str = ""  # pattern of a mask's path, by `folder` and `stem` of its image; "" = by format

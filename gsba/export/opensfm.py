@@ -128,10 +128,8 @@ def _shots(
 
 def _tracks(reconstruction: Reconstruction, frames: FrameSet, names: list[str]) -> Iterator[str]:
     """Lines of tracks.csv, shot after shot."""
-    order = np.argsort(reconstruction.observation_frames, kind="stable")
-    ends = np.searchsorted(reconstruction.observation_frames[order], np.arange(len(frames) + 1))
-    for f, name in enumerate(names):
-        rows = order[ends[f] : ends[f + 1]]
+    observed = reconstruction.observations_by_frame()
+    for f, (name, rows) in enumerate(zip(names, observed, strict=True)):
         points = reconstruction.observation_points[rows]
         kind = frames.format_of(f)
         pixels = erp_from_bearings(

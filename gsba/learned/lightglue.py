@@ -13,7 +13,6 @@ from gsba.learned.weights import load_into, read_state
 from gsba.log import GsbaError
 
 _MIN_SCORE = 0.1  # published value
-_NOTHING = re.compile(r"(?!)")
 _UNUSED = re.compile(r"log_assignment\.\d+\.r")  # tensors of disk_lightglue.pth that nothing reads
 
 
@@ -42,11 +41,11 @@ class LightGlue:
                     for name, value in state.items()
                 }
         parts = {name for name, _ in model.named_children()} | {"confidence_thresholds"}
-        unused = _UNUSED if extractor == "disk" else _NOTHING
         state = {
             name: value
             for name, value in state.items()
-            if name.partition(".")[0] in parts and not unused.fullmatch(name)
+            if name.partition(".")[0] in parts
+            and not (extractor == "disk" and _UNUSED.fullmatch(name))
         }
         self._length = model.conf.input_dim  # of a descriptor
         self._model = load_into(model, state, f"{extractor}-lightglue", weights)

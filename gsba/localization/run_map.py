@@ -1,6 +1,6 @@
 """A finished run as a map to localise in: its keyframes' keypoints with the points they show."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -89,7 +89,7 @@ class RunMap:
         if not len(first):
             raise GsbaError(f"{root}: its first frame has no keypoints: refine again with --fresh")
         axes = principal_axes(first)
-        observed = _ObservedPoints.of(result)
+        observed = result.observations_by_frame()
         fields = tuple(SphereField(np.array(kind.correction)) for kind in frames.formats)
 
         numbers = frames.cameras
@@ -170,28 +170,10 @@ class _KeypointReader:
         return extract(images, masks, rig, make())
 
 
-@dataclass(frozen=True, slots=True)
-class _ObservedPoints:
-    """Observations of a reconstruction, frame by frame."""
-
-    order: np.ndarray  # (O,) int64, rows of observations, sorted by frame
-    starts: np.ndarray  # (F + 1,) int64: frame f has rows order[starts[f]:starts[f + 1]]
-
-    @classmethod
-    def of(cls, result: Reconstruction) -> "_ObservedPoints":
-        order = np.argsort(result.observation_frames, kind="stable")
-        numbers = np.arange(len(result.world_T_rigs) + 1)
-        return cls(order, np.searchsorted(result.observation_frames[order], numbers))
-
-    def rows(self, frame: int) -> np.ndarray:
-        """Rows of the observations of one frame."""
-        return self.order[self.starts[frame] : self.starts[frame + 1]]
-
-
 def _keyframe(
     frame: int,
     features: Features,
-    observed: _ObservedPoints,
+    observed: Sequence[np.ndarray],
     result: Reconstruction,
     lenses: Lenses,
     field: SphereField,
@@ -202,7 +184,7 @@ def _keyframe(
     """Keypoints of a frame that lie where the frame observes a point of the map."""
     from scipy.spatial import KDTree
 
-    rows = observed.rows(frame)
+    rows = observed[frame]
     seen = corrected(gather([features]), field, rig)
     seen = Cameras((lenses.of_frame(frame),)).seen(seen) if lenses else seen
     numbers = np.zeros(len(features), np.int64)

@@ -8,7 +8,6 @@ has one, and become maps of their own otherwise.
 """
 
 import logging
-from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -25,7 +24,7 @@ from gsba.loop_closure.pose_graph import Loop
 from gsba.loop_closure.registration import Resection, resect
 from gsba.loop_closure.retrieval import global_descriptors
 from gsba.matching import pairs, recovery
-from gsba.matching.guided_search import Gate, MatchContext, guided
+from gsba.matching.guided_search import Gate, MatchContext
 from gsba.similarity import Sim3
 from gsba.trajectory.judgement import long_steps, over_missing_frames
 from gsba.types import Counts, Matches, Solution
@@ -242,8 +241,8 @@ class _Joining:
         meetings = self._meetings(self.context.of_strongest(), chosen)
         found = self._best(part, meetings, rows, inside)
         if meetings and found is None:  # perhaps too few: search around the best
-            searched = replace(self.context, matcher=guided)
-            meetings += self._meetings(searched, self._around(meetings, rows, inside, chosen))
+            around = self._around(meetings, rows, inside, chosen)
+            meetings += self._meetings(self.context.by_search(), around)
             found = self._best(part, meetings, rows, inside)
         return found or self._over_break(part, rows, inside)
 
@@ -509,8 +508,7 @@ class _Joining:
         """Keypoints (m,) of a frame and the map points (m, 3) that each may observe."""
         nowhere = np.tile(np.eye(4), (len(self.parts), 1, 1))
         gates = [Gate.anywhere()] * len(chosen)
-        searched = replace(self.context, matcher=guided)
-        found = searched.match(chosen, nowhere, gates, strongest=strongest)
+        found = self.context.by_search().match(chosen, nowhere, gates, strongest=strongest)
         return _each_once(*self._points_seen(found, 0), self.depth)
 
     def _points_seen(self, matches: Matches, column: int) -> tuple[np.ndarray, np.ndarray]:

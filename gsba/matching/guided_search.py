@@ -351,9 +351,13 @@ class MatchContext:
     matcher: Matcher = guided  # compares two frames
     cameras: Cameras = ONE_CAMERA  # cameras of the keypoints
 
+    def by_search(self) -> "MatchContext":
+        """Guided search, whatever the run's matcher."""
+        return replace(self, matcher=guided)
+
     def of_strongest(self) -> "MatchContext":
         """Guided search among the strongest keypoints, for pairs of which few show one place."""
-        return replace(self, frames=self.strongest, matcher=guided)
+        return replace(self.by_search(), frames=self.strongest)
 
     def match(
         self,

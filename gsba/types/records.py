@@ -523,6 +523,12 @@ class Reconstruction:
         """Units of a map's world per unit of the largest map's."""
         return 1.0 if self.map_scales is None else float(self.map_scales[number - 1])
 
+    def observations_by_frame(self) -> list[np.ndarray]:
+        """Rows (m,) int64 of the observations of each frame."""
+        order = np.argsort(self.observation_frames, kind="stable")
+        numbers = np.arange(1, len(self.world_T_rigs))
+        return np.split(order, np.searchsorted(self.observation_frames[order], numbers))
+
     def pieces(self) -> "Iterator[Reconstruction]":
         """The reconstruction with some of its observations at a time, all of a point together; one
         piece at least."""
