@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsba.config import VerifySettings
+from gsba.config import TwoViewLimits
 from gsba.geometry import inverse
 from gsba.matching.absolute_pose import panorama_pose
 
@@ -26,7 +26,7 @@ class Resection:
 
 
 def resect(
-    bearings: np.ndarray, points_world: np.ndarray, settings: VerifySettings, seed: int
+    bearings: np.ndarray, points_world: np.ndarray, settings: TwoViewLimits, seed: int
 ) -> Resection | None:
     """Absolute pose from bearings of points, and its acceptance.
 

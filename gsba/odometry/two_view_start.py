@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsba.camera.rig import witnesses
-from gsba.config import VerifySettings
+from gsba.config import TwoViewLimits
 from gsba.geometry import angles_between, nearest_rotation
 from gsba.matching.verification import relative_pose
 from gsba.odometry.window import AdjustedWindow, WindowObservations, adjust_window
@@ -16,7 +16,7 @@ _MOVED, _MOVED_LITTLE = np.deg2rad([4.0, 1.2])  # parallax of the upper quarter 
 _MAX_DIRECTION_SIGMA = np.deg2rad(6.0)  # largest standard deviation of the translation's direction
 _MIN_POINTS = 40  # least number of independent points, in cells of 6 degrees
 _CELLS = 16
-_VERIFY = VerifySettings(max_error_deg=0.3)
+_VERIFY = TwoViewLimits(max_error_deg=0.3)
 _GATE = 4.0  # standard deviations
 
 

@@ -218,7 +218,7 @@ def families_of(frames: FrameSet, settings: RefineSettings) -> list[Family]:
         GsbaError: a package whose family cannot be made, or positions that cannot be used.
     """
     fixes = positions_of(frames, settings)
-    made: list[Family] = [] if fixes is None else [GpsFixes(fixes, settings.gps)]
+    made: list[Family] = [] if fixes is None else [GpsFixes(fixes)]
     for named in settings.package_families():
         name, _, argument = named.partition(":")
         try:

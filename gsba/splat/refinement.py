@@ -26,6 +26,7 @@ from factors import LandmarkBlock
 from gsba.bundle import adjustment, triangulation
 from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.optimizer import OptimizeResult, optimize
+from gsba.bundle.reconstruction import MIN_OBSERVATIONS
 from gsba.camera.optics import ONE_EYE, Optics
 from gsba.config import SplatSettings
 from gsba.splat.alignment import Captured, capture, splat_block
@@ -38,6 +39,9 @@ from gsba.splat.splat_greys import SplatGreys
 from gsba.splat.train import State, advance, begin
 from gsba.store.records import load_checkpoint, save_record
 from gsba.types import Counts, FrameSet, Keypoints, Landmarks, Round, Solution
+
+_SOLVER_STEPS = 2  # Levenberg-Marquardt steps in a move
+_SH_DEGREE = 1  # of colours: higher ones take errors of poses for reflections
 
 logger = logging.getLogger(__name__)
 
@@ -108,7 +112,7 @@ def refine(
         GsbaError: all frames are masked, or the splat is no longer finite.
     """
     chosen = context.settings.splat
-    usable = start.observations() >= context.settings.rounds.min_observations
+    usable = start.observations() >= MIN_OBSERVATIONS
     if np.count_nonzero(usable) <= chosen.held_out_every:
         few = int(np.count_nonzero(usable))
         logger.warning("%d refined frames are too few for a splat to judge poses by", few)
@@ -119,7 +123,7 @@ def refine(
     turns = _Turns(keypoints, start, context, split)
     progress = load_checkpoint(checkpoint, key, _Progress, "the splat refinement starts anew")
     if progress is None:
-        cloud = _cloud(start.landmarks, keypoints, chosen.sh_degree)
+        cloud = _cloud(start.landmarks, keypoints, _SH_DEGREE)
         first = begin(cloud, turns.training(0))
         progress = _Progress(0, -1, start.world_T_rigs, first, (), ())
     else:
@@ -169,7 +173,7 @@ class _Turns:
         return SplatSettings(
             iterations=len(chosen.sizes) * each,
             face_size=chosen.sizes[level],
-            sh_degree=chosen.sh_degree,
+            sh_degree=_SH_DEGREE,
             max_gaussians=chosen.max_gaussians,
             held_out_every=chosen.held_out_every,
             seed=self.settings.seed,
@@ -204,7 +208,7 @@ class _Turns:
         evidence = together(score(gains), score(savings, chance))
         after = self._placed(moved)
         accepted = evidence > chosen.min_sigmas and growth <= chosen.max_growth
-        least = self.settings.rounds.min_observations
+        least = MIN_OBSERVATIONS
         accepted &= replace(self.solved, landmarks=after).carries(self.solved, least)
         move = Move(
             settings.face_size, float(looks[0].mean()), float(looks[1].mean()),
@@ -246,7 +250,7 @@ class _Turns:
         terms = self.context.beside(greys).terms(replace(self.solved, world_T_rigs=world_T_rigs))
         values, landmarks = terms.values, self._block()
         landmarks.polish(values)
-        solver = settings.solver.model_copy(update={"max_iterations": settings.splat.solver_steps})
+        solver = settings.solver.model_copy(update={"max_iterations": _SOLVER_STEPS})
         result = optimize(terms.graph, [landmarks, *terms.blocks], values, solver)
         return adjustment.poses_of(result.values, len(world_T_rigs)), result
 
