@@ -64,7 +64,7 @@ class Terms:
             if found is not None:
                 return found
             blocks = (observed.block(), *blocks)
-        return optimize(self.graph, blocks, self.values, settings)
+        return optimize(self.graph, self.values, blocks, settings)
 
 
 @dataclass(frozen=True, slots=True)

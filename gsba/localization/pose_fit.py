@@ -69,7 +69,7 @@ def fit(
     noises = np.ones(len(pictures))
     for scale in scales:
         block = _block(pictures, noises, projections, scale)
-        values = optimize(graph, [block], values, _SOLVER).values
+        values = optimize(graph, values, [block], _SOLVER).values
         squares = block.squared_residuals(values)
         if scale <= _KNOWN_NOISE:
             noises = np.array([_rescaled(*pair) for pair in zip(noises, squares, strict=True)])

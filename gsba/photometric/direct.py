@@ -250,7 +250,7 @@ def _solve(
         landmarks.polish(values)
         before, fits = landmarks.error(values), _geometric_fits(landmarks, values)
         terms = context.beside(PatchGreys(block)).terms(solved)
-        result = optimize(terms.graph, [landmarks, *terms.blocks], terms.values, solver)
+        result = optimize(terms.graph, terms.values, [landmarks, *terms.blocks], solver)
         growth = _geometric_fits(landmarks, result.values) / fits
         doubts, residuals = _frame_weights(block, result.values, growth)
         if np.all(doubts >= 1) or np.any(weights < 1):

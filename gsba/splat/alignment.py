@@ -90,7 +90,7 @@ def align_to_splat(
         values = gtsam.Values()
         for f in which:
             values.insert(pose_variables.X(int(f)), gtsam.Pose3(poses[f]))
-        found = optimize(gtsam.NonlinearFactorGraph(), blocks, values, settings).values
+        found = optimize(gtsam.NonlinearFactorGraph(), values, blocks, settings).values
         poses = np.stack([found.atPose3(pose_variables.X(int(f))).matrix() for f in which])
     return poses
 

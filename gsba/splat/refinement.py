@@ -251,7 +251,7 @@ class _Turns:
         values, landmarks = terms.values, self._block()
         landmarks.polish(values)
         solver = settings.solver.model_copy(update={"max_iterations": _SOLVER_STEPS})
-        result = optimize(terms.graph, [landmarks, *terms.blocks], values, solver)
+        result = optimize(terms.graph, values, [landmarks, *terms.blocks], solver)
         return adjustment.poses_of(result.values, len(world_T_rigs)), result
 
     def _block(self) -> LandmarkBlock:
