@@ -179,7 +179,7 @@ def _shifts(num: int) -> np.ndarray:
 
 
 @dataclass(frozen=True, slots=True)
-class GpsFixes(Family):
+class GpsFactors(Family):
     """Fixes of frames; each adjustment carries them into its map anew."""
 
     name = "gps"

@@ -15,7 +15,7 @@ from gsba.bundle import (
     tracks,
 )
 from gsba.bundle.gauge import Gauge
-from gsba.bundle.gps_factors import GpsFixes
+from gsba.bundle.gps_factors import GpsFactors
 from gsba.bundle.lens_centres import baseline_of
 from gsba.bundle.map_strength import MapStrength
 from gsba.bundle.reconstruction import MIN_OBSERVATIONS, assemble, world_scale
@@ -217,15 +217,15 @@ def without_fixes(state: State, latest: Sequence[str]) -> State:
     logger.warning("the images contradict the GPS fixes: the map is made anew without these")
     run = state.run
     members = [
-        replace(one, contradicted=True) if isinstance(one, GpsFixes) else one
+        replace(one, contradicted=True) if isinstance(one, GpsFactors) else one
         for one in run.families.members
     ]
     chain, families = Chain(run.store, latest), run.families.with_members(members)
     return replace(state, run=replace(run, chain=chain, families=families, suffix=WITHOUT_GPS))
 
 
-def _fixes_of(run: Run) -> list[GpsFixes]:
-    return [family for family in run.families.members if isinstance(family, GpsFixes)]
+def _fixes_of(run: Run) -> list[GpsFactors]:
+    return [family for family in run.families.members if isinstance(family, GpsFactors)]
 
 
 def refine_photometric(state: State) -> State:

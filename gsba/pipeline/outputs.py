@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from gsba.bundle.gps_factors import GpsFixes
+from gsba.bundle.gps_factors import GpsFactors
 from gsba.bundle.gyro_turns import GyroTurns
 from gsba.bundle.map_strength import MAX_SCALE_SIGMA
 from gsba.bundle.reconstruction import world_scale
@@ -168,7 +168,7 @@ def _report(state: State, result: Reconstruction) -> dict[str, Any]:
     solver = [{"stage": name, "rounds": some} for name, some in rounds.items()]
     stages = StageLog(tuple(run.store.records.values()), run.journal.counts, solver)
     gauge, of_families = _gauge(run, state.prior), _of_families(state)
-    found = _findings(state, result, of_families.pop(GpsFixes.name, None))
+    found = _findings(state, result, of_families.pop(GpsFactors.name, None))
     coarse = state.prior.coarse
     report = build_report(run.settings, run.frames, coarse, result, stages, gauge, found)
     report["families"] = of_families

@@ -36,7 +36,7 @@ from gsba.splat.gaussians import Gaussians, from_cloud
 from gsba.splat.scene import Faces, Split, load_faces, make_views, near_of, split_frames
 from gsba.splat.scores import face_psnrs
 from gsba.splat.splat_greys import SplatGreys
-from gsba.splat.train import State, advance, begin
+from gsba.splat.train import TrainingState, advance, begin
 from gsba.store.records import load_checkpoint, save_record
 from gsba.types import Counts, FrameSet, Keypoints, Landmarks, Round, Solution
 
@@ -47,7 +47,7 @@ logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class Move:
+class PoseMove:
     """One joint move of all poses, and its evidence from held-out frames."""
 
     size: int  # pixels of a face
@@ -68,7 +68,7 @@ class SplatResult:
 
     adjustment: Solution
     counts: tuple[Counts, ...]  # of frames: those that the splat is trained on are kept
-    moves: tuple[Move, ...]
+    moves: tuple[PoseMove, ...]
 
     @property
     def rounds(self) -> tuple[Round, ...]:
@@ -83,8 +83,8 @@ class _Progress:
     level: int  # index into the sizes
     turns: int  # moves made at this level; -1: before its first training
     world_T_rigs: np.ndarray  # (F, 4, 4)
-    state: State
-    moves: tuple[Move, ...]
+    state: TrainingState
+    moves: tuple[PoseMove, ...]
     rounds: tuple[Round, ...]
 
 
@@ -210,7 +210,7 @@ class _Turns:
         accepted = evidence > chosen.min_sigmas and growth <= chosen.max_growth
         least = MIN_OBSERVATIONS
         accepted &= replace(self.solved, landmarks=after).carries(self.solved, least)
-        move = Move(
+        move = PoseMove(
             settings.face_size, float(looks[0].mean()), float(looks[1].mean()),
             standard_error(gains), growth, len(savings) * standard_error(savings) / total,
             evidence, *_median_move(poses, moved), accepted,
@@ -278,13 +278,13 @@ class _Turns:
         return unknowns * cost / redundancy if redundancy > 0 else np.inf
 
     def _trained(
-        self, state: State, world_T_rigs: np.ndarray, settings: SplatSettings, steps: int
-    ) -> State:
+        self, state: TrainingState, world_T_rigs: np.ndarray, settings: SplatSettings, steps: int
+    ) -> TrainingState:
         views = make_views(self.faces, world_T_rigs[self.split.training])
         return advance(state, views, settings, self.backend, steps)
 
     def _held_out_psnrs(
-        self, state: State, world_T_rigs: np.ndarray, settings: SplatSettings
+        self, state: TrainingState, world_T_rigs: np.ndarray, settings: SplatSettings
     ) -> np.ndarray:
         """PSNR (V,) of each held-out face in dB, after fitting gains."""
         views = make_views(self.held_out, world_T_rigs[self.split.held_out])
@@ -307,7 +307,7 @@ class _Turns:
         return rounds[-1].gate_sigmas if rounds else np.inf
 
 
-def _log(move: Move) -> None:
+def _log(move: PoseMove) -> None:
     gain, verdict = move.psnr_moved - move.psnr_stayed, "accepted" if move.accepted else "undone"
     logger.info(
         "faces of %d px: held out %+.4f dB (standard error %.4f), cost of observations times %.4f "

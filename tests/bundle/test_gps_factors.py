@@ -14,7 +14,7 @@ from gsba.bundle.adjustment import AdjustmentContext, values_of
 from gsba.bundle.bearings import Bearings
 from gsba.bundle.families import Families, Family
 from gsba.bundle.fixes import FrameFixes
-from gsba.bundle.gps_factors import GpsFixes
+from gsba.bundle.gps_factors import GpsFactors
 from gsba.bundle.trajectory_prior import TrajectoryPrior
 from gsba.config import RefineSettings
 from gsba.geometry import furthest, inverse
@@ -38,7 +38,7 @@ def _problem(coarse: np.ndarray, poses: np.ndarray, fixes: FrameFixes | None) ->
     settings = RefineSettings()
     prior = TrajectoryPrior(coarse, settings.priors, first=poses[0])
     members: list[Family] = [Bearings(), prior]
-    members += [] if fixes is None else [GpsFixes(fixes)]
+    members += [] if fixes is None else [GpsFactors(fixes)]
     families = Families(tuple(members)).fitted(Solution.without_points(poses))
     return AdjustmentContext(families, RIG, settings, 1)
 
@@ -150,7 +150,7 @@ def test_images_contradict_fixes_that_bend_their_map() -> None:
         problem = _problem(coarse, solved.world_T_rigs, None)
         _, joint = adjustment.pose_covariances(solved, world.keypoints, problem)
         snapshot = Families().snapshot(solved)
-        family = GpsFixes(fixes)
+        family = GpsFactors(fixes)
         ratios.append(family.contradiction(snapshot, joint.draws))
         muted = replace(family, contradicted=True)
         assert muted.fitted(snapshot) is None and muted.digest != family.digest

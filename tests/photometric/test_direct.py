@@ -6,11 +6,11 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
-from photometric_world import Texture, render
+from photometric_world import Texture, planes_from, render
 from synthetic import unit
 from tiny_run import SETTINGS, Case, computed_stages
 
-from factors.patch_windows import PatchTable, patch_spans, pixel_grid, planes_from
+from factors.patch_windows import PatchTable, patch_spans, pixel_grid
 from gsba.bundle import adjustment
 from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.bearings import Bearings
