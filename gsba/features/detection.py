@@ -14,7 +14,7 @@ from gsba.config import FeatureSettings
 from gsba.disk import concatenated
 from gsba.types import FACES, Features, Keypoints
 
-# Noise of SIFT keypoints along each axis, face pixels, measured on rendered walks: of the smallest
+# Noise of SIFT keypoints along each axis, face pixels: of the smallest
 # ones, and what is added in proportion to a keypoint's size.
 SIGMA_PX, _SIGMA_PER_SIZE = 0.16, 0.033
 _SAME_PIXEL_PX = 0.01  # pixels of one keypoint on the faces of two rigs differ by more

@@ -66,7 +66,7 @@ class Gate:
         return min(max_error_rad / self.rotation_rad, 1.0) if self.is_prediction else 0.0
 
 
-# Of poses of a coarse trajectory: SLAM errs by 4 degrees and two fifths of a step at most.
+# Assumed errors of a coarse trajectory's relative poses: 4 degrees, tangent of a direction's error.
 PRIOR_GATE = Gate(np.deg2rad(4.0), 0.4, MAX_PARALLAX_RAD)
 
 

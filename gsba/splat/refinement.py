@@ -41,7 +41,7 @@ from gsba.store.records import load_checkpoint, save_record
 from gsba.types import Counts, FrameSet, Keypoints, Landmarks, Round, Solution
 
 _SOLVER_STEPS = 2  # Levenberg-Marquardt steps in a move
-_SH_DEGREE = 1  # of colours: higher ones take errors of poses for reflections
+_SH_DEGREE = 1  # of colours: low, so that views must agree on them
 
 logger = logging.getLogger(__name__)
 
