@@ -17,7 +17,10 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+if TYPE_CHECKING:
+    import numpy as np
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,6 +168,20 @@ def cut_short(case: Case, num_frames: int, folder: Path) -> Case:
         _write(folder / path.name, "".join(kept))
     trajectory = case.trajectory and folder / case.trajectory.name
     return Case(folder / "images", trajectory, folder / case.truth.name)
+
+
+def take_frames(walk: Path, rows: "np.ndarray", times: "np.ndarray", folder: Path) -> None:
+    """Link frames (R,) of a walk, at times (R,) in seconds, into a folder with timestamps.csv."""
+    table = (walk / "images/timestamps.csv").read_text().splitlines()[1:]
+    names = [Path(row.partition(",")[0]).stem for row in table]
+    images = {path.stem: path for path in (walk / "images").iterdir()}
+    folder.mkdir(parents=True, exist_ok=True)
+    for row in rows.tolist():
+        target = folder / images[names[row]].name
+        target.unlink(missing_ok=True)
+        target.symlink_to(images[names[row]].resolve())
+    lines = [f"{names[row]},{time:.6f}" for row, time in zip(rows.tolist(), times, strict=True)]
+    (folder / "timestamps.csv").write_text("\n".join(["name,timestamp", *lines, ""]))
 
 
 def peak_mb() -> float:

@@ -25,18 +25,24 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from common import code_digest, digest, kept_row, run_row, write_table
-from recording_cuts import Cut, cut_rows, position_errors
+from common import code_digest, digest, kept_row, run_row, take_frames, write_table
+from scipy.spatial.transform import Rotation
 
+from gsba.demo import degrade
 from gsba.disk import write_text
+from gsba.evaluate.trajectory import pose_errors
+from gsba.geometry import pose
+from gsba.similarity import Sim3
 from gsba.store.finished import load_run
-from gsba.trajectory.files import read_trajectory
+from gsba.trajectory.files import read_trajectory, write_tum
+from gsba.types import Trajectory
 
 NUM_FRAMES = 24  # of a recording
 AGAIN_FROM = 12  # first frame of a second recording of a flat
 MAX_ERROR = 0.03  # of a map's extent, of any of its frames
 MIN_FRAMES = 3  # of a map that is checked: fewer can always be aligned to the truth
 TIMEOUT_S = 3600.0
+_SCALES = (0.4, 0.9, 1.7, 0.6, 1.2, 2.3)  # map units per metre of the trajectories
 MEET_NOWHERE = "meet nowhere"  # in the message of `gsba merge` that refuses maps of two places
 HEAD = [
     "| recordings | by | frames | maps: frames of each (worst frame, of its extent) | found again, "
@@ -48,6 +54,42 @@ _SHARES = re.compile(
 )  # that did not suffice for a join
 _GSBA = [sys.executable, "-c", "from gsba.cli import main; main()"]
 _SET = ["--allow-partial", "--set", "export.formats=[]"]
+
+
+class Cut(NamedTuple):
+    """A recording cut from a walk."""
+
+    folder: Path  # of its frames, with timestamps.csv
+    trajectory: Path  # TUM, with drift, in a world and scale of its own
+    rows: np.ndarray  # (R,) frames of the walk
+
+
+def cut_rows(walk: Path, rows: np.ndarray, folder: Path, number: int) -> Cut:
+    """Cut frames out of a walk as a recording; its trajectory lies beside its folder.
+
+    Args:
+        walk: folder with `images/`, their timestamps.csv, and `groundtruth.tum`.
+        rows: (R,) frames of the walk.
+        folder: of the recording.
+        number: decides world, scale and drift of its trajectory.
+    """
+    truth = read_trajectory(walk / "groundtruth.tum")
+    times = truth.timestamps[rows] - truth.timestamps[rows[0]]
+    take_frames(walk, rows, times, folder)
+    given = Trajectory(times, truth.world_T_rigs[rows])
+    coarse = degrade(given, number, scale=_SCALES[number % 6])
+    turn = Rotation.from_rotvec([0.3, 1.1 * number, -0.2]).as_matrix()
+    moved = Sim3.of(1.0, pose(turn, np.array([3.0 * number, -2.0, 5.0])))
+    path = folder.with_name(f"{folder.name}.tum")
+    write_tum(path, Trajectory(coarse.timestamps, moved.poses(coarse.world_T_rigs)))
+    return Cut(folder, path, rows)
+
+
+def position_errors(found: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """Errors (N,) of positions of poses (N, 4, 4) after one alignment to the truth (N, 4, 4), of
+    frames that may be of several clocks."""
+    times = np.arange(len(true), dtype=np.float64)
+    return pose_errors(Trajectory(times, found), Trajectory(times, true)).positions
 
 
 class Recording(NamedTuple):

@@ -92,7 +92,7 @@ def measure(name: str, path: Path, size: int) -> str:
     chosen = {"extractor": name.partition("-")[0], "weights": name if "." in name else None}
     settings = RefineSettings.model_validate({"features": chosen})
     extractor = make_extractor(settings.features, find_weights(settings))()
-    rig = CubeRig(size, np.deg2rad(settings.cubemap.hfov_deg))
+    rig = CubeRig(size, np.deg2rad(cubemap.HFOV_DEG))
     panorama = np.asarray(cv2.imread(str(path), cv2.IMREAD_COLOR_RGB))
     start = time.process_time()
     first = detection.extract(cubemap.cut(panorama, rig), None, rig, extractor)

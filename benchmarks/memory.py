@@ -1,6 +1,6 @@
 """Peak memory of aligning patches in 8K panoramas: n frames, and twice as many.
 
-    python -m benchmarks.memory --out WORK [--frames 24] [--width 8192] [--markdown FILE]
+    python benchmarks/memory.py --out WORK [--frames 24] [--width 8192] [--markdown FILE]
 
 Frames are made by shifting one textured panorama, which is a rotating camera among points with
 known positions. Only the process that aligns patches is measured.
@@ -14,8 +14,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from common import measure, peak_mb, write_table
 
-from benchmarks.common import measure, peak_mb, write_table
 from gsba.camera.rig import CubeRig, owner_faces
 from gsba.config import PatchSettings
 from gsba.frames import panorama
@@ -111,7 +111,7 @@ def main() -> None:
         folder = options.out / f"{num}"
         make_frames(folder, num, options.width)
         log = options.out / f"{num}.log"
-        command = [sys.executable, "-m", "benchmarks.memory", "--out", str(options.out)]
+        command = [sys.executable, __file__, "--out", str(options.out)]
         command += ["--threads", str(options.threads), "--align", str(folder)]
         cost = measure(command, log, 3600)
         found = json.loads(log.read_text().strip().splitlines()[-1])

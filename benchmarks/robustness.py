@@ -11,14 +11,15 @@ import json
 import shutil
 import time
 from collections.abc import Callable, Iterator
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
+from unittest.mock import patch
 
 import numpy as np
 from common import machine
-from false_loops import forged_loops
+from scipy.spatial import cKDTree  # type: ignore[attr-defined]
 from scipy.spatial.transform import Rotation
 
 from gsba import refine
@@ -29,8 +30,10 @@ from gsba.demo.degrade import Drift
 from gsba.evaluate.trajectory import evaluate
 from gsba.geometry import inverse
 from gsba.log import GsbaError
+from gsba.matching import correspondences
+from gsba.matching.guided_search import MatchContext
 from gsba.trajectory.files import read_trajectory, write_tum
-from gsba.types import Trajectory
+from gsba.types import Counts, Matches, Solution, Trajectory, VerifiedPairs
 
 RESULTS = Path(__file__).parent / "results"
 DRIFTS = (0.0, 0.02, 0.05, 0.1, 0.2)  # of the path
@@ -43,6 +46,7 @@ MISSING_DRIFT = 0.05  # of the path, of the trajectory whose loop is missing
 FALSE_LOOPS = (3, 8)  # in a row, between frames a quarter and three quarters into the walk
 TURN_DEG_PER_DRIFT = 100.0  # degrees of rotation drift that go with a drift of one path length
 OUTLIER_STEPS, OUTLIER_DEG = (1.0, 3.0), (5.0, 20.0)  # smallest and largest error of an outlier
+MAX_DEG = 0.5  # between a keypoint and the other frame's point projected by the false pose
 
 
 class Point(NamedTuple):
@@ -52,6 +56,58 @@ class Point(NamedTuple):
     amount: float
     trajectory: Trajectory
     outliers: list[int]  # frames that were displaced
+
+
+def forge(context: MatchContext, solved: Solution, pairs: list[tuple[int, int]]) -> VerifiedPairs:
+    """Verified matches of frames that share no part of the scene.
+
+    The second frame of a pair gets the pose of the first one's successor. Its matches are the
+    keypoints near map points projected by that pose.
+    """
+    known = solved.points_by_keypoint(context.keypoints)
+    rows, poses = [], []
+    for f0, f1 in pairs:
+        f0_T_f1 = inverse(solved.world_T_rigs[f0]) @ solved.world_T_rigs[f0 + 1]
+        mine = np.flatnonzero(np.isfinite(known[f0]).all(axis=1))
+        seen = (known[f0][mine] - f0_T_f1[:3, 3]) @ f0_T_f1[:3, :3]
+        seen /= np.linalg.norm(seen, axis=1, keepdims=True)
+        away, theirs = cKDTree(context.keypoints.bearings_of(f1)).query(seen)
+        _, first = np.unique(theirs, return_index=True)
+        first = first[away[first] < np.radians(MAX_DEG)]
+        rows.append(np.column_stack([mine[first], theirs[first]]).astype(np.int32))
+        f0_T_f1[:3, 3] /= np.linalg.norm(f0_T_f1[:3, 3])
+        poses.append(f0_T_f1)
+    matches = Matches.of_rows(np.array(pairs, np.int32), rows)
+    counts = Counts(len(pairs), len(pairs), "pairs")
+    return VerifiedPairs(matches, np.array(poses), np.zeros(len(pairs)), counts)
+
+
+@contextmanager
+def forged_loops(first: int, far: int, count: int) -> Iterator[list[int]]:
+    """Add `count` false loop closures to runs in this context, of frames `first` + n and n + `far`.
+
+    Yields:
+        number of matches of each false pair, filled when a run has closed its loops.
+    """
+    honest, sizes = correspondences.match_loops, []
+
+    def match_loops(context: MatchContext, solved: Solution) -> VerifiedPairs:
+        found = honest(context, solved)
+        pairs = [(first + n, first + n + far) for n in range(count)]
+        false = forge(context, solved, pairs)
+        sizes[:] = np.diff(false.matches.offsets).tolist()
+        ours, theirs = found.matches, false.matches
+        both = Matches(
+            np.concatenate([ours.pairs, theirs.pairs]),
+            np.concatenate([ours.offsets, ours.offsets[-1] + theirs.offsets[1:]]),
+            np.concatenate([ours.keypoints, theirs.keypoints]),
+        )
+        poses = np.concatenate([found.f0_T_f1s, false.f0_T_f1s])
+        sigmas = np.concatenate([found.direction_sigmas, false.direction_sigmas])
+        return VerifiedPairs(both, poses, sigmas, found.counts)
+
+    with patch.object(correspondences, "match_loops", match_loops):
+        yield sizes
 
 
 def spoiled(truth: Trajectory, seed: int) -> Iterator[tuple[str, float, Trajectory, list[int]]]:

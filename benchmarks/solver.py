@@ -96,7 +96,6 @@ def solve_ours(problem: Problem, num_threads: int) -> tuple[Result, np.ndarray, 
     from gtsam.symbol_shorthand import X
 
     from gsba.bundle.optimizer import optimize
-    from gsba.config import SolverSettings
 
     _warm_up(problem)
     wall, cpu = time.perf_counter(), time.process_time()
@@ -107,7 +106,7 @@ def solve_ours(problem: Problem, num_threads: int) -> tuple[Result, np.ndarray, 
     distance = float(first.range(far))
     noise = gtsam.noiseModel.Isotropic.Sigma(1, 1e-3)
     graph.add(gtsam.RangeFactorPose3(X(0), X(len(problem.world_T_rigs) // 2), distance, noise))
-    done = optimize(graph, [block], values, SolverSettings())
+    done = optimize(graph, values, [block])
     cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
     poses = np.array([done.values.atPose3(key).matrix() for key in block.keys])
     steps = len(done.history) - 1
@@ -245,7 +244,7 @@ def _warm_up(problem: Problem) -> None:
     noise = gtsam.noiseModel.Isotropic.Sigma(6, 0.1)
     for key in block.keys:
         graph.add(gtsam.PriorFactorPose3(key, values.atPose3(key), noise))
-    optimize(graph, [block], values)
+    optimize(graph, values, [block])
 
 
 def _child(solver: str, folder: Path, num_threads: int) -> None:

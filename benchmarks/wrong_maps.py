@@ -28,9 +28,9 @@ from common import (
     kept_row,
     refine_command,
     run_row,
+    take_frames,
     write_table,
 )
-from recording_cuts import take_frames
 
 from gsba.demo import degrade
 from gsba.evaluate.trajectory import pose_errors

@@ -39,7 +39,8 @@ class PatchTable:
     hosts: np.ndarray  # (P,) int, frame whose pixels are the template
     bearings_rig: np.ndarray  # (P, 3) float64, unit, centre in the host's rig frame, as in its
     # picture
-    planes: np.ndarray  # (P, 3) float64, 1 / map units: inverse depth and slopes, see `planes_from`
+    planes: np.ndarray  # (P, 3) float64, 1 / map units: inverse depth along the
+    # bearing + x e1 + y e2: theta0 + x theta1 + y theta2, over the length of that vector
     plane_sigmas: np.ndarray  # (P, 3) float64, 1 / map units, prior of `planes`; inf = none
     offsets: np.ndarray  # (P + 1,) int64: patch p owns targets[offsets[p]:offsets[p + 1]]
     targets: np.ndarray  # (O,) int, frames, without the host and without repetition in a patch
@@ -132,29 +133,6 @@ def pixel_grid(size: int, spacing_rad: float) -> np.ndarray:
 def patch_axes(bearings_rig: np.ndarray) -> np.ndarray:
     """(P, 3, 3) float64, rows: the unit bearing (P, 3) and the axes of its tangent plane."""
     return np.concatenate([bearings_rig[:, None], tangent_basis(bearings_rig)], axis=1)
-
-
-def planes_from(
-    bearings_rig: np.ndarray, distances: np.ndarray, normals_rig: np.ndarray | None = None
-) -> np.ndarray:
-    """Inverse-depth planes (P, 3) of patches at distances (P,), map units.
-
-    Along bearing + x e1 + y e2 the plane is at 1 / (theta0 + x theta1 + y theta2) times the length
-    of that vector.
-
-    Args:
-        bearings_rig: (P, 3) unit.
-        distances: (P,) positive.
-        normals_rig: (P, 3) of any length, either sign, not orthogonal to the bearing; None = planes
-            orthogonal to the bearings.
-    """
-    inverse = 1.0 / np.asarray(distances, dtype=np.float64)
-    planes = np.zeros((len(inverse), 3))
-    planes[:, 0] = inverse
-    if normals_rig is not None:
-        along = np.einsum("pki,pi->pk", patch_axes(bearings_rig), normals_rig)
-        planes[:, 1:] = inverse[:, None] * along[:, 1:] / along[:, :1]
-    return planes
 
 
 def covisible_frames(table: PatchTable, num_frames: int) -> tuple[np.ndarray, np.ndarray]:

@@ -45,7 +45,7 @@ def photometric_residuals(
 
     Args:
         world_T_host, world_T_target: (4, 4) float64.
-        plane: (3,) inverse depth and slopes, see `factors.patch_windows.planes_from`.
+        plane: (3,) inverse depth and slopes, see `factors.patch_windows.PatchTable`.
         axes: (3, 3) bearing and tangent axes, see `factors.patch_windows.patch_axes`.
         grid: (N, 2) tangents of the pixels.
         template: (N,) grey values in the host.

@@ -122,30 +122,6 @@ class SphereField:
         return roots @ (tangent_basis(bearings) @ np.swapaxes(there, 1, 2))
 
 
-def field_residuals(
-    bearings: np.ndarray, directions: np.ndarray, degree: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals under a zero field, and their Jacobian by its coefficients.
-
-    The residual is the log map of the direction at the observed bearing, less the displacement
-    there: to first order in both, that of `bearing_residuals` at the corrected bearing.
-
-    Args:
-        bearings: (N, 3) observed, unit.
-        directions: (N, 3) expected, unit.
-        degree: degree of the field.
-
-    Returns:
-        residuals (N, 2), radians on `tangent_basis(bearings)`; Jacobian (N, 2, K).
-    """
-    axes = tangent_basis(bearings)
-    across = np.einsum("nij,nj->ni", axes, directions)
-    sine = np.linalg.norm(across, axis=1)
-    angle = np.arctan2(sine, np.einsum("ni,ni->n", bearings, directions))
-    residuals = across * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 1.0)[:, None]
-    return residuals, -np.einsum("nij,njk->nik", axes, harmonics(bearings, degree))
-
-
 def _moved(bearings: np.ndarray, tangents: np.ndarray) -> np.ndarray:
     """Unit bearings moved along arcs."""
     angles = np.linalg.norm(tangents, axis=-1, keepdims=True)

@@ -43,11 +43,6 @@ class SphereImage:
         rows[:, :height], rows[:, height:] = circles[:height], circles[height:][::-1]
         return cls(rows)
 
-    @property
-    def pixel_rad(self) -> float:
-        """Angle between pixels on the equator."""
-        return 2 * np.pi / self.coefficients.shape[1]
-
     def sample(self, vectors_rig: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Values and their gradients at directions.
 

@@ -14,6 +14,7 @@ from gsba.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from gsba.bundle.families import Family, MapSnapshot
+    from gsba.bundle.optimizer import optimize
     from gsba.bundle.point_observations import PointObservations
     from gsba.bundle.pose_variables import X
     from gsba.config import RefineSettings
@@ -42,6 +43,7 @@ __all__ = [
     "load_config",
     "load_run",
     "merge_runs",
+    "optimize",
     "refine",
     "refine_recordings",
     "remove_recordings",
@@ -62,6 +64,7 @@ _HOMES = {
     "load_config": "gsba.config_file",
     "load_run": "gsba.store.finished",
     "merge_runs": "gsba.pipeline.growing",
+    "optimize": "gsba.bundle.optimizer",
     "refine": "gsba.pipeline.refine",
     "refine_recordings": "gsba.pipeline.recordings",
     "remove_recordings": "gsba.pipeline.growing",

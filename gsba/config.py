@@ -1,6 +1,7 @@
 """Settings: one frozen model per stage, defaults that run a sensible job with no file."""
 
 import os
+from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from itertools import pairwise
 from typing import Annotated, Literal
@@ -20,14 +21,10 @@ class _Settings(BaseModel):
 class ReadSettings(_Settings):
     """Frames, trajectory and their association in time."""
 
-    max_interpolation_s: float = Field(
-        default=10.0, gt=0
-    )  # poses in longer gaps are interpolated, too, and reported
     trajectory_format: _Text | None = None  # convention of trajectories, see `--trajectory-format`
     clock_offset_s: float | None = None  # s to add to frame times; None = clocks agree or one fits
     clock: Literal["auto", "given"] = "auto"  # auto: an offset is estimated from the camera's
     # rotation, and applied where it is certain
-    max_clock_shift_s: float = Field(default=10.0, gt=0, le=600)  # largest estimated offset
 
 
 class VideoSettings(_Settings):
@@ -65,7 +62,6 @@ class OdometrySettings(_Settings):
 class CubemapSettings(_Settings):
     """Faces cut from a panorama for detection."""
 
-    hfov_deg: float = Field(default=96.0, ge=90, le=120)
     face_size: _CutSize | None = None  # pixels; None = by oversampling
     oversampling: float = Field(default=0.5, ge=0.25, le=4)  # face pixels per panorama pixel
     min_face_size: _CutSize = 192  # pixels; bounds on the automatic size
@@ -81,12 +77,6 @@ class FeatureSettings(_Settings):
     download: bool = False  # fetch missing weights from their authors
     max_per_face: int = Field(default=450, ge=16)
     contrast_threshold: float = Field(default=0.02, gt=0)
-    sigma_px: float = Field(
-        default=0.16, gt=0
-    )  # per-axis noise of the smallest keypoints, face pixels
-    sigma_per_size: float = Field(
-        default=0.033, ge=0
-    )  # noise that is added in proportion to the keypoint's size
 
 
 class WeakFrameSettings(_Settings):
@@ -97,12 +87,7 @@ class WeakFrameSettings(_Settings):
     max_drift: float = Field(
         default=1.1e-4, gt=0
     )  # predicted position error relative to the path; maps below it get no more keypoints
-    max_scale_sigma: float = Field(
-        default=8e-4, gt=0
-    )  # relative sigma of the ratio of two successive baselines; frames above it are weak
-    reach: int = Field(default=2, ge=0)  # frames before and after a weak one that count as weak
     max_per_face: int = Field(default=1200, ge=16)
-    contrast_threshold: float = Field(default=0.01, gt=0)
 
 
 class MatchingSettings(_Settings):
@@ -114,53 +99,32 @@ class MatchingSettings(_Settings):
     max_ratio: Annotated[float, Field(gt=0, le=1)] | None = None  # ratio test; None = by extractor
 
 
-class GateSettings(_Settings):
-    """Gate of guided matching: assumed errors of a predicted relative pose."""
-
-    rotation_deg: float = Field(gt=0)  # error of the relative rotation
-    direction: float = Field(ge=0)  # tangent of the angular error of the translation
-
-
 class PairSettings(_Settings):
     """Frame pairs to match, and the gates around their predicted geometry."""
 
     window: int = Field(default=32, ge=2)  # frames in time
     max_baseline_depths: float = Field(default=2.0, gt=0)  # longest baseline in median scene depths
     max_loop_neighbours: int = Field(default=8, ge=0)  # nearest frames in space outside the window
-    max_parallax_deg: float = Field(default=60.0, gt=0, le=180)
+    gate_factor: float = Field(default=1.0, gt=0)  # widens angular gates; a run widens them itself
+    # for raw frames whose calibration is poorly known
     strongest_per_face: int = Field(default=150, ge=16)  # keypoints that give pairs' first geometry
-    scarce_matches: int = Field(default=60, ge=0)  # pairs with fewer are matched with all keypoints
-    min_inlier_ratio: float = Field(default=0.5, ge=0, le=1)  # smallest share of a step's matches
-    # that must fit its relative pose; steps below it are matched with all keypoints
-    prior: GateSettings = GateSettings(rotation_deg=4.0, direction=0.4)  # coarse trajectory
-    loop_deg: float = Field(default=2.0, gt=0)  # gate around a known point, added to drift
-    refined: GateSettings = GateSettings(rotation_deg=0.4, direction=0.005)  # solved map
-    point_deg: float = Field(default=0.6, gt=0)  # gate around a known point's predicted bearing
-    drift: float = Field(
-        default=0.003, gt=0
-    )  # drift of the solved chain, relative to the path between two frames
     far_drift: float = Field(
         default=0.05, ge=0, le=1
     )  # largest relative drift that a loop closure may correct
 
 
-class VerifySettings(_Settings):
-    """Two-view geometry."""
+@dataclass(frozen=True, slots=True)
+class TwoViewLimits:
+    """Limits of two-view geometry, and of its agreement with the trajectory."""
 
-    max_error_deg: float = Field(default=0.25, gt=0)  # RANSAC inlier threshold
-    max_false_alarms: float = Field(
-        default=1e-3, gt=0, lt=1
-    )  # expected number of relative poses that fit random matches as well as the estimated one
-    max_error_rate: float = Field(
-        default=0.05, gt=0, lt=1
-    )  # probability of preferring one of two poses that explain the matches equally well
-    max_rotation_deg: float = Field(default=6.0, gt=0)  # disagreement with the trajectory
-    max_direction_deg: float = Field(default=20.0, gt=0)  # disagreement with the trajectory
-    max_length_ratio: float = Field(default=1.5, gt=1)  # disagreement with the trajectory
-    max_triplet_deg: float = Field(
-        default=3.0, gt=0
-    )  # largest deviation of a pair over two steps from these steps' geometry: true pairs deviate
-    # by less than 1, pairs of look-alike places by 10
+    max_error_deg: float = 0.25  # RANSAC inlier threshold, for exact directions
+    max_false_alarms: float = 1e-3  # expected number of relative poses that fit random matches as
+    # well as the estimated one
+    max_error_rate: float = 0.05  # probability of preferring one of two poses that explain the
+    # matches equally well
+    max_rotation_deg: float = 6.0  # disagreement with the trajectory; the next two as well
+    max_direction_deg: float = 20.0
+    max_length_ratio: float = 1.5
 
 
 class TriangulateSettings(_Settings):
@@ -179,14 +143,6 @@ class RoundSettings(_Settings):
     refined: tuple[float, ...] = (4.0, 2.5)  # with matches along the solved map
     aligned: tuple[float, ...] = (6.0, 3.0)  # with aligned patches
     map_passes: int = Field(default=1, ge=1)  # matching passes after loops are closed
-    gate_scale: float = Field(default=10.0, ge=1)  # wider gates widen the loss in proportion
-    tolerance: float = Field(default=3e-4, gt=0, lt=1)  # relative tolerance of all rounds but the
-    # run's last
-    min_support: float = Field(
-        default=0.99, gt=0, le=1
-    )  # share of the inliers that a round must keep, or it is undone
-    min_noise: float = Field(default=0.5, gt=0)  # floor of the estimated noise, in feature sigmas
-    min_observations: int = Field(default=12, ge=1)  # frames with fewer count as unrefined
 
 
 class PatchSettings(_Settings):
@@ -196,19 +152,6 @@ class PatchSettings(_Settings):
     # end once the steps between frames no longer change; 0 = none
     patch_size: int = Field(default=15, ge=5, le=41)  # pixels across, odd
     max_width: int = Field(default=4096, ge=64)  # pixels across a panorama; wider ones are halved
-    max_views: int = Field(default=16, ge=1)  # most frames that a point is aligned in
-    near_frames: int = Field(default=40, ge=0)  # nearest frames in space that may show a point
-    min_track_length: int = Field(
-        default=3, ge=2
-    )  # observations that a point needs before it is aligned in frames without an observation of it
-    max_angle_deg: float = Field(default=45.0, gt=0, lt=90)  # between two rays of a point
-    max_ratio: float = Field(default=1.8, gt=1)  # of a point's distances from two frames
-    affine_sigma: float = Field(default=0.15, gt=0)  # prior of the warp: a surface facing the ray
-    grey_sigma: float = Field(default=3.0, gt=0)  # noise of pixels, grey values
-    min_contrast: float = Field(default=2.0, gt=0)  # grey values, standard deviation in a patch
-    min_zncc: float = Field(default=0.75, gt=0, lt=1)  # correlation of the aligned patches
-    max_shift_px: float = Field(default=3.0, gt=0)  # from the predicted pixel, panorama pixels
-    max_sigma_px: float = Field(default=0.5, gt=0)  # along the least certain direction
 
     @field_validator("patch_size")
     @classmethod
@@ -240,7 +183,6 @@ class CameraSettings(_Settings):
     name: Literal[tuple(CAMERAS)] | None = None  # type: ignore[valid-type]  # sets both priors below
     lens_yaws_deg: tuple[float, ...] | None = None  # directions in which a panorama's lenses look,
     # from its middle to the right; None = two, front and back, or as a stabiliser turned them
-    seam_deg: float = Field(default=4.0, ge=0, le=20)  # from the seam: blended pixels are not used
     baseline_mm: float | None = Field(
         default=None, ge=2, le=200
     )  # published baseline of the lenses (the first two of more): gives the metric scale
@@ -306,10 +248,6 @@ class StitchingSettings(_Settings):
 
     mode: Literal["auto", "off"] = "auto"  # auto: applied where it predicts held-out observations
     max_degree: int = Field(default=10, ge=1, le=16)  # of spherical harmonics; wavelength 360 / it
-    min_gain: float = Field(
-        default=0.03, ge=0, lt=1
-    )  # share by which it must lower the robust cost of held-out observations
-    rounds: int = Field(default=2, ge=1)  # estimates of the field, each with a bundle adjustment
 
 
 class PriorSettings(_Settings):
@@ -317,9 +255,6 @@ class PriorSettings(_Settings):
 
     rotation_deg: float = Field(default=0.5, gt=0)  # noise of a step's rotation
     translation: float = Field(default=0.1, gt=0)  # noise of a step's translation, part of the step
-    absolute_rotation_deg: float = Field(default=30.0, gt=0)
-    absolute_position: float = Field(default=0.3, gt=0)  # part of the trajectory's extent
-    loss_sigmas: float = Field(default=2.0, gt=0)  # Cauchy scale: limits the pull of wrong steps
 
     def faint(self) -> "PriorSettings":
         """Priors ten times as loose: they only hold steps that images do not constrain."""
@@ -356,26 +291,7 @@ class PhotometricSettings(_Settings):
     size: int = Field(default=9, ge=3, le=33)  # pixels across a patch
     spacing_deg: float = Field(default=7.0, gt=0, le=60)  # between patches of a frame
     targets: int = Field(default=8, ge=1)  # frames that a patch is aligned in, nearest in space
-    min_gradient: float = Field(default=2.0, gt=0)  # grey values per pixel, smallest in a patch
-    min_correlation: float = Field(default=0.8, ge=-1, le=1)  # with the template, at the start
     depth_levels: int = Field(default=2, ge=0)  # coarser levels on which depths are estimated first
-    depth_reach_deg: float = Field(default=6.0, gt=0, le=60)  # to map points that give the depth
-    depth_tolerance: float = Field(default=0.03, gt=0)  # relative, of map points on one plane
-    depth_sigma: float = Field(default=0.2, gt=0)  # relative, of a patch's depth
-    slope_sigma: float = Field(default=0.7, gt=0)  # of a patch's tilt, as a tangent
-    noise_grey: float = Field(default=2.0, gt=0)  # grey values of a pixel
-    noise_contrast: float = Field(default=0.1, ge=0)  # added noise, relative to the contrast
-    inflation: float = Field(default=2.0, gt=0)  # of sigmas: a patch's pixel errors are correlated
-    loss_sigmas: float = Field(default=2.0, gt=0)  # Cauchy scale, of a patch's mean residual
-    max_frame_ratio: float = Field(
-        default=2.0, gt=1
-    )  # residual of a frame over the median of all frames; above it, the frame is weighted down
-    max_frame_growth: float = Field(
-        default=1.2, gt=1
-    )  # growth of a frame's geometric residual in the joint solve; above it, it is weighted down
-    max_growth: float = Field(default=1.05, gt=0)  # of the geometric cost, or the solve is undone
-    tolerance: float = Field(default=1e-3, gt=0, lt=1)  # relative tolerance of the joint solve
-    polish_steps: int = Field(default=0, ge=0)  # steps of the planes after each step of the poses
 
 
 class SplatFactorSettings(_Settings):
@@ -389,14 +305,12 @@ class SplatFactorSettings(_Settings):
         default=150, ge=1
     )  # training steps after each move, before held-out panoramas compare the poses
     moves: int = Field(default=3, ge=1)  # most updates of the poses at each size
-    solver_steps: int = Field(default=2, ge=1)  # Levenberg-Marquardt steps in a move
     min_sigmas: float = Field(
         default=2.0, ge=0
     )  # gain on held-out panoramas in standard errors that a move needs, or it is undone
     max_growth: float = Field(default=1.05, gt=0)  # of the geometric cost, or a move is undone
     held_out_every: int = Field(default=8, ge=2)  # one panorama of so many is held out of training
     max_gaussians: int = Field(default=30_000, ge=1)
-    sh_degree: int = Field(default=1, ge=0, le=3)
     backend: Literal["auto", "gsplat", "cpu"] = "auto"
 
 
@@ -470,7 +384,6 @@ class GpsSettings(_Settings):
     sigma_up_m: float = Field(default=5.0, gt=0)  # vertical standard deviation, metres
     correlation_s: float = Field(default=60.0, gt=0)  # correlation time of the errors
     offset_s: float = 0.0  # seconds, added to the times of a file to give the frames' clock
-    loss_sigmas: float = Field(default=2.0, gt=0)  # Cauchy scale of the gps factors
 
 
 class PlacementSettings(_Settings):
@@ -511,7 +424,6 @@ class RefineSettings(_Settings):
     weak_frames: WeakFrameSettings = WeakFrameSettings()
     matching: MatchingSettings = MatchingSettings()
     pairs: PairSettings = PairSettings()
-    verify: VerifySettings = VerifySettings()
     triangulate: TriangulateSettings = TriangulateSettings()
     priors: PriorSettings = PriorSettings()
     rounds: RoundSettings = RoundSettings()
@@ -540,19 +452,15 @@ class RefineSettings(_Settings):
         camera = self.camera.model_copy(update={"name": None, "readout_ms": None})
         return self.model_copy(update={"camera": camera})
 
+    @property
+    def verify(self) -> TwoViewLimits:
+        """Limits of two-view geometry under the gates."""
+        return TwoViewLimits(self.pairs.gate_factor * TwoViewLimits().max_error_deg)
+
     def with_gates(self, scale: float) -> "RefineSettings":
         """Settings with matching gates `scale` times as wide, for poorly calibrated lenses."""
-        verify = {"max_error_deg": scale * self.verify.max_error_deg}
-        refined = {"rotation_deg": scale * self.pairs.refined.rotation_deg}
-        pairs = {
-            "point_deg": scale * self.pairs.point_deg,
-            "refined": self.pairs.refined.model_copy(update=refined),
-        }
-        sections = {
-            "verify": self.verify.model_copy(update=verify),
-            "pairs": self.pairs.model_copy(update=pairs),
-        }
-        return self.model_copy(update=sections)
+        wider = {"gate_factor": scale * self.pairs.gate_factor}
+        return self.model_copy(update={"pairs": self.pairs.model_copy(update=wider)})
 
     def with_faint_priors(self) -> "RefineSettings":
         """Settings with loose priors, for a trajectory that only gives initial poses."""

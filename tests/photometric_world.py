@@ -7,7 +7,7 @@ import numpy as np
 from synthetic import unit
 
 from factors._photometric_kernels import sample_many
-from factors.patch_windows import PAD, PatchPixels, PatchTable, coded, pixel_grid, planes_from
+from factors.patch_windows import PAD, PatchPixels, PatchTable, coded, patch_axes, pixel_grid
 from factors.sphere_image import SphereImage
 from gsba.camera.sphere import bearings_from_erp
 
@@ -29,6 +29,29 @@ class Texture:
             waves += self.phases
             np.sin(waves, out=waves).sum(axis=-1, out=sums[first : first + 512])
         return 127 + 8 * sums.reshape(points.shape[:-1])
+
+
+def planes_from(
+    bearings_rig: np.ndarray, distances: np.ndarray, normals_rig: np.ndarray | None = None
+) -> np.ndarray:
+    """Inverse-depth planes (P, 3) of patches at distances (P,), map units.
+
+    Along bearing + x e1 + y e2 the plane is at 1 / (theta0 + x theta1 + y theta2) times the length
+    of that vector.
+
+    Args:
+        bearings_rig: (P, 3) unit.
+        distances: (P,) positive.
+        normals_rig: (P, 3) of any length, either sign, not orthogonal to the bearing; None = planes
+            orthogonal to the bearings.
+    """
+    inverse = 1.0 / np.asarray(distances, dtype=np.float64)
+    planes = np.zeros((len(inverse), 3))
+    planes[:, 0] = inverse
+    if normals_rig is not None:
+        along = np.einsum("pki,pi->pk", patch_axes(bearings_rig), normals_rig)
+        planes[:, 1:] = inverse[:, None] * along[:, 1:] / along[:, :1]
+    return planes
 
 
 class CodedImage:

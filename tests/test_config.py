@@ -63,10 +63,10 @@ def everything(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_table_keeps_what_an_override_leaves_unsaid(tmp_path: Path) -> None:
-    expected = RefineSettings().pairs.refined.model_copy(update={"direction": 0.01})
-    assert load_config(None, ["pairs.refined.direction=0.01"]).pairs.refined == expected
-    path = _written(tmp_path, "[pairs.refined]\ndirection = 0.01\n")
-    assert load_config(path).pairs.refined == expected
+    expected = RefineSettings().pairs.model_copy(update={"window": 8})
+    assert load_config(None, ["pairs.window=8"]).pairs == expected
+    path = _written(tmp_path, "[pairs]\nwindow = 8\n")
+    assert load_config(path).pairs == expected
 
 
 def _written(folder: Path, text: str) -> Path:
@@ -100,9 +100,9 @@ def test_every_kind_of_setting_round_trips(tmp_path: Path) -> None:
 
 
 def test_overrides_win_over_the_file(tmp_path: Path) -> None:
-    path = _written(tmp_path, "[features]\nmax_per_face = 100\nsigma_px = 0.5\n")
+    path = _written(tmp_path, "[features]\nmax_per_face = 100\ncontrast_threshold = 0.5\n")
     settings = load_config(path, ["features.max_per_face=200"])
-    assert (settings.features.max_per_face, settings.features.sigma_px) == (200, 0.5)
+    assert (settings.features.max_per_face, settings.features.contrast_threshold) == (200, 0.5)
 
 
 @pytest.mark.usefixtures("everything")

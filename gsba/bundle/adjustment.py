@@ -17,6 +17,7 @@ from gsba.bundle.gyro_turns import GyroTurns
 from gsba.bundle.observation_noise import observation_noise, with_scaled_noise
 from gsba.bundle.optimizer import OptimizeResult, marginal_covariances, optimize
 from gsba.bundle.pose_variables import poses_of, values_of
+from gsba.bundle.reconstruction import MIN_OBSERVATIONS
 from gsba.camera.rig import CubeRig
 from gsba.config import CameraSettings, RefineSettings, SolverSettings
 from gsba.types import (
@@ -29,6 +30,11 @@ from gsba.types import (
     Solution,
     Tracks,
 )
+
+GATE_SCALE = 10.0  # gates wider than so many standard deviations widen the loss in proportion
+_TOLERANCE = 3e-4  # relative decrease of the cost that ends a round, but the run's last one
+_MIN_SUPPORT = 0.99  # share of the inliers that a round must keep, or it is undone
+_MIN_NOISE = 0.5  # floor of the estimated noise, in feature sigmas
 
 logger = logging.getLogger(__name__)
 
@@ -58,7 +64,7 @@ class Terms:
             if found is not None:
                 return found
             blocks = (observed.block(), *blocks)
-        return optimize(self.graph, blocks, self.values, settings)
+        return optimize(self.graph, self.values, blocks, settings)
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,7 +262,7 @@ def rescale_noise(
     factors = np.ones(len(keypoints.faces))
     for group in (sighted.aligned, ~sighted.aligned):
         chosen = group[keypoints.rows(placed.tracks)]
-        if np.count_nonzero(chosen) >= settings.rounds.min_observations:
+        if np.count_nonzero(chosen) >= MIN_OBSERVATIONS:
             noise = observation_noise(placed, keypoints, poses, threads, chosen)
             factors[group] = max(noise, _MIN_NOISE_RATIO)
     return replace(sighted, keypoints=with_scaled_noise(keypoints, factors, scratch))
@@ -306,7 +312,7 @@ def adjust_through(
     support = len(place(view.keypoints, solved.world_T_rigs, last_gate).tracks)
     for number, gate in enumerate(gates, 1):
         landmarks = place(view.keypoints, solved.world_T_rigs, gate * solved.noise)
-        spread = solved.noise * max(1.0, gate / settings.rounds.gate_scale)
+        spread = solved.noise * max(1.0, gate / GATE_SCALE)
         solver = _solver(settings, last=final and number == len(gates))
         if context.families.limit_drift:
             finer = {"lambda_initial": _DRIFT_DAMPING, "relative_tolerance": _DRIFT_TOLERANCE}
@@ -316,7 +322,7 @@ def adjust_through(
         result = terms.minimized(solver)
         poses, then = poses_of(result.values, len(solved.world_T_rigs)), after(result.values)
         new_support = len(place(then.keypoints, poses, last_gate).tracks)
-        accepted = new_support >= settings.rounds.min_support * support
+        accepted = new_support >= _MIN_SUPPORT * support
         if accepted:
             view, support = then, new_support
             variables = terms.own.variables(result.values)
@@ -325,7 +331,7 @@ def adjust_through(
             if len(placed.tracks):
                 seen, threads = view.keypoints, context.num_threads
                 noise = observation_noise(placed, seen, poses, threads)
-                solved = replace(solved, noise=max(noise, settings.rounds.min_noise))
+                solved = replace(solved, noise=max(noise, _MIN_NOISE))
         used = len(landmarks.tracks), landmarks.tracks.num_points
         outcome = accepted, result.history, result.reason
         rounds.append(Round(gate, solved.noise, *used, new_support, *outcome))
@@ -357,9 +363,9 @@ class _Placement:
 
 def _solver(settings: RefineSettings, last: bool) -> SolverSettings:
     """Settings of a round: only the last of a run is solved to the end."""
-    if last or settings.rounds.tolerance < settings.solver.relative_tolerance:
+    if last or settings.solver.relative_tolerance > _TOLERANCE:
         return settings.solver
-    looser = {"relative_tolerance": settings.rounds.tolerance, "absolute_tolerance": None}
+    looser = {"relative_tolerance": _TOLERANCE, "absolute_tolerance": None}
     return settings.solver.model_copy(update=looser)
 
 

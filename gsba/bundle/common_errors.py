@@ -5,7 +5,7 @@ truth they then hold for steps from frame to frame, but poses far along the path
 what they claim: sampling and surfaces mislead the patches of some frames alike, and poses take that
 up. It remains where images have neither noise nor compression. What is added here are errors as
 residuals show them, enlarged and smoothed along the path; both numbers are measured
-(`benchmarks/covariances.py`), not derived.
+(`benchmarks/results/covariances.md`), not derived.
 """
 
 from collections.abc import Sequence

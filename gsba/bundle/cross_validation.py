@@ -13,7 +13,7 @@ import numpy as np
 _MIN_GAIN_SIGMAS = 3.0  # least significant gain, in its standard deviations
 
 
-class Part(Protocol):
+class SequencePart(Protocol):
     """A part of the sequence, whose robust cost is a function of parameters."""
 
     @property
@@ -26,7 +26,7 @@ class Part(Protocol):
         ...
 
 
-P = TypeVar("P", bound=Part)
+P = TypeVar("P", bound=SequencePart)
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,9 +24,9 @@ import numpy as np
 from gsba.bundle.families import Family, MapSnapshot, digest_of
 from gsba.bundle.fixes import MAX_DRIFT_SHARE, WHITE_SHARE, FrameFixes
 from gsba.bundle.pose_variables import X, values_of
-from gsba.config import GpsSettings
 from gsba.similarity import NoSimilarityError, Sim3, extent_of, robust_similarity, similarity
 
+_LOSS_SIGMAS = 2.0  # Cauchy scale of the factors
 MIN_FIXES = 5  # in a map: seven unknowns leave little of fewer
 _ROUNDS = 10  # of choosing fixes
 
@@ -61,7 +61,6 @@ class Anchors:
 def anchor(
     world_T_rigs: np.ndarray,
     fixes: FrameFixes,
-    settings: GpsSettings,
     maps: np.ndarray | None = None,
 ) -> Anchors | None:
     """Fixes carried into the world of these poses, each map by a similarity of its own.
@@ -72,7 +71,6 @@ def anchor(
     Args:
         world_T_rigs: (F, 4, 4) poses so far.
         fixes: of some of the frames.
-        settings: scale of the loss.
         maps: (F,) map of each frame; None = there is one.
 
     Returns:
@@ -96,7 +94,7 @@ def anchor(
         return None
     chosen = np.sort(np.concatenate(rows))
     of_fix, kept = of_fix[chosen], fixes.taken(chosen)
-    sigmas, scales = kept.independent_sigmas(), settings.loss_sigmas * wide[chosen]
+    sigmas, scales = kept.independent_sigmas(), _LOSS_SIGMAS * wide[chosen]
     places, covariances = np.empty((len(chosen), 3)), np.empty((len(chosen), 3, 3))
     for a, number in enumerate(of_fix.tolist()):
         fit = found[number]
@@ -181,20 +179,19 @@ def _shifts(num: int) -> np.ndarray:
 
 
 @dataclass(frozen=True, slots=True)
-class GpsFixes(Family):
+class GpsFactors(Family):
     """Fixes of frames; each adjustment carries them into its map anew."""
 
     name = "gps"
     limits_drift = True
 
     fixes: FrameFixes
-    settings: GpsSettings  # scale of the loss
     contradicted: bool = False  # by the images: they are left out, and only reported
 
     @property
     def digest(self) -> str:
         """Digest of the fixes and of the scale of the loss."""
-        return digest_of(self.fixes.digest(), self.settings.loss_sigmas, self.contradicted)
+        return digest_of(self.fixes.digest(), _LOSS_SIGMAS, self.contradicted)
 
     def fitted(self, snapshot: MapSnapshot) -> "AnchoredFixes | None":
         """The fixes in the world of these poses; None where these contradict them."""
@@ -209,7 +206,7 @@ class GpsFixes(Family):
     def _anchors(self, snapshot: MapSnapshot) -> Anchors | None:
         if self.contradicted:
             return None
-        return anchor(snapshot.world_T_rigs, self.fixes, self.settings, snapshot.maps)
+        return anchor(snapshot.world_T_rigs, self.fixes, snapshot.maps)
 
     def report(self, snapshot: MapSnapshot) -> Mapping[str, Any]:
         """Used and false fixes, and their residuals in metres."""

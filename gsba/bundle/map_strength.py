@@ -17,6 +17,8 @@ from gsba.geometry import inverse, rotation_angle, step_covariances
 from gsba.types import Counts, JointErrors, StepNoise
 from gsba.types.records import slices
 
+MAX_SCALE_SIGMA = 8e-4  # relative, of two successive baselines' ratio; frames above it are weak
+_REACH = 2  # frames before and after a weak one that count as weak
 _MAX_HELD_SHARE = 0.25  # largest share of a prior's standard deviation in any direction: the prior
 # then weighs 6 %
 _MIN_HELD_STEPS = 8  # least number of held steps from which the trajectory's noise is estimated
@@ -79,9 +81,9 @@ def measure(
     sigmas = scale_sigmas(world_T_rigs, joint.draws)
     between = seen[:-1] & seen[1:] & np.isfinite(sigmas)
     poor = np.zeros(num, bool)
-    poor[1:-1] = drifting[1:-1] & between & (np.nan_to_num(sigmas) > weak_frames.max_scale_sigma)
-    reach = np.ones(2 * weak_frames.reach + 1)
-    weak = np.convolve(poor, reach)[weak_frames.reach : weak_frames.reach + num] > 0
+    poor[1:-1] = drifting[1:-1] & between & (np.nan_to_num(sigmas) > MAX_SCALE_SIGMA)
+    reach = np.ones(2 * _REACH + 1)
+    weak = np.convolve(poor, reach)[_REACH : _REACH + num] > 0
     held = seen & _held(world_T_rigs, covariances, joint, priors)
     noise = _noise(world_T_rigs, coarse_world_T_rigs, held & believed, priors)
     num_held = int(held.sum())

@@ -122,8 +122,8 @@ class System(Protocol):
 
 def optimize(
     graph: gtsam.NonlinearFactorGraph,
-    blocks: Sequence[Block],
     values: gtsam.Values,
+    blocks: Sequence[Block] = (),
     settings: SolverSettings | None = None,
     callback: Callable[[Iteration, gtsam.Values], None] | None = None,
 ) -> OptimizeResult:
@@ -131,8 +131,9 @@ def optimize(
 
     Args:
         graph: native or user factors, on variables of any type.
-        blocks: batched factors on Pose3 variables; their landmarks move along.
         values: start; variables that nothing constrains stay as they are.
+        blocks: batched factors on Pose3 variables; their landmarks move along.
+        settings: tolerances and damping; None = the defaults.
         callback: called with each attempt and the best values so far.
 
     Returns:

@@ -21,6 +21,7 @@ from gsba.types import (
     Solution,
 )
 
+MIN_OBSERVATIONS = 12  # of a refined frame: 24 residuals for the 6 unknowns of its pose
 _MIN_CORRELATION = 0.1  # least correlation of refined and coarse positions: with usual drift it is
 # .8
 _AT_ONCE = 1 << 16  # observations whose poses are held together: 9 MB

@@ -17,6 +17,9 @@ from gsba.camera.cameras import ONE_CAMERA, Cameras
 from gsba.camera.rig import CubeRig, owner_faces
 from gsba.types import Counts, Keypoints, Round, Sighted, Solution
 
+_MIN_GAIN = 0.03  # share by which the field must lower the robust cost of held-out observations
+_ROUNDS = 2  # estimates of the field, each with a bundle adjustment
+
 logger = logging.getLogger(__name__)
 
 _PRIOR_SIGMAS_RAD = (1e-4, 3e-4, 1e-3, 3e-3)  # radians: a priori, of coefficients of degree 1;
@@ -96,8 +99,8 @@ def estimate(
     """
     settings = context.settings
     chosen = settings.stitching
-    whole = _MAX_OBSERVATIONS, chosen.max_degree, chosen.min_gain
-    probe = _PROBE[0], min(_PROBE[1], chosen.max_degree), 0.5 * chosen.min_gain
+    whole = _MAX_OBSERVATIONS, chosen.max_degree, _MIN_GAIN
+    probe = _PROBE[0], min(_PROBE[1], chosen.max_degree), 0.5 * _MIN_GAIN
     now = Stitching(field, before, keypoints, 0, np.zeros(PARTS), Counts(0, 0, "observations"))
     systems, spread = [], 0.0
     for most, max_degree, least in [whole] if field else [probe, whole]:
@@ -109,7 +112,7 @@ def estimate(
         now = replace(now, degree=degree, part_gains=gains / costs, counts=counts)
         if gains.sum() < least * costs.sum() or np.any(gains <= 0):
             return now
-    for number in range(chosen.rounds):
+    for number in range(_ROUNDS):
         if number:
             systems, _ = _systems(now, _MAX_OBSERVATIONS, chosen.max_degree, context, lenses)
         field = SphereField(_fitted(systems, now.degree, spread))

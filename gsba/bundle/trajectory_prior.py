@@ -11,6 +11,10 @@ from gsba.config import PriorSettings
 from gsba.geometry import inverse
 from gsba.types import StepNoise
 
+# Noise of a frame's pose in the trajectory's world, which only holds frames that nothing else does.
+_ABSOLUTE_DEG = 30.0
+_ABSOLUTE_POSITION = 0.3  # part of the trajectory's extent
+LOSS_SIGMAS = 2.0  # Cauchy scale: limits the pull of wrong steps
 _WEAKER = 10.0  # times the noise of absolute priors, where another family holds the gauge
 _FIRST_SIGMA = 1e-6  # of the held first pose: radians, and part of the extent
 
@@ -77,8 +81,8 @@ class TrajectoryPrior(Family):
     def _add_frames(self, graph: gtsam.NonlinearFactorGraph, extent: float, weaker: float) -> None:
         """Add absolute priors of frames, `weaker` times as noisy as in the settings."""
         model = self._robust(
-            weaker * np.deg2rad(self.settings.absolute_rotation_deg),
-            weaker * self.settings.absolute_position * extent,
+            weaker * np.deg2rad(_ABSOLUTE_DEG),
+            weaker * _ABSOLUTE_POSITION * extent,
         )
         for f, world_T_rig in enumerate(self.world_T_rigs):
             if self.false_frames is None or not self.false_frames[f]:
@@ -91,7 +95,7 @@ class TrajectoryPrior(Family):
         return gtsam.noiseModel.Robust.Create(self._loss(), gaussian)
 
     def _loss(self) -> gtsam.noiseModel.mEstimator.Base:
-        return gtsam.noiseModel.mEstimator.Cauchy.Create(self.settings.loss_sigmas)
+        return gtsam.noiseModel.mEstimator.Cauchy.Create(LOSS_SIGMAS)
 
 
 def _in_a_row(kept: np.ndarray) -> np.ndarray:

@@ -14,6 +14,9 @@ from gsba.config import FeatureSettings
 from gsba.disk import concatenated
 from gsba.types import FACES, Features, Keypoints
 
+# Noise of SIFT keypoints along each axis, face pixels: of the smallest
+# ones, and what is added in proportion to a keypoint's size.
+SIGMA_PX, _SIGMA_PER_SIZE = 0.16, 0.033
 _SAME_PIXEL_PX = 0.01  # pixels of one keypoint on the faces of two rigs differ by more
 
 
@@ -60,7 +63,7 @@ class SiftExtractor:
         keypoints, descriptors = [keypoints[k] for k in order], descriptors[order]
         pixels = np.array([k.pt for k in keypoints]) + 0.5
         sizes = np.array([k.size for k in keypoints])
-        sigmas = np.hypot(self._settings.sigma_px, self._settings.sigma_per_size * sizes)
+        sigmas = np.hypot(SIGMA_PX, _SIGMA_PER_SIZE * sizes)
         return FaceKeypoints(pixels, sigmas, _root_sift(descriptors))
 
 

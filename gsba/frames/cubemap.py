@@ -16,6 +16,7 @@ from gsba.frames.pixels import load_erp, load_faces
 from gsba.frames.track_pairs import load_squares
 from gsba.types import FACES, FrameSet, PictureFormat
 
+HFOV_DEG = 96.0  # of a face: keypoints near an edge are whole on one of both faces
 _ROWS_AT_ONCE = 256  # rows whose coordinates are held in double precision at once
 
 
@@ -30,7 +31,7 @@ def rig_for(kind: PictureFormat, settings: CubemapSettings) -> CubeRig:
     if not kind.panoramic:
         most = settings.face_size or settings.max_face_size
         return CubeRig(min(kind.native_face_size, most), np.pi / 2)
-    hfov = np.deg2rad(settings.hfov_deg)
+    hfov = np.deg2rad(HFOV_DEG)
     native = 2 * kind.width / (2 * np.pi) * np.tan(hfov / 2)
     wanted = max(round(settings.oversampling * native), settings.min_face_size)
     size = settings.face_size or min(wanted, settings.max_face_size)

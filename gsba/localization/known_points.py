@@ -30,7 +30,7 @@ def num_parameters(projection: Projection) -> int:
 
 
 @dataclass(frozen=True, slots=True)
-class Sightings:
+class PointSightings:
     """Points of a map in one picture, a panorama or a photo."""
 
     points_world: np.ndarray  # (N, 3) float64, map units
@@ -41,7 +41,7 @@ class Sightings:
     origins_rig: np.ndarray | None = None  # (N, 3) origins of rays, rig frame; None = the centre
     camera: int | None = None  # number of a photo's camera; None = a panorama
 
-    def taken(self, rows: np.ndarray) -> "Sightings":
+    def taken(self, rows: np.ndarray) -> "PointSightings":
         """Sightings `rows` (M,), int or bool."""
         origins = self.origins_rig
         return replace(
@@ -66,7 +66,7 @@ class Residuals:
 
 
 def residuals_of(
-    seen: Sightings, world_T_rig: np.ndarray, projection: Projection | None
+    seen: PointSightings, world_T_rig: np.ndarray, projection: Projection | None
 ) -> Residuals:
     """Residuals of sightings at a pose (4, 4): in a panorama on the bearing's tangent plane, in a
     photo in pixels."""
@@ -104,7 +104,10 @@ class KnownPointBlock:
     """
 
     def __init__(
-        self, pictures: Sequence[Sightings], projections: Sequence[Projection], loss: RobustLoss
+        self,
+        pictures: Sequence[PointSightings],
+        projections: Sequence[Projection],
+        loss: RobustLoss,
     ) -> None:
         self._pictures, self._loss = tuple(pictures), loss
         # Cameras at accepted values, and these: steps lead on from there.

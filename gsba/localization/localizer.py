@@ -19,7 +19,7 @@ from gsba.frames import cubemap
 from gsba.frames.files import image_size
 from gsba.frames.panorama import fitted_to, load_grey
 from gsba.geometry import adjoint, inverse
-from gsba.localization.known_points import Sightings, isotropic
+from gsba.localization.known_points import PointSightings, isotropic
 from gsba.localization.patch_sightings import PatchAligner
 from gsba.localization.picture_cameras import PictureCameras
 from gsba.localization.pictures import load_panorama
@@ -268,7 +268,7 @@ class Localizer:
             bearings, origins = lenses.rays(bearings, np.zeros(len(bearings), np.int64))
         points = self.map.result.points_world[found.points]
         uncertain = self.map.point_covariances[found.points]
-        seen = Sightings(points, uncertain, bearings, found.covariances, origins)
+        seen = PointSightings(points, uncertain, bearings, found.covariances, origins)
         fitted = fit([seen], frame.world_T_rig[None], FINE)
         world_T_rig, inliers = fitted.world_T_rigs[0], fitted.inliers[0]
         if not np.isfinite(fitted.covariances[0]).all() or inliers.sum() < _MIN_POINTS:
@@ -359,9 +359,9 @@ class Localizer:
         positions = self.map.result.points_world[points]
         return Candidates(keypoints, query.bearings[keypoints], points, positions)
 
-    def _sightings(self, query: Query, candidates: Candidates) -> Sightings:
+    def _sightings(self, query: Query, candidates: Candidates) -> PointSightings:
         rows, origins = candidates.keypoints, query.origins_rig
-        return Sightings(
+        return PointSightings(
             candidates.points_world,
             self.map.point_covariances[candidates.points],
             query.bearings[rows],
@@ -370,7 +370,7 @@ class Localizer:
         )
 
     def _judged(
-        self, name: str, fitted: PoseFit, seen: Sightings, candidates: Candidates
+        self, name: str, fitted: PoseFit, seen: PointSightings, candidates: Candidates
     ) -> LocalizedFrame:
         """The frame with its pose, if that is significant and determined."""
         inliers, covariance = fitted.inliers[0], fitted.covariances[0]

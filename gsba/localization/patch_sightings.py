@@ -15,7 +15,7 @@ from gsba.localization.photos import shows
 from gsba.localization.run_map import RunMap, without_correction
 from gsba.photometric.alignment import REJECTIONS, accepted_rows
 from gsba.photometric.frame_jobs import align_to, cut
-from gsba.photometric.references import view_differences
+from gsba.photometric.references import MAX_ANGLE_DEG, MAX_RATIO, view_differences
 from gsba.store.shards import Threads
 
 
@@ -63,15 +63,15 @@ class PatchAligner:
     def expected(self, world_T_rig: np.ndarray, frames: np.ndarray) -> Expected:
         """Points that frames (N,) of the map observe, each with the frame whose view is most like
         that from a pose (4, 4)."""
-        result, settings = self._map.result, self._map.settings.patches
+        result = self._map.result
         rows = np.flatnonzero(np.isin(result.observation_frames, frames))
         points, hosts = result.observation_points[rows], result.observation_frames[rows]
         positions = result.points_world[points]
         own = positions - world_T_rig[:3, 3]
         theirs = positions - result.world_T_rigs[hosts, :3, 3]
         cosines, ratios, costs = view_differences(own, theirs)
-        likely = cosines > np.cos(np.deg2rad(settings.max_angle_deg))
-        likely &= (ratios < settings.max_ratio) & (ratios * settings.max_ratio > 1)
+        likely = cosines > np.cos(np.deg2rad(MAX_ANGLE_DEG))
+        likely &= (ratios < MAX_RATIO) & (ratios * MAX_RATIO > 1)
         rows = np.flatnonzero(likely)
         rows = rows[np.lexsort((costs[rows], points[rows]))]
         _, first = np.unique(points[rows], return_index=True)
@@ -118,7 +118,7 @@ class PatchAligner:
         patches: PatchSet = cut(
             "patches", self.greys, expected.hosts, origins, spreads, settings, threads
         )
-        align_to(image, mask, patches, sightings, settings)
+        align_to(image, mask, patches, sightings)
         dropped = dict.fromkeys(REJECTIONS, 0)
-        kept, bearings, covariances = accepted_rows(patches, sightings, pixel, settings, dropped)
+        kept, bearings, covariances = accepted_rows(patches, sightings, pixel, dropped)
         return AlignedPoints(expected.points[kept], bearings, covariances)

@@ -11,7 +11,7 @@ from factors.sphere_image import SphereImage
 from gsba.camera.lens import ONE_CENTRE
 from gsba.camera.projections import PerspectiveProjection
 from gsba.camera.rig import owner_faces
-from gsba.localization.known_points import Sightings
+from gsba.localization.known_points import PointSightings
 from gsba.localization.localizer import (
     NO_PLACE,
     NOT_DETERMINED,
@@ -87,7 +87,7 @@ class _Placed:
     image: np.ndarray  # (H, W, 3) uint8
     world_T_camera: np.ndarray  # (4, 4)
     projection: PerspectiveProjection
-    seen: Sightings  # points that it shows, camera 0
+    seen: PointSightings  # points that it shows, camera 0
     num_inliers: int
     evidence: JoinEvidence  # for and against its pose
 
@@ -261,14 +261,14 @@ def _sightings(
     pixels: np.ndarray,
     features: Features,
     cut_by: PerspectiveProjection,
-) -> Sightings:
+) -> PointSightings:
     """Candidates as pixels (K, 2) of the photo, with the noise of their keypoints."""
     rows = candidates.keypoints
     by_bearing = cut_by.jacobians(features.bearings_rig[rows])[0]
     spreads = by_bearing @ np.swapaxes(by_bearing, 1, 2)
     spreads *= features.sigmas_rad[rows, None, None] ** 2
     covariances = localizer.map.point_covariances[candidates.points]
-    return Sightings(candidates.points_world, covariances, pixels[rows], spreads, camera=0)
+    return PointSightings(candidates.points_world, covariances, pixels[rows], spreads, camera=0)
 
 
 def _fit_together(
@@ -287,7 +287,7 @@ def _fit_together(
     pictures = [replace(one.seen, camera=c) for one, c in zip(placed, numbers, strict=True)]
     poses = np.array([one.world_T_camera for one in placed])
 
-    def solve(seen: Sequence[Sightings]) -> PoseFit:
+    def solve(seen: Sequence[PointSightings]) -> PoseFit:
         steps = [_step(*pair) for pair in zip(starts, expected, strict=True)]
         beliefs = [CameraPrior(*pair) for pair in zip(steps, sigmas, strict=True)]
         return fit(seen, poses, FINE, starts, beliefs)
@@ -325,8 +325,8 @@ def _on_patches(
     placed: _Placed,
     world_T_camera: np.ndarray,
     projection: PerspectiveProjection,
-    before: Sightings,
-) -> Sightings:
+    before: PointSightings,
+) -> PointSightings:
     """Points that patches find in a photo; the sightings before if they are too few."""
     aligner, map_ = localizer.aligner, localizer.map
     grey, mask = as_panorama(placed.image, projection, aligner.width)
@@ -344,11 +344,11 @@ def _on_patches(
     spreads = axes @ found.covariances @ np.swapaxes(axes, 1, 2)
     points = map_.result.points_world[found.points]
     uncertain = map_.point_covariances[found.points]
-    return Sightings(points, uncertain, pixels, spreads, camera=before.camera)
+    return PointSightings(points, uncertain, pixels, spreads, camera=before.camera)
 
 
 def _judged(
-    localizer: Localizer, name: str, fitted: PoseFit, number: int, seen: Sightings, camera: int
+    localizer: Localizer, name: str, fitted: PoseFit, number: int, seen: PointSightings, camera: int
 ) -> LocalizedFrame:
     """A photo with its pose, if that is determined."""
     pose, inliers = fitted.world_T_rigs[number], fitted.inliers[number]

@@ -11,7 +11,7 @@ from gsba.bundle.optimizer import marginal_covariances, optimize
 from gsba.bundle.pose_variables import X
 from gsba.camera.projections import Projection
 from gsba.config import SolverSettings
-from gsba.localization.known_points import K, KnownPointBlock, Sightings, num_parameters
+from gsba.localization.known_points import K, KnownPointBlock, PointSightings, num_parameters
 
 GATE_SIGMAS = 3.5  # of an inlier's residual
 COARSE = (8.0,)  # scales of the loss, round by round, standard deviations, of a first fit
@@ -44,7 +44,7 @@ class PoseFit:
 
 
 def fit(
-    pictures: Sequence[Sightings],
+    pictures: Sequence[PointSightings],
     starts: np.ndarray,
     scales: Sequence[float],
     projections: Sequence[Projection] = (),
@@ -69,7 +69,7 @@ def fit(
     noises = np.ones(len(pictures))
     for scale in scales:
         block = _block(pictures, noises, projections, scale)
-        values = optimize(graph, [block], values, _SOLVER).values
+        values = optimize(graph, values, [block], _SOLVER).values
         squares = block.squared_residuals(values)
         if scale <= _KNOWN_NOISE:
             noises = np.array([_rescaled(*pair) for pair in zip(noises, squares, strict=True)])
@@ -99,7 +99,7 @@ def is_determined(
 
 
 def _block(
-    pictures: Sequence[Sightings],
+    pictures: Sequence[PointSightings],
     noises: np.ndarray,
     projections: Sequence[Projection],
     scale: float,

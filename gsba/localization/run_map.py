@@ -33,7 +33,7 @@ _SAME_PLACE_RAD = np.deg2rad(0.25)  # and largest such angle
 
 
 @dataclass(frozen=True, slots=True)
-class Keyframe:
+class MapKeyframe:
     """A frame of the map: the keypoints that show points of the map."""
 
     features: Features  # (K)
@@ -61,7 +61,7 @@ class RunMap:
     axes: np.ndarray  # (D, D) float32, axes of descriptors, see `searchable`
     load_features: Callable[[int], Features]  # keypoints of a frame, by its number, without those
     # that are extracted at weak frames later
-    load_keyframe: Callable[[int], Keyframe]  # by the number of the frame; recent ones are kept
+    load_keyframe: Callable[[int], MapKeyframe]  # by the number of the frame; recent ones are kept
 
     @classmethod
     def open(cls, root: Path, map_number: int = 1) -> "RunMap":
@@ -94,7 +94,7 @@ class RunMap:
 
         numbers = frames.cameras
 
-        def keyframe(f: int) -> Keyframe:
+        def keyframe(f: int) -> MapKeyframe:
             seen_by = cameras.at(f), fields[numbers[f]]
             return _keyframe(f, reader(f), observed, result, *seen_by, settings, rig, axes)
 
@@ -180,7 +180,7 @@ def _keyframe(
     settings: RefineSettings,
     rig: CubeRig,
     axes: np.ndarray,
-) -> Keyframe:
+) -> MapKeyframe:
     """Keypoints of a frame that lie where the frame observes a point of the map."""
     from scipy.spatial import KDTree
 
@@ -200,7 +200,7 @@ def _keyframe(
     points = result.points_world[numbers[chosen]] - world_T_rig[:3, 3]
     strongest = searchable(kept, axes, settings.pairs.strongest_per_face)
     every = searchable(kept, axes)
-    return Keyframe(kept, strongest, every, points @ world_T_rig[:3, :3], numbers[chosen])
+    return MapKeyframe(kept, strongest, every, points @ world_T_rig[:3, :3], numbers[chosen])
 
 
 def taken(features: Features, rows: np.ndarray) -> Features:

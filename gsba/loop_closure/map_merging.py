@@ -21,7 +21,7 @@ from gsba.loop_closure.join_test import JoinTest, Judged
 from gsba.loop_closure.map_similarity import Meeting, Proposal, propose
 from gsba.loop_closure.merged_map import Registered, carried, laid_out
 from gsba.loop_closure.pose_graph import Loop
-from gsba.loop_closure.registration import Resection, resect
+from gsba.loop_closure.registration import RegisteredFrame, resect
 from gsba.loop_closure.retrieval import global_descriptors
 from gsba.matching import pairs, recovery
 from gsba.matching.guided_search import Gate, MatchContext
@@ -447,7 +447,7 @@ class _Joining:
                 return True
         return False
 
-    def _resected(self, f: int, rows: np.ndarray, points: np.ndarray) -> Resection | None:
+    def _resected(self, f: int, rows: np.ndarray, points: np.ndarray) -> RegisteredFrame | None:
         """Accepted pose of a frame whose keypoints (m,) may observe points (m, 3)."""
         if len(rows) == 0:
             return None

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsba.config import VerifySettings
+from gsba.config import TwoViewLimits
 from gsba.geometry import inverse
 from gsba.matching.absolute_pose import panorama_pose
 
@@ -17,7 +17,7 @@ _RIVAL_DISTANCE = 0.3  # distance of another place, in median depths or radians
 
 
 @dataclass(frozen=True, slots=True)
-class Resection:
+class RegisteredFrame:
     """Pose of one frame in a map."""
 
     world_T_rig: np.ndarray  # (4, 4) float64
@@ -26,8 +26,8 @@ class Resection:
 
 
 def resect(
-    bearings: np.ndarray, points_world: np.ndarray, settings: VerifySettings, seed: int
-) -> Resection | None:
+    bearings: np.ndarray, points_world: np.ndarray, settings: TwoViewLimits, seed: int
+) -> RegisteredFrame | None:
     """Absolute pose from bearings of points, and its acceptance.
 
     Args:
@@ -62,4 +62,4 @@ def resect(
             turned = np.linalg.norm(moved[:3, :3] - np.eye(3)) / np.sqrt(2)
             if max(np.linalg.norm(moved[:3, 3]) / depth, turned) > _RIVAL_DISTANCE:
                 reason = "another place explains it nearly as well"
-    return Resection(world_T_rig, inliers, reason)
+    return RegisteredFrame(world_T_rig, inliers, reason)

@@ -5,13 +5,24 @@ from functools import partial
 
 import numpy as np
 
-from gsba.config import RefineSettings
 from gsba.geometry import inverse
 from gsba.matching import pairs, verification
-from gsba.matching.guided_search import Gate, MatchContext
+from gsba.matching.guided_search import MAX_PARALLAX_RAD, PRIOR_GATE, Gate, MatchContext
 from gsba.matching.verification import RelativePose
 from gsba.types import Matches, Solution, VerifiedPairs
 
+# Gates in degrees are for exact directions: `pairs.gate_factor` widens those of a solved map.
+SCARCE_MATCHES = 60  # pairs with fewer are matched with all keypoints
+_MIN_INLIER_RATIO = (
+    0.5  # of a step's matches to its pose; steps below are matched with all keypoints
+)
+_LOOP_DEG = 2.0  # gate around a known point, added to drift
+_REFINED_DEG, _REFINED_DIRECTION = (
+    0.4,
+    0.005,
+)  # gate of the solved map: rotation, tangent of direction
+_POINT_DEG = 0.6  # gate around a known point's predicted bearing
+_DRIFT = 0.003  # of the solved chain, relative to the path between two frames
 _ROTATION_GAPS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)  # gaps in frames between
 # matched pairs
 _MAX_JOIN_ERROR_RAD = np.deg2rad(4.0)  # largest error of a joined part's pose, as an angle at the
@@ -29,11 +40,9 @@ def match_neighbours(context: MatchContext, start: Solution) -> VerifiedPairs:
     """
     world_T_rigs, settings = start.world_T_rigs, context.settings
     chosen = pairs.adjacent(len(world_T_rigs))
-    prior = settings.pairs.prior
-    gate = _gate(prior.rotation_deg, prior.direction, settings)
 
     # The strongest keypoints suffice for a pair's geometry, at a tenth of the cost.
-    found = context.match(chosen, world_T_rigs, [gate] * len(chosen), strongest=True)
+    found = context.match(chosen, world_T_rigs, [PRIOR_GATE] * len(chosen), strongest=True)
     f0_T_f1s = inverse(world_T_rigs[chosen[:, 0]]) @ world_T_rigs[chosen[:, 1]]
     agreeing = partial(
         verification.agree_with_prior,
@@ -41,16 +50,16 @@ def match_neighbours(context: MatchContext, start: Solution) -> VerifiedPairs:
         position_sigmas=np.zeros(len(chosen)),
         settings=settings.verify,
     )
-    estimates = _estimates(found, gate, context)
+    estimates = _estimates(found, PRIOR_GATE, context)
     neighbours = agreeing(found, estimates)
-    scarce = np.diff(found.offsets) < settings.pairs.scarce_matches
+    scarce = np.diff(found.offsets) < SCARCE_MATCHES
     steps = chosen[:, 1] - chosen[:, 0] == 1
-    doubtful = steps & (_inlier_ratios(found, neighbours) < settings.pairs.min_inlier_ratio)
+    doubtful = steps & (_inlier_ratios(found, neighbours) < _MIN_INLIER_RATIO)
     rows = np.flatnonzero(scarce | doubtful)
     if len(rows) == 0:
         return neighbours
-    again = context.match(chosen[rows], world_T_rigs, [gate] * len(rows))
-    for p, estimate in zip(rows, _estimates(again, gate, context), strict=True):
+    again = context.match(chosen[rows], world_T_rigs, [PRIOR_GATE] * len(rows))
+    for p, estimate in zip(rows, _estimates(again, PRIOR_GATE, context), strict=True):
         estimates[p] = estimate
     return agreeing(_with_replaced(found, rows, again), estimates)
 
@@ -73,8 +82,8 @@ def match_loops(context: MatchContext, solved: Solution) -> VerifiedPairs:
     chosen = pairs.closing(positions, depth, settings.pairs)
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     along = np.concatenate([[0], np.cumsum(steps)])
-    drifts = settings.pairs.drift * (along[chosen[:, 1]] - along[chosen[:, 0]])
-    radii = np.deg2rad(settings.pairs.loop_deg) + 2 * drifts / max(depth, 1e-12)
+    drifts = _DRIFT * (along[chosen[:, 1]] - along[chosen[:, 0]])
+    radii = np.deg2rad(_LOOP_DEG) + 2 * drifts / max(depth, 1e-12)
     few = pairs.thinned(chosen, radii > _UNPREDICTED_RAD, _UNPREDICTED_NEIGHBOURS)
     chosen, drifts = chosen[few], drifts[few]
     gates = [Gate.around_points(radius) for radius in radii[few]]
@@ -98,7 +107,7 @@ def match_along_epipolars(
         maps: (F,) int, map of each frame; -1 = a frame of none; None = there is one map.
     """
     poses, settings = solved.world_T_rigs, context.settings
-    refined = settings.pairs.refined
+    turn = np.deg2rad(settings.pairs.gate_factor * _REFINED_DEG)
     chosen = pairs.adjacent(len(poses))
     if maps is not None:
         first, second = maps[chosen].T
@@ -106,7 +115,7 @@ def match_along_epipolars(
     lengths = np.linalg.norm(poses[chosen[:, 1], :3, 3] - poses[chosen[:, 0], :3, 3], axis=1)
     apart = context.cameras.baseline  # a ray may start at either lens
     gates = [
-        _gate(refined.rotation_deg, refined.direction + apart / max(length, 1e-12), settings)
+        Gate(turn, _REFINED_DIRECTION + apart / max(length, 1e-12), MAX_PARALLAX_RAD)
         for length in lengths
     ]
     # A learned matcher adds nothing where poses are known this well.
@@ -154,7 +163,7 @@ def match_known_points(context: MatchContext, solved: Solution, loops_closed: bo
     chosen = near[near[:, 1] - near[:, 0] > 2]
     if loops_closed:
         chosen = np.concatenate([chosen, loops])
-    gates = [Gate.around_points(np.deg2rad(settings.point_deg))] * len(chosen)
+    gates = [Gate.around_points(np.deg2rad(settings.gate_factor * _POINT_DEG))] * len(chosen)
     known = solved.points_by_keypoint(context.keypoints)
     # A learned matcher adds nothing where a point is known this well.
     return context.match(chosen, poses, gates, known, guided_only=True)
@@ -166,7 +175,7 @@ def match_known_points_across(
     """Match frames of different parts (F,) of a map around predicted bearings of known points."""
     poses, settings = solved.world_T_rigs, context.settings.pairs
     chosen = pairs.across(poses[:, :3, 3], solved.median_depth(), settings, parts)
-    gates = [Gate.around_points(np.deg2rad(settings.point_deg))] * len(chosen)
+    gates = [Gate.around_points(np.deg2rad(settings.gate_factor * _POINT_DEG))] * len(chosen)
     known = solved.points_by_keypoint(context.keypoints)
     return context.match(chosen, poses, gates, known, guided_only=True)
 
@@ -221,10 +230,6 @@ def _with_replaced(matches: Matches, indices: np.ndarray, others: Matches) -> Ma
     for n, p in enumerate(indices):
         rows[p] = others.of(n)
     return Matches.of_rows(matches.pairs, rows)
-
-
-def _gate(rotation_deg: float, direction: float, settings: RefineSettings) -> Gate:
-    return Gate(np.deg2rad(rotation_deg), direction, np.deg2rad(settings.pairs.max_parallax_deg))
 
 
 def match_for_rotations(context: MatchContext, world_T_rigs: np.ndarray) -> Matches:

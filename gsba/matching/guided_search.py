@@ -25,6 +25,7 @@ from gsba.matching.pairs import by_place
 from gsba.store.shards import Workers, blocks_of_frames
 from gsba.types import Features, Keypoints, Matches
 
+MAX_PARALLAX_RAD = np.deg2rad(60.0)  # between two rays of a point
 T = TypeVar("T")
 _CELLS_PER_SIDE = 8  # cells along a face's side
 _NO_MATCHES = np.zeros((0, 2), np.int32)
@@ -63,6 +64,10 @@ class Gate:
             return min(4 * max_error_rad / (np.pi * self.point_rad), 1.0)  # area of a strip of a
             # disc
         return min(max_error_rad / self.rotation_rad, 1.0) if self.is_prediction else 0.0
+
+
+# Assumed errors of a coarse trajectory's relative poses: 4 degrees, tangent of a direction's error.
+PRIOR_GATE = Gate(np.deg2rad(4.0), 0.4, MAX_PARALLAX_RAD)
 
 
 @dataclass(frozen=True, slots=True)

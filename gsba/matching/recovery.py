@@ -7,8 +7,8 @@ import numpy as np
 from gsba.config import RefineSettings
 from gsba.geometry import inverse
 from gsba.matching import guided_search, pairs
-from gsba.matching.correspondences import verified
-from gsba.matching.guided_search import Gate, MatchContext
+from gsba.matching.correspondences import SCARCE_MATCHES, verified
+from gsba.matching.guided_search import PRIOR_GATE, Gate, MatchContext
 from gsba.trajectory import clock, joining, judgement, misread, turning
 from gsba.trajectory.clock import ClockEstimate
 from gsba.trajectory.joining import SegmentAlignment
@@ -27,6 +27,10 @@ from gsba.trajectory.steps import (
 )
 from gsba.types import CoarsePoses, Counts, Keypoints, Trajectory, VerifiedPairs
 
+_MAX_CLOCK_SHIFT_S = 10.0  # largest offset of clocks that is looked for
+# Largest deviation of a pair over two steps from these steps' geometry: true pairs deviate by less
+# than 1 degree, pairs of look-alike places by 10.
+_MAX_TRIPLET_DEG = 3.0
 _WIDER_GAPS = 2, 4, 8  # gaps in frames of additional pairs
 _MIN_LOST_SHARE = 0.2  # share of lost neighbours from which whole panoramas are compared
 _MIN_COMMON_POINTS = 5  # common points that suffice for the ratio of two steps' lengths
@@ -229,17 +233,16 @@ def check_clock(
         guided = VerifiedPairs.joined([guided, match_anywhere(context, lost)])
     steps = image_steps(guided, context.keypoints)
     misread.refuse_misread(coarse, steps, settings.verify)
-    reach = settings.read.max_clock_shift_s
-    return clock.estimate_clock(timestamps, steps, trajectory, coarse.time_offset, reach)
+    return clock.estimate_clock(
+        timestamps, steps, trajectory, coarse.time_offset, _MAX_CLOCK_SHIFT_S
+    )
 
 
 def _match_along(
     context: MatchContext, world_T_rigs: np.ndarray, chosen: np.ndarray
 ) -> VerifiedPairs:
     """Match pairs (P, 2) guided by the start, and verify that they agree with it."""
-    settings = context.settings.pairs
-    prior, limit = settings.prior, np.deg2rad(settings.max_parallax_deg)
-    gates = [Gate(np.deg2rad(prior.rotation_deg), prior.direction, limit)] * len(chosen)
+    gates = [PRIOR_GATE] * len(chosen)
     found = context.match(chosen, world_T_rigs, gates)
     f0_T_f1s = inverse(world_T_rigs[chosen[:, 0]]) @ world_T_rigs[chosen[:, 1]]
     return verified(found, gates, f0_T_f1s, np.zeros(len(chosen)), context)
@@ -365,7 +368,7 @@ def _frames_of_open_ratio(context: MatchContext, found: VerifiedPairs) -> tuple[
             continue  # a break, or rotations on the spot
         before, after = (found.matches.of(p) for p in both)
         shared = len(np.intersect1d(before[:, 1], after[:, 0]))
-        if shared >= context.settings.pairs.scarce_matches:
+        if shared >= SCARCE_MATCHES:
             continue
         if np.isinf(sigmas[f - 1]):
             unknown.add(f)
@@ -379,5 +382,5 @@ def _consistent(
 ) -> VerifiedPairs:
     """Pairs without those over two steps that repeated structure contradicts, see `off_steps`."""
     off = off_steps(found, steps)
-    false = off > np.deg2rad(settings.verify.max_triplet_deg)
+    false = off > np.deg2rad(_MAX_TRIPLET_DEG)
     return found.taken(np.flatnonzero(~false).tolist()) if false.any() else found

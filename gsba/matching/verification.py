@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from gsba.camera.rig import witnesses
-from gsba.config import VerifySettings
+from gsba.config import TwoViewLimits
 from gsba.geometry import inverse, pose, rotation_angle
 from gsba.significance import least_agreeing, outweighs
 from gsba.store.shards import ITEMS, Workers, even_blocks
@@ -47,7 +47,7 @@ def agree_with_prior(
     estimates: Sequence[RelativePose | None],
     prior_f0_T_f1s: np.ndarray | None,
     position_sigmas: np.ndarray | None,
-    settings: VerifySettings,
+    settings: TwoViewLimits,
 ) -> VerifiedPairs:
     """Keep pairs that have one relative pose, which agrees with the prior.
 
@@ -90,7 +90,7 @@ def agree_with_prior(
 
 
 def _why_prior_contradicts(
-    found: RelativePose, prior: np.ndarray, position_sigma: float, settings: VerifySettings
+    found: RelativePose, prior: np.ndarray, position_sigma: float, settings: TwoViewLimits
 ) -> str:
     """Reason why a pose does not fit a prior (4, 4) with standard deviation `position_sigma`; "" =
     it fits."""
@@ -109,7 +109,7 @@ def _why_prior_contradicts(
 def estimate_relative_poses(
     matches: Matches,
     keypoints: Keypoints,
-    settings: VerifySettings,
+    settings: TwoViewLimits,
     seed: int,
     workers: Workers,
     chances: np.ndarray,
@@ -141,7 +141,7 @@ class _PoseJob:
 
     num: int
     rays: Callable[[int], tuple[np.ndarray, np.ndarray]]  # of a pair, (m, 3) in either frame's axes
-    settings: VerifySettings
+    settings: TwoViewLimits
     seed: int
     chances: np.ndarray
     rivals: bool
@@ -166,7 +166,7 @@ class _PoseJob:
 def relative_pose(
     bearings0: np.ndarray,
     bearings1: np.ndarray,
-    settings: VerifySettings,
+    settings: TwoViewLimits,
     seed: int,
     chance: float = 0.0,
     rivals: bool = False,
@@ -191,7 +191,7 @@ def relative_pose(
 def _significant_pose(
     bearings0: np.ndarray,
     bearings1: np.ndarray,
-    settings: VerifySettings,
+    settings: TwoViewLimits,
     seed: int,
     chance: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray] | None:
@@ -219,7 +219,7 @@ def _significant_pose(
 
 
 def _ransac(
-    bearings0: np.ndarray, bearings1: np.ndarray, least: int, settings: VerifySettings, seed: int
+    bearings0: np.ndarray, bearings1: np.ndarray, least: int, settings: TwoViewLimits, seed: int
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """f0_T_f1 (4, 4) and inliers (m,) bool of the pose with the most inliers, at least `least`."""
     import pycolmap
@@ -249,7 +249,7 @@ def _is_rivalled(
     bearings0: np.ndarray,
     bearings1: np.ndarray,
     inliers: np.ndarray,
-    settings: VerifySettings,
+    settings: TwoViewLimits,
     seed: int,
 ) -> bool:
     """True if outliers of a pose agree on another pose that explains about as many matches.

@@ -13,7 +13,7 @@ import numpy as np
 from gsba.geometry import inverse
 from gsba.loop_closure import map_merging
 from gsba.odometry.loops import find_joins, find_loops
-from gsba.odometry.places import Places, chosen_keyframes, described, make_places
+from gsba.odometry.places import KeyframePlaces, chosen_keyframes, described, make_places
 from gsba.odometry.pose_graph import Constraint, close_loops, covariances_of
 from gsba.odometry.steps import MeasuredSteps, measure_steps
 from gsba.similarity import Sim3
@@ -80,7 +80,7 @@ def close(tracked: TrackedKeyframes, seed: int, workers: Workers) -> ClosedKeyfr
     return found
 
 
-def _places(tracked: TrackedKeyframes, seed: int, workers: Workers) -> Places | None:
+def _places(tracked: TrackedKeyframes, seed: int, workers: Workers) -> KeyframePlaces | None:
     maps = np.where(tracked.solved, tracked.maps, -1)
     rows = chosen_keyframes(tracked.world_T_keys, maps, tracked.distances)
     if len(rows) < _MIN_PLACES:
@@ -91,7 +91,9 @@ def _places(tracked: TrackedKeyframes, seed: int, workers: Workers) -> Places | 
     return make_places(rows, tracked.maps[rows], poses, features, seed, workers)
 
 
-def _joined(found: ClosedKeyframes, places: Places, tracked: TrackedKeyframes) -> ClosedKeyframes:
+def _joined(
+    found: ClosedKeyframes, places: KeyframePlaces, tracked: TrackedKeyframes
+) -> ClosedKeyframes:
     """Maps moved to where they overlap others; the first map of each group stays in place."""
     numbers, counts = np.unique(places.maps, return_counts=True)
     numbers = numbers[counts >= _MIN_PLACES]
@@ -121,7 +123,7 @@ def _joined(found: ClosedKeyframes, places: Places, tracked: TrackedKeyframes) -
 
 
 def _closed(
-    found: ClosedKeyframes, keys: np.ndarray, places: Places, steps: MeasuredSteps
+    found: ClosedKeyframes, keys: np.ndarray, places: KeyframePlaces, steps: MeasuredSteps
 ) -> ClosedKeyframes:
     """The map of some keyframes (N,) with its loops closed, and the covariances of its poses."""
     poses, scales = found.world_T_keys[keys], found.scales[keys]

@@ -13,7 +13,7 @@ from gsba.loop_closure.map_similarity import Meeting, Proposal, propose
 from gsba.loop_closure.pose_graph import Loop
 from gsba.loop_closure.retrieval import global_descriptors
 from gsba.matching import recovery
-from gsba.odometry.places import Places
+from gsba.odometry.places import KeyframePlaces
 from gsba.odometry.pose_graph import Constraint
 from gsba.similarity import Sim3
 
@@ -36,7 +36,7 @@ _CORRELATED = 4.0  # factor on the variance of independent points: those of one 
 # correlated errors
 
 
-def find_loops(places: Places, unseen: np.ndarray) -> list[Constraint]:
+def find_loops(places: KeyframePlaces, unseen: np.ndarray) -> list[Constraint]:
     """Loops proposed by appearance and confirmed by geometry and surroundings.
 
     Args:
@@ -66,7 +66,7 @@ def find_loops(places: Places, unseen: np.ndarray) -> list[Constraint]:
     return [one for one in measured if one is not None]
 
 
-def find_joins(places: Places) -> list[Constraint]:
+def find_joins(places: KeyframePlaces) -> list[Constraint]:
     """Constraints between joined maps, each measured where they are closest.
 
     Args:
@@ -93,7 +93,7 @@ def find_joins(places: Places) -> list[Constraint]:
     return found
 
 
-def _join_test(places: Places) -> JoinTest:
+def _join_test(places: KeyframePlaces) -> JoinTest:
     solved, context = places.solved, places.context
     by_keypoint = solved.points_by_keypoint(context.keypoints)
     frames = np.arange(len(places.keyframes))
@@ -119,7 +119,7 @@ def _meeting_by_meeting(meetings: list[Meeting]) -> list[list[Meeting]]:
 
 
 def _judged(
-    group: list[Meeting], places: Places, unseen: np.ndarray, test: JoinTest
+    group: list[Meeting], places: KeyframePlaces, unseen: np.ndarray, test: JoinTest
 ) -> list[Judged]:
     """Each similarity proposed by a group of pairs, judged by its surroundings."""
     poses, seed = places.solved.world_T_rigs, places.context.settings.seed
@@ -133,7 +133,9 @@ def _judged(
     return found
 
 
-def _plausible(proposal: Proposal, places: Places, unseen: np.ndarray, depth: float) -> bool:
+def _plausible(
+    proposal: Proposal, places: KeyframePlaces, unseen: np.ndarray, depth: float
+) -> bool:
     """True if a loop needs no more drift than the path between its places can have."""
     if abs(np.log(proposal.move.scale)) > np.log(_MAX_SCALE_DRIFT):
         return False

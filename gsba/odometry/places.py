@@ -30,7 +30,7 @@ _MAX_ERROR_SIGMAS = 6.0  # largest residual of an observation
 
 
 @dataclass(frozen=True, slots=True)
-class Places:
+class KeyframePlaces:
     """Selected keyframes of maps with points; each place is a frame of the matching."""
 
     keyframes: np.ndarray  # (P,) int64, numbers of the keyframes
@@ -39,7 +39,7 @@ class Places:
     solved: Solution  # poses, each in the world of its map, and points of the keypoints
     context: MatchContext  # for matching the keypoints
 
-    def taken(self, rows: np.ndarray, world_T_rigs: np.ndarray) -> "Places":
+    def taken(self, rows: np.ndarray, world_T_rigs: np.ndarray) -> "KeyframePlaces":
         """Some places (P',), ascending, with other poses (P', 4, 4), triangulated again."""
         features = [self.features[row] for row in rows]
         seed, workers = self.context.settings.seed, self.context.workers
@@ -108,7 +108,7 @@ def make_places(
     features: Sequence[Features],
     seed: int,
     workers: Workers,
-) -> Places:
+) -> KeyframePlaces:
     """Match each place with its neighbours, along the poses, and triangulate common points.
 
     Args:
@@ -132,4 +132,4 @@ def make_places(
     tracks = build([found], np.diff(keypoints.starts))
     settings = context.settings.triangulate
     landmarks = place(tracks, keypoints, world_T_rigs, _MAX_ERROR_SIGMAS, settings)
-    return Places(keyframes, maps, features, replace(start, landmarks=landmarks), context)
+    return KeyframePlaces(keyframes, maps, features, replace(start, landmarks=landmarks), context)

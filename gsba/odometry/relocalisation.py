@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from gsba.config import VerifySettings
+from gsba.config import TwoViewLimits
 from gsba.geometry import pose
 from gsba.matching.verification import relative_pose
 from gsba.odometry.atlas import Atlas, AtlasLayout
@@ -14,7 +14,7 @@ _MAX_KEYPOINTS = 1500
 _CONTRAST = 0.02  # least contrast of a keypoint, in units of OpenCV's SIFT
 _RATIO = 0.85  # largest ratio of the distances of the best and the second best match
 _MIN_MATCHES = 20
-_VERIFY = VerifySettings(max_error_deg=0.4)
+_VERIFY = TwoViewLimits(max_error_deg=0.4)
 _NEAR = np.deg2rad(4.0)  # largest angle between a match and the point whose distance it takes
 _MIN_SCALES = 8  # least number of matches near a point
 _MIN_PARALLAX = np.deg2rad(1.0)  # least parallax of a match whose distance is compared

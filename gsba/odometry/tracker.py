@@ -20,7 +20,7 @@ from gsba.odometry.flow import follow
 from gsba.odometry.frame_record import FrameRecord, FrameStatus
 from gsba.odometry.relocalisation import Described, describe, placed
 from gsba.odometry.resection import Resection, resect
-from gsba.odometry.tracker_state import Features, Keyframe, TrackerState
+from gsba.odometry.tracker_state import Keyframe, TrackedFeatures, TrackerState
 from gsba.odometry.two_view_start import median_turn, start_map
 from gsba.odometry.window import AdjustedWindow, WindowObservations, adjust_window
 
@@ -159,7 +159,7 @@ class Tracker:
         self._record(FrameStatus.TURNING, inverse(key.world_T_rig) @ self.state.world_T_rig)
 
     def _followed(
-        self, grey: np.ndarray, key: Keyframe, features: Features, world_R_rig: np.ndarray
+        self, grey: np.ndarray, key: Keyframe, features: TrackedFeatures, world_R_rig: np.ndarray
     ) -> tuple[Atlas, np.ndarray, np.ndarray]:
         """Atlas, bearings (N, 3) of features and found (N,), tracked at a predicted rotation."""
         assert key.atlas is not None
@@ -229,7 +229,7 @@ class Tracker:
             self.state.motion = np.eye(4)
 
     def _attempt(
-        self, grey: np.ndarray, key: Keyframe, features: Features, predicted: np.ndarray
+        self, grey: np.ndarray, key: Keyframe, features: TrackedFeatures, predicted: np.ndarray
     ) -> _Attempt:
         """Follow a keyframe's features into a frame whose pose (4, 4) is predicted, and pose it.
 
@@ -292,7 +292,7 @@ class Tracker:
         key_T_rig = inverse(key.world_T_rig) @ self.state.world_T_rig
         self._record(FrameStatus.TRACKED, key_T_rig, distance, number)
 
-    def _fitting(self, features: Features, tried: _Attempt, key: Keyframe) -> np.ndarray:
+    def _fitting(self, features: TrackedFeatures, tried: _Attempt, key: Keyframe) -> np.ndarray:
         """Features (N,) bool found where the pose permits them."""
         points = self.state.points[features.ids]
         known = np.isfinite(points[:, 0])
@@ -311,7 +311,7 @@ class Tracker:
         return fits
 
     def _parallax(
-        self, features: Features, tried: _Attempt, fits: np.ndarray, key: Keyframe
+        self, features: TrackedFeatures, tried: _Attempt, fits: np.ndarray, key: Keyframe
     ) -> float:
         """Median angle between features' rays in the keyframe and in the frame."""
         if not fits.any():
@@ -418,7 +418,7 @@ class Tracker:
         return None
 
     def _confirmed(
-        self, grey: np.ndarray, key: Keyframe, features: Features, tried: _Attempt
+        self, grey: np.ndarray, key: Keyframe, features: TrackedFeatures, tried: _Attempt
     ) -> bool:
         """True if tracking from a perturbed pose leads back to the pose.
 
@@ -495,7 +495,7 @@ class Tracker:
             self._mask = self._mask_cutter.cut(grey, atlas.cut_R_rig, exactly=True)
         return self._mask.image > 250
 
-    def _followable(self, key: Keyframe) -> Features:
+    def _followable(self, key: Keyframe) -> TrackedFeatures:
         """Features of a keyframe, at the distance of the nearest one with a point."""
         points = self.state.points[key.ids]
         known = np.isfinite(points[:, 0])
@@ -506,9 +506,9 @@ class Tracker:
             distances = lengths[nearest]
         rays = distances[:, None] * (key.bearings @ key.world_T_rig[:3, :3].T)
         assumed = key.world_T_rig[:3, 3] + rays
-        return Features(key.ids, key.bearings, assumed, np.zeros(len(rays), int))
+        return TrackedFeatures(key.ids, key.bearings, assumed, np.zeros(len(rays), int))
 
-    def _assume(self, features: Features, found: np.ndarray, bearings: np.ndarray) -> None:
+    def _assume(self, features: TrackedFeatures, found: np.ndarray, bearings: np.ndarray) -> None:
         """Move assumed positions of features found (N,) bool onto their last bearings."""
         position = self.state.world_T_rig[:3, 3]
         distances = np.linalg.norm(features.assumed_world[found] - position, axis=1)

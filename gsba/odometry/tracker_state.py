@@ -28,7 +28,7 @@ class Keyframe:
 
 
 @dataclass(slots=True)
-class Features:
+class TrackedFeatures:
     """Tracked features of the last keyframe."""
 
     ids: np.ndarray  # (N,) int64
@@ -37,9 +37,9 @@ class Features:
     # their last bearing and the distance of neighbouring points
     misses: np.ndarray  # (N,) int, frames since it was last found
 
-    def taken(self, rows: np.ndarray) -> "Features":
+    def taken(self, rows: np.ndarray) -> "TrackedFeatures":
         """The features of some rows."""
-        return Features(
+        return TrackedFeatures(
             self.ids[rows], self.bearings[rows], self.assumed_world[rows], self.misses[rows]
         )
 
@@ -55,7 +55,7 @@ class TrackerState:
     keyframe_features: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)  # that
     # each keyframe sees: ids (N,) int64, bearings (N, 3) float32 in the rig frame
     window: list[Keyframe] = field(default_factory=list)  # the last keyframes
-    features: Features | None = None  # tracked ones; None = the next frame begins a map
+    features: TrackedFeatures | None = None  # tracked ones; None = the next frame begins a map
     points: np.ndarray = field(default_factory=lambda: np.full((4096, 3), np.nan))  # (ids, 3) of
     # features, world of the map; NaN = unknown
     num_ids: int = 0  # of features so far

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsba.camera.rig import witnesses
-from gsba.config import VerifySettings
+from gsba.config import TwoViewLimits
 from gsba.geometry import angles_between, nearest_rotation
 from gsba.matching.verification import relative_pose
 from gsba.odometry.window import AdjustedWindow, WindowObservations, adjust_window
@@ -16,19 +16,19 @@ _MOVED, _MOVED_LITTLE = np.deg2rad([4.0, 1.2])  # parallax of the upper quarter 
 _MAX_DIRECTION_SIGMA = np.deg2rad(6.0)  # largest standard deviation of the translation's direction
 _MIN_POINTS = 40  # least number of independent points, in cells of 6 degrees
 _CELLS = 16
-_VERIFY = VerifySettings(max_error_deg=0.3)
+_VERIFY = TwoViewLimits(max_error_deg=0.3)
 _GATE = 4.0  # standard deviations
 
 
 @dataclass(frozen=True, slots=True)
-class Turn:
+class StartTurn:
     """The rotation that explains most features of two frames, and residuals."""
 
     one_R_other: np.ndarray  # (3, 3) float64
     parallaxes: np.ndarray  # (N,) float64, radians, residual of each feature under the rotation
 
 
-def median_turn(one: np.ndarray, other: np.ndarray) -> Turn:
+def median_turn(one: np.ndarray, other: np.ndarray) -> StartTurn:
     """The rotation that maps most bearings (N, 3) of the other frame onto those of the first."""
     near, rotation = np.ones(len(one), bool), np.eye(3)
     off = np.zeros(len(one))
@@ -36,14 +36,14 @@ def median_turn(one: np.ndarray, other: np.ndarray) -> Turn:
         rotation = nearest_rotation(one[near].T @ other[near])
         off = angles_between(one, other @ rotation.T)
         near = off <= np.median(off)
-    return Turn(rotation, off)
+    return StartTurn(rotation, off)
 
 
 def start_map(
     ids: np.ndarray,
     one: np.ndarray,
     other: np.ndarray,
-    turn: Turn,
+    turn: StartTurn,
     sigma: float,
     seed: int,
     fading: bool,

@@ -85,7 +85,7 @@ def adjust_window(
     keys = [pose_variables.X(k) for k in range(len(world_T_rigs))]
     block = LandmarkBlock(keys, marks.points_world, [term], RobustLoss("cauchy", 2.0), 1)
     graph = _held(world_T_rigs, num_held)
-    poses = poses_of(optimize(graph, [block], values_of(world_T_rigs), _SOLVER).values, len(keys))
+    poses = poses_of(optimize(graph, values_of(world_T_rigs), [block], _SOLVER).values, len(keys))
     marks = place(poses, gate)
     kept = np.zeros(len(seen.ids), bool)
     kept[marks.tracks.keypoints] = True

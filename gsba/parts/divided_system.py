@@ -22,7 +22,7 @@ from gsba.parts.jobs import (
     Linearize,
     Linearized,
     Move,
-    Points,
+    PartPoints,
     Shared,
     Substitute,
     version_file,
@@ -37,7 +37,7 @@ _STATE, _RESULT = "state.npz", "result.npz"
 
 
 @dataclass(frozen=True, slots=True)
-class State:
+class SolverState:
     """Where a solution stands: what the loop does next depends on nothing else."""
 
     version: int  # of the parts' landmarks
@@ -84,9 +84,9 @@ class DividedSystem:
         self._folder, self._workers, self._loss = folder.absolute(), workers, loss
         self._scratch = scratch
         index = load_index(folder)
-        self.start = State(0, index.start, np.nan)
+        self.start = SolverState(0, index.start, np.nan)
         if (folder / _STATE).exists():
-            self.start = load(folder / _STATE, State)
+            self.start = load(folder / _STATE, SolverState)
         self._version = self._latest = self.start.version
         self._saved: int | None = self._version if self._version else None
         self.num_frames = len(index.start.poses)
@@ -299,7 +299,7 @@ class DividedSystem:
 
     def finish(self, values: gtsam.Values) -> None:
         """Note that the solution ended at these values, with the landmarks of this version."""
-        state = State(self._version, self._of(values), np.nan)
+        state = SolverState(self._version, self._of(values), np.nan)
         save_record(self._folder / _RESULT, state, {})
 
     @property
@@ -330,7 +330,7 @@ class DividedSystem:
     def _save(self, damping: float) -> None:
         """Note where the solution stands, and delete older and rejected versions."""
         if self._saved != self._version:
-            save_record(self._folder / _STATE, State(self._version, self._at, damping), {})
+            save_record(self._folder / _STATE, SolverState(self._version, self._at, damping), {})
             self._saved = self._version
         for path in self._folder.glob("part-*/*-[0-9]*.npz"):
             if not path.stem.endswith(f"-{self._version:06d}"):
@@ -389,6 +389,6 @@ def read_landmarks(folder: Path, part: int) -> tuple[np.ndarray, np.ndarray]:
     Raises:
         GsbaError: the map is not solved yet, or a file is damaged.
     """
-    version = load(folder / _RESULT, State).version
-    points = load(version_file(folder, part, "points", version), Points).points_world
+    version = load(folder / _RESULT, SolverState).version
+    points = load(version_file(folder, part, "points", version), PartPoints).points_world
     return load_part(folder, part).numbers, points

@@ -16,7 +16,7 @@ from gsba.bundle.family_variables import kept, restored
 from gsba.bundle.pose_variables import X
 from gsba.disk import disk_errors
 from gsba.log import GsbaError
-from gsba.parts.observations import NotStorableError, Sightings, TermRows, merged
+from gsba.parts.observations import NotStorableError, ObservedRows, TermRows, merged
 from gsba.parts.partition import Partition, partition
 from gsba.store.records import RecordError, load_record, save_record
 from gsba.types import FamilyVariables
@@ -62,7 +62,7 @@ class Part:
     frames: np.ndarray  # (N,) int32, frames of the map: its own ones, then those on cuts
     keys: np.ndarray  # (M,) int64, of all its variables: its own ones, then those on cuts
     num_kept: int  # K nodes of variables on cuts
-    sightings: Sightings  # frames are rows of `frames`
+    sightings: ObservedRows  # frames are rows of `frames`
     numbers: np.ndarray  # (J,) int64, place of each landmark in the stream
     graph: np.ndarray  # (B,) uint8, its other factors as GTSAM serializes them
 
@@ -90,7 +90,7 @@ class Index:
 class _Chunk:
     """Part of a stream, or what a part owns of it."""
 
-    sightings: Sightings
+    sightings: ObservedRows
     numbers: np.ndarray  # (J,) int64
     graph: np.ndarray  # (B,) uint8
 
@@ -188,7 +188,9 @@ class PartsWriter:
             NotStorableError: a factor or a residual cannot be stored (one written in Python).
         """
         graph = gtsam.NonlinearFactorGraph() if graph is None else graph
-        sightings = Sightings(tuple(map(TermRows.of, terms)), np.asarray(points_world, np.float64))
+        sightings = ObservedRows(
+            tuple(map(TermRows.of, terms)), np.asarray(points_world, np.float64)
+        )
         numbers = self._num_points + np.arange(len(sightings.points_world))
         self._num_points += len(numbers)
         tied = [_covisible(sightings)]
@@ -391,7 +393,7 @@ def _codes_among(numbers: np.ndarray) -> np.ndarray:
     return numbers[i] << 32 | numbers[j]
 
 
-def _covisible(sightings: Sightings) -> np.ndarray:
+def _covisible(sightings: ObservedRows) -> np.ndarray:
     """Codes (P,) of frame pairs with a common landmark."""
     seen_by, points = sightings.frames, sightings.points
     if not len(seen_by):

@@ -23,7 +23,7 @@ from gsba.store.shards import even_blocks
 
 
 @dataclass(frozen=True, slots=True)
-class Points:
+class PartPoints:
     """Landmarks of a part at a version."""
 
     points_world: np.ndarray  # (J, 3) float64
@@ -107,13 +107,13 @@ class Linearize(_PartJob):
         part = load_part(self.folder, self.parts[item])
         points = part.sightings.points_world
         if self.version:
-            points = load(self._file(item, "points", self.version), Points).points_world
+            points = load(self._file(item, "points", self.version), PartPoints).points_world
         block, graph = _block(part, points, self.loss), deserialized(part.graph)
         values = self.at[item].values(part.frames)
         pairs = part.keys[self.pairs[item]].tolist() if self.pairs else ()
         linearized, equations = _linearized(part, block, graph, values, pairs)
         save_record(self._file(item, "equations", self.version), equations, {})
-        points = Points(block.points_world, block.point_costs)
+        points = PartPoints(block.points_world, block.point_costs)
         save_record(self._file(item, "points", self.version), points, {})
         return linearized
 
@@ -144,7 +144,7 @@ class Move(_PartJob):
 
     def __call__(self, item: int) -> Moved:
         part = load_part(self.folder, self.parts[item])
-        points = load(self._file(item, "points", self.version), Points)
+        points = load(self._file(item, "points", self.version), PartPoints)
         block, graph = _block(part, points.points_world, self.loss), deserialized(part.graph)
         block.restore(self.before[item].values(part.frames), points.costs)
         values = self.after[item].values(part.frames)
@@ -154,7 +154,7 @@ class Move(_PartJob):
         block.accept()
         linearized, equations = _linearized(part, block, graph, values)
         save_record(self._file(item, "equations", self.to), equations, {})
-        moved = Points(block.points_world, block.point_costs)
+        moved = PartPoints(block.points_world, block.point_costs)
         save_record(self._file(item, "points", self.to), moved, {})
         return Moved(cost, linearized)
 

@@ -74,7 +74,7 @@ class TermRows:
 
 
 @dataclass(frozen=True, slots=True)
-class Sightings:
+class ObservedRows:
     """Landmarks, each with all of its observations."""
 
     terms: tuple[TermRows, ...]
@@ -90,14 +90,14 @@ class Sightings:
         """(O,) int32, row of the landmark of each."""
         return np.concatenate([np.empty(0, np.int32), *(term.points for term in self.terms)])
 
-    def taken(self, mine: np.ndarray) -> "Sightings":
+    def taken(self, mine: np.ndarray) -> "ObservedRows":
         """The landmarks `mine`, (J,) bool."""
         points = np.cumsum(mine) - 1
         terms = tuple(term.taken(mine[term.points], points) for term in self.terms)
-        return Sightings(terms, self.points_world[mine])
+        return ObservedRows(terms, self.points_world[mine])
 
 
-def merged(chunks: Sequence[Sightings], local: np.ndarray) -> Sightings:
+def merged(chunks: Sequence[ObservedRows], local: np.ndarray) -> ObservedRows:
     """Sightings one behind the other, frames replaced by `local (F,)` ones."""
     firsts = np.cumsum([0, *(len(chunk.points_world) for chunk in chunks)])
     groups: dict[tuple[str, int, bytes], list[TermRows]] = {}
@@ -106,7 +106,7 @@ def merged(chunks: Sequence[Sightings], local: np.ndarray) -> Sightings:
             moved = replace(term, frames=local[term.frames], points=term.points + np.int32(first))
             groups.setdefault((term.name, term.kind, term.faces.tobytes()), []).append(moved)
     points = [np.empty((0, 3)), *(chunk.points_world for chunk in chunks)]
-    return Sightings(tuple(_joined(group) for group in groups.values()), np.concatenate(points))
+    return ObservedRows(tuple(_joined(group) for group in groups.values()), np.concatenate(points))
 
 
 def _joined(terms: Sequence[TermRows]) -> TermRows:

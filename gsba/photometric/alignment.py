@@ -16,12 +16,16 @@ from gsba.config import PatchSettings
 from gsba.frames import panorama
 from gsba.memory import release_mapped_files, total_memory_bytes
 from gsba.photometric import frame_jobs, surfaces
+from gsba.photometric.frame_jobs import MAX_SHIFT_PX
 from gsba.photometric.packing import Observed, Shown, pack
 from gsba.photometric.references import references, visible_frames
 from gsba.store.shards import Workers
 from gsba.types import Counts, Keypoints, Landmarks, Sighted, Solution
 from gsba.types.records import slices
 
+_MIN_ZNCC = 0.75  # correlation of the aligned patches
+_MAX_SIGMA_PX = 0.5  # along the least certain direction, panorama pixels
+_MIN_TRACK_LENGTH = 3  # of a point that is aligned in frames without an observation of it, too
 _TOO_UNCERTAIN = "position too uncertain"
 _SIGHTINGS_AT_ONCE = 1 << 15  # sightings that a thread processes together: some 20 MB
 _BYTES_PER_POINT = 8192  # of a point's patch and its sightings, about
@@ -177,17 +181,17 @@ def _align_some(
     if observed.normals_rig is not None:
         normals = observed.normals_rig[own]
     planes = _planes(landmarks, world_T_rigs, hosts, normals, pixel, field, lenses)
-    extended = _confirmed_points(landmarks, keypoints, observed.aligned, settings.min_track_length)
-    views = visible_frames(landmarks, world_T_rigs, rows, extended, settings)
+    extended = _confirmed_points(landmarks, keypoints, observed.aligned, _MIN_TRACK_LENGTH)
+    views = visible_frames(landmarks, world_T_rigs, rows, extended)
     map_, threads = (landmarks, planes, world_T_rigs), workers.num_threads
     points, seeing = _unblended(*map_, hosts, *views, lenses, threads)
     at, across, rays = _projected_patches(*map_, points, seeing, lenses, threads)
     sightings = expect(points, field.observed(at), across)
     title, cut = f"{name}: templates", (planes.origins, planes.tilted)
     patches = frame_jobs.cut(title, greys, hosts, *cut, settings, workers)
-    frame_jobs.align(name, greys, seeing, patches, sightings, settings, workers)
+    frame_jobs.align(name, greys, seeing, patches, sightings, workers)
     enlarged = greys.enlargements()
-    kept, found = _accepted(patches, sightings, seeing, pixel, settings, dropped, threads)
+    kept, found = _accepted(patches, sightings, seeing, pixel, dropped, threads)
     found = found.enlarged(np.maximum(enlarged[seeing[kept]], enlarged[hosts[found.points]]))
     at_hosts = _at_hosts(patches, sightings, kept, hosts, planes, pixel)
     at_hosts = at_hosts.enlarged(enlarged[at_hosts.frames])
@@ -278,7 +282,6 @@ def _accepted(
     sightings: Sightings,
     seeing: np.ndarray,
     pixel: float,
-    settings: PatchSettings,
     dropped: dict[str, int],
     num_threads: int,
 ) -> tuple[np.ndarray, Observed]:
@@ -287,7 +290,7 @@ def _accepted(
     def accept(some: slice) -> tuple[np.ndarray, ...]:
         there = Sightings(*(array[some] for array in sightings))
         own = dict.fromkeys(dropped, 0)
-        kept, bearings, covariances = accepted_rows(patches, there, pixel, settings, own)
+        kept, bearings, covariances = accepted_rows(patches, there, pixel, own)
         return some.start + kept, bearings, covariances, np.array([list(own.values())])
 
     some = slices(len(seeing), _SIGHTINGS_AT_ONCE)
@@ -302,7 +305,6 @@ def accepted_rows(
     patches: PatchSet,
     sightings: Sightings,
     pixel: float,
-    settings: PatchSettings,
     dropped: dict[str, int],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Accepted rows (N,) of the sightings, their bearings (N, 3) and covariances (N, 2, 2);
@@ -316,9 +318,9 @@ def accepted_rows(
     shifts = np.linalg.norm(np.cross(sightings.origins, bearings), axis=1)
     tests = {reason: sightings.states != state for state, reason in REASONS.items()}
     aligned = sightings.states == ALIGNED
-    tests["look different"] &= ~aligned | (sightings.scores > settings.min_zncc)
-    tests["found too far off"] &= ~aligned | (shifts < settings.max_shift_px * pixel)
-    tests[_TOO_UNCERTAIN] = ~aligned | (worst < settings.max_sigma_px * pixel)
+    tests["look different"] &= ~aligned | (sightings.scores > _MIN_ZNCC)
+    tests["found too far off"] &= ~aligned | (shifts < MAX_SHIFT_PX * pixel)
+    tests[_TOO_UNCERTAIN] = ~aligned | (worst < _MAX_SIGMA_PX * pixel)
     left = np.ones(len(bearings), bool)
     for reason, passed in tests.items():
         dropped[reason] += int(np.count_nonzero(left & ~passed))

@@ -13,6 +13,7 @@ from factors.sphere_image import SphereImage
 from gsba.bundle import adjustment, pose_variables, triangulation
 from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.optimizer import OptimizeResult, optimize
+from gsba.bundle.reconstruction import MIN_OBSERVATIONS
 from gsba.camera.cameras import ONE_CAMERA, Cameras
 from gsba.config import PhotometricSettings, RefineSettings
 from gsba.frames.masks import load_weights
@@ -20,6 +21,16 @@ from gsba.log import GsbaError, track
 from gsba.photometric import patches
 from gsba.photometric.patch_greys import PatchGreys
 from gsba.types import Counts, FrameSet, Keypoints, Round, Solution
+
+_MIN_CORRELATION = 0.8  # with the template, at the start
+_NOISE_GREY = 2.0  # grey values of a pixel
+_NOISE_CONTRAST = 0.1  # added noise, relative to the contrast
+_INFLATION = 2.0  # of sigmas: a patch's pixel errors are correlated
+_LOSS_SIGMAS = 2.0  # Cauchy scale, of a patch's mean residual
+_MAX_FRAME_RATIO = 2.0  # of a frame's residual to the median; above it, the frame is weighted down
+_MAX_FRAME_GROWTH = 1.2  # of a frame's geometric residual in the joint solve; as above
+_MAX_GROWTH = 1.05  # of the geometric cost, or the solve is undone
+_TOLERANCE = 1e-3  # relative decrease of the cost that ends the joint solve
 
 logger = logging.getLogger(__name__)
 
@@ -164,13 +175,13 @@ def _with_depths(
     )
     planes = table.planes
     for pixels in reversed(gathered):
-        block = make_block(pixels, visible, settings, num_threads)
+        block = make_block(pixels, visible, num_threads)
         block.planes = planes
         block.refresh(values)
         block.polish(values, _NUM_DEPTH_STEPS)
         planes = block.planes
     block.refresh(values)
-    correlated = block.correlations(values) >= chosen.min_correlation
+    correlated = block.correlations(values) >= _MIN_CORRELATION
     reasons = {
         "masked or saturated": np.count_nonzero(visible == 0),
         **block.dropped,
@@ -226,26 +237,26 @@ def _solve(
     It is undone if it fits the map's own observations worse than before.
     """
     settings, num_threads = context.settings, context.num_threads
-    chosen, values = settings.photometric, adjustment.values_of(solved.world_T_rigs)
-    looser = {"relative_tolerance": chosen.tolerance, "absolute_tolerance": None}
+    values = adjustment.values_of(solved.world_T_rigs)
+    looser = {"relative_tolerance": _TOLERANCE, "absolute_tolerance": None}
     solver = settings.solver.model_copy(update=looser)
-    start = make_block(pixels, trust, settings, num_threads)
-    noise = _noise(start, values) * chosen.inflation
+    start = make_block(pixels, trust, num_threads)
+    noise = _noise(start, values) * _INFLATION
     weights = np.ones(pixels.num_frames)
     for _ in range(2):
-        block = make_block(pixels, start.counted * trust, settings, num_threads, noise)
+        block = make_block(pixels, start.counted * trust, num_threads, noise)
         block.weigh(weights)
         landmarks = adjustment.landmark_block(solved.landmarks, keypoints, solved.noise, context)
         landmarks.polish(values)
         before, fits = landmarks.error(values), _geometric_fits(landmarks, values)
         terms = context.beside(PatchGreys(block)).terms(solved)
-        result = optimize(terms.graph, [landmarks, *terms.blocks], terms.values, solver)
+        result = optimize(terms.graph, terms.values, [landmarks, *terms.blocks], solver)
         growth = _geometric_fits(landmarks, result.values) / fits
-        doubts, residuals = _frame_weights(block, result.values, growth, chosen)
+        doubts, residuals = _frame_weights(block, result.values, growth)
         if np.all(doubts >= 1) or np.any(weights < 1):
             break
         weights = doubts
-    accepted = landmarks.error(result.values) <= chosen.max_growth * before
+    accepted = landmarks.error(result.values) <= _MAX_GROWTH * before
     solved = replace(solved, variables=terms.own.variables(result.values)) if accepted else solved
     adjusted = _adjusted(solved, keypoints, result, accepted, settings, num_threads)
     return adjusted, weights, residuals
@@ -271,10 +282,10 @@ def joint(
     pixels, trust, _ = _patches(frames, solved, level, settings, num_threads, lenses)
     if pixels is None:
         return []
-    start = make_block(pixels, trust, settings, num_threads)
+    start = make_block(pixels, trust, num_threads)
     values = adjustment.values_of(solved.world_T_rigs)
-    noise = _noise(start, values) * settings.photometric.inflation
-    block = make_block(pixels, start.counted * trust, settings, num_threads, noise)
+    noise = _noise(start, values) * _INFLATION
+    block = make_block(pixels, start.counted * trust, num_threads, noise)
     block.weigh(frame_weights)
     return [PatchGreys(block)]
 
@@ -282,22 +293,19 @@ def joint(
 def make_block(
     pixels: PatchPixels,
     weights: np.ndarray,
-    settings: RefineSettings,
     num_threads: int,
     noise: float = 1.0,
 ) -> PhotometricBlock:
     """The factor block of gathered patches, with the settings' noise times `noise`."""
-    chosen = settings.photometric
     contrasts = pixels.templates.std(axis=1).astype(np.float64)
-    sigmas = noise * np.hypot(chosen.noise_grey, chosen.noise_contrast * contrasts)
+    sigmas = noise * np.hypot(_NOISE_GREY, _NOISE_CONTRAST * contrasts)
     return PhotometricBlock(
         [pose_variables.X(f) for f in range(pixels.num_frames)],
         pixels,
         sigmas,
-        RobustLoss("cauchy", chosen.loss_sigmas / chosen.inflation),
+        RobustLoss("cauchy", _LOSS_SIGMAS / _INFLATION),
         weights,
         num_threads,
-        chosen.polish_steps,
     )
 
 
@@ -326,7 +334,6 @@ def _frame_weights(
     block: PhotometricBlock,
     values: gtsam.Values,
     growth: np.ndarray,
-    settings: PhotometricSettings,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Weight (F,) of each frame's pixels, and the median (F,) of its residuals in sigmas.
 
@@ -343,8 +350,8 @@ def _frame_weights(
         if np.count_nonzero(rows) >= _MIN_OBSERVATIONS:
             residuals[f] = np.median(errors[rows])
     typical = np.nanmedian(residuals) if np.isfinite(residuals).any() else 1.0
-    ratios = np.nan_to_num(residuals / typical, nan=1.0) / settings.max_frame_ratio
-    worst = np.maximum(1.0, np.maximum(ratios, growth / settings.max_frame_growth))
+    ratios = np.nan_to_num(residuals / typical, nan=1.0) / _MAX_FRAME_RATIO
+    worst = np.maximum(1.0, np.maximum(ratios, growth / _MAX_FRAME_GROWTH))
     return np.maximum(worst**-2.0, _MIN_FRAME_WEIGHT), residuals
 
 
@@ -361,7 +368,7 @@ def _adjusted(
     Points are triangulated again as after a bundle adjustment: those of the solve are closer to
     most observations than noise permits.
     """
-    tracks, least = solved.landmarks.tracks, settings.rounds.min_observations
+    tracks, least = solved.landmarks.tracks, MIN_OBSERVATIONS
     gate = solved.rounds[-1].gate_sigmas if solved.rounds else np.inf
     poses = adjustment.poses_of(result.values, len(solved.world_T_rigs))
     limit = gate * solved.noise

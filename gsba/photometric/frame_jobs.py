@@ -13,6 +13,10 @@ from gsba.config import PatchSettings
 from gsba.frames.panorama import Greys
 from gsba.store.shards import Workers, blocks_of_frames
 
+MAX_SHIFT_PX = 3.0  # from the predicted pixel, panorama pixels
+_AFFINE_SIGMA = 0.15  # prior of the warp: a surface facing the ray
+_GREY_SIGMA = 3.0  # noise of pixels, grey values
+_MIN_CONTRAST = 2.0  # grey values, standard deviation in a patch
 _WINDOW_SIGMA_SHARE = 0.6  # standard deviation of the patch's window, in half patches
 _SEARCH_SHIFT_RATIO = 1.5  # largest shift during alignment, in largest accepted shifts
 _MAX_STEPS = 12  # largest number of alignment steps
@@ -55,7 +59,6 @@ def align(
     seeing: np.ndarray,
     patches: PatchSet,
     sightings: Sightings,
-    settings: PatchSettings,
     workers: Workers,
 ) -> None:
     """Align templates to the frames that should show them.
@@ -64,10 +67,10 @@ def align(
         seeing: (O,) frame of each sighting.
         patches: the templates.
         sightings: predicted sightings; the results are filled in.
-        name, greys, settings, workers: as for `cut`.
+        name, greys, workers: as for `cut`.
     """
     rows = _by_frame(seeing, greys.num_frames)
-    job = _AlignJob(name, greys, rows, patches, sightings, settings)
+    job = _AlignJob(name, greys, rows, patches, sightings)
     for chosen, found in zip(rows.each(), workers.map_shards(job), strict=True):
         arrays = sightings.warps, sightings.scores, sightings.variances, sightings.states
         for array, part in zip(arrays, found, strict=True):
@@ -79,23 +82,20 @@ def align_to(
     mask: np.ndarray | None,
     patches: PatchSet,
     sightings: Sightings,
-    settings: PatchSettings,
 ) -> None:
     """Align templates to one picture; the results are filled in.
 
     Args:
         image: the picture. mask: (H, 2H) bool, True = use; None = all.
-        patches, sightings, settings: as for `align`.
+        patches, sightings: as for `align`.
     """
-    reach, every = _SEARCH_SHIFT_RATIO * settings.max_shift_px, np.arange(len(sightings.templates))
+    reach, every = _SEARCH_SHIFT_RATIO * MAX_SHIFT_PX, np.arange(len(sightings.templates))
     patches.align(image, mask, every, sightings, reach, _MAX_STEPS, _TOLERANCE_PX)
 
 
 def _empty_patches(num: int, settings: PatchSettings) -> PatchSet:
     """Empty storage for templates."""
-    return PatchSet(
-        num, settings.patch_size, _WINDOW_SIGMA_SHARE, settings.affine_sigma, settings.grey_sigma
-    )
+    return PatchSet(num, settings.patch_size, _WINDOW_SIGMA_SHARE, _AFFINE_SIGMA, _GREY_SIGMA)
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +162,7 @@ class _CutJob(_FrameJob):
     def __call__(self, item: int) -> tuple[np.ndarray, ...]:
         rows = self.rows.of(item)
         found = _empty_patches(len(rows), self.settings)
-        every, least = np.arange(len(rows)), self.settings.min_contrast
+        every, least = np.arange(len(rows)), _MIN_CONTRAST
         found.cut(*self.image(item), every, self.origins[rows], self.spreads[rows], least)
         own = found.templates
         return own.grey, own.by_x, own.by_y, own.inverses, own.states
@@ -184,12 +184,11 @@ class _AlignJob(_FrameJob):
 
     patches: PatchSet
     sightings: Sightings
-    settings: PatchSettings
 
     def __call__(self, item: int) -> tuple[np.ndarray, ...]:
         rows = self.rows.of(item)
         own = Sightings(*(column[rows] for column in self.sightings))
-        align_to(*self.image(item), self.patches, own, self.settings)
+        align_to(*self.image(item), self.patches, own)
         return own.warps, own.scores, own.variances, own.states
 
     def part(self, start: int, stop: int) -> "_AlignJob":

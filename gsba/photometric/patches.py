@@ -15,6 +15,11 @@ from gsba.frames.masks import load_usable
 from gsba.frames.pixels import load_erp
 from gsba.types import Counts, FrameSet, Landmarks
 
+_MIN_GRADIENT = 2.0  # grey values per pixel, smallest in a patch
+_DEPTH_REACH_DEG = 6.0  # to map points that give the depth
+_DEPTH_TOLERANCE = 0.03  # relative, of map points on one plane
+_DEPTH_SIGMA = 0.2  # relative, of a patch's depth
+_SLOPE_SIGMA = 0.7  # of a patch's tilt, as a tangent
 _NUM_PLANE_POINTS = 8  # map points that determine a patch's plane
 _MIN_GREY, _MAX_GREY = 3, 252  # grey values beyond which a pixel counts as saturated
 _EDGE_WEIGHT = 0.05  # weight of an edge's strength, beside that of a corner
@@ -94,7 +99,7 @@ def candidates(grey: np.ndarray, usable: np.ndarray, settings: PhotometricSettin
     first = np.full(len(starts), len(order))
     hits = np.flatnonzero(ranked == best[cell])
     np.minimum.at(first, cell[hits], hits)
-    chosen = order[first[best > settings.min_gradient**2]]
+    chosen = order[first[best > _MIN_GRADIENT**2]]
     v, u = np.divmod(chosen, width)
     return bearings_from_erp(np.column_stack([u + 0.5, v + 0.5]), width, height)
 
@@ -113,9 +118,7 @@ def _cells(width: int, height: int, spacing_deg: float) -> tuple[np.ndarray, np.
     return order, np.flatnonzero(np.diff(cell[order], prepend=-1))
 
 
-def lay_planes(
-    bearings: np.ndarray, points_rig: np.ndarray, settings: PhotometricSettings
-) -> tuple[np.ndarray, np.ndarray]:
+def lay_planes(bearings: np.ndarray, points_rig: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Inverse-depth planes of patches, fitted to map points around them.
 
     A plane's inverse depth is linear over the tangent plane, so that a weighted linear fit to the
@@ -134,7 +137,7 @@ def lay_planes(
     ranges = np.linalg.norm(points_rig, axis=1)
     if len(points_rig) < _NUM_PLANE_POINTS or len(bearings) == 0:
         return planes, clear
-    reach = 2 * np.sin(np.deg2rad(settings.depth_reach_deg) / 2)
+    reach = 2 * np.sin(np.deg2rad(_DEPTH_REACH_DEG) / 2)
     chords, rows = KDTree(points_rig / ranges[:, None]).query(bearings, k=_NUM_PLANE_POINTS)
     local = np.einsum("pki,pni->pnk", patch_axes(bearings), points_rig[rows])
     ahead = (local[..., 0] > 0) & (chords < reach)
@@ -146,15 +149,15 @@ def lay_planes(
     for _ in range(4):  # reweighted: points of another surface lose weight
         typical = (trust * y).sum(axis=1) / np.maximum(trust.sum(axis=1), 1e-300)
         V = np.einsum("pn,pni,pnj->pij", trust, x, x)
-        ridge = (settings.depth_tolerance / settings.slope_sigma) ** 2 * weights.max(axis=1)
+        ridge = (_DEPTH_TOLERANCE / _SLOPE_SIGMA) ** 2 * weights.max(axis=1)
         V[:, [1, 2], [1, 2]] += ridge[:, None]
         V += 1e-12 * np.eye(3)
         planes = np.linalg.solve(V, np.einsum("pn,pni,pn->pi", trust, x, y)[..., None])[..., 0]
         off = (np.einsum("pni,pi->pn", x, planes) - y) / np.maximum(typical, 1e-12)[:, None]
-        trust = weights / (1 + (off / settings.depth_tolerance) ** 2)
-    agreeing = (ahead & (np.abs(off) < 2 * settings.depth_tolerance)).sum(axis=1)
+        trust = weights / (1 + (off / _DEPTH_TOLERANCE) ** 2)
+    agreeing = (ahead & (np.abs(off) < 2 * _DEPTH_TOLERANCE)).sum(axis=1)
     nearest = chords[:, 0] < 0.25 * reach
-    agrees = np.abs(off[:, 0]) < settings.depth_tolerance
+    agrees = np.abs(off[:, 0]) < _DEPTH_TOLERANCE
     clear = (planes[:, 0] > 0) & (agreeing >= 3) & (agrees | ~nearest)
     clear &= agreeing >= 0.6 * ahead.sum(axis=1)
     return planes, clear
@@ -187,7 +190,7 @@ def table_of(
         seen = landmarks.points_world[tracks.points[tracks.frames == f]]
         points_rig = (seen - positions[f]) @ world_T_rigs[f, :3, :3]
         shown = lenses.seeing(points_rig, np.full(len(points_rig), f))
-        laid, clear = lay_planes(found, shown, settings)
+        laid, clear = lay_planes(found, shown)
         distances = np.linalg.norm(positions - positions[f], axis=1)
         distances[f] = np.inf
         near = np.argsort(distances, kind="stable")[: min(settings.targets, len(positions) - 1)]
@@ -196,7 +199,7 @@ def table_of(
         planes.append(laid[clear])
         targets.append(np.broadcast_to(near, (int(np.count_nonzero(clear)), len(near))))
     plane = np.concatenate(planes)
-    sigmas = [settings.depth_sigma, settings.slope_sigma, settings.slope_sigma]
+    sigmas = [_DEPTH_SIGMA, _SLOPE_SIGMA, _SLOPE_SIGMA]
     table = PatchTable(
         np.concatenate(hosts),
         np.concatenate(centres),

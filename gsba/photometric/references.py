@@ -3,8 +3,12 @@
 import numpy as np
 
 from factors.compiled import kernel_and_part
-from gsba.config import PatchSettings
 from gsba.types import Landmarks
+
+_MAX_VIEWS = 16  # most frames that a point is aligned in
+_NEAR_FRAMES = 40  # nearest frames in space that may show a point
+MAX_ANGLE_DEG = 45.0  # between two rays of a point
+MAX_RATIO = 1.8  # of a point's distances from two frames
 
 _kernel, _part = kernel_and_part()
 _LOG_RATIO_WEIGHT = 0.25  # weight of a squared log ratio of distances, relative to a squared angle
@@ -27,7 +31,6 @@ def visible_frames(
     world_T_rigs: np.ndarray,
     rows: np.ndarray,
     extended: np.ndarray,
-    settings: PatchSettings,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Frames in which each point is searched, without its reference.
 
@@ -45,17 +48,17 @@ def visible_frames(
     """
     centres = np.ascontiguousarray(world_T_rigs[:, :3, 3])
     frames, points = landmarks.tracks.frames, landmarks.points_world
-    num_near = min(settings.near_frames, len(centres) - 1)
+    num_near = min(_NEAR_FRAMES, len(centres) - 1)
     near = np.empty((len(centres), num_near), np.int64)
     for f in np.unique(frames[rows]):
         distances = np.linalg.norm(centres - centres[f], axis=1)
         distances[f] = -1
         near[f] = np.argsort(distances, kind="stable")[1 : num_near + 1]
-    room = len(frames) + settings.max_views * len(points)
+    room = len(frames) + _MAX_VIEWS * len(points)
     out = np.empty((2, room), np.int64)
-    limits = np.cos(np.deg2rad(settings.max_angle_deg)), settings.max_ratio
+    limits = np.cos(np.deg2rad(MAX_ANGLE_DEG)), MAX_RATIO
     num = _views(
-        _starts(landmarks), frames, centres, points, rows, near, *limits, settings.max_views,
+        _starts(landmarks), frames, centres, points, rows, near, *limits, _MAX_VIEWS,
         extended, out,
     )  # fmt: skip
     return out[0, :num].copy(), out[1, :num].copy()

@@ -15,10 +15,10 @@ from gsba.bundle import (
     tracks,
 )
 from gsba.bundle.gauge import Gauge
-from gsba.bundle.gps_factors import GpsFixes
+from gsba.bundle.gps_factors import GpsFactors
 from gsba.bundle.lens_centres import baseline_of
 from gsba.bundle.map_strength import MapStrength
-from gsba.bundle.reconstruction import assemble, world_scale
+from gsba.bundle.reconstruction import MIN_OBSERVATIONS, assemble, world_scale
 from gsba.camera.optics import Optics
 from gsba.camera.views import scenes_around
 from gsba.features.extractor_traits import search_settings
@@ -123,7 +123,7 @@ def separate_parts(state: State) -> np.ndarray | None:
             "follow one another closely (or lower triangulate.min_track_length or "
             "triangulate.min_parallax_deg)"
         )
-    scarce = connectivity.starving(solution, state.run.settings.rounds.min_observations)
+    scarce = connectivity.starving(solution, MIN_OBSERVATIONS)
     nothing = np.zeros_like(state.prior.trust.held_steps)
     unguided = state.prior.unguided
     if unguided.any():  # nothing but points hands the scale on
@@ -158,7 +158,7 @@ def merge_maps(state: State, parts: np.ndarray) -> State:
         held, shown = trust.held_steps, ~(trust.unseen_steps | _doubtful_steps(state))
         open_scale = prior.unguided[1:] & prior.unguided[:-1]
         if open_scale.any():  # images show a step between parts, but not how long it is
-            fed = ~connectivity.starving(solution, run.settings.rounds.min_observations)
+            fed = ~connectivity.starving(solution, MIN_OBSERVATIONS)
             shown &= ~((parts[1:] != parts[:-1]) & fed[1:] & fed[:-1] & open_scale)
         context, times = state.observed.context, run.frames.timestamps
         # No trajectory relates recordings: their maps are as free as those of images alone.
@@ -217,15 +217,15 @@ def without_fixes(state: State, latest: Sequence[str]) -> State:
     logger.warning("the images contradict the GPS fixes: the map is made anew without these")
     run = state.run
     members = [
-        replace(one, contradicted=True) if isinstance(one, GpsFixes) else one
+        replace(one, contradicted=True) if isinstance(one, GpsFactors) else one
         for one in run.families.members
     ]
     chain, families = Chain(run.store, latest), run.families.with_members(members)
     return replace(state, run=replace(run, chain=chain, families=families, suffix=WITHOUT_GPS))
 
 
-def _fixes_of(run: Run) -> list[GpsFixes]:
-    return [family for family in run.families.members if isinstance(family, GpsFixes)]
+def _fixes_of(run: Run) -> list[GpsFactors]:
+    return [family for family in run.families.members if isinstance(family, GpsFactors)]
 
 
 def refine_photometric(state: State) -> State:
@@ -301,7 +301,7 @@ def reconstruct(
             covariances,
             observed,
             None if run.families.fixing_gauge.members else prior.worlds(),
-            run.settings.rounds.min_observations,
+            MIN_OBSERVATIONS,
             prior.trust.false_frames,
             prior.parts,
             joint,
@@ -366,7 +366,7 @@ def _vertical(state: State, result: Reconstruction) -> np.ndarray | None:
 def _reconstruct_rotations(state: State) -> Reconstruction:
     """Rotations alone, of a camera that stayed in one place."""
     run, prior, observed = state.run, state.prior, state.observed
-    least, poses = run.settings.rounds.min_observations, prior.start().world_T_rigs
+    least, poses = MIN_OBSERVATIONS, prior.start().world_T_rigs
     turn = prior.trust.turn
     assert turn is not None
     parts = connectivity.apart(~turn.frames)

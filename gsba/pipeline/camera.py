@@ -19,7 +19,7 @@ from gsba.bundle import (
     self_calibration,
     stitching,
 )
-from gsba.bundle.adjustment import AdjustmentContext
+from gsba.bundle.adjustment import GATE_SCALE, AdjustmentContext
 from gsba.bundle.camera_adjustment import solve_sighted_with_camera, solve_with_camera
 from gsba.bundle.camera_estimates import CameraEstimates, tracks_of_camera
 from gsba.bundle.camera_system import CameraCovariances, CameraSystem
@@ -40,6 +40,7 @@ from gsba.pipeline.state import State
 from gsba.trajectory.axes import quarter_turn
 from gsba.types import CoarsePoses, Keypoints, PoseSource, Reconstruction, Sighted, Solution
 
+_SEAM_DEG = 4.0  # from the seam of a panorama: pixels that are blended of both lenses are not used
 T = TypeVar("T")
 
 Cuts = tuple[tuple[Rig, bool] | None, ...]  # (C,) calibration to cut raw frames of each camera by,
@@ -163,7 +164,7 @@ def _on_trial(
     trial, raw = state, _raw_cameras(run)
     for camera in sought:
         own = run.settings_of(camera)
-        yaws, band = own.lens_yaws_deg, float(np.deg2rad(own.seam_deg))
+        yaws, band = own.lens_yaws_deg, float(np.deg2rad(_SEAM_DEG))
         if camera in raw:
             fisheyes = run.frames.formats[camera].fisheyes
             assert fisheyes is not None
@@ -223,7 +224,7 @@ def _settle_cameras(state: State, name: str) -> State:
             read = _from_features(state, stage, camera, _readout, CameraEstimate, noted=True)
             found = found.changed(camera, lambda _, read=read: read)
     rounds = run.settings.rounds
-    gates = rounds.gate_scale, *rounds.dense  # a camera that is off throws observations off
+    gates = GATE_SCALE, *rounds.dense  # a camera that is off throws observations off
     state = state.through(found.cameras)
 
     def compute() -> tuple[Solution, CameraEstimates]:
@@ -470,13 +471,12 @@ def _from_features(
     """
     run, observed, solution = state.run, state.observed, state.solution
     lenses = observed.cameras.lenses[number]
-    least = run.settings.rounds.gate_scale
-    gate = least if lenses else _WIDE_GATE_SIGMAS
+    gate = GATE_SCALE if lenses else _WIDE_GATE_SIGMAS
 
     def compute() -> T:
         tracks = tracks_of_camera(backend.tracks_of(state), observed.cameras.of_frame, number)
         placed = state.triangulated(tracks, observed.keypoints, gate * solution.noise)
-        wide = replace(solution, landmarks=placed, noise=solution.noise * gate / least)
+        wide = replace(solution, landmarks=placed, noise=solution.noise * gate / GATE_SCALE)
         given = observed.keypoints, observed.shown, CameraEstimate(lenses), number, state
         return estimate(_Observations(wide, *given))
 

@@ -30,6 +30,7 @@ from gsba.trajectory import judgement, steps, turning
 from gsba.trajectory.clock import ClockEstimate
 from gsba.types import CoarsePoses, Features, Keypoints, Matches, PoseSource, VerifiedPairs
 
+_WEAK_CONTRAST_THRESHOLD = 0.01  # of keypoints in weak frames: half of the default elsewhere
 _DARK = 32  # of 255
 _NUM_WIDE_PAIRS = 60  # pairs of frames of each wider gap that show whether a camera walks
 
@@ -49,7 +50,8 @@ def extract(run: Run) -> State:
 
 def _enlarged(settings: RefineSettings) -> RefineSettings:
     """Settings with as many keypoints as weak frames get."""
-    more = settings.weak_frames.model_dump(include={"max_per_face", "contrast_threshold"})
+    most = settings.weak_frames.max_per_face
+    more = {"max_per_face": most, "contrast_threshold": _WEAK_CONTRAST_THRESHOLD}
     return settings.model_copy(update={"features": settings.features.model_copy(update=more)})
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from gsba import odometry, video
 from gsba.bundle.families import Family
 from gsba.bundle.fixes import FrameFixes
-from gsba.bundle.gps_factors import MIN_FIXES, GpsFixes
+from gsba.bundle.gps_factors import MIN_FIXES, GpsFactors
 from gsba.camera.calibration import read_calibration
 from gsba.compilation import compile_ahead
 from gsba.config import RefineSettings, VideoSettings, installed_families
@@ -218,7 +218,7 @@ def families_of(frames: FrameSet, settings: RefineSettings) -> list[Family]:
         GsbaError: a package whose family cannot be made, or positions that cannot be used.
     """
     fixes = positions_of(frames, settings)
-    made: list[Family] = [] if fixes is None else [GpsFixes(fixes, settings.gps)]
+    made: list[Family] = [] if fixes is None else [GpsFactors(fixes)]
     for named in settings.package_families():
         name, _, argument = named.partition(":")
         try:

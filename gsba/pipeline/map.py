@@ -16,7 +16,7 @@ from gsba.bundle.stitching import Stitching
 from gsba.camera.cameras import Cameras
 from gsba.camera.lens import Lenses
 from gsba.camera.rig import CubeRig
-from gsba.splat.refinement import Move
+from gsba.splat.refinement import PoseMove
 from gsba.types import FrameSet, Keypoints, Solution
 
 
@@ -62,7 +62,7 @@ class Map:
     cameras: tuple[FoundCamera, ...] = (FoundCamera(),)  # (C,)
     of_frame: tuple[int, ...] = ()  # (F,) camera of each frame, as in `Cameras`
     covariances: CameraCovariances | None = None  # with these unknown beside the poses
-    moves: tuple[Move, ...] = ()  # of the poses against a splat
+    moves: tuple[PoseMove, ...] = ()  # of the poses against a splat
 
     @classmethod
     def of(cls, solution: Solution, keypoints: Keypoints, frames: FrameSet) -> "Map":

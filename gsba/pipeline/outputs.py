@@ -4,8 +4,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from gsba.bundle.gps_factors import GpsFixes
+from gsba.bundle.gps_factors import GpsFactors
 from gsba.bundle.gyro_turns import GyroTurns
+from gsba.bundle.map_strength import MAX_SCALE_SIGMA
 from gsba.bundle.reconstruction import world_scale
 from gsba.camera.calibration import calibration_json
 from gsba.camera.cameras import Cameras
@@ -167,7 +168,7 @@ def _report(state: State, result: Reconstruction) -> dict[str, Any]:
     solver = [{"stage": name, "rounds": some} for name, some in rounds.items()]
     stages = StageLog(tuple(run.store.records.values()), run.journal.counts, solver)
     gauge, of_families = _gauge(run, state.prior), _of_families(state)
-    found = _findings(state, result, of_families.pop(GpsFixes.name, None))
+    found = _findings(state, result, of_families.pop(GpsFactors.name, None))
     coarse = state.prior.coarse
     report = build_report(run.settings, run.frames, coarse, result, stages, gauge, found)
     report["families"] = of_families
@@ -183,7 +184,7 @@ def _findings(state: State, result: Reconstruction, gps: dict[str, Any] | None) 
     Args:
         gps: report of the GPS fixes; None = there are none.
     """
-    run, prior, map_, frames = state.run, state.prior, state.map, state.run.frames
+    prior, map_, frames = state.prior, state.map, state.run.frames
     trajectory, notes = findings.of_trajectory(
         prior.trust, prior.clock, prior.merged, prior.joints, frames, prior.absent
     )
@@ -201,8 +202,9 @@ def _findings(state: State, result: Reconstruction, gps: dict[str, Any] | None) 
         notes += more
     if gps is not None:
         notes += notes_on_gps(gps, len(frames))
-    most = run.settings.weak_frames.max_scale_sigma
-    lists, more = findings.of_frames(frames, prior.coarse, result, map_.frame_weights, most)
+    lists, more = findings.of_frames(
+        frames, prior.coarse, result, map_.frame_weights, MAX_SCALE_SIGMA
+    )
     notes += more
     stitching = map_.stitching and findings.of_field(map_.stitching)
     clocks, sources = [one.clock for one in prior.of_recordings], prior.coarse.sources

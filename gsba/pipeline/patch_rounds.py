@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from gsba.bundle import adjustment, settling, stitching
+from gsba.bundle.reconstruction import MIN_OBSERVATIONS
 from gsba.bundle.stitching import Stitching
 from gsba.photometric import alignment
 from gsba.photometric.alignment import Observations
@@ -113,7 +114,7 @@ def adjust_aligned(
 
 def carried(state: State, sighted: Sighted, solved: Solution, keypoints: Keypoints) -> State | None:
     """The state with the map of aligned observations; None where that explains less."""
-    if not solved.carries(state.solution, state.run.settings.rounds.min_observations):
+    if not solved.carries(state.solution, MIN_OBSERVATIONS):
         return None
     map_ = replace(
         state.map,
@@ -143,7 +144,7 @@ def _straighten(state: State, sighted: Sighted, number: int) -> State:
     found = run.stage(f"stitching{number}", key, compute, Stitching)
     if not found.field:
         return replace(state, map=replace(map_, stitching=found))
-    if not found.adjustment.carries(map_.solution, settings.rounds.min_observations):
+    if not found.adjustment.carries(map_.solution, MIN_OBSERVATIONS):
         return state
     if map_.stitching is not None:  # its gain is measured against no field
         found = replace(found, part_gains=map_.stitching.part_gains)

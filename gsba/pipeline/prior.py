@@ -8,7 +8,7 @@ from gsba.bundle.families import Family
 from gsba.bundle.gauge import Gauge
 from gsba.bundle.gyro_turns import GyroTurns
 from gsba.bundle.map_strength import MapStrength
-from gsba.bundle.trajectory_prior import TrajectoryPrior
+from gsba.bundle.trajectory_prior import LOSS_SIGMAS, TrajectoryPrior
 from gsba.config import PriorSettings
 from gsba.imu.alignment import Alignment
 from gsba.loop_closure.merged_map import Registered, side_by_side
@@ -85,7 +85,7 @@ class Prior:
         if self.turning is None:
             return (prior,)
         extent = float(np.linalg.norm(np.ptp(believed[:, :3, 3], axis=0)))
-        return prior, GyroTurns(self.turning, extent, settings.loss_sigmas)
+        return prior, GyroTurns(self.turning, extent, LOSS_SIGMAS)
 
     def moved(self, gauge: Gauge) -> "Prior":
         """The trajectory carried to another world, part by part as numbered in `parts`."""

@@ -235,7 +235,7 @@ class Run:
         settings = self.matching_settings
         files = fingerprint(path for stage, path in self.weights.items() if stage == "matching")
         how = search_settings(settings).model_dump(exclude={"weights"}), files
-        return [settings.pairs, how, settings.verify, settings.seed]
+        return [settings.pairs, how, settings.seed]
 
     def solving_key(self) -> list[object]:
         """Settings that solutions rest on."""

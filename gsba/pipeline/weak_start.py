@@ -14,7 +14,7 @@ from gsba.features.extraction import Search
 from gsba.features.extractor_traits import search_settings
 from gsba.geometry import inverse
 from gsba.matching import guided_search
-from gsba.matching.guided_search import Gate, SearchableFrames
+from gsba.matching.guided_search import PRIOR_GATE, SearchableFrames
 from gsba.matching.verification import relative_pose
 from gsba.pipeline.run import Run
 from gsba.trajectory.returning import comes_back
@@ -65,15 +65,15 @@ def _matches(run: Run, found: Mapping[str, Features], steps: np.ndarray) -> floa
         return found[run.frames.names[frame]]
 
     settings, poses = run.matching_settings, run.coarse.world_T_rigs
-    prior, pairs = settings.pairs.prior, settings.pairs
-    gate = Gate(np.deg2rad(prior.rotation_deg), prior.direction, np.deg2rad(pairs.max_parallax_deg))
-    chance = gate.chance(np.deg2rad(settings.verify.max_error_deg))
-    frames = SearchableFrames(load, pairs.strongest_per_face)
+    chance = PRIOR_GATE.chance(np.deg2rad(settings.verify.max_error_deg))
+    frames = SearchableFrames(load, settings.pairs.strongest_per_face)
 
     def verified(step: int) -> int:
         f0, f1 = steps[step].tolist()
         f0_T_f1 = inverse(poses[f0]) @ poses[f1]
-        rows = guided_search.guided(frames, (f0, f1), f0_T_f1, gate, search_settings(settings))
+        rows = guided_search.guided(
+            frames, (f0, f1), f0_T_f1, PRIOR_GATE, search_settings(settings)
+        )
         rays = load(f0).bearings_rig[rows[:, 0]], load(f1).bearings_rig[rows[:, 1]]
         pose = relative_pose(*rays, settings.verify, settings.seed, chance)
         return 0 if pose is None else int(np.count_nonzero(pose.inliers))

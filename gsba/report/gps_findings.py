@@ -14,7 +14,7 @@ def notes_on_gps(content: Mapping[str, Any], num_frames: int) -> list[str]:
     """Notes on used and false fixes.
 
     Args:
-        content: report of the family, see `gsba.bundle.gps_factors.GpsFixes.report`.
+        content: report of the family, see `gsba.bundle.gps_factors.GpsFactors.report`.
         num_frames: frames of the run.
     """
     if not content["taken"]:

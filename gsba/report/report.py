@@ -87,8 +87,8 @@ class Findings:
     stitching: Mapping[str, Any] | None = None  # its field, see `findings.of_field`
     camera: Mapping[str, Any] | None = None  # two lenses, see `camera_findings.of_camera`
     gyro: Mapping[str, Any] | None = None  # see `imu_findings.of_gyro`
-    gps: Mapping[str, Any] | None = None  # see `gps_factors.GpsFixes.report`
-    moves: Sequence[object] = ()  # of the poses by a splat, see `gsba.splat.refinement.Move`
+    gps: Mapping[str, Any] | None = None  # see `gps_factors.GpsFactors.report`
+    moves: Sequence[object] = ()  # of the poses by a splat, see `gsba.splat.refinement.PoseMove`
     recordings: Sequence[Mapping[str, Any]] = ()  # see `recordings.of_recordings`
     frame_lists: Mapping[str, Sequence[str]] = dataclasses.field(
         default_factory=dict

@@ -23,7 +23,7 @@ _CELLS_PER_SIZE = (2, 4)  # cell edges, as divisors of the cloud's size, for the
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class ScanVerdict:
     """Evidence of a scan on a cloud's points, at one similarity."""
 
     explained: np.ndarray  # (N,) bool, points on a surface
@@ -43,7 +43,7 @@ class Verdict:
         known = self.explained.sum() + self.contradicted.sum()
         return float(self.explained.sum() / max(known, 1))
 
-    def doubt(self, other: "Verdict") -> float:
+    def doubt(self, other: "ScanVerdict") -> float:
         """P value of the lead over another placement, if the other were as good.
 
         It is by Wilcoxon's signed-rank test (Biometrics Bulletin 1, 1945) of log likelihood ratios,
@@ -67,7 +67,7 @@ def _chance(gains: np.ndarray) -> float:
     return float(np.asarray(wilcoxon(gains, alternative="greater"))[1])
 
 
-class Grid:
+class CellGrid:
     """Grid of a scan's surfaces: one point with its normal in each occupied cell."""
 
     def __init__(self, scan: Scan) -> None:
@@ -108,7 +108,7 @@ class Grid:
         return first
 
 
-def verdict(fit: Sim3, cloud: Cloud, scan: Scan, grid: Grid, noise: Noise) -> Verdict:
+def verdict(fit: Sim3, cloud: Cloud, scan: Scan, grid: CellGrid, noise: Noise) -> ScanVerdict:
     """Evidence of a scan on a cloud.
 
     Args:
@@ -137,7 +137,7 @@ def verdict(fit: Sim3, cloud: Cloud, scan: Scan, grid: Grid, noise: Noise) -> Ve
     logs += _brightness_logs(cloud, scan, nearest, near)
     informed = near | hidden
     cells = tuple(cells_of(cloud.points, cloud.size / part) for part in _CELLS_PER_SIZE)
-    return Verdict(explained, contradicted, informed, np.where(informed, logs, 0.0), cells)
+    return ScanVerdict(explained, contradicted, informed, np.where(informed, logs, 0.0), cells)
 
 
 def _brightness_logs(cloud: Cloud, scan: Scan, nearest: np.ndarray, near: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ import numpy as np
 
 from gsba.log import GsbaError
 from gsba.scans.fit import Fit, approach, settle
-from gsba.scans.judge import Grid, Verdict, verdict
+from gsba.scans.judge import CellGrid, ScanVerdict, verdict
 from gsba.scans.noise import noise_of, reach_of
 from gsba.scans.search import Guess, candidates, distance
 from gsba.scans.types import Cloud, Scan
@@ -39,7 +39,7 @@ class Registration:
     """Placement of a cloud in a scan, and the evidence for it."""
 
     fit: Fit
-    verdict: Verdict
+    verdict: ScanVerdict
     rivals: int  # number of other placements that explain about as much
     doubt: float  # p value of the lead over the strongest rival; 0 = there is none
     rival: Sim3 | None = None  # the strongest rival
@@ -88,7 +88,7 @@ def register(cloud: Cloud, scan: Scan, guess: Guess | None = None) -> Registrati
     Raises:
         NoPlacementError: no placement explains enough, or several do about as well.
     """
-    guess, grid = guess or Guess(), Grid(scan)
+    guess, grid = guess or Guess(), CellGrid(scan)
     fits = _likeliest(cloud, scan, guess, grid, _NUM_FINALISTS)
     if not fits:
         raise NoPlacementError("no part of the scan resembles the run: " + _ADVICE)
@@ -118,7 +118,7 @@ def register(cloud: Cloud, scan: Scan, guess: Guess | None = None) -> Registrati
     return found
 
 
-def _likeliest(cloud: Cloud, scan: Scan, guess: Guess, grid: Grid, most: int) -> list[Fit]:
+def _likeliest(cloud: Cloud, scan: Scan, guess: Guess, grid: CellGrid, most: int) -> list[Fit]:
     """Fits of the placements that explain most of a cloud, the best first, at most `most`."""
     near = _aligned(candidates(cloud, scan, guess, _NUM_CANDIDATES), cloud, scan)
     noises = [noise_of(fit, cloud, scan, sigma) for fit, sigma in near]
@@ -155,7 +155,9 @@ def _check(found: Registration, reach: float) -> None:
         )
 
 
-def _check_handed(found: Registration, cloud: Cloud, scan: Scan, guess: Guess, grid: Grid) -> None:
+def _check_handed(
+    found: Registration, cloud: Cloud, scan: Scan, guess: Guess, grid: CellGrid
+) -> None:
     """Refuse a scan that the mirrored cloud fits better: it cannot be of the same place."""
     twin, axis = cloud.mirrored(), guess.axis
     if axis is not None:

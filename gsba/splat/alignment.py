@@ -3,34 +3,27 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import gtsam
 import numpy as np
 
-from factors import BearingTerm, FaceCameras, LandmarkBlock, RobustLoss
+from factors import FaceCameras, RobustLoss
 from factors.splat import RenderedView, SplatBlock
 from gsba.bundle import pose_variables
-from gsba.bundle.optimizer import optimize
 from gsba.camera.fisheye import facing
 from gsba.camera.lens import seam_sines
 from gsba.camera.optics import ONE_EYE, Optics
 from gsba.camera.rig import CubeRig
 from gsba.camera.views import View, nearest_lens, rig_views, turned_rigs
-from gsba.config import SolverSettings
 from gsba.frames import cubemap
 from gsba.frames.masks import load_weights
 from gsba.log import track
 from gsba.splat.backend import Backend
 from gsba.splat.camera import rig_cameras
 from gsba.splat.gaussians import Gaussians
-from gsba.splat.scene import cut_faces, cut_lens_faces, place_points
-from gsba.types import FrameSet, Reconstruction
+from gsba.splat.scene import cut_faces, cut_lens_faces
+from gsba.types import FrameSet
 
 MIN_ALPHA = 0.95  # least alpha of a rendered pixel that is used
 MAX_STEP = 0.1  # relative depth step between neighbouring pixels from which they are an edge
-MAX_STEPS = 15  # solver steps at each size
-GATES_DEG = (16.0, 5.0, 1.5, 0.5)  # degrees, gates of observations at the first sizes; the last one
-# at all further sizes
-_GATE_SIGMAS = 10.0  # wider gates loosen the loss in proportion
 _LUMA = np.array([0.299, 0.587, 0.114])
 _CAPTURED_HFOV_DEG = 100.0  # of captured faces, so that samples beyond a rendered edge find pixels
 
@@ -46,74 +39,6 @@ class Captured:
     weights: tuple[np.ndarray | None, ...]  # (W,) of (K, S, S) float32, 0..1; None = all one
     turns: np.ndarray | None = None  # (W, 3, 3) axes of the views' rig in each frame's; None =
     # equal
-
-
-def align_to_splat(
-    gaussians: Gaussians,
-    frames: FrameSet,
-    world_T_rigs: np.ndarray,
-    near: float,
-    backend: Backend,
-    sizes: Sequence[int] = (24, 48, 96, 192),
-    reconstruction: Reconstruction | None = None,
-    optics: Optics = ONE_EYE,
-) -> np.ndarray:
-    """Align the poses of all frames to a fixed splat, from coarse to fine.
-
-    The splat fixes the gauge. The coarsest faces have the widest basin; observations, where given,
-    join from the start, with a gate and a loss that tighten from size to size.
-
-    Args:
-        gaussians: the splat.
-        frames: captured frames.
-        world_T_rigs: (F, 4, 4) initial poses, in the splat's world.
-        near: least z of a Gaussian, map units.
-        backend: the renderer.
-        sizes: pixels of a face at each level.
-        reconstruction: its observations join as bearing factors; None = the splat alone.
-        optics: lenses of the frames.
-
-    Returns:
-        (F, 4, 4) float64.
-    """
-    which = np.arange(len(frames))
-    settings = SolverSettings(
-        max_iterations=MAX_STEPS, relative_tolerance=1e-5, absolute_tolerance=None
-    )
-    poses = world_T_rigs
-    for level, size in enumerate(sizes):
-        captured = capture(frames, which, size, optics)
-        blocks: list = [splat_block(gaussians, captured, near, backend)]
-        if reconstruction is not None:
-            gate = float(np.deg2rad(GATES_DEG[min(level, len(GATES_DEG) - 1)]))
-            blocks.append(bearing_block(reconstruction, poses, gate))
-        values = gtsam.Values()
-        for f in which:
-            values.insert(pose_variables.X(int(f)), gtsam.Pose3(poses[f]))
-        found = optimize(gtsam.NonlinearFactorGraph(), blocks, values, settings).values
-        poses = np.stack([found.atPose3(pose_variables.X(int(f))).matrix() for f in which])
-    return poses
-
-
-def bearing_block(
-    reconstruction: Reconstruction, world_T_rigs: np.ndarray, gate_rad: float
-) -> LandmarkBlock:
-    """A run's observations as bearing factors, with points triangulated under given poses.
-
-    Args:
-        world_T_rigs: (F, 4, 4).
-        gate_rad: observations further from their point are left out; wider gates make the
-            observations less certain than the run estimated.
-    """
-    which = np.arange(len(world_T_rigs))
-    landmarks, _ = place_points(reconstruction, world_T_rigs, which, gate_rad)
-    tracks = landmarks.tracks
-    sigmas = reconstruction.observation_sigmas[tracks.keypoints]
-    spread = gate_rad / (_GATE_SIGMAS * float(np.median(sigmas))) if len(sigmas) else 1.0
-    bearings = reconstruction.observation_bearings[tracks.keypoints]
-    term = BearingTerm(tracks.frames, tracks.points, bearings, max(1.0, spread) * sigmas)
-    keys = [pose_variables.X(int(f)) for f in which]
-    return LandmarkBlock(keys, landmarks.points_world, [term], RobustLoss("cauchy", 1.0))
 
 
 def capture(frames: FrameSet, which: np.ndarray, size: int, optics: Optics = ONE_EYE) -> Captured:

@@ -26,6 +26,7 @@ from factors import LandmarkBlock
 from gsba.bundle import adjustment, triangulation
 from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.optimizer import OptimizeResult, optimize
+from gsba.bundle.reconstruction import MIN_OBSERVATIONS
 from gsba.camera.optics import ONE_EYE, Optics
 from gsba.config import SplatSettings
 from gsba.splat.alignment import Captured, capture, splat_block
@@ -35,15 +36,18 @@ from gsba.splat.gaussians import Gaussians, from_cloud
 from gsba.splat.scene import Faces, Split, load_faces, make_views, near_of, split_frames
 from gsba.splat.scores import face_psnrs
 from gsba.splat.splat_greys import SplatGreys
-from gsba.splat.train import State, advance, begin
+from gsba.splat.train import TrainingState, advance, begin
 from gsba.store.records import load_checkpoint, save_record
 from gsba.types import Counts, FrameSet, Keypoints, Landmarks, Round, Solution
+
+_SOLVER_STEPS = 2  # Levenberg-Marquardt steps in a move
+_SH_DEGREE = 1  # of colours: low, so that views must agree on them
 
 logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class Move:
+class PoseMove:
     """One joint move of all poses, and its evidence from held-out frames."""
 
     size: int  # pixels of a face
@@ -64,7 +68,7 @@ class SplatResult:
 
     adjustment: Solution
     counts: tuple[Counts, ...]  # of frames: those that the splat is trained on are kept
-    moves: tuple[Move, ...]
+    moves: tuple[PoseMove, ...]
 
     @property
     def rounds(self) -> tuple[Round, ...]:
@@ -79,8 +83,8 @@ class _Progress:
     level: int  # index into the sizes
     turns: int  # moves made at this level; -1: before its first training
     world_T_rigs: np.ndarray  # (F, 4, 4)
-    state: State
-    moves: tuple[Move, ...]
+    state: TrainingState
+    moves: tuple[PoseMove, ...]
     rounds: tuple[Round, ...]
 
 
@@ -108,7 +112,7 @@ def refine(
         GsbaError: all frames are masked, or the splat is no longer finite.
     """
     chosen = context.settings.splat
-    usable = start.observations() >= context.settings.rounds.min_observations
+    usable = start.observations() >= MIN_OBSERVATIONS
     if np.count_nonzero(usable) <= chosen.held_out_every:
         few = int(np.count_nonzero(usable))
         logger.warning("%d refined frames are too few for a splat to judge poses by", few)
@@ -119,7 +123,7 @@ def refine(
     turns = _Turns(keypoints, start, context, split)
     progress = load_checkpoint(checkpoint, key, _Progress, "the splat refinement starts anew")
     if progress is None:
-        cloud = _cloud(start.landmarks, keypoints, chosen.sh_degree)
+        cloud = _cloud(start.landmarks, keypoints, _SH_DEGREE)
         first = begin(cloud, turns.training(0))
         progress = _Progress(0, -1, start.world_T_rigs, first, (), ())
     else:
@@ -169,7 +173,7 @@ class _Turns:
         return SplatSettings(
             iterations=len(chosen.sizes) * each,
             face_size=chosen.sizes[level],
-            sh_degree=chosen.sh_degree,
+            sh_degree=_SH_DEGREE,
             max_gaussians=chosen.max_gaussians,
             held_out_every=chosen.held_out_every,
             seed=self.settings.seed,
@@ -204,9 +208,9 @@ class _Turns:
         evidence = together(score(gains), score(savings, chance))
         after = self._placed(moved)
         accepted = evidence > chosen.min_sigmas and growth <= chosen.max_growth
-        least = self.settings.rounds.min_observations
+        least = MIN_OBSERVATIONS
         accepted &= replace(self.solved, landmarks=after).carries(self.solved, least)
-        move = Move(
+        move = PoseMove(
             settings.face_size, float(looks[0].mean()), float(looks[1].mean()),
             standard_error(gains), growth, len(savings) * standard_error(savings) / total,
             evidence, *_median_move(poses, moved), accepted,
@@ -246,8 +250,8 @@ class _Turns:
         terms = self.context.beside(greys).terms(replace(self.solved, world_T_rigs=world_T_rigs))
         values, landmarks = terms.values, self._block()
         landmarks.polish(values)
-        solver = settings.solver.model_copy(update={"max_iterations": settings.splat.solver_steps})
-        result = optimize(terms.graph, [landmarks, *terms.blocks], values, solver)
+        solver = settings.solver.model_copy(update={"max_iterations": _SOLVER_STEPS})
+        result = optimize(terms.graph, values, [landmarks, *terms.blocks], solver)
         return adjustment.poses_of(result.values, len(world_T_rigs)), result
 
     def _block(self) -> LandmarkBlock:
@@ -274,13 +278,13 @@ class _Turns:
         return unknowns * cost / redundancy if redundancy > 0 else np.inf
 
     def _trained(
-        self, state: State, world_T_rigs: np.ndarray, settings: SplatSettings, steps: int
-    ) -> State:
+        self, state: TrainingState, world_T_rigs: np.ndarray, settings: SplatSettings, steps: int
+    ) -> TrainingState:
         views = make_views(self.faces, world_T_rigs[self.split.training])
         return advance(state, views, settings, self.backend, steps)
 
     def _held_out_psnrs(
-        self, state: State, world_T_rigs: np.ndarray, settings: SplatSettings
+        self, state: TrainingState, world_T_rigs: np.ndarray, settings: SplatSettings
     ) -> np.ndarray:
         """PSNR (V,) of each held-out face in dB, after fitting gains."""
         views = make_views(self.held_out, world_T_rigs[self.split.held_out])
@@ -303,7 +307,7 @@ class _Turns:
         return rounds[-1].gate_sigmas if rounds else np.inf
 
 
-def _log(move: Move) -> None:
+def _log(move: PoseMove) -> None:
     gain, verdict = move.psnr_moved - move.psnr_stayed, "accepted" if move.accepted else "undone"
     logger.info(
         "faces of %d px: held out %+.4f dB (standard error %.4f), cost of observations times %.4f "

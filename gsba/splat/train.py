@@ -53,7 +53,7 @@ class Views:
 
 
 @dataclass(frozen=True, slots=True)
-class State:
+class TrainingState:
     """A splat in training."""
 
     step: int  # steps made
@@ -61,11 +61,13 @@ class State:
     moments: adam.Moments
     pull: Pull
 
-    def copy(self) -> "State":
+    def copy(self) -> "TrainingState":
         """A state with arrays of its own: a step may change those of its state in place."""
         rows = np.arange(len(self.gaussians))
         pull = Pull(self.pull.sums.copy(), self.pull.counts.copy())
-        return State(self.step, self.gaussians.select(rows), self.moments.select(rows), pull)
+        return TrainingState(
+            self.step, self.gaussians.select(rows), self.moments.select(rows), pull
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +123,7 @@ def train(
         GsbaError: all pixels are masked, there is no Gaussian, or parameters are no longer finite;
             the last checkpoint with finite ones is kept.
     """
-    state = load_checkpoint(checkpoint, key, State, "training starts anew")
+    state = load_checkpoint(checkpoint, key, TrainingState, "training starts anew")
     if state is None:
         state = begin(start, settings)
     else:
@@ -145,7 +147,7 @@ def train(
     return state.gaussians
 
 
-def begin(start: Gaussians, settings: SplatSettings) -> State:
+def begin(start: Gaussians, settings: SplatSettings) -> TrainingState:
     """A training before its first step; if there are too many Gaussians, with a sample of them.
 
     Args:
@@ -163,12 +165,12 @@ def begin(start: Gaussians, settings: SplatSettings) -> State:
         draw = np.random.default_rng(settings.seed)
         rows = np.sort(draw.permutation(len(start))[: settings.max_gaussians])
     first = start.select(rows)
-    return State(0, first, adam.Moments.zero(first), Pull.none(len(first)))
+    return TrainingState(0, first, adam.Moments.zero(first), Pull.none(len(first)))
 
 
 def advance(
-    state: State, views: Views, settings: SplatSettings, backend: Backend, steps: int
-) -> State:
+    state: TrainingState, views: Views, settings: SplatSettings, backend: Backend, steps: int
+) -> TrainingState:
     """Train for some steps; the given state is not changed.
 
     Raises:
@@ -183,7 +185,7 @@ def advance(
     return state
 
 
-def _require_finite(state: State, checkpoint: Path | None) -> None:
+def _require_finite(state: TrainingState, checkpoint: Path | None) -> None:
     if not state.gaussians.is_finite():
         kept = "" if checkpoint is None else f"; the last good state is in {checkpoint}"
         raise GsbaError(f"the splat is no longer finite at step {state.step}{kept}")
@@ -226,7 +228,7 @@ class Trainer:
         self.near = settings.near * self.extent
         self.capped = False
 
-    def advance(self, state: State, end: int) -> State:
+    def advance(self, state: TrainingState, end: int) -> TrainingState:
         """Take a stretch of steps, at most to `end`; arrays of the state may be changed in
         place."""
         settings, times = self.settings, self.times
@@ -243,7 +245,7 @@ class Trainer:
                 pull = Pull.none(len(gaussians))
             if step % times.reset_every == 0 and step < times.densify_until:
                 gaussians, moments = reset_opacity(gaussians, moments)
-        return State(step, gaussians, moments, pull)
+        return TrainingState(step, gaussians, moments, pull)
 
     def _stop(self, step: int, end: int) -> int:
         """End of a stretch from a step: the next step at which density control may be due, or
@@ -285,7 +287,7 @@ class Trainer:
             sh_rest=fade * settings.rate_colors / 20,
         )
 
-    def _densify(self, state: State, step: int) -> tuple[Gaussians, adam.Moments]:
+    def _densify(self, state: TrainingState, step: int) -> tuple[Gaussians, adam.Moments]:
         settings = self.settings
         limits = DensityLimits(
             pull=settings.densify_pull,

@@ -10,6 +10,8 @@ from gsba.log import GsbaError
 from gsba.trajectory.units import refuse_apart, refuse_intervals, refuse_other_unit, span
 from gsba.types import CoarsePoses, FrameSet, PoseSource, Trajectory
 
+_MAX_INTERPOLATION_S = 10.0  # between an entry and a frame; poses further away are reported
+
 _log = logging.getLogger(__name__)
 
 _MIN_SHARED_SPAN = 0.5  # least part of the frames or of the entries within the other's span
@@ -52,7 +54,7 @@ def associate(frames: FrameSet, trajectory: Trajectory, settings: ReadSettings) 
     sources = np.where(
         seen, PoseSource.SLAM, np.where(outside, PoseSource.EXTRAPOLATED, PoseSource.INTERPOLATED)
     ).astype(np.uint8)
-    _log_sources(frames, sources, times, entries, settings.max_interpolation_s)
+    _log_sources(frames, sources, times, entries)
     return CoarsePoses(poses_at(trajectory, times), sources, offset)
 
 
@@ -68,7 +70,6 @@ def _log_sources(
     sources: np.ndarray,
     times: np.ndarray,
     entries: np.ndarray,
-    max_interpolation_s: float,
 ) -> None:
     counts = np.bincount(sources, minlength=len(PoseSource))
     _log.info(
@@ -79,14 +80,14 @@ def _log_sources(
     gaps = entries[inside] - entries[inside - 1]
     far = np.maximum(entries[0] - times, times - entries[-1])
     distance = np.where(sources == PoseSource.INTERPOLATED, gaps, far)
-    long = (sources != PoseSource.SLAM) & (distance > max_interpolation_s)
+    long = (sources != PoseSource.SLAM) & (distance > _MAX_INTERPOLATION_S)
     if long.any():
         f = int(np.argmax(np.where(long, distance, 0)))
         _log.warning(
             "%d frames lie in gaps of the trajectory longer than %g s (frame '%s': %.1f s); "
             "their poses are rough",
             long.sum(),
-            max_interpolation_s,
+            _MAX_INTERPOLATION_S,
             frames.names[f],
             distance[f],
         )

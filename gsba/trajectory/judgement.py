@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsba.config import PriorSettings, VerifySettings
+from gsba.config import PriorSettings, TwoViewLimits
 from gsba.geometry import inverse, nearest_rotation, pose, rotation_angle
 from gsba.trajectory.steps import Steps, chained, step_errors, step_lengths
 from gsba.trajectory.turning import Turn
@@ -78,7 +78,7 @@ def check_steps(
     found: Steps,
     logs: np.ndarray,
     sigmas: np.ndarray,
-    verify: VerifySettings,
+    verify: TwoViewLimits,
     priors: PriorSettings,
     turn: Turn | None = None,
 ) -> StepChecks:
@@ -364,7 +364,7 @@ class OutlierLimits:
 
 
 def outlier_limits(
-    slam: np.ndarray, images: np.ndarray, judged: np.ndarray, settings: VerifySettings
+    slam: np.ndarray, images: np.ndarray, judged: np.ndarray, settings: TwoViewLimits
 ) -> OutlierLimits:
     """Thresholds that mark an outlier: beyond the settings, and beyond the trajectory's noise.
 

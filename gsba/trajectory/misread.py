@@ -1,8 +1,10 @@
 """Detection of trajectories in another convention, or of another recording."""
 
+from dataclasses import replace
+
 import numpy as np
 
-from gsba.config import VerifySettings
+from gsba.config import TwoViewLimits
 from gsba.geometry import inverse, pose
 from gsba.log import GsbaError
 from gsba.trajectory.conventions import CAMERA_FROM_WORLD, OURS, WXYZ, axis_systems, w_first
@@ -33,7 +35,7 @@ def refuse_useless(coarse: CoarsePoses) -> None:
         )
 
 
-def refuse_misread(coarse: CoarsePoses, found: Steps, settings: VerifySettings) -> None:
+def refuse_misread(coarse: CoarsePoses, found: Steps, settings: TwoViewLimits) -> None:
     """Refuse a trajectory that most steps of the images contradict, but not in another convention.
 
     Args:
@@ -68,7 +70,7 @@ def refuse_misread(coarse: CoarsePoses, found: Steps, settings: VerifySettings) 
     raise GsbaError(f"{text}: the trajectory is {best}{other}, {_ADVICE}")
 
 
-def refuse_misfit(coarse: CoarsePoses, found: Steps, settings: VerifySettings) -> None:
+def refuse_misfit(coarse: CoarsePoses, found: Steps, settings: TwoViewLimits) -> None:
     """Refuse a trajectory that most steps of the images contradict, with the likely reason.
 
     Args:
@@ -78,7 +80,7 @@ def refuse_misfit(coarse: CoarsePoses, found: Steps, settings: VerifySettings) -
         GsbaError: most steps contradict the images.
     """
     refuse_misread(coarse, found, settings)
-    judged, loose = _judged_steps(coarse, found), settings.model_copy(update=_LOOSE_LIMITS)
+    judged, loose = _judged_steps(coarse, found), replace(settings, **_LOOSE_LIMITS)
     steps = _steps(coarse.world_T_rigs)
     if (
         judged.sum() < _MIN_STEPS
@@ -99,7 +101,7 @@ def refuse_misfit(coarse: CoarsePoses, found: Steps, settings: VerifySettings) -
 
 
 def _delay_in_frames(
-    coarse: CoarsePoses, found: Steps, judged: np.ndarray, settings: VerifySettings
+    coarse: CoarsePoses, found: Steps, judged: np.ndarray, settings: TwoViewLimits
 ) -> tuple[int, float]:
     """Delay in frames of the trajectory's steps, and the share of steps that it explains.
 
@@ -182,7 +184,7 @@ def _flipped(steps: np.ndarray, signs: np.ndarray | list[int]) -> np.ndarray:
 
 
 def _agreeing_share(
-    steps: np.ndarray, found: Steps, judged: np.ndarray, settings: VerifySettings
+    steps: np.ndarray, found: Steps, judged: np.ndarray, settings: TwoViewLimits
 ) -> float:
     """Share of the judged steps that agree with the images."""
     turned, off = step_errors(steps, found)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsba.camera.rig import witnesses
-from gsba.config import VerifySettings
+from gsba.config import TwoViewLimits
 from gsba.geometry import nearest_rotation
 from gsba.significance import log10_false_alarms, outweighs
 from gsba.types import Keypoints, VerifiedPairs
@@ -50,7 +50,7 @@ def rotation_of_most(rays0: np.ndarray, rays1: np.ndarray) -> tuple[np.ndarray, 
 def prove(
     pairs: VerifiedPairs,
     keypoints: Keypoints,
-    settings: VerifySettings,
+    settings: TwoViewLimits,
     max_parallax: float = MAX_PARALLAX_RAD,
 ) -> Turn | None:
     """The largest part of the frames that turned on the spot; None = that is not proved.
@@ -81,7 +81,7 @@ def prove(
     return turn
 
 
-def _is_turn(support: int, against: int, chance: float, settings: VerifySettings) -> bool:
+def _is_turn(support: int, against: int, chance: float, settings: TwoViewLimits) -> bool:
     """True if matches surely agree on a rotation, and no translation explains as many more.
 
     Args:

@@ -169,7 +169,7 @@ def test_a_joint_solve_agrees_with_gtsam(world: World) -> None:
     block = adjustment.landmark_block(solved.landmarks, world.keypoints, solved.noise, problem)
     tight = SolverSettings(relative_tolerance=1e-12, absolute_tolerance=1e-8, max_iterations=100)
     terms = problem.terms(solved)
-    ours = optimize(terms.graph, [block], terms.values, tight)
+    ours = optimize(terms.graph, terms.values, [block], tight)
     graph = gtsam.NonlinearFactorGraph(terms.graph)
     for factor in block.factors():
         graph.add(factor)

@@ -14,9 +14,9 @@ from gsba.bundle.adjustment import AdjustmentContext, values_of
 from gsba.bundle.bearings import Bearings
 from gsba.bundle.families import Families, Family
 from gsba.bundle.fixes import FrameFixes
-from gsba.bundle.gps_factors import GpsFixes
+from gsba.bundle.gps_factors import GpsFactors
 from gsba.bundle.trajectory_prior import TrajectoryPrior
-from gsba.config import GpsSettings, RefineSettings
+from gsba.config import RefineSettings
 from gsba.geometry import furthest, inverse
 from gsba.similarity import Sim3, pose_similarity
 from gsba.types import Solution
@@ -38,7 +38,7 @@ def _problem(coarse: np.ndarray, poses: np.ndarray, fixes: FrameFixes | None) ->
     settings = RefineSettings()
     prior = TrajectoryPrior(coarse, settings.priors, first=poses[0])
     members: list[Family] = [Bearings(), prior]
-    members += [] if fixes is None else [GpsFixes(fixes, GpsSettings())]
+    members += [] if fixes is None else [GpsFactors(fixes)]
     families = Families(tuple(members)).fitted(Solution.without_points(poses))
     return AdjustmentContext(families, RIG, settings, 1)
 
@@ -54,7 +54,7 @@ def _solve(world: World, coarse: np.ndarray, fixes: FrameFixes | None) -> Soluti
 
 def test_exact_fixes_are_carried_to_where_the_poses_are() -> None:
     world = make_world(0, 24)
-    anchors = gps_factors.anchor(world.world_T_rigs, _fixes(world, 0, 0.0), GpsSettings())
+    anchors = gps_factors.anchor(world.world_T_rigs, _fixes(world, 0, 0.0))
     assert anchors is not None and anchors.used.all()
     np.testing.assert_allclose(anchors.positions, world.world_T_rigs[:, :3, 3], atol=1e-9)
     assert anchors.level_from_map[0].scale == pytest.approx(METRES)
@@ -73,14 +73,14 @@ def test_false_fixes_are_left_out_and_others_elsewhere_have_no_say() -> None:
     fixes = _fixes(world, 1)
     wild = np.array([2, 11, 17])
     fixes.positions[wild] += 50 * np.eye(3)
-    anchors = gps_factors.anchor(world.world_T_rigs, fixes, GpsSettings())
+    anchors = gps_factors.anchor(world.world_T_rigs, fixes)
     assert anchors is not None
     assert not anchors.used[wild].any() and anchors.used.sum() == 21
     assert np.array_equal(anchors.frames, np.setdiff1d(np.arange(24), wild))
     still = fixes_at(rng.normal(0, 3, (24, 3)), TIMES)
-    assert gps_factors.anchor(world.world_T_rigs, still, GpsSettings()) is None
+    assert gps_factors.anchor(world.world_T_rigs, still) is None
     few = _fixes(world, 1).taken(np.arange(24) < 4)
-    assert gps_factors.anchor(world.world_T_rigs, few, GpsSettings()) is None
+    assert gps_factors.anchor(world.world_T_rigs, few) is None
 
 
 def test_each_map_has_a_similarity_of_its_own() -> None:
@@ -88,12 +88,12 @@ def test_each_map_has_a_similarity_of_its_own() -> None:
     poses, maps = world.world_T_rigs.copy(), np.repeat([0, 1], 12)
     moved = Sim3(0.3, Rotation.from_rotvec([0.2, 2.0, 0.1]).as_matrix(), np.array([50.0, 0, 0]))
     poses[12:] = moved.poses(poses[12:])
-    anchors = gps_factors.anchor(poses, _fixes(world, 0, 0.0), GpsSettings(), maps)
+    anchors = gps_factors.anchor(poses, _fixes(world, 0, 0.0), maps)
     assert anchors is not None and anchors.holds(0, maps) and anchors.holds(20, maps)
     np.testing.assert_allclose(anchors.positions, poses[:, :3, 3], atol=1e-8)
     assert anchors.level_from_map[1].scale == pytest.approx(METRES / 0.3)
     some = _fixes(world, 0, 0.0).taken(np.arange(24) < 12)
-    anchors = gps_factors.anchor(poses, some, GpsSettings(), maps)
+    anchors = gps_factors.anchor(poses, some, maps)
     assert anchors is not None and anchors.holds(0, maps) and not anchors.holds(20, maps)
 
 
@@ -150,7 +150,7 @@ def test_images_contradict_fixes_that_bend_their_map() -> None:
         problem = _problem(coarse, solved.world_T_rigs, None)
         _, joint = adjustment.pose_covariances(solved, world.keypoints, problem)
         snapshot = Families().snapshot(solved)
-        family = GpsFixes(fixes, GpsSettings())
+        family = GpsFactors(fixes)
         ratios.append(family.contradiction(snapshot, joint.draws))
         muted = replace(family, contradicted=True)
         assert muted.fitted(snapshot) is None and muted.digest != family.digest
@@ -161,7 +161,7 @@ def test_linear_factors_leave_the_gauge_free() -> None:
     """Any similar set of poses is as good: what moves all alike costs nothing."""
     world = make_world(0, 24)
     poses, fixes = world.world_T_rigs, _fixes(world, 2)
-    anchors = gps_factors.anchor(poses, fixes, GpsSettings())
+    anchors = gps_factors.anchor(poses, fixes)
     assert anchors is not None
     factors, values = gps_factors.linear_factors(anchors, poses)
     values.insert(values_of(poses))

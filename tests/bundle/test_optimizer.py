@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import L, X
 
+import gsba
 from factors import (
     BearingFactor,
     BearingTerm,
@@ -103,7 +104,7 @@ def world() -> World:
 def solved(world):
     """The fast door's result and its block."""
     block = world.block()
-    return optimize(world.graph, [block], world.values, TIGHT), block
+    return optimize(world.graph, world.values, [block], TIGHT), block
 
 
 def stock(graph, values) -> gtsam.Values:
@@ -170,6 +171,20 @@ def test_reference_host_factors_and_fast_door_agree(world, solved):
     assert distance(result.values, hosted, world.keys) < 1e-5
 
 
+def test_a_plain_graph_ends_where_gtsam_ends(world):
+    """Poses and points to 1e-9, of our single factors and GTSAM's priors, without any block."""
+    graph, values = world.reference()
+    exact = SolverSettings(relative_tolerance=1e-15, absolute_tolerance=1e-15, max_iterations=200)
+    ours = gsba.optimize(graph, values, settings=exact).values
+    params = gtsam.LevenbergMarquardtParams()
+    params.setRelativeErrorTol(0)
+    params.setAbsoluteErrorTol(0)
+    theirs = gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
+    assert distance(ours, theirs, world.keys) < 1e-9
+    points = [L(j) for j in range(len(world.start_points))]
+    assert max(np.abs(ours.atPoint3(k) - theirs.atPoint3(k)).max() for k in points) < 1e-9
+
+
 def test_host_factor_errors_add_up_to_the_cost_with_and_without_derivatives(world):
     block = world.block()
     cost = block.polish(world.values)
@@ -203,7 +218,7 @@ def test_covariances_agree_with_marginals(world, solved):
 def test_result_does_not_depend_on_threads_or_order(world, solved):
     result, _ = solved
     block = world.block(num_threads=3)
-    other = optimize(world.graph, [block], world.values, TIGHT)
+    other = optimize(world.graph, world.values, [block], TIGHT)
     assert distance(result.values, other.values, world.keys) < 1e-6
     assert other.cost == pytest.approx(result.cost, rel=1e-9)
 
@@ -265,7 +280,7 @@ def test_degenerate_landmarks_and_idle_frames_stay_finite(world):
     frames, owners = np.array([0, 1, 1, 2, 0]), np.array([0, 1, 1, 1, 3])  # one ray; none; centre
     bearings = np.tile([0.0, 0.0, 1.0], (5, 1))
     block = LandmarkBlock(world.keys, points, [BearingTerm(frames, owners, bearings, 0.01)])
-    result = optimize(world.graph, [block], world.values)
+    result = optimize(world.graph, world.values, [block])
     assert np.isfinite(result.cost) and np.isfinite(block.points_world).all()
     covariances, _ = marginal_covariances(world.graph, [block], result.values, world.keys)
     assert np.isfinite(covariances).all()
@@ -278,7 +293,7 @@ def test_covariance_of_an_idle_pose_is_nan_and_spoils_no_other(world):
     seen = world.frames != 7
     term = BearingTerm(world.frames[seen], world.owners[seen], world.bearings[seen], SIGMA_RAD)
     block = LandmarkBlock(world.keys, world.start_points, [term], LOSS)
-    result = optimize(graph, [block], world.values)
+    result = optimize(graph, world.values, [block])
     assert result.values.atPose3(X(7)).equals(world.values.atPose3(X(7)), 1e-12)
     covariances, joint = marginal_covariances(graph, [block], result.values, world.keys, 3)
     assert np.isnan(covariances[7]).all() and np.isfinite(covariances[:7]).all()
@@ -323,7 +338,7 @@ def test_variables_of_other_types_join(world):
         return np.array([pose.x() + 3.0 - values.atDouble(scalar)])
 
     graph.add(gtsam.CustomFactor(gtsam.noiseModel.Isotropic.Sigma(1, 0.01), [scalar, X(0)], tied))
-    ours = optimize(graph, [world.block()], values, TIGHT)
+    ours = optimize(graph, values, [world.block()], TIGHT)
     grouped = gtsam.NonlinearFactorGraph(graph)
     for factor in world.block().factors():
         grouped.add(factor)
@@ -347,12 +362,12 @@ def test_bad_steps_are_refused_and_bad_starts_reported(world):
 
     graph = gtsam.NonlinearFactorGraph(world.graph)
     graph.add(gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(1), [key], root))
-    result = optimize(graph, [world.block()], values)
+    result = optimize(graph, values, [world.block()])
     assert np.isfinite(result.cost) and result.cost <= result.history[0].cost
     assert not all(step.accepted for step in result.history)
     values.update(key, -1.0)
     with pytest.raises(GsbaError, match="graph is not finite"):
-        optimize(graph, [world.block()], values)
+        optimize(graph, values, [world.block()])
 
 
 def test_interrupt_passes_through(world):
@@ -360,7 +375,7 @@ def test_interrupt_passes_through(world):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        optimize(world.graph, [world.block()], world.values, callback=stop)
+        optimize(world.graph, world.values, [world.block()], callback=stop)
 
 
 def test_bad_terms_are_named(world):
@@ -376,7 +391,7 @@ def test_bad_terms_are_named(world):
     with pytest.raises(ValueError, match="positive"):
         LandmarkBlock(world.keys, np.zeros((1, 3)), [BearingTerm(one, one, np.eye(3)[:1], 0.0)])
     with pytest.raises(ValueError, match="no value"):
-        optimize(world.graph, [], gtsam.Values())
+        optimize(world.graph, gtsam.Values())
 
 
 def test_landmarks_are_eliminated_in_runs_of_any_length(world, monkeypatch):
@@ -413,7 +428,7 @@ def test_steps_by_iterations_are_those_of_a_factorization(world):
 
 def test_history_is_logged(world, caplog):
     with caplog.at_level(logging.DEBUG, logger="gsba.bundle.optimizer"):
-        optimize(world.graph, [world.block()], world.values)
+        optimize(world.graph, world.values, [world.block()])
     assert "step 0" in caplog.text
 
 
@@ -433,6 +448,6 @@ def test_weak_modes_settle_beside_a_large_cost_that_stays() -> None:
         graph.add(gtsam.PriorFactorPose3(X(0), claim, rigid))
     aside = gtsam.noiseModel.Isotropic.Sigma(6, 0.5)
     graph.add(gtsam.PriorFactorPose3(X(num - 1), at(num - 1, 3), aside))
-    result = optimize(graph, [], values, SolverSettings())
-    best = optimize(graph, [], result.values, TIGHT)
+    result = optimize(graph, values, settings=SolverSettings())
+    best = optimize(graph, result.values, settings=TIGHT)
     assert result.converged and result.cost - best.cost < 0.05

@@ -136,7 +136,7 @@ def test_model_predicts_the_cost() -> None:
         there = corrected(keypoints, field, RIG)
         block = adjustment.landmark_block(landmarks, there, 1.0, problem)
         terms = problem.terms(Solution.without_points(world.world_T_rigs))
-        result = optimize(terms.graph, [block], terms.values, plain)
+        result = optimize(terms.graph, terms.values, [block], plain)
         poses = adjustment.poses_of(result.values, len(world.world_T_rigs))
         return Solution(poses, landmarks, 1.0, ()), block.error(result.values)
 

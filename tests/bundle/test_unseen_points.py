@@ -16,7 +16,7 @@ from gsba.bundle.families import Families
 from gsba.bundle.reconstruction import assemble
 from gsba.camera.cameras import Cameras
 from gsba.camera.lens import Lenses
-from gsba.config import PatchSettings, RefineSettings
+from gsba.config import RefineSettings
 from gsba.photometric.references import references, visible_frames
 from gsba.types import CoarsePoses, Counts, Landmarks, PoseSource, Solution, Tracks
 
@@ -160,7 +160,7 @@ def test_patches_are_looked_for_at_the_seen_alone(case: Case) -> None:
     for landmarks in case.landmarks():
         rows = references(landmarks, poses)
         extended = np.ones(len(rows), bool)
-        views = visible_frames(landmarks, poses, rows, extended, PatchSettings())
+        views = visible_frames(landmarks, poses, rows, extended)
         found.append((rows, views))
     np.testing.assert_array_equal(found[0][0][case.seen], found[1][0])
     points, frames = found[0][1]

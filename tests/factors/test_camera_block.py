@@ -302,7 +302,7 @@ def test_optimum_is_that_of_gtsam_on_the_same_factors(kind: str) -> None:
     frames, which, _, measured, whiteners, seeing, fractions = rows
     camera, graph = block.camera, _priors(values, block.camera)
     tight = SolverSettings(relative_tolerance=1e-13, absolute_tolerance=None, max_iterations=100)
-    found = optimize(graph, [block], values, tight)
+    found = optimize(graph, values, [block], tight)
     whole, start = gtsam.NonlinearFactorGraph(graph), gtsam.Values(values)
     for j, point in enumerate(block.points_world):
         start.insert(L(j), gtsam.Point3(*point))

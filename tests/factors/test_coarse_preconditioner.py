@@ -169,9 +169,9 @@ def test_blocks_without_products_are_written_out_beside_those_with(
 
 def test_the_optimum_is_the_same(world, held, monkeypatch) -> None:
     tight = SolverSettings(relative_tolerance=1e-12, max_iterations=200)
-    iterated = optimize(world.graph, [world.block()], world.values, tight)
+    iterated = optimize(world.graph, world.values, [world.block()], tight)
     monkeypatch.setattr(system_choice, "_MAX_OPERATIONS", np.inf)
-    direct = optimize(world.graph, [world.block()], world.values, tight)
+    direct = optimize(world.graph, world.values, [world.block()], tight)
     assert iterated.cost == pytest.approx(direct.cost, rel=1e-9)
     for key in world.keys:
         pose = direct.values.atPose3(key)

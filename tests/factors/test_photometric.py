@@ -6,11 +6,11 @@ from functools import cache
 import gtsam
 import numpy as np
 import pytest
-from photometric_world import BallWorld, CodedImage, make_ball_world, table_of
+from photometric_world import BallWorld, CodedImage, make_ball_world, planes_from, table_of
 from synthetic import unit
 
 from factors import RobustLoss, jacobian_errors
-from factors.patch_windows import PatchPixels, PatchTable, PatchViews, patch_axes, planes_from
+from factors.patch_windows import PatchPixels, PatchTable, PatchViews, patch_axes
 from factors.photometric import _MIN_THREAD_OBSERVATIONS, FAMILY, PhotometricBlock
 from factors.photometric_factor import PhotometricFactor, photometric_residuals
 from factors.sphere_image import SphereImage
@@ -191,7 +191,7 @@ def test_both_doors_and_stock_gtsam_end_at_one_optimum() -> None:
     world = make_ball_world(4, 3, 40)
     start = moved(world, 2, 2e-3, 0.008)
     prior = held(world)
-    fast = optimize(prior, [block_of(world)], world.values(start), TIGHT)
+    fast = optimize(prior, world.values(start), [block_of(world)], TIGHT)
 
     grouped = gtsam.NonlinearFactorGraph(prior)
     for factor in block_of(world).factors():
@@ -229,7 +229,7 @@ def test_exact_world_is_recovered() -> None:
     world = make_ball_world(6, 4, 150)
     start = moved(world, 4, 4e-3, 0.02)  # a third of a pixel in rotation, 0.4 in parallax
     assert pose_errors(world, world.values(start))[1] > 0.02
-    result = optimize(held(world), [block_of(world)], world.values(start), TIGHT)
+    result = optimize(held(world), world.values(start), [block_of(world)], TIGHT)
     rotation, position = pose_errors(world, result.values)
     # patches are flat, the ball is not: 0.01 px of a 512 px panorama are 1.2e-4 rad
     assert rotation < 1.5e-4 and position < 1e-3
@@ -242,7 +242,7 @@ def test_gain_and_offset_change_nothing() -> None:
     )
     start = moved(plain, 5, 2e-3, 0.01)
     results = [
-        optimize(held(world), [block_of(world)], world.values(start), TIGHT)
+        optimize(held(world), world.values(start), [block_of(world)], TIGHT)
         for world in (plain, toned)
     ]
     for f in range(3):
@@ -283,7 +283,7 @@ def test_textureless_and_saturated_frames_stay_finite() -> None:
     for array in (system.diagonal, system.off_diagonal, system.gradient):
         assert np.isfinite(array).all()
     assert block.dropped["no contrast"] > 0
-    result = optimize(held(world), [block], world.values(moved(world, 6, 1e-3, 3e-3)))
+    result = optimize(held(world), world.values(moved(world, 6, 1e-3, 3e-3)), [block])
     assert np.isfinite(result.cost) and np.isfinite(block.planes).all()
 
 

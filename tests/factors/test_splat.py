@@ -126,7 +126,7 @@ def test_poses_are_found_again_under_another_exposure(apart: bool) -> None:
     poses = truth(3)
     start = values_of(moved(poses, 0.03))  # 1.7 degrees, 0.03 of a room 4 wide
     block = block_at(poses, apart=apart)
-    result = optimize(gtsam.NonlinearFactorGraph(), [block], start)
+    result = optimize(gtsam.NonlinearFactorGraph(), start, [block])
     assert errors(start, poses).max() > 0.03
     assert errors(result.values, poses).max() < 5e-4
 
@@ -135,7 +135,7 @@ def test_somebody_in_the_picture_is_let_go() -> None:
     poses = truth(2)
     start = values_of(moved(poses, 0.02))
     block = block_at(poses, spoil=0.5)
-    result = optimize(gtsam.NonlinearFactorGraph(), [block], start)
+    result = optimize(gtsam.NonlinearFactorGraph(), start, [block])
     assert errors(result.values, poses).max() < 2e-3
 
 
@@ -146,7 +146,7 @@ def test_masked_pixels_are_not_sampled() -> None:
     use = np.ones((6, 48, 48), bool)
     use[0] = False
     block = SplatBlock([X(0)], [image], [use], CAMERAS, render)
-    result = optimize(gtsam.NonlinearFactorGraph(), [block], values_of(moved(poses, 0.02)))
+    result = optimize(gtsam.NonlinearFactorGraph(), values_of(moved(poses, 0.02)), [block])
     assert errors(result.values, poses).max() < 5e-4
 
 

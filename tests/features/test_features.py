@@ -106,7 +106,7 @@ def test_sift_trusts_large_keypoints_less() -> None:
         SiftExtractor(settings)(_blobs(np.array([[128.3, 127.6]]), spread=spread), None).sigmas_px
         for spread in (2.0, 8.0)
     ]
-    assert settings.sigma_px < sigmas[0].min() < sigmas[1].max()
+    assert detection.SIGMA_PX < sigmas[0].min() < sigmas[1].max()
 
 
 def _extract(faces: np.ndarray, masks: np.ndarray | None = None) -> Features:

@@ -112,9 +112,7 @@ def _frame_set(layout: str, width: int) -> FrameSet:
 
 @pytest.mark.parametrize("oversampling", [0.5, 1.25])
 def test_automatic_size_follows_the_panoramas_density(oversampling: float) -> None:
-    settings = CubemapSettings(
-        hfov_deg=96, oversampling=oversampling, min_face_size=64, max_face_size=2048
-    )
+    settings = CubemapSettings(oversampling=oversampling, min_face_size=64, max_face_size=2048)
     rig = cubemap.rig_for(_frame_set("erp", 2048).format, settings)
     assert 2 * np.pi * rig.focal == pytest.approx(oversampling * 2048, rel=0.5 / rig.size)
     assert rig.hfov_rad == pytest.approx(np.deg2rad(96))

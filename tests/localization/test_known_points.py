@@ -9,7 +9,13 @@ from factors import RobustLoss
 from gsba.bundle.pose_variables import X
 from gsba.camera.projections import PerspectiveProjection
 from gsba.geometry import pose
-from gsba.localization.known_points import K, KnownPointBlock, Sightings, isotropic, residuals_of
+from gsba.localization.known_points import (
+    K,
+    KnownPointBlock,
+    PointSightings,
+    isotropic,
+    residuals_of,
+)
 from gsba.localization.pose_fit import COARSE, FINE, CameraPrior, fit
 
 CAMERA = PerspectiveProjection(800, 600, 500.0, (410.0, 295.0), (0.05, -0.01))
@@ -17,7 +23,7 @@ CAMERA = PerspectiveProjection(800, 600, 500.0, (410.0, 295.0), (0.05, -0.01))
 
 def test_derivatives_of_a_panoramas_residuals_agree_with_differences() -> None:
     seen, world_T_rig = _panorama(np.random.default_rng(1), 30, 1e-2)
-    seen = Sightings(
+    seen = PointSightings(
         seen.points_world,
         seen.covariances,
         seen.measured,
@@ -78,7 +84,7 @@ def test_a_panorama_is_fitted_despite_outliers_with_a_fair_covariance() -> None:
         wrong = rng.permutation(200)[:60]
         bearings = seen.measured.copy()
         bearings[wrong] = _units(rng, 60)
-        seen = Sightings(seen.points_world, seen.covariances, bearings, seen.spreads)
+        seen = PointSightings(seen.points_world, seen.covariances, bearings, seen.spreads)
         start = _moved(_moved(world_T_rig, 0.01, 1), 0.05, 3)
         start = fit([seen], start[None], COARSE).world_T_rigs
         found = fit([seen], start, FINE)
@@ -112,24 +118,28 @@ def test_uncertain_points_count_less() -> None:
     points, covariances = seen.points_world.copy(), seen.covariances.copy()
     points[:50] += rng.normal(0, 0.2, (50, 3))
     covariances[:50] = 0.04 * np.eye(3)
-    blurred = Sightings(points, covariances, seen.measured, seen.spreads)
+    blurred = PointSightings(points, covariances, seen.measured, seen.spreads)
     found = fit([blurred], world_T_rig[None], FINE)
     assert np.linalg.norm(found.world_T_rigs[0][:3, 3] - world_T_rig[:3, 3]) < 2e-3
 
 
-def _panorama(rng: np.random.Generator, num: int, sigma: float) -> tuple[Sightings, np.ndarray]:
+def _panorama(
+    rng: np.random.Generator, num: int, sigma: float
+) -> tuple[PointSightings, np.ndarray]:
     """Sightings of points around a panorama, and its pose."""
     world_T_rig = pose(Rotation.from_quat(rng.normal(size=4)).as_matrix(), rng.normal(size=3))
     bearings, distances = _units(rng, num), rng.uniform(1, 8, (num, 1))
     points = (bearings * distances) @ world_T_rig[:3, :3].T + world_T_rig[:3, 3]
     noisy = bearings + rng.normal(0, sigma, (num, 3))
     noisy /= np.linalg.norm(noisy, axis=1, keepdims=True)
-    return Sightings(
+    return PointSightings(
         points, np.zeros((num, 3, 3)), noisy, isotropic(np.full(num, sigma))
     ), world_T_rig
 
 
-def _photo(rng: np.random.Generator, num: int, sigma_px: float) -> tuple[Sightings, np.ndarray]:
+def _photo(
+    rng: np.random.Generator, num: int, sigma_px: float
+) -> tuple[PointSightings, np.ndarray]:
     """Sightings of points in a photo by CAMERA, and its pose."""
     world_T_rig = pose(Rotation.from_quat(rng.normal(size=4)).as_matrix(), rng.normal(size=3))
     pixels = rng.uniform([0, 0], [800, 600], (num, 2))
@@ -137,7 +147,7 @@ def _photo(rng: np.random.Generator, num: int, sigma_px: float) -> tuple[Sightin
     points = local @ world_T_rig[:3, :3].T + world_T_rig[:3, 3]
     noisy = pixels + rng.normal(0, sigma_px, (num, 2))
     spreads = isotropic(np.full(num, sigma_px))
-    return Sightings(points, np.zeros((num, 3, 3)), noisy, spreads, camera=0), world_T_rig
+    return PointSightings(points, np.zeros((num, 3, 3)), noisy, spreads, camera=0), world_T_rig
 
 
 def _units(rng: np.random.Generator, num: int) -> np.ndarray:

@@ -12,7 +12,7 @@ from gsba.loop_closure import connectivity, join_evidence, map_merging
 from gsba.loop_closure.join_evidence import JoinEvidence
 from gsba.loop_closure.map_similarity import Proposal
 from gsba.loop_closure.merged_map import Registered, follow
-from gsba.loop_closure.registration import Resection
+from gsba.loop_closure.registration import RegisteredFrame
 from gsba.similarity import Sim3
 from gsba.trajectory import judgement
 from gsba.trajectory.joining import GUESS, PLACES, SegmentAlignment
@@ -181,7 +181,7 @@ def test_a_frame_a_bay_off_is_registered_at_the_usual_pace(
     step, calls = TRUTH[f, :3, 3] - TRUTH[f - 1, :3, 3], list[int]()
     resect = map_merging.resect
 
-    def misled(*given) -> Resection | None:
+    def misled(*given) -> RegisteredFrame | None:
         found = resect(*given)
         calls.append(f)
         if found is None or len(calls) > 1:

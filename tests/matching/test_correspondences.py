@@ -42,9 +42,9 @@ def _scene(shift: float) -> tuple[SearchableFrames, Keypoints, Solution]:
     return SearchableFrames(frames.__getitem__), detection.gather(frames), solved
 
 
-def _loops_to_last(shift: float, loop_deg: float = 2.0) -> tuple[VerifiedPairs, np.ndarray]:
+def _loops_to_last(shift: float) -> tuple[VerifiedPairs, np.ndarray]:
     """All loops, and the rows of those that end in the last frame."""
-    settings = RefineSettings(pairs=PairSettings(window=2, loop_deg=loop_deg))
+    settings = RefineSettings(pairs=PairSettings(window=2))
     frames, keypoints, solved = _scene(shift)
     context = MatchContext(frames, frames, keypoints, settings, Threads(1))
     found = correspondences.match_loops(context, solved)
@@ -88,16 +88,19 @@ def test_loops_are_closed_by_known_points() -> None:
 
 
 @pytest.mark.parametrize(("loop_deg", "fooled"), [(2.0, False), (180.0, True)])
-def test_look_alikes_at_a_distance_close_no_loop(loop_deg: float, fooled: bool) -> None:
+def test_look_alikes_at_a_distance_close_no_loop(
+    loop_deg: float, fooled: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Copies as one would see the points from further along: two views alone cannot tell."""
-    found, rows = _loops_to_last(shift=-1.5, loop_deg=loop_deg)
+    monkeypatch.setattr(correspondences, "_LOOP_DEG", loop_deg)
+    found, rows = _loops_to_last(shift=-1.5)
     assert (len(rows) > 0) == fooled
     assert len(found.matches.pairs) - len(rows) == 3  # 0-3, 0-4 and 1-4 are what they seem
 
 
 @pytest.mark.parametrize(("min_inlier_ratio", "misled"), [(0.5, False), (0.0, True)])
 def test_all_keypoints_decide_where_the_strongest_disagree(
-    min_inlier_ratio: float, misled: bool
+    min_inlier_ratio: float, misled: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The strongest see a pattern that repeats, or nothing in common; the many others are right."""
     rng = np.random.default_rng(3)
@@ -114,7 +117,8 @@ def test_all_keypoints_decide_where_the_strongest_disagree(
             bearings[lost] = with_noise(bearings[lost], np.deg2rad(1), rng)
         by_face = np.argsort(owner_faces(bearings), kind="stable")
         frames.append(features_of(bearings[by_face], descriptors[by_face]))
-    settings = RefineSettings(pairs=PairSettings(window=2, min_inlier_ratio=min_inlier_ratio))
+    monkeypatch.setattr(correspondences, "_MIN_INLIER_RATIO", min_inlier_ratio)
+    settings = RefineSettings(pairs=PairSettings(window=2))
     all_, strongest = (SearchableFrames(frames.__getitem__, n) for n in (None, 40))
     context = MatchContext(all_, strongest, detection.gather(frames), settings, Threads(1))
     world_T_rigs = pose(np.tile(np.eye(3), (2, 1, 1)), np.stack([np.zeros(3), true]))

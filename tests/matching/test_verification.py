@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from synthetic import bearings_of, unit, with_noise
 
-from gsba.config import VerifySettings
+from gsba.config import TwoViewLimits
 from gsba.geometry import pose, rotation_angle
 from gsba.matching import verification
 from gsba.store.shards import Threads
@@ -13,7 +13,7 @@ from gsba.types import Keypoints, Matches, VerifiedPairs
 
 NUM = 200
 SIGMA = 3e-4
-SETTINGS = VerifySettings()
+SETTINGS = TwoViewLimits()
 F0_T_F1 = pose(Rotation.from_rotvec([0.05, 0.4, -0.02]).as_matrix(), np.array([0.4, 0.05, 0.6]))
 
 

@@ -87,7 +87,7 @@ def test_variables_that_all_share_move_as_undivided(most: int, tmp_path: Path) -
     writer.finish(values, NUM, writer.cut(values, NUM, most))
     keys = [X(f) for f in range(NUM)]
     block = LandmarkBlock(keys, points, [term], LOSS, num_threads=1)
-    expected = optimize(graph, [block], values, settings)
+    expected = optimize(graph, values, [block], settings)
     found = optimize_divided(tmp_path / "map", Threads(1), settings)
     assert found.cost == pytest.approx(expected.cost, rel=1e-9)
     for key in (B(0), B(1)):

@@ -44,7 +44,7 @@ def undivided() -> tuple[OptimizeResult, np.ndarray]:
     loss = RobustLoss(SETTINGS.loss, SETTINGS.loss_sigmas)
     keys = [X(f) for f in range(NUM)]
     block = LandmarkBlock(keys, points, [term], loss, num_threads=1)
-    result = optimize(graph, [block], values_at(np.arange(NUM), rows), SETTINGS)
+    result = optimize(graph, values_at(np.arange(NUM), rows), [block], SETTINGS)
     return result, block.points_world
 
 

@@ -283,11 +283,11 @@ def test_points_at_a_centre_and_behind_walls_do_no_harm(walk) -> None:
     assert infos is not None and np.isfinite(infos).all()
 
 
-def test_confirmed_points_are_looked_for_elsewhere(walk) -> None:
+def test_confirmed_points_are_looked_for_elsewhere(walk, monkeypatch: pytest.MonkeyPatch) -> None:
     _, keypoints = _start(walk[1])
-    settings = PatchSettings(patch_size=11, min_track_length=4)  # longer than any here
+    monkeypatch.setattr(alignment, "_MIN_TRACK_LENGTH", 4)  # longer than any here
     short, confirmed = (
-        _run(walk, settings, aligned=aligned)
+        _run(walk, SETTINGS, aligned=aligned)
         for aligned in (None, np.ones(len(keypoints.faces), bool))
     )
     assert short.counts.received == 2 * 400  # all observations but the references

@@ -6,11 +6,11 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
-from photometric_world import Texture, render
+from photometric_world import Texture, planes_from, render
 from synthetic import unit
 from tiny_run import SETTINGS, Case, computed_stages
 
-from factors.patch_windows import PatchTable, patch_spans, pixel_grid, planes_from
+from factors.patch_windows import PatchTable, patch_spans, pixel_grid
 from gsba.bundle import adjustment
 from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.bearings import Bearings
@@ -63,15 +63,15 @@ def test_coarser_masks_want_all_pixels() -> None:
     assert np.array_equal(patches.coarser(usable, 2), [[1, 1, 1, 1], [1, 1, 0, 1]])
 
 
-def test_planes_pass_through_the_map() -> None:
+def test_planes_pass_through_the_map(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(1)
     normal, offset = unit(np.array([0.3, -0.2, 1.0])), 3.0
     rays = unit(np.array([0, 0, 1.0]) + 0.25 * rng.normal(size=(400, 3)))
     points = rays * (offset / (rays @ normal))[:, None]
     points[::15] *= 1.5  # of another surface
     bearings = unit(np.array([0, 0, 1.0]) + 0.05 * rng.normal(size=(50, 3)))
-    settings = PhotometricSettings(slope_sigma=10.0)
-    planes, clear = patches.lay_planes(bearings, points, settings)
+    monkeypatch.setattr(patches, "_SLOPE_SIGMA", 10.0)
+    planes, clear = patches.lay_planes(bearings, points)
     assert np.count_nonzero(clear) > 40
     expected = bearings @ normal / offset
     assert np.abs(planes[clear, 0] / expected[clear] - 1).max() < 0.01
@@ -81,11 +81,11 @@ def test_a_map_without_points_near_gives_no_depth() -> None:
     rng = np.random.default_rng(2)
     bearings = unit(np.array([0, 0, -1.0]) + 0.05 * rng.normal(size=(5, 3)))
     points = 3 * unit(np.array([0, 0, 1.0]) + 0.05 * rng.normal(size=(100, 3)))
-    assert not patches.lay_planes(bearings, points, PhotometricSettings())[1].any()
-    assert not patches.lay_planes(bearings, points[:3], PhotometricSettings())[1].any()
+    assert not patches.lay_planes(bearings, points)[1].any()
+    assert not patches.lay_planes(bearings, points[:3])[1].any()
     scattered = unit(rng.normal(size=(200, 3))) * rng.uniform(1, 30, (200, 1))
     anywhere = unit(rng.normal(size=(50, 3)))
-    clear = patches.lay_planes(anywhere, scattered, PhotometricSettings())[1]
+    clear = patches.lay_planes(anywhere, scattered)[1]
     assert np.count_nonzero(clear) < 10
 
 
@@ -152,10 +152,9 @@ def _start(case: Case, settings: RefineSettings):
     return frames, keypoints, solved, priors, cubemap.rig_for(frames.format, settings.cubemap)
 
 
-def test_nothing_to_see_changes_nothing(case: Case) -> None:
-    settings = JOINT.model_copy(
-        update={"photometric": PhotometricSettings(min_gradient=1e3, depth_levels=0)}
-    )
+def test_nothing_to_see_changes_nothing(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(patches, "_MIN_GRADIENT", 1e3)
+    settings = JOINT.model_copy(update={"photometric": PhotometricSettings(depth_levels=0)})
     frames, keypoints, solved, priors, rig = _start(case, settings)
     result = direct.refine(
         frames,
@@ -188,17 +187,18 @@ def test_observations_weigh_what_both_masks_say(case: Case, tmp_path: Path) -> N
     expected *= patches.values_at(half, seen)
     assert set(expected) == {0.25, 0.5, 1.0}
     assert np.mean(np.abs(trust - expected) < 0.01) > 0.99  # others are at the border
-    block = direct.make_block(pixels, trust, settings, 1)
-    whole = direct.make_block(pixels, np.ones(len(trust)), settings, 1)
+    block = direct.make_block(pixels, trust, 1)
+    whole = direct.make_block(pixels, np.ones(len(trust)), 1)
     values = adjustment.values_of(solved.world_T_rigs)
     for one in (block, whole):
         one.refresh(values)
     assert block.costs(values)["photometric"] < whole.costs(values)["photometric"]
 
 
-def test_a_solve_against_the_map_is_undone(case: Case) -> None:
+def test_a_solve_against_the_map_is_undone(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(direct, "_MAX_GROWTH", 1e-3)
     settings = JOINT.model_copy(
-        update={"photometric": PhotometricSettings(max_growth=1e-3, depth_levels=0, spacing_deg=20)}
+        update={"photometric": PhotometricSettings(depth_levels=0, spacing_deg=20)}
     )
     frames, keypoints, solved, priors, rig = _start(case, settings)
     result = direct.refine(
@@ -267,9 +267,9 @@ def test_a_doubted_frame_loses_weight() -> None:
         def errors(self, _values: gtsam.Values) -> np.ndarray:
             return np.repeat([1.0, 1.0, 36.0], 20)
 
-    settings, values = PhotometricSettings(), gtsam.Values()
+    values = gtsam.Values()
     rule = direct._frame_weights
-    weights, residuals = rule(Block(), values, np.ones(3), settings)  # type: ignore[arg-type]
+    weights, residuals = rule(Block(), values, np.ones(3))  # type: ignore[arg-type]
     assert np.allclose(residuals, [1, 1, 6]) and np.allclose(weights, [1, 1, 1 / 9])
-    pulled = rule(Block(), values, np.array([2.4, 1.0, 1.0]), settings)[0]  # type: ignore[arg-type]
+    pulled = rule(Block(), values, np.array([2.4, 1.0, 1.0]))[0]  # type: ignore[arg-type]
     assert np.allclose(pulled, [1 / 4, 1, 1 / 9])

@@ -1,9 +1,10 @@
 """Which frame a point is taken from, and where it is looked for."""
 
 import numpy as np
+import pytest
 
-from gsba.config import PatchSettings
 from gsba.geometry import pose
+from gsba.photometric import references as references_
 from gsba.photometric.references import references, visible_frames
 from gsba.types import Counts, Landmarks, Tracks
 
@@ -27,14 +28,14 @@ def test_the_reference_is_in_the_middle() -> None:
     assert list(references(landmarks, poses)) == [1, 4]
 
 
-def test_views_are_similar_and_never_the_reference() -> None:
+def test_views_are_similar_and_never_the_reference(monkeypatch: pytest.MonkeyPatch) -> None:
     x = np.array([0, 1, 2, 3, 4, 30.0])
     landmarks = _landmarks([[2, 0, 4]], [[1, 2, 3]])
-    settings = PatchSettings(max_angle_deg=20, max_views=10)
-    points, frames = visible_frames(landmarks, _poses(x), np.array([1]), ALL, settings)
+    monkeypatch.setattr(references_, "MAX_ANGLE_DEG", 20.0)
+    points, frames = visible_frames(landmarks, _poses(x), np.array([1]), ALL)
     assert list(points) == [0, 0] and list(frames) == [1, 3]  # 0 and 4 are 27 degrees off
-    settings = PatchSettings(max_angle_deg=30, max_views=10)
-    assert set(visible_frames(landmarks, _poses(x), np.array([1]), ALL, settings)[1]) == {
+    monkeypatch.setattr(references_, "MAX_ANGLE_DEG", 30.0)
+    assert set(visible_frames(landmarks, _poses(x), np.array([1]), ALL)[1]) == {
         0,
         1,
         3,
@@ -42,28 +43,24 @@ def test_views_are_similar_and_never_the_reference() -> None:
     }
 
 
-def test_revisits_are_views_whatever_their_time() -> None:
+def test_revisits_are_views_whatever_their_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(references_, "_NEAR_FRAMES", 3)
     x = np.array([0, 1, 2, 50, 51, 1.1])
     landmarks = _landmarks([[1, 0, 4]], [[0, 1, 2]])
-    _, frames = visible_frames(
-        landmarks, _poses(x), np.array([1]), ALL, PatchSettings(near_frames=3)
-    )
+    _, frames = visible_frames(landmarks, _poses(x), np.array([1]), ALL)
     assert set(frames) == {0, 2, 5}
 
 
-def test_limits_hold() -> None:
+def test_limits_hold(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(references_, "_MAX_VIEWS", 5)
     x = np.linspace(0, 1, 12)
     landmarks = _landmarks([[0.5, 0, 4], [0.5, 0, 5]], [[3, 5, 7], [4, 6]])
-    points, frames = visible_frames(
-        landmarks, _poses(x), np.array([1, 4]), np.array([True, False]), PatchSettings(max_views=5)
-    )
+    points, frames = visible_frames(landmarks, _poses(x), np.array([1, 4]), np.array([True, False]))
     assert np.count_nonzero(points == 0) == 5
     assert list(frames[points == 1]) == [4]  # not to be looked for elsewhere
 
 
 def test_a_point_at_a_centre_is_looked_for_nowhere_else() -> None:
     landmarks = _landmarks([[1, 0, 0]], [[0, 1, 2]])
-    _, frames = visible_frames(
-        landmarks, _poses(np.arange(4.0)), np.array([1]), ALL, PatchSettings()
-    )
+    _, frames = visible_frames(landmarks, _poses(np.arange(4.0)), np.array([1]), ALL)
     assert 3 not in frames

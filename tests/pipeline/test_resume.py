@@ -13,6 +13,7 @@ import pytest
 from tiny_run import NUM_FRAMES, SETTINGS, Case, computed_stages
 
 import gsba
+from gsba.bundle import map_strength
 from gsba.config import WeakFrameSettings
 from gsba.matching import correspondences
 
@@ -113,9 +114,11 @@ def test_an_interrupt_leaves_what_is_finished(
 
 
 @pytest.mark.slow
-def test_a_weak_map_gets_more_keypoints_and_resumes(case: Case, tmp_path: Path) -> None:
-    closer = {"max_drift": 1e-12, "max_scale_sigma": 1e-12, "max_per_face": 600}
-    closer["mode"] = "measured"
+def test_a_weak_map_gets_more_keypoints_and_resumes(
+    case: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(map_strength, "MAX_SCALE_SIGMA", 1e-12)
+    closer = {"max_drift": 1e-12, "max_per_face": 600, "mode": "measured"}
     settings = SETTINGS.model_copy(update={"weak_frames": WeakFrameSettings(**closer)})
     out = case.copy(tmp_path / "run")
     result = case.refine(out, settings)

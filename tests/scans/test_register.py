@@ -9,7 +9,7 @@ from scan_world import HALL, INTO_SCAN, SIZE, cloud, rectangles, sampled, scan
 from scipy.spatial.transform import Rotation
 
 from gsba.scans.fit import _weighted, moved_by, settle
-from gsba.scans.judge import Grid, verdict
+from gsba.scans.judge import CellGrid, verdict
 from gsba.scans.noise import Noise
 from gsba.scans.registration import NoPlacementError, Registration, register
 from gsba.scans.search import Guess, main_axes
@@ -103,7 +103,7 @@ def test_a_lead_has_a_p_value() -> None:
     half = Sim3(1.0, np.diag([-1.0, -1, 1]), np.array([6.0, 4, 0]))
     for boxes, least, most in ((HALL, 0.0, 1e-6), ((), 0.05, 0.95)):
         surfaces, run = scan(SIZE, boxes, 6, Sim3(), missing=0.0), cloud(SIZE, boxes, 6)
-        grid, noise = Grid(surfaces), Noise(0.005)
+        grid, noise = CellGrid(surfaces), Noise(0.005)
         here, turned = (verdict(at, run, surfaces, grid, noise) for at in (Sim3(), half))
         assert least <= here.doubt(turned) <= most
 
@@ -153,7 +153,7 @@ def test_rays_through_a_wall_contradict() -> None:
     run = replace(run, eyes=np.tile(np.array(SIZE) / 2, (600, 1)))
     wall = np.array([[[4.5, 0, 0], [0, 4, 0], [0, 0, 2.6], [1, 0, 0]]])
     points, normals = sampled(np.random.default_rng(0), wall, 4000)
-    said = verdict(Sim3(), run, surfaces := Scan(points, normals), Grid(surfaces), Noise(1e-3))
+    said = verdict(Sim3(), run, surfaces := Scan(points, normals), CellGrid(surfaces), Noise(1e-3))
     inner = (np.abs(run.points - [6, 2, 1.3]) < [0.01, 1, 0.6]).all(axis=1)
     assert inner.sum() > 5 and said.contradicted[inner].all() and not said.explained[inner].any()
     assert not said.contradicted[run.points[:, 0] < 2.0].any()

@@ -6,6 +6,7 @@ import gtsam
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from splat_alignment import align_to_splat
 
 from gsba.camera.lens import Lenses
 from gsba.camera.optics import ONE_EYE, Optics
@@ -14,7 +15,7 @@ from gsba.config import SplatSettings
 from gsba.disk import write_image
 from gsba.geometry import pose
 from gsba.splat import Gaussians, from_cloud
-from gsba.splat.alignment import align_to_splat, capture
+from gsba.splat.alignment import capture
 from gsba.splat.backend import CpuBackend
 from gsba.splat.gaussians import concatenate
 from gsba.splat.pictures import render_panorama
@@ -103,7 +104,7 @@ def test_poses_come_back_by_what_each_lens_sees(taken, room: Gaussians) -> None:
     moved = np.stack([gtsam.Pose3(p).retract(step).matrix() for p, step in pairs])
     off = []
     for optics in (Optics(lenses), ONE_EYE):
-        found = align_to_splat(room, frames, moved, NEAR, BACKEND, (48,), optics=optics)
+        found = align_to_splat(room, frames, moved, NEAR, BACKEND, (48,), optics)
         off.append(np.linalg.norm(found[:, :3, 3] - POSES[:, :3, 3], axis=1).max())
     assert off[0] < 4e-3 and off[1] > 10 * off[0]
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from synthetic import RIG, bearings_of, drifted, loop_walk, unit, with_noise
 
-from gsba.config import PriorSettings, VerifySettings
+from gsba.config import PriorSettings, TwoViewLimits
 from gsba.geometry import inverse, pose, rotation_angle
 from gsba.trajectory import judgement, turning
 from gsba.trajectory.judgement import StepChecks
@@ -15,7 +15,7 @@ from gsba.trajectory.steps import chained, image_steps, length_ratios, off_steps
 from gsba.types import CoarsePoses, Counts, Keypoints, Matches, PoseSource, VerifiedPairs
 
 NUM_FRAMES, NUM_POINTS = 24, 80
-VERIFY, PRIORS = VerifySettings(), PriorSettings()
+VERIFY, PRIORS = TwoViewLimits(), PriorSettings()
 TRUTH = loop_walk(NUM_FRAMES)
 
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from synthetic import drifted, loop_walk, unit
 
-from gsba.config import RefineSettings, VerifySettings
+from gsba.config import RefineSettings, TwoViewLimits
 from gsba.geometry import inverse, pose
 from gsba.log import GsbaError
 from gsba.matching import recovery
@@ -76,15 +76,15 @@ def _another() -> np.ndarray:
 )
 def test_what_does_not_fit_is_refused_with_the_reason(poses: np.ndarray, said: str) -> None:
     with pytest.raises(GsbaError, match=said) as refused:
-        refuse_misfit(_coarse(poses), _found(), VerifySettings())
+        refuse_misfit(_coarse(poses), _found(), TwoViewLimits())
     assert "\n" not in str(refused.value) and "--no-trajectory" in str(refused.value)
 
 
 def test_a_late_clock_or_another_recording_are_not_misread() -> None:
-    refuse_misread(_coarse(np.roll(SLAM, 9, axis=0)), _found(), VerifySettings())
-    refuse_misread(_coarse(_another()), _found(), VerifySettings())
+    refuse_misread(_coarse(np.roll(SLAM, 9, axis=0)), _found(), TwoViewLimits())
+    refuse_misread(_coarse(_another()), _found(), TwoViewLimits())
     with pytest.raises(GsbaError, match="reversed in time"):
-        refuse_misread(_coarse(SLAM[::-1]), _found(), VerifySettings())
+        refuse_misread(_coarse(SLAM[::-1]), _found(), TwoViewLimits())
 
 
 @pytest.mark.parametrize("late", [12, -13])
@@ -98,9 +98,9 @@ def test_the_other_side_of_a_loop_is_another_clock(late: int) -> None:
     found, ahead = Steps(steps, every, every), np.arange(NUM) + late
     sources = np.where((ahead >= 0) & (ahead < NUM), PoseSource.SLAM, PoseSource.EXTRAPOLATED)
     poses = CoarsePoses(truth[ahead.clip(0, NUM - 1)], sources.astype(np.uint8), 0.0)
-    refuse_misread(poses, found, VerifySettings())
+    refuse_misread(poses, found, TwoViewLimits())
     with pytest.raises(GsbaError, match=r"on another clock, by about [0-9]+ frames") as refused:
-        refuse_misfit(poses, found, VerifySettings())
+        refuse_misfit(poses, found, TwoViewLimits())
     said = int(str(refused.value).split("about ")[1].split()[0])
     assert abs(said - abs(late)) <= 1  # a step turns by 12 degrees, and 20 are no contradiction
 
@@ -119,12 +119,12 @@ def test_a_reversed_trajectory_is_refused_before_another_clock_is_looked_for(
 
 
 def test_many_outliers_are_no_reason_to_refuse() -> None:
-    refuse_misfit(_coarse(SLAM), _found(), VerifySettings())
+    refuse_misfit(_coarse(SLAM), _found(), TwoViewLimits())
     bad = SLAM.copy()
     rng = np.random.default_rng(0)
     which = rng.choice(NUM, NUM // 3, replace=False)
     bad[which, :3, 3] += 3 * unit(rng.normal(size=(len(which), 3)))
-    refuse_misfit(_coarse(bad), _found(), VerifySettings())
+    refuse_misfit(_coarse(bad), _found(), TwoViewLimits())
 
 
 def test_identical_poses_are_refused() -> None:

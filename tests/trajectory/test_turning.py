@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 from synthetic import unit, with_noise
 
 from gsba.camera.rig import owner_faces
-from gsba.config import VerifySettings
+from gsba.config import TwoViewLimits
 from gsba.geometry import rotation_angle
 from gsba.trajectory import turning
 from gsba.types import Counts, Keypoints, Matches, VerifiedPairs
@@ -51,7 +51,7 @@ def _seen(
 
 
 def _prove(pairs: VerifiedPairs, keypoints: Keypoints) -> turning.Turn | None:
-    return turning.prove(pairs, keypoints, VerifySettings())
+    return turning.prove(pairs, keypoints, TwoViewLimits())
 
 
 def test_a_turn_is_proved_and_its_rotations_are_right() -> None:
@@ -81,9 +81,9 @@ def test_a_hand_may_move_where_no_position_is_claimed_but_not_walk() -> None:
     hand, walk = _seen(0.0, frames=frames, hand=0.05), _seen(0.04, frames=frames)
     assert _prove(*hand) is None
     most = turning.MAX_HAND_PARALLAX_RAD
-    turn = turning.prove(*hand, VerifySettings(), most)
+    turn = turning.prove(*hand, TwoViewLimits(), most)
     assert turn is not None and turn.frames.all()
-    assert turning.prove(*walk, VerifySettings(), most) is None
+    assert turning.prove(*walk, TwoViewLimits(), most) is None
 
 
 def test_few_matches_prove_a_turn_only_if_all_agree() -> None:

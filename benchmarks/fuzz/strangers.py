@@ -1,4 +1,4 @@
-"""Cases of malicious files for `fuzz.py`, besides those of `fuzz_inputs.py`."""
+"""Cases of malicious files for `fuzz.py`, besides those of `inputs.py`."""
 
 import importlib.util
 import json
@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import fuzz_inputs as usual
+import inputs as usual
 import numpy as np
 import yaml
-from fuzz_damage import (
+from damage import (
     TREES,
     WORDS,
     Draft,
@@ -23,9 +23,9 @@ from fuzz_damage import (
     copied,
     spoil_file,
 )
-from fuzz_inputs import small_settings
-from fuzz_prepare import NUM
-from fuzz_prepare import prepare as prepare_usual
+from inputs import small_settings
+from prepared import NUM
+from prepared import prepare as prepare_usual
 
 from gsba.camera.calibration import calibration_json
 from gsba.store.finished import load_run

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from fuzz_damage import copied
+from damage import copied
 
 from gsba.config import RefineSettings
 from gsba.demo.degrade import degrade

@@ -1,8 +1,8 @@
 """Fuzzing of the command line with thousands of damaged inputs: tracebacks, hangs, wrong output.
 
-    python benchmarks/fuzz.py                       # 10,000 cases, on 2 cores about an hour
-    python benchmarks/fuzz.py --family gps --cases 500 --seed 3
-    python benchmarks/fuzz.py --case 1234           # repeats one case and prints its output
+    python benchmarks/fuzz/fuzz.py                       # 10,000 cases, on 2 cores about an hour
+    python benchmarks/fuzz/fuzz.py --family gps --cases 500 --seed 3
+    python benchmarks/fuzz/fuzz.py --case 1234           # repeats one case and prints its output
 
 Case N of a seed is always the same. A walk of a few small frames, its run, a video, a splat and
 tables of all kinds are made first (`--out`, kept). Each case copies its inputs, damages a file or
@@ -36,10 +36,9 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from common import write_table
-from fuzz_damage import Spoiled
-from fuzz_inputs import located
-from fuzz_strangers import FAMILIES, prepare, spoil
+from damage import Spoiled
+from inputs import located
+from strangers import FAMILIES, prepare, spoil
 
 LIMIT_S = 30.0  # of a case; whole runs get more
 GRACE_S = 60.0  # until a worker that ignores signals is killed; the first case compiles kernels
@@ -88,7 +87,8 @@ def main() -> None:
     outcomes = list(campaign(options))
     lines = table(outcomes, time.perf_counter() - started, options.seed)
     print("\n".join(lines))
-    write_table(lines, options.markdown)
+    if options.markdown:
+        options.markdown.write_text("\n".join([*lines, ""]))
     sys.exit(any(outcome.findings for outcome in outcomes))
 
 

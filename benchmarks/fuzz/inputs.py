@@ -8,7 +8,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from fuzz_damage import (
+from damage import (
     WORDS,
     Draft,
     Spoiled,
@@ -23,7 +23,7 @@ from fuzz_damage import (
     spoil_names,
     written,
 )
-from fuzz_prepare import NUM, SETTINGS, TRUTH
+from prepared import NUM, SETTINGS, TRUTH
 
 from gsba.config import RefineSettings
 from gsba.similarity import pose_similarity
