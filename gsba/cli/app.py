@@ -31,7 +31,8 @@ _MEMORY_SETTINGS = {  # first letters of a stage's name -> settings that lower i
 _DEFAULT_MEMORY_SETTING = "features.max_per_face"  # of all other stages
 
 app = typer.Typer(
-    help="Pixel-true camera poses for 360-degree video, from frames and a SLAM trajectory.",
+    help="Pixel-true camera poses for 360-degree video, from the video or frames alone, or from a "
+    "trajectory.",
     no_args_is_help=True,
     add_completion=False,
     rich_markup_mode=None,
