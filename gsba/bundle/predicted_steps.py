@@ -42,15 +42,6 @@ def step_deviations(result: Reconstruction) -> np.ndarray:
     return np.where(known[1:] & known[:-1], off, np.nan)
 
 
-def predictable_steps(num: int) -> np.ndarray:
-    """Steps (F - 1,) bool of a map of `num` frames at both ends of which enough frames are far that
-    these could predict them: of small maps none."""
-    frames = np.arange(num)
-    near = np.minimum(frames + _REACH, num - 1) - np.maximum(frames - _REACH, 0) + 1
-    enough = num - near >= 2 * _MIN_FAR_FRAMES
-    return enough[1:] & enough[:-1]
-
-
 def _num_far(result: Reconstruction) -> np.ndarray:
     """Number (O,) of observations of each observation's point in frames out of reach."""
     frames, num = result.observation_frames.astype(np.int64), len(result.world_T_rigs)

@@ -218,7 +218,9 @@ def _findings(state: State, result: Reconstruction, gps: dict[str, Any] | None) 
     recordings = of_recordings(frames, result, sources, clocks)
     notes += notes_on_recordings(recordings)
     found = Findings(notes, trajectory, stitching, camera, gyro, gps, map_.moves)
-    return replace(found, recordings=recordings, reasons=_reasons(prior), frame_lists=lists, start=start)
+    return replace(
+        found, recordings=recordings, reasons=_reasons(prior), frame_lists=lists, start=start
+    )
 
 
 def _of_camera(
