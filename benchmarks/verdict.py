@@ -18,7 +18,7 @@ import re
 import subprocess
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -114,7 +114,7 @@ def cases(lengths: Mapping[str, int]) -> Iterator[Case]:
     for n in range(12):
         for walk, num in lengths.items():
             first, seed = (11 * n) % max(num - 28, 1), 101 + n
-            early = n < 4  # the hardest pictures
+            early, spoiled = n < 4, dict[str, Any]()  # the hardest pictures come first
             if n % 4 == 0:
                 yield Case(walk, first, first + 12, 1, "none", seed)
                 if early:
