@@ -189,8 +189,6 @@ def of_frames(
         notes.append("started from pairs of frames: the unit of the map is arbitrary")
     if coarse.time_offset:
         notes.append(f"frame times were shifted by {coarse.time_offset:.6f} s")
-    for note in notes:
-        logger.warning(note)
     fetched = (
         "extra frames of the video strengthened the map; datasets skip them, --set "
         "export.fetched=true keeps them"
@@ -207,7 +205,8 @@ def of_frames(
         if names and finding:
             unit = f"of {len(frames)} frames"
             notes.append(f"{finding}: {named(names, f'frame_lists.{key}', unit)}")
-            logger.warning(notes[-1])
+    for note in notes:
+        logger.info(note)
     return lists, notes
 
 
