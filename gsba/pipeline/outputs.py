@@ -172,7 +172,8 @@ def _report(state: State, result: Reconstruction) -> dict[str, Any]:
     """The content of report.json."""
     run, rounds = state.run, state.run.journal.rounds
     solver = [{"stage": name, "rounds": some} for name, some in rounds.items()]
-    stages = StageLog(tuple(run.store.records.values()), run.journal.counts, solver)
+    costs, again_s = tuple(run.store.records.values()), run.store.seconds_again
+    stages = StageLog(costs, run.journal.counts, solver, again_s)
     gauge, of_families = _gauge(run, state.prior), _of_families(state)
     found = _findings(state, result, of_families.pop(GpsFixes.name, None))
     coarse = state.prior.coarse

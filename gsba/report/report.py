@@ -127,6 +127,7 @@ class StageLog:
         default_factory=dict
     )  # by stage name
     solver: Sequence[object] = ()  # a record for each round, with its iterations' cost by family
+    seconds_again: float = 0.0  # of stages that were computed again later, and are in no row
 
     def rows(self) -> list[dict[str, Any]]:
         """Cost and counts of each stage."""
@@ -163,7 +164,8 @@ def build_report(
         "gsba": __version__,
         "finished": datetime.now(UTC).isoformat(timespec="seconds"),
         "start": found.start,
-        "summary": _summary(frames, coarse, reconstruction),
+        "summary": _summary(frames, coarse, reconstruction)
+        | {"seconds": stages.seconds_again + sum(stage.seconds for stage in stages.costs)},
         "maps": summarize_maps(reconstruction, frames, found.reasons),
         "gauge": gauge,
         "notes": found.notes,

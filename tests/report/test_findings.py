@@ -35,8 +35,8 @@ def test_long_lists_of_frames_are_counted_in_notes_and_named_in_the_report(tmp_p
     lists, notes = of_frames(frames, coarse, result, weights, 0.01, RunStart.ODOMETRY)
     assert lists["interpolated"] == list(frames.names) and lists["unmatched"] == []
     assert notes == [
-        f"no pose of the odometry, the initial pose is interpolated: {num} of {num} frames, listed in "
-        "report.json under frame_lists.interpolated",
+        f"no pose of the odometry, the initial pose is interpolated: {num} of {num} frames, "
+        "listed in report.json under frame_lists.interpolated",
         f"pixels fit badly and were weighted down: {frames.names[2]}",
     ]
 

@@ -3,7 +3,7 @@ const COLOURS = ["--a", "--b", "--c", "--d", "--e", "--f"];
 function tiles() {
   const s = D.report.summary, extra = s.frames_fetched;
   const length = path => path.reduce((sum, p, i) => i ? sum + Math.hypot(...p.map((v, k) => v - path[i - 1][k])) : 0, 0);
-  const seconds = D.report.stages.reduce((sum, stage) => sum + stage.seconds, 0);
+  const seconds = s.seconds;
   const px = degrees => degrees === null ? "–" : `${num(degrees * pxPerDeg)} px`;
   const apart = [[s.exported - s.refined, "with poses of the trajectory"], [s.frames_in_other_maps, "in other maps"], [s.frames_in_no_map, "in no map"]]
     .concat([[s.fetched, "more strengthened the map, datasets skip them"]]).filter(([count]) => count).map(([count, where]) => `${num(count)} ${where}`).join(", ");
