@@ -275,7 +275,7 @@ import os, signal, time
 from gsba.cli.app import app, command, loading
 @command
 def wait() -> None:
-    {loads or 'pass'}
+    {loads or "pass"}
     os.kill(os.getpid(), signal.SIGTERM)
     time.sleep(60)
 app(["wait"])
