@@ -36,6 +36,8 @@ class Figures:
     false_steps: int  # number of the start's steps that images contradict
     unrefined: tuple[int, ...]  # (n,) frames whose poses are those of the start
     scale_changes: tuple[float, ...]  # (F - 1,) that may hide at each step, see `scale_handover`
+    moved_by_scale: tuple[float, ...]  # (F - 1,) part of the extent by which such a change moves
+    # positions of the smaller side
     deviations: tuple[float, ...]  # (F - 1,) of steps from those that far frames predict
 
     @property
@@ -58,9 +60,12 @@ def measure(report: Mapping[str, Any], main: Reconstruction, shown: FrameSet) ->
     shifts = neighbour_shifts(main) * _ERROR_RATIO * width / (2 * np.pi)
     shifts, checks = shifts[np.isfinite(shifts)], report["trajectory"] or {}
     unknown = (math.nan,) * (len(shown) - 1)
-    changes, deviations = unknown, unknown
+    changes = moved = deviations = unknown
     if known:
         changes = tuple(scale_changes(main, shown.recording_of_frame).tolist())
+        sides = _smaller_sides(main.world_T_rigs[:, :3, 3]) / extent
+        # The best similarity takes up half.
+        moved = tuple((np.array(changes) * np.maximum(sides, 1e-9) / 2).tolist())
         deviations = tuple(step_deviations(main).tolist())
     return Figures(
         frames=report["summary"]["frames"] - report["summary"].get("frames_fetched", 0),
@@ -73,6 +78,7 @@ def measure(report: Mapping[str, Any], main: Reconstruction, shown: FrameSet) ->
         false_steps=len(checks.get("false_steps", ())),
         unrefined=tuple(np.flatnonzero(main.pose_statuses != PoseStatus.REFINED).tolist()),
         scale_changes=changes,
+        moved_by_scale=moved,
         deviations=deviations,
     )
 
@@ -86,6 +92,15 @@ def _position_error(main: Reconstruction) -> float:
     if not errors.size:
         return math.nan
     return _ERROR_RATIO * float(np.quantile(errors.max(axis=1), _CONFIDENCE))
+
+
+def _smaller_sides(positions: np.ndarray) -> np.ndarray:
+    """Extent (F - 1,) of the frames (F, 3) before or behind each step, the smaller of both."""
+    sides = []
+    for some in (positions, positions[::-1]):
+        boxes = np.maximum.accumulate(some) - np.minimum.accumulate(some)
+        sides.append(np.linalg.norm(boxes[:-1], axis=1))
+    return np.minimum(sides[0], sides[1][::-1])
 
 
 def _metres_per_unit(report: Mapping[str, Any]) -> float:

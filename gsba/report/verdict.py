@@ -19,10 +19,8 @@ from gsba.types import FrameSet, Reconstruction, RunStart
 
 MAX_POSITION_ERROR = 0.01  # of the extent, of a map that is good to train on
 MAX_UNSHARP_ERROR = 0.1  # of the extent; beyond, images do not determine the map
-MAX_SCALE_CHANGE = (
-    0.02  # that may hide at a step: halfway along a straight walk it moves the ends by
-)
-# a quarter of that part of the extent
+# Of the extent, by a change of scale that may hide at a step: right maps have .0043 and less.
+MAX_MOVED_BY_SCALE = MAX_POSITION_ERROR / 2
 MAX_DEVIATION = 0.2  # of a step from the one that far frames predict, part of its length
 MAX_CONTRADICTED_SHARE = 0.25  # of the steps, by far frames
 MAX_HELD_SHARE = 0.25  # of the steps, by a start that images contradict elsewhere
@@ -169,7 +167,7 @@ class _Tests:
     def _loosely_scaled(self) -> Iterator[Reason]:
         """Steps over which the scale is not carried on."""
         changes = np.array(self.figures.scale_changes)
-        loose = np.flatnonzero(changes > MAX_SCALE_CHANGE)
+        loose = np.flatnonzero(np.array(self.figures.moved_by_scale) > MAX_MOVED_BY_SCALE)
         if not len(loose):
             return
         worst = changes[loose].max()

@@ -4,9 +4,10 @@ import math
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 
-from gsba.report.map_figures import Figures
+from gsba.report.map_figures import Figures, _smaller_sides
 from gsba.report.verdict import Level, Verdict, verdict_on
 from gsba.types import RunStart
 
@@ -23,8 +24,10 @@ GOOD = Figures(
     false_steps=0,
     unrefined=(),
     scale_changes=(math.nan, *(0.003,) * (NUM - 3), math.nan),
+    moved_by_scale=(math.nan, *(0.0007,) * (NUM - 3), math.nan),
     deviations=(0.01,) * (NUM - 1),
 )
+LOOSE = {"scale_changes": (0.0, 0.0, 0.053, 0.03), "moved_by_scale": (0.0, 0.0, 0.012, 0.004)}
 
 
 def _verdict(figures: Figures, names: tuple[str, ...] = NAMES, **more: Any) -> Verdict:
@@ -69,12 +72,17 @@ def test_lengths_are_metres_where_the_scale_is_known_and_the_camera_is_named() -
         ),
         ({"unrefined": (5, 6)}, Level.LOOK, "005 006", "the pose is that of the odometry"),
         (
-            {"scale_changes": (math.nan, 0.0, 0.053, *(0.0,) * 16)},
+            LOOSE,
             Level.LOOK,
             "002 003",
             "1 of 19 steps: what lies behind may be larger or smaller by up to 5.3 %",
         ),
-        ({"scale_changes": (0.0, math.inf)}, Level.LOOK, "001 002", "smaller by any factor"),
+        (
+            {"scale_changes": (0.0, math.inf), "moved_by_scale": (0.0, math.inf)},
+            Level.LOOK,
+            "001 002",
+            "smaller by any factor",
+        ),
         ({"position_error": 0.02}, Level.LOOK, "", "may be off by 2 % of the path's extent"),
         ({"position_error": 0.2}, Level.REFUSED, "", "may be off by 20 % of the path's extent"),
         ({"deviations": (0.3, *(0.0,) * 18)}, Level.LOOK, "000 001", "contradict 1 of 19 steps"),
@@ -117,3 +125,8 @@ def test_many_frames_are_counted_in_a_line() -> None:
     found = _verdict(replace(GOOD, held_steps=tuple(range(9))))
     assert found.reasons[0].line().startswith("000 to 009 (10 frames): no image shows")
     assert found.to_json()["reasons"][0]["line"] == found.reasons[0].line()
+
+
+def test_a_change_of_scale_moves_the_smaller_side_of_a_walk() -> None:
+    walk = np.column_stack([np.arange(5.0), [0.0, 0.0, 0.0, 0.0, 3.0], np.zeros(5)])
+    np.testing.assert_allclose(_smaller_sides(walk), [0.0, 1.0, 2.0, 0.0], rtol=1e-12)
