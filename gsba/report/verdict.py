@@ -219,7 +219,7 @@ def _accuracy(figures: Figures) -> str:
         size = f"{1e3 * share * metres:.2g} mm ({size})"
     pixels = figures.neighbour_pixels
     shift = f", {pixels:.2g} pixels in a neighbour's picture" if math.isfinite(pixels) else ""
-    return f"no position is off by more than {size}{shift}"
+    return f"positions may be off by up to {size}{shift}"
 
 
 def _camera(report: Mapping[str, Any]) -> str:

@@ -44,7 +44,7 @@ def test_a_good_map_is_said_to_be_good_in_a_sentence() -> None:
     found = _verdict(GOOD)
     assert (found.level, found.reasons) == (Level.GOOD, ())
     assert found.sentence == (
-        "good to train: all 20 frames are in one map; no position is off by more than 0.04 % of "
+        "good to train: all 20 frames are in one map; positions may be off by up to 0.04 % of "
         "the path's extent, 0.13 pixels in a neighbour's picture"
     )
 
@@ -53,7 +53,7 @@ def test_lengths_are_metres_where_the_scale_is_known_and_the_camera_is_named() -
     camera = {"taken": True, "baseline": 0.052, "metres_per_unit": 0.6}
     camera |= {"readout": {"taken": True, "ms": 13.24}}
     sentence = _verdict(replace(GOOD, extent_metres=11.0), camera=camera).sentence
-    assert "more than 4.4 mm (0.04 % of the path's extent)" in sentence
+    assert "up to 4.4 mm (0.04 % of the path's extent)" in sentence
     assert sentence.endswith("; two lenses 31.2 mm apart, rows read in 13.2 ms")
     one = _verdict(GOOD, camera={"taken": False}).sentence
     assert one.endswith("; the camera has one centre")
@@ -99,7 +99,9 @@ def test_each_failed_test_names_place_cause_and_remedy(
     assert cause in reason.cause and reason.remedy
     assert frames is None or " ".join(reason.frames) == frames
     assert found.sentence.startswith(f"{level}: ")
-    assert ("no position is off" in found.sentence) == (cause.startswith("may be off by 2 %"))
+    assert ("positions may be off by up to" in found.sentence) == (
+        cause.startswith("may be off by 2 %")
+    )
 
 
 @pytest.mark.parametrize(("inside", "level"), [(19, Level.LOOK), (9, Level.REFUSED)])
