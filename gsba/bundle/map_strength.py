@@ -14,14 +14,15 @@ import numpy as np
 
 from gsba.config import PriorSettings, RefineSettings
 from gsba.geometry import inverse, rotation_angle, step_covariances
-from gsba.types import Counts, JointErrors, StepNoise
-from gsba.types.records import slices
+from gsba.types import Counts, JointErrors, Reconstruction, StepNoise
+from gsba.types.records import slices, spread_rows
 
 MAX_SCALE_SIGMA = 8e-4  # relative, of two successive baselines' ratio; frames above it are weak
 _REACH = 2  # frames before and after a weak one that count as weak
 _MAX_HELD_SHARE = 0.25  # largest share of a prior's standard deviation in any direction: the prior
 # then weighs 6 %
 _MIN_HELD_STEPS = 8  # least number of held steps from which the trajectory's noise is estimated
+_SHIFTED_POINTS = 24  # points of a frame whose shift in the next one is computed
 _DRAWS_AT_ONCE = 50  # errors drawn of all poses, in float64
 _MIN_NOISE_RATIO = 0.1  # least estimate, part of the settings' noise
 
@@ -104,29 +105,70 @@ def scale_sigmas(world_T_rigs: np.ndarray, draws: np.ndarray) -> np.ndarray:
     return np.diff(stretches, axis=1).std(axis=0)
 
 
+def position_errors(world_T_rigs: np.ndarray, draws: np.ndarray) -> np.ndarray:
+    """Errors of positions (D, F) to be expected after the best similarity, map units, to first
+    order in the errors `draws (D, F, 6)`; NaN = not known, of all frames if fewer than three are.
+    """
+    found = np.full(draws.shape[:2], np.nan)
+    known = np.isfinite(draws).all(axis=(0, 2))
+    if np.count_nonzero(known) < 3:
+        return found
+    poses = world_T_rigs[known]
+    offsets = poses[:, :3, 3] - poses[:, :3, 3].mean(axis=0)
+    turns = [np.cross(axis, offsets) for axis in np.eye(3)]
+    shifts = [np.tile(axis, (len(poses), 1)) for axis in np.eye(3)]
+    basis = np.linalg.qr(np.array([*shifts, *turns, offsets]).reshape(7, -1).T)[0]
+    for some in slices(len(draws), _DRAWS_AT_ONCE):
+        errors = np.einsum("fij,dfj->dfi", poses[:, :3, :3], draws[some][:, known, 3:])
+        flat = errors.reshape(-1, 3 * len(poses))
+        errors = (flat - flat @ basis @ basis.T).reshape(errors.shape)
+        found[some, known] = np.linalg.norm(errors, axis=2)
+    return found
+
+
+def neighbour_shifts(result: Reconstruction) -> np.ndarray:
+    """Angles (F,) in radians, rms, by which points of a frame are to be expected beside their
+    pictures in the next one, by errors of the step between both; NaN = not known, as of the last.
+
+    Args:
+        result: one map with its joint errors.
+    """
+    poses, joint = result.world_T_rigs, result.joint_errors
+    found = np.full(len(poses), np.nan)
+    if joint is None:
+        return found
+    for f, seen in enumerate(result.observations_by_frame()[:-1]):
+        if not len(seen):
+            continue
+        rows = seen[spread_rows(len(seen), min(len(seen), _SHIFTED_POINTS))]
+        points, moved = result.points_world[result.observation_points[rows]], []
+        for frame in (f, f + 1):
+            at_rig = (points - poses[frame, :3, 3]) @ poses[frame, :3, :3]
+            errors = joint.draws[:, frame, None].astype(np.float64)
+            moved.append(np.cross(errors[..., :3], at_rig) + errors[..., 3:])
+        turn = poses[f, :3, :3].T @ poses[f + 1, :3, :3]
+        depths = np.linalg.norm(at_rig, axis=1)[:, None]
+        rays = at_rig / depths
+        shifts = (moved[0] @ turn - moved[1]) / depths
+        across = shifts - np.sum(shifts * rays, axis=2, keepdims=True) * rays
+        found[f] = np.sqrt(np.median(np.mean(np.sum(across**2, axis=2), axis=0)))
+    return found
+
+
 def _drift(world_T_rigs: np.ndarray, draws: np.ndarray, walks: np.ndarray) -> float:
     """See `MapStrength.drift`; 0 where fewer than three poses are known.
 
     Args:
         walks: (F,) recording of each frame.
     """
-    known = np.isfinite(draws).all(axis=(0, 2))
-    if np.count_nonzero(known) < 3:
+    errors = position_errors(world_T_rigs, draws)
+    known = np.isfinite(errors).all(axis=0)
+    if not known.any():
         return 0.0
-    poses = world_T_rigs[known]
-    offsets = poses[:, :3, 3] - poses[:, :3, 3].mean(axis=0)
-    turns = [np.cross(axis, offsets) for axis in np.eye(3)]
-    shifts = [np.tile(axis, (len(poses), 1)) for axis in np.eye(3)]
-    basis = np.linalg.qr(np.array([*shifts, *turns, offsets]).reshape(7, -1).T)[0]
-    squares = 0.0
-    for some in slices(len(draws), _DRAWS_AT_ONCE):
-        errors = np.einsum("fij,dfj->dfi", poses[:, :3, :3], draws[some][:, known, 3:])
-        errors = errors.reshape(-1, 3 * len(poses))
-        squares += float(np.sum((errors - errors @ basis @ basis.T) ** 2))
-    lengths = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    lengths = np.linalg.norm(np.diff(world_T_rigs[known, :3, 3], axis=0), axis=1)
     within = np.diff(walks[known]) == 0  # from one recording to the next is no step
     path = np.bincount(walks[known][1:][within], lengths[within]).max(initial=0.0)
-    return float(np.sqrt(squares / (len(draws) * len(poses))) / max(path, 1e-300))
+    return float(np.sqrt(np.mean(errors[:, known] ** 2)) / max(path, 1e-300))
 
 
 def _held(

@@ -3,10 +3,12 @@
 import gc
 import logging
 import os
+import signal
 import sys
+import threading
 import traceback
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import wraps
 from pathlib import Path
 from typing import Annotated, NoReturn, ParamSpec
@@ -31,7 +33,8 @@ _MEMORY_SETTINGS = {  # first letters of a stage's name -> settings that lower i
 _DEFAULT_MEMORY_SETTING = "features.max_per_face"  # of all other stages
 
 app = typer.Typer(
-    help="Pixel-true camera poses for 360-degree video, from frames and a SLAM trajectory.",
+    help="Pixel-true camera poses for 360-degree video, from the video or frames alone, or from a "
+    "trajectory.",
     no_args_is_help=True,
     add_completion=False,
     rich_markup_mode=None,
@@ -116,16 +119,28 @@ class _Command(TyperCommand):
 
 @contextmanager
 def loading() -> Iterator[None]:
-    """Import heavy packages without garbage collection, and exempt them from it for good."""
+    """Import heavy packages without garbage collection, and exempt them from it for good.
+
+    pycolmap is imported, too: it takes SIGTERM over when it is, to print a stack.
+    """
     collected = gc.isenabled()
     gc.disable()
     try:
         yield
+        with suppress(ImportError):
+            import pycolmap  # noqa: F401
     finally:
+        _end_on_sigterm()
         if gc.get_freeze_count() == 0:  # once: frozen objects are never collected
             gc.freeze()
         if collected:
             gc.enable()
+
+
+def _end_on_sigterm() -> None:
+    """Have SIGTERM, by which containers and clusters stop a process, end a command as SIGINT."""
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
 
 
 def command(function: Callable[P, None]) -> Callable[P, None]:
@@ -134,6 +149,7 @@ def command(function: Callable[P, None]) -> Callable[P, None]:
     @wraps(function)
     def run(*args: P.args, **kwargs: P.kwargs) -> None:
         code = 1
+        _end_on_sigterm()
         try:
             with _expected_failures():
                 function(*args, **kwargs)

@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     from gsba.demo.two_lenses import TwoLenses
     from gsba.pipeline import Recording, RunResult
 
-PARTIAL = 3  # exit code of a run whose exported map has less than nine tenths of its frames
+PARTIAL = 3  # exit code of a run whose exported map has less than nine tenths of its frames, or is
+# not good to train on
 
 Config = Annotated[
     Path | None,
@@ -186,7 +187,8 @@ AllowPartial = Annotated[
     bool,
     typer.Option(
         "--allow-partial",
-        help="Exit with 0 even if less than nine tenths of the frames are in one map.",
+        help="Exit with 0 even if less than nine tenths of the frames are in one map, or the "
+        "verdict on it is not to train.",
     ),
 ]
 Segment = Annotated[
@@ -228,7 +230,8 @@ def refine(
 ) -> None:
     """Refine the pose of every frame; the same call again resumes.
 
-    The exit code is 3 if less than nine tenths of the frames are in the exported map.
+    The last line is the verdict on the map. The exit code is 3 if it is not to train, or if less
+    than nine tenths of the frames are in the exported map.
     """
     if frames is None and not recording:
         raise GsbaError("give the FRAMES to refine: a folder or a video")
@@ -287,18 +290,17 @@ def run_folder(frames: Path) -> Path:
 
 
 def conclude(results: "Sequence[RunResult]", allow_partial: bool) -> None:
-    """Print the outcome of finished runs; exit with PARTIAL if one of them is partial."""
+    """Print the outcome of finished runs; exit with PARTIAL if one of them failed."""
     from gsba.report.maps import MIN_SHARE_IN_ONE_MAP, format_outcome
 
     for result in results:
         typer.echo(format_outcome(result.report, result.out))
-    if allow_partial or not any(result.partial for result in results):
+    if allow_partial or not any(result.failed for result in results):
         return
-    typer.echo(
-        f"less than {MIN_SHARE_IN_ONE_MAP:.0%} of the frames are in the exported map: "
-        f"exit code {PARTIAL}; --allow-partial makes it 0",
-        err=True,
-    )
+    why = "the map is not good to train on"
+    if any(result.partial for result in results):
+        why = f"less than {MIN_SHARE_IN_ONE_MAP:.0%} of the frames are in the exported map"
+    typer.echo(f"{why}: exit code {PARTIAL}; --allow-partial makes it 0", err=True)
     raise typer.Exit(PARTIAL)
 
 
@@ -384,7 +386,7 @@ def _demo_of_video(out: Path, allow_partial: bool, **options: Any) -> None:
         f"{len(result.frames)} of {len(truth.timestamps)} frames of the video were refined, "
         f"without a trajectory. Video and truth in {out / 'walk'}, the run in {run}."
     )
-    conclude([result] if len(result.maps) > 1 or result.partial else [], allow_partial)
+    conclude([result], allow_partial)
 
 
 def _demo_of_frames(
@@ -436,9 +438,7 @@ def _demo_of_frames(
         typer.echo(_found_lenses(report["camera"], rows["two lenses"].scale, walk.lenses))
         where += f", the run with one centre in {central}"
     typer.echo(f"Frames, trajectories and truth in {out / 'walk'}, {where}.")
-    conclude(
-        [result for result in results if len(result.maps) > 1 or result.partial], allow_partial
-    )
+    conclude(results, allow_partial)
 
 
 def _found_lenses(found: dict[str, Any], scale: float, lenses: "TwoLenses") -> str:

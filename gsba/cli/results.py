@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gsba.cli.app import command
+from gsba.cli.app import command, loading
 from gsba.cli.refining import Cluster
 from gsba.cli.splat import (
     BackendName,
@@ -189,8 +189,9 @@ def export(
     cluster: Cluster = None,
 ) -> None:
     """Write a finished run as a dataset for another program."""
+    with loading():
+        from gsba.export import ExportOptions, export_all
     from gsba.config_file import validated
-    from gsba.export import ExportOptions, export_all
     from gsba.export.photos import read_photos
     from gsba.export.trainers import format_of, how_to_start, options_for
     from gsba.placement.placement import place

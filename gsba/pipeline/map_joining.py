@@ -36,7 +36,16 @@ from gsba.pipeline.state import MapMatches, State
 from gsba.similarity import Sim3
 from gsba.store.store import RunStore
 from gsba.trajectory.judgement import StepChecks
-from gsba.types import CoarsePoses, Keypoints, Matches, PoseSource, Sighted, Solution, Tracks
+from gsba.types import (
+    CoarsePoses,
+    Keypoints,
+    Matches,
+    PoseSource,
+    RunStart,
+    Sighted,
+    Solution,
+    Tracks,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -73,7 +82,8 @@ def begin(store: RunStore, maps: JointMaps, settings: RefineSettings) -> State:
         origin=maps.runs[0].result.origin,
     )
     families = tuple(inputs.families_of(maps.frames, settings))
-    evidence = Evidence(families=families, recordings=_settings_of_cameras(maps, start))
+    cameras = _settings_of_cameras(maps, start)
+    evidence = Evidence(families=families, recordings=cameras, start=RunStart.EARLIER_RUN)
     run = Run.begin(store, maps.frames, start, settings.with_faint_priors(), evidence)
     observed = frontend.adopt(run, [path for one in maps.runs for path in one.files])
     state = replace(State.begin(run, observed), map=maps.map)
@@ -396,7 +406,8 @@ def _settings_of_cameras(maps: JointMaps, start: CoarsePoses) -> tuple[Recording
     found = list[RecordingEvidence]()
     for name, rows in frames.recordings.items():
         own = CoarsePoses(start.world_T_rigs[rows], start.sources[rows], 0.0)
-        found.append(RecordingEvidence(name, own, camera=settings[frames.cameras[rows[0]]]))
+        camera = settings[frames.cameras[rows[0]]]
+        found.append(RecordingEvidence(name, own, camera=camera, start=RunStart.EARLIER_RUN))
     return tuple(found)
 
 

@@ -28,12 +28,13 @@ from gsba.report.imu_findings import of_gyro
 from gsba.report.maps import MapSummary, is_partial, summarize_maps
 from gsba.report.recordings import notes_on_recordings, of_recordings
 from gsba.report.report import Findings, StageLog, build_report, plain, write_poses
+from gsba.report.verdict import Level
 from gsba.store.store import RunStore
 from gsba.trajectory.files import write_tum
 from gsba.types import CoarsePoses, Counts, FrameSet, Reconstruction, Trajectory
 
 _GAUGE = (
-    "Sim(3)-aligned to the coarse trajectory over its refined SLAM poses: its world and scale; "
+    "Sim(3)-aligned to the initial poses of refined frames: their world and scale; "
     "covariances hold the first pose and the distance to the frame furthest from it"
 )
 _FIRST_GAUGE = (
@@ -78,6 +79,11 @@ class RunResult:
         """Whether less than nine tenths of the frames are in the map that is exported."""
         return is_partial(self.maps, len(self.frames))
 
+    @property
+    def failed(self) -> bool:
+        """Whether the run is partial, or its map is not good to train on."""
+        return self.partial or self.report["verdict"]["level"] == Level.REFUSED
+
 
 def write(state: State, result: Reconstruction, cameras: Cameras) -> RunResult:
     """Poses, cloud, report and datasets; of several maps that nothing ties together the largest.
@@ -97,7 +103,8 @@ def write(state: State, result: Reconstruction, cameras: Cameras) -> RunResult:
     if not prior.absent:
         write_tum(out / "coarse.tum", Trajectory(shown.timestamps, start.world_T_rigs))
     _write_trajectories(store, shown, main)
-    write_poses(out / "poses.csv", frames, coarse, result)
+    start_name = run.evidence.start_name(prior.absent)
+    write_poses(out / "poses.csv", frames, coarse, result, start_name)
     write_points(out / "points.ply", main)
     (out / "transform.json").unlink(missing_ok=True)
     if main.origin is not None:
@@ -166,7 +173,8 @@ def _report(state: State, result: Reconstruction) -> dict[str, Any]:
     """The content of report.json."""
     run, rounds = state.run, state.run.journal.rounds
     solver = [{"stage": name, "rounds": some} for name, some in rounds.items()]
-    stages = StageLog(tuple(run.store.records.values()), run.journal.counts, solver)
+    costs, again_s = tuple(run.store.records.values()), run.store.seconds_again
+    stages = StageLog(costs, run.journal.counts, solver, again_s)
     gauge, of_families = _gauge(run, state.prior), _of_families(state)
     found = _findings(state, result, of_families.pop(GpsFactors.name, None))
     coarse = state.prior.coarse
@@ -202,16 +210,18 @@ def _findings(state: State, result: Reconstruction, gps: dict[str, Any] | None) 
         notes += more
     if gps is not None:
         notes += notes_on_gps(gps, len(frames))
-    lists, more = findings.of_frames(
-        frames, prior.coarse, result, map_.frame_weights, MAX_SCALE_SIGMA
-    )
+    start = run.evidence.start_name(prior.absent)
+    found_of = frames, prior.coarse, result, map_.frame_weights, MAX_SCALE_SIGMA, start
+    lists, more = findings.of_frames(*found_of)
     notes += more
     stitching = map_.stitching and findings.of_field(map_.stitching)
     clocks, sources = [one.clock for one in prior.of_recordings], prior.coarse.sources
     recordings = of_recordings(frames, result, sources, clocks)
     notes += notes_on_recordings(recordings)
     found = Findings(notes, trajectory, stitching, camera, gyro, gps, map_.moves)
-    return replace(found, recordings=recordings, reasons=_reasons(prior), frame_lists=lists)
+    return replace(
+        found, recordings=recordings, reasons=_reasons(prior), frame_lists=lists, start=start
+    )
 
 
 def _of_camera(

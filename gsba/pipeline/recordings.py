@@ -27,7 +27,7 @@ from gsba.store import cluster
 from gsba.store.store import RunStore
 from gsba.trajectory.conventions import Convention
 from gsba.trajectory.metashape import NamedPoses
-from gsba.types import FrameSet, Trajectory
+from gsba.types import FrameSet, RunStart, Trajectory
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -174,7 +174,9 @@ class _Given:
             imu = inputs.read_gyro(_path(self.recording.imu), Path(self.recording.frames))
         except GsbaError as error:
             raise _named(self.name, error) from error
-        return RecordingEvidence(self.name, coarse, trajectories, imu, self.camera(plain))
+        start = RunStart.TRAJECTORY if trajectories else RunStart.PAIRS
+        start, camera = RunStart.ODOMETRY if self.followed else start, self.camera(plain)
+        return RecordingEvidence(self.name, coarse, trajectories, imu, camera, start)
 
 
 def _path(given: Path | str | None) -> Path | None:

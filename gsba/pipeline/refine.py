@@ -40,7 +40,7 @@ from gsba.report.html import add_odometry
 from gsba.store import cluster
 from gsba.store.store import RunStore
 from gsba.trajectory.conventions import Convention
-from gsba.types import CoarsePoses, FrameSet, Reconstruction
+from gsba.types import CoarsePoses, FrameSet, Reconstruction, RunStart
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -110,7 +110,9 @@ def refine(
         given, settings = walk.pieces(), inputs.for_odometry(settings)
     image_circles = inputs.given_circles(circles, calibration)
     found = scan(frames, timestamps, fps, chosen.given, not given, calibration, image_circles)
-    evidence = Evidence(tuple(inputs.timed(given, found)), readings, families=tuple(families))
+    begin = RunStart.TRAJECTORY if walk is None else RunStart.ODOMETRY
+    timed = tuple(inputs.timed(given, found))
+    evidence = Evidence(timed, readings, families=tuple(families), start=begin)
     start = Start.of(found, evidence, settings)
     with RunStore(out, origin, fresh, cluster.hire(client, frames, settings), title_of) as store:
         return refine_from(store, settings, chosen, evidence, start, origin["frames"], walk)

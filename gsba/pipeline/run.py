@@ -24,7 +24,7 @@ from gsba.log import GsbaError
 from gsba.parts import DividedAdjustments
 from gsba.photometric import direct
 from gsba.store.store import Chain, RunStore, fingerprint
-from gsba.types import CoarsePoses, Counts, FrameSet, Round, Trajectory
+from gsba.types import CoarsePoses, Counts, FrameSet, Round, RunStart, Trajectory
 
 T = TypeVar("T")
 
@@ -61,6 +61,7 @@ class RecordingEvidence:
     trajectories: tuple[Trajectory, ...] = ()  # in pieces that each have their own world
     imu: Readings | None = None  # of a gyro that rode along; None = there are none
     camera: CameraSettings | None = None  # of its camera; None = those of the run
+    start: RunStart = RunStart.TRAJECTORY  # for the report
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +73,17 @@ class Evidence:
     families: tuple[Family, ...] = ()  # of GPS, of packages and of the caller
     recordings: tuple[RecordingEvidence, ...] = ()  # of several recordings, in order of their
     # frames, which then have their trajectories and gyros from here; () = there is one recording
+    start: RunStart = RunStart.TRAJECTORY  # for the report
+
+    def start_name(self, absent: bool) -> str:
+        """What the run started from, for the report.
+
+        Args:
+            absent: True if there is no trajectory.
+        """
+        if absent:
+            return RunStart.PAIRS
+        return " and ".join(dict.fromkeys(one.start for one in self.recordings)) or self.start
 
 
 @dataclass(frozen=True, slots=True)

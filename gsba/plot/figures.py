@@ -87,7 +87,7 @@ def _trajectories(
         plan = _TopView(world)
         if one.coarse is not None:
             before = one.coarse_errors.fit if one.coarse_errors is not None else own
-            lines["before"] = plan.line(axes, one.coarse, before, charts.BEFORE, "-")
+            lines[one.before] = plan.line(axes, one.coarse, before, charts.BEFORE, "-")
             lines["after"] = plan.line(axes, one.refined, own, charts.AFTER, "-")
         else:
             lines["trajectory"] = plan.line(axes, one.refined, own, charts.ALONE, "-")
@@ -124,7 +124,7 @@ def _errors(figure: "SubFigure | Figure", shown: Sequence[Shown]) -> None:
     start = min(float(one.refined.timestamps[0]) for one in shown)
     for one, color in zip(shown, charts.colors(), strict=False):
         name = charts.plain(one.name)
-        kinds = [(one.coarse_errors, one.coarse, ":", f"{name}, before")]
+        kinds = [(one.coarse_errors, one.coarse, ":", f"{name}, {one.before}")]
         for errors, walk, style, label in [*kinds, (one.errors, one.refined, "-", name)]:
             if errors is None or walk is None:
                 continue

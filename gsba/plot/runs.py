@@ -1,6 +1,8 @@
 """Runs for figures, in the world of the truth or in that of the first run."""
 
+import json
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -31,6 +33,7 @@ class Shown:
     errors: PoseErrors | None = None  # None = there is no truth
     coarse_errors: PoseErrors | None = None
     placed: Sim3 | None = None  # similarity to the common world; None = it could not be aligned
+    before: str = "before"  # name of `coarse` in legends: what the run started from
 
 
 def load(paths: Sequence[Path], truth: Trajectory | None = None) -> tuple[Shown, ...]:
@@ -54,13 +57,16 @@ def _read(name: str, path: Path) -> Shown:
     if not path.is_dir():
         return Shown(name, read_trajectory(path))
     reconstruction, frames = load_run(path)
-    coarse = path / "coarse.tum"
+    coarse, start = path / "coarse.tum", ""
+    with suppress(OSError, ValueError, KeyError):  # of an older run
+        start = f" ({json.loads((path / 'report.json').read_text(encoding='utf-8'))['start']})"
     return Shown(
         name,
         Trajectory(frames.timestamps, reconstruction.world_T_rigs),
         read_trajectory(coarse) if coarse.is_file() else None,
         np.sort(np.degrees(angular_residuals(reconstruction))),
         frame_quality(reconstruction).median_residuals_deg,
+        before=f"before{start}",
     )
 
 

@@ -12,13 +12,11 @@ from gsba.loop_closure.merged_map import Registered
 from gsba.trajectory.clock import ClockEstimate
 from gsba.trajectory.joining import GUESS, SegmentAlignment
 from gsba.trajectory.judgement import StepChecks
-from gsba.types import CoarsePoses, FrameSet, PoseSource, PoseStatus, Reconstruction
+from gsba.types import CoarsePoses, FrameSet, PoseSource, PoseStatus, Reconstruction, RunStart
 
 logger = logging.getLogger(__name__)
 
 _MAX_NAMED_FRAMES = 5  # frames whose names a note lists
-_MAX_NAMED_MAPS = 5  # maps that a note describes
-_MAX_FALSE_SHARE = 0.1  # share of contradicted steps; above it, the other steps are in doubt, too
 
 
 def of_trajectory(
@@ -81,17 +79,6 @@ def _steps(trust: StepChecks, frames: FrameSet, absent: bool) -> tuple[dict[str,
                 "no matches tie these frames to the others: they have no rotation and are not "
                 f"exported: {named(apart, 'trajectory.not_tied', f'of {len(names)} frames')}"
             )
-    if trust.held_steps.any():
-        steps = [f"{a} to {b}" for a, b in between(trust.held_steps)]
-        seen = ~trust.unseen_steps
-        wrong, num = np.count_nonzero(trust.false_steps & seen), np.count_nonzero(seen)
-        doubt = ""
-        if wrong > _MAX_FALSE_SHARE * num:
-            doubt = f" (images contradict {wrong} of its other {num} steps)"
-        notes.append(
-            f"no reliable matches: the step comes from the trajectory{doubt}: "
-            f"{named(steps, 'trajectory.unseen_steps', 'steps')}"
-        )
     for note in notes:
         logger.warning(note)
     return judgement, notes
@@ -130,30 +117,12 @@ def _maps(
     alone, lost = names[registered.alone].tolist(), names[registered.lost].tolist()
     own = registered.components[~registered.lost]
     maps = [names[registered.components == c].tolist() for c in np.unique(own)]
-    count = len(maps)
     judgement |= {"registered": alone, "not_registered": lost}
-    judgement["maps"] = maps if count > 1 else []
+    judgement["maps"] = maps if len(maps) > 1 else []
     if alone:
         notes.append(
             f"{len(alone)} frames were registered against the map's points: "
             f"{named(alone, 'trajectory.registered')}"
-        )
-    if lost:
-        notes.append(
-            f"{len(lost)} frames could not be registered and are not exported: "
-            f"{named(lost, 'trajectory.not_registered')}"
-        )
-    if count > 1:
-        parts = "; ".join(
-            f"map {n} from {m[0]} to {m[-1]} ({len(m)} frames)"
-            for n, m in enumerate(maps[1 : 1 + _MAX_NAMED_MAPS], 2)
-        )
-        if count > 1 + _MAX_NAMED_MAPS:
-            parts += f"; {count - 1 - _MAX_NAMED_MAPS} more are listed in report.json under maps"
-        notes.append(
-            f"images do not connect {count} places: each is a map with its own world and scale. "
-            f"Map 1 with {len(maps[0])} frames is exported; gsba export --map NUMBER exports the "
-            f"others, whose poses are in poses.csv: {parts}"
         )
     return judgement, notes
 
@@ -196,6 +165,7 @@ def of_frames(
     reconstruction: Reconstruction,
     frame_weights: np.ndarray,
     max_scale_sigma: float,
+    start: str = RunStart.TRAJECTORY,
 ) -> tuple[dict[str, list[str]], list[str]]:
     """Names of frames with a finding, for `frame_lists` of report.json, and notes.
 
@@ -206,6 +176,7 @@ def of_frames(
         frame_weights: (F,) weight of each frame's pixels, below 1 if they contradict the others.
         max_scale_sigma: relative sigma of the ratio of two successive baselines; frames above it
             are listed.
+        start: what the run started from.
     """
     absent = coarse.sources == PoseSource.NONE
     filled = np.flatnonzero((coarse.sources != PoseSource.SLAM) & ~absent)
@@ -213,34 +184,29 @@ def of_frames(
     lost = np.flatnonzero(unrefined & (reconstruction.map_numbers() > 0))
     doubted = np.flatnonzero(frame_weights < 1)
     weak = _weak_places(reconstruction, max_scale_sigma)
-    uncertain = (
-        f"the scale is uncertain by more than {max_scale_sigma:.2%} where few points are seen from "
-        "three frames"
-    )
     notes = []
     if absent.all():
-        notes.append("no trajectory: poses come from images alone, and the unit is arbitrary")
+        notes.append("started from pairs of frames: the unit of the map is arbitrary")
     if coarse.time_offset:
         notes.append(f"frame times were shifted by {coarse.time_offset:.6f} s")
-    for note in notes:
-        logger.warning(note)
     fetched = (
-        "frames of the video that were added where the map was weak; datasets leave them out "
-        "unless export.fetched = true"
+        "extra frames of the video strengthened the map; datasets skip them, --set "
+        "export.fetched=true keeps them"
     )
     lists = {}
     for key, finding, rows in (
         ("fetched", fetched, np.flatnonzero(frames.fetched)),
-        ("interpolated", "no SLAM pose, the initial pose is interpolated", filled),
-        ("unmatched", "no matches, the pose comes from the trajectory", lost),
+        ("interpolated", f"no pose of the {start}, the initial pose is interpolated", filled),
+        ("unmatched", "", lost),  # a reason of the verdict
         ("weighted_down", "pixels fit badly and were weighted down", doubted),
-        ("uncertain_scale", uncertain, weak),
+        ("uncertain_scale", "", weak),  # a figure: it holds for most frames of good maps, too
     ):
         lists[key] = names = [frames.names[f] for f in rows]
-        if names:
+        if names and finding:
             unit = f"of {len(frames)} frames"
             notes.append(f"{finding}: {named(names, f'frame_lists.{key}', unit)}")
-            logger.warning(notes[-1])
+    for note in notes:
+        logger.info(note)
     return lists, notes
 
 

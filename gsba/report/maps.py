@@ -9,7 +9,9 @@ import numpy as np
 from gsba.types import FrameSet, PoseStatus, Reconstruction
 
 MIN_SHARE_IN_ONE_MAP = 0.9  # of a run's frames; a run with fewer in its largest map is partial
+MIN_SHARE_OF_A_MAP = 0.5  # of a run's frames; fewer are no map of the place
 _MAX_SHOWN_SPANS = 3  # spans of a map's frames in a line of the table
+_MAX_SHOWN_REASONS = 5  # of the verdict, on the terminal
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,23 +70,29 @@ def format_outcome(report: Mapping[str, Any], run: object) -> str:
     """Outcome of a finished run, for a terminal.
 
     The first line counts the frames of the exported map, and then those of other maps. A table
-    follows if there are several maps.
+    follows if there are several maps, and then the reasons of the verdict, and the verdict.
 
     Args:
         report: content of report.json.
         run: folder of the run.
     """
     summary, maps = report["summary"], report["maps"]
+    refined = summary["refined"] - summary["fetched"]
+    frames = summary["frames"] - summary["frames_fetched"]
     residual, found = summary["median_residual_deg"], "rotations only, no points"
     if residual is not None:
         found = f"{summary['points']} points, median residual {residual:.4f} deg"
     apart = _apart(summary)
-    first = f"{summary['refined']} of {summary['frames']} frames refined{apart}, {found}: {run}"
-    return first if len(maps) == 1 else "\n".join([first, *_table(maps)])
+    first = f"{refined} of {frames} frames refined{apart}, {found}: {run}"
+    verdict, table = report["verdict"], _table(maps) if len(maps) > 1 else []
+    reasons = [f"- {one['line']}" for one in verdict["reasons"][:_MAX_SHOWN_REASONS]]
+    more = len(verdict["reasons"]) - len(reasons)
+    reasons += [f"- {more} more in report.html"] if more > 0 else []
+    return "\n".join([first, *table, *reasons, verdict["sentence"]])
 
 
 def _apart(summary: Mapping[str, Any]) -> str:
-    """Numbers of frames that are not exported, in brackets; "" = none.
+    """Numbers of frames that no dataset has, in brackets; "" = none.
 
     Args:
         summary: `summary` of report.json.
@@ -93,6 +101,8 @@ def _apart(summary: Mapping[str, Any]) -> str:
     where = "another map" if others == 1 else f"{others} other maps"
     counts = {where: summary["frames_in_other_maps"], "no map": summary["frames_in_no_map"]}
     parts = [f"{count} in {name}" for name, count in counts.items() if count]
+    if summary["fetched"]:
+        parts.append(f"{summary['fetched']} more strengthened the map, and datasets skip them")
     return f" ({', '.join(parts)})" if parts else ""
 
 

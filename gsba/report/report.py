@@ -21,14 +21,35 @@ from gsba.geometry import angular_errors, moved_to, quaternion_from_rotation
 from gsba.memory import release_mapped_files, total_memory_bytes, usable_cpus
 from gsba.report.maps import summarize_maps
 from gsba.report.medians import medians_by_group
+from gsba.report.verdict import judge
 from gsba.store.store import StageRecord
-from gsba.types import CoarsePoses, Counts, FrameSet, PoseSource, PoseStatus, Reconstruction
+from gsba.types import (
+    CoarsePoses,
+    Counts,
+    FrameSet,
+    PoseSource,
+    PoseStatus,
+    Reconstruction,
+    RunStart,
+)
 from gsba.version import __version__
 
 logger = logging.getLogger(__name__)
 
 _PACKAGES = ("gtsam", "numpy", "numba", "scipy", "opencv-python-headless", "pycolmap")
 _AXES = ("rx", "ry", "rz", "tx", "ty", "tz")  # of a pose covariance
+
+
+def source_name(pose: int, start: str) -> str:
+    """Name of the source of a frame's initial pose.
+
+    Args:
+        pose: a `PoseSource`.
+        start: what the run started from.
+    """
+    if pose in (PoseSource.SLAM, PoseSource.NONE):
+        return start
+    return PoseSource(pose).name.lower()
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -94,6 +115,7 @@ class Findings:
         default_factory=dict
     )  # names of frames with a finding, see `findings.of_frames`
     reasons: Sequence[str] = ()  # why maps were not joined, see `maps.summarize_maps`
+    start: str = RunStart.TRAJECTORY  # what the run started from
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -105,6 +127,7 @@ class StageLog:
         default_factory=dict
     )  # by stage name
     solver: Sequence[object] = ()  # a record for each round, with its iterations' cost by family
+    seconds_again: float = 0.0  # of stages that were computed again later, and are in no row
 
     def rows(self) -> list[dict[str, Any]]:
         """Cost and counts of each stage."""
@@ -140,7 +163,9 @@ def build_report(
     report = {
         "gsba": __version__,
         "finished": datetime.now(UTC).isoformat(timespec="seconds"),
-        "summary": _summary(frames, coarse, reconstruction),
+        "start": found.start,
+        "summary": _summary(frames, coarse, reconstruction)
+        | {"seconds": stages.seconds_again + sum(stage.seconds for stage in stages.costs)},
         "maps": summarize_maps(reconstruction, frames, found.reasons),
         "gauge": gauge,
         "notes": found.notes,
@@ -151,12 +176,14 @@ def build_report(
         "solver": stages.solver,
         "splat": found.moves,
         "frame_lists": found.frame_lists,
-        "frames": _frame_rows(frames, coarse, reconstruction, quality),
+        "frames": _frame_rows(frames, coarse, reconstruction, quality, found.start),
         "settings": settings,
         "machine": _machine(),
         "versions": {name: _version(name) for name in _PACKAGES},
     }
-    return plain(report)
+    report = plain(report)
+    main, shown = reconstruction.of_map(1), frames.taken(reconstruction.largest_map())
+    return report | {"verdict": plain(judge(report, main, shown).to_json())}
 
 
 def _summary(
@@ -174,6 +201,8 @@ def _summary(
         "maps": reconstruction.num_maps,
         "frames_in_other_maps": np.count_nonzero(numbers > 1),
         "frames_in_no_map": np.count_nonzero(numbers == 0),
+        "fetched": np.count_nonzero(frames.taken(rows).fetched),
+        "frames_fetched": np.count_nonzero(frames.fetched),
         "points": len(lengths),
         "observations": len(residuals),
         "mean_track_length": lengths.mean() if len(lengths) else math.nan,
@@ -183,7 +212,11 @@ def _summary(
 
 
 def write_poses(
-    path: Path, frames: FrameSet, coarse: CoarsePoses, reconstruction: Reconstruction
+    path: Path,
+    frames: FrameSet,
+    coarse: CoarsePoses,
+    reconstruction: Reconstruction,
+    start: str = RunStart.TRAJECTORY,
 ) -> None:
     """Write poses.csv: world_T_rig, its quality and its covariance for every frame.
 
@@ -191,6 +224,8 @@ def write_poses(
     the upper triangle is written row by row. Cells of unknown values are empty. Frames of the same
     `map` share a world; map 1 is the largest; the cell is empty for frames in no map. `fetched` is
     1 for frames that were added to strengthen the map and are in no dataset, see `FrameSet`.
+    `source` says where a frame's initial pose is from: `start`, which the run started from, or
+    interpolated or extrapolated from that.
     """
     quality = frame_quality(reconstruction)
     rows, columns = np.triu_indices(6)
@@ -218,7 +253,7 @@ def write_poses(
             table.writerow(header)
             for f, name in enumerate(frames.names):
                 status = PoseStatus(reconstruction.pose_statuses[f]).name.lower()
-                source = PoseSource(coarse.sources[f]).name.lower()
+                source = source_name(coarse.sources[f], start)
                 table.writerow(
                     [name, repr(float(frames.timestamps[f])), status, source]
                     + [int(quality.num_observations[f]), _cell(quality.median_residuals_deg[f])]
@@ -234,13 +269,17 @@ def _cell(value: float) -> str:
 
 
 def _frame_rows(
-    frames: FrameSet, coarse: CoarsePoses, reconstruction: Reconstruction, quality: FrameQuality
+    frames: FrameSet,
+    coarse: CoarsePoses,
+    reconstruction: Reconstruction,
+    quality: FrameQuality,
+    start: str,
 ) -> list[dict[str, Any]]:
     return [
         {
             "name": name,
             "status": PoseStatus(reconstruction.pose_statuses[f]).name.lower(),
-            "coarse_pose": PoseSource(coarse.sources[f]).name.lower(),
+            "coarse_pose": source_name(coarse.sources[f], start),
             "observations": quality.num_observations[f],
             "median_residual_deg": quality.median_residuals_deg[f],
             "std_rotation_deg": np.linalg.norm(quality.std_rotations_deg[f]),

@@ -93,6 +93,9 @@ class RunStore:
         self.root = root
         self._title_of = title_of
         self.records: dict[str, StageRecord] = {}  # stages of this call, in order
+        self.seconds_again = 0.0  # of stages of this call that it computed again later
+        self._computed: set[str] = set()  # stages that this call computed
+        self._resumed: dict[str, float] = {}  # stage -> seconds, not told of yet
         self._types: dict[str, object] = {}  # stage -> type of its result
         self._prefix = ""
         self._lock = open_run_folder(root, origin, fresh)
@@ -106,6 +109,7 @@ class RunStore:
         return self
 
     def __exit__(self, _: Any = None, error: BaseException | None = None, __: Any = None) -> None:
+        self._tell_resumed()
         os.close(self._lock)
         if isinstance(error, FullDiskError):
             raise FullDiskError(f"{error}; finished stages are kept") from error
@@ -274,13 +278,30 @@ class RunStore:
         return digest(__version__, FORMAT, self._prefix + name, settings, keys)
 
     def _note(self, record: StageRecord) -> None:
+        if not record.resumed and record.name in self._computed:
+            self.seconds_again += self.records[record.name].seconds
         self.records[record.name] = record
         how = "resumed, computed in" if record.resumed else "done in"
         title, name = self._title_of(record.name), record.name
-        shown = title if title == name else f"{title} [{name}]"
-        logger.info("%s: %s %.1f s, %.0f MB", shown, how, record.seconds, record.peak_mb)
+        detailed = logger.isEnabledFor(logging.DEBUG) and title != name
+        shown = f"{title} [{name}]" if detailed else title
+        level = logging.DEBUG if record.resumed else logging.INFO
+        if record.resumed and name not in self._computed:
+            self._resumed[name] = record.seconds
+        elif not record.resumed:
+            self._computed.add(name)
+            self._tell_resumed()
+        logger.log(level, "%s: %s %.1f s, %.0f MB", shown, how, record.seconds, record.peak_mb)
         cost = {"seconds": round(record.seconds, 3), "resumed": record.resumed}
         event("done", name=name, title=title, **cost)
+
+    def _tell_resumed(self) -> None:
+        """Log in a line how many stages were resumed since the last such line."""
+        if self._resumed:
+            seconds = sum(self._resumed.values())
+            text = "resumed %d stages of an earlier call, which took %.0f s"
+            logger.info(text, len(self._resumed), seconds)
+            self._resumed.clear()
 
 
 class Chain:
@@ -471,7 +492,7 @@ def _load_if_current(path: Path, key: str, returns: type[T]) -> tuple[T, StageRe
     try:
         info = read_info(path)
         if info.get("key") != key:
-            logger.info("%s: settings or inputs changed, computing again", path.stem)
+            logger.debug("%s: settings or inputs changed, computing again", path.stem)
             return None
         return load_record(path, returns, mapped=True), typed(info, StageRecord)
     except RecordError as error:

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from enum import IntEnum
+from enum import IntEnum, StrEnum
 
 import numpy as np
 
@@ -25,10 +25,19 @@ def spread_rows(num: int, count: int) -> np.ndarray:
 class PoseSource(IntEnum):
     """Source of a frame's coarse pose."""
 
-    SLAM = 0  # an entry of the trajectory file
+    SLAM = 0  # an entry of the trajectory, of a file or an odometry
     INTERPOLATED = 1  # between two entries
     EXTRAPOLATED = 2  # before the first or after the last entry
     NONE = 3  # no trajectory: a placeholder
+
+
+class RunStart(StrEnum):
+    """What gives a run its initial poses, in words for the user."""
+
+    TRAJECTORY = "trajectory file"
+    ODOMETRY = "odometry"  # of the run's own video
+    PAIRS = "pairs of frames"
+    EARLIER_RUN = "earlier run"
 
 
 class PoseStatus(IntEnum):

@@ -265,3 +265,21 @@ def test_a_trajectory_and_none_are_not_both(runs: list[tuple[object, ...]]) -> N
     _fails(_gsba("refine", "frames", "slam.tum", "--no-trajectory"), "exclude each other")
     _fails(_gsba("refine", "frames", "--keyframes", "k.tum"), "--keyframes needs the TRAJECTORY")
     assert not runs
+
+
+@pytest.mark.parametrize("loads", ["", "with loading(): import gsba"])
+def test_sigterm_ends_a_command_in_one_line(loads: str) -> None:
+    """pycolmap, which other packages import, would print a stack."""
+    script = f"""
+import os, signal, time
+from gsba.cli.app import app, command, loading
+@command
+def wait() -> None:
+    {loads or "pass"}
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(60)
+app(["wait"])
+"""
+    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert ended.returncode == 130
+    assert ended.stderr.splitlines() == ["error: interrupted; run again to resume"]

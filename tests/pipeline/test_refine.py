@@ -82,7 +82,8 @@ def test_the_report_tells_what_happened(case: Case) -> None:
     summary = report["summary"]
     assert (summary["frames"], summary["refined"]) == (NUM_FRAMES, NUM_FRAMES)
     assert 0 < summary["median_residual_deg"] < summary["median_residual_deg_coarse"]
-    assert report["notes"] == []
+    assert report["notes"] == [] and report["start"] == "trajectory file"
+    assert report["verdict"]["sentence"].startswith("good to train: all 8 frames are in one map")
     stages = {stage["name"]: stage for stage in report["stages"]}
     assert {"features", "neighbours", "chain", "reconstruction", "export-colmap"} <= stages.keys()
     assert all(stage["seconds"] >= 0 and stage["peak_mb"] > 0 for stage in stages.values())
@@ -120,7 +121,11 @@ def test_a_blank_frame_keeps_a_pose_and_is_reported(blank: Case) -> None:
     expected[3] = PoseStatus.UNREFINED
     np.testing.assert_array_equal(statuses, expected)
     assert result.report["frames"][3]["status"] == "unrefined"
-    assert any("000003" in note for note in result.report["notes"])
+    verdict = result.report["verdict"]
+    assert verdict["level"] == "look at these places" and not result.failed
+    assert "hardly any matches: the pose is that of the trajectory file" in [
+        one["cause"] for one in verdict["reasons"] if "000003" in one["frames"]
+    ]
     before, after = (
         evaluate(_without(read_trajectory(path), 3), _without(blank.truth, 3))
         for path in (blank.slam, blank.out / "trajectory.tum")

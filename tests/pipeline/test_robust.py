@@ -39,7 +39,7 @@ def test_no_trajectory_will_do(case: Case, tmp_path: Path) -> None:
     result = _refine(case, tmp_path, None)
     assert (result.reconstruction.pose_statuses == PoseStatus.REFINED).all()
     assert result.report["gauge"].startswith("no trajectory")
-    assert any(note.startswith("no trajectory") for note in result.report["notes"])
+    assert any(note.startswith("started from pairs") for note in result.report["notes"])
     case.assert_as_good(tmp_path / "run")
 
 

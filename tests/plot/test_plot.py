@@ -70,7 +70,7 @@ def test_runs_are_laid_on_the_truth_with_the_errors_that_evaluate_has(
     assert run.coarse_errors.positions.mean() > run.errors.positions.mean()
     assert alone.residuals_deg is None and alone.coarse is None and alone.errors is not None
     panels, names = _drawn(lambda figure: _errors(figure, (run, alone)))
-    assert names == ["run, before", "run", "other.tum"]
+    assert names == ["run, before (trajectory file)", "run", "other.tum"]
     before, after, _ = panels[0].get_lines()
     np.testing.assert_array_equal(after.get_ydata(), run.errors.positions)
     np.testing.assert_array_equal(before.get_ydata(), run.coarse_errors.positions)

@@ -4,33 +4,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
 from export_scene import panoramas, poses, reconstruction
 
 from gsba.loop_closure.merged_map import Registered
 from gsba.report.findings import of_frames, of_trajectory
 from gsba.trajectory.judgement import StepChecks
-from gsba.types import CoarsePoses, Counts, PoseSource, Solution
-
-
-@pytest.mark.parametrize(
-    ("contradicted", "doubt"), [(0, ""), (2, " (images contradict 2 of its other {} steps)")]
-)
-def test_steps_that_no_image_shows_are_in_doubt_where_others_are_wrong(
-    tmp_path: Path, contradicted: int, doubt: str
-) -> None:
-    frames = panoramas(tmp_path, ".png")
-    num = len(frames)
-    steps = np.arange(num - 1)
-    trust = replace(
-        StepChecks.of_all(np.tile(np.eye(4), (num, 1, 1))),
-        unseen_steps=steps == num - 2,
-        false_steps=steps < contradicted,
-    )
-    found, notes = of_trajectory(trust, None, None, (), frames)
-    assert found["unseen_steps"] == [[frames.names[-2], frames.names[-1]]]
-    alone = f"no reliable matches: the step comes from the trajectory{doubt.format(num - 2)}"
-    assert notes == [f"{alone}: {frames.names[-2]} to {frames.names[-1]}"]
+from gsba.types import CoarsePoses, Counts, PoseSource, RunStart, Solution
 
 
 def test_without_a_trajectory_images_contradict_nothing(tmp_path: Path) -> None:
@@ -53,16 +32,16 @@ def test_long_lists_of_frames_are_counted_in_notes_and_named_in_the_report(tmp_p
     sources = np.full(num, PoseSource.INTERPOLATED, np.uint8)
     coarse, weights = CoarsePoses(poses(), sources, 0.0), np.ones(num)
     weights[2] = 0.5
-    lists, notes = of_frames(frames, coarse, result, weights, 0.01)
+    lists, notes = of_frames(frames, coarse, result, weights, 0.01, RunStart.ODOMETRY)
     assert lists["interpolated"] == list(frames.names) and lists["unmatched"] == []
     assert notes == [
-        f"no SLAM pose, the initial pose is interpolated: {num} of {num} frames, listed in "
-        "report.json under frame_lists.interpolated",
+        f"no pose of the odometry, the initial pose is interpolated: {num} of {num} frames, "
+        "listed in report.json under frame_lists.interpolated",
         f"pixels fit badly and were weighted down: {frames.names[2]}",
     ]
 
 
-def test_of_many_maps_a_note_describes_a_few(tmp_path: Path) -> None:
+def test_maps_that_are_not_joined_are_no_note_but_a_list(tmp_path: Path) -> None:
     frames = panoramas(tmp_path, ".png")
     num, none = len(frames), np.zeros(len(frames), bool)
     registered = Registered(
@@ -76,7 +55,5 @@ def test_of_many_maps_a_note_describes_a_few(tmp_path: Path) -> None:
         lost=none,
         counts=Counts(num - 1, 0, "parts"),
     )
-    found, (note,) = of_trajectory(StepChecks.of_all(poses()), None, registered, (), frames)
-    assert len(found["maps"]) == num > 7
-    assert f"images do not connect {num} places" in note and note.count("; map") == 4
-    assert note.endswith(f"; {num - 6} more are listed in report.json under maps")
+    found, notes = of_trajectory(StepChecks.of_all(poses()), None, registered, (), frames)
+    assert len(found["maps"]) == num and notes == []

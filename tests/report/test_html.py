@@ -326,6 +326,7 @@ def test_browser_shows_it(page: Path) -> None:
         assert tab.evaluate("document.documentElement.dataset.theme") == "dark"
         assert tab.evaluate("document.documentElement.scrollWidth <= innerWidth")
         chart = tab.locator("#top")
+        chart.scroll_into_view_if_needed()
         box = chart.bounding_box()
         pictures_seen = [chart.screenshot()]
         tab.mouse.move(box["x"] + 90, box["y"] + 300)

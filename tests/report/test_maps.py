@@ -75,21 +75,27 @@ def test_the_summary_counts_the_exported_map_alone(tmp_path: Path) -> None:
 
 def test_the_outcome_says_frames_in_other_maps_first(tmp_path: Path) -> None:
     text = format_outcome(_report(tmp_path, _in_maps(), ("", "too few matches")), "out")
-    first, header, *rows = text.splitlines()
+    first, header, *rows = text.splitlines()[:4]
+    *reasons, verdict = text.splitlines()[4:]
     assert first.startswith("4 of 9 frames refined (2 in another map, 2 in no map), 5 points")
     assert first.endswith(": out")
+    assert [line.count("frame_000") for line in reasons] == [4, 1, 3]
+    assert "(too few matches); gsba export RUN --map 2" in reasons[0]
+    assert verdict.startswith("look at these places: 5 of 9 frames are in the map")
     assert header.split()[:5] == ["map", "frames", "steps", "points", "extent"]
     assert rows[0].split()[:4] == ["1", "5", "2", "5"] and len(rows) == 2
     assert rows[1].split()[:4] == ["2", "2", "0", "2"] and rows[1].endswith("  too few matches")
     unknown = format_outcome(_report(tmp_path, _in_maps()), "out")
     assert "why it was not joined" in header and "why" not in unknown
     whole = format_outcome(_report(tmp_path, scene.reconstruction()), "out")
-    assert whole.startswith("9 of 9 frames refined, 9 points") and len(whole.splitlines()) == 1
+    first, *_, verdict = whole.splitlines()
+    assert first.startswith("9 of 9 frames refined, 9 points")
+    assert "all 9 frames are in one map" in verdict
 
 
 def test_rows_of_many_spans_stay_short(tmp_path: Path) -> None:
     result = _in_maps(np.array([0, 1, 0, 1, 0, 1, 0, 1, 0], np.int32))
-    rows = format_outcome(_report(tmp_path, result), "out").splitlines()[2:]
+    rows = format_outcome(_report(tmp_path, result), "out").splitlines()[2:4]
     assert [row[row.index("0.") :].count(",") for row in rows] == [3, 3]
     assert rows[0].endswith(", 2 more") and rows[1].endswith(", 1 more")
 

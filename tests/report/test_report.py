@@ -147,7 +147,7 @@ def test_report_is_valid_json(tmp_path: Path) -> None:
     assert back["frames"][3] == {
         "name": "003, ä",
         "status": "unrefined",
-        "coarse_pose": "slam",
+        "coarse_pose": "trajectory file",
         "observations": 0,
         "median_residual_deg": None,
         "std_rotation_deg": None,

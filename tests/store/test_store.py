@@ -466,3 +466,30 @@ def test_keys_see_settings_paths_and_file_changes(tmp_path: Path) -> None:
     before = fingerprint([path, None])
     path.write_text("longer")
     assert len(before) == 1 and fingerprint([path, None]) != before
+
+
+def test_a_resumed_call_says_so_in_one_line(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    for changed in (0, 1):
+        caplog.clear()
+        with caplog.at_level("INFO", "gsba"), RunStore(tmp_path, {}) as store:
+            for name in ("one", "two"):
+                store.stage(name, 0, _tracks, Tracks)
+            for _ in range(2):  # what this call computed itself is not resumed
+                store.stage("three", changed, _tracks, Tracks, ["two"])
+        lines = [record.getMessage() for record in caplog.records]
+        assert sum(line.startswith("resumed 2 stages of an earlier call") for line in lines) == (
+            changed
+        )
+        assert not any("changed" in line or "resumed, computed" in line for line in lines)
+        assert len(lines) == (2 if changed else 3)
+
+
+def test_stages_that_are_computed_again_cost_their_time_twice(tmp_path: Path) -> None:
+    with RunStore(tmp_path, {}) as store:
+        store.stage("one", 0, _tracks, Tracks)
+        first = store.records["one"].seconds
+        assert store.seconds_again == 0
+        store.stage("one", 1, _tracks, Tracks)
+        assert store.seconds_again == first > 0

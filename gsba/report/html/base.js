@@ -52,9 +52,11 @@ let marked = -1;
 function mark(f) {
   if (f !== marked) { marked = f; redraw(); }
 }
-const SOURCES = ["SLAM", "interpolated", "extrapolated"];
+const STARTED = D.report.start !== "pairs of frames";  // else there are no poses before refinement
+const SOURCES = [D.report.start, "interpolated", "extrapolated", D.report.start];
 function describe(f) {
-  return `${F.name[f]}  ·  ${F.time[f].toFixed(3)} s\nmoved ${num(F.moved[f])} units, turned ${num(F.turned_deg[f])}°\n` +
+  const moved = STARTED ? `moved ${num(F.moved[f])} units, turned ${num(F.turned_deg[f])}°\n` : "";
+  return `${F.name[f]}  ·  ${F.time[f].toFixed(3)} s\n${moved}` +
     `residual ${residualText(F.residual_deg[f])}, ${num(F.observations[f])} observations\n` +
     `start: ${SOURCES[F.source[f]]}${F.status[f] ? "  ·  not refined" : ""}`;
 }

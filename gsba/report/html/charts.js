@@ -4,7 +4,7 @@ function worldMap(canvas, across, up) {
   const view = { x: 0, y: 0, scale: 1, fitted: false };
   const { before, after, points, colors } = D.map;
   function fit(width, height) {
-    const all = before.concat(after);
+    const all = layers.before ? before.concat(after) : after;
     const range = k => [Math.min(...all.map(p => p[k])), Math.max(...all.map(p => p[k]))];
     const [x0, x1] = range(across), [y0, y1] = range(up);
     view.x = (x0 + x1) / 2; view.y = (y0 + y1) / 2;

@@ -1,16 +1,17 @@
 const COLOURS = ["--a", "--b", "--c", "--d", "--e", "--f"];
 
 function tiles() {
-  const s = D.report.summary;
+  const s = D.report.summary, extra = s.frames_fetched;
   const length = path => path.reduce((sum, p, i) => i ? sum + Math.hypot(...p.map((v, k) => v - path[i - 1][k])) : 0, 0);
-  const seconds = D.report.stages.reduce((sum, stage) => sum + stage.seconds, 0);
+  const seconds = s.seconds;
   const px = degrees => degrees === null ? "–" : `${num(degrees * pxPerDeg)} px`;
   const apart = [[s.exported - s.refined, "with poses of the trajectory"], [s.frames_in_other_maps, "in other maps"], [s.frames_in_no_map, "in no map"]]
-    .filter(([count]) => count).map(([count, where]) => `${num(count)} ${where}`).join(", ");
+    .concat([[s.fetched, "more strengthened the map, datasets skip them"]]).filter(([count]) => count).map(([count, where]) => `${num(count)} ${where}`).join(", ");
   const rows = [
-    ["Frames refined", `${num(s.refined)} / ${num(s.frames)}`, apart || "all of them"],
-    ["Median residual", px(s.median_residual_deg), `was ${px(s.median_residual_deg_coarse)} under the SLAM poses`],
-    ["Largest move", num(Math.max(...F.moved)), `map units, on a path of ${num(length(D.map.after))}`],
+    ["Frames refined", `${num(s.refined - s.fetched)} / ${num(s.frames - extra)}`, apart || "all of them"],
+    ["Median residual", px(s.median_residual_deg), STARTED ? `was ${px(s.median_residual_deg_coarse)} under the ${D.report.start}` : "started from pairs of frames"],
+    STARTED ? ["Largest move", num(Math.max(...F.moved)), `map units, on a path of ${num(length(D.map.after))}`]
+      : ["Path", num(length(D.map.after)), "map units"],
     ["Points", num(s.points), `in ${num(+(s.mean_track_length || 0).toFixed(1))} frames each on average`],
     ["Observations", num(s.observations), `${num(Math.round(s.observations / s.exported))} a frame`],
     ["Time", seconds < 90 ? `${num(seconds)} s` : `${num(seconds / 60)} min`, `${num(D.report.machine.cpus)} cores`],
@@ -30,7 +31,10 @@ function maps() {
 }
 
 function mapLegend() {
-  const names = { before: "before (SLAM)", after: "after", points: "points" };
+  const names = { before: `before (${D.report.start})`, after: STARTED ? "after" : "positions", points: "points" };
+  if (!STARTED) { delete names.before; layers.before = false; }
+  el("trajectory-lead").textContent = STARTED ? `Positions of the frames before (${D.report.start}) and after refinement.`
+    : "Positions of the frames; the run started from pairs of frames.";
   for (const [key, text] of Object.entries(names)) {
     const box = make("input", { type: "checkbox", checked: "" });
     box.addEventListener("change", () => { layers[key] = box.checked; redraw(); });
@@ -162,15 +166,17 @@ document.title = `${D.run} – gsba`;
 el("when").textContent = `finished ${D.report.finished.replace("T", " ").replace("+00:00", " UTC")} · gsba ${D.report.gsba}`;
 el("gauge").textContent = `${D.report.gauge}. The numbers behind this page are in report.json and poses.csv.`;
 el("settings").textContent = JSON.stringify({ settings: D.report.settings, machine: D.report.machine, versions: D.report.versions }, null, 1);
-for (const note of D.report.notes) el("notes").append(make("p", { class: "note" }, note));
+verdict();
 tiles();
 if (D.report.maps.length > 1) maps();
 else el("maps").remove();
 mapLegend();
 worldMap(el("top"), 0, 1);
 worldMap(el("side"), 0, 2);
-series(el("series"), "Moved", "units", F.moved, "--after");
-series(el("series"), "Turned", "°", F.turned_deg, "--after");
+if (STARTED) {
+  series(el("series"), "Moved", "units", F.moved, "--after");
+  series(el("series"), "Turned", "°", F.turned_deg, "--after");
+}
 series(el("series"), "Residual", "px", F.residual_deg.map(v => v === null ? null : v * pxPerDeg), "--c");
 series(el("series"), "Observations", "", F.observations, "--c");
 series(el("series"), "σ of position", "units", F.std, "--d");

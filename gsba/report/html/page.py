@@ -19,7 +19,10 @@ from gsba.types import CoarsePoses, FrameSet, Reconstruction
 
 logger = logging.getLogger(__name__)
 
-_PARTS = {"/*STYLE*/": ("style.css",), "/*SCRIPT*/": ("base.js", "charts.js", "main.js")}
+_PARTS = {
+    "/*STYLE*/": ("style.css",),
+    "/*SCRIPT*/": ("base.js", "charts.js", "verdict.js", "main.js"),
+}
 _DATA = "/*DATA*/"
 _BEFORE_DATA, _AFTER_DATA = '<script type="application/json" id="data">', "</script>"
 

@@ -1,0 +1,132 @@
+"""How well the scale is carried over from each frame of a map to the next.
+
+Along a path the scale is handed on by points that are seen from several places before a step, and
+from several behind it. Both sides triangulate such a point by themselves. Where they disagree on
+the distances of most, or few such points are left, as at a door, all that lies behind may be larger
+or smaller. Covariances assume that observations are right within their noise, and so do not tell of
+few points that err together: the scatter of distances does.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from gsba.geometry import moved_to
+from gsba.types import Reconstruction
+
+_REACH = 6.0  # usual steps that a side is long, and its fewest frames are two
+_STANDING_RATIO = 0.1  # of the rms step: shorter ones are of a camera that stands
+_MIN_POINTS = 8  # that both sides see
+_MAX_DISTANCE_SIGMA = 0.1  # of a point's distance by one side, part of it
+_SIGMAS = 2.0  # standard errors of the median that count as uncertainty
+_MEDIAN_ERROR = (
+    1.2533  # standard error of a median of normal values, times the root of their number
+)
+_MAD_SIGMAS = 1.4826  # standard deviation of normal values over their median absolute deviation
+_PARALLEL = 1e-9  # smallest over largest information of a point's place, of parallel rays
+
+
+def scale_changes(result: Reconstruction, recordings: np.ndarray) -> np.ndarray:
+    """Largest relative change (F - 1,) of scale that may hide at each step: the median difference
+    of distances by both sides, and two standard errors of it by their scatter.
+
+    inf = too few points are seen by both sides; NaN = a side has one frame.
+
+    Args:
+        result: one map.
+        recordings: (F,) number of each frame's recording.
+    """
+    found = np.full(max(len(result.world_T_rigs) - 1, 0), np.nan)
+    order = np.argsort(result.observation_frames, kind="stable")
+    bounds = np.searchsorted(result.observation_frames[order], np.arange(len(found) + 2))
+    for step, first, end in _sides(result.world_T_rigs[:, :3, 3], recordings):
+        before, behind = (
+            order[bounds[a] : bounds[b]] for a, b in ((first, step + 1), (step + 1, end))
+        )
+        middle = result.world_T_rigs[step : step + 2, :3, 3].mean(axis=0)
+        found[step] = _change(result, before, behind, middle)
+    return found
+
+
+def _sides(positions: np.ndarray, recordings: np.ndarray) -> Iterator[tuple[int, int, int]]:
+    """Steps with two frames and more on both sides: the step, the first frame of the side before
+    it, and the frame after the last one of the side behind it."""
+    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    walked = steps[steps > _STANDING_RATIO * np.sqrt(np.mean(steps**2))] if len(steps) else steps
+    if not len(walked):
+        return
+    along = np.concatenate([[0.0], np.cumsum(steps)])
+    reach = _REACH * float(np.median(walked)) * (1 + 1e-9)
+    for step in range(len(steps)):
+        own = np.flatnonzero(recordings == recordings[step])
+        first = max(int(np.searchsorted(along, along[step] - reach)), int(own[0]))
+        end = min(
+            int(np.searchsorted(along, along[step + 1] + reach, side="right")), int(own[-1]) + 1
+        )
+        if recordings[step] == recordings[step + 1] and step - first >= 1 and end - step >= 3:
+            yield step, first, end
+
+
+def _change(
+    result: Reconstruction, before: np.ndarray, behind: np.ndarray, middle: np.ndarray
+) -> float:
+    """Change of scale that may hide between two sides.
+
+    Args:
+        result: the map.
+        before, behind: observations of the frames of either side.
+        middle: (3,) place between them, from where distances count.
+    """
+    several = []
+    for rows in (before, behind):
+        names, counts = np.unique(result.observation_points[rows], return_counts=True)
+        several.append(names[counts > 1])
+    common = np.intersect1d(*several, assume_unique=True)
+    if len(common) < _MIN_POINTS:
+        return np.inf
+    ends, spreads = zip(
+        *(_triangulated(result, rows, common) for rows in (before, behind)), strict=True
+    )
+    mean = (ends[0] + ends[1]) / 2 - middle
+    lengths = np.maximum(np.linalg.norm(mean, axis=1), 1e-12)
+    towards = mean / lengths[:, None]
+    distances = [np.einsum("ni,ni->n", end - middle, towards) for end in ends]
+    known = np.ones(len(common), bool)
+    for distance, spread in zip(distances, spreads, strict=True):
+        variances = np.einsum("ni,nij,nj->n", towards, spread, towards)
+        known &= (distance > 0) & (variances < (_MAX_DISTANCE_SIGMA * lengths) ** 2)
+    if np.count_nonzero(known) < _MIN_POINTS:
+        return np.inf
+    logs = np.log(distances[1][known] / distances[0][known])
+    median = float(np.median(logs))
+    scatter = _MAD_SIGMAS * float(np.median(np.abs(logs - median)))
+    return abs(median) + _SIGMAS * _MEDIAN_ERROR * scatter / np.sqrt(len(logs))
+
+
+def _triangulated(
+    result: Reconstruction, rows: np.ndarray, points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Places (N, 3) of points (N,), ascending, by some observations alone, and their covariances
+    (N, 3, 3): NaN where the rays are parallel."""
+    index = np.searchsorted(points, result.observation_points[rows])
+    index[index == len(points)] = 0
+    own = points[index] == result.observation_points[rows]
+    rows, index = rows[own], index[own]
+    frames, origins = result.world_T_rigs[result.observation_frames[rows]], None
+    if result.observation_origins is not None:
+        origins = result.observation_origins[rows]
+    placed = moved_to(frames, origins)[:, :3, 3]
+    rays = np.einsum("oij,oj->oi", frames[:, :3, :3], result.observation_bearings[rows])
+    depths = np.linalg.norm(result.points_world[points[index]] - placed, axis=1)
+    weights = 1 / (np.maximum(depths, 1e-12) * result.observation_sigmas[rows]) ** 2
+    across = (np.eye(3) - rays[:, :, None] * rays[:, None, :]) * weights[:, None, None]
+    columns = np.hstack([across.reshape(-1, 9), np.einsum("oij,oj->oi", across, placed)])
+    sums = np.stack([np.bincount(index, column, len(points)) for column in columns.T], axis=1)
+    systems = sums[:, :9].reshape(-1, 3, 3)
+    lowest, _, highest = np.linalg.eigvalsh(systems).T
+    parallel = lowest <= _PARALLEL * highest
+    systems[parallel] = np.eye(3)
+    covariances = np.linalg.inv(systems)
+    places = np.einsum("nij,nj->ni", covariances, sums[:, 9:])
+    covariances[parallel] = np.nan
+    return places, covariances

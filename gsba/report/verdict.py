@@ -1,0 +1,236 @@
+"""The verdict on a run: whether its exported map is good to train on, and if not, where and why.
+
+Tests of figures that a finished run knows. Each that fails gives a reason: the frames that it holds
+for, the cause, and what to do. Limits are set by maps of known truth: those that are off by more
+than a hundredth of their extent shall not pass (benchmarks/results/verdict.md).
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from enum import StrEnum
+from typing import Any
+
+import numpy as np
+
+from gsba.report.map_figures import Figures, measure
+from gsba.report.maps import MIN_SHARE_OF_A_MAP
+from gsba.types import FrameSet, Reconstruction, RunStart
+
+MAX_POSITION_ERROR = 0.01  # of the extent, of a map that is good to train on
+MAX_UNSHARP_ERROR = 0.1  # of the extent; beyond, images do not determine the map
+# Of the extent, by a change of scale that may hide at a step: right maps have .0043 and less.
+MAX_MOVED_BY_SCALE = MAX_POSITION_ERROR / 2
+MAX_DEVIATION = 0.2  # of a step from the one that far frames predict, part of its length
+MAX_CONTRADICTED_SHARE = 0.25  # of the steps, by far frames
+MAX_HELD_SHARE = 0.25  # of the steps, by a start that images contradict elsewhere
+MAX_FALSE_SHARE = 0.1  # of the start's steps; above it the others are in doubt, too
+_MAX_NAMED_FRAMES = 6  # of a reason, in a line of text
+
+
+class Level(StrEnum):
+    """Levels of the verdict, from the best on."""
+
+    GOOD = "good to train"
+    LOOK = "look at these places"
+    REFUSED = "do not train"
+
+
+@dataclass(frozen=True, slots=True)
+class Reason:
+    """A test that failed."""
+
+    level: Level
+    frames: tuple[str, ...]  # names of the frames that it holds for; () = the whole map
+    cause: str
+    remedy: str  # what to do
+
+    def line(self) -> str:
+        """Place, cause and remedy in a line."""
+        place = f"{', '.join(self.frames)}: " if self.frames else ""
+        if len(self.frames) > _MAX_NAMED_FRAMES:
+            place = f"{self.frames[0]} to {self.frames[-1]} ({len(self.frames)} frames): "
+        return f"{place}{self.cause}; {self.remedy}"
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """The level, a sentence for the user, the reasons with the worst first, and the figures."""
+
+    level: Level
+    sentence: str
+    reasons: tuple[Reason, ...]
+    figures: Figures
+
+    def to_json(self) -> dict[str, Any]:
+        """Section `verdict` of report.json."""
+        found = asdict(self)
+        for row, reason in zip(found["reasons"], self.reasons, strict=True):
+            row["line"] = reason.line()
+        return found
+
+
+def judge(report: Mapping[str, Any], main: Reconstruction, shown: FrameSet) -> Verdict:
+    """Verdict on a run.
+
+    Args:
+        report: content of report.json.
+        main: the exported map.
+        shown: its frames.
+    """
+    return verdict_on(measure(report, main, shown), report, shown.names)
+
+
+def verdict_on(figures: Figures, report: Mapping[str, Any], names: Sequence[str]) -> Verdict:
+    """Verdict on the figures of an exported map of frames `names` (F,)."""
+    levels = list(Level)
+    found = _Tests(figures, report, names).failed()
+    reasons = tuple(sorted(found, key=lambda one: levels.index(one.level), reverse=True))
+    level = reasons[0].level if reasons else Level.GOOD
+    parts = [f"all {figures.frames} frames are in one map"]
+    if figures.exported < figures.frames:
+        parts = [f"{figures.exported} of {figures.frames} frames are in the map"]
+    # Where a step is in doubt, covariances do not tell how far the map is off.
+    doubted = [one.cause for one in reasons if one.level == Level.REFUSED or one.frames]
+    parts += [reasons[0].cause] if doubted else [_accuracy(figures)]
+    parts += [_camera(report)] if level != Level.REFUSED else []
+    return Verdict(level, f"{level}: {'; '.join(filter(None, parts))}", reasons, figures)
+
+
+@dataclass(frozen=True, slots=True)
+class _Tests:
+    """The tests; each gives a reason or more where it fails."""
+
+    figures: Figures
+    report: Mapping[str, Any]
+    names: Sequence[str]  # (F,) of the frames
+
+    def failed(self) -> Iterator[Reason]:
+        """Reasons of all tests that fail."""
+        yield from self._frames_out()
+        if not self.figures.points:
+            cause = "the camera turned on the spot: there are rotations and no points"
+            yield Reason(Level.REFUSED, (), cause, "walk while you film: a trainer needs parallax")
+            return
+        yield from self._unrefined()
+        yield from self._held()
+        yield from self._loosely_scaled()
+        yield from self._uncertain()
+        yield from self._contradicted()
+
+    @property
+    def _start(self) -> str:
+        return self.report.get("start", RunStart.TRAJECTORY)
+
+    def _frames_out(self) -> Iterator[Reason]:
+        """Frames that are not in the exported map."""
+        exported, num = self.figures.exported, self.figures.frames
+        if exported == num:
+            return
+        inside = {*self.names, *self.report["frame_lists"].get("fetched", ())}
+        out = tuple(row["name"] for row in self.report["frames"] if row["name"] not in inside)
+        why = next((one["reason"] for one in self.report["maps"][1:] if one["reason"]), "")
+        cause = f"no matches tie {len(out)} of {num} frames to the exported map"
+        remedy = "film the way between without a pause next time, and slowly through doors"
+        if len(self.report["maps"]) > 1:
+            remedy = f"gsba export RUN --map 2 exports the next map; {remedy}"
+        level = Level.REFUSED if exported < MIN_SHARE_OF_A_MAP * num else Level.LOOK
+        yield Reason(level, out, f"{cause} ({why})" if why else cause, remedy)
+
+    def _unrefined(self) -> Iterator[Reason]:
+        """Frames that images do not constrain."""
+        rows = self.figures.unrefined
+        if rows:
+            cause = f"hardly any matches: the pose is that of the {self._start}"
+            remedy = "leave these frames out of the training, or give sharper ones"
+            yield Reason(Level.LOOK, tuple(self.names[f] for f in rows), cause, remedy)
+
+    def _held(self) -> Iterator[Reason]:
+        """Steps that no image shows."""
+        held, num = self.figures.held_steps, self.figures.num_steps
+        if not held:
+            return
+        false, doubt, level = self.figures.false_steps, "", Level.LOOK
+        if false > MAX_FALSE_SHARE * num:
+            doubt = f", though images contradict it at {false} others"
+            level = Level.REFUSED if len(held) > MAX_HELD_SHARE * num else level
+        cause = (
+            f"no image shows {len(held)} of {num} steps: there the {self._start} is believed as it "
+            f"is{doubt}"
+        )
+        remedy = (
+            "compare both sides of the place in gsba view RUN; next time walk slower there, with "
+            "more light, or give frames closer together"
+        )
+        yield Reason(level, self._ends(held), cause, remedy)
+
+    def _loosely_scaled(self) -> Iterator[Reason]:
+        """Steps over which the scale is not carried on."""
+        changes = np.array(self.figures.scale_changes)
+        loose = np.flatnonzero(np.array(self.figures.moved_by_scale) > MAX_MOVED_BY_SCALE)
+        if not len(loose):
+            return
+        worst = changes[loose].max()
+        size = f"by up to {100 * worst:.2g} %" if np.isfinite(worst) else "by any factor"
+        cause = (
+            f"few points are seen from both sides of {len(loose)} of {self.figures.num_steps} "
+            f"steps: what lies behind may be larger or smaller {size}"
+        )
+        remedy = (
+            "give frames closer together there (of a video leave --fps out), walk slowly through "
+            "doors, and come back to places where you were"
+        )
+        yield Reason(Level.LOOK, self._ends(loose.tolist()), cause, remedy)
+
+    def _uncertain(self) -> Iterator[Reason]:
+        """Positions that the images hold too loosely."""
+        error = self.figures.position_error
+        if error > MAX_POSITION_ERROR:
+            level = Level.REFUSED if error > MAX_UNSHARP_ERROR else Level.LOOK
+            cause = f"positions may be off by {100 * error:.2g} % of the path's extent"
+            remedy = "walk further than a few steps; sharper or larger pictures help"
+            yield Reason(level, (), cause, remedy)
+
+    def _contradicted(self) -> Iterator[Reason]:
+        """Steps that frames further away contradict."""
+        wrong = np.flatnonzero(np.array(self.figures.deviations) > MAX_DEVIATION).tolist()
+        num = self.figures.num_steps
+        if wrong:
+            level = Level.REFUSED if len(wrong) > MAX_CONTRADICTED_SHARE * num else Level.LOOK
+            cause = f"frames further away contradict {len(wrong)} of {num} steps"
+            remedy = (
+                "look for things that move, and mask them (--masks distractors); leave these "
+                "frames out of the training"
+            )
+            yield Reason(level, self._ends(wrong), cause, remedy)
+
+    def _ends(self, steps: Sequence[int]) -> tuple[str, ...]:
+        """Names of the frames at both ends of steps, in order."""
+        return tuple(self.names[f] for f in sorted({f for s in steps for f in (s, s + 1)}))
+
+
+def _accuracy(figures: Figures) -> str:
+    """How far positions may be off; "" = not known."""
+    share, metres = figures.position_error, figures.extent_metres
+    if not math.isfinite(share):
+        return ""
+    size = f"{100 * share:.2g} % of the path's extent"
+    if math.isfinite(metres):
+        size = f"{1e3 * share * metres:.2g} mm ({size})"
+    pixels = figures.neighbour_pixels
+    shift = f", {pixels:.2g} pixels in a neighbour's picture" if math.isfinite(pixels) else ""
+    return f"positions may be off by up to {size}{shift}"
+
+
+def _camera(report: Mapping[str, Any]) -> str:
+    """What was found of the camera; "" = it was not looked for."""
+    found = report.get("camera") or {}
+    if not found:
+        return ""
+    if not found["taken"]:
+        return "the camera has one centre"
+    metres, readout = found.get("metres_per_unit"), found.get("readout") or {}
+    unit, scale = ("mm", 1e3 * metres) if metres else ("map units", 1.0)
+    text = f"two lenses {scale * found['baseline']:.3g} {unit} apart"
+    rows = f", rows read in {readout['ms']:.3g} ms" if readout.get("ms") else ""
+    return text + rows if readout.get("taken") else text

@@ -1,0 +1,134 @@
+"""The verdict: its level, its sentence and its reasons, by the figures of a map."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gsba.report.map_figures import Figures, _smaller_sides
+from gsba.report.verdict import Level, Verdict, verdict_on
+from gsba.types import RunStart
+
+NUM = 20
+NAMES = tuple(f"{n:03d}" for n in range(NUM))
+GOOD = Figures(
+    frames=NUM,
+    exported=NUM,
+    points=5000,
+    position_error=0.0004,
+    neighbour_pixels=0.13,
+    extent_metres=math.nan,
+    held_steps=(),
+    false_steps=0,
+    unrefined=(),
+    scale_changes=(math.nan, *(0.003,) * (NUM - 3), math.nan),
+    moved_by_scale=(math.nan, *(0.0007,) * (NUM - 3), math.nan),
+    deviations=(0.01,) * (NUM - 1),
+)
+LOOSE = {"scale_changes": (0.0, 0.0, 0.053, 0.03), "moved_by_scale": (0.0, 0.0, 0.012, 0.004)}
+
+
+def _verdict(figures: Figures, names: tuple[str, ...] = NAMES, **more: Any) -> Verdict:
+    report = {
+        "start": RunStart.ODOMETRY,
+        "frames": [{"name": name} for name in NAMES],
+        "frame_lists": {"fetched": []},
+        "maps": [{"reason": None}] * (1 + (len(names) < NUM)),
+    }
+    return verdict_on(figures, report | more, names)
+
+
+def test_a_good_map_is_said_to_be_good_in_a_sentence() -> None:
+    found = _verdict(GOOD)
+    assert (found.level, found.reasons) == (Level.GOOD, ())
+    assert found.sentence == (
+        "good to train: all 20 frames are in one map; positions may be off by up to 0.04 % of "
+        "the path's extent, 0.13 pixels in a neighbour's picture"
+    )
+
+
+def test_lengths_are_metres_where_the_scale_is_known_and_the_camera_is_named() -> None:
+    camera = {"taken": True, "baseline": 0.052, "metres_per_unit": 0.6}
+    camera |= {"readout": {"taken": True, "ms": 13.24}}
+    sentence = _verdict(replace(GOOD, extent_metres=11.0), camera=camera).sentence
+    assert "up to 4.4 mm (0.04 % of the path's extent)" in sentence
+    assert sentence.endswith("; two lenses 31.2 mm apart, rows read in 13.2 ms")
+    one = _verdict(GOOD, camera={"taken": False}).sentence
+    assert one.endswith("; the camera has one centre")
+
+
+@pytest.mark.parametrize(
+    ("figures", "level", "frames", "cause"),
+    [
+        ({"held_steps": (3,)}, Level.LOOK, "003 004", "no image shows 1 of 19 steps: there the"),
+        ({"held_steps": tuple(range(9))}, Level.LOOK, None, "no image shows 9 of 19 steps"),
+        (
+            {"held_steps": tuple(range(9)), "false_steps": 3},
+            Level.REFUSED,
+            None,
+            "though images contradict it at 3 others",
+        ),
+        ({"unrefined": (5, 6)}, Level.LOOK, "005 006", "the pose is that of the odometry"),
+        (
+            LOOSE,
+            Level.LOOK,
+            "002 003",
+            "1 of 19 steps: what lies behind may be larger or smaller by up to 5.3 %",
+        ),
+        (
+            {"scale_changes": (0.0, math.inf), "moved_by_scale": (0.0, math.inf)},
+            Level.LOOK,
+            "001 002",
+            "smaller by any factor",
+        ),
+        ({"position_error": 0.02}, Level.LOOK, "", "may be off by 2 % of the path's extent"),
+        ({"position_error": 0.2}, Level.REFUSED, "", "may be off by 20 % of the path's extent"),
+        ({"deviations": (0.3, *(0.0,) * 18)}, Level.LOOK, "000 001", "contradict 1 of 19 steps"),
+        ({"deviations": (0.3,) * 19}, Level.REFUSED, None, "contradict 19 of 19 steps"),
+        ({"points": 0}, Level.REFUSED, "", "the camera turned on the spot"),
+    ],
+)
+def test_each_failed_test_names_place_cause_and_remedy(
+    figures: dict[str, Any], level: Level, frames: str | None, cause: str
+) -> None:
+    found = _verdict(replace(GOOD, **figures))
+    (reason,) = found.reasons
+    assert (found.level, reason.level) == (level, level)
+    assert cause in reason.cause and reason.remedy
+    assert frames is None or " ".join(reason.frames) == frames
+    assert found.sentence.startswith(f"{level}: ")
+    assert ("positions may be off by up to" in found.sentence) == (
+        cause.startswith("may be off by 2 %")
+    )
+
+
+@pytest.mark.parametrize(("inside", "level"), [(19, Level.LOOK), (9, Level.REFUSED)])
+def test_frames_that_are_not_exported_are_named(inside: int, level: Level) -> None:
+    figures = replace(GOOD, exported=inside)
+    maps = [{"reason": None}, {"reason": "too few matches"}]
+    found = _verdict(figures, NAMES[:inside], maps=maps)
+    (reason,) = found.reasons
+    assert (found.level, reason.frames) == (level, NAMES[inside:])
+    assert f"tie {NUM - inside} of 20 frames to the exported map (too few matches)" in reason.cause
+    assert "gsba export RUN --map 2" in reason.remedy
+    assert f"{inside} of 20 frames are in the map" in found.sentence
+
+
+def test_the_worst_reason_is_the_first_and_gives_the_level() -> None:
+    figures = replace(GOOD, held_steps=(3,), position_error=0.3, unrefined=(2,))
+    found = _verdict(figures)
+    assert [one.level for one in found.reasons] == [Level.REFUSED, Level.LOOK, Level.LOOK]
+    assert found.level == Level.REFUSED and "30 %" in found.sentence
+
+
+def test_many_frames_are_counted_in_a_line() -> None:
+    found = _verdict(replace(GOOD, held_steps=tuple(range(9))))
+    assert found.reasons[0].line().startswith("000 to 009 (10 frames): no image shows")
+    assert found.to_json()["reasons"][0]["line"] == found.reasons[0].line()
+
+
+def test_a_change_of_scale_moves_the_smaller_side_of_a_walk() -> None:
+    walk = np.column_stack([np.arange(5.0), [0.0, 0.0, 0.0, 0.0, 3.0], np.zeros(5)])
+    np.testing.assert_allclose(_smaller_sides(walk), [0.0, 1.0, 2.0, 0.0], rtol=1e-12)
