@@ -40,6 +40,7 @@ def overview(run: Path) -> dict[str, Any]:
         "seconds": seconds,
         "notes": report.get("notes", []),
         "camera": report.get("camera"),
+        "verdict": _verdict(report),
         "recordings": [
             str(one["name"])
             for one in report.get("recordings") or ()
@@ -48,6 +49,24 @@ def overview(run: Path) -> dict[str, Any]:
         "files": [name for name in _FILES if (run / name).is_file()],
         "figures": sorted(path.name for path in run.glob("figures/*.png")),
     }
+
+
+def brief_facts(run: Path) -> dict[str, str]:
+    """Facts about a run for a list: its verdict, and how many frames were refined."""
+    found = overview(run)
+    if not found["finished"]:
+        return {"state": "not finished"}
+    summary, verdict = found["summary"], found["verdict"]
+    facts = {"verdict": verdict["level"]} if verdict else {}
+    return facts | {"frames": f"{summary.get('refined')} of {summary.get('frames')} refined"}
+
+
+def _verdict(report: dict[str, Any]) -> dict[str, str] | None:
+    """Level and sentence of a report's verdict; None = it has none."""
+    found = report.get("verdict")
+    if not isinstance(found, dict) or not found.get("sentence"):
+        return None
+    return {"level": str(found.get("level")), "sentence": str(found["sentence"])}
 
 
 def camera_so_far(run: Path, done: Sequence[str]) -> list[str]:
