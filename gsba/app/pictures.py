@@ -42,20 +42,22 @@ def picture_of(path: Path, width: int, share: float) -> bytes:
 
 
 def frame_of(run: Path, frame: int, width: int) -> bytes:
-    """JPEG of the panorama of a finished run's frame, or of its first face.
+    """JPEG of the panorama of a finished run's frame, of all its maps.
 
     Raises:
         GsbaError: it is no finished run, has no such frame, or the frame cannot be decoded.
     """
-    from gsba.frames.pixels import load_erp, load_faces
-    from gsba.store.finished import load_run
+    from gsba.report.html.pictures import small_panorama
+    from gsba.store.store import load_stage
+    from gsba.types import FrameSet, Reconstruction
 
-    _, frames = load_run(run)
+    frames = load_stage(run, "frames", FrameSet)
+    formats = load_stage(run, "reconstruction", Reconstruction).formats
+    frames = frames.with_formats(formats or frames.formats)
     if not 0 <= frame < len(frames):
         raise GsbaError(f"{run} has no frame {frame}: it has {len(frames)}")
-    if frames.format_of(frame).panoramic:
-        return _jpeg(load_erp(frames, frame, width=width)[..., ::-1], width)
-    return _jpeg(load_faces(frames, frame)[0][..., ::-1], width)
+    widest = frames.format_of(frame).panorama_width
+    return _jpeg(small_panorama(frames, frame, min(width, widest))[..., ::-1], width)
 
 
 def _jpeg(image: Any, width: int) -> bytes:

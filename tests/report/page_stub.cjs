@@ -15,7 +15,7 @@ function element(id) {
   const node = {
     id, dataset: {}, style: {}, listeners: {}, children: [], textContent: id === "data" ? data : "",
     clientWidth: 400, clientHeight: 200, offsetWidth: 50, offsetHeight: 20, width: 0, height: 0,
-    append(...c) { node.children.push(...c); }, setAttribute() {}, remove() {}, setPointerCapture() {},
+    complete: true, naturalWidth: 4, append(...c) { node.children.push(...c); }, replaceChildren(...c) { node.children = c; }, setAttribute() {}, remove() {}, setPointerCapture() {},
     addEventListener(kind, f) { (node.listeners[kind] ??= []).push(f); },
     getContext: () => node.context ??= context(),
   };
@@ -35,7 +35,7 @@ globalThis.matchMedia = () => ({ matches: true, addEventListener() {} });
 globalThis.requestAnimationFrame = f => f();
 (0, eval)(script.replaceAll('"use strict";', ""));
 const event = { offsetX: 120, offsetY: 80, clientX: 10, clientY: 10, deltaY: 50, key: "+", pointerId: 1, preventDefault() {} };
-for (const node of all) for (const kind of ["pointermove", "pointerdown", "pointermove", "pointerup", "wheel", "keydown", "dblclick", "pointerenter", "pointerleave", "change", "click"])
+for (const node of [...all]) for (const kind of ["pointermove", "pointerdown", "pointermove", "pointerup", "wheel", "keydown", "dblclick", "pointerenter", "pointerleave", "change", "click"])
   for (const f of node.listeners[kind] ?? []) f(event);
 if (errors.length) throw new Error("not finite: " + errors.slice(0, 3));
 console.log(JSON.stringify([byId.tiles.children.length, byId.run.textContent, byId.worst?.children.length, byId.stages.children.length, byId.notes?.children[0]?.children,
