@@ -22,7 +22,7 @@ function compare(first) {
     done.forEach((one, k) => [["frames refined", `${one.summary.refined} of ${one.summary.frames}`], ...figures(one)]
       .forEach(([name, text]) => { (rows[name] = rows[name] || [])[k] = text; }));
     table.replaceChildren(done.length ? make("table", {},
-      make("thead", {}, make("tr", {}, make("th", {}, ""), ...done.map((one) => make("th", { scope: "col" }, one.path)))),
+      make("thead", {}, make("tr", {}, make("th", { scope: "col" }, "Figure"), ...done.map((one) => make("th", { scope: "col" }, one.path)))),
       make("tbody", {}, ...Object.entries(rows).map(([name, cells]) => make("tr", {}, make("th", { scope: "row" }, name),
         ...done.map((_, k) => make("td", { class: "number" }, cells[k] || "")))))) : "No finished run is chosen.");
   };
