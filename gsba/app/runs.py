@@ -22,6 +22,7 @@ T = TypeVar("T")
 _MAX_POINTS = 4000  # of a map from above
 _NO_MAP: dict[str, Any] = {"stage": "", "path": [], "points": [], "colors": None, "starts": []}
 _POSES, _POINTS, _COLORS = "world_T_rigs", "points_world", "point_colors"
+_LEVELS = {"good to train": "good", "look at these places": "look", "do not train": "stop"}
 _FILES = ("report.html", "trajectory.tum", "points.ply", "poses.csv", "config.toml")
 
 
@@ -61,12 +62,18 @@ def brief_facts(run: Path) -> dict[str, str]:
     return facts | {"frames": f"{summary.get('refined')} of {summary.get('frames')} refined"}
 
 
-def _verdict(report: dict[str, Any]) -> dict[str, str] | None:
-    """Level and sentence of a report's verdict; None = it has none."""
+def _verdict(report: dict[str, Any]) -> dict[str, Any] | None:
+    """Verdict of a report: "level" (good, look or stop), "sentence" and "reasons"; None = none."""
     found = report.get("verdict")
     if not isinstance(found, dict) or not found.get("sentence"):
         return None
-    return {"level": str(found.get("level")), "sentence": str(found["sentence"])}
+    level = str(found.get("level"))
+    reasons = [one for one in found.get("reasons") or () if isinstance(one, dict)]
+    return {
+        "level": _LEVELS.get(level, level if level in _LEVELS.values() else "look"),
+        "sentence": str(found["sentence"]).removeprefix(f"{level}: "),
+        "reasons": [str(one["line"]) for one in reasons if "line" in one],
+    }
 
 
 def camera_so_far(run: Path, done: Sequence[str]) -> list[str]:

@@ -64,9 +64,10 @@ async function results(where, run, current) {
 function verdictCard(found) {
   const summary = found.summary, counts = `${summary.refined} of ${summary.frames} frames refined`;
   if (!found.verdict) return card(counts);
-  const { level, sentence } = found.verdict, title = { good: "Good to train", look: "Look at these places", stop: "Do not train" };
+  const { level, sentence, reasons } = found.verdict, title = { good: "Good to train", look: "Look at these places", stop: "Do not train" };
   return make("section", { class: `card verdict ${level}` }, make("h2", {}, title[level] || "Verdict"),
-    make("p", {}, sentence), make("p", { class: "faint" }, counts));
+    make("p", {}, sentence), reasons.length ? make("ul", {}, ...reasons.map((reason) => make("li", {}, reason))) : null,
+    make("p", { class: "faint" }, counts));
 }
 
 function figureCard(paths) {
