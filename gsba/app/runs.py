@@ -59,7 +59,8 @@ def brief_facts(run: Path) -> dict[str, str]:
         return {"state": "not finished"}
     summary, verdict = found["summary"], found["verdict"]
     facts = {"verdict": verdict["level"]} if verdict else {}
-    return facts | {"frames": f"{summary.get('refined')} of {summary.get('frames')} refined"}
+    counts = f"{summary.get('refined')} of {summary.get('frames')} frames refined"
+    return facts | {"refined": counts}
 
 
 def _verdict(report: dict[str, Any]) -> dict[str, Any] | None:

@@ -158,7 +158,11 @@ def figures_are_drawn(page: Any) -> None:
 
 def test_from_a_video_to_a_dataset(browser: Any, server: Server) -> None:
     page = opened(browser, server.address, DESK)
+    page.get_by_text("stitched panoramas, 512x256 · 7.5 s, 60 frames").wait_for()
+    page.locator(".files .shot img").wait_for()
+    picture(page, "app-files")
     chosen(page, "first")
+    page.get_by_text("Drag to look around.").wait_for()
     page.get_by_text("Fast", exact=True).click()
     page.locator("#command", has_text="--config fast").wait_for()
     picture(page, "app-new")

@@ -65,7 +65,7 @@ def test_the_verdict_is_that_of_the_report(
     (tmp_path / "report.json").write_text(json.dumps(report))
     shown = overview(tmp_path)["verdict"]
     assert shown == {"level": level, "sentence": sentence, "reasons": reasons}
-    assert brief_facts(tmp_path) == {"verdict": level, "frames": "8 of 9 refined"}
+    assert brief_facts(tmp_path) == {"verdict": level, "refined": "8 of 9 frames refined"}
     for nothing in ({}, {"level": "good"}, None, "good", []):
         (tmp_path / "report.json").write_text(json.dumps(report | {"verdict": nothing}))
         assert overview(tmp_path)["verdict"] is None

@@ -54,7 +54,7 @@ async function fillInSight(rows, inSight, watch) {
 // Facts of `gsba info` in one or two lines.
 function shortFacts({ facts, problem }) {
   const known = facts || {}, lines = [];
-  const first = [known.camera, known.layout || known.size, known.frames].filter(Boolean).join(" · ");
+  const first = [known.camera, known.layout || known.size, lengthOf(known.frames), known.refined].filter(Boolean).join(" · ");
   if (known.verdict) lines.push(make("span", { class: `level ${known.verdict}` }, LEVELS[known.verdict] || known.verdict));
   if (known.state) lines.push(make("span", {}, known.state));
   if (first) lines.push(make("span", {}, first));
@@ -63,6 +63,12 @@ function shortFacts({ facts, problem }) {
   // A single image is no fault of a list; other problems are said where they are seen first.
   if (problem && !/ is one image: /.test(problem)) lines.push(make("span", { class: "error" }, problem));
   return lines;
+}
+// "60, 8 a second, 7.5 s" of a video as "7.5 s, 60 frames"; frames without times have no length.
+function lengthOf(text) {
+  if (!text) return "";
+  const parts = text.split(", "), last = parts[parts.length - 1];
+  return `${/ (s|min)\b/.test(last) ? `${last}, ` : ""}${parts[0]} frames`;
 }
 function sensor(name, text) {
   if (/not checked|pip install/.test(text)) return `${name}: not checked`;
