@@ -7,6 +7,7 @@ of damaged files may hang or crash: the server then ends this process and starts
 import json
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +19,12 @@ _NICENESS = 10  # runs come first
 
 
 def picture_of(path: Path, width: int, share: float) -> bytes:
-    """JPEG of a video's frame, of an image, or of a folder's first image.
+    """JPEG of a video's frame, of an image, or of an image of a folder.
 
     Args:
-        path: video, image, or folder with images.
+        path: video, image, or folder with images, or with folders of these, one a lens.
         width: pixels across; smaller pictures keep their size.
-        share: place in a video, 0..1 of its duration.
+        share: place in a video or folder, 0..1 of its duration or images.
 
     Raises:
         GsbaError: there is no picture, or it cannot be decoded.
@@ -32,13 +33,18 @@ def picture_of(path: Path, width: int, share: float) -> bytes:
     from gsba.video.timeline import is_video, picture_near
 
     if path.is_dir():
-        images = sorted(each for each in path.iterdir() if is_image(each))
-        if not images:
+        folders = (path, *sorted(each for each in path.iterdir() if each.is_dir()))
+        images = next(filter(None, (_images_in(folder, is_image) for folder in folders)), None)
+        if images is None:
             raise GsbaError(f"{path} holds no images")
         path = images[int(share * (len(images) - 1))]
     if is_video(path):
         return _jpeg(picture_near(path, share), width)
     return _jpeg(decode(path, image_size(path), at_least=width)[..., ::-1], width)
+
+
+def _images_in(folder: Path, is_image: Callable[[Path], bool]) -> list[Path]:
+    return sorted(each for each in folder.iterdir() if is_image(each))
 
 
 def frame_of(run: Path, frame: int, width: int) -> bytes:
@@ -97,8 +103,10 @@ def main() -> None:
 
     os.nice(_NICENESS)
     cv2.setNumThreads(1)
+    answers = os.fdopen(os.dup(sys.stdout.fileno()), "w")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # words of libraries are no answers
     for line in sys.stdin:
-        print(json.dumps(answer(json.loads(line))), flush=True)
+        print(json.dumps(answer(json.loads(line))), file=answers, flush=True)
 
 
 if __name__ == "__main__":

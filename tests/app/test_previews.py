@@ -97,6 +97,10 @@ def test_one_task_is_answered_in_one_line(root: Path, tmp_path: Path) -> None:
     assert answer(task | {"path": str(root / "frames")}) == {}
     image = cv2.imread(str(out))
     assert image is not None and image.shape == (32, 64, 3)
+    assert answer(task | {"path": str(root)}) == {}
+    (root / "lenses").mkdir()
+    (root / "frames").rename(root / "lenses/front")  # a folder for each lens
+    assert answer(task | {"path": str(root / "lenses")}) == {}
     for path in ("broken.mp4", "empty", "notes.txt", "nothing.jpg"):
         assert path in answer(task | {"path": str(root / path)})["error"]
     run = answer({"kind": "frame", "frame": 0, "width": 64, "out": "", "path": str(root)})

@@ -24,7 +24,7 @@ function compare(first) {
     table.replaceChildren(done.length ? make("table", {},
       make("thead", {}, make("tr", {}, make("th", { scope: "col" }, "Figure"), ...done.map((one) => make("th", { scope: "col" }, one.path)))),
       make("tbody", {}, ...Object.entries(rows).map(([name, cells]) => make("tr", {}, make("th", { scope: "row" }, name),
-        ...done.map((_, k) => make("td", { class: "number" }, cells[k] || "")))))) : "No finished run is chosen.");
+        ...done.map((_, k) => make("td", { class: "number" }, cells[k] || "")))))) : "Choose two finished runs above, or more: their figures stand side by side here.");
   };
   const pick = (path, kind) => {
     message.textContent = kind === "run" ? "" : `${path} is no run`;

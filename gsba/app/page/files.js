@@ -122,8 +122,10 @@ async function footage(path) {
     location.hash = open(to, one.path);
   };
   const up = found.parent === null ? null : make("a", { href: open("files", found.parent) }, "One folder up");
-  const whole = found.images ? make("button", { type: "button", class: "main", onclick: () => { location.hash = open("start", found.path); } },
-    `Use these ${found.images} images`) : null;
+  const use = (kind, text) => make("button", { type: "button", class: kind, onclick: () => { location.hash = open("start", found.path); } }, text);
+  const inner = found.parent !== null && found.entries.some((one) => one.kind === "folder");
+  const whole = found.images ? use("main", `Use these ${found.images} images`)
+    : inner ? use("", "Use this folder, with a folder for each lens or recording") : null;
   const bar = make("div", { class: "row" }, up, whole);
   where.replaceChildren(...unfinishedCards(found),
     found.entries.length ? card("", bar, fileList(found.entries, go), leftOut(found)) : make("div", {}, bar, lesson()));
