@@ -81,6 +81,8 @@ class Previews:
             pending = known is None or shown is None
             known = known or {"facts": None, "problem": None}
             problem = known.get("error", known.get("problem"))
+            if path.is_dir():  # a folder of several recordings is no fault
+                problem = problem and ""
             drawn = shown is not None and "error" not in shown
             known = {"facts": known.get("facts", {}), "problem": problem}
             found.append(known | {"picture": drawn, "pending": pending})
@@ -258,10 +260,8 @@ def _started(root: Path) -> subprocess.Popen[bytes]:
 
 
 def _has_preview(path: Path) -> bool:
-    """True for videos, images, runs, and folders that hold images."""
-    if path.is_dir():
-        return is_run_folder(path) or any(is_image(each) for each in path.iterdir())
-    return path.is_file() and (is_video(path) or is_image(path))
+    """True for videos, images and folders."""
+    return path.is_dir() or (path.is_file() and (is_video(path) or is_image(path)))
 
 
 def _lasts(answer: dict[str, Any]) -> bool:
