@@ -15,9 +15,10 @@ function element(id) {
   const node = {
     id, dataset: {}, style: {}, listeners: {}, children: [], textContent: id === "data" ? data : "",
     clientWidth: 400, clientHeight: 200, offsetWidth: 50, offsetHeight: 20, width: 0, height: 0,
-    complete: true, naturalWidth: 4, append(...c) { node.children.push(...c); }, replaceChildren(...c) { node.children = c; }, setAttribute() {}, remove() {}, setPointerCapture() {},
+    append(...c) { node.children.push(...c); }, setAttribute() {}, remove() {}, setPointerCapture() {},
     addEventListener(kind, f) { (node.listeners[kind] ??= []).push(f); },
     getContext: () => node.context ??= context(),
+    replaceChildren(...c) { node.children = c; }, complete: true, naturalWidth: 4,
   };
   all.push(node);
   return node;
