@@ -8,6 +8,7 @@ import json
 import os
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -48,18 +49,19 @@ def _images_in(folder: Path, is_image: Callable[[Path], bool]) -> list[Path]:
 
 
 def frame_of(run: Path, frame: int, width: int) -> bytes:
-    """JPEG of the panorama of a finished run's frame, of all its maps.
+    """JPEG of the panorama of a run's frame, read by the calibration that the run found, if it has.
 
     Raises:
-        GsbaError: it is no finished run, has no such frame, or the frame cannot be decoded.
+        GsbaError: it is no run, has no such frame yet, or the frame cannot be decoded.
     """
     from gsba.report.html.pictures import small_panorama
     from gsba.store.store import load_stage
     from gsba.types import FrameSet, Reconstruction
 
     frames = load_stage(run, "frames", FrameSet)
-    formats = load_stage(run, "reconstruction", Reconstruction).formats
-    frames = frames.with_formats(formats or frames.formats)
+    with suppress(GsbaError):  # the run goes on
+        found = load_stage(run, "reconstruction", Reconstruction)
+        frames = frames.with_formats(found.formats or frames.formats)
     if not 0 <= frame < len(frames):
         raise GsbaError(f"{run} has no frame {frame}: it has {len(frames)}")
     widest = frames.format_of(frame).panorama_width

@@ -19,7 +19,7 @@ from gsba.disk import write_json
 from gsba.frames.files import is_image
 from gsba.frames.lens_names import lens_files
 from gsba.log import GsbaError
-from gsba.store.folder import is_run_folder
+from gsba.store.folder import STAGES, is_run_folder
 from gsba.version import __version__
 from gsba.video.timeline import is_video
 
@@ -149,10 +149,13 @@ class Previews:
 
     def _task(self, path: Path, values: dict[str, Any]) -> _Task:
         """A task whose result is kept under the state of the file, and of the other lens's."""
+        files = [path, *(lens_files(path) or ())]
+        if is_run_folder(path):
+            files = [path / STAGES / f"{name}.npz" for name in ("frames", "reconstruction")]
         states = []
-        for each in dict.fromkeys([path, *(lens_files(path) or ())]):
+        for each in dict.fromkeys(files):
             try:
-                found = (each / "report.json" if is_run_folder(each) else each).stat()
+                found = each.stat()
                 states.append([each.name, found.st_size, found.st_mtime_ns])
             except OSError:
                 states.append([each.name])

@@ -55,12 +55,13 @@ function actions(job) {
 
 function job(id) {
   const head = make("div"), now = make("div"), stages = make("ul", { class: "plain stages" });
-  const canvas = make("canvas", { role: "img" }), caption = make("p", { class: "faint" });
+  let run = "";
+  const seen = places(() => run), plan = seen.plan;
   const notes = make("div"), log = make("pre", { class: "log" }), after = make("div");
-  const plan = card("From above", canvas, caption), stageCard = card("Stages", stages);
+  const stageCard = card("Stages", stages);
   const output = make("details", { class: "card" }, make("summary", {}, "Output of the command"), log);
   show(head, after, make("div", { class: "two" }, make("div", {}, now, plan),
-    make("div", {}, notes, stageCard)), output);
+    make("div", {}, seen.looks, notes, stageCard)), output);
   let drawn = "", shownStatus = "";
   follow(async (current) => {
     const found = await ask(`api/jobs/${id}`);
@@ -79,9 +80,9 @@ function job(id) {
       const map = await ask(`api/jobs/${id}/map`);
       if (!current()) return false;
       drawn = key;
-      drawPlan(canvas, map);
-      caption.textContent = map.stage === "odometry" ? `${map.path.length} keyframes of the odometry`
-        : map.path.length ? `${map.path.length} frames, after: ${titleOf(progress, map.stage)}` : "Nothing yet.";
+      run = found.run;
+      seen.show(map, map.stage === "odometry" ? `${map.path.length} keyframes of the odometry`
+        : map.path.length ? `${map.path.length} frames, after: ${titleOf(progress, map.stage)}` : "Nothing yet.");
     }
     if (found.status !== shownStatus) {
       shownStatus = found.status;
@@ -122,7 +123,7 @@ function fillNow(now, job) {
   }
   const parts = [make("p", {}, make("strong", {}, stage ? stage.title : work.what))];
   if (work && work.total) {
-    const rate = work.rate ? `${work.rate.toPrecision(3)} a second` : "";
+    const rate = work.rate ? `${Number(work.rate.toPrecision(3))} a second` : "";
     const more = [`${work.done} of ${work.total}`, rate, left ? `${spoken(left)} left` : "", work.note];
     parts.push(make("progress", { max: work.total, value: work.done, "aria-label": work.what }),
       make("p", { class: "faint" }, `${work.what}: ${more.filter(Boolean).join(", ")}`));

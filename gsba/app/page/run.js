@@ -97,32 +97,42 @@ function figures(found) {
 }
 
 function runPage(run) {
-  const where = make("div"), places = make("div");
-  show(make("h1", {}, run), where, places);
+  const where = make("div"), seen = places(() => run);
+  show(make("h1", {}, run), where, make("div", { class: "two" }, seen.plan, seen.looks));
   const own = view, current = () => own === view;
   results(where, run, current).catch((error) => failure(where, error));
-  ask(`api/run/map?path=${encodeURIComponent(run)}`)
-    .then((map) => current() && map.path.length && placesOf(places, run, map)).catch(() => undefined);
+  ask(`api/run/map?path=${encodeURIComponent(run)}`).then((map) => current() && seen.show(map)).catch(() => undefined);
 }
 
-// The path from above, and the panorama of the frame that is chosen on it.
-function placesOf(where, run, map) {
-  const canvas = make("canvas", { role: "img", class: "pointed" }), shown = panoramaView("Panorama of the chosen frame");
-  const slider = make("input", { type: "range", id: "frame", min: "0", max: String(map.path.length - 1), value: "0" });
-  let timer = 0;
+// Cards of the path from above, and of the panorama of the frame that is chosen on it; `runOf` gives the run's folder.
+function places(runOf) {
+  const canvas = make("canvas", { role: "img", class: "pointed" }), caption = make("p", { class: "faint" });
+  const slider = make("input", { type: "range", id: "frame", min: "0", value: "0" }), shown = panoramaView("Panorama of the chosen frame");
+  const choice = make("label", { for: "frame" }, "Frame: click the map, or move here", slider);
+  const plan = card("From above", canvas, choice, caption), looks = card("What the camera saw there", shown.figure);
+  let map = null, timer = 0, address = "";
   const choose = (frame) => {
     slider.value = String(frame);
     drawPlan(canvas, map, frame);
+    const next = picture(runOf(), `&frame=${frame}`);
+    if (next === address) return;
+    address = next;
     clearTimeout(timer); // a slider passes many frames
-    timer = setTimeout(() => shown.load(picture(run, `&frame=${frame}`), true, `Frame ${frame + 1} of ${map.path.length}`), 150);
+    timer = setTimeout(() => shown.load(next, true, `Frame ${frame + 1} of ${map.path.length}`), 150);
   };
   slider.addEventListener("input", () => choose(Number(slider.value)));
   canvas.addEventListener("click", (happening) => {
     const frame = nearestOnPlan(canvas, happening.offsetX, happening.offsetY);
-    if (frame >= 0) choose(frame);
+    if (frame >= 0 && !looks.hidden) choose(frame);
   });
-  where.replaceChildren(make("div", { class: "two" },
-    card("From above", canvas, make("label", { for: "frame" }, "Frame: click the map, or move here", slider)),
-    card("What the camera saw there", shown.figure)));
-  choose(0);
+  // Keyframes of the odometry are not files yet: they have no pictures.
+  const update = (newest, text = "") => {
+    map = newest;
+    caption.textContent = text;
+    looks.hidden = choice.hidden = !map.path.length || map.stage === "odometry";
+    slider.max = String(Math.max(map.path.length - 1, 0));
+    if (looks.hidden) drawPlan(canvas, map); else choose(Math.min(Number(slider.value), map.path.length - 1));
+  };
+  looks.hidden = choice.hidden = true;
+  return { plan, looks, show: update };
 }
