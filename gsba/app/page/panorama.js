@@ -20,8 +20,8 @@ void main() {
 // A canvas in a figure; `load(address)` shows another panorama, `message(text)` a line instead.
 function panoramaView(label) {
   const canvas = make("canvas", { class: "panorama", tabindex: 0, role: "img", "aria-label": `${label}. Arrow keys turn, plus and minus zoom.` });
-  const line = make("span", { role: "status" }), flat = make("img", { class: "flat", alt: label, hidden: true });
-  const figure = make("figure", {}, canvas, flat, make("figcaption", { class: "faint" }, line)), look = { yaw: 0, pitch: 0, fov: 1.6 };
+  const line = make("span", { role: "status" }), flat = make("img", { class: "flat", alt: label });
+  const figure = make("figure", {}, canvas, make("figcaption", { class: "faint" }, line)), look = { yaw: 0, pitch: 0, fov: 1.6 };
   let scene = null, newest = 0;
   const draw = () => { if (scene) scene.draw(look); };
   const turn = (yaw, pitch) => {
@@ -64,8 +64,13 @@ function panoramaView(label) {
     if (turnable && !scene) scene = sceneOn(canvas);
     const turned = turnable && scene !== null;
     canvas.hidden = !turned;
-    flat.hidden = turned;
-    if (turned) scene.show(image); else flat.src = address;
+    if (turned) {
+      flat.remove();
+      scene.show(image);
+    } else {
+      flat.src = address;
+      canvas.after(flat);
+    }
     draw();
     canvas.dataset.shown = address;
     message(done);
