@@ -47,7 +47,9 @@ def listing(root: Path, name: str) -> dict[str, Any]:
     entries = []
     for path in paths:
         if path.resolve().is_relative_to(base):
-            entries.append({"name": path.name, "path": _relative(base, path), "kind": _kind(path)})
+            kind, place = _kind(path), _relative(base, path)
+            size = path.stat().st_size if path.is_file() else None
+            entries.append({"name": path.name, "path": place, "kind": kind, "size": size})
     entries.sort(key=lambda entry: (entry["kind"] not in ("run", "folder"), entry["name"].lower()))
     here = _relative(base, folder)
     return {

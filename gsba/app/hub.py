@@ -1,7 +1,6 @@
 """State that all pages of a server share: the root, the commands, the jobs, the viewers."""
 
 import secrets
-import subprocess
 import threading
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -10,17 +9,16 @@ from typing import TYPE_CHECKING
 
 from gsba.app.forms import Form
 from gsba.app.jobs import Job, Jobs
+from gsba.app.previews import Previews
 from gsba.app.progress import Followed, Progress
-from gsba.app.worker import GSBA, ensure_worker
+from gsba.app.worker import ensure_worker
 from gsba.disk import write_text
-from gsba.log import GsbaError, brief
+from gsba.log import GsbaError
 from gsba.view import load_scene
 from gsba.view import serve as serve_view
 
 if TYPE_CHECKING:
     from gsba.view.display import View
-
-_INSPECTION_S = 60.0  # longest time that `gsba info` may take
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +28,8 @@ class Choices:
     cameras: tuple[str, ...]  # names for --camera
     presets: tuple[tuple[str, str], ...]  # name for --config, and what it is for
     masks: tuple[str, ...]  # words for --masks
-    exports: tuple[str, ...]  # programs and formats for --to
+    programs: tuple[str, ...]  # programs for --to
+    formats: tuple[str, ...]  # formats for --to
     settings: tuple[tuple[str, str, str], ...]  # name for --set, default, allowed values
 
 
@@ -59,6 +58,7 @@ class App:
         self.forms = {form.command: form for form in forms}
         self.choices, self.check = choices, check
         self.token = _kept_token(state / "token")
+        self.previews = Previews(self.root, state.resolve() / "previews")
         self._followed: dict[str, Followed] = {}
         self._views: dict[Path, View] = {}
         self._lock = threading.Lock()  # of viewers and of progress: requests come from threads
@@ -68,29 +68,6 @@ class App:
         """Progress of a job by its events so far."""
         with self._lock:
             return self._followed.setdefault(job.id, Followed(job.events)).now()
-
-    def inspect(self, path: Path) -> str:
-        """JSON text of `gsba info` for a path below the root.
-
-        Raises:
-            GsbaError: it cannot be described.
-        """
-        name = path.relative_to(self.root).as_posix()
-        try:
-            found = subprocess.run(
-                [*GSBA, "-q", "info", "--json", f"./{name}"],
-                cwd=self.root,
-                capture_output=True,
-                text=True,
-                errors="replace",
-                timeout=_INSPECTION_S,
-            )
-        except subprocess.TimeoutExpired:
-            raise GsbaError(f"gsba info took more than {_INSPECTION_S:.0f} s on {name}") from None
-        if found.returncode:
-            last = (found.stderr.strip().splitlines() or ["gsba info failed"])[-1]
-            raise GsbaError(brief(last.removeprefix("error: "), 500))
-        return found.stdout
 
     def view(self, run: Path) -> str:
         """Address of the viewer of a run, started if it is not shown yet.
@@ -104,7 +81,8 @@ class App:
             return self._views[run].address
 
     def close(self) -> None:
-        """Stop the viewers; jobs go on."""
+        """Stop the viewers and the previews; jobs go on."""
+        self.previews.close()
         for view in self._views.values():
             view.stop()
 

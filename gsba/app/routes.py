@@ -11,12 +11,12 @@ from typing import Any
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import Headers
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from gsba.app import runs
+from gsba.app import drops, runs
 from gsba.app.browse import inside, listing
 from gsba.app.hub import App
 from gsba.app.jobs import ACTIVE, Command, Job
@@ -25,7 +25,23 @@ from gsba.log import GsbaError
 from gsba.view.guard import allowed
 
 _MAX_BODY, _MAX_LOG = 256 * 1024, 64 * 1024  # bytes
-_PAGE = {"": "index.html"} | {name: name for name in ("app.css", "app.js", "growing.js", "plan.js")}
+_MAX_ABOUT = 200  # paths of one request
+_SCRIPTS = (
+    "elements",
+    "files",
+    "drop",
+    "panorama",
+    "plan",
+    "command",
+    "start",
+    "jobs",
+    "run",
+    "growing",
+    "compare",
+    "app",
+)
+_PAGE = {"": "index.html", "app.css": "app.css"} | {f"{n}.js": f"{n}.js" for n in _SCRIPTS}
+_UPLOAD = "/upload"
 _TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript"}
 _PAGE_POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
@@ -52,6 +68,10 @@ def application(app: App) -> ASGIApp:
         "/api/jobs/{id}": ("GET", _job),
         "/api/jobs/{id}/map": ("GET", _job_map),
         "/api/jobs/{id}/log": ("GET", _job_log),
+        "/api/about": ("POST", _about),
+        "/api/picture": ("GET", _picture),
+        "/api/drop": ("POST", _drop),
+        "/api/discard": ("POST", _discard),
         "/api/command": ("POST", _command),
         "/api/run": ("GET", _run),
         "/api/run/map": ("GET", _run_map),
@@ -66,6 +86,7 @@ def application(app: App) -> ASGIApp:
         Route(path, _answering(app, handler), methods=[method])
         for path, (method, handler) in table.items()
     ]
+    routes.append(Route(_UPLOAD, _receiving(app), methods=["POST"]))
     return _Guard(Starlette(routes=routes), app.token)
 
 
@@ -82,10 +103,12 @@ class _Guard:
         hosts, origins = headers.getlist("host"), headers.getlist("origin")
         path = scope["path"]
         # A request that changes something must come from the page: a form of another page cannot
-        # send JSON without asking first.
+        # send these types without asking first.
         kind = headers.get("content-type", "").partition(";")[0]
-        json_only = scope["method"] in ("GET", "HEAD") or kind == "application/json"
-        if not (json_only and allowed(hosts, origins, path, self._token)):
+        upload = path == f"/{self._token}{_UPLOAD}"
+        wanted = "application/octet-stream" if upload else "application/json"
+        not_a_form = scope["method"] in ("GET", "HEAD") or kind == wanted
+        if not (not_a_form and allowed(hosts, origins, path, self._token)):
             await PlainTextResponse(_HINT, 403)(scope, receive, send)
             return
         rest = path.removeprefix(f"/{self._token}")
@@ -131,6 +154,33 @@ def _answering(app: App, handler: Handler) -> Callable[[Request], Awaitable[Resp
     return answer
 
 
+def _receiving(app: App) -> Callable[[Request], Awaitable[Response]]:
+    """Endpoint that appends its body to a dropped file."""
+
+    async def answer(request: Request) -> Response:
+        query = request.query_params
+        try:
+            numbers = [int(query[name]) for name in ("size", "modified", "offset")]
+        except (KeyError, ValueError):
+            return JSONResponse({"error": "the request is no part of a file"}, 400)
+        try:
+            path = query.get("path", "")
+            arrival = await run_in_threadpool(drops.Arrival, app.root, path, *numbers)
+            try:
+                async for chunk in request.stream():
+                    await run_in_threadpool(arrival.write, chunk)
+                found = await run_in_threadpool(arrival.finish)
+            finally:
+                arrival.close()
+        except GsbaError as error:
+            return JSONResponse({"error": str(error)}, 400)
+        except ClientDisconnect:  # the page was closed: what has arrived stays
+            return JSONResponse({"error": "the page was closed"}, 400)
+        return JSONResponse(found)
+
+    return answer
+
+
 def _page(app: App, request: Request) -> Response:
     name = _PAGE.get(request.path_params.get("name", ""))
     if name is None:
@@ -147,12 +197,52 @@ def _start(app: App, request: Request) -> Any:
 
 
 def _browse(app: App, request: Request) -> Any:
-    return listing(app.root, request.query_params.get("path", ""))
+    name = request.query_params.get("path", "")
+    return listing(app.root, name) | {"unfinished": drops.unfinished(inside(app.root, name))}
+
+
+def _about(app: App, request: Request) -> Any:
+    """What is known so far of several paths, by path."""
+    names = request.state.body.get("paths")
+    if not isinstance(names, list):
+        raise GsbaError("the request names no paths")
+    names = [str(name) for name in names[:_MAX_ABOUT]]
+    found = app.previews.about([inside(app.root, name) for name in names])
+    return {"about": dict(zip(names, found, strict=True))}
+
+
+def _picture(app: App, request: Request) -> Response:
+    """A small picture of a path, a panorama at a place of it, or that of a run's frame."""
+    query = request.query_params
+    path = inside(app.root, query.get("path", ""))
+    try:
+        if "frame" in query:
+            made = app.previews.frame(path, int(query["frame"]))
+        elif "at" in query:
+            made = app.previews.panorama(path, float(query["at"]))
+        else:
+            made = app.previews.picture(path)
+    except ValueError:
+        raise GsbaError("the place of a picture is no number") from None
+    return FileResponse(made, media_type="image/jpeg")
+
+
+def _drop(app: App, request: Request) -> Any:
+    body = request.state.body
+    if not isinstance(body.get("files"), list):
+        raise GsbaError("the request names no files")
+    return {"files": drops.plan(app.root, str(body.get("folder", "")), body["files"])}
+
+
+def _discard(app: App, request: Request) -> Any:
+    body = request.state.body
+    drops.discard(app.root, str(body.get("folder", "")), str(body.get("part", "")))
+    return {}
 
 
 def _info(app: App, request: Request) -> Any:
     path = inside(app.root, request.query_params.get("path", ""))
-    return json.loads(app.inspect(path))[0] | {"path": path.relative_to(app.root).as_posix()}
+    return app.previews.facts(path) | {"path": path.relative_to(app.root).as_posix()}
 
 
 def _jobs(app: App, request: Request) -> Any:

@@ -22,6 +22,7 @@ T = TypeVar("T")
 _MAX_POINTS = 4000  # of a map from above
 _NO_MAP: dict[str, Any] = {"stage": "", "path": [], "points": [], "colors": None, "starts": []}
 _POSES, _POINTS, _COLORS = "world_T_rigs", "points_world", "point_colors"
+_LEVELS = {"good to train": "good", "look at these places": "look", "do not train": "stop"}
 _FILES = ("report.html", "trajectory.tum", "points.ply", "poses.csv", "config.toml")
 
 
@@ -40,6 +41,7 @@ def overview(run: Path) -> dict[str, Any]:
         "seconds": seconds,
         "notes": report.get("notes", []),
         "camera": report.get("camera"),
+        "verdict": _verdict(report),
         "recordings": [
             str(one["name"])
             for one in report.get("recordings") or ()
@@ -47,6 +49,31 @@ def overview(run: Path) -> dict[str, Any]:
         ],
         "files": [name for name in _FILES if (run / name).is_file()],
         "figures": sorted(path.name for path in run.glob("figures/*.png")),
+    }
+
+
+def brief_facts(run: Path) -> dict[str, str]:
+    """Facts about a run for a list: its verdict, and how many frames were refined."""
+    found = overview(run)
+    if not found["finished"]:
+        return {"state": "not finished"}
+    summary, verdict = found["summary"], found["verdict"]
+    facts = {"verdict": verdict["level"]} if verdict else {}
+    counts = f"{summary.get('refined')} of {summary.get('frames')} frames refined"
+    return facts | {"refined": counts}
+
+
+def _verdict(report: dict[str, Any]) -> dict[str, Any] | None:
+    """Verdict of a report: "level" (good, look or stop), "sentence" and "reasons"; None = none."""
+    found = report.get("verdict")
+    if not isinstance(found, dict) or not found.get("sentence"):
+        return None
+    level = str(found.get("level"))
+    reasons = [one for one in found.get("reasons") or () if isinstance(one, dict)]
+    return {
+        "level": _LEVELS.get(level, level if level in _LEVELS.values() else "look"),
+        "sentence": str(found["sentence"]).removeprefix(f"{level}: "),
+        "reasons": [str(one["line"]) for one in reasons if "line" in one],
     }
 
 

@@ -15,7 +15,7 @@ from gsba.log import GsbaError
 if TYPE_CHECKING:
     from gsba.app import Choices, Field, Form
 
-COMMANDS = ("refine", "add", "merge", "remove", "export", "plot")  # that pages can run
+COMMANDS = ("refine", "add", "merge", "remove", "localize", "export", "plot")  # that pages can run
 _NOT_ON_A_PAGE = ("segment", "help")  # --segment runs any command of the machine
 _USAGE_ERROR: Any = typer.BadParameter.__bases__[0]  # of click, or of the copy of it that typer has
 
@@ -82,7 +82,8 @@ def choices() -> "Choices":
         tuple(CAMERAS),
         tuple(presets),
         ("auto", "carrier", "distractors", "none"),
-        tuple(dict.fromkeys([*PROGRAMS, *ExportFormat])),
+        tuple(PROGRAMS),
+        tuple(ExportFormat),
         tuple(allowed_settings(RefineSettings())),
     )
 

@@ -15,8 +15,10 @@ from typing import Any
 
 import numpy as np
 
+from gsba.frames.files import turned
 from gsba.log import GsbaError
 from gsba.video.claims import PictureClaims, claims_of
+from gsba.video.colours import bgr
 
 VIDEO_SUFFIXES = frozenset(
     (".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi", ".ts", ".insv", ".360", ".lrv", ".osv")
@@ -178,6 +180,33 @@ def decode(track: Track, timeline: Timeline, chosen: Sequence[int]) -> Iterator[
                         yield wanted.pop(frame.pts), frame
                 if pictures and pictures[-1].pts is not None and pictures[-1].pts >= last:
                     break
+
+
+def picture_near(video: Path, share: float) -> np.ndarray:
+    """Colours (H, W, 3) uint8 BGR of a picture near a place, without reading the whole file.
+
+    Args:
+        video: its first track is shown.
+        share: place, 0..1 of the duration: the last frame before it at which decoding can begin.
+
+    Raises:
+        GsbaError: the file is no video, or nothing can be decoded.
+    """
+    av = _pyav()
+    with _opened(video) as (container, streams):
+        stream, end = streams[0], _claimed_end(container, streams[0])
+        if share and end:
+            container.seek(
+                int((stream.start_time or 0) + share * end / stream.time_base), stream=stream
+            )
+        for packet in islice(container.demux(stream), _MAX_CLAIM_PACKETS):
+            try:
+                pictures = packet.decode()
+            except av.error.InvalidDataError:
+                continue
+            for picture in pictures:
+                return turned(bgr(picture), claims_of(picture, None).orientation)
+    raise GsbaError(f"{video}: no picture can be decoded: copy or export it again")
 
 
 def _pyav() -> Any:

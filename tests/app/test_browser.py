@@ -3,6 +3,7 @@
 With GSBA_PICTURES=FOLDER the pictures of docs/app.md are written to that folder.
 """
 
+import base64
 import os
 import re
 import shutil
@@ -31,6 +32,17 @@ BROWSER = next((p for name in ("chromium", "chromium-browser") if (p := shutil.w
 GSBA = (sys.executable, "-c", "from gsba.cli import main; main()")
 DESK, PHONE = {"width": 1100, "height": 800}, {"width": 390, "height": 844}
 RUN_MS = 540_000  # a run on a busy machine
+COUNT_CLICKS = """
+window.clicks = 0;
+addEventListener("click", (event) => { if (event.isTrusted) window.clicks += 1; }, true);
+"""
+NAMELESS = """
+[...document.querySelectorAll("button, a, input, select, canvas, img, progress")].filter((one) => {
+  const labelled = one.labels && [...one.labels].some((label) => label.textContent.trim());
+  const named = one.getAttribute("aria-label") || one.textContent.trim() || one.hasAttribute("alt");
+  return !one.hidden && !labelled && !named;
+}).map((one) => one.outerHTML)
+"""
 
 
 @dataclass
@@ -69,7 +81,8 @@ def browser() -> Iterator[Any]:
     if BROWSER is None:
         pytest.skip("no chromium here: apt-get install chromium")
     with sync_api.sync_playwright() as playwright:
-        shown = playwright.chromium.launch(executable_path=BROWSER, args=["--no-sandbox"])
+        software_gl = ["--no-sandbox", "--enable-unsafe-swiftshader"]  # no GPU on test machines
+        shown = playwright.chromium.launch(executable_path=BROWSER, args=software_gl)
         yield shown
         shown.close()
 
@@ -100,11 +113,33 @@ def picture(page: Any, name: str) -> None:
 
 
 def chosen(page: Any, out: str) -> None:
-    """Choose the video on the page of new runs, and name the run."""
-    page.get_by_role("button", name="walk.mp4 video").click()
-    page.get_by_text("stitched panoramas, 512x256").wait_for()
+    """Choose the video in the list, and name the run."""
+    row(page, "walk.mp4").click()
+    page.locator("dd", has_text="stitched panoramas, 512x256").wait_for()
     page.locator("#field-out").fill(out)
     page.locator("#command", has_text=f"--out {out}").wait_for()
+
+
+def row(page: Any, name: str) -> Any:
+    """Row of a list of files; its facts and its picture come later."""
+    return page.locator(".files button", has=page.get_by_text(name, exact=True))
+
+
+def dropped(page: Any, name: str, content: bytes | int, modified: int = 1_700_000_000_000) -> None:
+    """Drop a file onto the page, of these bytes or of this number of zeros."""
+    text = base64.b64encode(content).decode() if isinstance(content, bytes) else ""
+    page.evaluate(
+        """([name, text, size, modified]) => {
+          const read = () => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+          const bytes = text ? read() : new Uint8Array(size);
+          const dataTransfer = new DataTransfer();
+          dataTransfer.items.add(new File([bytes], name, { lastModified: modified }));
+          const options = { dataTransfer, bubbles: true, cancelable: true };
+          document.body.dispatchEvent(new DragEvent("dragover", options));
+          document.body.dispatchEvent(new DragEvent("drop", options));
+        }""",
+        [name, text, content if isinstance(content, int) else 0, modified],
+    )
 
 
 def status(page: Any, text: str) -> None:
@@ -123,7 +158,11 @@ def figures_are_drawn(page: Any) -> None:
 
 def test_from_a_video_to_a_dataset(browser: Any, server: Server) -> None:
     page = opened(browser, server.address, DESK)
+    page.get_by_text("stitched panoramas, 512x256 · 7.5 s, 60 frames").wait_for()
+    page.locator(".files .shot img").wait_for()
+    picture(page, "app-files")
     chosen(page, "first")
+    page.get_by_text("Drag to look around.").wait_for()
     page.get_by_text("Fast", exact=True).click()
     page.locator("#command", has_text="--config fast").wait_for()
     picture(page, "app-new")
@@ -173,18 +212,18 @@ def test_from_a_video_to_a_dataset(browser: Any, server: Server) -> None:
     page.get_by_role("columnheader", name="first").wait_for()
     page.goto(done)
     page.get_by_role("button", name="Merge with a run").click()
-    page.get_by_role("button", name="first run").click()
+    row(page, "first").click()
     page.get_by_role("button", name="Take this folder").click()
     page.get_by_text("first is this run").wait_for()
     page.get_by_role("button", name="Add a recording").click()
-    page.get_by_role("button", name="walk.mp4 video").click()
+    row(page, "walk.mp4").click()
     page.locator("#command", has_text="gsba add first walk.mp4").wait_for()
     page.get_by_role("button", name="Start").click()
     page.get_by_role("heading", name="add first").wait_for()
     status(page, "failed")
     page.get_by_text("first has recording").first.wait_for()  # its only one, once more
     page.goto(done)
-    page.get_by_role("button", name="nerfstudio", exact=True).click()
+    page.get_by_role("button", name="Nerfstudio", exact=True).click()
     page.get_by_role("heading", name="export first").wait_for()
     status(page, "done")
     assert (server.root / "first/nerfstudio/transforms.json").is_file()
@@ -196,7 +235,7 @@ def test_from_a_video_to_a_dataset(browser: Any, server: Server) -> None:
     assert ours.read_bytes() == other.read_bytes()
     page.goto(f"{server.address}#compare")
     for name in ("first", "second"):
-        page.get_by_role("button", name=f"{name} run").click()
+        row(page, name).click()
         page.get_by_role("button", name="Take this folder").click()
         page.get_by_role("columnheader", name=name).wait_for()
     assert fits(page)
@@ -209,12 +248,107 @@ def test_from_a_video_to_a_dataset(browser: Any, server: Server) -> None:
     assert [fault for fault in page.faults if not fault.endswith("failed")] == []
 
 
+def test_from_a_dropped_file_to_a_dataset_in_six_clicks(
+    browser: Any, server: Server, tmp_path: Path
+) -> None:
+    (tmp_path / "root").mkdir()
+    empty = Server(tmp_path / "root", tmp_path / "state")
+    try:
+        page = browser.new_page(viewport=DESK)
+        page.set_default_timeout(RUN_MS)
+        page.add_init_script(COUNT_CLICKS)
+        page.goto(empty.address)
+        page.get_by_text("Nothing is here yet").wait_for()
+        film = (server.root / "walk.mp4").read_bytes()
+        dropped(page, "walk.mp4", film)
+        page.get_by_text("walk.mp4 has arrived", exact=True).first.wait_for(state="attached")
+        assert (empty.root / "walk.mp4").read_bytes() == film
+        row(page, "walk.mp4").click()
+        page.get_by_text("Fast", exact=True).click()
+        page.get_by_role("button", name="Start").click()
+        status(page, "done")
+        page.get_by_role("button", name="Nerfstudio", exact=True).click()
+        page.get_by_role("heading", name="export walk-run").wait_for()
+        status(page, "done")
+        assert (empty.root / "walk-run/nerfstudio/transforms.json").is_file()
+        page.get_by_text("ns-train splatfacto").wait_for()  # how the trainer is started
+        assert page.evaluate("window.clicks") <= 6
+        page.get_by_role("link", name="Back to walk-run").click()
+        looked = page.locator("canvas.panorama[data-shown*='frame=0']")
+        looked.wait_for()
+        before = looked.screenshot()
+        looked.focus()
+        page.keyboard.press("ArrowRight")
+        assert looked.screenshot() != before
+    finally:
+        empty.kill()
+
+
+def test_a_drop_goes_on_after_a_closed_page_and_a_killed_server(
+    browser: Any, server: Server
+) -> None:
+    size, folder = 20 * 2**20, server.root
+    page = browser.new_page(viewport=PHONE)
+    page.goto(server.address)
+    row(page, "walk.mp4").wait_for()
+    held: list[Any] = []
+
+    def hold_the_second(route: Any) -> None:
+        held.append(route)
+        if len(held) != 2:
+            route.continue_()
+
+    page.route("**/upload?*", hold_the_second)
+    with page.expect_request(lambda r: "upload" in r.url and "offset=8388608" in r.url):
+        dropped(page, "big.mp4", size)
+    page.close(run_before_unload=False)
+    assert not (folder / "big.mp4").exists()
+    page = browser.new_page(viewport=PHONE)
+    page.goto(server.address)
+    page.get_by_text("has arrived to 40 % of 21 MB").wait_for()
+    assert fits(page)
+    held.clear()
+    page.route("**/upload?*", hold_the_second)
+    with page.expect_request(lambda r: "upload" in r.url and "offset=16777216" in r.url):
+        dropped(page, "big.mp4", size)
+    while len(held) < 2:
+        page.wait_for_timeout(20)
+    server.kill()
+    held[1].abort()
+    server.start()
+    page.locator("#drops").get_by_text("big.mp4 has arrived").wait_for()
+    assert (folder / "big.mp4").stat().st_size == size
+    dropped(page, "big.mp4", size)
+    page.locator("#drops").get_by_text("big.mp4 is here already").wait_for()
+    dropped(page, "big.mp4", 1000)
+    page.locator("#drops").get_by_text("Another big.mp4 is here: this one becomes").wait_for()
+    dropped(page, "notes.docx", b"words")
+    page.locator("#drops").get_by_text("notes.docx is no footage").wait_for()
+    row(page, "big-2.mp4").wait_for()
+    assert fits(page)
+    for name in ("big.mp4", "big-2.mp4"):
+        (folder / name).unlink()
+
+
+def test_all_that_can_be_used_has_a_name(browser: Any, server: Server) -> None:
+    """Buttons, links, fields and pictures have names; rows answer the keyboard."""
+    page = opened(browser, server.address, DESK)
+    row(page, "walk.mp4").focus()
+    page.keyboard.press("Enter")
+    page.get_by_text("Drag to look around.").wait_for()
+    page.get_by_text("Options:").click()
+    nameless = page.evaluate(NAMELESS)
+    assert nameless == []
+    assert page.evaluate("document.querySelectorAll('h1').length") == 1
+    assert page.faults == []
+
+
 def test_a_run_is_stopped_and_goes_on_and_the_next_one_waits(browser: Any, server: Server) -> None:
     page = opened(browser, server.address, PHONE)
     chosen(page, "third")
     page.get_by_role("button", name="Start").click()
     status(page, "running")
-    page.goto(f"{server.address}#new")
+    page.goto(f"{server.address}#files")
     chosen(page, "fourth")
     page.get_by_role("button", name="Start").click()
     status(page, "waiting")
@@ -256,7 +390,7 @@ def test_the_command_is_of_the_newest_values_though_an_older_answer_comes_last(
 def test_what_cannot_be_refined_is_said_in_one_line(browser: Any, server: Server) -> None:
     (server.root / "broken.mp4").write_bytes(b"no video")
     page = opened(browser, server.address, PHONE)
-    page.get_by_role("button", name="broken.mp4 video").click()
+    row(page, "broken.mp4").click()
     alert = page.get_by_role("alert").filter(has_text="broken.mp4")
     alert.wait_for()
     assert page.locator("#command").count() == 0
@@ -267,7 +401,7 @@ def test_what_cannot_be_refined_is_said_in_one_line(browser: Any, server: Server
 def test_a_page_in_the_dark_has_contrast(browser: Any, server: Server) -> None:
     page = browser.new_page(viewport=DESK, color_scheme="dark")
     page.goto(server.address)
-    page.get_by_role("heading", name="New run").wait_for()
+    page.get_by_role("heading", name="Footage and runs").wait_for()
     back, text = page.evaluate(
         "[getComputedStyle(document.body).backgroundColor, getComputedStyle(document.body).color]"
     )

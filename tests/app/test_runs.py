@@ -1,5 +1,9 @@
 """Contents of run folders that the page shows while a run goes on."""
 
+import json
+from pathlib import Path
+from typing import Any
+
 import pytest
 
 from gsba.pipeline.stage_titles import LENS_CENTRES, READOUTS, RECONSTRUCTION, is_one_of, title_of
@@ -32,3 +36,36 @@ def test_stages_that_the_page_looks_for_are_stages(pattern: str) -> None:
     assert title_of(name) != name
     assert is_one_of(name, [pattern]) and is_one_of(f"again_{name}@upper", [pattern])
     assert not is_one_of(f"{name}x", [pattern])
+
+
+@pytest.mark.parametrize(
+    ("verdict", "level", "sentence", "reasons"),
+    [
+        (
+            {
+                "level": "do not train",
+                "sentence": "do not train: 3 of 9 frames are in the map",
+                "reasons": [{"line": "frame 3: no match; film slower"}, 5],
+            },
+            "stop",
+            "3 of 9 frames are in the map",
+            ["frame 3: no match; film slower"],
+        ),
+        ({"level": "good to train", "sentence": "fine"}, "good", "fine", []),
+        ({"level": "stop", "sentence": "off"}, "stop", "off", []),
+        ({"level": "of a later version", "sentence": "so so"}, "look", "so so", []),
+    ],
+)
+def test_the_verdict_is_that_of_the_report(
+    tmp_path: Path, verdict: dict[str, Any], level: str, sentence: str, reasons: list[str]
+) -> None:
+    from gsba.app.runs import brief_facts, overview
+
+    report = {"summary": {"refined": 8, "frames": 9}, "verdict": verdict}
+    (tmp_path / "report.json").write_text(json.dumps(report))
+    shown = overview(tmp_path)["verdict"]
+    assert shown == {"level": level, "sentence": sentence, "reasons": reasons}
+    assert brief_facts(tmp_path) == {"verdict": level, "refined": "8 of 9 frames refined"}
+    for nothing in ({}, {"level": "good"}, None, "good", []):
+        (tmp_path / "report.json").write_text(json.dumps(report | {"verdict": nothing}))
+        assert overview(tmp_path)["verdict"] is None

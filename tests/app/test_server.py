@@ -16,7 +16,7 @@ pytest.importorskip("httpx")
 from starlette.testclient import TestClient
 
 from gsba.app import App, Form, serve
-from gsba.app.routes import application
+from gsba.app.routes import _SCRIPTS, application
 from gsba.cli.serving import COMMANDS, check, choices, form_of
 from gsba.log import GsbaError
 from gsba.trajectory.files import read_trajectory
@@ -98,7 +98,7 @@ def test_a_form_of_another_page_changes_nothing(client: TestClient) -> None:
 
 
 def test_the_page_loads_nothing_from_elsewhere(client: TestClient) -> None:
-    for name in ("", "app.css", "app.js", "plan.js"):
+    for name in ("", "app.css", *(f"{name}.js" for name in _SCRIPTS)):
         answer = client.get(name)
         assert answer.status_code == 200
         assert "default-src 'none'" in answer.headers["content-security-policy"]
@@ -112,7 +112,8 @@ def test_the_chooser_stays_below_its_root(client: TestClient, tmp_path: Path) ->
     kinds = {entry["name"]: entry["kind"] for entry in found["entries"]}
     assert kinds["walk"] == "folder" and kinds["clip.mp4"] == "video" and "out" not in kinds
     for path in ("..", "walk/../..", "/etc", "out", str(tmp_path / "secret.txt"), "a\0b"):
-        for request in ("browse", "info", "run", "run/map"):
+        assert client.post("api/about", json={"paths": [path]}).status_code == 400
+        for request in ("browse", "info", "run", "run/map", "picture"):
             answer = client.get(f"api/{request}", params={"path": path})
             assert answer.status_code == 400 and "error" in answer.json()
     assert client.get("files/out/secret.txt").status_code == 400
@@ -205,7 +206,7 @@ def test_forms_come_from_the_commands() -> None:
     assert (kinds["fresh"], kinds["fps"], kinds["masks"]) == ("flag", "number", "path")
     known = choices()
     assert {"fast", "accurate"} <= {name for name, _ in known.presets}
-    for target in known.exports:
+    for target in (*known.programs, *known.formats):
         check(["export", "run", "--to", target])
     with pytest.raises(GsbaError, match="has no option nope"):
         Form("refine", "", ()).arguments({"nope": 1})

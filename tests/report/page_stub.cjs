@@ -18,6 +18,7 @@ function element(id) {
     classList: { add() {} }, append(...c) { node.children.push(...c); }, setAttribute() {}, remove() {}, setPointerCapture() {},
     addEventListener(kind, f) { (node.listeners[kind] ??= []).push(f); },
     getContext: () => node.context ??= context(),
+    replaceChildren(...c) { node.children = c; }, complete: true, naturalWidth: 4,
   };
   all.push(node);
   return node;
@@ -35,7 +36,7 @@ globalThis.matchMedia = () => ({ matches: true, addEventListener() {} });
 globalThis.requestAnimationFrame = f => f();
 (0, eval)(script.replaceAll('"use strict";', ""));
 const event = { offsetX: 120, offsetY: 80, clientX: 10, clientY: 10, deltaY: 50, key: "+", pointerId: 1, preventDefault() {} };
-for (const node of all) for (const kind of ["pointermove", "pointerdown", "pointermove", "pointerup", "wheel", "keydown", "dblclick", "pointerenter", "pointerleave", "change", "click"])
+for (const node of [...all]) for (const kind of ["pointermove", "pointerdown", "pointermove", "pointerup", "wheel", "keydown", "dblclick", "pointerenter", "pointerleave", "change", "click"])
   for (const f of node.listeners[kind] ?? []) f(event);
 if (errors.length) throw new Error("not finite: " + errors.slice(0, 3));
 console.log(JSON.stringify([byId.tiles.children.length, byId.run.textContent, byId.worst?.children.length, byId.stages.children.length, byId.verdict?.children.at(-1)?.children[1]?.children,

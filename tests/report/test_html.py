@@ -205,7 +205,7 @@ def test_many_frames_share_a_cell() -> None:
 
 def test_frames_that_came_as_faces(tmp_path: Path) -> None:
     frames, result = scene.cube_frames(tmp_path / "cube"), scene.reconstruction()
-    image = pictures._small_panorama(frames, 0)
+    image = pictures.small_panorama(frames, 0, 720)
     bearing = scene.POINTS[0] / np.linalg.norm(scene.POINTS[0])  # frame 0 is the world
     u = 720 * (np.arctan2(bearing[0], bearing[2]) / (2 * np.pi) + 0.5)
     v = 360 * (0.5 + np.arcsin(bearing[1]) / np.pi)

@@ -1,5 +1,5 @@
 "use strict";
-// A finished run that grows: recordings added or taken out, and runs merged.
+// A finished run that grows: recordings added or taken out, runs merged, pictures localised.
 
 // Card of a finished run, by what `api/run` says of it.
 function growing(run, found) {
@@ -25,9 +25,12 @@ function growing(run, found) {
     }
     begin("merge", { runs: [run, path], out: `${run}-${path.split("/").pop()}` }, []);
   });
+  const localize = pick("Choose pictures of the same place: a file, a folder or a video.", (path) =>
+    begin("localize", { run, images: [path] }, ["run"]));
   const button = (text, onclick) => make("button", { type: "button", onclick }, text);
   const names = found.recordings.length > 1 ? found.recordings : [];
   return card("Grow", make("div", { class: "row" }, button("Add a recording", add), button("Merge with a run", merge),
+    button("Localise pictures", localize),
     ...names.map((name) => button(`Take out ${name}`, () => begin("remove", { run, names: [name] }, ["run"])))),
     make("p", { class: "faint" }, `It starts from the map of ${run}. Without a folder of its own the result takes its place, and ${run} is kept as ${run}-before.`),
     chooser, where);

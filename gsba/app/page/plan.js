@@ -1,7 +1,7 @@
 "use strict";
 // A map from above on a canvas: points by height or colour, the path, its start and its end.
 
-function drawPlan(canvas, map) {
+function drawPlan(canvas, map, chosen = -1) {
   const ratio = window.devicePixelRatio || 1;
   const width = canvas.clientWidth, height = canvas.clientHeight;
   canvas.width = Math.round(width * ratio);
@@ -64,4 +64,17 @@ function drawPlan(canvas, map) {
   };
   dot(path[0], "--green");
   dot(path[path.length - 1], "--orange");
+  if (path[chosen]) {
+    context.strokeStyle = color("--text");
+    context.beginPath();
+    context.arc(...at(path[chosen]), 9, 0, 2 * Math.PI);
+    context.stroke();
+  }
+  canvas.placed = path.map(at);
+}
+
+// Number of the pose that is drawn nearest to a place; -1 = none.
+function nearestOnPlan(canvas, x, y) {
+  const away = ([a, b]) => (a - x) ** 2 + (b - y) ** 2, placed = canvas.placed || [];
+  return placed.reduce((best, place, k) => (best < 0 || away(place) < away(placed[best]) ? k : best), -1);
 }

@@ -191,6 +191,7 @@ if (D.odometry) {
 } else el("odometry").remove();
 if (D.scan) scan();
 else el("scan").remove();
+pictures();
 worst();
 cost();
 stages();

@@ -14,6 +14,7 @@ from gsba.log import GsbaError
 from gsba.odometry import Odometry
 from gsba.report.html import figures, pictures
 from gsba.report.html.odometry import odometry_plan
+from gsba.report.html.thumbnails import frame_pictures
 from gsba.report.report import frame_quality, plain
 from gsba.types import CoarsePoses, FrameSet, Reconstruction
 
@@ -21,7 +22,7 @@ logger = logging.getLogger(__name__)
 
 _PARTS = {
     "/*STYLE*/": ("style.css",),
-    "/*SCRIPT*/": ("base.js", "charts.js", "verdict.js", "main.js"),
+    "/*SCRIPT*/": ("base.js", "charts.js", "verdict.js", "frames.js", "main.js"),
 }
 _DATA = "/*DATA*/"
 _BEFORE_DATA, _AFTER_DATA = '<script type="application/json" id="data">', "</script>"
@@ -54,6 +55,7 @@ def write_html(
         "erp_width": max(kind.panorama_width for kind in frames.formats),
         "recordings": list(frames.recordings),
         "worst": _worst(frames, reconstruction),
+        "pictures": frame_pictures(frames, reconstruction, report.get("camera")),
         "scan": None,
         "odometry": None,
     }

@@ -6,8 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from gsba.camera.fisheye import facing, optical_axes, project
 from gsba.camera.rig import CubeRig, owner_faces
 from gsba.camera.sphere import bearings_from_erp, erp_from_bearings
+from gsba.frames.files import decode
 from gsba.frames.pixels import load_erp, load_faces
 from gsba.report.html.figures import tangent_residuals
 from gsba.report.report import frame_quality
@@ -38,20 +40,20 @@ def picture(frames: FrameSet, reconstruction: Reconstruction, f: int) -> dict[st
     if len(rows) > _MAX_VECTORS:
         rows = rows[np.linspace(0, len(rows) - 1, _MAX_VECTORS).astype(int)]
     bearings = reconstruction.observation_bearings[rows]
-    residuals = np.degrees(_of_rows(reconstruction, rows))
+    residuals = np.degrees(residuals_of_rows(reconstruction, rows))
     level = np.maximum(np.hypot(bearings[:, 0], bearings[:, 2]), 0.05)
     places = erp_from_bearings(bearings, 1, 1)
     vectors = np.column_stack([places, residuals[:, 0] / level, residuals[:, 1]])
     return {
         "frame": f,
-        "jpeg": _jpeg(_small_panorama(frames, f)),
+        "jpeg": _jpeg(small_panorama(frames, f, _WIDTH)),
         "width": _WIDTH,
         "height": _WIDTH // 2,
         "vectors": vectors.round(5),
     }
 
 
-def _of_rows(reconstruction: Reconstruction, rows: np.ndarray) -> np.ndarray:
+def residuals_of_rows(reconstruction: Reconstruction, rows: np.ndarray) -> np.ndarray:
     """Tangent residuals (N, 2) of observations `rows` (N,), radians."""
     origins = reconstruction.observation_origins
     chosen = dataclasses.replace(
@@ -64,25 +66,46 @@ def _of_rows(reconstruction: Reconstruction, rows: np.ndarray) -> np.ndarray:
     return tangent_residuals(chosen)
 
 
-def _small_panorama(frames: FrameSet, f: int) -> np.ndarray:
-    """Panorama (H, W, 3) uint8 RGB of a frame, assembled from cube faces if it has faces only."""
+def small_panorama(frames: FrameSet, f: int, width: int) -> np.ndarray:
+    """Panorama (width / 2, width, 3) uint8 RGB of a frame, black where it has no face.
+
+    Raw lenses and faces are read at a part of their size and sampled at the nearest pixel.
+    """
     kind = frames.format_of(f)
     import cv2
 
-    if kind.panoramic:
-        erp = load_erp(frames, f, width=_WIDTH)
-        return cv2.resize(erp, (_WIDTH, _WIDTH // 2), interpolation=cv2.INTER_AREA)
-    faces, rig = load_faces(frames, f), CubeRig(kind.width, np.pi / 2)
-    centres = np.stack(np.meshgrid(np.arange(_WIDTH), np.arange(_WIDTH // 2)), axis=-1) + 0.5
-    bearings = bearings_from_erp(centres, _WIDTH, _WIDTH // 2)
-    owners = owner_faces(bearings)
-    out = np.zeros((*owners.shape, 3), np.uint8)
+    raw = kind.fisheyes is not None and len(set(frames.paths[f])) == len(kind.fisheyes)
+    if kind.panoramic and not raw:
+        erp = load_erp(frames, f, width=width)
+        return cv2.resize(erp, (width, width // 2), interpolation=cv2.INTER_AREA)
+    centres = np.stack(np.meshgrid(np.arange(width), np.arange(width // 2)), axis=-1) + 0.5
+    bearings = bearings_from_erp(centres, width, width // 2)
+    out = np.zeros((width // 2, width, 3), np.uint8)
+    if raw:
+        rig = kind.fisheyes or ()
+        owners = facing(bearings, optical_axes(rig))
+        for number, (lens, path) in enumerate(zip(rig, frames.paths[f], strict=True)):
+            image, own = decode(path, (lens.width, lens.height), at_least=width), owners == number
+            scale = image.shape[1] / lens.width
+            out[own] = _nearest(image, scale * project(lens, bearings[own]))
+        return out
+    size = min(kind.width, width // 2)
+    faces, rig, owners = (
+        load_faces(frames, f, size=size),
+        CubeRig(size, np.pi / 2),
+        owner_faces(bearings),
+    )
     for image, name in zip(faces, kind.faces, strict=True):
         own = owners == FACES.index(name)
-        pixels = np.floor(rig.project(bearings[own], FACES.index(name)))
-        columns, rows = np.clip(pixels, 0, rig.size - 1).astype(int).T
-        out[own] = image[rows, columns]
+        out[own] = _nearest(image, rig.project(bearings[own], FACES.index(name)))
     return out
+
+
+def _nearest(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Colours (N, 3) of an image (H, W, 3) at pixels (N, 2), corner origin."""
+    height, width = image.shape[:2]
+    columns, rows = np.nan_to_num(np.floor(pixels)).astype(int).T
+    return image[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)]
 
 
 def _jpeg(image: np.ndarray) -> str:

@@ -1,0 +1,193 @@
+"""Frames of the report as small panoramas, with masks, seams, circles and matches to draw in.
+
+The page is one file: pictures share a budget of bytes, and more than `MAX_PICTURES` frames are
+shown by some of them, evenly spread.
+"""
+
+import base64
+import logging
+from collections.abc import Mapping
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from gsba.camera.fisheye import unproject
+from gsba.camera.sphere import erp_from_bearings
+from gsba.frames.masks import load_mask
+from gsba.log import GsbaError
+from gsba.report.html.pictures import residuals_of_rows, small_panorama
+from gsba.types import FrameSet, PictureFormat, Reconstruction
+
+logger = logging.getLogger(__name__)
+
+MAX_PICTURES = 500
+_WIDTH = 256  # pixels across a picture
+_MASK_WIDTH = 128
+_MASK_BGRA = (40, 40, 220, 150)  # of masked pixels
+_MAX_BYTES = 2_600_000  # of all pictures; a third more in base64
+_LARGEST = 9_000  # bytes of a picture, where there are few
+_QUALITIES = (75, 60, 45, 30, 20)  # of JPEGs, until a picture fits
+_MAX_CANDIDATES, _MAX_MATCHES = 60, 24  # matches of a pair that are looked at, and drawn
+_MANY_FRAMES = 1000  # above it, half as many matches are drawn
+_STEPS = 72  # points of a circle or a seam
+
+
+def frame_pictures(
+    frames: FrameSet, reconstruction: Reconstruction, camera: Mapping[str, Any] | None
+) -> dict[str, Any]:
+    """Pictures of frames, and what is drawn in.
+
+    Args:
+        frames: frames of the page.
+        reconstruction: their map.
+        camera: entry "camera" of report.json; None = there is none.
+
+    Returns:
+        "shown", frames with a picture, their "jpegs", "masks" as PNGs without repetition and
+        "mask" of each shown frame, -1 = none; "cameras" (F,), and of each camera "seams" and
+        "circles": lines of places relative to width and height; "matches", see `_matches`.
+    """
+    num = len(frames)
+    wanted = np.unique(np.linspace(0, num - 1, min(num, MAX_PICTURES)).astype(int)) if num else []
+    shown, jpegs, masks, mask = list[int](), list[str](), dict[bytes, int](), list[int]()
+    kept = dict[Any, int]()
+    for f in (int(f) for f in wanted):
+        try:
+            jpegs.append(_small_jpeg(small_panorama(frames, f, _WIDTH), _MAX_BYTES // len(wanted)))
+        except GsbaError as error:
+            logger.warning("report.html: no image of frame %s (%s)", frames.names[f], error)
+            continue
+        shown.append(f)
+        key = frames.mask_paths[f], int(frames.cameras[f])
+        if key not in kept:
+            kept[key] = _mask_number(frames, f, masks)
+        mask.append(kept[key])
+    stitched = camera is not None and bool(camera.get("taken"))
+    turned = stitched and bool(camera and camera.get("turned_below_panorama"))
+    return {
+        "shown": shown,
+        "jpegs": jpegs,
+        "masks": [base64.b64encode(png).decode("ascii") for png in masks],
+        "mask": mask,
+        "cameras": frames.cameras,
+        "seams": [_seams(kind, stitched and not turned) for kind in frames.formats],
+        "circles": [_circles(kind) for kind in frames.formats],
+        "matches": _matches(frames, reconstruction),
+    }
+
+
+def _small_jpeg(image: np.ndarray, room: int) -> str:
+    """JPEG (base64) of an RGB image, as good as its room in bytes allows."""
+    import cv2
+
+    encoded = b""
+    for quality in _QUALITIES:
+        how = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
+        encoded = cv2.imencode(".jpg", image[..., ::-1], how)[1].tobytes()
+        if len(encoded) <= min(room, _LARGEST):
+            break
+    return base64.b64encode(encoded).decode("ascii")
+
+
+def _mask_number(frames: FrameSet, f: int, masks: dict[bytes, int]) -> int:
+    """Number of a frame's mask among all, which it joins; -1 = it has none, or none readable."""
+    import cv2
+
+    try:
+        usable = load_mask(frames, f)
+    except GsbaError:
+        return -1
+    if usable is None:
+        return -1
+    size = _MASK_WIDTH, _MASK_WIDTH // 2
+    hidden = cv2.resize((~usable).astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.5
+    image = hidden[..., None] * np.array(_MASK_BGRA, np.uint8)
+    png = cv2.imencode(".png", image)[1].tobytes()
+    return masks.setdefault(png, len(masks))
+
+
+def _seams(kind: PictureFormat, two_lenses: bool) -> list[np.ndarray]:
+    """Lines (N, 2) where pictures of two lenses along the z axis meet.
+
+    Args:
+        kind: format of the pictures.
+        two_lenses: True if stitched panoramas were found to be of such lenses.
+    """
+    raw = kind.fisheyes is not None and len(kind.fisheyes) == 2
+    if not raw and not (two_lenses and kind.panoramic):
+        return []
+    angles = np.linspace(0, 2 * np.pi, _STEPS + 1)
+    return [_places(np.column_stack([np.cos(angles), np.sin(angles), 0 * angles]))]
+
+
+def _circles(kind: PictureFormat) -> list[np.ndarray]:
+    """Lines (N, 2) along the edge of each lens's picture."""
+    lines, angles = [], np.linspace(0, 2 * np.pi, _STEPS + 1)
+    edge = np.column_stack([np.cos(angles), np.sin(angles)])
+    for lens in kind.fisheyes or ():
+        pixels = np.array(lens.principal) + min(lens.width, lens.height) / 2 * edge
+        lines.append(_places(unproject(lens, pixels)))
+    return lines
+
+
+def _places(bearings: np.ndarray) -> np.ndarray:
+    return erp_from_bearings(bearings, 1, 1).round(4)
+
+
+def _matches(frames: FrameSet, reconstruction: Reconstruction) -> dict[str, Any]:
+    """Points that frames share with the next one, the worst half of them among those.
+
+    Returns:
+        "shared" (F - 1,), numbers of shared points; "counts" (F - 1,), numbers of drawn ones;
+        "data", base64 of (N, 5) uint16 little-endian: places in both frames relative to width and
+        height, in 1/65535, and the larger residual of the two in 1/1000 degree.
+    """
+    starts, order = _rows_by_frame(reconstruction, len(frames))
+    owners = frames.recording_of_frame
+    shared, chosen = np.zeros(max(len(frames) - 1, 0), int), []
+    for f in range(len(shared)):
+        if owners[f] != owners[f + 1]:
+            continue
+        rows, others = (order[starts[g] : starts[g + 1]] for g in (f, f + 1))
+        points = reconstruction.observation_points
+        _, a, b = np.intersect1d(points[rows], points[others], return_indices=True)
+        shared[f] = len(a)
+        some = np.linspace(0, len(a) - 1, min(len(a), _MAX_CANDIDATES)).astype(int)
+        chosen.append(np.column_stack([np.full(len(some), f), rows[a[some]], others[b[some]]]))
+    pairs = np.concatenate(chosen) if chosen else np.zeros((0, 3), int)
+    lengths = [
+        np.linalg.norm(residuals_of_rows(reconstruction, pairs[:, k]), axis=1) for k in (1, 2)
+    ]
+    worst = np.degrees(np.max(lengths, axis=0))
+    most = _MAX_MATCHES // (2 if len(frames) > _MANY_FRAMES else 1)
+    kept = _some_and_worst(pairs[:, 0], worst, most)
+    pairs, worst = pairs[kept], worst[kept]
+    bearings = [reconstruction.observation_bearings[pairs[:, k]] for k in (1, 2)]
+    places = np.hstack([np.mod(erp_from_bearings(each, 1, 1), 1.0) for each in bearings])
+    values = np.column_stack([65535 * places, 1000 * worst])
+    packed = np.clip(np.rint(np.nan_to_num(values)), 0, 65535).astype("<u2")
+    return {
+        "shared": shared,
+        "counts": np.bincount(pairs[:, 0], minlength=len(shared)),
+        "data": base64.b64encode(packed.tobytes()).decode("ascii"),
+    }
+
+
+def _rows_by_frame(reconstruction: Reconstruction, num: int) -> tuple[np.ndarray, np.ndarray]:
+    """First row (F + 1,) of each frame among the observations in their order (O,) by frame."""
+    observed = reconstruction.observation_frames
+    order = np.argsort(observed, kind="stable")
+    return np.searchsorted(observed[order], np.arange(num + 1)), order
+
+
+def _some_and_worst(pairs: np.ndarray, worst: np.ndarray, most: int) -> np.ndarray:
+    """Rows (N',) of at most `most` matches of each pair: the worst half, and some of the others."""
+    kept = []
+    bounds = np.flatnonzero(np.diff(pairs, prepend=-1, append=-1))
+    for first, end in pairwise(bounds):
+        order = first + np.argsort(-worst[first:end], kind="stable")
+        rest = order[most // 2 :]
+        evenly = np.linspace(0, len(rest) - 1, min(len(rest), most - most // 2)).astype(int)
+        kept.append(np.sort(np.concatenate([order[: most // 2], rest[evenly]])))
+    return np.concatenate(kept) if kept else np.zeros(0, int)
