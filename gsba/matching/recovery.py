@@ -6,6 +6,7 @@ import numpy as np
 
 from gsba.config import RefineSettings
 from gsba.geometry import inverse
+from gsba.log import GsbaError
 from gsba.matching import guided_search, pairs
 from gsba.matching.correspondences import verified
 from gsba.matching.guided_search import Gate, MatchContext
@@ -221,7 +222,8 @@ def check_clock(
         trajectory: all entries of its file.
 
     Raises:
-        GsbaError: the trajectory is reversed, mirrored, inverted or in other axes.
+        GsbaError: the trajectory is reversed, mirrored, inverted or in other axes, or its clock runs
+            at another rate.
     """
     settings, chosen = context.settings, pairs.without_pause(timestamps)
     lost = guided.missing(chosen)
@@ -230,7 +232,14 @@ def check_clock(
     steps = image_steps(guided, context.keypoints)
     misread.refuse_misread(coarse, steps, settings.verify)
     reach = settings.read.max_clock_shift_s
-    return clock.estimate_clock(timestamps, steps, trajectory, coarse.time_offset, reach)
+    estimate = clock.estimate_clock(timestamps, steps, trajectory, coarse.time_offset, reach)
+    rate = clock.other_rate(timestamps, steps, trajectory, estimate)
+    if rate is not None:
+        raise GsbaError(
+            f"the trajectory turns as the images do on a clock of {rate:.2g} times the rate of the "
+            f"frames': correct its times, or the frames' (--fps), {misread.ADVICE}"
+        )
+    return estimate
 
 
 def _match_along(

@@ -17,7 +17,7 @@ _DOUBTFUL_SHARE = 0.6  # share of agreeing steps below which another convention 
 _MIN_EXPLAINED_SHARE = 0.7  # least share of steps that another convention must explain
 _COMMON_SYSTEMS = "right-up-back", "left-down-back", "left-up-forward"  # half turns: of graphics,
 # about the vertical axis, about the forward axis
-_ADVICE = "or refine without it (--no-trajectory)"
+ADVICE = "or refine without it (--no-trajectory)"
 
 
 def refuse_useless(coarse: CoarsePoses) -> None:
@@ -29,7 +29,7 @@ def refuse_useless(coarse: CoarsePoses) -> None:
     poses = coarse.world_T_rigs
     if len(poses) > 1 and np.abs(poses - poses[0]).max() < 1e-12:
         raise GsbaError(
-            f"all {len(poses)} poses of the trajectory are identical: check the file, {_ADVICE}"
+            f"all {len(poses)} poses of the trajectory are identical: check the file, {ADVICE}"
         )
 
 
@@ -65,7 +65,7 @@ def refuse_misread(coarse: CoarsePoses, found: Steps, settings: VerifySettings) 
     text, other = _contradiction_text(shares[""], judged), ""
     if late:
         other = f"; or it is on another clock, by about {abs(late)} frames"
-    raise GsbaError(f"{text}: the trajectory is {best}{other}, {_ADVICE}")
+    raise GsbaError(f"{text}: the trajectory is {best}{other}, {ADVICE}")
 
 
 def refuse_misfit(coarse: CoarsePoses, found: Steps, settings: VerifySettings) -> None:
@@ -90,11 +90,11 @@ def refuse_misfit(coarse: CoarsePoses, found: Steps, settings: VerifySettings) -
     if late:
         raise GsbaError(
             f"{text}: the trajectory is on another clock, by about {abs(late)} frames: correct "
-            f"the times or read.clock_offset_s, {_ADVICE}"
+            f"the times or read.clock_offset_s, {ADVICE}"
         )
     raise GsbaError(
         f"{text}: the trajectory is of another recording or on another clock; "
-        f"give the right one, {_ADVICE}"
+        f"give the right one, {ADVICE}"
     )
 
 
