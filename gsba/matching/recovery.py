@@ -222,8 +222,8 @@ def check_clock(
         trajectory: all entries of its file.
 
     Raises:
-        GsbaError: the trajectory is reversed, mirrored, inverted or in other axes, or its clock runs
-            at another rate.
+        GsbaError: the trajectory is reversed, mirrored, inverted or in other axes, or its clock
+            runs at another rate.
     """
     settings, chosen = context.settings, pairs.without_pause(timestamps)
     lost = guided.missing(chosen)

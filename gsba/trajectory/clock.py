@@ -136,7 +136,8 @@ def other_rate(
         for p in fit.candidates(start, turns.step)
     ]
     tried.sort(key=lambda one: one[0])
-    refined = [(rate, (fit := at_rate(rate)), fit.refine(p)) for _, rate, p in tried[:_NUM_REFINED_RATES]]
+    nearest = [(rate, at_rate(rate), p) for _, rate, p in tried[:_NUM_REFINED_RATES]]
+    refined = [(rate, fit, fit.refine(p)) for rate, fit, p in nearest]
     sigma = min(noise(fit.residuals(p)) for _, fit, p in refined)
     rate, fit, best = min(refined, key=lambda one: one[1].cost(one[2], sigma))
     after = [np.linalg.norm(residuals, axis=1) for residuals in (before, fit.residuals(best))]
