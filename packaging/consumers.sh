@@ -21,7 +21,7 @@ if ! "$work/venv/bin/pip" install --quiet --retries 1 --timeout 20 "${readers[@]
   exit 0
 fi
 if command -v npm >/dev/null && npm install --silent --no-audit --no-fund --fetch-retries 0 --prefix "$work/node" \
-  gltf-validator@2.0.0-dev.3.10; then
+  gltf-validator@2.0.0-dev.3.10 @playcanvas/splat-transform@2.7.1; then
   export GSBA_NODE_MODULES="$work/node/node_modules"
 fi
 # Blender has its own NumPy, older than ours, and wants Python 3.11.

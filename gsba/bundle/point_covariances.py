@@ -8,6 +8,14 @@ from gsba.types import Reconstruction
 
 _PRIOR_EXTENTS = 10.0  # standard deviation of a point before any observation, extents of the map
 _MAX_DRAWS = 16  # of the poses' errors: standard deviations of 16 are right within a fifth
+_TRACKS_PER_CLASS, _MAX_CLASSES = 100, 10  # classes of points by the noise of their observations
+_MIN_TRACK_LENGTH = 3  # of two observations, only those across the baseline that agree are kept
+_MIN_SHARE = 1e-3  # least part of a shift across the baseline that no move of the point explains
+_MEDIAN_ABS_NORMAL = 0.6745  # median of |x|, x unit normal
+# Errors of depths, in units of what shifts across the baseline predict: 1.7 to 1.9 in four maps of
+# two rendered scenes, on surfaces that are flat for two pixels around. Shifts along the baseline
+# are larger, and slant turns errors across the ray into errors of depth (1.25 of it).
+_ALONG_BASELINE = 1.8
 
 
 def point_covariances(result: Reconstruction) -> np.ndarray:
@@ -26,6 +34,7 @@ def depth_variances(result: Reconstruction, axes: np.ndarray) -> np.ndarray:
 
     Poses in error move all points that they see: the depth of a point errs by how far its own shift
     differs from that of the frame. An error in the scale of all poses and points is no error here.
+    Errors of one point's observations are not independent, see `_error_ratios`.
 
     Args:
         result: with the poses' joint errors; without them, poses count as given.
@@ -33,6 +42,7 @@ def depth_variances(result: Reconstruction, axes: np.ndarray) -> np.ndarray:
     """
     covariances, poses = point_covariances(result), result.world_T_rigs
     turns, moves, scales = _pose_errors(result)
+    ratios = np.square(_ALONG_BASELINE * _error_ratios(result, covariances))
     variances, start = np.empty(len(axes)), 0
     for some in result.pieces():
         points, frames = some.observation_points, some.observation_frames
@@ -41,6 +51,7 @@ def depth_variances(result: Reconstruction, axes: np.ndarray) -> np.ndarray:
         reaches = some.points_world[points] - poses[frames, :3, 3]
         depths, information = np.sum(axes[rows] * reaches, axis=1), _informations(some)
         variance = np.einsum("oi,oij,oj->o", axes[rows], covariances[points], axes[rows])
+        variance *= ratios[points]
         for turn, move, scale in zip(turns, moves, scales, strict=True):
             shifts = move[frames] + np.cross(turn[frames], reaches)  # of what the frame sees there
             pulls = np.einsum("oij,oj->oi", information, shifts)
@@ -52,10 +63,64 @@ def depth_variances(result: Reconstruction, axes: np.ndarray) -> np.ndarray:
     return variances
 
 
+def _error_ratios(result: Reconstruction, covariances: np.ndarray) -> np.ndarray:
+    """True errors of points (J,) in units of those that independent observations would have.
+
+    A patch that is seen from elsewhere shows other surfaces beside its own, and its foreshortening
+    is known roughly: its shift grows with the change of the viewing direction, as that of a wrong
+    depth does. The depth absorbs the shift along the baseline; the one across it remains in the
+    residuals, and is as large as predicted if errors are independent.
+    """
+    shifts = _shifts_across(result, covariances)
+    num = np.bincount(result.observation_points, minlength=len(shifts))
+    squares = np.bincount(result.observation_points, result.observation_sigmas**2, len(shifts))
+    noise = squares / np.maximum(num, 1)
+    usable = np.isfinite(shifts) & (num >= _MIN_TRACK_LENGTH)
+    classes = min(int(np.count_nonzero(usable)) // _TRACKS_PER_CLASS, _MAX_CLASSES)
+    if classes == 0:
+        return np.ones(len(shifts))
+    bounds = np.unique(np.quantile(noise[usable], np.arange(1, classes) / classes))
+    bounds = bounds[bounds < noise[usable].max()]
+    which, ratios = np.searchsorted(bounds, noise), np.empty(len(bounds) + 1)
+    for number in range(len(ratios)):
+        ratios[number] = np.median(np.abs(shifts[usable & (which == number)])) / _MEDIAN_ABS_NORMAL
+    return ratios[which]
+
+
+def _shifts_across(result: Reconstruction, covariances: np.ndarray) -> np.ndarray:
+    """Shifts (J,) of points' observations that grow along the track as those of a wrong depth do,
+    but across them, in standard deviations of independent observations; NaN = undetermined."""
+    num = len(covariances)
+    axes = np.linalg.eigh(covariances)[1][:, :, 2]  # the least certain ones
+    slopes, pulls, sums = np.zeros((num, 3)), np.zeros((num, 3)), np.zeros((2, num))
+    for some in result.pieces():
+        points, lenses = some.observation_points, _lens_poses(some)
+        reaches = some.points_world[points] - lenses[:, :3, 3]
+        distances = np.maximum(np.linalg.norm(reaches, axis=1), 1e-12)
+        rays = np.einsum("oij,oj->oi", lenses[:, :3, :3], some.observation_bearings)
+        scales = (some.observation_sigmas * distances)[:, None]
+        across = np.cross(rays, axes[points]) / scales
+        residuals = reaches / scales - rays / some.observation_sigmas[:, None]
+        residuals -= np.sum(residuals * rays, axis=1, keepdims=True) * rays
+        np.add.at(slopes, points, across / scales)
+        np.add.at(pulls, points, residuals / scales)
+        sums[0] += np.bincount(points, np.sum(across**2, axis=1), num)
+        sums[1] += np.bincount(points, np.sum(across * residuals, axis=1), num)
+    moved = np.einsum("jik,jk->ji", covariances, slopes)
+    information = sums[0] - np.sum(moved * slopes, axis=1)
+    determined = information > _MIN_SHARE * sums[0]
+    shifts = (sums[1] - np.sum(moved * pulls, axis=1)) / np.sqrt(np.maximum(information, 1e-300))
+    return np.where(determined, shifts, np.nan)
+
+
+def _lens_poses(some: Reconstruction) -> np.ndarray:
+    """Poses (O, 4, 4) world_T_lens of observations."""
+    return moved_to(some.world_T_rigs[some.observation_frames], some.observation_origins)
+
+
 def _informations(some: Reconstruction) -> np.ndarray:
     """Information (O, 3, 3) of observations on their points, in the world, 1/map unit^2."""
-    points, poses = some.observation_points, some.world_T_rigs
-    lenses = moved_to(poses[some.observation_frames], some.observation_origins)
+    points, lenses = some.observation_points, _lens_poses(some)
     distances = np.linalg.norm(some.points_world[points] - lenses[:, :3, 3], axis=1)
     scales = some.observation_sigmas * np.maximum(distances, 1e-12)
     axes = tangent_basis(some.observation_bearings) / scales[:, None, None]

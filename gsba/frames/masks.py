@@ -1,6 +1,7 @@
 """Equirectangular masks: white = use, black = do not use, light grey = use with less weight."""
 
 import functools
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,7 +13,10 @@ from gsba.frames.files import IMAGE_SUFFIXES, decode, image_size, is_image
 from gsba.log import GsbaError
 from gsba.types import FrameSet
 
+logger = logging.getLogger(__name__)
+
 _MAX_UNUSED_LEVEL = 127  # highest grey level of unused pixels
+_MAX_USUAL_SHARE = 0.6  # of the sphere: carriers and their riders hide up to half
 
 
 def find_masks(
@@ -50,7 +54,30 @@ def find_masks(
             raise GsbaError(f"{path}: mask is {w}x{h}, but frames are {erp_size[0]}x{erp_size[1]}")
         if w != 2 * h:
             raise GsbaError(f"{path}: mask is {w}x{h}; masks are equirectangular, 2:1")
+    if masks.is_file():
+        _warn_of_inversion(masks, image_size(masks))
     return tuple(path.absolute() for path in paths)
+
+
+def _warn_of_inversion(path: Path, size: tuple[int, int]) -> None:
+    """Warn of a mask of all frames that hides most of the sphere.
+
+    Raises:
+        GsbaError: it hides all of it, or cannot be read.
+    """
+    rows = (np.arange(size[1]) + 0.5) / size[1]
+    levels = _levels_in(path, size, path.stat().st_mtime_ns)
+    unused = (levels <= _MAX_UNUSED_LEVEL).mean(axis=1)
+    hidden = float(np.average(unused, weights=np.sin(np.pi * rows)))
+    if hidden == 1:
+        raise GsbaError(f"{path}: the mask hides all of each picture: 255 = use, 0 = ignore")
+    if hidden > _MAX_USUAL_SHARE:
+        logger.warning(
+            "%s hides %.0f %% of each picture (255 = use, 0 = ignore): invert it if it is to hide "
+            "the rest",
+            path,
+            100 * hidden,
+        )
 
 
 def load_mask(frames: FrameSet, f: int) -> np.ndarray | None:

@@ -461,6 +461,9 @@ def _stacked(path: Path, size: tuple[int, int]) -> str:
     return f". It is {kind}: {REMEDIES[kind]}" if kind == OVER_UNDER else ""
 
 
+_CUBE_LAYOUTS = (6, 1), (1, 6), (3, 2), (2, 3), (4, 3), (3, 4)  # faces across and down a picture
+
+
 def _no_panorama(path: Path, header: Header, more: str = "") -> GsbaError:
     """The refusal of an image that is not 2:1."""
     (w, h) = header.size
@@ -469,6 +472,8 @@ def _no_panorama(path: Path, header: Header, more: str = "") -> GsbaError:
     what = ": remove that tag" if turned else more
     if abs(w - 2 * h) <= MAX_ROUNDING * w:
         what = f", and this is nearly so: if it is a whole panorama, scale it to {w}x{w // 2}"
+    elif any(w * down == h * across for across, down in _CUBE_LAYOUTS):
+        what += ". If it is a cube map, cut out its faces, as front/NAME.jpg and so on"
     return GsbaError(f"{path}: is {w}x{h}{why}; an equirectangular frame is 2:1{what}")
 
 

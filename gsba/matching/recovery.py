@@ -6,6 +6,7 @@ import numpy as np
 
 from gsba.config import RefineSettings
 from gsba.geometry import inverse
+from gsba.log import GsbaError
 from gsba.matching import guided_search, pairs
 from gsba.matching.correspondences import SCARCE_MATCHES, verified
 from gsba.matching.guided_search import PRIOR_GATE, Gate, MatchContext
@@ -225,7 +226,8 @@ def check_clock(
         trajectory: all entries of its file.
 
     Raises:
-        GsbaError: the trajectory is reversed, mirrored, inverted or in other axes.
+        GsbaError: the trajectory is reversed, mirrored, inverted or in other axes, or its clock
+            runs at another rate.
     """
     settings, chosen = context.settings, pairs.without_pause(timestamps)
     lost = guided.missing(chosen)
@@ -233,9 +235,16 @@ def check_clock(
         guided = VerifiedPairs.joined([guided, match_anywhere(context, lost)])
     steps = image_steps(guided, context.keypoints)
     misread.refuse_misread(coarse, steps, settings.verify)
-    return clock.estimate_clock(
+    estimate = clock.estimate_clock(
         timestamps, steps, trajectory, coarse.time_offset, _MAX_CLOCK_SHIFT_S
     )
+    rate = clock.other_rate(timestamps, steps, trajectory, estimate)
+    if rate is not None:
+        raise GsbaError(
+            f"the trajectory turns as the images do on a clock of {rate:.2g} times the rate of the "
+            f"frames': correct its times, or the frames' (--fps), {misread.ADVICE}"
+        )
+    return estimate
 
 
 def _match_along(

@@ -10,6 +10,7 @@ from threadpoolctl import threadpool_limits
 
 from gsba import video
 from gsba.bundle.families import Family
+from gsba.camera.fisheye import turned
 from gsba.compilation import compile_ahead
 from gsba.config import RefineSettings
 from gsba.frames.scan import scan
@@ -40,6 +41,7 @@ from gsba.report.html import add_odometry
 from gsba.store import cluster
 from gsba.store.store import RunStore
 from gsba.trajectory.conventions import Convention
+from gsba.trajectory.misread import TurnedAboutForwardError
 from gsba.types import CoarsePoses, FrameSet, Reconstruction, RunStart
 
 if TYPE_CHECKING:
@@ -268,27 +270,51 @@ def _solve_raw(run: Run) -> State:
         if any(kind.fisheyes is not None for kind in frames.formats) and not kept:
             better = run.store.stored(name, known, camera.Cuts, after)
         if better is None:
-            state = solve(frontend.extract(run))
-            unseen = int(state.prior.trust.unseen_steps.sum())
-            if best is not None and unseen > best[1]:
-                logger.info("frames cut anew match at fewer steps: the pass before is kept")
-                run.store.stage(f"recut{n - 1}_undone", known, lambda: True, bool, best[0])
-                return best[2]
-            best, last = (after, unseen, state), bool(kept) or n == _MAX_PASSES - 1
-            better = None if last else camera.better_calibration(run.coarse, state.map)
-            if better is None:
-                return state
+            try:
+                state = solve(frontend.extract(run))
+            except TurnedAboutForwardError as error:
+                better = _in_axes_of_trajectory(frames, error, first=n == 0)
+            else:
+                unseen = int(state.prior.trust.unseen_steps.sum())
+                if best is not None and unseen > best[1]:
+                    logger.info("frames cut anew match at fewer steps: the pass before is kept")
+                    run.store.stage(f"recut{n - 1}_undone", known, lambda: True, bool, best[0])
+                    return best[2]
+                best, last = (after, unseen, state), bool(kept) or n == _MAX_PASSES - 1
+                better = None if last else camera.better_calibration(run.coarse, state.map)
+                if better is None:
+                    return state
             run.store.stage(name, known, lambda found=better: found, camera.Cuts, after)
         n, found = n + 1, tuple(bool(cut and cut[1]) for cut in better)
         again = Journal(dict(counts))
         frames = frames.with_formats(
             [
-                kind if cut is None else replace(kind, fisheyes=cut[0], lenses_nominal=False)
+                kind
+                if cut is None
+                else replace(
+                    kind, fisheyes=cut[0], lenses_nominal=kind.lenses_nominal and not cut[1]
+                )
                 for kind, cut in zip(frames.formats, better, strict=True)
             ]
         )
         frames = merging.recut(run.store, frames, n)
         run = Run.begin(run.store, frames, run.coarse, run.settings, evidence, again, found)
+
+
+def _in_axes_of_trajectory(
+    frames: FrameSet, error: TurnedAboutForwardError, first: bool
+) -> camera.Cuts:
+    """Lenses to cut raw frames of one camera by in the first pass, so that they are upright as the
+    trajectory is.
+
+    Raises:
+        TurnedAboutForwardError: the error, of other frames.
+    """
+    lenses = frames.formats[0].fisheyes
+    if not first or len(frames.formats) > 1 or lenses is None:
+        raise error
+    logger.info("raw pictures are turned against the trajectory about its forward axis: cut anew")
+    return ((turned(lenses, error.ours_R_theirs), False),)
 
 
 def solve(state: State) -> State:

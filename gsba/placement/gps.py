@@ -143,7 +143,12 @@ def read_gps(path: Path, settings: GpsSettings | None = None) -> GpsFixes:
         if set(names) & set(header)
     }
     if not {"latitude", "longitude"} <= where.keys():
-        raise GsbaError(f"{path} has no columns of latitude and longitude; {_HEADER_ADVICE}")
+        what, advice = "has no columns of latitude and longitude", _HEADER_ADVICE
+        if lines[0][1].startswith("$"):
+            what, advice = "is an NMEA log", "convert it to GPX, as by gpsbabel"
+        elif ";" in lines[0][1]:
+            what, advice = "has semicolons between its columns", "use commas, and points in numbers"
+        raise GsbaError(f"{path} {what}; {advice}")
     if not {"name", "time"} & where.keys():
         raise GsbaError(f"{path} has no column of frames' names or times; {_HEADER_ADVICE}")
     keys, rows, noise = [], [], []
@@ -214,7 +219,9 @@ def _read_gpx(path: Path, settings: GpsSettings) -> GpsFixes:
         up = point.findtext("{*}vdop")
         noise.append([_noise(dop, "hdop", place), _noise(up, "vdop", place), math.nan, math.nan])
     if not rows:
-        raise GsbaError(f"{path}: the GPX file holds no track points")
+        kml = root.tag.endswith("}kml")
+        what = "is KML, whose points have no times: give" if kml else "holds no track points of"
+        raise GsbaError(f"{path} {what} a GPX track")
     return _checked_fixes(path, _spread(times), rows, noise, settings)
 
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from gsba.significance import outweighs
 from gsba.trajectory.clock_search import ClockFit, merged, noise
 from gsba.trajectory.steps import Steps
 from gsba.types import Trajectory
@@ -29,6 +30,11 @@ _MAX_NOISE_RAD = np.deg2rad(2.0)  # largest noise of a trajectory's steps per ax
 # times as much, steps contradict the images (verify.max_rotation_deg)
 _MIN_GAIN = 0.2  # share of the turns by which another clock must explain more
 _MAX_RIVAL_SHARE = 0.75  # share of the best clock's explained turns that no rival may reach
+_OTHER_RATES = np.exp(np.delete(np.linspace(-1, 1, 81), 40) * np.log(10))  # spaced by twice what
+# the search around each of them reaches
+_NUM_REFINED_RATES = 4  # best of them
+_MAX_NOISE_RATIO = 0.5  # largest noise of rotations under another rate, in that under the given one
+_OTHER_RATE_ERROR = 1e-3  # probability that it is nearer at so many steps by chance
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,6 +104,51 @@ def estimate_clock(
         best, covariance = simplest(fit, min(tried, key=lambda p: fit.cost(p, sigma)))
         others = [p for p in tried if fit.apart(p, best) > interval]
     return _with_verdict(fit, given, best, covariance, others, interval)
+
+
+def other_rate(
+    timestamps: np.ndarray, found: Steps, trajectory: Trajectory, estimate: ClockEstimate
+) -> float | None:
+    """Rate of the trajectory's clock, 0.1 to 10, at which it turns as the images do from the first
+    frame on, if the given rate and those near it contradict the images; else None.
+
+    It is no correction, as rate and offset are hardly determined where the verdict is unclear.
+
+    Args:
+        timestamps, found, trajectory: as for `estimate_clock`.
+        estimate: its result.
+    """
+    turns = merged(timestamps, found.f_T_nexts[:, :3, :3], found.verified)
+    if estimate.verdict != "unclear" or len(turns) < MIN_STEPS:
+        return None
+    given, start = estimate.clock, np.array([estimate.clock.offset, 1.0])
+    begin = given.start + given.offset
+
+    def at_rate(rate: float) -> ClockFit:
+        times = begin + (trajectory.timestamps - begin) / rate
+        return ClockFit(turns, replace(trajectory, timestamps=times))
+
+    usual = ClockFit(turns, trajectory)
+    before = usual.residuals(usual.refine(start))
+    tried = [
+        (fit.cost(p, noise(before)), rate, p)
+        for rate, fit in ((rate, at_rate(rate)) for rate in _OTHER_RATES.tolist())
+        for p in fit.candidates(start, turns.step)
+    ]
+    tried.sort(key=lambda one: one[0])
+    nearest = [(rate, at_rate(rate), p) for _, rate, p in tried[:_NUM_REFINED_RATES]]
+    refined = [(rate, fit, fit.refine(p)) for rate, fit, p in nearest]
+    sigma = min(noise(fit.residuals(p)) for _, fit, p in refined)
+    rate, fit, best = min(refined, key=lambda one: one[1].cost(one[2], sigma))
+    after = [np.linalg.norm(residuals, axis=1) for residuals in (before, fit.residuals(best))]
+    nearer = np.count_nonzero(after[1] < after[0])
+    contradicted = (
+        _turning(fit, best).sum() >= _MIN_TURNS
+        and _explained(fit, best, best) >= _SURE_EXPLAINED
+        and noise(fit.residuals(best)) < _MAX_NOISE_RATIO * noise(before)
+        and outweighs(int(nearer), len(turns) - int(nearer), _OTHER_RATE_ERROR)
+    )
+    return float(rate * best[1]) if contradicted else None
 
 
 def _turning(fit: ClockFit, best: np.ndarray) -> np.ndarray:

@@ -59,6 +59,10 @@ def read_trajectory(path: Path, timestamps: Path | None = None) -> Trajectory:
     found = f"{columns} values"
     if columns == 1 and "," in rows[0][1]:
         found = "values separated by commas"
+    elif rows[0][1].startswith(("{", "[")):
+        found = "JSON, as nerfstudio's transforms.json"
+    elif columns == 10:
+        found = "10 values, as in COLMAP's images.txt, whose poses are inverted"
     raise GsbaError(
         f"{path}:{rows[0][0]}: {found}; want 8 separated by blanks (TUM: timestamp tx ty "
         "tz qx qy qz qw) or 12 (KITTI)"

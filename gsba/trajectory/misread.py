@@ -19,7 +19,16 @@ _DOUBTFUL_SHARE = 0.6  # share of agreeing steps below which another convention 
 _MIN_EXPLAINED_SHARE = 0.7  # least share of steps that another convention must explain
 _COMMON_SYSTEMS = "right-up-back", "left-down-back", "left-up-forward"  # half turns: of graphics,
 # about the vertical axis, about the forward axis
-_ADVICE = "or refine without it (--no-trajectory)"
+ADVICE = "or refine without it (--no-trajectory)"
+
+
+class TurnedAboutForwardError(GsbaError):
+    """A trajectory in axes that differ from the camera's by a turn about the forward one, as those
+    of upright panoramas do from raw pictures of a sensor that is mounted on its side."""
+
+    def __init__(self, message: str, ours_R_theirs: np.ndarray) -> None:
+        super().__init__(message)
+        self.ours_R_theirs = ours_R_theirs  # (3, 3) float64
 
 
 def refuse_useless(coarse: CoarsePoses) -> None:
@@ -31,7 +40,7 @@ def refuse_useless(coarse: CoarsePoses) -> None:
     poses = coarse.world_T_rigs
     if len(poses) > 1 and np.abs(poses - poses[0]).max() < 1e-12:
         raise GsbaError(
-            f"all {len(poses)} poses of the trajectory are identical: check the file, {_ADVICE}"
+            f"all {len(poses)} poses of the trajectory are identical: check the file, {ADVICE}"
         )
 
 
@@ -44,7 +53,8 @@ def refuse_misread(coarse: CoarsePoses, found: Steps, settings: TwoViewLimits) -
         settings: thresholds of contradiction.
 
     Raises:
-        GsbaError: the trajectory is reversed, mirrored, inverted or in other axes.
+        TurnedAboutForwardError: the trajectory is in axes that are turned about the forward one.
+        GsbaError: it is reversed, mirrored, inverted or in other axes.
     """
     judged = _judged_steps(coarse, found)
     if judged.sum() < _MIN_STEPS:
@@ -67,7 +77,11 @@ def refuse_misread(coarse: CoarsePoses, found: Steps, settings: TwoViewLimits) -
     text, other = _contradiction_text(shares[""], judged), ""
     if late:
         other = f"; or it is on another clock, by about {abs(late)} frames"
-    raise GsbaError(f"{text}: the trajectory is {best}{other}, {_ADVICE}")
+    message = f"{text}: the trajectory is {best}{other}, {ADVICE}"
+    for name, ours_R_theirs in axis_systems():
+        if best == _in_system(name) and name.endswith("forward"):
+            raise TurnedAboutForwardError(message, ours_R_theirs)
+    raise GsbaError(message)
 
 
 def refuse_misfit(coarse: CoarsePoses, found: Steps, settings: TwoViewLimits) -> None:
@@ -92,11 +106,11 @@ def refuse_misfit(coarse: CoarsePoses, found: Steps, settings: TwoViewLimits) ->
     if late:
         raise GsbaError(
             f"{text}: the trajectory is on another clock, by about {abs(late)} frames: correct "
-            f"the times or read.clock_offset_s, {_ADVICE}"
+            f"the times or read.clock_offset_s, {ADVICE}"
         )
     raise GsbaError(
         f"{text}: the trajectory is of another recording or on another clock; "
-        f"give the right one, {_ADVICE}"
+        f"give the right one, {ADVICE}"
     )
 
 
@@ -150,7 +164,7 @@ def _steps_in_other_conventions(world_T_rigs: np.ndarray) -> dict[str, np.ndarra
     }
     systems = {name: rotation for name, rotation in axis_systems() if name != OURS}
     for name in sorted(systems, key=lambda name: name not in _COMMON_SYSTEMS):
-        readings[f"{_axes(name)}: {_pass(name)}"] = _in_axes(steps, systems[name])
+        readings[_in_system(name)] = _in_axes(steps, systems[name])
     for name, axis in zip("xyz", np.eye(3), strict=True):
         mirrored = f"mirrored along {name}: it is no rigid motion of this camera, flip that axis"
         readings[mirrored] = _flipped(steps, 1 - 2 * axis)
@@ -164,6 +178,11 @@ def _steps_in_other_conventions(world_T_rigs: np.ndarray) -> dict[str, np.ndarra
 
 def _pass(words: str) -> str:
     return f"pass --trajectory-format {words}"
+
+
+def _in_system(system: str) -> str:
+    """The reading of a trajectory in another system of camera axes."""
+    return f"{_axes(system)}: {_pass(system)}"
 
 
 def _axes(system: str) -> str:

@@ -20,6 +20,8 @@ from gsba.export import ExportFormat, ExportOptions, export_all
 from gsba.export.photos import PhotoCamera, Photos, PlacedPhoto
 from gsba.frames.held_out import held_out_rows
 from gsba.geometry import pose
+from gsba.splat.gaussians import Gaussians
+from gsba.splat.ply import read_ply, write_ply
 from gsba.types import FrameSet, PictureFormat
 
 pytestmark = [pytest.mark.consumers, pytest.mark.filterwarnings("ignore")]  # of the programs
@@ -171,10 +173,16 @@ def test_open3d_reads_the_cloud(cloud: str, exported: Path) -> None:
     np.testing.assert_allclose(np.asarray(read.colors) * 255, COLORS, atol=1e-6)
 
 
+def _node_package(name: str) -> Path:
+    """Folder of a package of node; the test is skipped without it."""
+    folder = Path(os.environ.get("GSBA_NODE_MODULES", "")) / name
+    if not folder.is_absolute() or not folder.is_dir() or shutil.which("node") is None:
+        pytest.skip(f"node or its package {name} is not installed")
+    return folder
+
+
 def test_the_scene_is_valid_gltf(exported: Path) -> None:
-    validator = Path(os.environ.get("GSBA_NODE_MODULES", "")) / "gltf-validator"
-    if not validator.is_absolute() or shutil.which("node") is None:
-        pytest.skip("node or its package gltf-validator is not installed")
+    validator = _node_package("gltf-validator")
     script = (
         f"require({json.dumps(str(validator))}).validateBytes(new Uint8Array("
         f"require('fs').readFileSync({json.dumps(str(exported / 'gltf/scene.glb'))})))"
@@ -184,3 +192,16 @@ def test_the_scene_is_valid_gltf(exported: Path) -> None:
     report = json.loads(read.stdout)
     assert (report["issues"]["numErrors"], report["issues"]["numWarnings"]) == (0, 0), report
     assert report["info"]["animationCount"] == 1
+
+
+def test_splat_transform_reads_splats(tmp_path: Path) -> None:
+    """SuperSplat's command line: all numbers of a splat come back."""
+    program = _node_package("@playcanvas/splat-transform") / "bin/cli.mjs"
+    rng, num = np.random.default_rng(0), 50
+    shapes = (num, 3), (num, 3), (num, 4), (num,), (num, 16, 3)
+    splat = Gaussians(*(rng.normal(size=shape).astype(np.float32) for shape in shapes))
+    before, after = tmp_path / "point_cloud.ply", tmp_path / "after.ply"
+    write_ply(before, splat)
+    subprocess.run(["node", program, before, after], capture_output=True, check=True)
+    for one, other in zip(read_ply(before).arrays(), read_ply(after).arrays(), strict=True):
+        np.testing.assert_array_equal(one, other)

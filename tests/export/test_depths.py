@@ -116,11 +116,41 @@ def test_errors_of_poses_are_errors_of_depths() -> None:
         expected = np.einsum("oi,oi->o", axes, points[numbers] - poses[frames, :3, 3])
         errors.append(depths - expected * (1 + scale))
     joint = JointErrors(np.zeros((NUM_FRAMES - 1, 6, 6)), draws.astype(np.float32))
-    exact = _observed(scene, numbers, frames, scene.observation_bearings, 1e-6)
+    exact = _observed(scene, numbers, frames, scene.observation_bearings, 1e-7)
     alone = depth_variances(exact, axes)
     found = depth_variances(replace(exact, joint_errors=joint), axes)
     assert alone.max() < 1e-4 * found.min()
     np.testing.assert_allclose(np.sqrt(found), np.sqrt(np.mean(np.square(errors), 0)), rtol=0.1)
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.01])
+def test_shifts_that_grow_along_tracks_are_errors_of_depths(shift: float) -> None:
+    """Observations of each point are shifted in proportion to the change of its viewing direction,
+    as patches that show other surfaces, too: errors are then many times those of independent noise.
+    They stay as far below `sigma`, for these shifts are as large across baselines as along."""
+    scene, rng, sigma = reconstruction(), np.random.default_rng(0), 1e-4
+    points = np.tile(scene.points_world, (80, 1)) * rng.uniform(0.8, 1.25, (720, 1))
+    frames = np.tile(np.arange(NUM_FRAMES, dtype=np.int32), len(points))
+    numbers = np.repeat(np.arange(len(points), dtype=np.int32), NUM_FRAMES)
+    poses = scene.world_T_rigs
+    rays = points[numbers] - poses[frames, :3, 3]
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    means = rays.reshape(len(points), NUM_FRAMES, 3).mean(axis=1)
+    moved = np.einsum(
+        "oij,oj->oi", rng.normal(0, shift, (len(points), 3, 3))[numbers], rays - means[numbers]
+    )
+    moved += rng.normal(0, sigma, rays.shape)
+    noisy = rays + moved - np.sum(moved * rays, axis=1, keepdims=True) * rays
+    noisy /= np.linalg.norm(noisy, axis=1, keepdims=True)
+    found = _triangulated(poses[frames, :3, 3], noisy, numbers, points)
+    bearings = np.einsum("oji,oj->oi", poses[frames][:, :3, :3], noisy)
+    estimated = replace(_observed(scene, numbers, frames, bearings, sigma), points_world=found)
+    axes = poses[frames, :3, 2]
+    errors = np.sum(axes * (found - points)[numbers], axis=1)
+    alone = np.einsum("oi,oij,oj->o", axes, point_covariances(estimated)[numbers], axes)
+    off = np.median(np.abs(errors) / np.sqrt(depth_variances(estimated, axes))) / 0.6745
+    assert off == pytest.approx(1 / 1.8, rel=0.2)
+    assert (np.median(np.abs(errors) / np.sqrt(alone)) > 5) == (shift > 0)
 
 
 def _observed(

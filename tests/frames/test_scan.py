@@ -203,6 +203,9 @@ def test_refused_frames(folder: Path) -> None:
     write_image(bad, 66, 32)
     with pytest.raises(GsbaError, match=r"0002.jpg: is 66x32; an equirectangular frame is 2:1"):
         scan(folder, fps=1)
+    write_image(bad, 48, 32)
+    with pytest.raises(GsbaError, match=r"48x32; .* cut out its faces, as front/NAME.jpg"):
+        scan(folder, fps=1)
     write_image(bad, 128, 64)
     with pytest.raises(GsbaError, match=r"0002.jpg: is 128x64, but '0000.jpg' is 64x32"):
         scan(folder, fps=1)
@@ -431,6 +434,26 @@ def test_refused_masks(folder: Path, tmp_path: Path) -> None:
     binary = write_mask(tmp_path / "binary.png", white=1)
     with pytest.raises(GsbaError, match=r"holds 0 and 1"):
         load_mask(scan(folder, fps=1, masks=binary), 0)
+
+
+def test_a_mask_that_hides_the_rest_is_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder, path, levels = tmp_path / "frames", tmp_path / "mask.png", np.zeros((32, 64), np.uint8)
+    folder.mkdir()
+    for f in range(3):
+        write_image(folder / f"{f:04d}.jpg")
+    cv2.imwrite(str(path), levels)
+    with pytest.raises(GsbaError, match=r"mask.png: the mask hides all of each picture: 255 = use"):
+        scan(folder, fps=1, masks=path)
+    levels[24:] = 255  # a carrier: an inverted mask
+    cv2.imwrite(str(path), levels)
+    scan(folder, fps=1, masks=path)
+    assert "hides 85 % of each picture" in caplog.text
+    caplog.clear()
+    cv2.imwrite(str(path), 255 - levels)
+    scan(folder, fps=1, masks=path)
+    assert not caplog.records
 
 
 def test_masks_of_cube_frames_are_panoramas_of_any_size(tmp_path: Path) -> None:

@@ -98,6 +98,24 @@ def test_a_straight_walk_tells_no_clock() -> None:
     assert found.clock == Clock(TIMES[0], 0.0, 1.0)
 
 
+@pytest.mark.parametrize("rate", [0.5, 1.0, 2.0])
+def test_a_clock_at_another_rate_is_told(rate: float) -> None:
+    """A walk straight on: what the hand turns is too little for a clock, not for its rate."""
+    rng = np.random.default_rng(0)
+    at = np.linspace(TIMES[0], TIMES[-1], 4 * NUM_FRAMES)
+    around = 2 * np.pi * (at - TIMES[0])[:, None] / rng.uniform(3, 8, (1, 3))
+    spline = RotationSpline(at, Rotation.from_rotvec(np.radians(1) * np.sin(around)))
+    true = Clock(TIMES[0], 0.0, rate)
+    poses, drifting = (pose(spline(t).as_matrix(), np.outer(t, [1, 0, 0])) for t in (TIMES, at))
+    steps = inverse(poses[:-1]) @ poses[1:]
+    noise = Rotation.from_rotvec(np.radians(0.1) * rng.normal(size=(len(at), 3)))
+    drifting[:, :3, :3] = drifting[:, :3, :3] @ noise.as_matrix()
+    every = np.ones(len(steps), bool)
+    found, trajectory = Steps(steps, every, every), Trajectory(true.times(at), drifting)
+    told = clock.other_rate(TIMES, found, trajectory, _estimate(found, trajectory))
+    assert told == (None if rate == 1 else pytest.approx(rate, rel=0.05))
+
+
 def test_another_recording_tells_no_clock() -> None:
     steps, _ = _case(Clock(TIMES[0], 0.0, 1.0), seed=0)
     _, trajectory = _case(Clock(TIMES[0], 0.0, 1.0), seed=5)

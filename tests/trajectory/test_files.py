@@ -99,6 +99,8 @@ def test_rows_of_lost_frames_have_no_pose(tmp_path: Path, row: str) -> None:
         ("1 2 3\n", "traj.txt:1: 3 values; want 8"),
         ("1,2,3,4,0,0,0,1\n", "traj.txt:1: values separated by commas; want 8"),
         ("0,1,2,3,0,0,0,1\n", "separated by blanks"),
+        ('{"frames": []}\n', "traj.txt:1: JSON, as nerfstudio's transforms.json; want 8"),
+        ("1 1 0 0 0 0 0 0 1 a.jpg\n", "10 values, as in COLMAP's images.txt"),
     ],
 )
 def test_refused_files(tmp_path: Path, text: str, message: str) -> None:

@@ -11,7 +11,12 @@ from gsba.config import RefineSettings, TwoViewLimits
 from gsba.geometry import inverse, pose
 from gsba.log import GsbaError
 from gsba.matching import recovery
-from gsba.trajectory.misread import refuse_misfit, refuse_misread, refuse_useless
+from gsba.trajectory.misread import (
+    TurnedAboutForwardError,
+    refuse_misfit,
+    refuse_misread,
+    refuse_useless,
+)
 from gsba.trajectory.steps import Steps
 from gsba.types import CoarsePoses, PoseSource, Trajectory, VerifiedPairs
 
@@ -78,6 +83,16 @@ def test_what_does_not_fit_is_refused_with_the_reason(poses: np.ndarray, said: s
     with pytest.raises(GsbaError, match=said) as refused:
         refuse_misfit(_coarse(poses), _found(), TwoViewLimits())
     assert "\n" not in str(refused.value) and "--no-trajectory" in str(refused.value)
+
+
+@pytest.mark.parametrize("quarters", [1, 2, 3])
+def test_turns_about_the_forward_axis_are_told_with_their_rotation(quarters: int) -> None:
+    """By which raw pictures of a sensor on its side are cut upright."""
+    ours_R_theirs = Rotation.from_euler("z", 90 * quarters, degrees=True).as_matrix()
+    turned = SLAM @ pose(ours_R_theirs, np.zeros(3))
+    with pytest.raises(TurnedAboutForwardError, match="z forward") as refused:
+        refuse_misread(_coarse(turned), _found(), VerifySettings())
+    np.testing.assert_allclose(refused.value.ours_R_theirs, ours_R_theirs, atol=1e-12)
 
 
 def test_a_late_clock_or_another_recording_are_not_misread() -> None:
