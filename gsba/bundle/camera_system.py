@@ -204,7 +204,7 @@ class _Linearized:
 
     def _system(self) -> ReducedSystem:
         graph = gtsam.NonlinearFactorGraph(self.graph)
-        graph.push_back(self.unknowns.graph)
+        graph.push_back(self.unknowns.priors())  # of frames that move by chance: their spread
         system = reduced_system(graph, self.blocks, self.values)
         system.linearize(self.values)
         return system
