@@ -37,9 +37,9 @@ N = partial(gtsam.symbol, "n")  # inverse of the stitching radius (1,), 1 / map 
 W = partial(gtsam.symbol, "w")  # own motion (6,) of a frame, beside that of its velocity
 
 _LEAST_TURN = 1e-6  # rad, standard deviation
-_MOVES_ALIKE = 3.0  # standard deviation of own translations in their spread: frames are often taken
-# at about the pace of steps, and successive ones then move alike; held as if each moved by chance,
-# they bent the radial profile of raw lenses
+_MOVES_ALIKE = 3.0  # standard deviation of own translations in their spread, where lenses are solved
+# for: frames are often taken at about the pace of steps, and successive ones then move alike; held
+# as if each moved by chance, they bend the radial profile of the lenses instead
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,13 +115,16 @@ class CameraUnknowns:
         return self.priors(_MOVES_ALIKE)
 
     def priors(self, moves_alike: float = 1.0) -> gtsam.NonlinearFactorGraph:
-        """As `graph`, with standard deviations of own translations in their spread."""
+        """As `graph`, with standard deviations of own translations in their spread, where lenses are
+        solved for."""
         graph, own = gtsam.NonlinearFactorGraph(self.shared), self.own
-        widened = np.repeat([1.0, moves_alike], 3)
         if own is None:
             return graph
+        solved_for = [camera.lenses is not None for camera in self.variables.cameras]
         for f in range(len(own.values)):
-            model = gtsam.noiseModel.Diagonal.Sigmas(widened * own.sigmas_of(f))
+            widened = moves_alike if solved_for[own.cameras[f]] else 1.0
+            sigmas = own.sigmas_of(f) * np.repeat([1.0, widened], 3)
+            model = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
             graph.add(gtsam.PriorFactorVector(W(f), np.zeros(6), model))
         return graph
 

@@ -210,7 +210,7 @@ def _findings(state: State, result: Reconstruction, gps: dict[str, Any] | None) 
         notes += more
     if gps is not None:
         notes += notes_on_gps(gps, len(frames))
-    start = run.evidence.start_name(prior.absent)
+    start = state.run.evidence.start_name(prior.absent)
     found_of = frames, prior.coarse, result, map_.frame_weights, MAX_SCALE_SIGMA, start
     lists, more = findings.of_frames(*found_of)
     notes += more

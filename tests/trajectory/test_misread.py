@@ -91,7 +91,7 @@ def test_turns_about_the_forward_axis_are_told_with_their_rotation(quarters: int
     ours_R_theirs = Rotation.from_euler("z", 90 * quarters, degrees=True).as_matrix()
     turned = SLAM @ pose(ours_R_theirs, np.zeros(3))
     with pytest.raises(TurnedAboutForwardError, match="z forward") as refused:
-        refuse_misread(_coarse(turned), _found(), VerifySettings())
+        refuse_misread(_coarse(turned), _found(), TwoViewLimits())
     np.testing.assert_allclose(refused.value.ours_R_theirs, ours_R_theirs, atol=1e-12)
 
 
