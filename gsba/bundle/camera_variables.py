@@ -37,9 +37,9 @@ N = partial(gtsam.symbol, "n")  # inverse of the stitching radius (1,), 1 / map 
 W = partial(gtsam.symbol, "w")  # own motion (6,) of a frame, beside that of its velocity
 
 _LEAST_TURN = 1e-6  # rad, standard deviation
-_MOVES_ALIKE = 3.0  # standard deviation of own translations in their spread, where lenses are solved
-# for: frames are often taken at about the pace of steps, and successive ones then move alike; held
-# as if each moved by chance, they bend the radial profile of the lenses instead
+_MOVES_ALIKE = 3.0  # standard deviation of own translations in their spread, where lenses are
+# solved for: frames are often taken at about the pace of steps, and successive ones then move
+# alike; held as if each moved by chance, they bend the radial profile of the lenses instead
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,8 +115,7 @@ class CameraUnknowns:
         return self.priors(_MOVES_ALIKE)
 
     def priors(self, moves_alike: float = 1.0) -> gtsam.NonlinearFactorGraph:
-        """As `graph`, with standard deviations of own translations in their spread, where lenses are
-        solved for."""
+        """As `graph`; own translations have this times their spread where lenses are solved for."""
         graph, own = gtsam.NonlinearFactorGraph(self.shared), self.own
         if own is None:
             return graph
