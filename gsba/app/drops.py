@@ -24,19 +24,8 @@ from gsba.log import GsbaError, brief
 from gsba.store.folder import MARKER, is_run_folder
 from gsba.video.timeline import VIDEO_SUFFIXES
 
-_BESIDE = (
-    ".tum",
-    ".csv",
-    ".txt",
-    ".gpx",
-    ".json",
-    ".srt",
-    ".ply",
-    ".las",
-    ".laz",
-    ".toml",
-)  # files
-# that commands take beside footage
+# Files that commands take beside footage.
+_BESIDE = (".tum", ".csv", ".txt", ".gpx", ".json", ".srt", ".ply", ".las", ".laz", ".toml")
 _PART = re.compile(r"^\.(?P<name>.+)\.(?P<size>\d+)-(?P<modified>\d+)\.gsba-drop$", re.DOTALL)
 _FORBIDDEN = re.compile(r'[\x00-\x1f\x7f-\x9f/\\:*?"<>|]')
 _MAX_NAME = 180  # bytes, so that names beside it fit

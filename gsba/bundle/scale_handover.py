@@ -19,9 +19,7 @@ _STANDING_RATIO = 0.1  # of the rms step: shorter ones are of a camera that stan
 _MIN_POINTS = 8  # that both sides see
 _MAX_DISTANCE_SIGMA = 0.1  # of a point's distance by one side, part of it
 _SIGMAS = 2.0  # standard errors of the median that count as uncertainty
-_MEDIAN_ERROR = (
-    1.2533  # standard error of a median of normal values, times the root of their number
-)
+_MEDIAN_ERROR = 1.2533  # of a median of normal values: standard error, over that of their mean
 _MAD_SIGMAS = 1.4826  # standard deviation of normal values over their median absolute deviation
 _PARALLEL = 1e-9  # smallest over largest information of a point's place, of parallel rays
 

@@ -25,14 +25,12 @@ class Figures:
     frames: int  # of the run, without those that were fetched for the map alone
     exported: int  # of these, in the exported map
     points: int
-    position_error: (
-        float  # part of the extent by which no position is further off, in 19 of 20 maps
-    )
+    # Part of the extent by which no position is further off, in 19 of 20 maps.
+    position_error: float
     neighbour_pixels: float  # the same of points in a neighbour's picture, median of the frames
     extent_metres: float  # NaN = no scale
-    held_steps: tuple[
-        int, ...
-    ]  # (n,) steps that no image shows: their poses are those of the start
+    # (n,) steps that no image shows: their poses are those of the start.
+    held_steps: tuple[int, ...]
     false_steps: int  # number of the start's steps that images contradict
     unrefined: tuple[int, ...]  # (n,) frames whose poses are those of the start
     scale_changes: tuple[float, ...]  # (F - 1,) that may hide at each step, see `scale_handover`
