@@ -291,7 +291,7 @@ def main() -> None:
         return
     rows = list(all_judged(options.out, options.judge))
     lines = table(rows)
-    lines = ["# How often is the verdict wrong?", "", *lines]
+    lines = ["# Error rates of the verdict", "", *lines]
     lines += [FOOT, "## Wrong verdicts", "", *mistakes(rows)]
     print("\n".join(lines))
     write_table(lines, options.markdown)

@@ -1,4 +1,4 @@
-"""How large the code is, counted: `python docs/size.py` from anywhere in the repository.
+"""Size of the code, counted: `python docs/size.py` from anywhere in the repository.
 
 Counts of one commit are compared with those of another by running this file in both. Functions are
 told by name alone, so that a name that several functions share counts as used more than once.
@@ -39,7 +39,7 @@ def functions(files: dict[Path, ast.Module]) -> list[str]:
 
 
 def uses(files: dict[Path, ast.Module]) -> Counter[str]:
-    """How often each name is read, as a name or as an attribute."""
+    """Number of times that each name is read, as a name or as an attribute."""
     nodes = [node for tree in files.values() for node in ast.walk(tree)]
     names = Counter(node.id for node in nodes if isinstance(node, ast.Name))
     return names + Counter(node.attr for node in nodes if isinstance(node, ast.Attribute))

@@ -11,8 +11,9 @@ import os
 import re
 import shutil
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -85,10 +86,11 @@ def plan(root: Path, folder: str, files: Sequence[Any]) -> list[dict[str, Any]]:
         GsbaError: nothing can be dropped there.
     """
     target, found, promised = _target(root, folder), [], dict[Path, Drop]()
+    on_their_way = cache(lambda where: unfinished(where) if where.is_dir() else [])
     free = shutil.disk_usage(_existing(target)).free - _SPARE
     for one in files:
         try:
-            drop = _placed(root, target, one, promised)
+            drop, renamed = _placed(root, target, one, promised, on_their_way)
             left = 0 if drop.is_here else drop.size - drop.arrived
             if left > free:
                 raise GsbaError(_no_room(drop, left, free))
@@ -98,7 +100,6 @@ def plan(root: Path, folder: str, files: Sequence[Any]) -> list[dict[str, Any]]:
             continue
         promised[drop.final] = drop
         state = "here" if drop.is_here else "unfinished" if drop.part.is_file() else "new"
-        wish = Path(_cleaned(str(one["name"]))[-1]).name
         found.append(
             {
                 "path": drop.final.relative_to(root.resolve()).as_posix(),
@@ -106,7 +107,7 @@ def plan(root: Path, folder: str, files: Sequence[Any]) -> list[dict[str, Any]]:
                 "modified": drop.modified,
                 "offset": drop.arrived,
                 "state": state,
-                "renamed": drop.name != wish,
+                "renamed": renamed,
                 "error": "",
             }
         )
@@ -230,8 +231,22 @@ def discard(root: Path, folder: str, part: str) -> None:
         path.unlink(missing_ok=True)
 
 
-def _placed(root: Path, target: Path, one: Any, promised: dict[Path, Drop]) -> Drop:
-    """A dropped file under the first name that is free, or that it has already."""
+def _placed(
+    root: Path,
+    target: Path,
+    one: Any,
+    promised: dict[Path, Drop],
+    on_their_way: Callable[[Path], list[dict[str, Any]]],
+) -> tuple[Drop, bool]:
+    """A dropped file under the first name that is free, or that it has already; True if that is not
+    its own name.
+
+    Args:
+        root, target: folder of the page, and where files are dropped.
+        one: name, size and time of change.
+        promised: files of the same plan, by path.
+        on_their_way: `unfinished` of a folder.
+    """
     try:
         name, size, modified = str(one["name"]), int(one["size"]), int(one["modified"])
     except (KeyError, TypeError, ValueError):
@@ -245,16 +260,12 @@ def _placed(root: Path, target: Path, one: Any, promised: dict[Path, Drop]) -> D
     for number in range(1, _MAX_NAMES):
         tried = wish.name if number == 1 else f"{wish.stem}-{number}{wish.suffix}"
         drop = Drop(folder, tried, size, modified)
-        taken = drop.final.exists() or drop.final in promised or _of_another(drop)
+        parts = {part["part"] for part in on_their_way(folder) if part["name"] == tried}
+        of_another = parts - {drop.part.name}
+        taken = drop.final.exists() or drop.final in promised or bool(of_another)
         if drop.is_here or not taken:
-            return drop
+            return drop, number > 1
     raise GsbaError(f"{brief(wish.name)}: there are {_MAX_NAMES} files of this name: rename it")
-
-
-def _of_another(drop: Drop) -> bool:
-    """True if a part of another file is on its way to the same name."""
-    parts = unfinished(drop.folder) if drop.folder.is_dir() else []
-    return any(one["name"] == drop.name and one["part"] != drop.part.name for one in parts)
 
 
 def _target(root: Path, folder: str) -> Path:

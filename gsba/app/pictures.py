@@ -7,12 +7,13 @@ of damaged files may hang or crash: the server then ends this process and starts
 import json
 import os
 import sys
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from gsba.frames.files import decode, image_size, is_image
 from gsba.log import GsbaError, brief
+from gsba.video.timeline import is_video, picture_near
 
 SMALL, LARGE = 320, 2048  # pixels across a picture of the list, and of a panorama to look around in
 _QUALITY = 82  # of JPEGs
@@ -30,12 +31,9 @@ def picture_of(path: Path, width: int, share: float) -> bytes:
     Raises:
         GsbaError: there is no picture, or it cannot be decoded.
     """
-    from gsba.frames.files import decode, image_size, is_image
-    from gsba.video.timeline import is_video, picture_near
-
     if path.is_dir():
         folders = (path, *sorted(each for each in path.iterdir() if each.is_dir()))
-        images = next(filter(None, (_images_in(folder, is_image) for folder in folders)), None)
+        images = next(filter(None, map(_images_in, folders)), None)
         if images is None:
             raise GsbaError(f"{path} holds no images")
         path = images[int(share * (len(images) - 1))]
@@ -44,7 +42,7 @@ def picture_of(path: Path, width: int, share: float) -> bytes:
     return _jpeg(decode(path, image_size(path), at_least=width)[..., ::-1], width)
 
 
-def _images_in(folder: Path, is_image: Callable[[Path], bool]) -> list[Path]:
+def _images_in(folder: Path) -> list[Path]:
     return sorted(each for each in folder.iterdir() if is_image(each))
 
 

@@ -59,7 +59,7 @@ class Previews:
         self._closed = False
 
     def about(self, paths: Sequence[Path]) -> list[dict[str, Any]]:
-        """What is known of files so far; the rest is queued.
+        """Facts and pictures of files as far as they are known; the rest is queued.
 
         Returns:
             of each path "facts" and "problem", None while they are not known; "picture", True if
@@ -75,17 +75,20 @@ class Previews:
                 known = {"facts": runs.brief_facts(path), "problem": ""}
             else:
                 known = self._result(facts)
-                missing += [facts] if known is None else []
             shown = self._result(picture)
-            missing += [picture] if shown is None else []
-            pending = known is None or shown is None
-            known = known or {"facts": None, "problem": None}
-            problem = known.get("error", known.get("problem"))
-            if path.is_dir():  # a folder of several recordings is no fault
-                problem = problem and ""
-            drawn = shown is not None and "error" not in shown
-            known = {"facts": known.get("facts", {}), "problem": problem}
-            found.append(known | {"picture": drawn, "pending": pending})
+            open_tasks = [one for one, got in ((facts, known), (picture, shown)) if got is None]
+            missing += open_tasks
+            problem = None if known is None else known.get("error", known.get("problem"))
+            if problem and path.is_dir():  # a folder of several recordings is no fault
+                problem = ""
+            found.append(
+                {
+                    "facts": None if known is None else known.get("facts", {}),
+                    "problem": problem,
+                    "picture": shown is not None and "error" not in shown,
+                    "pending": bool(open_tasks),
+                }
+            )
         self._want(missing[::-1])
         return found
 
@@ -105,9 +108,7 @@ class Previews:
         Raises:
             GsbaError: there is none.
         """
-        task = self._picture_task(path)
-        self._made(task)
-        return task.kept
+        return self._file(self._picture_task(path))
 
     def panorama(self, path: Path, share: float) -> Path:
         """JPEG of a panorama to look around in, at a place 0..1 of a video or folder.
@@ -116,9 +117,7 @@ class Previews:
             GsbaError: there is none.
         """
         values = {"kind": "picture", "width": LARGE, "share": min(max(share, 0.0), 1.0)}
-        task = self._task(path, values)
-        self._made(task)
-        return task.kept
+        return self._file(self._task(path, values))
 
     def frame(self, run: Path, frame: int) -> Path:
         """JPEG of the panorama of a finished run's frame.
@@ -126,9 +125,7 @@ class Previews:
         Raises:
             GsbaError: there is none.
         """
-        task = self._task(run, {"kind": "frame", "frame": frame, "width": LARGE})
-        self._made(task)
-        return task.kept
+        return self._file(self._task(run, {"kind": "frame", "frame": frame, "width": LARGE}))
 
     def close(self) -> None:
         """End the process."""
@@ -191,6 +188,11 @@ class Previews:
         if "error" in known:
             raise GsbaError(known["error"])
         return known
+
+    def _file(self, task: _Task) -> Path:
+        """File of a task's result; waits for it."""
+        self._made(task)
+        return task.kept
 
     def _want(self, tasks: Sequence[_Task]) -> None:
         """Queue tasks; the last of them is made next."""

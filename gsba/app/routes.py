@@ -202,7 +202,7 @@ def _browse(app: App, request: Request) -> Any:
 
 
 def _about(app: App, request: Request) -> Any:
-    """What is known so far of several paths, by path."""
+    """Facts about several paths and whether they have a picture, as far as known, by path."""
     names = request.state.body.get("paths")
     if not isinstance(names, list):
         raise GsbaError("the request names no paths")

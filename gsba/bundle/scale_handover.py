@@ -1,4 +1,4 @@
-"""How well the scale is carried over from each frame of a map to the next.
+"""Transfer of the scale from each frame of a map to the next.
 
 Along a path the scale is handed on by points that are seen from several places before a step, and
 from several behind it. Both sides triangulate such a point by themselves. Where they disagree on
@@ -35,12 +35,10 @@ def scale_changes(result: Reconstruction, recordings: np.ndarray) -> np.ndarray:
         recordings: (F,) number of each frame's recording.
     """
     found = np.full(max(len(result.world_T_rigs) - 1, 0), np.nan)
-    order = np.argsort(result.observation_frames, kind="stable")
-    bounds = np.searchsorted(result.observation_frames[order], np.arange(len(found) + 2))
+    observed = result.observations_by_frame()
     for step, first, end in _sides(result.world_T_rigs[:, :3, 3], recordings):
-        before, behind = (
-            order[bounds[a] : bounds[b]] for a, b in ((first, step + 1), (step + 1, end))
-        )
+        before = np.concatenate(observed[first : step + 1])
+        behind = np.concatenate(observed[step + 1 : end])
         middle = result.world_T_rigs[step : step + 2, :3, 3].mean(axis=0)
         found[step] = _change(result, before, behind, middle)
     return found

@@ -81,7 +81,7 @@ class RunResult:
 
     @property
     def failed(self) -> bool:
-        """Whether the run is partial, or its map is not good to train on."""
+        """True if the run is partial, or its map is not good to train on."""
         return self.partial or self.report["verdict"]["level"] == Level.REFUSED
 
 

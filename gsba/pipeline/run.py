@@ -76,7 +76,7 @@ class Evidence:
     start: RunStart = RunStart.TRAJECTORY  # for the report
 
     def start_name(self, absent: bool) -> str:
-        """What the run started from, for the report.
+        """Name of the source of the initial poses, for the report.
 
         Args:
             absent: True if there is no trajectory.

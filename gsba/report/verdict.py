@@ -210,7 +210,7 @@ class _Tests:
 
 
 def _accuracy(figures: Figures) -> str:
-    """How far positions may be off; "" = not known."""
+    """Bound on the errors of positions, in words; "" = not known."""
     share, metres = figures.position_error, figures.extent_metres
     if not math.isfinite(share):
         return ""
@@ -223,7 +223,7 @@ def _accuracy(figures: Figures) -> str:
 
 
 def _camera(report: Mapping[str, Any]) -> str:
-    """What was found of the camera; "" = it was not looked for."""
+    """Parts of the camera that were found, in words; "" = none were looked for."""
     found = report.get("camera") or {}
     if not found:
         return ""

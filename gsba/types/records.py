@@ -32,7 +32,7 @@ class PoseSource(IntEnum):
 
 
 class RunStart(StrEnum):
-    """What gives a run its initial poses, in words for the user."""
+    """Source of a run's initial poses, in words for the user."""
 
     TRAJECTORY = "trajectory file"
     ODOMETRY = "odometry"  # of the run's own video

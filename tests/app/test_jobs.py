@@ -6,11 +6,12 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
+from waiting import until
 
 from gsba.app import worker
 from gsba.app.jobs import Command, Job, Jobs, alive, alive_lock, ending
@@ -56,14 +57,6 @@ def at_work(jobs: Jobs) -> threading.Thread:
     return thread
 
 
-def until(condition: Callable[[], bool]) -> None:
-    for _ in range(2400):
-        if condition():
-            return
-        time.sleep(0.05)
-    pytest.fail("it did not happen within 2 minutes")
-
-
 def status(jobs: Jobs, job: Job) -> str:
     return jobs.get(job.id).state.status
 
@@ -86,14 +79,14 @@ def test_jobs_run_one_after_another_in_order(jobs: Jobs) -> None:
 def test_a_job_is_stopped_and_goes_on_without_fresh(jobs: Jobs) -> None:
     job = added(jobs, "wait", "--fresh")
     thread = at_work(jobs)
-    until(lambda: has_begun(jobs, job))
+    until(lambda: has_begun(jobs, job), 120)
     assert jobs.stop(job.id).state.status == "stopping"
     thread.join(120)
     assert status(jobs, job) == "stopped" and jobs.get(job.id).state.code == 130
     jobs.go_on(job.id)
     assert jobs.get(job.id).arguments() == ["wait"]
     thread = at_work(jobs)
-    until(lambda: status(jobs, job) == "running" and has_begun(jobs, job))
+    until(lambda: status(jobs, job) == "running" and has_begun(jobs, job), 120)
     jobs.stop(job.id)
     thread.join(120)
     assert (jobs.root.parent / "seen").read_text().splitlines() == ["wait --fresh", "wait"]
@@ -102,7 +95,7 @@ def test_a_job_is_stopped_and_goes_on_without_fresh(jobs: Jobs) -> None:
 def test_stopping_again_kills(jobs: Jobs) -> None:
     job = added(jobs, "wait")
     thread = at_work(jobs)
-    until(lambda: has_begun(jobs, job))
+    until(lambda: has_begun(jobs, job), 120)
     os.kill(jobs.get(job.id).state.pid or 0, signal.SIGSTOP)  # it does not hear SIGINT
     jobs.stop(job.id)
     assert status(jobs, job) == "stopping"
@@ -137,7 +130,7 @@ def test_a_job_outlives_its_worker_and_the_next_one_sees_it_out(jobs: Jobs) -> N
     job = added(jobs, "wait")
     with jobs.locked():  # as a worker that is killed right after it started the job
         job, process = worker._start(jobs, job)
-    until(lambda: has_begun(jobs, job))
+    until(lambda: has_begun(jobs, job), 120)
     after = added(jobs, "exit", "0")
     thread = at_work(jobs)
     time.sleep(0.5)
@@ -152,7 +145,7 @@ def test_another_process_with_the_pid_of_a_job_is_not_the_job(jobs: Jobs) -> Non
     job = added(jobs, "wait")
     with jobs.locked():
         job, process = worker._start(jobs, job)
-    until(lambda: has_begun(jobs, job))
+    until(lambda: has_begun(jobs, job), 120)
     assert alive(job)
     process.kill()
     process.wait(120)
@@ -172,7 +165,7 @@ def test_the_lock_of_an_earlier_start_does_not_hold_up_the_next(jobs: Jobs) -> N
     with alive_lock(job) as left_behind:
         assert alive(job)
         thread = at_work(jobs)
-        until(lambda: has_begun(jobs, job))
+        until(lambda: has_begun(jobs, job), 120)
         jobs.stop(job.id)
         thread.join(120)
         assert status(jobs, job) == "stopped" and not alive(jobs.get(job.id))
@@ -182,7 +175,7 @@ def test_the_lock_of_an_earlier_start_does_not_hold_up_the_next(jobs: Jobs) -> N
 def test_a_job_that_was_killed_is_lost(jobs: Jobs) -> None:
     job = added(jobs, "wait")
     thread = at_work(jobs)
-    until(lambda: has_begun(jobs, job))
+    until(lambda: has_begun(jobs, job), 120)
     os.kill(jobs.get(job.id).state.pid or 0, signal.SIGKILL)
     thread.join(120)
     assert status(jobs, job) == "lost"
@@ -192,7 +185,7 @@ def test_a_job_that_was_killed_is_lost(jobs: Jobs) -> None:
 def test_there_is_one_worker(jobs: Jobs) -> None:
     job = added(jobs, "wait")
     thread = at_work(jobs)
-    until(lambda: has_begun(jobs, job))
+    until(lambda: has_begun(jobs, job), 120)
     work(jobs)  # returns at once
     assert status(jobs, job) == "running"
     jobs.stop(job.id)

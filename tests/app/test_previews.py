@@ -2,13 +2,13 @@
 
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from waiting import until
 
 from gsba.app import previews
 from gsba.app.pictures import answer
@@ -37,14 +37,6 @@ def made(root: Path, tmp_path: Path) -> Iterator[Previews]:
     found.close()
 
 
-def until(condition: Callable[[], bool]) -> None:
-    for _ in range(1200):
-        if condition():
-            return
-        time.sleep(0.05)
-    pytest.fail("it did not happen within a minute")
-
-
 def with_process(monkeypatch: pytest.MonkeyPatch, script: str) -> None:
     line = [sys.executable, "-c", script]
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
@@ -57,7 +49,7 @@ def test_a_list_is_filled_in_the_background_and_kept(
     paths = [root / n for n in ("a.jpg", "frames", "broken.mp4", "empty", "notes.txt")]
     first = made.about(paths)
     assert [one["pending"] for one in first] == [True, True, True, True, False]
-    until(lambda: not any(one["pending"] for one in made.about(paths)))
+    until(lambda: not any(one["pending"] for one in made.about(paths)), 60)
     image, folder, broken, empty, notes = made.about(paths)
     assert image["facts"]["size"] == "640x320" and image["picture"]
     assert folder["picture"] and folder["problem"] == ""  # as a row: it may hold recordings
