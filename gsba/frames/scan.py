@@ -1,11 +1,13 @@
 """Captured frames on disk: which images form a frame, in what order, and their pixels."""
 
+import filecmp
 import logging
 import re
 import shlex
 import unicodedata
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -111,6 +113,24 @@ def scan(
         formats=(kind,),
         timed=timed,
     )
+
+
+def warn_of_repeats(frames: FrameSet) -> None:
+    """Pictures that are there twice have the same errors, which count as independent ones."""
+    same = partial(filecmp.cmp, shallow=False)
+    repeats = [
+        name
+        for name, (before, after) in zip(frames.names[1:], pairwise(frames.paths), strict=True)
+        if before != after and all(map(same, before, after))
+    ]
+    if repeats:
+        _log.warning(
+            "%d of %d frames are the picture before them once more, %s first: errors will be larger"
+            " than stated; leave them out",
+            len(repeats),
+            len(frames),
+            repeats[0],
+        )
 
 
 def _factory_lenses(

@@ -4,14 +4,14 @@ import numpy as np
 
 from gsba.bundle.predicted_steps import step_deviations
 from gsba.frames.masks import load_mask
-from gsba.geometry import inverse, step_covariances, unit
+from gsba.geometry import inverse, rotation_angle, step_covariances, unit
 from gsba.log import GsbaError
 from gsba.masks.borders import find_borders
 from gsba.masks.carrier import VEHICLE_SHARE
 from gsba.types import FrameSet, Reconstruction
 
 MIN_STEP_SIGMAS = 3.0  # median length of a map's steps, in standard deviations; maps of real and
-# rendered walks have 40 and more
+# rendered walks have 40 and more; a camera that turns by less in a step, and moves by less, stands
 MAX_STEP_DEVIATION = 0.5  # of a step from the one that far frames predict, part of its length: true
 # walks deviate by .006 at most, true positions of a turn by hand by .05
 MAX_CONTRADICTED_SHARE = 0.1  # of steps
@@ -109,18 +109,24 @@ def _require_prediction(main: Reconstruction) -> None:
 
 
 def step_sigmas(result: Reconstruction) -> np.ndarray:
-    """Length of each step of a map over the standard deviation of its end, (F - 1,) float64.
+    """Length of each step of a map over the standard deviation of its end, (N,) float64.
 
-    Steps of unknown covariance are left out.
+    Left out are steps of unknown covariance, and those in which the camera stands (a tripod, a
+    frame given twice), unless it stands in all.
     """
     poses, joint = result.world_T_rigs, result.joint_errors
     if joint is None or len(poses) < 2:
         return np.zeros(0)
     steps = inverse(poses[:-1]) @ poses[1:]
-    spread = step_covariances(poses, result.pose_covariances, joint.neighbours)[:, 3:, 3:]
-    variances = np.trace(spread, axis1=1, axis2=2)
+    spread = step_covariances(poses, result.pose_covariances, joint.neighbours)
+    turn_variances, variances = (
+        np.trace(spread[:, part, part], axis1=1, axis2=2) for part in (np.s_[:3], np.s_[3:])
+    )
     known = np.isfinite(variances) & (variances > 0)
-    return np.linalg.norm(steps[known, :3, 3], axis=1) / np.sqrt(variances[known])
+    lengths = np.linalg.norm(steps[known, :3, 3], axis=1) / np.sqrt(variances[known])
+    turns = rotation_angle(steps[known, :3, :3])
+    moves = (lengths > MIN_STEP_SIGMAS) | (turns > MIN_STEP_SIGMAS * np.sqrt(turn_variances[known]))
+    return lengths[moves] if moves.any() else lengths
 
 
 def share_ahead(result: Reconstruction) -> float:

@@ -13,7 +13,7 @@ from gsba.bundle.families import Family
 from gsba.camera.fisheye import turned
 from gsba.compilation import compile_ahead
 from gsba.config import RefineSettings
-from gsba.frames.scan import scan
+from gsba.frames.scan import scan, warn_of_repeats
 from gsba.masks import merging
 from gsba.masks.segmentation import Segment
 from gsba.odometry import Odometry
@@ -158,6 +158,7 @@ def refine_from(
         store, settings, chosen: of the run.
     """
     compile_ahead("refine")
+    warn_of_repeats(start.frames)
     if walk is not None:
         start = _with_fetched(store, settings, chosen, given, start, source, walk)
     state, result = _solve_or_turn(_begin(store, settings, chosen, start), walk is not None)

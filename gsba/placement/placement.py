@@ -312,12 +312,14 @@ def _on_earth(
     fit = dataclasses.replace(found.similarity, rotation=found.similarity.rotation @ level)
     grounds = {**upright.grounds, "gps": {"file": str(path), **_claims(found, positions @ level.T)}}
     logger.info(
-        "--gps %s: %d of %d positions are inliers, with an RMS residual of %.3g m; sigmas: scale "
-        "%.2g %%, heading %.2g degrees, tilt %.2g degrees, position %.2g m",
+        "--gps %s: %d of %d positions are inliers, with an RMS residual of %.3g m, at latitude "
+        "%.5f, longitude %.5f; sigmas: scale %.2g %%, heading %.2g degrees, tilt %.2g degrees, "
+        "position %.2g m",
         path,
         found.used.sum(),
         len(fixes),
         found.rms_m,
+        *fixes.origin[:2],
         100 * found.scale_sigma,
         np.degrees(found.heading_sigma),
         np.degrees(found.tilt_sigma),

@@ -12,7 +12,7 @@ from PIL import Image
 from gsba.frames import masks
 from gsba.frames.masks import load_mask
 from gsba.frames.pixels import load_erp, load_faces
-from gsba.frames.scan import scan
+from gsba.frames.scan import scan, warn_of_repeats
 from gsba.log import GsbaError
 from gsba.types import FACES
 
@@ -86,6 +86,14 @@ def test_numbers_without_leading_zeros_are_in_numeric_order(tmp_path: Path, capl
         write_image(tmp_path / f"f{i}.PNG")
     assert scan(tmp_path, fps=1).names == ("f9", "f10", "f11")
     assert "numeric order" in caplog.text
+
+
+def test_pictures_that_are_there_twice_are_named(folder: Path, caplog) -> None:
+    warn_of_repeats(scan(folder, fps=1))
+    assert "once more" not in caplog.text
+    shutil.copy(folder / "0001.jpg", folder / "0001_copy.jpg")
+    warn_of_repeats(scan(folder, fps=1))
+    assert "1 of 5 frames are the picture before them once more, 0001_copy first" in caplog.text
 
 
 def test_fps_warns_of_files_that_stella_counts(folder: Path, caplog) -> None:

@@ -75,6 +75,19 @@ def test_positions_that_images_do_not_determine_are_refused(tmp_path: Path) -> N
         require_motion(vehicle, _result(0.0))
 
 
+def test_where_the_camera_stands_says_nothing_of_where_it_walks() -> None:
+    """Every frame twice; a camera that turns on the spot does not stand."""
+    walked, stood = _result(1.0), _result(0.0)
+    twice = replace(walked, world_T_rigs=walked.world_T_rigs[np.arange(NUM) // 2])
+    assert len(step_sigmas(twice)) == (NUM - 1) // 2 and step_sigmas(twice).min() > MIN_STEP_SIGMAS
+    assert step_sigmas(stood).max() < MIN_STEP_SIGMAS
+    turning = replace(twice, world_T_rigs=twice.world_T_rigs.copy())
+    angles = np.deg2rad(np.arange(NUM) % 2)
+    turning.world_T_rigs[:, 0, 0] = turning.world_T_rigs[:, 2, 2] = np.cos(angles)
+    turning.world_T_rigs[:, 0, 2], turning.world_T_rigs[:, 2, 0] = np.sin(angles), -np.sin(angles)
+    assert len(step_sigmas(turning)) == NUM - 1
+
+
 def _driven(turn_deg: float, backwards: int) -> Reconstruction:
     """Steps ahead of a camera that turns at each, the last few back again."""
     result, poses = _result(1.0), [np.eye(4)]
