@@ -49,9 +49,7 @@ def atomic_write(path: Path, write: Callable[[Path], object], parents: bool = Tr
     """Write a file beside `path` and rename it into place, so that `path` is never half-written.
 
     Args:
-        path: final file.
         write: called with a temporary path of the same folder and suffix.
-        parents: make missing parent folders.
     Raises:
         GsbaError: the disk is full, or writing is not permitted.
     """
@@ -114,7 +112,6 @@ def write_vertices(path: Path, vertices: "np.ndarray") -> None:
     """Write a binary little-endian PLY file with one element, `vertex`, atomically.
 
     Args:
-        path: the file.
         vertices: (N,) structured, one field for each property, in the file's order.
 
     Raises:
@@ -159,10 +156,6 @@ def read_vertices(path: Path) -> "np.ndarray":
 def link_or_copy(source: Path, target: Path) -> None:
     """Give a file a second name, or copy it where the disk knows no hard links.
 
-    Args:
-        source: an ordinary file.
-        target: the new name; a file of this name is replaced.
-
     Raises:
         GsbaError: the disk is full, or writing is not permitted.
     """
@@ -206,7 +199,6 @@ def refuse_links(folder: Path, below: bool = False) -> None:
 
     Args:
         folder: may be missing; may not itself be a link, pipe or device.
-        below: check its subfolders too.
 
     Raises:
         GsbaError: the folder holds a link, pipe or device, which the message names.

@@ -89,10 +89,7 @@ def track(
     The bar is on stderr, on a terminal unless the run is quiet. For events see `event`.
 
     Args:
-        items: work to do.
-        description: of the work.
         total: number of items, those done before among them; None = len(items).
-        done: items that were done before.
         note: gives a text that stands behind the speed.
     """
     with_bar = sys.stderr.isatty() and logging.getLogger("gsba").isEnabledFor(logging.INFO)

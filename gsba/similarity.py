@@ -89,7 +89,6 @@ def pose_similarity(
 
     Args:
         source_T_rigs, target_T_rigs: (N, 4, 4) poses of the same rigs in two worlds.
-        min_correlation: see `turned_similarity`.
 
     Raises:
         NoSimilarityError: no positive scale maps the rigs' positions to the targets'.
@@ -164,7 +163,6 @@ def robust_similarity(
 
     Args:
         source, target: (N, 3) float64.
-        solve: least-squares similarity of some of them.
         num_needed: smallest number of points that `solve` takes.
         tolerances: (N,) largest error of each target, target units.
         drift: largest error of the sources, part of their extent.
@@ -242,7 +240,6 @@ def relative_map(
 
     Args:
         points0, points1: (m, 3) points in the rigs of both frames, map units.
-        seed: of the sampling.
 
     Returns:
         f0_T_f1 (4, 4) in the units of frame 0, and the number of inliers; None if too few.
@@ -284,7 +281,6 @@ def similarity_along(
     Args:
         points0, points1: (m, 3) points in the rigs of both frames, each in its own unit.
         f0_T_f1: (4, 4) relative pose, whose translation has any length.
-        least: smallest number of inliers.
 
     Returns:
         similarity from rig 1 to rig 0, and its inliers (m,) bool; None if too few.
@@ -340,8 +336,7 @@ def _agree(points0: np.ndarray, points1: np.ndarray, chosen: np.ndarray) -> np.n
 def _agree_with_triples(
     points0: np.ndarray, points1: np.ndarray, triples: np.ndarray
 ) -> np.ndarray:
-    """Inliers (T, m) bool of the similarities that fit three points each, rows (T, 3); none where
-    no similarity does. See `similarity`."""
+    """Inliers (T, m) bool of similarities that fit three points each, rows (T, 3); else none."""
     source, target = points1[triples], points0[triples]
     s, t = source - source.mean(axis=1, keepdims=True), target - target.mean(axis=1, keepdims=True)
     u, _, vt = np.linalg.svd(np.swapaxes(t, 1, 2) @ s)

@@ -12,10 +12,6 @@ from gsba.log import GsbaError, track
 def localize_all(localizer: Localizer, pictures: Sequence[Picture]) -> LocalizedPhotos:
     """Localise panoramas and photos; one that cannot be read is refused with the reason.
 
-    Args:
-        localizer: of the run.
-        pictures: see `find_pictures`.
-
     Returns:
         Frames in the order of the pictures, and the cameras of photos.
     """

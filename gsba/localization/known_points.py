@@ -192,8 +192,7 @@ class KnownPointBlock:
     def _whitened(
         self, picture: int, values: gtsam.Values
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Whitened residuals (N, 2), derivatives by pose (N, 2, 6) and camera (N, 2, C), weights
-        (N,) of the loss."""
+        """Whitened residuals (N, 2), by pose (N, 2, 6), by camera (N, 2, C), and weights (N,)."""
         found, roots = self._residuals(picture, values), self._roots[picture]
         whitened = np.einsum("nij,nj->ni", roots, found.values)
         whitened[found.behind] = [_BEHIND, 0.0]

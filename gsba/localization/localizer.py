@@ -149,8 +149,6 @@ class Localizer:
         """Pose of one frame of a scanned folder, with its mask.
 
         Args:
-            frames: of the layout of frames of the run.
-            frame: its number.
             camera: of the run, that took it; None = that of its layout and size.
 
         Raises:
@@ -329,7 +327,6 @@ class Localizer:
         """Points of the nearest keyframes that look like keypoints near their predicted bearing.
 
         Args:
-            query: the picture.
             world_T_rig: (4, 4) predicted pose.
             gate_rad: around the prediction.
             recognised: (N,) keyframes whose points are searched, too; None = no others.

@@ -31,12 +31,6 @@ def write_localized(
     Covariances are of the tangent [rotation (radians), translation (map units)] in the picture's
     frame, given the map.
 
-    Args:
-        folder: made if missing.
-        run: folder of the run that they were localised in.
-        found: all pictures, those that are not localised too.
-        pictures: of the same order.
-
     Raises:
         GsbaError: the disk cannot be written.
     """
@@ -109,8 +103,7 @@ def _as_json(frame: LocalizedFrame, picture: Picture) -> dict[str, Any]:
 
 
 def _camera_json(camera: PhotoCamera) -> dict[str, Any]:
-    """Camera of photos: r = focal (t + k1 t^3 + k2 t^5), t the tangent of the angle from the
-    axis."""
+    """Camera of photos: r = focal (t + k1 t^3 + k2 t^5), t the tangent of the angle to z."""
     projection = camera.projection
     sigmas = np.sqrt(np.maximum(np.diag(camera.covariance), 0)) * np.array(
         [projection.focal] * 3 + [1.0, 1.0]

@@ -110,10 +110,6 @@ def localize_photos(localizer: Localizer, photos: Sequence[Photo]) -> LocalizedP
 
     Each photo is first placed alone; then all poses and cameras are fitted together, to keypoints
     and to patches aligned below a pixel.
-
-    Args:
-        localizer: of the run.
-        photos: in any order.
     """
     placed: list[_Placed] = []
     refused: dict[str, LocalizedFrame] = {}

@@ -102,9 +102,6 @@ def photo_features(
 
     Args:
         image: (H, W, 3) uint8 RGB.
-        projection: the photo's, as far as it is known.
-        rig: faces, see `photo_rig`.
-        extractor: the detector.
     """
     faces = np.zeros((len(FACES), rig.size, rig.size, 3), np.uint8)
     masks = np.zeros((len(FACES), rig.size, rig.size), bool)
@@ -127,8 +124,6 @@ def as_panorama(
 
     Args:
         image: (H, W, 3) uint8 RGB.
-        projection: the photo's.
-        width: pixels across.
     """
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     grey, scales = _as_dense_as(grey, projection, width / (2 * np.pi))

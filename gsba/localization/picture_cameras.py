@@ -27,8 +27,6 @@ class PictureCameras:
         """Cameras of a map.
 
         Args:
-            root: folder of the run.
-            frames: of the map.
             recording: whose camera took all pictures; None = their layout and size tell.
 
         Raises:
@@ -55,7 +53,6 @@ class PictureCameras:
 
         Args:
             width, height: of the picture, pixels.
-            name: of the picture, for the message.
 
         Raises:
             GsbaError: it can be of several.
@@ -81,7 +78,6 @@ class PictureCameras:
 
         Args:
             read: format of the frames by the camera whose calibration they were read by.
-            name: of their folder, for the message.
 
         Raises:
             GsbaError: they can be of several.
@@ -91,10 +87,6 @@ class PictureCameras:
 
     def of_frames(self, kind: PictureFormat, name: str) -> int:
         """Camera of frames of several images each: that of their layout and size.
-
-        Args:
-            kind: of the frames.
-            name: of their folder, for the message.
 
         Raises:
             GsbaError: it can be of several, or of none.

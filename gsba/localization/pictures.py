@@ -36,7 +36,6 @@ def load_panorama(path: Path, at_least: int) -> np.ndarray:
     """A panorama (H, 2H, 3) uint8 RGB.
 
     Args:
-        path: its file.
         at_least: width that is enough: JPEGs are decoded at a part of theirs.
 
     Raises:
@@ -52,8 +51,6 @@ def find_pictures(sources: Sequence[Path], cameras: PictureCameras, work: Path) 
     """The pictures of files, folders and videos, in this order; those of one name are refused.
 
     Args:
-        sources: pictures, folders of them, or 360-degree videos.
-        cameras: of the run, that may have taken them.
         work: folder for the frames of videos, one a second.
 
     Raises:
@@ -80,8 +77,7 @@ def _images(folder: Path) -> list[Path]:
 
 
 def _is_of_single_images(folder: Path, cameras: PictureCameras) -> bool:
-    """True if the pictures of a folder are a file each, not two fisheyes side by side, nor faces
-    or tracks in folders."""
+    """True if a folder's pictures are a file each: no pairs, nor faces or tracks in folders."""
     layouts = cameras.layouts()
     if layouts == {"erp"}:
         return True
@@ -97,8 +93,7 @@ def _is_of_single_images(folder: Path, cameras: PictureCameras) -> bool:
 
 
 def _single_images(source: Path, stitched: bool) -> list[Picture]:
-    """Panoramas or photos, one file each: 2:1 pictures are panoramas where frames of the run are
-    stitched ones."""
+    """Panoramas or photos, one file each; 2:1 pictures are panoramas where the run has such."""
 
     def picture(path: Path, time: float) -> Picture:
         panoramic = stitched and _is_panorama(path)
@@ -147,8 +142,7 @@ def _frames_of_several_images(folder: Path, cameras: PictureCameras) -> list[Pic
 
 
 def _scanned(folder: Path, cameras: PictureCameras) -> dict[int, FrameSet]:
-    """Frames of a folder by camera: read by the calibration of each of raw fisheyes that they can
-    be of; else as what they are, of the camera of their layout and size."""
+    """Frames of a folder by camera: raw fisheyes by each calibration that reads them."""
     chosen, errors = cameras.chosen, list[GsbaError]()
     found = dict[int, FrameSet]()
     for camera, calibration in enumerate(cameras.calibrations):

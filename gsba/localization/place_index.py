@@ -57,14 +57,7 @@ def open_index(map_: RunMap) -> PlaceIndex:
 
 
 def load_or_make(map_: RunMap, path: Path, kind: type[T], make: Callable[[], T]) -> T:
-    """Load a record that depends on a map's run alone; make and save it if this run has none.
-
-    Args:
-        map_: the map.
-        path: file beside the run.
-        kind: type of the record.
-        make: computes the record.
-    """
+    """Load a record that depends on a map's run alone; make and save it if this run has none."""
     key = _key(map_)
     found = load_checkpoint(path, key, kind, "the map is indexed again")
     if found is not None:

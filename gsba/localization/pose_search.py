@@ -44,14 +44,7 @@ class Candidates:
 def search_pose(
     candidates: Candidates, max_error_rad: float, seed: int, least: int = _MIN_WITNESSES
 ) -> FoundPose | None:
-    """Pose of a panorama with the most inliers; None if no pose has enough.
-
-    Args:
-        candidates: many may be false.
-        max_error_rad: of an inlier.
-        seed: of the sampling.
-        least: number of inliers that is enough.
-    """
+    """Pose of a panorama with the most inliers; None if no pose has enough."""
     given = candidates.bearings, candidates.points_world
     return panorama_pose(*given, max_error_rad, seed, least, _MIN_RATIO)
 
@@ -59,12 +52,7 @@ def search_pose(
 def search_poses(
     candidates: Candidates, max_error_rad: float, seed: int, most: int
 ) -> list[FoundPose]:
-    """Significant poses of a panorama, each of the candidates that those before leave over.
-
-    Args:
-        candidates, max_error_rad, seed: see `search_pose`.
-        most: number of poses.
-    """
+    """Significant poses of a panorama, each of the candidates that those before leave over."""
     found, least = list[FoundPose](), _MIN_WITNESSES
     chance = (1 - np.cos(max_error_rad)) / 2  # a disc's share of the sphere
     while len(found) < most:
@@ -93,9 +81,6 @@ def search_focal(
         points_world: (m, 3) candidate point of each.
         camera: SIMPLE_PINHOLE.
         known: whether its focal length is known.
-        max_error_px: of an inlier.
-        seed: of the sampling.
-        least: number of inliers that is enough.
     """
     given = pixels, points_world, camera
     return camera_pose(*given, max_error_px, seed, least, _MIN_RATIO, estimate_focal=not known)
@@ -135,9 +120,7 @@ def is_rivalled(found: FoundPose, rival: FoundPose | None, candidates: Candidate
     """True if the candidates that a pose leaves over agree about as well on another place.
 
     Args:
-        found: of all candidates.
         rival: of those that it leaves over, with `least_of_rival` inliers.
-        candidates: all of them.
     """
     if rival is None:
         return False

@@ -55,9 +55,6 @@ def best_of(poses: Sequence[PlacedPose]) -> tuple[int, str]:
 
     Its surroundings must confirm it, and it must explain significantly more cells than every pose
     at another place that is no look-alike.
-
-    Args:
-        poses: at least one.
     """
     best = max(range(len(poses)), key=lambda n: len(poses[n].cells))
     one = poses[best]

@@ -68,7 +68,6 @@ class RunMap:
         """Read a finished run.
 
         Args:
-            root: folder of the run.
             map_number: number of the map, 1 = the largest.
 
         Raises:

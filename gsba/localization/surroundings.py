@@ -94,9 +94,7 @@ class Surroundings:
         """Evidence for and against a pose.
 
         Args:
-            seen: keypoints of the picture.
             world_T_rig: (4, 4) its pose.
-            usual: rates for pictures of its kind.
             shown: tells the points that lie within a picture with edges.
         """
         found = self._predictions(seen, world_T_rig, shown=shown)
@@ -112,8 +110,7 @@ class Surroundings:
         left_out: int | None = None,
         shown: Shown | None = None,
     ) -> Predictions:
-        """Points of the nearest keyframes predicted in a picture. Without one of the frames the map
-        would lack points that fewer than `_MIN_OTHERS` others observe."""
+        """Points of the nearest keyframes predicted in a picture, as if one frame were left out."""
         map_ = self.map
         result, num_observers = map_.result, self._num_observers
         nearest = map_.nearest(world_T_rig, _NUM_NEAREST + 1)
@@ -151,10 +148,7 @@ def open_rates(
     Where pictures of the run are gone, its stored keypoints are taken: on faces of the run's size.
 
     Args:
-        surroundings: of the map.
         rigs: (C) faces on which keypoints of each camera's panoramas are found, if they can be.
-        extract: finds keypoints of a frame.
-        query_of: prepares keypoints of a camera's frame.
     """
     map_ = surroundings.map
 

@@ -38,10 +38,8 @@ def crossing(
 
     Args:
         pairs: pairs of one frame outside the map and one inside.
-        keypoints: keypoints of all frames.
         poses: (F, 4, 4), each frame's in its own map.
         known: (F) of (K_f, 3), points of each frame's keypoints in its rig frame, NaN = unknown.
-        outside: frames of the part.
     """
     found = []
     for p, (f0, f1) in enumerate(pairs.matches.pairs.tolist()):
@@ -69,7 +67,6 @@ def agreed(proposals: list[Proposal], poses: np.ndarray, depth: float) -> Propos
     others are too few, or no majority.
 
     Args:
-        proposals: proposals of single pairs.
         poses: (F, 4, 4), each frame's in its own map.
         depth: median distance of points, map units.
     """
@@ -127,9 +124,7 @@ class Breaks:
         return found
 
     def _velocities(self, move: Sim3, f: int, g: int) -> list[np.ndarray]:
-        """Velocities (3,) that the camera may have between frame f of the part, once moved, and
-        frame g of the map: at the usual speed of the map there, in the mean direction of the steps
-        before and behind, and in that of either; none where the map does not move."""
+        """Velocities (3,) that the camera may have between g of the map and f of the moved part."""
         theirs = self._beside(g, f, self.inside)
         ours = move.scale * self._beside(f, g, self.part) @ move.rotation.T
         speed = float(np.median(np.linalg.norm(theirs, axis=1))) if len(theirs) else 0.0
@@ -141,8 +136,7 @@ class Breaks:
         return [speed * way / np.linalg.norm(way) for way in ways if way.any()]
 
     def _beside(self, g: int, f: int, rows: np.ndarray) -> np.ndarray:
-        """Velocities (n, 3) of at most `_REACH` steps of frames `rows` beside g, on the side away
-        from f, the nearest first."""
+        """Velocities (n, 3) of up to `_REACH` steps of `rows` beside g, away from f"""
         ends = g + np.sign(g - f) * np.arange(_REACH + 1)
         ends = ends[: int(np.argmin(np.append(np.isin(ends, rows), False)))]
         steps = np.diff(self.poses[ends, :3, 3], axis=0)
@@ -150,8 +144,7 @@ class Breaks:
 
 
 def _step_length(known: np.ndarray, depths: np.ndarray) -> float | None:
-    """Length of a step in the unit of a map, from its points (m, 3) and their distances (m,) in
-    steps; None if it is too uncertain."""
+    """Length of a step in a map's unit, by points (m, 3) and depths (m,); None = uncertain."""
     logs = np.log(np.linalg.norm(known, axis=1) / depths)
     logs = logs[np.isfinite(logs)]
     if len(logs) < _MIN_SHARED_POINTS:

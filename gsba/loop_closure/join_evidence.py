@@ -198,8 +198,6 @@ def rates(
     """Rates at which points of a frame are found again in frames of its own part.
 
     Args:
-        context: features and settings of the run.
-        places: frames and points, each part consistent in itself.
         parts: (F,) int, part of each frame.
         surfaces: see `predict`.
         chosen: (F,) bool, frames that are compared; None = all.
@@ -249,10 +247,7 @@ def weigh(
     """Weigh the evidence for and against a join of two groups of frames.
 
     Args:
-        context: features and settings of the run.
-        places: frames and points of both groups after the join.
         groups: (N,) and (M,) frames.
-        usual: result of `rates`, with the same `surfaces`.
         depth: median distance of points, map units.
         surfaces: see `predict`.
 
@@ -274,8 +269,6 @@ def evidence_of(seen: Predictions, usual: Rates, depth: float) -> JoinEvidence:
     of its own, but not what covers them.
 
     Args:
-        seen: at least one prediction.
-        usual: see `weigh`.
         depth: median distance of points, map units.
     """
     cells = np.floor(seen.points_world / (_CELL_DEPTHS * depth)).astype(np.int64)
@@ -304,8 +297,7 @@ def evidence_of(seen: Predictions, usual: Rates, depth: float) -> JoinEvidence:
 
 
 def _distinct(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distinct rows (D, 3) of rows (N, 3) int64, in ascending order, and the number (N,) of each
-    row's. Several times faster than `np.unique` along an axis."""
+    """Ascending distinct rows (D, 3), each row's number (N,); faster than `np.unique` by axis."""
     number_of = np.zeros(len(rows), np.int64)
     for column in rows.T:
         values, each = np.unique(column, return_inverse=True)
@@ -364,8 +356,6 @@ def predict(
     """Predict points of the first frames of pairs in the second frames, and match them.
 
     Args:
-        context: features and settings of the run.
-        places: frames and points.
         pairs: (P, 2) frames.
         surfaces: predict only points on surfaces that the second frame knows; else all, of which
             some will be occluded.
@@ -389,8 +379,6 @@ def predicted(
     """Points of frame f, predicted in frame g.
 
     Args:
-        places: frames and points.
-        f, g: numbers of the frames.
         matched: (M, 2) keypoints of f and of g that match near a prediction.
         bearings: (K, 3) unit, rig frame of g, of its keypoints.
         surfaces: see `predict`.
@@ -415,8 +403,7 @@ def predicted(
 
 
 def _on_surface(known: np.ndarray, directions: np.ndarray, distances: np.ndarray) -> np.ndarray:
-    """True (V,) for points at distances (V,) along unit directions (V, 3) that lie on surfaces
-    shown by a frame's points (K, 3)."""
+    """True (V,) for points, by direction and distance, on surfaces that points (K, 3) show."""
     points = known[np.isfinite(known).all(axis=1)]
     if not len(points):
         return np.zeros(len(distances), bool)

@@ -63,9 +63,7 @@ class JoinTest:
         """Weigh a proposal to join two parts.
 
         Args:
-            proposal: carries `rows` to `inside`.
             rows, inside: (N,) and (M,) frames of either part, ascending.
-            judged: those judged before.
 
         Returns:
             None if the proposal leads to the place of one that is confirmed already.
@@ -117,7 +115,6 @@ class JoinTest:
         """Matched points that both frames of pairs know, one of them among those outside.
 
         Args:
-            matches: matches of P pairs.
             outside: frames (N,) outside the map.
             f0_T_f1s: (P, 4, 4) relative poses by bearings, their translations of any length.
         """
@@ -129,8 +126,7 @@ class JoinTest:
         groups: Sequence[np.ndarray],
         known: Sequence[Proposal],
     ) -> Judged | None:
-        """The proposal tested with frames of both sides; None if it leads to the place of a known
-        one."""
+        """The proposal tested by frames of both sides; None if it leads to a known one's place."""
         (f, g), move = proposal.frames, proposal.move
         given = f, g, move.scale, move.new_T_old.tobytes(), *(rows.tobytes() for rows in groups)
         found = self._tested.get(given) or self._settled(proposal, groups, known)
@@ -145,8 +141,7 @@ class JoinTest:
         groups: Sequence[np.ndarray],
         known: Sequence[Proposal],
     ) -> Judged | None:
-        """The proposal refined by frames of both sides until it hardly changes; None once it leads
-        to the place of a known one."""
+        """The proposal refined until it settles; None once it leads to a known one's place."""
         rows, inside = groups
         evidence, found = self.weigh(rows, inside, proposal.move)
         for _ in range(_MAX_REFINEMENTS):

@@ -57,8 +57,6 @@ def close(
     """Find revisited places, and deform the map so that they coincide.
 
     Args:
-        context: of the run; its strongest features are compared.
-        solved: poses and points, accurate between neighbours.
         unseen: (F - 1,) bool, steps that no images confirm: their error may be their length.
         scratch: folder on the disk that takes the global descriptors; None = they are in memory.
     """
@@ -111,9 +109,7 @@ def candidates(
 
     Args:
         looks: (F, D) global descriptors.
-        solved: poses and points.
         unseen: (F - 1,) bool, steps that no images confirm.
-        settings: of the run.
         held: sparse matrix (F, F) of frames that the map holds together already, which are left
             out; None = none are.
     """
@@ -186,11 +182,7 @@ def _sharing_points(tracks: Tracks, num_frames: int) -> csr_matrix:
 def _least_similarity(
     looks: np.ndarray, solved: Solution, unseen_before: np.ndarray, window: int
 ) -> float:
-    """Similarity of almost all frames that are a quarter to a half of the median depth apart along
-    at most `window` steps, which images confirm; of successive ones where none are.
-
-    `unseen_before` (F,) is the number of steps before each frame that no images confirm.
-    """
+    """Similarity of almost all frames some way apart over confirmed steps, else of successive on"""
     positions, depth = solved.world_T_rigs[:, :3, 3], solved.median_depth()
     near, successive = [np.zeros(0)], np.zeros(0)
     for gap in range(1, min(window, len(positions) - 1) + 1):
@@ -249,11 +241,9 @@ def within_drift(
     """True if a loop needs no more drift than the path between its frames can have.
 
     Args:
-        loop: the loop.
         poses: (F, 4, 4) of the map.
         depth: median distance of points, map units.
         unseen: (F - 1,) bool, steps that no images confirm.
-        settings: of the run.
     """
     slack = _max_drift(loop.f0, loop.f1, poses[:, :3, 3], unseen, settings)
     expected = poses[loop.f0] @ loop.f0_T_f1
@@ -270,8 +260,6 @@ def consistent(loops: list[Loop], solved: Solution, window: int) -> list[Loop]:
     path, back over the other) leads back to its start.
 
     Args:
-        loops: all measured loops.
-        solved: the map, accurate over short stretches.
         window: number of frames over which the map counts as accurate.
     """
     depth, poses = solved.median_depth(), solved.world_T_rigs

@@ -57,8 +57,6 @@ def merge(
     """Join the parts of a map where they overlap, and register single frames.
 
     Args:
-        context: features and settings of the run.
-        solved: poses and points, consistent within every part.
         parts: (F,) int, see `gsba.loop_closure.connectivity.parted`.
         held: (F - 1,) bool, steps without matches whose pose the trajectory gives.
         seen: (F - 1,) bool, steps verified by images: they tie frames with too few points.
@@ -224,8 +222,7 @@ class _Joining:
         return np.array(sorted(found), np.int32).reshape(-1, 2)
 
     def _similarity(self, part: int, rows: np.ndarray, inside: np.ndarray) -> Sim3 | None:
-        """The similarity that moves a part to where it overlaps the map; None if none is
-        certain."""
+        """The similarity that moves a part to where it overlaps the map; None = uncertain."""
         if len(inside) < self.min_testable and not self._is_held_by_trajectory(rows):
             self.reasons[part] = f"a map of {len(inside)} frames is too small to test a join"
             return None
@@ -255,8 +252,7 @@ class _Joining:
     def _best(
         self, part: int, meetings: list[Meeting], rows: np.ndarray, inside: np.ndarray
     ) -> Sim3 | None:
-        """The similarity that the surroundings of both parts confirm, unless they confirm a rival
-        too."""
+        """The similarity that surroundings confirm, unless they confirm a rival too."""
         weighed: list[Judged] = []
         for proposal in propose(meetings, self.poses, self.depth, self.context.settings.seed):
             if self._is_held_by_trajectory(rows) and not self._plausible(proposal):
@@ -280,16 +276,14 @@ class _Joining:
     def _following(
         self, weighed: list[Judged], rows: np.ndarray, inside: np.ndarray
     ) -> list[Judged]:
-        """Likely proposals that let the camera walk on at each break between a part and the map:
-        look-alikes are elsewhere, or turned about."""
+        """Likely proposals under which the camera walks on at each break between part and map."""
         breaks = self._breaks(rows, inside)
         return [
             one for one in weighed if one.evidence.likely and breaks.continued_by(one.proposal.move)
         ]
 
     def _at_pace(self, found: Judged, rows: np.ndarray, inside: np.ndarray) -> Judged:
-        """The proposal found; or where it lets the camera walk on at an unusual pace, one that
-        continues the map at the usual pace, unless its surroundings speak against that."""
+        """The proposal found, or one at the usual pace unless its surroundings speak against it."""
         breaks = self._breaks(rows, inside)
         held = self._is_held_by_trajectory(rows)  # which knows more than the pace
         if held or not breaks.steps or breaks.continued_by(found.proposal.move):
@@ -324,12 +318,10 @@ class _Joining:
         return sorted(((int(f), int(g)) for f, g in near), key=min)
 
     def _over_break(self, part: int, rows: np.ndarray, inside: np.ndarray) -> Sim3 | None:
-        """The similarity that several pairs of frames across a short break or pause agree on; None
-        if the part is not next to the map in time, or its surroundings speak against it.
+        """The similarity on which pairs of frames across a short break or pause agree, or None.
 
-        A camera that walks on cannot have moved far in between. A bay of a hall can be as near as
-        the next one is, though: what the surroundings do not confirm must continue the map at its
-        pace.
+        A camera that walks on cannot have moved far in between, but a bay of a hall can be as near:
+        what the surroundings do not confirm must continue the map at its pace.
         """
         for outer, inner in self._next_in_time(rows, inside, _MAX_PAUSE_INTERVALS):
             earlier, later = (rows, inside) if outer < inner else (inside, rows)
@@ -360,8 +352,7 @@ class _Joining:
         return None
 
     def _is_level(self, rows: np.ndarray, inside: np.ndarray, move: Sim3) -> bool:
-        """True if a part would stand upright on the map, within the spread of its frames'
-        verticals: on its own recording's frames, if there are any."""
+        """True if a part stands upright on the map, within the spread of the frames' verticals."""
         own = inside[np.isin(self.recordings[inside], self.recordings[rows])]
         limit = _MAX_TILT_RAD if len(own) else _MAX_TILT_BETWEEN_RAD
         inside = own if len(own) else inside
@@ -379,8 +370,7 @@ class _Joining:
         return join_evidence.rates(self.context, places, self.parts, chosen=chosen)
 
     def _meetings(self, context: MatchContext, chosen: np.ndarray) -> list[Meeting]:
-        """Matched points that both frames of pairs (P, 2) know, one outside and one inside the
-        map."""
+        """Matched points that both frames of pairs (P, 2) know, one of them outside the map."""
         verified = recovery.match_anywhere(context, np.sort(chosen, axis=1), rivals=False)
         return self.test.meetings(verified.matches, chosen[:, 0])
 
@@ -414,16 +404,11 @@ class _Joining:
         return even and loops.within_drift(loop, poses, self.depth, self.held, settings)
 
     def _is_of_map(self, f: int) -> bool:
-        """True if the map holds frames of a frame's recording.
-
-        A picture that hangs in two places gives a single frame a pose in either. Between frames of
-        one recording time and path decide; between recordings only the test of joins can.
-        """
+        """True if the map holds frames of a frame's recording, whose time and path decide."""
         return bool((self.recordings[self.components == self.current] == self.recordings[f]).any())
 
     def _register_each(self, rows: np.ndarray, inside: np.ndarray) -> bool:
-        """True if any of some frames gets a pose from points of the map. Those next to the map in
-        time come first: the others walk on from them."""
+        """True if any frame gets a pose from points of the map; those next to it come first."""
         num, away = len(inside), np.abs(rows[:, None] - inside).min(axis=1)
         for f in rows[np.argsort(away, kind="stable")].tolist():
             if self._is_of_map(f) and self._register(f, inside):
@@ -431,8 +416,7 @@ class _Joining:
         return len(inside) > num
 
     def _register(self, f: int, inside: np.ndarray) -> bool:
-        """True if a single frame gets an accepted pose from points of the map; the map then holds
-        it."""
+        """True if a single frame gets an accepted pose from points of the map, and joins it."""
         chosen = self._candidates(np.array([f]), inside, 2 * _NUM_CANDIDATES)
         for strongest in (True, False):
             found = self._resected(f, *self._sightings(f, chosen, strongest))
@@ -458,8 +442,7 @@ class _Joining:
         return found
 
     def _resected_at_pace(self, f: int, inside: np.ndarray, found: np.ndarray) -> np.ndarray | None:
-        """The pose (4, 4) found of a frame; or where the camera would walk on to it at an unusual
-        pace, one at the usual pace. None if there is none, and steps to it or from it are wide."""
+        """The pose (4, 4) found, or one at the usual pace; None if wide steps leave both unsure."""
         rows, move = np.array([f]), self._move_of(f, found)
         breaks = self._breaks(rows, inside)
         if breaks.continued_by(move) or self._is_held_by_trajectory(rows):
@@ -487,9 +470,10 @@ class _Joining:
         return Sim3.of(1.0, world_T_rig @ inverse(self.poses[f]))
 
     def _shows_map(self, f: int, inside: np.ndarray, world_T_rig: np.ndarray) -> bool:
-        """True unless a single frame shows next to nothing of the map around it: a look-alike
-        poster brings no surroundings. One that is not next to the map in time must show as much as
-        a place of the map does: a look-alike bay brings some."""
+        """True unless a frame shows next to nothing of the map around, as at a look-alike poster.
+
+        One that is not next to the map in time must show as much as a place of the map does.
+        """
         poses = self.poses.copy()
         poses[f] = world_T_rig
         if self.usual_anywhere is None:
@@ -512,8 +496,7 @@ class _Joining:
         return _each_once(*self._points_seen(found, 0), self.depth)
 
     def _points_seen(self, matches: Matches, column: int) -> tuple[np.ndarray, np.ndarray]:
-        """Keypoints (m,) of the frame in one column of all pairs, and points (m, 3) of the map that
-        the other frames' matched keypoints observe."""
+        """Keypoints (m,) of the frame in one column, and points (m, 3) that others observe."""
         rows, points = [np.zeros(0, np.int32)], [np.zeros((0, 3))]
         for p, pair in enumerate(matches.pairs.tolist()):
             matched, g = matches.of(p), pair[1 - column]
@@ -524,8 +507,7 @@ class _Joining:
         return np.concatenate(rows), np.concatenate(points)
 
     def _in_reach(self, f: int, world_T_rig: np.ndarray) -> bool:
-        """True if a frame is no further from its neighbours in time than the camera can have
-        moved."""
+        """True if a frame is within reach of its neighbours in time."""
         inside = np.flatnonzero(self.components == self.current)
         lengths = np.linalg.norm(np.diff(self.poses[inside, :3, 3], axis=0), axis=1)
         pace = float(np.median(lengths / np.diff(self.times[inside])))
@@ -583,8 +565,7 @@ class _Joining:
                 self.moves[f] = back.after(self.moves[f])
 
     def _reasons(self, order: np.ndarray) -> tuple[str, ...]:
-        """Reason why each map (order: (F,) number of each frame's) was not joined to a larger
-        one."""
+        """Why each map, by each frame's number (F,), was not joined to a larger one."""
         first = np.unique(order, return_index=True)[1]
         return tuple(
             "" if f == first[0] else self.reasons.get(int(self.parts[f]), "") for f in first

@@ -45,7 +45,6 @@ def meetings_of(
 
     Args:
         known: (F) of (K_f, 3): points of keypoints, rig frames; NaN = unknown.
-        matches: matches of P pairs.
         outside: frames (N,) outside the map.
         f0_T_f1s: (P, 4, 4) relative poses by bearings, their translations of any length.
     """
@@ -78,10 +77,8 @@ def propose(meetings: list[Meeting], poses: np.ndarray, depth: float, seed: int)
     Where no pair shares enough points, each counts those of the pairs beside it, too.
 
     Args:
-        meetings: meetings of frames outside and inside the map.
         poses: (F, 4, 4) each in its own map.
         depth: median distance of points, units of the map.
-        seed: of the sampling.
     """
     found = _proposed(meetings, meetings, poses, seed)
     if not found:
@@ -140,7 +137,6 @@ def carrying(g_T_f: Sim3, world_T_f: np.ndarray, world_T_g: np.ndarray) -> Sim3:
     """The similarity that moves the world of rig f into that of rig g.
 
     Args:
-        g_T_f: rig f in rig g, with its unit.
         world_T_f, world_T_g: (4, 4) poses of both, each in the world of its map.
     """
     f_T_own = inverse(world_T_f)
@@ -175,7 +171,6 @@ def alike(
     """True if two proposals move the frames of both to the same poses.
 
     Args:
-        one, other: the proposals.
         poses: (F, 4, 4), each frame's in its own map.
         depth: median distance of points, map units.
         slack: tolerance, in typical differences of two estimates of one similarity.
@@ -200,7 +195,6 @@ def refined(meetings: list[Meeting], start: Sim3, poses: np.ndarray) -> Sim3:
     """The similarity that minimises bearing residuals of all meetings, in both directions.
 
     Args:
-        meetings: meetings whose points largely agree with `start`.
         start: similarity to start from; points that it does not map onto one another are left out.
         poses: (F, 4, 4) each in its own map.
     """
@@ -217,10 +211,6 @@ def similarity_covariance(meetings: list[Meeting], move: Sim3, poses: np.ndarray
 
     Points of one meeting have common errors: residuals count as correlated within a meeting, and
     as independent between meetings (Liang and Zeger, Biometrika 73(1), 1986).
-
-    Args:
-        meetings, poses: those that it was found from.
-        move: the similarity.
     """
     step, every = 1e-6, _inliers_of(meetings, move, poses)
     normal, scores = np.zeros((7, 7)), np.zeros((7, 7))

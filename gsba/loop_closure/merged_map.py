@@ -43,7 +43,6 @@ def carried(
     """A map whose frames were moved; each point moves with its first frame.
 
     Args:
-        solved: the map before.
         world_T_rigs: (F, 4, 4) poses after.
         scales, moves, offsets: see `Registered`.
     """

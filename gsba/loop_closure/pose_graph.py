@@ -103,8 +103,6 @@ def bend(solved: Solution, loops: list[Loop], unseen: np.ndarray) -> Solution:
     Each point moves with its first frame.
 
     Args:
-        solved: poses and points.
-        loops: loops to close, under a robust loss.
         unseen: (F - 1,) bool, steps without matches, which give way first.
     """
     poses = solved.world_T_rigs

@@ -33,8 +33,6 @@ def resect(
     Args:
         bearings: (m, 3) unit, rig frame.
         points_world: (m, 3) candidate point of each bearing, map units; many may be wrong.
-        settings: inlier threshold and count.
-        seed: of the sampling.
 
     Returns:
         None if no pose has enough inliers.

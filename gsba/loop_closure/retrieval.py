@@ -33,10 +33,6 @@ def global_descriptors(
     """Global descriptors (F, D) float32 of all panoramas, of unit length, invariant to heading.
 
     Args:
-        frames: the panoramas' features.
-        num_frames: F.
-        seed: of the sample that the visual words are made of.
-        workers: threads or processes that run it.
         scratch: folder on the disk that takes the descriptors; None = they are in memory.
     """
     words, everyone = visual_words(frames, num_frames, seed, workers), np.arange(num_frames)

@@ -109,8 +109,7 @@ class DividedAdjustments:
         return _FRAMES if big else None
 
     def _digest(self, map_: DivisibleMap, most: int, purpose: str) -> str | None:
-        """Name of a map's folder, by all that its solution depends on; None = files cannot hold
-        it."""
+        """Name of a map's folder by all that its solution depends on; None = not storable."""
         parts = [__version__, purpose, most, map_.num_frames, map_.loss]
         frames = range(map_.num_frames)
         parts.append(content_digest(At.of(map_.values, frames, keys_beside(map_.values))))

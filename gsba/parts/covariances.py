@@ -27,10 +27,7 @@ def divided_covariances(
 
     Args:
         folder: of the map, from `folder.PartsWriter`, which was to `tie` neighbouring frames.
-        workers: who computes the parts.
-        loss: robust loss of the observations.
         num_draws: errors drawn of all poses at once, D.
-        seed: of these.
         scratch: folder of the workers' own files; None = they have none.
 
     Returns:

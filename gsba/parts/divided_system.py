@@ -66,8 +66,6 @@ class DividedSystem:
 
     Args:
         folder: of the map, from `folder.PartsWriter`.
-        workers: who computes the parts.
-        loss: robust loss of the observations.
         scratch: folder of the workers' own files, emptied after each pass; None = they have none.
 
     Attributes:
@@ -150,12 +148,7 @@ class DividedSystem:
         return steps if np.all(np.isfinite(steps)) else None
 
     def _factorized(self, damping: float) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """Eliminate the parts, and factorize what is left; None if singular.
-
-        Returns:
-            Of the nodes on cuts, (C, 6) each: what was added to the diagonal, the gradient with the
-            parts eliminated, and as it was.
-        """
+        """Addition to the diagonal, gradients without and with parts, (C, 6); None = singular."""
         num, pairs = len(self.cut_nodes), len(self._codes)
         diagonal, undamped = np.zeros((2, num, DIM, DIM))
         off_diagonal, gradient, raw = np.zeros((pairs, DIM, DIM)), *np.zeros((2, num, DIM))
@@ -189,8 +182,6 @@ class DividedSystem:
 
         Args:
             pairs: (Q, 2) nodes that the writer was to tie.
-            num_draws: number of draws, D.
-            seed: of the draws.
 
         Returns:
             (N, 6, 6) diagonal blocks, (Q, 6, 6) blocks between the pairs, and vectors (D, N, 6)
@@ -359,7 +350,6 @@ def optimize_divided(
 
     Args:
         folder: of the map, from `folder.PartsWriter`, on a disk that the workers share.
-        workers: who computes the parts.
         settings: loss, damping, tolerances; `max_iterations` counts from where this call starts.
         scratch: folder of the workers' own files, emptied after each pass; None = they have none.
         callback: called with each attempt and the best values so far.

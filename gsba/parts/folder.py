@@ -211,7 +211,6 @@ class PartsWriter:
 
         Args:
             values: to start from: poses X(frame) of all frames, and other variables of factors.
-            num_frames: F.
             most: frames and other variables of a part, without those on cuts.
 
         Returns:
@@ -223,12 +222,7 @@ class PartsWriter:
         return partition(num, pairs, most, _places(poses[:, 9:], pairs, num))
 
     def finish(self, values: gtsam.Values, num_frames: int, cut: Partition) -> Index:
-        """Write the parts of a map, as `cut` has cut it.
-
-        Args:
-            values, num_frames: see `cut`.
-            cut: the part of each variable.
-        """
+        """Write the parts of a map, as `cut` has cut it."""
         keys, dims = list(self._numbers), values.dims()
         start = At.of(values, range(num_frames), keys)
         variables = _Variables(num_frames, keys, [dims[key] for key in keys])

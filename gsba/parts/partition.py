@@ -46,7 +46,6 @@ def partition(
     """Cut frames into parts of at most `most` frames off the cuts.
 
     Args:
-        num_frames: F.
         pairs: (P, 2) int, distinct frames that a landmark or another factor ties.
         most: frames of a part, at least one.
         positions: (F, 3) where frames are, roughly; None = cuts follow the pairs alone.
@@ -69,8 +68,7 @@ def partition(
 
 
 def _homes_of_cuts(homes: np.ndarray, on_cut: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    """Homes (F,), those of frames on cuts the first part that they adjoin, perhaps through others;
-    the very first part for those that adjoin none."""
+    """Homes (F,); frames on cuts get the first part that they adjoin, perhaps through others."""
     far = np.iinfo(np.int64).max
     found = np.where(on_cut, far, homes)
     i, j = np.asarray(pairs).reshape(-1, 2).T
@@ -132,8 +130,7 @@ def _cut(order: np.ndarray, pairs: np.ndarray) -> np.ndarray:
 
 
 def _cover(left: np.ndarray, right: np.ndarray, num_left: int, num_right: int) -> np.ndarray:
-    """Fewest vertices that touch all edges (left, right) of a bipartite graph, right ones behind
-    the left ones."""
+    """Fewest vertices that touch all edges of a bipartite graph, right ones behind left ones."""
     edges = coo_array((np.ones(len(left)), (left, right)), shape=(num_left, num_right)).tocsr()
     match = maximum_bipartite_matching(edges, perm_type="column")  # of each left vertex
     partner = np.full(num_right, -1)

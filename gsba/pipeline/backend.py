@@ -52,10 +52,7 @@ def adjust(state: State, name: str, gates: Sequence[float], *, final: bool = Fal
     """Bundle adjustment in rounds over the tracks that the state's matches make.
 
     Args:
-        state: of the run; its map is the start.
-        name: of the stage.
         gates: of each round, standard deviations of an observation's residual.
-        final: see `adjustment.adjust`.
     """
     run, keypoints = state.run, state.observed.keypoints
 
@@ -140,8 +137,7 @@ def separate_parts(state: State) -> np.ndarray | None:
 
 
 def _doubtful_steps(state: State) -> np.ndarray:
-    """Unguided steps (F - 1,) bool over missing frames that are walked at an unusual pace in the
-    map, and long ones back and forth."""
+    """Unguided steps (F - 1,) bool of an unusual pace over missing frames, or long, to and fro."""
     frames, unguided, solution = state.run.frames, state.prior.unguided, state.solution
     times, poses = (frames.timestamps, frames.recording_of_frame), solution.world_T_rigs
     found = judgement.unusual_paces(poses, *times)
@@ -211,7 +207,6 @@ def without_fixes(state: State, latest: Sequence[str]) -> State:
     """The state without GPS fixes, which its images contradict.
 
     Args:
-        state: before its map.
         latest: names of the stages that it rests on.
     """
     logger.warning("the images contradict the GPS fixes: the map is made anew without these")
@@ -277,7 +272,6 @@ def reconstruct(
     """Covariances, and everything back in the trajectory's world; of a turn, rotations alone.
 
     Args:
-        state: of the run at its end.
         amended: gives the result with what else is known of it; None = as it is.
     """
     run, prior, map_, solution = state.run, state.prior, state.map, state.solution
@@ -320,14 +314,10 @@ def reconstruct(
 
 
 def _baseline(state: State, scale: float) -> tuple[float, float] | None:
-    """Distance of the lenses of the first camera whose distance is published, else of the first
-    one that has two, and its standard deviation; None = none has two.
+    """Distance of the first camera's lenses and its sigma, by published ones; None = none has two.
 
-    Published distances of other cameras say the same of the map's scale: they are averaged. Where
-    they contradict one another, the standard deviation is as much larger as they scatter.
-
-    Args:
-        scale: units of the result per map unit.
+    Published distances of other cameras say the same of the map's scale (units per map unit): they
+    are averaged; where they contradict one another, sigma grows as they scatter.
     """
     run, found = state.run, list[tuple[tuple[float, float], tuple[float, float] | None]]()
     for number, camera in enumerate(state.map.cameras):

@@ -76,7 +76,6 @@ def sought_cameras(state: State, again: bool = False) -> list[int]:
     """Cameras that may have several lenses, and are one centre so far.
 
     Args:
-        state: of the run.
         again: leave raw lenses out, which are known to be several from the start.
     """
     run = state.run
@@ -158,8 +157,7 @@ def _with_lenses(state: State, lenses: dict[int, Lenses]) -> State:
 def _on_trial(
     state: State, sought: Sequence[int], prefix: str
 ) -> tuple[State, dict[int, LensAxes]]:
-    """The state seen through lenses that centres are looked for, and guesses of stitched ones'
-    axes."""
+    """The state seen through lenses that centres are sought for; guesses of stitched ones' axes."""
     run, guesses = state.run, dict[int, LensAxes]()
     trial, raw = state, _raw_cameras(run)
     for camera in sought:
@@ -249,8 +247,6 @@ def take_parts_from_patches(state: State, sighted: Sighted, name: str, number: i
 
     Args:
         state: of the run; its map has two lenses somewhere.
-        sighted: observations that patches were aligned to.
-        name: of the round's stages.
         number: of the estimate in this round. The first finds how rows are read, the second which
             axes and calibration lenses have, as far as these are not known by then.
     """
@@ -290,8 +286,6 @@ def adjust_with_patches(
 
     Args:
         state: of the run; its map has two lenses.
-        sighted: observations that patches were aligned to.
-        name: of the stage.
         gates: of the rounds; None = those of aligned patches.
 
     Returns:
@@ -460,14 +454,8 @@ def _from_features(
 ) -> T:
     """An estimate of one camera from points of the state's matches with all that is within a gate.
 
-    Observations that one centre threw off are far: the gate is wide until there are two, and
-    poses count as unsure as it is wide.
-
-    Args:
-        state: of the run.
-        number: of the camera.
-        name, returns, noted: of the stage, see `Run.stage`.
-        estimate: makes the result.
+    Observations that one centre threw off are far: the gate is wide until there are two, and poses
+    count as unsure as it is wide.
     """
     run, observed, solution = state.run, state.observed, state.solution
     lenses = observed.cameras.lenses[number]

@@ -38,11 +38,6 @@ def fetch_where_weak(
     are left between, or `odometry.fetch_rounds` are over.
 
     Args:
-        store: of the run.
-        video_file: where frames come from.
-        walk: the odometry of the video.
-        frames: as chosen.
-        settings: of the run.
         measure: solves frames as far as needed to tell where their map is weak.
     """
     if len(set(frames.mask_paths)) > 1:
@@ -91,7 +86,6 @@ def rows_between(walk: Odometry, times: np.ndarray, steps: np.ndarray, most: int
     """Rows (N,) of an odometry to fetch: for each step the sharpest frame of its middle third.
 
     Args:
-        walk: of the whole video.
         times: (F,) seconds, of the frames that are there.
         steps: (F - 1,) bool, between which of them to fetch one.
         most: rows; of more, some are left out evenly.

@@ -25,9 +25,6 @@ from gsba.types import CoarsePoses, GyroConstraints, VerifiedPairs
 def match_neighbours(state: State) -> State:
     """Neighbours in time of every recording, and what they say of its trajectory, clock and gyro.
 
-    Args:
-        state: keypoints of the frames of several recordings.
-
     Raises:
         GsbaError: a recording whose images do not match or contradict its trajectory, or show no
             motion; the message names the recording.
@@ -64,10 +61,7 @@ def _renumbered(pairs: VerifiedPairs, first: int) -> VerifiedPairs:
 
 
 def _combined(priors: Sequence[Prior]) -> Prior:
-    """Priors of recordings as one, their worlds brought together by a guess.
-
-    No step leads from one recording to the next: those between them have no prior.
-    """
+    """Priors of recordings as one, their worlds brought together by a guess."""
     apart = joined_poses([one.coarse for one in priors])
     coarse, guesses = joining.join(apart)
     moves = [Sim3(), *(Sim3.of(guess.scale, guess.world_T_own) for guess in guesses)]
@@ -114,13 +108,7 @@ def _steps(parts: Sequence[np.ndarray], between: object) -> np.ndarray:
 def _joints(
     priors: Sequence[Prior], guesses: Sequence[SegmentAlignment], moves: Sequence[Sim3]
 ) -> tuple[SegmentAlignment, ...]:
-    """Alignments of all pieces of the trajectories of recordings but the very first one.
-
-    Args:
-        priors: of the recordings.
-        guesses: alignment of each recording but the first.
-        moves: the same as similarities, of all recordings.
-    """
+    """Alignments of all pieces of the trajectories of recordings but the very first one."""
     joints, begin = list[SegmentAlignment](), 0
     for number, (one, move) in enumerate(zip(priors, moves, strict=True)):
         if number:
@@ -136,8 +124,7 @@ def _joints(
 
 
 def _turning(parts: Sequence[tuple[GyroConstraints | None, int]]) -> GyroConstraints | None:
-    """Constraints by the gyros of recordings, given with their numbers of frames; None = no
-    recording has one that is believed."""
+    """Constraints by the gyros of recordings, with numbers of frames; None = none is believed."""
     known = [turning for turning, _ in parts if turning is not None]
     if not known:
         return None

@@ -178,13 +178,7 @@ def _tied(map_: Map, frames: FrameSet) -> np.ndarray:
 
 
 def _result_of(result: Reconstruction, rows: np.ndarray, groups: np.ndarray) -> Reconstruction:
-    """The result of frames `rows` (F',), ascending, of all maps, the largest one first.
-
-    Args:
-        result: of all frames.
-        rows: the frames.
-        groups: (F',) frames of one map that are of different groups are of different maps now.
-    """
+    """Result of frames `rows` (F',); groups (F',) of one map are maps of their own now."""
     num, scales = len(result.world_T_rigs), result.map_scales
     own = (np.zeros(num, np.int32) if result.components is None else result.components)[rows]
     components = by_size(np.unique(np.column_stack([own, groups]), axis=0, return_inverse=True)[1])

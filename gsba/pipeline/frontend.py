@@ -120,12 +120,7 @@ def _matchable(
 
 
 def of_recording(state: State, number: int) -> State:
-    """The first state of one recording, from the first state of all recordings of a run.
-
-    Args:
-        state: keypoints of all frames, as `extract` gives them.
-        number: index of the recording.
-    """
+    """The first state of one recording, from the first state of all recordings of a run."""
     run = state.run.of_recording(number)
     rows = state.run.frames.recordings[state.run.evidence.recordings[number].name]
     first, last = int(rows[0]), int(rows[-1])
@@ -209,9 +204,6 @@ def prove_turn(state: State) -> State | None:
     Frames one, two, four, ... apart are matched without any prediction, over the whole sequence: a
     slow walk adds up to parallax over the widest gaps. Neighbours tie frames together; of the wider
     gaps of a long sequence, some pairs suffice.
-
-    Args:
-        state: keypoints of all frames, as `extract` gives them.
     """
     run, context, num = state.run, state.observed.context, len(state.run.frames)
     nowhere = np.tile(np.eye(4), (num, 1, 1))

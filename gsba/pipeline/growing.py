@@ -197,11 +197,6 @@ class _Place:
         """Store of the run in a folder beside its place, taken up where a call was interrupted.
 
         The folder is deleted where maps turn out not to be of one place.
-
-        Args:
-            origin: inputs of the run.
-            client: see `gsba.refine`.
-            first: run whose settings it has.
         """
         work = grown_folder.folder_beside(self.out)
         grown_folder.forget_other_work(work, origin, self.out)
@@ -225,9 +220,6 @@ class _Place:
         """Write the result, and put it in place.
 
         Args:
-            store: of the run, in the folder beside its place.
-            state: of the run at its end.
-            maps: that it is made of.
             held: (H,) frames of the first run whose poses were held; None = all were solved.
             rigid: similarities that maps were moved by; None = they were solved together.
         """
@@ -391,10 +383,7 @@ def _with_rigid(
 
 
 def _worlds(state: State, maps: JointMaps) -> tuple[Prior, ...]:
-    """For each recording, the poses that define the world of the map that it is in.
-
-    A map has the world of the first run that it has frames of.
-    """
+    """The poses of each recording that define its map's world: that of the first run in the map."""
     components = state.prior.parts
     if components is None:
         components = np.zeros(len(state.run.frames), np.int64)

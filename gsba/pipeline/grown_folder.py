@@ -70,8 +70,6 @@ def forget_other_work(work: Path, origin: dict[str, Path], out: Path) -> None:
     """Delete what a call with other inputs has left half-written.
 
     Args:
-        work: the folder that is being written.
-        origin: inputs of this call.
         out: its place in the end. A finished run in `work`, whose renaming was interrupted, is kept
             beside it.
     """
@@ -94,12 +92,6 @@ def forget_other_work(work: Path, origin: dict[str, Path], out: Path) -> None:
 
 def complete(store: RunStore, frames: FrameSet, sources: Sequence[Path], out: Path) -> FrameSet:
     """Give a run all files that its frames and masks are read from, so that it needs no other run.
-
-    Args:
-        store: of the run, in the folder that is being written.
-        frames: of the run, as they are read so far.
-        sources: folders of runs that frames and masks may lie in.
-        out: where the run's folder is put in the end.
 
     Returns:
         The frames as they are read then.
@@ -137,10 +129,6 @@ def complete(store: RunStore, frames: FrameSet, sources: Sequence[Path], out: Pa
 
 def put_in_place(work: Path, out: Path) -> Path | None:
     """Rename a complete run into place; a run that is there gets another name.
-
-    Args:
-        work: folder of the complete run.
-        out: its place.
 
     Returns:
         The new name of the run that was there; None = there was none.

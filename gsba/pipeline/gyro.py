@@ -29,7 +29,6 @@ def align_to_map(state: State, name: str, *, with_noise: bool = True) -> State:
 
     Args:
         state: of the run; it stays as it is where no gyro is believed.
-        name: of the stage.
         with_noise: measure the gyro's noise, too. Poses have followed it by as much as it was
             believed: the noise that they leave is measured once where they have become much better.
     """

@@ -277,11 +277,7 @@ def extract_frames(
     """Write the frames of the video that a run is about to `out`/frames.
 
     Args:
-        out: folder of the run.
-        origin: the files that the run is about.
-        settings: see `gsba.config`.
         fps: frames kept per second; None = as the settings say.
-        fresh: forget an earlier run in `out`.
         by_odometry: choose the frames by what the video's own odometry shows under these masks;
             None = by the settings.
         calibration: of the lenses of a raw video, for the odometry.
@@ -315,8 +311,6 @@ def extract_video(
     """Write the frames of a video to `frames` in the run's folder, see `extract_frames`.
 
     Args:
-        store: of the run.
-        video_file: the video.
         settings, fps, by_odometry, calibration: see `extract_frames`.
         name: of one of several recordings, whose frames go to `frames`/`name`; "" = the only one.
     """
@@ -349,8 +343,7 @@ def _follow(
     calibration: Path | None,
     name: str,
 ) -> Odometry | None:
-    """Odometry of a video, its trajectory and chosen frames written to the run's folder; None
-    where it lost the camera in most of the video."""
+    """Odometry of a video, written to the run's folder; None where it lost the camera mostly."""
     start, end = settings.video.from_s, settings.video.to_s
     width, seed = settings.odometry.width, settings.seed
     stage = f"odometry@{name}" if name else "odometry"

@@ -84,10 +84,7 @@ class JointCameras:
         """Estimate of each camera (C,), for the frames of all runs.
 
         Args:
-            runs: the runs.
             moves: similarities of each run's solution to its place in the joint one.
-            solution: the joint one.
-            frames: of all runs.
         """
         return tuple(
             self._found(c, runs, moves, solution, frames) for c in range(len(self.formats))
@@ -124,7 +121,6 @@ def as_read_by(
     image circles tell. Settings of a camera that the run does not have say nothing of its model.
 
     Args:
-        run: a finished run.
         found: frames of the recordings by their names, of one camera each.
         models: camera model by recording; None = not known.
 
@@ -153,7 +149,6 @@ def refuse_fields(runs: Sequence[FinishedRun], several: bool) -> None:
     """Refuse to lay cameras beside one for which a field of stitching errors was found.
 
     Args:
-        runs: finished runs.
         several: True if they are to be a run of several cameras.
 
     Raises:
@@ -211,15 +206,7 @@ def _for_all_frames(
     solution: Solution,
     frames: FrameSet,
 ) -> CameraEstimate | None:
-    """The estimate of a camera, for the frames of all runs; None = it has one centre.
-
-    Args:
-        found: the estimate in the joint unit.
-        known: what the run that lends it knows.
-        each: for each run, lenses of the camera, None = it took none of its frames; and number of
-            frames.
-        moves, solution, frames: as in `JointCameras.found`.
-    """
+    """The estimate of a camera in the joint unit, for the frames of all runs; None = one centre."""
     if found is None or not known.lenses:
         return found
     lenses = found.lenses
@@ -236,19 +223,12 @@ def _for_all_frames(
 
 
 def _scaled(found: FoundCamera, scale: float) -> CameraEstimate | None:
-    """A camera in another unit: one map unit is `scale` of the new ones; None = it has one centre
-    and was not looked for."""
+    """A camera in a unit of which one map unit has `scale`; None = one centre, not looked for."""
     return found.estimate().scaled(scale) if found.lenses else found.readout
 
 
 def _in_unit(found: FoundCamera, camera: CameraEstimate | None, scale: float) -> FoundCamera:
-    """A camera of a map in another unit.
-
-    Args:
-        found: the camera in the old unit.
-        camera: its estimate in the new one; None = it has one centre.
-        scale: new units per old one.
-    """
+    """A camera, `camera` its estimate in a unit of which one map unit has `scale`."""
     radius = found.radius and _rescaled(found.radius, scale)
     centres = _centres(found.centres, camera, scale)
     return FoundCamera(centres, found.axes, radius, found.calibrated, camera)

@@ -97,10 +97,6 @@ def joined_keypoints(parts: Sequence[Keypoints]) -> Keypoints:
 def check_new(run: FinishedRun, found: Mapping[str, FrameSet]) -> None:
     """Refuse recordings that a run has already.
 
-    Args:
-        run: a finished run.
-        found: frames of the recordings by their names.
-
     Raises:
         GsbaError: there is one; the message names it.
     """
@@ -140,8 +136,7 @@ def _frames_of(runs: Sequence[FinishedRun], cameras: JointCameras) -> FrameSet:
 
 
 def _moves(runs: Sequence[FinishedRun], cameras: JointCameras) -> tuple[Sim3, ...]:
-    """Similarities of runs from their solutions' worlds to those of their results, with the unit
-    of the first run for all that know the distance of the lenses of a camera that it has, too."""
+    """Similarities from solutions' to results' worlds, in the first run's unit if known."""
     moves = [run.to_result() for run in runs]
     for n in range(1, len(runs)):
         for pair in cameras.shared(0, n):

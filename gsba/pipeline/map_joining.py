@@ -67,13 +67,7 @@ class ApartError(GsbaError):
 
 
 def begin(store: RunStore, maps: JointMaps, settings: RefineSettings) -> State:
-    """The state of maps that nothing ties together yet.
-
-    Args:
-        store: of the run that they become.
-        maps: of finished runs.
-        settings: of that run.
-    """
+    """The state of maps that nothing ties together yet."""
     poses = maps.map.solution.world_T_rigs
     start = CoarsePoses(
         poses,
@@ -256,15 +250,7 @@ def tie(state: State, parts: np.ndarray) -> State:
 
 
 def _aligned(state: State, base: Sighted, features: Keypoints, parts: np.ndarray) -> State | None:
-    """Shared points aligned to patches below a pixel, then all around them, and solved, until
-    steps move by less than their noise; None where that explains less.
-
-    Args:
-        state: poses and camera, and matches of features.
-        base: observations of the maps alone.
-        features: of all frames, as pictures show them, with the noise that they turned out to have.
-        parts: (F,) part of each frame.
-    """
+    """Shared points aligned to patches, then all around them, and solved; None = no better."""
     run, rounds = state.run, state.run.settings.patches.rounds
     gate = run.settings.rounds.aligned[0]
     rays = state.map.rays(features, run.rig)
@@ -289,11 +275,7 @@ def _aligned(state: State, base: Sighted, features: Keypoints, parts: np.ndarray
 
 
 def _align_around(state: State, parts: np.ndarray, name: str) -> tuple[Sighted, Sighted]:
-    """Observations of points that frames see where different parts meet, these observed anew.
-
-    Returns:
-        Those of all other points, and those of the points that were observed anew.
-    """
+    """Observations of all other points, and anew those of points that frames at meetings see."""
     solution = state.solution
     landmarks, tracks = solution.landmarks, solution.landmarks.tracks
     meeting = np.unique(tracks.frames[_of_several(tracks, parts)[tracks.points]])
@@ -309,8 +291,7 @@ def _align_around(state: State, parts: np.ndarray, name: str) -> tuple[Sighted, 
 def _solved(
     state: State, sighted: Sighted, name: str, gates: Sequence[float] | None = None
 ) -> State | None:
-    """Bundle adjustment of observations, with the camera unless poses are held; None where it
-    explains less."""
+    """Adjustment of observations, with the camera unless poses are held; None = no better."""
     held = any(isinstance(family, HeldPoses) for family in state.run.families.members)
     if held or not state.map.lenses:
         return patch_rounds.adjust_aligned(state, sighted, name, gates)
@@ -340,13 +321,7 @@ def _tied_within(state: State, parts: np.ndarray, merged: Registered | None = No
 
 
 def _with_unit(state: State, scales: np.ndarray, units: Sequence[int]) -> State:
-    """The state with its cameras in the unit of maps that are moved.
-
-    Args:
-        state: of the maps.
-        scales: (F,) by which each frame's map is moved.
-        units: (C,) frame of the map in whose unit each camera is.
-    """
+    """Cameras in the unit of maps moved by scales (F,), each in that of a frame `units` (C,)."""
     if all(one.readout is None for one in state.map.cameras) or not state.map.lenses:
         return state
     found = state.map.estimates()
@@ -376,8 +351,7 @@ def _check_units(maps: JointMaps, merged: Registered) -> None:
 def _check_unit(
     maps: JointMaps, merged: Registered, numbers: tuple[int, int], cameras: tuple[int, int]
 ) -> None:
-    """Refuse two maps (numbers of their runs) that meet in another scale than the lenses of a
-    camera (its numbers in these runs), which are equally far apart."""
+    """Refuse two maps that meet in another scale than the lenses of a camera that both have."""
     lengths, shares = list[float](), list[float]()
     for number, c in zip(numbers, cameras, strict=True):
         run, move = maps.runs[number], maps.moves[number]
@@ -455,11 +429,7 @@ def _matches_of(tracks: Tracks) -> Matches:
 
 
 def _across(state: State, parts: np.ndarray, merged: Registered) -> State:
-    """The state with matches of frames of different parts (F,), around the joined maps' points.
-
-    Where frames share few points, no two of them confirm each other, as all together have confirmed
-    the join: then matches are those within the bearings that the join predicts.
-    """
+    """The state with matches of frames of different parts (F,), around the joined maps' points."""
     if not merged.met.any():
         return state
     near = state.with_solution(replace(_by_features(state), noise=1.0))
@@ -542,12 +512,7 @@ def _normals_of(sighted: Sighted) -> np.ndarray:
 
 
 def _without_same(base: Sighted, shared: Sighted, width: int) -> Sighted:
-    """Observations without those of points that are observed anew among the shared ones.
-
-    Args:
-        base, shared: observations, as pictures show them.
-        width: of a panorama, pixels.
-    """
+    """Observations without those of points that are observed anew among the shared ones."""
     from scipy.spatial import KDTree
 
     radius, tracks = _SAME_POINT_PX * 2 * np.pi / width, base.tracks

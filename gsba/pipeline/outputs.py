@@ -86,13 +86,7 @@ class RunResult:
 
 
 def write(state: State, result: Reconstruction, cameras: Cameras) -> RunResult:
-    """Poses, cloud, report and datasets; of several maps that nothing ties together the largest.
-
-    Args:
-        state: of the run at its end.
-        result: what its map became in the trajectory's world.
-        cameras: in the result's unit.
-    """
+    """Poses, cloud, report and datasets; of several maps that nothing ties together the largest."""
     run, prior, world = state.run, state.prior, state.map
     store, settings, coarse = run.store, run.settings, prior.coarse
     frames, out, rows = world.straightened(run.frames), store.root, result.largest_map()
@@ -187,11 +181,7 @@ def _report(state: State, result: Reconstruction) -> dict[str, Any]:
 
 
 def _findings(state: State, result: Reconstruction, gps: dict[str, Any] | None) -> Findings:
-    """Sections of the report on trajectory, camera and sensors, and notes on all that is odd.
-
-    Args:
-        gps: report of the GPS fixes; None = there are none.
-    """
+    """Sections of the report on trajectory, camera and sensors, and notes on all that is odd."""
     prior, map_, frames = state.prior, state.map, state.run.frames
     trajectory, notes = findings.of_trajectory(
         prior.trust, prior.clock, prior.merged, prior.joints, frames, prior.absent

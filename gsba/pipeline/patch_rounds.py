@@ -32,10 +32,7 @@ def align(state: State) -> State:
 
 
 def _round(state: State, number: int) -> State:
-    """Patches around the map's points aligned to its frames, solved, straightened.
-
-    The map stays as it was where that explains less.
-    """
+    """Patches aligned to frames, solved, straightened; the map as it was where that is worse."""
     sighted = observe(state, state.solution, observations(state), f"align{number}")
     better = _adjust_under_lenses(state, sighted, number)
     if better is None:
@@ -65,14 +62,7 @@ def _adjust_under_lenses(state: State, sighted: Sighted, number: int) -> State |
 
 
 def observe(state: State, start: Solution, observed: Observations, name: str) -> Sighted:
-    """Points of a solution observed anew, by aligned patches.
-
-    Args:
-        state: frames, camera and settings.
-        start: poses and points.
-        observed: observations of these points so far.
-        name: of the stage.
-    """
+    """Points of a solution observed anew, by aligned patches."""
     run, settings = state.run, state.run.settings.patches
 
     def compute() -> Sighted:
@@ -94,8 +84,6 @@ def adjust_aligned(
     """Bundle adjustment of aligned observations; None where that explains less.
 
     Args:
-        state, sighted: the map, and its observations.
-        name: of the stage.
         gates: of the rounds; None = those of aligned patches.
     """
     run, map_ = state.run, state.map
@@ -156,7 +144,6 @@ def is_settled(before: State, state: State, number: int) -> bool:
     """True if the last round of aligning patches moved steps by less than their noise.
 
     Args:
-        before, state: before that round, and after it.
         number: of the next round, from 1.
     """
     if number <= _MIN_ROUNDS:

@@ -189,8 +189,7 @@ def _named(name: str, error: GsbaError) -> GsbaError:
 
 
 def _with_camera(settings: RefineSettings, given: Sequence[_Given]) -> RefineSettings:
-    """Settings with the camera model that recordings name first, and the baseline of a
-    calibration."""
+    """Settings with the first camera model that is named, and the baseline of a calibration."""
     for name in [one.recording.camera for one in given if one.recording.camera is not None][:1]:
         camera = settings.camera.model_dump() | {"name": name}
         settings = validated(settings.model_dump() | {"camera": camera})
@@ -220,10 +219,7 @@ def _with_videos(
     settings: RefineSettings,
     fresh: bool,
 ) -> tuple[list[_Given], bool]:
-    """Recordings with the frames of videos extracted, and whether to forget an earlier run yet.
-
-    Videos without a trajectory are followed by odometry, see `gsba.refine`.
-    """
+    """Recordings with the frames of videos extracted, and whether to forget an earlier run yet."""
     if not any(video.is_video(one.folder) for one in given):
         return list(given), fresh
     inputs.check_positions(settings)

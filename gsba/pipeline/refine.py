@@ -151,11 +151,7 @@ def refine_from(
     """Run all stages, from frames to written outputs.
 
     Args:
-        given: the evidence that does not depend on the frames.
-        start: the frames.
-        source: folder or video that they come from.
         walk: the odometry of the video; None = frames were not chosen by it.
-        store, settings, chosen: of the run.
     """
     compile_ahead("refine")
     warn_of_repeats(start.frames)
@@ -171,16 +167,7 @@ def refine_from(
 
 
 def _solve_or_turn(run: Run, followed: bool) -> tuple[State, Reconstruction]:
-    """The last state and its result; rotations alone where images determine no positions, but prove
-    that the camera turned on the spot.
-
-    Args:
-        run: at its start.
-        followed: True if the trajectory is an odometry of the same images.
-
-    Raises:
-        GsbaError: images that determine neither.
-    """
+    """The last state and its result; rotations alone where only a turn on the spot is proved."""
     try:
         state = _solve_raw(run)
         result = backend.reconstruct(state)
@@ -209,11 +196,7 @@ def _with_fetched(
     video_file: Path,
     walk: Odometry,
 ) -> Start:
-    """The start with more frames of a video where the map of features is weak.
-
-    Raises:
-        GsbaError: the odometry is in pieces, and a vehicle carries the camera.
-    """
+    """The start with more frames of a video where the map of features is weak."""
     if start.coarse.segments is not None:
         acceptance.refuse_vehicle_in_pieces(_begin(store, settings, chosen, start).frames)
 
@@ -254,11 +237,7 @@ def _without_distractors(
 
 
 def _solve_raw(run: Run) -> State:
-    """The method; raw pairs anew, cut by what their lenses turned out to be, where that is far off.
-
-    Returns:
-        The state after the last pass, whose run has the frames as they were cut for it.
-    """
+    """The method; raw pairs cut anew by what their lenses turned out to be, if that is far off."""
     evidence = run.evidence
     known = [run.settings.model_dump(exclude={"export", "placement"}), run.families.digests()]
     known += [] if evidence.imu is None else [evidence.imu.digest]
@@ -305,12 +284,7 @@ def _solve_raw(run: Run) -> State:
 def _in_axes_of_trajectory(
     frames: FrameSet, error: TurnedAboutForwardError, first: bool
 ) -> camera.Cuts:
-    """Lenses to cut raw frames of one camera by in the first pass, so that they are upright as the
-    trajectory is.
-
-    Raises:
-        TurnedAboutForwardError: the error, of other frames.
-    """
+    """Lenses by which raw frames of one camera are cut as upright as the trajectory is."""
     lenses = frames.formats[0].fisheyes
     if not first or len(frames.formats) > 1 or lenses is None:
         raise error
@@ -425,12 +399,7 @@ def _add_keypoints_where_weak(state: State) -> State:
 
 
 def _match_from_itself(state: State, prefix: str = "") -> State:
-    """Match the map's points in all frames, and adjust.
-
-    Args:
-        state: of the run.
-        prefix: of the names of stages.
-    """
+    """Match the map's points in all frames, and adjust."""
     rounds, patches = state.run.settings.rounds, state.run.settings.patches.rounds
     for n in range(1, rounds.map_passes + 1):
         state = frontend.match_known_points(state, f"{prefix}everywhere{n}")

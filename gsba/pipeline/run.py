@@ -76,11 +76,7 @@ class Evidence:
     start: RunStart = RunStart.TRAJECTORY  # for the report
 
     def start_name(self, absent: bool) -> str:
-        """Name of the source of the initial poses, for the report.
-
-        Args:
-            absent: True if there is no trajectory.
-        """
+        """Name of the source of the initial poses, for the report."""
         if absent:
             return RunStart.PAIRS
         return " and ".join(dict.fromkeys(one.start for one in self.recordings)) or self.start
@@ -180,7 +176,6 @@ class Run:
         """Result of a stage that rests on the one before it: the stored one, or computed.
 
         Args:
-            name, key, compute, returns: see `gsba.store.RunStore.stage`.
             noted: whether the report tells of it.
         """
         name += self.suffix
@@ -193,9 +188,6 @@ class Run:
         """The run restricted to one of its recordings, on that recording's clock.
 
         Its stages rest on the latest one of this run.
-
-        Args:
-            number: index of the recording.
         """
         given = self.evidence.recordings[number]
         frames = self.frames.taken(self.frames.recordings[given.name])

@@ -121,7 +121,6 @@ class State:
         """Points of tracks under the poses as they are.
 
         Args:
-            tracks: candidates, of rows of `keypoints`.
             gate: largest residual, in the keypoints' own standard deviations.
         """
         poses, run = self.solution.world_T_rigs, self.run
@@ -138,11 +137,7 @@ class State:
         return self._context(families.fitted(self.solution, prior.parts))
 
     def context_of_images(self, noise: PriorSettings) -> AdjustmentContext:
-        """The context of an adjustment by images, trajectory and gyro alone.
-
-        Args:
-            noise: of the trajectory's steps and poses.
-        """
+        """The context of an adjustment by images, trajectory and gyro alone."""
         observing = self.run.families.observing_points
         own = self.prior.families(noise)
         return self._context(observing.with_members((*own, *observing.members)))

@@ -28,10 +28,6 @@ _DRIFT_PER_FRAME = 0.13  # times frames over squared matches of a step: the drif
 def expected_drift(run: Run, search: Search) -> tuple[float, dict[str, Features]]:
     """Drift to be expected of a run whose frames were not searched yet, part of its path.
 
-    Args:
-        run: the run.
-        search: of its frames.
-
     Returns:
         The drift, 0 where nothing foretells it; and keypoints of the frames that were compared, by
         name: none if an earlier call did.

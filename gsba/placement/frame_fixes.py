@@ -53,7 +53,6 @@ def fixes_of_frames(
     noise of the fixes have no fix.
 
     Args:
-        source: see `read_fixes`.
         frames: frames of the run; they need times unless fixes name frames.
         settings: smallest noise, and correlation time of the errors.
 

@@ -38,7 +38,6 @@ def read_video_gps(path: Path, settings: GpsSettings | None = None) -> GpsFixes:
     """Fixes of a video of Insta360 or GoPro, with times in seconds on the video's clock.
 
     Args:
-        path: the video.
         settings: smallest noise of a fix; the file's DOP is used if it has one.
 
     Raises:
@@ -55,8 +54,7 @@ def read_video_gps(path: Path, settings: GpsSettings | None = None) -> GpsFixes:
 def _of_insta360(
     record: GpsRecord, created_unix_s: float | None, settings: GpsSettings | None
 ) -> GpsFixes:
-    """Fixes with times since the creation of the recording, accurate to a second; since the first
-    fix if the creation time is implausible."""
+    """Fixes with times since the recording's creation, or the first fix if that is implausible."""
     begin = float(record.unix_times[0])
     if created_unix_s is not None:
         low, high = _FIRST_FIX_S
@@ -68,11 +66,8 @@ def _of_insta360(
 def _of_gopro(path: Path, settings: GpsSettings | None) -> GpsFixes:
     """Fixes with times in seconds after the first GPS packet.
 
-    The fixes of a packet are spread evenly until the next packet. Packets are timed by the camera's
-    counter (STMP), else by the receiver's UTC. Entries without a valid fix are left out.
-
-    Raises:
-        GsbaError: the library is not installed, or finds no positions.
+    Fixes of a packet are spread evenly until the next one. Packets are timed by the camera
+    (STMP), else by the receiver's UTC. Entries without a valid fix are left out.
     """
     groups = ask_telemetry_parser(path, "telemetry", "GPS", "a CSV or GPX file")
     packets = [packet for packet in map(_packet, groups) if packet is not None]
@@ -109,8 +104,7 @@ def _of_gopro(path: Path, settings: GpsSettings | None) -> GpsFixes:
 def _packet(groups: Mapping[str, Mapping[str, Any]]) -> tuple[float, np.ndarray] | None:
     """Start in seconds and fixes (n, 5) of a packet; None = it has no fixes.
 
-    Columns are latitude, longitude (degrees), altitude (metres), DOP (NaN = unknown), and the state
-    of the receiver.
+    Columns: latitude, longitude (degrees), altitude (metres), DOP (NaN = unknown), lock state.
     """
     tags = groups.get("GPS9") or groups.get("GPS")
     if not isinstance(tags, Mapping) or "Scale" not in tags:

@@ -58,7 +58,6 @@ def estimate_gravity(reconstruction: Reconstruction, frames: FrameSet) -> Gravit
     Compass, ECCV 2002).
 
     Args:
-        reconstruction: refined poses; unrefined ones are not used.
         frames: frames of the run; the images of a few are read.
     """
     good = np.flatnonzero(reconstruction.pose_statuses == PoseStatus.REFINED)
@@ -177,8 +176,7 @@ def _side_faces(frames: FrameSet, f: int) -> tuple[np.ndarray, np.ndarray | None
 def _level_axis(
     normals: np.ndarray, weights: np.ndarray, start: np.ndarray
 ) -> tuple[np.ndarray, int]:
-    """Axis (3,) near `start` that is perpendicular to most normals, and the number of these; 0 =
-    `start`."""
+    """Axis (3,) near `start` perpendicular to most normals, and their number; 0 = `start`."""
     up, near = start, np.zeros(len(normals), bool)
     for gate in _GATES_DEG:
         for _ in range(5):

@@ -63,7 +63,6 @@ def place(
     """Placement of a run's world by the settings.
 
     Args:
-        reconstruction: the run, in its own world.
         frames: its frames; their images are read to find the vertical.
         settings: `up` alone applies the smallest rotation that makes -y point up. With `length`
             the unit becomes the metre. `gps` gives metres east, north and up; together with `up` it
@@ -72,7 +71,6 @@ def place(
             world of true poses, `scan` that of a scan of the place; with a scan, `up`, `gps` or
             `pairs` only start the alignment.
         baseline: distance of the lenses and its standard deviation, metres, for a length of "lens".
-        gps: noise of GPS positions.
 
     Raises:
         GsbaError: settings exclude one another, or data do not determine the placement.
@@ -135,7 +133,6 @@ def check(
     """Check settings and the files that they name.
 
     Args:
-        settings: settings of the placement.
         frames: frames of the run, whose EXIF positions are checked; None = not checked.
         baseline: distance of the lenses and its standard deviation, metres; None = not known.
 
@@ -276,15 +273,7 @@ def _on_earth(
     scale: tuple[float, float] | None = None,
     settings: GpsSettings | None = None,
 ) -> Placement:
-    """Placement in metres east, north and up around the median of the fixes.
-
-    Args:
-        reconstruction, frames: the run.
-        source: see `read_fixes`.
-        upright: placement whose up, if known, is kept.
-        scale: metres per map unit, known from other data, and its standard deviation.
-        settings: noise of the fixes.
-    """
+    """Placement in metres east, north and up around the median fix; keeps `upright`'s up."""
     fixes, path = fixes_of_frames(source, frames, settings), Path(source)
     fixes = fixes.taken(reconstruction.pose_statuses[fixes.frames] == PoseStatus.REFINED)
     if len(fixes) < 3:
@@ -337,15 +326,7 @@ def _require_majority(
     rows: np.ndarray,
     advice: str,
 ) -> None:
-    """Raise GsbaError, naming them, if no more than half of a file's positions agree with the run.
-
-    Args:
-        path: the file.
-        used: (N,) bool, inliers.
-        off: (N,) residuals, placed units.
-        frames, rows: frames of the run, and rows (N,) of those that the positions are of.
-        advice: what else may help.
-    """
+    """Raise GsbaError, naming them, unless most of a file's positions (rows of frames) agree."""
     if 2 * used.sum() > len(used):
         return
     false = rows[~used]
@@ -379,10 +360,7 @@ def _require_one_scale(
 
 
 def _claims(found: GpsFit, positions: np.ndarray) -> dict[str, Any]:
-    """Entries of transform.json on a fit: numbers of fixes, and standard deviations.
-
-    Those of the position are east, north and up, medians over the frames with a fix.
-    """
+    """Entries of transform.json on a fit; position sigmas are medians, east, north and up."""
     return {
         "fixes": len(found.used),
         "outliers": int(np.sum(~found.used)),
@@ -485,9 +463,7 @@ def guess_in_scan(
     """Initial guess of a run's placement in a scan, by `pairs`, else `gps`, else `up`.
 
     Args:
-        reconstruction, frames: the run.
         settings: placement settings; `scan` names the file of the scan.
-        scan: the scan.
 
     Returns:
         The guess, in the scan's world less its offset, and entries of transform.json on it.

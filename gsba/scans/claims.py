@@ -46,10 +46,7 @@ class _TooMuch(Exception):
 
 
 def _check_laser(head: bytes, size: int) -> None:
-    """Check the header of LAS or LAZ (LAS 1.4, revision 15, section 2.4).
-
-    LAZ sets the highest bits of the point format.
-    """
+    """Check the header of LAS or LAZ (LAS 1.4, section 2.4; LAZ sets high bits of the format)."""
     if head[:4] != b"LASF":
         raise ValueError
     head_size, first, num_records, kind, length, num = struct.unpack_from("<HIIBHI", head, 94)

@@ -166,11 +166,7 @@ def read_on_trial(path: str) -> None:
 
 
 def _content(path: Path) -> tuple[Any, np.ndarray, np.ndarray | None]:
-    """Mesh of a file, or None; else the points (M, 3) of its cloud, and their colours or None.
-
-    Raises:
-        GsbaError: the file cannot be read, or holds neither a mesh nor a cloud.
-    """
+    """Mesh of a file, or None; else the points (M, 3) of its cloud, and their colours or None."""
     suffix = path.suffix.lower()
     mesh = _mesh(path) if suffix in MESHES or suffix == ".ply" else None
     if mesh is not None:
@@ -184,11 +180,7 @@ def _content(path: Path) -> tuple[Any, np.ndarray, np.ndarray | None]:
 
 
 def _mesh(path: Path) -> Any:
-    """Triangles of a file; None if it has none.
-
-    Raises:
-        GsbaError: corners of triangles are missing or not finite.
-    """
+    """Triangles of a file; None if it has none."""
     mesh = open3d().io.read_triangle_mesh(str(path), enable_post_processing=True)
     triangles, vertices = np.asarray(mesh.triangles), np.asarray(mesh.vertices)
     if not len(triangles):
@@ -250,11 +242,7 @@ def _origin_of(points: np.ndarray) -> np.ndarray:
 
 
 def _thinned(cloud: Any, path: Path) -> Any:
-    """Cloud of at most `_MAX_POINTS` points, one for each occupied cell, without duplicates.
-
-    Raises:
-        GsbaError: too few points are left.
-    """
+    """Cloud of at most `_MAX_POINTS` points, one for each occupied cell, without duplicates."""
     points = np.asarray(cloud.points)
     cell = float(np.ptp(points, axis=0).max()) / 1000 if len(points) else 0.0
     while cell and len(cloud.points) > _MAX_POINTS:

@@ -42,8 +42,6 @@ def approach(start: Sim3, cloud: Cloud, scan: Scan, width: float) -> tuple[Sim3,
     both shows are outliers.
 
     Args:
-        start: initial similarity, within some widths of the result.
-        cloud, scan: point cloud and scan.
         width: initial width of the loss, unit of the scan.
     """
     least = LEAST_SIGMA * scan.spacing
@@ -138,9 +136,8 @@ def moved_by(fit: Sim3, step: np.ndarray, middle: np.ndarray) -> Sim3:
 def _with_covariance(fit: Sim3, cloud: Cloud, scan: Scan, noise: Noise) -> Fit:
     """Fit with the sandwich covariance of clustered errors (Liang and Zeger, Biometrika 73, 1986).
 
-    Errors of neighbours (of a piece of wall, by a wrong normal) are correlated, so that the
-    residuals of a cell form one cluster. The size of cells is chosen as by Flyvbjerg and Petersen
-    (J. Chem. Phys. 91, 1989): of several sizes, the one with the largest variances is taken.
+    Residuals of a cell form a cluster, as neighbours' errors are correlated. Of several sizes of
+    cells the one with the largest variances is taken (Flyvbjerg and Petersen, J. Chem. Phys. 91).
     """
     jacobians, off, variances, weights, carried, middle = _weighted(fit, cloud, scan, noise)
     gradients = jacobians * (weights * off)[:, None]

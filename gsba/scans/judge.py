@@ -112,8 +112,6 @@ def verdict(fit: Sim3, cloud: Cloud, scan: Scan, grid: CellGrid, noise: Noise) -
     """Evidence of a scan on a cloud.
 
     Args:
-        fit: similarity from the cloud to the scan.
-        cloud, scan, grid: point cloud, scan and the scan's grid.
         noise: noise of distances from explained points to their surface.
     """
     carried, nearest, off, gaps = residuals_of(fit, cloud, scan)
@@ -141,11 +139,7 @@ def verdict(fit: Sim3, cloud: Cloud, scan: Scan, grid: CellGrid, noise: Noise) -
 
 
 def _brightness_logs(cloud: Cloud, scan: Scan, nearest: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """Log likelihood ratio (N,) of the correlation of near points and surfaces in brightness.
-
-    Ranks of both are transformed to normal scores. The hypotheses are a bivariate normal
-    distribution with their correlation, and independence.
-    """
+    """Log likelihood ratio (N,) of correlated brightness: bivariate normal scores or none."""
     logs = np.zeros(len(near))
     if scan.brightness is None or near.sum() < _MIN_BRIGHTNESS_POINTS:
         return logs

@@ -39,8 +39,6 @@ def noise_of(fit: Sim3, cloud: Cloud, scan: Scan, sigma: float) -> Noise:
     """Maximum-likelihood noise, from points within a fiftieth of the cloud's size of a surface.
 
     Args:
-        fit: similarity from the cloud to the scan.
-        cloud, scan: point cloud and scan.
         sigma: initial standard deviation, unit of the scan.
     """
     from scipy.optimize import minimize

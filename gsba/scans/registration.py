@@ -82,7 +82,6 @@ def register(cloud: Cloud, scan: Scan, guess: Guess | None = None) -> Registrati
     """Unique similarity from a cloud to a scan.
 
     Args:
-        cloud, scan: point cloud and scan.
         guess: prior knowledge; only placements within it are tried.
 
     Raises:
@@ -136,11 +135,7 @@ _ADVICE = (
 
 
 def _check(found: Registration, reach: float) -> None:
-    """Refuse a placement that explains too little, or only by a noise that no run has.
-
-    Args:
-        reach: largest noise of a run, unit of the scan.
-    """
+    """Refuse a placement that explains too little, or only by a noise that no run has."""
     evidence, sigma = found.verdict, found.fit.noise.sigma
     if sigma > reach:
         raise NoPlacementError(

@@ -57,12 +57,7 @@ def try_in_process(path: Path) -> None:
 
 
 def limited(path: Path, read: Callable[[Path], object]) -> None:
-    """Read a scan with limits on memory and processor time by its size, and end the process.
-
-    Args:
-        path: file of the scan.
-        read: function that is called with the path.
-    """
+    """Read a scan with limits on memory and processor time by its size, and end the process."""
     size = path.stat().st_size
     memory = _mapped_bytes() + _BASE_MEMORY_BYTES + _MEMORY_PER_BYTE * size
     spent = sum(os.times()[:2])

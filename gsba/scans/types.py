@@ -108,7 +108,6 @@ def cloud_of(
     directions, with the noise of the observation times the distance as standard deviation.
 
     Args:
-        reconstruction: the run.
         normals_of: computes unit normals (N, 3) of points (N, 3) from their neighbours.
 
     Raises:

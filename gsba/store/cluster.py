@@ -63,8 +63,6 @@ def hire(
 
     Args:
         client: client of a scheduler; None = threads of this process.
-        frames: frames of the run, which workers read.
-        settings: settings of the run.
     """
 
     def make(folder: Path) -> Workers:
@@ -82,7 +80,6 @@ def hired(client: "Client | None", out: Path, frames: FrameSet) -> Iterator["Clu
     Args:
         client: client of a scheduler; None = no workers.
         out: folder on a disk that workers share; may be missing.
-        frames: frames that workers read.
     """
     if client is None:
         yield None
@@ -151,11 +148,7 @@ def connect(address: str) -> "Client":
 
 
 def _scheduler_address(address: str) -> str:
-    """Address that a scheduler listens at: `address`, or the one in its file.
-
-    Raises:
-        OSError, ValueError: the file is missing, or there is no valid address.
-    """
+    """Address that a scheduler listens at: `address`, or the one in its file."""
     found: Any = address
     if address.endswith(".json"):
         found = json.loads(Path(address).read_text(encoding="utf-8"))
@@ -210,9 +203,6 @@ class Cluster:
     """Workers of a Dask scheduler that see the run's folder and its frames.
 
     Args:
-        client: client of the scheduler.
-        folder: folder of shards, in the run's folder.
-        frames: frames of the run.
         num_threads: of this process, for what is not shared out.
 
     Raises:
@@ -302,13 +292,7 @@ class Cluster:
         )
 
     def _wait(self, shard: _Shard, returns: Any, lasted: list[float]) -> tuple[Any, ...]:
-        """Results of a shard's items; replaces workers that die or are late.
-
-        Args:
-            shard: the shard.
-            returns: type of an item's result.
-            lasted: seconds that earlier shards took; this one's time is appended.
-        """
+        """Results of a shard's items; replaces workers that die or are late."""
         from distributed import wait
 
         began, died = time.monotonic(), 0
@@ -337,11 +321,7 @@ class Cluster:
         return self._load(shard, returns)
 
     def _outcome(self, future: "Future", shard: _Shard) -> Manifest | None:
-        """Manifest of a shard from its worker; None = the worker died.
-
-        Raises:
-            Exception: the error of the worker or of the scheduler.
-        """
+        """Manifest of a shard from its worker; None = the worker died."""
         from distributed import KilledWorker
 
         if future.status == "finished":

@@ -15,7 +15,6 @@ def load_run(out: Path, map_number: int = 1) -> tuple[Reconstruction, FrameSet]:
     """One map of a finished run and its frames.
 
     Args:
-        out: folder of the run.
         map_number: number of the map, 1 = the largest.
 
     Raises:
@@ -39,12 +38,6 @@ def one_map(
 ) -> tuple[Reconstruction, FrameSet]:
     """Map of a reconstruction, 1 = the largest, and its frames.
 
-    Args:
-        reconstruction: all maps.
-        frames: all frames.
-        map_number: number of the map.
-        name: name of the run in the message.
-
     Raises:
         GsbaError: there is no such map.
     """
@@ -58,10 +51,6 @@ def one_map(
 
 def load_cameras(out: Path, main: Reconstruction, frames: FrameSet, map_number: int = 1) -> Cameras:
     """Cameras of a finished run's map, in that map's unit; one centre each if none has two lenses.
-
-    Args:
-        out: folder of the run.
-        main, frames, map_number: the map, as `load_run` gives it.
 
     Raises:
         GsbaError: the run found two lenses, but their file is missing.

@@ -32,7 +32,6 @@ def open_run_folder(root: Path, origin: Mapping[str, Path], fresh: bool) -> int:
     """Make or reopen a run folder and lock it against other processes.
 
     Args:
-        root: the folder, made if missing.
         origin: inputs of the run, e.g. `{"frames": path, "trajectory": path}`.
         fresh: delete the files that gsba wrote for an earlier run of any inputs.
     Returns:

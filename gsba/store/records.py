@@ -113,7 +113,6 @@ def load_record(path: Path, returns: type[T], mapped: bool = False) -> T:
     """Read a record back.
 
     Args:
-        path: file written by `save_record`.
         returns: its type, e.g. a dataclass or `tuple[Matches, Counts]`.
         mapped: leave large arrays on the disk, where they are read as they are used; they cannot be
             written. The file may be replaced meanwhile, but not changed.
@@ -140,10 +139,6 @@ def load_keyed(path: Path, key: str, returns: type[T]) -> T | None:
 def load_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
     """Read arrays of a record by the names of their fields, whatever the record's type.
 
-    Args:
-        path: file written by `save_record`.
-        names: names of fields.
-
     Returns:
         The first array of each name, in the order of the record's fields; those it lacks are left
         out.
@@ -165,8 +160,6 @@ def load_checkpoint(path: Path | None, key: str, returns: type[T], anew: str) ->
 
     Args:
         path: file written by `save_record`; None = there is none.
-        key: digest of all that the work depends on.
-        returns: type of the record.
         anew: clause for the log if the file cannot be used, e.g. "training starts anew".
 
     Returns:
@@ -234,13 +227,10 @@ class _MappedArchive(_Archive):
 
 
 def _header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
-    """Shape, order and type of an array of numbers from the beginning of its `.npy` file.
+    """Shape, order and type of an array of numbers, from the beginning of its `.npy` file.
 
-    numpy's own reader parses the header as Python code: one thread at a time, and CPython 3.11
-    fails now and then where another one parses, too (its issue 106905).
-
-    Raises:
-        ValueError: it is no header of such an array, or not of the version that is written here.
+    numpy's reader parses the header as Python code: one thread at a time, and CPython 3.11 fails at
+    times where another one parses, too (its issue 106905).
     """
     version = np.lib.format.read_magic(file)
     if version != (1, 0):

@@ -182,7 +182,6 @@ def write_shard(job: Job[R], folder: Path) -> tuple[Path, str]:
     """Write a part of a job for a worker.
 
     Args:
-        job: the part.
         folder: folder of shards, on a disk that workers share.
 
     Returns:
@@ -208,7 +207,6 @@ def run_shard(path: str, digest: str) -> Manifest:
     others may have written into the folder of a run that was copied.
 
     Args:
-        path: file of the shard.
         digest: SHA-256 of its content from `write_shard`.
 
     Raises:

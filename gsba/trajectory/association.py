@@ -33,7 +33,6 @@ def associate(frames: FrameSet, trajectory: Trajectory, settings: ReadSettings) 
     an interval of frames or entries, whichever is shorter.
 
     Args:
-        frames: F frames.
         trajectory: N entries; its clock may differ from the frames' by a constant.
         settings: `clock_offset_s` states that constant. Without it the clocks must agree, or
             exactly one offset must make all times meet; that one is then used, with a warning.

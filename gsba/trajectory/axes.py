@@ -18,7 +18,6 @@ def quarter_turn(coarse: CoarsePoses, world_T_rigs: np.ndarray) -> np.ndarray:
     A trajectory comes from upright panoramas, but sensors may be mounted turned by quarters.
 
     Args:
-        coarse: the trajectory.
         world_T_rigs: (F, 4, 4) estimated poses, up to a similarity.
     """
     own = coarse.sources == PoseSource.SLAM

@@ -80,8 +80,6 @@ def estimate_clock(
 
     Args:
         timestamps: (F,) times of frames, seconds.
-        found: steps estimated from images.
-        trajectory: all entries, N.
         offset: offset of the association, seconds to add to times of frames.
         reach_s: largest change of the offset that is tried, seconds.
     """
@@ -113,10 +111,6 @@ def other_rate(
     frame on, if the given rate and those near it contradict the images; else None.
 
     It is no correction, as rate and offset are hardly determined where the verdict is unclear.
-
-    Args:
-        timestamps, found, trajectory: as for `estimate_clock`.
-        estimate: its result.
     """
     turns = merged(timestamps, found.f_T_nexts[:, :3, :3], found.verified)
     if estimate.verdict != "unclear" or len(turns) < MIN_STEPS:

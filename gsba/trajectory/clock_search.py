@@ -116,8 +116,7 @@ class ClockFit:
         return np.where(inside[..., None], found, -self.turns.rotvecs)
 
     def _rotations(self, times: np.ndarray) -> np.ndarray:
-        """Quaternions (..., 4) of the trajectory in its span, at constant angular velocity between
-        entries."""
+        """Quaternions (..., 4) in the trajectory's span, at constant velocity between entries."""
         before = np.clip(np.searchsorted(self._entries, times) - 1, 0, len(self._onward) - 1)
         span = self._entries[before + 1] - self._entries[before]
         share = (times - self._entries[before]) / span
@@ -203,10 +202,7 @@ class ClockFit:
         return parameters
 
     def _profile(self, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        """Shifts (n,) up to one step, the loss under each, and the least noise.
-
-        The loss is bounded: one outlier more or less must not outweigh all inliers.
-        """
+        """Shifts (n,) up to one step, the bounded loss under each, and the least noise."""
         shifts = self.turns.step * np.linspace(-1, 1, _NUM_SHIFTS)
         tried = parameters + np.column_stack([shifts, np.zeros(_NUM_SHIFTS)])
         residuals = self.residuals(tried)
@@ -235,7 +231,6 @@ class ClockFit:
         """Parameters (2,) of the best clocks on a grid around a start, best first.
 
         Args:
-            start: the clock in the middle of the grid.
             reach_s: largest tried difference of the offset. Steps of a fraction of a second are
                 searched less far: the size of the grid is bounded, whatever the times are.
         """
@@ -260,9 +255,7 @@ class ClockFit:
     def _angular_velocity(
         self, spacing: float, middle: float, reach: float
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Instants (n,) of the trajectory and its mean angular velocity (n, 3) over a step around
-        each.
-        """
+        """Instants (n,) of the trajectory, its mean angular velocity (n, 3) over a step there."""
         half = 0.5 * min(self.turns.step, float(np.ptp(self.span)))
         far = reach + (1 + _MAX_RATE_DEVIATION) * np.abs(self.turns.ends).max() + half
         begin, end = self.span[0] + half, self.span[1] - half
@@ -286,8 +279,7 @@ class ClockFit:
         return self.turns.times - self.turns.middle
 
     def _jacobian(self, parameters: np.ndarray) -> np.ndarray:
-        """Derivatives (N, 3, 2) of residuals, by differences over part of a step: residuals are
-        jagged."""
+        """Derivatives (N, 3, 2) of residuals by differences: residuals are jagged."""
         reach = 0.1 * self.turns.step
         steps = np.diag([reach, reach / self.turns.ends[1]])
         ahead, back = self.residuals(parameters + np.stack([steps, -steps]))

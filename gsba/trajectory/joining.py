@@ -32,9 +32,6 @@ class SegmentAlignment:
 def join(coarse: CoarsePoses) -> tuple[CoarsePoses, tuple[SegmentAlignment, ...]]:
     """Move the pieces of a trajectory into the world of the first, each by a guess.
 
-    Args:
-        coarse: poses of each piece in its own world.
-
     Returns:
         Poses in one world, and the alignment of each further piece, in order.
     """

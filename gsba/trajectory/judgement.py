@@ -85,11 +85,7 @@ def check_steps(
     """Compare the trajectory's steps with those of the images.
 
     Args:
-        coarse: the trajectory.
-        found: steps from the images.
         logs, sigmas: (F - 2,) logarithms of ratios of lengths, and standard deviations.
-        verify: thresholds of contradiction.
-        priors: noise of the trajectory's steps.
         turn: proof that the camera turned on the spot; None = there is none, or it moved.
     """
     slam = inverse(coarse.world_T_rigs[:-1]) @ coarse.world_T_rigs[1:]
@@ -162,8 +158,6 @@ def implausible_steps(
     noise is the limit.
 
     Args:
-        coarse: the trajectory.
-        trust: its checks.
         world_T_rigs: (F, 4, 4) poses in the map.
         timestamps: (F,) seconds.
         max_ratio: of the lengths of a step in both, relative to steps around it.
@@ -233,7 +227,6 @@ def unusual_paces(
 
     Args:
         world_T_rigs: (F, 4, 4) poses in a map of the images.
-        timestamps, recordings: see `over_missing_frames`.
     """
     missing = over_missing_frames(timestamps, recordings)
     usual = ~missing & (recordings[1:] == recordings[:-1])
@@ -341,8 +334,7 @@ def leaps(world_T_rigs: np.ndarray, timestamps: np.ndarray) -> np.ndarray:
 
 
 def _chain(world_T_rigs: np.ndarray, chosen: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """Poses (F, 4, 4) that follow the chosen steps, aligned with the trajectory's tracked
-    frames."""
+    """Poses (F, 4, 4) that follow the chosen steps, aligned with tracked frames."""
     poses = chained(chosen)
     own = own if own.any() else np.ones(len(own), bool)
     rotation = nearest_rotation(
@@ -376,7 +368,6 @@ def outlier_limits(
         slam: (F - 1, 4, 4) steps of the trajectory.
         images: (F - 1, 4, 4) steps from images, with lengths.
         judged: (F - 1,) bool, steps known from both.
-        settings: thresholds of contradiction.
     """
     turned = rotation_angle(np.swapaxes(slam[:, :3, :3], 1, 2) @ images[:, :3, :3])
     off = np.linalg.norm(slam[:, :3, 3] - images[:, :3, 3], axis=1)
@@ -409,7 +400,6 @@ def false_frames(
         wrong: (F - 1,) bool, steps that images contradict.
         slam, chosen: (F - 1, 4, 4) steps of the trajectory and the best known steps.
         own: (F,) bool, frames with an entry in the trajectory.
-        limits: thresholds of an outlier.
     """
     named = np.zeros(len(own), bool)
     if not wrong.any():

@@ -18,7 +18,6 @@ def follow_keyframes(frames: Trajectory, keyframes: Trajectory) -> Trajectory:
     only one.
 
     Args:
-        frames: N poses.
         keyframes: K poses of the same run, in the same world and on the same clock.
 
     Returns:

@@ -47,11 +47,6 @@ def refuse_useless(coarse: CoarsePoses) -> None:
 def refuse_misread(coarse: CoarsePoses, found: Steps, settings: TwoViewLimits) -> None:
     """Refuse a trajectory that most steps of the images contradict, but not in another convention.
 
-    Args:
-        coarse: the trajectory.
-        found: steps from the images.
-        settings: thresholds of contradiction.
-
     Raises:
         TurnedAboutForwardError: the trajectory is in axes that are turned about the forward one.
         GsbaError: it is reversed, mirrored, inverted or in other axes.
@@ -87,9 +82,6 @@ def refuse_misread(coarse: CoarsePoses, found: Steps, settings: TwoViewLimits) -
 def refuse_misfit(coarse: CoarsePoses, found: Steps, settings: TwoViewLimits) -> None:
     """Refuse a trajectory that most steps of the images contradict, with the likely reason.
 
-    Args:
-        coarse, found, settings: as for `refuse_misread`.
-
     Raises:
         GsbaError: most steps contradict the images.
     """
@@ -117,10 +109,7 @@ def refuse_misfit(coarse: CoarsePoses, found: Steps, settings: TwoViewLimits) ->
 def _delay_in_frames(
     coarse: CoarsePoses, found: Steps, judged: np.ndarray, settings: TwoViewLimits
 ) -> tuple[int, float]:
-    """Delay in frames of the trajectory's steps, and the share of steps that it explains.
-
-    The delay is 0 if no shift explains enough steps.
-    """
+    """Delay of the trajectory in frames, 0 if none explains enough, and the share explained."""
     steps, best = _steps(coarse.world_T_rigs), (0, 0.0)
     own = coarse.sources[:-1] == PoseSource.SLAM
     own &= coarse.sources[1:] == PoseSource.SLAM
@@ -213,7 +202,6 @@ def _agreeing_share(
 
 
 def _mean_error(steps: np.ndarray, found: Steps, judged: np.ndarray) -> float:
-    """Mean error of the judged steps' rotation and direction, radians: it decides between readings
-    that differ in a motion which is small in all steps, as that up and down."""
+    """Mean error of judged steps, radians: tells readings apart that differ in small motions."""
     turned, off = step_errors(steps, found)
     return float(np.mean((turned + off)[judged]))

@@ -29,9 +29,6 @@ def split_restarts(trajectory: Trajectory) -> list[Trajectory]:
     jump, while the entries around keep the pace. A jump and another one back soon after are false
     poses, not a new map.
 
-    Args:
-        trajectory: N entries.
-
     Returns:
         The pieces in order of time, each with an origin and a scale of its own.
     """
@@ -64,11 +61,6 @@ def associate_pieces(
 
     A frame between two pieces belongs to the nearer one. Where pieces overlap in time, the one that
     begins first is used.
-
-    Args:
-        frames: F frames.
-        pieces: at least one.
-        settings: see `associate`.
 
     Returns:
         Poses with `segments` set if there is more than one piece; no two worlds are related yet.

@@ -46,7 +46,6 @@ def image_steps(pairs: VerifiedPairs, keypoints: Keypoints) -> Steps:
 
     Args:
         pairs: pairs of frames at most a few apart.
-        keypoints: keypoints of all frames.
     """
     num = max(len(keypoints.starts) - 2, 0)
     f_T_nexts = np.tile(np.eye(4), (num, 1, 1))
@@ -147,8 +146,6 @@ def length_ratios(
 
     Args:
         pairs: pairs of frames at most a few apart.
-        found: steps of these pairs.
-        keypoints: keypoints of all frames.
         least_alike: points that suffice if they agree on one ratio to 15 %; None = eight points,
             however they agree.
 

@@ -57,8 +57,6 @@ def prove(
 
     Args:
         pairs: pairs of frames, the closest first.
-        keypoints: keypoints of all frames.
-        settings: error rates.
         max_parallax: radians between bearings that a rotation explains.
     """
     frames, num_frames = pairs.matches.pairs, len(keypoints.starts) - 1
@@ -82,21 +80,14 @@ def prove(
 
 
 def _is_turn(support: int, against: int, chance: float, settings: TwoViewLimits) -> bool:
-    """True if matches surely agree on a rotation, and no translation explains as many more.
-
-    Args:
-        support, against: numbers of witnesses that the rotation explains, and of others.
-        chance: that it explains a false match, or one of a camera that moved.
-        settings: error rates.
-    """
+    """True if matches surely agree on a rotation, and no translation explains as many more."""
     alarms = log10_false_alarms(support + against, support, chance, _SAMPLE_SIZE)
     significant = alarms < np.log10(settings.max_false_alarms)
     return bool(significant) and outweighs(support, against, settings.max_error_rate)
 
 
 def _tied(pairs: np.ndarray, rotations: np.ndarray, num_frames: int) -> Turn:
-    """The largest part of the frames that pairs (P, 2) tie together, their rotations (P, 3, 3)
-    chained along the closest pairs."""
+    """The largest part that pairs (P, 2) tie together, rotations chained along the closest ones."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import (
         breadth_first_order,
