@@ -233,27 +233,16 @@ def naming(path: Path) -> Iterator[None]:
         ) from None
 
 
-def relative_map(
-    points0: np.ndarray, points1: np.ndarray, seed: int
-) -> tuple[np.ndarray, int] | None:
-    """Relative pose of two frames from corresponding points, each frame with its own scale.
+def relative_similarity(
+    points0: np.ndarray, points1: np.ndarray, seed: int, least: int = _MIN_POINTS
+) -> tuple[Sim3, np.ndarray] | None:
+    """Similarity of two rigs from corresponding points, each frame with its own scale.
 
     Args:
         points0, points1: (m, 3) points in the rigs of both frames, map units.
 
     Returns:
-        f0_T_f1 (4, 4) in the units of frame 0, and the number of inliers; None if too few.
-    """
-    found = relative_similarity(points0, points1, seed)
-    return None if found is None else (found[0].new_T_old, int(found[1].sum()))
-
-
-def relative_similarity(
-    points0: np.ndarray, points1: np.ndarray, seed: int, least: int = _MIN_POINTS
-) -> tuple[Sim3, np.ndarray] | None:
-    """Similarity from rig 1 to rig 0 and its inliers (m,) bool; None if fewer than `least`.
-
-    For the arguments see `relative_map`.
+        similarity from rig 1 to rig 0, and its inliers (m,) bool; None if fewer than `least`.
     """
     if len(points0) < least:
         return None
@@ -264,7 +253,11 @@ def relative_similarity(
     for _ in range(3):
         if best.sum() < least:
             return None
-        best = _agree(points0, points1, np.flatnonzero(best))
+        try:
+            fit = similarity(points1[best], points0[best])
+        except NoSimilarityError:
+            return None
+        best = agreeing_points(points0, points1, fit)
     if best.sum() < least:
         return None
     return similarity(points1[best], points0[best]), best
@@ -307,30 +300,14 @@ def similarity_along(
     for _ in range(2 if agree.sum() >= least else 0):
         ratio = float(np.median(ratios[agree]))
         at = turned[agree] + ratio * direction
-        fit = _scaled(points0[agree], at, rotation, ratio * direction)
+        lengths0, lengths1 = (np.linalg.norm(points, axis=1) for points in (points0[agree], at))
+        scale = float(np.median(lengths0 / np.maximum(lengths1, 1e-12)))
+        fit = Sim3(scale, rotation, scale * (ratio * direction))
         fits = agreeing_points(points0, points1, fit)
         if fits.sum() < agree.sum():
             break
         best, agree = fit, fits
     return None if best is None or agree.sum() < least else (best, agree)
-
-
-def _scaled(
-    points0: np.ndarray, points1: np.ndarray, rotation: np.ndarray, step: np.ndarray
-) -> Sim3:
-    """Similarity whose scale is the median ratio of distances; `step` (3,) in units of rig 1."""
-    lengths0, lengths1 = (np.linalg.norm(points, axis=1) for points in (points0, points1))
-    scale = float(np.median(lengths0 / np.maximum(lengths1, 1e-12)))
-    return Sim3(scale, rotation, scale * step)
-
-
-def _agree(points0: np.ndarray, points1: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-    """Inliers (m,) bool of the similarity that fits the chosen points."""
-    try:
-        fit = similarity(points1[chosen], points0[chosen])
-    except NoSimilarityError:
-        return np.zeros(len(points0), bool)
-    return agreeing_points(points0, points1, fit)
 
 
 def _agree_with_triples(

@@ -33,9 +33,8 @@ from gsba.localization.pose_fit import (
     is_determined,
 )
 from gsba.localization.pose_search import Candidates, is_significant, search_poses
-from gsba.localization.query import Query
 from gsba.localization.rival_poses import PlacedPose, best_of
-from gsba.localization.run_map import RunMap, without_correction
+from gsba.localization.run_map import Query, RunMap, without_correction
 from gsba.localization.surroundings import Surroundings, open_rates
 from gsba.log import GsbaError
 from gsba.matching.guided_search import Gate, match_pair, searchable

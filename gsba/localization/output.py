@@ -72,18 +72,14 @@ def _write_table(path: Path, frames: Sequence[LocalizedFrame], times: Sequence[f
                 row = [frame.name, repr(float(time)), status, frame.reason, camera]
                 numbers = [""] * (len(header) - len(row))
                 if frame.found:
-                    values = (*_position_and_rotation(frame), *frame.covariance[_UPPER])
+                    pose = frame.world_T_rig
+                    values = [*pose[:3, 3], *quaternion_from_rotation(pose[:3, :3])]
+                    values += [*frame.covariance[_UPPER]]
                     numbers = [frame.num_points, f"{np.degrees(frame.noise_rad):.6g}"]
                     numbers += [frame.nearest, *(f"{value:.15g}" for value in values)]
                 table.writerow(row + numbers)
 
     atomic_write(path, write)
-
-
-def _position_and_rotation(frame: LocalizedFrame) -> tuple[float, ...]:
-    """Position and quaternion wxyz."""
-    wxyz = quaternion_from_rotation(frame.world_T_rig[:3, :3])
-    return (*frame.world_T_rig[:3, 3].tolist(), *wxyz.tolist())
 
 
 def _as_json(frame: LocalizedFrame, picture: Picture) -> dict[str, Any]:

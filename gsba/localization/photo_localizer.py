@@ -20,7 +20,15 @@ from gsba.localization.localizer import (
     Localizer,
     typical_sigma,
 )
-from gsba.localization.photos import Photo, as_panorama, photo_features, photo_rig, shows
+from gsba.localization.photos import (
+    Photo,
+    as_panorama,
+    photo_features,
+    photo_rig,
+    read_photo,
+    shows,
+)
+from gsba.localization.pictures import Picture
 from gsba.localization.pose_fit import (
     COARSE,
     FINE,
@@ -31,17 +39,19 @@ from gsba.localization.pose_fit import (
     is_determined,
 )
 from gsba.localization.pose_search import (
+    MIN_RATIO,
+    MIN_WITNESSES,
     Candidates,
     is_rivalled,
     is_significant,
     least_of_rival,
-    search_focal,
 )
-from gsba.localization.query import Query
 from gsba.localization.rival_poses import LOOK_ALIKE, TWO_PLACES
+from gsba.localization.run_map import Query
 from gsba.localization.surroundings import is_contradicted
 from gsba.log import GsbaError, track
 from gsba.loop_closure.join_evidence import JoinEvidence
+from gsba.matching.absolute_pose import FoundPose, camera_pose
 from gsba.matching.guided_search import searchable
 from gsba.types import Features
 
@@ -181,7 +191,7 @@ def _refine(
     if not is_significant(*given, sample=0, per_side=_CELLS_PER_SIDE):
         return None
     evidence = localizer.surroundings.evidence(
-        query, pose, localizer.usual.of_photos, lambda points: shows(projection, points)
+        query, pose, localizer.usual.of_camera(-1), lambda points: shows(projection, points)
     )
     inliers = int(fitted.inliers[0].sum())
     return _Placed(photo, image, pose, projection, seen, inliers, evidence)
@@ -235,16 +245,18 @@ def _recognise(
         model="SIMPLE_PINHOLE", width=photo.width, height=photo.height, params=params
     )
     max_error, seed = _MAX_ERROR_RAD * projection.focal, localizer.map.settings.seed
-    found = search_focal(pixels, candidates.points_world, camera, known, max_error, seed)
+
+    def search(rows: np.ndarray, least: int) -> FoundPose | None:
+        given = pixels[rows], candidates.points_world[rows], camera, max_error, seed, least
+        return camera_pose(*given, MIN_RATIO, estimate_focal=not known)
+
+    found = search(np.ones(len(pixels), bool), MIN_WITNESSES)
     chance = np.pi * max_error**2 / (photo.width * photo.height)
     if found is None or not is_significant(candidates.bearings, found.inliers, chance, _SAMPLE):
         return None, ""
     if not _plausible(photo.projection(found.focal)):
         return None, ""
-    left = candidates.taken(~found.inliers)
-    rest, least = pixels[~found.inliers], least_of_rival(found)
-    rival = search_focal(rest, left.points_world, camera, known, max_error, seed, least)
-    if is_rivalled(found, rival, candidates):
+    if is_rivalled(found, search(~found.inliers, least_of_rival(found)), candidates):
         return None, TWO_PLACES
     start, agreeing = photo.projection(found.focal), candidates.taken(found.inliers)
     every = projection.project(features.bearings_rig)
@@ -365,3 +377,29 @@ def _judged(
         camera,
     )
     return localizer.with_map_error(frame)
+
+
+def localize_all(localizer: Localizer, pictures: Sequence[Picture]) -> LocalizedPhotos:
+    """Localise panoramas and photos; one that cannot be read is refused with the reason.
+
+    Returns:
+        Frames in the order of the pictures, and the cameras of photos.
+    """
+    found: dict[str, LocalizedFrame] = {}
+    photos: list[Photo] = []
+    for picture in track(pictures, "localising", len(pictures)):
+        try:
+            if picture.frames is not None:
+                given = picture.frames, picture.frame, picture.camera
+                found[picture.name] = localizer.localize_frame(*given)
+                continue
+            assert picture.path is not None
+            if picture.photo:
+                photos.append(read_photo(picture.path))
+            else:
+                found[picture.name] = localizer.localize(picture.path, picture.name)
+        except GsbaError as error:
+            found[picture.name] = LocalizedFrame.refused(picture.name, str(error))
+    together = localize_photos(localizer, photos)
+    found |= {frame.name: frame for frame in together.frames}
+    return LocalizedPhotos(tuple(found[picture.name] for picture in pictures), together.cameras)

@@ -69,7 +69,11 @@ def find_pictures(sources: Sequence[Path], cameras: PictureCameras, work: Path) 
             found += _frames_of_several_images(source, cameras)
         else:
             found += _single_images(source, "erp" in layouts)
-    return _with_own_names(found)
+    names = [picture.name for picture in found]
+    for name in names:
+        if names.count(name) > 1:
+            raise GsbaError(f"two pictures are named '{name}': localise them in two calls")
+    return found
 
 
 def _images(folder: Path) -> list[Path]:
@@ -81,7 +85,7 @@ def _is_of_single_images(folder: Path, cameras: PictureCameras) -> bool:
     layouts = cameras.layouts()
     if layouts == {"erp"}:
         return True
-    images = [path for path in _images(folder) if _is_whole(path)]
+    images = list(filter(_size_of, _images(folder)))
     if not images or layouts.isdisjoint(("erp", "cube")):
         return False
     size = image_size(images[0])
@@ -96,7 +100,8 @@ def _single_images(source: Path, stitched: bool) -> list[Picture]:
     """Panoramas or photos, one file each; 2:1 pictures are panoramas where the run has such."""
 
     def picture(path: Path, time: float) -> Picture:
-        panoramic = stitched and _is_panorama(path)
+        width, height = _size_of(path) or (2, 1)  # is refused where its pixels are read
+        panoramic = stitched and width == 2 * height
         return Picture(path.stem, time, path, photo=not panoramic)
 
     if source.is_file():
@@ -106,28 +111,18 @@ def _single_images(source: Path, stitched: bool) -> list[Picture]:
         raise GsbaError(f"{source}: holds no JPEG, PNG, WebP or TIFF image")
     names, table = [path.stem for path in paths], source / _TIMES_FILE
     given = table if table.is_file() else None
-    tagged = [(path,) for path in paths] if all(map(_is_whole, paths)) else []
+    tagged = [(path,) for path in paths] if all(map(_size_of, paths)) else []
     times, _ = frame_times(names, given, None, True, tagged)
     order = np.argsort(times, kind="stable")
     return [picture(paths[n], float(times[n])) for n in order]
 
 
-def _is_panorama(path: Path) -> bool:
-    """True if an image is 2:1, or cannot be read: it is refused where its pixels are."""
+def _size_of(path: Path) -> tuple[int, int] | None:
+    """Width and height of an image by its header; None = it cannot be read."""
     try:
-        width, height = image_size(path)
+        return image_size(path)
     except GsbaError:
-        return True
-    return width == 2 * height
-
-
-def _is_whole(path: Path) -> bool:
-    """True if an image can be read, as far as its header tells."""
-    try:
-        image_size(path)
-    except GsbaError:
-        return False
-    return True
+        return None
 
 
 def _frames_of_several_images(folder: Path, cameras: PictureCameras) -> list[Picture]:
@@ -159,13 +154,3 @@ def _scanned(folder: Path, cameras: PictureCameras) -> dict[int, FrameSet]:
         raise errors[0]
     frames = scan(folder, order_suffices=True, min_frames=1)
     return {cameras.of_frames(frames.format, str(folder)): frames}
-
-
-def _with_own_names(pictures: list[Picture]) -> list[Picture]:
-    """The pictures, none of which has the name of another one."""
-    seen: set[str] = set()
-    for picture in pictures:
-        if picture.name in seen:
-            raise GsbaError(f"two pictures are named '{picture.name}': localise them in two calls")
-        seen.add(picture.name)
-    return pictures

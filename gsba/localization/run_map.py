@@ -44,6 +44,17 @@ class MapKeyframe:
 
 
 @dataclass(frozen=True, slots=True)
+class Query:
+    """Keypoints of a picture to localise, prepared for matching."""
+
+    features: Features
+    bearings: np.ndarray  # (K, 3) unit, corrected directions of the keypoints, rig frame
+    origins_rig: np.ndarray | None  # (K, 3) origins of their rays; None = the centre
+    strongest: Searchable
+    all: Searchable
+
+
+@dataclass(frozen=True, slots=True)
 class RunMap:
     """Poses and points of one map of a finished run, and what reads the keypoints of its frames.
 

@@ -17,8 +17,7 @@ from gsba.features.extractor_traits import search_settings
 from gsba.frames import cubemap
 from gsba.geometry import inverse
 from gsba.localization.place_index import index_path, load_or_make
-from gsba.localization.query import Query
-from gsba.localization.run_map import RunMap
+from gsba.localization.run_map import Query, RunMap
 from gsba.log import GsbaError
 from gsba.loop_closure.join_evidence import (
     GATE_RAD,
@@ -59,11 +58,6 @@ class PictureRates:
     def of_camera(self, camera: int) -> Rates:
         """Rates of a camera's panoramas."""
         return Rates(self.within[camera], float(self.chance[camera]), self.placed[camera])
-
-    @property
-    def of_photos(self) -> Rates:
-        """Rates of photos."""
-        return self.of_camera(len(self.face_px))
 
 
 class Surroundings:

@@ -17,14 +17,13 @@ from factors.threads import map_in_threads
 from gsba.config import RefineSettings
 from gsba.geometry import inverse, rotation_angle
 from gsba.loop_closure import join_evidence
-from gsba.loop_closure.connectivity import parted
 from gsba.loop_closure.join_evidence import LOCAL, Places, around
 from gsba.loop_closure.pose_graph import Loop, bend, met
 from gsba.loop_closure.retrieval import global_descriptors
 from gsba.matching import recovery
 from gsba.matching.guided_search import MatchContext
 from gsba.memory import release_mapped_files
-from gsba.similarity import relative_map
+from gsba.similarity import relative_similarity
 from gsba.types import Counts, Keypoints, Solution, Tracks, VerifiedPairs
 from gsba.types.records import slices
 
@@ -87,11 +86,6 @@ def close(
     )
     pairs = np.array([(loop.f0, loop.f1) for loop in believed], np.int32).reshape(-1, 2)
     return Closed(bend(solved, believed, unseen) if believed else solved, pairs, counts)
-
-
-def connected(unseen: np.ndarray, pairs: np.ndarray) -> bool:
-    """True if loops (P, 2) connect all parts that steps (F - 1,) without images leave apart."""
-    return parted(pairs, ~unseen) is None
 
 
 def candidates(
@@ -202,15 +196,6 @@ def _least_similarity(
     return float(np.quantile(some, _LEAST_ALIKE_SHARE)) if len(some) else -1.0
 
 
-def _max_drift(
-    f0: int, f1: int, positions: np.ndarray, unseen: np.ndarray, settings: RefineSettings
-) -> float:
-    """Largest error of the map between two frames, map units."""
-    first, last = min(f0, f1), max(f0, f1)
-    between = positions[first : last + 1]
-    return float(_max_step_drifts(between, unseen[first:last], settings).sum())
-
-
 def _max_step_drifts(
     positions: np.ndarray, unseen: np.ndarray, settings: RefineSettings
 ) -> np.ndarray:
@@ -229,9 +214,10 @@ def _measured_loops(
         rows = verified.matches.of(p)
         points0, points1 = known[f0][rows[:, 0]], known[f1][rows[:, 1]]
         both = np.isfinite(points0).all(axis=1) & np.isfinite(points1).all(axis=1)
-        measured = relative_map(points0[both], points1[both], seed)
+        measured = relative_similarity(points0[both], points1[both], seed)
         if measured is not None:
-            loops.append(Loop(f0, f1, *measured))
+            step, inliers = measured
+            loops.append(Loop(f0, f1, step.new_T_old, int(inliers.sum())))
     return loops
 
 
@@ -245,7 +231,9 @@ def within_drift(
         depth: median distance of points, map units.
         unseen: (F - 1,) bool, steps that no images confirm.
     """
-    slack = _max_drift(loop.f0, loop.f1, poses[:, :3, 3], unseen, settings)
+    first, last = min(loop.f0, loop.f1), max(loop.f0, loop.f1)
+    between, steps = poses[first : last + 1, :3, 3], unseen[first:last]
+    slack = float(_max_step_drifts(between, steps, settings).sum())
     expected = poses[loop.f0] @ loop.f0_T_f1
     moved = np.linalg.norm(expected[:3, 3] - poses[loop.f1, :3, 3])
     turned = np.degrees(rotation_angle(expected[:3, :3].T @ poses[loop.f1, :3, :3]))

@@ -228,8 +228,11 @@ class _Joining:
             return None
         # Beside the first map there may be many: only what looks most like them is searched.
         first = self.current == 0 and self.components[rows[0]] < 0
-        if not first and not self._looks_like(rows, inside):
-            return self._over_break(part, rows, inside)
+        if not first:
+            others = np.setdiff1d(np.arange(len(self.parts)), rows)
+            nearest = np.argmax(self.looks[rows] @ self.looks[others].T, axis=1)
+            if not np.isin(others[nearest], inside).any():
+                return self._over_break(part, rows, inside)
         sampled = np.linspace(0, len(rows) - 1, _NUM_SAMPLED_FRAMES).astype(int)
         sampled = rows[
             np.unique([*sampled, *range(_BREAK_REACH_FRAMES), *range(-_BREAK_REACH_FRAMES, 0)])
@@ -242,12 +245,6 @@ class _Joining:
             meetings += self._meetings(self.context.by_search(), around)
             found = self._best(part, meetings, rows, inside)
         return found or self._over_break(part, rows, inside)
-
-    def _looks_like(self, rows: np.ndarray, inside: np.ndarray) -> bool:
-        """True if a frame of a part looks more like one of the map than like any other."""
-        others = np.setdiff1d(np.arange(len(self.parts)), rows)
-        nearest = np.argmax(self.looks[rows] @ self.looks[others].T, axis=1)
-        return bool(np.isin(others[nearest], inside).any())
 
     def _best(
         self, part: int, meetings: list[Meeting], rows: np.ndarray, inside: np.ndarray
@@ -264,7 +261,9 @@ class _Joining:
             self.reasons[part] = "no frame of it shares enough points with a frame of another map"
             return None
         accepted = [one for one in weighed if one.evidence.confirmed]
-        accepted = accepted or self._following(weighed, rows, inside)
+        if not accepted:  # of the likely ones, look-alikes are elsewhere or turned about at breaks
+            on = self._breaks(rows, inside).continued_by
+            accepted = [one for one in weighed if one.evidence.likely and on(one.proposal.move)]
         best = max(accepted or weighed, key=lambda one: one.evidence.margin())
         frames, why = best.proposal.frames, best.evidence
         logger.info("a part of %d frames overlaps the map at frames %s: %s", len(rows), frames, why)
@@ -272,15 +271,6 @@ class _Joining:
             return self._at_pace(best, rows, inside).proposal.move
         self.reasons[part] = "it fits two places" if accepted else f"not certain: {why}"
         return None
-
-    def _following(
-        self, weighed: list[Judged], rows: np.ndarray, inside: np.ndarray
-    ) -> list[Judged]:
-        """Likely proposals under which the camera walks on at each break between part and map."""
-        breaks = self._breaks(rows, inside)
-        return [
-            one for one in weighed if one.evidence.likely and breaks.continued_by(one.proposal.move)
-        ]
 
     def _at_pace(self, found: Judged, rows: np.ndarray, inside: np.ndarray) -> Judged:
         """The proposal found, or one at the usual pace unless its surroundings speak against it."""
@@ -403,15 +393,14 @@ class _Joining:
         even = abs(np.log(proposal.move.scale)) < np.log(settings.verify.max_length_ratio)
         return even and loops.within_drift(loop, poses, self.depth, self.held, settings)
 
-    def _is_of_map(self, f: int) -> bool:
-        """True if the map holds frames of a frame's recording, whose time and path decide."""
-        return bool((self.recordings[self.components == self.current] == self.recordings[f]).any())
-
     def _register_each(self, rows: np.ndarray, inside: np.ndarray) -> bool:
         """True if any frame gets a pose from points of the map; those next to it come first."""
         num, away = len(inside), np.abs(rows[:, None] - inside).min(axis=1)
         for f in rows[np.argsort(away, kind="stable")].tolist():
-            if self._is_of_map(f) and self._register(f, inside):
+            # A picture that hangs in two places gives a single frame a pose in either. Between
+            # frames of one recording time and path decide; between recordings, the test of joins.
+            of_map = self.recordings[self.components == self.current] == self.recordings[f]
+            if of_map.any() and self._register(f, inside):
                 inside = np.sort(np.append(inside, f))
         return len(inside) > num
 

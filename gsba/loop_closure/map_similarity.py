@@ -1,6 +1,6 @@
 """Similarities of two maps, proposed by matched frames, and their refinement."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -200,9 +200,9 @@ def refined(meetings: list[Meeting], start: Sim3, poses: np.ndarray) -> Sim3:
     """
     from scipy.optimize import least_squares
 
-    shared = _SharedPoints.of(_inliers_of(meetings, start, poses), poses)
+    residuals = _residuals_of(_inliers_of(meetings, start, poses), poses)
     given = {"loss": "soft_l1", "f_scale": np.deg2rad(_LOSS_DEG)}
-    x = least_squares(lambda x: shared.residuals(nudged(start, x)).ravel(), np.zeros(7), **given).x
+    x = least_squares(lambda x: residuals(nudged(start, x)).ravel(), np.zeros(7), **given).x
     return nudged(start, x)
 
 
@@ -215,12 +215,12 @@ def similarity_covariance(meetings: list[Meeting], move: Sim3, poses: np.ndarray
     step, every = 1e-6, _inliers_of(meetings, move, poses)
     normal, scores = np.zeros((7, 7)), np.zeros((7, 7))
     for meeting in every:
-        shared = _SharedPoints.of([meeting], poses)
-        found = shared.residuals(move)
+        residuals = _residuals_of([meeting], poses)
+        found = residuals(move)
         if not len(found):
             continue
         columns = [
-            (shared.residuals(nudged(move, x)) - shared.residuals(nudged(move, -x))) / (2 * step)
+            (residuals(nudged(move, x)) - residuals(nudged(move, -x))) / (2 * step)
             for x in step * np.eye(7)
         ]
         jacobian = np.stack([column.ravel() for column in columns], axis=1)
@@ -243,30 +243,18 @@ def nudged(move: Sim3, x: np.ndarray) -> Sim3:
     return Sim3(move.scale * float(np.exp(x[6])), rotation, move.translation + x[3:6])
 
 
-@dataclass(frozen=True, slots=True)
-class _SharedPoints:
-    """Points that two maps share, and the positions of the frames that know them."""
+def _residuals_of(meetings: list[Meeting], poses: np.ndarray) -> Callable[[Sim3], np.ndarray]:
+    """Differences (2 N, 3) of bearings of meetings' points in both directions, by similarity."""
+    own_seers, own = _in_world(poses, [(m.f, m.own) for m in meetings])
+    their_seers, theirs = _in_world(poses, [(m.g, m.theirs) for m in meetings])
 
-    own: np.ndarray  # (N, 3) world of the map that moves
-    own_seers: np.ndarray  # (N, 3)
-    theirs: np.ndarray  # (N, 3) world of the other map
-    their_seers: np.ndarray  # (N, 3)
-
-    @classmethod
-    def of(cls, meetings: list[Meeting], poses: np.ndarray) -> "_SharedPoints":
-        columns: list[list[np.ndarray]] = [[np.zeros((0, 3))] for _ in range(4)]
-        for m in meetings:
-            for n, (seer, seen) in enumerate(((m.f, m.own), (m.g, m.theirs))):
-                columns[2 * n].append(seen @ poses[seer, :3, :3].T + poses[seer, :3, 3])
-                columns[2 * n + 1].append(np.tile(poses[seer, :3, 3], (len(seen), 1)))
-        return cls(*(np.concatenate(column) for column in columns))
-
-    def residuals(self, move: Sim3) -> np.ndarray:
-        """Differences (2 N, 3) of bearings, in both directions."""
-        there, back = move.points(self.own), move.points_back(self.theirs)
-        seen = _bearings(there, self.their_seers) - _bearings(self.theirs, self.their_seers)
-        sent = _bearings(back, self.own_seers) - _bearings(self.own, self.own_seers)
+    def residuals(move: Sim3) -> np.ndarray:
+        there, back = move.points(own), move.points_back(theirs)
+        seen = _bearings(there, their_seers) - _bearings(theirs, their_seers)
+        sent = _bearings(back, own_seers) - _bearings(own, own_seers)
         return np.concatenate([seen, sent])
+
+    return residuals
 
 
 def _bearings(points: np.ndarray, seers: np.ndarray) -> np.ndarray:

@@ -71,14 +71,6 @@ def laid_out(positions: np.ndarray, components: np.ndarray, reach: float) -> np.
     return offsets
 
 
-def side_by_side(world_T_rigs: np.ndarray, registered: Registered | None) -> np.ndarray:
-    """Poses (F, 4, 4) with each map's offset to lie beside the others."""
-    poses = world_T_rigs.copy()
-    if registered is not None:
-        poses[:, :3, 3] += registered.offsets
-    return poses
-
-
 def follow(
     registered: Registered,
     coarse: CoarsePoses,

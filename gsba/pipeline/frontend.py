@@ -14,7 +14,7 @@ from gsba.features import detection, extraction
 from gsba.features.extraction import FrameFeatures, Search
 from gsba.frames import panorama
 from gsba.log import GsbaError
-from gsba.loop_closure import loops
+from gsba.loop_closure import connectivity, loops
 from gsba.loop_closure.loops import Closed
 from gsba.matching import correspondences, pairs, recovery
 from gsba.matching.guided_search import MatchContext, SearchableFrames
@@ -314,7 +314,7 @@ def _meet_places(state: State, near: VerifiedPairs) -> State:
     run, prior, trust = state.run, state.prior, state.prior.trust
     unseen = trust.unseen_steps if prior.merged is None else np.zeros_like(trust.unseen_steps)
     pairs = near.matches.pairs
-    if loops.connected(unseen, pairs) and len(pairs):
+    if len(pairs) and connectivity.parted(pairs, ~unseen) is None:
         return state
     known = state.observed.context, state.solution, unseen, run.store.scratch_folder
     compute = partial(loops.close, *known)
