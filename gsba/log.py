@@ -6,7 +6,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sized
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from functools import cache
 from typing import TYPE_CHECKING, TypeVar
 
@@ -101,7 +101,8 @@ def track(
     work = {"what": description, "total": total}
     event("progress", **work, done=done, rate=None, note="")
     began = told = time.monotonic()
-    with _bar(description, total, done) if with_bar else _no_bar() as show:
+    silent = nullcontext(lambda count, note: None)
+    with _bar(description, total, done) if with_bar else silent as show:
         for count, item in enumerate(items, start=1):
             yield item
             now = time.monotonic()
@@ -136,11 +137,6 @@ def _bar(description: str, total: int | None, done: int) -> Iterator[Callable[[i
     with Progress(*columns, console=_console(), transient=True) as bar:
         task = bar.add_task(description, total=total, completed=done, note="")
         yield lambda count, note: bar.update(task, completed=count, note=note)
-
-
-@contextmanager
-def _no_bar() -> Iterator[Callable[[int, str], None]]:
-    yield lambda count, note: None
 
 
 class _EventHandler(logging.Handler):

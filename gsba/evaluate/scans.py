@@ -6,14 +6,12 @@ from typing import Any
 import numpy as np
 
 from gsba.bundle.triangulation import points_under
-from gsba.scans.distances import Distances, distances_to
 from gsba.scans.files import normals_of
-from gsba.scans.fit import approach, settle
+from gsba.scans.fit import Noise, approach, residuals_of, settle
 from gsba.scans.judge import SIGMAS
-from gsba.scans.noise import Noise, residuals_of
 from gsba.scans.registration import Registration, register
 from gsba.scans.search import Guess
-from gsba.scans.types import Cloud, Scan, cloud_of
+from gsba.scans.types import Cloud, Distances, Scan, cloud_of, distances_to
 from gsba.similarity import Sim3, pose_similarity
 from gsba.types import Reconstruction
 

@@ -11,8 +11,7 @@ from gsba.bundle.division import DivisibleMap
 from gsba.bundle.optimizer import OptimizeResult
 from gsba.config import SolverSettings
 from gsba.memory import give_back_freed_memory, total_memory_bytes
-from gsba.parts.covariances import divided_covariances
-from gsba.parts.divided_system import optimize_divided
+from gsba.parts.divided_system import divided_covariances, optimize_divided
 from gsba.parts.folder import (
     At,
     PartsWriter,

@@ -194,7 +194,9 @@ class PartsWriter:
         numbers = self._num_points + np.arange(len(sightings.points_world))
         self._num_points += len(numbers)
         tied = [_covisible(sightings)]
-        tied += [_codes_among(self._variables(keys)) for keys in _keys_of_factors(graph)]
+        for numbers_of in map(self._variables, _keys_of_factors(graph)):
+            i, j = np.triu_indices(len(numbers_of), 1)
+            tied.append(numbers_of[i] << 32 | numbers_of[j])
         self._codes = np.unique(np.concatenate([self._codes, *tied]))
         chunk = _Chunk(sightings, numbers, serialized(graph))
         save_record(self._incoming / f"{self._num_chunks:06d}.npz", chunk, {})
@@ -239,9 +241,9 @@ class PartsWriter:
             self._write_part(part, chunks[part], cut, variables)
             for part in range(max(cut.num_parts, 1))
         ]
-        nodes = [part.nodes for part in written]
+        nodes = [rows for rows, _ in written]
         starts = np.concatenate([[0], np.cumsum([len(rows) for rows in nodes])]).astype(np.int64)
-        num_kept = np.array([part.num_kept for part in written], np.int64)
+        num_kept = np.array([num for _, num in written], np.int64)
         index = Index(np.concatenate(nodes), starts, num_kept, start)
         save_record(self._folder / _INDEX, index, {})
         self._incoming.rmdir()
@@ -278,8 +280,8 @@ class PartsWriter:
 
     def _write_part(
         self, number: int, num_chunks: int, cut: Partition, variables: "_Variables"
-    ) -> "_Written":
-        """Merge the chunks of a part."""
+    ) -> tuple[np.ndarray, int]:
+        """Merge the chunks of a part; its nodes (N,) int64, and the number of those on cuts."""
         folder = part_folder(self._folder, number)
         folder.mkdir(exist_ok=True)
         paths = [folder / f"chunk-{n:06d}.npz" for n in range(num_chunks)]
@@ -308,15 +310,7 @@ class PartsWriter:
         save_record(folder / "given.npz", part, {})
         for path in paths:
             path.unlink()
-        return _Written(variables.nodes_of(rows), num_kept)
-
-
-@dataclass(frozen=True, slots=True)
-class _Written:
-    """A part that was written."""
-
-    nodes: np.ndarray  # (N,) int64
-    num_kept: int
+        return variables.nodes_of(rows), num_kept
 
 
 class _Variables:
@@ -379,12 +373,6 @@ def serialized(graph: gtsam.NonlinearFactorGraph) -> np.ndarray:
 def _keys_of_factors(graph: gtsam.NonlinearFactorGraph) -> list[list[int]]:
     """Keys that each factor is about."""
     return [graph.at(i).keys() for i in range(graph.size())]
-
-
-def _codes_among(numbers: np.ndarray) -> np.ndarray:
-    """Codes of all pairs of a few variables, ascending."""
-    i, j = np.triu_indices(len(numbers), 1)
-    return numbers[i] << 32 | numbers[j]
 
 
 def _covisible(sightings: ObservedRows) -> np.ndarray:

@@ -37,7 +37,7 @@ from gsba.pipeline import backend, frontend
 from gsba.pipeline.map import Map
 from gsba.pipeline.run import Run
 from gsba.pipeline.state import State
-from gsba.trajectory.axes import quarter_turn
+from gsba.trajectory.conventions import quarter_turn
 from gsba.types import CoarsePoses, Keypoints, PoseSource, Reconstruction, Sighted, Solution
 
 _SEAM_DEG = 4.0  # from the seam of a panorama: pixels that are blended of both lenses are not used

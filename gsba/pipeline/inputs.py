@@ -27,14 +27,12 @@ from gsba.odometry.walk import Odometry
 from gsba.pipeline.stage_titles import title_of
 from gsba.placement import EXIF, check, fixes_of_frames, read_fixes
 from gsba.store.store import RunStore, fingerprint
-from gsba.trajectory.association import without_trajectory
+from gsba.trajectory.association import follow_keyframes, without_trajectory
 from gsba.trajectory.conventions import Convention
 from gsba.trajectory.files import read_trajectory
-from gsba.trajectory.keyframes import follow_keyframes
-from gsba.trajectory.lost_frames import without_lost_frames
 from gsba.trajectory.metashape import NamedPoses, is_metashape, read_metashape
 from gsba.trajectory.misread import refuse_useless
-from gsba.trajectory.restarts import associate_pieces, split_restarts
+from gsba.trajectory.restarts import associate_pieces, split_restarts, without_lost_frames
 from gsba.types import CoarsePoses, FrameSet, Trajectory
 from gsba.video.recording import files_of
 

@@ -143,7 +143,9 @@ def _edge_normals(
     frames: FrameSet, f: int, world_T_rig: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Normals (E, 3), world, of the planes through straight edges, and their lengths (E,), rad."""
-    images, masks = _side_faces(frames, f)
+    assert FACES[:4] == ("front", "right", "back", "left")
+    images, masks = cubemap.load(frames, f, cubemap.native_rig(frames.format_of(f), _FACE_PX))
+    images = images[:4]
     rig = CubeRig(images.shape[1], np.pi / 2)
     detector = cv2.createLineSegmentDetector(cv2.LSD_REFINE_STD)
     normals, lengths = [np.zeros((0, 3))], [np.zeros(0)]
@@ -164,13 +166,6 @@ def _edge_normals(
         normals.append(across / np.maximum(sine, 1e-12)[:, None] @ world_T_rig[:3, :3].T)
         lengths.append(np.arcsin(np.clip(sine, 0, 1)))
     return np.concatenate(normals), np.concatenate(lengths)
-
-
-def _side_faces(frames: FrameSet, f: int) -> tuple[np.ndarray, np.ndarray | None]:
-    """Four faces around the horizon (4, N, N, 3), and masks (4, N, N) bool, True = use."""
-    assert FACES[:4] == ("front", "right", "back", "left")
-    images, masks = cubemap.load(frames, f, cubemap.native_rig(frames.format_of(f), _FACE_PX))
-    return images[:4], None if masks is None else masks[:4]
 
 
 def _level_axis(

@@ -411,7 +411,10 @@ def _up_sigma(upright: Placement) -> float:
 def _aligned(reconstruction: Reconstruction, frames: FrameSet, path: Path) -> Placement:
     """Placement in the world of true poses."""
     truth = read_trajectory(path)
-    _require_times(path, frames)
+    if not frames.timed:
+        raise GsbaError(
+            f"{path}: the frames have no times to match true poses with: refine with --timestamps"
+        )
     run = Trajectory(frames.timestamps, reconstruction.world_T_rigs)
     rows, of_truth = matched_in_time(run, truth, _TOLERANCE_S)
     good = reconstruction.pose_statuses[rows] == PoseStatus.REFINED
@@ -495,10 +498,3 @@ def _by_pairs(reconstruction: Reconstruction, frames: FrameSet, path: Path) -> G
         raise GsbaError(f"{path}: its points lie on a line: add a point off that line")
     with naming(path):
         return Guess(similarity=similarity(source, target))
-
-
-def _require_times(path: Path, frames: FrameSet) -> None:
-    if not frames.timed:
-        raise GsbaError(
-            f"{path}: the frames have no times to match true poses with: refine with --timestamps"
-        )

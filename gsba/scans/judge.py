@@ -9,8 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ndtri
 
-from gsba.scans.fit import cells_of
-from gsba.scans.noise import Noise, reach_of, residuals_of
+from gsba.scans.fit import Noise, cells_of, reach_of, residuals_of
 from gsba.scans.types import Cloud, Scan
 from gsba.similarity import Sim3
 
@@ -52,19 +51,16 @@ class ScanVerdict:
         p value over several sizes of cells is taken: a lead that large cells do not show may come
         from errors that small cells share.
         """
+        from scipy.stats import wilcoxon
+
         both = self.informed & other.informed
         gains = (self.logs - other.logs)[both]
-        return max(_chance(np.bincount(c[both], gains)) for c in self.cells)
-
-
-def _chance(gains: np.ndarray) -> float:
-    """P value of gains (C,) under a distribution that is symmetric around zero."""
-    from scipy.stats import wilcoxon
-
-    gains = gains[gains != 0]
-    if not len(gains):
-        return 1.0
-    return float(np.asarray(wilcoxon(gains, alternative="greater"))[1])
+        sums = [np.bincount(c[both], gains) for c in self.cells]
+        sums = [some[some != 0] for some in sums]
+        return max(
+            float(np.asarray(wilcoxon(some, alternative="greater"))[1]) if len(some) else 1.0
+            for some in sums
+        )
 
 
 class CellGrid:

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 
 from gsba.log import GsbaError
-from gsba.scans.fit import Fit, approach, settle
+from gsba.scans.fit import Fit, approach, noise_of, reach_of, settle
 from gsba.scans.judge import CellGrid, ScanVerdict, verdict
-from gsba.scans.noise import noise_of, reach_of
 from gsba.scans.search import Guess, candidates, distance
 from gsba.scans.types import Cloud, Scan
 from gsba.similarity import Sim3

@@ -114,21 +114,23 @@ def check_steps(
     rough |= found.directed & linked & (strain > _MAX_PRIOR_SIGMAS * priors.translation)
     chosen = slam.copy()
     if wrong.any() or unseen.any():
-        chosen[rough, :3, :3] = found.f_T_nexts[rough, :3, :3]
-        moved = rough & found.directed
-        chosen[moved, :3, 3] = lengths[moved, None] * found.f_T_nexts[moved, :3, 3]
+        chosen = _replaced(slam, found, lengths, rough)
         start = _chain(coarse.world_T_rigs, chosen, own)
     else:
         start = coarse.world_T_rigs
-    seen = slam.copy()
-    seen[found.verified, :3, :3] = found.f_T_nexts[found.verified, :3, :3]
-    seen[found.directed, :3, 3] = (
-        lengths[found.directed, None] * found.f_T_nexts[found.directed, :3, 3]
-    )
+    seen = _replaced(slam, found, lengths, found.verified)
     named = false_frames(
         wrong, slam, chosen, own, outlier_limits(slam, seen, known & found.directed, verify)
     )
     return StepChecks(start, wrong, named, unseen, lengths, None)
+
+
+def _replaced(slam: np.ndarray, found: Steps, lengths: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Steps (F - 1, 4, 4) of the trajectory, at `rows` (F - 1,) bool those of the images."""
+    steps, moved = slam.copy(), rows & found.directed
+    steps[rows, :3, :3] = found.f_T_nexts[rows, :3, :3]
+    steps[moved, :3, 3] = lengths[moved, None] * found.f_T_nexts[moved, :3, 3]
+    return steps
 
 
 def confirmed(coarse: CoarsePoses, found: Steps, priors: PriorSettings) -> np.ndarray:
@@ -297,10 +299,7 @@ def _from_images_alone(
     if found.directed.any():
         unknown = np.full(len(slam), np.inf)
         lengths = step_lengths(slam_lengths, unknown, logs, sigmas)
-    chosen = slam.copy()
-    chosen[found.verified, :3, :3] = found.f_T_nexts[found.verified, :3, :3]
-    moved = found.directed
-    chosen[moved, :3, 3] = lengths[moved, None] * found.f_T_nexts[moved, :3, 3]
+    chosen = _replaced(slam, found, lengths, found.verified)
     start = _chain(coarse.world_T_rigs, chosen, coarse.sources == PoseSource.SLAM)
     return _without_priors(start, found, lengths)
 

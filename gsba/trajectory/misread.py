@@ -156,7 +156,8 @@ def _steps_in_other_conventions(world_T_rigs: np.ndarray) -> dict[str, np.ndarra
         readings[_in_system(name)] = _in_axes(steps, systems[name])
     for name, axis in zip("xyz", np.eye(3), strict=True):
         mirrored = f"mirrored along {name}: it is no rigid motion of this camera, flip that axis"
-        readings[mirrored] = _flipped(steps, 1 - 2 * axis)
+        flip = np.diag([*(1 - 2 * axis), 1.0])
+        readings[mirrored] = flip @ steps @ flip
     order = "in quaternions of the order w, x, y, z"
     readings[f"{order}: {_pass(WXYZ)}"] = reordered
     for name, rotation in systems.items():
@@ -184,11 +185,6 @@ def _in_axes(steps: np.ndarray, ours_R_theirs: np.ndarray) -> np.ndarray:
     turn = np.eye(4)
     turn[:3, :3] = ours_R_theirs
     return turn @ steps @ turn.T
-
-
-def _flipped(steps: np.ndarray, signs: np.ndarray | list[int]) -> np.ndarray:
-    flip = np.diag([*signs, 1.0])
-    return flip @ steps @ flip
 
 
 def _agreeing_share(

@@ -67,7 +67,12 @@ def prove(
         alike = off < max_parallax
         counts[p] = [witnesses(rays[0][some], CELLS_PER_SIDE) for some in (alike, ~alike)]
     chance = max_parallax / np.pi  # a false match lies anywhere along its epipolar line
-    proved = np.array([_is_turn(a, b, chance, settings) for a, b in counts.tolist()], bool)
+    proved = np.zeros(len(frames), bool)
+    for p, (support, against) in enumerate(counts.tolist()):
+        # Matches surely agree on a rotation, and no translation explains as many more.
+        alarms = log10_false_alarms(support + against, support, chance, _SAMPLE_SIZE)
+        significant = alarms < np.log10(settings.max_false_alarms)
+        proved[p] = significant and outweighs(support, against, settings.max_error_rate)
     turn = _tied(frames[proved], rotations[proved], num_frames)
     if np.count_nonzero(turn.frames) < min(_MIN_FRAMES, num_frames):
         return None
@@ -77,13 +82,6 @@ def prove(
         if not outweighs(support, against, settings.max_error_rate):
             return None
     return turn
-
-
-def _is_turn(support: int, against: int, chance: float, settings: TwoViewLimits) -> bool:
-    """True if matches surely agree on a rotation, and no translation explains as many more."""
-    alarms = log10_false_alarms(support + against, support, chance, _SAMPLE_SIZE)
-    significant = alarms < np.log10(settings.max_false_alarms)
-    return bool(significant) and outweighs(support, against, settings.max_error_rate)
 
 
 def _tied(pairs: np.ndarray, rotations: np.ndarray, num_frames: int) -> Turn:
