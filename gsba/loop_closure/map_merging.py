@@ -525,13 +525,15 @@ class _Joining:
         reasons = self._reasons(order := by_size(self.components))
         reach = self.context.settings.pairs.max_baseline_depths * self.depth
         offsets = laid_out(self.poses[:, :3, 3], order, reach)
+        poses = self.poses.copy()
+        poses[:, :3, 3] += offsets
         scales = np.array([move.scale for move in self.moves])
         moves = np.array([move.new_T_old for move in self.moves])
         num, alone = int(self.parts.max()) + 1, int(lost.sum())
         dropped = {"frames alone": alone, "apart": maps - 1}
         kept = num - maps - alone
         return Registered(
-            carried(self.solved, self.poses, scales, moves, offsets),
+            carried(self.solved, poses, scales, moves, offsets),
             order.astype(np.int32),
             scales,
             moves,

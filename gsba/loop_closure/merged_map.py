@@ -48,9 +48,8 @@ def carried(
     """
     landmarks = solved.landmarks.moved(scales, moves)
     points = landmarks.points_world + offsets[landmarks.tracks.hosts()]
-    poses = world_T_rigs.copy()
-    poses[:, :3, 3] += offsets
-    return replace(solved, world_T_rigs=poses, landmarks=replace(landmarks, points_world=points))
+    landmarks = replace(landmarks, points_world=points)
+    return replace(solved, world_T_rigs=world_T_rigs, landmarks=landmarks)
 
 
 def laid_out(positions: np.ndarray, components: np.ndarray, reach: float) -> np.ndarray:

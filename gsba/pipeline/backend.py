@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -73,9 +74,7 @@ def align_gauge(state: State, name: str) -> State:
     if not run.families.fixing_gauge.members:
         return state
 
-    def compute() -> Gauge:
-        return gauge.align(run.families, solution, prior.parts)
-
+    compute = partial(gauge.align, run.families, solution, prior.parts)
     found = run.stage(name, run.families.digests(), compute, Gauge, noted=False)
     carried = replace(state, prior=prior.moved(found))
     return carried.with_solution(found.moved(solution, prior.parts))
@@ -190,7 +189,8 @@ def measure_strength(state: State) -> State:
             run.frames.recording_of_frame,
         )
         snapshot = run.families.snapshot(solution, prior.parts)
-        bent = [fixes.contradiction(snapshot, errors[1].draws) for fixes in _fixes_of(run)]
+        fixes = [one for one in run.families.members if isinstance(one, GpsFactors)]
+        bent = [one.contradiction(snapshot, errors[1].draws) for one in fixes]
         return replace(strength, contradiction=max(bent, default=0.0))
 
     strength = run.stage("strength", [run.solving_key(), limits], compute, MapStrength)
@@ -217,10 +217,6 @@ def without_fixes(state: State, latest: Sequence[str]) -> State:
     ]
     chain, families = Chain(run.store, latest), run.families.with_members(members)
     return replace(state, run=replace(run, chain=chain, families=families, suffix=WITHOUT_GPS))
-
-
-def _fixes_of(run: Run) -> list[GpsFactors]:
-    return [family for family in run.families.members if isinstance(family, GpsFactors)]
 
 
 def refine_photometric(state: State) -> State:

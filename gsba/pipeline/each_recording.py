@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from gsba.log import GsbaError
-from gsba.pipeline import frontend, gyro
+from gsba.pipeline import frontend
 from gsba.pipeline.prior import Prior
 from gsba.pipeline.state import State
 from gsba.similarity import Sim3
@@ -43,7 +43,7 @@ def _match(state: State, number: int) -> State:
     name = state.run.evidence.recordings[number].name
     try:
         found = frontend.match_neighbours(frontend.of_recording(state, number))
-        found = gyro.align_to_neighbours(frontend.judge_trajectory(found))
+        found = frontend.align_gyro_to_neighbours(frontend.judge_trajectory(found))
     except GsbaError as error:
         raise GsbaError(f"recording '{name}': {error}") from error
     if found.prior.turning_only:

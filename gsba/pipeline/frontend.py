@@ -7,24 +7,28 @@ from pathlib import Path
 
 import numpy as np
 
+from factors.threads import map_in_threads
 from gsba import learned
 from gsba.camera.cameras import Cameras
 from gsba.config import RefineSettings
 from gsba.features import detection, extraction
 from gsba.features.extraction import FrameFeatures, Search
+from gsba.features.extractor_traits import search_settings
 from gsba.frames import panorama
+from gsba.geometry import inverse
+from gsba.imu.alignment import Alignment, align, turning_of
 from gsba.log import GsbaError
 from gsba.loop_closure import connectivity, loops
 from gsba.loop_closure.loops import Closed
-from gsba.matching import correspondences, pairs, recovery
-from gsba.matching.guided_search import MatchContext, SearchableFrames
+from gsba.matching import correspondences, guided_search, pairs, recovery
+from gsba.matching.guided_search import PRIOR_GATE, MatchContext, SearchableFrames
 from gsba.matching.recovery import Recovered
-from gsba.pipeline import inputs, weak_start
+from gsba.matching.verification import relative_pose
+from gsba.pipeline import inputs
 from gsba.pipeline.acceptance import NoPositions
-from gsba.pipeline.observed_frames import ObservedFrames
 from gsba.pipeline.prior import Prior
 from gsba.pipeline.run import Run
-from gsba.pipeline.state import MapMatches, State
+from gsba.pipeline.state import MapMatches, ObservedFrames, State
 from gsba.store.store import PerFrame
 from gsba.trajectory import judgement, steps, turning
 from gsba.trajectory.clock import ClockEstimate
@@ -33,6 +37,14 @@ from gsba.types import CoarsePoses, Features, Keypoints, Matches, PoseSource, Ve
 _WEAK_CONTRAST_THRESHOLD = 0.01  # of keypoints in weak frames: half of the default elsewhere
 _DARK = 32  # of 255
 _NUM_WIDE_PAIRS = 60  # pairs of frames of each wider gap that show whether a camera walks
+_NUM_STEPS = 3  # compared, spread over the walk
+_DRIFT_PER_FRAME = 0.13  # times frames over squared matches of a step: the drift of rendered walks
+# of 24 to 48 frames is 0.10 to 0.15 times it; a real one of 11 frames drifts eight times as much
+_MAX_GAP_SHARE = 0.1  # largest distance of two positions at one place, part of the path between
+# them: the trajectory drifts by less
+_MIN_PATH_SHARE = 0.5  # of the whole path, that lies between them at least: shorter detours leave
+# the rest open
+_MAX_POSITIONS = 500  # compared with one another, evenly chosen
 
 
 def extract(run: Run) -> State:
@@ -40,7 +52,7 @@ def extract(run: Run) -> State:
 
     Frames of a map that is expected to be weak get as many as weak ones at once.
     """
-    drift, known = weak_start.expected_drift(run, _search(run, run.settings))
+    drift, known = expected_drift(run, _search(run, run.settings))
     more = drift > run.settings.weak_frames.max_drift
     enlarged = _enlarged(run.settings)
     found = _extract(run, enlarged) if more else _extract(run, run.settings, known=known)
@@ -197,6 +209,48 @@ def judge_trajectory(state: State) -> State:
     return state.begun(prior, near)
 
 
+def align_gyro_to_neighbours(state: State) -> State:
+    """Constraints on the frames' turning from a gyro, aligned to how neighbours turn in images."""
+    readings, times = state.run.evidence.imu, state.run.frames.timestamps
+    if readings is None:
+        return state
+    seen = steps.image_steps(state.verified, state.observed.keypoints)
+
+    def compute() -> Alignment:
+        return align(times, seen.f_T_nexts[:, :3, :3], seen.verified, readings)
+
+    found = state.run.stage("imu", readings.digest, compute, Alignment)
+    turning = None if found.reason else turning_of(readings, found, times)
+    return replace(state, prior=replace(state.prior, gyro=found, turning=turning))
+
+
+def align_gyro_to_map(state: State, name: str, *, with_noise: bool = True) -> State:
+    """The gyro aligned anew, to the map's poses, which are better than those before.
+
+    Args:
+        state: of the run; it stays as it is where no gyro is believed.
+        with_noise: measure the gyro's noise, too. Poses have followed it by as much as it was
+            believed: the noise that they leave is measured once where they have become much better.
+    """
+    prior, times = state.prior, state.run.frames.timestamps
+    readings, former = state.run.evidence.imu, prior.gyro
+    if readings is None or former is None or former.reason:
+        return state
+    rotations = state.solution.world_T_rigs[:, :3, :3]
+    turns = np.swapaxes(rotations[:-1], 1, 2) @ rotations[1:]
+
+    def compute() -> Alignment:
+        return align(times, turns, ~prior.trust.unseen_steps, readings, former)
+
+    found = state.run.stage(name, readings.digest, compute, Alignment)
+    if found.reason:
+        return state
+    if not with_noise:
+        found = replace(found, noise=former.noise)
+    turning = turning_of(readings, found, times)
+    return replace(state, prior=replace(prior, gyro=found, turning=turning))
+
+
 def prove_turn(state: State) -> State | None:
     """The state before a map of rotations alone, of a camera whose positions images do not
     determine; None = that it turned on the spot is not proved either.
@@ -324,3 +378,74 @@ def _meet_places(state: State, near: VerifiedPairs) -> State:
     # Places met again know better than a step that no image shows.
     trust = replace(trust, false_steps=trust.false_steps | unseen)
     return replace(state, prior=replace(prior, trust=trust)).with_solution(closed.solved)
+
+
+def expected_drift(run: Run, search: Search) -> tuple[float, dict[str, Features]]:
+    """Drift to be expected of a run whose frames were not searched yet, part of its path.
+
+    Returns:
+        The drift, 0 where nothing foretells it; and keypoints of the frames that were compared, by
+        name: none if an earlier call did.
+    """
+    settings, num = run.settings, len(run.frames)
+    usual = settings.features.extractor == "sift" and settings.matching.matcher == "guided"
+    if settings.weak_frames.mode != "auto" or not usual or num < 2 * _NUM_STEPS:
+        return 0.0, {}
+    coarse = run.coarse
+    if run.evidence.recordings or coarse.segments is not None or coarse.absent:
+        return 0.0, {}
+    if comes_back(coarse.world_T_rigs[:, :3, 3]):
+        return 0.0, {}
+    found = dict[str, Features]()
+    first = np.linspace(0, num - 2, _NUM_STEPS).astype(int)
+    steps = np.column_stack([first, first + 1])
+
+    def compute() -> float:
+        found.update(search.of(np.unique(steps).tolist()))
+        return _DRIFT_PER_FRAME * num / max(_matches(run, found, steps), 1.0) ** 2
+
+    key = [run.matching_key(), settings.features, settings.cubemap]
+    drift = run.store.stage("expected_drift", key, compute, float, run.chain.latest)
+    return drift, found
+
+
+def _matches(run: Run, found: Mapping[str, Features], steps: np.ndarray) -> float:
+    """Median number of verified matches of steps (S, 2) between frames, by strong keypoints."""
+
+    def load(frame: int) -> Features:
+        return found[run.frames.names[frame]]
+
+    settings, poses = run.matching_settings, run.coarse.world_T_rigs
+    chance = PRIOR_GATE.chance(np.deg2rad(settings.verify.max_error_deg))
+    frames = SearchableFrames(load, settings.pairs.strongest_per_face)
+
+    def verified(step: int) -> int:
+        f0, f1 = steps[step].tolist()
+        f0_T_f1 = inverse(poses[f0]) @ poses[f1]
+        rows = guided_search.guided(
+            frames, (f0, f1), f0_T_f1, PRIOR_GATE, search_settings(settings)
+        )
+        rays = load(f0).bearings_rig[rows[:, 0]], load(f1).bearings_rig[rows[:, 1]]
+        pose = relative_pose(*rays, settings.verify, settings.seed, chance)
+        return 0 if pose is None else int(np.count_nonzero(pose.inliers))
+
+    return float(np.median(list(map_in_threads(verified, len(steps), run.num_threads))))
+
+
+def comes_back(positions: np.ndarray) -> bool:
+    """True if a path returns to a place after at least half of its length, or does not move.
+
+    Args:
+        positions: (F, 3) world, in order of time.
+    """
+    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    along = np.concatenate([[0.0], np.cumsum(steps)])
+    if not along[-1] > 0:
+        return True
+    num = len(positions)
+    chosen = np.unique(np.linspace(0, num - 1, min(num, _MAX_POSITIONS)).astype(int))
+    places, along = positions[chosen], along[chosen]
+    distances = np.linalg.norm(places[:, None] - places, axis=2)
+    between = np.abs(along[:, None] - along)
+    met = (distances < _MAX_GAP_SHARE * between) & (between > _MIN_PATH_SHARE * along[-1])
+    return bool(met.any())

@@ -2,7 +2,7 @@
 
 import logging
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -12,25 +12,24 @@ from typing import TYPE_CHECKING
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from gsba.config import CameraSettings, GpsSettings, PlacementSettings, RefineSettings
+from gsba.config import GpsSettings, PlacementSettings, RefineSettings
 from gsba.log import GsbaError
 from gsba.masks.segmentation import Segment
 from gsba.pipeline import backend, camera, finished_run, grown_folder, map_joining, outputs
 from gsba.pipeline.finished_run import FinishedRun
 from gsba.pipeline.joint_cameras import JointCameras, as_read_by, refuse_fields
-from gsba.pipeline.joint_map import JointMaps, check_new
+from gsba.pipeline.joint_map import JointMaps
 from gsba.pipeline.map_joining import ApartError, RigidMoves
 from gsba.pipeline.outputs import RunResult
 from gsba.pipeline.prior import Prior
-from gsba.pipeline.recording import Recording, names_of
-from gsba.pipeline.recordings import refine_each
+from gsba.pipeline.recordings import Recording, names_of, refine_each
 from gsba.pipeline.stage_titles import title_of
 from gsba.pipeline.state import State
 from gsba.similarity import NoSimilarityError, Sim3, pose_similarity
 from gsba.store import cluster
 from gsba.store.store import RunStore
 from gsba.trajectory.joining import PLACES, SegmentAlignment
-from gsba.types import CoarsePoses, FrameSet, PoseSource, Reconstruction
+from gsba.types import CoarsePoses, PoseSource, Reconstruction
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -83,7 +82,7 @@ def add_recordings(
             settings = _settings_of_new(finished.settings)
             given = {"segment": segment, "client": client}
             models = {one.name: one.camera for one in named}
-            given |= {"adapt": partial(_new_as_read_by, finished, models=models)}
+            given |= {"adapt": partial(as_read_by, finished, models=models)}
             refine_each(named, scratch, settings, **given)
             runs = [finished, FinishedRun.load(scratch)]
             state, maps = _joined(work, runs)
@@ -252,14 +251,6 @@ def _settings_of_new(settings: RefineSettings) -> RefineSettings:
     )
 
 
-def _new_as_read_by(
-    run: FinishedRun, found: Mapping[str, FrameSet], models: Mapping[str, str | None]
-) -> dict[str, tuple[FrameSet, CameraSettings]]:
-    """New recordings as a run reads them, see `as_read_by`; those that it has are refused."""
-    check_new(run, found)
-    return as_read_by(run, found, models)
-
-
 def _refuse_known(run: FinishedRun, recordings: Sequence[Recording], names: Sequence[str]) -> None:
     """Refuse recordings that are in a run already, or whose name is taken there."""
     taken = list(run.frames.recordings)
@@ -341,8 +332,12 @@ def _write(
     def amended(result: Reconstruction) -> Reconstruction:
         if maps.rows(0)[0] in result.largest_map():
             result = replace(result, vertical=maps.runs[0].result.vertical)
-        if held is not None:
-            result = _with_held(result, maps, held)
+        if held is not None:  # the poses of the first run stay as they were
+            first, poses = maps.runs[0].result, result.world_T_rigs.copy()
+            covariances = result.pose_covariances.copy()
+            poses[held], covariances[held] = first.world_T_rigs, first.pose_covariances
+            changes = {"world_T_rigs": poses, "pose_covariances": covariances}
+            result = replace(result, joint_errors=None, **changes)
         return result if rigid is None else _with_rigid(result, state, maps, rigid)
 
     state = replace(state, prior=replace(state.prior, of_recordings=_worlds(state, maps)))
@@ -353,14 +348,6 @@ def _write(
     state = _told(state, maps, result, rigid)
     finished_run.keep(state)
     return outputs.write(state, result, lenses)
-
-
-def _with_held(result: Reconstruction, maps: JointMaps, held: np.ndarray) -> Reconstruction:
-    """The result with the poses of the first run as they were."""
-    first = maps.runs[0].result
-    poses, covariances = result.world_T_rigs.copy(), result.pose_covariances.copy()
-    poses[held], covariances[held] = first.world_T_rigs, first.pose_covariances
-    return replace(result, world_T_rigs=poses, pose_covariances=covariances, joint_errors=None)
 
 
 def _with_rigid(

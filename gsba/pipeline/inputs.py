@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,7 +25,6 @@ from gsba.log import GsbaError
 from gsba.masks.merging import Choice
 from gsba.odometry.files import write_chosen, write_odometry
 from gsba.odometry.walk import Odometry
-from gsba.pipeline.stage_titles import title_of
 from gsba.placement import EXIF, check, fixes_of_frames, read_fixes
 from gsba.store.store import RunStore, fingerprint
 from gsba.trajectory.association import follow_keyframes, without_trajectory
@@ -190,7 +190,10 @@ def read_gyro(imu: Path | None, frames: Path) -> Readings | None:
     errors = []
     for path in filter(Path.is_file, pair or (frames,)):  # of a pair, either may have it
         try:
-            found = read_telemetry(path, _duration_s(path))
+            duration_s = None  # of a video that cannot be read, which its extraction tells
+            with suppress(GsbaError):
+                duration_s = video.claimed_duration_s(path)
+            found = read_telemetry(path, duration_s)
         except GsbaError as error:
             errors.append(error)
             continue
@@ -199,14 +202,6 @@ def read_gyro(imu: Path | None, frames: Path) -> Readings | None:
         return found
     logger.info("no gyro: %s", errors[0])
     return None
-
-
-def _duration_s(path: Path) -> float | None:
-    """Seconds that a video claims to last; None = it cannot be read, which its extraction tells."""
-    try:
-        return video.claimed_duration_s(path)
-    except GsbaError:
-        return None
 
 
 def families_of(frames: FrameSet, settings: RefineSettings) -> list[Family]:
@@ -263,32 +258,6 @@ def follows(
     return fps is None and asked == (VideoSettings().fps, None, None) and not settings.sharpest
 
 
-def extract_frames(
-    out: Path,
-    origin: Mapping[str, Path],
-    settings: RefineSettings,
-    fps: float | None,
-    fresh: bool,
-    by_odometry: Choice | None = None,
-    calibration: Path | None = None,
-) -> Odometry | None:
-    """Write the frames of the video that a run is about to `out`/frames.
-
-    Args:
-        fps: frames kept per second; None = as the settings say.
-        by_odometry: choose the frames by what the video's own odometry shows under these masks;
-            None = by the settings.
-        calibration: of the lenses of a raw video, for the odometry.
-
-    Returns:
-        The odometry that frames were chosen by; None where it was not asked for, or found too
-        little.
-    """
-    check_positions(settings)
-    with RunStore(out, dict(origin), fresh, title_of=title_of) as store:
-        return extract_video(store, origin["frames"], settings, fps, by_odometry, calibration)
-
-
 def check_positions(settings: RefineSettings) -> None:
     """Refuse positions that the frames of a video cannot have, before hours of decoding."""
     if EXIF in (settings.placement.gps, settings.gps.file):
@@ -306,11 +275,17 @@ def extract_video(
     calibration: Path | None = None,
     name: str = "",
 ) -> Odometry | None:
-    """Write the frames of a video to `frames` in the run's folder, see `extract_frames`.
+    """Write the frames of a video to `frames` in the run's folder.
 
     Args:
-        settings, fps, by_odometry, calibration: see `extract_frames`.
+        fps: frames kept per second; None = as the settings say.
+        by_odometry: choose the frames by what the video's own odometry shows under these masks;
+            None = by the settings.
+        calibration: of the lenses of a raw video, for the odometry.
         name: of one of several recordings, whose frames go to `frames`/`name`; "" = the only one.
+
+    Returns:
+        The odometry that frames were chosen by; None = not asked for, or it found too little.
     """
     compile_ahead(*([] if by_odometry is None else ["odometry"]), "refine")
     chosen, folder = settings.video, store.root / "frames" / name

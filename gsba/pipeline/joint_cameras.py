@@ -10,11 +10,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsba.bundle.lens_centres import LensCentres, StitchRadius
 from gsba.bundle.readout import CameraEstimate, velocities
 from gsba.camera.lens import Lenses
 from gsba.config import CameraSettings
-from gsba.frames.recordings import one_mode, own_timestamps
+from gsba.frames.recordings import combine, one_mode, own_timestamps
 from gsba.log import GsbaError
 from gsba.pipeline.finished_run import FinishedRun
 from gsba.pipeline.map import FoundCamera
@@ -44,7 +43,10 @@ class JointCameras:
                 alike = [
                     c
                     for c, (one, other) in enumerate(known)
-                    if c not in own and _one_cut(one, kind) and _one_model(other, chosen)
+                    if c not in own
+                    and one_mode(one, kind)
+                    and one.fisheyes == kind.fisheyes  # one calibration has read both
+                    and _one_model(other, chosen)
                 ]
                 if len(alike) != 1:  # none, or nothing tells which
                     alike = [len(formats)]
@@ -102,14 +104,24 @@ class JointCameras:
         inside = self.in_run(camera, number)
         assert inside is not None
         known, scale = runs[number].map.cameras[inside], moves[number].scale
-        each = [(self._lenses_in(camera, n, run), len(run.frames)) for n, run in enumerate(runs)]
+        each = list[tuple[Lenses | None, int]]()
+        for n, run in enumerate(runs):
+            c = self.in_run(camera, n)
+            lenses = None if c is None else run.map.cameras[c].lenses
+            each.append((lenses, len(run.frames)))
         estimate = _for_all_frames(_scaled(known, scale), known, each, moves, solution, frames)
-        return _in_unit(known, estimate, scale)
-
-    def _lenses_in(self, camera: int, number: int, run: FinishedRun) -> Lenses | None:
-        """Lenses of a camera as a run knows them; None = it took none of its frames."""
-        inside = self.in_run(camera, number)
-        return None if inside is None else run.map.cameras[inside].lenses
+        centres, radius = known.centres, known.radius
+        if centres is not None:
+            lenses = Lenses() if estimate is None else estimate.lenses
+            covariance = centres.covariance * scale**2
+            centre = scale * centres.found
+            centres = replace(centres, lenses=lenses, found=centre, covariance=covariance)
+        if radius is not None:
+            inverse, sigma = radius.inverse_stitch_radius / scale, radius.sigma / scale
+            lenses = radius.lenses.scaled(scale)
+            changes = {"lenses": lenses, "inverse_stitch_radius": inverse, "sigma": sigma}
+            radius = replace(radius, **changes)
+        return FoundCamera(centres, known.axes, radius, known.calibrated, estimate)
 
 
 def as_read_by(
@@ -127,6 +139,7 @@ def as_read_by(
     Raises:
         GsbaError: a recording has a camera of its own, and the run a field of stitching errors.
     """
+    combine({**run.recordings(), **found})  # refuses recordings that the run has
     read = dict[str, tuple[FrameSet, CameraSettings]]()
     for name, frames in found.items():
         model = run.settings.camera.model_copy(update={"name": models[name]})
@@ -171,11 +184,6 @@ def _one_make(kind: PictureFormat, frames: FrameSet) -> bool:
     sizes = [[(one.width, one.height) for one in each.fisheyes or ()] for each in (kind, own)]
     unmasked = all(path is None for path in frames.mask_paths)  # masks have the panorama's size
     return sizes[0] == sizes[1] and (unmasked or kind.width == own.width)
-
-
-def _one_cut(one: PictureFormat, other: PictureFormat) -> bool:
-    """True if one camera in one mode can have made both, and one calibration has read them."""
-    return one_mode(one, other) and one.fisheyes == other.fisheyes
 
 
 def _one_model(one: CameraSettings, other: CameraSettings) -> bool:
@@ -227,13 +235,6 @@ def _scaled(found: FoundCamera, scale: float) -> CameraEstimate | None:
     return found.estimate().scaled(scale) if found.lenses else found.readout
 
 
-def _in_unit(found: FoundCamera, camera: CameraEstimate | None, scale: float) -> FoundCamera:
-    """A camera, `camera` its estimate in a unit of which one map unit has `scale`."""
-    radius = found.radius and _rescaled(found.radius, scale)
-    centres = _centres(found.centres, camera, scale)
-    return FoundCamera(centres, found.axes, radius, found.calibrated, camera)
-
-
 def _readout_motion(
     each: Sequence[tuple[Lenses | None, int]],
     moves: Sequence[Sim3],
@@ -252,21 +253,3 @@ def _readout_motion(
         motion.append(own)
         begin += num
     return np.concatenate(motion)
-
-
-def _rescaled(found: StitchRadius, scale: float) -> StitchRadius:
-    """An estimated radius in another unit: one map unit is `scale` of the new ones."""
-    inverse, sigma = found.inverse_stitch_radius / scale, found.sigma / scale
-    lenses = found.lenses.scaled(scale)
-    return replace(found, lenses=lenses, inverse_stitch_radius=inverse, sigma=sigma)
-
-
-def _centres(
-    found: LensCentres | None, camera: CameraEstimate | None, scale: float
-) -> LensCentres | None:
-    """Estimated centres in another unit, with the lenses of a camera."""
-    if found is None:
-        return None
-    lenses = Lenses() if camera is None else camera.lenses
-    covariance = found.covariance * scale**2
-    return replace(found, lenses=lenses, found=scale * found.found, covariance=covariance)

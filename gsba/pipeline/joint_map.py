@@ -4,7 +4,7 @@ Every run's map is carried to the world of its result. A camera that several run
 the run which knows most of it; lengths of the others are such that its lenses are as far apart.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -46,18 +46,17 @@ class JointMaps:
         starts = (0, *np.cumsum([len(run.frames) for run in runs]).tolist())
         moves = _moves(runs, cameras)
         solutions = [_moved(run, move) for run, move in zip(runs, moves, strict=True)]
-        observed = [_in_one_noise(run) for run in runs]
+        observed = [run.map.observed.scaled_noise(run.map.solution.noise) for run in runs]
         rig = rig_for(frames.formats[0], runs[0].settings.cubemap)
-        keypoints = on_faces(joined_keypoints([one for one, _ in observed]), rig)
-        aligned = np.concatenate([confirmed for _, confirmed in observed])
+        keypoints = on_faces(joined_keypoints(observed), rig)
         solution = _back_to_back(solutions, starts)
         parts = _parts_of(runs)
         map_ = Map(
             solution,
             keypoints,
             np.concatenate([run.map.frame_weights for run in runs]),
-            aligned,
-            np.concatenate([_normals(run) for run in runs]),
+            np.concatenate([run.map.confirmed for run in runs]),
+            np.concatenate([run.map.normals for run in runs]),
             None if len(cameras.formats) > 1 else runs[cameras.seen_by[0]].map.stitching,
             cameras.found(runs, moves, solution, frames),
             frames.camera_of_frame,
@@ -92,15 +91,6 @@ def joined_keypoints(parts: Sequence[Keypoints]) -> Keypoints:
         np.concatenate([part.colors for part in parts]),
         infos,
     )
-
-
-def check_new(run: FinishedRun, found: Mapping[str, FrameSet]) -> None:
-    """Refuse recordings that a run has already.
-
-    Raises:
-        GsbaError: there is one; the message names it.
-    """
-    combine({**run.recordings(), **found})
 
 
 def _check_settings(runs: Sequence[FinishedRun]) -> None:
@@ -158,18 +148,6 @@ def _moved(run: FinishedRun, move: Sim3) -> Solution:
     )
     poses = move.poses(solution.world_T_rigs)
     return replace(solution, world_T_rigs=poses, landmarks=landmarks)
-
-
-def _in_one_noise(run: FinishedRun) -> tuple[Keypoints, np.ndarray]:
-    """Keypoints of a run with the noise that its solution found, and which are aligned (N,)."""
-    observed, aligned = run.map.observed, run.map.aligned
-    scaled = observed.scaled_noise(run.map.solution.noise)
-    return scaled, np.zeros(len(observed.faces), bool) if aligned is None else aligned
-
-
-def _normals(run: FinishedRun) -> np.ndarray:
-    normals = run.map.normals_rig
-    return np.zeros((len(run.map.observed.faces), 3), np.float32) if normals is None else normals
 
 
 def _back_to_back(solutions: Sequence[Solution], starts: Sequence[int]) -> Solution:

@@ -97,6 +97,18 @@ class Map:
         return CameraEstimates(tuple(one.estimate() for one in self.cameras), self.of_frame)
 
     @property
+    def confirmed(self) -> np.ndarray:
+        """Observations (N,) bool that patches have confirmed."""
+        num = len(self.observed.faces)
+        return np.zeros(num, bool) if self.aligned is None else self.aligned
+
+    @property
+    def normals(self) -> np.ndarray:
+        """Normals (N, 3) float32 of the surfaces that observations show, 0 = unknown."""
+        num, known = len(self.observed.faces), self.normals_rig
+        return np.zeros((num, 3), np.float32) if known is None else known
+
+    @property
     def field(self) -> SphereField:
         """What is known of what stitching bends."""
         return SphereField.none() if self.stitching is None else self.stitching.field

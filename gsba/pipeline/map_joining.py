@@ -26,7 +26,7 @@ from gsba.loop_closure.map_similarity import (
     refined,
     similarity_covariance,
 )
-from gsba.loop_closure.merged_map import Registered
+from gsba.loop_closure.merged_map import Registered, carried
 from gsba.photometric.alignment import Observations
 from gsba.pipeline import backend, camera, frontend, inputs, patch_rounds
 from gsba.pipeline.joint_map import JointMaps, joined_keypoints
@@ -100,11 +100,13 @@ def register(state: State, maps: JointMaps) -> State:
         return map_merging.merge(*given, run.frames.timestamps, True, owners)
 
     merged = run.stage("registered", run.matching_key(), compute, Registered)
-    _check_units(maps, merged)
-    landmarks = solution.landmarks.moved(merged.scales, merged.moves)
-    points = landmarks.points_world + merged.offsets[landmarks.tracks.hosts()]
+    for number in range(1, len(maps.runs)):
+        frames = int(maps.main_rows(0)[0]), int(maps.main_rows(number)[0])
+        if merged.components[frames[0]] == merged.components[frames[1]]:
+            for pair in maps.cameras.shared(0, number):
+                _check_unit(maps, merged, (0, number), pair)
     poses = merged.solved.world_T_rigs
-    moved = replace(solution, world_T_rigs=poses, landmarks=replace(landmarks, points_world=points))
+    moved = carried(solution, poses, merged.scales, merged.moves, merged.offsets)
     state = _with_unit(state, merged.scales, maps.unit_frames())
     return _tied_within(state.with_solution(moved), maps.parts, merged)
 
@@ -244,7 +246,10 @@ def tie(state: State, parts: np.ndarray) -> State:
         raise ApartError(_NOT_TIED.format("lose points when they are adjusted together"))
     if not run.settings.patches.rounds:
         return solved
-    features = _unravelled(solved.map.observed, order, len(base.aligned), state.observed.shown)
+    sigmas = np.empty(len(order))  # noise of features that are interleaved with observations
+    sigmas[order] = solved.map.observed.sigmas_rad
+    changed = {"sigmas_rad": sigmas[len(base.aligned) :], "sqrt_infos": None}
+    features = replace(state.observed.shown, **changed)
     state = replace(_with_poses_of(state, solved), matches=state.matches)
     return _aligned(state, base, features, parts) or solved
 
@@ -267,7 +272,21 @@ def _aligned(state: State, base: Sighted, features: Keypoints, parts: np.ndarray
             break
         if n > 1:
             left, shared = _align_around(state, parts, f"align{n}")
-        solved = _solved(state, _joined_sighted(left, shared), f"aligned{n}")
+        keypoints, order = _interleaved(left.keypoints, shared.keypoints)
+        sizes, tracks = np.diff(left.keypoints.starts), shared.tracks
+        tracks = replace(tracks, keypoints=tracks.keypoints + sizes[tracks.frames])
+        normals = []
+        for one in (left, shared):
+            nothing = np.zeros((len(one.aligned), 3), np.float32)
+            normals.append(nothing if one.normals_rig is None else one.normals_rig)
+        both = Sighted(
+            keypoints,
+            np.concatenate([left.aligned, shared.aligned])[order],
+            _with_tracks(left.tracks, tracks),
+            shared.counts,
+            np.concatenate(normals)[order],
+        )
+        solved = _solved(state, both, f"aligned{n}")
         if solved is None:
             break
         before, state, better = state, solved, solved
@@ -325,27 +344,16 @@ def _with_unit(state: State, scales: np.ndarray, units: Sequence[int]) -> State:
     if all(one.readout is None for one in state.map.cameras) or not state.map.lenses:
         return state
     found = state.map.estimates()
-    pairs = zip(found.each, units, strict=True)
-    moved = found.with_each([_in_unit_of(one, scales, frame) for one, frame in pairs])
+    each = list[CameraEstimate]()
+    for one, frame in zip(found.each, units, strict=True):
+        scaled, motion = one.scaled(float(scales[frame])), one.lenses.readout_motion
+        if motion is not None:
+            factors = np.repeat(np.column_stack([np.ones(len(motion)), scales]), 3, axis=1)
+            lenses = replace(scaled.lenses, readout_motion=motion * factors)
+            scaled = replace(scaled, lenses=lenses)
+        each.append(scaled)
+    moved = found.with_each(each)
     return state.with_cameras(moved).through(moved.cameras)
-
-
-def _in_unit_of(found: CameraEstimate, scales: np.ndarray, frame: int) -> CameraEstimate:
-    """A camera of `_with_unit`."""
-    scaled, motion = found.scaled(float(scales[frame])), found.lenses.readout_motion
-    if motion is None:
-        return scaled
-    factors = np.repeat(np.column_stack([np.ones(len(motion)), scales]), 3, axis=1)
-    return replace(scaled, lenses=replace(scaled.lenses, readout_motion=motion * factors))
-
-
-def _check_units(maps: JointMaps, merged: Registered) -> None:
-    """Refuse maps that meet in another scale than the lenses of a camera that both have."""
-    for number in range(1, len(maps.runs)):
-        frames = int(maps.main_rows(0)[0]), int(maps.main_rows(number)[0])
-        if merged.components[frames[0]] == merged.components[frames[1]]:
-            for pair in maps.cameras.shared(0, number):
-                _check_unit(maps, merged, (0, number), pair)
 
 
 def _check_unit(
@@ -436,16 +444,12 @@ def _across(state: State, parts: np.ndarray, merged: Registered) -> State:
     found = frontend.match_across(near, parts)
     across = found.matches.across
     assert across is not None
-    if set(parts[across.pairs].ravel()) >= _met_parts(parts, merged):
-        return found
-    return frontend.match_known_points_across(found, parts, "across_points")
-
-
-def _met_parts(parts: np.ndarray, merged: Registered) -> set[int]:
-    """Parts of maps that images joined from several ones."""
     joined = np.unique(np.column_stack([merged.components, parts])[merged.met], axis=0)
     maps, numbers = np.unique(joined[:, 0], return_counts=True)
-    return set(joined[np.isin(joined[:, 0], maps[numbers > 1]), 1].tolist())
+    met = set(joined[np.isin(joined[:, 0], maps[numbers > 1]), 1].tolist())
+    if set(parts[across.pairs].ravel()) >= met:  # parts of maps that images joined from several
+        return found
+    return frontend.match_known_points_across(found, parts, "across_points")
 
 
 def _crossing(state: State, parts: np.ndarray) -> Tracks:
@@ -467,9 +471,9 @@ def _of_several(tracks: Tracks, parts: np.ndarray) -> np.ndarray:
 def _sighted(state: State) -> Sighted:
     """The observations of the map's points."""
     map_ = state.map
-    aligned = np.zeros(len(map_.observed.faces), bool) if map_.aligned is None else map_.aligned
     landmarks = map_.solution.landmarks
-    return Sighted(map_.observed, aligned, landmarks.tracks, landmarks.counts, map_.normals_rig)
+    seen = landmarks.tracks, landmarks.counts, map_.normals_rig
+    return Sighted(map_.observed, map_.confirmed, *seen)
 
 
 def _interleaved(one: Keypoints, other: Keypoints) -> tuple[Keypoints, np.ndarray]:
@@ -477,13 +481,6 @@ def _interleaved(one: Keypoints, other: Keypoints) -> tuple[Keypoints, np.ndarra
     frames = np.concatenate([one.frames(), other.frames()])
     order = np.argsort(frames, kind="stable")
     return joined_keypoints([one, other]).at(order, one.starts + other.starts), order
-
-
-def _unravelled(both: Keypoints, order: np.ndarray, num_first: int, other: Keypoints) -> Keypoints:
-    """The second of two interleaved sets of keypoints, with the noise that it has there."""
-    sigmas = np.empty(len(order))
-    sigmas[order] = both.sigmas_rad
-    return replace(other, sigmas_rad=sigmas[num_first:], sqrt_infos=None)
 
 
 def _with_tracks(one: Tracks, other: Tracks) -> Tracks:
@@ -494,21 +491,6 @@ def _with_tracks(one: Tracks, other: Tracks) -> Tracks:
         np.concatenate([one.keypoints, other.keypoints]).astype(np.int32),
         one.num_points + other.num_points,
     )
-
-
-def _joined_sighted(one: Sighted, other: Sighted) -> Sighted:
-    """Observations of both."""
-    keypoints, order = _interleaved(one.keypoints, other.keypoints)
-    sizes = np.diff(one.keypoints.starts)
-    moved = replace(other.tracks, keypoints=other.tracks.keypoints + sizes[other.tracks.frames])
-    normals = np.concatenate([_normals_of(one), _normals_of(other)])[order]
-    aligned = np.concatenate([one.aligned, other.aligned])[order]
-    return Sighted(keypoints, aligned, _with_tracks(one.tracks, moved), other.counts, normals)
-
-
-def _normals_of(sighted: Sighted) -> np.ndarray:
-    normals = sighted.normals_rig
-    return np.zeros((len(sighted.aligned), 3), np.float32) if normals is None else normals
 
 
 def _without_same(base: Sighted, shared: Sighted, width: int) -> Sighted:

@@ -9,7 +9,7 @@ from gsba.bundle.reconstruction import MIN_OBSERVATIONS
 from gsba.bundle.stitching import Stitching
 from gsba.photometric import alignment
 from gsba.photometric.alignment import Observations
-from gsba.pipeline import camera, gyro
+from gsba.pipeline import camera, frontend
 from gsba.pipeline.state import State
 from gsba.types import Keypoints, Sighted, Solution
 
@@ -26,7 +26,7 @@ def align(state: State) -> State:
         if is_settled(before, state, n):
             break
         if n > 1:
-            state = gyro.align_to_map(state, f"imu_aligned{n}")
+            state = frontend.align_gyro_to_map(state, f"imu_aligned{n}")
         before, state = state, _round(state, n)
     return state
 
@@ -48,7 +48,7 @@ def _adjust_under_lenses(state: State, sighted: Sighted, number: int) -> State |
     if not state.map.lenses:
         return adjust_aligned(state, sighted, name)
     for n in range(2):
-        state = gyro.align_to_map(state, f"imu_{name}_{n}", with_noise=False)
+        state = frontend.align_gyro_to_map(state, f"imu_{name}_{n}", with_noise=False)
         trial = camera.take_parts_from_patches(state, sighted, name, n)
         if n and trial.map.lenses.parts == state.map.lenses.parts:
             return trial

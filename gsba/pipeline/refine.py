@@ -26,7 +26,6 @@ from gsba.pipeline import (
     each_recording,
     finished_run,
     frontend,
-    gyro,
     inputs,
     outputs,
     patch_rounds,
@@ -106,7 +105,9 @@ def refine(
     given = inputs.read_trajectories(origin, timestamps, convention)  # fails before decoding
     if video.is_video(frames):
         by_odometry = chosen if inputs.follows(settings.video, fps, odometry, given) else None
-        walk = inputs.extract_frames(out, origin, settings, fps, fresh, by_odometry, calibration)
+        inputs.check_positions(settings)
+        with RunStore(out, origin, fresh, title_of=title_of) as store:
+            walk = inputs.extract_video(store, frames, settings, fps, by_odometry, calibration)
         frames, timestamps, fps, fresh = out / "frames", None, None, False
     if walk is not None:  # made of these very images: no evidence beside them
         given, settings = walk.pieces(), inputs.for_odometry(settings)
@@ -324,7 +325,7 @@ def solve(state: State) -> State:
         state = backend.refine_photometric(state)
     if "splat" in families:
         state = backend.refine_on_splat(state)
-    state = gyro.align_to_map(state, "imu_final", with_noise=False)
+    state = frontend.align_gyro_to_map(state, "imu_final", with_noise=False)
     return camera.measure_camera(state)
 
 
@@ -347,7 +348,7 @@ def _map_all(state: State) -> State:
     else:
         state = frontend.match_neighbours(state)
         state = frontend.judge_trajectory(state)
-        state = gyro.align_to_neighbours(state)
+        state = frontend.align_gyro_to_neighbours(state)
     if state.prior.turning_only:
         return state
     # A chain of relative poses, then all points that neighbours share.
@@ -361,9 +362,9 @@ def _map_all(state: State) -> State:
     state = frontend.close_loops(state)
     state = backend.align_gauge(state, "gauge_closed")
     state = backend.adjust(state, "closed", rounds.loops)
-    state = gyro.align_to_map(state, "imu_closed")
+    state = frontend.align_gyro_to_map(state, "imu_closed")
     state = camera.find_camera(state)
-    state = gyro.align_to_map(state, "imu_camera", with_noise=bool(state.map.lenses))
+    state = frontend.align_gyro_to_map(state, "imu_camera", with_noise=bool(state.map.lenses))
     return backend.measure_strength(state)
 
 

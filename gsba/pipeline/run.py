@@ -135,7 +135,9 @@ class Run:
             if family.name in (TrajectoryPrior.name, GyroTurns.name):
                 raise GsbaError(f"family {family.name}: gsba has one of this name; rename yours")
         rig = cubemap.rig_for(frames.formats[0], settings.cubemap)
-        members = (*_of_points(settings, rig), *evidence.families)
+        own: list[Family] = [Bearings(), Reprojections(rig)]
+        own = [family for family in own if family.name in settings.factors]
+        members = (*own, *evidence.families)
         families = Families(members, frames.names, frames.timestamps)
         if not families.observing_points.members:
             raise GsbaError("factors: no family observes points; add bearing or reprojection")
@@ -246,9 +248,3 @@ class Run:
         settings = self.settings
         relevant = [settings.triangulate, settings.rounds, settings.priors, settings.solver]
         return [*relevant, self.families.digests()]
-
-
-def _of_points(settings: RefineSettings, rig: CubeRig) -> list[Family]:
-    """gsba's own families that observe points, as settings.factors name them."""
-    own: list[Family] = [Bearings(), Reprojections(rig)]
-    return [family for family in own if family.name in settings.factors]

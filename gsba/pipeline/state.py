@@ -12,11 +12,33 @@ from gsba.camera.cameras import Cameras
 from gsba.camera.lens import Lenses
 from gsba.config import PriorSettings
 from gsba.loop_closure import connectivity
+from gsba.matching.guided_search import MatchContext
 from gsba.pipeline.map import Map
-from gsba.pipeline.observed_frames import ObservedFrames
 from gsba.pipeline.prior import Prior
 from gsba.pipeline.run import Run
-from gsba.types import Keypoints, Landmarks, Matches, Solution, Tracks, VerifiedPairs
+from gsba.store.store import PerFrame
+from gsba.types import Features, Keypoints, Landmarks, Matches, Solution, Tracks, VerifiedPairs
+
+
+@dataclass(frozen=True, slots=True)
+class ObservedFrames:
+    """Keypoints of all frames, and the means to match them."""
+
+    features: tuple[PerFrame[Features], ...]  # (F,) stage that holds each frame's
+    shown: Keypoints  # of all frames, where pictures show them
+    context: MatchContext  # matches them
+    cameras: Cameras  # that the keypoints are seen through
+    more: bool = False  # whether all frames got as many keypoints as weak ones from the start
+
+    @property
+    def keypoints(self) -> Keypoints:
+        """Of all frames, as rays of the cameras."""
+        return self.context.keypoints
+
+    def through(self, cameras: Cameras) -> "ObservedFrames":
+        """The frames with their keypoints as rays that start at the lenses of these cameras."""
+        context = replace(self.context, keypoints=cameras.seen(self.shown), cameras=cameras)
+        return replace(self, context=context, cameras=cameras)
 
 
 @dataclass(frozen=True, slots=True)
