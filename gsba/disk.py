@@ -81,11 +81,7 @@ def write_json(path: Path, content: object) -> None:
 
 
 def write_image(path: Path, image: "np.ndarray", jpeg_quality: int = 95) -> None:
-    """Encode (H, W, 3) RGB or (H, W) uint8 by the suffix of `path`, atomically.
-
-    Raises:
-        GsbaError: the image cannot be encoded, or the disk cannot be written.
-    """
+    """Encode (H, W, 3) RGB or (H, W) uint8 by the suffix of `path`, atomically."""
     write_bytes(path, encoded_image(image, path, jpeg_quality))
 
 
@@ -154,11 +150,8 @@ def read_vertices(path: Path) -> "np.ndarray":
 
 
 def link_or_copy(source: Path, target: Path) -> None:
-    """Give a file a second name, or copy it where the disk knows no hard links.
-
-    Raises:
-        GsbaError: the disk is full, or writing is not permitted.
-    """
+    """Give a file a second name, which it replaces, or copy it where the disk knows no hard
+    links."""
 
     def write(temporary: Path) -> None:
         try:
@@ -170,11 +163,8 @@ def link_or_copy(source: Path, target: Path) -> None:
 
 
 def exchange_folders(one: Path, other: Path) -> bool:
-    """Exchange two folders of one disk in a single step, so that either is there at any moment.
-
-    Returns:
-        False where the system cannot: nothing was changed.
-    """
+    """Exchange two folders of one disk in a single step, so that either is there at any moment;
+    False where the system cannot: nothing was changed."""
     library = ctypes.CDLL(None, use_errno=True)
     if sys.platform == "darwin":
         names = os.fsencode(one), os.fsencode(other)

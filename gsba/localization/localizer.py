@@ -323,13 +323,8 @@ class Localizer:
         gate_rad: float,
         recognised: np.ndarray | None = None,
     ) -> Candidates:
-        """Points of the nearest keyframes that look like keypoints near their predicted bearing.
-
-        Args:
-            world_T_rig: (4, 4) predicted pose.
-            gate_rad: around the prediction.
-            recognised: (N,) keyframes whose points are searched, too; None = no others.
-        """
+        """Points of the nearest keyframes, and those `recognised` (N,), that look like keypoints
+        within `gate_rad` of their predicted bearing from a pose (4, 4)."""
         poses, places = self.map.result.world_T_rigs, self.map.nearest(world_T_rig, NUM_NEAREST)
         if recognised is not None:
             places = np.union1d(places, recognised)

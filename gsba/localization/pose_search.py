@@ -85,11 +85,8 @@ def least_of_rival(found: FoundPose) -> int:
 
 
 def is_rivalled(found: FoundPose, rival: FoundPose | None, candidates: Candidates) -> bool:
-    """True if the candidates that a pose leaves over agree about as well on another place.
-
-    Args:
-        rival: of those that it leaves over, with `least_of_rival` inliers.
-    """
+    """True if candidates that a pose leaves over agree about as well on `rival`, at another
+    place."""
     if rival is None:
         return False
     offsets = candidates.points_world[found.inliers] - found.world_T_rig[:3, 3]

@@ -142,11 +142,7 @@ def without_correction(frames: FrameSet) -> FrameSet:
 
 
 def require_own_version(root: Path) -> None:
-    """Refuse a run that another version of gsba made.
-
-    Raises:
-        GsbaError: the run is of another version.
-    """
+    """Refuse a run that another version of gsba made."""
     version = read_marker(root).get("gsba", __version__)
     if version != __version__:
         raise GsbaError(

@@ -69,12 +69,8 @@ class Surroundings:
         self._num_observers = np.bincount(map_.result.observation_points, None, num)
 
     def rates(self, frames: Sequence[int], seen: Sequence[Query]) -> Rates:
-        """Rates at which frames of the map show what the map without them would expect.
-
-        Args:
-            frames: numbers (N) of the frames.
-            seen: (N) their keypoints, found as those of the pictures to test.
-        """
+        """Rates at which frames (N,) of the map show what the map without them would expect, by
+        their keypoints (N), found as those of the pictures to test."""
         poses = self.map.result.world_T_rigs
         at, away = [], []
         for frame, picture in zip(frames, seen, strict=True):
@@ -85,12 +81,8 @@ class Surroundings:
     def evidence(
         self, seen: Query, world_T_rig: np.ndarray, usual: Rates, shown: Shown | None = None
     ) -> JoinEvidence:
-        """Evidence for and against a pose.
-
-        Args:
-            world_T_rig: (4, 4) its pose.
-            shown: tells the points that lie within a picture with edges.
-        """
+        """Evidence for and against a pose (4, 4); `shown` tells the points within a picture with
+        edges."""
         found = self._predictions(seen, world_T_rig, shown=shown)
         if not len(found.bins):
             return JoinEvidence(0.0, np.inf, 0)

@@ -63,13 +63,9 @@ def crossing(
 
 
 def agreed(proposals: list[Proposal], poses: np.ndarray, depth: float) -> Proposal | None:
-    """The proposal that most others agree with, of several the one with most matches; None if the
-    others are too few, or no majority.
-
-    Args:
-        poses: (F, 4, 4), each frame's in its own map.
-        depth: median distance of points, map units.
-    """
+    """The proposal that most others agree with, of several the one with most matches; None without
+    a majority. Poses (F, 4, 4) are each frame's in its own map; `depth`, its median, in map
+    units."""
     counts = [sum(alike(one, other, poses, depth) for other in proposals) for one in proposals]
     if max(counts, default=0) < max(MIN_AGREEING, len(proposals) // 2 + 1):
         return None

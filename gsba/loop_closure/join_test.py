@@ -112,12 +112,8 @@ class JoinTest:
     def meetings(
         self, matches: Matches, outside: np.ndarray, f0_T_f1s: np.ndarray | None = None
     ) -> list[Meeting]:
-        """Matched points that both frames of pairs know, one of them among those outside.
-
-        Args:
-            outside: frames (N,) outside the map.
-            f0_T_f1s: (P, 4, 4) relative poses by bearings, their translations of any length.
-        """
+        """Matched points that both frames of pairs know, one of them outside (N,); see
+        `meetings_of`."""
         return meetings_of(self.known, matches, outside, f0_T_f1s)
 
     def _judged(

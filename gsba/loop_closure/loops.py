@@ -224,13 +224,8 @@ def _measured_loops(
 def within_drift(
     loop: Loop, poses: np.ndarray, depth: float, unseen: np.ndarray, settings: RefineSettings
 ) -> bool:
-    """True if a loop needs no more drift than the path between its frames can have.
-
-    Args:
-        poses: (F, 4, 4) of the map.
-        depth: median distance of points, map units.
-        unseen: (F - 1,) bool, steps that no images confirm.
-    """
+    """True if a loop needs no more drift than the path (F, 4, 4) between its frames can have, whose
+    steps `unseen` (F - 1,) bool no images confirm; `depth`, the median, in map units."""
     first, last = min(loop.f0, loop.f1), max(loop.f0, loop.f1)
     between, steps = poses[first : last + 1, :3, 3], unseen[first:last]
     slack = float(_max_step_drifts(between, steps, settings).sum())

@@ -510,10 +510,8 @@ class _Joining:
         return True
 
     def result(self) -> Registered:
-        """The map in its current state, each map in the world of its earliest part.
-
-        A frame in no map is placed beside the one before it.
-        """
+        """The map as it is, each in the world of its earliest part; lost frames beside the one
+        before."""
         self._keep_earliest_worlds()
         lost, maps = self.components < 0, int(self.components.max()) + 1
         for n, f in enumerate(np.flatnonzero(lost).tolist()):

@@ -134,11 +134,7 @@ def _pooled(meeting: Meeting, meetings: list[Meeting], poses: np.ndarray) -> Mee
 
 
 def carrying(g_T_f: Sim3, world_T_f: np.ndarray, world_T_g: np.ndarray) -> Sim3:
-    """The similarity that moves the world of rig f into that of rig g.
-
-    Args:
-        world_T_f, world_T_g: (4, 4) poses of both, each in the world of its map.
-    """
+    """The similarity that moves the world of rig f into that of rig g, by poses (4, 4) in these."""
     f_T_own = inverse(world_T_f)
     f_T_own[:3, 3] *= g_T_f.scale
     return Sim3.of(g_T_f.scale, world_T_g @ g_T_f.new_T_old @ f_T_own)

@@ -40,12 +40,7 @@ def carried(
     moves: np.ndarray,
     offsets: np.ndarray,
 ) -> Solution:
-    """A map whose frames were moved; each point moves with its first frame.
-
-    Args:
-        world_T_rigs: (F, 4, 4) poses after.
-        scales, moves, offsets: see `Registered`.
-    """
+    """A map with poses (F, 4, 4) after moves, see `Registered`; points move with first frames."""
     landmarks = solved.landmarks.moved(scales, moves)
     points = landmarks.points_world + offsets[landmarks.tracks.hosts()]
     landmarks = replace(landmarks, points_world=points)
@@ -53,13 +48,8 @@ def carried(
 
 
 def laid_out(positions: np.ndarray, components: np.ndarray, reach: float) -> np.ndarray:
-    """Offsets (F, 3) that separate maps: no frame of one is near a point of another.
-
-    Args:
-        positions: (F, 3) of the frames, each in its map.
-        components: (F,) int, map of each frame.
-        reach: largest distance of points from frames, map units.
-    """
+    """Offsets (F, 3) to positions (F, 3) by which maps (F,) lie apart: no frame is within `reach`,
+    map units, of a point of another."""
     offsets = np.zeros((len(components), 3))
     groups = [components == c for c in range(int(components.max()) + 1)]
     extent = max(float(np.linalg.norm(np.ptp(positions[group], axis=0))) for group in groups)

@@ -20,12 +20,8 @@ _INLIER_PROBABILITY = 0.99  # that a true loop is within its noise
 def path(
     world_T_rigs: np.ndarray, unseen: np.ndarray
 ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, gtsam.noiseModel.Base]:
-    """A pose graph of the steps with its first pose fixed, its values, and the noise of a loop.
-
-    Args:
-        world_T_rigs: (F, 4, 4) poses, accurate from one to the next.
-        unseen: (F - 1,) bool, steps without matches, which give way first.
-    """
+    """A pose graph of the steps of poses (F, 4, 4), its first fixed, its values, and a loop's
+    noise; steps `unseen` (F - 1,) bool without matches give way first."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for f, world_T_rig in enumerate(world_T_rigs):
         values.insert(X(f), gtsam.Pose3(world_T_rig))
@@ -98,13 +94,8 @@ def met(loops: list[Loop], solved: Solution, unseen: np.ndarray) -> list[Loop]:
 
 
 def bend(solved: Solution, loops: list[Loop], unseen: np.ndarray) -> Solution:
-    """Distribute the residuals of loops over the path: a pose graph of its steps and the loops.
-
-    Each point moves with its first frame.
-
-    Args:
-        unseen: (F - 1,) bool, steps without matches, which give way first.
-    """
+    """Distribute the residuals of loops over the path, each point with its first frame; steps
+    `unseen` (F - 1,) bool without matches give way first."""
     poses = solved.world_T_rigs
     graph, values, noise = path(poses, unseen)
     cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(2.0)

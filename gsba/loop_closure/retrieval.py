@@ -30,11 +30,8 @@ def global_descriptors(
     workers: Workers,
     scratch: Path | None = None,
 ) -> np.ndarray:
-    """Global descriptors (F, D) float32 of all panoramas, of unit length, invariant to heading.
-
-    Args:
-        scratch: folder on the disk that takes the descriptors; None = they are in memory.
-    """
+    """Global descriptors (F, D) float32 of panoramas, of unit length, invariant to heading; on the
+    disk in the folder `scratch`, None = in memory."""
     words, everyone = visual_words(frames, num_frames, seed, workers), np.arange(num_frames)
     job = _DescriptorJob("looks", frames, everyone, partial(_descriptor_of, words=words))
     looks = ((look[None].astype(np.float32),) for look in workers.map_shards(job))

@@ -101,20 +101,12 @@ def part_folder(folder: Path, part: int) -> Path:
 
 
 def load_part(folder: Path, part: int) -> Part:
-    """Read what a part owns.
-
-    Raises:
-        GsbaError: the file is missing or damaged.
-    """
+    """Read what a part owns."""
     return load(part_folder(folder, part) / "given.npz", Part)
 
 
 def load_index(folder: Path) -> Index:
-    """Read the parts of a map.
-
-    Raises:
-        GsbaError: the file is missing or damaged.
-    """
+    """Read the parts of a map."""
     return load(folder / _INDEX, Index)
 
 
@@ -136,11 +128,7 @@ def keys_beside(values: gtsam.Values) -> list[int]:
 
 
 def load(path: Path, returns: type[T]) -> T:
-    """Read a record of a map in parts.
-
-    Raises:
-        GsbaError: the file is missing or damaged.
-    """
+    """Read a record of a map in parts; GsbaError if it is missing or damaged."""
     try:
         return load_record(path, returns)
     except RecordError as error:
@@ -354,11 +342,7 @@ def deserialized(graph: np.ndarray) -> gtsam.NonlinearFactorGraph:
 
 
 def serialized(graph: gtsam.NonlinearFactorGraph) -> np.ndarray:
-    """Factors as bytes.
-
-    Raises:
-        NotStorableError: a factor is written in Python.
-    """
+    """Factors as bytes; NotStorableError if one is written in Python."""
     if not graph.size():
         return np.empty(0, np.uint8)
     try:

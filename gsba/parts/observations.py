@@ -28,11 +28,7 @@ class TermRows:
 
     @classmethod
     def of(cls, term: Term) -> "TermRows":
-        """The arrays of a term of `factors`.
-
-        Raises:
-            NotStorableError: its residual is a function.
-        """
+        """The arrays of a term of `factors`; NotStorableError if its residual is a function."""
         if not isinstance(term.kind, int):
             raise NotStorableError(
                 f"the residual of family {term.name} is a function, which files cannot hold"

@@ -27,12 +27,8 @@ class Partition:
         return int(self.homes.max(initial=-1)) + 1
 
     def owners(self, frames: np.ndarray, items: np.ndarray, num_items: int) -> np.ndarray:
-        """The part (I,) that owns each item: the one in which it is seen, off the cuts.
-
-        Args:
-            frames, items: (O,) int, frames that have a share in each item, which are all paired.
-            num_items: I; an item without frames belongs to the first part.
-        """
+        """The part (I,) that owns each item: the one in which its frames (O,) lie, off the cuts;
+        the first part owns an item without frames."""
         num = max(self.num_parts, 1)
         codes = self.homes[frames] + num * self.on_cut[frames]
         least = np.full(num_items, 2 * num)

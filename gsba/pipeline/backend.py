@@ -50,11 +50,7 @@ _MIN_BRIDGING = 12  # points of three frames, without which the scale is open: i
 
 
 def adjust(state: State, name: str, gates: Sequence[float], *, final: bool = False) -> State:
-    """Bundle adjustment in rounds over the tracks that the state's matches make.
-
-    Args:
-        gates: of each round, standard deviations of an observation's residual.
-    """
+    """Bundle adjustment in rounds over the state's tracks; `gates` in sigmas of a residual."""
     run, keypoints = state.run, state.observed.keypoints
 
     def compute() -> Solution:
@@ -204,11 +200,7 @@ def contradicts_fixes(state: State) -> bool:
 
 
 def without_fixes(state: State, latest: Sequence[str]) -> State:
-    """The state without GPS fixes, which its images contradict.
-
-    Args:
-        latest: names of the stages that it rests on.
-    """
+    """The state without GPS fixes, which its images contradict, after the stages `latest`."""
     logger.warning("the images contradict the GPS fixes: the map is made anew without these")
     run = state.run
     members = [
@@ -266,10 +258,7 @@ def reconstruct(
     state: State, amended: Callable[[Reconstruction], Reconstruction] | None = None
 ) -> Reconstruction:
     """Covariances, and everything back in the trajectory's world; of a turn, rotations alone.
-
-    Args:
-        amended: gives the result with what else is known of it; None = as it is.
-    """
+    `amended` gives the result with what else is known of it; None = as it is."""
     run, prior, map_, solution = state.run, state.prior, state.map, state.solution
     if prior.turning_only:
         return _reconstruct_rotations(state)

@@ -81,11 +81,7 @@ def find_camera(state: State, prefix: str = "") -> State:
 
 
 def sought_cameras(state: State, again: bool = False) -> list[int]:
-    """Cameras that may have several lenses, and are one centre so far.
-
-    Args:
-        again: leave raw lenses out, which are known to be several from the start.
-    """
+    """Cameras that may have several lenses and are one centre so far; `again`: without raw ones."""
     run = state.run
     if run.settings.camera.model == "central":
         return []
@@ -287,15 +283,9 @@ def take_parts_from_patches(state: State, sighted: Sighted, name: str, number: i
 def adjust_with_patches(
     state: State, sighted: Sighted, name: str, gates: Sequence[float] | None = None
 ) -> tuple[Solution, Keypoints, CameraEstimates]:
-    """Aligned observations solved for poses, points and camera.
-
-    Args:
-        state: of the run; its map has two lenses.
-        gates: of the rounds; None = those of aligned patches.
-
-    Returns:
-        The solution, the keypoints with the noise that they turned out to have, and the camera.
-    """
+    """Aligned observations solved for poses, points and camera; gates None = those of patches.
+    Returns the solution, the keypoints with the noise that they turned out to have, and the
+    camera."""
     run, map_ = state.run, state.map
     gates = run.settings.rounds.aligned if gates is None else gates
 
@@ -351,12 +341,8 @@ def keep_lenses(state: State, result: Reconstruction) -> Cameras:
 
 
 def better_calibration(coarse: CoarsePoses, map_: Map) -> Cuts | None:
-    """The calibrations to cut raw frames by in the next pass, in the trajectory's axes.
-
-    Returns:
-        For each camera the calibration, and whether it was estimated; None = its frames are cut
-        well, or all are.
-    """
+    """Calibrations to cut raw frames by in the next pass, in the trajectory's axes, and whether
+    each was estimated; None = a camera's frames are cut well, or all are."""
     found = [_better(coarse, map_, camera) for camera in range(len(map_.cameras))]
     return tuple(found) if any(found) else None
 

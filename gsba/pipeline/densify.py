@@ -34,12 +34,8 @@ def fetch_where_weak(
     settings: RefineSettings,
     measure: Callable[[FrameSet], Prior],
 ) -> FrameSet:
-    """Frames of a run, and between weak ones more of the video, until the map is strong, no frames
-    are left between, or `odometry.fetch_rounds` are over.
-
-    Args:
-        measure: solves frames as far as needed to tell where their map is weak.
-    """
+    """Frames of a run, and between weak ones more of the video, until the map that `measure` solves
+    is strong, no frames are left between, or `odometry.fetch_rounds` are over."""
     if len(set(frames.mask_paths)) > 1:
         logger.info("no frames are fetched: each frame has a mask of its own")
         return frames
@@ -83,13 +79,8 @@ def weak_steps(prior: Prior, settings: OdometrySettings) -> np.ndarray:
 
 
 def rows_between(walk: Odometry, times: np.ndarray, steps: np.ndarray, most: int) -> np.ndarray:
-    """Rows (N,) of an odometry to fetch: for each step the sharpest frame of its middle third.
-
-    Args:
-        times: (F,) seconds, of the frames that are there.
-        steps: (F - 1,) bool, between which of them to fetch one.
-        most: rows; of more, some are left out evenly.
-    """
+    """Rows (N,) of an odometry to fetch, at most `most`: of steps (F - 1,) bool between times (F,),
+    seconds, the sharpest frame of the middle third."""
     posed, rows = np.flatnonzero(walk.posed()), []
     half = 0.5 * float(np.median(np.diff(walk.timestamps)))
     for f in np.flatnonzero(steps).tolist():

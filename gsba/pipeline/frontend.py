@@ -320,10 +320,8 @@ def match_along_epipolars(state: State, name: str = "adjacent") -> State:
 
 
 def match_across(state: State, parts: np.ndarray) -> State:
-    """Verified matches of frames whose parts (F,) of the map were joined by images.
-
-    Other matches between these parts are dropped: they did not tie them together.
-    """
+    """Verified matches of frames whose parts (F,) images joined; others between these are
+    dropped."""
     run, context, merged = state.run, state.observed.context, state.prior.merged
     assert merged is not None
     compute = partial(correspondences.match_across, context, state.solution, parts, merged.met)
@@ -381,12 +379,8 @@ def _meet_places(state: State, near: VerifiedPairs) -> State:
 
 
 def expected_drift(run: Run, search: Search) -> tuple[float, dict[str, Features]]:
-    """Drift to be expected of a run whose frames were not searched yet, part of its path.
-
-    Returns:
-        The drift, 0 where nothing foretells it; and keypoints of the frames that were compared, by
-        name: none if an earlier call did.
-    """
+    """Drift to be expected before frames are searched, part of the path; 0 where nothing foretells
+    it; and keypoints of the frames compared, by name: none if an earlier call compared them."""
     settings, num = run.settings, len(run.frames)
     usual = settings.features.extractor == "sift" and settings.matching.matcher == "guided"
     if settings.weak_frames.mode != "auto" or not usual or num < 2 * _NUM_STEPS:
@@ -433,11 +427,8 @@ def _matches(run: Run, found: Mapping[str, Features], steps: np.ndarray) -> floa
 
 
 def comes_back(positions: np.ndarray) -> bool:
-    """True if a path returns to a place after at least half of its length, or does not move.
-
-    Args:
-        positions: (F, 3) world, in order of time.
-    """
+    """True if a path (F, 3) returns to a place after at least half of its length, or does not
+    move."""
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     along = np.concatenate([[0.0], np.cumsum(steps)])
     if not along[-1] > 0:

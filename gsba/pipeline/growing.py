@@ -178,11 +178,7 @@ class _Place:
 
     @classmethod
     def of(cls, root: Path | None, out: Path | str | None) -> "_Place":
-        """A place for the result of a run that grows.
-
-        Raises:
-            GsbaError: there is something.
-        """
+        """A place for the result of a run that grows; GsbaError if there is something."""
         if root is not None and (out is None or Path(out).resolve() == root.resolve()):
             return cls(root, True)
         assert out is not None
@@ -216,12 +212,8 @@ class _Place:
         held: np.ndarray | None = None,
         rigid: RigidMoves | None = None,
     ) -> RunResult:
-        """Write the result, and put it in place.
-
-        Args:
-            held: (H,) frames of the first run whose poses were held; None = all were solved.
-            rigid: similarities that maps were moved by; None = they were solved together.
-        """
+        """Write the result and put it in place; frames `held` (H,) kept their poses, maps of
+        `rigid` were moved by similarities; None = all were solved together."""
         written = _write(state, maps, held, rigid)
         sources = [*(run.root for run in maps.runs), store.root]
         frames = grown_folder.complete(store, state.run.frames, sources, self.out)

@@ -27,11 +27,8 @@ _ODOMETRY = "odometry"  # folder of what the odometry of videos found
 
 @contextmanager
 def held_runs(roots: Sequence[Path]) -> Iterator[None]:
-    """Keep other processes from the folders of runs within this context.
-
-    Raises:
-        GsbaError: a folder is missing, no run, or in use by another process.
-    """
+    """Keep other processes from runs in this context; GsbaError if one is missing, no run, or in
+    use."""
     locks = list[int]()
     try:
         for root in roots:
@@ -55,11 +52,7 @@ def scratch_of(work: Path) -> Path:
 
 
 def refuse_existing(out: Path) -> None:
-    """Refuse a folder to write a new run to that exists and is not empty.
-
-    Raises:
-        GsbaError: there is something.
-    """
+    """Refuse a folder to write a new run to that exists and is not empty, or has no parent."""
     if out.is_symlink() or (out.exists() and not (out.is_dir() and not any(out.iterdir()))):
         raise GsbaError(f"{out} exists: choose another --out")
     if not out.parent.is_dir():
@@ -67,12 +60,8 @@ def refuse_existing(out: Path) -> None:
 
 
 def forget_other_work(work: Path, origin: dict[str, Path], out: Path) -> None:
-    """Delete what a call with other inputs has left half-written.
-
-    Args:
-        out: its place in the end. A finished run in `work`, whose renaming was interrupted, is kept
-            beside it.
-    """
+    """Delete what a call with other inputs has left half-written in `work`; a finished run whose
+    renaming to `out` was interrupted is kept beside it."""
     if not work.exists():
         return
     lock = hold_folder(work)
@@ -91,11 +80,8 @@ def forget_other_work(work: Path, origin: dict[str, Path], out: Path) -> None:
 
 
 def complete(store: RunStore, frames: FrameSet, sources: Sequence[Path], out: Path) -> FrameSet:
-    """Give a run all files that its frames and masks are read from, so that it needs no other run.
-
-    Returns:
-        The frames as they are read then.
-    """
+    """Give a run all files that its frames and masks are read from, and no other run need hold;
+    returns the frames as they are read then."""
     roots = [root.resolve() for root in sources]
 
     def kept(path: Path, frame: str, folder: str) -> Path:
@@ -128,11 +114,7 @@ def complete(store: RunStore, frames: FrameSet, sources: Sequence[Path], out: Pa
 
 
 def put_in_place(work: Path, out: Path) -> Path | None:
-    """Rename a complete run into place; a run that is there gets another name.
-
-    Returns:
-        The new name of the run that was there; None = there was none.
-    """
+    """Rename a complete run into place; a run that was there gets the name returned."""
     with disk_errors(out):
         shutil.rmtree(work / _SCRATCH, ignore_errors=True)
         if not out.exists() or not any(out.iterdir()):

@@ -85,12 +85,8 @@ def read_trajectories(
 
 
 def timed(given: Sequence[Trajectory | NamedPoses], frames: FrameSet) -> list[Trajectory]:
-    """Trajectories with the times of frames, where their poses go by file names, each in a world
-    whose origin is near it.
-
-    Raises:
-        GsbaError: fewer than two frames have a pose of a file.
-    """
+    """Trajectories at the times of frames, those by file names too, each in a world near its
+    origin; GsbaError if fewer than two frames have a pose of a file."""
     known = [one.timed(frames) if isinstance(one, NamedPoses) else one for one in given]
     return [_near_origin(one) for one in known]
 

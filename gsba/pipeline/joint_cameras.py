@@ -83,11 +83,8 @@ class JointCameras:
         solution: Solution,
         frames: FrameSet,
     ) -> tuple[FoundCamera, ...]:
-        """Estimate of each camera (C,), for the frames of all runs.
-
-        Args:
-            moves: similarities of each run's solution to its place in the joint one.
-        """
+        """Estimate of each camera (C,) for the frames of all runs, which `moves` place in the joint
+        one."""
         return tuple(
             self._found(c, runs, moves, solution, frames) for c in range(len(self.formats))
         )

@@ -73,11 +73,7 @@ class Map:
 
     @property
     def only(self) -> FoundCamera:
-        """The only camera.
-
-        Raises:
-            ValueError: there are several.
-        """
+        """The only camera; ValueError if there are several."""
         (found,) = self.cameras
         return found
 

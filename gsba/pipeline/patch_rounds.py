@@ -81,11 +81,7 @@ def observations(state: State) -> Observations:
 def adjust_aligned(
     state: State, sighted: Sighted, name: str, gates: Sequence[float] | None = None
 ) -> State | None:
-    """Bundle adjustment of aligned observations; None where that explains less.
-
-    Args:
-        gates: of the rounds; None = those of aligned patches.
-    """
+    """Bundle adjustment of aligned observations; None where that explains less."""
     run, map_ = state.run, state.map
     gates = run.settings.rounds.aligned if gates is None else gates
 
@@ -141,11 +137,7 @@ def _straighten(state: State, sighted: Sighted, number: int) -> State:
 
 
 def is_settled(before: State, state: State, number: int) -> bool:
-    """True if the last round of aligning patches moved steps by less than their noise.
-
-    Args:
-        number: of the next round, from 1.
-    """
+    """True if the last round (`number` is the next) moved steps by less than their noise."""
     if number <= _MIN_ROUNDS:
         return False
     run, prior, solution = state.run, state.prior, state.solution

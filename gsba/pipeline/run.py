@@ -175,11 +175,8 @@ class Run:
         *,
         noted: bool = True,
     ) -> T:
-        """Result of a stage that rests on the one before it: the stored one, or computed.
-
-        Args:
-            noted: whether the report tells of it.
-        """
+        """Result of a stage that rests on the one before it; `noted`: whether the report tells of
+        it."""
         name += self.suffix
         result = self.chain.stage(name, key, compute, returns)
         if noted:

@@ -140,11 +140,8 @@ class State:
         return maps
 
     def triangulated(self, tracks: Tracks, keypoints: Keypoints, gate: float) -> Landmarks:
-        """Points of tracks under the poses as they are.
-
-        Args:
-            gate: largest residual, in the keypoints' own standard deviations.
-        """
+        """Points of tracks under the poses as they are; `gate` in the keypoints' standard
+        deviations."""
         poses, run = self.solution.world_T_rigs, self.run
         settings, threads = run.settings.triangulate, run.num_threads
         return triangulation.place(tracks, keypoints, poses, gate, settings, threads)

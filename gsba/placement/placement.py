@@ -193,12 +193,8 @@ def _upright(reconstruction: Reconstruction, frames: FrameSet) -> Placement:
 def metres_per_unit(
     lenses: tuple[float, float], baseline: tuple[float, float]
 ) -> tuple[float, float]:
-    """Metric scale and its standard deviation, from the distance between two lenses.
-
-    Args:
-        lenses: estimated distance and its standard deviation, map units.
-        baseline: published distance and its standard deviation, metres.
-    """
+    """Metric scale and its standard deviation, from the distance of two lenses (map units) and its
+    published value (metres), each with its standard deviation."""
     scale = baseline[0] / lenses[0]
     return scale, scale * float(np.hypot(lenses[1] / lenses[0], baseline[1] / baseline[0]))
 

@@ -38,11 +38,7 @@ _MAX_PCD_HEADER_BYTES = 1 << 16
 
 
 def check_claims(path: Path) -> None:
-    """Refuse LAS, LAZ and PCD files that claim more points than their size allows.
-
-    Raises:
-        GsbaError: the file claims too many points, or its header is damaged.
-    """
+    """Refuse LAS, LAZ and PCD files that claim more points than their size allows."""
     suffix, size = path.suffix.lower(), path.stat().st_size
     with path.open("rb") as file:
         head = file.read(_MAX_PCD_HEADER_BYTES)
@@ -119,11 +115,7 @@ def _check_pcd(head: bytes, size: int) -> None:
 
 
 def open3d() -> ModuleType:
-    """Import open3d.
-
-    Raises:
-        GsbaError: open3d or a system library is missing; the message has the install command.
-    """
+    """Import open3d; GsbaError with the install command if it or a system library is missing."""
     try:
         import open3d  # pyright: ignore[reportMissingImports]
     except ModuleNotFoundError as error:
@@ -171,11 +163,7 @@ def read_pairs(path: Path) -> tuple[list[str], np.ndarray]:
 
 
 def check_scan(path: Path) -> None:
-    """Check the suffix and access of a scan's file, and the libraries that read it.
-
-    Raises:
-        GsbaError: the suffix is unknown, the file cannot be read, or a library is missing.
-    """
+    """Check the suffix and access of a scan's file, and the libraries that read it."""
     if path.suffix.lower() not in SUFFIXES:
         raise GsbaError(f"{path} is no scan: give a file of {', '.join(SUFFIXES)}")
     if path.exists() and not path.is_file():
@@ -236,11 +224,8 @@ def read_scan(path: Path) -> Scan:
 
 
 def read_mesh(path: Path) -> Any:
-    """Triangles of a mesh file with colours or textures, as open3d's TriangleMesh.
-
-    Raises:
-        GsbaError: the file cannot be read, or holds no triangles.
-    """
+    """Triangles of a mesh file with colours or textures, as open3d's TriangleMesh; GsbaError if
+    none."""
     try_in_process(path)
     mesh = _mesh(path)
     if mesh is None:

@@ -44,11 +44,7 @@ class Noise:
 
 
 def noise_of(fit: Sim3, cloud: Cloud, scan: Scan, sigma: float) -> Noise:
-    """Maximum-likelihood noise, from points within a fiftieth of the cloud's size of a surface.
-
-    Args:
-        sigma: initial standard deviation, unit of the scan.
-    """
+    """Maximum-likelihood noise, from points within a fiftieth of the cloud's size of a surface."""
     from scipy.optimize import minimize
 
     reach = reach_of(fit, cloud)
@@ -89,12 +85,8 @@ def reach_of(fit: Sim3, cloud: Cloud) -> float:
 def residuals_of(
     fit: Sim3, cloud: Cloud, scan: Scan, reach: float = np.inf
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Nearest scan points and distances of a transformed cloud.
-
-    Returns:
-        transformed points (N, 3), rows (N,) of the nearest scan points, distances (N,) to the
-        planes of these, and distances (N,) to these, infinite beyond `reach`.
-    """
+    """Of a transformed cloud: points (N, 3), rows (N,) of the nearest scan points, distances (N,)
+    to their planes, and distances (N,) to them, infinite beyond `reach`."""
     carried = fit.points(cloud.points)
     gaps, nearest = scan.tree.query(carried, distance_upper_bound=reach)
     nearest = np.minimum(nearest, len(scan.points) - 1)

@@ -80,10 +80,8 @@ class CellGrid:
         return np.clip(((points - self.low) / self.edge).astype(np.int64), 0, self.shape - 1)
 
     def first_crossings(self, eyes: np.ndarray, ends: np.ndarray) -> np.ndarray:
-        """Part (N,) of each segment from an eye to an end at its first crossing of a surface.
-
-        Infinite for segments that cross none.
-        """
+        """Part (N,) of each segment at its first crossing of a surface; infinite if it crosses
+        none."""
         ways = ends - eyes
         lengths = np.linalg.norm(ways, axis=1)
         first = np.full(len(eyes), np.inf)
@@ -105,11 +103,7 @@ class CellGrid:
 
 
 def verdict(fit: Sim3, cloud: Cloud, scan: Scan, grid: CellGrid, noise: Noise) -> ScanVerdict:
-    """Evidence of a scan on a cloud.
-
-    Args:
-        noise: noise of distances from explained points to their surface.
-    """
+    """Evidence of a scan on a cloud at a similarity; `noise` of explained points' distances."""
     carried, nearest, off, gaps = residuals_of(fit, cloud, scan)
     variances = noise.variances(fit, cloud, scan, nearest)
     sigmas, size = np.sqrt(variances), cloud.size * fit.scale

@@ -27,11 +27,7 @@ _REFUSED = 3  # exit code of the process after it has printed a message
 
 
 def try_in_process(path: Path) -> None:
-    """Read a scan in another process, see `limited`.
-
-    Raises:
-        GsbaError: the file cannot be read, or the process crashed.
-    """
+    """Read a scan in another process, see `limited`; GsbaError if that fails or crashes."""
     found = subprocess.run(
         [sys.executable, "-P", "-c", _CHILD, json.dumps(sys.path), str(path.absolute())],
         stdin=subprocess.DEVNULL,

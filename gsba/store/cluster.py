@@ -59,11 +59,8 @@ _DISK_TIMEOUT_S = 30.0  # until a shared disk shows a file that another machine 
 def hire(
     client: "Client | None", frames: Path, settings: RefineSettings
 ) -> Callable[[Path], Workers]:
-    """Function that makes the workers of a run from the folder of its shards.
-
-    Args:
-        client: client of a scheduler; None = threads of this process.
-    """
+    """Function that makes a run's workers from the folder of its shards; no client: threads
+    here."""
 
     def make(folder: Path) -> Workers:
         if client is None:
@@ -75,12 +72,8 @@ def hire(
 
 @contextmanager
 def hired(client: "Client | None", out: Path, frames: FrameSet) -> Iterator["Cluster | None"]:
-    """Workers that write to `out`; the folder of their shards lies beside it within this context.
-
-    Args:
-        client: client of a scheduler; None = no workers.
-        out: folder on a disk that workers share; may be missing.
-    """
+    """Workers that write to `out`, which may be missing; within this context their shards' folder
+    lies beside it. Without a client there are none."""
     if client is None:
         yield None
         return

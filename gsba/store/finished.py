@@ -36,11 +36,7 @@ def load_run(out: Path, map_number: int = 1) -> tuple[Reconstruction, FrameSet]:
 def one_map(
     reconstruction: Reconstruction, frames: FrameSet, map_number: int, name: str
 ) -> tuple[Reconstruction, FrameSet]:
-    """Map of a reconstruction, 1 = the largest, and its frames.
-
-    Raises:
-        GsbaError: there is no such map.
-    """
+    """Map of a reconstruction, 1 = the largest, and its frames; GsbaError if there is none."""
     num = reconstruction.num_maps
     if not 1 <= map_number <= num:
         raise GsbaError(
@@ -50,11 +46,8 @@ def one_map(
 
 
 def load_cameras(out: Path, main: Reconstruction, frames: FrameSet, map_number: int = 1) -> Cameras:
-    """Cameras of a finished run's map, in that map's unit; one centre each if none has two lenses.
-
-    Raises:
-        GsbaError: the run found two lenses, but their file is missing.
-    """
+    """Cameras of a finished run's map, in that map's unit; one centre each if none has two
+    lenses."""
     if main.lens_baseline is None:
         return Cameras.of(ONE_CENTRE, frames)
     whole = load_stage(out, "reconstruction", Reconstruction)

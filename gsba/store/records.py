@@ -124,11 +124,7 @@ def load_record(path: Path, returns: type[T], mapped: bool = False) -> T:
 
 
 def load_keyed(path: Path, key: str, returns: type[T]) -> T | None:
-    """Read a record back if its info has this `key`; None if it has another.
-
-    Raises:
-        RecordError: as for `load_record`.
-    """
+    """Read a record back if its info has this `key`; None if it has another; see `load_record`."""
     with _reading(path) as archive:
         manifest = _manifest(archive)
         if manifest["info"].get("key") != key:
@@ -181,11 +177,7 @@ class _Archive(zipfile.ZipFile):
     """Archive whose arrays are read as a whole."""
 
     def array(self, name: str) -> np.ndarray:
-        """An array whose bytes agree with their checksum.
-
-        Raises:
-            ValueError: it is not of numbers, or longer or shorter than its header says.
-        """
+        """An array of numbers whose bytes agree with their checksum and header; else ValueError."""
         content = self.read(name)
         file = io.BytesIO(content)
         shape, fortran, dtype = _header(file)
@@ -295,11 +287,7 @@ def _join(place: str, name: str) -> str:
 
 
 def typed(tree: Any, returns: type[T]) -> T:
-    """Record without arrays from its JSON tree.
-
-    Raises:
-        RecordError: the tree is of another type.
-    """
+    """Record without arrays from its JSON tree; RecordError if it is of another type."""
     try:
         return _decode(tree, returns, None)
     except (ValueError, TypeError, AttributeError) as error:

@@ -97,11 +97,7 @@ class Workers(Protocol):
         ...
 
     def must_see(self, paths: Sequence[Path]) -> None:
-        """Refuse workers that do not see these paths.
-
-        Raises:
-            GsbaError: a worker does not see a path.
-        """
+        """Refuse workers that do not see these paths."""
         ...
 
 

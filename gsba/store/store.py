@@ -229,11 +229,8 @@ class RunStore:
         compute: Callable[[str], T],
         returns: type[T],
     ) -> "PerFrame[T]":
-        """Results of a per-frame stage that another run has stored, as results of this one.
-
-        Args:
-            files: frame name -> file in the folder of the other run; computed where it is missing.
-        """
+        """Results of a per-frame stage that another run has stored in files (frame name -> file),
+        as results of this one; computed where a file is missing."""
         folder, keys = self.root / STAGES / name, {}
         for frame, source in files.items():
             path = folder / f"{frame}.npz"
@@ -425,11 +422,8 @@ class _Missing:
 
 
 def load_stage(root: Path, name: str, returns: type[T]) -> T:
-    """Result of a finished stage of a run with any settings, for export and evaluate.
-
-    Raises:
-        GsbaError: `root` is no gsba run or holds links, or the stage is missing or damaged.
-    """
+    """Result of a finished stage of a run with any settings; GsbaError if `root` is no gsba run or
+    holds links, or the stage is missing or damaged."""
     if not is_run_folder(root):
         raise GsbaError(f"{root} is not a gsba run: it has no {MARKER}")
     refuse_foreign(root)

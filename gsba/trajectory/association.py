@@ -33,11 +33,7 @@ _MAX_TIME_DIFFERENCE_S = 1e-3  # largest time difference of entries of one frame
 
 
 def refuse_intervals(frame_times: np.ndarray, entries: np.ndarray) -> None:
-    """Refuse times (F,), (N,) that lie closer together than a clock resolves.
-
-    Raises:
-        GsbaError: two times are too close; the message names them.
-    """
+    """Refuse times (F,), (N,) that lie closer together than a clock resolves."""
     for owner, times in (("two frames are", frame_times), ("two poses are", entries)):
         if np.diff(times).min() <= _MIN_INTERVAL_S:
             at = float(times[np.argmin(np.diff(times))])

@@ -123,12 +123,8 @@ class ClockFit:
         return _product(self._at[before], _exp(share[..., None] * self._onward[before]))
 
     def cost(self, parameters: np.ndarray, sigma: float) -> float:
-        """Mean bounded residual of a step, from 0 to 1 (Geman and McClure, 1987).
-
-        Args:
-            parameters: (2,) shift and rate.
-            sigma: noise of rotations per axis.
-        """
+        """Mean bounded residual of a step, 0 to 1 (Geman and McClure, 1987), at (2,) shift and
+        rate."""
         return _bounded(self.residuals(parameters), sigma)
 
     def refine(
@@ -228,12 +224,8 @@ class ClockFit:
         return float(np.abs((one - other)[0] + (one - other)[1] * self.turns.ends).max())
 
     def candidates(self, start: np.ndarray, reach_s: float) -> Iterator[np.ndarray]:
-        """Parameters (2,) of the best clocks on a grid around a start, best first.
-
-        Args:
-            reach_s: largest tried difference of the offset. Steps of a fraction of a second are
-                searched less far: the size of the grid is bounded, whatever the times are.
-        """
+        """Parameters (2,) of the best clocks on a grid around a start, best first, up to `reach_s`
+        away; less far where steps take a fraction of a second: the size of the grid is bounded."""
         spacing = _SPACING_STEPS * self.turns.step
         rates = max(
             round(min(_MAX_RATE_DEVIATION * self.turns.ends[1] / spacing, _MAX_RATES / 2)), 1

@@ -56,11 +56,8 @@ class Convention:
         return cls(WXYZ in words, CAMERA_FROM_WORLD in words, rotation)
 
     def poses(self, read: Trajectory) -> Trajectory:
-        """A trajectory as world_T_cameras, quaternions in their order; camera axes as in the file.
-
-        Args:
-            read: from the file, as if it were in our convention.
-        """
+        """A trajectory read as if it were in our convention, as world_T_cameras in the file's
+        axes."""
         poses = read.world_T_rigs
         if self.w_first:
             poses = pose(w_first(poses[:, :3, :3]), poses[:, :3, 3])

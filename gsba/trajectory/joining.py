@@ -30,11 +30,8 @@ class SegmentAlignment:
 
 
 def join(coarse: CoarsePoses) -> tuple[CoarsePoses, tuple[SegmentAlignment, ...]]:
-    """Move the pieces of a trajectory into the world of the first, each by a guess.
-
-    Returns:
-        Poses in one world, and the alignment of each further piece, in order.
-    """
+    """Move the pieces of a trajectory into the world of the first, each by a guess; returns poses
+    in one world, and the alignment of each further piece, in order."""
     if coarse.segments is None:
         return coarse, ()
     poses, joints = coarse.world_T_rigs.copy(), []

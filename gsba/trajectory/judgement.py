@@ -187,12 +187,8 @@ def implausible_steps(
 
 
 def over_missing_frames(timestamps: np.ndarray, recordings: np.ndarray) -> np.ndarray:
-    """Steps (F - 1,) bool within recordings that take longer than usual there.
-
-    Args:
-        timestamps: (F,) seconds.
-        recordings: (F,) int, number of each frame's recording.
-    """
+    """Steps (F - 1,) bool within recordings (F,) int that take longer (seconds) than usual
+    there."""
     found = np.zeros(len(timestamps) - 1, bool)
     for number in np.unique(recordings):
         rows = np.flatnonzero(recordings == number)
@@ -203,12 +199,8 @@ def over_missing_frames(timestamps: np.ndarray, recordings: np.ndarray) -> np.nd
 
 
 def long_steps(world_T_rigs: np.ndarray, depth: float) -> np.ndarray:
-    """Steps (F - 1,) bool where those around are so long that the view changes much.
-
-    Args:
-        world_T_rigs: (F, 4, 4) poses in a map of the images.
-        depth: median distance of points, map units.
-    """
+    """Steps (F - 1,) bool between poses (F, 4, 4) among steps so long that the view changes much;
+    `depth`, the median distance of points, in map units."""
     lengths = np.linalg.norm(np.diff(world_T_rigs[:, :3, 3], axis=0), axis=1)
     around = [
         lengths[max(step - _STEPS_AROUND, 0) : step + _STEPS_AROUND + 1]

@@ -32,11 +32,7 @@ class TurnedAboutForwardError(GsbaError):
 
 
 def refuse_useless(coarse: CoarsePoses) -> None:
-    """Refuse a trajectory without information.
-
-    Raises:
-        GsbaError: all poses are identical.
-    """
+    """Refuse a trajectory without information: all poses are identical."""
     poses = coarse.world_T_rigs
     if len(poses) > 1 and np.abs(poses - poses[0]).max() < 1e-12:
         raise GsbaError(
@@ -80,11 +76,7 @@ def refuse_misread(coarse: CoarsePoses, found: Steps, settings: TwoViewLimits) -
 
 
 def refuse_misfit(coarse: CoarsePoses, found: Steps, settings: TwoViewLimits) -> None:
-    """Refuse a trajectory that most steps of the images contradict, with the likely reason.
-
-    Raises:
-        GsbaError: most steps contradict the images.
-    """
+    """Refuse a trajectory that most steps of the images contradict, with the likely reason."""
     refuse_misread(coarse, found, settings)
     judged, loose = _judged_steps(coarse, found), replace(settings, **_LOOSE_LIMITS)
     steps = _steps(coarse.world_T_rigs)

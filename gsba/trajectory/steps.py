@@ -40,13 +40,8 @@ class Steps:
 
 
 def image_steps(pairs: VerifiedPairs, keypoints: Keypoints) -> Steps:
-    """Relative poses of consecutive frames among verified pairs.
-
-    A step too short to have a direction takes that of the closest pairs over it.
-
-    Args:
-        pairs: pairs of frames at most a few apart.
-    """
+    """Relative poses of consecutive frames among verified pairs of frames at most a few apart; a
+    step too short to have a direction takes that of the closest pairs over it."""
     num = max(len(keypoints.starts) - 2, 0)
     f_T_nexts = np.tile(np.eye(4), (num, 1, 1))
     verified, sigmas = np.zeros(num, bool), np.full(num, np.inf)

@@ -53,12 +53,8 @@ def prove(
     settings: TwoViewLimits,
     max_parallax: float = MAX_PARALLAX_RAD,
 ) -> Turn | None:
-    """The largest part of the frames that turned on the spot; None = that is not proved.
-
-    Args:
-        pairs: pairs of frames, the closest first.
-        max_parallax: radians between bearings that a rotation explains.
-    """
+    """The largest part of the frames that turned on the spot, by pairs, the closest first; None =
+    not proved. A rotation explains bearings up to `max_parallax` radians apart."""
     frames, num_frames = pairs.matches.pairs, len(keypoints.starts) - 1
     rotations, counts = np.empty((len(frames), 3, 3)), np.empty((len(frames), 2), int)
     for p, pair in enumerate(frames):
