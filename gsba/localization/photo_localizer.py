@@ -358,7 +358,6 @@ def _on_patches(
 def _judged(
     localizer: Localizer, name: str, fitted: PoseFit, number: int, seen: PointSightings, camera: int
 ) -> LocalizedFrame:
-    """A photo with its pose, if that is determined."""
     pose, inliers = fitted.world_T_rigs[number], fitted.inliers[number]
     covariance = fitted.covariances[number]
     determined = is_determined(pose, covariance, seen.points_world[inliers])

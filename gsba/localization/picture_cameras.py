@@ -109,7 +109,6 @@ class PictureCameras:
         return [c for c, kind in each if self.chosen in (None, c) and fits(kind)]
 
     def _only(self, alike: list[int], told: str) -> int:
-        """The chosen camera, or the only one that is alike."""
         if self.chosen is not None:
             return self.chosen
         if len(alike) == 1:
@@ -132,7 +131,6 @@ def _sizes(kind: PictureFormat) -> tuple[tuple[int, int], ...]:
 
 
 def _camera_of(root: Path, frames: FrameSet, recording: str) -> int:
-    """Camera of a recording."""
     rows = frames.recordings.get(recording)
     if rows is None:
         known = ", ".join(frames.recordings) or "one recording alone"

@@ -126,7 +126,6 @@ def _size_of(path: Path) -> tuple[int, int] | None:
 
 
 def _frames_of_several_images(folder: Path, cameras: PictureCameras) -> list[Picture]:
-    """Cube faces, tracks or raw fisheyes."""
     found = _scanned(folder, cameras)
     camera = next(iter(found))
     if len(found) > 1:

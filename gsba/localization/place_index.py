@@ -77,7 +77,6 @@ def index_path(root: Path) -> Path:
 
 
 def _key(map_: RunMap) -> str:
-    """Digest of all that the index depends on."""
     try:
         info = read_info(map_.root / STAGES / "reconstruction.npz")
     except RecordError as error:  # it was read a moment ago
@@ -86,7 +85,6 @@ def _key(map_: RunMap) -> str:
 
 
 def _make(map_: RunMap) -> PlaceIndex:
-    """Vocabulary, and descriptors of all keyframes."""
     num = len(map_.frames)
     frames = SearchableFrames(lambda f: map_.load_keyframe(f).features, axes=map_.axes)
     words = visual_words(frames, num, map_.settings.seed, Threads(1))

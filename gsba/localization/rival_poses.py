@@ -1,9 +1,5 @@
-"""The choice among poses of a picture at several places that look like it.
-
-In a hall whose bays repeat, the matches with the map agree on one pose for each bay. Fitted to all
-that the map has around each, the true one shows what is expected around, and explains keypoints
-that the others leave: what does not repeat.
-"""
+"""The choice among poses of a picture at several places that look like it: the true one shows what
+is expected around, and explains keypoints that the others leave."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

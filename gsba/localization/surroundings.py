@@ -1,11 +1,6 @@
-"""Test of a localised pose by the points of the map that a picture taken there should show.
-
-In a hall whose bays or sides repeat, hundreds of matches can agree on a pose where the picture was
-not taken, with a small covariance. A picture at its true pose shows the points of the nearest
-keyframes at the rate at which frames of the map show those of one another. At a look-alike it shows
-few of them, and none in some directions. `gsba.loop_closure.join_evidence` tests joins of maps by
-the same evidence.
-"""
+"""Test of a localised pose by the points of the map that a picture taken there should show: at a
+look-alike it shows few of them, and none in some directions. See
+`gsba.loop_closure.join_evidence`."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,10 +1,5 @@
-"""Maps on either side of a short break of a recording, across which the camera moved on.
-
-Similarities of both maps follow from single pairs of frames across the break. Two overlapping
-frames give their relative rotation, the direction from one to the other, and distances of points in
-units of that step. Points of one of the maps give the step's length in its unit; so both maps
-together give the ratio of their units.
-"""
+"""Maps on either side of a short break of a recording, across which the camera moved on: pairs of
+frames give the step across in either map's unit, and so the ratio of the units."""
 
 from dataclasses import dataclass, replace
 

@@ -1,15 +1,8 @@
-"""Evidence for and against a join of two parts of a map.
+"""Evidence for and against a join of two parts of a map (docs/method.md, "When two places are one").
 
-If a join is true, frames of one part see points of the other part that lie on surfaces they already
-know nearby. A repeated poster, window or arch brings matches for a false join, but not the rest of
-the place. So points that are found again are weighed against those that are not, relative to the
-rate at which points are found again within parts under the same change of view. Points of a small
-cell of space count as one witness, and witnesses of one region have correlated errors. Weighed by
-their numbers, points must confirm a join, too.
-
-Homes of one plan share walls, doors and furniture, and the bays of a hall their columns. What is
-found there matches by chance, anywhere around where it is expected, or stands at a place that is
-only similar: how near a point is to where it is expected counts, too.
+Points that are found again are weighed against those that are not, relative to the rate within
+parts under the same change of view; how near a point is to its place counts, too. Points of a small
+cell of space are one witness, and witnesses of one region have correlated errors.
 """
 
 from collections.abc import Sequence

@@ -1,7 +1,4 @@
-"""The test of joins: evidence from the frames around a meeting on a proposed similarity.
-
-Joins of maps and loops within one map are tested alike: evidence, and rival proposals.
-"""
+"""The test of joins of maps and of loops: evidence from the frames around a meeting, and rivals."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -102,7 +99,6 @@ class JoinTest:
         return join_evidence.weigh(self.context, places, (rows, inside), usual, self.depth)
 
     def _rates(self, frames: np.ndarray) -> Rates:
-        """Usual rates of the recordings that frames are of; measured once."""
         owners = np.unique(self.owners[frames])
         key = tuple(owners.tolist())
         if key not in self._usual:
@@ -155,5 +151,4 @@ class JoinTest:
         return Judged(proposal, evidence)
 
     def _leads_to(self, proposal: Proposal, known: Sequence[Proposal]) -> bool:
-        """True if a proposal is for the place of a known one."""
         return any(alike(proposal, other, self.poses, self.depth) for other in known)

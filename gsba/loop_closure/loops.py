@@ -1,9 +1,5 @@
-"""Loop closure: candidates by place recognition, accepted by geometric consistency.
-
-Frames with similar global descriptors (`gsba.loop_closure.retrieval`) are matched, and every loop
-is tested against the map: repeated structure makes perfect loops to the wrong place, but those need
-more drift than the path can have, or contradict one another.
-"""
+"""Loop closure: candidates by place recognition, tested against the map. Perfect loops to the wrong
+place need more drift than the path can have, or contradict one another."""
 
 import logging
 from dataclasses import dataclass
@@ -207,7 +203,6 @@ def _max_step_drifts(
 def _measured_loops(
     verified: VerifiedPairs, keypoints: Keypoints, solved: Solution, seed: int
 ) -> list[Loop]:
-    """Loops, measured from map points that both frames of a pair observe."""
     known = solved.points_by_keypoint(keypoints)
     loops = []
     for p, (f0, f1) in enumerate(verified.matches.pairs.tolist()):

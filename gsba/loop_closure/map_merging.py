@@ -1,10 +1,7 @@
 """Map merging: parts of a map that no verified step connects, joined where they overlap.
 
-A pause of the video, a restarted SLAM or frames without texture leave maps with a scale and a
-world of their own. Whole panoramas with similar global descriptors are matched; points that both
-maps know give the similarity between them, accepted if several pairs agree. A single frame without
-a map gets its pose from points of a map. Parts without overlap keep the trajectory's pose where it
-has one, and become maps of their own otherwise.
+Points that both know, of frames that look alike, give the similarity; single frames get their pose
+from points of a map. Parts without overlap keep the trajectory's pose, or become maps of their own.
 """
 
 import logging

@@ -1,8 +1,5 @@
-"""Place recognition by global descriptors of panoramas, invariant to heading.
-
-Frames are compared by vectors of locally aggregated descriptors (VLAD: Jegou et al., CVPR 2010;
-normalised word by word as in Arandjelovic and Zisserman, CVPR 2013) over whole panoramas.
-"""
+"""Place recognition by global descriptors of panoramas, invariant to heading: VLAD (Jegou et al.,
+CVPR 2010), normalised word by word (Arandjelovic and Zisserman, CVPR 2013)."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

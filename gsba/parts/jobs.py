@@ -1,8 +1,6 @@
-"""Passes over parts where these lie: files in, files out, the same bytes whoever computes.
-
-A version is a number of accepted or tentative poses. `points-V.npz` holds a part's landmarks at a
-version, `equations-V.npz` its normal equations there.
-"""
+"""Passes over parts where these lie: files in, files out, the same bytes whoever computes. At
+version V, of accepted or tentative poses, `points-V.npz` holds landmarks, `equations-V.npz` normal
+equations."""
 
 import threading
 from collections.abc import Mapping, Sequence

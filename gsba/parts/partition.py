@@ -1,9 +1,6 @@
-"""Parts of a map: its frames, cut where few of them see across.
-
-A map is bisected again and again (nested dissection: George, 1973). Each cut is the smallest set
-of frames that covers all pairs between two halves: a minimum vertex cover of a bipartite graph,
-found from a maximum matching (Koenig, 1931).
-"""
+"""Parts of a map, bisected again and again (nested dissection: George, 1973). Each cut is the
+smallest set of frames that covers all pairs between two halves: a minimum vertex cover of a
+bipartite graph, found from a maximum matching (Koenig, 1931)."""
 
 from dataclasses import dataclass
 

@@ -339,7 +339,6 @@ def _vertical(state: State, result: Reconstruction) -> np.ndarray | None:
 
 
 def _reconstruct_rotations(state: State) -> Reconstruction:
-    """Rotations alone, of a camera that stayed in one place."""
     run, prior, observed = state.run, state.prior, state.observed
     least, poses = MIN_OBSERVATIONS, prior.start().world_T_rigs
     turn = prior.trust.turn

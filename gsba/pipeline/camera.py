@@ -1,8 +1,4 @@
-"""The camera of a run: where its lenses are, what they are, and how their rows are read.
-
-Two sources tell of it: features, matched before any gate has taken what a wrong camera threw off,
-and patches, aligned to a part of a pixel. `_Rays` holds either; an estimator takes these.
-"""
+"""The camera of a run: where its lenses are, what they are, and how their rows are read."""
 
 import logging
 from collections.abc import Callable, Sequence
@@ -152,7 +148,6 @@ def _with_stitch_radii(start: State, stitched: Sequence[int], prefix: str) -> St
 
 
 def _with_lenses(state: State, lenses: dict[int, Lenses]) -> State:
-    """The state with other lenses of some cameras, and its keypoints as their rays."""
     for camera, own in lenses.items():
         state = _through(state, camera, own).with_lenses(camera, own)
     return state
@@ -183,7 +178,6 @@ def _on_trial(
 
 
 def _through(state: State, camera: int, lenses: Lenses) -> State:
-    """The state with keypoints of one camera as rays of other lenses."""
     every = list(state.observed.cameras.lenses)
     every[camera] = lenses
     return state.through(state.observed.cameras.with_lenses(every))
@@ -482,7 +476,6 @@ def _axes_known(run: Run, camera: int) -> bool:
 
 
 def _raw_cameras(run: Run) -> list[int]:
-    """Cameras whose frames are raw fisheyes."""
     return [c for c, kind in enumerate(run.frames.formats) if kind.fisheyes is not None]
 
 
@@ -494,7 +487,6 @@ def _named(run: Run, stage: str, camera: int) -> str:
 
 
 def _settings_of_cameras(run: Run) -> list[object]:
-    """Settings that estimates of the cameras rest on."""
     found = list[object]()
     for number in range(len(run.frames.formats)):
         camera = run.settings_of(number)

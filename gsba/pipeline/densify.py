@@ -1,8 +1,5 @@
-"""More frames of a video where the map is weak: those between the frames that it is weak between.
-
-A door, a turn or a dark corner may want more frames than were chosen. The video has them, and its
-odometry has a pose for each. They strengthen the map, and stay out of datasets unless asked for.
-"""
+"""More frames of a video between those where the map is weak; they stay out of datasets unless
+asked for."""
 
 import logging
 from collections.abc import Callable

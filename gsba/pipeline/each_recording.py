@@ -1,10 +1,6 @@
-"""Several recordings: the neighbours of each, matched and judged alone, and their combination.
-
-Every recording has a clock, a trajectory with a world and a scale, and a gyro of its own; no frame
-of one is a neighbour in time of a frame of another. So the start of the front end sees them one by
-one. What it finds is laid back to back, each recording a part of the map that nothing ties to the
-others yet: map merging joins them by the places that they share.
-"""
+"""Several recordings, each with a clock, a trajectory and a gyro of its own, matched and judged
+alone; laid back to back, they are parts of a map that nothing ties together yet: map merging joins
+them."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -55,7 +51,6 @@ def _match(state: State, number: int) -> State:
 
 
 def _renumbered(pairs: VerifiedPairs, first: int) -> VerifiedPairs:
-    """Pairs whose frames are numbered from `first` on instead of from 0."""
     moved = (pairs.matches.pairs + first).astype(pairs.matches.pairs.dtype)
     return replace(pairs, matches=replace(pairs.matches, pairs=moved))
 

@@ -1,7 +1,5 @@
-"""A finished run as other runs start from it: its recordings, its map, and the world of its result.
-
-`keep` stores the map at the end of every run; `FinishedRun.load` reads it back with the rest.
-"""
+"""A finished run as other runs start from it: its recordings, its map, and the world of its
+result."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -194,7 +192,6 @@ def _result_of(result: Reconstruction, rows: np.ndarray, groups: np.ndarray) -> 
 
 
 def _features_file(root: Path, name: str) -> Path:
-    """File of a frame's features, the last ones that were extracted."""
     paths = [root / STAGES / stage / f"{name}.npz" for stage in _FEATURES]
     return next((path for path in paths if path.is_file()), paths[-1])
 
@@ -240,7 +237,6 @@ def _map_of(map_: Map, rows: np.ndarray) -> Map:
 
 
 def _camera_of(found: FoundCamera, rows: np.ndarray) -> FoundCamera:
-    """The camera of frames `rows` (F',)."""
     centres, readout = found.centres, found.readout
     return replace(
         found,

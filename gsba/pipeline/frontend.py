@@ -61,7 +61,6 @@ def extract(run: Run) -> State:
 
 
 def _enlarged(settings: RefineSettings) -> RefineSettings:
-    """Settings with as many keypoints as weak frames get."""
     most = settings.weak_frames.max_per_face
     more = {"max_per_face": most, "contrast_threshold": _WEAK_CONTRAST_THRESHOLD}
     return settings.model_copy(update={"features": settings.features.model_copy(update=more)})
@@ -355,7 +354,6 @@ def close_loops(state: State) -> State:
 
 
 def _match_loops(state: State, name: str) -> VerifiedPairs:
-    """Verified matches of frames that met the same place again."""
     run, context = state.run, state.observed.context
     compute = partial(correspondences.match_loops, context, state.solution)
     return run.stage(name, run.matching_key(), compute, VerifiedPairs)

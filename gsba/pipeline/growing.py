@@ -224,7 +224,6 @@ class _Place:
 
 
 def _joined(store: RunStore, runs: Sequence[FinishedRun]) -> tuple[State, JointMaps]:
-    """Maps of runs moved to where they meet."""
     maps = JointMaps.of(runs)
     return map_joining.register(map_joining.begin(store, maps, runs[0].settings), maps), maps
 
@@ -259,7 +258,6 @@ def _refuse_known(run: FinishedRun, recordings: Sequence[Recording], names: Sequ
 
 
 def _refuse_common(runs: Sequence[FinishedRun]) -> None:
-    """Refuse runs that have a recording in common."""
     known: dict[Path, FinishedRun] = {}
     for run in runs:
         for what, path in run.origin.items():

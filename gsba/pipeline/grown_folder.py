@@ -1,7 +1,5 @@
-"""Folders of runs that grow: written beside, complete, then put in place.
-
-Until the last step the run that grows is only read; it is kept, under another name.
-"""
+"""Folders of runs that grow: written beside, complete, then put in place; the run before is
+kept."""
 
 import logging
 import os

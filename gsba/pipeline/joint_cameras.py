@@ -1,9 +1,5 @@
-"""Cameras of several runs laid together: which are one camera, and the estimate of each for all.
-
-Cameras of different runs are one where one camera in one mode can have made their pictures, unless
-their models have different names. Raw fisheyes must have been read by one calibration, which the
-observations of both are directions by. The run that knows most of a camera lends its estimate.
-"""
+"""Cameras of several runs: which are one (of one mode and calibration, without two model names),
+and the estimate of each by the run that knows most of it."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -189,7 +185,6 @@ def _one_model(one: CameraSettings, other: CameraSettings) -> bool:
 
 
 def _without_model(settings: CameraSettings) -> CameraSettings:
-    """Settings that say nothing of the camera's model."""
     metric = isinstance(settings.stitch_radius_m, float)
     changes = _UNKNOWN_MODEL | ({"stitch_radius_m": None} if metric else {})
     return settings.model_copy(update=changes)

@@ -1,8 +1,4 @@
-"""Maps of finished runs laid back to back as one state, which nothing ties together yet.
-
-Every run's map is carried to the world of its result. A camera that several runs share is that of
-the run which knows most of it; lengths of the others are such that its lenses are as far apart.
-"""
+"""Maps of finished runs laid back to back in the worlds of their results; nothing ties them yet."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -94,7 +90,6 @@ def joined_keypoints(parts: Sequence[Keypoints]) -> Keypoints:
 
 
 def _check_settings(runs: Sequence[FinishedRun]) -> None:
-    """Refuse runs whose features cannot be compared."""
     first = runs[0].settings
     for run in runs[1:]:
         for name in ("features", "cubemap"):
@@ -106,7 +101,6 @@ def _check_settings(runs: Sequence[FinishedRun]) -> None:
 
 
 def _frames_of(runs: Sequence[FinishedRun], cameras: JointCameras) -> FrameSet:
-    """Frames of all runs, one recording after the other."""
     recordings: dict[str, FrameSet] = {}
     for run in runs:
         for name, own in run.recordings().items():
@@ -141,7 +135,6 @@ def _moves(runs: Sequence[FinishedRun], cameras: JointCameras) -> tuple[Sim3, ..
 
 
 def _moved(run: FinishedRun, move: Sim3) -> Solution:
-    """The solution of a run in another world."""
     solution = run.map.solution
     landmarks = replace(
         solution.landmarks, points_world=move.points(solution.landmarks.points_world)
@@ -151,7 +144,6 @@ def _moved(run: FinishedRun, move: Sim3) -> Solution:
 
 
 def _back_to_back(solutions: Sequence[Solution], starts: Sequence[int]) -> Solution:
-    """Solutions as one, each part in its own world."""
     begins = np.cumsum([0, *(one.landmarks.tracks.num_points for one in solutions)])
     tracks = [one.landmarks.tracks for one in solutions]
     points = [one.points + begin for one, begin in zip(tracks, begins, strict=False)]

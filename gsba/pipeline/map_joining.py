@@ -1,10 +1,6 @@
-"""Finished maps made one: joined where they meet, tied by points of both, and solved together.
-
-What a run has solved is where this starts: its poses, its camera, its points with the observations
-that patches were aligned to. New are only the points that frames of different parts share. These
-are matched by features, aligned to patches in all frames that show them, and replace the points of
-either part that they are the same as.
-"""
+"""Finished maps made one: joined where they meet, tied by points of both, and solved together. Only
+points that frames of different parts share are new: they replace those of either part that they
+are."""
 
 import logging
 from collections.abc import Sequence
@@ -320,7 +316,6 @@ def _solved(
 
 
 def _with_poses_of(state: State, solved: State) -> State:
-    """The state with the poses and the camera of another one."""
     poses = solved.solution.world_T_rigs
     moved = state.with_solution(replace(state.solution, world_T_rigs=poses))
     unread = all(one.readout is None for one in solved.map.cameras)
@@ -469,7 +464,6 @@ def _of_several(tracks: Tracks, parts: np.ndarray) -> np.ndarray:
 
 
 def _sighted(state: State) -> Sighted:
-    """The observations of the map's points."""
     map_ = state.map
     landmarks = map_.solution.landmarks
     seen = landmarks.tracks, landmarks.counts, map_.normals_rig

@@ -131,7 +131,6 @@ def _write_trajectories(store: RunStore, shown: FrameSet, main: Reconstruction) 
 
 
 def _reasons(prior: Prior) -> tuple[str, ...]:
-    """Why maps were not joined, the largest first."""
     return () if prior.merged is None else prior.merged.reasons
 
 
@@ -153,7 +152,6 @@ def _write_calibrations(state: State, result: Reconstruction, cameras: Cameras) 
 def _calibration(
     rig: Rig, state: State, result: Reconstruction, lenses: Lenses, number: int
 ) -> dict[str, Any]:
-    """The content of calibration.json of one camera."""
     baseline, metres = state.run.settings.camera.baseline(), None
     if baseline is not None and result.lens_baseline is not None:
         metres = metres_per_unit(result.lens_baseline, baseline)[0]
@@ -164,7 +162,6 @@ def _calibration(
 
 
 def _report(state: State, result: Reconstruction) -> dict[str, Any]:
-    """The content of report.json."""
     run, rounds = state.run, state.run.journal.rounds
     solver = [{"stage": name, "rounds": some} for name, some in rounds.items()]
     costs, again_s = tuple(run.store.records.values()), run.store.seconds_again
@@ -240,7 +237,6 @@ def _of_camera(
 
 
 def _of_cameras(state: State, result: Reconstruction) -> list[dict[str, Any]]:
-    """The report of each of several cameras: its recordings, its pictures and its lenses."""
     frames = state.run.frames
     every = list[dict[str, Any]]()
     for number, kind in enumerate(frames.formats):
@@ -262,7 +258,6 @@ def _gyro_steps_used(state: State) -> float | None:
 
 
 def _of_families(state: State) -> dict[str, Any]:
-    """The report of each family of GPS, of packages and of the caller, by its name."""
     families = state.run.families
     snapshot = families.snapshot(state.solution, state.prior.parts)
     reports = {family.name: plain(family.report(snapshot)) for family in families.members}

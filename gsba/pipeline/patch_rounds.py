@@ -111,7 +111,6 @@ def carried(state: State, sighted: Sighted, solved: Solution, keypoints: Keypoin
 
 
 def _straighten(state: State, sighted: Sighted, number: int) -> State:
-    """Remove the stitching field that all frames share."""
     run, map_, settings = state.run, state.map, state.run.settings
     looked_for = number == 1 or map_.field
     stitched = len(run.frames.formats) == 1 and run.frames.format.layout in ("erp", "eac")

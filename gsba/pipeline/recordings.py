@@ -231,7 +231,6 @@ def _path(given: Path | str | None) -> Path | None:
 
 
 def _named(name: str, error: GsbaError) -> GsbaError:
-    """An error of one recording, with the recording's name."""
     return GsbaError(f"recording '{name}': {error}")
 
 

@@ -211,7 +211,6 @@ def _with_fetched(
 
 
 def _begin(store: RunStore, settings: RefineSettings, chosen: merging.Choice, start: Start) -> Run:
-    """A run on frames that are masked as asked."""
     journal, frames = Journal(), merging.before(store, start.frames, chosen)
     if chosen.distractors:
         frames = _without_distractors(store, settings, replace(start, frames=frames), journal)
@@ -369,7 +368,6 @@ def _map_all(state: State) -> State:
 
 
 def _adjust_chain(state: State) -> State:
-    """Adjust the chain of relative poses, without steps less plausible than the trajectory's."""
     gates = state.run.settings.rounds.chain
     chain = backend.adjust(state, "chain", gates)
     kept = frontend.drop_implausible_steps(chain)
@@ -377,7 +375,6 @@ def _adjust_chain(state: State) -> State:
 
 
 def _merge_maps(state: State) -> State:
-    """Join the parts of the map that no step ties together, and match across them."""
     parts = backend.separate_parts(state)
     if parts is None:
         return state
@@ -400,7 +397,6 @@ def _add_keypoints_where_weak(state: State) -> State:
 
 
 def _match_from_itself(state: State, prefix: str = "") -> State:
-    """Match the map's points in all frames, and adjust."""
     rounds, patches = state.run.settings.rounds, state.run.settings.patches.rounds
     for n in range(1, rounds.map_passes + 1):
         state = frontend.match_known_points(state, f"{prefix}everywhere{n}")

@@ -1,10 +1,6 @@
-"""GPS fixes that cameras record into their videos.
-
-Fixes of Insta360 are in the trailer of the file. Fixes of GoPro are unpacked by `telemetry_parser`:
-GPMF packets of about a second hold them as GPS5 (up to HERO10 and MAX, with one DOP and one state
-of the receiver a packet) or as GPS9 (later, with one for each fix): see
-github.com/gopro/gpmf-parser.
-"""
+"""GPS fixes that cameras record into their videos: Insta360 in the file's trailer, GoPro in packets
+of about a second, as GPS5 (one DOP and state a packet) or GPS9 (one for each fix), unpacked by
+`telemetry_parser`; see github.com/gopro/gpmf-parser."""
 
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,8 +1,4 @@
-"""Placement of an exported world: upright, metric, by GPS, by true poses or by a scan.
-
-A run keeps the world and scale of its SLAM trajectory. One similarity transforms the world of an
-export; `transform.json` in it states the similarity and its inverse.
-"""
+"""Placement of an exported world: upright, metric, by GPS, by true poses or by a scan."""
 
 import dataclasses
 import logging

@@ -1,7 +1,4 @@
-"""Reading of scans: clouds and meshes by open3d, LAS and LAZ by laspy; normals of clouds.
-
-Only this module imports open3d.
-"""
+"""Reading of scans: clouds and meshes by open3d (imported here alone), LAS and LAZ by laspy."""
 
 import logging
 import struct

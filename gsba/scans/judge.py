@@ -1,8 +1,5 @@
-"""Evidence of a scan for and against a cloud's placement: surfaces at points and along rays.
-
-A point on a surface of the scan is explained. A point is contradicted if its ray crosses a surface
-before it, or close behind it. Points where the scan has no surface are neutral.
-"""
+"""Evidence of a scan for and against a cloud's placement: points on a surface are explained, those
+whose ray crosses one before them or close behind are contradicted, others are neutral."""
 
 from dataclasses import dataclass
 

@@ -1,9 +1,5 @@
-"""Candidate placements of a cloud in a scan, by the main axes of their surfaces.
-
-The planes of rooms give both the same main axes, along which the profiles of surfaces correlate at
-one scale and shift. All rotations that map axes to axes are tried, so that rooms with a symmetry
-give several candidates.
-"""
+"""Candidate placements of a cloud in a scan, by the main axes of their surfaces, along which
+profiles correlate at one scale and shift; all rotations that map axes to axes are tried."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace

@@ -1,7 +1,4 @@
-"""Trial reading of scans in a separate process, as damaged files crash the reading libraries.
-
-The calling process reads a file again that passed.
-"""
+"""Trial reading of scans in a separate process, as damaged files crash the reading libraries."""
 
 import json
 import os

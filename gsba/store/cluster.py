@@ -1,9 +1,5 @@
-"""Workers of a Dask scheduler, for `gsba.store.shards`, and recovery from their failures.
-
-Workers get paths only, and share the run's disk. A shard's result is a file that is written
-atomically and does not depend on the worker, so that a worker that dies, disconnects or is slow
-costs only time. The scheduler gets a window of a job's shards at a time.
-"""
+"""Workers of a Dask scheduler, for `gsba.store.shards`, and recovery from their failures: results
+are files that do not depend on the worker, so that one that dies or is slow costs only time."""
 
 import importlib
 import json
@@ -141,7 +137,6 @@ def connect(address: str) -> "Client":
 
 
 def _scheduler_address(address: str) -> str:
-    """Address that a scheduler listens at: `address`, or the one in its file."""
     found: Any = address
     if address.endswith(".json"):
         found = json.loads(Path(address).read_text(encoding="utf-8"))
@@ -344,7 +339,6 @@ class Cluster:
             shard.futures.append(self._submit(shard, others))
 
     def _load(self, shard: _Shard, returns: Any) -> tuple[Any, ...]:
-        """Results that a worker has stored, once this machine sees the file."""
         end = time.monotonic() + _DISK_TIMEOUT_S
         while True:
             found = shards.load_shard(shard.path, returns)

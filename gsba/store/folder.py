@@ -1,8 +1,5 @@
-"""Run folders: their inputs, their lock, and the list of files that gsba wrote.
-
-`RUN/gsba.json` names the inputs of the run and lists the files that gsba wrote, so that a folder
-of other content is refused and `--fresh` deletes only files of gsba.
-"""
+"""Run folders: their lock, their inputs, and the list of files that gsba wrote (`gsba.json`), so
+that other content is refused, and kept by `--fresh`."""
 
 import json
 import os

@@ -1,10 +1,6 @@
-"""Parallel work on frames: one interface for threads of this process and remote workers.
-
-A job is a set of items that are computed independently, in any order. Remote workers get a shard:
-the path of a file in the run's folder that holds a block of items with their inputs. They write the
-results beside it, and send back their name and the cost. A shard is named after its content, so
-that a finished block is never computed again.
-"""
+"""Parallel work on frames: one interface for threads of this process and remote workers. A shard is
+a file with a block of a job's items and their inputs, named after its content, so that a finished
+one is never computed again."""
 
 import hashlib
 import hmac

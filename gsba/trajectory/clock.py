@@ -1,11 +1,8 @@
-"""The trajectory's clock against the video's: offset and rate, estimated from camera rotations.
+"""The trajectory's clock against the video's: offset and rate by which it rotates as the images do.
 
-Relative rotations of neighbouring frames come from images alone. The trajectory must rotate by as
-much between the same two instants, whatever its drift and scale. Angular velocities are
-compared over a grid of offsets and rates first; the best few are then refined on relative
-rotations under a robust loss (cf. the temporal calibration of Furgale et al., IROS 2013). Another
-clock than the given one is accepted only if rotations determine it, no third clock fits nearly as
-well, and it explains the images markedly better.
+Angular velocities are compared over a grid; the best few are refined on relative rotations under a
+robust loss (cf. Furgale et al., IROS 2013). Another clock than the given one must be determined,
+have no rival, and explain the images markedly better.
 """
 
 from dataclasses import dataclass, replace

@@ -283,7 +283,6 @@ class ClockFit:
         return np.diag([0, _RATE_SIGMA**-2])[:free, :free]
 
     def _total(self, residuals: np.ndarray, parameters: np.ndarray, sigma: float) -> float:
-        """The cost that `refine` minimises."""
         squares = np.sum(residuals**2, axis=1) / (_LOSS_WIDTH_SIGMAS * sigma) ** 2
         return float(_LOSS_WIDTH_SIGMAS**2 * np.log1p(squares).sum()) + float(
             (parameters[1] - 1) ** 2 / _RATE_SIGMA**2

@@ -1,9 +1,6 @@
-"""Pieces of a trajectory, each with an origin and a scale of its own, moved into one world.
-
-A trajectory does not relate its pieces. Each further one is placed by a guess, at a constant pace
-over the gap, so that every frame has an initial pose. Points that both pieces share join them later
-(`gsba.loop_closure.map_merging`), or they stay maps of their own.
-"""
+"""Pieces of a trajectory, each with an origin and a scale of its own, moved into one world by
+guesses at a constant pace; points that they share join them later
+(`gsba.loop_closure.map_merging`)."""
 
 from dataclasses import dataclass, replace
 

@@ -1,10 +1,5 @@
-"""Checks of the trajectory's steps against images, and initial poses that follow both.
-
-Consecutive frames overlap so much that their relative rotation and direction of
-motion can be estimated from images alone. The length of a step, which two views leave open, follows
-from its neighbours': a point that two steps see must be equally far in both. Steps of the
-trajectory that images contradict lose their prior, and initial poses are chained past them.
-"""
+"""Checks of the trajectory's steps against images: those that images contradict lose their prior,
+and initial poses are chained past them."""
 
 import logging
 from dataclasses import dataclass, replace

@@ -130,7 +130,6 @@ def _contradiction_text(share: float, judged: np.ndarray) -> str:
 
 
 def _steps(poses: np.ndarray) -> np.ndarray:
-    """Relative poses (F - 1, 4, 4) of consecutive ones."""
     return inverse(poses[:-1]) @ poses[1:]
 
 
@@ -163,12 +162,10 @@ def _pass(words: str) -> str:
 
 
 def _in_system(system: str) -> str:
-    """The reading of a trajectory in another system of camera axes."""
     return f"{_axes(system)}: {_pass(system)}"
 
 
 def _axes(system: str) -> str:
-    """A clause that names camera axes by their ways."""
     return "in axes of " + ", ".join(map(" ".join, zip("xyz", system.split("-"), strict=True)))
 
 
@@ -182,7 +179,6 @@ def _in_axes(steps: np.ndarray, ours_R_theirs: np.ndarray) -> np.ndarray:
 def _agreeing_share(
     steps: np.ndarray, found: Steps, judged: np.ndarray, settings: TwoViewLimits
 ) -> float:
-    """Share of the judged steps that agree with the images."""
     turned, off = step_errors(steps, found)
     agree = turned < np.deg2rad(settings.max_rotation_deg)
     agree &= off < np.deg2rad(settings.max_direction_deg)

@@ -90,7 +90,6 @@ def _lost_identity(trajectory: Trajectory, first: int, last: int, pace: float) -
 
 
 def _lost_repeat(trajectory: Trajectory, first: int, last: int, pace: float) -> bool:
-    """True if a pose is repeated from `first` to `last` as frames were lost."""
     if last + 1 == len(trajectory.timestamps):
         return True
     steady, sudden = (_speed(trajectory, row, last + 1) for row in (first, last))

@@ -1,9 +1,6 @@
-"""Relative poses of consecutive frames, from images alone.
-
-Such frames overlap so much that their relative rotation and direction of motion can be estimated
-from the images. The length of a step, which two views leave open, follows from its neighbours':
-a point common to two steps must have the same depth in both.
-"""
+"""Relative poses of consecutive frames, from images alone. The length of a step, which two views
+leave open, follows from its neighbours': a point common to two steps must have the same depth in
+both."""
 
 from dataclasses import dataclass
 

@@ -1,10 +1,6 @@
-"""Proof that a camera only turned: rotations that explain matches, over one and several frames.
-
-That no translation is found proves nothing where few matches are left to show one. A turn is proved
-by the reverse: most matches of a pair agree on one rotation, in which chance has no part, and so do
-most matches of all pairs one, two, four and eight frames apart. Frames that no such pair ties to
-the others have no rotation.
-"""
+"""Proof that a camera only turned: most matches of a pair agree on one rotation, in which chance
+has no part, and so do most matches of all pairs one, two, four and eight frames apart. That no
+translation is found would prove nothing."""
 
 from dataclasses import dataclass
 
