@@ -1,7 +1,7 @@
 """Factor block of pictures that show known points: poses, and cameras that pictures share."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
@@ -40,18 +40,6 @@ class PointSightings:
     # bearing's tangent_basis, or pixels^2
     origins_rig: np.ndarray | None = None  # (N, 3) origins of rays, rig frame; None = the centre
     camera: int | None = None  # number of a photo's camera; None = a panorama
-
-    def taken(self, rows: np.ndarray) -> "PointSightings":
-        """Sightings `rows` (M,), int or bool."""
-        origins = self.origins_rig
-        return replace(
-            self,
-            points_world=self.points_world[rows],
-            covariances=self.covariances[rows],
-            measured=self.measured[rows],
-            spreads=self.spreads[rows],
-            origins_rig=None if origins is None else origins[rows],
-        )
 
 
 @dataclass(frozen=True, slots=True)

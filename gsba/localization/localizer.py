@@ -39,6 +39,7 @@ from gsba.localization.surroundings import Surroundings, open_rates
 from gsba.log import GsbaError
 from gsba.matching.guided_search import Gate, match_pair, searchable
 from gsba.types import Features, FrameSet, Keypoints, PictureFormat
+from gsba.types.records import with_rows
 
 _NUM_PLACES = 5  # keyframes that look most like a frame
 _NUM_MORE_PLACES = 16  # where these do not suffice
@@ -234,7 +235,7 @@ class Localizer:
             return frame, None
         usual = self.usual.of_camera(camera)
         evidence = self.surroundings.evidence(query, world_T_rig, usual)
-        agreeing = candidates.taken(fitted.inliers[0])
+        agreeing = with_rows(candidates, fitted.inliers[0])
         given = world_T_rig, agreeing.points_world, agreeing.bearings, evidence
         return frame, PlacedPose.of(*given)
 

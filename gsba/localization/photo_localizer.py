@@ -54,6 +54,7 @@ from gsba.loop_closure.join_evidence import JoinEvidence
 from gsba.matching.absolute_pose import FoundPose, camera_pose
 from gsba.matching.guided_search import searchable
 from gsba.types import Features
+from gsba.types.records import with_rows
 
 _NUM_PLACES = 10  # keyframes with a face that looks most like a photo
 _FIELDS_RAD = tuple(np.deg2rad([70.0, 45.0, 105.0]))  # of the longer side, tried where the focal
@@ -258,7 +259,8 @@ def _recognise(
         return None, ""
     if is_rivalled(found, search(~found.inliers, least_of_rival(found)), candidates):
         return None, TWO_PLACES
-    start, agreeing = photo.projection(found.focal), candidates.taken(found.inliers)
+    start = photo.projection(found.focal)
+    agreeing = with_rows(candidates, found.inliers)
     every = projection.project(features.bearings_rig)
     return _Recognised(found.world_T_rig, start, places, agreeing, every, features, projection), ""
 

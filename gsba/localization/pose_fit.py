@@ -12,6 +12,7 @@ from gsba.bundle.pose_variables import X
 from gsba.camera.projections import Projection
 from gsba.config import SolverSettings
 from gsba.localization.known_points import K, KnownPointBlock, PointSightings, num_parameters
+from gsba.types.records import with_rows
 
 GATE_SIGMAS = 3.5  # of an inlier's residual
 COARSE = (8.0,)  # scales of the loss, round by round, standard deviations, of a first fit
@@ -75,7 +76,7 @@ def fit(
             noises = np.array([_rescaled(*pair) for pair in zip(noises, squares, strict=True)])
     squares = _block(pictures, noises, projections, scales[-1]).squared_residuals(values)
     inliers = tuple(part < GATE_SIGMAS**2 for part in squares)
-    kept = [seen.taken(own) for seen, own in zip(pictures, inliers, strict=True)]
+    kept = [with_rows(*pair) for pair in zip(pictures, inliers, strict=True)]
     block = _block(kept, noises, projections, GATE_SIGMAS, "none")
     block.refresh(values)
     cameras = [K(c) for c in range(len(projections))]

@@ -8,6 +8,7 @@ from gsba.camera.rig import witnesses
 from gsba.geometry import inverse, rotation_angle
 from gsba.matching.absolute_pose import FoundPose, panorama_pose
 from gsba.significance import least_agreeing
+from gsba.types.records import with_rows
 
 MIN_RATIO = 0.02  # least inlier ratio that the number of trials allows for
 CELLS_PER_SIDE = 16  # along a face's side: keypoints within one, 6 degrees, are one witness
@@ -30,12 +31,6 @@ class Candidates:
     def __len__(self) -> int:
         return len(self.points)
 
-    def taken(self, rows: np.ndarray) -> "Candidates":
-        """Candidates `rows`, int or bool."""
-        return Candidates(
-            self.keypoints[rows], self.bearings[rows], self.points[rows], self.points_world[rows]
-        )
-
 
 def search_poses(
     candidates: Candidates, max_error_rad: float, seed: int, most: int
@@ -50,7 +45,7 @@ def search_poses(
             break
         least = max(least, int(_MIN_SHARE * one.inliers.sum()))
         found.append(one)
-        candidates = candidates.taken(~one.inliers)
+        candidates = with_rows(candidates, ~one.inliers)
     return found
 
 

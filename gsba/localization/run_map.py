@@ -24,6 +24,7 @@ from gsba.store.finished import load_cameras, load_run
 from gsba.store.folder import STAGES, read_marker
 from gsba.store.records import RecordError, load_record
 from gsba.types import Features, FrameSet, Reconstruction
+from gsba.types.records import with_rows
 from gsba.version import __version__
 
 _NUM_KEPT = 64  # keyframes kept in memory
@@ -201,23 +202,9 @@ def _keyframe(
         known = np.asarray(gaps) < allowed
         numbers = result.observation_points[rows].astype(np.int64)[np.asarray(nearest)]
     chosen = np.flatnonzero(known)
-    kept = taken(features, chosen)
+    kept = with_rows(features, chosen)
     world_T_rig = result.world_T_rigs[frame]
     points = result.points_world[numbers[chosen]] - world_T_rig[:3, 3]
     strongest = searchable(kept, axes, settings.pairs.strongest_per_face)
     every = searchable(kept, axes)
     return MapKeyframe(kept, strongest, every, points @ world_T_rig[:3, :3], numbers[chosen])
-
-
-def taken(features: Features, rows: np.ndarray) -> Features:
-    """Keypoints `rows` (K',), ascending."""
-    scores = features.scores
-    return Features(
-        features.pixels[rows],
-        features.faces[rows],
-        features.bearings_rig[rows],
-        features.sigmas_rad[rows],
-        features.descriptors[rows],
-        features.colors[rows],
-        None if scores is None else scores[rows],
-    )

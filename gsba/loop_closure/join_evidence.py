@@ -1,4 +1,4 @@
-"""Evidence for and against a join of two parts of a map (docs/method.md, "When two places are one").
+"""Evidence for and against a join of two parts of a map (see docs/method.md).
 
 Points that are found again are weighed against those that are not, relative to the rate within
 parts under the same change of view; how near a point is to its place counts, too. Points of a small

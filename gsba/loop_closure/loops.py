@@ -109,10 +109,31 @@ def candidates(
     unseen_before = np.concatenate([[0], np.cumsum(unseen)])
     least = _least_similarity(looks, solved, unseen_before, settings.pairs.window)
     blocks = list(slices(num, _FRAMES_AT_ONCE))
-    compared = _Compared(looks, positions, drifts, reach, settings.pairs.window // 4, held)
-    each = map_in_threads(
-        lambda n: compared.most_alike(blocks[n]), len(blocks), settings.solver.threads()
-    )
+    apart = settings.pairs.window // 4  # frames along the path that are too near to be compared
+
+    def within_reach(f: int) -> np.ndarray:
+        distance = np.linalg.norm(positions - positions[f], axis=1)
+        chosen = distance < reach + np.abs(drifts - drifts[f])
+        chosen[max(f - apart, 0) : f + apart + 1] = False
+        if held is not None:
+            chosen[held.indices[held.indptr[f] : held.indptr[f + 1]]] = False
+        return np.flatnonzero(chosen)
+
+    def most_alike(block: int) -> list[tuple[int, int, float]]:
+        """Some frames, each with those that look most like it, and how much."""
+        frames, best = blocks[block], []
+        others = [within_reach(f) for f in range(frames.start, frames.stop)]
+        every = np.unique(np.concatenate(others))
+        alike = np.empty((len(every), len(others)), looks.dtype)
+        for some in slices(len(every), _ROWS_AT_ONCE):
+            alike[some] = looks[every[some]] @ looks[frames].T
+        for n, rows in enumerate(others):
+            own = alike[np.searchsorted(every, rows), n]
+            first = np.argsort(-own, kind="stable")[:_NUM_CANDIDATES]
+            best += [(frames.start + n, int(rows[k]), float(own[k])) for k in first]
+        return best
+
+    each = map_in_threads(most_alike, len(blocks), settings.solver.threads())
     found = dict[tuple[int, int], float]()
     for best in each:
         found |= {(min(f, g), max(f, g)): similarity for f, g, similarity in best}
@@ -123,40 +144,6 @@ def candidates(
     if len(seeds):
         kept |= KDTree(seeds).query(pairs, p=np.inf)[0] <= settings.pairs.window
     return pairs[kept]
-
-
-@dataclass(frozen=True, slots=True)
-class _Compared:
-    """Frames that are compared by their looks, each with those within reach of drift."""
-
-    looks: np.ndarray  # (F, D) global descriptors
-    positions: np.ndarray  # (F, 3)
-    drifts: np.ndarray  # (F,) largest error since the first frame, map units
-    reach: float  # map units
-    apart: int  # frames along the path that are too near to be compared
-    held: csr_matrix | None  # (F, F) frames that are left out; None = none are
-
-    def others(self, f: int) -> np.ndarray:
-        """Frames that one is compared with."""
-        distance = np.linalg.norm(self.positions - self.positions[f], axis=1)
-        chosen = distance < self.reach + np.abs(self.drifts - self.drifts[f])
-        chosen[max(f - self.apart, 0) : f + self.apart + 1] = False
-        if self.held is not None:
-            chosen[self.held.indices[self.held.indptr[f] : self.held.indptr[f + 1]]] = False
-        return np.flatnonzero(chosen)
-
-    def most_alike(self, frames: slice) -> list[tuple[int, int, float]]:
-        """Some frames, each with those that look most like it, and how much."""
-        others = [self.others(f) for f in range(frames.start, frames.stop)]
-        every, best = np.unique(np.concatenate(others)), []
-        alike = np.empty((len(every), len(others)), self.looks.dtype)
-        for some in slices(len(every), _ROWS_AT_ONCE):
-            alike[some] = self.looks[every[some]] @ self.looks[frames].T
-        for n, rows in enumerate(others):
-            own = alike[np.searchsorted(every, rows), n]
-            first = np.argsort(-own, kind="stable")[:_NUM_CANDIDATES]
-            best += [(frames.start + n, int(rows[k]), float(own[k])) for k in first]
-        return best
 
 
 def _sharing_points(tracks: Tracks, num_frames: int) -> csr_matrix:

@@ -188,7 +188,9 @@ def _calibrate_raw(trial: State, raw: Sequence[int]) -> State:
     run, free = trial.run, False
     for camera in raw:
         lenses = trial.map.cameras[camera].lenses
-        if run.lenses_found_of(camera):  # patches say more of them than features do
+        if (
+            run.lenses_found and run.lenses_found[camera]
+        ):  # patches say more of them than features do
             lenses = replace(lenses, fisheyes=lenses.reference_calibration)
             trial = trial.with_lenses(camera, lenses)
             continue

@@ -29,7 +29,11 @@ def match_neighbours(state: State) -> State:
     apart = [_match(state, number) for number in range(len(run.evidence.recordings))]
     run.chain.join([one.run.chain for one in apart])
     begins = np.cumsum([0, *(len(one.run.frames) for one in apart)]).tolist()
-    near = [_renumbered(one.verified, f) for one, f in zip(apart, begins, strict=False)]
+    near = list[VerifiedPairs]()
+    for one, first in zip(apart, begins, strict=False):
+        matches = one.verified.matches
+        pairs = (matches.pairs + first).astype(matches.pairs.dtype)
+        near.append(replace(one.verified, matches=replace(matches, pairs=pairs)))
     verified = VerifiedPairs.joined(near)
     return state.begun(_combined([one.prior for one in apart]), verified)
 
@@ -48,11 +52,6 @@ def _match(state: State, number: int) -> State:
             "those of others: leave it out"
         )
     return found
-
-
-def _renumbered(pairs: VerifiedPairs, first: int) -> VerifiedPairs:
-    moved = (pairs.matches.pairs + first).astype(pairs.matches.pairs.dtype)
-    return replace(pairs, matches=replace(pairs.matches, pairs=moved))
 
 
 def _combined(priors: Sequence[Prior]) -> Prior:

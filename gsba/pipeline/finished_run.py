@@ -89,11 +89,14 @@ class FinishedRun:
         num, points = len(frames), len(kept.map.solution.landmarks.points_world)
         if len(kept.map.solution.world_T_rigs) != num or points != len(result.points_world):
             raise GsbaError(f"{root}: its results do not fit together: refine again with --fresh")
-        files = tuple(_features_file(root, name) for name in frames.names)
+        stages = [root / STAGES / stage for stage in _FEATURES]
+        each = [[stage / f"{name}.npz" for stage in stages] for name in frames.names]
+        files = tuple(next(filter(Path.is_file, paths), paths[-1]) for paths in each)
         origin = {what: Path(path) for what, path in read_marker(root)["origin"].items()}
         settings = load_config(root / "config.toml")
         if not frames.recordings:
-            name = _name_of(origin.get("frames", root))
+            path = origin.get("frames", root)
+            name = (path.stem if path.is_file() else path.name) or "frames"
             origin = {f"{name}: {what}": path for what, path in origin.items()}
             frames = replace(
                 frames,
@@ -142,9 +145,13 @@ class FinishedRun:
         frames, map_ = self.frames.taken(rows), _map_of(self.map, rows)
         used, _ = cameras_of(self.frames.camera_of_frame, rows)
         cameras = tuple(self.camera_settings[c] for c in used)
+        settings = self.settings
+        if len(cameras) < len(self.camera_settings):  # those of a model that is left
+            known = next((one for one in cameras if one.baseline() is not None), cameras[0])
+            settings = settings.model_copy(update={"camera": known})
         return replace(
             self,
-            settings=self._settings_of(cameras),
+            settings=settings,
             camera_settings=cameras,
             origin=origin,
             frames=frames,
@@ -153,13 +160,6 @@ class FinishedRun:
             result=_result_of(self.result, rows, _tied(map_, frames)),
             files=tuple(self.files[f] for f in rows),
         )
-
-    def _settings_of(self, cameras: Sequence[CameraSettings]) -> RefineSettings:
-        """Settings when only some of the cameras are left: those of a model that is left."""
-        if len(cameras) == len(self.camera_settings):
-            return self.settings
-        known = next((one for one in cameras if one.baseline() is not None), cameras[0])
-        return self.settings.model_copy(update={"camera": known})
 
 
 def _tied(map_: Map, frames: FrameSet) -> np.ndarray:
@@ -189,17 +189,6 @@ def _result_of(result: Reconstruction, rows: np.ndarray, groups: np.ndarray) -> 
         map_scales=ratios if several else None,
         vertical=result.vertical if own[first[0]] == 0 else None,
     )
-
-
-def _features_file(root: Path, name: str) -> Path:
-    paths = [root / STAGES / stage / f"{name}.npz" for stage in _FEATURES]
-    return next((path for path in paths if path.is_file()), paths[-1])
-
-
-def _name_of(path: Path) -> str:
-    """Name of the only recording of a run, by its folder or video."""
-    name = path.stem if path.is_file() else path.name
-    return name or "frames"
 
 
 def _map_of(map_: Map, rows: np.ndarray) -> Map:

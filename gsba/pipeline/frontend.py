@@ -81,7 +81,8 @@ def extract_more(state: State, weak: np.ndarray) -> State:
     found = _extract(run, _enlarged(run.settings), "features_closer", weak)
     each = [found if more else old for more, old in zip(weak, before.features, strict=True)]
     observed = _observe(run, "keypoints_closer", each, "features_closer")
-    return state.with_keypoints(observed.through(before.cameras))
+    observed = observed.through(before.cameras)
+    return replace(state, observed=observed, map=replace(state.map, observed=observed.shown))
 
 
 def _extract(

@@ -77,7 +77,7 @@ def add_recordings(
             f"{name}: frames": Path(one.frames) for name, one in zip(names, recordings, strict=True)
         }
         with place.store(finished.origin | given, client, finished) as work:
-            scratch = grown_folder.scratch_of(work.root)
+            scratch = work.root / grown_folder.SCRATCH
             named = [replace(one, name=name) for one, name in zip(recordings, names, strict=True)]
             settings = _settings_of_new(finished.settings)
             given = {"segment": segment, "client": client}
@@ -193,7 +193,7 @@ class _Place:
 
         The folder is deleted where maps turn out not to be of one place.
         """
-        work = grown_folder.folder_beside(self.out)
+        work = self.out.with_name(f".{self.out.name}.growing")
         grown_folder.forget_other_work(work, origin, self.out)
         hired = cluster.hire(client, first.frames.paths[0][0], first.settings)
         try:

@@ -18,7 +18,7 @@ from gsba.types import FrameSet
 
 logger = logging.getLogger(__name__)
 
-_SCRATCH = "new"  # run of new recordings, in the folder that is being written
+SCRATCH = "new"  # run of new recordings, in the folder that is being written
 _FRAMES, _MASKS = "frames", "masks"  # folders of the frames and masks that runs hold themselves
 _ODOMETRY = "odometry"  # folder of what the odometry of videos found
 
@@ -37,16 +37,6 @@ def held_runs(roots: Sequence[Path]) -> Iterator[None]:
     finally:
         for lock in locks:
             os.close(lock)
-
-
-def folder_beside(out: Path) -> Path:
-    """Folder in which a run is written until it is complete."""
-    return out.with_name(f".{out.name}.growing")
-
-
-def scratch_of(work: Path) -> Path:
-    """Folder of the run of new recordings, in the one that is being written."""
-    return work / _SCRATCH
 
 
 def refuse_existing(out: Path) -> None:
@@ -114,7 +104,7 @@ def complete(store: RunStore, frames: FrameSet, sources: Sequence[Path], out: Pa
 def put_in_place(work: Path, out: Path) -> Path | None:
     """Rename a complete run into place; a run that was there gets the name returned."""
     with disk_errors(out):
-        shutil.rmtree(work / _SCRATCH, ignore_errors=True)
+        shutil.rmtree(work / SCRATCH, ignore_errors=True)
         if not out.exists() or not any(out.iterdir()):
             with suppress(FileNotFoundError):
                 out.rmdir()

@@ -88,22 +88,18 @@ def timed(given: Sequence[Trajectory | NamedPoses], frames: FrameSet) -> list[Tr
     """Trajectories at the times of frames, those by file names too, each in a world near its
     origin; GsbaError if fewer than two frames have a pose of a file."""
     known = [one.timed(frames) if isinstance(one, NamedPoses) else one for one in given]
-    return [_near_origin(one) for one in known]
-
-
-def _near_origin(trajectory: Trajectory) -> Trajectory:
-    """A trajectory whose world is shifted if it is far from the origin, as ECEF and UTM are."""
-    origin = local_origin(trajectory.world_T_rigs[:, :3, 3])
-    if origin is None:
-        return trajectory
-    logger.info(
-        "the trajectory is far from its origin: the run's world is shifted by %s, which "
-        "transform.json states",
-        ", ".join(f"{value:.12g}" for value in origin),
-    )
-    poses = trajectory.world_T_rigs.copy()
-    poses[:, :3, 3] -= origin
-    return replace(trajectory, world_T_rigs=poses, origin=origin)
+    for n, one in enumerate(known):
+        origin = local_origin(one.world_T_rigs[:, :3, 3])
+        if origin is not None:  # as of ECEF and UTM
+            logger.info(
+                "the trajectory is far from its origin: the run's world is shifted by %s, which "
+                "transform.json states",
+                ", ".join(f"{value:.12g}" for value in origin),
+            )
+            poses = one.world_T_rigs.copy()
+            poses[:, :3, 3] -= origin
+            known[n] = replace(one, world_T_rigs=poses, origin=origin)
+    return known
 
 
 def coarse_poses(

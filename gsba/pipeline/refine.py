@@ -41,7 +41,7 @@ from gsba.store import cluster
 from gsba.store.store import RunStore
 from gsba.trajectory.conventions import Convention
 from gsba.trajectory.misread import TurnedAboutForwardError
-from gsba.types import CoarsePoses, FrameSet, Reconstruction, RunStart
+from gsba.types import CoarsePoses, FrameSet, Reconstruction, RunStart, VerifiedPairs
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -319,7 +319,7 @@ def solve(state: State) -> State:
         if [bool(one.lenses) for one in state.map.cameras] != before:
             state = _match_from_itself(state, "again_")
     # Below a pixel: patches, pixels, splats.
-    state = patch_rounds.align(state.without_matches())
+    state = patch_rounds.align(state.with_verified(VerifiedPairs.none()))  # lets matches go
     if "photometric" in families:
         state = backend.refine_photometric(state)
     if "splat" in families:
@@ -352,7 +352,11 @@ def _map_all(state: State) -> State:
         return state
     # A chain of relative poses, then all points that neighbours share.
     state = backend.align_gauge(state, "gauge")
-    state = _adjust_chain(state)
+    gates = rounds.chain
+    chain = backend.adjust(state, "chain", gates)
+    # Without steps less plausible than the trajectory's.
+    state = frontend.drop_implausible_steps(chain)
+    state = chain if state is chain else backend.adjust(state, "chain2", gates)
     state = frontend.match_along_epipolars(state)
     state = frontend.match_known_points(state, "near", loops_closed=False)
     state = backend.adjust(state, "dense", rounds.dense)
@@ -365,13 +369,6 @@ def _map_all(state: State) -> State:
     state = camera.find_camera(state)
     state = frontend.align_gyro_to_map(state, "imu_camera", with_noise=bool(state.map.lenses))
     return backend.measure_strength(state)
-
-
-def _adjust_chain(state: State) -> State:
-    gates = state.run.settings.rounds.chain
-    chain = backend.adjust(state, "chain", gates)
-    kept = frontend.drop_implausible_steps(chain)
-    return chain if kept is chain else backend.adjust(kept, "chain2", gates)
 
 
 def _merge_maps(state: State) -> State:

@@ -217,10 +217,6 @@ class Run:
         found = self.camera_settings
         return found[camera] if found else self.settings.camera
 
-    def lenses_found_of(self, camera: int) -> bool:
-        """True if the calibration by which a camera's raw frames are cut was estimated."""
-        return bool(self.lenses_found) and self.lenses_found[camera]
-
     @property
     def matching_settings(self) -> RefineSettings:
         """Settings whose gates are as wide as directions of raw pairs are uncertain."""

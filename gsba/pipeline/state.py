@@ -104,18 +104,9 @@ class State:
         """The state with other matches of neighbours, and none beside these."""
         return replace(self, verified=verified, matches=MapMatches(verified.matches))
 
-    def without_matches(self) -> "State":
-        """The state with a map that is not built anew: its matches are let go, for their memory."""
-        return self.with_verified(VerifiedPairs.none())
-
     def with_solution(self, solution: Solution) -> "State":
         """The state with other poses and points."""
         return replace(self, map=replace(self.map, solution=solution))
-
-    def with_keypoints(self, observed: ObservedFrames) -> "State":
-        """The state with other keypoints, which the map is to be made of."""
-        map_ = replace(self.map, observed=observed.shown)
-        return replace(self, observed=observed, map=map_)
 
     def with_cameras(self, found: CameraEstimates) -> "State":
         """The state with other cameras of the map; keypoints stay rays of those before."""

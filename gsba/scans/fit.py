@@ -7,6 +7,7 @@ import numpy as np
 
 from gsba.scans.types import Cloud, Scan
 from gsba.similarity import Sim3
+from gsba.types.records import with_rows
 
 _WIDTH_RATIO = 0.7  # of the loss's width, from round to round
 _MIN_STEP = 1e-6  # part of the cloud's size; a smaller step ends a round
@@ -52,7 +53,7 @@ def noise_of(fit: Sim3, cloud: Cloud, scan: Scan, sigma: float) -> Noise:
     near = (np.abs(off) <= reach) & (gaps <= reach + scan.reaches[nearest])
     if near.sum() < _MIN_POINTS:
         return Noise(sigma)
-    some, off, rows = cloud.taken(np.flatnonzero(near)), off[near], nearest[near]
+    some, off, rows = with_rows(cloud, np.flatnonzero(near)), off[near], nearest[near]
     own, rough = _own_variances(fit, some, scan, rows), scan.variances(rows)
     least = LEAST_SIGMA * scan.spacing
 
@@ -121,10 +122,8 @@ def approach(start: Sim3, cloud: Cloud, scan: Scan, width: float) -> tuple[Sim3,
         width: initial width of the loss, unit of the scan.
     """
     least = LEAST_SIGMA * scan.spacing
-    fit, some = (
-        start,
-        cloud.taken(np.arange(0, len(cloud.points), -(-len(cloud.points) // _NUM_COARSE_POINTS))),
-    )
+    every = np.arange(len(cloud.points))
+    fit, some = start, with_rows(cloud, every[:: -(-len(every) // _NUM_COARSE_POINTS)])
     while True:
         fit = _settle(fit, some, scan, Noise(width), _FEW_STEPS)
         sigma = max(scatter(fit, some, scan, width), least)

@@ -10,6 +10,7 @@ from scipy.spatial import KDTree
 
 from gsba.log import GsbaError
 from gsba.types import Reconstruction
+from gsba.types.records import with_rows
 
 NEIGHBOURS = 24  # of a scan's point, through which its plane is fitted
 MIN_POINTS = 300  # of a cloud that can be registered
@@ -85,11 +86,6 @@ class Cloud:
             normals=self.normals * flip,
         )
 
-    def taken(self, rows: np.ndarray) -> "Cloud":
-        """Cloud of the points `rows` (N',)."""
-        parts = ("points", "covariances", "eyes", "rows", "normals", "brightness")
-        return replace(self, **{name: getattr(self, name)[rows] for name in parts})
-
 
 def size_of(points: np.ndarray) -> float:
     """RMS distance of points (N, 3) from their median, without the 5 % furthest."""
@@ -137,7 +133,7 @@ def cloud_of(
         result.point_colors[every].mean(axis=1),
     )
     if len(every) >= MIN_POINTS:
-        cloud = cloud.taken(1 / np.sqrt(values[every, 0]) <= _MAX_POINT_SIGMA * cloud.size)
+        cloud = with_rows(cloud, 1 / np.sqrt(values[every, 0]) <= _MAX_POINT_SIGMA * cloud.size)
     if len(cloud.points) < MIN_POINTS:
         raise GsbaError(
             f"the run has {len(cloud.points)} points with a sigma below "

@@ -24,7 +24,7 @@ import zipfile
 import zlib
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import MISSING, Field, fields, is_dataclass
+from dataclasses import MISSING, fields, is_dataclass
 from enum import Enum
 from functools import lru_cache
 from pathlib import Path
@@ -368,13 +368,9 @@ def _decode_dataclass(tree: Any, cls: type[T], archive: _Archive | None) -> T:
 def _fields_of(cls: type) -> tuple[frozenset[str], dict[str, Any]]:
     """Names of a dataclass's fields that have no default, and the types of all."""
     own, hints = fields(cls), typing.get_type_hints(cls)
-    needed = frozenset(entry.name for entry in own if not _has_default(entry))
-    return needed, {entry.name: hints[entry.name] for entry in own}
-
-
-def _has_default(entry: Field) -> bool:
-    """True if the field has a default, so that records from before it was added can be read."""
-    return entry.default is not MISSING or entry.default_factory is not MISSING
+    # Records from before a field with a default was added can be read.
+    needed = [f.name for f in own if f.default is MISSING and f.default_factory is MISSING]
+    return frozenset(needed), {entry.name: hints[entry.name] for entry in own}
 
 
 def _require(condition: bool, tree: Any, hint: Any) -> None:

@@ -180,7 +180,9 @@ def write_shard(job: Job[R], folder: Path) -> tuple[Path, str]:
         Its file, whose result goes to `result_path` of it, and the SHA-256 of its content. The
         digest must reach `run_shard` by another way than this disk.
     """
-    content = f"{__version__}\n".encode() + _pickled(job)
+    buffer = io.BytesIO()
+    _pickle(job, buffer)
+    content = f"{__version__}\n".encode() + buffer.getvalue()
     digest = hashlib.sha256(content).hexdigest()
     path = folder.absolute() / f"{digest[:32]}.job"
     write_bytes(path, content)
@@ -237,12 +239,6 @@ class _Pickler(pickle.Pickler):
         if isinstance(obj, np.ndarray):
             return _array, (obj.dtype.str, obj.shape, np.ascontiguousarray(obj).tobytes())
         return NotImplemented
-
-
-def _pickled(value: object) -> bytes:
-    buffer = io.BytesIO()
-    _pickle(value, buffer)
-    return buffer.getvalue()
 
 
 def content_digest(*values: object) -> str:
