@@ -19,19 +19,20 @@ from gsba.frames import cubemap
 from gsba.frames.files import image_size
 from gsba.frames.panorama import fitted_to, load_grey
 from gsba.geometry import adjoint, inverse
-from gsba.localization.known_points import PointSightings, isotropic
+from gsba.localization.known_points import (
+    COARSE,
+    FINE,
+    GATE_SIGMAS,
+    PointSightings,
+    PoseFit,
+    fit,
+    is_determined,
+    isotropic,
+)
 from gsba.localization.patch_sightings import PatchAligner
 from gsba.localization.picture_cameras import PictureCameras
 from gsba.localization.pictures import load_panorama
 from gsba.localization.place_index import open_index
-from gsba.localization.pose_fit import (
-    COARSE,
-    FINE,
-    GATE_SIGMAS,
-    PoseFit,
-    fit,
-    is_determined,
-)
 from gsba.localization.pose_search import Candidates, is_significant, search_poses
 from gsba.localization.rival_poses import PlacedPose, best_of
 from gsba.localization.run_map import Query, RunMap, without_correction

@@ -11,7 +11,16 @@ from factors.sphere_image import SphereImage
 from gsba.camera.lens import ONE_CENTRE
 from gsba.camera.projections import PerspectiveProjection
 from gsba.camera.rig import owner_faces
-from gsba.localization.known_points import PointSightings
+from gsba.localization.known_points import (
+    COARSE,
+    FINE,
+    GATE_SIGMAS,
+    CameraPrior,
+    PointSightings,
+    PoseFit,
+    fit,
+    is_determined,
+)
 from gsba.localization.localizer import (
     NO_PLACE,
     NOT_DETERMINED,
@@ -29,15 +38,6 @@ from gsba.localization.photos import (
     shows,
 )
 from gsba.localization.pictures import Picture
-from gsba.localization.pose_fit import (
-    COARSE,
-    FINE,
-    GATE_SIGMAS,
-    CameraPrior,
-    PoseFit,
-    fit,
-    is_determined,
-)
 from gsba.localization.pose_search import (
     MIN_RATIO,
     MIN_WITNESSES,

@@ -5,6 +5,7 @@ from points of a map. Parts without overlap keep the trajectory's pose, or becom
 """
 
 import logging
+from functools import partial
 from itertools import combinations
 
 import numpy as np
@@ -15,9 +16,9 @@ from gsba.loop_closure.break_crossing import Breaks, agreed, crossing
 from gsba.loop_closure.connectivity import MIN_MAP_FRAMES, by_size
 from gsba.loop_closure.join_evidence import GATE_RAD, Places, Rates
 from gsba.loop_closure.join_test import JoinTest, Judged
+from gsba.loop_closure.loops import Loop
 from gsba.loop_closure.map_similarity import Meeting, Proposal, propose
 from gsba.loop_closure.merged_map import Registered, carried, laid_out
-from gsba.loop_closure.pose_graph import Loop
 from gsba.loop_closure.registration import RegisteredFrame, resect
 from gsba.loop_closure.retrieval import global_descriptors
 from gsba.matching import pairs, recovery
@@ -100,8 +101,10 @@ class _Joining:
         known = solved.points_by_keypoint(context.keypoints)
         self.own_known = [known[f] for f in range(num)]  # rig frames, units of their parts
         self.known = list(self.own_known)  # in the map's unit once moved there
+        places = Places(solved.world_T_rigs, self.own_known)
+        usual = partial(join_evidence.rates, context, places, parts)  # within the original parts
         self.test = JoinTest(
-            context, self.poses, self.known, self.depth, recordings, self._usual_rates
+            context, self.poses, self.known, self.depth, recordings, lambda rows: usual(chosen=rows)
         )
         self.usual_anywhere: Rates | None = None
         self.min_testable = min_testable  # frames of a map that joins can be tested by
@@ -350,11 +353,6 @@ class _Joining:
             for axes, mean in zip((down, theirs), means, strict=True)
         ]
         return bool(angles_between(means[0], means[1]) < limit + 3 * np.hypot(*spreads))
-
-    def _usual_rates(self, chosen: np.ndarray) -> Rates:
-        """Rates at which points of frames (F,) bool are found again within the original parts."""
-        places = Places(self.solved.world_T_rigs, self.own_known)
-        return join_evidence.rates(self.context, places, self.parts, chosen=chosen)
 
     def _meetings(self, context: MatchContext, chosen: np.ndarray) -> list[Meeting]:
         """Matched points that both frames of pairs (P, 2) know, one of them outside the map."""

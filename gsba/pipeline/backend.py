@@ -115,7 +115,7 @@ def separate_parts(state: State) -> np.ndarray | None:
             "follow one another closely (or lower triangulate.min_track_length or "
             "triangulate.min_parallax_deg)"
         )
-    scarce = connectivity.starving(solution, MIN_OBSERVATIONS)
+    scarce = solution.observations() < MIN_OBSERVATIONS
     nothing = np.zeros_like(state.prior.trust.held_steps)
     unguided = state.prior.unguided
     if unguided.any():  # nothing but points hands the scale on
@@ -149,7 +149,7 @@ def merge_maps(state: State, parts: np.ndarray) -> State:
         held, shown = trust.held_steps, ~(trust.unseen_steps | _doubtful_steps(state))
         open_scale = prior.unguided[1:] & prior.unguided[:-1]
         if open_scale.any():  # images show a step between parts, but not how long it is
-            fed = ~connectivity.starving(solution, MIN_OBSERVATIONS)
+            fed = solution.observations() >= MIN_OBSERVATIONS
             shown &= ~((parts[1:] != parts[:-1]) & fed[1:] & fed[:-1] & open_scale)
         context, times = state.observed.context, run.frames.timestamps
         # No trajectory relates recordings: their maps are as free as those of images alone.
@@ -343,7 +343,8 @@ def _reconstruct_rotations(state: State) -> Reconstruction:
     least, poses = MIN_OBSERVATIONS, prior.start().world_T_rigs
     turn = prior.trust.turn
     assert turn is not None
-    parts = connectivity.apart(~turn.frames)
+    lonely = ~turn.frames  # are parts of their own, behind all others
+    parts = np.where(lonely, np.cumsum(lonely), 0) if lonely.any() else None
 
     def compute() -> Reconstruction:
         matches = correspondences.match_for_rotations(observed.context, poses)

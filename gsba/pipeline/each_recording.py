@@ -2,7 +2,8 @@
 alone; laid back to back, they are parts of a map that nothing ties together yet: map merging joins
 them."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -38,19 +39,25 @@ def match_neighbours(state: State) -> State:
     return state.begun(_combined([one.prior for one in apart]), verified)
 
 
-def _match(state: State, number: int) -> State:
-    """One recording with its neighbours matched, its trajectory judged, its gyro aligned."""
-    name = state.run.evidence.recordings[number].name
+@contextmanager
+def naming_recording(name: str) -> Iterator[None]:
+    """Name a recording in the message of a GsbaError."""
     try:
-        found = frontend.match_neighbours(frontend.of_recording(state, number))
-        found = frontend.align_gyro_to_neighbours(frontend.judge_trajectory(found))
+        yield
     except GsbaError as error:
         raise GsbaError(f"recording '{name}': {error}") from error
-    if found.prior.turning_only:
-        raise GsbaError(
-            f"recording '{name}': the camera only turned, so that its frames have no place among "
-            "those of others: leave it out"
-        )
+
+
+def _match(state: State, number: int) -> State:
+    """One recording with its neighbours matched, its trajectory judged, its gyro aligned."""
+    with naming_recording(state.run.evidence.recordings[number].name):
+        found = frontend.match_neighbours(frontend.of_recording(state, number))
+        found = frontend.align_gyro_to_neighbours(frontend.judge_trajectory(found))
+        if found.prior.turning_only:
+            raise GsbaError(
+                "the camera only turned, so that its frames have no place among those of others: "
+                "leave it out"
+            )
     return found
 
 

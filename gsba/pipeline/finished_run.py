@@ -72,7 +72,7 @@ class FinishedRun:
         """Read a finished run.
 
         Args:
-            root: folder of a run, see `grown_folder.held_runs`.
+            root: folder of a run, see `growing.held_runs`.
 
         Raises:
             GsbaError: a run that is not finished, one of another version of gsba, or one without

@@ -17,6 +17,7 @@ from gsba.log import GsbaError
 from gsba.masks import merging
 from gsba.masks.segmentation import Segment
 from gsba.pipeline import inputs
+from gsba.pipeline.each_recording import naming_recording
 from gsba.pipeline.outputs import RunResult
 from gsba.pipeline.refine import Start, refine_from
 from gsba.pipeline.run import Evidence, RecordingEvidence
@@ -185,10 +186,8 @@ class _Given:
         """A recording whose trajectory files are read, before any video is decoded."""
         folder = Path(recording.frames)
         poses = inputs.trajectory_files(recording.trajectory, _path(recording.keyframes))
-        try:
+        with naming_recording(name):
             pieces = inputs.read_trajectories(poses, _path(recording.timestamps), convention)
-        except GsbaError as error:
-            raise _named(name, error) from error
         files = {f"{name}: {what}": path for what, path in ({"frames": folder} | poses).items()}
         return cls(name, recording, files, tuple(pieces), folder)
 
@@ -197,12 +196,10 @@ class _Given:
         one, given = self.recording, merging.choose(self.recording.masks).given
         timestamps, fps = (None, None) if self.extracted else (_path(one.timestamps), one.fps)
         calibration = _path(one.calibration)
-        try:
+        with naming_recording(self.name):
             circles = inputs.given_circles(one.circles, calibration)
             by_order = not self.trajectories
             return scan(self.folder, timestamps, fps, given, by_order, calibration, circles)
-        except GsbaError as error:
-            raise _named(self.name, error) from error
 
     def camera(self, settings: RefineSettings) -> CameraSettings:
         """Settings of its camera: the model that it names, the baseline of its calibration."""
@@ -215,12 +212,10 @@ class _Given:
         self, frames: FrameSet, settings: RefineSettings, plain: RefineSettings
     ) -> RecordingEvidence:
         """Initial poses of its frames, its gyro, and its camera by the `plain` settings of all."""
-        try:
+        with naming_recording(self.name):
             trajectories = tuple(inputs.timed(self.trajectories, frames))
             coarse = inputs.coarse_poses(frames, trajectories, settings)
             imu = inputs.read_gyro(_path(self.recording.imu), Path(self.recording.frames))
-        except GsbaError as error:
-            raise _named(self.name, error) from error
         start = RunStart.TRAJECTORY if trajectories else RunStart.PAIRS
         start, camera = RunStart.ODOMETRY if self.followed else start, self.camera(plain)
         return RecordingEvidence(self.name, coarse, trajectories, imu, camera, start)
@@ -228,10 +223,6 @@ class _Given:
 
 def _path(given: Path | str | None) -> Path | None:
     return None if given is None else Path(given)
-
-
-def _named(name: str, error: GsbaError) -> GsbaError:
-    return GsbaError(f"recording '{name}': {error}")
 
 
 def _with_camera(settings: RefineSettings, given: Sequence[_Given]) -> RefineSettings:
@@ -282,10 +273,8 @@ def _extracted(one: _Given, store: RunStore, settings: RefineSettings) -> _Given
     followed = inputs.follows(settings.video, recording.fps, recording.odometry, one.trajectories)
     chosen = merging.choose(recording.masks) if followed else None
     given = one.folder, settings, recording.fps, chosen, _path(recording.calibration), one.name
-    try:
+    with naming_recording(one.name):
         walk = inputs.extract_video(store, *given)
-    except GsbaError as error:
-        raise _named(one.name, error) from error
     ready = replace(one, folder=store.root / "frames" / one.name, extracted=True)
     if walk is None:
         return ready

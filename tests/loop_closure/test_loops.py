@@ -11,7 +11,7 @@ from gsba.config import PairSettings, RefineSettings
 from gsba.features import detection
 from gsba.geometry import inverse, pose, rotation_angle
 from gsba.loop_closure import loops
-from gsba.loop_closure.pose_graph import Loop
+from gsba.loop_closure.loops import Loop
 from gsba.loop_closure.retrieval import _sampled_descriptors, aggregate, global_descriptors
 from gsba.matching.guided_search import MatchContext, SearchableFrames
 from gsba.similarity import relative_similarity
