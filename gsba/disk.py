@@ -46,13 +46,9 @@ def disk_errors(path: Path) -> Iterator[None]:
 
 
 def atomic_write(path: Path, write: Callable[[Path], object], parents: bool = True) -> None:
-    """Write a file beside `path` and rename it into place, so that `path` is never half-written.
-
-    Args:
-        write: called with a temporary path of the same folder and suffix.
-    Raises:
-        GsbaError: the disk is full, or writing is not permitted.
-    """
+    """Write a file beside `path`, by `write` with a temporary path of the same folder and suffix,
+    and rename it into place, so that `path` is never half-written; GsbaError if the disk is
+    full."""
     # Processes of several machines may write the same file at the same time.
     temporary = path.with_name(f"{_TEMPORARY}{uuid.uuid4().hex[:8]}-{path.name}")
     with disk_errors(path):
@@ -86,12 +82,8 @@ def write_image(path: Path, image: "np.ndarray", jpeg_quality: int = 95) -> None
 
 
 def encoded_image(image: "np.ndarray", path: Path, jpeg_quality: int = 95) -> bytes:
-    """Encode (H, W, 3) RGB, (H, W, 4) RGBA or (H, W) uint8 as the content of an image file with
-    this suffix.
-
-    Raises:
-        GsbaError: the image cannot be encoded in the format of the suffix.
-    """
+    """Content of an image file with this suffix, of (H, W, 3) RGB, (H, W, 4) RGBA or (H, W) uint8;
+    GsbaError if it cannot be encoded so."""
     import cv2
 
     options = [] if path.suffix.lower() == ".png" else [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality]
@@ -105,14 +97,8 @@ def encoded_image(image: "np.ndarray", path: Path, jpeg_quality: int = 95) -> by
 
 
 def write_vertices(path: Path, vertices: "np.ndarray") -> None:
-    """Write a binary little-endian PLY file with one element, `vertex`, atomically.
-
-    Args:
-        vertices: (N,) structured, one field for each property, in the file's order.
-
-    Raises:
-        GsbaError: the file cannot be written.
-    """
+    """Write a binary little-endian PLY file with one element, `vertex`, atomically: (N,)
+    structured, a field for each property, in the file's order."""
     from plyfile import PlyData, PlyElement
 
     file = PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<")
@@ -120,14 +106,8 @@ def write_vertices(path: Path, vertices: "np.ndarray") -> None:
 
 
 def read_vertices(path: Path) -> "np.ndarray":
-    """The element `vertex` of a binary or ASCII PLY file.
-
-    Returns:
-        (N,) structured, one field for each property, mapped from a binary file.
-
-    Raises:
-        GsbaError: the file is unreadable, no PLY, truncated, or its points have lists.
-    """
+    """The element `vertex` of a binary or ASCII PLY file, (N,) structured, a field for each
+    property, mapped from a binary file; GsbaError if it is damaged, or its points have lists."""
     from plyfile import PlyData, PlyHeaderParseError
 
     try:
@@ -214,15 +194,8 @@ def _not_ours(path: Path) -> GsbaError:
 
 
 def hold_folder(folder: Path) -> int:
-    """Lock a folder against other processes until the lock is closed or this process ends.
-
-    The kernel keeps the lock, so it is never stale.
-
-    Returns:
-        File descriptor of the lock.
-    Raises:
-        GsbaError: another process holds the lock.
-    """
+    """Lock a folder against other processes until the descriptor returned is closed or this process
+    ends: the kernel keeps the lock, so it is never stale. GsbaError if another one holds it."""
     lock = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -28,13 +28,8 @@ class StoppedError(GsbaError):
 
 
 def show_log(level: int = logging.INFO) -> None:
-    """Send the log of gsba and its factors to stderr, for the command line.
-
-    On a terminal, log lines do not disturb the progress bar.
-
-    Args:
-        level: lowest level shown, e.g. `logging.WARNING` for a quiet run.
-    """
+    """Send the log of gsba and its factors to stderr, from `level` on; on a terminal, log lines do
+    not disturb the progress bar."""
     if sys.stderr.isatty():
         from rich.logging import RichHandler
 

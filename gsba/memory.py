@@ -84,12 +84,8 @@ def give_back_freed_memory(least: int = _MIN_RETURNED_BYTES) -> None:
 
 
 def mapped_file(file: IO[bytes]) -> mmap.mmap:
-    """Content of an open file, read-only, whose pages are read as they are used.
-
-    Raises:
-        OSError: it cannot be read.
-        ValueError: it is empty.
-    """
+    """Content of an open file, read-only, whose pages are read as they are used; ValueError if it
+    is empty."""
     content = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     _mapped_files.add(content)
     return content

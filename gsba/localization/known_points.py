@@ -227,15 +227,8 @@ def fit(
     projections: Sequence[Projection] = (),
     priors: Sequence[CameraPrior] = (),
 ) -> PoseFit:
-    """Minimise the robust residuals of known points over poses and cameras.
-
-    Args:
-        pictures: sightings of each picture (P); many may be false.
-        starts: (P, 4, 4) initial world_T_rigs.
-        scales: of the loss, round by round.
-        projections: (C) initial cameras.
-        priors: (C) on their parameters.
-    """
+    """Minimise the robust residuals of sightings over poses (P, 4, 4) and cameras (C) with priors,
+    in rounds of loss `scales`; many sightings may be false."""
     values, graph = gtsam.Values(), gtsam.NonlinearFactorGraph()
     for p, start in enumerate(starts):
         values.insert(X(p), gtsam.Pose3(start))

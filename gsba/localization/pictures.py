@@ -33,14 +33,8 @@ class Picture:
 
 
 def load_panorama(path: Path, at_least: int) -> np.ndarray:
-    """A panorama (H, 2H, 3) uint8 RGB.
-
-    Args:
-        at_least: width that is enough: JPEGs are decoded at a part of theirs.
-
-    Raises:
-        GsbaError: the file cannot be read, or is no 2:1 image.
-    """
+    """A panorama (H, 2H, 3) uint8 RGB, JPEGs decoded at a part of their width that is `at_least`
+    enough; GsbaError if it cannot be read, or is not 2:1."""
     width, height = image_size(path)
     if width != 2 * height:
         raise GsbaError(f"{path}: is {width}x{height}; a panorama is 2:1")
@@ -48,14 +42,8 @@ def load_panorama(path: Path, at_least: int) -> np.ndarray:
 
 
 def find_pictures(sources: Sequence[Path], cameras: PictureCameras, work: Path) -> list[Picture]:
-    """The pictures of files, folders and videos, in this order; those of one name are refused.
-
-    Args:
-        work: folder for the frames of videos, one a second.
-
-    Raises:
-        GsbaError: a source is missing, holds no picture, or frames of no camera of the run.
-    """
+    """The pictures of files, folders and videos (one frame a second, in `work`), in this order;
+    GsbaError for a source that holds none, frames of no camera of the run, or two of one name."""
     layouts = cameras.layouts()
     found: list[Picture] = []
     for number, source in enumerate(sources):

@@ -77,14 +77,8 @@ class RunMap:
 
     @classmethod
     def open(cls, root: Path, map_number: int = 1) -> "RunMap":
-        """Read a finished run.
-
-        Args:
-            map_number: number of the map, 1 = the largest.
-
-        Raises:
-            GsbaError: no finished run, one of another version of gsba, or one without points.
-        """
+        """Read a map of a finished run, 1 = the largest; GsbaError for no finished run, one of
+        another version of gsba, or one without points."""
         require_own_version(root)
         result, frames = load_run(root, map_number)
         if not len(result.points_world):

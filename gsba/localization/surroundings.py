@@ -124,13 +124,8 @@ def open_rates(
     extract: Callable[[FrameSet, int, CubeRig], Features],
     query_of: Callable[[Features, int, CubeRig], Query],
 ) -> PictureRates:
-    """Rates of a map: those kept beside the run if they are the run's, else measured and kept.
-
-    Where pictures of the run are gone, its stored keypoints are taken: on faces of the run's size.
-
-    Args:
-        rigs: (C) faces on which keypoints of each camera's panoramas are found, if they can be.
-    """
+    """Rates of a map: those kept beside the run if they are the run's, else measured on faces of
+    `rigs` (C) and kept; where pictures of the run are gone, by its stored keypoints."""
     map_ = surroundings.map
 
     def rates_of_camera(camera: int) -> tuple[Rates, Rates, int]:

@@ -29,13 +29,8 @@ def crossing(
     known: list[np.ndarray],
     outside: np.ndarray,
 ) -> list[Proposal]:
-    """Similarities of a part and the map, one from each pair of frames over a break.
-
-    Args:
-        pairs: pairs of one frame outside the map and one inside.
-        poses: (F, 4, 4), each frame's in its own map.
-        known: (F) of (K_f, 3), points of each frame's keypoints in its rig frame, NaN = unknown.
-    """
+    """Similarities of a part and the map, one from each pair of frames over a break; `known` (F) of
+    (K_f, 3) are points of keypoints, rig frames, NaN = unknown."""
     found = []
     for p, (f0, f1) in enumerate(pairs.matches.pairs.tolist()):
         if not np.isfinite(pairs.direction_sigmas[p]):

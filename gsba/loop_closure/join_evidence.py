@@ -237,16 +237,9 @@ def weigh(
     depth: float,
     surfaces: bool = True,
 ) -> tuple[JoinEvidence, Matches]:
-    """Weigh the evidence for and against a join of two groups of frames.
-
-    Args:
-        groups: (N,) and (M,) frames.
-        depth: median distance of points, map units.
-        surfaces: see `predict`.
-
-    Returns:
-        The evidence, and the points found again: matches of frames of both groups.
-    """
+    """Weigh the evidence for and against a join of two groups (N,), (M,) of frames; with it the
+    points found again, as matches of frames of both. `depth`: median distance of points, map
+    units."""
     pairs = nearest_pairs(places, *groups)[:_MAX_PAIRS]
     seen, found = predict(context, places, pairs, surfaces)
     if not len(seen.bins):
@@ -346,16 +339,9 @@ def nearest_pairs(places: Places, one: np.ndarray, other: np.ndarray) -> np.ndar
 def predict(
     context: MatchContext, places: Places, pairs: np.ndarray, surfaces: bool
 ) -> tuple[Predictions, Matches]:
-    """Predict points of the first frames of pairs in the second frames, and match them.
-
-    Args:
-        pairs: (P, 2) frames.
-        surfaces: predict only points on surfaces that the second frame knows; else all, of which
-            some will be occluded.
-
-    Returns:
-        Predictions, and the matches that were found.
-    """
+    """Predict points of the first frames of pairs (P, 2) in the second ones, and match them: with
+    `surfaces` only points on surfaces that the second frame knows, else all, some of them
+    occluded."""
     gates = [Gate.around_points(GATE_RAD)] * len(pairs)
     found = context.match(pairs, places.world_T_rigs, gates, places.known, guided_only=True)
     seen = context.keypoints.bearings_of
@@ -369,13 +355,8 @@ def predict(
 def predicted(
     places: Places, f: int, g: int, matched: np.ndarray, bearings: np.ndarray, surfaces: bool
 ) -> Predictions:
-    """Points of frame f, predicted in frame g.
-
-    Args:
-        matched: (M, 2) keypoints of f and of g that match near a prediction.
-        bearings: (K, 3) unit, rig frame of g, of its keypoints.
-        surfaces: see `predict`.
-    """
+    """Points of frame f, predicted in frame g, by keypoints (M, 2) of both that match near a
+    prediction and by bearings (K, 3), unit, rig frame of g, of its keypoints."""
     rows = np.flatnonzero(np.isfinite(places.known[f]).all(axis=1))
     own, g_T_f = places.known[f][rows], inverse(places.world_T_rigs[g]) @ places.world_T_rigs[f]
     there = own @ g_T_f[:3, :3].T + g_T_f[:3, 3]

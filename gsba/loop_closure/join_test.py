@@ -57,14 +57,8 @@ class JoinTest:
     def judge(
         self, proposal: Proposal, rows: np.ndarray, inside: np.ndarray, judged: Sequence[Judged]
     ) -> Judged | None:
-        """Weigh a proposal to join two parts.
-
-        Args:
-            rows, inside: (N,) and (M,) frames of either part, ascending.
-
-        Returns:
-            None if the proposal leads to the place of one that is confirmed already.
-        """
+        """Weigh a proposal to join frames (N,) and (M,), ascending; None if it leads to the place
+        of one that is confirmed already."""
         known = [one.proposal for one in judged if one.evidence.confirmed]
         (f, g), (reach, wider_reach) = proposal.frames, (join_evidence.LOCAL, join_evidence.WIDER)
         near = around(rows, f, reach), around(inside, g, reach)

@@ -148,12 +148,8 @@ class Closed:
 def close(
     context: MatchContext, solved: Solution, unseen: np.ndarray, scratch: Path | None = None
 ) -> Closed:
-    """Find revisited places, and deform the map so that they coincide.
-
-    Args:
-        unseen: (F - 1,) bool, steps that no images confirm: their error may be their length.
-        scratch: folder on the disk that takes the global descriptors; None = they are in memory.
-    """
+    """Find revisited places, and deform the map so that they coincide; steps `unseen` (F - 1,) bool
+    may be off by their length. `scratch` takes global descriptors on the disk."""
     settings, keypoints = context.settings, context.keypoints
     num = len(solved.world_T_rigs)
     looks = global_descriptors(context.strongest, num, settings.seed, context.workers, scratch)
@@ -318,14 +314,8 @@ def within_drift(
 
 
 def consistent(loops: list[Loop], solved: Solution, window: int) -> list[Loop]:
-    """Loops that agree with others around them and outweigh those that contradict them.
-
-    Two loops between the same stretches of the path agree if a round trip (one loop, along the
-    path, back over the other) leads back to its start.
-
-    Args:
-        window: number of frames over which the map counts as accurate.
-    """
+    """Loops that outweigh those that contradict them, and agree with others within `window` frames:
+    a round trip over both and the path leads back to its start."""
     depth, poses = solved.median_depth(), solved.world_T_rigs
     rivals = [
         [

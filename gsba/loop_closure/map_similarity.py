@@ -72,14 +72,9 @@ class Proposal:
 
 
 def propose(meetings: list[Meeting], poses: np.ndarray, depth: float, seed: int) -> list[Proposal]:
-    """Similarities given by pairs of frames, those with the most inliers first.
-
-    Where no pair shares enough points, each counts those of the pairs beside it, too.
-
-    Args:
-        poses: (F, 4, 4) each in its own map.
-        depth: median distance of points, units of the map.
-    """
+    """Similarities given by pairs of frames, the most inliers first; where no pair shares enough
+    points, each counts those of the pairs beside it, too. Poses (F, 4, 4) are each in its own
+    map."""
     found = _proposed(meetings, meetings, poses, seed)
     if not found:
         found = _proposed([_pooled(m, meetings, poses) for m in meetings], meetings, poses, seed)
@@ -164,13 +159,8 @@ def _inliers_of(meetings: list[Meeting], move: Sim3, poses: np.ndarray) -> list[
 def alike(
     one: Proposal, other: Proposal, poses: np.ndarray, depth: float, slack: float = 1.0
 ) -> bool:
-    """True if two proposals move the frames of both to the same poses.
-
-    Args:
-        poses: (F, 4, 4), each frame's in its own map.
-        depth: median distance of points, map units.
-        slack: tolerance, in typical differences of two estimates of one similarity.
-    """
+    """True if two proposals move the frames of both, poses (F, 4, 4) each in its own map, to the
+    same poses; `depth` in map units, `slack` in typical differences of two estimates."""
     frames = poses[[one.frames[0], other.frames[0]]]
     off, turned, stretched = difference(one.move, other.move, frames)
     near = off < slack * AGREE * max(depth, 1e-12)
@@ -188,12 +178,8 @@ def difference(one: Sim3, other: Sim3, poses: np.ndarray) -> tuple[float, float,
 
 
 def refined(meetings: list[Meeting], start: Sim3, poses: np.ndarray) -> Sim3:
-    """The similarity that minimises bearing residuals of all meetings, in both directions.
-
-    Args:
-        start: similarity to start from; points that it does not map onto one another are left out.
-        poses: (F, 4, 4) each in its own map.
-    """
+    """The similarity that minimises bearing residuals of meetings in both directions, from `start`
+    on; points that it does not map onto one another are left out."""
     from scipy.optimize import least_squares
 
     residuals = _residuals_of(_inliers_of(meetings, start, poses), poses)

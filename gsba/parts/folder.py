@@ -197,15 +197,8 @@ class PartsWriter:
         self._codes = np.unique(np.concatenate([self._codes, first << 32 | second]))
 
     def cut(self, values: gtsam.Values, num_frames: int, most: int) -> Partition:
-        """Cut what was added into parts.
-
-        Args:
-            values: to start from: poses X(frame) of all frames, and other variables of factors.
-            most: frames and other variables of a part, without those on cuts.
-
-        Returns:
-            The part of each frame, then of each other variable.
-        """
+        """Cut what was added into parts of at most `most` variables off the cuts; gives the part of
+        each frame, then of each other variable."""
         pairs = np.column_stack([self._codes >> 32, self._codes & 0xFFFFFFFF])
         pairs = np.where(pairs < _BESIDE, pairs, pairs - _BESIDE + num_frames)
         num, poses = num_frames + len(self._numbers), At.of(values, range(num_frames), ()).poses

@@ -36,13 +36,8 @@ class Partition:
 def partition(
     num_frames: int, pairs: np.ndarray, most: int, positions: np.ndarray | None = None
 ) -> Partition:
-    """Cut frames into parts of at most `most` frames off the cuts.
-
-    Args:
-        pairs: (P, 2) int, distinct frames that a landmark or another factor ties.
-        most: frames of a part, at least one.
-        positions: (F, 3) where frames are, roughly; None = cuts follow the pairs alone.
-    """
+    """Cut frames into parts of at most `most` frames off the cuts, by tied pairs (P, 2) and rough
+    positions (F, 3); None = by pairs alone."""
     on_cut, homes, num_parts = np.zeros(num_frames, bool), np.full(num_frames, -1), 0
     waiting = [(np.arange(num_frames), np.asarray(pairs, np.int64).reshape(-1, 2))]
     while waiting:

@@ -20,12 +20,8 @@ from gsba.types import CoarsePoses, GyroConstraints, VerifiedPairs
 
 
 def match_neighbours(state: State) -> State:
-    """Neighbours in time of every recording, and what they say of its trajectory, clock and gyro.
-
-    Raises:
-        GsbaError: a recording whose images do not match or contradict its trajectory, or show no
-            motion; the message names the recording.
-    """
+    """Neighbours in time of every recording, and what they say of its trajectory, clock and gyro;
+    GsbaError names one whose images do not match, contradict it, or show no motion."""
     run = state.run
     apart = [_match(state, number) for number in range(len(run.evidence.recordings))]
     run.chain.join([one.run.chain for one in apart])

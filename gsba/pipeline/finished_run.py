@@ -69,15 +69,8 @@ class FinishedRun:
 
     @classmethod
     def load(cls, root: Path) -> "FinishedRun":
-        """Read a finished run.
-
-        Args:
-            root: folder of a run, see `growing.held_runs`.
-
-        Raises:
-            GsbaError: a run that is not finished, one of another version of gsba, or one without
-                points.
-        """
+        """Read a finished run; GsbaError for one that is not finished, of another version of gsba,
+        or without points."""
         require_own_version(root)
         if not (root / "report.json").is_file():
             raise GsbaError(f"{root} is not finished: run gsba refine with --out {root} to the end")

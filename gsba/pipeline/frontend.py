@@ -48,10 +48,8 @@ _MAX_POSITIONS = 500  # compared with one another, evenly chosen
 
 
 def extract(run: Run) -> State:
-    """Keypoints of all frames: the first state of a run.
-
-    Frames of a map that is expected to be weak get as many as weak ones at once.
-    """
+    """Keypoints of all frames, the first state of a run; where its map is expected to be weak, as
+    many as weak frames get."""
     drift, known = expected_drift(run, _search(run, run.settings))
     more = drift > run.settings.weak_frames.max_drift
     enlarged = _enlarged(run.settings)
@@ -181,11 +179,8 @@ def _match_neighbours(state: State, name: str) -> State:
 
 def judge_trajectory(state: State) -> State:
     """The trajectory without what images contradict; neighbours once more where it misled.
-
-    Raises:
-        NoPositions: neighbours match, but show neither a way nor a turn.
-        GsbaError: images contradict most of the trajectory, or match nowhere.
-    """
+    NoPositions if neighbours show neither a way nor a turn, GsbaError if images contradict most of
+    it."""
     run, prior, times = state.run, state.prior, state.run.frames.timestamps
     context = state.observed.context
     compute = partial(recovery.recover, context, state.verified, prior.coarse, times)

@@ -146,11 +146,8 @@ def with_baseline(settings: RefineSettings, calibration: Path | None) -> RefineS
 def given_circles(
     circles: Sequence[tuple[float, float, float]], calibration: Path | None
 ) -> tuple[ImageCircle, ...]:
-    """Image circles of the front and the back lens as a caller gives them, or one of both.
-
-    Raises:
-        GsbaError: more than two of them, no circles, or a calibration as well.
-    """
+    """Image circles of the front and the back lens, or one of both, as a caller gives them;
+    GsbaError for more than two, what is no circle, or a calibration as well."""
     if not circles:
         return ()
     if calibration is not None:
@@ -167,13 +164,8 @@ def given_circles(
 
 
 def read_gyro(imu: Path | None, frames: Path) -> Readings | None:
-    """Readings that a run is given, or that its raw video holds.
-
-    A video without them, or without the library that reads them, is taken as it is, in a line.
-
-    Raises:
-        GsbaError: a file of readings that cannot be used.
-    """
+    """Readings that a run is given, or that its raw video holds; a video without them, or without
+    the library that reads them, is taken as it is. GsbaError if `imu` cannot be used."""
     if imu is not None:
         return read_imu(imu)
     pair = lens_files(frames)
@@ -197,11 +189,8 @@ def read_gyro(imu: Path | None, frames: Path) -> Readings | None:
 
 
 def families_of(frames: FrameSet, settings: RefineSettings) -> list[Family]:
-    """GPS fixes and families that packages provide, as settings.factors name them.
-
-    Raises:
-        GsbaError: a package whose family cannot be made, or positions that cannot be used.
-    """
+    """GPS fixes and families that packages provide, as settings.factors name them; GsbaError if one
+    cannot be made."""
     fixes = positions_of(frames, settings)
     made: list[Family] = [] if fixes is None else [GpsFactors(fixes)]
     for named in settings.package_families():
@@ -215,13 +204,8 @@ def families_of(frames: FrameSet, settings: RefineSettings) -> list[Family]:
 
 
 def positions_of(frames: FrameSet, settings: RefineSettings) -> FrameFixes | None:
-    """GPS fixes of frames for the gps factors; None = they are not asked for.
-
-    Positions that the run's exports are to be placed by are read, too, to refuse them early.
-
-    Raises:
-        GsbaError: positions that cannot be used, or that too few frames have.
-    """
+    """GPS fixes of frames for the gps factors, None = not asked for; positions that exports are to
+    be placed by are read, too. GsbaError if they cannot be used, or too few frames have one."""
     check(settings.placement, frames, settings.camera.baseline())
     source = settings.gps.file
     if source is None:

@@ -152,14 +152,8 @@ def as_read_by(
 
 
 def refuse_fields(runs: Sequence[FinishedRun], several: bool) -> None:
-    """Refuse to lay cameras beside one for which a field of stitching errors was found.
-
-    Args:
-        several: True if they are to be a run of several cameras.
-
-    Raises:
-        GsbaError: a run has such a field.
-    """
+    """Refuse to lay cameras beside one for which a field of stitching errors was found, if runs are
+    to be one of `several` cameras."""
     for run in runs if several else ():
         if run.map.field:
             raise GsbaError(

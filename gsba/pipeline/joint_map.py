@@ -30,12 +30,8 @@ class JointMaps:
 
     @classmethod
     def of(cls, runs: Sequence[FinishedRun]) -> "JointMaps":
-        """Lay the maps of runs back to back.
-
-        Raises:
-            GsbaError: runs that cannot be one: of different features or faces, with recordings of
-                one name, or with one recording twice.
-        """
+        """Lay the maps of runs back to back; GsbaError for runs of different features or faces,
+        with recordings of one name, or with one recording twice."""
         _check_settings(runs)
         cameras = JointCameras.of(runs)
         frames = _frames_of(runs, cameras)

@@ -82,11 +82,8 @@ def begin(store: RunStore, maps: JointMaps, settings: RefineSettings) -> State:
 
 
 def register(state: State, maps: JointMaps) -> State:
-    """Maps moved to where they meet others, as the test of joins confirms.
-
-    Raises:
-        ApartError: two maps meet in a scale that the distances of their lenses contradict.
-    """
+    """Maps moved to where they meet others, as the test of joins confirms; ApartError where two
+    meet in a scale that the distances of their lenses contradict."""
     run, solution = state.run, state.solution
     nothing = np.zeros(len(solution.world_T_rigs) - 1, bool)
 
@@ -139,10 +136,8 @@ class RigidMoves:
 
 
 def align_rigidly(state: State, parts: np.ndarray) -> RigidMoves:
-    """Parts (F,) of joined maps moved by the points that they share, each as it is.
-
-    The first part of every map stays. Each further one is moved to those before it.
-    """
+    """Parts (F,) of joined maps moved, each as it is, by the points that they share with those
+    before them; the first part of every map stays."""
     run, merged, num = state.run, state.prior.merged, int(parts.max()) + 1
     assert merged is not None
     matches = _across(state, parts, merged).matches.across
@@ -217,11 +212,8 @@ def hold(state: State, rows: np.ndarray) -> State:
 
 
 def tie(state: State, parts: np.ndarray) -> State:
-    """Joined maps tied by the points that frames of different parts (F,) share, and adjusted.
-
-    Raises:
-        ApartError: they share no points, or frames lose theirs when maps are adjusted together.
-    """
+    """Joined maps tied by the points that frames of different parts (F,) share, and adjusted;
+    ApartError if they share none, or frames lose theirs when adjusted together."""
     merged, run = state.prior.merged, state.run
     assert merged is not None
     state = replace(state, matches=_across(state, parts, merged).matches)

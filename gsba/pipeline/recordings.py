@@ -55,13 +55,8 @@ class Recording:
 
 
 def names_of(recordings: Sequence[Recording]) -> list[str]:
-    """A name for each recording: its own, else that of its folder or video.
-
-    Folders of one name, such as `images`, get their parents' names before theirs.
-
-    Raises:
-        GsbaError: two recordings have one name.
-    """
+    """A name for each recording: its own, else that of its folder or video, with its parent's
+    before it where several have one. GsbaError if two recordings still have one name."""
     paths = [Path(one.frames).resolve() for one in recordings]
     for path in paths:
         if paths.count(path) > 1:

@@ -78,16 +78,8 @@ def _first_tag(paths: Sequence[Path]) -> tuple[GpsTag | None, int]:
 def read_fixes(
     source: str, frames: FrameSet | None = None, settings: GpsSettings | None = None
 ) -> GpsFixes | None:
-    """Fixes of the source that `--gps` names: a CSV or GPX file, a video, or "exif" of the frames.
-
-    Args:
-        source: path of the file, or "exif".
-        frames: frames of the run; None = not known yet, so that "exif" gives None.
-        settings: smallest noise of a fix.
-
-    Raises:
-        GsbaError: the source cannot be read; the message names the line.
-    """
+    """Fixes of the source that `--gps` names: a CSV or GPX file, a video, or "exif" of the frames,
+    None where these are not known yet. GsbaError names the line that cannot be read."""
     if source == EXIF:
         return None if frames is None else read_exif_gps(frames, settings)
     path = Path(source)

@@ -31,14 +31,8 @@ def is_recording(path: Path) -> bool:
 
 
 def read_video_gps(path: Path, settings: GpsSettings | None = None) -> GpsFixes:
-    """Fixes of a video of Insta360 or GoPro, with times in seconds on the video's clock.
-
-    Args:
-        settings: smallest noise of a fix; the file's DOP is used if it has one.
-
-    Raises:
-        GsbaError: the video holds no positions, or `telemetry_parser` is needed and not installed.
-    """
+    """Fixes of a video of Insta360 or GoPro, with times in seconds on the video's clock; GsbaError
+    if it holds none, or `telemetry_parser` is needed and not installed."""
     trailer = read_trailer(path)
     if trailer is None:
         return _of_gopro(path, settings)

@@ -134,13 +134,9 @@ def upwards(path: Path) -> str:
 
 
 def read_pairs(path: Path) -> tuple[list[str], np.ndarray]:
-    """Picked point pairs: texts that name points of the run, and points (N, 3) of the scan's file.
-
-    Lines have two columns: a frame, or x,y,z in the run's world; X,Y,Z of the scan.
-
-    Raises:
-        GsbaError: a line cannot be used, or there are fewer than three pairs.
-    """
+    """Picked point pairs, one a line: texts that name points of the run (a frame, or x,y,z), and
+    points (N, 3) of the scan's file (X,Y,Z). GsbaError for a line like no other, or less than
+    three."""
     ends, points = [], []
     for number, line in read_lines(path):
         try:

@@ -78,14 +78,8 @@ def in_file(path: Path) -> Iterator[None]:
 
 
 def register(cloud: Cloud, scan: Scan, guess: Guess | None = None) -> Registration:
-    """Unique similarity from a cloud to a scan.
-
-    Args:
-        guess: prior knowledge; only placements within it are tried.
-
-    Raises:
-        NoPlacementError: no placement explains enough, or several do about as well.
-    """
+    """Unique similarity from a cloud to a scan, of those that `guess` allows; NoPlacementError if
+    none explains enough, or several do about as well."""
     guess, grid = guess or Guess(), CellGrid(scan)
     fits = _likeliest(cloud, scan, guess, grid, _NUM_FINALISTS)
     if not fits:

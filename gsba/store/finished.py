@@ -12,14 +12,8 @@ from gsba.types import FrameSet, Reconstruction
 
 
 def load_run(out: Path, map_number: int = 1) -> tuple[Reconstruction, FrameSet]:
-    """One map of a finished run and its frames.
-
-    Args:
-        map_number: number of the map, 1 = the largest.
-
-    Raises:
-        GsbaError: `out` is no finished run, or was edited; there is no such map.
-    """
+    """One map of a finished run, 1 = the largest, and its frames; GsbaError if `out` is no finished
+    run, was edited, or has no such map."""
     reconstruction = load_stage(out, "reconstruction", Reconstruction)
     frames = load_stage(out, "frames", FrameSet)
     if not _fit_together(reconstruction, frames):

@@ -58,12 +58,8 @@ class RecordError(Exception):
 
 
 def save_record(path: Path, value: object, info: Mapping[str, Any]) -> None:
-    """Store a record atomically, with a JSON-able `info` (key, timing).
-
-    Raises:
-        TypeError: `value` holds a type that records cannot hold.
-        GsbaError: the disk cannot be written.
-    """
+    """Store a record atomically, with a JSON-able `info` (key, timing); TypeError if it holds a
+    type that records cannot hold, GsbaError if the disk cannot be written."""
     arrays: dict[str, np.ndarray] = {}
     manifest = {"format": FORMAT, "info": dict(info), "value": _encode(value, "", arrays)}
 
@@ -133,15 +129,8 @@ def load_keyed(path: Path, key: str, returns: type[T]) -> T | None:
 
 
 def load_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
-    """Read arrays of a record by the names of their fields, whatever the record's type.
-
-    Returns:
-        The first array of each name, in the order of the record's fields; those it lacks are left
-        out.
-
-    Raises:
-        RecordError: missing, truncated or corrupt.
-    """
+    """Arrays of a record by names of fields, whatever its type: the first of each, in the order of
+    the record's fields, without those it lacks; RecordError if damaged."""
     arrays: dict[str, np.ndarray] = {}
     with _reading(path) as archive:
         for member in archive.namelist():
@@ -152,15 +141,8 @@ def load_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
 
 
 def load_checkpoint(path: Path | None, key: str, returns: type[T], anew: str) -> T | None:
-    """Read what interrupted work saved, if it was saved with this `key` in its info.
-
-    Args:
-        path: file written by `save_record`; None = there is none.
-        anew: clause for the log if the file cannot be used, e.g. "training starts anew".
-
-    Returns:
-        The record; None = there is none that can be used.
-    """
+    """What interrupted work saved with this `key`; None if there is nothing usable, which the log
+    tells with the clause `anew`, as "training starts anew"."""
     if path is None or not path.exists():
         return None
     try:

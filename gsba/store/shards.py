@@ -171,15 +171,8 @@ class Manifest:
 
 
 def write_shard(job: Job[R], folder: Path) -> tuple[Path, str]:
-    """Write a part of a job for a worker.
-
-    Args:
-        folder: folder of shards, on a disk that workers share.
-
-    Returns:
-        Its file, whose result goes to `result_path` of it, and the SHA-256 of its content. The
-        digest must reach `run_shard` by another way than this disk.
-    """
+    """Write a part of a job for a worker to a folder of shards, on a disk that workers share; gives
+    its file and the SHA-256 of its content, which must reach `run_shard` by another way."""
     buffer = io.BytesIO()
     _pickle(job, buffer)
     content = f"{__version__}\n".encode() + buffer.getvalue()

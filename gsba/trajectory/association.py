@@ -79,16 +79,8 @@ def refuse_other_unit(
 
 
 def refuse_apart(frame_times: np.ndarray, entries: np.ndarray, margin: float) -> None:
-    """Refuse a trajectory that hardly overlaps the frames in time.
-
-    Args:
-        frame_times: (F,) frame times on the trajectory's clock, ascending.
-        entries: (N,) times of the trajectory, ascending.
-        margin: seconds by which both spans are extended.
-
-    Raises:
-        GsbaError: fewer than two frames lie in its span, or fewer than two poses in theirs.
-    """
+    """Refuse a trajectory (N,) that hardly overlaps the frames (F,) in time, seconds on its clock,
+    both spans extended by `margin`."""
     inside = np.sum((frame_times >= entries[0] - margin) & (frame_times <= entries[-1] + margin))
     during = np.sum((entries >= frame_times[0] - margin) & (entries <= frame_times[-1] + margin))
     if min(inside, during) >= 2:

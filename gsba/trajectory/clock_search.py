@@ -56,13 +56,8 @@ class Turns:
 
 
 def merged(timestamps: np.ndarray, f_R_nexts: np.ndarray, verified: np.ndarray) -> Turns:
-    """Turns from the steps of frames, short ones merged.
-
-    Args:
-        timestamps: (F,) seconds.
-        f_R_nexts: (F - 1, 3, 3) rotations between consecutive frames.
-        verified: (F - 1,) bool, True for known rotations.
-    """
+    """Turns from the steps of frames at times (F,), seconds, short ones merged: rotations (F - 1,
+    3, 3), and which of them are known, (F - 1,) bool."""
     from scipy.spatial.transform import Rotation
 
     least = max(_MIN_STEP_S, np.ptp(timestamps) / _MAX_STEPS) if len(timestamps) else 0.0
@@ -97,16 +92,8 @@ class ClockFit:
         self._rough_sigma = max(0.5 * typical, _MIN_GRID_SIGMA_RAD)
 
     def residuals(self, parameters: np.ndarray) -> np.ndarray:
-        """Rotation residuals in radians, from the images' to the trajectory's.
-
-        Outside its span the trajectory counts as not rotating.
-
-        Args:
-            parameters: (..., 2) shift and rate.
-
-        Returns:
-            (..., N, 3).
-        """
+        """Rotation residuals (..., N, 3), radians, from the images' to the trajectory's, at shifts
+        and rates (..., 2); outside its span the trajectory counts as not rotating."""
         shifts, rates = parameters[..., 0, None, None], parameters[..., 1, None, None]
         times = self.turns.middle + shifts + rates * self._from_middle()
         inside = ((times >= self.span[0]) & (times <= self.span[1])).all(axis=-1)

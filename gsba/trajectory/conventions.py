@@ -89,13 +89,8 @@ def axis_systems() -> Iterator[tuple[str, np.ndarray]]:
 
 
 def quarter_turn(coarse: CoarsePoses, world_T_rigs: np.ndarray) -> np.ndarray:
-    """ours_R_theirs (3, 3), by quarter turns about the forward axis, under which steps agree best.
-
-    A trajectory comes from upright panoramas, but sensors may be mounted turned by quarters.
-
-    Args:
-        world_T_rigs: (F, 4, 4) estimated poses, up to a similarity.
-    """
+    """ours_R_theirs (3, 3), by quarter turns about the forward axis, under which steps agree best
+    with estimated poses (F, 4, 4): sensors may be mounted turned, unlike upright panoramas."""
     own = coarse.sources == PoseSource.SLAM
     own = own[:-1] & own[1:]
     ours, theirs = _steps(world_T_rigs)[own], _steps(coarse.world_T_rigs)[own]

@@ -29,11 +29,8 @@ class NamedPoses:
     world_T_rigs: np.ndarray  # (N, 4, 4) float64, chunk units
 
     def timed(self, frames: FrameSet) -> Trajectory:
-        """The poses of the frames with these names, with `_` for folders, at the frames' times.
-
-        Raises:
-            GsbaError: fewer than two frames have a pose.
-        """
+        """The poses of frames with these names, with `_` for folders, at the frames' times;
+        GsbaError if fewer than two have one."""
         rows = {name: row for row, name in enumerate(self.names)}
         named = [name if name in rows else name.replace("/", "_") for name in frames.names]
         known = [(f, rows[name]) for f, name in enumerate(named) if name in rows]

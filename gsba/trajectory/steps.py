@@ -175,15 +175,8 @@ def length_ratios(
 
 
 def given_up(open_at: set[int], matches: np.ndarray) -> set[int]:
-    """Steps to drop so that no two consecutive steps remain without a known ratio of lengths.
-
-    Args:
-        open_at: frames between two steps whose ratio is unknown.
-        matches: (F - 1,) matches of each step; of two steps, the one with fewer is dropped.
-
-    Returns:
-        First frames of the dropped steps.
-    """
+    """First frames of steps to drop so that no two consecutive ones remain without a known ratio of
+    lengths, as at frames `open_at`; of two, the one with fewer matches (F - 1,)."""
     out, left = set[int](), set(open_at)
     while left:
         beside = {step for f in left for step in (f - 1, f)}
