@@ -110,16 +110,6 @@ class Loop:
     support: int  # number of inliers
 
 
-def met(loops: list[Loop], solved: Solution, unseen: np.ndarray) -> list[Loop]:
-    """Loops that the path can close without bending verified steps."""
-    if not loops:
-        return loops
-    pairs = np.array([(loop.f0, loop.f1) for loop in loops])
-    asserted = np.array([loop.f0_T_f1 for loop in loops])
-    kept = affordable(solved.world_T_rigs, unseen, pairs, asserted)
-    return [loop for loop, stays in zip(loops, kept, strict=True) if stays]
-
-
 def bend(solved: Solution, loops: list[Loop], unseen: np.ndarray) -> Solution:
     """Distribute the residuals of loops over the path, each point with its first frame; steps
     `unseen` (F - 1,) bool without matches give way first."""
@@ -162,7 +152,10 @@ def close(
     within = [loop for loop in loops if within_drift(loop, poses, depth, unseen, settings)]
     agreeing = consistent(within, solved, settings.pairs.window)
     upheld = _not_refuted(context, solved, agreeing)
-    believed = met(upheld, solved, unseen)
+    ends = np.array([(loop.f0, loop.f1) for loop in upheld], np.int32).reshape(-1, 2)
+    steps = np.array([loop.f0_T_f1 for loop in upheld])
+    kept = affordable(poses, unseen, ends, steps) if upheld else np.zeros(0, bool)
+    believed = [loop for loop, stays in zip(upheld, kept, strict=True) if stays]
     counts = Counts(
         len(chosen),
         len(believed),
@@ -175,8 +168,7 @@ def close(
             "bend confirmed steps": len(upheld) - len(believed),
         },
     )
-    pairs = np.array([(loop.f0, loop.f1) for loop in believed], np.int32).reshape(-1, 2)
-    return Closed(bend(solved, believed, unseen) if believed else solved, pairs, counts)
+    return Closed(bend(solved, believed, unseen) if believed else solved, ends[kept], counts)
 
 
 def candidates(

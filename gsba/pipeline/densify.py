@@ -39,7 +39,9 @@ def fetch_where_weak(
     chosen = len(frames)
     for n in range(settings.odometry.fetch_rounds):
         left = int((1 + _MAX_SHARE) * chosen) - len(frames)
-        name, key = f"fetch{n}", _key(frames, settings)
+        name = f"fetch{n}"
+        paths = [path for group in frames.paths for path in group] + list(set(frames.mask_paths))
+        key = [settings.model_dump(exclude={"export", "placement"}), fingerprint(paths)]
         rows = store.stored(name, key, np.ndarray, ())
         if rows is None:
             steps = weak_steps(measure(frames), settings.odometry)
@@ -91,12 +93,6 @@ def rows_between(walk: Odometry, times: np.ndarray, steps: np.ndarray, most: int
     if len(rows) > most:
         rows = [rows[n] for n in np.linspace(0, len(rows) - 1, max(most, 0)).astype(int)]
     return np.array(rows, np.int64)
-
-
-def _key(frames: FrameSet, settings: RefineSettings) -> list[object]:
-    """All that a choice of frames to fetch rests on."""
-    paths = [path for group in frames.paths for path in group] + list(set(frames.mask_paths))
-    return [settings.model_dump(exclude={"export", "placement"}), fingerprint(paths)]
 
 
 def _with_rows(

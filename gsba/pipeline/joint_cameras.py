@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsba.bundle.readout import CameraEstimate, velocities
-from gsba.camera.lens import Lenses
+from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.config import CameraSettings
 from gsba.frames.recordings import combine, one_mode, own_timestamps
 from gsba.log import GsbaError
@@ -81,40 +81,49 @@ class JointCameras:
     ) -> tuple[FoundCamera, ...]:
         """Estimate of each camera (C,) for the frames of all runs, which `moves` place in the joint
         one."""
-        return tuple(
-            self._found(c, runs, moves, solution, frames) for c in range(len(self.formats))
-        )
+        times, poses = own_timestamps(frames), solution.world_T_rigs
+        starts = np.cumsum([0, *(len(run.frames) for run in runs)])
 
-    def _found(
-        self,
-        camera: int,
-        runs: Sequence[FinishedRun],
-        moves: Sequence[Sim3],
-        solution: Solution,
-        frames: FrameSet,
-    ) -> FoundCamera:
-        number = self.seen_by[camera]
-        inside = self.in_run(camera, number)
-        assert inside is not None
-        known, scale = runs[number].map.cameras[inside], moves[number].scale
-        each = list[tuple[Lenses | None, int]]()
-        for n, run in enumerate(runs):
-            c = self.in_run(camera, n)
-            lenses = None if c is None else run.map.cameras[c].lenses
-            each.append((lenses, len(run.frames)))
-        estimate = _for_all_frames(_scaled(known, scale), known, each, moves, solution, frames)
-        centres, radius = known.centres, known.radius
-        if centres is not None:
-            lenses = Lenses() if estimate is None else estimate.lenses
-            covariance = centres.covariance * scale**2
-            centre = scale * centres.found
-            centres = replace(centres, lenses=lenses, found=centre, covariance=covariance)
-        if radius is not None:
-            inverse, sigma = radius.inverse_stitch_radius / scale, radius.sigma / scale
-            lenses = radius.lenses.scaled(scale)
-            changes = {"lenses": lenses, "inverse_stitch_radius": inverse, "sigma": sigma}
-            radius = replace(radius, **changes)
-        return FoundCamera(centres, known.axes, radius, known.calibrated, estimate)
+        def estimate(camera: int, known: FoundCamera, scale: float) -> CameraEstimate | None:
+            """In the joint unit, for the frames of all runs; None = one centre, not looked for."""
+            if not known.lenses:
+                return known.readout
+            found = known.estimate().scaled(scale)
+            motion, axes = list[np.ndarray](), list[np.ndarray]()
+            for n, (run, move) in enumerate(zip(runs, moves, strict=True)):
+                rows, c = np.arange(starts[n], starts[n + 1]), self.in_run(camera, n)
+                lenses = ONE_CENTRE if c is None else run.map.cameras[c].lenses
+                if found.lenses.readout_motion is not None:
+                    moved = None if c is None else lenses.scaled(move.scale).readout_motion
+                    if moved is None:  # the run did not find it
+                        moved = found.readout_s * velocities(poses[rows], times[rows])
+                    motion.append(moved)
+                straight = np.tile(np.eye(3), (len(rows), 1, 1))
+                axes.append(straight if lenses.axes is None else lenses.axes)
+            lenses = found.lenses
+            if lenses.readout_motion is not None:
+                lenses = replace(lenses, readout_motion=np.concatenate(motion))
+            if lenses.axes is not None:
+                lenses = replace(lenses, axes=np.concatenate(axes))
+            return replace(found, lenses=lenses)
+
+        every = list[FoundCamera]()
+        for camera, number in enumerate(self.seen_by):
+            inside = self.in_run(camera, number)
+            assert inside is not None
+            known, scale = runs[number].map.cameras[inside], moves[number].scale
+            found, centres, radius = estimate(camera, known, scale), known.centres, known.radius
+            if centres is not None:
+                lenses = Lenses() if found is None else found.lenses
+                covariance, centre = centres.covariance * scale**2, scale * centres.found
+                centres = replace(centres, lenses=lenses, found=centre, covariance=covariance)
+            if radius is not None:
+                inverse, sigma = radius.inverse_stitch_radius / scale, radius.sigma / scale
+                lenses = radius.lenses.scaled(scale)
+                changes = {"lenses": lenses, "inverse_stitch_radius": inverse, "sigma": sigma}
+                radius = replace(radius, **changes)
+            every.append(FoundCamera(centres, known.axes, radius, known.calibrated, found))
+        return tuple(every)
 
 
 def as_read_by(
@@ -190,52 +199,3 @@ def _best_run(runs: Sequence[FinishedRun], numbers: Sequence[tuple[int, ...]], c
     lenses = [runs[n].map.cameras[numbers[n].index(camera)].lenses for n in having]
     known = [(bool(one), sum(one.parts)) for one in lenses]
     return having[known.index(max(known))]
-
-
-def _for_all_frames(
-    found: CameraEstimate | None,
-    known: FoundCamera,
-    each: Sequence[tuple[Lenses | None, int]],
-    moves: Sequence[Sim3],
-    solution: Solution,
-    frames: FrameSet,
-) -> CameraEstimate | None:
-    """The estimate of a camera in the joint unit, for the frames of all runs; None = one centre."""
-    if found is None or not known.lenses:
-        return found
-    lenses = found.lenses
-    if lenses.readout_motion is not None:
-        motion = _readout_motion(each, moves, solution, frames, found.readout_s)
-        lenses = replace(lenses, readout_motion=motion)
-    if lenses.axes is not None:
-        axes = [
-            np.tile(np.eye(3), (num, 1, 1)) if one is None or one.axes is None else one.axes
-            for one, num in each
-        ]
-        lenses = replace(lenses, axes=np.concatenate(axes))
-    return replace(found, lenses=lenses)
-
-
-def _scaled(found: FoundCamera, scale: float) -> CameraEstimate | None:
-    """A camera in a unit of which one map unit has `scale`; None = one centre, not looked for."""
-    return found.estimate().scaled(scale) if found.lenses else found.readout
-
-
-def _readout_motion(
-    each: Sequence[tuple[Lenses | None, int]],
-    moves: Sequence[Sim3],
-    solution: Solution,
-    frames: FrameSet,
-    readout_s: float,
-) -> np.ndarray:
-    """Motion (F, 6) of all frames during the readout: as their run found it, else by velocity."""
-    times, motion = own_timestamps(frames), list[np.ndarray]()
-    begin = 0
-    for (lenses, num), move in zip(each, moves, strict=True):
-        rows = np.arange(begin, begin + num)
-        own = None if lenses is None else lenses.scaled(move.scale).readout_motion
-        if own is None:
-            own = readout_s * velocities(solution.world_T_rigs[rows], times[rows])
-        motion.append(own)
-        begin += num
-    return np.concatenate(motion)

@@ -10,8 +10,6 @@ from gsba.bundle.map_strength import MAX_SCALE_SIGMA
 from gsba.bundle.reconstruction import world_scale
 from gsba.camera.calibration import calibration_json
 from gsba.camera.cameras import Cameras
-from gsba.camera.fisheye import Rig
-from gsba.camera.lens import Lenses
 from gsba.config_file import to_toml
 from gsba.disk import write_json, write_text
 from gsba.export import ExportFormat, ExportOptions, export_all, seen_by, write_points
@@ -140,25 +138,19 @@ def _write_calibrations(state: State, result: Reconstruction, cameras: Cameras) 
     for path in store.root.glob(f"calibration@*{CALIBRATION[-5:]}"):  # of an earlier call
         path.unlink()
     several = len(frames.formats) > 1
+    baseline, metres = state.run.settings.camera.baseline(), None
+    if baseline is not None and result.lens_baseline is not None:
+        metres = metres_per_unit(result.lens_baseline, baseline)[0]
     for number, name in enumerate(names_of_cameras(frames)):
         rig = frames.formats[number].fisheyes
         if rig is not None:
             path = store.root / (f"calibration@{name}.json" if several else CALIBRATION)
-            content = _calibration(rig, state, result, cameras.lenses[number], number)
-            write_json(path, content)
+            read, centre = state.map.cameras[number].estimate(), cameras.lenses[number].centre
+            timed = read.lenses.readout_motion is not None
+            more = {"readout_s": read.readout_s} if timed else {}
+            scale, unit = (1.0, "map") if metres is None else (metres, "m")
+            write_json(path, calibration_json(rig, centre * scale, unit, more))
             store.claim(path)
-
-
-def _calibration(
-    rig: Rig, state: State, result: Reconstruction, lenses: Lenses, number: int
-) -> dict[str, Any]:
-    baseline, metres = state.run.settings.camera.baseline(), None
-    if baseline is not None and result.lens_baseline is not None:
-        metres = metres_per_unit(result.lens_baseline, baseline)[0]
-    read = state.map.cameras[number].estimate()
-    more = {"readout_s": read.readout_s} if read.lenses.readout_motion is not None else {}
-    centre = lenses.centre * (1.0 if metres is None else metres)
-    return calibration_json(rig, centre, "map" if metres is None else "m", more)
 
 
 def _report(state: State, result: Reconstruction) -> dict[str, Any]:
@@ -166,7 +158,10 @@ def _report(state: State, result: Reconstruction) -> dict[str, Any]:
     solver = [{"stage": name, "rounds": some} for name, some in rounds.items()]
     costs, again_s = tuple(run.store.records.values()), run.store.seconds_again
     stages = StageLog(costs, run.journal.counts, solver, again_s)
-    gauge, of_families = _gauge(run, state.prior), _of_families(state)
+    snapshot = run.families.snapshot(state.solution, state.prior.parts)
+    of_families = {family.name: plain(family.report(snapshot)) for family in run.families.members}
+    of_families = {name: report for name, report in of_families.items() if report}
+    gauge = _gauge(run, state.prior)
     found = _findings(state, result, of_families.pop(GpsFactors.name, None))
     coarse = state.prior.coarse
     report = build_report(run.settings, run.frames, coarse, result, stages, gauge, found)
@@ -255,13 +250,6 @@ def _gyro_steps_used(state: State) -> float | None:
         if isinstance(family, GyroTurns):
             return family.report(snapshot)["steps_used"]
     return None
-
-
-def _of_families(state: State) -> dict[str, Any]:
-    families = state.run.families
-    snapshot = families.snapshot(state.solution, state.prior.parts)
-    reports = {family.name: plain(family.report(snapshot)) for family in families.members}
-    return {name: report for name, report in reports.items() if report}
 
 
 def _gauge(run: Run, prior: Prior) -> str:

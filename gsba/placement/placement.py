@@ -468,7 +468,13 @@ def guess_in_scan(
     """
     axis = UPS[upwards(Path(settings.scan or ""))]
     if settings.pairs is not None:
-        guess = _by_pairs(reconstruction, frames, Path(settings.pairs))
+        path = Path(settings.pairs)
+        ends, target = read_pairs(path)
+        source = np.array([_point(end, reconstruction, frames) for end in ends])
+        if extents(source)[1] <= _MIN_EXTENT_RATIO:
+            raise GsbaError(f"{path}: its points lie on a line: add a point off that line")
+        with naming(path):
+            guess = Guess(similarity=similarity(source, target))
         return guess.without(scan.offset), {"pairs": settings.pairs}
     if settings.gps is not None:
         upright = _upright(reconstruction, frames) if settings.up == "auto" else Placement()
@@ -480,13 +486,3 @@ def guess_in_scan(
         upright = _upright(reconstruction, frames)
         return Guess(axis=(upright.similarity.rotation.T @ _UP_WORLD, axis)), upright.grounds
     return Guess(), {}
-
-
-def _by_pairs(reconstruction: Reconstruction, frames: FrameSet, path: Path) -> Guess:
-    """Guess from picked pairs, in the world of the scan's file."""
-    ends, target = read_pairs(path)
-    source = np.array([_point(end, reconstruction, frames) for end in ends])
-    if extents(source)[1] <= _MIN_EXTENT_RATIO:
-        raise GsbaError(f"{path}: its points lie on a line: add a point off that line")
-    with naming(path):
-        return Guess(similarity=similarity(source, target))
