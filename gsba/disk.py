@@ -163,16 +163,8 @@ def remove_temporaries(folder: Path) -> None:
 
 
 def refuse_links(folder: Path, below: bool = False) -> None:
-    """Refuse a folder to write to if it holds anything but files and folders.
-
-    Through a link, gsba would replace or delete files elsewhere. Reading a pipe never ends.
-
-    Args:
-        folder: may be missing; may not itself be a link, pipe or device.
-
-    Raises:
-        GsbaError: the folder holds a link, pipe or device, which the message names.
-    """
+    """Refuse a folder to write to, which may be missing, if it or (with `below`) what is in it
+    holds a link, pipe or device: through links, gsba would replace files elsewhere."""
     if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
         raise _not_ours(folder)
     waiting = [folder] if folder.exists() else []

@@ -79,14 +79,8 @@ def track(
     done: int = 0,
     note: Callable[[], str] | None = None,
 ) -> Iterator[T]:
-    """Yield `items` and show their progress, as a bar and as events.
-
-    The bar is on stderr, on a terminal unless the run is quiet. For events see `event`.
-
-    Args:
-        total: number of items, those done before among them; None = len(items).
-        note: gives a text that stands behind the speed.
-    """
+    """Yield `items` and show their progress, as a bar on a terminal's stderr unless the run is
+    quiet, and as events (see `event`), out of `total`, with a note behind the speed."""
     with_bar = sys.stderr.isatty() and logging.getLogger("gsba").isEnabledFor(logging.INFO)
     if not (with_bar or os.environ.get(EVENTS)):
         yield from items

@@ -92,11 +92,8 @@ def mapped_file(file: IO[bytes]) -> mmap.mmap:
 
 
 def release_mapped_files() -> None:
-    """Take the pages of all mapped files out of this process's memory.
-
-    They are read again as they are used, from the system's cache of the disk as long as that has
-    them. Nothing is lost, as mapped files are not written.
-    """
+    """Take the pages of all mapped files, which are not written, out of this process's memory; they
+    are read again as they are used."""
     if hasattr(mmap, "MADV_DONTNEED"):
         for content in list(_mapped_files):
             content.madvise(mmap.MADV_DONTNEED)

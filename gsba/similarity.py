@@ -67,14 +67,8 @@ class NoSimilarityError(GsbaError):
 
 
 def similarity(source: np.ndarray, target: np.ndarray) -> Sim3:
-    """Least-squares similarity of points: Umeyama, PAMI 13(4), 1991.
-
-    Args:
-        source, target: (N, 3) float64, N >= 3, not all on one point.
-
-    Raises:
-        NoSimilarityError: the targets are all on one point, or uncorrelated with the sources.
-    """
+    """Least-squares similarity of points (N, 3), N >= 3: Umeyama, PAMI 13(4), 1991.
+    NoSimilarityError if targets are all on one point, or uncorrelated with the sources."""
     s, t = source - source.mean(axis=0), target - target.mean(axis=0)
     return turned_similarity(source, target, nearest_rotation(t.T @ s / len(s)))
 
@@ -131,13 +125,8 @@ def turned_similarity(
 
 
 def level_similarity(source: np.ndarray, target: np.ndarray) -> Sim3:
-    """Least-squares similarity whose rotation is around z: scale, heading and translation.
-
-    Closed form of the plane (Umeyama's with complex numbers); heights only constrain the scale.
-
-    Raises:
-        NoSimilarityError: see `gsba.similarity.turned_similarity`.
-    """
+    """Least-squares similarity whose rotation is around z, in closed form (Umeyama's with complex
+    numbers); heights only constrain the scale. For NoSimilarityError see `turned_similarity`."""
     mean_s, mean_t = source.mean(axis=0), target.mean(axis=0)
     s, t = source - mean_s, target - mean_t
     cross = np.sum((t[:, 0] + 1j * t[:, 1]) * (s[:, 0] - 1j * s[:, 1]))
@@ -236,14 +225,8 @@ def naming(path: Path) -> Iterator[None]:
 def relative_similarity(
     points0: np.ndarray, points1: np.ndarray, seed: int, least: int = _MIN_POINTS
 ) -> tuple[Sim3, np.ndarray] | None:
-    """Similarity of two rigs from corresponding points, each frame with its own scale.
-
-    Args:
-        points0, points1: (m, 3) points in the rigs of both frames, map units.
-
-    Returns:
-        similarity from rig 1 to rig 0, and its inliers (m,) bool; None if fewer than `least`.
-    """
+    """Similarity from rig 1 to rig 0 by corresponding points (m, 3) in both, each rig with its own
+    scale, and its inliers (m,) bool; None if fewer than `least`."""
     if len(points0) < least:
         return None
     rng = np.random.default_rng(seed)

@@ -117,11 +117,8 @@ class _Recognised:
 
 
 def localize_photos(localizer: Localizer, photos: Sequence[Photo]) -> LocalizedPhotos:
-    """Poses of photos, and the cameras that they share.
-
-    Each photo is first placed alone; then all poses and cameras are fitted together, to keypoints
-    and to patches aligned below a pixel.
-    """
+    """Poses of photos, each first placed alone, then all fitted together with the cameras that they
+    share, to keypoints and to patches aligned below a pixel."""
     placed: list[_Placed] = []
     refused: dict[str, LocalizedFrame] = {}
     for photo in track(photos, "localising photos", len(photos)):
@@ -381,11 +378,8 @@ def _judged(
 
 
 def localize_all(localizer: Localizer, pictures: Sequence[Picture]) -> LocalizedPhotos:
-    """Localise panoramas and photos; one that cannot be read is refused with the reason.
-
-    Returns:
-        Frames in the order of the pictures, and the cameras of photos.
-    """
+    """Localise panoramas and photos, in the order of the pictures; one that cannot be read is
+    refused with the reason. With the cameras of photos."""
     found: dict[str, LocalizedFrame] = {}
     photos: list[Photo] = []
     for picture in track(pictures, "localising", len(pictures)):

@@ -41,11 +41,7 @@ class Photo:
     camera: str  # photos of one text share a camera's parameters
 
     def load(self) -> np.ndarray:
-        """Pixels (H, W, 3) uint8 RGB.
-
-        Raises:
-            GsbaError: the file cannot be read.
-        """
+        """Pixels (H, W, 3) uint8 RGB; GsbaError if the file cannot be read."""
         return decode(self.path, (self.width, self.height))
 
     def projection(self, focal: float) -> PerspectiveProjection:
@@ -64,14 +60,9 @@ class Photo:
 
 
 def read_photo(path: Path) -> Photo:
-    """A photo by its header and its tags.
-
-    Photos share a camera if their tags name the same maker, model, lens and focal length, and they
-    have one size. A photo without these tags has a camera of its own.
-
-    Raises:
-        GsbaError: the file cannot be read.
-    """
+    """A photo by its header and its tags. Photos share a camera if these name the same maker,
+    model, lens and focal length, and they have one size; without tags each has its own. GsbaError
+    if damaged."""
     width, height = image_size(path)
     try:
         tags = read_exif(path)
@@ -96,13 +87,8 @@ def photo_rig(projection: PerspectiveProjection, rig: CubeRig) -> CubeRig:
 def photo_features(
     image: np.ndarray, projection: PerspectiveProjection, rig: CubeRig, extractor: Extractor
 ) -> Features:
-    """Keypoints of a photo on faces around its camera, bearings as the projection has them.
-
-    On faces a photo of any field of view looks to the extractor as panoramas do.
-
-    Args:
-        image: (H, W, 3) uint8 RGB.
-    """
+    """Keypoints of a photo (H, W, 3) uint8 RGB on faces around its camera, where it looks to the
+    extractor as panoramas do, bearings as the projection has them."""
     faces = np.zeros((len(FACES), rig.size, rig.size, 3), np.uint8)
     masks = np.zeros((len(FACES), rig.size, rig.size), bool)
     image, scales = _as_dense_as(image, projection, rig.focal)
@@ -120,11 +106,8 @@ def photo_features(
 def as_panorama(
     image: np.ndarray, projection: PerspectiveProjection, width: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Grey panorama (width / 2, width) uint8 that holds a photo, and the mask of its pixels.
-
-    Args:
-        image: (H, W, 3) uint8 RGB.
-    """
+    """Grey panorama (width / 2, width) uint8 that holds a photo (H, W, 3) uint8 RGB, and its
+    mask."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     grey, scales = _as_dense_as(grey, projection, width / (2 * np.pi))
     out = np.zeros((width // 2, width), np.uint8)

@@ -47,11 +47,8 @@ class PlacedPose:
 
 
 def best_of(poses: Sequence[PlacedPose]) -> tuple[int, str]:
-    """The pose that most cells agree with, and the reason why it is not accepted; "" = it is.
-
-    Its surroundings must confirm it, and it must explain significantly more cells than every pose
-    at another place that is no look-alike.
-    """
+    """The pose that most cells agree with, and why it is not accepted; "" = its surroundings
+    confirm it, and it explains significantly more than every other place that is no look-alike."""
     best = max(range(len(poses)), key=lambda n: len(poses[n].cells))
     one = poses[best]
     if not one.evidence.confirmed:

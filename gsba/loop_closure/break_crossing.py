@@ -91,11 +91,8 @@ class Breaks:
 
     def at_usual_pace(self, move: Sim3) -> list[Sim3]:
         """Similarities that move the part as one does, and then along the camera's way until it
-        walks on over a break at about the usual pace.
-
-        In a hall of bays, matches over a break agree on steps that are one bay too short, or lead
-        back.
-        """
+        walks on at about the usual pace: in a hall of bays, matches agree on steps that are a bay
+        too short."""
         found = list[Sim3]()
         for f, g in self.steps:
             step = move.poses(self.poses[[f]])[0, :3, 3] - self.poses[g, :3, 3]

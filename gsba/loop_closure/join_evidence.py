@@ -188,13 +188,8 @@ def rates(
     surfaces: bool = True,
     chosen: np.ndarray | None = None,
 ) -> Rates:
-    """Rates at which points of a frame are found again in frames of its own part.
-
-    Args:
-        parts: (F,) int, part of each frame.
-        surfaces: see `predict`.
-        chosen: (F,) bool, frames that are compared; None = all.
-    """
+    """Rates at which points of a frame are found again in frames of its own part (F,), if both are
+    `chosen` (F,) bool; for `surfaces` see `predict`."""
     compared = np.ones(len(parts), bool) if chosen is None else chosen
     rows = [np.flatnonzero(compared & (parts == p)) for p in np.unique(parts[compared])]
     pairs = np.concatenate([nearest_pairs(places, some, some) for some in rows])

@@ -41,13 +41,8 @@ def meetings_of(
     outside: np.ndarray,
     f0_T_f1s: np.ndarray | None = None,
 ) -> list[Meeting]:
-    """Matched points that both frames of pairs know, one of them among those outside.
-
-    Args:
-        known: (F) of (K_f, 3): points of keypoints, rig frames; NaN = unknown.
-        outside: frames (N,) outside the map.
-        f0_T_f1s: (P, 4, 4) relative poses by bearings, their translations of any length.
-    """
+    """Matched points, as known (F) of (K_f, 3), rig frames, NaN = unknown, to both frames of pairs,
+    one of them `outside` (N,); with relative poses (P, 4, 4) by bearings, of any length."""
     found = []
     for p, (f0, f1) in enumerate(matches.pairs.tolist()):
         matched = matches.of(p)

@@ -352,15 +352,9 @@ def optimize_divided(
 
 
 def read_landmarks(folder: Path, part: int) -> tuple[np.ndarray, np.ndarray]:
-    """The landmarks of a part of a map that `optimize_divided` has solved.
-
-    Returns:
-        (J,) int64, place of each landmark in the stream that the map was written from; (J, 3)
-        float64, world.
-
-    Raises:
-        GsbaError: the map is not solved yet, or a file is damaged.
-    """
+    """Landmarks of a part of a map that `optimize_divided` has solved: place (J,) int64 in the
+    stream that the map was written from, and (J, 3) float64, world. GsbaError if it is not solved
+    yet."""
     version = load(folder / _RESULT, SolverState).version
     points = load(version_file(folder, part, "points", version), PartPoints).points_world
     return load_part(folder, part).numbers, points

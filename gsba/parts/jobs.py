@@ -25,48 +25,28 @@ _MEMORY_SHARE = 64  # of the machine's memory: a process keeps factors of this p
 _Key = tuple[str, int, int, float]  # file, its inode, time of writing, damping
 
 
-class _Kept:
-    """Factors by the file of their equations and the damping."""
-
-    def __init__(self) -> None:
-        self._factors: dict[_Key, PartElimination] = {}
-        self._num_bytes, self._lock = 0, threading.Lock()
-
-    def put(self, key: _Key, factor: PartElimination, most: int) -> None:
-        """Keep a factor if all that are kept take `most` bytes at most, older ones of its file
-        left out."""
-        with self._lock:
-            for old in [old for old in self._factors if old[0] == key[0]]:
-                self._drop(old)
-            if self._num_bytes + factor.num_bytes <= most:
-                self._factors[key] = factor
-                self._num_bytes += factor.num_bytes
-
-    def take(self, key: _Key) -> PartElimination | None:
-        """A factor, which is not kept any longer."""
-        with self._lock:
-            return self._drop(key) if key in self._factors else None
-
-    def _drop(self, key: _Key) -> PartElimination:
-        factor = self._factors.pop(key)
-        self._num_bytes -= factor.num_bytes
-        return factor
-
-
-_kept = _Kept()
+_kept: dict[_Key, PartElimination] = {}
+_lock = threading.Lock()  # of `_kept`
 
 
 def eliminated(file: Path, damping: float) -> PartElimination:
-    """Factorize the equations in a file; the factor is kept for `substituting`."""
+    """Factorize the equations in a file; the factor is kept for `substituting` while all that are
+    kept take a share of the memory at most, older ones of its file left out."""
     factor = PartElimination(load(file, PartEquations), damping)
     if factor.regular:
-        _kept.put(_key(file, damping), factor, total_memory_bytes() // _MEMORY_SHARE)
+        with _lock:
+            for old in [old for old in _kept if old[0] == str(file)]:
+                del _kept[old]
+            num_bytes = sum(one.num_bytes for one in [factor, *_kept.values()])
+            if num_bytes <= total_memory_bytes() // _MEMORY_SHARE:
+                _kept[_key(file, damping)] = factor
     return factor
 
 
 def substituting(file: Path, damping: float) -> PartElimination:
-    """The factor that `eliminated` returned, or computed again."""
-    factor = _kept.take(_key(file, damping))
+    """The factor that `eliminated` returned, which is kept no longer, or computed again."""
+    with _lock:
+        factor = _kept.pop(_key(file, damping), None)
     return PartElimination(load(file, PartEquations), damping) if factor is None else factor
 
 

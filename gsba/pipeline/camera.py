@@ -243,12 +243,9 @@ def _settle_cameras(state: State, name: str) -> State:
 
 
 def take_parts_from_patches(state: State, sighted: Sighted, name: str, number: int) -> State:
-    """The map with the parts of cameras that aligned patches show; its poses are yet to follow.
-
-    Args:
-        number: of the estimate in this round. The first finds how rows are read, the second which
-            axes and calibration lenses have, as far as these are not known by then.
-    """
+    """The map with the parts of cameras that aligned patches show, its poses yet to follow:
+    estimate 0 of a round finds how rows are read, 1 which axes and calibration lenses have, if not
+    known."""
     run = state.run
     for camera, one in enumerate(state.map.cameras):
         lenses = one.lenses

@@ -140,14 +140,9 @@ def of_recording(state: State, number: int) -> State:
 
 
 def match_neighbours(state: State) -> State:
-    """Verified matches of frames next to one another in time, the clock set right first.
-
-    The start is at the right times afterwards. Of several trajectories each may have a clock of its
-    own: they are taken as they are.
-
-    Raises:
-        GsbaError: a trajectory that turns otherwise than the images.
-    """
+    """Verified matches of frames next to one another in time, the clock set right first, unless
+    several trajectories may have clocks of their own. GsbaError if a trajectory turns otherwise
+    than the images."""
     run, prior, trajectories = state.run, state.prior, state.run.evidence.trajectories
     state = _match_neighbours(state, "neighbours")
     if len(trajectories) != 1 or prior.absent or run.settings.read.clock == "given":

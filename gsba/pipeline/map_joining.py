@@ -116,14 +116,8 @@ class RigidMoves:
     def pose_covariances(
         self, own: np.ndarray, world_T_rigs: np.ndarray, stretches: np.ndarray, parts: np.ndarray
     ) -> np.ndarray:
-        """Covariances (F, 6, 6) of moved poses, in the map that they were moved to.
-
-        Args:
-            own: (F, 6, 6) covariances in their own maps.
-            world_T_rigs: (F, 4, 4) poses after the moves.
-            stretches: (F,) units of the new map per unit of each frame's own one.
-            parts: (F,) part of each frame.
-        """
+        """Covariances (F, 6, 6) of poses (F, 4, 4) moved by parts (F,), in the new map, from those
+        in their own maps, of which a unit has `stretches` (F,) of the new one."""
         turned = world_T_rigs.copy()
         turned[:, :3, 3] -= self.moves[parts, :3, 3]  # what turns and grows under the move
         back = inverse(turned)

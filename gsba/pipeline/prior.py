@@ -68,12 +68,8 @@ class Prior:
     def families(
         self, settings: PriorSettings, first: np.ndarray | None = None
     ) -> tuple[Family, ...]:
-        """The trajectory prior, as far as images confirm it, and the gyro's family if it has one.
-
-        Args:
-            settings: noise of the trajectory, unless images showed it.
-            first: (4, 4) where the first pose is held; None = where the start has it.
-        """
+        """The trajectory prior, as far as images confirm it, and the gyro's family if it has one;
+        `first` (4, 4) is where the first pose is held, None = where the start has it."""
         trust, strength = self.trust, self.strength
         whole = trust.false_steps.all()  # then the start is all there is
         believed = trust.world_T_rigs if whole else self.coarse.world_T_rigs.copy()

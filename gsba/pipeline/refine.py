@@ -149,11 +149,8 @@ def refine_from(
     source: Path,
     walk: Odometry | None,
 ) -> RunResult:
-    """Run all stages, from frames to written outputs.
-
-    Args:
-        walk: the odometry of the video; None = frames were not chosen by it.
-    """
+    """Run all stages, from frames to written outputs; `walk` is the odometry that chose the
+    frames."""
     compile_ahead("refine")
     warn_of_repeats(start.frames)
     if walk is not None:

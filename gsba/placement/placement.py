@@ -126,15 +126,8 @@ def check(
     frames: FrameSet | None = None,
     baseline: tuple[float, float] | None = None,
 ) -> None:
-    """Check settings and the files that they name.
-
-    Args:
-        frames: frames of the run, whose EXIF positions are checked; None = not checked.
-        baseline: distance of the lenses and its standard deviation, metres; None = not known.
-
-    Raises:
-        GsbaError: settings exclude one another, or a file cannot be read.
-    """
+    """Check settings, and the files that they name (positions in images only of known `frames`),
+    with the distance of the lenses and its sigma, metres. GsbaError if any exclude one another."""
     if settings.length == "lens" and baseline is None:
         raise GsbaError(
             "--scale lens needs the distance between the lenses: refine with --camera NAME or "

@@ -73,13 +73,8 @@ def estimate_clock(
     offset: float,
     reach_s: float,
 ) -> ClockEstimate:
-    """Compare the given clock with all others within reach.
-
-    Args:
-        timestamps: (F,) times of frames, seconds.
-        offset: offset of the association, seconds to add to times of frames.
-        reach_s: largest change of the offset that is tried, seconds.
-    """
+    """Compare the given clock, by its offset to times (F,) of frames, with all others whose offset
+    differs by up to `reach_s`; all in seconds."""
     given = Clock(float(timestamps[0]), offset, 1.0)
     turns = merged(timestamps, found.f_T_nexts[:, :3, :3], found.verified)
     if len(turns) < MIN_STEPS:

@@ -77,12 +77,8 @@ def check_steps(
     priors: PriorSettings,
     turn: Turn | None = None,
 ) -> StepChecks:
-    """Compare the trajectory's steps with those of the images.
-
-    Args:
-        logs, sigmas: (F - 2,) logarithms of ratios of lengths, and standard deviations.
-        turn: proof that the camera turned on the spot; None = there is none, or it moved.
-    """
+    """Compare the trajectory's steps with those of the images, by logarithms (F - 2,) of ratios of
+    lengths and their standard deviations; `turn` proves that the camera turned on the spot."""
     slam = inverse(coarse.world_T_rigs[:-1]) @ coarse.world_T_rigs[1:]
     slam_lengths = np.linalg.norm(slam[:, :3, 3], axis=1)
     own = coarse.sources == PoseSource.SLAM

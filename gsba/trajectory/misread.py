@@ -41,12 +41,8 @@ def refuse_useless(coarse: CoarsePoses) -> None:
 
 
 def refuse_misread(coarse: CoarsePoses, found: Steps, settings: TwoViewLimits) -> None:
-    """Refuse a trajectory that most steps of the images contradict, but not in another convention.
-
-    Raises:
-        TurnedAboutForwardError: the trajectory is in axes that are turned about the forward one.
-        GsbaError: it is reversed, mirrored, inverted or in other axes.
-    """
+    """Refuse a trajectory that most steps of the images contradict, but not in another convention;
+    TurnedAboutForwardError if its axes are turned about the forward one."""
     judged = _judged_steps(coarse, found)
     if judged.sum() < _MIN_STEPS:
         return

@@ -134,16 +134,9 @@ def _angle_to_arc(direction: np.ndarray, start: np.ndarray, end: np.ndarray) -> 
 def length_ratios(
     pairs: VerifiedPairs, found: Steps, keypoints: Keypoints, least_alike: int | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Length of each step relative to the step before, from common points.
-
-    Args:
-        pairs: pairs of frames at most a few apart.
-        least_alike: points that suffice if they agree on one ratio to 15 %; None = eight points,
-            however they agree.
-
-    Returns:
-        Logarithms (F - 2,) of the ratios and their standard deviations, infinite where unknown.
-    """
+    """Logarithms (F - 2,) of each step's length by that of the step before, and their standard
+    deviations, infinite where unknown, from common points: eight, or `least_alike` that agree to 15
+    %."""
     num = len(found.verified)
     logs, sigmas = np.zeros(max(num - 1, 0)), np.full(max(num - 1, 0), np.inf)
     rows = {int(f0): p for p, (f0, f1) in enumerate(pairs.matches.pairs) if f1 - f0 == 1}
