@@ -76,17 +76,10 @@ def similarity(source: np.ndarray, target: np.ndarray) -> Sim3:
 def pose_similarity(
     source_T_rigs: np.ndarray, target_T_rigs: np.ndarray, min_correlation: float = _MIN_CORRELATION
 ) -> Sim3:
-    """Similarity that maps one set of poses to another of the same rigs.
-
-    The rotation is the chordal mean over orientations, so that a straight path suffices. Scale and
-    translation are least squares over positions. A rig that never moves leaves the scale at 1.
-
-    Args:
-        source_T_rigs, target_T_rigs: (N, 4, 4) poses of the same rigs in two worlds.
-
-    Raises:
-        NoSimilarityError: no positive scale maps the rigs' positions to the targets'.
-    """
+    """Similarity between worlds of poses (N, 4, 4) of the same rigs: rotation by the chordal mean
+    over orientations, so that a straight path suffices, scale and translation by least squares over
+    positions; a rig that never moves leaves the scale at 1. For NoSimilarityError see
+    `turned_similarity`."""
     between = np.einsum("nij,nkj->ik", target_T_rigs[:, :3, :3], source_T_rigs[:, :3, :3])
     source, target = source_T_rigs[:, :3, 3], target_T_rigs[:, :3, 3]
     return turned_similarity(source, target, nearest_rotation(between), min_correlation)

@@ -167,12 +167,10 @@ class Localizer:
         return self._localize_features(name, features, grey, camera)
 
     def _extract(self, frames: FrameSet, frame: int, rig: CubeRig) -> Features:
-        """Keypoints of a frame as its picture shows it, on faces of a rig."""
         images, masks = cubemap.load(without_correction(frames), frame, rig)
         return extract(images, masks, rig, self.extractor)
 
     def _localize_panorama(self, erp: np.ndarray, name: str, camera: int) -> LocalizedFrame:
-        """Pose of a panorama (H, 2H, 3) of a camera."""
         import cv2
 
         rig, small = self._rigs[camera], erp

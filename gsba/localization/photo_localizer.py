@@ -139,7 +139,8 @@ def _place(localizer: Localizer, photo: Photo) -> _Placed | str:
     """A photo placed by its keypoints; or the reason why it is not."""
     image, reason = photo.load(), NO_PLACE
     known = photo.focal is not None
-    focals = [photo.focal] if photo.focal else [photo.focal_of_field(f) for f in _FIELDS_RAD]
+    half = max(photo.width, photo.height) / 2
+    focals = [photo.focal] if photo.focal else [half / np.tan(f / 2) for f in _FIELDS_RAD]
     best: _Placed | None = None
     for focal in focals:
         projection = photo.projection(focal)

@@ -49,10 +49,6 @@ class Photo:
         middle = self.width / 2, self.height / 2
         return PerspectiveProjection(self.width, self.height, focal, middle, (0.0, 0.0))
 
-    def focal_of_field(self, field_rad: float) -> float:
-        """Focal length in pixels at which the longer side spans a field of view."""
-        return max(self.width, self.height) / 2 / np.tan(field_rad / 2)
-
     def prior_sigmas(self) -> np.ndarray:
         """Standard deviations (5,) of the prior on the projection's parameters."""
         focal = _UNKNOWN_FOCAL_SIGMA if self.focal is None else _EXIF_FOCAL_SIGMA

@@ -450,7 +450,6 @@ class _Joining:
         return best
 
     def _move_of(self, f: int, world_T_rig: np.ndarray) -> Sim3:
-        """The similarity that carries a single frame to a pose (4, 4)."""
         return Sim3.of(1.0, world_T_rig @ inverse(self.poses[f]))
 
     def _shows_map(self, f: int, inside: np.ndarray, world_T_rig: np.ndarray) -> bool:

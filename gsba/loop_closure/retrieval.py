@@ -77,7 +77,6 @@ def _sampled_descriptors(descriptors: np.ndarray, frame: int, share: int, seed: 
 
 
 def _descriptor_of(descriptors: np.ndarray, _frame: int, words: np.ndarray) -> np.ndarray:
-    """The global descriptor of a frame."""
     return aggregate(descriptors, words)
 
 

@@ -154,7 +154,6 @@ class DividedAdjustments:
 
 
 def _pieces(graph: gtsam.NonlinearFactorGraph) -> list[gtsam.NonlinearFactorGraph]:
-    """A graph in pieces of a few factors."""
     pieces = []
     for first in range(0, graph.size(), _FACTORS_AT_ONCE):
         piece = gtsam.NonlinearFactorGraph()

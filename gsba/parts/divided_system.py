@@ -283,7 +283,6 @@ class DividedSystem:
         return At.of(values, range(self.num_frames), self._beside)
 
     def _of_parts(self, values: gtsam.Values) -> tuple[At, ...]:
-        """Variables of each part."""
         poses, nothing = self._of(values).poses, At.of(values, (), ()).beside
         return tuple(
             At(poses[frames], kept(values, beside) if beside else nothing)

@@ -348,7 +348,6 @@ def serialized(graph: gtsam.NonlinearFactorGraph) -> np.ndarray:
 
 
 def _keys_of_factors(graph: gtsam.NonlinearFactorGraph) -> list[list[int]]:
-    """Keys that each factor is about."""
     return [graph.at(i).keys() for i in range(graph.size())]
 
 

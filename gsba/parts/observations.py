@@ -106,7 +106,6 @@ def merged(chunks: Sequence[ObservedRows], local: np.ndarray) -> ObservedRows:
 
 
 def _joined(terms: Sequence[TermRows]) -> TermRows:
-    """Observations of a family one behind the other."""
     origins = None
     if any(term.origins_rig is not None for term in terms):
         none = [np.zeros((len(term.frames), 3)) for term in terms]

@@ -44,7 +44,7 @@ logger = logging.getLogger(__name__)
 
 # Fixes bend a map by this many times the square that their noise and that of the images explain. In
 # simulations with right claims the ratio is at most .25, and images err by twice their claims.
-_MAX_CONTRADICTION = 4.0
+MAX_CONTRADICTION = 4.0
 _MIN_BRIDGING = 12  # points of three frames, without which the scale is open: in rendered tours up
 # to 8 left it wrong by a fifth, 16 and more right
 
@@ -191,12 +191,6 @@ def measure_strength(state: State) -> State:
 
     strength = run.stage("strength", [run.solving_key(), limits], compute, MapStrength)
     return replace(state, prior=replace(prior, strength=strength))
-
-
-def contradicts_fixes(state: State) -> bool:
-    """True if GPS fixes bend the measured map by more than its images allow."""
-    strength = state.prior.strength
-    return strength is not None and strength.contradiction > _MAX_CONTRADICTION
 
 
 def without_fixes(state: State, latest: Sequence[str]) -> State:

@@ -232,7 +232,10 @@ def tie(state: State, parts: np.ndarray) -> State:
     sigmas[order] = solved.map.observed.sigmas_rad
     changed = {"sigmas_rad": sigmas[len(base.aligned) :], "sqrt_infos": None}
     features = replace(state.observed.shown, **changed)
-    state = replace(_with_poses_of(state, solved), matches=state.matches)
+    unread = all(one.readout is None for one in solved.map.cameras)
+    poses = replace(state.solution, world_T_rigs=solved.solution.world_T_rigs)
+    state = state.with_solution(poses)
+    state = state if unread else state.with_cameras(solved.map.estimates())
     return _aligned(state, base, features, parts) or solved
 
 
@@ -299,13 +302,6 @@ def _solved(
     solved, keypoints, found = camera.adjust_with_patches(state, sighted, name, gates)
     better = patch_rounds.carried(state, sighted, solved, keypoints)
     return None if better is None else better.with_cameras(found)
-
-
-def _with_poses_of(state: State, solved: State) -> State:
-    poses = solved.solution.world_T_rigs
-    moved = state.with_solution(replace(state.solution, world_T_rigs=poses))
-    unread = all(one.readout is None for one in solved.map.cameras)
-    return moved if unread else moved.with_cameras(solved.map.estimates())
 
 
 def _tied_within(state: State, parts: np.ndarray, merged: Registered | None = None) -> State:

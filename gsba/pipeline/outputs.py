@@ -188,7 +188,11 @@ def _findings(state: State, result: Reconstruction, gps: dict[str, Any] | None) 
     notes += more
     gyro = None
     if prior.gyro is not None:
-        gyro, more = of_gyro(prior.gyro, _gyro_steps_used(state), map_.cameras[0].readout)
+        used, snapshot = None, state.run.families.snapshot(state.solution, prior.parts)
+        for family in prior.families(state.run.settings.priors):
+            if isinstance(family, GyroTurns):
+                used = family.report(snapshot)["steps_used"]
+        gyro, more = of_gyro(prior.gyro, used, map_.cameras[0].readout)
         notes += more
     if gps is not None:
         notes += notes_on_gps(gps, len(frames))
@@ -241,15 +245,6 @@ def _of_cameras(state: State, result: Reconstruction) -> list[dict[str, Any]]:
         content |= {"width": kind.width, "height": kind.height}
         every.append(content | {"lenses": plain(_of_camera(state, result, number)[0])})
     return every
-
-
-def _gyro_steps_used(state: State) -> float | None:
-    """Share of steps whose rotation agrees with the gyro; None = no gyro was used."""
-    snapshot = state.run.families.snapshot(state.solution, state.prior.parts)
-    for family in state.prior.families(state.run.settings.priors):
-        if isinstance(family, GyroTurns):
-            return family.report(snapshot)["steps_used"]
-    return None
 
 
 def _gauge(run: Run, prior: Prior) -> str:

@@ -118,16 +118,9 @@ def refine_each(
     adapt: Callable[[Mapping[str, FrameSet]], Mapping[str, tuple[FrameSet, CameraSettings]]]
     | None = None,
 ) -> RunResult:
-    """Refine recordings in one run as `refine_recordings` does; one is enough.
-
-    Args:
-        recordings, out, settings, segment, fresh, families, client: see `refine_recordings`.
-        adapt: gives frames as they are to be read, and settings of their camera, from frames by the
-            name of their recording, before anything is computed; None = as they are, `settings`.
-
-    Raises:
-        GsbaError: as `refine_recordings`, and what `adapt` raises.
-    """
+    """Refine recordings, one or more, in one run as `refine_recordings` does. `adapt` gives frames
+    as they are to be read, and settings of their camera, from frames by the name of their
+    recording."""
     plain = settings or RefineSettings()
     convention = Convention.parse(plain.read.trajectory_format)
     given = [

@@ -329,7 +329,8 @@ def _map_features(state: State) -> State:
     """The map of all frames' features, without GPS fixes that its images contradict."""
     latest, run = list(state.run.chain.latest), state.run
     mapped = _map_all(state)
-    if not backend.contradicts_fixes(mapped):
+    strength = mapped.prior.strength
+    if strength is None or not strength.contradiction > backend.MAX_CONTRADICTION:
         return mapped
     mapped = _map_all(backend.without_fixes(state, latest))
     return replace(mapped, run=replace(mapped.run, suffix=run.suffix))

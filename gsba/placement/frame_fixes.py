@@ -25,15 +25,9 @@ MIN_FIXES = 3
 
 
 def read_exif_gps(frames: FrameSet, settings: GpsSettings | None = None) -> GpsFixes:
-    """Fixes of the frames whose images have GPS tags, by name.
-
-    Frames without a valid fix are left out, and frames that repeat an earlier frame's fix (equal
-    position and GPS timestamp). If at least three fixes have an altitude, fixes without one are
-    left out, too; else unknown altitudes are 0.
-
-    Raises:
-        GsbaError: fewer than three frames have a fix, or an image cannot be read.
-    """
+    """Fixes of the frames whose images have GPS tags, by name, without those that repeat an earlier
+    frame's position and time; unknown altitudes as of `fixes_of`. GsbaError if fewer than three
+    frames have a fix, or an image cannot be read."""
     found: dict[str, GpsTag] = {}
     taken, damaged = set[tuple[float, float, float]](), 0
     for name, paths in zip(frames.names, track(frames.paths, "reading EXIF"), strict=True):

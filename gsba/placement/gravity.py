@@ -135,7 +135,6 @@ def _tilt_deg(frames: FrameSet, f: int) -> tuple[float, float]:
 
 
 def _degrees(one: np.ndarray, other: np.ndarray) -> float:
-    """Angle between two unit vectors, degrees."""
     return float(np.degrees(np.arccos(np.clip(one @ other, -1, 1))))
 
 

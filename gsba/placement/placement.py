@@ -205,7 +205,6 @@ def _scale_by_lenses(
 def _by_lenses(
     reconstruction: Reconstruction, baseline: tuple[float, float] | None, placement: Placement
 ) -> Placement:
-    """Placement in metres, by the published distance between the lenses."""
     (scale, sigma), grounds = _scale_by_lenses(reconstruction, baseline)
     if not sigma < _MAX_LENS_SCALE_SIGMA * scale:
         raise GsbaError(
@@ -394,7 +393,6 @@ def _up_sigma(upright: Placement) -> float:
 
 
 def _aligned(reconstruction: Reconstruction, frames: FrameSet, path: Path) -> Placement:
-    """Placement in the world of true poses."""
     truth = read_trajectory(path)
     if not frames.timed:
         raise GsbaError(
@@ -448,17 +446,9 @@ def _in_scan(
 def guess_in_scan(
     reconstruction: Reconstruction, frames: FrameSet, settings: PlacementSettings, scan: Scan
 ) -> tuple[Guess, dict[str, Any]]:
-    """Initial guess of a run's placement in a scan, by `pairs`, else `gps`, else `up`.
-
-    Args:
-        settings: placement settings; `scan` names the file of the scan.
-
-    Returns:
-        The guess, in the scan's world less its offset, and entries of transform.json on it.
-
-    Raises:
-        GsbaError: files cannot be used, or the frames have no common up axis.
-    """
+    """Initial guess of a run's placement in a scan, in its world less its offset, by `pairs`, else
+    `gps`, else `up`, and entries of transform.json on it. GsbaError if files cannot be used, or
+    frames have no common up axis."""
     axis = UPS[upwards(Path(settings.scan or ""))]
     if settings.pairs is not None:
         path = Path(settings.pairs)

@@ -172,14 +172,9 @@ def check_scan(path: Path) -> None:
 
 
 def read_scan(path: Path) -> Scan:
-    """Surfaces of a scan, thinned to some 400,000 points with normals.
-
-    Meshes are sampled evenly over their surfaces. Clouds are thinned to the mean point of each
-    cell, projected to the plane through its neighbours, see `gsba.scans.files`.
-
-    Raises:
-        GsbaError: the file is missing, of an unknown format or damaged, or holds too few points.
-    """
+    """Surfaces of a scan, some 400,000 points with normals: meshes sampled evenly, clouds thinned
+    to the mean point of each cell, on the plane through its neighbours. GsbaError if it is missing,
+    damaged, of an unknown format, or too small."""
     check_scan(path)
     try_in_process(path)
     o3d, (mesh, points, colors) = open3d(), _content(path)

@@ -106,15 +106,9 @@ def read_info(path: Path) -> dict[str, Any]:
 
 
 def load_record(path: Path, returns: type[T], mapped: bool = False) -> T:
-    """Read a record back.
-
-    Args:
-        returns: its type, e.g. a dataclass or `tuple[Matches, Counts]`.
-        mapped: leave large arrays on the disk, where they are read as they are used; they cannot be
-            written. The file may be replaced meanwhile, but not changed.
-    Raises:
-        RecordError: missing, truncated, corrupt, or of another type.
-    """
+    """Read a record back as a type, e.g. a dataclass or `tuple[Matches, Counts]`; `mapped` leaves
+    large arrays on the disk, read-only, whose file may be replaced, but not changed. RecordError if
+    it is missing, corrupt, or of another type."""
     with _reading(path, _MappedArchive if mapped else _Archive) as archive:
         return _decode(_manifest(archive)["value"], returns, archive)
 

@@ -117,11 +117,8 @@ class ClockFit:
     def refine(
         self, start: np.ndarray, with_rate: bool = True, widening: float = 3.0
     ) -> np.ndarray:
-        """Parameters (2,) of the best fit around a start, under a Cauchy loss.
-        start: (2,) initial shift and rate.
-        with_rate: estimate the rate, too.
-        widening: initial width of the loss, relative to the noise.
-        """
+        """Parameters (2,), shift and rate, of the best fit around a start under a Cauchy loss,
+        `widening` times the noise wide at first."""
         parameters, free = start.copy(), 1 + with_rate
         residuals = self.residuals(parameters)
         sigma, damping = widening * noise(residuals), 1e-3

@@ -204,15 +204,9 @@ def long_steps(world_T_rigs: np.ndarray, depth: float) -> np.ndarray:
 def unusual_paces(
     world_T_rigs: np.ndarray, timestamps: np.ndarray, recordings: np.ndarray
 ) -> np.ndarray:
-    """Steps (F - 1,) bool over missing frames that are walked much slower or faster than those
-    around, or back.
-
-    Where frames are missing, the view changes more, and in a hall of bays the next bay may match
-    better than the same one: then hundreds of matches agree on a step that is a bay too short.
-
-    Args:
-        world_T_rigs: (F, 4, 4) poses in a map of the images.
-    """
+    """Steps (F - 1,) bool over missing frames that are walked in a map, poses (F, 4, 4), much
+    slower or faster than those around, or back: there, hundreds of matches agree on a step that is
+    a bay too short."""
     missing = over_missing_frames(timestamps, recordings)
     usual = ~missing & (recordings[1:] == recordings[:-1])
     velocities = np.diff(world_T_rigs[:, :3, 3], axis=0) / np.diff(timestamps)[:, None]
@@ -231,16 +225,8 @@ def unusual_paces(
 
 def back_and_forth(world_T_rigs: np.ndarray, shown: np.ndarray, depth: float) -> np.ndarray:
     """Steps (F - 1,) bool before and behind a frame at which the camera goes back the way that it
-    came, without turning, where frames are far apart.
-
-    There, too, the next bay of a hall may match better than the same one. Which of two such steps
-    is false does not show.
-
-    Args:
-        world_T_rigs: (F, 4, 4) poses in a map of the images.
-        shown: (F - 1,) bool, steps that images show, over no missing frame.
-        depth: median distance of points, map units.
-    """
+    came without turning, far from others, over no missing frame (`shown`): the next bay of a hall
+    may match better, and which of two steps is false does not show. `depth` in map units."""
     steps = np.diff(world_T_rigs[:, :3, 3], axis=0)
     lengths = np.linalg.norm(steps, axis=1)
     found = np.zeros(len(steps), bool)
@@ -340,17 +326,9 @@ class OutlierLimits:
 def outlier_limits(
     slam: np.ndarray, images: np.ndarray, judged: np.ndarray, settings: TwoViewLimits
 ) -> OutlierLimits:
-    """Thresholds that mark an outlier: beyond the settings, and beyond the trajectory's noise.
-
-    A quickly drifting trajectory contradicts the images in many steps, each by about as much; none
-    of its frames is an outlier. Its noise is estimated from its better steps, which outliers leave
-    alone.
-
-    Args:
-        slam: (F - 1, 4, 4) steps of the trajectory.
-        images: (F - 1, 4, 4) steps from images, with lengths.
-        judged: (F - 1,) bool, steps known from both.
-    """
+    """Thresholds that mark an outlier, beyond the settings and the noise of the trajectory, as its
+    better ones of the steps judged (F - 1,) bool, (F - 1, 4, 4) each, tell: a quickly drifting
+    trajectory contradicts images in many steps, and none of its frames is an outlier."""
     turned = rotation_angle(np.swapaxes(slam[:, :3, :3], 1, 2) @ images[:, :3, :3])
     off = np.linalg.norm(slam[:, :3, 3] - images[:, :3, 3], axis=1)
     usual = [
@@ -372,17 +350,9 @@ def false_frames(
     own: np.ndarray,
     limits: OutlierLimits,
 ) -> np.ndarray:
-    """Frames (F,) with a false pose: the fewest whose removal explains the false steps.
-
-    The longest chain of frames is kept whose consecutive relative poses in the trajectory agree
-    with the images; a permanent jump breaks it, at a cost, and marks the frame behind. Interpolated
-    poses are ignored.
-
-    Args:
-        wrong: (F - 1,) bool, steps that images contradict.
-        slam, chosen: (F - 1, 4, 4) steps of the trajectory and the best known steps.
-        own: (F,) bool, frames with an entry in the trajectory.
-    """
+    """Frames (F,) with a false pose: the fewest whose removal explains the steps that are `wrong`
+    (F - 1,) bool. Of `own` frames (F,) bool the longest chain is kept whose relative poses agree
+    with the images; a permanent jump breaks it, at a cost, and marks the frame behind."""
     named = np.zeros(len(own), bool)
     if not wrong.any():
         return named

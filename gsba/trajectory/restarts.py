@@ -97,15 +97,9 @@ def _lost_repeat(trajectory: Trajectory, first: int, last: int, pace: float) -> 
 
 
 def split_restarts(trajectory: Trajectory) -> list[Trajectory]:
-    """Pieces of a trajectory whose SLAM lost its map and began another.
-
-    A new map begins at the origin: an entry that is exactly the identity, or one near it behind a
-    jump, while the entries around keep the pace. A jump and another one back soon after are false
-    poses, not a new map.
-
-    Returns:
-        The pieces in order of time, each with an origin and a scale of its own.
-    """
+    """Pieces of a trajectory, in order of time, whose SLAM lost its map and began another: at an
+    entry that is exactly the identity, or near it behind a jump, while the entries around keep the
+    pace. A jump and another one back soon after are false poses, not a new map."""
     poses, times = trajectory.world_T_rigs, trajectory.timestamps
     lengths, intervals = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1), np.diff(times)
     speeds = lengths / intervals
@@ -131,17 +125,9 @@ def split_restarts(trajectory: Trajectory) -> list[Trajectory]:
 def associate_pieces(
     frames: FrameSet, pieces: Sequence[Trajectory], settings: ReadSettings
 ) -> CoarsePoses:
-    """Coarse poses from pieces of a trajectory on one clock, each frame in its piece's own world.
-
-    A frame between two pieces belongs to the nearer one. Where pieces overlap in time, the one that
-    begins first is used.
-
-    Returns:
-        Poses with `segments` set if there is more than one piece; no two worlds are related yet.
-
-    Raises:
-        GsbaError: see `associate`.
-    """
+    """Coarse poses from pieces of a trajectory on one clock, each frame in the world of the piece
+    that is nearest, the first where pieces overlap, as `segments` tell. For GsbaError see
+    `associate`."""
     pieces = _in_turn(pieces)
     times = np.concatenate([piece.timestamps for piece in pieces])
     poses = np.concatenate([piece.world_T_rigs for piece in pieces])

@@ -100,15 +100,9 @@ def step_errors(steps: np.ndarray, found: Steps) -> tuple[np.ndarray, np.ndarray
 
 
 def off_steps(pairs: VerifiedPairs, found: Steps) -> np.ndarray:
-    """Angles by which pairs over two steps violate the directions of those steps.
-
-    Frame f + 2 lies, as seen from f, between the directions of both steps. A false pair from
-    repeated structure agrees with neither, though it may be within the trajectory's tolerance.
-
-    Returns:
-        (P,) radians, less three standard deviations of the directions; 0 for other pairs, and if a
-        direction is unknown.
-    """
+    """Angles (P,), radians, by which pairs over two steps violate the directions of these, less
+    three sigmas; 0 for other pairs and unknown directions. A false pair from repeated structure
+    agrees with neither step, though it may be within the trajectory's tolerance."""
     out = np.zeros(len(pairs.matches.pairs))
     for p, (f0, f2) in enumerate(pairs.matches.pairs):
         sigmas = np.array([pairs.direction_sigmas[p], *found.direction_sigmas[f0 : f0 + 2]])
