@@ -3,18 +3,18 @@
 import logging
 import os
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from gsba.config import GpsSettings, PlacementSettings, RefineSettings
+from gsba.config import CameraSettings, GpsSettings, PlacementSettings, RefineSettings
 from gsba.disk import disk_errors, exchange_folders, hold_folder, link_or_copy
+from gsba.frames.recordings import combine
 from gsba.log import GsbaError
 from gsba.masks.segmentation import Segment
 from gsba.pipeline import backend, camera, finished_run, map_joining, outputs
@@ -192,9 +192,13 @@ def add_recordings(
             scratch = work.root / SCRATCH
             named = [replace(one, name=name) for one, name in zip(recordings, names, strict=True)]
             settings = _settings_of_new(finished.settings)
-            given = {"segment": segment, "client": client}
             models = {one.name: one.camera for one in named}
-            given |= {"adapt": partial(as_read_by, finished, models=models)}
+
+            def adapt(found: Mapping[str, FrameSet]) -> dict[str, tuple[FrameSet, CameraSettings]]:
+                combine({**finished.recordings(), **found})  # refuses recordings that the run has
+                return as_read_by(finished, found, models)
+
+            given = {"segment": segment, "client": client, "adapt": adapt}
             refine_each(named, scratch, settings, **given)
             runs = [finished, FinishedRun.load(scratch)]
             state, maps = _joined(work, runs)

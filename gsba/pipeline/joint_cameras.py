@@ -9,7 +9,7 @@ import numpy as np
 from gsba.bundle.readout import CameraEstimate, velocities
 from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.config import CameraSettings
-from gsba.frames.recordings import combine, one_mode, own_timestamps
+from gsba.frames.recordings import one_mode, own_timestamps
 from gsba.log import GsbaError
 from gsba.pipeline.finished_run import FinishedRun
 from gsba.pipeline.map import FoundCamera
@@ -141,7 +141,6 @@ def as_read_by(
     Raises:
         GsbaError: a recording has a camera of its own, and the run a field of stitching errors.
     """
-    combine({**run.recordings(), **found})  # refuses recordings that the run has
     read = dict[str, tuple[FrameSet, CameraSettings]]()
     for name, frames in found.items():
         model = run.settings.camera.model_copy(update={"name": models[name]})
