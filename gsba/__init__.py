@@ -23,8 +23,7 @@ if TYPE_CHECKING:
     from gsba.log import GsbaError
     from gsba.pipeline.growing import add_recordings, merge_runs, remove_recordings
     from gsba.pipeline.outputs import RunResult
-    from gsba.pipeline.recording import Recording
-    from gsba.pipeline.recordings import refine_recordings
+    from gsba.pipeline.recordings import Recording, refine_recordings
     from gsba.pipeline.refine import refine
     from gsba.store.finished import load_run
 
@@ -56,7 +55,7 @@ _HOMES = {
     "Localizer": "gsba.localization.localizer",
     "MapSnapshot": "gsba.bundle.families",
     "PointObservations": "gsba.bundle.point_observations",
-    "Recording": "gsba.pipeline.recording",
+    "Recording": "gsba.pipeline.recordings",
     "RefineSettings": "gsba.config",
     "RunResult": "gsba.pipeline.outputs",
     "X": "gsba.bundle.pose_variables",

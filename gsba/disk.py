@@ -46,15 +46,9 @@ def disk_errors(path: Path) -> Iterator[None]:
 
 
 def atomic_write(path: Path, write: Callable[[Path], object], parents: bool = True) -> None:
-    """Write a file beside `path` and rename it into place, so that `path` is never half-written.
-
-    Args:
-        path: final file.
-        write: called with a temporary path of the same folder and suffix.
-        parents: make missing parent folders.
-    Raises:
-        GsbaError: the disk is full, or writing is not permitted.
-    """
+    """Write a file beside `path`, by `write` with a temporary path of the same folder and suffix,
+    and rename it into place, so that `path` is never half-written; GsbaError if the disk is
+    full."""
     # Processes of several machines may write the same file at the same time.
     temporary = path.with_name(f"{_TEMPORARY}{uuid.uuid4().hex[:8]}-{path.name}")
     with disk_errors(path):
@@ -83,21 +77,13 @@ def write_json(path: Path, content: object) -> None:
 
 
 def write_image(path: Path, image: "np.ndarray", jpeg_quality: int = 95) -> None:
-    """Encode (H, W, 3) RGB or (H, W) uint8 by the suffix of `path`, atomically.
-
-    Raises:
-        GsbaError: the image cannot be encoded, or the disk cannot be written.
-    """
+    """Encode (H, W, 3) RGB or (H, W) uint8 by the suffix of `path`, atomically."""
     write_bytes(path, encoded_image(image, path, jpeg_quality))
 
 
 def encoded_image(image: "np.ndarray", path: Path, jpeg_quality: int = 95) -> bytes:
-    """Encode (H, W, 3) RGB, (H, W, 4) RGBA or (H, W) uint8 as the content of an image file with
-    this suffix.
-
-    Raises:
-        GsbaError: the image cannot be encoded in the format of the suffix.
-    """
+    """Content of an image file with this suffix, of (H, W, 3) RGB, (H, W, 4) RGBA or (H, W) uint8;
+    GsbaError if it cannot be encoded so."""
     import cv2
 
     options = [] if path.suffix.lower() == ".png" else [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality]
@@ -111,15 +97,8 @@ def encoded_image(image: "np.ndarray", path: Path, jpeg_quality: int = 95) -> by
 
 
 def write_vertices(path: Path, vertices: "np.ndarray") -> None:
-    """Write a binary little-endian PLY file with one element, `vertex`, atomically.
-
-    Args:
-        path: the file.
-        vertices: (N,) structured, one field for each property, in the file's order.
-
-    Raises:
-        GsbaError: the file cannot be written.
-    """
+    """Write a binary little-endian PLY file with one element, `vertex`, atomically: (N,)
+    structured, a field for each property, in the file's order."""
     from plyfile import PlyData, PlyElement
 
     file = PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<")
@@ -127,14 +106,8 @@ def write_vertices(path: Path, vertices: "np.ndarray") -> None:
 
 
 def read_vertices(path: Path) -> "np.ndarray":
-    """The element `vertex` of a binary or ASCII PLY file.
-
-    Returns:
-        (N,) structured, one field for each property, mapped from a binary file.
-
-    Raises:
-        GsbaError: the file is unreadable, no PLY, truncated, or its points have lists.
-    """
+    """The element `vertex` of a binary or ASCII PLY file, (N,) structured, a field for each
+    property, mapped from a binary file; GsbaError if it is damaged, or its points have lists."""
     from plyfile import PlyData, PlyHeaderParseError
 
     try:
@@ -157,15 +130,8 @@ def read_vertices(path: Path) -> "np.ndarray":
 
 
 def link_or_copy(source: Path, target: Path) -> None:
-    """Give a file a second name, or copy it where the disk knows no hard links.
-
-    Args:
-        source: an ordinary file.
-        target: the new name; a file of this name is replaced.
-
-    Raises:
-        GsbaError: the disk is full, or writing is not permitted.
-    """
+    """Give a file a second name, which it replaces, or copy it where the disk knows no hard
+    links."""
 
     def write(temporary: Path) -> None:
         try:
@@ -177,11 +143,8 @@ def link_or_copy(source: Path, target: Path) -> None:
 
 
 def exchange_folders(one: Path, other: Path) -> bool:
-    """Exchange two folders of one disk in a single step, so that either is there at any moment.
-
-    Returns:
-        False where the system cannot: nothing was changed.
-    """
+    """Exchange two folders of one disk in a single step, so that either is there at any moment;
+    False where the system cannot: nothing was changed."""
     library = ctypes.CDLL(None, use_errno=True)
     if sys.platform == "darwin":
         names = os.fsencode(one), os.fsencode(other)
@@ -200,17 +163,8 @@ def remove_temporaries(folder: Path) -> None:
 
 
 def refuse_links(folder: Path, below: bool = False) -> None:
-    """Refuse a folder to write to if it holds anything but files and folders.
-
-    Through a link, gsba would replace or delete files elsewhere. Reading a pipe never ends.
-
-    Args:
-        folder: may be missing; may not itself be a link, pipe or device.
-        below: check its subfolders too.
-
-    Raises:
-        GsbaError: the folder holds a link, pipe or device, which the message names.
-    """
+    """Refuse a folder to write to, which may be missing, if it or (with `below`) what is in it
+    holds a link, pipe or device: through links, gsba would replace files elsewhere."""
     if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
         raise _not_ours(folder)
     waiting = [folder] if folder.exists() else []
@@ -232,15 +186,8 @@ def _not_ours(path: Path) -> GsbaError:
 
 
 def hold_folder(folder: Path) -> int:
-    """Lock a folder against other processes until the lock is closed or this process ends.
-
-    The kernel keeps the lock, so it is never stale.
-
-    Returns:
-        File descriptor of the lock.
-    Raises:
-        GsbaError: another process holds the lock.
-    """
+    """Lock a folder against other processes until the descriptor returned is closed or this process
+    ends: the kernel keeps the lock, so it is never stale. GsbaError if another one holds it."""
     lock = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)

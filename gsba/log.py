@@ -6,7 +6,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sized
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from functools import cache
 from typing import TYPE_CHECKING, TypeVar
 
@@ -28,13 +28,8 @@ class StoppedError(GsbaError):
 
 
 def show_log(level: int = logging.INFO) -> None:
-    """Send the log of gsba and its factors to stderr, for the command line.
-
-    On a terminal, log lines do not disturb the progress bar.
-
-    Args:
-        level: lowest level shown, e.g. `logging.WARNING` for a quiet run.
-    """
+    """Send the log of gsba and its factors to stderr, from `level` on; on a terminal, log lines do
+    not disturb the progress bar."""
     if sys.stderr.isatty():
         from rich.logging import RichHandler
 
@@ -84,17 +79,8 @@ def track(
     done: int = 0,
     note: Callable[[], str] | None = None,
 ) -> Iterator[T]:
-    """Yield `items` and show their progress, as a bar and as events.
-
-    The bar is on stderr, on a terminal unless the run is quiet. For events see `event`.
-
-    Args:
-        items: work to do.
-        description: of the work.
-        total: number of items, those done before among them; None = len(items).
-        done: items that were done before.
-        note: gives a text that stands behind the speed.
-    """
+    """Yield `items` and show their progress, as a bar on a terminal's stderr unless the run is
+    quiet, and as events (see `event`), out of `total`, with a note behind the speed."""
     with_bar = sys.stderr.isatty() and logging.getLogger("gsba").isEnabledFor(logging.INFO)
     if not (with_bar or os.environ.get(EVENTS)):
         yield from items
@@ -104,7 +90,8 @@ def track(
     work = {"what": description, "total": total}
     event("progress", **work, done=done, rate=None, note="")
     began = told = time.monotonic()
-    with _bar(description, total, done) if with_bar else _no_bar() as show:
+    silent = nullcontext(lambda count, note: None)
+    with _bar(description, total, done) if with_bar else silent as show:
         for count, item in enumerate(items, start=1):
             yield item
             now = time.monotonic()
@@ -139,11 +126,6 @@ def _bar(description: str, total: int | None, done: int) -> Iterator[Callable[[i
     with Progress(*columns, console=_console(), transient=True) as bar:
         task = bar.add_task(description, total=total, completed=done, note="")
         yield lambda count, note: bar.update(task, completed=count, note=note)
-
-
-@contextmanager
-def _no_bar() -> Iterator[Callable[[int, str], None]]:
-    yield lambda count, note: None
 
 
 class _EventHandler(logging.Handler):

@@ -84,23 +84,16 @@ def give_back_freed_memory(least: int = _MIN_RETURNED_BYTES) -> None:
 
 
 def mapped_file(file: IO[bytes]) -> mmap.mmap:
-    """Content of an open file, read-only, whose pages are read as they are used.
-
-    Raises:
-        OSError: it cannot be read.
-        ValueError: it is empty.
-    """
+    """Content of an open file, read-only, whose pages are read as they are used; ValueError if it
+    is empty."""
     content = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     _mapped_files.add(content)
     return content
 
 
 def release_mapped_files() -> None:
-    """Take the pages of all mapped files out of this process's memory.
-
-    They are read again as they are used, from the system's cache of the disk as long as that has
-    them. Nothing is lost, as mapped files are not written.
-    """
+    """Take the pages of all mapped files, which are not written, out of this process's memory; they
+    are read again as they are used."""
     if hasattr(mmap, "MADV_DONTNEED"):
         for content in list(_mapped_files):
             content.madvise(mmap.MADV_DONTNEED)

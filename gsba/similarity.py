@@ -67,14 +67,8 @@ class NoSimilarityError(GsbaError):
 
 
 def similarity(source: np.ndarray, target: np.ndarray) -> Sim3:
-    """Least-squares similarity of points: Umeyama, PAMI 13(4), 1991.
-
-    Args:
-        source, target: (N, 3) float64, N >= 3, not all on one point.
-
-    Raises:
-        NoSimilarityError: the targets are all on one point, or uncorrelated with the sources.
-    """
+    """Least-squares similarity of points (N, 3), N >= 3: Umeyama, PAMI 13(4), 1991.
+    NoSimilarityError if targets are all on one point, or uncorrelated with the sources."""
     s, t = source - source.mean(axis=0), target - target.mean(axis=0)
     return turned_similarity(source, target, nearest_rotation(t.T @ s / len(s)))
 
@@ -82,18 +76,10 @@ def similarity(source: np.ndarray, target: np.ndarray) -> Sim3:
 def pose_similarity(
     source_T_rigs: np.ndarray, target_T_rigs: np.ndarray, min_correlation: float = _MIN_CORRELATION
 ) -> Sim3:
-    """Similarity that maps one set of poses to another of the same rigs.
-
-    The rotation is the chordal mean over orientations, so that a straight path suffices. Scale and
-    translation are least squares over positions. A rig that never moves leaves the scale at 1.
-
-    Args:
-        source_T_rigs, target_T_rigs: (N, 4, 4) poses of the same rigs in two worlds.
-        min_correlation: see `turned_similarity`.
-
-    Raises:
-        NoSimilarityError: no positive scale maps the rigs' positions to the targets'.
-    """
+    """Similarity between worlds of poses (N, 4, 4) of the same rigs: rotation by the chordal mean
+    over orientations, so that a straight path suffices, scale and translation by least squares over
+    positions; a rig that never moves leaves the scale at 1. For NoSimilarityError see
+    `turned_similarity`."""
     between = np.einsum("nij,nkj->ik", target_T_rigs[:, :3, :3], source_T_rigs[:, :3, :3])
     source, target = source_T_rigs[:, :3, 3], target_T_rigs[:, :3, 3]
     return turned_similarity(source, target, nearest_rotation(between), min_correlation)
@@ -132,13 +118,8 @@ def turned_similarity(
 
 
 def level_similarity(source: np.ndarray, target: np.ndarray) -> Sim3:
-    """Least-squares similarity whose rotation is around z: scale, heading and translation.
-
-    Closed form of the plane (Umeyama's with complex numbers); heights only constrain the scale.
-
-    Raises:
-        NoSimilarityError: see `gsba.similarity.turned_similarity`.
-    """
+    """Least-squares similarity whose rotation is around z, in closed form (Umeyama's with complex
+    numbers); heights only constrain the scale. For NoSimilarityError see `turned_similarity`."""
     mean_s, mean_t = source.mean(axis=0), target.mean(axis=0)
     s, t = source - mean_s, target - mean_t
     cross = np.sum((t[:, 0] + 1j * t[:, 1]) * (s[:, 0] - 1j * s[:, 1]))
@@ -164,7 +145,6 @@ def robust_similarity(
 
     Args:
         source, target: (N, 3) float64.
-        solve: least-squares similarity of some of them.
         num_needed: smallest number of points that `solve` takes.
         tolerances: (N,) largest error of each target, target units.
         drift: largest error of the sources, part of their extent.
@@ -235,29 +215,11 @@ def naming(path: Path) -> Iterator[None]:
         ) from None
 
 
-def relative_map(
-    points0: np.ndarray, points1: np.ndarray, seed: int
-) -> tuple[np.ndarray, int] | None:
-    """Relative pose of two frames from corresponding points, each frame with its own scale.
-
-    Args:
-        points0, points1: (m, 3) points in the rigs of both frames, map units.
-        seed: of the sampling.
-
-    Returns:
-        f0_T_f1 (4, 4) in the units of frame 0, and the number of inliers; None if too few.
-    """
-    found = relative_similarity(points0, points1, seed)
-    return None if found is None else (found[0].new_T_old, int(found[1].sum()))
-
-
 def relative_similarity(
     points0: np.ndarray, points1: np.ndarray, seed: int, least: int = _MIN_POINTS
 ) -> tuple[Sim3, np.ndarray] | None:
-    """Similarity from rig 1 to rig 0 and its inliers (m,) bool; None if fewer than `least`.
-
-    For the arguments see `relative_map`.
-    """
+    """Similarity from rig 1 to rig 0 by corresponding points (m, 3) in both, each rig with its own
+    scale, and its inliers (m,) bool; None if fewer than `least`."""
     if len(points0) < least:
         return None
     rng = np.random.default_rng(seed)
@@ -267,7 +229,11 @@ def relative_similarity(
     for _ in range(3):
         if best.sum() < least:
             return None
-        best = _agree(points0, points1, np.flatnonzero(best))
+        try:
+            fit = similarity(points1[best], points0[best])
+        except NoSimilarityError:
+            return None
+        best = agreeing_points(points0, points1, fit)
     if best.sum() < least:
         return None
     return similarity(points1[best], points0[best]), best
@@ -284,7 +250,6 @@ def similarity_along(
     Args:
         points0, points1: (m, 3) points in the rigs of both frames, each in its own unit.
         f0_T_f1: (4, 4) relative pose, whose translation has any length.
-        least: smallest number of inliers.
 
     Returns:
         similarity from rig 1 to rig 0, and its inliers (m,) bool; None if too few.
@@ -311,7 +276,9 @@ def similarity_along(
     for _ in range(2 if agree.sum() >= least else 0):
         ratio = float(np.median(ratios[agree]))
         at = turned[agree] + ratio * direction
-        fit = _scaled(points0[agree], at, rotation, ratio * direction)
+        lengths0, lengths1 = (np.linalg.norm(points, axis=1) for points in (points0[agree], at))
+        scale = float(np.median(lengths0 / np.maximum(lengths1, 1e-12)))
+        fit = Sim3(scale, rotation, scale * (ratio * direction))
         fits = agreeing_points(points0, points1, fit)
         if fits.sum() < agree.sum():
             break
@@ -319,29 +286,10 @@ def similarity_along(
     return None if best is None or agree.sum() < least else (best, agree)
 
 
-def _scaled(
-    points0: np.ndarray, points1: np.ndarray, rotation: np.ndarray, step: np.ndarray
-) -> Sim3:
-    """Similarity whose scale is the median ratio of distances; `step` (3,) in units of rig 1."""
-    lengths0, lengths1 = (np.linalg.norm(points, axis=1) for points in (points0, points1))
-    scale = float(np.median(lengths0 / np.maximum(lengths1, 1e-12)))
-    return Sim3(scale, rotation, scale * step)
-
-
-def _agree(points0: np.ndarray, points1: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-    """Inliers (m,) bool of the similarity that fits the chosen points."""
-    try:
-        fit = similarity(points1[chosen], points0[chosen])
-    except NoSimilarityError:
-        return np.zeros(len(points0), bool)
-    return agreeing_points(points0, points1, fit)
-
-
 def _agree_with_triples(
     points0: np.ndarray, points1: np.ndarray, triples: np.ndarray
 ) -> np.ndarray:
-    """Inliers (T, m) bool of the similarities that fit three points each, rows (T, 3); none where
-    no similarity does. See `similarity`."""
+    """Inliers (T, m) bool of similarities that fit three points each, rows (T, 3); else none."""
     source, target = points1[triples], points0[triples]
     s, t = source - source.mean(axis=1, keepdims=True), target - target.mean(axis=1, keepdims=True)
     u, _, vt = np.linalg.svd(np.swapaxes(t, 1, 2) @ s)

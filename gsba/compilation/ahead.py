@@ -25,14 +25,9 @@ _begun: set[str] = set()  # kinds of work that this process has begun
 
 
 def compile_ahead(*kinds: str) -> None:
-    """Begin to compile kernels that are not yet in this user's cache.
-
-    The processes end with this one. A kernel that one of them is compiling is waited for, any other
-    is compiled by whoever needs it first.
-
-    Args:
-        kinds: kinds of the work that begins, see `signatures.KINDS`.
-    """
+    """Begin to compile kernels for kinds of work (`signatures.KINDS`) that are not yet in the
+    cache, in processes that end with this one; any other kernel is compiled by whoever needs it
+    first."""
     if config.DISABLE_JIT or not can_keep():
         return
     kinds = tuple(kind for kind in kinds if kind not in _begun)

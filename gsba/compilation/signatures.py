@@ -42,7 +42,6 @@ def write(recorded: dict[str, list[tuple[str, Signature]]]) -> None:
 
 
 def _recorded(kind: str) -> list[list[Any]]:
-    """Names and encoded signatures of a kind of work."""
     return json.loads(FILE.read_text(encoding="utf-8"))[kind]
 
 

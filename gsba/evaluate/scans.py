@@ -1,21 +1,20 @@
 """Distances of a run's points to a scan of the place, before and after refinement."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from gsba.bundle.triangulation import points_under
-from gsba.scans.distances import Distances, distances_to
 from gsba.scans.files import normals_of
-from gsba.scans.fit import approach, settle
+from gsba.scans.fit import Noise, approach, residuals_of, settle
 from gsba.scans.judge import SIGMAS
-from gsba.scans.noise import Noise, residuals_of
 from gsba.scans.registration import Registration, register
 from gsba.scans.search import Guess
-from gsba.scans.types import Cloud, Scan, cloud_of
+from gsba.scans.types import Cloud, Distances, Scan, cloud_of, distances_to
 from gsba.similarity import Sim3, pose_similarity
 from gsba.types import Reconstruction
+from gsba.types.records import with_rows
 
 _MAX_COARSE_OFFSET = 0.08  # largest offset of the unrefined cloud, part of the cloud's size
 _HISTOGRAM_QUANTILE = 0.9  # share of points whose distance a histogram spans
@@ -91,7 +90,9 @@ def scan_errors(
             pose_similarity(coarse_T_rigs, reconstruction.world_T_rigs).points(points)
         )
         good = np.isfinite(placed).all(axis=1)
-        coarse = cloud.taken(np.flatnonzero(good)).at(at.points_back(placed[good]))
+        coarse = replace(
+            with_rows(cloud, np.flatnonzero(good)), points=at.points_back(placed[good])
+        )
         width = _MAX_COARSE_OFFSET * cloud.size * at.scale
         near, sigma = approach(at, coarse, scan, width)
         fit = settle(near, coarse, scan, sigma)

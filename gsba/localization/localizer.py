@@ -19,27 +19,28 @@ from gsba.frames import cubemap
 from gsba.frames.files import image_size
 from gsba.frames.panorama import fitted_to, load_grey
 from gsba.geometry import adjoint, inverse
-from gsba.localization.known_points import PointSightings, isotropic
+from gsba.localization.known_points import (
+    COARSE,
+    FINE,
+    GATE_SIGMAS,
+    PointSightings,
+    PoseFit,
+    fit,
+    is_determined,
+    isotropic,
+)
 from gsba.localization.patch_sightings import PatchAligner
 from gsba.localization.picture_cameras import PictureCameras
 from gsba.localization.pictures import load_panorama
 from gsba.localization.place_index import open_index
-from gsba.localization.pose_fit import (
-    COARSE,
-    FINE,
-    GATE_SIGMAS,
-    PoseFit,
-    fit,
-    is_determined,
-)
 from gsba.localization.pose_search import Candidates, is_significant, search_poses
-from gsba.localization.query import Query
 from gsba.localization.rival_poses import PlacedPose, best_of
-from gsba.localization.run_map import RunMap, without_correction
+from gsba.localization.run_map import Query, RunMap, without_correction
 from gsba.localization.surroundings import Surroundings, open_rates
 from gsba.log import GsbaError
 from gsba.matching.guided_search import Gate, match_pair, searchable
 from gsba.types import Features, FrameSet, Keypoints, PictureFormat
+from gsba.types.records import with_rows
 
 _NUM_PLACES = 5  # keyframes that look most like a frame
 _NUM_MORE_PLACES = 16  # where these do not suffice
@@ -149,8 +150,6 @@ class Localizer:
         """Pose of one frame of a scanned folder, with its mask.
 
         Args:
-            frames: of the layout of frames of the run.
-            frame: its number.
             camera: of the run, that took it; None = that of its layout and size.
 
         Raises:
@@ -168,12 +167,10 @@ class Localizer:
         return self._localize_features(name, features, grey, camera)
 
     def _extract(self, frames: FrameSet, frame: int, rig: CubeRig) -> Features:
-        """Keypoints of a frame as its picture shows it, on faces of a rig."""
         images, masks = cubemap.load(without_correction(frames), frame, rig)
         return extract(images, masks, rig, self.extractor)
 
     def _localize_panorama(self, erp: np.ndarray, name: str, camera: int) -> LocalizedFrame:
-        """Pose of a panorama (H, 2H, 3) of a camera."""
         import cv2
 
         rig, small = self._rigs[camera], erp
@@ -237,7 +234,7 @@ class Localizer:
             return frame, None
         usual = self.usual.of_camera(camera)
         evidence = self.surroundings.evidence(query, world_T_rig, usual)
-        agreeing = candidates.taken(fitted.inliers[0])
+        agreeing = with_rows(candidates, fitted.inliers[0])
         given = world_T_rig, agreeing.points_world, agreeing.bearings, evidence
         return frame, PlacedPose.of(*given)
 
@@ -326,14 +323,8 @@ class Localizer:
         gate_rad: float,
         recognised: np.ndarray | None = None,
     ) -> Candidates:
-        """Points of the nearest keyframes that look like keypoints near their predicted bearing.
-
-        Args:
-            query: the picture.
-            world_T_rig: (4, 4) predicted pose.
-            gate_rad: around the prediction.
-            recognised: (N,) keyframes whose points are searched, too; None = no others.
-        """
+        """Points of the nearest keyframes, and those `recognised` (N,), that look like keypoints
+        within `gate_rad` of their predicted bearing from a pose (4, 4)."""
         poses, places = self.map.result.world_T_rigs, self.map.nearest(world_T_rig, NUM_NEAREST)
         if recognised is not None:
             places = np.union1d(places, recognised)

@@ -31,12 +31,6 @@ def write_localized(
     Covariances are of the tangent [rotation (radians), translation (map units)] in the picture's
     frame, given the map.
 
-    Args:
-        folder: made if missing.
-        run: folder of the run that they were localised in.
-        found: all pictures, those that are not localised too.
-        pictures: of the same order.
-
     Raises:
         GsbaError: the disk cannot be written.
     """
@@ -78,18 +72,14 @@ def _write_table(path: Path, frames: Sequence[LocalizedFrame], times: Sequence[f
                 row = [frame.name, repr(float(time)), status, frame.reason, camera]
                 numbers = [""] * (len(header) - len(row))
                 if frame.found:
-                    values = (*_position_and_rotation(frame), *frame.covariance[_UPPER])
+                    pose = frame.world_T_rig
+                    values = [*pose[:3, 3], *quaternion_from_rotation(pose[:3, :3])]
+                    values += [*frame.covariance[_UPPER]]
                     numbers = [frame.num_points, f"{np.degrees(frame.noise_rad):.6g}"]
                     numbers += [frame.nearest, *(f"{value:.15g}" for value in values)]
                 table.writerow(row + numbers)
 
     atomic_write(path, write)
-
-
-def _position_and_rotation(frame: LocalizedFrame) -> tuple[float, ...]:
-    """Position and quaternion wxyz."""
-    wxyz = quaternion_from_rotation(frame.world_T_rig[:3, :3])
-    return (*frame.world_T_rig[:3, 3].tolist(), *wxyz.tolist())
 
 
 def _as_json(frame: LocalizedFrame, picture: Picture) -> dict[str, Any]:
@@ -109,8 +99,7 @@ def _as_json(frame: LocalizedFrame, picture: Picture) -> dict[str, Any]:
 
 
 def _camera_json(camera: PhotoCamera) -> dict[str, Any]:
-    """Camera of photos: r = focal (t + k1 t^3 + k2 t^5), t the tangent of the angle from the
-    axis."""
+    """Camera of photos: r = focal (t + k1 t^3 + k2 t^5), t the tangent of the angle to z."""
     projection = camera.projection
     sigmas = np.sqrt(np.maximum(np.diag(camera.covariance), 0)) * np.array(
         [projection.focal] * 3 + [1.0, 1.0]

@@ -45,11 +45,7 @@ class AlignedPoints:
 
 
 class PatchAligner:
-    """Aligns patches of a map's keyframes to new pictures.
-
-    Args:
-        map_: the map; greys of the keyframes last used stay in memory.
-    """
+    """Aligns patches of a map's keyframes to new pictures."""
 
     def __init__(self, map_: RunMap) -> None:
         self._map, settings = map_, map_.settings.patches
@@ -90,7 +86,6 @@ class PatchAligner:
         """Align the patches of expected points to a picture.
 
         Args:
-            expected: points and the frames that lend patches.
             world_T_rig: (4, 4) predicted pose, within some pixels.
             image: the picture on the sphere, (width / 2, width).
             mask: (width / 2, width) bool, True = the picture shows it; None = all.

@@ -11,7 +11,16 @@ from factors.sphere_image import SphereImage
 from gsba.camera.lens import ONE_CENTRE
 from gsba.camera.projections import PerspectiveProjection
 from gsba.camera.rig import owner_faces
-from gsba.localization.known_points import PointSightings
+from gsba.localization.known_points import (
+    COARSE,
+    FINE,
+    GATE_SIGMAS,
+    CameraPrior,
+    PointSightings,
+    PoseFit,
+    fit,
+    is_determined,
+)
 from gsba.localization.localizer import (
     NO_PLACE,
     NOT_DETERMINED,
@@ -20,30 +29,32 @@ from gsba.localization.localizer import (
     Localizer,
     typical_sigma,
 )
-from gsba.localization.photos import Photo, as_panorama, photo_features, photo_rig, shows
-from gsba.localization.pose_fit import (
-    COARSE,
-    FINE,
-    GATE_SIGMAS,
-    CameraPrior,
-    PoseFit,
-    fit,
-    is_determined,
+from gsba.localization.photos import (
+    Photo,
+    as_panorama,
+    photo_features,
+    photo_rig,
+    read_photo,
+    shows,
 )
+from gsba.localization.pictures import Picture
 from gsba.localization.pose_search import (
+    MIN_RATIO,
+    MIN_WITNESSES,
     Candidates,
     is_rivalled,
     is_significant,
     least_of_rival,
-    search_focal,
 )
-from gsba.localization.query import Query
 from gsba.localization.rival_poses import LOOK_ALIKE, TWO_PLACES
+from gsba.localization.run_map import Query
 from gsba.localization.surroundings import is_contradicted
 from gsba.log import GsbaError, track
 from gsba.loop_closure.join_evidence import JoinEvidence
+from gsba.matching.absolute_pose import FoundPose, camera_pose
 from gsba.matching.guided_search import searchable
 from gsba.types import Features
+from gsba.types.records import with_rows
 
 _NUM_PLACES = 10  # keyframes with a face that looks most like a photo
 _FIELDS_RAD = tuple(np.deg2rad([70.0, 45.0, 105.0]))  # of the longer side, tried where the focal
@@ -106,15 +117,8 @@ class _Recognised:
 
 
 def localize_photos(localizer: Localizer, photos: Sequence[Photo]) -> LocalizedPhotos:
-    """Poses of photos, and the cameras that they share.
-
-    Each photo is first placed alone; then all poses and cameras are fitted together, to keypoints
-    and to patches aligned below a pixel.
-
-    Args:
-        localizer: of the run.
-        photos: in any order.
-    """
+    """Poses of photos, each first placed alone, then all fitted together with the cameras that they
+    share, to keypoints and to patches aligned below a pixel."""
     placed: list[_Placed] = []
     refused: dict[str, LocalizedFrame] = {}
     for photo in track(photos, "localising photos", len(photos)):
@@ -135,7 +139,8 @@ def _place(localizer: Localizer, photo: Photo) -> _Placed | str:
     """A photo placed by its keypoints; or the reason why it is not."""
     image, reason = photo.load(), NO_PLACE
     known = photo.focal is not None
-    focals = [photo.focal] if photo.focal else [photo.focal_of_field(f) for f in _FIELDS_RAD]
+    half = max(photo.width, photo.height) / 2
+    focals = [photo.focal] if photo.focal else [half / np.tan(f / 2) for f in _FIELDS_RAD]
     best: _Placed | None = None
     for focal in focals:
         projection = photo.projection(focal)
@@ -185,7 +190,7 @@ def _refine(
     if not is_significant(*given, sample=0, per_side=_CELLS_PER_SIDE):
         return None
     evidence = localizer.surroundings.evidence(
-        query, pose, localizer.usual.of_photos, lambda points: shows(projection, points)
+        query, pose, localizer.usual.of_camera(-1), lambda points: shows(projection, points)
     )
     inliers = int(fitted.inliers[0].sum())
     return _Placed(photo, image, pose, projection, seen, inliers, evidence)
@@ -239,18 +244,21 @@ def _recognise(
         model="SIMPLE_PINHOLE", width=photo.width, height=photo.height, params=params
     )
     max_error, seed = _MAX_ERROR_RAD * projection.focal, localizer.map.settings.seed
-    found = search_focal(pixels, candidates.points_world, camera, known, max_error, seed)
+
+    def search(rows: np.ndarray, least: int) -> FoundPose | None:
+        given = pixels[rows], candidates.points_world[rows], camera, max_error, seed, least
+        return camera_pose(*given, MIN_RATIO, estimate_focal=not known)
+
+    found = search(np.ones(len(pixels), bool), MIN_WITNESSES)
     chance = np.pi * max_error**2 / (photo.width * photo.height)
     if found is None or not is_significant(candidates.bearings, found.inliers, chance, _SAMPLE):
         return None, ""
     if not _plausible(photo.projection(found.focal)):
         return None, ""
-    left = candidates.taken(~found.inliers)
-    rest, least = pixels[~found.inliers], least_of_rival(found)
-    rival = search_focal(rest, left.points_world, camera, known, max_error, seed, least)
-    if is_rivalled(found, rival, candidates):
+    if is_rivalled(found, search(~found.inliers, least_of_rival(found)), candidates):
         return None, TWO_PLACES
-    start, agreeing = photo.projection(found.focal), candidates.taken(found.inliers)
+    start = photo.projection(found.focal)
+    agreeing = with_rows(candidates, found.inliers)
     every = projection.project(features.bearings_rig)
     return _Recognised(found.world_T_rig, start, places, agreeing, every, features, projection), ""
 
@@ -350,7 +358,6 @@ def _on_patches(
 def _judged(
     localizer: Localizer, name: str, fitted: PoseFit, number: int, seen: PointSightings, camera: int
 ) -> LocalizedFrame:
-    """A photo with its pose, if that is determined."""
     pose, inliers = fitted.world_T_rigs[number], fitted.inliers[number]
     covariance = fitted.covariances[number]
     determined = is_determined(pose, covariance, seen.points_world[inliers])
@@ -369,3 +376,26 @@ def _judged(
         camera,
     )
     return localizer.with_map_error(frame)
+
+
+def localize_all(localizer: Localizer, pictures: Sequence[Picture]) -> LocalizedPhotos:
+    """Localise panoramas and photos, in the order of the pictures; one that cannot be read is
+    refused with the reason. With the cameras of photos."""
+    found: dict[str, LocalizedFrame] = {}
+    photos: list[Photo] = []
+    for picture in track(pictures, "localising", len(pictures)):
+        try:
+            if picture.frames is not None:
+                given = picture.frames, picture.frame, picture.camera
+                found[picture.name] = localizer.localize_frame(*given)
+                continue
+            assert picture.path is not None
+            if picture.photo:
+                photos.append(read_photo(picture.path))
+            else:
+                found[picture.name] = localizer.localize(picture.path, picture.name)
+        except GsbaError as error:
+            found[picture.name] = LocalizedFrame.refused(picture.name, str(error))
+    together = localize_photos(localizer, photos)
+    found |= {frame.name: frame for frame in together.frames}
+    return LocalizedPhotos(tuple(found[picture.name] for picture in pictures), together.cameras)

@@ -41,21 +41,13 @@ class Photo:
     camera: str  # photos of one text share a camera's parameters
 
     def load(self) -> np.ndarray:
-        """Pixels (H, W, 3) uint8 RGB.
-
-        Raises:
-            GsbaError: the file cannot be read.
-        """
+        """Pixels (H, W, 3) uint8 RGB; GsbaError if the file cannot be read."""
         return decode(self.path, (self.width, self.height))
 
     def projection(self, focal: float) -> PerspectiveProjection:
         """The projection without distortion, its principal point in the middle."""
         middle = self.width / 2, self.height / 2
         return PerspectiveProjection(self.width, self.height, focal, middle, (0.0, 0.0))
-
-    def focal_of_field(self, field_rad: float) -> float:
-        """Focal length in pixels at which the longer side spans a field of view."""
-        return max(self.width, self.height) / 2 / np.tan(field_rad / 2)
 
     def prior_sigmas(self) -> np.ndarray:
         """Standard deviations (5,) of the prior on the projection's parameters."""
@@ -64,14 +56,9 @@ class Photo:
 
 
 def read_photo(path: Path) -> Photo:
-    """A photo by its header and its tags.
-
-    Photos share a camera if their tags name the same maker, model, lens and focal length, and they
-    have one size. A photo without these tags has a camera of its own.
-
-    Raises:
-        GsbaError: the file cannot be read.
-    """
+    """A photo by its header and its tags. Photos share a camera if these name the same maker,
+    model, lens and focal length, and they have one size; without tags each has its own. GsbaError
+    if damaged."""
     width, height = image_size(path)
     try:
         tags = read_exif(path)
@@ -96,16 +83,8 @@ def photo_rig(projection: PerspectiveProjection, rig: CubeRig) -> CubeRig:
 def photo_features(
     image: np.ndarray, projection: PerspectiveProjection, rig: CubeRig, extractor: Extractor
 ) -> Features:
-    """Keypoints of a photo on faces around its camera, bearings as the projection has them.
-
-    On faces a photo of any field of view looks to the extractor as panoramas do.
-
-    Args:
-        image: (H, W, 3) uint8 RGB.
-        projection: the photo's, as far as it is known.
-        rig: faces, see `photo_rig`.
-        extractor: the detector.
-    """
+    """Keypoints of a photo (H, W, 3) uint8 RGB on faces around its camera, where it looks to the
+    extractor as panoramas do, bearings as the projection has them."""
     faces = np.zeros((len(FACES), rig.size, rig.size, 3), np.uint8)
     masks = np.zeros((len(FACES), rig.size, rig.size), bool)
     image, scales = _as_dense_as(image, projection, rig.focal)
@@ -123,13 +102,8 @@ def photo_features(
 def as_panorama(
     image: np.ndarray, projection: PerspectiveProjection, width: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Grey panorama (width / 2, width) uint8 that holds a photo, and the mask of its pixels.
-
-    Args:
-        image: (H, W, 3) uint8 RGB.
-        projection: the photo's.
-        width: pixels across.
-    """
+    """Grey panorama (width / 2, width) uint8 that holds a photo (H, W, 3) uint8 RGB, and its
+    mask."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     grey, scales = _as_dense_as(grey, projection, width / (2 * np.pi))
     out = np.zeros((width // 2, width), np.uint8)

@@ -27,8 +27,6 @@ class PictureCameras:
         """Cameras of a map.
 
         Args:
-            root: folder of the run.
-            frames: of the map.
             recording: whose camera took all pictures; None = their layout and size tell.
 
         Raises:
@@ -51,15 +49,8 @@ class PictureCameras:
         return {self.formats[c].layout for c in self._those(lambda kind: True)}
 
     def of_panorama(self, width: int, height: int, name: str) -> int:
-        """Camera of a stitched panorama: that of its size, or the only one of stitched panoramas.
-
-        Args:
-            width, height: of the picture, pixels.
-            name: of the picture, for the message.
-
-        Raises:
-            GsbaError: it can be of several.
-        """
+        """Camera of a stitched panorama: that of its size, pixels, or the only one of stitched
+        panoramas; GsbaError if it can be of several."""
         stitched = self._those(lambda kind: kind.layout == "erp") or range(len(self.formats))
         alike = [c for c in stitched if self.formats[c].width == width]
         return self._only(alike or list(stitched), f"{name}: is {width}x{height}")
@@ -77,28 +68,14 @@ class PictureCameras:
         return bool(self._those(lambda kind: not set(_sizes(kind)).isdisjoint(sizes)))
 
     def of_raw(self, read: Mapping[int, PictureFormat], name: str) -> int:
-        """Camera of raw fisheyes that the calibrations of several can read: that of their size.
-
-        Args:
-            read: format of the frames by the camera whose calibration they were read by.
-            name: of their folder, for the message.
-
-        Raises:
-            GsbaError: they can be of several.
-        """
+        """Camera of raw fisheyes, of those whose calibrations can read them (with the formats
+        read): that of their size; GsbaError if they can be of several."""
         alike = [c for c, kind in read.items() if _sizes(kind) == _sizes(self.formats[c])]
         return self._only(alike or list(read), f"{name}: holds raw fisheyes")
 
     def of_frames(self, kind: PictureFormat, name: str) -> int:
-        """Camera of frames of several images each: that of their layout and size.
-
-        Args:
-            kind: of the frames.
-            name: of their folder, for the message.
-
-        Raises:
-            GsbaError: it can be of several, or of none.
-        """
+        """Camera of frames of several images each: that of their layout and size; GsbaError if they
+        can be of several, or of none."""
         if len(self.formats) == 1:
             return 0
         size = kind.width, kind.height, kind.tracks, _sizes(kind)
@@ -117,7 +94,6 @@ class PictureCameras:
         return [c for c, kind in each if self.chosen in (None, c) and fits(kind)]
 
     def _only(self, alike: list[int], told: str) -> int:
-        """The chosen camera, or the only one that is alike."""
         if self.chosen is not None:
             return self.chosen
         if len(alike) == 1:
@@ -140,7 +116,6 @@ def _sizes(kind: PictureFormat) -> tuple[tuple[int, int], ...]:
 
 
 def _camera_of(root: Path, frames: FrameSet, recording: str) -> int:
-    """Camera of a recording."""
     rows = frames.recordings.get(recording)
     if rows is None:
         known = ", ".join(frames.recordings) or "one recording alone"

@@ -33,15 +33,8 @@ class Picture:
 
 
 def load_panorama(path: Path, at_least: int) -> np.ndarray:
-    """A panorama (H, 2H, 3) uint8 RGB.
-
-    Args:
-        path: its file.
-        at_least: width that is enough: JPEGs are decoded at a part of theirs.
-
-    Raises:
-        GsbaError: the file cannot be read, or is no 2:1 image.
-    """
+    """A panorama (H, 2H, 3) uint8 RGB, JPEGs decoded at a part of their width that is `at_least`
+    enough; GsbaError if it cannot be read, or is not 2:1."""
     width, height = image_size(path)
     if width != 2 * height:
         raise GsbaError(f"{path}: is {width}x{height}; a panorama is 2:1")
@@ -49,16 +42,8 @@ def load_panorama(path: Path, at_least: int) -> np.ndarray:
 
 
 def find_pictures(sources: Sequence[Path], cameras: PictureCameras, work: Path) -> list[Picture]:
-    """The pictures of files, folders and videos, in this order; those of one name are refused.
-
-    Args:
-        sources: pictures, folders of them, or 360-degree videos.
-        cameras: of the run, that may have taken them.
-        work: folder for the frames of videos, one a second.
-
-    Raises:
-        GsbaError: a source is missing, holds no picture, or frames of no camera of the run.
-    """
+    """The pictures of files, folders and videos (one frame a second, in `work`), in this order;
+    GsbaError for a source that holds none, frames of no camera of the run, or two of one name."""
     layouts = cameras.layouts()
     found: list[Picture] = []
     for number, source in enumerate(sources):
@@ -72,7 +57,11 @@ def find_pictures(sources: Sequence[Path], cameras: PictureCameras, work: Path) 
             found += _frames_of_several_images(source, cameras)
         else:
             found += _single_images(source, "erp" in layouts)
-    return _with_own_names(found)
+    names = [picture.name for picture in found]
+    for name in names:
+        if names.count(name) > 1:
+            raise GsbaError(f"two pictures are named '{name}': localise them in two calls")
+    return found
 
 
 def _images(folder: Path) -> list[Path]:
@@ -80,12 +69,11 @@ def _images(folder: Path) -> list[Path]:
 
 
 def _is_of_single_images(folder: Path, cameras: PictureCameras) -> bool:
-    """True if the pictures of a folder are a file each, not two fisheyes side by side, nor faces
-    or tracks in folders."""
+    """True if a folder's pictures are a file each: no pairs, nor faces or tracks in folders."""
     layouts = cameras.layouts()
     if layouts == {"erp"}:
         return True
-    images = [path for path in _images(folder) if _is_whole(path)]
+    images = list(filter(_size_of, _images(folder)))
     if not images or layouts.isdisjoint(("erp", "cube")):
         return False
     size = image_size(images[0])
@@ -97,11 +85,11 @@ def _is_of_single_images(folder: Path, cameras: PictureCameras) -> bool:
 
 
 def _single_images(source: Path, stitched: bool) -> list[Picture]:
-    """Panoramas or photos, one file each: 2:1 pictures are panoramas where frames of the run are
-    stitched ones."""
+    """Panoramas or photos, one file each; 2:1 pictures are panoramas where the run has such."""
 
     def picture(path: Path, time: float) -> Picture:
-        panoramic = stitched and _is_panorama(path)
+        width, height = _size_of(path) or (2, 1)  # is refused where its pixels are read
+        panoramic = stitched and width == 2 * height
         return Picture(path.stem, time, path, photo=not panoramic)
 
     if source.is_file():
@@ -111,32 +99,21 @@ def _single_images(source: Path, stitched: bool) -> list[Picture]:
         raise GsbaError(f"{source}: holds no JPEG, PNG, WebP or TIFF image")
     names, table = [path.stem for path in paths], source / _TIMES_FILE
     given = table if table.is_file() else None
-    tagged = [(path,) for path in paths] if all(map(_is_whole, paths)) else []
+    tagged = [(path,) for path in paths] if all(map(_size_of, paths)) else []
     times, _ = frame_times(names, given, None, True, tagged)
     order = np.argsort(times, kind="stable")
     return [picture(paths[n], float(times[n])) for n in order]
 
 
-def _is_panorama(path: Path) -> bool:
-    """True if an image is 2:1, or cannot be read: it is refused where its pixels are."""
+def _size_of(path: Path) -> tuple[int, int] | None:
+    """Width and height of an image by its header; None = it cannot be read."""
     try:
-        width, height = image_size(path)
+        return image_size(path)
     except GsbaError:
-        return True
-    return width == 2 * height
-
-
-def _is_whole(path: Path) -> bool:
-    """True if an image can be read, as far as its header tells."""
-    try:
-        image_size(path)
-    except GsbaError:
-        return False
-    return True
+        return None
 
 
 def _frames_of_several_images(folder: Path, cameras: PictureCameras) -> list[Picture]:
-    """Cube faces, tracks or raw fisheyes."""
     found = _scanned(folder, cameras)
     camera = next(iter(found))
     if len(found) > 1:
@@ -147,8 +124,7 @@ def _frames_of_several_images(folder: Path, cameras: PictureCameras) -> list[Pic
 
 
 def _scanned(folder: Path, cameras: PictureCameras) -> dict[int, FrameSet]:
-    """Frames of a folder by camera: read by the calibration of each of raw fisheyes that they can
-    be of; else as what they are, of the camera of their layout and size."""
+    """Frames of a folder by camera: raw fisheyes by each calibration that reads them."""
     chosen, errors = cameras.chosen, list[GsbaError]()
     found = dict[int, FrameSet]()
     for camera, calibration in enumerate(cameras.calibrations):
@@ -165,13 +141,3 @@ def _scanned(folder: Path, cameras: PictureCameras) -> dict[int, FrameSet]:
         raise errors[0]
     frames = scan(folder, order_suffices=True, min_frames=1)
     return {cameras.of_frames(frames.format, str(folder)): frames}
-
-
-def _with_own_names(pictures: list[Picture]) -> list[Picture]:
-    """The pictures, none of which has the name of another one."""
-    seen: set[str] = set()
-    for picture in pictures:
-        if picture.name in seen:
-            raise GsbaError(f"two pictures are named '{picture.name}': localise them in two calls")
-        seen.add(picture.name)
-    return pictures

@@ -57,14 +57,7 @@ def open_index(map_: RunMap) -> PlaceIndex:
 
 
 def load_or_make(map_: RunMap, path: Path, kind: type[T], make: Callable[[], T]) -> T:
-    """Load a record that depends on a map's run alone; make and save it if this run has none.
-
-    Args:
-        map_: the map.
-        path: file beside the run.
-        kind: type of the record.
-        make: computes the record.
-    """
+    """Load a record that depends on a map's run alone; make and save it if this run has none."""
     key = _key(map_)
     found = load_checkpoint(path, key, kind, "the map is indexed again")
     if found is not None:
@@ -84,7 +77,6 @@ def index_path(root: Path) -> Path:
 
 
 def _key(map_: RunMap) -> str:
-    """Digest of all that the index depends on."""
     try:
         info = read_info(map_.root / STAGES / "reconstruction.npz")
     except RecordError as error:  # it was read a moment ago
@@ -93,7 +85,6 @@ def _key(map_: RunMap) -> str:
 
 
 def _make(map_: RunMap) -> PlaceIndex:
-    """Vocabulary, and descriptors of all keyframes."""
     num = len(map_.frames)
     frames = SearchableFrames(lambda f: map_.load_keyframe(f).features, axes=map_.axes)
     words = visual_words(frames, num, map_.settings.seed, Threads(1))

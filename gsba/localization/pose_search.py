@@ -1,22 +1,19 @@
 """Search for a picture's pose among candidate points: its significance, and rivals."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from gsba.camera.rig import witnesses
 from gsba.geometry import inverse, rotation_angle
-from gsba.matching.absolute_pose import FoundPose, camera_pose, panorama_pose
+from gsba.matching.absolute_pose import FoundPose, panorama_pose
 from gsba.significance import least_agreeing
+from gsba.types.records import with_rows
 
-if TYPE_CHECKING:
-    import pycolmap
-
-_MIN_RATIO = 0.02  # least inlier ratio that the number of trials allows for
+MIN_RATIO = 0.02  # least inlier ratio that the number of trials allows for
 CELLS_PER_SIDE = 16  # along a face's side: keypoints within one, 6 degrees, are one witness
 _MAX_FALSE_ALARMS = 1e-6  # expected number of poses that chance explains as well as an accepted one
-_MIN_WITNESSES = 10  # fewer may be of one moving object
+MIN_WITNESSES = 10  # fewer may be of one moving object
 _MIN_SHARE = 0.25  # of the first pose's inliers, that further poses must have
 _MIN_RIVAL_RATIO = 1.5  # ratio by which a pose must outweigh the best one at another place
 _RIVAL_DISTANCE = 0.3  # distance of another place, in median depths or radians
@@ -34,71 +31,22 @@ class Candidates:
     def __len__(self) -> int:
         return len(self.points)
 
-    def taken(self, rows: np.ndarray) -> "Candidates":
-        """Candidates `rows`, int or bool."""
-        return Candidates(
-            self.keypoints[rows], self.bearings[rows], self.points[rows], self.points_world[rows]
-        )
-
-
-def search_pose(
-    candidates: Candidates, max_error_rad: float, seed: int, least: int = _MIN_WITNESSES
-) -> FoundPose | None:
-    """Pose of a panorama with the most inliers; None if no pose has enough.
-
-    Args:
-        candidates: many may be false.
-        max_error_rad: of an inlier.
-        seed: of the sampling.
-        least: number of inliers that is enough.
-    """
-    given = candidates.bearings, candidates.points_world
-    return panorama_pose(*given, max_error_rad, seed, least, _MIN_RATIO)
-
 
 def search_poses(
     candidates: Candidates, max_error_rad: float, seed: int, most: int
 ) -> list[FoundPose]:
-    """Significant poses of a panorama, each of the candidates that those before leave over.
-
-    Args:
-        candidates, max_error_rad, seed: see `search_pose`.
-        most: number of poses.
-    """
-    found, least = list[FoundPose](), _MIN_WITNESSES
+    """Significant poses of a panorama, each of the candidates that those before leave over."""
+    found, least = list[FoundPose](), MIN_WITNESSES
     chance = (1 - np.cos(max_error_rad)) / 2  # a disc's share of the sphere
     while len(found) < most:
-        one = search_pose(candidates, max_error_rad, seed, least)
+        given = candidates.bearings, candidates.points_world
+        one = panorama_pose(*given, max_error_rad, seed, least, MIN_RATIO)
         if one is None or not is_significant(candidates.bearings, one.inliers, chance):
             break
         least = max(least, int(_MIN_SHARE * one.inliers.sum()))
         found.append(one)
-        candidates = candidates.taken(~one.inliers)
+        candidates = with_rows(candidates, ~one.inliers)
     return found
-
-
-def search_focal(
-    pixels: np.ndarray,
-    points_world: np.ndarray,
-    camera: "pycolmap.Camera",
-    known: bool,
-    max_error_px: float,
-    seed: int,
-    least: int = _MIN_WITNESSES,
-) -> FoundPose | None:
-    """Pose of a photo without distortion, and its focal length if that is not known.
-
-    Args:
-        pixels: (m, 2) keypoints, corner origin.
-        points_world: (m, 3) candidate point of each.
-        camera: SIMPLE_PINHOLE.
-        known: whether its focal length is known.
-        max_error_px: of an inlier.
-        seed: of the sampling.
-        least: number of inliers that is enough.
-    """
-    given = pixels, points_world, camera
-    return camera_pose(*given, max_error_px, seed, least, _MIN_RATIO, estimate_focal=not known)
 
 
 def is_significant(
@@ -123,22 +71,17 @@ def is_significant(
     agreeing = witnesses(bearings[inliers], per_side)
     per_witness = 1 - (1 - min(chance, 0.5)) ** (len(bearings) / num)
     needed = least_agreeing(num, per_witness, sample, _MAX_FALSE_ALARMS)
-    return agreeing >= max(needed, _MIN_WITNESSES)
+    return agreeing >= max(needed, MIN_WITNESSES)
 
 
 def least_of_rival(found: FoundPose) -> int:
     """Number of inliers from which another pose counts as a rival of one that was found."""
-    return max(_MIN_WITNESSES, int(found.inliers.sum() / _MIN_RIVAL_RATIO))
+    return max(MIN_WITNESSES, int(found.inliers.sum() / _MIN_RIVAL_RATIO))
 
 
 def is_rivalled(found: FoundPose, rival: FoundPose | None, candidates: Candidates) -> bool:
-    """True if the candidates that a pose leaves over agree about as well on another place.
-
-    Args:
-        found: of all candidates.
-        rival: of those that it leaves over, with `least_of_rival` inliers.
-        candidates: all of them.
-    """
+    """True if candidates that a pose leaves over agree about as well on `rival`, at another
+    place."""
     if rival is None:
         return False
     offsets = candidates.points_world[found.inliers] - found.world_T_rig[:3, 3]

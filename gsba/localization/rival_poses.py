@@ -1,9 +1,5 @@
-"""The choice among poses of a picture at several places that look like it.
-
-In a hall whose bays repeat, the matches with the map agree on one pose for each bay. Fitted to all
-that the map has around each, the true one shows what is expected around, and explains keypoints
-that the others leave: what does not repeat.
-"""
+"""The choice among poses of a picture at several places that look like it: the true one shows what
+is expected around, and explains keypoints that the others leave."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -51,14 +47,8 @@ class PlacedPose:
 
 
 def best_of(poses: Sequence[PlacedPose]) -> tuple[int, str]:
-    """The pose that most cells agree with, and the reason why it is not accepted; "" = it is.
-
-    Its surroundings must confirm it, and it must explain significantly more cells than every pose
-    at another place that is no look-alike.
-
-    Args:
-        poses: at least one.
-    """
+    """The pose that most cells agree with, and why it is not accepted; "" = its surroundings
+    confirm it, and it explains significantly more than every other place that is no look-alike."""
     best = max(range(len(poses)), key=lambda n: len(poses[n].cells))
     one = poses[best]
     if not one.evidence.confirmed:

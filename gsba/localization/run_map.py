@@ -1,8 +1,9 @@
 """A finished run as a map to localise in: its keyframes' keypoints with the points they show."""
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,6 @@ from gsba import learned
 from gsba.bundle.point_covariances import point_covariances
 from gsba.bundle.stitching import corrected
 from gsba.camera.cameras import Cameras
-from gsba.camera.lens import Lenses
 from gsba.camera.rig import CubeRig
 from gsba.config import RefineSettings
 from gsba.config_file import load_config
@@ -24,8 +24,10 @@ from gsba.store.finished import load_cameras, load_run
 from gsba.store.folder import STAGES, read_marker
 from gsba.store.records import RecordError, load_record
 from gsba.types import Features, FrameSet, Reconstruction
+from gsba.types.records import with_rows
 from gsba.version import __version__
 
+_STAGES = "features_closer", "features"  # that store keypoints of frames, the last one first
 _NUM_KEPT = 64  # keyframes kept in memory
 _SAME_PLACE_SIGMAS = 6.0  # largest angle between a keypoint and the observation of a point that is
 # taken for the keypoint's, standard deviations of the keypoint
@@ -41,6 +43,17 @@ class MapKeyframe:
     all: Searchable  # all of them, prepared for matching
     points_rig: np.ndarray  # (K, 3) float64, point of each keypoint, rig frame, map units
     points: np.ndarray  # (K,) int64, its number
+
+
+@dataclass(frozen=True, slots=True)
+class Query:
+    """Keypoints of a picture to localise, prepared for matching."""
+
+    features: Features
+    bearings: np.ndarray  # (K, 3) unit, corrected directions of the keypoints, rig frame
+    origins_rig: np.ndarray | None  # (K, 3) origins of their rays; None = the centre
+    strongest: Searchable
+    all: Searchable
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,15 +78,8 @@ class RunMap:
 
     @classmethod
     def open(cls, root: Path, map_number: int = 1) -> "RunMap":
-        """Read a finished run.
-
-        Args:
-            root: folder of the run.
-            map_number: number of the map, 1 = the largest.
-
-        Raises:
-            GsbaError: no finished run, one of another version of gsba, or one without points.
-        """
+        """Read a map of a finished run, 1 = the largest; GsbaError for no finished run, one of
+        another version of gsba, or one without points."""
         require_own_version(root)
         result, frames = load_run(root, map_number)
         if not len(result.points_world):
@@ -84,24 +90,47 @@ class RunMap:
         settings = load_config(root / "config.toml")
         cameras = load_cameras(root, result, frames, map_number)
         rig = cubemap.rig_for(frames.formats[0], settings.cubemap)
-        reader = _KeypointReader(root, frames, settings, ("features_closer", "features"))
-        first = reader(0).descriptors
+        raw = without_correction(frames)  # keypoints are corrected later
+
+        def features_of(f: int, stages: Sequence[str]) -> Features:
+            """Keypoints of a frame: those that a stage stored, the first that has, else anew."""
+            for stage in stages:
+                with suppress(RecordError):
+                    return load_record(root / STAGES / stage / f"{frames.names[f]}.npz", Features)
+            make = learned.make_extractor(settings.features, learned.find_weights(settings))
+            own = cubemap.rig_for(raw.format_of(f), settings.cubemap)
+            return extract(*cubemap.load(raw, f, own), own, make())
+
+        first = features_of(0, _STAGES).descriptors
         if not len(first):
             raise GsbaError(f"{root}: its first frame has no keypoints: refine again with --fresh")
-        axes = principal_axes(first)
-        observed = result.observations_by_frame()
+        axes, observed = principal_axes(first), result.observations_by_frame()
         fields = tuple(SphereField(np.array(kind.correction)) for kind in frames.formats)
 
-        numbers = frames.cameras
-
         def keyframe(f: int) -> MapKeyframe:
-            seen_by = cameras.at(f), fields[numbers[f]]
-            return _keyframe(f, reader(f), observed, result, *seen_by, settings, rig, axes)
+            """Keypoints of a frame that lie where the frame observes a point of the map."""
+            from scipy.spatial import KDTree
+
+            features, rows, lenses = features_of(f, _STAGES), observed[f], cameras.at(f)
+            seen = corrected(gather([features]), fields[frames.cameras[f]], rig)
+            seen = Cameras((lenses.of_frame(f),)).seen(seen) if lenses else seen
+            numbers = np.zeros(len(features), np.int64)
+            known = np.zeros(len(features), bool)
+            if len(rows) and len(features):
+                gaps, nearest = KDTree(result.observation_bearings[rows]).query(seen.bearings_rig)
+                allowed = np.minimum(_SAME_PLACE_SIGMAS * seen.sigmas_rad, _SAME_PLACE_RAD)
+                known = np.asarray(gaps) < allowed
+                numbers = result.observation_points[rows].astype(np.int64)[np.asarray(nearest)]
+            chosen = np.flatnonzero(known)
+            kept, numbers = with_rows(features, chosen), numbers[chosen]
+            world_T_rig = result.world_T_rigs[f]
+            points = (result.points_world[numbers] - world_T_rig[:3, 3]) @ world_T_rig[:3, :3]
+            strongest = searchable(kept, axes, settings.pairs.strongest_per_face)
+            return MapKeyframe(kept, strongest, searchable(kept, axes), points, numbers)
 
         load = lru_cache(_NUM_KEPT)(keyframe)
-        covariances = point_covariances(result)
-        first_look = replace(reader, stages=("features",))
-        known = rig, covariances, axes
+        known = rig, point_covariances(result), axes
+        first_look = partial(features_of, stages=("features",))
         return cls(root, frames, result, cameras, fields, settings, *known, first_look, load)
 
     def nearest(self, world_T_rig: np.ndarray, most: int) -> np.ndarray:
@@ -132,86 +161,10 @@ def without_correction(frames: FrameSet) -> FrameSet:
 
 
 def require_own_version(root: Path) -> None:
-    """Refuse a run that another version of gsba made.
-
-    Raises:
-        GsbaError: the run is of another version.
-    """
+    """Refuse a run that another version of gsba made."""
     version = read_marker(root).get("gsba", __version__)
     if version != __version__:
         raise GsbaError(
             f"{root} is a run of gsba {version}, this is gsba {__version__}: refine it again with "
             f"--out {root}, or use gsba {version}"
         )
-
-
-@dataclass(frozen=True, slots=True)
-class _KeypointReader:
-    """Keypoints of the map's frames: those that the run stored, else extracted again."""
-
-    root: Path
-    frames: FrameSet
-    settings: RefineSettings
-    stages: tuple[str, ...]  # that may have stored them, the first that has is read
-
-    def __call__(self, frame: int) -> Features:
-        name = self.frames.names[frame]
-        for stage in self.stages:
-            path = self.root / STAGES / stage / f"{name}.npz"
-            if path.is_file():
-                try:
-                    return load_record(path, Features)
-                except RecordError:
-                    continue
-        raw = without_correction(self.frames)  # keypoints are corrected later
-        make = learned.make_extractor(self.settings.features, learned.find_weights(self.settings))
-        rig = cubemap.rig_for(raw.format_of(frame), self.settings.cubemap)
-        images, masks = cubemap.load(raw, frame, rig)
-        return extract(images, masks, rig, make())
-
-
-def _keyframe(
-    frame: int,
-    features: Features,
-    observed: Sequence[np.ndarray],
-    result: Reconstruction,
-    lenses: Lenses,
-    field: SphereField,
-    settings: RefineSettings,
-    rig: CubeRig,
-    axes: np.ndarray,
-) -> MapKeyframe:
-    """Keypoints of a frame that lie where the frame observes a point of the map."""
-    from scipy.spatial import KDTree
-
-    rows = observed[frame]
-    seen = corrected(gather([features]), field, rig)
-    seen = Cameras((lenses.of_frame(frame),)).seen(seen) if lenses else seen
-    numbers = np.zeros(len(features), np.int64)
-    known = np.zeros(len(features), bool)
-    if len(rows) and len(features):
-        gaps, nearest = KDTree(result.observation_bearings[rows]).query(seen.bearings_rig)
-        allowed = np.minimum(_SAME_PLACE_SIGMAS * seen.sigmas_rad, _SAME_PLACE_RAD)
-        known = np.asarray(gaps) < allowed
-        numbers = result.observation_points[rows].astype(np.int64)[np.asarray(nearest)]
-    chosen = np.flatnonzero(known)
-    kept = taken(features, chosen)
-    world_T_rig = result.world_T_rigs[frame]
-    points = result.points_world[numbers[chosen]] - world_T_rig[:3, 3]
-    strongest = searchable(kept, axes, settings.pairs.strongest_per_face)
-    every = searchable(kept, axes)
-    return MapKeyframe(kept, strongest, every, points @ world_T_rig[:3, :3], numbers[chosen])
-
-
-def taken(features: Features, rows: np.ndarray) -> Features:
-    """Keypoints `rows` (K',), ascending."""
-    scores = features.scores
-    return Features(
-        features.pixels[rows],
-        features.faces[rows],
-        features.bearings_rig[rows],
-        features.sigmas_rad[rows],
-        features.descriptors[rows],
-        features.colors[rows],
-        None if scores is None else scores[rows],
-    )

@@ -1,11 +1,6 @@
-"""Test of a localised pose by the points of the map that a picture taken there should show.
-
-In a hall whose bays or sides repeat, hundreds of matches can agree on a pose where the picture was
-not taken, with a small covariance. A picture at its true pose shows the points of the nearest
-keyframes at the rate at which frames of the map show those of one another. At a look-alike it shows
-few of them, and none in some directions. `gsba.loop_closure.join_evidence` tests joins of maps by
-the same evidence.
-"""
+"""Test of a localised pose by the points of the map that a picture taken there should show: at a
+look-alike it shows few of them, and none in some directions. See
+`gsba.loop_closure.join_evidence`."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -17,8 +12,7 @@ from gsba.features.extractor_traits import search_settings
 from gsba.frames import cubemap
 from gsba.geometry import inverse
 from gsba.localization.place_index import index_path, load_or_make
-from gsba.localization.query import Query
-from gsba.localization.run_map import RunMap
+from gsba.localization.run_map import Query, RunMap
 from gsba.log import GsbaError
 from gsba.loop_closure.join_evidence import (
     GATE_RAD,
@@ -60,11 +54,6 @@ class PictureRates:
         """Rates of a camera's panoramas."""
         return Rates(self.within[camera], float(self.chance[camera]), self.placed[camera])
 
-    @property
-    def of_photos(self) -> Rates:
-        """Rates of photos."""
-        return self.of_camera(len(self.face_px))
-
 
 class Surroundings:
     """Points that a picture taken from some pose is expected to show."""
@@ -75,12 +64,8 @@ class Surroundings:
         self._num_observers = np.bincount(map_.result.observation_points, None, num)
 
     def rates(self, frames: Sequence[int], seen: Sequence[Query]) -> Rates:
-        """Rates at which frames of the map show what the map without them would expect.
-
-        Args:
-            frames: numbers (N) of the frames.
-            seen: (N) their keypoints, found as those of the pictures to test.
-        """
+        """Rates at which frames (N,) of the map show what the map without them would expect, by
+        their keypoints (N), found as those of the pictures to test."""
         poses = self.map.result.world_T_rigs
         at, away = [], []
         for frame, picture in zip(frames, seen, strict=True):
@@ -91,14 +76,8 @@ class Surroundings:
     def evidence(
         self, seen: Query, world_T_rig: np.ndarray, usual: Rates, shown: Shown | None = None
     ) -> JoinEvidence:
-        """Evidence for and against a pose.
-
-        Args:
-            seen: keypoints of the picture.
-            world_T_rig: (4, 4) its pose.
-            usual: rates for pictures of its kind.
-            shown: tells the points that lie within a picture with edges.
-        """
+        """Evidence for and against a pose (4, 4); `shown` tells the points within a picture with
+        edges."""
         found = self._predictions(seen, world_T_rig, shown=shown)
         if not len(found.bins):
             return JoinEvidence(0.0, np.inf, 0)
@@ -112,8 +91,7 @@ class Surroundings:
         left_out: int | None = None,
         shown: Shown | None = None,
     ) -> Predictions:
-        """Points of the nearest keyframes predicted in a picture. Without one of the frames the map
-        would lack points that fewer than `_MIN_OTHERS` others observe."""
+        """Points of the nearest keyframes predicted in a picture, as if one frame were left out."""
         map_ = self.map
         result, num_observers = map_.result, self._num_observers
         nearest = map_.nearest(world_T_rig, _NUM_NEAREST + 1)
@@ -146,16 +124,8 @@ def open_rates(
     extract: Callable[[FrameSet, int, CubeRig], Features],
     query_of: Callable[[Features, int, CubeRig], Query],
 ) -> PictureRates:
-    """Rates of a map: those kept beside the run if they are the run's, else measured and kept.
-
-    Where pictures of the run are gone, its stored keypoints are taken: on faces of the run's size.
-
-    Args:
-        surroundings: of the map.
-        rigs: (C) faces on which keypoints of each camera's panoramas are found, if they can be.
-        extract: finds keypoints of a frame.
-        query_of: prepares keypoints of a camera's frame.
-    """
+    """Rates of a map: those kept beside the run if they are the run's, else measured on faces of
+    `rigs` (C) and kept; where pictures of the run are gone, by its stored keypoints."""
     map_ = surroundings.map
 
     def rates_of_camera(camera: int) -> tuple[Rates, Rates, int]:

@@ -1,10 +1,5 @@
-"""Maps on either side of a short break of a recording, across which the camera moved on.
-
-Similarities of both maps follow from single pairs of frames across the break. Two overlapping
-frames give their relative rotation, the direction from one to the other, and distances of points in
-units of that step. Points of one of the maps give the step's length in its unit; so both maps
-together give the ratio of their units.
-"""
+"""Maps on either side of a short break of a recording, across which the camera moved on: pairs of
+frames give the step across in either map's unit, and so the ratio of the units."""
 
 from dataclasses import dataclass, replace
 
@@ -34,15 +29,8 @@ def crossing(
     known: list[np.ndarray],
     outside: np.ndarray,
 ) -> list[Proposal]:
-    """Similarities of a part and the map, one from each pair of frames over a break.
-
-    Args:
-        pairs: pairs of one frame outside the map and one inside.
-        keypoints: keypoints of all frames.
-        poses: (F, 4, 4), each frame's in its own map.
-        known: (F) of (K_f, 3), points of each frame's keypoints in its rig frame, NaN = unknown.
-        outside: frames of the part.
-    """
+    """Similarities of a part and the map, one from each pair of frames over a break; `known` (F) of
+    (K_f, 3) are points of keypoints, rig frames, NaN = unknown."""
     found = []
     for p, (f0, f1) in enumerate(pairs.matches.pairs.tolist()):
         if not np.isfinite(pairs.direction_sigmas[p]):
@@ -65,14 +53,9 @@ def crossing(
 
 
 def agreed(proposals: list[Proposal], poses: np.ndarray, depth: float) -> Proposal | None:
-    """The proposal that most others agree with, of several the one with most matches; None if the
-    others are too few, or no majority.
-
-    Args:
-        proposals: proposals of single pairs.
-        poses: (F, 4, 4), each frame's in its own map.
-        depth: median distance of points, map units.
-    """
+    """The proposal that most others agree with, of several the one with most matches; None without
+    a majority. Poses (F, 4, 4) are each frame's in its own map; `depth`, its median, in map
+    units."""
     counts = [sum(alike(one, other, poses, depth) for other in proposals) for one in proposals]
     if max(counts, default=0) < max(MIN_AGREEING, len(proposals) // 2 + 1):
         return None
@@ -108,11 +91,8 @@ class Breaks:
 
     def at_usual_pace(self, move: Sim3) -> list[Sim3]:
         """Similarities that move the part as one does, and then along the camera's way until it
-        walks on over a break at about the usual pace.
-
-        In a hall of bays, matches over a break agree on steps that are one bay too short, or lead
-        back.
-        """
+        walks on at about the usual pace: in a hall of bays, matches agree on steps that are a bay
+        too short."""
         found = list[Sim3]()
         for f, g in self.steps:
             step = move.poses(self.poses[[f]])[0, :3, 3] - self.poses[g, :3, 3]
@@ -127,9 +107,7 @@ class Breaks:
         return found
 
     def _velocities(self, move: Sim3, f: int, g: int) -> list[np.ndarray]:
-        """Velocities (3,) that the camera may have between frame f of the part, once moved, and
-        frame g of the map: at the usual speed of the map there, in the mean direction of the steps
-        before and behind, and in that of either; none where the map does not move."""
+        """Velocities (3,) that the camera may have between g of the map and f of the moved part."""
         theirs = self._beside(g, f, self.inside)
         ours = move.scale * self._beside(f, g, self.part) @ move.rotation.T
         speed = float(np.median(np.linalg.norm(theirs, axis=1))) if len(theirs) else 0.0
@@ -141,8 +119,7 @@ class Breaks:
         return [speed * way / np.linalg.norm(way) for way in ways if way.any()]
 
     def _beside(self, g: int, f: int, rows: np.ndarray) -> np.ndarray:
-        """Velocities (n, 3) of at most `_REACH` steps of frames `rows` beside g, on the side away
-        from f, the nearest first."""
+        """Velocities (n, 3) of up to `_REACH` steps of `rows` beside g, away from f"""
         ends = g + np.sign(g - f) * np.arange(_REACH + 1)
         ends = ends[: int(np.argmin(np.append(np.isin(ends, rows), False)))]
         steps = np.diff(self.poses[ends, :3, 3], axis=0)
@@ -150,8 +127,7 @@ class Breaks:
 
 
 def _step_length(known: np.ndarray, depths: np.ndarray) -> float | None:
-    """Length of a step in the unit of a map, from its points (m, 3) and their distances (m,) in
-    steps; None if it is too uncertain."""
+    """Length of a step in a map's unit, by points (m, 3) and depths (m,); None = uncertain."""
     logs = np.log(np.linalg.norm(known, axis=1) / depths)
     logs = logs[np.isfinite(logs)]
     if len(logs) < _MIN_SHARED_POINTS:

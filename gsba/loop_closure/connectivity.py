@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gsba.types import Matches, Solution, Tracks
+from gsba.types import Matches, Tracks
 
 MIN_MAP_FRAMES = 3  # least frames of a part that count as a map
 
@@ -36,12 +36,6 @@ def maps_of_images(pairs: np.ndarray, num_frames: int) -> np.ndarray:
     return np.where(np.bincount(parts)[parts] < MIN_MAP_FRAMES, -1, parts)
 
 
-def apart(lonely: np.ndarray) -> np.ndarray | None:
-    """Component (F,) int64 of each frame where those `lonely` (F,) bool are components of their
-    own, behind all others; None = there is none."""
-    return np.where(lonely, np.cumsum(lonely), 0) if lonely.any() else None
-
-
 def several(found: np.ndarray) -> np.ndarray | None:
     """Labels, or None if all are equal."""
     return found if (found != found[0]).any() else None
@@ -65,11 +59,6 @@ def within(matches: Matches, parts: np.ndarray | None) -> Matches:
     if len(keep) == len(matches.pairs):
         return matches
     return matches.taken(keep)
-
-
-def starving(solved: Solution, least: int) -> np.ndarray:
-    """Frames (F,) bool with fewer than `least` observations of a map."""
-    return solved.observations() < least
 
 
 def bridging(tracks: Tracks, num_frames: int) -> np.ndarray:

@@ -1,15 +1,8 @@
-"""Evidence for and against a join of two parts of a map.
+"""Evidence for and against a join of two parts of a map (see docs/method.md).
 
-If a join is true, frames of one part see points of the other part that lie on surfaces they already
-know nearby. A repeated poster, window or arch brings matches for a false join, but not the rest of
-the place. So points that are found again are weighed against those that are not, relative to the
-rate at which points are found again within parts under the same change of view. Points of a small
-cell of space count as one witness, and witnesses of one region have correlated errors. Weighed by
-their numbers, points must confirm a join, too.
-
-Homes of one plan share walls, doors and furniture, and the bays of a hall their columns. What is
-found there matches by chance, anywhere around where it is expected, or stands at a place that is
-only similar: how near a point is to where it is expected counts, too.
+Points that are found again are weighed against those that are not, relative to the rate within
+parts under the same change of view; how near a point is to its place counts, too. Points of a small
+cell of space are one witness, and witnesses of one region have correlated errors.
 """
 
 from collections.abc import Sequence
@@ -195,15 +188,8 @@ def rates(
     surfaces: bool = True,
     chosen: np.ndarray | None = None,
 ) -> Rates:
-    """Rates at which points of a frame are found again in frames of its own part.
-
-    Args:
-        context: features and settings of the run.
-        places: frames and points, each part consistent in itself.
-        parts: (F,) int, part of each frame.
-        surfaces: see `predict`.
-        chosen: (F,) bool, frames that are compared; None = all.
-    """
+    """Rates at which points of a frame are found again in frames of its own part (F,), if both are
+    `chosen` (F,) bool; for `surfaces` see `predict`."""
     compared = np.ones(len(parts), bool) if chosen is None else chosen
     rows = [np.flatnonzero(compared & (parts == p)) for p in np.unique(parts[compared])]
     pairs = np.concatenate([nearest_pairs(places, some, some) for some in rows])
@@ -246,19 +232,9 @@ def weigh(
     depth: float,
     surfaces: bool = True,
 ) -> tuple[JoinEvidence, Matches]:
-    """Weigh the evidence for and against a join of two groups of frames.
-
-    Args:
-        context: features and settings of the run.
-        places: frames and points of both groups after the join.
-        groups: (N,) and (M,) frames.
-        usual: result of `rates`, with the same `surfaces`.
-        depth: median distance of points, map units.
-        surfaces: see `predict`.
-
-    Returns:
-        The evidence, and the points found again: matches of frames of both groups.
-    """
+    """Weigh the evidence for and against a join of two groups (N,), (M,) of frames; with it the
+    points found again, as matches of frames of both. `depth`: median distance of points, map
+    units."""
     pairs = nearest_pairs(places, *groups)[:_MAX_PAIRS]
     seen, found = predict(context, places, pairs, surfaces)
     if not len(seen.bins):
@@ -274,8 +250,6 @@ def evidence_of(seen: Predictions, usual: Rates, depth: float) -> JoinEvidence:
     of its own, but not what covers them.
 
     Args:
-        seen: at least one prediction.
-        usual: see `weigh`.
         depth: median distance of points, map units.
     """
     cells = np.floor(seen.points_world / (_CELL_DEPTHS * depth)).astype(np.int64)
@@ -304,8 +278,7 @@ def evidence_of(seen: Predictions, usual: Rates, depth: float) -> JoinEvidence:
 
 
 def _distinct(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distinct rows (D, 3) of rows (N, 3) int64, in ascending order, and the number (N,) of each
-    row's. Several times faster than `np.unique` along an axis."""
+    """Ascending distinct rows (D, 3), each row's number (N,); faster than `np.unique` by axis."""
     number_of = np.zeros(len(rows), np.int64)
     for column in rows.T:
         values, each = np.unique(column, return_inverse=True)
@@ -361,18 +334,9 @@ def nearest_pairs(places: Places, one: np.ndarray, other: np.ndarray) -> np.ndar
 def predict(
     context: MatchContext, places: Places, pairs: np.ndarray, surfaces: bool
 ) -> tuple[Predictions, Matches]:
-    """Predict points of the first frames of pairs in the second frames, and match them.
-
-    Args:
-        context: features and settings of the run.
-        places: frames and points.
-        pairs: (P, 2) frames.
-        surfaces: predict only points on surfaces that the second frame knows; else all, of which
-            some will be occluded.
-
-    Returns:
-        Predictions, and the matches that were found.
-    """
+    """Predict points of the first frames of pairs (P, 2) in the second ones, and match them: with
+    `surfaces` only points on surfaces that the second frame knows, else all, some of them
+    occluded."""
     gates = [Gate.around_points(GATE_RAD)] * len(pairs)
     found = context.match(pairs, places.world_T_rigs, gates, places.known, guided_only=True)
     seen = context.keypoints.bearings_of
@@ -386,15 +350,8 @@ def predict(
 def predicted(
     places: Places, f: int, g: int, matched: np.ndarray, bearings: np.ndarray, surfaces: bool
 ) -> Predictions:
-    """Points of frame f, predicted in frame g.
-
-    Args:
-        places: frames and points.
-        f, g: numbers of the frames.
-        matched: (M, 2) keypoints of f and of g that match near a prediction.
-        bearings: (K, 3) unit, rig frame of g, of its keypoints.
-        surfaces: see `predict`.
-    """
+    """Points of frame f, predicted in frame g, by keypoints (M, 2) of both that match near a
+    prediction and by bearings (K, 3), unit, rig frame of g, of its keypoints."""
     rows = np.flatnonzero(np.isfinite(places.known[f]).all(axis=1))
     own, g_T_f = places.known[f][rows], inverse(places.world_T_rigs[g]) @ places.world_T_rigs[f]
     there = own @ g_T_f[:3, :3].T + g_T_f[:3, 3]
@@ -415,8 +372,7 @@ def predicted(
 
 
 def _on_surface(known: np.ndarray, directions: np.ndarray, distances: np.ndarray) -> np.ndarray:
-    """True (V,) for points at distances (V,) along unit directions (V, 3) that lie on surfaces
-    shown by a frame's points (K, 3)."""
+    """True (V,) for points, by direction and distance, on surfaces that points (K, 3) show."""
     points = known[np.isfinite(known).all(axis=1)]
     if not len(points):
         return np.zeros(len(distances), bool)

@@ -1,7 +1,4 @@
-"""The test of joins: evidence from the frames around a meeting on a proposed similarity.
-
-Joins of maps and loops within one map are tested alike: evidence, and rival proposals.
-"""
+"""The test of joins of maps and of loops: evidence from the frames around a meeting, and rivals."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -60,16 +57,8 @@ class JoinTest:
     def judge(
         self, proposal: Proposal, rows: np.ndarray, inside: np.ndarray, judged: Sequence[Judged]
     ) -> Judged | None:
-        """Weigh a proposal to join two parts.
-
-        Args:
-            proposal: carries `rows` to `inside`.
-            rows, inside: (N,) and (M,) frames of either part, ascending.
-            judged: those judged before.
-
-        Returns:
-            None if the proposal leads to the place of one that is confirmed already.
-        """
+        """Weigh a proposal to join frames (N,) and (M,), ascending; None if it leads to the place
+        of one that is confirmed already."""
         known = [one.proposal for one in judged if one.evidence.confirmed]
         (f, g), (reach, wider_reach) = proposal.frames, (join_evidence.LOCAL, join_evidence.WIDER)
         near = around(rows, f, reach), around(inside, g, reach)
@@ -104,7 +93,6 @@ class JoinTest:
         return join_evidence.weigh(self.context, places, (rows, inside), usual, self.depth)
 
     def _rates(self, frames: np.ndarray) -> Rates:
-        """Usual rates of the recordings that frames are of; measured once."""
         owners = np.unique(self.owners[frames])
         key = tuple(owners.tolist())
         if key not in self._usual:
@@ -114,13 +102,8 @@ class JoinTest:
     def meetings(
         self, matches: Matches, outside: np.ndarray, f0_T_f1s: np.ndarray | None = None
     ) -> list[Meeting]:
-        """Matched points that both frames of pairs know, one of them among those outside.
-
-        Args:
-            matches: matches of P pairs.
-            outside: frames (N,) outside the map.
-            f0_T_f1s: (P, 4, 4) relative poses by bearings, their translations of any length.
-        """
+        """Matched points that both frames of pairs know, one of them outside (N,); see
+        `meetings_of`."""
         return meetings_of(self.known, matches, outside, f0_T_f1s)
 
     def _judged(
@@ -129,8 +112,7 @@ class JoinTest:
         groups: Sequence[np.ndarray],
         known: Sequence[Proposal],
     ) -> Judged | None:
-        """The proposal tested with frames of both sides; None if it leads to the place of a known
-        one."""
+        """The proposal tested by frames of both sides; None if it leads to a known one's place."""
         (f, g), move = proposal.frames, proposal.move
         given = f, g, move.scale, move.new_T_old.tobytes(), *(rows.tobytes() for rows in groups)
         found = self._tested.get(given) or self._settled(proposal, groups, known)
@@ -145,8 +127,7 @@ class JoinTest:
         groups: Sequence[np.ndarray],
         known: Sequence[Proposal],
     ) -> Judged | None:
-        """The proposal refined by frames of both sides until it hardly changes; None once it leads
-        to the place of a known one."""
+        """The proposal refined until it settles; None once it leads to a known one's place."""
         rows, inside = groups
         evidence, found = self.weigh(rows, inside, proposal.move)
         for _ in range(_MAX_REFINEMENTS):
@@ -164,5 +145,4 @@ class JoinTest:
         return Judged(proposal, evidence)
 
     def _leads_to(self, proposal: Proposal, known: Sequence[Proposal]) -> bool:
-        """True if a proposal is for the place of a known one."""
         return any(alike(proposal, other, self.poses, self.depth) for other in known)

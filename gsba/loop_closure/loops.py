@@ -1,30 +1,26 @@
-"""Loop closure: candidates by place recognition, accepted by geometric consistency.
-
-Frames with similar global descriptors (`gsba.loop_closure.retrieval`) are matched, and every loop
-is tested against the map: repeated structure makes perfect loops to the wrong place, but those need
-more drift than the path can have, or contradict one another.
-"""
+"""Loop closure: candidates by place recognition, tested against the map. Perfect loops to the wrong
+place need more drift than the path can have, or contradict one another."""
 
 import logging
 from dataclasses import dataclass
 from pathlib import Path
 
+import gtsam
 import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.spatial import KDTree
 
 from factors.threads import map_in_threads
+from gsba.bundle.pose_variables import X
 from gsba.config import RefineSettings
 from gsba.geometry import inverse, rotation_angle
 from gsba.loop_closure import join_evidence
-from gsba.loop_closure.connectivity import parted
 from gsba.loop_closure.join_evidence import LOCAL, Places, around
-from gsba.loop_closure.pose_graph import Loop, bend, met
 from gsba.loop_closure.retrieval import global_descriptors
 from gsba.matching import recovery
 from gsba.matching.guided_search import MatchContext
 from gsba.memory import release_mapped_files
-from gsba.similarity import relative_map
+from gsba.similarity import relative_similarity
 from gsba.types import Counts, Keypoints, Solution, Tracks, VerifiedPairs
 from gsba.types.records import slices
 
@@ -40,6 +36,94 @@ RIVAL = 1.5  # ratio by which a group must outweigh one that contradicts it
 # Largest rotation error of the map between two frames; of each step without matches besides.
 _MAX_ROTATION_DEG, _UNSEEN_ROTATION_DEG = 10.0, 45.0
 AGREE_DEG, AGREE = 2.0, 0.1  # between two pairs; relative to the median depth
+# Noise of a verified step, and of a loop: rotation; position in typical lengths of steps.
+_STEP_SIGMA_DEG, _STEP_SIGMA_LENGTHS = 0.2, 0.02
+_LOOP_SIGMA_DEG, _LOOP_SIGMA_LENGTHS = 0.3, 0.05
+# Rotation noise of a step without matches, whose position noise is its length.
+_UNSEEN_SIGMA_RAD = 0.5
+_INLIER_PROBABILITY = 0.99  # that a true loop is within its noise
+
+
+def path(
+    world_T_rigs: np.ndarray, unseen: np.ndarray
+) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, gtsam.noiseModel.Base]:
+    """A pose graph of the steps of poses (F, 4, 4), its first fixed, its values, and a loop's
+    noise; steps `unseen` (F - 1,) bool without matches give way first."""
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    for f, world_T_rig in enumerate(world_T_rigs):
+        values.insert(X(f), gtsam.Pose3(world_T_rig))
+    graph.add(gtsam.PriorFactorPose3(X(0), gtsam.Pose3(world_T_rigs[0]), _noise_model(1e-6, 1e-6)))
+    steps = inverse(world_T_rigs[:-1]) @ world_T_rigs[1:]
+    lengths = np.linalg.norm(steps[:, :3, 3], axis=1)
+    typical = float(np.median(lengths)) or 1.0
+    for f, step in enumerate(steps):
+        loose = _noise_model(_UNSEEN_SIGMA_RAD, float(max(lengths[f], typical)))
+        noise = (
+            loose
+            if unseen[f]
+            else _noise_model(np.deg2rad(_STEP_SIGMA_DEG), _STEP_SIGMA_LENGTHS * typical)
+        )
+        graph.add(gtsam.BetweenFactorPose3(X(f), X(f + 1), gtsam.Pose3(step), noise))
+    return graph, values, _noise_model(np.deg2rad(_LOOP_SIGMA_DEG), _LOOP_SIGMA_LENGTHS * typical)
+
+
+def affordable(
+    world_T_rigs: np.ndarray, unseen: np.ndarray, pairs: np.ndarray, f0_T_f1s: np.ndarray
+) -> np.ndarray:
+    """True (L,) for loops that the path can close within the noise of its steps.
+
+    Graduated non-convexity with a truncated quadratic loss on loops only (Yang, Antonante,
+    Tzoumas and Carlone, RA-L 5(2), 2020). A loop to a look-alike place bends verified steps further
+    than many such loops are worth, and is switched off; one that needs normal drift, or moves a
+    step without matches, stays.
+
+    Args:
+        world_T_rigs: (F, 4, 4) poses, accurate from one to the next.
+        unseen: (F - 1,) bool, steps without matches, which give way first.
+        pairs: (L, 2) frames of loops.
+        f0_T_f1s: (L, 4, 4) relative poses by the loops, map units.
+    """
+    graph, values, noise = path(world_T_rigs, unseen)
+    chain = graph.size()
+    for (f0, f1), f0_T_f1 in zip(pairs.tolist(), f0_T_f1s, strict=True):
+        graph.add(gtsam.BetweenFactorPose3(X(f0), X(f1), gtsam.Pose3(f0_T_f1), noise))
+    parameters = gtsam.GncLMParams()
+    parameters.setLossType(gtsam.GncLossType.TLS)
+    parameters.setKnownInliers(list(range(chain)))
+    solver = gtsam.GncLMOptimizer(graph, values, parameters)
+    solver.setInlierCostThresholdsAtProbability(_INLIER_PROBABILITY)
+    solver.optimize()
+    return np.asarray(solver.getWeights())[chain:] > 0.5
+
+
+def _noise_model(rotation: float, translation: float) -> gtsam.noiseModel.Base:
+    return gtsam.noiseModel.Diagonal.Sigmas(np.array([rotation] * 3 + [translation] * 3))
+
+
+@dataclass(frozen=True, slots=True)
+class Loop:
+    """Two frames that observe the same map points, and their relative pose."""
+
+    f0: int
+    f1: int
+    f0_T_f1: np.ndarray  # (4, 4) float64, map units
+    support: int  # number of inliers
+
+
+def bend(solved: Solution, loops: list[Loop], unseen: np.ndarray) -> Solution:
+    """Distribute the residuals of loops over the path, each point with its first frame; steps
+    `unseen` (F - 1,) bool without matches give way first."""
+    poses = solved.world_T_rigs
+    graph, values, noise = path(poses, unseen)
+    cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(2.0)
+    robust = gtsam.noiseModel.Robust.Create(cauchy, noise)
+    for loop in loops:
+        between = gtsam.Pose3(loop.f0_T_f1)
+        graph.add(gtsam.BetweenFactorPose3(X(loop.f0), X(loop.f1), between, robust))
+    result = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+    bent = np.array([result.atPose3(X(f)).matrix() for f in range(len(poses))])
+    landmarks = solved.landmarks.moved(np.ones(len(poses)), bent @ inverse(poses))
+    return Solution(bent, landmarks, solved.noise, ())
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,14 +138,8 @@ class Closed:
 def close(
     context: MatchContext, solved: Solution, unseen: np.ndarray, scratch: Path | None = None
 ) -> Closed:
-    """Find revisited places, and deform the map so that they coincide.
-
-    Args:
-        context: of the run; its strongest features are compared.
-        solved: poses and points, accurate between neighbours.
-        unseen: (F - 1,) bool, steps that no images confirm: their error may be their length.
-        scratch: folder on the disk that takes the global descriptors; None = they are in memory.
-    """
+    """Find revisited places, and deform the map so that they coincide; steps `unseen` (F - 1,) bool
+    may be off by their length. `scratch` takes global descriptors on the disk."""
     settings, keypoints = context.settings, context.keypoints
     num = len(solved.world_T_rigs)
     looks = global_descriptors(context.strongest, num, settings.seed, context.workers, scratch)
@@ -74,7 +152,10 @@ def close(
     within = [loop for loop in loops if within_drift(loop, poses, depth, unseen, settings)]
     agreeing = consistent(within, solved, settings.pairs.window)
     upheld = _not_refuted(context, solved, agreeing)
-    believed = met(upheld, solved, unseen)
+    ends = np.array([(loop.f0, loop.f1) for loop in upheld], np.int32).reshape(-1, 2)
+    steps = np.array([loop.f0_T_f1 for loop in upheld])
+    kept = affordable(poses, unseen, ends, steps) if upheld else np.zeros(0, bool)
+    believed = [loop for loop, stays in zip(upheld, kept, strict=True) if stays]
     counts = Counts(
         len(chosen),
         len(believed),
@@ -87,13 +168,7 @@ def close(
             "bend confirmed steps": len(upheld) - len(believed),
         },
     )
-    pairs = np.array([(loop.f0, loop.f1) for loop in believed], np.int32).reshape(-1, 2)
-    return Closed(bend(solved, believed, unseen) if believed else solved, pairs, counts)
-
-
-def connected(unseen: np.ndarray, pairs: np.ndarray) -> bool:
-    """True if loops (P, 2) connect all parts that steps (F - 1,) without images leave apart."""
-    return parted(pairs, ~unseen) is None
+    return Closed(bend(solved, believed, unseen) if believed else solved, ends[kept], counts)
 
 
 def candidates(
@@ -111,9 +186,7 @@ def candidates(
 
     Args:
         looks: (F, D) global descriptors.
-        solved: poses and points.
         unseen: (F - 1,) bool, steps that no images confirm.
-        settings: of the run.
         held: sparse matrix (F, F) of frames that the map holds together already, which are left
             out; None = none are.
     """
@@ -123,10 +196,31 @@ def candidates(
     unseen_before = np.concatenate([[0], np.cumsum(unseen)])
     least = _least_similarity(looks, solved, unseen_before, settings.pairs.window)
     blocks = list(slices(num, _FRAMES_AT_ONCE))
-    compared = _Compared(looks, positions, drifts, reach, settings.pairs.window // 4, held)
-    each = map_in_threads(
-        lambda n: compared.most_alike(blocks[n]), len(blocks), settings.solver.threads()
-    )
+    apart = settings.pairs.window // 4  # frames along the path that are too near to be compared
+
+    def within_reach(f: int) -> np.ndarray:
+        distance = np.linalg.norm(positions - positions[f], axis=1)
+        chosen = distance < reach + np.abs(drifts - drifts[f])
+        chosen[max(f - apart, 0) : f + apart + 1] = False
+        if held is not None:
+            chosen[held.indices[held.indptr[f] : held.indptr[f + 1]]] = False
+        return np.flatnonzero(chosen)
+
+    def most_alike(block: int) -> list[tuple[int, int, float]]:
+        """Some frames, each with those that look most like it, and how much."""
+        frames, best = blocks[block], []
+        others = [within_reach(f) for f in range(frames.start, frames.stop)]
+        every = np.unique(np.concatenate(others))
+        alike = np.empty((len(every), len(others)), looks.dtype)
+        for some in slices(len(every), _ROWS_AT_ONCE):
+            alike[some] = looks[every[some]] @ looks[frames].T
+        for n, rows in enumerate(others):
+            own = alike[np.searchsorted(every, rows), n]
+            first = np.argsort(-own, kind="stable")[:_NUM_CANDIDATES]
+            best += [(frames.start + n, int(rows[k]), float(own[k])) for k in first]
+        return best
+
+    each = map_in_threads(most_alike, len(blocks), settings.solver.threads())
     found = dict[tuple[int, int], float]()
     for best in each:
         found |= {(min(f, g), max(f, g)): similarity for f, g, similarity in best}
@@ -137,40 +231,6 @@ def candidates(
     if len(seeds):
         kept |= KDTree(seeds).query(pairs, p=np.inf)[0] <= settings.pairs.window
     return pairs[kept]
-
-
-@dataclass(frozen=True, slots=True)
-class _Compared:
-    """Frames that are compared by their looks, each with those within reach of drift."""
-
-    looks: np.ndarray  # (F, D) global descriptors
-    positions: np.ndarray  # (F, 3)
-    drifts: np.ndarray  # (F,) largest error since the first frame, map units
-    reach: float  # map units
-    apart: int  # frames along the path that are too near to be compared
-    held: csr_matrix | None  # (F, F) frames that are left out; None = none are
-
-    def others(self, f: int) -> np.ndarray:
-        """Frames that one is compared with."""
-        distance = np.linalg.norm(self.positions - self.positions[f], axis=1)
-        chosen = distance < self.reach + np.abs(self.drifts - self.drifts[f])
-        chosen[max(f - self.apart, 0) : f + self.apart + 1] = False
-        if self.held is not None:
-            chosen[self.held.indices[self.held.indptr[f] : self.held.indptr[f + 1]]] = False
-        return np.flatnonzero(chosen)
-
-    def most_alike(self, frames: slice) -> list[tuple[int, int, float]]:
-        """Some frames, each with those that look most like it, and how much."""
-        others = [self.others(f) for f in range(frames.start, frames.stop)]
-        every, best = np.unique(np.concatenate(others)), []
-        alike = np.empty((len(every), len(others)), self.looks.dtype)
-        for some in slices(len(every), _ROWS_AT_ONCE):
-            alike[some] = self.looks[every[some]] @ self.looks[frames].T
-        for n, rows in enumerate(others):
-            own = alike[np.searchsorted(every, rows), n]
-            first = np.argsort(-own, kind="stable")[:_NUM_CANDIDATES]
-            best += [(frames.start + n, int(rows[k]), float(own[k])) for k in first]
-        return best
 
 
 def _sharing_points(tracks: Tracks, num_frames: int) -> csr_matrix:
@@ -186,11 +246,7 @@ def _sharing_points(tracks: Tracks, num_frames: int) -> csr_matrix:
 def _least_similarity(
     looks: np.ndarray, solved: Solution, unseen_before: np.ndarray, window: int
 ) -> float:
-    """Similarity of almost all frames that are a quarter to a half of the median depth apart along
-    at most `window` steps, which images confirm; of successive ones where none are.
-
-    `unseen_before` (F,) is the number of steps before each frame that no images confirm.
-    """
+    """Similarity of almost all frames some way apart over confirmed steps, else of successive on"""
     positions, depth = solved.world_T_rigs[:, :3, 3], solved.median_depth()
     near, successive = [np.zeros(0)], np.zeros(0)
     for gap in range(1, min(window, len(positions) - 1) + 1):
@@ -210,15 +266,6 @@ def _least_similarity(
     return float(np.quantile(some, _LEAST_ALIKE_SHARE)) if len(some) else -1.0
 
 
-def _max_drift(
-    f0: int, f1: int, positions: np.ndarray, unseen: np.ndarray, settings: RefineSettings
-) -> float:
-    """Largest error of the map between two frames, map units."""
-    first, last = min(f0, f1), max(f0, f1)
-    between = positions[first : last + 1]
-    return float(_max_step_drifts(between, unseen[first:last], settings).sum())
-
-
 def _max_step_drifts(
     positions: np.ndarray, unseen: np.ndarray, settings: RefineSettings
 ) -> np.ndarray:
@@ -230,32 +277,27 @@ def _max_step_drifts(
 def _measured_loops(
     verified: VerifiedPairs, keypoints: Keypoints, solved: Solution, seed: int
 ) -> list[Loop]:
-    """Loops, measured from map points that both frames of a pair observe."""
     known = solved.points_by_keypoint(keypoints)
     loops = []
     for p, (f0, f1) in enumerate(verified.matches.pairs.tolist()):
         rows = verified.matches.of(p)
         points0, points1 = known[f0][rows[:, 0]], known[f1][rows[:, 1]]
         both = np.isfinite(points0).all(axis=1) & np.isfinite(points1).all(axis=1)
-        measured = relative_map(points0[both], points1[both], seed)
+        measured = relative_similarity(points0[both], points1[both], seed)
         if measured is not None:
-            loops.append(Loop(f0, f1, *measured))
+            step, inliers = measured
+            loops.append(Loop(f0, f1, step.new_T_old, int(inliers.sum())))
     return loops
 
 
 def within_drift(
     loop: Loop, poses: np.ndarray, depth: float, unseen: np.ndarray, settings: RefineSettings
 ) -> bool:
-    """True if a loop needs no more drift than the path between its frames can have.
-
-    Args:
-        loop: the loop.
-        poses: (F, 4, 4) of the map.
-        depth: median distance of points, map units.
-        unseen: (F - 1,) bool, steps that no images confirm.
-        settings: of the run.
-    """
-    slack = _max_drift(loop.f0, loop.f1, poses[:, :3, 3], unseen, settings)
+    """True if a loop needs no more drift than the path (F, 4, 4) between its frames can have, whose
+    steps `unseen` (F - 1,) bool no images confirm; `depth`, the median, in map units."""
+    first, last = min(loop.f0, loop.f1), max(loop.f0, loop.f1)
+    between, steps = poses[first : last + 1, :3, 3], unseen[first:last]
+    slack = float(_max_step_drifts(between, steps, settings).sum())
     expected = poses[loop.f0] @ loop.f0_T_f1
     moved = np.linalg.norm(expected[:3, 3] - poses[loop.f1, :3, 3])
     turned = np.degrees(rotation_angle(expected[:3, :3].T @ poses[loop.f1, :3, :3]))
@@ -264,16 +306,8 @@ def within_drift(
 
 
 def consistent(loops: list[Loop], solved: Solution, window: int) -> list[Loop]:
-    """Loops that agree with others around them and outweigh those that contradict them.
-
-    Two loops between the same stretches of the path agree if a round trip (one loop, along the
-    path, back over the other) leads back to its start.
-
-    Args:
-        loops: all measured loops.
-        solved: the map, accurate over short stretches.
-        window: number of frames over which the map counts as accurate.
-    """
+    """Loops that outweigh those that contradict them, and agree with others within `window` frames:
+    a round trip over both and the path leads back to its start."""
     depth, poses = solved.median_depth(), solved.world_T_rigs
     rivals = [
         [

@@ -1,13 +1,11 @@
 """Map merging: parts of a map that no verified step connects, joined where they overlap.
 
-A pause of the video, a restarted SLAM or frames without texture leave maps with a scale and a
-world of their own. Whole panoramas with similar global descriptors are matched; points that both
-maps know give the similarity between them, accepted if several pairs agree. A single frame without
-a map gets its pose from points of a map. Parts without overlap keep the trajectory's pose where it
-has one, and become maps of their own otherwise.
+Points that both know, of frames that look alike, give the similarity; single frames get their pose
+from points of a map. Parts without overlap keep the trajectory's pose, or become maps of their own.
 """
 
 import logging
+from functools import partial
 from itertools import combinations
 
 import numpy as np
@@ -18,9 +16,9 @@ from gsba.loop_closure.break_crossing import Breaks, agreed, crossing
 from gsba.loop_closure.connectivity import MIN_MAP_FRAMES, by_size
 from gsba.loop_closure.join_evidence import GATE_RAD, Places, Rates
 from gsba.loop_closure.join_test import JoinTest, Judged
+from gsba.loop_closure.loops import Loop
 from gsba.loop_closure.map_similarity import Meeting, Proposal, propose
 from gsba.loop_closure.merged_map import Registered, carried, laid_out
-from gsba.loop_closure.pose_graph import Loop
 from gsba.loop_closure.registration import RegisteredFrame, resect
 from gsba.loop_closure.retrieval import global_descriptors
 from gsba.matching import pairs, recovery
@@ -57,8 +55,6 @@ def merge(
     """Join the parts of a map where they overlap, and register single frames.
 
     Args:
-        context: features and settings of the run.
-        solved: poses and points, consistent within every part.
         parts: (F,) int, see `gsba.loop_closure.connectivity.parted`.
         held: (F - 1,) bool, steps without matches whose pose the trajectory gives.
         seen: (F - 1,) bool, steps verified by images: they tie frames with too few points.
@@ -105,8 +101,10 @@ class _Joining:
         known = solved.points_by_keypoint(context.keypoints)
         self.own_known = [known[f] for f in range(num)]  # rig frames, units of their parts
         self.known = list(self.own_known)  # in the map's unit once moved there
+        places = Places(solved.world_T_rigs, self.own_known)
+        usual = partial(join_evidence.rates, context, places, parts)  # within the original parts
         self.test = JoinTest(
-            context, self.poses, self.known, self.depth, recordings, self._usual_rates
+            context, self.poses, self.known, self.depth, recordings, lambda rows: usual(chosen=rows)
         )
         self.usual_anywhere: Rates | None = None
         self.min_testable = min_testable  # frames of a map that joins can be tested by
@@ -224,15 +222,17 @@ class _Joining:
         return np.array(sorted(found), np.int32).reshape(-1, 2)
 
     def _similarity(self, part: int, rows: np.ndarray, inside: np.ndarray) -> Sim3 | None:
-        """The similarity that moves a part to where it overlaps the map; None if none is
-        certain."""
+        """The similarity that moves a part to where it overlaps the map; None = uncertain."""
         if len(inside) < self.min_testable and not self._is_held_by_trajectory(rows):
             self.reasons[part] = f"a map of {len(inside)} frames is too small to test a join"
             return None
         # Beside the first map there may be many: only what looks most like them is searched.
         first = self.current == 0 and self.components[rows[0]] < 0
-        if not first and not self._looks_like(rows, inside):
-            return self._over_break(part, rows, inside)
+        if not first:
+            others = np.setdiff1d(np.arange(len(self.parts)), rows)
+            nearest = np.argmax(self.looks[rows] @ self.looks[others].T, axis=1)
+            if not np.isin(others[nearest], inside).any():
+                return self._over_break(part, rows, inside)
         sampled = np.linspace(0, len(rows) - 1, _NUM_SAMPLED_FRAMES).astype(int)
         sampled = rows[
             np.unique([*sampled, *range(_BREAK_REACH_FRAMES), *range(-_BREAK_REACH_FRAMES, 0)])
@@ -246,17 +246,10 @@ class _Joining:
             found = self._best(part, meetings, rows, inside)
         return found or self._over_break(part, rows, inside)
 
-    def _looks_like(self, rows: np.ndarray, inside: np.ndarray) -> bool:
-        """True if a frame of a part looks more like one of the map than like any other."""
-        others = np.setdiff1d(np.arange(len(self.parts)), rows)
-        nearest = np.argmax(self.looks[rows] @ self.looks[others].T, axis=1)
-        return bool(np.isin(others[nearest], inside).any())
-
     def _best(
         self, part: int, meetings: list[Meeting], rows: np.ndarray, inside: np.ndarray
     ) -> Sim3 | None:
-        """The similarity that the surroundings of both parts confirm, unless they confirm a rival
-        too."""
+        """The similarity that surroundings confirm, unless they confirm a rival too."""
         weighed: list[Judged] = []
         for proposal in propose(meetings, self.poses, self.depth, self.context.settings.seed):
             if self._is_held_by_trajectory(rows) and not self._plausible(proposal):
@@ -268,7 +261,9 @@ class _Joining:
             self.reasons[part] = "no frame of it shares enough points with a frame of another map"
             return None
         accepted = [one for one in weighed if one.evidence.confirmed]
-        accepted = accepted or self._following(weighed, rows, inside)
+        if not accepted:  # of the likely ones, look-alikes are elsewhere or turned about at breaks
+            on = self._breaks(rows, inside).continued_by
+            accepted = [one for one in weighed if one.evidence.likely and on(one.proposal.move)]
         best = max(accepted or weighed, key=lambda one: one.evidence.margin())
         frames, why = best.proposal.frames, best.evidence
         logger.info("a part of %d frames overlaps the map at frames %s: %s", len(rows), frames, why)
@@ -277,19 +272,8 @@ class _Joining:
         self.reasons[part] = "it fits two places" if accepted else f"not certain: {why}"
         return None
 
-    def _following(
-        self, weighed: list[Judged], rows: np.ndarray, inside: np.ndarray
-    ) -> list[Judged]:
-        """Likely proposals that let the camera walk on at each break between a part and the map:
-        look-alikes are elsewhere, or turned about."""
-        breaks = self._breaks(rows, inside)
-        return [
-            one for one in weighed if one.evidence.likely and breaks.continued_by(one.proposal.move)
-        ]
-
     def _at_pace(self, found: Judged, rows: np.ndarray, inside: np.ndarray) -> Judged:
-        """The proposal found; or where it lets the camera walk on at an unusual pace, one that
-        continues the map at the usual pace, unless its surroundings speak against that."""
+        """The proposal found, or one at the usual pace unless its surroundings speak against it."""
         breaks = self._breaks(rows, inside)
         held = self._is_held_by_trajectory(rows)  # which knows more than the pace
         if held or not breaks.steps or breaks.continued_by(found.proposal.move):
@@ -324,12 +308,10 @@ class _Joining:
         return sorted(((int(f), int(g)) for f, g in near), key=min)
 
     def _over_break(self, part: int, rows: np.ndarray, inside: np.ndarray) -> Sim3 | None:
-        """The similarity that several pairs of frames across a short break or pause agree on; None
-        if the part is not next to the map in time, or its surroundings speak against it.
+        """The similarity on which pairs of frames across a short break or pause agree, or None.
 
-        A camera that walks on cannot have moved far in between. A bay of a hall can be as near as
-        the next one is, though: what the surroundings do not confirm must continue the map at its
-        pace.
+        A camera that walks on cannot have moved far in between, but a bay of a hall can be as near:
+        what the surroundings do not confirm must continue the map at its pace.
         """
         for outer, inner in self._next_in_time(rows, inside, _MAX_PAUSE_INTERVALS):
             earlier, later = (rows, inside) if outer < inner else (inside, rows)
@@ -360,8 +342,7 @@ class _Joining:
         return None
 
     def _is_level(self, rows: np.ndarray, inside: np.ndarray, move: Sim3) -> bool:
-        """True if a part would stand upright on the map, within the spread of its frames'
-        verticals: on its own recording's frames, if there are any."""
+        """True if a part stands upright on the map, within the spread of the frames' verticals."""
         own = inside[np.isin(self.recordings[inside], self.recordings[rows])]
         limit = _MAX_TILT_RAD if len(own) else _MAX_TILT_BETWEEN_RAD
         inside = own if len(own) else inside
@@ -373,14 +354,8 @@ class _Joining:
         ]
         return bool(angles_between(means[0], means[1]) < limit + 3 * np.hypot(*spreads))
 
-    def _usual_rates(self, chosen: np.ndarray) -> Rates:
-        """Rates at which points of frames (F,) bool are found again within the original parts."""
-        places = Places(self.solved.world_T_rigs, self.own_known)
-        return join_evidence.rates(self.context, places, self.parts, chosen=chosen)
-
     def _meetings(self, context: MatchContext, chosen: np.ndarray) -> list[Meeting]:
-        """Matched points that both frames of pairs (P, 2) know, one outside and one inside the
-        map."""
+        """Matched points that both frames of pairs (P, 2) know, one of them outside the map."""
         verified = recovery.match_anywhere(context, np.sort(chosen, axis=1), rivals=False)
         return self.test.meetings(verified.matches, chosen[:, 0])
 
@@ -413,26 +388,19 @@ class _Joining:
         even = abs(np.log(proposal.move.scale)) < np.log(settings.verify.max_length_ratio)
         return even and loops.within_drift(loop, poses, self.depth, self.held, settings)
 
-    def _is_of_map(self, f: int) -> bool:
-        """True if the map holds frames of a frame's recording.
-
-        A picture that hangs in two places gives a single frame a pose in either. Between frames of
-        one recording time and path decide; between recordings only the test of joins can.
-        """
-        return bool((self.recordings[self.components == self.current] == self.recordings[f]).any())
-
     def _register_each(self, rows: np.ndarray, inside: np.ndarray) -> bool:
-        """True if any of some frames gets a pose from points of the map. Those next to the map in
-        time come first: the others walk on from them."""
+        """True if any frame gets a pose from points of the map; those next to it come first."""
         num, away = len(inside), np.abs(rows[:, None] - inside).min(axis=1)
         for f in rows[np.argsort(away, kind="stable")].tolist():
-            if self._is_of_map(f) and self._register(f, inside):
+            # A picture that hangs in two places gives a single frame a pose in either. Between
+            # frames of one recording time and path decide; between recordings, the test of joins.
+            of_map = self.recordings[self.components == self.current] == self.recordings[f]
+            if of_map.any() and self._register(f, inside):
                 inside = np.sort(np.append(inside, f))
         return len(inside) > num
 
     def _register(self, f: int, inside: np.ndarray) -> bool:
-        """True if a single frame gets an accepted pose from points of the map; the map then holds
-        it."""
+        """True if a single frame gets an accepted pose from points of the map, and joins it."""
         chosen = self._candidates(np.array([f]), inside, 2 * _NUM_CANDIDATES)
         for strongest in (True, False):
             found = self._resected(f, *self._sightings(f, chosen, strongest))
@@ -458,8 +426,7 @@ class _Joining:
         return found
 
     def _resected_at_pace(self, f: int, inside: np.ndarray, found: np.ndarray) -> np.ndarray | None:
-        """The pose (4, 4) found of a frame; or where the camera would walk on to it at an unusual
-        pace, one at the usual pace. None if there is none, and steps to it or from it are wide."""
+        """The pose (4, 4) found, or one at the usual pace; None if wide steps leave both unsure."""
         rows, move = np.array([f]), self._move_of(f, found)
         breaks = self._breaks(rows, inside)
         if breaks.continued_by(move) or self._is_held_by_trajectory(rows):
@@ -483,13 +450,13 @@ class _Joining:
         return best
 
     def _move_of(self, f: int, world_T_rig: np.ndarray) -> Sim3:
-        """The similarity that carries a single frame to a pose (4, 4)."""
         return Sim3.of(1.0, world_T_rig @ inverse(self.poses[f]))
 
     def _shows_map(self, f: int, inside: np.ndarray, world_T_rig: np.ndarray) -> bool:
-        """True unless a single frame shows next to nothing of the map around it: a look-alike
-        poster brings no surroundings. One that is not next to the map in time must show as much as
-        a place of the map does: a look-alike bay brings some."""
+        """True unless a frame shows next to nothing of the map around, as at a look-alike poster.
+
+        One that is not next to the map in time must show as much as a place of the map does.
+        """
         poses = self.poses.copy()
         poses[f] = world_T_rig
         if self.usual_anywhere is None:
@@ -512,8 +479,7 @@ class _Joining:
         return _each_once(*self._points_seen(found, 0), self.depth)
 
     def _points_seen(self, matches: Matches, column: int) -> tuple[np.ndarray, np.ndarray]:
-        """Keypoints (m,) of the frame in one column of all pairs, and points (m, 3) of the map that
-        the other frames' matched keypoints observe."""
+        """Keypoints (m,) of the frame in one column, and points (m, 3) that others observe."""
         rows, points = [np.zeros(0, np.int32)], [np.zeros((0, 3))]
         for p, pair in enumerate(matches.pairs.tolist()):
             matched, g = matches.of(p), pair[1 - column]
@@ -524,8 +490,7 @@ class _Joining:
         return np.concatenate(rows), np.concatenate(points)
 
     def _in_reach(self, f: int, world_T_rig: np.ndarray) -> bool:
-        """True if a frame is no further from its neighbours in time than the camera can have
-        moved."""
+        """True if a frame is within reach of its neighbours in time."""
         inside = np.flatnonzero(self.components == self.current)
         lengths = np.linalg.norm(np.diff(self.poses[inside, :3, 3], axis=0), axis=1)
         pace = float(np.median(lengths / np.diff(self.times[inside])))
@@ -539,10 +504,8 @@ class _Joining:
         return True
 
     def result(self) -> Registered:
-        """The map in its current state, each map in the world of its earliest part.
-
-        A frame in no map is placed beside the one before it.
-        """
+        """The map as it is, each in the world of its earliest part; lost frames beside the one
+        before."""
         self._keep_earliest_worlds()
         lost, maps = self.components < 0, int(self.components.max()) + 1
         for n, f in enumerate(np.flatnonzero(lost).tolist()):
@@ -554,13 +517,15 @@ class _Joining:
         reasons = self._reasons(order := by_size(self.components))
         reach = self.context.settings.pairs.max_baseline_depths * self.depth
         offsets = laid_out(self.poses[:, :3, 3], order, reach)
+        poses = self.poses.copy()
+        poses[:, :3, 3] += offsets
         scales = np.array([move.scale for move in self.moves])
         moves = np.array([move.new_T_old for move in self.moves])
         num, alone = int(self.parts.max()) + 1, int(lost.sum())
         dropped = {"frames alone": alone, "apart": maps - 1}
         kept = num - maps - alone
         return Registered(
-            carried(self.solved, self.poses, scales, moves, offsets),
+            carried(self.solved, poses, scales, moves, offsets),
             order.astype(np.int32),
             scales,
             moves,
@@ -583,8 +548,7 @@ class _Joining:
                 self.moves[f] = back.after(self.moves[f])
 
     def _reasons(self, order: np.ndarray) -> tuple[str, ...]:
-        """Reason why each map (order: (F,) number of each frame's) was not joined to a larger
-        one."""
+        """Why each map, by each frame's number (F,), was not joined to a larger one."""
         first = np.unique(order, return_index=True)[1]
         return tuple(
             "" if f == first[0] else self.reasons.get(int(self.parts[f]), "") for f in first

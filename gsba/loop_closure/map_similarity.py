@@ -1,6 +1,6 @@
 """Similarities of two maps, proposed by matched frames, and their refinement."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -41,14 +41,8 @@ def meetings_of(
     outside: np.ndarray,
     f0_T_f1s: np.ndarray | None = None,
 ) -> list[Meeting]:
-    """Matched points that both frames of pairs know, one of them among those outside.
-
-    Args:
-        known: (F) of (K_f, 3): points of keypoints, rig frames; NaN = unknown.
-        matches: matches of P pairs.
-        outside: frames (N,) outside the map.
-        f0_T_f1s: (P, 4, 4) relative poses by bearings, their translations of any length.
-    """
+    """Matched points, as known (F) of (K_f, 3), rig frames, NaN = unknown, to both frames of pairs,
+    one of them `outside` (N,); with relative poses (P, 4, 4) by bearings, of any length."""
     found = []
     for p, (f0, f1) in enumerate(matches.pairs.tolist()):
         matched = matches.of(p)
@@ -73,16 +67,9 @@ class Proposal:
 
 
 def propose(meetings: list[Meeting], poses: np.ndarray, depth: float, seed: int) -> list[Proposal]:
-    """Similarities given by pairs of frames, those with the most inliers first.
-
-    Where no pair shares enough points, each counts those of the pairs beside it, too.
-
-    Args:
-        meetings: meetings of frames outside and inside the map.
-        poses: (F, 4, 4) each in its own map.
-        depth: median distance of points, units of the map.
-        seed: of the sampling.
-    """
+    """Similarities given by pairs of frames, the most inliers first; where no pair shares enough
+    points, each counts those of the pairs beside it, too. Poses (F, 4, 4) are each in its own
+    map."""
     found = _proposed(meetings, meetings, poses, seed)
     if not found:
         found = _proposed([_pooled(m, meetings, poses) for m in meetings], meetings, poses, seed)
@@ -137,12 +124,7 @@ def _pooled(meeting: Meeting, meetings: list[Meeting], poses: np.ndarray) -> Mee
 
 
 def carrying(g_T_f: Sim3, world_T_f: np.ndarray, world_T_g: np.ndarray) -> Sim3:
-    """The similarity that moves the world of rig f into that of rig g.
-
-    Args:
-        g_T_f: rig f in rig g, with its unit.
-        world_T_f, world_T_g: (4, 4) poses of both, each in the world of its map.
-    """
+    """The similarity that moves the world of rig f into that of rig g, by poses (4, 4) in these."""
     f_T_own = inverse(world_T_f)
     f_T_own[:3, 3] *= g_T_f.scale
     return Sim3.of(g_T_f.scale, world_T_g @ g_T_f.new_T_old @ f_T_own)
@@ -172,14 +154,8 @@ def _inliers_of(meetings: list[Meeting], move: Sim3, poses: np.ndarray) -> list[
 def alike(
     one: Proposal, other: Proposal, poses: np.ndarray, depth: float, slack: float = 1.0
 ) -> bool:
-    """True if two proposals move the frames of both to the same poses.
-
-    Args:
-        one, other: the proposals.
-        poses: (F, 4, 4), each frame's in its own map.
-        depth: median distance of points, map units.
-        slack: tolerance, in typical differences of two estimates of one similarity.
-    """
+    """True if two proposals move the frames of both, poses (F, 4, 4) each in its own map, to the
+    same poses; `depth` in map units, `slack` in typical differences of two estimates."""
     frames = poses[[one.frames[0], other.frames[0]]]
     off, turned, stretched = difference(one.move, other.move, frames)
     near = off < slack * AGREE * max(depth, 1e-12)
@@ -197,18 +173,13 @@ def difference(one: Sim3, other: Sim3, poses: np.ndarray) -> tuple[float, float,
 
 
 def refined(meetings: list[Meeting], start: Sim3, poses: np.ndarray) -> Sim3:
-    """The similarity that minimises bearing residuals of all meetings, in both directions.
-
-    Args:
-        meetings: meetings whose points largely agree with `start`.
-        start: similarity to start from; points that it does not map onto one another are left out.
-        poses: (F, 4, 4) each in its own map.
-    """
+    """The similarity that minimises bearing residuals of meetings in both directions, from `start`
+    on; points that it does not map onto one another are left out."""
     from scipy.optimize import least_squares
 
-    shared = _SharedPoints.of(_inliers_of(meetings, start, poses), poses)
+    residuals = _residuals_of(_inliers_of(meetings, start, poses), poses)
     given = {"loss": "soft_l1", "f_scale": np.deg2rad(_LOSS_DEG)}
-    x = least_squares(lambda x: shared.residuals(nudged(start, x)).ravel(), np.zeros(7), **given).x
+    x = least_squares(lambda x: residuals(nudged(start, x)).ravel(), np.zeros(7), **given).x
     return nudged(start, x)
 
 
@@ -217,20 +188,16 @@ def similarity_covariance(meetings: list[Meeting], move: Sim3, poses: np.ndarray
 
     Points of one meeting have common errors: residuals count as correlated within a meeting, and
     as independent between meetings (Liang and Zeger, Biometrika 73(1), 1986).
-
-    Args:
-        meetings, poses: those that it was found from.
-        move: the similarity.
     """
     step, every = 1e-6, _inliers_of(meetings, move, poses)
     normal, scores = np.zeros((7, 7)), np.zeros((7, 7))
     for meeting in every:
-        shared = _SharedPoints.of([meeting], poses)
-        found = shared.residuals(move)
+        residuals = _residuals_of([meeting], poses)
+        found = residuals(move)
         if not len(found):
             continue
         columns = [
-            (shared.residuals(nudged(move, x)) - shared.residuals(nudged(move, -x))) / (2 * step)
+            (residuals(nudged(move, x)) - residuals(nudged(move, -x))) / (2 * step)
             for x in step * np.eye(7)
         ]
         jacobian = np.stack([column.ravel() for column in columns], axis=1)
@@ -253,30 +220,18 @@ def nudged(move: Sim3, x: np.ndarray) -> Sim3:
     return Sim3(move.scale * float(np.exp(x[6])), rotation, move.translation + x[3:6])
 
 
-@dataclass(frozen=True, slots=True)
-class _SharedPoints:
-    """Points that two maps share, and the positions of the frames that know them."""
+def _residuals_of(meetings: list[Meeting], poses: np.ndarray) -> Callable[[Sim3], np.ndarray]:
+    """Differences (2 N, 3) of bearings of meetings' points in both directions, by similarity."""
+    own_seers, own = _in_world(poses, [(m.f, m.own) for m in meetings])
+    their_seers, theirs = _in_world(poses, [(m.g, m.theirs) for m in meetings])
 
-    own: np.ndarray  # (N, 3) world of the map that moves
-    own_seers: np.ndarray  # (N, 3)
-    theirs: np.ndarray  # (N, 3) world of the other map
-    their_seers: np.ndarray  # (N, 3)
-
-    @classmethod
-    def of(cls, meetings: list[Meeting], poses: np.ndarray) -> "_SharedPoints":
-        columns: list[list[np.ndarray]] = [[np.zeros((0, 3))] for _ in range(4)]
-        for m in meetings:
-            for n, (seer, seen) in enumerate(((m.f, m.own), (m.g, m.theirs))):
-                columns[2 * n].append(seen @ poses[seer, :3, :3].T + poses[seer, :3, 3])
-                columns[2 * n + 1].append(np.tile(poses[seer, :3, 3], (len(seen), 1)))
-        return cls(*(np.concatenate(column) for column in columns))
-
-    def residuals(self, move: Sim3) -> np.ndarray:
-        """Differences (2 N, 3) of bearings, in both directions."""
-        there, back = move.points(self.own), move.points_back(self.theirs)
-        seen = _bearings(there, self.their_seers) - _bearings(self.theirs, self.their_seers)
-        sent = _bearings(back, self.own_seers) - _bearings(self.own, self.own_seers)
+    def residuals(move: Sim3) -> np.ndarray:
+        there, back = move.points(own), move.points_back(theirs)
+        seen = _bearings(there, their_seers) - _bearings(theirs, their_seers)
+        sent = _bearings(back, own_seers) - _bearings(own, own_seers)
         return np.concatenate([seen, sent])
+
+    return residuals
 
 
 def _bearings(points: np.ndarray, seers: np.ndarray) -> np.ndarray:

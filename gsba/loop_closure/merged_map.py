@@ -40,28 +40,16 @@ def carried(
     moves: np.ndarray,
     offsets: np.ndarray,
 ) -> Solution:
-    """A map whose frames were moved; each point moves with its first frame.
-
-    Args:
-        solved: the map before.
-        world_T_rigs: (F, 4, 4) poses after.
-        scales, moves, offsets: see `Registered`.
-    """
+    """A map with poses (F, 4, 4) after moves, see `Registered`; points move with first frames."""
     landmarks = solved.landmarks.moved(scales, moves)
     points = landmarks.points_world + offsets[landmarks.tracks.hosts()]
-    poses = world_T_rigs.copy()
-    poses[:, :3, 3] += offsets
-    return replace(solved, world_T_rigs=poses, landmarks=replace(landmarks, points_world=points))
+    landmarks = replace(landmarks, points_world=points)
+    return replace(solved, world_T_rigs=world_T_rigs, landmarks=landmarks)
 
 
 def laid_out(positions: np.ndarray, components: np.ndarray, reach: float) -> np.ndarray:
-    """Offsets (F, 3) that separate maps: no frame of one is near a point of another.
-
-    Args:
-        positions: (F, 3) of the frames, each in its map.
-        components: (F,) int, map of each frame.
-        reach: largest distance of points from frames, map units.
-    """
+    """Offsets (F, 3) to positions (F, 3) by which maps (F,) lie apart: no frame is within `reach`,
+    map units, of a point of another."""
     offsets = np.zeros((len(components), 3))
     groups = [components == c for c in range(int(components.max()) + 1)]
     extent = max(float(np.linalg.norm(np.ptp(positions[group], axis=0))) for group in groups)
@@ -70,14 +58,6 @@ def laid_out(positions: np.ndarray, components: np.ndarray, reach: float) -> np.
         offsets[group] = positions[groups[0]].mean(axis=0) + away
         offsets[group] -= positions[group].mean(axis=0)
     return offsets
-
-
-def side_by_side(world_T_rigs: np.ndarray, registered: Registered | None) -> np.ndarray:
-    """Poses (F, 4, 4) with each map's offset to lie beside the others."""
-    poses = world_T_rigs.copy()
-    if registered is not None:
-        poses[:, :3, 3] += registered.offsets
-    return poses
 
 
 def follow(

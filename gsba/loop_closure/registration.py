@@ -28,17 +28,8 @@ class RegisteredFrame:
 def resect(
     bearings: np.ndarray, points_world: np.ndarray, settings: TwoViewLimits, seed: int
 ) -> RegisteredFrame | None:
-    """Absolute pose from bearings of points, and its acceptance.
-
-    Args:
-        bearings: (m, 3) unit, rig frame.
-        points_world: (m, 3) candidate point of each bearing, map units; many may be wrong.
-        settings: inlier threshold and count.
-        seed: of the sampling.
-
-    Returns:
-        None if no pose has enough inliers.
-    """
+    """Absolute pose by unit bearings (m, 3), rig frame, of candidate points (m, 3), map units, many
+    of which may be wrong, and its acceptance; None if no pose has enough inliers."""
     max_error = np.deg2rad(settings.max_error_deg)
     found = panorama_pose(bearings, points_world, max_error, seed, _MIN_INLIERS)
     if found is None:

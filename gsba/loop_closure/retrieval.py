@@ -1,8 +1,5 @@
-"""Place recognition by global descriptors of panoramas, invariant to heading.
-
-Frames are compared by vectors of locally aggregated descriptors (VLAD: Jegou et al., CVPR 2010;
-normalised word by word as in Arandjelovic and Zisserman, CVPR 2013) over whole panoramas.
-"""
+"""Place recognition by global descriptors of panoramas, invariant to heading: VLAD (Jegou et al.,
+CVPR 2010), normalised word by word (Arandjelovic and Zisserman, CVPR 2013)."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -30,15 +27,8 @@ def global_descriptors(
     workers: Workers,
     scratch: Path | None = None,
 ) -> np.ndarray:
-    """Global descriptors (F, D) float32 of all panoramas, of unit length, invariant to heading.
-
-    Args:
-        frames: the panoramas' features.
-        num_frames: F.
-        seed: of the sample that the visual words are made of.
-        workers: threads or processes that run it.
-        scratch: folder on the disk that takes the descriptors; None = they are in memory.
-    """
+    """Global descriptors (F, D) float32 of panoramas, of unit length, invariant to heading; on the
+    disk in the folder `scratch`, None = in memory."""
     words, everyone = visual_words(frames, num_frames, seed, workers), np.arange(num_frames)
     job = _DescriptorJob("looks", frames, everyone, partial(_descriptor_of, words=words))
     looks = ((look[None].astype(np.float32),) for look in workers.map_shards(job))
@@ -87,7 +77,6 @@ def _sampled_descriptors(descriptors: np.ndarray, frame: int, share: int, seed: 
 
 
 def _descriptor_of(descriptors: np.ndarray, _frame: int, words: np.ndarray) -> np.ndarray:
-    """The global descriptor of a frame."""
     return aggregate(descriptors, words)
 
 

@@ -9,8 +9,8 @@ from gsba.loop_closure import join_evidence, loops
 from gsba.loop_closure.join_evidence import LOCAL, around
 from gsba.loop_closure.join_evidence import Places as KnownPlaces
 from gsba.loop_closure.join_test import JoinTest, Judged
+from gsba.loop_closure.loops import Loop
 from gsba.loop_closure.map_similarity import Meeting, Proposal, propose
-from gsba.loop_closure.pose_graph import Loop
 from gsba.loop_closure.retrieval import global_descriptors
 from gsba.matching import recovery
 from gsba.odometry.places import KeyframePlaces

@@ -5,8 +5,7 @@ Gives the poses and points that `gsba.bundle.optimizer.optimize` finds undivided
 """
 
 from gsba.parts.adjustments import DividedAdjustments
-from gsba.parts.covariances import divided_covariances
-from gsba.parts.divided_system import optimize_divided
+from gsba.parts.divided_system import divided_covariances, optimize_divided
 from gsba.parts.folder import PartsWriter
 
 __all__ = ["DividedAdjustments", "PartsWriter", "divided_covariances", "optimize_divided"]

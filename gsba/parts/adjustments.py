@@ -11,8 +11,7 @@ from gsba.bundle.division import DivisibleMap
 from gsba.bundle.optimizer import OptimizeResult
 from gsba.config import SolverSettings
 from gsba.memory import give_back_freed_memory, total_memory_bytes
-from gsba.parts.covariances import divided_covariances
-from gsba.parts.divided_system import optimize_divided
+from gsba.parts.divided_system import divided_covariances, optimize_divided
 from gsba.parts.folder import (
     At,
     PartsWriter,
@@ -109,8 +108,7 @@ class DividedAdjustments:
         return _FRAMES if big else None
 
     def _digest(self, map_: DivisibleMap, most: int, purpose: str) -> str | None:
-        """Name of a map's folder, by all that its solution depends on; None = files cannot hold
-        it."""
+        """Name of a map's folder by all that its solution depends on; None = not storable."""
         parts = [__version__, purpose, most, map_.num_frames, map_.loss]
         frames = range(map_.num_frames)
         parts.append(content_digest(At.of(map_.values, frames, keys_beside(map_.values))))
@@ -156,7 +154,6 @@ class DividedAdjustments:
 
 
 def _pieces(graph: gtsam.NonlinearFactorGraph) -> list[gtsam.NonlinearFactorGraph]:
-    """A graph in pieces of a few factors."""
     pieces = []
     for first in range(0, graph.size(), _FACTORS_AT_ONCE):
         piece = gtsam.NonlinearFactorGraph()

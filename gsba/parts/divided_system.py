@@ -7,6 +7,7 @@ from typing import TypeVar
 
 import gtsam
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from factors import RobustLoss
 from factors.cholesky import DIM, BlockCholesky
@@ -15,7 +16,7 @@ from gsba.bundle.family_variables import kept
 from gsba.bundle.optimizer import OptimizeResult, minimize
 from gsba.bundle.pose_variables import X
 from gsba.config import SolverSettings
-from gsba.parts.folder import At, Index, Part, load, load_index, load_part
+from gsba.parts.folder import At, Index, load, load_index, load_part
 from gsba.parts.jobs import (
     Covariances,
     Eliminate,
@@ -29,7 +30,7 @@ from gsba.parts.jobs import (
 )
 from gsba.store.records import save_record
 from gsba.store.shards import Job, Workers
-from gsba.types import Iteration
+from gsba.types import Iteration, JointErrors
 
 R = TypeVar("R")
 
@@ -45,18 +46,6 @@ class SolverState:
     damping: float  # of the next attempt
 
 
-@dataclass(frozen=True, slots=True)
-class _Variables:
-    """Variables of a part, without what it owns."""
-
-    frames: np.ndarray  # (N,) int32, frames of the map
-    beside: list[int]  # keys of its other variables
-
-    @classmethod
-    def of(cls, part: Part) -> "_Variables":
-        return cls(part.frames, part.beside)
-
-
 class DividedSystem:
     """Normal equations of a map in parts: what a part owns is eliminated where it lies.
 
@@ -66,8 +55,6 @@ class DividedSystem:
 
     Args:
         folder: of the map, from `folder.PartsWriter`.
-        workers: who computes the parts.
-        loss: robust loss of the observations.
         scratch: folder of the workers' own files, emptied after each pass; None = they have none.
 
     Attributes:
@@ -92,18 +79,15 @@ class DividedSystem:
         self.num_frames = len(index.start.poses)
         self._beside = index.start.beside.keys.tolist()
         self.nodes = [index.nodes_of(p) for p in range(len(index.num_kept))]
-        self._variables = [_Variables.of(load_part(folder, p)) for p in range(len(self.nodes))]
-        self._set_dims(self.start.at.values(range(self.num_frames)))
+        parts = (load_part(folder, p) for p in range(len(self.nodes)))
+        self._variables = [(part.frames, part.beside) for part in parts]  # of each, not its points
+        dims = self.start.at.values(range(self.num_frames)).dims()
+        self._dims = [dims[key] for key in self._beside]  # of variables that are no frames
+        firsts = np.cumsum([self.num_frames, *(-(-dim // DIM) for dim in self._dims)])
+        self._firsts, self._num_nodes = firsts[:-1].tolist(), int(firsts[-1])
         self._set_cuts(index)
         self._tentative: list[Linearized] = []
         self._linearized: list[Linearized] = []
-
-    def _set_dims(self, values: gtsam.Values) -> None:
-        """Note the nodes of variables that are no frames."""
-        dims = values.dims()
-        self._dims = [dims[key] for key in self._beside]
-        firsts = np.cumsum([self.num_frames, *(-(-dim // DIM) for dim in self._dims)])
-        self._firsts, self._num_nodes = firsts[:-1].tolist(), int(firsts[-1])
 
     def _set_cuts(self, index: Index) -> None:
         """Fix the pattern of the nodes on cuts."""
@@ -142,26 +126,21 @@ class DividedSystem:
             self._predicted = 0.5 * float((there * (added * there - raw)).sum())
         kept = tuple(steps[self.cut_nodes[rows]] for rows in self.kept)
         job = Substitute(self._folder, self._all, self._version, damping, kept)
-        for p, found in enumerate(self._workers.map_shards(job)):
+        for p, (own, predicted) in enumerate(self._workers.map_shards(job)):
             nodes = self.nodes[p]
-            steps[nodes[: len(nodes) - len(self.kept[p])]] = found.steps
-            self._predicted += found.predicted
+            steps[nodes[: len(nodes) - len(self.kept[p])]] = own
+            self._predicted += predicted
         self._clear()
         return steps if np.all(np.isfinite(steps)) else None
 
     def _factorized(self, damping: float) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """Eliminate the parts, and factorize what is left; None if singular.
-
-        Returns:
-            Of the nodes on cuts, (C, 6) each: what was added to the diagonal, the gradient with the
-            parts eliminated, and as it was.
-        """
+        """Addition to the diagonal, gradients without and with parts, (C, 6); None = singular."""
         num, pairs = len(self.cut_nodes), len(self._codes)
         diagonal, undamped = np.zeros((2, num, DIM, DIM))
         off_diagonal, gradient, raw = np.zeros((pairs, DIM, DIM)), *np.zeros((2, num, DIM))
         job = Eliminate(self._folder, self._all, self._version, damping)
-        for p, reduced in enumerate(self._workers.map_shards(job)):
-            rows, condensed = self.kept[p], reduced.condensed
+        for p, condensed in enumerate(self._workers.map_shards(job)):
+            rows = self.kept[p]
             if condensed is None:
                 return None
             i, j = np.triu_indices(len(rows), 1)
@@ -189,8 +168,6 @@ class DividedSystem:
 
         Args:
             pairs: (Q, 2) nodes that the writer was to tie.
-            num_draws: number of draws, D.
-            seed: of the draws.
 
         Returns:
             (N, 6, 6) diagonal blocks, (Q, 6, 6) blocks between the pairs, and vectors (D, N, 6)
@@ -213,11 +190,7 @@ class DividedSystem:
         job = Covariances(self._folder, self._all, self._version, inside, seed)
         for p, found in enumerate(self._workers.map_shards(job)):
             nodes = self.nodes[p][: own[p]]
-            inverse[nodes], drawn[:, nodes], between[asked[p]] = (
-                found.inverse,
-                found.drawn,
-                found.between,
-            )
+            inverse[nodes], between[asked[p]], drawn[:, nodes] = found
         self._clear()
         between[np.isnan(inverse[pairs]).any(axis=(1, 2, 3))] = np.nan
         return inverse, between, drawn
@@ -273,12 +246,12 @@ class DividedSystem:
             self._latest,
             before,
             self._of_parts(values),
-            tuple(steps[part.frames] for part in self._variables),
+            tuple(steps[frames] for frames, _ in self._variables),
             self._loss,
         )
         moved = self._results(job)
-        self._tentative = [part.linearized for part in moved]
-        return sum(part.cost for part in moved)
+        self._tentative = [linearized for _, linearized in moved]
+        return sum(cost for cost, _ in moved)
 
     def predicted_decrease(self) -> float:
         """See `gsba.bundle.optimizer.System`."""
@@ -310,11 +283,10 @@ class DividedSystem:
         return At.of(values, range(self.num_frames), self._beside)
 
     def _of_parts(self, values: gtsam.Values) -> tuple[At, ...]:
-        """Variables of each part."""
         poses, nothing = self._of(values).poses, At.of(values, (), ()).beside
         return tuple(
-            At(poses[part.frames], kept(values, part.beside) if part.beside else nothing)
-            for part in self._variables
+            At(poses[frames], kept(values, beside) if beside else nothing)
+            for frames, beside in self._variables
         )
 
     def _results(self, job: Job[R]) -> list[R]:
@@ -359,7 +331,6 @@ def optimize_divided(
 
     Args:
         folder: of the map, from `folder.PartsWriter`, on a disk that the workers share.
-        workers: who computes the parts.
         settings: loss, damping, tolerances; `max_iterations` counts from where this call starts.
         scratch: folder of the workers' own files, emptied after each pass; None = they have none.
         callback: called with each attempt and the best values so far.
@@ -380,15 +351,46 @@ def optimize_divided(
 
 
 def read_landmarks(folder: Path, part: int) -> tuple[np.ndarray, np.ndarray]:
-    """The landmarks of a part of a map that `optimize_divided` has solved.
-
-    Returns:
-        (J,) int64, place of each landmark in the stream that the map was written from; (J, 3)
-        float64, world.
-
-    Raises:
-        GsbaError: the map is not solved yet, or a file is damaged.
-    """
+    """Landmarks of a part of a map that `optimize_divided` has solved: place (J,) int64 in the
+    stream that the map was written from, and (J, 3) float64, world. GsbaError if it is not solved
+    yet."""
     version = load(folder / _RESULT, SolverState).version
     points = load(version_file(folder, part, "points", version), PartPoints).points_world
     return load_part(folder, part).numbers, points
+
+
+@threadpool_limits.wrap(limits=1, user_api="blas")
+def divided_covariances(
+    folder: Path,
+    workers: Workers,
+    loss: RobustLoss,
+    num_draws: int = 0,
+    seed: int = 0,
+    scratch: Path | None = None,
+) -> tuple[np.ndarray, JointErrors]:
+    """Marginal covariances of the poses of a map in parts, where it starts.
+
+    As `gsba.bundle.optimizer.marginal_covariances`, which it equals within rounding where that
+    factorizes; the errors drawn are other ones of the same distribution.
+
+    Args:
+        folder: of the map, from `folder.PartsWriter`, which was to `tie` neighbouring frames.
+        num_draws: errors drawn of all poses at once, D.
+        scratch: folder of the workers' own files; None = they have none.
+
+    Returns:
+        (F, 6, 6) float64, [rotation rad, translation], rig frame, and joint errors. NaN for one
+        that nothing constrains, and for all where the rest is singular (the gauge is not fixed).
+
+    Raises:
+        GsbaError: the disk is full or damaged, or workers fail again and again.
+    """
+    system = DividedSystem(folder, workers, loss, scratch)
+    num = system.num_frames
+    steps = np.column_stack([np.arange(num - 1), np.arange(1, num)])
+    found = system.covariances(steps, num_draws, seed)
+    if found is None:
+        nothing = np.full((num_draws, num, 6), np.nan, np.float32)
+        return np.full((num, 6, 6), np.nan), JointErrors(np.full((num - 1, 6, 6), np.nan), nothing)
+    inverse, between, drawn = found
+    return inverse[:num], JointErrors(between, drawn[:, :num])

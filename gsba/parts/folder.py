@@ -101,20 +101,12 @@ def part_folder(folder: Path, part: int) -> Path:
 
 
 def load_part(folder: Path, part: int) -> Part:
-    """Read what a part owns.
-
-    Raises:
-        GsbaError: the file is missing or damaged.
-    """
+    """Read what a part owns."""
     return load(part_folder(folder, part) / "given.npz", Part)
 
 
 def load_index(folder: Path) -> Index:
-    """Read the parts of a map.
-
-    Raises:
-        GsbaError: the file is missing or damaged.
-    """
+    """Read the parts of a map."""
     return load(folder / _INDEX, Index)
 
 
@@ -136,11 +128,7 @@ def keys_beside(values: gtsam.Values) -> list[int]:
 
 
 def load(path: Path, returns: type[T]) -> T:
-    """Read a record of a map in parts.
-
-    Raises:
-        GsbaError: the file is missing or damaged.
-    """
+    """Read a record of a map in parts; GsbaError if it is missing or damaged."""
     try:
         return load_record(path, returns)
     except RecordError as error:
@@ -194,7 +182,9 @@ class PartsWriter:
         numbers = self._num_points + np.arange(len(sightings.points_world))
         self._num_points += len(numbers)
         tied = [_covisible(sightings)]
-        tied += [_codes_among(self._variables(keys)) for keys in _keys_of_factors(graph)]
+        for numbers_of in map(self._variables, _keys_of_factors(graph)):
+            i, j = np.triu_indices(len(numbers_of), 1)
+            tied.append(numbers_of[i] << 32 | numbers_of[j])
         self._codes = np.unique(np.concatenate([self._codes, *tied]))
         chunk = _Chunk(sightings, numbers, serialized(graph))
         save_record(self._incoming / f"{self._num_chunks:06d}.npz", chunk, {})
@@ -207,28 +197,15 @@ class PartsWriter:
         self._codes = np.unique(np.concatenate([self._codes, first << 32 | second]))
 
     def cut(self, values: gtsam.Values, num_frames: int, most: int) -> Partition:
-        """Cut what was added into parts.
-
-        Args:
-            values: to start from: poses X(frame) of all frames, and other variables of factors.
-            num_frames: F.
-            most: frames and other variables of a part, without those on cuts.
-
-        Returns:
-            The part of each frame, then of each other variable.
-        """
+        """Cut what was added into parts of at most `most` variables off the cuts; gives the part of
+        each frame, then of each other variable."""
         pairs = np.column_stack([self._codes >> 32, self._codes & 0xFFFFFFFF])
         pairs = np.where(pairs < _BESIDE, pairs, pairs - _BESIDE + num_frames)
         num, poses = num_frames + len(self._numbers), At.of(values, range(num_frames), ()).poses
         return partition(num, pairs, most, _places(poses[:, 9:], pairs, num))
 
     def finish(self, values: gtsam.Values, num_frames: int, cut: Partition) -> Index:
-        """Write the parts of a map, as `cut` has cut it.
-
-        Args:
-            values, num_frames: see `cut`.
-            cut: the part of each variable.
-        """
+        """Write the parts of a map, as `cut` has cut it."""
         keys, dims = list(self._numbers), values.dims()
         start = At.of(values, range(num_frames), keys)
         variables = _Variables(num_frames, keys, [dims[key] for key in keys])
@@ -245,9 +222,9 @@ class PartsWriter:
             self._write_part(part, chunks[part], cut, variables)
             for part in range(max(cut.num_parts, 1))
         ]
-        nodes = [part.nodes for part in written]
+        nodes = [rows for rows, _ in written]
         starts = np.concatenate([[0], np.cumsum([len(rows) for rows in nodes])]).astype(np.int64)
-        num_kept = np.array([part.num_kept for part in written], np.int64)
+        num_kept = np.array([num for _, num in written], np.int64)
         index = Index(np.concatenate(nodes), starts, num_kept, start)
         save_record(self._folder / _INDEX, index, {})
         self._incoming.rmdir()
@@ -284,8 +261,8 @@ class PartsWriter:
 
     def _write_part(
         self, number: int, num_chunks: int, cut: Partition, variables: "_Variables"
-    ) -> "_Written":
-        """Merge the chunks of a part."""
+    ) -> tuple[np.ndarray, int]:
+        """Merge the chunks of a part; its nodes (N,) int64, and the number of those on cuts."""
         folder = part_folder(self._folder, number)
         folder.mkdir(exist_ok=True)
         paths = [folder / f"chunk-{n:06d}.npz" for n in range(num_chunks)]
@@ -314,15 +291,7 @@ class PartsWriter:
         save_record(folder / "given.npz", part, {})
         for path in paths:
             path.unlink()
-        return _Written(variables.nodes_of(rows), num_kept)
-
-
-@dataclass(frozen=True, slots=True)
-class _Written:
-    """A part that was written."""
-
-    nodes: np.ndarray  # (N,) int64
-    num_kept: int
+        return variables.nodes_of(rows), num_kept
 
 
 class _Variables:
@@ -366,11 +335,7 @@ def deserialized(graph: np.ndarray) -> gtsam.NonlinearFactorGraph:
 
 
 def serialized(graph: gtsam.NonlinearFactorGraph) -> np.ndarray:
-    """Factors as bytes.
-
-    Raises:
-        NotStorableError: a factor is written in Python.
-    """
+    """Factors as bytes; NotStorableError if one is written in Python."""
     if not graph.size():
         return np.empty(0, np.uint8)
     try:
@@ -383,14 +348,7 @@ def serialized(graph: gtsam.NonlinearFactorGraph) -> np.ndarray:
 
 
 def _keys_of_factors(graph: gtsam.NonlinearFactorGraph) -> list[list[int]]:
-    """Keys that each factor is about."""
     return [graph.at(i).keys() for i in range(graph.size())]
-
-
-def _codes_among(numbers: np.ndarray) -> np.ndarray:
-    """Codes of all pairs of a few variables, ascending."""
-    i, j = np.triu_indices(len(numbers), 1)
-    return numbers[i] << 32 | numbers[j]
 
 
 def _covisible(sightings: ObservedRows) -> np.ndarray:

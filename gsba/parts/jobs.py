@@ -1,11 +1,10 @@
-"""Passes over parts where these lie: files in, files out, the same bytes whoever computes.
+"""Passes over parts where these lie: files in, files out, the same bytes whoever computes. At
+version V, of accepted or tentative poses, `points-V.npz` holds landmarks, `equations-V.npz` normal
+equations."""
 
-A version is a number of accepted or tentative poses. `points-V.npz` holds a part's landmarks at a
-version, `equations-V.npz` its normal equations there.
-"""
-
+import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -13,13 +12,47 @@ import gtsam
 import numpy as np
 
 from factors import LandmarkBlock, RobustLoss
-from factors.part_system import Condensed, PartEquations, PartSystem
+from factors.part_system import Condensed, PartElimination, PartEquations, PartSystem
 from factors.system_layout import SystemLayout
 from gsba.bundle.pose_variables import X
-from gsba.parts.eliminations import eliminated, substituting
+from gsba.memory import total_memory_bytes
 from gsba.parts.folder import At, Part, deserialized, load, load_part, part_folder
 from gsba.store.records import save_record
 from gsba.store.shards import even_blocks
+
+_MEMORY_SHARE = 64  # of the machine's memory: a process keeps factors of this part of it at most
+
+_Key = tuple[str, int, int, float]  # file, its inode, time of writing, damping
+
+
+_kept: dict[_Key, PartElimination] = {}
+_lock = threading.Lock()  # of `_kept`
+
+
+def eliminated(file: Path, damping: float) -> PartElimination:
+    """Factorize the equations in a file; the factor is kept for `substituting` while all that are
+    kept take a share of the memory at most, older ones of its file left out."""
+    factor = PartElimination(load(file, PartEquations), damping)
+    if factor.regular:
+        with _lock:
+            for old in [old for old in _kept if old[0] == str(file)]:
+                del _kept[old]
+            num_bytes = sum(one.num_bytes for one in [factor, *_kept.values()])
+            if num_bytes <= total_memory_bytes() // _MEMORY_SHARE:
+                _kept[_key(file, damping)] = factor
+    return factor
+
+
+def substituting(file: Path, damping: float) -> PartElimination:
+    """The factor that `eliminated` returned, which is kept no longer, or computed again."""
+    with _lock:
+        factor = _kept.pop(_key(file, damping), None)
+    return PartElimination(load(file, PartEquations), damping) if factor is None else factor
+
+
+def _key(file: Path, damping: float) -> _Key:
+    stat = file.stat()
+    return str(file), stat.st_ino, stat.st_mtime_ns, damping
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,29 +70,6 @@ class Linearized:
     costs: Mapping[str, float]  # family -> cost
     diagonal: np.ndarray  # (K, 6, 6) float64, the part's own share of H, nothing damped
     gradient: np.ndarray  # (K, 6) float64
-
-
-@dataclass(frozen=True, slots=True)
-class Moved:
-    """A part at tentative poses."""
-
-    cost: float
-    linearized: Linearized  # there
-
-
-@dataclass(frozen=True, slots=True)
-class Reduced:
-    """Equations of a part on its nodes on cuts, its damped own ones eliminated."""
-
-    condensed: Condensed | None  # None = its own block is singular
-
-
-@dataclass(frozen=True, slots=True)
-class Substituted:
-    """Steps of a part's own nodes."""
-
-    steps: np.ndarray  # (N - K, 6) float64
-    predicted: float  # share of the decrease that the model predicts
 
 
 def version_file(folder: Path, part: int, name: str, version: int) -> Path:
@@ -82,6 +92,12 @@ class _PartJob:
         """One part for one worker."""
         return even_blocks(len(self.parts), 1)
 
+    def part(self, start: int, stop: int) -> Self:
+        """See `gsba.store.shards.Job`."""
+        every = {entry.name: getattr(self, entry.name) for entry in fields(self)}
+        each = {name: value for name, value in every.items() if isinstance(value, tuple)}
+        return replace(self, **{name: value[start:stop] for name, value in each.items()})
+
     def _file(self, item: int, name: str, version: int) -> Path:
         return version_file(self.folder, self.parts[item], name, version)
 
@@ -97,11 +113,6 @@ class Linearize(_PartJob):
 
     title = "linearizing"
     returns: Any = Linearized
-
-    def part(self, start: int, stop: int) -> Self:
-        """See `gsba.store.shards.Job`."""
-        chosen = slice(start, stop)
-        return replace(self, parts=self.parts[chosen], at=self.at[chosen], pairs=self.pairs[chosen])
 
     def __call__(self, item: int) -> Linearized:
         part = load_part(self.folder, self.parts[item])
@@ -129,20 +140,9 @@ class Move(_PartJob):
     loss: RobustLoss
 
     title = "moving"
-    returns: Any = Moved
+    returns: Any = tuple[float, Linearized]  # cost, and the part there
 
-    def part(self, start: int, stop: int) -> Self:
-        """See `gsba.store.shards.Job`."""
-        chosen = slice(start, stop)
-        return replace(
-            self,
-            parts=self.parts[chosen],
-            before=self.before[chosen],
-            after=self.after[chosen],
-            steps=self.steps[chosen],
-        )
-
-    def __call__(self, item: int) -> Moved:
+    def __call__(self, item: int) -> tuple[float, Linearized]:
         part = load_part(self.folder, self.parts[item])
         points = load(self._file(item, "points", self.version), PartPoints)
         block, graph = _block(part, points.points_world, self.loss), deserialized(part.graph)
@@ -156,7 +156,7 @@ class Move(_PartJob):
         save_record(self._file(item, "equations", self.to), equations, {})
         moved = PartPoints(block.points_world, block.point_costs)
         save_record(self._file(item, "points", self.to), moved, {})
-        return Moved(cost, linearized)
+        return cost, linearized
 
 
 @dataclass(frozen=True)
@@ -166,15 +166,11 @@ class Eliminate(_PartJob):
     damping: float
 
     title = "eliminating"
-    returns: Any = Reduced
+    returns: Any = Condensed | None  # equations on nodes on cuts; None = its block is singular
 
-    def part(self, start: int, stop: int) -> Self:
-        """See `gsba.store.shards.Job`."""
-        return replace(self, parts=self.parts[start:stop])
-
-    def __call__(self, item: int) -> Reduced:
+    def __call__(self, item: int) -> Condensed | None:
         factor = eliminated(self._file(item, "equations", self.version), self.damping)
-        return Reduced(factor.condensed() if factor.regular else None)
+        return factor.condensed() if factor.regular else None
 
 
 @dataclass(frozen=True)
@@ -185,16 +181,12 @@ class Substitute(_PartJob):
     kept: tuple[np.ndarray, ...]  # (K, 6) steps of each part's nodes on cuts
 
     title = "substituting"
-    returns: Any = Substituted
+    # Steps (N - K, 6) float64, and the share of the decrease that the model predicts.
+    returns: Any = tuple[np.ndarray, float]
 
-    def part(self, start: int, stop: int) -> Self:
-        """See `gsba.store.shards.Job`."""
-        chosen = slice(start, stop)
-        return replace(self, parts=self.parts[chosen], kept=self.kept[chosen])
-
-    def __call__(self, item: int) -> Substituted:
+    def __call__(self, item: int) -> tuple[np.ndarray, float]:
         factor = substituting(self._file(item, "equations", self.version), self.damping)
-        return Substituted(*factor.substituted(self.kept[item]))
+        return factor.substituted(self.kept[item])
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,15 +195,6 @@ class Shared:
 
     inverse: np.ndarray  # (6 K, 6 K) float64, of the map's system
     drawn: np.ndarray  # (D, K, 6) float64, errors of its covariance
-
-
-@dataclass(frozen=True, slots=True)
-class Uncertain:
-    """Covariances of a part's own nodes."""
-
-    inverse: np.ndarray  # (N - K, 6, 6) float64
-    between: np.ndarray  # (Q, 6, 6) float64
-    drawn: np.ndarray  # (D, N - K, 6) float32
 
 
 @dataclass(frozen=True)
@@ -225,21 +208,17 @@ class Covariances(_PartJob):
     seed: int  # of the draws, beside the part's number
 
     title = "covariances"
-    returns: Any = Uncertain
+    # (N - K, 6, 6) float64, (Q, 6, 6) float64 between pairs, and drawn (D, N - K, 6) float32.
+    returns: Any = tuple[np.ndarray, np.ndarray, np.ndarray]
 
-    def part(self, start: int, stop: int) -> Self:
-        """See `gsba.store.shards.Job`."""
-        chosen = slice(start, stop)
-        return replace(self, parts=self.parts[chosen], pairs=self.pairs[chosen])
-
-    def __call__(self, item: int) -> Uncertain:
+    def __call__(self, item: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         shared = load(self._file(item, "shared", self.version), Shared)
         factor = substituting(self._file(item, "equations", self.version), 0.0)
         inverse, between = factor.inverse_blocks(self.pairs[item], shared.inverse)
         rng = np.random.default_rng([self.seed, self.parts[item]])
         drawn = factor.drawn(shared.drawn, rng).astype(np.float32)
         inverse[factor.idle], drawn[:, factor.idle] = np.nan, np.nan
-        return Uncertain(inverse, between, drawn)
+        return inverse, between, drawn
 
 
 def _block(part: Part, points_world: np.ndarray, loss: RobustLoss) -> LandmarkBlock:

@@ -28,11 +28,7 @@ class TermRows:
 
     @classmethod
     def of(cls, term: Term) -> "TermRows":
-        """The arrays of a term of `factors`.
-
-        Raises:
-            NotStorableError: its residual is a function.
-        """
+        """The arrays of a term of `factors`; NotStorableError if its residual is a function."""
         if not isinstance(term.kind, int):
             raise NotStorableError(
                 f"the residual of family {term.name} is a function, which files cannot hold"
@@ -110,7 +106,6 @@ def merged(chunks: Sequence[ObservedRows], local: np.ndarray) -> ObservedRows:
 
 
 def _joined(terms: Sequence[TermRows]) -> TermRows:
-    """Observations of a family one behind the other."""
     origins = None
     if any(term.origins_rig is not None for term in terms):
         none = [np.zeros((len(term.frames), 3)) for term in terms]

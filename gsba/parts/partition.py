@@ -1,9 +1,6 @@
-"""Parts of a map: its frames, cut where few of them see across.
-
-A map is bisected again and again (nested dissection: George, 1973). Each cut is the smallest set
-of frames that covers all pairs between two halves: a minimum vertex cover of a bipartite graph,
-found from a maximum matching (Koenig, 1931).
-"""
+"""Parts of a map, bisected again and again (nested dissection: George, 1973). Each cut is the
+smallest set of frames that covers all pairs between two halves: a minimum vertex cover of a
+bipartite graph, found from a maximum matching (Koenig, 1931)."""
 
 from dataclasses import dataclass
 
@@ -27,12 +24,8 @@ class Partition:
         return int(self.homes.max(initial=-1)) + 1
 
     def owners(self, frames: np.ndarray, items: np.ndarray, num_items: int) -> np.ndarray:
-        """The part (I,) that owns each item: the one in which it is seen, off the cuts.
-
-        Args:
-            frames, items: (O,) int, frames that have a share in each item, which are all paired.
-            num_items: I; an item without frames belongs to the first part.
-        """
+        """The part (I,) that owns each item: the one in which its frames (O,) lie, off the cuts;
+        the first part owns an item without frames."""
         num = max(self.num_parts, 1)
         codes = self.homes[frames] + num * self.on_cut[frames]
         least = np.full(num_items, 2 * num)
@@ -43,14 +36,8 @@ class Partition:
 def partition(
     num_frames: int, pairs: np.ndarray, most: int, positions: np.ndarray | None = None
 ) -> Partition:
-    """Cut frames into parts of at most `most` frames off the cuts.
-
-    Args:
-        num_frames: F.
-        pairs: (P, 2) int, distinct frames that a landmark or another factor ties.
-        most: frames of a part, at least one.
-        positions: (F, 3) where frames are, roughly; None = cuts follow the pairs alone.
-    """
+    """Cut frames into parts of at most `most` frames off the cuts, by tied pairs (P, 2) and rough
+    positions (F, 3); None = by pairs alone."""
     on_cut, homes, num_parts = np.zeros(num_frames, bool), np.full(num_frames, -1), 0
     waiting = [(np.arange(num_frames), np.asarray(pairs, np.int64).reshape(-1, 2))]
     while waiting:
@@ -69,8 +56,7 @@ def partition(
 
 
 def _homes_of_cuts(homes: np.ndarray, on_cut: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    """Homes (F,), those of frames on cuts the first part that they adjoin, perhaps through others;
-    the very first part for those that adjoin none."""
+    """Homes (F,); frames on cuts get the first part that they adjoin, perhaps through others."""
     far = np.iinfo(np.int64).max
     found = np.where(on_cut, far, homes)
     i, j = np.asarray(pairs).reshape(-1, 2).T
@@ -132,8 +118,7 @@ def _cut(order: np.ndarray, pairs: np.ndarray) -> np.ndarray:
 
 
 def _cover(left: np.ndarray, right: np.ndarray, num_left: int, num_right: int) -> np.ndarray:
-    """Fewest vertices that touch all edges (left, right) of a bipartite graph, right ones behind
-    the left ones."""
+    """Fewest vertices that touch all edges of a bipartite graph, right ones behind left ones."""
     edges = coo_array((np.ones(len(left)), (left, right)), shape=(num_left, num_right)).tocsr()
     match = maximum_bipartite_matching(edges, perm_type="column")  # of each left vertex
     partner = np.full(num_right, -1)

@@ -52,7 +52,6 @@ def require_motion(frames: FrameSet, result: Reconstruction) -> None:
 
     Args:
         frames: of the run, with their masks.
-        result: what was solved from the images alone.
 
     Raises:
         NoPositions: the images determine no positions, and no vehicle is to blame.
@@ -91,11 +90,7 @@ def require_motion(frames: FrameSet, result: Reconstruction) -> None:
 
 
 def _require_prediction(main: Reconstruction) -> None:
-    """Refuse a map whose steps differ from those that frames further away predict.
-
-    Raises:
-        NoPositions: more than `MAX_CONTRADICTED_SHARE` of the steps do.
-    """
+    """Refuse a map whose steps differ from those that frames further away predict."""
     deviations = step_deviations(main)
     tested = deviations[np.isfinite(deviations)]
     wrong = np.count_nonzero(tested > MAX_STEP_DEVIATION)

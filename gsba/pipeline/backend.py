@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -43,20 +44,13 @@ logger = logging.getLogger(__name__)
 
 # Fixes bend a map by this many times the square that their noise and that of the images explain. In
 # simulations with right claims the ratio is at most .25, and images err by twice their claims.
-_MAX_CONTRADICTION = 4.0
+MAX_CONTRADICTION = 4.0
 _MIN_BRIDGING = 12  # points of three frames, without which the scale is open: in rendered tours up
 # to 8 left it wrong by a fifth, 16 and more right
 
 
 def adjust(state: State, name: str, gates: Sequence[float], *, final: bool = False) -> State:
-    """Bundle adjustment in rounds over the tracks that the state's matches make.
-
-    Args:
-        state: of the run; its map is the start.
-        name: of the stage.
-        gates: of each round, standard deviations of an observation's residual.
-        final: see `adjustment.adjust`.
-    """
+    """Bundle adjustment in rounds over the state's tracks; `gates` in sigmas of a residual."""
     run, keypoints = state.run, state.observed.keypoints
 
     def compute() -> Solution:
@@ -76,9 +70,7 @@ def align_gauge(state: State, name: str) -> State:
     if not run.families.fixing_gauge.members:
         return state
 
-    def compute() -> Gauge:
-        return gauge.align(run.families, solution, prior.parts)
-
+    compute = partial(gauge.align, run.families, solution, prior.parts)
     found = run.stage(name, run.families.digests(), compute, Gauge, noted=False)
     carried = replace(state, prior=prior.moved(found))
     return carried.with_solution(found.moved(solution, prior.parts))
@@ -123,7 +115,7 @@ def separate_parts(state: State) -> np.ndarray | None:
             "follow one another closely (or lower triangulate.min_track_length or "
             "triangulate.min_parallax_deg)"
         )
-    scarce = connectivity.starving(solution, MIN_OBSERVATIONS)
+    scarce = solution.observations() < MIN_OBSERVATIONS
     nothing = np.zeros_like(state.prior.trust.held_steps)
     unguided = state.prior.unguided
     if unguided.any():  # nothing but points hands the scale on
@@ -140,8 +132,7 @@ def separate_parts(state: State) -> np.ndarray | None:
 
 
 def _doubtful_steps(state: State) -> np.ndarray:
-    """Unguided steps (F - 1,) bool over missing frames that are walked at an unusual pace in the
-    map, and long ones back and forth."""
+    """Unguided steps (F - 1,) bool of an unusual pace over missing frames, or long, to and fro."""
     frames, unguided, solution = state.run.frames, state.prior.unguided, state.solution
     times, poses = (frames.timestamps, frames.recording_of_frame), solution.world_T_rigs
     found = judgement.unusual_paces(poses, *times)
@@ -158,7 +149,7 @@ def merge_maps(state: State, parts: np.ndarray) -> State:
         held, shown = trust.held_steps, ~(trust.unseen_steps | _doubtful_steps(state))
         open_scale = prior.unguided[1:] & prior.unguided[:-1]
         if open_scale.any():  # images show a step between parts, but not how long it is
-            fed = ~connectivity.starving(solution, MIN_OBSERVATIONS)
+            fed = solution.observations() >= MIN_OBSERVATIONS
             shown &= ~((parts[1:] != parts[:-1]) & fed[1:] & fed[:-1] & open_scale)
         context, times = state.observed.context, run.frames.timestamps
         # No trajectory relates recordings: their maps are as free as those of images alone.
@@ -194,26 +185,16 @@ def measure_strength(state: State) -> State:
             run.frames.recording_of_frame,
         )
         snapshot = run.families.snapshot(solution, prior.parts)
-        bent = [fixes.contradiction(snapshot, errors[1].draws) for fixes in _fixes_of(run)]
+        fixes = [one for one in run.families.members if isinstance(one, GpsFactors)]
+        bent = [one.contradiction(snapshot, errors[1].draws) for one in fixes]
         return replace(strength, contradiction=max(bent, default=0.0))
 
     strength = run.stage("strength", [run.solving_key(), limits], compute, MapStrength)
     return replace(state, prior=replace(prior, strength=strength))
 
 
-def contradicts_fixes(state: State) -> bool:
-    """True if GPS fixes bend the measured map by more than its images allow."""
-    strength = state.prior.strength
-    return strength is not None and strength.contradiction > _MAX_CONTRADICTION
-
-
 def without_fixes(state: State, latest: Sequence[str]) -> State:
-    """The state without GPS fixes, which its images contradict.
-
-    Args:
-        state: before its map.
-        latest: names of the stages that it rests on.
-    """
+    """The state without GPS fixes, which its images contradict, after the stages `latest`."""
     logger.warning("the images contradict the GPS fixes: the map is made anew without these")
     run = state.run
     members = [
@@ -222,10 +203,6 @@ def without_fixes(state: State, latest: Sequence[str]) -> State:
     ]
     chain, families = Chain(run.store, latest), run.families.with_members(members)
     return replace(state, run=replace(run, chain=chain, families=families, suffix=WITHOUT_GPS))
-
-
-def _fixes_of(run: Run) -> list[GpsFactors]:
-    return [family for family in run.families.members if isinstance(family, GpsFactors)]
 
 
 def refine_photometric(state: State) -> State:
@@ -275,11 +252,7 @@ def reconstruct(
     state: State, amended: Callable[[Reconstruction], Reconstruction] | None = None
 ) -> Reconstruction:
     """Covariances, and everything back in the trajectory's world; of a turn, rotations alone.
-
-    Args:
-        state: of the run at its end.
-        amended: gives the result with what else is known of it; None = as it is.
-    """
+    `amended` gives the result with what else is known of it; None = as it is."""
     run, prior, map_, solution = state.run, state.prior, state.map, state.solution
     if prior.turning_only:
         return _reconstruct_rotations(state)
@@ -320,14 +293,10 @@ def reconstruct(
 
 
 def _baseline(state: State, scale: float) -> tuple[float, float] | None:
-    """Distance of the lenses of the first camera whose distance is published, else of the first
-    one that has two, and its standard deviation; None = none has two.
+    """Distance of the first camera's lenses and its sigma, by published ones; None = none has two.
 
-    Published distances of other cameras say the same of the map's scale: they are averaged. Where
-    they contradict one another, the standard deviation is as much larger as they scatter.
-
-    Args:
-        scale: units of the result per map unit.
+    Published distances of other cameras say the same of the map's scale (units per map unit): they
+    are averaged; where they contradict one another, sigma grows as they scatter.
     """
     run, found = state.run, list[tuple[tuple[float, float], tuple[float, float] | None]]()
     for number, camera in enumerate(state.map.cameras):
@@ -364,12 +333,12 @@ def _vertical(state: State, result: Reconstruction) -> np.ndarray | None:
 
 
 def _reconstruct_rotations(state: State) -> Reconstruction:
-    """Rotations alone, of a camera that stayed in one place."""
     run, prior, observed = state.run, state.prior, state.observed
     least, poses = MIN_OBSERVATIONS, prior.start().world_T_rigs
     turn = prior.trust.turn
     assert turn is not None
-    parts = connectivity.apart(~turn.frames)
+    lonely = ~turn.frames  # are parts of their own, behind all others
+    parts = np.where(lonely, np.cumsum(lonely), 0) if lonely.any() else None
 
     def compute() -> Reconstruction:
         matches = correspondences.match_for_rotations(observed.context, poses)

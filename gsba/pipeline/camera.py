@@ -1,8 +1,4 @@
-"""The camera of a run: where its lenses are, what they are, and how their rows are read.
-
-Two sources tell of it: features, matched before any gate has taken what a wrong camera threw off,
-and patches, aligned to a part of a pixel. `_Observations` holds either; an estimator takes these.
-"""
+"""The camera of a run: where its lenses are, what they are, and how their rows are read."""
 
 import logging
 from collections.abc import Callable, Sequence
@@ -37,8 +33,16 @@ from gsba.pipeline import backend, frontend
 from gsba.pipeline.map import Map
 from gsba.pipeline.run import Run
 from gsba.pipeline.state import State
-from gsba.trajectory.axes import quarter_turn
-from gsba.types import CoarsePoses, Keypoints, PoseSource, Reconstruction, Sighted, Solution
+from gsba.trajectory.conventions import quarter_turn
+from gsba.types import (
+    CoarsePoses,
+    Keypoints,
+    Landmarks,
+    PoseSource,
+    Reconstruction,
+    Sighted,
+    Solution,
+)
 
 _SEAM_DEG = 4.0  # from the seam of a panorama: pixels that are blended of both lenses are not used
 T = TypeVar("T")
@@ -73,12 +77,7 @@ def find_camera(state: State, prefix: str = "") -> State:
 
 
 def sought_cameras(state: State, again: bool = False) -> list[int]:
-    """Cameras that may have several lenses, and are one centre so far.
-
-    Args:
-        state: of the run.
-        again: leave raw lenses out, which are known to be several from the start.
-    """
+    """Cameras that may have several lenses and are one centre so far; `again`: without raw ones."""
     run = state.run
     if run.settings.camera.model == "central":
         return []
@@ -101,7 +100,7 @@ def _find_lenses(state: State, sought: Sequence[int], prefix: str) -> State:
         lenses = list(trial.observed.cameras.lenses)
         for camera in left:
             name = _named(run, f"{prefix}lenses{n}", camera)
-            centres = _from_features(trial, name, camera, _centres, LensCentres, noted=True)
+            centres = _from_features(trial, name, camera, _Rays.centres, LensCentres, noted=True)
             map_, lenses[camera] = map_.changed(camera, centres=centres), centres.lenses
         left = [camera for camera in left if lenses[camera]]
         if not left:
@@ -129,7 +128,7 @@ def _with_stitch_radii(start: State, stitched: Sequence[int], prefix: str) -> St
 
     def asked(state: State, stage: str, camera: int) -> StitchRadius:
         name = _named(state.run, prefix + stage, camera)
-        return _from_features(state, name, camera, _stitch_radius, StitchRadius)
+        return _from_features(state, name, camera, _Rays.stitch_radius, StitchRadius)
 
     for camera in stitched:
         first = asked(start, "stitch_radius", camera)
@@ -149,7 +148,6 @@ def _with_stitch_radii(start: State, stitched: Sequence[int], prefix: str) -> St
 
 
 def _with_lenses(state: State, lenses: dict[int, Lenses]) -> State:
-    """The state with other lenses of some cameras, and its keypoints as their rays."""
     for camera, own in lenses.items():
         state = _through(state, camera, own).with_lenses(camera, own)
     return state
@@ -158,8 +156,7 @@ def _with_lenses(state: State, lenses: dict[int, Lenses]) -> State:
 def _on_trial(
     state: State, sought: Sequence[int], prefix: str
 ) -> tuple[State, dict[int, LensAxes]]:
-    """The state seen through lenses that centres are looked for, and guesses of stitched ones'
-    axes."""
+    """The state seen through lenses that centres are sought for; guesses of stitched ones' axes."""
     run, guesses = state.run, dict[int, LensAxes]()
     trial, raw = state, _raw_cameras(run)
     for camera in sought:
@@ -174,14 +171,13 @@ def _on_trial(
         trial = _through(trial, camera, lenses)
         if not _axes_known(run, camera):
             name = _named(run, f"{prefix}axes", camera)
-            guesses[camera] = _from_features(trial, name, camera, _guessed_axes, LensAxes)
+            guesses[camera] = _from_features(trial, name, camera, _Rays.guessed_axes, LensAxes)
             lenses = guesses[camera].lenses
         trial = _through(trial, camera, replace(lenses, band_rad=band))
     return trial, guesses
 
 
 def _through(state: State, camera: int, lenses: Lenses) -> State:
-    """The state with keypoints of one camera as rays of other lenses."""
     every = list(state.observed.cameras.lenses)
     every[camera] = lenses
     return state.through(state.observed.cameras.with_lenses(every))
@@ -192,12 +188,14 @@ def _calibrate_raw(trial: State, raw: Sequence[int]) -> State:
     run, free = trial.run, False
     for camera in raw:
         lenses = trial.map.cameras[camera].lenses
-        if run.lenses_found_of(camera):  # patches say more of them than features do
+        if (
+            run.lenses_found and run.lenses_found[camera]
+        ):  # patches say more of them than features do
             lenses = replace(lenses, fisheyes=lenses.reference_calibration)
             trial = trial.with_lenses(camera, lenses)
             continue
         name = _named(run, "calibrated", camera)
-        known = _from_features(trial, name, camera, _calibration, SelfCalibration)
+        known = _from_features(trial, name, camera, _Rays.calibration, SelfCalibration)
         trial = replace(trial, map=trial.map.changed(camera, calibrated=known))
         if not known.reason:
             trial, free = trial.with_lenses(camera, known.lenses), True
@@ -221,7 +219,7 @@ def _settle_cameras(state: State, name: str) -> State:
     for camera, one in enumerate(found.each):
         if one.lenses and one.lenses.readout_motion is None:
             stage = _named(run, f"{name}_readout", camera)
-            read = _from_features(state, stage, camera, _readout, CameraEstimate, noted=True)
+            read = _from_features(state, stage, camera, _Rays.readout, CameraEstimate, noted=True)
             found = found.changed(camera, lambda _, read=read: read)
     rounds = run.settings.rounds
     gates = GATE_SCALE, *rounds.dense  # a camera that is off throws observations off
@@ -245,58 +243,42 @@ def _settle_cameras(state: State, name: str) -> State:
 
 
 def take_parts_from_patches(state: State, sighted: Sighted, name: str, number: int) -> State:
-    """The map with the parts of cameras that aligned patches show; its poses are yet to follow.
-
-    Args:
-        state: of the run; its map has two lenses somewhere.
-        sighted: observations that patches were aligned to.
-        name: of the round's stages.
-        number: of the estimate in this round. The first finds how rows are read, the second which
-            axes and calibration lenses have, as far as these are not known by then.
-    """
+    """The map with the parts of cameras that aligned patches show, its poses yet to follow:
+    estimate 0 of a round finds how rows are read, 1 which axes and calibration lenses have, if not
+    known."""
+    run = state.run
     for camera, one in enumerate(state.map.cameras):
-        if one.lenses:
-            state = _take_parts(state, sighted, name, number, camera)
-    return state
-
-
-def _take_parts(state: State, sighted: Sighted, name: str, number: int, camera: int) -> State:
-    """As `take_parts_from_patches`, of one camera."""
-    run, lenses = state.run, state.map.cameras[camera].lenses
-    given = state, sighted
-    if number == 0 and lenses.readout_motion is None:
-        found = _named(run, f"readout_{name}", camera)
-        read = _from_patches(*given, found, camera, _readout, CameraEstimate, noted=True)
-        estimates = state.map.estimates()
-        return state.with_cameras(estimates.changed(camera, lambda _: read))
-    if number == 1 and camera in _raw_cameras(run) and lenses.fisheyes is None:  # the rest has
-        # settled
-        found = _named(run, f"calibrated_{name}", camera)
-        known = _from_patches(*given, found, camera, _calibration, SelfCalibration, noted=True)
-        state = replace(state, map=state.map.changed(camera, calibrated=known))
-        state = state.with_lenses(camera, known.lenses)
-    if number == 1 and not _axes_known(run, camera) and lenses.axes is None:
-        found = _named(run, f"axes_{name}", camera)
-        axes = _from_patches(state, sighted, found, camera, _loose_axes, LensAxes, noted=True)
-        state = replace(state, map=state.map.changed(camera, axes=axes))
-        state = state.with_lenses(camera, axes.lenses)
+        lenses = one.lenses
+        if not lenses:
+            continue
+        if number == 0 and lenses.readout_motion is None:
+            stage = _named(run, f"readout_{name}", camera)
+            given = stage, camera, _Rays.readout, CameraEstimate
+            read = _from_patches(state, sighted, *given, noted=True)
+            changed = state.map.estimates().changed(camera, lambda _, read=read: read)
+            state = state.with_cameras(changed)
+        raw = camera in _raw_cameras(run)
+        if number == 1 and raw and lenses.fisheyes is None:  # the rest has settled
+            stage = _named(run, f"calibrated_{name}", camera)
+            given = stage, camera, _Rays.calibration, SelfCalibration
+            known = _from_patches(state, sighted, *given, noted=True)
+            state = replace(state, map=state.map.changed(camera, calibrated=known))
+            state = state.with_lenses(camera, known.lenses)
+        if number == 1 and not _axes_known(run, camera) and lenses.axes is None:
+            stage = _named(run, f"axes_{name}", camera)
+            given = stage, camera, _Rays.loose_axes, LensAxes
+            axes = _from_patches(state, sighted, *given, noted=True)
+            state = replace(state, map=state.map.changed(camera, axes=axes))
+            state = state.with_lenses(camera, axes.lenses)
     return state
 
 
 def adjust_with_patches(
     state: State, sighted: Sighted, name: str, gates: Sequence[float] | None = None
 ) -> tuple[Solution, Keypoints, CameraEstimates]:
-    """Aligned observations solved for poses, points and camera.
-
-    Args:
-        state: of the run; its map has two lenses.
-        sighted: observations that patches were aligned to.
-        name: of the stage.
-        gates: of the rounds; None = those of aligned patches.
-
-    Returns:
-        The solution, the keypoints with the noise that they turned out to have, and the camera.
-    """
+    """Aligned observations solved for poses, points and camera; gates None = those of patches.
+    Returns the solution, the keypoints with the noise that they turned out to have, and the
+    camera."""
     run, map_ = state.run, state.map
     gates = run.settings.rounds.aligned if gates is None else gates
 
@@ -352,12 +334,8 @@ def keep_lenses(state: State, result: Reconstruction) -> Cameras:
 
 
 def better_calibration(coarse: CoarsePoses, map_: Map) -> Cuts | None:
-    """The calibrations to cut raw frames by in the next pass, in the trajectory's axes.
-
-    Returns:
-        For each camera the calibration, and whether it was estimated; None = its frames are cut
-        well, or all are.
-    """
+    """Calibrations to cut raw frames by in the next pass, in the trajectory's axes, and whether
+    each was estimated; None = a camera's frames are cut well, or all are."""
     found = [_better(coarse, map_, camera) for camera in range(len(map_.cameras))]
     return tuple(found) if any(found) else None
 
@@ -381,7 +359,7 @@ def _better(coarse: CoarsePoses, map_: Map, camera: int) -> tuple[Rig, bool] | N
 
 
 @dataclass(frozen=True, slots=True)
-class _Observations:
+class _Rays:
     """Points and the rays that see them: all that an estimate of the camera rests on."""
 
     solution: Solution  # poses and points, noise of the observations
@@ -406,68 +384,48 @@ class _Observations:
         """Of the frames, (F,) float64, seconds."""
         return self.state.run.frames.timestamps
 
+    @property
+    def _map(self) -> tuple[Landmarks, Keypoints, Solution, Lenses]:
+        return self.solution.landmarks, self.keypoints, self.solution, self.camera.lenses
 
-def _guessed_axes(of: _Observations) -> LensAxes:
-    return lens_axes.guess(
-        of.solution.landmarks, of.keypoints, of.solution, of.camera.lenses, of.context
-    )
+    @property
+    def _pictured_map(self) -> tuple[Landmarks, Keypoints, np.ndarray, Solution, Lenses]:
+        landmarks, keypoints, solution, lenses = self._map
+        return landmarks, keypoints, self.shown, solution, lenses
 
+    def guessed_axes(self) -> LensAxes:
+        return lens_axes.guess(*self._map, self.context)
 
-def _loose_axes(of: _Observations) -> LensAxes:
-    return lens_axes.loosened(
-        of.solution.landmarks, of.keypoints, of.solution, of.camera.lenses, of.context
-    )
+    def loose_axes(self) -> LensAxes:
+        return lens_axes.loosened(*self._map, self.context)
 
+    def centres(self) -> LensCentres:
+        return lens_centres.estimate(*self._map, self.context)
 
-def _centres(of: _Observations) -> LensCentres:
-    return lens_centres.estimate(
-        of.solution.landmarks, of.keypoints, of.solution, of.camera.lenses, of.context
-    )
+    def stitch_radius(self) -> StitchRadius:
+        return lens_centres.stitched_for(*self._pictured_map, self.context)
 
+    def calibration(self) -> SelfCalibration:
+        nominal = self.state.run.frames.formats[self.number].lenses_nominal
+        return self_calibration.estimate(*self._pictured_map, self.context, nominal)
 
-def _stitch_radius(of: _Observations) -> StitchRadius:
-    return lens_centres.stitched_for(
-        of.solution.landmarks, of.keypoints, of.shown, of.solution, of.camera.lenses, of.context
-    )
-
-
-def _calibration(of: _Observations) -> SelfCalibration:
-    landmarks, lenses, nominal = (
-        of.solution.landmarks,
-        of.camera.lenses,
-        of.state.run.frames.formats[of.number].lenses_nominal,
-    )
-    return self_calibration.estimate(
-        landmarks, of.keypoints, of.shown, of.solution, lenses, of.context, nominal
-    )
-
-
-def _readout(of: _Observations) -> CameraEstimate:
-    landmarks, lenses = of.solution.landmarks, of.camera.lenses
-    return readout.estimate(
-        landmarks, of.keypoints, of.shown, of.solution, lenses, of.times, of.context
-    )
+    def readout(self) -> CameraEstimate:
+        return readout.estimate(*self._pictured_map, self.times, self.context)
 
 
 def _from_features(
     state: State,
     name: str,
     number: int,
-    estimate: Callable[[_Observations], T],
+    estimate: Callable[[_Rays], T],
     returns: type[T],
     *,
     noted: bool = False,
 ) -> T:
     """An estimate of one camera from points of the state's matches with all that is within a gate.
 
-    Observations that one centre threw off are far: the gate is wide until there are two, and
-    poses count as unsure as it is wide.
-
-    Args:
-        state: of the run.
-        number: of the camera.
-        name, returns, noted: of the stage, see `Run.stage`.
-        estimate: makes the result.
+    Observations that one centre threw off are far: the gate is wide until there are two, and poses
+    count as unsure as it is wide.
     """
     run, observed, solution = state.run, state.observed, state.solution
     lenses = observed.cameras.lenses[number]
@@ -478,7 +436,7 @@ def _from_features(
         placed = state.triangulated(tracks, observed.keypoints, gate * solution.noise)
         wide = replace(solution, landmarks=placed, noise=solution.noise * gate / GATE_SCALE)
         given = observed.keypoints, observed.shown, CameraEstimate(lenses), number, state
-        return estimate(_Observations(wide, *given))
+        return estimate(_Rays(wide, *given))
 
     return run.stage(name, _settings_of_cameras(run), compute, returns, noted=noted)
 
@@ -488,7 +446,7 @@ def _from_patches(
     sighted: Sighted,
     name: str,
     number: int,
-    estimate: Callable[[_Observations], T],
+    estimate: Callable[[_Rays], T],
     returns: type[T],
     *,
     noted: bool = False,
@@ -505,7 +463,7 @@ def _from_patches(
         solution = replace(map_.solution, noise=1.0, landmarks=placed)
         shown = stitching.corrected(sighted.keypoints, map_.field, run.rig)
         camera = map_.cameras[number].estimate()
-        return estimate(_Observations(solution, there.keypoints, shown, camera, number, state))
+        return estimate(_Rays(solution, there.keypoints, shown, camera, number, state))
 
     return run.stage(name, _settings_of_cameras(run), compute, returns, noted=noted)
 
@@ -517,7 +475,6 @@ def _axes_known(run: Run, camera: int) -> bool:
 
 
 def _raw_cameras(run: Run) -> list[int]:
-    """Cameras whose frames are raw fisheyes."""
     return [c for c, kind in enumerate(run.frames.formats) if kind.fisheyes is not None]
 
 
@@ -529,7 +486,6 @@ def _named(run: Run, stage: str, camera: int) -> str:
 
 
 def _settings_of_cameras(run: Run) -> list[object]:
-    """Settings that estimates of the cameras rest on."""
     found = list[object]()
     for number in range(len(run.frames.formats)):
         camera = run.settings_of(number)

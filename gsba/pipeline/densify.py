@@ -1,8 +1,5 @@
-"""More frames of a video where the map is weak: those between the frames that it is weak between.
-
-A door, a turn or a dark corner may want more frames than were chosen. The video has them, and its
-odometry has a pose for each. They strengthen the map, and stay out of datasets unless asked for.
-"""
+"""More frames of a video between those where the map is weak; they stay out of datasets unless
+asked for."""
 
 import logging
 from collections.abc import Callable
@@ -34,24 +31,17 @@ def fetch_where_weak(
     settings: RefineSettings,
     measure: Callable[[FrameSet], Prior],
 ) -> FrameSet:
-    """Frames of a run, and between weak ones more of the video, until the map is strong, no frames
-    are left between, or `odometry.fetch_rounds` are over.
-
-    Args:
-        store: of the run.
-        video_file: where frames come from.
-        walk: the odometry of the video.
-        frames: as chosen.
-        settings: of the run.
-        measure: solves frames as far as needed to tell where their map is weak.
-    """
+    """Frames of a run, and between weak ones more of the video, until the map that `measure` solves
+    is strong, no frames are left between, or `odometry.fetch_rounds` are over."""
     if len(set(frames.mask_paths)) > 1:
         logger.info("no frames are fetched: each frame has a mask of its own")
         return frames
     chosen = len(frames)
     for n in range(settings.odometry.fetch_rounds):
         left = int((1 + _MAX_SHARE) * chosen) - len(frames)
-        name, key = f"fetch{n}", _key(frames, settings)
+        name = f"fetch{n}"
+        paths = [path for group in frames.paths for path in group] + list(set(frames.mask_paths))
+        key = [settings.model_dump(exclude={"export", "placement"}), fingerprint(paths)]
         rows = store.stored(name, key, np.ndarray, ())
         if rows is None:
             steps = weak_steps(measure(frames), settings.odometry)
@@ -88,14 +78,8 @@ def weak_steps(prior: Prior, settings: OdometrySettings) -> np.ndarray:
 
 
 def rows_between(walk: Odometry, times: np.ndarray, steps: np.ndarray, most: int) -> np.ndarray:
-    """Rows (N,) of an odometry to fetch: for each step the sharpest frame of its middle third.
-
-    Args:
-        walk: of the whole video.
-        times: (F,) seconds, of the frames that are there.
-        steps: (F - 1,) bool, between which of them to fetch one.
-        most: rows; of more, some are left out evenly.
-    """
+    """Rows (N,) of an odometry to fetch, at most `most`: of steps (F - 1,) bool between times (F,),
+    seconds, the sharpest frame of the middle third."""
     posed, rows = np.flatnonzero(walk.posed()), []
     half = 0.5 * float(np.median(np.diff(walk.timestamps)))
     for f in np.flatnonzero(steps).tolist():
@@ -109,12 +93,6 @@ def rows_between(walk: Odometry, times: np.ndarray, steps: np.ndarray, most: int
     if len(rows) > most:
         rows = [rows[n] for n in np.linspace(0, len(rows) - 1, max(most, 0)).astype(int)]
     return np.array(rows, np.int64)
-
-
-def _key(frames: FrameSet, settings: RefineSettings) -> list[object]:
-    """All that a choice of frames to fetch rests on."""
-    paths = [path for group in frames.paths for path in group] + list(set(frames.mask_paths))
-    return [settings.model_dump(exclude={"export", "placement"}), fingerprint(paths)]
 
 
 def _with_rows(

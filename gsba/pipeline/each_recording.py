@@ -1,18 +1,15 @@
-"""Several recordings: the neighbours of each, matched and judged alone, and their combination.
+"""Several recordings, each with a clock, a trajectory and a gyro of its own, matched and judged
+alone; laid back to back, they are parts of a map that nothing ties together yet: map merging joins
+them."""
 
-Every recording has a clock, a trajectory with a world and a scale, and a gyro of its own; no frame
-of one is a neighbour in time of a frame of another. So the start of the front end sees them one by
-one. What it finds is laid back to back, each recording a part of the map that nothing ties to the
-others yet: map merging joins them by the places that they share.
-"""
-
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
 
 from gsba.log import GsbaError
-from gsba.pipeline import frontend, gyro
+from gsba.pipeline import frontend
 from gsba.pipeline.prior import Prior
 from gsba.pipeline.state import State
 from gsba.similarity import Sim3
@@ -23,51 +20,45 @@ from gsba.types import CoarsePoses, GyroConstraints, VerifiedPairs
 
 
 def match_neighbours(state: State) -> State:
-    """Neighbours in time of every recording, and what they say of its trajectory, clock and gyro.
-
-    Args:
-        state: keypoints of the frames of several recordings.
-
-    Raises:
-        GsbaError: a recording whose images do not match or contradict its trajectory, or show no
-            motion; the message names the recording.
-    """
+    """Neighbours in time of every recording, and what they say of its trajectory, clock and gyro;
+    GsbaError names one whose images do not match, contradict it, or show no motion."""
     run = state.run
     apart = [_match(state, number) for number in range(len(run.evidence.recordings))]
     run.chain.join([one.run.chain for one in apart])
     begins = np.cumsum([0, *(len(one.run.frames) for one in apart)]).tolist()
-    near = [_renumbered(one.verified, f) for one, f in zip(apart, begins, strict=False)]
+    near = list[VerifiedPairs]()
+    for one, first in zip(apart, begins, strict=False):
+        matches = one.verified.matches
+        pairs = (matches.pairs + first).astype(matches.pairs.dtype)
+        near.append(replace(one.verified, matches=replace(matches, pairs=pairs)))
     verified = VerifiedPairs.joined(near)
     return state.begun(_combined([one.prior for one in apart]), verified)
 
 
-def _match(state: State, number: int) -> State:
-    """One recording with its neighbours matched, its trajectory judged, its gyro aligned."""
-    name = state.run.evidence.recordings[number].name
+@contextmanager
+def naming_recording(name: str) -> Iterator[None]:
+    """Name a recording in the message of a GsbaError."""
     try:
-        found = frontend.match_neighbours(frontend.of_recording(state, number))
-        found = gyro.align_to_neighbours(frontend.judge_trajectory(found))
+        yield
     except GsbaError as error:
         raise GsbaError(f"recording '{name}': {error}") from error
-    if found.prior.turning_only:
-        raise GsbaError(
-            f"recording '{name}': the camera only turned, so that its frames have no place among "
-            "those of others: leave it out"
-        )
+
+
+def _match(state: State, number: int) -> State:
+    """One recording with its neighbours matched, its trajectory judged, its gyro aligned."""
+    with naming_recording(state.run.evidence.recordings[number].name):
+        found = frontend.match_neighbours(frontend.of_recording(state, number))
+        found = frontend.align_gyro_to_neighbours(frontend.judge_trajectory(found))
+        if found.prior.turning_only:
+            raise GsbaError(
+                "the camera only turned, so that its frames have no place among those of others: "
+                "leave it out"
+            )
     return found
 
 
-def _renumbered(pairs: VerifiedPairs, first: int) -> VerifiedPairs:
-    """Pairs whose frames are numbered from `first` on instead of from 0."""
-    moved = (pairs.matches.pairs + first).astype(pairs.matches.pairs.dtype)
-    return replace(pairs, matches=replace(pairs.matches, pairs=moved))
-
-
 def _combined(priors: Sequence[Prior]) -> Prior:
-    """Priors of recordings as one, their worlds brought together by a guess.
-
-    No step leads from one recording to the next: those between them have no prior.
-    """
+    """Priors of recordings as one, their worlds brought together by a guess."""
     apart = joined_poses([one.coarse for one in priors])
     coarse, guesses = joining.join(apart)
     moves = [Sim3(), *(Sim3.of(guess.scale, guess.world_T_own) for guess in guesses)]
@@ -114,13 +105,7 @@ def _steps(parts: Sequence[np.ndarray], between: object) -> np.ndarray:
 def _joints(
     priors: Sequence[Prior], guesses: Sequence[SegmentAlignment], moves: Sequence[Sim3]
 ) -> tuple[SegmentAlignment, ...]:
-    """Alignments of all pieces of the trajectories of recordings but the very first one.
-
-    Args:
-        priors: of the recordings.
-        guesses: alignment of each recording but the first.
-        moves: the same as similarities, of all recordings.
-    """
+    """Alignments of all pieces of the trajectories of recordings but the very first one."""
     joints, begin = list[SegmentAlignment](), 0
     for number, (one, move) in enumerate(zip(priors, moves, strict=True)):
         if number:
@@ -136,8 +121,7 @@ def _joints(
 
 
 def _turning(parts: Sequence[tuple[GyroConstraints | None, int]]) -> GyroConstraints | None:
-    """Constraints by the gyros of recordings, given with their numbers of frames; None = no
-    recording has one that is believed."""
+    """Constraints by the gyros of recordings, with numbers of frames; None = none is believed."""
     known = [turning for turning, _ in parts if turning is not None]
     if not known:
         return None

@@ -1,7 +1,5 @@
-"""A finished run as other runs start from it: its recordings, its map, and the world of its result.
-
-`keep` stores the map at the end of every run; `FinishedRun.load` reads it back with the rest.
-"""
+"""A finished run as other runs start from it: its recordings, its map, and the world of its
+result."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -71,15 +69,8 @@ class FinishedRun:
 
     @classmethod
     def load(cls, root: Path) -> "FinishedRun":
-        """Read a finished run.
-
-        Args:
-            root: folder of a run, see `grown_folder.held_runs`.
-
-        Raises:
-            GsbaError: a run that is not finished, one of another version of gsba, or one without
-                points.
-        """
+        """Read a finished run; GsbaError for one that is not finished, of another version of gsba,
+        or without points."""
         require_own_version(root)
         if not (root / "report.json").is_file():
             raise GsbaError(f"{root} is not finished: run gsba refine with --out {root} to the end")
@@ -91,11 +82,14 @@ class FinishedRun:
         num, points = len(frames), len(kept.map.solution.landmarks.points_world)
         if len(kept.map.solution.world_T_rigs) != num or points != len(result.points_world):
             raise GsbaError(f"{root}: its results do not fit together: refine again with --fresh")
-        files = tuple(_features_file(root, name) for name in frames.names)
+        stages = [root / STAGES / stage for stage in _FEATURES]
+        each = [[stage / f"{name}.npz" for stage in stages] for name in frames.names]
+        files = tuple(next(filter(Path.is_file, paths), paths[-1]) for paths in each)
         origin = {what: Path(path) for what, path in read_marker(root)["origin"].items()}
         settings = load_config(root / "config.toml")
         if not frames.recordings:
-            name = _name_of(origin.get("frames", root))
+            path = origin.get("frames", root)
+            name = (path.stem if path.is_file() else path.name) or "frames"
             origin = {f"{name}: {what}": path for what, path in origin.items()}
             frames = replace(
                 frames,
@@ -144,9 +138,13 @@ class FinishedRun:
         frames, map_ = self.frames.taken(rows), _map_of(self.map, rows)
         used, _ = cameras_of(self.frames.camera_of_frame, rows)
         cameras = tuple(self.camera_settings[c] for c in used)
+        settings = self.settings
+        if len(cameras) < len(self.camera_settings):  # those of a model that is left
+            known = next((one for one in cameras if one.baseline() is not None), cameras[0])
+            settings = settings.model_copy(update={"camera": known})
         return replace(
             self,
-            settings=self._settings_of(cameras),
+            settings=settings,
             camera_settings=cameras,
             origin=origin,
             frames=frames,
@@ -155,13 +153,6 @@ class FinishedRun:
             result=_result_of(self.result, rows, _tied(map_, frames)),
             files=tuple(self.files[f] for f in rows),
         )
-
-    def _settings_of(self, cameras: Sequence[CameraSettings]) -> RefineSettings:
-        """Settings when only some of the cameras are left: those of a model that is left."""
-        if len(cameras) == len(self.camera_settings):
-            return self.settings
-        known = next((one for one in cameras if one.baseline() is not None), cameras[0])
-        return self.settings.model_copy(update={"camera": known})
 
 
 def _tied(map_: Map, frames: FrameSet) -> np.ndarray:
@@ -178,13 +169,7 @@ def _tied(map_: Map, frames: FrameSet) -> np.ndarray:
 
 
 def _result_of(result: Reconstruction, rows: np.ndarray, groups: np.ndarray) -> Reconstruction:
-    """The result of frames `rows` (F',), ascending, of all maps, the largest one first.
-
-    Args:
-        result: of all frames.
-        rows: the frames.
-        groups: (F',) frames of one map that are of different groups are of different maps now.
-    """
+    """Result of frames `rows` (F',); groups (F',) of one map are maps of their own now."""
     num, scales = len(result.world_T_rigs), result.map_scales
     own = (np.zeros(num, np.int32) if result.components is None else result.components)[rows]
     components = by_size(np.unique(np.column_stack([own, groups]), axis=0, return_inverse=True)[1])
@@ -197,18 +182,6 @@ def _result_of(result: Reconstruction, rows: np.ndarray, groups: np.ndarray) -> 
         map_scales=ratios if several else None,
         vertical=result.vertical if own[first[0]] == 0 else None,
     )
-
-
-def _features_file(root: Path, name: str) -> Path:
-    """File of a frame's features, the last ones that were extracted."""
-    paths = [root / STAGES / stage / f"{name}.npz" for stage in _FEATURES]
-    return next((path for path in paths if path.is_file()), paths[-1])
-
-
-def _name_of(path: Path) -> str:
-    """Name of the only recording of a run, by its folder or video."""
-    name = path.stem if path.is_file() else path.name
-    return name or "frames"
 
 
 def _map_of(map_: Map, rows: np.ndarray) -> Map:
@@ -246,7 +219,6 @@ def _map_of(map_: Map, rows: np.ndarray) -> Map:
 
 
 def _camera_of(found: FoundCamera, rows: np.ndarray) -> FoundCamera:
-    """The camera of frames `rows` (F',)."""
     centres, readout = found.centres, found.readout
     return replace(
         found,

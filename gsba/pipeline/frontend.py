@@ -7,24 +7,28 @@ from pathlib import Path
 
 import numpy as np
 
+from factors.threads import map_in_threads
 from gsba import learned
 from gsba.camera.cameras import Cameras
 from gsba.config import RefineSettings
 from gsba.features import detection, extraction
 from gsba.features.extraction import FrameFeatures, Search
+from gsba.features.extractor_traits import search_settings
 from gsba.frames import panorama
+from gsba.geometry import inverse
+from gsba.imu.alignment import Alignment, align, turning_of
 from gsba.log import GsbaError
-from gsba.loop_closure import loops
+from gsba.loop_closure import connectivity, loops
 from gsba.loop_closure.loops import Closed
-from gsba.matching import correspondences, pairs, recovery
-from gsba.matching.guided_search import MatchContext, SearchableFrames
+from gsba.matching import correspondences, guided_search, pairs, recovery
+from gsba.matching.guided_search import PRIOR_GATE, MatchContext, SearchableFrames
 from gsba.matching.recovery import Recovered
-from gsba.pipeline import inputs, weak_start
+from gsba.matching.verification import relative_pose
+from gsba.pipeline import inputs
 from gsba.pipeline.acceptance import NoPositions
-from gsba.pipeline.observed_frames import ObservedFrames
 from gsba.pipeline.prior import Prior
 from gsba.pipeline.run import Run
-from gsba.pipeline.state import MapMatches, State
+from gsba.pipeline.state import MapMatches, ObservedFrames, State
 from gsba.store.store import PerFrame
 from gsba.trajectory import judgement, steps, turning
 from gsba.trajectory.clock import ClockEstimate
@@ -33,14 +37,20 @@ from gsba.types import CoarsePoses, Features, Keypoints, Matches, PoseSource, Ve
 _WEAK_CONTRAST_THRESHOLD = 0.01  # of keypoints in weak frames: half of the default elsewhere
 _DARK = 32  # of 255
 _NUM_WIDE_PAIRS = 60  # pairs of frames of each wider gap that show whether a camera walks
+_NUM_STEPS = 3  # compared, spread over the walk
+_DRIFT_PER_FRAME = 0.13  # times frames over squared matches of a step: the drift of rendered walks
+# of 24 to 48 frames is 0.10 to 0.15 times it; a real one of 11 frames drifts eight times as much
+_MAX_GAP_SHARE = 0.1  # largest distance of two positions at one place, part of the path between
+# them: the trajectory drifts by less
+_MIN_PATH_SHARE = 0.5  # of the whole path, that lies between them at least: shorter detours leave
+# the rest open
+_MAX_POSITIONS = 500  # compared with one another, evenly chosen
 
 
 def extract(run: Run) -> State:
-    """Keypoints of all frames: the first state of a run.
-
-    Frames of a map that is expected to be weak get as many as weak ones at once.
-    """
-    drift, known = weak_start.expected_drift(run, _search(run, run.settings))
+    """Keypoints of all frames, the first state of a run; where its map is expected to be weak, as
+    many as weak frames get."""
+    drift, known = expected_drift(run, _search(run, run.settings))
     more = drift > run.settings.weak_frames.max_drift
     enlarged = _enlarged(run.settings)
     found = _extract(run, enlarged) if more else _extract(run, run.settings, known=known)
@@ -49,7 +59,6 @@ def extract(run: Run) -> State:
 
 
 def _enlarged(settings: RefineSettings) -> RefineSettings:
-    """Settings with as many keypoints as weak frames get."""
     most = settings.weak_frames.max_per_face
     more = {"max_per_face": most, "contrast_threshold": _WEAK_CONTRAST_THRESHOLD}
     return settings.model_copy(update={"features": settings.features.model_copy(update=more)})
@@ -70,7 +79,8 @@ def extract_more(state: State, weak: np.ndarray) -> State:
     found = _extract(run, _enlarged(run.settings), "features_closer", weak)
     each = [found if more else old for more, old in zip(weak, before.features, strict=True)]
     observed = _observe(run, "keypoints_closer", each, "features_closer")
-    return state.with_keypoints(observed.through(before.cameras))
+    observed = observed.through(before.cameras)
+    return replace(state, observed=observed, map=replace(state.map, observed=observed.shown))
 
 
 def _extract(
@@ -120,12 +130,7 @@ def _matchable(
 
 
 def of_recording(state: State, number: int) -> State:
-    """The first state of one recording, from the first state of all recordings of a run.
-
-    Args:
-        state: keypoints of all frames, as `extract` gives them.
-        number: index of the recording.
-    """
+    """The first state of one recording, from the first state of all recordings of a run."""
     run = state.run.of_recording(number)
     rows = state.run.frames.recordings[state.run.evidence.recordings[number].name]
     first, last = int(rows[0]), int(rows[-1])
@@ -135,14 +140,9 @@ def of_recording(state: State, number: int) -> State:
 
 
 def match_neighbours(state: State) -> State:
-    """Verified matches of frames next to one another in time, the clock set right first.
-
-    The start is at the right times afterwards. Of several trajectories each may have a clock of its
-    own: they are taken as they are.
-
-    Raises:
-        GsbaError: a trajectory that turns otherwise than the images.
-    """
+    """Verified matches of frames next to one another in time, the clock set right first, unless
+    several trajectories may have clocks of their own. GsbaError if a trajectory turns otherwise
+    than the images."""
     run, prior, trajectories = state.run, state.prior, state.run.evidence.trajectories
     state = _match_neighbours(state, "neighbours")
     if len(trajectories) != 1 or prior.absent or run.settings.read.clock == "given":
@@ -174,11 +174,8 @@ def _match_neighbours(state: State, name: str) -> State:
 
 def judge_trajectory(state: State) -> State:
     """The trajectory without what images contradict; neighbours once more where it misled.
-
-    Raises:
-        NoPositions: neighbours match, but show neither a way nor a turn.
-        GsbaError: images contradict most of the trajectory, or match nowhere.
-    """
+    NoPositions if neighbours show neither a way nor a turn, GsbaError if images contradict most of
+    it."""
     run, prior, times = state.run, state.prior, state.run.frames.timestamps
     context = state.observed.context
     compute = partial(recovery.recover, context, state.verified, prior.coarse, times)
@@ -202,6 +199,48 @@ def judge_trajectory(state: State) -> State:
     return state.begun(prior, near)
 
 
+def align_gyro_to_neighbours(state: State) -> State:
+    """Constraints on the frames' turning from a gyro, aligned to how neighbours turn in images."""
+    readings, times = state.run.evidence.imu, state.run.frames.timestamps
+    if readings is None:
+        return state
+    seen = steps.image_steps(state.verified, state.observed.keypoints)
+
+    def compute() -> Alignment:
+        return align(times, seen.f_T_nexts[:, :3, :3], seen.verified, readings)
+
+    found = state.run.stage("imu", readings.digest, compute, Alignment)
+    turning = None if found.reason else turning_of(readings, found, times)
+    return replace(state, prior=replace(state.prior, gyro=found, turning=turning))
+
+
+def align_gyro_to_map(state: State, name: str, *, with_noise: bool = True) -> State:
+    """The gyro aligned anew, to the map's poses, which are better than those before.
+
+    Args:
+        state: of the run; it stays as it is where no gyro is believed.
+        with_noise: measure the gyro's noise, too. Poses have followed it by as much as it was
+            believed: the noise that they leave is measured once where they have become much better.
+    """
+    prior, times = state.prior, state.run.frames.timestamps
+    readings, former = state.run.evidence.imu, prior.gyro
+    if readings is None or former is None or former.reason:
+        return state
+    rotations = state.solution.world_T_rigs[:, :3, :3]
+    turns = np.swapaxes(rotations[:-1], 1, 2) @ rotations[1:]
+
+    def compute() -> Alignment:
+        return align(times, turns, ~prior.trust.unseen_steps, readings, former)
+
+    found = state.run.stage(name, readings.digest, compute, Alignment)
+    if found.reason:
+        return state
+    if not with_noise:
+        found = replace(found, noise=former.noise)
+    turning = turning_of(readings, found, times)
+    return replace(state, prior=replace(prior, gyro=found, turning=turning))
+
+
 def prove_turn(state: State) -> State | None:
     """The state before a map of rotations alone, of a camera whose positions images do not
     determine; None = that it turned on the spot is not proved either.
@@ -209,9 +248,6 @@ def prove_turn(state: State) -> State | None:
     Frames one, two, four, ... apart are matched without any prediction, over the whole sequence: a
     slow walk adds up to parallax over the widest gaps. Neighbours tie frames together; of the wider
     gaps of a long sequence, some pairs suffice.
-
-    Args:
-        state: keypoints of all frames, as `extract` gives them.
     """
     run, context, num = state.run, state.observed.context, len(state.run.frames)
     nowhere = np.tile(np.eye(4), (num, 1, 1))
@@ -274,10 +310,8 @@ def match_along_epipolars(state: State, name: str = "adjacent") -> State:
 
 
 def match_across(state: State, parts: np.ndarray) -> State:
-    """Verified matches of frames whose parts (F,) of the map were joined by images.
-
-    Other matches between these parts are dropped: they did not tie them together.
-    """
+    """Verified matches of frames whose parts (F,) images joined; others between these are
+    dropped."""
     run, context, merged = state.run, state.observed.context, state.prior.merged
     assert merged is not None
     compute = partial(correspondences.match_across, context, state.solution, parts, merged.met)
@@ -311,7 +345,6 @@ def close_loops(state: State) -> State:
 
 
 def _match_loops(state: State, name: str) -> VerifiedPairs:
-    """Verified matches of frames that met the same place again."""
     run, context = state.run, state.observed.context
     compute = partial(correspondences.match_loops, context, state.solution)
     return run.stage(name, run.matching_key(), compute, VerifiedPairs)
@@ -322,7 +355,7 @@ def _meet_places(state: State, near: VerifiedPairs) -> State:
     run, prior, trust = state.run, state.prior, state.prior.trust
     unseen = trust.unseen_steps if prior.merged is None else np.zeros_like(trust.unseen_steps)
     pairs = near.matches.pairs
-    if loops.connected(unseen, pairs) and len(pairs):
+    if len(pairs) and connectivity.parted(pairs, ~unseen) is None:
         return state
     known = state.observed.context, state.solution, unseen, run.store.scratch_folder
     compute = partial(loops.close, *known)
@@ -332,3 +365,67 @@ def _meet_places(state: State, near: VerifiedPairs) -> State:
     # Places met again know better than a step that no image shows.
     trust = replace(trust, false_steps=trust.false_steps | unseen)
     return replace(state, prior=replace(prior, trust=trust)).with_solution(closed.solved)
+
+
+def expected_drift(run: Run, search: Search) -> tuple[float, dict[str, Features]]:
+    """Drift to be expected before frames are searched, part of the path; 0 where nothing foretells
+    it; and keypoints of the frames compared, by name: none if an earlier call compared them."""
+    settings, num = run.settings, len(run.frames)
+    usual = settings.features.extractor == "sift" and settings.matching.matcher == "guided"
+    if settings.weak_frames.mode != "auto" or not usual or num < 2 * _NUM_STEPS:
+        return 0.0, {}
+    coarse = run.coarse
+    if run.evidence.recordings or coarse.segments is not None or coarse.absent:
+        return 0.0, {}
+    if comes_back(coarse.world_T_rigs[:, :3, 3]):
+        return 0.0, {}
+    found = dict[str, Features]()
+    first = np.linspace(0, num - 2, _NUM_STEPS).astype(int)
+    steps = np.column_stack([first, first + 1])
+
+    def compute() -> float:
+        found.update(search.of(np.unique(steps).tolist()))
+        return _DRIFT_PER_FRAME * num / max(_matches(run, found, steps), 1.0) ** 2
+
+    key = [run.matching_key(), settings.features, settings.cubemap]
+    drift = run.store.stage("expected_drift", key, compute, float, run.chain.latest)
+    return drift, found
+
+
+def _matches(run: Run, found: Mapping[str, Features], steps: np.ndarray) -> float:
+    """Median number of verified matches of steps (S, 2) between frames, by strong keypoints."""
+
+    def load(frame: int) -> Features:
+        return found[run.frames.names[frame]]
+
+    settings, poses = run.matching_settings, run.coarse.world_T_rigs
+    chance = PRIOR_GATE.chance(np.deg2rad(settings.verify.max_error_deg))
+    frames = SearchableFrames(load, settings.pairs.strongest_per_face)
+
+    def verified(step: int) -> int:
+        f0, f1 = steps[step].tolist()
+        f0_T_f1 = inverse(poses[f0]) @ poses[f1]
+        rows = guided_search.guided(
+            frames, (f0, f1), f0_T_f1, PRIOR_GATE, search_settings(settings)
+        )
+        rays = load(f0).bearings_rig[rows[:, 0]], load(f1).bearings_rig[rows[:, 1]]
+        pose = relative_pose(*rays, settings.verify, settings.seed, chance)
+        return 0 if pose is None else int(np.count_nonzero(pose.inliers))
+
+    return float(np.median(list(map_in_threads(verified, len(steps), run.num_threads))))
+
+
+def comes_back(positions: np.ndarray) -> bool:
+    """True if a path (F, 3) returns to a place after at least half of its length, or does not
+    move."""
+    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    along = np.concatenate([[0.0], np.cumsum(steps)])
+    if not along[-1] > 0:
+        return True
+    num = len(positions)
+    chosen = np.unique(np.linspace(0, num - 1, min(num, _MAX_POSITIONS)).astype(int))
+    places, along = positions[chosen], along[chosen]
+    distances = np.linalg.norm(places[:, None] - places, axis=2)
+    between = np.abs(along[:, None] - along)
+    met = (distances < _MAX_GAP_SHARE * between) & (between > _MIN_PATH_SHARE * along[-1])
+    return bool(met.any())

@@ -1,11 +1,11 @@
 """Finished runs that grow: recordings added or taken out, and runs merged, from what is solved."""
 
 import logging
+import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,21 +13,24 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from gsba.config import CameraSettings, GpsSettings, PlacementSettings, RefineSettings
+from gsba.disk import disk_errors, exchange_folders, hold_folder, link_or_copy
+from gsba.frames.recordings import combine
 from gsba.log import GsbaError
 from gsba.masks.segmentation import Segment
-from gsba.pipeline import backend, camera, finished_run, grown_folder, map_joining, outputs
+from gsba.pipeline import backend, camera, finished_run, map_joining, outputs
 from gsba.pipeline.finished_run import FinishedRun
 from gsba.pipeline.joint_cameras import JointCameras, as_read_by, refuse_fields
-from gsba.pipeline.joint_map import JointMaps, check_new
+from gsba.pipeline.joint_map import JointMaps
 from gsba.pipeline.map_joining import ApartError, RigidMoves
 from gsba.pipeline.outputs import RunResult
 from gsba.pipeline.prior import Prior
-from gsba.pipeline.recording import Recording, names_of
-from gsba.pipeline.recordings import refine_each
+from gsba.pipeline.recordings import Recording, names_of, refine_each
 from gsba.pipeline.stage_titles import title_of
 from gsba.pipeline.state import State
 from gsba.similarity import NoSimilarityError, Sim3, pose_similarity
 from gsba.store import cluster
+from gsba.store.folder import STAGES, is_run_folder, read_marker
+from gsba.store.records import save_record
 from gsba.store.store import RunStore
 from gsba.trajectory.joining import PLACES, SegmentAlignment
 from gsba.types import CoarsePoses, FrameSet, PoseSource, Reconstruction
@@ -36,6 +39,114 @@ if TYPE_CHECKING:
     from distributed import Client
 
 logger = logging.getLogger(__name__)
+SCRATCH = "new"  # run of new recordings, in the folder that is being written
+_FRAMES, _MASKS = "frames", "masks"  # folders of the frames and masks that runs hold themselves
+_ODOMETRY = "odometry"  # folder of what the odometry of videos found
+
+
+@contextmanager
+def held_runs(roots: Sequence[Path]) -> Iterator[None]:
+    """Keep other processes from runs in this context; GsbaError if one is missing, no run, or in
+    use."""
+    locks = list[int]()
+    try:
+        for root in roots:
+            if not is_run_folder(root):
+                raise GsbaError(f"{root} is not a gsba run: give the folder that gsba refine wrote")
+            locks.append(hold_folder(root))
+        yield
+    finally:
+        for lock in locks:
+            os.close(lock)
+
+
+def refuse_existing(out: Path) -> None:
+    """Refuse a folder to write a new run to that exists and is not empty, or has no parent."""
+    if out.is_symlink() or (out.exists() and not (out.is_dir() and not any(out.iterdir()))):
+        raise GsbaError(f"{out} exists: choose another --out")
+    if not out.parent.is_dir():
+        raise GsbaError(f"{out.parent} is no folder: make it, or choose another --out")
+
+
+def forget_other_work(work: Path, origin: dict[str, Path], out: Path) -> None:
+    """Delete what a call with other inputs has left half-written in `work`; a finished run whose
+    renaming to `out` was interrupted is kept beside it."""
+    if not work.exists():
+        return
+    lock = hold_folder(work)
+    try:
+        resolved = {name: str(path.resolve()) for name, path in origin.items()}
+        if is_run_folder(work) and read_marker(work)["origin"] == resolved:
+            return
+        with disk_errors(work):
+            if (work / "report.json").is_file():
+                work.rename(_free_name(out))
+                return
+            logger.info("%s: left by another call that was interrupted, deleted", work)
+            shutil.rmtree(work)
+    finally:
+        os.close(lock)
+
+
+def complete(store: RunStore, frames: FrameSet, sources: Sequence[Path], out: Path) -> FrameSet:
+    """Give a run all files that its frames and masks are read from, and no other run need hold;
+    returns the frames as they are read then."""
+    roots = [root.resolve() for root in sources]
+
+    def kept(path: Path, frame: str, folder: str) -> Path:
+        own = path.resolve()
+        if not any(root in own.parents for root in roots):
+            return path
+        name = Path(folder) / frame.rpartition("/")[0] / path.name
+        if not (store.root / name).is_file():
+            link_or_copy(own, store.root / name)
+        return out.absolute() / name
+
+    paths, masks = [], []
+    for frame, group, mask in zip(frames.names, frames.paths, frames.mask_paths, strict=True):
+        paths.append(tuple(kept(path, frame, _FRAMES) for path in group))
+        masks.append(mask and kept(mask, frame, _MASKS))
+    for root in roots:
+        for path in sorted((root / _ODOMETRY).rglob("*")):
+            if path.is_file() and root != store.root.resolve():
+                link_or_copy(path, store.root / path.relative_to(root))
+    for folder in (_FRAMES, _MASKS, _ODOMETRY):
+        if (store.root / folder).is_dir():
+            store.claim(store.root / folder)
+    moved = replace(frames, paths=tuple(paths), mask_paths=tuple(masks))
+    info = {"key": store.records["frames"].key} | {
+        name: getattr(store.records["frames"], name)
+        for name in ("name", "resumed", "seconds", "cpu_seconds", "peak_mb", "workers")
+    }
+    save_record(store.root / STAGES / "frames.npz", moved, info)
+    return moved
+
+
+def put_in_place(work: Path, out: Path) -> Path | None:
+    """Rename a complete run into place; a run that was there gets the name returned."""
+    with disk_errors(out):
+        shutil.rmtree(work / SCRATCH, ignore_errors=True)
+        if not out.exists() or not any(out.iterdir()):
+            with suppress(FileNotFoundError):
+                out.rmdir()
+            work.rename(out)
+            return None
+        before = _free_name(out)
+        if exchange_folders(work, out):
+            work.rename(before)
+        else:  # for a moment the run has its other name alone
+            out.rename(before)
+            work.rename(out)
+        return before
+
+
+def _free_name(out: Path) -> Path:
+    """Name beside a run's folder under which it can be kept."""
+    number, path = 1, out.with_name(f"{out.name}-before")
+    while path.exists():
+        number += 1
+        path = out.with_name(f"{out.name}-before-{number}")
+    return path
 
 
 @threadpool_limits.wrap(limits=1, user_api="blas")  # sums keep their order
@@ -69,7 +180,7 @@ def add_recordings(
     root = Path(run)
     if not recordings:
         raise GsbaError("give a recording to add: a folder of frames, or a video")
-    with grown_folder.held_runs([root]):
+    with held_runs([root]):
         finished = FinishedRun.load(root)
         names = names_of(recordings)
         _refuse_known(finished, recordings, names)
@@ -78,12 +189,16 @@ def add_recordings(
             f"{name}: frames": Path(one.frames) for name, one in zip(names, recordings, strict=True)
         }
         with place.store(finished.origin | given, client, finished) as work:
-            scratch = grown_folder.scratch_of(work.root)
+            scratch = work.root / SCRATCH
             named = [replace(one, name=name) for one, name in zip(recordings, names, strict=True)]
             settings = _settings_of_new(finished.settings)
-            given = {"segment": segment, "client": client}
             models = {one.name: one.camera for one in named}
-            given |= {"adapt": partial(_new_as_read_by, finished, models=models)}
+
+            def adapt(found: Mapping[str, FrameSet]) -> dict[str, tuple[FrameSet, CameraSettings]]:
+                combine({**finished.recordings(), **found})  # refuses recordings that the run has
+                return as_read_by(finished, found, models)
+
+            given = {"segment": segment, "client": client, "adapt": adapt}
             refine_each(named, scratch, settings, **given)
             runs = [finished, FinishedRun.load(scratch)]
             state, maps = _joined(work, runs)
@@ -125,7 +240,7 @@ def merge_runs(
         if resolved.count(path) > 1:
             raise GsbaError(f"{root} is given twice: give each run once")
     place = _Place.of(None, out)
-    with grown_folder.held_runs(roots):
+    with held_runs(roots):
         finished = [FinishedRun.load(root) for root in roots]
         _refuse_common(finished)
         refuse_fields(finished, len(JointCameras.of(finished).formats) > 1)
@@ -159,7 +274,7 @@ def remove_recordings(
         GsbaError: an input that cannot be used; no such recording, or none that would be left.
     """
     root = Path(run)
-    with grown_folder.held_runs([root]):
+    with held_runs([root]):
         finished = FinishedRun.load(root)
         _refuse_unknown(finished, names)
         left = finished.without(names)
@@ -179,15 +294,11 @@ class _Place:
 
     @classmethod
     def of(cls, root: Path | None, out: Path | str | None) -> "_Place":
-        """A place for the result of a run that grows.
-
-        Raises:
-            GsbaError: there is something.
-        """
+        """A place for the result of a run that grows; GsbaError if there is something."""
         if root is not None and (out is None or Path(out).resolve() == root.resolve()):
             return cls(root, True)
         assert out is not None
-        grown_folder.refuse_existing(Path(out))
+        refuse_existing(Path(out))
         return cls(Path(out), False)
 
     @contextmanager
@@ -197,14 +308,9 @@ class _Place:
         """Store of the run in a folder beside its place, taken up where a call was interrupted.
 
         The folder is deleted where maps turn out not to be of one place.
-
-        Args:
-            origin: inputs of the run.
-            client: see `gsba.refine`.
-            first: run whose settings it has.
         """
-        work = grown_folder.folder_beside(self.out)
-        grown_folder.forget_other_work(work, origin, self.out)
+        work = self.out.with_name(f".{self.out.name}.growing")
+        forget_other_work(work, origin, self.out)
         hired = cluster.hire(client, first.frames.paths[0][0], first.settings)
         try:
             with RunStore(work, origin, hire=hired, title_of=title_of) as store:
@@ -222,26 +328,18 @@ class _Place:
         held: np.ndarray | None = None,
         rigid: RigidMoves | None = None,
     ) -> RunResult:
-        """Write the result, and put it in place.
-
-        Args:
-            store: of the run, in the folder beside its place.
-            state: of the run at its end.
-            maps: that it is made of.
-            held: (H,) frames of the first run whose poses were held; None = all were solved.
-            rigid: similarities that maps were moved by; None = they were solved together.
-        """
+        """Write the result and put it in place; frames `held` (H,) kept their poses, maps of
+        `rigid` were moved by similarities; None = all were solved together."""
         written = _write(state, maps, held, rigid)
         sources = [*(run.root for run in maps.runs), store.root]
-        frames = grown_folder.complete(store, state.run.frames, sources, self.out)
-        before = grown_folder.put_in_place(store.root, self.out)
+        frames = complete(store, state.run.frames, sources, self.out)
+        before = put_in_place(store.root, self.out)
         if before is not None:
             logger.info("the run as it was: %s; delete it whenever you like", before)
         return replace(written, out=self.out, frames=frames)
 
 
 def _joined(store: RunStore, runs: Sequence[FinishedRun]) -> tuple[State, JointMaps]:
-    """Maps of runs moved to where they meet."""
     maps = JointMaps.of(runs)
     return map_joining.register(map_joining.begin(store, maps, runs[0].settings), maps), maps
 
@@ -260,14 +358,6 @@ def _settings_of_new(settings: RefineSettings) -> RefineSettings:
     )
 
 
-def _new_as_read_by(
-    run: FinishedRun, found: Mapping[str, FrameSet], models: Mapping[str, str | None]
-) -> dict[str, tuple[FrameSet, CameraSettings]]:
-    """New recordings as a run reads them, see `as_read_by`; those that it has are refused."""
-    check_new(run, found)
-    return as_read_by(run, found, models)
-
-
 def _refuse_known(run: FinishedRun, recordings: Sequence[Recording], names: Sequence[str]) -> None:
     """Refuse recordings that are in a run already, or whose name is taken there."""
     taken = list(run.frames.recordings)
@@ -284,7 +374,6 @@ def _refuse_known(run: FinishedRun, recordings: Sequence[Recording], names: Sequ
 
 
 def _refuse_common(runs: Sequence[FinishedRun]) -> None:
-    """Refuse runs that have a recording in common."""
     known: dict[Path, FinishedRun] = {}
     for run in runs:
         for what, path in run.origin.items():
@@ -349,8 +438,12 @@ def _write(
     def amended(result: Reconstruction) -> Reconstruction:
         if maps.rows(0)[0] in result.largest_map():
             result = replace(result, vertical=maps.runs[0].result.vertical)
-        if held is not None:
-            result = _with_held(result, maps, held)
+        if held is not None:  # the poses of the first run stay as they were
+            first, poses = maps.runs[0].result, result.world_T_rigs.copy()
+            covariances = result.pose_covariances.copy()
+            poses[held], covariances[held] = first.world_T_rigs, first.pose_covariances
+            changes = {"world_T_rigs": poses, "pose_covariances": covariances}
+            result = replace(result, joint_errors=None, **changes)
         return result if rigid is None else _with_rigid(result, state, maps, rigid)
 
     state = replace(state, prior=replace(state.prior, of_recordings=_worlds(state, maps)))
@@ -361,14 +454,6 @@ def _write(
     state = _told(state, maps, result, rigid)
     finished_run.keep(state)
     return outputs.write(state, result, lenses)
-
-
-def _with_held(result: Reconstruction, maps: JointMaps, held: np.ndarray) -> Reconstruction:
-    """The result with the poses of the first run as they were."""
-    first = maps.runs[0].result
-    poses, covariances = result.world_T_rigs.copy(), result.pose_covariances.copy()
-    poses[held], covariances[held] = first.world_T_rigs, first.pose_covariances
-    return replace(result, world_T_rigs=poses, pose_covariances=covariances, joint_errors=None)
 
 
 def _with_rigid(
@@ -391,10 +476,7 @@ def _with_rigid(
 
 
 def _worlds(state: State, maps: JointMaps) -> tuple[Prior, ...]:
-    """For each recording, the poses that define the world of the map that it is in.
-
-    A map has the world of the first run that it has frames of.
-    """
+    """The poses of each recording that define its map's world: that of the first run in the map."""
     components = state.prior.parts
     if components is None:
         components = np.zeros(len(state.run.frames), np.int64)

@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,17 +25,14 @@ from gsba.log import GsbaError
 from gsba.masks.merging import Choice
 from gsba.odometry.files import write_chosen, write_odometry
 from gsba.odometry.walk import Odometry
-from gsba.pipeline.stage_titles import title_of
 from gsba.placement import EXIF, check, fixes_of_frames, read_fixes
 from gsba.store.store import RunStore, fingerprint
-from gsba.trajectory.association import without_trajectory
+from gsba.trajectory.association import follow_keyframes, without_trajectory
 from gsba.trajectory.conventions import Convention
 from gsba.trajectory.files import read_trajectory
-from gsba.trajectory.keyframes import follow_keyframes
-from gsba.trajectory.lost_frames import without_lost_frames
 from gsba.trajectory.metashape import NamedPoses, is_metashape, read_metashape
 from gsba.trajectory.misread import refuse_useless
-from gsba.trajectory.restarts import associate_pieces, split_restarts
+from gsba.trajectory.restarts import associate_pieces, split_restarts, without_lost_frames
 from gsba.types import CoarsePoses, FrameSet, Trajectory
 from gsba.video.recording import files_of
 
@@ -87,29 +85,21 @@ def read_trajectories(
 
 
 def timed(given: Sequence[Trajectory | NamedPoses], frames: FrameSet) -> list[Trajectory]:
-    """Trajectories with the times of frames, where their poses go by file names, each in a world
-    whose origin is near it.
-
-    Raises:
-        GsbaError: fewer than two frames have a pose of a file.
-    """
+    """Trajectories at the times of frames, those by file names too, each in a world near its
+    origin; GsbaError if fewer than two frames have a pose of a file."""
     known = [one.timed(frames) if isinstance(one, NamedPoses) else one for one in given]
-    return [_near_origin(one) for one in known]
-
-
-def _near_origin(trajectory: Trajectory) -> Trajectory:
-    """A trajectory whose world is shifted if it is far from the origin, as ECEF and UTM are."""
-    origin = local_origin(trajectory.world_T_rigs[:, :3, 3])
-    if origin is None:
-        return trajectory
-    logger.info(
-        "the trajectory is far from its origin: the run's world is shifted by %s, which "
-        "transform.json states",
-        ", ".join(f"{value:.12g}" for value in origin),
-    )
-    poses = trajectory.world_T_rigs.copy()
-    poses[:, :3, 3] -= origin
-    return replace(trajectory, world_T_rigs=poses, origin=origin)
+    for n, one in enumerate(known):
+        origin = local_origin(one.world_T_rigs[:, :3, 3])
+        if origin is not None:  # as of ECEF and UTM
+            logger.info(
+                "the trajectory is far from its origin: the run's world is shifted by %s, which "
+                "transform.json states",
+                ", ".join(f"{value:.12g}" for value in origin),
+            )
+            poses = one.world_T_rigs.copy()
+            poses[:, :3, 3] -= origin
+            known[n] = replace(one, world_T_rigs=poses, origin=origin)
+    return known
 
 
 def coarse_poses(
@@ -156,11 +146,8 @@ def with_baseline(settings: RefineSettings, calibration: Path | None) -> RefineS
 def given_circles(
     circles: Sequence[tuple[float, float, float]], calibration: Path | None
 ) -> tuple[ImageCircle, ...]:
-    """Image circles of the front and the back lens as a caller gives them, or one of both.
-
-    Raises:
-        GsbaError: more than two of them, no circles, or a calibration as well.
-    """
+    """Image circles of the front and the back lens, or one of both, as a caller gives them;
+    GsbaError for more than two, what is no circle, or a calibration as well."""
     if not circles:
         return ()
     if calibration is not None:
@@ -177,13 +164,8 @@ def given_circles(
 
 
 def read_gyro(imu: Path | None, frames: Path) -> Readings | None:
-    """Readings that a run is given, or that its raw video holds.
-
-    A video without them, or without the library that reads them, is taken as it is, in a line.
-
-    Raises:
-        GsbaError: a file of readings that cannot be used.
-    """
+    """Readings that a run is given, or that its raw video holds; a video without them, or without
+    the library that reads them, is taken as it is. GsbaError if `imu` cannot be used."""
     if imu is not None:
         return read_imu(imu)
     pair = lens_files(frames)
@@ -192,7 +174,10 @@ def read_gyro(imu: Path | None, frames: Path) -> Readings | None:
     errors = []
     for path in filter(Path.is_file, pair or (frames,)):  # of a pair, either may have it
         try:
-            found = read_telemetry(path, _duration_s(path))
+            duration_s = None  # of a video that cannot be read, which its extraction tells
+            with suppress(GsbaError):
+                duration_s = video.claimed_duration_s(path)
+            found = read_telemetry(path, duration_s)
         except GsbaError as error:
             errors.append(error)
             continue
@@ -203,20 +188,9 @@ def read_gyro(imu: Path | None, frames: Path) -> Readings | None:
     return None
 
 
-def _duration_s(path: Path) -> float | None:
-    """Seconds that a video claims to last; None = it cannot be read, which its extraction tells."""
-    try:
-        return video.claimed_duration_s(path)
-    except GsbaError:
-        return None
-
-
 def families_of(frames: FrameSet, settings: RefineSettings) -> list[Family]:
-    """GPS fixes and families that packages provide, as settings.factors name them.
-
-    Raises:
-        GsbaError: a package whose family cannot be made, or positions that cannot be used.
-    """
+    """GPS fixes and families that packages provide, as settings.factors name them; GsbaError if one
+    cannot be made."""
     fixes = positions_of(frames, settings)
     made: list[Family] = [] if fixes is None else [GpsFactors(fixes)]
     for named in settings.package_families():
@@ -230,13 +204,8 @@ def families_of(frames: FrameSet, settings: RefineSettings) -> list[Family]:
 
 
 def positions_of(frames: FrameSet, settings: RefineSettings) -> FrameFixes | None:
-    """GPS fixes of frames for the gps factors; None = they are not asked for.
-
-    Positions that the run's exports are to be placed by are read, too, to refuse them early.
-
-    Raises:
-        GsbaError: positions that cannot be used, or that too few frames have.
-    """
+    """GPS fixes of frames for the gps factors, None = not asked for; positions that exports are to
+    be placed by are read, too. GsbaError if they cannot be used, or too few frames have one."""
     check(settings.placement, frames, settings.camera.baseline())
     source = settings.gps.file
     if source is None:
@@ -265,36 +234,6 @@ def follows(
     return fps is None and asked == (VideoSettings().fps, None, None) and not settings.sharpest
 
 
-def extract_frames(
-    out: Path,
-    origin: Mapping[str, Path],
-    settings: RefineSettings,
-    fps: float | None,
-    fresh: bool,
-    by_odometry: Choice | None = None,
-    calibration: Path | None = None,
-) -> Odometry | None:
-    """Write the frames of the video that a run is about to `out`/frames.
-
-    Args:
-        out: folder of the run.
-        origin: the files that the run is about.
-        settings: see `gsba.config`.
-        fps: frames kept per second; None = as the settings say.
-        fresh: forget an earlier run in `out`.
-        by_odometry: choose the frames by what the video's own odometry shows under these masks;
-            None = by the settings.
-        calibration: of the lenses of a raw video, for the odometry.
-
-    Returns:
-        The odometry that frames were chosen by; None where it was not asked for, or found too
-        little.
-    """
-    check_positions(settings)
-    with RunStore(out, dict(origin), fresh, title_of=title_of) as store:
-        return extract_video(store, origin["frames"], settings, fps, by_odometry, calibration)
-
-
 def check_positions(settings: RefineSettings) -> None:
     """Refuse positions that the frames of a video cannot have, before hours of decoding."""
     if EXIF in (settings.placement.gps, settings.gps.file):
@@ -312,13 +251,17 @@ def extract_video(
     calibration: Path | None = None,
     name: str = "",
 ) -> Odometry | None:
-    """Write the frames of a video to `frames` in the run's folder, see `extract_frames`.
+    """Write the frames of a video to `frames` in the run's folder.
 
     Args:
-        store: of the run.
-        video_file: the video.
-        settings, fps, by_odometry, calibration: see `extract_frames`.
+        fps: frames kept per second; None = as the settings say.
+        by_odometry: choose the frames by what the video's own odometry shows under these masks;
+            None = by the settings.
+        calibration: of the lenses of a raw video, for the odometry.
         name: of one of several recordings, whose frames go to `frames`/`name`; "" = the only one.
+
+    Returns:
+        The odometry that frames were chosen by; None = not asked for, or it found too little.
     """
     compile_ahead(*([] if by_odometry is None else ["odometry"]), "refine")
     chosen, folder = settings.video, store.root / "frames" / name
@@ -349,8 +292,7 @@ def _follow(
     calibration: Path | None,
     name: str,
 ) -> Odometry | None:
-    """Odometry of a video, its trajectory and chosen frames written to the run's folder; None
-    where it lost the camera in most of the video."""
+    """Odometry of a video, written to the run's folder; None where it lost the camera mostly."""
     start, end = settings.video.from_s, settings.video.to_s
     width, seed = settings.odometry.width, settings.seed
     stage = f"odometry@{name}" if name else "odometry"

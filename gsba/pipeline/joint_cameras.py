@@ -1,18 +1,13 @@
-"""Cameras of several runs laid together: which are one camera, and the estimate of each for all.
-
-Cameras of different runs are one where one camera in one mode can have made their pictures, unless
-their models have different names. Raw fisheyes must have been read by one calibration, which the
-observations of both are directions by. The run that knows most of a camera lends its estimate.
-"""
+"""Cameras of several runs: which are one (of one mode and calibration, without two model names),
+and the estimate of each by the run that knows most of it."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsba.bundle.lens_centres import LensCentres, StitchRadius
 from gsba.bundle.readout import CameraEstimate, velocities
-from gsba.camera.lens import Lenses
+from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.config import CameraSettings
 from gsba.frames.recordings import one_mode, own_timestamps
 from gsba.log import GsbaError
@@ -44,7 +39,10 @@ class JointCameras:
                 alike = [
                     c
                     for c, (one, other) in enumerate(known)
-                    if c not in own and _one_cut(one, kind) and _one_model(other, chosen)
+                    if c not in own
+                    and one_mode(one, kind)
+                    and one.fisheyes == kind.fisheyes  # one calibration has read both
+                    and _one_model(other, chosen)
                 ]
                 if len(alike) != 1:  # none, or nothing tells which
                     alike = [len(formats)]
@@ -81,38 +79,51 @@ class JointCameras:
         solution: Solution,
         frames: FrameSet,
     ) -> tuple[FoundCamera, ...]:
-        """Estimate of each camera (C,), for the frames of all runs.
+        """Estimate of each camera (C,) for the frames of all runs, which `moves` place in the joint
+        one."""
+        times, poses = own_timestamps(frames), solution.world_T_rigs
+        starts = np.cumsum([0, *(len(run.frames) for run in runs)])
 
-        Args:
-            runs: the runs.
-            moves: similarities of each run's solution to its place in the joint one.
-            solution: the joint one.
-            frames: of all runs.
-        """
-        return tuple(
-            self._found(c, runs, moves, solution, frames) for c in range(len(self.formats))
-        )
+        def estimate(camera: int, known: FoundCamera, scale: float) -> CameraEstimate | None:
+            """In the joint unit, for the frames of all runs; None = one centre, not looked for."""
+            if not known.lenses:
+                return known.readout
+            found = known.estimate().scaled(scale)
+            motion, axes = list[np.ndarray](), list[np.ndarray]()
+            for n, (run, move) in enumerate(zip(runs, moves, strict=True)):
+                rows, c = np.arange(starts[n], starts[n + 1]), self.in_run(camera, n)
+                lenses = ONE_CENTRE if c is None else run.map.cameras[c].lenses
+                if found.lenses.readout_motion is not None:
+                    moved = None if c is None else lenses.scaled(move.scale).readout_motion
+                    if moved is None:  # the run did not find it
+                        moved = found.readout_s * velocities(poses[rows], times[rows])
+                    motion.append(moved)
+                straight = np.tile(np.eye(3), (len(rows), 1, 1))
+                axes.append(straight if lenses.axes is None else lenses.axes)
+            lenses = found.lenses
+            if lenses.readout_motion is not None:
+                lenses = replace(lenses, readout_motion=np.concatenate(motion))
+            if lenses.axes is not None:
+                lenses = replace(lenses, axes=np.concatenate(axes))
+            return replace(found, lenses=lenses)
 
-    def _found(
-        self,
-        camera: int,
-        runs: Sequence[FinishedRun],
-        moves: Sequence[Sim3],
-        solution: Solution,
-        frames: FrameSet,
-    ) -> FoundCamera:
-        number = self.seen_by[camera]
-        inside = self.in_run(camera, number)
-        assert inside is not None
-        known, scale = runs[number].map.cameras[inside], moves[number].scale
-        each = [(self._lenses_in(camera, n, run), len(run.frames)) for n, run in enumerate(runs)]
-        estimate = _for_all_frames(_scaled(known, scale), known, each, moves, solution, frames)
-        return _in_unit(known, estimate, scale)
-
-    def _lenses_in(self, camera: int, number: int, run: FinishedRun) -> Lenses | None:
-        """Lenses of a camera as a run knows them; None = it took none of its frames."""
-        inside = self.in_run(camera, number)
-        return None if inside is None else run.map.cameras[inside].lenses
+        every = list[FoundCamera]()
+        for camera, number in enumerate(self.seen_by):
+            inside = self.in_run(camera, number)
+            assert inside is not None
+            known, scale = runs[number].map.cameras[inside], moves[number].scale
+            found, centres, radius = estimate(camera, known, scale), known.centres, known.radius
+            if centres is not None:
+                lenses = Lenses() if found is None else found.lenses
+                covariance, centre = centres.covariance * scale**2, scale * centres.found
+                centres = replace(centres, lenses=lenses, found=centre, covariance=covariance)
+            if radius is not None:
+                inverse, sigma = radius.inverse_stitch_radius / scale, radius.sigma / scale
+                lenses = radius.lenses.scaled(scale)
+                changes = {"lenses": lenses, "inverse_stitch_radius": inverse, "sigma": sigma}
+                radius = replace(radius, **changes)
+            every.append(FoundCamera(centres, known.axes, radius, known.calibrated, found))
+        return tuple(every)
 
 
 def as_read_by(
@@ -124,7 +135,6 @@ def as_read_by(
     image circles tell. Settings of a camera that the run does not have say nothing of its model.
 
     Args:
-        run: a finished run.
         found: frames of the recordings by their names, of one camera each.
         models: camera model by recording; None = not known.
 
@@ -150,15 +160,8 @@ def as_read_by(
 
 
 def refuse_fields(runs: Sequence[FinishedRun], several: bool) -> None:
-    """Refuse to lay cameras beside one for which a field of stitching errors was found.
-
-    Args:
-        runs: finished runs.
-        several: True if they are to be a run of several cameras.
-
-    Raises:
-        GsbaError: a run has such a field.
-    """
+    """Refuse to lay cameras beside one for which a field of stitching errors was found, if runs are
+    to be one of `several` cameras."""
     for run in runs if several else ():
         if run.map.field:
             raise GsbaError(
@@ -178,18 +181,12 @@ def _one_make(kind: PictureFormat, frames: FrameSet) -> bool:
     return sizes[0] == sizes[1] and (unmasked or kind.width == own.width)
 
 
-def _one_cut(one: PictureFormat, other: PictureFormat) -> bool:
-    """True if one camera in one mode can have made both, and one calibration has read them."""
-    return one_mode(one, other) and one.fisheyes == other.fisheyes
-
-
 def _one_model(one: CameraSettings, other: CameraSettings) -> bool:
     """True unless settings name two models."""
     return one.name is None or other.name is None or one.name == other.name
 
 
 def _without_model(settings: CameraSettings) -> CameraSettings:
-    """Settings that say nothing of the camera's model."""
     metric = isinstance(settings.stitch_radius_m, float)
     changes = _UNKNOWN_MODEL | ({"stitch_radius_m": None} if metric else {})
     return settings.model_copy(update=changes)
@@ -201,92 +198,3 @@ def _best_run(runs: Sequence[FinishedRun], numbers: Sequence[tuple[int, ...]], c
     lenses = [runs[n].map.cameras[numbers[n].index(camera)].lenses for n in having]
     known = [(bool(one), sum(one.parts)) for one in lenses]
     return having[known.index(max(known))]
-
-
-def _for_all_frames(
-    found: CameraEstimate | None,
-    known: FoundCamera,
-    each: Sequence[tuple[Lenses | None, int]],
-    moves: Sequence[Sim3],
-    solution: Solution,
-    frames: FrameSet,
-) -> CameraEstimate | None:
-    """The estimate of a camera, for the frames of all runs; None = it has one centre.
-
-    Args:
-        found: the estimate in the joint unit.
-        known: what the run that lends it knows.
-        each: for each run, lenses of the camera, None = it took none of its frames; and number of
-            frames.
-        moves, solution, frames: as in `JointCameras.found`.
-    """
-    if found is None or not known.lenses:
-        return found
-    lenses = found.lenses
-    if lenses.readout_motion is not None:
-        motion = _readout_motion(each, moves, solution, frames, found.readout_s)
-        lenses = replace(lenses, readout_motion=motion)
-    if lenses.axes is not None:
-        axes = [
-            np.tile(np.eye(3), (num, 1, 1)) if one is None or one.axes is None else one.axes
-            for one, num in each
-        ]
-        lenses = replace(lenses, axes=np.concatenate(axes))
-    return replace(found, lenses=lenses)
-
-
-def _scaled(found: FoundCamera, scale: float) -> CameraEstimate | None:
-    """A camera in another unit: one map unit is `scale` of the new ones; None = it has one centre
-    and was not looked for."""
-    return found.estimate().scaled(scale) if found.lenses else found.readout
-
-
-def _in_unit(found: FoundCamera, camera: CameraEstimate | None, scale: float) -> FoundCamera:
-    """A camera of a map in another unit.
-
-    Args:
-        found: the camera in the old unit.
-        camera: its estimate in the new one; None = it has one centre.
-        scale: new units per old one.
-    """
-    radius = found.radius and _rescaled(found.radius, scale)
-    centres = _centres(found.centres, camera, scale)
-    return FoundCamera(centres, found.axes, radius, found.calibrated, camera)
-
-
-def _readout_motion(
-    each: Sequence[tuple[Lenses | None, int]],
-    moves: Sequence[Sim3],
-    solution: Solution,
-    frames: FrameSet,
-    readout_s: float,
-) -> np.ndarray:
-    """Motion (F, 6) of all frames during the readout: as their run found it, else by velocity."""
-    times, motion = own_timestamps(frames), list[np.ndarray]()
-    begin = 0
-    for (lenses, num), move in zip(each, moves, strict=True):
-        rows = np.arange(begin, begin + num)
-        own = None if lenses is None else lenses.scaled(move.scale).readout_motion
-        if own is None:
-            own = readout_s * velocities(solution.world_T_rigs[rows], times[rows])
-        motion.append(own)
-        begin += num
-    return np.concatenate(motion)
-
-
-def _rescaled(found: StitchRadius, scale: float) -> StitchRadius:
-    """An estimated radius in another unit: one map unit is `scale` of the new ones."""
-    inverse, sigma = found.inverse_stitch_radius / scale, found.sigma / scale
-    lenses = found.lenses.scaled(scale)
-    return replace(found, lenses=lenses, inverse_stitch_radius=inverse, sigma=sigma)
-
-
-def _centres(
-    found: LensCentres | None, camera: CameraEstimate | None, scale: float
-) -> LensCentres | None:
-    """Estimated centres in another unit, with the lenses of a camera."""
-    if found is None:
-        return None
-    lenses = Lenses() if camera is None else camera.lenses
-    covariance = found.covariance * scale**2
-    return replace(found, lenses=lenses, found=scale * found.found, covariance=covariance)

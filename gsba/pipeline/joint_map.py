@@ -1,10 +1,6 @@
-"""Maps of finished runs laid back to back as one state, which nothing ties together yet.
+"""Maps of finished runs laid back to back in the worlds of their results; nothing ties them yet."""
 
-Every run's map is carried to the world of its result. A camera that several runs share is that of
-the run which knows most of it; lengths of the others are such that its lenses are as far apart.
-"""
-
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -34,30 +30,25 @@ class JointMaps:
 
     @classmethod
     def of(cls, runs: Sequence[FinishedRun]) -> "JointMaps":
-        """Lay the maps of runs back to back.
-
-        Raises:
-            GsbaError: runs that cannot be one: of different features or faces, with recordings of
-                one name, or with one recording twice.
-        """
+        """Lay the maps of runs back to back; GsbaError for runs of different features or faces,
+        with recordings of one name, or with one recording twice."""
         _check_settings(runs)
         cameras = JointCameras.of(runs)
         frames = _frames_of(runs, cameras)
         starts = (0, *np.cumsum([len(run.frames) for run in runs]).tolist())
         moves = _moves(runs, cameras)
         solutions = [_moved(run, move) for run, move in zip(runs, moves, strict=True)]
-        observed = [_in_one_noise(run) for run in runs]
+        observed = [run.map.observed.scaled_noise(run.map.solution.noise) for run in runs]
         rig = rig_for(frames.formats[0], runs[0].settings.cubemap)
-        keypoints = on_faces(joined_keypoints([one for one, _ in observed]), rig)
-        aligned = np.concatenate([confirmed for _, confirmed in observed])
+        keypoints = on_faces(joined_keypoints(observed), rig)
         solution = _back_to_back(solutions, starts)
         parts = _parts_of(runs)
         map_ = Map(
             solution,
             keypoints,
             np.concatenate([run.map.frame_weights for run in runs]),
-            aligned,
-            np.concatenate([_normals(run) for run in runs]),
+            np.concatenate([run.map.confirmed for run in runs]),
+            np.concatenate([run.map.normals for run in runs]),
             None if len(cameras.formats) > 1 else runs[cameras.seen_by[0]].map.stitching,
             cameras.found(runs, moves, solution, frames),
             frames.camera_of_frame,
@@ -94,21 +85,7 @@ def joined_keypoints(parts: Sequence[Keypoints]) -> Keypoints:
     )
 
 
-def check_new(run: FinishedRun, found: Mapping[str, FrameSet]) -> None:
-    """Refuse recordings that a run has already.
-
-    Args:
-        run: a finished run.
-        found: frames of the recordings by their names.
-
-    Raises:
-        GsbaError: there is one; the message names it.
-    """
-    combine({**run.recordings(), **found})
-
-
 def _check_settings(runs: Sequence[FinishedRun]) -> None:
-    """Refuse runs whose features cannot be compared."""
     first = runs[0].settings
     for run in runs[1:]:
         for name in ("features", "cubemap"):
@@ -120,7 +97,6 @@ def _check_settings(runs: Sequence[FinishedRun]) -> None:
 
 
 def _frames_of(runs: Sequence[FinishedRun], cameras: JointCameras) -> FrameSet:
-    """Frames of all runs, one recording after the other."""
     recordings: dict[str, FrameSet] = {}
     for run in runs:
         for name, own in run.recordings().items():
@@ -140,8 +116,7 @@ def _frames_of(runs: Sequence[FinishedRun], cameras: JointCameras) -> FrameSet:
 
 
 def _moves(runs: Sequence[FinishedRun], cameras: JointCameras) -> tuple[Sim3, ...]:
-    """Similarities of runs from their solutions' worlds to those of their results, with the unit
-    of the first run for all that know the distance of the lenses of a camera that it has, too."""
+    """Similarities from solutions' to results' worlds, in the first run's unit if known."""
     moves = [run.to_result() for run in runs]
     for n in range(1, len(runs)):
         for pair in cameras.shared(0, n):
@@ -156,7 +131,6 @@ def _moves(runs: Sequence[FinishedRun], cameras: JointCameras) -> tuple[Sim3, ..
 
 
 def _moved(run: FinishedRun, move: Sim3) -> Solution:
-    """The solution of a run in another world."""
     solution = run.map.solution
     landmarks = replace(
         solution.landmarks, points_world=move.points(solution.landmarks.points_world)
@@ -165,20 +139,7 @@ def _moved(run: FinishedRun, move: Sim3) -> Solution:
     return replace(solution, world_T_rigs=poses, landmarks=landmarks)
 
 
-def _in_one_noise(run: FinishedRun) -> tuple[Keypoints, np.ndarray]:
-    """Keypoints of a run with the noise that its solution found, and which are aligned (N,)."""
-    observed, aligned = run.map.observed, run.map.aligned
-    scaled = observed.scaled_noise(run.map.solution.noise)
-    return scaled, np.zeros(len(observed.faces), bool) if aligned is None else aligned
-
-
-def _normals(run: FinishedRun) -> np.ndarray:
-    normals = run.map.normals_rig
-    return np.zeros((len(run.map.observed.faces), 3), np.float32) if normals is None else normals
-
-
 def _back_to_back(solutions: Sequence[Solution], starts: Sequence[int]) -> Solution:
-    """Solutions as one, each part in its own world."""
     begins = np.cumsum([0, *(one.landmarks.tracks.num_points for one in solutions)])
     tracks = [one.landmarks.tracks for one in solutions]
     points = [one.points + begin for one, begin in zip(tracks, begins, strict=False)]

@@ -73,11 +73,7 @@ class Map:
 
     @property
     def only(self) -> FoundCamera:
-        """The only camera.
-
-        Raises:
-            ValueError: there are several.
-        """
+        """The only camera; ValueError if there are several."""
         (found,) = self.cameras
         return found
 
@@ -95,6 +91,18 @@ class Map:
     def estimates(self) -> CameraEstimates:
         """Estimate of each camera."""
         return CameraEstimates(tuple(one.estimate() for one in self.cameras), self.of_frame)
+
+    @property
+    def confirmed(self) -> np.ndarray:
+        """Observations (N,) bool that patches have confirmed."""
+        num = len(self.observed.faces)
+        return np.zeros(num, bool) if self.aligned is None else self.aligned
+
+    @property
+    def normals(self) -> np.ndarray:
+        """Normals (N, 3) float32 of the surfaces that observations show, 0 = unknown."""
+        num, known = len(self.observed.faces), self.normals_rig
+        return np.zeros((num, 3), np.float32) if known is None else known
 
     @property
     def field(self) -> SphereField:

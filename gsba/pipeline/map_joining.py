@@ -1,10 +1,6 @@
-"""Finished maps made one: joined where they meet, tied by points of both, and solved together.
-
-What a run has solved is where this starts: its poses, its camera, its points with the observations
-that patches were aligned to. New are only the points that frames of different parts share. These
-are matched by features, aligned to patches in all frames that show them, and replace the points of
-either part that they are the same as.
-"""
+"""Finished maps made one: joined where they meet, tied by points of both, and solved together. Only
+points that frames of different parts share are new: they replace those of either part that they
+are."""
 
 import logging
 from collections.abc import Sequence
@@ -26,7 +22,7 @@ from gsba.loop_closure.map_similarity import (
     refined,
     similarity_covariance,
 )
-from gsba.loop_closure.merged_map import Registered
+from gsba.loop_closure.merged_map import Registered, carried
 from gsba.photometric.alignment import Observations
 from gsba.pipeline import backend, camera, frontend, inputs, patch_rounds
 from gsba.pipeline.joint_map import JointMaps, joined_keypoints
@@ -67,13 +63,7 @@ class ApartError(GsbaError):
 
 
 def begin(store: RunStore, maps: JointMaps, settings: RefineSettings) -> State:
-    """The state of maps that nothing ties together yet.
-
-    Args:
-        store: of the run that they become.
-        maps: of finished runs.
-        settings: of that run.
-    """
+    """The state of maps that nothing ties together yet."""
     poses = maps.map.solution.world_T_rigs
     start = CoarsePoses(
         poses,
@@ -92,11 +82,8 @@ def begin(store: RunStore, maps: JointMaps, settings: RefineSettings) -> State:
 
 
 def register(state: State, maps: JointMaps) -> State:
-    """Maps moved to where they meet others, as the test of joins confirms.
-
-    Raises:
-        ApartError: two maps meet in a scale that the distances of their lenses contradict.
-    """
+    """Maps moved to where they meet others, as the test of joins confirms; ApartError where two
+    meet in a scale that the distances of their lenses contradict."""
     run, solution = state.run, state.solution
     nothing = np.zeros(len(solution.world_T_rigs) - 1, bool)
 
@@ -106,11 +93,13 @@ def register(state: State, maps: JointMaps) -> State:
         return map_merging.merge(*given, run.frames.timestamps, True, owners)
 
     merged = run.stage("registered", run.matching_key(), compute, Registered)
-    _check_units(maps, merged)
-    landmarks = solution.landmarks.moved(merged.scales, merged.moves)
-    points = landmarks.points_world + merged.offsets[landmarks.tracks.hosts()]
+    for number in range(1, len(maps.runs)):
+        frames = int(maps.main_rows(0)[0]), int(maps.main_rows(number)[0])
+        if merged.components[frames[0]] == merged.components[frames[1]]:
+            for pair in maps.cameras.shared(0, number):
+                _check_unit(maps, merged, (0, number), pair)
     poses = merged.solved.world_T_rigs
-    moved = replace(solution, world_T_rigs=poses, landmarks=replace(landmarks, points_world=points))
+    moved = carried(solution, poses, merged.scales, merged.moves, merged.offsets)
     state = _with_unit(state, merged.scales, maps.unit_frames())
     return _tied_within(state.with_solution(moved), maps.parts, merged)
 
@@ -127,14 +116,8 @@ class RigidMoves:
     def pose_covariances(
         self, own: np.ndarray, world_T_rigs: np.ndarray, stretches: np.ndarray, parts: np.ndarray
     ) -> np.ndarray:
-        """Covariances (F, 6, 6) of moved poses, in the map that they were moved to.
-
-        Args:
-            own: (F, 6, 6) covariances in their own maps.
-            world_T_rigs: (F, 4, 4) poses after the moves.
-            stretches: (F,) units of the new map per unit of each frame's own one.
-            parts: (F,) part of each frame.
-        """
+        """Covariances (F, 6, 6) of poses (F, 4, 4) moved by parts (F,), in the new map, from those
+        in their own maps, of which a unit has `stretches` (F,) of the new one."""
         turned = world_T_rigs.copy()
         turned[:, :3, 3] -= self.moves[parts, :3, 3]  # what turns and grows under the move
         back = inverse(turned)
@@ -147,10 +130,8 @@ class RigidMoves:
 
 
 def align_rigidly(state: State, parts: np.ndarray) -> RigidMoves:
-    """Parts (F,) of joined maps moved by the points that they share, each as it is.
-
-    The first part of every map stays. Each further one is moved to those before it.
-    """
+    """Parts (F,) of joined maps moved, each as it is, by the points that they share with those
+    before them; the first part of every map stays."""
     run, merged, num = state.run, state.prior.merged, int(parts.max()) + 1
     assert merged is not None
     matches = _across(state, parts, merged).matches.across
@@ -225,11 +206,8 @@ def hold(state: State, rows: np.ndarray) -> State:
 
 
 def tie(state: State, parts: np.ndarray) -> State:
-    """Joined maps tied by the points that frames of different parts (F,) share, and adjusted.
-
-    Raises:
-        ApartError: they share no points, or frames lose theirs when maps are adjusted together.
-    """
+    """Joined maps tied by the points that frames of different parts (F,) share, and adjusted;
+    ApartError if they share none, or frames lose theirs when adjusted together."""
     merged, run = state.prior.merged, state.run
     assert merged is not None
     state = replace(state, matches=_across(state, parts, merged).matches)
@@ -250,21 +228,19 @@ def tie(state: State, parts: np.ndarray) -> State:
         raise ApartError(_NOT_TIED.format("lose points when they are adjusted together"))
     if not run.settings.patches.rounds:
         return solved
-    features = _unravelled(solved.map.observed, order, len(base.aligned), state.observed.shown)
-    state = replace(_with_poses_of(state, solved), matches=state.matches)
+    sigmas = np.empty(len(order))  # noise of features that are interleaved with observations
+    sigmas[order] = solved.map.observed.sigmas_rad
+    changed = {"sigmas_rad": sigmas[len(base.aligned) :], "sqrt_infos": None}
+    features = replace(state.observed.shown, **changed)
+    unread = all(one.readout is None for one in solved.map.cameras)
+    poses = replace(state.solution, world_T_rigs=solved.solution.world_T_rigs)
+    state = state.with_solution(poses)
+    state = state if unread else state.with_cameras(solved.map.estimates())
     return _aligned(state, base, features, parts) or solved
 
 
 def _aligned(state: State, base: Sighted, features: Keypoints, parts: np.ndarray) -> State | None:
-    """Shared points aligned to patches below a pixel, then all around them, and solved, until
-    steps move by less than their noise; None where that explains less.
-
-    Args:
-        state: poses and camera, and matches of features.
-        base: observations of the maps alone.
-        features: of all frames, as pictures show them, with the noise that they turned out to have.
-        parts: (F,) part of each frame.
-    """
+    """Shared points aligned to patches, then all around them, and solved; None = no better."""
     run, rounds = state.run, state.run.settings.patches.rounds
     gate = run.settings.rounds.aligned[0]
     rays = state.map.rays(features, run.rig)
@@ -281,7 +257,21 @@ def _aligned(state: State, base: Sighted, features: Keypoints, parts: np.ndarray
             break
         if n > 1:
             left, shared = _align_around(state, parts, f"align{n}")
-        solved = _solved(state, _joined_sighted(left, shared), f"aligned{n}")
+        keypoints, order = _interleaved(left.keypoints, shared.keypoints)
+        sizes, tracks = np.diff(left.keypoints.starts), shared.tracks
+        tracks = replace(tracks, keypoints=tracks.keypoints + sizes[tracks.frames])
+        normals = []
+        for one in (left, shared):
+            nothing = np.zeros((len(one.aligned), 3), np.float32)
+            normals.append(nothing if one.normals_rig is None else one.normals_rig)
+        both = Sighted(
+            keypoints,
+            np.concatenate([left.aligned, shared.aligned])[order],
+            _with_tracks(left.tracks, tracks),
+            shared.counts,
+            np.concatenate(normals)[order],
+        )
+        solved = _solved(state, both, f"aligned{n}")
         if solved is None:
             break
         before, state, better = state, solved, solved
@@ -289,11 +279,7 @@ def _aligned(state: State, base: Sighted, features: Keypoints, parts: np.ndarray
 
 
 def _align_around(state: State, parts: np.ndarray, name: str) -> tuple[Sighted, Sighted]:
-    """Observations of points that frames see where different parts meet, these observed anew.
-
-    Returns:
-        Those of all other points, and those of the points that were observed anew.
-    """
+    """Observations of all other points, and anew those of points that frames at meetings see."""
     solution = state.solution
     landmarks, tracks = solution.landmarks, solution.landmarks.tracks
     meeting = np.unique(tracks.frames[_of_several(tracks, parts)[tracks.points]])
@@ -309,22 +295,13 @@ def _align_around(state: State, parts: np.ndarray, name: str) -> tuple[Sighted, 
 def _solved(
     state: State, sighted: Sighted, name: str, gates: Sequence[float] | None = None
 ) -> State | None:
-    """Bundle adjustment of observations, with the camera unless poses are held; None where it
-    explains less."""
+    """Adjustment of observations, with the camera unless poses are held; None = no better."""
     held = any(isinstance(family, HeldPoses) for family in state.run.families.members)
     if held or not state.map.lenses:
         return patch_rounds.adjust_aligned(state, sighted, name, gates)
     solved, keypoints, found = camera.adjust_with_patches(state, sighted, name, gates)
     better = patch_rounds.carried(state, sighted, solved, keypoints)
     return None if better is None else better.with_cameras(found)
-
-
-def _with_poses_of(state: State, solved: State) -> State:
-    """The state with the poses and the camera of another one."""
-    poses = solved.solution.world_T_rigs
-    moved = state.with_solution(replace(state.solution, world_T_rigs=poses))
-    unread = all(one.readout is None for one in solved.map.cameras)
-    return moved if unread else moved.with_cameras(solved.map.estimates())
 
 
 def _tied_within(state: State, parts: np.ndarray, merged: Registered | None = None) -> State:
@@ -340,44 +317,26 @@ def _tied_within(state: State, parts: np.ndarray, merged: Registered | None = No
 
 
 def _with_unit(state: State, scales: np.ndarray, units: Sequence[int]) -> State:
-    """The state with its cameras in the unit of maps that are moved.
-
-    Args:
-        state: of the maps.
-        scales: (F,) by which each frame's map is moved.
-        units: (C,) frame of the map in whose unit each camera is.
-    """
+    """Cameras in the unit of maps moved by scales (F,), each in that of a frame `units` (C,)."""
     if all(one.readout is None for one in state.map.cameras) or not state.map.lenses:
         return state
     found = state.map.estimates()
-    pairs = zip(found.each, units, strict=True)
-    moved = found.with_each([_in_unit_of(one, scales, frame) for one, frame in pairs])
+    each = list[CameraEstimate]()
+    for one, frame in zip(found.each, units, strict=True):
+        scaled, motion = one.scaled(float(scales[frame])), one.lenses.readout_motion
+        if motion is not None:
+            factors = np.repeat(np.column_stack([np.ones(len(motion)), scales]), 3, axis=1)
+            lenses = replace(scaled.lenses, readout_motion=motion * factors)
+            scaled = replace(scaled, lenses=lenses)
+        each.append(scaled)
+    moved = found.with_each(each)
     return state.with_cameras(moved).through(moved.cameras)
-
-
-def _in_unit_of(found: CameraEstimate, scales: np.ndarray, frame: int) -> CameraEstimate:
-    """A camera of `_with_unit`."""
-    scaled, motion = found.scaled(float(scales[frame])), found.lenses.readout_motion
-    if motion is None:
-        return scaled
-    factors = np.repeat(np.column_stack([np.ones(len(motion)), scales]), 3, axis=1)
-    return replace(scaled, lenses=replace(scaled.lenses, readout_motion=motion * factors))
-
-
-def _check_units(maps: JointMaps, merged: Registered) -> None:
-    """Refuse maps that meet in another scale than the lenses of a camera that both have."""
-    for number in range(1, len(maps.runs)):
-        frames = int(maps.main_rows(0)[0]), int(maps.main_rows(number)[0])
-        if merged.components[frames[0]] == merged.components[frames[1]]:
-            for pair in maps.cameras.shared(0, number):
-                _check_unit(maps, merged, (0, number), pair)
 
 
 def _check_unit(
     maps: JointMaps, merged: Registered, numbers: tuple[int, int], cameras: tuple[int, int]
 ) -> None:
-    """Refuse two maps (numbers of their runs) that meet in another scale than the lenses of a
-    camera (its numbers in these runs), which are equally far apart."""
+    """Refuse two maps that meet in another scale than the lenses of a camera that both have."""
     lengths, shares = list[float](), list[float]()
     for number, c in zip(numbers, cameras, strict=True):
         run, move = maps.runs[number], maps.moves[number]
@@ -455,27 +414,19 @@ def _matches_of(tracks: Tracks) -> Matches:
 
 
 def _across(state: State, parts: np.ndarray, merged: Registered) -> State:
-    """The state with matches of frames of different parts (F,), around the joined maps' points.
-
-    Where frames share few points, no two of them confirm each other, as all together have confirmed
-    the join: then matches are those within the bearings that the join predicts.
-    """
+    """The state with matches of frames of different parts (F,), around the joined maps' points."""
     if not merged.met.any():
         return state
     near = state.with_solution(replace(_by_features(state), noise=1.0))
     found = frontend.match_across(near, parts)
     across = found.matches.across
     assert across is not None
-    if set(parts[across.pairs].ravel()) >= _met_parts(parts, merged):
-        return found
-    return frontend.match_known_points_across(found, parts, "across_points")
-
-
-def _met_parts(parts: np.ndarray, merged: Registered) -> set[int]:
-    """Parts of maps that images joined from several ones."""
     joined = np.unique(np.column_stack([merged.components, parts])[merged.met], axis=0)
     maps, numbers = np.unique(joined[:, 0], return_counts=True)
-    return set(joined[np.isin(joined[:, 0], maps[numbers > 1]), 1].tolist())
+    met = set(joined[np.isin(joined[:, 0], maps[numbers > 1]), 1].tolist())
+    if set(parts[across.pairs].ravel()) >= met:  # parts of maps that images joined from several
+        return found
+    return frontend.match_known_points_across(found, parts, "across_points")
 
 
 def _crossing(state: State, parts: np.ndarray) -> Tracks:
@@ -495,11 +446,10 @@ def _of_several(tracks: Tracks, parts: np.ndarray) -> np.ndarray:
 
 
 def _sighted(state: State) -> Sighted:
-    """The observations of the map's points."""
     map_ = state.map
-    aligned = np.zeros(len(map_.observed.faces), bool) if map_.aligned is None else map_.aligned
     landmarks = map_.solution.landmarks
-    return Sighted(map_.observed, aligned, landmarks.tracks, landmarks.counts, map_.normals_rig)
+    seen = landmarks.tracks, landmarks.counts, map_.normals_rig
+    return Sighted(map_.observed, map_.confirmed, *seen)
 
 
 def _interleaved(one: Keypoints, other: Keypoints) -> tuple[Keypoints, np.ndarray]:
@@ -507,13 +457,6 @@ def _interleaved(one: Keypoints, other: Keypoints) -> tuple[Keypoints, np.ndarra
     frames = np.concatenate([one.frames(), other.frames()])
     order = np.argsort(frames, kind="stable")
     return joined_keypoints([one, other]).at(order, one.starts + other.starts), order
-
-
-def _unravelled(both: Keypoints, order: np.ndarray, num_first: int, other: Keypoints) -> Keypoints:
-    """The second of two interleaved sets of keypoints, with the noise that it has there."""
-    sigmas = np.empty(len(order))
-    sigmas[order] = both.sigmas_rad
-    return replace(other, sigmas_rad=sigmas[num_first:], sqrt_infos=None)
 
 
 def _with_tracks(one: Tracks, other: Tracks) -> Tracks:
@@ -526,28 +469,8 @@ def _with_tracks(one: Tracks, other: Tracks) -> Tracks:
     )
 
 
-def _joined_sighted(one: Sighted, other: Sighted) -> Sighted:
-    """Observations of both."""
-    keypoints, order = _interleaved(one.keypoints, other.keypoints)
-    sizes = np.diff(one.keypoints.starts)
-    moved = replace(other.tracks, keypoints=other.tracks.keypoints + sizes[other.tracks.frames])
-    normals = np.concatenate([_normals_of(one), _normals_of(other)])[order]
-    aligned = np.concatenate([one.aligned, other.aligned])[order]
-    return Sighted(keypoints, aligned, _with_tracks(one.tracks, moved), other.counts, normals)
-
-
-def _normals_of(sighted: Sighted) -> np.ndarray:
-    normals = sighted.normals_rig
-    return np.zeros((len(sighted.aligned), 3), np.float32) if normals is None else normals
-
-
 def _without_same(base: Sighted, shared: Sighted, width: int) -> Sighted:
-    """Observations without those of points that are observed anew among the shared ones.
-
-    Args:
-        base, shared: observations, as pictures show them.
-        width: of a panorama, pixels.
-    """
+    """Observations without those of points that are observed anew among the shared ones."""
     from scipy.spatial import KDTree
 
     radius, tracks = _SAME_POINT_PX * 2 * np.pi / width, base.tracks

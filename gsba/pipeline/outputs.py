@@ -10,8 +10,6 @@ from gsba.bundle.map_strength import MAX_SCALE_SIGMA
 from gsba.bundle.reconstruction import world_scale
 from gsba.camera.calibration import calibration_json
 from gsba.camera.cameras import Cameras
-from gsba.camera.fisheye import Rig
-from gsba.camera.lens import Lenses
 from gsba.config_file import to_toml
 from gsba.disk import write_json, write_text
 from gsba.export import ExportFormat, ExportOptions, export_all, seen_by, write_points
@@ -86,13 +84,7 @@ class RunResult:
 
 
 def write(state: State, result: Reconstruction, cameras: Cameras) -> RunResult:
-    """Poses, cloud, report and datasets; of several maps that nothing ties together the largest.
-
-    Args:
-        state: of the run at its end.
-        result: what its map became in the trajectory's world.
-        cameras: in the result's unit.
-    """
+    """Poses, cloud, report and datasets; of several maps that nothing ties together the largest."""
     run, prior, world = state.run, state.prior, state.map
     store, settings, coarse = run.store, run.settings, prior.coarse
     frames, out, rows = world.straightened(run.frames), store.root, result.largest_map()
@@ -137,7 +129,6 @@ def _write_trajectories(store: RunStore, shown: FrameSet, main: Reconstruction) 
 
 
 def _reasons(prior: Prior) -> tuple[str, ...]:
-    """Why maps were not joined, the largest first."""
     return () if prior.merged is None else prior.merged.reasons
 
 
@@ -147,35 +138,30 @@ def _write_calibrations(state: State, result: Reconstruction, cameras: Cameras) 
     for path in store.root.glob(f"calibration@*{CALIBRATION[-5:]}"):  # of an earlier call
         path.unlink()
     several = len(frames.formats) > 1
+    baseline, metres = state.run.settings.camera.baseline(), None
+    if baseline is not None and result.lens_baseline is not None:
+        metres = metres_per_unit(result.lens_baseline, baseline)[0]
     for number, name in enumerate(names_of_cameras(frames)):
         rig = frames.formats[number].fisheyes
         if rig is not None:
             path = store.root / (f"calibration@{name}.json" if several else CALIBRATION)
-            content = _calibration(rig, state, result, cameras.lenses[number], number)
-            write_json(path, content)
+            read, centre = state.map.cameras[number].estimate(), cameras.lenses[number].centre
+            timed = read.lenses.readout_motion is not None
+            more = {"readout_s": read.readout_s} if timed else {}
+            scale, unit = (1.0, "map") if metres is None else (metres, "m")
+            write_json(path, calibration_json(rig, centre * scale, unit, more))
             store.claim(path)
 
 
-def _calibration(
-    rig: Rig, state: State, result: Reconstruction, lenses: Lenses, number: int
-) -> dict[str, Any]:
-    """The content of calibration.json of one camera."""
-    baseline, metres = state.run.settings.camera.baseline(), None
-    if baseline is not None and result.lens_baseline is not None:
-        metres = metres_per_unit(result.lens_baseline, baseline)[0]
-    read = state.map.cameras[number].estimate()
-    more = {"readout_s": read.readout_s} if read.lenses.readout_motion is not None else {}
-    centre = lenses.centre * (1.0 if metres is None else metres)
-    return calibration_json(rig, centre, "map" if metres is None else "m", more)
-
-
 def _report(state: State, result: Reconstruction) -> dict[str, Any]:
-    """The content of report.json."""
     run, rounds = state.run, state.run.journal.rounds
     solver = [{"stage": name, "rounds": some} for name, some in rounds.items()]
     costs, again_s = tuple(run.store.records.values()), run.store.seconds_again
     stages = StageLog(costs, run.journal.counts, solver, again_s)
-    gauge, of_families = _gauge(run, state.prior), _of_families(state)
+    snapshot = run.families.snapshot(state.solution, state.prior.parts)
+    of_families = {family.name: plain(family.report(snapshot)) for family in run.families.members}
+    of_families = {name: report for name, report in of_families.items() if report}
+    gauge = _gauge(run, state.prior)
     found = _findings(state, result, of_families.pop(GpsFactors.name, None))
     coarse = state.prior.coarse
     report = build_report(run.settings, run.frames, coarse, result, stages, gauge, found)
@@ -187,11 +173,7 @@ def _report(state: State, result: Reconstruction) -> dict[str, Any]:
 
 
 def _findings(state: State, result: Reconstruction, gps: dict[str, Any] | None) -> Findings:
-    """Sections of the report on trajectory, camera and sensors, and notes on all that is odd.
-
-    Args:
-        gps: report of the GPS fixes; None = there are none.
-    """
+    """Sections of the report on trajectory, camera and sensors, and notes on all that is odd."""
     prior, map_, frames = state.prior, state.map, state.run.frames
     trajectory, notes = findings.of_trajectory(
         prior.trust, prior.clock, prior.merged, prior.joints, frames, prior.absent
@@ -206,7 +188,11 @@ def _findings(state: State, result: Reconstruction, gps: dict[str, Any] | None) 
     notes += more
     gyro = None
     if prior.gyro is not None:
-        gyro, more = of_gyro(prior.gyro, _gyro_steps_used(state), map_.cameras[0].readout)
+        used, snapshot = None, state.run.families.snapshot(state.solution, prior.parts)
+        for family in prior.families(state.run.settings.priors):
+            if isinstance(family, GyroTurns):
+                used = family.report(snapshot)["steps_used"]
+        gyro, more = of_gyro(prior.gyro, used, map_.cameras[0].readout)
         notes += more
     if gps is not None:
         notes += notes_on_gps(gps, len(frames))
@@ -250,7 +236,6 @@ def _of_camera(
 
 
 def _of_cameras(state: State, result: Reconstruction) -> list[dict[str, Any]]:
-    """The report of each of several cameras: its recordings, its pictures and its lenses."""
     frames = state.run.frames
     every = list[dict[str, Any]]()
     for number, kind in enumerate(frames.formats):
@@ -260,23 +245,6 @@ def _of_cameras(state: State, result: Reconstruction) -> list[dict[str, Any]]:
         content |= {"width": kind.width, "height": kind.height}
         every.append(content | {"lenses": plain(_of_camera(state, result, number)[0])})
     return every
-
-
-def _gyro_steps_used(state: State) -> float | None:
-    """Share of steps whose rotation agrees with the gyro; None = no gyro was used."""
-    snapshot = state.run.families.snapshot(state.solution, state.prior.parts)
-    for family in state.prior.families(state.run.settings.priors):
-        if isinstance(family, GyroTurns):
-            return family.report(snapshot)["steps_used"]
-    return None
-
-
-def _of_families(state: State) -> dict[str, Any]:
-    """The report of each family of GPS, of packages and of the caller, by its name."""
-    families = state.run.families
-    snapshot = families.snapshot(state.solution, state.prior.parts)
-    reports = {family.name: plain(family.report(snapshot)) for family in families.members}
-    return {name: report for name, report in reports.items() if report}
 
 
 def _gauge(run: Run, prior: Prior) -> str:

@@ -9,7 +9,7 @@ from gsba.bundle.reconstruction import MIN_OBSERVATIONS
 from gsba.bundle.stitching import Stitching
 from gsba.photometric import alignment
 from gsba.photometric.alignment import Observations
-from gsba.pipeline import camera, gyro
+from gsba.pipeline import camera, frontend
 from gsba.pipeline.state import State
 from gsba.types import Keypoints, Sighted, Solution
 
@@ -26,16 +26,13 @@ def align(state: State) -> State:
         if is_settled(before, state, n):
             break
         if n > 1:
-            state = gyro.align_to_map(state, f"imu_aligned{n}")
+            state = frontend.align_gyro_to_map(state, f"imu_aligned{n}")
         before, state = state, _round(state, n)
     return state
 
 
 def _round(state: State, number: int) -> State:
-    """Patches around the map's points aligned to its frames, solved, straightened.
-
-    The map stays as it was where that explains less.
-    """
+    """Patches aligned to frames, solved, straightened; the map as it was where that is worse."""
     sighted = observe(state, state.solution, observations(state), f"align{number}")
     better = _adjust_under_lenses(state, sighted, number)
     if better is None:
@@ -51,7 +48,7 @@ def _adjust_under_lenses(state: State, sighted: Sighted, number: int) -> State |
     if not state.map.lenses:
         return adjust_aligned(state, sighted, name)
     for n in range(2):
-        state = gyro.align_to_map(state, f"imu_{name}_{n}", with_noise=False)
+        state = frontend.align_gyro_to_map(state, f"imu_{name}_{n}", with_noise=False)
         trial = camera.take_parts_from_patches(state, sighted, name, n)
         if n and trial.map.lenses.parts == state.map.lenses.parts:
             return trial
@@ -65,14 +62,7 @@ def _adjust_under_lenses(state: State, sighted: Sighted, number: int) -> State |
 
 
 def observe(state: State, start: Solution, observed: Observations, name: str) -> Sighted:
-    """Points of a solution observed anew, by aligned patches.
-
-    Args:
-        state: frames, camera and settings.
-        start: poses and points.
-        observed: observations of these points so far.
-        name: of the stage.
-    """
+    """Points of a solution observed anew, by aligned patches."""
     run, settings = state.run, state.run.settings.patches
 
     def compute() -> Sighted:
@@ -91,13 +81,7 @@ def observations(state: State) -> Observations:
 def adjust_aligned(
     state: State, sighted: Sighted, name: str, gates: Sequence[float] | None = None
 ) -> State | None:
-    """Bundle adjustment of aligned observations; None where that explains less.
-
-    Args:
-        state, sighted: the map, and its observations.
-        name: of the stage.
-        gates: of the rounds; None = those of aligned patches.
-    """
+    """Bundle adjustment of aligned observations; None where that explains less."""
     run, map_ = state.run, state.map
     gates = run.settings.rounds.aligned if gates is None else gates
 
@@ -127,7 +111,6 @@ def carried(state: State, sighted: Sighted, solved: Solution, keypoints: Keypoin
 
 
 def _straighten(state: State, sighted: Sighted, number: int) -> State:
-    """Remove the stitching field that all frames share."""
     run, map_, settings = state.run, state.map, state.run.settings
     looked_for = number == 1 or map_.field
     stitched = len(run.frames.formats) == 1 and run.frames.format.layout in ("erp", "eac")
@@ -153,12 +136,7 @@ def _straighten(state: State, sighted: Sighted, number: int) -> State:
 
 
 def is_settled(before: State, state: State, number: int) -> bool:
-    """True if the last round of aligning patches moved steps by less than their noise.
-
-    Args:
-        before, state: before that round, and after it.
-        number: of the next round, from 1.
-    """
+    """True if the last round (`number` is the next) moved steps by less than their noise."""
     if number <= _MIN_ROUNDS:
         return False
     run, prior, solution = state.run, state.prior, state.solution

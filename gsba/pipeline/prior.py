@@ -11,7 +11,7 @@ from gsba.bundle.map_strength import MapStrength
 from gsba.bundle.trajectory_prior import LOSS_SIGMAS, TrajectoryPrior
 from gsba.config import PriorSettings
 from gsba.imu.alignment import Alignment
-from gsba.loop_closure.merged_map import Registered, side_by_side
+from gsba.loop_closure.merged_map import Registered
 from gsba.trajectory.clock import ClockEstimate
 from gsba.trajectory.joining import SegmentAlignment
 from gsba.trajectory.judgement import StepChecks
@@ -68,15 +68,13 @@ class Prior:
     def families(
         self, settings: PriorSettings, first: np.ndarray | None = None
     ) -> tuple[Family, ...]:
-        """The trajectory prior, as far as images confirm it, and the gyro's family if it has one.
-
-        Args:
-            settings: noise of the trajectory, unless images showed it.
-            first: (4, 4) where the first pose is held; None = where the start has it.
-        """
+        """The trajectory prior, as far as images confirm it, and the gyro's family if it has one;
+        `first` (4, 4) is where the first pose is held, None = where the start has it."""
         trust, strength = self.trust, self.strength
         whole = trust.false_steps.all()  # then the start is all there is
-        believed = trust.world_T_rigs if whole else self._side_by_side()
+        believed = trust.world_T_rigs if whole else self.coarse.world_T_rigs.copy()
+        if self.merged is not None and not whole:
+            believed[:, :3, 3] += self.merged.offsets
         false, noise = trust.false_steps, None
         if strength is not None:
             false, noise = false | strength.held_steps, strength.noise
@@ -120,6 +118,3 @@ class Prior:
         others = np.isin(maps, maps[defining]) & ~defining
         sources = np.where(others, PoseSource.INTERPOLATED, coarse.sources).astype(np.uint8)
         return replace(coarse, world_T_rigs=poses, sources=sources)
-
-    def _side_by_side(self) -> np.ndarray:
-        return side_by_side(self.coarse.world_T_rigs, self.merged)

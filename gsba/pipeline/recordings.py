@@ -17,8 +17,8 @@ from gsba.log import GsbaError
 from gsba.masks import merging
 from gsba.masks.segmentation import Segment
 from gsba.pipeline import inputs
+from gsba.pipeline.each_recording import naming_recording
 from gsba.pipeline.outputs import RunResult
-from gsba.pipeline.recording import Recording, names_of
 from gsba.pipeline.refine import Start, refine_from
 from gsba.pipeline.run import Evidence, RecordingEvidence
 from gsba.pipeline.stage_titles import title_of
@@ -31,6 +31,49 @@ from gsba.types import FrameSet, RunStart, Trajectory
 
 if TYPE_CHECKING:
     from distributed import Client
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """One recording of a place, with a clock, a trajectory and a gyro of its own.
+
+    Paths may be text. Fields without a comment are those of `gsba.refine`.
+    """
+
+    frames: Path | str  # folder of frames, or a video
+    trajectory: Path | str | Sequence[Path | str] | None = None
+    name: str = ""  # folder of its frames in exports; "" = that of its folder or video
+    keyframes: Path | str | None = None
+    masks: merging.Masks = merging.AUTO
+    timestamps: Path | str | None = None
+    fps: float | None = None
+    calibration: Path | str | None = None
+    circles: Sequence[tuple[float, float, float]] = ()
+    imu: Path | str | None = None
+    odometry: bool | None = None
+    camera: str | None = None  # camera model, as the setting camera.name; None = not known
+
+
+def names_of(recordings: Sequence[Recording]) -> list[str]:
+    """A name for each recording: its own, else that of its folder or video, with its parent's
+    before it where several have one. GsbaError if two recordings still have one name."""
+    paths = [Path(one.frames).resolve() for one in recordings]
+    for path in paths:
+        if paths.count(path) > 1:
+            raise GsbaError(f"recording {path} is given twice: give each one once")
+    stems = [path.stem if path.is_file() else path.name for path in paths]
+    names = []
+    for one, path, stem in zip(recordings, paths, stems, strict=True):
+        repeated = stems.count(stem) > 1
+        names.append(one.name or (f"{path.parent.name}-{stem}" if repeated else stem))
+    for name in names:
+        if names.count(name) > 1:
+            places = [str(path) for path, other in zip(paths, names, strict=True) if other == name]
+            raise GsbaError(
+                f"recordings {places[0]} and {places[1]} are both named '{name}': give each a name "
+                "(name=NAME)"
+            )
+    return names
 
 
 @threadpool_limits.wrap(limits=1, user_api="blas")  # frames have threads; sums keep their order
@@ -75,16 +118,9 @@ def refine_each(
     adapt: Callable[[Mapping[str, FrameSet]], Mapping[str, tuple[FrameSet, CameraSettings]]]
     | None = None,
 ) -> RunResult:
-    """Refine recordings in one run as `refine_recordings` does; one is enough.
-
-    Args:
-        recordings, out, settings, segment, fresh, families, client: see `refine_recordings`.
-        adapt: gives frames as they are to be read, and settings of their camera, from frames by the
-            name of their recording, before anything is computed; None = as they are, `settings`.
-
-    Raises:
-        GsbaError: as `refine_recordings`, and what `adapt` raises.
-    """
+    """Refine recordings, one or more, in one run as `refine_recordings` does. `adapt` gives frames
+    as they are to be read, and settings of their camera, from frames by the name of their
+    recording."""
     plain = settings or RefineSettings()
     convention = Convention.parse(plain.read.trajectory_format)
     given = [
@@ -138,10 +174,8 @@ class _Given:
         """A recording whose trajectory files are read, before any video is decoded."""
         folder = Path(recording.frames)
         poses = inputs.trajectory_files(recording.trajectory, _path(recording.keyframes))
-        try:
+        with naming_recording(name):
             pieces = inputs.read_trajectories(poses, _path(recording.timestamps), convention)
-        except GsbaError as error:
-            raise _named(name, error) from error
         files = {f"{name}: {what}": path for what, path in ({"frames": folder} | poses).items()}
         return cls(name, recording, files, tuple(pieces), folder)
 
@@ -150,12 +184,10 @@ class _Given:
         one, given = self.recording, merging.choose(self.recording.masks).given
         timestamps, fps = (None, None) if self.extracted else (_path(one.timestamps), one.fps)
         calibration = _path(one.calibration)
-        try:
+        with naming_recording(self.name):
             circles = inputs.given_circles(one.circles, calibration)
             by_order = not self.trajectories
             return scan(self.folder, timestamps, fps, given, by_order, calibration, circles)
-        except GsbaError as error:
-            raise _named(self.name, error) from error
 
     def camera(self, settings: RefineSettings) -> CameraSettings:
         """Settings of its camera: the model that it names, the baseline of its calibration."""
@@ -168,12 +200,10 @@ class _Given:
         self, frames: FrameSet, settings: RefineSettings, plain: RefineSettings
     ) -> RecordingEvidence:
         """Initial poses of its frames, its gyro, and its camera by the `plain` settings of all."""
-        try:
+        with naming_recording(self.name):
             trajectories = tuple(inputs.timed(self.trajectories, frames))
             coarse = inputs.coarse_poses(frames, trajectories, settings)
             imu = inputs.read_gyro(_path(self.recording.imu), Path(self.recording.frames))
-        except GsbaError as error:
-            raise _named(self.name, error) from error
         start = RunStart.TRAJECTORY if trajectories else RunStart.PAIRS
         start, camera = RunStart.ODOMETRY if self.followed else start, self.camera(plain)
         return RecordingEvidence(self.name, coarse, trajectories, imu, camera, start)
@@ -183,14 +213,8 @@ def _path(given: Path | str | None) -> Path | None:
     return None if given is None else Path(given)
 
 
-def _named(name: str, error: GsbaError) -> GsbaError:
-    """An error of one recording, with the recording's name."""
-    return GsbaError(f"recording '{name}': {error}")
-
-
 def _with_camera(settings: RefineSettings, given: Sequence[_Given]) -> RefineSettings:
-    """Settings with the camera model that recordings name first, and the baseline of a
-    calibration."""
+    """Settings with the first camera model that is named, and the baseline of a calibration."""
     for name in [one.recording.camera for one in given if one.recording.camera is not None][:1]:
         camera = settings.camera.model_dump() | {"name": name}
         settings = validated(settings.model_dump() | {"camera": camera})
@@ -220,10 +244,7 @@ def _with_videos(
     settings: RefineSettings,
     fresh: bool,
 ) -> tuple[list[_Given], bool]:
-    """Recordings with the frames of videos extracted, and whether to forget an earlier run yet.
-
-    Videos without a trajectory are followed by odometry, see `gsba.refine`.
-    """
+    """Recordings with the frames of videos extracted, and whether to forget an earlier run yet."""
     if not any(video.is_video(one.folder) for one in given):
         return list(given), fresh
     inputs.check_positions(settings)
@@ -240,10 +261,8 @@ def _extracted(one: _Given, store: RunStore, settings: RefineSettings) -> _Given
     followed = inputs.follows(settings.video, recording.fps, recording.odometry, one.trajectories)
     chosen = merging.choose(recording.masks) if followed else None
     given = one.folder, settings, recording.fps, chosen, _path(recording.calibration), one.name
-    try:
+    with naming_recording(one.name):
         walk = inputs.extract_video(store, *given)
-    except GsbaError as error:
-        raise _named(one.name, error) from error
     ready = replace(one, folder=store.root / "frames" / one.name, extracted=True)
     if walk is None:
         return ready

@@ -26,7 +26,6 @@ from gsba.pipeline import (
     each_recording,
     finished_run,
     frontend,
-    gyro,
     inputs,
     outputs,
     patch_rounds,
@@ -42,7 +41,7 @@ from gsba.store import cluster
 from gsba.store.store import RunStore
 from gsba.trajectory.conventions import Convention
 from gsba.trajectory.misread import TurnedAboutForwardError
-from gsba.types import CoarsePoses, FrameSet, Reconstruction, RunStart
+from gsba.types import CoarsePoses, FrameSet, Reconstruction, RunStart, VerifiedPairs
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -106,7 +105,9 @@ def refine(
     given = inputs.read_trajectories(origin, timestamps, convention)  # fails before decoding
     if video.is_video(frames):
         by_odometry = chosen if inputs.follows(settings.video, fps, odometry, given) else None
-        walk = inputs.extract_frames(out, origin, settings, fps, fresh, by_odometry, calibration)
+        inputs.check_positions(settings)
+        with RunStore(out, origin, fresh, title_of=title_of) as store:
+            walk = inputs.extract_video(store, frames, settings, fps, by_odometry, calibration)
         frames, timestamps, fps, fresh = out / "frames", None, None, False
     if walk is not None:  # made of these very images: no evidence beside them
         given, settings = walk.pieces(), inputs.for_odometry(settings)
@@ -148,15 +149,8 @@ def refine_from(
     source: Path,
     walk: Odometry | None,
 ) -> RunResult:
-    """Run all stages, from frames to written outputs.
-
-    Args:
-        given: the evidence that does not depend on the frames.
-        start: the frames.
-        source: folder or video that they come from.
-        walk: the odometry of the video; None = frames were not chosen by it.
-        store, settings, chosen: of the run.
-    """
+    """Run all stages, from frames to written outputs; `walk` is the odometry that chose the
+    frames."""
     compile_ahead("refine")
     warn_of_repeats(start.frames)
     if walk is not None:
@@ -171,16 +165,7 @@ def refine_from(
 
 
 def _solve_or_turn(run: Run, followed: bool) -> tuple[State, Reconstruction]:
-    """The last state and its result; rotations alone where images determine no positions, but prove
-    that the camera turned on the spot.
-
-    Args:
-        run: at its start.
-        followed: True if the trajectory is an odometry of the same images.
-
-    Raises:
-        GsbaError: images that determine neither.
-    """
+    """The last state and its result; rotations alone where only a turn on the spot is proved."""
     try:
         state = _solve_raw(run)
         result = backend.reconstruct(state)
@@ -209,11 +194,7 @@ def _with_fetched(
     video_file: Path,
     walk: Odometry,
 ) -> Start:
-    """The start with more frames of a video where the map of features is weak.
-
-    Raises:
-        GsbaError: the odometry is in pieces, and a vehicle carries the camera.
-    """
+    """The start with more frames of a video where the map of features is weak."""
     if start.coarse.segments is not None:
         acceptance.refuse_vehicle_in_pieces(_begin(store, settings, chosen, start).frames)
 
@@ -227,7 +208,6 @@ def _with_fetched(
 
 
 def _begin(store: RunStore, settings: RefineSettings, chosen: merging.Choice, start: Start) -> Run:
-    """A run on frames that are masked as asked."""
     journal, frames = Journal(), merging.before(store, start.frames, chosen)
     if chosen.distractors:
         frames = _without_distractors(store, settings, replace(start, frames=frames), journal)
@@ -254,11 +234,7 @@ def _without_distractors(
 
 
 def _solve_raw(run: Run) -> State:
-    """The method; raw pairs anew, cut by what their lenses turned out to be, where that is far off.
-
-    Returns:
-        The state after the last pass, whose run has the frames as they were cut for it.
-    """
+    """The method; raw pairs cut anew by what their lenses turned out to be, if that is far off."""
     evidence = run.evidence
     known = [run.settings.model_dump(exclude={"export", "placement"}), run.families.digests()]
     known += [] if evidence.imu is None else [evidence.imu.digest]
@@ -305,12 +281,7 @@ def _solve_raw(run: Run) -> State:
 def _in_axes_of_trajectory(
     frames: FrameSet, error: TurnedAboutForwardError, first: bool
 ) -> camera.Cuts:
-    """Lenses to cut raw frames of one camera by in the first pass, so that they are upright as the
-    trajectory is.
-
-    Raises:
-        TurnedAboutForwardError: the error, of other frames.
-    """
+    """Lenses by which raw frames of one camera are cut as upright as the trajectory is."""
     lenses = frames.formats[0].fisheyes
     if not first or len(frames.formats) > 1 or lenses is None:
         raise error
@@ -345,12 +316,12 @@ def solve(state: State) -> State:
         if [bool(one.lenses) for one in state.map.cameras] != before:
             state = _match_from_itself(state, "again_")
     # Below a pixel: patches, pixels, splats.
-    state = patch_rounds.align(state.without_matches())
+    state = patch_rounds.align(state.with_verified(VerifiedPairs.none()))  # lets matches go
     if "photometric" in families:
         state = backend.refine_photometric(state)
     if "splat" in families:
         state = backend.refine_on_splat(state)
-    state = gyro.align_to_map(state, "imu_final", with_noise=False)
+    state = frontend.align_gyro_to_map(state, "imu_final", with_noise=False)
     return camera.measure_camera(state)
 
 
@@ -358,7 +329,8 @@ def _map_features(state: State) -> State:
     """The map of all frames' features, without GPS fixes that its images contradict."""
     latest, run = list(state.run.chain.latest), state.run
     mapped = _map_all(state)
-    if not backend.contradicts_fixes(mapped):
+    strength = mapped.prior.strength
+    if strength is None or not strength.contradiction > backend.MAX_CONTRADICTION:
         return mapped
     mapped = _map_all(backend.without_fixes(state, latest))
     return replace(mapped, run=replace(mapped.run, suffix=run.suffix))
@@ -373,12 +345,16 @@ def _map_all(state: State) -> State:
     else:
         state = frontend.match_neighbours(state)
         state = frontend.judge_trajectory(state)
-        state = gyro.align_to_neighbours(state)
+        state = frontend.align_gyro_to_neighbours(state)
     if state.prior.turning_only:
         return state
     # A chain of relative poses, then all points that neighbours share.
     state = backend.align_gauge(state, "gauge")
-    state = _adjust_chain(state)
+    gates = rounds.chain
+    chain = backend.adjust(state, "chain", gates)
+    # Without steps less plausible than the trajectory's.
+    state = frontend.drop_implausible_steps(chain)
+    state = chain if state is chain else backend.adjust(state, "chain2", gates)
     state = frontend.match_along_epipolars(state)
     state = frontend.match_known_points(state, "near", loops_closed=False)
     state = backend.adjust(state, "dense", rounds.dense)
@@ -387,22 +363,13 @@ def _map_all(state: State) -> State:
     state = frontend.close_loops(state)
     state = backend.align_gauge(state, "gauge_closed")
     state = backend.adjust(state, "closed", rounds.loops)
-    state = gyro.align_to_map(state, "imu_closed")
+    state = frontend.align_gyro_to_map(state, "imu_closed")
     state = camera.find_camera(state)
-    state = gyro.align_to_map(state, "imu_camera", with_noise=bool(state.map.lenses))
+    state = frontend.align_gyro_to_map(state, "imu_camera", with_noise=bool(state.map.lenses))
     return backend.measure_strength(state)
 
 
-def _adjust_chain(state: State) -> State:
-    """Adjust the chain of relative poses, without steps less plausible than the trajectory's."""
-    gates = state.run.settings.rounds.chain
-    chain = backend.adjust(state, "chain", gates)
-    kept = frontend.drop_implausible_steps(chain)
-    return chain if kept is chain else backend.adjust(kept, "chain2", gates)
-
-
 def _merge_maps(state: State) -> State:
-    """Join the parts of the map that no step ties together, and match across them."""
     parts = backend.separate_parts(state)
     if parts is None:
         return state
@@ -425,12 +392,6 @@ def _add_keypoints_where_weak(state: State) -> State:
 
 
 def _match_from_itself(state: State, prefix: str = "") -> State:
-    """Match the map's points in all frames, and adjust.
-
-    Args:
-        state: of the run.
-        prefix: of the names of stages.
-    """
     rounds, patches = state.run.settings.rounds, state.run.settings.patches.rounds
     for n in range(1, rounds.map_passes + 1):
         state = frontend.match_known_points(state, f"{prefix}everywhere{n}")

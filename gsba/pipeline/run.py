@@ -76,11 +76,7 @@ class Evidence:
     start: RunStart = RunStart.TRAJECTORY  # for the report
 
     def start_name(self, absent: bool) -> str:
-        """Name of the source of the initial poses, for the report.
-
-        Args:
-            absent: True if there is no trajectory.
-        """
+        """Name of the source of the initial poses, for the report."""
         if absent:
             return RunStart.PAIRS
         return " and ".join(dict.fromkeys(one.start for one in self.recordings)) or self.start
@@ -139,7 +135,9 @@ class Run:
             if family.name in (TrajectoryPrior.name, GyroTurns.name):
                 raise GsbaError(f"family {family.name}: gsba has one of this name; rename yours")
         rig = cubemap.rig_for(frames.formats[0], settings.cubemap)
-        members = (*_of_points(settings, rig), *evidence.families)
+        own: list[Family] = [Bearings(), Reprojections(rig)]
+        own = [family for family in own if family.name in settings.factors]
+        members = (*own, *evidence.families)
         families = Families(members, frames.names, frames.timestamps)
         if not families.observing_points.members:
             raise GsbaError("factors: no family observes points; add bearing or reprojection")
@@ -177,12 +175,8 @@ class Run:
         *,
         noted: bool = True,
     ) -> T:
-        """Result of a stage that rests on the one before it: the stored one, or computed.
-
-        Args:
-            name, key, compute, returns: see `gsba.store.RunStore.stage`.
-            noted: whether the report tells of it.
-        """
+        """Result of a stage that rests on the one before it; `noted`: whether the report tells of
+        it."""
         name += self.suffix
         result = self.chain.stage(name, key, compute, returns)
         if noted:
@@ -193,9 +187,6 @@ class Run:
         """The run restricted to one of its recordings, on that recording's clock.
 
         Its stages rest on the latest one of this run.
-
-        Args:
-            number: index of the recording.
         """
         given = self.evidence.recordings[number]
         frames = self.frames.taken(self.frames.recordings[given.name])
@@ -226,10 +217,6 @@ class Run:
         found = self.camera_settings
         return found[camera] if found else self.settings.camera
 
-    def lenses_found_of(self, camera: int) -> bool:
-        """True if the calibration by which a camera's raw frames are cut was estimated."""
-        return bool(self.lenses_found) and self.lenses_found[camera]
-
     @property
     def matching_settings(self) -> RefineSettings:
         """Settings whose gates are as wide as directions of raw pairs are uncertain."""
@@ -254,9 +241,3 @@ class Run:
         settings = self.settings
         relevant = [settings.triangulate, settings.rounds, settings.priors, settings.solver]
         return [*relevant, self.families.digests()]
-
-
-def _of_points(settings: RefineSettings, rig: CubeRig) -> list[Family]:
-    """gsba's own families that observe points, as settings.factors name them."""
-    own: list[Family] = [Bearings(), Reprojections(rig)]
-    return [family for family in own if family.name in settings.factors]

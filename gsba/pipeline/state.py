@@ -12,11 +12,33 @@ from gsba.camera.cameras import Cameras
 from gsba.camera.lens import Lenses
 from gsba.config import PriorSettings
 from gsba.loop_closure import connectivity
+from gsba.matching.guided_search import MatchContext
 from gsba.pipeline.map import Map
-from gsba.pipeline.observed_frames import ObservedFrames
 from gsba.pipeline.prior import Prior
 from gsba.pipeline.run import Run
-from gsba.types import Keypoints, Landmarks, Matches, Solution, Tracks, VerifiedPairs
+from gsba.store.store import PerFrame
+from gsba.types import Features, Keypoints, Landmarks, Matches, Solution, Tracks, VerifiedPairs
+
+
+@dataclass(frozen=True, slots=True)
+class ObservedFrames:
+    """Keypoints of all frames, and the means to match them."""
+
+    features: tuple[PerFrame[Features], ...]  # (F,) stage that holds each frame's
+    shown: Keypoints  # of all frames, where pictures show them
+    context: MatchContext  # matches them
+    cameras: Cameras  # that the keypoints are seen through
+    more: bool = False  # whether all frames got as many keypoints as weak ones from the start
+
+    @property
+    def keypoints(self) -> Keypoints:
+        """Of all frames, as rays of the cameras."""
+        return self.context.keypoints
+
+    def through(self, cameras: Cameras) -> "ObservedFrames":
+        """The frames with their keypoints as rays that start at the lenses of these cameras."""
+        context = replace(self.context, keypoints=cameras.seen(self.shown), cameras=cameras)
+        return replace(self, context=context, cameras=cameras)
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,18 +104,9 @@ class State:
         """The state with other matches of neighbours, and none beside these."""
         return replace(self, verified=verified, matches=MapMatches(verified.matches))
 
-    def without_matches(self) -> "State":
-        """The state with a map that is not built anew: its matches are let go, for their memory."""
-        return self.with_verified(VerifiedPairs.none())
-
     def with_solution(self, solution: Solution) -> "State":
         """The state with other poses and points."""
         return replace(self, map=replace(self.map, solution=solution))
-
-    def with_keypoints(self, observed: ObservedFrames) -> "State":
-        """The state with other keypoints, which the map is to be made of."""
-        map_ = replace(self.map, observed=observed.shown)
-        return replace(self, observed=observed, map=map_)
 
     def with_cameras(self, found: CameraEstimates) -> "State":
         """The state with other cameras of the map; keypoints stay rays of those before."""
@@ -118,12 +131,8 @@ class State:
         return maps
 
     def triangulated(self, tracks: Tracks, keypoints: Keypoints, gate: float) -> Landmarks:
-        """Points of tracks under the poses as they are.
-
-        Args:
-            tracks: candidates, of rows of `keypoints`.
-            gate: largest residual, in the keypoints' own standard deviations.
-        """
+        """Points of tracks under the poses as they are; `gate` in the keypoints' standard
+        deviations."""
         poses, run = self.solution.world_T_rigs, self.run
         settings, threads = run.settings.triangulate, run.num_threads
         return triangulation.place(tracks, keypoints, poses, gate, settings, threads)
@@ -138,11 +147,7 @@ class State:
         return self._context(families.fitted(self.solution, prior.parts))
 
     def context_of_images(self, noise: PriorSettings) -> AdjustmentContext:
-        """The context of an adjustment by images, trajectory and gyro alone.
-
-        Args:
-            noise: of the trajectory's steps and poses.
-        """
+        """The context of an adjustment by images, trajectory and gyro alone."""
         observing = self.run.families.observing_points
         own = self.prior.families(noise)
         return self._context(observing.with_members((*own, *observing.members)))

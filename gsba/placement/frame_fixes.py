@@ -1,6 +1,8 @@
 """GPS fixes of a run's frames, from files of all kinds, interpolated at the frames' times."""
 
 import logging
+import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,10 +10,10 @@ import numpy as np
 
 from gsba.bundle.fixes import FrameFixes
 from gsba.config import GpsSettings
+from gsba.frames.exif import GpsTag, read_exif
 from gsba.frames.recordings import own_timestamps
-from gsba.log import GsbaError
-from gsba.placement.exif import read_exif_gps
-from gsba.placement.gps import GpsFixes, local_from_geodetic, read_gps
+from gsba.log import GsbaError, track
+from gsba.placement.gps import GpsFixes, fixes_of, local_from_geodetic, read_gps, sigmas_of
 from gsba.placement.gps_video import is_recording, read_video_gps
 from gsba.types import FrameSet
 
@@ -19,21 +21,59 @@ logger = logging.getLogger(__name__)
 
 EXIF = "exif"  # in place of a file: positions in the EXIF data of the images
 _ACCELERATION = 1.0  # m/s^2, of pedestrians: bounds the deviation from the line between fixes
+MIN_FIXES = 3
+
+
+def read_exif_gps(frames: FrameSet, settings: GpsSettings | None = None) -> GpsFixes:
+    """Fixes of the frames whose images have GPS tags, by name, without those that repeat an earlier
+    frame's position and time; unknown altitudes as of `fixes_of`. GsbaError if fewer than three
+    frames have a fix, or an image cannot be read."""
+    found: dict[str, GpsTag] = {}
+    taken, damaged = set[tuple[float, float, float]](), 0
+    for name, paths in zip(frames.names, track(frames.paths, "reading EXIF"), strict=True):
+        tag, failed = _first_tag(paths)
+        damaged += failed
+        if tag is None:
+            continue
+        known = tag.latitude, tag.longitude, tag.unix_time
+        if math.isnan(tag.unix_time) or known not in taken:
+            found[name] = tag
+        taken.add(known)
+    if damaged:
+        logger.warning("--gps exif: the EXIF data of %d images are damaged", damaged)
+    if len(found) < MIN_FIXES:
+        raise GsbaError(
+            f"--gps exif: {len(found)} of {len(frames)} frames have GPS tags "
+            f"('{frames.paths[0][0]}' is the first frame), and {MIN_FIXES} are needed: "
+            "give positions as --gps FILE, CSV or GPX"
+        )
+    tags, settings = list(found.values()), settings or GpsSettings()
+    geodetic = np.array([[tag.latitude, tag.longitude, tag.altitude] for tag in tags])
+    dop, error = (np.array([getattr(tag, key) for tag in tags]) for key in ("dop", "error_m"))
+    fixes = fixes_of(list(found), geodetic, sigmas_of(settings, dop, error_m=error), settings)
+    logger.info("--gps exif: %d of %d frames have a position", len(fixes.geodetic), len(frames))
+    return fixes
+
+
+def _first_tag(paths: Sequence[Path]) -> tuple[GpsTag | None, int]:
+    """Position of the first image of a frame that has one, and the number of damaged images."""
+    damaged = 0
+    for path in paths:
+        try:
+            tag = read_exif(path).gps
+        except ValueError:
+            damaged += 1
+            continue
+        if tag is not None:
+            return tag, damaged
+    return None, damaged
 
 
 def read_fixes(
     source: str, frames: FrameSet | None = None, settings: GpsSettings | None = None
 ) -> GpsFixes | None:
-    """Fixes of the source that `--gps` names: a CSV or GPX file, a video, or "exif" of the frames.
-
-    Args:
-        source: path of the file, or "exif".
-        frames: frames of the run; None = not known yet, so that "exif" gives None.
-        settings: smallest noise of a fix.
-
-    Raises:
-        GsbaError: the source cannot be read; the message names the line.
-    """
+    """Fixes of the source that `--gps` names: a CSV or GPX file, a video, or "exif" of the frames,
+    None where these are not known yet. GsbaError names the line that cannot be read."""
     if source == EXIF:
         return None if frames is None else read_exif_gps(frames, settings)
     path = Path(source)
@@ -53,7 +93,6 @@ def fixes_of_frames(
     noise of the fixes have no fix.
 
     Args:
-        source: see `read_fixes`.
         frames: frames of the run; they need times unless fixes name frames.
         settings: smallest noise, and correlation time of the errors.
 

@@ -60,7 +60,6 @@ def fixes_of(
             with a sigma of 20 m.
         sigmas: (G, 3) standard deviations east, north and up, metres; None = the smallest that
             settings allow, see `sigmas_of`.
-        settings: smallest noise of a fix.
     """
     geodetic = np.array(geodetic, np.float64).reshape(-1, 3)
     sigmas = sigmas_of(settings or GpsSettings(), np.full(len(geodetic), np.nan), sigmas)
@@ -96,7 +95,6 @@ def sigmas_of(
     to the horizontal one. NaN is unknown in all arguments.
 
     Args:
-        settings: smallest noise of a fix.
         dop, dop_up: (G,) dilution of precision: horizontal (or of the position), and vertical.
         given: (G, 3) known standard deviations, metres; the settings bound them from below.
         error_m, error_up_m: (G,) error estimates of the receiver, metres.
@@ -122,10 +120,6 @@ def read_gps(path: Path, settings: GpsSettings | None = None) -> GpsFixes:
     `vdop`, `pdop`, or `sigma`, `accuracy` and `sigma_up` in metres. Times of a GPX track are UTC
     and become Unix time; its `hdop`, `vdop` and `pdop` are read. Points that share a whole second
     are spread over it. The settings' offset is added to all times.
-
-    Args:
-        path: the file.
-        settings: smallest noise of a fix.
 
     Raises:
         GsbaError: a line cannot be used; the message names it.
@@ -226,10 +220,7 @@ def _read_gpx(path: Path, settings: GpsSettings) -> GpsFixes:
 
 
 def _spread(times: list[float]) -> list[float]:
-    """Times of a GPX track whose points share whole seconds, spread over these seconds.
-
-    Apps that record several points a second write the time without its fraction.
-    """
+    """Times of a GPX track spread over whole seconds, where apps write no fraction."""
     if any(time % 1 for time in times):
         return times
     shares = Counter(times)

@@ -67,7 +67,6 @@ def fit_fixes(
 
     Args:
         positions: (G, 3) positions of the fixes' frames, map units, not all on one point.
-        fixes: GPS fixes of these frames.
         up_sigma: standard deviation of the direction +z of the map, radians, which is then kept as
             up; None = up is not known.
         scale: metres per map unit, known from other data, and its standard deviation.

@@ -1,10 +1,6 @@
-"""GPS fixes that cameras record into their videos.
-
-Fixes of Insta360 are in the trailer of the file. Fixes of GoPro are unpacked by `telemetry_parser`:
-GPMF packets of about a second hold them as GPS5 (up to HERO10 and MAX, with one DOP and one state
-of the receiver a packet) or as GPS9 (later, with one for each fix): see
-github.com/gopro/gpmf-parser.
-"""
+"""GPS fixes that cameras record into their videos: Insta360 in the file's trailer, GoPro in packets
+of about a second, as GPS5 (one DOP and state a packet) or GPS9 (one for each fix), unpacked by
+`telemetry_parser`; see github.com/gopro/gpmf-parser."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -35,15 +31,8 @@ def is_recording(path: Path) -> bool:
 
 
 def read_video_gps(path: Path, settings: GpsSettings | None = None) -> GpsFixes:
-    """Fixes of a video of Insta360 or GoPro, with times in seconds on the video's clock.
-
-    Args:
-        path: the video.
-        settings: smallest noise of a fix; the file's DOP is used if it has one.
-
-    Raises:
-        GsbaError: the video holds no positions, or `telemetry_parser` is needed and not installed.
-    """
+    """Fixes of a video of Insta360 or GoPro, with times in seconds on the video's clock; GsbaError
+    if it holds none, or `telemetry_parser` is needed and not installed."""
     trailer = read_trailer(path)
     if trailer is None:
         return _of_gopro(path, settings)
@@ -55,8 +44,7 @@ def read_video_gps(path: Path, settings: GpsSettings | None = None) -> GpsFixes:
 def _of_insta360(
     record: GpsRecord, created_unix_s: float | None, settings: GpsSettings | None
 ) -> GpsFixes:
-    """Fixes with times since the creation of the recording, accurate to a second; since the first
-    fix if the creation time is implausible."""
+    """Fixes with times since the recording's creation, or the first fix if that is implausible."""
     begin = float(record.unix_times[0])
     if created_unix_s is not None:
         low, high = _FIRST_FIX_S
@@ -68,11 +56,8 @@ def _of_insta360(
 def _of_gopro(path: Path, settings: GpsSettings | None) -> GpsFixes:
     """Fixes with times in seconds after the first GPS packet.
 
-    The fixes of a packet are spread evenly until the next packet. Packets are timed by the camera's
-    counter (STMP), else by the receiver's UTC. Entries without a valid fix are left out.
-
-    Raises:
-        GsbaError: the library is not installed, or finds no positions.
+    Fixes of a packet are spread evenly until the next one. Packets are timed by the camera
+    (STMP), else by the receiver's UTC. Entries without a valid fix are left out.
     """
     groups = ask_telemetry_parser(path, "telemetry", "GPS", "a CSV or GPX file")
     packets = [packet for packet in map(_packet, groups) if packet is not None]
@@ -109,8 +94,7 @@ def _of_gopro(path: Path, settings: GpsSettings | None) -> GpsFixes:
 def _packet(groups: Mapping[str, Mapping[str, Any]]) -> tuple[float, np.ndarray] | None:
     """Start in seconds and fixes (n, 5) of a packet; None = it has no fixes.
 
-    Columns are latitude, longitude (degrees), altitude (metres), DOP (NaN = unknown), and the state
-    of the receiver.
+    Columns: latitude, longitude (degrees), altitude (metres), DOP (NaN = unknown), lock state.
     """
     tags = groups.get("GPS9") or groups.get("GPS")
     if not isinstance(tags, Mapping) or "Scale" not in tags:

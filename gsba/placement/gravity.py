@@ -58,7 +58,6 @@ def estimate_gravity(reconstruction: Reconstruction, frames: FrameSet) -> Gravit
     Compass, ECCV 2002).
 
     Args:
-        reconstruction: refined poses; unrefined ones are not used.
         frames: frames of the run; the images of a few are read.
     """
     good = np.flatnonzero(reconstruction.pose_statuses == PoseStatus.REFINED)
@@ -136,7 +135,6 @@ def _tilt_deg(frames: FrameSet, f: int) -> tuple[float, float]:
 
 
 def _degrees(one: np.ndarray, other: np.ndarray) -> float:
-    """Angle between two unit vectors, degrees."""
     return float(np.degrees(np.arccos(np.clip(one @ other, -1, 1))))
 
 
@@ -144,7 +142,9 @@ def _edge_normals(
     frames: FrameSet, f: int, world_T_rig: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Normals (E, 3), world, of the planes through straight edges, and their lengths (E,), rad."""
-    images, masks = _side_faces(frames, f)
+    assert FACES[:4] == ("front", "right", "back", "left")
+    images, masks = cubemap.load(frames, f, cubemap.native_rig(frames.format_of(f), _FACE_PX))
+    images = images[:4]
     rig = CubeRig(images.shape[1], np.pi / 2)
     detector = cv2.createLineSegmentDetector(cv2.LSD_REFINE_STD)
     normals, lengths = [np.zeros((0, 3))], [np.zeros(0)]
@@ -167,18 +167,10 @@ def _edge_normals(
     return np.concatenate(normals), np.concatenate(lengths)
 
 
-def _side_faces(frames: FrameSet, f: int) -> tuple[np.ndarray, np.ndarray | None]:
-    """Four faces around the horizon (4, N, N, 3), and masks (4, N, N) bool, True = use."""
-    assert FACES[:4] == ("front", "right", "back", "left")
-    images, masks = cubemap.load(frames, f, cubemap.native_rig(frames.format_of(f), _FACE_PX))
-    return images[:4], None if masks is None else masks[:4]
-
-
 def _level_axis(
     normals: np.ndarray, weights: np.ndarray, start: np.ndarray
 ) -> tuple[np.ndarray, int]:
-    """Axis (3,) near `start` that is perpendicular to most normals, and the number of these; 0 =
-    `start`."""
+    """Axis (3,) near `start` perpendicular to most normals, and their number; 0 = `start`."""
     up, near = start, np.zeros(len(normals), bool)
     for gate in _GATES_DEG:
         for _ in range(5):

@@ -1,8 +1,4 @@
-"""Placement of an exported world: upright, metric, by GPS, by true poses or by a scan.
-
-A run keeps the world and scale of its SLAM trajectory. One similarity transforms the world of an
-export; `transform.json` in it states the similarity and its inverse.
-"""
+"""Placement of an exported world: upright, metric, by GPS, by true poses or by a scan."""
 
 import dataclasses
 import logging
@@ -63,7 +59,6 @@ def place(
     """Placement of a run's world by the settings.
 
     Args:
-        reconstruction: the run, in its own world.
         frames: its frames; their images are read to find the vertical.
         settings: `up` alone applies the smallest rotation that makes -y point up. With `length`
             the unit becomes the metre. `gps` gives metres east, north and up; together with `up` it
@@ -72,7 +67,6 @@ def place(
             world of true poses, `scan` that of a scan of the place; with a scan, `up`, `gps` or
             `pairs` only start the alignment.
         baseline: distance of the lenses and its standard deviation, metres, for a length of "lens".
-        gps: noise of GPS positions.
 
     Raises:
         GsbaError: settings exclude one another, or data do not determine the placement.
@@ -132,16 +126,8 @@ def check(
     frames: FrameSet | None = None,
     baseline: tuple[float, float] | None = None,
 ) -> None:
-    """Check settings and the files that they name.
-
-    Args:
-        settings: settings of the placement.
-        frames: frames of the run, whose EXIF positions are checked; None = not checked.
-        baseline: distance of the lenses and its standard deviation, metres; None = not known.
-
-    Raises:
-        GsbaError: settings exclude one another, or a file cannot be read.
-    """
+    """Check settings, and the files that they name (positions in images only of known `frames`),
+    with the distance of the lenses and its sigma, metres. GsbaError if any exclude one another."""
     if settings.length == "lens" and baseline is None:
         raise GsbaError(
             "--scale lens needs the distance between the lenses: refine with --camera NAME or "
@@ -196,12 +182,8 @@ def _upright(reconstruction: Reconstruction, frames: FrameSet) -> Placement:
 def metres_per_unit(
     lenses: tuple[float, float], baseline: tuple[float, float]
 ) -> tuple[float, float]:
-    """Metric scale and its standard deviation, from the distance between two lenses.
-
-    Args:
-        lenses: estimated distance and its standard deviation, map units.
-        baseline: published distance and its standard deviation, metres.
-    """
+    """Metric scale and its standard deviation, from the distance of two lenses (map units) and its
+    published value (metres), each with its standard deviation."""
     scale = baseline[0] / lenses[0]
     return scale, scale * float(np.hypot(lenses[1] / lenses[0], baseline[1] / baseline[0]))
 
@@ -223,7 +205,6 @@ def _scale_by_lenses(
 def _by_lenses(
     reconstruction: Reconstruction, baseline: tuple[float, float] | None, placement: Placement
 ) -> Placement:
-    """Placement in metres, by the published distance between the lenses."""
     (scale, sigma), grounds = _scale_by_lenses(reconstruction, baseline)
     if not sigma < _MAX_LENS_SCALE_SIGMA * scale:
         raise GsbaError(
@@ -276,15 +257,7 @@ def _on_earth(
     scale: tuple[float, float] | None = None,
     settings: GpsSettings | None = None,
 ) -> Placement:
-    """Placement in metres east, north and up around the median of the fixes.
-
-    Args:
-        reconstruction, frames: the run.
-        source: see `read_fixes`.
-        upright: placement whose up, if known, is kept.
-        scale: metres per map unit, known from other data, and its standard deviation.
-        settings: noise of the fixes.
-    """
+    """Placement in metres east, north and up around the median fix; keeps `upright`'s up."""
     fixes, path = fixes_of_frames(source, frames, settings), Path(source)
     fixes = fixes.taken(reconstruction.pose_statuses[fixes.frames] == PoseStatus.REFINED)
     if len(fixes) < 3:
@@ -337,15 +310,7 @@ def _require_majority(
     rows: np.ndarray,
     advice: str,
 ) -> None:
-    """Raise GsbaError, naming them, if no more than half of a file's positions agree with the run.
-
-    Args:
-        path: the file.
-        used: (N,) bool, inliers.
-        off: (N,) residuals, placed units.
-        frames, rows: frames of the run, and rows (N,) of those that the positions are of.
-        advice: what else may help.
-    """
+    """Raise GsbaError, naming them, unless most of a file's positions (rows of frames) agree."""
     if 2 * used.sum() > len(used):
         return
     false = rows[~used]
@@ -379,10 +344,7 @@ def _require_one_scale(
 
 
 def _claims(found: GpsFit, positions: np.ndarray) -> dict[str, Any]:
-    """Entries of transform.json on a fit: numbers of fixes, and standard deviations.
-
-    Those of the position are east, north and up, medians over the frames with a fix.
-    """
+    """Entries of transform.json on a fit; position sigmas are medians, east, north and up."""
     return {
         "fixes": len(found.used),
         "outliers": int(np.sum(~found.used)),
@@ -431,9 +393,11 @@ def _up_sigma(upright: Placement) -> float:
 
 
 def _aligned(reconstruction: Reconstruction, frames: FrameSet, path: Path) -> Placement:
-    """Placement in the world of true poses."""
     truth = read_trajectory(path)
-    _require_times(path, frames)
+    if not frames.timed:
+        raise GsbaError(
+            f"{path}: the frames have no times to match true poses with: refine with --timestamps"
+        )
     run = Trajectory(frames.timestamps, reconstruction.world_T_rigs)
     rows, of_truth = matched_in_time(run, truth, _TOLERANCE_S)
     good = reconstruction.pose_statuses[rows] == PoseStatus.REFINED
@@ -482,22 +446,18 @@ def _in_scan(
 def guess_in_scan(
     reconstruction: Reconstruction, frames: FrameSet, settings: PlacementSettings, scan: Scan
 ) -> tuple[Guess, dict[str, Any]]:
-    """Initial guess of a run's placement in a scan, by `pairs`, else `gps`, else `up`.
-
-    Args:
-        reconstruction, frames: the run.
-        settings: placement settings; `scan` names the file of the scan.
-        scan: the scan.
-
-    Returns:
-        The guess, in the scan's world less its offset, and entries of transform.json on it.
-
-    Raises:
-        GsbaError: files cannot be used, or the frames have no common up axis.
-    """
+    """Initial guess of a run's placement in a scan, in its world less its offset, by `pairs`, else
+    `gps`, else `up`, and entries of transform.json on it. GsbaError if files cannot be used, or
+    frames have no common up axis."""
     axis = UPS[upwards(Path(settings.scan or ""))]
     if settings.pairs is not None:
-        guess = _by_pairs(reconstruction, frames, Path(settings.pairs))
+        path = Path(settings.pairs)
+        ends, target = read_pairs(path)
+        source = np.array([_point(end, reconstruction, frames) for end in ends])
+        if extents(source)[1] <= _MIN_EXTENT_RATIO:
+            raise GsbaError(f"{path}: its points lie on a line: add a point off that line")
+        with naming(path):
+            guess = Guess(similarity=similarity(source, target))
         return guess.without(scan.offset), {"pairs": settings.pairs}
     if settings.gps is not None:
         upright = _upright(reconstruction, frames) if settings.up == "auto" else Placement()
@@ -509,20 +469,3 @@ def guess_in_scan(
         upright = _upright(reconstruction, frames)
         return Guess(axis=(upright.similarity.rotation.T @ _UP_WORLD, axis)), upright.grounds
     return Guess(), {}
-
-
-def _by_pairs(reconstruction: Reconstruction, frames: FrameSet, path: Path) -> Guess:
-    """Guess from picked pairs, in the world of the scan's file."""
-    ends, target = read_pairs(path)
-    source = np.array([_point(end, reconstruction, frames) for end in ends])
-    if extents(source)[1] <= _MIN_EXTENT_RATIO:
-        raise GsbaError(f"{path}: its points lie on a line: add a point off that line")
-    with naming(path):
-        return Guess(similarity=similarity(source, target))
-
-
-def _require_times(path: Path, frames: FrameSet) -> None:
-    if not frames.timed:
-        raise GsbaError(
-            f"{path}: the frames have no times to match true poses with: refine with --timestamps"
-        )

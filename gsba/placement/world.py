@@ -57,10 +57,7 @@ class Placement:
         )
 
     def of_trajectory(self, origin: np.ndarray | None) -> "Placement":
-        """With the offset to the world of the trajectory, whose origin (3,) the run's world is at.
-
-        See `Reconstruction.origin`.
-        """
+        """With the offset to the world of the trajectory, see `Reconstruction.origin`."""
         if origin is None:
             return self
         move = self.similarity
@@ -100,11 +97,7 @@ class Placement:
 
 
 def read_placement(path: Path) -> Placement:
-    """Placement of an export, from its transform.json.
-
-    Raises:
-        GsbaError: the file is missing, or gsba did not write it.
-    """
+    """Placement of an export, from its transform.json; GsbaError if gsba did not write it."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         scale, rotation = float(content["scale"]), np.array(content["rotation"], np.float64)

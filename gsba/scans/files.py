@@ -1,22 +1,19 @@
-"""Reading of scans: clouds and meshes by open3d, LAS and LAZ by laspy; normals of clouds.
-
-Only this module imports open3d.
-"""
+"""Reading of scans: clouds and meshes by open3d (imported here alone), LAS and LAZ by laspy."""
 
 import logging
+import struct
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from gsba.frames.times import read_lines
 from gsba.geometry import local_origin
 from gsba.log import GsbaError, brief
-from gsba.scans.claims import check_claims
-from gsba.scans.surfaces import on_planes
 from gsba.scans.trial import limited, try_in_process
-from gsba.scans.types import Scan
+from gsba.scans.types import NEIGHBOURS, Scan
 
 logger = logging.getLogger(__name__)
 
@@ -27,14 +24,95 @@ _NUM_MESH_SAMPLES = 1_000_000  # points sampled on a mesh, before it is thinned
 _MAX_COORDINATE = 1e9  # in a scan's file
 _MIN_POINTS = 1000
 _MIN_PAIRS = 3
+_POINTS_AT_ONCE = 50_000
+_MIN_FLAT_SHARE = 0.1  # of points that are on planes: this quantile of the scatter is noise
+_MAX_SCATTER_RATIO = 3.5  # of a point's scatter to that noise, if its neighbours share a plane
+_LAS_HEADER_BYTES = 227  # of LAS 1.0 to 1.2; 375 of 1.4
+_VLR_BYTES, _EVLR_BYTES = 54, 60  # of the header of a variable-length record
+_MIN_LAZ_POINT_BYTES = 0.2  # of a compressed point: equal ones in a row take 0.3
+_MAX_PCD_RATIO = 255  # of uncompressed to compressed bytes in PCD
+_MAX_PCD_HEADER_BYTES = 1 << 16
+
+
+def check_claims(path: Path) -> None:
+    """Refuse LAS, LAZ and PCD files that claim more points than their size allows."""
+    suffix, size = path.suffix.lower(), path.stat().st_size
+    with path.open("rb") as file:
+        head = file.read(_MAX_PCD_HEADER_BYTES)
+    try:
+        if suffix in (".las", ".laz"):
+            _check_laser(head, size)
+        elif suffix == ".pcd":
+            _check_pcd(head, size)
+    except _TooMuch as claim:
+        raise GsbaError(
+            f"{path} claims {claim}, more than its {size} bytes can hold: it is truncated or "
+            "damaged; copy or export it again"
+        ) from None
+    except (struct.error, ValueError, IndexError, KeyError):
+        raise GsbaError(
+            f"{path}: cannot be read (its header is damaged): copy or export it again"
+        ) from None
+
+
+class _TooMuch(Exception):
+    """A header claims more than the file can hold; the message is the claim."""
+
+
+def _check_laser(head: bytes, size: int) -> None:
+    """Check the header of LAS or LAZ (LAS 1.4, section 2.4; LAZ sets high bits of the format)."""
+    if head[:4] != b"LASF":
+        raise ValueError
+    head_size, first, num_records, kind, length, num = struct.unpack_from("<HIIBHI", head, 94)
+    num_late = late = 0
+    if head[25] >= 4:
+        late, num_late, more = struct.unpack_from("<QIQ", head, 235)
+        num = max(num, more)
+    if head_size < _LAS_HEADER_BYTES or not length:
+        raise ValueError
+    if head_size + _VLR_BYTES * num_records > size or late + _EVLR_BYTES * num_late > size:
+        raise _TooMuch(f"{num_records} and {num_late} variable-length records")
+    each = _MIN_LAZ_POINT_BYTES if kind & 0xC0 else length
+    if num and first + each * num > size:
+        raise _TooMuch(f"{num} points")
+
+
+def _check_pcd(head: bytes, size: int) -> None:
+    """Check the header of a PCD file: lines of a word and numbers, of which DATA is the last."""
+    fields: dict[str, list[str]] = {}
+    at = 0
+    while "DATA" not in fields:
+        end = head.index(b"\n", at)
+        word, *numbers = head[at:end].decode("ascii", "replace").split() or ["#"]
+        fields[word] = numbers
+        at = end + 1
+    names, kinds = fields["FIELDS"], fields["TYPE"]
+    sizes = [int(text) for text in fields["SIZE"]]
+    counts = [int(text) for text in fields.get("COUNT", ["1"] * len(names))]
+    width, height = (int(fields.get(word, ["1"])[0]) for word in ("WIDTH", "HEIGHT"))
+    num = int(fields["POINTS"][0]) if "POINTS" in fields else width * height
+    if not len(names) == len(sizes) == len(counts) == len(kinds):
+        raise ValueError
+    if min([*sizes, *counts, num, width, height], default=0) < 0 or set(sizes) - {1, 2, 4, 8}:
+        raise ValueError
+    length = sum(a * b for a, b in zip(sizes, counts, strict=True))
+    form, left = fields["DATA"][0], size - at
+    if form == "ascii":
+        least = 2 * sum(counts) * num  # a digit and a separator
+        room = left + 1
+    elif form == "binary":
+        least, room = length * num, left
+    else:
+        packed, unpacked = struct.unpack_from("<II", head, at)
+        least, room = max(length * num, unpacked), _MAX_PCD_RATIO * min(packed, left - 8)
+        if packed > left - 8:
+            raise _TooMuch(f"{packed} bytes of points")
+    if least > room or width * height < num:
+        raise _TooMuch(f"{num} points")
 
 
 def open3d() -> ModuleType:
-    """Import open3d.
-
-    Raises:
-        GsbaError: open3d or a system library is missing; the message has the install command.
-    """
+    """Import open3d; GsbaError with the install command if it or a system library is missing."""
     try:
         import open3d  # pyright: ignore[reportMissingImports]
     except ModuleNotFoundError as error:
@@ -56,13 +134,9 @@ def upwards(path: Path) -> str:
 
 
 def read_pairs(path: Path) -> tuple[list[str], np.ndarray]:
-    """Picked point pairs: texts that name points of the run, and points (N, 3) of the scan's file.
-
-    Lines have two columns: a frame, or x,y,z in the run's world; X,Y,Z of the scan.
-
-    Raises:
-        GsbaError: a line cannot be used, or there are fewer than three pairs.
-    """
+    """Picked point pairs, one a line: texts that name points of the run (a frame, or x,y,z), and
+    points (N, 3) of the scan's file (X,Y,Z). GsbaError for a line like no other, or less than
+    three."""
     ends, points = [], []
     for number, line in read_lines(path):
         try:
@@ -82,11 +156,7 @@ def read_pairs(path: Path) -> tuple[list[str], np.ndarray]:
 
 
 def check_scan(path: Path) -> None:
-    """Check the suffix and access of a scan's file, and the libraries that read it.
-
-    Raises:
-        GsbaError: the suffix is unknown, the file cannot be read, or a library is missing.
-    """
+    """Check the suffix and access of a scan's file, and the libraries that read it."""
     if path.suffix.lower() not in SUFFIXES:
         raise GsbaError(f"{path} is no scan: give a file of {', '.join(SUFFIXES)}")
     if path.exists() and not path.is_file():
@@ -102,14 +172,9 @@ def check_scan(path: Path) -> None:
 
 
 def read_scan(path: Path) -> Scan:
-    """Surfaces of a scan, thinned to some 400,000 points with normals.
-
-    Meshes are sampled evenly over their surfaces. Clouds are thinned to the mean point of each
-    cell, projected to the plane through its neighbours, see `gsba.scans.surfaces`.
-
-    Raises:
-        GsbaError: the file is missing, of an unknown format or damaged, or holds too few points.
-    """
+    """Surfaces of a scan, some 400,000 points with normals: meshes sampled evenly, clouds thinned
+    to the mean point of each cell, on the plane through its neighbours. GsbaError if it is missing,
+    damaged, of an unknown format, or too small."""
     check_scan(path)
     try_in_process(path)
     o3d, (mesh, points, colors) = open3d(), _content(path)
@@ -147,11 +212,8 @@ def read_scan(path: Path) -> Scan:
 
 
 def read_mesh(path: Path) -> Any:
-    """Triangles of a mesh file with colours or textures, as open3d's TriangleMesh.
-
-    Raises:
-        GsbaError: the file cannot be read, or holds no triangles.
-    """
+    """Triangles of a mesh file with colours or textures, as open3d's TriangleMesh; GsbaError if
+    none."""
     try_in_process(path)
     mesh = _mesh(path)
     if mesh is None:
@@ -166,11 +228,7 @@ def read_on_trial(path: str) -> None:
 
 
 def _content(path: Path) -> tuple[Any, np.ndarray, np.ndarray | None]:
-    """Mesh of a file, or None; else the points (M, 3) of its cloud, and their colours or None.
-
-    Raises:
-        GsbaError: the file cannot be read, or holds neither a mesh nor a cloud.
-    """
+    """Mesh of a file, or None; else the points (M, 3) of its cloud, and their colours or None."""
     suffix = path.suffix.lower()
     mesh = _mesh(path) if suffix in MESHES or suffix == ".ply" else None
     if mesh is not None:
@@ -178,17 +236,18 @@ def _content(path: Path) -> tuple[Any, np.ndarray, np.ndarray | None]:
     if suffix in MESHES:
         raise GsbaError(f"{path} holds no triangles that open3d can read")
     check_claims(path)
-    points, colors = (_of_laser if suffix in LASER else _of_cloud)(path)
+    if suffix in LASER:
+        points, colors = _of_laser(path)
+    else:
+        cloud = open3d().io.read_point_cloud(str(path))
+        points, colors = np.array(cloud.points), np.array(cloud.colors)
+        colors = colors if cloud.has_colors() else None
     good = (np.abs(points) < _MAX_COORDINATE).all(axis=1)
     return None, points[good], None if colors is None else colors[good]
 
 
 def _mesh(path: Path) -> Any:
-    """Triangles of a file; None if it has none.
-
-    Raises:
-        GsbaError: corners of triangles are missing or not finite.
-    """
+    """Triangles of a file; None if it has none."""
     mesh = open3d().io.read_triangle_mesh(str(path), enable_post_processing=True)
     triangles, vertices = np.asarray(mesh.triangles), np.asarray(mesh.vertices)
     if not len(triangles):
@@ -211,12 +270,6 @@ def normals_of(points: np.ndarray) -> np.ndarray:
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
     cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(12))
     return np.array(cloud.normals)
-
-
-def _of_cloud(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
-    """Points and colours (M, 3) of a PLY or PCD file."""
-    cloud = open3d().io.read_point_cloud(str(path))
-    return np.array(cloud.points), np.array(cloud.colors) if cloud.has_colors() else None
 
 
 def _laspy() -> ModuleType:
@@ -250,11 +303,7 @@ def _origin_of(points: np.ndarray) -> np.ndarray:
 
 
 def _thinned(cloud: Any, path: Path) -> Any:
-    """Cloud of at most `_MAX_POINTS` points, one for each occupied cell, without duplicates.
-
-    Raises:
-        GsbaError: too few points are left.
-    """
+    """Cloud of at most `_MAX_POINTS` points, one for each occupied cell, without duplicates."""
     points = np.asarray(cloud.points)
     cell = float(np.ptp(points, axis=0).max()) / 1000 if len(points) else 0.0
     while cell and len(cloud.points) > _MAX_POINTS:
@@ -264,3 +313,29 @@ def _thinned(cloud: Any, path: Path) -> Any:
     if num < _MIN_POINTS:
         raise GsbaError(f"{path} holds {num} distinct points; registration needs {_MIN_POINTS}")
     return cloud
+
+
+def on_planes(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points (N, 3) projected to their neighbours' planes, unit normals (N, 3), and scatters (N,).
+
+    Independent noise shrinks with the square root of the number of neighbours. Without the
+    projection, alignment would keep all of it and prefer points whose noise happens to fit. Near
+    edges, where neighbours share no plane, points are not moved, and their scatter is the standard
+    deviation of their neighbours about the plane; elsewhere it is 0.
+    """
+    tree = KDTree(points)
+    neighbours = min(NEIGHBOURS, len(points))
+    normals, offsets, scatters = [], [], []
+    for start in range(0, len(points), _POINTS_AT_ONCE):
+        some = points[start : start + _POINTS_AT_ONCE]
+        around = points[tree.query(some, neighbours)[1]]
+        middles = around.mean(axis=1)
+        around = around - middles[:, None]
+        values, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around) / neighbours)
+        normals.append(axes[:, :, 0])
+        offsets.append(np.einsum("ni,ni->n", axes[:, :, 0], middles - some))
+        scatters.append(np.sqrt(np.maximum(values[:, 0], 0)))
+    across, off, scatter = (np.concatenate(parts) for parts in (normals, offsets, scatters))
+    flat = scatter <= _MAX_SCATTER_RATIO * np.quantile(scatter, _MIN_FLAT_SHARE)
+    laid = points + np.where(flat, off, 0)[:, None] * across
+    return laid, across, np.where(flat, 0, scatter)

@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gsba.scans.noise import LEAST_SIGMA, Noise, noise_of, residuals_of
 from gsba.scans.types import Cloud, Scan
 from gsba.similarity import Sim3
+from gsba.types.records import with_rows
 
 _WIDTH_RATIO = 0.7  # of the loss's width, from round to round
 _MIN_STEP = 1e-6  # part of the cloud's size; a smaller step ends a round
@@ -16,6 +16,83 @@ _NUM_FINAL_ROUNDS = 6  # rounds with the whole cloud and the estimated noise
 _NUM_COARSE_POINTS = 1200  # points of the cloud in the rounds before
 _CELLS_PER_SIZE = (8, 4, 2, 1)  # cell edges, as divisors of the cloud's size, for the covariance
 _MEDIAN_ABS_NORMAL = 0.6745  # median of |x|, x unit normal
+LEAST_SIGMA = 0.1  # smallest sigma, part of the scan's spacing
+_MAX_NEAR_DISTANCE = 0.02  # of a point to a near surface, part of the cloud's size
+_MAX_LOG_CHANGE = 20.0  # of log parameters from their start: beyond, likelihoods are constant
+_MIN_POINTS = 50  # with fewer, the noise cannot be estimated
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """Noise model of distances from a cloud's points to the planes of a scan."""
+
+    sigma: float  # standard deviation that all points share, unit of the scan
+    factor: float = 1.0  # factor on the standard deviations of the cloud's points
+    inliers: float = 0.8  # share of points near a surface that are on it
+
+    def variances(self, fit: Sim3, cloud: Cloud, scan: Scan, rows: np.ndarray) -> np.ndarray:
+        """Variances (N,) of the distances to the planes of the scan's points `rows` (N,)."""
+        own = _own_variances(fit, cloud, scan, rows)
+        return self.sigma**2 + self.factor**2 * own + scan.variances(rows)
+
+    def logs(self, off: np.ndarray, variances: np.ndarray, reach: float) -> np.ndarray:
+        """Log likelihood ratios (N,) of distances within `reach` over a uniform distribution.
+
+        Distances of inliers are normal, those of outliers uniform.
+        """
+        normal = np.exp(-0.5 * off**2 / variances) / np.sqrt(2 * np.pi * variances)
+        return np.log(self.inliers * 2 * reach * normal + 1 - self.inliers)
+
+
+def noise_of(fit: Sim3, cloud: Cloud, scan: Scan, sigma: float) -> Noise:
+    """Maximum-likelihood noise, from points within a fiftieth of the cloud's size of a surface."""
+    from scipy.optimize import minimize
+
+    reach = reach_of(fit, cloud)
+    _, nearest, off, gaps = residuals_of(fit, cloud, scan, reach + scan.reach)
+    near = (np.abs(off) <= reach) & (gaps <= reach + scan.reaches[nearest])
+    if near.sum() < _MIN_POINTS:
+        return Noise(sigma)
+    some, off, rows = with_rows(cloud, np.flatnonzero(near)), off[near], nearest[near]
+    own, rough = _own_variances(fit, some, scan, rows), scan.variances(rows)
+    least = LEAST_SIGMA * scan.spacing
+
+    def noise(x: np.ndarray) -> Noise:
+        shared, factor, odds = np.clip(x, low, high)
+        share = 1 / (1 + float(np.exp(-odds)))
+        return Noise(max(float(np.exp(shared)), least), float(np.exp(factor)), share)
+
+    def cost(x: np.ndarray) -> float:
+        tried = noise(x)
+        logs = tried.logs(off, tried.sigma**2 + tried.factor**2 * own + rough, reach)
+        return 0.01 * float(x[1] ** 2) - float(logs.mean())
+
+    start = np.array([np.log(max(sigma, least)), 0.5, 1.4])
+    low, high = start - _MAX_LOG_CHANGE, start + _MAX_LOG_CHANGE
+    return noise(minimize(cost, start, method="Nelder-Mead", options={"xatol": 0.01}).x)
+
+
+def _own_variances(fit: Sim3, cloud: Cloud, scan: Scan, rows: np.ndarray) -> np.ndarray:
+    """Variances (N,) of the cloud's points along the scan's normals, unit of the scan squared."""
+    turned = scan.normals[rows] @ fit.rotation
+    return fit.scale**2 * np.einsum("ni,nij,nj->n", turned, cloud.covariances, turned)
+
+
+def reach_of(fit: Sim3, cloud: Cloud) -> float:
+    """Largest distance of a point that counts as near a surface, unit of the scan."""
+    return _MAX_NEAR_DISTANCE * cloud.size * fit.scale
+
+
+def residuals_of(
+    fit: Sim3, cloud: Cloud, scan: Scan, reach: float = np.inf
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Of a transformed cloud: points (N, 3), rows (N,) of the nearest scan points, distances (N,)
+    to their planes, and distances (N,) to them, infinite beyond `reach`."""
+    carried = fit.points(cloud.points)
+    gaps, nearest = scan.tree.query(carried, distance_upper_bound=reach)
+    nearest = np.minimum(nearest, len(scan.points) - 1)
+    offsets = carried - scan.points[nearest]
+    return carried, nearest, np.einsum("ni,ni->n", scan.normals[nearest], offsets), gaps
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,15 +119,11 @@ def approach(start: Sim3, cloud: Cloud, scan: Scan, width: float) -> tuple[Sim3,
     both shows are outliers.
 
     Args:
-        start: initial similarity, within some widths of the result.
-        cloud, scan: point cloud and scan.
         width: initial width of the loss, unit of the scan.
     """
     least = LEAST_SIGMA * scan.spacing
-    fit, some = (
-        start,
-        cloud.taken(np.arange(0, len(cloud.points), -(-len(cloud.points) // _NUM_COARSE_POINTS))),
-    )
+    every = np.arange(len(cloud.points))
+    fit, some = start, with_rows(cloud, every[:: -(-len(every) // _NUM_COARSE_POINTS)])
     while True:
         fit = _settle(fit, some, scan, Noise(width), _FEW_STEPS)
         sigma = max(scatter(fit, some, scan, width), least)
@@ -138,9 +211,8 @@ def moved_by(fit: Sim3, step: np.ndarray, middle: np.ndarray) -> Sim3:
 def _with_covariance(fit: Sim3, cloud: Cloud, scan: Scan, noise: Noise) -> Fit:
     """Fit with the sandwich covariance of clustered errors (Liang and Zeger, Biometrika 73, 1986).
 
-    Errors of neighbours (of a piece of wall, by a wrong normal) are correlated, so that the
-    residuals of a cell form one cluster. The size of cells is chosen as by Flyvbjerg and Petersen
-    (J. Chem. Phys. 91, 1989): of several sizes, the one with the largest variances is taken.
+    Residuals of a cell form a cluster, as neighbours' errors are correlated. Of several sizes of
+    cells the one with the largest variances is taken (Flyvbjerg and Petersen, J. Chem. Phys. 91).
     """
     jacobians, off, variances, weights, carried, middle = _weighted(fit, cloud, scan, noise)
     gradients = jacobians * (weights * off)[:, None]

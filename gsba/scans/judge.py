@@ -1,16 +1,12 @@
-"""Evidence of a scan for and against a cloud's placement: surfaces at points and along rays.
-
-A point on a surface of the scan is explained. A point is contradicted if its ray crosses a surface
-before it, or close behind it. Points where the scan has no surface are neutral.
-"""
+"""Evidence of a scan for and against a cloud's placement: points on a surface are explained, those
+whose ray crosses one before them or close behind are contradicted, others are neutral."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import ndtri
 
-from gsba.scans.fit import cells_of
-from gsba.scans.noise import Noise, reach_of, residuals_of
+from gsba.scans.fit import Noise, cells_of, reach_of, residuals_of
 from gsba.scans.types import Cloud, Scan
 from gsba.similarity import Sim3
 
@@ -52,19 +48,16 @@ class ScanVerdict:
         p value over several sizes of cells is taken: a lead that large cells do not show may come
         from errors that small cells share.
         """
+        from scipy.stats import wilcoxon
+
         both = self.informed & other.informed
         gains = (self.logs - other.logs)[both]
-        return max(_chance(np.bincount(c[both], gains)) for c in self.cells)
-
-
-def _chance(gains: np.ndarray) -> float:
-    """P value of gains (C,) under a distribution that is symmetric around zero."""
-    from scipy.stats import wilcoxon
-
-    gains = gains[gains != 0]
-    if not len(gains):
-        return 1.0
-    return float(np.asarray(wilcoxon(gains, alternative="greater"))[1])
+        sums = [np.bincount(c[both], gains) for c in self.cells]
+        sums = [some[some != 0] for some in sums]
+        return max(
+            float(np.asarray(wilcoxon(some, alternative="greater"))[1]) if len(some) else 1.0
+            for some in sums
+        )
 
 
 class CellGrid:
@@ -84,10 +77,8 @@ class CellGrid:
         return np.clip(((points - self.low) / self.edge).astype(np.int64), 0, self.shape - 1)
 
     def first_crossings(self, eyes: np.ndarray, ends: np.ndarray) -> np.ndarray:
-        """Part (N,) of each segment from an eye to an end at its first crossing of a surface.
-
-        Infinite for segments that cross none.
-        """
+        """Part (N,) of each segment at its first crossing of a surface; infinite if it crosses
+        none."""
         ways = ends - eyes
         lengths = np.linalg.norm(ways, axis=1)
         first = np.full(len(eyes), np.inf)
@@ -109,13 +100,7 @@ class CellGrid:
 
 
 def verdict(fit: Sim3, cloud: Cloud, scan: Scan, grid: CellGrid, noise: Noise) -> ScanVerdict:
-    """Evidence of a scan on a cloud.
-
-    Args:
-        fit: similarity from the cloud to the scan.
-        cloud, scan, grid: point cloud, scan and the scan's grid.
-        noise: noise of distances from explained points to their surface.
-    """
+    """Evidence of a scan on a cloud at a similarity; `noise` of explained points' distances."""
     carried, nearest, off, gaps = residuals_of(fit, cloud, scan)
     variances = noise.variances(fit, cloud, scan, nearest)
     sigmas, size = np.sqrt(variances), cloud.size * fit.scale
@@ -141,11 +126,7 @@ def verdict(fit: Sim3, cloud: Cloud, scan: Scan, grid: CellGrid, noise: Noise) -
 
 
 def _brightness_logs(cloud: Cloud, scan: Scan, nearest: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """Log likelihood ratio (N,) of the correlation of near points and surfaces in brightness.
-
-    Ranks of both are transformed to normal scores. The hypotheses are a bivariate normal
-    distribution with their correlation, and independence.
-    """
+    """Log likelihood ratio (N,) of correlated brightness: bivariate normal scores or none."""
     logs = np.zeros(len(near))
     if scan.brightness is None or near.sum() < _MIN_BRIGHTNESS_POINTS:
         return logs

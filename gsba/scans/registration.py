@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 
 from gsba.log import GsbaError
-from gsba.scans.fit import Fit, approach, settle
+from gsba.scans.fit import Fit, approach, noise_of, reach_of, settle
 from gsba.scans.judge import CellGrid, ScanVerdict, verdict
-from gsba.scans.noise import noise_of, reach_of
 from gsba.scans.search import Guess, candidates, distance
 from gsba.scans.types import Cloud, Scan
 from gsba.similarity import Sim3
@@ -79,15 +78,8 @@ def in_file(path: Path) -> Iterator[None]:
 
 
 def register(cloud: Cloud, scan: Scan, guess: Guess | None = None) -> Registration:
-    """Unique similarity from a cloud to a scan.
-
-    Args:
-        cloud, scan: point cloud and scan.
-        guess: prior knowledge; only placements within it are tried.
-
-    Raises:
-        NoPlacementError: no placement explains enough, or several do about as well.
-    """
+    """Unique similarity from a cloud to a scan, of those that `guess` allows; NoPlacementError if
+    none explains enough, or several do about as well."""
     guess, grid = guess or Guess(), CellGrid(scan)
     fits = _likeliest(cloud, scan, guess, grid, _NUM_FINALISTS)
     if not fits:
@@ -136,11 +128,7 @@ _ADVICE = (
 
 
 def _check(found: Registration, reach: float) -> None:
-    """Refuse a placement that explains too little, or only by a noise that no run has.
-
-    Args:
-        reach: largest noise of a run, unit of the scan.
-    """
+    """Refuse a placement that explains too little, or only by a noise that no run has."""
     evidence, sigma = found.verdict, found.fit.noise.sigma
     if sigma > reach:
         raise NoPlacementError(

@@ -1,9 +1,5 @@
-"""Candidate placements of a cloud in a scan, by the main axes of their surfaces.
-
-The planes of rooms give both the same main axes, along which the profiles of surfaces correlate at
-one scale and shift. All rotations that map axes to axes are tried, so that rooms with a symmetry
-give several candidates.
-"""
+"""Candidate placements of a cloud in a scan, by the main axes of their surfaces, along which
+profiles correlate at one scale and shift; all rotations that map axes to axes are tried."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -106,19 +102,17 @@ def main_axes(normals: np.ndarray) -> np.ndarray:
     """Right-handed frame as rows (3, 3): the most frequent direction of normals, the most frequent
     one perpendicular to it, and their cross product."""
     some = _some(normals, 4000)
-    tried = _half_sphere(1500)
-    votes = _votes(some, tried)
+    z = (np.arange(1500) + 0.5) / 1500  # over half the sphere, by Fibonacci's lattice
+    turn, flat = np.pi * (1 + np.sqrt(5)) * np.arange(1500), np.sqrt(1 - z * z)
+    tried = np.stack([flat * np.cos(turn), flat * np.sin(turn), z], axis=1)
+    cosines = np.abs(tried @ some.T)
+    votes = np.sum(np.exp((cosines**2 - 1) / np.radians(5) ** 2 / 2), axis=1)
     first = _centred(some, tried[np.argmax(votes)])
     level = np.abs(tried @ first) < np.sin(np.radians(8))
     second = _centred(some, tried[np.argmax(np.where(level, votes, -1))])
     second = second - first * (first @ second)
     second /= np.linalg.norm(second)
     return np.stack([first, second, np.cross(first, second)])
-
-
-def _votes(normals: np.ndarray, tried: np.ndarray) -> np.ndarray:
-    cosines = np.abs(tried @ normals.T)
-    return np.sum(np.exp((cosines**2 - 1) / np.radians(5) ** 2 / 2), axis=1)
 
 
 def _centred(normals: np.ndarray, axis: np.ndarray) -> np.ndarray:
@@ -129,14 +123,6 @@ def _centred(normals: np.ndarray, axis: np.ndarray) -> np.ndarray:
             break
         axis = np.linalg.eigh(near.T @ near)[1][:, 2]
     return axis
-
-
-def _half_sphere(num: int) -> np.ndarray:
-    """Directions (num, 3) spread evenly over half the sphere (Fibonacci's lattice)."""
-    z = (np.arange(num) + 0.5) / num
-    turn = np.pi * (1 + np.sqrt(5)) * np.arange(num)
-    flat = np.sqrt(1 - z * z)
-    return np.stack([flat * np.cos(turn), flat * np.sin(turn), z], axis=1)
 
 
 def _turns() -> Iterator[np.ndarray]:

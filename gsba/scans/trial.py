@@ -1,7 +1,4 @@
-"""Trial reading of scans in a separate process, as damaged files crash the reading libraries.
-
-The calling process reads a file again that passed.
-"""
+"""Trial reading of scans in a separate process, as damaged files crash the reading libraries."""
 
 import json
 import os
@@ -27,11 +24,7 @@ _REFUSED = 3  # exit code of the process after it has printed a message
 
 
 def try_in_process(path: Path) -> None:
-    """Read a scan in another process, see `limited`.
-
-    Raises:
-        GsbaError: the file cannot be read, or the process crashed.
-    """
+    """Read a scan in another process, see `limited`; GsbaError if that fails or crashes."""
     found = subprocess.run(
         [sys.executable, "-P", "-c", _CHILD, json.dumps(sys.path), str(path.absolute())],
         stdin=subprocess.DEVNULL,
@@ -57,12 +50,7 @@ def try_in_process(path: Path) -> None:
 
 
 def limited(path: Path, read: Callable[[Path], object]) -> None:
-    """Read a scan with limits on memory and processor time by its size, and end the process.
-
-    Args:
-        path: file of the scan.
-        read: function that is called with the path.
-    """
+    """Read a scan with limits on memory and processor time by its size, and end the process."""
     size = path.stat().st_size
     memory = _mapped_bytes() + _BASE_MEMORY_BYTES + _MEMORY_PER_BYTE * size
     spent = sum(os.times()[:2])

@@ -3,18 +3,21 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.spatial import KDTree
 
 from gsba.log import GsbaError
 from gsba.types import Reconstruction
+from gsba.types.records import with_rows
 
 NEIGHBOURS = 24  # of a scan's point, through which its plane is fitted
 MIN_POINTS = 300  # of a cloud that can be registered
 _POINTS_AT_ONCE = 50_000
 _MIN_RAYS = 3  # of a point: two wrong rays may also meet
 _MAX_POINT_SIGMA = 0.02  # of a used point, part of the cloud's size
+_NUM_BINS = 30  # of a histogram
 
 
 @dataclass(frozen=True)
@@ -72,10 +75,6 @@ class Cloud:
         """Size of the cloud, see `size_of`."""
         return size_of(self.points)
 
-    def at(self, points: np.ndarray) -> "Cloud":
-        """Cloud with its points moved to (N, 3)."""
-        return replace(self, points=points)
-
     def mirrored(self) -> "Cloud":
         """Cloud mirrored along x, which no rotation maps to this one."""
         flip = np.array([-1.0, 1, 1])
@@ -86,11 +85,6 @@ class Cloud:
             eyes=self.eyes * flip,
             normals=self.normals * flip,
         )
-
-    def taken(self, rows: np.ndarray) -> "Cloud":
-        """Cloud of the points `rows` (N',)."""
-        parts = ("points", "covariances", "eyes", "rows", "normals", "brightness")
-        return replace(self, **{name: getattr(self, name)[rows] for name in parts})
 
 
 def size_of(points: np.ndarray) -> float:
@@ -108,7 +102,6 @@ def cloud_of(
     directions, with the noise of the observation times the distance as standard deviation.
 
     Args:
-        reconstruction: the run.
         normals_of: computes unit normals (N, 3) of points (N, 3) from their neighbours.
 
     Raises:
@@ -140,10 +133,57 @@ def cloud_of(
         result.point_colors[every].mean(axis=1),
     )
     if len(every) >= MIN_POINTS:
-        cloud = cloud.taken(1 / np.sqrt(values[every, 0]) <= _MAX_POINT_SIGMA * cloud.size)
+        cloud = with_rows(cloud, 1 / np.sqrt(values[every, 0]) <= _MAX_POINT_SIGMA * cloud.size)
     if len(cloud.points) < MIN_POINTS:
         raise GsbaError(
             f"the run has {len(cloud.points)} points with a sigma below "
             f"{100 * _MAX_POINT_SIGMA:.0f} % of its size; alignment to a scan needs {MIN_POINTS}"
         )
     return replace(cloud, normals=normals_of(cloud.points))
+
+
+@dataclass(frozen=True, slots=True)
+class Distances:
+    """Distances of a cloud's points to the surfaces of a scan."""
+
+    values: np.ndarray  # (N,) float64, unit of the scan
+    explained: float  # share of points on a surface, see `gsba.scans.judge`
+
+    @property
+    def median(self) -> float:
+        """Median distance."""
+        return float(np.median(self.values))
+
+    @property
+    def percentile90(self) -> float:
+        """90th percentile of the distances."""
+        return float(np.quantile(self.values, 0.9))
+
+    def histogram(self, furthest: float) -> tuple[np.ndarray, np.ndarray]:
+        """Counts (B + 1,), the last one of distances beyond `furthest`, and edges (B + 1,)."""
+        edges = np.linspace(0, furthest, _NUM_BINS + 1)
+        counts = np.histogram(self.values, edges)[0]
+        return np.append(counts, np.sum(self.values > furthest)), edges
+
+    def to_json(self, furthest: float) -> dict[str, Any]:
+        """Plain values for JSON; the histogram spans distances up to `furthest`."""
+        counts, edges = self.histogram(furthest)
+        return {
+            "points": len(self.values),
+            "median": self.median,
+            "percentile90": self.percentile90,
+            "explained": self.explained,
+            "histogram": {"edges": edges.tolist(), "counts": counts.tolist()},
+        }
+
+
+def distances_to(scan: Scan, points: np.ndarray) -> np.ndarray:
+    """Distances (N,) of points (N, 3) to a scan's surfaces.
+
+    The distance is to the plane of the nearest scan point if its foot is within the range of that
+    point's neighbours, so that the scan's spacing adds no error; else to the scan point.
+    """
+    gaps, nearest = scan.tree.query(points)
+    off = np.einsum("ni,ni->n", scan.normals[nearest], points - scan.points[nearest])
+    along = np.sqrt(np.maximum(gaps**2 - off**2, 0))
+    return np.where(along <= scan.reaches[nearest], np.abs(off), gaps)

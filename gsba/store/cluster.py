@@ -1,9 +1,5 @@
-"""Workers of a Dask scheduler, for `gsba.store.shards`, and recovery from their failures.
-
-Workers get paths only, and share the run's disk. A shard's result is a file that is written
-atomically and does not depend on the worker, so that a worker that dies, disconnects or is slow
-costs only time. The scheduler gets a window of a job's shards at a time.
-"""
+"""Workers of a Dask scheduler, for `gsba.store.shards`, and recovery from their failures: results
+are files that do not depend on the worker, so that one that dies or is slow costs only time."""
 
 import importlib
 import json
@@ -59,13 +55,8 @@ _DISK_TIMEOUT_S = 30.0  # until a shared disk shows a file that another machine 
 def hire(
     client: "Client | None", frames: Path, settings: RefineSettings
 ) -> Callable[[Path], Workers]:
-    """Function that makes the workers of a run from the folder of its shards.
-
-    Args:
-        client: client of a scheduler; None = threads of this process.
-        frames: frames of the run, which workers read.
-        settings: settings of the run.
-    """
+    """Function that makes a run's workers from the folder of its shards; no client: threads
+    here."""
 
     def make(folder: Path) -> Workers:
         if client is None:
@@ -77,13 +68,8 @@ def hire(
 
 @contextmanager
 def hired(client: "Client | None", out: Path, frames: FrameSet) -> Iterator["Cluster | None"]:
-    """Workers that write to `out`; the folder of their shards lies beside it within this context.
-
-    Args:
-        client: client of a scheduler; None = no workers.
-        out: folder on a disk that workers share; may be missing.
-        frames: frames that workers read.
-    """
+    """Workers that write to `out`, which may be missing; within this context their shards' folder
+    lies beside it. Without a client there are none."""
     if client is None:
         yield None
         return
@@ -151,11 +137,6 @@ def connect(address: str) -> "Client":
 
 
 def _scheduler_address(address: str) -> str:
-    """Address that a scheduler listens at: `address`, or the one in its file.
-
-    Raises:
-        OSError, ValueError: the file is missing, or there is no valid address.
-    """
     found: Any = address
     if address.endswith(".json"):
         found = json.loads(Path(address).read_text(encoding="utf-8"))
@@ -210,9 +191,6 @@ class Cluster:
     """Workers of a Dask scheduler that see the run's folder and its frames.
 
     Args:
-        client: client of the scheduler.
-        folder: folder of shards, in the run's folder.
-        frames: frames of the run.
         num_threads: of this process, for what is not shared out.
 
     Raises:
@@ -302,13 +280,7 @@ class Cluster:
         )
 
     def _wait(self, shard: _Shard, returns: Any, lasted: list[float]) -> tuple[Any, ...]:
-        """Results of a shard's items; replaces workers that die or are late.
-
-        Args:
-            shard: the shard.
-            returns: type of an item's result.
-            lasted: seconds that earlier shards took; this one's time is appended.
-        """
+        """Results of a shard's items; replaces workers that die or are late."""
         from distributed import wait
 
         began, died = time.monotonic(), 0
@@ -337,11 +309,7 @@ class Cluster:
         return self._load(shard, returns)
 
     def _outcome(self, future: "Future", shard: _Shard) -> Manifest | None:
-        """Manifest of a shard from its worker; None = the worker died.
-
-        Raises:
-            Exception: the error of the worker or of the scheduler.
-        """
+        """Manifest of a shard from its worker; None = the worker died."""
         from distributed import KilledWorker
 
         if future.status == "finished":
@@ -371,7 +339,6 @@ class Cluster:
             shard.futures.append(self._submit(shard, others))
 
     def _load(self, shard: _Shard, returns: Any) -> tuple[Any, ...]:
-        """Results that a worker has stored, once this machine sees the file."""
         end = time.monotonic() + _DISK_TIMEOUT_S
         while True:
             found = shards.load_shard(shard.path, returns)

@@ -12,15 +12,8 @@ from gsba.types import FrameSet, Reconstruction
 
 
 def load_run(out: Path, map_number: int = 1) -> tuple[Reconstruction, FrameSet]:
-    """One map of a finished run and its frames.
-
-    Args:
-        out: folder of the run.
-        map_number: number of the map, 1 = the largest.
-
-    Raises:
-        GsbaError: `out` is no finished run, or was edited; there is no such map.
-    """
+    """One map of a finished run, 1 = the largest, and its frames; GsbaError if `out` is no finished
+    run, was edited, or has no such map."""
     reconstruction = load_stage(out, "reconstruction", Reconstruction)
     frames = load_stage(out, "frames", FrameSet)
     if not _fit_together(reconstruction, frames):
@@ -37,17 +30,7 @@ def load_run(out: Path, map_number: int = 1) -> tuple[Reconstruction, FrameSet]:
 def one_map(
     reconstruction: Reconstruction, frames: FrameSet, map_number: int, name: str
 ) -> tuple[Reconstruction, FrameSet]:
-    """Map of a reconstruction, 1 = the largest, and its frames.
-
-    Args:
-        reconstruction: all maps.
-        frames: all frames.
-        map_number: number of the map.
-        name: name of the run in the message.
-
-    Raises:
-        GsbaError: there is no such map.
-    """
+    """Map of a reconstruction, 1 = the largest, and its frames; GsbaError if there is none."""
     num = reconstruction.num_maps
     if not 1 <= map_number <= num:
         raise GsbaError(
@@ -57,15 +40,8 @@ def one_map(
 
 
 def load_cameras(out: Path, main: Reconstruction, frames: FrameSet, map_number: int = 1) -> Cameras:
-    """Cameras of a finished run's map, in that map's unit; one centre each if none has two lenses.
-
-    Args:
-        out: folder of the run.
-        main, frames, map_number: the map, as `load_run` gives it.
-
-    Raises:
-        GsbaError: the run found two lenses, but their file is missing.
-    """
+    """Cameras of a finished run's map, in that map's unit; one centre each if none has two
+    lenses."""
     if main.lens_baseline is None:
         return Cameras.of(ONE_CENTRE, frames)
     whole = load_stage(out, "reconstruction", Reconstruction)

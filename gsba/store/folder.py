@@ -1,8 +1,5 @@
-"""Run folders: their inputs, their lock, and the list of files that gsba wrote.
-
-`RUN/gsba.json` names the inputs of the run and lists the files that gsba wrote, so that a folder
-of other content is refused and `--fresh` deletes only files of gsba.
-"""
+"""Run folders: their lock, their inputs, and the list of files that gsba wrote (`gsba.json`), so
+that other content is refused, and kept by `--fresh`."""
 
 import json
 import os
@@ -32,7 +29,6 @@ def open_run_folder(root: Path, origin: Mapping[str, Path], fresh: bool) -> int:
     """Make or reopen a run folder and lock it against other processes.
 
     Args:
-        root: the folder, made if missing.
         origin: inputs of the run, e.g. `{"frames": path, "trajectory": path}`.
         fresh: delete the files that gsba wrote for an earlier run of any inputs.
     Returns:
@@ -43,7 +39,10 @@ def open_run_folder(root: Path, origin: Mapping[str, Path], fresh: bool) -> int:
     """
     resolved = {name: str(path.resolve()) for name, path in origin.items()}
     with disk_errors(root):
-        _require_ours_or_empty(root)
+        if root.exists() and not root.is_dir():
+            raise GsbaError(f"{root} is a file: choose another --out")
+        if root.is_dir() and not is_run_folder(root) and any(root.iterdir()):
+            raise GsbaError(f"{root} is not empty and not a gsba run: choose another --out")
         root.mkdir(parents=True, exist_ok=True)
         lock = hold_folder(root)
     try:
@@ -106,13 +105,6 @@ def _write_marker(root: Path, origin: Mapping[str, str], wrote: Any) -> None:
     marker = {"gsba": __version__, "origin": origin, "wrote": sorted(wrote)}
     text = json.dumps(marker, indent=1) + "\n"
     write_text(root / MARKER, text)
-
-
-def _require_ours_or_empty(root: Path) -> None:
-    if root.exists() and not root.is_dir():
-        raise GsbaError(f"{root} is a file: choose another --out")
-    if root.is_dir() and not is_run_folder(root) and any(root.iterdir()):
-        raise GsbaError(f"{root} is not empty and not a gsba run: choose another --out")
 
 
 def _remove_claimed(root: Path, marker: Mapping[str, Any]) -> None:

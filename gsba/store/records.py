@@ -24,7 +24,7 @@ import zipfile
 import zlib
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import MISSING, Field, fields, is_dataclass
+from dataclasses import MISSING, fields, is_dataclass
 from enum import Enum
 from functools import lru_cache
 from pathlib import Path
@@ -58,12 +58,8 @@ class RecordError(Exception):
 
 
 def save_record(path: Path, value: object, info: Mapping[str, Any]) -> None:
-    """Store a record atomically, with a JSON-able `info` (key, timing).
-
-    Raises:
-        TypeError: `value` holds a type that records cannot hold.
-        GsbaError: the disk cannot be written.
-    """
+    """Store a record atomically, with a JSON-able `info` (key, timing); TypeError if it holds a
+    type that records cannot hold, GsbaError if the disk cannot be written."""
     arrays: dict[str, np.ndarray] = {}
     manifest = {"format": FORMAT, "info": dict(info), "value": _encode(value, "", arrays)}
 
@@ -110,26 +106,15 @@ def read_info(path: Path) -> dict[str, Any]:
 
 
 def load_record(path: Path, returns: type[T], mapped: bool = False) -> T:
-    """Read a record back.
-
-    Args:
-        path: file written by `save_record`.
-        returns: its type, e.g. a dataclass or `tuple[Matches, Counts]`.
-        mapped: leave large arrays on the disk, where they are read as they are used; they cannot be
-            written. The file may be replaced meanwhile, but not changed.
-    Raises:
-        RecordError: missing, truncated, corrupt, or of another type.
-    """
+    """Read a record back as a type, e.g. a dataclass or `tuple[Matches, Counts]`; `mapped` leaves
+    large arrays on the disk, read-only, whose file may be replaced, but not changed. RecordError if
+    it is missing, corrupt, or of another type."""
     with _reading(path, _MappedArchive if mapped else _Archive) as archive:
         return _decode(_manifest(archive)["value"], returns, archive)
 
 
 def load_keyed(path: Path, key: str, returns: type[T]) -> T | None:
-    """Read a record back if its info has this `key`; None if it has another.
-
-    Raises:
-        RecordError: as for `load_record`.
-    """
+    """Read a record back if its info has this `key`; None if it has another; see `load_record`."""
     with _reading(path) as archive:
         manifest = _manifest(archive)
         if manifest["info"].get("key") != key:
@@ -138,19 +123,8 @@ def load_keyed(path: Path, key: str, returns: type[T]) -> T | None:
 
 
 def load_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
-    """Read arrays of a record by the names of their fields, whatever the record's type.
-
-    Args:
-        path: file written by `save_record`.
-        names: names of fields.
-
-    Returns:
-        The first array of each name, in the order of the record's fields; those it lacks are left
-        out.
-
-    Raises:
-        RecordError: missing, truncated or corrupt.
-    """
+    """Arrays of a record by names of fields, whatever its type: the first of each, in the order of
+    the record's fields, without those it lacks; RecordError if damaged."""
     arrays: dict[str, np.ndarray] = {}
     with _reading(path) as archive:
         for member in archive.namelist():
@@ -161,17 +135,8 @@ def load_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
 
 
 def load_checkpoint(path: Path | None, key: str, returns: type[T], anew: str) -> T | None:
-    """Read what interrupted work saved, if it was saved with this `key` in its info.
-
-    Args:
-        path: file written by `save_record`; None = there is none.
-        key: digest of all that the work depends on.
-        returns: type of the record.
-        anew: clause for the log if the file cannot be used, e.g. "training starts anew".
-
-    Returns:
-        The record; None = there is none that can be used.
-    """
+    """What interrupted work saved with this `key`; None if there is nothing usable, which the log
+    tells with the clause `anew`, as "training starts anew"."""
     if path is None or not path.exists():
         return None
     try:
@@ -188,11 +153,7 @@ class _Archive(zipfile.ZipFile):
     """Archive whose arrays are read as a whole."""
 
     def array(self, name: str) -> np.ndarray:
-        """An array whose bytes agree with their checksum.
-
-        Raises:
-            ValueError: it is not of numbers, or longer or shorter than its header says.
-        """
+        """An array of numbers whose bytes agree with their checksum and header; else ValueError."""
         content = self.read(name)
         file = io.BytesIO(content)
         shape, fortran, dtype = _header(file)
@@ -234,13 +195,10 @@ class _MappedArchive(_Archive):
 
 
 def _header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
-    """Shape, order and type of an array of numbers from the beginning of its `.npy` file.
+    """Shape, order and type of an array of numbers, from the beginning of its `.npy` file.
 
-    numpy's own reader parses the header as Python code: one thread at a time, and CPython 3.11
-    fails now and then where another one parses, too (its issue 106905).
-
-    Raises:
-        ValueError: it is no header of such an array, or not of the version that is written here.
+    numpy's reader parses the header as Python code: one thread at a time, and CPython 3.11 fails at
+    times where another one parses, too (its issue 106905).
     """
     version = np.lib.format.read_magic(file)
     if version != (1, 0):
@@ -305,11 +263,7 @@ def _join(place: str, name: str) -> str:
 
 
 def typed(tree: Any, returns: type[T]) -> T:
-    """Record without arrays from its JSON tree.
-
-    Raises:
-        RecordError: the tree is of another type.
-    """
+    """Record without arrays from its JSON tree; RecordError if it is of another type."""
     try:
         return _decode(tree, returns, None)
     except (ValueError, TypeError, AttributeError) as error:
@@ -390,13 +344,9 @@ def _decode_dataclass(tree: Any, cls: type[T], archive: _Archive | None) -> T:
 def _fields_of(cls: type) -> tuple[frozenset[str], dict[str, Any]]:
     """Names of a dataclass's fields that have no default, and the types of all."""
     own, hints = fields(cls), typing.get_type_hints(cls)
-    needed = frozenset(entry.name for entry in own if not _has_default(entry))
-    return needed, {entry.name: hints[entry.name] for entry in own}
-
-
-def _has_default(entry: Field) -> bool:
-    """True if the field has a default, so that records from before it was added can be read."""
-    return entry.default is not MISSING or entry.default_factory is not MISSING
+    # Records from before a field with a default was added can be read.
+    needed = [f.name for f in own if f.default is MISSING and f.default_factory is MISSING]
+    return frozenset(needed), {entry.name: hints[entry.name] for entry in own}
 
 
 def _require(condition: bool, tree: Any, hint: Any) -> None:

@@ -1,10 +1,6 @@
-"""Parallel work on frames: one interface for threads of this process and remote workers.
-
-A job is a set of items that are computed independently, in any order. Remote workers get a shard:
-the path of a file in the run's folder that holds a block of items with their inputs. They write the
-results beside it, and send back their name and the cost. A shard is named after its content, so
-that a finished block is never computed again.
-"""
+"""Parallel work on frames: one interface for threads of this process and remote workers. A shard is
+a file with a block of a job's items and their inputs, named after its content, so that a finished
+one is never computed again."""
 
 import hashlib
 import hmac
@@ -97,11 +93,7 @@ class Workers(Protocol):
         ...
 
     def must_see(self, paths: Sequence[Path]) -> None:
-        """Refuse workers that do not see these paths.
-
-        Raises:
-            GsbaError: a worker does not see a path.
-        """
+        """Refuse workers that do not see these paths."""
         ...
 
 
@@ -179,17 +171,11 @@ class Manifest:
 
 
 def write_shard(job: Job[R], folder: Path) -> tuple[Path, str]:
-    """Write a part of a job for a worker.
-
-    Args:
-        job: the part.
-        folder: folder of shards, on a disk that workers share.
-
-    Returns:
-        Its file, whose result goes to `result_path` of it, and the SHA-256 of its content. The
-        digest must reach `run_shard` by another way than this disk.
-    """
-    content = f"{__version__}\n".encode() + _pickled(job)
+    """Write a part of a job for a worker to a folder of shards, on a disk that workers share; gives
+    its file and the SHA-256 of its content, which must reach `run_shard` by another way."""
+    buffer = io.BytesIO()
+    _pickle(job, buffer)
+    content = f"{__version__}\n".encode() + buffer.getvalue()
     digest = hashlib.sha256(content).hexdigest()
     path = folder.absolute() / f"{digest[:32]}.job"
     write_bytes(path, content)
@@ -208,7 +194,6 @@ def run_shard(path: str, digest: str) -> Manifest:
     others may have written into the folder of a run that was copied.
 
     Args:
-        path: file of the shard.
         digest: SHA-256 of its content from `write_shard`.
 
     Raises:
@@ -247,12 +232,6 @@ class _Pickler(pickle.Pickler):
         if isinstance(obj, np.ndarray):
             return _array, (obj.dtype.str, obj.shape, np.ascontiguousarray(obj).tobytes())
         return NotImplemented
-
-
-def _pickled(value: object) -> bytes:
-    buffer = io.BytesIO()
-    _pickle(value, buffer)
-    return buffer.getvalue()
 
 
 def content_digest(*values: object) -> str:

@@ -72,11 +72,9 @@ class RunStore:
     """One run's folder, locked by one process at a time; use as a context manager.
 
     Args:
-        root: folder of the run, made if missing.
         origin: inputs of the run, e.g. `{"frames": path, "trajectory": path}`.
         fresh: delete the files that gsba wrote for an earlier run in `root`, and only these.
         hire: makes the workers of the stages from the folder of shards; None = one thread.
-        title_of: gives the title of a stage by its name, for the log.
 
     Raises:
         GsbaError: the folder is of another run, is no run, or is locked by another process.
@@ -149,10 +147,8 @@ class RunStore:
         """Result of a stage: the stored one if its key matches, else computed and stored.
 
         Args:
-            name: names the stage, its file and its row in the report.
             settings: everything `compute` depends on besides earlier stages: settings models,
                 `fingerprint(...)` of input files, numbers, ... (see `digest`).
-            compute: makes the result; called without arguments.
             returns: type of the result, a record of gsba.types or a tuple of such.
             after: names of earlier stages of this call whose results `compute` uses.
 
@@ -200,7 +196,6 @@ class RunStore:
             items: frame name -> inputs of this frame's result besides `settings`, e.g.
                 `fingerprint(paths)`; only frames whose entry changed are computed again.
             compute: makes the result of the named frame; remote workers need it to be a `Taken`.
-            name, settings, returns, after: see `stage`.
             alone: compute one frame at a time, in this process.
         """
         base = self._key(name, settings, after)
@@ -234,13 +229,8 @@ class RunStore:
         compute: Callable[[str], T],
         returns: type[T],
     ) -> "PerFrame[T]":
-        """Results of a per-frame stage that another run has stored, as results of this one.
-
-        Args:
-            name: name of the stage.
-            files: frame name -> file in the folder of the other run; computed where it is missing.
-            compute, returns: see `per_frame`.
-        """
+        """Results of a per-frame stage that another run has stored in files (frame name -> file),
+        as results of this one; computed where a file is missing."""
         folder, keys = self.root / STAGES / name, {}
         for frame, source in files.items():
             path = folder / f"{frame}.npz"
@@ -308,7 +298,6 @@ class Chain:
     """Stages that each depend on the one before.
 
     Args:
-        store: store of the run.
         latest: names of the stages that the first one depends on.
     """
 
@@ -433,11 +422,8 @@ class _Missing:
 
 
 def load_stage(root: Path, name: str, returns: type[T]) -> T:
-    """Result of a finished stage of a run with any settings, for export and evaluate.
-
-    Raises:
-        GsbaError: `root` is no gsba run or holds links, or the stage is missing or damaged.
-    """
+    """Result of a finished stage of a run with any settings; GsbaError if `root` is no gsba run or
+    holds links, or the stage is missing or damaged."""
     if not is_run_folder(root):
         raise GsbaError(f"{root} is not a gsba run: it has no {MARKER}")
     refuse_foreign(root)

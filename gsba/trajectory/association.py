@@ -5,9 +5,8 @@ import logging
 import numpy as np
 
 from gsba.config import ReadSettings
-from gsba.geometry import pose
+from gsba.geometry import inverse, pose
 from gsba.log import GsbaError
-from gsba.trajectory.units import refuse_apart, refuse_intervals, refuse_other_unit, span
 from gsba.types import CoarsePoses, FrameSet, PoseSource, Trajectory
 
 _MAX_INTERPOLATION_S = 10.0  # between an entry and a frame; poses further away are reported
@@ -23,6 +22,82 @@ _GRID_TOLERANCE = 0.1  # tolerance of coinciding times when an offset is searche
 _VELOCITY_S = 0.5
 _TRANSLATION_FADE_S = 10.0
 _ROTATION_FADE_S = 1.0
+_UNIT_OF_POWER = {3: "milliseconds", 6: "microseconds", 9: "nanoseconds"}  # by their power of ten
+_MAX_LOG_DEVIATION = np.log10(1.5)  # largest log10 deviation of the ratio of durations from a
+# unit's power
+_MAX_ROUGH_LOG_DEVIATION = np.log10(5.0)  # the same limit if times as given make no sense
+_MAX_INTERVAL_RATIO = 8.0  # largest interval in the other side's intervals: no SLAM and no camera
+# is that slow
+_MIN_INTERVAL_S = 1e-9  # least interval: no camera is that fast
+_MAX_TIME_DIFFERENCE_S = 1e-3  # largest time difference of entries of one frame
+
+
+def refuse_intervals(frame_times: np.ndarray, entries: np.ndarray) -> None:
+    """Refuse times (F,), (N,) that lie closer together than a clock resolves."""
+    for owner, times in (("two frames are", frame_times), ("two poses are", entries)):
+        if np.diff(times).min() <= _MIN_INTERVAL_S:
+            at = float(times[np.argmin(np.diff(times))])
+            raise GsbaError(
+                f"{owner} less than {_MIN_INTERVAL_S:g} s apart, at {at!r} s: check the times"
+            )
+
+
+def refuse_other_unit(
+    frame_times: np.ndarray, entries: np.ndarray, senseless: bool = False
+) -> None:
+    """Refuse times of one side in milli-, micro- or nanoseconds while the other is in seconds.
+
+    Both durations agree but for a power of a thousand. A clip of a long trajectory may do so by
+    chance, or poses for a few of many frames: then neither side is much sparser than the other.
+
+    Args:
+        frame_times: (F,) frame times as given, ascending.
+        entries: (N,) times of the trajectory as given, ascending.
+        senseless: True if times as given make no sense; then the limit is looser.
+
+    Raises:
+        GsbaError: units differ; the message names the unit and the remedy.
+    """
+    ratio = float(np.log10(np.ptp(entries) / np.ptp(frame_times)))
+    power = int(np.clip(3 * round(ratio / 3), -9, 9))
+    intervals = np.median(np.diff(entries)), np.median(np.diff(frame_times))
+    sparse = max(intervals) > _MAX_INTERVAL_RATIO * min(intervals) and (power > 0) == (
+        intervals[0] > intervals[1]
+    )
+    sure = abs(ratio - power) <= _MAX_LOG_DEVIATION and sparse
+    if power == 0 or not (sure or (senseless and abs(ratio - power) <= _MAX_ROUGH_LOG_DEVIATION)):
+        return
+    whose, others = ("the trajectory's times", "the frames'")
+    what = "divide them"
+    if power < 0:
+        whose, others = "the frames' times", "the trajectory's"
+        what = "check --fps, or divide the times"
+    raise GsbaError(
+        f"{whose} look like {_UNIT_OF_POWER[abs(power)]} where {others} are seconds (frames span "
+        f"{span(frame_times)}, the trajectory {span(entries)}): {what} by 1e{abs(power)}"
+    )
+
+
+def refuse_apart(frame_times: np.ndarray, entries: np.ndarray, margin: float) -> None:
+    """Refuse a trajectory (N,) that hardly overlaps the frames (F,) in time, seconds on its clock,
+    both spans extended by `margin`."""
+    inside = np.sum((frame_times >= entries[0] - margin) & (frame_times <= entries[-1] + margin))
+    during = np.sum((entries >= frame_times[0] - margin) & (entries <= frame_times[-1] + margin))
+    if min(inside, during) >= 2:
+        return
+    refuse_other_unit(frame_times, entries, senseless=True)
+    what = f"only {inside} of {len(frame_times)} frames lie within the trajectory's time"
+    if during < 2:
+        what = f"only {during} of {len(entries)} poses lie within the frames' time"
+    raise GsbaError(
+        f"{what} (frames span {span(frame_times)} s, the trajectory {span(entries)} s): check "
+        "--fps, --timestamps or read.clock_offset_s, or refine without it (--no-trajectory)"
+    )
+
+
+def span(times: np.ndarray) -> str:
+    """First and last of times (N,), for a message."""
+    return f"{times[0]:.6f} to {times[-1]:.6f}"
 
 
 def associate(frames: FrameSet, trajectory: Trajectory, settings: ReadSettings) -> CoarsePoses:
@@ -33,7 +108,6 @@ def associate(frames: FrameSet, trajectory: Trajectory, settings: ReadSettings) 
     an interval of frames or entries, whichever is shorter.
 
     Args:
-        frames: F frames.
         trajectory: N entries; its clock may differ from the frames' by a constant.
         settings: `clock_offset_s` states that constant. Without it the clocks must agree, or
             exactly one offset must make all times meet; that one is then used, with a warning.
@@ -210,3 +284,55 @@ def matched_in_time(
     mutual = nearest_t[nearest_e] == rows_t
     rows_t = rows_t[mutual & (np.abs(times_e[nearest_e] - times_t) <= tolerance_s)]
     return finite[nearest_e[rows_t]], rows_t
+
+
+def follow_keyframes(frames: Trajectory, keyframes: Trajectory) -> Trajectory:
+    """Frame poses corrected by the keyframes around them.
+
+    After a loop closure a SLAM corrects its keyframes, but not the frames between them. Each frame
+    is moved with the keyframe before it and with the one after it by their relative motion in the
+    frame trajectory, and is interpolated between both results in time; beyond the ends there is
+    only one.
+
+    Args:
+        keyframes: K poses of the same run, in the same world and on the same clock.
+
+    Returns:
+        Poses at all times of both trajectories.
+
+    Raises:
+        GsbaError: fewer than two keyframes are frames of the trajectory.
+    """
+    nearest = np.searchsorted(frames.timestamps, keyframes.timestamps)
+    nearest = np.clip(nearest, 1, len(frames.timestamps) - 1)
+    gaps = np.abs(frames.timestamps[[nearest - 1, nearest]] - keyframes.timestamps)
+    nearest = nearest - (gaps[0] < gaps[1])
+    shared = gaps.min(axis=0) < _MAX_TIME_DIFFERENCE_S
+    if shared.sum() < 2:
+        raise GsbaError(
+            f"only {shared.sum()} of {len(shared)} keyframes have the time of a frame of the "
+            "trajectory: give both files of one run"
+        )
+    at, leading = nearest[shared], keyframes.world_T_rigs[shared]
+    moves = leading @ inverse(frames.world_T_rigs[at])  # correction of the world at each keyframe
+    after = np.searchsorted(at, np.arange(len(frames.timestamps)), side="right")
+    before, after = np.clip(after - 1, 0, None), np.clip(after, 0, len(at) - 1)
+    times = frames.timestamps
+    span = np.maximum(times[at[after]] - times[at[before]], 1e-12)
+    share = np.clip((times - times[at[before]]) / span, 0, 1)
+    first, second = moves[before] @ frames.world_T_rigs, moves[after] @ frames.world_T_rigs
+    followed = _interpolated(first, second, share)
+    times = np.concatenate([times, keyframes.timestamps[~shared]])
+    poses = np.concatenate([followed, keyframes.world_T_rigs[~shared]])
+    order = np.argsort(times)
+    return Trajectory(times[order], poses[order])
+
+
+def _interpolated(first: np.ndarray, second: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """Poses (N, 4, 4) interpolated from the first to the second by shares (N,)."""
+    from scipy.spatial.transform import Rotation
+
+    turn = np.swapaxes(first[:, :3, :3], 1, 2) @ second[:, :3, :3]
+    part = Rotation.from_rotvec(share[:, None] * Rotation.from_matrix(turn).as_rotvec())
+    positions = (1 - share[:, None]) * first[:, :3, 3] + share[:, None] * second[:, :3, 3]
+    return pose(first[:, :3, :3] @ part.as_matrix(), positions)

@@ -1,11 +1,8 @@
-"""The trajectory's clock against the video's: offset and rate, estimated from camera rotations.
+"""The trajectory's clock against the video's: offset and rate by which it rotates as the images do.
 
-Relative rotations of neighbouring frames come from images alone. The trajectory must rotate by as
-much between the same two instants, whatever its drift and scale. Angular velocities are
-compared over a grid of offsets and rates first; the best few are then refined on relative
-rotations under a robust loss (cf. the temporal calibration of Furgale et al., IROS 2013). Another
-clock than the given one is accepted only if rotations determine it, no third clock fits nearly as
-well, and it explains the images markedly better.
+Angular velocities are compared over a grid; the best few are refined on relative rotations under a
+robust loss (cf. Furgale et al., IROS 2013). Another clock than the given one must be determined,
+have no rival, and explain the images markedly better.
 """
 
 from dataclasses import dataclass, replace
@@ -76,15 +73,8 @@ def estimate_clock(
     offset: float,
     reach_s: float,
 ) -> ClockEstimate:
-    """Compare the given clock with all others within reach.
-
-    Args:
-        timestamps: (F,) times of frames, seconds.
-        found: steps estimated from images.
-        trajectory: all entries, N.
-        offset: offset of the association, seconds to add to times of frames.
-        reach_s: largest change of the offset that is tried, seconds.
-    """
+    """Compare the given clock, by its offset to times (F,) of frames, with all others whose offset
+    differs by up to `reach_s`; all in seconds."""
     given = Clock(float(timestamps[0]), offset, 1.0)
     turns = merged(timestamps, found.f_T_nexts[:, :3, :3], found.verified)
     if len(turns) < MIN_STEPS:
@@ -113,10 +103,6 @@ def other_rate(
     frame on, if the given rate and those near it contradict the images; else None.
 
     It is no correction, as rate and offset are hardly determined where the verdict is unclear.
-
-    Args:
-        timestamps, found, trajectory: as for `estimate_clock`.
-        estimate: its result.
     """
     turns = merged(timestamps, found.f_T_nexts[:, :3, :3], found.verified)
     if estimate.verdict != "unclear" or len(turns) < MIN_STEPS:

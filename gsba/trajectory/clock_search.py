@@ -56,13 +56,8 @@ class Turns:
 
 
 def merged(timestamps: np.ndarray, f_R_nexts: np.ndarray, verified: np.ndarray) -> Turns:
-    """Turns from the steps of frames, short ones merged.
-
-    Args:
-        timestamps: (F,) seconds.
-        f_R_nexts: (F - 1, 3, 3) rotations between consecutive frames.
-        verified: (F - 1,) bool, True for known rotations.
-    """
+    """Turns from the steps of frames at times (F,), seconds, short ones merged: rotations (F - 1,
+    3, 3), and which of them are known, (F - 1,) bool."""
     from scipy.spatial.transform import Rotation
 
     least = max(_MIN_STEP_S, np.ptp(timestamps) / _MAX_STEPS) if len(timestamps) else 0.0
@@ -97,16 +92,8 @@ class ClockFit:
         self._rough_sigma = max(0.5 * typical, _MIN_GRID_SIGMA_RAD)
 
     def residuals(self, parameters: np.ndarray) -> np.ndarray:
-        """Rotation residuals in radians, from the images' to the trajectory's.
-
-        Outside its span the trajectory counts as not rotating.
-
-        Args:
-            parameters: (..., 2) shift and rate.
-
-        Returns:
-            (..., N, 3).
-        """
+        """Rotation residuals (..., N, 3), radians, from the images' to the trajectory's, at shifts
+        and rates (..., 2); outside its span the trajectory counts as not rotating."""
         shifts, rates = parameters[..., 0, None, None], parameters[..., 1, None, None]
         times = self.turns.middle + shifts + rates * self._from_middle()
         inside = ((times >= self.span[0]) & (times <= self.span[1])).all(axis=-1)
@@ -116,30 +103,22 @@ class ClockFit:
         return np.where(inside[..., None], found, -self.turns.rotvecs)
 
     def _rotations(self, times: np.ndarray) -> np.ndarray:
-        """Quaternions (..., 4) of the trajectory in its span, at constant angular velocity between
-        entries."""
+        """Quaternions (..., 4) in the trajectory's span, at constant velocity between entries."""
         before = np.clip(np.searchsorted(self._entries, times) - 1, 0, len(self._onward) - 1)
         span = self._entries[before + 1] - self._entries[before]
         share = (times - self._entries[before]) / span
         return _product(self._at[before], _exp(share[..., None] * self._onward[before]))
 
     def cost(self, parameters: np.ndarray, sigma: float) -> float:
-        """Mean bounded residual of a step, from 0 to 1 (Geman and McClure, 1987).
-
-        Args:
-            parameters: (2,) shift and rate.
-            sigma: noise of rotations per axis.
-        """
+        """Mean bounded residual of a step, 0 to 1 (Geman and McClure, 1987), at (2,) shift and
+        rate."""
         return _bounded(self.residuals(parameters), sigma)
 
     def refine(
         self, start: np.ndarray, with_rate: bool = True, widening: float = 3.0
     ) -> np.ndarray:
-        """Parameters (2,) of the best fit around a start, under a Cauchy loss.
-        start: (2,) initial shift and rate.
-        with_rate: estimate the rate, too.
-        widening: initial width of the loss, relative to the noise.
-        """
+        """Parameters (2,), shift and rate, of the best fit around a start under a Cauchy loss,
+        `widening` times the noise wide at first."""
         parameters, free = start.copy(), 1 + with_rate
         residuals = self.residuals(parameters)
         sigma, damping = widening * noise(residuals), 1e-3
@@ -203,10 +182,7 @@ class ClockFit:
         return parameters
 
     def _profile(self, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        """Shifts (n,) up to one step, the loss under each, and the least noise.
-
-        The loss is bounded: one outlier more or less must not outweigh all inliers.
-        """
+        """Shifts (n,) up to one step, the bounded loss under each, and the least noise."""
         shifts = self.turns.step * np.linspace(-1, 1, _NUM_SHIFTS)
         tried = parameters + np.column_stack([shifts, np.zeros(_NUM_SHIFTS)])
         residuals = self.residuals(tried)
@@ -232,13 +208,8 @@ class ClockFit:
         return float(np.abs((one - other)[0] + (one - other)[1] * self.turns.ends).max())
 
     def candidates(self, start: np.ndarray, reach_s: float) -> Iterator[np.ndarray]:
-        """Parameters (2,) of the best clocks on a grid around a start, best first.
-
-        Args:
-            start: the clock in the middle of the grid.
-            reach_s: largest tried difference of the offset. Steps of a fraction of a second are
-                searched less far: the size of the grid is bounded, whatever the times are.
-        """
+        """Parameters (2,) of the best clocks on a grid around a start, best first, up to `reach_s`
+        away; less far where steps take a fraction of a second: the size of the grid is bounded."""
         spacing = _SPACING_STEPS * self.turns.step
         rates = max(
             round(min(_MAX_RATE_DEVIATION * self.turns.ends[1] / spacing, _MAX_RATES / 2)), 1
@@ -260,9 +231,7 @@ class ClockFit:
     def _angular_velocity(
         self, spacing: float, middle: float, reach: float
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Instants (n,) of the trajectory and its mean angular velocity (n, 3) over a step around
-        each.
-        """
+        """Instants (n,) of the trajectory, its mean angular velocity (n, 3) over a step there."""
         half = 0.5 * min(self.turns.step, float(np.ptp(self.span)))
         far = reach + (1 + _MAX_RATE_DEVIATION) * np.abs(self.turns.ends).max() + half
         begin, end = self.span[0] + half, self.span[1] - half
@@ -286,8 +255,7 @@ class ClockFit:
         return self.turns.times - self.turns.middle
 
     def _jacobian(self, parameters: np.ndarray) -> np.ndarray:
-        """Derivatives (N, 3, 2) of residuals, by differences over part of a step: residuals are
-        jagged."""
+        """Derivatives (N, 3, 2) of residuals by differences: residuals are jagged."""
         reach = 0.1 * self.turns.step
         steps = np.diag([reach, reach / self.turns.ends[1]])
         ahead, back = self.residuals(parameters + np.stack([steps, -steps]))
@@ -299,7 +267,6 @@ class ClockFit:
         return np.diag([0, _RATE_SIGMA**-2])[:free, :free]
 
     def _total(self, residuals: np.ndarray, parameters: np.ndarray, sigma: float) -> float:
-        """The cost that `refine` minimises."""
         squares = np.sum(residuals**2, axis=1) / (_LOSS_WIDTH_SIGMAS * sigma) ** 2
         return float(_LOSS_WIDTH_SIGMAS**2 * np.log1p(squares).sum()) + float(
             (parameters[1] - 1) ** 2 / _RATE_SIGMA**2

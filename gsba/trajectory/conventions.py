@@ -5,10 +5,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from gsba.geometry import inverse, pose, quaternion_from_rotation, rotation_from_quaternion
 from gsba.log import GsbaError
-from gsba.types import Trajectory
+from gsba.types import CoarsePoses, PoseSource, Trajectory
 
 WXYZ, CAMERA_FROM_WORLD = "wxyz", "camera-from-world"
 OURS = "right-down-forward"
@@ -20,6 +21,10 @@ _WAYS = {
     "forward": (2, 1),
     "back": (2, -1),
 }  # way -> index and sign of our axis
+_MIN_ROTATION_RAD = np.deg2rad(1.0)  # rotation of a step below which its axis is uncertain
+_MAX_RESIDUAL_RATIO = 0.6  # largest residual of an accepted rotation, relative to that of no
+# rotation
+QUARTER_TURNS = [Rotation.from_euler("z", 90 * n, degrees=True).as_matrix() for n in range(4)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,11 +56,8 @@ class Convention:
         return cls(WXYZ in words, CAMERA_FROM_WORLD in words, rotation)
 
     def poses(self, read: Trajectory) -> Trajectory:
-        """A trajectory as world_T_cameras, quaternions in their order; camera axes as in the file.
-
-        Args:
-            read: from the file, as if it were in our convention.
-        """
+        """A trajectory read as if it were in our convention, as world_T_cameras in the file's
+        axes."""
         poses = read.world_T_rigs
         if self.w_first:
             poses = pose(w_first(poses[:, :3, :3]), poses[:, :3, 3])
@@ -84,3 +86,29 @@ def axis_systems() -> Iterator[tuple[str, np.ndarray]]:
             rotation[axis, column] = sign
         if np.linalg.det(rotation) > 0.5:
             yield "-".join(ways), rotation
+
+
+def quarter_turn(coarse: CoarsePoses, world_T_rigs: np.ndarray) -> np.ndarray:
+    """ours_R_theirs (3, 3), by quarter turns about the forward axis, under which steps agree best
+    with estimated poses (F, 4, 4): sensors may be mounted turned, unlike upright panoramas."""
+    own = coarse.sources == PoseSource.SLAM
+    own = own[:-1] & own[1:]
+    ours, theirs = _steps(world_T_rigs)[own], _steps(coarse.world_T_rigs)[own]
+    left = [_residual(ours, theirs, turn) for turn in QUARTER_TURNS]
+    best = int(np.argmin(left))
+    return QUARTER_TURNS[best if left[best] < _MAX_RESIDUAL_RATIO * left[0] else 0]
+
+
+def _steps(poses: np.ndarray) -> np.ndarray:
+    return inverse(poses[:-1]) @ poses[1:]
+
+
+def _residual(ours: np.ndarray, theirs: np.ndarray, turn: np.ndarray) -> float:
+    """Sum of differences in rotation and direction of steps (N, 4, 4), theirs in rotated axes."""
+    turns = [Rotation.from_matrix(steps[:, :3, :3]).as_rotvec() for steps in (ours, theirs)]
+    moves = [steps[:, :3, 3] for steps in (ours, theirs)]
+    ways = [move / np.maximum(np.linalg.norm(move, axis=1), 1e-12)[:, None] for move in moves]
+    sizes = [np.linalg.norm(vectors, axis=1) for vectors in turns]
+    turned = np.linalg.norm(turns[0] - turns[1] @ turn.T, axis=1) / (sum(sizes) + _MIN_ROTATION_RAD)
+    moved = np.linalg.norm(ways[0] - ways[1] @ turn.T, axis=1) / 2
+    return float(np.sum(turned + moved))

@@ -108,15 +108,7 @@ def _tracked(
     turned: np.ndarray,
     where: Sequence[str],
 ) -> np.ndarray:
-    """Rows (M,) of N that have a pose, at least 2 unless N is less; others are logged.
-
-    Args:
-        path: of the file.
-        values: (N, V) numbers of a row.
-        positions: (N, 3) among them.
-        turned: (N,) bool, rows whose rotation is not all zeros.
-        where: (N) place of each row.
-    """
+    """Rows (M,) of N that have a pose, at least 2 unless N is less; others are logged."""
     known = np.isfinite(values).all(axis=1) & turned
     known &= (np.abs(np.where(known[:, None], positions, 0)) <= _MAX_COORDINATE).all(axis=1)
     lost = np.flatnonzero(~known)

@@ -1,9 +1,6 @@
-"""Pieces of a trajectory, each with an origin and a scale of its own, moved into one world.
-
-A trajectory does not relate its pieces. Each further one is placed by a guess, at a constant pace
-over the gap, so that every frame has an initial pose. Points that both pieces share join them later
-(`gsba.loop_closure.map_merging`), or they stay maps of their own.
-"""
+"""Pieces of a trajectory, each with an origin and a scale of its own, moved into one world by
+guesses at a constant pace; points that they share join them later
+(`gsba.loop_closure.map_merging`)."""
 
 from dataclasses import dataclass, replace
 
@@ -30,14 +27,8 @@ class SegmentAlignment:
 
 
 def join(coarse: CoarsePoses) -> tuple[CoarsePoses, tuple[SegmentAlignment, ...]]:
-    """Move the pieces of a trajectory into the world of the first, each by a guess.
-
-    Args:
-        coarse: poses of each piece in its own world.
-
-    Returns:
-        Poses in one world, and the alignment of each further piece, in order.
-    """
+    """Move the pieces of a trajectory into the world of the first, each by a guess; returns poses
+    in one world, and the alignment of each further piece, in order."""
     if coarse.segments is None:
         return coarse, ()
     poses, joints = coarse.world_T_rigs.copy(), []

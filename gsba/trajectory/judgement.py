@@ -1,10 +1,5 @@
-"""Checks of the trajectory's steps against images, and initial poses that follow both.
-
-Consecutive frames overlap so much that their relative rotation and direction of
-motion can be estimated from images alone. The length of a step, which two views leave open, follows
-from its neighbours': a point that two steps see must be equally far in both. Steps of the
-trajectory that images contradict lose their prior, and initial poses are chained past them.
-"""
+"""Checks of the trajectory's steps against images: those that images contradict lose their prior,
+and initial poses are chained past them."""
 
 import logging
 from dataclasses import dataclass, replace
@@ -82,16 +77,8 @@ def check_steps(
     priors: PriorSettings,
     turn: Turn | None = None,
 ) -> StepChecks:
-    """Compare the trajectory's steps with those of the images.
-
-    Args:
-        coarse: the trajectory.
-        found: steps from the images.
-        logs, sigmas: (F - 2,) logarithms of ratios of lengths, and standard deviations.
-        verify: thresholds of contradiction.
-        priors: noise of the trajectory's steps.
-        turn: proof that the camera turned on the spot; None = there is none, or it moved.
-    """
+    """Compare the trajectory's steps with those of the images, by logarithms (F - 2,) of ratios of
+    lengths and their standard deviations; `turn` proves that the camera turned on the spot."""
     slam = inverse(coarse.world_T_rigs[:-1]) @ coarse.world_T_rigs[1:]
     slam_lengths = np.linalg.norm(slam[:, :3, 3], axis=1)
     own = coarse.sources == PoseSource.SLAM
@@ -118,21 +105,23 @@ def check_steps(
     rough |= found.directed & linked & (strain > _MAX_PRIOR_SIGMAS * priors.translation)
     chosen = slam.copy()
     if wrong.any() or unseen.any():
-        chosen[rough, :3, :3] = found.f_T_nexts[rough, :3, :3]
-        moved = rough & found.directed
-        chosen[moved, :3, 3] = lengths[moved, None] * found.f_T_nexts[moved, :3, 3]
+        chosen = _replaced(slam, found, lengths, rough)
         start = _chain(coarse.world_T_rigs, chosen, own)
     else:
         start = coarse.world_T_rigs
-    seen = slam.copy()
-    seen[found.verified, :3, :3] = found.f_T_nexts[found.verified, :3, :3]
-    seen[found.directed, :3, 3] = (
-        lengths[found.directed, None] * found.f_T_nexts[found.directed, :3, 3]
-    )
+    seen = _replaced(slam, found, lengths, found.verified)
     named = false_frames(
         wrong, slam, chosen, own, outlier_limits(slam, seen, known & found.directed, verify)
     )
     return StepChecks(start, wrong, named, unseen, lengths, None)
+
+
+def _replaced(slam: np.ndarray, found: Steps, lengths: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Steps (F - 1, 4, 4) of the trajectory, at `rows` (F - 1,) bool those of the images."""
+    steps, moved = slam.copy(), rows & found.directed
+    steps[rows, :3, :3] = found.f_T_nexts[rows, :3, :3]
+    steps[moved, :3, 3] = lengths[moved, None] * found.f_T_nexts[moved, :3, 3]
+    return steps
 
 
 def confirmed(coarse: CoarsePoses, found: Steps, priors: PriorSettings) -> np.ndarray:
@@ -162,8 +151,6 @@ def implausible_steps(
     noise is the limit.
 
     Args:
-        coarse: the trajectory.
-        trust: its checks.
         world_T_rigs: (F, 4, 4) poses in the map.
         timestamps: (F,) seconds.
         max_ratio: of the lengths of a step in both, relative to steps around it.
@@ -191,12 +178,8 @@ def implausible_steps(
 
 
 def over_missing_frames(timestamps: np.ndarray, recordings: np.ndarray) -> np.ndarray:
-    """Steps (F - 1,) bool within recordings that take longer than usual there.
-
-    Args:
-        timestamps: (F,) seconds.
-        recordings: (F,) int, number of each frame's recording.
-    """
+    """Steps (F - 1,) bool within recordings (F,) int that take longer (seconds) than usual
+    there."""
     found = np.zeros(len(timestamps) - 1, bool)
     for number in np.unique(recordings):
         rows = np.flatnonzero(recordings == number)
@@ -207,12 +190,8 @@ def over_missing_frames(timestamps: np.ndarray, recordings: np.ndarray) -> np.nd
 
 
 def long_steps(world_T_rigs: np.ndarray, depth: float) -> np.ndarray:
-    """Steps (F - 1,) bool where those around are so long that the view changes much.
-
-    Args:
-        world_T_rigs: (F, 4, 4) poses in a map of the images.
-        depth: median distance of points, map units.
-    """
+    """Steps (F - 1,) bool between poses (F, 4, 4) among steps so long that the view changes much;
+    `depth`, the median distance of points, in map units."""
     lengths = np.linalg.norm(np.diff(world_T_rigs[:, :3, 3], axis=0), axis=1)
     around = [
         lengths[max(step - _STEPS_AROUND, 0) : step + _STEPS_AROUND + 1]
@@ -225,16 +204,9 @@ def long_steps(world_T_rigs: np.ndarray, depth: float) -> np.ndarray:
 def unusual_paces(
     world_T_rigs: np.ndarray, timestamps: np.ndarray, recordings: np.ndarray
 ) -> np.ndarray:
-    """Steps (F - 1,) bool over missing frames that are walked much slower or faster than those
-    around, or back.
-
-    Where frames are missing, the view changes more, and in a hall of bays the next bay may match
-    better than the same one: then hundreds of matches agree on a step that is a bay too short.
-
-    Args:
-        world_T_rigs: (F, 4, 4) poses in a map of the images.
-        timestamps, recordings: see `over_missing_frames`.
-    """
+    """Steps (F - 1,) bool over missing frames that are walked in a map, poses (F, 4, 4), much
+    slower or faster than those around, or back: there, hundreds of matches agree on a step that is
+    a bay too short."""
     missing = over_missing_frames(timestamps, recordings)
     usual = ~missing & (recordings[1:] == recordings[:-1])
     velocities = np.diff(world_T_rigs[:, :3, 3], axis=0) / np.diff(timestamps)[:, None]
@@ -253,16 +225,8 @@ def unusual_paces(
 
 def back_and_forth(world_T_rigs: np.ndarray, shown: np.ndarray, depth: float) -> np.ndarray:
     """Steps (F - 1,) bool before and behind a frame at which the camera goes back the way that it
-    came, without turning, where frames are far apart.
-
-    There, too, the next bay of a hall may match better than the same one. Which of two such steps
-    is false does not show.
-
-    Args:
-        world_T_rigs: (F, 4, 4) poses in a map of the images.
-        shown: (F - 1,) bool, steps that images show, over no missing frame.
-        depth: median distance of points, map units.
-    """
+    came without turning, far from others, over no missing frame (`shown`): the next bay of a hall
+    may match better, and which of two steps is false does not show. `depth` in map units."""
     steps = np.diff(world_T_rigs[:, :3, 3], axis=0)
     lengths = np.linalg.norm(steps, axis=1)
     found = np.zeros(len(steps), bool)
@@ -304,10 +268,7 @@ def _from_images_alone(
     if found.directed.any():
         unknown = np.full(len(slam), np.inf)
         lengths = step_lengths(slam_lengths, unknown, logs, sigmas)
-    chosen = slam.copy()
-    chosen[found.verified, :3, :3] = found.f_T_nexts[found.verified, :3, :3]
-    moved = found.directed
-    chosen[moved, :3, 3] = lengths[moved, None] * found.f_T_nexts[moved, :3, 3]
+    chosen = _replaced(slam, found, lengths, found.verified)
     start = _chain(coarse.world_T_rigs, chosen, coarse.sources == PoseSource.SLAM)
     return _without_priors(start, found, lengths)
 
@@ -341,8 +302,7 @@ def leaps(world_T_rigs: np.ndarray, timestamps: np.ndarray) -> np.ndarray:
 
 
 def _chain(world_T_rigs: np.ndarray, chosen: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """Poses (F, 4, 4) that follow the chosen steps, aligned with the trajectory's tracked
-    frames."""
+    """Poses (F, 4, 4) that follow the chosen steps, aligned with tracked frames."""
     poses = chained(chosen)
     own = own if own.any() else np.ones(len(own), bool)
     rotation = nearest_rotation(
@@ -366,18 +326,9 @@ class OutlierLimits:
 def outlier_limits(
     slam: np.ndarray, images: np.ndarray, judged: np.ndarray, settings: TwoViewLimits
 ) -> OutlierLimits:
-    """Thresholds that mark an outlier: beyond the settings, and beyond the trajectory's noise.
-
-    A quickly drifting trajectory contradicts the images in many steps, each by about as much; none
-    of its frames is an outlier. Its noise is estimated from its better steps, which outliers leave
-    alone.
-
-    Args:
-        slam: (F - 1, 4, 4) steps of the trajectory.
-        images: (F - 1, 4, 4) steps from images, with lengths.
-        judged: (F - 1,) bool, steps known from both.
-        settings: thresholds of contradiction.
-    """
+    """Thresholds that mark an outlier, beyond the settings and the noise of the trajectory, as its
+    better ones of the steps judged (F - 1,) bool, (F - 1, 4, 4) each, tell: a quickly drifting
+    trajectory contradicts images in many steps, and none of its frames is an outlier."""
     turned = rotation_angle(np.swapaxes(slam[:, :3, :3], 1, 2) @ images[:, :3, :3])
     off = np.linalg.norm(slam[:, :3, 3] - images[:, :3, 3], axis=1)
     usual = [
@@ -399,18 +350,9 @@ def false_frames(
     own: np.ndarray,
     limits: OutlierLimits,
 ) -> np.ndarray:
-    """Frames (F,) with a false pose: the fewest whose removal explains the false steps.
-
-    The longest chain of frames is kept whose consecutive relative poses in the trajectory agree
-    with the images; a permanent jump breaks it, at a cost, and marks the frame behind. Interpolated
-    poses are ignored.
-
-    Args:
-        wrong: (F - 1,) bool, steps that images contradict.
-        slam, chosen: (F - 1, 4, 4) steps of the trajectory and the best known steps.
-        own: (F,) bool, frames with an entry in the trajectory.
-        limits: thresholds of an outlier.
-    """
+    """Frames (F,) with a false pose: the fewest whose removal explains the steps that are `wrong`
+    (F - 1,) bool. Of `own` frames (F,) bool the longest chain is kept whose relative poses agree
+    with the images; a permanent jump breaks it, at a cost, and marks the frame behind."""
     named = np.zeros(len(own), bool)
     if not wrong.any():
         return named

@@ -1,10 +1,6 @@
-"""Camera poses from Agisoft Metashape's cameras.xml, as coarse trajectories.
-
-A camera's transform is `chunk_T_camera`, row by row, with axes x right, y down, z forward, as in
-our rig. Cameras have labels in place of times, so that poses become trajectories once the times of
-the frames with these names are known. Each component is aligned by itself and has an origin and a
-scale of its own: it is a trajectory of its own.
-"""
+"""Camera poses from Agisoft Metashape's cameras.xml: `chunk_T_camera`, row by row, axes as in our
+rig. Cameras have labels in place of times; each component is a trajectory with a world of its
+own."""
 
 import logging
 import xml.etree.ElementTree as ET
@@ -33,11 +29,8 @@ class NamedPoses:
     world_T_rigs: np.ndarray  # (N, 4, 4) float64, chunk units
 
     def timed(self, frames: FrameSet) -> Trajectory:
-        """The poses of the frames with these names, with `_` for folders, at the frames' times.
-
-        Raises:
-            GsbaError: fewer than two frames have a pose.
-        """
+        """The poses of frames with these names, with `_` for folders, at the frames' times;
+        GsbaError if fewer than two have one."""
         rows = {name: row for row, name in enumerate(self.names)}
         named = [name if name in rows else name.replace("/", "_") for name in frames.names]
         known = [(f, rows[name]) for f, name in enumerate(named) if name in rows]

@@ -32,11 +32,7 @@ class TurnedAboutForwardError(GsbaError):
 
 
 def refuse_useless(coarse: CoarsePoses) -> None:
-    """Refuse a trajectory without information.
-
-    Raises:
-        GsbaError: all poses are identical.
-    """
+    """Refuse a trajectory without information: all poses are identical."""
     poses = coarse.world_T_rigs
     if len(poses) > 1 and np.abs(poses - poses[0]).max() < 1e-12:
         raise GsbaError(
@@ -45,17 +41,8 @@ def refuse_useless(coarse: CoarsePoses) -> None:
 
 
 def refuse_misread(coarse: CoarsePoses, found: Steps, settings: TwoViewLimits) -> None:
-    """Refuse a trajectory that most steps of the images contradict, but not in another convention.
-
-    Args:
-        coarse: the trajectory.
-        found: steps from the images.
-        settings: thresholds of contradiction.
-
-    Raises:
-        TurnedAboutForwardError: the trajectory is in axes that are turned about the forward one.
-        GsbaError: it is reversed, mirrored, inverted or in other axes.
-    """
+    """Refuse a trajectory that most steps of the images contradict, but not in another convention;
+    TurnedAboutForwardError if its axes are turned about the forward one."""
     judged = _judged_steps(coarse, found)
     if judged.sum() < _MIN_STEPS:
         return
@@ -85,14 +72,7 @@ def refuse_misread(coarse: CoarsePoses, found: Steps, settings: TwoViewLimits) -
 
 
 def refuse_misfit(coarse: CoarsePoses, found: Steps, settings: TwoViewLimits) -> None:
-    """Refuse a trajectory that most steps of the images contradict, with the likely reason.
-
-    Args:
-        coarse, found, settings: as for `refuse_misread`.
-
-    Raises:
-        GsbaError: most steps contradict the images.
-    """
+    """Refuse a trajectory that most steps of the images contradict, with the likely reason."""
     refuse_misread(coarse, found, settings)
     judged, loose = _judged_steps(coarse, found), replace(settings, **_LOOSE_LIMITS)
     steps = _steps(coarse.world_T_rigs)
@@ -117,10 +97,7 @@ def refuse_misfit(coarse: CoarsePoses, found: Steps, settings: TwoViewLimits) ->
 def _delay_in_frames(
     coarse: CoarsePoses, found: Steps, judged: np.ndarray, settings: TwoViewLimits
 ) -> tuple[int, float]:
-    """Delay in frames of the trajectory's steps, and the share of steps that it explains.
-
-    The delay is 0 if no shift explains enough steps.
-    """
+    """Delay of the trajectory in frames, 0 if none explains enough, and the share explained."""
     steps, best = _steps(coarse.world_T_rigs), (0, 0.0)
     own = coarse.sources[:-1] == PoseSource.SLAM
     own &= coarse.sources[1:] == PoseSource.SLAM
@@ -149,7 +126,6 @@ def _contradiction_text(share: float, judged: np.ndarray) -> str:
 
 
 def _steps(poses: np.ndarray) -> np.ndarray:
-    """Relative poses (F - 1, 4, 4) of consecutive ones."""
     return inverse(poses[:-1]) @ poses[1:]
 
 
@@ -167,7 +143,8 @@ def _steps_in_other_conventions(world_T_rigs: np.ndarray) -> dict[str, np.ndarra
         readings[_in_system(name)] = _in_axes(steps, systems[name])
     for name, axis in zip("xyz", np.eye(3), strict=True):
         mirrored = f"mirrored along {name}: it is no rigid motion of this camera, flip that axis"
-        readings[mirrored] = _flipped(steps, 1 - 2 * axis)
+        flip = np.diag([*(1 - 2 * axis), 1.0])
+        readings[mirrored] = flip @ steps @ flip
     order = "in quaternions of the order w, x, y, z"
     readings[f"{order}: {_pass(WXYZ)}"] = reordered
     for name, rotation in systems.items():
@@ -181,12 +158,10 @@ def _pass(words: str) -> str:
 
 
 def _in_system(system: str) -> str:
-    """The reading of a trajectory in another system of camera axes."""
     return f"{_axes(system)}: {_pass(system)}"
 
 
 def _axes(system: str) -> str:
-    """A clause that names camera axes by their ways."""
     return "in axes of " + ", ".join(map(" ".join, zip("xyz", system.split("-"), strict=True)))
 
 
@@ -197,15 +172,9 @@ def _in_axes(steps: np.ndarray, ours_R_theirs: np.ndarray) -> np.ndarray:
     return turn @ steps @ turn.T
 
 
-def _flipped(steps: np.ndarray, signs: np.ndarray | list[int]) -> np.ndarray:
-    flip = np.diag([*signs, 1.0])
-    return flip @ steps @ flip
-
-
 def _agreeing_share(
     steps: np.ndarray, found: Steps, judged: np.ndarray, settings: TwoViewLimits
 ) -> float:
-    """Share of the judged steps that agree with the images."""
     turned, off = step_errors(steps, found)
     agree = turned < np.deg2rad(settings.max_rotation_deg)
     agree &= off < np.deg2rad(settings.max_direction_deg)
@@ -213,7 +182,6 @@ def _agreeing_share(
 
 
 def _mean_error(steps: np.ndarray, found: Steps, judged: np.ndarray) -> float:
-    """Mean error of the judged steps' rotation and direction, radians: it decides between readings
-    that differ in a motion which is small in all steps, as that up and down."""
+    """Mean error of judged steps, radians: tells readings apart that differ in small motions."""
     turned, off = step_errors(steps, found)
     return float(np.mean((turned + off)[judged]))

@@ -1,9 +1,6 @@
-"""Relative poses of consecutive frames, from images alone.
-
-Such frames overlap so much that their relative rotation and direction of motion can be estimated
-from the images. The length of a step, which two views leave open, follows from its neighbours':
-a point common to two steps must have the same depth in both.
-"""
+"""Relative poses of consecutive frames, from images alone. The length of a step, which two views
+leave open, follows from its neighbours': a point common to two steps must have the same depth in
+both."""
 
 from dataclasses import dataclass
 
@@ -40,14 +37,8 @@ class Steps:
 
 
 def image_steps(pairs: VerifiedPairs, keypoints: Keypoints) -> Steps:
-    """Relative poses of consecutive frames among verified pairs.
-
-    A step too short to have a direction takes that of the closest pairs over it.
-
-    Args:
-        pairs: pairs of frames at most a few apart.
-        keypoints: keypoints of all frames.
-    """
+    """Relative poses of consecutive frames among verified pairs of frames at most a few apart; a
+    step too short to have a direction takes that of the closest pairs over it."""
     num = max(len(keypoints.starts) - 2, 0)
     f_T_nexts = np.tile(np.eye(4), (num, 1, 1))
     verified, sigmas = np.zeros(num, bool), np.full(num, np.inf)
@@ -109,15 +100,9 @@ def step_errors(steps: np.ndarray, found: Steps) -> tuple[np.ndarray, np.ndarray
 
 
 def off_steps(pairs: VerifiedPairs, found: Steps) -> np.ndarray:
-    """Angles by which pairs over two steps violate the directions of those steps.
-
-    Frame f + 2 lies, as seen from f, between the directions of both steps. A false pair from
-    repeated structure agrees with neither, though it may be within the trajectory's tolerance.
-
-    Returns:
-        (P,) radians, less three standard deviations of the directions; 0 for other pairs, and if a
-        direction is unknown.
-    """
+    """Angles (P,), radians, by which pairs over two steps violate the directions of these, less
+    three sigmas; 0 for other pairs and unknown directions. A false pair from repeated structure
+    agrees with neither step, though it may be within the trajectory's tolerance."""
     out = np.zeros(len(pairs.matches.pairs))
     for p, (f0, f2) in enumerate(pairs.matches.pairs):
         sigmas = np.array([pairs.direction_sigmas[p], *found.direction_sigmas[f0 : f0 + 2]])
@@ -143,18 +128,9 @@ def _angle_to_arc(direction: np.ndarray, start: np.ndarray, end: np.ndarray) -> 
 def length_ratios(
     pairs: VerifiedPairs, found: Steps, keypoints: Keypoints, least_alike: int | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Length of each step relative to the step before, from common points.
-
-    Args:
-        pairs: pairs of frames at most a few apart.
-        found: steps of these pairs.
-        keypoints: keypoints of all frames.
-        least_alike: points that suffice if they agree on one ratio to 15 %; None = eight points,
-            however they agree.
-
-    Returns:
-        Logarithms (F - 2,) of the ratios and their standard deviations, infinite where unknown.
-    """
+    """Logarithms (F - 2,) of each step's length by that of the step before, and their standard
+    deviations, infinite where unknown, from common points: eight, or `least_alike` that agree to 15
+    %."""
     num = len(found.verified)
     logs, sigmas = np.zeros(max(num - 1, 0)), np.full(max(num - 1, 0), np.inf)
     rows = {int(f0): p for p, (f0, f1) in enumerate(pairs.matches.pairs) if f1 - f0 == 1}
@@ -186,15 +162,8 @@ def length_ratios(
 
 
 def given_up(open_at: set[int], matches: np.ndarray) -> set[int]:
-    """Steps to drop so that no two consecutive steps remain without a known ratio of lengths.
-
-    Args:
-        open_at: frames between two steps whose ratio is unknown.
-        matches: (F - 1,) matches of each step; of two steps, the one with fewer is dropped.
-
-    Returns:
-        First frames of the dropped steps.
-    """
+    """First frames of steps to drop so that no two consecutive ones remain without a known ratio of
+    lengths, as at frames `open_at`; of two, the one with fewer matches (F - 1,)."""
     out, left = set[int](), set(open_at)
     while left:
         beside = {step for f in left for step in (f - 1, f)}

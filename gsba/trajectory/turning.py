@@ -1,10 +1,6 @@
-"""Proof that a camera only turned: rotations that explain matches, over one and several frames.
-
-That no translation is found proves nothing where few matches are left to show one. A turn is proved
-by the reverse: most matches of a pair agree on one rotation, in which chance has no part, and so do
-most matches of all pairs one, two, four and eight frames apart. Frames that no such pair ties to
-the others have no rotation.
-"""
+"""Proof that a camera only turned: most matches of a pair agree on one rotation, in which chance
+has no part, and so do most matches of all pairs one, two, four and eight frames apart. That no
+translation is found would prove nothing."""
 
 from dataclasses import dataclass
 
@@ -53,14 +49,8 @@ def prove(
     settings: TwoViewLimits,
     max_parallax: float = MAX_PARALLAX_RAD,
 ) -> Turn | None:
-    """The largest part of the frames that turned on the spot; None = that is not proved.
-
-    Args:
-        pairs: pairs of frames, the closest first.
-        keypoints: keypoints of all frames.
-        settings: error rates.
-        max_parallax: radians between bearings that a rotation explains.
-    """
+    """The largest part of the frames that turned on the spot, by pairs, the closest first; None =
+    not proved. A rotation explains bearings up to `max_parallax` radians apart."""
     frames, num_frames = pairs.matches.pairs, len(keypoints.starts) - 1
     rotations, counts = np.empty((len(frames), 3, 3)), np.empty((len(frames), 2), int)
     for p, pair in enumerate(frames):
@@ -69,7 +59,12 @@ def prove(
         alike = off < max_parallax
         counts[p] = [witnesses(rays[0][some], CELLS_PER_SIDE) for some in (alike, ~alike)]
     chance = max_parallax / np.pi  # a false match lies anywhere along its epipolar line
-    proved = np.array([_is_turn(a, b, chance, settings) for a, b in counts.tolist()], bool)
+    proved = np.zeros(len(frames), bool)
+    for p, (support, against) in enumerate(counts.tolist()):
+        # Matches surely agree on a rotation, and no translation explains as many more.
+        alarms = log10_false_alarms(support + against, support, chance, _SAMPLE_SIZE)
+        significant = alarms < np.log10(settings.max_false_alarms)
+        proved[p] = significant and outweighs(support, against, settings.max_error_rate)
     turn = _tied(frames[proved], rotations[proved], num_frames)
     if np.count_nonzero(turn.frames) < min(_MIN_FRAMES, num_frames):
         return None
@@ -81,22 +76,8 @@ def prove(
     return turn
 
 
-def _is_turn(support: int, against: int, chance: float, settings: TwoViewLimits) -> bool:
-    """True if matches surely agree on a rotation, and no translation explains as many more.
-
-    Args:
-        support, against: numbers of witnesses that the rotation explains, and of others.
-        chance: that it explains a false match, or one of a camera that moved.
-        settings: error rates.
-    """
-    alarms = log10_false_alarms(support + against, support, chance, _SAMPLE_SIZE)
-    significant = alarms < np.log10(settings.max_false_alarms)
-    return bool(significant) and outweighs(support, against, settings.max_error_rate)
-
-
 def _tied(pairs: np.ndarray, rotations: np.ndarray, num_frames: int) -> Turn:
-    """The largest part of the frames that pairs (P, 2) tie together, their rotations (P, 3, 3)
-    chained along the closest pairs."""
+    """The largest part that pairs (P, 2) tie together, rotations chained along the closest ones."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import (
         breadth_first_order,

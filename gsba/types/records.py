@@ -1,14 +1,24 @@
 """Records that stages pass to one another: arrays, with one comment per field."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum, StrEnum
+from typing import Any, TypeVar
 
 import numpy as np
 
 from gsba.types.frame_set import PictureFormat
 
+T = TypeVar("T", bound=Any)  # a dataclass
+
 _AT_ONCE = 1 << 16  # observations whose poses are held together: 9 MB
+
+
+def with_rows(record: T, rows: np.ndarray) -> T:
+    """A dataclass with rows (N,), int or bool, of all its arrays."""
+    every = {entry.name: getattr(record, entry.name) for entry in fields(record)}
+    arrays = {name: value for name, value in every.items() if isinstance(value, np.ndarray)}
+    return replace(record, **{name: array[rows] for name, array in arrays.items()})
 
 
 def slices(num: int, most: int) -> Iterator[slice]:

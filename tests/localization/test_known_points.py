@@ -10,13 +10,16 @@ from gsba.bundle.pose_variables import X
 from gsba.camera.projections import PerspectiveProjection
 from gsba.geometry import pose
 from gsba.localization.known_points import (
+    COARSE,
+    FINE,
+    CameraPrior,
     K,
     KnownPointBlock,
     PointSightings,
+    fit,
     isotropic,
     residuals_of,
 )
-from gsba.localization.pose_fit import COARSE, FINE, CameraPrior, fit
 
 CAMERA = PerspectiveProjection(800, 600, 500.0, (410.0, 295.0), (0.05, -0.01))
 

@@ -9,8 +9,8 @@ from tiny_run import Case
 
 from gsba import GsbaError, Localizer, refine
 from gsba.localization.pose_search import Candidates, search_poses
-from gsba.localization.query import Query
 from gsba.localization.rival_poses import LOOK_ALIKE, TWO_PLACES, PlacedPose, best_of
+from gsba.localization.run_map import Query
 from gsba.localization.surroundings import is_contradicted, is_look_alike
 from gsba.loop_closure.join_evidence import JoinEvidence
 
@@ -43,7 +43,7 @@ def test_frames_show_what_is_around_them_and_not_what_is_elsewhere(localizer: Lo
 
 
 def test_only_what_a_picture_with_edges_can_show_is_expected(localizer: Localizer) -> None:
-    pose, usual = localizer.map.result.world_T_rigs[5], localizer.usual.of_photos
+    pose, usual = localizer.map.result.world_T_rigs[5], localizer.usual.of_camera(-1)
     query = _query(localizer, 5)
     every = localizer.surroundings.evidence(query, pose, usual)
     ahead = localizer.surroundings.evidence(query, pose, usual, lambda points: points[:, 2] > 0)

@@ -5,7 +5,7 @@ import pytest
 from synthetic import drifted, loop_walk
 
 from gsba.geometry import inverse
-from gsba.loop_closure import pose_graph
+from gsba.loop_closure import loops
 
 NUM_FRAMES = 40
 TRUTH = loop_walk(NUM_FRAMES)
@@ -24,7 +24,7 @@ def _relative(pairs: np.ndarray, shift: float = 0.0) -> np.ndarray:
 @pytest.mark.parametrize("seed", range(3))
 def test_true_loops_stay_on_a_path_that_drifted(seed: int) -> None:
     path = drifted(TRUTH, np.random.default_rng(seed), 0.3)
-    assert pose_graph.affordable(path, SEEN, TRUE, _relative(TRUE)).all()
+    assert loops.affordable(path, SEEN, TRUE, _relative(TRUE)).all()
 
 
 @pytest.mark.parametrize("count", [3, 8])
@@ -35,7 +35,7 @@ def test_false_loops_that_agree_with_one_another_are_switched_off(shift: float, 
     false = np.array([(8 + n, 20 + n) for n in range(count)])
     pairs = np.concatenate([TRUE, false])
     asserted = np.concatenate([_relative(TRUE), _relative(false, shift)])
-    kept = pose_graph.affordable(path, SEEN, pairs, asserted)
+    kept = loops.affordable(path, SEEN, pairs, asserted)
     assert kept[: len(TRUE)].all() and not kept[len(TRUE) :].any()
 
 
@@ -43,5 +43,5 @@ def test_a_step_that_no_image_confirms_gives_way() -> None:
     torn, unseen = TRUTH.copy(), SEEN.copy()
     torn[20:, :3, 3] += [0.4 * STEP, 0, STEP]
     unseen[19] = True
-    assert pose_graph.affordable(torn, unseen, TRUE, _relative(TRUE)).all()
-    assert not pose_graph.affordable(torn, SEEN, TRUE[:2], _relative(TRUE[:2], 3.0)).any()
+    assert loops.affordable(torn, unseen, TRUE, _relative(TRUE)).all()
+    assert not loops.affordable(torn, SEEN, TRUE[:2], _relative(TRUE[:2], 3.0)).any()

@@ -11,8 +11,7 @@ from town_in_parts import NUM, town
 from factors import LandmarkBlock, RobustLoss
 from gsba.bundle.optimizer import marginal_covariances, optimize
 from gsba.config import SolverSettings
-from gsba.parts.covariances import divided_covariances
-from gsba.parts.divided_system import optimize_divided
+from gsba.parts.divided_system import divided_covariances, optimize_divided
 from gsba.parts.folder import PartsWriter, load_index, values_at
 from gsba.store.shards import Threads
 

@@ -18,7 +18,7 @@ from gsba.config import PlacementSettings, RefineSettings
 from gsba.frames.exif import read_exif
 from gsba.log import GsbaError
 from gsba.pipeline import refine
-from gsba.placement.exif import read_exif_gps
+from gsba.placement.frame_fixes import read_exif_gps
 from gsba.placement.placement import check, place
 from gsba.types import FrameSet
 

@@ -14,7 +14,7 @@ from walk_on_earth import frame_set
 from gsba.config import GpsSettings
 from gsba.log import GsbaError
 from gsba.placement import fixes_of, fixes_of_frames, read_fixes, read_gps
-from gsba.placement.exif import read_exif_gps
+from gsba.placement.frame_fixes import read_exif_gps
 from gsba.placement.gps_video import read_video_gps
 from gsba.types import FrameSet
 

@@ -9,8 +9,8 @@ import pytest
 
 from gsba.log import GsbaError
 from gsba.scans import read_scan, trial
-from gsba.scans.claims import check_claims
-from gsba.scans.noise import noise_of
+from gsba.scans.files import check_claims
+from gsba.scans.fit import noise_of
 from gsba.scans.trial import try_in_process
 from gsba.scans.types import Cloud, Scan
 from gsba.similarity import Sim3

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from gsba.cli import app
 from gsba.log import GsbaError
 from gsba.scans import check_scan, distances_to, files, read_pairs, read_scan
-from gsba.scans.surfaces import on_planes
+from gsba.scans.files import on_planes
 from gsba.scans.types import Scan
 
 FAR = np.array([412_300.0, 5_655_800.0, 110.0])

@@ -8,9 +8,8 @@ import pytest
 from scan_world import HALL, INTO_SCAN, SIZE, cloud, rectangles, sampled, scan
 from scipy.spatial.transform import Rotation
 
-from gsba.scans.fit import _weighted, moved_by, settle
+from gsba.scans.fit import Noise, _weighted, moved_by, settle
 from gsba.scans.judge import CellGrid, verdict
-from gsba.scans.noise import Noise
 from gsba.scans.registration import NoPlacementError, Registration, register
 from gsba.scans.search import Guess, main_axes
 from gsba.scans.types import Scan

@@ -5,7 +5,7 @@ import pytest
 from synthetic import loop_walk
 
 from gsba.geometry import inverse
-from gsba.trajectory.axes import QUARTER_TURNS, quarter_turn
+from gsba.trajectory.conventions import QUARTER_TURNS, quarter_turn
 from gsba.types import CoarsePoses, PoseSource
 
 

@@ -7,7 +7,7 @@ from synthetic import loop_walk
 
 from gsba.geometry import inverse, pose, rotation_angle
 from gsba.log import GsbaError
-from gsba.trajectory.keyframes import follow_keyframes
+from gsba.trajectory.association import follow_keyframes
 from gsba.types import Trajectory
 
 TRUTH, TIMES = loop_walk(41), np.arange(41) / 10

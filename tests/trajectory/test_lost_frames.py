@@ -5,8 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gsba.geometry import pose
-from gsba.trajectory.lost_frames import without_lost_frames
-from gsba.trajectory.restarts import split_restarts
+from gsba.trajectory.restarts import split_restarts, without_lost_frames
 from gsba.types import Trajectory
 
 NUM = 30

@@ -13,7 +13,7 @@ from typer.testing import CliRunner, Result
 from gsba.cli import app
 from gsba.config import RefineSettings, VideoSettings
 from gsba.log import GsbaError
-from gsba.pipeline.inputs import extract_frames
+from gsba.pipeline.inputs import extract_video
 from gsba.store.store import RunStore
 from gsba.video import extract, extraction, is_video, recording
 from gsba.video.claims import PictureClaims
@@ -343,7 +343,8 @@ def test_raw_and_stitched_extractions_replace_each_other(film: Path, tmp_path: P
 
 def test_frames_of_a_run(film: Path, tmp_path: Path) -> None:
     run, settings = tmp_path / "run", RefineSettings(video=VideoSettings(every=10))
-    extract_frames(run, {"frames": film}, settings, None, False)
+    with RunStore(run, {"frames": film}) as store:
+        extract_video(store, film, settings, None)
     _check_shown(run / "frames", [0, 10, 20, 30], _steady(40))
     with RunStore(run, {"frames": film}, fresh=True):
         assert not (run / "frames").exists()  # all of it was claimed

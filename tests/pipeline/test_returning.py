@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gsba.trajectory.returning import comes_back
+from gsba.pipeline.frontend import comes_back
 
 
 def _circle(share: float, num: int = 60) -> np.ndarray:
