@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from tiny_run import Case
+from tiny_run import LIGHT, Case
 
 pytest.importorskip("starlette")
 pytest.importorskip("httpx")
@@ -247,10 +247,8 @@ def test_a_run_of_the_page_is_that_of_the_command_line(case: Case, tmp_path: Pat
     app = App(root, tmp_path / "state", [form_of(name) for name in COMMANDS], choices(), check)
     client = TestClient(application(app), base_url=f"http://127.0.0.1:8360/{app.token}/")
     out = f"of-page-{tmp_path.name}"
-    light = ["cubemap.face_size=256", "features.max_per_face=400"]
-    light += ["solver.num_threads=2", "weak_frames.mode=off", "patches.rounds=2"]
     values = {"frames": case.frames.name, "trajectory": [case.slam.name], "out": out}
-    values |= {"overrides": light}
+    values |= {"overrides": list(LIGHT)}
     added = post(client, "api/add", {"command": "refine", "values": values})
     found = wait_for(client, added["id"])
     assert found["status"] == "done", client.get(f"api/jobs/{added['id']}/log").text

@@ -19,7 +19,7 @@ from cameras_home import (
     fisheyes,
     panoramas,
 )
-from typer.testing import CliRunner
+from command import run_gsba
 
 from factors.sphere_field import SphereField, num_harmonics
 from gsba import (
@@ -30,7 +30,6 @@ from gsba import (
     remove_recordings,
 )
 from gsba.bundle.stitching import Stitching
-from gsba.cli import app
 from gsba.frames.scan import scan
 from gsba.log import GsbaError
 from gsba.pipeline.finished_run import FinishedRun
@@ -72,7 +71,7 @@ def grown(single: Path, home: Home) -> Path:
     """The second recording added to the first one's run from the command line."""
     out, small = home.folder / "grown", panoramas(home, 1, SMALL)
     words = ["add", str(single), str(small.frames), str(small.trajectory), "--out", str(out)]
-    result = CliRunner().invoke(app, ["--quiet", *words])
+    result = run_gsba("--quiet", *words)
     assert result.exit_code == 0, result.output
     return out
 
@@ -186,7 +185,7 @@ def test_recordings_of_two_models_have_two_cameras(home: Home, tmp_path: Path) -
     settings = SETTINGS.model_copy(update={"camera": named})
     refine_each([first], run, settings)
     call = f"{second.frames},trajectory={second.trajectory},camera=gopro-max"
-    result = CliRunner().invoke(app, ["--quiet", "add", str(run), "--recording", call])
+    result = run_gsba("--quiet", "add", run, "--recording", call)
     assert result.exit_code == 0, result.output
     frames: FrameSet = load_run(run)[1]
     assert frames.camera_of_frame == (0,) * num + (1,) * num
