@@ -10,7 +10,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from one_gallery import OVAL_FRAMES, OVAL_WIDTH
-from tiny_run import settings_with
+from tiny_run import exporting
 
 from gsba import Recording, refine_recordings
 from gsba.camera.calibration import calibration_json
@@ -151,18 +151,18 @@ def error_of(run: Path, home: Home) -> float:
     return evaluate(Trajectory(times, reconstruction.world_T_rigs), true).ate.rmse
 
 
-SMALL_EXPORT = settings_with(export={"formats": ("colmap-flat",), "face_size": 64})
+SMALL_EXPORT = exporting("colmap-flat", face_size=64)
 
 
 def make_beside_faces(home: Home, folder: Path) -> Path:
     """A run of panoramas and, of the second recording, cube faces."""
-    out, settings = folder / "cube", settings_with(export={"formats": ("colmap-flat",)})
+    out, settings = folder / "cube", exporting("colmap-flat")
     return refine_recordings([panoramas(home, 0, WIDTH), faces(home)], out, settings).out
 
 
 def make_beside_fisheyes(home: Home, folder: Path) -> Path:
     """A run of panoramas and, of the second recording, raw fisheyes."""
-    out, settings = folder / "fisheyes", settings_with(export={"formats": ("colmap",)})
+    out, settings = folder / "fisheyes", exporting("colmap")
     return refine_recordings([panoramas(home, 0, WIDTH), fisheyes(home)], out, settings).out
 
 

@@ -3,22 +3,18 @@
 import hashlib
 import logging
 import os
+import pickle
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
+from threading import get_ident
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read as NumPy loads: workers fill the cores
 
 
 import numpy as np
 import pytest
-from cameras_home import (
-    Home,
-    make_beside_faces,
-    make_beside_fisheyes,
-    make_home,
-    make_two_sizes,
-)
+from cameras_home import Home, make_beside_faces, make_beside_fisheyes, make_home, make_two_sizes
 from growing_home import GrowingHome, make_growing_home
 from made_once import MadeOnce
 from one_gallery import gallery, oval_walk
@@ -113,19 +109,22 @@ def plain_run(case: Case, made_once: MadeOnce) -> Path:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _found_once() -> Iterator[None]:
+def _found_once(made_once: MadeOnce) -> Iterator[None]:
     """Dozens of runs read the same pictures: keypoints of a face, a third of a run's time, are
-    found once in a process, and the demo's gallery is built once."""
-    find, kept = SiftExtractor.__call__, dict[bytes, FaceKeypoints]()
+    found once for all workers, and the demo's gallery is built once in each."""
+    find, folder = SiftExtractor.__call__, made_once("keypoints", lambda folder: folder)
 
     def find_once(
         extractor: SiftExtractor, face_rgb: np.ndarray, mask: np.ndarray | None
     ) -> FaceKeypoints:
         given = repr((extractor._settings, face_rgb.shape)).encode(), face_rgb.tobytes()
-        key = hashlib.sha1(b"".join((*given, b"" if mask is None else mask.tobytes()))).digest()
-        if key not in kept:
-            kept[key] = find(extractor, face_rgb, mask)
-        return kept[key]
+        content = b"".join((*given, b"" if mask is None else mask.tobytes()))
+        kept = folder / hashlib.sha1(content).hexdigest()
+        if not kept.exists():
+            new = kept.with_suffix(f".{os.getpid()}-{get_ident()}")
+            new.write_bytes(pickle.dumps(find(extractor, face_rgb, mask)))
+            new.rename(kept)
+        return pickle.loads(kept.read_bytes())
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(SiftExtractor, "__call__", find_once)

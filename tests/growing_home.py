@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from one_gallery import OVAL_FRAMES
 from scipy.spatial.transform import Rotation
-from tiny_run import settings_with
+from tiny_run import exporting
 
 from gsba import Recording, refine
 from gsba.demo import DemoWalk
@@ -24,7 +24,7 @@ MAX_ERROR = 0.0015  # of a map of both recordings: an eighteenth of a pixel, two
 SCALES = 1.0, 1.7  # of the trajectories
 WORLD = pose(Rotation.from_rotvec([0.4, -2.0, 0.7]).as_matrix(), np.array([5.0, -3.0, 8.0]))
 CLOCKS = 100.0, 3.5  # seconds at the first frames
-SMALL_EXPORTS = settings_with(export={"formats": ("colmap-flat", "tum"), "face_size": 64})
+SMALL_EXPORTS = exporting("colmap-flat", "tum", face_size=64)
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,12 @@ def settings_with(**changes: object) -> RefineSettings:
     return RefineSettings.model_validate(given)
 
 
-BARE = settings_with(export={"formats": ()})  # of runs whose exports no test reads
+def exporting(*formats: str, **options: object) -> RefineSettings:
+    """Light settings with these exports."""
+    return settings_with(export={"formats": formats, **options})
+
+
+BARE = exporting()  # of runs whose exports no test reads
 PLAIN = settings_with(export={"formats": ()}, patches={"rounds": 0})
 
 

@@ -7,16 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from cameras_home import (
-    NUM,
-    SMALL,
-    WIDTH,
-    Home,
-    faces,
-    fisheyes,
-    panoramas,
-    read,
-)
+from cameras_home import NUM, SMALL, WIDTH, Home, faces, fisheyes, panoramas, read
 from command import run_gsba
 
 from gsba import GsbaError, Localizer

@@ -16,12 +16,7 @@ from growing_home import MAX_ERROR, NUM, SMALL_EXPORTS, GrowingHome
 from typer.testing import Result
 from waiting import until
 
-from gsba import (
-    add_recordings,
-    load_run,
-    merge_runs,
-    refine,
-)
+from gsba import add_recordings, load_run, merge_runs, refine
 from gsba.disk import hold_folder
 from gsba.export import ExportFormat
 from gsba.localization import Localizer

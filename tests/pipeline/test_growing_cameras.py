@@ -20,15 +20,10 @@ from cameras_home import (
     panoramas,
 )
 from command import run_gsba
+from tiny_run import settings_with
 
 from factors.sphere_field import SphereField, num_harmonics
-from gsba import (
-    Localizer,
-    add_recordings,
-    load_run,
-    merge_runs,
-    remove_recordings,
-)
+from gsba import Localizer, add_recordings, load_run, merge_runs, remove_recordings
 from gsba.bundle.stitching import Stitching
 from gsba.frames.scan import scan
 from gsba.log import GsbaError
@@ -43,14 +38,11 @@ def home(cameras_home: Home) -> Home:
     return cameras_home
 
 
-SETTINGS = SMALL_EXPORT
-
-
 @pytest.fixture(scope="module")
 def single(home: Home) -> Path:
     """A run of the first recording, of one camera."""
     out = home.folder / "single"
-    refine_each([panoramas(home, 0, WIDTH)], out, SETTINGS)
+    refine_each([panoramas(home, 0, WIDTH)], out, SMALL_EXPORT)
     return out
 
 
@@ -112,7 +104,7 @@ def test_fixed_poses_of_a_run_of_several_cameras_stay(
 def raw(home: Home) -> Path:
     """A run of the second recording as raw fisheyes."""
     out = home.folder / "raw_run"
-    refine_each([fisheyes(home)], out, SETTINGS)
+    refine_each([fisheyes(home)], out, SMALL_EXPORT)
     return out
 
 
@@ -154,7 +146,7 @@ def test_a_camera_goes_with_its_recordings(
     alone = single
     if not gone:
         alone = tmp_path / "alone"
-        refine_each([panoramas(home, 1, SMALL)], alone, SETTINGS)
+        refine_each([panoramas(home, 1, SMALL)], alone, SMALL_EXPORT)
     assert_as_accurate(out, error_of(out, home), alone, 1.25)
     # The remaining run grows again: its features were extracted beside those of another camera.
     again = tmp_path / "again"
@@ -181,9 +173,7 @@ def test_recordings_of_two_models_have_two_cameras(home: Home, tmp_path: Path) -
     first, second = (
         beginning(panoramas(home, n, WIDTH), num, tmp_path / f"recording{n}") for n in range(2)
     )
-    named = SETTINGS.camera.model_copy(update={"name": "insta360-x3"})
-    settings = SETTINGS.model_copy(update={"camera": named})
-    refine_each([first], run, settings)
+    refine_each([first], run, settings_with(camera={"name": "insta360-x3"}))
     call = f"{second.frames},trajectory={second.trajectory},camera=gopro-max"
     result = run_gsba("--quiet", "add", run, "--recording", call)
     assert result.exit_code == 0, result.output

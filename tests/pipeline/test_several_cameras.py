@@ -10,18 +10,8 @@ import numpy as np
 import pycolmap
 import pytest
 from accuracy import assert_as_accurate, predicted_error
-from cameras_home import (
-    NUM,
-    SMALL,
-    WIDTH,
-    Home,
-    error_of,
-    faces,
-    panoramas,
-    read,
-    settings_with,
-)
-from tiny_run import SETTINGS
+from cameras_home import NUM, SMALL, WIDTH, Home, error_of, faces, panoramas, read
+from tiny_run import SETTINGS, exporting
 
 from gsba import RunResult, refine_recordings
 from gsba.config import RefineSettings
@@ -41,9 +31,9 @@ def home(cameras_home: Home) -> Home:
 def sizes(two_sizes: Path, home: Home, tmp_path_factory: pytest.TempPathFactory) -> RunResult:
     """A recording at 512 pixels and one at 384, in several formats."""
     out = Path(shutil.copytree(two_sizes, tmp_path_factory.mktemp("several") / "sizes"))
-    formats = {"formats": ("colmap", "colmap-erp", "nerfstudio", "metashape")}
+    settings = exporting("colmap", "colmap-erp", "nerfstudio", "metashape")
     recordings = [panoramas(home, 0, WIDTH), panoramas(home, 1, SMALL)]
-    return refine_recordings(recordings, out, settings_with(export=formats))
+    return refine_recordings(recordings, out, settings)
 
 
 def test_pictures_of_two_sizes_make_one_map(sizes: RunResult, home: Home) -> None:
@@ -106,7 +96,7 @@ def test_stitched_panoramas_and_cube_faces_make_one_map(
     model = pycolmap.Reconstruction(str(faces_run / "colmap-flat/sparse/0"))
     assert len(model.images) == 12 * NUM - 3  # 15 faces of three held-out frames beside 102 others
     with pytest.raises(GsbaError, match="needs panoramas"):
-        given = settings_with(export={"formats": ("colmap-erp",), "images": "panorama"})
+        given = exporting("colmap-erp", images="panorama")
         recordings = [panoramas(home, 0, WIDTH), faces(home)]
         refine_recordings(recordings, shutil.copytree(faces_run, tmp_path / "run"), given)
 
