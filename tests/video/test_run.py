@@ -21,7 +21,7 @@ pytest.importorskip("av", reason="PyAV is not installed")
 def test_video_and_folder_give_the_same(case: Case, tmp_path: Path) -> None:
     video = tmp_path / "walk.mp4"
     walk = case.result.frames
-    pictures = [cv2.imread(str(path))[..., ::-1] for (path,) in walk.paths]
+    pictures = [cv2.cvtColor(cv2.imread(str(p)), cv2.COLOR_BGR2RGB) for (p,) in walk.paths]
     encode(video, (pictures, np.rint(90_000 * walk.timestamps)))
     settings = SETTINGS.model_copy(update={"video": VideoSettings(every=1)})
     out = tmp_path / "from-video"
