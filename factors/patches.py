@@ -95,9 +95,9 @@ class PatchSet:
             origins (T, 3), spreads (T, 3, 2): plane patches, rig frame of the panorama.
             least_contrast: least standard deviation in grey values.
         """
-        usable = _NO_MASK if mask is None else mask
+        places = np.ascontiguousarray(origins), np.ascontiguousarray(spreads)
         coefficients = image.coefficients
-        cut_templates(coefficients, usable, rows, origins, spreads, least_contrast, self.templates)
+        cut_templates(coefficients, _usable(mask), rows, *places, least_contrast, self.templates)
 
     def align(
         self,
@@ -116,12 +116,11 @@ class PatchSet:
             max_shift, tolerance: limits of the shift and of its last step, template pixels.
             max_steps: largest number of Gauss-Newton steps.
         """
-        usable = _NO_MASK if mask is None else mask
         states = self.templates.states[sightings.templates[rows]]
         sightings.states[rows] = states
         rows = rows[states == ALIGNED]
         align_templates(
-            image.coefficients, usable, rows, sightings, max_shift, max_steps, tolerance,
+            image.coefficients, _usable(mask), rows, sightings, max_shift, max_steps, tolerance,
             self.templates,
         )  # fmt: skip
 
@@ -133,6 +132,11 @@ class PatchSet:
             variances: (N,) residual variances, in the template's grey values.
         """
         return self.templates.inverses[:, :2, :2][rows] * np.asarray(variances)[:, None, None]
+
+
+def _usable(mask: np.ndarray | None) -> np.ndarray:
+    """A mask as the kernels are compiled for: one that cannot be written to is copied."""
+    return _NO_MASK if mask is None else np.require(mask, bool, ["C", "W"])
 
 
 def expect(templates: np.ndarray, origins: np.ndarray, spreads: np.ndarray) -> Sightings:

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -222,9 +223,7 @@ def relative_similarity(
     scale, and its inliers (m,) bool; None if fewer than `least`."""
     if len(points0) < least:
         return None
-    rng = np.random.default_rng(seed)
-    draws = [rng.choice(len(points0), 3, replace=False) for _ in range(_NUM_TRIALS)]
-    inliers = _agree_with_triples(points0, points1, np.array(draws))
+    inliers = _agree_with_triples(points0, points1, _triples(len(points0), seed))
     best = inliers[np.argmax(inliers.sum(axis=1))]
     for _ in range(3):
         if best.sum() < least:
@@ -237,6 +236,13 @@ def relative_similarity(
     if best.sum() < least:
         return None
     return similarity(points1[best], points0[best]), best
+
+
+@lru_cache(maxsize=256)
+def _triples(num: int, seed: int) -> np.ndarray:
+    """Rows (T, 3) of three of `num` points each: the same for all pairs of frames."""
+    rng = np.random.default_rng(seed)
+    return np.array([rng.choice(num, 3, replace=False) for _ in range(_NUM_TRIALS)])
 
 
 def similarity_along(

@@ -10,14 +10,13 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from one_gallery import OVAL_FRAMES, OVAL_WIDTH
-from tiny_run import SETTINGS
+from tiny_run import exporting
 
 from gsba import Recording, refine_recordings
 from gsba.camera.calibration import calibration_json
 from gsba.camera.fisheye import unproject
 from gsba.camera.rig import CubeRig
 from gsba.camera.sphere import around_sphere, erp_from_bearings
-from gsba.config import RefineSettings
 from gsba.demo import DemoWalk
 from gsba.evaluate.trajectory import evaluate
 from gsba.frames.cubemap import cut
@@ -141,14 +140,6 @@ def read(path: Path) -> np.ndarray:
     return pixels
 
 
-def settings_with(**changes: object) -> RefineSettings:
-    """Light settings with changes of some stages."""
-    given = SETTINGS.model_dump()
-    for stage, values in changes.items():
-        given[stage] |= values
-    return RefineSettings.model_validate(given)
-
-
 def error_of(run: Path, home: Home) -> float:
     """Error of a run of some of the recordings, all in one map."""
     reconstruction, frames = load_run(run)
@@ -160,7 +151,19 @@ def error_of(run: Path, home: Home) -> float:
     return evaluate(Trajectory(times, reconstruction.world_T_rigs), true).ate.rmse
 
 
-SMALL_EXPORT = settings_with(export={"formats": ("colmap-flat",), "face_size": 64})
+SMALL_EXPORT = exporting("colmap-flat", face_size=64)
+
+
+def make_beside_faces(home: Home, folder: Path) -> Path:
+    """A run of panoramas and, of the second recording, cube faces."""
+    out, settings = folder / "cube", exporting("colmap-flat")
+    return refine_recordings([panoramas(home, 0, WIDTH), faces(home)], out, settings).out
+
+
+def make_beside_fisheyes(home: Home, folder: Path) -> Path:
+    """A run of panoramas and, of the second recording, raw fisheyes."""
+    out, settings = folder / "fisheyes", exporting("colmap")
+    return refine_recordings([panoramas(home, 0, WIDTH), fisheyes(home)], out, settings).out
 
 
 def make_two_sizes(home: Home, folder: Path) -> Path:

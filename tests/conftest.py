@@ -1,20 +1,27 @@
 """Fixtures that several files share."""
 
+import hashlib
 import logging
 import os
+import pickle
+from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
+from threading import get_ident
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read as NumPy loads: workers fill the cores
 
 
 import numpy as np
 import pytest
-from cameras_home import Home, make_home, make_two_sizes
+from cameras_home import Home, make_beside_faces, make_beside_fisheyes, make_home, make_two_sizes
+from growing_home import GrowingHome, make_growing_home
 from made_once import MadeOnce
-from one_gallery import oval_walk
-from tiny_run import Case, make_case
+from one_gallery import gallery, oval_walk
+from tiny_run import PLAIN, Case, make_case
 
 from gsba.demo import DemoWalk
+from gsba.features import FaceKeypoints, SiftExtractor
 
 # Files and folders whose tests take longest begin first, so that no worker is left alone with them.
 # While the first file compiles the pipeline's kernels, the next ones need none of them.
@@ -40,6 +47,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: _place_in_queue(item.path))
 
 
+@cache
 def _place_in_queue(path: Path) -> int:
     tests = Path(__file__).parent
     found = (n for n, first in enumerate(_FIRST) if path.is_relative_to(tests / first))
@@ -74,6 +82,54 @@ def cameras_home(oval: DemoWalk, made_once: MadeOnce) -> Home:
 def two_sizes(cameras_home: Home, made_once: MadeOnce) -> Path:
     """A finished run of recordings of two sizes; copy it before going on from it."""
     return made_once("two-sizes", lambda folder: make_two_sizes(cameras_home, folder))
+
+
+@pytest.fixture(scope="session")
+def growing_home(oval: DemoWalk, made_once: MadeOnce) -> GrowingHome:
+    """Two recordings of one place and a run of the first one; tests only read them."""
+    return made_once("growing", lambda folder: make_growing_home(folder, oval))
+
+
+@pytest.fixture(scope="session")
+def faces_run(cameras_home: Home, made_once: MadeOnce) -> Path:
+    """A finished run of panoramas and cube faces; copy it before going on from it."""
+    return made_once("faces-run", lambda folder: make_beside_faces(cameras_home, folder))
+
+
+@pytest.fixture(scope="session")
+def fisheyes_run(cameras_home: Home, made_once: MadeOnce) -> Path:
+    """A finished run of panoramas and raw fisheyes; copy it before going on from it."""
+    return made_once("fisheyes-run", lambda folder: make_beside_fisheyes(cameras_home, folder))
+
+
+@pytest.fixture(scope="session")
+def plain_run(case: Case, made_once: MadeOnce) -> Path:
+    """The tiny walk's run without patches."""
+    return made_once("plain", lambda folder: case.refine(folder / "run", PLAIN).out)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _found_once(made_once: MadeOnce) -> Iterator[None]:
+    """Dozens of runs read the same pictures: keypoints of a face, a third of a run's time, are
+    found once for all workers, and the demo's gallery is built once in each."""
+    find, folder = SiftExtractor.__call__, made_once("keypoints", lambda folder: folder)
+
+    def find_once(
+        extractor: SiftExtractor, face_rgb: np.ndarray, mask: np.ndarray | None
+    ) -> FaceKeypoints:
+        given = repr((extractor._settings, face_rgb.shape)).encode(), face_rgb.tobytes()
+        content = b"".join((*given, b"" if mask is None else mask.tobytes()))
+        kept = folder / hashlib.sha1(content).hexdigest()
+        if not kept.exists():
+            new = kept.with_suffix(f".{os.getpid()}-{get_ident()}")
+            new.write_bytes(pickle.dumps(find(extractor, face_rgb, mask)))
+            new.rename(kept)
+        return pickle.loads(kept.read_bytes())
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(SiftExtractor, "__call__", find_once)
+        patch.setattr("gsba.demo.gallery.build_gallery", gallery)
+        yield
 
 
 @pytest.fixture

@@ -51,8 +51,7 @@ def render_walk() -> RenderedWalk:
     poses = truth.world_T_rigs[:NUM_FRAMES].copy()
     frames = []
     for pose in poses:
-        picture = render_erp(scene, pose, 2 * WIDTH, WIDTH)
-        small = cv2.resize(picture, (WIDTH, WIDTH // 2), interpolation=cv2.INTER_AREA)
-        grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
+        picture = render_erp(scene, pose, WIDTH, WIDTH // 2)
+        grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
         frames.append(np.clip(grey, 0, 255).astype(np.uint8))
     return RenderedWalk(frames, poses)

@@ -5,10 +5,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from one_gallery import walk_in_gallery
 
 from gsba import refine
 from gsba.config import RefineSettings
+from gsba.config_file import load_config
+from gsba.demo import make_walk
 from gsba.demo.walk import Heading, WalkPath, walk_poses
 from gsba.evaluate.trajectory import TrajectoryErrors, evaluate
 from gsba.pipeline import RunResult
@@ -16,15 +17,31 @@ from gsba.trajectory.files import read_trajectory
 from gsba.types import Trajectory
 
 NUM_FRAMES, WIDTH = 8, 512
-SETTINGS = RefineSettings.model_validate(  # lighter than the defaults
-    {
-        "cubemap": {"face_size": 256},
-        "features": {"max_per_face": 400},
-        "solver": {"num_threads": 2},
-        "weak_frames": {"mode": "off"},
-        "patches": {"rounds": 2},
-    }
+LIGHT = (  # changes of the defaults, as `--set` takes them
+    "cubemap.face_size=256",
+    "features.max_per_face=400",
+    "solver.num_threads=2",
+    "weak_frames.mode=off",
+    "patches.rounds=2",
 )
+SETTINGS = load_config(None, LIGHT)
+
+
+def settings_with(**changes: object) -> RefineSettings:
+    """Light settings with changes of some stages."""
+    given = SETTINGS.model_dump()
+    for stage, values in changes.items():
+        given[stage] |= values
+    return RefineSettings.model_validate(given)
+
+
+def exporting(*formats: str, **options: object) -> RefineSettings:
+    """Light settings with these exports."""
+    return settings_with(export={"formats": formats, **options})
+
+
+BARE = exporting()  # of runs whose exports no test reads
+PLAIN = settings_with(export={"formats": ()}, patches={"rounds": 0})
 
 
 @dataclass(frozen=True)
@@ -67,7 +84,7 @@ def make_case(folder: Path) -> Case:
     """Render the walk into a folder and refine it."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("gsba.demo.walk.walk_poses", _first_third)
-        walk = walk_in_gallery(folder / "walk", "open", "locked", NUM_FRAMES, WIDTH)
+        walk = make_walk(folder / "walk", "open", "locked", NUM_FRAMES, WIDTH)
     out = folder / "run"
     result = refine(walk.frames_dir, walk.slam_path, out, SETTINGS)
     return Case(walk.frames_dir, walk.slam_path, read_trajectory(walk.truth_path), out, result)

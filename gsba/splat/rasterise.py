@@ -78,7 +78,7 @@ def render(
     num = len(gaussians)
     across, down = (-(-pixels // _tiles.TILE) for pixels in (camera.width, camera.height))
     splats, reach2 = np.empty((num, 10), np.float32), np.empty(num, np.float32)
-    given = (camera.packed(), near, *gaussians.arrays(), degree)
+    given = (camera.packed(), near, *map(np.ascontiguousarray, gaussians.arrays()), degree)
     run = functools.partial(_in_parallel, num_threads or os.cpu_count() or 1)
     run(num, 2048, _project.project, *given, splats, reach2)
     offsets = np.zeros(num + 1, np.int64)

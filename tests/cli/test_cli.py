@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import typer.main
-from typer.testing import CliRunner, Result
+from command import fails, run_gsba
 
 import gsba
 from gsba import log
@@ -25,18 +25,6 @@ from gsba.config import RefineSettings
 from gsba.config_file import load_config
 from gsba.export import ExportFormat
 from gsba.log import GsbaError
-
-
-def _gsba(*arguments: object) -> Result:
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
-
-
-def _fails(result: Result, message: str, code: int = 1) -> None:
-    """The command ended with exactly one line on stderr and nothing on stdout."""
-    lines = result.stderr.splitlines()
-    assert len(lines) == 1 and lines[0].startswith("error: "), result.stderr
-    assert message in lines[0]
-    assert (result.exit_code, result.stdout) == (code, "")
 
 
 @pytest.fixture
@@ -64,47 +52,47 @@ def _tum(path: Path, num: int = 5, scale: float = 1.0) -> Path:
 
 
 def test_help_names_every_command_and_format() -> None:
-    out = _gsba("--help").stdout
+    out = run_gsba("--help").stdout
     for command in ("refine", "export", "evaluate", "demo", "show-config", "--version"):
         assert command in out
-    out = _gsba("export", "--help").stdout
+    out = run_gsba("export", "--help").stdout
     assert all(to in out for to in ExportFormat)
 
 
 def test_version() -> None:
-    assert _gsba("--version").stdout == f"gsba {gsba.__version__}\n"
+    assert run_gsba("--version").stdout == f"gsba {gsba.__version__}\n"
 
 
 def test_show_config_prints_what_load_config_reads(tmp_path: Path) -> None:
-    result = _gsba("show-config", "--set", "features.max_per_face=77")
+    result = run_gsba("show-config", "--set", "features.max_per_face=77")
     assert result.exit_code == 0
     (tmp_path / "all.toml").write_text(result.stdout)
     assert load_config(tmp_path / "all.toml").features.max_per_face == 77
-    again = _gsba("show-config", "--config", tmp_path / "all.toml")
+    again = run_gsba("show-config", "--config", tmp_path / "all.toml")
     assert again.stdout == result.stdout
 
 
 def test_wrong_settings_name_the_key() -> None:
-    _fails(_gsba("show-config", "--set", "features.max_per_fce=1"), "did you mean max_per_face?")
-    _fails(_gsba("show-config", "--set", "seed=x"), "use an integer")
-    _fails(_gsba("show-config", "--set", "seed=-1"), "use an integer >= 0")
-    _fails(_gsba("show-config", "--set", "seed=" + "9" * 9999), "seed=999")
-    _fails(_gsba("show-config", "--set", "seed=" + "[" * 3000), "the value is not valid TOML")
-    _fails(_gsba("show-config", "--set", 'placement.gps="a\\u0000"'), "placement.gps = ")
-    _fails(_gsba("show-config", "--set", "video.width=99999"), "use an even integer >= 64")
-    _fails(_gsba("show-config", "--set", "patches.patch_size=8"), "not allowed: must be odd")
-    _fails(_gsba("show-config", "--config", "nowhere.toml"), "cannot read settings nowhere.toml")
-    _fails(_gsba("refine", "a", "b", "--out", "c", "--set", "x=1"), "unknown setting x")
+    fails(run_gsba("show-config", "--set", "features.max_per_fce=1"), "did you mean max_per_face?")
+    fails(run_gsba("show-config", "--set", "seed=x"), "use an integer")
+    fails(run_gsba("show-config", "--set", "seed=-1"), "use an integer >= 0")
+    fails(run_gsba("show-config", "--set", "seed=" + "9" * 9999), "seed=999")
+    fails(run_gsba("show-config", "--set", "seed=" + "[" * 3000), "the value is not valid TOML")
+    fails(run_gsba("show-config", "--set", 'placement.gps="a\\u0000"'), "placement.gps = ")
+    fails(run_gsba("show-config", "--set", "video.width=99999"), "use an even integer >= 64")
+    fails(run_gsba("show-config", "--set", "patches.patch_size=8"), "not allowed: must be odd")
+    fails(run_gsba("show-config", "--config", "nowhere.toml"), "cannot read settings nowhere.toml")
+    fails(run_gsba("refine", "a", "b", "--out", "c", "--set", "x=1"), "unknown setting x")
     assert not Path("c").exists()
 
 
 def test_factors_are_a_setting() -> None:
     if "factors" not in RefineSettings.model_fields:
         pytest.skip("no factor families to choose from")
-    out = _gsba("show-config", "--factors", "bearing,reprojection").stdout
+    out = run_gsba("show-config", "--factors", "bearing,reprojection").stdout
     assert 'factors = ["bearing", "reprojection"]' in out
-    _fails(_gsba("show-config", "--factors", "nonsense"), '"bearing"')
-    _fails(_gsba("show-config", "--factors", "splat"), "error: factors: splat needs bearing")
+    fails(run_gsba("show-config", "--factors", "nonsense"), '"bearing"')
+    fails(run_gsba("show-config", "--factors", "splat"), "error: factors: splat needs bearing")
 
 
 @pytest.mark.parametrize(
@@ -121,8 +109,8 @@ def test_expected_failures_are_one_line(
     pipeline: Callable[[BaseException], None], error: BaseException, message: str, code: int
 ) -> None:
     pipeline(error)
-    _fails(_gsba("refine", "frames", "slam.tum", "--out", "run"), message, code)
-    _fails(_gsba("export", "run", "--to", "colmap"), message, code)
+    fails(run_gsba("refine", "frames", "slam.tum", "--out", "run"), message, code)
+    fails(run_gsba("export", "run", "--to", "colmap"), message, code)
 
 
 def test_what_nobody_foresaw_is_one_line_that_can_be_reported(
@@ -130,9 +118,9 @@ def test_what_nobody_foresaw_is_one_line_that_can_be_reported(
 ) -> None:
     pipeline(ZeroDivisionError("no\nway"))
     call = ["refine", "frames", "slam.tum", "--out", "run"]
-    _fails(_gsba(*call), "unforeseen ZeroDivisionError at refining.py:")
-    _fails(_gsba(*call), "(no way): a bug in gsba")
-    assert isinstance(_gsba("--debug", *call).exception, ZeroDivisionError)
+    fails(run_gsba(*call), "unforeseen ZeroDivisionError at refining.py:")
+    fails(run_gsba(*call), "(no way): a bug in gsba")
+    assert isinstance(run_gsba("--debug", *call).exception, ZeroDivisionError)
 
 
 def test_memory_errors_name_the_stage_and_its_settings(
@@ -140,30 +128,30 @@ def test_memory_errors_name_the_stage_and_its_settings(
 ) -> None:
     error = MemoryError("Unable to allocate 4.50 GiB")
     pipeline(error)
-    _fails(_gsba("export", "run", "--to", "ply"), "(Unable to allocate 4.50 GiB): give smaller")
+    fails(run_gsba("export", "run", "--to", "ply"), "(Unable to allocate 4.50 GiB): give smaller")
     error.add_note("align1")
-    _fails(_gsba("export", "run", "--to", "ply"), "(stage align1; Unable")
-    _fails(_gsba("export", "run", "--to", "ply"), "lower patches.max_width or solver.num_threads")
+    fails(run_gsba("export", "run", "--to", "ply"), "(stage align1; Unable")
+    fails(run_gsba("export", "run", "--to", "ply"), "lower patches.max_width or solver.num_threads")
 
 
 def test_messages_are_short_and_printable(pipeline: Callable[[BaseException], None]) -> None:
     pipeline(GsbaError("9" * 10_000 + "\udcff\nend"))
-    line = _gsba("refine", "frames", "slam.tum", "--out", "run").stderr
+    line = run_gsba("refine", "frames", "slam.tum", "--out", "run").stderr
     assert len(line) < 1100 and line.startswith("error: 999") and line.endswith("end\n")
     assert "\\udcff" in line
 
 
 def test_help_says_nothing_of_python() -> None:
     for command in typer.main.get_command(app).commands:  # type: ignore[attr-defined]
-        assert "[Path]" not in _gsba(command, "--help").stdout
+        assert "[Path]" not in run_gsba(command, "--help").stdout
 
 
 def test_export_checks_its_options(tmp_path: Path) -> None:
-    _fails(_gsba("export", tmp_path, "--to", "obj"), "use one of colmap, colmap-flat, colmap-erp")
+    fails(run_gsba("export", tmp_path, "--to", "obj"), "use one of colmap, colmap-flat, colmap-erp")
     for size in (0, 15):
-        result = _gsba("export", tmp_path, "--to", "ply", "--face-size", size)
-        _fails(result, f"export.face_size = {size} is not allowed: use an integer >= 16")
-    _fails(_gsba("export", tmp_path, "--to", "ply", "--gps", ""), 'gps = "" is not allowed')
+        result = run_gsba("export", tmp_path, "--to", "ply", "--face-size", size)
+        fails(result, f"export.face_size = {size} is not allowed: use an integer >= 16")
+    fails(run_gsba("export", tmp_path, "--to", "ply", "--gps", ""), 'gps = "" is not allowed')
 
 
 def test_evaluate_compares_a_file_or_a_run(tmp_path: Path) -> None:
@@ -171,25 +159,25 @@ def test_evaluate_compares_a_file_or_a_run(tmp_path: Path) -> None:
     (tmp_path / "run").mkdir()
     _tum(tmp_path / "run/trajectory.tum", scale=3.0)
     numbers = tmp_path / "numbers.json"
-    result = _gsba("evaluate", tmp_path / "run", "--truth", truth, "--json", numbers)
+    result = run_gsba("evaluate", tmp_path / "run", "--truth", truth, "--json", numbers)
     assert result.exit_code == 0 and "5/5" in result.stdout
     assert "covariances cannot be checked" in result.stdout
     assert json.loads(numbers.read_text())["scale"] == pytest.approx(1 / 3)
-    assert _gsba("evaluate", truth, "--truth", truth).exit_code == 0
+    assert run_gsba("evaluate", truth, "--truth", truth).exit_code == 0
 
 
 def test_evaluate_fails_in_one_line(tmp_path: Path) -> None:
     truth = _tum(tmp_path / "truth.tum")
-    _fails(_gsba("evaluate", tmp_path / "none.tum", "--truth", truth), "none.tum")
-    _fails(_gsba("evaluate", tmp_path, "--truth", truth), "trajectory.tum")
+    fails(run_gsba("evaluate", tmp_path / "none.tum", "--truth", truth), "none.tum")
+    fails(run_gsba("evaluate", tmp_path, "--truth", truth), "trajectory.tum")
     (tmp_path / "bad.tum").write_text("0 1 2 nan 0 0 0 1\n")
-    _fails(_gsba("evaluate", truth, "--truth", tmp_path / "bad.tum"), "bad.tum:1")
+    fails(run_gsba("evaluate", truth, "--truth", tmp_path / "bad.tum"), "bad.tum:1")
 
 
 def test_demo_checks_its_options(tmp_path: Path) -> None:
-    _fails(_gsba("demo", "--path", "spiral", "--out", tmp_path), "'spiral'")
-    _fails(_gsba("demo", "--frames", 2, "--out", tmp_path), "2 frames")
-    _fails(_gsba("demo", "--seed", -1, "--out", tmp_path), "seed -1")
+    fails(run_gsba("demo", "--path", "spiral", "--out", tmp_path), "'spiral'")
+    fails(run_gsba("demo", "--frames", 2, "--out", tmp_path), "2 frames")
+    fails(run_gsba("demo", "--seed", -1, "--out", tmp_path), "seed -1")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -256,14 +244,14 @@ def test_refine_needs_no_more_than_a_folder_or_a_video(
     (tmp_path / "clips/walk").touch()
     (tmp_path / "bare").touch()
     for frames in ("frames", ".", "clips/walk.mp4", "clips/walk", "bare"):
-        _gsba("refine", frames)
+        run_gsba("refine", frames)
     folders = ["frames-run", f"{tmp_path.name}-run", "walk", "walk", "bare-run"]
     assert [(trajectory, str(out)) for _, trajectory, out in runs] == [(None, f) for f in folders]
 
 
 def test_a_trajectory_and_none_are_not_both(runs: list[tuple[object, ...]]) -> None:
-    _fails(_gsba("refine", "frames", "slam.tum", "--no-trajectory"), "exclude each other")
-    _fails(_gsba("refine", "frames", "--keyframes", "k.tum"), "--keyframes needs the TRAJECTORY")
+    fails(run_gsba("refine", "frames", "slam.tum", "--no-trajectory"), "exclude each other")
+    fails(run_gsba("refine", "frames", "--keyframes", "k.tum"), "--keyframes needs the TRAJECTORY")
     assert not runs
 
 

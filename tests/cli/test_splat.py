@@ -4,18 +4,13 @@ import json
 from pathlib import Path
 
 import pytest
+from command import run_gsba
 from tiny_run import Case
-from typer.testing import CliRunner, Result
 
-from gsba.cli import app
 from gsba.config import RefineSettings
 from gsba.config_file import load_config
 from gsba.log import GsbaError
 from gsba.pipeline import RunResult
-
-
-def call(*arguments: object) -> Result:
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
 @pytest.mark.parametrize("upright", [True, False])
@@ -36,7 +31,7 @@ def test_splat_writes_a_trainers_dataset(
     if not upright:
         monkeypatch.setattr("gsba.placement.placement.place", no_vertical)
     options = ("--out", run, "--to", "brush", "--config", "fast", "--face-size", 64)
-    done = call("splat", tmp_path / "walk.mp4", *options)
+    done = run_gsba("splat", tmp_path / "walk.mp4", *options)
     assert done.exit_code == 0, done.output
     assert called == [(tmp_path / "walk.mp4", None, run, load_config(Path("fast")))]
     assert f"brush: brush {run / 'brush'}" in done.output
@@ -46,10 +41,10 @@ def test_splat_writes_a_trainers_dataset(
 
 
 def test_splat_refuses_a_wrong_trainer_before_it_refines(tmp_path: Path) -> None:
-    done = call("splat", tmp_path / "walk.mp4", "--to", "brsh")
+    done = run_gsba("splat", tmp_path / "walk.mp4", "--to", "brsh")
     assert done.exit_code == 1 and "--to brsh is not known" in done.stderr
 
 
 def test_summaries_of_commands_fit_their_lines() -> None:
-    lines = call("--help").output.splitlines()
+    lines = run_gsba("--help").output.splitlines()
     assert not [line for line in lines if line.endswith("...") and "Usage" not in line]

@@ -8,13 +8,13 @@ from itertools import islice
 import cv2
 import numpy as np
 import pytest
+from command import run_gsba
+from one_gallery import gallery
 from scipy.spatial.transform import Rotation
-from typer.testing import CliRunner
 
 from gsba import pipeline
 from gsba.camera.lens import Lenses
 from gsba.camera.sphere import bearings_from_erp, erp_from_bearings
-from gsba.cli import app
 from gsba.cli.refining import _found_lenses
 from gsba.demo import degrade, make_walk
 from gsba.demo.degrade import Drift
@@ -197,7 +197,8 @@ def test_depth_and_truth_carry_one_frame_into_the_next(walk):
     assert right < 0.6 * min(still, backwards)
 
 
-def test_walk_is_reproducible_and_replaces_only_walks(walk, tmp_path):
+def test_walk_is_reproducible_and_replaces_only_walks(walk, tmp_path, monkeypatch):
+    monkeypatch.setattr("gsba.demo.gallery.build_gallery", gallery.__wrapped__)  # built anew
     again = make_walk(tmp_path / "again", num_frames=FRAMES, width=WIDTH, seed=3)
     for first, second in ((walk.slam_path, again.slam_path), (walk.truth_path, again.truth_path)):
         assert first.read_bytes() == second.read_bytes()
@@ -430,14 +431,14 @@ def test_a_camera_of_two_lenses_walks_the_same_way(walk, tmp_path):
 @pytest.mark.slow
 def test_demo_compares_one_centre_with_two_lenses(tmp_path):
     few = ["--frames", "3", "--width", "256", "--out", str(tmp_path / "demo")]
-    result = CliRunner().invoke(app, ["-q", "demo", "--camera", "two-lens", *few])
+    result = run_gsba("-q", "demo", "--camera", "two-lens", *few)
     assert result.exit_code == 0, result.output
     starts = [line[:12].strip() for line in result.stdout.splitlines()]
     assert starts[2:5] == ["before", "one centre", "two lenses"]
     assert "Two lenses were not found: too few points" in result.stdout  # of three frames
     for run in ("run", "run-central"):
         assert (tmp_path / "demo" / run / "trajectory.tum").is_file()
-    wrong = CliRunner().invoke(app, ["demo", "--camera", "nonsense", "--out", str(tmp_path / "x")])
+    wrong = run_gsba("demo", "--camera", "nonsense", "--out", tmp_path / "x")
     assert wrong.exit_code == 1
     assert wrong.stderr == "error: camera 'nonsense' is none of ideal, two-lens\n"
     assert [p.name for p in tmp_path.iterdir()] == ["demo"]
@@ -467,9 +468,9 @@ def test_demo_ends_like_refine_where_its_walk_falls_apart(tmp_path, monkeypatch)
         return replace(result, maps=maps, report=result.report | {"summary": summary})
 
     few = ["-q", "demo", "--frames", "3", "--width", "256", "--out", str(tmp_path / "demo")]
-    assert CliRunner().invoke(app, few).exit_code == 0
+    assert run_gsba(*few).exit_code == 0
     monkeypatch.setattr(pipeline, "refine", refine_in_parts)
-    result = CliRunner().invoke(app, few)
+    result = run_gsba(*few)
     assert result.exit_code == 3 and "2 of 3 frames refined (1 in no map)" in result.stdout
     assert result.stderr.splitlines()[-1].endswith("exit code 3; --allow-partial makes it 0")
-    assert CliRunner().invoke(app, [*few, "--allow-partial"]).exit_code == 0
+    assert run_gsba(*few, "--allow-partial").exit_code == 0

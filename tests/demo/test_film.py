@@ -5,9 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from command import run_gsba
 
-from gsba.cli import app
 from gsba.demo.film import FPS, WHOLE_WALK
 from gsba.demo.walk import walk_poses
 from gsba.trajectory.files import read_trajectory
@@ -31,7 +30,7 @@ def test_a_video_is_filmed_and_refined_without_a_trajectory(tmp_path: Path) -> N
     pytest.importorskip("av", reason="PyAV is not installed")
     out = tmp_path / "demo"
     small = ["-q", "demo", "--video", "--frames", "24", "--width", "384", "--out", str(out)]
-    result = CliRunner().invoke(app, small)
+    result = run_gsba(*small)
     assert result.exit_code == 0, result.output
     rows = {line.split()[0]: line.split() for line in result.stdout.splitlines()}
     assert rows["odometry"][1] == "24/24" and float(rows["odometry"][2]) < 0.02
@@ -51,7 +50,7 @@ def test_what_cannot_be_filmed_is_refused_in_one_line(tmp_path: Path) -> None:
         (["--frames", "2"], "2 frames"),
         (["--camera", "nonsense"], "'nonsense'"),
     ):
-        result = CliRunner().invoke(app, ["demo", "--video", "--out", str(out), *options])
+        result = run_gsba("demo", "--video", "--out", out, *options)
         assert result.exit_code == 1 and said in result.stderr
         assert len(result.stderr.splitlines()) == 1
     assert not out.exists()
@@ -61,6 +60,6 @@ def test_without_pyav_a_line_says_what_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "av", None)  # as if it were not installed
-    result = CliRunner().invoke(app, ["demo", "--video", "--out", str(tmp_path / "demo")])
+    result = run_gsba("demo", "--video", "--out", tmp_path / "demo")
     assert result.exit_code == 1 and "pip install 'gsba[video]'" in result.stderr
     assert not (tmp_path / "demo").exists()

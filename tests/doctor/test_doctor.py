@@ -10,9 +10,8 @@ from pathlib import Path
 
 import pytest
 import simplejpeg
-from typer.testing import CliRunner
+from command import run_gsba
 
-from gsba.cli import app
 from gsba.doctor import examination, examine, facts
 from gsba.doctor.machine import look
 from gsba.doctor.packages import debian_package, look_at
@@ -140,7 +139,7 @@ def test_a_process_that_cannot_start_is_no_clean_bill(
 def _examined(monkeypatch: pytest.MonkeyPatch, *wanted: Requirement):
     monkeypatch.setattr(examination, "requirements", lambda: wanted)
     monkeypatch.setattr(examination, "_OWN", Requirement("gsba", "gsba.version", "", NEEDED))
-    return CliRunner().invoke(app, ["doctor"]), CliRunner().invoke(app, ["doctor", "--json"])
+    return run_gsba("doctor"), run_gsba("doctor", "--json")
 
 
 def test_what_a_run_needs_decides_the_exit_code(

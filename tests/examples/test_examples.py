@@ -9,11 +9,12 @@ import cv2
 import gtsam
 import numpy as np
 import pytest
-from one_gallery import gallery, walk_in_gallery
+from one_gallery import gallery
 
 from factors.check import jacobian_errors
 from gsba import RefineSettings
 from gsba.camera.sphere import bearings_from_erp
+from gsba.demo import make_walk
 from gsba.demo.raycast import ranges
 from gsba.similarity import pose_similarity
 from gsba.trajectory.files import read_trajectory
@@ -45,7 +46,7 @@ def _examples_are_modules(monkeypatch: pytest.MonkeyPatch) -> None:
 def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The demo's gallery, with tags on the walls beside the way."""
     folder = tmp_path_factory.mktemp("examples") / "walk"
-    walk_in_gallery(folder, "open", "locked", NUM_FRAMES, WIDTH)
+    make_walk(folder, "open", "locked", NUM_FRAMES, WIDTH)
     truth = read_trajectory(folder / "groundtruth.tum").world_T_rigs
     tags = _hung(truth[2::4])
     for world_T_rig, path in zip(truth, sorted((folder / "images").glob("*.jpg")), strict=True):

@@ -6,14 +6,13 @@ from typing import TYPE_CHECKING
 
 import pycolmap
 import pytest
+from command import run_gsba
 from dask_workers import some_workers
 from export_scene import NUM_FRAMES, panoramas, reconstruction
 from shard_jobs import DiesWriting
 from tiny_run import Case
-from typer.testing import CliRunner
 
 from gsba.camera.cameras import Cameras
-from gsba.cli import app
 from gsba.export import ExportFormat, export_all, formats, images, pictures
 from gsba.log import GsbaError
 from gsba.store.cluster import hired
@@ -88,6 +87,6 @@ def test_a_finished_run_is_exported_by_workers(case: Case, client, tmp_path: Pat
     address = client.scheduler.address
     for out, more in (("here", ()), ("there", ("--cluster", address))):
         arguments = ["export", case.out, "--to", "nerfstudio", "--out", tmp_path / out, *more]
-        assert CliRunner().invoke(app, [*map(str, arguments)]).exit_code == 0
+        assert run_gsba(*arguments).exit_code == 0
     assert _written(tmp_path / "here") == _written(tmp_path / "there")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["here", "there"]

@@ -5,13 +5,7 @@ import pytest
 from synthetic import unit
 
 from factors import tangent_basis
-from factors.sphere_field import (
-    SphereField,
-    degree_of,
-    degrees_of,
-    harmonics,
-    num_harmonics,
-)
+from factors.sphere_field import SphereField, degree_of, degrees_of, harmonics, num_harmonics
 
 RNG = np.random.default_rng(0)
 EDGES = np.vstack([np.eye(3), -np.eye(3), unit(np.array([[1e-9, 1, 0], [0, 1e-9, -1.0]]))])

@@ -32,7 +32,7 @@ class Drawn:
 
 def _draw(rng: np.random.Generator) -> Drawn:
     """A picture of a random lens: off its centre, glowing, in shadow, cut off left and right."""
-    height = int(rng.integers(320, 800))
+    height = int(rng.integers(240, 480))
     width = int(height * rng.choice([1.0, 1.0, 1.03, 0.94]))
     side, dim = min(width, height), rng.choice([1.0, rng.uniform(0.35, 1.0)])
     return Drawn(

@@ -1,6 +1,7 @@
 """GPano tags of stills, and pictures without tags that are no panoramas."""
 
 import struct
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image, PngImagePlugin
 from two_fisheyes import made_pair, picture
+from wave_panorama import wave_panorama
 
 from gsba.frames.files import goes_out_as_it_is, image_header
 from gsba.frames.gpano import Crop, read_tags
@@ -18,21 +20,8 @@ from gsba.log import GsbaError
 from gsba.masks.borders import find_borders, padded
 
 WIDTH, HEIGHT = 1024, 512
+_panorama = partial(wave_panorama, WIDTH)
 ROWS, COLUMNS = slice(64, 448), slice(128, 896)  # 135 x 270 degrees, 2:1 again
-
-
-def _panorama(seed: int = 0) -> np.ndarray:
-    """Colours (512, 1024, 3) uint8 of random waves on the sphere."""
-    rng = np.random.default_rng(seed)
-    latitude = (0.5 - (np.arange(HEIGHT) + 0.5) / HEIGHT)[:, None] * np.pi
-    longitude = (np.arange(WIDTH) + 0.5)[None] / WIDTH * 2 * np.pi
-    flat = np.cos(latitude)
-    rays = np.stack(
-        [flat * np.sin(longitude), np.repeat(np.sin(latitude), WIDTH, 1), flat * np.cos(longitude)],
-        axis=-1,
-    )
-    waves = np.sin(rays @ rng.normal(0, 9, (3, 20)) + rng.uniform(0, 6, 20))
-    return np.clip(128 + 25 * waves @ rng.normal(0, 1, (20, 3)), 20, 255).astype(np.uint8)
 
 
 def _packet(full: tuple[int, int], area: tuple[int, int, int, int], more: str = "") -> bytes:

@@ -8,11 +8,11 @@ import cv2
 import insta360_files as made
 import numpy as np
 import pytest
+from command import run_gsba
 from PIL import Image
 from two_fisheyes import made_pair, picture
-from typer.testing import CliRunner
+from video_files import encode, steady
 
-from gsba.cli import app
 from gsba.frames.scan import scan
 from gsba.inspection import Inspection, inspect
 from gsba.log import GsbaError
@@ -81,17 +81,11 @@ def test_neither_footage_nor_there(tmp_path: Path) -> None:
 
 
 def test_a_video_with_all_that_its_maker_appends(tmp_path: Path) -> None:
-    av = pytest.importorskip("av", reason="PyAV is not installed")
+    pytest.importorskip("av", reason="PyAV is not installed")
     path = tmp_path / "VID_20240101_120000_00_001.insv"
     both = np.concatenate([picture(lens) for lens in made_pair(144)], axis=1)
-    with av.open(str(path), "w", format="mp4") as container:
-        stream = container.add_stream("libx264", rate=30)
-        stream.height, stream.width = both.shape[:2]
-        stream.pix_fmt = "yuv420p"
-        for _ in range(12):
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(both, format="rgb24")))
-        container.mux(stream.encode())
-    path.write_bytes(path.read_bytes() + made.trailer(made.usual_records()))
+    trailer = made.trailer(made.usual_records())
+    encode(path, ([both] * 12, steady(12)), container_format="mp4", trailer=trailer)
     found = inspect(path)
     facts = _facts(found)
     assert facts["camera"] == "Insta360 OneR, firmware v2.0.0"
@@ -106,11 +100,11 @@ def test_a_video_with_all_that_its_maker_appends(tmp_path: Path) -> None:
 
 def test_the_command_prints_text_or_json(tmp_path: Path) -> None:
     folder = _panoramas(tmp_path / "tour")
-    shown = CliRunner().invoke(app, ["--quiet", "info", str(folder)])
+    shown = run_gsba("--quiet", "info", folder)
     assert shown.exit_code == 0 and f"gsba refine {folder}" in shown.stdout
-    tables = json.loads(CliRunner().invoke(app, ["info", "--json", str(folder)]).stdout)
+    tables = json.loads(run_gsba("info", "--json", folder).stdout)
     assert tables[0]["facts"]["camera"] == "GoPro GoPro Max"
-    nowhere = CliRunner().invoke(app, ["info", str(tmp_path / "nowhere")])
+    nowhere = run_gsba("info", tmp_path / "nowhere")
     assert nowhere.exit_code == 1 and "no such file" in nowhere.stderr
 
 

@@ -8,12 +8,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from command import run_gsba
 from one_gallery import gallery
 from tiny_run import NUM_FRAMES, WIDTH, Case
-from typer.testing import CliRunner
 
 from gsba import GsbaError, Localizer
-from gsba.cli import app
 from gsba.demo.render import render_erp
 from gsba.demo.walk import walk_poses
 from gsba.localization import LocalizedFrame
@@ -76,9 +75,7 @@ def test_the_run_stays_as_it_is_to_the_byte(
 ) -> None:
     run = case.copy(tmp_path / "run")
     before = _contents(run)
-    result = CliRunner().invoke(
-        app, ["localize", str(run), str(new[0]), "--out", str(tmp_path / "out")]
-    )
+    result = run_gsba("localize", run, new[0], "--out", tmp_path / "out")
     assert result.exit_code == 0, result.output
     assert "3 of 3 pictures localised" in result.output
     assert _contents(run) == before
@@ -100,12 +97,12 @@ def test_a_picture_from_elsewhere_is_refused_in_one_line(case: Case, tmp_path: P
     cv2.imwrite(str(folder / "noise.png"), noise)
     (folder / "torn.jpg").write_bytes(b"\xff\xd8\xff\xe0 torn")
     call = ["localize", str(case.copy(tmp_path / "run")), str(folder), "--out", str(tmp_path / "o")]
-    result = CliRunner().invoke(app, call)
+    result = run_gsba(*call)
     assert result.exit_code == 3
     assert "noise: not localised: no place of the map looks like it" in result.output
     assert "torn: not localised: " in result.output
     assert (tmp_path / "o/trajectory.tum").read_text() == ""
-    assert CliRunner().invoke(app, [*call, "--allow-partial"]).exit_code == 0
+    assert run_gsba(*call, "--allow-partial").exit_code == 0
 
 
 def test_a_run_of_another_version_is_refused(case: Case, tmp_path: Path) -> None:
@@ -119,10 +116,10 @@ def test_a_run_of_another_version_is_refused(case: Case, tmp_path: Path) -> None
 def test_no_run_and_an_output_folder_within_the_run_are_refused(
     case: Case, tmp_path: Path, new: tuple[Path, Trajectory]
 ) -> None:
-    result = CliRunner().invoke(app, ["localize", str(tmp_path), str(new[0])])
+    result = run_gsba("localize", tmp_path, new[0])
     assert result.exit_code == 1 and "is not a gsba run" in result.output
     inside = ["localize", str(case.out), str(new[0]), "--out", str(case.out / "poses")]
-    result = CliRunner().invoke(app, inside)
+    result = run_gsba(*inside)
     assert result.exit_code == 1 and "stays as it is" in result.output
 
 

@@ -7,21 +7,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from cameras_home import (
-    NUM,
-    SMALL,
-    WIDTH,
-    Home,
-    faces,
-    fisheyes,
-    panoramas,
-    read,
-    settings_with,
-)
-from typer.testing import CliRunner
+from cameras_home import NUM, SMALL, WIDTH, Home, faces, fisheyes, panoramas, read
+from command import run_gsba
 
-from gsba import GsbaError, Localizer, refine_recordings
-from gsba.cli import app
+from gsba import GsbaError, Localizer
 from gsba.store.finished import load_run
 
 
@@ -64,34 +53,27 @@ def test_a_size_of_no_camera_is_refused_unless_the_camera_is_named(
     ):
         Localizer(sizes).localize(small)
     call = ["localize", str(sizes), str(small), "--out", str(tmp_path / "out")]
-    assert "small: not localised: " in CliRunner().invoke(app, call).output
-    named = CliRunner().invoke(app, [*call, "--camera-of", f"stitched0at{WIDTH}"])
+    assert "small: not localised: " in run_gsba(*call).output
+    named = run_gsba(*call, "--camera-of", f"stitched0at{WIDTH}")
     assert named.exit_code == 0, named.output
     (told,) = json.loads((tmp_path / "out/localized.json").read_text())["pictures"]
     assert _distance(sizes, 4, np.array(told["world_T_picture"])) < 0.02
-    missing = CliRunner().invoke(app, [*call, "--camera-of", "attic"])
+    missing = run_gsba(*call, "--camera-of", "attic")
     assert missing.exit_code == 1 and "has no recording 'attic' in this map" in missing.output
 
 
-def test_raw_fisheyes_and_faces_are_localised_beside_panoramas(home: Home, tmp_path: Path) -> None:
-    out = tmp_path / "run"
-    raw, cube = fisheyes(home), faces(home)
-    recordings = [panoramas(home, 0, WIDTH), raw, cube]
-    refine_recordings(recordings, out, settings_with(export={"formats": ()}))
-    new = tmp_path / "new"
-    for source, parts in ((raw, ("front", "back")), (cube, ("front", "left", "up"))):
-        folder = new / Path(source.frames).name
-        for name in (
-            parts if source is raw else [p.name for p in Path(cube.frames).iterdir() if p.is_dir()]
-        ):
-            (folder / name).mkdir(parents=True)
-            for frame in (3, 6):
-                file = f"{frame:06d}.png"
-                shutil.copy(Path(source.frames) / name / file, folder / name / file)
-    for folder, first in ((new / "raw", NUM), (new / "faces", 2 * NUM)):
-        call = ["localize", str(out), str(folder), "--out", str(tmp_path / folder.name)]
-        result = CliRunner().invoke(app, call)
-        assert result.exit_code == 0, result.output
-        told = json.loads((tmp_path / folder.name / "localized.json").read_text())["pictures"]
-        for frame, one in zip((3, 6), told, strict=True):
-            assert _distance(out, first + frame, np.array(one["world_T_picture"])) < 0.02
+@pytest.mark.parametrize("kind", ["fisheyes", "faces"])
+def test_raw_fisheyes_and_faces_are_localised_beside_panoramas(
+    kind: str, home: Home, request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    out = Path(shutil.copytree(request.getfixturevalue(f"{kind}_run"), tmp_path / "run"))
+    source = Path((fisheyes if kind == "fisheyes" else faces)(home).frames)
+    for path in source.glob("*/00000[36].png"):
+        (tmp_path / "new" / path.parent.name).mkdir(parents=True, exist_ok=True)
+        shutil.copy(path, tmp_path / "new" / path.parent.name)
+    call = ["localize", str(out), str(tmp_path / "new"), "--out", str(tmp_path / "found")]
+    result = run_gsba(*call)
+    assert result.exit_code == 0, result.output
+    told = json.loads((tmp_path / "found/localized.json").read_text())["pictures"]
+    for frame, one in zip((3, 6), told, strict=True):
+        assert _distance(out, NUM + frame, np.array(one["world_T_picture"])) < 0.02

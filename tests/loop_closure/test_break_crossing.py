@@ -8,12 +8,7 @@ from scipy.spatial.transform import Rotation
 from two_maps import HALF, MOVE, NUM, SCALE, TRUTH, scene, torn
 
 from gsba.geometry import inverse
-from gsba.loop_closure.break_crossing import (
-    MIN_AGREEING,
-    Breaks,
-    agreed,
-    crossing,
-)
+from gsba.loop_closure.break_crossing import MIN_AGREEING, Breaks, agreed, crossing
 from gsba.loop_closure.map_similarity import Proposal
 from gsba.matching import recovery
 from gsba.similarity import Sim3

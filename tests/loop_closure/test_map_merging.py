@@ -154,7 +154,7 @@ def test_a_join_a_bay_off_is_left_for_one_at_the_usual_pace(
     held: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Pairs over the break agree on a step that leads back; a trajectory would know better."""
-    context, whole, late = scene()
+    context, whole, late = scene(shown=np.full(NUM, 0.4))
     parts, true = torn(whole, late, SCALE, MOVE), Sim3.of(SCALE, MOVE).inverse()
     step = TRUTH[HALF, :3, 3] - TRUTH[HALF - 1, :3, 3]
     bay_off = replace(true, translation=true.translation - 1.4 * step)

@@ -2,19 +2,19 @@
 
 import dataclasses
 import json
+from functools import cache
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from command import run_gsba
 from scipy.spatial.transform import Rotation
 from tiny_run import SETTINGS, Case, computed_stages
 from two_fisheyes import colours, made_pair, picture, write
-from typer.testing import CliRunner
 
 from gsba import refine
 from gsba.camera.sphere import bearings_from_erp, erp_from_bearings
-from gsba.cli import app
 from gsba.disk import write_image
 from gsba.frames.scan import find_panoramas
 from gsba.log import GsbaError
@@ -40,15 +40,12 @@ def _rays() -> np.ndarray:
     return bearings_from_erp(grid, WIDTH, HEIGHT)
 
 
-def _walk(folder: Path, look: np.ndarray | None, plain_floor: bool = False, speed: float = 0.25):
-    """Panoramas inside a textured box that the camera walks through, `look` pasted in front.
-
-    Exposure breathes by 6%, and there is noise.
-    """
-    rng = np.random.default_rng(0)
-    noise = cv2.GaussianBlur(rng.normal(size=(256, 256, 3)), (0, 0), 2.5)
+@cache
+def _box(plain_floor: bool, speed: float) -> list[np.ndarray]:
+    """What a camera sees that walks through a textured box, (H, W, 3) float each."""
+    noise = cv2.GaussianBlur(np.random.default_rng(0).normal(size=(256, 256, 3)), (0, 0), 2.5)
     texture = np.clip(128 + 45 * noise / noise.std(), 0, 255).astype(np.float32)
-    rays, mask = _rays(), _outline()
+    rays, images = _rays(), []
     for f in range(NUM):
         centre = np.array([speed * f - 1.7, 0.1 * np.sin(f), 0.3 * np.cos(f)])
         walls = np.array([4.0, 1.6, 3.0])
@@ -57,13 +54,20 @@ def _walk(folder: Path, look: np.ndarray | None, plain_floor: bool = False, spee
         hit = centre + np.min(steps, axis=-1)[..., None] * rays
         across = np.take_along_axis(hit, np.stack([(axis + 1) % 3, (axis + 2) % 3], -1), axis=-1)
         at = (across * 40 + 1000 + 70 * axis[..., None]).astype(np.float32) % 255
-        image = cv2.remap(texture, at[..., 0], at[..., 1], cv2.INTER_LINEAR)
+        images.append(cv2.remap(texture, at[..., 0], at[..., 1], cv2.INTER_LINEAR))
         if plain_floor:
-            image[(axis == 1) & (rays[..., 1] > 0)] = (150, 140, 130)
-        image *= 1 + 0.06 * np.sin(1.7 * f)
+            images[-1][(axis == 1) & (rays[..., 1] > 0)] = (150, 140, 130)
+    return images
+
+
+def _walk(folder: Path, look: np.ndarray | None, plain_floor: bool = False, speed: float = 0.25):
+    """Panoramas inside the box, `look` pasted in front; exposure breathes by 6%, with noise."""
+    rng, mask = np.random.default_rng(0), _outline()
+    for f, seen in enumerate(_box(plain_floor, speed)):
+        image = seen.copy()
         if look is not None:
-            image[mask] = look[mask] * (1 + 0.06 * np.sin(1.7 * f))
-        image += rng.normal(0, 2, image.shape)
+            image[mask] = look[mask]
+        image = image * (1 + 0.06 * np.sin(1.7 * f)) + rng.normal(0, 2, image.shape)
         write_image(folder / f"{f:03d}.png", np.clip(image, 0, 255).astype(np.uint8))
     return find_panoramas(folder)
 
@@ -201,7 +205,7 @@ def test_command_writes_what_can_be_looked_at(tmp_path: Path) -> None:
     own[:40] = 0
     cv2.imwrite(str(tmp_path / "own.png"), own)
     arguments = ["mask", frames.paths[0][0].parent, "--out", tmp_path / "m"]
-    result = CliRunner().invoke(app, [*map(str, arguments), "--masks", str(tmp_path / "own.png")])
+    result = run_gsba(*arguments, "--masks", tmp_path / "own.png")
     assert result.exit_code == 0 and "% of the image" in result.stdout
     found = cv2.imread(str(tmp_path / "m/carrier.png"), cv2.IMREAD_UNCHANGED)
     assert set(np.unique(found)) == {0, 255} and _overlap(found == 0, _outline()) >= 0.9
@@ -209,7 +213,7 @@ def test_command_writes_what_can_be_looked_at(tmp_path: Path) -> None:
     merged = find_panoramas(frames.paths[0][0].parent, tmp_path / "m/merged")
     both = cv2.imread(str(merged.mask_paths[3]), cv2.IMREAD_UNCHANGED)
     np.testing.assert_array_equal(both > 0, (found > 0) & (own > 0))
-    bad = CliRunner().invoke(app, ["mask", str(tmp_path / "nowhere"), "--out", str(tmp_path / "n")])
+    bad = run_gsba("mask", tmp_path / "nowhere", "--out", tmp_path / "n")
     assert bad.exit_code == 1 and "no such file or folder" in bad.stderr
 
 
@@ -270,7 +274,7 @@ def test_raw_pairs_are_taken(tmp_path: Path) -> None:
 
             write(tmp_path / "raw" / name / f"{f}.png", picture(lens, seen))
     arguments = ["mask", str(tmp_path / "raw"), "--out", str(tmp_path / "m")]
-    result = CliRunner().invoke(app, arguments)
+    result = run_gsba(*arguments)
     assert result.exit_code == 0, result.stderr
     found = cv2.imread(str(tmp_path / "m/carrier.png"), cv2.IMREAD_UNCHANGED) == 0
     height, width = found.shape

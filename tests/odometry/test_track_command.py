@@ -7,19 +7,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from command import run_gsba
 from dense_walk import RenderedWalk
-from typer.testing import CliRunner, Result
 
-from gsba.cli import app
 from gsba.evaluate.trajectory import evaluate
 from gsba.trajectory.files import read_trajectory
 from gsba.types import Trajectory
 
 FPS = 10
-
-
-def _run(*arguments: object) -> Result:
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +52,7 @@ def test_every_frame_gets_a_pose(
 ) -> None:
     frames, out = request.getfixturevalue(source), tmp_path / "walk.tum"
     times = ["--fps", FPS] if source == "folder" else []
-    result = _run("track", frames, "--out", out, "--masks", "none", *times)
+    result = run_gsba("track", frames, "--out", out, "--masks", "none", *times)
     assert result.exit_code == 0, result.output
     assert f"{len(walk.frames)} of {len(walk.frames)} frames posed" in result.output
     assert len(read_trajectory(out).timestamps) == len(walk.frames)
@@ -77,7 +72,7 @@ def test_every_frame_gets_a_pose(
 def test_a_mask_is_used_and_a_false_one_refused(folder: Path, tmp_path: Path) -> None:
     square = tmp_path / "square.png"
     cv2.imwrite(str(square), np.full((64, 64), 255, np.uint8))
-    result = _run("track", folder, "--fps", FPS, "--out", tmp_path / "w.tum", "--masks", square)
+    result = run_gsba("track", folder, "--fps", FPS, "--out", tmp_path / "w.tum", "--masks", square)
     assert result.exit_code == 1 and "a mask is 2:1" in result.output
     assert not (tmp_path / "w.tum").exists()
 
@@ -90,7 +85,7 @@ def test_what_is_no_input_is_refused_in_one_line(folder: Path, video: Path, tmp_
         ((video, "--out", out, "--fps", 3), "holds the times of its frames"),
         ((video, "--out", out, "--width", 801), "width"),
     ):
-        result = _run("track", *arguments)
+        result = run_gsba("track", *arguments)
         assert result.exit_code == 1 and said in result.output
         assert len(result.output.strip().splitlines()) == 1
     assert not out.exists()
@@ -98,13 +93,13 @@ def test_what_is_no_input_is_refused_in_one_line(folder: Path, video: Path, tmp_
 
 def test_frames_are_extracted_by_what_they_show(video: Path, tmp_path: Path) -> None:
     frames = tmp_path / "frames"
-    result = _run("extract", video, "--every", "auto", "--out", frames)
+    result = run_gsba("extract", video, "--every", "auto", "--out", frames)
     assert result.exit_code == 0, result.output
     chosen = read_trajectory(tmp_path / "frames.tum")
     names = sorted(path.name for path in frames.glob("*.jpg"))
     assert 3 < len(names) == len(chosen.timestamps) < 34
     assert [f"{round(t * FPS):06d}.jpg" for t in chosen.timestamps] == names
-    again = _run("extract", video, "--every", "auto", "--out", frames)
+    again = run_gsba("extract", video, "--every", "auto", "--out", frames)
     assert again.exit_code == 0 and f"{len(names)} of" in again.output
 
 
@@ -113,7 +108,7 @@ def test_a_video_is_refined_from_its_own_odometry(
 ) -> None:
     out = tmp_path / "run"
     light = ["--set", "patches.rounds=0", "--set", "features.max_per_face=300"]
-    result = _run("refine", video, "--masks", "none", "--out", out, *light)
+    result = run_gsba("refine", video, "--masks", "none", "--out", out, *light)
     assert result.exit_code == 0, result.output
     assert (out / "odometry/walk.tum").is_file() and (out / "odometry/poses.csv").is_file()
     assert "Camera path by the odometry on the video" in (out / "report.html").read_text()
@@ -121,5 +116,5 @@ def test_a_video_is_refined_from_its_own_odometry(
     chosen = read_trajectory(out / "odometry/chosen.tum")
     assert len(list((out / "frames").glob("*.jpg"))) == len(chosen.timestamps)
     assert _ate(out / "trajectory.tum", walk) < 0.005
-    again = _run("refine", video, "--masks", "none", "--out", out, *light)
+    again = run_gsba("refine", video, "--masks", "none", "--out", out, *light)
     assert again.exit_code == 0 and again.output.splitlines()[-1] == result.output.splitlines()[-1]

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from export_scene import panoramas, reconstruction
+from video_files import encode, steady
 
 from gsba.bundle.map_strength import MapStrength
 from gsba.config import OdometrySettings, RefineSettings, VideoSettings
@@ -75,16 +76,11 @@ def test_the_sharpest_of_the_middle_of_a_weak_step_is_fetched() -> None:
 
 @pytest.fixture
 def video(tmp_path: Path) -> Path:
-    av = pytest.importorskip("av", reason="PyAV is not installed")
-    path, rng = tmp_path / "walk.mp4", np.random.default_rng(0)
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=FPS)
-        stream.height, stream.width, stream.pix_fmt = 64, 128, "yuv420p"
-        for _ in range(NUM_VIDEO):
-            image = cv2.resize(rng.integers(60, 200, (8, 16, 3), np.uint8), (128, 64))
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, "bgr24")))
-        container.mux(stream.encode())
-    return path
+    pytest.importorskip("av", reason="PyAV is not installed")
+    rng = np.random.default_rng(0)
+    coarse = [rng.integers(60, 200, (8, 16, 3), np.uint8) for _ in range(NUM_VIDEO)]
+    pictures = [cv2.resize(picture, (128, 64)) for picture in coarse]
+    return encode(tmp_path / "walk.mp4", (pictures, steady(NUM_VIDEO, 90_000 // FPS)))
 
 
 def test_frames_are_fetched_until_the_map_is_strong(video: Path, tmp_path: Path) -> None:

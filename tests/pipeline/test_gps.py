@@ -5,17 +5,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny_run import SETTINGS, Case, computed_stages
-from typer.testing import CliRunner
+from command import run_gsba
+from tiny_run import PLAIN, Case, computed_stages
 from walk_on_earth import geodetic_of
 
-from gsba.cli import app
 from gsba.config import RefineSettings
 from gsba.evaluate.trajectory import evaluate
 from gsba.log import GsbaError
 from gsba.trajectory.files import read_trajectory
-
-PLAIN = SETTINGS.model_copy(update={"patches": SETTINGS.patches.model_copy(update={"rounds": 0})})
 
 
 def _with_gps(file: Path, **options: float) -> RefineSettings:
@@ -44,14 +41,6 @@ def _table(
     return path
 
 
-@pytest.fixture(scope="module")
-def without(case: Case, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The run without fixes."""
-    out = tmp_path_factory.mktemp("without") / "run"
-    case.refine(out, PLAIN)
-    return out
-
-
 def _apart(one: Path, other: Path) -> float:
     """RMS of the positions of two runs, once aligned, over the extent of the walk."""
     first, second = (read_trajectory(out / "trajectory.tum") for out in (one, other))
@@ -59,7 +48,7 @@ def _apart(one: Path, other: Path) -> float:
     return evaluate(first, second).ate.rmse / extent
 
 
-def test_fixes_hold_a_run_and_are_reported(case: Case, without: Path, tmp_path: Path) -> None:
+def test_fixes_hold_a_run_and_are_reported(case: Case, plain_run: Path, tmp_path: Path) -> None:
     table, out = _table(tmp_path / "gps.csv", case, 30.0), tmp_path / "run"
     result = case.refine(out, _with_gps(table))
     said = json.loads((out / "report.json").read_text())["gps"]
@@ -67,14 +56,14 @@ def test_fixes_hold_a_run_and_are_reported(case: Case, without: Path, tmp_path: 
     assert said["false_fixes"] == [] and said["residual_m"]["most"] < 10
     assert any(note.startswith("GPS held 8 of 8 frames") for note in result.report["notes"])
     # Images know this walk far better: fixes leave it as it is, in the trajectory's world.
-    assert _apart(out, without) < 1e-4
-    assert case.errors(out).scale == pytest.approx(case.errors(without).scale, rel=1e-3)
+    assert _apart(out, plain_run) < 1e-4
+    assert case.errors(out).scale == pytest.approx(case.errors(plain_run).scale, rel=1e-3)
     claims = []
     late = _table(tmp_path / "late.csv", case, 30.0, shift_s=1000.0)
     for file, more in ((table, ()), (late, ("--gps-sigma", "0.3", "--gps-offset", "-1000"))):
         folder = tmp_path / f"export{len(more)}"
         command = ["export", out, "--to", "tum", "--out", folder, "--gps", file, *more]
-        done = CliRunner().invoke(app, [str(part) for part in command])
+        done = run_gsba(*command)
         assert done.exit_code == 0, done.stderr
         said = json.loads((folder / "transform.json").read_text())
         assert (said["unit"], said["up"]) == ("m", "z")
@@ -94,12 +83,12 @@ def test_the_command_takes_gps_as_a_family(case: Case, tmp_path: Path) -> None:
         ("exif", "--gps exif: 0 of 8 frames have GPS tags"),
     ):
         command = ["refine", case.frames, case.slam, "--out", tmp_path / "run", "--gps", source]
-        done = CliRunner().invoke(app, [str(part) for part in command])
+        done = run_gsba(*command)
         assert done.exit_code == 1 and message in done.stderr, done.stderr
         assert len(done.stderr.splitlines()) == 1
 
 
-def test_positions_elsewhere_have_no_say(case: Case, without: Path, tmp_path: Path) -> None:
+def test_positions_elsewhere_have_no_say(case: Case, plain_run: Path, tmp_path: Path) -> None:
     table = tmp_path / "gps.csv"
     rng = np.random.default_rng(3)
     rows = [
@@ -115,18 +104,18 @@ def test_positions_elsewhere_have_no_say(case: Case, without: Path, tmp_path: Pa
     report = case.refine(out, _with_gps(table)).report
     assert not report["gps"]["taken"]
     assert any(note.startswith("GPS was not used") for note in report["notes"])
-    assert _apart(out, without) < 1e-4
+    assert _apart(out, plain_run) < 1e-4
 
 
 def test_fixes_that_images_contradict_are_left_out(
-    case: Case, without: Path, tmp_path: Path
+    case: Case, plain_run: Path, tmp_path: Path
 ) -> None:
     """Precise by their claim, but stretched: they would bend the map."""
     table, out = _table(tmp_path / "gps.csv", case, 300.0, stretch=1.1), tmp_path / "run"
     report = case.refine(out, _with_gps(table, sigma_m=0.05, sigma_up_m=0.05)).report
     assert report["gps"] | {"taken": False, "contradicted": True} == report["gps"]
     assert any("would bend the map" in note for note in report["notes"])
-    assert _apart(out, without) < 1e-3
+    assert _apart(out, plain_run) < 1e-3
 
 
 def test_settings_name_both_or_none() -> None:

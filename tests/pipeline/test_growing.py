@@ -6,23 +6,17 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 from accuracy import assert_as_accurate
-from growing_home import MAX_ERROR, NUM, GrowingHome, make_growing_home, settings
-from typer.testing import CliRunner, Result
+from command import run_gsba
+from growing_home import MAX_ERROR, NUM, SMALL_EXPORTS, GrowingHome
+from typer.testing import Result
+from waiting import until
 
-from gsba import (
-    add_recordings,
-    load_run,
-    merge_runs,
-    refine,
-)
-from gsba.cli import app
-from gsba.demo import DemoWalk
+from gsba import add_recordings, load_run, merge_runs, refine
 from gsba.disk import hold_folder
 from gsba.export import ExportFormat
 from gsba.localization import Localizer
@@ -33,8 +27,8 @@ from gsba.view import load_scene
 
 
 @pytest.fixture(scope="module")
-def home(oval: DemoWalk, tmp_path_factory: pytest.TempPathFactory) -> GrowingHome:
-    return make_growing_home(tmp_path_factory.mktemp("home"), oval)
+def home(growing_home: GrowingHome) -> GrowingHome:
+    return growing_home
 
 
 @pytest.fixture(scope="module")
@@ -42,15 +36,15 @@ def grown(home: GrowingHome, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The second recording added from the command line, the finished run left as it is."""
     out = tmp_path_factory.mktemp("grown") / "run"
     before = _content(home.run)
-    result = _add(home.run, home.second, home.second_trajectory, "--out", out)
+    result = _gsba("add", home.run, home.folders[1], home.trajectories[1], "--out", out)
     assert result.exit_code == 0, result.output
     assert "20 of 20 frames refined" in result.output
     assert _content(home.run) == before
     return out
 
 
-def _add(*arguments: object) -> Result:
-    return CliRunner().invoke(app, ["--quiet", "add", *map(str, arguments)])
+def _gsba(*arguments: object) -> Result:
+    return run_gsba("--quiet", *arguments)
 
 
 def _content(folder: Path) -> dict[str, tuple[int, bytes]]:
@@ -104,7 +98,7 @@ def test_report_exports_and_viewer_tell_recordings_apart(grown: Path) -> None:
 
 
 def test_pictures_are_localised_in_a_grown_run(grown: Path, home: GrowingHome) -> None:
-    found = Localizer(grown).localize(home.second / "000003.jpg")
+    found = Localizer(grown).localize(home.folders[1] / "000003.jpg")
     assert found.found
     pose = load_run(grown)[0].world_T_rigs[NUM + 3]
     assert np.linalg.norm(found.world_T_rig[:3, 3] - pose[:3, 3]) < 0.02
@@ -125,7 +119,14 @@ def test_fixed_poses_stay_to_the_byte(home: GrowingHome, tmp_path: Path) -> None
 
 def test_a_recording_of_another_place_is_refused(home: GrowingHome, tmp_path: Path) -> None:
     before, out = _content(home.run), tmp_path / "run"
-    result = _add(home.run, home.elsewhere, home.elsewhere_trajectory, "--out", out)
+    result = _gsba(
+        "add",
+        home.run,
+        home.elsewhere,
+        home.elsewhere_trajectory,
+        "--out",
+        out,
+    )
     assert result.exit_code == 1 and not out.exists()
     assert "recording 'elsewhere' does not meet the map of" in result.output
     assert _content(home.run) == before and not list(tmp_path.iterdir())
@@ -138,46 +139,51 @@ def test_refusals_are_one_line_and_leave_the_run(home: GrowingHome, tmp_path: Pa
     older = Path(shutil.copytree(home.run, tmp_path / "older"))
     marker = json.loads((older / "gsba.json").read_text())
     (older / "gsba.json").write_text(json.dumps(marker | {"gsba": "0.0.1"}))
-    copied = shutil.copytree(home.first, tmp_path / "copied")
+    copied = shutil.copytree(home.folders[0], tmp_path / "copied")
     cases = [
         ([home.run], "give the RECORDING to add"),
         ([home.run, copied], "hold the same pictures"),
-        ([home.first, home.second], "is not a gsba run"),
-        ([unfinished, home.second], "is not finished"),
-        ([older, home.second], "is a run of gsba 0.0.1"),
-        ([home.run, home.first], "has recording"),
-        ([home.run, "--recording", f"{home.second},name=ground"], "named 'ground'"),
-        ([home.run, home.second, "--out", home.first], "exists: choose another --out"),
-        ([home.run, home.second, tmp_path / "missing.tum"], "missing.tum"),
+        ([home.folders[0], home.folders[1]], "is not a gsba run"),
+        ([unfinished, home.folders[1]], "is not finished"),
+        ([older, home.folders[1]], "is a run of gsba 0.0.1"),
+        ([home.run, home.folders[0]], "has recording"),
+        (
+            [home.run, "--recording", f"{home.folders[1]},name=ground"],
+            "named 'ground'",
+        ),
+        (
+            [home.run, home.folders[1], "--out", home.folders[0]],
+            "exists: choose another --out",
+        ),
+        ([home.run, home.folders[1], tmp_path / "missing.tum"], "missing.tum"),
     ]
     for arguments, told in cases:
-        result = _add(*arguments)
+        result = _gsba("add", *arguments)
         assert result.exit_code == 1, arguments
         assert told in result.output and len(result.output.strip().splitlines()) == 1, told
     lock = hold_folder(home.run)
     try:
-        assert "in use by another gsba process" in _add(home.run, home.second).output
+        assert "in use by another gsba process" in _gsba("add", home.run, home.folders[1]).output
     finally:
         os.close(lock)
     assert _content(home.run) == before
 
 
-@pytest.mark.parametrize("stage", ["new/stages/features", "stages/registered.npz"])
 def test_a_killed_call_leaves_the_run_and_goes_on(
-    stage: str, home: GrowingHome, grown: Path, tmp_path: Path
+    home: GrowingHome, grown: Path, tmp_path: Path
 ) -> None:
+    """Killed while features are extracted, and again once the recording is registered."""
     run = Path(shutil.copytree(home.run, tmp_path / "run"))
     before, work = _content(run), tmp_path / ".run.growing"
-    words = ["add", str(run), str(home.second), str(home.second_trajectory)]
+    words = ["add", str(run), str(home.folders[1]), str(home.trajectories[1])]
     command = [sys.executable, "-c", "from gsba.cli import main; main()", *words]
-    process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
-    deadline = time.monotonic() + 120
-    while not (work / stage).exists() and process.poll() is None and time.monotonic() < deadline:
-        time.sleep(0.02)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    assert _content(run) == before
-    result = CliRunner().invoke(app, words)
+    for stage in ("new/stages/features", "stages/registered.npz"):
+        process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+        until((work / stage).exists, 120)
+        process.send_signal(signal.SIGKILL)
+        assert process.wait() == -signal.SIGKILL
+        assert _content(run) == before
+    result = run_gsba(*words)
     assert result.exit_code == 0, result.output
     again = (run / "trajectory.tum").read_bytes()
     assert again == (grown / "trajectory.tum").read_bytes()
@@ -191,19 +197,15 @@ def test_a_killed_call_leaves_the_run_and_goes_on(
 def second_run(home: GrowingHome, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run of the second recording alone."""
     out = tmp_path_factory.mktemp("second") / "run"
-    refine(home.second, home.second_trajectory, out, settings())
+    refine(home.folders[1], home.trajectories[1], out, SMALL_EXPORTS)
     return out
-
-
-def _invoke(*arguments: object) -> Result:
-    return CliRunner().invoke(app, ["--quiet", *map(str, arguments)])
 
 
 def test_merged_runs_are_as_good_as_a_grown_one(
     home: GrowingHome, second_run: Path, tmp_path: Path
 ) -> None:
     before, out = _content(home.run) | _content(second_run), tmp_path / "run"
-    result = _invoke("merge", home.run, second_run, "--out", out)
+    result = _gsba("merge", home.run, second_run, "--out", out)
     assert result.exit_code == 0, result.output
     assert home.error(out) < MAX_ERROR  # its ratio to that of `grown` scatters by a fifth
     assert _content(home.run) | _content(second_run) == before
@@ -239,9 +241,9 @@ def test_rigid_merging_keeps_both_maps_and_tells_how_sure_it_is(
 
 def test_runs_that_meet_nowhere_are_not_merged(home: GrowingHome, tmp_path: Path) -> None:
     other = tmp_path / "other"
-    refine(home.elsewhere, home.elsewhere_trajectory, other, settings())
+    refine(home.elsewhere, home.elsewhere_trajectory, other, SMALL_EXPORTS)
     before, out = _content(home.run), tmp_path / "run"
-    result = _invoke("merge", home.run, other, "--out", out)
+    result = _gsba("merge", home.run, other, "--out", out)
     assert result.exit_code == 1 and not out.exists()
     assert "meet nowhere" in result.output
     assert _content(home.run) == before and list(tmp_path.iterdir()) == [other]
@@ -249,7 +251,7 @@ def test_runs_that_meet_nowhere_are_not_merged(home: GrowingHome, tmp_path: Path
 
 def test_a_recording_is_taken_out_again(grown: Path, home: GrowingHome, tmp_path: Path) -> None:
     run = Path(shutil.copytree(grown, tmp_path / "run"))
-    result = _invoke("remove", run, "upper")
+    result = _gsba("remove", run, "upper")
     assert result.exit_code == 0, result.output
     reconstruction, frames = load_run(run)
     assert list(frames.recordings) == ["ground"] and len(frames) == NUM
@@ -276,7 +278,7 @@ def test_merge_and_remove_refuse_in_one_line(
         (["remove", home.run, "ground"], "has no other recording"),
     ]
     for arguments, told in cases:
-        result = _invoke(*arguments)
+        result = _gsba(*arguments)
         assert result.exit_code == 1, arguments
         assert told in result.output and len(result.output.strip().splitlines()) == 1, told
     assert not (tmp_path / "out").exists()

@@ -19,18 +19,12 @@ from cameras_home import (
     fisheyes,
     panoramas,
 )
-from typer.testing import CliRunner
+from command import run_gsba
+from tiny_run import settings_with
 
 from factors.sphere_field import SphereField, num_harmonics
-from gsba import (
-    Localizer,
-    add_recordings,
-    load_run,
-    merge_runs,
-    remove_recordings,
-)
+from gsba import Localizer, add_recordings, load_run, merge_runs, remove_recordings
 from gsba.bundle.stitching import Stitching
-from gsba.cli import app
 from gsba.frames.scan import scan
 from gsba.log import GsbaError
 from gsba.pipeline.finished_run import FinishedRun
@@ -44,14 +38,11 @@ def home(cameras_home: Home) -> Home:
     return cameras_home
 
 
-SETTINGS = SMALL_EXPORT
-
-
 @pytest.fixture(scope="module")
 def single(home: Home) -> Path:
     """A run of the first recording, of one camera."""
     out = home.folder / "single"
-    refine_each([panoramas(home, 0, WIDTH)], out, SETTINGS)
+    refine_each([panoramas(home, 0, WIDTH)], out, SMALL_EXPORT)
     return out
 
 
@@ -72,7 +63,7 @@ def grown(single: Path, home: Home) -> Path:
     """The second recording added to the first one's run from the command line."""
     out, small = home.folder / "grown", panoramas(home, 1, SMALL)
     words = ["add", str(single), str(small.frames), str(small.trajectory), "--out", str(out)]
-    result = CliRunner().invoke(app, ["--quiet", *words])
+    result = run_gsba("--quiet", *words)
     assert result.exit_code == 0, result.output
     return out
 
@@ -113,7 +104,7 @@ def test_fixed_poses_of_a_run_of_several_cameras_stay(
 def raw(home: Home) -> Path:
     """A run of the second recording as raw fisheyes."""
     out = home.folder / "raw_run"
-    refine_each([fisheyes(home)], out, SETTINGS)
+    refine_each([fisheyes(home)], out, SMALL_EXPORT)
     return out
 
 
@@ -155,7 +146,7 @@ def test_a_camera_goes_with_its_recordings(
     alone = single
     if not gone:
         alone = tmp_path / "alone"
-        refine_each([panoramas(home, 1, SMALL)], alone, SETTINGS)
+        refine_each([panoramas(home, 1, SMALL)], alone, SMALL_EXPORT)
     assert_as_accurate(out, error_of(out, home), alone, 1.25)
     # The remaining run grows again: its features were extracted beside those of another camera.
     again = tmp_path / "again"
@@ -182,11 +173,9 @@ def test_recordings_of_two_models_have_two_cameras(home: Home, tmp_path: Path) -
     first, second = (
         beginning(panoramas(home, n, WIDTH), num, tmp_path / f"recording{n}") for n in range(2)
     )
-    named = SETTINGS.camera.model_copy(update={"name": "insta360-x3"})
-    settings = SETTINGS.model_copy(update={"camera": named})
-    refine_each([first], run, settings)
+    refine_each([first], run, settings_with(camera={"name": "insta360-x3"}))
     call = f"{second.frames},trajectory={second.trajectory},camera=gopro-max"
-    result = CliRunner().invoke(app, ["--quiet", "add", str(run), "--recording", call])
+    result = run_gsba("--quiet", "add", run, "--recording", call)
     assert result.exit_code == 0, result.output
     frames: FrameSet = load_run(run)[1]
     assert frames.camera_of_frame == (0,) * num + (1,) * num

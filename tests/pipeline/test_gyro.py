@@ -6,12 +6,11 @@ from pathlib import Path
 import insta360_files as made
 import numpy as np
 import pytest
+from command import run_gsba
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
-from tiny_run import SETTINGS, Case, computed_stages
-from typer.testing import CliRunner
+from tiny_run import PLAIN, Case, computed_stages
 
-from gsba.cli import app
 from gsba.imu.readings import Readings
 from gsba.log import GsbaError
 from gsba.pipeline.inputs import read_gyro
@@ -19,7 +18,6 @@ from gsba.types import Trajectory
 
 IMU_R_RIG = Rotation.from_rotvec([0.4, 2.0, -0.8]).as_matrix()
 OFFSET_S, BIAS = -41.3, np.array([0.01, -0.02, 0.015])  # of its clock; rad/s
-PLAIN = SETTINGS.model_copy(update={"patches": SETTINGS.patches.model_copy(update={"rounds": 0})})
 
 
 def _write(path: Path, on: Trajectory, seed: int = 0) -> Path:
@@ -41,16 +39,8 @@ def _readings(on: Trajectory, seed: int = 0) -> np.ndarray:
     return np.column_stack([fine + OFFSET_S, rates, forces @ IMU_R_RIG.T])
 
 
-@pytest.fixture(scope="module")
-def without(case: Case, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The run without readings."""
-    out = tmp_path_factory.mktemp("without") / "run"
-    case.refine(out, PLAIN)
-    return out
-
-
 def test_a_gyro_is_aligned_and_frames_turn_as_it_says(
-    case: Case, without: Path, tmp_path: Path
+    case: Case, plain_run: Path, tmp_path: Path
 ) -> None:
     out, readings = tmp_path / "run", _write(tmp_path / "imu.csv", case.truth)
     result = case.refine(out, PLAIN, imu=readings)
@@ -63,7 +53,7 @@ def test_a_gyro_is_aligned_and_frames_turn_as_it_says(
     assert np.rad2deg(off) < 2
     assert any("the gyro agrees with 100 %" in note for note in report["notes"])
     assert "the gyro agrees with 100 %" in (out / "report.html").read_text()
-    turned = [case.errors(run).rpe_rotation_deg.rmse for run in (out, without)]
+    turned = [case.errors(run).rpe_rotation_deg.rmse for run in (out, plain_run)]
     assert turned[0] < 0.9 * turned[1]
     vertical, found = result.reconstruction.vertical, result.reconstruction.world_T_rigs
     assert vertical is not None
@@ -74,7 +64,7 @@ def test_a_gyro_is_aligned_and_frames_turn_as_it_says(
     assert not computed_stages(again)
 
 
-def test_a_camera_s_own_readings_are_aligned(case: Case, without: Path, tmp_path: Path) -> None:
+def test_a_camera_s_own_readings_are_aligned(case: Case, plain_run: Path, tmp_path: Path) -> None:
     """In the trailer of an Insta360, as whole numbers, on a clock from the first frame."""
     table = _readings(case.truth)
     begin_us = 7_000_000
@@ -90,12 +80,12 @@ def test_a_camera_s_own_readings_are_aligned(case: Case, without: Path, tmp_path
     np.testing.assert_allclose(np.deg2rad(said["bias_deg_per_s"]), BIAS, atol=2e-3)
     off = Rotation.from_matrix(np.array(said["rig_R_imu"]) @ IMU_R_RIG).magnitude()
     assert np.rad2deg(off) < 2
-    turned = [case.errors(run).rpe_rotation_deg.rmse for run in (out, without)]
+    turned = [case.errors(run).rpe_rotation_deg.rmse for run in (out, plain_run)]
     assert turned[0] < 0.9 * turned[1]
 
 
 def test_readings_of_another_walk_change_nothing(
-    case: Case, without: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    case: Case, plain_run: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     poses = case.truth.world_T_rigs.copy()
     turns = np.random.default_rng(0).normal(0, 0.03, (len(poses), 3))
@@ -108,7 +98,7 @@ def test_readings_of_another_walk_change_nothing(
     assert not said["taken"] and said["reason"]
     assert f"the gyro was not used: {said['reason']}" in caplog.text
     for name in ("trajectory.tum", "poses.csv", "points.ply"):
-        assert (out / name).read_bytes() == (without / name).read_bytes()
+        assert (out / name).read_bytes() == (plain_run / name).read_bytes()
 
 
 def test_readings_that_cannot_be_used_are_refused_before_anything_is_written(
@@ -117,7 +107,7 @@ def test_readings_that_cannot_be_used_are_refused_before_anything_is_written(
     imu, out = tmp_path / "imu.csv", tmp_path / "run"
     imu.write_text("t,gyro_x,gyro_y\n0,1,2\n")
     asked = ["refine", case.frames, case.slam, "--out", out, "--imu", imu]
-    result = CliRunner().invoke(app, [*map(str, asked)])
+    result = run_gsba(*asked)
     assert result.exit_code == 1
     assert (
         result.output.strip()

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from tiny_run import NUM_FRAMES, SETTINGS, Case, computed_stages
+from tiny_run import NUM_FRAMES, Case, computed_stages, settings_with
 
 from gsba.bundle.division import DivisibleMap
 from gsba.bundle.optimizer import OptimizeResult
@@ -26,8 +26,8 @@ def test_a_run_in_parts_is_as_good_and_leaves_none_behind(
         return found
 
     monkeypatch.setattr(adjustments.DividedAdjustments, "minimized", noted)
-    solver = SETTINGS.solver.model_copy(update={"part_frames": NUM_FRAMES // 2})
-    settings = SETTINGS.model_copy(update={"solver": solver})
+    solver = {"part_frames": NUM_FRAMES // 2}
+    settings = settings_with(solver=solver, export={"formats": ()})
     result = case.refine(tmp_path / "run", settings)
     assert len(used) > 3 and all(used)
     case.assert_as_good(tmp_path / "run")

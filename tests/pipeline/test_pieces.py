@@ -7,13 +7,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from command import run_gsba
 from one_gallery import gallery
 from scipy.spatial.transform import Rotation
-from tiny_run import NUM_FRAMES, SETTINGS, Case
-from typer.testing import CliRunner, Result
+from tiny_run import LIGHT, NUM_FRAMES, Case
+from typer.testing import Result
 
 from gsba import load_run
-from gsba.cli import app
 from gsba.demo.render import render_erp
 from gsba.demo.walk import walk_poses
 from gsba.export import ExportFormat, export
@@ -29,23 +29,17 @@ from gsba.view import load_scene
 
 SCALE = 1.7
 MOVE = pose(Rotation.from_rotvec([0.4, -2.0, 0.7]).as_matrix(), np.array([5.0, -3.0, 8.0]))
-SET = (
-    f"cubemap.face_size={SETTINGS.cubemap.face_size}",
-    f"features.max_per_face={SETTINGS.features.max_per_face}",
-    f"patches.rounds={SETTINGS.patches.rounds}",
-    'export.formats=["colmap-flat"]',
-)
 
 
 def _refine(out: Path, frames: Path, *trajectories: Path, options: tuple[str, ...] = ()) -> Result:
     command = ["--quiet", "refine", frames, *trajectories, "--out", out, *options]
-    for change in SET:
+    for change in (*LIGHT, 'export.formats=["colmap-flat"]'):
         command += ["--set", change]
-    return CliRunner().invoke(app, [str(part) for part in command])
+    return run_gsba(*command)
 
 
 def _gsba(*arguments: object) -> Result:
-    return CliRunner().invoke(app, ["--quiet", *map(str, arguments)])
+    return run_gsba("--quiet", *arguments)
 
 
 def _report(out: Path) -> dict:
@@ -249,7 +243,7 @@ def test_covariances_are_judged_by_the_truth(case: Case, tmp_path: Path) -> None
     numbers = tmp_path / "numbers.json"
     write_tum(tmp_path / "truth.tum", case.truth)
     command = ["evaluate", case.out, "--truth", tmp_path / "truth.tum", "--json", numbers]
-    result = CliRunner().invoke(app, [str(part) for part in command])
+    result = run_gsba(*command)
     assert result.exit_code == 0 and "\nabsolute " in result.output
     assert "fixes the pose of 000000 and its distance to 000007" in result.output
     claims = json.loads(numbers.read_text())["consistency"]

@@ -8,15 +8,14 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from command import run_gsba
 from one_gallery import gallery
 from tiny_run import SETTINGS
-from typer.testing import CliRunner
 
 from gsba.camera.calibration import calibration_json, read_calibration
 from gsba.camera.fisheye import Pair, changed, project, rotation_of, unproject
 from gsba.camera.sphere import erp_from_bearings
 from gsba.camera.views import lens_views
-from gsba.cli import app
 from gsba.config import RefineSettings
 from gsba.demo.degrade import degrade
 from gsba.demo.render import render_erp
@@ -105,7 +104,7 @@ def test_raw_pairs_of_known_lenses_become_faces_of_either(walk: Path, tmp_path: 
 def _check_fisheyes(run: Path) -> None:
     """Both pictures as they are, points where these show them; faces of one centre on request."""
     call = ["-q", "export", str(run), "--to", "colmap", "--images"]
-    result = CliRunner().invoke(app, [*call, "fisheye", "--out", str(run / "raw")])
+    result = run_gsba(*call, "fisheye", "--out", run / "raw")
     assert result.exit_code == 0, result.output
     model = pycolmap.Reconstruction(run / "raw/sparse/0")
     assert {camera.model.name for camera in model.cameras.values()} == {"OPENCV_FISHEYE"}
@@ -113,17 +112,17 @@ def _check_fisheyes(run: Path) -> None:
     masks = [cv2.imread(str(path), 0) for path in sorted((run / "raw/masks/front").iterdir())]
     assert all(mask is not None and mask[SIZE // 2, SIZE // 2] == 255 for mask in masks)
     assert all(mask is not None and mask[0, 0] == 0 for mask in masks)
-    result = CliRunner().invoke(app, [*call, "cube", "--out", str(run / "cube")])
+    result = run_gsba(*call, "cube", "--out", run / "cube")
     assert result.exit_code == 0 and len(list((run / "cube/images").iterdir())) == 6
     wrong = ["export", str(run), "--to", "tum", "--images", "fisheye"]
-    result = CliRunner().invoke(app, [*wrong, "--out", str(run / "no")])
+    result = run_gsba(*wrong, "--out", run / "no")
     assert result.exit_code == 1 and "colmap" in result.output and not (run / "no").exists()
 
 
 def _check_panoramas(walk: Path, run: Path) -> None:
     """Stitched at the map's depth they are what one camera sees, better than joined at infinity."""
     call = ["-q", "export", str(run), "--to", "tum", "--images", "panorama"]
-    result = CliRunner().invoke(app, [*call, "--out", str(run / "panoramas")])
+    result = run_gsba(*call, "--out", run / "panoramas")
     assert result.exit_code == 0, result.output
     _, frames = load_run(run)
     truth, scene = read_trajectory(walk / "truth.tum"), gallery()
@@ -158,7 +157,7 @@ def _check_families(walk: Path, run: Path) -> None:
     assert computed[:2] == ["photometric", "splat"] and len(report["splat"]) == 1
     assert evaluate(read_trajectory(run / "trajectory.tum"), truth).ate.rmse < 0.004
     train = ["-q", "train", str(run), "--iterations", "20", "--face-size", "32", "--backend", "cpu"]
-    result = CliRunner().invoke(app, train)
+    result = run_gsba(*train)
     assert result.exit_code == 0, result.output
     (picture, *_) = sorted((run / "splat/pictures").iterdir())
     views = lens_views(load_cameras(run, *load_run(run)).only, 32)
@@ -222,7 +221,7 @@ def test_a_circle_goes_without_a_calibration(walk: Path, tmp_path: Path) -> None
         refine(walk / "frames", walk / "slam.tum", tmp_path / "run", **given)
     arguments = [str(walk / "frames"), str(walk / "slam.tum"), "--out", str(tmp_path / "run")]
     for text, message in (("1,2", "three numbers"), ("9,9,-3", "positive radius")):
-        result = CliRunner().invoke(app, ["-q", "refine", *arguments, "--circle", text])
+        result = run_gsba("-q", "refine", *arguments, "--circle", text)
         assert result.exit_code == 1 and message in result.output
     assert not (tmp_path / "run").exists()
 

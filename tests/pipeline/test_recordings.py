@@ -3,86 +3,45 @@
 import csv
 import json
 import shutil
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from growing_home import MAX_ERROR
-from one_gallery import OVAL_FRAMES
-from scipy.spatial.transform import Rotation
-from tiny_run import SETTINGS
-from typer.testing import CliRunner, Result
+from command import run_gsba
+from growing_home import MAX_ERROR, NUM, SMALL_EXPORTS, GrowingHome
+from tiny_run import LIGHT, SETTINGS, computed_stages
+from typer.testing import Result
 
 from gsba import Recording, load_run, refine_recordings
-from gsba.cli import app
-from gsba.demo import DemoWalk
 from gsba.evaluate.trajectory import evaluate
-from gsba.geometry import pose
 from gsba.log import GsbaError
-from gsba.similarity import Sim3
 from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.types import Trajectory
 from gsba.view import load_scene
 
-NUM = OVAL_FRAMES // 2  # frames of a recording
-SCALES = 1.0, 1.7  # of the trajectories
-TURN = Rotation.from_rotvec([0.4, -2.0, 0.7]).as_matrix()
-WORLDS = np.eye(4), pose(TURN, np.array([5.0, -3.0, 8.0]))
-CLOCKS = 100.0, 3.5  # seconds at the first frames
-SET = (
-    f"cubemap.face_size={SETTINGS.cubemap.face_size}",
-    f"features.max_per_face={SETTINGS.features.max_per_face}",
-    f"solver.num_threads={SETTINGS.solver.num_threads}",
-    f"weak_frames.mode={SETTINGS.weak_frames.mode}",
-    f"patches.rounds={SETTINGS.patches.rounds}",
-    'export.formats=["colmap-flat", "tum"]',
-)
-
-
-@dataclass(frozen=True)
-class Home:
-    """Two recordings of one place."""
-
-    folders: tuple[Path, Path]
-    trajectories: tuple[Path, Path]
-    truths: tuple[Trajectory, Trajectory]  # on the recordings' clocks
-
-
-@pytest.fixture(scope="module")
-def home(oval: DemoWalk, tmp_path_factory: pytest.TempPathFactory) -> Home:
-    """Every other frame of a walk: names and times of both recordings begin anew."""
-    folder = tmp_path_factory.mktemp("recordings")
-    truth, slam = read_trajectory(oval.truth_path), read_trajectory(oval.slam_path)
-    images = sorted(oval.frames_dir.glob("*.jpg"))
-    folders, files, truths = [], [], []
-    for n, name in enumerate(("ground", "upper")):
-        own = folder / name
-        own.mkdir()
-        for number, image in enumerate(images[n::2]):
-            shutil.copy(image, own / f"{number:06d}.jpg")
-        times = CLOCKS[n] + 0.5 * np.arange(NUM)
-        rows = [f"{number:06d},{time}" for number, time in enumerate(times)]
-        (own / "timestamps.csv").write_text("\n".join(["name,timestamp", *rows, ""]))
-        poses = Sim3.of(SCALES[n], WORLDS[n]).poses(slam.world_T_rigs[n::2])
-        files.append(folder / f"{name}.txt")
-        write_tum(files[-1], Trajectory(times, poses))
-        folders.append(own)
-        truths.append(Trajectory(times, truth.world_T_rigs[n::2]))
-    return Home((folders[0], folders[1]), (files[0], files[1]), (truths[0], truths[1]))
+SET = (*LIGHT, 'export.formats=["colmap-flat", "tum"]', "export.face_size=64")
 
 
 def _refine(out: Path, *arguments: object) -> Result:
     command = ["--quiet", "refine", *map(str, arguments), "--out", str(out)]
-    return CliRunner().invoke(app, [*command, *(word for one in SET for word in ("--set", one))])
+    return run_gsba(*command, *(word for one in SET for word in ("--set", one)))
 
 
 @pytest.fixture(scope="module")
-def run(home: Home, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def home(growing_home: GrowingHome, tmp_path_factory: pytest.TempPathFactory) -> GrowingHome:
+    """The recordings in a folder of their own: a test lays a file beside one."""
+    own = tmp_path_factory.mktemp("recordings")
+    folders = [Path(shutil.copytree(each, own / each.name)) for each in growing_home.folders]
+    return replace(growing_home, folders=(folders[0], folders[1]))
+
+
+@pytest.fixture(scope="module")
+def run(home: GrowingHome, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Both recordings refined from the command line, the second one's keys in a file beside it."""
     out = tmp_path_factory.mktemp("recordings-run") / "run"
     beside = home.folders[1].with_suffix(".toml")
-    beside.write_text(f'trajectory = "{home.trajectories[1].name}"\nmasks = "none"\n')
+    beside.write_text(f'trajectory = "{home.trajectories[1]}"\nmasks = "none"\n')
     try:
         result = _refine(out, home.folders[0], home.trajectories[0], home.folders[1])
     finally:
@@ -91,27 +50,25 @@ def run(home: Home, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_recordings_are_one_map_with_one_scale(run: Path, home: Home) -> None:
+def test_recordings_are_one_map_with_one_scale(run: Path, home: GrowingHome) -> None:
     reconstruction, frames = load_run(run)
     assert reconstruction.num_maps == 1 and len(frames) == 2 * NUM
     assert frames.names[:2] == ("ground/000000", "ground/000001")
     assert frames.names[NUM] == "upper/000000"
-    truth = np.concatenate([one.world_T_rigs for one in home.truths])
-    times = frames.timestamps
-    errors = evaluate(Trajectory(times, reconstruction.world_T_rigs), Trajectory(times, truth))
+    error = home.error(run)
     alone = [
         evaluate(read_trajectory(run / f"trajectories/{folder.name}.tum"), own)
         for folder, own in zip(home.folders, home.truths, strict=True)
     ]
     assert [one.num_matched for one in alone] == [NUM, NUM]
     assert abs(np.log(alone[0].scale / alone[1].scale)) < 2e-3
-    assert errors.ate.rmse < MAX_ERROR  # as that of a run that grew, see test_growing.py
-    assert errors.ate.rmse < 1.5 * max(one.ate.rmse for one in alone)
+    assert error < MAX_ERROR  # as that of a run that grew, see test_growing.py
+    assert error < 1.5 * max(one.ate.rmse for one in alone)
     before = evaluate(read_trajectory(home.trajectories[0]), home.truths[0])
-    assert errors.ate.rmse < 0.3 * before.ate.rmse
+    assert error < 0.3 * before.ate.rmse
 
 
-def test_the_world_is_that_of_the_first_recording(run: Path, home: Home) -> None:
+def test_the_world_is_that_of_the_first_recording(run: Path, home: GrowingHome) -> None:
     found = read_trajectory(run / "trajectories/ground.tum").world_T_rigs
     given = read_trajectory(home.trajectories[0]).world_T_rigs
     extent = np.linalg.norm(np.ptp(given[:, :3, 3], axis=0))
@@ -135,22 +92,22 @@ def test_the_report_and_exports_tell_recordings_apart(run: Path) -> None:
     assert list(load_scene(run).frames.recordings) == ["ground", "upper"]
 
 
-def test_a_second_call_resumes(run: Path, home: Home) -> None:
+def test_a_second_call_resumes(run: Path, home: GrowingHome) -> None:
     recordings = [
         Recording(folder, trajectory, masks="none" if n else "auto")
         for n, (folder, trajectory) in enumerate(zip(home.folders, home.trajectories, strict=True))
     ]
-    settings = SETTINGS.model_copy(
-        update={"export": SETTINGS.export.model_copy(update={"formats": ("colmap-flat", "tum")})}
-    )
-    result = refine_recordings(recordings, run, settings)
-    computed = [stage["name"] for stage in result.report["stages"] if not stage["resumed"]]
-    assert computed == []
+    assert computed_stages(refine_recordings(recordings, run, SMALL_EXPORTS)) == []
 
 
 @pytest.mark.slow
-def test_recordings_with_and_without_a_trajectory_are_joined(home: Home, tmp_path: Path) -> None:
-    recordings = [Recording(home.folders[0]), Recording(home.folders[1], home.trajectories[1])]
+def test_recordings_with_and_without_a_trajectory_are_joined(
+    home: GrowingHome, tmp_path: Path
+) -> None:
+    recordings = [
+        Recording(home.folders[0]),
+        Recording(home.folders[1], home.trajectories[1]),
+    ]
     result = refine_recordings(recordings, tmp_path / "run", SETTINGS)
     assert len(result.maps) == 1
     first, second = result.report["recordings"]
@@ -168,7 +125,7 @@ def _refusal(out: Path, *recordings: Recording) -> str:
     return str(told.value)
 
 
-def test_one_recording_twice_is_refused(home: Home, tmp_path: Path) -> None:
+def test_one_recording_twice_is_refused(home: GrowingHome, tmp_path: Path) -> None:
     out = tmp_path / "run"
     first, second = home.folders
     assert "is given twice" in _refusal(out, Recording(first), Recording(first))
@@ -178,18 +135,21 @@ def test_one_recording_twice_is_refused(home: Home, tmp_path: Path) -> None:
     assert "both named 'one'" in _refusal(out, *names)
 
 
-def test_errors_name_the_recording(home: Home, tmp_path: Path) -> None:
+def test_errors_name_the_recording(home: GrowingHome, tmp_path: Path) -> None:
     out = tmp_path / "run"
     first, second = home.folders
     told = _refusal(out, Recording(first), Recording(second, tmp_path / "missing.tum"))
     assert told.startswith("recording 'upper': ") and "missing.tum" in told
 
 
-def test_a_trajectory_of_another_recording_is_refused(home: Home, tmp_path: Path) -> None:
+def test_a_trajectory_of_another_recording_is_refused(home: GrowingHome, tmp_path: Path) -> None:
     swapped = read_trajectory(home.trajectories[0]).world_T_rigs[::-1]
     path = tmp_path / "other.tum"
     write_tum(path, Trajectory(home.truths[1].timestamps, swapped))
-    recordings = Recording(home.folders[0], home.trajectories[0]), Recording(home.folders[1], path)
+    recordings = (
+        Recording(home.folders[0], home.trajectories[0]),
+        Recording(home.folders[1], path),
+    )
     with pytest.raises(GsbaError, match="recording 'upper': the images contradict"):
         refine_recordings(recordings, tmp_path / "run", SETTINGS)
 

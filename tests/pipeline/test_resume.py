@@ -10,7 +10,7 @@ from pathlib import Path
 
 import cv2
 import pytest
-from tiny_run import NUM_FRAMES, SETTINGS, Case, computed_stages
+from tiny_run import BARE, NUM_FRAMES, SETTINGS, Case, computed_stages, exporting
 
 import gsba
 from gsba.bundle import map_strength
@@ -29,9 +29,7 @@ def test_a_second_call_takes_everything_up(case: Case, tmp_path: Path) -> None:
 
 def test_a_changed_setting_renews_what_depends_on_it(case: Case, tmp_path: Path) -> None:
     out = case.copy(tmp_path / "run")
-    exported = SETTINGS.model_copy(
-        update={"export": SETTINGS.export.model_copy(update={"face_size": 64})}
-    )
+    exported = exporting("colmap", face_size=64)
     assert computed_stages(case.refine(out, exported)) == ["export-colmap"]
     (image, *_) = (out / "colmap/images/front").iterdir()
     pixels = cv2.imread(str(image))
@@ -45,11 +43,11 @@ def test_a_changed_setting_renews_what_depends_on_it(case: Case, tmp_path: Path)
 def test_a_changed_frame_is_extracted_alone(case: Case, tmp_path: Path) -> None:
     frames = Path(shutil.copytree(case.frames, tmp_path / "frames"))
     out, own = tmp_path / "run", replace(case, frames=frames)
-    own.refine(out)
+    own.refine(out, BARE)
     stored = {path: path.stat().st_mtime_ns for path in (out / "stages/features").glob("*.npz")}
     assert len(stored) == NUM_FRAMES
     os.utime(frames / "000003.jpg")
-    computed = computed_stages(own.refine(out))
+    computed = computed_stages(own.refine(out, BARE))
     assert {"features", "neighbours", "reconstruction"} <= set(computed)
     renewed = [path.stem for path, time in stored.items() if path.stat().st_mtime_ns != time]
     assert renewed == ["000003"]

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from tiny_run import SETTINGS, Case
+from tiny_run import BARE, SETTINGS, Case
 
 from gsba import refine
 from gsba.evaluate.trajectory import evaluate
@@ -21,7 +21,7 @@ def _refine(case: Case, folder: Path, trajectory: Trajectory | None) -> RunResul
     if trajectory is not None:
         slam = folder / "slam.tum"
         write_tum(slam, trajectory)
-    return refine(case.frames, slam, folder / "run", SETTINGS)
+    return refine(case.frames, slam, folder / "run", BARE)
 
 
 def test_a_displaced_frame_is_named_and_repaired(case: Case, tmp_path: Path) -> None:

@@ -9,25 +9,17 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
-from accuracy import assert_as_accurate
-from cameras_home import (
-    NUM,
-    SMALL,
-    WIDTH,
-    Home,
-    error_of,
-    faces,
-    fisheyes,
-    panoramas,
-    read,
-    settings_with,
-)
-from tiny_run import SETTINGS
+from accuracy import assert_as_accurate, predicted_error
+from cameras_home import NUM, SMALL, WIDTH, Home, error_of, faces, panoramas, read
+from tiny_run import SETTINGS, exporting
 
 from gsba import RunResult, refine_recordings
 from gsba.config import RefineSettings
 from gsba.log import GsbaError
 from gsba.store.finished import load_run
+
+# Error that a run of both recordings at 384 pixels predicts; it scatters by a twentieth.
+COARSER = 0.00083
 
 
 @pytest.fixture(scope="module")
@@ -35,30 +27,19 @@ def home(cameras_home: Home) -> Home:
     return cameras_home
 
 
-def _error(result: RunResult, home: Home) -> float:
-    assert len(result.maps) == 1
-    return error_of(result.out, home)
-
-
-@pytest.fixture(scope="module")
-def coarser(home: Home) -> Path:
-    """A run of the coarser camera for all."""
-    recordings = [panoramas(home, n, SMALL) for n in range(2)]
-    return refine_recordings(recordings, home.folder / "coarser", SETTINGS).out
-
-
 @pytest.fixture(scope="module")
 def sizes(two_sizes: Path, home: Home, tmp_path_factory: pytest.TempPathFactory) -> RunResult:
     """A recording at 512 pixels and one at 384, in several formats."""
     out = Path(shutil.copytree(two_sizes, tmp_path_factory.mktemp("several") / "sizes"))
-    formats = {"formats": ("colmap", "colmap-erp", "nerfstudio", "metashape")}
+    settings = exporting("colmap", "colmap-erp", "nerfstudio", "metashape")
     recordings = [panoramas(home, 0, WIDTH), panoramas(home, 1, SMALL)]
-    return refine_recordings(recordings, out, settings_with(export=formats))
+    return refine_recordings(recordings, out, settings)
 
 
-def test_pictures_of_two_sizes_make_one_map(sizes: RunResult, coarser: Path, home: Home) -> None:
+def test_pictures_of_two_sizes_make_one_map(sizes: RunResult, home: Home) -> None:
     assert [kind.width for kind in sizes.frames.formats] == [WIDTH, SMALL]
-    assert_as_accurate(sizes.out, _error(sizes, home), coarser, 1.25)
+    error, predicted = error_of(sizes.out, home), predicted_error(sizes.out)
+    assert predicted < 1.25 * COARSER and error < 4 * predicted
     _, frames = load_run(sizes.out)
     assert frames.camera_of_frame == (0,) * NUM + (1,) * NUM
 
@@ -107,28 +88,25 @@ def test_poses_and_the_report_have_all_frames(sizes: RunResult) -> None:
     assert (sizes.out / "report.html").is_file()
 
 
-def test_stitched_panoramas_and_cube_faces_make_one_map(home: Home, coarser: Path) -> None:
-    recordings = [panoramas(home, 0, WIDTH), faces(home)]
-    settings = settings_with(export={"formats": ("colmap-flat",)})
-    result = refine_recordings(recordings, home.folder / "cube", settings)
-    assert [kind.layout for kind in result.frames.formats] == ["erp", "cube"]
-    assert_as_accurate(result.out, _error(result, home), coarser, 1.25)
-    model = pycolmap.Reconstruction(str(result.out / "colmap-flat/sparse/0"))
+def test_stitched_panoramas_and_cube_faces_make_one_map(
+    home: Home, faces_run: Path, two_sizes: Path, tmp_path: Path
+) -> None:
+    assert [kind.layout for kind in load_run(faces_run)[1].formats] == ["erp", "cube"]
+    assert_as_accurate(faces_run, error_of(faces_run, home), two_sizes, 1.25)
+    model = pycolmap.Reconstruction(str(faces_run / "colmap-flat/sparse/0"))
     assert len(model.images) == 12 * NUM - 3  # 15 faces of three held-out frames beside 102 others
     with pytest.raises(GsbaError, match="needs panoramas"):
-        given = settings_with(export={"formats": ("colmap-erp",), "images": "panorama"})
-        refine_recordings(recordings, home.folder / "cube", given)
+        given = exporting("colmap-erp", images="panorama")
+        recordings = [panoramas(home, 0, WIDTH), faces(home)]
+        refine_recordings(recordings, shutil.copytree(faces_run, tmp_path / "run"), given)
 
 
-def test_stitched_panoramas_and_raw_fisheyes_make_one_map(home: Home) -> None:
-    recordings = [panoramas(home, 0, WIDTH), fisheyes(home)]
-    settings = settings_with(export={"formats": ("colmap",)})
-    result = refine_recordings(recordings, home.folder / "fisheyes", settings)
-    assert [kind.layout for kind in result.frames.formats] == ["erp", "fisheye"]
+def test_stitched_panoramas_and_raw_fisheyes_make_one_map(home: Home, fisheyes_run: Path) -> None:
+    assert [kind.layout for kind in load_run(fisheyes_run)[1].formats] == ["erp", "fisheye"]
     # The raw pictures are coarser, and resampled twice: .0018 to .0020 with three seeds. One camera
     # for all scatters from .0006 to .0011, too widely for a ratio.
-    assert _error(result, home) < 0.003
-    model = pycolmap.Reconstruction(str(result.out / "colmap/sparse/0"))
+    assert error_of(fisheyes_run, home) < 0.003
+    model = pycolmap.Reconstruction(str(fisheyes_run / "colmap/sparse/0"))
     assert len(model.rigs) == 2 and len(model.frames) == 2 * NUM
 
 

@@ -7,13 +7,12 @@ import numpy as np
 import pycolmap
 import pytest
 from accuracy import assert_as_accurate
+from command import run_gsba
 from ring_of_lenses import RADIUS, distance, render, ring, turned_off, write_calibration
 from tiny_run import SETTINGS
-from typer.testing import CliRunner
 
 from gsba.camera.calibration import read_calibration
 from gsba.camera.fisheye import rotation_of
-from gsba.cli import app
 from gsba.config import RefineSettings
 from gsba.evaluate import TrajectoryErrors, evaluate
 from gsba.pipeline import refine
@@ -72,11 +71,11 @@ def test_three_raw_lenses_are_as_exact_as_two(walks: dict[int, Path], tmp_path: 
     kept = read_calibration(run / "calibration.json")
     assert [lens.focal for lens in kept] == [lens.focal for lens in ring(3)]
     call = ["-q", "export", str(run), "--to", "colmap", "--images"]
-    result = CliRunner().invoke(app, [*call, "fisheye", "--out", str(run / "raw")])
+    result = run_gsba(*call, "fisheye", "--out", run / "raw")
     assert result.exit_code == 0, result.output
     model = pycolmap.Reconstruction(run / "raw/sparse/0")
     assert len(model.cameras) == 3 and model.compute_mean_reprojection_error() < 0.5
-    result = CliRunner().invoke(app, [*call, "lenses", "--out", str(run / "faces")])
+    result = run_gsba(*call, "lenses", "--out", run / "faces")
     assert result.exit_code == 1 and "the camera has 3 lenses" in result.output
     assert not (run / "faces").exists()
 

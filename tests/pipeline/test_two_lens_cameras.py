@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 import pytest
 from accuracy import assert_as_accurate
-from one_gallery import walk_in_gallery
 from tiny_run import SETTINGS
 
 from gsba import Recording, RefineSettings, add_recordings, load_run, refine, refine_recordings
 from gsba.camera.sphere import bearings_from_erp
+from gsba.demo import make_walk
 from gsba.demo.render import render_erp
 from gsba.demo.walk import walk_poses
 from gsba.evaluate import TrajectoryErrors, evaluate
@@ -64,7 +64,7 @@ def films(tmp_path_factory: pytest.TempPathFactory) -> Films:
     folder = tmp_path_factory.mktemp("films")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("gsba.demo.render.render_erp", _seen_by_turns)
-        walk = walk_in_gallery(folder / "walk", "rectangle", "forward", 2 * NUM, WIDTHS[0])
+        walk = make_walk(folder / "walk", "rectangle", "forward", 2 * NUM, WIDTHS[0])
     truth, slam = read_trajectory(walk.truth_path), read_trajectory(walk.slam_path)
     images, recordings = sorted(walk.frames_dir.glob("*.jpg")), []
     for n, (name, width) in enumerate(zip(("narrow", "wide"), WIDTHS, strict=True)):

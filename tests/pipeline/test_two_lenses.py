@@ -6,15 +6,14 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
-from one_gallery import walk_in_gallery
+from command import run_gsba
 from tiny_run import SETTINGS
-from typer.testing import CliRunner
 
 from gsba.app.runs import camera_so_far
 from gsba.camera.sphere import bearings_from_erp
 from gsba.camera.views import lens_views
-from gsba.cli import app
 from gsba.config import PlacementSettings, RefineSettings
+from gsba.demo import make_walk
 from gsba.demo.render import render_erp
 from gsba.demo.walk import walk_poses
 from gsba.evaluate import TrajectoryErrors, evaluate
@@ -62,7 +61,7 @@ def _stabilised(scene, world_T_rig: np.ndarray, width: int, height: int) -> np.n
 def _walk(out: Path, camera, heading: str):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("gsba.demo.render.render_erp", camera)
-        return walk_in_gallery(out, "rectangle", heading, NUM_FRAMES, WIDTH)
+        return make_walk(out, "rectangle", heading, NUM_FRAMES, WIDTH)
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +98,7 @@ def test_a_camera_of_two_lenses_is_found_and_gives_the_scale(walk, tmp_path: Pat
     assert next(stage["name"] for stage in report["stages"] if not stage["resumed"]) == "splat"
     _, central = _refine(walk, tmp_path / "one", model="central")
     one = ["export", str(tmp_path / "one"), "--to", "colmap", "--images", "lenses"]
-    refused = CliRunner().invoke(app, one)
+    refused = run_gsba(*one)
     assert refused.exit_code == 1 and "the run has one centre" in refused.output
     assert errors.ate.rmse < 0.1 * central.ate.rmse  # a hundredth
     assert errors.rpe_rotation_deg.rmse < 0.3 * central.rpe_rotation_deg.rmse  # a twentieth
@@ -111,7 +110,7 @@ def _export_both(run: Path, scale: float) -> None:
     assert 2 * scale * np.linalg.norm(lenses.centre) == pytest.approx(BASELINE, rel=0.02)
     for images, number in (("--images", "lenses"), 10), ((), 6):
         call = ["-q", "export", str(run), "--to", "colmap", "--face-size", "64", *images]
-        result = CliRunner().invoke(app, call)
+        result = run_gsba(*call)
         assert result.exit_code == 0, result.output
         assert len(list((run / "colmap/images").iterdir())) == number
         centres = {}
@@ -120,7 +119,7 @@ def _export_both(run: Path, scale: float) -> None:
         apart = [np.ptp(np.array(found), axis=0) for found in centres.values()]
         lengths = scale * np.linalg.norm(apart, axis=1)
         np.testing.assert_allclose(lengths, BASELINE if number == 10 else 0, rtol=0.02, atol=1e-9)
-    wrong = CliRunner().invoke(app, ["export", str(run), "--to", "colmap", "--images", "ball"])
+    wrong = run_gsba("export", run, "--to", "colmap", "--images", "ball")
     assert wrong.exit_code == 1 and "export.images" in wrong.output
 
 
@@ -131,7 +130,7 @@ def _train_and_look(run: Path) -> None:
     splat, name = run / "splat/refined/point_cloud.ply", frames.names[3]
     calls = (["train", str(run), "--iterations", "30"], ["render", str(splat), str(run), "--frame"])
     for call in (calls[0], [*calls[1], name]):
-        result = CliRunner().invoke(app, ["-q", *call, *size])
+        result = run_gsba("-q", *call, *size)
         assert result.exit_code == 0, result.output
     views = [view.name for view in lens_views(load_cameras(run, reconstruction, frames).only, 32)]
     rendered = {path.name for path in (run / "renderings").iterdir()}

@@ -9,11 +9,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from command import run_gsba
 from PIL import Image
-from typer.testing import CliRunner
 from walk_on_earth import ORIGIN, frame_set, geodetic_of, level_metres, walk_result
 
-from gsba.cli import app
 from gsba.config import PlacementSettings, RefineSettings
 from gsba.frames.exif import read_exif
 from gsba.log import GsbaError
@@ -218,5 +217,5 @@ def test_a_run_is_refused_before_it_begins(tmp_path: Path) -> None:
         "--set",
         "placement.gps=exif",
     ]
-    done = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    done = run_gsba(*arguments)
     assert done.exit_code == 1 and len(done.stderr.splitlines()) == 1, done.stderr

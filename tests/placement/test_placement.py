@@ -9,12 +9,11 @@ import cv2
 import export_scene as scene
 import numpy as np
 import pytest
+from command import run_gsba
 from scipy.spatial.transform import Rotation
-from typer.testing import CliRunner, Result
 from walk_on_earth import ORIGIN, frame_set, geodetic_of, level_metres, walk_result
 
 from gsba.camera.sphere import bearings_from_erp
-from gsba.cli import app
 from gsba.config import PlacementSettings
 from gsba.export import ExportFormat, export
 from gsba.geometry import angular_errors, pose
@@ -374,10 +373,6 @@ def test_positions_on_a_line_leave_a_roll_open(tmp_path: Path) -> None:
         place(result, frames, PlacementSettings(gps=str(path)))
 
 
-def _gsba(*arguments: object) -> Result:
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
-
-
 def test_bad_options(tmp_path: Path) -> None:
     result, frames = walk_result(), frame_set(40)
     truth = tmp_path / "t.tum"
@@ -396,7 +391,7 @@ def test_bad_options(tmp_path: Path) -> None:
         (("--up", "down"), 'placement.up = "down" is not allowed: use one of "auto", "none"'),
         (("--scale", -1, "--between", "a", "b"), "placement.length = -1.0"),
     ):
-        out = _gsba("export", tmp_path, "--to", "tum", *options)
+        out = run_gsba("export", tmp_path, "--to", "tum", *options)
         assert out.exit_code == 1 and message in out.stderr and len(out.stderr.splitlines()) == 1
 
 

@@ -7,12 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command import run_gsba
 from PIL import Image
 from scipy.spatial.transform import Rotation
 from tiny_run import Case
-from typer.testing import CliRunner
 
-from gsba.cli import app
 from gsba.evaluate import charts
 from gsba.evaluate.splats import SourceResult, _write_curves
 from gsba.evaluate.trajectory import evaluate
@@ -190,7 +189,7 @@ def test_the_command_says_what_it_wrote_or_why_not(
     walk = _written(tmp_path / "a.tum", _walk())
 
     def call(*arguments: object):
-        return CliRunner().invoke(app, ["plot", *map(str, arguments)])
+        return run_gsba("plot", *arguments)
 
     done = call(walk, "--out", tmp_path / "figures", "--truth", walk)
     assert done.exit_code == 0 and len(done.stdout.splitlines()) == 4

@@ -5,10 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command import run_gsba
 from scan_world import HALL, SIZE, rectangles, sampled
-from typer.testing import CliRunner
 
-from gsba.cli import app
 from gsba.log import GsbaError
 from gsba.scans import check_scan, distances_to, files, read_pairs, read_scan
 from gsba.scans.files import on_planes
@@ -118,9 +117,9 @@ def test_distances_are_to_surfaces_and_not_to_the_next_point() -> None:
 
 
 def test_settings_that_exclude_one_another(tmp_path: Path) -> None:
-    told = CliRunner().invoke(app, ["export", str(tmp_path), "--to", "tum", "--pairs", "p.txt"])
+    told = run_gsba("export", tmp_path, "--to", "tum", "--pairs", "p.txt")
     assert told.exit_code == 1 and "error: " in told.output
-    told = CliRunner().invoke(app, ["evaluate", str(tmp_path), "--pairs", "p.txt"])
+    told = run_gsba("evaluate", tmp_path, "--pairs", "p.txt")
     assert told.exit_code == 1 and "give --scan FILE" in told.output
 
 

@@ -6,12 +6,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from command import run_gsba
 from tiny_run import Case
-from typer.testing import CliRunner
 
 from gsba.camera.rig import CubeRig
 from gsba.camera.views import rig_views
-from gsba.cli import app
 from gsba.config import SplatSettings
 from gsba.evaluate.splats import compare, poses_for
 from gsba.geometry import pose
@@ -29,7 +28,7 @@ TINY = ["--iterations", "30", "--face-size", "32", "--backend", "cpu"]
 
 
 def call(*arguments: object) -> str:
-    result = CliRunner().invoke(app, ["-q", *map(str, arguments)])
+    result = run_gsba("-q", *arguments)
     assert result.exit_code == 0, result.output
     return result.output
 
@@ -60,7 +59,7 @@ def test_render_writes_faces_and_a_panorama(run: Path) -> None:
     shapes = {path.name: cv2.imread(str(path)).shape for path in (run / "renderings").iterdir()}
     assert shapes[f"{frame}_erp.png"] == (64, 128, 3)
     assert shapes[f"{frame}_down.png"] == (32, 32, 3) and len(shapes) == 7
-    failed = CliRunner().invoke(app, ["render", str(ply), str(run), "--frame", "nonsense"])
+    failed = run_gsba("render", ply, run, "--frame", "nonsense")
     assert failed.exit_code == 1 and "no frame 'nonsense'" in failed.output
 
 
@@ -82,7 +81,7 @@ def test_evaluate_compares_sources_and_resumes(case: Case, run: Path, tmp_path: 
 
 
 def test_evaluate_needs_something_to_compare_with(run: Path) -> None:
-    failed = CliRunner().invoke(app, ["evaluate", str(run)])
+    failed = run_gsba("evaluate", run)
     assert failed.exit_code == 1 and "--truth" in failed.output
 
 
@@ -91,7 +90,7 @@ def test_evaluate_needs_something_to_compare_with(run: Path) -> None:
     [("--iterations", "0"), ("--face-size", "3"), ("--backend", "x"), ("--max-gaussians", "0")],
 )
 def test_bad_options_are_one_line(run: Path, option: tuple[str, str]) -> None:
-    failed = CliRunner().invoke(app, ["train", str(run), *option])
+    failed = run_gsba("train", run, *option)
     assert failed.exit_code == 1 and failed.output.startswith(f"error: {option[0]} {option[1]}")
 
 

@@ -10,10 +10,9 @@ from typing import Any
 import export_scene as scene
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from command import run_gsba
 
 from gsba import load_run
-from gsba.cli import app
 from gsba.log import GsbaError
 from gsba.placement.world import read_placement
 from gsba.store.folder import open_run_folder
@@ -112,7 +111,7 @@ def test_names_that_leave_the_folder_are_refused(
     name = name.format(tmp_path)
     _edit(run / "stages/frames.npz", lambda tree: tree["value"]["names"].__setitem__(3, name))
     before = sorted(tmp_path.rglob("*"))
-    told = CliRunner().invoke(app, ["export", str(run), "--to", to, "--out", str(tmp_path / "o/u")])
+    told = run_gsba("export", run, "--to", to, "--out", tmp_path / "o/u")
     assert told.exit_code == 1 and sorted(tmp_path.rglob("*")) == before
     line = told.stderr.splitlines()
     assert len(line) == 1 and "cannot be the name of a frame" in line[0], told.stderr

@@ -7,10 +7,9 @@ from pathlib import Path
 import export_scene as scene
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from command import run_gsba
 
 from gsba import load_run
-from gsba.cli import app
 from gsba.disk import refuse_links
 from gsba.export.folder import output_folder
 from gsba.log import GsbaError
@@ -106,7 +105,7 @@ def test_results_are_read_from_no_pipe(
     truth = run.parent / "true.tum"
     truth.write_text("0 0 0 0 0 0 0 1\n")
     with_ = {"export": ["--to", "colmap"], "evaluate": ["--truth", str(truth)]}[command]
-    told = CliRunner().invoke(app, [command, str(run), *with_])
+    told = run_gsba(command, run, *with_)
     (line,) = told.stderr.splitlines()
     assert told.exit_code == 1 and "where gsba keeps its own files: move it away" in line
     assert set(_contents(elsewhere).values()) == {"precious"}

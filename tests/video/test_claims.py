@@ -2,6 +2,7 @@
 
 import struct
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from two_fisheyes import made_pair, picture
+from wave_panorama import wave_panorama
 
 from gsba.frames.files import turned
 from gsba.log import GsbaError
@@ -18,6 +20,7 @@ from gsba.video.recording import Picture, Recording, read_recording, shots
 av = pytest.importorskip("av", reason="PyAV is not installed")
 
 WIDTH, HEIGHT = 256, 128
+_panorama = partial(wave_panorama, WIDTH)
 ONE = 65536
 MATRICES = {  # a, b, c, d of EXIF's orientations
     1: (1, 0, 0, 1),
@@ -29,24 +32,6 @@ MATRICES = {  # a, b, c, d of EXIF's orientations
     7: (0, -1, -1, 0),
     8: (0, -1, 1, 0),
 }
-
-
-def _panorama(seed: int = 0, width: int = WIDTH) -> np.ndarray:
-    """Colours (H, 2H, 3) uint8 of random low harmonics on the sphere: poles and edges are right."""
-    rng = np.random.default_rng(seed)
-    height = width // 2
-    latitude = (0.5 - (np.arange(height) + 0.5) / height)[:, None] * np.pi
-    longitude = (np.arange(width) + 0.5)[None] / width * 2 * np.pi
-    rays = np.stack(
-        [
-            np.cos(latitude) * np.sin(longitude),
-            np.repeat(np.sin(latitude), width, 1),
-            np.cos(latitude) * np.cos(longitude),
-        ],
-        axis=-1,
-    )
-    waves = np.sin(rays @ rng.normal(0, 9, (3, 30)) + rng.uniform(0, 6, 30))
-    return np.clip(128 + 22 * waves @ rng.normal(0, 1, (30, 3)), 0, 255).astype(np.uint8)
 
 
 def _write(path: Path, pictures: list[np.ndarray], orientation: int = 1, aspect: int = 1) -> Path:
@@ -190,7 +175,7 @@ def _halves(axis: int) -> np.ndarray:
         (_halves(0), "stereo, one eye above the other"),
         (_halves(1), "stereo, an eye on the left"),
         (np.tile(_panorama()[:, 64:192], (1, 2, 1)), "VR180"),
-        (_panorama(width=512)[32:224, 64:448], "a cropped panorama"),
+        (wave_panorama(512)[32:224, 64:448], "a cropped panorama"),
         (np.concatenate([_panorama(), np.roll(_panorama(), -3, 1)]), "one eye above the other"),
     ],
     ids=["over-under", "side by side", "vr180", "cropped", "square"],

@@ -3,17 +3,16 @@
 import json
 import logging
 from dataclasses import replace
-from fractions import Fraction
 from pathlib import Path
 
 import insta360_files as made
 import numpy as np
 import pytest
+from command import run_gsba
 from two_fisheyes import picture
-from typer.testing import CliRunner
+from video_files import encode, steady
 
 from gsba.camera.factory_lenses import FactoryCalibration, parse_factory_lenses
-from gsba.cli import app
 from gsba.config import VideoSettings
 from gsba.frames.factory_start import FACTORY_FILE
 from gsba.frames.scan import scan
@@ -34,22 +33,8 @@ TRAILER = made.trailer(made.usual_records())
 
 def _video(path: Path, *tracks: np.ndarray, trailer: bytes = b"") -> Path:
     """A video of NUM equal frames at 30 fps in each track, and what is appended to it."""
-    with av.open(str(path), "w", format="mp4") as container:
-        streams = []
-        for pixels in tracks:
-            stream = container.add_stream("libx264", rate=30, options={"crf": "12"})
-            stream.height, stream.width = pixels.shape[:2]
-            stream.pix_fmt = "yuv420p"
-            stream.time_base = stream.codec_context.time_base = Fraction(1, 90_000)
-            streams.append(stream)
-        for stream, pixels in zip(streams, tracks, strict=True):
-            for number in range(NUM):
-                frame = av.VideoFrame.from_ndarray(pixels, format="rgb24")
-                frame.pts, frame.time_base = 3000 * number, Fraction(1, 90_000)
-                container.mux(stream.encode(frame))
-            container.mux(stream.encode())
-    path.write_bytes(path.read_bytes() + trailer)
-    return path
+    shown = [([pixels] * NUM, steady(NUM)) for pixels in tracks]
+    return encode(path, *shown, container_format="mp4", trailer=trailer)
 
 
 def _name(folder: Path, lens: str) -> Path:
@@ -155,7 +140,7 @@ def test_black_pictures_are_refused_in_one_line(tmp_path: Path) -> None:
 @pytest.mark.skipif(not made.REAL.is_file(), reason="../shared/data/real is not there")
 def test_a_real_file_is_refused_for_its_darkness_and_its_gyro_is_listed(tmp_path: Path) -> None:
     asked = ["refine", made.REAL, "--no-trajectory", "--out", tmp_path / "run"]
-    result = CliRunner().invoke(app, list(map(str, asked)))
+    result = run_gsba(*asked)
     lines = result.output.strip().splitlines()
     assert result.exit_code == 1 and "its frames are black" in lines[-1]
     assert any("sample.insv: gyro, 1178 readings at 1000 Hz" in line for line in lines)

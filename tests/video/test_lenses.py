@@ -2,15 +2,14 @@
 
 import json
 import logging
-from fractions import Fraction
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from typer.testing import CliRunner, Result
+from command import fails, run_gsba
+from video_files import Track, encode, steady, times_of
 
-from gsba.cli import app
 from gsba.config import RefineSettings, VideoSettings
 from gsba.log import GsbaError
 from gsba.pipeline.inputs import extract_video
@@ -22,9 +21,7 @@ from gsba.video.recording import read_recording
 av = pytest.importorskip("av", reason="PyAV is not installed")
 
 SIDE, BITS = 96, 6
-TICK = Fraction(1, 90_000)
 EVERY = VideoSettings(every=1, standing_deg=0)
-Track = tuple[list[np.ndarray], list[int]]  # pictures, and the ticks at which they are shown
 
 
 def _texture(seed: int, height: int, width: int) -> np.ndarray:
@@ -63,28 +60,6 @@ def _read(path: Path) -> tuple[str, int]:
     return lens, sum(int(cell > 128) << bit for bit, cell in enumerate(cells))
 
 
-def _encode(path: Path, *tracks: Track, container_format: str | None = None) -> Path:
-    with av.open(str(path), "w", format=container_format) as container:
-        streams = []
-        for pictures, _ in tracks:
-            stream = container.add_stream("libx264", rate=30, options={"crf": "12"})
-            stream.height, stream.width = pictures[0].shape[:2]
-            stream.pix_fmt, stream.gop_size = "yuv420p", 12
-            stream.time_base = stream.codec_context.time_base = TICK
-            streams.append(stream)
-        for stream, (pictures, ticks) in zip(streams, tracks, strict=True):
-            for picture, tick in zip(pictures, ticks, strict=True):
-                frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
-                frame.pts, frame.time_base = int(tick), TICK
-                container.mux(stream.encode(frame))
-            container.mux(stream.encode())
-    return path
-
-
-def _steady(num: int) -> list[int]:
-    return [3000 * i for i in range(num)]
-
-
 def _seen(name: str, indices: list[int] | range, ticks: list[int], ahead: int = 0) -> Track:
     """A lens's track of some instants, each at its tick."""
     return [_lens(name, i) for i in indices], [ticks[i] + ahead for i in indices]
@@ -94,15 +69,9 @@ def _beside(front: np.ndarray, back: np.ndarray) -> np.ndarray:
     return np.concatenate([front, back], axis=1)
 
 
-def _times(folder: Path) -> dict[str, float]:
-    rows = (folder / "timestamps.csv").read_text().splitlines()
-    assert rows[0] == "name,timestamp"
-    return {name: float(time) for name, time in (row.split(",") for row in rows[1:])}
-
-
 def _check_shown(folder: Path, indices: list[int], ticks: list[int]) -> None:
     """The folder holds both lenses' pictures of just these instants, at their times."""
-    times = _times(folder)
+    times = times_of(folder)
     assert list(times) == [f"{i:06d}.jpg" for i in indices]
     expected = (np.array(ticks)[indices] - ticks[0]) / 90_000
     np.testing.assert_allclose(list(times.values()), expected, atol=1e-9)
@@ -118,8 +87,8 @@ def _check_shown(folder: Path, indices: list[int], ticks: list[int]) -> None:
 def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One file with a track for each lens, 40 instants at 30 fps."""
     path = tmp_path_factory.mktemp("film") / "VID_20240101_120000_00_001.insv"
-    tracks = [_seen(lens, range(40), _steady(40)) for lens in ("front", "back")]
-    return _encode(path, *tracks, container_format="mp4")
+    tracks = [_seen(lens, range(40), steady(40)) for lens in ("front", "back")]
+    return encode(path, *tracks, container_format="mp4")
 
 
 @pytest.mark.parametrize("suffix", ["mp4", "mkv"])
@@ -128,7 +97,7 @@ def test_two_tracks(tmp_path: Path, suffix: str) -> None:
     rng = np.random.default_rng(1)
     ticks = (90 * (np.cumsum(rng.integers(20, 60, 40)) + 700)).tolist()
     tracks = [_seen(lens, range(40), ticks) for lens in ("front", "back")]
-    video = _encode(tmp_path / f"v.{suffix}", *tracks)
+    video = encode(tmp_path / f"v.{suffix}", *tracks)
     counts = extract(video, tmp_path / "frames", VideoSettings(every=3, standing_deg=0))
     assert (counts.received, counts.kept) == (40, 14)
     _check_shown(tmp_path / "frames", list(range(0, 40, 3)), ticks)
@@ -144,9 +113,9 @@ def test_tracks_out_of_step(tmp_path: Path, caplog: pytest.LogCaptureFixture) ->
     """Frames pair by time, not by number: a lens late by a third of a frame, some frames gone."""
     front = [i for i in range(40) if i not in (7, 20)]
     back = [i for i in range(40) if i not in (5, 6, 20, 31)]
-    ticks = _steady(40)
+    ticks = steady(40)
     tracks = _seen("front", front, ticks), _seen("back", back, ticks, 1000)
-    video = _encode(tmp_path / "v.mp4", *tracks)
+    video = encode(tmp_path / "v.mp4", *tracks)
     with caplog.at_level(logging.INFO):
         counts = extract(video, tmp_path / "frames", EVERY)
     both = [i for i in front if i in back]
@@ -156,7 +125,7 @@ def test_tracks_out_of_step(tmp_path: Path, caplog: pytest.LogCaptureFixture) ->
     assert [_read(path) for path in paths[0]] == [("front", i) for i in both]
     assert [_read(path) for path in paths[1]] == [("back", i) for i in both]
     np.testing.assert_allclose(
-        list(_times(tmp_path / "frames").values()), np.array(both) / 30, atol=1e-9
+        list(times_of(tmp_path / "frames").values()), np.array(both) / 30, atol=1e-9
     )
     assert "4 instants are left out, which only one lens has (3 front, 1 back)" in caplog.text
     assert "two tracks of 96x96: front lens, back lens" in caplog.text
@@ -172,9 +141,9 @@ def test_tracks_out_of_step(tmp_path: Path, caplog: pytest.LogCaptureFixture) ->
     ],
 )
 def test_two_files(tmp_path: Path, names: tuple[str, str], given: int) -> None:
-    ticks = _steady(20)
+    ticks = steady(20)
     for name, lens in zip(names, ("front", "back"), strict=True):
-        _encode(tmp_path / name, _seen(lens, range(20), ticks), container_format="mp4")
+        encode(tmp_path / name, _seen(lens, range(20), ticks), container_format="mp4")
     video = tmp_path / names[given]
     assert is_video(video)
     extract(video, tmp_path / "frames", VideoSettings(fps=6, standing_deg=0))
@@ -184,10 +153,10 @@ def test_two_files(tmp_path: Path, names: tuple[str, str], given: int) -> None:
 def test_the_other_file_counts_for_what_was_extracted(tmp_path: Path) -> None:
     paths = [tmp_path / f"v{mark}1.mp4" for mark in ("_00_", "_10_")]
     for path, lens in zip(paths, ("front", "back"), strict=True):
-        _encode(path, _seen(lens, range(8), _steady(8)))
+        encode(path, _seen(lens, range(8), steady(8)))
     extract(paths[0], tmp_path / "frames", EVERY)
     extract(paths[1], tmp_path / "frames", EVERY)  # the same
-    _encode(paths[1], _seen("back", range(1, 9), _steady(9), -3000))
+    encode(paths[1], _seen("back", range(1, 9), steady(9), -3000))
     with pytest.raises(GsbaError, match="another extraction"):
         extract(paths[0], tmp_path / "frames", EVERY)
 
@@ -195,7 +164,7 @@ def test_the_other_file_counts_for_what_was_extracted(tmp_path: Path) -> None:
 def test_a_panorama_named_like_one_of_a_pair_is_a_panorama(tmp_path: Path) -> None:
     panorama = [_texture(i, SIDE, 2 * SIDE) for i in range(4)]
     for mark in ("_00_", "_10_"):
-        _encode(tmp_path / f"v{mark}1.mp4", (panorama, _steady(4)))
+        encode(tmp_path / f"v{mark}1.mp4", (panorama, steady(4)))
     extract(tmp_path / "v_00_1.mp4", tmp_path / "frames", EVERY)
     assert (tmp_path / "frames/000003.jpg").is_file()
     assert "lenses" not in json.loads((tmp_path / "frames/extract.json").read_text())
@@ -204,10 +173,10 @@ def test_a_panorama_named_like_one_of_a_pair_is_a_panorama(tmp_path: Path) -> No
 def test_side_by_side(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     pictures = [_beside(_lens("front", i), _lens("back", i)) for i in range(20)]
     pictures[10] = np.zeros_like(pictures[10])  # dark for a moment
-    video = _encode(tmp_path / "v.insv", (pictures, _steady(20)), container_format="mp4")
+    video = encode(tmp_path / "v.insv", (pictures, steady(20)), container_format="mp4")
     with caplog.at_level(logging.INFO):
         extract(video, tmp_path / "frames", VideoSettings(every=3, standing_deg=0))
-    _check_shown(tmp_path / "frames", list(range(0, 20, 3)), _steady(20))
+    _check_shown(tmp_path / "frames", list(range(0, 20, 3)), steady(20))
     assert "two fisheyes side by side, front left and back right" in caplog.text
 
 
@@ -215,7 +184,7 @@ def test_side_by_side(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
 def test_circles_smaller_and_larger_than_the_frame(tmp_path: Path, radius: float) -> None:
     lens = _texture(0, SIDE, SIDE)
     lens[_radius() > radius * SIDE] = 0
-    video = _encode(tmp_path / "v.mp4", ([_beside(lens, lens)] * 6, _steady(6)))
+    video = encode(tmp_path / "v.mp4", ([_beside(lens, lens)] * 6, steady(6)))
     assert read_recording(video).lenses == ("front", "back")
 
 
@@ -235,7 +204,7 @@ def _panorama(kind: str, index: int) -> np.ndarray:
 @pytest.mark.parametrize("kind", ["nadir", "bands", "night", "all but once"])
 def test_black_parts_make_no_fisheyes(tmp_path: Path, kind: str) -> None:
     pictures = [_panorama(kind, i) for i in range(12)]
-    video = _encode(tmp_path / "v.mp4", (pictures, _steady(12)))
+    video = encode(tmp_path / "v.mp4", (pictures, steady(12)))
     assert read_recording(video).lenses == ()
     extract(video, tmp_path / "frames", EVERY)
     assert cv2.imread(str(tmp_path / "frames/000004.jpg")).shape == (SIDE, 2 * SIDE, 3)
@@ -245,11 +214,11 @@ def test_sharpness_is_that_of_both_lenses(tmp_path: Path) -> None:
     """One lens is sharpest at the first instant, the other far sharper at the second."""
     front = [_lens("front", i, blur) for i, blur in enumerate((0, 1.0, 3.0))]
     back = [_lens("back", i, blur) for i, blur in enumerate((3.0, 0, 3.0))]
-    video = _encode(tmp_path / "v.mp4", (front, _steady(3)), (back, _steady(3)))
+    video = encode(tmp_path / "v.mp4", (front, steady(3)), (back, steady(3)))
     extract(video, tmp_path / "frames", VideoSettings(every=3, sharpest=True))
     assert _read(tmp_path / "frames/front/000001.jpg") == ("front", 1)
     assert _read(tmp_path / "frames/back/000001.jpg") == ("back", 1)
-    assert len(_times(tmp_path / "frames")) == 1
+    assert len(times_of(tmp_path / "frames")) == 1
 
 
 def test_a_standing_camera_is_left_out(tmp_path: Path) -> None:
@@ -257,18 +226,18 @@ def test_a_standing_camera_is_left_out(tmp_path: Path) -> None:
     tracks = []
     for lens in ("front", "back"):
         pictures = [_lens(lens, 0, shift=shift) for shift in shifts]
-        tracks.append((pictures, _steady(42)))
-    video = _encode(tmp_path / "v.mp4", *tracks)
+        tracks.append((pictures, steady(42)))
+    video = encode(tmp_path / "v.mp4", *tracks)
     counts = extract(video, tmp_path / "frames", VideoSettings(every=1))
     assert counts.dropped["while the camera stood"] == 20
-    kept = [int(name[:6]) for name in _times(tmp_path / "frames")]
+    kept = [int(name[:6]) for name in times_of(tmp_path / "frames")]
     assert kept == [*range(11), *range(31, 42)]
 
 
 def test_range_and_width(film: Path, tmp_path: Path) -> None:
     settings = VideoSettings(every=5, from_s=0.5, to_s=1.0, width=64, standing_deg=0)
     extract(film, tmp_path / "frames", settings)
-    _check_shown(tmp_path / "frames", [15, 20, 25, 30], _steady(40))
+    _check_shown(tmp_path / "frames", [15, 20, 25, 30], steady(40))
     assert cv2.imread(str(tmp_path / "frames/back/000015.jpg")).shape == (64, 64, 3)
     with pytest.raises(GsbaError, match="has only 96 pixels"):
         extract(film, tmp_path / "wide", VideoSettings(width=128))
@@ -279,8 +248,8 @@ def test_nearly_square_pictures_stay_whole(tmp_path: Path) -> None:
     tracks = []
     for lens in ("front", "back"):
         pictures = [cv2.copyMakeBorder(_lens(lens, i), 0, 0, 4, 4, 0) for i in range(6)]
-        tracks.append((pictures, _steady(6)))
-    video = _encode(tmp_path / "v.mp4", *tracks)
+        tracks.append((pictures, steady(6)))
+    video = encode(tmp_path / "v.mp4", *tracks)
     extract(video, tmp_path / "frames", EVERY)
     for n in range(6):
         for lens in ("front", "back"):
@@ -322,12 +291,12 @@ def test_an_interrupted_extraction_goes_on(
     extract(film, parts, settings)  # complete: nothing to do
     assert len(calls) == 6 + 16
     extract(film, other, VideoSettings(every=20, standing_deg=0), replace=True)
-    _check_shown(other, [0, 20], _steady(40))  # nothing of the interrupted call is left
+    _check_shown(other, [0, 20], steady(40))  # nothing of the interrupted call is left
 
 
 def test_raw_and_stitched_extractions_replace_each_other(film: Path, tmp_path: Path) -> None:
     panorama = [_texture(i, SIDE, 2 * SIDE) for i in range(4)]
-    stitched = _encode(tmp_path / "v.mp4", (panorama, _steady(4)))
+    stitched = encode(tmp_path / "v.mp4", (panorama, steady(4)))
     out = tmp_path / "frames"
     extract(film, out, VideoSettings(every=10))
     with pytest.raises(GsbaError, match="another extraction"):
@@ -345,24 +314,13 @@ def test_frames_of_a_run(film: Path, tmp_path: Path) -> None:
     run, settings = tmp_path / "run", RefineSettings(video=VideoSettings(every=10))
     with RunStore(run, {"frames": film}) as store:
         extract_video(store, film, settings, None)
-    _check_shown(run / "frames", [0, 10, 20, 30], _steady(40))
+    _check_shown(run / "frames", [0, 10, 20, 30], steady(40))
     with RunStore(run, {"frames": film}, fresh=True):
         assert not (run / "frames").exists()  # all of it was claimed
 
 
-def _gsba(*arguments: object) -> Result:
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
-
-
-def _fails(result: Result, message: str) -> None:
-    lines = result.stderr.splitlines()
-    assert len(lines) == 1 and lines[0].startswith("error: "), result.stderr
-    assert message in lines[0], lines[0]
-    assert result.exit_code == 1
-
-
 def _of_size(width: int, height: int, num: int = 4) -> Track:
-    return [_texture(i, height, width) for i in range(num)], _steady(num)
+    return [_texture(i, height, width) for i in range(num)], steady(num)
 
 
 @pytest.mark.parametrize(
@@ -378,39 +336,45 @@ def _of_size(width: int, height: int, num: int = 4) -> Track:
     ],
 )
 def test_other_tracks_are_refused(tmp_path: Path, tracks: list[Track], message: str) -> None:
-    video = _encode(tmp_path / "v.mp4", *tracks)
-    _fails(_gsba("extract", video, "--out", tmp_path / "f"), message)
+    video = encode(tmp_path / "v.mp4", *tracks)
+    fails(run_gsba("extract", video, "--out", tmp_path / "f"), message)
 
 
 def test_lenses_that_do_not_match_are_refused(tmp_path: Path) -> None:
     out = ("--out", tmp_path / "f")
-    front, ticks = _seen("front", range(20), _steady(60)), _steady(60)
+    front, ticks = _seen("front", range(20), steady(60)), steady(60)
     later = ([_lens("back", i) for i in range(20)], ticks[30:50])
-    video = _encode(tmp_path / "later.mp4", front, later)
-    _fails(_gsba("extract", video, *out), "the lenses share no times (front 0 to 0.633 s, back 1.0")
-    video = _encode(tmp_path / "short.mp4", front, _seen("back", range(17), ticks))
-    result = _gsba("extract", video, *out)
-    _fails(
+    video = encode(tmp_path / "later.mp4", front, later)
+    fails(
+        run_gsba("extract", video, *out), "the lenses share no times (front 0 to 0.633 s, back 1.0"
+    )
+    video = encode(tmp_path / "short.mp4", front, _seen("back", range(17), ticks))
+    result = run_gsba("extract", video, *out)
+    fails(
         result, "the back lens's pictures last 0.567 s, the front one's 0.667 s: one is truncated"
     )
-    _fails(result, "pass --to 0.533")
-    assert _gsba("extract", video, *out, "--to", 0.533, "--every", 4).exit_code == 0
-    video = _encode(tmp_path / "alike.mp4", front, _seen("back", range(18), ticks))
-    assert _gsba("extract", video, "--out", tmp_path / "g").exit_code == 0
+    fails(result, "pass --to 0.533")
+    assert run_gsba("extract", video, *out, "--to", 0.533, "--every", 4).exit_code == 0
+    video = encode(tmp_path / "alike.mp4", front, _seen("back", range(18), ticks))
+    assert run_gsba("extract", video, "--out", tmp_path / "g").exit_code == 0
 
 
 def test_files_that_do_not_match_are_refused(tmp_path: Path) -> None:
     out = ("--out", tmp_path / "f")
     front, back = tmp_path / "v_00_1.insv", tmp_path / "v_10_1.insv"
-    _encode(front, _seen("front", range(20), _steady(20)), container_format="mp4")
-    _fails(_gsba("extract", front, *out), "v_10_1.insv is not beside it: copy the other lens's")
-    _encode(back, _of_size(64, 64, 20), container_format="mp4")
-    _fails(_gsba("extract", front, *out), "v_10_1.insv is 64x64, but v_00_1.insv, the front lens's")
-    _fails(_gsba("extract", back, *out), "v_10_1.insv is 64x64, but v_00_1.insv, the front lens's")
-    _encode(back, _seen("back", range(10), _steady(20)), container_format="mp4")
-    _fails(_gsba("extract", front, *out), "v_10_1.insv: the back lens's pictures last 0.333 s")
+    encode(front, _seen("front", range(20), steady(20)), container_format="mp4")
+    fails(run_gsba("extract", front, *out), "v_10_1.insv is not beside it: copy the other lens's")
+    encode(back, _of_size(64, 64, 20), container_format="mp4")
+    fails(
+        run_gsba("extract", front, *out), "v_10_1.insv is 64x64, but v_00_1.insv, the front lens's"
+    )
+    fails(
+        run_gsba("extract", back, *out), "v_10_1.insv is 64x64, but v_00_1.insv, the front lens's"
+    )
+    encode(back, _seen("back", range(10), steady(20)), container_format="mp4")
+    fails(run_gsba("extract", front, *out), "v_10_1.insv: the back lens's pictures last 0.333 s")
     back.write_bytes(b"no video")
-    _fails(_gsba("extract", front, *out), "v_10_1.insv: cannot be read as video")
+    fails(run_gsba("extract", front, *out), "v_10_1.insv: cannot be read as video")
     front.unlink()
-    _encode(back, _seen("back", range(4), _steady(4)), container_format="mp4")
-    _fails(_gsba("extract", back, *out), "v_00_1.insv is not beside it")
+    encode(back, _seen("back", range(4), steady(4)), container_format="mp4")
+    fails(run_gsba("extract", back, *out), "v_00_1.insv is not beside it")

@@ -1,12 +1,12 @@
 """A video refined in one call is its extracted folder, refined."""
 
-from fractions import Fraction
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from tiny_run import SETTINGS, Case, computed_stages
+from video_files import encode
 
 from gsba import refine
 from gsba.config import VideoSettings
@@ -14,24 +14,15 @@ from gsba.log import GsbaError
 from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.video import extract
 
-av = pytest.importorskip("av", reason="PyAV is not installed")
+pytest.importorskip("av", reason="PyAV is not installed")
 
 
 @pytest.mark.slow
 def test_video_and_folder_give_the_same(case: Case, tmp_path: Path) -> None:
     video = tmp_path / "walk.mp4"
     walk = case.result.frames
-    with av.open(str(video), "w") as container:
-        stream = container.add_stream("libx264", rate=30, options={"crf": "12"})
-        shown = walk.format
-        stream.width, stream.height, stream.pix_fmt = shown.width, shown.height, "yuv420p"
-        stream.time_base = stream.codec_context.time_base = Fraction(1, 90_000)
-        for (path,), time in zip(walk.paths, walk.timestamps, strict=True):
-            picture = cv2.imread(str(path))
-            frame = av.VideoFrame.from_ndarray(picture, format="bgr24")
-            frame.pts, frame.time_base = round(time * 90_000), Fraction(1, 90_000)
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode())
+    pictures = [cv2.cvtColor(cv2.imread(str(p)), cv2.COLOR_BGR2RGB) for (p,) in walk.paths]
+    encode(video, (pictures, np.rint(90_000 * walk.timestamps)))
     settings = SETTINGS.model_copy(update={"video": VideoSettings(every=1)})
     out = tmp_path / "from-video"
     direct = refine(video, case.slam, out, settings)

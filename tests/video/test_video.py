@@ -1,15 +1,14 @@
 """Frames from videos made here: which, when, how sharp, resumed, and what is refused."""
 
 import json
-from fractions import Fraction
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from typer.testing import CliRunner, Result
+from command import fails, run_gsba
+from video_files import encode, steady, times_of
 
-from gsba.cli import app
 from gsba.config import VideoSettings
 from gsba.frames.scan import scan
 from gsba.log import GsbaError
@@ -22,7 +21,7 @@ from gsba.video.likeness import apparent_motion_deg, miniature, sharpness
 av = pytest.importorskip("av", reason="PyAV is not installed")
 
 HEIGHT, WIDTH, BITS = 128, 256, 10
-TICK = Fraction(1, 90_000)
+NTSC = 3003  # ticks between frames at 29.97 per second
 
 
 def _world(seed: int = 0, width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
@@ -51,45 +50,15 @@ def _index_in(image: np.ndarray) -> int:
     return sum(int(cell > 128) << bit for bit, cell in enumerate(cells))
 
 
-def _encode(
-    path: Path, pictures: list[np.ndarray], ticks: list[int], codec: str = "libx264"
-) -> Path:
-    """A video whose pictures are shown at exactly the given ticks."""
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream(
-            codec, rate=30, options={"crf": "12", "x265-params": "log-level=none"}
-        )
-        stream.height, stream.width = pictures[0].shape[:2]
-        stream.pix_fmt, stream.gop_size = "yuv420p", 12
-        stream.time_base = stream.codec_context.time_base = TICK
-        for picture, tick in zip(pictures, ticks, strict=True):
-            frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
-            frame.pts, frame.time_base = tick, TICK
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode())
-    return path
-
-
-def _steady(num: int) -> list[int]:
-    """Ticks of 29.97 frames per second."""
-    return [3003 * i for i in range(num)]
-
-
 @pytest.fixture(scope="module")
 def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """90 frames of a turning camera at 29.97 fps; every seventh is sharp, the others blurred."""
     pictures = [_picture(i, 1.5 * i, 0 if i % 7 == 3 else 1.5) for i in range(90)]
-    return _encode(tmp_path_factory.mktemp("film") / "walk.mp4", pictures, _steady(90))
+    return encode(tmp_path_factory.mktemp("film") / "walk.mp4", (pictures, steady(90, NTSC)))
 
 
 def _indices(folder: Path) -> list[int]:
     return [_index_in(cv2.imread(str(p))) for p in sorted(folder.glob("*.jpg"))]
-
-
-def _times(folder: Path) -> dict[str, float]:
-    rows = (folder / "timestamps.csv").read_text().splitlines()
-    assert rows[0] == "name,timestamp"
-    return {name: float(time) for name, time in (row.split(",") for row in rows[1:])}
 
 
 @pytest.mark.parametrize(
@@ -102,10 +71,10 @@ def test_times_are_those_of_presentation(tmp_path: Path, suffix: str, codec: str
     rng = np.random.default_rng(1)
     milliseconds = np.cumsum(rng.integers(20, 60, 40)) + 700  # what Matroska can express
     pictures = [_picture(i, 2 * i) for i in range(40)]
-    video = _encode(tmp_path / f"v.{suffix}", pictures, [90 * int(t) for t in milliseconds], codec)
+    video = encode(tmp_path / f"v.{suffix}", (pictures, 90 * milliseconds), codec=codec)
     counts = extract(video, tmp_path / "frames", VideoSettings(every=3))
     assert (counts.received, counts.kept) == (40, 14)
-    times = _times(tmp_path / "frames")
+    times = times_of(tmp_path / "frames")
     expected = (milliseconds - milliseconds[0])[::3] / 1e3
     np.testing.assert_allclose(list(times.values()), expected, atol=1e-9)
     assert list(times) == [f"{i:06d}.jpg" for i in range(0, 40, 3)]
@@ -121,7 +90,7 @@ def test_one_frame_a_second_and_the_sharpest_of_it(film: Path, tmp_path: Path) -
     extract(film, tmp_path / "sharp", VideoSettings(fps=3, sharpest=True))
     chosen = _indices(tmp_path / "sharp")
     assert len(chosen) == 9 and all(i % 7 == 3 for i in chosen)
-    times = list(_times(tmp_path / "sharp").values())
+    times = list(times_of(tmp_path / "sharp").values())
     np.testing.assert_allclose(times, np.array(chosen) * 1001 / 30_000, atol=1e-9)
 
 
@@ -151,7 +120,7 @@ def test_a_standing_camera_is_left_out_even_while_people_pass(tmp_path: Path) ->
     pictures = [_picture(i, yaw) for i, yaw in enumerate(yaws)]
     for i, picture in enumerate(pictures):  # somebody walks through
         cv2.rectangle(picture, (6 * i, 50), (6 * i + 20, 90), (200, 30, 30), -1)
-    video = _encode(tmp_path / "v.mp4", pictures, _steady(42))
+    video = encode(tmp_path / "v.mp4", (pictures, steady(42, NTSC)))
     counts = extract(video, tmp_path / "frames", VideoSettings(every=1))
     assert _indices(tmp_path / "frames") == [*range(11), *range(31, 42)]
     assert counts.dropped["while the camera stood"] == 20
@@ -261,38 +230,27 @@ def test_colours_survive(tmp_path: Path) -> None:
     np.testing.assert_allclose(back[64, 192].astype(int), (40, 90, 170), atol=4)
 
 
-def _gsba(*arguments: object) -> Result:
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
-
-
-def _fails(result: Result, message: str) -> None:
-    lines = result.stderr.splitlines()
-    assert len(lines) == 1 and lines[0].startswith("error: "), result.stderr
-    assert message in lines[0], lines[0]
-    assert result.exit_code == 1
-
-
 def test_command(film: Path, tmp_path: Path) -> None:
-    result = _gsba("extract", film, "--out", tmp_path / "f", "--every", 30, "--width", 64)
+    result = run_gsba("extract", film, "--out", tmp_path / "f", "--every", 30, "--width", 64)
     assert result.exit_code == 0 and result.stdout.startswith("3 of 90 frames kept")
-    _fails(_gsba("extract", film, "--out", tmp_path / "f"), "holds another extraction")
-    assert _gsba("extract", film, "--out", tmp_path / "f", "--fresh").exit_code == 0
+    fails(run_gsba("extract", film, "--out", tmp_path / "f"), "holds another extraction")
+    assert run_gsba("extract", film, "--out", tmp_path / "f", "--fresh").exit_code == 0
 
 
 def test_bad_options(film: Path, tmp_path: Path) -> None:
     out = ("--out", tmp_path / "f")
-    _fails(_gsba("extract", film, *out, "--fps", 1, "--every", 2), "pass one")
-    _fails(_gsba("extract", film, *out, "--fps", -1), "video.fps = -1.0 is not allowed")
-    _fails(_gsba("extract", film, *out, "--width", 999), "video.width")
-    _fails(_gsba("extract", film, *out, "--width", 99999), "use an even integer >= 64")
-    _fails(_gsba("extract", tmp_path, *out), "is a folder: give a video")
-    _fails(_gsba("extract", film, *out, "--width", 512), "has only 256 pixels")
-    _fails(_gsba("extract", film, *out, "--from", 2, "--to", 1), "later than --from")
-    _fails(_gsba("extract", film, *out, "--from", 20), "no frame between 20 and inf s")
-    _fails(_gsba("extract", film, *out, "--at", tmp_path / "x.tum"), "x.tum: ")
-    _fails(_gsba("extract", film, *out, "--at", "x.tum", "--sharpest"), "leave out --sharpest")
-    _fails(_gsba("extract", tmp_path / "none.mp4", *out), "none.mp4: no such file")
-    _fails(_gsba("extract", film, "--out", film), "is a file")
+    fails(run_gsba("extract", film, *out, "--fps", 1, "--every", 2), "pass one")
+    fails(run_gsba("extract", film, *out, "--fps", -1), "video.fps = -1.0 is not allowed")
+    fails(run_gsba("extract", film, *out, "--width", 999), "video.width")
+    fails(run_gsba("extract", film, *out, "--width", 99999), "use an even integer >= 64")
+    fails(run_gsba("extract", tmp_path, *out), "is a folder: give a video")
+    fails(run_gsba("extract", film, *out, "--width", 512), "has only 256 pixels")
+    fails(run_gsba("extract", film, *out, "--from", 2, "--to", 1), "later than --from")
+    fails(run_gsba("extract", film, *out, "--from", 20), "no frame between 20 and inf s")
+    fails(run_gsba("extract", film, *out, "--at", tmp_path / "x.tum"), "x.tum: ")
+    fails(run_gsba("extract", film, *out, "--at", "x.tum", "--sharpest"), "leave out --sharpest")
+    fails(run_gsba("extract", tmp_path / "none.mp4", *out), "none.mp4: no such file")
+    fails(run_gsba("extract", film, "--out", film), "is a file")
 
 
 @pytest.mark.parametrize(
@@ -301,8 +259,8 @@ def test_bad_options(film: Path, tmp_path: Path) -> None:
 )
 def test_other_shapes_are_refused(tmp_path: Path, size: tuple[int, int], message: str) -> None:
     pictures = [_world(i, *size) for i in range(3)]
-    video = _encode(tmp_path / "v.mp4", pictures, _steady(3))
-    _fails(_gsba("extract", video, "--out", tmp_path / "f"), message)
+    video = encode(tmp_path / "v.mp4", (pictures, steady(3, NTSC)))
+    fails(run_gsba("extract", video, "--out", tmp_path / "f"), message)
 
 
 def test_broken_files_are_one_line(film: Path, tmp_path: Path) -> None:
@@ -310,11 +268,11 @@ def test_broken_files_are_one_line(film: Path, tmp_path: Path) -> None:
     files = {"text.mp4": b"not a video" * 99, "empty.mp4": b"", "cut.mp4": data[: len(data) // 2]}
     for name, content in files.items():  # an MP4 has its index at the end: half of it has none
         (tmp_path / name).write_bytes(content)
-        result = _gsba("extract", tmp_path / name, "--out", tmp_path / "f")
-        _fails(result, f"{name}: cannot be read as video")
+        result = run_gsba("extract", tmp_path / name, "--out", tmp_path / "f")
+        fails(result, f"{name}: cannot be read as video")
     odd = tmp_path / "odd.mp4"
     odd.write_bytes(data.replace(b"avc1", b"zzzz").replace(b"avcC", b"zzzC"))
-    _fails(_gsba("extract", odd, "--out", tmp_path / "f"), "there is no decoder for its codec")
+    fails(run_gsba("extract", odd, "--out", tmp_path / "f"), "there is no decoder for its codec")
 
 
 def test_names_of_another_encoding_do_not_matter(film: Path, tmp_path: Path) -> None:
@@ -323,7 +281,7 @@ def test_names_of_another_encoding_do_not_matter(film: Path, tmp_path: Path) -> 
     assert b"VideoHandler" in data
     odd = tmp_path / "odd.mp4"
     odd.write_bytes(data.replace(b"VideoHandler", b"Vid\xe9oHandle\xff"))
-    assert _gsba("extract", odd, "--out", tmp_path / "f").exit_code == 0
+    assert run_gsba("extract", odd, "--out", tmp_path / "f").exit_code == 0
     assert _indices(tmp_path / "f")
 
 
@@ -337,10 +295,10 @@ def test_a_truncated_video_says_how_far_it_goes(film: Path, tmp_path: Path) -> N
                 target.mux(packet)
     cut = tmp_path / "cut.mkv"
     cut.write_bytes(whole.read_bytes()[: int(0.5 * whole.stat().st_size)])
-    result = _gsba("extract", cut, "--out", tmp_path / "f")
-    _fails(result, "truncated; copy it again, or pass --to")
+    result = run_gsba("extract", cut, "--out", tmp_path / "f")
+    fails(result, "truncated; copy it again, or pass --to")
     end = result.stderr.split("--to ")[1].split()[0]
-    assert _gsba("extract", cut, "--out", tmp_path / "f", "--to", end).exit_code == 0
+    assert run_gsba("extract", cut, "--out", tmp_path / "f", "--to", end).exit_code == 0
     assert 0 in _indices(tmp_path / "f")
 
 
@@ -348,8 +306,8 @@ def test_missing_library_is_one_line(
     film: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(__import__("sys").modules, "av", None)
-    result = _gsba("extract", film, "--out", tmp_path / "f")
-    _fails(result, "reading video needs PyAV: pip install 'gsba[video]'")
+    result = run_gsba("extract", film, "--out", tmp_path / "f")
+    fails(result, "reading video needs PyAV: pip install 'gsba[video]'")
 
 
 @pytest.mark.parametrize("kind", ["yuv420p", "yuvj420p", "nv12", "yuv420p10le"])

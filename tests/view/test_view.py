@@ -17,13 +17,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from command import run_gsba
 from scipy.spatial.transform import Rotation
 from tiny_run import NUM_FRAMES, Case
-from typer.testing import CliRunner
 
 from gsba import view
 from gsba.camera.rig import RIG_R_FACE, CubeRig
-from gsba.cli import app
 from gsba.geometry import rotation_from_quaternion
 from gsba.log import GsbaError
 from gsba.placement.world import Placement, read_placement
@@ -303,7 +302,7 @@ def _wait_for(happened, seconds: float = 10.0) -> None:
 
 
 def _view_fails(*arguments: object) -> str:
-    result = CliRunner().invoke(app, ["view", *map(str, arguments)])
+    result = run_gsba("view", *arguments)
     lines = result.stderr.splitlines()
     assert (result.exit_code, result.stdout, len(lines)) == (1, "", 1), result.stderr
     return lines[0]
