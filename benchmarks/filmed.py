@@ -26,7 +26,7 @@ from filmed_camera import ALL, EFFECTS, HAND_MOTION, Camera, Hands, write_film
 from gsba.demo.degrade import degrade
 from gsba.demo.gallery import build_gallery
 from gsba.demo.raycast import Scene
-from gsba.demo.walk import held_by_hand, walk_poses
+from gsba.demo.walk import walk_poses
 from gsba.evaluate.pixels import depth_maps, induced_errors
 from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.types import Trajectory
@@ -128,10 +128,7 @@ def cells(rows: list[dict[str, Any]], ideal: float | None) -> list[str]:
     if ideal:
         found["ratio"] = found["ate"] / ideal
     lost = f" ({len(rows) - len(ended)} failed)" if len(ended) < len(rows) else ""
-    texts = [
-        format(factor * found[key], form) if key in found else ""
-        for key, _, factor, form in COLUMNS
-    ]
+    texts = [format(x * found[key], form) if key in found else "" for key, _, x, form in COLUMNS]
     return [texts[0] + lost, *texts[1:]]
 
 

@@ -72,7 +72,7 @@ class Hands:
     def __init__(self, walk: Trajectory, seed: int) -> None:
         rng = np.random.default_rng([seed, 7])
         self.walk = walk
-        self._at = CubicSpline(walk.timestamps, walk.world_T_rigs[:, :3, 3])
+        self.walked = CubicSpline(walk.timestamps, walk.world_T_rigs[:, :3, 3])
         self._turn = RotationSpline(
             walk.timestamps, Rotation.from_matrix(walk.world_T_rigs[:, :3, :3])
         )
@@ -89,7 +89,7 @@ class Hands:
         inside = np.clip(times, self.walk.timestamps[0], self.walk.timestamps[-1])
         hand = Rotation.from_rotvec(self._hand_turn(times + self._offset))
         rotations = (hand * self._turn(inside)).as_matrix()
-        return pose(rotations, self._at(inside) + self._hand_shift(times + self._offset))
+        return pose(rotations, self.walked(inside) + self._hand_shift(times + self._offset))
 
 
 def _recorded() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -165,11 +165,13 @@ class Camera:
             burst = []
             for k in range(bursts):
                 at = time - (bursts - 1 - k) / VIDEO_FPS
-                views = [look.processed(self.record(at, side, f), f) for side in (1.0, -1.0)]
+                samples = BLUR_SAMPLES if k == bursts - 1 else 2
+                recorded = [self.record(at, side, f, samples) for side in (1.0, -1.0)]
+                views = [look.processed(view, f) for view in recorded]
                 burst.append(self._stitched(*views, at, rng))
             yield burst
 
-    def record(self, time: float, facing: float, f: int) -> View:
+    def record(self, time: float, facing: float, f: int, samples: int) -> View:
         """Radiance that one lens gathers: its rows, exposure, and people in front of it."""
         lens = TwoLenses()
         baseline = lens.baseline if "lenses" in self.effects else 0.0
@@ -179,7 +181,7 @@ class Camera:
         exposures = np.zeros(1)
         if "blur" in self.effects:
             exposed_s = np.clip(0.010 / self.metered[f], 0.002, 0.020)
-            exposures = exposed_s * ((np.arange(BLUR_SAMPLES) + 0.5) / BLUR_SAMPLES - 0.5)
+            exposures = exposed_s * ((np.arange(samples) + 0.5) / samples - 0.5)
         total = 0.0
         for e in exposures:
             poses = self.hands.poses(time + e + after)
@@ -204,7 +206,7 @@ class Camera:
         for k, (lead, tone) in enumerate(((5.0, (0.5, 0.2, 0.15)), (14.0, (0.12, 0.2, 0.4)))):
             span = walk.timestamps[-1] - walk.timestamps[0]
             met = walk.timestamps[0] + (2 * lead - 0.8 * (time - walk.timestamps[0])) % span
-            centre = self.hands._at(met) + [0.45, 0.65, 0.35]
+            centre = self.hands.walked(met) + np.array([0.45, 0.65, 0.35])
             distance, at = _ellipsoid(origin, rays, centre, np.array([0.24, 0.85, 0.2]))
             rows = np.flatnonzero(distance > 0)
             free = ranges(self.scene, origin, rays[rows])
