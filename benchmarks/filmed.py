@@ -5,7 +5,7 @@
 
 Walks through scenes of `gsba demo` are filmed by the camera of `filmed_camera.py`, with the motion
 of real hands where that recording is on the machine. `ideal` has no effect, `each` stands for every
-effect alone, `all` for all of them, and `a+b` for these two. Each film is refined from a trajectory
+effect alone, `all` for all of them, `a+b` for these two, and `all-a` for all but one. Each film is refined from a trajectory
 with drift and without any, and with `--peer` by COLMAP's panorama mode. Films and rows are kept in
 WORK and used again while the code and the film stay the same. Errors are root mean squares, except
 the induced pixel error (median, of neighbouring frames).
@@ -107,11 +107,12 @@ def asked(words: list[str]) -> dict[str, frozenset[str]]:
         if word == "each":
             found |= {name: frozenset([name]) for name in EFFECTS}
         else:
-            named = {"ideal": frozenset(), "all": ALL}.get(word, frozenset(word.split("+")))
-            named = ALL | (named - {"all"}) if "all" in named else named
-            if unknown := named - set(EFFECTS):
+            some, *less = word.split("-")
+            named = frozenset(some.split("+")) - {"ideal"}
+            named = ALL | named - {"all"} if "all" in named else named
+            if unknown := (named | set(less)) - set(EFFECTS):
                 raise SystemExit(f"--effects: {', '.join(unknown)} is none of {', '.join(EFFECTS)}")
-            found[word] = named
+            found[word] = named - set(less)
     return found
 
 

@@ -72,10 +72,11 @@ class Hands:
     def __init__(self, walk: Trajectory, seed: int) -> None:
         rng = np.random.default_rng([seed, 7])
         self.walk = walk
+        steady = np.concatenate([[-1.0], walk.timestamps, [walk.timestamps[-1] + 1]])
+        rows = np.clip(np.arange(-1, len(walk.timestamps) + 1), 0, len(walk.timestamps) - 1)
+        turns = Rotation.from_matrix(walk.world_T_rigs[rows, :3, :3])
         self.walked = CubicSpline(walk.timestamps, walk.world_T_rigs[:, :3, 3])
-        self._turn = RotationSpline(
-            walk.timestamps, Rotation.from_matrix(walk.world_T_rigs[:, :3, :3])
-        )
+        self._turn = RotationSpline(steady, turns)  # which does not extrapolate
         self.recorded = HAND_MOTION.exists()
         times, turns, shifts = _recorded() if self.recorded else _invented(walk, rng)
         span = walk.timestamps[-1] - walk.timestamps[0] + 2
@@ -86,10 +87,9 @@ class Hands:
 
     def poses(self, times: np.ndarray) -> np.ndarray:
         """Poses world_T_rig (N, 4, 4) at times (N,), seconds of the walk."""
-        inside = np.clip(times, self.walk.timestamps[0], self.walk.timestamps[-1])
         hand = Rotation.from_rotvec(self._hand_turn(times + self._offset))
-        rotations = (hand * self._turn(inside)).as_matrix()
-        return pose(rotations, self.walked(inside) + self._hand_shift(times + self._offset))
+        rotations = (hand * self._turn(times)).as_matrix()
+        return pose(rotations, self.walked(times) + self._hand_shift(times + self._offset))
 
 
 def _recorded() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
