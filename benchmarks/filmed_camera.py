@@ -29,7 +29,7 @@ from gsba.demo.walk import JPEG_QUALITY, NOISE
 from gsba.geometry import pose
 from gsba.types import Trajectory
 
-HAND_MOTION = Path("/work/shared/data/real/hand_motion/floor_2_2025-10-28_run_2.txt")
+HAND_MOTION = Path("../shared/data/real/hand_motion/floor_2_2025-10-28_run_2.txt")
 EFFECTS = {
     "lenses": "lenses 32 mm apart, stitched at infinity, whatever the depth is",
     "rows": "rows read one after another, 12 ms a frame",
