@@ -32,7 +32,7 @@ import llvmlite
 import numba
 import numpy as np
 from llvmlite.binding import get_host_cpu_name
-from numba.core import config
+from numba.core import config, types
 from numba.core.caching import _Cache
 from numba.core.compiler import CompileResult
 from numba.core.dispatcher import Dispatcher
@@ -102,8 +102,11 @@ class KernelCache(_Cache):
             self._lock = None
 
     def _path(self, sig: Any, codegen: Any) -> Path:
-        args = getattr(sig, "args", sig)
-        facts = (digest(self._kernel), str(tuple(args)), codegen.magic_tuple(), versions())
+        args = tuple(getattr(sig, "args", sig))
+        # Types of records are found by their modules when a kernel is loaded.
+        records = [each.instance_class for each in args if isinstance(each, types.BaseNamedTuple)]
+        homes = "".join(f" {each.__module__}.{each.__qualname__}" for each in records)
+        facts = (digest(self._kernel), f"{args}{homes}", codegen.magic_tuple(), versions())
         name = hashlib.sha256(repr(facts).encode()).hexdigest()[:24]
         return cache_folder() / f"{self._kernel.py_func.__name__.strip('_')}-{name}.kernel"
 

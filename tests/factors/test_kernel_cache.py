@@ -92,6 +92,21 @@ def test_a_kernel_is_renewed_when_what_it_uses_changes(package: Path, tmp_path: 
     assert start(elsewhere, cache).stdout.split() == ["6.0"]  # older kernels were kept
 
 
+def test_a_kernel_is_renewed_when_a_record_that_it_takes_moves(
+    package: Path, tmp_path: Path
+) -> None:
+    """Its file names the module of the record's type, which is no more there."""
+    record = "from typing import NamedTuple\nclass Pair(NamedTuple):\n    x: float\n"
+    kernel = "@kernel\ndef first(pair):\n    return pair.x + 0.0\n"
+    call = "def twice(x):\n    return first(Pair(2 * x))\n"
+    for home in ("one", "two"):
+        (package / "one.py").unlink(missing_ok=True)
+        (package / f"{home}.py").write_text(record)
+        text = f"from parts import kernel\nfrom {home} import Pair\n{kernel}{call}"
+        (package / "kernels.py").write_text(text)
+        assert start(package, tmp_path / "cache").stdout.split() == ["6.0", "first"]
+
+
 def test_kernels_for_another_processor_are_kept_apart(package: Path, tmp_path: Path) -> None:
     cache = tmp_path / "cache"
     for processor in ("generic", "x86-64-v2" if platform.machine() == "x86_64" else "cortex-a57"):
