@@ -14,7 +14,7 @@ root mean squares, except the induced pixel error (median, of neighbouring frame
 import argparse
 import shutil
 import sys
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -75,18 +75,17 @@ def refined(film: Path, start: str, home: Path, sets: list[str]) -> dict[str, An
     run = home / "run"
     frames = film / "images"
     key = {"film": digest(sorted(frames.iterdir())), "sets": sets}
-    finish: Callable[[], dict[str, Any]]
     if start == "peer":
         key |= {"peer": "spherical-incremental"}
         script = Path(__file__).with_name("peer.py")
         command = [sys.executable, str(script), "spherical-incremental", str(frames), str(run)]
-        finish = lambda: judged_peer(run, truth)  # noqa: E731
+        finish = partial(judged_peer, run, truth)
     else:
         key |= {"code": code_digest()}
         options = [str(film / "slam.tum")] if start == "trajectory" else ["--no-trajectory"]
         options += [word for one in sets for word in ("--set", one)]
         command = refine_command(frames, run, options)
-        finish = lambda: _outcome(run, film, truth)  # noqa: E731
+        finish = partial(_outcome, run, film, truth)
     row = kept_row(home, key, TIMEOUT_S)
     return row or run_row(command, home, {"key": key, "start": start}, finish, TIMEOUT_S)
 

@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from learned import turned
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, RotationSpline
@@ -25,8 +26,10 @@ from gsba.demo.gait import KNOTS, STEPS_HZ, SWING_DEG, SWING_UNITS
 from gsba.demo.raycast import Scene, ranges
 from gsba.demo.render import EXPOSURE, Eye, render_eye
 from gsba.demo.two_lenses import SWEEP, TwoLenses
-from gsba.demo.walk import JPEG_QUALITY, NOISE
+from gsba.demo.walk import JPEG_QUALITY, NOISE, write_depth
+from gsba.disk import write_image
 from gsba.geometry import pose
+from gsba.trajectory.files import write_tum
 from gsba.types import Trajectory
 
 HAND_MOTION = Path("../shared/data/real/hand_motion/floor_2_2025-10-28_run_2.txt")
@@ -60,7 +63,7 @@ _MARGIN_DEG = 14.0  # each lens is rendered to this angle beyond the seam: filte
 
 
 class View(NamedTuple):
-    """What a lens records of one frame."""
+    """Record of one frame by one lens."""
 
     facing: float  # 1 front, -1 back
     radiance: np.ndarray  # (H, W, 3) float32, RGB, linear; 0 beyond the lens's part
@@ -110,7 +113,7 @@ def _recorded() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _invented(
     walk: Trajectory, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The same of an invented gait, for a machine without the recording."""
+    """Times, rotation vectors and shifts of an invented gait, where the recording is absent."""
     times = np.arange(walk.timestamps[0] - 2, walk.timestamps[-1] + 2, 1 / VIDEO_FPS)
     rates = 2 * np.pi * STEPS_HZ * np.array([0.5, 1, 0.5, 1, 0.5, 0.5])
     waves = np.sin(times[:, None] * rates + rng.uniform(0, 2 * np.pi, 6))
@@ -233,7 +236,7 @@ class Camera:
         picture = back + share[..., None].astype(np.float32) * (front - back)
         if "stabilised" in self.effects:
             world_R_rig = self.hands.poses(np.array([time]))[0, :3, :3]
-            picture = _turned(picture, self.bearings @ (self.heading().T @ world_R_rig))
+            picture = turned(picture, world_R_rig.T @ self.heading(), cv2.INTER_CUBIC)
         if "noise" not in self.effects:  # that of the ideal camera
             picture = picture + NOISE * rng.standard_normal(picture.shape, dtype=np.float32)
         return np.clip(picture, 0, 255)
@@ -336,16 +339,6 @@ def _demosaiced(raw: np.ndarray) -> np.ndarray:
     return cv2.cvtColor(counts, cv2.COLOR_BayerRGGB2RGB_EA).astype(np.float32) / np.float32(scale)
 
 
-def _turned(picture: np.ndarray, bearings: np.ndarray) -> np.ndarray:
-    """Panorama whose pixels show the directions (H, W, 3) of another one."""
-    height, width = picture.shape[:2]
-    u = (np.arctan2(bearings[..., 0], bearings[..., 2]) / (2 * np.pi) + 0.5) * width - 0.5
-    v = (np.arcsin(np.clip(bearings[..., 1], -1, 1)) / np.pi + 0.5) * height - 0.5
-    padded = np.concatenate([picture[:, -4:], picture, picture[:, :4]], axis=1)
-    x, y = (u + 4).astype(np.float32), v.astype(np.float32)
-    return cv2.remap(padded, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-
-
 def encoded(bursts: list[list[np.ndarray]], deep: bool, folder: Path) -> list[np.ndarray]:
     """Last frames of bursts (H, W, 3) RGB 0..255 as x265 leaves them, uint8.
 
@@ -407,10 +400,7 @@ def _decode(path: Path, length: int) -> list[np.ndarray]:
 
 def write_film(camera: Camera, out: Path) -> None:
     """Write `images/` with timestamps.csv, `groundtruth.tum` and `depth/` of a camera's film."""
-    from gsba.trajectory.files import write_tum
-
     (out / "images").mkdir(parents=True)
-    (out / "depth").mkdir()
     truth = camera.truth()
     compressed = bool(camera.effects & {"hevc", "hevc10"})
     if compressed:
@@ -419,19 +409,11 @@ def write_film(camera: Camera, out: Path) -> None:
         kept = (burst[-1] for burst in camera.frames())
     rows = ["name,timestamp"]
     for f, picture in enumerate(kept):
-        bgr = np.clip(picture[..., ::-1] + 0.5 * (picture.dtype != np.uint8), 0, 255)
+        rgb = np.clip(picture + 0.5 * (picture.dtype != np.uint8), 0, 255)
         quality = 100 if compressed else JPEG_QUALITY
         name = f"{f:06d}.jpg"
-        cv2.imwrite(
-            str(out / "images" / name), bgr.astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, quality]
-        )
+        write_image(out / "images" / name, rgb.astype(np.uint8), quality)
         rows.append(f"{name},{truth.timestamps[f]:.6f}")
     (out / "images" / "timestamps.csv").write_text("\n".join([*rows, ""]))
     write_tum(out / "groundtruth.tum", truth)
-    width = camera.width // 4
-    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(width // 2) + 0.5)
-    rays = bearings_from_erp(np.stack([u, v], axis=-1), width, width // 2)
-    for f, T in enumerate(truth.world_T_rigs):
-        hit = ranges(camera.scene, T[:3, 3], rays.reshape(-1, 3) @ T[:3, :3].T)
-        depth = hit.reshape(rays.shape[:2]).astype(np.float32)
-        np.savez_compressed(out / "depth" / f"{f:06d}.npz", range=depth)
+    write_depth(out / "depth", camera.scene, truth, camera.width // 4)

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gsba.camera.rig import CubeRig
+from gsba.camera.sphere import around_seam, bearings_from_erp, erp_from_bearings
 from gsba.config import RefineSettings
 from gsba.features import detection
 from gsba.frames import cubemap
@@ -33,18 +34,18 @@ _HEADER = (
 )
 
 
-def turned(panorama: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+def turned(
+    panorama: np.ndarray, rotation: np.ndarray, interpolation: int = cv2.INTER_LANCZOS4
+) -> np.ndarray:
     """The panorama (H, W, 3) of a camera turned by `rotation` (3, 3)."""
     height, width = panorama.shape[:2]
-    longitudes = ((np.arange(width) + 0.5) / width * 2 - 1) * np.pi
-    latitudes = ((np.arange(height) + 0.5) / height - 0.5) * np.pi
-    u, v = np.meshgrid(longitudes, latitudes)
-    rays = np.stack([np.cos(v) * np.sin(u), np.sin(v), np.cos(v) * np.cos(u)], -1) @ rotation.T
-    columns = (np.arctan2(rays[..., 0], rays[..., 2]) / np.pi + 1) / 2 * width - 0.5
-    rows = (np.arcsin(np.clip(rays[..., 1], -1, 1)) / np.pi + 0.5) * height - 0.5
-    padded = np.pad(panorama, ((0, 0), (8, 8), (0, 0)), mode="wrap")
-    places = (columns + 8).astype(np.float32), rows.astype(np.float32)
-    return cv2.remap(padded, *places, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
+    pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1)
+    rays = bearings_from_erp(pixels, width, height) @ rotation.T
+    places = erp_from_bearings(rays, width, height) - 0.5
+    places[..., 0] += 8
+    padded = around_seam(panorama, 8)
+    places = places.astype(np.float32)
+    return cv2.remap(padded, places, None, interpolation, borderMode=cv2.BORDER_REPLICATE)
 
 
 def mutual_matches(first: Features, second: Features) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -89,7 +89,7 @@ def make_walk(
         if lenses is not None:
             lenses.write(partial / "calibration.json")
         if depth:
-            _write_depth(partial / "depth", scene, truth, width // 4)
+            write_depth(partial / "depth", scene, truth, width // 4)
     return DemoWalk(out / "images", out / "groundtruth.tum", out / "slam.tum", lenses)
 
 
@@ -264,7 +264,8 @@ def render_walk(
         yield render_stitched(scene, world_T_rigs, lenses, width, width // 2)
 
 
-def _write_depth(folder: Path, scene, truth: Trajectory, width: int) -> None:
+def write_depth(folder: Path, scene, truth: Trajectory, width: int) -> None:
+    """Write distances (width / 2, width) float32 along the rays of panoramas, 0 = none hit."""
     from gsba.demo.raycast import ranges
 
     folder.mkdir()
