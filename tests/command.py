@@ -6,7 +6,7 @@ from gsba.cli import app
 
 
 def run_gsba(*arguments: object) -> Result:
-    """What `gsba` with these arguments prints, and its exit code."""
+    """Output and exit code of `gsba` with these arguments."""
     return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 

@@ -62,10 +62,7 @@ def make_growing_home(folder: Path, walk: DemoWalk) -> GrowingHome:
         files.append(folder / f"{name}.txt")
         write_tum(files[-1], Trajectory(times, poses))
         truths.append(Trajectory(times, truth.world_T_rigs[n::2]))
-    elsewhere, away = (
-        _recording(folder / "elsewhere", images[1::2], times),
-        folder / "elsewhere.txt",
-    )
+    elsewhere = _recording(folder / "elsewhere", images[1::2], times)
     for path in elsewhere.glob("*.jpg"):  # another place: what a mirror shows
         pixels = cv2.imread(str(path))
         assert pixels is not None

@@ -1,5 +1,6 @@
 """Pictures to localise: files, folders and videos, as panoramas or as photos."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -57,9 +58,8 @@ def find_pictures(sources: Sequence[Path], cameras: PictureCameras, work: Path) 
             found += _frames_of_several_images(source, cameras)
         else:
             found += _single_images(source, "erp" in layouts)
-    names = [picture.name for picture in found]
-    for name in names:
-        if names.count(name) > 1:
+    for name, count in Counter(picture.name for picture in found).items():
+        if count > 1:
             raise GsbaError(f"two pictures are named '{name}': localise them in two calls")
     return found
 

@@ -99,7 +99,7 @@ def _find_lenses(state: State, sought: Sequence[int], prefix: str) -> State:
     for n in range(2):
         lenses = list(trial.observed.cameras.lenses)
         for camera in left:
-            name = _named(run, f"{prefix}lenses{n}", camera)
+            name = f"{prefix}lenses{n}"
             centres = _from_features(trial, name, camera, _Rays.centres, LensCentres, noted=True)
             map_, lenses[camera] = map_.changed(camera, centres=centres), centres.lenses
         left = [camera for camera in left if lenses[camera]]
@@ -127,8 +127,7 @@ def _with_stitch_radii(start: State, stitched: Sequence[int], prefix: str) -> St
     tried = dict[int, Lenses]()
 
     def asked(state: State, stage: str, camera: int) -> StitchRadius:
-        name = _named(state.run, prefix + stage, camera)
-        return _from_features(state, name, camera, _Rays.stitch_radius, StitchRadius)
+        return _from_features(state, prefix + stage, camera, _Rays.stitch_radius, StitchRadius)
 
     for camera in stitched:
         first = asked(start, "stitch_radius", camera)
@@ -170,8 +169,8 @@ def _on_trial(
         lenses = Lenses() if yaws is None else Lenses.ring(np.deg2rad(yaws))
         trial = _through(trial, camera, lenses)
         if not _axes_known(run, camera):
-            name = _named(run, f"{prefix}axes", camera)
-            guesses[camera] = _from_features(trial, name, camera, _Rays.guessed_axes, LensAxes)
+            given = f"{prefix}axes", camera, _Rays.guessed_axes, LensAxes
+            guesses[camera] = _from_features(trial, *given)
             lenses = guesses[camera].lenses
         trial = _through(trial, camera, replace(lenses, band_rad=band))
     return trial, guesses
@@ -188,14 +187,12 @@ def _calibrate_raw(trial: State, raw: Sequence[int]) -> State:
     run, free = trial.run, False
     for camera in raw:
         lenses = trial.map.cameras[camera].lenses
-        if (
-            run.lenses_found and run.lenses_found[camera]
-        ):  # patches say more of them than features do
+        if run.lenses_found and run.lenses_found[camera]:
+            # Patches say more of them than features do.
             lenses = replace(lenses, fisheyes=lenses.reference_calibration)
             trial = trial.with_lenses(camera, lenses)
             continue
-        name = _named(run, "calibrated", camera)
-        known = _from_features(trial, name, camera, _Rays.calibration, SelfCalibration)
+        known = _from_features(trial, "calibrated", camera, _Rays.calibration, SelfCalibration)
         trial = replace(trial, map=trial.map.changed(camera, calibrated=known))
         if not known.reason:
             trial, free = trial.with_lenses(camera, known.lenses), True
@@ -218,7 +215,7 @@ def _settle_cameras(state: State, name: str) -> State:
     run, found = state.run, state.map.estimates()
     for camera, one in enumerate(found.each):
         if one.lenses and one.lenses.readout_motion is None:
-            stage = _named(run, f"{name}_readout", camera)
+            stage = f"{name}_readout"
             read = _from_features(state, stage, camera, _Rays.readout, CameraEstimate, noted=True)
             found = found.changed(camera, lambda _, read=read: read)
     rounds = run.settings.rounds
@@ -252,22 +249,19 @@ def take_parts_from_patches(state: State, sighted: Sighted, name: str, number: i
         if not lenses:
             continue
         if number == 0 and lenses.readout_motion is None:
-            stage = _named(run, f"readout_{name}", camera)
-            given = stage, camera, _Rays.readout, CameraEstimate
-            read = _from_patches(state, sighted, *given, noted=True)
+            given = f"readout_{name}", camera, _Rays.readout, CameraEstimate
+            read = _from_patches(state, sighted, *given)
             changed = state.map.estimates().changed(camera, lambda _, read=read: read)
             state = state.with_cameras(changed)
         raw = camera in _raw_cameras(run)
         if number == 1 and raw and lenses.fisheyes is None:  # the rest has settled
-            stage = _named(run, f"calibrated_{name}", camera)
-            given = stage, camera, _Rays.calibration, SelfCalibration
-            known = _from_patches(state, sighted, *given, noted=True)
+            given = f"calibrated_{name}", camera, _Rays.calibration, SelfCalibration
+            known = _from_patches(state, sighted, *given)
             state = replace(state, map=state.map.changed(camera, calibrated=known))
             state = state.with_lenses(camera, known.lenses)
         if number == 1 and not _axes_known(run, camera) and lenses.axes is None:
-            stage = _named(run, f"axes_{name}", camera)
-            given = stage, camera, _Rays.loose_axes, LensAxes
-            axes = _from_patches(state, sighted, *given, noted=True)
+            given = f"axes_{name}", camera, _Rays.loose_axes, LensAxes
+            axes = _from_patches(state, sighted, *given)
             state = replace(state, map=state.map.changed(camera, axes=axes))
             state = state.with_lenses(camera, axes.lenses)
     return state
@@ -415,7 +409,7 @@ class _Rays:
 
 def _from_features(
     state: State,
-    name: str,
+    stage: str,
     number: int,
     estimate: Callable[[_Rays], T],
     returns: type[T],
@@ -425,7 +419,7 @@ def _from_features(
     """An estimate of one camera from points of the state's matches with all that is within a gate.
 
     Observations that one centre threw off are far: the gate is wide until there are two, and poses
-    count as unsure as it is wide.
+    count as unsure as it is wide. The stage is named after the camera, too, if there are several.
     """
     run, observed, solution = state.run, state.observed, state.solution
     lenses = observed.cameras.lenses[number]
@@ -438,18 +432,17 @@ def _from_features(
         given = observed.keypoints, observed.shown, CameraEstimate(lenses), number, state
         return estimate(_Rays(wide, *given))
 
+    name = _named(run, stage, number)
     return run.stage(name, _settings_of_cameras(run), compute, returns, noted=noted)
 
 
 def _from_patches(
     state: State,
     sighted: Sighted,
-    name: str,
+    stage: str,
     number: int,
     estimate: Callable[[_Rays], T],
     returns: type[T],
-    *,
-    noted: bool = False,
 ) -> T:
     """An estimate of one camera from aligned patches; arguments as for `_from_features`."""
     run, map_ = state.run, state.map
@@ -465,7 +458,8 @@ def _from_patches(
         camera = map_.cameras[number].estimate()
         return estimate(_Rays(solution, there.keypoints, shown, camera, number, state))
 
-    return run.stage(name, _settings_of_cameras(run), compute, returns, noted=noted)
+    name = _named(run, stage, number)
+    return run.stage(name, _settings_of_cameras(run), compute, returns, noted=True)
 
 
 def _axes_known(run: Run, camera: int) -> bool:

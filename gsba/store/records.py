@@ -135,8 +135,8 @@ def load_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
 
 
 def load_checkpoint(path: Path | None, key: str, returns: type[T], anew: str) -> T | None:
-    """What interrupted work saved with this `key`; None if there is nothing usable, which the log
-    tells with the clause `anew`, as "training starts anew"."""
+    """Record that interrupted work saved with this `key`; None if there is nothing usable, which
+    the log tells with the clause `anew`, as "training starts anew"."""
     if path is None or not path.exists():
         return None
     try:

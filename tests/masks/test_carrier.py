@@ -42,7 +42,7 @@ def _rays() -> np.ndarray:
 
 @cache
 def _box(plain_floor: bool, speed: float) -> list[np.ndarray]:
-    """What a camera sees that walks through a textured box, (H, W, 3) float each."""
+    """Panoramas (H, W, 3) float of a walk through a textured box."""
     noise = cv2.GaussianBlur(np.random.default_rng(0).normal(size=(256, 256, 3)), (0, 0), 2.5)
     texture = np.clip(128 + 45 * noise / noise.std(), 0, 255).astype(np.float32)
     rays, images = _rays(), []
