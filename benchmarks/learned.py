@@ -41,11 +41,10 @@ def turned(
     height, width = panorama.shape[:2]
     pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1)
     rays = bearings_from_erp(pixels, width, height) @ rotation.T
-    places = erp_from_bearings(rays, width, height) - 0.5
-    places[..., 0] += 8
+    u, v = np.moveaxis(erp_from_bearings(rays, width, height), -1, 0)
+    places = (u + 7.5).astype(np.float32), (v - 0.5).astype(np.float32)
     padded = around_seam(panorama, 8)
-    places = places.astype(np.float32)
-    return cv2.remap(padded, places, None, interpolation, borderMode=cv2.BORDER_REPLICATE)
+    return cv2.remap(padded, *places, interpolation, borderMode=cv2.BORDER_REPLICATE)
 
 
 def mutual_matches(first: Features, second: Features) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
