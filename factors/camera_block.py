@@ -215,12 +215,7 @@ class CameraBlock:
 
 
 def _pairs(num: int, kinds: int, shared: int, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Rows of keys that share a residual (P, 2), in the order of `CameraBlock._in_blocks`.
-
-    Args:
-        num: F.
-        rows, columns: covisible frame pairs.
-    """
+    """Rows of keys that share a residual (P, 2), in the order of `CameraBlock._in_blocks`."""
     own, common = np.arange(kinds), kinds * num + np.arange(shared)
     upper, above = np.triu_indices(kinds, 1), np.triu_indices(shared, 1)
     first = kinds * np.arange(num)[:, None]

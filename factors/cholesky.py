@@ -22,10 +22,7 @@ def _nothing() -> np.ndarray:
 
 @dataclass(slots=True)
 class _Front:
-    """A run of columns with the rows below it: places of its entries, and its part of the factor.
-
-    Local places are block indices: columns first, then rows.
-    """
+    """A run of columns with the rows below it: local block indices of entries, and its factor."""
 
     first: int  # column
     width: int  # W columns

@@ -101,10 +101,7 @@ class IterativeSystem(ReducedSystem):
         max_iterations: int = _MAX_ITERATIONS,
         truncate: bool = False,
     ) -> tuple[np.ndarray, np.ndarray] | None:
-        """Solutions (N, 6, R) with `added (N, 6)` on the diagonal, and the residuals of `right`.
-
-        None if they take too many iterations, or the groups' system is singular.
-        """
+        """Solutions (N, 6, R) with `added` (N, 6) on the diagonal, residuals; None = unsolved."""
         diagonal, written = self._diagonal.copy(), self._written.copy()
         for blocks in (diagonal, written):
             np.einsum("nii->ni", blocks)[:] += added
@@ -147,8 +144,7 @@ class IterativeSystem(ReducedSystem):
     def _drawn(
         self, added: np.ndarray, num_draws: int, rng: np.random.Generator
     ) -> np.ndarray | None:
-        """Vectors (D, N, 6) of covariance (H + added)^-1: that inverse times J^T e, e of all
-        factors."""
+        """Draws (D, N, 6) of covariance (H + added)^-1: the inverse times J^T e of all factors."""
         layout, draws, self._coarse = self._layout, [], None
         for _ in range(0, max(num_draws, _MIN_DRAWS), _DRAWS_AT_ONCE):
             right = np.sqrt(added)[..., None] * rng.normal(size=(*added.shape, _DRAWS_AT_ONCE))

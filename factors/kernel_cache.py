@@ -172,8 +172,7 @@ def _codes(code: CodeType) -> Iterator[CodeType]:
 
 
 def _code_text(code: CodeType) -> str:
-    """Byte code, constants and names of a code object: they change with docstrings, but not with
-    comments or line numbers."""
+    """Byte code, constants and names of a code object, docstrings included."""
     constants = [_text(each) for each in code.co_consts if not isinstance(each, CodeType)]
     return f"{code.co_code.hex()} {constants} {code.co_names} {code.co_varnames}"
 
@@ -226,8 +225,7 @@ def _save(path: Path, payload: bytes) -> None:
 
 
 def _lock(path: Path, *, wait: bool = True) -> Any:
-    """A locked file, closed to unlock it; None where files cannot be locked, or if another process
-    has locked it and is not waited for."""
+    """A locked file, closed to unlock it; None = unsupported, or another's and not waited for."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         file = path.open("w")

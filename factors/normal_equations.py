@@ -72,8 +72,7 @@ class NormalEquations:
         return system.costs
 
     def _gathered(self, parts: Sequence[np.ndarray]) -> np.ndarray:
-        """Off-diagonal blocks (P, 6, 6) of all factors; a single block of factors that has them
-        all, which may be gigabytes, is not copied."""
+        """Off-diagonal blocks (P, 6, 6) of all factors; a single block's own is not copied."""
         if len(parts) == 1:
             slots, flip = self._block_slots[0]
             if np.array_equal(slots, np.arange(len(self._pairs))) and not flip.any():

@@ -296,8 +296,7 @@ class PhotometricBlock:
     def _better(
         self, poses: np.ndarray, new: np.ndarray, old: np.ndarray, least: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """The better of two planes for each patch; the old ones are only evaluated above
-        `least`."""
+        """The better of two planes for each patch; old ones are only evaluated above `least`."""
         costs = self._patch_costs(new, self._observe(poses, new, 0)[1])
         worse = ~(costs <= least)
         if np.any(worse):

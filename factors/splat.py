@@ -186,8 +186,7 @@ class SplatBlock:
     def _sample(
         self, f: int, view: RenderedView, pose: np.ndarray, with_jacobian: bool
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Captured grey (N,), its Jacobian by the pose (N, 6), and weights (N,), 0 = not
-        visible."""
+        """Captured grey (N,), its Jacobian by the pose (N, 6), and weights (N,), 0 = hidden."""
         num, cameras = len(view.points_world), self._cameras
         rotations, centres = cameras.rig_R_faces, self._centres
         if self._turns is not None:

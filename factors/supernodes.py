@@ -135,10 +135,7 @@ def _postorder(parents):
 def _fundamental(
     starts: np.ndarray, columns: np.ndarray, cut: int
 ) -> tuple[list[int], list[np.ndarray]]:
-    """First columns of the runs of a postordered pattern, and the rows below each run's end.
-
-    A run starts at column `cut`, whatever is before it.
-    """
+    """First columns of a postordered pattern's runs (one at `cut`), and the rows below each end."""
     num = len(starts) - 1
     firsts: list[int] = []
     rows: list[np.ndarray] = []  # of each run so far; of the last one from its last column on
@@ -164,10 +161,7 @@ def _fundamental(
 def _relaxed(
     firsts: list[int], rows: list[np.ndarray], num: int, cut: int
 ) -> tuple[np.ndarray, tuple[np.ndarray, ...], np.ndarray]:
-    """Starts, rows and parents of runs, small ones absorbed by the next if few zeros arise.
-
-    The run that starts at column `cut` absorbs none.
-    """
+    """Starts, rows and parents of runs, small ones absorbed by the next (not over `cut`)."""
     kept: list[tuple[int, int, np.ndarray, int]] = []  # first, end, rows, zeros
     for first, end, below in zip(firsts, [*firsts[1:], num], rows, strict=True):
         zeros = 0

@@ -35,8 +35,7 @@ class Bearings(Family):
 
 
 def _face_roots(observed: PointObservations) -> np.ndarray:
-    """Square-root information (O, 2, 2), 1/rad on `factors.tangent_basis`, of keypoints whose noise
-    is equal along both axes of their face."""
+    """Square-root information (O, 2, 2), 1/rad on `tangent_basis`, of noise equal on face axes."""
     roots = np.empty((len(observed.faces), 2, 2))
     axes = np.ascontiguousarray(RIG_R_FACE[:, :, 2])
     face_roots(observed.bearings_rig, axes, observed.faces, observed.sigmas_rad, roots)

@@ -94,8 +94,7 @@ class CameraSystem:
         return system.unknowns.cameras
 
     def _agrees(self, number: int, rates: np.ndarray) -> bool:
-        """True if images alone confirm a gyro's rates (F, 3) of one camera's frames during their
-        readout."""
+        """True if images alone confirm a gyro's rates (F, 3) of a camera during the readout."""
         camera, num = self.cameras.each[number], len(rates)
         without = self.cameras.changed(number, lambda one: replace(one, by_gyro=False))
         alone = replace(self, cameras=without)._linearized()

@@ -155,12 +155,7 @@ class CameraUnknowns:
     def _sighted(
         self, directions: np.ndarray, frames: np.ndarray, roots: np.ndarray
     ) -> tuple[np.ndarray, ...]:
-        """Measurements (O, 3), whiteners (O, 2, 2), lenses (O,) and fractions of the readout (O,)
-        of directions (O, 3) in frames (O,), as `Sightings` has them.
-
-        Args:
-            roots: (O, 2, 2) that whiten directions on their tangent_basis.
-        """
+        """Measurements (O, 3), whiteners (O, 2, 2), lenses and readout fractions (O,)."""
         if not self.cameras.of_frame:
             return self._sighted_by(0, directions, frames, roots)
         measured, whiteners = np.empty_like(directions), np.empty_like(roots)
@@ -245,11 +240,7 @@ def _lens_variables(
     values: gtsam.Values,
     graph: gtsam.NonlinearFactorGraph,
 ) -> LensVariables:
-    """Variables that all frames of a camera share, added to values and graph.
-
-    Args:
-        numbers: of the camera, and of its first lens among those of all cameras.
-    """
+    """Variables shared by all frames of a camera; `numbers`: of it and of its first lens."""
     lenses, (number, first) = camera.lenses, numbers
     if not lenses:
         return LensVariables()

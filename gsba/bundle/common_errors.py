@@ -54,8 +54,7 @@ def added(
 def _in_common(
     draws: np.ndarray, world_T_rigs: np.ndarray, parts: Sequence[np.ndarray]
 ) -> np.ndarray:
-    """Errors in common (D, F, 6), enlarged and smoothed from errors drawn of the poses of each
-    part's frames (F',); none for a part of one frame."""
+    """Errors in common (D, F, 6), enlarged and smoothed from draws of each part's frames (F',)."""
     rotations, errors = world_T_rigs[:, :3, :3], np.zeros(draws.shape)
     for rows in parts:
         if len(rows) > 1:

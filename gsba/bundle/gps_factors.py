@@ -106,12 +106,7 @@ def anchor(
 
 
 def _level_from_map(positions: np.ndarray, fixes: FrameFixes) -> tuple[Sim3, np.ndarray, float]:
-    """Similarity of a map, fixes (G,) that agree with it, and how many times their noise they
-    scatter, at least 1.
-
-    Raises:
-        NoSimilarityError: most of them do not lie as the frames do.
-    """
+    """Map's similarity, fixes (G,) that agree, and their scatter in units of their noise, >= 1."""
     limits = fixes.tolerances(), MAX_DRIFT_SHARE
     fit, used, _ = robust_similarity(positions, fixes.positions, similarity, 3, *limits)
     scatter = 1.0

@@ -156,11 +156,7 @@ def neighbour_shifts(result: Reconstruction) -> np.ndarray:
 
 
 def _drift(world_T_rigs: np.ndarray, draws: np.ndarray, walks: np.ndarray) -> float:
-    """See `MapStrength.drift`; 0 where fewer than three poses are known.
-
-    Args:
-        walks: (F,) recording of each frame.
-    """
+    """See `MapStrength.drift`; 0 where fewer than three poses are known."""
     errors = position_errors(world_T_rigs, draws)
     known = np.isfinite(errors).all(axis=0)
     if not known.any():

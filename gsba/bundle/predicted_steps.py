@@ -53,8 +53,7 @@ def _num_far(result: Reconstruction) -> np.ndarray:
 
 
 def _resected(result: Reconstruction, frame: int, rows: np.ndarray) -> np.ndarray:
-    """Pose (4, 4) of a frame that its observations `rows` (O,) of known points give, by
-    Gauss-Newton under a Cauchy loss from its pose in the map."""
+    """Pose (4, 4) of a frame by its observations `rows` (O,) of points, from that in the map."""
     from scipy.spatial.transform import Rotation
 
     points = result.points_world[result.observation_points[rows]]

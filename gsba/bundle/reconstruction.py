@@ -92,18 +92,7 @@ def assemble(
 def _observations(
     adjustment: Solution, keypoints: Keypoints, scales: np.ndarray, colors: np.ndarray
 ) -> Iterator[tuple[np.ndarray, ...]]:
-    """Columns of the points' observations, those of some points at a time.
-
-    Args:
-        adjustment: the last solution.
-        keypoints: of all frames.
-        scales: (F,) units of the result per map unit, of each frame's map.
-        colors: (J, 3) uint8, the points' mean colors, which are written here.
-
-    Yields:
-        Bearings (O, 3), their standard deviations (O,) and angles (O,) to the points, radians; and
-        where rays have origins of their own, these, (O, 3) in units of the result.
-    """
+    """Bearings (O, 3), sigmas and angles (O,) to points, radians, origins; of some at a time."""
     landmarks, poses = adjustment.landmarks, adjustment.world_T_rigs
     nothing, none = np.empty((0, 3)), np.empty(0)
     yield (nothing, none, none, *([] if keypoints.origins_rig is None else [nothing]))
@@ -148,17 +137,10 @@ def _require_small(errors: np.ndarray) -> None:
 def _placed(
     adjustment: Solution, target_T_rigs: np.ndarray | None, known: np.ndarray, groups: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Poses, points, and factors (F, 6) of the standard deviations, each map in its own world.
+    """Poses, points, and factors (F, 6) of standard deviations, each map in its own world.
 
-    Args:
-        adjustment: the last solution.
-        target_T_rigs: (F, 4, 4) poses that define the worlds; None = all stay as they are.
-        known: (F,) bool, frames that say where their map goes; all, where fewer than two do.
-        groups: (F,) map of each frame, 0 = the largest; a smaller one that does not lie as its
-            coarse poses, at no scale, stays as it was solved.
-
-    Raises:
-        GsbaError: the largest does not.
+    Frames `known` (F,) say where their map goes; all do, where fewer than two are. Of `groups` (F,)
+    a map but the largest that does not lie as its coarse poses, at no scale, stays as solved.
     """
     poses, landmarks = adjustment.world_T_rigs, adjustment.landmarks
     placed, stretch = np.empty_like(poses), np.ones((len(poses), 6))

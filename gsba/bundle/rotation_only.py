@@ -152,15 +152,7 @@ def _excess(
     """Factors (F,), at least 1, by which covariances of rotations grow as residuals of a region of
     the sphere are alike: those of a hand that moves are the parallax of what is seen there.
 
-    The variance that sums of residuals over regions give (the cluster-robust estimator of Liang and
-    Zeger, Biometrika 1986) relative to that of independent ones.
-
-    Args:
-        rotations: (F, 3, 3) solved.
-        sigmas: (O,) of the observations, radians.
-        noise: their factor.
-        linearised: tracks, bearings (O, 3), bases (O, 2, 3), residuals (O, 2) in sigmas, and
-            weights over sigmas (O,), of the last iteration.
+    The cluster-robust estimator of Liang and Zeger, Biometrika 1986, relative to the usual one.
     """
     found, bearings, bases, residuals, pulls = linearised
     axes = np.cross(np.eye(3)[None], bearings[:, None, :])

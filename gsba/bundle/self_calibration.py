@@ -120,12 +120,7 @@ def estimate(
 def _of_nominal(
     system: SharedModel, so_far: Lenses, off: np.ndarray, counts: Counts
 ) -> SelfCalibration:
-    """Calibration of plain lenses of unknown make, where focal lengths are determined.
-
-    Args:
-        system: of all observations.
-        off: (K,) how far lenses are from the plain ones.
-    """
+    """Calibration of plain lenses of unknown make, where focal lengths are determined."""
     num = len(off)
     found, sigmas = _step([system], off), _sigmas(system, num)
     loose, focals = undetermined(sigmas), focals_of(so_far.num_lenses)
@@ -283,7 +278,6 @@ def _shown(values: np.ndarray) -> str:
 
 
 def _centre_step(systems: list[SharedModel], num: int) -> np.ndarray:
-    """Change (3 (L - 1),) of the centres that minimises the parts' cost, K parameters of lenses
-    held."""
+    """Change (3 (L - 1),) of the centres that minimises the parts' cost, K lens parameters held."""
     total = summed([each.of(slice(num, None)) for each in systems])
     return -np.linalg.solve(total.curvature * total.hessian, total.gradient)

@@ -101,11 +101,7 @@ def calibration_json(
 
 
 def _in_centred_rig(rig: Rig) -> Rig:
-    """The lenses in a rig whose origin is the mean of their centres.
-
-    Raises:
-        ValueError: two lenses do not look ahead and behind, or more leave a direction unseen.
-    """
+    """The lenses in a rig whose origin is the mean of their centres."""
     axes = np.array([rotation_of(lens)[:, 2] for lens in rig])
     if len(rig) == 2 and min(axes[0, 2], -axes[1, 2]) < np.cos(_MAX_AXIS_ANGLE_RAD):
         raise ValueError(
@@ -151,11 +147,7 @@ def scaled_to_size(rig: Rig, size: tuple[int, int], path: Path) -> Rig:
 
 
 def _parsed_file(path: Path) -> Any:
-    """The parsed content of a JSON or YAML file.
-
-    Raises:
-        GsbaError: the file is neither, or cannot be read.
-    """
+    """The parsed content of a JSON or YAML file."""
     try:
         with path.open("rb") as file:
             content = file.read(_MAX_FILE_BYTES + 1)

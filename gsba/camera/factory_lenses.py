@@ -148,11 +148,7 @@ def parse_factory_lenses(calibration: FactoryCalibration) -> FactoryLenses:
 
 
 def _of_numbers(numbers: np.ndarray, calibration: FactoryCalibration) -> FactoryLenses:
-    """Lenses from all numbers of a calibration.
-
-    Raises:
-        ValueError: the form is unknown, or no lenses have such numbers.
-    """
+    """Lenses from all numbers of a calibration."""
     count = _COUNTS.get(len(numbers))
     if count is None or numbers[0] != 2 or not (abs(numbers) < _MAX_ABSOLUTE_NUMBER).all():
         raise ValueError("its form is not known")
@@ -204,11 +200,7 @@ def _camera_R_lens(angles: np.ndarray, behind: bool) -> np.ndarray:
 def _radial_model(
     generation: int, numbers: np.ndarray
 ) -> tuple[float, tuple[float, float, float, float]]:
-    """Focal length, pixels per radian, and k1 to k4 of `Fisheye`, fitted over all angles.
-
-    Raises:
-        ValueError: no lens has such numbers.
-    """
+    """Focal length, pixels per radian, and k1 to k4 of `Fisheye`, fitted over all angles."""
     angles = np.linspace(0, _MAX_FITTED_ANGLE_RAD, 201)[1:]
     if generation == 1:
         radii = numbers[0] * angles / _REFERENCE_ANGLE_RAD
@@ -236,8 +228,7 @@ def _radial_model(
 def _window(
     half: np.ndarray, calibration: FactoryCalibration
 ) -> tuple[float, float, float, float] | None:
-    """Left, top, width and height in a lens's half (2,) of the canvas; None = it exceeds that
-    half."""
+    """Left, top, width and height in a lens's half (2,) of the canvas; None = beyond it."""
     if calibration.window is None:
         return None
     scale = half / (half if calibration.sensor is None else np.array(calibration.sensor))

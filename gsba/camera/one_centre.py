@@ -137,8 +137,7 @@ class Stitcher:
     def _moved(
         self, lens: int, top: int, columns: np.ndarray, num_rows: int, width: int
     ) -> np.ndarray:
-        """Offsets (h, w, 3) from directions of a panorama's rows and columns to a lens's
-        directions."""
+        """Offsets (h, w, 3) from directions of panorama rows and columns to a lens's directions."""
         scale = _DEPTH_GRID_WIDTH / width
         places = np.meshgrid(columns + 0.5, np.arange(top, top + num_rows) + 0.5)
         across, down = ((at * scale - 0.5 + PAD).astype(np.float32) for at in places)

@@ -115,10 +115,7 @@ def lens_views(lenses: Lenses, size: int) -> tuple[View, ...]:
 
 
 def _side(axis: np.ndarray, ahead: np.ndarray, size: int, band_rad: float) -> View:
-    """The view of the lens facing `ahead` towards `axis`, from its whole face to the blended band.
-
-    The principal point is the middle: some trainers support no other.
-    """
+    """The view of the lens facing `ahead` towards `axis`, from its whole face to the band."""
     towards, along = _side_extents(band_rad)
     short, long = 2 * int(size / 2 * towards), 2 * int(np.ceil(size / 2 * along))
     tilt = np.pi / 4 + np.arctan(short / size)  # its edge meets the whole face's
@@ -135,11 +132,7 @@ def _side(axis: np.ndarray, ahead: np.ndarray, size: int, band_rad: float) -> Vi
 
 
 def _side_extents(band_rad: float) -> tuple[float, float]:
-    """Half the extents of a side view towards and along the seam, as tangents.
-
-    It begins where the whole face ends, 45 degrees from its lens's axis, and its corners end at the
-    band; along the seam it meets its neighbours on the diagonals between them.
-    """
+    """Half the extents, tangents, of a side view towards the seam, where it ends, and along it."""
 
     def along_at(half: float) -> float:
         tilt = np.pi / 4 + half
@@ -382,8 +375,7 @@ class ViewCutter:
     def _maps(
         self, view: View, offsets: np.ndarray, places: Callable[[np.ndarray], np.ndarray]
     ) -> np.ndarray:
-        """OpenCV pixels (2, height, width) float32 of a view; `places` maps directions (h, w, 3) in
-        which pictures show its rays to pixels (h, w, 2)."""
+        """OpenCV pixels (2, height, width) float32 of a view; `places`: directions to pixels."""
         maps = np.empty((2, view.height, view.width), np.float32)
         for top in range(0, view.height, _ROWS_AT_ONCE):
             rows = np.arange(top, min(top + _ROWS_AT_ONCE, view.height)) + 0.5

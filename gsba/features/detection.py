@@ -102,8 +102,7 @@ def extract(
 
 @lru_cache(maxsize=2)
 def _owned_pixels(rig: CubeRig) -> np.ndarray:
-    """Pixels (6, N, N) bool at or beside those that a face owns; keypoints elsewhere are
-    dropped."""
+    """Pixels (6, N, N) bool at or beside those that a face owns; other keypoints are dropped."""
     centres = np.arange(rig.size) + 0.5
     grid = np.stack(np.meshgrid(centres, centres), axis=-1)
     owned = [owner_faces(rig.bearings(grid, face)) == face for face in range(len(FACES))]

@@ -170,8 +170,7 @@ class _Candidate:
 
 
 def _sensor_and_axes(turns: Turns, turned: np.ndarray) -> tuple[Sensor, np.ndarray, float]:
-    """Bias and scales, axes (3, 3) and their standard deviation that map the sensor's rotations (n,
-    3) to the images', under a Cauchy loss."""
+    """Bias and scales, axes (3, 3) and their sigma, by sensor and image rotations (n, 3)."""
     spans, seen = np.diff(turns.times, axis=1), turns.rotvecs
     weights, scales, sigma = np.ones((len(spans), 1)), np.ones(3), float(np.std(seen))
     for _ in range(_NUM_REWEIGHTINGS):
@@ -226,8 +225,7 @@ def _candidates(turns: Turns, readings: Readings) -> Iterator[np.ndarray]:
 def _orientation_trajectory(
     readings: Readings, sensor: Sensor, axes: np.ndarray | None = None
 ) -> Trajectory:
-    """Orientations integrated from angular velocities, without translation; sensor's or rig's
-    axes."""
+    """Orientations integrated from angular velocities of sensor or rig, without translation."""
     turned = readings.turned(sensor)
     every = max(int(_ORIENTATION_SPACING_S / float(np.median(np.diff(readings.timestamps)))), 1)
     turned = turned[::every] if axes is None else axes @ turned[::every] @ axes.T

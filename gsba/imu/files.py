@@ -88,11 +88,7 @@ def read_telemetry(path: Path, lasting_s: float | None = None) -> Readings:
 
 
 def _by_telemetry_parser(path: Path) -> Readings:
-    """Readings of a recording by `telemetry_parser`: deg/s and m/s^2.
-
-    Raises:
-        GsbaError: the library is not installed, or finds no readings.
-    """
+    """Readings of a recording by `telemetry_parser`: deg/s and m/s^2."""
     table = "a table (t, gyro x y z, accelerometer x y z)"
     rows = ask_telemetry_parser(path, "normalized_imu", "gyro", table)
     rows = [row for row in rows if row.get("gyro") is not None]
@@ -158,11 +154,7 @@ def _is_number(text: str) -> bool:
 
 
 def _columns(where: str, names: list[str]) -> list[tuple[int, float]]:
-    """Column of t, of each axis of gyro and accelerometer, and the factor of its unit.
-
-    Raises:
-        GsbaError: a column is missing, named twice, or has an unknown unit.
-    """
+    """Column of t, of each axis of gyro and accelerometer, and the factor of its unit."""
     found: dict[str, tuple[int, float]] = {}
     for column, name in enumerate(names):
         plain, unit = _name_and_unit(name)

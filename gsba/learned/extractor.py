@@ -67,10 +67,7 @@ class LearnedExtractor:
 
 @functools.lru_cache(maxsize=1)
 def _load(name: str, weights: Path, max_per_face: int) -> Detector:
-    """Network in inference mode, shared by all threads.
-
-    It finds twice the number of kept keypoints, as masks and neighbouring faces remove some.
-    """
+    """Network in inference mode, with twice the kept keypoints: masks and faces remove some."""
     try:
         if name == "superpoint":
             from gsba.learned.magicleap import superpoint as load

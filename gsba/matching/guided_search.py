@@ -217,8 +217,7 @@ def _limits(
 def _targets(
     f0_T_f1: np.ndarray, points_f0: np.ndarray | None, keypoints: np.ndarray, lenses: Lenses
 ) -> np.ndarray:
-    """Directions (n, 3) float32 from frame 1, in frame 0's axes, of the points of keypoints (n,)
-    of frame 0; NaN where unknown."""
+    """Directions (n, 3) float32 from frame 1 of frame 0's points, in 0's axes; NaN = unknown."""
     if points_f0 is None:
         return np.full((len(keypoints), 3), np.nan, np.float32)
     offsets = points_f0[keypoints] - f0_T_f1[:3, 3]

@@ -158,8 +158,7 @@ def _misleads(context: MatchContext, guided: VerifiedPairs) -> bool:
 def _walked_on(
     coarse: CoarsePoses, lost: np.ndarray, found: VerifiedPairs, timestamps: np.ndarray
 ) -> np.ndarray:
-    """Poses (F, 4, 4) chained along the trajectory; at its lost steps (P, 2), where it may have
-    jumped, the camera turns as in pairs found without it, and walks on as before and behind."""
+    """Poses (F, 4, 4) chained along the trajectory, at lost steps (P, 2) by pairs without it."""
     poses, intervals = coarse.world_T_rigs, np.diff(timestamps)
     steps = inverse(poses[:-1]) @ poses[1:]
     steps[found.matches.pairs[:, 0], :3, :3] = found.f0_T_f1s[:, :3, :3]
@@ -174,8 +173,7 @@ def _walked_on(
 
 
 def _missing_two_apart(found: VerifiedPairs, steps: Steps, absent: bool) -> np.ndarray:
-    """Pairs (P, 2) of frames two apart that are not found yet; without a trajectory, only over two
-    verified steps: nothing else gives a step's length."""
+    """Pairs (P, 2) two apart not found yet; without a trajectory, over two verified steps only."""
     first = np.arange(len(steps.verified) - 1)
     if absent:
         first = first[steps.verified[:-1] & steps.verified[1:]]
@@ -183,8 +181,7 @@ def _missing_two_apart(found: VerifiedPairs, steps: Steps, absent: bool) -> np.n
 
 
 def _with_wider_pairs(context: MatchContext, found: VerifiedPairs) -> VerifiedPairs:
-    """Neighbours, and wider pairs over steps that are too short to tell translation from
-    rotation."""
+    """Neighbours, and wider pairs over steps too short to tell translation from rotation."""
     for gap in _WIDER_GAPS:
         steps = image_steps(found, context.keypoints)
         short = steps.verified & ~steps.directed
@@ -365,8 +362,7 @@ def _with_consistent_scale(context: MatchContext, found: VerifiedPairs) -> Verif
 
 
 def _frames_of_open_ratio(context: MatchContext, found: VerifiedPairs) -> tuple[set[int], set[int]]:
-    """Frames between two steps whose common points leave the ratio of lengths open, or give one
-    beyond `_MAX_STEP_RATIO`; and the latter alone."""
+    """Frames between two steps of open or excessive ratio of lengths; and the latter alone."""
     steps = image_steps(found, context.keypoints)
     logs, sigmas = length_ratios(found, steps, context.keypoints, _MIN_COMMON_POINTS)
     rows = {int(f0): p for p, (f0, f1) in enumerate(found.matches.pairs) if f1 - f0 == 1}

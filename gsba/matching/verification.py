@@ -92,8 +92,7 @@ def agree_with_prior(
 def _why_prior_contradicts(
     found: RelativePose, prior: np.ndarray, position_sigma: float, settings: TwoViewLimits
 ) -> str:
-    """Reason why a pose does not fit a prior (4, 4) with standard deviation `position_sigma`; "" =
-    it fits."""
+    """Reason why a pose does not fit a prior (4, 4) of `position_sigma`; "" = it fits."""
     turn = rotation_angle(prior[:3, :3].T @ found.f0_T_f1[:3, :3])
     if turn > np.deg2rad(settings.max_rotation_deg):
         return "rotation contradicts"
@@ -195,8 +194,7 @@ def _significant_pose(
     seed: int,
     chance: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """f0_T_f1 (4, 4) with unit translation and inliers (m,) bool of the best pose; None if chance
-    explains as many."""
+    """f0_T_f1 (4, 4), unit translation, inliers (m,) bool of the best pose; None = by chance."""
     largest, num = np.sin(np.deg2rad(settings.max_error_deg)), witnesses(bearings0, CELLS_PER_SIDE)
 
     def needed(of_match: float) -> int:

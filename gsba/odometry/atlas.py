@@ -162,8 +162,7 @@ def _arctangent(y, x):
 
 @_kernel
 def _erp_pixels(xs, ys, zs, cut_R_rig, height, across, down):
-    """OpenCV pixels of a panorama in the directions of rays, axes of the cut; float32
-    throughout."""
+    """OpenCV pixels of a panorama in directions of rays, axes of the cut; float32 throughout."""
     per_radian = height / _HALF
     half = _ONE_HALF
     for i in range(len(xs)):

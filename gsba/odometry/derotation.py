@@ -114,8 +114,7 @@ def _rays() -> np.ndarray:
 
 
 def _jacobian(detail: np.ndarray) -> np.ndarray:
-    """Derivative (64 * 128, 3) of the detail at each ray by a rotation of the ray about the
-    axes."""
+    """Derivative (64 * 128, 3) of the detail at each ray by a rotation of the ray."""
     per_radian = _WIDTH / (2 * np.pi)
     by_u = 0.5 * (np.roll(detail, -1, axis=1) - np.roll(detail, 1, axis=1)) * per_radian
     by_v = np.gradient(detail, axis=0) * per_radian

@@ -28,11 +28,7 @@ def write_odometry(found: Odometry, walk: Path, keyframes: Path, poses: Path, re
 
 
 def _write_poses(path: Path, found: Odometry) -> None:
-    """Status, map and pose of every frame, and the upper triangle of its covariance, row by row.
-
-    Covariances are of the tangent [rotation (radians), translation (map units)] in the rig frame.
-    Cells of unknown values are empty.
-    """
+    """Status, map, pose and upper triangle of the covariance [rotation, translation] of frames."""
     upper, covariances = np.triu_indices(6), found.covariances
     if covariances is None:
         covariances = np.full((len(found), 6, 6), np.nan)

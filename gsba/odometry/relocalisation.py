@@ -100,13 +100,7 @@ def _length(
     bearings: np.ndarray,
     distances: np.ndarray,
 ) -> float | None:
-    """Length of the step at which matches have the distances of nearby points; or None.
-
-    Args:
-        one, other: (m, 3) rays of the matches in the keyframe's axes.
-        direction: (3,) unit, direction of the step.
-        bearings, distances: of the points.
-    """
+    """Length of the step at which matches have the distances of nearby points; or None."""
     from scipy.spatial import KDTree
 
     if not len(bearings):

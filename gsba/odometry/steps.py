@@ -92,8 +92,7 @@ def _covariance(
     origins: np.ndarray,
     distance: float,
 ) -> np.ndarray:
-    """Covariance (7, 7) of the step to a keyframe that observes points (N, 3) with bearings (N, 3);
-    `origins` (N, 3): positions from which they were observed first."""
+    """Covariance (7, 7) of a step to a keyframe; `origins` (N, 3): where points were seen first."""
     unknown, model = (
         np.diag(np.square([rotation] * 3 + [translation * distance] * 3 + [log_scale]))
         for rotation, translation, log_scale in (_UNKNOWN, _MODEL)

@@ -231,11 +231,7 @@ class Tracker:
     def _attempt(
         self, grey: np.ndarray, key: Keyframe, features: TrackedFeatures, predicted: np.ndarray
     ) -> _Attempt:
-        """Follow a keyframe's features into a frame whose pose (4, 4) is predicted, and pose it.
-
-        Features with points go first. If their pose is far from the predicted one, those that do
-        not fit it are tracked once more; all others are predicted by that pose.
-        """
+        """Follow features into a frame of predicted pose (4, 4); badly predicted ones twice."""
         template = key.atlas
         assert template is not None
         atlas = self._cutter.cut(grey, predicted[:3, :3])

@@ -230,14 +230,7 @@ def _odometry(
     timestamps: np.ndarray,
     closing_cpu_s: float,
 ) -> Odometry:
-    """Frames moved with their keyframes, as the result of odometry.
-
-    Args:
-        tracked: all frames.
-        tracked_keyframes, closed: its keyframes before and after loops were closed.
-        timestamps: (F,) of all panoramas.
-        closing_cpu_s: processor time of closing loops.
-    """
+    """Frames moved with their keyframes, before and after loop closure, as odometry's result."""
     num, records, rows = len(timestamps), tracked.state.records, np.array(tracked.rows)
     key_frames, sharp = tracked.state.keyframe_frames, np.zeros(num)
     sharp[rows] = tracked.sharpness

@@ -125,14 +125,7 @@ def align(
 
 
 def _by_hosts(hosts: np.ndarray, positions: np.ndarray) -> Iterator[np.ndarray]:
-    """Points (n,), ascending, whose patches are held together: those of hosts near one another.
-
-    Each picture is then read for few of these groups, however often its place was visited.
-
-    Args:
-        hosts: (J,) frame of each point's patch.
-        positions: (F, 3) of the frames, world.
-    """
+    """Points (n,), ascending, held together: those of hosts (J,) near one another, read at once."""
     most = max(total_memory_bytes() // (_MEMORY_SHARE * _BYTES_PER_POINT), 1)
     order = np.argsort(_numbers_by_place(positions)[hosts], kind="stable")
     for some in slices(len(order), most):
@@ -140,8 +133,7 @@ def _by_hosts(hosts: np.ndarray, positions: np.ndarray) -> Iterator[np.ndarray]:
 
 
 def _numbers_by_place(positions: np.ndarray) -> np.ndarray:
-    """Numbers (F,) int64 of cells that positions (F, 3) lie in, cells near one another having
-    similar ones: the bits of their coordinates, interleaved (Morton, 1966)."""
+    """Numbers (F,) int64 of cells of positions (F, 3), similar for near ones (Morton, 1966)."""
     low, edge = positions.min(axis=0), float(np.ptp(positions, axis=0).max())
     last = (1 << _PLACE_BITS) - 1
     cells = ((positions - low) / max(edge, 1e-300) * last).astype(np.int64)
@@ -209,12 +201,7 @@ def _planes(
     field: SphereField,
     lenses: Cameras,
 ) -> _Planes:
-    """Plane patches around the points (J,), in their hosts.
-
-    Args:
-        normals_rig: (J, 3) of the surfaces, zero = unknown.
-        pixel: of a panorama, radians.
-    """
+    """Plane patches around points (J,), in their hosts; normals_rig (J, 3) zero = unknown."""
     world_T_hosts = world_T_rigs[hosts]
     offsets = landmarks.points_world - world_T_hosts[:, :3, 3]
     local = np.einsum("jba,jb->ja", world_T_hosts[:, :3, :3], offsets)
@@ -259,8 +246,7 @@ def _projected_patches(
     lenses: Cameras,
     num_threads: int,
 ) -> list[np.ndarray]:
-    """Patches of points (O,) in the rigs of their frames (O,), at unit distance: bearings (O, 3),
-    axes (O, 3, 2), and rays (O, 3) to them from their hosts."""
+    """Bearings (O, 3), axes (O, 3, 2) in frames (O,) at unit distance; rays (O, 3) from hosts."""
 
     def project(some: slice) -> tuple[np.ndarray, ...]:
         own, seeing = points[some], frames[some]
@@ -362,12 +348,7 @@ def _normals_world(
     world_T_hosts: np.ndarray,
     num_threads: int,
 ) -> np.ndarray:
-    """Normals (J, 3) of the surfaces, from the patches' alignments, zero = unknown.
-
-    Args:
-        kept: (N,) accepted sightings.
-        bearings (N, 3), rays (N, 3): where they were found, and from their hosts to them.
-    """
+    """Normals (J, 3) of surfaces by alignments of `kept` (N,) sightings, zero = unknown."""
 
     def depths(some: slice) -> tuple[np.ndarray, ...]:
         seen = sightings.spreads[kept[some]], sightings.warps[kept[some]]
@@ -399,10 +380,7 @@ def _former_observations(
     num_frames: int,
     num_threads: int,
 ) -> Iterator[Observed]:
-    """The former observations of points in frames where alignment failed, of some at a time.
-
-    Points without an aligned patch are kept only in frames with few aligned ones.
-    """
+    """Former observations where alignment failed; of points without a patch in weak frames."""
     tracks = landmarks.tracks
     wanted = np.zeros(tracks.num_points, bool)
     wanted[found.points] = True

@@ -165,10 +165,7 @@ def _with_depths(
     num_threads: int,
     dropped: dict[str, int],
 ) -> PhotometricBlock:
-    """Patches with planes estimated at fixed poses, coarse to fine; uncorrelated ones do not count.
-
-    The number of uncorrelated ones is added to `dropped`.
-    """
+    """Patches with planes estimated at fixed poses, coarse to fine; `dropped` counts others."""
     chosen, values = settings.photometric, adjustment.values_of(world_T_rigs)
     gathered, visible = _gather(
         frames, table, world_T_rigs, level, level + chosen.depth_levels, chosen
@@ -202,8 +199,7 @@ def _gather(
     top: int,
     settings: PhotometricSettings,
 ) -> tuple[list[PatchPixels], np.ndarray]:
-    """Pixels of the patches at the levels from `level` to `top`; weights (O,) from the masks of
-    both frames."""
+    """Pixels of patches at levels `level` to `top`; weights (O,) from the masks of both frames."""
     gathered: list[PatchPixels] = []
     visible, trusted = np.ones(len(table.targets)), np.ones(len(table))
     needed = np.union1d(table.hosts, table.targets)
@@ -232,10 +228,7 @@ def _solve(
     solved: Solution,
     context: AdjustmentContext,
 ) -> tuple[Solution, np.ndarray, np.ndarray]:
-    """The joint solve, repeated once with lower weights of bad frames: weights, residuals.
-
-    It is undone if it fits the map's own observations worse than before.
-    """
+    """The joint solve, once more with lower weights of bad frames; undone if the map fits worse."""
     settings, num_threads = context.settings, context.num_threads
     values = adjustment.values_of(solved.world_T_rigs)
     looser = {"relative_tolerance": _TOLERANCE, "absolute_tolerance": None}

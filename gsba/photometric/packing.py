@@ -114,12 +114,7 @@ def _by_frame(
     rig: CubeRig,
     num_threads: int,
 ) -> Iterator[tuple[np.ndarray, ...]]:
-    """Observations of points seen several times (J,), ordered by frame and point.
-
-    Yields:
-        Points, frames, True for those of the first part, normals, and the columns of keypoints but
-        for origins, of some frames; the number of each frame's goes to `sizes` (F,).
-    """
+    """Observations of points seen repeatedly (J,), by frame, then point; some frames at a time."""
     groups = list(slices(len(sizes), _FRAMES_AT_ONCE))
 
     def ordered(n: int) -> tuple[np.ndarray, ...]:
@@ -159,8 +154,7 @@ def _columns(every: Observed, shown: Shown, rig: CubeRig) -> tuple[np.ndarray, .
 def _by_point(
     points: np.ndarray, frames: np.ndarray, starts: np.ndarray, num_points: int
 ) -> Iterator[tuple[np.ndarray, ...]]:
-    """Points, numbered anew, frames and keypoints of observations (O,), which are ordered by frame,
-    ordered by point; of some points at a time."""
+    """Points, frames and keypoints of observations (O,) reordered by point, some at a time."""
     number = 0
     for some in slices(num_points, _POINTS_AT_ONCE):
         rows = np.flatnonzero((points >= some.start) & (points < some.stop))
