@@ -159,7 +159,6 @@ def visits_of(offsets: np.ndarray, frames: np.ndarray, num_frames: int, most: in
 
     Args:
         offsets (J + 1,), frames (O,): observations by landmark.
-        num_frames: F.
         most: limit on a run's visits, exceeded by its last landmark only.
     """
     owners = np.repeat(np.arange(len(offsets) - 1, dtype=np.int32), np.diff(offsets))

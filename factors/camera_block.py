@@ -51,8 +51,6 @@ class CameraBlock:
         """Fix the pattern.
 
         Args:
-            camera: variables, and what they act on.
-            sightings: observations; see `sightings_of`.
             points_world: (J, 3) start values, world.
             loss: robust loss on each whitened residual norm; None is plain least squares.
             polish_steps: Gauss-Newton steps on the landmarks after each proposed step.

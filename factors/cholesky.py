@@ -62,7 +62,6 @@ class BlockCholesky:
         """Choose an elimination order (minimum degree) and find the fill.
 
         Args:
-            num_blocks: N block rows.
             pairs: (P, 2) int, i < j, distinct: where off-diagonal blocks may be nonzero.
             num_kept: K blocks, the last ones, that are not eliminated: `factorize` then leaves
                 their Schur complement, and `reduced` and `substituted` replace `solve`.

@@ -55,7 +55,6 @@ def coarse_system(
         written: (N, 6, 6) blocks H[i, i], without the factored complements.
         off_diagonal, pairs: (P, 6, 6), (P, 2) off-diagonal blocks of that part, i < j.
         held: complements of landmarks in factored form, their variables (F,), and visits by groups.
-        groups, bases: groups of the variables and their motions.
     """
     num = GROUP_DIM * groups.num
     target = np.zeros((num, num))  # its upper triangle

@@ -25,7 +25,6 @@ def conjugate_gradients(
         right: (N, 6, R).
         precondition: approximate H^-1 applied to (N, 6, R), symmetric positive definite.
         tolerance: of each residual in the preconditioner's norm, relative to x = 0.
-        max_iterations: largest number of products with H.
         truncate: return the last iterate even if the tolerance is not reached.
 
     Returns:

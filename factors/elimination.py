@@ -78,7 +78,6 @@ def eliminate(
     """The Schur complement of landmarks in a linear least-squares problem.
 
     Args:
-        num_frames: F.
         frames, points: (O,) int, frame and landmark of each observation.
         residuals: (O, 2) whitened.
         by_point: (O, 2, 3) Jacobian by the landmark.

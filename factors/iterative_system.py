@@ -31,7 +31,6 @@ class IterativeSystem(ReducedSystem):
         """Form groups of covisible frames, and the visits of landmarks by groups.
 
         Args:
-            layout: of the system.
             products: of those of the layout's blocks, by index, that are not written out.
         """
         super().__init__(layout, products)

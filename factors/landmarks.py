@@ -308,7 +308,6 @@ def eliminate_points(
     """Reduced pose system of observations: robust weights, landmarks eliminated.
 
     Args:
-        obs, visits: observations and visits by landmark.
         points: (J, 3) world.
         poses: (F, 12) as in `factors._kernels`.
         row_starts, columns: (F + 1,), (P,) covisible frame pairs i < k as sorted CSR rows.

@@ -241,7 +241,6 @@ class PatchPixels:
         """Allocate templates; nothing is sampled yet.
 
         Args:
-            table: patches; its frames index the poses.
             world_T_rigs: (F, 4, 4) float64, poses that place the windows.
             width: of the sphere images, pixels.
             margin: pixels of that image at the equator.

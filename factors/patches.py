@@ -43,7 +43,6 @@ class PatchSet:
         """Allocate templates.
 
         Args:
-            num: number of templates, T.
             size: pixels across a patch, n, odd.
             window: standard deviation of the Gaussian window, in half patches.
             affine_sigma: standard deviation of the affine part's deviation from the prediction.

@@ -54,7 +54,6 @@ class PhotometricBlock:
 
         Args:
             keys: (F,) keys of Pose3 variables.
-            pixels: templates and windows, of all frames that the table names.
             sigmas: (P,) or one, noise of a residual, grey values of a pixel in the host.
             loss: robust loss on the root mean square of a patch's whitened residuals, times the
                 number of its pixels; None is plain least squares.

@@ -52,7 +52,6 @@ def covisible_groups(num: int, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -
     Pairs join groups, the strongest first (Kruskal's algorithm), as long as they stay small.
 
     Args:
-        num: N variables.
         pairs: rows (P, 2) of variables, and the number (P,) of landmarks that each two share, which
             is normalised by both variables' totals. Variables without a pair stay alone.
     """

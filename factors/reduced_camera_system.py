@@ -79,8 +79,6 @@ class ReducedSystem(NormalEquations, ABC):
         gauge: its errors are merely enormous.
 
         Args:
-            num_draws: number of draws, D.
-            rng: generator of the draws.
             damping: part of the diagonal that is added to it.
 
         Returns:

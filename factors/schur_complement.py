@@ -70,7 +70,6 @@ class SchurComplement:
         Args:
             labels: (F,) group of each pose.
             bases: (F, 6, 7) motion of each pose when its group moves.
-            visits: visits by groups of each run.
             target: (7 G, 7 G), only the upper triangle is written.
         """
         for run, projected, by_group in zip(self.runs, self.projected, visits, strict=True):

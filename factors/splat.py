@@ -77,7 +77,6 @@ class SplatBlock:
                 overlap by a few pixels for sampling near their edges.
             weights: (F,) of (C, H, W) float or bool, weights of pixels, 0..1: 0 is never
                 sampled; or None.
-            cameras: of the faces.
             render: the splat from a pose; called by `refresh`.
             loss: robust loss on each whitened residual; None is Cauchy at one sigma.
             correlation: number of pixels with a common error, which count as one; 25 made the

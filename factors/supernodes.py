@@ -30,7 +30,6 @@ def find_supernodes(num: int, pairs: np.ndarray, num_kept: int = 0) -> Supernode
     Ashcraft and Grimes, 1989.
 
     Args:
-        num: N rows.
         pairs: (P, 2) int, i < j, distinct: entries off the diagonal.
         num_kept: K rows, the last ones, that come last in the order, as they are, and are a
             supernode of their own; `pairs` must pair each with each.

@@ -28,9 +28,6 @@ def reduced_system(
     Conjugate gradients take over where covisibility would fill in a factorization.
 
     Args:
-        graph: native and user factors.
-        blocks: batched ones.
-        values: of all variables.
         pairs: keys of two variables each, whose joint block `covariances` returns.
 
     Raises:

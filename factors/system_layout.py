@@ -39,9 +39,6 @@ class SystemLayout:
         """Place the variables.
 
         Args:
-            graph: native and user factors.
-            blocks: batched ones.
-            values: of all variables.
             pairs: keys of two variables each, whose joint block `covariances` returns.
             order: keys of variables that come first, in this order; others follow.
 

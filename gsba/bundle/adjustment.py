@@ -113,7 +113,6 @@ class AdjustmentContext:
         """Terms for covariances: the first pose and the extent of each map are held fixed.
 
         Args:
-            solved: poses, and own variables of families.
             maps: (F,) map of each frame; None = there is one.
         """
         own = self.families.covariance_terms(solved, self.maps)
@@ -183,7 +182,6 @@ class View(Protocol):
         """Terms that an adjustment from a solution minimises, and the view at the values it finds.
 
         Args:
-            solved: poses, and the points to use.
             noise: of the observations, in units of the keypoints' own sigmas.
         """
         ...
@@ -226,12 +224,7 @@ def adjust_sighted(
 def adjust_sighted_through(
     view: V, sighted: Sighted, before: Solution, context: AdjustmentContext, gates: Sequence[float]
 ) -> tuple[Solution, V]:
-    """As `adjust_sighted`, through a camera that may be solved for, too.
-
-    Args:
-        view: of the observations.
-        sighted: their tracks, and which of them are aligned.
-    """
+    """As `adjust_sighted`, through a camera that may be solved for, too."""
     solved, rounds, settings = before, [], context.settings
     for number, gate in enumerate(gates, 1):
         so_far = replace(sighted, keypoints=view.keypoints)
@@ -284,9 +277,7 @@ def adjust(
 
     Args:
         tracks: candidate tracks; every round starts from all of them.
-        keypoints: of all frames.
         start: poses to start from, and the noise known so far.
-        context: priors, families, loss, solver.
         gates: of each round, in standard deviations of the noise.
         final: whether the last round is solved to the end; others lose observations anyway.
     """
@@ -375,9 +366,7 @@ def landmark_block(
     """The factor block of the families that observe points.
 
     Args:
-        landmarks, keypoints: what is observed, where.
         noise: of the observations, in units of the keypoints' own sigmas.
-        context: families, loss.
     """
     solver = context.settings.solver
     return LandmarkBlock(

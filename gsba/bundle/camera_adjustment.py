@@ -84,7 +84,6 @@ def solve_with_camera(
     The last round, of the tightest gate, is of poses and points alone.
 
     Args:
-        tracks: candidate tracks.
         shown: keypoints as pictures show them.
         cameras: to start from; what it leaves out (a readout, axes, raw lenses) is left out.
         timestamps: (F,) seconds.

@@ -66,9 +66,7 @@ def tracks_of_camera(tracks: Tracks, of_frame: Sequence[int], camera: int) -> Tr
     """Tracks of what one camera observes: points that it sees twice or more.
 
     Args:
-        tracks: of frames of all cameras.
         of_frame: (F,) camera of each frame; () = there is one.
-        camera: index of the camera.
     """
     if not of_frame:
         return tracks

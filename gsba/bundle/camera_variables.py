@@ -85,7 +85,6 @@ class CameraUnknowns:
             cameras: as found so far.
             world_T_rigs: (F, 4, 4) poses, whose velocities frames have while they are read.
             timestamps: (F,) seconds.
-            context: settings, and a gyro's rates.
         """
         num, parts, first = len(world_T_rigs), list[LensVariables](), 0
         values, graph = gtsam.Values(), gtsam.NonlinearFactorGraph()
@@ -133,7 +132,6 @@ class CameraUnknowns:
         """The observations of some points, to be explained by poses and cameras.
 
         Args:
-            landmarks: points and what observes them.
             shown: keypoints as pictures show them.
             noise: of the observations, in units of the keypoints' own sigmas.
             curved: see `CameraBlock`.
@@ -322,7 +320,6 @@ def keys_of_lenses(num: int, first: int = 0) -> list[int]:
     """Keys of the variables of L raw lenses, in the order of `self_calibration`.
 
     Args:
-        num: L.
         first: number of the camera's first lens among those of all cameras.
     """
     others = [[F(lens), K(lens), B(lens - 1)] for lens in range(first + 1, first + num)]

@@ -32,7 +32,6 @@ def added(
 
     Args:
         covariances: (F, 6, 6) of poses, [rotation rad, translation], rig frames; NaN = none.
-        joint: what their errors have in common so far.
         world_T_rigs: (F, 4, 4).
         components: (F,) map of each frame, in which the first pose and its distance to the
             furthest position are held; None = there is one.

@@ -51,7 +51,6 @@ def cross_validate(
     """Predict each part of a sequence by the others.
 
     Args:
-        parts: of the sequence.
         candidate: parameters that some parts give.
         baseline: the same by the simpler model that the candidate is compared with; None = all
             parameters are zero.

@@ -150,7 +150,6 @@ class Families:
         """Residuals of points by all families that observe them.
 
         Args:
-            landmarks, keypoints: what is observed, where.
             noise: of the observations, in units of the keypoints' own sigmas.
         """
         observing = self.observing_points.members
@@ -166,7 +165,6 @@ class Families:
         """The snapshot of a solution that families build their factors from.
 
         Args:
-            solved: poses, points, and own variables so far.
             maps: (F,) map of each frame; None = there is one.
         """
         of_frames = numbered(maps, len(solved.world_T_rigs))
@@ -184,7 +182,6 @@ class Families:
         """Factors, blocks and variables of all families, for an adjustment from a solution.
 
         Args:
-            solved: poses, points, and own variables so far.
             maps: (F,) map of each frame; None = there is one.
 
         Raises:

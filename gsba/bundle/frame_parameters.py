@@ -69,8 +69,6 @@ def models_of(
     Args:
         landmarks: points, moved to their best first, and their observations.
         keypoints: where these really point.
-        solved: poses, and the noise of observations.
-        context: families, loss.
         by_parameters: Jacobian (O, 2, K) of residuals by parameters of their frames.
     """
     drawn = np.random.default_rng(context.settings.seed).permutation(landmarks.tracks.num_points)

@@ -51,7 +51,6 @@ class Gauge:
         """A solution's poses moved map by map, without points and variables of families.
 
         Args:
-            solved: the solution.
             maps: (F,) map of each frame; None = there is one.
         """
         start = Solution.without_points(self.poses(solved.world_T_rigs, maps))
@@ -66,7 +65,6 @@ def align(families: Families, solved: Solution, maps: np.ndarray | None = None) 
 
     Args:
         families: of the run; those that do not fix the gauge have no say.
-        solved: poses so far.
         maps: (F,) map of each frame; None = there is one.
     """
     chosen = families.fixing_gauge

@@ -70,7 +70,6 @@ def anchor(
 
     Args:
         world_T_rigs: (F, 4, 4) poses so far.
-        fixes: of some of the frames.
         maps: (F,) map of each frame; None = there is one.
 
     Returns:
@@ -131,7 +130,6 @@ def contradiction(anchors: Anchors, world_T_rigs: np.ndarray, draws: np.ndarray)
     that fixes know better than images.
 
     Args:
-        anchors: fixes in the world of the poses.
         world_T_rigs: (F, 4, 4) adjusted poses.
         draws: (D, F, 6) errors of the poses by images alone, rig frames; NaN = none.
 
@@ -292,7 +290,6 @@ def linear_factors(
     """Factors of fixes for covariances: lasting errors are variables, too.
 
     Args:
-        anchors: fixes in the world of the poses.
         world_T_rigs: (F, 4, 4) where factors are linearized.
         free_similarity: whether the map's similarity is a variable, as it must be where the first
             pose is held.

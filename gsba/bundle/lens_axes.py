@@ -57,11 +57,8 @@ def guess(
     """Lenses with axes that explain most with two centres: the rig's, turned ones, or the walk's.
 
     Args:
-        landmarks: points and their observations.
         keypoints: of these, as seen from one centre.
-        solved: the map's poses, and the noise of its observations.
         so_far: one centre; `band_rad` is kept.
-        context: loss, settings.
     """
     frames = keypoints.frames()
     tried = [replace(so_far, axes=axes) for axes in _candidates(solved.world_T_rigs)]
@@ -102,11 +99,8 @@ def loosened(
     """Axes of each frame's own, the rig's yet, if turning them by some points predicts others.
 
     Args:
-        landmarks: points and their observations.
         keypoints: of these, as rays of the lenses so far.
-        solved: the map's poses, solved under these, and the noise of its observations.
         so_far: two lenses whose axes are the rig's.
-        context: loss, settings.
     """
     used = drawn(landmarks, _MAX_OBSERVATIONS, context.settings.seed)
     counts = sample_counts(landmarks, used)

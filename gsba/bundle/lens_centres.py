@@ -84,11 +84,8 @@ def estimate(
     """Find the lenses' centres from a map, poses and points adjusted with them.
 
     Args:
-        landmarks: points and their observations.
         keypoints: of these, as rays under the lenses so far.
-        solved: the map's poses, solved under these, and the noise of its observations.
         so_far: centres that the rays start at; `band_rad` is kept.
-        context: priors, loss, settings.
     """
     chosen = context.settings.camera
     frames = keypoints.frames()
@@ -156,12 +153,8 @@ def stitched_for(
     first estimate: their distance is wrong where there is one.
 
     Args:
-        landmarks: points and their observations.
         keypoints: of these, as rays of the lenses so far.
         shown: (N, 3) directions of the keypoints in their pictures.
-        solved: the map's poses, solved under these, and the noise of its observations.
-        so_far: the lenses.
-        context: loss, settings.
     """
     said = context.settings.camera.inverse_stitch_radius(so_far.baseline / 2)
     if said is not None:
@@ -195,7 +188,6 @@ def by_inverse_stitch_radius(bearings_rig: np.ndarray, origins_rig: np.ndarray) 
     """Jacobian (O, 2, 1) of residuals of bearings (O, 3) by the inverse stitch radius.
 
     Args:
-        bearings_rig: of the rays.
         origins_rig: (O, 3) where they start.
     """
     return tangent_basis(bearings_rig) @ origins_rig[:, :, None]

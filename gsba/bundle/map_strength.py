@@ -129,9 +129,6 @@ def position_errors(world_T_rigs: np.ndarray, draws: np.ndarray) -> np.ndarray:
 def neighbour_shifts(result: Reconstruction) -> np.ndarray:
     """Angles (F,) in radians, rms, by which points of a frame are to be expected beside their
     pictures in the next one, by errors of the step between both; NaN = not known, as of the last.
-
-    Args:
-        result: one map with its joint errors.
     """
     poses, joint = result.world_T_rigs, result.joint_errors
     found = np.full(len(poses), np.nan)

@@ -35,7 +35,6 @@ def observation_noise(
 
     Args:
         landmarks: points and their observations, O of them.
-        keypoints: of all frames.
         world_T_rigs: (F, 4, 4) poses.
         num_threads: that share the points; the result does not depend on them.
         chosen: (O,) bool, observations whose spread is asked for.

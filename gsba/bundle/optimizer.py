@@ -226,10 +226,8 @@ def marginal_covariances(
 
     Args:
         graph, blocks: what constrains them, linearized at `values`.
-        values: of all variables.
         keys: (F,) keys of Pose3 variables, in the order of the path.
         num_draws: errors drawn of all poses at once.
-        seed: of these.
         beside: (B,) keys of other variables, of at most six dimensions: their covariances follow.
 
     Returns:

@@ -27,8 +27,6 @@ class PointObservations:
         """Observations of landmarks.
 
         Args:
-            landmarks: points, and the keypoints that show them.
-            keypoints: of all frames.
             noise: of an observation, in units of its keypoint's own sigma.
         """
         tracks, rows = landmarks.tracks, keypoints.rows(landmarks.tracks)

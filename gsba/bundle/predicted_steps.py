@@ -21,9 +21,6 @@ _ITERATIONS = 10
 def step_deviations(result: Reconstruction) -> np.ndarray:
     """Deviation (F - 1,) of each step from the one that far frames predict, part of the longer of
     both, and at least a tenth of the rms step; NaN = they predict none.
-
-    Args:
-        result: one map.
     """
     poses = result.world_T_rigs
     predicted, known = poses.copy(), np.zeros(len(poses), bool)

@@ -70,13 +70,10 @@ def estimate(
     No readout is taken while another way of reading rows predicts unseen parts nearly as well.
 
     Args:
-        landmarks: points and their observations.
         keypoints: of these, as rays of the lenses.
         shown: (N, 3) directions of the keypoints in their pictures: these tell rows.
-        solved: poses under these, and the noise of observations.
         lenses: read at one instant so far.
         timestamps: (F,) seconds, whose differences give velocities.
-        context: loss, settings.
     """
     turning = turning_of(lenses, context)
     motion = velocities(solved.world_T_rigs, timestamps, turning, context.maps)

@@ -42,9 +42,7 @@ def assemble(
     """Carry the solution back to the trajectory's world and gather what exports need.
 
     Args:
-        adjustment: the last solution.
         covariances: (F, 6, 6) of its poses.
-        keypoints: of all frames.
         coarse: poses that define the world, unless they are interpolated; None = world and scale
             of the solution are those of the result.
         min_observations: frames with fewer count as unrefined.

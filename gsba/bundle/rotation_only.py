@@ -36,7 +36,6 @@ def refine(
 
     Args:
         found: which keypoints show one direction; some may be false.
-        keypoints: of all frames.
         world_T_rigs: (F, 4, 4) rotations right but for the drift of a chain; positions are kept.
         coarse: poses that define the world.
         min_observations: frames with fewer count as unrefined.
@@ -62,7 +61,6 @@ def solve(
     Args:
         world_R_rigs: (F, 3, 3) to start from; the first is kept.
         found: which keypoints show one direction; some may be false.
-        keypoints: of all frames.
 
     Returns:
         (F, 3, 3) rotations; their covariances (F, 3, 3) in the rig frame, radians squared, with

@@ -31,7 +31,6 @@ def scale_changes(result: Reconstruction, recordings: np.ndarray) -> np.ndarray:
     inf = too few points are seen by both sides; NaN = a side has one frame.
 
     Args:
-        result: one map.
         recordings: (F,) number of each frame's recording.
     """
     found = np.full(max(len(result.world_T_rigs) - 1, 0), np.nan)

@@ -70,12 +70,8 @@ def estimate(
     """Calibrate lenses by a map, poses, points and lens centres adjusted with them.
 
     Args:
-        landmarks: points and their observations.
         keypoints: of these, as rays under the lenses so far.
         shown: (N, 3) directions of the keypoints in their panoramas.
-        solved: the map's poses, solved under these, and the noise of its observations.
-        so_far: lenses of raw pairs.
-        context: priors, loss, settings.
         nominal: whether the lenses so far are plain ones of unknown make, not calibrated.
     """
     frames, num = keypoints.frames(), num_parameters(so_far.num_lenses)
@@ -197,7 +193,6 @@ def by_lenses(
     Args:
         bearings_rig: (O, 3) of the rays.
         shown: (O, 3) directions in the panoramas.
-        lenses: of raw pairs.
         residuals: (O, 2) of the bearings, from observed to predicted; None = taken as 0.
     """
     out = np.zeros((len(shown), 2, num_parameters(lenses.num_lenses)))

@@ -196,8 +196,6 @@ def model_of(
     Args:
         landmarks: points, moved to their best first, and their observations.
         keypoints: where these really point.
-        solved: poses, and the noise of observations.
-        context: families, loss.
         by_shared: Jacobian (O, 2, K) of bearings' residuals, from the rows (O,) of keypoints, the
             Jacobian (O, 2, 3) by where each ray starts, and the residuals (O, 2).
     """
@@ -249,8 +247,6 @@ def without_points(
     """Normal equations of bearings with the points eliminated.
 
     Args:
-        seen, tracks: the bearings.
-        num_frames: F.
         by_frame: Jacobian (O, 2, K) of residuals by K variables of their frames.
         by_shared: Jacobian (O, 2, S) by variables of all frames; None = there are none.
     """
@@ -268,7 +264,6 @@ def by_origin(
     """Jacobian (O, 2, 3) of residuals by the origin of rays, rig frame, and by their direction.
 
     Args:
-        seen: the residuals.
         world_R_rigs: (O, 3, 3) of their poses.
         bearings_rig: (O, 3) of their rays.
         inverse_stitch_radius: see `Lenses`.

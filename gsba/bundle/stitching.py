@@ -66,7 +66,6 @@ def with_noise_of(
     """Keypoints whose noise is scaled as in others of the same rows, where they were corrected.
 
     Args:
-        keypoints, calibrated: these, and the others.
         scratch: folder on the disk that takes the noise of many; None = it is in memory.
     """
     factors = calibrated.sigmas_rad / keypoints.sigmas_rad
@@ -92,10 +91,6 @@ def estimate(
     Args:
         sighted: candidate tracks and their keypoints, as observed.
         keypoints: the same with the noise they turned out to have.
-        before: the map solved with `field`.
-        field: so far.
-        context: priors, limits, loss, solver.
-        lenses: that see the observations.
     """
     settings = context.settings
     chosen = settings.stitching

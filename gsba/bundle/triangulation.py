@@ -35,13 +35,10 @@ def triangulate(
     midpoint, then Gauss-Newton on tangent-plane residuals).
 
     Args:
-        tracks: candidate tracks.
         bearings_rig: (O, 3) bearings of the observations.
         sigmas_rad: (O,) their noise.
         world_T_rigs: (F, 4, 4) current poses.
         max_error_sigmas: gate on the angle between observation and point, in sigmas.
-        settings: limits on parallax and track length.
-        num_threads: that share the tracks.
         origins_rig: (O, 3) rig frame, where each ray starts; None = the rig's centre.
     """
     starts = np.searchsorted(tracks.points, np.arange(tracks.num_points + 1))
@@ -97,7 +94,6 @@ def place(
     """As `triangulate`, the observations being the tracks' own keypoints; some tracks at a time.
 
     Args:
-        tracks, keypoints, world_T_rigs, max_error_sigmas, settings, num_threads: see `triangulate`.
         scratch: folder on the disk that takes the points of very many tracks; None = they are in
             memory.
     """

@@ -77,7 +77,6 @@ def calibration_json(
         rig: lenses, the front one first.
         centre: (3 (L - 1),) centres of all but the last one, see `gsba.camera.lens.Lenses`.
         unit: unit of `centre`, "m" or "map".
-        more: further entries of the file.
     """
     return {
         "model": _MODEL,

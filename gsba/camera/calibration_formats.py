@@ -308,7 +308,6 @@ def of_projection(lens: RadialProjection, rig_T_lens: np.ndarray, where: str) ->
     """Our lens model fitted to a lens of another projection.
 
     Args:
-        lens: its projection.
         rig_T_lens: (4, 4), metres.
         where: file and projection, for error messages.
 

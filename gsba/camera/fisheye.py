@@ -68,7 +68,6 @@ def by_parameters(lens: Fisheye, directions: np.ndarray) -> np.ndarray:
     """Jacobians (N, 3, PARAMETERS) of the directions of fixed pixels by the lens's parameters.
 
     Args:
-        lens: its current parameters.
         directions: (N, 3) unit, rig frame, of the pixels.
     """
     rig_R_lens = rotation_of(lens)

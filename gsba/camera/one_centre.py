@@ -38,7 +38,6 @@ class Stitcher:
         """Compute the offset from each direction of the rig to its direction in each lens.
 
         Args:
-            lenses: the lenses.
             frame: index of the frame in `lenses`.
             scene: (N, 3) points in the rig frame of this frame, which give the depths.
         """

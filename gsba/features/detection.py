@@ -82,8 +82,6 @@ def extract(
     Args:
         faces_rgb: (6, N, N, 3) uint8 in FACES order.
         masks: (6, N, N) bool, True = use, or None.
-        rig: geometry of the faces.
-        extractor: the detector.
     """
     wanted = _owned_pixels(rig) if masks is None else _owned_pixels(rig) & masks
     usable = [face for face in range(len(FACES)) if wanted[face].any()]
@@ -134,7 +132,6 @@ def gather(frames: Iterable[Features], folder: Path | None = None) -> Keypoints:
     """Keypoints of all frames in one record, without descriptors.
 
     Args:
-        frames: features of each frame.
         folder: on the disk that holds the arrays while they are used; None = they are in memory.
     """
     lengths = [0]
@@ -153,7 +150,6 @@ def on_faces(keypoints: Keypoints, rig: CubeRig) -> Keypoints:
 
     Args:
         keypoints: of frames of several runs, each on the faces of its own rig.
-        rig: the faces.
     """
     pixels = rig.project(keypoints.bearings_rig, keypoints.faces)
     moved = np.abs(pixels - keypoints.pixels).max(axis=1, initial=0.0) > _SAME_PIXEL_PX

@@ -71,7 +71,6 @@ def align(
         timestamps: (F,) times of frames, seconds.
         f_R_nexts: (F - 1, 3, 3) rotations between consecutive frames, by images.
         known: (F - 1,) bool, True for known rotations.
-        readings: readings of the gyro.
         former: the estimate from less accurate rotations; None = try all offsets.
     """
     turns = merged(timestamps, f_R_nexts, known)

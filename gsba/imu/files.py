@@ -61,7 +61,6 @@ def read_telemetry(path: Path, lasting_s: float | None = None) -> Readings:
     """Readings stored in a maker's recording.
 
     Args:
-        path: the recording.
         lasting_s: duration of its pictures, seconds; readings timed from the first frame that begin
             after it are of another recording. None = not known.
 

@@ -22,7 +22,6 @@ def up_axis(
     median of the means.
 
     Args:
-        readings: readings of both sensors.
         found: alignment of the readings with the frames.
         timestamps: (F,) times of frames, seconds, on their own clock.
         world_R_rigs: (F, 3, 3) refined rotations.

@@ -21,7 +21,6 @@ def make_extractor(
     """Factory of the extractor for each frame: SIFT, or a learned network.
 
     Args:
-        settings: `extractor` and its settings.
         weights: files of learned networks (`find_weights`).
     """
     if settings.extractor == "sift":

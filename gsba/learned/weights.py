@@ -273,12 +273,6 @@ def read_state(path: Path) -> dict[str, Any]:
 def load_into(model: Any, state: dict[str, Any], key: str, path: Path) -> Any:
     """Load weights into a network and put it into inference mode.
 
-    Args:
-        model: torch module.
-        state: tensors by name.
-        key: key of the network in SOURCES.
-        path: file of the weights, for the message.
-
     Raises:
         GsbaError: the weights are of another network.
     """

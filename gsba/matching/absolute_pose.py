@@ -42,7 +42,6 @@ def panorama_pose(
         bearings: (m, 3) unit, rig frame.
         points_world: (m, 3) candidate point of each bearing; many may be wrong.
         max_error_rad: of an inlier.
-        seed: of the sampling.
         least: number of inliers that is enough.
         min_ratio: least inlier ratio that the number of trials allows for.
     """

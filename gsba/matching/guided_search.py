@@ -96,7 +96,6 @@ def searchable(
     """Sort features into cells; keypoints at one place (several orientations) become one.
 
     Args:
-        features: features of one frame.
         axes: (D, D) orthonormal columns, equal for all frames; similarities do not depend on them,
             but the search is fast if the first columns hold most of the descriptors' energy.
         strongest: keypoints of a face to search among, None for all.
@@ -150,7 +149,6 @@ def match_pair(
     """Mutual, distinctive nearest neighbours within the gate.
 
     Args:
-        first, second: features of both frames.
         f0_T_f1: (4, 4) predicted pose of frame 1 in frame 0; its translation's length is unused.
         gate: allowed deviation from the prediction.
         points_f0: (K, 3) scene points of frame 0's keypoints in its rig frame, NaN where unknown.
@@ -284,7 +282,6 @@ class SearchableFrames:
     """Features of frames, prepared for matching; read on demand, the most recent ones are kept.
 
     Args:
-        load: reads the features of a frame.
         strongest: keypoints of a face to match, None for all.
         capacity: frames kept in memory.
         axes: axes of the descriptors, see `searchable`; None = those of frame 0.
@@ -401,11 +398,8 @@ def match(
         pairs: (P, 2) frame indices.
         world_T_rigs: (F, 4, 4) poses that predict the pairs' geometry.
         gates: (P) uncertainty of each prediction.
-        frames: features of the frames.
         settings: thresholds on similarity and distinctiveness, see `search_settings`.
-        workers: threads or processes that run it.
         points_rig: points (K_f, 3) of each frame, see `match_pair`.
-        matcher: compares two frames.
     """
     f0_T_f1s = inverse(world_T_rigs[pairs[:, 0]]) @ world_T_rigs[pairs[:, 1]]
     order, places = by_place(pairs, len(world_T_rigs))  # pairs that share frames follow one another

@@ -73,9 +73,7 @@ def recover(
     pieces is estimated by `gsba.loop_closure.map_merging`, from points that both maps hold.
 
     Args:
-        context: features and settings of the run.
         guided: neighbours verified under the trajectory's guidance; all of them where it is right.
-        coarse: the trajectory.
         timestamps: (F,) seconds.
 
     Raises:
@@ -215,7 +213,6 @@ def check_clock(
     A trajectory that fits in another convention is refused first: it may turn at other times.
 
     Args:
-        context: features and settings of the run.
         guided: neighbours verified under the trajectory's guidance. Where it lost many, whole
             panoramas are matched: a wrong clock loses the turns, which determine it.
         coarse: the trajectory at the frames' times.
@@ -261,7 +258,6 @@ def match_anywhere(context: MatchContext, chosen: np.ndarray, rivals: bool = Tru
     matcher, whose matches of all features are few and right, gets all at once.
 
     Args:
-        context: features and settings of the run.
         chosen: (P, 2) frame indices.
         rivals: True if another pose that explains about as many matches speaks against a pair.
     """
@@ -284,8 +280,6 @@ def match_again(context: MatchContext, found: VerifiedPairs, steps: set[int]) ->
     """Match steps again with all keypoints along the epipolar lines found, and verify them anew.
 
     Args:
-        context: features and settings of the run.
-        found: neighbours.
         steps: first frames of the steps; each keeps the pose with more inliers.
     """
     chosen = [

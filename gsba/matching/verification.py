@@ -52,12 +52,9 @@ def agree_with_prior(
     """Keep pairs that have one relative pose, which agrees with the prior.
 
     Args:
-        matches: putative matches.
-        estimates: result of `estimate_relative_poses` for each pair.
         prior_f0_T_f1s: (P, 4, 4) relative poses of the trajectory; None = no prior.
         position_sigmas: (P,) standard deviation of the prior's relative position, map units; it
             sets the tolerance of the direction.
-        settings: thresholds.
     """
     kept, kept_poses = [], []
     dropped: dict[str, int] = {
@@ -117,11 +114,6 @@ def estimate_relative_poses(
     """`relative_pose` of every pair by LO-RANSAC, without any prior.
 
     Args:
-        matches: putative matches.
-        keypoints: keypoints of all frames.
-        settings: thresholds.
-        seed: of the sampling.
-        workers: threads or processes that run it.
         chances: (P,) probability that a false match that passed the gate agrees with a pose near
             the predicted one; 0 = nothing was predicted.
         rivals: True if rival poses are searched too.
@@ -174,8 +166,6 @@ def relative_pose(
 
     Args:
         bearings0, bearings1: (m, 3) unit, rays of the matches in each frame.
-        settings: thresholds.
-        seed: of the sampling.
         chance, rivals: see `estimate_relative_poses`.
     """
     found = _significant_pose(bearings0, bearings1, settings, seed, chance)

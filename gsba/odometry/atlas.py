@@ -119,7 +119,6 @@ class Cutter:
         """The atlas of a panorama (h, 2h) uint8 whose orientation is roughly known.
 
         Args:
-            grey: the panorama.
             world_R_rig: (3, 3) predicted orientation.
             exactly: cut along these axes, not along others near them.
         """

@@ -60,13 +60,7 @@ class ClosedKeyframes:
 
 
 def close(tracked: TrackedKeyframes, seed: int, workers: Workers) -> ClosedKeyframes:
-    """Join the maps of a walk where they overlap, close loops, and estimate covariances.
-
-    Args:
-        tracked: all keyframes.
-        seed: of the sampling.
-        workers: who compare places.
-    """
+    """Join the maps of a walk where they overlap, close loops, and estimate covariances."""
     found = ClosedKeyframes.unchanged(tracked)
     places = _places(tracked, seed, workers)
     if places is None:

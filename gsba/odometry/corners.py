@@ -21,8 +21,6 @@ def new_corners(
     """Bearings (N, 3), rig frame, of corners in cells with too few features.
 
     Args:
-        layout: of the atlas.
-        atlas: the keyframe.
         usable: (2 s, 3 s) bool, pixels of the scene; None = all.
         known: (M, 3) bearings, rig frame, of features followed so far.
     """

@@ -19,10 +19,6 @@ def choose_frames(found: Odometry, settings: OdometrySettings) -> np.ndarray:
     From one frame to the next the camera moves by at most `step` times the median distance of the
     scene, and rotates by at most `max_turn_deg`, wherever the video has frames that close; the
     sharpest of the last part of each such stretch is selected. Frames without a pose are left out.
-
-    Args:
-        found: odometry of all frames.
-        settings: lengths of the steps, and the largest number of frames.
     """
     count = settings.max_frames
     steps = _Steps.of(found, settings.step, np.deg2rad(settings.max_turn_deg))

@@ -55,7 +55,6 @@ def close_loops(
     Args:
         world_T_keys: (K, 4, 4) poses of one map; the first is fixed.
         steps: steps to all keyframes but the first.
-        loops: candidate loops.
     """
     from scipy.stats import chi2
 

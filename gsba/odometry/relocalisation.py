@@ -59,7 +59,6 @@ def placed(
         key, frame: keypoints of the keyframe and the frame.
         bearings: (P, 3) unit, the keyframe's rig frame, of its points.
         distances: (P,) distances of these points, map units.
-        seed: of the sampling.
     """
     if min(len(key.bearings_rig), len(frame.bearings_rig)) < _MIN_MATCHES:
         return None

@@ -42,7 +42,6 @@ def track_frames(panoramas: SmallPanoramas, seed: int, checkpoint: Path | None) 
 
     Args:
         panoramas: in time order; those that are damaged are left out.
-        seed: of the sampling.
         checkpoint: written each minute; where it is of these panoramas, tracking goes on from it.
             The caller removes it. None = there is none.
 

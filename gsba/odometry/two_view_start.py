@@ -57,7 +57,6 @@ def start_map(
         one, other: (N, 3) their bearings in the two frames.
         turn: rotation of the bearings.
         sigma: radians, noise of bearings per axis.
-        seed: of the sampling.
         fading: True if features are being lost; then little parallax suffices.
     """
     moved = _MOVED_LITTLE if fading else _MOVED

@@ -173,7 +173,6 @@ def track_panoramas(
 
     Args:
         panoramas: all frames, in time order; damaged ones count as lost.
-        seed: of the sampling.
         workers: threads or processes that compare places; None = threads of this process.
         with_loops: False = join no maps, close no loops, estimate no covariances.
         checkpoint: file that tracking is saved to each minute, continued from if it is of the same

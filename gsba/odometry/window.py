@@ -67,7 +67,6 @@ def adjust_window(
         world_T_rigs: (K, 4, 4) initial poses.
         num_held: number of first keyframes that are fixed. With one, its distance to the furthest
             keyframe is fixed besides, as the scale is free otherwise.
-        seen: observations.
         sigma: radians, noise of bearings per axis.
         gate: residual from which observations are outliers, standard deviations.
     """

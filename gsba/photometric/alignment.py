@@ -84,14 +84,7 @@ def align(
     part, gain and offset are estimated. The affine parts determine the surfaces' normals.
 
     Args:
-        solved: points, poses, and the noise of the observations so far.
-        observed: these observations.
-        greys: the frames' images.
-        rig: faces that pixels are given on.
-        settings: limits and sizes.
-        workers: who work on frames.
         lenses: lenses of the camera; the band where two pictures are blended is left out.
-        name: beside the progress bar.
 
     Returns:
         Tracks of aligned observations, and of former ones where alignment failed.

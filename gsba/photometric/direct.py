@@ -91,10 +91,6 @@ def refine(
 
     Args:
         frames: panoramas; read twice a level, one at a time.
-        keypoints: keypoints of all frames.
-        start: the solved map.
-        context: priors, families, loss, solver, patches.
-        lenses: the camera's lenses.
     """
     solved, counts, settings = start, [], context.settings
     weights, residuals = np.ones(len(frames)), np.full(len(frames), np.nan)
@@ -267,7 +263,6 @@ def joint(
 
     Args:
         frame_weights: (F,) weights of each frame's pixels, see `PhotometricResult`.
-        lenses: the camera's lenses.
     """
     if "photometric" not in settings.factors:
         return []

@@ -35,12 +35,8 @@ def cut(
     """Templates cut from their host frames.
 
     Args:
-        name: beside the progress bar.
-        greys: the frames' images.
         hosts: (J,) frame of each template.
         origins (J, 3), spreads (J, 3, 2): plane patches, rig frame of the host.
-        settings: sizes and limits.
-        workers: threads or processes that run it.
     """
     patches = _empty_patches(len(hosts), settings)
     rows = _by_frame(hosts, greys.num_frames)
@@ -65,9 +61,7 @@ def align(
 
     Args:
         seeing: (O,) frame of each sighting.
-        patches: the templates.
         sightings: predicted sightings; the results are filled in.
-        name, greys, workers: as for `cut`.
     """
     rows = _by_frame(seeing, greys.num_frames)
     job = _AlignJob(name, greys, rows, patches, sightings)
@@ -87,7 +81,6 @@ def align_to(
 
     Args:
         image: the picture. mask: (H, 2H) bool, True = use; None = all.
-        patches, sightings: as for `align`.
     """
     reach, every = _SEARCH_SHIFT_RATIO * MAX_SHIFT_PX, np.arange(len(sightings.templates))
     patches.align(image, mask, every, sightings, reach, _MAX_STEPS, _TOLERANCE_PX)

@@ -84,11 +84,7 @@ def pack(
 
     Args:
         new, former: by patches, and earlier ones; no point is in a frame twice.
-        shown: what belongs to them.
-        rig: faces that pixels are given on.
-        counts: of observations.
         folder: of the arrays' files; None = they are in memory.
-        num_threads: that share the frames.
     """
     num_points, num_frames = len(shown.colors), len(shown.world_T_rigs)
     times = np.zeros(num_points, np.int64)

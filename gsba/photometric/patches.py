@@ -176,9 +176,7 @@ def table_of(
     Args:
         bearings: of each frame, (K, 3) candidates.
         world_T_rigs: (F, 4, 4) solved poses.
-        landmarks: the solved map.
         width: of the panoramas that patches are sampled from, pixels.
-        lenses: the camera's lenses.
     """
     tracks = landmarks.tracks
     positions = world_T_rigs[:, :3, 3]
