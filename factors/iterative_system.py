@@ -7,9 +7,8 @@ import numpy as np
 
 from factors._terms import pose_rows
 from factors.block import Products
-from factors.coarse_preconditioner import Coarse, Held, coarse_system
+from factors.coarse_preconditioner import Coarse, Held, coarse_system, covisible_groups
 from factors.conjugate_gradients import conjugate_gradients, multiply_blocks
-from factors.pose_clusters import covisible_groups
 from factors.reduced_camera_system import STEP_TOLERANCE, ReducedSystem
 from factors.schur_complement import group_visits
 from factors.system_layout import SystemLayout

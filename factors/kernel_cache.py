@@ -80,7 +80,17 @@ class KernelCache(_Cache):
         """Keep a compiled form, and let other processes go on."""
         try:
             if not data.library.has_dynamic_globals:
-                _save(self._path(sig, data.codegen), dumps(data._reduce()))
+                path = self._path(sig, data.codegen)
+                payload = dumps(data._reduce())
+                unfinished = path.with_suffix(f".{uuid.uuid4().hex}.tmp")
+                try:
+                    unfinished.write_bytes(hashlib.sha256(payload).digest() + payload)
+                    unfinished.replace(path)
+                    _remove_unused(path.parent)
+                except OSError as error:
+                    _tell_trouble(error.strerror or str(error))
+                    with contextlib.suppress(OSError):
+                        unfinished.unlink()
         finally:
             self.release()
 
@@ -209,19 +219,6 @@ def _load(path: Path, target_context: Any) -> CompileResult | None:
     if hashlib.sha256(payload).digest() != checksum:
         return None
     return CompileResult._rebuild(target_context, *pickle.loads(payload))
-
-
-def _save(path: Path, payload: bytes) -> None:
-    """Write a kernel's file at once, or not at all."""
-    unfinished = path.with_suffix(f".{uuid.uuid4().hex}.tmp")
-    try:
-        unfinished.write_bytes(hashlib.sha256(payload).digest() + payload)
-        unfinished.replace(path)
-        _remove_unused(path.parent)
-    except OSError as error:
-        _tell_trouble(error.strerror or str(error))
-        with contextlib.suppress(OSError):
-            unfinished.unlink()
 
 
 def _lock(path: Path, *, wait: bool = True) -> Any:

@@ -4,8 +4,7 @@ import copy
 
 import numpy as np
 
-from factors._patch_kernels import align_templates, cut_templates
-from factors._patch_records import (
+from factors._patch_kernels import (
     ALIGNED,
     FAR,
     FLAT,
@@ -14,6 +13,8 @@ from factors._patch_records import (
     UNSTEADY,
     Sightings,
     Templates,
+    align_templates,
+    cut_templates,
 )
 from factors.sphere_image import SphereImage
 

@@ -108,7 +108,14 @@ class PhotometricBlock:
         """Select the observations that count."""
         self._data.weights[:] = self._weights
         _, errors = self._observe(pose_rows(values, self.keys), self.planes, 0)
-        flags = self._rejections(values, errors)
+        world_T_rigs = np.array([values.atPose3(key).matrix() for key in self.keys])
+        owners = self.table.owners
+        lost = 2 * self._data.scales[owners] ** 2 / len(self.table.grid)
+        flags = {
+            **poor_views(self.table, world_T_rigs, self.planes),
+            "outside its window": errors == lost,
+            "no contrast": self._flat[owners],
+        }
         left = self._weights > 0
         self.dropped = {}
         for reason, flag in flags.items():
@@ -253,17 +260,6 @@ class PhotometricBlock:
             return cost, part.linearize(values)
 
         return reduced_factor(part.keys, part.pairs, evaluate)
-
-    def _rejections(self, values: gtsam.Values, errors: np.ndarray) -> dict[str, np.ndarray]:
-        """Reason -> observations (O,) bool to leave out, at the current planes."""
-        world_T_rigs = np.array([values.atPose3(key).matrix() for key in self.keys])
-        owners = self.table.owners
-        lost = 2 * self._data.scales[owners] ** 2 / len(self.table.grid)
-        return {
-            **poor_views(self.table, world_T_rigs, self.planes),
-            "outside its window": errors == lost,
-            "no contrast": self._flat[owners],
-        }
 
     def _observe(self, poses: np.ndarray, planes: np.ndarray, dims: int):
         """Models (hessians, gradients) of the observations, and their mean squares (O,)."""

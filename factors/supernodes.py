@@ -34,17 +34,6 @@ def find_supernodes(num: int, pairs: np.ndarray, num_kept: int = 0) -> Supernode
         num_kept: K rows, the last ones, that come last in the order, as they are, and are a
             supernode of their own; `pairs` must pair each with each.
     """
-    order, cut = _minimum_degree(num, pairs), num - num_kept
-    if num_kept:
-        order = np.concatenate([order[order < cut], np.arange(cut, num)])
-    order = order[_postorder(_tree(*_upper(num, pairs, order)))]
-    starts, columns = _upper(num, pairs, order)
-    firsts, rows = _fundamental(starts, columns, cut)
-    return Supernodes(order, *_relaxed(firsts, rows, num, cut))
-
-
-def _minimum_degree(num: int, pairs: np.ndarray) -> np.ndarray:
-    """Elimination order (N,) of a symmetric pattern: SuperLU's multiple minimum degree."""
     from scipy.sparse import coo_matrix, identity
     from scipy.sparse.linalg import splu
 
@@ -57,7 +46,13 @@ def _minimum_degree(num: int, pairs: np.ndarray) -> np.ndarray:
         diag_pivot_thresh=0.0,
         options={"SymmetricMode": True},
     )
-    return np.argsort(factor.perm_c)
+    order, cut = np.argsort(factor.perm_c), num - num_kept
+    if num_kept:
+        order = np.concatenate([order[order < cut], np.arange(cut, num)])
+    order = order[_postorder(_tree(*_upper(num, pairs, order)))]
+    starts, columns = _upper(num, pairs, order)
+    firsts, rows = _fundamental(starts, columns, cut)
+    return Supernodes(order, *_relaxed(firsts, rows, num, cut))
 
 
 def _upper(num: int, pairs: np.ndarray, order: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

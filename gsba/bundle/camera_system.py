@@ -11,10 +11,10 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from factors import Block
+from factors.block import QuadraticBlock
 from factors.camera_rows import LensVariables
-from factors.quadratic_block import QuadraticBlock
+from factors.direct_system import reduced_system
 from factors.reduced_camera_system import ReducedSystem
-from factors.system_choice import reduced_system
 from gsba.bundle import readout
 from gsba.bundle.adjustment import DRAWS, AdjustmentContext
 from gsba.bundle.camera_estimates import CameraEstimates

@@ -22,7 +22,7 @@ from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.camera_estimates import CameraEstimates
 from gsba.bundle.pose_variables import X
 from gsba.bundle.readout import CameraEstimate
-from gsba.camera.fisheye import Rig, rotation_of
+from gsba.camera.fisheye import rotation_of
 from gsba.config import CameraSettings
 from gsba.types import Keypoints, Landmarks
 
@@ -254,9 +254,16 @@ def _lens_variables(
             given["front_by_radius"] = lenses.inverse_stitch_radius * lenses.baseline / 2
     if lenses.fisheyes is not None:
         assert lenses.reference_calibration is not None
-        keys = keys_of_lenses(lenses.num_lenses, first)
+        keys = [F(first), K(first)]
+        for lens in range(first + 1, first + lenses.num_lenses):
+            keys += [F(lens), K(lens), B(lens - 1)]
         given["lenses"] = keys
-        given["calibration"] = _rows(lenses.reference_calibration)
+        given["calibration"] = np.array(
+            [
+                [lens.focal, *lens.principal, *lens.radial, *rotation_of(lens).ravel()]
+                for lens in lenses.reference_calibration
+            ]
+        )
         off = split_lenses(self_calibration.from_calibrated(lenses))
         for key, part, spread in zip(
             keys, off, split_lenses(self_calibration.spread(lenses.num_lenses)), strict=True
@@ -284,7 +291,8 @@ def _velocities(
     for number, camera in enumerate(cameras.each):
         if camera.lenses.readout_motion is not None:
             rows = cameras.frames_of(number, num)
-            found = velocities_of(camera, world_T_rigs, timestamps, context)
+            turning = context.turning if camera.by_gyro else None
+            found = readout.velocities(world_T_rigs, timestamps, turning, context.maps)
             whole[rows] = found[rows]
     return whole
 
@@ -299,31 +307,10 @@ def _axes(cameras: CameraEstimates, num_frames: int) -> np.ndarray:
     return whole
 
 
-def velocities_of(
-    camera: CameraEstimate,
-    world_T_rigs: np.ndarray,
-    timestamps: np.ndarray,
-    context: AdjustmentContext,
-) -> np.ndarray:
-    """Velocities (F, 6) of frames, from poses, and from a gyro that is believed."""
-    turning = context.turning if camera.by_gyro else None
-    return readout.velocities(world_T_rigs, timestamps, turning, context.maps)
-
-
 def split_lenses(columns: np.ndarray) -> list[np.ndarray]:
     """Parameters (..., K) of raw lenses, split by variable."""
     sizes = lens_sizes(self_calibration.num_lenses_of(columns.shape[-1]))
     return np.split(columns, np.cumsum(sizes[:-1]), axis=-1)
-
-
-def keys_of_lenses(num: int, first: int = 0) -> list[int]:
-    """Keys of the variables of L raw lenses, in the order of `self_calibration`.
-
-    Args:
-        first: number of the camera's first lens among those of all cameras.
-    """
-    others = [[F(lens), K(lens), B(lens - 1)] for lens in range(first + 1, first + num)]
-    return [F(first), K(first), *(key for keys in others for key in keys)]
 
 
 def _own_motion(
@@ -361,10 +348,3 @@ def _add(
     values.insert(key, np.array(value))
     model = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
     graph.add(gtsam.PriorFactorVector(key, np.zeros(len(value)), model))
-
-
-def _rows(rig: Rig) -> np.ndarray:
-    """Lenses as `factors.camera_rows` has them (L, 16)."""
-    return np.array(
-        [[lens.focal, *lens.principal, *lens.radial, *rotation_of(lens).ravel()] for lens in rig]
-    )

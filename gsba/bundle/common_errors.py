@@ -61,7 +61,14 @@ def _in_common(
             smooth = gaussian_filter1d(
                 np.concatenate(turned, axis=2)[..., 0], _SMOOTHING_FRAMES, axis=1
             )
-            held = _in_gauge(smooth, world_T_rigs[rows, :3, 3])
+            positions = world_T_rigs[rows, :3, 3]
+            offsets = positions - positions[0]
+            far, distance = furthest(positions)
+            turns, shifts = smooth[..., :3], smooth[..., 3:]
+            shifts = shifts - shifts[:, :1] - np.cross(turns[:, :1], offsets)
+            stretch = shifts[:, far] @ offsets[far] / max(distance, 1e-300) ** 2
+            shifts = shifts - stretch[:, None, None] * offsets
+            held = np.concatenate([turns - turns[:, :1], shifts], axis=-1)
             back = np.swapaxes(rotations[rows], 1, 2)
             turned = [back @ held[:, :, part, None] for part in _PARTS]
             errors[:, rows] = _COMMON_RATIO * np.concatenate(turned, axis=2)[..., 0]
@@ -69,14 +76,3 @@ def _in_common(
 
 
 _PARTS = slice(3), slice(3, 6)  # rotation, translation
-
-
-def _in_gauge(errors: np.ndarray, positions: np.ndarray) -> np.ndarray:
-    """World-frame errors (D, N, 6) with the first pose and its distance to the furthest held."""
-    offsets = positions - positions[0]
-    far, distance = furthest(positions)
-    turns, shifts = errors[..., :3], errors[..., 3:]
-    shifts = shifts - shifts[:, :1] - np.cross(turns[:, :1], offsets)
-    stretch = shifts[:, far] @ offsets[far] / max(distance, 1e-300) ** 2
-    shifts = shifts - stretch[:, None, None] * offsets
-    return np.concatenate([turns - turns[:, :1], shifts], axis=-1)

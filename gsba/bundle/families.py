@@ -16,10 +16,45 @@ import numpy as np
 
 from factors import Block, Term
 from gsba.bundle.family_variables import kept, restored
-from gsba.bundle.point_observations import PointObservations
 from gsba.bundle.pose_variables import X
 from gsba.log import GsbaError
 from gsba.types import FamilyVariables, Keypoints, Landmarks, Solution
+
+
+@dataclass(frozen=True, slots=True)
+class PointObservations:
+    """O observations of points by frames, each with its noise."""
+
+    frames: np.ndarray  # (O,) int64, row of the frame
+    points: np.ndarray  # (O,) int64, row of the point
+    bearings_rig: np.ndarray  # (O, 3) float64, unit, rig frame
+    sigmas_rad: np.ndarray  # (O,) float64, of either angle on `factors.tangent_basis`
+    sqrt_infos: np.ndarray | None  # (O, 2, 2) 1/rad on that basis, in place of sigmas_rad where
+    # observations are sharper along one direction; None = they are not
+    origins_rig: np.ndarray | None  # (O, 3) map units, rig frame, where each ray starts; None = in
+    # the rig's centre
+    faces: np.ndarray  # (O,) uint8, cube face that shows the observation
+    pixels: np.ndarray  # (O, 2) float64, (u, v) on it, corner origin
+
+    @classmethod
+    def of(cls, landmarks: Landmarks, keypoints: Keypoints, noise: float) -> "PointObservations":
+        """Observations of landmarks.
+
+        Args:
+            noise: of an observation, in units of its keypoint's own sigma.
+        """
+        tracks, rows = landmarks.tracks, keypoints.rows(landmarks.tracks)
+        infos = keypoints.sqrt_infos
+        return cls(
+            frames=tracks.frames,
+            points=tracks.points,
+            bearings_rig=keypoints.bearings_rig.take(rows, axis=0),
+            sigmas_rad=noise * keypoints.sigmas_rad[rows],
+            sqrt_infos=None if infos is None else infos.take(rows, axis=0) / noise,
+            origins_rig=keypoints.origins_of(rows),
+            faces=keypoints.faces[rows],
+            pixels=keypoints.pixels.take(rows, axis=0),
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,7 +239,19 @@ def _terms_of(families: Sequence[Family], snapshot: MapSnapshot) -> FamilyTerms:
     poses = {X(f) for f in range(len(snapshot.world_T_rigs))}
     for family in families:
         own = family.variables(snapshot)
-        _check_keys(family, own, values)
+        for key in own.keys():  # noqa: SIM118
+            shown = gtsam.DefaultKeyFormatter(key)
+            letter = chr(gtsam.symbolChr(key))
+            if not (letter.isupper() or letter in family.reserved_letters):
+                raise GsbaError(
+                    f"family {family.name}: variable {shown}: make its key by gtsam.symbol with a "
+                    "capital letter, others are gsba's own"
+                )
+            if values.exists(key):
+                raise GsbaError(
+                    f"family {family.name}: variable {shown} belongs to another family: choose "
+                    "another letter"
+                )
         known = poses | set(own.keys())
         factors, arrays = family.graph(snapshot), tuple(family.blocks(snapshot))
         for n in range(factors.size()):
@@ -230,23 +277,6 @@ def digest_of(*parts: object) -> str:
 def numbered(maps: np.ndarray | None, num_frames: int) -> np.ndarray:
     """Map (F,) int64 of each frame; None = there is one, map 0."""
     return np.zeros(num_frames, np.int64) if maps is None else np.asarray(maps, np.int64)
-
-
-def _check_keys(family: Family, own: gtsam.Values, others: gtsam.Values) -> None:
-    """GsbaError where a key of a family's variables is not its own."""
-    for key in own.keys():  # noqa: SIM118
-        shown = gtsam.DefaultKeyFormatter(key)
-        letter = chr(gtsam.symbolChr(key))
-        if not (letter.isupper() or letter in family.reserved_letters):
-            raise GsbaError(
-                f"family {family.name}: variable {shown}: make its key by gtsam.symbol with a "
-                "capital letter, others are gsba's own"
-            )
-        if others.exists(key):
-            raise GsbaError(
-                f"family {family.name}: variable {shown} belongs to another family: choose "
-                "another letter"
-            )
 
 
 def _check_known(family: Family, what: str, keys: Iterable[int], known: set[int]) -> None:

@@ -14,10 +14,11 @@ from scipy.sparse.linalg import splu
 
 from factors.elimination import LinearSystem
 from gsba.bundle.adjustment import AdjustmentContext
-from gsba.bundle.cross_validation import Verdict, cross_validate
 from gsba.bundle.shared_parameters import (
     PARTS,
+    Verdict,
     Weighted,
+    cross_validate,
     of_points,
     weighted,
     without_points,

@@ -84,7 +84,11 @@ def align(families: Families, solved: Solution, maps: np.ndarray | None = None) 
             of_maps = step[: 7 * len(numbers)].reshape(-1, 7)
             tried = dict(zip(numbers, map(_exp, of_maps), strict=True))
             new_poses = _moved(poses, of_frames, tried)
-            new_own = _retracted(own, step[of_maps.size :])
+            delta, at, dims = gtsam.VectorValues(), 0, own.dims()
+            for key in own.keys():  # noqa: SIM118
+                delta.insert(key, step[of_maps.size :][at : at + dims[key]])
+                at += dims[key]
+            new_own = own.retract(delta)
             new_cost = _cost(terms, new_poses, new_own)
             if new_cost <= cost:
                 break
@@ -186,12 +190,3 @@ def _add_graph(graph, values, dims, basis, hessian, gradient) -> None:
 def _exp(step: np.ndarray) -> Sim3:
     """The similarity of a step [rotation, translation, log scale]."""
     return Sim3(float(np.exp(step[6])), gtsam.Rot3.Expmap(step[:3]).matrix(), step[3:6])
-
-
-def _retracted(own: gtsam.Values, steps: np.ndarray) -> gtsam.Values:
-    """Own variables moved by their tangents, in the order of their keys."""
-    delta, at, dims = gtsam.VectorValues(), 0, own.dims()
-    for key in own.keys():  # noqa: SIM118
-        delta.insert(key, steps[at : at + dims[key]])
-        at += dims[key]
-    return own.retract(delta)

@@ -146,7 +146,14 @@ def contradiction(anchors: Anchors, world_T_rigs: np.ndarray, draws: np.ndarray)
         frames, places = anchors.frames[rows], anchors.positions[rows]
         information = np.linalg.inv(anchors.covariances[rows]) * weights[rows, None, None]
         arms = places - places.mean(axis=0)
-        gauge = np.stack([arms, *np.cross(np.eye(3)[:, None], arms), *_shifts(len(rows))], axis=2)
+        gauge = np.stack(
+            [
+                arms,
+                *np.cross(np.eye(3)[:, None], arms),
+                *np.repeat(np.eye(3)[:, None], len(rows), axis=1),
+            ],
+            axis=2,
+        )
         pulled = np.einsum("aij,ajk->aik", information, gauge)
         inverse = np.linalg.pinv(np.einsum("aik,ail->kl", gauge, pulled), hermitian=True)
 
@@ -164,11 +171,6 @@ def contradiction(anchors: Anchors, world_T_rigs: np.ndarray, draws: np.ndarray)
         expected = np.mean(np.einsum("dai,aij,daj->d", moved, information, moved))
         worst = max(worst, float(bent / np.clip(expected, 1.0, 3 * len(rows))))
     return worst
-
-
-def _shifts(num: int) -> np.ndarray:
-    """Unit shifts (3, N, 3) along each axis."""
-    return np.repeat(np.eye(3)[:, None], num, axis=1)
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,14 +13,15 @@ from scipy.spatial.transform import Rotation
 
 from gsba.bundle import shared_parameters
 from gsba.bundle.adjustment import AdjustmentContext
-from gsba.bundle.cross_validation import cross_validate, predicts
 from gsba.bundle.frame_parameters import models_of, validated
 from gsba.bundle.shared_parameters import (
     PARTS,
     SharedModel,
     Weighted,
     by_origin,
+    cross_validate,
     drawn,
+    predicts,
     sample_counts,
     summed,
 )

@@ -14,10 +14,10 @@ import numpy as np
 from factors.bearing import tangent_basis
 from factors.camera_rows import half_baseline
 from gsba.bundle.adjustment import AdjustmentContext
-from gsba.bundle.cross_validation import cross_validate
 from gsba.bundle.shared_parameters import (
     PARTS,
     SharedModel,
+    cross_validate,
     models_of,
     summed,
     whole_model_of,
@@ -164,7 +164,7 @@ def stitched_for(
 
     def by_both(rows: np.ndarray, by_origin: np.ndarray, _: np.ndarray) -> np.ndarray:
         directions, there, bearings = shown[rows], frames[rows], keypoints.bearings_rig[rows]
-        by_near = by_inverse_stitch_radius(bearings, so_far.origins(directions, there))
+        by_near = tangent_basis(bearings) @ so_far.origins(directions, there)[:, :, None]
         by_origin = by_origin + before * tangent_basis(bearings)
         return np.concatenate([so_far.by_centre(by_origin, directions, there), by_near], axis=2)
 
@@ -182,15 +182,6 @@ def stitched_for(
         reason = "as well stitched at infinity"
     lenses = replace(so_far, inverse_stitch_radius=0.0 if reason else inverse_stitch_radius)
     return StitchRadius(lenses, inverse_stitch_radius, sigma, shares, reason)
-
-
-def by_inverse_stitch_radius(bearings_rig: np.ndarray, origins_rig: np.ndarray) -> np.ndarray:
-    """Jacobian (O, 2, 1) of residuals of bearings (O, 3) by the inverse stitch radius.
-
-    Args:
-        origins_rig: (O, 3) where they start.
-    """
-    return tangent_basis(bearings_rig) @ origins_rig[:, :, None]
 
 
 def _step(systems: Sequence[SharedModel]) -> np.ndarray:

@@ -13,8 +13,14 @@ from itertools import product
 import numpy as np
 
 from gsba.bundle.adjustment import AdjustmentContext
-from gsba.bundle.cross_validation import cross_validate, predicts
-from gsba.bundle.shared_parameters import PARTS, SharedModel, models_of, summed
+from gsba.bundle.shared_parameters import (
+    PARTS,
+    SharedModel,
+    cross_validate,
+    models_of,
+    predicts,
+    summed,
+)
 from gsba.camera.lens import Lenses, rows_run
 from gsba.config import CameraSettings
 from gsba.types import Counts, GyroConstraints, Keypoints, Landmarks, Solution
@@ -96,7 +102,10 @@ def estimate(
     of_ways = [[part.of(slice(way, way + 1)) for part in systems] for way in range(len(ways))]
     verdicts = [cross_validate(parts, _newton_step) for parts in of_ways]
     best = int(np.argmax([verdict.gains.sum() for verdict in verdicts]))
-    verdict, (duration, sigma) = verdicts[best], _duration(of_ways[best])
+    total = summed(of_ways[best])
+    curved = max(float(total.hessian[0, 0]), 1e-300)
+    verdict, sigma = verdicts[best], (total.curvature * curved) ** -0.5
+    duration = -float(total.gradient[0]) / curved / total.curvature
     sign = -1.0 if duration < 0 else 1.0  # rows are read the other way
     found = CameraEstimate(lenses, abs(duration), sigma, gains=verdict.shares, counts=counts)
     logger.info("readout: %.2f ms (sigma %.2f)", 1e3 * abs(duration), 1e3 * sigma)
@@ -186,13 +195,6 @@ def _newton_step(parts: Sequence[SharedModel]) -> np.ndarray:
     """Duration (1,) by these parts for one row direction, the loss's curvature left out."""
     total = summed(parts)
     return -total.gradient / np.maximum(total.hessian[0], 1e-300)
-
-
-def _duration(parts: Sequence[SharedModel]) -> tuple[float, float]:
-    """Duration by these parts for one row direction, and its standard deviation, seconds."""
-    total = summed(parts)
-    curved = max(float(total.hessian[0, 0]), 1e-300)
-    return -float(total.gradient[0]) / curved / total.curvature, (total.curvature * curved) ** -0.5
 
 
 def _ways(camera: CameraSettings, lenses: Lenses) -> list[np.ndarray]:

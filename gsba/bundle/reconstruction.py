@@ -68,7 +68,13 @@ def assemble(
     colors = np.zeros((len(lengths), 3), np.uint8)
     pieces = _observations(adjustment, keypoints, stretch[:, 3], colors)
     bearings, sigmas, errors, *origins = concatenated(pieces, scratch)
-    _require_small(errors)
+    median = float(np.degrees(np.median(errors))) if len(errors) else 0.0
+    if not median <= _MAX_RESIDUAL_DEG:
+        raise GsbaError(
+            f"the solution fell apart (median residual {median:.1f} deg): nothing is written; "
+            "check that frames and trajectory belong together, or refine without it "
+            "(--no-trajectory)"
+        )
     return Reconstruction(
         placed,
         covariances * stretch[:, :, None] * stretch[:, None, :],
@@ -119,17 +125,6 @@ def world_scale(solved: Solution, result: Reconstruction) -> float:
     rows = result.largest_map()
     lengths = [furthest(T[rows, :3, 3])[1] for T in (solved.world_T_rigs, result.world_T_rigs)]
     return lengths[1] / lengths[0] if lengths[0] > 0 else 1.0
-
-
-def _require_small(errors: np.ndarray) -> None:
-    """GsbaError for residuals (O,) in radians that cannot be those of a solution."""
-    median = float(np.degrees(np.median(errors))) if len(errors) else 0.0
-    if not median <= _MAX_RESIDUAL_DEG:
-        raise GsbaError(
-            f"the solution fell apart (median residual {median:.1f} deg): nothing is written; "
-            "check that frames and trajectory belong together, or refine without it "
-            "(--no-trajectory)"
-        )
 
 
 def _placed(

@@ -89,7 +89,14 @@ def solve(
         wide = max(0.5 * wide, 1.0)
     covariances = np.zeros((num, 3, 3))
     if system is not None:
-        covariances[1:] = noise**2 * _diagonal_blocks(system)
+        size = system.shape[0]
+        blocks = np.empty((size // 3, 3, 3))
+        for first in range(0, size, _COLUMNS):
+            last = min(first + _COLUMNS, size)
+            columns = _solved(system, np.eye(size, last - first, -first))
+            for n in range(first // 3, last // 3):
+                blocks[n] = columns[3 * n : 3 * n + 3, 3 * n - first : 3 * n + 3 - first]
+        covariances[1:] = noise**2 * blocks
         linearised = found, bearings, bases, residuals, weights / sigmas
         covariances *= _excess(rotations, sigmas, noise, linearised)[:, None, None]
     used = np.bincount(found.frames[weights > 0.1], minlength=num)
@@ -175,15 +182,3 @@ def _solved(system, right: np.ndarray) -> np.ndarray:
 
     damping = 1e-9 * float(np.mean(system.diagonal())) + 1e-12
     return splu((system + damping * identity(system.shape[0])).tocsc()).solve(right)
-
-
-def _diagonal_blocks(system) -> np.ndarray:
-    """The 3x3 blocks (N, 3, 3) on the diagonal of a sparse matrix's inverse."""
-    size = system.shape[0]
-    blocks = np.empty((size // 3, 3, 3))
-    for first in range(0, size, _COLUMNS):
-        last = min(first + _COLUMNS, size)
-        columns = _solved(system, np.eye(size, last - first, -first))
-        for n in range(first // 3, last // 3):
-            blocks[n] = columns[3 * n : 3 * n + 3, 3 * n - first : 3 * n + 3 - first]
-    return blocks

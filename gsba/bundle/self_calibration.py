@@ -15,10 +15,10 @@ import numpy as np
 
 from factors.bearing import tangent_basis
 from gsba.bundle.adjustment import AdjustmentContext
-from gsba.bundle.cross_validation import cross_validate
 from gsba.bundle.shared_parameters import (
     PARTS,
     SharedModel,
+    cross_validate,
     models_of,
     summed,
     whole_model_of,
@@ -118,7 +118,10 @@ def _of_nominal(
 ) -> SelfCalibration:
     """Calibration of plain lenses of unknown make, where focal lengths are determined."""
     num = len(off)
-    found, sigmas = _step([system], off), _sigmas(system, num)
+    pull = _pull(len(system.gradient), np.zeros(num))
+    information = system.curvature * system.hessian + np.diag(pull)
+    information += 1e-12 * np.trace(information) * np.eye(len(information))
+    found, sigmas = _step([system], off), np.sqrt(np.diagonal(np.linalg.inv(information))[:num])
     loose, focals = undetermined(sigmas), focals_of(so_far.num_lenses)
     focal = 100 * sigmas[focals]
     reason = ""
@@ -258,14 +261,6 @@ def _step(systems: list[SharedModel], off: np.ndarray) -> np.ndarray:
     whole[: len(off)] = off
     gradient = total.gradient + pull * whole
     return -np.linalg.solve(total.curvature * total.hessian + np.diag(pull), gradient)
-
-
-def _sigmas(system: SharedModel, num: int) -> np.ndarray:
-    """Standard deviations (K,) of lenses, adjusted with centres, poses and points."""
-    pull = _pull(len(system.gradient), np.zeros(num))
-    information = system.curvature * system.hessian + np.diag(pull)
-    information += 1e-12 * np.trace(information) * np.eye(len(information))
-    return np.sqrt(np.diagonal(np.linalg.inv(information))[:num])
 
 
 def _shown(values: np.ndarray) -> str:

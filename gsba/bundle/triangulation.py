@@ -1,6 +1,6 @@
 """Scene points from bearings and poses, robust to false observations in a track."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -64,22 +64,15 @@ def triangulate(
     flat = ~short & (parallaxes < np.deg2rad(settings.min_parallax_deg))
     dropped = {"observations disagree": short, "parallax too small": flat}
     if origins_rig is not None:
-        inside = _within_camera(tracks, inliers > 0, points, centres, origins_rig)
+        distances = np.linalg.norm(points[tracks.points] - centres, axis=1)
+        near = (inliers > 0) & (distances < np.linalg.norm(origins_rig, axis=1))
+        inside = np.bincount(tracks.points, near, len(points)) > 0
         dropped["within the camera"] = inside & ~short & ~flat
     kept = ~np.any(list(dropped.values()), axis=0)
     survivors = tracks.of_observations(kept[tracks.points] & (inliers > 0))
     numbers = {reason: int(flag.sum()) for reason, flag in dropped.items()}
     counts = Counts(tracks.num_points, survivors.num_points, "tracks", numbers)
     return Landmarks(points[kept], survivors, counts)
-
-
-def _within_camera(
-    tracks: Tracks, seen: np.ndarray, points: np.ndarray, centres: np.ndarray, origins: np.ndarray
-) -> np.ndarray:
-    """Points (J,) nearer to a lens that has seen them than that is to the camera's middle."""
-    distances = np.linalg.norm(points[tracks.points] - centres, axis=1)
-    near = seen & (distances < np.linalg.norm(origins, axis=1))
-    return np.bincount(tracks.points, near, len(points)) > 0
 
 
 def place(
@@ -118,17 +111,12 @@ def place(
     folder = scratch if len(tracks) > _IN_MEMORY else None
     points_world, points, frames, rows = concatenated(found(), folder)
     seen = Tracks(points, frames, rows, len(points_world))
-    return Landmarks(points_world, seen, _sum(counts))
-
-
-def _sum(parts: Sequence[Counts]) -> Counts:
-    """Counts of tracks added up."""
     dropped: dict[str, int] = {}
-    for part in parts:
+    for part in counts:
         for reason, number in part.dropped.items():
             dropped[reason] = dropped.get(reason, 0) + number
-    received, kept = sum(p.received for p in parts), sum(p.kept for p in parts)
-    return Counts(received, kept, "tracks", dropped)
+    received, kept = sum(p.received for p in counts), sum(p.kept for p in counts)
+    return Landmarks(points_world, seen, Counts(received, kept, "tracks", dropped))
 
 
 def points_under(reconstruction: Reconstruction, world_T_rigs: np.ndarray) -> np.ndarray:

@@ -63,7 +63,21 @@ def read_calibration(path: Path) -> Rig:
             why = f"it has no {error}"
         raise GsbaError(f"{path}: not a calibration of lenses ({why}); {_EXPECTED_FORM}") from None
     try:
-        return _in_centred_rig(rig)
+        axes = np.array([rotation_of(lens)[:, 2] for lens in rig])
+        if len(rig) == 2 and min(axes[0, 2], -axes[1, 2]) < np.cos(_MAX_AXIS_ANGLE_RAD):
+            raise ValueError(
+                "the front lens must look along z of the rig and the back one the other way, "
+                f"within {np.rad2deg(_MAX_AXIS_ANGLE_RAD):.0f} degrees: check their poses"
+            )
+        widest = np.arccos(np.clip((_DIRECTIONS @ axes.T).max(axis=1).min(), -1, 1))
+        if len(rig) > 2 and widest > _MAX_UNSEEN_ANGLE_RAD:
+            raise ValueError(
+                f"a direction is {np.rad2deg(widest):.0f} degrees from every lens's axis; lenses "
+                f"must see all around, to {np.rad2deg(_MAX_UNSEEN_ANGLE_RAD):.0f} degrees: check "
+                "their poses"
+            )
+        middle = np.mean([lens.centre for lens in rig], axis=0)
+        return tuple(replace(lens, centre=_three(np.asarray(lens.centre) - middle)) for lens in rig)
     except ValueError as error:
         raise GsbaError(f"{path}: {error}") from None
 
@@ -97,24 +111,6 @@ def calibration_json(
         },
         **more,
     }
-
-
-def _in_centred_rig(rig: Rig) -> Rig:
-    """The lenses in a rig whose origin is the mean of their centres."""
-    axes = np.array([rotation_of(lens)[:, 2] for lens in rig])
-    if len(rig) == 2 and min(axes[0, 2], -axes[1, 2]) < np.cos(_MAX_AXIS_ANGLE_RAD):
-        raise ValueError(
-            "the front lens must look along z of the rig and the back one the other way, within "
-            f"{np.rad2deg(_MAX_AXIS_ANGLE_RAD):.0f} degrees: check their poses"
-        )
-    widest = np.arccos(np.clip((_DIRECTIONS @ axes.T).max(axis=1).min(), -1, 1))
-    if len(rig) > 2 and widest > _MAX_UNSEEN_ANGLE_RAD:
-        raise ValueError(
-            f"a direction is {np.rad2deg(widest):.0f} degrees from every lens's axis; lenses must "
-            f"see all around, to {np.rad2deg(_MAX_UNSEEN_ANGLE_RAD):.0f} degrees: check their poses"
-        )
-    middle = np.mean([lens.centre for lens in rig], axis=0)
-    return tuple(replace(lens, centre=_three(np.asarray(lens.centre) - middle)) for lens in rig)
 
 
 def scaled_to_size(rig: Rig, size: tuple[int, int], path: Path) -> Rig:

@@ -16,8 +16,8 @@ import cv2
 import numpy as np
 
 from gsba.camera.rig import RIG_R_FACE
+from gsba.camera.sphere import table
 from gsba.camera.straighten import PAD, observed
-from gsba.camera.tables import table
 from gsba.types import FACES
 
 _MAX_OVERLAP = 1 / 8  # part of a square: cameras have 1/60 to 1/20

@@ -159,13 +159,17 @@ def _of_numbers(numbers: np.ndarray, calibration: FactoryCalibration) -> Factory
         raise ValueError(f"its canvas cannot be {canvas[0]:g}x{canvas[1]:g}")
     at = 3 if generation >= 3 else 1  # index of the centre
     angles = parts[:, at + 2 : at + 5]
-    known = _are_as_described(angles)
+    # degrees, the third ones about the axes and back to back
+    tilts, about = abs(angles[:, :2]), angles[:, 2].sum() % 360
+    known = bool((tilts < _MAX_TILT_DEG).all() and abs(about - 180) < _MAX_OFF_AXIS_SUM_DEG)
     lenses = []
     for n in range(2):
         centre = parts[n, at : at + 2] - (n * half[0], 0)
         if (abs(centre - half / 2) > half / 4).any():
             raise ValueError(f"the centre of lens {n + 1} is far from the middle")
-        rotation = _camera_R_lens(angles[n] if known else np.array([0, 0, 90.0]), behind=n == 1)
+        yaw, pitch, roll = angles[n] if known else np.array([0, 0, 90.0])
+        turn = Rotation.from_euler("ZYX", [roll - 90, yaw, pitch], degrees=True).as_matrix()
+        rotation = (turn @ (_HALF_TURN_ABOUT_Y if n == 1 else np.eye(3))).T
         lenses.append(FactoryLens(*_radial_model(generation, parts[n]), _two(centre), rotation))
     if calibration.back_first:
         lenses = [
@@ -182,19 +186,6 @@ def _of_numbers(numbers: np.ndarray, calibration: FactoryCalibration) -> Factory
         baseline_m=apart if low <= apart <= high else None,
         angles_known=known,
     )
-
-
-def _are_as_described(angles: np.ndarray) -> bool:
-    """True if angles (2, 3) are degrees, the third ones about the axes and back to back."""
-    tilts, about = abs(angles[:, :2]), angles[:, 2].sum() % 360
-    return bool((tilts < _MAX_TILT_DEG).all() and abs(about - 180) < _MAX_OFF_AXIS_SUM_DEG)
-
-
-def _camera_R_lens(angles: np.ndarray, behind: bool) -> np.ndarray:
-    """Rotation (3, 3) from a lens's frame to the camera's, by its angles (3,) in degrees."""
-    yaw, pitch, roll = angles
-    lens_R_camera = Rotation.from_euler("ZYX", [roll - 90, yaw, pitch], degrees=True).as_matrix()
-    return (lens_R_camera @ (_HALF_TURN_ABOUT_Y if behind else np.eye(3))).T
 
 
 def _radial_model(

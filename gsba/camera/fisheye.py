@@ -74,7 +74,11 @@ def by_parameters(lens: Fisheye, directions: np.ndarray) -> np.ndarray:
     by_local, by_own = projection_of(lens).jacobians(directions @ rig_R_lens)
     basis = tangent_basis(directions)  # (N, 2, 3) float64: a unit direction moves on it only
     moves = -np.linalg.solve(by_local @ rig_R_lens.T @ np.swapaxes(basis, 1, 2), by_own)
-    return np.concatenate([np.swapaxes(basis, 1, 2) @ moves, -_cross(directions)], axis=2)
+    out = np.zeros((len(directions), 3, 3))
+    x, y, z = directions.T
+    out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -z, y, -x
+    out[:, 1, 0], out[:, 2, 0], out[:, 2, 1] = z, -y, x
+    return np.concatenate([np.swapaxes(basis, 1, 2) @ moves, -out], axis=2)
 
 
 def changed(lens: Fisheye, step: np.ndarray) -> Fisheye:
@@ -142,12 +146,3 @@ def recalibrated(
 def _with_rotation(lens: Fisheye, rotation: np.ndarray) -> Fisheye:
     a, b, c = (float(v) for v in rotation)
     return replace(lens, rotation=(a, b, c))
-
-
-def _cross(vectors: np.ndarray) -> np.ndarray:
-    """Matrices (N, 3, 3) whose product with another vector is the cross product."""
-    out = np.zeros((len(vectors), 3, 3))
-    x, y, z = vectors.T
-    out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -z, y, -x
-    out[:, 1, 0], out[:, 2, 0], out[:, 2, 1] = z, -y, x
-    return out

@@ -8,7 +8,7 @@ are the lenses', which a stabiliser may have rotated against the panorama's.
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import cv2
@@ -109,26 +109,22 @@ def lens_views(lenses: Lenses, size: int) -> tuple[View, ...]:
             views.append(replace(whole, centre=axis[2] * lenses.centre))
             continue
         for lens, sign in (("front", 1.0), ("back", -1.0)):
-            side = _side(axis, np.array([0, 0, sign]), size, lenses.band_rad)
+            ahead = np.array([0, 0, sign])
+            towards, along = _side_extents(lenses.band_rad)
+            short, long = 2 * int(size / 2 * towards), 2 * int(np.ceil(size / 2 * along))
+            tilt = np.pi / 4 + np.arctan(short / size)  # its edge meets the whole face's
+            forward = np.cos(tilt) * ahead + np.sin(tilt) * axis
+            seamwards = np.cos(tilt) * axis - np.sin(tilt) * ahead
+            if axis[0]:  # beside the lens, upright
+                down = np.array([0.0, 1, 0])
+                right, width, height = np.cross(down, forward), short, long
+            else:
+                down = seamwards * np.sign(axis[1])
+                right, width, height = np.cross(down, forward), long, short
+            turn = np.column_stack([right, down, forward])
+            side = View("", width, height, size / 2, (width / 2, height / 2), turn, np.zeros(3))
             views.append(replace(side, name=f"{whole.name}_{lens}", centre=sign * lenses.centre))
     return tuple(views)
-
-
-def _side(axis: np.ndarray, ahead: np.ndarray, size: int, band_rad: float) -> View:
-    """The view of the lens facing `ahead` towards `axis`, from its whole face to the band."""
-    towards, along = _side_extents(band_rad)
-    short, long = 2 * int(size / 2 * towards), 2 * int(np.ceil(size / 2 * along))
-    tilt = np.pi / 4 + np.arctan(short / size)  # its edge meets the whole face's
-    forward = np.cos(tilt) * ahead + np.sin(tilt) * axis
-    seamwards = np.cos(tilt) * axis - np.sin(tilt) * ahead
-    if axis[0]:  # beside the lens, upright
-        down = np.array([0.0, 1, 0])
-        right, width, height = np.cross(down, forward), short, long
-    else:
-        down = seamwards * np.sign(axis[1])
-        right, width, height = np.cross(down, forward), long, short
-    turn = np.column_stack([right, down, forward])
-    return View("", width, height, size / 2, (width / 2, height / 2), turn, np.zeros(3))
 
 
 def _side_extents(band_rad: float) -> tuple[float, float]:
@@ -459,3 +455,42 @@ def views_for(kind: PictureFormat, size: int, lenses: Lenses) -> tuple[View, ...
     if lenses and kind.panoramic:
         return lens_views(lenses, size)
     return cube_views(kind.faces or FACES, size)
+
+
+@dataclass(frozen=True, slots=True)
+class Optics:
+    """Lenses, and depths of the scene around them. One centre by default."""
+
+    lenses: Lenses = field(default_factory=Lenses)  # in the unit of the poses
+    scenes: Callable[[int], np.ndarray] | None = None  # points (N, 3) around a frame, rig frame, by
+    # its index; None = everything is far
+
+    def __bool__(self) -> bool:
+        return bool(self.lenses)
+
+    @classmethod
+    def of(cls, cameras: Cameras, reconstruction: Reconstruction) -> "Optics":
+        """Lenses of the frames that a reconstruction was made from.
+
+        Of more than two lenses there are no faces of one lens each, and of several cameras none
+        that all frames share: they count as one centre.
+        """
+        if len(cameras.lenses) > 1 or cameras.only.num_lenses > 2:
+            return ONE_EYE
+        return cls(cameras.only, scenes_of(reconstruction))
+
+    def views(self, size: int) -> tuple[View, ...]:
+        """Six faces of `size` pixels and 90 degrees, or as dense faces of one lens each."""
+        return lens_views(self.lenses, size) if self else rig_views(CubeRig(size, np.pi / 2))
+
+    def cutter(self, views: tuple[View, ...], frame: int) -> ViewCutter:
+        """The cutter of views out of the pictures of a frame."""
+        return ViewCutter(views, self.lenses, frame, self.scenes and self.scenes(frame))
+
+    def own(self, world_T_rigs: np.ndarray, frames: np.ndarray) -> np.ndarray:
+        """Poses (W, 4, 4) of rigs that have the lenses' axes, from those of frames (W,)."""
+        axes = self.lenses.axes
+        return world_T_rigs if axes is None else turned_rigs(world_T_rigs, axes[frames])
+
+
+ONE_EYE = Optics()

@@ -70,7 +70,15 @@ def read_telemetry(path: Path, lasting_s: float | None = None) -> Readings:
     """
     trailer = read_trailer(path)
     if trailer is None:
-        return _by_telemetry_parser(path)
+        table = "a table (t, gyro x y z, accelerometer x y z)"
+        rows = ask_telemetry_parser(path, "normalized_imu", "gyro", table)
+        rows = [row for row in rows if row.get("gyro") is not None]
+        times = np.array([1e-3 * row["timestamp_ms"] for row in rows], np.float64)
+        rates = np.array([row["gyro"] for row in rows], np.float64).reshape(-1, 3) * _DEGREE
+        forces = None
+        if rows and all(row.get("accl") is not None for row in rows):
+            forces = np.array([row["accl"] for row in rows], np.float64).reshape(-1, 3)
+        return _checked(path, times, rates, forces, [f"reading {n + 1}" for n in range(len(rows))])
     if trailer.gyro is None:
         why = f" ({'; '.join(trailer.notes)})" if trailer.notes else ""
         raise GsbaError(f"{path}: its Insta360 trailer holds no gyro that can be read{why}")
@@ -84,19 +92,6 @@ def read_telemetry(path: Path, lasting_s: float | None = None) -> Readings:
         )
     where = [f"reading {n + 1}" for n in range(len(gyro.times))]
     return _checked(path, gyro.times, gyro.rates, gyro.accelerations, where)
-
-
-def _by_telemetry_parser(path: Path) -> Readings:
-    """Readings of a recording by `telemetry_parser`: deg/s and m/s^2."""
-    table = "a table (t, gyro x y z, accelerometer x y z)"
-    rows = ask_telemetry_parser(path, "normalized_imu", "gyro", table)
-    rows = [row for row in rows if row.get("gyro") is not None]
-    times = np.array([1e-3 * row["timestamp_ms"] for row in rows], np.float64)
-    rates = np.array([row["gyro"] for row in rows], np.float64).reshape(-1, 3) * _DEGREE
-    forces = None
-    if rows and all(row.get("accl") is not None for row in rows):
-        forces = np.array([row["accl"] for row in rows], np.float64).reshape(-1, 3)
-    return _checked(path, times, rates, forces, [f"reading {n + 1}" for n in range(len(rows))])
 
 
 def _read_table(path: Path) -> Readings:

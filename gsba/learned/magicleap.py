@@ -20,7 +20,7 @@ from transformers import (  # pyright: ignore[reportMissingImports]
 
 from gsba.features.detection import FaceKeypoints
 from gsba.learned.device import device, inference
-from gsba.learned.interfaces import Detector
+from gsba.learned.extractor import Detector
 from gsba.learned.weights import load_into, read_state
 
 _HEADS = 4  # of SuperGlue's attention

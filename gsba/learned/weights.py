@@ -120,11 +120,6 @@ SOURCES = {
 }
 
 
-def matcher_source(settings: RefineSettings) -> str:
-    """Key in SOURCES of the learned matcher that settings choose."""
-    return f"{settings.features.extractor}-{settings.matching.matcher}"
-
-
 def find_weights(settings: RefineSettings) -> dict[str, Path]:
     """Files of the learned networks that settings choose, by "features" and "matching".
 
@@ -136,7 +131,8 @@ def find_weights(settings: RefineSettings) -> dict[str, Path]:
     if chosen.extractor != "sift":
         wanted["features"] = (chosen.extractor, chosen.weights)
     if settings.matching.matcher != "guided":
-        wanted["matching"] = (matcher_source(settings), settings.matching.weights)
+        matcher = f"{chosen.extractor}-{settings.matching.matcher}"
+        wanted["matching"] = matcher, settings.matching.weights
     for key, _ in wanted.values():
         _check_licence(SOURCES[key], chosen.accept_noncommercial)
     return {

@@ -17,8 +17,8 @@ from gsba.camera.cameras import ONE_CAMERA, Cameras
 from gsba.camera.lens import Lenses
 from gsba.camera.rig import cells_of
 from gsba.config import MatchingSettings, RefineSettings
+from gsba.features.detection import search_settings
 from gsba.features.extraction import FrameFeatures
-from gsba.features.extractor_traits import search_settings
 from gsba.geometry import inverse
 from gsba.matching._search_kernels import HEAD, Cells, Limits, Rows, passes, search
 from gsba.matching.pairs import by_place

@@ -97,7 +97,10 @@ def recover(
     trust = _check_steps(alone, keypoints, coarse, settings)
     if trust.sound and not joints:
         return Recovered(guided, trust, coarse)
-    again = _pairs_of_one_piece(_missing_two_apart(alone, steps, absent), coarse)
+    first = np.arange(len(steps.verified) - 1)
+    if absent:
+        first = first[steps.verified[:-1] & steps.verified[1:]]
+    again = _pairs_of_one_piece(alone.missing(np.column_stack([first, first + 2])), coarse)
     over = _match_along(context, trust.world_T_rigs, again)
     neighbours = VerifiedPairs.joined([alone, _consistent(over, steps, keypoints, settings)])
     alike = judgement.confirmed(coarse, steps, settings.priors)
@@ -168,14 +171,6 @@ def _walked_on(
         beside = [*known[known < f][-1:], *known[known > f][:1]]
         steps[f, :3, 3] = world_R_rigs[f].T @ velocities[beside].mean(axis=0) * intervals[f]
     return chained(steps)
-
-
-def _missing_two_apart(found: VerifiedPairs, steps: Steps, absent: bool) -> np.ndarray:
-    """Pairs (P, 2) two apart not found yet; without a trajectory, over two verified steps only."""
-    first = np.arange(len(steps.verified) - 1)
-    if absent:
-        first = first[steps.verified[:-1] & steps.verified[1:]]
-    return found.missing(np.column_stack([first, first + 2]))
 
 
 def _with_wider_pairs(context: MatchContext, found: VerifiedPairs) -> VerifiedPairs:

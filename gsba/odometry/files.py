@@ -8,7 +8,7 @@ import numpy as np
 from gsba.disk import atomic_write, write_json
 from gsba.geometry import quaternion_from_rotation
 from gsba.log import GsbaError
-from gsba.odometry.frame_record import FrameStatus
+from gsba.odometry.tracker_state import FrameStatus
 from gsba.odometry.walk import Odometry
 from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.types import Trajectory

@@ -55,7 +55,12 @@ def resect(
         noise = float(np.sqrt(np.median(squares[inliers]) / 1.386))
     distance = float(np.median(distances)) if len(distances) else 1.0
     covariance = max(noise, 0.3 * sigma) ** 2 * np.linalg.pinv(information, hermitian=True)
-    significant = _significant(bearings_rig, inliers, sigma)
+    num = witnesses(bearings_rig, _CELLS) if len(bearings_rig) else 0
+    agreeing = witnesses(bearings_rig[inliers], _CELLS) if inliers.any() else 0
+    chance = min((_GATE * sigma / _CHANCE_SPAN) ** 2, 0.5)
+    per_witness = 1 - (1 - chance) ** (len(bearings_rig) / max(num, 1))
+    needed = least_agreeing(num, per_witness, _SAMPLE, _MAX_FALSE_ALARMS)
+    significant = agreeing >= max(needed, _MIN_WITNESSES)
     spread = np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1])
     significant &= spread < _MAX_POSITION_SIGMA * distance
     return Resection(pose, inliers, noise, covariance, bool(significant))
@@ -113,16 +118,6 @@ def retracted(world_T_rig: np.ndarray, tangent: np.ndarray) -> np.ndarray:
     import gtsam
 
     return gtsam.Pose3(world_T_rig).retract(tangent).matrix()
-
-
-def _significant(bearings: np.ndarray, inliers: np.ndarray, sigma: float) -> bool:
-    """True if chance does not explain the inliers, counted in independent witnesses."""
-    num = witnesses(bearings, _CELLS) if len(bearings) else 0
-    agreeing = witnesses(bearings[inliers], _CELLS) if inliers.any() else 0
-    chance = min((_GATE * sigma / _CHANCE_SPAN) ** 2, 0.5)
-    per_witness = 1 - (1 - chance) ** (len(bearings) / max(num, 1))
-    needed = least_agreeing(num, per_witness, _SAMPLE, _MAX_FALSE_ALARMS)
-    return agreeing >= max(needed, _MIN_WITNESSES)
 
 
 @_part

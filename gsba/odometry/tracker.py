@@ -13,14 +13,18 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gsba.geometry import angles_between, inverse, nearest_rotation, pose, rotation_angle, unit
-from gsba.odometry.atlas import Atlas, AtlasLayout, Cutter
+from gsba.odometry.atlas import Atlas, AtlasLayout, Cutter, follow
 from gsba.odometry.corners import new_corners
 from gsba.odometry.derotation import Miniature, miniature, turned
-from gsba.odometry.flow import follow
-from gsba.odometry.frame_record import FrameRecord, FrameStatus
 from gsba.odometry.relocalisation import Described, describe, placed
 from gsba.odometry.resection import Resection, resect
-from gsba.odometry.tracker_state import Keyframe, TrackedFeatures, TrackerState
+from gsba.odometry.tracker_state import (
+    FrameRecord,
+    FrameStatus,
+    Keyframe,
+    TrackedFeatures,
+    TrackerState,
+)
 from gsba.odometry.two_view_start import median_turn, start_map
 from gsba.odometry.window import AdjustedWindow, WindowObservations, adjust_window
 
@@ -270,7 +274,10 @@ class Tracker:
         noise = float(np.clip(fit.noise, _MIN_SIGMA, _MAX_SIGMA))
         self.state.sigma += _ADAPTING * (noise - self.state.sigma)
         fits = self._fitting(features, tried, key)
-        self._assume(features, fits, tried.bearings[fits])
+        position = self.state.world_T_rig[:3, 3]
+        distances = np.linalg.norm(features.assumed_world[fits] - position, axis=1)
+        rays = distances[:, None] * (tried.bearings[fits] @ self.state.world_T_rig[:3, :3].T)
+        features.assumed_world[fits] = position + rays
         features.misses = np.where(fits, 0, features.misses + 1)
         known = np.isfinite(self.state.points[features.ids, 0])
         distance = self._distance(features.ids[fits & known], self.state.world_T_rig)
@@ -503,13 +510,6 @@ class Tracker:
         rays = distances[:, None] * (key.bearings @ key.world_T_rig[:3, :3].T)
         assumed = key.world_T_rig[:3, 3] + rays
         return TrackedFeatures(key.ids, key.bearings, assumed, np.zeros(len(rays), int))
-
-    def _assume(self, features: TrackedFeatures, found: np.ndarray, bearings: np.ndarray) -> None:
-        """Move assumed positions of features found (N,) bool onto their last bearings."""
-        position = self.state.world_T_rig[:3, 3]
-        distances = np.linalg.norm(features.assumed_world[found] - position, axis=1)
-        rays = distances[:, None] * (bearings @ self.state.world_T_rig[:3, :3].T)
-        features.assumed_world[found] = position + rays
 
     def _distance(self, ids: np.ndarray, world_T_rig: np.ndarray) -> float:
         """Median distance of features' points from a pose; NaN without points."""

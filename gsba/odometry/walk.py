@@ -11,9 +11,9 @@ import numpy as np
 from gsba.geometry import inverse
 from gsba.log import GsbaError
 from gsba.odometry.closing import ClosedKeyframes, TrackedKeyframes, close
-from gsba.odometry.frame_record import FrameStatus
 from gsba.odometry.panoramas import SmallPanoramas
 from gsba.odometry.pose_graph import carried_covariances
+from gsba.odometry.tracker_state import FrameStatus
 from gsba.odometry.tracking import Tracking, track_frames
 from gsba.store.shards import Threads, Workers
 from gsba.types import Trajectory
@@ -114,7 +114,12 @@ class Odometry:
 
     def lost(self) -> list[Stretch]:
         """Stretches of frames without a pose."""
-        return self._stretches(~self.posed())
+        edges = np.flatnonzero(np.diff((~self.posed()).astype(int), prepend=0, append=0))
+        times = self.timestamps
+        return [
+            Stretch(float(times[a]), float(times[b - 1]), int(b - a))
+            for a, b in zip(edges[::2], edges[1::2], strict=True)
+        ]
 
     def path_lengths(self) -> list[float]:
         """Path length of each map, in its unit."""
@@ -153,14 +158,6 @@ class Odometry:
             line += f", {maps} maps that nothing ties together"
         return f"{line}, {told['cpu_ms_per_frame']:.0f} ms of processor time a frame"
 
-    def _stretches(self, chosen: np.ndarray) -> list[Stretch]:
-        edges = np.flatnonzero(np.diff(chosen.astype(int), prepend=0, append=0))
-        times = self.timestamps
-        return [
-            Stretch(float(times[a]), float(times[b - 1]), int(b - a))
-            for a, b in zip(edges[::2], edges[1::2], strict=True)
-        ]
-
 
 def track_panoramas(
     panoramas: SmallPanoramas,
@@ -193,7 +190,15 @@ def track_panoramas(
     found = _odometry(tracked, keyframes, closed, panoramas.timestamps, closing_cpu_s)
     if checkpoint is not None:
         checkpoint.unlink(missing_ok=True)
-    _log(found)
+    logger.info("%s", found.summary())
+    for stretch in found.lost():
+        logger.warning(
+            "no pose from %.3f to %.3f s (%d frames): too dark, covered, or nothing in common "
+            "with what was seen before",
+            stretch.first_s,
+            stretch.last_s,
+            stretch.frames,
+        )
     return found
 
 
@@ -254,15 +259,3 @@ def _odometry(
     known = statuses, maps, keyframes, distances, inliers, sharp
     ends = of_keys[closed.loops], of_keys[closed.joins]
     return Odometry(timestamps, poses, *known, tracked.cpu_s, covariances, *ends, closing_cpu_s)
-
-
-def _log(found: Odometry) -> None:
-    logger.info("%s", found.summary())
-    for stretch in found.lost():
-        logger.warning(
-            "no pose from %.3f to %.3f s (%d frames): too dark, covered, or nothing in common "
-            "with what was seen before",
-            stretch.first_s,
-            stretch.last_s,
-            stretch.frames,
-        )

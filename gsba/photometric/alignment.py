@@ -120,13 +120,7 @@ def align(
 def _by_hosts(hosts: np.ndarray, positions: np.ndarray) -> Iterator[np.ndarray]:
     """Points (n,), ascending, held together: those of hosts (J,) near one another, read at once."""
     most = max(total_memory_bytes() // (_MEMORY_SHARE * _BYTES_PER_POINT), 1)
-    order = np.argsort(_numbers_by_place(positions)[hosts], kind="stable")
-    for some in slices(len(order), most):
-        yield np.sort(order[some])
-
-
-def _numbers_by_place(positions: np.ndarray) -> np.ndarray:
-    """Numbers (F,) int64 of cells of positions (F, 3), similar for near ones (Morton, 1966)."""
+    # numbers of cells, similar for near ones (Morton, 1966)
     low, edge = positions.min(axis=0), float(np.ptp(positions, axis=0).max())
     last = (1 << _PLACE_BITS) - 1
     cells = ((positions - low) / max(edge, 1e-300) * last).astype(np.int64)
@@ -134,7 +128,9 @@ def _numbers_by_place(positions: np.ndarray) -> np.ndarray:
     for bit in range(_PLACE_BITS):
         for axis in range(3):
             numbers |= (cells[:, axis] >> bit & 1) << (3 * bit + axis)
-    return numbers
+    order = np.argsort(numbers[hosts], kind="stable")
+    for some in slices(len(order), most):
+        yield np.sort(order[some])
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,7 +162,10 @@ def _align_some(
     if observed.normals_rig is not None:
         normals = observed.normals_rig[own]
     planes = _planes(landmarks, world_T_rigs, hosts, normals, pixel, field, lenses)
-    extended = _confirmed_points(landmarks, keypoints, observed.aligned, _MIN_TRACK_LENGTH)
+    tracks = landmarks.tracks
+    extended = np.bincount(tracks.points, minlength=tracks.num_points) >= _MIN_TRACK_LENGTH
+    if observed.aligned is not None:
+        extended[tracks.points[observed.aligned[keypoints.rows(tracks)]]] = True
     views = visible_frames(landmarks, world_T_rigs, rows, extended)
     map_, threads = (landmarks, planes, world_T_rigs), workers.num_threads
     points, seeing = _unblended(*map_, hosts, *views, lenses, threads)
@@ -178,7 +177,16 @@ def _align_some(
     enlarged = greys.enlargements()
     kept, found = _accepted(patches, sightings, seeing, pixel, dropped, threads)
     found = found.enlarged(np.maximum(enlarged[seeing[kept]], enlarged[hosts[found.points]]))
-    at_hosts = _at_hosts(patches, sightings, kept, hosts, planes, pixel)
+    # a template's place is exact by definition; its noise is shared by all its alignments
+    templates = sightings.templates[kept]
+    times = np.bincount(templates, minlength=len(hosts))
+    sums = np.bincount(templates, sightings.variances[kept], len(hosts))
+    used = np.flatnonzero(times)
+    of_shifts = patches.shift_covariances(used, sums[used] / times[used])
+    axes = tangent_basis(planes.origins[used]) @ planes.spreads[used]
+    covariances = axes @ of_shifts @ np.swapaxes(axes, 1, 2)
+    covariances += (_MIN_SIGMA_PX * pixel) ** 2 * np.eye(2)
+    at_hosts = Observed(used, hosts[used], planes.origins[used], covariances)
     at_hosts = at_hosts.enlarged(enlarged[at_hosts.frames])
     shown = found.bearings_rig, rays[kept]
     normals_world = _normals_world(sightings, kept, *shown, planes, world_T_rigs[hosts], threads)
@@ -308,30 +316,6 @@ def accepted_rows(
     return kept, bearings[kept], covariances[kept]
 
 
-def _at_hosts(
-    patches: PatchSet,
-    sightings: Sightings,
-    kept: np.ndarray,
-    hosts: np.ndarray,
-    planes: _Planes,
-    pixel: float,
-) -> Observed:
-    """Observations of aligned templates in their host frames.
-
-    A template's place is exact by definition; its noise, which all its alignments share, is
-    counted here, with the mean residual of those alignments.
-    """
-    templates = sightings.templates[kept]
-    times = np.bincount(templates, minlength=len(hosts))
-    sums = np.bincount(templates, sightings.variances[kept], len(hosts))
-    used = np.flatnonzero(times)
-    of_shifts = patches.shift_covariances(used, sums[used] / times[used])
-    axes = tangent_basis(planes.origins[used]) @ planes.spreads[used]
-    covariances = axes @ of_shifts @ np.swapaxes(axes, 1, 2)
-    covariances += (_MIN_SIGMA_PX * pixel) ** 2 * np.eye(2)
-    return Observed(used, hosts[used], planes.origins[used], covariances)
-
-
 def _normals_world(
     sightings: Sightings,
     kept: np.ndarray,
@@ -352,17 +336,6 @@ def _normals_world(
     laid = planes.slopes, planes.origins, planes.spreads
     normals = surfaces.normals(sightings.templates[kept], shifts, products, *laid)
     return np.einsum("jab,jb->ja", world_T_hosts[:, :3, :3], normals)
-
-
-def _confirmed_points(
-    landmarks: Landmarks, keypoints: Keypoints, aligned: np.ndarray | None, min_length: int
-) -> np.ndarray:
-    """Points (J,) confirmed by many observations or a patch: searched in further frames."""
-    tracks = landmarks.tracks
-    out = np.bincount(tracks.points, minlength=tracks.num_points) >= min_length
-    if aligned is not None:
-        out[tracks.points[aligned[keypoints.rows(tracks)]]] = True
-    return out
 
 
 def _former_observations(

@@ -1,17 +1,19 @@
 """Direct photometric refinement: patches of all frames, joint with the map's observations."""
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 
-from factors import LandmarkBlock, RobustLoss
+from factors import Block, LandmarkBlock, RobustLoss
 from factors.patch_windows import PatchPixels, PatchTable, patch_spans, poor_views
 from factors.photometric import PhotometricBlock
 from factors.sphere_image import SphereImage
 from gsba.bundle import adjustment, pose_variables, triangulation
 from gsba.bundle.adjustment import AdjustmentContext
+from gsba.bundle.families import Family, MapSnapshot
 from gsba.bundle.optimizer import OptimizeResult, optimize
 from gsba.bundle.reconstruction import MIN_OBSERVATIONS
 from gsba.camera.cameras import ONE_CAMERA, Cameras
@@ -19,8 +21,22 @@ from gsba.config import PhotometricSettings, RefineSettings
 from gsba.frames.masks import load_weights
 from gsba.log import GsbaError, track
 from gsba.photometric import patches
-from gsba.photometric.patch_greys import PatchGreys
 from gsba.types import Counts, FrameSet, Keypoints, Round, Solution
+
+
+@dataclass(frozen=True, slots=True)
+class PatchGreys(Family):
+    """Grey values of patches of some frames in others. See `factors.photometric`."""
+
+    name = "photometric"
+    digest = ""  # stages keep their results by what the block is made of
+
+    block: PhotometricBlock  # of sampled patches, whose planes stay as an adjustment leaves them
+
+    def blocks(self, snapshot: MapSnapshot) -> Sequence[Block]:
+        """The block of all patches."""
+        return (self.block,)
+
 
 _MIN_CORRELATION = 0.8  # with the template, at the start
 _NOISE_GREY = 2.0  # grey values of a pixel

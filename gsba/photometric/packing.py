@@ -122,29 +122,27 @@ def _by_frame(
         every = Observed.joined(iter(chosen), None)
         order = np.lexsort((every.points, every.frames))
         is_new, every = order < len(chosen[0]), every.taken(order)
-        return every.points, every.frames, is_new, *_columns(every, shown, rig)
+        bearings, faces = every.bearings_rig, owner_faces(every.bearings_rig)
+        lower = np.linalg.cholesky(np.linalg.inv(every.covariances))
+        rotations = shown.world_T_rigs[every.frames, :3, :3]
+        normals = np.einsum("oba,ob->oa", rotations, shown.normals_world[every.points])
+        return (
+            every.points,
+            every.frames,
+            is_new,
+            normals.astype(np.float32),
+            rig.project(bearings, faces),
+            faces,
+            bearings,
+            np.linalg.det(every.covariances) ** 0.25,
+            shown.colors[every.points],
+            np.ascontiguousarray(np.swapaxes(lower, 1, 2)),
+        )
 
     for found in map_in_threads(ordered, len(groups), num_threads):
         sizes += np.bincount(found[1], minlength=len(sizes))
         yield found
         release_mapped_files()
-
-
-def _columns(every: Observed, shown: Shown, rig: CubeRig) -> tuple[np.ndarray, ...]:
-    """Normals of observations, and the columns of keypoints but for origins."""
-    bearings, faces = every.bearings_rig, owner_faces(every.bearings_rig)
-    lower = np.linalg.cholesky(np.linalg.inv(every.covariances))
-    rotations = shown.world_T_rigs[every.frames, :3, :3]
-    normals = np.einsum("oba,ob->oa", rotations, shown.normals_world[every.points])
-    return (
-        normals.astype(np.float32),
-        rig.project(bearings, faces),
-        faces,
-        bearings,
-        np.linalg.det(every.covariances) ** 0.25,
-        shown.colors[every.points],
-        np.ascontiguousarray(np.swapaxes(lower, 1, 2)),
-    )
 
 
 def _by_point(

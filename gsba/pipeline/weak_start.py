@@ -10,8 +10,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from factors.threads import map_in_threads
+from gsba.features.detection import search_settings
 from gsba.features.extraction import Search
-from gsba.features.extractor_traits import search_settings
 from gsba.geometry import inverse
 from gsba.matching import guided_search
 from gsba.matching.guided_search import PRIOR_GATE, SearchableFrames

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from tiny_run import NUM_FRAMES, SETTINGS, Case, computed_stages
 
-from gsba.bundle.division import DivisibleMap
+from gsba.bundle.adjustment import DivisibleMap
 from gsba.bundle.optimizer import OptimizeResult
 from gsba.config import SolverSettings
 from gsba.parts import adjustments
