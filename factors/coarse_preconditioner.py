@@ -13,7 +13,6 @@ from factors.schur_complement import GroupVisits, SchurComplement
 
 _MIN_GROUP_SIZE = 4  # least frames of a group
 _MAX_GROUPS = 640  # number of groups whose dense system is factorized within seconds
-_MEAN_PAIRS = 24  # strongest pairs of a frame that are used, on average
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +62,7 @@ def covisible_groups(num: int, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -
     shared = np.concatenate([s for _, s in pairs]).astype(np.float64)
     totals = np.bincount(rows.ravel(), np.repeat(shared, 2), minlength=num)
     weights = shared / np.sqrt(totals[rows[:, 0]] * totals[rows[:, 1]])
-    most = _MEAN_PAIRS * num
+    most = 24 * num  # strongest pairs of a frame that are used, on average
     if len(weights) > most:
         least = np.partition(weights, len(weights) - most)[len(weights) - most]
         rows, weights = rows[weights >= least], weights[weights >= least]

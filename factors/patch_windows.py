@@ -13,7 +13,6 @@ from factors.bearing import tangent_basis
 from factors.sphere_image import SphereImage
 
 PAD = 2  # coefficients beyond the border: the support of the spline
-_MIN_VIEW_COSINE = 0.15  # least cosine between a patch's normal and its viewing ray
 _MAX_ZOOM = 2.0  # largest ratio of a patch's size between host and target, either way
 
 
@@ -190,7 +189,7 @@ def poor_views(
     cosine = np.einsum("oi,oi->o", normals, rays) / length
     return {
         "behind": ~np.all(inverse_depths > 0, axis=0)[owners],
-        "grazing": ~(cosine > _MIN_VIEW_COSINE),
+        "grazing": ~(cosine > 0.15),  # least cosine between a patch's normal and its viewing ray
         "zoom": ~((area < _MAX_ZOOM**2) & (area > _MAX_ZOOM**-2)),
     }
 

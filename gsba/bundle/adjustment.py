@@ -83,7 +83,6 @@ _MIN_NOISE = 0.5  # floor of the estimated noise, in feature sigmas
 logger = logging.getLogger(__name__)
 
 _MIN_NOISE_RATIO = 1e-3  # least noise of an observation over its claimed sigma
-_UNKNOWN_NOISE_GATE = 20.0  # gate in sigmas for observations whose noise is not known yet
 DRAWS = 500  # errors drawn of all poses, from which joint covariances are computed
 _DRIFT_DAMPING, _DRIFT_TOLERANCE = 1e-9, 1e-7  # first damping and relative tolerance of adjustments
 # with a family that limits drift
@@ -288,7 +287,7 @@ def rescale_noise(
     """
     tracks, keypoints = sighted.tracks, sighted.keypoints
     poses = before.world_T_rigs
-    gate = _UNKNOWN_NOISE_GATE
+    gate = 20.0  # gate in sigmas for observations whose noise is not known yet
     threads = settings.solver.threads()
     how = gate, settings.triangulate, threads, scratch
     placed = triangulation.place(tracks, keypoints, poses, *how)

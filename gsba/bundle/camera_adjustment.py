@@ -21,7 +21,6 @@ from gsba.bundle.camera_variables import CameraUnknowns
 from gsba.bundle.stitching import with_noise_of
 from gsba.types import Keypoints, Sighted, Solution, Tracks
 
-_MAX_REPEATS = 8  # of a round; three to six settle it
 _SCALE_SIGMA = 1e-3  # of each map's extent about its former one: images leave the scale open, and
 # priors of zero on frames' own motion would shrink the map
 
@@ -142,7 +141,7 @@ def _settled(
     """
     solved, rounds = start, ()
     for gate in gates:
-        for _ in range(_MAX_REPEATS):
+        for _ in range(8):  # of a round; three to six settle it
             solved, view = adjust_once(solved, view, gate)
             rounds += solved.rounds
             last = solved.rounds[-1]

@@ -23,7 +23,6 @@ from gsba.bundle.optimizer import marginal_covariances
 from gsba.types import JointErrors, Keypoints, Solution
 
 _DAMPING = 1e-6
-_NUM_SPREAD_PASSES = 4  # passes that estimate the spread of frames' own motion
 _MAX_GYRO_SQUARES = 4.0  # largest median square of a gyro's errors, in variances of the motion
 _MAX_UNEXPLAINED_SHARE = 0.5  # largest share of the rotations by images that a gyro further off may
 # leave unexplained
@@ -78,7 +77,7 @@ class CameraSystem:
         variances = system.own_variances()  # they hardly depend on the spread
         if variances is None:
             return cameras
-        for _ in range(_NUM_SPREAD_PASSES):
+        for _ in range(4):  # passes that estimate the spread of frames' own motion
             motion, own = system.own_motion(), system.unknowns.own
             if motion is None or own is None:
                 break

@@ -36,7 +36,6 @@ K = partial(gtsam.symbol, "k")  # radial terms (4,) of a lens
 N = partial(gtsam.symbol, "n")  # inverse of the stitching radius (1,), 1 / map units
 W = partial(gtsam.symbol, "w")  # own motion (6,) of a frame, beside that of its velocity
 
-_LEAST_TURN = 1e-6  # rad, standard deviation
 _MOVES_ALIKE = 3.0  # standard deviation of own translations in their spread, where lenses are
 # solved for: frames are often taken at about the pace of steps, and successive ones then move
 # alike; held as if each moved by chance, they bend the radial profile of the lenses instead
@@ -331,7 +330,7 @@ def _own_motion(
         beside[rows] = own[rows]
         sigmas.append(readout.own_sigmas(camera, velocities[rows]))
         if turning is not None and camera.by_gyro:
-            sigma = max(camera.readout_s * turning.rate_sigma, _LEAST_TURN)
+            sigma = max(camera.readout_s * turning.rate_sigma, 1e-6)  # rad, standard deviation
             told[rows] = np.all(np.isfinite(turning.rates), axis=1)[rows]
         told_sigmas.append(sigma)
     return OwnMotion(beside, tuple(sigmas), told, tuple(told_sigmas), of_frame)

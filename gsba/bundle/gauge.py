@@ -15,8 +15,6 @@ from gsba.bundle.pose_variables import X, values_of
 from gsba.similarity import Sim3
 from gsba.types import Solution
 
-_MAX_STEPS = 100  # of Levenberg-Marquardt
-_CONVERGED = 1e-9  # relative decrease of the cost
 _MAX_DAMPING = 1e8
 _MIN_CURVATURE = 1e-9  # least curvature that counts as determined, part of the largest
 
@@ -74,7 +72,7 @@ def align(families: Families, solved: Solution, maps: np.ndarray | None = None) 
     terms = chosen.terms(solved, maps)
     poses, own, damping = solved.world_T_rigs, terms.values, 1e-4
     cost = _cost(terms, poses, own)
-    for _ in range(_MAX_STEPS):
+    for _ in range(100):  # of Levenberg-Marquardt
         hessian, gradient = _projected(terms, poses, own, of_frames, numbers)
         curvature = np.diagonal(hessian)
         floor = _MIN_CURVATURE * max(float(curvature.max(initial=0)), 1e-300)
@@ -97,7 +95,7 @@ def align(families: Families, solved: Solution, maps: np.ndarray | None = None) 
             break
         moves = {number: tried[number].after(moves[number]) for number in numbers}
         poses, own, damping = new_poses, new_own, max(damping / 10, 1e-12)
-        converged = cost - new_cost <= _CONVERGED * cost
+        converged = cost - new_cost <= 1e-9 * cost  # relative decrease of the cost
         cost = new_cost
         if converged:
             break

@@ -28,7 +28,6 @@ from gsba.similarity import NoSimilarityError, Sim3, extent_of, robust_similarit
 
 _LOSS_SIGMAS = 2.0  # Cauchy scale of the factors
 MIN_FIXES = 5  # in a map: seven unknowns leave little of fewer
-_ROUNDS = 10  # of choosing fixes
 
 S: Callable[[int], int] = gtsam.symbol_shorthand.S  # what a map's similarity changes by (7,)
 E: Callable[[int], int] = gtsam.symbol_shorthand.E  # lasting error of a fix (3,), in its sigmas
@@ -109,7 +108,7 @@ def _level_from_map(positions: np.ndarray, fixes: FrameFixes) -> tuple[Sim3, np.
     limits = fixes.tolerances(), MAX_DRIFT_SHARE
     fit, used, _ = robust_similarity(positions, fixes.positions, similarity, 3, *limits)
     scatter = 1.0
-    for _ in range(_ROUNDS):
+    for _ in range(10):  # of choosing fixes
         extent = fit.scale * extent_of(positions)
         before = used
         used, scatter = fixes.inliers(fixes.positions - fit.points(positions), extent)

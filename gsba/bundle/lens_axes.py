@@ -30,8 +30,6 @@ from gsba.types import Counts, Keypoints, Landmarks, Solution
 
 logger = logging.getLogger(__name__)
 
-_MAX_OBSERVATIONS = 60_000  # observations that axes are found from
-_MAX_FIRST_OBSERVATIONS = 20_000  # observations for a first guess
 _YAWS_RAD = np.deg2rad([0.0, 45, 90, 135])  # of the line through both lenses, tried at first
 TURNS = np.deg2rad([0.5, 1.5, 5.0])  # prior standard deviations of a frame's turn
 _MIN_STEP_SHARE = 0.1  # part of a typical step, below which a frame counts as standing
@@ -73,7 +71,12 @@ def guess(
         return np.concatenate(columns, axis=2)
 
     systems, counts = shared_parameters.models_of(
-        landmarks, _MAX_FIRST_OBSERVATIONS, keypoints, solved, context, by_centres
+        landmarks,
+        20_000,
+        keypoints,
+        solved,
+        context,
+        by_centres,  # observations for a first guess
     )
     if not systems:
         return LensAxes(so_far, np.full(PARTS, np.nan), "too few points", counts)
@@ -103,7 +106,7 @@ def loosened(
         keypoints: of these, as rays of the lenses so far.
         so_far: two lenses whose axes are the rig's.
     """
-    used = drawn(landmarks, _MAX_OBSERVATIONS, context.settings.seed)
+    used = drawn(landmarks, 60_000, context.settings.seed)  # observations that axes are found from
     counts = sample_counts(landmarks, used)
     frames, num = keypoints.frames(), len(solved.world_T_rigs)
 

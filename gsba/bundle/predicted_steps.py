@@ -13,8 +13,6 @@ from gsba.geometry import inverse, pose, step_covariances
 from gsba.types import JointErrors, Reconstruction
 
 _REACH = 3  # frames to either side that do not count as far
-_MIN_FAR_FRAMES = 2  # that see a point
-_MIN_OBSERVATIONS = 12  # of such points, in a frame
 _STANDING_RATIO = 0.1  # of the rms step: shorter ones are of a camera that stands, and mere noise
 _ITERATIONS = 10
 
@@ -32,12 +30,12 @@ def step_deviations(result: Reconstruction) -> np.ndarray:
     last = np.searchsorted(keys, first + np.minimum(frames + _REACH, num - 1), side="right")
     near = last - np.searchsorted(keys, first + np.maximum(frames - _REACH, 0))
     every = np.bincount(result.observation_points)[result.observation_points]
-    usable = np.flatnonzero(every - near >= _MIN_FAR_FRAMES)
+    usable = np.flatnonzero(every - near >= 2)  # that see a point
     usable = usable[np.argsort(result.observation_frames[usable], kind="stable")]
     bounds = np.searchsorted(result.observation_frames[usable], np.arange(len(poses) + 1))
     for f in range(len(poses)):
         rows = usable[bounds[f] : bounds[f + 1]]
-        known[f] = len(rows) >= _MIN_OBSERVATIONS
+        known[f] = len(rows) >= 12  # of such points, in a frame
         if known[f]:
             predicted[f] = _resected(result, f, rows)
     steps = [(inverse(some[:-1]) @ some[1:])[:, :3, 3] for some in (poses, predicted)]

@@ -25,7 +25,6 @@ MIN_OBSERVATIONS = 12  # of a refined frame: 24 residuals for the 6 unknowns of 
 _MIN_CORRELATION = 0.1  # least correlation of refined and coarse positions: with usual drift it is
 # .8
 _AT_ONCE = 1 << 16  # observations whose poses are held together: 9 MB
-_MAX_RESIDUAL_DEG = 10.0  # largest median residual: gates leave a tenth of a degree
 
 
 def assemble(
@@ -69,7 +68,7 @@ def assemble(
     pieces = _observations(adjustment, keypoints, stretch[:, 3], colors)
     bearings, sigmas, errors, *origins = concatenated(pieces, scratch)
     median = float(np.degrees(np.median(errors))) if len(errors) else 0.0
-    if not median <= _MAX_RESIDUAL_DEG:
+    if not median <= 10.0:  # largest median residual: gates leave a tenth of a degree
         raise GsbaError(
             f"the solution fell apart (median residual {median:.1f} deg): nothing is written; "
             "check that frames and trajectory belong together, or refine without it "

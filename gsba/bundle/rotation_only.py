@@ -18,8 +18,6 @@ from gsba.types import CoarsePoses, Keypoints, PoseStatus, Reconstruction, Solut
 logger = logging.getLogger(__name__)
 
 _ITERATIONS = 30
-_CONVERGED = 1e-9  # radians
-_LOSS_SIGMAS = 2.0  # Cauchy
 _OUTLIER_SIGMAS = 10.0  # of the noise, scale of the loss at the start
 _COLUMNS = 384  # columns of the inverse computed at a time
 
@@ -79,12 +77,12 @@ def solve(
         residuals = np.einsum("oij,oj->oi", bases, rays) / sigmas[:, None]
         lengths = np.linalg.norm(residuals, axis=1)
         noise = max(float(np.median(lengths)) / 1.1774, 1e-9)  # of a Rayleigh distribution
-        weights = 1 / (1 + (lengths / (_LOSS_SIGMAS * wide * noise)) ** 2)
+        weights = 1 / (1 + (lengths / (2.0 * wide * noise)) ** 2)  # Cauchy
         system, gradient = _system(rotations, bearings, bases, residuals, sigmas, weights, found)
         step = _solved(system, -gradient[3:, None])[:, 0]
         turns = Rotation.from_rotvec(np.concatenate([np.zeros(3), step]).reshape(num, 3))
         rotations = rotations @ turns.as_matrix()
-        if np.abs(step).max() < _CONVERGED and wide == 1:
+        if np.abs(step).max() < 1e-9 and wide == 1:  # radians
             break
         wide = max(0.5 * wide, 1.0)
     covariances = np.zeros((num, 3, 3))

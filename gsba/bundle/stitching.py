@@ -24,7 +24,6 @@ from gsba.camera.rig import CubeRig, owner_faces
 from gsba.types import Counts, Keypoints, Round, Sighted, Solution
 
 _MIN_GAIN = 0.03  # share by which the field must lower the robust cost of held-out observations
-_ROUNDS = 2  # estimates of the field, each with a bundle adjustment
 
 logger = logging.getLogger(__name__)
 
@@ -122,7 +121,7 @@ def estimate(
         now = replace(now, degree=degree, part_gains=gains / costs, counts=counts)
         if gains.sum() < least * costs.sum() or np.any(gains <= 0):
             return now
-    for number in range(_ROUNDS):
+    for number in range(2):  # estimates of the field, each with a bundle adjustment
         if number:
             systems, _ = _systems(now, _MAX_OBSERVATIONS, chosen.max_degree, context, lenses)
         field = SphereField(_fitted(systems, now.degree, spread))

@@ -14,10 +14,8 @@ from gsba.types import GyroConstraints, StepNoise
 
 # Noise of a frame's pose in the trajectory's world, which only holds frames that nothing else does.
 _ABSOLUTE_DEG = 30.0
-_ABSOLUTE_POSITION = 0.3  # part of the trajectory's extent
 LOSS_SIGMAS = 2.0  # Cauchy scale: limits the pull of wrong steps
 _WEAKER = 10.0  # times the noise of absolute priors, where another family holds the gauge
-_FIRST_SIGMA = 1e-6  # of the held first pose: radians, and part of the extent
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,12 +56,12 @@ class TrajectoryPrior(Family):
         weaker = 1.0 if held else _WEAKER
         model = self._robust(
             weaker * np.deg2rad(_ABSOLUTE_DEG),
-            weaker * _ABSOLUTE_POSITION * extent,
+            weaker * 0.3 * extent,  # part of the trajectory's extent
         )
         for f, world_T_rig in enumerate(self.world_T_rigs):
             if self.false_frames is None or not self.false_frames[f]:
                 graph.add(gtsam.PriorFactorPose3(X(f), gtsam.Pose3(world_T_rig), model))
-        sigma = _FIRST_SIGMA if held else 1.0
+        sigma = 1e-6 if held else 1.0  # of the held first pose: radians, and part of the extent
         noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([sigma] * 3 + [sigma * extent] * 3))
         fixed = gtsam.Pose3(world_T_rigs[0] if self.first is None else self.first)
         graph.add(gtsam.PriorFactorPose3(X(0), fixed, noise))

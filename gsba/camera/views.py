@@ -32,7 +32,6 @@ _NUM_DEPTH_POINTS = 12  # map points that give the depth in a direction
 _MIN_SMOOTHING_RAD = np.deg2rad(3.0)  # least angle over which points are averaged
 _PLANE_TOLERANCE = 0.1  # relative depth error at which a point counts as off a plane
 _FRONTAL_PLANE_WEIGHT = 0.05  # weight of the fronto-parallel plane, relative to the points'
-_NUM_ROBUST_ROUNDS = 4  # reweighting rounds of the plane fit
 _ROWS_AT_ONCE = 128  # rows whose coordinates are held in double precision at once
 _NODES_ACROSS_FACE = 33  # nodes across a face of the interpolated offsets, which vary over tens of
 # degrees
@@ -431,7 +430,7 @@ def depths_along(directions: np.ndarray, points: np.ndarray) -> np.ndarray:
     facing_us = (_FRONTAL_PLANE_WEIGHT * spread**2 * weights.sum(axis=1, keepdims=True))[
         ..., None
     ] * np.eye(3)
-    for _ in range(_NUM_ROBUST_ROUNDS):
+    for _ in range(4):  # reweighting rounds of the plane fit
         off = (left - np.einsum("nki,ni->nk", beside, tilt)) / (_PLANE_TOLERANCE * middle[:, None])
         shares = weights / (1 + off**2)
         normal = np.einsum("nk,nki,nkj->nij", shares, beside, beside) + facing_us

@@ -22,17 +22,11 @@ _MAX_SPACING_STEPS, _MAX_SPACING_S = 0.25, 0.05  # largest spacing of tried offs
 # in seconds
 _MAX_OFFSETS = 60_000  # largest number of tried offsets
 _MAX_TURNS_AT_ONCE = 200_000  # largest number of rotations of all offsets tried together
-_MAX_OUTSIDE_SHARE = 0.4  # part of the video that may lie outside the readings
-_NUM_REFINED = 6  # offsets of the grid that are refined
-_NUM_ROUNDS = 3  # rounds of clock, then bias and axes
-_MIN_OFFSET_CHANGE_S = 1e-5  # s of change of the offset below which rounds end
-_NUM_REWEIGHTINGS = 10  # reweighting passes over bias and axes
 _LOSS_WIDTH_SIGMAS = 2.0  # width of their loss, standard deviations
 _TURNING_SIGMAS, _AGREEING_SIGMAS = 4.0, 3.0  # standard deviations: least rotation of a turn;
 # largest residual of agreement
 _MIN_TURNS = 4  # least number of steps that turn
 _MIN_EXPLAINED = 0.6  # least share of the turns that a gyro must explain
-_MAX_RIVAL_SHARE = 0.75  # share of the best offset's explained turns that no rival may reach
 _SCALE_SIGMA = 0.01  # prior standard deviation of a gyro's scale
 _MAX_AXES_SIGMA_RAD = np.deg2rad(5.0)  # largest standard deviation of the axes
 _TURNING_STEP_RAD = np.deg2rad(1.0)  # rotation of a turning step: a tenth of the steps must exceed
@@ -154,11 +148,11 @@ class _Candidate:
     def settled(self) -> "_Candidate":
         """The candidate with clock, bias and axes refined in turn."""
         one = self
-        for _ in range(_NUM_ROUNDS):
+        for _ in range(3):  # rounds of clock, then bias and axes
             parameters = simplest(one.fit, one.fit.refine(one.parameters))[0]
             moved = abs(float(parameters[0] - one.parameters[0]))
             one = _Candidate.of(self.turns, self.readings, parameters, one.sensor.bias)
-            if moved < _MIN_OFFSET_CHANGE_S:
+            if moved < 1e-5:  # s of change of the offset below which rounds end
                 break
         return one
 
@@ -172,7 +166,7 @@ def _sensor_and_axes(turns: Turns, turned: np.ndarray) -> tuple[Sensor, np.ndarr
     """Bias and scales, axes (3, 3) and their sigma, by sensor and image rotations (n, 3)."""
     spans, seen = np.diff(turns.times, axis=1), turns.rotvecs
     weights, scales, sigma = np.ones((len(spans), 1)), np.ones(3), float(np.std(seen))
-    for _ in range(_NUM_REWEIGHTINGS):
+    for _ in range(10):  # reweighting passes over bias and axes
         total = np.sum(weights * spans**2)
         by_time = [np.sum(weights * spans * some, axis=0) / total for some in (seen, turned)]
         left = seen - spans * by_time[0], turned - spans * by_time[1]
@@ -194,7 +188,7 @@ def _candidates(turns: Turns, readings: Readings) -> Iterator[np.ndarray]:
     """Parameters (2,) of the grid's offsets that explain the most, best first."""
     free = replace(turns, rotvecs=np.zeros_like(turns.rotvecs))
     fit = ClockFit(free, _orientation_trajectory(readings, Sensor.ideal()))
-    over = _MAX_OUTSIDE_SHARE * float(np.ptp(turns.times))
+    over = 0.4 * float(np.ptp(turns.times))  # part of the video that may lie outside the readings
     ends = fit.span - turns.middle - turns.ends
     low, high = min(ends) - over, max(ends) + over
     spacing = max(min(_MAX_SPACING_STEPS * turns.step, _MAX_SPACING_S), (high - low) / _MAX_OFFSETS)
@@ -217,7 +211,7 @@ def _candidates(turns: Turns, readings: Readings) -> Iterator[np.ndarray]:
         if all(abs(shift - other) > 2.5 * spacing for other in chosen):
             chosen.append(float(shift))
             yield np.array([shift, 1.0])
-        if len(chosen) == _NUM_REFINED:
+        if len(chosen) == 6:  # offsets of the grid that are refined
             return
 
 
@@ -263,7 +257,7 @@ def _with_reason(
         return replace(found, reason="the camera turns too little to determine the gyro's clock")
     if share < _MIN_EXPLAINED or turning.sum() < _MIN_TURNS:
         return replace(found, reason="the gyro's rotations fit the images at no clock offset")
-    if rival > _MAX_RIVAL_SHARE * share:
+    if rival > 0.75 * share:  # share of the best offset's explained turns that no rival may reach
         return replace(found, reason="the gyro's rotations fit the images at several clock offsets")
     if best.axes_sigma > _MAX_AXES_SIGMA_RAD:
         return replace(
@@ -278,7 +272,6 @@ def _rejected(timestamps: np.ndarray, reason: str, counts: Counts) -> Alignment:
 
 
 _MEAN_SPAN_S = 1.05  # s over which a force is averaged: two steps, in which sways cancel out
-_MIN_MEANS = 3  # least number of such means
 _GRAVITY_M_S2 = 9.80665  # m/s^2, standard gravity
 _MAX_RELATIVE_DEVIATION = 0.2  # largest relative deviation of a mean's length from gravity
 
@@ -316,6 +309,6 @@ def up_axis(
     means = means[full] / counts[full, None]
     lengths = np.linalg.norm(means, axis=1)
     right = np.abs(lengths - _GRAVITY_M_S2) < _MAX_RELATIVE_DEVIATION * _GRAVITY_M_S2
-    if right.sum() < _MIN_MEANS:
+    if right.sum() < 3:  # least number of such means
         return None
     return median_direction(means[right] / lengths[right, None])

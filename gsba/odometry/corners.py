@@ -7,7 +7,6 @@ from gsba.camera.rig import cells_of, owner_faces
 from gsba.odometry.atlas import Atlas, AtlasLayout
 
 _PER_SIDE = 11  # cells along a side of a cube face, 8 degrees each
-_PER_CELL = 1  # features in a cell, including followed ones
 _BLOCK = 5  # pixels across the patch of which gradients are summed
 _APART_PX = 5  # least distance between features
 _MIN_EIGENVALUE = 3e-5  # least eigenvalue of a patch's gradients, in OpenCV's normalisation: less
@@ -39,7 +38,7 @@ def new_corners(
     faces = (v // layout.rig.size) * 3 + u // layout.rig.size
     bearings = layout.bearings(np.stack([u, v], axis=1).astype(float), faces)
     cells = cells_of(bearings, _PER_SIDE)
-    kept = _strongest(cells, _PER_CELL - taken)
+    kept = _strongest(cells, 1 - taken)  # features in a cell, including followed ones
     kept = kept[_apart(np.stack([u, v], axis=1)[kept])]
     return bearings[kept] @ atlas.cut_R_rig
 

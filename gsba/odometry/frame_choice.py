@@ -10,7 +10,6 @@ from gsba.odometry.walk import Odometry
 
 _EARLIEST = 0.6  # part of a step after which the sharpest frame is searched
 _MOST_LONGER = 1e6  # largest factor on the step, if few frames are wanted
-_HALVINGS = 20  # bisections of the interval of that factor
 
 
 def choose_frames(found: Odometry, settings: OdometrySettings) -> np.ndarray:
@@ -30,7 +29,7 @@ def choose_frames(found: Odometry, settings: OdometrySettings) -> np.ndarray:
         low, high = high, 2 * high
         if high > _MOST_LONGER:  # more maps than frames are wanted
             return rows[np.linspace(0, len(rows) - 1, count).round().astype(int)]
-    for _ in range(_HALVINGS):
+    for _ in range(20):  # bisections of the interval of that factor
         middle = 0.5 * (low + high)
         if len(_chosen(found, steps, middle)) > count:
             low = middle

@@ -19,7 +19,6 @@ _HELD = 1e-5  # standard deviation of the fixed first keyframe of a map, all par
 _HELD_LOG_DISTANCE = 1e-5  # of the distance to the furthest keyframe, in the gauge of covariances
 _FREE_LOG_SCALE = 1.0  # of the first keyframe's scale in that gauge
 _POSE_ROTATION = 0.007  # standard deviations of each frame's own errors: radians, and units of the
-_POSE_TRANSLATION = 0.005  # median distance
 _ERROR_RATE = 1e-9  # probability of rejecting a true loop, low because drift is partly systematic
 # while covariances are of random errors
 
@@ -142,7 +141,7 @@ def carried_covariances(
     own = np.zeros_like(into_rigs)
     turn, step = np.arange(3), np.arange(3, 6)
     own[:, turn, turn] = _POSE_ROTATION**2
-    own[:, step, step] = np.square(_POSE_TRANSLATION * distances)[:, None]
+    own[:, step, step] = np.square(0.005 * distances)[:, None]  # median distance
     return into_rigs @ covariances @ np.swapaxes(into_rigs, 1, 2) + own
 
 

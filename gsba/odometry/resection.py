@@ -10,7 +10,6 @@ from gsba.camera.rig import witnesses
 from gsba.significance import least_agreeing
 
 _kernel, _part = kernel_and_part()
-_STEPS = 12  # Gauss-Newton steps
 _CONVERGED = 1e-6  # radians, and parts of the median distance
 _ANNEALED = (8.0, 4.0, 2.0, 1.0)  # factors on the scale of the loss in the first steps
 _GATE = 3.5  # standard deviations of an inlier
@@ -21,7 +20,6 @@ _MIN_WITNESSES = 20  # least number of witnesses: fewer may be of one moving obj
 _MAX_FALSE_ALARMS = 1e-6  # expected number of poses that chance explains as well as the accepted
 # one
 _CHANCE_SPAN = np.deg2rad(6.0)  # false matches lie anywhere within this angle of their prediction
-_MAX_POSITION_SIGMA = 0.05  # of the position, in median distances of the points
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +60,7 @@ def resect(
     needed = least_agreeing(num, per_witness, _SAMPLE, _MAX_FALSE_ALARMS)
     significant = agreeing >= max(needed, _MIN_WITNESSES)
     spread = np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1])
-    significant &= spread < _MAX_POSITION_SIGMA * distance
+    significant &= spread < 0.05 * distance  # of the position, in median distances of the points
     return Resection(pose, inliers, noise, covariance, bool(significant))
 
 
@@ -78,7 +76,7 @@ def _fitted(
     bases = tangent_basis(bearings_rig)
     information, gradient = np.empty((6, 6)), np.empty(6)
     observed = points_world, bases, bearings_rig
-    for step in range(_STEPS):
+    for step in range(12):  # Gauss-Newton steps
         scale = 3 * sigma * _ANNEALED[min(step, len(_ANNEALED) - 1)]
         found = residuals, distances, information, gradient
         _normal_equations(*observed, world_T_rig, scale, *found)

@@ -12,7 +12,6 @@ from gsba.odometry.resection import linearised
 from gsba.odometry.window import WindowObservations
 
 _REACH = 12  # keyframes before one among which its parent is searched
-_MIN_SHARED = 8  # least number of common features with points that measure a step
 _CORRELATED = 13.0  # factor on the variance of independent features: those of a surface have
 # correlated errors
 _MODEL = 0.0003, 0.001, 0.002  # standard deviations of model errors (two lens centres, rolling
@@ -97,7 +96,7 @@ def _covariance(
         np.diag(np.square([rotation] * 3 + [translation * distance] * 3 + [log_scale]))
         for rotation, translation, log_scale in (_UNKNOWN, _MODEL)
     )
-    if len(points) < _MIN_SHARED:
+    if len(points) < 8:  # least number of common features with points that measure a step
         return unknown
     _, jacobians, _ = linearised(points, tangent_basis(bearings), bearings, world_T_key)
     jacobian = jacobians.reshape(-1, 6)

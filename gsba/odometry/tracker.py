@@ -31,7 +31,6 @@ from gsba.odometry.window import AdjustedWindow, WindowObservations, adjust_wind
 logger = logging.getLogger(__name__)
 
 FREE, HELD = 8, 5  # keyframes of the window that are adjusted, and fixed ones before them
-_REMEMBERED = 10  # keyframes that a lost frame is compared with
 _DESCRIBED = 4  # last keyframes with which it is compared by descriptors
 _MIN_CONTRAST = 1.5  # grey values: a lower contrast is darkness, or a hand over the lenses
 _KEYFRAME_PARALLAX = np.deg2rad(3.0)  # median parallax of the features since the last keyframe
@@ -362,7 +361,7 @@ class Tracker:
         state.keyframe_frames.append(frame)
         state.keyframe_features.append((ids, bearings.astype(np.float32)))
         del state.window[: -(FREE + HELD)]
-        for old in state.window[:-_REMEMBERED]:
+        for old in state.window[:-10]:  # keyframes that a lost frame is compared with
             old.atlas = old.small = old.described = None
         state.features = self._followable(key)
 

@@ -20,8 +20,6 @@ from gsba.types import Trajectory
 
 logger = logging.getLogger(__name__)
 
-_MIN_FRAMES_OF_MAP = 5  # maps with fewer frames are ignored
-
 
 def _no_pairs() -> np.ndarray:
     return np.zeros((0, 2), np.int64)
@@ -71,7 +69,7 @@ class Odometry:
         counts = np.bincount(self.maps[found], minlength=int(self.maps.max(initial=0)) + 1)
         if not len(with_points):
             return found & (self.maps == np.argmax(counts))
-        large = with_points[counts[with_points] >= _MIN_FRAMES_OF_MAP]
+        large = with_points[counts[with_points] >= 5]  # maps with fewer frames are ignored
         return found & np.isin(self.maps, large)
 
     def usable(self) -> bool:

@@ -15,7 +15,6 @@ from gsba.types import Landmarks, Tracks
 _SOLVER = SolverSettings(
     max_iterations=8, relative_tolerance=1e-3, absolute_tolerance=1.0, lambda_initial=1e-6
 )
-_MIN_PARALLAX_DEG = 1.0  # least triangulation angle of a point
 _HELD = 1e-6  # standard deviation of fixed poses: radians, and parts of their extent
 
 
@@ -71,7 +70,7 @@ def adjust_window(
         gate: residual from which observations are outliers, standard deviations.
     """
     tracks, sigmas = seen.tracks(), np.full(len(seen.ids), sigma)
-    settings = TriangulateSettings(min_parallax_deg=_MIN_PARALLAX_DEG)
+    settings = TriangulateSettings(min_parallax_deg=1.0)  # least triangulation angle of a point
 
     def place(poses: np.ndarray, limit: float):
         return triangulate(tracks, seen.bearings_rig, sigmas, poses, limit, settings)

@@ -38,11 +38,8 @@ class PatchGreys(Family):
         return (self.block,)
 
 
-_MIN_CORRELATION = 0.8  # with the template, at the start
-_NOISE_GREY = 2.0  # grey values of a pixel
 _NOISE_CONTRAST = 0.1  # added noise, relative to the contrast
 _INFLATION = 2.0  # of sigmas: a patch's pixel errors are correlated
-_LOSS_SIGMAS = 2.0  # Cauchy scale, of a patch's mean residual
 _MAX_FRAME_RATIO = 2.0  # of a frame's residual to the median; above it, the frame is weighted down
 _MAX_FRAME_GROWTH = 1.2  # of a frame's geometric residual in the joint solve; as above
 _MAX_GROWTH = 1.05  # of the geometric cost, or the solve is undone
@@ -50,8 +47,6 @@ _TOLERANCE = 1e-3  # relative decrease of the cost that ends the joint solve
 
 logger = logging.getLogger(__name__)
 
-_MIN_FRAME_WEIGHT = 1e-3  # least weight of a frame
-_NUM_DEPTH_STEPS = 5  # Gauss-Newton steps on the planes at each level
 _MIN_OBSERVATIONS = 10  # observations of a frame from which its fit is judged
 _OBSERVATIONS_AT_ONCE = 40_000  # observations whose depths are estimated at once: bounds the memory
 # of windows
@@ -187,10 +182,10 @@ def _with_depths(
         block = make_block(pixels, visible, num_threads)
         block.planes = planes
         block.refresh(values)
-        block.polish(values, _NUM_DEPTH_STEPS)
+        block.polish(values, 5)  # Gauss-Newton steps on the planes at each level
         planes = block.planes
     block.refresh(values)
-    correlated = block.correlations(values) >= _MIN_CORRELATION
+    correlated = block.correlations(values) >= 0.8  # with the template, at the start
     reasons = {
         "masked or saturated": np.count_nonzero(visible == 0),
         **block.dropped,
@@ -302,12 +297,12 @@ def make_block(
 ) -> PhotometricBlock:
     """The factor block of gathered patches, with the settings' noise times `noise`."""
     contrasts = pixels.templates.std(axis=1).astype(np.float64)
-    sigmas = noise * np.hypot(_NOISE_GREY, _NOISE_CONTRAST * contrasts)
+    sigmas = noise * np.hypot(2.0, _NOISE_CONTRAST * contrasts)  # grey values of a pixel
     return PhotometricBlock(
         [pose_variables.X(f) for f in range(pixels.num_frames)],
         pixels,
         sigmas,
-        RobustLoss("cauchy", _LOSS_SIGMAS / _INFLATION),
+        RobustLoss("cauchy", 2.0 / _INFLATION),  # Cauchy scale, of a patch's mean residual
         weights,
         num_threads,
     )
@@ -356,7 +351,7 @@ def _frame_weights(
     typical = np.nanmedian(residuals) if np.isfinite(residuals).any() else 1.0
     ratios = np.nan_to_num(residuals / typical, nan=1.0) / _MAX_FRAME_RATIO
     worst = np.maximum(1.0, np.maximum(ratios, growth / _MAX_FRAME_GROWTH))
-    return np.maximum(worst**-2.0, _MIN_FRAME_WEIGHT), residuals
+    return np.maximum(worst**-2.0, 1e-3), residuals  # least weight of a frame
 
 
 def _adjusted(

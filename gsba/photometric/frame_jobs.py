@@ -16,7 +16,6 @@ from gsba.store.shards import Workers, blocks_of_frames
 MAX_SHIFT_PX = 3.0  # from the predicted pixel, panorama pixels
 _AFFINE_SIGMA = 0.15  # prior of the warp: a surface facing the ray
 _GREY_SIGMA = 3.0  # noise of pixels, grey values
-_MIN_CONTRAST = 2.0  # grey values, standard deviation in a patch
 _WINDOW_SIGMA_SHARE = 0.6  # standard deviation of the patch's window, in half patches
 _SEARCH_SHIFT_RATIO = 1.5  # largest shift during alignment, in largest accepted shifts
 _MAX_STEPS = 12  # largest number of alignment steps
@@ -155,7 +154,7 @@ class _CutJob(_FrameJob):
     def __call__(self, item: int) -> tuple[np.ndarray, ...]:
         rows = self.rows.of(item)
         found = _empty_patches(len(rows), self.settings)
-        every, least = np.arange(len(rows)), _MIN_CONTRAST
+        every, least = np.arange(len(rows)), 2.0  # grey values, standard deviation in a patch
         found.cut(*self.image(item), every, self.origins[rows], self.spreads[rows], least)
         own = found.templates
         return own.grey, own.by_x, own.by_y, own.inverses, own.states
