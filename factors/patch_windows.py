@@ -1,8 +1,5 @@
-"""Patches of a sphere image observed in others: their table, and their pixels gathered.
-
-Frames are processed one at a time: each gives the templates of its own patches and a small window
-around every patch that it shows. Memory grows with observations, never with the images.
-"""
+"""Patches of a sphere image observed in others: their table, and small windows of pixels around
+them, gathered frame by frame: memory grows with observations, never with the images."""
 
 from dataclasses import dataclass, replace
 

@@ -1,8 +1,5 @@
-"""Threads, and ranges of landmarks or patches distributed among them.
-
-Work is divided by its size alone, never by the number of threads, and partial sums are added in
-order: results are identical to the last bit for any number of threads.
-"""
+"""Threads, and ranges of landmarks or patches distributed among them by size alone; partial sums
+are added in order, so that results are identical to the last bit for any number of threads."""
 
 import os
 from collections import deque

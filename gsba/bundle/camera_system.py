@@ -1,8 +1,4 @@
-"""A map and its camera as one system: spread of frames' own motion, and covariances.
-
-Points are eliminated. What frames have of their own is drawn to what is typical, by as much as
-frames turn out to differ.
-"""
+"""A map and its camera as one system: spread of frames' own motion, and covariances."""
 
 from dataclasses import dataclass, replace
 

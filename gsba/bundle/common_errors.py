@@ -1,12 +1,5 @@
-"""Errors that neighbouring frames have in common, which no residual shows.
-
-Covariances follow from residuals, as if every observation erred by itself. On sequences with known
-truth they then hold for steps from frame to frame, but poses far along the path are off by twice
-what they claim: sampling and surfaces mislead the patches of some frames alike, and poses take that
-up. It remains where images have neither noise nor compression. What is added here are errors as
-residuals show them, enlarged and smoothed along the path; both numbers are measured
-(`benchmarks/results/covariances.md`), not derived.
-"""
+"""Errors that neighbouring frames have in common, which no residual shows: those of residuals,
+enlarged and smoothed along the path by measured numbers (`benchmarks/results/covariances.md`)."""
 
 from collections.abc import Sequence
 

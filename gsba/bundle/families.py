@@ -1,10 +1,5 @@
-"""Families of residuals: one object adds everything that one source of knowledge contributes.
-
-Bearings, reprojections, the trajectory prior, the gyro and GPS are families, and so are those of
-callers and packages. A family has factors, and variables of its own if need be: a barometer has a
-bias, tags have poses. It builds its factors anew whenever the map changes, so that they always
-belong to the poses that they are solved with.
-"""
+"""Families of residuals: one object adds everything that one source of knowledge contributes:
+factors, built anew whenever the map changes, and variables of its own if need be."""
 
 import hashlib
 from collections.abc import Iterable, Mapping, Sequence

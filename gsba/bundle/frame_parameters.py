@@ -1,8 +1,5 @@
-"""Parameters that each frame has beside its pose: found with poses and points adjusted.
-
-Normal equations of bearings, points eliminated. Points that the parameters were not found from say
-whether they predict.
-"""
+"""Parameters that each frame has beside its pose, poses and points adjusted; other points say
+whether they predict."""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor

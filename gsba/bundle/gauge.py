@@ -1,8 +1,5 @@
-"""The world and scale that families ask for, before an adjustment starts.
-
-A trajectory has a world and a scale of its own. Where a family knows them, each map is first moved
-by the similarity that fits the family's residuals best, so that the adjustment has only to bend it.
-"""
+"""The world and scale that families ask for: each map is moved by the similarity that fits their
+residuals best, before an adjustment starts."""
 
 from dataclasses import dataclass, replace
 

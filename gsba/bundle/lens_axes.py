@@ -1,8 +1,5 @@
-"""Axes of the lenses of each frame: those of the panorama, or turned by a stabiliser.
-
-A stabilised panorama keeps its heading while the camera turns below it: the lenses' axes are then
-those of the walk, up to how the camera is held, and what each frame's points say beside it.
-"""
+"""Axes of the lenses of each frame: those of the panorama, or turned by a stabiliser, which keeps
+the heading while the camera turns with the walk."""
 
 import logging
 from collections.abc import Sequence

@@ -1,9 +1,5 @@
-"""Centres of the lenses, estimated from points that cross the seam and from parallax.
-
-Points of the front half of the sphere are seen from one place, those of the back half from another.
-Two centres that parts of the sequence gain by are taken on trial: the map is matched and adjusted
-with them. They are believed where they then predict parts that they were not found from.
-"""
+"""Centres of the lenses, from points that cross the seam and from parallax: taken on trial where
+parts of the sequence gain by them, and believed where they then predict other parts."""
 
 import logging
 from collections.abc import Sequence

@@ -1,9 +1,5 @@
-"""Steps predicted by far frames: poses from points that frames further away in time determine.
-
-Frames that stand close together may hold a tiny map of their own inside a large one: their steps
-shrink, residuals stay small, and covariances do not tell. Points that frames outside such a group
-see then give another pose to each of its frames. On walks both poses agree.
-"""
+"""Steps predicted by far frames, and their motion by a round: frames that stand close together may
+hold a tiny map of their own, whose covariances do not tell; far frames' points do."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation

@@ -1,9 +1,5 @@
 """Motion during the readout of a frame: whether rows are read one after another, and which way.
-
-Each lens is read in a way of its own: a ray's time follows from its row. The duration that makes
-what frames move meanwhile their velocity is found as other parameters that all frames share, and
-believed where it predicts; `camera_adjustment` then finds each frame's own motion.
-"""
+`camera_adjustment` then finds each frame's own motion."""
 
 import logging
 from collections.abc import Sequence

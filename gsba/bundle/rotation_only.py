@@ -1,9 +1,5 @@
-"""A camera that turns but never moves: rotations alone, and no points.
-
-Without parallax a point is a direction. Each track has one, eliminated as the weighted mean of its
-rays; what remains is a problem of the frames' rotations, solved by Gauss-Newton under a robust
-loss. Frames far apart in time are matched too, since all see the same: rotations do not drift.
-"""
+"""A camera that turns but never moves: rotations alone, by Gauss-Newton under a robust loss, each
+track's direction eliminated as the weighted mean of its rays."""
 
 import logging
 from dataclasses import replace

@@ -1,10 +1,7 @@
-"""Transfer of the scale from each frame of a map to the next.
+"""Transfer of the scale from each frame to the next, by points seen from both sides of a step.
 
-Along a path the scale is handed on by points that are seen from several places before a step, and
-from several behind it. Both sides triangulate such a point by themselves. Where they disagree on
-the distances of most, or few such points are left, as at a door, all that lies behind may be larger
-or smaller. Covariances assume that observations are right within their noise, and so do not tell of
-few points that err together: the scatter of distances does.
+Both sides triangulate such a point by themselves. Covariances do not tell of few points that err
+together: the scatter of distances does.
 """
 
 from collections.abc import Iterator

@@ -1,11 +1,8 @@
 """Self-calibration of raw lenses: focal lengths, distortion, rotations of all but the front one.
 
-Found from a map as other parameters that all frames share, beside the lenses' centre. What differs
-from a calibration is believed where every part of the sequence gains by what the others give. Plain
-lenses of unknown make are only a start, with priors as wide as such lenses differ: what is found is
-taken where observations determine the focal lengths, in short sequences too. The front lens's axes
-are the rig's, as it was calibrated: a turn of all lenses is one of the poses. Parameters (K,) are
-those of the front lens but its rotation, then all of each other lens.
+Plain lenses of unknown make are only a start, with priors as wide as such lenses differ: what is
+found is taken where observations determine the focal lengths. Parameters (K,) are those of the
+front lens but its rotation, then all of each other lens.
 """
 
 import logging

@@ -1,9 +1,5 @@
-"""Parameters that all frames share: models of each part of the sequence, poses and points adjusted.
-
-A part's cost is a quadratic function of the parameters once its points and poses are eliminated.
-Sums of other parts' models give parameters, and the part itself says what they are worth: they are
-believed only if they predict what they were not found from.
-"""
+"""Parameters that all frames share: quadratic models of the cost of each part of a sequence, poses
+and points eliminated. Others' parameters are believed where they predict a part."""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor

@@ -1,10 +1,5 @@
-"""Calibrations of raw lenses, read from files.
-
-Takes JSON of our own form, whose rig keeps its axes: `rig_T_lens` in metres, unless `unit` names
-cm, mm, in, ft, or "map" for lengths of no known unit. Takes Kalibr's and COLMAP's files of
-pairs too, see `gsba.camera.calibration_formats`. The rig's origin is moved into the middle of the
-lenses.
-"""
+"""Calibrations of raw lenses in files: JSON of our own form (metres, or as `unit` says),
+and those of `calibration_formats`. The rig's origin is moved into the middle of the lenses."""
 
 import json
 import re

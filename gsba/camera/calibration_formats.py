@@ -1,8 +1,5 @@
-"""Calibrations of a raw pair by other programs: a Kalibr camchain, a COLMAP rig.
-
-These give the pose of one camera relative to the other. The rig's z is halfway between the front
-lens's axis and the reversed axis of the back one, its x is the front picture's, orthogonal to z.
-"""
+"""Calibrations of a raw pair by other programs: a Kalibr camchain, a COLMAP rig. z is halfway
+between the front lens's axis and the back one's reversed; x is the front picture's, across z."""
 
 import logging
 import re

@@ -1,10 +1,5 @@
-"""Raw fisheyes as parts of one panorama: projection of rig directions into their pictures.
-
-The lens that faces a direction sees it, as in `gsba.camera.lens`: of a pair the front one sees what
-is ahead of the rig, and the back one what is behind it. Lenses may be recalibrated after panoramas
-were cut by them: then a direction of a panorama is one pixel of a fisheye, which has another
-direction by the new calibration.
-"""
+"""Raw fisheyes as parts of one panorama: projection of rig directions into their pictures. After
+recalibration a direction of a panorama is a pixel that has another direction."""
 
 from dataclasses import replace
 

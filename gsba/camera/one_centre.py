@@ -1,11 +1,7 @@
 """Panoramas of two lenses resampled as one camera in the middle between them would take them.
 
-A stitcher joins both pictures as if everything were far: near objects are displaced, to one side in
-front and to the other behind, and are doubled or cut at the seam. Here each direction is looked up
-where its lens shows it, at the depth of map points around it, with all rows read in the middle of
-the exposure. Both lenses are blended across the seam, which is no worse in pixels than a hard cut
-of raw pictures, and better than a hard cut of a panorama that is blended there. Directions without
-points nearby keep about the displacement that they had.
+Each direction is looked up where its lens shows it, at the depth of map points around it, with all
+rows read in the middle of the exposure; both lenses are blended across the seam.
 """
 
 from collections.abc import Callable, Iterator

@@ -1,10 +1,7 @@
 """The pinhole cameras that panoramas are cut into: cube faces, or faces of one lens each.
 
-A panorama of two lenses has no single centre of projection. Faces of one lens each have one: front
-and back whole, and each lens's part of the four sides. Each has its lens's centre in the rig and
-leaves out the band where both pictures are blended. They are cut as the lens would show them with
-all rows read in the middle of the exposure, at the depths that map points give. Their rig's axes
-are the lenses', which a stabiliser may have rotated against the panorama's.
+Faces of one lens have its centre, axes of the lenses, and leave out the blended band; they are cut
+as with all rows read in the middle of the exposure, at the depths that map points give.
 """
 
 from collections.abc import Callable, Iterator

@@ -1,10 +1,8 @@
-"""Clock, bias and axes of a gyro, estimated from camera rotations by images.
+"""Clock, bias and axes of a gyro from camera rotations by images, and the vertical by forces.
 
-Between two instants the gyro must rotate by as much as the images, in axes of its own. Each offset
-on a grid gives its best axes and bias in closed form (Kabsch 1976, on rotation vectors; the bias is
-the part that grows with time alone), and the share of rotations that it explains. The best few are
-refined like the clocks of trajectories. Gyros have scale errors of a percent: these are estimated
-for each axis as well, where rotations determine them.
+Each offset on a grid gives its best axes and bias in closed form (Kabsch 1976, on rotation
+vectors; the bias is the part that grows with time alone). The best few are refined; scale errors
+of a percent are estimated for each axis where rotations determine them.
 """
 
 from collections.abc import Iterator

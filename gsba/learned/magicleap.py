@@ -1,8 +1,5 @@
-"""SuperPoint and SuperGlue by transformers; weights under Magic Leap's non-commercial licence.
-
-Files have the authors' layout (`superpoint_v1.pth`, `superglue_outdoor.pth`) or that of
-transformers (`model.safetensors`).
-"""
+"""SuperPoint and SuperGlue by transformers; weights, in the authors' layout or of transformers,
+under Magic Leap's non-commercial licence."""
 
 import re
 from pathlib import Path

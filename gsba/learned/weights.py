@@ -1,10 +1,5 @@
-"""Weights of learned networks: files, authors, licences, and search paths.
-
-They are searched at the path of the settings (a file, a folder that holds the file under an
-official name, or such a name), then in the download caches of torch and Hugging Face, then in the
-packages of the extra `weights`. They are downloaded only if the settings allow it. Weights for
-non-commercial use are used only if that licence is accepted.
-"""
+"""Weights of learned networks: files, authors, licences, and search paths: that of the settings,
+download caches of torch and Hugging Face, packages of the extra `weights`, a permitted download."""
 
 import logging
 import os

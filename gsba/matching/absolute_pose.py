@@ -1,8 +1,5 @@
-"""Absolute poses from points of a map, by LO-RANSAC on three-point poses.
-
-pycolmap solves on rays: bearings pass through the pixels of a virtual panorama, so that the whole
-sphere contributes and no face is special.
-"""
+"""Absolute poses from points of a map, by LO-RANSAC on three-point poses. pycolmap solves on rays:
+bearings pass through the pixels of a virtual panorama."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING

@@ -1,8 +1,5 @@
-"""Two-view verification on bearings.
-
-A relative pose is accepted if chance does not explain its inliers, no other pose explains about
-as many of the other matches, and the trajectory does not contradict it.
-"""
+"""Two-view verification on bearings: a pose is accepted if chance does not explain its inliers, no
+other pose explains as many of the other matches, and the trajectory does not contradict it."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

@@ -1,8 +1,5 @@
-"""A small panorama as six overlapping pinhole faces side by side in one picture, its atlas.
-
-Optical flow needs pictures without seam and poles. Frames are cut along axes that are nearly fixed
-in the world, so that the appearance of features does not rotate with the camera.
-"""
+"""A small panorama as six overlapping pinhole faces side by side in one picture, its atlas, cut
+along axes nearly fixed in the world; and features followed between two."""
 
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,8 +1,5 @@
-"""The last step of odometry, on all keyframes: maps joined, loops closed, covariances.
-
-A wrong loop or join ruins a map, and a missed one only leaves drift: both must pass the test of
-joins (`gsba.loop_closure.join_test`).
-"""
+"""The last step of odometry, on all keyframes: maps joined, loops closed (both by the test of
+`gsba.loop_closure.join_test`: a wrong one ruins a map), covariances."""
 
 import logging
 from collections.abc import Sequence

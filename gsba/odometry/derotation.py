@@ -1,8 +1,5 @@
-"""Rotation between two frames from their panoramas alone, at any angle.
-
-Used without a reliable prediction: after fast turns, gaps and blackouts. Rows are correlated for
-the yaw, then the whole sphere is aligned over SO(3) (Gauss-Newton, inverse compositional).
-"""
+"""Rotation between two frames from their panoramas alone, at any angle: rows are correlated for the
+yaw, then the whole sphere is aligned over SO(3) (Gauss-Newton, inverse compositional)."""
 
 from dataclasses import dataclass
 

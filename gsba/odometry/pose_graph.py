@@ -1,9 +1,5 @@
-"""The pose graph of keyframes over Sim(3): odometry steps that propagate scale, and loops.
-
-Poses of a monocular camera drift in scale besides rotation and position (Strasdat, Montiel and
-Davison, RSS 2010). Each keyframe is a similarity: the pose of its rig, and the length of its local
-unit in the world.
-"""
+"""The pose graph of keyframes over Sim(3), as monocular poses drift in scale (Strasdat, Montiel and
+Davison, RSS 2010): the rig's pose, and the length of its local unit in the world."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
