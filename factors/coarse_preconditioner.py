@@ -7,9 +7,14 @@ import numpy as np
 from scipy.linalg import get_blas_funcs, get_lapack_funcs
 from scipy.sparse import csr_matrix
 
-from factors._schur_kernels import GROUP_DIM, add_pairs_of_groups, merge_capped
 from factors.cholesky import DIM
-from factors.schur_complement import GroupVisits, SchurComplement
+from factors.schur_complement import (
+    GROUP_DIM,
+    GroupVisits,
+    SchurComplement,
+    add_pairs_of_groups,
+    merge_capped,
+)
 
 _MIN_GROUP_SIZE = 4  # least frames of a group
 _MAX_GROUPS = 640  # number of groups whose dense system is factorized within seconds

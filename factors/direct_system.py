@@ -7,8 +7,7 @@ import numpy as np
 
 from factors.block import Block
 from factors.cholesky import DIM, BlockCholesky
-from factors.conjugate_gradients import conjugate_gradients, multiply_blocks
-from factors.iterative_system import IterativeSystem
+from factors.iterative_system import IterativeSystem, conjugate_gradients, multiply_blocks
 from factors.reduced_camera_system import STEP_TOLERANCE, ReducedSystem
 from factors.system_layout import SystemLayout
 

@@ -22,12 +22,11 @@ from factors._observations import (
     sort_observations,
     visits_of,
 )
-from factors._schur_kernels import project_visits
 from factors._terms import pose_rows
 from factors.block import PoseSystem, Products
 from factors.reduced_factor import reduced_factor
 from factors.robust import RobustLoss
-from factors.schur_complement import SchurComplement
+from factors.schur_complement import SchurComplement, project_visits
 from factors.threads import balanced_ranges, map_in_threads, run_in_threads
 
 _POLISH_TOLERANCE = 1e-12  # part of a landmark's cost

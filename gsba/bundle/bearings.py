@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from factors import BearingTerm, FaceCameras, ReprojectionTerm, Term
-from gsba.bundle._noise_kernels import face_roots
 from gsba.bundle.families import Family, PointObservations
+from gsba.bundle.observation_noise import face_roots
 from gsba.camera.rig import RIG_R_FACE, CubeRig
 
 

@@ -15,9 +15,9 @@ from gsba.bundle.adjustment import (
     adjust_sighted_through,
     adjust_through,
 )
-from gsba.bundle.camera_estimates import CameraEstimates
 from gsba.bundle.camera_system import CameraSystem
 from gsba.bundle.camera_variables import CameraUnknowns
+from gsba.bundle.readout import CameraEstimates
 from gsba.bundle.stitching import with_noise_of
 from gsba.types import Keypoints, Sighted, Solution, Tracks
 

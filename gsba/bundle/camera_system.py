@@ -13,9 +13,9 @@ from factors.direct_system import reduced_system
 from factors.reduced_camera_system import ReducedSystem
 from gsba.bundle import readout
 from gsba.bundle.adjustment import DRAWS, AdjustmentContext
-from gsba.bundle.camera_estimates import CameraEstimates
 from gsba.bundle.camera_variables import CameraUnknowns, W
 from gsba.bundle.optimizer import marginal_covariances
+from gsba.bundle.readout import CameraEstimates
 from gsba.types import JointErrors, Keypoints, Solution
 
 _DAMPING = 1e-6

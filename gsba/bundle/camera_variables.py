@@ -19,9 +19,8 @@ from factors.camera_rows import (
 )
 from gsba.bundle import lens_axes, readout, self_calibration
 from gsba.bundle.adjustment import AdjustmentContext
-from gsba.bundle.camera_estimates import CameraEstimates
 from gsba.bundle.pose_variables import X
-from gsba.bundle.readout import CameraEstimate
+from gsba.bundle.readout import CameraEstimate, CameraEstimates
 from gsba.camera.fisheye import rotation_of
 from gsba.config import CameraSettings
 from gsba.types import Keypoints, Landmarks

@@ -7,7 +7,7 @@ import numpy as np
 import torch  # pyright: ignore[reportMissingImports]
 
 from gsba.learned.device import device, inference
-from gsba.learned.extractor import Detector
+from gsba.learned.interfaces import Detector
 from gsba.learned.weights import load_into, read_state
 
 # Of the layer by which ALIKED's models differ: channels and samples of a descriptor.

@@ -3,37 +3,13 @@
 import functools
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
 from gsba.config import FeatureSettings
 from gsba.features.detection import TRAITS, Extractor, FaceKeypoints, SiftExtractor
+from gsba.learned.interfaces import Detector
 from gsba.learned.weights import missing_library
-
-
-class Detector(Protocol):
-    """Network that detects and describes keypoints on one image."""
-
-    def __call__(self, image: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Keypoints of an image (N, N, 3) uint8, N a multiple of 32.
-
-        Returns:
-            pixels (K, 2) (u, v), with the origin in the centre of the first pixel, scores (K,), and
-            descriptors (K, D) float32 of length one.
-        """
-        ...
-
-
-class FaceNetwork(Protocol):
-    """Network that matches the keypoints of two images of `size` by `size` pixels."""
-
-    def __call__(
-        self, first: FaceKeypoints, second: FaceKeypoints, size: int
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Matches (m, 2) and their scores (m,)."""
-        ...
-
 
 _SIZE_MULTIPLE_PX = 32  # of network inputs, which are halved several times
 

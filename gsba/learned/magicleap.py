@@ -17,7 +17,7 @@ from transformers import (  # pyright: ignore[reportMissingImports]
 
 from gsba.features.detection import FaceKeypoints
 from gsba.learned.device import device, inference
-from gsba.learned.extractor import Detector
+from gsba.learned.interfaces import Detector
 from gsba.learned.weights import load_into, read_state
 
 _MIN_SCORE = 0.2  # published value of SuperGlue

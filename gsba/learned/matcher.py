@@ -9,7 +9,7 @@ import numpy as np
 from gsba.camera.rig import owner_faces
 from gsba.config import MatchingSettings, RefineSettings
 from gsba.features.detection import FaceKeypoints
-from gsba.learned.extractor import FaceNetwork
+from gsba.learned.interfaces import FaceNetwork
 from gsba.learned.weights import missing_library
 from gsba.matching.guided_search import (
     Gate,

@@ -11,8 +11,13 @@ from gsba.geometry import inverse
 from gsba.loop_closure import map_merging
 from gsba.odometry.loops import find_joins, find_loops
 from gsba.odometry.places import KeyframePlaces, chosen_keyframes, described, make_places
-from gsba.odometry.pose_graph import Constraint, close_loops, covariances_of
-from gsba.odometry.steps import MeasuredSteps, measure_steps
+from gsba.odometry.pose_graph import (
+    Constraint,
+    MeasuredSteps,
+    close_loops,
+    covariances_of,
+    measure_steps,
+)
 from gsba.similarity import Sim3
 from gsba.store.shards import Workers
 

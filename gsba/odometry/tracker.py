@@ -13,8 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gsba.geometry import angles_between, inverse, nearest_rotation, pose, rotation_angle, unit
-from gsba.odometry.atlas import Atlas, AtlasLayout, Cutter, follow
-from gsba.odometry.corners import new_corners
+from gsba.odometry.atlas import Atlas, AtlasLayout, Cutter, follow, new_corners
 from gsba.odometry.derotation import Miniature, miniature, turned
 from gsba.odometry.relocalisation import Described, describe, placed
 from gsba.odometry.resection import Resection, resect
@@ -25,8 +24,13 @@ from gsba.odometry.tracker_state import (
     TrackedFeatures,
     TrackerState,
 )
-from gsba.odometry.two_view_start import median_turn, start_map
-from gsba.odometry.window import AdjustedWindow, WindowObservations, adjust_window
+from gsba.odometry.window import (
+    AdjustedWindow,
+    WindowObservations,
+    adjust_window,
+    median_turn,
+    start_map,
+)
 
 logger = logging.getLogger(__name__)
 

@@ -15,7 +15,7 @@ from gsba.camera.rig import CubeRig
 from gsba.config import PatchSettings
 from gsba.frames import panorama
 from gsba.memory import release_mapped_files, total_memory_bytes
-from gsba.photometric import frame_jobs, surfaces
+from gsba.photometric import frame_jobs
 from gsba.photometric.frame_jobs import MAX_SHIFT_PX
 from gsba.photometric.packing import Observed, Shown, pack
 from gsba.photometric.references import references, visible_frames
@@ -212,7 +212,7 @@ def _planes(
     origins = field.observed(local / np.maximum(depths, 1e-300)[:, None])
     spreads = pixel * np.swapaxes(tangent_basis(origins), 1, 2)
     spreads[normals_rig.any(axis=1)] *= _TILTED_STEP_PX
-    slopes = surfaces.slopes_of(normals_rig, origins, spreads)
+    slopes = slopes_of(normals_rig, origins, spreads)
     tilted = spreads + origins[:, :, None] * slopes[:, None, :]
     away = world_T_hosts[:, :3, :3] * depths[:, None, None]
     rays = np.einsum("jab,jb->ja", away, origins)
@@ -329,12 +329,12 @@ def _normals_world(
 
     def depths(some: slice) -> tuple[np.ndarray, ...]:
         seen = sightings.spreads[kept[some]], sightings.warps[kept[some]]
-        return surfaces.shown_depths(*seen, bearings[some], rays[some])
+        return shown_depths(*seen, bearings[some], rays[some])
 
     some = slices(len(kept), _SIGHTINGS_AT_ONCE)
     shifts, products = rows_in_threads(depths, some, num_threads)
     laid = planes.slopes, planes.origins, planes.spreads
-    normals = surfaces.normals(sightings.templates[kept], shifts, products, *laid)
+    normals = surface_normals(sightings.templates[kept], shifts, products, *laid)
     return np.einsum("jab,jb->ja", world_T_hosts[:, :3, :3], normals)
 
 
@@ -373,3 +373,73 @@ def _former_observations(
     for one in map_in_threads(left, len(parts), num_threads):
         yield one
         release_mapped_files()
+
+
+_AFFINE_SIGMA = 0.07  # noise of an alignment's affine part
+_SLOPE_SIGMA = 0.7  # prior of surface slopes, tangents of their tilt
+_MAX_TILT_TANGENT = 3.0  # tangent of a tilt beyond which a patch covers too little of its surface
+
+
+def slopes_of(normals_rig: np.ndarray, origins: np.ndarray, spreads: np.ndarray) -> np.ndarray:
+    """Relative depth (J, 2) that a step across each patch adds on its surface; 0 = unknown.
+
+    Args:
+        normals_rig: (J, 3) of the surfaces, any length, rig frame of the host; zero = unknown.
+        origins: (J, 3) unit bearings of the points.
+        spreads: (J, 3, 2) steps across them, radians.
+    """
+    facing = np.einsum("ji,ji->j", normals_rig, origins)
+    across = np.einsum("ji,jic->jc", normals_rig, spreads)
+    known = facing > 0
+    slopes = -across / np.where(known, facing, 1.0)[:, None]
+    steps = np.linalg.norm(spreads[:, :, 0], axis=1)
+    steepness = np.linalg.norm(slopes, axis=1) / np.maximum(steps, 1e-300)
+    slopes *= np.minimum(1.0, _MAX_TILT_TANGENT / np.maximum(steepness, _MAX_TILT_TANGENT))[:, None]
+    return np.where(known[:, None], slopes, 0.0)
+
+
+def shown_depths(
+    spreads: np.ndarray, warps: np.ndarray, bearings: np.ndarray, rays: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Shifts (N, 2) in template steps by which relative depth along the host's ray appears in each
+    aligned sighting, and their products (N, 2) with the affine part.
+
+    Args:
+        spreads (N, 3, 2), warps (N, 6): of the sightings, see `factors.patches.Sightings`.
+        bearings: (N, 3) where they were found, rig frame of the observing frame.
+        rays: (N, 3) from the host to the template's point, in the observing frame, in units of its
+            distance there.
+    """
+    axes = tangent_basis(bearings)
+    shifts = np.linalg.solve(axes @ spreads, axes @ rays[:, :, None])[:, :, 0]
+    affine = np.swapaxes(warps[:, 2:].reshape(-1, 2, 2), 1, 2)
+    return shifts, np.einsum("oij,oi->oj", affine, shifts)
+
+
+def surface_normals(
+    templates: np.ndarray,
+    shifts: np.ndarray,
+    products: np.ndarray,
+    slopes: np.ndarray,
+    origins: np.ndarray,
+    spreads: np.ndarray,
+) -> np.ndarray:
+    """Normals (J, 3) of the surfaces, rig frames of the hosts, from their patches' alignments.
+
+    Args:
+        templates: (N,) template of each accepted sighting.
+        shifts (N, 2), products (N, 2): see `shown_depths`.
+        slopes: (J, 2) slopes by which the patches were projected.
+        origins (J, 3), spreads (J, 3, 2): the patches in their hosts, before slopes.
+
+    Returns:
+        Normals of any length, zero where they are undetermined.
+    """
+    num = len(slopes)
+    pulls = np.stack([np.bincount(templates, column, num) for column in products.T], axis=1)
+    weights = np.bincount(templates, np.einsum("oi,oi->o", shifts, shifts), num)
+    sizes = np.linalg.norm(spreads[:, :, 0], axis=1)
+    prior = (_AFFINE_SIGMA / (_SLOPE_SIGMA * np.maximum(sizes, 1e-300))) ** 2
+    found = slopes + (pulls - prior[:, None] * slopes) / (weights + prior)[:, None]
+    gradients = np.einsum("jic,jc->ji", spreads, found) / sizes[:, None] ** 2
+    return np.where((weights > prior)[:, None], origins - gradients, 0.0)

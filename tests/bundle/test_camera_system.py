@@ -17,11 +17,10 @@ from gsba.bundle import adjustment
 from gsba.bundle.adjustment import values_of
 from gsba.bundle.bearings import Bearings
 from gsba.bundle.camera_adjustment import solve_with_camera
-from gsba.bundle.camera_estimates import CameraEstimates
 from gsba.bundle.camera_system import CameraSystem
 from gsba.bundle.camera_variables import CameraUnknowns
 from gsba.bundle.families import Families
-from gsba.bundle.readout import CameraEstimate
+from gsba.bundle.readout import CameraEstimate, CameraEstimates
 from gsba.bundle.trajectory_prior import GyroTurns
 from gsba.camera.cameras import Cameras
 from gsba.camera.lens import Lenses

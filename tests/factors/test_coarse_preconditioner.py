@@ -13,13 +13,13 @@ from factors import (
     direct_system,
     iterative_system,
 )
-from factors._schur_kernels import GROUP_DIM
 from factors._terms import pose_rows
 from factors.block import QuadraticBlock
 from factors.coarse_preconditioner import Groups, covisible_groups
 from factors.direct_system import DirectSystem, reduced_system
 from factors.iterative_system import IterativeSystem
 from factors.reduced_camera_system import ReducedSystem
+from factors.schur_complement import GROUP_DIM
 from factors.system_layout import SystemLayout
 from gsba.bundle.optimizer import optimize
 from gsba.config import SolverSettings
