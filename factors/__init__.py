@@ -4,7 +4,6 @@ from factors._observations import Term
 from factors.bearing import (
     BearingFactor,
     BearingTerm,
-    LensBearingFactor,
     bearing_residuals,
     tangent_basis,
 )
@@ -15,7 +14,6 @@ from factors.landmarks import LandmarkBlock
 from factors.patch_windows import PatchPixels, PatchTable
 from factors.patches import PatchSet
 from factors.photometric import PhotometricBlock
-from factors.photometric_factor import PhotometricFactor, photometric_residuals
 from factors.reprojection import (
     FaceCameras,
     ReprojectionFactor,
@@ -33,12 +31,10 @@ __all__ = [
     "LandmarkBlock",
     "LandmarkResidual",
     "LandmarkTerm",
-    "LensBearingFactor",
     "PatchPixels",
     "PatchSet",
     "PatchTable",
     "PhotometricBlock",
-    "PhotometricFactor",
     "PoseSystem",
     "ReprojectionFactor",
     "ReprojectionTerm",
@@ -47,7 +43,6 @@ __all__ = [
     "Term",
     "bearing_residuals",
     "jacobian_errors",
-    "photometric_residuals",
     "reprojection_residuals",
     "tangent_basis",
 ]

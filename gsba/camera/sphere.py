@@ -1,5 +1,10 @@
 """Equirectangular pixels, the bearings that they show, and what lies beyond a picture's border."""
 
+import functools
+import threading
+from collections.abc import Callable
+from typing import ParamSpec, TypeVar
+
 import numpy as np
 
 _ROWS_AT_ONCE = 64  # rows moved at once, so that they stay in the cache
@@ -69,3 +74,23 @@ def around_sphere(image: np.ndarray, pad: int, out: np.ndarray | None = None) ->
     inner[-pad:] = np.roll(inner[-2 * pad : -pad][::-1], width // 2, axis=1)
     out[:, :pad], out[:, -pad:] = inner[:, -pad:], inner[:, :pad]
     return out
+
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+def table(maxsize: int) -> Callable[[Callable[P, T]], Callable[P, T]]:
+    """A `functools.lru_cache` that computes an entry once if several threads need it at once."""
+
+    def kept(compute: Callable[P, T]) -> Callable[P, T]:
+        cached, lock = functools.lru_cache(maxsize=maxsize)(compute), threading.Lock()
+
+        @functools.wraps(compute)
+        def look_up(*args: P.args, **kwargs: P.kwargs) -> T:
+            with lock:
+                return cached(*args, **kwargs)  # type: ignore[arg-type]
+
+        return look_up
+
+    return kept

@@ -79,7 +79,7 @@ def _chosen_by_odometry(
     """Trajectory file beside the folder of frames, with the poses of frames that odometry chose."""
     from gsba import odometry
     from gsba.config_file import validated
-    from gsba.odometry.files import write_chosen
+    from gsba.odometry.walk import write_chosen
 
     path = out.with_name(f"{out.name}.tum")
     if path.is_file() and (out / "extract.json").is_file() and not fresh:

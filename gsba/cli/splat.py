@@ -68,7 +68,7 @@ def render(
     """
     import numpy as np
 
-    from gsba.camera.optics import Optics
+    from gsba.camera.views import Optics
     from gsba.disk import write_image
     from gsba.splat import read_ply, scene
     from gsba.splat.backend import choose_backend
@@ -120,7 +120,7 @@ def _compare(
     run: Path, others, settings: "SplatSettings", out: Path, lpips_weights: Sequence[Path]
 ):
     """Results of splats on the run's poses ("refined") and on others, by name."""
-    from gsba.camera.optics import Optics
+    from gsba.camera.views import Optics
     from gsba.evaluate.splats import compare, poses_for
     from gsba.splat.backend import choose_backend
     from gsba.splat.lpips import Lpips

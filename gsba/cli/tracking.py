@@ -63,7 +63,7 @@ def track(
     """Estimate a pose for every frame by visual odometry."""
     from gsba import odometry
     from gsba.config_file import validated
-    from gsba.odometry.files import write_odometry
+    from gsba.odometry.walk import write_odometry
     from gsba.video import is_video
 
     if out.is_dir():

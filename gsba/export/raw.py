@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsba.camera.fisheye import Rig, rotation_of, unproject
-from gsba.camera.sphere import erp_from_bearings
-from gsba.camera.tables import table
+from gsba.camera.sphere import erp_from_bearings, table
 from gsba.export.pictures import FrameWriter, Shown
 from gsba.frames.dual_fisheye import load_raw
 from gsba.log import GsbaError

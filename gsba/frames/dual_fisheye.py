@@ -8,8 +8,7 @@ import numpy as np
 
 from gsba.camera.fisheye import Rig, facing, optical_axes, project
 from gsba.camera.lens import seam_sines
-from gsba.camera.sphere import bearings_from_erp
-from gsba.camera.tables import table
+from gsba.camera.sphere import bearings_from_erp, table
 from gsba.frames.raw_pairs import decode_pair
 from gsba.types import FrameSet
 

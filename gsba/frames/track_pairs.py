@@ -21,8 +21,7 @@ from gsba.camera.equiangular import (
     square_pixels,
     squares,
 )
-from gsba.camera.sphere import bearings_from_erp
-from gsba.camera.tables import table
+from gsba.camera.sphere import bearings_from_erp, table
 from gsba.frames.files import decode, image_size, is_image
 from gsba.log import GsbaError
 from gsba.types import FACES, FrameSet

@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Any
 
 from gsba.bundle.gps_factors import GpsFactors
-from gsba.bundle.gyro_turns import GyroTurns
 from gsba.bundle.map_strength import MAX_SCALE_SIGMA
 from gsba.bundle.reconstruction import world_scale
+from gsba.bundle.trajectory_prior import GyroTurns
 from gsba.camera.calibration import calibration_json
 from gsba.camera.cameras import Cameras
 from gsba.config_file import to_toml

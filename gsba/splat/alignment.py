@@ -10,9 +10,8 @@ from factors.splat import RenderedView, SplatBlock
 from gsba.bundle import pose_variables
 from gsba.camera.fisheye import facing
 from gsba.camera.lens import seam_sines
-from gsba.camera.optics import ONE_EYE, Optics
 from gsba.camera.rig import CubeRig
-from gsba.camera.views import View, nearest_lens, rig_views, turned_rigs
+from gsba.camera.views import ONE_EYE, Optics, View, nearest_lens, rig_views, turned_rigs
 from gsba.frames import cubemap
 from gsba.frames.masks import load_weights
 from gsba.log import track

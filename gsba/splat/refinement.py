@@ -27,7 +27,7 @@ from gsba.bundle import adjustment, triangulation
 from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.optimizer import OptimizeResult, optimize
 from gsba.bundle.reconstruction import MIN_OBSERVATIONS
-from gsba.camera.optics import ONE_EYE, Optics
+from gsba.camera.views import ONE_EYE, Optics
 from gsba.config import SplatSettings
 from gsba.splat.alignment import Captured, capture, splat_block
 from gsba.splat.backend import choose_backend

@@ -6,9 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsba.bundle import triangulation
-from gsba.camera.optics import ONE_EYE, Optics
 from gsba.camera.rig import CubeRig
-from gsba.camera.views import View, turned_rigs
+from gsba.camera.views import ONE_EYE, Optics, View, turned_rigs
 from gsba.config import SplatSettings, TriangulateSettings
 from gsba.frames import cubemap, lens_faces
 from gsba.frames.held_out import held_out_rows

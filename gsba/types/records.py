@@ -366,7 +366,7 @@ class Round:
 
 @dataclass(frozen=True, slots=True)
 class FamilyVariables:
-    """Variables that belong to families of residuals, see `gsba.bundle.family_variables`."""
+    """Variables that belong to families of residuals, see `gsba.bundle.families`."""
 
     keys: np.ndarray  # (V,) int64, GTSAM keys
     kinds: tuple[str, ...]  # (V) GTSAM type of each

@@ -8,8 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from gsba.camera.optics import ONE_EYE, Optics
-from gsba.camera.views import View
+from gsba.camera.views import ONE_EYE, Optics, View
 from gsba.evaluate.scans import colors_of
 from gsba.frames import cubemap, lens_faces
 from gsba.frames.masks import load_mask

@@ -3,7 +3,7 @@
 import numpy as np
 
 from gsba.odometry import Odometry
-from gsba.odometry.frame_record import FrameStatus
+from gsba.odometry.tracker_state import FrameStatus
 from gsba.report.html.odometry import odometry_plan
 
 
