@@ -4,6 +4,7 @@ from factors._observations import Term
 from factors.bearing import (
     BearingFactor,
     BearingTerm,
+    LensBearingFactor,
     bearing_residuals,
     tangent_basis,
 )
@@ -14,6 +15,7 @@ from factors.landmarks import LandmarkBlock
 from factors.patch_windows import PatchPixels, PatchTable
 from factors.patches import PatchSet
 from factors.photometric import PhotometricBlock
+from factors.photometric_factor import PhotometricFactor, photometric_residuals
 from factors.reprojection import (
     FaceCameras,
     ReprojectionFactor,
@@ -31,10 +33,12 @@ __all__ = [
     "LandmarkBlock",
     "LandmarkResidual",
     "LandmarkTerm",
+    "LensBearingFactor",
     "PatchPixels",
     "PatchSet",
     "PatchTable",
     "PhotometricBlock",
+    "PhotometricFactor",
     "PoseSystem",
     "ReprojectionFactor",
     "ReprojectionTerm",
@@ -43,6 +47,7 @@ __all__ = [
     "Term",
     "bearing_residuals",
     "jacobian_errors",
+    "photometric_residuals",
     "reprojection_residuals",
     "tangent_basis",
 ]

@@ -126,3 +126,37 @@ def BearingFactor(
         return bearing_residuals(world_T_rig, point, measured)
 
     return custom_factor(pose_key, point_key, noise_model, residual)
+
+
+def LensBearingFactor(
+    pose_key: int,
+    point_key: int,
+    centre_key: int,
+    bearing_rig: np.ndarray,
+    noise_model: gtsam.noiseModel.Base,
+    sign: float = 1.0,
+) -> gtsam.CustomFactor:
+    """One bearing observed through a lens off the rig's centre: the reference for lens centres.
+
+    Args:
+        pose_key, point_key: keys of a Pose3 `world_T_rig` and of a Point3.
+        centre_key: key of a Point3, the front lens's centre in the rig frame, map units.
+        bearing_rig: (3,) unit, rig frame.
+        noise_model: of dimension 2, radians on `tangent_basis(bearing_rig)`, robust or not.
+        sign: 1 for the front lens, -1 for the opposite one.
+    """
+    measured = np.asarray(bearing_rig, dtype=np.float64)[None]
+
+    def error(_factor, values: gtsam.Values, jacobians) -> np.ndarray:
+        world_T_rig = values.atPose3(pose_key).matrix()[None]
+        origin = sign * values.atPoint3(centre_key)[None]
+        residuals, by_pose, by_point = bearing_residuals(
+            world_T_rig, values.atPoint3(point_key)[None], measured, origin
+        )
+        if jacobians is not None:
+            by_centre = -sign * by_point[0] @ world_T_rig[0, :3, :3]
+            for n, jacobian in enumerate((by_pose[0], by_point[0], by_centre)):
+                jacobians[n] = np.asfortranarray(jacobian)
+        return residuals[0]
+
+    return gtsam.CustomFactor(noise_model, [pose_key, point_key, centre_key], error)

@@ -9,10 +9,10 @@ from factors import (
     BearingTerm,
     FaceCameras,
     LandmarkBlock,
+    LensBearingFactor,
     PoseSystem,
     ReprojectionTerm,
     RobustLoss,
-    bearing_residuals,
     jacobian_errors,
 )
 
@@ -20,32 +20,6 @@ UNIT = gtsam.noiseModel.Unit.Create(2)
 FRAMES, POINTS = 4, 12
 CENTRES = np.array([[0.02, -0.05, 0.3], [-0.03, 0.04, -0.25]])  # of two lenses
 CAMERAS = FaceCameras(np.eye(3)[None], np.array([100.0]), np.array([[50.0, 50.0]]))
-
-
-def LensBearingFactor(
-    pose_key: int,
-    point_key: int,
-    centre_key: int,
-    bearing_rig: np.ndarray,
-    noise_model: gtsam.noiseModel.Base,
-    sign: float = 1.0,
-) -> gtsam.CustomFactor:
-    """One bearing through the lens at `sign` times the point under `centre_key`, rig frame."""
-    measured = np.asarray(bearing_rig, dtype=np.float64)[None]
-
-    def error(_factor, values: gtsam.Values, jacobians) -> np.ndarray:
-        world_T_rig = values.atPose3(pose_key).matrix()[None]
-        origin = sign * values.atPoint3(centre_key)[None]
-        residuals, by_pose, by_point = bearing_residuals(
-            world_T_rig, values.atPoint3(point_key)[None], measured, origin
-        )
-        if jacobians is not None:
-            by_centre = -sign * by_point[0] @ world_T_rig[0, :3, :3]
-            for n, jacobian in enumerate((by_pose[0], by_point[0], by_centre)):
-                jacobians[n] = np.asfortranarray(jacobian)
-        return residuals[0]
-
-    return gtsam.CustomFactor(noise_model, [pose_key, point_key, centre_key], error)
 
 
 @pytest.mark.parametrize("bearing", [[0, 0, 1], [1e-9, 0.1, -1], [0, -1, 0], [0.3, -0.5, 0.2]])

@@ -6,13 +6,13 @@ from functools import cache
 import gtsam
 import numpy as np
 import pytest
-from photometric_factor import PhotometricFactor, photometric_residuals
 from photometric_world import BallWorld, CodedImage, make_ball_world, planes_from, table_of
 from synthetic import unit
 
 from factors import RobustLoss, jacobian_errors
 from factors.patch_windows import PatchPixels, PatchTable, PatchViews, patch_axes
 from factors.photometric import _MIN_THREAD_OBSERVATIONS, FAMILY, PhotometricBlock
+from factors.photometric_factor import PhotometricFactor, photometric_residuals
 from factors.sphere_image import SphereImage
 from factors.threads import balanced_ranges
 from gsba.bundle.optimizer import optimize
