@@ -152,24 +152,6 @@ class Case(NamedTuple):
     truth: Path  # TUM
 
 
-def cut_short(case: Case, num_frames: int, folder: Path) -> Case:
-    """Case of the first frames, as links in `folder`, with the poses up to the last of them."""
-    shutil.rmtree(folder, ignore_errors=True)
-    (folder / "images").mkdir(parents=True)
-    header, *rows = (case.images / "timestamps.csv").read_text().splitlines()
-    for row in rows[:num_frames]:
-        name = row.partition(",")[0]
-        (folder / "images" / name).symlink_to((case.images / name).resolve())
-    _write(folder / "images/timestamps.csv", "\n".join([header, *rows[:num_frames], ""]))
-    last = float(rows[:num_frames][-1].partition(",")[2])
-    for path in filter(None, (case.trajectory, case.truth)):
-        poses = path.read_text().splitlines(keepends=True)
-        kept = [one for one in poses if one[0] == "#" or float(one.split()[0]) <= last + 1e-6]
-        _write(folder / path.name, "".join(kept))
-    trajectory = case.trajectory and folder / case.trajectory.name
-    return Case(folder / "images", trajectory, folder / case.truth.name)
-
-
 def take_frames(walk: Path, rows: "np.ndarray", times: "np.ndarray", folder: Path) -> None:
     """Link frames (R,) of a walk, at times (R,) in seconds, into a folder with timestamps.csv."""
     table = (walk / "images/timestamps.csv").read_text().splitlines()[1:]

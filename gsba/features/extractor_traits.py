@@ -1,6 +1,6 @@
 """Measured traits of each extractor: noise and offset of its keypoints, likeness of true matches.
 
-Measured by `benchmarks/learned.py` on panoramas turned about all axes; see
+Measured on panoramas turned about all axes; see
 `benchmarks/results/learned.md`.
 """
 
