@@ -238,15 +238,7 @@ def _placed(
     promised: dict[Path, Drop],
     on_their_way: Callable[[Path], list[dict[str, Any]]],
 ) -> tuple[Drop, bool]:
-    """A dropped file under the first name that is free, or that it has already; True if that is not
-    its own name.
-
-    Args:
-        root, target: folder of the page, and where files are dropped.
-        one: name, size and time of change.
-        promised: files of the same plan, by path.
-        on_their_way: `unfinished` of a folder.
-    """
+    """A dropped file under its name or the first free one; True if that is not its own name."""
     try:
         name, size, modified = str(one["name"]), int(one["size"]), int(one["modified"])
     except (KeyError, TypeError, ValueError):
@@ -269,11 +261,7 @@ def _placed(
 
 
 def _target(root: Path, folder: str) -> Path:
-    """Folder of a drop below the root.
-
-    Raises:
-        GsbaError: it leads out of the root, or into a run.
-    """
+    """Folder of a drop below the root."""
     path, base = inside(root, folder), root.resolve()
     for each in (path, *path.parents):
         if is_run_folder(each):
@@ -286,11 +274,7 @@ def _target(root: Path, folder: str) -> Path:
 
 
 def _cleaned(name: str) -> list[str]:
-    """Components of a dropped path that any disk takes: no controls, no hidden or endless names.
-
-    Raises:
-        GsbaError: nothing is left, or there are too many folders.
-    """
+    """Components of a dropped path that any disk takes: no controls, no hidden or endless names."""
     if holds_half_characters(name):
         raise GsbaError("the name of a dropped file holds half characters: rename it")
     parts = []

@@ -401,16 +401,7 @@ def _against_truth(estimate: Path, truth: Path, depth: Path | None, json_file: P
 
 
 def _against_scan(run: Path, path: Path, known: dict[str, str], json_file: Path | None) -> None:
-    """Measure the distances of a run's points to a scan.
-
-    Prints a table and writes RUN/scan.json and RUN/scan.ply, a cloud coloured by distance.
-
-    Args:
-        run: folder of the run.
-        path: file of the scan.
-        known: placement settings that start the alignment.
-        json_file: another file for the numbers.
-    """
+    """Measure a run's points against a scan: a table, RUN/scan.json, a coloured RUN/scan.ply."""
     from gsba.config_file import validated
     from gsba.disk import write_json
     from gsba.evaluate.scans import format_scan, scan_errors

@@ -96,8 +96,7 @@ def _unfit(wanted: Requirement, version: str | None) -> str:
 def _imported(
     modules: Sequence[str], facts: str
 ) -> tuple[dict[str, dict[str, Any]], dict[str, Any]]:
-    """Report of each module, and facts; after a crash the remaining modules are imported again in
-    a new process."""
+    """Report of each module, and facts; after a crash the rest is imported in a new process."""
     reports: dict[str, dict[str, Any]] = {}
     answers: dict[str, Any] = {}
     rest = list(modules)

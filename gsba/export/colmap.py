@@ -132,8 +132,7 @@ def _write_flat_model(
     wanted: bool,
     num_photos: int = 0,
 ) -> Sequence[Files]:
-    """Write the model with INRIA's start cloud, in the order of a split if one is wanted; returns
-    the files of each camera's frames in that order."""
+    """Write the model with INRIA's cloud, in a split's order; returns each camera's files in it."""
     num_views = [len(rigs[rig]) for rig in frames.cameras.tolist()]
     split = split_of(seen, num_views, num_photos) if wanted else None
     if split is not None:
@@ -319,12 +318,7 @@ def _write_rig_config(
 
 
 def _rig_config(sensors: Sequence[Sensor], names: Sequence[str], folder: str) -> dict:
-    """Rig in the format of `colmap rig_configurator`; rotations are cam_from_rig, wxyz.
-
-    Args:
-        sensors, names: of the rig's cameras.
-        folder: of its images, in that of each camera.
-    """
+    """Rig in the format of `colmap rig_configurator`; rotations are cam_from_rig, wxyz."""
     configs = []
     for sensor, name in zip(sensors, names, strict=True):
         config: dict[str, object] = {"image_prefix": f"{name}/{folder}"}

@@ -113,8 +113,7 @@ def _depths(
     views: Sequence[tuple[View, ...]],
     which: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Depths (O,) of observed points from the views (O,) that show them, and their standard
-    deviations (O,)."""
+    """Depths (O,) of observed points from the views (O,) that show them, and their sigmas (O,)."""
     poses, of_frame = seen.world_T_rigs, seen.observation_frames
     axes, depths = np.empty((len(which), 3)), np.empty(len(which))
     for camera, own in enumerate(views):

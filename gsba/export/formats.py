@@ -196,8 +196,7 @@ def _write_dataset(
     cameras: Cameras,
     options: ExportOptions,
 ) -> list[FrameWriter]:
-    """Write a dataset of an unplaced map with its placement, without images; returns the writers
-    of these."""
+    """Write a dataset of an unplaced map with its placement; returns the writers of images."""
     from gsba.export import opensfm
 
     if to == ExportFormat.OPENSFM:
@@ -294,8 +293,7 @@ def _write_panoramas(
 
 
 def _require_fitting(to: ExportFormat, frames: FrameSet, options: ExportOptions) -> None:
-    """Refuse images that the format cannot hold or its reader cannot read, and panoramas of frames
-    that are cube faces."""
+    """Refuse images that the format cannot hold or its reader cannot read."""
     images, photos = options.images, options.photos
     fitting = FORMATS_OF.get(images, (to.value,))
     if to.value not in fitting:

@@ -124,11 +124,7 @@ def _write(
     sensors: Sequence[ET.Element],
     taken: Sequence[_Taken],
 ) -> None:
-    """Write cameras.xml and the cloud.
-
-    Args:
-        taken: (F,) images of the frames.
-    """
+    """Write cameras.xml and the cloud."""
     write_splat_points(
         partial / "points3D.ply", reconstruction.points_world, reconstruction.point_colors
     )

@@ -329,10 +329,7 @@ def _write_transforms(
     reconstruction: Reconstruction,
     split: bool,
 ) -> None:
-    """Write transforms.json, with the entries of each frame (F).
-
-    Images of held-out frames are for evaluation, and without a split for training, too.
-    """
+    """Write transforms.json with each frame's (F) entries; unsplit, all are for training, too."""
     held_out = held_out_frames(reconstruction)
     names = [[str(entry["file_path"]) for entry in of_frame] for of_frame in entries]
     evaluated = [n for held, own in zip(held_out, names, strict=True) if held for n in own]

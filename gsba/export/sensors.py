@@ -64,10 +64,8 @@ def project_in_rigs(
 def _project(
     sensors: Sequence[Sensor], bearings: np.ndarray, origins: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Sensor (O,) that sees each bearing (O, 3) from its origin, and its pixel (O, 2) there.
-
-    Among the sensors of the origin's lens it is the one with the pixel furthest from the border.
-    """
+    """Sensor (O,) of the origin's lens that sees each bearing (O, 3) furthest from its border, and
+    the pixel (O, 2) there."""
     if sensors[0].fisheye is not None:
         return _project_raw(sensors, bearings, origins)
     if sensors[0].model == "EQUIRECTANGULAR":

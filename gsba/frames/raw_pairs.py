@@ -82,11 +82,7 @@ def find_pairs(folder: Path) -> Found | None:
 
 
 def _of_numbered(folder: Path, numbered: Mapping[int, Path]) -> Found:
-    """Pictures of three lenses or more, in folders lens0, lens1, ...
-
-    Raises:
-        GsbaError: a lens or a picture is missing.
-    """
+    """Pictures of three lenses or more, in folders lens0, lens1, ..."""
     if sorted(numbered) != list(range(len(numbered))):
         held = ", ".join(f"{numbered[lens].name}/" for lens in sorted(numbered))
         raise GsbaError(
@@ -100,8 +96,7 @@ def _of_numbered(folder: Path, numbered: Mapping[int, Path]) -> Found:
 
 
 def _tagged_pairs(folder: Path, images: Sequence[Path], tags: LensNames) -> Found | None:
-    """Pairs of files whose names include the lens; None for panoramas and cube faces named like
-    that."""
+    """Pairs of files named after their lens; None for panoramas and cube faces named like that."""
     tagged = {path: tag for path in images if (tag := tags.read(path.stem))}
     if not tagged or all(_OF_FACE.fullmatch(path.stem) for path in tagged):
         return None
@@ -209,14 +204,7 @@ def lenses_of(
 def _calibrated(
     folder: Path, chosen: Sequence[Sequence[Path]], size: tuple[int, int], calibration: Path
 ) -> tuple[Rig, bool]:
-    """Lenses of a calibration, of a pair checked by the pictures.
-
-    Args:
-        chosen: files of some frames, as for `decode_pair`.
-
-    Raises:
-        GsbaError: it is of other pictures or of another number of lenses.
-    """
+    """Lenses of a calibration, of a pair checked by the pictures."""
     known, num = scaled_to_size(read_calibration(calibration), size, calibration), len(chosen[0])
     if len(known) != num:
         raise GsbaError(
@@ -234,12 +222,7 @@ def _checked_calibration(
     size: tuple[int, int],
     calibration: Path,
 ) -> tuple[Pair, bool]:
-    """Calibrated lenses; if pictures contradict them, rescaled focal lengths and True (to
-    estimate).
-
-    Args:
-        chosen: files of some frames, as for `decode_pair`.
-    """
+    """Calibrated lenses; if pictures contradict them, rescaled ones and True (to estimate)."""
     try:
         looks = [decode_pair(paths, size, gray=True) for paths in chosen]
     except GsbaError:  # the error is raised when the picture is used
@@ -265,11 +248,7 @@ def _checked_calibration(
 def _given_circles(
     circles: Sequence[ImageCircle], size: tuple[int, int]
 ) -> tuple[ImageCircle, ImageCircle] | None:
-    """Image circles given by the caller; None = none are given.
-
-    Raises:
-        GsbaError: one of them is not in the picture.
-    """
+    """Image circles given by the caller; None = none are given."""
     if not circles:
         return None
     width, height = size
@@ -287,11 +266,7 @@ def _given_circles(
 def _found_circles(
     folder: Path, first: Sequence[Path], looks: Sequence[Sequence[np.ndarray]]
 ) -> tuple[ImageCircle, ImageCircle]:
-    """Image circles found in the pictures of both lenses.
-
-    Raises:
-        GsbaError: the pictures of a lens show none.
-    """
+    """Image circles found in the pictures of both lenses."""
     circles = []
     for name, pictures in zip(("front", "back"), zip(*looks, strict=True), strict=True):
         search: CircleSearch = find_circle(pictures)

@@ -121,12 +121,7 @@ def _refuse_same(name: str, one: FrameSet, other_name: str, other: FrameSet) -> 
 def _cameras_of(
     recordings: Mapping[str, FrameSet], names: Mapping[str, str]
 ) -> tuple[tuple[PictureFormat, ...], list[int]]:
-    """Format (C,) of each camera, and the camera (R,) of each recording.
-
-    Args:
-        recordings: frames of one camera each.
-        names: of camera models, by recording.
-    """
+    """Format (C,) of each camera, and the camera (R,) of each recording, by the models' `names`."""
     formats, models, numbers = list[PictureFormat](), list[str](), list[int]()
     for recording, frames in recordings.items():
         own, model = frames.format, names.get(recording, "")

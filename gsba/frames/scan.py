@@ -188,11 +188,7 @@ def _pair_size(
     circles: Sequence[ImageCircle] = (),
     factory: FactoryLenses | None = None,
 ) -> tuple[int, int] | None:
-    """Width and height of one lens's picture where images hold two side by side; None = panoramas.
-
-    Raises:
-        GsbaError: they are neither.
-    """
+    """Size of one lens's picture where images hold two side by side; None = panoramas."""
     if factory is not None:
         return lens_sizes(size)[0]
     shape, source = None, ""
@@ -213,11 +209,7 @@ def _pair_size(
 
 
 def _refuse_others(folder: Path, images: Sequence[Path], size: tuple[int, int]) -> None:
-    """Refuse 2:1 pictures that are no panoramas by their tags, or by what they show without any.
-
-    Raises:
-        GsbaError: they are named as what they are.
-    """
+    """Refuse 2:1 pictures that are no panoramas by their tags, or by what they show without any."""
     tags = image_header(images[0]).tags
     if tags is not None and tags.projection not in ("", "equirectangular"):
         raise GsbaError(
@@ -241,8 +233,7 @@ def _lenses(
     circles: Sequence[ImageCircle],
     factory: FactoryLenses | None,
 ) -> tuple[Rig | None, bool]:
-    """Initial lenses of raw fisheyes, None = other layouts; and True if they are to be
-    estimated."""
+    """Initial lenses of raw fisheyes, None = other layouts; True if they are to be estimated."""
     if layout == "fisheye" and factory is not None and not circles:
         return starting_lenses(folder, paths, size, factory), True
     if layout == "fisheye":
@@ -356,14 +347,7 @@ def _find_frames(folder: Path) -> tuple[str, tuple[str, ...], dict[str, tuple[Pa
 def _no_images(
     folder: Path, entries: Sequence[Path], others: Sequence[str], foreign: str
 ) -> GsbaError:
-    """The refusal of a folder without pictures.
-
-    Args:
-        folder: the folder.
-        entries: all files and folders in it.
-        others: names of those that are no images.
-        foreign: number and format of images in unsupported formats.
-    """
+    """The refusal of a folder without pictures."""
     if foreign:
         return GsbaError(
             f"{folder}: no JPEG, PNG, WebP or TIFF images, but {foreign}: convert them first"

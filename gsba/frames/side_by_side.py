@@ -218,8 +218,7 @@ def readable(paths: Iterable[Path], size: tuple[int, int]) -> Iterator[np.ndarra
 
 
 def _radii(shape: tuple[int, ...]) -> np.ndarray:
-    """Distance of pixels from the middle of their half of the picture, in units of the half's
-    sides."""
+    """Distance of pixels from the middle of their half of the picture, in units of its sides."""
     height, width = shape[0], shape[1]
     v, u = np.ogrid[:height, :width]
     side = width / 2
@@ -235,11 +234,7 @@ def _corners_lit(grey: np.ndarray) -> bool:
 
 
 def _circle_evidence(grey: np.ndarray) -> tuple[bool, float]:
-    """Evidence for two image circles in a picture (H, 2H) uint8, or in a squeezed one.
-
-    Returns:
-        True if all around them is black; part of the rows in which they are lit beside it.
-    """
+    """True if all around two circles is black; part of the rows in which they are lit beside it."""
     radii = _radii(grey.shape)
     outside, inside = radii > _OUTSIDE_RADIUS, radii < _INSIDE_RADIUS
     rows = np.flatnonzero(outside.any(axis=1) & inside.any(axis=1))

@@ -160,11 +160,8 @@ def _maps(grid: Grid, width: int) -> np.ndarray:
 
 
 def _edge_correlations(faces: np.ndarray) -> np.ndarray:
-    """Correlations (n,) of grey values on both sides of edges that squares of both tracks share.
-
-    Values of squares (6, S, S) are averaged along an edge, so that noise counts as no contrast;
-    edges without contrast are left out.
-    """
+    """Correlations (n,) of means along edges of squares (6, S, S) that both tracks share, where
+    they have contrast."""
     size, found = faces.shape[1], []
     along = np.arange(size) + 0.5
     for face in ("front", "right", "left"):  # of track 0

@@ -110,8 +110,7 @@ def _metres_per_unit(report: Mapping[str, Any]) -> float:
 
 
 def _held_steps(report: Mapping[str, Any], names: Sequence[str]) -> tuple[int, ...]:
-    """Steps of the exported map whose poses the start alone gives, by the rows of their first
-    frames."""
+    """Steps of the exported map whose poses the start alone gives, by their first frames' rows."""
     checks, rows = report["trajectory"] or {}, {name: row for row, name in enumerate(names)}
     if {row["coarse_pose"] for row in report["frames"]} <= _NO_START:
         return ()

@@ -58,10 +58,7 @@ def capture(frames: FrameSet, which: np.ndarray, size: int, optics: Optics = ONE
 
 
 def _capture_of_lenses(frames: FrameSet, which: np.ndarray, size: int, optics: Optics) -> Captured:
-    """Captured faces like those of `capture`, of one lens each, squares around the rendered ones.
-
-    Pixels that are blended or of the other lens have no weight.
-    """
+    """Faces like those of `capture`, of one lens each; blended pixels have no weight."""
     wide, rendered, lenses = _wide_rig(size), optics.views(size), optics.lenses
     square = {"width": wide.size, "height": wide.size, "principal": (wide.principal,) * 2}
     views = tuple(replace(view, **square) for view in rendered)

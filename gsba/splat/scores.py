@@ -111,11 +111,7 @@ def mean_score(scores: Iterable[Score]) -> Score:
 
 
 def _panoramas(views: Views) -> list[np.ndarray]:
-    """Rows of the views of each panorama.
-
-    Raises:
-        GsbaError: there are none.
-    """
+    """Rows of the views of each panorama."""
     if len(views.cameras) == 0:
         raise GsbaError("no pixel to measure a splat on: all held-out frames are masked")
     return [np.flatnonzero(views.panoramas == i) for i in np.unique(views.panoramas)]

@@ -248,8 +248,7 @@ class Trainer:
         return TrainingState(step, gaussians, moments, pull)
 
     def _stop(self, step: int, end: int) -> int:
-        """End of a stretch from a step: the next step at which density control may be due, or
-        earlier."""
+        """The next step at which density control may be due, or the end of the stretch."""
         times = self.times
         rhythms = (self.backend.stretch, times.densify_every, times.reset_every)
         stops = [end, *(step // every * every + every for every in rhythms)]

@@ -220,8 +220,7 @@ def _check_pair(files: tuple[Path, ...], size: tuple[int, int]) -> None:
 
 
 def _lens_tracks(sizes: Sequence[tuple[int, int]]) -> list[int]:
-    """Numbers of the tracks that lenses may have: the two largest, if they are square and equal,
-    beside covers and previews (DJI's `.osv`); else all."""
+    """The two largest tracks, if they are square and equal, as in DJI's `.osv`; else all."""
     largest = max(sizes, key=lambda size: size[0] * size[1])
     pair = [n for n, size in enumerate(sizes) if size == largest]
     return pair if len(pair) == 2 and _is_nearly_square(largest) else list(range(len(sizes)))
@@ -285,11 +284,7 @@ def _check_panorama(video: Path, size: tuple[int, int]) -> None:
 
 
 def _of_one_track(track: Track, size: tuple[int, int]) -> Recording:
-    """Recording of panoramas, or of two lenses side by side or one above the other.
-
-    Raises:
-        GsbaError: the track holds neither.
-    """
+    """Recording of panoramas, or of two lenses side by side or one above the other."""
     claims, timeline = read_claims(track), read_timeline(track)
     _refuse_claims(track.path, claims)
     shown, looks = claims.shown_size(size), tee(_looks(track, timeline), 3)

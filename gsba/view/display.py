@@ -324,10 +324,7 @@ def _has_masks(scene: Scene) -> bool:
 
 
 def _pyramid(length: float) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (5, 3) and triangles (4, 3) of a pyramid from the origin along z, without a base.
-
-    A camera in its apex looks through it.
-    """
+    """Vertices (5, 3) and triangles (4, 3) of a pyramid along z without a base."""
     half = 0.6 * length
     corners = [[-half, -half, length], [half, -half, length], [half, half, length]]
     vertices = np.array([[0, 0, 0], *corners, [-half, half, length]], np.float32)

@@ -166,8 +166,7 @@ def _shrunk(image: np.ndarray) -> np.ndarray:
 
 
 def _latest_placement(run: Path) -> tuple[Placement, str]:
-    """Placement of the run's latest export of map 1 that has one, else the identity; and its
-    source."""
+    """Placement of the latest export of map 1 that has one, else the identity; and its source."""
     files = sorted(run.glob("*/transform.json"), key=lambda path: path.stat().st_mtime_ns)
     for path in reversed(files):
         placement = read_placement(path)

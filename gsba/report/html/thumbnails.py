@@ -108,12 +108,7 @@ def _mask_number(frames: FrameSet, f: int, masks: dict[bytes, int]) -> int:
 
 
 def _seams(kind: PictureFormat, two_lenses: bool) -> list[np.ndarray]:
-    """Lines (N, 2) where pictures of two lenses along the z axis meet.
-
-    Args:
-        kind: format of the pictures.
-        two_lenses: True if stitched panoramas were found to be of such lenses.
-    """
+    """Lines (N, 2) where pictures of two lenses along the z axis meet."""
     raw = kind.fisheyes is not None and len(kind.fisheyes) == 2
     if not raw and not (two_lenses and kind.panoramic):
         return []
