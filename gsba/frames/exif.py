@@ -78,7 +78,7 @@ def read_exif(path: Path) -> ExifTags:
 
 
 def _taken(tags: Mapping[int, Any]) -> tuple[float | None, bool, bool]:
-    """Time of DateTimeOriginal with its fraction; whether its zone is known, and it has a fraction."""
+    """Time of DateTimeOriginal with its fraction; whether zone and fraction are given."""
     try:
         moment = datetime.strptime(_text(tags, _TAKEN), "%Y:%m:%d %H:%M:%S")
     except ValueError:  # absent, or blank as written by cameras without a clock
