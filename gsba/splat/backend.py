@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -12,9 +13,21 @@ from gsba.splat import adam
 from gsba.splat.camera import FaceCamera
 from gsba.splat.density import Pull
 from gsba.splat.gaussians import Gaussians
-from gsba.splat.lesson import Lesson
 from gsba.splat.metrics import training_loss
 from gsba.splat.rasterise import Gradients, Rendering, differentiate, render
+
+
+@dataclass(frozen=True, slots=True)
+class Lesson:
+    """A view to train on, and the learning rates of its step."""
+
+    camera: FaceCamera
+    truth: np.ndarray  # (H, W, 3) uint8, RGB
+    use: np.ndarray | None  # (H, W) bool, pixels of the loss; None = all
+    sh_degree: int  # highest degree of the harmonics
+    rates: adam.Rates
+    number: int  # of the step, from 1
+
 
 logger = logging.getLogger(__name__)
 

@@ -23,7 +23,7 @@ from gsba.splat.gaussians import Gaussians
 from gsba.splat.rasterise import Rendering
 
 if TYPE_CHECKING:
-    from gsba.splat.lesson import Lesson
+    from gsba.splat.backend import Lesson
 
 
 class GsplatBackend:

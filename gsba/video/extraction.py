@@ -34,11 +34,11 @@ from gsba.store.store import digest, fingerprint
 from gsba.trajectory.files import read_trajectory
 from gsba.types import Counts
 from gsba.version import __version__
-from gsba.video.cube_tracks import TRACKS
 from gsba.video.likeness import apparent_motion_deg, lens_interior, miniature, sharpness
 from gsba.video.recording import (
     EXACT_S,
     LENSES,
+    TRACKS,
     Picture,
     Recording,
     check_lengths,

@@ -8,8 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from gsba.cli import app
-from gsba.demo.film import FPS, WHOLE_WALK
-from gsba.demo.walk import walk_poses
+from gsba.demo.walk import FPS, WHOLE_WALK, walk_poses
 from gsba.trajectory.files import read_trajectory
 
 

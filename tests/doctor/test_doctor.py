@@ -15,8 +15,7 @@ from typer.testing import CliRunner
 from gsba.cli import app
 from gsba.doctor import examination, examine, facts
 from gsba.doctor.machine import look
-from gsba.doctor.packages import debian_package, look_at
-from gsba.doctor.requirements import NEEDED, Requirement, requirements
+from gsba.doctor.packages import NEEDED, Requirement, debian_package, look_at, requirements
 
 ROOT = Path(__file__).parents[2]
 

@@ -13,7 +13,7 @@ from gsba.disk import write_text
 from gsba.log import GsbaError
 from gsba.odometry import Odometry
 from gsba.report.html import figures, pictures
-from gsba.report.html.odometry import odometry_plan
+from gsba.report.html.figures import odometry_plan
 from gsba.report.html.thumbnails import frame_pictures
 from gsba.report.report import frame_quality, plain
 from gsba.types import CoarsePoses, FrameSet, Reconstruction
