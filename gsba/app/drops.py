@@ -87,7 +87,8 @@ def plan(root: Path, folder: str, files: Sequence[Any]) -> list[dict[str, Any]]:
     """
     target, found, promised = _target(root, folder), [], dict[Path, Drop]()
     on_their_way = cache(lambda where: unfinished(where) if where.is_dir() else [])
-    free = shutil.disk_usage(_existing(target)).free - _SPARE
+    existing = next(each for each in (target, *target.parents) if each.is_dir())
+    free = shutil.disk_usage(existing).free - _SPARE
     for one in files:
         try:
             drop, renamed = _placed(root, target, one, promised, on_their_way)
@@ -313,8 +314,3 @@ def _no_room(drop: Drop, left: int, free: int) -> str:
         f"the disk is full: {drop.name} needs {left / 1e9:.1f} GB more, and {usable:.1f} GB can be "
         f"used: free {missing:.2g} GB, then drop it again{kept}"
     )
-
-
-def _existing(folder: Path) -> Path:
-    """The folder, or the first one above it that exists."""
-    return next(each for each in (folder, *folder.parents) if each.is_dir())

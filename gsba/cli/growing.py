@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from gsba.cli.app import command, loading
+from gsba.cli.app import Run, command, loading
 from gsba.cli.recordings import recordings_of
 from gsba.cli.refining import (
     PARTIAL,
@@ -21,7 +21,6 @@ from gsba.cli.refining import (
 )
 from gsba.log import GsbaError
 
-Run = Annotated[Path, typer.Argument(help="Folder of a finished run.", metavar="RUN")]
 Out = Annotated[
     Path | None,
     typer.Option(
@@ -130,7 +129,7 @@ _ENOUGH = 0.9  # share of the pictures that must be localised for exit code 0
 
 @command
 def localize(
-    run: Annotated[Path, typer.Argument(help="Folder of a finished run.", metavar="RUN")],
+    run: Run,
     images: Annotated[
         list[Path],
         typer.Argument(help="Pictures of the run's cameras, or photos: files, folders, videos."),

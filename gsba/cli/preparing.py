@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from gsba.cli.app import command
+from gsba.cli.refining import Calibration
 from gsba.log import GsbaError
 
 
@@ -105,10 +106,7 @@ def mask(
     masks: Annotated[
         Path | None, typer.Option(help="Masks of your own, merged with the carrier's.")
     ] = None,
-    calibration: Annotated[
-        Path | None,
-        typer.Option(help="Calibration of the lenses of raw fisheyes.", metavar="FILE"),
-    ] = None,
+    calibration: Calibration = None,
 ) -> None:
     """Find the carrier of the camera and write its mask.
 
@@ -173,10 +171,7 @@ def track(
     timestamps: Annotated[
         Path | None, typer.Option(help="File with the times of a folder's frames.", metavar="FILE")
     ] = None,
-    calibration: Annotated[
-        Path | None,
-        typer.Option(help="Calibration of the lenses of raw fisheyes.", metavar="FILE"),
-    ] = None,
+    calibration: Calibration = None,
 ) -> None:
     """Estimate a pose for every frame by visual odometry."""
     from gsba import odometry

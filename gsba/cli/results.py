@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gsba.cli.app import command, loading
+from gsba.cli.app import Run, command, loading
 from gsba.cli.refining import Cluster
 from gsba.cli.splat import (
     BackendName,
@@ -160,13 +160,13 @@ Located = Annotated[
 
 @command
 def export(
-    run: Annotated[Path, typer.Argument(help="Folder of a finished run.", metavar="RUN")],
+    run: Run,
     to: Target,
     out: Annotated[
         Path | None,
         typer.Option(help="Folder to write; default: RUN/FORMAT, of map 2 RUN/FORMAT-map2."),
     ] = None,
-    face_size: Annotated[int | None, typer.Option(help="Width of a cube face in pixels.")] = None,
+    face_size: FaceSize = None,
     images: Images = "auto",
     up: Annotated[str, typer.Option(help="auto: turn the world upright; none: do not.")] = "none",
     scale: Length = None,

@@ -7,13 +7,13 @@ from typing import Annotated
 
 import typer
 
-from gsba.cli.app import command
+from gsba.cli.app import Run, command
 from gsba.log import GsbaError
 
 
 @command
 def view(
-    run: Annotated[Path, typer.Argument(help="Folder of a finished run.", metavar="RUN")],
+    run: Run,
     port: Annotated[int, typer.Option(help="Port of 127.0.0.1; 0: any free one.")] = 8080,
 ) -> None:
     """Show a run in the browser.

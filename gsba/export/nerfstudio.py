@@ -250,10 +250,11 @@ def _write_transforms(
     trained = [n for held, own in zip(apart, names, strict=True) if not held for n in own]
     every = [entry["transform_matrix"] for of_frame in entries for entry in of_frame]
     applied = np.column_stack([out_R_world, np.zeros(3)])
+    half = _NGP_SCALE * np.abs(np.array(every)[:, :3, 3]).max(initial=0.0)  # side of the box
     document = {
         **camera,
         "applied_transform": applied.tolist(),
-        "aabb_scale": _ngp_boxes(np.array(every)[:, :3, 3]),
+        "aabb_scale": int(min(2.0 ** np.ceil(np.log2(max(2 * half, 1.0))), _NGP_MAX_BOXES)),
         "ply_file_path": _CLOUD,
         "train_filenames": trained,
         "val_filenames": evaluated,
@@ -261,9 +262,3 @@ def _write_transforms(
         "frames": [entry for of_frame in entries for entry in of_frame],
     }
     (data.folder / name).write_text(json.dumps(document, indent=1) + "\n")
-
-
-def _ngp_boxes(centres: np.ndarray) -> int:
-    """Scale of instant-ngp's box that holds all camera centres (N, 3)."""
-    half = _NGP_SCALE * np.abs(centres).max(initial=0.0)
-    return int(min(2.0 ** np.ceil(np.log2(max(2 * half, 1.0))), _NGP_MAX_BOXES))

@@ -94,7 +94,8 @@ def add_photos(data: Dataset) -> None:
         np.array([photo.world_T_camera for photo in photos.photos])
     )
     pattern = "images/photos/{}{}" if to == "colmap" else "images/photo_{}{}"
-    names = [pattern.format(photo.name, _suffix(photo)) for photo in photos.photos]
+    suffixes = [{".png": ".png"}.get(p.path.suffix.lower(), ".jpg") for p in photos.photos]
+    names = [pattern.format(p.name, end) for p, end in zip(photos.photos, suffixes, strict=True)]
     for n, name in enumerate(names):
         if name in names[:n]:
             first, second = (photos.photos[k].path for k in (names.index(name), n))
@@ -122,19 +123,19 @@ def add_photos(data: Dataset) -> None:
     write_in_order(model, partial / "sparse" / "0")
 
 
-def _suffix(photo: PlacedPhoto) -> str:
-    return ".png" if photo.path.suffix.lower() == ".png" else ".jpg"
-
-
 def _write_photos(partial: Path, photos: Photos, names: Sequence[str], undistort: bool) -> None:
     """Write the photos to paths in the dataset, upright and in eight bits."""
+    import cv2
+
     for photo, name in zip(photos.photos, names, strict=True):
         target, camera = partial / name, photos.cameras[photo.camera]
         with disk_errors(target):
             target.parent.mkdir(parents=True, exist_ok=True)
             if undistort:
                 image = decode(photo.path, image_size(photo.path))
-                write_image(target, _undistorted(image, camera))
+                pinhole = _pinhole(camera)
+                image = cv2.undistort(image, *_opencv(camera), newCameraMatrix=pinhole)
+                write_image(target, image)
             elif goes_out_as_it_is(photo.path, target):
                 shutil.copyfile(photo.path, target)
             else:
@@ -163,12 +164,6 @@ def _pinhole(camera: PhotoCamera) -> np.ndarray:
 
     size = camera.width, camera.height
     return cv2.getOptimalNewCameraMatrix(*_opencv(camera), size, alpha=0)[0]
-
-
-def _undistorted(image: np.ndarray, camera: PhotoCamera) -> np.ndarray:
-    import cv2
-
-    return cv2.undistort(image, *_opencv(camera), newCameraMatrix=_pinhole(camera))
 
 
 def _add_to_colmap(

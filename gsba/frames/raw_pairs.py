@@ -9,8 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gsba.camera.calibration import read_calibration, scaled_to_size
-from gsba.camera.fisheye import Pair, Rig
-from gsba.frames.files import decode, image_size, is_image
+from gsba.camera.fisheye import Rig
+from gsba.frames.files import decode, entries_of, image_size, is_image
 from gsba.frames.image_circles import CircleSearch, ImageCircle, find_circle
 from gsba.frames.lens_names import FUSION_NAMES, LENS_NAMES, LensNames
 from gsba.frames.lens_overlap import measure_overlap, scaled
@@ -204,7 +204,11 @@ def lenses_of(
 def _calibrated(
     folder: Path, chosen: Sequence[Sequence[Path]], size: tuple[int, int], calibration: Path
 ) -> tuple[Rig, bool]:
-    """Lenses of a calibration, of a pair checked by the pictures."""
+    """Lenses of a calibration; a pair that pictures contradict is rescaled, and True (to estimate).
+
+    Args:
+        chosen: files of some frames, as for `decode_pair`.
+    """
     known, num = scaled_to_size(read_calibration(calibration), size, calibration), len(chosen[0])
     if len(known) != num:
         raise GsbaError(
@@ -212,17 +216,7 @@ def _calibrated(
         )
     if num > 2:
         return known, False
-    return _checked_calibration(folder, (known[0], known[-1]), chosen, size, calibration)
-
-
-def _checked_calibration(
-    folder: Path,
-    pair: Pair,
-    chosen: Sequence[Sequence[Path]],
-    size: tuple[int, int],
-    calibration: Path,
-) -> tuple[Pair, bool]:
-    """Calibrated lenses; if pictures contradict them, rescaled ones and True (to estimate)."""
+    pair = known[0], known[-1]
     try:
         looks = [decode_pair(paths, size, gray=True) for paths in chosen]
     except GsbaError:  # the error is raised when the picture is used
@@ -283,12 +277,7 @@ def _found_circles(
 
 def _images_in(folder: Path) -> list[Path]:
     """Images in a folder, in name order; none if it is no folder."""
-    if not folder.is_dir():
-        return []
-    try:
-        return [path for path in sorted(folder.iterdir()) if is_image(path)]
-    except OSError as error:
-        raise GsbaError(f"{folder}: cannot be read ({error.strerror})") from None
+    return list(filter(is_image, entries_of(folder))) if folder.is_dir() else []
 
 
 def _by_frame(folder: Path, images: Iterable[Path]) -> dict[str, Path]:

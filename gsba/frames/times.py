@@ -151,7 +151,12 @@ def frame_times(
     if table is not None:
         rows = read_times(table)
         if rows[0].name is None:
-            return _times_from_list(names, table, rows), True
+            if len(rows) != len(names):
+                raise GsbaError(
+                    f"{table}: {len(rows)} times for {len(names)} frames; give one a frame in name "
+                    "order, or name,timestamp rows"
+                )
+            return np.array([row.timestamp for row in rows]), True
         return _times_by_name(names, table, rows), True
     try:
         if fps is not None:
@@ -180,15 +185,6 @@ def check_fps(fps: float) -> float:
             f"{_FPS_RANGE[0]:g} to {_FPS_RANGE[1]:g}"
         )
     return fps
-
-
-def _times_from_list(names: Sequence[str], path: Path, rows: list[TimeRow]) -> np.ndarray:
-    if len(rows) != len(names):
-        raise GsbaError(
-            f"{path}: {len(rows)} times for {len(names)} frames; give one a frame in name order, "
-            "or name,timestamp rows"
-        )
-    return np.array([row.timestamp for row in rows])
 
 
 def _times_by_name(names: Sequence[str], path: Path, rows: list[TimeRow]) -> np.ndarray:

@@ -264,7 +264,9 @@ def _merge(
                 found = part(f)
                 if found is not None:
                     weights = weights * _fit(found, weights.shape[1])
-            _write_if_new(path, levels_of(weights))
+            encoded = cv2.imencode(".png", levels_of(weights))[1].tobytes()
+            if not (path.exists() and path.read_bytes() == encoded):
+                write_bytes(path, encoded)
             masked += not weights.all()
         return Counts(len(paths), masked, "masks", {"nothing masked": len(paths) - masked})
 
@@ -287,12 +289,6 @@ def _fit(weights: np.ndarray, width: int) -> np.ndarray:
     size = (width, width // 2)
     values, inside = (cv2.resize(part, size) for part in (values, (values > 0).astype(np.float32)))
     return np.where(inside > 0.5, values / np.maximum(inside, 0.5), 0)
-
-
-def _write_if_new(path: Path, levels: np.ndarray) -> None:
-    encoded = cv2.imencode(".png", levels)[1].tobytes()
-    if not (path.exists() and path.read_bytes() == encoded):
-        write_bytes(path, encoded)
 
 
 def _write_check(path: Path, frames: FrameSet, shares: np.ndarray) -> None:

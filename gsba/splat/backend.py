@@ -3,7 +3,7 @@
 import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -29,15 +29,24 @@ class Lesson:
     number: int  # of the step, from 1
 
 
+if TYPE_CHECKING:
+    from gsba.splat.gpu import GsplatBackend
+
 logger = logging.getLogger(__name__)
 
+Backend: TypeAlias = "CpuBackend | GsplatBackend"  # renders splats, and trains them on images
 
-class Backend(Protocol):
-    """Renders splats, and trains them on images."""
 
-    name: str
-    stretch: int  # steps that are most efficient in one call of `descend`
+class CpuBackend:
+    """The rasteriser of `gsba.splat.rasterise`: deterministic, on any machine."""
+
+    name = "cpu"
+    stretch = 1  # steps that are most efficient in one call of `descend`
     memory_bytes: int  # of the device, all of it
+
+    def __init__(self, num_threads: int | None = None) -> None:
+        self.num_threads = num_threads
+        self.memory_bytes = total_memory_bytes()
 
     def render(
         self,
@@ -47,7 +56,7 @@ class Backend(Protocol):
         near: float,
     ) -> list[Rendering]:
         """An image for each camera; see `gsba.splat.rasterise.render`."""
-        ...
+        return [render(gaussians, c, sh_degree, near, self.num_threads)[0] for c in cameras]
 
     def descend(
         self,
@@ -68,38 +77,6 @@ class Backend(Protocol):
             near: least z of a Gaussian, map units.
             ssim_weight: see `training_loss`.
         """
-        ...
-
-
-class CpuBackend:
-    """The rasteriser of `gsba.splat.rasterise`: deterministic, on any machine."""
-
-    name, stretch = "cpu", 1
-
-    def __init__(self, num_threads: int | None = None) -> None:
-        self.num_threads = num_threads
-        self.memory_bytes = total_memory_bytes()
-
-    def render(
-        self,
-        gaussians: Gaussians,
-        cameras: Sequence[FaceCamera],
-        sh_degree: int | None,
-        near: float,
-    ) -> list[Rendering]:
-        """See `Backend`."""
-        return [render(gaussians, c, sh_degree, near, self.num_threads)[0] for c in cameras]
-
-    def descend(
-        self,
-        gaussians: Gaussians,
-        moments: adam.Moments,
-        pull: Pull | None,
-        lessons: Iterable[Lesson],
-        near: float,
-        ssim_weight: float,
-    ) -> None:
-        """See `Backend`."""
         for lesson in lessons:
             found = self.gradients(gaussians, lesson, near, ssim_weight)
             adam.step(gaussians, found.gaussians, moments, lesson.rates, lesson.number)

@@ -65,7 +65,7 @@ class GsplatBackend:
         sh_degree: int | None,
         near: float,
     ) -> list[Rendering]:
-        """See `gsba.splat.backend.Backend`; all cameras of one size are one batch."""
+        """See `gsba.splat.backend.CpuBackend`; all cameras of one size are one batch."""
         degree, renderings = gaussians.usable_degree(sh_degree), {}
         with self._within_memory(gaussians), self._torch.no_grad():
             parameters = self._upload(gaussians)
@@ -88,7 +88,7 @@ class GsplatBackend:
         near: float,
         ssim_weight: float,
     ) -> None:
-        """See `gsba.splat.backend.Backend`."""
+        """See `gsba.splat.backend.CpuBackend`."""
         torch = self._torch
         with self._within_memory(gaussians):
             values, first, second = (

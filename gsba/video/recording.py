@@ -5,8 +5,8 @@ Raw recordings of two fisheyes are one file with a track for each lens, two file
 side, perhaps squeezed to 16:9. These layouts follow public descriptions (OpenSpeleo/insta360-rs,
 docs/INSV_FORMAT.md; insta.pk360.de on file types); they were tested on two real files, one of them
 black. The first track, `_00_` and the left circle are taken for the front lens; images keep the
-rotation in which the camera stores them. GoPro's `.360` holds two tracks of a cube map, see
-`gsba.video.recording`.
+rotation in which the camera stores them. GoPro's `.360` holds two tracks of a cube map, told by
+their size: streams 0 and 5 of videos, 0 and 4 of time lapses.
 """
 
 import itertools

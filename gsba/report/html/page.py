@@ -123,7 +123,7 @@ def _frames(
     moved, turned = figures.displacements(coarse, reconstruction)
     return {
         "name": frames.names,
-        "recording": _recordings(frames),
+        "recording": frames.recording_of_frame,
         "time": frames.timestamps,
         "source": coarse.sources,
         "status": reconstruction.pose_statuses,
@@ -134,14 +134,6 @@ def _frames(
         "std_deg": np.linalg.norm(quality.std_rotations_deg, axis=1),
         "std": np.linalg.norm(quality.std_translations, axis=1),
     }
-
-
-def _recordings(frames: FrameSet) -> np.ndarray:
-    """Number (F,) of each frame's recording, from 0."""
-    numbers = np.zeros(len(frames), np.int64)
-    for number, rows in enumerate(frames.recordings.values()):
-        numbers[rows] = number
-    return numbers
 
 
 def _worst(frames: FrameSet, reconstruction: Reconstruction) -> list[dict[str, Any]]:
