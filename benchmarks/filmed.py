@@ -1,14 +1,14 @@
 """Errors by what a camera does to pixels: each effect alone, none, and all together.
 
-    python benchmarks/filmed.py --out WORK [--scenes gallery flat] [--seeds 0 1] \
+    python benchmarks/filmed.py --out WORK [--scenes gallery passage] [--seeds 0 1] \
         [--effects ideal each all] [--peer] [--markdown FILE]
 
 Walks through scenes of `gsba demo` are filmed by the camera of `filmed_camera.py`, with the motion
 of real hands where that recording is on the machine. `ideal` has no effect, `each` stands for every
-effect alone, `all` for all of them, `a+b` for these two, and `all-a` for all but one. Each film is refined from a trajectory
-with drift and without any, and with `--peer` by COLMAP's panorama mode. Films and rows are kept in
-WORK and used again while the code and the film stay the same. Errors are root mean squares, except
-the induced pixel error (median, of neighbouring frames).
+effect alone, `all` for all of them, `a+b` for these two, and `all-a` for all but one. Each film is
+refined from a trajectory with drift and without any, and with `--peer` by COLMAP's panorama mode.
+Films and rows are kept in WORK and used again while the code and the film stay the same. Errors are
+root mean squares, except the induced pixel error (median, of neighbouring frames).
 """
 
 import argparse

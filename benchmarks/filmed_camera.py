@@ -21,15 +21,14 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from gsba.camera.sphere import bearings_from_erp
-from gsba.demo.gait import KNOTS, STEPS_HZ, SWING_DEG, SWING_UNITS
 from gsba.demo.raycast import Scene, ranges
 from gsba.demo.render import EXPOSURE, Eye, render_eye
-from gsba.demo.two_lenses import SWEEP, TwoLenses
+from gsba.demo.two_lenses import KNOTS, STEPS_HZ, SWEEP, SWING_DEG, SWING_UNITS, TwoLenses
 from gsba.demo.walk import JPEG_QUALITY, NOISE
 from gsba.geometry import pose
 from gsba.types import Trajectory
 
-HAND_MOTION = Path("/work/shared/data/real/hand_motion/floor_2_2025-10-28_run_2.txt")
+HAND_MOTION = Path("../shared/data/real/hand_motion/floor_2_2025-10-28_run_2.txt")
 EFFECTS = {
     "lenses": "lenses 32 mm apart, stitched at infinity, whatever the depth is",
     "rows": "rows read one after another, 12 ms a frame",

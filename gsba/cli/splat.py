@@ -6,13 +6,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gsba.cli.app import command
+from gsba.cli.app import Run, command
 from gsba.log import GsbaError
 
 if TYPE_CHECKING:
     from gsba.config import SplatSettings
 
-Run = Annotated[Path, typer.Argument(help="Folder of a finished run.", metavar="RUN")]
 Iterations = Annotated[int | None, typer.Option(help="Training steps of one view each.")]
 FaceSize = Annotated[int | None, typer.Option(help="Width of a cube face in pixels.")]
 LpipsWeights = Annotated[

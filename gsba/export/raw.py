@@ -54,8 +54,7 @@ class RawPictures(FrameWriter):
 
 @table(maxsize=4)
 def _circle(lens: Fisheye, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
-    """Mask (h, w) bool of a lens's image, True within SEEN_DEG; and the panorama's pixel that
-    each pixel shows, (h, w) int32, counted row by row."""
+    """Mask (h, w) bool of what a lens sees within SEEN_DEG; the panorama's pixel, (h, w) int32."""
     seen = np.empty((lens.height, lens.width), bool)
     pixels = np.empty((lens.height, lens.width), np.int32)
     for top in range(0, lens.height, _ROWS_AT_ONCE):
