@@ -167,7 +167,7 @@ class Camera:
                 samples = BLUR_SAMPLES if k == bursts - 1 else 2
                 recorded = [self.record(at, side, f, samples) for side in (1.0, -1.0)]
                 views = [look.processed(view, f) for view in recorded]
-                burst.append(self._stitched(*views, at, rng))
+                burst.append(self._stitched(views[0], views[1], at, rng))
             yield burst
 
     def record(self, time: float, facing: float, f: int, samples: int) -> View:

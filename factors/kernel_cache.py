@@ -204,7 +204,7 @@ def versions() -> tuple[str, ...]:
 
 
 def _load(path: Path, target_context: Any) -> CompileResult | None:
-    """A kernel from its file; None if there is none, or it is damaged."""
+    """A kernel from its file; None if there is none, or this version cannot use it."""
     try:
         content = path.read_bytes()
     except FileNotFoundError:
@@ -218,7 +218,11 @@ def _load(path: Path, target_context: Any) -> CompileResult | None:
     checksum, payload = content[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
     if hashlib.sha256(payload).digest() != checksum:
         return None
-    return CompileResult._rebuild(target_context, *pickle.loads(payload))
+    try:
+        parts = pickle.loads(payload)
+    except (ImportError, AttributeError):  # it takes records that another version has elsewhere
+        return None
+    return CompileResult._rebuild(target_context, *parts)
 
 
 def _lock(path: Path, *, wait: bool = True) -> Any:

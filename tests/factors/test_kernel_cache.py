@@ -1,5 +1,6 @@
 """Compiled kernels on disk: what renews them, who shares them, and folders that cannot be used."""
 
+import hashlib
 import os
 import platform
 import subprocess
@@ -99,7 +100,7 @@ def test_kernels_for_another_processor_are_kept_apart(package: Path, tmp_path: P
     assert len(list((cache / "gsba").iterdir())) == 2
 
 
-@pytest.mark.parametrize("damage", ["cut", "flipped", "empty"])
+@pytest.mark.parametrize("damage", ["cut", "flipped", "empty", "elsewhere"])
 def test_a_damaged_kernel_is_compiled_anew(package: Path, tmp_path: Path, damage: str) -> None:
     cache = tmp_path / "cache"
     start(package, cache)
@@ -107,7 +108,10 @@ def test_a_damaged_kernel_is_compiled_anew(package: Path, tmp_path: Path, damage
     content = file.read_bytes()
     middle = len(content) // 2
     flipped = content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :]
-    file.write_bytes({"cut": content[:middle], "flipped": flipped, "empty": b""}[damage])
+    moved = b"cno_such_module\nRecord\n."  # pickled: a type of a module of another version
+    elsewhere = hashlib.sha256(moved).digest() + moved
+    contents = {"cut": content[:middle], "flipped": flipped, "empty": b"", "elsewhere": elsewhere}
+    file.write_bytes(contents[damage])
     told = start(package, cache)
     assert told.stdout.split() == ["6.0", "scaled", "twice"]
     assert told.stderr.count("\n") == 1 and "compiling kernels" in told.stderr
