@@ -22,10 +22,9 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from gsba.camera.sphere import bearings_from_erp
-from gsba.demo.gait import KNOTS, STEPS_HZ, SWING_DEG, SWING_UNITS
 from gsba.demo.raycast import Scene, ranges
 from gsba.demo.render import EXPOSURE, Eye, render_eye
-from gsba.demo.two_lenses import SWEEP, TwoLenses
+from gsba.demo.two_lenses import KNOTS, STEPS_HZ, SWEEP, SWING_DEG, SWING_UNITS, TwoLenses
 from gsba.demo.walk import JPEG_QUALITY, NOISE, write_depth
 from gsba.disk import write_image
 from gsba.geometry import pose

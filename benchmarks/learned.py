@@ -3,7 +3,7 @@
     python benchmarks/learned.py OUT.md PANORAMA [PANORAMA ...] [--size 384] [--extractors sift,...]
 
 Of mutual nearest neighbours of a panorama and the same one turned, the rotation tells which are
-true. Medians and quantiles of these give `gsba.features.extractor_traits.TRAITS`. Weights come from
+true. Medians and quantiles of these give `gsba.features.detection.TRAITS`. Weights come from
 the packages of the extra `weights`; a name such as aliked-n32.pth chooses a model.
 """
 

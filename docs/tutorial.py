@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from pictures import write
 
-from gsba.demo.film import make_film
+from gsba.demo.walk import make_film
 from gsba.evaluate import charts
 from gsba.frames.pixels import load_erp
 from gsba.report.html.figures import viewing_axes

@@ -494,7 +494,7 @@ def draw_run(obs, visits, points, poses, U, roots, seed, out):
     `invert_symmetric` counts as an observation of the landmark.
 
     Args:
-        U (V, 3, 6): see `factors._schur_kernels.project_visits`.
+        U (V, 3, 6): see `factors.schur_complement.project_visits`.
         roots (L, 6): see `linearize_range`.
         seed: uint64.
     """

@@ -7,9 +7,37 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from scipy.sparse import csr_matrix
 
-from factors._sorting_kernels import frame_spans, sort_by_owner
+from factors.compiled import kernel_and_part
 from factors.landmark_residual import LandmarkResidual
 from factors.robust import RobustLoss
+
+_kernel, _ = kernel_and_part()
+
+
+@_kernel
+def frame_spans(frames, owners, first, last):
+    """Lower `first` and raise `last` (J,) to the frames that observe each landmark."""
+    for o in range(len(frames)):
+        first[owners[o]] = min(first[owners[o]], frames[o])
+        last[owners[o]] = max(last[owners[o]], frames[o])
+
+
+@_kernel
+def sort_by_owner(frames, owners, offsets, ends, order):
+    """Rows of observations by landmark, then frame, then row.
+
+    Landmark j gets order[offsets[j]:offsets[j + 1]]; `ends` (J,) begins as offsets[:-1]. Time is
+    linear where the frames of a landmark ascend already.
+    """
+    for o in range(len(frames)):
+        j = owners[o]
+        at = ends[j]
+        while at > offsets[j] and frames[order[at - 1]] > frames[o]:
+            order[at] = order[at - 1]
+            at -= 1
+        order[at] = o
+        ends[j] += 1
+
 
 BEARING, REPROJECTION, GIVEN = 0, 1, 2  # kinds of measurement; from GIVEN on one for each residual
 # that others wrote
@@ -131,7 +159,10 @@ def sort_observations(
         families=families[order],
         measurements=ordered(_measurements(terms)),
         whiteners=ordered(term.whiteners() for term in terms),
-        origins=ordered(_origins(term) for term in terms),
+        origins=ordered(
+            np.zeros((len(term.frames), 3)) if term.origins_rig is None else term.origins_rig
+            for term in terms
+        ),
         cameras=np.concatenate([np.zeros((0, 12)), *(term.cameras() for term in terms)]),
         functions=np.array(given, dtype=np.int64) if given else None,
         loss=loss.code,
@@ -149,17 +180,11 @@ def _measurements(terms: Sequence[Term]) -> Iterator[np.ndarray]:
         num_cameras += own
 
 
-def _origins(term: Term) -> np.ndarray:
-    """Origins of a term's rays; zero in the rig's own centre."""
-    return np.zeros((len(term.frames), 3)) if term.origins_rig is None else term.origins_rig
-
-
 def visits_of(offsets: np.ndarray, frames: np.ndarray, num_frames: int, most: int) -> list[Visits]:
     """Visits of observations sorted by landmark, then frame, cut into runs of landmarks.
 
     Args:
         offsets (J + 1,), frames (O,): observations by landmark.
-        num_frames: F.
         most: limit on a run's visits, exceeded by its last landmark only.
     """
     owners = np.repeat(np.arange(len(offsets) - 1, dtype=np.int32), np.diff(offsets))

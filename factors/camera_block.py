@@ -51,8 +51,6 @@ class CameraBlock:
         """Fix the pattern.
 
         Args:
-            camera: variables, and what they act on.
-            sightings: observations; see `sightings_of`.
             points_world: (J, 3) start values, world.
             loss: robust loss on each whitened residual norm; None is plain least squares.
             polish_steps: Gauss-Newton steps on the landmarks after each proposed step.
@@ -215,12 +213,7 @@ class CameraBlock:
 
 
 def _pairs(num: int, kinds: int, shared: int, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Rows of keys that share a residual (P, 2), in the order of `CameraBlock._in_blocks`.
-
-    Args:
-        num: F.
-        rows, columns: covisible frame pairs.
-    """
+    """Rows of keys that share a residual (P, 2), in the order of `CameraBlock._in_blocks`."""
     own, common = np.arange(kinds), kinds * num + np.arange(shared)
     upper, above = np.triu_indices(kinds, 1), np.triu_indices(shared, 1)
     first = kinds * np.arange(num)[:, None]

@@ -14,8 +14,6 @@ def jacobian_errors(
     are no part of a residual's derivative.
 
     Args:
-        factor: any nonlinear factor with a Gaussian noise model.
-        values: values of all its keys, at which it is checked.
         step: of the differences, in each variable's tangent space.
 
     Returns:

@@ -22,10 +22,7 @@ def _nothing() -> np.ndarray:
 
 @dataclass(slots=True)
 class _Front:
-    """A run of columns with the rows below it: places of its entries, and its part of the factor.
-
-    Local places are block indices: columns first, then rows.
-    """
+    """A run of columns with the rows below it: local block indices of entries, and its factor."""
 
     first: int  # column
     width: int  # W columns
@@ -65,7 +62,6 @@ class BlockCholesky:
         """Choose an elimination order (minimum degree) and find the fill.
 
         Args:
-            num_blocks: N block rows.
             pairs: (P, 2) int, i < j, distinct: where off-diagonal blocks may be nonzero.
             num_kept: K blocks, the last ones, that are not eliminated: `factorize` then leaves
                 their Schur complement, and `reduced` and `substituted` replace `solve`.

@@ -1,18 +1,94 @@
 """The reduced camera system by conjugate gradients, without assembling it."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import gtsam
 import numpy as np
 
 from factors._terms import pose_rows
 from factors.block import Products
-from factors.coarse_preconditioner import Coarse, Held, coarse_system
-from factors.conjugate_gradients import conjugate_gradients, multiply_blocks
-from factors.pose_clusters import covisible_groups
+from factors.cholesky import DIM
+from factors.coarse_preconditioner import Coarse, Held, coarse_system, covisible_groups
+from factors.compiled import kernel_and_part
 from factors.reduced_camera_system import STEP_TOLERANCE, ReducedSystem
 from factors.schur_complement import group_visits
 from factors.system_layout import SystemLayout
+
+_kernel, _ = kernel_and_part()
+
+
+def conjugate_gradients(
+    multiply: Callable[[np.ndarray], np.ndarray],
+    right: np.ndarray,
+    precondition: Callable[[np.ndarray], np.ndarray],
+    tolerance: float,
+    max_iterations: int,
+    truncate: bool = False,
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Solve H x = right for several right sides at once. Hestenes and Stiefel, 1952.
+
+    Args:
+        multiply: H applied to (N, 6, R), symmetric positive definite.
+        right: (N, 6, R).
+        precondition: approximate H^-1 applied to (N, 6, R), symmetric positive definite.
+        tolerance: of each residual in the preconditioner's norm, relative to x = 0.
+        truncate: return the last iterate even if the tolerance is not reached.
+
+    Returns:
+        x (N, 6, R) and the residual right - H x; None if the tolerance is not reached, or if H is
+        not positive definite.
+    """
+    x, residual = np.zeros_like(right), right.copy()
+    better = precondition(residual)
+    direction = better.copy()
+    squared = _products(residual, better)
+    enough = tolerance**2 * squared
+    if not np.all(squared > 0):  # also where it is not a number
+        return (x, residual) if not np.any(right) else None
+    for _ in range(max_iterations):
+        product = multiply(direction)
+        curvature = _products(direction, product)
+        if not np.all(curvature > 0):
+            return None
+        step = squared / curvature
+        x += step * direction
+        residual -= step * product
+        better = precondition(residual)
+        before, squared = squared, _products(residual, better)
+        if np.all(squared <= enough):
+            return x, residual
+        direction *= squared / before
+        direction += better
+    return (x, residual) if truncate else None
+
+
+def _products(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Inner products (R,) of two sets of R vectors."""
+    return np.einsum("nir,nir->r", a, b)
+
+
+@_kernel
+def multiply_blocks(diagonal, off_diagonal, pairs, x):
+    """H x of blocks H[i, i] (N, 6, 6) and H[i, j] (P, 6, 6) of pairs (P, 2), i < j; x (N, 6, R)."""
+    out = np.zeros_like(x)
+    for s in range(x.shape[2]):
+        for n in range(len(diagonal)):
+            for r in range(DIM):
+                total = 0.0
+                for c in range(DIM):
+                    total += diagonal[n, r, c] * x[n, c, s]
+                out[n, r, s] = total
+        for p in range(len(pairs)):
+            i, j, block = pairs[p, 0], pairs[p, 1], off_diagonal[p]
+            xi, xj, yi, yj = x[i], x[j], out[i], out[j]
+            for r in range(DIM):
+                total, a = 0.0, xi[r, s]
+                for c in range(DIM):
+                    total += block[r, c] * xj[c, s]
+                    yj[c, s] += block[r, c] * a
+                yi[r, s] += total
+    return out
+
 
 _NATIVE_FACTOR_WEIGHT = 1e-3  # landmarks that a native factor counts for when groups are formed
 _MAX_ITERATIONS = 300  # largest number of conjugate-gradient iterations; ten or twenty suffice
@@ -31,7 +107,6 @@ class IterativeSystem(ReducedSystem):
         """Form groups of covisible frames, and the visits of landmarks by groups.
 
         Args:
-            layout: of the system.
             products: of those of the layout's blocks, by index, that are not written out.
         """
         super().__init__(layout, products)
@@ -101,10 +176,7 @@ class IterativeSystem(ReducedSystem):
         max_iterations: int = _MAX_ITERATIONS,
         truncate: bool = False,
     ) -> tuple[np.ndarray, np.ndarray] | None:
-        """Solutions (N, 6, R) with `added (N, 6)` on the diagonal, and the residuals of `right`.
-
-        None if they take too many iterations, or the groups' system is singular.
-        """
+        """Solutions (N, 6, R) with `added` (N, 6) on the diagonal, residuals; None = unsolved."""
         diagonal, written = self._diagonal.copy(), self._written.copy()
         for blocks in (diagonal, written):
             np.einsum("nii->ni", blocks)[:] += added
@@ -147,8 +219,7 @@ class IterativeSystem(ReducedSystem):
     def _drawn(
         self, added: np.ndarray, num_draws: int, rng: np.random.Generator
     ) -> np.ndarray | None:
-        """Vectors (D, N, 6) of covariance (H + added)^-1: that inverse times J^T e, e of all
-        factors."""
+        """Draws (D, N, 6) of covariance (H + added)^-1: the inverse times J^T e of all factors."""
         layout, draws, self._coarse = self._layout, [], None
         for _ in range(0, max(num_draws, _MIN_DRAWS), _DRAWS_AT_ONCE):
             right = np.sqrt(added)[..., None] * rng.normal(size=(*added.shape, _DRAWS_AT_ONCE))

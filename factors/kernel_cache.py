@@ -80,7 +80,17 @@ class KernelCache(_Cache):
         """Keep a compiled form, and let other processes go on."""
         try:
             if not data.library.has_dynamic_globals:
-                _save(self._path(sig, data.codegen), dumps(data._reduce()))
+                path = self._path(sig, data.codegen)
+                payload = dumps(data._reduce())
+                unfinished = path.with_suffix(f".{uuid.uuid4().hex}.tmp")
+                try:
+                    unfinished.write_bytes(hashlib.sha256(payload).digest() + payload)
+                    unfinished.replace(path)
+                    _remove_unused(path.parent)
+                except OSError as error:
+                    _tell_trouble(error.strerror or str(error))
+                    with contextlib.suppress(OSError):
+                        unfinished.unlink()
         finally:
             self.release()
 
@@ -175,8 +185,7 @@ def _codes(code: CodeType) -> Iterator[CodeType]:
 
 
 def _code_text(code: CodeType) -> str:
-    """Byte code, constants and names of a code object: they change with docstrings, but not with
-    comments or line numbers."""
+    """Byte code, constants and names of a code object, docstrings included."""
     constants = [_text(each) for each in code.co_consts if not isinstance(each, CodeType)]
     return f"{code.co_code.hex()} {constants} {code.co_names} {code.co_varnames}"
 
@@ -219,22 +228,8 @@ def _load(path: Path, target_context: Any) -> CompileResult | None:
     return CompileResult._rebuild(target_context, *parts)
 
 
-def _save(path: Path, payload: bytes) -> None:
-    """Write a kernel's file at once, or not at all."""
-    unfinished = path.with_suffix(f".{uuid.uuid4().hex}.tmp")
-    try:
-        unfinished.write_bytes(hashlib.sha256(payload).digest() + payload)
-        unfinished.replace(path)
-        _remove_unused(path.parent)
-    except OSError as error:
-        _tell_trouble(error.strerror or str(error))
-        with contextlib.suppress(OSError):
-            unfinished.unlink()
-
-
 def _lock(path: Path, *, wait: bool = True) -> Any:
-    """A locked file, closed to unlock it; None where files cannot be locked, or if another process
-    has locked it and is not waited for."""
+    """A locked file, closed to unlock it; None = unsupported, or another's and not waited for."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         file = path.open("w")

@@ -1,8 +1,5 @@
-"""Residuals of landmarks that others write: one compiled function, called by its address.
-
-The kernels of `LandmarkBlock` hold bearings and reprojections inline. Any other residual is a
-function that these kernels call where they lie, so that landmarks are still eliminated inside.
-"""
+"""Residuals of landmarks that others write: one compiled function, called by its address where
+`LandmarkBlock` holds its own kinds inline, so that landmarks are still eliminated inside."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

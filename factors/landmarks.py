@@ -22,12 +22,11 @@ from factors._observations import (
     sort_observations,
     visits_of,
 )
-from factors._schur_kernels import project_visits
 from factors._terms import pose_rows
 from factors.block import PoseSystem, Products
 from factors.reduced_factor import reduced_factor
 from factors.robust import RobustLoss
-from factors.schur_complement import SchurComplement
+from factors.schur_complement import SchurComplement, project_visits
 from factors.threads import balanced_ranges, map_in_threads, run_in_threads
 
 _POLISH_TOLERANCE = 1e-12  # part of a landmark's cost
@@ -308,7 +307,6 @@ def eliminate_points(
     """Reduced pose system of observations: robust weights, landmarks eliminated.
 
     Args:
-        obs, visits: observations and visits by landmark.
         points: (J, 3) world.
         poses: (F, 12) as in `factors._kernels`.
         row_starts, columns: (F + 1,), (P,) covisible frame pairs i < k as sorted CSR rows.

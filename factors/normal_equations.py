@@ -29,7 +29,8 @@ class NormalEquations:
             for i, (block, rows) in enumerate(zip(layout.blocks, layout.block_rows, strict=True))
             if i not in factored
         ]
-        codes = [self._pair_codes(pairs) for pairs in placed]
+        num = layout.num
+        codes = [p.min(axis=1, initial=num) * num + p.max(axis=1, initial=0) for p in placed]
         self._codes = np.unique(np.concatenate(codes))
         self._pairs = np.column_stack(np.divmod(self._codes, layout.num))
         self._block_slots = [
@@ -72,8 +73,7 @@ class NormalEquations:
         return system.costs
 
     def _gathered(self, parts: Sequence[np.ndarray]) -> np.ndarray:
-        """Off-diagonal blocks (P, 6, 6) of all factors; a single block of factors that has them
-        all, which may be gigabytes, is not copied."""
+        """Off-diagonal blocks (P, 6, 6) of all factors; a single block's own is not copied."""
         if len(parts) == 1:
             slots, flip = self._block_slots[0]
             if np.array_equal(slots, np.arange(len(self._pairs))) and not flip.any():
@@ -82,11 +82,6 @@ class NormalEquations:
         for part, (slots, flip) in zip(parts, self._block_slots, strict=True):
             _add_blocks(out, slots, flip, part)
         return out
-
-    def _pair_codes(self, pairs: np.ndarray) -> np.ndarray:
-        return pairs.min(axis=1, initial=self._layout.num) * self._layout.num + pairs.max(
-            axis=1, initial=0
-        )
 
     def _add_graph(self, values: gtsam.Values) -> None:
         """Add the native and user factors, linearized by GTSAM."""

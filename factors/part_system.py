@@ -49,7 +49,6 @@ class PartElimination:
         """Factorize.
 
         Args:
-            equations: of the part.
             damping: part of the diagonal that is added to it; 0 = none, and own blocks that
                 nothing constrains count as unit ones.
         """

@@ -1,8 +1,5 @@
-"""Patches of a sphere image observed in others: their table, and their pixels gathered.
-
-Frames are processed one at a time: each gives the templates of its own patches and a small window
-around every patch that it shows. Memory grows with observations, never with the images.
-"""
+"""Patches of a sphere image observed in others: their table, and small windows of pixels around
+them, gathered frame by frame: memory grows with observations, never with the images."""
 
 from dataclasses import dataclass, replace
 
@@ -13,7 +10,6 @@ from factors.bearing import tangent_basis
 from factors.sphere_image import SphereImage
 
 PAD = 2  # coefficients beyond the border: the support of the spline
-_MIN_VIEW_COSINE = 0.15  # least cosine between a patch's normal and its viewing ray
 _MAX_ZOOM = 2.0  # largest ratio of a patch's size between host and target, either way
 
 
@@ -190,7 +186,7 @@ def poor_views(
     cosine = np.einsum("oi,oi->o", normals, rays) / length
     return {
         "behind": ~np.all(inverse_depths > 0, axis=0)[owners],
-        "grazing": ~(cosine > _MIN_VIEW_COSINE),
+        "grazing": ~(cosine > 0.15),  # least cosine between a patch's normal and its viewing ray
         "zoom": ~((area < _MAX_ZOOM**2) & (area > _MAX_ZOOM**-2)),
     }
 
@@ -241,7 +237,6 @@ class PatchPixels:
         """Allocate templates; nothing is sampled yet.
 
         Args:
-            table: patches; its frames index the poses.
             world_T_rigs: (F, 4, 4) float64, poses that place the windows.
             width: of the sphere images, pixels.
             margin: pixels of that image at the equator.

@@ -4,8 +4,7 @@ import copy
 
 import numpy as np
 
-from factors._patch_kernels import align_templates, cut_templates
-from factors._patch_records import (
+from factors._patch_kernels import (
     ALIGNED,
     FAR,
     FLAT,
@@ -14,6 +13,8 @@ from factors._patch_records import (
     UNSTEADY,
     Sightings,
     Templates,
+    align_templates,
+    cut_templates,
 )
 from factors.sphere_image import SphereImage
 
@@ -43,7 +44,6 @@ class PatchSet:
         """Allocate templates.
 
         Args:
-            num: number of templates, T.
             size: pixels across a patch, n, odd.
             window: standard deviation of the Gaussian window, in half patches.
             affine_sigma: standard deviation of the affine part's deviation from the prediction.

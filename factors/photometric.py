@@ -54,7 +54,6 @@ class PhotometricBlock:
 
         Args:
             keys: (F,) keys of Pose3 variables.
-            pixels: templates and windows, of all frames that the table names.
             sigmas: (P,) or one, noise of a residual, grey values of a pixel in the host.
             loss: robust loss on the root mean square of a patch's whitened residuals, times the
                 number of its pixels; None is plain least squares.
@@ -109,7 +108,14 @@ class PhotometricBlock:
         """Select the observations that count."""
         self._data.weights[:] = self._weights
         _, errors = self._observe(pose_rows(values, self.keys), self.planes, 0)
-        flags = self._rejections(values, errors)
+        world_T_rigs = np.array([values.atPose3(key).matrix() for key in self.keys])
+        owners = self.table.owners
+        lost = 2 * self._data.scales[owners] ** 2 / len(self.table.grid)
+        flags = {
+            **poor_views(self.table, world_T_rigs, self.planes),
+            "outside its window": errors == lost,
+            "no contrast": self._flat[owners],
+        }
         left = self._weights > 0
         self.dropped = {}
         for reason, flag in flags.items():
@@ -255,17 +261,6 @@ class PhotometricBlock:
 
         return reduced_factor(part.keys, part.pairs, evaluate)
 
-    def _rejections(self, values: gtsam.Values, errors: np.ndarray) -> dict[str, np.ndarray]:
-        """Reason -> observations (O,) bool to leave out, at the current planes."""
-        world_T_rigs = np.array([values.atPose3(key).matrix() for key in self.keys])
-        owners = self.table.owners
-        lost = 2 * self._data.scales[owners] ** 2 / len(self.table.grid)
-        return {
-            **poor_views(self.table, world_T_rigs, self.planes),
-            "outside its window": errors == lost,
-            "no contrast": self._flat[owners],
-        }
-
     def _observe(self, poses: np.ndarray, planes: np.ndarray, dims: int):
         """Models (hessians, gradients) of the observations, and their mean squares (O,)."""
         num_o = len(self.table.targets)
@@ -296,8 +291,7 @@ class PhotometricBlock:
     def _better(
         self, poses: np.ndarray, new: np.ndarray, old: np.ndarray, least: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """The better of two planes for each patch; the old ones are only evaluated above
-        `least`."""
+        """The better of two planes for each patch; old ones are only evaluated above `least`."""
         costs = self._patch_costs(new, self._observe(poses, new, 0)[1])
         worse = ~(costs <= least)
         if np.any(worse):

@@ -49,7 +49,6 @@ def photometric_residuals(
         axes: (3, 3) bearing and tangent axes, see `factors.patch_windows.patch_axes`.
         grid: (N, 2) tangents of the pixels.
         template: (N,) grey values in the host.
-        image: the target's.
         floor: see `normalised`.
         rig_T_host, rig_T_target: (4, 4) of the lens that shows the patch; None = the rig itself.
 

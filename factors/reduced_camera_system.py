@@ -15,7 +15,7 @@ STEP_TOLERANCE = 1e-2  # tolerance of a step by conjugate gradients: the next li
 class ReducedSystem(NormalEquations, ABC):
     """Normal equations and their solver.
 
-    `factors.system_choice.reduced_system` chooses between the solvers `DirectSystem` and
+    `factors.direct_system.reduced_system` chooses between the solvers `DirectSystem` and
     `IterativeSystem`, which differ in how they solve, and in which blocks they write out.
     """
 
@@ -79,8 +79,6 @@ class ReducedSystem(NormalEquations, ABC):
         gauge: its errors are merely enormous.
 
         Args:
-            num_draws: number of draws, D.
-            rng: generator of the draws.
             damping: part of the diagonal that is added to it.
 
         Returns:

@@ -106,7 +106,6 @@ def ReprojectionFactor(
     Args:
         pose_key, point_key: keys of a Pose3 `world_T_rig` and of a Point3.
         pixel: (2,) measured (u, v) on the face, corner origin.
-        face: row of `cameras`.
         noise_model: of dimension 2, pixels, robust or not.
     """
     measured = np.asarray(pixel, dtype=np.float64)[None]

@@ -50,7 +50,6 @@ def harmonics(bearings: np.ndarray, degree: int) -> np.ndarray:
 
     Args:
         bearings: (N, 3) float64, unit.
-        degree: highest degree.
 
     Returns:
         (N, 3, K) float64, by degree, gradients before curls within each; orthonormal over

@@ -4,7 +4,139 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from factors._image_kernels import filter_columns, filter_rows, sample_vectors
+from factors.compiled import kernel_and_part
+
+_POLE = np.sqrt(3.0) - 2.0  # pole of the cubic B-spline's inverse filter
+_NUM_TERMS = 16  # terms of its geometric series: further ones are below float32's resolution
+
+_kernel, _part = kernel_and_part(fastmath={"contract", "reassoc", "nsz"})
+
+
+@_kernel
+def filter_rows(image):
+    """Inverse cubic B-spline filter along each row in place, rows being periodic."""
+    num, length = image.shape
+    pole = np.float32(_POLE)
+    for r in range(num):
+        row = image[r]
+        start, power = np.float32(0.0), np.float32(1.0)
+        for k in range(_NUM_TERMS):
+            start += power * row[-k % length]
+            power *= pole
+        row[0] = np.float32(6.0) * start
+        for k in range(1, length):
+            row[k] = np.float32(6.0) * row[k] + pole * row[k - 1]
+        end, power = np.float32(0.0), -pole
+        for k in range(_NUM_TERMS):
+            end += power * row[(length - 1 + k) % length]
+            power *= pole
+        row[length - 1] = end
+        for k in range(length - 2, -1, -1):
+            row[k] = pole * (row[k + 1] - row[k])
+
+
+@_kernel
+def filter_columns(image):
+    """Inverse cubic B-spline filter along each column in place, columns being periodic."""
+    length = len(image)
+    pole = np.float32(_POLE)
+    ends = np.zeros_like(image[0])
+    power = np.float32(1.0)
+    for k in range(_NUM_TERMS):
+        ends += power * image[-k % length]
+        power *= pole
+    image[0] = np.float32(6.0) * ends
+    for k in range(1, length):
+        for c in range(image.shape[1]):
+            image[k, c] = np.float32(6.0) * image[k, c] + pole * image[k - 1, c]
+    ends[:] = 0.0
+    power = -pole
+    for k in range(_NUM_TERMS):
+        ends += power * image[(length - 1 + k) % length]
+        power *= pole
+    image[length - 1] = ends
+    for k in range(length - 2, -1, -1):
+        for c in range(image.shape[1]):
+            image[k, c] = pole * (image[k + 1, c] - image[k, c])
+
+
+@_part
+def erp_pixel(x, y, z, width, height):
+    """Pixel (u, v) of a vector, u in [0, width]."""
+    u = width * (np.arctan2(x, z) / (2 * np.pi) + 0.5)
+    v = height * (0.5 + np.arctan2(y, np.sqrt(x * x + z * z)) / np.pi)
+    return u, v
+
+
+@_part
+def _weights(t):
+    """Cubic B-spline weights of the four samples around a position t in [0, 1) after the second."""
+    s = np.float32(1.0) - t
+    sixth = np.float32(1.0 / 6.0)
+    w0, w3 = sixth * s * s * s, sixth * t * t * t
+    w1 = np.float32(2.0 / 3.0) - t * t * (np.float32(1.0) - np.float32(0.5) * t)
+    return w0, w1, np.float32(1.0) - w0 - w1 - w3, w3
+
+
+@_part
+def _slopes(t):
+    """Derivatives of `_weights` by t."""
+    s = np.float32(1.0) - t
+    half = np.float32(0.5)
+    d1 = t * (np.float32(1.5) * t - np.float32(2.0))
+    return -half * s * s, d1, half * s * s - d1 - half * t * t, half * t * t
+
+
+@_part
+def _tap(coefficients, row, column):
+    """Coefficient at any row and column, continued across the seam and the poles."""
+    height, width = coefficients.shape
+    if row < 0:
+        row, column = -1 - row, column + width // 2
+    elif row >= height:
+        row, column = 2 * height - 1 - row, column + width // 2
+    return coefficients[row, column % width]
+
+
+@_part
+def sample_gradient(coefficients, u, v):
+    """Value at pixel (u, v) and its derivatives by u and v."""
+    u, v = u - 0.5, v - 0.5
+    column, row = int(np.floor(u)), int(np.floor(v))
+    t, s = np.float32(u - column), np.float32(v - row)
+    a0, a1, a2, a3 = _weights(t)
+    d0, d1, d2, d3 = _slopes(t)
+    b0, b1, b2, b3 = _weights(s)
+    e0, e1, e2, e3 = _slopes(s)
+    value = by_u = by_v = np.float32(0.0)
+    for k in range(4):
+        b = b0 if k == 0 else (b1 if k == 1 else (b2 if k == 2 else b3))
+        e = e0 if k == 0 else (e1 if k == 1 else (e2 if k == 2 else e3))
+        r = row - 1 + k
+        c0, c1 = _tap(coefficients, r, column - 1), _tap(coefficients, r, column)
+        c2, c3 = _tap(coefficients, r, column + 1), _tap(coefficients, r, column + 2)
+        across = a0 * c0 + a1 * c1 + a2 * c2 + a3 * c3
+        value += b * across
+        by_v += e * across
+        by_u += b * (d0 * c0 + d1 * c1 + d2 * c2 + d3 * c3)
+    return value, by_u, by_v
+
+
+@_kernel
+def sample_vectors(coefficients, vectors, values, gradients):
+    """Values (N,) and gradients (N, 3) by the vector, at vectors (N, 3) of any length."""
+    height, width = coefficients.shape
+    for n in range(len(vectors)):
+        x, y, z = vectors[n, 0], vectors[n, 1], vectors[n, 2]
+        u, v = erp_pixel(x, y, z, width, height)
+        value, by_u, by_v = sample_gradient(coefficients, u, v)
+        flat2 = max(x * x + z * z, 1e-18 * y * y)  # at a pole any longitude will do
+        flat, squared = np.sqrt(flat2), flat2 + y * y
+        lon, lat = by_u * width / (2 * np.pi) / flat2, by_v * height / np.pi / squared
+        values[n] = value
+        gradients[n, 0] = lon * z - lat * y * x / flat
+        gradients[n, 1] = lat * flat
+        gradients[n, 2] = -lon * x - lat * y * z / flat
 
 
 @dataclass(frozen=True, slots=True)

@@ -77,7 +77,6 @@ class SplatBlock:
                 overlap by a few pixels for sampling near their edges.
             weights: (F,) of (C, H, W) float or bool, weights of pixels, 0..1: 0 is never
                 sampled; or None.
-            cameras: of the faces.
             render: the splat from a pose; called by `refresh`.
             loss: robust loss on each whitened residual; None is Cauchy at one sigma.
             correlation: number of pixels with a common error, which count as one; 25 made the
@@ -186,8 +185,7 @@ class SplatBlock:
     def _sample(
         self, f: int, view: RenderedView, pose: np.ndarray, with_jacobian: bool
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Captured grey (N,), its Jacobian by the pose (N, 6), and weights (N,), 0 = not
-        visible."""
+        """Captured grey (N,), its Jacobian by the pose (N, 6), and weights (N,), 0 = hidden."""
         num, cameras = len(view.points_world), self._cameras
         rotations, centres = cameras.rig_R_faces, self._centres
         if self._turns is not None:

@@ -30,22 +30,10 @@ def find_supernodes(num: int, pairs: np.ndarray, num_kept: int = 0) -> Supernode
     Ashcraft and Grimes, 1989.
 
     Args:
-        num: N rows.
         pairs: (P, 2) int, i < j, distinct: entries off the diagonal.
         num_kept: K rows, the last ones, that come last in the order, as they are, and are a
             supernode of their own; `pairs` must pair each with each.
     """
-    order, cut = _minimum_degree(num, pairs), num - num_kept
-    if num_kept:
-        order = np.concatenate([order[order < cut], np.arange(cut, num)])
-    order = order[_postorder(_tree(*_upper(num, pairs, order)))]
-    starts, columns = _upper(num, pairs, order)
-    firsts, rows = _fundamental(starts, columns, cut)
-    return Supernodes(order, *_relaxed(firsts, rows, num, cut))
-
-
-def _minimum_degree(num: int, pairs: np.ndarray) -> np.ndarray:
-    """Elimination order (N,) of a symmetric pattern: SuperLU's multiple minimum degree."""
     from scipy.sparse import coo_matrix, identity
     from scipy.sparse.linalg import splu
 
@@ -58,7 +46,13 @@ def _minimum_degree(num: int, pairs: np.ndarray) -> np.ndarray:
         diag_pivot_thresh=0.0,
         options={"SymmetricMode": True},
     )
-    return np.argsort(factor.perm_c)
+    order, cut = np.argsort(factor.perm_c), num - num_kept
+    if num_kept:
+        order = np.concatenate([order[order < cut], np.arange(cut, num)])
+    order = order[_postorder(_tree(*_upper(num, pairs, order)))]
+    starts, columns = _upper(num, pairs, order)
+    firsts, rows = _fundamental(starts, columns, cut)
+    return Supernodes(order, *_relaxed(firsts, rows, num, cut))
 
 
 def _upper(num: int, pairs: np.ndarray, order: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -135,10 +129,7 @@ def _postorder(parents):
 def _fundamental(
     starts: np.ndarray, columns: np.ndarray, cut: int
 ) -> tuple[list[int], list[np.ndarray]]:
-    """First columns of the runs of a postordered pattern, and the rows below each run's end.
-
-    A run starts at column `cut`, whatever is before it.
-    """
+    """First columns of a postordered pattern's runs (one at `cut`), and the rows below each end."""
     num = len(starts) - 1
     firsts: list[int] = []
     rows: list[np.ndarray] = []  # of each run so far; of the last one from its last column on
@@ -164,10 +155,7 @@ def _fundamental(
 def _relaxed(
     firsts: list[int], rows: list[np.ndarray], num: int, cut: int
 ) -> tuple[np.ndarray, tuple[np.ndarray, ...], np.ndarray]:
-    """Starts, rows and parents of runs, small ones absorbed by the next if few zeros arise.
-
-    The run that starts at column `cut` absorbs none.
-    """
+    """Starts, rows and parents of runs, small ones absorbed by the next (not over `cut`)."""
     kept: list[tuple[int, int, np.ndarray, int]] = []  # first, end, rows, zeros
     for first, end, below in zip(firsts, [*firsts[1:], num], rows, strict=True):
         zeros = 0

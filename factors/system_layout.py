@@ -39,9 +39,6 @@ class SystemLayout:
         """Place the variables.
 
         Args:
-            graph: native and user factors.
-            blocks: batched ones.
-            values: of all variables.
             pairs: keys of two variables each, whose joint block `covariances` returns.
             order: keys of variables that come first, in this order; others follow.
 
@@ -67,33 +64,27 @@ class SystemLayout:
             np.array([self.first_block[key] for key in block.keys], dtype=np.int64)
             for block in self.blocks
         ]
-        self.padding = self._padded_entries(counts)
-        self.asked = np.array([self.first_block[key] for key in paired], np.int64).reshape(-1, 2)
-        self._set_columns(all_dims)
-        blocks_of = dict(zip(self.keys, counts, strict=True))
-        self.factor_pairs = self._pairs_of([*factor_keys, *map(list, pairs)], blocks_of)
-
-    def _padded_entries(self, counts: list[int]) -> tuple[np.ndarray, np.ndarray]:
-        """(block, coordinate) of the padding entries."""
         pads = [
             (self.first_block[key] + count - 1, coordinate)
             for key, dim, count in zip(self.keys, self.dims, counts, strict=True)
             for coordinate in range(dim - DIM * (count - 1), DIM)
         ]
         table = np.array(pads, dtype=np.int64).reshape(-1, 2)
-        return table[:, 0], table[:, 1]
-
-    def _pairs_of(self, factor_keys: list[list[int]], counts: dict[int, int]) -> np.ndarray:
-        """Pairs (P, 2) of blocks coupled by factors of these keys, ascending."""
+        self.padding = table[:, 0], table[:, 1]
+        self.asked = np.array([self.first_block[key] for key in paired], np.int64).reshape(-1, 2)
+        self._set_columns(all_dims)
+        blocks_of = dict(zip(self.keys, counts, strict=True))
         shared = {
             pair
-            for keys in factor_keys
+            for keys in [*factor_keys, *map(list, pairs)]
             for pair in combinations(
-                sorted(self.first_block[key] + i for key in set(keys) for i in range(counts[key])),
+                sorted(
+                    self.first_block[key] + i for key in set(keys) for i in range(blocks_of[key])
+                ),
                 2,
             )
         }
-        return np.array(sorted(shared), dtype=np.int64).reshape(-1, 2)
+        self.factor_pairs = np.array(sorted(shared), dtype=np.int64).reshape(-1, 2)
 
     def _set_columns(self, dims: dict[int, int]) -> None:
         """Place of each column of the graph's sparse Jacobian (keys in sorted order)."""

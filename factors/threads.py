@@ -1,8 +1,5 @@
-"""Threads, and ranges of landmarks or patches distributed among them.
-
-Work is divided by its size alone, never by the number of threads, and partial sums are added in
-order: results are identical to the last bit for any number of threads.
-"""
+"""Threads, and ranges of landmarks or patches distributed among them by size alone; partial sums
+are added in order, so that results are identical to the last bit for any number of threads."""
 
 import os
 from collections import deque
@@ -16,8 +13,6 @@ import numpy as np
 
 T = TypeVar("T")
 
-_MAX_RUNS = 24  # largest number of runs, as each has sums of its own
-
 
 def balanced_ranges(offsets: np.ndarray, least: int = 8192) -> list[tuple[int, int]]:
     """Runs of owners with about the same number of observations; at least one.
@@ -27,7 +22,7 @@ def balanced_ranges(offsets: np.ndarray, least: int = 8192) -> list[tuple[int, i
         least: least observations of a run.
     """
     total = int(offsets[-1])
-    num = min(max(total // least, 1), _MAX_RUNS)
+    num = min(max(total // least, 1), 24)  # largest number of runs, as each has sums of its own
     targets = np.linspace(0, total, num + 1)[1:-1]
     bounds = np.unique([0, *np.searchsorted(offsets, targets), len(offsets) - 1])
     if len(bounds) < 2:

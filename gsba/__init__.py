@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING, Any
 from gsba.version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from gsba.bundle.families import Family, MapSnapshot
+    from gsba.bundle.families import Family, MapSnapshot, PointObservations
     from gsba.bundle.optimizer import optimize
-    from gsba.bundle.point_observations import PointObservations
     from gsba.bundle.pose_variables import X
     from gsba.config import RefineSettings
     from gsba.config_file import load_config
@@ -54,7 +53,7 @@ _HOMES = {
     "LocalizedFrame": "gsba.localization.localizer",
     "Localizer": "gsba.localization.localizer",
     "MapSnapshot": "gsba.bundle.families",
-    "PointObservations": "gsba.bundle.point_observations",
+    "PointObservations": "gsba.bundle.families",
     "Recording": "gsba.pipeline.recordings",
     "RefineSettings": "gsba.config",
     "RunResult": "gsba.pipeline.outputs",

@@ -10,9 +10,8 @@ from gsba.bundle import adjustment, triangulation
 from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.bearings import Bearings
 from gsba.bundle.camera_adjustment import solve_with_camera
-from gsba.bundle.camera_estimates import CameraEstimates
 from gsba.bundle.families import Families
-from gsba.bundle.readout import CameraEstimate
+from gsba.bundle.readout import CameraEstimate, CameraEstimates
 from gsba.bundle.trajectory_prior import TrajectoryPrior
 from gsba.camera.cameras import Cameras
 from gsba.camera.lens import Lenses

@@ -7,7 +7,7 @@ import numpy as np
 
 from gsba import optimize
 from gsba.bundle.pose_variables import poses_of, values_of
-from gsba.camera.optics import ONE_EYE, Optics
+from gsba.camera.views import ONE_EYE, Optics
 from gsba.config import SolverSettings
 from gsba.splat.alignment import capture, splat_block
 from gsba.splat.backend import Backend

@@ -87,7 +87,8 @@ def plan(root: Path, folder: str, files: Sequence[Any]) -> list[dict[str, Any]]:
     """
     target, found, promised = _target(root, folder), [], dict[Path, Drop]()
     on_their_way = cache(lambda where: unfinished(where) if where.is_dir() else [])
-    free = shutil.disk_usage(_existing(target)).free - _SPARE
+    existing = next(each for each in (target, *target.parents) if each.is_dir())
+    free = shutil.disk_usage(existing).free - _SPARE
     for one in files:
         try:
             drop, renamed = _placed(root, target, one, promised, on_their_way)
@@ -238,15 +239,7 @@ def _placed(
     promised: dict[Path, Drop],
     on_their_way: Callable[[Path], list[dict[str, Any]]],
 ) -> tuple[Drop, bool]:
-    """A dropped file under the first name that is free, or that it has already; True if that is not
-    its own name.
-
-    Args:
-        root, target: folder of the page, and where files are dropped.
-        one: name, size and time of change.
-        promised: files of the same plan, by path.
-        on_their_way: `unfinished` of a folder.
-    """
+    """A dropped file under its name or the first free one; True if that is not its own name."""
     try:
         name, size, modified = str(one["name"]), int(one["size"]), int(one["modified"])
     except (KeyError, TypeError, ValueError):
@@ -269,11 +262,7 @@ def _placed(
 
 
 def _target(root: Path, folder: str) -> Path:
-    """Folder of a drop below the root.
-
-    Raises:
-        GsbaError: it leads out of the root, or into a run.
-    """
+    """Folder of a drop below the root."""
     path, base = inside(root, folder), root.resolve()
     for each in (path, *path.parents):
         if is_run_folder(each):
@@ -286,11 +275,7 @@ def _target(root: Path, folder: str) -> Path:
 
 
 def _cleaned(name: str) -> list[str]:
-    """Components of a dropped path that any disk takes: no controls, no hidden or endless names.
-
-    Raises:
-        GsbaError: nothing is left, or there are too many folders.
-    """
+    """Components of a dropped path that any disk takes: no controls, no hidden or endless names."""
     if holds_half_characters(name):
         raise GsbaError("the name of a dropped file holds half characters: rename it")
     parts = []
@@ -329,8 +314,3 @@ def _no_room(drop: Drop, left: int, free: int) -> str:
         f"the disk is full: {drop.name} needs {left / 1e9:.1f} GB more, and {usable:.1f} GB can be "
         f"used: free {missing:.2g} GB, then drop it again{kept}"
     )
-
-
-def _existing(folder: Path) -> Path:
-    """The folder, or the first one above it that exists."""
-    return next(each for each in (folder, *folder.parents) if each.is_dir())

@@ -221,7 +221,8 @@ class Previews:
                 task = self._wanted.popitem()[1]
                 self._now = task.kept
             answer = self._ask(dict(task.values))
-            if task.kind == "facts" and "error" not in answer and _lasts(answer):
+            may_grow = "pip install" in json.dumps(answer)  # a package that is missing today
+            if task.kind == "facts" and "error" not in answer and not may_grow:
                 write_json(task.kept, answer)
             with self._changed:
                 self._results[task.kept], self._now = answer, None
@@ -267,8 +268,3 @@ def _started(root: Path) -> subprocess.Popen[bytes]:
 def _has_preview(path: Path) -> bool:
     """True for videos, images and folders."""
     return path.is_dir() or (path.is_file() and (is_video(path) or is_image(path)))
-
-
-def _lasts(answer: dict[str, Any]) -> bool:
-    """False if a package that is missing today may add facts."""
-    return "pip install" not in json.dumps(answer)

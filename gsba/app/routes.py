@@ -22,7 +22,7 @@ from gsba.app.hub import App
 from gsba.app.jobs import ACTIVE, Command, Job
 from gsba.app.worker import ensure_worker
 from gsba.log import GsbaError
-from gsba.view.guard import allowed
+from gsba.view.server import allowed
 
 _MAX_BODY, _MAX_LOG = 256 * 1024, 64 * 1024  # bytes
 _MAX_ABOUT = 200  # paths of one request

@@ -1,7 +1,7 @@
 """Rounds of triangulation, bundle adjustment and filtering over one set of tracks."""
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol, Self, TypeVar
@@ -11,15 +11,16 @@ import numpy as np
 
 from factors import Block, LandmarkBlock, RobustLoss, Term
 from gsba.bundle import pose_variables, triangulation
-from gsba.bundle.division import DivisibleMap, Division
 from gsba.bundle.families import Families, Family, FamilyTerms
-from gsba.bundle.gyro_turns import GyroTurns
 from gsba.bundle.observation_noise import observation_noise, with_scaled_noise
 from gsba.bundle.optimizer import OptimizeResult, marginal_covariances, optimize
 from gsba.bundle.pose_variables import poses_of, values_of
 from gsba.bundle.reconstruction import MIN_OBSERVATIONS
+from gsba.bundle.tracks import runs
+from gsba.bundle.trajectory_prior import GyroTurns
 from gsba.camera.rig import CubeRig
 from gsba.config import CameraSettings, RefineSettings, SolverSettings
+from gsba.memory import release_mapped_files
 from gsba.types import (
     GyroConstraints,
     JointErrors,
@@ -31,6 +32,49 @@ from gsba.types import (
     Tracks,
 )
 
+_CHUNK = 1 << 17  # observations whose residuals are made at a time: 20 MB
+
+
+@dataclass(frozen=True, slots=True)
+class DivisibleMap:
+    """A map to be adjusted, whose residuals of landmarks are made a few at a time."""
+
+    landmarks: Landmarks
+    terms_of: Callable[[Landmarks], Sequence[Term]]  # terms of `factors` of some of the landmarks
+    graph: gtsam.NonlinearFactorGraph  # of families
+    values: gtsam.Values  # to start from: poses, and variables of families
+    num_frames: int
+    loss: RobustLoss  # of the observations
+
+    @property
+    def num_observations(self) -> int:
+        """Number of observations."""
+        return len(self.landmarks.tracks)
+
+    def chunks(self) -> Iterator[tuple[np.ndarray, Sequence[Term]]]:
+        """Landmarks (J, 3) and their terms, a few of them at a time."""
+        landmarks = self.landmarks
+        for points, _, own in runs(landmarks.tracks, _CHUNK):
+            some = Landmarks(landmarks.points_world[points], own, landmarks.counts)
+            yield some.points_world, self.terms_of(some)
+            release_mapped_files()
+
+
+class Division(Protocol):
+    """Adjusts maps in parts."""
+
+    def minimized(self, map_: DivisibleMap, settings: SolverSettings) -> OptimizeResult | None:
+        """The result of `gsba.bundle.optimizer.optimize`; None = the map is not to be divided."""
+        ...
+
+    def covariances(
+        self, map_: DivisibleMap, num_draws: int, seed: int
+    ) -> tuple[np.ndarray, JointErrors] | None:
+        """The result of `gsba.bundle.optimizer.marginal_covariances` for all poses; None = the map
+        is not to be divided."""
+        ...
+
+
 GATE_SCALE = 10.0  # gates wider than so many standard deviations widen the loss in proportion
 _TOLERANCE = 3e-4  # relative decrease of the cost that ends a round, but the run's last one
 _MIN_SUPPORT = 0.99  # share of the inliers that a round must keep, or it is undone
@@ -39,7 +83,6 @@ _MIN_NOISE = 0.5  # floor of the estimated noise, in feature sigmas
 logger = logging.getLogger(__name__)
 
 _MIN_NOISE_RATIO = 1e-3  # least noise of an observation over its claimed sigma
-_UNKNOWN_NOISE_GATE = 20.0  # gate in sigmas for observations whose noise is not known yet
 DRAWS = 500  # errors drawn of all poses, from which joint covariances are computed
 _DRIFT_DAMPING, _DRIFT_TOLERANCE = 1e-9, 1e-7  # first damping and relative tolerance of adjustments
 # with a family that limits drift
@@ -60,7 +103,8 @@ class Terms:
         """The best values, in parts where the context divides the map; see `optimizer.optimize`."""
         blocks, observed = self.blocks, self.observed
         if observed is not None:
-            found = observed.minimized_in_parts(self, settings)
+            division, map_ = observed.context.division, observed._divisible(self)
+            found = division.minimized(map_, settings) if division and map_ else None
             if found is not None:
                 return found
             blocks = (observed.block(), *blocks)
@@ -113,7 +157,6 @@ class AdjustmentContext:
         """Terms for covariances: the first pose and the extent of each map are held fixed.
 
         Args:
-            solved: poses, and own variables of families.
             maps: (F,) map of each frame; None = there is one.
         """
         own = self.families.covariance_terms(solved, self.maps)
@@ -135,11 +178,6 @@ class ObservedPoints:
     def block(self) -> LandmarkBlock:
         """Their factor block."""
         return landmark_block(self.landmarks, self.keypoints, self.noise, self.context)
-
-    def minimized_in_parts(self, terms: Terms, settings: SolverSettings) -> OptimizeResult | None:
-        """The best values of these and of other terms; None where the map is not divided."""
-        division, map_ = self.context.division, self._divisible(terms)
-        return division.minimized(map_, settings) if division and map_ else None
 
     def covariances_in_parts(self, terms: Terms) -> tuple[np.ndarray, JointErrors] | None:
         """Covariances of poses, as `pose_covariances`; None where the map is not divided."""
@@ -183,7 +221,6 @@ class View(Protocol):
         """Terms that an adjustment from a solution minimises, and the view at the values it finds.
 
         Args:
-            solved: poses, and the points to use.
             noise: of the observations, in units of the keypoints' own sigmas.
         """
         ...
@@ -226,12 +263,7 @@ def adjust_sighted(
 def adjust_sighted_through(
     view: V, sighted: Sighted, before: Solution, context: AdjustmentContext, gates: Sequence[float]
 ) -> tuple[Solution, V]:
-    """As `adjust_sighted`, through a camera that may be solved for, too.
-
-    Args:
-        view: of the observations.
-        sighted: their tracks, and which of them are aligned.
-    """
+    """As `adjust_sighted`, through a camera that may be solved for, too."""
     solved, rounds, settings = before, [], context.settings
     for number, gate in enumerate(gates, 1):
         so_far = replace(sighted, keypoints=view.keypoints)
@@ -255,7 +287,7 @@ def rescale_noise(
     """
     tracks, keypoints = sighted.tracks, sighted.keypoints
     poses = before.world_T_rigs
-    gate = _UNKNOWN_NOISE_GATE
+    gate = 20.0  # gate in sigmas for observations whose noise is not known yet
     threads = settings.solver.threads()
     how = gate, settings.triangulate, threads, scratch
     placed = triangulation.place(tracks, keypoints, poses, *how)
@@ -284,9 +316,7 @@ def adjust(
 
     Args:
         tracks: candidate tracks; every round starts from all of them.
-        keypoints: of all frames.
         start: poses to start from, and the noise known so far.
-        context: priors, families, loss, solver.
         gates: of each round, in standard deviations of the noise.
         final: whether the last round is solved to the end; others lose observations anyway.
     """
@@ -375,9 +405,7 @@ def landmark_block(
     """The factor block of the families that observe points.
 
     Args:
-        landmarks, keypoints: what is observed, where.
         noise: of the observations, in units of the keypoints' own sigmas.
-        context: families, loss.
     """
     solver = context.settings.solver
     return LandmarkBlock(

@@ -15,13 +15,12 @@ from gsba.bundle.adjustment import (
     adjust_sighted_through,
     adjust_through,
 )
-from gsba.bundle.camera_estimates import CameraEstimates
 from gsba.bundle.camera_system import CameraSystem
 from gsba.bundle.camera_variables import CameraUnknowns
+from gsba.bundle.readout import CameraEstimates
 from gsba.bundle.stitching import with_noise_of
 from gsba.types import Keypoints, Sighted, Solution, Tracks
 
-_MAX_REPEATS = 8  # of a round; three to six settle it
 _SCALE_SIGMA = 1e-3  # of each map's extent about its former one: images leave the scale open, and
 # priors of zero on frames' own motion would shrink the map
 
@@ -84,7 +83,6 @@ def solve_with_camera(
     The last round, of the tightest gate, is of poses and points alone.
 
     Args:
-        tracks: candidate tracks.
         shown: keypoints as pictures show them.
         cameras: to start from; what it leaves out (a readout, axes, raw lenses) is left out.
         timestamps: (F,) seconds.
@@ -143,7 +141,7 @@ def _settled(
     """
     solved, rounds = start, ()
     for gate in gates:
-        for _ in range(_MAX_REPEATS):
+        for _ in range(8):  # of a round; three to six settle it
             solved, view = adjust_once(solved, view, gate)
             rounds += solved.rounds
             last = solved.rounds[-1]

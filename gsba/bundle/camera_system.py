@@ -1,8 +1,4 @@
-"""A map and its camera as one system: spread of frames' own motion, and covariances.
-
-Points are eliminated. What frames have of their own is drawn to what is typical, by as much as
-frames turn out to differ.
-"""
+"""A map and its camera as one system: spread of frames' own motion, and covariances."""
 
 from dataclasses import dataclass, replace
 
@@ -11,19 +7,18 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from factors import Block
+from factors.block import QuadraticBlock
 from factors.camera_rows import LensVariables
-from factors.quadratic_block import QuadraticBlock
+from factors.direct_system import reduced_system
 from factors.reduced_camera_system import ReducedSystem
-from factors.system_choice import reduced_system
 from gsba.bundle import readout
 from gsba.bundle.adjustment import DRAWS, AdjustmentContext
-from gsba.bundle.camera_estimates import CameraEstimates
 from gsba.bundle.camera_variables import CameraUnknowns, W
 from gsba.bundle.optimizer import marginal_covariances
+from gsba.bundle.readout import CameraEstimates
 from gsba.types import JointErrors, Keypoints, Solution
 
 _DAMPING = 1e-6
-_NUM_SPREAD_PASSES = 4  # passes that estimate the spread of frames' own motion
 _MAX_GYRO_SQUARES = 4.0  # largest median square of a gyro's errors, in variances of the motion
 _MAX_UNEXPLAINED_SHARE = 0.5  # largest share of the rotations by images that a gyro further off may
 # leave unexplained
@@ -78,7 +73,7 @@ class CameraSystem:
         variances = system.own_variances()  # they hardly depend on the spread
         if variances is None:
             return cameras
-        for _ in range(_NUM_SPREAD_PASSES):
+        for _ in range(4):  # passes that estimate the spread of frames' own motion
             motion, own = system.own_motion(), system.unknowns.own
             if motion is None or own is None:
                 break
@@ -94,8 +89,7 @@ class CameraSystem:
         return system.unknowns.cameras
 
     def _agrees(self, number: int, rates: np.ndarray) -> bool:
-        """True if images alone confirm a gyro's rates (F, 3) of one camera's frames during their
-        readout."""
+        """True if images alone confirm a gyro's rates (F, 3) of a camera during the readout."""
         camera, num = self.cameras.each[number], len(rates)
         without = self.cameras.changed(number, lambda one: replace(one, by_gyro=False))
         alone = replace(self, cameras=without)._linearized()

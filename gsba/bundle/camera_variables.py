@@ -19,10 +19,9 @@ from factors.camera_rows import (
 )
 from gsba.bundle import lens_axes, readout, self_calibration
 from gsba.bundle.adjustment import AdjustmentContext
-from gsba.bundle.camera_estimates import CameraEstimates
 from gsba.bundle.pose_variables import X
-from gsba.bundle.readout import CameraEstimate
-from gsba.camera.fisheye import Rig, rotation_of
+from gsba.bundle.readout import CameraEstimate, CameraEstimates
+from gsba.camera.fisheye import rotation_of
 from gsba.config import CameraSettings
 from gsba.types import Keypoints, Landmarks
 
@@ -36,7 +35,6 @@ K = partial(gtsam.symbol, "k")  # radial terms (4,) of a lens
 N = partial(gtsam.symbol, "n")  # inverse of the stitching radius (1,), 1 / map units
 W = partial(gtsam.symbol, "w")  # own motion (6,) of a frame, beside that of its velocity
 
-_LEAST_TURN = 1e-6  # rad, standard deviation
 _MOVES_ALIKE = 3.0  # standard deviation of own translations in their spread, where lenses are
 # solved for: frames are often taken at about the pace of steps, and successive ones then move
 # alike; held as if each moved by chance, they bend the radial profile of the lenses instead
@@ -85,7 +83,6 @@ class CameraUnknowns:
             cameras: as found so far.
             world_T_rigs: (F, 4, 4) poses, whose velocities frames have while they are read.
             timestamps: (F,) seconds.
-            context: settings, and a gyro's rates.
         """
         num, parts, first = len(world_T_rigs), list[LensVariables](), 0
         values, graph = gtsam.Values(), gtsam.NonlinearFactorGraph()
@@ -133,7 +130,6 @@ class CameraUnknowns:
         """The observations of some points, to be explained by poses and cameras.
 
         Args:
-            landmarks: points and what observes them.
             shown: keypoints as pictures show them.
             noise: of the observations, in units of the keypoints' own sigmas.
             curved: see `CameraBlock`.
@@ -155,12 +151,7 @@ class CameraUnknowns:
     def _sighted(
         self, directions: np.ndarray, frames: np.ndarray, roots: np.ndarray
     ) -> tuple[np.ndarray, ...]:
-        """Measurements (O, 3), whiteners (O, 2, 2), lenses (O,) and fractions of the readout (O,)
-        of directions (O, 3) in frames (O,), as `Sightings` has them.
-
-        Args:
-            roots: (O, 2, 2) that whiten directions on their tangent_basis.
-        """
+        """Measurements (O, 3), whiteners (O, 2, 2), lenses and readout fractions (O,)."""
         if not self.cameras.of_frame:
             return self._sighted_by(0, directions, frames, roots)
         measured, whiteners = np.empty_like(directions), np.empty_like(roots)
@@ -245,11 +236,7 @@ def _lens_variables(
     values: gtsam.Values,
     graph: gtsam.NonlinearFactorGraph,
 ) -> LensVariables:
-    """Variables that all frames of a camera share, added to values and graph.
-
-    Args:
-        numbers: of the camera, and of its first lens among those of all cameras.
-    """
+    """Variables shared by all frames of a camera; `numbers`: of it and of its first lens."""
     lenses, (number, first) = camera.lenses, numbers
     if not lenses:
         return LensVariables()
@@ -265,9 +252,16 @@ def _lens_variables(
             given["front_by_radius"] = lenses.inverse_stitch_radius * lenses.baseline / 2
     if lenses.fisheyes is not None:
         assert lenses.reference_calibration is not None
-        keys = keys_of_lenses(lenses.num_lenses, first)
+        keys = [F(first), K(first)]
+        for lens in range(first + 1, first + lenses.num_lenses):
+            keys += [F(lens), K(lens), B(lens - 1)]
         given["lenses"] = keys
-        given["calibration"] = _rows(lenses.reference_calibration)
+        given["calibration"] = np.array(
+            [
+                [lens.focal, *lens.principal, *lens.radial, *rotation_of(lens).ravel()]
+                for lens in lenses.reference_calibration
+            ]
+        )
         off = split_lenses(self_calibration.from_calibrated(lenses))
         for key, part, spread in zip(
             keys, off, split_lenses(self_calibration.spread(lenses.num_lenses)), strict=True
@@ -295,7 +289,8 @@ def _velocities(
     for number, camera in enumerate(cameras.each):
         if camera.lenses.readout_motion is not None:
             rows = cameras.frames_of(number, num)
-            found = velocities_of(camera, world_T_rigs, timestamps, context)
+            turning = context.turning if camera.by_gyro else None
+            found = readout.velocities(world_T_rigs, timestamps, turning, context.maps)
             whole[rows] = found[rows]
     return whole
 
@@ -310,32 +305,10 @@ def _axes(cameras: CameraEstimates, num_frames: int) -> np.ndarray:
     return whole
 
 
-def velocities_of(
-    camera: CameraEstimate,
-    world_T_rigs: np.ndarray,
-    timestamps: np.ndarray,
-    context: AdjustmentContext,
-) -> np.ndarray:
-    """Velocities (F, 6) of frames, from poses, and from a gyro that is believed."""
-    turning = context.turning if camera.by_gyro else None
-    return readout.velocities(world_T_rigs, timestamps, turning, context.maps)
-
-
 def split_lenses(columns: np.ndarray) -> list[np.ndarray]:
     """Parameters (..., K) of raw lenses, split by variable."""
     sizes = lens_sizes(self_calibration.num_lenses_of(columns.shape[-1]))
     return np.split(columns, np.cumsum(sizes[:-1]), axis=-1)
-
-
-def keys_of_lenses(num: int, first: int = 0) -> list[int]:
-    """Keys of the variables of L raw lenses, in the order of `self_calibration`.
-
-    Args:
-        num: L.
-        first: number of the camera's first lens among those of all cameras.
-    """
-    others = [[F(lens), K(lens), B(lens - 1)] for lens in range(first + 1, first + num)]
-    return [F(first), K(first), *(key for keys in others for key in keys)]
 
 
 def _own_motion(
@@ -356,7 +329,7 @@ def _own_motion(
         beside[rows] = own[rows]
         sigmas.append(readout.own_sigmas(camera, velocities[rows]))
         if turning is not None and camera.by_gyro:
-            sigma = max(camera.readout_s * turning.rate_sigma, _LEAST_TURN)
+            sigma = max(camera.readout_s * turning.rate_sigma, 1e-6)  # rad, standard deviation
             told[rows] = np.all(np.isfinite(turning.rates), axis=1)[rows]
         told_sigmas.append(sigma)
     return OwnMotion(beside, tuple(sigmas), told, tuple(told_sigmas), of_frame)
@@ -373,10 +346,3 @@ def _add(
     values.insert(key, np.array(value))
     model = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
     graph.add(gtsam.PriorFactorVector(key, np.zeros(len(value)), model))
-
-
-def _rows(rig: Rig) -> np.ndarray:
-    """Lenses as `factors.camera_rows` has them (L, 16)."""
-    return np.array(
-        [[lens.focal, *lens.principal, *lens.radial, *rotation_of(lens).ravel()] for lens in rig]
-    )

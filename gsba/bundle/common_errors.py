@@ -1,12 +1,5 @@
-"""Errors that neighbouring frames have in common, which no residual shows.
-
-Covariances follow from residuals, as if every observation erred by itself. On sequences with known
-truth they then hold for steps from frame to frame, but poses far along the path are off by twice
-what they claim: sampling and surfaces mislead the patches of some frames alike, and poses take that
-up. It remains where images have neither noise nor compression. What is added here are errors as
-residuals show them, enlarged and smoothed along the path; both numbers are measured
-(`benchmarks/results/covariances.md`), not derived.
-"""
+"""Errors that neighbouring frames have in common, which no residual shows: those of residuals,
+enlarged and smoothed along the path by measured numbers (`benchmarks/results/covariances.md`)."""
 
 from collections.abc import Sequence
 
@@ -32,7 +25,6 @@ def added(
 
     Args:
         covariances: (F, 6, 6) of poses, [rotation rad, translation], rig frames; NaN = none.
-        joint: what their errors have in common so far.
         world_T_rigs: (F, 4, 4).
         components: (F,) map of each frame, in which the first pose and its distance to the
             furthest position are held; None = there is one.
@@ -54,8 +46,7 @@ def added(
 def _in_common(
     draws: np.ndarray, world_T_rigs: np.ndarray, parts: Sequence[np.ndarray]
 ) -> np.ndarray:
-    """Errors in common (D, F, 6), enlarged and smoothed from errors drawn of the poses of each
-    part's frames (F',); none for a part of one frame."""
+    """Errors in common (D, F, 6), enlarged and smoothed from draws of each part's frames (F',)."""
     rotations, errors = world_T_rigs[:, :3, :3], np.zeros(draws.shape)
     for rows in parts:
         if len(rows) > 1:
@@ -63,7 +54,14 @@ def _in_common(
             smooth = gaussian_filter1d(
                 np.concatenate(turned, axis=2)[..., 0], _SMOOTHING_FRAMES, axis=1
             )
-            held = _in_gauge(smooth, world_T_rigs[rows, :3, 3])
+            positions = world_T_rigs[rows, :3, 3]
+            offsets = positions - positions[0]
+            far, distance = furthest(positions)
+            turns, shifts = smooth[..., :3], smooth[..., 3:]
+            shifts = shifts - shifts[:, :1] - np.cross(turns[:, :1], offsets)
+            stretch = shifts[:, far] @ offsets[far] / max(distance, 1e-300) ** 2
+            shifts = shifts - stretch[:, None, None] * offsets
+            held = np.concatenate([turns - turns[:, :1], shifts], axis=-1)
             back = np.swapaxes(rotations[rows], 1, 2)
             turned = [back @ held[:, :, part, None] for part in _PARTS]
             errors[:, rows] = _COMMON_RATIO * np.concatenate(turned, axis=2)[..., 0]
@@ -71,14 +69,3 @@ def _in_common(
 
 
 _PARTS = slice(3), slice(3, 6)  # rotation, translation
-
-
-def _in_gauge(errors: np.ndarray, positions: np.ndarray) -> np.ndarray:
-    """World-frame errors (D, N, 6) with the first pose and its distance to the furthest held."""
-    offsets = positions - positions[0]
-    far, distance = furthest(positions)
-    turns, shifts = errors[..., :3], errors[..., 3:]
-    shifts = shifts - shifts[:, :1] - np.cross(turns[:, :1], offsets)
-    stretch = shifts[:, far] @ offsets[far] / max(distance, 1e-300) ** 2
-    shifts = shifts - stretch[:, None, None] * offsets
-    return np.concatenate([turns - turns[:, :1], shifts], axis=-1)

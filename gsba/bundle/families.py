@@ -1,13 +1,8 @@
-"""Families of residuals: one object adds everything that one source of knowledge contributes.
-
-Bearings, reprojections, the trajectory prior, the gyro and GPS are families, and so are those of
-callers and packages. A family has factors, and variables of its own if need be: a barometer has a
-bias, tags have poses. It builds its factors anew whenever the map changes, so that they always
-belong to the poses that they are solved with.
-"""
+"""Families of residuals: one object adds everything that one source of knowledge contributes:
+factors, built anew whenever the map changes, and variables of its own if need be."""
 
 import hashlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
@@ -15,11 +10,45 @@ import gtsam
 import numpy as np
 
 from factors import Block, Term
-from gsba.bundle.family_variables import kept, restored
-from gsba.bundle.point_observations import PointObservations
 from gsba.bundle.pose_variables import X
 from gsba.log import GsbaError
 from gsba.types import FamilyVariables, Keypoints, Landmarks, Solution
+
+
+@dataclass(frozen=True, slots=True)
+class PointObservations:
+    """O observations of points by frames, each with its noise."""
+
+    frames: np.ndarray  # (O,) int64, row of the frame
+    points: np.ndarray  # (O,) int64, row of the point
+    bearings_rig: np.ndarray  # (O, 3) float64, unit, rig frame
+    sigmas_rad: np.ndarray  # (O,) float64, of either angle on `factors.tangent_basis`
+    sqrt_infos: np.ndarray | None  # (O, 2, 2) 1/rad on that basis, in place of sigmas_rad where
+    # observations are sharper along one direction; None = they are not
+    origins_rig: np.ndarray | None  # (O, 3) map units, rig frame, where each ray starts; None = in
+    # the rig's centre
+    faces: np.ndarray  # (O,) uint8, cube face that shows the observation
+    pixels: np.ndarray  # (O, 2) float64, (u, v) on it, corner origin
+
+    @classmethod
+    def of(cls, landmarks: Landmarks, keypoints: Keypoints, noise: float) -> "PointObservations":
+        """Observations of landmarks.
+
+        Args:
+            noise: of an observation, in units of its keypoint's own sigma.
+        """
+        tracks, rows = landmarks.tracks, keypoints.rows(landmarks.tracks)
+        infos = keypoints.sqrt_infos
+        return cls(
+            frames=tracks.frames,
+            points=tracks.points,
+            bearings_rig=keypoints.bearings_rig.take(rows, axis=0),
+            sigmas_rad=noise * keypoints.sigmas_rad[rows],
+            sqrt_infos=None if infos is None else infos.take(rows, axis=0) / noise,
+            origins_rig=keypoints.origins_of(rows),
+            faces=keypoints.faces[rows],
+            pixels=keypoints.pixels.take(rows, axis=0),
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,7 +179,6 @@ class Families:
         """Residuals of points by all families that observe them.
 
         Args:
-            landmarks, keypoints: what is observed, where.
             noise: of the observations, in units of the keypoints' own sigmas.
         """
         observing = self.observing_points.members
@@ -166,7 +194,6 @@ class Families:
         """The snapshot of a solution that families build their factors from.
 
         Args:
-            solved: poses, points, and own variables so far.
             maps: (F,) map of each frame; None = there is one.
         """
         of_frames = numbered(maps, len(solved.world_T_rigs))
@@ -184,7 +211,6 @@ class Families:
         """Factors, blocks and variables of all families, for an adjustment from a solution.
 
         Args:
-            solved: poses, points, and own variables so far.
             maps: (F,) map of each frame; None = there is one.
 
         Raises:
@@ -207,7 +233,19 @@ def _terms_of(families: Sequence[Family], snapshot: MapSnapshot) -> FamilyTerms:
     poses = {X(f) for f in range(len(snapshot.world_T_rigs))}
     for family in families:
         own = family.variables(snapshot)
-        _check_keys(family, own, values)
+        for key in own.keys():  # noqa: SIM118
+            shown = gtsam.DefaultKeyFormatter(key)
+            letter = chr(gtsam.symbolChr(key))
+            if not (letter.isupper() or letter in family.reserved_letters):
+                raise GsbaError(
+                    f"family {family.name}: variable {shown}: make its key by gtsam.symbol with a "
+                    "capital letter, others are gsba's own"
+                )
+            if values.exists(key):
+                raise GsbaError(
+                    f"family {family.name}: variable {shown} belongs to another family: choose "
+                    "another letter"
+                )
         known = poses | set(own.keys())
         factors, arrays = family.graph(snapshot), tuple(family.blocks(snapshot))
         for n in range(factors.size()):
@@ -235,23 +273,6 @@ def numbered(maps: np.ndarray | None, num_frames: int) -> np.ndarray:
     return np.zeros(num_frames, np.int64) if maps is None else np.asarray(maps, np.int64)
 
 
-def _check_keys(family: Family, own: gtsam.Values, others: gtsam.Values) -> None:
-    """GsbaError where a key of a family's variables is not its own."""
-    for key in own.keys():  # noqa: SIM118
-        shown = gtsam.DefaultKeyFormatter(key)
-        letter = chr(gtsam.symbolChr(key))
-        if not (letter.isupper() or letter in family.reserved_letters):
-            raise GsbaError(
-                f"family {family.name}: variable {shown}: make its key by gtsam.symbol with a "
-                "capital letter, others are gsba's own"
-            )
-        if others.exists(key):
-            raise GsbaError(
-                f"family {family.name}: variable {shown} belongs to another family: choose "
-                "another letter"
-            )
-
-
 def _check_known(family: Family, what: str, keys: Iterable[int], known: set[int]) -> None:
     """GsbaError where a residual is about a variable that has no value."""
     for key in keys:
@@ -261,3 +282,87 @@ def _check_known(family: Family, what: str, keys: Iterable[int], known: set[int]
                 f"{gtsam.DefaultKeyFormatter(key)}, which has no value: there is no such frame, "
                 "and variables() does not return it"
             )
+
+
+_READERS: dict[str, Callable[[gtsam.Values, int], Any]] = {  # RuntimeError for another type
+    "double": gtsam.Values.atDouble,
+    "Point2": gtsam.Values.atPoint2,
+    "Point3": gtsam.Values.atPoint3,
+    "Vector": gtsam.Values.atVector,
+    "Rot3": gtsam.Values.atRot3,
+    "Pose3": gtsam.Values.atPose3,
+    "Unit3": gtsam.Values.atUnit3,
+    "Similarity3": gtsam.Values.atSimilarity3,
+    "ConstantBias": gtsam.Values.atConstantBias,
+}
+
+
+def _numbers(value: Any) -> np.ndarray:
+    """A value as an array: a matrix row by row where it is one, a similarity's scale last."""
+    if isinstance(value, gtsam.Unit3):
+        return np.ravel(value.point3())
+    if isinstance(value, gtsam.imuBias.ConstantBias):
+        return np.ravel(value.vector())
+    if isinstance(value, gtsam.Similarity3):
+        rigid = gtsam.Pose3(value.rotation(), value.translation())
+        return np.append(rigid.matrix().ravel(), value.scale())
+    if isinstance(value, (gtsam.Rot3, gtsam.Pose3)):
+        return value.matrix().ravel()
+    return np.ravel(np.asarray(value, np.float64))
+
+
+def _value(kind: str, numbers: np.ndarray) -> Any:
+    """The inverse of `_numbers`."""
+    if kind == "double":
+        return float(numbers[0])
+    if kind == "Rot3":
+        return gtsam.Rot3(numbers.reshape(3, 3))
+    if kind == "Pose3":
+        return gtsam.Pose3(numbers.reshape(4, 4))
+    if kind == "Unit3":
+        return gtsam.Unit3(numbers)
+    if kind == "Similarity3":
+        rigid = gtsam.Pose3(numbers[:16].reshape(4, 4))
+        return gtsam.Similarity3(rigid.rotation(), rigid.translation(), float(numbers[16]))
+    if kind == "ConstantBias":
+        return gtsam.imuBias.ConstantBias(numbers[:3], numbers[3:])
+    return numbers
+
+
+def kept(values: gtsam.Values, keys: Sequence[int]) -> FamilyVariables:
+    """Variables as arrays.
+
+    Raises:
+        GsbaError: a variable of a type that is not among those above.
+    """
+    kinds, numbers = list[str](), list[np.ndarray]()
+    for key in keys:
+        for kind, read in _READERS.items():
+            try:
+                value = read(values, key)
+            except RuntimeError:
+                continue
+            kinds.append(kind)
+            numbers.append(_numbers(value))
+            break
+        else:
+            raise GsbaError(
+                f"variable {gtsam.DefaultKeyFormatter(key)} is of a type that runs cannot store; "
+                f"use {', '.join(_READERS)}"
+            )
+    counts = np.array([len(part) for part in numbers], np.int64)
+    data = np.concatenate([np.zeros(0), *numbers])
+    return FamilyVariables(np.array(keys, np.int64), tuple(kinds), counts, data)
+
+
+def restored(variables: FamilyVariables | None) -> gtsam.Values:
+    """The variables that arrays hold; None = there are none."""
+    values = gtsam.Values()
+    if variables is None:
+        return values
+    ends = np.cumsum(variables.counts)
+    for key, kind, count, end in zip(
+        variables.keys.tolist(), variables.kinds, variables.counts, ends, strict=True
+    ):
+        values.insert(key, _value(kind, variables.data[end - count : end]))
+    return values

@@ -1,8 +1,5 @@
-"""Parameters that each frame has beside its pose: found with poses and points adjusted.
-
-Normal equations of bearings, points eliminated. Points that the parameters were not found from say
-whether they predict.
-"""
+"""Parameters that each frame has beside its pose, poses and points adjusted; other points say
+whether they predict."""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -14,10 +11,11 @@ from scipy.sparse.linalg import splu
 
 from factors.elimination import LinearSystem
 from gsba.bundle.adjustment import AdjustmentContext
-from gsba.bundle.cross_validation import Verdict, cross_validate
 from gsba.bundle.shared_parameters import (
     PARTS,
+    Verdict,
     Weighted,
+    cross_validate,
     of_points,
     weighted,
     without_points,
@@ -69,8 +67,6 @@ def models_of(
     Args:
         landmarks: points, moved to their best first, and their observations.
         keypoints: where these really point.
-        solved: poses, and the noise of observations.
-        context: families, loss.
         by_parameters: Jacobian (O, 2, K) of residuals by parameters of their frames.
     """
     drawn = np.random.default_rng(context.settings.seed).permutation(landmarks.tracks.num_points)

@@ -1,8 +1,5 @@
-"""The world and scale that families ask for, before an adjustment starts.
-
-A trajectory has a world and a scale of its own. Where a family knows them, each map is first moved
-by the similarity that fits the family's residuals best, so that the adjustment has only to bend it.
-"""
+"""The world and scale that families ask for: each map is moved by the similarity that fits their
+residuals best, before an adjustment starts."""
 
 from dataclasses import dataclass, replace
 
@@ -15,8 +12,6 @@ from gsba.bundle.pose_variables import X, values_of
 from gsba.similarity import Sim3
 from gsba.types import Solution
 
-_MAX_STEPS = 100  # of Levenberg-Marquardt
-_CONVERGED = 1e-9  # relative decrease of the cost
 _MAX_DAMPING = 1e8
 _MIN_CURVATURE = 1e-9  # least curvature that counts as determined, part of the largest
 
@@ -51,7 +46,6 @@ class Gauge:
         """A solution's poses moved map by map, without points and variables of families.
 
         Args:
-            solved: the solution.
             maps: (F,) map of each frame; None = there is one.
         """
         start = Solution.without_points(self.poses(solved.world_T_rigs, maps))
@@ -66,7 +60,6 @@ def align(families: Families, solved: Solution, maps: np.ndarray | None = None) 
 
     Args:
         families: of the run; those that do not fix the gauge have no say.
-        solved: poses so far.
         maps: (F,) map of each frame; None = there is one.
     """
     chosen = families.fixing_gauge
@@ -76,7 +69,7 @@ def align(families: Families, solved: Solution, maps: np.ndarray | None = None) 
     terms = chosen.terms(solved, maps)
     poses, own, damping = solved.world_T_rigs, terms.values, 1e-4
     cost = _cost(terms, poses, own)
-    for _ in range(_MAX_STEPS):
+    for _ in range(100):  # of Levenberg-Marquardt
         hessian, gradient = _projected(terms, poses, own, of_frames, numbers)
         curvature = np.diagonal(hessian)
         floor = _MIN_CURVATURE * max(float(curvature.max(initial=0)), 1e-300)
@@ -86,7 +79,11 @@ def align(families: Families, solved: Solution, maps: np.ndarray | None = None) 
             of_maps = step[: 7 * len(numbers)].reshape(-1, 7)
             tried = dict(zip(numbers, map(_exp, of_maps), strict=True))
             new_poses = _moved(poses, of_frames, tried)
-            new_own = _retracted(own, step[of_maps.size :])
+            delta, at, dims = gtsam.VectorValues(), 0, own.dims()
+            for key in own.keys():  # noqa: SIM118
+                delta.insert(key, step[of_maps.size :][at : at + dims[key]])
+                at += dims[key]
+            new_own = own.retract(delta)
             new_cost = _cost(terms, new_poses, new_own)
             if new_cost <= cost:
                 break
@@ -95,7 +92,7 @@ def align(families: Families, solved: Solution, maps: np.ndarray | None = None) 
             break
         moves = {number: tried[number].after(moves[number]) for number in numbers}
         poses, own, damping = new_poses, new_own, max(damping / 10, 1e-12)
-        converged = cost - new_cost <= _CONVERGED * cost
+        converged = cost - new_cost <= 1e-9 * cost  # relative decrease of the cost
         cost = new_cost
         if converged:
             break
@@ -188,12 +185,3 @@ def _add_graph(graph, values, dims, basis, hessian, gradient) -> None:
 def _exp(step: np.ndarray) -> Sim3:
     """The similarity of a step [rotation, translation, log scale]."""
     return Sim3(float(np.exp(step[6])), gtsam.Rot3.Expmap(step[:3]).matrix(), step[3:6])
-
-
-def _retracted(own: gtsam.Values, steps: np.ndarray) -> gtsam.Values:
-    """Own variables moved by their tangents, in the order of their keys."""
-    delta, at, dims = gtsam.VectorValues(), 0, own.dims()
-    for key in own.keys():  # noqa: SIM118
-        delta.insert(key, steps[at : at + dims[key]])
-        at += dims[key]
-    return own.retract(delta)

@@ -28,7 +28,6 @@ from gsba.similarity import NoSimilarityError, Sim3, extent_of, robust_similarit
 
 _LOSS_SIGMAS = 2.0  # Cauchy scale of the factors
 MIN_FIXES = 5  # in a map: seven unknowns leave little of fewer
-_ROUNDS = 10  # of choosing fixes
 
 S: Callable[[int], int] = gtsam.symbol_shorthand.S  # what a map's similarity changes by (7,)
 E: Callable[[int], int] = gtsam.symbol_shorthand.E  # lasting error of a fix (3,), in its sigmas
@@ -70,7 +69,6 @@ def anchor(
 
     Args:
         world_T_rigs: (F, 4, 4) poses so far.
-        fixes: of some of the frames.
         maps: (F,) map of each frame; None = there is one.
 
     Returns:
@@ -106,16 +104,11 @@ def anchor(
 
 
 def _level_from_map(positions: np.ndarray, fixes: FrameFixes) -> tuple[Sim3, np.ndarray, float]:
-    """Similarity of a map, fixes (G,) that agree with it, and how many times their noise they
-    scatter, at least 1.
-
-    Raises:
-        NoSimilarityError: most of them do not lie as the frames do.
-    """
+    """Map's similarity, fixes (G,) that agree, and their scatter in units of their noise, >= 1."""
     limits = fixes.tolerances(), MAX_DRIFT_SHARE
     fit, used, _ = robust_similarity(positions, fixes.positions, similarity, 3, *limits)
     scatter = 1.0
-    for _ in range(_ROUNDS):
+    for _ in range(10):  # of choosing fixes
         extent = fit.scale * extent_of(positions)
         before = used
         used, scatter = fixes.inliers(fixes.positions - fit.points(positions), extent)
@@ -136,7 +129,6 @@ def contradiction(anchors: Anchors, world_T_rigs: np.ndarray, draws: np.ndarray)
     that fixes know better than images.
 
     Args:
-        anchors: fixes in the world of the poses.
         world_T_rigs: (F, 4, 4) adjusted poses.
         draws: (D, F, 6) errors of the poses by images alone, rig frames; NaN = none.
 
@@ -153,7 +145,14 @@ def contradiction(anchors: Anchors, world_T_rigs: np.ndarray, draws: np.ndarray)
         frames, places = anchors.frames[rows], anchors.positions[rows]
         information = np.linalg.inv(anchors.covariances[rows]) * weights[rows, None, None]
         arms = places - places.mean(axis=0)
-        gauge = np.stack([arms, *np.cross(np.eye(3)[:, None], arms), *_shifts(len(rows))], axis=2)
+        gauge = np.stack(
+            [
+                arms,
+                *np.cross(np.eye(3)[:, None], arms),
+                *np.repeat(np.eye(3)[:, None], len(rows), axis=1),
+            ],
+            axis=2,
+        )
         pulled = np.einsum("aij,ajk->aik", information, gauge)
         inverse = np.linalg.pinv(np.einsum("aik,ail->kl", gauge, pulled), hermitian=True)
 
@@ -171,11 +170,6 @@ def contradiction(anchors: Anchors, world_T_rigs: np.ndarray, draws: np.ndarray)
         expected = np.mean(np.einsum("dai,aij,daj->d", moved, information, moved))
         worst = max(worst, float(bent / np.clip(expected, 1.0, 3 * len(rows))))
     return worst
-
-
-def _shifts(num: int) -> np.ndarray:
-    """Unit shifts (3, N, 3) along each axis."""
-    return np.repeat(np.eye(3)[:, None], num, axis=1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -297,7 +291,6 @@ def linear_factors(
     """Factors of fixes for covariances: lasting errors are variables, too.
 
     Args:
-        anchors: fixes in the world of the poses.
         world_T_rigs: (F, 4, 4) where factors are linearized.
         free_similarity: whether the map's similarity is a variable, as it must be where the first
             pose is held.

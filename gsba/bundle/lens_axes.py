@@ -1,8 +1,5 @@
-"""Axes of the lenses of each frame: those of the panorama, or turned by a stabiliser.
-
-A stabilised panorama keeps its heading while the camera turns below it: the lenses' axes are then
-those of the walk, up to how the camera is held, and what each frame's points say beside it.
-"""
+"""Axes of the lenses of each frame: those of the panorama, or turned by a stabiliser, which keeps
+the heading while the camera turns with the walk."""
 
 import logging
 from collections.abc import Sequence
@@ -13,14 +10,15 @@ from scipy.spatial.transform import Rotation
 
 from gsba.bundle import shared_parameters
 from gsba.bundle.adjustment import AdjustmentContext
-from gsba.bundle.cross_validation import cross_validate, predicts
 from gsba.bundle.frame_parameters import models_of, validated
 from gsba.bundle.shared_parameters import (
     PARTS,
     SharedModel,
     Weighted,
     by_origin,
+    cross_validate,
     drawn,
+    predicts,
     sample_counts,
     summed,
 )
@@ -29,8 +27,6 @@ from gsba.types import Counts, Keypoints, Landmarks, Solution
 
 logger = logging.getLogger(__name__)
 
-_MAX_OBSERVATIONS = 60_000  # observations that axes are found from
-_MAX_FIRST_OBSERVATIONS = 20_000  # observations for a first guess
 _YAWS_RAD = np.deg2rad([0.0, 45, 90, 135])  # of the line through both lenses, tried at first
 TURNS = np.deg2rad([0.5, 1.5, 5.0])  # prior standard deviations of a frame's turn
 _MIN_STEP_SHARE = 0.1  # part of a typical step, below which a frame counts as standing
@@ -57,11 +53,8 @@ def guess(
     """Lenses with axes that explain most with two centres: the rig's, turned ones, or the walk's.
 
     Args:
-        landmarks: points and their observations.
         keypoints: of these, as seen from one centre.
-        solved: the map's poses, and the noise of its observations.
         so_far: one centre; `band_rad` is kept.
-        context: loss, settings.
     """
     frames = keypoints.frames()
     tried = [replace(so_far, axes=axes) for axes in _candidates(solved.world_T_rigs)]
@@ -75,7 +68,12 @@ def guess(
         return np.concatenate(columns, axis=2)
 
     systems, counts = shared_parameters.models_of(
-        landmarks, _MAX_FIRST_OBSERVATIONS, keypoints, solved, context, by_centres
+        landmarks,
+        20_000,
+        keypoints,
+        solved,
+        context,
+        by_centres,  # observations for a first guess
     )
     if not systems:
         return LensAxes(so_far, np.full(PARTS, np.nan), "too few points", counts)
@@ -102,13 +100,10 @@ def loosened(
     """Axes of each frame's own, the rig's yet, if turning them by some points predicts others.
 
     Args:
-        landmarks: points and their observations.
         keypoints: of these, as rays of the lenses so far.
-        solved: the map's poses, solved under these, and the noise of its observations.
         so_far: two lenses whose axes are the rig's.
-        context: loss, settings.
     """
-    used = drawn(landmarks, _MAX_OBSERVATIONS, context.settings.seed)
+    used = drawn(landmarks, 60_000, context.settings.seed)  # observations that axes are found from
     counts = sample_counts(landmarks, used)
     frames, num = keypoints.frames(), len(solved.world_T_rigs)
 

@@ -1,9 +1,5 @@
-"""Centres of the lenses, estimated from points that cross the seam and from parallax.
-
-Points of the front half of the sphere are seen from one place, those of the back half from another.
-Two centres that parts of the sequence gain by are taken on trial: the map is matched and adjusted
-with them. They are believed where they then predict parts that they were not found from.
-"""
+"""Centres of the lenses, from points that cross the seam and from parallax: taken on trial where
+parts of the sequence gain by them, and believed where they then predict other parts."""
 
 import logging
 from collections.abc import Sequence
@@ -14,10 +10,10 @@ import numpy as np
 from factors.bearing import tangent_basis
 from factors.camera_rows import half_baseline
 from gsba.bundle.adjustment import AdjustmentContext
-from gsba.bundle.cross_validation import cross_validate
 from gsba.bundle.shared_parameters import (
     PARTS,
     SharedModel,
+    cross_validate,
     models_of,
     summed,
     whole_model_of,
@@ -84,11 +80,8 @@ def estimate(
     """Find the lenses' centres from a map, poses and points adjusted with them.
 
     Args:
-        landmarks: points and their observations.
         keypoints: of these, as rays under the lenses so far.
-        solved: the map's poses, solved under these, and the noise of its observations.
         so_far: centres that the rays start at; `band_rad` is kept.
-        context: priors, loss, settings.
     """
     chosen = context.settings.camera
     frames = keypoints.frames()
@@ -156,12 +149,8 @@ def stitched_for(
     first estimate: their distance is wrong where there is one.
 
     Args:
-        landmarks: points and their observations.
         keypoints: of these, as rays of the lenses so far.
         shown: (N, 3) directions of the keypoints in their pictures.
-        solved: the map's poses, solved under these, and the noise of its observations.
-        so_far: the lenses.
-        context: loss, settings.
     """
     said = context.settings.camera.inverse_stitch_radius(so_far.baseline / 2)
     if said is not None:
@@ -171,7 +160,7 @@ def stitched_for(
 
     def by_both(rows: np.ndarray, by_origin: np.ndarray, _: np.ndarray) -> np.ndarray:
         directions, there, bearings = shown[rows], frames[rows], keypoints.bearings_rig[rows]
-        by_near = by_inverse_stitch_radius(bearings, so_far.origins(directions, there))
+        by_near = tangent_basis(bearings) @ so_far.origins(directions, there)[:, :, None]
         by_origin = by_origin + before * tangent_basis(bearings)
         return np.concatenate([so_far.by_centre(by_origin, directions, there), by_near], axis=2)
 
@@ -189,16 +178,6 @@ def stitched_for(
         reason = "as well stitched at infinity"
     lenses = replace(so_far, inverse_stitch_radius=0.0 if reason else inverse_stitch_radius)
     return StitchRadius(lenses, inverse_stitch_radius, sigma, shares, reason)
-
-
-def by_inverse_stitch_radius(bearings_rig: np.ndarray, origins_rig: np.ndarray) -> np.ndarray:
-    """Jacobian (O, 2, 1) of residuals of bearings (O, 3) by the inverse stitch radius.
-
-    Args:
-        bearings_rig: of the rays.
-        origins_rig: (O, 3) where they start.
-    """
-    return tangent_basis(bearings_rig) @ origins_rig[:, :, None]
 
 
 def _step(systems: Sequence[SharedModel]) -> np.ndarray:

@@ -1,11 +1,7 @@
-"""Strength of a map: how well images alone determine it, and where the trajectory must help.
+"""Strength of a map: steps that images hold well, and the trajectory's noise as these show it.
 
-Along a path the scale is handed on from step to step by the points that three frames see. Where
-these are few, or far, all that lies behind may be larger or smaller, and turned: a walk that does
-not return has nothing else to hold it; where it returns, loops do. Priors on the trajectory's steps
-are no help: drift is smooth, so that they all err the same way, and together bend a place that is
-held a little less than others. So a step that the images hold well goes without one, and those that
-are left are worth what the others show of the trajectory's noise.
+Priors on well-held steps are no help: drift is smooth, so that they all err the same way, and
+together bend a place that is held a little less than others. Such steps go without one.
 """
 
 from dataclasses import dataclass
@@ -129,9 +125,6 @@ def position_errors(world_T_rigs: np.ndarray, draws: np.ndarray) -> np.ndarray:
 def neighbour_shifts(result: Reconstruction) -> np.ndarray:
     """Angles (F,) in radians, rms, by which points of a frame are to be expected beside their
     pictures in the next one, by errors of the step between both; NaN = not known, as of the last.
-
-    Args:
-        result: one map with its joint errors.
     """
     poses, joint = result.world_T_rigs, result.joint_errors
     found = np.full(len(poses), np.nan)
@@ -156,11 +149,7 @@ def neighbour_shifts(result: Reconstruction) -> np.ndarray:
 
 
 def _drift(world_T_rigs: np.ndarray, draws: np.ndarray, walks: np.ndarray) -> float:
-    """See `MapStrength.drift`; 0 where fewer than three poses are known.
-
-    Args:
-        walks: (F,) recording of each frame.
-    """
+    """See `MapStrength.drift`; 0 where fewer than three poses are known."""
     errors = position_errors(world_T_rigs, draws)
     known = np.isfinite(errors).all(axis=0)
     if not known.any():

@@ -6,12 +6,173 @@ from pathlib import Path
 
 import numpy as np
 
-from gsba.bundle._noise_kernels import standardized_residuals
+from factors.compiled import kernel_and_part
 from gsba.bundle.tracks import map_runs
 from gsba.disk import concatenated
 from gsba.memory import release_mapped_files
 from gsba.types import Keypoints, Landmarks, Tracks
 from gsba.types.records import slices
+
+_kernel, _part = kernel_and_part()
+_MIN_INFORMATION_SHARE = 1e-12  # of a point's information, added to it, as depth may be unknown
+_MIN_RESIDUAL_SHARE = 1e-3  # least share of a residual that its point cannot absorb
+
+
+@_kernel
+def standardized_residuals(
+    first, last, starts, points, frames, poses, bearings, roots, origins, out
+):
+    """Residuals (O,) of the observations of points first to last - 1, all of the same spread.
+
+    Args:
+        starts (J + 1,): point j owns observations starts[j]:starts[j + 1].
+        points (J, 3): world. frames (O,), poses (F, 4, 4): T_world_rig.
+        bearings (O, 3): unit, rig frame.
+        roots (O, 2, 2): square-root information on `factors.tangent_basis`.
+        origins (O, 3): where rays start, rig frame; (0, 3) = the rig's centre.
+        out (O,): written.
+    """
+    longest = 0
+    for j in range(first, last):
+        longest = max(longest, starts[j + 1] - starts[j])
+    rows = np.empty((longest, 8))  # residual (2) and its Jacobian by the point (2 x 3)
+    normal = np.empty(6)
+    for j in range(first, last):
+        _standardize(j, starts, points, frames, poses, bearings, roots, origins, rows, normal, out)
+
+
+@_part
+def _standardize(j, starts, points, frames, poses, bearings, roots, origins, rows, normal, out):
+    """`standardized_residuals` of point j."""
+    normal[:] = 0.0
+    for o in range(starts[j], starts[j + 1]):
+        row = rows[o - starts[j]]
+        _by_point(o, points[j], poses[frames[o]], bearings, roots, origins, row)
+        a0, a1, a2, b0, b1, b2 = row[2], row[3], row[4], row[5], row[6], row[7]
+        normal[0] += a0 * a0 + b0 * b0
+        normal[1] += a0 * a1 + b0 * b1
+        normal[2] += a0 * a2 + b0 * b2
+        normal[3] += a1 * a1 + b1 * b1
+        normal[4] += a1 * a2 + b1 * b2
+        normal[5] += a2 * a2 + b2 * b2
+    covariance = _inverse(normal)
+    for o in range(starts[j], starts[j + 1]):
+        out[o] = _along(rows[o - starts[j]], covariance)
+
+
+@_part
+def _by_point(o, point, pose, bearings, roots, origins, row):
+    """Whitened residual of observation o, and its Jacobian by the point: the angles are small."""
+    x, y, z = point[0] - pose[0, 3], point[1] - pose[1, 3], point[2] - pose[2, 3]
+    dx = pose[0, 0] * x + pose[1, 0] * y + pose[2, 0] * z
+    dy = pose[0, 1] * x + pose[1, 1] * y + pose[2, 1] * z
+    dz = pose[0, 2] * x + pose[1, 2] * y + pose[2, 2] * z
+    if len(origins):
+        dx, dy, dz = dx - origins[o, 0], dy - origins[o, 1], dz - origins[o, 2]
+    mx, my, mz = bearings[o, 0], bearings[o, 1], bearings[o, 2]
+    sign = 1.0 if mz >= 0 else -1.0  # axes of factors.tangent_basis
+    a = -1.0 / (sign + mz)
+    b = mx * my * a
+    u0, u1, u2 = 1.0 + sign * mx * mx * a, sign * b, -sign * mx
+    v0, v1, v2 = b, sign + my * my * a, -my
+    distance = np.sqrt(dx * dx + dy * dy + dz * dz)
+    for i in range(2):
+        s, t = roots[o, i, 0], roots[o, i, 1]
+        c0, c1, c2 = s * u0 + t * v0, s * u1 + t * v1, s * u2 + t * v2
+        c0, c1, c2 = c0 / distance, c1 / distance, c2 / distance
+        row[i] = c0 * dx + c1 * dy + c2 * dz
+        for k in range(3):
+            row[2 + 3 * i + k] = c0 * pose[k, 0] + c1 * pose[k, 1] + c2 * pose[k, 2]
+
+
+@_part
+def _inverse(normal):
+    """Inverse (00 01 02 11 12 22) of a symmetric 3x3 in this form, its diagonal raised a little."""
+    added = _MIN_INFORMATION_SHARE * (normal[0] + normal[3] + normal[5]) + 2.3e-308
+    a, b, c = normal[0] + added, normal[1], normal[2]
+    d, e, f = normal[3] + added, normal[4], normal[5] + added
+    l00 = np.sqrt(a)
+    l10, l20 = b / l00, c / l00
+    l11 = np.sqrt(max(d - l10 * l10, added))
+    l21 = (e - l10 * l20) / l11
+    l22 = np.sqrt(max(f - l20 * l20 - l21 * l21, added))
+    i00, i11, i22 = 1 / l00, 1 / l11, 1 / l22
+    i10, i21 = -l10 * i00 * i11, -l21 * i11 * i22
+    i20 = -(l20 * i00 + l21 * i10) * i22
+    return (
+        i00 * i00 + i10 * i10 + i20 * i20, i10 * i11 + i20 * i21, i20 * i22,
+        i11 * i11 + i21 * i21, i21 * i22, i22 * i22,
+    )  # fmt: skip
+
+
+@_part
+def _product(row, i, k, covariance):
+    """Rows i and k of a Jacobian, about the covariance of its point."""
+    c00, c01, c02, c11, c12, c22 = covariance
+    x, y, z = row[2 + 3 * i], row[3 + 3 * i], row[4 + 3 * i]
+    p = c00 * x + c01 * y + c02 * z
+    q = c01 * x + c11 * y + c12 * z
+    r = c02 * x + c12 * y + c22 * z
+    return p * row[2 + 3 * k] + q * row[3 + 3 * k] + r * row[4 + 3 * k]
+
+
+@_part
+def _along(row, covariance):
+    """The residual in the direction in which its point leaves the most, over its spread there."""
+    a, d = 1.0 - _product(row, 0, 0, covariance), 1.0 - _product(row, 1, 1, covariance)
+    b = -_product(row, 0, 1, covariance)
+    half = 0.5 * (a - d)
+    radius = np.sqrt(half * half + b * b)
+    if half >= 0:
+        x, y = half + radius, b
+    else:
+        x, y = b, radius - half
+    length = np.sqrt(x * x + y * y)
+    x, y = (x / length, y / length) if length > 0 else (0.0, 1.0)
+    left = 0.5 * (a + d) + radius
+    return (x * row[0] + y * row[1]) / np.sqrt(max(left, _MIN_RESIDUAL_SHARE))
+
+
+_MIN_COSINE, _MIN_LENGTH = 0.1, 1e-12
+
+
+@_kernel
+def face_roots(bearings, axes, faces, sigmas, out):
+    """Square-root information (O, 2, 2), 1/rad on `factors.tangent_basis`, of keypoints whose noise
+    is equal along both axes of their face.
+
+    At an angle a from the axis of a face of focal length f, a pixel subtends cos^2(a) / f away from
+    the axis and cos(a) / f around it; sigmas are the geometric mean of both.
+
+    Args:
+        bearings (O, 3): unit, rig frame. axes (6, 3): of the faces. faces (O,): of keypoints.
+        sigmas (O,): radians.
+        out (O, 2, 2): written.
+    """
+    for o in range(len(faces)):
+        _face_root(o, bearings, axes, faces, sigmas, out)
+
+
+@_part
+def _face_root(o, bearings, axes, faces, sigmas, out):
+    """`face_roots` of keypoint o."""
+    mx, my, mz = bearings[o, 0], bearings[o, 1], bearings[o, 2]
+    ax, ay, az = axes[faces[o], 0], axes[faces[o], 1], axes[faces[o], 2]
+    cosine = mx * ax + my * ay + mz * az
+    x, y, z = cosine * mx - ax, cosine * my - ay, cosine * mz - az  # away from the axis
+    sign = 1.0 if mz >= 0 else -1.0  # axes of factors.tangent_basis
+    a = -1.0 / (sign + mz)
+    b = mx * my * a
+    s = (1.0 + sign * mx * mx * a) * x + sign * b * y - sign * mx * z
+    t = b * x + (sign + my * my * a) * y - my * z
+    length = max(np.sqrt(s * s + t * t), _MIN_LENGTH)
+    s, t = s / length, t / length
+    root = np.sqrt(min(max(cosine, _MIN_COSINE), 1.0))
+    more = 1.0 / root - root
+    out[o, 0, 0] = (root + more * s * s) / sigmas[o]
+    out[o, 0, 1] = out[o, 1, 0] = more * s * t / sigmas[o]
+    out[o, 1, 1] = (root + more * t * t) / sigmas[o]
+
 
 _AT_ONCE = 1 << 18  # keypoints whose noise is scaled together: 17 MB
 _MIN_REDUNDANCY = 0.1  # least share of residual dimensions beyond the unknowns
@@ -35,7 +196,6 @@ def observation_noise(
 
     Args:
         landmarks: points and their observations, O of them.
-        keypoints: of all frames.
         world_T_rigs: (F, 4, 4) poses.
         num_threads: that share the points; the result does not depend on them.
         chosen: (O,) bool, observations whose spread is asked for.

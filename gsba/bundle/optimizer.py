@@ -12,7 +12,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from factors import Block
-from factors.system_choice import reduced_system
+from factors.direct_system import reduced_system
 from gsba.config import SolverSettings
 from gsba.log import GsbaError
 from gsba.types import Iteration, JointErrors
@@ -166,7 +166,10 @@ def minimize(
         return OptimizeResult(values, tuple(history.steps), converged, reason)
 
     costs = system.linearize(values)
-    cost = _checked_sum(costs)
+    bad = [name for name, part in costs.items() if not np.isfinite(part)]
+    if bad:
+        raise GsbaError(f"the cost of {', '.join(bad)} is not finite at the start: check its input")
+    cost = sum(costs.values())
     damping = _Damping(settings.lambda_initial)
     history.add(values, cost, costs, damping.value, True)
     for _ in range(settings.max_iterations):
@@ -205,13 +208,6 @@ def _attempt(
     return trial, system.propose(trial, steps), system.predicted_decrease()
 
 
-def _checked_sum(costs: Mapping[str, float]) -> float:
-    bad = [name for name, part in costs.items() if not np.isfinite(part)]
-    if bad:
-        raise GsbaError(f"the cost of {', '.join(bad)} is not finite at the start: check its input")
-    return sum(costs.values())
-
-
 @threadpool_limits.wrap(limits=1, user_api="blas")
 def marginal_covariances(
     graph: gtsam.NonlinearFactorGraph,
@@ -226,10 +222,8 @@ def marginal_covariances(
 
     Args:
         graph, blocks: what constrains them, linearized at `values`.
-        values: of all variables.
         keys: (F,) keys of Pose3 variables, in the order of the path.
         num_draws: errors drawn of all poses at once.
-        seed: of these.
         beside: (B,) keys of other variables, of at most six dimensions: their covariances follow.
 
     Returns:

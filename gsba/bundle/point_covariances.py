@@ -88,8 +88,7 @@ def _error_ratios(result: Reconstruction, covariances: np.ndarray) -> np.ndarray
 
 
 def _shifts_across(result: Reconstruction, covariances: np.ndarray) -> np.ndarray:
-    """Shifts (J,) of points' observations that grow along the track as those of a wrong depth do,
-    but across them, in standard deviations of independent observations; NaN = undetermined."""
+    """Shifts (J,) across the track of observations' errors, in independent ones' sigmas; or NaN."""
     num = len(covariances)
     axes = np.linalg.eigh(covariances)[1][:, :, 2]  # the least certain ones
     slopes, pulls, sums = np.zeros((num, 3)), np.zeros((num, 3)), np.zeros((2, num))
@@ -129,8 +128,7 @@ def _informations(some: Reconstruction) -> np.ndarray:
 
 
 def _pose_errors(result: Reconstruction) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rotations and translations (D, F, 3) of draws of the poses' errors, in the world, and the
-    relative error (D,) of the scale of each draw; D = 0: they are unknown."""
+    """Turns and moves (D, F, 3) of pose errors drawn, in the world, and relative scales (D,)."""
     if result.joint_errors is None:
         return np.zeros((0, 0, 3)), np.zeros((0, 0, 3)), np.zeros(0)
     draws = np.nan_to_num(result.joint_errors.draws[:_MAX_DRAWS].astype(float))

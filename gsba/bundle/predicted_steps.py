@@ -1,19 +1,14 @@
-"""Steps predicted by far frames: poses from points that frames further away in time determine.
-
-Frames that stand close together may hold a tiny map of their own inside a large one: their steps
-shrink, residuals stay small, and covariances do not tell. Points that frames outside such a group
-see then give another pose to each of its frames. On walks both poses agree.
-"""
+"""Steps predicted by far frames, and their motion by a round: frames that stand close together may
+hold a tiny map of their own, whose covariances do not tell; far frames' points do."""
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from factors import tangent_basis
-from gsba.geometry import inverse, pose
-from gsba.types import Reconstruction
+from gsba.geometry import inverse, pose, step_covariances
+from gsba.types import JointErrors, Reconstruction
 
 _REACH = 3  # frames to either side that do not count as far
-_MIN_FAR_FRAMES = 2  # that see a point
-_MIN_OBSERVATIONS = 12  # of such points, in a frame
 _STANDING_RATIO = 0.1  # of the rms step: shorter ones are of a camera that stands, and mere noise
 _ITERATIONS = 10
 
@@ -21,18 +16,22 @@ _ITERATIONS = 10
 def step_deviations(result: Reconstruction) -> np.ndarray:
     """Deviation (F - 1,) of each step from the one that far frames predict, part of the longer of
     both, and at least a tenth of the rms step; NaN = they predict none.
-
-    Args:
-        result: one map.
     """
     poses = result.world_T_rigs
     predicted, known = poses.copy(), np.zeros(len(poses), bool)
-    usable = np.flatnonzero(_num_far(result) >= _MIN_FAR_FRAMES)
+    # observations of each observation's point in frames out of reach
+    frames, num = result.observation_frames.astype(np.int64), len(poses)
+    first = result.observation_points.astype(np.int64) * num
+    keys = np.sort(first + frames)  # by point, then frame
+    last = np.searchsorted(keys, first + np.minimum(frames + _REACH, num - 1), side="right")
+    near = last - np.searchsorted(keys, first + np.maximum(frames - _REACH, 0))
+    every = np.bincount(result.observation_points)[result.observation_points]
+    usable = np.flatnonzero(every - near >= 2)  # that see a point
     usable = usable[np.argsort(result.observation_frames[usable], kind="stable")]
     bounds = np.searchsorted(result.observation_frames[usable], np.arange(len(poses) + 1))
     for f in range(len(poses)):
         rows = usable[bounds[f] : bounds[f + 1]]
-        known[f] = len(rows) >= _MIN_OBSERVATIONS
+        known[f] = len(rows) >= 12  # of such points, in a frame
         if known[f]:
             predicted[f] = _resected(result, f, rows)
     steps = [(inverse(some[:-1]) @ some[1:])[:, :3, 3] for some in (poses, predicted)]
@@ -42,19 +41,8 @@ def step_deviations(result: Reconstruction) -> np.ndarray:
     return np.where(known[1:] & known[:-1], off, np.nan)
 
 
-def _num_far(result: Reconstruction) -> np.ndarray:
-    """Number (O,) of observations of each observation's point in frames out of reach."""
-    frames, num = result.observation_frames.astype(np.int64), len(result.world_T_rigs)
-    first = result.observation_points.astype(np.int64) * num
-    keys = np.sort(first + frames)  # by point, then frame
-    last = np.searchsorted(keys, first + np.minimum(frames + _REACH, num - 1), side="right")
-    near = last - np.searchsorted(keys, first + np.maximum(frames - _REACH, 0))
-    return np.bincount(result.observation_points)[result.observation_points] - near
-
-
 def _resected(result: Reconstruction, frame: int, rows: np.ndarray) -> np.ndarray:
-    """Pose (4, 4) of a frame that its observations `rows` (O,) of known points give, by
-    Gauss-Newton under a Cauchy loss from its pose in the map."""
+    """Pose (4, 4) of a frame by its observations `rows` (O,) of points, from that in the map."""
     from scipy.spatial.transform import Rotation
 
     points = result.points_world[result.observation_points[rows]]
@@ -76,3 +64,43 @@ def _resected(result: Reconstruction, frame: int, rows: np.ndarray) -> np.ndarra
         turn = Rotation.from_rotvec(step[:3]).as_matrix()
         world_T_rig = world_T_rig @ pose(turn, step[3:])
     return world_T_rig
+
+
+def step_motion(
+    before_T_rigs: np.ndarray,
+    world_T_rigs: np.ndarray,
+    covariances: np.ndarray,
+    joint: JointErrors,
+) -> float:
+    """Motion of the steps from frame to frame in their own standard deviations, rms.
+
+    Args:
+        before_T_rigs: (F, 4, 4) poses before the round, in a world of any scale.
+        world_T_rigs: (F, 4, 4) poses after it.
+        covariances: (F, 6, 6) of these [rotation rad, translation], rig frames; NaN = not known.
+        joint: what errors of neighbours have in common.
+
+    Returns:
+        sqrt(mean(d^T C^-1 d) / 6) over all steps of known covariance C; NaN where there is none.
+    """
+    steps, former = _steps(world_T_rigs), _steps(before_T_rigs)
+    length, was = (np.linalg.norm(some[:, :3, 3], axis=1).sum() for some in (steps, former))
+    former[:, :3, 3] *= length / max(was, 1e-300)
+    motion = inverse(former) @ steps
+    tangents = np.column_stack(
+        [Rotation.from_matrix(motion[:, :3, :3]).as_rotvec(), motion[:, :3, 3]]
+    )
+    spread = step_covariances(world_T_rigs, covariances, joint.neighbours)
+    known = np.isfinite(spread).all(axis=(1, 2))
+    if not known.any():
+        return np.nan
+    # Radians and map units apart by orders of magnitude: each by its own standard deviation first.
+    sigmas = np.sqrt(np.maximum(np.einsum("fii->fi", spread[known]), 1e-300))
+    scaled = tangents[known] / sigmas
+    correlations = spread[known] / (sigmas[:, :, None] * sigmas[:, None, :])
+    inverses = np.linalg.pinv(correlations, hermitian=True)
+    return float(np.sqrt(np.einsum("fi,fij,fj->f", scaled, inverses, scaled).mean() / 6))
+
+
+def _steps(world_T_rigs: np.ndarray) -> np.ndarray:
+    return inverse(world_T_rigs[:-1]) @ world_T_rigs[1:]

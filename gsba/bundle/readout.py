@@ -1,23 +1,26 @@
 """Motion during the readout of a frame: whether rows are read one after another, and which way.
-
-Each lens is read in a way of its own: a ray's time follows from its row. The duration that makes
-what frames move meanwhile their velocity is found as other parameters that all frames share, and
-believed where it predicts; `camera_adjustment` then finds each frame's own motion.
-"""
+`camera_adjustment` then finds each frame's own motion."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 
 import numpy as np
 
 from gsba.bundle.adjustment import AdjustmentContext
-from gsba.bundle.cross_validation import cross_validate, predicts
-from gsba.bundle.shared_parameters import PARTS, SharedModel, models_of, summed
+from gsba.bundle.shared_parameters import (
+    PARTS,
+    SharedModel,
+    cross_validate,
+    models_of,
+    predicts,
+    summed,
+)
+from gsba.camera.cameras import Cameras
 from gsba.camera.lens import Lenses, rows_run
 from gsba.config import CameraSettings
-from gsba.types import Counts, GyroConstraints, Keypoints, Landmarks, Solution
+from gsba.types import Counts, GyroConstraints, Keypoints, Landmarks, Solution, Tracks
 
 logger = logging.getLogger(__name__)
 
@@ -70,13 +73,10 @@ def estimate(
     No readout is taken while another way of reading rows predicts unseen parts nearly as well.
 
     Args:
-        landmarks: points and their observations.
         keypoints: of these, as rays of the lenses.
         shown: (N, 3) directions of the keypoints in their pictures: these tell rows.
-        solved: poses under these, and the noise of observations.
         lenses: read at one instant so far.
         timestamps: (F,) seconds, whose differences give velocities.
-        context: loss, settings.
     """
     turning = turning_of(lenses, context)
     motion = velocities(solved.world_T_rigs, timestamps, turning, context.maps)
@@ -99,7 +99,10 @@ def estimate(
     of_ways = [[part.of(slice(way, way + 1)) for part in systems] for way in range(len(ways))]
     verdicts = [cross_validate(parts, _newton_step) for parts in of_ways]
     best = int(np.argmax([verdict.gains.sum() for verdict in verdicts]))
-    verdict, (duration, sigma) = verdicts[best], _duration(of_ways[best])
+    total = summed(of_ways[best])
+    curved = max(float(total.hessian[0, 0]), 1e-300)
+    verdict, sigma = verdicts[best], (total.curvature * curved) ** -0.5
+    duration = -float(total.gradient[0]) / curved / total.curvature
     sign = -1.0 if duration < 0 else 1.0  # rows are read the other way
     found = CameraEstimate(lenses, abs(duration), sigma, gains=verdict.shares, counts=counts)
     logger.info("readout: %.2f ms (sigma %.2f)", 1e3 * abs(duration), 1e3 * sigma)
@@ -191,13 +194,6 @@ def _newton_step(parts: Sequence[SharedModel]) -> np.ndarray:
     return -total.gradient / np.maximum(total.hessian[0], 1e-300)
 
 
-def _duration(parts: Sequence[SharedModel]) -> tuple[float, float]:
-    """Duration by these parts for one row direction, and its standard deviation, seconds."""
-    total = summed(parts)
-    curved = max(float(total.hessian[0, 0]), 1e-300)
-    return -float(total.gradient[0]) / curved / total.curvature, (total.curvature * curved) ** -0.5
-
-
 def _ways(camera: CameraSettings, lenses: Lenses) -> list[np.ndarray]:
     """Row directions (L, 3) that lenses may have, up to all of them reversed."""
     num = lenses.num_lenses
@@ -214,3 +210,66 @@ def _ways(camera: CameraSettings, lenses: Lenses) -> list[np.ndarray]:
         return [sign * axes for axes in (right, down) for sign in signs]
     back = [sign * axis for axis in _AXES for sign in (1.0, -1.0)]
     return [np.array(way) for way in product(_AXES, back)]
+
+
+@dataclass(frozen=True, slots=True)
+class CameraEstimates:
+    """Estimate of each camera, and the camera of each frame."""
+
+    each: tuple[CameraEstimate, ...]  # (C,)
+    of_frame: tuple[int, ...] = ()  # (F,) as in `Cameras`
+
+    @classmethod
+    def of(cls, cameras: Cameras) -> "CameraEstimates":
+        """Cameras of which lenses alone are known."""
+        return cls(tuple(CameraEstimate(lenses) for lenses in cameras.lenses), cameras.of_frame)
+
+    @property
+    def cameras(self) -> Cameras:
+        """The lenses of each camera."""
+        return Cameras(tuple(one.lenses for one in self.each), self.of_frame)
+
+    @property
+    def only(self) -> CameraEstimate:
+        """The estimate of a single camera.
+
+        Raises:
+            ValueError: there are several cameras.
+        """
+        (found,) = self.each
+        return found
+
+    def with_each(self, each: Sequence[CameraEstimate]) -> "CameraEstimates":
+        """Other estimates (C,) of the cameras that took these frames."""
+        if len(each) != len(self.each):
+            raise ValueError(f"estimates of {len(each)} cameras instead of {len(self.each)}")
+        return replace(self, each=tuple(each))
+
+    def with_lenses(self, lenses: Sequence[Lenses]) -> "CameraEstimates":
+        """The estimates with other lenses (C,)."""
+        pairs = zip(self.each, lenses, strict=True)
+        return self.with_each([replace(one, lenses=own) for one, own in pairs])
+
+    def changed(
+        self, camera: int, change: Callable[[CameraEstimate], CameraEstimate]
+    ) -> "CameraEstimates":
+        """The estimates with that of one camera changed."""
+        each = list(self.each)
+        each[camera] = change(each[camera])
+        return self.with_each(each)
+
+    def frames_of(self, camera: int, num_frames: int) -> np.ndarray:
+        """Frames (F',) int64 that a camera took, of `num_frames`."""
+        return self.cameras.frames_of(camera, num_frames)
+
+
+def tracks_of_camera(tracks: Tracks, of_frame: Sequence[int], camera: int) -> Tracks:
+    """Tracks of what one camera observes: points that it sees twice or more.
+
+    Args:
+        of_frame: (F,) camera of each frame; () = there is one.
+    """
+    if not of_frame:
+        return tracks
+    own = np.array(of_frame)[tracks.frames] == camera
+    return tracks.of_observations(tracks.seen_twice(own))

@@ -25,7 +25,6 @@ MIN_OBSERVATIONS = 12  # of a refined frame: 24 residuals for the 6 unknowns of 
 _MIN_CORRELATION = 0.1  # least correlation of refined and coarse positions: with usual drift it is
 # .8
 _AT_ONCE = 1 << 16  # observations whose poses are held together: 9 MB
-_MAX_RESIDUAL_DEG = 10.0  # largest median residual: gates leave a tenth of a degree
 
 
 def assemble(
@@ -42,9 +41,7 @@ def assemble(
     """Carry the solution back to the trajectory's world and gather what exports need.
 
     Args:
-        adjustment: the last solution.
         covariances: (F, 6, 6) of its poses.
-        keypoints: of all frames.
         coarse: poses that define the world, unless they are interpolated; None = world and scale
             of the solution are those of the result.
         min_observations: frames with fewer count as unrefined.
@@ -70,7 +67,13 @@ def assemble(
     colors = np.zeros((len(lengths), 3), np.uint8)
     pieces = _observations(adjustment, keypoints, stretch[:, 3], colors)
     bearings, sigmas, errors, *origins = concatenated(pieces, scratch)
-    _require_small(errors)
+    median = float(np.degrees(np.median(errors))) if len(errors) else 0.0
+    if not median <= 10.0:  # largest median residual: gates leave a tenth of a degree
+        raise GsbaError(
+            f"the solution fell apart (median residual {median:.1f} deg): nothing is written; "
+            "check that frames and trajectory belong together, or refine without it "
+            "(--no-trajectory)"
+        )
     return Reconstruction(
         placed,
         covariances * stretch[:, :, None] * stretch[:, None, :],
@@ -92,18 +95,7 @@ def assemble(
 def _observations(
     adjustment: Solution, keypoints: Keypoints, scales: np.ndarray, colors: np.ndarray
 ) -> Iterator[tuple[np.ndarray, ...]]:
-    """Columns of the points' observations, those of some points at a time.
-
-    Args:
-        adjustment: the last solution.
-        keypoints: of all frames.
-        scales: (F,) units of the result per map unit, of each frame's map.
-        colors: (J, 3) uint8, the points' mean colors, which are written here.
-
-    Yields:
-        Bearings (O, 3), their standard deviations (O,) and angles (O,) to the points, radians; and
-        where rays have origins of their own, these, (O, 3) in units of the result.
-    """
+    """Bearings (O, 3), sigmas and angles (O,) to points, radians, origins; of some at a time."""
     landmarks, poses = adjustment.landmarks, adjustment.world_T_rigs
     nothing, none = np.empty((0, 3)), np.empty(0)
     yield (nothing, none, none, *([] if keypoints.origins_rig is None else [nothing]))
@@ -134,31 +126,13 @@ def world_scale(solved: Solution, result: Reconstruction) -> float:
     return lengths[1] / lengths[0] if lengths[0] > 0 else 1.0
 
 
-def _require_small(errors: np.ndarray) -> None:
-    """GsbaError for residuals (O,) in radians that cannot be those of a solution."""
-    median = float(np.degrees(np.median(errors))) if len(errors) else 0.0
-    if not median <= _MAX_RESIDUAL_DEG:
-        raise GsbaError(
-            f"the solution fell apart (median residual {median:.1f} deg): nothing is written; "
-            "check that frames and trajectory belong together, or refine without it "
-            "(--no-trajectory)"
-        )
-
-
 def _placed(
     adjustment: Solution, target_T_rigs: np.ndarray | None, known: np.ndarray, groups: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Poses, points, and factors (F, 6) of the standard deviations, each map in its own world.
+    """Poses, points, and factors (F, 6) of standard deviations, each map in its own world.
 
-    Args:
-        adjustment: the last solution.
-        target_T_rigs: (F, 4, 4) poses that define the worlds; None = all stay as they are.
-        known: (F,) bool, frames that say where their map goes; all, where fewer than two do.
-        groups: (F,) map of each frame, 0 = the largest; a smaller one that does not lie as its
-            coarse poses, at no scale, stays as it was solved.
-
-    Raises:
-        GsbaError: the largest does not.
+    Frames `known` (F,) say where their map goes; all do, where fewer than two are. Of `groups` (F,)
+    a map but the largest that does not lie as its coarse poses, at no scale, stays as solved.
     """
     poses, landmarks = adjustment.world_T_rigs, adjustment.landmarks
     placed, stretch = np.empty_like(poses), np.ones((len(poses), 6))

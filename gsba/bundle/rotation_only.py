@@ -1,9 +1,5 @@
-"""A camera that turns but never moves: rotations alone, and no points.
-
-Without parallax a point is a direction. Each track has one, eliminated as the weighted mean of its
-rays; what remains is a problem of the frames' rotations, solved by Gauss-Newton under a robust
-loss. Frames far apart in time are matched too, since all see the same: rotations do not drift.
-"""
+"""A camera that turns but never moves: rotations alone, by Gauss-Newton under a robust loss, each
+track's direction eliminated as the weighted mean of its rays."""
 
 import logging
 from dataclasses import replace
@@ -18,8 +14,6 @@ from gsba.types import CoarsePoses, Keypoints, PoseStatus, Reconstruction, Solut
 logger = logging.getLogger(__name__)
 
 _ITERATIONS = 30
-_CONVERGED = 1e-9  # radians
-_LOSS_SIGMAS = 2.0  # Cauchy
 _OUTLIER_SIGMAS = 10.0  # of the noise, scale of the loss at the start
 _COLUMNS = 384  # columns of the inverse computed at a time
 
@@ -36,7 +30,6 @@ def refine(
 
     Args:
         found: which keypoints show one direction; some may be false.
-        keypoints: of all frames.
         world_T_rigs: (F, 4, 4) rotations right but for the drift of a chain; positions are kept.
         coarse: poses that define the world.
         min_observations: frames with fewer count as unrefined.
@@ -62,7 +55,6 @@ def solve(
     Args:
         world_R_rigs: (F, 3, 3) to start from; the first is kept.
         found: which keypoints show one direction; some may be false.
-        keypoints: of all frames.
 
     Returns:
         (F, 3, 3) rotations; their covariances (F, 3, 3) in the rig frame, radians squared, with
@@ -81,17 +73,24 @@ def solve(
         residuals = np.einsum("oij,oj->oi", bases, rays) / sigmas[:, None]
         lengths = np.linalg.norm(residuals, axis=1)
         noise = max(float(np.median(lengths)) / 1.1774, 1e-9)  # of a Rayleigh distribution
-        weights = 1 / (1 + (lengths / (_LOSS_SIGMAS * wide * noise)) ** 2)
+        weights = 1 / (1 + (lengths / (2.0 * wide * noise)) ** 2)  # Cauchy
         system, gradient = _system(rotations, bearings, bases, residuals, sigmas, weights, found)
         step = _solved(system, -gradient[3:, None])[:, 0]
         turns = Rotation.from_rotvec(np.concatenate([np.zeros(3), step]).reshape(num, 3))
         rotations = rotations @ turns.as_matrix()
-        if np.abs(step).max() < _CONVERGED and wide == 1:
+        if np.abs(step).max() < 1e-9 and wide == 1:  # radians
             break
         wide = max(0.5 * wide, 1.0)
     covariances = np.zeros((num, 3, 3))
     if system is not None:
-        covariances[1:] = noise**2 * _diagonal_blocks(system)
+        size = system.shape[0]
+        blocks = np.empty((size // 3, 3, 3))
+        for first in range(0, size, _COLUMNS):
+            last = min(first + _COLUMNS, size)
+            columns = _solved(system, np.eye(size, last - first, -first))
+            for n in range(first // 3, last // 3):
+                blocks[n] = columns[3 * n : 3 * n + 3, 3 * n - first : 3 * n + 3 - first]
+        covariances[1:] = noise**2 * blocks
         linearised = found, bearings, bases, residuals, weights / sigmas
         covariances *= _excess(rotations, sigmas, noise, linearised)[:, None, None]
     used = np.bincount(found.frames[weights > 0.1], minlength=num)
@@ -152,15 +151,7 @@ def _excess(
     """Factors (F,), at least 1, by which covariances of rotations grow as residuals of a region of
     the sphere are alike: those of a hand that moves are the parallax of what is seen there.
 
-    The variance that sums of residuals over regions give (the cluster-robust estimator of Liang and
-    Zeger, Biometrika 1986) relative to that of independent ones.
-
-    Args:
-        rotations: (F, 3, 3) solved.
-        sigmas: (O,) of the observations, radians.
-        noise: their factor.
-        linearised: tracks, bearings (O, 3), bases (O, 2, 3), residuals (O, 2) in sigmas, and
-            weights over sigmas (O,), of the last iteration.
+    The cluster-robust estimator of Liang and Zeger, Biometrika 1986, relative to the usual one.
     """
     found, bearings, bases, residuals, pulls = linearised
     axes = np.cross(np.eye(3)[None], bearings[:, None, :])
@@ -185,15 +176,3 @@ def _solved(system, right: np.ndarray) -> np.ndarray:
 
     damping = 1e-9 * float(np.mean(system.diagonal())) + 1e-12
     return splu((system + damping * identity(system.shape[0])).tocsc()).solve(right)
-
-
-def _diagonal_blocks(system) -> np.ndarray:
-    """The 3x3 blocks (N, 3, 3) on the diagonal of a sparse matrix's inverse."""
-    size = system.shape[0]
-    blocks = np.empty((size // 3, 3, 3))
-    for first in range(0, size, _COLUMNS):
-        last = min(first + _COLUMNS, size)
-        columns = _solved(system, np.eye(size, last - first, -first))
-        for n in range(first // 3, last // 3):
-            blocks[n] = columns[3 * n : 3 * n + 3, 3 * n - first : 3 * n + 3 - first]
-    return blocks

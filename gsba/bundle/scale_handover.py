@@ -1,10 +1,7 @@
-"""Transfer of the scale from each frame of a map to the next.
+"""Transfer of the scale from each frame to the next, by points seen from both sides of a step.
 
-Along a path the scale is handed on by points that are seen from several places before a step, and
-from several behind it. Both sides triangulate such a point by themselves. Where they disagree on
-the distances of most, or few such points are left, as at a door, all that lies behind may be larger
-or smaller. Covariances assume that observations are right within their noise, and so do not tell of
-few points that err together: the scatter of distances does.
+Both sides triangulate such a point by themselves. Covariances do not tell of few points that err
+together: the scatter of distances does.
 """
 
 from collections.abc import Iterator
@@ -31,7 +28,6 @@ def scale_changes(result: Reconstruction, recordings: np.ndarray) -> np.ndarray:
     inf = too few points are seen by both sides; NaN = a side has one frame.
 
     Args:
-        result: one map.
         recordings: (F,) number of each frame's recording.
     """
     found = np.full(max(len(result.world_T_rigs) - 1, 0), np.nan)
@@ -45,8 +41,7 @@ def scale_changes(result: Reconstruction, recordings: np.ndarray) -> np.ndarray:
 
 
 def _sides(positions: np.ndarray, recordings: np.ndarray) -> Iterator[tuple[int, int, int]]:
-    """Steps with two frames and more on both sides: the step, the first frame of the side before
-    it, and the frame after the last one of the side behind it."""
+    """Steps with two frames and more on both sides: step, first before, end behind."""
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     walked = steps[steps > _STANDING_RATIO * np.sqrt(np.mean(steps**2))] if len(steps) else steps
     if not len(walked):
@@ -66,13 +61,7 @@ def _sides(positions: np.ndarray, recordings: np.ndarray) -> Iterator[tuple[int,
 def _change(
     result: Reconstruction, before: np.ndarray, behind: np.ndarray, middle: np.ndarray
 ) -> float:
-    """Change of scale that may hide between two sides.
-
-    Args:
-        result: the map.
-        before, behind: observations of the frames of either side.
-        middle: (3,) place between them, from where distances count.
-    """
+    """Change of scale that may hide between two sides' observations; distances from `middle`."""
     several = []
     for rows in (before, behind):
         names, counts = np.unique(result.observation_points[rows], return_counts=True)
@@ -102,8 +91,7 @@ def _change(
 def _triangulated(
     result: Reconstruction, rows: np.ndarray, points: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Places (N, 3) of points (N,), ascending, by some observations alone, and their covariances
-    (N, 3, 3): NaN where the rays are parallel."""
+    """Places (N, 3) of points (N,) by some observations alone, and covariances; NaN if parallel."""
     index = np.searchsorted(points, result.observation_points[rows])
     index[index == len(points)] = 0
     own = points[index] == result.observation_points[rows]

@@ -1,11 +1,8 @@
 """Self-calibration of raw lenses: focal lengths, distortion, rotations of all but the front one.
 
-Found from a map as other parameters that all frames share, beside the lenses' centre. What differs
-from a calibration is believed where every part of the sequence gains by what the others give. Plain
-lenses of unknown make are only a start, with priors as wide as such lenses differ: what is found is
-taken where observations determine the focal lengths, in short sequences too. The front lens's axes
-are the rig's, as it was calibrated: a turn of all lenses is one of the poses. Parameters (K,) are
-those of the front lens but its rotation, then all of each other lens.
+Plain lenses of unknown make are only a start, with priors as wide as such lenses differ: what is
+found is taken where observations determine the focal lengths. Parameters (K,) are those of the
+front lens but its rotation, then all of each other lens.
 """
 
 import logging
@@ -15,10 +12,10 @@ import numpy as np
 
 from factors.bearing import tangent_basis
 from gsba.bundle.adjustment import AdjustmentContext
-from gsba.bundle.cross_validation import cross_validate
 from gsba.bundle.shared_parameters import (
     PARTS,
     SharedModel,
+    cross_validate,
     models_of,
     summed,
     whole_model_of,
@@ -70,12 +67,8 @@ def estimate(
     """Calibrate lenses by a map, poses, points and lens centres adjusted with them.
 
     Args:
-        landmarks: points and their observations.
         keypoints: of these, as rays under the lenses so far.
         shown: (N, 3) directions of the keypoints in their panoramas.
-        solved: the map's poses, solved under these, and the noise of its observations.
-        so_far: lenses of raw pairs.
-        context: priors, loss, settings.
         nominal: whether the lenses so far are plain ones of unknown make, not calibrated.
     """
     frames, num = keypoints.frames(), num_parameters(so_far.num_lenses)
@@ -120,14 +113,12 @@ def estimate(
 def _of_nominal(
     system: SharedModel, so_far: Lenses, off: np.ndarray, counts: Counts
 ) -> SelfCalibration:
-    """Calibration of plain lenses of unknown make, where focal lengths are determined.
-
-    Args:
-        system: of all observations.
-        off: (K,) how far lenses are from the plain ones.
-    """
+    """Calibration of plain lenses of unknown make, where focal lengths are determined."""
     num = len(off)
-    found, sigmas = _step([system], off), _sigmas(system, num)
+    pull = _pull(len(system.gradient), np.zeros(num))
+    information = system.curvature * system.hessian + np.diag(pull)
+    information += 1e-12 * np.trace(information) * np.eye(len(information))
+    found, sigmas = _step([system], off), np.sqrt(np.diagonal(np.linalg.inv(information))[:num])
     loose, focals = undetermined(sigmas), focals_of(so_far.num_lenses)
     focal = 100 * sigmas[focals]
     reason = ""
@@ -202,7 +193,6 @@ def by_lenses(
     Args:
         bearings_rig: (O, 3) of the rays.
         shown: (O, 3) directions in the panoramas.
-        lenses: of raw pairs.
         residuals: (O, 2) of the bearings, from observed to predicted; None = taken as 0.
     """
     out = np.zeros((len(shown), 2, num_parameters(lenses.num_lenses)))
@@ -270,20 +260,11 @@ def _step(systems: list[SharedModel], off: np.ndarray) -> np.ndarray:
     return -np.linalg.solve(total.curvature * total.hessian + np.diag(pull), gradient)
 
 
-def _sigmas(system: SharedModel, num: int) -> np.ndarray:
-    """Standard deviations (K,) of lenses, adjusted with centres, poses and points."""
-    pull = _pull(len(system.gradient), np.zeros(num))
-    information = system.curvature * system.hessian + np.diag(pull)
-    information += 1e-12 * np.trace(information) * np.eye(len(information))
-    return np.sqrt(np.diagonal(np.linalg.inv(information))[:num])
-
-
 def _shown(values: np.ndarray) -> str:
     return " and ".join(f"{value:+.3f}" for value in values)
 
 
 def _centre_step(systems: list[SharedModel], num: int) -> np.ndarray:
-    """Change (3 (L - 1),) of the centres that minimises the parts' cost, K parameters of lenses
-    held."""
+    """Change (3 (L - 1),) of the centres that minimises the parts' cost, K lens parameters held."""
     total = summed([each.of(slice(num, None)) for each in systems])
     return -np.linalg.solve(total.curvature * total.hessian, total.gradient)

@@ -1,16 +1,13 @@
-"""Parameters that all frames share: models of each part of the sequence, poses and points adjusted.
-
-A part's cost is a quadratic function of the parameters once its points and poses are eliminated.
-Sums of other parts' models give parameters, and the part itself says what they are worth: they are
-believed only if they predict what they were not found from.
-"""
+"""Parameters that all frames share: quadratic models of the cost of each part of a sequence, poses
+and points eliminated. Others' parameters are believed where they predict a part."""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from typing import Protocol, TypeVar
 
 import numpy as np
-from scipy.sparse import bsr_array, csr_array
+from scipy.sparse import bsr_array
 
 from factors.bearing import bearing_residuals, tangent_basis
 from factors.cholesky import BlockCholesky
@@ -196,8 +193,6 @@ def model_of(
     Args:
         landmarks: points, moved to their best first, and their observations.
         keypoints: where these really point.
-        solved: poses, and the noise of observations.
-        context: families, loss.
         by_shared: Jacobian (O, 2, K) of bearings' residuals, from the rows (O,) of keypoints, the
             Jacobian (O, 2, 3) by where each ray starts, and the residuals (O, 2).
     """
@@ -215,17 +210,6 @@ def _without_poses(system: LinearSystem, num_frames: int, curvature: float) -> S
     num = 6 * num_frames
     of_poses, across = system.hessian[:num, :num], system.hessian[:num, num:].toarray()
     right = np.column_stack([across, system.gradient[:num]])
-    coupled = right.T @ _solve_poses(of_poses, right)
-    return SharedModel(
-        system.cost - 0.5 * float(coupled[-1, -1]),
-        system.gradient[num:] - coupled[:-1, -1],
-        system.hessian[num:, num:].toarray() - coupled[:-1, :-1],
-        curvature,
-    )
-
-
-def _solve_poses(of_poses: csr_array, right: np.ndarray) -> np.ndarray:
-    """Poses (6 F, K) that a damped Hessian takes to as many right sides."""
     blocks = bsr_array(of_poses, blocksize=(6, 6))
     rows = np.repeat(np.arange(len(blocks.indptr) - 1), np.diff(blocks.indptr))
     own, upper = rows == blocks.indices, rows < blocks.indices
@@ -236,7 +220,15 @@ def _solve_poses(of_poses: csr_array, right: np.ndarray) -> np.ndarray:
     cholesky = BlockCholesky(len(diagonal), np.column_stack([rows[upper], blocks.indices[upper]]))
     if not cholesky.factorize(diagonal, blocks.data[upper]):
         raise ArithmeticError("a damped Hessian of poses is not positive definite")
-    return cholesky.solve_all(right.T.reshape(-1, len(diagonal), 6)).reshape(right.T.shape).T
+    coupled = (
+        right.T @ cholesky.solve_all(right.T.reshape(-1, len(diagonal), 6)).reshape(right.T.shape).T
+    )
+    return SharedModel(
+        system.cost - 0.5 * float(coupled[-1, -1]),
+        system.gradient[num:] - coupled[:-1, -1],
+        system.hessian[num:, num:].toarray() - coupled[:-1, :-1],
+        curvature,
+    )
 
 
 def without_points(
@@ -249,8 +241,6 @@ def without_points(
     """Normal equations of bearings with the points eliminated.
 
     Args:
-        seen, tracks: the bearings.
-        num_frames: F.
         by_frame: Jacobian (O, 2, K) of residuals by K variables of their frames.
         by_shared: Jacobian (O, 2, S) by variables of all frames; None = there are none.
     """
@@ -268,9 +258,75 @@ def by_origin(
     """Jacobian (O, 2, 3) of residuals by the origin of rays, rig frame, and by their direction.
 
     Args:
-        seen: the residuals.
         world_R_rigs: (O, 3, 3) of their poses.
         bearings_rig: (O, 3) of their rays.
         inverse_stitch_radius: see `Lenses`.
     """
     return -seen.by_point @ world_R_rigs + inverse_stitch_radius * tangent_basis(bearings_rig)
+
+
+_MIN_GAIN_SIGMAS = 3.0  # least significant gain, in its standard deviations
+
+
+class SequencePart(Protocol):
+    """A part of the sequence, whose robust cost is a function of parameters."""
+
+    @property
+    def cost(self) -> float:
+        """The cost where all parameters are zero."""
+        ...
+
+    def gain(self, step: np.ndarray, /) -> float:
+        """Decrease of the cost from there by parameters."""
+        ...
+
+
+P = TypeVar("P", bound=SequencePart)
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Gains of parts by parameters that were found from the other parts."""
+
+    gains: np.ndarray  # (PARTS,) float64, decrease of each part's robust cost by the
+    # parameters of the other parts, beyond the baseline
+    shares: np.ndarray  # (PARTS,) float64, gains as shares of the cost that the baseline leaves
+
+    @property
+    def predicts(self) -> bool:
+        """True if the parameters surely predict parts that they were not found from."""
+        return predicts(self.gains)
+
+
+def cross_validate(
+    parts: Sequence[P],
+    candidate: Callable[[list[P]], np.ndarray],
+    baseline: Callable[[list[P]], np.ndarray] | None = None,
+) -> Verdict:
+    """Predict each part of a sequence by the others.
+
+    Args:
+        candidate: parameters that some parts give.
+        baseline: the same by the simpler model that the candidate is compared with; None = all
+            parameters are zero.
+    """
+    gains, costs = np.zeros(len(parts)), np.array([part.cost for part in parts])
+    for p, part in enumerate(parts):
+        others = [*parts[:p], *parts[p + 1 :]]
+        before = 0.0 if baseline is None else part.gain(baseline(others))
+        gains[p] = part.gain(candidate(others)) - before
+        costs[p] -= before
+    return Verdict(gains, gains / costs)
+
+
+def predicts(gains: np.ndarray) -> bool:
+    """True if gains (PARTS,) in log-likelihood are surely more than chance.
+
+    A gain of G by parameters that are true has a standard deviation of sqrt(2 G): the residuals'
+    noise along their change. The sum of all parts must exceed none by several of these, and no part
+    may surely lose.
+    """
+    total = float(gains.sum())
+    sigma = np.sqrt(2 * max(total, 0.0))
+    least = -_MIN_GAIN_SIGMAS * sigma / np.sqrt(len(gains))
+    return bool(total > _MIN_GAIN_SIGMAS * sigma and np.all(gains > least))

@@ -2,6 +2,7 @@
 
 import logging
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,15 +11,19 @@ from factors.bearing import tangent_basis
 from factors.sphere_field import SphereField, degrees_of, harmonics, num_harmonics
 from gsba.bundle import adjustment
 from gsba.bundle.adjustment import AdjustmentContext
-from gsba.bundle.cross_validation import Verdict, cross_validate
 from gsba.bundle.observation_noise import with_scaled_noise
-from gsba.bundle.shared_parameters import PARTS, BySharedParameters, SharedModel, models_of
+from gsba.bundle.shared_parameters import (
+    PARTS,
+    BySharedParameters,
+    SharedModel,
+    cross_validate,
+    models_of,
+)
 from gsba.camera.cameras import ONE_CAMERA, Cameras
 from gsba.camera.rig import CubeRig, owner_faces
 from gsba.types import Counts, Keypoints, Round, Sighted, Solution
 
 _MIN_GAIN = 0.03  # share by which the field must lower the robust cost of held-out observations
-_ROUNDS = 2  # estimates of the field, each with a bundle adjustment
 
 logger = logging.getLogger(__name__)
 
@@ -66,7 +71,6 @@ def with_noise_of(
     """Keypoints whose noise is scaled as in others of the same rows, where they were corrected.
 
     Args:
-        keypoints, calibrated: these, and the others.
         scratch: folder on the disk that takes the noise of many; None = it is in memory.
     """
     factors = calibrated.sigmas_rad / keypoints.sigmas_rad
@@ -92,10 +96,6 @@ def estimate(
     Args:
         sighted: candidate tracks and their keypoints, as observed.
         keypoints: the same with the noise they turned out to have.
-        before: the map solved with `field`.
-        field: so far.
-        context: priors, limits, loss, solver.
-        lenses: that see the observations.
     """
     settings = context.settings
     chosen = settings.stitching
@@ -107,12 +107,21 @@ def estimate(
         systems, counts = _systems(now, most, max_degree, context, lenses)
         if not systems:
             return replace(now, counts=counts)
-        degree, spread, gains = _choose(systems, max_degree)
+        # the smoothest field that predicts parts well
+        tried = [
+            (d, spread, cross_validate(systems, partial(_fitted, degree=d, spread=spread)))
+            for spread in _PRIOR_SIGMAS_RAD
+            for d in range(1, max_degree + 1)
+        ]
+        best = max(verdict.gains.sum() for _, _, verdict in tried)
+        enough = min(_MIN_GAIN_SHARE * best, best)
+        degree, spread, verdict = next(each for each in tried if each[2].gains.sum() >= enough)
+        gains = verdict.gains
         costs = np.array([part.cost for part in systems])
         now = replace(now, degree=degree, part_gains=gains / costs, counts=counts)
         if gains.sum() < least * costs.sum() or np.any(gains <= 0):
             return now
-    for number in range(_ROUNDS):
+    for number in range(2):  # estimates of the field, each with a bundle adjustment
         if number:
             systems, _ = _systems(now, _MAX_OBSERVATIONS, chosen.max_degree, context, lenses)
         field = SphereField(_fitted(systems, now.degree, spread))
@@ -153,19 +162,3 @@ def _fitted(systems: list[SharedModel], degree: int, spread: float) -> np.ndarra
     gradient = sum(part.gradient[:num] for part in systems)
     hessian = sum((part.hessian[:num, :num] for part in systems), np.diag(pull))
     return -np.linalg.solve(hessian, gradient)
-
-
-def _choose(systems: list[SharedModel], max_degree: int) -> tuple[int, float, np.ndarray]:
-    """Degree and spread of the smoothest field that predicts parts well, and the parts' gains."""
-    tried = [
-        (degree, spread, _validated(systems, degree, spread).gains)
-        for spread in _PRIOR_SIGMAS_RAD
-        for degree in range(1, max_degree + 1)
-    ]
-    best = max(gains.sum() for _, _, gains in tried)
-    return next(trial for trial in tried if trial[2].sum() >= min(_MIN_GAIN_SHARE * best, best))
-
-
-def _validated(systems: list[SharedModel], degree: int, spread: float) -> Verdict:
-    """Verdict on fields of a degree and a spread."""
-    return cross_validate(systems, lambda others: _fitted(others, degree, spread))

@@ -67,8 +67,7 @@ def build(
 
 
 def _edges(matches: Sequence[Matches], first_node: np.ndarray) -> Iterator[np.ndarray]:
-    """Nodes (M, 2) of all matches in their order, some at a time; a node is a keypoint of all
-    frames'."""
+    """Nodes (M, 2), keypoints of all frames, of all matches in their order, some at a time."""
     for part in matches:
         for some in slices(len(part.keypoints), _AT_ONCE):
             first = int(np.searchsorted(part.offsets, some.start, side="right")) - 1

@@ -1,5 +1,6 @@
 """The trajectory prior: a family of relative priors, weak absolute ones, and a held first pose."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import gtsam
@@ -9,14 +10,12 @@ from gsba.bundle.families import Family, MapSnapshot, digest_of
 from gsba.bundle.pose_variables import X
 from gsba.config import PriorSettings
 from gsba.geometry import inverse
-from gsba.types import StepNoise
+from gsba.types import GyroConstraints, StepNoise
 
 # Noise of a frame's pose in the trajectory's world, which only holds frames that nothing else does.
 _ABSOLUTE_DEG = 30.0
-_ABSOLUTE_POSITION = 0.3  # part of the trajectory's extent
 LOSS_SIGMAS = 2.0  # Cauchy scale: limits the pull of wrong steps
 _WEAKER = 10.0  # times the noise of absolute priors, where another family holds the gauge
-_FIRST_SIGMA = 1e-6  # of the held first pose: radians, and part of the extent
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,8 +53,15 @@ class TrajectoryPrior(Family):
         extent = max(float(np.linalg.norm(np.ptp(world_T_rigs[:, :3, 3], axis=0))), typical)
         graph = gtsam.NonlinearFactorGraph()
         self._add_steps(graph, np.maximum(lengths, typical))
-        self._add_frames(graph, extent, 1.0 if held else _WEAKER)
-        sigma = _FIRST_SIGMA if held else 1.0
+        weaker = 1.0 if held else _WEAKER
+        model = self._robust(
+            weaker * np.deg2rad(_ABSOLUTE_DEG),
+            weaker * 0.3 * extent,  # part of the trajectory's extent
+        )
+        for f, world_T_rig in enumerate(self.world_T_rigs):
+            if self.false_frames is None or not self.false_frames[f]:
+                graph.add(gtsam.PriorFactorPose3(X(f), gtsam.Pose3(world_T_rig), model))
+        sigma = 1e-6 if held else 1.0  # of the held first pose: radians, and part of the extent
         noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([sigma] * 3 + [sigma * extent] * 3))
         fixed = gtsam.Pose3(world_T_rigs[0] if self.first is None else self.first)
         graph.add(gtsam.PriorFactorPose3(X(0), fixed, noise))
@@ -66,7 +72,9 @@ class TrajectoryPrior(Family):
         settings, noise = self.settings, self.noise
         steps = inverse(self.world_T_rigs[:-1]) @ self.world_T_rigs[1:]
         kept = np.ones(len(steps), bool) if self.false_steps is None else ~self.false_steps
-        in_a_row = _in_a_row(kept)
+        # steps in a gapless run drift alike
+        runs = np.cumsum(np.diff(kept.astype(int), prepend=0) != 0)
+        in_a_row = np.bincount(runs, minlength=1)[runs] if len(kept) else runs
         for f in np.flatnonzero(kept).tolist():
             length = float(lengths[f])
             if noise is None:
@@ -78,16 +86,6 @@ class TrajectoryPrior(Family):
                 model = gtsam.noiseModel.Robust.Create(self._loss(), gaussian)
             graph.add(gtsam.BetweenFactorPose3(X(f), X(f + 1), gtsam.Pose3(steps[f]), model))
 
-    def _add_frames(self, graph: gtsam.NonlinearFactorGraph, extent: float, weaker: float) -> None:
-        """Add absolute priors of frames, `weaker` times as noisy as in the settings."""
-        model = self._robust(
-            weaker * np.deg2rad(_ABSOLUTE_DEG),
-            weaker * _ABSOLUTE_POSITION * extent,
-        )
-        for f, world_T_rig in enumerate(self.world_T_rigs):
-            if self.false_frames is None or not self.false_frames[f]:
-                graph.add(gtsam.PriorFactorPose3(X(f), gtsam.Pose3(world_T_rig), model))
-
     def _robust(self, rotation: float, translation: float) -> gtsam.noiseModel.Base:
         """Noise of a pose, radians and map units, under the loss."""
         sigmas = np.array([rotation] * 3 + [translation] * 3)
@@ -96,12 +94,6 @@ class TrajectoryPrior(Family):
 
     def _loss(self) -> gtsam.noiseModel.mEstimator.Base:
         return gtsam.noiseModel.mEstimator.Cauchy.Create(LOSS_SIGMAS)
-
-
-def _in_a_row(kept: np.ndarray) -> np.ndarray:
-    """For each step (N,), the number of kept ones in its gapless run: these drift alike."""
-    runs = np.cumsum(np.diff(kept.astype(int), prepend=0) != 0)
-    return np.bincount(runs, minlength=1)[runs] if len(kept) else runs
 
 
 def _step_covariance(f_T_next: np.ndarray, length: float, noise: StepNoise) -> np.ndarray:
@@ -114,3 +106,78 @@ def _step_covariance(f_T_next: np.ndarray, length: float, noise: StepNoise) -> n
     if not ahead.any():
         covariance[3:, 3:] = (length * noise.length) ** 2 * np.eye(3)
     return covariance
+
+
+_SIGMA = 1e-7  # of a held pose: radians, and part of the extent of all held poses
+
+
+@dataclass(frozen=True, slots=True)
+class HeldPoses(Family):
+    """Priors so tight that images do not move the poses."""
+
+    name = "held_poses"
+
+    rows: np.ndarray  # (H,) int64, frames
+    world_T_rigs: np.ndarray  # (H, 4, 4) float64, their poses
+
+    @property
+    def digest(self) -> str:
+        """Digest of the frames and poses."""
+        return digest_of(self.rows, self.world_T_rigs)
+
+    def graph(self, snapshot: MapSnapshot) -> gtsam.NonlinearFactorGraph:
+        """A prior on each pose."""
+        positions = self.world_T_rigs[:, :3, 3]
+        extent = max(float(np.linalg.norm(np.ptp(positions, axis=0))), 1e-12)
+        sigmas = np.array([_SIGMA] * 3 + [_SIGMA * extent] * 3)
+        noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+        graph = gtsam.NonlinearFactorGraph()
+        for f, world_T_rig in zip(self.rows.tolist(), self.world_T_rigs, strict=True):
+            graph.add(gtsam.PriorFactorPose3(X(f), gtsam.Pose3(world_T_rig), noise))
+        return graph
+
+
+_FREE_EXTENTS = 1e4  # sigma of a step's translation, extents of the map: none is measured
+_MAX_RESIDUAL_SIGMAS = 3.0  # of a step; beyond it, the robust loss suppresses the step
+
+
+@dataclass(frozen=True, slots=True)
+class GyroTurns(Family):
+    """Rotations between neighbours that a gyro measured, under a Cauchy loss."""
+
+    name = "gyro"
+
+    turning: GyroConstraints  # steps and how well they are known
+    extent: float  # of the map, map units
+    loss_sigmas: float  # scale of the loss, standard deviations
+
+    @property
+    def digest(self) -> str:
+        """Digest of the steps and their noise."""
+        turning = self.turning
+        measured = turning.steps, turning.step_sigmas, turning.rates, turning.rate_sigma
+        return digest_of(*measured, self.extent, self.loss_sigmas)
+
+    def graph(self, snapshot: MapSnapshot) -> gtsam.NonlinearFactorGraph:
+        """A relative prior for each step that was measured."""
+        graph, turning = gtsam.NonlinearFactorGraph(), self.turning
+        free = _FREE_EXTENTS * max(self.extent, 1e-9)
+        loss = gtsam.noiseModel.mEstimator.Cauchy.Create(self.loss_sigmas)
+        for f in np.flatnonzero(np.isfinite(turning.step_sigmas)).tolist():
+            sigmas = np.array([turning.step_sigmas[f]] * 3 + [free] * 3)
+            gaussian = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+            model = gtsam.noiseModel.Robust.Create(loss, gaussian)
+            step = gtsam.Pose3(gtsam.Rot3.Expmap(turning.steps[f]), np.zeros(3))
+            graph.add(gtsam.BetweenFactorPose3(X(f), X(f + 1), step, model))
+        return graph
+
+    def report(self, snapshot: MapSnapshot) -> Mapping[str, float]:
+        """Share of all steps whose refined rotation agrees with the gyro."""
+        from scipy.spatial.transform import Rotation
+
+        rotations, turning = snapshot.world_T_rigs[:, :3, :3], self.turning
+        found = Rotation.from_matrix(np.swapaxes(rotations[:-1], 1, 2) @ rotations[1:])
+        off = (found.inv() * Rotation.from_rotvec(turning.steps)).as_rotvec()
+        limits = _MAX_RESIDUAL_SIGMAS * np.sqrt(3) * turning.step_sigmas
+        near = np.linalg.norm(off, axis=1) < limits
+        return {"steps_used": float(np.mean(near & np.isfinite(turning.step_sigmas)))}

@@ -1,18 +1,176 @@
 """Scene points from bearings and poses, robust to false observations in a track."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
+from factors.compiled import kernel_and_part
 from factors.threads import balanced_ranges, run_in_threads
-from gsba.bundle._triangulation_kernels import cast_rays, triangulate_tracks
 from gsba.bundle.tracks import map_runs
 from gsba.config import TriangulateSettings
 from gsba.disk import concatenated
 from gsba.geometry import moved_to
 from gsba.memory import release_mapped_files
 from gsba.types import Counts, Keypoints, Landmarks, Reconstruction, Tracks
+
+_kernel, _part = kernel_and_part()
+_MAX_HYPOTHESES = 12  # pairs of observations tried per track
+
+
+@_kernel
+def cast_rays(first, last, world_T_rigs, frames, bearings, origins, rays, centres):
+    """Directions and starts in the world of the rays of observations first to last - 1.
+
+    `origins` (O, 3) in the rig's frame, or (0, 3) if all rays start in the rig's centre.
+    """
+    for o in range(first, last):
+        f = frames[o]
+        for i in range(3):
+            ray, centre = 0.0, world_T_rigs[f, i, 3]
+            for k in range(3):
+                ray += world_T_rigs[f, i, k] * bearings[o, k]
+            if len(origins):
+                turned = 0.0
+                for k in range(3):
+                    turned += world_T_rigs[f, i, k] * origins[o, k]
+                centre += turned
+            rays[o, i], centres[o, i] = ray, centre
+
+
+@_kernel
+def triangulate_tracks(
+    starts, first, last, rays, centres, sigmas, gate, points, inliers, parallaxes
+):
+    """Points, inlier flags and largest parallax (radians) of tracks first to last - 1.
+
+    Rays are in the world frame. A hypothesis that all observations support ends the search.
+    """
+    best = np.empty(3)
+    for j in range(first, last):
+        lo, hi = starts[j], starts[j + 1]
+        best_count, best_cost = 0, np.inf
+        tried = 0
+        for step in range(hi - lo - 1, 0, -1):  # wide pairs of the track first
+            for a in range(lo, hi - step):
+                if tried == _MAX_HYPOTHESES or best_count == hi - lo:
+                    break
+                tried += 1
+                x, y, z, ok = _midpoint(rays, centres, a, a + step)
+                if not ok:
+                    continue
+                count, cost = 0, 0.0
+                for o in range(lo, hi):
+                    error = _squared_error(rays, centres, o, x, y, z) / sigmas[o] ** 2
+                    if error < gate * gate:
+                        count += 1
+                        cost += error
+                if count > best_count or (count == best_count and cost < best_cost):
+                    best_count, best_cost = count, cost
+                    best[0], best[1], best[2] = x, y, z
+        if best_count < 2:
+            continue
+        for _ in range(3):
+            _gauss_newton_step(rays, centres, sigmas, lo, hi, best, gate)
+        x, y, z = best[0], best[1], best[2]
+        cosine = 1.0
+        for o in range(lo, hi):
+            if _squared_error(rays, centres, o, x, y, z) < (gate * sigmas[o]) ** 2:
+                inliers[o] = 1
+                for p in range(lo, o):
+                    if inliers[p]:
+                        cosine = min(cosine, _cosine(centres, o, p, x, y, z))
+        points[j, 0], points[j, 1], points[j, 2] = x, y, z
+        parallaxes[j] = np.arccos(max(cosine, -1.0))
+
+
+@_part
+def _squared_error(rays, centres, o, x, y, z):
+    """Squared tangent of the angle between ray o and the way to a point; inf behind."""
+    x, y, z = x - centres[o, 0], y - centres[o, 1], z - centres[o, 2]
+    u, v, w = rays[o, 0], rays[o, 1], rays[o, 2]
+    along = u * x + v * y + w * z
+    if along <= 0:
+        return np.inf
+    a, b, c = v * z - w * y, w * x - u * z, u * y - v * x
+    return (a * a + b * b + c * c) / (along * along)
+
+
+@_part
+def _cosine(centres, o, p, x, y, z):
+    """Cosine of the angle at a point between the ways to two centres."""
+    a, b, c = x - centres[o, 0], y - centres[o, 1], z - centres[o, 2]
+    d, e, f = x - centres[p, 0], y - centres[p, 1], z - centres[p, 2]
+    squares = (a * a + b * b + c * c) * (d * d + e * e + f * f)
+    return (a * d + b * e + c * f) / np.sqrt(max(squares, 1e-300))
+
+
+@_part
+def _midpoint(rays, centres, a, b):
+    """Point halfway between two rays where they come closest; False if parallel or behind."""
+    ux, uy, uz = rays[a, 0], rays[a, 1], rays[a, 2]
+    vx, vy, vz = rays[b, 0], rays[b, 1], rays[b, 2]
+    ax, ay, az = centres[a, 0], centres[a, 1], centres[a, 2]
+    wx, wy, wz = centres[b, 0] - ax, centres[b, 1] - ay, centres[b, 2] - az
+    c = ux * vx + uy * vy + uz * vz
+    denominator = 1 - c * c
+    if denominator < 1e-10:
+        return ax, ay, az, False
+    uw, vw = ux * wx + uy * wy + uz * wz, vx * wx + vy * wy + vz * wz
+    s, t = (uw - c * vw) / denominator, (c * uw - vw) / denominator
+    x = ax + 0.5 * (s * ux + wx + t * vx)
+    y = ay + 0.5 * (s * uy + wy + t * vy)
+    z = az + 0.5 * (s * uz + wz + t * vz)
+    return x, y, z, s > 0 and t > 0
+
+
+@_part
+def _gauss_newton_step(rays, centres, sigmas, lo, hi, point, gate):
+    """Move a point by one step on the sines of the angles of the observations within the gate."""
+    xx = xy = xz = yy = yz = zz = gx = gy = gz = 0.0
+    for o in range(lo, hi):
+        if (
+            _squared_error(rays, centres, o, point[0], point[1], point[2])
+            >= (gate * sigmas[o]) ** 2
+        ):
+            continue
+        dx, dy, dz = point[0] - centres[o, 0], point[1] - centres[o, 1], point[2] - centres[o, 2]
+        u, v, w = rays[o, 0], rays[o, 1], rays[o, 2]
+        weight = 1 / (sigmas[o] ** 2 * max(dx * dx + dy * dy + dz * dz, 1e-24))
+        along = u * dx + v * dy + w * dz
+        gx += weight * (dx - along * u)
+        gy += weight * (dy - along * v)
+        gz += weight * (dz - along * w)
+        xx += weight * (1 - u * u)
+        yy += weight * (1 - v * v)
+        zz += weight * (1 - w * w)
+        xy -= weight * u * v
+        xz -= weight * u * w
+        yz -= weight * v * w
+    # Cholesky factor of the Hessian, its diagonal raised a little
+    a = np.sqrt(xx * (1 + 1e-9))
+    if not a > 0:
+        return
+    b, c = xy / a, xz / a
+    d = yy * (1 + 1e-9) - b * b
+    if not d > 0:
+        return
+    d = np.sqrt(d)
+    e = (yz - b * c) / d
+    f = zz * (1 + 1e-9) - c * c - e * e
+    if not f > 0:
+        return
+    f = np.sqrt(f)
+    p = gx / a
+    q = (gy - b * p) / d
+    r = (gz - c * p - e * q) / f
+    z = r / f
+    y = (q - e * z) / d
+    x = (p - b * y - c * z) / a
+    point[0] -= x
+    point[1] -= y
+    point[2] -= z
+
 
 _IN_MEMORY = 1 << 18  # observations of which the tracks are in memory in any case
 _NONE = Counts(0, 0, "tracks")
@@ -35,13 +193,10 @@ def triangulate(
     midpoint, then Gauss-Newton on tangent-plane residuals).
 
     Args:
-        tracks: candidate tracks.
         bearings_rig: (O, 3) bearings of the observations.
         sigmas_rad: (O,) their noise.
         world_T_rigs: (F, 4, 4) current poses.
         max_error_sigmas: gate on the angle between observation and point, in sigmas.
-        settings: limits on parallax and track length.
-        num_threads: that share the tracks.
         origins_rig: (O, 3) rig frame, where each ray starts; None = the rig's centre.
     """
     starts = np.searchsorted(tracks.points, np.arange(tracks.num_points + 1))
@@ -67,22 +222,15 @@ def triangulate(
     flat = ~short & (parallaxes < np.deg2rad(settings.min_parallax_deg))
     dropped = {"observations disagree": short, "parallax too small": flat}
     if origins_rig is not None:
-        inside = _within_camera(tracks, inliers > 0, points, centres, origins_rig)
+        distances = np.linalg.norm(points[tracks.points] - centres, axis=1)
+        near = (inliers > 0) & (distances < np.linalg.norm(origins_rig, axis=1))
+        inside = np.bincount(tracks.points, near, len(points)) > 0
         dropped["within the camera"] = inside & ~short & ~flat
     kept = ~np.any(list(dropped.values()), axis=0)
     survivors = tracks.of_observations(kept[tracks.points] & (inliers > 0))
     numbers = {reason: int(flag.sum()) for reason, flag in dropped.items()}
     counts = Counts(tracks.num_points, survivors.num_points, "tracks", numbers)
     return Landmarks(points[kept], survivors, counts)
-
-
-def _within_camera(
-    tracks: Tracks, seen: np.ndarray, points: np.ndarray, centres: np.ndarray, origins: np.ndarray
-) -> np.ndarray:
-    """Points (J,) nearer to a lens that has seen them than that is to the camera's middle."""
-    distances = np.linalg.norm(points[tracks.points] - centres, axis=1)
-    near = seen & (distances < np.linalg.norm(origins, axis=1))
-    return np.bincount(tracks.points, near, len(points)) > 0
 
 
 def place(
@@ -97,7 +245,6 @@ def place(
     """As `triangulate`, the observations being the tracks' own keypoints; some tracks at a time.
 
     Args:
-        tracks, keypoints, world_T_rigs, max_error_sigmas, settings, num_threads: see `triangulate`.
         scratch: folder on the disk that takes the points of very many tracks; None = they are in
             memory.
     """
@@ -122,17 +269,12 @@ def place(
     folder = scratch if len(tracks) > _IN_MEMORY else None
     points_world, points, frames, rows = concatenated(found(), folder)
     seen = Tracks(points, frames, rows, len(points_world))
-    return Landmarks(points_world, seen, _sum(counts))
-
-
-def _sum(parts: Sequence[Counts]) -> Counts:
-    """Counts of tracks added up."""
     dropped: dict[str, int] = {}
-    for part in parts:
+    for part in counts:
         for reason, number in part.dropped.items():
             dropped[reason] = dropped.get(reason, 0) + number
-    received, kept = sum(p.received for p in parts), sum(p.kept for p in parts)
-    return Counts(received, kept, "tracks", dropped)
+    received, kept = sum(p.received for p in counts), sum(p.kept for p in counts)
+    return Landmarks(points_world, seen, Counts(received, kept, "tracks", dropped))
 
 
 def points_under(reconstruction: Reconstruction, world_T_rigs: np.ndarray) -> np.ndarray:

@@ -1,10 +1,5 @@
-"""Calibrations of raw lenses, read from files.
-
-Takes JSON of our own form, whose rig keeps its axes: `rig_T_lens` in metres, unless `unit` names
-cm, mm, in, ft, or "map" for lengths of no known unit. Takes Kalibr's and COLMAP's files of
-pairs too, see `gsba.camera.calibration_formats`. The rig's origin is moved into the middle of the
-lenses.
-"""
+"""Calibrations of raw lenses in files: JSON of our own form (metres, or as `unit` says),
+and those of `calibration_formats`. The rig's origin is moved into the middle of the lenses."""
 
 import json
 import re
@@ -63,7 +58,21 @@ def read_calibration(path: Path) -> Rig:
             why = f"it has no {error}"
         raise GsbaError(f"{path}: not a calibration of lenses ({why}); {_EXPECTED_FORM}") from None
     try:
-        return _in_centred_rig(rig)
+        axes = np.array([rotation_of(lens)[:, 2] for lens in rig])
+        if len(rig) == 2 and min(axes[0, 2], -axes[1, 2]) < np.cos(_MAX_AXIS_ANGLE_RAD):
+            raise ValueError(
+                "the front lens must look along z of the rig and the back one the other way, "
+                f"within {np.rad2deg(_MAX_AXIS_ANGLE_RAD):.0f} degrees: check their poses"
+            )
+        widest = np.arccos(np.clip((_DIRECTIONS @ axes.T).max(axis=1).min(), -1, 1))
+        if len(rig) > 2 and widest > _MAX_UNSEEN_ANGLE_RAD:
+            raise ValueError(
+                f"a direction is {np.rad2deg(widest):.0f} degrees from every lens's axis; lenses "
+                f"must see all around, to {np.rad2deg(_MAX_UNSEEN_ANGLE_RAD):.0f} degrees: check "
+                "their poses"
+            )
+        middle = np.mean([lens.centre for lens in rig], axis=0)
+        return tuple(replace(lens, centre=_three(np.asarray(lens.centre) - middle)) for lens in rig)
     except ValueError as error:
         raise GsbaError(f"{path}: {error}") from None
 
@@ -77,7 +86,6 @@ def calibration_json(
         rig: lenses, the front one first.
         centre: (3 (L - 1),) centres of all but the last one, see `gsba.camera.lens.Lenses`.
         unit: unit of `centre`, "m" or "map".
-        more: further entries of the file.
     """
     return {
         "model": _MODEL,
@@ -98,28 +106,6 @@ def calibration_json(
         },
         **more,
     }
-
-
-def _in_centred_rig(rig: Rig) -> Rig:
-    """The lenses in a rig whose origin is the mean of their centres.
-
-    Raises:
-        ValueError: two lenses do not look ahead and behind, or more leave a direction unseen.
-    """
-    axes = np.array([rotation_of(lens)[:, 2] for lens in rig])
-    if len(rig) == 2 and min(axes[0, 2], -axes[1, 2]) < np.cos(_MAX_AXIS_ANGLE_RAD):
-        raise ValueError(
-            "the front lens must look along z of the rig and the back one the other way, within "
-            f"{np.rad2deg(_MAX_AXIS_ANGLE_RAD):.0f} degrees: check their poses"
-        )
-    widest = np.arccos(np.clip((_DIRECTIONS @ axes.T).max(axis=1).min(), -1, 1))
-    if len(rig) > 2 and widest > _MAX_UNSEEN_ANGLE_RAD:
-        raise ValueError(
-            f"a direction is {np.rad2deg(widest):.0f} degrees from every lens's axis; lenses must "
-            f"see all around, to {np.rad2deg(_MAX_UNSEEN_ANGLE_RAD):.0f} degrees: check their poses"
-        )
-    middle = np.mean([lens.centre for lens in rig], axis=0)
-    return tuple(replace(lens, centre=_three(np.asarray(lens.centre) - middle)) for lens in rig)
 
 
 def scaled_to_size(rig: Rig, size: tuple[int, int], path: Path) -> Rig:
@@ -151,11 +137,7 @@ def scaled_to_size(rig: Rig, size: tuple[int, int], path: Path) -> Rig:
 
 
 def _parsed_file(path: Path) -> Any:
-    """The parsed content of a JSON or YAML file.
-
-    Raises:
-        GsbaError: the file is neither, or cannot be read.
-    """
+    """The parsed content of a JSON or YAML file."""
     try:
         with path.open("rb") as file:
             content = file.read(_MAX_FILE_BYTES + 1)

@@ -1,8 +1,5 @@
-"""Calibrations of a raw pair by other programs: a Kalibr camchain, a COLMAP rig.
-
-These give the pose of one camera relative to the other. The rig's z is halfway between the front
-lens's axis and the reversed axis of the back one, its x is the front picture's, orthogonal to z.
-"""
+"""Calibrations of a raw pair by other programs: a Kalibr camchain, a COLMAP rig. z is halfway
+between the front lens's axis and the back one's reversed; x is the front picture's, across z."""
 
 import logging
 import re
@@ -228,8 +225,7 @@ def from_colmap_model(folder: Path) -> Pair:
 
 
 def _kalibr_lens(tree: Mapping[str, Any], where: str) -> Fisheye:
-    """A camera of a camchain, its own frame being the rig's; Kalibr's pixel centres are whole
-    numbers."""
+    """A camera of a camchain as the rig; Kalibr's pixel centres are whole numbers."""
     name = where.rpartition(": ")[2]
     model, distortion = fields_of(tree, ("camera_model", "distortion_model"), name)
     kind = str(model), str(distortion)
@@ -280,15 +276,7 @@ def _fit_to_omni(
     distortion: Sequence[float],
     where: str,
 ) -> Fisheye:
-    """Our lens model fitted to Mei and Rives's (ICRA 2007) with radial and tangential distortion.
-
-    Args:
-        size: pixels.
-        intrinsics: xi and focal length.
-        principal: pixels, corner origin.
-        distortion: k1, k2, p1, p2.
-        where: file and camera, for error messages.
-    """
+    """Our model fitted to Mei and Rives's (ICRA 2007) with distortion k1, k2, p1, p2."""
     (xi, focal), (k1, k2, p1, p2) = intrinsics, distortion
     angles, around = np.meshgrid(np.linspace(0, _MAX_ANGLE_RAD, 96), np.arange(24) * np.pi / 12)
     angles, around = angles.ravel(), around.ravel()
@@ -317,7 +305,6 @@ def of_projection(lens: RadialProjection, rig_T_lens: np.ndarray, where: str) ->
     """Our lens model fitted to a lens of another projection.
 
     Args:
-        lens: its projection.
         rig_T_lens: (4, 4), metres.
         where: file and projection, for error messages.
 
@@ -340,16 +327,8 @@ def of_projection(lens: RadialProjection, rig_T_lens: np.ndarray, where: str) ->
 def _fitted(
     angles: np.ndarray, away: np.ndarray, shown: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Our lens model fitted to pixels of rays.
-
-    Args:
-        angles: (N,) from the axis, rad.
-        away: (N, 2) unit directions across the axis.
-        shown: (N, 2) pixels from the principal point.
-
-    Returns:
-        The focal length and its products with k1 to k4 (5,), the principal point's shift (2,), and
-        the largest distance, pixels.
+    """Our model fitted to pixels (N, 2) of rays: focal length and its products with k1 to k4 (5,),
+    the principal point's shift (2,), and the largest distance, pixels.
     """
     powers = angles[:, None] ** np.array([1, 3, 5, 7, 9])
     radial = (away[:, :, None] * powers[:, None]).reshape(-1, 5)
@@ -360,11 +339,7 @@ def _fitted(
 
 
 def _checked_rigid(a_T_b: np.ndarray) -> np.ndarray:
-    """A pose (4, 4), checked to be a rigid motion.
-
-    Raises:
-        ValueError: the matrix is no rigid motion.
-    """
+    """A pose (4, 4), checked to be a rigid motion."""
     turn = a_T_b[:3, :3]
     small = bool((np.abs(a_T_b) < _MAX_POSE_ENTRY).all())  # no NaN either
     if not small or np.abs(turn @ turn.T - np.eye(3)).max() > 1e-3:
@@ -375,8 +350,7 @@ def _checked_rigid(a_T_b: np.ndarray) -> np.ndarray:
 
 
 def _in_rig(pair: Pair, front_T_back: np.ndarray, path: Path) -> Pair:
-    """Both lenses in a rig whose z lies between their axes; its origin is the front lens's
-    centre."""
+    """Both lenses in a rig at the front lens's centre, z between their axes."""
     from scipy.spatial.transform import Rotation
 
     axis = np.array([0.0, 0, 1]) - front_T_back[:3, 2]

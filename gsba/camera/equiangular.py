@@ -16,8 +16,8 @@ import cv2
 import numpy as np
 
 from gsba.camera.rig import RIG_R_FACE
+from gsba.camera.sphere import table
 from gsba.camera.straighten import PAD, observed
-from gsba.camera.tables import table
 from gsba.types import FACES
 
 _MAX_OVERLAP = 1 / 8  # part of a square: cameras have 1/60 to 1/20
@@ -156,11 +156,7 @@ class Grid:
 
 
 def _blended(stored: np.ndarray, size: int, overlap: int) -> np.ndarray:
-    """Blend the doubled columns of a side square; `stored` begins at its left edge.
-
-    Returns:
-        (S, S[, C]) uint8.
-    """
+    """Doubled columns (S, S[, C]) of a side square blended; `stored` begins at its left edge."""
     half = (size + overlap) // 2
     first = half - overlap
     left, right = stored[:, first:half], stored[:, half : half + overlap]
@@ -178,8 +174,7 @@ def _left_share(columns: np.ndarray, size: int, overlap: int) -> np.ndarray:
 
 @table(maxsize=4)
 def _borders(size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows and columns (n, k) of all padding in a grid, and OpenCV pixels (2, n, k) float32 of the
-    grid from which the padding is copied."""
+    """Rows and columns (n, k) of a grid's padding, and OpenCV pixels (2, n, k) of its source."""
     cell, grid = size + 2 * PAD, Grid(size)
     ring = np.ones((cell, cell), bool)
     ring[PAD:-PAD, PAD:-PAD] = False

@@ -148,11 +148,7 @@ def parse_factory_lenses(calibration: FactoryCalibration) -> FactoryLenses:
 
 
 def _of_numbers(numbers: np.ndarray, calibration: FactoryCalibration) -> FactoryLenses:
-    """Lenses from all numbers of a calibration.
-
-    Raises:
-        ValueError: the form is unknown, or no lenses have such numbers.
-    """
+    """Lenses from all numbers of a calibration."""
     count = _COUNTS.get(len(numbers))
     if count is None or numbers[0] != 2 or not (abs(numbers) < _MAX_ABSOLUTE_NUMBER).all():
         raise ValueError("its form is not known")
@@ -163,13 +159,17 @@ def _of_numbers(numbers: np.ndarray, calibration: FactoryCalibration) -> Factory
         raise ValueError(f"its canvas cannot be {canvas[0]:g}x{canvas[1]:g}")
     at = 3 if generation >= 3 else 1  # index of the centre
     angles = parts[:, at + 2 : at + 5]
-    known = _are_as_described(angles)
+    # degrees, the third ones about the axes and back to back
+    tilts, about = abs(angles[:, :2]), angles[:, 2].sum() % 360
+    known = bool((tilts < _MAX_TILT_DEG).all() and abs(about - 180) < _MAX_OFF_AXIS_SUM_DEG)
     lenses = []
     for n in range(2):
         centre = parts[n, at : at + 2] - (n * half[0], 0)
         if (abs(centre - half / 2) > half / 4).any():
             raise ValueError(f"the centre of lens {n + 1} is far from the middle")
-        rotation = _camera_R_lens(angles[n] if known else np.array([0, 0, 90.0]), behind=n == 1)
+        yaw, pitch, roll = angles[n] if known else np.array([0, 0, 90.0])
+        turn = Rotation.from_euler("ZYX", [roll - 90, yaw, pitch], degrees=True).as_matrix()
+        rotation = (turn @ (_HALF_TURN_ABOUT_Y if n == 1 else np.eye(3))).T
         lenses.append(FactoryLens(*_radial_model(generation, parts[n]), _two(centre), rotation))
     if calibration.back_first:
         lenses = [
@@ -188,27 +188,10 @@ def _of_numbers(numbers: np.ndarray, calibration: FactoryCalibration) -> Factory
     )
 
 
-def _are_as_described(angles: np.ndarray) -> bool:
-    """True if angles (2, 3) are degrees, the third ones about the axes and back to back."""
-    tilts, about = abs(angles[:, :2]), angles[:, 2].sum() % 360
-    return bool((tilts < _MAX_TILT_DEG).all() and abs(about - 180) < _MAX_OFF_AXIS_SUM_DEG)
-
-
-def _camera_R_lens(angles: np.ndarray, behind: bool) -> np.ndarray:
-    """Rotation (3, 3) from a lens's frame to the camera's, by its angles (3,) in degrees."""
-    yaw, pitch, roll = angles
-    lens_R_camera = Rotation.from_euler("ZYX", [roll - 90, yaw, pitch], degrees=True).as_matrix()
-    return (lens_R_camera @ (_HALF_TURN_ABOUT_Y if behind else np.eye(3))).T
-
-
 def _radial_model(
     generation: int, numbers: np.ndarray
 ) -> tuple[float, tuple[float, float, float, float]]:
-    """Focal length, pixels per radian, and k1 to k4 of `Fisheye`, fitted over all angles.
-
-    Raises:
-        ValueError: no lens has such numbers.
-    """
+    """Focal length, pixels per radian, and k1 to k4 of `Fisheye`, fitted over all angles."""
     angles = np.linspace(0, _MAX_FITTED_ANGLE_RAD, 201)[1:]
     if generation == 1:
         radii = numbers[0] * angles / _REFERENCE_ANGLE_RAD
@@ -236,8 +219,7 @@ def _radial_model(
 def _window(
     half: np.ndarray, calibration: FactoryCalibration
 ) -> tuple[float, float, float, float] | None:
-    """Left, top, width and height in a lens's half (2,) of the canvas; None = it exceeds that
-    half."""
+    """Left, top, width and height in a lens's half (2,) of the canvas; None = beyond it."""
     if calibration.window is None:
         return None
     scale = half / (half if calibration.sensor is None else np.array(calibration.sensor))

@@ -1,10 +1,5 @@
-"""Raw fisheyes as parts of one panorama: projection of rig directions into their pictures.
-
-The lens that faces a direction sees it, as in `gsba.camera.lens`: of a pair the front one sees what
-is ahead of the rig, and the back one what is behind it. Lenses may be recalibrated after panoramas
-were cut by them: then a direction of a panorama is one pixel of a fisheye, which has another
-direction by the new calibration.
-"""
+"""Raw fisheyes as parts of one panorama: projection of rig directions into their pictures. After
+recalibration a direction of a panorama is a pixel that has another direction."""
 
 from dataclasses import replace
 
@@ -68,14 +63,17 @@ def by_parameters(lens: Fisheye, directions: np.ndarray) -> np.ndarray:
     """Jacobians (N, 3, PARAMETERS) of the directions of fixed pixels by the lens's parameters.
 
     Args:
-        lens: its current parameters.
         directions: (N, 3) unit, rig frame, of the pixels.
     """
     rig_R_lens = rotation_of(lens)
     by_local, by_own = projection_of(lens).jacobians(directions @ rig_R_lens)
     basis = tangent_basis(directions)  # (N, 2, 3) float64: a unit direction moves on it only
     moves = -np.linalg.solve(by_local @ rig_R_lens.T @ np.swapaxes(basis, 1, 2), by_own)
-    return np.concatenate([np.swapaxes(basis, 1, 2) @ moves, -_cross(directions)], axis=2)
+    out = np.zeros((len(directions), 3, 3))
+    x, y, z = directions.T
+    out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -z, y, -x
+    out[:, 1, 0], out[:, 2, 0], out[:, 2, 1] = z, -y, x
+    return np.concatenate([np.swapaxes(basis, 1, 2) @ moves, -out], axis=2)
 
 
 def changed(lens: Fisheye, step: np.ndarray) -> Fisheye:
@@ -143,12 +141,3 @@ def recalibrated(
 def _with_rotation(lens: Fisheye, rotation: np.ndarray) -> Fisheye:
     a, b, c = (float(v) for v in rotation)
     return replace(lens, rotation=(a, b, c))
-
-
-def _cross(vectors: np.ndarray) -> np.ndarray:
-    """Matrices (N, 3, 3) whose product with another vector is the cross product."""
-    out = np.zeros((len(vectors), 3, 3))
-    x, y, z = vectors.T
-    out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -z, y, -x
-    out[:, 1, 0], out[:, 2, 0], out[:, 2, 1] = z, -y, x
-    return out

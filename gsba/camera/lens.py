@@ -222,8 +222,7 @@ class Lenses:
     def _readout_motion_at(
         self, directions: np.ndarray, frames: np.ndarray, lens: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Rotations (N, 3, 3) and translations (N, 3) of frames (N,) from the middle of the readout
-        to the rows of unit directions (N, 3)."""
+        """Rotations (N, 3, 3) and translations (N, 3) from mid-readout to directions' rows."""
         assert self.readout_motion is not None
         moved = self.fractions(directions, frames, lens=lens)[:, None] * self.readout_motion[frames]
         return _rotations(moved[:, :3]), moved[:, 3:]

@@ -1,11 +1,7 @@
 """Panoramas of two lenses resampled as one camera in the middle between them would take them.
 
-A stitcher joins both pictures as if everything were far: near objects are displaced, to one side in
-front and to the other behind, and are doubled or cut at the seam. Here each direction is looked up
-where its lens shows it, at the depth of map points around it, with all rows read in the middle of
-the exposure. Both lenses are blended across the seam, which is no worse in pixels than a hard cut
-of raw pictures, and better than a hard cut of a panorama that is blended there. Directions without
-points nearby keep about the displacement that they had.
+Each direction is looked up where its lens shows it, at the depth of map points around it, with all
+rows read in the middle of the exposure; both lenses are blended across the seam.
 """
 
 from collections.abc import Callable, Iterator
@@ -38,7 +34,6 @@ class Stitcher:
         """Compute the offset from each direction of the rig to its direction in each lens.
 
         Args:
-            lenses: the lenses.
             frame: index of the frame in `lenses`.
             scene: (N, 3) points in the rig frame of this frame, which give the depths.
         """
@@ -137,8 +132,7 @@ class Stitcher:
     def _moved(
         self, lens: int, top: int, columns: np.ndarray, num_rows: int, width: int
     ) -> np.ndarray:
-        """Offsets (h, w, 3) from directions of a panorama's rows and columns to a lens's
-        directions."""
+        """Offsets (h, w, 3) from directions of panorama rows and columns to a lens's directions."""
         scale = _DEPTH_GRID_WIDTH / width
         places = np.meshgrid(columns + 0.5, np.arange(top, top + num_rows) + 0.5)
         across, down = ((at * scale - 0.5 + PAD).astype(np.float32) for at in places)

@@ -1,10 +1,5 @@
-"""Projections: how lenses map directions to pixels, with Jacobians and parameters with priors.
-
-A projection is one component of a camera. It has the lens's own axes (x right, y down, z ahead) and
-knows nothing of where the lens is. Each is a `Projection`: the perspective lens, the fisheye, the
-panorama. A lens that is symmetric about its axis is a `RadialProjection` with one formula, the
-distance of a ray's picture from the principal point as a function of its angle from the axis.
-"""
+"""Projections: how lenses map directions to pixels in the lens's own axes (x right, y down, z
+ahead), with Jacobians and parameters with priors."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable

@@ -1,7 +1,13 @@
 """Equirectangular pixels, the bearings that they show, and what lies beyond a picture's border."""
 
+import functools
+import threading
+from collections.abc import Callable, Iterator
+from typing import ParamSpec, TypeVar
+
 import numpy as np
 
+_BAND_ROWS = 256  # rows whose bearings are held in double precision at once
 _ROWS_AT_ONCE = 64  # rows moved at once, so that they stay in the cache
 
 
@@ -19,6 +25,14 @@ def bearings_from_erp(pixels: np.ndarray, width: int, height: int) -> np.ndarray
     latitude = np.pi * (0.5 - pixels[..., 1] / height)
     c = np.cos(latitude)
     return np.stack([c * np.sin(longitude), -np.sin(latitude), c * np.cos(longitude)], axis=-1)
+
+
+def erp_bands(columns: np.ndarray, width: int) -> Iterator[tuple[int, np.ndarray]]:
+    """Yield first row and bearings (h, C, 3) of bands of columns (C,) of a panorama."""
+    for top in range(0, width // 2, _BAND_ROWS):
+        rows = np.arange(top, min(top + _BAND_ROWS, width // 2)) + 0.5
+        pixels = np.stack(np.meshgrid(columns + 0.5, rows), axis=-1)
+        yield top, bearings_from_erp(pixels, width, width // 2)
 
 
 def erp_from_bearings(bearings: np.ndarray, width: int, height: int) -> np.ndarray:
@@ -69,3 +83,23 @@ def around_sphere(image: np.ndarray, pad: int, out: np.ndarray | None = None) ->
     inner[-pad:] = np.roll(inner[-2 * pad : -pad][::-1], width // 2, axis=1)
     out[:, :pad], out[:, -pad:] = inner[:, -pad:], inner[:, :pad]
     return out
+
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+def table(maxsize: int) -> Callable[[Callable[P, T]], Callable[P, T]]:
+    """A `functools.lru_cache` that computes an entry once if several threads need it at once."""
+
+    def kept(compute: Callable[P, T]) -> Callable[P, T]:
+        cached, lock = functools.lru_cache(maxsize=maxsize)(compute), threading.Lock()
+
+        @functools.wraps(compute)
+        def look_up(*args: P.args, **kwargs: P.kwargs) -> T:
+            with lock:
+                return cached(*args, **kwargs)  # type: ignore[arg-type]
+
+        return look_up
+
+    return kept

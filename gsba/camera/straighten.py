@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from gsba.camera.sphere import around_sphere, bearings_from_erp, erp_from_bearings
-from gsba.camera.tables import table
+from gsba.camera.sphere import around_sphere, bearings_from_erp, erp_from_bearings, table
 
 PAD = 4  # pixels of wrap-around: the support of bicubic sampling, and more
 _FIELD_GRID_WIDTH = 256  # width of the grid on which a field is evaluated; its shortest wave is 18
@@ -78,11 +77,6 @@ def _maps(correction: tuple[float, ...], width: int, height: int) -> np.ndarray:
 
 @table(maxsize=2)
 def _padded_offsets(correction: tuple[float, ...]) -> np.ndarray:
-    return around_sphere(_offsets(correction), PAD)
-
-
-def _offsets(correction: tuple[float, ...]) -> np.ndarray:
-    """Offsets (h, 2h, 3) float32 from true to observed directions, on a coarse panorama."""
     from factors.sphere_field import SphereField
 
     centres = np.meshgrid(
@@ -92,4 +86,4 @@ def _offsets(correction: tuple[float, ...]) -> np.ndarray:
         np.stack(centres, axis=-1), _FIELD_GRID_WIDTH, _FIELD_GRID_WIDTH // 2
     )
     observed = SphereField(np.array(correction)).observed(directions)
-    return (observed - directions).astype(np.float32)
+    return around_sphere((observed - directions).astype(np.float32), PAD)

@@ -1,14 +1,11 @@
 """The pinhole cameras that panoramas are cut into: cube faces, or faces of one lens each.
 
-A panorama of two lenses has no single centre of projection. Faces of one lens each have one: front
-and back whole, and each lens's part of the four sides. Each has its lens's centre in the rig and
-leaves out the band where both pictures are blended. They are cut as the lens would show them with
-all rows read in the middle of the exposure, at the depths that map points give. Their rig's axes
-are the lenses', which a stabiliser may have rotated against the panorama's.
+Faces of one lens have its centre, axes of the lenses, and leave out the blended band; they are cut
+as with all rows read in the middle of the exposure, at the depths that map points give.
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import cv2
@@ -32,7 +29,6 @@ _NUM_DEPTH_POINTS = 12  # map points that give the depth in a direction
 _MIN_SMOOTHING_RAD = np.deg2rad(3.0)  # least angle over which points are averaged
 _PLANE_TOLERANCE = 0.1  # relative depth error at which a point counts as off a plane
 _FRONTAL_PLANE_WEIGHT = 0.05  # weight of the fronto-parallel plane, relative to the points'
-_NUM_ROBUST_ROUNDS = 4  # reweighting rounds of the plane fit
 _ROWS_AT_ONCE = 128  # rows whose coordinates are held in double precision at once
 _NODES_ACROSS_FACE = 33  # nodes across a face of the interpolated offsets, which vary over tens of
 # degrees
@@ -109,37 +105,26 @@ def lens_views(lenses: Lenses, size: int) -> tuple[View, ...]:
             views.append(replace(whole, centre=axis[2] * lenses.centre))
             continue
         for lens, sign in (("front", 1.0), ("back", -1.0)):
-            side = _side(axis, np.array([0, 0, sign]), size, lenses.band_rad)
+            ahead = np.array([0, 0, sign])
+            towards, along = _side_extents(lenses.band_rad)
+            short, long = 2 * int(size / 2 * towards), 2 * int(np.ceil(size / 2 * along))
+            tilt = np.pi / 4 + np.arctan(short / size)  # its edge meets the whole face's
+            forward = np.cos(tilt) * ahead + np.sin(tilt) * axis
+            seamwards = np.cos(tilt) * axis - np.sin(tilt) * ahead
+            if axis[0]:  # beside the lens, upright
+                down = np.array([0.0, 1, 0])
+                right, width, height = np.cross(down, forward), short, long
+            else:
+                down = seamwards * np.sign(axis[1])
+                right, width, height = np.cross(down, forward), long, short
+            turn = np.column_stack([right, down, forward])
+            side = View("", width, height, size / 2, (width / 2, height / 2), turn, np.zeros(3))
             views.append(replace(side, name=f"{whole.name}_{lens}", centre=sign * lenses.centre))
     return tuple(views)
 
 
-def _side(axis: np.ndarray, ahead: np.ndarray, size: int, band_rad: float) -> View:
-    """The view of the lens facing `ahead` towards `axis`, from its whole face to the blended band.
-
-    The principal point is the middle: some trainers support no other.
-    """
-    towards, along = _side_extents(band_rad)
-    short, long = 2 * int(size / 2 * towards), 2 * int(np.ceil(size / 2 * along))
-    tilt = np.pi / 4 + np.arctan(short / size)  # its edge meets the whole face's
-    forward = np.cos(tilt) * ahead + np.sin(tilt) * axis
-    seamwards = np.cos(tilt) * axis - np.sin(tilt) * ahead
-    if axis[0]:  # beside the lens, upright
-        down = np.array([0.0, 1, 0])
-        right, width, height = np.cross(down, forward), short, long
-    else:
-        down = seamwards * np.sign(axis[1])
-        right, width, height = np.cross(down, forward), long, short
-    turn = np.column_stack([right, down, forward])
-    return View("", width, height, size / 2, (width / 2, height / 2), turn, np.zeros(3))
-
-
 def _side_extents(band_rad: float) -> tuple[float, float]:
-    """Half the extents of a side view towards and along the seam, as tangents.
-
-    It begins where the whole face ends, 45 degrees from its lens's axis, and its corners end at the
-    band; along the seam it meets its neighbours on the diagonals between them.
-    """
+    """Half the extents, tangents, of a side view towards the seam, where it ends, and along it."""
 
     def along_at(half: float) -> float:
         tilt = np.pi / 4 + half
@@ -382,8 +367,7 @@ class ViewCutter:
     def _maps(
         self, view: View, offsets: np.ndarray, places: Callable[[np.ndarray], np.ndarray]
     ) -> np.ndarray:
-        """OpenCV pixels (2, height, width) float32 of a view; `places` maps directions (h, w, 3) in
-        which pictures show its rays to pixels (h, w, 2)."""
+        """OpenCV pixels (2, height, width) float32 of a view; `places`: directions to pixels."""
         maps = np.empty((2, view.height, view.width), np.float32)
         for top in range(0, view.height, _ROWS_AT_ONCE):
             rows = np.arange(top, min(top + _ROWS_AT_ONCE, view.height)) + 0.5
@@ -443,7 +427,7 @@ def depths_along(directions: np.ndarray, points: np.ndarray) -> np.ndarray:
     facing_us = (_FRONTAL_PLANE_WEIGHT * spread**2 * weights.sum(axis=1, keepdims=True))[
         ..., None
     ] * np.eye(3)
-    for _ in range(_NUM_ROBUST_ROUNDS):
+    for _ in range(4):  # reweighting rounds of the plane fit
         off = (left - np.einsum("nki,ni->nk", beside, tilt)) / (_PLANE_TOLERANCE * middle[:, None])
         shares = weights / (1 + off**2)
         normal = np.einsum("nk,nki,nkj->nij", shares, beside, beside) + facing_us
@@ -467,3 +451,42 @@ def views_for(kind: PictureFormat, size: int, lenses: Lenses) -> tuple[View, ...
     if lenses and kind.panoramic:
         return lens_views(lenses, size)
     return cube_views(kind.faces or FACES, size)
+
+
+@dataclass(frozen=True, slots=True)
+class Optics:
+    """Lenses, and depths of the scene around them. One centre by default."""
+
+    lenses: Lenses = field(default_factory=Lenses)  # in the unit of the poses
+    scenes: Callable[[int], np.ndarray] | None = None  # points (N, 3) around a frame, rig frame, by
+    # its index; None = everything is far
+
+    def __bool__(self) -> bool:
+        return bool(self.lenses)
+
+    @classmethod
+    def of(cls, cameras: Cameras, reconstruction: Reconstruction) -> "Optics":
+        """Lenses of the frames that a reconstruction was made from.
+
+        Of more than two lenses there are no faces of one lens each, and of several cameras none
+        that all frames share: they count as one centre.
+        """
+        if len(cameras.lenses) > 1 or cameras.only.num_lenses > 2:
+            return ONE_EYE
+        return cls(cameras.only, scenes_of(reconstruction))
+
+    def views(self, size: int) -> tuple[View, ...]:
+        """Six faces of `size` pixels and 90 degrees, or as dense faces of one lens each."""
+        return lens_views(self.lenses, size) if self else rig_views(CubeRig(size, np.pi / 2))
+
+    def cutter(self, views: tuple[View, ...], frame: int) -> ViewCutter:
+        """The cutter of views out of the pictures of a frame."""
+        return ViewCutter(views, self.lenses, frame, self.scenes and self.scenes(frame))
+
+    def own(self, world_T_rigs: np.ndarray, frames: np.ndarray) -> np.ndarray:
+        """Poses (W, 4, 4) of rigs that have the lenses' axes, from those of frames (W,)."""
+        axes = self.lenses.axes
+        return world_T_rigs if axes is None else turned_rigs(world_T_rigs, axes[frames])
+
+
+ONE_EYE = Optics()

@@ -1,39 +1,7 @@
 """The command line. Commands parse, call and print; heavy imports stay in their bodies."""
 
-from gsba.cli import (
-    checking,
-    growing,
-    inspecting,
-    localizing,
-    making,
-    plotting,
-    preparing,
-    refining,
-    results,
-    serving,
-    splat,
-    tracking,
-    viewing,
-)
+from gsba.cli import growing, making, preparing, refining, results, serving, showing, splat  # noqa: F401
 from gsba.cli.app import app
-
-__all__ = [
-    "app",
-    "checking",
-    "growing",
-    "inspecting",
-    "localizing",
-    "main",
-    "making",
-    "plotting",
-    "preparing",
-    "refining",
-    "results",
-    "serving",
-    "splat",
-    "tracking",
-    "viewing",
-]
 
 
 def main() -> None:

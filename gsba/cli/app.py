@@ -20,6 +20,7 @@ from gsba.log import GsbaError, brief, event, show_log
 from gsba.version import __version__
 
 P = ParamSpec("P")
+Run = Annotated[Path, typer.Argument(help="Folder of a finished run.", metavar="RUN")]
 
 _SOURCE = Path(__file__).parents[1]  # folder of gsba's own code
 _MAX_MESSAGE_LENGTH = 1000  # characters

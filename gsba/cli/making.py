@@ -18,7 +18,7 @@ from gsba.cli.refining import (
     settings_of,
 )
 from gsba.cli.results import cameras_of, shutter_of
-from gsba.cli.splat import BackendName, Iterations, splat_settings, train_on
+from gsba.cli.splat import BackendName, FaceSize, Iterations, splat_settings, train_on
 from gsba.log import GsbaError
 
 logger = logging.getLogger(__name__)
@@ -40,7 +40,7 @@ def splat(
     config: Config = None,
     overrides: Overrides = None,
     camera: Camera = None,
-    face_size: Annotated[int | None, typer.Option(help="Width of a cube face in pixels.")] = None,
+    face_size: FaceSize = None,
     iterations: Iterations = None,
     backend: BackendName = "auto",
     allow_partial: AllowPartial = False,

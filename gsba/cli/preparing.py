@@ -1,4 +1,4 @@
-"""Commands that prepare frames: `extract`, `mask`."""
+"""Commands on footage: `extract`, `mask`, `track`."""
 
 from pathlib import Path
 from typing import Annotated
@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from gsba.cli.app import command
+from gsba.cli.refining import Calibration
 from gsba.log import GsbaError
 
 
@@ -79,7 +80,7 @@ def _chosen_by_odometry(
     """Trajectory file beside the folder of frames, with the poses of frames that odometry chose."""
     from gsba import odometry
     from gsba.config_file import validated
-    from gsba.odometry.files import write_chosen
+    from gsba.odometry.walk import write_chosen
 
     path = out.with_name(f"{out.name}.tum")
     if path.is_file() and (out / "extract.json").is_file() and not fresh:
@@ -105,10 +106,7 @@ def mask(
     masks: Annotated[
         Path | None, typer.Option(help="Masks of your own, merged with the carrier's.")
     ] = None,
-    calibration: Annotated[
-        Path | None,
-        typer.Option(help="Calibration of the lenses of raw fisheyes.", metavar="FILE"),
-    ] = None,
+    calibration: Calibration = None,
 ) -> None:
     """Find the carrier of the camera and write its mask.
 
@@ -124,3 +122,89 @@ def mask(
     if carrier.turns.any():
         result += " and rotates in it: each frame has its own mask"
     typer.echo(f"{result}: {written[0]}" + (f", {out / 'merged'}" if len(written) > 2 else ""))
+
+
+Keyframes = Annotated[
+    Path | None,
+    typer.Option(
+        help="Keyframes to write, TUM; default: beside --out, named -keyframes.", metavar="FILE"
+    ),
+]
+Report = Annotated[
+    Path | None,
+    typer.Option(
+        help="Report to write, JSON; default: beside --out, named -report.", metavar="FILE"
+    ),
+]
+Poses = Annotated[
+    Path | None,
+    typer.Option(
+        help="Maps, statuses and covariances of poses to write, CSV; default: beside --out, "
+        "named -poses.",
+        metavar="FILE",
+    ),
+]
+Width = Annotated[
+    int | None,
+    typer.Option(help="Width in pixels of the panoramas that odometry uses; default: 800."),
+]
+
+
+@command
+def track(
+    frames: Annotated[
+        Path,
+        typer.Argument(help="Video, or folder of 2:1 panoramas or raw fisheyes, in time order."),
+    ],
+    out: Annotated[
+        Path, typer.Option(help="Trajectory to write: TUM, poses of all frames.", metavar="FILE")
+    ],
+    keyframes: Keyframes = None,
+    poses: Poses = None,
+    report: Report = None,
+    masks: Annotated[
+        str,
+        typer.Option(help="auto: mask the carrier of the camera; none; or a mask, white = use."),
+    ] = "auto",
+    width: Width = None,
+    fps: Annotated[float | None, typer.Option(help="Frame rate of a folder without times.")] = None,
+    timestamps: Annotated[
+        Path | None, typer.Option(help="File with the times of a folder's frames.", metavar="FILE")
+    ] = None,
+    calibration: Calibration = None,
+) -> None:
+    """Estimate a pose for every frame by visual odometry."""
+    from gsba import odometry
+    from gsba.config_file import validated
+    from gsba.odometry.walk import write_odometry
+    from gsba.video import is_video
+
+    if out.is_dir():
+        raise GsbaError(f"{out}: is a folder; --out names the trajectory file to write")
+    width = validated({"odometry": {} if width is None else {"width": width}}).odometry.width
+    mask = None if masks in ("auto", "none") else Path(masks)
+    if is_video(frames):
+        if fps is not None or timestamps is not None:
+            raise GsbaError(
+                "a video holds the times of its frames: leave out --fps and --timestamps"
+            )
+        panoramas = odometry.of_video(frames, width, calibration)
+    else:
+        from gsba.frames.scan import scan
+
+        found = scan(frames, timestamps, fps, None, order_suffices=True, calibration=calibration)
+        panoramas = odometry.of_frames(found, frames, width)
+    if mask is not None:
+        panoramas = odometry.masked(panoramas, mask)
+    elif masks == "auto":
+        panoramas = odometry.without_carrier(panoramas)
+    unfinished = out.with_name(f"{out.stem}-unfinished.npz")
+    walk = odometry.track_panoramas(panoramas, checkpoint=unfinished)
+    write_odometry(
+        walk,
+        out,
+        keyframes or out.with_name(f"{out.stem}-keyframes{out.suffix}"),
+        poses or out.with_name(f"{out.stem}-poses.csv"),
+        report or out.with_name(f"{out.stem}-report.json"),
+    )
+    typer.echo(f"{walk.summary()}: {out}")

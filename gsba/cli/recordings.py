@@ -86,11 +86,7 @@ def _beside(frames: Path) -> dict[str, Any]:
 
 
 def _checked(fields: Mapping[str, Any], folder: Path, where: str) -> dict[str, Any]:
-    """Fields of a recording with relative paths taken from `folder`.
-
-    Raises:
-        GsbaError: a key that is unknown, or a value of another type.
-    """
+    """Fields of a recording with relative paths taken from `folder`."""
     checked: dict[str, Any] = {}
     for key, value in fields.items():
         if key not in _KEYS:

@@ -355,12 +355,7 @@ def demo(
 
 
 def _demo_of_video(out: Path, allow_partial: bool, **options: Any) -> None:
-    """Film a walk, refine the video, and print the errors of odometry and of the refined poses.
-
-    Args:
-        out: folder for the walk and its run.
-        options: arguments of `gsba.demo.make_film`.
-    """
+    """Film a walk, refine the video, and print the errors of odometry and of the refined poses."""
     from gsba.demo import make_film
     from gsba.evaluate.trajectory import evaluate as compare
     from gsba.evaluate.trajectory import format_table
@@ -442,13 +437,8 @@ def _demo_of_frames(
 
 
 def _found_lenses(found: dict[str, Any], scale: float, lenses: "TwoLenses") -> str:
-    """Line with the estimated baseline and readout time, beside their true values.
-
-    Args:
-        found: `camera` of report.json.
-        scale: metres, the unit of the truth, per map unit.
-        lenses: the true camera.
-    """
+    """Line with the estimated baseline and readout (`camera` of report.json) beside true values;
+    `scale` is metres per map unit."""
     if not found["taken"]:
         return f"Two lenses were not found: {found['reason']}."
     apart, sigma = (1e3 * scale * found[key] for key in ("baseline", "baseline_sigma"))

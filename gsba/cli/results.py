@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gsba.cli.app import command, loading
+from gsba.cli.app import Run, command, loading
 from gsba.cli.refining import Cluster
 from gsba.cli.splat import (
     BackendName,
@@ -160,13 +160,13 @@ Located = Annotated[
 
 @command
 def export(
-    run: Annotated[Path, typer.Argument(help="Folder of a finished run.", metavar="RUN")],
+    run: Run,
     to: Target,
     out: Annotated[
         Path | None,
         typer.Option(help="Folder to write; default: RUN/FORMAT, of map 2 RUN/FORMAT-map2."),
     ] = None,
-    face_size: Annotated[int | None, typer.Option(help="Width of a cube face in pixels.")] = None,
+    face_size: FaceSize = None,
     images: Images = "auto",
     up: Annotated[str, typer.Option(help="auto: turn the world upright; none: do not.")] = "none",
     scale: Length = None,
@@ -401,16 +401,7 @@ def _against_truth(estimate: Path, truth: Path, depth: Path | None, json_file: P
 
 
 def _against_scan(run: Path, path: Path, known: dict[str, str], json_file: Path | None) -> None:
-    """Measure the distances of a run's points to a scan.
-
-    Prints a table and writes RUN/scan.json and RUN/scan.ply, a cloud coloured by distance.
-
-    Args:
-        run: folder of the run.
-        path: file of the scan.
-        known: placement settings that start the alignment.
-        json_file: another file for the numbers.
-    """
+    """Measure a run's points against a scan: a table, RUN/scan.json, a coloured RUN/scan.ply."""
     from gsba.config_file import validated
     from gsba.disk import write_json
     from gsba.evaluate.scans import format_scan, scan_errors

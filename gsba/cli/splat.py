@@ -6,13 +6,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gsba.cli.app import command
+from gsba.cli.app import Run, command
 from gsba.log import GsbaError
 
 if TYPE_CHECKING:
     from gsba.config import SplatSettings
 
-Run = Annotated[Path, typer.Argument(help="Folder of a finished run.", metavar="RUN")]
 Iterations = Annotated[int | None, typer.Option(help="Training steps of one view each.")]
 FaceSize = Annotated[int | None, typer.Option(help="Width of a cube face in pixels.")]
 LpipsWeights = Annotated[
@@ -68,7 +67,7 @@ def render(
     """
     import numpy as np
 
-    from gsba.camera.optics import Optics
+    from gsba.camera.views import Optics
     from gsba.disk import write_image
     from gsba.splat import read_ply, scene
     from gsba.splat.backend import choose_backend
@@ -120,7 +119,7 @@ def _compare(
     run: Path, others, settings: "SplatSettings", out: Path, lpips_weights: Sequence[Path]
 ):
     """Results of splats on the run's poses ("refined") and on others, by name."""
-    from gsba.camera.optics import Optics
+    from gsba.camera.views import Optics
     from gsba.evaluate.splats import compare, poses_for
     from gsba.splat.backend import choose_backend
     from gsba.splat.lpips import Lpips

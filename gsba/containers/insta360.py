@@ -229,15 +229,7 @@ def _bytes_at(file: BinaryIO, start: int, count: int) -> bytes:
 def _find_records(
     file: BinaryIO, start: int, end: int, wanted: set[int], contents: _Contents
 ) -> None:
-    """Read wanted records backwards from the end, or at the offsets of a directory.
-
-    Args:
-        file: file of at least `end` bytes.
-        start: offset of the trailer in the file.
-        end: offset of the end of its last record.
-        wanted: numbers of records.
-        contents: receives the records and notes.
-    """
+    """Read wanted records backwards from the end, or at the offsets of a directory."""
     at = end
     for _ in range(_MAX_RECORDS):
         if at <= start:
@@ -341,8 +333,7 @@ class _Ticks:
 def _gyro(
     record: bytes, raw: bool | None, values: Mapping[int, Any], notes: list[str]
 ) -> _Ticks | None:
-    """Readings of a record, in the layout that the metadata states, or in the other one if that
-    fails."""
+    """Readings of a record, in the layout that the metadata states, or else in the other one."""
     if not record:
         return None
     ranges = read_message(values.get(_GYRO_RANGES, b""))[0]
@@ -371,8 +362,7 @@ def _gyro(
 
 
 def _near_others(ticks: np.ndarray) -> np.ndarray:
-    """Plausible times (N,) bool: within a multiple of the readings' total duration of their
-    median; times (N,) int64."""
+    """Plausible times (N,) bool, near the readings' median; times (N,) int64."""
     sound = (ticks >= 0) & (ticks < _MAX_TICK)
     if sound.sum() < 2:
         return sound

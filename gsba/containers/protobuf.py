@@ -27,11 +27,7 @@ def read_message(data: object) -> tuple[dict[int, Any], bool]:
 
 
 def _fields(data: bytes) -> Iterator[tuple[int, Any]]:
-    """Yield number and value of each field.
-
-    Raises:
-        IndexError, ValueError, struct.error: the data end early or are no message.
-    """
+    """Yield number and value of each field; damaged data raise ValueError and others."""
     at = 0
     while at < len(data):
         key, at = _varint(data, at)

@@ -5,9 +5,8 @@ Gives frames or a video, the truth and a trajectory with drift and noise.
 """
 
 from gsba.demo.degrade import degrade
-from gsba.demo.film import DemoFilm, make_film
 from gsba.demo.mesh_walk import make_mesh_walk
-from gsba.demo.walk import DemoWalk, Heading, WalkPath, make_walk
+from gsba.demo.walk import DemoFilm, DemoWalk, Heading, WalkPath, make_film, make_walk
 
 __all__ = [
     "DemoFilm",

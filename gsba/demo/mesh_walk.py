@@ -178,10 +178,7 @@ def _rgb(texture: np.ndarray) -> np.ndarray:
 
 
 def _texture_colors(texture: np.ndarray, uvs: np.ndarray) -> np.ndarray:
-    """Colours (N, 3) at texture coordinates (N, 2), which repeat.
-
-    v counts from the first row, as open3d flips images when it reads them.
-    """
+    """Colours (N, 3) at texture coordinates (N, 2), which repeat; v counts from the first row."""
     at = np.mod(uvs, 1.0) * texture.shape[1::-1] - 0.5
     shape = -(-len(at) // _LOOKUP_WIDTH), _LOOKUP_WIDTH  # cv2 takes images, no lists
     x = np.resize(at[:, 0], shape).astype(np.float32)

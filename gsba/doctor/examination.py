@@ -10,8 +10,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from gsba.doctor import facts, machine
-from gsba.doctor.packages import Package, debian_package, look_at
-from gsba.doctor.requirements import NEEDED, Requirement, requirements
+from gsba.doctor.packages import NEEDED, Package, Requirement, debian_package, look_at, requirements
 from gsba.log import brief
 from gsba.version import __version__
 

@@ -6,6 +6,7 @@ import re
 import signal
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib import metadata, util
@@ -13,9 +14,66 @@ from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
-from gsba.doctor.requirements import Requirement
+from packaging.specifiers import SpecifierSet
+from packaging.utils import canonicalize_name
+from packaging.version import InvalidVersion, Version
+
+import gsba
 from gsba.log import brief
 from gsba.version import __version__
+from packaging import requirements as requirements_of
+
+NEEDED = ""  # in place of an extra: packages that every run needs
+_MODULES = {"opencv-python-headless": "cv2", "pillow": "PIL", "pyyaml": "yaml"}
+# Unions of others, extras for developers, and files of weights, whose modules are not imported.
+_NOT_EXAMINED = ("all", "docs", "test", "dev", "weights")
+
+
+@dataclass(frozen=True, slots=True)
+class Requirement:
+    """Package that gsba requires."""
+
+    name: str  # of the distribution
+    module: str  # name of its module
+    range: str  # of versions, such as ">=5,<6"
+    extra: str  # "" = always needed
+
+    def allows(self, version: str) -> bool:
+        """True if a version is in the range, or is no number."""
+        try:
+            return SpecifierSet(self.range).contains(Version(version), prereleases=True)
+        except InvalidVersion:
+            return True
+
+
+def requirements() -> tuple[Requirement, ...]:
+    """All required packages, those that are always needed first.
+
+    They are read from pyproject.toml if gsba runs from its source, else from installed metadata.
+    """
+    project = Path(gsba.__file__).parents[1] / "pyproject.toml"
+    if project.is_file():
+        table = tomllib.loads(project.read_text(encoding="utf-8"))["project"]
+        lines = [(line, NEEDED) for line in table["dependencies"]]
+        for extra, of_extra in table["optional-dependencies"].items():
+            lines += [(line, extra) for line in of_extra]
+    else:
+        lines = []
+        for line in metadata.requires("gsba") or ():
+            marker = re.search(r"extra\s*==\s*['\"]([^'\"]+)", line)
+            lines.append((line, marker[1] if marker else NEEDED))
+    kept = [(line, extra) for line, extra in lines if extra not in _NOT_EXAMINED]
+    return tuple(_requirement(line, extra) for line, extra in kept)
+
+
+def _requirement(line: str, extra: str) -> Requirement:
+    """Requirement from a line such as `laspy[lazrs]>=2.5`."""
+    parsed = requirements_of.Requirement(line)
+    name = canonicalize_name(parsed.name)
+    return Requirement(
+        name, _MODULES.get(name, name.replace("-", "_")), str(parsed.specifier), extra
+    )
+
 
 _TIMEOUT_S = 120.0
 _MAX_MESSAGE_LENGTH = 160  # characters of an import's error
@@ -96,8 +154,7 @@ def _unfit(wanted: Requirement, version: str | None) -> str:
 def _imported(
     modules: Sequence[str], facts: str
 ) -> tuple[dict[str, dict[str, Any]], dict[str, Any]]:
-    """Report of each module, and facts; after a crash the remaining modules are imported again in
-    a new process."""
+    """Report of each module, and facts; after a crash the rest is imported in a new process."""
     reports: dict[str, dict[str, Any]] = {}
     answers: dict[str, Any] = {}
     rest = list(modules)

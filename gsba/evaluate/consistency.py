@@ -195,8 +195,7 @@ def format_consistency(found: Consistency, name: Callable[[int], str] = str) -> 
 
 
 def _in_gauge(true_T_rigs: np.ndarray, world_T_rigs: np.ndarray, far: int) -> np.ndarray:
-    """True poses (N, 4, 4), moved to the estimate's first pose and scaled to its distance to frame
-    `far`."""
+    """True poses (N, 4, 4) in the estimate's first pose, scaled to its distance to frame `far`."""
     scales = [
         np.linalg.norm(some[far, :3, 3] - some[0, :3, 3]) for some in (world_T_rigs, true_T_rigs)
     ]
@@ -209,8 +208,7 @@ def _in_gauge(true_T_rigs: np.ndarray, world_T_rigs: np.ndarray, far: int) -> np
 
 
 def _errors(estimates: np.ndarray, truths: np.ndarray) -> np.ndarray:
-    """Tangents (N, 6) [rotation, translation] from estimates (N, 4, 4) to truths, to first order:
-    the translation is that of the relative pose, not of the group's logarithm."""
+    """Tangents (N, 6) [rotation, translation of the relative pose] from estimates to truths."""
     from scipy.spatial.transform import Rotation
 
     off = inverse(estimates) @ truths

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gsba.camera.optics import ONE_EYE, Optics
+from gsba.camera.views import ONE_EYE, Optics
 from gsba.config import SplatSettings
 from gsba.disk import write_image, write_text
 from gsba.evaluate import charts

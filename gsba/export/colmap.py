@@ -26,21 +26,15 @@ from pathlib import Path
 
 import numpy as np
 
-from gsba.camera.cameras import ONE_CAMERA, Cameras
 from gsba.camera.fisheye import lens_names
 from gsba.camera.one_centre import seen_from_the_middle
-from gsba.camera.views import (
-    View,
-    scenes_of,
-    seen_from_lenses,
-    shown_in_pictures,
-)
+from gsba.camera.views import View, scenes_of, seen_from_lenses, shown_in_pictures
+from gsba.export.dataset import Dataset, ExportFormat
 from gsba.export.depths import write_depths
 from gsba.export.images import has_masks, panorama_writer, view_writer, views_of_cameras
-from gsba.export.masks import MASK_FILES, MaskStyle
 from gsba.export.names import base_names, padded_names
 from gsba.export.pictures import Files, FrameWriter, by_camera
-from gsba.export.ply import write_splat_points
+from gsba.export.ply import write_cloud
 from gsba.export.raw import RawPictures
 from gsba.export.sensors import Sensor, pinholes, project_in_rigs, raw_sensors
 from gsba.export.split import split_of
@@ -52,113 +46,64 @@ _BY_VIEW, _FLAT = "{view}/{name}{suffix}", "{name}_{view}{suffix}"  # names of i
 _FLAT_MASK = "{name}_{view}.png"  # others keep the image's suffix before .png, as COLMAP does
 
 
-def write_colmap(
-    partial: Path,
-    reconstruction: Reconstruction,
-    frames: FrameSet,
-    face_size: int | None,
-    link: bool = False,
-    cameras: Cameras = ONE_CAMERA,
-    masks: MaskStyle = MASK_FILES,
-    depths: bool = False,
-) -> FrameWriter:
-    """Write the rig layout into `partial`, without images; returns their writer."""
-    views = views_of_cameras(frames, face_size, cameras)
-    files = _files_of_cameras(partial, _BY_VIEW, views, frames, masks)
-    seen, rigs = seen_from_lenses(reconstruction, cameras), pinholes(views)
-    if depths:
-        write_depths(partial, reconstruction, seen, frames, files, views)
-    write_model(partial / "sparse" / "0", seen, rigs, _names(files, frames), frames.cameras)
-    _write_rig_config(partial, rigs, files, frames)
-    return view_writer(files, frames, views, cameras, link, scenes_of(reconstruction))
-
-
-def write_colmap_flat(
-    partial: Path,
-    reconstruction: Reconstruction,
-    frames: FrameSet,
-    face_size: int | None,
-    link: bool = False,
-    cameras: Cameras = ONE_CAMERA,
-    split: bool = True,
-    masks: MaskStyle = MASK_FILES,
-    num_photos: int = 0,
-    depths: bool = False,
-) -> FrameWriter:
-    """Write the layout with unique base names into `partial`, without images; returns their
-    writer. A split leaves room for photos, see `gsba.export.photos.add_photos`."""
-    views = views_of_cameras(frames, face_size, cameras)
-    files = _files_of_cameras(partial, _FLAT, views, frames, masks)
-    seen = seen_from_lenses(reconstruction, cameras)
-    given = partial, seen, pinholes(views), files, frames, split
-    files = _write_flat_model(*given, num_photos)
-    if depths:
-        write_depths(partial, reconstruction, seen, frames, files, views)
-    return view_writer(files, frames, views, cameras, link, scenes_of(reconstruction))
-
-
-def write_colmap_raw(
-    partial: Path,
-    reconstruction: Reconstruction,
-    frames: FrameSet,
-    cameras: Cameras,
-    flat: bool,
-    link: bool = False,
-    split: bool = True,
-    masks: MaskStyle = MASK_FILES,
-) -> FrameWriter:
-    """Write the rig or the flat layout of raw fisheyes into `partial`, without images; returns
-    their writer."""
-    own = zip(frames.formats, cameras.lenses, strict=True)
-    rigs = [raw_sensors(kind, lenses) for kind, lenses in own]
-    pattern = _FLAT if flat else _BY_VIEW
-    views = [lens_names(len(sensors)) for sensors in rigs]
-    files = [_files(partial, pattern, own, frames, True, masks) for own in views]
-    seen = shown_in_pictures(reconstruction, cameras)
-    if flat:
-        files = _write_flat_model(partial, seen, rigs, files, frames, split)
+def write_colmap(data: Dataset) -> FrameWriter:
+    """Write faces or raw fisheyes in the rig layout or the flat one, without images; returns their
+    writer."""
+    frames, cameras, folder = data.frames, data.cameras, data.folder
+    raw, flat = data.images == "fisheye", data.to == ExportFormat.COLMAP_FLAT
+    views: list[tuple[View, ...]] = []
+    if raw:
+        own = zip(frames.formats, cameras.lenses, strict=True)
+        rigs = [raw_sensors(kind, lenses) for kind, lenses in own]
+        names = [lens_names(len(sensors)) for sensors in rigs]
+        seen = shown_in_pictures(data.reconstruction, cameras)
     else:
-        write_model(partial / "sparse" / "0", seen, rigs, _names(files, frames), frames.cameras)
-        _write_rig_config(partial, rigs, files, frames)
-    return by_camera([RawPictures(own, link) for own in files], frames)
+        views = views_of_cameras(frames, data.options.face_size, cameras)
+        rigs = pinholes(views)
+        names = [[view.name for view in own] for own in views]
+        seen = seen_from_lenses(data.reconstruction, cameras)
+    masked = raw or has_masks(frames)
+    files = [_files(data, _FLAT if flat else _BY_VIEW, own, masked) for own in names]
+    if flat:
+        files = _write_flat_model(data, seen, rigs, files)
+    else:
+        write_model(folder / "sparse" / "0", seen, rigs, _names(files, frames), frames.cameras)
+        _write_rig_config(folder, rigs, files, frames)
+    if data.options.depths:
+        write_depths(data, seen, files, views)
+    if raw:
+        return by_camera([RawPictures(own, data.options.link) for own in files], frames)
+    scenes = scenes_of(data.reconstruction)
+    return view_writer(files, frames, views, cameras, data.options.link, scenes)
 
 
 def _write_flat_model(
-    partial: Path,
+    data: Dataset,
     seen: Reconstruction,
     rigs: Sequence[Sequence[Sensor]],
     files: Sequence[Files],
-    frames: FrameSet,
-    wanted: bool,
-    num_photos: int = 0,
 ) -> Sequence[Files]:
-    """Write the model with INRIA's start cloud, in the order of a split if one is wanted; returns
-    the files of each camera's frames in that order."""
+    """Write the model with INRIA's cloud, in a split's order; returns each camera's files in it."""
+    frames, num_photos = data.frames, len(data.options.photos.photos)
     num_views = [len(rigs[rig]) for rig in frames.cameras.tolist()]
-    split = split_of(seen, num_views, num_photos) if wanted else None
+    split = split_of(seen, num_views, num_photos) if data.split else None
     if split is not None:
         files = [split.files(own, frames) for own in files]
-    names, model = _names(files, frames), partial / "sparse" / "0"
+    names, model = _names(files, frames), data.folder / "sparse" / "0"
     write_model(model, seen, rigs, names, frames.cameras, None if split is None else split.numbers)
-    write_splat_points(model / "points3D.ply", seen.points_world, seen.point_colors)
+    write_cloud(model / "points3D.ply", seen)
     if split is not None:
-        split.write_lists(partial, names)
+        split.write_lists(data.folder, names)
     return files
 
 
-def write_colmap_erp(
-    partial: Path,
-    reconstruction: Reconstruction,
-    frames: FrameSet,
-    link: bool = False,
-    cameras: Cameras = ONE_CAMERA,
-    masks: MaskStyle = MASK_FILES,
-) -> FrameWriter:
-    """Write the equirectangular layout into `partial`, without images; returns their writer.
+def write_colmap_erp(data: Dataset) -> FrameWriter:
+    """Write the equirectangular layout, without images; returns their writer.
 
     Raises:
         GsbaError: the frames are cube faces.
     """
+    frames, cameras = data.frames, data.cameras
     if not all(kind.panoramic for kind in frames.formats):
         raise GsbaError("colmap-erp needs panoramas, these frames are cube faces: use colmap")
     sizes = [(kind.width, kind.height) for kind in frames.formats]
@@ -166,11 +111,12 @@ def write_colmap_erp(
         [Sensor("EQUIRECTANGULAR", *size, (float(size[0]), float(size[1])), np.eye(4))]
         for size in sizes
     ]
-    files = _files(partial, "{name}{suffix}", ("",), frames, has_masks(frames), masks)
-    seen = seen_from_the_middle(reconstruction) if cameras else reconstruction
+    files = _files(data, "{name}{suffix}", ("",), has_masks(frames))
+    seen = seen_from_the_middle(data.reconstruction) if cameras else data.reconstruction
     names = _names([files] * len(rigs), frames)
-    write_model(partial / "sparse" / "0", seen, rigs, names, frames.cameras)
-    return panorama_writer(files, frames, cameras, link, scenes_of(reconstruction))
+    write_model(data.folder / "sparse" / "0", seen, rigs, names, frames.cameras)
+    scenes = scenes_of(data.reconstruction)
+    return panorama_writer(files, frames, cameras, data.options.link, scenes)
 
 
 def write_model(
@@ -319,12 +265,7 @@ def _write_rig_config(
 
 
 def _rig_config(sensors: Sequence[Sensor], names: Sequence[str], folder: str) -> dict:
-    """Rig in the format of `colmap rig_configurator`; rotations are cam_from_rig, wxyz.
-
-    Args:
-        sensors, names: of the rig's cameras.
-        folder: of its images, in that of each camera.
-    """
+    """Rig in the format of `colmap rig_configurator`; rotations are cam_from_rig, wxyz."""
     configs = []
     for sensor, name in zip(sensors, names, strict=True):
         config: dict[str, object] = {"image_prefix": f"{name}/{folder}"}
@@ -339,32 +280,13 @@ def _rig_config(sensors: Sequence[Sensor], names: Sequence[str], folder: str) ->
     return {"cameras": configs}
 
 
-def _files_of_cameras(
-    partial: Path,
-    name: str,
-    views: Sequence[Sequence[View]],
-    frames: FrameSet,
-    style: MaskStyle,
-) -> list[Files]:
-    """Files of images and masks of each camera's frames."""
-    masked = has_masks(frames)
-    names = [[view.name for view in own] for own in views]
-    return [_files(partial, name, own, frames, masked, style) for own in names]
-
-
-def _files(
-    partial: Path,
-    name: str,
-    views: Sequence[str],
-    frames: FrameSet,
-    masked: bool,
-    style: MaskStyle,
-) -> Files:
+def _files(data: Dataset, name: str, views: Sequence[str], masked: bool) -> Files:
     """Files of images and masks by the pattern of their names."""
     mask = _FLAT_MASK if name == _FLAT else f"{name}.png"
-    names = padded_names(frames.names)
+    names = padded_names(data.frames.names)
     names = base_names(names) if name == _FLAT else names
-    return Files(partial, views, f"images/{name}", f"masks/{mask}" if masked else "", style, names)
+    mask = f"masks/{mask}" if masked else ""
+    return Files(data.folder, views, f"images/{name}", mask, data.options.masks, names)
 
 
 def _names(files: Sequence[Files], frames: FrameSet) -> list[list[str]]:

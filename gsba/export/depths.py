@@ -23,6 +23,7 @@ import numpy as np
 from gsba.bundle.point_covariances import depth_variances
 from gsba.camera.views import View
 from gsba.disk import write_bytes
+from gsba.export.dataset import Dataset
 from gsba.export.pictures import Files
 from gsba.export.sensors import pinholes, project_in_rigs
 from gsba.export.split import LEFT_OUT
@@ -60,10 +61,8 @@ def map_path(image: str) -> str:
 
 
 def write_depths(
-    partial: Path,
-    reconstruction: Reconstruction,
+    data: Dataset,
     seen: Reconstruction,
-    frames: FrameSet,
     files: Sequence[Files],
     views: Sequence[tuple[View, ...]],
     maps: bool = False,
@@ -71,10 +70,8 @@ def write_depths(
     """Write the depths of all images of a dataset.
 
     Args:
-        partial: folder of the dataset.
-        reconstruction: in the dataset's world.
-        seen: the same as seen from the dataset's cameras, see `seen_from_lenses`.
-        frames: its frames.
+        data: the dataset.
+        seen: its map as seen from its cameras, see `seen_from_lenses`.
         files: (C,) files of the images of each camera's frames.
         views: (C,) of each camera.
         maps: with the maps that nerfstudio reads.
@@ -82,8 +79,9 @@ def write_depths(
     Raises:
         GsbaError: the disk cannot be written.
     """
+    partial, frames = data.folder, data.frames
     which, pixels = project_in_rigs(seen, pinholes(views), frames.cameras)
-    depths, sigmas = _depths(reconstruction, seen, frames, views, which)
+    depths, sigmas = _depths(data.reconstruction, seen, frames, views, which)
     observed, num_shown, num_mapped = seen.observations_by_frame(), 0, 0
     for f, camera in enumerate(frames.cameras.tolist()):
         images = zip(views[camera], files[camera].images(frames, f), strict=True)
@@ -113,8 +111,7 @@ def _depths(
     views: Sequence[tuple[View, ...]],
     which: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Depths (O,) of observed points from the views (O,) that show them, and their standard
-    deviations (O,)."""
+    """Depths (O,) of observed points from the views (O,) that show them, and their sigmas (O,)."""
     poses, of_frame = seen.world_T_rigs, seen.observation_frames
     axes, depths = np.empty((len(which), 3)), np.empty(len(which))
     for camera, own in enumerate(views):

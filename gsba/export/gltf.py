@@ -21,9 +21,9 @@ from typing import Any
 
 import numpy as np
 
-from gsba.camera.cameras import ONE_CAMERA, Cameras
 from gsba.camera.views import scenes_of
 from gsba.disk import write_bytes
+from gsba.export.dataset import Dataset
 from gsba.export.images import panorama_writer
 from gsba.export.pictures import Files, FrameWriter
 from gsba.geometry import CV_R_GL, quaternion_from_rotation
@@ -40,32 +40,19 @@ _MIN_FPS, _MAX_FPS = 24, 240  # of Blender's timeline
 _MAX_FRAME = 1_000_000  # of Blender's timeline, which ends at 1,048,574
 
 
-def write_blender(
-    partial: Path,
-    reconstruction: Reconstruction,
-    frames: FrameSet,
-    up: str | None = None,
-    link: bool = False,
-    cameras: Cameras = ONE_CAMERA,
-    panoramas: bool = False,
-) -> list[FrameWriter]:
-    """Write scene.glb and the script that opens it in Blender into `partial`; returns the writer
-    of the panoramas.
-
-    Args:
-        partial: folder to write.
-        reconstruction, frames, up: see `write_gltf`.
-        link: make hard links to panoramas that are exported unchanged.
-        cameras: cameras of the frames.
-        panoramas: with the panoramas, as backgrounds of the cameras.
-    """
-    files = Files(partial, ("",), "images/{name}{suffix}", "")
+def write_blender(data: Dataset) -> list[FrameWriter]:
+    """Write scene.glb and the script that opens it in Blender; returns the writer of panoramas, if
+    they are wanted as backgrounds of the cameras."""
+    files, frames = Files(data.folder, ("",), "images/{name}{suffix}", ""), data.frames
+    panoramas = data.images == "panorama"
     pictures = [files.images(frames, f)[0] for f in range(len(frames))] if panoramas else None
-    write_gltf(partial / "scene.glb", reconstruction, frames, up, pictures)
-    shutil.copyfile(Path(__file__).with_name(_SCRIPT), partial / _SCRIPT)
+    path = data.folder / "scene.glb"
+    write_gltf(path, data.reconstruction, frames, data.placement.up, pictures)
+    shutil.copyfile(Path(__file__).with_name(_SCRIPT), data.folder / _SCRIPT)
     if not panoramas:
         return []
-    return [panorama_writer(files, frames, cameras, link, scenes_of(reconstruction))]
+    given = files, frames, data.cameras, data.options.link, scenes_of(data.reconstruction)
+    return [panorama_writer(*given)]
 
 
 def write_gltf(

@@ -16,74 +16,52 @@ from pathlib import Path
 
 import numpy as np
 
-from gsba.camera.cameras import ONE_CAMERA, Cameras
 from gsba.camera.views import View, scenes_of, seen_from_lenses
+from gsba.export.dataset import Dataset
 from gsba.export.images import has_masks, panorama_writer, view_writer, views_of_cameras
-from gsba.export.masks import MASK_FILES, MaskStyle
 from gsba.export.names import base_names
 from gsba.export.pictures import Files, FrameWriter
-from gsba.export.ply import write_splat_points
-from gsba.types import FrameSet, Reconstruction
-
-_CAMERAS = "cameras.xml"
+from gsba.export.ply import write_cloud
 
 
-def write_metashape_panoramas(
-    partial: Path,
-    reconstruction: Reconstruction,
-    frames: FrameSet,
-    link: bool = False,
-    cameras: Cameras = ONE_CAMERA,
-    masks: MaskStyle = MASK_FILES,
-) -> FrameWriter:
-    """Write cloud and cameras.xml of panoramas into `partial`, without images; returns their
+def write_metashape(data: Dataset) -> FrameWriter:
+    """Write cloud and cameras.xml of panoramas or of pinhole faces, without images; returns their
     writer."""
-    mask = "masks/{name}.png" if has_masks(frames) else ""
-    names = base_names(frames.names)
-    files = Files(partial, ("",), "images/{name}{suffix}", mask, masks, names)
-    sensors = [
-        _sensor(number, "panorama", "spherical", kind.width, kind.height)
-        for number, kind in enumerate(frames.formats)
-    ]
-    taken = [
-        _Taken(files.images(frames, f), pose[None], [camera])
-        for f, (pose, camera) in enumerate(
-            zip(reconstruction.world_T_rigs, frames.cameras.tolist(), strict=True)
-        )
-    ]
-    _write(partial, reconstruction, sensors, taken)
-    return panorama_writer(files, frames, cameras, link, scenes_of(reconstruction))
+    frames, cameras, link = data.frames, data.cameras, data.options.link
+    scenes, faces = scenes_of(data.reconstruction), data.images != "panorama"
+    name = "{name}_{view}" if faces else "{name}"
+    mask = f"masks/{name}.png" if has_masks(frames) else ""
+    names, style = base_names(frames.names), data.options.masks
 
+    def files_of(views: Sequence[str]) -> Files:
+        return Files(data.folder, views, f"images/{name}{{suffix}}", mask, style, names)
 
-def write_metashape_faces(
-    partial: Path,
-    reconstruction: Reconstruction,
-    frames: FrameSet,
-    face_size: int | None,
-    link: bool = False,
-    cameras: Cameras = ONE_CAMERA,
-    masks: MaskStyle = MASK_FILES,
-) -> FrameWriter:
-    """Write cloud and cameras.xml of pinhole faces into `partial`, without images; returns their
-    writer."""
-    views = views_of_cameras(frames, face_size, cameras)
-    mask = "masks/{name}_{view}.png" if has_masks(frames) else ""
-    pattern, names = "images/{name}_{view}{suffix}", base_names(frames.names)
-    files = [
-        Files(partial, [view.name for view in own], pattern, mask, masks, names) for own in views
-    ]
+    if not faces:
+        files, poses = files_of(("",)), data.reconstruction.world_T_rigs
+        sensors = [
+            _sensor(number, "panorama", "spherical", kind.width, kind.height)
+            for number, kind in enumerate(frames.formats)
+        ]
+        taken = [
+            _Taken(files.images(frames, f), poses[[f]], [camera])
+            for f, camera in enumerate(frames.cameras.tolist())
+        ]
+        _write(data, sensors, taken)
+        return panorama_writer(files, frames, cameras, link, scenes)
+    views = views_of_cameras(frames, data.options.face_size, cameras)
+    of_cameras = [files_of([view.name for view in own]) for own in views]
     sensors, kinds = list[ET.Element](), list[list[int]]()
     for own in views:
         alike = len({view.intrinsics for view in own}) == 1
         first = len(sensors)
         sensors += [_pinhole(first + n, view) for n, view in enumerate(own[:1] if alike else own)]
         kinds.append([first + n * (not alike) for n in range(len(own))])
-    seen, taken = seen_from_lenses(reconstruction, cameras), list[_Taken]()
+    seen, taken = seen_from_lenses(data.reconstruction, cameras), list[_Taken]()
     for f, camera in enumerate(frames.cameras.tolist()):
         poses = seen.world_T_rigs[f] @ np.stack([view.rig_T_view for view in views[camera]])
-        taken.append(_Taken(files[camera].images(frames, f), poses, kinds[camera]))
-    _write(partial, reconstruction, sensors, taken)
-    return view_writer(files, frames, views, cameras, link, scenes_of(reconstruction))
+        taken.append(_Taken(of_cameras[camera].images(frames, f), poses, kinds[camera]))
+    _write(data, sensors, taken)
+    return view_writer(of_cameras, frames, views, cameras, link, scenes)
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,20 +96,9 @@ def _resolution(parent: ET.Element, width: int, height: int) -> None:
     ET.SubElement(parent, "resolution", {"width": str(width), "height": str(height)})
 
 
-def _write(
-    partial: Path,
-    reconstruction: Reconstruction,
-    sensors: Sequence[ET.Element],
-    taken: Sequence[_Taken],
-) -> None:
-    """Write cameras.xml and the cloud.
-
-    Args:
-        taken: (F,) images of the frames.
-    """
-    write_splat_points(
-        partial / "points3D.ply", reconstruction.points_world, reconstruction.point_colors
-    )
+def _write(data: Dataset, sensors: Sequence[ET.Element], taken: Sequence[_Taken]) -> None:
+    """Write cameras.xml and the cloud."""
+    write_cloud(data.folder / "points3D.ply", data.reconstruction)
     document = ET.Element("document", {"version": "1.5.0"})
     chunk = ET.SubElement(document, "chunk", {"label": "gsba", "enabled": "true"})
     ET.SubElement(chunk, "sensors", {"next_id": str(len(sensors))}).extend(sensors)
@@ -155,4 +122,4 @@ def _write(
         ET.SubElement(entry, "transform").text = " ".join(numbers)
     ET.indent(document)
     tree = ET.ElementTree(document)
-    tree.write(partial / _CAMERAS, encoding="UTF-8", xml_declaration=True)
+    tree.write(data.folder / "cameras.xml", encoding="UTF-8", xml_declaration=True)

@@ -20,21 +20,19 @@ frames, panoramas as pinholes. Velocities for 3dgs-deblur: `gsba.export.motion`.
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gsba.camera.cameras import ONE_CAMERA, Cameras
 from gsba.camera.fisheye import Rig, lens_names, rotation_of
 from gsba.camera.lens import Lenses
 from gsba.camera.views import View, scenes_of, seen_from_lenses
 from gsba.export import motion
+from gsba.export.dataset import Dataset
 from gsba.export.depths import map_path, write_depths
 from gsba.export.images import has_masks, panorama_writer, view_writer, views_of_cameras
-from gsba.export.masks import MASK_FILES, MaskStyle
 from gsba.export.names import base_names, padded_names
 from gsba.export.pictures import Files, FrameWriter, by_camera
 from gsba.export.ply import write_splat_points
@@ -50,92 +48,30 @@ _NGP_SCALE = 0.33  # of instant-ngp's unit cube, in this world's units, about th
 _NGP_MAX_BOXES = 128  # largest `aabb_scale`, a power of two
 
 
-def write_nerfstudio(
-    partial: Path,
-    reconstruction: Reconstruction,
-    frames: FrameSet,
-    face_size: int | None,
-    up: str | None = None,
-    link: bool = False,
-    cameras: Cameras = ONE_CAMERA,
-    shutter: motion.Shutter = motion.UNKNOWN,
-    split: bool = True,
-    masks: MaskStyle = MASK_FILES,
-    panoramas: bool = True,
-    depths: bool = False,
-) -> list[FrameWriter]:
-    """Write cloud and transforms.json of faces into `partial`, of panoramas transforms_erp.json,
-    too, without images; returns their writers.
-
-    Args:
-        partial: folder to write.
-        reconstruction, frames: poses and cloud, and their frames.
-        face_size: pixels of a cube face; None = see `gsba.export.images.face_size_for`.
-        up: axis of the world that points up, "-y", "y" or "z"; None = unknown, taken for "-y".
-        link: make hard links to images that are exported unchanged.
-        cameras: cameras of the frames.
-        shutter: times of the exposure.
-        split: hold panoramas out of the training.
-        masks: how masks are written.
-        panoramas: write transforms_erp.json.
-        depths: with the depths of the faces, see `gsba.export.depths`.
-    """
-    out_R_world = _write_cloud(partial, reconstruction, up)
-    views = views_of_cameras(frames, face_size, cameras)
-    masked = has_masks(frames)
-    files = [_files(partial, [view.name for view in own], frames, masked, masks) for own in views]
-    seen = seen_from_lenses(reconstruction, cameras)
-    given = partial, seen, frames, files, views, out_R_world, cameras, shutter
-    if depths:
-        write_depths(partial, reconstruction, seen, frames, files, views, maps=True)
-    _write_face_dataset(*given, split, depths)
-    scenes = scenes_of(reconstruction)
-    writers = [view_writer(files, frames, views, cameras, link, scenes)]
-    if panoramas and all(kind.panoramic for kind in frames.formats):
-        given = partial, reconstruction, frames, cameras, out_R_world, link
-        writers.append(_write_erp_dataset(*given, "_erp", split, masks))
+def write_nerfstudio(data: Dataset) -> list[FrameWriter]:
+    """Write cloud and transforms.json of raw fisheyes, of panoramas, or of faces and beside these
+    transforms_erp.json of panoramas, without images; returns their writers."""
+    out_R_world = z_up_R_world(data.placement.up)
+    points = data.reconstruction.points_world @ out_R_world.T
+    write_splat_points(data.folder / _CLOUD, points, data.reconstruction.point_colors)
+    if data.images == "fisheye":
+        return [_write_raw(data, out_R_world)]
+    if data.images == "panorama":
+        return [_write_panoramas(data, out_R_world, "")]
+    writers = [_write_faces(data, out_R_world)]
+    if data.options.panoramas and all(kind.panoramic for kind in data.frames.formats):
+        writers.append(_write_panoramas(data, out_R_world, "_erp"))
     return writers
 
 
-def write_nerfstudio_erp(
-    partial: Path,
-    reconstruction: Reconstruction,
-    frames: FrameSet,
-    cameras: Cameras,
-    up: str | None = None,
-    link: bool = False,
-    split: bool = True,
-    masks: MaskStyle = MASK_FILES,
-) -> list[FrameWriter]:
-    """Write cloud and transforms.json of panoramas into `partial`, without images; returns their
-    writers."""
-    out_R_world = _write_cloud(partial, reconstruction, up)
-    given = partial, reconstruction, frames, cameras, out_R_world, link
-    return [_write_erp_dataset(*given, "", split, masks)]
-
-
-def write_nerfstudio_raw(
-    partial: Path,
-    reconstruction: Reconstruction,
-    frames: FrameSet,
-    cameras: Cameras,
-    up: str | None = None,
-    link: bool = False,
-    shutter: motion.Shutter = motion.UNKNOWN,
-    split: bool = True,
-    masks: MaskStyle = MASK_FILES,
-) -> list[FrameWriter]:
-    """Write cloud and transforms.json of raw fisheyes into `partial`, without images; returns
-    their writers."""
-    out_R_world = _write_cloud(partial, reconstruction, up)
+def _write_raw(data: Dataset, out_R_world: np.ndarray) -> FrameWriter:
+    frames, cameras, shutter = data.frames, data.cameras, data.options.shutter
     own = zip(frames.formats, cameras.lenses, strict=True)
     rigs = [_RawRig.of(kind, lenses) for kind, lenses in own]
-    files = [_files(partial, lens_names(len(one.rig)), frames, True, masks) for one in rigs]
-    velocities = motion.rig_velocities(reconstruction, frames, cameras, shutter)
+    files = [_files(data, lens_names(len(one.rig)), True) for one in rigs]
+    velocities = motion.rig_velocities(data.reconstruction, frames, cameras, shutter)
     entries = list[list[dict[str, Any]]]()
-    for f, (world_T_rig, c) in enumerate(
-        zip(reconstruction.world_T_rigs, frames.cameras.tolist(), strict=True)
-    ):
+    for f, (world_T_rig, c) in enumerate(_posed(data.reconstruction, frames)):
         names = files[c].images(frames, f), _mask_paths(files[c], frames, f)
         velocity = None if velocities is None else velocities[f]
         entries.append(rigs[c].entries(f, world_T_rig, *names, out_R_world, velocity))
@@ -145,9 +81,8 @@ def write_nerfstudio_raw(
         camera["rolling_shutter"] = [0, 0, 1, 0]
     if velocities is not None:
         camera |= motion.shutter_keys(shutter, rolling=moving)
-    path = partial / "transforms.json"
-    _write_transforms(path, camera, entries, out_R_world, reconstruction, split)
-    return [by_camera([RawPictures(one, link) for one in files], frames)]
+    _write_transforms(data, "transforms.json", camera, entries, out_R_world)
+    return by_camera([RawPictures(one, data.options.link) for one in files], frames)
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,42 +126,33 @@ class _RawRig:
 
 
 def z_up_R_world(up: str | None) -> np.ndarray:
-    """Rotation (3, 3) of a world to one whose z points up, see `write_nerfstudio`."""
+    """Rotation (3, 3) of a world to one whose z points up, taken for y down if unknown."""
     return _Z_UP_R_WORLD.get(up or "-y", NERFSTUDIO_R_WORLD)
 
 
-def _write_cloud(partial: Path, reconstruction: Reconstruction, up: str | None) -> np.ndarray:
-    """Write the cloud in nerfstudio's world; returns out_R_world (3, 3)."""
-    out_R_world = z_up_R_world(up)
-    points = reconstruction.points_world @ out_R_world.T
-    write_splat_points(partial / _CLOUD, points, reconstruction.point_colors)
-    return out_R_world
+def _posed(reconstruction: Reconstruction, frames: FrameSet) -> Iterator[tuple[np.ndarray, int]]:
+    """Pose (4, 4) and camera of each frame."""
+    return zip(reconstruction.world_T_rigs, frames.cameras.tolist(), strict=True)
 
 
-def _write_face_dataset(
-    partial: Path,
-    reconstruction: Reconstruction,
-    frames: FrameSet,
-    files: Sequence[Files],
-    views: Sequence[tuple[View, ...]],
-    out_R_world: np.ndarray,
-    cameras: Cameras,
-    shutter: motion.Shutter,
-    split: bool,
-    depths: bool,
-) -> None:
+def _write_faces(data: Dataset, out_R_world: np.ndarray) -> FrameWriter:
+    frames, cameras, options = data.frames, data.cameras, data.options
+    views = views_of_cameras(frames, options.face_size, cameras)
+    masked = has_masks(frames)
+    files = [_files(data, [view.name for view in own], masked) for own in views]
+    seen = seen_from_lenses(data.reconstruction, cameras)
+    if options.depths:
+        write_depths(data, seen, files, views, maps=True)
     # OPENCV without distortion is a pinhole, by the only name that all readers know.
     camera = {"camera_model": "OPENCV", "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0}
     alike = len({view.intrinsics for own in views for view in own}) == 1
     if alike:
         camera |= _intrinsics(views[0][0])
-    velocities = motion.rig_velocities(reconstruction, frames, cameras, shutter)
+    velocities = motion.rig_velocities(seen, frames, cameras, options.shutter)
     if velocities is not None:
-        camera |= motion.shutter_keys(shutter, rolling=False)
+        camera |= motion.shutter_keys(options.shutter, rolling=False)
     entries = list[list[dict[str, Any]]]()
-    for f, (world_T_rig, c) in enumerate(
-        zip(reconstruction.world_T_rigs, frames.cameras.tolist(), strict=True)
-    ):
+    for f, (world_T_rig, c) in enumerate(_posed(seen, frames)):
         images, hidden = files[c].images(frames, f), _mask_paths(files[c], frames, f)
         entries.append([])
         for number, view in enumerate(views[c]):
@@ -235,29 +161,21 @@ def _write_face_dataset(
                 entry |= _intrinsics(view)
             if hidden:
                 entry["mask_path"] = hidden[number]
-            if depths:
+            if options.depths:
                 entry["depth_file_path"] = map_path(images[number])
             if velocities is not None:
                 entry |= motion.velocity_keys(velocities[f], view.rig_T_view)
             entries[-1].append(entry)
-    path = partial / "transforms.json"
-    _write_transforms(path, camera, entries, out_R_world, reconstruction, split)
+    _write_transforms(data, "transforms.json", camera, entries, out_R_world)
+    scenes = scenes_of(data.reconstruction)
+    return view_writer(files, frames, views, cameras, options.link, scenes)
 
 
-def _write_erp_dataset(
-    partial: Path,
-    reconstruction: Reconstruction,
-    frames: FrameSet,
-    cameras: Cameras,
-    out_R_world: np.ndarray,
-    link: bool,
-    which: str,
-    split: bool,
-    masks: MaskStyle,
-) -> FrameWriter:
+def _write_panoramas(data: Dataset, out_R_world: np.ndarray, which: str) -> FrameWriter:
+    frames = data.frames
     mask = f"masks{which}/{{name}}.png" if has_masks(frames) else ""
-    names = base_names(padded_names(frames.names))
-    files = Files(partial, ("",), f"images{which}/{{name}}{{suffix}}", mask, masks, names)
+    names, pattern = base_names(padded_names(frames.names)), f"images{which}/{{name}}{{suffix}}"
+    files = Files(data.folder, ("",), pattern, mask, data.options.masks, names)
     shapes = [
         {"fl_x": kind.width / 2, "fl_y": float(kind.height), "cx": kind.width / 2}
         | {"cy": kind.height / 2, "w": kind.width, "h": kind.height}
@@ -266,9 +184,7 @@ def _write_erp_dataset(
     camera: dict[str, Any] = {"camera_model": "EQUIRECTANGULAR"}
     camera |= shapes[0] if len(shapes) == 1 else {}
     entries = list[list[dict[str, Any]]]()
-    for f, (world_T_rig, c) in enumerate(
-        zip(reconstruction.world_T_rigs, frames.cameras.tolist(), strict=True)
-    ):
+    for f, (world_T_rig, c) in enumerate(_posed(data.reconstruction, frames)):
         (image,), hidden = files.images(frames, f), _mask_paths(files, frames, f)
         entry = _entry(image, out_R_world, world_T_rig)
         if len(shapes) > 1:
@@ -276,18 +192,16 @@ def _write_erp_dataset(
         if hidden:
             entry["mask_path"] = hidden[0]
         entries.append([entry])
-    path = partial / f"transforms{which}.json"
-    _write_transforms(path, camera, entries, out_R_world, reconstruction, split)
-    return panorama_writer(files, frames, cameras, link, scenes_of(reconstruction))
+    _write_transforms(data, f"transforms{which}.json", camera, entries, out_R_world)
+    scenes = scenes_of(data.reconstruction)
+    return panorama_writer(files, frames, data.cameras, data.options.link, scenes)
 
 
-def _files(
-    partial: Path, views: Sequence[str], frames: FrameSet, masked: bool, style: MaskStyle
-) -> Files:
+def _files(data: Dataset, views: Sequence[str], masked: bool) -> Files:
     """Files of images and masks with unique base names."""
-    mask = "masks/{name}_{view}.png" if masked else ""
-    names = base_names(padded_names(frames.names))
-    return Files(partial, views, "images/{name}_{view}{suffix}", mask, style, names)
+    mask, pattern = "masks/{name}_{view}.png" if masked else "", "images/{name}_{view}{suffix}"
+    names = base_names(padded_names(data.frames.names))
+    return Files(data.folder, views, pattern, mask, data.options.masks, names)
 
 
 def _mask_paths(files: Files, frames: FrameSet, f: int) -> list[str]:
@@ -322,38 +236,29 @@ def _matrix(out_R_world: np.ndarray, world_T_camera: np.ndarray) -> list[list[fl
 
 
 def _write_transforms(
-    path: Path,
+    data: Dataset,
+    name: str,
     camera: dict[str, Any],
     entries: Sequence[Sequence[dict[str, Any]]],
     out_R_world: np.ndarray,
-    reconstruction: Reconstruction,
-    split: bool,
 ) -> None:
-    """Write transforms.json, with the entries of each frame (F).
-
-    Images of held-out frames are for evaluation, and without a split for training, too.
-    """
-    held_out = held_out_frames(reconstruction)
+    """Write transforms.json with each frame's (F) entries; unsplit, all are for training, too."""
+    held_out = held_out_frames(data.reconstruction)
     names = [[str(entry["file_path"]) for entry in of_frame] for of_frame in entries]
     evaluated = [n for held, own in zip(held_out, names, strict=True) if held for n in own]
-    apart = held_out & split
+    apart = held_out & data.split
     trained = [n for held, own in zip(apart, names, strict=True) if not held for n in own]
     every = [entry["transform_matrix"] for of_frame in entries for entry in of_frame]
     applied = np.column_stack([out_R_world, np.zeros(3)])
+    half = _NGP_SCALE * np.abs(np.array(every)[:, :3, 3]).max(initial=0.0)  # side of the box
     document = {
         **camera,
         "applied_transform": applied.tolist(),
-        "aabb_scale": _ngp_boxes(np.array(every)[:, :3, 3]),
+        "aabb_scale": int(min(2.0 ** np.ceil(np.log2(max(2 * half, 1.0))), _NGP_MAX_BOXES)),
         "ply_file_path": _CLOUD,
         "train_filenames": trained,
         "val_filenames": evaluated,
         "test_filenames": evaluated,
         "frames": [entry for of_frame in entries for entry in of_frame],
     }
-    path.write_text(json.dumps(document, indent=1) + "\n")
-
-
-def _ngp_boxes(centres: np.ndarray) -> int:
-    """Scale of instant-ngp's box that holds all camera centres (N, 3)."""
-    half = _NGP_SCALE * np.abs(centres).max(initial=0.0)
-    return int(min(2.0 ** np.ceil(np.log2(max(2 * half, 1.0))), _NGP_MAX_BOXES))
+    (data.folder / name).write_text(json.dumps(document, indent=1) + "\n")

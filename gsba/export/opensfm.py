@@ -18,12 +18,11 @@ from typing import Any
 
 import numpy as np
 
-from gsba.camera.cameras import ONE_CAMERA, Cameras
 from gsba.camera.one_centre import seen_from_the_middle
 from gsba.camera.sphere import erp_from_bearings
 from gsba.camera.views import scenes_of
+from gsba.export.dataset import Dataset
 from gsba.export.images import has_masks, panorama_writer
-from gsba.export.masks import MASK_FILES, MaskStyle
 from gsba.export.names import base_names
 from gsba.export.nerfstudio import z_up_R_world
 from gsba.export.pictures import Files, FrameWriter
@@ -47,33 +46,18 @@ def z_up(placement: Placement) -> Placement:
     )
 
 
-def write_opensfm(
-    partial: Path,
-    reconstruction: Reconstruction,
-    frames: FrameSet,
-    placement: Placement,
-    link: bool = False,
-    cameras: Cameras = ONE_CAMERA,
-    masks: MaskStyle = MASK_FILES,
-) -> FrameWriter:
-    """Write a project into `partial`, without images; returns their writer.
-
-    Args:
-        partial: folder to write.
-        reconstruction, frames: poses and cloud in a world whose z points up, and their frames.
-        placement: of that world.
-        link: make hard links to panoramas that are exported unchanged.
-        cameras: cameras of the frames.
-        masks: how masks are written.
+def write_opensfm(data: Dataset) -> FrameWriter:
+    """Write a project, in a world whose z points up, without images; returns their writer.
 
     Raises:
         GsbaError: the frames are cube faces, or two of them get one file name.
     """
+    frames, partial, placement = data.frames, data.folder, data.placement
     if not all(kind.panoramic for kind in frames.formats):
         raise GsbaError("opensfm needs panoramas, these frames are cube faces: use colmap")
     mask = "masks/{name}{suffix}.png" if has_masks(frames) else ""
     names = base_names(frames.names)  # OpenSfM looks into no subfolder
-    files = Files(partial, ("",), "images/{name}{suffix}", mask, masks, names)
+    files = Files(partial, ("",), "images/{name}{suffix}", mask, data.options.masks, names)
     shots = [files.images(frames, f)[0].removeprefix("images/") for f in range(len(frames))]
     models = {
         _camera_name(kind.width, kind.height): {
@@ -83,7 +67,7 @@ def write_opensfm(
         }
         for kind in frames.formats
     }
-    seen = seen_from_the_middle(reconstruction) if cameras else reconstruction
+    seen = seen_from_the_middle(data.reconstruction) if data.cameras else data.reconstruction
     document: dict[str, Any] = {"cameras": models, "shots": _shots(seen, frames, shots)}
     document["points"] = {
         str(j): {"coordinates": xyz, "color": color}
@@ -100,7 +84,8 @@ def write_opensfm(
     with (partial / "tracks.csv").open("w", encoding="utf-8") as file:
         file.write("OPENSFM_TRACKS_VERSION_v2\n")
         file.writelines(_tracks(seen, frames, shots))
-    return panorama_writer(files, frames, cameras, link, scenes_of(reconstruction))
+    scenes = scenes_of(data.reconstruction)
+    return panorama_writer(files, frames, data.cameras, data.options.link, scenes)
 
 
 def _camera_name(width: int, height: int) -> str:

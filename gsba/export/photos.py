@@ -10,7 +10,6 @@ points. They are for training, but for those that such readers hold out (`gsba.e
 import json
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,46 +17,17 @@ import numpy as np
 
 from gsba.disk import disk_errors, write_image
 from gsba.export.colmap import write_in_order
+from gsba.export.dataset import Dataset, PhotoCamera, Photos, PlacedPhoto
 from gsba.export.depths import map_path, write_empty_map
+from gsba.export.images import has_masks
 from gsba.export.split import TRAIN_LIST, add_images
 from gsba.frames.files import decode, goes_out_as_it_is, image_size
 from gsba.geometry import CV_R_GL, inverse
 from gsba.log import GsbaError
-from gsba.placement.placement import Placement
 from gsba.store.records import RecordError, typed
 
 LIST = "localized.json"  # of `gsba localize`, in its folder
-FITTING = ("colmap", "colmap-flat", "nerfstudio")  # formats of faces, that hold photos and depths
 _INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "p1", "p2")
-
-
-@dataclass(frozen=True, slots=True)
-class PhotoCamera:
-    """A camera that photos share: r = focal (t + k1 t^3 + k2 t^5), t = tan of the angle."""
-
-    width: int  # pixels
-    height: int  # pixels
-    focal: float  # pixels
-    principal: tuple[float, float]  # pixels, corner origin
-    radial: tuple[float, float]  # k1, k2
-
-
-@dataclass(frozen=True, slots=True)
-class PlacedPhoto:
-    """A photo with a pose in the run's world."""
-
-    name: str
-    path: Path
-    world_T_camera: np.ndarray  # (4, 4) float64, x right, y down, z forward
-    camera: int  # number of its camera
-
-
-@dataclass(frozen=True, slots=True)
-class Photos:
-    """Photos of a run's place, and their cameras."""
-
-    photos: tuple[PlacedPhoto, ...] = ()
-    cameras: tuple[PhotoCamera, ...] = ()
 
 
 def read_photos(folder: Path | None, run: Path) -> Photos:
@@ -110,31 +80,22 @@ def _photo(entry: dict[str, Any]) -> PlacedPhoto:
     return PlacedPhoto(name, Path(typed(entry["file"], str)), pose, camera)
 
 
-def add_photos(
-    partial: Path,
-    to: str,
-    photos: Photos,
-    placement: Placement,
-    undistort: bool = False,
-    masked: bool = False,
-) -> None:
-    """Add photos to a dataset that is being written.
-
-    Args:
-        partial: its folder, with the model of the faces.
-        to: its format, one of FITTING.
-        photos: in the run's world.
-        placement: of the exported world.
-        undistort: write photos of pinhole cameras.
-        masked: write masks that hide nothing: nerfstudio wants one of each image, or none.
+def add_photos(data: Dataset) -> None:
+    """Add its photos to a dataset whose faces are written, of pinhole cameras if its reader knows
+    no others. Where frames have masks, photos get some that hide nothing.
 
     Raises:
         GsbaError: two photos would have one name, or one cannot be read.
     """
-    move = placement.similarity
-    poses = move.poses(np.array([photo.world_T_camera for photo in photos.photos]))
+    partial, to, photos, options = data.folder, data.to, data.options.photos, data.options
+    undistort = bool(options.cameras) and "RADIAL" not in options.cameras
+    masked = has_masks(data.frames) and not options.masks.path
+    poses = data.placement.similarity.poses(
+        np.array([photo.world_T_camera for photo in photos.photos])
+    )
     pattern = "images/photos/{}{}" if to == "colmap" else "images/photo_{}{}"
-    names = [pattern.format(photo.name, _suffix(photo)) for photo in photos.photos]
+    suffixes = [{".png": ".png"}.get(p.path.suffix.lower(), ".jpg") for p in photos.photos]
+    names = [pattern.format(p.name, end) for p, end in zip(photos.photos, suffixes, strict=True)]
     for n, name in enumerate(names):
         if name in names[:n]:
             first, second = (photos.photos[k].path for k in (names.index(name), n))
@@ -162,19 +123,19 @@ def add_photos(
     write_in_order(model, partial / "sparse" / "0")
 
 
-def _suffix(photo: PlacedPhoto) -> str:
-    return ".png" if photo.path.suffix.lower() == ".png" else ".jpg"
-
-
 def _write_photos(partial: Path, photos: Photos, names: Sequence[str], undistort: bool) -> None:
     """Write the photos to paths in the dataset, upright and in eight bits."""
+    import cv2
+
     for photo, name in zip(photos.photos, names, strict=True):
         target, camera = partial / name, photos.cameras[photo.camera]
         with disk_errors(target):
             target.parent.mkdir(parents=True, exist_ok=True)
             if undistort:
                 image = decode(photo.path, image_size(photo.path))
-                write_image(target, _undistorted(image, camera))
+                pinhole = _pinhole(camera)
+                image = cv2.undistort(image, *_opencv(camera), newCameraMatrix=pinhole)
+                write_image(target, image)
             elif goes_out_as_it_is(photo.path, target):
                 shutil.copyfile(photo.path, target)
             else:
@@ -203,12 +164,6 @@ def _pinhole(camera: PhotoCamera) -> np.ndarray:
 
     size = camera.width, camera.height
     return cv2.getOptimalNewCameraMatrix(*_opencv(camera), size, alpha=0)[0]
-
-
-def _undistorted(image: np.ndarray, camera: PhotoCamera) -> np.ndarray:
-    import cv2
-
-    return cv2.undistort(image, *_opencv(camera), newCameraMatrix=_pinhole(camera))
 
 
 def _add_to_colmap(

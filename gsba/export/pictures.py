@@ -21,11 +21,10 @@ import numpy as np
 
 from gsba.camera.straighten import PAD
 from gsba.disk import atomic_write, encoded_image, write_bytes
-from gsba.export.masks import MASK_FILES, MaskStyle
-from gsba.frames.buffers import Buffers
+from gsba.export.dataset import MASK_FILES, MaskStyle
 from gsba.frames.files import goes_out_as_it_is
 from gsba.frames.masks import load_mask
-from gsba.frames.pixels import load_padded
+from gsba.frames.pixels import Buffers, load_padded
 from gsba.log import GsbaError
 from gsba.store.shards import even_blocks
 from gsba.types import FrameSet

@@ -50,6 +50,11 @@ def write_splat_points(path: Path, points: np.ndarray, colors: np.ndarray) -> No
     _write(path, columns)
 
 
+def write_cloud(path: Path, reconstruction: Reconstruction) -> None:
+    """Write a map's points by `write_splat_points`."""
+    write_splat_points(path, reconstruction.points_world, reconstruction.point_colors)
+
+
 def _vectors(names: str, values: np.ndarray, dtype: str) -> dict[str, np.ndarray]:
     return {name: values[:, i].astype(dtype) for i, name in enumerate(names.split())}
 

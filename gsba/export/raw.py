@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsba.camera.fisheye import Rig, rotation_of, unproject
-from gsba.camera.sphere import erp_from_bearings
-from gsba.camera.tables import table
+from gsba.camera.sphere import erp_from_bearings, table
 from gsba.export.pictures import FrameWriter, Shown
 from gsba.frames.dual_fisheye import load_raw
 from gsba.log import GsbaError
@@ -55,8 +54,7 @@ class RawPictures(FrameWriter):
 
 @table(maxsize=4)
 def _circle(lens: Fisheye, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
-    """Mask (h, w) bool of a lens's image, True within SEEN_DEG; and the panorama's pixel that
-    each pixel shows, (h, w) int32, counted row by row."""
+    """Mask (h, w) bool of what a lens sees within SEEN_DEG; the panorama's pixel, (h, w) int32."""
     seen = np.empty((lens.height, lens.width), bool)
     pixels = np.empty((lens.height, lens.width), np.int32)
     for top in range(0, lens.height, _ROWS_AT_ONCE):

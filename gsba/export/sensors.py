@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsba.camera.fisheye import Rig, facing, optical_axes, project, rotation_of
+from gsba.camera.fisheye import facing, optical_axes, project, rotation_of
 from gsba.camera.lens import Lenses
 from gsba.camera.sphere import erp_from_bearings
 from gsba.camera.views import View
@@ -64,10 +64,8 @@ def project_in_rigs(
 def _project(
     sensors: Sequence[Sensor], bearings: np.ndarray, origins: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Sensor (O,) that sees each bearing (O, 3) from its origin, and its pixel (O, 2) there.
-
-    Among the sensors of the origin's lens it is the one with the pixel furthest from the border.
-    """
+    """Sensor (O,) of the origin's lens that sees each bearing (O, 3) furthest from its border, and
+    the pixel (O, 2) there."""
     if sensors[0].fisheye is not None:
         return _project_raw(sensors, bearings, origins)
     if sensors[0].model == "EQUIRECTANGULAR":
@@ -91,7 +89,8 @@ def _project_raw(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Sensor (O,) and pixel (O, 2) of each bearing (O, 3) in the raw lenses; -1 beyond SEEN_DEG."""
     if origins is None:
-        which = facing(bearings, optical_axes(_fisheyes(sensors)))
+        rig = tuple(sensor.fisheye for sensor in sensors if sensor.fisheye is not None)
+        which = facing(bearings, optical_axes(rig))
     else:
         centres = np.array([sensor.rig_T_sensor[:3, 3] for sensor in sensors])
         apart = np.linalg.norm(origins[:, None] - centres, axis=2)
@@ -104,10 +103,6 @@ def _project_raw(
         far = bearings @ rotation_of(sensor.fisheye)[:, 2] < np.cos(np.deg2rad(SEEN_DEG))
         which[own & far] = -1
     return which, pixels
-
-
-def _fisheyes(sensors: Sequence[Sensor]) -> Rig:
-    return tuple(sensor.fisheye for sensor in sensors if sensor.fisheye is not None)
 
 
 def _pinhole(view: View) -> Sensor:

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import get_args
 
+from gsba.export.dataset import MASK_FILES, MaskStyle, Paint
 from gsba.export.formats import ExportFormat, ExportOptions
-from gsba.export.masks import MASK_FILES, MaskStyle, Paint
 from gsba.log import GsbaError
 
 

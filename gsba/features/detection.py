@@ -10,9 +10,37 @@ import cv2
 import numpy as np
 
 from gsba.camera.rig import RIG_R_FACE, CubeRig, owner_faces
-from gsba.config import FeatureSettings
+from gsba.config import FeatureSettings, MatchingSettings, RefineSettings
 from gsba.disk import concatenated
 from gsba.types import FACES, Features, Keypoints
+
+
+@dataclass(frozen=True, slots=True)
+class ExtractorTraits:
+    """Traits of an extractor's keypoints and descriptors."""
+
+    min_similarity: float  # cosine that 95 % of true matches exceed
+    max_ratio: float  # ratio of distances, best over second best, below which 90 % of them are
+    sigma_px: float | None = None  # per-axis noise, face pixels; None = by a keypoint's size
+    offset_px: tuple[float, float] = (0.0, 0.0)  # (u, v) to add to the network's pixels
+
+
+TRAITS = {
+    "sift": ExtractorTraits(0.8, 0.9),
+    "aliked": ExtractorTraits(0.55, 0.95, 0.28, (-0.35, 0.1)),
+    "disk": ExtractorTraits(0.55, 0.95, 0.37, (-0.45, -0.35)),
+    "xfeat": ExtractorTraits(0.78, 0.97, 0.42, (-0.1, 1.05)),
+    "superpoint": ExtractorTraits(0.8, 0.9, 0.5),  # not measured
+}
+
+
+def search_settings(settings: RefineSettings) -> MatchingSettings:
+    """Settings of the descriptor search, with the extractor's limits where none are given."""
+    chosen, traits = settings.matching, TRAITS[settings.features.extractor]
+    measured = {"min_similarity": traits.min_similarity, "max_ratio": traits.max_ratio}
+    missing = {name: value for name, value in measured.items() if getattr(chosen, name) is None}
+    return chosen.model_copy(update=missing)
+
 
 # Noise of SIFT keypoints along each axis, face pixels: of the smallest
 # ones, and what is added in proportion to a keypoint's size.
@@ -64,14 +92,10 @@ class SiftExtractor:
         pixels = np.array([k.pt for k in keypoints]) + 0.5
         sizes = np.array([k.size for k in keypoints])
         sigmas = np.hypot(SIGMA_PX, _SIGMA_PER_SIZE * sizes)
-        return FaceKeypoints(pixels, sigmas, _root_sift(descriptors))
-
-
-def _root_sift(descriptors: np.ndarray) -> np.ndarray:
-    """Hellinger-normalised descriptors, quantised to uint8 with factor 512."""
-    mass = descriptors.sum(axis=1, keepdims=True)
-    rooted = np.sqrt(descriptors / np.maximum(mass, 1e-12))
-    return np.minimum(np.rint(512 * rooted), 255).astype(np.uint8)
+        # Hellinger-normalised, quantised with factor 512
+        mass = descriptors.sum(axis=1, keepdims=True)
+        rooted = np.rint(512 * np.sqrt(descriptors / np.maximum(mass, 1e-12)))
+        return FaceKeypoints(pixels, sigmas, np.minimum(rooted, 255).astype(np.uint8))
 
 
 def extract(
@@ -82,8 +106,6 @@ def extract(
     Args:
         faces_rgb: (6, N, N, 3) uint8 in FACES order.
         masks: (6, N, N) bool, True = use, or None.
-        rig: geometry of the faces.
-        extractor: the detector.
     """
     wanted = _owned_pixels(rig) if masks is None else _owned_pixels(rig) & masks
     usable = [face for face in range(len(FACES)) if wanted[face].any()]
@@ -93,7 +115,15 @@ def extract(
         found = extractor(faces_rgb[face], wanted[face])
         bearings = rig.bearings(found.pixels, face)
         own = owner_faces(bearings) == face
-        parts.append(_feature_fields(found, bearings, own, face, faces_rgb[face], rig))
+        pixels = found.pixels[own]
+        # A pixel at angle a off the axis subtends cos^2 a radially and cos a tangentially of 1 / f;
+        # the geometric mean keeps the noise isotropic.
+        cosine = bearings[own] @ RIG_R_FACE[face, :, 2]
+        sigmas = found.sigmas_px[own] / rig.focal * cosine**1.5
+        columns, rows = np.minimum(pixels, rig.size - 1).astype(int).T
+        colors = faces_rgb[face][rows, columns]
+        owners = np.full(len(pixels), face, np.uint8)
+        parts.append((pixels, owners, bearings[own], sigmas, found.descriptors[own], colors))
         if found.scores is not None:
             scores.append(found.scores[own])
     features = Features(*(np.concatenate(column) for column in zip(*parts, strict=True)))
@@ -102,8 +132,7 @@ def extract(
 
 @lru_cache(maxsize=2)
 def _owned_pixels(rig: CubeRig) -> np.ndarray:
-    """Pixels (6, N, N) bool at or beside those that a face owns; keypoints elsewhere are
-    dropped."""
+    """Pixels (6, N, N) bool at or beside those that a face owns; other keypoints are dropped."""
     centres = np.arange(rig.size) + 0.5
     grid = np.stack(np.meshgrid(centres, centres), axis=-1)
     owned = [owner_faces(rig.bearings(grid, face)) == face for face in range(len(FACES))]
@@ -111,31 +140,10 @@ def _owned_pixels(rig: CubeRig) -> np.ndarray:
     return np.stack([cv2.dilate(own.astype(np.uint8), border) > 0 for own in owned])
 
 
-def _feature_fields(
-    found: FaceKeypoints,
-    bearings: np.ndarray,
-    own: np.ndarray,
-    face: int,
-    image: np.ndarray,
-    rig: CubeRig,
-) -> tuple[np.ndarray, ...]:
-    """Fields of Features for the keypoints of one face that the face owns."""
-    pixels = found.pixels[own]
-    # A pixel at angle a off the axis subtends cos^2 a radially and cos a tangentially of 1 / f;
-    # the geometric mean keeps the noise isotropic.
-    cosine = bearings[own] @ RIG_R_FACE[face, :, 2]
-    sigmas = found.sigmas_px[own] / rig.focal * cosine**1.5
-    rows, columns = np.minimum(pixels[:, 1], rig.size - 1), np.minimum(pixels[:, 0], rig.size - 1)
-    colors = image[rows.astype(int), columns.astype(int)]
-    owners = np.full(len(pixels), face, np.uint8)
-    return pixels, owners, bearings[own], sigmas, found.descriptors[own], colors
-
-
 def gather(frames: Iterable[Features], folder: Path | None = None) -> Keypoints:
     """Keypoints of all frames in one record, without descriptors.
 
     Args:
-        frames: features of each frame.
         folder: on the disk that holds the arrays while they are used; None = they are in memory.
     """
     lengths = [0]
@@ -154,7 +162,6 @@ def on_faces(keypoints: Keypoints, rig: CubeRig) -> Keypoints:
 
     Args:
         keypoints: of frames of several runs, each on the faces of its own rig.
-        rig: the faces.
     """
     pixels = rig.project(keypoints.bearings_rig, keypoints.faces)
     moved = np.abs(pixels - keypoints.pixels).max(axis=1, initial=0.0) > _SAME_PIXEL_PX

@@ -103,10 +103,7 @@ def extract(
     """Features by frame name; image and mask are read, cut and released one at a time.
 
     Args:
-        store: of the run.
-        search: its frames, and how they are searched.
         files: that the extractor depends on: weights of a learned one.
-        name: name of the stage.
         chosen_frames: (F,) bool, frames to extract; None = all.
         known: features of some of them by name, found by the same search; None = of none.
     """
@@ -144,7 +141,6 @@ def adopted(
         store, frames, rig, settings: those of the run.
         make_extractor: makes an extractor, once for each frame.
         stored: (F,) file of each frame in the folder of another run.
-        name: name of the stage.
     """
     index = {frame: f for f, frame in enumerate(frames.names)}
     compute = _Extraction(frames, index, rig, settings, make_extractor)

@@ -7,9 +7,8 @@ import numpy as np
 
 from gsba.camera.equiangular import Grid, around_squares, shrunk
 from gsba.camera.rig import CubeRig
-from gsba.camera.sphere import around_sphere, dense_enough, erp_from_bearings, low_passed
+from gsba.camera.sphere import around_sphere, dense_enough, erp_from_bearings, low_passed, table
 from gsba.camera.straighten import PAD
-from gsba.camera.tables import table
 from gsba.config import CubemapSettings
 from gsba.frames.masks import load_usable
 from gsba.frames.pixels import load_erp, load_faces

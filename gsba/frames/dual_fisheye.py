@@ -1,6 +1,5 @@
 """Panoramas of raw fisheyes: the lens that faces a direction shows it; nothing is blended."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -8,12 +7,10 @@ import numpy as np
 
 from gsba.camera.fisheye import Rig, facing, optical_axes, project
 from gsba.camera.lens import seam_sines
-from gsba.camera.sphere import bearings_from_erp
-from gsba.camera.tables import table
+from gsba.camera.sphere import erp_bands, table
 from gsba.frames.raw_pairs import decode_pair
 from gsba.types import FrameSet
 
-_ROWS_AT_ONCE = 256  # rows whose coordinates are held in double precision at once
 _ASIDE_PX = 1e-6  # a column that lies exactly on a seam goes whole to the lens on its right
 SEAM = np.deg2rad(1.5)  # angle from the seam within which a window shows both lenses
 
@@ -53,10 +50,12 @@ def join_pictures(pictures: list[np.ndarray], rig: Rig, width: int, share: float
         places = part.places
         if share < 1:
             size = picture.shape[1::-1]
-            picture = _shrunk(picture, share)
+            shrunk = [max(round(share * pixels), 1) for pixels in size]
+            picture = cv2.resize(picture, shrunk, interpolation=cv2.INTER_AREA)
             scale = np.array(picture.shape[1::-1]) / size
             places = ((places + 0.5) * scale - 0.5).astype(np.float32)
-        shown = _picture_at(picture, places)
+        nothing, how = np.zeros(0, np.float32), cv2.INTER_LANCZOS4
+        shown = cv2.remap(picture, places, nothing, how, borderMode=cv2.BORDER_REPLICATE)
         if part.own is None:
             joined[:, part.columns] = shown
         else:
@@ -87,23 +86,10 @@ def clear_of_seam(height: int, rig: Rig) -> np.ndarray:
 @table(maxsize=2)
 def _clear_of_seam(height: int, axes: tuple[tuple[float, ...], ...]) -> np.ndarray:
     clear, of_lenses = np.empty((height, 2 * height), bool), np.array(axes)
-    for top in range(0, height, _ROWS_AT_ONCE):
-        rows = np.arange(top, min(top + _ROWS_AT_ONCE, height)) + 0.5
-        pixels = np.stack(np.meshgrid(np.arange(2 * height) + 0.5, rows), axis=-1)
-        bearings = bearings_from_erp(pixels, 2 * height, height)
-        clear[top : top + len(rows)] = seam_sines(bearings, of_lenses) > np.sin(SEAM)
+    for top, bearings in erp_bands(np.arange(2 * height), 2 * height):
+        clear[top : top + len(bearings)] = seam_sines(bearings, of_lenses) > np.sin(SEAM)
     clear.setflags(write=False)
     return clear
-
-
-def _picture_at(picture: np.ndarray, places: np.ndarray) -> np.ndarray:
-    nothing, how = np.zeros(0, np.float32), cv2.INTER_LANCZOS4
-    return cv2.remap(picture, places, nothing, how, borderMode=cv2.BORDER_REPLICATE)
-
-
-def _shrunk(picture: np.ndarray, share: float) -> np.ndarray:
-    height, width = (max(round(share * size), 1) for size in picture.shape[:2])
-    return cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
 
 
 @table(maxsize=2)
@@ -111,23 +97,15 @@ def _parts(rig: Rig, width: int) -> tuple[_Part, ...]:
     """The part of a panorama that each lens shows."""
     height, axes, faced = width // 2, optical_axes(rig), np.empty((width // 2, width), np.uint8)
     aside = np.arange(width) + _ASIDE_PX
-    for top, bearings in _bearings(aside, width):
+    for top, bearings in erp_bands(aside, width):
         faced[top : top + len(bearings)] = facing(bearings, axes)
     parts = []
     for number, lens in enumerate(rig):
         own = faced == number
         columns = np.flatnonzero(own.any(axis=0))
         places = np.empty((height, len(columns), 2), np.float32)
-        for top, bearings in _bearings(columns, width):
+        for top, bearings in erp_bands(columns, width):
             places[top : top + len(bearings)] = project(lens, bearings) - 0.5
         own = own[:, columns]
         parts.append(_Part(columns, places, None if own.all() else own))
     return tuple(parts)
-
-
-def _bearings(columns: np.ndarray, width: int) -> Iterator[tuple[int, np.ndarray]]:
-    """First row and directions (h, C, 3) of parts of some columns of a panorama."""
-    for top in range(0, width // 2, _ROWS_AT_ONCE):
-        rows = np.arange(top, min(top + _ROWS_AT_ONCE, width // 2)) + 0.5
-        pixels = np.stack(np.meshgrid(columns + 0.5, rows), axis=-1)
-        yield top, bearings_from_erp(pixels, width, width // 2)

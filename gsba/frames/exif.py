@@ -78,8 +78,7 @@ def read_exif(path: Path) -> ExifTags:
 
 
 def _taken(tags: Mapping[int, Any]) -> tuple[float | None, bool, bool]:
-    """Time of DateTimeOriginal with its fraction; True if its zone is known; True if it has a
-    fraction."""
+    """Time of DateTimeOriginal with its fraction; whether zone and fraction are given."""
     try:
         moment = datetime.strptime(_text(tags, _TAKEN), "%Y:%m:%d %H:%M:%S")
     except ValueError:  # absent, or blank as written by cameras without a clock
@@ -137,8 +136,7 @@ def _number(tags: Mapping[int, Any], tag: int, low: float = 0.0) -> float:
 
 
 def _sexagesimal(parts: Sequence[Any]) -> float:
-    """Value in the first unit of (degrees or hours, minutes, seconds); later parts may be absent or
-    0/0."""
+    """Value in the first unit of (degrees or hours, minutes, seconds); later parts may be 0/0."""
     values = [float(part) for part in parts]
     values[1:] = [value if math.isfinite(value) else 0.0 for value in values[1:]]
     return sum(value / 60**k for k, value in enumerate(values[:3]))

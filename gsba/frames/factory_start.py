@@ -138,11 +138,7 @@ def starting_lenses(
 
 
 def _read_factory_calibration(folder: Path) -> FactoryCalibration | None:
-    """The maker's calibration beside frames; None = there is none.
-
-    Raises:
-        GsbaError: the file is damaged.
-    """
+    """The maker's calibration beside frames; None = there is none."""
     path = folder / FACTORY_FILE
     try:
         with path.open("rb") as file:
@@ -162,11 +158,7 @@ def _read_factory_calibration(folder: Path) -> FactoryCalibration | None:
 
 
 def _two_whole(values: Any) -> tuple[int, int]:
-    """Two integers.
-
-    Raises:
-        ValueError, TypeError: the values are not two integers.
-    """
+    """Two integers, or ValueError or TypeError."""
     first, second = values
     if not all(isinstance(value, int) and abs(value) < 1 << 20 for value in (first, second)):
         raise ValueError

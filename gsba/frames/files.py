@@ -2,6 +2,7 @@
 
 import mmap
 import re
+from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,38 @@ IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".insp")  #
 
 _MAX_PADDING_BYTES, _PADDING_VALUES = 1024, (b"\0", b"\xff")  # largest number of padding bytes
 # before the end, and their values
+
+
+def entries_of(folder: Path) -> list[Path]:
+    """Files and folders in a folder, in the order of their names.
+
+    Raises:
+        GsbaError: it is no folder, or cannot be read.
+    """
+    try:
+        return sorted(folder.iterdir())
+    except FileNotFoundError:
+        raise GsbaError(f"{folder}: no such file or folder") from None
+    except NotADirectoryError:
+        raise GsbaError(f"{folder}: is a file; give the folder of extracted frames") from None
+    except OSError as error:
+        raise GsbaError(f"{folder}: cannot be read ({error.strerror})") from None
+
+
+def images_by_name(folder: Path, images: Iterable[Path]) -> dict[str, Path]:
+    """Images by frame name.
+
+    Raises:
+        GsbaError: two of them have one name in `folder`, the folder of all frames.
+    """
+    found: dict[str, Path] = {}
+    for path in images:
+        if path.stem in found:
+            raise GsbaError(
+                f"{folder}: '{found[path.stem].name}' and '{path.name}' are one frame's name twice"
+            )
+        found[path.stem] = path
+    return found
 
 
 def is_image(path: Path) -> bool:
@@ -93,7 +126,9 @@ def decode(
             f"{path}: is {header.width}x{header.height}, was {size[0]}x{size[1]} when the run began"
         )
     if header.crop is not None:
-        return _padded(_stored(encoded, path, header, gray), header.crop)
+        if header.kind == "JPEG":
+            return _padded(_decoded_jpeg(encoded, path, (0, 0), 1, gray, None), header.crop)
+        return _padded(_decoded(encoded, path, gray), header.crop)
     if header.kind == "JPEG":
         part = max(k for k in (1, 2, 4, 8) if k == 1 or size[0] >= k * (at_least or size[0]))
         stored = (size[1], size[0]) if header.swapped else size
@@ -102,13 +137,6 @@ def decode(
         pixels = _decoded(encoded, path, gray)
     upright = header.kind == "TIFF"  # OpenCV turns TIFFs by their tag in any case
     return pixels if upright else turned(pixels, header.orientation)
-
-
-def _stored(encoded: bytes, path: Path, header: Header, gray: bool) -> np.ndarray:
-    """Pixels of the part of a panorama that a file holds."""
-    if header.kind != "JPEG":
-        return _decoded(encoded, path, gray)
-    return _decoded_jpeg(encoded, path, (0, 0), 1, gray, None)
 
 
 def _padded(pixels: np.ndarray, crop: Crop) -> np.ndarray:

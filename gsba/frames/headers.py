@@ -124,10 +124,7 @@ def _header(data: Bytes) -> Header:
 def _shown(
     kind: str, width: int, height: int, orientation: int, plain: bool, xmp: bytes = b""
 ) -> Header:
-    """A header with the size on display, of a stored width and height.
-
-    A panorama of which a part is stored is shown as a whole.
-    """
+    """Header with the size on display; a stored part of a panorama is shown as a whole."""
     if orientation > 4:
         width, height = height, width
     tags = read_tags(xmp) if xmp else None
@@ -270,10 +267,7 @@ def _tiff(data: Bytes) -> Header:
 
 
 def _directory(data: Bytes) -> dict[int, np.ndarray]:
-    """The supported tags of a TIFF's first directory, or of EXIF data.
-
-    If a tag occurs more than once, the first one counts, as in other readers.
-    """
+    """Supported tags of a TIFF's first directory, or of EXIF; of equal tags the first counts."""
     starts = {b"II": "little", b"MM": "big"}
     order = starts.get(data[:2])
     if order not in ("little", "big"):

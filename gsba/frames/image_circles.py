@@ -147,10 +147,8 @@ def _edges(smooth: np.ndarray) -> _Edges:
 
 
 def _half_level(profile: np.ndarray) -> float:
-    """Position in samples at which a falling profile (n,) of brightness is midway between its ends.
-
-    The logarithm is steepest further out, where blur weighs most.
-    """
+    """Position in samples at which a falling profile (n,) is midway between its ends: blur moves
+    the steepest place of its logarithm outwards."""
     level = 0.5 * (profile[:2].mean() + profile[-2:].mean())
     after = int(np.argmax(profile < level))
     before = max(after - 1, 0)
@@ -159,8 +157,7 @@ def _half_level(profile: np.ndarray) -> float:
 
 
 def _best_circle(edges: _Edges, pictures: Sequence[np.ndarray]) -> tuple[ImageCircle | None, int]:
-    """The circle on which most rays have an edge, and their number; the scene's circle in a
-    housing."""
+    """Circle on which most rays have an edge, in a housing the scene's, and these rays' number."""
     height, width = pictures[0].shape
     circles = _trials(edges.places, width, height)
     if not len(circles):
@@ -238,8 +235,7 @@ def _refined(edges: _Edges, circle: np.ndarray, width: int, height: int) -> tupl
 
 
 def _sigma(away: np.ndarray, residuals: np.ndarray) -> float:
-    """Largest standard deviation of centre and radius, pixels, by edges (E, 2) relative to the
-    centre."""
+    """Largest standard deviation of centre and radius, pixels, by edges (E, 2) from the centre."""
     if len(away) <= _CORRELATED_RAYS * 3:
         return float("inf")
     units = away / np.linalg.norm(away, axis=1, keepdims=True)
@@ -250,10 +246,7 @@ def _sigma(away: np.ndarray, residuals: np.ndarray) -> float:
 
 
 def _contrast(pictures: Sequence[np.ndarray], circle: np.ndarray) -> float:
-    """Relative contrast of fine structure along a circle (3,), inside the pictures.
-
-    Single pictures are used: their median has lost most of a moving scene.
-    """
+    """Relative contrast of fine structure along a circle (3,), inside the pictures."""
     x, y, radius = circle
     angles = np.arange(0, 2 * np.pi, 1.0 / radius)
     across, down = x + radius * np.cos(angles), y + radius * np.sin(angles)

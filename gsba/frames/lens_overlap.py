@@ -155,8 +155,7 @@ def _correlation(one: np.ndarray, other: np.ndarray, lowest: int) -> float:
 
 
 def _peak(scores: np.ndarray) -> float | None:
-    """The scale of focal lengths at a clear peak of correlations (S,); None = there is no clear
-    one."""
+    """Scale of focal lengths at a clear peak of correlations (S,); None = there is none."""
     best = int(np.argmax(scores))
     sides = best - _PEAK_HALF_WIDTH, best + _PEAK_HALF_WIDTH
     if sides[0] < 0 or sides[1] >= len(scores) or scores[best] < _MIN_PEAK_CORRELATION:

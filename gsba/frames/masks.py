@@ -60,11 +60,7 @@ def find_masks(
 
 
 def _warn_of_inversion(path: Path, size: tuple[int, int]) -> None:
-    """Warn of a mask of all frames that hides most of the sphere.
-
-    Raises:
-        GsbaError: it hides all of it, or cannot be read.
-    """
+    """Warn of a mask of all frames that hides most of the sphere."""
     rows = (np.arange(size[1]) + 0.5) / size[1]
     levels = _levels_in(path, size, path.stat().st_mtime_ns)
     unused = (levels <= _MAX_UNUSED_LEVEL).mean(axis=1)

@@ -1,14 +1,33 @@
 """Pixels of a frame: its panorama, for any panoramic layout, or its cube faces."""
 
+import math
+import threading
+
 import numpy as np
 
 from gsba.camera.sphere import around_sphere
 from gsba.camera.straighten import PAD, straightened, straightened_inside
-from gsba.frames.buffers import Buffers
-from gsba.frames.dual_fisheye import load_joined
+from gsba.camera.views import ViewCutter
+from gsba.frames.dual_fisheye import load_joined, load_raw
 from gsba.frames.files import decode
-from gsba.frames.track_pairs import load_panorama
+from gsba.frames.track_pairs import load_panorama, load_squares
 from gsba.types import FrameSet
+
+
+class Buffers(threading.local):
+    """A thread's arrays by name: allocating fresh pages costs as much as filling them."""
+
+    def __init__(self) -> None:
+        self._kept: dict[str, np.ndarray] = {}
+
+    def array(self, name: str, shape: tuple[int, ...]) -> np.ndarray:
+        """An uninitialised uint8 array; the next one of this name in this thread reuses its
+        memory."""
+        size = math.prod(shape)
+        if name not in self._kept or self._kept[name].size < size:
+            self._kept.pop(name, None)
+            self._kept[name] = np.empty(size, np.uint8)
+        return self._kept[name][:size].reshape(shape)
 
 
 def load_erp(frames: FrameSet, f: int, gray: bool = False, width: int | None = None) -> np.ndarray:
@@ -77,3 +96,18 @@ def load_faces(frames: FrameSet, f: int, gray: bool = False, size: int | None = 
     if size is not None and size < kind.width:
         faces = [cv2.resize(face, (size, size), interpolation=cv2.INTER_AREA) for face in faces]
     return np.stack(faces)
+
+
+def cut_views(frames: FrameSet, f: int, cutter: ViewCutter) -> list[np.ndarray]:
+    """Images (height, width, 3) uint8 RGB of each view of frame f.
+
+    Args:
+        frames: panoramas; raw pairs and equi-angular cube maps are cut in one step.
+        cutter: the cutter for that frame.
+    """
+    kind = frames.format_of(f)
+    if kind.fisheyes is not None:
+        return list(cutter.cut_raw(load_raw(frames, f)))
+    if kind.tracks is not None:
+        return list(cutter.cut_squares(load_squares(frames, f), kind.correction))
+    return cutter.cut(load_erp(frames, f))

@@ -9,8 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gsba.camera.calibration import read_calibration, scaled_to_size
-from gsba.camera.fisheye import Pair, Rig
-from gsba.frames.files import decode, image_size, is_image
+from gsba.camera.fisheye import Rig
+from gsba.frames.files import decode, entries_of, image_size, is_image
 from gsba.frames.image_circles import CircleSearch, ImageCircle, find_circle
 from gsba.frames.lens_names import FUSION_NAMES, LENS_NAMES, LensNames
 from gsba.frames.lens_overlap import measure_overlap, scaled
@@ -82,11 +82,7 @@ def find_pairs(folder: Path) -> Found | None:
 
 
 def _of_numbered(folder: Path, numbered: Mapping[int, Path]) -> Found:
-    """Pictures of three lenses or more, in folders lens0, lens1, ...
-
-    Raises:
-        GsbaError: a lens or a picture is missing.
-    """
+    """Pictures of three lenses or more, in folders lens0, lens1, ..."""
     if sorted(numbered) != list(range(len(numbered))):
         held = ", ".join(f"{numbered[lens].name}/" for lens in sorted(numbered))
         raise GsbaError(
@@ -100,8 +96,7 @@ def _of_numbered(folder: Path, numbered: Mapping[int, Path]) -> Found:
 
 
 def _tagged_pairs(folder: Path, images: Sequence[Path], tags: LensNames) -> Found | None:
-    """Pairs of files whose names include the lens; None for panoramas and cube faces named like
-    that."""
+    """Pairs of files named after their lens; None for panoramas and cube faces named like that."""
     tagged = {path: tag for path in images if (tag := tags.read(path.stem))}
     if not tagged or all(_OF_FACE.fullmatch(path.stem) for path in tagged):
         return None
@@ -209,13 +204,10 @@ def lenses_of(
 def _calibrated(
     folder: Path, chosen: Sequence[Sequence[Path]], size: tuple[int, int], calibration: Path
 ) -> tuple[Rig, bool]:
-    """Lenses of a calibration, of a pair checked by the pictures.
+    """Lenses of a calibration; a pair that pictures contradict is rescaled, and True (to estimate).
 
     Args:
         chosen: files of some frames, as for `decode_pair`.
-
-    Raises:
-        GsbaError: it is of other pictures or of another number of lenses.
     """
     known, num = scaled_to_size(read_calibration(calibration), size, calibration), len(chosen[0])
     if len(known) != num:
@@ -224,22 +216,7 @@ def _calibrated(
         )
     if num > 2:
         return known, False
-    return _checked_calibration(folder, (known[0], known[-1]), chosen, size, calibration)
-
-
-def _checked_calibration(
-    folder: Path,
-    pair: Pair,
-    chosen: Sequence[Sequence[Path]],
-    size: tuple[int, int],
-    calibration: Path,
-) -> tuple[Pair, bool]:
-    """Calibrated lenses; if pictures contradict them, rescaled focal lengths and True (to
-    estimate).
-
-    Args:
-        chosen: files of some frames, as for `decode_pair`.
-    """
+    pair = known[0], known[-1]
     try:
         looks = [decode_pair(paths, size, gray=True) for paths in chosen]
     except GsbaError:  # the error is raised when the picture is used
@@ -265,11 +242,7 @@ def _checked_calibration(
 def _given_circles(
     circles: Sequence[ImageCircle], size: tuple[int, int]
 ) -> tuple[ImageCircle, ImageCircle] | None:
-    """Image circles given by the caller; None = none are given.
-
-    Raises:
-        GsbaError: one of them is not in the picture.
-    """
+    """Image circles given by the caller; None = none are given."""
     if not circles:
         return None
     width, height = size
@@ -287,11 +260,7 @@ def _given_circles(
 def _found_circles(
     folder: Path, first: Sequence[Path], looks: Sequence[Sequence[np.ndarray]]
 ) -> tuple[ImageCircle, ImageCircle]:
-    """Image circles found in the pictures of both lenses.
-
-    Raises:
-        GsbaError: the pictures of a lens show none.
-    """
+    """Image circles found in the pictures of both lenses."""
     circles = []
     for name, pictures in zip(("front", "back"), zip(*looks, strict=True), strict=True):
         search: CircleSearch = find_circle(pictures)
@@ -308,12 +277,7 @@ def _found_circles(
 
 def _images_in(folder: Path) -> list[Path]:
     """Images in a folder, in name order; none if it is no folder."""
-    if not folder.is_dir():
-        return []
-    try:
-        return [path for path in sorted(folder.iterdir()) if is_image(path)]
-    except OSError as error:
-        raise GsbaError(f"{folder}: cannot be read ({error.strerror})") from None
+    return list(filter(is_image, entries_of(folder))) if folder.is_dir() else []
 
 
 def _by_frame(folder: Path, images: Iterable[Path]) -> dict[str, Path]:

@@ -35,10 +35,15 @@ def combine(
     Raises:
         GsbaError: names that cannot be folders, or one recording given twice.
     """
-    _check_names(list(recordings))
+    for name in recordings:
+        if NO_FILE_NAME.search(name):
+            raise GsbaError(f"recording {name!r:.60}: the name cannot be that of a folder")
     for (name, one), (other_name, other) in combinations(recordings.items(), 2):
         _refuse_same(name, one, other_name, other)
-        _log_common_times(name, one, other_name, other)
+        first, second = one.timestamps, other.timestamps
+        if one.timed and other.timed and first[0] <= second[-1] and second[0] <= first[-1]:
+            both = "times of recordings '%s' and '%s' overlap: each has a clock of its own"
+            _log.info(both, name, other_name)
     parts = list(recordings.values())
     formats, numbers = _cameras_of(recordings, cameras or {})
     gap = _GAP_INTERVALS * max(float(np.median(np.diff(part.timestamps))) for part in parts)
@@ -79,24 +84,6 @@ def names_of_cameras(frames: FrameSet) -> list[str]:
     return names
 
 
-def _check_names(names: list[str]) -> None:
-    """Refuse names of recordings that folders cannot have."""
-    for name in names:
-        if NO_FILE_NAME.search(name):
-            raise GsbaError(f"recording {name!r:.60}: the name cannot be that of a folder")
-
-
-def _log_common_times(name: str, one: FrameSet, other_name: str, other: FrameSet) -> None:
-    """Log that the times of two recordings overlap, which says nothing of one another."""
-    first, second = one.timestamps, other.timestamps
-    if one.timed and other.timed and first[0] <= second[-1] and second[0] <= first[-1]:
-        _log.info(
-            "times of recordings '%s' and '%s' overlap: each has a clock of its own",
-            name,
-            other_name,
-        )
-
-
 def _refuse_same(name: str, one: FrameSet, other_name: str, other: FrameSet) -> None:
     """Refuse two recordings whose pictures are the same files, or copies."""
     common = set(one.paths) & set(other.paths)
@@ -121,12 +108,7 @@ def _refuse_same(name: str, one: FrameSet, other_name: str, other: FrameSet) -> 
 def _cameras_of(
     recordings: Mapping[str, FrameSet], names: Mapping[str, str]
 ) -> tuple[tuple[PictureFormat, ...], list[int]]:
-    """Format (C,) of each camera, and the camera (R,) of each recording.
-
-    Args:
-        recordings: frames of one camera each.
-        names: of camera models, by recording.
-    """
+    """Format (C,) of each camera, and the camera (R,) of each recording, by the models' `names`."""
     formats, models, numbers = list[PictureFormat](), list[str](), list[int]()
     for recording, frames in recordings.items():
         own, model = frames.format, names.get(recording, "")

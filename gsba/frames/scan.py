@@ -18,7 +18,7 @@ from gsba.camera.factory_lenses import FactoryLenses
 from gsba.camera.fisheye import Rig
 from gsba.frames.dual_fisheye import width_of
 from gsba.frames.factory_start import FACTORY_FILE, find_factory_lenses, starting_lenses
-from gsba.frames.files import decode, image_header, image_size, is_image
+from gsba.frames.files import decode, entries_of, image_header, image_size, images_by_name, is_image
 from gsba.frames.headers import Header
 from gsba.frames.image_circles import ImageCircle
 from gsba.frames.masks import find_masks
@@ -44,6 +44,7 @@ _log = logging.getLogger(__name__)
 MIN_FRAMES = 3
 _SIDE_FACES = ("front", "right", "back", "left")
 _TIMES_FILE = "timestamps.csv"
+_TAGGED = re.compile(rf"(?P<name>.+)_(?P<face>{'|'.join(FACES)})", re.IGNORECASE)
 _UNSUPPORTED_FORMATS = {  # images that are not read, by suffix
     ".avif": "AVIF",
     ".36p": "GoPro .36P",
@@ -88,15 +89,19 @@ def scan(
     Raises:
         GsbaError: a file or frame cannot be used; the message names the first one.
     """
-    _check_times(timestamps, fps)
+    if timestamps is not None and fps is not None:
+        raise GsbaError("--timestamps and --fps both give the times of frames; pass one")
     layout, faces, found = _find_frames(Path(folder))
-    _check_number(folder, len(found), min_frames)
+    if len(found) < min_frames:
+        num = "1 frame" if len(found) == 1 else f"{len(found)} frames"
+        raise GsbaError(f"{folder}: {num}; at least {min_frames} are needed")
     names, times, timed = _in_time_order(Path(folder), found, timestamps, fps, order_suffices)
     paths = tuple(found[name] for name in names)
     tracks = track_size(Path(folder), paths) if layout == "eac" else None
     width, height = tracks or _common_size(paths, layout)
     images, lens_size = [group[0] for group in paths], (width, height)
-    known = calibration, circles, _factory_lenses(Path(folder), images, calibration)
+    factory = find_factory_lenses(Path(folder), images) if calibration is None else None
+    known = calibration, circles, factory
     if layout == "erp" and (raw := _pair_size(Path(folder), images, lens_size, *known)) is not None:
         layout, lens_size = "fisheye", raw
         paths = tuple((path, path) for path in images)
@@ -133,25 +138,6 @@ def warn_of_repeats(frames: FrameSet) -> None:
         )
 
 
-def _factory_lenses(
-    folder: Path, images: Sequence[Path], calibration: Path | None
-) -> FactoryLenses | None:
-    """The maker's calibration, unless another is given."""
-    return find_factory_lenses(folder, images) if calibration is None else None
-
-
-def _check_number(folder: Path, num: int, least: int) -> None:
-    if num < least:
-        frames = "1 frame" if num == 1 else f"{num} frames"
-        raise GsbaError(f"{folder}: {frames}; at least {least} are needed")
-
-
-def _check_times(timestamps: Path | None, fps: float | None) -> None:
-    """Refuse two sources of times."""
-    if timestamps is not None and fps is not None:
-        raise GsbaError("--timestamps and --fps both give the times of frames; pass one")
-
-
 def _in_time_order(
     folder: Path,
     found: Mapping[str, tuple[Path, ...]],
@@ -163,7 +149,8 @@ def _in_time_order(
     names = sorted(found, key=_natural)
     _check_names(folder, names)
     if names != sorted(names):
-        _log.warning("frames are taken in numeric order (%s before %s)", *_first_swap(names))
+        swap = next((a, b) for a, b in pairwise(names) if a > b)
+        _log.warning("frames are taken in numeric order (%s before %s)", *swap)
     table = timestamps
     if table is None and fps is None and (folder / _TIMES_FILE).is_file():
         table = folder / _TIMES_FILE
@@ -188,11 +175,7 @@ def _pair_size(
     circles: Sequence[ImageCircle] = (),
     factory: FactoryLenses | None = None,
 ) -> tuple[int, int] | None:
-    """Width and height of one lens's picture where images hold two side by side; None = panoramas.
-
-    Raises:
-        GsbaError: they are neither.
-    """
+    """Size of one lens's picture where images hold two side by side; None = panoramas."""
     if factory is not None:
         return lens_sizes(size)[0]
     shape, source = None, ""
@@ -213,11 +196,7 @@ def _pair_size(
 
 
 def _refuse_others(folder: Path, images: Sequence[Path], size: tuple[int, int]) -> None:
-    """Refuse 2:1 pictures that are no panoramas by their tags, or by what they show without any.
-
-    Raises:
-        GsbaError: they are named as what they are.
-    """
+    """Refuse 2:1 pictures that are no panoramas by their tags, or by what they show without any."""
     tags = image_header(images[0]).tags
     if tags is not None and tags.projection not in ("", "equirectangular"):
         raise GsbaError(
@@ -241,8 +220,7 @@ def _lenses(
     circles: Sequence[ImageCircle],
     factory: FactoryLenses | None,
 ) -> tuple[Rig | None, bool]:
-    """Initial lenses of raw fisheyes, None = other layouts; and True if they are to be
-    estimated."""
+    """Initial lenses of raw fisheyes, None = other layouts; True if they are to be estimated."""
     if layout == "fisheye" and factory is not None and not circles:
         return starting_lenses(folder, paths, size, factory), True
     if layout == "fisheye":
@@ -302,7 +280,7 @@ def _absolute(paths: Sequence[Sequence[Path]]) -> tuple[tuple[Path, ...], ...]:
 
 def _find_frames(folder: Path) -> tuple[str, tuple[str, ...], dict[str, tuple[Path, ...]]]:
     """Layout, faces, and the images of each frame by name."""
-    entries = _entries(folder)
+    entries = entries_of(folder)
     pairs = find_pairs(folder)
     if pairs is not None:
         return "fisheye", (), dict(pairs)
@@ -325,12 +303,12 @@ def _find_frames(folder: Path) -> tuple[str, tuple[str, ...], dict[str, tuple[Pa
     if others:
         _log.info("%s: ignored %d other entries: %s", folder, len(others), ", ".join(others[:5]))
     places = [folder, *(path for path in entries if path.name.lower() in FACES and path.is_dir())]
-    foreign = _unsupported_images(path for place in places for path in _entries(place))
+    foreign = _unsupported_images(path for place in places for path in entries_of(place))
     if foreign and (subfolders or images):
         _log.warning("%s: left out %s: convert them to JPEG, PNG, WebP or TIFF", folder, foreign)
     if subfolders:
         by_face = {
-            face: _by_name(folder, filter(is_image, _entries(subfolders[face])))
+            face: images_by_name(folder, filter(is_image, entries_of(subfolders[face])))
             for face in FACES
             if face in subfolders
         }
@@ -340,7 +318,7 @@ def _find_frames(folder: Path) -> tuple[str, tuple[str, ...], dict[str, tuple[Pa
     tagged = {path: m for path in images if (m := re.fullmatch(_TAGGED, path.stem))}
     tags = {match["face"].lower() for match in tagged.values()}
     if not tags.issuperset(_SIDE_FACES) and len(tagged) < len(images):
-        found = _by_name(folder, images)
+        found = images_by_name(folder, images)
         return "erp", (), {name: (path,) for name, path in found.items()}
     stray = next((path for path in images if path not in tagged), None)
     if stray:
@@ -356,20 +334,13 @@ def _find_frames(folder: Path) -> tuple[str, tuple[str, ...], dict[str, tuple[Pa
 def _no_images(
     folder: Path, entries: Sequence[Path], others: Sequence[str], foreign: str
 ) -> GsbaError:
-    """The refusal of a folder without pictures.
-
-    Args:
-        folder: the folder.
-        entries: all files and folders in it.
-        others: names of those that are no images.
-        foreign: number and format of images in unsupported formats.
-    """
+    """The refusal of a folder without pictures."""
     if foreign:
         return GsbaError(
             f"{folder}: no JPEG, PNG, WebP or TIFF images, but {foreign}: convert them first"
         )
     folders = [path for path in entries if path.is_dir() and path.name[0] != "."]
-    if below := [path for path in folders if any(map(is_image, _entries(path)))]:
+    if below := [path for path in folders if any(map(is_image, entries_of(path)))]:
         return GsbaError(_recordings_below(folder, below))
     counts = Counter(Path(name).suffix.lower() or Path(name).name for name in others)
     held = ", ".join(f"{n} {kind}" for kind, n in sorted(counts.items())[:5]) or "nothing"
@@ -391,9 +362,6 @@ def _recordings_below(folder: Path, below: Sequence[Path]) -> str:
     )
 
 
-_TAGGED = re.compile(rf"(?P<name>.+)_(?P<face>{'|'.join(FACES)})", re.IGNORECASE)
-
-
 def _unsupported_images(paths: Iterable[Path]) -> str:
     """Number and format of images in unsupported formats: "2 TIFF and 1 WebP images", or ""."""
     kinds = [_UNSUPPORTED_FORMATS.get(path.suffix.lower()) for path in paths if path.name[0] != "."]
@@ -401,28 +369,6 @@ def _unsupported_images(paths: Iterable[Path]) -> str:
     *front, last = [f"{n} {kind}" for kind, n in counts] or [""]
     text = f"{', '.join(front)} and {last}" if front else last
     return text and f"{text} image{'s' if sum(n for _, n in counts) > 1 else ''}"
-
-
-def _entries(folder: Path) -> list[Path]:
-    try:
-        return sorted(folder.iterdir())
-    except FileNotFoundError:
-        raise GsbaError(f"{folder}: no such file or folder") from None
-    except NotADirectoryError:
-        raise GsbaError(f"{folder}: is a file; give the folder of extracted frames") from None
-    except OSError as error:
-        raise GsbaError(f"{folder}: cannot be read ({error.strerror})") from None
-
-
-def _by_name(folder: Path, images: Sequence[Path] | filter) -> dict[str, Path]:
-    found: dict[str, Path] = {}
-    for path in images:
-        if path.stem in found:
-            raise GsbaError(
-                f"{folder}: '{found[path.stem].name}' and '{path.name}' are one frame's name twice"
-            )
-        found[path.stem] = path
-    return found
 
 
 def _cube_frames(
@@ -499,7 +445,9 @@ def _no_panorama(path: Path, header: Header, more: str = "") -> GsbaError:
 
 def _warn_of_slots(folder: Path, last: str) -> None:
     """stella_vslam gives every file of a folder a time slot, images or not."""
-    early = [p.name for p in _entries(folder) if p.is_file() and not is_image(p) and p.name < last]
+    early = [
+        p.name for p in entries_of(folder) if p.is_file() and not is_image(p) and p.name < last
+    ]
     if early:
         _log.warning(
             "--fps counts images only; if stella_vslam read this folder with '%s' in it, its times "
@@ -514,7 +462,3 @@ def _natural(name: str) -> tuple[list[tuple[str, int]], str]:
     parts = re.split(r"([0-9]+)", name)
     keys = [(p, -1) if i % 2 == 0 else ("", int(p)) for i, p in enumerate(parts)]
     return keys, name
-
-
-def _first_swap(names: Sequence[str]) -> tuple[str, str]:
-    return next((a, b) for a, b in pairwise(names) if a > b)

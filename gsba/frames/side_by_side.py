@@ -180,7 +180,7 @@ def _by_circles(looks: Sequence[np.ndarray], size: tuple[int, int], where: Path)
     for width, height in lens_sizes(size):
         across = looks[0].shape[1] // 2
         small = across, round(across * height / width)
-        halves = zip(*(cut(_even(look), small) for look in looks), strict=True)
+        halves = zip(*(cut(look[:, : 2 * across], small) for look in looks), strict=True)
         found: list[CircleSearch] = [find_circle(half) for half in halves]
         rays = sum(one.num_rays for one in found)
         circles = [one.circle for one in found if one.circle is not None]
@@ -195,10 +195,6 @@ def _by_circles(looks: Sequence[np.ndarray], size: tuple[int, int], where: Path)
         return SideBySide(best, (note,), min(max(top, 0), max(size[1] - best[0], 0)))
     squeezed = f"; they are ellipses: {size[0]}x{size[1]} is read as {2 * best[0]}x{best[1]}"
     return SideBySide(best, (note + squeezed,))
-
-
-def _even(picture: np.ndarray) -> np.ndarray:
-    return picture[:, : picture.shape[1] // 2 * 2]
 
 
 def _collected(greys: Iterator[np.ndarray], taken: list[np.ndarray]) -> Iterator[np.ndarray]:
@@ -218,8 +214,7 @@ def readable(paths: Iterable[Path], size: tuple[int, int]) -> Iterator[np.ndarra
 
 
 def _radii(shape: tuple[int, ...]) -> np.ndarray:
-    """Distance of pixels from the middle of their half of the picture, in units of the half's
-    sides."""
+    """Distance of pixels from the middle of their half of the picture, in units of its sides."""
     height, width = shape[0], shape[1]
     v, u = np.ogrid[:height, :width]
     side = width / 2
@@ -235,11 +230,7 @@ def _corners_lit(grey: np.ndarray) -> bool:
 
 
 def _circle_evidence(grey: np.ndarray) -> tuple[bool, float]:
-    """Evidence for two image circles in a picture (H, 2H) uint8, or in a squeezed one.
-
-    Returns:
-        True if all around them is black; part of the rows in which they are lit beside it.
-    """
+    """True if all around two circles is black; part of the rows in which they are lit beside it."""
     radii = _radii(grey.shape)
     outside, inside = radii > _OUTSIDE_RADIUS, radii < _INSIDE_RADIUS
     rows = np.flatnonzero(outside.any(axis=1) & inside.any(axis=1))

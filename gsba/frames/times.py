@@ -151,7 +151,12 @@ def frame_times(
     if table is not None:
         rows = read_times(table)
         if rows[0].name is None:
-            return _times_from_list(names, table, rows), True
+            if len(rows) != len(names):
+                raise GsbaError(
+                    f"{table}: {len(rows)} times for {len(names)} frames; give one a frame in name "
+                    "order, or name,timestamp rows"
+                )
+            return np.array([row.timestamp for row in rows]), True
         return _times_by_name(names, table, rows), True
     try:
         if fps is not None:
@@ -180,15 +185,6 @@ def check_fps(fps: float) -> float:
             f"{_FPS_RANGE[0]:g} to {_FPS_RANGE[1]:g}"
         )
     return fps
-
-
-def _times_from_list(names: Sequence[str], path: Path, rows: list[TimeRow]) -> np.ndarray:
-    if len(rows) != len(names):
-        raise GsbaError(
-            f"{path}: {len(rows)} times for {len(names)} frames; give one a frame in name order, "
-            "or name,timestamp rows"
-        )
-    return np.array([row.timestamp for row in rows])
 
 
 def _times_by_name(names: Sequence[str], path: Path, rows: list[TimeRow]) -> np.ndarray:
@@ -228,9 +224,7 @@ def _times_at_rate(names: Sequence[str], fps: float) -> np.ndarray:
 
 
 def _relative_times(names: Sequence[str]) -> np.ndarray:
-    """Numbers (F,) that names end in, from 0 and in their usual difference: where some are skipped,
-    frames are missing. The order of the names where most do not differ by the same, or names are
-    dates."""
+    """Numbers (F,) that names end in, from 0, in units of their usual step; else names' order."""
     order, digits = np.arange(len(names), dtype=np.float64), _last_digits(names)
     if len(names) < 2 or digits is None or any(re.search(_DATE, name) for name in names):
         return order
@@ -251,10 +245,7 @@ def _last_digits(names: Sequence[str]) -> list[str] | None:
 
 
 def _times_from_names(names: Sequence[str]) -> np.ndarray | None:
-    """Times of names that are decimal seconds, or whole Unix times after a common prefix.
-
-    None = other names.
-    """
+    """Times of names that are decimal seconds or, after one prefix, Unix times; None = others."""
     if all(re.fullmatch(r"[0-9]+\.[0-9]+", name) for name in names):
         times = np.array([float(name) for name in names])
         if np.median(np.diff(np.sort(times))) < _MIN_INTERVAL_S:
@@ -270,11 +261,7 @@ def _times_from_names(names: Sequence[str]) -> np.ndarray | None:
 
 
 def _times_from_exif(names: Sequence[str], pictures: Sequence[Sequence[Path]]) -> np.ndarray:
-    """Times of DateTimeOriginal and SubSecTimeOriginal, Unix time where the zone is given.
-
-    Raises:
-        NoTimesError: a frame has none, or they do not ascend with the names.
-    """
+    """Times of DateTimeOriginal and SubSecTimeOriginal, Unix time where the zone is given."""
     tags = [_time_tags(files) for files in track(pictures, "reading EXIF")]
     why, taken = _why_exif_is_unusable(names, tags), [tag.taken for tag in tags if tag is not None]
     if not taken or why:

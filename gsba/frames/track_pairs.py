@@ -21,16 +21,14 @@ from gsba.camera.equiangular import (
     square_pixels,
     squares,
 )
-from gsba.camera.sphere import bearings_from_erp
-from gsba.camera.tables import table
-from gsba.frames.files import decode, image_size, is_image
+from gsba.camera.sphere import erp_bands, table
+from gsba.frames.files import decode, entries_of, image_size, images_by_name, is_image
 from gsba.log import GsbaError
 from gsba.types import FACES, FrameSet
 
 _log = logging.getLogger(__name__)
 
 _FOLDER = re.compile(r"track(\d+)", re.IGNORECASE)
-_ROWS_AT_ONCE = 256  # rows whose coordinates are held in double precision at once
 _NUM_CHECKED_FRAMES = 5  # frames in which edges of squares are compared
 _MIN_CORRELATION = 0.5  # median correlation of grey values along edges shared by both tracks:
 # 0.95 and more on real frames, 0.2 and less on pictures of several instants
@@ -50,9 +48,9 @@ def find_tracks(folder: Path) -> dict[str, tuple[Path, ...]] | None:
         GsbaError: one folder or more than two hold images, or their names differ.
     """
     found: dict[int, Path] = {}
-    for path in _entries(folder):
+    for path in entries_of(folder):
         match = _FOLDER.fullmatch(path.name)
-        if match and path.is_dir() and any(map(is_image, _entries(path))):
+        if match and path.is_dir() and any(map(is_image, entries_of(path))):
             found[int(match[1])] = path
     if not found:
         return None
@@ -64,7 +62,8 @@ def find_tracks(folder: Path) -> dict[str, tuple[Path, ...]] | None:
             f"{folder}: holds {held}; of a .360 recording, extract both video tracks, as track0/ "
             "and track5/ (gsba extract does)"
         )
-    first, second = (_by_name(folder / name) for name in names)
+    folders = [folder / name for name in names]
+    first, second = (images_by_name(one, filter(is_image, entries_of(one))) for one in folders)
     for one, other, (ours, theirs) in ((first, second, names), (second, first, names[::-1])):
         missing = sorted(one.keys() - other.keys())
         if missing:
@@ -149,22 +148,15 @@ def _check_edges(folder: Path, pairs: Sequence[tuple[Path, ...]], size: tuple[in
 @table(maxsize=2)
 def _maps(grid: Grid, width: int) -> np.ndarray:
     """Places (2, width / 2, width) float32 of a panorama's pixels in a grid, OpenCV pixels."""
-    height = width // 2
-    maps = np.empty((2, height, width), np.float32)
-    for top in range(0, height, _ROWS_AT_ONCE):
-        rows = np.arange(top, min(top + _ROWS_AT_ONCE, height)) + 0.5
-        pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, rows), axis=-1)
-        found = grid.places(bearings_from_erp(pixels, width, height))
-        maps[:, top : top + len(rows)] = np.moveaxis(found, -1, 0)
+    maps = np.empty((2, width // 2, width), np.float32)
+    for top, bearings in erp_bands(np.arange(width), width):
+        maps[:, top : top + len(bearings)] = np.moveaxis(grid.places(bearings), -1, 0)
     return maps
 
 
 def _edge_correlations(faces: np.ndarray) -> np.ndarray:
-    """Correlations (n,) of grey values on both sides of edges that squares of both tracks share.
-
-    Values of squares (6, S, S) are averaged along an edge, so that noise counts as no contrast;
-    edges without contrast are left out.
-    """
+    """Correlations (n,) of means along edges of squares (6, S, S) that both tracks share, where
+    they have contrast."""
     size, found = faces.shape[1], []
     along = np.arange(size) + 0.5
     for face in ("front", "right", "left"):  # of track 0
@@ -182,21 +174,3 @@ def _edge_correlations(faces: np.ndarray) -> np.ndarray:
             if min(np.std(a), np.std(b)) > _MIN_CONTRAST:
                 found.append(np.corrcoef(a, b)[0, 1])
     return np.array(found)
-
-
-def _entries(folder: Path) -> list[Path]:
-    try:
-        return sorted(folder.iterdir())
-    except OSError as error:
-        raise GsbaError(f"{folder}: cannot be read ({error.strerror})") from None
-
-
-def _by_name(folder: Path) -> dict[str, Path]:
-    found: dict[str, Path] = {}
-    for path in filter(is_image, _entries(folder)):
-        if path.stem in found:
-            raise GsbaError(
-                f"{folder}: '{found[path.stem].name}' and '{path.name}' are one frame's name twice"
-            )
-        found[path.stem] = path
-    return found

@@ -1,10 +1,8 @@
-"""Clock, bias and axes of a gyro, estimated from camera rotations by images.
+"""Clock, bias and axes of a gyro from camera rotations by images, and the vertical by forces.
 
-Between two instants the gyro must rotate by as much as the images, in axes of its own. Each offset
-on a grid gives its best axes and bias in closed form (Kabsch 1976, on rotation vectors; the bias is
-the part that grows with time alone), and the share of rotations that it explains. The best few are
-refined like the clocks of trajectories. Gyros have scale errors of a percent: these are estimated
-for each axis as well, where rotations determine them.
+Each offset on a grid gives its best axes and bias in closed form (Kabsch 1976, on rotation
+vectors; the bias is the part that grows with time alone). The best few are refined; scale errors
+of a percent are estimated for each axis where rotations determine them.
 """
 
 from collections.abc import Iterator
@@ -12,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsba.geometry import nearest_rotation, pose
+from gsba.geometry import median_direction, nearest_rotation, pose
 from gsba.imu.readings import Readings, Sensor
 from gsba.trajectory.clock import MIN_STEPS, Clock, simplest
 from gsba.trajectory.clock_search import ClockFit, Turns, merged, noise
@@ -22,17 +20,11 @@ _MAX_SPACING_STEPS, _MAX_SPACING_S = 0.25, 0.05  # largest spacing of tried offs
 # in seconds
 _MAX_OFFSETS = 60_000  # largest number of tried offsets
 _MAX_TURNS_AT_ONCE = 200_000  # largest number of rotations of all offsets tried together
-_MAX_OUTSIDE_SHARE = 0.4  # part of the video that may lie outside the readings
-_NUM_REFINED = 6  # offsets of the grid that are refined
-_NUM_ROUNDS = 3  # rounds of clock, then bias and axes
-_MIN_OFFSET_CHANGE_S = 1e-5  # s of change of the offset below which rounds end
-_NUM_REWEIGHTINGS = 10  # reweighting passes over bias and axes
 _LOSS_WIDTH_SIGMAS = 2.0  # width of their loss, standard deviations
 _TURNING_SIGMAS, _AGREEING_SIGMAS = 4.0, 3.0  # standard deviations: least rotation of a turn;
 # largest residual of agreement
 _MIN_TURNS = 4  # least number of steps that turn
 _MIN_EXPLAINED = 0.6  # least share of the turns that a gyro must explain
-_MAX_RIVAL_SHARE = 0.75  # share of the best offset's explained turns that no rival may reach
 _SCALE_SIGMA = 0.01  # prior standard deviation of a gyro's scale
 _MAX_AXES_SIGMA_RAD = np.deg2rad(5.0)  # largest standard deviation of the axes
 _TURNING_STEP_RAD = np.deg2rad(1.0)  # rotation of a turning step: a tenth of the steps must exceed
@@ -71,7 +63,6 @@ def align(
         timestamps: (F,) times of frames, seconds.
         f_R_nexts: (F - 1, 3, 3) rotations between consecutive frames, by images.
         known: (F - 1,) bool, True for known rotations.
-        readings: readings of the gyro.
         former: the estimate from less accurate rotations; None = try all offsets.
     """
     turns = merged(timestamps, f_R_nexts, known)
@@ -155,11 +146,11 @@ class _Candidate:
     def settled(self) -> "_Candidate":
         """The candidate with clock, bias and axes refined in turn."""
         one = self
-        for _ in range(_NUM_ROUNDS):
+        for _ in range(3):  # rounds of clock, then bias and axes
             parameters = simplest(one.fit, one.fit.refine(one.parameters))[0]
             moved = abs(float(parameters[0] - one.parameters[0]))
             one = _Candidate.of(self.turns, self.readings, parameters, one.sensor.bias)
-            if moved < _MIN_OFFSET_CHANGE_S:
+            if moved < 1e-5:  # s of change of the offset below which rounds end
                 break
         return one
 
@@ -170,11 +161,10 @@ class _Candidate:
 
 
 def _sensor_and_axes(turns: Turns, turned: np.ndarray) -> tuple[Sensor, np.ndarray, float]:
-    """Bias and scales, axes (3, 3) and their standard deviation that map the sensor's rotations (n,
-    3) to the images', under a Cauchy loss."""
+    """Bias and scales, axes (3, 3) and their sigma, by sensor and image rotations (n, 3)."""
     spans, seen = np.diff(turns.times, axis=1), turns.rotvecs
     weights, scales, sigma = np.ones((len(spans), 1)), np.ones(3), float(np.std(seen))
-    for _ in range(_NUM_REWEIGHTINGS):
+    for _ in range(10):  # reweighting passes over bias and axes
         total = np.sum(weights * spans**2)
         by_time = [np.sum(weights * spans * some, axis=0) / total for some in (seen, turned)]
         left = seen - spans * by_time[0], turned - spans * by_time[1]
@@ -196,7 +186,7 @@ def _candidates(turns: Turns, readings: Readings) -> Iterator[np.ndarray]:
     """Parameters (2,) of the grid's offsets that explain the most, best first."""
     free = replace(turns, rotvecs=np.zeros_like(turns.rotvecs))
     fit = ClockFit(free, _orientation_trajectory(readings, Sensor.ideal()))
-    over = _MAX_OUTSIDE_SHARE * float(np.ptp(turns.times))
+    over = 0.4 * float(np.ptp(turns.times))  # part of the video that may lie outside the readings
     ends = fit.span - turns.middle - turns.ends
     low, high = min(ends) - over, max(ends) + over
     spacing = max(min(_MAX_SPACING_STEPS * turns.step, _MAX_SPACING_S), (high - low) / _MAX_OFFSETS)
@@ -219,15 +209,14 @@ def _candidates(turns: Turns, readings: Readings) -> Iterator[np.ndarray]:
         if all(abs(shift - other) > 2.5 * spacing for other in chosen):
             chosen.append(float(shift))
             yield np.array([shift, 1.0])
-        if len(chosen) == _NUM_REFINED:
+        if len(chosen) == 6:  # offsets of the grid that are refined
             return
 
 
 def _orientation_trajectory(
     readings: Readings, sensor: Sensor, axes: np.ndarray | None = None
 ) -> Trajectory:
-    """Orientations integrated from angular velocities, without translation; sensor's or rig's
-    axes."""
+    """Orientations integrated from angular velocities of sensor or rig, without translation."""
     turned = readings.turned(sensor)
     every = max(int(_ORIENTATION_SPACING_S / float(np.median(np.diff(readings.timestamps)))), 1)
     turned = turned[::every] if axes is None else axes @ turned[::every] @ axes.T
@@ -266,7 +255,7 @@ def _with_reason(
         return replace(found, reason="the camera turns too little to determine the gyro's clock")
     if share < _MIN_EXPLAINED or turning.sum() < _MIN_TURNS:
         return replace(found, reason="the gyro's rotations fit the images at no clock offset")
-    if rival > _MAX_RIVAL_SHARE * share:
+    if rival > 0.75 * share:  # share of the best offset's explained turns that no rival may reach
         return replace(found, reason="the gyro's rotations fit the images at several clock offsets")
     if best.axes_sigma > _MAX_AXES_SIGMA_RAD:
         return replace(
@@ -278,3 +267,46 @@ def _with_reason(
 def _rejected(timestamps: np.ndarray, reason: str, counts: Counts) -> Alignment:
     clock, nan = Clock(float(timestamps[0]), 0.0, 1.0), float("nan")
     return Alignment(clock, nan, Sensor.ideal(), np.eye(3), nan, nan, 0.0, counts, reason)
+
+
+_MEAN_SPAN_S = 1.05  # s over which a force is averaged: two steps, in which sways cancel out
+_GRAVITY_M_S2 = 9.80665  # m/s^2, standard gravity
+_MAX_RELATIVE_DEVIATION = 0.2  # largest relative deviation of a mean's length from gravity
+
+
+def up_axis(
+    readings: Readings, found: Alignment, timestamps: np.ndarray, world_R_rigs: np.ndarray
+) -> np.ndarray | None:
+    """Unit vector (3,) along the vertical in the world; None if forces do not determine it.
+
+    Forces are rotated into the world by the pose of the frame before and the gyro since then, and
+    averaged over two steps each. Longer accelerations are outliers: the result is the geometric
+    median of the means.
+
+    Args:
+        found: alignment of the readings with the frames.
+        timestamps: (F,) times of frames, seconds, on their own clock.
+        world_R_rigs: (F, 3, 3) refined rotations.
+    """
+    if readings.forces is None:
+        return None
+    times = found.clock.times(timestamps)
+    inside = (readings.timestamps >= times[0]) & (readings.timestamps <= times[-1])
+    if not inside.any():
+        return None
+    at, forces = readings.timestamps[inside], readings.forces[inside] @ found.rig_R_imu.T
+    before = np.clip(np.searchsorted(times, at, side="right") - 1, 0, len(times) - 1)
+    turned = orientations(readings, found, np.concatenate([times, at]))
+    of_frames, of_forces = turned[: len(times)], turned[len(times) :]
+    worlds = world_R_rigs @ np.swapaxes(of_frames, 1, 2)
+    up = np.einsum("nij,njk,nk->ni", worlds[before], of_forces, forces)
+    part = ((at - at[0]) / _MEAN_SPAN_S).astype(int)
+    counts = np.bincount(part)
+    full = counts > 0.5 * np.median(counts[counts > 0])
+    means = np.column_stack([np.bincount(part, column) for column in up.T])
+    means = means[full] / counts[full, None]
+    lengths = np.linalg.norm(means, axis=1)
+    right = np.abs(lengths - _GRAVITY_M_S2) < _MAX_RELATIVE_DEVIATION * _GRAVITY_M_S2
+    if right.sum() < 3:  # least number of such means
+        return None
+    return median_direction(means[right] / lengths[right, None])

@@ -61,7 +61,6 @@ def read_telemetry(path: Path, lasting_s: float | None = None) -> Readings:
     """Readings stored in a maker's recording.
 
     Args:
-        path: the recording.
         lasting_s: duration of its pictures, seconds; readings timed from the first frame that begin
             after it are of another recording. None = not known.
 
@@ -71,7 +70,15 @@ def read_telemetry(path: Path, lasting_s: float | None = None) -> Readings:
     """
     trailer = read_trailer(path)
     if trailer is None:
-        return _by_telemetry_parser(path)
+        table = "a table (t, gyro x y z, accelerometer x y z)"
+        rows = ask_telemetry_parser(path, "normalized_imu", "gyro", table)
+        rows = [row for row in rows if row.get("gyro") is not None]
+        times = np.array([1e-3 * row["timestamp_ms"] for row in rows], np.float64)
+        rates = np.array([row["gyro"] for row in rows], np.float64).reshape(-1, 3) * _DEGREE
+        forces = None
+        if rows and all(row.get("accl") is not None for row in rows):
+            forces = np.array([row["accl"] for row in rows], np.float64).reshape(-1, 3)
+        return _checked(path, times, rates, forces, [f"reading {n + 1}" for n in range(len(rows))])
     if trailer.gyro is None:
         why = f" ({'; '.join(trailer.notes)})" if trailer.notes else ""
         raise GsbaError(f"{path}: its Insta360 trailer holds no gyro that can be read{why}")
@@ -85,23 +92,6 @@ def read_telemetry(path: Path, lasting_s: float | None = None) -> Readings:
         )
     where = [f"reading {n + 1}" for n in range(len(gyro.times))]
     return _checked(path, gyro.times, gyro.rates, gyro.accelerations, where)
-
-
-def _by_telemetry_parser(path: Path) -> Readings:
-    """Readings of a recording by `telemetry_parser`: deg/s and m/s^2.
-
-    Raises:
-        GsbaError: the library is not installed, or finds no readings.
-    """
-    table = "a table (t, gyro x y z, accelerometer x y z)"
-    rows = ask_telemetry_parser(path, "normalized_imu", "gyro", table)
-    rows = [row for row in rows if row.get("gyro") is not None]
-    times = np.array([1e-3 * row["timestamp_ms"] for row in rows], np.float64)
-    rates = np.array([row["gyro"] for row in rows], np.float64).reshape(-1, 3) * _DEGREE
-    forces = None
-    if rows and all(row.get("accl") is not None for row in rows):
-        forces = np.array([row["accl"] for row in rows], np.float64).reshape(-1, 3)
-    return _checked(path, times, rates, forces, [f"reading {n + 1}" for n in range(len(rows))])
 
 
 def _read_table(path: Path) -> Readings:
@@ -158,11 +148,7 @@ def _is_number(text: str) -> bool:
 
 
 def _columns(where: str, names: list[str]) -> list[tuple[int, float]]:
-    """Column of t, of each axis of gyro and accelerometer, and the factor of its unit.
-
-    Raises:
-        GsbaError: a column is missing, named twice, or has an unknown unit.
-    """
+    """Column of t, of each axis of gyro and accelerometer, and the factor of its unit."""
     found: dict[str, tuple[int, float]] = {}
     for column, name in enumerate(names):
         plain, unit = _name_and_unit(name)

@@ -1,17 +1,36 @@
 """Facts about a video: camera, layout, tracks, times, gyro, positions, lenses."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from gsba.containers.insta360 import Insta360Trailer, read_trailer
 from gsba.imu.files import read_telemetry
-from gsba.inspection.facts import Facts, Found, spoken_seconds
 from gsba.log import GsbaError
 from gsba.placement.gps_video import read_video_gps
 from gsba.video.extraction import refuse_darkness
 from gsba.video.recording import Recording, read_recording
 from gsba.video.timeline import container_tags
+
+Facts = tuple[tuple[str, str], ...]  # name and text of each, in the order of the output
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """Facts about a path, and its problem if it cannot be refined."""
+
+    facts: Facts
+    problem: str = ""  # reason why it cannot be refined; "" = it can
+
+
+def spoken_seconds(duration_s: float) -> str:
+    """Text of a duration: seconds, or minutes and seconds."""
+    if duration_s < 100:
+        return f"{duration_s:.3g} s"
+    minutes, seconds = divmod(round(duration_s), 60)
+    return f"{minutes} min {seconds} s"
+
 
 _MAX_INTERVAL_RATIO = 1.5  # longest over median frame interval of a constant frame rate
 

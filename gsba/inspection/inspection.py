@@ -8,7 +8,7 @@ from typing import Any
 from gsba import video
 from gsba.frames.files import is_image
 from gsba.inspection import footage, pictures
-from gsba.inspection.facts import Facts
+from gsba.inspection.footage import Facts
 from gsba.log import GsbaError
 
 

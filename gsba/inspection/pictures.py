@@ -12,7 +12,7 @@ from gsba.frames.image_circles import find_circle
 from gsba.frames.panorama_checks import unlike_panorama
 from gsba.frames.scan import scan
 from gsba.frames.side_by_side import cut, one_beside_other, recognise, two_circles
-from gsba.inspection.facts import Facts, Found, spoken_seconds
+from gsba.inspection.footage import Facts, Found, spoken_seconds
 from gsba.log import GsbaError
 from gsba.types import FrameSet
 

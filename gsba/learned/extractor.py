@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from gsba.config import FeatureSettings
-from gsba.features.detection import Extractor, FaceKeypoints, SiftExtractor
-from gsba.features.extractor_traits import TRAITS
+from gsba.features.detection import TRAITS, Extractor, FaceKeypoints, SiftExtractor
 from gsba.learned.interfaces import Detector
 from gsba.learned.weights import missing_library
 
@@ -21,7 +20,6 @@ def make_extractor(
     """Factory of the extractor for each frame: SIFT, or a learned network.
 
     Args:
-        settings: `extractor` and its settings.
         weights: files of learned networks (`find_weights`).
     """
     if settings.extractor == "sift":
@@ -67,10 +65,7 @@ class LearnedExtractor:
 
 @functools.lru_cache(maxsize=1)
 def _load(name: str, weights: Path, max_per_face: int) -> Detector:
-    """Network in inference mode, shared by all threads.
-
-    It finds twice the number of kept keypoints, as masks and neighbouring faces remove some.
-    """
+    """Network in inference mode, with twice the kept keypoints: masks and faces remove some."""
     try:
         if name == "superpoint":
             from gsba.learned.magicleap import superpoint as load

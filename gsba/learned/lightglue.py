@@ -12,7 +12,6 @@ from gsba.learned.device import device, inference
 from gsba.learned.weights import load_into, read_state
 from gsba.log import GsbaError
 
-_MIN_SCORE = 0.1  # published value
 _UNUSED = re.compile(r"log_assignment\.\d+\.r")  # tensors of disk_lightglue.pth that nothing reads
 
 
@@ -30,7 +29,7 @@ class LightGlue:
     def __init__(self, extractor: str, weights: Path) -> None:
         wide = kornia.feature.LightGlue.features[extractor]
         chosen = {**wide, "depth_confidence": -1, "width_confidence": -1, "weights": None}
-        chosen |= {"flash": False, "filter_threshold": _MIN_SCORE}
+        chosen |= {"flash": False, "filter_threshold": 0.1}  # published value
         model = kornia.feature.LightGlue(None, **chosen)  # pyright: ignore[reportArgumentType]
         state = {name.removeprefix("matcher."): v for name, v in read_state(weights).items()}
         for block in ("self_attn", "cross_attn"):  # self_attn.3.x of the authors' files

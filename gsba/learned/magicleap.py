@@ -1,8 +1,5 @@
-"""SuperPoint and SuperGlue by transformers; weights under Magic Leap's non-commercial licence.
-
-Files have the authors' layout (`superpoint_v1.pth`, `superglue_outdoor.pth`) or that of
-transformers (`model.safetensors`).
-"""
+"""SuperPoint and SuperGlue by transformers; weights, in the authors' layout or of transformers,
+under Magic Leap's non-commercial licence."""
 
 import re
 from pathlib import Path
@@ -23,7 +20,6 @@ from gsba.learned.device import device, inference
 from gsba.learned.interfaces import Detector
 from gsba.learned.weights import load_into, read_state
 
-_HEADS = 4  # of SuperGlue's attention
 _MIN_SCORE = 0.2  # published value of SuperGlue
 _HEAD_NAMES = {  # layer of superpoint_v1.pth -> layer of transformers
     "convPa": "keypoint_decoder.conv_score_a",
@@ -148,4 +144,4 @@ def _in_stack(index: int, last: int, kind: str) -> str:
 
 def _by_head(value: Any) -> Any:
     """Rows reordered from (channel, head) to (head, channel)."""
-    return value.unflatten(0, (-1, _HEADS)).transpose(0, 1).flatten(0, 1)
+    return value.unflatten(0, (-1, 4)).transpose(0, 1).flatten(0, 1)  # of SuperGlue's attention

@@ -128,13 +128,7 @@ def overlapping_faces(
 
 
 def _shares(bearings: np.ndarray, seen: np.ndarray, towards: np.ndarray) -> np.ndarray:
-    """Shares (6, 6) of each face's keypoints that may be on each face of the other frame.
-
-    Args:
-        bearings: (n, 3) bearings in their own rig frame.
-        seen: (n, 3) these directions in the other rig frame.
-        towards: (3,) direction of the parallax of near points, in the other rig frame.
-    """
+    """Shares (6, 6) of each face's keypoints that may be on each face of the other frame."""
     faces, length = owner_faces(bearings), np.linalg.norm(towards)
     places = [owner_faces(seen)]
     if length > 1e-12:

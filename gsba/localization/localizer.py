@@ -13,8 +13,7 @@ from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.camera.rig import CubeRig, owner_faces
 from gsba.camera.sphere import dense_enough
 from gsba.config import RefineSettings
-from gsba.features.detection import extract, gather
-from gsba.features.extractor_traits import search_settings
+from gsba.features.detection import extract, gather, search_settings
 from gsba.frames import cubemap
 from gsba.frames.files import image_size
 from gsba.frames.panorama import fitted_to, load_grey

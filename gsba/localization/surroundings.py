@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsba.camera.rig import CubeRig
-from gsba.features.extractor_traits import search_settings
+from gsba.features.detection import search_settings
 from gsba.frames import cubemap
 from gsba.geometry import inverse
 from gsba.localization.place_index import index_path, load_or_make

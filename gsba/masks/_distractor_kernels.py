@@ -28,10 +28,8 @@ def _atan2(y, x):
 
 @_part
 def _project(T, rays, inverse, height, u, v):
-    """Pixels u, v (W,) in a neighbour's panorama, of rays (W, 3) at inverse distances (W,).
-
-    Kept free of branches, so that it is compiled to vector instructions.
-    """
+    """Pixels u, v (W,) in a neighbour's panorama of rays (W, 3) at inverse distances (W,); without
+    branches, so that it is compiled to vector instructions."""
     scale = np.float32(height / math.pi)
     across, down = np.float32(height - 0.5), np.float32(0.5 * height - 0.5)
     for c in range(len(rays)):

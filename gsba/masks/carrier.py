@@ -126,11 +126,7 @@ def _require_enough(num: int) -> None:
 
 
 def _outlined(pictures: np.ndarray, structure: FixedStructure) -> tuple[np.ndarray, np.ndarray]:
-    """The median (h, 2h, 3) uint8 of pictures, and the carrier in it (h, 2h) bool.
-
-    Raises:
-        GsbaError: too little moves.
-    """
+    """The median (h, 2h, 3) uint8 of pictures, and the carrier in it (h, 2h) bool."""
     _check_moving(structure)
     median = median_picture(pictures).astype(np.uint8)
     return median, outline_carrier(pictures, median, structure)
@@ -197,7 +193,7 @@ def _measure(pictures: np.ndarray, width: int) -> FixedStructure:
 
 def _measure_turned(pictures: np.ndarray) -> tuple[np.ndarray, FixedStructure] | None:
     """Pictures rotated so that the carrier keeps its direction, and their structure; None = no
-    turns, or those of the camera itself: the world above the carrier turns likewise."""
+    turns, or those of the camera itself."""
     turns = find_turns(np.stack([band_of(picture) for picture in pictures]))
     if np.ptp(turns) < _MIN_TURN_RAD:
         return None
@@ -222,11 +218,7 @@ def _steadiness_above(structure: FixedStructure) -> float:
 
 
 def _check_moving(structure: FixedStructure) -> None:
-    """Refuse frames in which too little moves to tell the carrier from the world.
-
-    Raises:
-        GsbaError: too little moves; the message gives the shares.
-    """
+    """Refuse frames in which too little moves to tell the carrier from the world."""
     heights = (np.arange(len(structure.strong)) + 0.5) / len(structure.strong)
     weights = structure.textured * np.sin(np.pi * heights)[:, None]  # solid angles
     if weights.mean() < _MIN_TEXTURED_SHARE:

@@ -305,10 +305,8 @@ def _score(
     lowest: np.ndarray,
     highest: np.ndarray,
 ) -> np.ndarray:
-    """Grey levels (h, w) by which no assumed distance explains a pixel.
-
-    Two neighbours must explain it; or three, where all of them agree on something else.
-    """
+    """Grey levels (h, w) by which no distance explains a pixel in two neighbours, or in three that
+    agree on something else."""
     num, shape = len(others), own.shape[:2]
     kernel = np.ones((3, 3), np.uint8)
     least, most = (op(_wrapped(own), kernel) for op in (cv2.erode, cv2.dilate))

@@ -68,8 +68,7 @@ def measure_fixed_structure(pictures: np.ndarray) -> FixedStructure:
 
 
 def _gradients(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Gradients to the right and down, (h + 2 _PADDING_PX, 2h + 2 _PADDING_PX, 3) float32, levels
-    per pixel."""
+    """Gradients right and down, (h + 2 pad, 2h + 2 pad, 3) float32, levels per pixel."""
     padded = around_sphere(picture, _PADDING_PX).astype(np.float32)
     smooth = cv2.GaussianBlur(padded, (0, 0), _SMOOTHING_PX)
     return cv2.Sobel(smooth, -1, 1, 0, scale=1 / 8), cv2.Sobel(smooth, -1, 0, 1, scale=1 / 8)

@@ -31,10 +31,7 @@ def median_picture(pictures: np.ndarray) -> np.ndarray:
 
 @lru_cache(maxsize=_MAX_SORTED)
 def _comparisons(num: int) -> tuple[tuple[int, int], ...]:
-    """Pairs of places of a network that sorts `num` values.
-
-    Batcher's merge exchange: Knuth, The Art of Computer Programming 3, 5.2.2, algorithm M.
-    """
+    """Pairs of a network that sorts `num` values: Batcher's merge exchange, Knuth 3, 5.2.2, M."""
     return tuple(_exchanges(num))
 
 

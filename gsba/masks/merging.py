@@ -137,12 +137,7 @@ def _borders(store: RunStore, frames: FrameSet) -> dict[str, Callable[[int], np.
 def _carriers(
     store: RunStore, frames: FrameSet, choice: Choice, alone: bool
 ) -> tuple[FrameSet, list[Callable[[int], np.ndarray | None]], list[str]]:
-    """Frames with the mask of each recording's carrier, or else parts of masks and their stages.
-
-    Args:
-        store, frames, choice: see `before`.
-        alone: True if frames have no other masks than given ones.
-    """
+    """Frames with the mask of each recording's carrier, or else parts of masks and their stages."""
     found: dict[str, Carrier] = {}
     for name, rows in frames.recordings.items():
         if name not in choice.without_carrier:
@@ -254,12 +249,8 @@ def _merge(
     parts: Sequence[Callable[[int], np.ndarray | None]],
     stages: Sequence[str],
 ) -> FrameSet:
-    """Frames with masks `folder`/NAME.png, merged from their own masks and all parts.
-
-    A part gives (h, 2h), bool or weights 0..1, or None.
-
-    An unchanged file keeps its time, so that stages that depend on it resume.
-    """
+    """Frames with masks `folder`/NAME.png of own masks and all parts ((h, 2h) bool, weights, None);
+    an unchanged file keeps its time, so that stages that depend on it resume."""
     paths = [folder / f"{name}.png" for name in frames.names]
 
     def compute() -> Counts:
@@ -273,7 +264,9 @@ def _merge(
                 found = part(f)
                 if found is not None:
                     weights = weights * _fit(found, weights.shape[1])
-            _write_if_new(path, levels_of(weights))
+            encoded = cv2.imencode(".png", levels_of(weights))[1].tobytes()
+            if not (path.exists() and path.read_bytes() == encoded):
+                write_bytes(path, encoded)
             masked += not weights.all()
         return Counts(len(paths), masked, "masks", {"nothing masked": len(paths) - masked})
 
@@ -296,12 +289,6 @@ def _fit(weights: np.ndarray, width: int) -> np.ndarray:
     size = (width, width // 2)
     values, inside = (cv2.resize(part, size) for part in (values, (values > 0).astype(np.float32)))
     return np.where(inside > 0.5, values / np.maximum(inside, 0.5), 0)
-
-
-def _write_if_new(path: Path, levels: np.ndarray) -> None:
-    encoded = cv2.imencode(".png", levels)[1].tobytes()
-    if not (path.exists() and path.read_bytes() == encoded):
-        write_bytes(path, encoded)
 
 
 def _write_check(path: Path, frames: FrameSet, shares: np.ndarray) -> None:

@@ -158,11 +158,7 @@ def _words(command: str) -> list[str]:
 
 
 def _call(words: list[str], values: dict[str, Path], command: str) -> None:
-    """Run a command without a shell.
-
-    Raises:
-        GsbaError: the command cannot be started, or fails; the message quotes its last line.
-    """
+    """Run a command without a shell; refuse its failure with its last line."""
     filled = []
     for word in words:
         for field, value in values.items():
@@ -178,11 +174,7 @@ def _call(words: list[str], values: dict[str, Path], command: str) -> None:
 
 
 def _checked(mask: np.ndarray, size: int, where: str) -> np.ndarray:
-    """A callable's mask, checked.
-
-    Raises:
-        GsbaError: the mask is not (size, size) bool.
-    """
+    """A callable's mask, checked."""
     mask = np.asarray(mask)
     if mask.shape != (size, size) or mask.dtype != bool:
         raise GsbaError(

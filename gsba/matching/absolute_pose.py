@@ -1,8 +1,5 @@
-"""Absolute poses from points of a map, by LO-RANSAC on three-point poses.
-
-pycolmap solves on rays: bearings pass through the pixels of a virtual panorama, so that the whole
-sphere contributes and no face is special.
-"""
+"""Absolute poses from points of a map, by LO-RANSAC on three-point poses. pycolmap solves on rays:
+bearings pass through the pixels of a virtual panorama."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -42,7 +39,6 @@ def panorama_pose(
         bearings: (m, 3) unit, rig frame.
         points_world: (m, 3) candidate point of each bearing; many may be wrong.
         max_error_rad: of an inlier.
-        seed: of the sampling.
         least: number of inliers that is enough.
         min_ratio: least inlier ratio that the number of trials allows for.
     """

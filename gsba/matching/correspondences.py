@@ -71,10 +71,6 @@ def match_loops(context: MatchContext, solved: Solution) -> VerifiedPairs:
     allows. Repeated structure in the distance, arches or columns, is further off than that. After
     so long a way that drift predicts nothing, all points of both frames are compared, and the
     nearest few frames are enough: the rest is found when the loop is closed.
-
-    Args:
-        context: features and settings of the run.
-        solved: poses and points that are right between neighbours.
     """
     settings, keypoints = context.settings, context.keypoints
     world_T_rigs, positions = solved.world_T_rigs, solved.world_T_rigs[:, :3, 3]
@@ -102,8 +98,6 @@ def match_along_epipolars(
     step that only the trajectory gives agrees on another length of it.
 
     Args:
-        context: features and settings of the run.
-        solved: the current solution.
         maps: (F,) int, map of each frame; -1 = a frame of none; None = there is one map.
     """
     poses, settings = solved.world_T_rigs, context.settings
@@ -130,8 +124,6 @@ def match_across(
     Known points are searched within the error of a join around their predicted bearing.
 
     Args:
-        context: features and settings of the run.
-        solved: the joined map.
         parts: (F,) each frame's part before the join.
         met: (F,) bool, frames whose part was joined by images, not by the trajectory alone.
     """
@@ -154,8 +146,6 @@ def match_known_points(context: MatchContext, solved: Solution, loops_closed: bo
     candidate.
 
     Args:
-        context: features and settings of the run.
-        solved: the current solution.
         loops_closed: True if frames far apart in time are predictable too.
     """
     poses, settings = solved.world_T_rigs, context.settings.pairs
@@ -191,11 +181,9 @@ def verified(
     """Matches that fit one relative pose of their pair, which agrees with the prior.
 
     Args:
-        found: putative matches.
         gates: gate of each pair (P,).
         f0_T_f1s: (P, 4, 4) relative poses of the trajectory; None = no prior.
         sigmas: (P,) standard deviations of their positions, map units; None = no prior.
-        context: features and settings of the run.
         rivals: see `verification.estimate_relative_poses`.
     """
     settings, seed = context.settings.verify, context.settings.seed

@@ -17,8 +17,8 @@ from gsba.camera.cameras import ONE_CAMERA, Cameras
 from gsba.camera.lens import Lenses
 from gsba.camera.rig import cells_of
 from gsba.config import MatchingSettings, RefineSettings
+from gsba.features.detection import search_settings
 from gsba.features.extraction import FrameFeatures
-from gsba.features.extractor_traits import search_settings
 from gsba.geometry import inverse
 from gsba.matching._search_kernels import HEAD, Cells, Limits, Rows, passes, search
 from gsba.matching.pairs import by_place
@@ -96,7 +96,6 @@ def searchable(
     """Sort features into cells; keypoints at one place (several orientations) become one.
 
     Args:
-        features: features of one frame.
         axes: (D, D) orthonormal columns, equal for all frames; similarities do not depend on them,
             but the search is fast if the first columns hold most of the descriptors' energy.
         strongest: keypoints of a face to search among, None for all.
@@ -150,7 +149,6 @@ def match_pair(
     """Mutual, distinctive nearest neighbours within the gate.
 
     Args:
-        first, second: features of both frames.
         f0_T_f1: (4, 4) predicted pose of frame 1 in frame 0; its translation's length is unused.
         gate: allowed deviation from the prediction.
         points_f0: (K, 3) scene points of frame 0's keypoints in its rig frame, NaN where unknown.
@@ -217,8 +215,7 @@ def _limits(
 def _targets(
     f0_T_f1: np.ndarray, points_f0: np.ndarray | None, keypoints: np.ndarray, lenses: Lenses
 ) -> np.ndarray:
-    """Directions (n, 3) float32 from frame 1, in frame 0's axes, of the points of keypoints (n,)
-    of frame 0; NaN where unknown."""
+    """Directions (n, 3) float32 from frame 1 of frame 0's points, in 0's axes; NaN = unknown."""
     if points_f0 is None:
         return np.full((len(keypoints), 3), np.nan, np.float32)
     offsets = points_f0[keypoints] - f0_T_f1[:3, 3]
@@ -285,7 +282,6 @@ class SearchableFrames:
     """Features of frames, prepared for matching; read on demand, the most recent ones are kept.
 
     Args:
-        load: reads the features of a frame.
         strongest: keypoints of a face to match, None for all.
         capacity: frames kept in memory.
         axes: axes of the descriptors, see `searchable`; None = those of frame 0.
@@ -402,11 +398,8 @@ def match(
         pairs: (P, 2) frame indices.
         world_T_rigs: (F, 4, 4) poses that predict the pairs' geometry.
         gates: (P) uncertainty of each prediction.
-        frames: features of the frames.
         settings: thresholds on similarity and distinctiveness, see `search_settings`.
-        workers: threads or processes that run it.
         points_rig: points (K_f, 3) of each frame, see `match_pair`.
-        matcher: compares two frames.
     """
     f0_T_f1s = inverse(world_T_rigs[pairs[:, 0]]) @ world_T_rigs[pairs[:, 1]]
     order, places = by_place(pairs, len(world_T_rigs))  # pairs that share frames follow one another

@@ -153,11 +153,7 @@ def _nearest(
     settings: PairSettings,
     chosen: Callable[[int, np.ndarray, np.ndarray], np.ndarray],
 ) -> np.ndarray:
-    """Pairs (L, 2) int32 of each frame and its nearest in space among those chosen.
-
-    Args:
-        chosen: selects, given a frame, frames within reach (N,) and distances: (N,) bool.
-    """
+    """Pairs (L, 2) int32 of each frame and its nearest by `chosen(frame, within, distances)`."""
     from scipy.spatial import KDTree
 
     tree = KDTree(rigs_in_world)

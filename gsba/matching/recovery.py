@@ -73,9 +73,7 @@ def recover(
     pieces is estimated by `gsba.loop_closure.map_merging`, from points that both maps hold.
 
     Args:
-        context: features and settings of the run.
         guided: neighbours verified under the trajectory's guidance; all of them where it is right.
-        coarse: the trajectory.
         timestamps: (F,) seconds.
 
     Raises:
@@ -99,7 +97,10 @@ def recover(
     trust = _check_steps(alone, keypoints, coarse, settings)
     if trust.sound and not joints:
         return Recovered(guided, trust, coarse)
-    again = _pairs_of_one_piece(_missing_two_apart(alone, steps, absent), coarse)
+    first = np.arange(len(steps.verified) - 1)
+    if absent:
+        first = first[steps.verified[:-1] & steps.verified[1:]]
+    again = _pairs_of_one_piece(alone.missing(np.column_stack([first, first + 2])), coarse)
     over = _match_along(context, trust.world_T_rigs, again)
     neighbours = VerifiedPairs.joined([alone, _consistent(over, steps, keypoints, settings)])
     alike = judgement.confirmed(coarse, steps, settings.priors)
@@ -158,8 +159,7 @@ def _misleads(context: MatchContext, guided: VerifiedPairs) -> bool:
 def _walked_on(
     coarse: CoarsePoses, lost: np.ndarray, found: VerifiedPairs, timestamps: np.ndarray
 ) -> np.ndarray:
-    """Poses (F, 4, 4) chained along the trajectory; at its lost steps (P, 2), where it may have
-    jumped, the camera turns as in pairs found without it, and walks on as before and behind."""
+    """Poses (F, 4, 4) chained along the trajectory, at lost steps (P, 2) by pairs without it."""
     poses, intervals = coarse.world_T_rigs, np.diff(timestamps)
     steps = inverse(poses[:-1]) @ poses[1:]
     steps[found.matches.pairs[:, 0], :3, :3] = found.f0_T_f1s[:, :3, :3]
@@ -173,18 +173,8 @@ def _walked_on(
     return chained(steps)
 
 
-def _missing_two_apart(found: VerifiedPairs, steps: Steps, absent: bool) -> np.ndarray:
-    """Pairs (P, 2) of frames two apart that are not found yet; without a trajectory, only over two
-    verified steps: nothing else gives a step's length."""
-    first = np.arange(len(steps.verified) - 1)
-    if absent:
-        first = first[steps.verified[:-1] & steps.verified[1:]]
-    return found.missing(np.column_stack([first, first + 2]))
-
-
 def _with_wider_pairs(context: MatchContext, found: VerifiedPairs) -> VerifiedPairs:
-    """Neighbours, and wider pairs over steps that are too short to tell translation from
-    rotation."""
+    """Neighbours, and wider pairs over steps too short to tell translation from rotation."""
     for gap in _WIDER_GAPS:
         steps = image_steps(found, context.keypoints)
         short = steps.verified & ~steps.directed
@@ -218,7 +208,6 @@ def check_clock(
     A trajectory that fits in another convention is refused first: it may turn at other times.
 
     Args:
-        context: features and settings of the run.
         guided: neighbours verified under the trajectory's guidance. Where it lost many, whole
             panoramas are matched: a wrong clock loses the turns, which determine it.
         coarse: the trajectory at the frames' times.
@@ -264,7 +253,6 @@ def match_anywhere(context: MatchContext, chosen: np.ndarray, rivals: bool = Tru
     matcher, whose matches of all features are few and right, gets all at once.
 
     Args:
-        context: features and settings of the run.
         chosen: (P, 2) frame indices.
         rivals: True if another pose that explains about as many matches speaks against a pair.
     """
@@ -287,8 +275,6 @@ def match_again(context: MatchContext, found: VerifiedPairs, steps: set[int]) ->
     """Match steps again with all keypoints along the epipolar lines found, and verify them anew.
 
     Args:
-        context: features and settings of the run.
-        found: neighbours.
         steps: first frames of the steps; each keeps the pose with more inliers.
     """
     chosen = [
@@ -365,8 +351,7 @@ def _with_consistent_scale(context: MatchContext, found: VerifiedPairs) -> Verif
 
 
 def _frames_of_open_ratio(context: MatchContext, found: VerifiedPairs) -> tuple[set[int], set[int]]:
-    """Frames between two steps whose common points leave the ratio of lengths open, or give one
-    beyond `_MAX_STEP_RATIO`; and the latter alone."""
+    """Frames between two steps of open or excessive ratio of lengths; and the latter alone."""
     steps = image_steps(found, context.keypoints)
     logs, sigmas = length_ratios(found, steps, context.keypoints, _MIN_COMMON_POINTS)
     rows = {int(f0): p for p, (f0, f1) in enumerate(found.matches.pairs) if f1 - f0 == 1}

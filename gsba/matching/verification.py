@@ -1,8 +1,5 @@
-"""Two-view verification on bearings.
-
-A relative pose is accepted if chance does not explain its inliers, no other pose explains about
-as many of the other matches, and the trajectory does not contradict it.
-"""
+"""Two-view verification on bearings: a pose is accepted if chance does not explain its inliers, no
+other pose explains as many of the other matches, and the trajectory does not contradict it."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -52,12 +49,9 @@ def agree_with_prior(
     """Keep pairs that have one relative pose, which agrees with the prior.
 
     Args:
-        matches: putative matches.
-        estimates: result of `estimate_relative_poses` for each pair.
         prior_f0_T_f1s: (P, 4, 4) relative poses of the trajectory; None = no prior.
         position_sigmas: (P,) standard deviation of the prior's relative position, map units; it
             sets the tolerance of the direction.
-        settings: thresholds.
     """
     kept, kept_poses = [], []
     dropped: dict[str, int] = {
@@ -92,8 +86,7 @@ def agree_with_prior(
 def _why_prior_contradicts(
     found: RelativePose, prior: np.ndarray, position_sigma: float, settings: TwoViewLimits
 ) -> str:
-    """Reason why a pose does not fit a prior (4, 4) with standard deviation `position_sigma`; "" =
-    it fits."""
+    """Reason why a pose does not fit a prior (4, 4) of `position_sigma`; "" = it fits."""
     turn = rotation_angle(prior[:3, :3].T @ found.f0_T_f1[:3, :3])
     if turn > np.deg2rad(settings.max_rotation_deg):
         return "rotation contradicts"
@@ -118,11 +111,6 @@ def estimate_relative_poses(
     """`relative_pose` of every pair by LO-RANSAC, without any prior.
 
     Args:
-        matches: putative matches.
-        keypoints: keypoints of all frames.
-        settings: thresholds.
-        seed: of the sampling.
-        workers: threads or processes that run it.
         chances: (P,) probability that a false match that passed the gate agrees with a pose near
             the predicted one; 0 = nothing was predicted.
         rivals: True if rival poses are searched too.
@@ -175,8 +163,6 @@ def relative_pose(
 
     Args:
         bearings0, bearings1: (m, 3) unit, rays of the matches in each frame.
-        settings: thresholds.
-        seed: of the sampling.
         chance, rivals: see `estimate_relative_poses`.
     """
     found = _significant_pose(bearings0, bearings1, settings, seed, chance)
@@ -195,8 +181,7 @@ def _significant_pose(
     seed: int,
     chance: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """f0_T_f1 (4, 4) with unit translation and inliers (m,) bool of the best pose; None if chance
-    explains as many."""
+    """f0_T_f1 (4, 4), unit translation, inliers (m,) bool of the best pose; None = by chance."""
     largest, num = np.sin(np.deg2rad(settings.max_error_deg)), witnesses(bearings0, CELLS_PER_SIDE)
 
     def needed(of_match: float) -> int:

@@ -1,8 +1,5 @@
-"""A small panorama as six overlapping pinhole faces side by side in one picture, its atlas.
-
-Optical flow needs pictures without seam and poles. Frames are cut along axes that are nearly fixed
-in the world, so that the appearance of features does not rotate with the camera.
-"""
+"""A small panorama as six overlapping pinhole faces side by side in one picture, its atlas, cut
+along axes nearly fixed in the world; and features followed between two."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,10 +8,10 @@ import cv2
 import numpy as np
 
 from factors.compiled import kernel_and_part
-from gsba.camera.rig import RIG_R_FACE, CubeRig, owner_faces
+from gsba.camera.rig import RIG_R_FACE, CubeRig, cells_of, owner_faces
 from gsba.camera.sphere import around_sphere
 from gsba.geometry import rotation_angle, unit
-from gsba.odometry.lucas_kanade import pyramid
+from gsba.odometry.lucas_kanade import LEVELS, WINDOW, align_patches, pyramid
 
 _kernel, _part = kernel_and_part()
 HFOV = np.deg2rad(106.0)  # of a face: a feature may move 8 degrees beyond the face that owns it
@@ -119,7 +116,6 @@ class Cutter:
         """The atlas of a panorama (h, 2h) uint8 whose orientation is roughly known.
 
         Args:
-            grey: the panorama.
             world_R_rig: (3, 3) predicted orientation.
             exactly: cut along these axes, not along others near them.
         """
@@ -162,8 +158,7 @@ def _arctangent(y, x):
 
 @_kernel
 def _erp_pixels(xs, ys, zs, cut_R_rig, height, across, down):
-    """OpenCV pixels of a panorama in the directions of rays, axes of the cut; float32
-    throughout."""
+    """OpenCV pixels of a panorama in directions of rays, axes of the cut; float32 throughout."""
     per_radian = height / _HALF
     half = _ONE_HALF
     for i in range(len(xs)):
@@ -173,3 +168,121 @@ def _erp_pixels(xs, ys, zs, cut_R_rig, height, across, down):
         c = cut_R_rig[0, 2] * x + cut_R_rig[1, 2] * y + cut_R_rig[2, 2] * z
         across[i] = height + per_radian * _arctangent(a, c) - half
         down[i] = half * height + per_radian * _arctangent(b, np.sqrt(a * a + c * c)) - half
+
+
+_MAX_RETURN_ERROR_PX = 0.6  # largest error of a feature followed forth and back
+_MAX_DIFFERENCE = 25.0  # largest mean difference of both patches, grey values
+
+
+def follow(
+    layout: AtlasLayout,
+    template: Atlas,
+    frame: Atlas,
+    bearings_template: np.ndarray,
+    predicted: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Bearings of one frame's features in another frame.
+
+    Each is followed, forth and back, on the face that best shows both bearings.
+
+    Args:
+        layout: of both atlases.
+        template, frame: cut along nearly the same axes of the world.
+        bearings_template: (N, 3) features in the template's rig frame.
+        predicted: (N, 3) unit, predicted bearings in the frame's rig frame.
+
+    Returns:
+        bearings (N, 3) in the frame's rig frame, and (N,) bool, True for found features.
+    """
+    before = bearings_template @ template.cut_R_rig.T
+    guess = predicted @ frame.cut_R_rig.T
+    faces = shared_faces(before, guess)
+    starts, ends = layout.pixels(before, faces), layout.pixels(guess, faces)
+    margin = WINDOW / 2 + 1
+    rows = np.flatnonzero(layout.inside(starts, faces, margin) & layout.inside(ends, faces, margin))
+    found, bearings = np.zeros(len(predicted), bool), predicted.copy()
+    if not len(rows):
+        return bearings, found
+    given = starts[rows], ends[rows]
+    there, forth, difference = align_patches(template.pyramid, frame.pyramid, *given, LEVELS)
+    expected = starts[rows] + there - ends[rows]  # as far off as the guess was
+    back, home, _ = align_patches(frame.pyramid, template.pyramid, there, expected, 1)
+    off = np.linalg.norm(back - starts[rows], axis=1)
+    good = forth & home & (off < _MAX_RETURN_ERROR_PX) & (difference < _MAX_DIFFERENCE)
+    good &= layout.inside(there, faces[rows], margin)
+    rows, there = rows[good], there[good]
+    found[rows] = True
+    bearings[rows] = layout.bearings(there, faces[rows]) @ frame.cut_R_rig
+    return bearings, found
+
+
+_PER_SIDE = 11  # cells along a side of a cube face, 8 degrees each
+_BLOCK = 5  # pixels across the patch of which gradients are summed
+_APART_PX = 5  # least distance between features
+_MIN_EIGENVALUE = 3e-5  # least eigenvalue of a patch's gradients, in OpenCV's normalisation: less
+# is noise
+_NOISES = 4.0  # least response of a corner, in median responses of a picture's flattest quarter
+
+
+def new_corners(
+    layout: AtlasLayout, atlas: Atlas, usable: np.ndarray | None, known: np.ndarray
+) -> np.ndarray:
+    """Bearings (N, 3), rig frame, of corners in cells with too few features.
+
+    Args:
+        usable: (2 s, 3 s) bool, pixels of the scene; None = all.
+        known: (M, 3) bearings, rig frame, of features followed so far.
+    """
+    response = cv2.cornerMinEigenVal(atlas.image, _BLOCK)
+    allowed = layout.owned if usable is None else layout.owned & usable
+    floor = max(_MIN_EIGENVALUE, _NOISES * _flat(response, allowed))
+    peaks = (response == cv2.dilate(response, np.ones((5, 5)))) & (response > floor) & allowed
+    taken = np.zeros(6 * _PER_SIDE**2, int)
+    if len(known):
+        along = known @ atlas.cut_R_rig.T
+        np.add.at(taken, cells_of(along, _PER_SIDE), 1)
+        _block(peaks, layout, along)
+    v, u = np.nonzero(peaks)
+    order = np.argsort(-response[v, u], kind="stable")
+    v, u = v[order], u[order]
+    faces = (v // layout.rig.size) * 3 + u // layout.rig.size
+    bearings = layout.bearings(np.stack([u, v], axis=1).astype(float), faces)
+    cells = cells_of(bearings, _PER_SIDE)
+    kept = _strongest(cells, 1 - taken)  # features in a cell, including followed ones
+    kept = kept[_apart(np.stack([u, v], axis=1)[kept])]
+    return bearings[kept] @ atlas.cut_R_rig
+
+
+def _flat(response: np.ndarray, allowed: np.ndarray) -> float:
+    """Median response of the flattest quarter of a picture: that of noise, if walls are bare."""
+    some = response[::4, ::4][allowed[::4, ::4]]
+    return float(np.quantile(some, 0.125)) if len(some) else 0.0
+
+
+def _block(peaks: np.ndarray, layout: AtlasLayout, along: np.ndarray) -> None:
+    """Clear `peaks` around known features, bearings (M, 3) along the axes of the cut."""
+    faces = owner_faces(along).astype(np.int64)
+    for u, v in np.rint(layout.pixels(along, faces)).astype(int):
+        top, left = max(v - _APART_PX, 0), max(u - _APART_PX, 0)
+        peaks[top : v + _APART_PX + 1, left : u + _APART_PX + 1] = False
+
+
+def _strongest(cells: np.ndarray, room: np.ndarray) -> np.ndarray:
+    """Rows (N',) of the first `room[cell]` entries of each cell (N,), given in falling order."""
+    order = np.argsort(cells, kind="stable")
+    starts = np.searchsorted(cells[order], np.arange(len(room)))
+    rank = np.empty(len(cells), int)
+    rank[order] = np.arange(len(cells)) - starts[cells[order]]
+    return np.flatnonzero(rank < room[cells])
+
+
+def _apart(pixels: np.ndarray) -> np.ndarray:
+    """Rows of pixels (N, 2), in falling order, at least `_APART_PX` from all earlier ones."""
+    from scipy.spatial import KDTree
+
+    if len(pixels) < 2:
+        return np.arange(len(pixels))
+    pairs = KDTree(pixels).query_pairs(_APART_PX, output_type="ndarray")
+    out = np.zeros(len(pixels), bool)
+    out[pairs.max(axis=1)] = True
+    return np.flatnonzero(~out)

@@ -1,8 +1,5 @@
-"""The last step of odometry, on all keyframes: maps joined, loops closed, covariances.
-
-A wrong loop or join ruins a map, and a missed one only leaves drift: both must pass the test of
-joins (`gsba.loop_closure.join_test`).
-"""
+"""The last step of odometry, on all keyframes: maps joined, loops closed (both by the test of
+`gsba.loop_closure.join_test`: a wrong one ruins a map), covariances."""
 
 import logging
 from collections.abc import Sequence
@@ -14,8 +11,13 @@ from gsba.geometry import inverse
 from gsba.loop_closure import map_merging
 from gsba.odometry.loops import find_joins, find_loops
 from gsba.odometry.places import KeyframePlaces, chosen_keyframes, described, make_places
-from gsba.odometry.pose_graph import Constraint, close_loops, covariances_of
-from gsba.odometry.steps import MeasuredSteps, measure_steps
+from gsba.odometry.pose_graph import (
+    Constraint,
+    MeasuredSteps,
+    close_loops,
+    covariances_of,
+    measure_steps,
+)
 from gsba.similarity import Sim3
 from gsba.store.shards import Workers
 
@@ -60,13 +62,7 @@ class ClosedKeyframes:
 
 
 def close(tracked: TrackedKeyframes, seed: int, workers: Workers) -> ClosedKeyframes:
-    """Join the maps of a walk where they overlap, close loops, and estimate covariances.
-
-    Args:
-        tracked: all keyframes.
-        seed: of the sampling.
-        workers: who compare places.
-    """
+    """Join the maps of a walk where they overlap, close loops, and estimate covariances."""
     found = ClosedKeyframes.unchanged(tracked)
     places = _places(tracked, seed, workers)
     if places is None:

@@ -1,16 +1,12 @@
-"""Rotation between two frames from their panoramas alone, at any angle.
-
-Used without a reliable prediction: after fast turns, gaps and blackouts. Rows are correlated for
-the yaw, then the whole sphere is aligned over SO(3) (Gauss-Newton, inverse compositional).
-"""
+"""Rotation between two frames from their panoramas alone, at any angle: rows are correlated for the
+yaw, then the whole sphere is aligned over SO(3) (Gauss-Newton, inverse compositional)."""
 
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
-from gsba.camera.sphere import around_sphere, bearings_from_erp, erp_from_bearings
-from gsba.camera.tables import table
+from gsba.camera.sphere import around_sphere, bearings_from_erp, erp_from_bearings, table
 
 _WIDTH = 128  # pixels across the panoramas that are compared
 _BLUR = 1.2, 8.0  # pixels, standard deviations: band of detail that is compared
@@ -54,21 +50,16 @@ def turned(one: Miniature, other: Miniature, guesses: list[np.ndarray]) -> np.nd
         guesses: initial rotations, besides the best rotation about the vertical axis.
     """
     best, least = np.eye(3), np.inf
-    for start in [*guesses, _yaw(one, other)]:
-        rotation, cost = _aligned(one, other, start)
-        if cost < least:
-            best, least = rotation, cost
-    return best
-
-
-def _yaw(one: Miniature, other: Miniature) -> np.ndarray:
-    """Rotation about the vertical axis under which rows correlate best."""
     rows = slice(*(round(part * len(one.detail)) for part in _ROWS))
     spectra = [np.fft.rfft(m.detail[rows] * (m.weights[rows] > 0), axis=1) for m in (one, other)]
     correlation = np.fft.irfft(spectra[0] * np.conj(spectra[1]), axis=1).sum(axis=0)
     angle = 2 * np.pi * int(np.argmax(correlation)) / _WIDTH
     c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+    for start in [*guesses, np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])]:
+        rotation, cost = _aligned(one, other, start)
+        if cost < least:
+            best, least = rotation, cost
+    return best
 
 
 def _aligned(one: Miniature, other: Miniature, start: np.ndarray) -> tuple[np.ndarray, float]:
@@ -114,8 +105,7 @@ def _rays() -> np.ndarray:
 
 
 def _jacobian(detail: np.ndarray) -> np.ndarray:
-    """Derivative (64 * 128, 3) of the detail at each ray by a rotation of the ray about the
-    axes."""
+    """Derivative (64 * 128, 3) of the detail at each ray by a rotation of the ray."""
     per_radian = _WIDTH / (2 * np.pi)
     by_u = 0.5 * (np.roll(detail, -1, axis=1) - np.roll(detail, 1, axis=1)) * per_radian
     by_v = np.gradient(detail, axis=0) * per_radian

@@ -10,7 +10,6 @@ from gsba.odometry.walk import Odometry
 
 _EARLIEST = 0.6  # part of a step after which the sharpest frame is searched
 _MOST_LONGER = 1e6  # largest factor on the step, if few frames are wanted
-_HALVINGS = 20  # bisections of the interval of that factor
 
 
 def choose_frames(found: Odometry, settings: OdometrySettings) -> np.ndarray:
@@ -19,10 +18,6 @@ def choose_frames(found: Odometry, settings: OdometrySettings) -> np.ndarray:
     From one frame to the next the camera moves by at most `step` times the median distance of the
     scene, and rotates by at most `max_turn_deg`, wherever the video has frames that close; the
     sharpest of the last part of each such stretch is selected. Frames without a pose are left out.
-
-    Args:
-        found: odometry of all frames.
-        settings: lengths of the steps, and the largest number of frames.
     """
     count = settings.max_frames
     steps = _Steps.of(found, settings.step, np.deg2rad(settings.max_turn_deg))
@@ -34,7 +29,7 @@ def choose_frames(found: Odometry, settings: OdometrySettings) -> np.ndarray:
         low, high = high, 2 * high
         if high > _MOST_LONGER:  # more maps than frames are wanted
             return rows[np.linspace(0, len(rows) - 1, count).round().astype(int)]
-    for _ in range(_HALVINGS):
+    for _ in range(20):  # bisections of the interval of that factor
         middle = 0.5 * (low + high)
         if len(_chosen(found, steps, middle)) > count:
             low = middle

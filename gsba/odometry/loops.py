@@ -159,12 +159,7 @@ def _rivals(one: Judged, judged: list[Judged], test: JoinTest) -> list[Judged]:
 def _measured(
     proposal: Proposal, rows: np.ndarray, inside: np.ndarray, test: JoinTest
 ) -> Constraint | None:
-    """An accepted proposal, fitted to points of the places next to the meeting, where drift is
-    least. None if few of their points fit it.
-
-    Args:
-        proposal: moves places `rows` (N,) to places `inside` (M,), ascending.
-    """
+    """A proposal fitted to points of places next to the meeting; None if few of them fit it."""
     (f, g), poses, move = proposal.frames, test.poses, proposal.move
     rows, inside = around(rows, f, _FITTED), around(inside, g, _FITTED)
     found = test.meetings(test.weigh(rows, inside, move)[1], rows)

@@ -58,7 +58,6 @@ def of_frames(frames: FrameSet, source: Path, width: int) -> SmallPanoramas:
 
     Args:
         frames: panoramas or raw pairs; pixels masked in all of them are masked.
-        source: the folder.
         width: pixels across; less if the frames are smaller.
 
     Raises:
@@ -98,7 +97,6 @@ def of_video(
     """Panoramas of a video: stitched, or raw and joined by its lenses' calibration.
 
     Args:
-        video: see `gsba.video.recording`.
         width: pixels across; less if the video is smaller.
         calibration: calibration file of a raw recording; None = from image circles or the maker's
             file.

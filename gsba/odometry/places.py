@@ -115,8 +115,6 @@ def make_places(
         keyframes, maps: (P,) keyframe number and map of each place.
         world_T_rigs: (P, 4, 4) poses, each in the world of its map.
         features: (P) see `described`.
-        seed: of later sampling.
-        workers: who match.
     """
     context = MatchContext(
         SearchableFrames(features.__getitem__),

@@ -16,7 +16,6 @@ _RATIO = 0.85  # largest ratio of the distances of the best and the second best 
 _MIN_MATCHES = 20
 _VERIFY = TwoViewLimits(max_error_deg=0.4)
 _NEAR = np.deg2rad(4.0)  # largest angle between a match and the point whose distance it takes
-_MIN_SCALES = 8  # least number of matches near a point
 _MIN_PARALLAX = np.deg2rad(1.0)  # least parallax of a match whose distance is compared
 
 
@@ -59,7 +58,6 @@ def placed(
         key, frame: keypoints of the keyframe and the frame.
         bearings: (P, 3) unit, the keyframe's rig frame, of its points.
         distances: (P,) distances of these points, map units.
-        seed: of the sampling.
     """
     if min(len(key.bearings_rig), len(frame.bearings_rig)) < _MIN_MATCHES:
         return None
@@ -100,13 +98,7 @@ def _length(
     bearings: np.ndarray,
     distances: np.ndarray,
 ) -> float | None:
-    """Length of the step at which matches have the distances of nearby points; or None.
-
-    Args:
-        one, other: (m, 3) rays of the matches in the keyframe's axes.
-        direction: (3,) unit, direction of the step.
-        bearings, distances: of the points.
-    """
+    """Length of the step at which matches have the distances of nearby points; or None."""
     from scipy.spatial import KDTree
 
     if not len(bearings):
@@ -114,7 +106,7 @@ def _length(
     parallax = np.linalg.norm(np.cross(one, other), axis=1)
     apart, nearest = KDTree(bearings).query(one)
     use = (parallax > _MIN_PARALLAX) & (apart < _NEAR)
-    if np.count_nonzero(use) < _MIN_SCALES:
+    if np.count_nonzero(use) < 8:  # least number of matches near a point
         return None
     # |step x other| / |one x other| is the distance along `one` at a step of length 1.
     at_one = np.linalg.norm(np.cross(direction, other[use]), axis=1) / parallax[use]

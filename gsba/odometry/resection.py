@@ -10,7 +10,6 @@ from gsba.camera.rig import witnesses
 from gsba.significance import least_agreeing
 
 _kernel, _part = kernel_and_part()
-_STEPS = 12  # Gauss-Newton steps
 _CONVERGED = 1e-6  # radians, and parts of the median distance
 _ANNEALED = (8.0, 4.0, 2.0, 1.0)  # factors on the scale of the loss in the first steps
 _GATE = 3.5  # standard deviations of an inlier
@@ -21,7 +20,6 @@ _MIN_WITNESSES = 20  # least number of witnesses: fewer may be of one moving obj
 _MAX_FALSE_ALARMS = 1e-6  # expected number of poses that chance explains as well as the accepted
 # one
 _CHANCE_SPAN = np.deg2rad(6.0)  # false matches lie anywhere within this angle of their prediction
-_MAX_POSITION_SIGMA = 0.05  # of the position, in median distances of the points
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,9 +53,14 @@ def resect(
         noise = float(np.sqrt(np.median(squares[inliers]) / 1.386))
     distance = float(np.median(distances)) if len(distances) else 1.0
     covariance = max(noise, 0.3 * sigma) ** 2 * np.linalg.pinv(information, hermitian=True)
-    significant = _significant(bearings_rig, inliers, sigma)
+    num = witnesses(bearings_rig, _CELLS) if len(bearings_rig) else 0
+    agreeing = witnesses(bearings_rig[inliers], _CELLS) if inliers.any() else 0
+    chance = min((_GATE * sigma / _CHANCE_SPAN) ** 2, 0.5)
+    per_witness = 1 - (1 - chance) ** (len(bearings_rig) / max(num, 1))
+    needed = least_agreeing(num, per_witness, _SAMPLE, _MAX_FALSE_ALARMS)
+    significant = agreeing >= max(needed, _MIN_WITNESSES)
     spread = np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1])
-    significant &= spread < _MAX_POSITION_SIGMA * distance
+    significant &= spread < 0.05 * distance  # of the position, in median distances of the points
     return Resection(pose, inliers, noise, covariance, bool(significant))
 
 
@@ -73,7 +76,7 @@ def _fitted(
     bases = tangent_basis(bearings_rig)
     information, gradient = np.empty((6, 6)), np.empty(6)
     observed = points_world, bases, bearings_rig
-    for step in range(_STEPS):
+    for step in range(12):  # Gauss-Newton steps
         scale = 3 * sigma * _ANNEALED[min(step, len(_ANNEALED) - 1)]
         found = residuals, distances, information, gradient
         _normal_equations(*observed, world_T_rig, scale, *found)
@@ -113,16 +116,6 @@ def retracted(world_T_rig: np.ndarray, tangent: np.ndarray) -> np.ndarray:
     import gtsam
 
     return gtsam.Pose3(world_T_rig).retract(tangent).matrix()
-
-
-def _significant(bearings: np.ndarray, inliers: np.ndarray, sigma: float) -> bool:
-    """True if chance does not explain the inliers, counted in independent witnesses."""
-    num = witnesses(bearings, _CELLS) if len(bearings) else 0
-    agreeing = witnesses(bearings[inliers], _CELLS) if inliers.any() else 0
-    chance = min((_GATE * sigma / _CHANCE_SPAN) ** 2, 0.5)
-    per_witness = 1 - (1 - chance) ** (len(bearings) / max(num, 1))
-    needed = least_agreeing(num, per_witness, _SAMPLE, _MAX_FALSE_ALARMS)
-    return agreeing >= max(needed, _MIN_WITNESSES)
 
 
 @_part

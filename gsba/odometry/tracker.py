@@ -13,21 +13,28 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gsba.geometry import angles_between, inverse, nearest_rotation, pose, rotation_angle, unit
-from gsba.odometry.atlas import Atlas, AtlasLayout, Cutter
-from gsba.odometry.corners import new_corners
+from gsba.odometry.atlas import Atlas, AtlasLayout, Cutter, follow, new_corners
 from gsba.odometry.derotation import Miniature, miniature, turned
-from gsba.odometry.flow import follow
-from gsba.odometry.frame_record import FrameRecord, FrameStatus
 from gsba.odometry.relocalisation import Described, describe, placed
 from gsba.odometry.resection import Resection, resect
-from gsba.odometry.tracker_state import Keyframe, TrackedFeatures, TrackerState
-from gsba.odometry.two_view_start import median_turn, start_map
-from gsba.odometry.window import AdjustedWindow, WindowObservations, adjust_window
+from gsba.odometry.tracker_state import (
+    FrameRecord,
+    FrameStatus,
+    Keyframe,
+    TrackedFeatures,
+    TrackerState,
+)
+from gsba.odometry.window import (
+    AdjustedWindow,
+    WindowObservations,
+    adjust_window,
+    median_turn,
+    start_map,
+)
 
 logger = logging.getLogger(__name__)
 
 FREE, HELD = 8, 5  # keyframes of the window that are adjusted, and fixed ones before them
-_REMEMBERED = 10  # keyframes that a lost frame is compared with
 _DESCRIBED = 4  # last keyframes with which it is compared by descriptors
 _MIN_CONTRAST = 1.5  # grey values: a lower contrast is darkness, or a hand over the lenses
 _KEYFRAME_PARALLAX = np.deg2rad(3.0)  # median parallax of the features since the last keyframe
@@ -231,11 +238,7 @@ class Tracker:
     def _attempt(
         self, grey: np.ndarray, key: Keyframe, features: TrackedFeatures, predicted: np.ndarray
     ) -> _Attempt:
-        """Follow a keyframe's features into a frame whose pose (4, 4) is predicted, and pose it.
-
-        Features with points go first. If their pose is far from the predicted one, those that do
-        not fit it are tracked once more; all others are predicted by that pose.
-        """
+        """Follow features into a frame of predicted pose (4, 4); badly predicted ones twice."""
         template = key.atlas
         assert template is not None
         atlas = self._cutter.cut(grey, predicted[:3, :3])
@@ -274,7 +277,10 @@ class Tracker:
         noise = float(np.clip(fit.noise, _MIN_SIGMA, _MAX_SIGMA))
         self.state.sigma += _ADAPTING * (noise - self.state.sigma)
         fits = self._fitting(features, tried, key)
-        self._assume(features, fits, tried.bearings[fits])
+        position = self.state.world_T_rig[:3, 3]
+        distances = np.linalg.norm(features.assumed_world[fits] - position, axis=1)
+        rays = distances[:, None] * (tried.bearings[fits] @ self.state.world_T_rig[:3, :3].T)
+        features.assumed_world[fits] = position + rays
         features.misses = np.where(fits, 0, features.misses + 1)
         known = np.isfinite(self.state.points[features.ids, 0])
         distance = self._distance(features.ids[fits & known], self.state.world_T_rig)
@@ -359,7 +365,7 @@ class Tracker:
         state.keyframe_frames.append(frame)
         state.keyframe_features.append((ids, bearings.astype(np.float32)))
         del state.window[: -(FREE + HELD)]
-        for old in state.window[:-_REMEMBERED]:
+        for old in state.window[:-10]:  # keyframes that a lost frame is compared with
             old.atlas = old.small = old.described = None
         state.features = self._followable(key)
 
@@ -507,13 +513,6 @@ class Tracker:
         rays = distances[:, None] * (key.bearings @ key.world_T_rig[:3, :3].T)
         assumed = key.world_T_rig[:3, 3] + rays
         return TrackedFeatures(key.ids, key.bearings, assumed, np.zeros(len(rays), int))
-
-    def _assume(self, features: TrackedFeatures, found: np.ndarray, bearings: np.ndarray) -> None:
-        """Move assumed positions of features found (N,) bool onto their last bearings."""
-        position = self.state.world_T_rig[:3, 3]
-        distances = np.linalg.norm(features.assumed_world[found] - position, axis=1)
-        rays = distances[:, None] * (bearings @ self.state.world_T_rig[:3, :3].T)
-        features.assumed_world[found] = position + rays
 
     def _distance(self, ids: np.ndarray, world_T_rig: np.ndarray) -> float:
         """Median distance of features' points from a pose; NaN without points."""

@@ -1,5 +1,6 @@
 """Odometry of a whole sequence: poses, statuses, covariances, and the report."""
 
+import csv
 import logging
 import os
 import time
@@ -8,19 +9,119 @@ from pathlib import Path
 
 import numpy as np
 
-from gsba.geometry import inverse
-from gsba.log import GsbaError
+from gsba import __version__
+from gsba.disk import atomic_write, write_json
+from gsba.geometry import inverse, quaternion_from_rotation
+from gsba.log import GsbaError, event, track
 from gsba.odometry.closing import ClosedKeyframes, TrackedKeyframes, close
-from gsba.odometry.frame_record import FrameStatus
 from gsba.odometry.panoramas import SmallPanoramas
+from gsba.odometry.places import compressed
 from gsba.odometry.pose_graph import carried_covariances
-from gsba.odometry.tracking import Tracking, track_frames
-from gsba.store.shards import Threads, Workers
+from gsba.odometry.tracker import Tracker
+from gsba.odometry.tracker_state import FrameStatus, TrackerState
+from gsba.store.records import load_checkpoint, save_record
+from gsba.store.shards import Threads, Workers, content_digest
+from gsba.store.store import fingerprint
+from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.types import Trajectory
+from gsba.video.likeness import sharpness
+
+_PATIENCE_S, _MIN_PATIENCE = 1.5, 8  # seconds, and frames, before a lost camera begins a new map
+_CHECKPOINT_S = 60.0  # between checkpoints
+_MAX_SAVING_SHARE = 0.03  # of the time between checkpoints that writing one may take
+_POINTS_TOLD = 12  # most points of a keyframe that its event holds
+
+
+@dataclass(slots=True)
+class Tracking:
+    """A sequence as far as it was tracked."""
+
+    state: TrackerState = field(default_factory=TrackerState)
+    rows: list[int] = field(default_factory=list)  # panoramas that could be read
+    sharpness: list[float] = field(default_factory=list)  # of each; see gsba.video.likeness
+    pictures: list[np.ndarray] = field(default_factory=list)  # (n,) uint8 each, keyframes as JPEG
+    cpu_s: float = 0.0  # processor time, decoding apart
+
+
+def track_frames(panoramas: SmallPanoramas, seed: int, checkpoint: Path | None) -> Tracking:
+    """Pose all frames of a sequence one after another.
+
+    Args:
+        panoramas: in time order; those that are damaged are left out.
+        checkpoint: written each minute; where it is of these panoramas, tracking goes on from it.
+            The caller removes it. None = there is none.
+
+    Raises:
+        GsbaError: the disk refuses a checkpoint.
+    """
+    num, interval = len(panoramas), float(np.median(np.diff(panoramas.timestamps)))
+    patience = max(_MIN_PATIENCE, round(_PATIENCE_S / interval))
+    key = _key(panoramas, seed, patience) if checkpoint is not None else ""
+    found = load_checkpoint(checkpoint, key, Tracking, "tracking begins anew") or Tracking()
+    if found.rows:
+        logger.info("tracking goes on after %d frames, from %s", len(found.rows), checkpoint)
+    state, first = found.state, found.rows[-1] + 1 if found.rows else 0
+    tracker = Tracker(panoramas.width, panoramas.usable, seed, patience, state)
+    gone, due = _DistanceGone(state), time.monotonic() + _CHECKPOINT_S
+    for number in range(len(state.keyframe_poses)):
+        _tell_keyframe(state, number)
+    pictures = panoramas.read(range(first, num), False)
+    for row, grey in track(pictures, "tracking", num, first, gone):
+        began = time.thread_time()
+        tracker.add(grey)
+        found.sharpness.append(sharpness(grey))
+        found.rows.append(row)
+        while len(state.keyframe_frames) > len(found.pictures):
+            found.pictures.append(compressed(grey))
+            _tell_keyframe(state, len(found.pictures) - 1)
+        found.cpu_s += time.thread_time() - began
+        if checkpoint is not None and (began := time.monotonic()) > due:
+            save_record(checkpoint, found, {"key": key})
+            now = time.monotonic()
+            due = now + max(_CHECKPOINT_S, (now - began) / _MAX_SAVING_SHARE)
+    return found
+
+
+def _tell_keyframe(state: TrackerState, number: int) -> None:
+    """Pass a keyframe on as an event: its map, its position, some of the points that it sees."""
+    ids, _ = state.keyframe_features[number]
+    points = state.points[ids]
+    points = points[np.isfinite(points).all(axis=1)]
+    points = points[:: max(1, -(-len(points) // _POINTS_TOLD))]
+    position = state.keyframe_poses[number][:3, 3]
+    map_number = state.records[state.keyframe_frames[number]].map_number
+    told = {"position": position.round(4).tolist(), "points": points.round(4).tolist()}
+    event("keyframe", map=map_number, **told)
+
+
+@dataclass(slots=True)
+class _DistanceGone:
+    """Length of the path so far, for the progress bar; from one map to the next there is none."""
+
+    state: TrackerState
+    keyframes: int = 1  # that are counted
+    length: float = 0.0  # map units
+
+    def __call__(self) -> str:
+        state, poses = self.state, self.state.keyframe_poses
+        for n in range(self.keyframes, len(poses)):
+            ends = state.keyframe_frames[n - 1 : n + 1]
+            if len({state.records[f].map_number for f in ends}) == 1:
+                self.length += float(np.linalg.norm(poses[n][:3, 3] - poses[n - 1][:3, 3]))
+        self.keyframes = max(len(poses), 1)
+        return f"{self.length:.1f} units gone"
+
+
+def _key(panoramas: SmallPanoramas, seed: int, patience: int) -> str:
+    """Digest of all that tracking rests on."""
+    usable = np.ones(0, bool) if panoramas.usable is None else panoramas.usable
+    source = panoramas.source  # a folder is dated anew whenever something is written to it
+    files = fingerprint([source]) if source.is_file() else str(source)
+    what = panoramas.width, seed, patience, __version__
+    return content_digest(files, panoramas.timestamps, usable, what)
+
 
 logger = logging.getLogger(__name__)
-
-_MIN_FRAMES_OF_MAP = 5  # maps with fewer frames are ignored
 
 
 def _no_pairs() -> np.ndarray:
@@ -71,7 +172,7 @@ class Odometry:
         counts = np.bincount(self.maps[found], minlength=int(self.maps.max(initial=0)) + 1)
         if not len(with_points):
             return found & (self.maps == np.argmax(counts))
-        large = with_points[counts[with_points] >= _MIN_FRAMES_OF_MAP]
+        large = with_points[counts[with_points] >= 5]  # maps with fewer frames are ignored
         return found & np.isin(self.maps, large)
 
     def usable(self) -> bool:
@@ -114,7 +215,12 @@ class Odometry:
 
     def lost(self) -> list[Stretch]:
         """Stretches of frames without a pose."""
-        return self._stretches(~self.posed())
+        edges = np.flatnonzero(np.diff((~self.posed()).astype(int), prepend=0, append=0))
+        times = self.timestamps
+        return [
+            Stretch(float(times[a]), float(times[b - 1]), int(b - a))
+            for a, b in zip(edges[::2], edges[1::2], strict=True)
+        ]
 
     def path_lengths(self) -> list[float]:
         """Path length of each map, in its unit."""
@@ -153,14 +259,6 @@ class Odometry:
             line += f", {maps} maps that nothing ties together"
         return f"{line}, {told['cpu_ms_per_frame']:.0f} ms of processor time a frame"
 
-    def _stretches(self, chosen: np.ndarray) -> list[Stretch]:
-        edges = np.flatnonzero(np.diff(chosen.astype(int), prepend=0, append=0))
-        times = self.timestamps
-        return [
-            Stretch(float(times[a]), float(times[b - 1]), int(b - a))
-            for a, b in zip(edges[::2], edges[1::2], strict=True)
-        ]
-
 
 def track_panoramas(
     panoramas: SmallPanoramas,
@@ -173,7 +271,6 @@ def track_panoramas(
 
     Args:
         panoramas: all frames, in time order; damaged ones count as lost.
-        seed: of the sampling.
         workers: threads or processes that compare places; None = threads of this process.
         with_loops: False = join no maps, close no loops, estimate no covariances.
         checkpoint: file that tracking is saved to each minute, continued from if it is of the same
@@ -194,7 +291,15 @@ def track_panoramas(
     found = _odometry(tracked, keyframes, closed, panoramas.timestamps, closing_cpu_s)
     if checkpoint is not None:
         checkpoint.unlink(missing_ok=True)
-    _log(found)
+    logger.info("%s", found.summary())
+    for stretch in found.lost():
+        logger.warning(
+            "no pose from %.3f to %.3f s (%d frames): too dark, covered, or nothing in common "
+            "with what was seen before",
+            stretch.first_s,
+            stretch.last_s,
+            stretch.frames,
+        )
     return found
 
 
@@ -230,14 +335,7 @@ def _odometry(
     timestamps: np.ndarray,
     closing_cpu_s: float,
 ) -> Odometry:
-    """Frames moved with their keyframes, as the result of odometry.
-
-    Args:
-        tracked: all frames.
-        tracked_keyframes, closed: its keyframes before and after loops were closed.
-        timestamps: (F,) of all panoramas.
-        closing_cpu_s: processor time of closing loops.
-    """
+    """Frames moved with their keyframes, before and after loop closure, as odometry's result."""
     num, records, rows = len(timestamps), tracked.state.records, np.array(tracked.rows)
     key_frames, sharp = tracked.state.keyframe_frames, np.zeros(num)
     sharp[rows] = tracked.sharpness
@@ -264,13 +362,68 @@ def _odometry(
     return Odometry(timestamps, poses, *known, tracked.cpu_s, covariances, *ends, closing_cpu_s)
 
 
-def _log(found: Odometry) -> None:
-    logger.info("%s", found.summary())
-    for stretch in found.lost():
-        logger.warning(
-            "no pose from %.3f to %.3f s (%d frames): too dark, covered, or nothing in common "
-            "with what was seen before",
-            stretch.first_s,
-            stretch.last_s,
-            stretch.frames,
-        )
+_AXES = ("rx", "ry", "rz", "tx", "ty", "tz")  # of a pose covariance
+
+
+def write_odometry(found: Odometry, walk: Path, keyframes: Path, poses: Path, report: Path) -> None:
+    """Write the poses of all frames and of the keyframes as TUM files, status and covariance of
+    each pose as CSV, and the report as JSON."""
+    for path in (walk, keyframes, poses, report):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    write_tum(keyframes, found.trajectory(keyframes=True))
+    write_json(report, found.report())
+    _write_poses(poses, found)
+    write_tum(walk, found.trajectory())
+
+
+def _write_poses(path: Path, found: Odometry) -> None:
+    """Status, map, pose and upper triangle of the covariance [rotation, translation] of frames."""
+    upper, covariances = np.triu_indices(6), found.covariances
+    if covariances is None:
+        covariances = np.full((len(found), 6, 6), np.nan)
+    numbers = np.hstack(
+        [
+            found.world_T_rigs[:, :3, 3],
+            quaternion_from_rotation(found.world_T_rigs[:, :3, :3]),
+            covariances[:, *upper],
+        ]
+    )
+    names = [f"cov_{_AXES[i]}_{_AXES[j]}" for i, j in zip(*upper, strict=True)]
+    header = ["timestamp", "status", "keyframe", "map", "tx", "ty", "tz", "qw", "qx", "qy", "qz"]
+    maps, posed = found.maps_in_turn(), found.posed()
+
+    def write(temporary: Path) -> None:
+        with temporary.open("w", newline="", encoding="utf-8") as file:
+            table = csv.writer(file)
+            table.writerow(header + names)
+            for f, timestamp in enumerate(found.timestamps):
+                status = FrameStatus(found.statuses[f]) if posed[f] else FrameStatus.LOST
+                row = [repr(float(timestamp)), status.name.lower(), int(found.keyframes[f])]
+                values = [f"{v:.9g}" if np.isfinite(v) else "" for v in numbers[f]]
+                known = [int(maps[f]), *values] if posed[f] else [""] * (1 + len(values))
+                table.writerow(row + known)
+
+    atomic_write(path, write)
+
+
+def write_chosen(found: Odometry, rows: np.ndarray, path: Path) -> None:
+    """Write the poses of chosen frames (N,) as a TUM file, whose times select them for extraction.
+
+    A file that holds them already is not rewritten: frames extracted by it stay valid.
+    """
+    chosen = Trajectory(found.timestamps[rows], found.world_T_rigs[rows])
+    if path.is_file() and _holds(path, chosen):
+        return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_tum(path, chosen)
+
+
+def _holds(path: Path, trajectory: Trajectory) -> bool:
+    """True if a file has a trajectory's times and poses, to the precision of the file."""
+    try:
+        written = read_trajectory(path)
+    except GsbaError:
+        return False
+    return np.array_equal(written.timestamps, trajectory.timestamps) and np.allclose(
+        written.world_T_rigs, trajectory.world_T_rigs, rtol=0, atol=1e-12
+    )

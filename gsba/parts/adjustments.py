@@ -7,7 +7,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 
-from gsba.bundle.division import DivisibleMap
+from gsba.bundle.adjustment import DivisibleMap
 from gsba.bundle.optimizer import OptimizeResult
 from gsba.config import SolverSettings
 from gsba.memory import give_back_freed_memory, total_memory_bytes
@@ -48,7 +48,7 @@ class _Finished:
 
 @dataclass(frozen=True)
 class DividedAdjustments:
-    """Adjusts the maps of a run in parts: a `gsba.bundle.division.Division`."""
+    """Adjusts the maps of a run in parts: a `gsba.bundle.adjustment.Division`."""
 
     folder: Path  # of the maps that are being adjusted, emptied when their stage is stored
     scratch: Path  # of the workers' own files
@@ -57,7 +57,7 @@ class DividedAdjustments:
     told: set[str] = field(default_factory=set)  # reasons that were logged
 
     def minimized(self, map_: DivisibleMap, settings: SolverSettings) -> OptimizeResult | None:
-        """See `gsba.bundle.division.Division`.
+        """See `gsba.bundle.adjustment.Division`.
 
         A call that goes on has what earlier ones solved, and goes on within what they had begun.
         """
@@ -87,7 +87,7 @@ class DividedAdjustments:
     def covariances(
         self, map_: DivisibleMap, num_draws: int, seed: int
     ) -> tuple[np.ndarray, JointErrors] | None:
-        """See `gsba.bundle.division.Division`."""
+        """See `gsba.bundle.adjustment.Division`."""
         most = self._frames_of_parts(map_)
         if most is None:
             return None

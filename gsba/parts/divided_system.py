@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_limits
 from factors import RobustLoss
 from factors.cholesky import DIM, BlockCholesky
 from factors.normal_equations import damping_of
-from gsba.bundle.family_variables import kept
+from gsba.bundle.families import kept
 from gsba.bundle.optimizer import OptimizeResult, minimize
 from gsba.bundle.pose_variables import X
 from gsba.config import SolverSettings

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from factors import Term
-from gsba.bundle.family_variables import kept, restored
+from gsba.bundle.families import kept, restored
 from gsba.bundle.pose_variables import X
 from gsba.disk import disk_errors
 from gsba.log import GsbaError

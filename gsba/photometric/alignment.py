@@ -15,7 +15,7 @@ from gsba.camera.rig import CubeRig
 from gsba.config import PatchSettings
 from gsba.frames import panorama
 from gsba.memory import release_mapped_files, total_memory_bytes
-from gsba.photometric import frame_jobs, surfaces
+from gsba.photometric import frame_jobs
 from gsba.photometric.frame_jobs import MAX_SHIFT_PX
 from gsba.photometric.packing import Observed, Shown, pack
 from gsba.photometric.references import references, visible_frames
@@ -84,14 +84,7 @@ def align(
     part, gain and offset are estimated. The affine parts determine the surfaces' normals.
 
     Args:
-        solved: points, poses, and the noise of the observations so far.
-        observed: these observations.
-        greys: the frames' images.
-        rig: faces that pixels are given on.
-        settings: limits and sizes.
-        workers: who work on frames.
         lenses: lenses of the camera; the band where two pictures are blended is left out.
-        name: beside the progress bar.
 
     Returns:
         Tracks of aligned observations, and of former ones where alignment failed.
@@ -125,23 +118,9 @@ def align(
 
 
 def _by_hosts(hosts: np.ndarray, positions: np.ndarray) -> Iterator[np.ndarray]:
-    """Points (n,), ascending, whose patches are held together: those of hosts near one another.
-
-    Each picture is then read for few of these groups, however often its place was visited.
-
-    Args:
-        hosts: (J,) frame of each point's patch.
-        positions: (F, 3) of the frames, world.
-    """
+    """Points (n,), ascending, held together: those of hosts (J,) near one another, read at once."""
     most = max(total_memory_bytes() // (_MEMORY_SHARE * _BYTES_PER_POINT), 1)
-    order = np.argsort(_numbers_by_place(positions)[hosts], kind="stable")
-    for some in slices(len(order), most):
-        yield np.sort(order[some])
-
-
-def _numbers_by_place(positions: np.ndarray) -> np.ndarray:
-    """Numbers (F,) int64 of cells that positions (F, 3) lie in, cells near one another having
-    similar ones: the bits of their coordinates, interleaved (Morton, 1966)."""
+    # numbers of cells, similar for near ones (Morton, 1966)
     low, edge = positions.min(axis=0), float(np.ptp(positions, axis=0).max())
     last = (1 << _PLACE_BITS) - 1
     cells = ((positions - low) / max(edge, 1e-300) * last).astype(np.int64)
@@ -149,7 +128,9 @@ def _numbers_by_place(positions: np.ndarray) -> np.ndarray:
     for bit in range(_PLACE_BITS):
         for axis in range(3):
             numbers |= (cells[:, axis] >> bit & 1) << (3 * bit + axis)
-    return numbers
+    order = np.argsort(numbers[hosts], kind="stable")
+    for some in slices(len(order), most):
+        yield np.sort(order[some])
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,7 +162,10 @@ def _align_some(
     if observed.normals_rig is not None:
         normals = observed.normals_rig[own]
     planes = _planes(landmarks, world_T_rigs, hosts, normals, pixel, field, lenses)
-    extended = _confirmed_points(landmarks, keypoints, observed.aligned, _MIN_TRACK_LENGTH)
+    tracks = landmarks.tracks
+    extended = np.bincount(tracks.points, minlength=tracks.num_points) >= _MIN_TRACK_LENGTH
+    if observed.aligned is not None:
+        extended[tracks.points[observed.aligned[keypoints.rows(tracks)]]] = True
     views = visible_frames(landmarks, world_T_rigs, rows, extended)
     map_, threads = (landmarks, planes, world_T_rigs), workers.num_threads
     points, seeing = _unblended(*map_, hosts, *views, lenses, threads)
@@ -193,7 +177,16 @@ def _align_some(
     enlarged = greys.enlargements()
     kept, found = _accepted(patches, sightings, seeing, pixel, dropped, threads)
     found = found.enlarged(np.maximum(enlarged[seeing[kept]], enlarged[hosts[found.points]]))
-    at_hosts = _at_hosts(patches, sightings, kept, hosts, planes, pixel)
+    # a template's place is exact by definition; its noise is shared by all its alignments
+    templates = sightings.templates[kept]
+    times = np.bincount(templates, minlength=len(hosts))
+    sums = np.bincount(templates, sightings.variances[kept], len(hosts))
+    used = np.flatnonzero(times)
+    of_shifts = patches.shift_covariances(used, sums[used] / times[used])
+    axes = tangent_basis(planes.origins[used]) @ planes.spreads[used]
+    covariances = axes @ of_shifts @ np.swapaxes(axes, 1, 2)
+    covariances += (_MIN_SIGMA_PX * pixel) ** 2 * np.eye(2)
+    at_hosts = Observed(used, hosts[used], planes.origins[used], covariances)
     at_hosts = at_hosts.enlarged(enlarged[at_hosts.frames])
     shown = found.bearings_rig, rays[kept]
     normals_world = _normals_world(sightings, kept, *shown, planes, world_T_rigs[hosts], threads)
@@ -209,12 +202,7 @@ def _planes(
     field: SphereField,
     lenses: Cameras,
 ) -> _Planes:
-    """Plane patches around the points (J,), in their hosts.
-
-    Args:
-        normals_rig: (J, 3) of the surfaces, zero = unknown.
-        pixel: of a panorama, radians.
-    """
+    """Plane patches around points (J,), in their hosts; normals_rig (J, 3) zero = unknown."""
     world_T_hosts = world_T_rigs[hosts]
     offsets = landmarks.points_world - world_T_hosts[:, :3, 3]
     local = np.einsum("jba,jb->ja", world_T_hosts[:, :3, :3], offsets)
@@ -224,7 +212,7 @@ def _planes(
     origins = field.observed(local / np.maximum(depths, 1e-300)[:, None])
     spreads = pixel * np.swapaxes(tangent_basis(origins), 1, 2)
     spreads[normals_rig.any(axis=1)] *= _TILTED_STEP_PX
-    slopes = surfaces.slopes_of(normals_rig, origins, spreads)
+    slopes = slopes_of(normals_rig, origins, spreads)
     tilted = spreads + origins[:, :, None] * slopes[:, None, :]
     away = world_T_hosts[:, :3, :3] * depths[:, None, None]
     rays = np.einsum("jab,jb->ja", away, origins)
@@ -259,8 +247,7 @@ def _projected_patches(
     lenses: Cameras,
     num_threads: int,
 ) -> list[np.ndarray]:
-    """Patches of points (O,) in the rigs of their frames (O,), at unit distance: bearings (O, 3),
-    axes (O, 3, 2), and rays (O, 3) to them from their hosts."""
+    """Bearings (O, 3), axes (O, 3, 2) in frames (O,) at unit distance; rays (O, 3) from hosts."""
 
     def project(some: slice) -> tuple[np.ndarray, ...]:
         own, seeing = points[some], frames[some]
@@ -329,30 +316,6 @@ def accepted_rows(
     return kept, bearings[kept], covariances[kept]
 
 
-def _at_hosts(
-    patches: PatchSet,
-    sightings: Sightings,
-    kept: np.ndarray,
-    hosts: np.ndarray,
-    planes: _Planes,
-    pixel: float,
-) -> Observed:
-    """Observations of aligned templates in their host frames.
-
-    A template's place is exact by definition; its noise, which all its alignments share, is
-    counted here, with the mean residual of those alignments.
-    """
-    templates = sightings.templates[kept]
-    times = np.bincount(templates, minlength=len(hosts))
-    sums = np.bincount(templates, sightings.variances[kept], len(hosts))
-    used = np.flatnonzero(times)
-    of_shifts = patches.shift_covariances(used, sums[used] / times[used])
-    axes = tangent_basis(planes.origins[used]) @ planes.spreads[used]
-    covariances = axes @ of_shifts @ np.swapaxes(axes, 1, 2)
-    covariances += (_MIN_SIGMA_PX * pixel) ** 2 * np.eye(2)
-    return Observed(used, hosts[used], planes.origins[used], covariances)
-
-
 def _normals_world(
     sightings: Sightings,
     kept: np.ndarray,
@@ -362,33 +325,17 @@ def _normals_world(
     world_T_hosts: np.ndarray,
     num_threads: int,
 ) -> np.ndarray:
-    """Normals (J, 3) of the surfaces, from the patches' alignments, zero = unknown.
-
-    Args:
-        kept: (N,) accepted sightings.
-        bearings (N, 3), rays (N, 3): where they were found, and from their hosts to them.
-    """
+    """Normals (J, 3) of surfaces by alignments of `kept` (N,) sightings, zero = unknown."""
 
     def depths(some: slice) -> tuple[np.ndarray, ...]:
         seen = sightings.spreads[kept[some]], sightings.warps[kept[some]]
-        return surfaces.shown_depths(*seen, bearings[some], rays[some])
+        return shown_depths(*seen, bearings[some], rays[some])
 
     some = slices(len(kept), _SIGHTINGS_AT_ONCE)
     shifts, products = rows_in_threads(depths, some, num_threads)
     laid = planes.slopes, planes.origins, planes.spreads
-    normals = surfaces.normals(sightings.templates[kept], shifts, products, *laid)
+    normals = surface_normals(sightings.templates[kept], shifts, products, *laid)
     return np.einsum("jab,jb->ja", world_T_hosts[:, :3, :3], normals)
-
-
-def _confirmed_points(
-    landmarks: Landmarks, keypoints: Keypoints, aligned: np.ndarray | None, min_length: int
-) -> np.ndarray:
-    """Points (J,) confirmed by many observations or a patch: searched in further frames."""
-    tracks = landmarks.tracks
-    out = np.bincount(tracks.points, minlength=tracks.num_points) >= min_length
-    if aligned is not None:
-        out[tracks.points[aligned[keypoints.rows(tracks)]]] = True
-    return out
 
 
 def _former_observations(
@@ -399,10 +346,7 @@ def _former_observations(
     num_frames: int,
     num_threads: int,
 ) -> Iterator[Observed]:
-    """The former observations of points in frames where alignment failed, of some at a time.
-
-    Points without an aligned patch are kept only in frames with few aligned ones.
-    """
+    """Former observations where alignment failed; of points without a patch in weak frames."""
     tracks = landmarks.tracks
     wanted = np.zeros(tracks.num_points, bool)
     wanted[found.points] = True
@@ -429,3 +373,73 @@ def _former_observations(
     for one in map_in_threads(left, len(parts), num_threads):
         yield one
         release_mapped_files()
+
+
+_AFFINE_SIGMA = 0.07  # noise of an alignment's affine part
+_SLOPE_SIGMA = 0.7  # prior of surface slopes, tangents of their tilt
+_MAX_TILT_TANGENT = 3.0  # tangent of a tilt beyond which a patch covers too little of its surface
+
+
+def slopes_of(normals_rig: np.ndarray, origins: np.ndarray, spreads: np.ndarray) -> np.ndarray:
+    """Relative depth (J, 2) that a step across each patch adds on its surface; 0 = unknown.
+
+    Args:
+        normals_rig: (J, 3) of the surfaces, any length, rig frame of the host; zero = unknown.
+        origins: (J, 3) unit bearings of the points.
+        spreads: (J, 3, 2) steps across them, radians.
+    """
+    facing = np.einsum("ji,ji->j", normals_rig, origins)
+    across = np.einsum("ji,jic->jc", normals_rig, spreads)
+    known = facing > 0
+    slopes = -across / np.where(known, facing, 1.0)[:, None]
+    steps = np.linalg.norm(spreads[:, :, 0], axis=1)
+    steepness = np.linalg.norm(slopes, axis=1) / np.maximum(steps, 1e-300)
+    slopes *= np.minimum(1.0, _MAX_TILT_TANGENT / np.maximum(steepness, _MAX_TILT_TANGENT))[:, None]
+    return np.where(known[:, None], slopes, 0.0)
+
+
+def shown_depths(
+    spreads: np.ndarray, warps: np.ndarray, bearings: np.ndarray, rays: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Shifts (N, 2) in template steps by which relative depth along the host's ray appears in each
+    aligned sighting, and their products (N, 2) with the affine part.
+
+    Args:
+        spreads (N, 3, 2), warps (N, 6): of the sightings, see `factors.patches.Sightings`.
+        bearings: (N, 3) where they were found, rig frame of the observing frame.
+        rays: (N, 3) from the host to the template's point, in the observing frame, in units of its
+            distance there.
+    """
+    axes = tangent_basis(bearings)
+    shifts = np.linalg.solve(axes @ spreads, axes @ rays[:, :, None])[:, :, 0]
+    affine = np.swapaxes(warps[:, 2:].reshape(-1, 2, 2), 1, 2)
+    return shifts, np.einsum("oij,oi->oj", affine, shifts)
+
+
+def surface_normals(
+    templates: np.ndarray,
+    shifts: np.ndarray,
+    products: np.ndarray,
+    slopes: np.ndarray,
+    origins: np.ndarray,
+    spreads: np.ndarray,
+) -> np.ndarray:
+    """Normals (J, 3) of the surfaces, rig frames of the hosts, from their patches' alignments.
+
+    Args:
+        templates: (N,) template of each accepted sighting.
+        shifts (N, 2), products (N, 2): see `shown_depths`.
+        slopes: (J, 2) slopes by which the patches were projected.
+        origins (J, 3), spreads (J, 3, 2): the patches in their hosts, before slopes.
+
+    Returns:
+        Normals of any length, zero where they are undetermined.
+    """
+    num = len(slopes)
+    pulls = np.stack([np.bincount(templates, column, num) for column in products.T], axis=1)
+    weights = np.bincount(templates, np.einsum("oi,oi->o", shifts, shifts), num)
+    sizes = np.linalg.norm(spreads[:, :, 0], axis=1)
+    prior = (_AFFINE_SIGMA / (_SLOPE_SIGMA * np.maximum(sizes, 1e-300))) ** 2
+    found = slopes + (pulls - prior[:, None] * slopes) / (weights + prior)[:, None]
+    gradients = np.einsum("jic,jc->ji", spreads, found) / sizes[:, None] ** 2
+    return np.where((weights > prior)[:, None], origins - gradients, 0.0)

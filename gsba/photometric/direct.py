@@ -1,17 +1,19 @@
 """Direct photometric refinement: patches of all frames, joint with the map's observations."""
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 
-from factors import LandmarkBlock, RobustLoss
+from factors import Block, LandmarkBlock, RobustLoss
 from factors.patch_windows import PatchPixels, PatchTable, patch_spans, poor_views
 from factors.photometric import PhotometricBlock
 from factors.sphere_image import SphereImage
 from gsba.bundle import adjustment, pose_variables, triangulation
 from gsba.bundle.adjustment import AdjustmentContext
+from gsba.bundle.families import Family, MapSnapshot
 from gsba.bundle.optimizer import OptimizeResult, optimize
 from gsba.bundle.reconstruction import MIN_OBSERVATIONS
 from gsba.camera.cameras import ONE_CAMERA, Cameras
@@ -19,14 +21,25 @@ from gsba.config import PhotometricSettings, RefineSettings
 from gsba.frames.masks import load_weights
 from gsba.log import GsbaError, track
 from gsba.photometric import patches
-from gsba.photometric.patch_greys import PatchGreys
 from gsba.types import Counts, FrameSet, Keypoints, Round, Solution
 
-_MIN_CORRELATION = 0.8  # with the template, at the start
-_NOISE_GREY = 2.0  # grey values of a pixel
+
+@dataclass(frozen=True, slots=True)
+class PatchGreys(Family):
+    """Grey values of patches of some frames in others. See `factors.photometric`."""
+
+    name = "photometric"
+    digest = ""  # stages keep their results by what the block is made of
+
+    block: PhotometricBlock  # of sampled patches, whose planes stay as an adjustment leaves them
+
+    def blocks(self, snapshot: MapSnapshot) -> Sequence[Block]:
+        """The block of all patches."""
+        return (self.block,)
+
+
 _NOISE_CONTRAST = 0.1  # added noise, relative to the contrast
 _INFLATION = 2.0  # of sigmas: a patch's pixel errors are correlated
-_LOSS_SIGMAS = 2.0  # Cauchy scale, of a patch's mean residual
 _MAX_FRAME_RATIO = 2.0  # of a frame's residual to the median; above it, the frame is weighted down
 _MAX_FRAME_GROWTH = 1.2  # of a frame's geometric residual in the joint solve; as above
 _MAX_GROWTH = 1.05  # of the geometric cost, or the solve is undone
@@ -34,8 +47,6 @@ _TOLERANCE = 1e-3  # relative decrease of the cost that ends the joint solve
 
 logger = logging.getLogger(__name__)
 
-_MIN_FRAME_WEIGHT = 1e-3  # least weight of a frame
-_NUM_DEPTH_STEPS = 5  # Gauss-Newton steps on the planes at each level
 _MIN_OBSERVATIONS = 10  # observations of a frame from which its fit is judged
 _OBSERVATIONS_AT_ONCE = 40_000  # observations whose depths are estimated at once: bounds the memory
 # of windows
@@ -91,10 +102,6 @@ def refine(
 
     Args:
         frames: panoramas; read twice a level, one at a time.
-        keypoints: keypoints of all frames.
-        start: the solved map.
-        context: priors, families, loss, solver, patches.
-        lenses: the camera's lenses.
     """
     solved, counts, settings = start, [], context.settings
     weights, residuals = np.ones(len(frames)), np.full(len(frames), np.nan)
@@ -165,10 +172,7 @@ def _with_depths(
     num_threads: int,
     dropped: dict[str, int],
 ) -> PhotometricBlock:
-    """Patches with planes estimated at fixed poses, coarse to fine; uncorrelated ones do not count.
-
-    The number of uncorrelated ones is added to `dropped`.
-    """
+    """Patches with planes estimated at fixed poses, coarse to fine; `dropped` counts others."""
     chosen, values = settings.photometric, adjustment.values_of(world_T_rigs)
     gathered, visible = _gather(
         frames, table, world_T_rigs, level, level + chosen.depth_levels, chosen
@@ -178,10 +182,10 @@ def _with_depths(
         block = make_block(pixels, visible, num_threads)
         block.planes = planes
         block.refresh(values)
-        block.polish(values, _NUM_DEPTH_STEPS)
+        block.polish(values, 5)  # Gauss-Newton steps on the planes at each level
         planes = block.planes
     block.refresh(values)
-    correlated = block.correlations(values) >= _MIN_CORRELATION
+    correlated = block.correlations(values) >= 0.8  # with the template, at the start
     reasons = {
         "masked or saturated": np.count_nonzero(visible == 0),
         **block.dropped,
@@ -202,8 +206,7 @@ def _gather(
     top: int,
     settings: PhotometricSettings,
 ) -> tuple[list[PatchPixels], np.ndarray]:
-    """Pixels of the patches at the levels from `level` to `top`; weights (O,) from the masks of
-    both frames."""
+    """Pixels of patches at levels `level` to `top`; weights (O,) from the masks of both frames."""
     gathered: list[PatchPixels] = []
     visible, trusted = np.ones(len(table.targets)), np.ones(len(table))
     needed = np.union1d(table.hosts, table.targets)
@@ -232,10 +235,7 @@ def _solve(
     solved: Solution,
     context: AdjustmentContext,
 ) -> tuple[Solution, np.ndarray, np.ndarray]:
-    """The joint solve, repeated once with lower weights of bad frames: weights, residuals.
-
-    It is undone if it fits the map's own observations worse than before.
-    """
+    """The joint solve, once more with lower weights of bad frames; undone if the map fits worse."""
     settings, num_threads = context.settings, context.num_threads
     values = adjustment.values_of(solved.world_T_rigs)
     looser = {"relative_tolerance": _TOLERANCE, "absolute_tolerance": None}
@@ -274,7 +274,6 @@ def joint(
 
     Args:
         frame_weights: (F,) weights of each frame's pixels, see `PhotometricResult`.
-        lenses: the camera's lenses.
     """
     if "photometric" not in settings.factors:
         return []
@@ -298,12 +297,12 @@ def make_block(
 ) -> PhotometricBlock:
     """The factor block of gathered patches, with the settings' noise times `noise`."""
     contrasts = pixels.templates.std(axis=1).astype(np.float64)
-    sigmas = noise * np.hypot(_NOISE_GREY, _NOISE_CONTRAST * contrasts)
+    sigmas = noise * np.hypot(2.0, _NOISE_CONTRAST * contrasts)  # grey values of a pixel
     return PhotometricBlock(
         [pose_variables.X(f) for f in range(pixels.num_frames)],
         pixels,
         sigmas,
-        RobustLoss("cauchy", _LOSS_SIGMAS / _INFLATION),
+        RobustLoss("cauchy", 2.0 / _INFLATION),  # Cauchy scale, of a patch's mean residual
         weights,
         num_threads,
     )
@@ -352,7 +351,7 @@ def _frame_weights(
     typical = np.nanmedian(residuals) if np.isfinite(residuals).any() else 1.0
     ratios = np.nan_to_num(residuals / typical, nan=1.0) / _MAX_FRAME_RATIO
     worst = np.maximum(1.0, np.maximum(ratios, growth / _MAX_FRAME_GROWTH))
-    return np.maximum(worst**-2.0, _MIN_FRAME_WEIGHT), residuals
+    return np.maximum(worst**-2.0, 1e-3), residuals  # least weight of a frame
 
 
 def _adjusted(

@@ -16,7 +16,6 @@ from gsba.store.shards import Workers, blocks_of_frames
 MAX_SHIFT_PX = 3.0  # from the predicted pixel, panorama pixels
 _AFFINE_SIGMA = 0.15  # prior of the warp: a surface facing the ray
 _GREY_SIGMA = 3.0  # noise of pixels, grey values
-_MIN_CONTRAST = 2.0  # grey values, standard deviation in a patch
 _WINDOW_SIGMA_SHARE = 0.6  # standard deviation of the patch's window, in half patches
 _SEARCH_SHIFT_RATIO = 1.5  # largest shift during alignment, in largest accepted shifts
 _MAX_STEPS = 12  # largest number of alignment steps
@@ -35,12 +34,8 @@ def cut(
     """Templates cut from their host frames.
 
     Args:
-        name: beside the progress bar.
-        greys: the frames' images.
         hosts: (J,) frame of each template.
         origins (J, 3), spreads (J, 3, 2): plane patches, rig frame of the host.
-        settings: sizes and limits.
-        workers: threads or processes that run it.
     """
     patches = _empty_patches(len(hosts), settings)
     rows = _by_frame(hosts, greys.num_frames)
@@ -65,9 +60,7 @@ def align(
 
     Args:
         seeing: (O,) frame of each sighting.
-        patches: the templates.
         sightings: predicted sightings; the results are filled in.
-        name, greys, workers: as for `cut`.
     """
     rows = _by_frame(seeing, greys.num_frames)
     job = _AlignJob(name, greys, rows, patches, sightings)
@@ -87,7 +80,6 @@ def align_to(
 
     Args:
         image: the picture. mask: (H, 2H) bool, True = use; None = all.
-        patches, sightings: as for `align`.
     """
     reach, every = _SEARCH_SHIFT_RATIO * MAX_SHIFT_PX, np.arange(len(sightings.templates))
     patches.align(image, mask, every, sightings, reach, _MAX_STEPS, _TOLERANCE_PX)
@@ -162,7 +154,7 @@ class _CutJob(_FrameJob):
     def __call__(self, item: int) -> tuple[np.ndarray, ...]:
         rows = self.rows.of(item)
         found = _empty_patches(len(rows), self.settings)
-        every, least = np.arange(len(rows)), _MIN_CONTRAST
+        every, least = np.arange(len(rows)), 2.0  # grey values, standard deviation in a patch
         found.cut(*self.image(item), every, self.origins[rows], self.spreads[rows], least)
         own = found.templates
         return own.grey, own.by_x, own.by_y, own.inverses, own.states

@@ -84,11 +84,7 @@ def pack(
 
     Args:
         new, former: by patches, and earlier ones; no point is in a frame twice.
-        shown: what belongs to them.
-        rig: faces that pixels are given on.
-        counts: of observations.
         folder: of the arrays' files; None = they are in memory.
-        num_threads: that share the frames.
     """
     num_points, num_frames = len(shown.colors), len(shown.world_T_rigs)
     times = np.zeros(num_points, np.int64)
@@ -114,12 +110,7 @@ def _by_frame(
     rig: CubeRig,
     num_threads: int,
 ) -> Iterator[tuple[np.ndarray, ...]]:
-    """Observations of points seen several times (J,), ordered by frame and point.
-
-    Yields:
-        Points, frames, True for those of the first part, normals, and the columns of keypoints but
-        for origins, of some frames; the number of each frame's goes to `sizes` (F,).
-    """
+    """Observations of points seen repeatedly (J,), by frame, then point; some frames at a time."""
     groups = list(slices(len(sizes), _FRAMES_AT_ONCE))
 
     def ordered(n: int) -> tuple[np.ndarray, ...]:
@@ -131,7 +122,22 @@ def _by_frame(
         every = Observed.joined(iter(chosen), None)
         order = np.lexsort((every.points, every.frames))
         is_new, every = order < len(chosen[0]), every.taken(order)
-        return every.points, every.frames, is_new, *_columns(every, shown, rig)
+        bearings, faces = every.bearings_rig, owner_faces(every.bearings_rig)
+        lower = np.linalg.cholesky(np.linalg.inv(every.covariances))
+        rotations = shown.world_T_rigs[every.frames, :3, :3]
+        normals = np.einsum("oba,ob->oa", rotations, shown.normals_world[every.points])
+        return (
+            every.points,
+            every.frames,
+            is_new,
+            normals.astype(np.float32),
+            rig.project(bearings, faces),
+            faces,
+            bearings,
+            np.linalg.det(every.covariances) ** 0.25,
+            shown.colors[every.points],
+            np.ascontiguousarray(np.swapaxes(lower, 1, 2)),
+        )
 
     for found in map_in_threads(ordered, len(groups), num_threads):
         sizes += np.bincount(found[1], minlength=len(sizes))
@@ -139,28 +145,10 @@ def _by_frame(
         release_mapped_files()
 
 
-def _columns(every: Observed, shown: Shown, rig: CubeRig) -> tuple[np.ndarray, ...]:
-    """Normals of observations, and the columns of keypoints but for origins."""
-    bearings, faces = every.bearings_rig, owner_faces(every.bearings_rig)
-    lower = np.linalg.cholesky(np.linalg.inv(every.covariances))
-    rotations = shown.world_T_rigs[every.frames, :3, :3]
-    normals = np.einsum("oba,ob->oa", rotations, shown.normals_world[every.points])
-    return (
-        normals.astype(np.float32),
-        rig.project(bearings, faces),
-        faces,
-        bearings,
-        np.linalg.det(every.covariances) ** 0.25,
-        shown.colors[every.points],
-        np.ascontiguousarray(np.swapaxes(lower, 1, 2)),
-    )
-
-
 def _by_point(
     points: np.ndarray, frames: np.ndarray, starts: np.ndarray, num_points: int
 ) -> Iterator[tuple[np.ndarray, ...]]:
-    """Points, numbered anew, frames and keypoints of observations (O,), which are ordered by frame,
-    ordered by point; of some points at a time."""
+    """Points, frames and keypoints of observations (O,) reordered by point, some at a time."""
     number = 0
     for some in slices(num_points, _POINTS_AT_ONCE):
         rows = np.flatnonzero((points >= some.start) & (points < some.stop))

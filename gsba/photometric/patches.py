@@ -16,13 +16,10 @@ from gsba.frames.pixels import load_erp
 from gsba.types import Counts, FrameSet, Landmarks
 
 _MIN_GRADIENT = 2.0  # grey values per pixel, smallest in a patch
-_DEPTH_REACH_DEG = 6.0  # to map points that give the depth
 _DEPTH_TOLERANCE = 0.03  # relative, of map points on one plane
-_DEPTH_SIGMA = 0.2  # relative, of a patch's depth
 _SLOPE_SIGMA = 0.7  # of a patch's tilt, as a tangent
 _NUM_PLANE_POINTS = 8  # map points that determine a patch's plane
 _MIN_GREY, _MAX_GREY = 3, 252  # grey values beyond which a pixel counts as saturated
-_EDGE_WEIGHT = 0.05  # weight of an edge's strength, beside that of a corner
 _MAX_LATITUDE_RAD = np.deg2rad(80.0)  # pixels of a panorama beyond are mostly interpolated
 
 
@@ -86,7 +83,7 @@ def candidates(grey: np.ndarray, usable: np.ndarray, settings: PhotometricSettin
     )
     spread = np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
     least, most = 0.5 * (xx + yy) - spread, 0.5 * (xx + yy) + spread
-    score = least + _EDGE_WEIGHT * most
+    score = least + 0.05 * most  # weight of an edge's strength, beside that of a corner
     border = 2 * (settings.size // 2) + 3
     open_ = cv2.erode(usable.astype(np.uint8), np.ones((border, border), np.uint8)) > 0
     open_[:, : border // 2] = open_[:, -(border // 2) :] = False  # erosion does not wrap around the
@@ -137,7 +134,7 @@ def lay_planes(bearings: np.ndarray, points_rig: np.ndarray) -> tuple[np.ndarray
     ranges = np.linalg.norm(points_rig, axis=1)
     if len(points_rig) < _NUM_PLANE_POINTS or len(bearings) == 0:
         return planes, clear
-    reach = 2 * np.sin(np.deg2rad(_DEPTH_REACH_DEG) / 2)
+    reach = 2 * np.sin(np.deg2rad(6.0) / 2)  # to map points that give the depth
     chords, rows = KDTree(points_rig / ranges[:, None]).query(bearings, k=_NUM_PLANE_POINTS)
     local = np.einsum("pki,pni->pnk", patch_axes(bearings), points_rig[rows])
     ahead = (local[..., 0] > 0) & (chords < reach)
@@ -176,9 +173,7 @@ def table_of(
     Args:
         bearings: of each frame, (K, 3) candidates.
         world_T_rigs: (F, 4, 4) solved poses.
-        landmarks: the solved map.
         width: of the panoramas that patches are sampled from, pixels.
-        lenses: the camera's lenses.
     """
     tracks = landmarks.tracks
     positions = world_T_rigs[:, :3, 3]
@@ -199,7 +194,7 @@ def table_of(
         planes.append(laid[clear])
         targets.append(np.broadcast_to(near, (int(np.count_nonzero(clear)), len(near))))
     plane = np.concatenate(planes)
-    sigmas = [_DEPTH_SIGMA, _SLOPE_SIGMA, _SLOPE_SIGMA]
+    sigmas = [0.2, _SLOPE_SIGMA, _SLOPE_SIGMA]  # relative, of a patch's depth
     table = PatchTable(
         np.concatenate(hosts),
         np.concatenate(centres),

@@ -38,7 +38,6 @@ def visible_frames(
     space, at any time, that see it from a similar direction and distance: the most similar first.
 
     Args:
-        landmarks: the points.
         world_T_rigs: (F, 4, 4) current poses.
         rows: (J,) reference observation of each point.
         extended: (J,) bool, points also searched in frames without an observation.

@@ -20,10 +20,9 @@ from gsba.bundle.gps_factors import GpsFactors
 from gsba.bundle.lens_centres import baseline_of
 from gsba.bundle.map_strength import MapStrength
 from gsba.bundle.reconstruction import MIN_OBSERVATIONS, assemble, world_scale
-from gsba.camera.optics import Optics
-from gsba.camera.views import scenes_around
-from gsba.features.extractor_traits import search_settings
-from gsba.imu.gravity import up_axis
+from gsba.camera.views import Optics, scenes_around
+from gsba.features.detection import search_settings
+from gsba.imu.alignment import up_axis
 from gsba.loop_closure import connectivity, map_merging
 from gsba.loop_closure.merged_map import Registered, follow
 from gsba.matching import correspondences

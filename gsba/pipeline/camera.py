@@ -17,11 +17,10 @@ from gsba.bundle import (
 )
 from gsba.bundle.adjustment import GATE_SCALE, AdjustmentContext
 from gsba.bundle.camera_adjustment import solve_sighted_with_camera, solve_with_camera
-from gsba.bundle.camera_estimates import CameraEstimates, tracks_of_camera
 from gsba.bundle.camera_system import CameraCovariances, CameraSystem
 from gsba.bundle.lens_axes import LensAxes
 from gsba.bundle.lens_centres import LensCentres, StitchRadius
-from gsba.bundle.readout import CameraEstimate
+from gsba.bundle.readout import CameraEstimate, CameraEstimates, tracks_of_camera
 from gsba.bundle.reconstruction import world_scale
 from gsba.bundle.self_calibration import SelfCalibration
 from gsba.camera.cameras import Cameras

@@ -11,8 +11,7 @@ import numpy as np
 from gsba import video
 from gsba.config import OdometrySettings, RefineSettings
 from gsba.frames.times import read_times
-from gsba.odometry.files import write_chosen
-from gsba.odometry.walk import Odometry
+from gsba.odometry.walk import Odometry, write_chosen
 from gsba.pipeline.prior import Prior
 from gsba.store.store import RunStore, fingerprint
 from gsba.types import FrameSet

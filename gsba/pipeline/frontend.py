@@ -12,8 +12,8 @@ from gsba import learned
 from gsba.camera.cameras import Cameras
 from gsba.config import RefineSettings
 from gsba.features import detection, extraction
+from gsba.features.detection import search_settings
 from gsba.features.extraction import FrameFeatures, Search
-from gsba.features.extractor_traits import search_settings
 from gsba.frames import panorama
 from gsba.geometry import inverse
 from gsba.imu.alignment import Alignment, align, turning_of

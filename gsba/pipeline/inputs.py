@@ -23,8 +23,7 @@ from gsba.imu.files import read_imu, read_telemetry
 from gsba.imu.readings import Readings
 from gsba.log import GsbaError
 from gsba.masks.merging import Choice
-from gsba.odometry.files import write_chosen, write_odometry
-from gsba.odometry.walk import Odometry
+from gsba.odometry.walk import Odometry, write_chosen, write_odometry
 from gsba.placement import EXIF, check, fixes_of_frames, read_fixes
 from gsba.store.store import RunStore, fingerprint
 from gsba.trajectory.association import follow_keyframes, without_trajectory

@@ -6,11 +6,10 @@ import numpy as np
 
 from factors.sphere_field import SphereField
 from gsba.bundle import stitching
-from gsba.bundle.camera_estimates import CameraEstimates
 from gsba.bundle.camera_system import CameraCovariances
 from gsba.bundle.lens_axes import LensAxes
 from gsba.bundle.lens_centres import LensCentres, StitchRadius
-from gsba.bundle.readout import CameraEstimate
+from gsba.bundle.readout import CameraEstimate, CameraEstimates
 from gsba.bundle.self_calibration import SelfCalibration
 from gsba.bundle.stitching import Stitching
 from gsba.camera.cameras import Cameras

@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsba.bundle.families import Families
-from gsba.bundle.held_poses import HeldPoses
 from gsba.bundle.lens_centres import baseline_of
 from gsba.bundle.readout import CameraEstimate
+from gsba.bundle.trajectory_prior import HeldPoses
 from gsba.config import RefineSettings
 from gsba.geometry import adjoint, inverse
 from gsba.log import GsbaError

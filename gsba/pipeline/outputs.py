@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Any
 
 from gsba.bundle.gps_factors import GpsFactors
-from gsba.bundle.gyro_turns import GyroTurns
 from gsba.bundle.map_strength import MAX_SCALE_SIGMA
 from gsba.bundle.reconstruction import world_scale
+from gsba.bundle.trajectory_prior import GyroTurns
 from gsba.camera.calibration import calibration_json
 from gsba.camera.cameras import Cameras
 from gsba.config_file import to_toml
@@ -20,11 +20,9 @@ from gsba.pipeline.state import State
 from gsba.placement.placement import Placement, metres_per_unit, place
 from gsba.report import findings
 from gsba.report.camera_findings import of_camera, of_lenses
-from gsba.report.gps_findings import notes_on_gps
+from gsba.report.findings import notes_on_gps, notes_on_recordings, of_gyro, of_recordings
 from gsba.report.html import residual_sphere, write_html
-from gsba.report.imu_findings import of_gyro
 from gsba.report.maps import MapSummary, is_partial, summarize_maps
-from gsba.report.recordings import notes_on_recordings, of_recordings
 from gsba.report.report import Findings, StageLog, build_report, plain, write_poses
 from gsba.report.verdict import Level
 from gsba.store.store import RunStore

@@ -6,9 +6,8 @@ import numpy as np
 
 from gsba.bundle.families import Family
 from gsba.bundle.gauge import Gauge
-from gsba.bundle.gyro_turns import GyroTurns
 from gsba.bundle.map_strength import MapStrength
-from gsba.bundle.trajectory_prior import LOSS_SIGMAS, TrajectoryPrior
+from gsba.bundle.trajectory_prior import LOSS_SIGMAS, GyroTurns, TrajectoryPrior
 from gsba.config import PriorSettings
 from gsba.imu.alignment import Alignment
 from gsba.loop_closure.merged_map import Registered

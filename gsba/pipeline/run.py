@@ -8,14 +8,12 @@ from typing import TypeVar
 import numpy as np
 
 from gsba import learned
-from gsba.bundle.bearings import Bearings
+from gsba.bundle.bearings import Bearings, Reprojections
 from gsba.bundle.families import Families, Family
-from gsba.bundle.gyro_turns import GyroTurns
-from gsba.bundle.reprojections import Reprojections
-from gsba.bundle.trajectory_prior import TrajectoryPrior
+from gsba.bundle.trajectory_prior import GyroTurns, TrajectoryPrior
 from gsba.camera.rig import CubeRig
 from gsba.config import CameraSettings, RefineSettings
-from gsba.features.extractor_traits import search_settings
+from gsba.features.detection import search_settings
 from gsba.frames import cubemap
 from gsba.frames.panorama import Greys
 from gsba.frames.recordings import own_timestamps

@@ -6,8 +6,8 @@ import numpy as np
 
 from gsba.bundle import triangulation
 from gsba.bundle.adjustment import AdjustmentContext
-from gsba.bundle.camera_estimates import CameraEstimates
 from gsba.bundle.families import Families
+from gsba.bundle.readout import CameraEstimates
 from gsba.camera.cameras import Cameras
 from gsba.camera.lens import Lenses
 from gsba.config import PriorSettings

@@ -57,11 +57,15 @@ def of_camera(
         if baseline is not None:
             notes.append(f"two lenses were not found: no scale by the baseline: {centres.reason}")
         return content, notes
-    notes.append(_baseline_note(centres, length, sigma))
+    which = "two" if centres.lenses.num_lenses == 2 else "first two"
+    notes.append(f"the {which} lenses are {length:.5g} map units apart (sigma {sigma:.1g})")
     if baseline is not None:
         metres, of_metres = metres_per_unit((length, sigma), baseline)
         content |= {"metres_per_unit": metres, "metres_per_unit_sigma": of_metres}
-        notes.append(_scale_note(metres, of_metres, baseline[0]))
+        notes.append(
+            f"one map unit is {metres:.4g} m (sigma {100 * of_metres / metres:.2g} %), if the "
+            f"lenses are {1e3 * baseline[0]:g} mm apart"
+        )
     if axes is not None:
         content["turned_below_panorama"] = centres.lenses.axes is not None
         content["gain_of_axes"] = axes.gains
@@ -127,18 +131,6 @@ def of_lenses(
         "other runs of this camera use calibration.json"
     )
     return content, notes
-
-
-def _baseline_note(centres: LensCentres, length: float, sigma: float) -> str:
-    which = "two" if centres.lenses.num_lenses == 2 else "first two"
-    return f"the {which} lenses are {length:.5g} map units apart (sigma {sigma:.1g})"
-
-
-def _scale_note(metres: float, sigma: float, baseline: float) -> str:
-    return (
-        f"one map unit is {metres:.4g} m (sigma {100 * sigma / metres:.2g} %), if the lenses are "
-        f"{1e3 * baseline:g} mm apart"
-    )
 
 
 def _stitch_radius_row(

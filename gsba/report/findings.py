@@ -1,13 +1,16 @@
 """Findings on a run's trajectory, maps and frames, for report.json, and notes for the user."""
 
 import logging
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from gsba.bundle.map_strength import scale_sigmas
+from gsba.bundle.readout import CameraEstimate
 from gsba.bundle.stitching import Stitching
+from gsba.imu.alignment import Alignment
 from gsba.loop_closure.merged_map import Registered
 from gsba.trajectory.clock import ClockEstimate
 from gsba.trajectory.joining import GUESS, SegmentAlignment
@@ -223,3 +226,132 @@ def named(names: Sequence[str], key: str, unit: str = "frames") -> str:
     if len(names) <= _MAX_NAMED_FRAMES:
         return ", ".join(names)
     return f"{len(names)} {unit}, listed in report.json under {key}"
+
+
+def notes_on_gps(content: Mapping[str, Any], num_frames: int) -> list[str]:
+    """Notes on used and false fixes.
+
+    Args:
+        content: report of the family, see `gsba.bundle.gps_factors.GpsFactors.report`.
+        num_frames: frames of the run.
+    """
+    if not content["taken"]:
+        why = (
+            "most of them are further from where the images put the frames than their noise and a "
+            "map's drift allow, or the path is shorter than their error"
+        )
+        if content["contradicted"]:
+            why = "they would bend the map by more than its images and their noise allow"
+        note = (
+            f"GPS was not used: the images contradict its {content['fixes']} positions: {why}; "
+            "check the positions, their noise and their clock"
+        )
+        logger.warning(note)
+        return [note]
+    typical, claimed = content["rms_m_east_north_up"], content["sigma_m_east_north_up"][0]
+    across, false = math.hypot(typical[0], typical[1]), content["false_fixes"]
+    note = (
+        f"GPS held {content['used']} of {num_frames} frames: residuals are {across:.2g} m "
+        f"horizontally and {typical[2]:.2g} m vertically (rms; the assumed sigma is {claimed:.2g} "
+        "m per axis)"
+    )
+    if false:
+        note += f"; {len(false)} fixes are outliers: {named(false, 'gps.false_fixes')}"
+    return [note]
+
+
+def of_gyro(
+    found: Alignment,
+    steps_used: float | None,
+    readout: CameraEstimate | None,
+) -> tuple[dict[str, Any], list[str]]:
+    """Clock, bias and axes of a gyro, and the share of its steps that agree with the poses.
+
+    Args:
+        found: alignment of the gyro with the frames.
+        steps_used: share of its steps that agree with the poses; None = it was not used.
+        readout: estimated readout of the frames; None = a global shutter.
+
+    Returns:
+        Content of report.json and notes.
+    """
+    content: dict[str, Any] = {
+        "taken": steps_used is not None,
+        "reason": found.reason,
+        "offset_s": found.clock.offset,
+        "offset_sigma_s": found.offset_sigma,
+        "rate": found.clock.rate,
+        "bias_deg_per_s": np.rad2deg(found.sensor.bias),
+        "scales": found.sensor.scales,
+        "rig_R_imu": found.rig_R_imu,
+        "axes_sigma_deg": np.rad2deg(found.axes_sigma),
+        "noise_of_a_step_deg": np.rad2deg(found.noise),
+        "turns_explained": found.explained,
+    }
+    if steps_used is None:
+        note = f"the gyro was not used: {found.reason}"
+        logger.warning(note)
+        return content, [note]
+    during = (
+        None if readout is None or readout.lenses.readout_motion is None else bool(readout.by_gyro)
+    )
+    content |= {"steps_used": steps_used, "during_readout": during}
+    bias = ", ".join(f"{value:.3g}" for value in np.rad2deg(found.sensor.bias))
+    notes = [
+        f"the gyro agrees with {100 * steps_used:.0f} % of the steps between frames (sigma "
+        f"{np.rad2deg(found.noise):.2g} degrees); its clock is {found.clock.offset:.4f} s ahead "
+        f"(sigma {found.offset_sigma:.1g}), its bias is {bias} degrees per second, and the sigma "
+        f"of its axes is {np.rad2deg(found.axes_sigma):.2g} degrees"
+    ]
+    if during is not None:
+        source = "the gyro" if during else "images, which contradict the gyro"
+        notes.append(f"rotations during the readout come from {source}")
+    return content, notes
+
+
+def of_recordings(
+    frames: FrameSet,
+    reconstruction: Reconstruction,
+    sources: np.ndarray,
+    clocks: Sequence[ClockEstimate | None],
+) -> list[dict[str, Any]]:
+    """Content of report.json on each of several recordings, in order; [] if there is only one.
+
+    Args:
+        frames: frames of the run.
+        reconstruction: the result.
+        sources: (F,) `PoseSource` of the frames' initial poses.
+        clocks: clock of each recording's trajectory; None = not checked.
+    """
+    found, numbers = [], reconstruction.map_numbers()
+    for (name, rows), clock in zip(frames.recordings.items(), clocks, strict=True):
+        of_maps = np.bincount(numbers[rows])
+        own = {
+            "name": name,
+            "frames": len(rows),
+            "with_trajectory": bool((sources[rows] != PoseSource.NONE).any()),
+            "frames_of_maps": {n: count for n, count in enumerate(of_maps.tolist()) if n and count},
+            "frames_in_no_map": int(np.count_nonzero(numbers[rows] == 0)),
+            "first": float(frames.timestamps[rows[0]]),
+            "clock_shift_s": frames.clock_shifts[int(rows[0])],
+        }
+        found.append(own if clock is None else own | {"clock": clock_section(clock)})
+    return found
+
+
+def notes_on_recordings(recordings: Sequence[dict[str, Any]]) -> list[str]:
+    """A sentence on each recording of which no frame is in the exported map."""
+    notes = []
+    for one in recordings:
+        maps = one["frames_of_maps"]
+        if 1 in maps:
+            continue
+        where = "in no map"
+        if maps:
+            largest = max(maps, key=maps.__getitem__)
+            where = f"map {largest} with a world and scale of its own"
+        notes.append(
+            f"recording {one['name']} is not joined to the exported map: {where}; recordings are "
+            "joined where they show the same place"
+        )
+    return notes

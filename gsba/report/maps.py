@@ -92,11 +92,7 @@ def format_outcome(report: Mapping[str, Any], run: object) -> str:
 
 
 def _apart(summary: Mapping[str, Any]) -> str:
-    """Numbers of frames that no dataset has, in brackets; "" = none.
-
-    Args:
-        summary: `summary` of report.json.
-    """
+    """Numbers of frames that no dataset has by report.json's `summary`, in brackets; "" = none."""
     others = summary["maps"] - 1
     where = "another map" if others == 1 else f"{others} other maps"
     counts = {where: summary["frames_in_other_maps"], "no map": summary["frames_in_no_map"]}

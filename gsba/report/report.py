@@ -20,7 +20,6 @@ from gsba.disk import atomic_write
 from gsba.geometry import angular_errors, moved_to, quaternion_from_rotation
 from gsba.memory import release_mapped_files, total_memory_bytes, usable_cpus
 from gsba.report.maps import summarize_maps
-from gsba.report.medians import medians_by_group
 from gsba.report.verdict import judge
 from gsba.store.store import StageRecord
 from gsba.types import (
@@ -337,3 +336,23 @@ def plain(value: Any, digits: int = 17) -> Any:
     if isinstance(value, Enum):
         return value.value
     return str(value) if isinstance(value, Path) else value
+
+
+def medians_by_group(
+    values: np.ndarray, groups: np.ndarray, num_groups: int, least: int = 1
+) -> np.ndarray:
+    """Median (G,) float64 of the values of each group; NaN for groups with fewer than `least`.
+
+    Args:
+        values: (N,).
+        groups: (N,) integers, group of each value.
+        num_groups: G.
+        least: values that a group needs, at least one.
+    """
+    counts = np.bincount(groups, minlength=num_groups)
+    ordered = values[np.argsort(groups, kind="stable")]
+    ends = np.cumsum(counts)
+    found = np.full(num_groups, np.nan)
+    for group in np.flatnonzero(counts >= least):
+        found[group] = np.median(ordered[ends[group] - counts[group] : ends[group]])
+    return found

@@ -4,8 +4,8 @@ Takes posed frames and a cloud.
 Gives Gaussians, pictures and scores, or the map refined against a splat.
 """
 
-from gsba.splat.camera import FaceCamera, face_camera
+from gsba.splat.camera import FaceCamera
 from gsba.splat.gaussians import Gaussians, from_cloud
 from gsba.splat.ply import read_ply, write_ply
 
-__all__ = ["FaceCamera", "Gaussians", "face_camera", "from_cloud", "read_ply", "write_ply"]
+__all__ = ["FaceCamera", "Gaussians", "from_cloud", "read_ply", "write_ply"]

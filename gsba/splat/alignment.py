@@ -5,14 +5,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from factors import FaceCameras, RobustLoss
+from factors import Block, FaceCameras, RobustLoss
 from factors.splat import RenderedView, SplatBlock
 from gsba.bundle import pose_variables
+from gsba.bundle.families import Family, MapSnapshot
 from gsba.camera.fisheye import facing
 from gsba.camera.lens import seam_sines
-from gsba.camera.optics import ONE_EYE, Optics
 from gsba.camera.rig import CubeRig
-from gsba.camera.views import View, nearest_lens, rig_views, turned_rigs
+from gsba.camera.views import ONE_EYE, Optics, View, nearest_lens, rig_views, turned_rigs
 from gsba.frames import cubemap
 from gsba.frames.masks import load_weights
 from gsba.log import track
@@ -58,10 +58,7 @@ def capture(frames: FrameSet, which: np.ndarray, size: int, optics: Optics = ONE
 
 
 def _capture_of_lenses(frames: FrameSet, which: np.ndarray, size: int, optics: Optics) -> Captured:
-    """Captured faces like those of `capture`, of one lens each, squares around the rendered ones.
-
-    Pixels that are blended or of the other lens have no weight.
-    """
+    """Faces like those of `capture`, of one lens each; blended pixels have no weight."""
     wide, rendered, lenses = _wide_rig(size), optics.views(size), optics.lenses
     square = {"width": wide.size, "height": wide.size, "principal": (wide.principal,) * 2}
     views = tuple(replace(view, **square) for view in rendered)
@@ -168,3 +165,17 @@ def _captured_rig(frames: FrameSet, size: int) -> CubeRig:
 def _wide_rig(size: int) -> CubeRig:
     hfov = np.deg2rad(_CAPTURED_HFOV_DEG)
     return CubeRig(round(size * np.tan(hfov / 2)), hfov)
+
+
+@dataclass(frozen=True, slots=True)
+class SplatGreys(Family):
+    """Grey values of frames and of a splat rendered from their poses. See `factors.splat`."""
+
+    name = "splat"
+    digest = ""  # stages keep their results by what the block is made of
+
+    block: SplatBlock  # of the captured frames
+
+    def blocks(self, snapshot: MapSnapshot) -> Sequence[Block]:
+        """The block of all captured frames."""
+        return (self.block,)

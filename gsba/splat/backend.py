@@ -2,7 +2,8 @@
 
 import logging
 from collections.abc import Iterable, Sequence
-from typing import Protocol
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -12,19 +13,40 @@ from gsba.splat import adam
 from gsba.splat.camera import FaceCamera
 from gsba.splat.density import Pull
 from gsba.splat.gaussians import Gaussians
-from gsba.splat.lesson import Lesson
 from gsba.splat.metrics import training_loss
 from gsba.splat.rasterise import Gradients, Rendering, differentiate, render
 
+
+@dataclass(frozen=True, slots=True)
+class Lesson:
+    """A view to train on, and the learning rates of its step."""
+
+    camera: FaceCamera
+    truth: np.ndarray  # (H, W, 3) uint8, RGB
+    use: np.ndarray | None  # (H, W) bool, pixels of the loss; None = all
+    sh_degree: int  # highest degree of the harmonics
+    rates: adam.Rates
+    number: int  # of the step, from 1
+
+
+if TYPE_CHECKING:
+    from gsba.splat.gpu import GsplatBackend
+
 logger = logging.getLogger(__name__)
 
+Backend: TypeAlias = "CpuBackend | GsplatBackend"  # renders splats, and trains them on images
 
-class Backend(Protocol):
-    """Renders splats, and trains them on images."""
 
-    name: str
-    stretch: int  # steps that are most efficient in one call of `descend`
+class CpuBackend:
+    """The rasteriser of `gsba.splat.rasterise`: deterministic, on any machine."""
+
+    name = "cpu"
+    stretch = 1  # steps that are most efficient in one call of `descend`
     memory_bytes: int  # of the device, all of it
+
+    def __init__(self, num_threads: int | None = None) -> None:
+        self.num_threads = num_threads
+        self.memory_bytes = total_memory_bytes()
 
     def render(
         self,
@@ -34,7 +56,7 @@ class Backend(Protocol):
         near: float,
     ) -> list[Rendering]:
         """An image for each camera; see `gsba.splat.rasterise.render`."""
-        ...
+        return [render(gaussians, c, sh_degree, near, self.num_threads)[0] for c in cameras]
 
     def descend(
         self,
@@ -55,38 +77,6 @@ class Backend(Protocol):
             near: least z of a Gaussian, map units.
             ssim_weight: see `training_loss`.
         """
-        ...
-
-
-class CpuBackend:
-    """The rasteriser of `gsba.splat.rasterise`: deterministic, on any machine."""
-
-    name, stretch = "cpu", 1
-
-    def __init__(self, num_threads: int | None = None) -> None:
-        self.num_threads = num_threads
-        self.memory_bytes = total_memory_bytes()
-
-    def render(
-        self,
-        gaussians: Gaussians,
-        cameras: Sequence[FaceCamera],
-        sh_degree: int | None,
-        near: float,
-    ) -> list[Rendering]:
-        """See `Backend`."""
-        return [render(gaussians, c, sh_degree, near, self.num_threads)[0] for c in cameras]
-
-    def descend(
-        self,
-        gaussians: Gaussians,
-        moments: adam.Moments,
-        pull: Pull | None,
-        lessons: Iterable[Lesson],
-        near: float,
-        ssim_weight: float,
-    ) -> None:
-        """See `Backend`."""
         for lesson in lessons:
             found = self.gradients(gaussians, lesson, near, ssim_weight)
             adam.step(gaussians, found.gaussians, moments, lesson.rates, lesson.number)

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsba.camera.rig import CubeRig
-from gsba.camera.views import View, rig_views
+from gsba.camera.views import View
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,14 +42,3 @@ def view_camera(world_T_rig: np.ndarray, view: View) -> FaceCamera:
     centre = world_T_rig[:3, 3] + rotation @ view.centre
     size = view.width, view.height
     return FaceCamera(rotation @ view.rig_R_view, centre, *size, view.focal, view.principal)
-
-
-def face_camera(world_T_rig: np.ndarray, face: int, rig: CubeRig) -> FaceCamera:
-    """Camera of one face of a rig.
-
-    Args:
-        world_T_rig: (4, 4) float64.
-        face: index into FACES.
-        rig: size and field of view.
-    """
-    return view_camera(world_T_rig, rig_views(rig)[face])

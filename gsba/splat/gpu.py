@@ -23,7 +23,7 @@ from gsba.splat.gaussians import Gaussians
 from gsba.splat.rasterise import Rendering
 
 if TYPE_CHECKING:
-    from gsba.splat.lesson import Lesson
+    from gsba.splat.backend import Lesson
 
 
 class GsplatBackend:
@@ -65,7 +65,7 @@ class GsplatBackend:
         sh_degree: int | None,
         near: float,
     ) -> list[Rendering]:
-        """See `gsba.splat.backend.Backend`; all cameras of one size are one batch."""
+        """See `gsba.splat.backend.CpuBackend`; all cameras of one size are one batch."""
         degree, renderings = gaussians.usable_degree(sh_degree), {}
         with self._within_memory(gaussians), self._torch.no_grad():
             parameters = self._upload(gaussians)
@@ -88,7 +88,7 @@ class GsplatBackend:
         near: float,
         ssim_weight: float,
     ) -> None:
-        """See `gsba.splat.backend.Backend`."""
+        """See `gsba.splat.backend.CpuBackend`."""
         torch = self._torch
         with self._within_memory(gaussians):
             values, first, second = (
@@ -180,10 +180,7 @@ class GsplatBackend:
         return use * ((1 - ssim_weight) * (x - y).sign() - ssim_weight * slope) / image.numel()
 
     def _blur(self, image: Any) -> Any:
-        """Convolve with the window of SSIM, with black around the image (H, W, C).
-
-        PyTorch's convolution is not used: in TF32, rounding would exceed the variances.
-        """
+        """Convolve (H, W, C) with SSIM's window, black around it; PyTorch's convolution is TF32."""
         half = len(self._window) // 2
         for axis, edges in enumerate([(0, 0, 0, 0, half, half), (0, 0, half, half)]):
             wide = self._torch.nn.functional.pad(image, edges)
@@ -206,11 +203,7 @@ class GsplatBackend:
 
 
 def _require_kernels(torch: Any) -> None:
-    """Load gsplat's CUDA kernels, which it builds when they are first used.
-
-    Raises:
-        GsbaError: no CUDA device, or no kernels.
-    """
+    """Load gsplat's CUDA kernels, which it builds when they are first used."""
     if not torch.cuda.is_available():
         raise GsbaError("the gsplat backend needs a CUDA device: use --backend cpu")
     try:

@@ -27,15 +27,13 @@ from gsba.bundle import adjustment, triangulation
 from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.optimizer import OptimizeResult, optimize
 from gsba.bundle.reconstruction import MIN_OBSERVATIONS
-from gsba.camera.optics import ONE_EYE, Optics
+from gsba.camera.views import ONE_EYE, Optics
 from gsba.config import SplatSettings
-from gsba.splat.alignment import Captured, capture, splat_block
+from gsba.splat.alignment import Captured, SplatGreys, capture, splat_block
 from gsba.splat.backend import choose_backend
-from gsba.splat.evidence import score, standard_error, together
 from gsba.splat.gaussians import Gaussians, from_cloud
 from gsba.splat.scene import Faces, Split, load_faces, make_views, near_of, split_frames
 from gsba.splat.scores import face_psnrs
-from gsba.splat.splat_greys import SplatGreys
 from gsba.splat.train import TrainingState, advance, begin
 from gsba.store.records import load_checkpoint, save_record
 from gsba.types import Counts, FrameSet, Keypoints, Landmarks, Round, Solution
@@ -323,3 +321,33 @@ def _median_move(before: np.ndarray, after: np.ndarray) -> tuple[float, float]:
     shifts = np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1)
     angles = np.degrees(np.arccos(np.clip(cosines, -1, 1)))
     return float(np.median(angles)), float(np.median(shifts))
+
+
+def standard_error(differences: np.ndarray) -> float:
+    """Standard error of the mean of differences (N,); infinite for a single one."""
+    num = len(differences)
+    return float(differences.std(ddof=1) / np.sqrt(num)) if num > 1 else np.inf
+
+
+def score(differences: np.ndarray, chance: float = 0.0) -> float:
+    """Significance of a positive sum of differences (N,), in standard errors.
+
+    Few differences determine their spread poorly: their t is mapped to the normal score of equal
+    probability (Wallace, Bounds on normal approximations, 1959).
+
+    Args:
+        chance: part of the sum that chance explains; only the excess counts.
+    """
+    total, num = float(differences.sum()), len(differences)
+    beyond, spread = max(abs(total) - chance, 0.0), num * standard_error(differences)
+    if beyond == 0 or not np.isfinite(spread):
+        return 0.0
+    squared, free = (beyond / max(spread, 1e-12)) ** 2, num - 1
+    size = np.sqrt(free * np.log1p(squared / free)) * (8 * free + 1) / (8 * free + 3)
+    return float(np.copysign(size, total))
+
+
+def together(*scores: float) -> float:
+    """Combined score of several kinds of evidence: log likelihoods, half the squares, add up."""
+    total = sum(one * abs(one) for one in scores)
+    return float(np.copysign(np.sqrt(abs(total)), total))

@@ -6,18 +6,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsba.bundle import triangulation
-from gsba.camera.optics import ONE_EYE, Optics
 from gsba.camera.rig import CubeRig
-from gsba.camera.views import View, turned_rigs
+from gsba.camera.views import ONE_EYE, Optics, View, turned_rigs
 from gsba.config import SplatSettings, TriangulateSettings
-from gsba.frames import cubemap, lens_faces
-from gsba.frames.held_out import held_out_rows
+from gsba.frames import cubemap
 from gsba.frames.masks import load_mask
+from gsba.frames.pixels import cut_views
 from gsba.log import GsbaError, track
 from gsba.splat.camera import view_camera
 from gsba.splat.gaussians import Gaussians, from_cloud
 from gsba.splat.train import Images, Views, extent_of
 from gsba.types import FrameSet, Landmarks, PoseStatus, Reconstruction, Tracks
+from gsba.types.records import held_out_rows
 
 _GATE_RAD = np.deg2rad(3.0)  # largest angle of an observation to its point, under poses that may
 # have drifted
@@ -119,7 +119,7 @@ def cut_lens_faces(
     times = int(np.clip(-(-kind.width / (2 * np.pi) // views[0].focal), 1, _MAX_OVERSAMPLING))
     finer = tuple(view.finer(times) for view in views)
     cutter = optics.cutter(finer, frame)
-    images, whole = lens_faces.cut(frames, frame, cutter), load_mask(frames, frame)
+    images, whole = cut_views(frames, frame, cutter), load_mask(frames, frame)
     masks = None if whole is None else cutter.cut_mask(whole)
     if times == 1:
         return images, masks

@@ -47,10 +47,9 @@ def measure(
     Raises:
         GsbaError: no panorama has a pixel to measure.
     """
+    given = settings, near, backend
     return {
-        int(views.panoramas[rows[0]]): _score(
-            gaussians, views, rows, settings, near, backend, lpips
-        )
+        int(views.panoramas[rows[0]]): _score(_pairs(gaussians, views, rows, *given), lpips)
         for rows in _panoramas(views)
     }
 
@@ -78,16 +77,10 @@ def face_psnrs(
 
 
 def _score(
-    gaussians: Gaussians,
-    views: Views,
-    rows: np.ndarray,
-    settings: SplatSettings,
-    near: float,
-    backend: Backend,
-    lpips: Distance | None,
+    pairs: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]], lpips: Distance | None
 ) -> Score:
     found, truth, similarities, distances = [], [], [], []
-    for image, real, use in _pairs(gaussians, views, rows, settings, near, backend):
+    for image, real, use in pairs:
         similarities.append(ssim(image, real, use))
         if lpips is not None:
             distances.append(lpips(image, real, use))
@@ -111,11 +104,7 @@ def mean_score(scores: Iterable[Score]) -> Score:
 
 
 def _panoramas(views: Views) -> list[np.ndarray]:
-    """Rows of the views of each panorama.
-
-    Raises:
-        GsbaError: there are none.
-    """
+    """Rows of the views of each panorama."""
     if len(views.cameras) == 0:
         raise GsbaError("no pixel to measure a splat on: all held-out frames are masked")
     return [np.flatnonzero(views.panoramas == i) for i in np.unique(views.panoramas)]

@@ -17,11 +17,10 @@ import numpy as np
 from gsba.config import SplatSettings
 from gsba.log import GsbaError, track
 from gsba.splat import adam
-from gsba.splat.backend import Backend
+from gsba.splat.backend import Backend, Lesson
 from gsba.splat.camera import FaceCamera
 from gsba.splat.density import DensityLimits, Pull, densify, reset_opacity
 from gsba.splat.gaussians import Gaussians, num_parameters
-from gsba.splat.lesson import Lesson
 from gsba.store.records import load_checkpoint, save_record
 
 logger = logging.getLogger(__name__)
@@ -248,8 +247,7 @@ class Trainer:
         return TrainingState(step, gaussians, moments, pull)
 
     def _stop(self, step: int, end: int) -> int:
-        """End of a stretch from a step: the next step at which density control may be due, or
-        earlier."""
+        """The next step at which density control may be due, or the end of the stretch."""
         times = self.times
         rhythms = (self.backend.stretch, times.densify_every, times.reset_every)
         stops = [end, *(step // every * every + every for every in rhythms)]

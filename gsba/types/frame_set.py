@@ -83,7 +83,6 @@ def cameras_of(of_frame: Sequence[int], rows: np.ndarray) -> tuple[np.ndarray, t
     Args:
         of_frame: (F,) index of each frame's camera; () = there is one camera, here and in the
             result.
-        rows: frames.
     """
     if not of_frame:
         return np.zeros(1, np.int64), ()

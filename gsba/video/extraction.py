@@ -34,11 +34,11 @@ from gsba.store.store import digest, fingerprint
 from gsba.trajectory.files import read_trajectory
 from gsba.types import Counts
 from gsba.version import __version__
-from gsba.video.cube_tracks import TRACKS
 from gsba.video.likeness import apparent_motion_deg, lens_interior, miniature, sharpness
 from gsba.video.recording import (
     EXACT_S,
     LENSES,
+    TRACKS,
     Picture,
     Recording,
     check_lengths,
@@ -221,11 +221,7 @@ def _extract(
     settings: VideoSettings,
     before: list[_Kept],
 ) -> tuple[list[_Kept], int]:
-    """Decode, choose and write the frames after those kept `before`.
-
-    Returns:
-        the kept frames, and the number of all windows left out because the camera stood.
-    """
+    """Write frames after those kept `before`; kept ones, and windows left out for standing."""
     times, kept, last = recording.times, list[_Kept](), None
     standing = before[-1].standing if before else 0
     todo = [window for window in windows if not before or window[0] > before[-1].index]

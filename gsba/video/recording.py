@@ -5,8 +5,8 @@ Raw recordings of two fisheyes are one file with a track for each lens, two file
 side, perhaps squeezed to 16:9. These layouts follow public descriptions (OpenSpeleo/insta360-rs,
 docs/INSV_FORMAT.md; insta.pk360.de on file types); they were tested on two real files, one of them
 black. The first track, `_00_` and the left circle are taken for the front lens; images keep the
-rotation in which the camera stores them. GoPro's `.360` holds two tracks of a cube map, see
-`gsba.video.cube_tracks`.
+rotation in which the camera stores them. GoPro's `.360` holds two tracks of a cube map, told by
+their size: streams 0 and 5 of videos, 0 and 4 of time lapses.
 """
 
 import itertools
@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from gsba.camera.equiangular import is_equiangular
 from gsba.camera.factory_lenses import FactoryCalibration
 from gsba.frames.factory_start import factory_calibration
 from gsba.frames.files import turned
@@ -37,7 +38,6 @@ from gsba.log import GsbaError
 from gsba.types.records import spread_rows
 from gsba.video.claims import PictureClaims
 from gsba.video.colours import bgr, luma
-from gsba.video.cube_tracks import TRACKS, cube_tracks
 from gsba.video.timeline import Timeline, Track, decode, read_claims, read_timeline, track_sizes
 
 LENSES = ("front", "back")
@@ -220,8 +220,7 @@ def _check_pair(files: tuple[Path, ...], size: tuple[int, int]) -> None:
 
 
 def _lens_tracks(sizes: Sequence[tuple[int, int]]) -> list[int]:
-    """Numbers of the tracks that lenses may have: the two largest, if they are square and equal,
-    beside covers and previews (DJI's `.osv`); else all."""
+    """The two largest tracks, if they are square and equal, as in DJI's `.osv`; else all."""
     largest = max(sizes, key=lambda size: size[0] * size[1])
     pair = [n for n, size in enumerate(sizes) if size == largest]
     return pair if len(pair) == 2 and _is_nearly_square(largest) else list(range(len(sizes)))
@@ -285,11 +284,7 @@ def _check_panorama(video: Path, size: tuple[int, int]) -> None:
 
 
 def _of_one_track(track: Track, size: tuple[int, int]) -> Recording:
-    """Recording of panoramas, or of two lenses side by side or one above the other.
-
-    Raises:
-        GsbaError: the track holds neither.
-    """
+    """Recording of panoramas, or of two lenses side by side or one above the other."""
     claims, timeline = read_claims(track), read_timeline(track)
     _refuse_claims(track.path, claims)
     shown, looks = claims.shown_size(size), tee(_looks(track, timeline), 3)
@@ -422,3 +417,35 @@ def _looks(track: Track, timeline: Timeline) -> Iterator[np.ndarray]:
     for part in ([middle], sorted(others)):
         for _, frame in decode(track, timeline, part):
             yield luma(frame)
+
+
+TRACKS = ("track0", "track5")  # folders of their frames, by GoPro's numbers
+
+
+def cube_tracks(video: Path, sizes: Sequence[tuple[int, int]]) -> tuple[int, int] | None:
+    """Find the two tracks of an equi-angular cube map in a video; None if it holds none.
+
+    Args:
+        video: the file.
+        sizes: width and height of its tracks.
+
+    Raises:
+        GsbaError: a `.360` file does not hold exactly two such tracks of one size.
+    """
+    found = [n for n, size in enumerate(sizes) if is_equiangular(*size)]
+    if len(found) == 2 and sizes[found[0]] == sizes[found[1]]:
+        return found[0], found[1]
+    panorama = len(sizes) == 1 and sizes[0][0] == 2 * sizes[0][1]
+    if video.suffix.lower() != ".360" or panorama:
+        return None
+    shapes = " and ".join(f"{width}x{height}" for width, height in sizes)
+    if len(sizes) == 1 and found:
+        raise GsbaError(
+            f"{video} holds one video track of {shapes}, but a .360 recording has two: the other "
+            "half of the sphere is missing; copy the file again from the camera"
+        )
+    raise GsbaError(
+        f"{video} holds video tracks of {shapes}; a .360 recording has two of one size, three "
+        "squares wide and up to a twelfth more (4096x1344, 2272x736): copy it again from the "
+        "camera, or export an equirectangular (2:1) video from GoPro Player"
+    )

@@ -227,7 +227,8 @@ def _opened(video: Path) -> Iterator[tuple[Any, list[Any]]]:
     av = _pyav()
     try:
         with av.open(str(video), metadata_errors="replace") as container:
-            streams = [s for s in container.streams.video if not _is_cover(s)]
+            every = container.streams.video  # covers are still images stored with the video
+            streams = [s for s in every if not s.disposition & type(s.disposition).attached_pic]
             if not streams:
                 raise GsbaError(f"{video} holds no video stream")
             if streams[0].codec_context is None:
@@ -242,11 +243,6 @@ def _opened(video: Path) -> Iterator[tuple[Any, list[Any]]]:
             f"{video}: cannot be read as video ({error.strerror}); it may be truncated or damaged: "
             "copy or export it again"
         ) from error
-
-
-def _is_cover(stream: Any) -> bool:
-    """True for a still image that is stored with the video."""
-    return bool(stream.disposition & type(stream.disposition).attached_pic)
 
 
 def _claimed_end(container: Any, stream: Any) -> float | None:

@@ -72,33 +72,32 @@ class View:
 
     def _add_cloud(self) -> None:
         found = self.scene.reconstruction
-        self.nodes["/cloud"] = self.server.scene.add_point_cloud(
-            "/cloud",
-            (self.scale * found.points_world).astype(np.float32),
-            found.point_colors,
-            point_size=0.02 * self.size,
+        self._add_points("/cloud", found.points_world, found.point_colors, 0.02)
+        if self.scene.judged is not None:
+            points, colors = self.scene.judged
+            self._add_points("/judged", points, colors, 0.025, visible=False)
+
+    def _add_points(
+        self, name: str, points: np.ndarray, colors: Any, size: float, visible: bool = True
+    ) -> None:
+        """Add points (N, 3) of a size in steps."""
+        self.nodes[name] = self.server.scene.add_point_cloud(
+            name,
+            (self.scale * points).astype(np.float32),
+            colors,
+            point_size=size * self.size,
             point_shape="circle",
             point_shading="flat",
             precision="float32",
+            visible=visible,
         )
-        if self.scene.judged is not None:
-            points, colors = self.scene.judged
-            self.nodes["/judged"] = self.server.scene.add_point_cloud(
-                "/judged",
-                (self.scale * points).astype(np.float32),
-                colors,
-                point_size=0.025 * self.size,
-                point_shape="circle",
-                point_shading="flat",
-                precision="float32",
-                visible=False,
-            )
 
     def _add_paths(self) -> None:
         """Add lines through the poses before and after, and a forward-facing pyramid per rig."""
         world_T_rigs = self.scene.reconstruction.world_T_rigs
         coarse = self.scene.coarse_T_rigs
-        own = self._colors_by_recording()
+        numbers = self.scene.frames.recording_of_frame
+        own = np.array(_RECORDINGS, np.uint8)[numbers % len(_RECORDINGS)]
         self._add_line("/refined", world_T_rigs, own)
         if coarse is not None:
             self._add_line("/coarse", coarse, np.full_like(own, _BEFORE))
@@ -128,13 +127,6 @@ class View:
             axes_radius=0.012 * self.size,
             visible=False,
         )
-
-    def _colors_by_recording(self) -> np.ndarray:
-        """Colour (F, 3) uint8 of the recording of each frame."""
-        colors = np.full((len(self.scene.frames), 3), _AFTER, np.uint8)
-        for n, rows in enumerate(self.scene.frames.recordings.values()):
-            colors[rows] = _RECORDINGS[n % len(_RECORDINGS)]
-        return colors
 
     def _add_line(self, name: str, world_T_rigs: np.ndarray, colors: np.ndarray) -> None:
         """Add a line through poses (F, 4, 4) in colours (F, 3), broken between recordings."""
@@ -220,16 +212,8 @@ class View:
         for view in views_of(self.scene.frames, f, self.scene.optics):
             self._place_face(f, view, faces.get(view.name))
         rows = found.observation_points[found.observation_frames == f]
-        self.nodes["/seen"] = add.add_point_cloud(
-            "/seen",
-            (self.scale * found.points_world[rows]).astype(np.float32),
-            _SEEN,
-            point_size=0.035 * self.size,
-            point_shape="circle",
-            point_shading="flat",
-            precision="float32",
-            visible=bool(self.controls["Observed points"].value),
-        )
+        shown = bool(self.controls["Observed points"].value)
+        self._add_points("/seen", found.points_world[rows], _SEEN, 0.035, shown)
 
     def _place_face(self, f: int, view: Face, image: np.ndarray | None) -> None:
         """Place the image of a view at its pose; remove it if `image` is None."""
@@ -324,10 +308,7 @@ def _has_masks(scene: Scene) -> bool:
 
 
 def _pyramid(length: float) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (5, 3) and triangles (4, 3) of a pyramid from the origin along z, without a base.
-
-    A camera in its apex looks through it.
-    """
+    """Vertices (5, 3) and triangles (4, 3) of a pyramid along z without a base."""
     half = 0.6 * length
     corners = [[-half, -half, length], [half, -half, length], [half, half, length]]
     vertices = np.array([[0, 0, 0], *corners, [-half, half, length]], np.float32)

@@ -8,11 +8,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from gsba.camera.optics import ONE_EYE, Optics
-from gsba.camera.views import View
+from gsba.camera.views import ONE_EYE, Optics, View
 from gsba.evaluate.scans import colors_of
-from gsba.frames import cubemap, lens_faces
+from gsba.frames import cubemap
 from gsba.frames.masks import load_mask
+from gsba.frames.pixels import cut_views
 from gsba.geometry import rotation_from_quaternion
 from gsba.log import GsbaError
 from gsba.placement.world import Placement, read_placement
@@ -146,7 +146,7 @@ def views_of(frames: FrameSet, f: int, optics: Optics) -> tuple[View, ...]:
 def _lens_faces(frames: FrameSet, f: int, masked: bool, optics: Optics) -> dict[str, np.ndarray]:
     views = views_of(frames, f, optics)
     cutter = optics.cutter(views, f)
-    images, mask = lens_faces.cut(frames, f, cutter), load_mask(frames, f) if masked else None
+    images, mask = cut_views(frames, f, cutter), load_mask(frames, f) if masked else None
     if mask is not None:
         pairs = zip(images, cutter.cut_mask(mask), strict=True)
         images = [_tinted(image, use) for image, use in pairs]
@@ -166,8 +166,7 @@ def _shrunk(image: np.ndarray) -> np.ndarray:
 
 
 def _latest_placement(run: Path) -> tuple[Placement, str]:
-    """Placement of the run's latest export of map 1 that has one, else the identity; and its
-    source."""
+    """Placement of the latest export of map 1 that has one, else the identity; and its source."""
     files = sorted(run.glob("*/transform.json"), key=lambda path: path.stat().st_mtime_ns)
     for path in reversed(files):
         placement = read_placement(path)

@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 
-from gsba.demo.film import make_film
+from gsba.demo.walk import make_film
 
 pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")

@@ -10,19 +10,18 @@ from synthetic import GivenFactors, loop_walk
 
 from factors import PoseSystem
 from factors.bearing import bearing_residuals
-from factors.quadratic_block import QuadraticBlock
-from factors.system_choice import reduced_system
+from factors.block import QuadraticBlock
+from factors.direct_system import reduced_system
 from gsba import Family, MapSnapshot, X
 from gsba.bundle import adjustment
 from gsba.bundle.adjustment import values_of
 from gsba.bundle.bearings import Bearings
 from gsba.bundle.camera_adjustment import solve_with_camera
-from gsba.bundle.camera_estimates import CameraEstimates
 from gsba.bundle.camera_system import CameraSystem
 from gsba.bundle.camera_variables import CameraUnknowns
 from gsba.bundle.families import Families
-from gsba.bundle.gyro_turns import GyroTurns
-from gsba.bundle.readout import CameraEstimate
+from gsba.bundle.readout import CameraEstimate, CameraEstimates
+from gsba.bundle.trajectory_prior import GyroTurns
 from gsba.camera.cameras import Cameras
 from gsba.camera.lens import Lenses
 from gsba.config import CameraSettings

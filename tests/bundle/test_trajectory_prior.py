@@ -8,9 +8,8 @@ from synthetic import loop_walk
 
 from gsba.bundle import pose_variables
 from gsba.bundle.families import Families
-from gsba.bundle.gyro_turns import GyroTurns
 from gsba.bundle.pose_variables import X
-from gsba.bundle.trajectory_prior import TrajectoryPrior
+from gsba.bundle.trajectory_prior import GyroTurns, TrajectoryPrior
 from gsba.config import PriorSettings
 from gsba.geometry import inverse, pose, rotation_angle
 from gsba.types import GyroConstraints, Solution

@@ -9,8 +9,7 @@ import pytest
 from factors.patch_windows import over_poles
 from gsba.camera.lens import Lenses
 from gsba.camera.rig import CubeRig
-from gsba.camera.sphere import around_seam, around_sphere
-from gsba.camera.tables import table
+from gsba.camera.sphere import around_seam, around_sphere, table
 from gsba.camera.views import ViewCutter, lens_views
 from gsba.frames import cubemap
 

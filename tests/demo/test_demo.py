@@ -18,11 +18,10 @@ from gsba.camera.sphere import bearings_from_erp, erp_from_bearings
 from gsba.cli.refining import _found_lenses
 from gsba.demo import degrade, make_walk
 from gsba.demo.degrade import Drift
-from gsba.demo.gait import KNOTS, poses_during
 from gsba.demo.mesh import MeshBuilder
 from gsba.demo.raycast import ranges
 from gsba.demo.render import render_erp
-from gsba.demo.two_lenses import SWEEP, TwoLenses, render_stitched
+from gsba.demo.two_lenses import KNOTS, SWEEP, TwoLenses, poses_during, render_stitched
 from gsba.demo.walk import walk_poses
 from gsba.geometry import inverse, pose, rotation_angle
 from gsba.log import GsbaError

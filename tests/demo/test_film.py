@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from command import run_gsba
 
-from gsba.demo.film import FPS, WHOLE_WALK
-from gsba.demo.walk import walk_poses
+from gsba.demo.walk import FPS, WHOLE_WALK, walk_poses
 from gsba.trajectory.files import read_trajectory
 
 

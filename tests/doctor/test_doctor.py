@@ -14,8 +14,7 @@ from command import run_gsba
 
 from gsba.doctor import examination, examine, facts
 from gsba.doctor.machine import look
-from gsba.doctor.packages import debian_package, look_at
-from gsba.doctor.requirements import NEEDED, Requirement, requirements
+from gsba.doctor.packages import NEEDED, Requirement, debian_package, look_at, requirements
 
 ROOT = Path(__file__).parents[2]
 

@@ -27,7 +27,7 @@ from gsba.camera.fisheye import project, unproject
 from gsba.camera.lens import Lenses, rows_run
 from gsba.disk import write_image
 from gsba.export import ExportFormat, Shutter, export, sensors
-from gsba.export.masks import MaskStyle
+from gsba.export.dataset import MaskStyle
 from gsba.geometry import inverse, pose
 from gsba.log import GsbaError
 from gsba.trajectory.files import read_trajectory

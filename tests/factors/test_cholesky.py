@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from factors.cholesky import BlockCholesky
-from factors.conjugate_gradients import conjugate_gradients, multiply_blocks
+from factors.iterative_system import conjugate_gradients, multiply_blocks
 from factors.supernodes import find_supernodes
 
 Pairs = list[tuple[int, int]]

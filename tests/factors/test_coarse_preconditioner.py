@@ -10,18 +10,16 @@ from factors import (
     LandmarkBlock,
     RobustLoss,
     coarse_preconditioner,
+    direct_system,
     iterative_system,
-    pose_clusters,
-    system_choice,
 )
-from factors._schur_kernels import GROUP_DIM
 from factors._terms import pose_rows
-from factors.direct_system import DirectSystem
+from factors.block import QuadraticBlock
+from factors.coarse_preconditioner import Groups, covisible_groups
+from factors.direct_system import DirectSystem, reduced_system
 from factors.iterative_system import IterativeSystem
-from factors.pose_clusters import Groups, covisible_groups
-from factors.quadratic_block import QuadraticBlock
 from factors.reduced_camera_system import ReducedSystem
-from factors.system_choice import reduced_system
+from factors.schur_complement import GROUP_DIM
 from factors.system_layout import SystemLayout
 from gsba.bundle.optimizer import optimize
 from gsba.config import SolverSettings
@@ -82,8 +80,8 @@ def world() -> World:
 @pytest.fixture
 def held(monkeypatch) -> None:
     """Nothing is written out, groups are small."""
-    monkeypatch.setattr(system_choice, "_MAX_OPERATIONS", 0)
-    monkeypatch.setattr(system_choice, "_MAX_INVERSE_OPERATIONS", 0)
+    monkeypatch.setattr(direct_system, "_MAX_OPERATIONS", 0)
+    monkeypatch.setattr(direct_system, "_MAX_INVERSE_OPERATIONS", 0)
 
 
 def dense(world: World) -> np.ndarray:
@@ -138,7 +136,7 @@ def test_groups_feel_what_their_frames_feel_together(world, held) -> None:
 def test_a_step_is_that_of_a_factorization(world, held, monkeypatch) -> None:
     monkeypatch.setattr(iterative_system, "STEP_TOLERANCE", 1e-10)
     iterated = world.system()
-    monkeypatch.setattr(system_choice, "_MAX_OPERATIONS", np.inf)
+    monkeypatch.setattr(direct_system, "_MAX_OPERATIONS", np.inf)
     direct = world.system()
     assert isinstance(iterated, IterativeSystem) and isinstance(direct, DirectSystem)
     for damping in (1e-3, 1e-6):  # the second one by the groups' system of the first
@@ -170,7 +168,7 @@ def test_blocks_without_products_are_written_out_beside_those_with(
 def test_the_optimum_is_the_same(world, held, monkeypatch) -> None:
     tight = SolverSettings(relative_tolerance=1e-12, max_iterations=200)
     iterated = optimize(world.graph, world.values, [world.block()], tight)
-    monkeypatch.setattr(system_choice, "_MAX_OPERATIONS", np.inf)
+    monkeypatch.setattr(direct_system, "_MAX_OPERATIONS", np.inf)
     direct = optimize(world.graph, world.values, [world.block()], tight)
     assert iterated.cost == pytest.approx(direct.cost, rel=1e-9)
     for key in world.keys:
@@ -188,7 +186,7 @@ def test_threads_change_nothing(world, held, monkeypatch) -> None:
 def test_errors_that_are_drawn_spread_as_the_inverse_says(world, held, monkeypatch) -> None:
     pairs = [(X(f), X(f + 1)) for f in range(NUM_FRAMES - 1)]
     iterated = reduced_system(world.graph, [world.block()], world.values, pairs)
-    monkeypatch.setattr(system_choice, "_MAX_INVERSE_OPERATIONS", np.inf)
+    monkeypatch.setattr(direct_system, "_MAX_INVERSE_OPERATIONS", np.inf)
     direct = reduced_system(world.graph, [world.block()], world.values, pairs)
     assert isinstance(iterated, IterativeSystem) and isinstance(direct, DirectSystem)
     found, expected = [], []
@@ -228,7 +226,7 @@ def test_a_group_moves_as_one(world) -> None:
 
 
 def test_groups_hold_what_shares_the_most(monkeypatch) -> None:
-    monkeypatch.setattr(pose_clusters, "_MIN_GROUP_SIZE", 3)
+    monkeypatch.setattr(coarse_preconditioner, "_MIN_GROUP_SIZE", 3)
     rows = np.array([[0, 1], [1, 2], [0, 2], [2, 3], [3, 4], [4, 5], [5, 3], [6, 7]])
     shared = np.array([9, 9, 9, 1, 9, 9, 9, 5])
     found = covisible_groups(9, [(rows, shared)])

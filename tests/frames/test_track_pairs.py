@@ -19,9 +19,8 @@ from gsba.camera.sphere import bearings_from_erp
 from gsba.camera.views import ViewCutter, cube_views, lens_views, rig_views
 from gsba.export.images import panorama_writer, view_writer, write_pictures
 from gsba.export.pictures import Files
-from gsba.frames import cubemap, lens_faces, load_erp, load_grey, scan
-from gsba.frames.buffers import Buffers
-from gsba.frames.pixels import load_padded
+from gsba.frames import cubemap, load_erp, load_grey, scan
+from gsba.frames.pixels import Buffers, cut_views, load_padded
 from gsba.frames.track_pairs import load_squares
 from gsba.log import GsbaError
 from gsba.types import FACES, FrameSet
@@ -85,7 +84,7 @@ def test_faces_show_the_sphere(frames: FrameSet, rig: CubeRig) -> None:
     assert masks is None
     assert np.abs(images - true).mean() < 0.6
     cutter = ViewCutter(rig_views(rig), ONE_CENTRE, 1)
-    assert np.abs(np.stack(lens_faces.cut(frames, 1, cutter)) - true).mean() < 0.7
+    assert np.abs(np.stack(cut_views(frames, 1, cutter)) - true).mean() < 0.7
 
 
 def test_faces_of_one_lens(frames: FrameSet) -> None:
@@ -93,7 +92,7 @@ def test_faces_of_one_lens(frames: FrameSet) -> None:
     lenses = Lenses(centre=np.array([0, 0, 0.015]), band_rad=float(np.deg2rad(4)))
     views = lens_views(lenses, 64)
     cutter = ViewCutter(views, lenses, 0, 1e6 * np.random.default_rng(0).normal(size=(200, 3)))
-    for view, image in zip(views, lens_faces.cut(frames, 0, cutter), strict=True):
+    for view, image in zip(views, cut_views(frames, 0, cutter), strict=True):
         centres = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
         true = colours(view.rays(np.stack(centres, axis=-1)))
         assert np.abs(image - true).mean() < 0.7

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 from riding_gyro import IMU_R_RIG, UP, Ride, ride
 
-from gsba.imu.alignment import Alignment, align
-from gsba.imu.gravity import up_axis
+from gsba.imu.alignment import Alignment, align, up_axis
 from gsba.imu.readings import Readings
 
 

@@ -13,7 +13,7 @@ import gsba.learned
 from gsba import refine
 from gsba.config import FeatureSettings, RefineSettings
 from gsba.config_file import load_config
-from gsba.features.extractor_traits import TRAITS
+from gsba.features.detection import TRAITS
 from gsba.learned import LearnedExtractor, find_weights
 from gsba.learned.extractor import _load
 from gsba.log import GsbaError

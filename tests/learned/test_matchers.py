@@ -21,7 +21,7 @@ from synthetic import features_of, unit
 from gsba.camera.rig import CubeRig
 from gsba.config import RefineSettings
 from gsba.features import detection
-from gsba.features.extractor_traits import search_settings
+from gsba.features.detection import search_settings
 from gsba.geometry import pose
 from gsba.learned import FaceMatcher, LearnedExtractor, make_matcher, overlapping_faces
 from gsba.learned.lightglue import LightGlue

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from gsba.config import RefineSettings
-from gsba.learned import find_weights, weight_packages
-from gsba.learned.weight_packages import PACKAGES, packaged
+from gsba.learned import find_weights, weights
+from gsba.learned.weights import PACKAGES, packaged
 from gsba.log import GsbaError
 
 FILES = ("aliked-n16.pth", "aliked-n32.pth", "disk-depth-save.pth")
@@ -28,7 +28,7 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (folder / name).write_bytes(name.encode())
     digests = {name: hashlib.sha256(name.encode()).hexdigest() for name in FILES}
     known = replace(PACKAGES[0], sha256=digests)
-    monkeypatch.setattr(weight_packages, "PACKAGES", (known,))
+    monkeypatch.setattr(weights, "PACKAGES", (known,))
     monkeypatch.syspath_prepend(tmp_path)
     for name in ("TORCH_HOME", "HF_HOME", "HF_HUB_CACHE"):
         monkeypatch.delenv(name, raising=False)

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from gsba.config import OdometrySettings
 from gsba.geometry import pose, rotation_angle
 from gsba.odometry import Odometry, choose_frames
-from gsba.odometry.frame_record import FrameStatus
+from gsba.odometry.tracker_state import FrameStatus
 
 SETTINGS = OdometrySettings()
 

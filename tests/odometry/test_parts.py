@@ -8,10 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from gsba.camera.sphere import bearings_from_erp
 from gsba.geometry import angles_between, inverse, pose, rotation_angle, unit
-from gsba.odometry.atlas import AtlasLayout, Cutter
-from gsba.odometry.corners import new_corners
+from gsba.odometry.atlas import AtlasLayout, Cutter, follow, new_corners
 from gsba.odometry.derotation import miniature, turned
-from gsba.odometry.flow import follow
 from gsba.odometry.relocalisation import describe, placed
 from gsba.odometry.window import WindowObservations, adjust_window
 

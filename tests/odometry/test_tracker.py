@@ -7,8 +7,8 @@ from scipy.spatial.transform import Rotation
 
 from gsba.evaluate.trajectory import evaluate
 from gsba.geometry import rotation_angle
-from gsba.odometry.frame_record import FrameStatus
 from gsba.odometry.tracker import FREE, HELD, Tracker
+from gsba.odometry.tracker_state import FrameStatus
 from gsba.types import Trajectory
 
 

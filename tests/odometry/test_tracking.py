@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from dense_walk import WIDTH, RenderedWalk
 
-from gsba.odometry import tracking
+from gsba.odometry import walk
 from gsba.odometry.panoramas import SmallPanoramas
-from gsba.odometry.tracking import Tracking, track_frames
+from gsba.odometry.walk import Tracking, track_frames
 
 BROKEN = 3  # the frame that cannot be read
 
@@ -34,8 +34,8 @@ def _panoramas(walk: RenderedWalk, folder: Path, stops: int | None = None) -> Sm
 @pytest.fixture
 def always(monkeypatch: pytest.MonkeyPatch) -> None:
     """A checkpoint after every frame."""
-    monkeypatch.setattr(tracking, "_CHECKPOINT_S", 0.0)
-    monkeypatch.setattr(tracking, "_MAX_SAVING_SHARE", 1e9)
+    monkeypatch.setattr(walk, "_CHECKPOINT_S", 0.0)
+    monkeypatch.setattr(walk, "_MAX_SAVING_SHARE", 1e9)
 
 
 @pytest.fixture(scope="module")

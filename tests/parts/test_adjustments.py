@@ -19,11 +19,9 @@ from town_in_parts import NUM, SIGMA, town
 from gsba import disk
 from gsba.bundle import adjustment
 from gsba.bundle.adjustment import AdjustmentContext
-from gsba.bundle.bearings import Bearings
+from gsba.bundle.bearings import Bearings, Reprojections
 from gsba.bundle.families import Families, Family
-from gsba.bundle.gyro_turns import GyroTurns
-from gsba.bundle.reprojections import Reprojections
-from gsba.bundle.trajectory_prior import TrajectoryPrior
+from gsba.bundle.trajectory_prior import GyroTurns, TrajectoryPrior
 from gsba.camera.rig import owner_faces
 from gsba.config import PriorSettings, RefineSettings
 from gsba.disk import FullDiskError

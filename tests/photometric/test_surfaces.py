@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from factors import tangent_basis
 from factors.patches import Sightings, expect
-from gsba.photometric.surfaces import normals, shown_depths, slopes_of
+from gsba.photometric.alignment import shown_depths, slopes_of, surface_normals
 
 STEP = 2 * np.pi / 1536
 POINT = np.array([0.4, -0.3, 2.0])  # seen from the host at the origin
@@ -57,7 +57,7 @@ def _from_sightings(sightings: Sightings, rays: np.ndarray, slopes: np.ndarray) 
     """The normal from sightings of one template, none of them shifted."""
     shown = shown_depths(sightings.spreads, sightings.warps, sightings.origins, rays)
     own = slopes[None], ORIGIN[None], SPREAD[None]
-    return normals(sightings.templates, *shown, *own)[0]
+    return surface_normals(sightings.templates, *shown, *own)[0]
 
 
 @pytest.mark.parametrize("tilt", [0, 20, 45, 65])

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from tiny_run import NUM_FRAMES, Case, computed_stages, settings_with
 
-from gsba.bundle.division import DivisibleMap
+from gsba.bundle.adjustment import DivisibleMap
 from gsba.bundle.optimizer import OptimizeResult
 from gsba.config import SolverSettings
 from gsba.parts import adjustments

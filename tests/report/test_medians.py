@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gsba.report.medians import medians_by_group
+from gsba.report.report import medians_by_group
 
 
 def test_medians_of_groups() -> None:

@@ -3,8 +3,8 @@
 import numpy as np
 
 from gsba.odometry import Odometry
-from gsba.odometry.frame_record import FrameStatus
-from gsba.report.html.odometry import odometry_plan
+from gsba.odometry.tracker_state import FrameStatus
+from gsba.report.html.figures import odometry_plan
 
 
 def test_maps_lie_side_by_side_with_their_loops_and_losses() -> None:

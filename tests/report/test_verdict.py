@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gsba.report.map_figures import Figures, _smaller_sides
-from gsba.report.verdict import Level, Verdict, verdict_on
+from gsba.report.verdict import Figures, Level, Verdict, _smaller_sides, verdict_on
 from gsba.types import RunStart
 
 NUM = 20

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gsba.splat.evidence import score, together
+from gsba.splat.refinement import score, together
 
 
 def test_scores_are_those_of_a_normal_distribution() -> None:

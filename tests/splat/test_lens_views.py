@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from splat_alignment import align_to_splat
 
 from gsba.camera.lens import Lenses
-from gsba.camera.optics import ONE_EYE, Optics
 from gsba.camera.sphere import bearings_from_erp
+from gsba.camera.views import ONE_EYE, Optics
 from gsba.config import SplatSettings
 from gsba.disk import write_image
 from gsba.geometry import pose

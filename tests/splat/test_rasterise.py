@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from gsba.camera.rig import CubeRig
+from gsba.camera.views import rig_views
 from gsba.splat import _tiles
-from gsba.splat.camera import FaceCamera, face_camera
+from gsba.splat.camera import FaceCamera, view_camera
 from gsba.splat.gaussians import Gaussians
 from gsba.splat.rasterise import differentiate, render
 
@@ -26,7 +27,7 @@ def scene(
     world_T_rig = np.eye(4)
     world_T_rig[:3, :3] = dense_splat.rotation(rng.normal(size=4))
     world_T_rig[:3, 3] = rng.normal(size=3)
-    camera = face_camera(world_T_rig, 1, CubeRig(SIZE, np.deg2rad(90)))
+    camera = view_camera(world_T_rig, rig_views(CubeRig(SIZE, np.deg2rad(90)))[1])
     if wide:
         size = {"width": SIZE + 9, "height": SIZE - 17}
         camera = dataclasses.replace(camera, **size, principal=(20.0, 13.5))

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from gsba.camera.rig import CubeRig
+from gsba.camera.views import rig_views
 from gsba.config import SplatSettings
 from gsba.geometry import pose
 from gsba.log import GsbaError
 from gsba.splat import adam
-from gsba.splat.backend import CpuBackend, choose_backend
-from gsba.splat.camera import face_camera
+from gsba.splat.backend import CpuBackend, Lesson, choose_backend
+from gsba.splat.camera import view_camera
 from gsba.splat.density import DensityLimits, Pull, densify, reset_opacity
 from gsba.splat.gaussians import Gaussians, from_cloud
-from gsba.splat.lesson import Lesson
 from gsba.splat.metrics import psnr
 from gsba.splat.rasterise import render
 from gsba.splat.train import Views, advance, begin, extent_of, most_gaussians, times_for, train
@@ -34,7 +34,7 @@ def scene() -> tuple[Gaussians, Views]:
     truth = from_cloud(points, rng.integers(0, 256, (150, 3)).astype(np.uint8), 1)
     truth = dataclasses.replace(truth, opacity_logits=np.full(150, 3, np.float32))
     places = np.column_stack([np.linspace(-0.5, 0.5, 6), np.zeros(6), np.linspace(0, 0.3, 6)])
-    cameras = [face_camera(pose(np.eye(3), place), 0, RIG) for place in places]
+    cameras = [view_camera(pose(np.eye(3), place), rig_views(RIG)[0]) for place in places]
     images = [render(truth, camera)[0].color for camera in cameras]
     return truth, Views(
         cameras, (np.clip(images, 0, 1) * 255 + 0.5).astype(np.uint8), None, np.arange(6)

@@ -13,7 +13,7 @@ from gsba.disk import write_text
 from gsba.log import GsbaError
 from gsba.odometry import Odometry
 from gsba.report.html import figures, pictures
-from gsba.report.html.odometry import odometry_plan
+from gsba.report.html.figures import odometry_plan
 from gsba.report.html.thumbnails import frame_pictures
 from gsba.report.report import frame_quality, plain
 from gsba.types import CoarsePoses, FrameSet, Reconstruction
@@ -123,7 +123,7 @@ def _frames(
     moved, turned = figures.displacements(coarse, reconstruction)
     return {
         "name": frames.names,
-        "recording": _recordings(frames),
+        "recording": frames.recording_of_frame,
         "time": frames.timestamps,
         "source": coarse.sources,
         "status": reconstruction.pose_statuses,
@@ -134,14 +134,6 @@ def _frames(
         "std_deg": np.linalg.norm(quality.std_rotations_deg, axis=1),
         "std": np.linalg.norm(quality.std_translations, axis=1),
     }
-
-
-def _recordings(frames: FrameSet) -> np.ndarray:
-    """Number (F,) of each frame's recording, from 0."""
-    numbers = np.zeros(len(frames), np.int64)
-    for number, rows in enumerate(frames.recordings.values()):
-        numbers[rows] = number
-    return numbers
 
 
 def _worst(frames: FrameSet, reconstruction: Reconstruction) -> list[dict[str, Any]]:

@@ -108,12 +108,7 @@ def _mask_number(frames: FrameSet, f: int, masks: dict[bytes, int]) -> int:
 
 
 def _seams(kind: PictureFormat, two_lenses: bool) -> list[np.ndarray]:
-    """Lines (N, 2) where pictures of two lenses along the z axis meet.
-
-    Args:
-        kind: format of the pictures.
-        two_lenses: True if stitched panoramas were found to be of such lenses.
-    """
+    """Lines (N, 2) where pictures of two lenses along the z axis meet."""
     raw = kind.fisheyes is not None and len(kind.fisheyes) == 2
     if not raw and not (two_lenses and kind.panoramic):
         return []
@@ -143,13 +138,13 @@ def _matches(frames: FrameSet, reconstruction: Reconstruction) -> dict[str, Any]
         "data", base64 of (N, 5) uint16 little-endian: places in both frames relative to width and
         height, in 1/65535, and the larger residual of the two in 1/1000 degree.
     """
-    starts, order = _rows_by_frame(reconstruction, len(frames))
+    observed = reconstruction.observations_by_frame()
     owners = frames.recording_of_frame
     shared, chosen = np.zeros(max(len(frames) - 1, 0), int), []
     for f in range(len(shared)):
         if owners[f] != owners[f + 1]:
             continue
-        rows, others = (order[starts[g] : starts[g + 1]] for g in (f, f + 1))
+        rows, others = observed[f], observed[f + 1]
         points = reconstruction.observation_points
         _, a, b = np.intersect1d(points[rows], points[others], return_indices=True)
         shared[f] = len(a)
@@ -172,13 +167,6 @@ def _matches(frames: FrameSet, reconstruction: Reconstruction) -> dict[str, Any]
         "counts": np.bincount(pairs[:, 0], minlength=len(shared)),
         "data": base64.b64encode(packed.tobytes()).decode("ascii"),
     }
-
-
-def _rows_by_frame(reconstruction: Reconstruction, num: int) -> tuple[np.ndarray, np.ndarray]:
-    """First row (F + 1,) of each frame among the observations in their order (O,) by frame."""
-    observed = reconstruction.observation_frames
-    order = np.argsort(observed, kind="stable")
-    return np.searchsorted(observed[order], np.arange(num + 1)), order
 
 
 def _some_and_worst(pairs: np.ndarray, worst: np.ndarray, most: int) -> np.ndarray:

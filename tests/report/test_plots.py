@@ -17,8 +17,7 @@ from gsba.evaluate.splats import SourceResult, _write_curves
 from gsba.evaluate.trajectory import evaluate
 from gsba.geometry import pose
 from gsba.log import GsbaError
-from gsba.plot import draw, load
-from gsba.plot.figures import _errors, _residuals, _shares, _trajectories
+from gsba.report.plots import _errors, _residuals, _shares, _trajectories, draw, load
 from gsba.similarity import Sim3
 from gsba.splat.scores import Score
 from gsba.trajectory.files import read_trajectory, write_tum
