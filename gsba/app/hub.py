@@ -1,11 +1,9 @@
 """State that all pages of a server share: the root, the commands, the jobs, the viewers."""
 
-import os
 import secrets
 import threading
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,7 +16,6 @@ from gsba.disk import write_text
 from gsba.log import GsbaError
 from gsba.view import load_scene
 from gsba.view import serve as serve_view
-from gsba.view.server import HOST, bound_socket
 
 if TYPE_CHECKING:
     from gsba.view.display import View
@@ -101,46 +98,3 @@ def _kept_token(path: Path) -> str:
         write_text(path, token)
         path.chmod(0o600)
     return token
-
-
-def state_folder(root: Path) -> Path:
-    """Folder of the jobs of a root, in the user's folder of states (XDG)."""
-    base = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local/state"
-    digest = sha256(str(root.resolve()).encode()).hexdigest()[:12]
-    return Path(base) / "gsba" / "app" / digest
-
-
-def serve(app: App, port: int, started: Callable[[str], None]) -> None:
-    """Answer browsers of this machine until the process is interrupted.
-
-    Args:
-        app: what pages show.
-        port: 1 to 65535, or 0 for any free one.
-        started: called with the address when browsers get answers.
-
-    Raises:
-        GsbaError: a package is missing, or the port is in use.
-    """
-    try:
-        import uvicorn
-
-        from gsba.app.routes import application
-    except ImportError as error:
-        raise GsbaError(f"gsba app needs {error.name}: pip install 'gsba[app]'") from None
-    listener = bound_socket(port)
-    address = f"http://{HOST}:{listener.getsockname()[1]}/{app.token}/"
-    config = uvicorn.Config(
-        application(app),
-        lifespan="off",
-        ws="none",
-        log_level="warning",
-        access_log=False,
-        timeout_graceful_shutdown=2,
-    )
-    try:
-        listener.listen()  # from here on connections wait for the server
-        started(address)
-        uvicorn.Server(config).run(sockets=[listener])
-    finally:
-        listener.close()
-        app.close()

@@ -19,9 +19,9 @@ from pathlib import Path
 import numpy as np
 
 from gsba.export.pictures import Files
+from gsba.frames.held_out import HOLD_OUT_EVERY, held_out_rows
 from gsba.log import GsbaError
 from gsba.types import FrameSet, PoseStatus, Reconstruction
-from gsba.types.records import HOLD_OUT_EVERY, held_out_rows
 
 logger = logging.getLogger(__name__)
 

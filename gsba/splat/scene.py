@@ -10,6 +10,7 @@ from gsba.camera.rig import CubeRig
 from gsba.camera.views import ONE_EYE, Optics, View, turned_rigs
 from gsba.config import SplatSettings, TriangulateSettings
 from gsba.frames import cubemap
+from gsba.frames.held_out import held_out_rows
 from gsba.frames.masks import load_mask
 from gsba.frames.pixels import cut_views
 from gsba.log import GsbaError, track
@@ -17,7 +18,6 @@ from gsba.splat.camera import view_camera
 from gsba.splat.gaussians import Gaussians, from_cloud
 from gsba.splat.train import Images, Views, extent_of
 from gsba.types import FrameSet, Landmarks, PoseStatus, Reconstruction, Tracks
-from gsba.types.records import held_out_rows
 
 _GATE_RAD = np.deg2rad(3.0)  # largest angle of an observation to its point, under poses that may
 # have drifted

@@ -596,11 +596,3 @@ class Reconstruction:
             components=None,
             joint_errors=self.joint_errors and self.joint_errors.taken(rows),
         )
-
-
-HOLD_OUT_EVERY = 8  # one panorama of so many: the interval of splat benchmarks and trainers
-
-
-def held_out_rows(num: int, every: int = HOLD_OUT_EVERY, at_least: int = 0) -> np.ndarray:
-    """Rows (H,) of `num` frames to hold out, evenly spread: one of each `every` begun, or more."""
-    return spread_rows(num, min(max(-(-num // every), at_least), num))

@@ -11,9 +11,9 @@ from export_scene import panoramas, reconstruction
 
 from gsba.export import ExportFormat, export
 from gsba.export.split import TRAIN_LIST, Split, add_images, split_of
+from gsba.frames.held_out import held_out_rows
 from gsba.log import GsbaError
 from gsba.types import PoseStatus, Reconstruction
-from gsba.types.records import held_out_rows
 
 
 def _numbers(split: Split) -> tuple[np.ndarray, np.ndarray]:
