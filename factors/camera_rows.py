@@ -231,7 +231,12 @@ class CameraVariables:
         if self.motions is not None and self.velocities is not None:
             velocities = np.ascontiguousarray(self.velocities, dtype=np.float64)
             motions = np.array([vector(values, key) for key in self.motions])
-            motions += self._durations(values) * velocities
+            durations = [
+                0.0 if camera.readout is None else float(vector(values, camera.readout)[0])
+                for camera in self.cameras
+            ]
+            of_frame = 0 if self.of_frame is None else self.of_frame[:, None]
+            motions += np.array(durations)[of_frame] * velocities
         centres = np.concatenate([camera.given_centres(values) for camera in self.cameras])
         axes = np.tile(np.eye(3), (num, 1, 1))
         by_turn = np.zeros((len(centres), num, 3, 3))
@@ -251,14 +256,6 @@ class CameraVariables:
         raw = [camera.raw(values) for camera in self.cameras]
         found = motions, velocities, axes, by_turn, centres, np.concatenate(inverse), by_centre
         return CameraRows(*found, *(np.concatenate(part) for part in zip(*raw, strict=True)))
-
-    def _durations(self, values: gtsam.Values) -> np.ndarray | float:
-        """Duration of the readout (F, 1) of each frame, s; 0 = none."""
-        found = [
-            0.0 if camera.readout is None else float(vector(values, camera.readout)[0])
-            for camera in self.cameras
-        ]
-        return found[0] if self.of_frame is None else np.array(found)[self.of_frame][:, None]
 
 
 def lens_sizes(num: int) -> tuple[int, ...]:

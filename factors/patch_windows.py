@@ -263,7 +263,10 @@ class PatchPixels:
         width = image.coefficients.shape[1]
         if width != self.width:
             raise ValueError(f"image of {width} px where {self.width} px are expected")
-        self._take_templates(frame, image)
+        hosted = np.flatnonzero(self.table.hosts == frame)
+        weights = np.column_stack([np.ones(len(self.table.grid)), self.table.grid])
+        directions = weights @ patch_axes(self.table.bearings_rig[hosted])
+        self.templates[hosted] = image.sample(directions)[0]
         rows = np.flatnonzero(self.table.targets == frame)
         if len(rows) == 0:
             return
@@ -286,12 +289,6 @@ class PatchPixels:
         joined = np.concatenate([np.zeros(0, np.int16), *self._chunks])
         self._chunks = [joined]
         return joined
-
-    def _take_templates(self, frame: int, image: SphereImage) -> None:
-        rows = np.flatnonzero(self.table.hosts == frame)
-        weights = np.column_stack([np.ones(len(self.table.grid)), self.table.grid])
-        directions = weights @ patch_axes(self.table.bearings_rig[rows])
-        self.templates[rows] = image.sample(directions)[0]
 
     def _boxes(self, rows: np.ndarray) -> np.ndarray:
         """First column and row, width and height (R, 4) int64 of the windows."""

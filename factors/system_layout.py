@@ -72,7 +72,15 @@ class SystemLayout:
         table = np.array(pads, dtype=np.int64).reshape(-1, 2)
         self.padding = table[:, 0], table[:, 1]
         self.asked = np.array([self.first_block[key] for key in paired], np.int64).reshape(-1, 2)
-        self._set_columns(all_dims)
+        places = [
+            self.first_block[key] + c // DIM
+            for key in self.graph_keys
+            for c in range(all_dims[key])
+        ]
+        self.column_blocks = np.array(places, dtype=np.int64)
+        self.column_offsets = np.array(
+            [c % DIM for key in self.graph_keys for c in range(all_dims[key])], dtype=np.int64
+        )
         blocks_of = dict(zip(self.keys, counts, strict=True))
         shared = {
             pair
@@ -85,13 +93,3 @@ class SystemLayout:
             )
         }
         self.factor_pairs = np.array(sorted(shared), dtype=np.int64).reshape(-1, 2)
-
-    def _set_columns(self, dims: dict[int, int]) -> None:
-        """Place of each column of the graph's sparse Jacobian (keys in sorted order)."""
-        blocks = [
-            self.first_block[key] + c // DIM for key in self.graph_keys for c in range(dims[key])
-        ]
-        self.column_blocks = np.array(blocks, dtype=np.int64)
-        self.column_offsets = np.array(
-            [c % DIM for key in self.graph_keys for c in range(dims[key])], dtype=np.int64
-        )

@@ -16,7 +16,6 @@ from gsba.bundle.shared_parameters import (
     Verdict,
     Weighted,
     cross_validate,
-    of_points,
     weighted,
     without_points,
 )
@@ -72,7 +71,7 @@ def models_of(
     drawn = np.random.default_rng(context.settings.seed).permutation(landmarks.tracks.num_points)
 
     def model(part: int) -> FrameModel:
-        some = of_points(landmarks, drawn % PARTS == part)
+        some = landmarks.of(drawn % PARTS == part)
         seen = weighted(some, keypoints, solved, context)
         by_frame = np.concatenate([seen.by_pose, by_parameters(seen)], axis=2)
         system = without_points(seen, some.tracks, len(solved.world_T_rigs), by_frame)

@@ -68,12 +68,7 @@ def guess(
         return np.concatenate(columns, axis=2)
 
     systems, counts = shared_parameters.models_of(
-        landmarks,
-        20_000,
-        keypoints,
-        solved,
-        context,
-        by_centres,  # observations for a first guess
+        landmarks, keypoints, solved, context, by_centres, most=20_000
     )
     if not systems:
         return LensAxes(so_far, np.full(PARTS, np.nan), "too few points", counts)
@@ -103,7 +98,7 @@ def loosened(
         keypoints: of these, as rays of the lenses so far.
         so_far: two lenses whose axes are the rig's.
     """
-    used = drawn(landmarks, 60_000, context.settings.seed)  # observations that axes are found from
+    used = drawn(landmarks, shared_parameters.MAX_OBSERVATIONS, context.settings.seed)
     counts = sample_counts(landmarks, used)
     frames, num = keypoints.frames(), len(solved.world_T_rigs)
 

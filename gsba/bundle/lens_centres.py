@@ -11,19 +11,20 @@ from factors.bearing import tangent_basis
 from factors.camera_rows import half_baseline
 from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.shared_parameters import (
+    MAX_OBSERVATIONS,
     PARTS,
     SharedModel,
     cross_validate,
+    drawn,
+    model_of,
     models_of,
     summed,
-    whole_model_of,
 )
 from gsba.camera.lens import Lenses
 from gsba.types import Counts, Keypoints, Landmarks, Solution
 
 logger = logging.getLogger(__name__)
 
-_MAX_OBSERVATIONS = 60_000  # observations that centres are found from
 _MODEL_ERROR_SHARE = 0.005  # of the distance between lenses: its error where residuals promise
 # none, as measured on rendered walks (benchmarks/results/camera.md)
 _MIN_SIGMAS = 5.0  # least distance from one centre, in standard deviations
@@ -89,12 +90,11 @@ def estimate(
     def by_centre(rows: np.ndarray, by_origin: np.ndarray, _: np.ndarray) -> np.ndarray:
         return so_far.by_centre(by_origin, keypoints.bearings_rig[rows], frames[rows])
 
-    systems, counts = models_of(landmarks, _MAX_OBSERVATIONS, keypoints, solved, context, by_centre)
-    whole = None
-    if (
-        not systems and so_far.reference_calibration is not None
-    ):  # raw pairs have two lenses, even where frames are few
-        whole = whole_model_of(landmarks, _MAX_OBSERVATIONS, keypoints, solved, context, by_centre)
+    systems, counts = models_of(landmarks, keypoints, solved, context, by_centre)
+    whole, used = None, drawn(landmarks, MAX_OBSERVATIONS, context.settings.seed)
+    # raw pairs have two lenses, even where frames are few
+    if not systems and so_far.reference_calibration is not None and used.tracks.num_points:
+        whole = model_of(used, keypoints, solved, context, by_centre)
     if not systems and whole is None:
         num = len(so_far.centre)
         unknown, nothing = np.full((num, num), np.nan), np.full(PARTS, np.nan)
@@ -164,7 +164,7 @@ def stitched_for(
         by_origin = by_origin + before * tangent_basis(bearings)
         return np.concatenate([so_far.by_centre(by_origin, directions, there), by_near], axis=2)
 
-    systems, _ = models_of(landmarks, _MAX_OBSERVATIONS, keypoints, solved, context, by_both)
+    systems, _ = models_of(landmarks, keypoints, solved, context, by_both)
     if not systems:
         return StitchRadius(so_far, 0.0, np.nan, np.full(PARTS, np.nan), "too few points")
     num = len(so_far.centre)

@@ -24,7 +24,6 @@ from gsba.types import Counts, GyroConstraints, Keypoints, Landmarks, Solution, 
 
 logger = logging.getLogger(__name__)
 
-_MAX_OBSERVATIONS = 60_000  # observations that the readout is estimated from
 _MIN_SIGMAS = 4.0  # least duration that is taken, in its standard deviations
 _ROTATION_SIGMA_RAD = np.deg2rad(0.12)  # rotation during a readout, standard deviation per axis
 _STABILISED_ROTATION_SIGMA_RAD = np.deg2rad(0.005)  # that where a stabiliser has removed it from
@@ -91,9 +90,7 @@ def estimate(
         moved = np.einsum("oij,oj->oi", by_origin, moving)
         return moved[:, :, None] * times[rows, None, :]
 
-    systems, counts = models_of(
-        landmarks, _MAX_OBSERVATIONS, keypoints, solved, context, by_duration
-    )
+    systems, counts = models_of(landmarks, keypoints, solved, context, by_duration)
     if not systems:
         return CameraEstimate(lenses, reason="too few points to tell rows apart", counts=counts)
     of_ways = [[part.of(slice(way, way + 1)) for part in systems] for way in range(len(ways))]

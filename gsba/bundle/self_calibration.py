@@ -13,12 +13,14 @@ import numpy as np
 from factors.bearing import tangent_basis
 from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.shared_parameters import (
+    MAX_OBSERVATIONS,
     PARTS,
     SharedModel,
     cross_validate,
+    drawn,
+    model_of,
     models_of,
     summed,
-    whole_model_of,
 )
 from gsba.camera.fisheye import PARAMETERS, Rig, by_parameters, changed, difference, recalibrated
 from gsba.camera.lens import Lenses
@@ -26,7 +28,6 @@ from gsba.types import Counts, Keypoints, Landmarks, Solution
 
 logger = logging.getLogger(__name__)
 
-_MAX_OBSERVATIONS = 60_000  # observations that lenses are calibrated from
 _NUM_DIRECTIONS = 500  # directions at which two calibrations are compared
 _TURN = 3  # number of the last parameters of a lens, its rotation
 OF_FRONT = PARAMETERS - _TURN  # parameters of the front lens
@@ -77,13 +78,13 @@ def estimate(
         own = by_lenses(keypoints.bearings_rig[rows], shown[rows], so_far, residuals)
         return np.concatenate([own, so_far.by_centre(by_origin, shown[rows], frames[rows])], axis=2)
 
-    systems, counts = models_of(landmarks, _MAX_OBSERVATIONS, keypoints, solved, context, by_both)
+    systems, counts = models_of(landmarks, keypoints, solved, context, by_both)
     off = from_calibrated(so_far)
     if nominal:
         whole = summed(systems) if systems else None
-        whole = whole or whole_model_of(
-            landmarks, _MAX_OBSERVATIONS, keypoints, solved, context, by_both
-        )
+        used = drawn(landmarks, MAX_OBSERVATIONS, context.settings.seed)
+        if whole is None and used.tracks.num_points:
+            whole = model_of(used, keypoints, solved, context, by_both)
         if whole is not None:
             return _of_nominal(whole, so_far, off, counts)
     if not systems:
@@ -104,9 +105,7 @@ def estimate(
         100 * float(shares.mean()),
         reason and f"; not taken: {reason}",
     )
-    lenses = so_far if reason else moved(so_far, found[:num])
-    if not reason:
-        lenses = replace(lenses, centre=so_far.centre + found[num:])
+    lenses = so_far if reason else _moved_all(so_far, found)
     return SelfCalibration(lenses, shares, reason, counts)
 
 
@@ -132,10 +131,7 @@ def _of_nominal(
         f"; hardly determined: {', '.join(loose)}" if loose else "",
         reason and f"; not taken: {reason}",
     )
-    lenses = so_far
-    if not reason:
-        lenses = moved(so_far, found[:num])
-        lenses = replace(lenses, centre=so_far.centre + found[num:])
+    lenses = so_far if reason else _moved_all(so_far, found)
     return SelfCalibration(lenses, np.full(PARTS, np.nan), reason, counts, loose)
 
 
@@ -215,6 +211,12 @@ def moved(lenses: Lenses, step: np.ndarray) -> Lenses:
     found = [changed(front, np.concatenate([steps[0], np.zeros(_TURN)]))]
     found += [changed(lens, own) for lens, own in zip(others, steps[1:], strict=True)]
     return replace(lenses, fisheyes=tuple(found))
+
+
+def _moved_all(lenses: Lenses, step: np.ndarray) -> Lenses:
+    """Lenses and their centres after a step."""
+    num = num_parameters(lenses.num_lenses)
+    return replace(moved(lenses, step[:num]), centre=lenses.centre + step[num:])
 
 
 def from_calibrated(lenses: Lenses) -> np.ndarray:

@@ -18,6 +18,7 @@ from gsba.types import Counts, Keypoints, Landmarks, Solution, Tracks
 
 BySharedParameters = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
+MAX_OBSERVATIONS = 60_000  # observations that parameters are estimated from
 PARTS = 4  # parts of the sequence: each is predicted by the others
 _LEAST_FRAMES = 2 * PARTS
 _MIN_POINTS = 50  # least number of points of a part
@@ -75,18 +76,13 @@ def drawn(landmarks: Landmarks, most: int, seed: int) -> Landmarks:
     if share >= 1:
         return landmarks
     chosen = np.random.default_rng(seed).random(tracks.num_points) < share
-    return of_points(landmarks, chosen)
+    return landmarks.of(chosen)
 
 
 def sample_counts(landmarks: Landmarks, used: Landmarks) -> Counts:
     """Counts of all observations and of those of the points that were drawn."""
     received, kept = len(landmarks.tracks), len(used.tracks)
     return Counts(received, kept, "observations", {"not in the random sample": received - kept})
-
-
-def of_points(landmarks: Landmarks, chosen: np.ndarray) -> Landmarks:
-    """Points `chosen (J,)` and their observations."""
-    return landmarks.of(chosen)
 
 
 def parts_of(landmarks: Landmarks) -> list[Landmarks]:
@@ -98,7 +94,7 @@ def parts_of(landmarks: Landmarks) -> list[Landmarks]:
     means = np.bincount(tracks.points, tracks.frames, tracks.num_points) / np.maximum(seen, 1)
     ranks = np.argsort(np.argsort(means, kind="stable"), kind="stable")
     part = ranks * PARTS // tracks.num_points
-    return [of_points(landmarks, part == p) for p in range(PARTS)]
+    return [landmarks.of(part == p) for p in range(PARTS)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,11 +135,11 @@ def weighted(
 
 def models_of(
     landmarks: Landmarks,
-    most: int,
     keypoints: Keypoints,
     solved: Solution,
     context: AdjustmentContext,
     by_shared: BySharedParameters,
+    most: int = MAX_OBSERVATIONS,
 ) -> tuple[list[SharedModel], Counts]:
     """Models of the cost of each part of the sequence, by at most so many observations.
 
@@ -161,24 +157,6 @@ def models_of(
     with ThreadPoolExecutor(context.num_threads) as pool:
         models = list(pool.map(model, parts_of(used)))
     return models, sample_counts(landmarks, used)
-
-
-def whole_model_of(
-    landmarks: Landmarks,
-    most: int,
-    keypoints: Keypoints,
-    solved: Solution,
-    context: AdjustmentContext,
-    by_shared: BySharedParameters,
-) -> SharedModel | None:
-    """Model of the cost of a sequence that is too short for parts; None = it has no points.
-
-    Args: see `models_of`.
-    """
-    used = drawn(landmarks, most, context.settings.seed)
-    if not used.tracks.num_points:
-        return None
-    return model_of(used, keypoints, solved, context, by_shared)
 
 
 def model_of(

@@ -13,6 +13,7 @@ from gsba.bundle import adjustment
 from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.observation_noise import with_scaled_noise
 from gsba.bundle.shared_parameters import (
+    MAX_OBSERVATIONS,
     PARTS,
     BySharedParameters,
     SharedModel,
@@ -30,7 +31,6 @@ logger = logging.getLogger(__name__)
 _PRIOR_SIGMAS_RAD = (1e-4, 3e-4, 1e-3, 3e-3)  # radians: a priori, of coefficients of degree 1;
 # falls with the square of the degree
 _MIN_GAIN_SHARE = 0.95  # share of the best gain: the smoothest field that reaches it is taken
-_MAX_OBSERVATIONS = 60_000  # observations that a field is found from
 _PROBE = 20_000, 4  # observations and degree of a first look: half the gain must show there
 
 
@@ -99,7 +99,7 @@ def estimate(
     """
     settings = context.settings
     chosen = settings.stitching
-    whole = _MAX_OBSERVATIONS, chosen.max_degree, _MIN_GAIN
+    whole = MAX_OBSERVATIONS, chosen.max_degree, _MIN_GAIN
     probe = _PROBE[0], min(_PROBE[1], chosen.max_degree), 0.5 * _MIN_GAIN
     now = Stitching(field, before, keypoints, 0, np.zeros(PARTS), Counts(0, 0, "observations"))
     systems, spread = [], 0.0
@@ -123,7 +123,7 @@ def estimate(
             return now
     for number in range(2):  # estimates of the field, each with a bundle adjustment
         if number:
-            systems, _ = _systems(now, _MAX_OBSERVATIONS, chosen.max_degree, context, lenses)
+            systems, _ = _systems(now, MAX_OBSERVATIONS, chosen.max_degree, context, lenses)
         field = SphereField(_fitted(systems, now.degree, spread))
         straight = corrected(sighted.keypoints, field, context.rig)
         there = replace(sighted, keypoints=lenses.seen(straight))
@@ -141,7 +141,7 @@ def _systems(
     """Models of the cost of each part of the sequence; none where there is too little."""
     there, solved = lenses.seen(corrected(now.keypoints, now.field, context.rig)), now.adjustment
     by_field = _by_field(now.keypoints, there, max_degree)
-    models, counts = models_of(solved.landmarks, most, there, solved, context, by_field)
+    models, counts = models_of(solved.landmarks, there, solved, context, by_field, most)
     return [model.around(now.field.coefficients) for model in models], counts
 
 

@@ -54,14 +54,21 @@ def match_neighbours(context: MatchContext, start: Solution) -> VerifiedPairs:
     neighbours = agreeing(found, estimates)
     scarce = np.diff(found.offsets) < SCARCE_MATCHES
     steps = chosen[:, 1] - chosen[:, 0] == 1
-    doubtful = steps & (_inlier_ratios(found, neighbours) < _MIN_INLIER_RATIO)
+    index = {(int(f0), int(f1)): p for p, (f0, f1) in enumerate(found.pairs)}
+    at = [index[int(f0), int(f1)] for f0, f1 in neighbours.matches.pairs]
+    shares = np.zeros(len(found.pairs))
+    shares[at] = np.diff(neighbours.matches.offsets)
+    doubtful = steps & (shares / np.maximum(np.diff(found.offsets), 1) < _MIN_INLIER_RATIO)
     rows = np.flatnonzero(scarce | doubtful)
     if len(rows) == 0:
         return neighbours
     again = context.match(chosen[rows], world_T_rigs, [PRIOR_GATE] * len(rows))
     for p, estimate in zip(rows, _estimates(again, PRIOR_GATE, context), strict=True):
         estimates[p] = estimate
-    return agreeing(_with_replaced(found, rows, again), estimates)
+    each = [found.of(p) for p in range(len(found.pairs))]
+    for n, p in enumerate(rows):
+        each[p] = again.of(n)
+    return agreeing(Matches.of_rows(found.pairs, each), estimates)
 
 
 def match_loops(context: MatchContext, solved: Solution) -> VerifiedPairs:
@@ -201,23 +208,6 @@ def _estimates(found: Matches, gate: Gate, context: MatchContext) -> list[Relati
     return verification.estimate_relative_poses(
         found, context.keypoints, verify, seed, context.workers, chances
     )
-
-
-def _inlier_ratios(found: Matches, kept: VerifiedPairs) -> np.ndarray:
-    """Inlier ratio (P,) of each pair's matches under its relative pose; 0 for pairs dropped."""
-    index = {(int(f0), int(f1)): p for p, (f0, f1) in enumerate(found.pairs)}
-    rows = [index[int(f0), int(f1)] for f0, f1 in kept.matches.pairs]
-    shares = np.zeros(len(found.pairs))
-    shares[rows] = np.diff(kept.matches.offsets)
-    return shares / np.maximum(np.diff(found.offsets), 1)
-
-
-def _with_replaced(matches: Matches, indices: np.ndarray, others: Matches) -> Matches:
-    """Matches with the rows of some pairs replaced."""
-    rows = [matches.of(p) for p in range(len(matches.pairs))]
-    for n, p in enumerate(indices):
-        rows[p] = others.of(n)
-    return Matches.of_rows(matches.pairs, rows)
 
 
 def match_for_rotations(context: MatchContext, world_T_rigs: np.ndarray) -> Matches:

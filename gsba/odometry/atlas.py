@@ -248,7 +248,12 @@ def new_corners(
     faces = (v // layout.rig.size) * 3 + u // layout.rig.size
     bearings = layout.bearings(np.stack([u, v], axis=1).astype(float), faces)
     cells = cells_of(bearings, _PER_SIDE)
-    kept = _strongest(cells, 1 - taken)  # features in a cell, including followed ones
+    room = 1 - taken
+    ranked = np.argsort(cells, kind="stable")
+    starts = np.searchsorted(cells[ranked], np.arange(len(room)))
+    rank = np.empty(len(cells), int)
+    rank[ranked] = np.arange(len(cells)) - starts[cells[ranked]]
+    kept = np.flatnonzero(rank < room[cells])  # features in a cell, including followed ones
     kept = kept[_apart(np.stack([u, v], axis=1)[kept])]
     return bearings[kept] @ atlas.cut_R_rig
 
@@ -265,15 +270,6 @@ def _block(peaks: np.ndarray, layout: AtlasLayout, along: np.ndarray) -> None:
     for u, v in np.rint(layout.pixels(along, faces)).astype(int):
         top, left = max(v - _APART_PX, 0), max(u - _APART_PX, 0)
         peaks[top : v + _APART_PX + 1, left : u + _APART_PX + 1] = False
-
-
-def _strongest(cells: np.ndarray, room: np.ndarray) -> np.ndarray:
-    """Rows (N',) of the first `room[cell]` entries of each cell (N,), given in falling order."""
-    order = np.argsort(cells, kind="stable")
-    starts = np.searchsorted(cells[order], np.arange(len(room)))
-    rank = np.empty(len(cells), int)
-    rank[order] = np.arange(len(cells)) - starts[cells[order]]
-    return np.flatnonzero(rank < room[cells])
 
 
 def _apart(pixels: np.ndarray) -> np.ndarray:
