@@ -100,6 +100,9 @@ def _find_lenses(state: State, sought: Sequence[int], prefix: str) -> State:
         for camera in left:
             name = f"{prefix}lenses{n}"
             centres = _from_features(trial, name, camera, _Rays.centres, LensCentres, noted=True)
+            if centres.reason and camera not in raw:
+                name = _named(run, f"{prefix}rows{n}", camera)
+                centres = _kept_for_rows(trial, centres, name, camera)
             map_, lenses[camera] = map_.changed(camera, centres=centres), centres.lenses
         left = [camera for camera in left if lenses[camera]]
         if not left:
@@ -113,8 +116,31 @@ def _find_lenses(state: State, sought: Sequence[int], prefix: str) -> State:
     for camera in left:
         map_ = map_.changed(camera, axes=guesses.get(camera))
     trial = replace(trial, map=replace(map_, solution=trial.solution))
-    trial = _with_stitch_radii(trial, [camera for camera in left if camera not in raw], prefix)
+    apart = [c for c in left if c not in raw and not _in_one_place(map_, c)]  # as no radius shows
+    trial = _with_stitch_radii(trial, apart, prefix)
     return _calibrate_raw(trial, [camera for camera in left if camera in raw])
+
+
+def _in_one_place(map_: Map, camera: int) -> bool:
+    """True if the lenses of a camera are kept for their rows alone."""
+    centres = map_.cameras[camera].centres
+    return centres is not None and bool(centres.reason)
+
+
+def _kept_for_rows(trial: State, centres: LensCentres, name: str, camera: int) -> LensCentres:
+    """Centres that were not taken, kept where rows are read one after another.
+
+    Mirrors and prisms can put both lenses in about one place: one centre then explains what they
+    see, one instant does not. Their estimated centres are kept, about zero, with their covariance,
+    and the reason why they were not taken. A camera whose lenses are known to be apart has rows
+    only if it has these.
+    """
+    if trial.run.settings_of(camera).baseline() is not None:
+        return centres
+    read = _from_features(trial, name, camera, _Rays.readout, CameraEstimate)
+    if read.reason:
+        return centres
+    return replace(centres, lenses=replace(centres.lenses, centre=centres.found))
 
 
 def _with_stitch_radii(start: State, stitched: Sequence[int], prefix: str) -> State:

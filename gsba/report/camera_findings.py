@@ -59,6 +59,8 @@ def of_camera(
         return content, notes
     which = "two" if centres.lenses.num_lenses == 2 else "first two"
     notes.append(f"the {which} lenses are {length:.5g} map units apart (sigma {sigma:.1g})")
+    if centres.reason:
+        notes[-1] += ": in one place; but rows are read one after another"
     if baseline is not None:
         metres, of_metres = metres_per_unit((length, sigma), baseline)
         content |= {"metres_per_unit": metres, "metres_per_unit_sigma": of_metres}
