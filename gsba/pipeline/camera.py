@@ -101,8 +101,7 @@ def _find_lenses(state: State, sought: Sequence[int], prefix: str) -> State:
             name = f"{prefix}lenses{n}"
             centres = _from_features(trial, name, camera, _Rays.centres, LensCentres, noted=True)
             if centres.reason and camera not in raw:
-                name = _named(run, f"{prefix}rows{n}", camera)
-                centres = _kept_for_rows(trial, centres, name, camera)
+                centres = _kept_for_rows(trial, centres, f"{prefix}rows{n}", camera)
             map_, lenses[camera] = map_.changed(camera, centres=centres), centres.lenses
         left = [camera for camera in left if lenses[camera]]
         if not left:

@@ -58,9 +58,10 @@ def of_camera(
             notes.append(f"two lenses were not found: no scale by the baseline: {centres.reason}")
         return content, notes
     which = "two" if centres.lenses.num_lenses == 2 else "first two"
-    notes.append(f"the {which} lenses are {length:.5g} map units apart (sigma {sigma:.1g})")
+    where = f"{length:.5g} map units apart (sigma {sigma:.1g})"
     if centres.reason:
-        notes[-1] += ": in one place; but rows are read one after another"
+        where = f"in one place ({where}), kept because rows are read one after another"
+    notes.append(f"the {which} lenses are {where}")
     if baseline is not None:
         metres, of_metres = metres_per_unit((length, sigma), baseline)
         content |= {"metres_per_unit": metres, "metres_per_unit_sigma": of_metres}

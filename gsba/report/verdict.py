@@ -341,5 +341,7 @@ def _camera(report: Mapping[str, Any]) -> str:
     metres, readout = found.get("metres_per_unit"), found.get("readout") or {}
     unit, scale = ("mm", 1e3 * metres) if metres else ("map units", 1.0)
     text = f"two lenses {scale * found['baseline']:.3g} {unit} apart"
+    if found["reason"]:  # kept for their rows
+        text = "two lenses in one place"
     rows = f", rows read in {readout['ms']:.3g} ms" if readout.get("ms") else ""
     return text + rows if readout.get("taken") else text

@@ -49,11 +49,13 @@ def test_a_good_map_is_said_to_be_good_in_a_sentence() -> None:
 
 
 def test_lengths_are_metres_where_the_scale_is_known_and_the_camera_is_named() -> None:
-    camera = {"taken": True, "baseline": 0.052, "metres_per_unit": 0.6}
+    camera = {"taken": True, "reason": "", "baseline": 0.052, "metres_per_unit": 0.6}
     camera |= {"readout": {"taken": True, "ms": 13.24}}
     sentence = _verdict(replace(GOOD, extent_metres=11.0), camera=camera).sentence
     assert "up to 4.4 mm (0.04 % of the path's extent)" in sentence
     assert sentence.endswith("; two lenses 31.2 mm apart, rows read in 13.2 ms")
+    for_rows = _verdict(GOOD, camera=camera | {"reason": "one centre is as likely"}).sentence
+    assert for_rows.endswith("; two lenses in one place, rows read in 13.2 ms")
     one = _verdict(GOOD, camera={"taken": False}).sentence
     assert one.endswith("; the camera has one centre")
 
