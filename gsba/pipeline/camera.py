@@ -100,8 +100,6 @@ def _find_lenses(state: State, sought: Sequence[int], prefix: str) -> State:
         for camera in left:
             name = f"{prefix}lenses{n}"
             centres = _from_features(trial, name, camera, _Rays.centres, LensCentres, noted=True)
-            if centres.reason and camera not in raw:
-                centres = _kept_for_rows(trial, centres, f"{prefix}rows{n}", camera)
             map_, lenses[camera] = map_.changed(camera, centres=centres), centres.lenses
         left = [camera for camera in left if lenses[camera]]
         if not left:
@@ -124,22 +122,6 @@ def _in_one_place(map_: Map, camera: int) -> bool:
     """True if the lenses of a camera are kept for their rows alone."""
     centres = map_.cameras[camera].centres
     return centres is not None and bool(centres.reason)
-
-
-def _kept_for_rows(trial: State, centres: LensCentres, name: str, camera: int) -> LensCentres:
-    """Centres that were not taken, kept where rows are read one after another.
-
-    Mirrors and prisms can put both lenses in about one place: one centre then explains what they
-    see, one instant does not. Their estimated centres are kept, about zero, with their covariance,
-    and the reason why they were not taken. A camera whose lenses are known to be apart has rows
-    only if it has these.
-    """
-    if trial.run.settings_of(camera).baseline() is not None:
-        return centres
-    read = _from_features(trial, name, camera, _Rays.readout, CameraEstimate)
-    if read.reason:
-        return centres
-    return replace(centres, lenses=replace(centres.lenses, centre=centres.found))
 
 
 def _with_stitch_radii(start: State, stitched: Sequence[int], prefix: str) -> State:
@@ -418,7 +400,18 @@ class _Rays:
         return lens_axes.loosened(*self._map, self.context)
 
     def centres(self) -> LensCentres:
-        return lens_centres.estimate(*self._map, self.context)
+        """Centres of the lenses, kept about zero, too, if rows are read one after another.
+
+        Mirrors and prisms can put both lenses in about one place: one centre then explains what
+        they see, one instant does not. Estimated centres are kept with the reason why they were not
+        taken. A camera whose lenses are known to be apart has rows only if it has these.
+        """
+        found = lens_centres.estimate(*self._map, self.context)
+        known = self.state.run.settings_of(self.number).baseline() is not None
+        raw = self.camera.lenses.reference_calibration is not None
+        if not found.reason or known or raw or self.readout().reason:
+            return found
+        return replace(found, lenses=replace(found.lenses, centre=found.found))
 
     def stitch_radius(self) -> StitchRadius:
         return lens_centres.stitched_for(*self._pictured_map, self.context)

@@ -58,7 +58,6 @@ _TITLES = {
     "closed": "adjust with loops closed",
     "axes": "choose lens axes",
     "lenses+": "estimate lens centres, round {0}",
-    "rows+": "estimate the readout of lenses in one place, round {0}",
     "lensed+": "adjust under two lenses, round {0}",
     "stitch_radius": "estimate the stitching radius",
     "stitch_radius_tried": "judge the stitching radius on trial",

@@ -1,6 +1,6 @@
 """Lenses in about one place, whose rows are read one after another: kept for their rows."""
 
-from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -12,6 +12,7 @@ from gsba.config import CameraSettings
 from gsba.pipeline import camera
 from gsba.types import Counts
 
+ONE = Lenses()
 FOUND = np.array([1e-5, 0.0, 2e-5])
 CENTRES = LensCentres(
     Lenses(),
@@ -23,11 +24,15 @@ CENTRES = LensCentres(
 )
 
 
-def _kept(monkeypatch: pytest.MonkeyPatch, reason: str, settings: CameraSettings) -> LensCentres:
+def _kept(
+    monkeypatch: pytest.MonkeyPatch, reason: str, settings: CameraSettings, lenses: Lenses = ONE
+) -> LensCentres:
     read = CameraEstimate(Lenses(), reason=reason)
-    monkeypatch.setattr(camera, "_from_features", lambda *_: read)
-    trial = SimpleNamespace(run=SimpleNamespace(settings_of=lambda _: settings))
-    return camera._kept_for_rows(trial, CENTRES, "rows0", 0)  # type: ignore[arg-type]
+    monkeypatch.setattr(camera._Rays, "readout", lambda _: read)
+    monkeypatch.setattr(camera.lens_centres, "estimate", lambda *_: CENTRES)
+    state = MagicMock()
+    state.run.settings_of = lambda _: settings
+    return camera._Rays(*3 * [MagicMock()], CameraEstimate(lenses), 0, state).centres()
 
 
 def test_a_readout_keeps_estimated_centres_and_the_reason(monkeypatch) -> None:
@@ -42,3 +47,8 @@ def test_one_centre_stays_without_a_readout(monkeypatch) -> None:
 
 def test_lenses_that_settings_put_apart_are_not_kept_for_rows(monkeypatch) -> None:
     assert _kept(monkeypatch, "", CameraSettings(baseline_mm=32.0)) is CENTRES
+
+
+def test_raw_lenses_that_are_not_told_apart_stay_so(monkeypatch) -> None:
+    raw = Lenses(np.zeros(3), reference_calibration=MagicMock())
+    assert _kept(monkeypatch, "", CameraSettings(), raw) is CENTRES
