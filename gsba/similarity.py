@@ -12,7 +12,8 @@ from gsba.geometry import nearest_rotation, pose
 from gsba.log import GsbaError
 
 _MIN_CORRELATION = 1e-6  # smallest correlation of positions that leaves a positive scale
-_NUM_DRAWS, _SEED = 500, 0  # samples of the least median of squares
+_MIN_DRAWS, _MAX_DRAWS, _SEED = 50, 500, 0  # samples of a robust similarity
+_MISS_CHANCE = 1e-9  # that all samples hold outliers, for a share of inliers as large as found
 _MIN_INLIER_CORRELATION = 0.5  # smallest correlation of inliers with their transformed positions
 _MEDIAN_LENGTH = 1.538  # median length of a 3-vector of independent unit normals
 _OUTLIER_SIGMAS = 4.6  # 99.99% of such vectors are shorter
@@ -157,9 +158,11 @@ def robust_similarity(
         NoSimilarityError: too few agree, or the inliers of both worlds are barely correlated.
     """
     rng, reach = np.random.default_rng(_SEED), drift * extent_of(source)
-    best, fit = np.inf, None
-    draws = (rng.choice(len(source), num_needed, replace=False) for _ in range(_NUM_DRAWS))
-    for draw in draws if len(source) > num_needed else [np.arange(len(source))]:
+    best, fit, enough = np.inf, None, float(_MAX_DRAWS)
+    draws = (rng.choice(len(source), num_needed, replace=False) for _ in range(_MAX_DRAWS))
+    for n, draw in enumerate(draws if len(source) > num_needed else [np.arange(len(source))]):
+        if n >= max(enough, _MIN_DRAWS):
+            break
         try:
             candidate = solve(source[draw], target[draw])
         except NoSimilarityError:
@@ -168,6 +171,8 @@ def robust_similarity(
         loss = float(np.sum(np.minimum(shares**2, 1.0)))
         if loss < best:
             best, fit = loss, candidate
+            spoilt = 1 - float(np.mean(shares <= 1)) ** num_needed  # chance that a sample is
+            enough = np.log(_MISS_CHANCE) / np.log(np.clip(spoilt, 1e-300, 1 - 1e-12))
     fit = fit or solve(source, target)
     extent = extent_of(target)
     used = np.ones(len(source), bool)
