@@ -24,7 +24,6 @@ from factors.robust import RobustLoss
 from factors.threads import balanced_ranges, map_in_threads, run_in_threads
 
 _POLISH_TOLERANCE = 1e-6  # of a landmark's cost: further steps gain less than the others do
-_FLATTEST = 0.3  # part of a robust loss's weights that its curvature is taken for, at least
 
 
 class CameraBlock:
@@ -107,7 +106,7 @@ class CameraBlock:
             self._point_costs[first:last] = np.bincount(owners, losses, last - first)
             weights += float(self.loss.weights(squares).sum())
             bent += float(curvatures.sum())
-        stretch = max(bent / max(weights, 1e-300), _FLATTEST) if self.curved else 1.0
+        stretch = max(bent / max(weights, 1e-300), 0.3) if self.curved else 1.0
         return self._in_blocks(sums, stretch, float(self._point_costs.sum()))
 
     def products(self) -> None:

@@ -17,7 +17,6 @@ from factors.schur_complement import (
 )
 
 _MIN_GROUP_SIZE = 4  # least frames of a group
-_MAX_GROUPS = 640  # number of groups whose dense system is factorized within seconds
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +71,8 @@ def covisible_groups(num: int, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -
         least = np.partition(weights, len(weights) - most)[len(weights) - most]
         rows, weights = rows[weights >= least], weights[weights >= least]
     rows = rows[np.argsort(-weights, kind="stable")].astype(np.int64)
-    size = max(_MIN_GROUP_SIZE, -(-num // _MAX_GROUPS))
+    # groups whose dense system is factorized within seconds
+    size = max(_MIN_GROUP_SIZE, -(-num // 640))
     labels, sizes = np.arange(num), np.ones(num, np.int64)
     merge_capped(rows[:, 0].copy(), rows[:, 1].copy(), size, labels, sizes)
     labels[totals == 0] = -1

@@ -11,10 +11,6 @@ from factors.iterative_system import IterativeSystem, conjugate_gradients, multi
 from factors.reduced_camera_system import STEP_TOLERANCE, ReducedSystem
 from factors.system_layout import SystemLayout
 
-_OPERATIONS_PER_BYTE = 4.0  # operations of a core on dense blocks in the time of reading a byte
-_MIN_ITERATIONS = 10  # conjugate-gradient iterations that must be cheaper than half a
-# factorization
-
 
 class DirectSystem(ReducedSystem):
     """Normal equations that are written out and factorized.
@@ -29,8 +25,9 @@ class DirectSystem(ReducedSystem):
         self._cholesky = BlockCholesky(layout.num, self._pairs)
         self._factorized = False  # True if the Cholesky factor is of an earlier system
         bytes_read = 8 * (2 * self._cholesky.num_entries + DIM * DIM * len(self._pairs))
-        cheaper = self.num_operations / (2 * _OPERATIONS_PER_BYTE * max(bytes_read, 1))
-        self._max_iterations = int(cheaper) if cheaper >= _MIN_ITERATIONS else 0
+        # a core does 4 operations on dense blocks in the time of reading a byte
+        cheaper = self.num_operations / (8.0 * max(bytes_read, 1))
+        self._max_iterations = int(cheaper) if cheaper >= 10 else 0
 
     @property
     def num_operations(self) -> float:

@@ -30,10 +30,8 @@ from factors.schur_complement import SchurComplement, project_visits
 from factors.threads import balanced_ranges, map_in_threads, run_in_threads
 
 _POLISH_TOLERANCE = 1e-12  # part of a landmark's cost
-_HOST_POLISH_STEPS = 50  # at each evaluation: an error is a function of the poses alone
 _MAX_VISITS_AT_ONCE = 1 << 17  # visits of landmarks that are eliminated together: 19 MB
 _MIN_THREAD_OBSERVATIONS = 1 << 14  # least observations that a thread accumulates on its own
-_PROPOSAL_TOLERANCE = 1e-6  # part of a landmark's cost below which further steps are skipped
 
 
 class LandmarkBlock:
@@ -159,7 +157,7 @@ class LandmarkBlock:
         if self._poses is None:
             raise RuntimeError("propose() needs linearize() before it")
         poses, steps = pose_rows(values, self.keys), np.ascontiguousarray(steps)
-        return self._move(poses, self._poses, steps, self.polish_steps, _PROPOSAL_TOLERANCE)
+        return self._move(poses, self._poses, steps, self.polish_steps, 1e-6)
 
     def accept(self) -> None:
         """Keep the landmarks of the last proposal."""
@@ -240,7 +238,7 @@ class LandmarkBlock:
             start, no_steps = self._points[first:last], np.zeros((num, 6))
             points, costs = np.empty_like(start), np.empty(last - first)
             polish_range(
-                0, last - first, local, start, poses, poses, no_steps, False, _HOST_POLISH_STEPS,
+                0, last - first, local, start, poses, poses, no_steps, False, 50,
                 _POLISH_TOLERANCE, costs, points, costs,
             )  # fmt: skip
             if not with_system:

@@ -25,7 +25,6 @@ REASONS = {
     FAR: "found too far off",
     UNSTEADY: "no convergence",
 }  # state of a sighting -> reason of its rejection
-_NO_MASK = np.zeros((0, 0), dtype=np.bool_)
 
 
 class PatchSet:
@@ -136,7 +135,7 @@ class PatchSet:
 
 def _usable(mask: np.ndarray | None) -> np.ndarray:
     """A mask as the kernels are compiled for: one that cannot be written to is copied."""
-    return _NO_MASK if mask is None else np.require(mask, bool, ["C", "W"])
+    return np.zeros((0, 0), dtype=np.bool_) if mask is None else np.require(mask, bool, ["C", "W"])
 
 
 def expect(templates: np.ndarray, origins: np.ndarray, spreads: np.ndarray) -> Sightings:

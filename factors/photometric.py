@@ -19,7 +19,6 @@ from factors.robust import RobustLoss
 from factors.threads import balanced_ranges, run_in_threads
 
 FAMILY = "photometric"
-_MIN_DEPTH_SHARE = 0.2  # least share of its inverse depth that a step leaves a patch
 _MIN_THREAD_OBSERVATIONS = 128  # least observations of a thread
 _MIN_CONTRAST = 1.0  # least standard deviation of a template's grey values
 
@@ -331,7 +330,7 @@ class PhotometricBlock:
 
     def _stepped(self, planes: np.ndarray, steps: np.ndarray) -> np.ndarray:
         """Planes after steps, shortened if they would lead behind the host."""
-        room = (1 - _MIN_DEPTH_SHARE) * planes[:, 0]
+        room = 0.8 * planes[:, 0]
         share = np.minimum(1.0, room / np.maximum(-steps[:, 0], 1e-300))
         return planes + share[:, None] * np.where(np.isfinite(steps), steps, 0.0)
 

@@ -15,7 +15,6 @@ from factors.compiled import kernel_and_part
 
 _MAX_STEPS = 20  # fixed-point steps that invert a field; each reduces the error by the field's
 # slope
-_CONVERGED_STEP = 1e-12  # step of a direction below which iteration ends
 
 _kernel, _part = kernel_and_part()
 
@@ -104,7 +103,7 @@ class SphereField:
             off = directions - self.corrected(found)
             found = found + off
             found = found / np.linalg.norm(found, axis=-1, keepdims=True)
-            if np.abs(off).max(initial=0.0) < _CONVERGED_STEP:
+            if np.abs(off).max(initial=0.0) < 1e-12:
                 break
         return found
 

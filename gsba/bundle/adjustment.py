@@ -32,8 +32,6 @@ from gsba.types import (
     Tracks,
 )
 
-_CHUNK = 1 << 17  # observations whose residuals are made at a time: 20 MB
-
 
 @dataclass(frozen=True, slots=True)
 class DivisibleMap:
@@ -54,7 +52,7 @@ class DivisibleMap:
     def chunks(self) -> Iterator[tuple[np.ndarray, Sequence[Term]]]:
         """Landmarks (J, 3) and their terms, a few of them at a time."""
         landmarks = self.landmarks
-        for points, _, own in runs(landmarks.tracks, _CHUNK):
+        for points, _, own in runs(landmarks.tracks, 1 << 17):  # 20 MB
             some = Landmarks(landmarks.points_world[points], own, landmarks.counts)
             yield some.points_world, self.terms_of(some)
             release_mapped_files()

@@ -19,9 +19,6 @@ from gsba.bundle.readout import CameraEstimates
 from gsba.types import JointErrors, Keypoints, Solution
 
 _DAMPING = 1e-6
-_MAX_GYRO_SQUARES = 4.0  # largest median square of a gyro's errors, in variances of the motion
-_MAX_UNEXPLAINED_SHARE = 0.5  # largest share of the rotations by images that a gyro further off may
-# leave unexplained
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,8 +97,8 @@ class CameraSystem:
             return False
         seen = motion[told, :3]  # rotations are own motion alone: velocities of poses give none
         off = seen - camera.readout_s * rates[told]
-        near = np.median(off**2 / variances[told, :3]) < _MAX_GYRO_SQUARES
-        return bool(near or np.sum(off**2) < _MAX_UNEXPLAINED_SHARE * np.sum(seen**2))
+        near = np.median(off**2 / variances[told, :3]) < 4.0  # variances of the motion
+        return bool(near or np.sum(off**2) < 0.5 * np.sum(seen**2))
 
     def _unknowns(self) -> CameraUnknowns:
         poses = self.solved.world_T_rigs

@@ -10,8 +10,6 @@ from gsba.geometry import furthest
 from gsba.types import JointErrors
 from gsba.types.records import slices
 
-_COMMON_RATIO = 1.7  # standard deviation of common errors over that of the others
-_SMOOTHING_FRAMES = 3.0  # frames, standard deviation of their smoothing
 _AT_ONCE = 20  # errors drawn of all poses, in float64
 
 
@@ -51,9 +49,8 @@ def _in_common(
     for rows in parts:
         if len(rows) > 1:
             turned = [rotations[rows] @ draws[:, rows, part, None] for part in _PARTS]
-            smooth = gaussian_filter1d(
-                np.concatenate(turned, axis=2)[..., 0], _SMOOTHING_FRAMES, axis=1
-            )
+            # frames, standard deviation
+            smooth = gaussian_filter1d(np.concatenate(turned, axis=2)[..., 0], 3.0, axis=1)
             positions = world_T_rigs[rows, :3, 3]
             offsets = positions - positions[0]
             far, distance = furthest(positions)
@@ -64,7 +61,8 @@ def _in_common(
             held = np.concatenate([turns - turns[:, :1], shifts], axis=-1)
             back = np.swapaxes(rotations[rows], 1, 2)
             turned = [back @ held[:, :, part, None] for part in _PARTS]
-            errors[:, rows] = _COMMON_RATIO * np.concatenate(turned, axis=2)[..., 0]
+            # standard deviation over that of the other errors
+            errors[:, rows] = 1.7 * np.concatenate(turned, axis=2)[..., 0]
     return errors
 
 

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 
 WHITE_SHARE = 0.1  # of the variance of a fix: independent from fix to fix, the rest lasts
-_UNTIMED_STEP = 0.5  # correlation times between fixes whose times are not known
 _MEDIAN_LENGTH = 1.538  # median length of a 3-vector of independent unit normals
 _OUTLIER_SIGMAS = 4.6  # 99.99 % of such vectors are shorter
 # Largest ratio of the true noise of fixes to the claimed one. Claims hold under an open sky: with
@@ -87,7 +86,7 @@ class FrameFixes:
     def correlations(self) -> np.ndarray:
         """Correlation (G - 1,) of the lasting part of the errors of each fix and the next."""
         if self.times is None:
-            return np.full(max(len(self) - 1, 0), np.exp(-_UNTIMED_STEP))
+            return np.full(max(len(self) - 1, 0), np.exp(-0.5))  # correlation times between fixes
         return np.exp(-np.diff(self.times) / self.correlation_s)
 
     def whitened(self, columns: np.ndarray) -> np.ndarray:

@@ -27,9 +27,7 @@ from gsba.types import Counts, Keypoints, Landmarks, Solution
 
 logger = logging.getLogger(__name__)
 
-_YAWS_RAD = np.deg2rad([0.0, 45, 90, 135])  # of the line through both lenses, tried at first
 TURNS = np.deg2rad([0.5, 1.5, 5.0])  # prior standard deviations of a frame's turn
-_MIN_STEP_SHARE = 0.1  # part of a typical step, below which a frame counts as standing
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,7 +157,7 @@ def _candidates(world_T_rigs: np.ndarray) -> list[np.ndarray]:
     return [
         upright(directions @ Rotation.from_rotvec([0, yaw, 0]).as_matrix().T)
         for directions in (fixed, _headings(world_T_rigs))
-        for yaw in _YAWS_RAD
+        for yaw in np.deg2rad([0.0, 45, 90, 135])
     ]
 
 
@@ -169,7 +167,8 @@ def _headings(world_T_rigs: np.ndarray) -> np.ndarray:
     before, after = np.maximum(np.arange(num) - 1, 0), np.minimum(np.arange(num) + 1, num - 1)
     moved = world_T_rigs[after, :3, 3] - world_T_rigs[before, :3, 3]
     lengths = np.linalg.norm(moved, axis=1)
-    going = np.flatnonzero(lengths > _MIN_STEP_SHARE * np.median(lengths))
+    # shorter steps are of a frame that stands
+    going = np.flatnonzero(lengths > 0.1 * np.median(lengths))
     if not len(going):
         return np.tile([0.0, 0, 1], (num, 1))
     nearest = going[np.abs(np.arange(num)[:, None] - going).argmin(axis=1)]

@@ -15,10 +15,6 @@ from gsba.types.records import slices, spread_rows
 
 MAX_SCALE_SIGMA = 8e-4  # relative, of two successive baselines' ratio; frames above it are weak
 _REACH = 2  # frames before and after a weak one that count as weak
-_MAX_HELD_SHARE = 0.25  # largest share of a prior's standard deviation in any direction: the prior
-# then weighs 6 %
-_MIN_HELD_STEPS = 8  # least number of held steps from which the trajectory's noise is estimated
-_SHIFTED_POINTS = 24  # points of a frame whose shift in the next one is computed
 _DRAWS_AT_ONCE = 50  # errors drawn of all poses, in float64
 _MIN_NOISE_RATIO = 0.1  # least estimate, part of the settings' noise
 
@@ -133,7 +129,7 @@ def neighbour_shifts(result: Reconstruction) -> np.ndarray:
     for f, seen in enumerate(result.observations_by_frame()[:-1]):
         if not len(seen):
             continue
-        rows = seen[spread_rows(len(seen), min(len(seen), _SHIFTED_POINTS))]
+        rows = seen[spread_rows(len(seen), min(len(seen), 24))]
         points, moved = result.points_world[result.observation_points[rows]], []
         for frame in (f, f + 1):
             at_rig = (points - poses[frame, :3, 3]) @ poses[frame, :3, :3]
@@ -172,14 +168,15 @@ def _held(
     found = found / allowed[:, :, None] / allowed[:, None, :]
     known = np.isfinite(found).all(axis=(1, 2))
     found[~known] = np.eye(6)
-    return known & (np.linalg.eigvalsh(found)[:, -1] < _MAX_HELD_SHARE**2)
+    # of the prior's sigma: it then weighs 6 %
+    return known & (np.linalg.eigvalsh(found)[:, -1] < 0.25**2)
 
 
 def _noise(
     world_T_rigs: np.ndarray, coarse: np.ndarray, held: np.ndarray, priors: PriorSettings
 ) -> StepNoise | None:
     """Robust spread of the trajectory's steps about those that the images hold."""
-    if np.count_nonzero(held) < _MIN_HELD_STEPS:
+    if np.count_nonzero(held) < 8:
         return None
     found, given = (inverse(some[:-1])[held] @ some[1:][held] for some in (world_T_rigs, coarse))
     turned = rotation_angle(np.swapaxes(given[:, :3, :3], 1, 2) @ found[:, :3, :3])

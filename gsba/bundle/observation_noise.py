@@ -14,8 +14,6 @@ from gsba.types import Keypoints, Landmarks, Tracks
 from gsba.types.records import slices
 
 _kernel, _part = kernel_and_part()
-_MIN_INFORMATION_SHARE = 1e-12  # of a point's information, added to it, as depth may be unknown
-_MIN_RESIDUAL_SHARE = 1e-3  # least share of a residual that its point cannot absorb
 
 
 @_kernel
@@ -88,7 +86,7 @@ def _by_point(o, point, pose, bearings, roots, origins, row):
 @_part
 def _inverse(normal):
     """Inverse (00 01 02 11 12 22) of a symmetric 3x3 in this form, its diagonal raised a little."""
-    added = _MIN_INFORMATION_SHARE * (normal[0] + normal[3] + normal[5]) + 2.3e-308
+    added = 1e-12 * (normal[0] + normal[3] + normal[5]) + 2.3e-308  # as depth may be unknown
     a, b, c = normal[0] + added, normal[1], normal[2]
     d, e, f = normal[3] + added, normal[4], normal[5] + added
     l00 = np.sqrt(a)
@@ -130,7 +128,7 @@ def _along(row, covariance):
     length = np.sqrt(x * x + y * y)
     x, y = (x / length, y / length) if length > 0 else (0.0, 1.0)
     left = 0.5 * (a + d) + radius
-    return (x * row[0] + y * row[1]) / np.sqrt(max(left, _MIN_RESIDUAL_SHARE))
+    return (x * row[0] + y * row[1]) / np.sqrt(max(left, 1e-3))
 
 
 _MIN_COSINE, _MIN_LENGTH = 0.1, 1e-12
@@ -175,7 +173,6 @@ def _face_root(o, bearings, axes, faces, sigmas, out):
 
 
 _AT_ONCE = 1 << 18  # keypoints whose noise is scaled together: 17 MB
-_MIN_REDUNDANCY = 0.1  # least share of residual dimensions beyond the unknowns
 
 
 def observation_noise(
@@ -209,7 +206,8 @@ def observation_noise(
     for _ in map_runs(work, tracks, num_threads):
         pass
     unknowns = 6 * len(world_T_rigs)
-    redundancy = max(1 - unknowns / max(2 * num - 3 * tracks.num_points, 1), _MIN_REDUNDANCY)
+    # least share of residual dimensions
+    redundancy = max(1 - unknowns / max(2 * num - 3 * tracks.num_points, 1), 0.1)
     kept = spread[chosen]
     np.abs(kept, out=kept)
     return float(1.4826 * np.median(kept, overwrite_input=True) / np.sqrt(redundancy))

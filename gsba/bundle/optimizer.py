@@ -20,9 +20,6 @@ from gsba.types import Iteration, JointErrors
 logger = logging.getLogger(__name__)
 
 _MAX_DAMPING = 1e10
-_MIN_DAMPING = 1e-12
-_FREE_DAMPING = 1e-6  # part of the diagonal; a small step says nothing about convergence where
-# damping made it small, and a long chain of frames bends by modes this weak
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +51,7 @@ class _Damping:
 
     def lower(self, ratio: float) -> None:
         """Lower after a step whose decrease was `ratio` of the predicted one."""
-        self.value = max(self.value * max(0.1, 1 - (2 * ratio - 1) ** 3), _MIN_DAMPING)
+        self.value = max(self.value * max(0.1, 1 - (2 * ratio - 1) ** 3), 1e-12)
         self.growth = 2.0
 
 
@@ -188,7 +185,9 @@ def minimize(
         system.accept(trial)
         values, decrease = trial, cost - trial_cost
         damping.lower(decrease / predicted if predicted > 0 else 1.0)
-        converged = decrease <= negligible and used <= _FREE_DAMPING
+        # a small step says nothing about convergence where damping made it small, and a long chain
+        # of frames bends by modes of 1e-6 of the diagonal
+        converged = decrease <= negligible and used <= 1e-6
         costs = system.costs(values) if converged else system.linearize(values)
         cost = sum(costs.values())
         history.add(values, cost, costs, used, True)

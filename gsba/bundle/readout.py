@@ -26,13 +26,8 @@ logger = logging.getLogger(__name__)
 
 _MIN_SIGMAS = 4.0  # least duration that is taken, in its standard deviations
 _ROTATION_SIGMA_RAD = np.deg2rad(0.12)  # rotation during a readout, standard deviation per axis
-_STABILISED_ROTATION_SIGMA_RAD = np.deg2rad(0.005)  # that where a stabiliser has removed it from
-# every row
-_TRANSLATION_SIGMA_SHARE = 0.3  # standard deviation of a translation about that by the velocity,
-# part of a typical translation
 _ROW_SCALE_SIGMA = 0.03  # relative; the distortion and field of view of lenses, which give the
 # number of rows between two directions, are not known from a stitched picture
-_MIN_PAUSE_INTERVALS = 50.0  # median intervals between frames; a longer one is a pause
 _AXES = np.eye(3)[:2]
 
 
@@ -132,8 +127,9 @@ def own_sigmas(found: CameraEstimate, motion: np.ndarray) -> np.ndarray:
     if found.own_sigmas is not None:
         return found.own_sigmas
     likely = found.readout_s * np.linalg.norm(motion[:, 3:], axis=1)
-    move = max(_TRANSLATION_SIGMA_SHARE * float(np.median(likely)), 1e-12)
-    turn = _ROTATION_SIGMA_RAD if found.lenses.axes is None else _STABILISED_ROTATION_SIGMA_RAD
+    move = max(0.3 * float(np.median(likely)), 1e-12)  # about that by the velocity
+    # from axes of their own, a stabiliser has removed rotations
+    turn = _ROTATION_SIGMA_RAD if found.lenses.axes is None else np.deg2rad(0.005)
     return np.repeat([turn, move], 3)
 
 
@@ -172,7 +168,7 @@ def velocities(
     num = len(timestamps)
     before, after = np.arange(num) - 1, np.arange(num) + 1
     intervals = np.diff(timestamps)
-    breaks = intervals > _MIN_PAUSE_INTERVALS * np.median(intervals)
+    breaks = intervals > 50.0 * np.median(intervals)
     if maps is not None:
         breaks |= maps[1:] != maps[:-1]
     pauses = np.flatnonzero(breaks)

@@ -14,11 +14,7 @@ from gsba.types import Reconstruction
 _REACH = 6.0  # usual steps that a side is long, and its fewest frames are two
 _STANDING_RATIO = 0.1  # of the rms step: shorter ones are of a camera that stands
 _MIN_POINTS = 8  # that both sides see
-_MAX_DISTANCE_SIGMA = 0.1  # of a point's distance by one side, part of it
 _SIGMAS = 2.0  # standard errors of the median that count as uncertainty
-_MEDIAN_ERROR = 1.2533  # of a median of normal values: standard error, over that of their mean
-_MAD_SIGMAS = 1.4826  # standard deviation of normal values over their median absolute deviation
-_PARALLEL = 1e-9  # smallest over largest information of a point's place, of parallel rays
 
 
 def scale_changes(result: Reconstruction, recordings: np.ndarray) -> np.ndarray:
@@ -79,13 +75,15 @@ def _change(
     known = np.ones(len(common), bool)
     for distance, spread in zip(distances, spreads, strict=True):
         variances = np.einsum("ni,nij,nj->n", towards, spread, towards)
-        known &= (distance > 0) & (variances < (_MAX_DISTANCE_SIGMA * lengths) ** 2)
+        known &= (distance > 0) & (variances < (0.1 * lengths) ** 2)
     if np.count_nonzero(known) < _MIN_POINTS:
         return np.inf
     logs = np.log(distances[1][known] / distances[0][known])
     median = float(np.median(logs))
-    scatter = _MAD_SIGMAS * float(np.median(np.abs(logs - median)))
-    return abs(median) + _SIGMAS * _MEDIAN_ERROR * scatter / np.sqrt(len(logs))
+    # standard deviation of normal values
+    scatter = 1.4826 * float(np.median(np.abs(logs - median)))
+    # 1.2533: standard error of a median of normal values, over that of their mean
+    return abs(median) + _SIGMAS * 1.2533 * scatter / np.sqrt(len(logs))
 
 
 def _triangulated(
@@ -108,7 +106,7 @@ def _triangulated(
     sums = np.stack([np.bincount(index, column, len(points)) for column in columns.T], axis=1)
     systems = sums[:, :9].reshape(-1, 3, 3)
     lowest, _, highest = np.linalg.eigvalsh(systems).T
-    parallel = lowest <= _PARALLEL * highest
+    parallel = lowest <= 1e-9 * highest
     systems[parallel] = np.eye(3)
     covariances = np.linalg.inv(systems)
     places = np.einsum("nij,nj->ni", covariances, sums[:, 9:])

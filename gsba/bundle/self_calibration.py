@@ -28,13 +28,10 @@ from gsba.types import Counts, Keypoints, Landmarks, Solution
 
 logger = logging.getLogger(__name__)
 
-_NUM_DIRECTIONS = 500  # directions at which two calibrations are compared
 _TURN = 3  # number of the last parameters of a lens, its rotation
 OF_FRONT = PARAMETERS - _TURN  # parameters of the front lens
 _SIGMAS = np.array([0.05, 0.02, 0.02, 0.05, 0.02, 0.005, 0.001, 0.03, 0.03, 0.03])  # prior standard
 # deviations of a lens
-_MAX_SIGMA_SHARE = 0.5  # largest share of its prior standard deviation that a determined parameter
-# keeps
 _GROUPS = {  # parameters of each lens
     "focal lengths": [0],
     "principal points": [1, 2],
@@ -138,7 +135,7 @@ def _of_nominal(
 def undetermined(sigmas: np.ndarray) -> tuple[str, ...]:
     """Groups of parameters whose standard deviations (K,) the adjustment hardly lowers."""
     num = num_lenses_of(len(sigmas))
-    loose = np.asarray(sigmas) > _MAX_SIGMA_SHARE * spread(num)
+    loose = np.asarray(sigmas) > 0.5 * spread(num)
     starts = [0, *(first_of(lens) for lens in range(1, num))]
     found = []
     for name, rows in _GROUPS.items():
@@ -233,7 +230,7 @@ def apart(one: Lenses, other: Lenses) -> float:
     """Difference of two calibrations of raw lenses in bearings of pixels, radians rms."""
     if one.reference_calibration is None or one.fisheyes == other.fisheyes:
         return 0.0
-    places = np.random.default_rng(0).normal(size=(_NUM_DIRECTIONS, 3))
+    places = np.random.default_rng(0).normal(size=(500, 3))
     places /= np.linalg.norm(places, axis=1, keepdims=True)
     there = recalibrated(places, now(one), now(other))
     return float(np.sqrt(np.mean(np.sum((there - places) ** 2, axis=1))))

@@ -20,7 +20,6 @@ BySharedParameters = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 MAX_OBSERVATIONS = 60_000  # observations that parameters are estimated from
 PARTS = 4  # parts of the sequence: each is predicted by the others
-_LEAST_FRAMES = 2 * PARTS
 _MIN_POINTS = 50  # least number of points of a part
 _POSE_DAMPING = 1e-4  # of the poses' information, against the map's free similarity
 _MIN_CURVATURE = 0.3  # lower curvatures give steps beyond the reach of the model
@@ -88,7 +87,7 @@ def sample_counts(landmarks: Landmarks, used: Landmarks) -> Counts:
 def parts_of(landmarks: Landmarks) -> list[Landmarks]:
     """The points of each part of the sequence; no part where there is too little."""
     tracks = landmarks.tracks
-    if len(np.unique(tracks.frames)) < _LEAST_FRAMES or tracks.num_points < _MIN_POINTS * PARTS:
+    if len(np.unique(tracks.frames)) < 2 * PARTS or tracks.num_points < _MIN_POINTS * PARTS:
         return []
     seen = np.bincount(tracks.points, minlength=tracks.num_points)
     means = np.bincount(tracks.points, tracks.frames, tracks.num_points) / np.maximum(seen, 1)

@@ -28,9 +28,6 @@ _MIN_GAIN = 0.03  # share by which the field must lower the robust cost of held-
 
 logger = logging.getLogger(__name__)
 
-_PRIOR_SIGMAS_RAD = (1e-4, 3e-4, 1e-3, 3e-3)  # radians: a priori, of coefficients of degree 1;
-# falls with the square of the degree
-_MIN_GAIN_SHARE = 0.95  # share of the best gain: the smoothest field that reaches it is taken
 _PROBE = 20_000, 4  # observations and degree of a first look: half the gain must show there
 
 
@@ -108,13 +105,14 @@ def estimate(
         if not systems:
             return replace(now, counts=counts)
         # the smoothest field that predicts parts well
+        # radians, of coefficients of degree 1; falls with the square of the degree
         tried = [
             (d, spread, cross_validate(systems, partial(_fitted, degree=d, spread=spread)))
-            for spread in _PRIOR_SIGMAS_RAD
+            for spread in (1e-4, 3e-4, 1e-3, 3e-3)
             for d in range(1, max_degree + 1)
         ]
         best = max(verdict.gains.sum() for _, _, verdict in tried)
-        enough = min(_MIN_GAIN_SHARE * best, best)
+        enough = min(0.95 * best, best)
         degree, spread, verdict = next(each for each in tried if each[2].gains.sum() >= enough)
         gains = verdict.gains
         costs = np.array([part.cost for part in systems])

@@ -13,9 +13,7 @@ from gsba.geometry import inverse
 from gsba.types import GyroConstraints, StepNoise
 
 # Noise of a frame's pose in the trajectory's world, which only holds frames that nothing else does.
-_ABSOLUTE_DEG = 30.0
 LOSS_SIGMAS = 2.0  # Cauchy scale: limits the pull of wrong steps
-_WEAKER = 10.0  # times the noise of absolute priors, where another family holds the gauge
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,9 +51,9 @@ class TrajectoryPrior(Family):
         extent = max(float(np.linalg.norm(np.ptp(world_T_rigs[:, :3, 3], axis=0))), typical)
         graph = gtsam.NonlinearFactorGraph()
         self._add_steps(graph, np.maximum(lengths, typical))
-        weaker = 1.0 if held else _WEAKER
+        weaker = 1.0 if held else 10.0  # absolute priors, where another family holds the gauge
         model = self._robust(
-            weaker * np.deg2rad(_ABSOLUTE_DEG),
+            weaker * np.deg2rad(30.0),
             weaker * 0.3 * extent,  # part of the trajectory's extent
         )
         for f, world_T_rig in enumerate(self.world_T_rigs):
@@ -137,10 +135,6 @@ class HeldPoses(Family):
         return graph
 
 
-_FREE_EXTENTS = 1e4  # sigma of a step's translation, extents of the map: none is measured
-_MAX_RESIDUAL_SIGMAS = 3.0  # of a step; beyond it, the robust loss suppresses the step
-
-
 @dataclass(frozen=True, slots=True)
 class GyroTurns(Family):
     """Rotations between neighbours that a gyro measured, under a Cauchy loss."""
@@ -161,7 +155,7 @@ class GyroTurns(Family):
     def graph(self, snapshot: MapSnapshot) -> gtsam.NonlinearFactorGraph:
         """A relative prior for each step that was measured."""
         graph, turning = gtsam.NonlinearFactorGraph(), self.turning
-        free = _FREE_EXTENTS * max(self.extent, 1e-9)
+        free = 1e4 * max(self.extent, 1e-9)  # no translation is measured
         loss = gtsam.noiseModel.mEstimator.Cauchy.Create(self.loss_sigmas)
         for f in np.flatnonzero(np.isfinite(turning.step_sigmas)).tolist():
             sigmas = np.array([turning.step_sigmas[f]] * 3 + [free] * 3)
@@ -178,6 +172,7 @@ class GyroTurns(Family):
         rotations, turning = snapshot.world_T_rigs[:, :3, :3], self.turning
         found = Rotation.from_matrix(np.swapaxes(rotations[:-1], 1, 2) @ rotations[1:])
         off = (found.inv() * Rotation.from_rotvec(turning.steps)).as_rotvec()
-        limits = _MAX_RESIDUAL_SIGMAS * np.sqrt(3) * turning.step_sigmas
+        # beyond 3, the robust loss suppresses a step
+        limits = 3.0 * np.sqrt(3) * turning.step_sigmas
         near = np.linalg.norm(off, axis=1) < limits
         return {"steps_used": float(np.mean(near & np.isfinite(turning.step_sigmas)))}

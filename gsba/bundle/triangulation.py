@@ -15,7 +15,6 @@ from gsba.memory import release_mapped_files
 from gsba.types import Counts, Keypoints, Landmarks, Reconstruction, Tracks
 
 _kernel, _part = kernel_and_part()
-_MAX_HYPOTHESES = 12  # pairs of observations tried per track
 
 
 @_kernel
@@ -53,7 +52,7 @@ def triangulate_tracks(
         tried = 0
         for step in range(hi - lo - 1, 0, -1):  # wide pairs of the track first
             for a in range(lo, hi - step):
-                if tried == _MAX_HYPOTHESES or best_count == hi - lo:
+                if tried == 12 or best_count == hi - lo:  # pairs of observations
                     break
                 tried += 1
                 x, y, z, ok = _midpoint(rays, centres, a, a + step)

@@ -18,7 +18,6 @@ from gsba.types import Fisheye
 
 _log = logging.getLogger(__name__)
 
-_MAX_POSE_ENTRY = 1e6  # largest absolute entry of a pose, in any unit
 _MAX_LOG_RATIO = 0.01  # largest logarithm of the ratio of a camera's two focal lengths
 _MAX_ANGLE_RAD = np.deg2rad(95.0)  # largest angle from a lens's axis at which its model must
 # hold
@@ -341,7 +340,7 @@ def _fitted(
 def _checked_rigid(a_T_b: np.ndarray) -> np.ndarray:
     """A pose (4, 4), checked to be a rigid motion."""
     turn = a_T_b[:3, :3]
-    small = bool((np.abs(a_T_b) < _MAX_POSE_ENTRY).all())  # no NaN either
+    small = bool((np.abs(a_T_b) < 1e6).all())  # in any unit; no NaN either
     if not small or np.abs(turn @ turn.T - np.eye(3)).max() > 1e-3:
         raise ValueError("the pose of a lens is no rigid motion")
     if np.linalg.det(turn) < 0:

@@ -20,8 +20,6 @@ from gsba.camera.sphere import table
 from gsba.camera.straighten import PAD, observed
 from gsba.types import FACES
 
-_MAX_OVERLAP = 1 / 8  # part of a square: cameras have 1/60 to 1/20
-
 # Storage of each face in FACES order: track, square from the left, and quarter turns
 # counterclockwise that set it upright.
 _STORED = ((0, 1, 0), (0, 2, 0), (1, 1, 1), (0, 0, 0), (1, 2, -1), (1, 0, -1))
@@ -44,7 +42,7 @@ def is_equiangular(width: int, height: int) -> bool:
     """True if one of two tracks can have this size, pixels."""
     extra = width - 3 * height
     even = extra % 2 == 0 and (height + extra // 2) % 2 == 0
-    return height > 0 and even and 0 <= extra <= 2 * _MAX_OVERLAP * height
+    return height > 0 and even and 0 <= extra <= height / 4  # cameras have 1/60 to 1/20
 
 
 def overlap_of(width: int, height: int) -> int:

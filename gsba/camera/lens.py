@@ -16,10 +16,6 @@ import numpy as np
 from gsba.camera.fisheye import Rig, facing, optical_axes, pixels_of, recalibrated, rotation_of
 from gsba.geometry import pose
 
-_HALF_FOV_RAD = np.deg2rad(100.0)  # half field of view of a fisheye that fills its sensor, first to
-# last row
-_NUM_ROW_TIME_PASSES = 4  # fixed-point passes between a point's pixel and its row's time
-
 
 def _centre() -> np.ndarray:
     return np.zeros(3)
@@ -144,7 +140,8 @@ class Lenses:
         radii = np.linalg.norm(across, axis=1)
         angles = np.arctan2(radii, ahead)
         along = np.einsum("ni,ni->n", across, np.asarray(row_directions)[lens])
-        return angles / (2 * _HALF_FOV_RAD) * along / np.maximum(radii, 1e-12)
+        # 200 degrees: a fisheye that fills its sensor, first row to last
+        return angles / (2 * np.deg2rad(100.0)) * along / np.maximum(radii, 1e-12)
 
     def rows_down(self) -> np.ndarray:
         """1 (L,) for the picture of a raw lens that is read from its top row down, -1 for one that
@@ -205,7 +202,7 @@ class Lenses:
         vectors = self._directions_in_panorama(points_rig, frames, lens)
         if self.readout_motion is None:
             return vectors
-        for _ in range(_NUM_ROW_TIME_PASSES):
+        for _ in range(4):  # fixed-point passes between pixel and time
             units = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300)
             turns, moves = self._readout_motion_at(units, frames, lens)
             local = np.einsum("nij,nj->ni", np.swapaxes(turns, 1, 2), points_rig - moves)

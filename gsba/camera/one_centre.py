@@ -19,8 +19,6 @@ from gsba.camera.views import depths_along, observed_points
 from gsba.types import Reconstruction
 
 _DEPTH_GRID_WIDTH = 128  # width of the grid that depths are taken on
-_MIN_DEPTH_IN_LENS_OFFSETS = 12.0  # smallest depth, in distances of a lens from the middle: nearer,
-# the seam lies beyond the rims
 _FAR_DEPTH = 1e9  # map units
 _ROWS_AT_ONCE = 128  # rows whose coordinates are held in double precision at once
 
@@ -45,7 +43,8 @@ class Stitcher:
         rays = bearings_from_erp(pixels, _DEPTH_GRID_WIDTH, _DEPTH_GRID_WIDTH // 2).reshape(-1, 3)
         depths = np.full(len(rays), _FAR_DEPTH)
         if len(scene):
-            nearest = _MIN_DEPTH_IN_LENS_OFFSETS * lenses.baseline / 2
+            # nearer points would lie beyond the rims at the seam
+            nearest = 12.0 * lenses.baseline / 2
             depths = np.maximum(depths_along(rays, scene), nearest)
         same, self._offsets = np.zeros(len(rays), int), []
         for lens in range(lenses.num_lenses):

@@ -25,10 +25,6 @@ from gsba.types import FACES, Fisheye, PictureFormat, Reconstruction
 _FAR_DEPTH = 1e9  # map units: depth from which both lenses see alike
 _MAX_OVERSAMPLING = 1.5  # largest ratio of a picture's density to a view's: beyond it, detail
 # aliases
-_NUM_DEPTH_POINTS = 12  # map points that give the depth in a direction
-_MIN_SMOOTHING_RAD = np.deg2rad(3.0)  # least angle over which points are averaged
-_PLANE_TOLERANCE = 0.1  # relative depth error at which a point counts as off a plane
-_FRONTAL_PLANE_WEIGHT = 0.05  # weight of the fronto-parallel plane, relative to the points'
 _ROWS_AT_ONCE = 128  # rows whose coordinates are held in double precision at once
 _NODES_ACROSS_FACE = 33  # nodes across a face of the interpolated offsets, which vary over tens of
 # degrees
@@ -416,19 +412,18 @@ def depths_along(directions: np.ndarray, points: np.ndarray) -> np.ndarray:
     from scipy.spatial import KDTree
 
     lengths = np.linalg.norm(points, axis=1)
-    units, near = points / lengths[:, None], min(_NUM_DEPTH_POINTS, len(points))
+    units, near = points / lengths[:, None], min(12, len(points))
     apart, rows = KDTree(units).query(directions, k=near)
     apart, rows = apart.reshape(-1, near), rows.reshape(-1, near)
-    spread = np.maximum(apart[:, near // 2, None], _MIN_SMOOTHING_RAD)
+    spread = np.maximum(apart[:, near // 2, None], np.deg2rad(3.0))
     weights, inverse = np.exp(-((apart / spread) ** 2)), 1 / lengths[rows]
     middle = _weighted_median(inverse, weights)
     flat, beside = middle[:, None] * directions, units[rows]
     tilt, left = np.zeros_like(flat), inverse - np.einsum("nki,ni->nk", beside, flat)
-    facing_us = (_FRONTAL_PLANE_WEIGHT * spread**2 * weights.sum(axis=1, keepdims=True))[
-        ..., None
-    ] * np.eye(3)
+    facing_us = (0.05 * spread**2 * weights.sum(axis=1, keepdims=True))[..., None] * np.eye(3)
     for _ in range(4):  # reweighting rounds of the plane fit
-        off = (left - np.einsum("nki,ni->nk", beside, tilt)) / (_PLANE_TOLERANCE * middle[:, None])
+        # a relative error of depth of .1 counts as off a plane
+        off = (left - np.einsum("nki,ni->nk", beside, tilt)) / (0.1 * middle[:, None])
         shares = weights / (1 + off**2)
         normal = np.einsum("nk,nki,nkj->nij", shares, beside, beside) + facing_us
         right = np.einsum("nk,nki,nk->ni", shares, beside, left)

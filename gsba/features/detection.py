@@ -45,7 +45,6 @@ def search_settings(settings: RefineSettings) -> MatchingSettings:
 # Noise of SIFT keypoints along each axis, face pixels: of the smallest
 # ones, and what is added in proportion to a keypoint's size.
 SIGMA_PX, _SIGMA_PER_SIZE = 0.16, 0.033
-_SAME_PIXEL_PX = 0.01  # pixels of one keypoint on the faces of two rigs differ by more
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,7 +163,7 @@ def on_faces(keypoints: Keypoints, rig: CubeRig) -> Keypoints:
         keypoints: of frames of several runs, each on the faces of its own rig.
     """
     pixels = rig.project(keypoints.bearings_rig, keypoints.faces)
-    moved = np.abs(pixels - keypoints.pixels).max(axis=1, initial=0.0) > _SAME_PIXEL_PX
+    moved = np.abs(pixels - keypoints.pixels).max(axis=1, initial=0.0) > 0.01  # pixels
     if not moved.any():
         return keypoints
     return replace(keypoints, pixels=np.where(moved[:, None], pixels, keypoints.pixels))

@@ -22,7 +22,6 @@ from gsba.imu.readings import Readings
 from gsba.log import GsbaError, brief
 
 _TABLES = (".csv", ".txt", ".tsv", ".dat")
-_MAX_RATE_RAD_S = 40.0  # rad/s: gyros saturate at 35, which are 2000 deg/s
 _MIN_READINGS_HZ = 25.0  # readings per second: fewer do not resolve a readout of 10 to 30 ms
 _MIN_READINGS = 10  # least number of readings
 _STANDARD_GRAVITY = 9.80665
@@ -202,7 +201,8 @@ def _checked(
             f"{path}:{where[late[0] + 1]}: time {times[late[0] + 1]:.9g} does not come after "
             f"{times[late[0]]:.9g}; sort the file"
         )
-    fast = np.flatnonzero(np.abs(rates).max(axis=1) > _MAX_RATE_RAD_S)
+    # rad/s: gyros saturate at 35, 2000 deg/s
+    fast = np.flatnonzero(np.abs(rates).max(axis=1) > 40.0)
     if len(fast):
         raise GsbaError(
             f"{path}:{where[fast[0]]}: {np.abs(rates[fast[0]]).max():.4g} rad/s, which no gyro "

@@ -5,8 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-_MAX_GAP_S = 0.1  # s between two readings: in longer gaps the rotation is unknown
-
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
@@ -52,7 +50,7 @@ class Readings:
 
     def covers(self, times: np.ndarray) -> np.ndarray:
         """True (n,) for spans of time (n, 2) within the readings, without a gap."""
-        late = np.diff(self.timestamps, append=np.inf) > _MAX_GAP_S
+        late = np.diff(self.timestamps, append=np.inf) > 0.1  # s: the rotation is unknown
         gaps = np.concatenate([[0], np.cumsum(late)])
         first = np.searchsorted(self.timestamps, times[:, 0], side="right") - 1
         last = np.searchsorted(self.timestamps, times[:, 1]) - 1

@@ -35,18 +35,11 @@ _MAX_FRAMES = 20
 _MIN_FRAMES = 6  # fewer agree by chance
 _MIN_FIXED_CORRELATION, _MAX_MOVING_CORRELATION = 0.75, 0.5  # least correlation of fixed structure;
 # largest of moving structure
-_MIN_MOVING_SHARE = 1 / 3  # share of the textured directions: with fewer, a carrier looks like the
-# distant world
-_STANDSTILL_SHARE = 0.9  # share of fixed textured directions from which the camera stands still
 VEHICLE_SHARE = 1 / 3  # share of the picture from which the carrier is a vehicle: people and sticks
 # fill less
-_MIN_TEXTURED_SHARE = 0.02  # share of all directions
 _STRUCTURE_WIDTH_PX, _TURNED_STRUCTURE_WIDTH_PX = 256, 128  # width in pixels of compared pictures:
 # the camera's tilt, which remains when turns are undone, moves the carrier by a pixel of the latter
-_BLACK_RIM_PX = 6  # of structure pictures, within which edges of black areas are compared
 _MIN_TURN_RAD = np.deg2rad(2.0)  # smaller turns are estimation noise
-_ROWS_ABOVE_SHARE = 0.55  # part of the height, from the zenith, where the world is seen
-_MIN_FRAMES_TURNED = 12  # fewer agree by chance once turns are free
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +77,8 @@ def find_carrier(frames: FrameSet) -> Carrier:
         loaded = pool.map(partial(_load, frames), chosen.tolist())
         pictures = np.stack(list(track(loaded, "looking for the carrier", len(chosen))))
     structure, turns = _measure(pictures, _STRUCTURE_WIDTH_PX), np.zeros(len(frames))
-    if not certain_places(structure).any() and len(pictures) >= _MIN_FRAMES_TURNED:
+    # fewer agree by chance once turns are free
+    if not certain_places(structure).any() and len(pictures) >= 12:
         below = _measure_turned(pictures)
         if below is not None:
             bands = [band_of(_load(frames, f)) for f in track(range(len(frames)), "its turns")]
@@ -187,7 +181,7 @@ def _measure(pictures: np.ndarray, width: int) -> FixedStructure:
     if not black.any():
         return found
     small = cv2.resize(black.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0
-    scene = ~widened(small, _BLACK_RIM_PX)
+    scene = ~widened(small, 6)  # pixels
     return FixedStructure(found.strong * scene, found.weak * scene, found.textured & scene)
 
 
@@ -212,7 +206,7 @@ def _measure_turned(pictures: np.ndarray) -> tuple[np.ndarray, FixedStructure] |
 
 def _steadiness_above(structure: FixedStructure) -> float:
     """Mean correlation of the textured directions above the carrier; 0 = there are none."""
-    rows = int(_ROWS_ABOVE_SHARE * len(structure.strong))
+    rows = int(0.55 * len(structure.strong))  # from the zenith, where the world is seen
     textured = structure.textured[:rows]
     return float(structure.strong[:rows][textured].mean()) if textured.any() else 0.0
 
@@ -221,7 +215,7 @@ def _check_moving(structure: FixedStructure) -> None:
     """Refuse frames in which too little moves to tell the carrier from the world."""
     heights = (np.arange(len(structure.strong)) + 0.5) / len(structure.strong)
     weights = structure.textured * np.sin(np.pi * heights)[:, None]  # solid angles
-    if weights.mean() < _MIN_TEXTURED_SHARE:
+    if weights.mean() < 0.02:  # of all directions
         raise GsbaError("the frames show too little texture to detect the carrier")
     staying, moving = (
         float((weights * places).sum() / weights.sum())
@@ -231,12 +225,12 @@ def _check_moving(structure: FixedStructure) -> None:
         )
     )
     logger.debug("textured: %.0f%% stay, %.0f%% move", 100 * staying, 100 * moving)
-    if staying > _STANDSTILL_SHARE:
+    if staying > 0.9:
         raise GsbaError(
             f"the frames hardly differ ({100 * staying:.0f}% of textured directions stay fixed): "
             "the camera must move to detect its carrier"
         )
-    if moving < _MIN_MOVING_SHARE:
+    if moving < 1 / 3:
         raise GsbaError(
             f"{100 * staying:.0f}% of textured directions stay fixed, only "
             f"{100 * moving:.0f}% move: most of the picture is a vehicle, or far away, or the "

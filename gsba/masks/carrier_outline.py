@@ -20,8 +20,6 @@ _MIN_CERTAIN_STRONG, _MIN_CERTAIN_WEAK = 0.75, 0.6  # least strong and weak corr
 # carrier has, see docs/masks.md
 _MIN_LIKELY_WEAK = 0.2  # least weak correlation of pixels joined to certain ones
 _SPILL_PX = 6  # pixels by which fixed structure exceeds the outline
-_REACH_PX = 28  # pixels from fixed structure within which the outline is searched
-_MIN_MOVING_RATIO = 3.0  # multiple of the carrier's own change above which pixels show the world
 _MIN_CHANGE = 1.0  # grey levels, least change of a carrier without noise
 _NUM_ROUNDS = 2  # rounds of the graph cut and its colour models
 _DILATION_PX = 1  # pixels added: features on the carrier's blurred rim are useless
@@ -59,9 +57,7 @@ def outline_carrier(
         return nothing
     change = _change(pictures, median)
     own_change = max(float(np.median(change[core])), _MIN_CHANGE)
-    moves = (
-        _filtered_on_sphere(cv2.GaussianBlur, change, (0, 0), 1.0) > _MIN_MOVING_RATIO * own_change
-    ) & ~core
+    moves = (_filtered_on_sphere(cv2.GaussianBlur, change, (0, 0), 1.0) > 3.0 * own_change) & ~core
     found = _parts_with(_cut(median, core, likely, moves), core)
     plain = _enclosed(found)
     found |= plain & ~_parts_with(plain, moves, least=0.5)
@@ -74,7 +70,7 @@ def outline_carrier(
 def _cut(median: np.ndarray, core: np.ndarray, likely: np.ndarray, moves: np.ndarray) -> np.ndarray:
     """The carrier (h, w) bool by colours and edges of the median picture (h, w, 3) uint8."""
     distance = _filtered_on_sphere(cv2.distanceTransform, ~likely, cv2.DIST_L2, 5)
-    far = distance > _REACH_PX
+    far = distance > 28  # pixels
     inside = _enclosed(~far)
     labels = np.full(core.shape, cv2.GC_PR_BGD, np.uint8)
     labels[inside | _shrunk(likely, _SPILL_PX // 2)] = cv2.GC_PR_FGD

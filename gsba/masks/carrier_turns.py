@@ -10,8 +10,6 @@ import numpy as np
 from gsba.masks.medians import median_picture
 
 WIDTH = 256  # pixels across the pictures in which shifts are estimated
-_TOP_ROW_SHARE = 0.7  # part of the height: only rows from here down are compared
-_NUM_REFERENCES = 3  # frames tried as the first template
 _NUM_ROUNDS = 4
 _MIN_CHANGE = 4.0  # grey levels: more stable pixels have equal weights
 
@@ -21,9 +19,7 @@ def band_of(picture: np.ndarray) -> np.ndarray:
     import cv2
 
     small = cv2.resize(picture, (WIDTH, WIDTH // 2), interpolation=cv2.INTER_AREA)
-    return cv2.cvtColor(small[int(_TOP_ROW_SHARE * len(small)) :], cv2.COLOR_RGB2GRAY).astype(
-        np.float32
-    )
+    return cv2.cvtColor(small[int(0.7 * len(small)) :], cv2.COLOR_RGB2GRAY).astype(np.float32)
 
 
 def find_turns(bands: np.ndarray) -> np.ndarray:
@@ -40,7 +36,7 @@ def find_turns(bands: np.ndarray) -> np.ndarray:
     spectra = np.fft.rfft(even, axis=-1)
     squares = np.fft.rfft(even**2, axis=-1)
     best, turns = 0.0, np.zeros(len(bands))
-    references = np.unique(np.linspace(0, len(bands) - 1, _NUM_REFERENCES).astype(int))
+    references = np.unique(np.linspace(0, len(bands) - 1, 3).astype(int))
     for reference in references:
         template, weights = even[reference], np.ones(even.shape[1:])
         shifts = np.zeros(len(bands))

@@ -27,23 +27,15 @@ from gsba.store.store import PerFrame
 from gsba.types import FrameSet, Landmarks, PictureFormat, Tracks
 
 _WIDTH_PX = 512  # pixels across the panoramas that are compared
-_NUM_NEIGHBOURS = 6  # neighbours that each frame is compared with
 _MIN_WITNESSES = 3  # least number of neighbours that can mark a pixel
 _MIN_SHARED_POINTS = 30  # least number of shared points of a neighbour
-_NUM_DISTANCES = 18  # assumed distances
-_DISTANCE_MARGIN = 1.4  # factor beyond the nearest and furthest points around a direction
-_CELL_PX = 8  # pixels: the grid on which distances are bounded
 _REACH_CELLS = 3  # cells around a direction whose points bound its distance
 _EMPTY_CELL = np.float32(-1e9)  # value of a cell without points
 _PATCH_PX = 5  # pixels over which differences are averaged
 _MAX_DIFFERENCE = 60.0  # grey levels at which differences are clipped
 _WEAK_DIFFERENCE, _STRONG_DIFFERENCE = 5.0, 14.0  # grey levels: of all pixels of a distractor, and
 # of at least some of them
-_TYPICAL_DIFFERENCE = 1.0  # grey levels, median difference of good pictures
-_MAX_MEDIAN_DIFFERENCE = 5.0  # grey levels, median difference from which a frame cannot be judged
-_MIN_SPREADS = 2.0  # spreads of the neighbours by which a pixel must differ from their median
 _MIN_WIDTH_PX = 5  # pixels: narrower regions are edges
-_MIN_AREA_PX = 120  # strong pixels at the equator
 _CLOSING_PX = 13  # pixels: gaps up to this are closed
 _DILATION_PX = 5  # pixels added: the rim is blurred, and a splat shows any remainder
 _MAX_SHARE = 0.35  # share of a picture: more is a wrong pose, or changed light
@@ -181,12 +173,12 @@ class StaticScene:
         score = _score(own, others, n_T_own, self._rays, lowest, highest)
         unjudged = seen < min(_MIN_WITNESSES, len(near))
         score[unjudged | ~usable] = 0
-        noise = max(1.0, float(np.median(score)) / _TYPICAL_DIFFERENCE)
+        noise = max(1.0, float(np.median(score)))
         found = _decide(score, noise)
         if self._known is not None:  # marked in the first pass, with no neighbour left to judge
             found |= self._known(frame) & unjudged
         found &= usable
-        if np.median(score) > _MAX_MEDIAN_DIFFERENCE or _share(found) > _MAX_SHARE:
+        if np.median(score) > 5.0 or _share(found) > _MAX_SHARE:  # grey levels
             return _packed(np.ones(shape), "fits no neighbour: its pose or light is off")
         return _packed(np.where(found, 0, 1 / (1 + (score / (noise * _WEAK_DIFFERENCE)) ** 2)), "")
 
@@ -198,7 +190,7 @@ class StaticScene:
         inside[self._seen[frame]] = True
         shared = np.array([np.count_nonzero(inside[seen]) for seen in self._seen])
         shared[frame] = 0
-        best = np.argsort(-shared, kind="stable")[:_NUM_NEIGHBOURS]
+        best = np.argsort(-shared, kind="stable")[:6]
         return best[shared[best] >= _MIN_SHARED_POINTS]
 
     def _picture(self, frame: int) -> np.ndarray:
@@ -244,7 +236,7 @@ class StaticScene:
     def _bounds(self, frame: int, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Logarithms (h, w) float32 of the least and largest inverse distance to assume."""
         points = np.unique(np.concatenate([self._seen[f] for f in (frame, *near)]))
-        width = self.width // _CELL_PX
+        width = self.width // 8
         pixels, distances = self._pixels(frame, points, width)
         u, v = pixels.T
         logs = -np.log(distances).astype(np.float32)
@@ -254,7 +246,7 @@ class StaticScene:
         np.maximum.at(low, (v, u), -logs)
         high, low = _spread_out(high), _spread_out(low)
         size = (self.width, self.width // 2)
-        margin = np.float32(np.log(_DISTANCE_MARGIN))
+        margin = np.float32(np.log(1.4))  # beyond the nearest and furthest points
         return -cv2.resize(low, size) - margin, cv2.resize(high, size) + margin
 
 
@@ -319,7 +311,7 @@ def _score(
         np.full(shape, 2 * _MAX_DIFFERENCE, np.float32),
     )
     nearest, furthest = np.exp(highest), np.exp(lowest)
-    for step in np.linspace(0, 1, _NUM_DISTANCES, dtype=np.float32):  # even steps in the pictures
+    for step in np.linspace(0, 1, 18, dtype=np.float32):  # even steps in the pictures
         assumed = (1 - step) * nearest + step * furthest
         _distractor_kernels.compare(
             own, least, most, others, n_T_own, rays, assumed, np.float32(_MAX_DIFFERENCE),
@@ -329,7 +321,8 @@ def _score(
         _distractor_kernels.keep_best(
             smooth, _averaged(away), _averaged(spread), best, away_best, spread_best
         )
-    contradicted = 0.5 * (away_best - _MIN_SPREADS * spread_best)
+    # a pixel must differ from its neighbours' median by two of their spreads
+    contradicted = 0.5 * (away_best - 2.0 * spread_best)
     return np.maximum(best[0], np.minimum(best[1], contradicted))
 
 
@@ -348,7 +341,7 @@ def _decide(score: np.ndarray, noise: float) -> np.ndarray:
     strong = (weak > 0) & (wide > noise * _STRONG_DIFFERENCE)
     sums = np.bincount(labels[strong], weights=areas[strong], minlength=num)
     sums[0] = 0
-    found = (sums >= _MIN_AREA_PX)[labels].astype(np.uint8)
+    found = (sums >= 120)[labels].astype(np.uint8)  # strong pixels at the equator
     ellipse = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (_CLOSING_PX, _CLOSING_PX))
     found = cv2.morphologyEx(found, cv2.MORPH_CLOSE, ellipse)
     outlines, _ = cv2.findContours(found, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)

@@ -17,13 +17,8 @@ from gsba.camera.sphere import around_sphere
 from gsba.masks.medians import median_picture
 
 _PADDING_PX = 16  # pixels padded around pictures
-_SMOOTHING_PX = 0.7  # pixels, standard deviation, before gradients are taken
 _WINDOW_SIGMA_PX, _WINDOW_SIZE = 2.0, (7, 7)  # pixels, standard deviation and extent, around a
 # direction
-_GRADIENT_NOISE = 3.0  # grey levels per pixel and channel: gradients of noise, JPEG and smooth
-# shading
-_WORST_QUANTILE = 0.1  # quantile of the frames: a passing shadow or hand may hide the carrier in
-# this share
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +45,8 @@ def measure_fixed_structure(pictures: np.ndarray) -> FixedStructure:
     a, b = -np.sin(strong_angle)[..., None], np.cos(strong_angle)[..., None]
     weak = a * u + b * v
     energy, weak_energy = uu + vv, window(_dot(weak, weak))
-    noise = np.float32(u.shape[-1] * _GRADIENT_NOISE**2)
+    # grey levels per pixel and channel: gradients of noise, JPEG and smooth shading
+    noise = np.float32(u.shape[-1] * 3.0**2)
     correlations, energies = [], []
     for x, y in zip(across, down, strict=True):
         own, along = window(_dot(x, x) + _dot(y, y)), a * x + b * y
@@ -60,7 +56,8 @@ def measure_fixed_structure(pictures: np.ndarray) -> FixedStructure:
         weak_scale = np.sqrt((own_weak + noise / 2) * np.maximum(weak_energy, 1e-6))
         correlations.append((shared / strong_scale, shared_weak / weak_scale))
         energies.append(own)
-    worst = np.quantile(np.array(correlations), _WORST_QUANTILE, axis=0).astype(np.float32)
+    # a passing shadow or hand may hide the carrier
+    worst = np.quantile(np.array(correlations), 0.1, axis=0).astype(np.float32)
     textured = median_picture(np.array(energies)) > noise
     return FixedStructure(
         *(x[_PADDING_PX:-_PADDING_PX, _PADDING_PX:-_PADDING_PX] for x in (*worst, textured))
@@ -70,7 +67,7 @@ def measure_fixed_structure(pictures: np.ndarray) -> FixedStructure:
 def _gradients(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Gradients right and down, (h + 2 pad, 2h + 2 pad, 3) float32, levels per pixel."""
     padded = around_sphere(picture, _PADDING_PX).astype(np.float32)
-    smooth = cv2.GaussianBlur(padded, (0, 0), _SMOOTHING_PX)
+    smooth = cv2.GaussianBlur(padded, (0, 0), 0.7)
     return cv2.Sobel(smooth, -1, 1, 0, scale=1 / 8), cv2.Sobel(smooth, -1, 0, 1, scale=1 / 8)
 
 

@@ -6,7 +6,6 @@ from functools import lru_cache
 import numpy as np
 
 _MAX_SORTED = 32  # pictures: of more, numpy's selection takes fewer comparisons
-_VALUES_AT_ONCE = 1 << 17  # compared values that stay in a processor's cache
 
 
 def median_picture(pictures: np.ndarray) -> np.ndarray:
@@ -18,7 +17,7 @@ def median_picture(pictures: np.ndarray) -> np.ndarray:
     flat = pictures.reshape(num, -1)
     exact = flat.dtype if flat.dtype.kind == "f" else np.float64
     median = np.empty(flat.shape[1], exact)
-    step = max(_VALUES_AT_ONCE // num, 1)
+    step = max((1 << 17) // num, 1)  # values that stay in a processor's cache
     for first in range(0, flat.shape[1], step):
         rows = list(flat[:, first : first + step])
         for low, high in _comparisons(num):

@@ -22,14 +22,10 @@ _REFINED_DEG, _REFINED_DIRECTION = (
     0.005,
 )  # gate of the solved map: rotation, tangent of direction
 _POINT_DEG = 0.6  # gate around a known point's predicted bearing
-_DRIFT = 0.003  # of the solved chain, relative to the path between two frames
 _ROTATION_GAPS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)  # gaps in frames between
 # matched pairs
 _MAX_JOIN_ERROR_RAD = np.deg2rad(4.0)  # largest error of a joined part's pose, as an angle at the
 # median depth
-_UNPREDICTED_RAD = np.deg2rad(60.0)  # radius of a search from which it is of all points
-_UNPREDICTED_NEIGHBOURS = 2  # frames that each frame is matched with then
-_ROTATION_RADIUS_DEG = 2.0  # radius of the search around a keypoint's rotated bearing
 
 
 def match_neighbours(context: MatchContext, start: Solution) -> VerifiedPairs:
@@ -85,9 +81,11 @@ def match_loops(context: MatchContext, solved: Solution) -> VerifiedPairs:
     chosen = pairs.closing(positions, depth, settings.pairs)
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     along = np.concatenate([[0], np.cumsum(steps)])
-    drifts = _DRIFT * (along[chosen[:, 1]] - along[chosen[:, 0]])
+    # relative to the path between two frames
+    drifts = 0.003 * (along[chosen[:, 1]] - along[chosen[:, 0]])
     radii = np.deg2rad(_LOOP_DEG) + 2 * drifts / max(depth, 1e-12)
-    few = pairs.thinned(chosen, radii > _UNPREDICTED_RAD, _UNPREDICTED_NEIGHBOURS)
+    # from 60 degrees on, a search is of all points: two frames suffice then
+    few = pairs.thinned(chosen, radii > np.deg2rad(60.0), 2)
     chosen, drifts = chosen[few], drifts[few]
     gates = [Gate.around_points(radius) for radius in radii[few]]
     known = solved.points_by_keypoint(keypoints)
@@ -217,6 +215,6 @@ def match_for_rotations(context: MatchContext, world_T_rigs: np.ndarray) -> Matc
     pairs = np.array(chosen, np.int32).reshape(-1, 2)
     still = world_T_rigs.copy()
     still[:, :3, 3] = 0
-    gates = [Gate.around_points(np.deg2rad(_ROTATION_RADIUS_DEG))] * len(pairs)
+    gates = [Gate.around_points(np.deg2rad(2.0))] * len(pairs)
     directions = [context.keypoints.bearings_of(f) for f in range(num)]
     return context.match(pairs, still, gates, directions)

@@ -28,7 +28,6 @@ from gsba.types import Features, Keypoints, Matches
 MAX_PARALLAX_RAD = np.deg2rad(60.0)  # between two rays of a point
 T = TypeVar("T")
 _CELLS_PER_SIDE = 8  # cells along a face's side
-_NO_MATCHES = np.zeros((0, 2), np.int32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -406,7 +405,7 @@ def match(
     chosen = [gates[p] for p in order]
     geometry = pairs[order], places, f0_T_f1s[order], chosen
     job = _PairJob(*geometry, frames, settings, points_rig, matcher)
-    rows = [_NO_MATCHES] * len(pairs)
+    rows = [np.zeros((0, 2), np.int32)] * len(pairs)
     for p, matched in zip(order, workers.map_shards(job), strict=True):
         rows[p] = matched
     return Matches.of_rows(np.asarray(pairs, np.int32).reshape(-1, 2), rows)

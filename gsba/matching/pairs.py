@@ -7,7 +7,6 @@ import numpy as np
 from gsba.config import PairSettings
 
 _FRAME_GAPS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
-_SAME_PLACE_SHARE = 0.125  # part of the reach within which a position counts as the same place
 MAX_INTERVALS = 2.5  # largest interval between neighbours, in median intervals
 
 
@@ -93,7 +92,7 @@ def closing(rigs_in_world: np.ndarray, median_depth: float, settings: PairSettin
 
     def next_visits(f: int, near: np.ndarray, distances: np.ndarray) -> np.ndarray:
         apart = np.abs(near - f) > settings.window
-        met = near[apart & (distances <= _SAME_PLACE_SHARE * reach)]
+        met = near[apart & (distances <= 0.125 * reach)]  # positions that count as the same place
         last = met[met < f].max(initial=0) - settings.window
         following = met[met > f].min(initial=len(rigs_in_world)) + settings.window
         return apart & (near >= last) & (near <= following)

@@ -16,16 +16,10 @@ from gsba.trajectory.turning import CELLS_PER_SIDE, rotation_of_most
 from gsba.types import Counts, Keypoints, Matches, VerifiedPairs
 
 _SAMPLE_SIZE = 5  # size of a minimal sample
-_RIVAL_FREE_BAND = 3.0  # inlier thresholds around a pose's epipolar planes within which matches
-# support no rival
 _MODEL_SIGMA_RAD = np.deg2rad(0.15)  # noise of bearings assumed to have one centre: lenses are
 # centimetres apart
 _CHI_SQUARE_MEDIANS = 1.3863, 0.4549  # medians of chi-square distributions with two and with one
 # degree of freedom
-_LOG_MEDIAN_RATIO_SIGMA = 2.75  # standard deviation of the logarithm of the ratio of two such
-# sample medians, times the root of the sample's size
-_MIN_TRANSLATION_SIGMAS = 4.75  # threshold on that ratio: one rotation in a million passes for a
-# translation
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,7 +236,8 @@ def _is_rivalled(
     A false pose from repeated structure has the true one as its rival, and vice versa.
     """
     sines = np.sum(_normals(f0_T_f1, bearings0) * (bearings1 @ f0_T_f1[:3, :3].T), axis=1)
-    rest = np.abs(sines) > np.sin(_RIVAL_FREE_BAND * np.deg2rad(settings.max_error_deg))
+    # matches within 3 thresholds of the pose's epipolar planes support no rival
+    rest = np.abs(sines) > np.sin(3.0 * np.deg2rad(settings.max_error_deg))
     rival = _significant_pose(bearings0[rest], bearings1[rest], settings, seed)
     if rival is None:
         return False
@@ -264,7 +259,10 @@ def _direction_sigma(f0_T_f1: np.ndarray, bearings0: np.ndarray, bearings1: np.n
     noise = np.median(across**2) / _CHI_SQUARE_MEDIANS[1]
     noise, left = noise + _MODEL_SIGMA_RAD**2, left + _MODEL_SIGMA_RAD**2
     num = witnesses(bearings0, CELLS_PER_SIDE)
-    if np.log(left / noise) < _MIN_TRANSLATION_SIGMAS * _LOG_MEDIAN_RATIO_SIGMA / np.sqrt(num):
+    # one rotation in a million passes for a translation
+    # 2.75: standard deviation of the log ratio of two such medians, times the root of the sample's
+    # size
+    if np.log(left / noise) < 4.75 * 2.75 / np.sqrt(num):
         return np.inf
     return _direction_error(f0_T_f1, bearings0, bearings1) * np.sqrt(noise * len(bearings0) / num)
 

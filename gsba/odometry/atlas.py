@@ -19,7 +19,6 @@ _COLUMNS = 3  # faces side by side
 _PAD = 2  # pixels beyond seam and poles for interpolation
 _MAX_CUT_ERROR = np.deg2rad(6.0)  # largest rotation of a cut's axes against the world: maps are
 # computed anew beyond it
-_SAME_CUT = 1e-9  # largest angle, radians, between axes that count as equal
 # Minimax polynomial of arctan(t) / t in t^2 on [0, 1] (Chebyshev nodes): error 7e-7 at most.
 _A0, _A1, _A2, _A3, _A4, _A5, _A6 = (
     np.float32(a)
@@ -122,7 +121,7 @@ class Cutter:
         off = np.inf
         if self.cut_R_rig is not None:
             off = float(rotation_angle(self.cut_R_rig.T @ world_R_rig))
-        if off > (_SAME_CUT if exactly else _MAX_CUT_ERROR):
+        if off > (1e-9 if exactly else _MAX_CUT_ERROR):
             self.cut_R_rig, self._maps = world_R_rig.copy(), None
         assert self.cut_R_rig is not None
         if self._maps is None or self._height != len(grey):
@@ -170,7 +169,6 @@ def _erp_pixels(xs, ys, zs, cut_R_rig, height, across, down):
         down[i] = half * height + per_radian * _arctangent(b, np.sqrt(a * a + c * c)) - half
 
 
-_MAX_RETURN_ERROR_PX = 0.6  # largest error of a feature followed forth and back
 _MAX_DIFFERENCE = 25.0  # largest mean difference of both patches, grey values
 
 
@@ -208,7 +206,7 @@ def follow(
     expected = starts[rows] + there - ends[rows]  # as far off as the guess was
     back, home, _ = align_patches(frame.pyramid, template.pyramid, there, expected, 1)
     off = np.linalg.norm(back - starts[rows], axis=1)
-    good = forth & home & (off < _MAX_RETURN_ERROR_PX) & (difference < _MAX_DIFFERENCE)
+    good = forth & home & (off < 0.6) & (difference < _MAX_DIFFERENCE)  # pixels
     good &= layout.inside(there, faces[rows], margin)
     rows, there = rows[good], there[good]
     found[rows] = True
@@ -221,7 +219,6 @@ _BLOCK = 5  # pixels across the patch of which gradients are summed
 _APART_PX = 5  # least distance between features
 _MIN_EIGENVALUE = 3e-5  # least eigenvalue of a patch's gradients, in OpenCV's normalisation: less
 # is noise
-_NOISES = 4.0  # least response of a corner, in median responses of a picture's flattest quarter
 
 
 def new_corners(
@@ -235,7 +232,7 @@ def new_corners(
     """
     response = cv2.cornerMinEigenVal(atlas.image, _BLOCK)
     allowed = layout.owned if usable is None else layout.owned & usable
-    floor = max(_MIN_EIGENVALUE, _NOISES * _flat(response, allowed))
+    floor = max(_MIN_EIGENVALUE, 4.0 * _flat(response, allowed))
     peaks = (response == cv2.dilate(response, np.ones((5, 5)))) & (response > floor) & allowed
     taken = np.zeros(6 * _PER_SIDE**2, int)
     if len(known):

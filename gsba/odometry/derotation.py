@@ -9,12 +9,9 @@ import numpy as np
 from gsba.camera.sphere import around_sphere, bearings_from_erp, erp_from_bearings, table
 
 _WIDTH = 128  # pixels across the panoramas that are compared
-_BLUR = 1.2, 8.0  # pixels, standard deviations: band of detail that is compared
 _STEPS = 15
 _PAD = 2  # pixels beyond seam and poles for interpolation
 _CONVERGED = np.deg2rad(0.05)
-_MAX_STEP = np.deg2rad(15.0)
-_ROWS = (0.25, 0.75)  # band of rows that are correlated, parts of the height
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +28,7 @@ def miniature(grey: np.ndarray, usable: np.ndarray | None = None) -> Miniature:
     size = (_WIDTH, _WIDTH // 2)
     small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA).astype(np.float32)
     wide = np.concatenate([small[:, -32:], small, small[:, :32]], axis=1)
-    fine, coarse = (cv2.GaussianBlur(wide, (0, 0), sigma)[:, 32:-32] for sigma in _BLUR)
+    fine, coarse = (cv2.GaussianBlur(wide, (0, 0), sigma)[:, 32:-32] for sigma in (1.2, 8.0))
     detail = fine - coarse
     heights = (np.arange(len(small)) + 0.5) / len(small)
     weights = np.repeat(np.sin(np.pi * heights)[:, None], _WIDTH, axis=1).astype(np.float32)
@@ -50,7 +47,8 @@ def turned(one: Miniature, other: Miniature, guesses: list[np.ndarray]) -> np.nd
         guesses: initial rotations, besides the best rotation about the vertical axis.
     """
     best, least = np.eye(3), np.inf
-    rows = slice(*(round(part * len(one.detail)) for part in _ROWS))
+    # the middle half of the rows is correlated
+    rows = slice(*(round(part * len(one.detail)) for part in (0.25, 0.75)))
     spectra = [np.fft.rfft(m.detail[rows] * (m.weights[rows] > 0), axis=1) for m in (one, other)]
     correlation = np.fft.irfft(spectra[0] * np.conj(spectra[1]), axis=1).sum(axis=0)
     angle = 2 * np.pi * int(np.argmax(correlation)) / _WIDTH
@@ -81,7 +79,7 @@ def _aligned(one: Miniature, other: Miniature, start: np.ndarray) -> tuple[np.nd
         weighted = jacobian * robust[:, None]
         normal = weighted.T @ jacobian + 1e-6 * np.eye(3)
         step = np.linalg.solve(normal, weighted.T @ residuals)
-        step *= min(1.0, _MAX_STEP / max(float(np.linalg.norm(step)), 1e-12))
+        step *= min(1.0, np.deg2rad(15.0) / max(float(np.linalg.norm(step)), 1e-12))
         rotation = Rotation.from_rotvec(step).as_matrix() @ rotation
         if np.linalg.norm(step) < _CONVERGED:
             break

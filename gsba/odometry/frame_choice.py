@@ -8,9 +8,6 @@ from gsba.config import OdometrySettings
 from gsba.geometry import rotation_angle
 from gsba.odometry.walk import Odometry
 
-_EARLIEST = 0.6  # part of a step after which the sharpest frame is searched
-_MOST_LONGER = 1e6  # largest factor on the step, if few frames are wanted
-
 
 def choose_frames(found: Odometry, settings: OdometrySettings) -> np.ndarray:
     """Rows (N,) of the frames to refine.
@@ -27,7 +24,7 @@ def choose_frames(found: Odometry, settings: OdometrySettings) -> np.ndarray:
     low, high = 1.0, 2.0
     while len(_chosen(found, steps, high)) > count:
         low, high = high, 2 * high
-        if high > _MOST_LONGER:  # more maps than frames are wanted
+        if high > 1e6:  # more maps than frames are wanted
             return rows[np.linspace(0, len(rows) - 1, count).round().astype(int)]
     for _ in range(20):  # bisections of the interval of that factor
         middle = 0.5 * (low + high)
@@ -93,7 +90,7 @@ def _next(
     if not len(ahead):
         return None
     stop = int(beyond[0]) if len(beyond) else len(ahead)
-    fit = np.flatnonzero(away[:stop] >= _EARLIEST)
+    fit = np.flatnonzero(away[:stop] >= 0.6)  # the sharpest of the last part of the step
     if len(fit):
         return int(ahead[fit[np.argmax(sharpness[rows[ahead[fit]]])]])
     if not len(beyond):

@@ -19,19 +19,10 @@ from gsba.similarity import Sim3
 
 logger = logging.getLogger(__name__)
 
-_MAX_SCALE_DRIFT = 1.25  # largest ratio of scales between two visits, either way
 _MIN_POINTS = 6  # least number of points known at both places of a pair
 _BESIDE = 4  # places from a meeting's ends that belong to it
-_MAX_TRIED = 4  # proposals of one meeting that are tested
 _FITTED = 3  # places to either side of a meeting whose points measure the loop
 _DIRECTION_SIGMA = np.deg2rad(0.25)  # noise of common points' bearings, as seen from a place
-_DISTANCE_SIGMA = 0.1  # noise of the logarithm of the ratio of common points' distances
-_FITTING = 4.0  # largest residual, in these standard deviations, of a point that fits
-_MIN_FITTING = 0.35  # least share of points that fit a measured loop; true ones have 0.4 to 0.6
-_MIN_ROTATION = np.deg2rad(0.1)  # least standard deviations of a loop: lenses have two centres, and
-_MIN_TRANSLATION = 0.003  # each side has drifted; in radians, median distances, and log scale
-_MIN_LOG_SCALE = 0.01
-_UNMEASURED = 5.0  # factor on these if too few points beside the meeting measure it
 _CORRELATED = 4.0  # factor on the variance of independent points: those of one surface have
 # correlated errors
 
@@ -85,7 +76,7 @@ def find_joins(places: KeyframePlaces) -> list[Constraint]:
         if measured is None:
             # Frames that measure it are further off; the join itself is accepted all the same.
             end, start = others[g], rows[f]
-            poses, wide = places.solved.world_T_rigs, _UNMEASURED * _floor(test.depth)
+            poses, wide = places.solved.world_T_rigs, 5.0 * _floor(test.depth)
             step = Sim3.of(1.0, inverse(poses[end]) @ poses[start])
             measured = Constraint(int(end), int(start), step, np.diag(np.square(wide)))
         found.append(measured)
@@ -124,7 +115,7 @@ def _judged(
     """Each similarity proposed by a group of pairs, judged by its surroundings."""
     poses, seed = places.solved.world_T_rigs, places.context.settings.seed
     found = []
-    for proposal in propose(group, poses, test.depth, seed)[:_MAX_TRIED]:
+    for proposal in propose(group, poses, test.depth, seed)[:4]:
         if not _plausible(proposal, places, unseen, test.depth):
             continue
         one = test.judge(proposal, *_sides(*proposal.frames, len(poses)), found)
@@ -137,7 +128,7 @@ def _plausible(
     proposal: Proposal, places: KeyframePlaces, unseen: np.ndarray, depth: float
 ) -> bool:
     """True if a loop needs no more drift than the path between its places can have."""
-    if abs(np.log(proposal.move.scale)) > np.log(_MAX_SCALE_DRIFT):
+    if abs(np.log(proposal.move.scale)) > np.log(1.25):  # largest ratio, either way
         return False
     (f, g), poses = proposal.frames, places.solved.world_T_rigs
     g_T_f = inverse(poses[g]) @ proposal.move.poses(poses[f])
@@ -208,14 +199,14 @@ def fit_loop(
         parts = [
             (there / lengths[0] - at_q / lengths[1]) / _DIRECTION_SIGMA,
             (back / lengths[2] - at_p / lengths[3]) / _DIRECTION_SIGMA,
-            np.log(lengths[0] / lengths[1]) / _DISTANCE_SIGMA,
+            np.log(lengths[0] / lengths[1]) / 0.1,
         ]
         return np.concatenate([part.ravel() for part in parts])
 
     solved = least_squares(residuals, np.zeros(7), loss="soft_l1", x_scale="jac")
     left = residuals(solved.x)
     off = np.linalg.norm(left[: 6 * len(p)].reshape(2, len(p), 3), axis=2)
-    if np.mean((off < _FITTING).all(axis=0)) < _MIN_FITTING:
+    if np.mean((off < 4.0).all(axis=0)) < 0.35:  # true loops have 0.4 to 0.6
         return None
     noise = max(float(np.median(np.abs(left))) / 0.6745, 0.5)
     information = solved.jac.T @ solved.jac
@@ -226,9 +217,8 @@ def fit_loop(
 
 def _floor(distance: float) -> np.ndarray:
     """Least standard deviations (7,) of a loop among points at a median distance."""
-    return np.array(
-        [_MIN_ROTATION] * 3 + [_MIN_TRANSLATION * distance] * 3 + [_MIN_LOG_SCALE], float
-    )
+    # lenses have two centres, and each side has drifted
+    return np.array([np.deg2rad(0.1)] * 3 + [0.003 * distance] * 3 + [0.01], float)
 
 
 def moved(similarity: Sim3, tangent: np.ndarray) -> Sim3:

@@ -33,7 +33,6 @@ from gsba.video.recording import (
 
 logger = logging.getLogger(__name__)
 
-_LOOKS = 8  # frames of a raw recording from which its lenses are initialised
 _CARRIER_LOOKS = 20  # frames in which the carrier is detected
 _LEAST = 3  # least number of frames of a sequence
 
@@ -181,7 +180,7 @@ def _pixels(picture: Picture, colour: bool) -> np.ndarray:
 
 def _lenses(recording: Recording, rows: np.ndarray, calibration: Path | None) -> Rig:
     """Initial lenses of a raw recording, from a few of its frames."""
-    looks = np.unique(np.linspace(0, len(rows) - 1, _LOOKS).astype(int))
+    looks = np.unique(np.linspace(0, len(rows) - 1, 8).astype(int))
     size = (recording.width, recording.width)
     with TemporaryDirectory(prefix="gsba-") as name:
         pairs = []

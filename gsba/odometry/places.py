@@ -20,13 +20,10 @@ from gsba.types import Features, Solution
 
 _JPEG_QUALITY = 90
 _HFOV = np.deg2rad(94.0)  # of faces: keypoints near a border are described by pixels beyond it
-_STEP = 0.12  # least distance of consecutive places, in median distances of points
-_MAX_PER_FACE = 150  # keypoints
 _STRONGEST_PER_FACE = 100  # strongest of these, compared without any prediction
 _SETTINGS = RefineSettings(
     pairs=PairSettings(strongest_per_face=_STRONGEST_PER_FACE, far_drift=0.03)
 )
-_MAX_ERROR_SIGMAS = 6.0  # largest residual of an observation
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +64,7 @@ def chosen_keyframes(
     for k in np.flatnonzero(maps >= 0).tolist():
         if chosen and maps[chosen[-1]] == maps[k]:
             moved = world_T_rigs[k, :3, 3] - world_T_rigs[chosen[-1], :3, 3]
-            if np.linalg.norm(moved) < _STEP * distances[k]:
+            if np.linalg.norm(moved) < 0.12 * distances[k]:
                 continue
         chosen.append(k)
     return np.array(chosen, np.int64)
@@ -86,7 +83,7 @@ def described(
     size = round(width / np.pi * np.tan(_HFOV / 2))
     rig = CubeRig(size, _HFOV)
     layout = AtlasLayout(rig)
-    cutter, extractor = Cutter(layout), SiftExtractor(FeatureSettings(max_per_face=_MAX_PER_FACE))
+    cutter, extractor = Cutter(layout), SiftExtractor(FeatureSettings(max_per_face=150))
 
     def faces(grey: np.ndarray) -> np.ndarray:
         atlas = cutter.cut(grey, np.eye(3)).image.reshape(2, size, 3, size)
@@ -129,5 +126,5 @@ def make_places(
     found, keypoints = found.taken(np.flatnonzero(same)), context.keypoints
     tracks = build([found], np.diff(keypoints.starts))
     settings = context.settings.triangulate
-    landmarks = place(tracks, keypoints, world_T_rigs, _MAX_ERROR_SIGMAS, settings)
+    landmarks = place(tracks, keypoints, world_T_rigs, 6.0, settings)
     return KeyframePlaces(keyframes, maps, features, replace(start, landmarks=landmarks), context)

@@ -17,11 +17,6 @@ from gsba.odometry.window import WindowObservations
 from gsba.similarity import Sim3
 
 _HELD = 1e-5  # standard deviation of the fixed first keyframe of a map, all parts of its tangent
-_HELD_LOG_DISTANCE = 1e-5  # of the distance to the furthest keyframe, in the gauge of covariances
-_FREE_LOG_SCALE = 1.0  # of the first keyframe's scale in that gauge
-_POSE_ROTATION = 0.007  # standard deviations of each frame's own errors: radians, and units of the
-_ERROR_RATE = 1e-9  # probability of rejecting a true loop, low because drift is partly systematic
-# while covariances are of random errors
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +60,9 @@ def close_loops(
     graph.add(gtsam.PriorFactorSimilarity3(X(0), values.atSimilarity3(X(0)), held))
     for one in steps:
         graph.add(factor_of(one))
-    kept, cost, most = np.zeros(len(loops), bool), graph.error(values), chi2.isf(_ERROR_RATE, 7)
+    # 1e-9: probability of rejecting a true loop, low because drift is partly systematic while
+    # covariances are of random errors
+    kept, cost, most = np.zeros(len(loops), bool), graph.error(values), chi2.isf(1e-9, 7)
     for n in np.argsort([one.second - one.first for one in loops], kind="stable"):
         tried = gtsam.NonlinearFactorGraph(graph)
         tried.add(factor_of(loops[n]))
@@ -110,7 +107,7 @@ def covariances_of(
     away = np.linalg.norm(world_T_keys[:, :3, 3] - world_T_keys[0, :3, 3], axis=1)
     far = int(np.argmax(away))
     moving = away[far] > 0
-    sigmas = np.array([_HELD] * 6 + [_FREE_LOG_SCALE if moving else _HELD])
+    sigmas = np.array([_HELD] * 6 + [1.0 if moving else _HELD])
     noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
     graph.add(gtsam.PriorFactorSimilarity3(X(0), values.atSimilarity3(X(0)), noise))
     if moving:
@@ -141,7 +138,7 @@ def carried_covariances(
     into_rigs = adjoint(inverse(key_T_rigs))
     own = np.zeros_like(into_rigs)
     turn, step = np.arange(3), np.arange(3, 6)
-    own[:, turn, turn] = _POSE_ROTATION**2
+    own[:, turn, turn] = 0.007**2  # radians
     own[:, step, step] = np.square(0.005 * distances)[:, None]  # median distance
     return into_rigs @ covariances @ np.swapaxes(into_rigs, 1, 2) + own
 
@@ -159,7 +156,7 @@ def _fixed_distance(far: int, world_T_ends: np.ndarray, scale: float) -> gtsam.C
             jacobians[0] = jacobian
         return np.zeros(1)
 
-    noise = gtsam.noiseModel.Isotropic.Sigma(1, _HELD_LOG_DISTANCE)
+    noise = gtsam.noiseModel.Isotropic.Sigma(1, 1e-5)
     return gtsam.CustomFactor(noise, [X(far)], error)
 
 

@@ -19,7 +19,6 @@ _CELLS = 16  # cells along a cube face's side: all features within one, 6 degree
 _MIN_WITNESSES = 20  # least number of witnesses: fewer may be of one moving object
 _MAX_FALSE_ALARMS = 1e-6  # expected number of poses that chance explains as well as the accepted
 # one
-_CHANCE_SPAN = np.deg2rad(6.0)  # false matches lie anywhere within this angle of their prediction
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +54,8 @@ def resect(
     covariance = max(noise, 0.3 * sigma) ** 2 * np.linalg.pinv(information, hermitian=True)
     num = witnesses(bearings_rig, _CELLS) if len(bearings_rig) else 0
     agreeing = witnesses(bearings_rig[inliers], _CELLS) if inliers.any() else 0
-    chance = min((_GATE * sigma / _CHANCE_SPAN) ** 2, 0.5)
+    # false matches lie anywhere within 6 degrees of their prediction
+    chance = min((_GATE * sigma / np.deg2rad(6.0)) ** 2, 0.5)
     per_witness = 1 - (1 - chance) ** (len(bearings_rig) / max(num, 1))
     needed = least_agreeing(num, per_witness, _SAMPLE, _MAX_FALSE_ALARMS)
     significant = agreeing >= max(needed, _MIN_WITNESSES)

@@ -29,7 +29,6 @@ from gsba.video.likeness import sharpness
 _PATIENCE_S, _MIN_PATIENCE = 1.5, 8  # seconds, and frames, before a lost camera begins a new map
 _CHECKPOINT_S = 60.0  # between checkpoints
 _MAX_SAVING_SHARE = 0.03  # of the time between checkpoints that writing one may take
-_POINTS_TOLD = 12  # most points of a keyframe that its event holds
 
 
 @dataclass(slots=True)
@@ -87,7 +86,7 @@ def _tell_keyframe(state: TrackerState, number: int) -> None:
     ids, _ = state.keyframe_features[number]
     points = state.points[ids]
     points = points[np.isfinite(points).all(axis=1)]
-    points = points[:: max(1, -(-len(points) // _POINTS_TOLD))]
+    points = points[:: max(1, -(-len(points) // 12))]  # a dozen at most
     position = state.keyframe_poses[number][:3, 3]
     map_number = state.records[state.keyframe_frames[number]].map_number
     told = {"position": position.round(4).tolist(), "points": points.round(4).tolist()}

@@ -110,10 +110,8 @@ def _held(world_T_rigs: np.ndarray, num_held: int) -> gtsam.NonlinearFactorGraph
     return graph
 
 
-_REFITS = 6  # refits of a rotation without the features that are furthest off
 _MOVED, _MOVED_LITTLE = np.deg2rad([4.0, 1.2])  # parallax of the upper quarter of the features from
 # which initialisation is tried; the latter while features are being lost
-_MAX_DIRECTION_SIGMA = np.deg2rad(6.0)  # largest standard deviation of the translation's direction
 _MIN_POINTS = 40  # least number of independent points, in cells of 6 degrees
 _CELLS = 16
 _VERIFY = TwoViewLimits(max_error_deg=0.3)
@@ -132,7 +130,7 @@ def median_turn(one: np.ndarray, other: np.ndarray) -> StartTurn:
     """The rotation that maps most bearings (N, 3) of the other frame onto those of the first."""
     near, rotation = np.ones(len(one), bool), np.eye(3)
     off = np.zeros(len(one))
-    for _ in range(_REFITS if len(one) >= 3 else 0):
+    for _ in range(6 if len(one) >= 3 else 0):  # without the features that are furthest off
         rotation = nearest_rotation(one[near].T @ other[near])
         off = angles_between(one, other @ rotation.T)
         near = off <= np.median(off)
@@ -163,7 +161,7 @@ def start_map(
     if len(ids) < _MIN_POINTS or np.quantile(turn.parallaxes, 0.75) < moved:
         return None
     found = relative_pose(one, other, _VERIFY, seed)
-    if found is None or found.direction_sigma > _MAX_DIRECTION_SIGMA:
+    if found is None or found.direction_sigma > np.deg2rad(6.0):
         return None
     poses = np.stack([np.eye(4), found.f0_T_f1])
     good = found.inliers

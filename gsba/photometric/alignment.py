@@ -23,19 +23,12 @@ from gsba.store.shards import Workers
 from gsba.types import Counts, Keypoints, Landmarks, Sighted, Solution
 from gsba.types.records import slices
 
-_MIN_ZNCC = 0.75  # correlation of the aligned patches
-_MAX_SIGMA_PX = 0.5  # along the least certain direction, panorama pixels
 _MIN_TRACK_LENGTH = 3  # of a point that is aligned in frames without an observation of it, too
 _TOO_UNCERTAIN = "position too uncertain"
 _SIGHTINGS_AT_ONCE = 1 << 15  # sightings that a thread processes together: some 20 MB
-_BYTES_PER_POINT = 8192  # of a point's patch and its sightings, about
 _MEMORY_SHARE = 64  # of the machine's memory, which the patches of one part take at most
 _POINTS_AT_ONCE = 1 << 15  # whose former observations a thread looks for together
 _PLACE_BITS = 10  # of a coordinate by which frames are put in order: cells of a 1024th of the map
-_ENOUGH_OBSERVATIONS = 100  # aligned observations of a frame from which points without aligned
-# patches are dropped
-_TILTED_STEP_PX = 1.4  # pixels to a step of patches tilted with their surfaces; 1 of patches facing
-# the host
 _MIN_SIGMA_PX = 0.03  # pixels, noise of the best patches: sampling, and a plane as the surface
 
 REJECTIONS = (*REASONS.values(), _TOO_UNCERTAIN)  # reasons why alignments are dropped
@@ -119,7 +112,8 @@ def align(
 
 def _by_hosts(hosts: np.ndarray, positions: np.ndarray) -> Iterator[np.ndarray]:
     """Points (n,), ascending, held together: those of hosts (J,) near one another, read at once."""
-    most = max(total_memory_bytes() // (_MEMORY_SHARE * _BYTES_PER_POINT), 1)
+    # 8192: bytes of a point's patch and its sightings, about
+    most = max(total_memory_bytes() // (_MEMORY_SHARE * 8192), 1)
     # numbers of cells, similar for near ones (Morton, 1966)
     low, edge = positions.min(axis=0), float(np.ptp(positions, axis=0).max())
     last = (1 << _PLACE_BITS) - 1
@@ -211,7 +205,7 @@ def _planes(
     depths = np.linalg.norm(local, axis=1)
     origins = field.observed(local / np.maximum(depths, 1e-300)[:, None])
     spreads = pixel * np.swapaxes(tangent_basis(origins), 1, 2)
-    spreads[normals_rig.any(axis=1)] *= _TILTED_STEP_PX
+    spreads[normals_rig.any(axis=1)] *= 1.4  # pixels to a step of tilted patches; 1 of others
     slopes = slopes_of(normals_rig, origins, spreads)
     tilted = spreads + origins[:, :, None] * slopes[:, None, :]
     away = world_T_hosts[:, :3, :3] * depths[:, None, None]
@@ -305,9 +299,10 @@ def accepted_rows(
     shifts = np.linalg.norm(np.cross(sightings.origins, bearings), axis=1)
     tests = {reason: sightings.states != state for state, reason in REASONS.items()}
     aligned = sightings.states == ALIGNED
-    tests["look different"] &= ~aligned | (sightings.scores > _MIN_ZNCC)
+    tests["look different"] &= ~aligned | (sightings.scores > 0.75)
     tests["found too far off"] &= ~aligned | (shifts < MAX_SHIFT_PX * pixel)
-    tests[_TOO_UNCERTAIN] = ~aligned | (worst < _MAX_SIGMA_PX * pixel)
+    # pixels, along the least certain direction
+    tests[_TOO_UNCERTAIN] = ~aligned | (worst < 0.5 * pixel)
     left = np.ones(len(bearings), bool)
     for reason, passed in tests.items():
         dropped[reason] += int(np.count_nonzero(left & ~passed))
@@ -350,7 +345,8 @@ def _former_observations(
     tracks = landmarks.tracks
     wanted = np.zeros(tracks.num_points, bool)
     wanted[found.points] = True
-    scarce = np.bincount(found.frames, minlength=num_frames) < _ENOUGH_OBSERVATIONS
+    # from here on, points without aligned patches are dropped
+    scarce = np.bincount(found.frames, minlength=num_frames) < 100
     wanted[tracks.points[scarce[tracks.frames]]] = True
     parts = list(slices(tracks.num_points, _POINTS_AT_ONCE))
 

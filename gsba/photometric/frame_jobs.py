@@ -15,11 +15,7 @@ from gsba.store.shards import Workers, blocks_of_frames
 
 MAX_SHIFT_PX = 3.0  # from the predicted pixel, panorama pixels
 _AFFINE_SIGMA = 0.15  # prior of the warp: a surface facing the ray
-_GREY_SIGMA = 3.0  # noise of pixels, grey values
-_WINDOW_SIGMA_SHARE = 0.6  # standard deviation of the patch's window, in half patches
-_SEARCH_SHIFT_RATIO = 1.5  # largest shift during alignment, in largest accepted shifts
 _MAX_STEPS = 12  # largest number of alignment steps
-_TOLERANCE_PX = 0.02  # of the last step, pixels
 
 
 def cut(
@@ -81,13 +77,14 @@ def align_to(
     Args:
         image: the picture. mask: (H, 2H) bool, True = use; None = all.
     """
-    reach, every = _SEARCH_SHIFT_RATIO * MAX_SHIFT_PX, np.arange(len(sightings.templates))
-    patches.align(image, mask, every, sightings, reach, _MAX_STEPS, _TOLERANCE_PX)
+    reach, every = 1.5 * MAX_SHIFT_PX, np.arange(len(sightings.templates))
+    patches.align(image, mask, every, sightings, reach, _MAX_STEPS, 0.02)
 
 
 def _empty_patches(num: int, settings: PatchSettings) -> PatchSet:
     """Empty storage for templates."""
-    return PatchSet(num, settings.patch_size, _WINDOW_SIGMA_SHARE, _AFFINE_SIGMA, _GREY_SIGMA)
+    # noise of 3 grey values, a window of .6 half patches
+    return PatchSet(num, settings.patch_size, 0.6, _AFFINE_SIGMA, 3.0)
 
 
 @dataclass(frozen=True, slots=True)

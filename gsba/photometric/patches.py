@@ -20,7 +20,6 @@ _DEPTH_TOLERANCE = 0.03  # relative, of map points on one plane
 _SLOPE_SIGMA = 0.7  # of a patch's tilt, as a tangent
 _NUM_PLANE_POINTS = 8  # map points that determine a patch's plane
 _MIN_GREY, _MAX_GREY = 3, 252  # grey values beyond which a pixel counts as saturated
-_MAX_LATITUDE_RAD = np.deg2rad(80.0)  # pixels of a panorama beyond are mostly interpolated
 
 
 def pyramid(
@@ -88,7 +87,8 @@ def candidates(grey: np.ndarray, usable: np.ndarray, settings: PhotometricSettin
     open_ = cv2.erode(usable.astype(np.uint8), np.ones((border, border), np.uint8)) > 0
     open_[:, : border // 2] = open_[:, -(border // 2) :] = False  # erosion does not wrap around the
     # seam
-    score = np.where(open_ & (np.abs(latitude) < _MAX_LATITUDE_RAD), score, 0.0).ravel()
+    # beyond 80 degrees, pixels of a panorama are mostly interpolated
+    score = np.where(open_ & (np.abs(latitude) < np.deg2rad(80.0)), score, 0.0).ravel()
     order, starts = _cells(width, height, settings.spacing_deg)
     ranked = score[order]
     best = np.maximum.reduceat(ranked, starts)

@@ -11,7 +11,6 @@ MAX_ANGLE_DEG = 45.0  # between two rays of a point
 MAX_RATIO = 1.8  # of a point's distances from two frames
 
 _kernel, _part = kernel_and_part()
-_LOG_RATIO_WEIGHT = 0.25  # weight of a squared log ratio of distances, relative to a squared angle
 
 
 def references(landmarks: Landmarks, world_T_rigs: np.ndarray) -> np.ndarray:
@@ -93,7 +92,7 @@ def _difference(ax, ay, az, bx, by, bz):
         return -1.0, np.inf, np.inf
     cosine = (ax * bx + ay * by + az * bz) / np.sqrt(aa * bb)
     ratio = np.sqrt(bb / aa)
-    return cosine, ratio, 2.0 * (1.0 - cosine) + _LOG_RATIO_WEIGHT * np.log(ratio) ** 2
+    return cosine, ratio, 2.0 * (1.0 - cosine) + 0.25 * np.log(ratio) ** 2
 
 
 @_kernel

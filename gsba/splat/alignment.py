@@ -25,7 +25,6 @@ from gsba.types import FrameSet
 MIN_ALPHA = 0.95  # least alpha of a rendered pixel that is used
 MAX_STEP = 0.1  # relative depth step between neighbouring pixels from which they are an edge
 _LUMA = np.array([0.299, 0.587, 0.114])
-_CAPTURED_HFOV_DEG = 100.0  # of captured faces, so that samples beyond a rendered edge find pixels
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,7 +162,7 @@ def _captured_rig(frames: FrameSet, size: int) -> CubeRig:
 
 
 def _wide_rig(size: int) -> CubeRig:
-    hfov = np.deg2rad(_CAPTURED_HFOV_DEG)
+    hfov = np.deg2rad(100.0)  # samples beyond a rendered edge find pixels
     return CubeRig(round(size * np.tan(hfov / 2)), hfov)
 
 

@@ -12,8 +12,6 @@ from gsba.splat.camera import rig_cameras
 from gsba.splat.gaussians import Gaussians
 from gsba.types import FACES
 
-_PANORAMA_HFOV_DEG = 94.0  # of the faces that a panorama is sampled from
-
 
 def render_views(
     gaussians: Gaussians,
@@ -36,7 +34,7 @@ def render_panorama(
     """
     import cv2
 
-    hfov = np.deg2rad(_PANORAMA_HFOV_DEG)
+    hfov = np.deg2rad(94.0)  # of the faces that a panorama is sampled from
     rig = CubeRig(round(width / np.pi * np.tan(hfov / 2)), hfov)  # as dense as the equator
     faces = render_views(gaussians, world_T_rig, rig_views(rig), near, backend)
     height = width // 2

@@ -38,7 +38,6 @@ from gsba.splat.train import TrainingState, advance, begin
 from gsba.store.records import load_checkpoint, save_record
 from gsba.types import Counts, FrameSet, Keypoints, Landmarks, Round, Solution
 
-_SOLVER_STEPS = 2  # Levenberg-Marquardt steps in a move
 _SH_DEGREE = 1  # of colours: low, so that views must agree on them
 
 logger = logging.getLogger(__name__)
@@ -248,7 +247,7 @@ class _Turns:
         terms = self.context.beside(greys).terms(replace(self.solved, world_T_rigs=world_T_rigs))
         values, landmarks = terms.values, self._block()
         landmarks.polish(values)
-        solver = settings.solver.model_copy(update={"max_iterations": _SOLVER_STEPS})
+        solver = settings.solver.model_copy(update={"max_iterations": 2})
         result = optimize(terms.graph, values, [landmarks, *terms.blocks], solver)
         return adjustment.poses_of(result.values, len(world_T_rigs)), result
 

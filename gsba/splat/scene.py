@@ -19,8 +19,6 @@ from gsba.splat.gaussians import Gaussians, from_cloud
 from gsba.splat.train import Images, Views, extent_of
 from gsba.types import FrameSet, Landmarks, PoseStatus, Reconstruction, Tracks
 
-_GATE_RAD = np.deg2rad(3.0)  # largest angle of an observation to its point, under poses that may
-# have drifted
 _MAX_OVERSAMPLING = 8  # largest number of samples of a panorama along a pixel of a face
 
 
@@ -208,7 +206,7 @@ def start_cloud(
         reconstruction, world_T_rigs, frames: see `place_points`.
         sh_degree: highest degree of the Gaussians' harmonics.
     """
-    landmarks, known = place_points(reconstruction, world_T_rigs, frames, float(_GATE_RAD))
+    landmarks, known = place_points(reconstruction, world_T_rigs, frames, float(np.deg2rad(3.0)))
     return from_cloud(landmarks.points_world, reconstruction.point_colors[known], sh_degree)
 
 

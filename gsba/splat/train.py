@@ -25,11 +25,6 @@ from gsba.store.records import load_checkpoint, save_record
 
 logger = logging.getLogger(__name__)
 
-_PUBLISHED_STEPS = 30_000  # steps of the published schedule
-_PARAMETER_COPIES = 8  # copies of all parameters in memory: gradients, two moments, and those of
-# density control
-_STEPS_BETWEEN_CHECKS = 20  # steps between checks for values that are not finite, at ends of
-# stretches
 
 Images = Sequence[np.ndarray] | np.ndarray  # of individual sizes, or of one size
 
@@ -82,7 +77,7 @@ class Times:
 
 def times_for(iterations: int) -> Times:
     """The published schedule, scaled to a number of steps."""
-    scale = iterations / _PUBLISHED_STEPS
+    scale = iterations / 30_000  # steps of the published schedule
     return Times(
         densify_from=max(round(500 * scale), 100),
         densify_until=iterations // 2,
@@ -135,7 +130,7 @@ def train(
             continue  # made together with an earlier one
         state = trainer.advance(state, settings.iterations)
         last = state.step == settings.iterations
-        if state.step % _STEPS_BETWEEN_CHECKS == 0 or last:
+        if state.step % 20 == 0 or last:
             _require_finite(state, checkpoint)
         if watch is not None:
             watch(state.step, state.gaussians)
@@ -202,9 +197,8 @@ def most_gaussians(views: Views, settings: SplatSettings, backend: Backend) -> t
     num = num_parameters(settings.sh_degree)
     pixels = views.num_pixels
     determined = max(3 * pixels // num, 1)
-    held = max(
-        backend.memory_bytes // 2 // (_PARAMETER_COPIES * np.dtype(np.float32).itemsize * num), 1
-    )
+    # 8 copies: gradients, two moments, and those of density control
+    held = max(backend.memory_bytes // 2 // (8 * np.dtype(np.float32).itemsize * num), 1)
     if determined <= held:
         return determined, f"that {pixels} pixels determine"
     return held, f"that half of {backend.memory_bytes / 1e9:.1f} GB of memory holds"

@@ -28,7 +28,6 @@ _PROJECTIONS = {
     4: "rectilinear",
     5: "fisheye",
 }  # AVSphericalProjection; 2: equirectangular with bounds
-_TILED = 2
 _ORIENTATIONS = {  # EXIF's, of the signs of a, b, c, d of a display matrix
     (1, 0, 0, 1): 1,
     (-1, 0, 0, 1): 2,
@@ -98,7 +97,7 @@ def claims_of(frame: Any, pixel_aspect: Fraction | None) -> PictureClaims:
         eyes,
         _PROJECTIONS.get(kind, "unknown"),
         True,
-        tuple(bounds) if kind == _TILED else (0.0,) * 4,  # type: ignore[arg-type]
+        tuple(bounds) if kind == 2 else (0.0,) * 4,  # type: ignore[arg-type]
         tuple(turn / 2**16 for turn in turns),  # type: ignore[arg-type]
         hdr,
     )

@@ -45,8 +45,6 @@ EXACT_S = 1e-6  # closer times are equal
 
 _RAW_SUFFIX = ".insv"  # of videos that hold fisheyes even if no image circle is detected
 _STITCH = "stitch it in the camera's app and export an equirectangular (2:1) video"
-_MAX_SQUARE_RATIO = 1.1  # of the longer to the shorter side of a nearly square image
-_MAX_MISSING_SHARE = 0.1  # of the longer track's duration that the shorter one may lack
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,7 +187,7 @@ def check_lengths(recording: Recording) -> None:
         GsbaError: one is shorter.
     """
     lasting = [float(line.times[-1]) + line.interval_s for line in recording.timelines]
-    if min(lasting) >= (1 - _MAX_MISSING_SHARE) * max(lasting):
+    if min(lasting) >= 0.9 * max(lasting):
         return
     short, long = int(np.argmin(lasting)), int(np.argmax(lasting))
     end = recording.times[recording.shown][-1]
@@ -205,7 +203,7 @@ def check_lengths(recording: Recording) -> None:
 
 
 def _is_nearly_square(size: tuple[int, int]) -> bool:
-    return 0 < max(size) <= _MAX_SQUARE_RATIO * min(size)
+    return 0 < max(size) <= 1.1 * min(size)
 
 
 def _check_pair(files: tuple[Path, ...], size: tuple[int, int]) -> None:

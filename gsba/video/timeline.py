@@ -24,7 +24,6 @@ VIDEO_SUFFIXES = frozenset(
     (".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi", ".ts", ".insv", ".360", ".lrv", ".osv")
 )
 _MAX_CLAIM_PACKETS = 60  # of a track until the first picture, which may be damaged
-_MAX_EXCESS_S = 1.0  # of the duration that a container claims over that of its frames
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +61,7 @@ class Timeline:
     def is_cut_short(self) -> bool:
         """True if the frames end clearly before the duration that the container claims."""
         last = float((self.ticks[-1] - self.ticks[0]) * self.tick_s)
-        return self.claimed_s - last > max(_MAX_EXCESS_S, 3 * last / len(self.ticks))
+        return self.claimed_s - last > max(1.0, 3 * last / len(self.ticks))
 
 
 def is_video(path: Path) -> bool:
