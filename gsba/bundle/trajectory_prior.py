@@ -12,7 +12,6 @@ from gsba.config import PriorSettings
 from gsba.geometry import inverse
 from gsba.types import GyroConstraints, StepNoise
 
-# Noise of a frame's pose in the trajectory's world, which only holds frames that nothing else does.
 LOSS_SIGMAS = 2.0  # Cauchy scale: limits the pull of wrong steps
 
 
@@ -51,7 +50,9 @@ class TrajectoryPrior(Family):
         extent = max(float(np.linalg.norm(np.ptp(world_T_rigs[:, :3, 3], axis=0))), typical)
         graph = gtsam.NonlinearFactorGraph()
         self._add_steps(graph, np.maximum(lengths, typical))
-        weaker = 1.0 if held else 10.0  # absolute priors, where another family holds the gauge
+        # absolute priors, weaker where another family holds the gauge: they only hold frames that
+        # nothing else does
+        weaker = 1.0 if held else 10.0
         model = self._robust(
             weaker * np.deg2rad(30.0),
             weaker * 0.3 * extent,  # part of the trajectory's extent
