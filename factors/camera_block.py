@@ -69,7 +69,22 @@ class CameraBlock:
         self.keys += [int(key) for key, _ in camera.shared]
         self._starts, self._columns, _ = covisible_pairs(sightings.offsets, sightings.frames, num)
         rows = np.repeat(np.arange(num), np.diff(self._starts))
-        self.pairs = _pairs(num, kinds, len(camera.shared), rows, self._columns)
+        shared = len(camera.shared)
+        own, common = np.arange(kinds), kinds * num + np.arange(shared)
+        upper, above = np.triu_indices(kinds, 1), np.triu_indices(shared, 1)
+        first = kinds * np.arange(num)[:, None]
+        among = np.stack([first + upper[0], first + upper[1]], axis=-1)
+        across = np.stack(
+            np.broadcast_arrays(
+                kinds * rows[:, None, None] + own[:, None],
+                kinds * self._columns[:, None, None] + own,
+            ),
+            axis=-1,
+        )
+        down = np.stack(np.broadcast_arrays((first + own)[:, :, None], common), axis=-1)
+        corner = np.stack([common[above[0]], common[above[1]]], axis=-1)
+        parts = [part.reshape(-1, 2) for part in (among, across, down, corner)]
+        self.pairs = np.concatenate(parts).astype(np.int64)
         self._ranges = balanced_ranges(sightings.offsets)
 
     @property
@@ -209,24 +224,6 @@ class CameraBlock:
         diagonal, off_diagonal = np.concatenate([of_frames, of_all]), np.concatenate(off)
         costs = {"bearing": cost}
         return PoseSystem(stretch * diagonal, stretch * off_diagonal, whole, costs)
-
-
-def _pairs(num: int, kinds: int, shared: int, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Rows of keys that share a residual (P, 2), in the order of `CameraBlock._in_blocks`."""
-    own, common = np.arange(kinds), kinds * num + np.arange(shared)
-    upper, above = np.triu_indices(kinds, 1), np.triu_indices(shared, 1)
-    first = kinds * np.arange(num)[:, None]
-    among = np.stack([first + upper[0], first + upper[1]], axis=-1)
-    across = np.stack(
-        np.broadcast_arrays(
-            kinds * rows[:, None, None] + own[:, None], kinds * columns[:, None, None] + own
-        ),
-        axis=-1,
-    )
-    down = np.stack(np.broadcast_arrays((first + own)[:, :, None], common), axis=-1)
-    corner = np.stack([common[above[0]], common[above[1]]], axis=-1)
-    parts = [part.reshape(-1, 2) for part in (among, across, down, corner)]
-    return np.concatenate(parts).astype(np.int64)
 
 
 def _spread(

@@ -230,7 +230,17 @@ class BlockCholesky:
             if kept is not None and s == len(self._fronts) - 1:
                 Z = kept
             else:
-                Z = self._inverse_of_front(front, whole.get(parent, _nothing()))
+                width, num = DIM * front.width, DIM * len(front.rows)
+                Z = np.empty((width + num, width + num))
+                root, _ = trtri(front.lower, lower=1)
+                Z[:width, :width] = root.T @ root
+                if num:
+                    at = (DIM * front.above[:, None] + np.arange(DIM)).ravel()
+                    Z[width:, width:] = whole.get(parent, _nothing())[at[:, None], at]
+                    G = front.below @ root
+                    Z[width:, :width] = -Z[width:, width:] @ G
+                    Z[:width, width:] = Z[width:, :width].T
+                    Z[:width, :width] -= G.T @ Z[width:, :width]
             if parent >= 0:
                 waiting[parent] -= 1
                 if not waiting[parent]:
@@ -246,21 +256,6 @@ class BlockCholesky:
         flip = self._place[pairs[:, 0]] < self._place[pairs[:, 1]]
         between[flip] = np.swapaxes(between[flip], 1, 2)
         return inverse, between
-
-    def _inverse_of_front(self, front: _Front, parent: np.ndarray) -> np.ndarray:
-        """H^-1 at the columns and rows of a front, from that at the parent's."""
-        width, num = DIM * front.width, DIM * len(front.rows)
-        Z = np.empty((width + num, width + num))
-        root, _ = trtri(front.lower, lower=1)
-        Z[:width, :width] = root.T @ root
-        if num:
-            at = (DIM * front.above[:, None] + np.arange(DIM)).ravel()
-            Z[width:, width:] = parent[at[:, None], at]
-            G = front.below @ root
-            Z[width:, :width] = -Z[width:, width:] @ G
-            Z[:width, width:] = Z[width:, :width].T
-            Z[:width, :width] -= G.T @ Z[width:, :width]
-        return Z
 
 
 def _local(places: np.ndarray, first: int, width: int, rows: np.ndarray) -> np.ndarray:

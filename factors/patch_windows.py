@@ -270,7 +270,23 @@ class PatchPixels:
         rows = np.flatnonzero(self.table.targets == frame)
         if len(rows) == 0:
             return
-        boxes, codes = self._boxes(rows), coded(image)
+        spans = patch_spans(self.table, self._world_T_rigs, self.table.planes, rows)
+        weights = np.column_stack([np.ones(len(self.table.grid)), self.table.grid])
+        uv = pixels_of(weights @ spans, self.width)
+        height = self.width // 2
+        u, v = uv[..., 0], uv[..., 1]
+        u = u[:, :1] + (u - u[:, :1] + self.width / 2) % self.width - self.width / 2
+        low = np.maximum(np.floor(v.min(axis=1) - self.margin) - PAD, -PAD)
+        high = np.minimum(np.ceil(v.max(axis=1) + self.margin) + PAD, height + PAD)
+        steepest = np.maximum(np.abs(low + PAD - height / 2), np.abs(high - PAD - height / 2))
+        cosine = np.cos(np.minimum(np.pi / 2, np.pi * steepest / height))
+        margin = self.margin / np.maximum(cosine, 1e-3)
+        left = np.floor(u.min(axis=1) - margin) - PAD
+        right = np.ceil(u.max(axis=1) + margin) + PAD
+        ring = right - left >= self.width  # all around a pole
+        left[ring], right[ring] = -PAD, self.width + PAD
+        boxes = np.stack([left, low, right - left, high - low], axis=1).astype(np.int64)
+        codes = coded(image)
         columns = np.arange(boxes[:, 2].max())
         for o, (left, top, wide, high) in zip(rows, boxes.tolist(), strict=True):
             first = left + PAD
@@ -289,22 +305,3 @@ class PatchPixels:
         joined = np.concatenate([np.zeros(0, np.int16), *self._chunks])
         self._chunks = [joined]
         return joined
-
-    def _boxes(self, rows: np.ndarray) -> np.ndarray:
-        """First column and row, width and height (R, 4) int64 of the windows."""
-        spans = patch_spans(self.table, self._world_T_rigs, self.table.planes, rows)
-        weights = np.column_stack([np.ones(len(self.table.grid)), self.table.grid])
-        uv = pixels_of(weights @ spans, self.width)
-        height = self.width // 2
-        u, v = uv[..., 0], uv[..., 1]
-        u = u[:, :1] + (u - u[:, :1] + self.width / 2) % self.width - self.width / 2
-        low = np.maximum(np.floor(v.min(axis=1) - self.margin) - PAD, -PAD)
-        high = np.minimum(np.ceil(v.max(axis=1) + self.margin) + PAD, height + PAD)
-        steepest = np.maximum(np.abs(low + PAD - height / 2), np.abs(high - PAD - height / 2))
-        cosine = np.cos(np.minimum(np.pi / 2, np.pi * steepest / height))
-        margin = self.margin / np.maximum(cosine, 1e-3)
-        left = np.floor(u.min(axis=1) - margin) - PAD
-        right = np.ceil(u.max(axis=1) + margin) + PAD
-        ring = right - left >= self.width  # all around a pole
-        left[ring], right[ring] = -PAD, self.width + PAD
-        return np.stack([left, low, right - left, high - low], axis=1).astype(np.int64)

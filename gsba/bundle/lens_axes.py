@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from gsba.bundle import shared_parameters
 from gsba.bundle.adjustment import AdjustmentContext
-from gsba.bundle.frame_parameters import models_of, validated
 from gsba.bundle.shared_parameters import (
     PARTS,
     SharedModel,
@@ -18,9 +17,11 @@ from gsba.bundle.shared_parameters import (
     by_origin,
     cross_validate,
     drawn,
+    frame_models,
     predicts,
     sample_counts,
     summed,
+    validated,
 )
 from gsba.camera.lens import Lenses
 from gsba.types import Counts, Keypoints, Landmarks, Solution
@@ -106,7 +107,7 @@ def loosened(
         by_start = by_origin(seen, rotations, bearings, so_far.inverse_stitch_radius)
         return so_far.by_centre(by_start, bearings, there) @ by_turn(so_far)
 
-    models = models_of(used, keypoints, solved, context, by_axes)
+    models = frame_models(used, keypoints, solved, context, by_axes)
     tried = [validated(models, np.full(2, width)) for width in TURNS]
     verdict = max(tried, key=lambda trial: float(trial.gains.sum()))
     shares = verdict.shares

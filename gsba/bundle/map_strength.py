@@ -77,7 +77,16 @@ def measure(
     poor[1:-1] = drifting[1:-1] & between & (np.nan_to_num(sigmas) > MAX_SCALE_SIGMA)
     reach = np.ones(2 * _REACH + 1)
     weak = np.convolve(poor, reach)[_REACH : _REACH + num] > 0
-    held = seen & _held(world_T_rigs, covariances, joint, priors)
+    lengths = np.linalg.norm(np.diff(world_T_rigs[:, :3, 3], axis=0), axis=1)
+    typical = float(np.median(lengths[lengths > 0])) if (lengths > 0).any() else 1.0
+    allowed = np.full((len(lengths), 6), np.deg2rad(priors.rotation_deg))
+    allowed[:, 3:] = priors.translation * np.maximum(lengths, typical)[:, None]
+    found = step_covariances(world_T_rigs, covariances, joint.neighbours)
+    found = found / allowed[:, :, None] / allowed[:, None, :]
+    known = np.isfinite(found).all(axis=(1, 2))
+    found[~known] = np.eye(6)
+    # a quarter of the prior's sigma in every direction: it then weighs 6 %
+    held = seen & known & (np.linalg.eigvalsh(found)[:, -1] < 0.25**2)
     noise = _noise(world_T_rigs, coarse_world_T_rigs, held & believed, priors)
     num_held = int(held.sum())
     dropped = {"images hold the step far better": num_held}
@@ -154,22 +163,6 @@ def _drift(world_T_rigs: np.ndarray, draws: np.ndarray, walks: np.ndarray) -> fl
     within = np.diff(walks[known]) == 0  # from one recording to the next is no step
     path = np.bincount(walks[known][1:][within], lengths[within]).max(initial=0.0)
     return float(np.sqrt(np.mean(errors[:, known] ** 2)) / max(path, 1e-300))
-
-
-def _held(
-    world_T_rigs: np.ndarray, covariances: np.ndarray, joint: JointErrors, priors: PriorSettings
-) -> np.ndarray:
-    """Steps (F - 1,) bool whose covariance is far below that of a prior in every direction."""
-    lengths = np.linalg.norm(np.diff(world_T_rigs[:, :3, 3], axis=0), axis=1)
-    typical = float(np.median(lengths[lengths > 0])) if (lengths > 0).any() else 1.0
-    allowed = np.full((len(lengths), 6), np.deg2rad(priors.rotation_deg))
-    allowed[:, 3:] = priors.translation * np.maximum(lengths, typical)[:, None]
-    found = step_covariances(world_T_rigs, covariances, joint.neighbours)
-    found = found / allowed[:, :, None] / allowed[:, None, :]
-    known = np.isfinite(found).all(axis=(1, 2))
-    found[~known] = np.eye(6)
-    # of the prior's sigma: it then weighs 6 %
-    return known & (np.linalg.eigvalsh(found)[:, -1] < 0.25**2)
 
 
 def _noise(

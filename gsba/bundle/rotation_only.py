@@ -69,7 +69,10 @@ def solve(
     system = None
     for _ in range(_ITERATIONS):
         rays = np.einsum("oij,oj->oi", rotations[found.frames], bearings)
-        bases = tangent_basis(_directions(rays, weights / sigmas**2, found))
+        pulls = ((weights / sigmas**2)[:, None] * rays).T  # towards the direction of each track
+        sums = np.stack([np.bincount(found.points, p, found.num_points) for p in pulls], axis=1)
+        sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-12)
+        bases = tangent_basis(sums[found.points])
         residuals = np.einsum("oij,oj->oi", bases, rays) / sigmas[:, None]
         lengths = np.linalg.norm(residuals, axis=1)
         noise = max(float(np.median(lengths)) / 1.1774, 1e-9)  # of a Rayleigh distribution
@@ -96,14 +99,6 @@ def solve(
     used = np.bincount(found.frames[weights > 0.1], minlength=num)
     logger.info("rotations of %d frames from %d observations", num, int(used.sum()))
     return rotations, covariances, used
-
-
-def _directions(rays: np.ndarray, information: np.ndarray, found: Tracks) -> np.ndarray:
-    """Unit direction (O, 3) of each observation's track."""
-    sums = [np.bincount(found.points, information * rays[:, k], found.num_points) for k in range(3)]
-    sums = np.stack(sums, axis=1)
-    sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-12)
-    return sums[found.points]
 
 
 def _system(

@@ -4,10 +4,12 @@ and points eliminated. Others' parameters are believed where they predict a part
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from scipy.sparse import bsr_array
+from scipy.sparse import diags_array as diags
+from scipy.sparse.linalg import splu
 
 from factors.bearing import bearing_residuals, tangent_basis
 from factors.cholesky import BlockCholesky
@@ -245,20 +247,7 @@ def by_origin(
 _MIN_GAIN_SIGMAS = 3.0  # least significant gain, in its standard deviations
 
 
-class SequencePart(Protocol):
-    """A part of the sequence, whose robust cost is a function of parameters."""
-
-    @property
-    def cost(self) -> float:
-        """The cost where all parameters are zero."""
-        ...
-
-    def gain(self, step: np.ndarray, /) -> float:
-        """Decrease of the cost from there by parameters."""
-        ...
-
-
-P = TypeVar("P", bound=SequencePart)
+P = TypeVar("P", "SharedModel", "FrameModel")
 
 
 @dataclass(frozen=True, slots=True)
@@ -307,3 +296,72 @@ def predicts(gains: np.ndarray) -> bool:
     sigma = np.sqrt(2 * max(total, 0.0))
     least = -_MIN_GAIN_SIGMAS * sigma / np.sqrt(len(gains))
     return bool(total > _MIN_GAIN_SIGMAS * sigma and np.all(gains > least))
+
+
+@dataclass(frozen=True, slots=True)
+class FrameModel:
+    """Second-order model of some points' cost over poses and K parameters of each frame."""
+
+    system: LinearSystem  # 6 + K variables of each frame, its pose first; by robust weights
+    curvature: float  # of that loss, part of its weights'
+
+    @property
+    def cost(self) -> float:
+        """At no step."""
+        return self.system.cost
+
+    def gain(self, step: np.ndarray) -> float:
+        """Decrease of the cost by a step of all of them."""
+        return float(-step @ (self.system.gradient + 0.5 * (self.system.hessian @ step)))
+
+
+def frame_models(
+    landmarks: Landmarks,
+    keypoints: Keypoints,
+    solved: Solution,
+    context: AdjustmentContext,
+    by_parameters: Callable[[Weighted], np.ndarray],
+) -> list[FrameModel]:
+    """Models of the robust cost of parts of some points, at a solution's poses.
+
+    Args:
+        landmarks: points, moved to their best first, and their observations.
+        keypoints: where these really point.
+        by_parameters: Jacobian (O, 2, K) of residuals by parameters of their frames.
+    """
+    drawn = np.random.default_rng(context.settings.seed).permutation(landmarks.tracks.num_points)
+
+    def model(part: int) -> FrameModel:
+        some = landmarks.of(drawn % PARTS == part)
+        seen = weighted(some, keypoints, solved, context)
+        by_frame = np.concatenate([seen.by_pose, by_parameters(seen)], axis=2)
+        system = without_points(seen, some.tracks, len(solved.world_T_rigs), by_frame)
+        return FrameModel(system, seen.curvature)
+
+    with ThreadPoolExecutor(context.num_threads) as pool:
+        return list(pool.map(model, range(PARTS)))
+
+
+def _frame_step(models: Sequence[FrameModel], sigmas: np.ndarray) -> np.ndarray:
+    """Change of poses and parameters (F * (6 + K),) by all points of the models.
+
+    Args:
+        sigmas: (K,) how strongly the parameters are drawn to what they are; 0 = they stay.
+    """
+    systems = [model.system for model in models]
+    gradient = np.sum([system.gradient for system in systems], axis=0)
+    hessian = sum(system.hessian for system in systems[1:]) + systems[0].hessian
+    hessian = float(np.mean([model.curvature for model in models])) * hessian
+    held = _POSE_DAMPING * hessian.diagonal().reshape(-1, 6 + len(sigmas))
+    held[held <= 0] = 1.0
+    held[:, 6:] = np.maximum(sigmas, 1e-12) ** -2.0
+    return -splu((hessian + diags(held.ravel())).tocsc()).solve(gradient)
+
+
+def validated(models: Sequence[FrameModel], sigmas: np.ndarray) -> Verdict:
+    """Verdict on parameters with priors `sigmas` (K,), poses solved for with and without them."""
+    return cross_validate(
+        models,
+        lambda others: _frame_step(others, sigmas),
+        lambda others: _frame_step(others, np.zeros_like(sigmas)),
+    )

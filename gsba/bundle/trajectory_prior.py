@@ -49,7 +49,22 @@ class TrajectoryPrior(Family):
         typical = float(np.median(lengths[lengths > 0])) if (lengths > 0).any() else 1.0
         extent = max(float(np.linalg.norm(np.ptp(world_T_rigs[:, :3, 3], axis=0))), typical)
         graph = gtsam.NonlinearFactorGraph()
-        self._add_steps(graph, np.maximum(lengths, typical))
+        settings, spread, lengths = self.settings, self.noise, np.maximum(lengths, typical)
+        steps = inverse(self.world_T_rigs[:-1]) @ self.world_T_rigs[1:]
+        kept = np.ones(len(steps), bool) if self.false_steps is None else ~self.false_steps
+        # steps in a gapless run drift alike
+        runs = np.cumsum(np.diff(kept.astype(int), prepend=0) != 0)
+        in_a_row = np.bincount(runs, minlength=1)[runs] if len(kept) else runs
+        for k in np.flatnonzero(kept).tolist():
+            length = float(lengths[k])
+            if spread is None:
+                rotation, translation = np.deg2rad(settings.rotation_deg), settings.translation
+                of_step = self._robust(rotation, translation * length)
+            else:
+                covariance = in_a_row[k] * _step_covariance(steps[k], length, spread)
+                gaussian = gtsam.noiseModel.Gaussian.Covariance(covariance)
+                of_step = gtsam.noiseModel.Robust.Create(self._loss(), gaussian)
+            graph.add(gtsam.BetweenFactorPose3(X(k), X(k + 1), gtsam.Pose3(steps[k]), of_step))
         # absolute priors, weaker where another family holds the gauge: they only hold frames that
         # nothing else does
         weaker = 1.0 if held else 10.0
@@ -65,25 +80,6 @@ class TrajectoryPrior(Family):
         fixed = gtsam.Pose3(world_T_rigs[0] if self.first is None else self.first)
         graph.add(gtsam.PriorFactorPose3(X(0), fixed, noise))
         return graph
-
-    def _add_steps(self, graph: gtsam.NonlinearFactorGraph, lengths: np.ndarray) -> None:
-        """Add relative priors of steps whose lengths (F - 1,) scale the noise."""
-        settings, noise = self.settings, self.noise
-        steps = inverse(self.world_T_rigs[:-1]) @ self.world_T_rigs[1:]
-        kept = np.ones(len(steps), bool) if self.false_steps is None else ~self.false_steps
-        # steps in a gapless run drift alike
-        runs = np.cumsum(np.diff(kept.astype(int), prepend=0) != 0)
-        in_a_row = np.bincount(runs, minlength=1)[runs] if len(kept) else runs
-        for f in np.flatnonzero(kept).tolist():
-            length = float(lengths[f])
-            if noise is None:
-                rotation, translation = np.deg2rad(settings.rotation_deg), settings.translation
-                model = self._robust(rotation, translation * length)
-            else:
-                covariance = in_a_row[f] * _step_covariance(steps[f], length, noise)
-                gaussian = gtsam.noiseModel.Gaussian.Covariance(covariance)
-                model = gtsam.noiseModel.Robust.Create(self._loss(), gaussian)
-            graph.add(gtsam.BetweenFactorPose3(X(f), X(f + 1), gtsam.Pose3(steps[f]), model))
 
     def _robust(self, rotation: float, translation: float) -> gtsam.noiseModel.Base:
         """Noise of a pose, radians and map units, under the loss."""

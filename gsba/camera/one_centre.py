@@ -107,7 +107,10 @@ class Stitcher:
             joined = np.zeros((*rays.shape[:2], channels), np.float32)
             for lens, share in enumerate(self._weights(rays)):
                 columns = np.flatnonzero((share > 0).any(axis=0))
-                moved = self._moved(lens, top, columns, len(rays), width)
+                scale = _DEPTH_GRID_WIDTH / width
+                places = np.meshgrid(columns + 0.5, np.arange(top, top + len(rays)) + 0.5)
+                across, down = ((at * scale - 0.5 + PAD).astype(np.float32) for at in places)
+                moved = cv2.remap(self._offsets[lens], across, down, cv2.INTER_CUBIC)
                 part = look(lens, rays[:, columns] + moved).reshape(*moved.shape[:2], channels)
                 joined[:, columns] += share[:, columns, None] * part
             parts.append(np.rint(joined).astype(np.uint8))
@@ -127,15 +130,6 @@ class Stitcher:
             sides.append(np.clip(0.5 + np.arcsin(np.clip(sines, -1, 1)) / (2 * band), 0, 1))
         total = np.sum(sides, axis=0)  # 1 where two lenses meet
         return [(side / total).astype(np.float32) for side in sides]
-
-    def _moved(
-        self, lens: int, top: int, columns: np.ndarray, num_rows: int, width: int
-    ) -> np.ndarray:
-        """Offsets (h, w, 3) from directions of panorama rows and columns to a lens's directions."""
-        scale = _DEPTH_GRID_WIDTH / width
-        places = np.meshgrid(columns + 0.5, np.arange(top, top + num_rows) + 0.5)
-        across, down = ((at * scale - 0.5 + PAD).astype(np.float32) for at in places)
-        return cv2.remap(self._offsets[lens], across, down, cv2.INTER_CUBIC)
 
 
 def _panorama_lookup(erp: np.ndarray, how: int) -> _Look:

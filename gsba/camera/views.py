@@ -176,7 +176,13 @@ def _by_camera(
 
 def _seen_from_lenses(reconstruction: Reconstruction, lenses: Lenses) -> Reconstruction:
     if lenses.readout_motion is not None:
-        reconstruction = _rays_from_lens_centres(reconstruction, lenses)
+        bearings, frames = reconstruction.observation_bearings, reconstruction.observation_frames
+        starts = lenses.origins(bearings, frames)
+        rays = observed_points(reconstruction) - starts
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        reconstruction = replace(
+            reconstruction, observation_bearings=rays, observation_origins=starts
+        )
     if lenses.axes is None:
         return reconstruction
     turns = lenses.axes[reconstruction.observation_frames]
@@ -194,15 +200,6 @@ def turned_rigs(world_T_rigs: np.ndarray, turns: np.ndarray) -> np.ndarray:
     turned = world_T_rigs.copy()
     turned[:, :3, :3] = turned[:, :3, :3] @ turns
     return turned
-
-
-def _rays_from_lens_centres(reconstruction: Reconstruction, lenses: Lenses) -> Reconstruction:
-    """Observed points as rays from the lenses' centres, all in the middle of the readout."""
-    bearings, frames = reconstruction.observation_bearings, reconstruction.observation_frames
-    origins = lenses.origins(bearings, frames)
-    rays = observed_points(reconstruction) - origins
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    return replace(reconstruction, observation_bearings=rays, observation_origins=origins)
 
 
 def shown_in_pictures(reconstruction: Reconstruction, cameras: Cameras) -> Reconstruction:
@@ -417,7 +414,11 @@ def depths_along(directions: np.ndarray, points: np.ndarray) -> np.ndarray:
     apart, rows = apart.reshape(-1, near), rows.reshape(-1, near)
     spread = np.maximum(apart[:, near // 2, None], np.deg2rad(3.0))
     weights, inverse = np.exp(-((apart / spread) ** 2)), 1 / lengths[rows]
-    middle = _weighted_median(inverse, weights)
+    order = np.argsort(inverse, axis=1)
+    heights = np.cumsum(np.take_along_axis(weights, order, axis=1), axis=1)
+    half = np.argmax(heights >= heights[:, -1:] / 2, axis=1)
+    half = np.take_along_axis(order, half[:, None], axis=1)
+    middle = np.take_along_axis(inverse, half, axis=1)[:, 0]
     flat, beside = middle[:, None] * directions, units[rows]
     tilt, left = np.zeros_like(flat), inverse - np.einsum("nki,ni->nk", beside, flat)
     facing_us = (0.05 * spread**2 * weights.sum(axis=1, keepdims=True))[..., None] * np.eye(3)
@@ -430,15 +431,6 @@ def depths_along(directions: np.ndarray, points: np.ndarray) -> np.ndarray:
         tilt = np.linalg.solve(normal, right[..., None])[..., 0]
     found = np.einsum("ni,ni->n", flat + tilt, directions)
     return 1 / np.clip(found, inverse.min(axis=1), inverse.max(axis=1))
-
-
-def _weighted_median(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Weighted medians (N,) of rows of values (N, K)."""
-    order = np.argsort(values, axis=1)
-    heights = np.cumsum(np.take_along_axis(weights, order, axis=1), axis=1)
-    half = np.argmax(heights >= heights[:, -1:] / 2, axis=1)
-    middle = np.take_along_axis(order, half[:, None], axis=1)
-    return np.take_along_axis(values, middle, axis=1)[:, 0]
 
 
 def views_for(kind: PictureFormat, size: int, lenses: Lenses) -> tuple[View, ...]:

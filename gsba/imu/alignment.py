@@ -62,7 +62,18 @@ def align(
     dropped = {"rotation not known from images": len(f_R_nexts) - num_known}
     counts = Counts(len(f_R_nexts), num_known, "steps", dropped)
     if len(turns) < MIN_STEPS:
-        return _rejected(timestamps, f"only {len(turns)} rotations are known from images", counts)
+        clock, nan = Clock(float(timestamps[0]), 0.0, 1.0), float("nan")
+        return Alignment(
+            clock,
+            nan,
+            Sensor.ideal(),
+            np.eye(3),
+            nan,
+            nan,
+            0.0,
+            counts,
+            f"only {len(turns)} rotations are known from images",
+        )
     if former is None:
         starts = [(p, np.zeros(3)) for p in _candidates(turns, readings)]  # no bias
     else:
@@ -81,7 +92,9 @@ def turning_of(readings: Readings, found: Alignment, timestamps: np.ndarray) -> 
     times = found.clock.times(timestamps)
     readings = readings.between(times[0] - _RATE_SPAN_S, times[-1] + _RATE_SPAN_S)
     spans = np.column_stack([times[:-1], times[1:]])
-    turned = _rotation_vectors(readings, found.sensor, spans) @ found.rig_R_imu.T
+    free = Turns(spans, np.zeros((len(spans), 3)))
+    fit = ClockFit(free, _orientation_trajectory(readings, found.sensor))
+    turned = fit.residuals(np.array([0.0, 1.0])) @ found.rig_R_imu.T
     rates = found.sensor.true(readings.mean_rates(times, _RATE_SPAN_S)) @ found.rig_R_imu.T
     noisy, every = readings.noise(), float(np.median(np.diff(readings.timestamps)))
     bent = float(np.std(np.diff(readings.rates, axis=0) / np.diff(readings.timestamps)[:, None]))
@@ -217,12 +230,6 @@ def _orientation_trajectory(
     return Trajectory(readings.timestamps[::every], pose(turned, np.zeros((len(turned), 3))))
 
 
-def _rotation_vectors(readings: Readings, sensor: Sensor, spans: np.ndarray) -> np.ndarray:
-    """Rotation vectors (n, 3) over spans of time (n, 2), on the sensor's clock and in its axes."""
-    free = Turns(spans, np.zeros((len(spans), 3)))
-    return ClockFit(free, _orientation_trajectory(readings, sensor)).residuals(np.array([0.0, 1.0]))
-
-
 def _with_reason(
     best: _Candidate, others: list[_Candidate], timestamps: np.ndarray, counts: Counts
 ) -> Alignment:
@@ -258,11 +265,6 @@ def _with_reason(
             found, reason="the camera turns about one axis only: the gyro's axes are undetermined"
         )
     return found
-
-
-def _rejected(timestamps: np.ndarray, reason: str, counts: Counts) -> Alignment:
-    clock, nan = Clock(float(timestamps[0]), 0.0, 1.0), float("nan")
-    return Alignment(clock, nan, Sensor.ideal(), np.eye(3), nan, nan, 0.0, counts, reason)
 
 
 _GRAVITY_M_S2 = 9.80665  # m/s^2, standard gravity

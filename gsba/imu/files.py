@@ -52,7 +52,39 @@ def read_imu(path: Path) -> Readings:
     """
     path = Path(path)
     if path.suffix.lower() in _TABLES or not path.is_file():
-        return _read_table(path)
+        lines = [(line, _cells(text)) for line, text in read_lines(path)]
+        # a header behind a #, which begins with the column of times
+        with path.open(encoding="utf-8-sig") as file:
+            first = file.readline().strip()
+        named = _cells(first.lstrip("# "))
+        timed = re.fullmatch(_COLUMN_PATTERNS["t"][0], _name_and_unit(named[0] if named else "")[0])
+        header = (1, named) if first.startswith("#") and timed else None
+        if lines and header is None and not _is_number(lines[0][1][0]):
+            header = lines[0]
+        if lines and header is not None and header[1] == lines[0][1]:
+            lines = lines[1:]
+        if not lines:
+            raise GsbaError(f"{path}: holds no readings")
+        if header is None and len(lines[0][1]) not in (4, 7):
+            raise GsbaError(
+                f"{path}:{lines[0][0]}: {len(lines[0][1])} columns; want t, gyro x y z [rad/s] and "
+                "accelerometer x y z [m/s^2], or a header that names them"
+            )
+        names = _DEFAULT_COLUMNS[: len(lines[0][1])] if header is None else header[1]
+        columns = _columns(f"{path}:{header[0]}" if header else str(path), names)
+        values = np.empty((len(lines), len(columns)))
+        for n, (line, cells) in enumerate(lines):
+            if len(cells) != len(names):
+                raise GsbaError(f"{path}:{line}: {len(cells)} values where {len(names)} are named")
+            for k, (column, scale) in enumerate(columns):
+                if not _is_number(cells[column]):
+                    raise GsbaError(
+                        f"{path}:{line}: '{brief(cells[column])}' is not a finite number"
+                    )
+                values[n, k] = float(cells[column]) * scale
+        forces = values[:, 4:] if values.shape[1] == 7 else None
+        where = [f"{line}" for line, _ in lines]
+        return _checked(path, values[:, 0], values[:, 1:4], forces, where)
     return read_telemetry(path)
 
 
@@ -91,45 +123,6 @@ def read_telemetry(path: Path, lasting_s: float | None = None) -> Readings:
         )
     where = [f"reading {n + 1}" for n in range(len(gyro.times))]
     return _checked(path, gyro.times, gyro.rates, gyro.accelerations, where)
-
-
-def _read_table(path: Path) -> Readings:
-    """Readings of a table."""
-    lines = [(line, _cells(text)) for line, text in read_lines(path)]
-    header = _header(path)
-    if lines and header is None and not _is_number(lines[0][1][0]):
-        header = lines[0]
-    if lines and header is not None and header[1] == lines[0][1]:
-        lines = lines[1:]
-    if not lines:
-        raise GsbaError(f"{path}: holds no readings")
-    if header is None and len(lines[0][1]) not in (4, 7):
-        raise GsbaError(
-            f"{path}:{lines[0][0]}: {len(lines[0][1])} columns; want t, gyro x y z [rad/s] and "
-            "accelerometer x y z [m/s^2], or a header that names them"
-        )
-    names = _DEFAULT_COLUMNS[: len(lines[0][1])] if header is None else header[1]
-    columns = _columns(f"{path}:{header[0]}" if header else str(path), names)
-    values = np.empty((len(lines), len(columns)))
-    for n, (line, cells) in enumerate(lines):
-        if len(cells) != len(names):
-            raise GsbaError(f"{path}:{line}: {len(cells)} values where {len(names)} are named")
-        for k, (column, scale) in enumerate(columns):
-            if not _is_number(cells[column]):
-                raise GsbaError(f"{path}:{line}: '{brief(cells[column])}' is not a finite number")
-            values[n, k] = float(cells[column]) * scale
-    forces = values[:, 4:] if values.shape[1] == 7 else None
-    where = [f"{line}" for line, _ in lines]
-    return _checked(path, values[:, 0], values[:, 1:4], forces, where)
-
-
-def _header(path: Path) -> tuple[int, list[str]] | None:
-    """A header behind a # in the first line, which begins with the column of times."""
-    with path.open(encoding="utf-8-sig") as file:
-        first = file.readline().strip()
-    cells = _cells(first.lstrip("# "))
-    timed = re.fullmatch(_COLUMN_PATTERNS["t"][0], _name_and_unit(cells[0] if cells else "")[0])
-    return (1, cells) if first.startswith("#") and timed else None
 
 
 def _cells(text: str) -> list[str]:

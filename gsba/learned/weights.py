@@ -67,12 +67,6 @@ PACKAGES = (
 )
 
 
-def install_command(names: Sequence[str]) -> str:
-    """Command that installs files of weights with some names; "" = no package holds them."""
-    commands = (package.command() for package in PACKAGES if package.sha256.keys() & set(names))
-    return next(commands, "")
-
-
 def packaged(names: Sequence[str]) -> Path | None:
     """File of weights with the first of some names that an installed package holds; None = no
     package of them is installed.
@@ -255,7 +249,8 @@ def _find(source: Source, given: str | None, setting: str, download: bool) -> Pa
         return at_hand
     if download and names is source.files:
         return _download(source)
-    command = install_command(names)
+    commands = (package.command() for package in PACKAGES if package.sha256.keys() & set(names))
+    command = next(commands, "")
     if given in names:
         raise GsbaError(f"no {given} at hand: {command}, or pass the path of the file")
     where = f"{given} holds no weights of" if given else "no weights of"

@@ -3,7 +3,7 @@
 Head, shoulders, arm, stick, helmet, bag or vehicle move with the camera, so that their structure
 keeps its place in the picture (`gsba.masks.fixed_structure`), up to an outline
 (`gsba.masks.carrier_outline`). With direction lock on, pictures do not turn with the camera and the
-carrier turns against them: this rotation is estimated for each frame (`gsba.masks.carrier_turns`)
+carrier turns against them: this rotation is estimated for each frame (`gsba.masks.fixed_structure`)
 and undone first.
 """
 
@@ -22,9 +22,13 @@ from gsba.frames.pixels import load_erp
 from gsba.log import GsbaError, track
 from gsba.masks.borders import black_areas, widened
 from gsba.masks.carrier_outline import certain_places, outline_carrier
-from gsba.masks.carrier_turns import band_of, find_turns
-from gsba.masks.fixed_structure import FixedStructure, measure_fixed_structure
-from gsba.masks.medians import median_picture
+from gsba.masks.fixed_structure import (
+    FixedStructure,
+    band_of,
+    find_turns,
+    measure_fixed_structure,
+    median_picture,
+)
 from gsba.memory import usable_cpus
 from gsba.types import FrameSet
 
@@ -121,7 +125,29 @@ def _require_enough(num: int) -> None:
 
 def _outlined(pictures: np.ndarray, structure: FixedStructure) -> tuple[np.ndarray, np.ndarray]:
     """The median (h, 2h, 3) uint8 of pictures, and the carrier in it (h, 2h) bool."""
-    _check_moving(structure)
+    heights = (np.arange(len(structure.strong)) + 0.5) / len(structure.strong)
+    weights = structure.textured * np.sin(np.pi * heights)[:, None]  # solid angles
+    if weights.mean() < 0.02:  # of all directions
+        raise GsbaError("the frames show too little texture to detect the carrier")
+    staying, moving = (
+        float((weights * places).sum() / weights.sum())
+        for places in (
+            structure.strong > _MIN_FIXED_CORRELATION,
+            structure.strong < _MAX_MOVING_CORRELATION,
+        )
+    )
+    logger.debug("textured: %.0f%% stay, %.0f%% move", 100 * staying, 100 * moving)
+    if staying > 0.9:
+        raise GsbaError(
+            f"the frames hardly differ ({100 * staying:.0f}% of textured directions stay fixed): "
+            "the camera must move to detect its carrier"
+        )
+    if moving < 1 / 3:
+        raise GsbaError(
+            f"{100 * staying:.0f}% of textured directions stay fixed, only "
+            f"{100 * moving:.0f}% move: most of the picture is a vehicle, or far away, or the "
+            "camera hardly moves; give a mask of the carrier (--masks FILE)"
+        )
     median = median_picture(pictures).astype(np.uint8)
     return median, outline_carrier(pictures, median, structure)
 
@@ -209,30 +235,3 @@ def _steadiness_above(structure: FixedStructure) -> float:
     rows = int(0.55 * len(structure.strong))  # from the zenith, where the world is seen
     textured = structure.textured[:rows]
     return float(structure.strong[:rows][textured].mean()) if textured.any() else 0.0
-
-
-def _check_moving(structure: FixedStructure) -> None:
-    """Refuse frames in which too little moves to tell the carrier from the world."""
-    heights = (np.arange(len(structure.strong)) + 0.5) / len(structure.strong)
-    weights = structure.textured * np.sin(np.pi * heights)[:, None]  # solid angles
-    if weights.mean() < 0.02:  # of all directions
-        raise GsbaError("the frames show too little texture to detect the carrier")
-    staying, moving = (
-        float((weights * places).sum() / weights.sum())
-        for places in (
-            structure.strong > _MIN_FIXED_CORRELATION,
-            structure.strong < _MAX_MOVING_CORRELATION,
-        )
-    )
-    logger.debug("textured: %.0f%% stay, %.0f%% move", 100 * staying, 100 * moving)
-    if staying > 0.9:
-        raise GsbaError(
-            f"the frames hardly differ ({100 * staying:.0f}% of textured directions stay fixed): "
-            "the camera must move to detect its carrier"
-        )
-    if moving < 1 / 3:
-        raise GsbaError(
-            f"{100 * staying:.0f}% of textured directions stay fixed, only "
-            f"{100 * moving:.0f}% move: most of the picture is a vehicle, or far away, or the "
-            "camera hardly moves; give a mask of the carrier (--masks FILE)"
-        )

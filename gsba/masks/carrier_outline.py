@@ -12,8 +12,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from gsba.camera.sphere import around_sphere
-from gsba.masks.fixed_structure import FixedStructure
-from gsba.masks.medians import median_picture
+from gsba.masks.fixed_structure import FixedStructure, median_picture
 
 _PADDING_PX = 32  # pixels around the sphere
 _MIN_CERTAIN_STRONG, _MIN_CERTAIN_WEAK = 0.75, 0.6  # least strong and weak correlations that only a
@@ -55,20 +54,11 @@ def outline_carrier(
     core = _shrunk(likely, _SPILL_PX)
     if not core.any():
         return nothing
-    change = _change(pictures, median)
+    rows = np.array_split(np.arange(len(median)), 8)  # little memory at a time
+    parts = [np.abs(pictures[:, r].astype(np.int16) - median[r]).mean(axis=-1) for r in rows]
+    change = np.concatenate([median_picture(part) for part in parts]).astype(np.float32)
     own_change = max(float(np.median(change[core])), _MIN_CHANGE)
     moves = (_filtered_on_sphere(cv2.GaussianBlur, change, (0, 0), 1.0) > 3.0 * own_change) & ~core
-    found = _parts_with(_cut(median, core, likely, moves), core)
-    plain = _enclosed(found)
-    found |= plain & ~_parts_with(plain, moves, least=0.5)
-    return (
-        _filtered_on_sphere(cv2.dilate, found, np.ones((3, 3), np.uint8), iterations=_DILATION_PX)
-        > 0
-    )
-
-
-def _cut(median: np.ndarray, core: np.ndarray, likely: np.ndarray, moves: np.ndarray) -> np.ndarray:
-    """The carrier (h, w) bool by colours and edges of the median picture (h, w, 3) uint8."""
     distance = _filtered_on_sphere(cv2.distanceTransform, ~likely, cv2.DIST_L2, 5)
     far = distance > 28  # pixels
     inside = _enclosed(~far)
@@ -81,16 +71,18 @@ def _cut(median: np.ndarray, core: np.ndarray, likely: np.ndarray, moves: np.nda
     nowhere, models = (0, 0, 0, 0), (np.zeros((1, 65)), np.zeros((1, 65)))
     cv2.setRNGSeed(0)
     cv2.grabCut(smooth, padded, nowhere, *models, _NUM_ROUNDS, cv2.GC_INIT_WITH_MASK)
-    return np.isin(
-        padded[_PADDING_PX:-_PADDING_PX, _PADDING_PX:-_PADDING_PX], (cv2.GC_FGD, cv2.GC_PR_FGD)
+    found = _parts_with(
+        np.isin(
+            padded[_PADDING_PX:-_PADDING_PX, _PADDING_PX:-_PADDING_PX], (cv2.GC_FGD, cv2.GC_PR_FGD)
+        ),
+        core,
     )
-
-
-def _change(pictures: np.ndarray, median: np.ndarray) -> np.ndarray:
-    """Median deviation (h, w) float32 of each pixel from the median picture, grey levels."""
-    rows = np.array_split(np.arange(len(median)), 8)  # little memory at a time
-    parts = [np.abs(pictures[:, r].astype(np.int16) - median[r]).mean(axis=-1) for r in rows]
-    return np.concatenate([median_picture(part) for part in parts]).astype(np.float32)
+    plain = _enclosed(found)
+    found |= plain & ~_parts_with(plain, moves, least=0.5)
+    return (
+        _filtered_on_sphere(cv2.dilate, found, np.ones((3, 3), np.uint8), iterations=_DILATION_PX)
+        > 0
+    )
 
 
 def _shrunk(places: np.ndarray, pixels: int) -> np.ndarray:

@@ -24,7 +24,7 @@ from gsba.geometry import inverse
 from gsba.masks import _distractor_kernels
 from gsba.store.shards import StoredRecords
 from gsba.store.store import PerFrame
-from gsba.types import FrameSet, Landmarks, PictureFormat, Tracks
+from gsba.types import FrameSet, Landmarks, Tracks
 
 _WIDTH_PX = 512  # pixels across the panoramas that are compared
 _MIN_WITNESSES = 3  # least number of neighbours that can mark a pixel
@@ -115,7 +115,10 @@ class StaticScene:
     ) -> None:
         self._frames, self._poses, self._landmarks = frames, world_T_rigs, landmarks
         self._limit_mb, self._known_neighbours = limit_mb, neighbours or {}
-        self.width = min(_width_of(kind) for kind in frames.formats)
+        self.width = min(
+            (min(_WIDTH_PX, kind.width) if kind.panoramic else panorama.width_for(kind, _WIDTH_PX))
+            for kind in frames.formats
+        )
         self._known, self._rays = known, _rays(self.width)
         self._room = int(limit_mb * 2**20 / (1.5 * self.width**2))
         self._kept: dict[int, np.ndarray] = {}
@@ -167,14 +170,45 @@ class StaticScene:
         usable = own[..., 0] >= 0
         others = np.stack([self._exposed(n, frame, own) for n in near])
         n_T_own = (inverse(self._poses[near]) @ self._poses[frame]).astype(np.float32)
-        lowest, highest = self._bounds(frame, near)
+        points = np.unique(np.concatenate([self._seen[f] for f in (frame, *near)]))
+        width = self.width // 8
+        pixels, distances = self._pixels(frame, points, width)
+        u, v = pixels.T
+        logs = -np.log(distances).astype(np.float32)
+        high = np.full((width // 2, width), _EMPTY_CELL, np.float32)
+        low = high.copy()  # of the negative, so that both are maxima
+        np.maximum.at(high, (v, u), logs)
+        np.maximum.at(low, (v, u), -logs)
+        high, low = _spread_out(high), _spread_out(low)
+        size = (self.width, self.width // 2)
+        margin = np.float32(np.log(1.4))  # beyond the nearest and furthest points
+        lowest, highest = -cv2.resize(low, size) - margin, cv2.resize(high, size) + margin
         middle = np.exp(0.5 * (lowest + highest)).astype(np.float32)
         seen = _distractor_kernels.witnesses(others[..., 0] >= 0, n_T_own, self._rays, middle)
         score = _score(own, others, n_T_own, self._rays, lowest, highest)
         unjudged = seen < min(_MIN_WITNESSES, len(near))
         score[unjudged | ~usable] = 0
         noise = max(1.0, float(np.median(score)))
-        found = _decide(score, noise)
+        wide = _wrapped(score)
+        weak = cv2.morphologyEx(
+            (wide > noise * _WEAK_DIFFERENCE).astype(np.uint8),
+            cv2.MORPH_OPEN,
+            np.ones((_MIN_WIDTH_PX, _MIN_WIDTH_PX), np.uint8),
+        )
+        num, parts = cv2.connectedComponents(weak, connectivity=4)
+        labels = np.asarray(parts, np.int32)
+        rows = (np.arange(len(wide)) + 0.5) / len(wide)
+        areas = np.broadcast_to(np.sin(np.pi * rows)[:, None], wide.shape)
+        strong = (weak > 0) & (wide > noise * _STRONG_DIFFERENCE)
+        sums = np.bincount(labels[strong], weights=areas[strong], minlength=num)
+        sums[0] = 0
+        found = (sums >= 120)[labels].astype(np.uint8)  # strong pixels at the equator
+        ellipse = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (_CLOSING_PX, _CLOSING_PX))
+        found = cv2.morphologyEx(found, cv2.MORPH_CLOSE, ellipse)
+        outlines, _ = cv2.findContours(found, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        cv2.drawContours(found, outlines, -1, 1, cv2.FILLED)
+        grown = cv2.dilate(found, np.ones((_DILATION_PX, _DILATION_PX), np.uint8))
+        found = _unwrapped(grown) > 0
         if self._known is not None:  # marked in the first pass, with no neighbour left to judge
             found |= self._known(frame) & unjudged
         found &= usable
@@ -232,27 +266,6 @@ class StaticScene:
         uv[:, 0] %= width
         uv[:, 1] = np.clip(uv[:, 1], 0, width // 2 - 1)
         return uv, np.maximum(np.linalg.norm(local, axis=1), 1e-9)
-
-    def _bounds(self, frame: int, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Logarithms (h, w) float32 of the least and largest inverse distance to assume."""
-        points = np.unique(np.concatenate([self._seen[f] for f in (frame, *near)]))
-        width = self.width // 8
-        pixels, distances = self._pixels(frame, points, width)
-        u, v = pixels.T
-        logs = -np.log(distances).astype(np.float32)
-        high = np.full((width // 2, width), _EMPTY_CELL, np.float32)
-        low = high.copy()  # of the negative, so that both are maxima
-        np.maximum.at(high, (v, u), logs)
-        np.maximum.at(low, (v, u), -logs)
-        high, low = _spread_out(high), _spread_out(low)
-        size = (self.width, self.width // 2)
-        margin = np.float32(np.log(1.4))  # beyond the nearest and furthest points
-        return -cv2.resize(low, size) - margin, cv2.resize(high, size) + margin
-
-
-def _width_of(kind: PictureFormat) -> int:
-    """Pixels across small panoramas of a camera's frames."""
-    return min(_WIDTH_PX, kind.width) if kind.panoramic else panorama.width_for(kind, _WIDTH_PX)
 
 
 def _rays(width: int) -> np.ndarray:
@@ -324,30 +337,6 @@ def _score(
     # a pixel must differ from its neighbours' median by two of their spreads
     contradicted = 0.5 * (away_best - 2.0 * spread_best)
     return np.maximum(best[0], np.minimum(best[1], contradicted))
-
-
-def _decide(score: np.ndarray, noise: float) -> np.ndarray:
-    """Distractors (h, w) bool: connected, not thin, and strong somewhere."""
-    wide = _wrapped(score)
-    weak = cv2.morphologyEx(
-        (wide > noise * _WEAK_DIFFERENCE).astype(np.uint8),
-        cv2.MORPH_OPEN,
-        np.ones((_MIN_WIDTH_PX, _MIN_WIDTH_PX), np.uint8),
-    )
-    num, parts = cv2.connectedComponents(weak, connectivity=4)
-    labels = np.asarray(parts, np.int32)
-    rows = (np.arange(len(wide)) + 0.5) / len(wide)
-    areas = np.broadcast_to(np.sin(np.pi * rows)[:, None], wide.shape)
-    strong = (weak > 0) & (wide > noise * _STRONG_DIFFERENCE)
-    sums = np.bincount(labels[strong], weights=areas[strong], minlength=num)
-    sums[0] = 0
-    found = (sums >= 120)[labels].astype(np.uint8)  # strong pixels at the equator
-    ellipse = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (_CLOSING_PX, _CLOSING_PX))
-    found = cv2.morphologyEx(found, cv2.MORPH_CLOSE, ellipse)
-    outlines, _ = cv2.findContours(found, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    cv2.drawContours(found, outlines, -1, 1, cv2.FILLED)
-    grown = cv2.dilate(found, np.ones((_DILATION_PX, _DILATION_PX), np.uint8))
-    return _unwrapped(grown) > 0
 
 
 def _packed(weights: np.ndarray, reason: str) -> Distractors:

@@ -189,7 +189,25 @@ def after(
     shares = np.array([one.share for one in results])
     check = store.root / "masks_check.jpg"
     if not (check.exists() and store.records["masks"].resumed):
-        _write_check(check, merged, shares)
+        rows = []
+        for row in np.sort(np.argsort(-shares, kind="stable")[:_NUM_CHECK_FRAMES]):
+            size = (_CHECK_WIDTH_PX, _CHECK_WIDTH_PX // 2)
+            if merged.format_of(int(row)).panoramic:
+                shown = cv2.resize(load_erp(merged, int(row), width=_CHECK_WIDTH_PX), size)
+            else:
+                shown = np.full((size[1], size[0], 3), 128, np.uint8)
+            mask = load_mask(merged, int(row))
+            assert mask is not None
+            out = _fit(mask, _CHECK_WIDTH_PX) == 0
+            shown[out] = (shown[out] * 0.5 + np.array([128, 0, 60])).astype(np.uint8)
+            outlines, _ = cv2.findContours(
+                out.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE
+            )
+            cv2.drawContours(shown, outlines, -1, (255, 80, 160), 1)
+            place = (6, size[1] - 8)
+            cv2.putText(shown, merged.names[row], place, cv2.FONT_HERSHEY_PLAIN, 1, (255, 255, 255))
+            rows.append(shown)
+        write_image(check, np.concatenate(rows), jpeg_quality=88)
     store.claim(check)
     reasons = [one.reason.partition(":")[0] for one in results if one.reason]
     for name, one in zip(frames.names, results, strict=True):
@@ -289,24 +307,3 @@ def _fit(weights: np.ndarray, width: int) -> np.ndarray:
     size = (width, width // 2)
     values, inside = (cv2.resize(part, size) for part in (values, (values > 0).astype(np.float32)))
     return np.where(inside > 0.5, values / np.maximum(inside, 0.5), 0)
-
-
-def _write_check(path: Path, frames: FrameSet, shares: np.ndarray) -> None:
-    """Write a picture of the frames with most distractors, masked pixels tinted."""
-    rows = []
-    for f in np.sort(np.argsort(-shares, kind="stable")[:_NUM_CHECK_FRAMES]):
-        size = (_CHECK_WIDTH_PX, _CHECK_WIDTH_PX // 2)
-        if frames.format_of(int(f)).panoramic:
-            shown = cv2.resize(load_erp(frames, int(f), width=_CHECK_WIDTH_PX), size)
-        else:
-            shown = np.full((size[1], size[0], 3), 128, np.uint8)
-        mask = load_mask(frames, int(f))
-        assert mask is not None
-        out = _fit(mask, _CHECK_WIDTH_PX) == 0
-        shown[out] = (shown[out] * 0.5 + np.array([128, 0, 60])).astype(np.uint8)
-        outlines, _ = cv2.findContours(out.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-        cv2.drawContours(shown, outlines, -1, (255, 80, 160), 1)
-        place = (6, size[1] - 8)
-        cv2.putText(shown, frames.names[f], place, cv2.FONT_HERSHEY_PLAIN, 1, (255, 255, 255))
-        rows.append(shown)
-    write_image(path, np.concatenate(rows), jpeg_quality=88)

@@ -137,11 +137,6 @@ class Cutter:
         return Atlas(image, self.cut_R_rig)
 
 
-def shared_faces(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Face (N,) that best shows a feature with two bearings (N, 3), axes of the cut."""
-    return owner_faces(unit(one + other)).astype(np.int64)
-
-
 @_part
 def _arctangent(y, x):
     """Angle in (-pi, pi] of a vector (x, y), float32, to a millionth of a radian."""
@@ -194,7 +189,7 @@ def follow(
     """
     before = bearings_template @ template.cut_R_rig.T
     guess = predicted @ frame.cut_R_rig.T
-    faces = shared_faces(before, guess)
+    faces = owner_faces(unit(before + guess)).astype(np.int64)
     starts, ends = layout.pixels(before, faces), layout.pixels(guess, faces)
     margin = WINDOW / 2 + 1
     rows = np.flatnonzero(layout.inside(starts, faces, margin) & layout.inside(ends, faces, margin))
@@ -232,7 +227,10 @@ def new_corners(
     """
     response = cv2.cornerMinEigenVal(atlas.image, _BLOCK)
     allowed = layout.owned if usable is None else layout.owned & usable
-    floor = max(_MIN_EIGENVALUE, 4.0 * _flat(response, allowed))
+    # median response of the flattest quarter of a picture: that of noise, if walls are bare
+    some = response[::4, ::4][allowed[::4, ::4]]
+    flat = float(np.quantile(some, 0.125)) if len(some) else 0.0
+    floor = max(_MIN_EIGENVALUE, 4.0 * flat)
     peaks = (response == cv2.dilate(response, np.ones((5, 5)))) & (response > floor) & allowed
     taken = np.zeros(6 * _PER_SIDE**2, int)
     if len(known):
@@ -253,12 +251,6 @@ def new_corners(
     kept = np.flatnonzero(rank < room[cells])  # features in a cell, including followed ones
     kept = kept[_apart(np.stack([u, v], axis=1)[kept])]
     return bearings[kept] @ atlas.cut_R_rig
-
-
-def _flat(response: np.ndarray, allowed: np.ndarray) -> float:
-    """Median response of the flattest quarter of a picture: that of noise, if walls are bare."""
-    some = response[::4, ::4][allowed[::4, ::4]]
-    return float(np.quantile(some, 0.125)) if len(some) else 0.0
 
 
 def _block(peaks: np.ndarray, layout: AtlasLayout, along: np.ndarray) -> None:

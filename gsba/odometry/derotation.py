@@ -66,7 +66,17 @@ def _aligned(one: Miniature, other: Miniature, start: np.ndarray) -> tuple[np.nd
 
     rays, rotation, cost = _rays(), start, np.inf
     weights = one.weights.ravel()
-    jacobian = _jacobian(one.detail)
+    per_radian = _WIDTH / (2 * np.pi)
+    by_u = 0.5 * (np.roll(one.detail, -1, axis=1) - np.roll(one.detail, 1, axis=1)) * per_radian
+    by_v = np.gradient(one.detail, axis=0) * per_radian
+    x, y, z = rays.T
+    level = np.maximum(np.hypot(x, z), 0.05)
+    # Rotating a ray r about w moves it by w x r: longitude and elevation angles follow.
+    by_longitude, by_height = by_u.ravel(), by_v.ravel()
+    east = np.stack([z, np.zeros_like(x), -x], axis=1) / level[:, None]
+    down = np.stack([-x * y, level**2, -z * y], axis=1) / level[:, None]
+    gradient = by_longitude[:, None] / level[:, None] * east + by_height[:, None] * down
+    jacobian = np.cross(rays, gradient)
     for _ in range(_STEPS):
         # The other picture, rotated by the estimate, is compared at the rays of the first.
         places = erp_from_bearings(rays @ rotation, _WIDTH, _WIDTH // 2) - 0.5
@@ -100,19 +110,3 @@ def _rays() -> np.ndarray:
     rays = bearings_from_erp(np.stack([u, v], axis=-1), _WIDTH, _WIDTH // 2).reshape(-1, 3)
     rays.setflags(write=False)
     return rays
-
-
-def _jacobian(detail: np.ndarray) -> np.ndarray:
-    """Derivative (64 * 128, 3) of the detail at each ray by a rotation of the ray."""
-    per_radian = _WIDTH / (2 * np.pi)
-    by_u = 0.5 * (np.roll(detail, -1, axis=1) - np.roll(detail, 1, axis=1)) * per_radian
-    by_v = np.gradient(detail, axis=0) * per_radian
-    x, y, z = _rays().T
-    level = np.maximum(np.hypot(x, z), 0.05)
-    # Rotating a ray r about w moves it by w x r: longitude and elevation angles follow.
-    by_longitude, by_height = by_u.ravel(), by_v.ravel()
-    east = np.stack([z, np.zeros_like(x), -x], axis=1) / level[:, None]
-    down = np.stack([-x * y, level**2, -z * y], axis=1) / level[:, None]
-    rays = _rays()
-    gradient = by_longitude[:, None] / level[:, None] * east + by_height[:, None] * down
-    return np.cross(rays, gradient)

@@ -24,7 +24,6 @@ from gsba.masks.carrier import PICTURE_WIDTH, find_fixed_carrier
 from gsba.types import FrameSet
 from gsba.video.recording import (
     EXACT_S,
-    Picture,
     Recording,
     factory_calibration_of,
     read_recording,
@@ -125,7 +124,10 @@ def of_video(
     def read(chosen: Sequence[int], colour: bool) -> Iterator[tuple[int, np.ndarray]]:
         number = {int(rows[row]): int(row) for row in chosen}
         for index, pictures in shots(recording, [int(rows[row]) for row in chosen]):
-            planes = [_pixels(picture, colour) for picture in pictures]
+            planes = [
+                np.ascontiguousarray(picture.bgr()[..., ::-1]) if colour else picture.luma()
+                for picture in pictures
+            ]
             if recording.cube:
                 whole = panorama_of(squares((planes[0], planes[1])), width)
             else:
@@ -172,10 +174,6 @@ def _narrowed(panoramas: SmallPanoramas, usable: np.ndarray) -> SmallPanoramas:
     fitted = cv2.resize(usable.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.9
     before = panoramas.usable
     return replace(panoramas, usable=fitted if before is None else fitted & before)
-
-
-def _pixels(picture: Picture, colour: bool) -> np.ndarray:
-    return np.ascontiguousarray(picture.bgr()[..., ::-1]) if colour else picture.luma()
 
 
 def _lenses(recording: Recording, rows: np.ndarray, calibration: Path | None) -> Rig:

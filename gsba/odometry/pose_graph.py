@@ -200,7 +200,16 @@ def measure_steps(
     """
     num = len(features)
     parents, covariances = np.full(num, -1), np.zeros((num, 7, 7))
-    points, first_seen = _points(features, world_T_keys)
+    seen = WindowObservations.of(features)
+    sigmas = np.full(len(seen.ids), _SIGMA)
+    rays, settings = seen.bearings_rig.astype(float), TriangulateSettings()
+    found = triangulate(seen.tracks(), rays, sigmas, world_T_keys, _GATE, settings)
+    first_rows = np.unique(found.tracks.points, return_index=True)[1]
+    known = seen.features_of(found)
+    most = int(seen.ids.max(initial=-1)) + 1
+    points, first_seen = np.full((most, 3), np.nan), np.zeros(most, np.int64)
+    points[known] = found.points_world
+    first_seen[known] = found.tracks.frames[first_rows]
     for k in range(num):
         ids, bearings = features[k]
         before = [j for j in range(max(k - _REACH, 0), k) if maps[j] == maps[k]]
@@ -214,23 +223,6 @@ def measure_steps(
         given = points[ids[rows]], bearings[rows].astype(float), world_T_keys[k], origins
         covariances[k] = _covariance(*given, float(distances[k]))
     return MeasuredSteps(parents, covariances)
-
-
-def _points(
-    features: Sequence[tuple[np.ndarray, np.ndarray]], world_T_keys: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """By id, the point (3,) of each feature, NaN = unknown, and its first keyframe."""
-    seen = WindowObservations.of(features)
-    sigmas = np.full(len(seen.ids), _SIGMA)
-    bearings, settings = seen.bearings_rig.astype(float), TriangulateSettings()
-    found = triangulate(seen.tracks(), bearings, sigmas, world_T_keys, _GATE, settings)
-    first_rows = np.unique(found.tracks.points, return_index=True)[1]
-    known = seen.features_of(found)
-    most = int(seen.ids.max(initial=-1)) + 1
-    points, first_seen = np.full((most, 3), np.nan), np.zeros(most, np.int64)
-    points[known] = found.points_world
-    first_seen[known] = found.tracks.frames[first_rows]
-    return points, first_seen
 
 
 def _covariance(

@@ -56,7 +56,22 @@ def placed(
     """
     if min(len(key.bearings_rig), len(frame.bearings_rig)) < _MIN_MATCHES:
         return None
-    rows = _matched(key.descriptors, frame.descriptors)
+    # mutual nearest neighbours that pass the ratio test
+    matcher = cv2.BFMatcher(cv2.NORM_L2)
+    forth = matcher.knnMatch(key.descriptors, frame.descriptors, k=2)
+    back = {
+        m[0].queryIdx: m[0].trainIdx
+        for m in matcher.knnMatch(frame.descriptors, key.descriptors, k=1)
+        if m
+    }
+    pairs = [
+        (m[0].queryIdx, m[0].trainIdx)
+        for m in forth
+        if len(m) == 2
+        and m[0].distance < 0.85 * m[1].distance
+        and back.get(m[0].trainIdx) == m[0].queryIdx
+    ]
+    rows = np.array(pairs, np.int64).reshape(-1, 2)
     if len(rows) < _MIN_MATCHES:
         return None
     one, other = key.bearings_rig[rows[:, 0]], frame.bearings_rig[rows[:, 1]]
@@ -69,21 +84,6 @@ def placed(
     one, other = one[found.inliers], other[found.inliers] @ rotation.T
     length = _length(one, other, direction, bearings, distances)
     return None if length is None else pose(rotation, length * direction)
-
-
-def _matched(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Rows (m, 2) of descriptors that are mutual nearest neighbours and pass the ratio test."""
-    matcher = cv2.BFMatcher(cv2.NORM_L2)
-    forth = matcher.knnMatch(one, other, k=2)
-    back = {m[0].queryIdx: m[0].trainIdx for m in matcher.knnMatch(other, one, k=1) if m}
-    rows = [
-        (m[0].queryIdx, m[0].trainIdx)
-        for m in forth
-        if len(m) == 2
-        and m[0].distance < 0.85 * m[1].distance
-        and back.get(m[0].trainIdx) == m[0].queryIdx
-    ]
-    return np.array(rows, np.int64).reshape(-1, 2)
 
 
 def _length(

@@ -322,7 +322,27 @@ class Tracker:
         """Make the last posed frame a keyframe: add features, adjust the window."""
         corners = self._corners(atlas, bearings)
         self._add_keyframe(frame, self.state.world_T_rig, atlas, small, (ids, bearings), corners)
-        self._adjust()
+        # adjust the window, and drop features that do not fit it
+        window = self.state.window
+        held = max(len(window) - FREE, min(2, len(window) - 1))
+        seen = WindowObservations.of([(key.ids, key.bearings) for key in window])
+        poses = np.array([key.world_T_rig for key in window])
+        solved = adjust_window(poses, held, seen, self.state.sigma, _GATE)
+        for key, world_T_rig in zip(window[held:], solved.world_T_rigs[held:], strict=True):
+            key.world_T_rig = world_T_rig
+            self.state.keyframe_poses[key.number] = world_T_rig
+        everything = np.unique(seen.ids)
+        self.state.points[everything] = np.nan
+        self.state.points[solved.ids] = solved.points_world
+        for n, key in enumerate(window):
+            false = solved.outliers[solved.outliers[:, 0] == n, 1]
+            if len(false):
+                kept = ~np.isin(key.ids, false)
+                key.ids, key.bearings = key.ids[kept], key.bearings[kept]
+                self.state.keyframe_features[key.number] = key.ids, key.bearings.astype(np.float32)
+        last = window[-1]
+        self.state.world_T_rig = last.world_T_rig.copy()
+        self.state.features = self._followable(last)
         known = np.isfinite(self.state.points[ids, 0])
         distance = self._distance(ids[known], self.state.world_T_rig)
         self._record(FrameStatus.TRACKED, np.eye(4), distance, len(ids))
@@ -356,29 +376,6 @@ class Tracker:
         for old in state.window[:-10]:  # keyframes that a lost frame is compared with
             old.atlas = old.small = old.described = None
         state.features = self._followable(key)
-
-    def _adjust(self) -> None:
-        """Adjust the window, and drop features that do not fit it."""
-        window = self.state.window
-        held = max(len(window) - FREE, min(2, len(window) - 1))
-        seen = WindowObservations.of([(key.ids, key.bearings) for key in window])
-        poses = np.array([key.world_T_rig for key in window])
-        solved = adjust_window(poses, held, seen, self.state.sigma, _GATE)
-        for key, world_T_rig in zip(window[held:], solved.world_T_rigs[held:], strict=True):
-            key.world_T_rig = world_T_rig
-            self.state.keyframe_poses[key.number] = world_T_rig
-        everything = np.unique(seen.ids)
-        self.state.points[everything] = np.nan
-        self.state.points[solved.ids] = solved.points_world
-        for n, key in enumerate(window):
-            false = solved.outliers[solved.outliers[:, 0] == n, 1]
-            if len(false):
-                kept = ~np.isin(key.ids, false)
-                key.ids, key.bearings = key.ids[kept], key.bearings[kept]
-                self.state.keyframe_features[key.number] = key.ids, key.bearings.astype(np.float32)
-        last = window[-1]
-        self.state.world_T_rig = last.world_T_rig.copy()
-        self.state.features = self._followable(last)
 
     # Lost frames.
 

@@ -85,7 +85,15 @@ def adjust_window(
     )
     keys = [pose_variables.X(k) for k in range(len(world_T_rigs))]
     block = LandmarkBlock(keys, marks.points_world, [term], RobustLoss("cauchy", 2.0), 1)
-    graph = _held(world_T_rigs, num_held)
+    extent = max(float(np.linalg.norm(np.ptp(world_T_rigs[:, :3, 3], axis=0))), 1e-9)
+    spread = np.array([_HELD] * 3 + [_HELD * extent] * 3)
+    noise = gtsam.noiseModel.Diagonal.Sigmas(spread)
+    graph = gtsam.NonlinearFactorGraph()
+    for k in range(num_held):
+        pose = gtsam.Pose3(world_T_rigs[k])
+        graph.add(gtsam.PriorFactorPose3(pose_variables.X(k), pose, noise))
+    if num_held == 1:
+        graph.push_back(pose_variables.fixed_scale(world_T_rigs))
     poses = poses_of(optimize(graph, values_of(world_T_rigs), [block], _SOLVER).values, len(keys))
     marks = place(poses, gate)
     kept = np.zeros(len(seen.ids), bool)
@@ -94,20 +102,6 @@ def adjust_window(
     false = ~kept & np.isin(seen.ids, ids)
     outliers = np.stack([seen.frames[false], seen.ids[false]], axis=1)
     return AdjustedWindow(poses, ids, marks.points_world, outliers)
-
-
-def _held(world_T_rigs: np.ndarray, num_held: int) -> gtsam.NonlinearFactorGraph:
-    """Priors that fix the gauge."""
-    extent = max(float(np.linalg.norm(np.ptp(world_T_rigs[:, :3, 3], axis=0))), 1e-9)
-    sigmas = np.array([_HELD] * 3 + [_HELD * extent] * 3)
-    noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
-    graph = gtsam.NonlinearFactorGraph()
-    for k in range(num_held):
-        pose = gtsam.Pose3(world_T_rigs[k])
-        graph.add(gtsam.PriorFactorPose3(pose_variables.X(k), pose, noise))
-    if num_held == 1:
-        graph.push_back(pose_variables.fixed_scale(world_T_rigs))
-    return graph
 
 
 _MOVED, _MOVED_LITTLE = np.deg2rad([4.0, 1.2])  # parallax of the upper quarter of the features from

@@ -132,7 +132,13 @@ def render_view(
     images = backend.render(gaussians, cameras, None, near)
     for camera, image in zip(cameras, images, strict=True):
         grid = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-        sure = (image.alpha > MIN_ALPHA) & ~_edges(image.depth)
+        # at a step, the expected depth is of neither side
+        low, high = image.depth.copy(), image.depth.copy()
+        for axis in (0, 1):
+            for shift in (1, -1):
+                other = np.roll(image.depth, shift, axis)
+                low, high = np.minimum(low, other), np.maximum(high, other)
+        sure = (image.alpha > MIN_ALPHA) & ~(high - low > MAX_STEP * np.maximum(image.depth, 1e-9))
         depth = image.depth[sure].astype(np.float64)
         offsets = (np.stack(grid, axis=-1)[sure] - camera.principal) / camera.focal
         local = np.column_stack([offsets, np.ones(len(offsets))]) * depth[:, None]
@@ -140,16 +146,6 @@ def render_view(
         # The scene behind a pixel that is not quite opaque is unknown: its share is left out.
         greys.append((image.color[sure] @ _LUMA) / image.alpha[sure])
     return RenderedView(np.concatenate(points), np.concatenate(greys))
-
-
-def _edges(depth: np.ndarray) -> np.ndarray:
-    """Pixels (H, W) bool at a step of the depth, where the expected depth is of neither side."""
-    low, high = depth.copy(), depth.copy()
-    for axis in (0, 1):
-        for shift in (1, -1):
-            other = np.roll(depth, shift, axis)
-            low, high = np.minimum(low, other), np.maximum(high, other)
-    return high - low > MAX_STEP * np.maximum(depth, 1e-9)
 
 
 def _captured_rig(frames: FrameSet, size: int) -> CubeRig:

@@ -22,7 +22,7 @@ def render_views(
 ) -> list[np.ndarray]:
     """Each view of a rig, (height, width, 3) uint8 RGB."""
     renderings = backend.render(gaussians, rig_cameras(world_T_rig, views), None, near)
-    return [to_uint8(rendering.color) for rendering in renderings]
+    return [(np.clip(one.color, 0, 1) * 255 + 0.5).astype(np.uint8) for one in renderings]
 
 
 def render_panorama(
@@ -47,8 +47,3 @@ def render_panorama(
         sampled = cv2.remap(faces[face], at[..., 0], at[..., 1], cv2.INTER_LINEAR)
         image[owners == face] = sampled[owners == face]
     return image
-
-
-def to_uint8(color: np.ndarray) -> np.ndarray:
-    """Colours 0..1 as 0..255, clipped and rounded."""
-    return (np.clip(color, 0, 1) * 255 + 0.5).astype(np.uint8)

@@ -87,12 +87,6 @@ def times_for(iterations: int) -> Times:
     )
 
 
-def extent_of(places: np.ndarray) -> float:
-    """Radius of the region of cameras at (N, 3), times 1.1; 1 for a single place."""
-    radius = float(np.linalg.norm(places - places.mean(axis=0), axis=1).max())
-    return 1.1 * radius if radius > 0 else 1.0
-
-
 def train(
     start: Gaussians,
     views: Views,
@@ -204,6 +198,12 @@ def most_gaussians(views: Views, settings: SplatSettings, backend: Backend) -> t
     return held, f"that half of {backend.memory_bytes / 1e9:.1f} GB of memory holds"
 
 
+def extent_of(places: np.ndarray) -> float:
+    """Radius of the region of cameras at (N, 3), times 1.1; 1 for a single place."""
+    radius = float(np.linalg.norm(places - places.mean(axis=0), axis=1).max())
+    return 1.1 * radius if radius > 0 else 1.0
+
+
 class Trainer:
     """Inputs that are constant over all steps.
 
@@ -226,7 +226,10 @@ class Trainer:
         place."""
         settings, times = self.settings, self.times
         gaussians, moments, pull = state.gaussians, state.moments, state.pull
-        step = self._stop(state.step, end)
+        due = self.times
+        rhythms = (self.backend.stretch, due.densify_every, due.reset_every)
+        stops = [end, *(state.step // every * every + every for every in rhythms)]
+        step = min([*stops, due.densify_until] if state.step < due.densify_until else stops)
         lessons = (self._lesson(number) for number in range(state.step + 1, step + 1))
         wanted = settings.densify and step <= times.densify_until
         self.backend.descend(
@@ -240,43 +243,29 @@ class Trainer:
                 gaussians, moments = reset_opacity(gaussians, moments)
         return TrainingState(step, gaussians, moments, pull)
 
-    def _stop(self, step: int, end: int) -> int:
-        """The next step at which density control may be due, or the end of the stretch."""
-        times = self.times
-        rhythms = (self.backend.stretch, times.densify_every, times.reset_every)
-        stops = [end, *(step // every * every + every for every in rhythms)]
-        return min([*stops, times.densify_until] if step < times.densify_until else stops)
-
     def _lesson(self, number: int) -> Lesson:
         """The view and rates of a step, counted from 1."""
-        views, view = self.views, self._view(number - 1)
+        turn, place = divmod(number - 1, len(self.views.cameras))
+        draw = np.random.default_rng([self.settings.seed, turn])
+        views, view = self.views, int(draw.permutation(len(self.views.cameras))[place])
+        settings = self.settings
+        done = number / settings.iterations
+        means = settings.rate_means ** (1 - done) * settings.rate_means_end**done
+        fade = settings.rate_fade**done
         return Lesson(
             views.cameras[view],
             views.images[view],
             None if views.use is None else views.use[view],
             min((number - 1) // self.times.degree_every, self.settings.sh_degree),
-            self._rates(number),
+            adam.Rates(
+                means=means * self.extent,
+                log_scales=fade * settings.rate_scales,
+                quaternions=fade * settings.rate_rotations,
+                opacity_logits=fade * settings.rate_opacities,
+                sh=fade * settings.rate_colors,
+                sh_rest=fade * settings.rate_colors / 20,
+            ),
             number,
-        )
-
-    def _view(self, step: int) -> int:
-        """Index of the view shown at a step."""
-        turn, place = divmod(step, len(self.views.cameras))
-        draw = np.random.default_rng([self.settings.seed, turn])
-        return int(draw.permutation(len(self.views.cameras))[place])
-
-    def _rates(self, step: int) -> adam.Rates:
-        settings = self.settings
-        done = step / settings.iterations
-        means = settings.rate_means ** (1 - done) * settings.rate_means_end**done
-        fade = settings.rate_fade**done
-        return adam.Rates(
-            means=means * self.extent,
-            log_scales=fade * settings.rate_scales,
-            quaternions=fade * settings.rate_rotations,
-            opacity_logits=fade * settings.rate_opacities,
-            sh=fade * settings.rate_colors,
-            sh_rest=fade * settings.rate_colors / 20,
         )
 
     def _densify(self, state: TrainingState, step: int) -> tuple[Gaussians, adam.Moments]:

@@ -36,9 +36,16 @@ from gsba.frames.side_by_side import (
 )
 from gsba.log import GsbaError
 from gsba.types.records import spread_rows
-from gsba.video.claims import PictureClaims
 from gsba.video.colours import bgr, luma
-from gsba.video.timeline import Timeline, Track, decode, read_claims, read_timeline, track_sizes
+from gsba.video.timeline import (
+    PictureClaims,
+    Timeline,
+    Track,
+    decode,
+    read_claims,
+    read_timeline,
+    track_sizes,
+)
 
 LENSES = ("front", "back")
 EXACT_S = 1e-6  # closer times are equal
@@ -133,12 +140,21 @@ def read_recording(video: Path) -> Recording:
         tracks = Track(video, cube[0]), Track(video, cube[1])
         return _of_two_tracks(tracks, (width, height), note, cube=True)
     if len(files) == 2:
-        _check_pair(files, size)
+        front, back = files
+        if (both := track_sizes(back)) != [size]:
+            shapes = " and ".join(f"{width}x{height}" for width, height in both)
+            raise GsbaError(
+                f"{back} is {shapes}, but {front.name}, the front lens's file, is {size[0]}x"
+                f"{size[1]}: they are no pair; copy both again from the camera, or {_STITCH}"
+            )
         note = f"{files[0]}: raw, of the front lens; of the back one is {files[1]}"
         return _of_two_tracks((Track(files[0]), Track(files[1])), size, note)
     if others:
         sizes = [size, *others]
-        pair = _lens_tracks(sizes)
+        # the two largest tracks, if they are square and equal, as in DJI's `.osv`
+        largest = max(sizes, key=lambda size: size[0] * size[1])
+        two = [n for n, size in enumerate(sizes) if size == largest]
+        pair = two if len(two) == 2 and _is_nearly_square(largest) else list(range(len(sizes)))
         size = sizes[pair[0]]
         _check_tracks(video, sizes if len(pair) > 2 else [sizes[n] for n in pair])
         note = f"{video}: raw, two tracks of {size[0]}x{size[1]}: front lens, back lens"
@@ -206,24 +222,6 @@ def _is_nearly_square(size: tuple[int, int]) -> bool:
     return 0 < max(size) <= 1.1 * min(size)
 
 
-def _check_pair(files: tuple[Path, ...], size: tuple[int, int]) -> None:
-    """Refuse two files that are not of two lenses."""
-    front, back = files
-    if (sizes := track_sizes(back)) != [size]:
-        shapes = " and ".join(f"{width}x{height}" for width, height in sizes)
-        raise GsbaError(
-            f"{back} is {shapes}, but {front.name}, the front lens's file, is {size[0]}x{size[1]}: "
-            f"they are no pair; copy both again from the camera, or {_STITCH}"
-        )
-
-
-def _lens_tracks(sizes: Sequence[tuple[int, int]]) -> list[int]:
-    """The two largest tracks, if they are square and equal, as in DJI's `.osv`; else all."""
-    largest = max(sizes, key=lambda size: size[0] * size[1])
-    pair = [n for n, size in enumerate(sizes) if size == largest]
-    return pair if len(pair) == 2 and _is_nearly_square(largest) else list(range(len(sizes)))
-
-
 def _check_tracks(video: Path, sizes: list[tuple[int, int]]) -> None:
     """Refuse several tracks that are not of two lenses."""
     (width, height), shapes = sizes[0], " and ".join(f"{w}x{h}" for w, h in sizes)
@@ -284,7 +282,20 @@ def _check_panorama(video: Path, size: tuple[int, int]) -> None:
 def _of_one_track(track: Track, size: tuple[int, int]) -> Recording:
     """Recording of panoramas, or of two lenses side by side or one above the other."""
     claims, timeline = read_claims(track), read_timeline(track)
-    _refuse_claims(track.path, claims)
+    left, top, right, bottom = claims.bounds
+    kind = ""
+    if claims.stereo:
+        kind = f"stereo, {claims.stereo}"
+    elif claims.projection:
+        kind = f"the projection '{claims.projection}', not equirectangular"
+    elif any(claims.bounds):
+        across, high = 360 * (1 - left - right), 180 * (1 - top - bottom)
+        kind = f"a cropped panorama of {across:.0f} x {high:.0f} degrees"
+    if kind:
+        raise GsbaError(
+            f"{track.path} holds {kind}, by its spherical video tags; gsba reads whole panoramas "
+            "of one eye: export it so"
+        )
     shown, looks = claims.shown_size(size), tee(_looks(track, timeline), 3)
     num, side = len(timeline.ticks), min(size[0], size[1] // 2)
     everything = np.ones(num, bool), np.arange(num)
@@ -302,7 +313,21 @@ def _of_one_track(track: Track, size: tuple[int, int]) -> Recording:
             _refuse_stereo(track.path, shown, (turned(g, claims.orientation) for g in looks[2]))
         _check_panorama(track.path, shown)
         places = ((slice(None), slice(None)),)
-        notes = (*found.notes, *_claim_notes(track.path, claims))
+        told = []
+        if claims.orientation > 1:
+            told.append(
+                f"{track.path}: turned by its display matrix, EXIF orientation {claims.orientation}"
+            )
+        if claims.pixel_aspect != 1:
+            told.append(f"{track.path}: pixels of {claims.pixel_aspect} are made square")
+        told += _hdr_notes(track.path, claims)
+        if any(claims.pose_deg):
+            turn = ", ".join(f"{angle:g}" for angle in claims.pose_deg)
+            told.append(
+                f"{track.path}: players turn its panoramas by yaw, pitch, roll {turn} deg; they "
+                "are read as stored"
+            )
+        notes = (*found.notes, *told)
         height = None if claims.pixel_aspect == 1 else shown[1]
         how = {"height": height, "orientation": claims.orientation}
         return Recording((track,), (timeline,), places, shown[0], *everything, notes, **how)
@@ -316,49 +341,12 @@ def _of_one_track(track: Track, size: tuple[int, int]) -> Recording:
     return Recording((track,), (timeline,), places, side, *everything, notes, height=unsqueezed)
 
 
-def _refuse_claims(video: Path, claims: PictureClaims) -> None:
-    """Refuse pictures that are no panoramas by their file's own claims."""
-    left, top, right, bottom = claims.bounds
-    kind = ""
-    if claims.stereo:
-        kind = f"stereo, {claims.stereo}"
-    elif claims.projection:
-        kind = f"the projection '{claims.projection}', not equirectangular"
-    elif any(claims.bounds):
-        across, high = 360 * (1 - left - right), 180 * (1 - top - bottom)
-        kind = f"a cropped panorama of {across:.0f} x {high:.0f} degrees"
-    if kind:
-        raise GsbaError(
-            f"{video} holds {kind}, by its spherical video tags; gsba reads whole panoramas of one "
-            "eye: export it so"
-        )
-
-
 def _refuse_stereo(video: Path, size: tuple[int, int], greys: Iterator[np.ndarray]) -> None:
     """Refuse pictures in 2:1, or square ones, that are no panoramas by what they show."""
     width, height = size
     kind = unlike_panorama(greys) if height in (width, width // 2) else ""
     if kind and (width == 2 * height or kind == OVER_UNDER):
         raise GsbaError(f"{video} holds no panoramas but {kind}: {REMEDIES[kind]}")
-
-
-def _claim_notes(video: Path, claims: PictureClaims) -> list[str]:
-    """Notes on claims that changed pixels, or that are left to the player."""
-    notes = []
-    if claims.orientation > 1:
-        notes.append(
-            f"{video}: turned by its display matrix, EXIF orientation {claims.orientation}"
-        )
-    if claims.pixel_aspect != 1:
-        notes.append(f"{video}: pixels of {claims.pixel_aspect} are made square")
-    notes += _hdr_notes(video, claims)
-    if any(claims.pose_deg):
-        turn = ", ".join(f"{angle:g}" for angle in claims.pose_deg)
-        notes.append(
-            f"{video}: players turn its panoramas by yaw, pitch, roll {turn} deg; they are read as "
-            "stored"
-        )
-    return notes
 
 
 def _hdr_notes(video: Path, claims: PictureClaims) -> list[str]:
