@@ -209,14 +209,9 @@ def visits_of(offsets: np.ndarray, frames: np.ndarray, num_frames: int, most: in
 def covisible_pairs(
     offsets: np.ndarray, frames: np.ndarray, num_frames: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Frame pairs f < g with a common landmark, as sorted CSR rows.
-
-    Args:
-        offsets (J + 1,), frames (O,): observations by landmark.
-
-    Returns:
-        starts (F + 1,) and columns (P,), int64; number of landmarks each two share, (P,) float32.
-    """
+    """Frame pairs f < g with a common landmark, of observations by landmark (offsets (J + 1,),
+    frames (O,)), as sorted CSR rows: starts (F + 1,) and columns (P,), int64; and the number of
+    landmarks that each two share, (P,) float32."""
     num_points = len(offsets) - 1
     owners = np.repeat(np.arange(num_points), np.diff(offsets))
     ones = np.ones(len(owners), dtype=np.float32)

@@ -260,14 +260,9 @@ def sightings_of(
 def pixels_of(
     directions: np.ndarray, lenses: np.ndarray, calibration: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (O, 3) that raw lenses show directions in, as `Sightings` has them, and how these
-    move, on their tangent_basis, with the pixels (O, 2, 2).
-
-    Args:
-        directions: (O, 3) unit, rig frame.
-        lenses: (O,) int, those that see them.
-        calibration: (L, 16) the lenses, as in `CameraRows`.
-    """
+    """Pixels (O, 3) that raw lenses (O,) show unit directions (O, 3), rig frame, in, as `Sightings`
+    has them, and how these move, on their tangent_basis, with the pixels (O, 2, 2); calibration (L,
+    16) as in `CameraRows`."""
     num = len(directions)
     frames, rows = np.zeros(num, np.int64), np.arange(num)
     plain = np.zeros((num, 3)), np.tile(np.eye(2), (num, 1, 1)), lenses, np.zeros(num)

@@ -206,17 +206,12 @@ class BlockCholesky:
     def inverse_blocks(
         self, pairs: np.ndarray, kept: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Blocks of the inverse of H (Takahashi's selected inversion, front by front).
+        """Diagonal blocks (N, 6, 6) of the inverse of H, and its blocks [i, j] (Q, 6, 6) of pairs
+        (Q, 2) of the pattern, in either order; kept: (6 K, 6 K) the inverse at the blocks that were
+        kept.
 
-        With G = L21 L11^-1, Z21 = -Z22 G and Z11 = (L11 L11^T)^-1 - G^T Z21. Takahashi, Fagan,
-        Chen, 1973.
-
-        Args:
-            pairs: (Q, 2) int, pairs of the pattern, in either order.
-            kept: (6 K, 6 K) the inverse at the blocks that were kept.
-
-        Returns:
-            (N, 6, 6) diagonal blocks, (Q, 6, 6) blocks [i, j] of the pairs.
+        Takahashi's selected inversion, front by front: with G = L21 L11^-1, Z21 = -Z22 G and Z11 =
+        (L11 L11^T)^-1 - G^T Z21. Takahashi, Fagan, Chen, 1973.
         """
         pairs = np.asarray(pairs, dtype=np.int64).reshape(-1, 2)
         placed = np.sort(self._place[pairs], axis=1)

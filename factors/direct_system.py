@@ -86,16 +86,9 @@ def reduced_system(
     values: gtsam.Values,
     pairs: Sequence[tuple[int, int]] = (),
 ) -> ReducedSystem:
-    """The normal equations of a graph and blocks, with the cheaper solver.
-
-    Conjugate gradients take over where covisibility would fill in a factorization.
-
-    Args:
-        pairs: keys of two variables each, whose joint block `covariances` returns.
-
-    Raises:
-        ValueError: a variable has no value.
-    """
+    """The normal equations of a graph and blocks, with the cheaper solver: conjugate gradients take
+    over where covisibility would fill in a factorization. `covariances` returns the joint blocks of
+    `pairs` of keys. ValueError: a variable has no value."""
     layout = SystemLayout(graph, blocks, values, pairs)
     offered = {i: block.products() for i, block in enumerate(layout.blocks)}
     products = {i: product for i, product in offered.items() if product is not None}

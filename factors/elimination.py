@@ -220,15 +220,9 @@ def eliminate(
     by_frame: np.ndarray,
     by_shared: np.ndarray,
 ) -> LinearSystem:
-    """The Schur complement of landmarks in a linear least-squares problem.
-
-    Args:
-        frames, points: (O,) int, frame and landmark of each observation.
-        residuals: (O, 2) whitened.
-        by_point: (O, 2, 3) Jacobian by the landmark.
-        by_frame: (O, 2, K) Jacobian by the variables of the frame.
-        by_shared: (O, 2, S) Jacobian by the shared variables.
-    """
+    """The Schur complement of landmarks in a linear least-squares problem of whitened residuals (O,
+    2), each of a frame and a landmark (O,); their Jacobians by the landmark (O, 2, 3), by the
+    variables of the frame (O, 2, K) and by the shared variables (O, 2, S)."""
     own, common = by_frame.shape[2], by_shared.shape[2]
     order = np.lexsort((frames, points))
     frames, points = np.asarray(frames)[order].astype(np.int64), np.asarray(points)[order]

@@ -25,18 +25,17 @@ def conjugate_gradients(
     max_iterations: int,
     truncate: bool = False,
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Solve H x = right for several right sides at once. Hestenes and Stiefel, 1952.
+    """Solve H x = right (N, 6, R) for several right sides at once. Hestenes and Stiefel, 1952.
 
     Args:
-        multiply: H applied to (N, 6, R), symmetric positive definite.
-        right: (N, 6, R).
-        precondition: approximate H^-1 applied to (N, 6, R), symmetric positive definite.
+        multiply, precondition: H and an approximate H^-1 applied to (N, 6, R), symmetric
+            positive definite.
         tolerance: of each residual in the preconditioner's norm, relative to x = 0.
         truncate: return the last iterate even if the tolerance is not reached.
 
     Returns:
-        x (N, 6, R) and the residual right - H x; None if the tolerance is not reached, or if H is
-        not positive definite.
+        x and the residual right - H x; None if the tolerance is not reached, or if H is not
+        positive definite.
     """
     x, residual = np.zeros_like(right), right.copy()
     better = precondition(residual)

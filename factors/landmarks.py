@@ -305,9 +305,8 @@ def eliminate_points(
     """Reduced pose system of observations: robust weights, landmarks eliminated.
 
     Args:
-        points: (J, 3) world.
-        poses: (F, 12) as in `factors._kernels`.
-        row_starts, columns: (F + 1,), (P,) covisible frame pairs i < k as sorted CSR rows.
+        points: (J, 3) world. poses: (F, 12) as in `factors._kernels`. row_starts, columns: (F +
+            1,), (P,) covisible frame pairs i < k as sorted CSR rows.
 
     Returns:
         Diagonal (F, 6, 6), off-diagonal (P, 6, 6) and gradient (F, 6); robust costs of families

@@ -91,15 +91,9 @@ class PartElimination:
         return steps, 0.5 * float((steps * (self._added * steps - gradient)).sum())
 
     def inverse_blocks(self, pairs: np.ndarray, kept: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Blocks of the inverse of the whole map's system, given it at the shared blocks.
-
-        Args:
-            pairs: (Q, 2) int, pairs of the part's pattern, i < j, i one of its own.
-            kept: (6 K, 6 K).
-
-        Returns:
-            (N - K, 6, 6) diagonal blocks of the own ones, (Q, 6, 6) blocks [i, j] of the pairs.
-        """
+        """Blocks of the inverse of the whole map's system, given it at the shared blocks, kept (6
+        K, 6 K): (N - K, 6, 6) diagonal ones of its own, (Q, 6, 6) blocks [i, j] of pairs (Q, 2) of
+        the part's pattern, i < j, i one of its own."""
         inverse, between = self._cholesky.inverse_blocks(pairs, kept if self._num_kept else None)
         return inverse[self._own], between
 

@@ -208,14 +208,9 @@ def over_poles(image: np.ndarray, rows: int) -> np.ndarray:
 
 
 def coded(image: SphereImage) -> np.ndarray:
-    """Spline coefficients in two bytes each, continued over seam and poles.
-
-    Returns:
-        (H + 2 PAD, 2 H + 2 PAD) int16, steps of 1 / CODE_SCALE grey values from CODE_ZERO.
-
-    Raises:
-        ValueError: the grey values are not finite.
-    """
+    """Spline coefficients in two bytes each, continued over seam and poles: (H + 2 PAD, 2 H + 2
+    PAD) int16, steps of 1 / CODE_SCALE grey values from CODE_ZERO. ValueError: grey values are not
+    finite."""
     tall = over_poles(image.coefficients, PAD)
     if not np.all(np.isfinite(tall)):
         raise ValueError("the grey values must be finite")

@@ -87,13 +87,9 @@ class PatchSet:
         spreads: np.ndarray,
         least_contrast: float,
     ) -> None:
-        """Cut the templates `rows (R,)` from their panorama.
-
-        Args:
-            mask: (H, 2H) bool, True = use.
-            origins (T, 3), spreads (T, 3, 2): plane patches, rig frame of the panorama.
-            least_contrast: least standard deviation in grey values.
-        """
+        """Cut the templates `rows (R,)` from their panorama, where the mask (H, 2H) is True: plane
+        patches, origins (T, 3) and spreads (T, 3, 2), rig frame of the panorama, of at least
+        `least_contrast`, standard deviation in grey values."""
         places = np.ascontiguousarray(origins), np.ascontiguousarray(spreads)
         coefficients = image.coefficients
         cut_templates(coefficients, _usable(mask), rows, *places, least_contrast, self.templates)
@@ -108,13 +104,9 @@ class PatchSet:
         max_steps: int,
         tolerance: float,
     ) -> None:
-        """Align the sightings `rows (R,)` of a panorama, and write their results.
-
-        Args:
-            mask: (H, 2H) bool, True = use.
-            max_shift, tolerance: limits of the shift and of its last step, template pixels.
-            max_steps: largest number of Gauss-Newton steps.
-        """
+        """Align the sightings `rows (R,)` of a panorama, where the mask (H, 2H) is True, and write
+        their results, by `max_steps` Gauss-Newton steps at most; `max_shift` and `tolerance` limit
+        the shift and its last step, template pixels."""
         states = self.templates.states[sightings.templates[rows]]
         sightings.states[rows] = states
         rows = rows[states == ALIGNED]

@@ -213,13 +213,8 @@ class SchurComplement:
         visits: Sequence[GroupVisits],
         target: np.ndarray,
     ) -> None:
-        """Add H projected to groups of poses.
-
-        Args:
-            labels: (F,) group of each pose.
-            bases: (F, 6, 7) motion of each pose when its group moves.
-            target: (7 G, 7 G), only the upper triangle is written.
-        """
+        """Add H projected to groups of poses, labels (F,), to the upper triangle of target (7 G, 7
+        G); bases: (F, 6, 7) motion of each pose when its group moves."""
         for run, projected, by_group in zip(self.runs, self.projected, visits, strict=True):
             over = by_group.over
             sums = np.empty((len(over.frames), 3, GROUP_DIM))

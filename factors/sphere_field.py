@@ -45,15 +45,9 @@ def degrees_of(num: int) -> np.ndarray:
 
 
 def harmonics(bearings: np.ndarray, degree: int) -> np.ndarray:
-    """Tangent vectors of each harmonic.
-
-    Args:
-        bearings: (N, 3) float64, unit.
-
-    Returns:
-        (N, 3, K) float64, by degree, gradients before curls within each; orthonormal over
-        the sphere. Solid harmonics by their Cartesian recurrences, which have no pole.
-    """
+    """Tangent vectors (N, 3, K) float64 of each harmonic at unit bearings (N, 3), by degree,
+    gradients before curls within each; orthonormal over the sphere. Solid harmonics by their
+    Cartesian recurrences, which have no pole."""
     flat = np.ascontiguousarray(bearings, dtype=np.float64)
     out = np.zeros((len(flat), 3, num_harmonics(degree)))
     if degree:

@@ -50,7 +50,7 @@ class DivisibleMap:
         return len(self.landmarks.tracks)
 
     def chunks(self) -> Iterator[tuple[np.ndarray, Sequence[Term]]]:
-        """Landmarks (J, 3) and their terms, a few of them at a time."""
+        """Landmarks (J, 3) and their terms, a few at a time."""
         landmarks = self.landmarks
         for points, _, own in runs(landmarks.tracks, 1 << 17):  # 20 MB
             some = Landmarks(landmarks.points_world[points], own, landmarks.counts)
@@ -152,11 +152,8 @@ class AdjustmentContext:
         return Terms(own.graph, own.blocks, values, own)
 
     def covariance_terms(self, solved: Solution, maps: np.ndarray | None) -> Terms:
-        """Terms for covariances: the first pose and the extent of each map are held fixed.
-
-        Args:
-            maps: (F,) map of each frame; None = there is one.
-        """
+        """Terms for covariances: the first pose and the extent of each map are held fixed; maps:
+        (F,) map of each frame, None = there is one."""
         own = self.families.covariance_terms(solved, self.maps)
         graph, values = gtsam.NonlinearFactorGraph(own.graph), values_of(solved.world_T_rigs)
         graph.push_back(pose_variables.fixed_scale(solved.world_T_rigs, maps))
@@ -216,11 +213,8 @@ class View(Protocol):
     def terms(
         self, solved: Solution, noise: float, context: AdjustmentContext
     ) -> "tuple[Terms, Callable[[gtsam.Values], Self]]":
-        """Terms that an adjustment from a solution minimises, and the view at the values it finds.
-
-        Args:
-            noise: of the observations, in units of the keypoints' own sigmas.
-        """
+        """Terms that an adjustment from a solution minimises, and the view at the values it finds;
+        noise: of the observations, in units of the keypoints' own sigmas."""
         ...
 
 
@@ -248,11 +242,8 @@ class FixedRays:
 def adjust_sighted(
     sighted: Sighted, before: Solution, context: AdjustmentContext, gates: Sequence[float]
 ) -> tuple[Solution, Keypoints]:
-    """As `adjust`, of aligned and former observations, the noise of either estimated on its own.
-
-    Returns:
-        The solution, and its keypoints with the noise that they turned out to have.
-    """
+    """As `adjust`, of aligned and former observations, the noise of either estimated on its own;
+    and the keypoints with the noise that they turned out to have."""
     view = FixedRays(sighted.keypoints)
     solved, seen = adjust_sighted_through(view, sighted, before, context, gates)
     return solved, seen.keypoints
@@ -329,11 +320,8 @@ def adjust_through(
     gates: Sequence[float],
     final: bool = True,
 ) -> tuple[Solution, V]:
-    """As `adjust`, through a camera that may be solved for beside the poses.
-
-    Returns:
-        The solution and the view that belongs to it.
-    """
+    """As `adjust`, through a camera that may be solved for beside the poses; and the view that
+    belongs to the solution."""
     solved, rounds, settings = replace(start, rounds=()), [], context.settings
     place = _Placement(tracks, context)
     last_gate = gates[-1] * start.noise
@@ -400,11 +388,8 @@ def _solver(settings: RefineSettings, last: bool) -> SolverSettings:
 def landmark_block(
     landmarks: Landmarks, keypoints: Keypoints, noise: float, context: AdjustmentContext
 ) -> LandmarkBlock:
-    """The factor block of the families that observe points.
-
-    Args:
-        noise: of the observations, in units of the keypoints' own sigmas.
-    """
+    """The factor block of the families that observe points; noise: of the observations, in units of
+    the keypoints' own sigmas."""
     solver = context.settings.solver
     return LandmarkBlock(
         [pose_variables.X(f) for f in range(len(keypoints.starts) - 1)],

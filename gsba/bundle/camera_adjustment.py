@@ -125,11 +125,8 @@ class CameraSystem:
         return _Linearized(unknowns, terms.graph, blocks, terms.values)
 
     def covariances(self, components: np.ndarray | None = None) -> CameraCovariances:
-        """Marginal covariances with the first pose and the extent of each map held fixed.
-
-        Args:
-            components: (F,) map of each frame; None = there is one.
-        """
+        """Marginal covariances with the first pose and the extent of each map held fixed;
+        components: (F,) map of each frame, None = there is one."""
         unknowns, terms = self._unknowns(), self.context.covariance_terms(self.solved, components)
         terms.values.insert(unknowns.values)
         block = unknowns.block(self.solved.landmarks, self.shown, self.solved.noise)
@@ -274,13 +271,9 @@ def solve_with_camera(
 ) -> tuple[Solution, CameraEstimates]:
     """Solve for poses, points and the parts of a camera that were taken, in one graph.
 
-    The last round, of the tightest gate, is of poses and points alone.
-
-    Args:
-        shown: keypoints as pictures show them.
-        cameras: to start from; what it leaves out (a readout, axes, raw lenses) is left out.
-        timestamps: (F,) seconds.
-        start, context, gates, final: see `adjustment.adjust`.
+    The last round, of the tightest gate, is of poses and points alone. The keypoints are as
+    pictures show them, timestamps (F,) in seconds; what the cameras leave out (a readout, axes, raw
+    lenses) is left out. For start, context, gates and final see `adjustment.adjust`.
     """
     wide, last = _split(gates)
     view = CameraView.of(shown, cameras, timestamps)
@@ -301,14 +294,8 @@ def solve_sighted_with_camera(
     context: AdjustmentContext,
     gates: Sequence[float],
 ) -> tuple[Solution, Keypoints, CameraEstimates]:
-    """As `solve_with_camera`, of aligned and former observations, as `adjust_sighted` takes them.
-
-    Args:
-        sighted: observations as pictures show them.
-
-    Returns:
-        The solution, the keypoints with the noise that they turned out to have, and the camera.
-    """
+    """As `solve_with_camera`, of aligned and former observations as pictures show them, as
+    `adjust_sighted` takes them; and the keypoints with the noise that they turned out to have."""
     wide, last = _split(gates)
     view = CameraView.of(sighted.keypoints, cameras, timestamps)
 

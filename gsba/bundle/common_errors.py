@@ -19,14 +19,9 @@ def added(
     world_T_rigs: np.ndarray,
     components: np.ndarray | None = None,
 ) -> tuple[np.ndarray, JointErrors]:
-    """Covariances with the errors in common, in the same gauge.
-
-    Args:
-        covariances: (F, 6, 6) of poses, [rotation rad, translation], rig frames; NaN = none.
-        world_T_rigs: (F, 4, 4).
-        components: (F,) map of each frame, in which the first pose and its distance to the
-            furthest position are held; None = there is one.
-    """
+    """Covariances (F, 6, 6) of poses, [rotation rad, translation], rig frames, NaN = none, with the
+    errors in common, in the same gauge: in each map of components (F,), None = there is one, the
+    first pose and its distance to the furthest position are held."""
     groups = np.zeros(len(world_T_rigs), int) if components is None else components
     known, num = np.isfinite(joint.draws).all(axis=(0, 2)), len(joint.draws)
     parts = [np.flatnonzero(known & (groups == group)) for group in np.unique(groups)]

@@ -34,11 +34,8 @@ class PointObservations:
 
     @classmethod
     def of(cls, landmarks: Landmarks, keypoints: Keypoints, noise: float) -> "PointObservations":
-        """Observations of landmarks.
-
-        Args:
-            noise: of an observation, in units of its keypoint's own sigma.
-        """
+        """Observations of landmarks; noise: of an observation, in units of its keypoint's own
+        sigma."""
         tracks, rows = landmarks.tracks, keypoints.rows(landmarks.tracks)
         infos = keypoints.sqrt_infos
         return cls(
@@ -178,11 +175,8 @@ class Families:
     def landmark_terms(
         self, landmarks: Landmarks, keypoints: Keypoints, noise: float
     ) -> list[Term]:
-        """Residuals of points by all families that observe them.
-
-        Args:
-            noise: of the observations, in units of the keypoints' own sigmas.
-        """
+        """Residuals of points by all families that observe them; noise: of the observations, in
+        units of the keypoints' own sigmas."""
         observing = self.observing_points.members
         share = noise * np.sqrt(len(observing))
         observed = PointObservations.of(landmarks, keypoints, share)
@@ -193,11 +187,8 @@ class Families:
         return [(family.name, family.digest) for family in self.members]
 
     def snapshot(self, solved: Solution, maps: np.ndarray | None = None) -> MapSnapshot:
-        """The snapshot of a solution that families build their factors from.
-
-        Args:
-            maps: (F,) map of each frame; None = there is one.
-        """
+        """The snapshot of a solution that families build their factors from; maps: (F,) map of each
+        frame, None = there is one."""
         of_frames = numbered(maps, len(solved.world_T_rigs))
         variables = restored(solved.variables)
         given = self.names, self.timestamps, solved.world_T_rigs, of_frames
@@ -210,14 +201,12 @@ class Families:
         return self.with_members(family for family in fitted if family is not None)
 
     def terms(self, solved: Solution, maps: np.ndarray | None = None) -> FamilyTerms:
-        """Factors, blocks and variables of all families, for an adjustment from a solution.
-
-        Args:
-            maps: (F,) map of each frame; None = there is one.
+        """Factors, blocks and variables of all families, for an adjustment from a solution; maps:
+        (F,) map of each frame, None = there is one.
 
         Raises:
             GsbaError: a factor on a variable that has no value, or a variable that two families
-                have, or whose key is not a family's.
+            have, or whose key is not a family's.
         """
         snapshot = self.snapshot(solved, maps)
         held = any(family.holds_gauge(snapshot) for family in self.members)

@@ -111,13 +111,11 @@ class FrameFixes:
         return np.exp(-np.diff(self.times) / self.correlation_s)
 
     def whitened(self, columns: np.ndarray) -> np.ndarray:
-        """Columns of a linear model of the positions, in units of independent errors.
+        """Columns (G, 3, ...) of a linear model of the positions, metres, residuals or Jacobians by
+        anything, in units of independent errors.
 
-        The innovations of a Kalman filter of the errors: their sum of squares is that of
-        `columns` weighted with the inverse covariance of all fixes (Kailath, IEEE TAC 13, 1968).
-
-        Args:
-            columns: (G, 3, ...) metres, residuals or Jacobians by anything.
+        The innovations of a Kalman filter of the errors: their sum of squares is that of `columns`
+        weighted with the inverse covariance of all fixes (Kailath, IEEE TAC 13, 1968).
         """
         scaled = columns / self.sigmas.reshape(*self.sigmas.shape, *[1] * (columns.ndim - 2))
         correlations = np.concatenate([[0.0], self.correlations()])
@@ -185,17 +183,11 @@ def anchor(
     fixes: FrameFixes,
     maps: np.ndarray | None = None,
 ) -> Anchors | None:
-    """Fixes carried into the world of these poses, each map by a similarity of its own.
+    """Fixes carried into the world of poses (F, 4, 4), each map by a similarity of its own; None
+    where no map has enough fixes of which most lie as its frames do.
 
     Fixes outside of the gate are left out, see `FrameFixes.inliers`; the scale of the loss is as
-    wide as the gate.
-
-    Args:
-        world_T_rigs: (F, 4, 4) poses so far.
-        maps: (F,) map of each frame; None = there is one.
-
-    Returns:
-        None where no map has enough fixes of which most lie as its frames do.
+    wide as the gate. maps: (F,) map of each frame; None = there is one.
     """
     positions, of_fix = world_T_rigs[fixes.frames, :3, 3], np.zeros(len(fixes), np.int64)
     if maps is not None:
@@ -411,16 +403,9 @@ def linear_factors(
     *,
     free_similarity: bool = True,
 ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-    """Factors of fixes for covariances: lasting errors are variables, too.
-
-    Args:
-        world_T_rigs: (F, 4, 4) where factors are linearized.
-        free_similarity: whether the map's similarity is a variable, as it must be where the first
-            pose is held.
-
-    Returns:
-        Linear factors, weighted as the loss weighs them there, and the variables beside the poses.
-    """
+    """Linear factors of fixes for covariances, and the variables beside the poses: lasting errors,
+    and the map's similarity, as it must be free where the first pose is held. They are linearized
+    at poses (F, 4, 4) and weighted as the loss weighs them there."""
     graph, weights = gtsam.NonlinearFactorGraph(), anchors.weights(world_T_rigs)
     own = gtsam.Values()
     for a in range(len(anchors.frames)):

@@ -92,11 +92,7 @@ def loosened(
     context: AdjustmentContext,
 ) -> LensAxes:
     """Axes of each frame's own, the rig's yet, if turning them by some points predicts others.
-
-    Args:
-        keypoints: of these, as rays of the lenses so far.
-        so_far: two lenses whose axes are the rig's.
-    """
+    Keypoints are rays of the two lenses so far."""
     used = drawn(landmarks, shared_parameters.MAX_OBSERVATIONS, context.settings.seed)
     counts = sample_counts(landmarks, used)
     frames, num = keypoints.frames(), len(solved.world_T_rigs)

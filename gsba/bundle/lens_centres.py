@@ -74,12 +74,8 @@ def estimate(
     so_far: Lenses,
     context: AdjustmentContext,
 ) -> LensCentres:
-    """Find the lenses' centres from a map, poses and points adjusted with them.
-
-    Args:
-        keypoints: of these, as rays under the lenses so far.
-        so_far: centres that the rays start at; `band_rad` is kept.
-    """
+    """Find the lenses' centres from a map, poses and points adjusted with them. Keypoints are rays
+    under the lenses so far, whose `band_rad` is kept."""
     chosen = context.settings.camera
     frames = keypoints.frames()
 
@@ -141,14 +137,12 @@ def stitched_for(
     so_far: Lenses,
     context: AdjustmentContext,
 ) -> StitchRadius:
-    """Find the radius that panoramas are stitched for, centres, poses and points adjusted with it.
+    """Find the radius that panoramas are stitched for, centres, poses and points adjusted with it;
+    shown: (N, 3) directions of the keypoints in their pictures, which are rays of the lenses so
+    far.
 
     Where settings say it, that is it. Around lenses that were solved for without a radius it is a
     first estimate: their distance is wrong where there is one.
-
-    Args:
-        keypoints: of these, as rays of the lenses so far.
-        shown: (N, 3) directions of the keypoints in their pictures.
     """
     said = context.settings.camera.inverse_stitch_radius(so_far.baseline / 2)
     if said is not None:

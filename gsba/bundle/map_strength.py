@@ -49,16 +49,13 @@ def measure(
     """Judge a solution by the joint covariance of its poses under negligible priors.
 
     Args:
-        world_T_rigs: (F, 4, 4).
-        errors: covariances (F, 6, 6) [rotation rad, translation], rig frames, and what errors of
-            poses have in common.
-        coarse_world_T_rigs: (F, 4, 4) the trajectory.
-        seen: (F - 1,) bool, steps that images show.
-        believed: (F - 1,) bool, steps of the trajectory that they do not contradict.
-        settings: weak_frames: limits, and how far around a weak place frames count as near; priors:
-            noise of the trajectory's steps, as far as the images do not know it.
-        components: (F,) map of each frame, from 0; None = there is one.
-        recordings: (F,) recording of each frame, from 0; None = there is one.
+        world_T_rigs, coarse_world_T_rigs: (F, 4, 4) poses, and those of the trajectory.
+        errors: covariances (F, 6, 6) [rotation rad, translation], rig frames, and what errors
+            of poses have in common.
+        seen, believed: (F - 1,) bool, steps that images show, and those of the trajectory that
+            they do not contradict.
+        components, recordings: (F,) map and recording of each frame, from 0; None = there is
+            one.
     """
     covariances, joint = errors
     num, weak_frames, priors = len(world_T_rigs), settings.weak_frames, settings.priors

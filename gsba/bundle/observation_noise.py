@@ -235,11 +235,8 @@ def _residuals(
 def with_scaled_noise(
     keypoints: Keypoints, factors: np.ndarray, folder: Path | None = None
 ) -> Keypoints:
-    """As `Keypoints.scaled_noise` by factors (N,), of keypoints that may be very many.
-
-    Args:
-        folder: on the disk that takes the noise; None = it is in memory.
-    """
+    """As `Keypoints.scaled_noise` by factors (N,), of keypoints that may be very many: a folder on
+    the disk takes the noise; None = it is in memory."""
     if folder is None:
         return keypoints.scaled_noise(factors)
     infos = keypoints.sqrt_infos

@@ -124,17 +124,15 @@ def optimize(
     settings: SolverSettings | None = None,
     callback: Callable[[Iteration, gtsam.Values], None] | None = None,
 ) -> OptimizeResult:
-    """Minimize the cost of a graph and of blocks over all variables they name.
+    """Minimize the cost of a graph and of blocks over all variables they name, from `values`; those
+    that nothing constrains stay as they are. The blocks then hold the landmarks that belong to the
+    result.
 
     Args:
         graph: native or user factors, on variables of any type.
-        values: start; variables that nothing constrains stay as they are.
         blocks: batched factors on Pose3 variables; their landmarks move along.
         settings: tolerances and damping; None = the defaults.
         callback: called with each attempt and the best values so far.
-
-    Returns:
-        The best values met. The blocks hold the landmarks that belong to them.
 
     Raises:
         GsbaError: the cost at the start is not finite.
@@ -217,17 +215,14 @@ def marginal_covariances(
     seed: int = 0,
     beside: Sequence[int] = (),
 ) -> tuple[np.ndarray, JointErrors]:
-    """Marginal covariances of Pose3 variables, and what their errors have in common.
-
-    Args:
-        graph, blocks: what constrains them, linearized at `values`.
-        keys: (F,) keys of Pose3 variables, in the order of the path.
-        num_draws: errors drawn of all poses at once.
-        beside: (B,) keys of other variables, of at most six dimensions: their covariances follow.
+    """Marginal covariances of Pose3 variables, keys (F,) in the order of the path, and of others
+    beside them (B,), of at most six dimensions; and what errors of poses have in common, by
+    num_draws errors drawn of all at once.
 
     Returns:
-        (F + B, 6, 6) float64, [rotation rad, translation], rig frame, and joint errors. NaN for one
-        that nothing constrains, and for all where the rest is singular (the gauge is not fixed).
+        (F + B, 6, 6) float64, [rotation rad, translation], rig frame, and joint errors. NaN for
+        one that nothing constrains, and for all where the rest is singular (the gauge is not
+        fixed).
     """
     num = len(keys)
     for block in blocks:

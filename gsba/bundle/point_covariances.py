@@ -29,15 +29,12 @@ def point_covariances(result: Reconstruction) -> np.ndarray:
 
 
 def depth_variances(result: Reconstruction, axes: np.ndarray) -> np.ndarray:
-    """Variances (O,) of the depths of observed points from their frames, map units^2.
+    """Variances (O,) of the depths of observed points from their frames, map units^2, along axes
+    (O, 3) float64, unit, world; without joint errors, the result's poses count as given.
 
     Poses in error move all points that they see: the depth of a point errs by how far its own shift
     differs from that of the frame. An error in the scale of all poses and points is no error here.
     Errors of one point's observations are not independent, see `_error_ratios`.
-
-    Args:
-        result: with the poses' joint errors; without them, poses count as given.
-        axes: (O, 3) float64, unit, world: direction in which each depth is measured.
     """
     covariances, poses = point_covariances(result), result.world_T_rigs
     turns, moves, scales = _pose_errors(result)

@@ -72,16 +72,14 @@ def step_motion(
     covariances: np.ndarray,
     joint: JointErrors,
 ) -> float:
-    """Motion of the steps from frame to frame in their own standard deviations, rms.
+    """Motion of the steps from frame to frame in their own standard deviations, rms: sqrt(mean(d^T
+    C^-1 d) / 6) over all steps of known covariance C; NaN where there is none.
 
     Args:
-        before_T_rigs: (F, 4, 4) poses before the round, in a world of any scale.
-        world_T_rigs: (F, 4, 4) poses after it.
-        covariances: (F, 6, 6) of these [rotation rad, translation], rig frames; NaN = not known.
-        joint: what errors of neighbours have in common.
-
-    Returns:
-        sqrt(mean(d^T C^-1 d) / 6) over all steps of known covariance C; NaN where there is none.
+        before_T_rigs, world_T_rigs: (F, 4, 4) poses before the round, in a world of any scale,
+            and after it.
+        covariances: (F, 6, 6) of these [rotation rad, translation], rig frames; NaN = not
+            known.
     """
     steps, former = _steps(world_T_rigs), _steps(before_T_rigs)
     length, was = (np.linalg.norm(some[:, :3, 3], axis=1).sum() for some in (steps, former))

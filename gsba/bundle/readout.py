@@ -113,11 +113,8 @@ def estimate(
 
 
 def total_sigma(found: CameraEstimate, sigma: float) -> float:
-    """Standard deviation of the duration, seconds, with that of the scale of rows.
-
-    Args:
-        sigma: by the covariance of the adjustment, in which rows are known exactly.
-    """
+    """Standard deviation of the duration, seconds, by the covariance of the adjustment, in which
+    rows are known exactly, and with that of the scale of rows."""
     scale_sigma = 0.0 if found.lenses.reference_calibration is not None else _ROW_SCALE_SIGMA
     return float(np.hypot(sigma, scale_sigma * found.readout_s))
 
@@ -153,17 +150,12 @@ def velocities(
     turning: GyroConstraints | None = None,
     maps: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Mean velocity (F, 6) around each frame, [rotation rad/s, translation per s], rig frame.
+    """Mean velocity (F, 6) around each frame, [rotation rad/s, translation per s], rig frame, of
+    poses (F, 4, 4) at ascending timestamps (F,), seconds, in maps (F,), None = there is one.
 
     Between frames a walk turns to and fro: rotations say nothing of those during a readout, which
-    are 0 where no gyro knows them. Nothing is known of motion across a pause, such as that from
-    one recording to the next, nor from one map to another, whose worlds nothing relates.
-
-    Args:
-        world_T_rigs: (F, 4, 4) poses.
-        timestamps: (F,) seconds, ascending.
-        turning: rotation rates by a gyro; None = there is none.
-        maps: (F,) map of each frame; None = there is one.
+    are 0 where no gyro knows them. Nothing is known of motion across a pause, such as that from one
+    recording to the next, nor from one map to another, whose worlds nothing relates.
     """
     num = len(timestamps)
     before, after = np.arange(num) - 1, np.arange(num) + 1
@@ -257,11 +249,8 @@ class CameraEstimates:
 
 
 def tracks_of_camera(tracks: Tracks, of_frame: Sequence[int], camera: int) -> Tracks:
-    """Tracks of what one camera observes: points that it sees twice or more.
-
-    Args:
-        of_frame: (F,) camera of each frame; () = there is one.
-    """
+    """Tracks of what one camera observes: points that it sees twice or more; of_frame: (F,) camera
+    of each frame, () = there is one."""
     if not of_frame:
         return tracks
     own = np.array(of_frame)[tracks.frames] == camera

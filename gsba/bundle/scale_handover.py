@@ -19,13 +19,8 @@ _SIGMAS = 2.0  # standard errors of the median that count as uncertainty
 
 def scale_changes(result: Reconstruction, recordings: np.ndarray) -> np.ndarray:
     """Largest relative change (F - 1,) of scale that may hide at each step: the median difference
-    of distances by both sides, and two standard errors of it by their scatter.
-
-    inf = too few points are seen by both sides; NaN = a side has one frame.
-
-    Args:
-        recordings: (F,) number of each frame's recording.
-    """
+    of distances by both sides, and two standard errors of it by their scatter. inf = too few points
+    are seen by both sides; NaN = a side has one frame, of recordings (F,)."""
     found = np.full(max(len(result.world_T_rigs) - 1, 0), np.nan)
     observed = result.observations_by_frame()
     for step, first, end in _sides(result.world_T_rigs[:, :3, 3], recordings):

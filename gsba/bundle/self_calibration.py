@@ -177,17 +177,7 @@ def by_lenses(
     lenses: Lenses,
     residuals: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Jacobian (O, 2, K) of residuals of bearings by the parameters of lenses.
-
-    Noise is of pixels: it is an angle that shrinks where a focal length grows, and least squares of
-    angles would prefer long ones. Taken where points are predicted, not where they were observed,
-    the Jacobian is free of that noise, and so is what it finds.
-
-    Args:
-        bearings_rig: (O, 3) of the rays.
-        shown: (O, 3) directions in the panoramas.
-        residuals: (O, 2) of the bearings, from observed to predicted; None = taken as 0.
-    """
+    """Jacobian (O, 2, K + 3 (L - 1)) of bearings' residuals by a step of lenses and centres."""
     out = np.zeros((len(shown), 2, num_parameters(lenses.num_lenses)))
     basis, there = -tangent_basis(bearings_rig), lenses.calibrated(shown)
     if residuals is not None:

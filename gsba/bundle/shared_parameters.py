@@ -142,13 +142,8 @@ def models_of(
     by_shared: BySharedParameters,
     most: int = MAX_OBSERVATIONS,
 ) -> tuple[list[SharedModel], Counts]:
-    """Models of the cost of each part of the sequence, by at most so many observations.
-
-    Args: see `model_of`.
-
-    Returns:
-        (PARTS) models, none where there is too little; and how many observations they rest on.
-    """
+    """Models of the cost of each part of the sequence, see `model_of`, by at most so many
+    observations, none where there is too little; and how many observations they rest on."""
     used = drawn(landmarks, most, context.settings.seed)
     alone = replace(context, num_threads=1)  # parts run side by side
 
@@ -217,11 +212,8 @@ def without_points(
     by_frame: np.ndarray,
     by_shared: np.ndarray | None = None,
 ) -> LinearSystem:
-    """Normal equations of bearings with the points eliminated.
-
-    Args:
-        by_frame: Jacobian (O, 2, K) of residuals by K variables of their frames.
-        by_shared: Jacobian (O, 2, S) by variables of all frames; None = there are none.
+    """Normal equations of bearings with the points eliminated, by Jacobians (O, 2, K) of residuals
+    by K variables of their frames, and (O, 2, S) by variables of all frames; None = there are none.
     """
     residuals = np.einsum("oij,oj->oi", seen.roots, seen.residuals)
     shared = np.zeros((len(residuals), 2, 0)) if by_shared is None else seen.roots @ by_shared
@@ -234,13 +226,8 @@ def without_points(
 def by_origin(
     seen: Weighted, world_R_rigs: np.ndarray, bearings_rig: np.ndarray, inverse_stitch_radius: float
 ) -> np.ndarray:
-    """Jacobian (O, 2, 3) of residuals by the origin of rays, rig frame, and by their direction.
-
-    Args:
-        world_R_rigs: (O, 3, 3) of their poses.
-        bearings_rig: (O, 3) of their rays.
-        inverse_stitch_radius: see `Lenses`.
-    """
+    """Jacobian (O, 2, 3) of residuals by the origin of rays, rig frame, and by their direction, of
+    rays (O, 3) of poses turned by (O, 3, 3); for inverse_stitch_radius see `Lenses`."""
     return -seen.by_point @ world_R_rigs + inverse_stitch_radius * tangent_basis(bearings_rig)
 
 
@@ -269,13 +256,8 @@ def cross_validate(
     candidate: Callable[[list[P]], np.ndarray],
     baseline: Callable[[list[P]], np.ndarray] | None = None,
 ) -> Verdict:
-    """Predict each part of a sequence by the others.
-
-    Args:
-        candidate: parameters that some parts give.
-        baseline: the same by the simpler model that the candidate is compared with; None = all
-            parameters are zero.
-    """
+    """Predict each part of a sequence by the others: by the parameters of a candidate, and by those
+    of a simpler baseline; None = all parameters are zero."""
     gains, costs = np.zeros(len(parts)), np.array([part.cost for part in parts])
     for p, part in enumerate(parts):
         others = [*parts[:p], *parts[p + 1 :]]
@@ -322,13 +304,9 @@ def frame_models(
     context: AdjustmentContext,
     by_parameters: Callable[[Weighted], np.ndarray],
 ) -> list[FrameModel]:
-    """Models of the robust cost of parts of some points, at a solution's poses.
-
-    Args:
-        landmarks: points, moved to their best first, and their observations.
-        keypoints: where these really point.
-        by_parameters: Jacobian (O, 2, K) of residuals by parameters of their frames.
-    """
+    """Models of the robust cost of parts of some points, moved to their best first, at a solution's
+    poses; keypoints: where these really point; by_parameters: Jacobian (O, 2, K) of residuals by
+    parameters of their frames."""
     drawn = np.random.default_rng(context.settings.seed).permutation(landmarks.tracks.num_points)
 
     def model(part: int) -> FrameModel:
@@ -343,11 +321,8 @@ def frame_models(
 
 
 def _frame_step(models: Sequence[FrameModel], sigmas: np.ndarray) -> np.ndarray:
-    """Change of poses and parameters (F * (6 + K),) by all points of the models.
-
-    Args:
-        sigmas: (K,) how strongly the parameters are drawn to what they are; 0 = they stay.
-    """
+    """Change of poses and parameters (F * (6 + K),) by all points of the models; sigmas: (K,) how
+    strongly the parameters are drawn to what they are; 0 = they stay."""
     systems = [model.system for model in models]
     gradient = np.sum([system.gradient for system in systems], axis=0)
     hessian = sum(system.hessian for system in systems[1:]) + systems[0].hessian

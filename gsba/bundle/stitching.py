@@ -65,11 +65,8 @@ def corrected(keypoints: Keypoints, field: SphereField, rig: CubeRig) -> Keypoin
 def with_noise_of(
     keypoints: Keypoints, calibrated: Keypoints, scratch: Path | None = None
 ) -> Keypoints:
-    """Keypoints whose noise is scaled as in others of the same rows, where they were corrected.
-
-    Args:
-        scratch: folder on the disk that takes the noise of many; None = it is in memory.
-    """
+    """Keypoints whose noise is scaled as in others of the same rows, where they were corrected; a
+    folder on the disk takes the noise of many, None = it is in memory."""
     factors = calibrated.sigmas_rad / keypoints.sigmas_rad
     scaled = with_scaled_noise(keypoints, factors, scratch)
     return replace(scaled, sigmas_rad=calibrated.sigmas_rad)  # to the byte
@@ -84,15 +81,12 @@ def estimate(
     lenses: Cameras = ONE_CAMERA,
 ) -> Stitching:
     """Find the field, by cross-validation over parts of the sequence, and solve the map with it.
+    `sighted` and the keypoints are as observed, the latter with the noise they turned out to have.
 
     Points are shared out among parts of the sequence by their mean frame. A part's cost is a
-    quadratic function of the field once its points and poses are eliminated; sums of those of
-    the other parts give fields of every degree and smoothness, and the part itself says what they
-    are worth. The field is taken where every part gains, and all together enough.
-
-    Args:
-        sighted: candidate tracks and their keypoints, as observed.
-        keypoints: the same with the noise they turned out to have.
+    quadratic function of the field once its points and poses are eliminated; sums of those of the
+    other parts give fields of every degree and smoothness, and the part itself says what they are
+    worth. The field is taken where every part gains, and all together enough.
     """
     settings = context.settings
     chosen = settings.stitching

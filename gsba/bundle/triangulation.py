@@ -192,8 +192,7 @@ def triangulate(
     midpoint, then Gauss-Newton on tangent-plane residuals).
 
     Args:
-        bearings_rig: (O, 3) bearings of the observations.
-        sigmas_rad: (O,) their noise.
+        bearings_rig, sigmas_rad: (O, 3) bearings of the observations, and (O,) their noise.
         world_T_rigs: (F, 4, 4) current poses.
         max_error_sigmas: gate on the angle between observation and point, in sigmas.
         origins_rig: (O, 3) rig frame, where each ray starts; None = the rig's centre.
@@ -241,12 +240,8 @@ def place(
     num_threads: int = 1,
     scratch: Path | None = None,
 ) -> Landmarks:
-    """As `triangulate`, the observations being the tracks' own keypoints; some tracks at a time.
-
-    Args:
-        scratch: folder on the disk that takes the points of very many tracks; None = they are in
-            memory.
-    """
+    """As `triangulate`, the observations being the tracks' own keypoints; some tracks at a time. A
+    folder on the disk takes the points of very many tracks; None = they are in memory."""
     counts = [_NONE]
 
     def placed(_: slice, __: slice, some: Tracks) -> Landmarks:

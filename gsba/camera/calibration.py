@@ -80,13 +80,8 @@ def read_calibration(path: Path) -> Rig:
 def calibration_json(
     rig: Rig, centre: np.ndarray, unit: str, more: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """The content of a calibration file.
-
-    Args:
-        rig: lenses, the front one first.
-        centre: (3 (L - 1),) centres of all but the last one, see `gsba.camera.lens.Lenses`.
-        unit: unit of `centre`, "m" or "map".
-    """
+    """The content of a calibration file of a rig, the front lens first; centre: (3 (L - 1),) of all
+    but the last one, see `gsba.camera.lens.Lenses`, in a unit, "m" or "map"."""
     return {
         "model": _MODEL,
         "unit": unit,

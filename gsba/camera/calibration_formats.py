@@ -33,14 +33,9 @@ def lens_of(
     radial: Sequence[Any],
     rig_T_lens: np.ndarray | None = None,
 ) -> Fisheye:
-    """A lens built from the numbers of a file.
-
-    Args:
-        size: width and height, pixels.
-        focal: pixels per radian.
-        principal: pixels, corner origin.
-        radial: up to four, of the odd powers from the third on.
-        rig_T_lens: (4, 4), metres; None = it is the rig.
+    """A lens built from the numbers of a file: size, focal length in pixels per radian, principal
+    point in pixels, corner origin, up to four radial terms, of the odd powers from the third on,
+    and its pose (4, 4), metres; None = it is the rig.
 
     Raises:
         ValueError: the values are no numbers, or no lens has them.
@@ -82,12 +77,8 @@ def metres_of(unit: Any) -> float:
 
 
 def fields_of(tree: Any, names: Sequence[str], where: str) -> list[Any]:
-    """Values of fields of a file.
-
-    Args:
-        tree: a group of fields, as JSON or YAML gives it.
-        names: of the fields.
-        where: name of the group in the file, for messages.
+    """Values of named fields of a group, as JSON or YAML gives it; where: the group's name in the
+    file.
 
     Raises:
         ValueError: this is no group of fields, or one is missing; the message names it.
@@ -301,11 +292,8 @@ def _fit_to_omni(
 
 
 def of_projection(lens: RadialProjection, rig_T_lens: np.ndarray, where: str) -> Fisheye:
-    """Our lens model fitted to a lens of another projection.
-
-    Args:
-        rig_T_lens: (4, 4), metres.
-        where: file and projection, for error messages.
+    """Our lens model fitted to a lens of another projection at rig_T_lens (4, 4), metres; where:
+    file and projection, for error messages.
 
     Raises:
         GsbaError: the projection is not close to any lens of our model.

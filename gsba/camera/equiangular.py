@@ -52,15 +52,8 @@ def overlap_of(width: int, height: int) -> int:
 
 
 def square_pixels(directions: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels of directions in upright equi-angular squares of `size` pixels.
-
-    Args:
-        directions: (..., 3) float64, any length, rig frame.
-        size: pixels across a square.
-
-    Returns:
-        (...) uint8, indices into FACES; (..., 2) float64 pixels, corner origin.
-    """
+    """Pixels of directions (..., 3), rig frame, of any length, in upright equi-angular squares of
+    `size` pixels: (...) uint8, indices into FACES, and (..., 2) float64 pixels, corner origin."""
     magnitudes = np.abs(directions)
     axis = np.argmax(magnitudes, axis=-1)[..., None]
     along = np.take_along_axis(directions, axis, axis=-1)
@@ -95,14 +88,9 @@ def taps(directions: np.ndarray, width: int, height: int) -> Taps:
 
 
 def squares(tracks: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Upright equi-angular squares (6, S, S[, C]) uint8, FACES order, of two tracks.
-
-    The columns recorded twice are blended, each lens's weight falling linearly to nothing where
-    its picture ends; no pixel is resampled.
-
-    Args:
-        tracks: (S, width[, C]) uint8 each, see `is_equiangular`.
-    """
+    """Upright equi-angular squares (6, S, S[, C]) uint8, FACES order, of two tracks (S, width[,
+    C]), see `is_equiangular`. The columns recorded twice are blended, each lens's weight falling
+    linearly to nothing where its picture ends; no pixel is resampled."""
     height, width = tracks[0].shape[:2]
     overlap, out = overlap_of(width, height), []
     starts = 0, height + overlap, 2 * height + overlap

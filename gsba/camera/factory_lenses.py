@@ -100,13 +100,8 @@ class FactoryLenses:
         return float(_ROTATION_SIGMA_RAD)
 
     def pairs(self, size: tuple[int, int]) -> list[Pair]:
-        """Lenses for pictures of a size that show the window or, less likely, all of the sensor.
-
-        Pictures of another aspect ratio show the middle of it.
-
-        Args:
-            size: width and height, pixels.
-        """
+        """Lenses for pictures of a size (width, height) that show the window or, less likely, all
+        of the sensor; pictures of another aspect ratio show the middle of it."""
         whole = (0.0, 0.0, float(self.canvas[0]), float(self.canvas[1]))
         windows = dict.fromkeys([whole if self.window is None else self.window, whole])
         return [self._pair(size, *window) for window in windows]

@@ -86,15 +86,8 @@ def splat_block(
     backend: Backend,
     loss: RobustLoss | None = None,
 ) -> SplatBlock:
-    """The block of captured frames against a fixed splat.
-
-    Args:
-        gaussians: the splat, in the world of the poses.
-        captured: frames; keys are graph.X(frame). Coarse to fine is one block after another.
-        near: least z of a Gaussian, map units.
-        backend: the renderer.
-        loss: see `factors.splat.SplatBlock`.
-    """
+    """The block of captured frames, keys X(frame), against a fixed splat in the world of the poses;
+    near: least z of a Gaussian, map units. Coarse to fine is one block after another."""
     views, turns = captured.views, captured.turns
     rotations, centres = (
         np.stack([v.rig_R_view for v in views]),

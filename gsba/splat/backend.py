@@ -94,15 +94,8 @@ class CpuBackend:
 
 
 def choose_backend(name: str, num_threads: int | None = None) -> Backend:
-    """The renderer with a name.
-
-    Args:
-        name: "cpu", "gsplat", or "auto": gsplat if it and a CUDA device are available.
-        num_threads: of the CPU renderer; None = all cores.
-
-    Raises:
-        GsbaError: gsplat is requested and cannot be used.
-    """
+    """The renderer "cpu", "gsplat", or "auto": gsplat if it and a CUDA device are available;
+    num_threads: of the CPU, None = all cores. GsbaError: gsplat is requested and cannot be used."""
     if name == "cpu":
         return CpuBackend(num_threads)
     from gsba.splat.gpu import GsplatBackend

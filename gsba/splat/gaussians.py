@@ -73,17 +73,11 @@ def from_cloud(
     opacity: float = 0.1,
     neighbours: int = 3,
 ) -> Gaussians:
-    """Round Gaussians at the points of a cloud, as wide as the distance to their neighbours.
+    """Round Gaussians at the points (N, 3) of a cloud, map units, with RGB colours (N, 3) uint8, as
+    wide as the distance to their neighbours; harmonics but the constant one start at zero.
 
-    The start of Kerbl et al., 3D Gaussian Splatting, 2023: the standard deviation is the root
-    mean square distance to the three nearest points, limited to a tenth of the cloud's extent.
-
-    Args:
-        points_world: (N, 3) float, map units.
-        colors: (N, 3) uint8, RGB.
-        sh_degree: highest degree of harmonics, 0 to 3; all but the constant one start at zero.
-        opacity: of every Gaussian, 0..1.
-        neighbours: nearest points that determine a width.
+    The start of Kerbl et al., 3D Gaussian Splatting, 2023: the standard deviation is the root mean
+    square distance to the three nearest points, limited to a tenth of the cloud's extent.
 
     Raises:
         GsbaError: the cloud has no points, or points that are not finite.
