@@ -177,7 +177,13 @@ def by_lenses(
     lenses: Lenses,
     residuals: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Jacobian (O, 2, K + 3 (L - 1)) of bearings' residuals by a step of lenses and centres."""
+    """Jacobian (O, 2, K) of residuals (O, 2) of bearings (O, 3), from observed to predicted, None =
+    0, by the parameters of lenses; shown: (O, 3) directions in the panoramas.
+
+    Noise is of pixels: it is an angle that shrinks where a focal length grows, and least squares of
+    angles would prefer long ones. Taken where points are predicted, not where they were observed,
+    the Jacobian is free of that noise, and so is what it finds.
+    """
     out = np.zeros((len(shown), 2, num_parameters(lenses.num_lenses)))
     basis, there = -tangent_basis(bearings_rig), lenses.calibrated(shown)
     if residuals is not None:

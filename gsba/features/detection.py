@@ -100,12 +100,8 @@ class SiftExtractor:
 def extract(
     faces_rgb: np.ndarray, masks: np.ndarray | None, rig: CubeRig, extractor: Extractor
 ) -> Features:
-    """Find keypoints on all faces of a frame; each stays only in the face that owns its bearing.
-
-    Args:
-        faces_rgb: (6, N, N, 3) uint8 in FACES order.
-        masks: (6, N, N) bool, True = use, or None.
-    """
+    """Find keypoints on all faces (6, N, N, 3) uint8 of a frame, FACES order, where masks (6, N, N)
+    are True; each stays only in the face that owns its bearing."""
     wanted = _owned_pixels(rig) if masks is None else _owned_pixels(rig) & masks
     usable = [face for face in range(len(FACES)) if wanted[face].any()]
     parts, scores = [], []

@@ -49,14 +49,9 @@ def align(
     readings: Readings,
     former: Alignment | None = None,
 ) -> Alignment:
-    """Estimate clock, bias, scales and axes of a gyro from rotations by images.
-
-    Args:
-        timestamps: (F,) times of frames, seconds.
-        f_R_nexts: (F - 1, 3, 3) rotations between consecutive frames, by images.
-        known: (F - 1,) bool, True for known rotations.
-        former: the estimate from less accurate rotations; None = try all offsets.
-    """
+    """Estimate clock, bias, scales and axes of a gyro from rotations (F - 1, 3, 3) by images, some
+    of which are known, between consecutive frames at timestamps (F,), seconds; former: the estimate
+    from less accurate rotations, None = try all offsets."""
     turns = merged(timestamps, f_R_nexts, known)
     num_known = int(known.sum())
     dropped = {"rotation not known from images": len(f_R_nexts) - num_known}
@@ -274,15 +269,11 @@ def up_axis(
     readings: Readings, found: Alignment, timestamps: np.ndarray, world_R_rigs: np.ndarray
 ) -> np.ndarray | None:
     """Unit vector (3,) along the vertical in the world; None if forces do not determine it.
+    Timestamps (F,) of frames, seconds, are on their own clock.
 
-    Forces are rotated into the world by the pose of the frame before and the gyro since then, and
-    averaged over two steps each. Longer accelerations are outliers: the result is the geometric
-    median of the means.
-
-    Args:
-        found: alignment of the readings with the frames.
-        timestamps: (F,) times of frames, seconds, on their own clock.
-        world_R_rigs: (F, 3, 3) refined rotations.
+    Forces are rotated into the world by the refined rotation (F, 3, 3) of the frame before and the
+    gyro since then, and averaged over two steps each. Longer accelerations are outliers: the result
+    is the geometric median of the means.
     """
     if readings.forces is None:
         return None

@@ -89,15 +89,12 @@ def read_imu(path: Path) -> Readings:
 
 
 def read_telemetry(path: Path, lasting_s: float | None = None) -> Readings:
-    """Readings stored in a maker's recording.
-
-    Args:
-        lasting_s: duration of its pictures, seconds; readings timed from the first frame that begin
-            after it are of another recording. None = not known.
+    """Readings stored in a maker's recording; those timed from the first frame that begin after its
+    pictures' duration, seconds, are of another recording; None = not known.
 
     Raises:
         GsbaError: the file holds no usable readings, or `telemetry_parser` is needed and not
-            installed.
+        installed.
     """
     trailer = read_trailer(path)
     if trailer is None:

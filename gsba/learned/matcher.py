@@ -27,12 +27,8 @@ _UPRIGHT_FACES = [*product(range(4), range(4)), (4, 4), (5, 5)]
 
 
 def make_matcher(settings: RefineSettings, weights: Mapping[str, Path], size: int) -> Matcher:
-    """Matcher that settings choose: guided search, or a learned network.
-
-    Args:
-        settings: `matching.matcher` and `features.extractor`.
-        weights: files of learned networks (`find_weights`).
-        size: pixels of a face.
+    """Matcher that `matching.matcher` and `features.extractor` choose for faces of `size` pixels:
+    guided search, or a learned network with weights by `find_weights`.
 
     Raises:
         GsbaError: the weights are of another network, or a library is not installed.
@@ -108,14 +104,11 @@ def _on_face(features: Features, keypoints: np.ndarray) -> FaceKeypoints:
 def overlapping_faces(
     bearings0: np.ndarray, bearings1: np.ndarray, f0_T_f1: np.ndarray
 ) -> list[tuple[int, int]]:
-    """Pairs of overlapping faces, of frame 0 and frame 1.
+    """Pairs of overlapping faces of frames 0 and 1, whose keypoints are (n, 3) in either's rig
+    frame; f0_T_f1: (4, 4) predicted, its translation's length is unused.
 
     At least a twentieth of the keypoints of one must be on the other, for points at infinity or
     with a parallax of 10 degrees.
-
-    Args:
-        bearings0, bearings1: (n, 3) keypoints of both frames, each in its own rig frame.
-        f0_T_f1: (4, 4) predicted pose of frame 1 in frame 0; its translation's length is unused.
     """
     rotation, motion = f0_T_f1[:3, :3], f0_T_f1[:3, 3]
     onto1 = _shares(bearings0, bearings0 @ rotation, -motion @ rotation)

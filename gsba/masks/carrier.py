@@ -65,10 +65,7 @@ def no_carrier(frames: FrameSet, reason: str) -> Carrier:
 
 
 def find_carrier(frames: FrameSet) -> Carrier:
-    """Detect the carrier in panoramas of a moving camera.
-
-    Args:
-        frames: panoramas or raw pairs.
+    """Detect the carrier in panoramas or raw pairs of a moving camera.
 
     Raises:
         GsbaError: cube faces, too few frames, no texture, or too little motion.
@@ -103,13 +100,8 @@ def find_carrier(frames: FrameSet) -> Carrier:
 
 
 def find_fixed_carrier(pictures: np.ndarray) -> np.ndarray:
-    """Mask of the world in pictures, False at a carrier that keeps its direction.
-
-    Args:
-        pictures: (N, h, 2h, 3) uint8 RGB, `PICTURE_WIDTH` across, of a moving camera.
-
-    Returns:
-        (h, 2h) bool, True = use; all True if nothing stays in place.
+    """Mask (h, 2h) bool of the world in pictures (N, h, 2h, 3) uint8 RGB, `PICTURE_WIDTH` across,
+    of a moving camera: False at a carrier that keeps its direction.
 
     Raises:
         GsbaError: too few pictures, no texture, or too little motion.
@@ -163,14 +155,11 @@ def carrier_mask(carrier: Carrier, frames: FrameSet, frame: int) -> np.ndarray:
 def write_carrier(
     carrier: Carrier, frames: FrameSet, out: Path, merge: bool = True, name: str = "carrier"
 ) -> list[Path]:
-    """Write the carrier's mask, and a picture to check it.
+    """Write the carrier's mask, and a picture to check it; returns the files.
 
     `NAME.png` is the mask (white = use), `NAME_check.jpg` the median picture with the outline. If
     the frames have masks of their own, or the carrier turns, `merged/FRAME.png` combines the masks
     of each frame, unless `merge` is False.
-
-    Returns:
-        the written files.
     """
     written = [out / f"{name}.png", out / f"{name}_check.jpg"]
     write_image(written[0], carrier_mask(carrier, frames, 0).astype(np.uint8) * 255)

@@ -32,13 +32,8 @@ def certain_places(structure: FixedStructure) -> np.ndarray:
 def outline_carrier(
     pictures: np.ndarray, median: np.ndarray, structure: FixedStructure
 ) -> np.ndarray:
-    """The carrier's pixels, (h, 2h) bool; all False without a carrier.
-
-    Args:
-        pictures: (K, h, 2h, 3) uint8 panoramas in which the carrier does not move.
-        median: (h, 2h, 3) uint8, median of these pictures.
-        structure: fixed structure of these pictures, smaller.
-    """
+    """The carrier's pixels, (h, 2h) bool; all False without a carrier, in panoramas (K, h, 2h, 3)
+    uint8 in which it does not move, their median, and their fixed structure, smaller."""
     height, width = pictures.shape[1:3]
     nothing = np.zeros((height, width), bool)
     if not certain_places(structure).any():

@@ -31,12 +31,8 @@ class FixedStructure:
 
 
 def measure_fixed_structure(pictures: np.ndarray) -> FixedStructure:
-    """Correlate frames, direction by direction.
-
-    Args:
-        pictures: (K, h, 2h, 3) uint8 panoramas, some hundred pixels across: structure counts as
-            fixed up to about half a pixel.
-    """
+    """Correlate panoramas (K, h, 2h, 3) uint8, some hundred pixels across, direction by direction:
+    structure counts as fixed up to about half a pixel."""
     across, down = np.stack([_gradients(picture) for picture in pictures], axis=1)
     u, v = across.mean(axis=0), down.mean(axis=0)
     window = partial(cv2.GaussianBlur, ksize=_WINDOW_SIZE, sigmaX=_WINDOW_SIGMA_PX)
@@ -131,14 +127,8 @@ def band_of(picture: np.ndarray) -> np.ndarray:
 
 
 def find_turns(bands: np.ndarray) -> np.ndarray:
-    """Rotation of the carrier in each frame.
-
-    Args:
-        bands: (F, r, WIDTH) float32 grey levels, the lowest rows of each picture.
-
-    Returns:
-        Turns (F,) float64, radians, to the right, relative to the first frame.
-    """
+    """Rotation (F,) float64 of the carrier in each frame, radians, to the right, relative to the
+    first one, by grey levels (F, r, WIDTH) float32 of the lowest rows of each picture."""
     levels = bands.mean(axis=(1, 2), keepdims=True)
     even = bands / np.maximum(levels, 1.0) * levels.mean()
     spectra = np.fft.rfft(even, axis=-1)

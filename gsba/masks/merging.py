@@ -164,15 +164,9 @@ def _carriers(
 def after(
     store: RunStore, frames: FrameSet, solved: Solution, stage: str
 ) -> tuple[FrameSet, Counts]:
-    """Frames with masks of pixels that no static scene explains.
-
+    """Frames with masks of pixels that no static scene explains, by a first solution and its stage.
     Distractors are searched twice: the second pass does not compare pixels that the first one
-    marked in other frames.
-
-    Args:
-        solved: a first solution.
-        stage: its stage name.
-    """
+    marked in other frames."""
     items = dict.fromkeys(frames.names)
 
     def look(name: str, before: PerFrame[Distractors] | None) -> PerFrame[Distractors]:
@@ -219,14 +213,8 @@ def after(
 
 
 def recut(store: RunStore, frames: FrameSet, cut: int) -> FrameSet:
-    """Raw pairs cut anew by a better calibration, with the carrier detected again.
-
-    Masks of anything else are kept.
-
-    Args:
-        frames: frames with masks of an earlier cut.
-        cut: number of this cut, from 1.
-    """
+    """Raw pairs, with masks of an earlier cut, cut anew by a better calibration, the `cut`-th from
+    1, with the carrier detected again. Masks of anything else are kept."""
     earlier = ["carrier.png", *(f"carrier{n}.png" for n in range(1, cut))]
     if not set(frames.mask_paths) <= {store.root / name for name in earlier}:
         return frames

@@ -92,13 +92,10 @@ def principal_axes(descriptors: np.ndarray) -> np.ndarray:
 def searchable(
     features: Features, axes: np.ndarray | None = None, strongest: int | None = None
 ) -> Searchable:
-    """Sort features into cells; keypoints at one place (several orientations) become one.
-
-    Args:
-        axes: (D, D) orthonormal columns, equal for all frames; similarities do not depend on them,
-            but the search is fast if the first columns hold most of the descriptors' energy.
-        strongest: keypoints of a face to search among, None for all.
-    """
+    """Sort features into cells, the strongest of each face or all; keypoints at one place (several
+    orientations) become one. axes: (D, D) orthonormal columns, equal for all frames; similarities
+    do not depend on them, but the search is fast if the first columns hold most of the descriptors'
+    energy."""
     chosen = strongest_of(features, strongest)
     bearings = features.bearings_rig[chosen]
     cells = cells_of(bearings, _CELLS_PER_SIDE)
@@ -145,16 +142,11 @@ def match_pair(
     settings: MatchingSettings,
     points_f0: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Mutual, distinctive nearest neighbours within the gate.
+    """Mutual, distinctive nearest neighbours within the gate around f0_T_f1 (4, 4), whose
+    translation's length is unused: (m, 2) int32 keypoint indices in either frame, sorted, unique.
 
-    Args:
-        f0_T_f1: (4, 4) predicted pose of frame 1 in frame 0; its translation's length is unused.
-        gate: allowed deviation from the prediction.
-        points_f0: (K, 3) scene points of frame 0's keypoints in its rig frame, NaN where unknown.
-            Given, only keypoints with a point are matched, close to where it must appear.
-
-    Returns:
-        (m, 2) int32 keypoint indices in frame 0 and frame 1, sorted, unique.
+    points_f0: (K, 3) scene points of frame 0's keypoints in its rig frame, NaN where unknown.
+    Given, only keypoints with a point are matched, close to where it must appear.
     """
     rotation = f0_T_f1[:3, :3].astype(np.float32)
     direction, limits = _limits(f0_T_f1, gate, settings)

@@ -40,13 +40,9 @@ def agree_with_prior(
     position_sigmas: np.ndarray | None,
     settings: TwoViewLimits,
 ) -> VerifiedPairs:
-    """Keep pairs that have one relative pose, which agrees with the prior.
-
-    Args:
-        prior_f0_T_f1s: (P, 4, 4) relative poses of the trajectory; None = no prior.
-        position_sigmas: (P,) standard deviation of the prior's relative position, map units; it
-            sets the tolerance of the direction.
-    """
+    """Keep pairs that have one relative pose, which agrees with the prior: poses (P, 4, 4) of the
+    trajectory, whose position sigmas (P,), map units, set the tolerance of the direction; None = no
+    prior."""
     kept, kept_poses = [], []
     dropped: dict[str, int] = {
         "too few matches": 0,
@@ -102,13 +98,9 @@ def estimate_relative_poses(
     chances: np.ndarray,
     rivals: bool = False,
 ) -> list[RelativePose | None]:
-    """`relative_pose` of every pair by LO-RANSAC, without any prior.
-
-    Args:
-        chances: (P,) probability that a false match that passed the gate agrees with a pose near
-            the predicted one; 0 = nothing was predicted.
-        rivals: True if rival poses are searched too.
-    """
+    """`relative_pose` of every pair by LO-RANSAC, without any prior; rival poses are searched too
+    if `rivals`. chances: (P,) probability that a false match that passed the gate agrees with a
+    pose near the predicted one; 0 = nothing was predicted."""
 
     def rays(p: int) -> tuple[np.ndarray, np.ndarray]:
         return keypoints.matched(matches.pairs[p], matches.of(p))
@@ -153,12 +145,8 @@ def relative_pose(
     chance: float = 0.0,
     rivals: bool = False,
 ) -> RelativePose | None:
-    """The relative pose with the most inliers, or None if chance explains as many.
-
-    Args:
-        bearings0, bearings1: (m, 3) unit, rays of the matches in each frame.
-        chance, rivals: see `estimate_relative_poses`.
-    """
+    """The relative pose with the most inliers, or None if chance explains as many, of unit rays (m,
+    3) of the matches in each frame; chance, rivals: see `estimate_relative_poses`."""
     found = _significant_pose(bearings0, bearings1, settings, seed, chance)
     if found is None:
         return None

@@ -112,12 +112,8 @@ class Cutter:
         self.cut_R_rig = cut_R_rig  # axes of the last cut
 
     def cut(self, grey: np.ndarray, world_R_rig: np.ndarray, exactly: bool = False) -> Atlas:
-        """The atlas of a panorama (h, 2h) uint8 whose orientation is roughly known.
-
-        Args:
-            world_R_rig: (3, 3) predicted orientation.
-            exactly: cut along these axes, not along others near them.
-        """
+        """The atlas of a panorama (h, 2h) uint8 whose orientation (3, 3) is roughly known; exactly:
+        cut along these axes, not along others near them."""
         off = np.inf
         if self.cut_R_rig is not None:
             off = float(rotation_angle(self.cut_R_rig.T @ world_R_rig))
@@ -174,18 +170,13 @@ def follow(
     bearings_template: np.ndarray,
     predicted: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Bearings of one frame's features in another frame.
-
-    Each is followed, forth and back, on the face that best shows both bearings.
+    """Bearings (N, 3) of features in a frame's rig frame, and (N,) bool, True for found ones. Each
+    is followed, forth and back, on the face that best shows both bearings.
 
     Args:
-        layout: of both atlases.
         template, frame: cut along nearly the same axes of the world.
-        bearings_template: (N, 3) features in the template's rig frame.
-        predicted: (N, 3) unit, predicted bearings in the frame's rig frame.
-
-    Returns:
-        bearings (N, 3) in the frame's rig frame, and (N,) bool, True for found features.
+        bearings_template, predicted: (N, 3) unit, in the template's rig frame, and predicted in
+            the frame's.
     """
     before = bearings_template @ template.cut_R_rig.T
     guess = predicted @ frame.cut_R_rig.T
@@ -219,12 +210,8 @@ _MIN_EIGENVALUE = 3e-5  # least eigenvalue of a patch's gradients, in OpenCV's n
 def new_corners(
     layout: AtlasLayout, atlas: Atlas, usable: np.ndarray | None, known: np.ndarray
 ) -> np.ndarray:
-    """Bearings (N, 3), rig frame, of corners in cells with too few features.
-
-    Args:
-        usable: (2 s, 3 s) bool, pixels of the scene; None = all.
-        known: (M, 3) bearings, rig frame, of features followed so far.
-    """
+    """Bearings (N, 3), rig frame, of corners in cells with too few features, known so far at (M,
+    3); usable: (2 s, 3 s) bool, pixels of the scene, None = all."""
     response = cv2.cornerMinEigenVal(atlas.image, _BLOCK)
     allowed = layout.owned if usable is None else layout.owned & usable
     # median response of the flattest quarter of a picture: that of noise, if walls are bare

@@ -36,12 +36,8 @@ _CORRELATED = 4.0  # factor on the variance of independent points: those of one 
 
 
 def find_loops(places: KeyframePlaces, unseen: np.ndarray) -> list[Constraint]:
-    """Loops proposed by appearance and confirmed by geometry and surroundings.
-
-    Args:
-        places: places of one map, in time order.
-        unseen: (P - 1,) bool, steps between places without matches.
-    """
+    """Loops among places of one map, in time order, proposed by appearance and confirmed by
+    geometry and surroundings; unseen: (P - 1,) bool, steps between places without matches."""
     solved, context, num = places.solved, places.context, len(places.keyframes)
     looks = global_descriptors(context.strongest, num, context.settings.seed, context.workers)
     chosen = loops.candidates(looks, solved, unseen, context.settings)
@@ -66,11 +62,8 @@ def find_loops(places: KeyframePlaces, unseen: np.ndarray) -> list[Constraint]:
 
 
 def find_joins(places: KeyframePlaces) -> list[Constraint]:
-    """Constraints between joined maps, each measured where they are closest.
-
-    Args:
-        places: places of several joined maps, with poses in one world.
-    """
+    """Constraints between joined maps, each measured where they are closest; places have poses in
+    one world."""
     positions, maps = places.solved.world_T_rigs[:, :3, 3], places.maps
     found, test = list[Constraint](), _join_test(places)
     inside = maps == maps[0]
@@ -178,18 +171,13 @@ def _sides(f: int, g: int, num: int) -> tuple[np.ndarray, np.ndarray]:
 def fit_loop(
     meetings: list[Meeting], poses: np.ndarray, at: tuple[int, int], start: Sim3
 ) -> tuple[Sim3, np.ndarray] | None:
-    """The similarity of two places by directions and distances of common points.
+    """The similarity g_T_f of the rigs of two places `at` = (f, g), near `start`, by directions and
+    distances of common points, and its covariance (7, 7), see `Constraint`; None if few points fit
+    it.
 
-    Directions determine the pose; distances the scale, if the places are close to one another.
-
-    Args:
-        meetings: meetings of places beside f with places beside g.
-        poses: (P, 4, 4) poses of all places, consistent on either side.
-        at: the places f and g.
-        start: g_T_f, similarity of their rigs.
-
-    Returns:
-        g_T_f and its covariance (7, 7), see `Constraint`; None if few points fit it.
+    Directions determine the pose; distances the scale, if the places are close to one another. The
+    meetings are of places beside f with places beside g; poses (P, 4, 4) of all are consistent on
+    either side.
     """
     from scipy.optimize import least_squares
 

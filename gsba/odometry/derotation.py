@@ -40,12 +40,8 @@ def miniature(grey: np.ndarray, usable: np.ndarray | None = None) -> Miniature:
 
 
 def turned(one: Miniature, other: Miniature, guesses: list[np.ndarray]) -> np.ndarray:
-    """one_R_other (3, 3) that best aligns the two panoramas.
-
-    Args:
-        one, other: miniatures of frames at nearby positions.
-        guesses: initial rotations, besides the best rotation about the vertical axis.
-    """
+    """one_R_other (3, 3) that best aligns the two panoramas, of nearby positions, from guesses and
+    from the best rotation about the vertical axis."""
     best, least = np.eye(3), np.inf
     # the middle half of the rows is correlated
     rows = slice(*(round(part * len(one.detail)) for part in (0.25, 0.75)))

@@ -52,11 +52,8 @@ class SmallPanoramas:
 
 
 def of_frames(frames: FrameSet, source: Path, width: int) -> SmallPanoramas:
-    """Panoramas of a folder.
-
-    Args:
-        frames: panoramas or raw pairs; pixels masked in all of them are masked.
-        width: pixels across; less if the frames are smaller.
+    """Panoramas of a folder of panoramas or raw pairs, `width` pixels across, less if the frames
+    are smaller; pixels masked in all frames are masked.
 
     Raises:
         GsbaError: cube faces.
@@ -92,13 +89,9 @@ def of_video(
     from_s: float | None = None,
     to_s: float | None = None,
 ) -> SmallPanoramas:
-    """Panoramas of a video: stitched, or raw and joined by its lenses' calibration.
-
-    Args:
-        width: pixels across; less if the video is smaller.
-        calibration: calibration file of a raw recording; None = from image circles or the maker's
-            file.
-        from_s, to_s: seconds since its first frame, the part that is read; None = all.
+    """Panoramas of a video: stitched, or raw and joined by its lenses' calibration file, None =
+    from image circles or the maker's file. They are `width` pixels across, less if the video is
+    smaller, from `from_s` to `to_s` seconds since its first frame; None = all.
 
     Raises:
         GsbaError: no such video, fewer than three frames, or a raw one without image circles.

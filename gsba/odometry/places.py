@@ -53,13 +53,8 @@ def compressed(grey: np.ndarray) -> np.ndarray:
 def chosen_keyframes(
     world_T_rigs: np.ndarray, maps: np.ndarray, distances: np.ndarray
 ) -> np.ndarray:
-    """Numbers (P,) of keyframes at least a step from the one selected before.
-
-    Args:
-        world_T_rigs: (K, 4, 4) poses of all keyframes.
-        maps: (K,) map of each, -1 = a map without points.
-        distances: (K,) median distance of their points, map units.
-    """
+    """Numbers (P,) of keyframes at least a step from the one selected before, of poses (K, 4, 4),
+    maps (K,), -1 = a map without points, and median distances (K,) of points, map units."""
     chosen: list[int] = []
     for k in np.flatnonzero(maps >= 0).tolist():
         if chosen and maps[chosen[-1]] == maps[k]:
@@ -73,13 +68,8 @@ def chosen_keyframes(
 def described(
     pictures: Sequence[np.ndarray], width: int, usable: np.ndarray | None
 ) -> list[Features]:
-    """Keypoints of keyframes.
-
-    Args:
-        pictures: panoramas, see `compressed`.
-        width: pixels across them.
-        usable: (h, 2h) bool, pixels of the scene; None = all.
-    """
+    """Keypoints of keyframes' panoramas, see `compressed`, `width` pixels across; usable: (h, 2h)
+    bool, pixels of the scene, None = all."""
     size = round(width / np.pi * np.tan(_HFOV / 2))
     rig = CubeRig(size, _HFOV)
     layout = AtlasLayout(rig)
@@ -106,13 +96,9 @@ def make_places(
     seed: int,
     workers: Workers,
 ) -> KeyframePlaces:
-    """Match each place with its neighbours, along the poses, and triangulate common points.
-
-    Args:
-        keyframes, maps: (P,) keyframe number and map of each place.
-        world_T_rigs: (P, 4, 4) poses, each in the world of its map.
-        features: (P) see `described`.
-    """
+    """Match each place with its neighbours, along poses (P, 4, 4), each in the world of its map,
+    and triangulate common points; keyframes and maps (P,) are their numbers, for features see
+    `described`."""
     context = MatchContext(
         SearchableFrames(features.__getitem__),
         SearchableFrames(features.__getitem__, _STRONGEST_PER_FACE),

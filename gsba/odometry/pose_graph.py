@@ -42,14 +42,11 @@ class ClosedGraph:
 def close_loops(
     world_T_keys: np.ndarray, steps: Sequence[Constraint], loops: Sequence[Constraint]
 ) -> ClosedGraph:
-    """Deform the path so that its loops close, without loops that contradict its steps.
+    """Deform the path (K, 4, 4) of one map, its first pose fixed, so that its loops close, without
+    loops that contradict its steps, which lead to all keyframes but the first.
 
     Loops are added one after another, those of the shortest time first: drift is least there. A
     loop is rejected if closing it costs more than the noise of the steps explains.
-
-    Args:
-        world_T_keys: (K, 4, 4) poses of one map; the first is fixed.
-        steps: steps to all keyframes but the first.
     """
     from scipy.stats import chi2
 
@@ -92,14 +89,10 @@ def similarity3(similarity: Sim3) -> gtsam.Similarity3:
 def covariances_of(
     world_T_keys: np.ndarray, scales: np.ndarray, constraints: Sequence[Constraint]
 ) -> np.ndarray:
-    """Marginal covariances (K, 6, 6) of poses, tangent [rotation, translation], map units.
+    """Marginal covariances (K, 6, 6) of the poses of one map, tangent [rotation, translation], map
+    units, by steps and loops that connect all keyframes; for scales see `ClosedGraph`.
 
     The gauge is that of refined maps: the first pose and its distance to the furthest are fixed.
-
-    Args:
-        world_T_keys: (K, 4, 4) poses of one map.
-        scales: (K,) scales of the keyframes, see `ClosedGraph`.
-        constraints: steps and loops that connect all keyframes.
     """
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for k, (world_T_key, scale) in enumerate(zip(world_T_keys, scales, strict=True)):
@@ -125,15 +118,11 @@ def covariances_of(
 def carried_covariances(
     covariances: np.ndarray, key_T_rigs: np.ndarray, distances: np.ndarray
 ) -> np.ndarray:
-    """Covariances (F, 6, 6) of frames, from those of their keyframes.
+    """Covariances (F, 6, 6) of frames at poses (F, 4, 4) in their keyframes, map units, from those
+    of their keyframes, see `covariances_of`; distances: (F,) median, of points, map units.
 
     The keyframe's errors are increased by each pose's own: lenses have two centres, and rows are
     read one after another.
-
-    Args:
-        covariances: (F, 6, 6) those of each frame's keyframe, see `covariances_of`.
-        key_T_rigs: (F, 4, 4) poses of frames in their keyframes, map units.
-        distances: (F,) median distance of points, map units.
     """
     into_rigs = adjoint(inverse(key_T_rigs))
     own = np.zeros_like(into_rigs)
@@ -194,8 +183,7 @@ def measure_steps(
 
     Args:
         features: ids (N,) and bearings (N, 3), rig frame, of each keyframe; maps share no id.
-        world_T_keys: (K, 4, 4) poses, each in the world of its map.
-        maps: (K,) map of each keyframe.
+        world_T_keys, maps: (K, 4, 4) poses, each in the world of its map, and (K,) these maps.
         distances: (K,) median distances of points, map units.
     """
     num = len(features)

@@ -47,13 +47,9 @@ def placed(
     distances: np.ndarray,
     seed: int,
 ) -> np.ndarray | None:
-    """key_T_rig (4, 4) of a frame, in the unit of the map; None if it is uncertain.
-
-    Args:
-        key, frame: keypoints of the keyframe and the frame.
-        bearings: (P, 3) unit, the keyframe's rig frame, of its points.
-        distances: (P,) distances of these points, map units.
-    """
+    """key_T_rig (4, 4) of a frame, in the unit of the map, by keypoints of the keyframe and the
+    frame; None if it is uncertain. Points of the keyframe are along unit bearings (P, 3), rig
+    frame, at distances (P,), map units."""
     if min(len(key.bearings_rig), len(frame.bearings_rig)) < _MIN_MATCHES:
         return None
     # mutual nearest neighbours that pass the ratio test

@@ -44,12 +44,9 @@ class Tracking:
 
 
 def track_frames(panoramas: SmallPanoramas, seed: int, checkpoint: Path | None) -> Tracking:
-    """Pose all frames of a sequence one after another.
-
-    Args:
-        panoramas: in time order; those that are damaged are left out.
-        checkpoint: written each minute; where it is of these panoramas, tracking goes on from it.
-            The caller removes it. None = there is none.
+    """Pose all frames of a sequence in time order; damaged ones are left out. A checkpoint is
+    written each minute; where it is of these panoramas, tracking goes on from it. The caller
+    removes it.
 
     Raises:
         GsbaError: the disk refuses a checkpoint.

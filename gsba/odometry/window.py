@@ -63,12 +63,11 @@ class AdjustedWindow:
 def adjust_window(
     world_T_rigs: np.ndarray, num_held: int, seen: WindowObservations, sigma: float, gate: float
 ) -> AdjustedWindow:
-    """Triangulate all features of a window again, and adjust poses and points.
+    """Triangulate all features of a window again, and adjust its poses (K, 4, 4) and points.
 
     Args:
-        world_T_rigs: (K, 4, 4) initial poses.
-        num_held: number of first keyframes that are fixed. With one, its distance to the furthest
-            keyframe is fixed besides, as the scale is free otherwise.
+        num_held: number of first keyframes that are fixed. With one, its distance to the
+            furthest keyframe is fixed besides, as the scale is free otherwise.
         sigma: radians, noise of bearings per axis.
         gate: residual from which observations are outliers, standard deviations.
     """
@@ -140,17 +139,9 @@ def start_map(
     seed: int,
     fading: bool,
 ) -> AdjustedWindow | None:
-    """Poses of two frames and their points; None if the camera may have rotated only.
-
-    The first pose is the identity; the median distance of points from it is 1.
-
-    Args:
-        ids: (N,) features.
-        one, other: (N, 3) their bearings in the two frames.
-        turn: rotation of the bearings.
-        sigma: radians, noise of bearings per axis.
-        fading: True if features are being lost; then little parallax suffices.
-    """
+    """Poses of two frames and points of features (N,), whose bearings are (N, 3) in either frame;
+    None if the camera may have rotated only. The first pose is the identity; the median distance of
+    points from it is 1. fading: features are being lost; then little parallax suffices."""
     moved = _MOVED_LITTLE if fading else _MOVED
     if len(ids) < _MIN_POINTS or np.quantile(turn.parallaxes, 0.75) < moved:
         return None

@@ -377,13 +377,9 @@ _MAX_TILT_TANGENT = 3.0  # tangent of a tilt beyond which a patch covers too lit
 
 
 def slopes_of(normals_rig: np.ndarray, origins: np.ndarray, spreads: np.ndarray) -> np.ndarray:
-    """Relative depth (J, 2) that a step across each patch adds on its surface; 0 = unknown.
-
-    Args:
-        normals_rig: (J, 3) of the surfaces, any length, rig frame of the host; zero = unknown.
-        origins: (J, 3) unit bearings of the points.
-        spreads: (J, 3, 2) steps across them, radians.
-    """
+    """Relative depth (J, 2) that a step across each patch adds on its surface, 0 = unknown, of
+    normals (J, 3) of any length, rig frame of the host, zero = unknown; origins: (J, 3) unit
+    bearings of the points; spreads: (J, 3, 2) steps across them, radians."""
     facing = np.einsum("ji,ji->j", normals_rig, origins)
     across = np.einsum("ji,jic->jc", normals_rig, spreads)
     known = facing > 0
@@ -420,16 +416,14 @@ def surface_normals(
     origins: np.ndarray,
     spreads: np.ndarray,
 ) -> np.ndarray:
-    """Normals (J, 3) of the surfaces, rig frames of the hosts, from their patches' alignments.
+    """Normals (J, 3) of the surfaces, of any length, rig frames of the hosts, from their patches'
+    alignments; zero where they are undetermined.
 
     Args:
         templates: (N,) template of each accepted sighting.
         shifts (N, 2), products (N, 2): see `shown_depths`.
-        slopes: (J, 2) slopes by which the patches were projected.
-        origins (J, 3), spreads (J, 3, 2): the patches in their hosts, before slopes.
-
-    Returns:
-        Normals of any length, zero where they are undetermined.
+        slopes (J, 2), origins (J, 3), spreads (J, 3, 2): by which patches were projected, and
+            the patches in their hosts, before slopes.
     """
     num = len(slopes)
     pulls = np.stack([np.bincount(templates, column, num) for column in products.T], axis=1)

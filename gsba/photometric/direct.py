@@ -93,11 +93,8 @@ def refine(
     context: AdjustmentContext,
     lenses: Cameras = ONE_CAMERA,
 ) -> PhotometricResult:
-    """Refine a solved map by the grey values of patches, level after level.
-
-    Args:
-        frames: panoramas; read twice a level, one at a time.
-    """
+    """Refine a solved map by the grey values of patches of panoramas, read twice a level, one at a
+    time, level after level."""
     solved, counts, settings = start, [], context.settings
     weights, residuals = np.ones(len(frames)), np.full(len(frames), np.nan)
     for level in settings.photometric.levels:
@@ -265,11 +262,8 @@ def joint(
     num_threads: int,
     lenses: Cameras = ONE_CAMERA,
 ) -> list[PatchGreys]:
-    """The patches of a solved map, for a joint solve with another family; none if not selected.
-
-    Args:
-        frame_weights: (F,) weights of each frame's pixels, see `PhotometricResult`.
-    """
+    """The patches of a solved map, for a joint solve with another family; none if not selected;
+    frame_weights (F,): of each frame's pixels, see `PhotometricResult`."""
     if "photometric" not in settings.factors:
         return []
     level = settings.photometric.levels[-1]

@@ -27,12 +27,8 @@ def cut(
     settings: PatchSettings,
     workers: Workers,
 ) -> PatchSet:
-    """Templates cut from their host frames.
-
-    Args:
-        hosts: (J,) frame of each template.
-        origins (J, 3), spreads (J, 3, 2): plane patches, rig frame of the host.
-    """
+    """Templates cut from their host frames (J,): plane patches, origins (J, 3) and spreads (J, 3,
+    2), rig frame of the host."""
     patches = _empty_patches(len(hosts), settings)
     rows = _by_frame(hosts, greys.num_frames)
     job = _CutJob(name, greys, rows, origins, spreads, settings)
@@ -52,12 +48,8 @@ def align(
     sightings: Sightings,
     workers: Workers,
 ) -> None:
-    """Align templates to the frames that should show them.
-
-    Args:
-        seeing: (O,) frame of each sighting.
-        sightings: predicted sightings; the results are filled in.
-    """
+    """Align templates to the frames (O,) that should show them; results are written to the
+    sightings."""
     rows = _by_frame(seeing, greys.num_frames)
     job = _AlignJob(name, greys, rows, patches, sightings)
     for chosen, found in zip(rows.each(), workers.map_shards(job), strict=True):
@@ -72,11 +64,8 @@ def align_to(
     patches: PatchSet,
     sightings: Sightings,
 ) -> None:
-    """Align templates to one picture; the results are filled in.
-
-    Args:
-        image: the picture. mask: (H, 2H) bool, True = use; None = all.
-    """
+    """Align templates to one picture, where its mask (H, 2H) is True; results are written to the
+    sightings."""
     reach, every = 1.5 * MAX_SHIFT_PX, np.arange(len(sightings.templates))
     patches.align(image, mask, every, sightings, reach, _MAX_STEPS, 0.02)
 

@@ -138,12 +138,8 @@ def extract(video: Path, out: Path, settings: VideoSettings, replace: bool = Fal
 
 
 def refuse_darkness(video: Path, recording: Recording, instants: Sequence[int]) -> None:
-    """Refuse a video whose middle, first and last frames are black.
-
-    Args:
-        video: the file, for the message.
-        recording: the recording.
-        instants: instants that are `shown`, ascending.
+    """Refuse a video whose middle, first and last frames are black, by instants that are `shown`,
+    ascending.
 
     Raises:
         GsbaError: all of these frames that can be decoded are black.

@@ -169,12 +169,8 @@ def factory_calibration_of(recording: Recording) -> FactoryCalibration | None:
 
 
 def shots(recording: Recording, chosen: Sequence[int]) -> Iterator[tuple[int, tuple[Picture, ...]]]:
-    """Yield (instant, its images) of chosen instants in order; damaged ones are left out.
-
-    Args:
-        recording: the recording.
-        chosen: ascending instants that are `shown`.
-    """
+    """Yield (instant, its images) of chosen instants, ascending and `shown`; damaged ones are left
+    out."""
     frames = decode(recording.tracks[0], recording.timelines[0], chosen)
     if len(recording.tracks) == 1:
         for index, frame in frames:
@@ -409,11 +405,8 @@ TRACKS = ("track0", "track5")  # folders of their frames, by GoPro's numbers
 
 
 def cube_tracks(video: Path, sizes: Sequence[tuple[int, int]]) -> tuple[int, int] | None:
-    """Find the two tracks of an equi-angular cube map in a video; None if it holds none.
-
-    Args:
-        video: the file.
-        sizes: width and height of its tracks.
+    """Find the two tracks of an equi-angular cube map among those of a video, by their widths and
+    heights; None if it holds none.
 
     Raises:
         GsbaError: a `.360` file does not hold exactly two such tracks of one size.

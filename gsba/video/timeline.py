@@ -79,12 +79,8 @@ class PictureClaims:
 
 
 def claims_of(frame: Any, pixel_aspect: Fraction | None) -> PictureClaims:
-    """Claims that come with a decoded frame.
-
-    Args:
-        frame: av.VideoFrame.
-        pixel_aspect: of its stream; None = not stated.
-    """
+    """Claims that come with a decoded av.VideoFrame; pixel_aspect: of its stream, None = not
+    stated."""
     records = {part.type.name: bytes(part) for part in frame.side_data}
     orientation = 1
     if len(matrix := records.get("DISPLAYMATRIX", b"")) >= 36:
@@ -182,9 +178,8 @@ def claimed_duration_s(video: Path) -> float | None:
 
 
 def container_tags(video: Path) -> dict[str, str]:
-    """Tags of a video's container by the last word of their names in lower case.
-
-    QuickTime's "com.apple.quicktime.model" is "model".
+    """Tags of a video's container by the last word of their names in lower case: QuickTime's
+    "com.apple.quicktime.model" is "model".
 
     Raises:
         GsbaError: the file is no video.
@@ -243,12 +238,8 @@ def read_claims(track: Track) -> PictureClaims:
 
 
 def decode(track: Track, timeline: Timeline, chosen: Sequence[int]) -> Iterator[tuple[int, Any]]:
-    """Yield (index, av.VideoFrame) of chosen frames in order; damaged ones are left out.
-
-    Args:
-        track, timeline: the track and its times.
-        chosen: ascending indices into `timeline.ticks`.
-    """
+    """Yield (index, av.VideoFrame) of chosen frames, ascending indices into `timeline.ticks`;
+    damaged ones are left out."""
     av = _pyav()
     wanted = {int(timeline.ticks[i]): i for i in chosen}
     begins = np.searchsorted(timeline.keyframes, timeline.ticks[list(chosen)], side="right") - 1
@@ -274,11 +265,8 @@ def decode(track: Track, timeline: Timeline, chosen: Sequence[int]) -> Iterator[
 
 
 def picture_near(video: Path, share: float) -> np.ndarray:
-    """Colours (H, W, 3) uint8 BGR of a picture near a place, without reading the whole file.
-
-    Args:
-        video: its first track is shown.
-        share: place, 0..1 of the duration: the last frame before it at which decoding can begin.
+    """Colours (H, W, 3) uint8 BGR of the last frame of a video's first track before a place, 0..1
+    of its duration, at which decoding can begin, without reading the whole file.
 
     Raises:
         GsbaError: the file is no video, or nothing can be decoded.
