@@ -244,10 +244,8 @@ def sightings_of(
     lenses: np.ndarray,
     fractions: np.ndarray,
 ) -> tuple[Sightings, np.ndarray]:
-    """Observations sorted by landmark and frame, and the row each was given in.
-
-    Args: (O, ...) as in `Sightings`.
-    """
+    """Observations (O, ...) as in `Sightings`, sorted by landmark and frame, and the row each was
+    given in."""
     order = np.lexsort((frames, points))
     offsets = np.zeros(num_points + 1, np.int64)
     np.cumsum(np.bincount(points, minlength=num_points), out=offsets[1:])

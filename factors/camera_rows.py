@@ -99,13 +99,9 @@ class LensVariables:
         return tuple(found)
 
     def columns(self, motion: int, turns: int, start: int, first: int) -> Columns:
-        """Columns (L,) of what its lenses see.
-
-        Args:
-            motion, turns: columns of what frames have of their own.
-            start: first column of what all its frames share.
-            first: number of its first lens.
-        """
+        """Columns (L,) of what its lenses see, the first of which is the `first`-th of all: motion
+        and turns are columns of what frames have of their own, start is the first of what all its
+        frames share."""
         num = self.num_lenses
         last = start + 3 * (num - 1)
         radius, last = (-1, last) if self.radius is None else (last, last + 1)

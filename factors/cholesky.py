@@ -108,12 +108,8 @@ class BlockCholesky:
         return sum(width * (width + 1) // 2 + width * rest for width, rest in widths)
 
     def factorize(self, diagonal: np.ndarray, off_diagonal: np.ndarray) -> bool:
-        """Factorize H; False (and unusable) if it is not positive definite.
-
-        Args:
-            diagonal: (N, 6, 6), symmetric blocks H[i, i].
-            off_diagonal: (P, 6, 6), blocks H[i, j] of the pairs.
-        """
+        """Factorize H of symmetric blocks H[i, i] (N, 6, 6) and blocks H[i, j] (P, 6, 6) of the
+        pairs; False (and unusable) if it is not positive definite."""
         for front in self._fronts:  # the factor before is not held beside the new one
             front.lower = front.below = _nothing()
         updates: dict[int, list[tuple[np.ndarray, np.ndarray]]] = {}
@@ -182,11 +178,8 @@ class BlockCholesky:
         return out
 
     def draw(self, normals: np.ndarray) -> np.ndarray:
-        """Vectors (D, N, 6) of covariance H^-1 from as many independent unit normals.
-
-        Where blocks were kept, `normals` holds what was drawn of these, from the covariance of
-        their own system.
-        """
+        """Vectors (D, N, 6) of covariance H^-1 from as many independent unit normals; where blocks
+        were kept, these hold what was drawn of them, from the covariance of their own system."""
         return self._all_backward(self._by_place(normals))
 
     def _by_place(self, vectors: np.ndarray) -> np.ndarray:

@@ -199,10 +199,8 @@ class Eliminated:
         by_frame: np.ndarray,
         by_shared: np.ndarray,
     ) -> None:
-        """Add landmarks: each has observations offsets[j] to offsets[j + 1], sorted by frame.
-
-        Args: see `eliminate`.
-        """
+        """Add landmarks: each has observations offsets[j] to offsets[j + 1], sorted by frame; see
+        `eliminate`."""
         self.cost += eliminate_linear_range(
             0, len(offsets) - 1, offsets, frames, residuals, by_point, by_frame, by_shared,
             _RELATIVE_DAMPING, int(np.diff(offsets).max(initial=0)), self.starts, self.columns,

@@ -173,12 +173,9 @@ class LandmarkBlock:
         return cost
 
     def residuals(self, values: gtsam.Values) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """Whitened residuals of each term in its own order, at the current landmarks.
-
-        Returns:
-            For each term (O, 2) residuals and (O,) bool, False where the point is behind the face
-            (there the residual is a large constant).
-        """
+        """Whitened residuals (O, 2) of each term in its own order, at the current landmarks, and
+        (O,) bool, False where the point is behind the face (there the residual is a large
+        constant)."""
         residuals, valid = self._residuals(values)
         unsorted, flags = np.empty_like(residuals), np.empty_like(valid)
         unsorted[self._order], flags[self._order] = residuals, valid
@@ -368,11 +365,8 @@ def complement_of(
     num_families: int,
     num_threads: int,
 ) -> tuple[SchurComplement, np.ndarray, np.ndarray, np.ndarray]:
-    """The system of `eliminate_points` in factored form.
-
-    Returns:
-        The complement, the gradient (F, 6); robust costs of families (T,) and of landmarks (J,).
-    """
+    """The system of `eliminate_points` in factored form: the complement, the gradient (F, 6);
+    robust costs of families (T,) and of landmarks (J,)."""
     num = len(poses)
     own, taken, gradient = np.zeros((num, 6, 6)), np.zeros((num, 6, 6)), np.zeros((num, 6))
     costs, point_costs = np.zeros(num_families), np.empty(len(points))

@@ -81,11 +81,8 @@ class PartElimination:
         return Condensed(diagonal, off_diagonal, -self._cholesky.reduced(-self._gradient))
 
     def substituted(self, kept: np.ndarray) -> tuple[np.ndarray, float]:
-        """Steps (N - K, 6) of the own blocks, given those of the shared ones, (K, 6).
-
-        Returns:
-            The steps, and their share of the decrease that the undamped model predicts.
-        """
+        """Steps (N - K, 6) of the own blocks, given those of the shared ones, (K, 6), and their
+        share of the decrease that the undamped model predicts."""
         steps = self._cholesky.substituted(-self._gradient, kept)[self._own]
         gradient = self._gradient[self._own]
         return steps, 0.5 * float((steps * (self._added * steps - gradient)).sum())
@@ -98,10 +95,8 @@ class PartElimination:
         return inverse[self._own], between
 
     def drawn(self, kept: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Errors (D, N - K, 6) of the own blocks, given those drawn of the shared ones, (D, K, 6).
-
-        They have the covariance of the whole map's inverse.
-        """
+        """Errors (D, N - K, 6) of the own blocks, of the covariance of the whole map's inverse,
+        given those drawn of the shared ones, (D, K, 6)."""
         num = len(kept)
         normals = rng.normal(size=(num, len(self._gradient) - self._num_kept, DIM))
         return self._cholesky.draw(np.concatenate([normals, kept], axis=1))[:, self._own]

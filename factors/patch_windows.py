@@ -62,10 +62,8 @@ class PatchTable:
         return world_T_targets if self.views is None else world_T_targets @ self.views.rig_T_targets
 
     def select(self, observations: np.ndarray) -> "tuple[PatchTable, np.ndarray]":
-        """The table of some observations (O,) bool, and the patches (p,) with any of them.
-
-        Frames keep their indices.
-        """
+        """The table of some observations (O,) bool, and the patches (p,) with any of them; frames
+        keep their indices."""
         counts = np.bincount(self.owners[observations], minlength=len(self))
         rows = np.flatnonzero(counts)
         part = replace(
@@ -81,12 +79,8 @@ class PatchTable:
         return part, rows
 
     def check(self, num_frames: int) -> None:
-        """Refuse inconsistent arrays.
-
-        Raises:
-            ValueError: unequal lengths, indices out of range, values not finite, or a patch with
-                its host or a repeated frame as target.
-        """
+        """Refuse inconsistent arrays. ValueError: unequal lengths, indices out of range, values not
+        finite, or a patch with its host or a repeated frame as target."""
         num = len(self.hosts)
         wanted = {
             "bearings_rig": (self.bearings_rig, (num, 3)),
@@ -150,10 +144,8 @@ def covisible_frames(table: PatchTable, num_frames: int) -> tuple[np.ndarray, np
 def patch_spans(
     table: PatchTable, world_T_rigs: np.ndarray, planes: np.ndarray, rows: np.ndarray
 ) -> np.ndarray:
-    """Vectors (R, 3, 3), rows: to the patch's centre, and its derivatives along e1 and e2.
-
-    They are in the views of targets, for observations `rows (R,)`, times the inverse depth.
-    """
+    """Vectors (R, 3, 3), rows: to the patch's centre, and its derivatives along e1 and e2, in the
+    views of targets, for observations `rows (R,)`, times the inverse depth."""
     owners = table.owners[rows]
     host = table.world_T_hosts(world_T_rigs)[owners]
     target = table.world_T_targets(world_T_rigs)[rows]

@@ -116,12 +116,8 @@ class PatchSet:
         )  # fmt: skip
 
     def shift_covariances(self, rows: np.ndarray, variances: np.ndarray) -> np.ndarray:
-        """Covariances (N, 2, 2) of shifts, template pixels squared.
-
-        Args:
-            rows: (N,) rows of templates.
-            variances: (N,) residual variances, in the template's grey values.
-        """
+        """Covariances (N, 2, 2) of shifts, template pixels squared, of templates rows (N,), by
+        residual variances (N,) in their grey values."""
         return self.templates.inverses[:, :2, :2][rows] * np.asarray(variances)[:, None, None]
 
 
@@ -131,12 +127,8 @@ def _usable(mask: np.ndarray | None) -> np.ndarray:
 
 
 def expect(templates: np.ndarray, origins: np.ndarray, spreads: np.ndarray) -> Sightings:
-    """Predicted sightings (O,) of templates, not yet aligned.
-
-    Args:
-        templates: (O,) row of each sighting's template. origins (O, 3), spreads (O, 3, 2): the
-        template's plane patch, rig frame of the observing frame.
-    """
+    """Predicted sightings of templates, rows (O,), not yet aligned; origins (O, 3), spreads (O, 3,
+    2): the template's plane patch, rig frame of the observing frame."""
     num = len(templates)
     return Sightings(
         np.asarray(templates, np.int64),
@@ -150,12 +142,8 @@ def expect(templates: np.ndarray, origins: np.ndarray, spreads: np.ndarray) -> S
 
 
 def found_at(sightings: Sightings) -> tuple[np.ndarray, np.ndarray]:
-    """Bearings of the aligned templates' centres.
-
-    Returns:
-        bearings (O, 3), unit, rig frame; their derivatives (O, 3, 2) by the shift in the
-        template's axes, radians per template pixel.
-    """
+    """Bearings (O, 3), unit, rig frame, of the aligned templates' centres; their derivatives (O, 3,
+    2) by the shift in the template's axes, radians per template pixel."""
     shift, affine = sightings.warps[:, :2], sightings.warps[:, 2:].reshape(-1, 2, 2)
     rays = sightings.origins + np.einsum("oij,oj->oi", sightings.spreads, shift)
     lengths = np.linalg.norm(rays, axis=1)

@@ -200,10 +200,8 @@ class PhotometricBlock:
         return self.weights > 0
 
     def subset(self, rows: np.ndarray) -> "PhotometricBlock":
-        """A block of some patches (rows, ascending, all observed) on their frames.
-
-        It copies the current planes and selection of observations, and shares the pixels.
-        """
+        """A block of some patches (rows, ascending, all observed) on their frames: it copies the
+        current planes and selection of observations, and shares the pixels."""
         chosen = np.zeros(len(self.table), bool)
         chosen[rows] = True
         observations = chosen[self.table.owners]

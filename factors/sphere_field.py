@@ -25,11 +25,7 @@ def num_harmonics(degree: int) -> int:
 
 
 def degree_of(num: int) -> int:
-    """Degree of a field with `num` coefficients.
-
-    Raises:
-        ValueError: no degree has that many.
-    """
+    """Degree of a field with `num` coefficients. ValueError: no degree has that many."""
     degree = 0
     while num_harmonics(degree) < num:
         degree += 1
@@ -102,12 +98,8 @@ class SphereField:
         return found
 
     def corrected_roots(self, bearings: np.ndarray, roots: np.ndarray) -> np.ndarray:
-        """Square-root informations (N, 2, 2) on the tangent bases of the corrected bearings.
-
-        Args:
-            bearings: (N, 3) observed.
-            roots: (N, 2, 2) on the tangent bases of the observed bearings.
-        """
+        """Square-root informations (N, 2, 2) on the tangent bases of the corrected bearings, of
+        those on the tangent bases of the observed bearings (N, 3)."""
         if not self:
             return roots
         there = tangent_basis(self.corrected(bearings))

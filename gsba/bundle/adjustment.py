@@ -142,11 +142,8 @@ class AdjustmentContext:
         return replace(self, families=self.families.with_members(members))
 
     def terms(self, solved: Solution) -> Terms:
-        """Terms of all families for an adjustment that starts from a solution.
-
-        Raises:
-            GsbaError: a family whose factors are about variables without a value.
-        """
+        """Terms of all families for an adjustment that starts from a solution. GsbaError: a family
+        whose factors are about variables without a value."""
         own, values = self.families.terms(solved, self.maps), values_of(solved.world_T_rigs)
         values.insert(own.values)
         return Terms(own.graph, own.blocks, values, own)

@@ -321,11 +321,7 @@ def _value(kind: str, numbers: np.ndarray) -> Any:
 
 
 def kept(values: gtsam.Values, keys: Sequence[int]) -> FamilyVariables:
-    """Variables as arrays.
-
-    Raises:
-        GsbaError: a variable of a type that is not among those above.
-    """
+    """Variables as arrays. GsbaError: a variable of a type that is not among those above."""
     kinds, numbers = list[str](), list[np.ndarray]()
     for key in keys:
         for kind, read in _READERS.items():

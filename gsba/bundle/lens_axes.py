@@ -49,12 +49,8 @@ def guess(
     so_far: Lenses,
     context: AdjustmentContext,
 ) -> LensAxes:
-    """Lenses with axes that explain most with two centres: the rig's, turned ones, or the walk's.
-
-    Args:
-        keypoints: of these, as seen from one centre.
-        so_far: one centre; `band_rad` is kept.
-    """
+    """Lenses with axes that explain most with two centres: the rig's, turned ones, or the walk's;
+    keypoints are seen from one centre, whose `band_rad` is kept."""
     frames = keypoints.frames()
     tried = [replace(so_far, axes=axes) for axes in _candidates(solved.world_T_rigs)]
 
@@ -114,10 +110,8 @@ def loosened(
 
 
 def turned(lenses: Lenses, turns: np.ndarray) -> Lenses:
-    """The lenses turned by turns (F, 2) rad about x and y of their frame, then level again.
-
-    The front one's centre is on their axis then: it is there that they look.
-    """
+    """The lenses turned by turns (F, 2) rad about x and y of their frame, then level again. The
+    front one's centre is on their axis then: it is there that they look."""
     assert lenses.axes is not None
     vectors = np.column_stack([turns, np.zeros(len(turns))])
     length = float(np.linalg.norm(lenses.centre))

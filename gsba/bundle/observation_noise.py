@@ -182,7 +182,8 @@ def observation_noise(
     num_threads: int,
     chosen: np.ndarray | slice = slice(None),
 ) -> float:
-    """Noise in units of the features' sigmas: robust spread of residuals over its expectation.
+    """Noise in units of the features' sigmas: robust spread of residuals over its expectation, of
+    chosen observations (O,), poses (F, 4, 4); it does not depend on the number of threads.
 
     The points are placed by least squares: under the robust loss of the adjustment they would lie
     closer to most of their observations than the noise allows. A residual e of noise sigma has the
@@ -190,12 +191,6 @@ def observation_noise(
     of it is left along the epipolar line where a point has two observations, nearly all where it
     has many. So each residual is taken along the direction in which the point leaves the most of
     it, over the square root of that eigenvalue: all observations then spread alike.
-
-    Args:
-        landmarks: points and their observations, O of them.
-        world_T_rigs: (F, 4, 4) poses.
-        num_threads: that share the points; the result does not depend on them.
-        chosen: (O,) bool, observations whose spread is asked for.
     """
     tracks, num = landmarks.tracks, len(landmarks.tracks)
     spread, poses = np.empty(num), np.ascontiguousarray(world_T_rigs)

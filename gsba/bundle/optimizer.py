@@ -150,11 +150,8 @@ def minimize(
     settings: SolverSettings,
     callback: Callable[[Iteration, gtsam.Values], None] | None = None,
 ) -> OptimizeResult:
-    """Minimize the cost of a system by Levenberg-Marquardt: `optimize`, of any system.
-
-    Raises:
-        GsbaError: the cost at the start is not finite.
-    """
+    """Minimize the cost of a system by Levenberg-Marquardt: `optimize`, of any system. GsbaError:
+    the cost at the start is not finite."""
     history = _History(callback)
 
     def result(converged: bool, reason: str) -> OptimizeResult:

@@ -62,16 +62,10 @@ def estimate(
     timestamps: np.ndarray,
     context: AdjustmentContext,
 ) -> CameraEstimate:
-    """Find how long the readout takes and which way rows are read, frames moving by velocity.
-
-    No readout is taken while another way of reading rows predicts unseen parts nearly as well.
-
-    Args:
-        keypoints: of these, as rays of the lenses.
-        shown: (N, 3) directions of the keypoints in their pictures: these tell rows.
-        lenses: read at one instant so far.
-        timestamps: (F,) seconds, whose differences give velocities.
-    """
+    """Find how long the readout takes and which way rows are read, frames moving by velocity,
+    timestamps (F,) in seconds; no readout is taken while another way of reading rows predicts
+    unseen parts nearly as well. Keypoints are rays of the lenses, read at one instant so far;
+    shown: (N, 3) their directions in the pictures: these tell rows."""
     turning = turning_of(lenses, context)
     motion = velocities(solved.world_T_rigs, timestamps, turning, context.maps)
     offsets = _offsets(landmarks, keypoints, solved) if motion[:, :3].any() else None
@@ -216,11 +210,7 @@ class CameraEstimates:
 
     @property
     def only(self) -> CameraEstimate:
-        """The estimate of a single camera.
-
-        Raises:
-            ValueError: there are several cameras.
-        """
+        """The estimate of a single camera. ValueError: there are several cameras."""
         (found,) = self.each
         return found
 

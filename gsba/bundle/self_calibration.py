@@ -62,13 +62,9 @@ def estimate(
     context: AdjustmentContext,
     nominal: bool = False,
 ) -> SelfCalibration:
-    """Calibrate lenses by a map, poses, points and lens centres adjusted with them.
-
-    Args:
-        keypoints: of these, as rays under the lenses so far.
-        shown: (N, 3) directions of the keypoints in their panoramas.
-        nominal: whether the lenses so far are plain ones of unknown make, not calibrated.
-    """
+    """Calibrate lenses by a map, poses, points and lens centres adjusted with them. Keypoints are
+    rays under the lenses so far; shown: (N, 3) their directions in the panoramas; nominal: whether
+    these lenses are plain ones of unknown make, not calibrated."""
     frames, num = keypoints.frames(), num_parameters(so_far.num_lenses)
 
     def by_both(rows: np.ndarray, by_origin: np.ndarray, residuals: np.ndarray) -> np.ndarray:

@@ -67,10 +67,7 @@ def lens_of(
 
 def metres_of(unit: Any) -> float:
     """Metres in a unit that a file names; 0 for "map", whose lengths have no known scale.
-
-    Raises:
-        ValueError: the unit is not known.
-    """
+    ValueError: the unit is not known."""
     if not isinstance(unit, str) or unit not in _METRES_OF_UNIT:
         raise ValueError(f"unit {brief(repr(unit))} is not known: use {', '.join(_METRES_OF_UNIT)}")
     return _METRES_OF_UNIT[unit]
@@ -93,10 +90,7 @@ def fields_of(tree: Any, names: Sequence[str], where: str) -> list[Any]:
 
 def numbers_of(tree: Any, name: str, where: str, count: int | None = None) -> np.ndarray:
     """Numbers (N,) float64 of a field of a file, see `fields_of`; nested lists are joined.
-
-    Raises:
-        ValueError: the field is missing, or is not `count` finite numbers; the message names it.
-    """
+    ValueError: the field is missing, or is not `count` finite numbers; the message names it."""
     (value,) = fields_of(tree, (name,), where)
     try:
         found = np.array(value, np.float64).ravel()

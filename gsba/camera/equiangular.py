@@ -109,10 +109,8 @@ def shrunk(faces: np.ndarray, size: int) -> np.ndarray:
 
 
 def around_squares(faces: np.ndarray) -> np.ndarray:
-    """Join squares (6, S, S[, C]) in one picture, three beside three, for `Grid` to look up.
-
-    Each square gets PAD pixels of what lies beyond its border on the sphere.
-    """
+    """Join squares (6, S, S[, C]) in one picture, three beside three, for `Grid` to look up; each
+    gets PAD pixels of what lies beyond its border on the sphere."""
     size = faces.shape[1]
     cell = size + 2 * PAD
     out = np.empty((2 * cell, 3 * cell, *faces.shape[3:]), faces.dtype)

@@ -125,11 +125,8 @@ class FactoryLenses:
 
 
 def parse_factory_lenses(calibration: FactoryCalibration) -> FactoryLenses:
-    """Lenses that a calibration of Insta360 describes.
-
-    Raises:
-        GsbaError: the form is unknown, or no lenses have such numbers.
-    """
+    """Lenses that a calibration of Insta360 describes. GsbaError: the form is unknown, or no lenses
+    have such numbers."""
     try:
         return _of_numbers(np.array(calibration.text.split("_"), np.float64), calibration)
     except ValueError as error:

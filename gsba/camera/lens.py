@@ -87,11 +87,8 @@ class Lenses:
     def origins(
         self, directions: np.ndarray, frames: np.ndarray, lens: np.ndarray | None = None
     ) -> np.ndarray:
-        """Centres (N, 3) of the lenses that face directions (N, 3), both in the rig frame.
-
-        Args:
-            lens: (N,) int, the lenses to take instead.
-        """
+        """Centres (N, 3) of the lenses that face directions (N, 3), both in the rig frame, or of
+        given ones."""
         lens = self.facing(directions, frames) if lens is None else lens
         centres = self.centres[lens]
         if self.axes is None:
@@ -194,11 +191,9 @@ class Lenses:
     def seeing(
         self, points_rig: np.ndarray, frames: np.ndarray, lens: np.ndarray | None = None
     ) -> np.ndarray:
-        """Vectors (N, 3) along the directions in which pictures of frames (N,) show points (N, 3).
-
-        The lens that faces a point sees it, or `lens` as in `origins`. Points are in
-        the rig frame in the middle of the readout.
-        """
+        """Vectors (N, 3) along the directions in which pictures of frames (N,) show points (N, 3),
+        rig frame in the middle of the readout, by the lens that faces a point, or `lens` as in
+        `origins`."""
         vectors = self._directions_in_panorama(points_rig, frames, lens)
         if self.readout_motion is None:
             return vectors
@@ -304,10 +299,8 @@ def all_centres(centre: np.ndarray) -> np.ndarray:
 
 
 def seam_sines(directions: np.ndarray, axes: np.ndarray) -> np.ndarray:
-    """Distances (...,) of vectors (..., 3) from the nearest seam of lenses with axes (L, 3).
-
-    The seam of two lenses is the plane between their axes.
-    """
+    """Distances (...,) of vectors (..., 3) from the nearest seam of lenses with axes (L, 3): that
+    of two lenses is the plane between their axes."""
     along = directions @ axes.T
     nearest = np.argmax(along, axis=-1)
     best = np.take_along_axis(along, nearest[..., None], axis=-1)

@@ -64,12 +64,8 @@ class Stitcher:
     def stitched_squares(
         self, squares: np.ndarray, correction: tuple[float, ...] = ()
     ) -> np.ndarray:
-        """The panorama (2 S, 4 S, C) uint8 of an equi-angular cube map.
-
-        Args:
-            squares: (6, S, S, C) uint8, FACES order.
-            correction: coefficients of the stitching field, see `FrameSet`.
-        """
+        """The panorama (2 S, 4 S, C) uint8 of an equi-angular cube map (6, S, S, C), FACES order;
+        correction: coefficients of the stitching field, see `FrameSet`."""
         picture, grid = around_squares(squares), Grid(squares.shape[1], correction)
 
         def look(_: int, shown: np.ndarray) -> np.ndarray:

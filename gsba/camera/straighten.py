@@ -39,10 +39,8 @@ def straightened_inside(
 
 
 def observed(directions: np.ndarray, correction: tuple[float, ...]) -> np.ndarray:
-    """Directions (h, w, 3) in which bent pictures show true directions (h, w, 3), unit, rig frame.
-
-    The field is evaluated on a coarse grid and interpolated.
-    """
+    """Directions (h, w, 3) in which bent pictures show true directions (h, w, 3), unit, rig frame,
+    by the field on a coarse grid, interpolated."""
     import cv2
 
     padded = _padded_offsets(correction)

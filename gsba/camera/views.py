@@ -84,11 +84,8 @@ def rig_views(rig: CubeRig) -> tuple[View, ...]:
 
 
 def lens_views(lenses: Lenses, size: int) -> tuple[View, ...]:
-    """Ten views of two lenses, with pixels as large as those of cube faces of `size`.
-
-    Raises:
-        GsbaError: there are more than two lenses.
-    """
+    """Ten views of two lenses, with pixels as large as those of cube faces of `size`. GsbaError:
+    there are more than two lenses."""
     if lenses.num_lenses != 2:
         raise GsbaError(
             f"the camera has {lenses.num_lenses} lenses, and faces of one lens each are cut for "
@@ -325,12 +322,8 @@ class ViewCutter:
     def cut_squares(
         self, squares: np.ndarray, correction: tuple[float, ...] = ()
     ) -> Iterator[np.ndarray]:
-        """Images (height, width[, C]) uint8, bicubic, of an equi-angular cube map.
-
-        Args:
-            squares: (6, S, S[, C]) uint8, FACES order.
-            correction: coefficients of the stitching field, see `PictureFormat`.
-        """
+        """Images (height, width[, C]) uint8, bicubic, of an equi-angular cube map (6, S, S, C),
+        FACES order; correction: coefficients of the stitching field, see `PictureFormat`."""
         width = dense_enough(4 * squares.shape[1], self._views[0].focal)
         squares = shrunk(squares, width // 4)
         places = Grid(squares.shape[1], correction).places

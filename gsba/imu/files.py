@@ -44,12 +44,8 @@ _DEFAULT_COLUMNS = ["t", *(f"gyro_{axis}" for axis in "xyz"), *(f"acc_{axis}" fo
 
 
 def read_imu(path: Path) -> Readings:
-    """Readings of a table, or of a maker's recording.
-
-    Raises:
-        GsbaError: the file cannot be read or used; the message names the line. Or
-            `telemetry_parser` is needed and not installed.
-    """
+    """Readings of a table, or of a maker's recording. GsbaError: the file cannot be read or used;
+    the message names the line. Or `telemetry_parser` is needed and not installed."""
     path = Path(path)
     if path.suffix.lower() in _TABLES or not path.is_file():
         lines = [(line, _cells(text)) for line, text in read_lines(path)]
@@ -90,12 +86,8 @@ def read_imu(path: Path) -> Readings:
 
 def read_telemetry(path: Path, lasting_s: float | None = None) -> Readings:
     """Readings stored in a maker's recording; those timed from the first frame that begin after its
-    pictures' duration, seconds, are of another recording; None = not known.
-
-    Raises:
-        GsbaError: the file holds no usable readings, or `telemetry_parser` is needed and not
-        installed.
-    """
+    pictures' duration, seconds, are of another recording; None = not known. GsbaError: the file
+    holds no usable readings, or `telemetry_parser` is needed and not installed."""
     trailer = read_trailer(path)
     if trailer is None:
         table = "a table (t, gyro x y z, accelerometer x y z)"

@@ -28,11 +28,8 @@ _UPRIGHT_FACES = [*product(range(4), range(4)), (4, 4), (5, 5)]
 
 def make_matcher(settings: RefineSettings, weights: Mapping[str, Path], size: int) -> Matcher:
     """Matcher that `matching.matcher` and `features.extractor` choose for faces of `size` pixels:
-    guided search, or a learned network with weights by `find_weights`.
-
-    Raises:
-        GsbaError: the weights are of another network, or a library is not installed.
-    """
+    guided search, or a learned network with weights by `find_weights`. GsbaError: the weights are
+    of another network, or a library is not installed."""
     name = settings.matching.matcher
     if name == "guided":
         return guided

@@ -69,11 +69,8 @@ PACKAGES = (
 
 def packaged(names: Sequence[str]) -> Path | None:
     """File of weights with the first of some names that an installed package holds; None = no
-    package of them is installed.
-
-    Raises:
-        GsbaError: the package's file is missing or another one than that of the known version.
-    """
+    package of them is installed. GsbaError: the package's file is missing or another one than that
+    of the known version."""
     for name in names:
         for package in PACKAGES:
             if name in package.sha256:
@@ -200,12 +197,9 @@ SOURCES = {
 
 
 def find_weights(settings: RefineSettings) -> dict[str, Path]:
-    """Files of the learned networks that settings choose, by "features" and "matching".
-
-    Raises:
-        GsbaError: weights are missing and may not be downloaded, or their licence was not accepted;
-            the message names the file, its licence and its source.
-    """
+    """Files of the learned networks that settings choose, by "features" and "matching". GsbaError:
+    weights are missing and may not be downloaded, or their licence was not accepted; the message
+    names the file, its licence and its source."""
     chosen, wanted = settings.features, {}
     if chosen.extractor != "sift":
         wanted["features"] = (chosen.extractor, chosen.weights)

@@ -53,11 +53,8 @@ def widened(places: np.ndarray, pixels: int) -> np.ndarray:
 
 
 def black_areas(brightest: np.ndarray) -> np.ndarray:
-    """Large areas (h, 2h) bool of no pixels; none if most of the picture is as dark.
-
-    Args:
-        brightest: (h, 2h) uint8, largest grey level of each pixel in all pictures.
-    """
+    """Large areas (h, 2h) bool of no pixels, by the largest grey level uint8 of each in all
+    pictures; none if most of the picture is as dark."""
     black = (brightest <= _MAX_BLACK_LEVEL).astype(np.uint8)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(black, connectivity=4)
     large = stats[:, cv2.CC_STAT_AREA] >= _MIN_SHARE * black.size

@@ -65,11 +65,8 @@ def no_carrier(frames: FrameSet, reason: str) -> Carrier:
 
 
 def find_carrier(frames: FrameSet) -> Carrier:
-    """Detect the carrier in panoramas or raw pairs of a moving camera.
-
-    Raises:
-        GsbaError: cube faces, too few frames, no texture, or too little motion.
-    """
+    """Detect the carrier in panoramas or raw pairs of a moving camera. GsbaError: cube faces, too
+    few frames, no texture, or too little motion."""
     if not frames.format.panoramic:
         raise GsbaError("the carrier is detected in panoramas; these frames are cube faces")
     _require_enough(len(frames))
@@ -101,11 +98,8 @@ def find_carrier(frames: FrameSet) -> Carrier:
 
 def find_fixed_carrier(pictures: np.ndarray) -> np.ndarray:
     """Mask (h, 2h) bool of the world in pictures (N, h, 2h, 3) uint8 RGB, `PICTURE_WIDTH` across,
-    of a moving camera: False at a carrier that keeps its direction.
-
-    Raises:
-        GsbaError: too few pictures, no texture, or too little motion.
-    """
+    of a moving camera: False at a carrier that keeps its direction. GsbaError: too few pictures, no
+    texture, or too little motion."""
     _require_enough(len(pictures))
     return ~_outlined(pictures, _measure(pictures, _STRUCTURE_WIDTH_PX))[1]
 

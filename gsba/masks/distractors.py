@@ -133,11 +133,8 @@ class StaticScene:
         return StaticScene, (*own, self._limit_mb, self._known_neighbours)
 
     def taken(self, chosen: Sequence[int]) -> tuple["StaticScene", dict[int, int]]:
-        """The part of the scene that some frames need, for other processes.
-
-        Returns:
-            The scene, and the index in it of each of its frames.
-        """
+        """The part of the scene that some frames need, for other processes, and the index in it of
+        each."""
         near = {frame: self._neighbours(frame) for frame in chosen}
         rows = np.unique(np.concatenate([np.array(chosen, np.int64), *near.values()]))
         number = {int(row): n for n, row in enumerate(rows)}

@@ -57,16 +57,10 @@ class Choice:
 
 
 def choose(masks: Masks, segment: Segment | None = None) -> Choice:
-    """The sources of masks that `--masks` and `--segment` name.
-
-    Args:
-        masks: a file or a folder, "auto", "carrier", "distractors", or several of these; "none" or
-            None = no masks. "carrier" is "auto" that fails if the carrier cannot be detected.
-        segment: see `gsba.masks.segmentation`.
-
-    Raises:
-        GsbaError: two files or folders, or "none" with others.
-    """
+    """The sources of masks that `--masks` (a file or a folder, "auto", "carrier", "distractors", or
+    several of these; "none" or None = no masks) and `--segment` (see `gsba.masks.segmentation`)
+    name. "carrier" is "auto" that fails if the carrier cannot be detected. GsbaError: two files or
+    folders, or "none" with others."""
     values = [masks] if isinstance(masks, Path | str) else list(masks or ())
     words = {str(value) for value in values} & {AUTO, CARRIER, DISTRACTORS, NONE}
     files = [Path(value) for value in values if str(value) not in words]
@@ -85,10 +79,7 @@ def choose(masks: Masks, segment: Segment | None = None) -> Choice:
 
 def before(store: RunStore, frames: FrameSet, choice: Choice) -> FrameSet:
     """Frames with masks known before any solution: segmentation, black borders, the carrier.
-
-    Raises:
-        GsbaError: a segmentation fails; or the carrier is required and cannot be detected.
-    """
+    GsbaError: a segmentation fails; or the carrier is required and cannot be detected."""
     parts: list[Callable[[int], np.ndarray | None]] = []
     names = []
     if choice.segment is not None:

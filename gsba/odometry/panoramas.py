@@ -53,11 +53,7 @@ class SmallPanoramas:
 
 def of_frames(frames: FrameSet, source: Path, width: int) -> SmallPanoramas:
     """Panoramas of a folder of panoramas or raw pairs, `width` pixels across, less if the frames
-    are smaller; pixels masked in all frames are masked.
-
-    Raises:
-        GsbaError: cube faces.
-    """
+    are smaller; pixels masked in all frames are masked. GsbaError: cube faces."""
     if not frames.format.panoramic:
         raise GsbaError(f"{source}: holds cube faces; odometry follows panoramas or raw fisheyes")
     width = min(width, frames.format.width)
@@ -131,10 +127,8 @@ def of_video(
 
 
 def without_carrier(panoramas: SmallPanoramas) -> SmallPanoramas:
-    """The panoramas with the carrier masked, if it keeps its place in the pictures.
-
-    If it cannot be detected, a line in the log says so and nothing is masked.
-    """
+    """The panoramas with the carrier masked, if it keeps its place in the pictures; else nothing is
+    masked, and a line in the log says so."""
     rows = np.unique(np.linspace(0, len(panoramas) - 1, _CARRIER_LOOKS).astype(int)).tolist()
     size = (PICTURE_WIDTH, PICTURE_WIDTH // 2)
     pictures = [cv2.resize(picture, size) for _, picture in panoramas.read(rows, True)]
@@ -148,11 +142,8 @@ def without_carrier(panoramas: SmallPanoramas) -> SmallPanoramas:
 
 
 def masked(panoramas: SmallPanoramas, mask: Path) -> SmallPanoramas:
-    """The panoramas, masked by a 2:1 picture for all frames, white = use.
-
-    Raises:
-        GsbaError: the mask cannot be read, or is not 2:1.
-    """
+    """The panoramas, masked by a 2:1 picture for all frames, white = use. GsbaError: the mask
+    cannot be read, or is not 2:1."""
     levels = cv2.imread(str(mask), cv2.IMREAD_GRAYSCALE)
     if levels is None:
         raise GsbaError(f"{mask}: cannot be read as a picture; give a 2:1 mask, white = use")

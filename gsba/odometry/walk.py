@@ -46,11 +46,7 @@ class Tracking:
 def track_frames(panoramas: SmallPanoramas, seed: int, checkpoint: Path | None) -> Tracking:
     """Pose all frames of a sequence in time order; damaged ones are left out. A checkpoint is
     written each minute; where it is of these panoramas, tracking goes on from it. The caller
-    removes it.
-
-    Raises:
-        GsbaError: the disk refuses a checkpoint.
-    """
+    removes it. GsbaError: the disk refuses a checkpoint."""
     num, interval = len(panoramas), float(np.median(np.diff(panoramas.timestamps)))
     patience = max(_MIN_PATIENCE, round(_PATIENCE_S / interval))
     key = _key(panoramas, seed, patience) if checkpoint is not None else ""

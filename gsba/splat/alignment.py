@@ -114,12 +114,7 @@ def render_view(
     near: float,
     backend: Backend,
 ) -> RenderedView:
-    """Opaque pixels of all views, as points with grey values.
-
-    Args:
-        world_T_rig: (4, 4) pose to render from.
-        views: views of that rig.
-    """
+    """Opaque pixels of views of a rig at a pose (4, 4), as points with grey values."""
     points, greys = [], []
     cameras = rig_cameras(world_T_rig, views)
     images = backend.render(gaussians, cameras, None, near)

@@ -49,11 +49,8 @@ def densify(
     limits: DensityLimits,
     rng: np.random.Generator,
 ) -> tuple[Gaussians, Moments, bool]:
-    """Clone small and split large Gaussians with strong gradients, then prune.
-
-    Returns:
-        The Gaussians, their moments (zero for new ones), and True if the limit kept some out.
-    """
+    """Clone small and split large Gaussians with strong gradients, then prune. Returns them, their
+    moments (zero for new ones), and True if the limit kept some out."""
     strength = pull.sums / np.maximum(pull.counts, 1)
     chosen = np.flatnonzero(strength >= limits.pull)
     room = max(limits.max_gaussians - len(gaussians), 0)

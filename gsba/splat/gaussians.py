@@ -108,11 +108,7 @@ def from_cloud(
 
 
 def write_ply(path: Path, gaussians: Gaussians) -> None:
-    """Write a splat, atomically by renaming.
-
-    Raises:
-        GsbaError: the file cannot be written.
-    """
+    """Write a splat, atomically by renaming. GsbaError: the file cannot be written."""
     num = len(gaussians)
     names = _names(gaussians.sh.shape[1])
     rest = gaussians.sh[:, 1:].transpose(0, 2, 1).reshape(num, -1)
@@ -125,12 +121,8 @@ def write_ply(path: Path, gaussians: Gaussians) -> None:
 
 
 def read_ply(path: Path) -> Gaussians:
-    """Read a splat of degree 0 to 3.
-
-    Raises:
-        GsbaError: the file is unreadable, no PLY of a splat, truncated, or holds values that are
-            not finite.
-    """
+    """Read a splat of degree 0 to 3. GsbaError: the file is unreadable, no PLY of a splat,
+    truncated, or holds values that are not finite."""
     rows = read_vertices(path)
     num, names = len(rows), rows.dtype.names or ()
     num_rest = sum(name.startswith("f_rest_") for name in names)

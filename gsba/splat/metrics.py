@@ -15,12 +15,8 @@ _C1, _C2 = 0.01**2, 0.03**2
 
 
 def psnr(image: np.ndarray, truth: np.ndarray, use: np.ndarray | None = None) -> float:
-    """Peak signal-to-noise ratio in dB over all pixels together; inf for equal images.
-
-    Args:
-        image, truth: (..., C), values 0..1.
-        use: (...) bool, pixels that count; None = all. At least one.
-    """
+    """Peak signal-to-noise ratio in dB over all pixels of images (..., C), values 0..1, that are in
+    `use (...)`, at least one, None = all; inf for equal images."""
     error = (np.asarray(image, np.float64) - truth) ** 2
     mean = float(np.mean(error if use is None else error[use]))
     return float("inf") if mean == 0 else -10 * float(np.log10(mean))

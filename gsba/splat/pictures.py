@@ -28,10 +28,8 @@ def render_views(
 def render_panorama(
     gaussians: Gaussians, world_T_rig: np.ndarray, width: int, near: float, backend: Backend
 ) -> np.ndarray:
-    """An equirectangular image (width / 2, width, 3) uint8 RGB as seen from the rig's centre.
-
-    It is sampled from wider faces.
-    """
+    """An equirectangular image (width / 2, width, 3) uint8 RGB as seen from the rig's centre,
+    sampled from wider faces."""
     import cv2
 
     hfov = np.deg2rad(94.0)  # of the faces that a panorama is sampled from

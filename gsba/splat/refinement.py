@@ -94,16 +94,9 @@ def refine(
     key: str = "",
     optics: Optics = ONE_EYE,
 ) -> SplatResult:
-    """Refine a solved map against splats of its own frames, from coarse faces to fine.
-
-    Args:
-        frames: panoramas or cube faces; all their faces are held in memory, one size at a time.
-        keypoints: keypoints of all frames.
-        start: the solved map.
-        context: priors, families, loss, solver, splat; its threads render, too.
-        checkpoint: file to store finished turns in and to resume from; None = none.
-        key: digest of the inputs; a checkpoint with another key is not resumed.
-        optics: lenses of the frames.
+    """Refine a solved map against splats of its own frames, from coarse faces to fine; all faces
+    are held in memory, one size at a time. Finished turns are stored in a checkpoint and resumed
+    from it, if its key, a digest of the inputs, is this one.
 
     Raises:
         GsbaError: all frames are masked, or the splat is no longer finite.
@@ -312,14 +305,9 @@ def standard_error(differences: np.ndarray) -> float:
 
 
 def score(differences: np.ndarray, chance: float = 0.0) -> float:
-    """Significance of a positive sum of differences (N,), in standard errors.
-
-    Few differences determine their spread poorly: their t is mapped to the normal score of equal
-    probability (Wallace, Bounds on normal approximations, 1959).
-
-    Args:
-        chance: part of the sum that chance explains; only the excess counts.
-    """
+    """Significance of a positive sum of differences (N,) beyond what chance explains, in standard
+    errors. Few differences determine their spread poorly: their t is mapped to the normal score of
+    equal probability (Wallace, Bounds on normal approximations, 1959)."""
     total, num = float(differences.sum()), len(differences)
     beyond, spread = max(abs(total) - chance, 0.0), num * standard_error(differences)
     if beyond == 0 or not np.isfinite(spread):

@@ -68,20 +68,12 @@ class _Kept:
 
 
 def extract(video: Path, out: Path, settings: VideoSettings, replace: bool = False) -> Counts:
-    """Write frames of a 360-degree video to a folder that `gsba.frames.scan` reads.
+    """Write frames of a 360-degree video, 2:1, GoPro's `.360`, or raw of two lenses (see
+    `gsba.video.recording`), either file of a pair, to a folder that `gsba.frames.scan` reads;
+    returns numbers of frames in the range, of kept frames, and of dropped ones by reason.
 
     Times are the container's presentation times since the first frame, also for variable frame
-    rates. An interrupted call resumes.
-
-    Args:
-        video: H.264, H.265 or another codec that FFmpeg decodes: 2:1, GoPro's `.360`, or raw of two
-            lenses (see `gsba.video.recording`), either file of a pair.
-        out: folder of the frames, made if missing.
-        settings: choice and size of the frames (of raw recordings: size of one lens's image).
-        replace: replace another extraction in `out`.
-
-    Returns:
-        Numbers of frames in the range, of kept frames, and of dropped ones by reason.
+    rates. An interrupted call resumes; another extraction in the folder is replaced if `replace`.
 
     Raises:
         GsbaError: the video or the folder cannot be used, or no frame is in the range.
@@ -138,12 +130,8 @@ def extract(video: Path, out: Path, settings: VideoSettings, replace: bool = Fal
 
 
 def refuse_darkness(video: Path, recording: Recording, instants: Sequence[int]) -> None:
-    """Refuse a video whose middle, first and last frames are black, by instants that are `shown`,
-    ascending.
-
-    Raises:
-        GsbaError: all of these frames that can be decoded are black.
-    """
+    """Refuse a video whose middle, first and last frames, of ascending instants that are `shown`,
+    are black. GsbaError: all of these frames that can be decoded are."""
     level = -1
     for row in dict.fromkeys([len(instants) // 2, 0, len(instants) - 1]):
         for _, pictures in shots(recording, [instants[row]]):

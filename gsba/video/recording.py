@@ -114,10 +114,7 @@ class Recording:
 
 def files_of(video: Path) -> tuple[Path, ...]:
     """Files of the recording that `video` is of: that file, or those of the front and back lens.
-
-    Raises:
-        GsbaError: the file is no video, or has an unknown layout.
-    """
+    GsbaError: the file is no video, or has an unknown layout."""
     pair = lens_files(video)
     if pair is None or not all(path.is_file() for path in pair):
         return (video,)
@@ -126,12 +123,8 @@ def files_of(video: Path) -> tuple[Path, ...]:
 
 
 def read_recording(video: Path) -> Recording:
-    """Recognise the layout of a video and read its times.
-
-    Raises:
-        GsbaError: the file is no video, holds neither panoramas nor a cube map nor two lenses, or
-            its lenses or tracks do not match.
-    """
+    """Recognise the layout of a video and read its times. GsbaError: the file is no video, holds
+    neither panoramas nor a cube map nor two lenses, or its lenses or tracks do not match."""
     files = files_of(video)
     size, *others = track_sizes(files[0])
     if (cube := cube_tracks(files[0], [size, *others])) is not None:
@@ -193,11 +186,7 @@ def shots(recording: Recording, chosen: Sequence[int]) -> Iterator[tuple[int, tu
 
 
 def check_lengths(recording: Recording) -> None:
-    """Refuse a recording with one lens, or track, that is clearly shorter than the other.
-
-    Raises:
-        GsbaError: one is shorter.
-    """
+    """GsbaError where one lens, or track, of a recording is clearly shorter than the other."""
     lasting = [float(line.times[-1]) + line.interval_s for line in recording.timelines]
     if min(lasting) >= 0.9 * max(lasting):
         return
@@ -406,11 +395,8 @@ TRACKS = ("track0", "track5")  # folders of their frames, by GoPro's numbers
 
 def cube_tracks(video: Path, sizes: Sequence[tuple[int, int]]) -> tuple[int, int] | None:
     """Find the two tracks of an equi-angular cube map among those of a video, by their widths and
-    heights; None if it holds none.
-
-    Raises:
-        GsbaError: a `.360` file does not hold exactly two such tracks of one size.
-    """
+    heights; None if it holds none. GsbaError: a `.360` file does not hold exactly two such tracks
+    of one size."""
     found = [n for n, size in enumerate(sizes) if is_equiangular(*size)]
     if len(found) == 2 and sizes[found[0]] == sizes[found[1]]:
         return found[0], found[1]

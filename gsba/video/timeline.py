@@ -158,42 +158,29 @@ def is_video(path: Path) -> bool:
 
 
 def track_sizes(video: Path) -> list[tuple[int, int]]:
-    """Width and height, pixels, of the video tracks of a file that can be decoded.
-
-    Raises:
-        GsbaError: the file is no video, or there is no decoder for it.
-    """
+    """Width and height, pixels, of the video tracks of a file that can be decoded. GsbaError: the
+    file is no video, or there is no decoder for it."""
     with _opened(video) as (_, streams):
         return [(stream.width, stream.height) for stream in streams]
 
 
 def claimed_duration_s(video: Path) -> float | None:
-    """Duration that the first track of a video claims, seconds; None = not stated.
-
-    Raises:
-        GsbaError: the file is no video, or there is no decoder for it.
-    """
+    """Duration that the first track of a video claims, seconds; None = not stated. GsbaError: the
+    file is no video, or there is no decoder for it."""
     with _opened(video) as (container, streams):
         return _claimed_end(container, streams[0])
 
 
 def container_tags(video: Path) -> dict[str, str]:
     """Tags of a video's container by the last word of their names in lower case: QuickTime's
-    "com.apple.quicktime.model" is "model".
-
-    Raises:
-        GsbaError: the file is no video.
-    """
+    "com.apple.quicktime.model" is "model". GsbaError: the file is no video."""
     with _opened(video) as (container, _):
         return {key.lower().rpartition(".")[2]: text for key, text in container.metadata.items()}
 
 
 def read_timeline(track: Track) -> Timeline:
-    """Presentation times of all frames of a track, from its packets alone.
-
-    Raises:
-        GsbaError: the file is no video, there is no decoder for it, or it holds no frames.
-    """
+    """Presentation times of all frames of a track, from its packets alone. GsbaError: the file is
+    no video, there is no decoder for it, or it holds no frames."""
     video = track.path
     with _opened(video) as (container, streams):
         stream = streams[track.number]
@@ -219,11 +206,8 @@ def read_timeline(track: Track) -> Timeline:
 
 
 def read_claims(track: Track) -> PictureClaims:
-    """Claims of a track about its pictures; none if its first second cannot be decoded.
-
-    Raises:
-        GsbaError: the file is no video, or there is no decoder for it.
-    """
+    """Claims of a track about its pictures; none if its first second cannot be decoded. GsbaError:
+    the file is no video, or there is no decoder for it."""
     av = _pyav()
     with _opened(track.path) as (container, streams):
         stream = streams[track.number]
@@ -266,11 +250,8 @@ def decode(track: Track, timeline: Timeline, chosen: Sequence[int]) -> Iterator[
 
 def picture_near(video: Path, share: float) -> np.ndarray:
     """Colours (H, W, 3) uint8 BGR of the last frame of a video's first track before a place, 0..1
-    of its duration, at which decoding can begin, without reading the whole file.
-
-    Raises:
-        GsbaError: the file is no video, or nothing can be decoded.
-    """
+    of its duration, at which decoding can begin, without reading the whole file. GsbaError: the
+    file is no video, or nothing can be decoded."""
     av = _pyav()
     with _opened(video) as (container, streams):
         stream, end = streams[0], _claimed_end(container, streams[0])
