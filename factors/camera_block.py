@@ -47,15 +47,10 @@ class CameraBlock:
         polish_steps: int = 3,
         curved: bool = False,
     ) -> None:
-        """Fix the pattern.
-
-        Args:
-            points_world: (J, 3) start values, world.
-            loss: robust loss on each whitened residual norm; None is plain least squares.
-            polish_steps: Gauss-Newton steps on the landmarks after each proposed step.
-            curved: scale the Hessian by the mean curvature of the loss, part of its weights: steps
-                by these alone fall as short.
-        """
+        """Fix the pattern; landmarks (J, 3), world, start here and take polish_steps Gauss-Newton
+        steps after each proposed step. The loss is of each whitened residual norm; None is plain
+        least squares. curved: scale the Hessian by the mean curvature of the loss, part of its
+        weights: steps by these alone fall as short."""
         self.camera, self.loss = camera, loss or RobustLoss()
         self.num_threads, self.polish_steps = num_threads, polish_steps
         self.curved = curved

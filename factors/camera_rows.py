@@ -28,10 +28,8 @@ class Sightings(NamedTuple):
 
 
 class CameraRows(NamedTuple):
-    """The cameras' values, and what derivatives by their variables need.
-
-    L counts the lenses of all cameras, one camera after the other.
-    """
+    """The cameras' values, and what derivatives by their variables need; L counts the lenses of all
+    cameras, one camera after the other."""
 
     motions: np.ndarray  # (F, 6): of each frame during its readout, [rotation rad, translation]
     velocities: np.ndarray  # (F, 6): their derivative by the readout's duration

@@ -59,13 +59,10 @@ class BlockCholesky:
     """
 
     def __init__(self, num_blocks: int, pairs: np.ndarray, num_kept: int = 0) -> None:
-        """Choose an elimination order (minimum degree) and find the fill.
-
-        Args:
-            pairs: (P, 2) int, i < j, distinct: where off-diagonal blocks may be nonzero.
-            num_kept: K blocks, the last ones, that are not eliminated: `factorize` then leaves
-                their Schur complement, and `reduced` and `substituted` replace `solve`.
-        """
+        """Choose an elimination order (minimum degree) and find the fill, of off-diagonal blocks of
+        pairs (P, 2), i < j, distinct, that may be nonzero. The last num_kept blocks are not
+        eliminated: `factorize` then leaves their Schur complement, and `reduced` and `substituted`
+        replace `solve`."""
         self.num_blocks, self.num_kept = num_blocks, num_kept
         self.complement = _nothing()
         pairs = np.asarray(pairs, dtype=np.int64).reshape(-1, 2)

@@ -167,10 +167,8 @@ class LinearSystem:
 
 @dataclass(slots=True)
 class Eliminated:
-    """Sums of a linear least-squares problem whose landmarks are eliminated, run by run.
-
-    Variables are K of each frame and S of all frames.
-    """
+    """Sums of a linear least-squares problem whose landmarks are eliminated, run by run; variables
+    are K of each frame and S of all frames."""
 
     starts: np.ndarray  # (F + 1,) int64 and
     columns: np.ndarray  # (P,) int64: covisible frame pairs f < g as sorted CSR rows

@@ -99,11 +99,8 @@ class IterativeSystem(ReducedSystem):
     """
 
     def __init__(self, layout: SystemLayout, products: Mapping[int, Products]) -> None:
-        """Form groups of covisible frames, and the visits of landmarks by groups.
-
-        Args:
-            products: of those of the layout's blocks, by index, that are not written out.
-        """
+        """Form groups of covisible frames, and the visits of landmarks by groups; products: of
+        those of the layout's blocks, by index, that are not written out."""
         super().__init__(layout, products)
         self._products = products
         self._coarse: Coarse | None = None  # of an earlier system

@@ -58,15 +58,15 @@ class LandmarkBlock:
         """Sort the observations by landmark and frame.
 
         Args:
-            keys: (F,) keys of Pose3 variables.
-            points_world: (J, 3) start values, world.
-            terms: observations; frames index keys, points index points_world.
+            keys: (F,) keys of Pose3 variables, which frames of terms index.
+            points_world: (J, 3) start values, world, which points of terms index.
             loss: robust loss on each whitened residual norm; None is plain least squares.
             num_threads: None = number of cores, at most 16.
             polish_steps: Gauss-Newton steps on the landmarks after each proposed pose step.
 
         Raises:
-            ValueError: indices are out of range, values not finite, or arrays of unequal length.
+            ValueError: indices are out of range, values not finite, or arrays of unequal
+            length.
         """
         self.keys = [int(key) for key in keys]
         self.loss = loss or RobustLoss()

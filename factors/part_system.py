@@ -40,18 +40,11 @@ class PartSystem(NormalEquations):
 
 class PartElimination:
     """Cholesky factor of a part's own blocks, damped; the shared ones are damped by who sums them.
-
-    Attributes:
-        regular: False where the own blocks are not positive definite: nothing else holds then.
-    """
+    Where own blocks are not positive definite, it is not `regular`, and nothing else holds."""
 
     def __init__(self, equations: PartEquations, damping: float) -> None:
-        """Factorize.
-
-        Args:
-            damping: part of the diagonal that is added to it; 0 = none, and own blocks that
-                nothing constrains count as unit ones.
-        """
+        """Factorize, with a part of the diagonal added to it; 0 = none, and own blocks that nothing
+        constrains count as unit ones."""
         num = len(equations.diagonal)
         self._own, self._num_kept = slice(0, num - equations.num_kept), equations.num_kept
         self._gradient = equations.gradient

@@ -221,16 +221,9 @@ class PatchPixels:
     def __init__(
         self, table: PatchTable, world_T_rigs: np.ndarray, width: int, margin: float = 6.0
     ) -> None:
-        """Allocate templates; nothing is sampled yet.
-
-        Args:
-            world_T_rigs: (F, 4, 4) float64, poses that place the windows.
-            width: of the sphere images, pixels.
-            margin: pixels of that image at the equator.
-
-        Raises:
-            ValueError: the table is inconsistent, or does not fit the poses.
-        """
+        """Allocate templates, of which nothing is sampled yet, for windows that poses (F, 4, 4)
+        float64 place in sphere images of this width, with a margin in pixels of these at the
+        equator. ValueError: the table is inconsistent, or does not fit the poses."""
         table.check(len(world_T_rigs))
         self.table, self.width, self.margin = table, width, margin
         self.templates = np.full((len(table), len(table.grid)), 0.0, dtype=np.float32)

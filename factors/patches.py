@@ -40,17 +40,9 @@ class PatchSet:
     def __init__(
         self, num: int, size: int, window: float, affine_sigma: float, grey_sigma: float
     ) -> None:
-        """Allocate templates.
-
-        Args:
-            size: pixels across a patch, n, odd.
-            window: standard deviation of the Gaussian window, in half patches.
-            affine_sigma: standard deviation of the affine part's deviation from the prediction.
-            grey_sigma: noise of grey values.
-
-        Raises:
-            ValueError: the size is even.
-        """
+        """Allocate templates of n = size pixels across, odd, under a Gaussian window whose standard
+        deviation is in half patches; affine_sigma: of the affine part's deviation from the
+        prediction; grey_sigma: noise of grey values. ValueError: the size is even."""
         if size % 2 == 0 or size < 3:
             raise ValueError(f"a patch's size must be an odd number of pixels, not {size}")
         offsets = (np.arange(size) - size // 2) / (window * size / 2)

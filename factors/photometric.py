@@ -56,8 +56,7 @@ class PhotometricBlock:
             sigmas: (P,) or one, noise of a residual, grey values of a pixel in the host.
             loss: robust loss on the root mean square of a patch's whitened residuals, times the
                 number of its pixels; None is plain least squares.
-            weights: (O,) weights of observations, 0 leaves one out; None = 1.
-            num_threads: None = number of cores, at most 16.
+            weights: (O,) of observations, 0 leaves one out; None = 1.
             polish_steps: Gauss-Newton steps on the planes after each proposed pose step.
             floor: grey values added to every contrast in quadrature.
 

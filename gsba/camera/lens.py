@@ -27,11 +27,8 @@ def _back_to_back() -> np.ndarray:
 
 @dataclass(frozen=True, slots=True)
 class Lenses:
-    """The camera of a sequence. One centre, one instant by default.
-
-    The lenses' frame has its origin in the middle of the lenses' centres, and z along the front
-    lens's axis.
-    """
+    """The camera of a sequence. One centre, one instant by default. The lenses' frame has its
+    origin in the middle of the lenses' centres, and z along the front lens's axis."""
 
     centre: np.ndarray = field(default_factory=_centre)  # (3 (L - 1),) float64, centres of all
     # lenses but the last one, the front one first, lenses' frame, map units; the last one's is

@@ -29,12 +29,8 @@ class Stitcher:
     """Makes the panorama of one frame."""
 
     def __init__(self, lenses: Lenses, frame: int, scene: np.ndarray) -> None:
-        """Compute the offset from each direction of the rig to its direction in each lens.
-
-        Args:
-            frame: index of the frame in `lenses`.
-            scene: (N, 3) points in the rig frame of this frame, which give the depths.
-        """
+        """Compute the offset from each direction of the rig to its direction in each lens, in the
+        frame-th frame of the lenses, at the depths of scene points (N, 3), rig frame."""
         self._lenses = lenses.of_frame(frame)
         centres = (
             np.arange(pixels) + 0.5 for pixels in (_DEPTH_GRID_WIDTH, _DEPTH_GRID_WIDTH // 2)

@@ -147,10 +147,8 @@ class RadialProjection(ABC):
 
 @dataclass(frozen=True, slots=True)
 class FisheyeProjection(RadialProjection):
-    """r = f (th + k1 th^3 + k2 th^5 + k3 th^7 + k4 th^9) (Kannala and Brandt, PAMI 2006).
-
-    Without radial terms it is the equidistant lens.
-    """
+    """r = f (th + k1 th^3 + k2 th^5 + k3 th^7 + k4 th^9) (Kannala and Brandt, PAMI 2006); without
+    radial terms it is the equidistant lens."""
 
     radial_sigmas: ClassVar[tuple[float, ...]] = (0.05, 0.02, 0.005, 0.001)
 

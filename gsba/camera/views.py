@@ -278,12 +278,9 @@ class ViewCutter:
         frame: int,
         scene: np.ndarray | None = None,
     ) -> None:
-        """Compute the offset from each view's rays to directions in frame `frame` of the lenses.
-
-        Args:
-            scene: (N, 3) points in the rig frame of this frame, which give the depths; None =
-            everything is far. Rolling shutter is undone at these depths.
-        """
+        """Compute the offset from each view's rays to directions in the frame-th frame of the
+        lenses, at the depths of scene points (N, 3), rig frame; None = everything is far. Rolling
+        shutter is undone at these depths."""
         self._views = views
         self._offsets = [_offsets(view, lenses, frame, scene) for view in views]
         self._turn = np.eye(3) if lenses.axes is None else lenses.axes[frame]

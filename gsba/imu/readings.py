@@ -25,10 +25,8 @@ class Sensor:
 
 @dataclass(frozen=True, slots=True)
 class Readings:
-    """Readings of a gyro and an accelerometer with common axes, right-handed, fixed to the camera.
-
-    Their rotation against the camera and the gyro's bias are not known.
-    """
+    """Readings of a gyro and an accelerometer with common axes, right-handed, fixed to the camera;
+    their rotation against the camera and the gyro's bias are not known."""
 
     timestamps: np.ndarray  # (N,) float64, seconds on a clock of their own, strictly increasing
     rates: np.ndarray  # (N, 3) float64, rad/s

@@ -56,14 +56,8 @@ def _superpoint_name(name: str) -> str:
 
 
 class SuperGlue:
-    """SuperGlue (Sarlin et al., CVPR 2020) between SuperPoint keypoints of two faces.
-
-    Args:
-        weights: file of either layout.
-
-    Raises:
-        GsbaError: the weights are of another network.
-    """
+    """SuperGlue (Sarlin et al., CVPR 2020) between SuperPoint keypoints of two faces, with weights
+    of either layout. GsbaError: they are of another network."""
 
     def __init__(self, weights: Path) -> None:
         model = SuperGlueForKeypointMatching(SuperGlueConfig(matching_threshold=0.2))

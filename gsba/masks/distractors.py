@@ -90,18 +90,12 @@ class _StoredMasks:
 
 
 class StaticScene:
-    """A solved map, prepared to search frames one by one, from any thread.
+    """A solved map, prepared to search frames of any layout one by one, from any thread.
 
-    Small pictures are kept in memory up to a limit; the others are read again.
-
-    Args:
-        frames: of any layout; masked pixels are neither compared nor marked.
-        world_T_rigs: (F, 4, 4) solved poses.
-        landmarks: the solved points.
-        known: distractors (h, w) bool of a frame found before: they are not compared, and stay
-            marked where too few neighbours are left to judge.
-        limit_mb: limit of memory for pictures, MB.
-        neighbours: neighbours of frames to search, if other frames are left out.
+    Masked pixels are neither compared nor marked, nor are distractors (h, w) bool of a frame found
+    before, which stay marked where too few neighbours are left to judge. Small pictures are kept in
+    memory up to a limit in MB; the others are read again. neighbours: of frames to search, if other
+    frames are left out.
     """
 
     def __init__(

@@ -270,13 +270,9 @@ class _Once(Generic[T]):
 
 
 class SearchableFrames:
-    """Features of frames, prepared for matching; read on demand, the most recent ones are kept.
-
-    Args:
-        strongest: keypoints of a face to match, None for all.
-        capacity: frames kept in memory.
-        axes: axes of the descriptors, see `searchable`; None = those of frame 0.
-    """
+    """Features of frames, prepared for matching, the strongest of a face or all; read on demand,
+    the most recent ones, up to a capacity, are kept. For axes of descriptors see `searchable`; None
+    = those of frame 0."""
 
     def __init__(
         self,

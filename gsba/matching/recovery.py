@@ -321,16 +321,13 @@ def _is_supported(
 
 
 def _with_consistent_scale(context: MatchContext, found: VerifiedPairs) -> VerifiedPairs:
-    """Neighbours without steps that are many times too short, by points common to two steps.
+    """Neighbours, found without a trajectory, without steps that are many times too short, by
+    points common to two steps.
 
     Where a floor's pattern is matched one tile further on, relative poses look right. One of the
     two steps is dropped there, and pairs over it: the map splits, and the test of joins may rejoin
     it. Steps that share too few points for a ratio of their lengths are first matched with all
     keypoints.
-
-    Args:
-        context: features and settings of a run without a trajectory.
-        found: neighbours.
     """
     open_at = _frames_of_open_ratio(context, found)[0]
     found = match_again(context, found, {step for f in open_at for step in (f - 1, f)})

@@ -55,15 +55,7 @@ class _Attempt:
 
 @dataclass(slots=True)
 class Tracker:
-    """State of the odometry between frames.
-
-    Attributes:
-        records: of all frames so far.
-        keyframe_poses: (4, 4) each, of all keyframes so far, in the world of their map.
-        keyframe_frames: index of each keyframe's frame.
-        keyframe_features: of each keyframe, its features: ids (N,) int64, and bearings
-            (N, 3) float32, rig frame.
-    """
+    """State of the odometry between frames."""
 
     width: int  # pixels across the panoramas
     usable: np.ndarray | None = None  # (h, 2h) bool, pixels that show the scene in every frame

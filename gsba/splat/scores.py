@@ -28,14 +28,8 @@ _MIN_SIZE_PX = {"alex": 32, "vgg": 16}  # least pixels of an image that leave so
 
 
 class Lpips:
-    """The LPIPS distance, on AlexNet or VGG16 as given by the weights.
-
-    Args:
-        paths: files of weights; see above.
-
-    Raises:
-        GsbaError: torch is not installed, or the files hold no such weights.
-    """
+    """The LPIPS distance, on AlexNet or VGG16 as given by the files of weights, see above.
+    GsbaError: torch is not installed, or the files hold no such weights."""
 
     def __init__(self, paths: Sequence[Path]) -> None:
         try:
@@ -66,15 +60,8 @@ class Lpips:
     def __call__(
         self, image: np.ndarray, truth: np.ndarray, use: np.ndarray | None = None
     ) -> float:
-        """Distance of two images; 0 for equal ones.
-
-        Args:
-            image, truth: (H, W, 3), values 0..1.
-            use: (H, W) bool, pixels that count; the others count as equal in both images.
-
-        Raises:
-            GsbaError: the images are too small for the network.
-        """
+        """Distance of two images (H, W, 3), values 0..1; 0 for equal ones. Pixels not in `use (H,
+        W)` count as equal in both. GsbaError: the images are too small for the network."""
         torch, least = self._torch, _MIN_SIZE_PX[self.net]
         if min(image.shape[:2]) < least:
             raise GsbaError(f"LPIPS on {self.net} needs faces of {least} pixels or more")

@@ -205,11 +205,7 @@ def extent_of(places: np.ndarray) -> float:
 
 
 class Trainer:
-    """Inputs that are constant over all steps.
-
-    Raises:
-        GsbaError: all pixels are masked.
-    """
+    """Inputs that are constant over all steps. GsbaError: all pixels are masked."""
 
     def __init__(self, views: Views, settings: SplatSettings, backend: Backend) -> None:
         if views.num_pixels == 0:
