@@ -128,7 +128,12 @@ def band_of(picture: np.ndarray) -> np.ndarray:
 
 def find_turns(bands: np.ndarray) -> np.ndarray:
     """Rotation (F,) float64 of the carrier in each frame, radians, to the right, relative to the
-    first one, by grey levels (F, r, WIDTH) float32 of the lowest rows of each picture."""
+    first one, by grey levels (F, r, WIDTH) float32 of the lowest rows of each picture.
+
+    With direction lock the picture keeps its heading, so that the carrier turns in it: its columns
+    shift as a whole, while the floor moves differently. A template and each frame's shift against
+    it are estimated in turn, every pixel weighted by its stability.
+    """
     levels = bands.mean(axis=(1, 2), keepdims=True)
     even = bands / np.maximum(levels, 1.0) * levels.mean()
     spectra = np.fft.rfft(even, axis=-1)

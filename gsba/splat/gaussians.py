@@ -108,7 +108,12 @@ def from_cloud(
 
 
 def write_ply(path: Path, gaussians: Gaussians) -> None:
-    """Write a splat, atomically by renaming. GsbaError: the file cannot be written."""
+    """Write a splat in the layout of INRIA's 3D Gaussian Splatting, atomically by renaming.
+
+    Properties, all float32: `x y z nx ny nz f_dc_0..2 f_rest_0.. opacity scale_0..2 rot_0..3`.
+    f_rest holds all coefficients of red, then green, then blue; opacity is a logit, scales are
+    logarithms, the rotation is wxyz. GsbaError: the file cannot be written.
+    """
     num = len(gaussians)
     names = _names(gaussians.sh.shape[1])
     rest = gaussians.sh[:, 1:].transpose(0, 2, 1).reshape(num, -1)
@@ -121,8 +126,9 @@ def write_ply(path: Path, gaussians: Gaussians) -> None:
 
 
 def read_ply(path: Path) -> Gaussians:
-    """Read a splat of degree 0 to 3. GsbaError: the file is unreadable, no PLY of a splat,
-    truncated, or holds values that are not finite."""
+    """Read a splat of degree 0 to 3, its properties by name: other writers leave out or reorder
+    some. GsbaError: the file is unreadable, no PLY of a splat, truncated, or holds values that are
+    not finite."""
     rows = read_vertices(path)
     num, names = len(rows), rows.dtype.names or ()
     num_rest = sum(name.startswith("f_rest_") for name in names)

@@ -28,8 +28,14 @@ _MIN_SIZE_PX = {"alex": 32, "vgg": 16}  # least pixels of an image that leave so
 
 
 class Lpips:
-    """The LPIPS distance, on AlexNet or VGG16 as given by the files of weights, see above.
-    GsbaError: torch is not installed, or the files hold no such weights."""
+    """The LPIPS distance (Zhang et al., The Unreasonable Effectiveness of Deep Features, CVPR
+    2018), on AlexNet or VGG16 as given by files of weights; nothing is downloaded.
+
+    They are those of `torch.save(lpips.LPIPS(net="alex").state_dict(), FILE)` in the authors'
+    package (BSD-2-Clause), or two files: a backbone of torchvision (`alexnet-…pth` or `vgg16-…pth`)
+    and the authors' linear heads (`lpips/weights/v0.1/alex.pth`). GsbaError: torch is not
+    installed, or the files hold no such weights.
+    """
 
     def __init__(self, paths: Sequence[Path]) -> None:
         try:

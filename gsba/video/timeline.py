@@ -51,7 +51,9 @@ _ORIENTATIONS = {  # EXIF's, of the signs of a, b, c, d of a display matrix
 
 @dataclass(frozen=True, slots=True)
 class PictureClaims:
-    """Claims about the pictures of a video track."""
+    """Claims about the pictures of a video track, which FFmpeg reads from MP4 (`tkhd`, `pasp`,
+    `st3d`, `sv3d`), Matroska and the bitstream: records AVStereo3D and AVSphericalMapping of
+    libavutil."""
 
     orientation: int = 1  # of EXIF, 1 to 8, in which stored pictures are shown
     pixel_aspect: Fraction = Fraction(1)  # width over height of a pixel
