@@ -171,12 +171,6 @@ class ObservedPoints:
         """Their factor block."""
         return landmark_block(self.landmarks, self.keypoints, self.noise, self.context)
 
-    def covariances_in_parts(self, terms: Terms) -> tuple[np.ndarray, JointErrors] | None:
-        """Covariances of poses, as `pose_covariances`; None where the map is not divided."""
-        division, map_ = self.context.division, self._divisible(terms)
-        seed = self.context.settings.seed
-        return division.covariances(map_, DRAWS, seed) if division and map_ else None
-
     def _terms_of(self, landmarks: Landmarks) -> list[Term]:
         return self.context.families.landmark_terms(landmarks, self.keypoints, self.noise)
 
@@ -406,7 +400,8 @@ def pose_covariances(
     """Marginal covariances (F, 6, 6) with the first pose and the extent of each map held fixed."""
     terms, seed = context.covariance_terms(solved, components), context.settings.seed
     observed = ObservedPoints(solved.landmarks, keypoints, solved.noise, context)
-    found = observed.covariances_in_parts(terms)
+    division, map_ = context.division, observed._divisible(terms)
+    found = division.covariances(map_, DRAWS, seed) if division and map_ else None
     if found is not None:
         return found
     keys = [pose_variables.X(f) for f in range(len(solved.world_T_rigs))]

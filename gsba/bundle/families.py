@@ -366,24 +366,21 @@ class Bearings(Family):
     def landmark_terms(self, observed: PointObservations) -> Sequence[Term]:
         """One bearing an observation, as noisy as on its face: a circle of pixels is an ellipse on
         the sphere."""
+        roots = observed.sqrt_infos
+        if roots is None:
+            roots = np.empty((len(observed.faces), 2, 2))
+            axes = np.ascontiguousarray(RIG_R_FACE[:, :, 2])
+            face_roots(observed.bearings_rig, axes, observed.faces, observed.sigmas_rad, roots)
         return [
             BearingTerm(
                 observed.frames,
                 observed.points,
                 observed.bearings_rig,
                 observed.sigmas_rad,
-                _face_roots(observed) if observed.sqrt_infos is None else observed.sqrt_infos,
+                roots,
                 origins_rig=observed.origins_rig,
             )
         ]
-
-
-def _face_roots(observed: PointObservations) -> np.ndarray:
-    """Square-root information (O, 2, 2), 1/rad on `tangent_basis`, of noise equal on face axes."""
-    roots = np.empty((len(observed.faces), 2, 2))
-    axes = np.ascontiguousarray(RIG_R_FACE[:, :, 2])
-    face_roots(observed.bearings_rig, axes, observed.faces, observed.sigmas_rad, roots)
-    return roots
 
 
 @dataclass(frozen=True, slots=True)

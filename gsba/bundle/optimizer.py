@@ -169,7 +169,11 @@ def minimize(
         if settings.absolute_tolerance is not None:
             negligible = min(negligible, settings.absolute_tolerance)
         used = damping.value
-        trial, trial_cost, predicted = _attempt(system, values, used)
+        steps = system.solve(used)
+        trial, trial_cost, predicted = values, np.inf, np.inf
+        if steps is not None:
+            trial = system.retract(values, steps)
+            trial_cost, predicted = system.propose(trial, steps), system.predicted_decrease()
         if not trial_cost <= cost:  # also where it is not a number
             history.add(values, trial_cost, {}, used, False)
             if predicted <= negligible:
@@ -189,17 +193,6 @@ def minimize(
         if converged:
             return result(True, f"decrease below {negligible:.3g}")
     return result(False, "iteration limit")
-
-
-def _attempt(
-    system: System, values: gtsam.Values, damping: float
-) -> tuple[gtsam.Values, float, float]:
-    """Values after one damped step, their cost and the decrease that the model expected."""
-    steps = system.solve(damping)
-    if steps is None:
-        return values, np.inf, np.inf
-    trial = system.retract(values, steps)
-    return trial, system.propose(trial, steps), system.predicted_decrease()
 
 
 @threadpool_limits.wrap(limits=1, user_api="blas")

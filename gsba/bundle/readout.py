@@ -68,7 +68,12 @@ def estimate(
     shown: (N, 3) their directions in the pictures: these tell rows."""
     turning = turning_of(lenses, context)
     motion = velocities(solved.world_T_rigs, timestamps, turning, context.maps)
-    offsets = _offsets(landmarks, keypoints, solved) if motion[:, :3].any() else None
+    offsets = None
+    if motion[:, :3].any():  # points in the rig frames of the keypoints that see them; 0 = none
+        tracks, offsets = landmarks.tracks, np.zeros((len(keypoints.faces), 3))
+        poses = solved.world_T_rigs[tracks.frames]
+        from_rigs = landmarks.points_world[tracks.points] - poses[:, :3, 3]
+        offsets[keypoints.rows(tracks)] = np.einsum("oji,oj->oi", poses[:, :3, :3], from_rigs)
     ways, frames = _ways(context.settings.camera, lenses), keypoints.frames()
     times = np.stack([lenses.fractions(shown, frames, way) for way in ways], axis=1)
 
@@ -122,15 +127,6 @@ def own_sigmas(found: CameraEstimate, motion: np.ndarray) -> np.ndarray:
     # from axes of their own, a stabiliser has removed rotations
     turn = _ROTATION_SIGMA_RAD if found.lenses.axes is None else np.deg2rad(0.005)
     return np.repeat([turn, move], 3)
-
-
-def _offsets(landmarks: Landmarks, keypoints: Keypoints, solved: Solution) -> np.ndarray:
-    """Points (N, 3) in the rig frames of the keypoints that see them; 0 = none."""
-    tracks, offsets = landmarks.tracks, np.zeros((len(keypoints.faces), 3))
-    poses = solved.world_T_rigs[tracks.frames]
-    from_rigs = landmarks.points_world[tracks.points] - poses[:, :3, 3]
-    offsets[keypoints.rows(tracks)] = np.einsum("oji,oj->oi", poses[:, :3, :3], from_rigs)
-    return offsets
 
 
 def turning_of(lenses: Lenses, context: AdjustmentContext) -> GyroConstraints | None:

@@ -17,20 +17,14 @@ from gsba.camera.fisheye import Rig, facing, optical_axes, pixels_of, recalibrat
 from gsba.geometry import pose
 
 
-def _centre() -> np.ndarray:
-    return np.zeros(3)
-
-
-def _back_to_back() -> np.ndarray:
-    return np.array([[0.0, 0, 1], [0, 0, -1]])
-
-
 @dataclass(frozen=True, slots=True)
 class Lenses:
     """The camera of a sequence. One centre, one instant by default. The lenses' frame has its
     origin in the middle of the lenses' centres, and z along the front lens's axis."""
 
-    centre: np.ndarray = field(default_factory=_centre)  # (3 (L - 1),) float64, centres of all
+    centre: np.ndarray = field(
+        default_factory=lambda: np.zeros(3)
+    )  # (3 (L - 1),) float64, centres of all
     # lenses but the last one, the front one first, lenses' frame, map units; the last one's is
     # minus their sum: of a pair it is opposite
     inverse_stitch_radius: float = 0.0  # 1 / map units; 0 = panoramas are stitched at infinity
@@ -44,8 +38,8 @@ class Lenses:
     reference_calibration: Rig | None = None  # by which panoramas of raw pairs were cut; None =
     # the frames are panoramas
     fisheyes: Rig | None = None  # lenses of raw pairs as estimated; None = reference_calibration
-    optical_axes: np.ndarray = field(default_factory=_back_to_back)  # (L, 3) float64, unit, lenses'
-    # frame: each direction is seen by the lens whose axis is nearest
+    optical_axes: np.ndarray = field(default_factory=lambda: np.array([[0.0, 0, 1], [0, 0, -1]]))
+    # (L, 3) float64, unit, lenses' frame: each direction is seen by the lens whose axis is nearest
 
     def __bool__(self) -> bool:
         return bool(self.centre.any()) or self.fisheyes is not None

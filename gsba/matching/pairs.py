@@ -42,11 +42,9 @@ def covisible(
     ).reshape(-1, 2)
     lengths = np.linalg.norm(rigs_in_world[window[:, 0]] - rigs_in_world[window[:, 1]], axis=1)
     window = window[(lengths < reach) | (window[:, 1] - window[:, 0] <= 2)]
-
-    def far_in_time(f: int, near: np.ndarray, _distances: np.ndarray) -> np.ndarray:
-        return np.abs(near - f) > settings.window
-
-    return window, _nearest(rigs_in_world, reach, settings, far_in_time)
+    return window, _nearest(
+        rigs_in_world, reach, settings, lambda f, near, _: np.abs(near - f) > settings.window
+    )
 
 
 def across(
@@ -55,11 +53,7 @@ def across(
     """Pairs (P, 2) int32, f0 < f1, the closest in space first, of frames of different parts (F,)
     that should see the same things; see `covisible`."""
     reach = settings.max_baseline_depths * median_depth
-
-    def of_others(f: int, near: np.ndarray, _distances: np.ndarray) -> np.ndarray:
-        return parts[near] != parts[f]
-
-    return _nearest(rigs_in_world, reach, settings, of_others)
+    return _nearest(rigs_in_world, reach, settings, lambda f, near, _: parts[near] != parts[f])
 
 
 def closing(rigs_in_world: np.ndarray, median_depth: float, settings: PairSettings) -> np.ndarray:

@@ -19,7 +19,6 @@ from gsba.matching import recovery
 from gsba.odometry.places import KeyframePlaces, chosen_keyframes, described, make_places
 from gsba.odometry.pose_graph import (
     Constraint,
-    MeasuredSteps,
     close_loops,
     covariances_of,
     measure_steps,
@@ -336,7 +335,10 @@ def _joined(
 
 
 def _closed(
-    found: ClosedKeyframes, keys: np.ndarray, places: KeyframePlaces, steps: MeasuredSteps
+    found: ClosedKeyframes,
+    keys: np.ndarray,
+    places: KeyframePlaces,
+    steps: tuple[np.ndarray, np.ndarray],
 ) -> ClosedKeyframes:
     """The map of some keyframes (N,) with its loops closed, and the covariances of its poses."""
     poses, scales = found.world_T_keys[keys], found.scales[keys]
@@ -353,14 +355,15 @@ def _closed(
 
     joins = [of_keys(one) for one in find_joins(some)]
     loops = [of_keys(one) for one in find_loops(some, np.diff(some.maps) != 0)]
+    parents, covariances_of_steps = steps
     measured = []
     for k, key in enumerate(keys.tolist()):
-        if steps.parents[key] < 0:
+        if parents[key] < 0:
             continue
-        parent = row_of[int(steps.parents[key])]
+        parent = row_of[int(parents[key])]
         step = inverse(poses[parent]) @ poses[k]
         units = np.array([1.0] * 3 + [scales[k]] * 3 + [1.0])
-        covariance = steps.covariances[key] * np.outer(units, units)
+        covariance = covariances_of_steps[key] * np.outer(units, units)
         measured.append(Constraint(parent, k, Sim3.of(1.0, step), covariance))
     path = [*measured, *joins]
     since = np.ones(len(keys))  # changes of scale after joining

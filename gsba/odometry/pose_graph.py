@@ -160,22 +160,14 @@ _UNKNOWN = np.deg2rad(2.0), 0.1, 0.05  # standard deviations of a step without c
 # rotation, translation in median distances, log scale
 
 
-@dataclass(frozen=True, slots=True)
-class MeasuredSteps:
-    """The step to each keyframe from its parent."""
-
-    parents: np.ndarray  # (K,) int64, keyframe it was tracked from; -1 = the first of its map
-    covariances: np.ndarray  # (K, 7, 7) float64, tangent [rotation, translation, log scale] on the
-    # right, units of the keyframe
-
-
 def measure_steps(
     features: Sequence[tuple[np.ndarray, np.ndarray]],
     world_T_keys: np.ndarray,
     maps: np.ndarray,
     distances: np.ndarray,
-) -> MeasuredSteps:
-    """Covariances of steps between keyframes, from common features; scale included.
+) -> tuple[np.ndarray, np.ndarray]:
+    """Keyframe (K,) int64 that each was tracked from, -1 = the first of its map, and covariances
+    (K, 7, 7) of the steps between both, from common features, as of a `Constraint`.
 
     Rotation and translation: information of the directions to points that the parent observes too.
     Scale: a point propagates it as accurately as the triangulation angle between its first keyframe
@@ -210,7 +202,7 @@ def measure_steps(
         origins = world_T_keys[first_seen[ids[rows]], :3, 3]
         given = points[ids[rows]], bearings[rows].astype(float), world_T_keys[k], origins
         covariances[k] = _covariance(*given, float(distances[k]))
-    return MeasuredSteps(parents, covariances)
+    return parents, covariances
 
 
 def _covariance(

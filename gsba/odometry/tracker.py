@@ -120,11 +120,11 @@ class Tracker:
             self._lose(grey, small, frame)
             return
         key.most_found = max(key.most_found, len(ids))
-        turn = median_turn(one, other)
-        world_R_rig = key.world_T_rig[:3, :3] @ turn.one_R_other
+        one_R_other, parallaxes = median_turn(one, other)
+        world_R_rig = key.world_T_rig[:3, :3] @ one_R_other
         fading = len(ids) < 0.7 * key.most_found  # less parallax suffices then
         seed = self.seed + frame
-        solved = start_map(ids, one, other, turn, self.state.sigma, seed, fading)
+        solved = start_map(ids, one, other, parallaxes, self.state.sigma, seed, fading)
         self.state.failures = 0
         if solved is not None:
             self._start(frame, solved, atlas, small, ids, other)

@@ -117,10 +117,6 @@ def _key(panoramas: SmallPanoramas, seed: int, patience: int) -> str:
 logger = logging.getLogger(__name__)
 
 
-def _no_pairs() -> np.ndarray:
-    return np.zeros((0, 2), np.int64)
-
-
 @dataclass(frozen=True, slots=True)
 class Stretch:
     """Frames in a row."""
@@ -146,10 +142,10 @@ class Odometry:
     covariances: np.ndarray | None = None  # (F, 6, 6) float64, of poses: tangent [rotation rad,
     # translation], map units; the first pose of each map and its distance to the furthest are held;
     # NaN and None = not known
-    loops: np.ndarray = field(default_factory=_no_pairs)  # (L, 2) int64, frames of loops within a
-    # map
-    joins: np.ndarray = field(default_factory=_no_pairs)  # (M, 2) int64, frames at which a map was
-    # joined to an earlier one
+    loops: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), np.int64))
+    # (L, 2) int64, frames of loops within a map
+    joins: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), np.int64))
+    # (M, 2) int64, frames at which a map was joined to an earlier one
     closing_cpu_s: float = 0.0  # processor time of joining maps and closing loops
 
     def __len__(self) -> int:

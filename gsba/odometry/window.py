@@ -111,30 +111,23 @@ _VERIFY = TwoViewLimits(max_error_deg=0.3)
 _GATE = 4.0  # standard deviations
 
 
-@dataclass(frozen=True, slots=True)
-class StartTurn:
-    """The rotation that explains most features of two frames, and residuals."""
-
-    one_R_other: np.ndarray  # (3, 3) float64
-    parallaxes: np.ndarray  # (N,) float64, radians, residual of each feature under the rotation
-
-
-def median_turn(one: np.ndarray, other: np.ndarray) -> StartTurn:
-    """The rotation that maps most bearings (N, 3) of the other frame onto those of the first."""
+def median_turn(one: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation (3, 3) that maps most bearings (N, 3) of the other frame onto those of the first, and
+    parallaxes (N,) rad, the residual of each feature under it."""
     near, rotation = np.ones(len(one), bool), np.eye(3)
     off = np.zeros(len(one))
     for _ in range(6 if len(one) >= 3 else 0):  # without the features that are furthest off
         rotation = nearest_rotation(one[near].T @ other[near])
         off = angles_between(one, other @ rotation.T)
         near = off <= np.median(off)
-    return StartTurn(rotation, off)
+    return rotation, off
 
 
 def start_map(
     ids: np.ndarray,
     one: np.ndarray,
     other: np.ndarray,
-    turn: StartTurn,
+    parallaxes: np.ndarray,
     sigma: float,
     seed: int,
     fading: bool,
@@ -143,7 +136,7 @@ def start_map(
     None if the camera may have rotated only. The first pose is the identity; the median distance of
     points from it is 1. fading: features are being lost; then little parallax suffices."""
     moved = _MOVED_LITTLE if fading else _MOVED
-    if len(ids) < _MIN_POINTS or np.quantile(turn.parallaxes, 0.75) < moved:
+    if len(ids) < _MIN_POINTS or np.quantile(parallaxes, 0.75) < moved:
         return None
     found = relative_pose(one, other, _VERIFY, seed)
     if found is None or found.direction_sigma > np.deg2rad(6.0):

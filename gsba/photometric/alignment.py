@@ -93,11 +93,11 @@ def align(
             chosen = np.zeros(len(rows), bool)
             chosen[points] = True
             some = replace(solved, landmarks=landmarks.of(chosen))
-            patches = _align_some(some, observed, greys, settings, workers, lenses, name, dropped)
-            normals_world[points] = patches.normals_world
-            num_found += len(patches.found)
-            yield patches.found.of(points)
-            yield patches.at_hosts.of(points)
+            given = observed, greys, settings, workers, lenses, name, dropped
+            found, at_hosts, normals_world[points] = _align_some(some, *given)
+            num_found += len(found)
+            yield found.of(points)
+            yield at_hosts.of(points)
             release_mapped_files()
 
     folder, keypoints = observed.folder, observed.keypoints
@@ -127,15 +127,6 @@ def _by_hosts(hosts: np.ndarray, positions: np.ndarray) -> Iterator[np.ndarray]:
         yield np.sort(order[some])
 
 
-@dataclass(frozen=True, slots=True)
-class _Aligned:
-    """Observations of some points by their patches."""
-
-    found: Observed  # in other frames
-    at_hosts: Observed
-    normals_world: np.ndarray  # (J, 3) of the surfaces, zero = unknown
-
-
 def _align_some(
     solved: Solution,
     observed: Observations,
@@ -145,8 +136,9 @@ def _align_some(
     lenses: Cameras,
     name: str,
     dropped: dict[str, int],
-) -> _Aligned:
-    """As `align`, of the points of a solution; rejections are added to `dropped`."""
+) -> tuple[Observed, Observed, np.ndarray]:
+    """Observations of a solution's points by their patches, in other frames and in their hosts, and
+    normals (J, 3) of the surfaces, world, zero = unknown; rejections are added to `dropped`."""
     landmarks, world_T_rigs = solved.landmarks, solved.world_T_rigs
     keypoints, field = observed.keypoints, observed.field
     rows = references(landmarks, world_T_rigs)
@@ -162,7 +154,11 @@ def _align_some(
         extended[tracks.points[observed.aligned[keypoints.rows(tracks)]]] = True
     views = visible_frames(landmarks, world_T_rigs, rows, extended)
     map_, threads = (landmarks, planes, world_T_rigs), workers.num_threads
-    points, seeing = _unblended(*map_, hosts, *views, lenses, threads)
+    points, seeing = views
+    if lenses:  # outside the band where two pictures are blended
+        at, _, _ = _projected_patches(*map_, *views, lenses, threads)
+        clear = ~(lenses.blended(planes.origins, hosts)[points] | lenses.blended(at, seeing))
+        points, seeing = points[clear], seeing[clear]
     at, across, rays = _projected_patches(*map_, points, seeing, lenses, threads)
     sightings = expect(points, field.observed(at), across)
     title, cut = f"{name}: templates", (planes.origins, planes.tilted)
@@ -184,7 +180,7 @@ def _align_some(
     at_hosts = at_hosts.enlarged(enlarged[at_hosts.frames])
     shown = found.bearings_rig, rays[kept]
     normals_world = _normals_world(sightings, kept, *shown, planes, world_T_rigs[hosts], threads)
-    return _Aligned(found, at_hosts, normals_world)
+    return found, at_hosts, normals_world
 
 
 def _planes(
@@ -211,25 +207,6 @@ def _planes(
     away = world_T_hosts[:, :3, :3] * depths[:, None, None]
     rays = np.einsum("jab,jb->ja", away, origins)
     return _Planes(origins, spreads, slopes, tilted, away @ tilted, rays)
-
-
-def _unblended(
-    landmarks: Landmarks,
-    planes: _Planes,
-    world_T_rigs: np.ndarray,
-    hosts: np.ndarray,
-    points: np.ndarray,
-    frames: np.ndarray,
-    lenses: Cameras,
-    num_threads: int,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Views of points (O,) in frames (O,) outside the band where two pictures are blended."""
-    if not lenses:
-        return points, frames
-    given = landmarks, planes, world_T_rigs, points, frames, lenses, num_threads
-    at, _, _ = _projected_patches(*given)
-    clear = ~(lenses.blended(planes.origins, hosts)[points] | lenses.blended(at, frames))
-    return points[clear], frames[clear]
 
 
 def _projected_patches(
