@@ -22,11 +22,9 @@ class Lenses:
     """The camera of a sequence. One centre, one instant by default. The lenses' frame has its
     origin in the middle of the lenses' centres, and z along the front lens's axis."""
 
-    centre: np.ndarray = field(
-        default_factory=lambda: np.zeros(3)
-    )  # (3 (L - 1),) float64, centres of all
-    # lenses but the last one, the front one first, lenses' frame, map units; the last one's is
-    # minus their sum: of a pair it is opposite
+    centre: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    # (3 (L - 1),) float64, centres of all lenses but the last one, the front one first, lenses'
+    # frame, map units; the last one's is minus their sum: of a pair it is opposite
     inverse_stitch_radius: float = 0.0  # 1 / map units; 0 = panoramas are stitched at infinity
     band_rad: float = 0.0  # half width of the seam's band in which both lenses are blended
     row_directions: np.ndarray | None = None  # (L, 3) float64, unit, lenses' frame: direction in

@@ -112,8 +112,8 @@ _GATE = 4.0  # standard deviations
 
 
 def median_turn(one: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation (3, 3) that maps most bearings (N, 3) of the other frame onto those of the first, and
-    parallaxes (N,) rad, the residual of each feature under it."""
+    """Rotation (3, 3) that maps most bearings (N, 3) of the other frame onto those of the first,
+    and parallaxes (N,) rad, the residual of each feature under it."""
     near, rotation = np.ones(len(one), bool), np.eye(3)
     off = np.zeros(len(one))
     for _ in range(6 if len(one) >= 3 else 0):  # without the features that are furthest off
