@@ -20,7 +20,6 @@ from factors.compiled import kernel_and_part
 from factors.robust import rho_and_weight
 
 _EPS = 1e-300  # guards divisions by a squared norm
-_LEAST_HESSIAN = 1e-12  # of a landmark's trace
 _BEHIND = 1e-12  # sine of the angle below which no direction leads back to the measured one
 
 _kernel, _part = kernel_and_part(fastmath={"contract"})
@@ -346,7 +345,7 @@ def _add_normal(normal, residual, by_point, weight):
 @_part
 def _step_of(normal, damping):
     """Gauss-Newton step of a landmark, negated, damped by part of its Hessian's trace."""
-    eps = (_LEAST_HESSIAN + damping) * (normal[0] + normal[3] + normal[5]) + 1e-200
+    eps = (1e-12 + damping) * (normal[0] + normal[3] + normal[5]) + 1e-200
     a, b, c, d = normal[0] + eps, normal[1], normal[2], normal[3] + eps
     l00 = np.sqrt(a)
     l10, l20 = b / l00, c / l00

@@ -117,12 +117,9 @@ class Term(Protocol):
 def sort_observations(
     terms: Sequence[Term], num_frames: int, num_points: int, loss: RobustLoss
 ) -> tuple[Observations, np.ndarray, np.ndarray]:
-    """Order landmarks by first and last frame, observations by landmark and frame.
-
-    Returns:
-        The observations; the row of each among the terms back to back, (O,) int32; the original row
-        of each landmark, (J,).
-    """
+    """Order landmarks by first and last frame, observations by landmark and frame. Returns these;
+    the row of each among the terms back to back, (O,) int32; the original row of each landmark,
+    (J,)."""
     lengths = [len(term.frames) for term in terms]
     frames = np.zeros(sum(lengths), dtype=np.int32)
     owners = np.zeros_like(frames)
@@ -181,12 +178,8 @@ def _measurements(terms: Sequence[Term]) -> Iterator[np.ndarray]:
 
 
 def visits_of(offsets: np.ndarray, frames: np.ndarray, num_frames: int, most: int) -> list[Visits]:
-    """Visits of observations sorted by landmark, then frame, cut into runs of landmarks.
-
-    Args:
-        offsets (J + 1,), frames (O,): observations by landmark.
-        most: limit on a run's visits, exceeded by its last landmark only.
-    """
+    """Visits of observations by landmark (offsets (J + 1,)), then frame (O,), cut into runs of
+    landmarks of at most so many visits, exceeded by a run's last landmark only."""
     owners = np.repeat(np.arange(len(offsets) - 1, dtype=np.int32), np.diff(offsets))
     new = np.ones(len(frames), dtype=bool)
     new[1:] = (frames[1:] != frames[:-1]) | (owners[1:] != owners[:-1])
@@ -209,14 +202,9 @@ def visits_of(offsets: np.ndarray, frames: np.ndarray, num_frames: int, most: in
 def covisible_pairs(
     offsets: np.ndarray, frames: np.ndarray, num_frames: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Frame pairs f < g with a common landmark, as sorted CSR rows.
-
-    Args:
-        offsets (J + 1,), frames (O,): observations by landmark.
-
-    Returns:
-        starts (F + 1,) and columns (P,), int64; number of landmarks each two share, (P,) float32.
-    """
+    """Frame pairs f < g with a common landmark, of observations by landmark (offsets (J + 1,),
+    frames (O,)), as sorted CSR rows: starts (F + 1,) and columns (P,), int64; and the number of
+    landmarks that each two share, (P,) float32."""
     num_points = len(offsets) - 1
     owners = np.repeat(np.arange(num_points), np.diff(offsets))
     ones = np.ones(len(owners), dtype=np.float32)
@@ -231,11 +219,8 @@ def covisible_pairs(
 
 
 def check_term(term: Term, num_frames: int, num_points: int) -> None:
-    """Refuse a term that is inconsistent with its block.
-
-    Raises:
-        ValueError: arrays have unequal lengths, indices are out of range, or values not finite.
-    """
+    """Refuse a term that is inconsistent with its block. ValueError: arrays have unequal lengths,
+    indices are out of range, or values not finite."""
     frames, points = np.asarray(term.frames), np.asarray(term.points)
     rows = term.measurements()
     if not len(frames) == len(points) == len(rows):

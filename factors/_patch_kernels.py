@@ -41,13 +41,10 @@ class Sightings(NamedTuple):
     states: np.ndarray  # (O,) uint8
 
 
-_TRIAL_STEPS = 4  # steps after which a patch must correlate somewhat to go on
 _POLE_HALF_PATCHES = 8.0  # distance from a pole, in half patches, within which each ray needs its
 # own pixel
 _MAX_OFF_CENTRE = 0.25  # pixels between a patch's centre and that of the square its pixels are
 # mapped in; the map is exact there
-_MIN_CORNER_DETERMINANT = 1e-4  # least determinant of the shift's information over its squared
-# trace: excludes edges
 _MIN_GREY_VARIANCE = 1e-3  # variance in grey values squared below which a patch is empty
 
 _FAST = {"contract", "reassoc", "nsz"}
@@ -329,7 +326,7 @@ def _normal_matrix(templates, t, reach, columns, normal):
     determinant = normal[0, 0] * normal[1, 1] - normal[0, 1] ** 2
     for r in range(8):
         normal[r, r] += 1e-6 * normal[r, r] + (templates.prior if 2 <= r < 6 else 0.0)
-    return determinant > _MIN_CORNER_DETERMINANT * trace * trace
+    return determinant > 1e-4 * trace * trace  # excludes edges
 
 
 @_part
@@ -469,7 +466,7 @@ def _align(coefficients, mask, o, sightings, max_shift, steps, tolerance, templa
                 return ALIGNED if _is_usable(mask, samples[0]) else MASKED
             gain, offset = np.sqrt(square / power), mean
         cost = _gradient(templates, t, values, samples[3], gain, offset, b)
-        if number >= _TRIAL_STEPS and not cost < power:
+        if number >= 4 and not cost < power:  # steps after which a patch must correlate somewhat
             return UNLIKE
         _solve(templates, t, warp, b, step)
         offset += gain * step[7]

@@ -9,13 +9,8 @@ import numpy as np
 def rig_vectors(
     world_T_rigs: np.ndarray, points_world: np.ndarray, origins_rig: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points seen from their rigs, `d = world_R_rig^T (X - rig_in_world) - origin`.
-
-    Args:
-        world_T_rigs: (N, 4, 4) float64.
-        points_world: (N, 3) float64, world.
-        origins_rig: (N, 3) rig frame, origin of each ray; None = the rig's centre. By these,
-            the Jacobian of d is minus one.
+    """Points (N, 3) seen from their rigs (N, 4, 4), `d = world_R_rig^T (X - rig_in_world) -
+    origin`, by which the Jacobian by origins is minus one.
 
     Returns:
         d (N, 3) in the rig frame, its Jacobians by the pose (N, 3, 6), a right perturbation

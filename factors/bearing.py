@@ -17,15 +17,8 @@ _MIN_SINE = 1e-12  # sine of the angle below which the residual's direction is u
 
 
 def tangent_basis(bearings: np.ndarray) -> np.ndarray:
-    """Orthonormal axes of the tangent planes at unit bearings.
-
-    Args:
-        bearings: (..., 3) float64, unit.
-
-    Returns:
-        (..., 2, 3) float64, rows are the axes. Duff et al., "Building an Orthonormal Basis,
-        Revisited", JCGT 6(1), 2017.
-    """
+    """Orthonormal axes, rows of (..., 2, 3) float64, of the tangent planes at unit bearings (...,
+    3). Duff et al., "Building an Orthonormal Basis, Revisited", JCGT 6(1), 2017."""
     x, y, z = np.moveaxis(np.asarray(bearings, dtype=np.float64), -1, 0)
     sign = np.where(z >= 0, 1.0, -1.0)
     a = -1.0 / (sign + z)

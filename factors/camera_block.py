@@ -24,7 +24,6 @@ from factors.robust import RobustLoss
 from factors.threads import balanced_ranges, map_in_threads, run_in_threads
 
 _POLISH_TOLERANCE = 1e-6  # of a landmark's cost: further steps gain less than the others do
-_FLATTEST = 0.3  # part of a robust loss's weights that its curvature is taken for, at least
 
 
 class CameraBlock:
@@ -48,15 +47,10 @@ class CameraBlock:
         polish_steps: int = 3,
         curved: bool = False,
     ) -> None:
-        """Fix the pattern.
-
-        Args:
-            points_world: (J, 3) start values, world.
-            loss: robust loss on each whitened residual norm; None is plain least squares.
-            polish_steps: Gauss-Newton steps on the landmarks after each proposed step.
-            curved: scale the Hessian by the mean curvature of the loss, part of its weights: steps
-                by these alone fall as short.
-        """
+        """Fix the pattern; landmarks (J, 3), world, start here and take polish_steps Gauss-Newton
+        steps after each proposed step. The loss is of each whitened residual norm; None is plain
+        least squares. curved: scale the Hessian by the mean curvature of the loss, part of its
+        weights: steps by these alone fall as short."""
         self.camera, self.loss = camera, loss or RobustLoss()
         self.num_threads, self.polish_steps = num_threads, polish_steps
         self.curved = curved
@@ -70,7 +64,22 @@ class CameraBlock:
         self.keys += [int(key) for key, _ in camera.shared]
         self._starts, self._columns, _ = covisible_pairs(sightings.offsets, sightings.frames, num)
         rows = np.repeat(np.arange(num), np.diff(self._starts))
-        self.pairs = _pairs(num, kinds, len(camera.shared), rows, self._columns)
+        shared = len(camera.shared)
+        own, common = np.arange(kinds), kinds * num + np.arange(shared)
+        upper, above = np.triu_indices(kinds, 1), np.triu_indices(shared, 1)
+        first = kinds * np.arange(num)[:, None]
+        among = np.stack([first + upper[0], first + upper[1]], axis=-1)
+        across = np.stack(
+            np.broadcast_arrays(
+                kinds * rows[:, None, None] + own[:, None],
+                kinds * self._columns[:, None, None] + own,
+            ),
+            axis=-1,
+        )
+        down = np.stack(np.broadcast_arrays((first + own)[:, :, None], common), axis=-1)
+        corner = np.stack([common[above[0]], common[above[1]]], axis=-1)
+        parts = [part.reshape(-1, 2) for part in (among, across, down, corner)]
+        self.pairs = np.concatenate(parts).astype(np.int64)
         self._ranges = balanced_ranges(sightings.offsets)
 
     @property
@@ -107,7 +116,7 @@ class CameraBlock:
             self._point_costs[first:last] = np.bincount(owners, losses, last - first)
             weights += float(self.loss.weights(squares).sum())
             bent += float(curvatures.sum())
-        stretch = max(bent / max(weights, 1e-300), _FLATTEST) if self.curved else 1.0
+        stretch = max(bent / max(weights, 1e-300), 0.3) if self.curved else 1.0
         return self._in_blocks(sums, stretch, float(self._point_costs.sum()))
 
     def products(self) -> None:
@@ -212,24 +221,6 @@ class CameraBlock:
         return PoseSystem(stretch * diagonal, stretch * off_diagonal, whole, costs)
 
 
-def _pairs(num: int, kinds: int, shared: int, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Rows of keys that share a residual (P, 2), in the order of `CameraBlock._in_blocks`."""
-    own, common = np.arange(kinds), kinds * num + np.arange(shared)
-    upper, above = np.triu_indices(kinds, 1), np.triu_indices(shared, 1)
-    first = kinds * np.arange(num)[:, None]
-    among = np.stack([first + upper[0], first + upper[1]], axis=-1)
-    across = np.stack(
-        np.broadcast_arrays(
-            kinds * rows[:, None, None] + own[:, None], kinds * columns[:, None, None] + own
-        ),
-        axis=-1,
-    )
-    down = np.stack(np.broadcast_arrays((first + own)[:, :, None], common), axis=-1)
-    corner = np.stack([common[above[0]], common[above[1]]], axis=-1)
-    parts = [part.reshape(-1, 2) for part in (among, across, down, corner)]
-    return np.concatenate(parts).astype(np.int64)
-
-
 def _spread(
     matrices: np.ndarray, rows: np.ndarray, columns: np.ndarray, high: int, wide: int
 ) -> np.ndarray:
@@ -248,10 +239,8 @@ def sightings_of(
     lenses: np.ndarray,
     fractions: np.ndarray,
 ) -> tuple[Sightings, np.ndarray]:
-    """Observations sorted by landmark and frame, and the row each was given in.
-
-    Args: (O, ...) as in `Sightings`.
-    """
+    """Observations (O, ...) as in `Sightings`, sorted by landmark and frame, and the row each was
+    given in."""
     order = np.lexsort((frames, points))
     offsets = np.zeros(num_points + 1, np.int64)
     np.cumsum(np.bincount(points, minlength=num_points), out=offsets[1:])
@@ -264,14 +253,9 @@ def sightings_of(
 def pixels_of(
     directions: np.ndarray, lenses: np.ndarray, calibration: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (O, 3) that raw lenses show directions in, as `Sightings` has them, and how these
-    move, on their tangent_basis, with the pixels (O, 2, 2).
-
-    Args:
-        directions: (O, 3) unit, rig frame.
-        lenses: (O,) int, those that see them.
-        calibration: (L, 16) the lenses, as in `CameraRows`.
-    """
+    """Pixels (O, 3) that raw lenses (O,) show unit directions (O, 3), rig frame, in, as `Sightings`
+    has them, and how these move, on their tangent_basis, with the pixels (O, 2, 2); calibration (L,
+    16) as in `CameraRows`."""
     num = len(directions)
     frames, rows = np.zeros(num, np.int64), np.arange(num)
     plain = np.zeros((num, 3)), np.tile(np.eye(2), (num, 1, 1)), lenses, np.zeros(num)

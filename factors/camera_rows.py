@@ -28,10 +28,8 @@ class Sightings(NamedTuple):
 
 
 class CameraRows(NamedTuple):
-    """The cameras' values, and what derivatives by their variables need.
-
-    L counts the lenses of all cameras, one camera after the other.
-    """
+    """The cameras' values, and what derivatives by their variables need; L counts the lenses of all
+    cameras, one camera after the other."""
 
     motions: np.ndarray  # (F, 6): of each frame during its readout, [rotation rad, translation]
     velocities: np.ndarray  # (F, 6): their derivative by the readout's duration
@@ -99,13 +97,9 @@ class LensVariables:
         return tuple(found)
 
     def columns(self, motion: int, turns: int, start: int, first: int) -> Columns:
-        """Columns (L,) of what its lenses see.
-
-        Args:
-            motion, turns: columns of what frames have of their own.
-            start: first column of what all its frames share.
-            first: number of its first lens.
-        """
+        """Columns (L,) of what its lenses see, the first of which is the `first`-th of all: motion
+        and turns are columns of what frames have of their own, start is the first of what all its
+        frames share."""
         num = self.num_lenses
         last = start + 3 * (num - 1)
         radius, last = (-1, last) if self.radius is None else (last, last + 1)

@@ -59,13 +59,10 @@ class BlockCholesky:
     """
 
     def __init__(self, num_blocks: int, pairs: np.ndarray, num_kept: int = 0) -> None:
-        """Choose an elimination order (minimum degree) and find the fill.
-
-        Args:
-            pairs: (P, 2) int, i < j, distinct: where off-diagonal blocks may be nonzero.
-            num_kept: K blocks, the last ones, that are not eliminated: `factorize` then leaves
-                their Schur complement, and `reduced` and `substituted` replace `solve`.
-        """
+        """Choose an elimination order (minimum degree) and find the fill, of off-diagonal blocks of
+        pairs (P, 2), i < j, distinct, that may be nonzero. The last num_kept blocks are not
+        eliminated: `factorize` then leaves their Schur complement, and `reduced` and `substituted`
+        replace `solve`."""
         self.num_blocks, self.num_kept = num_blocks, num_kept
         self.complement = _nothing()
         pairs = np.asarray(pairs, dtype=np.int64).reshape(-1, 2)
@@ -108,12 +105,8 @@ class BlockCholesky:
         return sum(width * (width + 1) // 2 + width * rest for width, rest in widths)
 
     def factorize(self, diagonal: np.ndarray, off_diagonal: np.ndarray) -> bool:
-        """Factorize H; False (and unusable) if it is not positive definite.
-
-        Args:
-            diagonal: (N, 6, 6), symmetric blocks H[i, i].
-            off_diagonal: (P, 6, 6), blocks H[i, j] of the pairs.
-        """
+        """Factorize H of symmetric blocks H[i, i] (N, 6, 6) and blocks H[i, j] (P, 6, 6) of the
+        pairs; False (and unusable) if it is not positive definite."""
         for front in self._fronts:  # the factor before is not held beside the new one
             front.lower = front.below = _nothing()
         updates: dict[int, list[tuple[np.ndarray, np.ndarray]]] = {}
@@ -182,11 +175,8 @@ class BlockCholesky:
         return out
 
     def draw(self, normals: np.ndarray) -> np.ndarray:
-        """Vectors (D, N, 6) of covariance H^-1 from as many independent unit normals.
-
-        Where blocks were kept, `normals` holds what was drawn of these, from the covariance of
-        their own system.
-        """
+        """Vectors (D, N, 6) of covariance H^-1 from as many independent unit normals; where blocks
+        were kept, these hold what was drawn of them, from the covariance of their own system."""
         return self._all_backward(self._by_place(normals))
 
     def _by_place(self, vectors: np.ndarray) -> np.ndarray:
@@ -206,17 +196,12 @@ class BlockCholesky:
     def inverse_blocks(
         self, pairs: np.ndarray, kept: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Blocks of the inverse of H (Takahashi's selected inversion, front by front).
+        """Diagonal blocks (N, 6, 6) of the inverse of H, and its blocks [i, j] (Q, 6, 6) of pairs
+        (Q, 2) of the pattern, in either order; kept: (6 K, 6 K) the inverse at the blocks that were
+        kept.
 
-        With G = L21 L11^-1, Z21 = -Z22 G and Z11 = (L11 L11^T)^-1 - G^T Z21. Takahashi, Fagan,
-        Chen, 1973.
-
-        Args:
-            pairs: (Q, 2) int, pairs of the pattern, in either order.
-            kept: (6 K, 6 K) the inverse at the blocks that were kept.
-
-        Returns:
-            (N, 6, 6) diagonal blocks, (Q, 6, 6) blocks [i, j] of the pairs.
+        Takahashi's selected inversion, front by front: with G = L21 L11^-1, Z21 = -Z22 G and Z11 =
+        (L11 L11^T)^-1 - G^T Z21. Takahashi, Fagan, Chen, 1973.
         """
         pairs = np.asarray(pairs, dtype=np.int64).reshape(-1, 2)
         placed = np.sort(self._place[pairs], axis=1)
@@ -230,7 +215,17 @@ class BlockCholesky:
             if kept is not None and s == len(self._fronts) - 1:
                 Z = kept
             else:
-                Z = self._inverse_of_front(front, whole.get(parent, _nothing()))
+                width, num = DIM * front.width, DIM * len(front.rows)
+                Z = np.empty((width + num, width + num))
+                root, _ = trtri(front.lower, lower=1)
+                Z[:width, :width] = root.T @ root
+                if num:
+                    at = (DIM * front.above[:, None] + np.arange(DIM)).ravel()
+                    Z[width:, width:] = whole.get(parent, _nothing())[at[:, None], at]
+                    G = front.below @ root
+                    Z[width:, :width] = -Z[width:, width:] @ G
+                    Z[:width, width:] = Z[width:, :width].T
+                    Z[:width, :width] -= G.T @ Z[width:, :width]
             if parent >= 0:
                 waiting[parent] -= 1
                 if not waiting[parent]:
@@ -246,21 +241,6 @@ class BlockCholesky:
         flip = self._place[pairs[:, 0]] < self._place[pairs[:, 1]]
         between[flip] = np.swapaxes(between[flip], 1, 2)
         return inverse, between
-
-    def _inverse_of_front(self, front: _Front, parent: np.ndarray) -> np.ndarray:
-        """H^-1 at the columns and rows of a front, from that at the parent's."""
-        width, num = DIM * front.width, DIM * len(front.rows)
-        Z = np.empty((width + num, width + num))
-        root, _ = trtri(front.lower, lower=1)
-        Z[:width, :width] = root.T @ root
-        if num:
-            at = (DIM * front.above[:, None] + np.arange(DIM)).ravel()
-            Z[width:, width:] = parent[at[:, None], at]
-            G = front.below @ root
-            Z[width:, :width] = -Z[width:, width:] @ G
-            Z[:width, width:] = Z[width:, :width].T
-            Z[:width, :width] -= G.T @ Z[width:, :width]
-        return Z
 
 
 def _local(places: np.ndarray, first: int, width: int, rows: np.ndarray) -> np.ndarray:

@@ -17,7 +17,6 @@ from factors.schur_complement import (
 )
 
 _MIN_GROUP_SIZE = 4  # least frames of a group
-_MAX_GROUPS = 640  # number of groups whose dense system is factorized within seconds
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,12 +28,8 @@ class Groups:
 
     def bases(self, poses: np.ndarray) -> np.ndarray:
         """Motion (N, 6, 7) of each variable when its group rotates, translates, scales in the
-        world.
-
-        Args:
-            poses: (N, 12) rows [world_R_rig row-major, rig_in_world]; arbitrary for other
-                variables.
-        """
+        world; poses: (N, 12) rows [world_R_rig row-major, rig_in_world], arbitrary for other
+        variables."""
         there = self.labels >= 0
         labels = self.labels[there]
         rotations = np.swapaxes(poses[there, :9].reshape(-1, 3, 3), 1, 2)  # rig_R_world
@@ -57,11 +52,9 @@ class Groups:
 def covisible_groups(num: int, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Groups:
     """Groups of the most covisible variables, none much larger than another.
 
-    Pairs join groups, the strongest first (Kruskal's algorithm), as long as they stay small.
-
-    Args:
-        pairs: rows (P, 2) of variables, and the number (P,) of landmarks that each two share, which
-            is normalised by both variables' totals. Variables without a pair stay alone.
+    Pairs, rows (P, 2) of variables and the number (P,) of landmarks that each two share, normalised
+    by both variables' totals, join groups, the strongest first (Kruskal's algorithm), as long as
+    they stay small. Variables without a pair stay alone.
     """
     rows = np.concatenate([p for p, _ in pairs])
     shared = np.concatenate([s for _, s in pairs]).astype(np.float64)
@@ -72,7 +65,8 @@ def covisible_groups(num: int, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -
         least = np.partition(weights, len(weights) - most)[len(weights) - most]
         rows, weights = rows[weights >= least], weights[weights >= least]
     rows = rows[np.argsort(-weights, kind="stable")].astype(np.int64)
-    size = max(_MIN_GROUP_SIZE, -(-num // _MAX_GROUPS))
+    # groups whose dense system is factorized within seconds
+    size = max(_MIN_GROUP_SIZE, -(-num // 640))
     labels, sizes = np.arange(num), np.ones(num, np.int64)
     merge_capped(rows[:, 0].copy(), rows[:, 1].copy(), size, labels, sizes)
     labels[totals == 0] = -1
@@ -118,13 +112,9 @@ def coarse_system(
     groups: Groups,
     bases: np.ndarray,
 ) -> Coarse | None:
-    """H projected to groups of variables, factorized; None if it is not positive definite.
-
-    Args:
-        written: (N, 6, 6) blocks H[i, i], without the factored complements.
-        off_diagonal, pairs: (P, 6, 6), (P, 2) off-diagonal blocks of that part, i < j.
-        held: complements of landmarks in factored form, their variables (F,), and visits by groups.
-    """
+    """H projected to groups of variables, factorized; None if it is not positive definite. H is
+    `written (N, 6, 6)`, `off_diagonal (P, 6, 6)` of `pairs (P, 2)`, i < j, and complements of
+    landmarks held in factored form, each with its variables (F,) and visits by groups."""
     num = GROUP_DIM * groups.num
     target = np.zeros((num, num))  # its upper triangle
     own = written.copy()

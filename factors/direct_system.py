@@ -11,10 +11,6 @@ from factors.iterative_system import IterativeSystem, conjugate_gradients, multi
 from factors.reduced_camera_system import STEP_TOLERANCE, ReducedSystem
 from factors.system_layout import SystemLayout
 
-_OPERATIONS_PER_BYTE = 4.0  # operations of a core on dense blocks in the time of reading a byte
-_MIN_ITERATIONS = 10  # conjugate-gradient iterations that must be cheaper than half a
-# factorization
-
 
 class DirectSystem(ReducedSystem):
     """Normal equations that are written out and factorized.
@@ -29,8 +25,9 @@ class DirectSystem(ReducedSystem):
         self._cholesky = BlockCholesky(layout.num, self._pairs)
         self._factorized = False  # True if the Cholesky factor is of an earlier system
         bytes_read = 8 * (2 * self._cholesky.num_entries + DIM * DIM * len(self._pairs))
-        cheaper = self.num_operations / (2 * _OPERATIONS_PER_BYTE * max(bytes_read, 1))
-        self._max_iterations = int(cheaper) if cheaper >= _MIN_ITERATIONS else 0
+        # a core does 4 operations on dense blocks in the time of reading a byte
+        cheaper = self.num_operations / (8.0 * max(bytes_read, 1))
+        self._max_iterations = int(cheaper) if cheaper >= 10 else 0
 
     @property
     def num_operations(self) -> float:
@@ -89,16 +86,9 @@ def reduced_system(
     values: gtsam.Values,
     pairs: Sequence[tuple[int, int]] = (),
 ) -> ReducedSystem:
-    """The normal equations of a graph and blocks, with the cheaper solver.
-
-    Conjugate gradients take over where covisibility would fill in a factorization.
-
-    Args:
-        pairs: keys of two variables each, whose joint block `covariances` returns.
-
-    Raises:
-        ValueError: a variable has no value.
-    """
+    """The normal equations of a graph and blocks, with the cheaper solver: conjugate gradients take
+    over where covisibility would fill in a factorization. `covariances` returns the joint blocks of
+    `pairs` of keys. ValueError: a variable has no value."""
     layout = SystemLayout(graph, blocks, values, pairs)
     offered = {i: block.products() for i, block in enumerate(layout.blocks)}
     products = {i: product for i, product in offered.items() if product is not None}

@@ -167,10 +167,8 @@ class LinearSystem:
 
 @dataclass(slots=True)
 class Eliminated:
-    """Sums of a linear least-squares problem whose landmarks are eliminated, run by run.
-
-    Variables are K of each frame and S of all frames.
-    """
+    """Sums of a linear least-squares problem whose landmarks are eliminated, run by run; variables
+    are K of each frame and S of all frames."""
 
     starts: np.ndarray  # (F + 1,) int64 and
     columns: np.ndarray  # (P,) int64: covisible frame pairs f < g as sorted CSR rows
@@ -199,10 +197,8 @@ class Eliminated:
         by_frame: np.ndarray,
         by_shared: np.ndarray,
     ) -> None:
-        """Add landmarks: each has observations offsets[j] to offsets[j + 1], sorted by frame.
-
-        Args: see `eliminate`.
-        """
+        """Add landmarks: each has observations offsets[j] to offsets[j + 1], sorted by frame; see
+        `eliminate`."""
         self.cost += eliminate_linear_range(
             0, len(offsets) - 1, offsets, frames, residuals, by_point, by_frame, by_shared,
             _RELATIVE_DAMPING, int(np.diff(offsets).max(initial=0)), self.starts, self.columns,
@@ -220,15 +216,9 @@ def eliminate(
     by_frame: np.ndarray,
     by_shared: np.ndarray,
 ) -> LinearSystem:
-    """The Schur complement of landmarks in a linear least-squares problem.
-
-    Args:
-        frames, points: (O,) int, frame and landmark of each observation.
-        residuals: (O, 2) whitened.
-        by_point: (O, 2, 3) Jacobian by the landmark.
-        by_frame: (O, 2, K) Jacobian by the variables of the frame.
-        by_shared: (O, 2, S) Jacobian by the shared variables.
-    """
+    """The Schur complement of landmarks in a linear least-squares problem of whitened residuals (O,
+    2), each of a frame and a landmark (O,); their Jacobians by the landmark (O, 2, 3), by the
+    variables of the frame (O, 2, K) and by the shared variables (O, 2, S)."""
     own, common = by_frame.shape[2], by_shared.shape[2]
     order = np.lexsort((frames, points))
     frames, points = np.asarray(frames)[order].astype(np.int64), np.asarray(points)[order]

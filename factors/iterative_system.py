@@ -25,18 +25,17 @@ def conjugate_gradients(
     max_iterations: int,
     truncate: bool = False,
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Solve H x = right for several right sides at once. Hestenes and Stiefel, 1952.
+    """Solve H x = right (N, 6, R) for several right sides at once. Hestenes and Stiefel, 1952.
 
     Args:
-        multiply: H applied to (N, 6, R), symmetric positive definite.
-        right: (N, 6, R).
-        precondition: approximate H^-1 applied to (N, 6, R), symmetric positive definite.
+        multiply, precondition: H and an approximate H^-1 applied to (N, 6, R), symmetric
+            positive definite.
         tolerance: of each residual in the preconditioner's norm, relative to x = 0.
         truncate: return the last iterate even if the tolerance is not reached.
 
     Returns:
-        x (N, 6, R) and the residual right - H x; None if the tolerance is not reached, or if H is
-        not positive definite.
+        x and the residual right - H x; None if the tolerance is not reached, or if H is not
+        positive definite.
     """
     x, residual = np.zeros_like(right), right.copy()
     better = precondition(residual)
@@ -90,10 +89,6 @@ def multiply_blocks(diagonal, off_diagonal, pairs, x):
     return out
 
 
-_NATIVE_FACTOR_WEIGHT = 1e-3  # landmarks that a native factor counts for when groups are formed
-_MAX_ITERATIONS = 300  # largest number of conjugate-gradient iterations; ten or twenty suffice
-_DRAW_TOLERANCE = 1e-3  # tolerance of drawn errors: no motion of thousands of frames may be missed
-_MIN_DRAWS = 200  # least number of draws whose spread gives a covariance
 _DRAWS_AT_ONCE = 20
 
 
@@ -104,11 +99,8 @@ class IterativeSystem(ReducedSystem):
     """
 
     def __init__(self, layout: SystemLayout, products: Mapping[int, Products]) -> None:
-        """Form groups of covisible frames, and the visits of landmarks by groups.
-
-        Args:
-            products: of those of the layout's blocks, by index, that are not written out.
-        """
+        """Form groups of covisible frames, and the visits of landmarks by groups; products: of
+        those of the layout's blocks, by index, that are not written out."""
         super().__init__(layout, products)
         self._products = products
         self._coarse: Coarse | None = None  # of an earlier system
@@ -120,9 +112,8 @@ class IterativeSystem(ReducedSystem):
         for i in products:
             poses[layout.block_rows[i]] = True
         tied = layout.factor_pairs[poses[layout.factor_pairs].all(axis=1)]
-        self._groups = covisible_groups(
-            layout.num, [*shares, (tied, np.full(len(tied), _NATIVE_FACTOR_WEIGHT))]
-        )
+        # of a landmark: each native factor
+        self._groups = covisible_groups(layout.num, [*shares, (tied, np.full(len(tied), 1e-3))])
         self._visits = {
             i: group_visits(
                 product.visits, self._groups.labels[layout.block_rows[i]], self._groups.num
@@ -173,7 +164,7 @@ class IterativeSystem(ReducedSystem):
         added: np.ndarray,
         right: np.ndarray,
         tolerance: float,
-        max_iterations: int = _MAX_ITERATIONS,
+        max_iterations: int = 300,  # ten or twenty suffice
         truncate: bool = False,
     ) -> tuple[np.ndarray, np.ndarray] | None:
         """Solutions (N, 6, R) with `added` (N, 6) on the diagonal, residuals; None = unsolved."""
@@ -221,14 +212,15 @@ class IterativeSystem(ReducedSystem):
     ) -> np.ndarray | None:
         """Draws (D, N, 6) of covariance (H + added)^-1: the inverse times J^T e of all factors."""
         layout, draws, self._coarse = self._layout, [], None
-        for _ in range(0, max(num_draws, _MIN_DRAWS), _DRAWS_AT_ONCE):
+        for _ in range(0, max(num_draws, 200), _DRAWS_AT_ONCE):  # whose spread gives a covariance
             right = np.sqrt(added)[..., None] * rng.normal(size=(*added.shape, _DRAWS_AT_ONCE))
             for complement, rows, _ in self._complements:
                 right[rows] += complement.draw(int(rng.integers(1 << 62)), _DRAWS_AT_ONCE)
             errors = rng.normal(size=(len(self._jacobian.indptr) - 1, _DRAWS_AT_ONCE))
             forces = self._jacobian.T @ errors
             np.add.at(right, (layout.column_blocks, layout.column_offsets), forces)
-            found = self._solve_products(added, right, _DRAW_TOLERANCE)
+            # no motion of thousands of frames may be missed
+            found = self._solve_products(added, right, 1e-3)
             if found is None:
                 return None
             draws.append(np.moveaxis(found[0], 2, 0))

@@ -41,7 +41,6 @@ from numba.core.serialize import dumps
 logger = logging.getLogger(__name__)
 
 _DIGEST_BYTES = 32  # of SHA-256, before each payload: a damaged file must not be executed
-_UNUSED_DAYS = 90  # age of a kernel's last use after which it is removed
 _DAY_S = 86400.0
 _VERSIONED = {"builtins", "math", "numba", "numpy"}  # packages whose versions are in the key
 
@@ -257,7 +256,7 @@ def _unlock(file: Any) -> None:
 def _remove_unused(folder: Path) -> None:
     """Remove kernels that were not used for long, once per process."""
     for path in folder.iterdir():
-        if time.time() - path.stat().st_mtime > _UNUSED_DAYS * _DAY_S:
+        if time.time() - path.stat().st_mtime > 90 * _DAY_S:
             with contextlib.suppress(OSError):
                 path.unlink()
 

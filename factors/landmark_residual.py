@@ -22,23 +22,17 @@ ResidualFunction = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], bo
 
 
 class LandmarkResidual:
-    """A residual of two rows of one observation of one landmark, compiled by Numba.
-
-    Attributes:
-        name: of the function.
-        address: of its compiled code in this process.
-    """
+    """A residual of two rows of one observation of one landmark, compiled by Numba: its name, and
+    the address of its code in this process."""
 
     def __init__(self, function: ResidualFunction) -> None:
-        """Compile a function.
+        """Compile a function of the measurement (3,) and the vector from the ray's origin to the
+        landmark in the rig frame (3,), which writes the residual (2,), not whitened, and its
+        Jacobian by that vector (2, 3), all float64.
 
-        Args:
-            function: takes the measurement (3,), the vector from the ray's origin to the landmark
-                in the rig frame (3,), and writes the residual (2,), not whitened, and its Jacobian
-                by that vector (2, 3), all float64. Returns False where the landmark cannot be
-                observed, behind a face for instance: the residual is a large constant there, the
-                Jacobian zero. It must be what Numba compiles, and is not called for a warning:
-                division by zero gives inf or nan.
+        It returns False where the landmark cannot be observed, behind a face for instance: the
+        residual is a large constant there, the Jacobian zero. It must be what Numba compiles, and
+        is not called for a warning: division by zero gives inf or nan.
         """
         compiled = njit(error_model="numpy")(function)
 

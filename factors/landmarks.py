@@ -30,10 +30,8 @@ from factors.schur_complement import SchurComplement, project_visits
 from factors.threads import balanced_ranges, map_in_threads, run_in_threads
 
 _POLISH_TOLERANCE = 1e-12  # part of a landmark's cost
-_HOST_POLISH_STEPS = 50  # at each evaluation: an error is a function of the poses alone
 _MAX_VISITS_AT_ONCE = 1 << 17  # visits of landmarks that are eliminated together: 19 MB
 _MIN_THREAD_OBSERVATIONS = 1 << 14  # least observations that a thread accumulates on its own
-_PROPOSAL_TOLERANCE = 1e-6  # part of a landmark's cost below which further steps are skipped
 
 
 class LandmarkBlock:
@@ -60,15 +58,15 @@ class LandmarkBlock:
         """Sort the observations by landmark and frame.
 
         Args:
-            keys: (F,) keys of Pose3 variables.
-            points_world: (J, 3) start values, world.
-            terms: observations; frames index keys, points index points_world.
+            keys: (F,) keys of Pose3 variables, which frames of terms index.
+            points_world: (J, 3) start values, world, which points of terms index.
             loss: robust loss on each whitened residual norm; None is plain least squares.
             num_threads: None = number of cores, at most 16.
             polish_steps: Gauss-Newton steps on the landmarks after each proposed pose step.
 
         Raises:
-            ValueError: indices are out of range, values not finite, or arrays of unequal length.
+            ValueError: indices are out of range, values not finite, or arrays of unequal
+            length.
         """
         self.keys = [int(key) for key in keys]
         self.loss = loss or RobustLoss()
@@ -159,7 +157,7 @@ class LandmarkBlock:
         if self._poses is None:
             raise RuntimeError("propose() needs linearize() before it")
         poses, steps = pose_rows(values, self.keys), np.ascontiguousarray(steps)
-        return self._move(poses, self._poses, steps, self.polish_steps, _PROPOSAL_TOLERANCE)
+        return self._move(poses, self._poses, steps, self.polish_steps, 1e-6)
 
     def accept(self) -> None:
         """Keep the landmarks of the last proposal."""
@@ -175,12 +173,9 @@ class LandmarkBlock:
         return cost
 
     def residuals(self, values: gtsam.Values) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """Whitened residuals of each term in its own order, at the current landmarks.
-
-        Returns:
-            For each term (O, 2) residuals and (O,) bool, False where the point is behind the face
-            (there the residual is a large constant).
-        """
+        """Whitened residuals (O, 2) of each term in its own order, at the current landmarks, and
+        (O,) bool, False where the point is behind the face (there the residual is a large
+        constant)."""
         residuals, valid = self._residuals(values)
         unsorted, flags = np.empty_like(residuals), np.empty_like(valid)
         unsorted[self._order], flags[self._order] = residuals, valid
@@ -240,7 +235,7 @@ class LandmarkBlock:
             start, no_steps = self._points[first:last], np.zeros((num, 6))
             points, costs = np.empty_like(start), np.empty(last - first)
             polish_range(
-                0, last - first, local, start, poses, poses, no_steps, False, _HOST_POLISH_STEPS,
+                0, last - first, local, start, poses, poses, no_steps, False, 50,
                 _POLISH_TOLERANCE, costs, points, costs,
             )  # fmt: skip
             if not with_system:
@@ -307,9 +302,8 @@ def eliminate_points(
     """Reduced pose system of observations: robust weights, landmarks eliminated.
 
     Args:
-        points: (J, 3) world.
-        poses: (F, 12) as in `factors._kernels`.
-        row_starts, columns: (F + 1,), (P,) covisible frame pairs i < k as sorted CSR rows.
+        points: (J, 3) world. poses: (F, 12) as in `factors._kernels`. row_starts, columns: (F +
+            1,), (P,) covisible frame pairs i < k as sorted CSR rows.
 
     Returns:
         Diagonal (F, 6, 6), off-diagonal (P, 6, 6) and gradient (F, 6); robust costs of families
@@ -371,11 +365,8 @@ def complement_of(
     num_families: int,
     num_threads: int,
 ) -> tuple[SchurComplement, np.ndarray, np.ndarray, np.ndarray]:
-    """The system of `eliminate_points` in factored form.
-
-    Returns:
-        The complement, the gradient (F, 6); robust costs of families (T,) and of landmarks (J,).
-    """
+    """The system of `eliminate_points` in factored form: the complement, the gradient (F, 6);
+    robust costs of families (T,) and of landmarks (J,)."""
     num = len(poses)
     own, taken, gradient = np.zeros((num, 6, 6)), np.zeros((num, 6, 6)), np.zeros((num, 6))
     costs, point_costs = np.zeros(num_families), np.empty(len(points))

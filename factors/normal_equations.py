@@ -13,7 +13,6 @@ from factors.system_layout import SystemLayout
 _kernel, _ = kernel_and_part()
 
 GRAPH = "graph"  # family under which the cost of the native and user factors is reported
-_MIN_DIAGONAL = 1e-6  # least curvature that damping is relative to, per sigma
 
 
 class NormalEquations:
@@ -112,7 +111,7 @@ class NormalEquations:
 
 def damping_of(diagonal: np.ndarray, damping: float) -> np.ndarray:
     """Damping (N, 6): `damping` times the diagonal of blocks (N, 6, 6)."""
-    return damping * np.maximum(np.einsum("nii->ni", diagonal), _MIN_DIAGONAL)
+    return damping * np.maximum(np.einsum("nii->ni", diagonal), 1e-6)
 
 
 @_kernel

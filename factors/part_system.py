@@ -40,18 +40,11 @@ class PartSystem(NormalEquations):
 
 class PartElimination:
     """Cholesky factor of a part's own blocks, damped; the shared ones are damped by who sums them.
-
-    Attributes:
-        regular: False where the own blocks are not positive definite: nothing else holds then.
-    """
+    Where own blocks are not positive definite, it is not `regular`, and nothing else holds."""
 
     def __init__(self, equations: PartEquations, damping: float) -> None:
-        """Factorize.
-
-        Args:
-            damping: part of the diagonal that is added to it; 0 = none, and own blocks that
-                nothing constrains count as unit ones.
-        """
+        """Factorize, with a part of the diagonal added to it; 0 = none, and own blocks that nothing
+        constrains count as unit ones."""
         num = len(equations.diagonal)
         self._own, self._num_kept = slice(0, num - equations.num_kept), equations.num_kept
         self._gradient = equations.gradient
@@ -81,33 +74,22 @@ class PartElimination:
         return Condensed(diagonal, off_diagonal, -self._cholesky.reduced(-self._gradient))
 
     def substituted(self, kept: np.ndarray) -> tuple[np.ndarray, float]:
-        """Steps (N - K, 6) of the own blocks, given those of the shared ones, (K, 6).
-
-        Returns:
-            The steps, and their share of the decrease that the undamped model predicts.
-        """
+        """Steps (N - K, 6) of the own blocks, given those of the shared ones, (K, 6), and their
+        share of the decrease that the undamped model predicts."""
         steps = self._cholesky.substituted(-self._gradient, kept)[self._own]
         gradient = self._gradient[self._own]
         return steps, 0.5 * float((steps * (self._added * steps - gradient)).sum())
 
     def inverse_blocks(self, pairs: np.ndarray, kept: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Blocks of the inverse of the whole map's system, given it at the shared blocks.
-
-        Args:
-            pairs: (Q, 2) int, pairs of the part's pattern, i < j, i one of its own.
-            kept: (6 K, 6 K).
-
-        Returns:
-            (N - K, 6, 6) diagonal blocks of the own ones, (Q, 6, 6) blocks [i, j] of the pairs.
-        """
+        """Blocks of the inverse of the whole map's system, given it at the shared blocks, kept (6
+        K, 6 K): (N - K, 6, 6) diagonal ones of its own, (Q, 6, 6) blocks [i, j] of pairs (Q, 2) of
+        the part's pattern, i < j, i one of its own."""
         inverse, between = self._cholesky.inverse_blocks(pairs, kept if self._num_kept else None)
         return inverse[self._own], between
 
     def drawn(self, kept: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Errors (D, N - K, 6) of the own blocks, given those drawn of the shared ones, (D, K, 6).
-
-        They have the covariance of the whole map's inverse.
-        """
+        """Errors (D, N - K, 6) of the own blocks, of the covariance of the whole map's inverse,
+        given those drawn of the shared ones, (D, K, 6)."""
         num = len(kept)
         normals = rng.normal(size=(num, len(self._gradient) - self._num_kept, DIM))
         return self._cholesky.draw(np.concatenate([normals, kept], axis=1))[:, self._own]

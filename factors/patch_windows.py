@@ -62,10 +62,8 @@ class PatchTable:
         return world_T_targets if self.views is None else world_T_targets @ self.views.rig_T_targets
 
     def select(self, observations: np.ndarray) -> "tuple[PatchTable, np.ndarray]":
-        """The table of some observations (O,) bool, and the patches (p,) with any of them.
-
-        Frames keep their indices.
-        """
+        """The table of some observations (O,) bool, and the patches (p,) with any of them; frames
+        keep their indices."""
         counts = np.bincount(self.owners[observations], minlength=len(self))
         rows = np.flatnonzero(counts)
         part = replace(
@@ -81,12 +79,8 @@ class PatchTable:
         return part, rows
 
     def check(self, num_frames: int) -> None:
-        """Refuse inconsistent arrays.
-
-        Raises:
-            ValueError: unequal lengths, indices out of range, values not finite, or a patch with
-                its host or a repeated frame as target.
-        """
+        """Refuse inconsistent arrays. ValueError: unequal lengths, indices out of range, values not
+        finite, or a patch with its host or a repeated frame as target."""
         num = len(self.hosts)
         wanted = {
             "bearings_rig": (self.bearings_rig, (num, 3)),
@@ -150,10 +144,8 @@ def covisible_frames(table: PatchTable, num_frames: int) -> tuple[np.ndarray, np
 def patch_spans(
     table: PatchTable, world_T_rigs: np.ndarray, planes: np.ndarray, rows: np.ndarray
 ) -> np.ndarray:
-    """Vectors (R, 3, 3), rows: to the patch's centre, and its derivatives along e1 and e2.
-
-    They are in the views of targets, for observations `rows (R,)`, times the inverse depth.
-    """
+    """Vectors (R, 3, 3), rows: to the patch's centre, and its derivatives along e1 and e2, in the
+    views of targets, for observations `rows (R,)`, times the inverse depth."""
     owners = table.owners[rows]
     host = table.world_T_hosts(world_T_rigs)[owners]
     target = table.world_T_targets(world_T_rigs)[rows]
@@ -208,14 +200,9 @@ def over_poles(image: np.ndarray, rows: int) -> np.ndarray:
 
 
 def coded(image: SphereImage) -> np.ndarray:
-    """Spline coefficients in two bytes each, continued over seam and poles.
-
-    Returns:
-        (H + 2 PAD, 2 H + 2 PAD) int16, steps of 1 / CODE_SCALE grey values from CODE_ZERO.
-
-    Raises:
-        ValueError: the grey values are not finite.
-    """
+    """Spline coefficients in two bytes each, continued over seam and poles: (H + 2 PAD, 2 H + 2
+    PAD) int16, steps of 1 / CODE_SCALE grey values from CODE_ZERO. ValueError: grey values are not
+    finite."""
     tall = over_poles(image.coefficients, PAD)
     if not np.all(np.isfinite(tall)):
         raise ValueError("the grey values must be finite")
@@ -234,16 +221,9 @@ class PatchPixels:
     def __init__(
         self, table: PatchTable, world_T_rigs: np.ndarray, width: int, margin: float = 6.0
     ) -> None:
-        """Allocate templates; nothing is sampled yet.
-
-        Args:
-            world_T_rigs: (F, 4, 4) float64, poses that place the windows.
-            width: of the sphere images, pixels.
-            margin: pixels of that image at the equator.
-
-        Raises:
-            ValueError: the table is inconsistent, or does not fit the poses.
-        """
+        """Allocate templates, of which nothing is sampled yet, for windows that poses (F, 4, 4)
+        float64 place in sphere images of this width, with a margin in pixels of these at the
+        equator. ValueError: the table is inconsistent, or does not fit the poses."""
         table.check(len(world_T_rigs))
         self.table, self.width, self.margin = table, width, margin
         self.templates = np.full((len(table), len(table.grid)), 0.0, dtype=np.float32)
@@ -270,7 +250,23 @@ class PatchPixels:
         rows = np.flatnonzero(self.table.targets == frame)
         if len(rows) == 0:
             return
-        boxes, codes = self._boxes(rows), coded(image)
+        spans = patch_spans(self.table, self._world_T_rigs, self.table.planes, rows)
+        weights = np.column_stack([np.ones(len(self.table.grid)), self.table.grid])
+        uv = pixels_of(weights @ spans, self.width)
+        height = self.width // 2
+        u, v = uv[..., 0], uv[..., 1]
+        u = u[:, :1] + (u - u[:, :1] + self.width / 2) % self.width - self.width / 2
+        low = np.maximum(np.floor(v.min(axis=1) - self.margin) - PAD, -PAD)
+        high = np.minimum(np.ceil(v.max(axis=1) + self.margin) + PAD, height + PAD)
+        steepest = np.maximum(np.abs(low + PAD - height / 2), np.abs(high - PAD - height / 2))
+        cosine = np.cos(np.minimum(np.pi / 2, np.pi * steepest / height))
+        margin = self.margin / np.maximum(cosine, 1e-3)
+        left = np.floor(u.min(axis=1) - margin) - PAD
+        right = np.ceil(u.max(axis=1) + margin) + PAD
+        ring = right - left >= self.width  # all around a pole
+        left[ring], right[ring] = -PAD, self.width + PAD
+        boxes = np.stack([left, low, right - left, high - low], axis=1).astype(np.int64)
+        codes = coded(image)
         columns = np.arange(boxes[:, 2].max())
         for o, (left, top, wide, high) in zip(rows, boxes.tolist(), strict=True):
             first = left + PAD
@@ -289,22 +285,3 @@ class PatchPixels:
         joined = np.concatenate([np.zeros(0, np.int16), *self._chunks])
         self._chunks = [joined]
         return joined
-
-    def _boxes(self, rows: np.ndarray) -> np.ndarray:
-        """First column and row, width and height (R, 4) int64 of the windows."""
-        spans = patch_spans(self.table, self._world_T_rigs, self.table.planes, rows)
-        weights = np.column_stack([np.ones(len(self.table.grid)), self.table.grid])
-        uv = pixels_of(weights @ spans, self.width)
-        height = self.width // 2
-        u, v = uv[..., 0], uv[..., 1]
-        u = u[:, :1] + (u - u[:, :1] + self.width / 2) % self.width - self.width / 2
-        low = np.maximum(np.floor(v.min(axis=1) - self.margin) - PAD, -PAD)
-        high = np.minimum(np.ceil(v.max(axis=1) + self.margin) + PAD, height + PAD)
-        steepest = np.maximum(np.abs(low + PAD - height / 2), np.abs(high - PAD - height / 2))
-        cosine = np.cos(np.minimum(np.pi / 2, np.pi * steepest / height))
-        margin = self.margin / np.maximum(cosine, 1e-3)
-        left = np.floor(u.min(axis=1) - margin) - PAD
-        right = np.ceil(u.max(axis=1) + margin) + PAD
-        ring = right - left >= self.width  # all around a pole
-        left[ring], right[ring] = -PAD, self.width + PAD
-        return np.stack([left, low, right - left, high - low], axis=1).astype(np.int64)

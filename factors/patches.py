@@ -25,7 +25,6 @@ REASONS = {
     FAR: "found too far off",
     UNSTEADY: "no convergence",
 }  # state of a sighting -> reason of its rejection
-_NO_MASK = np.zeros((0, 0), dtype=np.bool_)
 
 
 class PatchSet:
@@ -41,17 +40,9 @@ class PatchSet:
     def __init__(
         self, num: int, size: int, window: float, affine_sigma: float, grey_sigma: float
     ) -> None:
-        """Allocate templates.
-
-        Args:
-            size: pixels across a patch, n, odd.
-            window: standard deviation of the Gaussian window, in half patches.
-            affine_sigma: standard deviation of the affine part's deviation from the prediction.
-            grey_sigma: noise of grey values.
-
-        Raises:
-            ValueError: the size is even.
-        """
+        """Allocate templates of n = size pixels across, odd, under a Gaussian window whose standard
+        deviation is in half patches; affine_sigma: of the affine part's deviation from the
+        prediction; grey_sigma: noise of grey values. ValueError: the size is even."""
         if size % 2 == 0 or size < 3:
             raise ValueError(f"a patch's size must be an odd number of pixels, not {size}")
         offsets = (np.arange(size) - size // 2) / (window * size / 2)
@@ -88,13 +79,9 @@ class PatchSet:
         spreads: np.ndarray,
         least_contrast: float,
     ) -> None:
-        """Cut the templates `rows (R,)` from their panorama.
-
-        Args:
-            mask: (H, 2H) bool, True = use.
-            origins (T, 3), spreads (T, 3, 2): plane patches, rig frame of the panorama.
-            least_contrast: least standard deviation in grey values.
-        """
+        """Cut the templates `rows (R,)` from their panorama, where the mask (H, 2H) is True: plane
+        patches, origins (T, 3) and spreads (T, 3, 2), rig frame of the panorama, of at least
+        `least_contrast`, standard deviation in grey values."""
         places = np.ascontiguousarray(origins), np.ascontiguousarray(spreads)
         coefficients = image.coefficients
         cut_templates(coefficients, _usable(mask), rows, *places, least_contrast, self.templates)
@@ -109,13 +96,9 @@ class PatchSet:
         max_steps: int,
         tolerance: float,
     ) -> None:
-        """Align the sightings `rows (R,)` of a panorama, and write their results.
-
-        Args:
-            mask: (H, 2H) bool, True = use.
-            max_shift, tolerance: limits of the shift and of its last step, template pixels.
-            max_steps: largest number of Gauss-Newton steps.
-        """
+        """Align the sightings `rows (R,)` of a panorama, where the mask (H, 2H) is True, and write
+        their results, by `max_steps` Gauss-Newton steps at most; `max_shift` and `tolerance` limit
+        the shift and its last step, template pixels."""
         states = self.templates.states[sightings.templates[rows]]
         sightings.states[rows] = states
         rows = rows[states == ALIGNED]
@@ -125,27 +108,19 @@ class PatchSet:
         )  # fmt: skip
 
     def shift_covariances(self, rows: np.ndarray, variances: np.ndarray) -> np.ndarray:
-        """Covariances (N, 2, 2) of shifts, template pixels squared.
-
-        Args:
-            rows: (N,) rows of templates.
-            variances: (N,) residual variances, in the template's grey values.
-        """
+        """Covariances (N, 2, 2) of shifts, template pixels squared, of templates rows (N,), by
+        residual variances (N,) in their grey values."""
         return self.templates.inverses[:, :2, :2][rows] * np.asarray(variances)[:, None, None]
 
 
 def _usable(mask: np.ndarray | None) -> np.ndarray:
     """A mask as the kernels are compiled for: one that cannot be written to is copied."""
-    return _NO_MASK if mask is None else np.require(mask, bool, ["C", "W"])
+    return np.zeros((0, 0), dtype=np.bool_) if mask is None else np.require(mask, bool, ["C", "W"])
 
 
 def expect(templates: np.ndarray, origins: np.ndarray, spreads: np.ndarray) -> Sightings:
-    """Predicted sightings (O,) of templates, not yet aligned.
-
-    Args:
-        templates: (O,) row of each sighting's template. origins (O, 3), spreads (O, 3, 2): the
-        template's plane patch, rig frame of the observing frame.
-    """
+    """Predicted sightings of templates, rows (O,), not yet aligned; origins (O, 3), spreads (O, 3,
+    2): the template's plane patch, rig frame of the observing frame."""
     num = len(templates)
     return Sightings(
         np.asarray(templates, np.int64),
@@ -159,12 +134,8 @@ def expect(templates: np.ndarray, origins: np.ndarray, spreads: np.ndarray) -> S
 
 
 def found_at(sightings: Sightings) -> tuple[np.ndarray, np.ndarray]:
-    """Bearings of the aligned templates' centres.
-
-    Returns:
-        bearings (O, 3), unit, rig frame; their derivatives (O, 3, 2) by the shift in the
-        template's axes, radians per template pixel.
-    """
+    """Bearings (O, 3), unit, rig frame, of the aligned templates' centres; their derivatives (O, 3,
+    2) by the shift in the template's axes, radians per template pixel."""
     shift, affine = sightings.warps[:, :2], sightings.warps[:, 2:].reshape(-1, 2, 2)
     rays = sightings.origins + np.einsum("oij,oj->oi", sightings.spreads, shift)
     lengths = np.linalg.norm(rays, axis=1)

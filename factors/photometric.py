@@ -19,7 +19,6 @@ from factors.robust import RobustLoss
 from factors.threads import balanced_ranges, run_in_threads
 
 FAMILY = "photometric"
-_MIN_DEPTH_SHARE = 0.2  # least share of its inverse depth that a step leaves a patch
 _MIN_THREAD_OBSERVATIONS = 128  # least observations of a thread
 _MIN_CONTRAST = 1.0  # least standard deviation of a template's grey values
 
@@ -57,8 +56,7 @@ class PhotometricBlock:
             sigmas: (P,) or one, noise of a residual, grey values of a pixel in the host.
             loss: robust loss on the root mean square of a patch's whitened residuals, times the
                 number of its pixels; None is plain least squares.
-            weights: (O,) weights of observations, 0 leaves one out; None = 1.
-            num_threads: None = number of cores, at most 16.
+            weights: (O,) of observations, 0 leaves one out; None = 1.
             polish_steps: Gauss-Newton steps on the planes after each proposed pose step.
             floor: grey values added to every contrast in quadrature.
 
@@ -201,10 +199,8 @@ class PhotometricBlock:
         return self.weights > 0
 
     def subset(self, rows: np.ndarray) -> "PhotometricBlock":
-        """A block of some patches (rows, ascending, all observed) on their frames.
-
-        It copies the current planes and selection of observations, and shares the pixels.
-        """
+        """A block of some patches (rows, ascending, all observed) on their frames: it copies the
+        current planes and selection of observations, and shares the pixels."""
         chosen = np.zeros(len(self.table), bool)
         chosen[rows] = True
         observations = chosen[self.table.owners]
@@ -331,7 +327,7 @@ class PhotometricBlock:
 
     def _stepped(self, planes: np.ndarray, steps: np.ndarray) -> np.ndarray:
         """Planes after steps, shortened if they would lead behind the host."""
-        room = (1 - _MIN_DEPTH_SHARE) * planes[:, 0]
+        room = 0.8 * planes[:, 0]
         share = np.minimum(1.0, room / np.maximum(-steps[:, 0], 1e-300))
         return planes + share[:, None] * np.where(np.isfinite(steps), steps, 0.0)
 

@@ -19,11 +19,8 @@ class Sampled(Protocol):
 
 
 def normalised(values: np.ndarray, floor: float) -> tuple[np.ndarray, float]:
-    """Grey values (N,) without mean over their contrast, and that contrast's norm.
-
-    Args:
-        floor: grey values added to the contrast in quadrature, so that flat patches stay near zero.
-    """
+    """Grey values (N,) without mean over their contrast, and that contrast's norm; floor: grey
+    values added to the contrast in quadrature, so that flat patches stay near zero."""
     centred = values - values.mean()
     norm = float(np.sqrt(centred @ centred + len(values) * floor**2))
     return centred / norm, norm

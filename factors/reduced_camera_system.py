@@ -73,17 +73,12 @@ class ReducedSystem(NormalEquations, ABC):
     def covariances(
         self, num_draws: int, rng: np.random.Generator, damping: float = 0.0
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """Blocks of H^-1 at the linearization point, and draws from it; None if singular.
+        """Blocks of H^-1 at the linearization point, damped by part of its diagonal, and draws from
+        it; None if singular: (N, 6, 6) diagonal blocks, (P, 6, 6) blocks between the first blocks
+        of the layout's pairs, and vectors (D, N, 6) of covariance H^-1.
 
         An unconstrained block is NaN and is left out. An iterative solver does not detect a free
         gauge: its errors are merely enormous.
-
-        Args:
-            damping: part of the diagonal that is added to it.
-
-        Returns:
-            (N, 6, 6) diagonal blocks, (P, 6, 6) blocks between the first blocks of the layout's
-            pairs, and vectors (D, N, 6) of covariance H^-1.
         """
         idle = np.logical_not(np.any(self._diagonal, axis=(1, 2)))
         diagonal = np.where(idle[:, None, None], np.eye(DIM), self._diagonal)

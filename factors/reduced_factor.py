@@ -16,14 +16,9 @@ Evaluate = Callable[[gtsam.Values, bool], tuple[float, PoseSystem | None]]
 def reduced_factor(
     keys: Sequence[int], pairs: np.ndarray, evaluate: Evaluate
 ) -> gtsam.CustomFactor:
-    """A factor whose error is a robust cost, and whose linearization is that cost's model.
-
-    Args:
-        keys: (F,) keys of Pose3 variables.
-        pairs: (P, 2) rows f < g of keys, of the model's off-diagonal blocks.
-        evaluate: cost at values, with inner variables optimised for them; and, if requested, the
-            model there.
-    """
+    """A factor on Pose3 variables, keys (F,), whose error is a robust cost, and whose linearization
+    is that cost's model, with off-diagonal blocks of rows f < g of keys, pairs (P, 2); evaluate:
+    cost at values, with inner variables optimised for them; and, if requested, the model there."""
     num, columns = len(keys), np.asarray(pairs).reshape(-1, 2)
 
     def error(_factor, values: gtsam.Values, jacobians) -> np.ndarray:

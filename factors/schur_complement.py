@@ -25,12 +25,9 @@ def _take_squares(U, out):
 
 @_kernel
 def project_visits(visits, W, roots, shifts, diagonal, gradient):
-    """Subtract the landmarks of a run from the poses' own Hessian and gradient; W becomes U.
-
-    Args:
-        W (V, 3, 6), roots (L, 6), shifts (L, 3): see `factors._kernels.linearize_range`.
-        diagonal (F, 6, 6), gradient (F, 6): accumulated.
-    """
+    """Subtract the landmarks of a run from the poses' own Hessian and gradient, diagonal (F, 6, 6),
+    gradient (F, 6); W becomes U. W (V, 3, 6), roots (L, 6), shifts (L, 3): see
+    `factors._kernels.linearize_range`."""
     for j in range(len(visits.offsets) - 1):
         shift = shifts[j]
         r00, r10, r20 = roots[j, 0], roots[j, 1], roots[j, 2]
@@ -112,12 +109,8 @@ def take_groups(first, last, over, sums, target):
 
 @_kernel
 def add_pairs_of_groups(pairs, blocks, groups, bases, target):
-    """Add blocks (P, 6, 6) of pairs (P, 2) of variables to target (7 G, 7 G), upper.
-
-    Args:
-        groups: (N,) group of each variable, -1 = none.
-        bases: (N, 6, 7).
-    """
+    """Add blocks (P, 6, 6) of pairs (P, 2) of variables to target (7 G, 7 G), upper; groups (N,):
+    of each variable, -1 = none; bases (N, 6, 7)."""
     moved = np.empty((6, GROUP_DIM))
     for p in range(len(pairs)):
         i, j = pairs[p, 0], pairs[p, 1]
@@ -213,13 +206,8 @@ class SchurComplement:
         visits: Sequence[GroupVisits],
         target: np.ndarray,
     ) -> None:
-        """Add H projected to groups of poses.
-
-        Args:
-            labels: (F,) group of each pose.
-            bases: (F, 6, 7) motion of each pose when its group moves.
-            target: (7 G, 7 G), only the upper triangle is written.
-        """
+        """Add H projected to groups of poses, labels (F,), to the upper triangle of target (7 G, 7
+        G); bases: (F, 6, 7) motion of each pose when its group moves."""
         for run, projected, by_group in zip(self.runs, self.projected, visits, strict=True):
             over = by_group.over
             sums = np.empty((len(over.frames), 3, GROUP_DIM))

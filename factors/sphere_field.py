@@ -15,7 +15,6 @@ from factors.compiled import kernel_and_part
 
 _MAX_STEPS = 20  # fixed-point steps that invert a field; each reduces the error by the field's
 # slope
-_CONVERGED_STEP = 1e-12  # step of a direction below which iteration ends
 
 _kernel, _part = kernel_and_part()
 
@@ -26,11 +25,7 @@ def num_harmonics(degree: int) -> int:
 
 
 def degree_of(num: int) -> int:
-    """Degree of a field with `num` coefficients.
-
-    Raises:
-        ValueError: no degree has that many.
-    """
+    """Degree of a field with `num` coefficients. ValueError: no degree has that many."""
     degree = 0
     while num_harmonics(degree) < num:
         degree += 1
@@ -46,15 +41,9 @@ def degrees_of(num: int) -> np.ndarray:
 
 
 def harmonics(bearings: np.ndarray, degree: int) -> np.ndarray:
-    """Tangent vectors of each harmonic.
-
-    Args:
-        bearings: (N, 3) float64, unit.
-
-    Returns:
-        (N, 3, K) float64, by degree, gradients before curls within each; orthonormal over
-        the sphere. Solid harmonics by their Cartesian recurrences, which have no pole.
-    """
+    """Tangent vectors (N, 3, K) float64 of each harmonic at unit bearings (N, 3), by degree,
+    gradients before curls within each; orthonormal over the sphere. Solid harmonics by their
+    Cartesian recurrences, which have no pole."""
     flat = np.ascontiguousarray(bearings, dtype=np.float64)
     out = np.zeros((len(flat), 3, num_harmonics(degree)))
     if degree:
@@ -104,17 +93,13 @@ class SphereField:
             off = directions - self.corrected(found)
             found = found + off
             found = found / np.linalg.norm(found, axis=-1, keepdims=True)
-            if np.abs(off).max(initial=0.0) < _CONVERGED_STEP:
+            if np.abs(off).max(initial=0.0) < 1e-12:
                 break
         return found
 
     def corrected_roots(self, bearings: np.ndarray, roots: np.ndarray) -> np.ndarray:
-        """Square-root informations (N, 2, 2) on the tangent bases of the corrected bearings.
-
-        Args:
-            bearings: (N, 3) observed.
-            roots: (N, 2, 2) on the tangent bases of the observed bearings.
-        """
+        """Square-root informations (N, 2, 2) on the tangent bases of the corrected bearings, of
+        those on the tangent bases of the observed bearings (N, 3)."""
         if not self:
             return roots
         there = tangent_basis(self.corrected(bearings))

@@ -150,17 +150,13 @@ class SphereImage:
 
     @classmethod
     def of(cls, grey: np.ndarray, smooth: bool = False) -> "SphereImage":
-        """Fit the spline through all pixels, or one that smooths them.
+        """Fit the spline through all pixels of an equirectangular image (H, 2H) of any real type, H
+        at least 2, or one that smooths them.
 
         Unser, "Splines: a perfect fit for signal and image processing", IEEE SPM 16(6), 1999.
-
-        Args:
-            grey: (H, 2H) any real type, equirectangular, H at least 2.
-            smooth: use pixel values as coefficients, which blurs by 0.58 pixels (standard deviation
-                per axis) equally at all positions between pixels, and reduces noise.
-
-        Raises:
-            ValueError: the image has another shape.
+        Smoothed, pixel values are the coefficients: that blurs by 0.58 pixels (standard deviation
+        per axis) equally at all positions between pixels, and reduces noise. ValueError: another
+        shape.
         """
         height, width = grey.shape
         if width != 2 * height or height < 2:
@@ -176,14 +172,8 @@ class SphereImage:
         return cls(rows)
 
     def sample(self, vectors_rig: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Values and their gradients at directions.
-
-        Args:
-            vectors_rig: (..., 3) float64, not zero, of any length, rig frame.
-
-        Returns:
-            values (...) float64 in grey values; gradients (..., 3) by the vector, across it.
-        """
+        """Values (...) float64 in grey values in the directions of vectors (..., 3) float64, not
+        zero, of any length, rig frame; and their gradients (..., 3) by the vector, across it."""
         vectors = np.asarray(vectors_rig, dtype=np.float64)
         flat = np.ascontiguousarray(vectors.reshape(-1, 3))
         values, gradients = np.empty(len(flat)), np.empty((len(flat), 3))

@@ -24,15 +24,12 @@ class Supernodes:
 
 
 def find_supernodes(num: int, pairs: np.ndarray, num_kept: int = 0) -> Supernodes:
-    """Order a symmetric pattern by minimum degree and find the supernodes of its factor.
+    """Order a symmetric pattern, pairs (P, 2), i < j, distinct, by minimum degree and find the
+    supernodes of its factor. The last num_kept rows come last in the order, as they are, and are a
+    supernode of their own; `pairs` must pair each of them with each.
 
     Liu, "The role of elimination trees in sparse factorization", 1990; runs are relaxed as in
     Ashcraft and Grimes, 1989.
-
-    Args:
-        pairs: (P, 2) int, i < j, distinct: entries off the diagonal.
-        num_kept: K rows, the last ones, that come last in the order, as they are, and are a
-            supernode of their own; `pairs` must pair each with each.
     """
     from scipy.sparse import coo_matrix, identity
     from scipy.sparse.linalg import splu

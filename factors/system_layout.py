@@ -36,15 +36,8 @@ class SystemLayout:
         pairs: Sequence[tuple[int, int]] = (),
         order: Sequence[int] = (),
     ) -> None:
-        """Place the variables.
-
-        Args:
-            pairs: keys of two variables each, whose joint block `covariances` returns.
-            order: keys of variables that come first, in this order; others follow.
-
-        Raises:
-            ValueError: a variable has no value.
-        """
+        """Place the variables, those of `order` first; `covariances` returns the joint blocks of
+        pairs of keys. ValueError: a variable has no value."""
         self.graph, self.blocks = graph, tuple(blocks)
         factor_keys = [graph.at(i).keys() for i in range(graph.size()) if graph.exists(i)]
         self.graph_keys = sorted({key for keys in factor_keys for key in keys})

@@ -15,12 +15,8 @@ T = TypeVar("T")
 
 
 def balanced_ranges(offsets: np.ndarray, least: int = 8192) -> list[tuple[int, int]]:
-    """Runs of owners with about the same number of observations; at least one.
-
-    Args:
-        offsets: (N + 1,) owner n holds observations offsets[n] to offsets[n + 1] - 1.
-        least: least observations of a run.
-    """
+    """Runs of owners with about the same number of observations, at least `least`; at least one.
+    Owner n holds observations offsets[n] to offsets[n + 1] - 1."""
     total = int(offsets[-1])
     num = min(max(total // least, 1), 24)  # largest number of runs, as each has sums of its own
     targets = np.linspace(0, total, num + 1)[1:-1]

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gsba.bundle.fixes import WHITE_SHARE, FrameFixes
+from gsba.bundle.gps_factors import WHITE_SHARE, FrameFixes
 
 SIGMAS_M = np.array([3.0, 3.0, 5.0])  # east, north, up
 TAU_S = 60.0

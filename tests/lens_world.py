@@ -8,9 +8,8 @@ from synthetic import RIG, World, make_world, unit, with_noise
 
 from gsba.bundle import adjustment, triangulation
 from gsba.bundle.adjustment import AdjustmentContext
-from gsba.bundle.bearings import Bearings
 from gsba.bundle.camera_adjustment import solve_with_camera
-from gsba.bundle.families import Families
+from gsba.bundle.families import Bearings, Families
 from gsba.bundle.readout import CameraEstimate, CameraEstimates
 from gsba.bundle.trajectory_prior import TrajectoryPrior
 from gsba.camera.cameras import Cameras

@@ -8,8 +8,7 @@ import numpy as np
 from tiny_run import SETTINGS, Case
 
 from gsba.bundle.adjustment import AdjustmentContext
-from gsba.bundle.bearings import Bearings
-from gsba.bundle.families import Families
+from gsba.bundle.families import Bearings, Families
 from gsba.bundle.trajectory_prior import TrajectoryPrior
 from gsba.config import RefineSettings
 from gsba.frames import cubemap

@@ -31,8 +31,7 @@ def prepare(out: Path) -> None:
     """Make the inputs of all cases once: a walk and its run, tables, images, a video."""
     from gsba import GsbaError, load_run, refine
     from gsba.splat import read_ply
-    from gsba.splat.gaussians import from_cloud
-    from gsba.splat.ply import write_ply
+    from gsba.splat.gaussians import from_cloud, write_ply
 
     try:
         load_run(out / "light")  # of this version

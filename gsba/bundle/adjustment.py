@@ -32,8 +32,6 @@ from gsba.types import (
     Tracks,
 )
 
-_CHUNK = 1 << 17  # observations whose residuals are made at a time: 20 MB
-
 
 @dataclass(frozen=True, slots=True)
 class DivisibleMap:
@@ -52,9 +50,9 @@ class DivisibleMap:
         return len(self.landmarks.tracks)
 
     def chunks(self) -> Iterator[tuple[np.ndarray, Sequence[Term]]]:
-        """Landmarks (J, 3) and their terms, a few of them at a time."""
+        """Landmarks (J, 3) and their terms, a few at a time."""
         landmarks = self.landmarks
-        for points, _, own in runs(landmarks.tracks, _CHUNK):
+        for points, _, own in runs(landmarks.tracks, 1 << 17):  # 20 MB
             some = Landmarks(landmarks.points_world[points], own, landmarks.counts)
             yield some.points_world, self.terms_of(some)
             release_mapped_files()
@@ -144,21 +142,15 @@ class AdjustmentContext:
         return replace(self, families=self.families.with_members(members))
 
     def terms(self, solved: Solution) -> Terms:
-        """Terms of all families for an adjustment that starts from a solution.
-
-        Raises:
-            GsbaError: a family whose factors are about variables without a value.
-        """
+        """Terms of all families for an adjustment that starts from a solution. GsbaError: a family
+        whose factors are about variables without a value."""
         own, values = self.families.terms(solved, self.maps), values_of(solved.world_T_rigs)
         values.insert(own.values)
         return Terms(own.graph, own.blocks, values, own)
 
     def covariance_terms(self, solved: Solution, maps: np.ndarray | None) -> Terms:
-        """Terms for covariances: the first pose and the extent of each map are held fixed.
-
-        Args:
-            maps: (F,) map of each frame; None = there is one.
-        """
+        """Terms for covariances: the first pose and the extent of each map are held fixed; maps:
+        (F,) map of each frame, None = there is one."""
         own = self.families.covariance_terms(solved, self.maps)
         graph, values = gtsam.NonlinearFactorGraph(own.graph), values_of(solved.world_T_rigs)
         graph.push_back(pose_variables.fixed_scale(solved.world_T_rigs, maps))
@@ -178,12 +170,6 @@ class ObservedPoints:
     def block(self) -> LandmarkBlock:
         """Their factor block."""
         return landmark_block(self.landmarks, self.keypoints, self.noise, self.context)
-
-    def covariances_in_parts(self, terms: Terms) -> tuple[np.ndarray, JointErrors] | None:
-        """Covariances of poses, as `pose_covariances`; None where the map is not divided."""
-        division, map_ = self.context.division, self._divisible(terms)
-        seed = self.context.settings.seed
-        return division.covariances(map_, DRAWS, seed) if division and map_ else None
 
     def _terms_of(self, landmarks: Landmarks) -> list[Term]:
         return self.context.families.landmark_terms(landmarks, self.keypoints, self.noise)
@@ -218,11 +204,8 @@ class View(Protocol):
     def terms(
         self, solved: Solution, noise: float, context: AdjustmentContext
     ) -> "tuple[Terms, Callable[[gtsam.Values], Self]]":
-        """Terms that an adjustment from a solution minimises, and the view at the values it finds.
-
-        Args:
-            noise: of the observations, in units of the keypoints' own sigmas.
-        """
+        """Terms that an adjustment from a solution minimises, and the view at the values it finds;
+        noise: of the observations, in units of the keypoints' own sigmas."""
         ...
 
 
@@ -250,11 +233,8 @@ class FixedRays:
 def adjust_sighted(
     sighted: Sighted, before: Solution, context: AdjustmentContext, gates: Sequence[float]
 ) -> tuple[Solution, Keypoints]:
-    """As `adjust`, of aligned and former observations, the noise of either estimated on its own.
-
-    Returns:
-        The solution, and its keypoints with the noise that they turned out to have.
-    """
+    """As `adjust`, of aligned and former observations, the noise of either estimated on its own;
+    and the keypoints with the noise that they turned out to have."""
     view = FixedRays(sighted.keypoints)
     solved, seen = adjust_sighted_through(view, sighted, before, context, gates)
     return solved, seen.keypoints
@@ -331,11 +311,8 @@ def adjust_through(
     gates: Sequence[float],
     final: bool = True,
 ) -> tuple[Solution, V]:
-    """As `adjust`, through a camera that may be solved for beside the poses.
-
-    Returns:
-        The solution and the view that belongs to it.
-    """
+    """As `adjust`, through a camera that may be solved for beside the poses; and the view that
+    belongs to the solution."""
     solved, rounds, settings = replace(start, rounds=()), [], context.settings
     place = _Placement(tracks, context)
     last_gate = gates[-1] * start.noise
@@ -402,11 +379,8 @@ def _solver(settings: RefineSettings, last: bool) -> SolverSettings:
 def landmark_block(
     landmarks: Landmarks, keypoints: Keypoints, noise: float, context: AdjustmentContext
 ) -> LandmarkBlock:
-    """The factor block of the families that observe points.
-
-    Args:
-        noise: of the observations, in units of the keypoints' own sigmas.
-    """
+    """The factor block of the families that observe points; noise: of the observations, in units of
+    the keypoints' own sigmas."""
     solver = context.settings.solver
     return LandmarkBlock(
         [pose_variables.X(f) for f in range(len(keypoints.starts) - 1)],
@@ -426,7 +400,8 @@ def pose_covariances(
     """Marginal covariances (F, 6, 6) with the first pose and the extent of each map held fixed."""
     terms, seed = context.covariance_terms(solved, components), context.settings.seed
     observed = ObservedPoints(solved.landmarks, keypoints, solved.noise, context)
-    found = observed.covariances_in_parts(terms)
+    division, map_ = context.division, observed._divisible(terms)
+    found = division.covariances(map_, DRAWS, seed) if division and map_ else None
     if found is not None:
         return found
     keys = [pose_variables.X(f) for f in range(len(solved.world_T_rigs))]

@@ -5,9 +5,16 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
+from scipy.linalg import block_diag
 
-from gsba.bundle import pose_variables
+from factors import Block
+from factors.block import QuadraticBlock
+from factors.camera_rows import LensVariables
+from factors.direct_system import reduced_system
+from factors.reduced_camera_system import ReducedSystem
+from gsba.bundle import pose_variables, readout
 from gsba.bundle.adjustment import (
+    DRAWS,
     AdjustmentContext,
     Terms,
     adjust,
@@ -15,11 +22,195 @@ from gsba.bundle.adjustment import (
     adjust_sighted_through,
     adjust_through,
 )
-from gsba.bundle.camera_system import CameraSystem
-from gsba.bundle.camera_variables import CameraUnknowns
+from gsba.bundle.camera_variables import CameraUnknowns, W
+from gsba.bundle.optimizer import marginal_covariances
 from gsba.bundle.readout import CameraEstimates
 from gsba.bundle.stitching import with_noise_of
-from gsba.types import Keypoints, Sighted, Solution, Tracks
+from gsba.types import JointErrors, Keypoints, Sighted, Solution, Tracks
+
+_DAMPING = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class CameraSigmas:
+    """Marginal covariances of one camera."""
+
+    centre: np.ndarray  # (3 (L - 1), 3 (L - 1)) float64, of the lenses' centres but the last one;
+    # what is common to different lenses is left out
+    readout_sigma: float  # s; NaN = no readout was taken
+    inverse_stitch_radius_sigma: float  # 1 / map units; NaN = infinity, or as settings say
+    lens_sigmas: np.ndarray | None = None  # (K,) of the parameters of raw lenses, see
+    # `self_calibration`; None = they are as calibrated
+
+
+@dataclass(frozen=True, slots=True)
+class CameraCovariances:
+    """Marginal covariances, cameras and poses adjusted together."""
+
+    poses: np.ndarray  # (F, 6, 6) float64, [rotation rad, translation], rig frame
+    joint: JointErrors  # what the poses' errors have in common
+    cameras: tuple[CameraSigmas, ...]  # (C,)
+
+
+@dataclass(frozen=True, slots=True)
+class CameraSystem:
+    """A map and its cameras, linearized together."""
+
+    solved: Solution  # poses, points, noise
+    shown: Keypoints  # keypoints of its observations, as pictures show them
+    cameras: CameraEstimates  # so far
+    timestamps: np.ndarray  # (F,) seconds
+    context: AdjustmentContext  # priors, loss
+
+    def prepared(self) -> CameraEstimates:
+        """The cameras with a decision on the gyro, and the estimated spread of frames' own motion.
+
+        The spread is estimated by expectation maximisation: squared deviations plus variances.
+        """
+        read = [camera.lenses.readout_motion is not None for camera in self.cameras.each]
+        if not any(read):
+            return self.cameras
+        cameras, num = self.cameras, len(self.solved.world_T_rigs)
+        for number in np.flatnonzero(read).tolist():
+            turning = readout.turning_of(cameras.each[number].lenses, self.context)
+            if turning is not None:
+                by_gyro = self._agrees(number, turning.rates)
+                cameras = cameras.changed(number, lambda one, by=by_gyro: replace(one, by_gyro=by))
+        system = replace(self, cameras=cameras)._linearized()
+        variances = system.own_variances()  # they hardly depend on the spread
+        if variances is None:
+            return cameras
+        for _ in range(4):  # passes that estimate the spread of frames' own motion
+            motion, own = system.own_motion(), system.unknowns.own
+            if motion is None or own is None:
+                break
+            sigmas = list(own.sigmas)
+            for number in np.flatnonzero(read).tolist():
+                rows = cameras.frames_of(number, num)
+                spread = np.sqrt(np.mean(motion[rows] ** 2 + variances[rows], axis=0))
+                if own.told[rows].any():  # rotations by the gyro do not measure the spread of
+                    # others
+                    spread[:3] = sigmas[number][:3]
+                sigmas[number] = spread
+            system = replace(system, unknowns=system.unknowns.spread_as(sigmas))
+        return system.unknowns.cameras
+
+    def _agrees(self, number: int, rates: np.ndarray) -> bool:
+        """True if images alone confirm a gyro's rates (F, 3) of a camera during the readout."""
+        camera, num = self.cameras.each[number], len(rates)
+        without = self.cameras.changed(number, lambda one: replace(one, by_gyro=False))
+        alone = replace(self, cameras=without)._linearized()
+        motion, variances = alone.own_motion(), alone.own_variances()
+        own = np.isin(np.arange(num), self.cameras.frames_of(number, num))
+        told = own & np.all(np.isfinite(rates), axis=1)
+        if motion is None or variances is None or not told.any():
+            return False
+        seen = motion[told, :3]  # rotations are own motion alone: velocities of poses give none
+        off = seen - camera.readout_s * rates[told]
+        near = np.median(off**2 / variances[told, :3]) < 4.0  # variances of the motion
+        return bool(near or np.sum(off**2) < 0.5 * np.sum(seen**2))
+
+    def _unknowns(self) -> CameraUnknowns:
+        poses = self.solved.world_T_rigs
+        return CameraUnknowns.of(self.cameras, poses, self.timestamps, self.context)
+
+    def _linearized(self) -> "_Linearized":
+        """The quadratic model at these poses and this camera, points at their optimum."""
+        unknowns, terms = self._unknowns(), self.context.terms(self.solved)
+        terms.values.insert(unknowns.values)
+        block = unknowns.block(self.solved.landmarks, self.shown, self.solved.noise, curved=True)
+        block.polish(terms.values)
+        whole = block.linearize(terms.values)
+        blocks = (QuadraticBlock(block.keys, block.pairs, whole), *terms.blocks)
+        return _Linearized(unknowns, terms.graph, blocks, terms.values)
+
+    def covariances(self, components: np.ndarray | None = None) -> CameraCovariances:
+        """Marginal covariances with the first pose and the extent of each map held fixed;
+        components: (F,) map of each frame, None = there is one."""
+        unknowns, terms = self._unknowns(), self.context.covariance_terms(self.solved, components)
+        terms.values.insert(unknowns.values)
+        block = unknowns.block(self.solved.landmarks, self.shown, self.solved.noise)
+        block.polish(terms.values)
+        num = len(self.solved.world_T_rigs)
+        graph = gtsam.NonlinearFactorGraph(terms.graph)
+        graph.push_back(unknowns.graph)
+        beside = [key for key, _ in unknowns.variables.shared]
+        found, joint = marginal_covariances(
+            graph,
+            [block, *terms.blocks],
+            terms.values,
+            list(unknowns.variables.poses),
+            DRAWS,
+            self.context.settings.seed,
+            beside,
+        )
+        sigmas = {
+            key: np.sqrt(np.diagonal(found[num + i])[:dim])
+            for i, (key, dim) in enumerate(unknowns.variables.shared)
+        }
+        of_centres = {
+            key: found[num + i, :3, :3] for i, (key, _) in enumerate(unknowns.variables.shared)
+        }
+        cameras = [
+            _sigmas_of(variables, sigmas, of_centres) for variables in unknowns.variables.cameras
+        ]
+        return CameraCovariances(found[:num], joint, tuple(cameras))
+
+
+def _sigmas_of(
+    variables: LensVariables, sigmas: dict[int, np.ndarray], covariances: dict[int, np.ndarray]
+) -> CameraSigmas:
+    """Covariances of one camera, from standard deviations and covariances of all by their keys."""
+    nothing = np.array([np.nan])
+    readout_sigma, of_radius = (
+        float(sigmas.get(-1 if key is None else key, nothing)[0])
+        for key in (variables.readout, variables.radius)
+    )
+    lenses = None
+    if variables.lenses is not None:
+        lenses = np.concatenate([sigmas[key] for key in variables.lenses])
+    centre = np.zeros((0, 0))
+    if variables.centres:
+        centre = np.asarray(block_diag(*(covariances[key] for key in variables.centres)))
+    return CameraSigmas(centre, readout_sigma, of_radius, lenses)
+
+
+@dataclass(frozen=True, slots=True)
+class _Linearized:
+    """Quadratic model of bearings over poses and camera, and priors on these."""
+
+    unknowns: CameraUnknowns
+    graph: gtsam.NonlinearFactorGraph  # of all but the camera
+    blocks: tuple[Block, ...]
+    values: gtsam.Values
+
+    def own_motion(self) -> np.ndarray | None:
+        """Frames' own motion (F, 6) at the model's minimum; None where it is singular."""
+        system, own = self._system(), self.unknowns.own
+        steps = system.solve(_DAMPING)
+        if steps is None or own is None:
+            return None
+        return own.values + steps[self._rows(system)]
+
+    def own_variances(self) -> np.ndarray | None:
+        """Variances (F, 6) of frames' own motion; None where the model is singular."""
+        system = self._system()
+        inverse = system.covariances(0, np.random.default_rng(0), _DAMPING)
+        if inverse is None:
+            return None
+        return np.einsum("fii->fi", inverse[0][self._rows(system)])
+
+    def _system(self) -> ReducedSystem:
+        graph = gtsam.NonlinearFactorGraph(self.graph)
+        graph.push_back(self.unknowns.priors())  # of frames that move by chance: their spread
+        system = reduced_system(graph, self.blocks, self.values)
+        system.linearize(self.values)
+        return system
+
+    def _rows(self, system: ReducedSystem) -> list[int]:
+        """Block of each frame's own motion."""
+        return [system.first_block[W(f)] for f in range(len(self.unknowns.variables.poses))]
+
 
 _SCALE_SIGMA = 1e-3  # of each map's extent about its former one: images leave the scale open, and
 # priors of zero on frames' own motion would shrink the map
@@ -80,13 +271,9 @@ def solve_with_camera(
 ) -> tuple[Solution, CameraEstimates]:
     """Solve for poses, points and the parts of a camera that were taken, in one graph.
 
-    The last round, of the tightest gate, is of poses and points alone.
-
-    Args:
-        shown: keypoints as pictures show them.
-        cameras: to start from; what it leaves out (a readout, axes, raw lenses) is left out.
-        timestamps: (F,) seconds.
-        start, context, gates, final: see `adjustment.adjust`.
+    The last round, of the tightest gate, is of poses and points alone. The keypoints are as
+    pictures show them, timestamps (F,) in seconds; what the cameras leave out (a readout, axes, raw
+    lenses) is left out. For start, context, gates and final see `adjustment.adjust`.
     """
     wide, last = _split(gates)
     view = CameraView.of(shown, cameras, timestamps)
@@ -107,14 +294,8 @@ def solve_sighted_with_camera(
     context: AdjustmentContext,
     gates: Sequence[float],
 ) -> tuple[Solution, Keypoints, CameraEstimates]:
-    """As `solve_with_camera`, of aligned and former observations, as `adjust_sighted` takes them.
-
-    Args:
-        sighted: observations as pictures show them.
-
-    Returns:
-        The solution, the keypoints with the noise that they turned out to have, and the camera.
-    """
+    """As `solve_with_camera`, of aligned and former observations as pictures show them, as
+    `adjust_sighted` takes them; and the keypoints with the noise that they turned out to have."""
     wide, last = _split(gates)
     view = CameraView.of(sighted.keypoints, cameras, timestamps)
 

@@ -77,13 +77,8 @@ class CameraUnknowns:
         timestamps: np.ndarray,
         context: AdjustmentContext,
     ) -> "CameraUnknowns":
-        """Variables of what was taken of cameras: the rest stays as it is.
-
-        Args:
-            cameras: as found so far.
-            world_T_rigs: (F, 4, 4) poses, whose velocities frames have while they are read.
-            timestamps: (F,) seconds.
-        """
+        """Variables of what was taken of cameras so far: the rest stays as it is. Frames have the
+        velocities of their poses (F, 4, 4) at timestamps (F,), seconds, while they are read."""
         num, parts, first = len(world_T_rigs), list[LensVariables](), 0
         values, graph = gtsam.Values(), gtsam.NonlinearFactorGraph()
         for number, camera in enumerate(cameras.each):
@@ -127,13 +122,8 @@ class CameraUnknowns:
     def block(
         self, landmarks: Landmarks, shown: Keypoints, noise: float, curved: bool = False
     ) -> CameraBlock:
-        """The observations of some points, to be explained by poses and cameras.
-
-        Args:
-            shown: keypoints as pictures show them.
-            noise: of the observations, in units of the keypoints' own sigmas.
-            curved: see `CameraBlock`.
-        """
+        """The observations of some points, to be explained by poses and cameras: keypoints as
+        pictures show them, their noise in units of their own sigmas; curved: see `CameraBlock`."""
         tracks, rows = landmarks.tracks, shown.rows(landmarks.tracks)
         seen = shown.bearings_rig[rows], tracks.frames, shown.roots(rows) / noise
         measured, roots, seeing, fractions = self._sighted(*seen)

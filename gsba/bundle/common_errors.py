@@ -10,8 +10,6 @@ from gsba.geometry import furthest
 from gsba.types import JointErrors
 from gsba.types.records import slices
 
-_COMMON_RATIO = 1.7  # standard deviation of common errors over that of the others
-_SMOOTHING_FRAMES = 3.0  # frames, standard deviation of their smoothing
 _AT_ONCE = 20  # errors drawn of all poses, in float64
 
 
@@ -21,14 +19,9 @@ def added(
     world_T_rigs: np.ndarray,
     components: np.ndarray | None = None,
 ) -> tuple[np.ndarray, JointErrors]:
-    """Covariances with the errors in common, in the same gauge.
-
-    Args:
-        covariances: (F, 6, 6) of poses, [rotation rad, translation], rig frames; NaN = none.
-        world_T_rigs: (F, 4, 4).
-        components: (F,) map of each frame, in which the first pose and its distance to the
-            furthest position are held; None = there is one.
-    """
+    """Covariances (F, 6, 6) of poses, [rotation rad, translation], rig frames, NaN = none, with the
+    errors in common, in the same gauge: in each map of components (F,), None = there is one, the
+    first pose and its distance to the furthest position are held."""
     groups = np.zeros(len(world_T_rigs), int) if components is None else components
     known, num = np.isfinite(joint.draws).all(axis=(0, 2)), len(joint.draws)
     parts = [np.flatnonzero(known & (groups == group)) for group in np.unique(groups)]
@@ -51,9 +44,8 @@ def _in_common(
     for rows in parts:
         if len(rows) > 1:
             turned = [rotations[rows] @ draws[:, rows, part, None] for part in _PARTS]
-            smooth = gaussian_filter1d(
-                np.concatenate(turned, axis=2)[..., 0], _SMOOTHING_FRAMES, axis=1
-            )
+            # frames, standard deviation
+            smooth = gaussian_filter1d(np.concatenate(turned, axis=2)[..., 0], 3.0, axis=1)
             positions = world_T_rigs[rows, :3, 3]
             offsets = positions - positions[0]
             far, distance = furthest(positions)
@@ -64,7 +56,8 @@ def _in_common(
             held = np.concatenate([turns - turns[:, :1], shifts], axis=-1)
             back = np.swapaxes(rotations[rows], 1, 2)
             turned = [back @ held[:, :, part, None] for part in _PARTS]
-            errors[:, rows] = _COMMON_RATIO * np.concatenate(turned, axis=2)[..., 0]
+            # standard deviation over that of the other errors
+            errors[:, rows] = 1.7 * np.concatenate(turned, axis=2)[..., 0]
     return errors
 
 

@@ -9,8 +9,10 @@ from typing import Any, Protocol
 import gtsam
 import numpy as np
 
-from factors import Block, Term
+from factors import BearingTerm, Block, FaceCameras, ReprojectionTerm, Term
+from gsba.bundle.observation_noise import face_roots
 from gsba.bundle.pose_variables import X
+from gsba.camera.rig import RIG_R_FACE, CubeRig
 from gsba.log import GsbaError
 from gsba.types import FamilyVariables, Keypoints, Landmarks, Solution
 
@@ -32,11 +34,8 @@ class PointObservations:
 
     @classmethod
     def of(cls, landmarks: Landmarks, keypoints: Keypoints, noise: float) -> "PointObservations":
-        """Observations of landmarks.
-
-        Args:
-            noise: of an observation, in units of its keypoint's own sigma.
-        """
+        """Observations of landmarks; noise: of an observation, in units of its keypoint's own
+        sigma."""
         tracks, rows = landmarks.tracks, keypoints.rows(landmarks.tracks)
         infos = keypoints.sqrt_infos
         return cls(
@@ -176,11 +175,8 @@ class Families:
     def landmark_terms(
         self, landmarks: Landmarks, keypoints: Keypoints, noise: float
     ) -> list[Term]:
-        """Residuals of points by all families that observe them.
-
-        Args:
-            noise: of the observations, in units of the keypoints' own sigmas.
-        """
+        """Residuals of points by all families that observe them; noise: of the observations, in
+        units of the keypoints' own sigmas."""
         observing = self.observing_points.members
         share = noise * np.sqrt(len(observing))
         observed = PointObservations.of(landmarks, keypoints, share)
@@ -191,11 +187,8 @@ class Families:
         return [(family.name, family.digest) for family in self.members]
 
     def snapshot(self, solved: Solution, maps: np.ndarray | None = None) -> MapSnapshot:
-        """The snapshot of a solution that families build their factors from.
-
-        Args:
-            maps: (F,) map of each frame; None = there is one.
-        """
+        """The snapshot of a solution that families build their factors from; maps: (F,) map of each
+        frame, None = there is one."""
         of_frames = numbered(maps, len(solved.world_T_rigs))
         variables = restored(solved.variables)
         given = self.names, self.timestamps, solved.world_T_rigs, of_frames
@@ -208,14 +201,12 @@ class Families:
         return self.with_members(family for family in fitted if family is not None)
 
     def terms(self, solved: Solution, maps: np.ndarray | None = None) -> FamilyTerms:
-        """Factors, blocks and variables of all families, for an adjustment from a solution.
-
-        Args:
-            maps: (F,) map of each frame; None = there is one.
+        """Factors, blocks and variables of all families, for an adjustment from a solution; maps:
+        (F,) map of each frame, None = there is one.
 
         Raises:
             GsbaError: a factor on a variable that has no value, or a variable that two families
-                have, or whose key is not a family's.
+            have, or whose key is not a family's.
         """
         snapshot = self.snapshot(solved, maps)
         held = any(family.holds_gauge(snapshot) for family in self.members)
@@ -330,11 +321,7 @@ def _value(kind: str, numbers: np.ndarray) -> Any:
 
 
 def kept(values: gtsam.Values, keys: Sequence[int]) -> FamilyVariables:
-    """Variables as arrays.
-
-    Raises:
-        GsbaError: a variable of a type that is not among those above.
-    """
+    """Variables as arrays. GsbaError: a variable of a type that is not among those above."""
     kinds, numbers = list[str](), list[np.ndarray]()
     for key in keys:
         for kind, read in _READERS.items():
@@ -366,3 +353,62 @@ def restored(variables: FamilyVariables | None) -> gtsam.Values:
     ):
         values.insert(key, _value(kind, variables.data[end - count : end]))
     return values
+
+
+class Bearings(Family):
+    """Directions to the map's points on the sphere: no seam, no pole, no face. See
+    `factors.bearing`."""
+
+    name = "bearing"
+    digest = ""
+    observes_points = True
+
+    def landmark_terms(self, observed: PointObservations) -> Sequence[Term]:
+        """One bearing an observation, as noisy as on its face: a circle of pixels is an ellipse on
+        the sphere."""
+        roots = observed.sqrt_infos
+        if roots is None:
+            roots = np.empty((len(observed.faces), 2, 2))
+            axes = np.ascontiguousarray(RIG_R_FACE[:, :, 2])
+            face_roots(observed.bearings_rig, axes, observed.faces, observed.sigmas_rad, roots)
+        return [
+            BearingTerm(
+                observed.frames,
+                observed.points,
+                observed.bearings_rig,
+                observed.sigmas_rad,
+                roots,
+                origins_rig=observed.origins_rig,
+            )
+        ]
+
+
+@dataclass(frozen=True, slots=True)
+class Reprojections(Family):
+    """Pixels of the map's points on the faces that show them. See `factors.reprojection`."""
+
+    name = "reprojection"
+    digest = ""
+    observes_points = True
+
+    rig: CubeRig  # the faces
+
+    def landmark_terms(self, observed: PointObservations) -> Sequence[Term]:
+        """One pixel an observation, as noisy as the angle that it subtends."""
+        rig, bearings, faces = self.rig, observed.bearings_rig, observed.faces
+        cosines = np.einsum("oi,oi->o", bearings, RIG_R_FACE[faces, :, 2])
+        num, pixels = len(RIG_R_FACE), observed.pixels
+        if observed.origins_rig is not None:  # rays of lenses start elsewhere than faces show them
+            pixels = rig.project(bearings, faces)
+        cameras = FaceCameras(RIG_R_FACE, np.full(num, rig.focal), np.full((num, 2), rig.principal))
+        return [
+            ReprojectionTerm(
+                observed.frames,
+                observed.points,
+                pixels,
+                faces,
+                cameras,
+                observed.sigmas_rad * rig.focal / cosines**1.5,
+                origins_rig=observed.origins_rig,
+            )
+        ]

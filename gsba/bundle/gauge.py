@@ -29,12 +29,7 @@ class Gauge:
         return dict(zip(self.maps.tolist(), self.moves_by_map, strict=True))
 
     def poses(self, world_T_rigs: np.ndarray, maps: np.ndarray | None) -> np.ndarray:
-        """Poses (F, 4, 4) moved map by map.
-
-        Args:
-            world_T_rigs: (F, 4, 4).
-            maps: (F,) map of each frame; None = there is one.
-        """
+        """Poses (F, 4, 4) moved map by map; maps: (F,) map of each frame, None = there is one."""
         return _moved(world_T_rigs, numbered(maps, len(world_T_rigs)), self.moves)
 
     def scales(self, maps: np.ndarray | None, num_frames: int) -> np.ndarray:
@@ -43,24 +38,17 @@ class Gauge:
         return np.array([moves[number].scale for number in of_frames.tolist()])
 
     def moved(self, solved: Solution, maps: np.ndarray | None) -> Solution:
-        """A solution's poses moved map by map, without points and variables of families.
-
-        Args:
-            maps: (F,) map of each frame; None = there is one.
-        """
+        """A solution's poses moved map by map, without points and variables of families."""
         start = Solution.without_points(self.poses(solved.world_T_rigs, maps))
         return replace(start, noise=solved.noise, rounds=solved.rounds)
 
 
 def align(families: Families, solved: Solution, maps: np.ndarray | None = None) -> Gauge:
-    """The similarity that carries each map to where families that fix the gauge have it.
+    """The similarity that carries each map to where families that fix the gauge have it; maps: (F,)
+    map of each frame, None = there is one.
 
     Levenberg-Marquardt over seven parameters a map and the families' own variables; what no
     residual determines (a world, where only the scale is known) stays.
-
-    Args:
-        families: of the run; those that do not fix the gauge have no say.
-        maps: (F,) map of each frame; None = there is one.
     """
     chosen = families.fixing_gauge
     of_frames = numbered(maps, len(solved.world_T_rigs))

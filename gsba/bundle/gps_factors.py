@@ -8,12 +8,13 @@ say nothing of the gauge; the result is carried back to the trajectory's world i
 the first pose and re-estimating the similarity in turns would approach it slowly, a shared
 variable would tie all frames to one another.
 
-Errors of fixes last (`gsba.bundle.fixes`). The adjustment has independent ones that say as much of
+Errors of fixes last, see `FrameFixes`. The adjustment has independent ones that say as much of
 drift, so that each fix is a factor of its own, with a robust loss. Covariances have the lasting
 errors as variables; and as they are of the gauge that holds the first pose, the similarity as well,
 all by factors that are linear.
 """
 
+import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -22,9 +23,129 @@ import gtsam
 import numpy as np
 
 from gsba.bundle.families import Family, MapSnapshot, digest_of
-from gsba.bundle.fixes import MAX_DRIFT_SHARE, WHITE_SHARE, FrameFixes
 from gsba.bundle.pose_variables import X, values_of
 from gsba.similarity import NoSimilarityError, Sim3, extent_of, robust_similarity, similarity
+
+WHITE_SHARE = 0.1  # of the variance of a fix: independent from fix to fix, the rest lasts
+_MEDIAN_LENGTH = 1.538  # median length of a 3-vector of independent unit normals
+_OUTLIER_SIGMAS = 4.6  # 99.99 % of such vectors are shorter
+# Largest ratio of the true noise of fixes to the claimed one. Claims hold under an open sky: with
+# the default of 3 m it is 10.5 m per axis, a mean horizontal error of 13 m, the largest that
+# Merry and Bettinger (PLoS ONE 14(7), e0219890, 2019) measured with a phone in a town.
+_MAX_NOISE_RATIO = 3.5
+MAX_DRIFT_SHARE = 0.05  # largest error of a map's positions, part of their extent
+
+
+@dataclass(frozen=True, slots=True)
+class FrameFixes:
+    """GPS positions of frames in a local level frame, with a model of their errors.
+
+    Errors of neighbouring fixes are alike: satellites, atmosphere and reflections change slowly.
+    The error of each axis is a first-order Gauss-Markov process, with white noise beside it.
+    "Comparison of Enhanced Noise Model Performance Based on Analysis of Civilian GPS Data"
+    (Sensors 20(21), 6050, 2020) finds such processes to describe recordings of receivers at rest;
+    D. L. Wilson measured a correlation time of about a minute on handheld receivers
+    (erols.com/dlwilson/gpscorr.htm), and the Gazebo simulator's GPS has the same.
+    """
+
+    frames: np.ndarray  # (G,) int64, ascending
+    positions: np.ndarray  # (G, 3) float64, metres east, north and up of the origin
+    sigmas: np.ndarray  # (G, 3) float64, metres east, north and up, standard deviations
+    times: np.ndarray | None  # (G,) float64, seconds, ascending; None = not known
+    origin: np.ndarray  # (3,) float64, latitude, longitude (degrees), altitude (metres)
+    correlation_s: float  # time constant of the errors, seconds
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def taken(self, chosen: np.ndarray) -> "FrameFixes":
+        """Some of the fixes, by a mask or ascending rows."""
+        times = None if self.times is None else self.times[chosen]
+        return FrameFixes(
+            self.frames[chosen],
+            self.positions[chosen],
+            self.sigmas[chosen],
+            times,
+            self.origin,
+            self.correlation_s,
+        )
+
+    def tolerances(self) -> np.ndarray:
+        """Largest error (G,) of a fix, metres, by its claimed noise."""
+        return _OUTLIER_SIGMAS * np.sqrt(np.mean(self.sigmas**2, axis=1))
+
+    def inliers(self, residuals: np.ndarray, extent: float) -> tuple[np.ndarray, float]:
+        """Fixes that agree with a map, and the scatter of all.
+
+        The gate is 4.6 standard deviations, or 4.6 times the scatter of all fixes if that is
+        larger. Where the scatter exceeds the largest noise of receivers and the largest drift of a
+        map, most fixes are false: the gate is then the median that these two allow, which fewer
+        than half of the fixes pass.
+
+        Args:
+            residuals: (G, 3) fixes less the transformed positions of their frames, metres.
+            extent: of the frames' transformed positions, metres.
+
+        Returns:
+            (G,) bool, and the scatter in standard deviations of the fixes, at least 1.
+        """
+        distances = np.linalg.norm(residuals / self.sigmas, axis=1)
+        drift = MAX_DRIFT_SHARE * extent / _OUTLIER_SIGMAS / float(np.median(self.sigmas[:, 0]))
+        most = float(np.hypot(_MAX_NOISE_RATIO, drift))
+        scatter = max(1.0, float(np.median(distances)) / _MEDIAN_LENGTH)
+        if scatter > most:
+            return distances < _MEDIAN_LENGTH * most, most
+        return distances <= _OUTLIER_SIGMAS * scatter, scatter
+
+    def digest(self) -> str:
+        """Fingerprint of all that results rest on."""
+        times = np.zeros(0) if self.times is None else self.times
+        parts = self.frames, self.positions, self.sigmas, times, np.array([self.correlation_s])
+        data = b"".join(np.ascontiguousarray(part, np.float64).tobytes() for part in parts)
+        return hashlib.sha256(data).hexdigest()[:16]
+
+    def correlations(self) -> np.ndarray:
+        """Correlation (G - 1,) of the lasting part of the errors of each fix and the next."""
+        if self.times is None:
+            return np.full(max(len(self) - 1, 0), np.exp(-0.5))  # correlation times between fixes
+        return np.exp(-np.diff(self.times) / self.correlation_s)
+
+    def whitened(self, columns: np.ndarray) -> np.ndarray:
+        """Columns (G, 3, ...) of a linear model of the positions, metres, residuals or Jacobians by
+        anything, in units of independent errors.
+
+        The innovations of a Kalman filter of the errors: their sum of squares is that of `columns`
+        weighted with the inverse covariance of all fixes (Kailath, IEEE TAC 13, 1968).
+        """
+        scaled = columns / self.sigmas.reshape(*self.sigmas.shape, *[1] * (columns.ndim - 2))
+        correlations = np.concatenate([[0.0], self.correlations()])
+        lasting = 1 - WHITE_SHARE
+        mean, variance = np.zeros(scaled.shape[1:]), lasting
+        out = np.empty_like(scaled)
+        for i, correlation in enumerate(correlations):
+            mean = correlation * mean
+            variance = correlation**2 * variance + (1 - correlation**2) * lasting
+            total = variance + WHITE_SHARE
+            innovation = scaled[i] - mean
+            out[i] = innovation / np.sqrt(total)
+            mean = mean + variance / total * innovation
+            variance *= 1 - variance / total
+        return out
+
+    def independent_sigmas(self) -> np.ndarray:
+        """Standard deviations (G, 3), metres, of independent errors that say as much.
+
+        White noise of the same spectral density at long periods: what fixes say of drift, and of
+        their mean, is then neither more nor less than their lasting errors allow. Of shorter
+        periods, about which images know more, they say less.
+        """
+        steps = self.correlations()
+        if not len(steps):
+            return self.sigmas
+        around = np.sqrt(np.append(steps, steps[-1]) * np.insert(steps, 0, steps[0]))
+        lasting = (1 - WHITE_SHARE) * (1 + around) / np.maximum(1 - around, 1e-9)
+        return self.sigmas * np.sqrt(lasting + WHITE_SHARE)[:, None]
+
 
 _LOSS_SIGMAS = 2.0  # Cauchy scale of the factors
 MIN_FIXES = 5  # in a map: seven unknowns leave little of fewer
@@ -62,17 +183,11 @@ def anchor(
     fixes: FrameFixes,
     maps: np.ndarray | None = None,
 ) -> Anchors | None:
-    """Fixes carried into the world of these poses, each map by a similarity of its own.
+    """Fixes carried into the world of poses (F, 4, 4), each map by a similarity of its own; None
+    where no map has enough fixes of which most lie as its frames do.
 
     Fixes outside of the gate are left out, see `FrameFixes.inliers`; the scale of the loss is as
-    wide as the gate.
-
-    Args:
-        world_T_rigs: (F, 4, 4) poses so far.
-        maps: (F,) map of each frame; None = there is one.
-
-    Returns:
-        None where no map has enough fixes of which most lie as its frames do.
+    wide as the gate. maps: (F,) map of each frame; None = there is one.
     """
     positions, of_fix = world_T_rigs[fixes.frames, :3, 3], np.zeros(len(fixes), np.int64)
     if maps is not None:
@@ -288,16 +403,9 @@ def linear_factors(
     *,
     free_similarity: bool = True,
 ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-    """Factors of fixes for covariances: lasting errors are variables, too.
-
-    Args:
-        world_T_rigs: (F, 4, 4) where factors are linearized.
-        free_similarity: whether the map's similarity is a variable, as it must be where the first
-            pose is held.
-
-    Returns:
-        Linear factors, weighted as the loss weighs them there, and the variables beside the poses.
-    """
+    """Linear factors of fixes for covariances, and the variables beside the poses: lasting errors,
+    and the map's similarity, as it must be free where the first pose is held. They are linearized
+    at poses (F, 4, 4) and weighted as the loss weighs them there."""
     graph, weights = gtsam.NonlinearFactorGraph(), anchors.weights(world_T_rigs)
     own = gtsam.Values()
     for a in range(len(anchors.frames)):

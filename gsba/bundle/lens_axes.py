@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from gsba.bundle import shared_parameters
 from gsba.bundle.adjustment import AdjustmentContext
-from gsba.bundle.frame_parameters import models_of, validated
 from gsba.bundle.shared_parameters import (
     PARTS,
     SharedModel,
@@ -18,18 +17,18 @@ from gsba.bundle.shared_parameters import (
     by_origin,
     cross_validate,
     drawn,
+    frame_models,
     predicts,
     sample_counts,
     summed,
+    validated,
 )
 from gsba.camera.lens import Lenses
 from gsba.types import Counts, Keypoints, Landmarks, Solution
 
 logger = logging.getLogger(__name__)
 
-_YAWS_RAD = np.deg2rad([0.0, 45, 90, 135])  # of the line through both lenses, tried at first
 TURNS = np.deg2rad([0.5, 1.5, 5.0])  # prior standard deviations of a frame's turn
-_MIN_STEP_SHARE = 0.1  # part of a typical step, below which a frame counts as standing
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,12 +49,8 @@ def guess(
     so_far: Lenses,
     context: AdjustmentContext,
 ) -> LensAxes:
-    """Lenses with axes that explain most with two centres: the rig's, turned ones, or the walk's.
-
-    Args:
-        keypoints: of these, as seen from one centre.
-        so_far: one centre; `band_rad` is kept.
-    """
+    """Lenses with axes that explain most with two centres: the rig's, turned ones, or the walk's;
+    keypoints are seen from one centre, whose `band_rad` is kept."""
     frames = keypoints.frames()
     tried = [replace(so_far, axes=axes) for axes in _candidates(solved.world_T_rigs)]
 
@@ -93,11 +88,7 @@ def loosened(
     context: AdjustmentContext,
 ) -> LensAxes:
     """Axes of each frame's own, the rig's yet, if turning them by some points predicts others.
-
-    Args:
-        keypoints: of these, as rays of the lenses so far.
-        so_far: two lenses whose axes are the rig's.
-    """
+    Keypoints are rays of the two lenses so far."""
     used = drawn(landmarks, shared_parameters.MAX_OBSERVATIONS, context.settings.seed)
     counts = sample_counts(landmarks, used)
     frames, num = keypoints.frames(), len(solved.world_T_rigs)
@@ -108,7 +99,7 @@ def loosened(
         by_start = by_origin(seen, rotations, bearings, so_far.inverse_stitch_radius)
         return so_far.by_centre(by_start, bearings, there) @ by_turn(so_far)
 
-    models = models_of(used, keypoints, solved, context, by_axes)
+    models = frame_models(used, keypoints, solved, context, by_axes)
     tried = [validated(models, np.full(2, width)) for width in TURNS]
     verdict = max(tried, key=lambda trial: float(trial.gains.sum()))
     shares = verdict.shares
@@ -119,10 +110,8 @@ def loosened(
 
 
 def turned(lenses: Lenses, turns: np.ndarray) -> Lenses:
-    """The lenses turned by turns (F, 2) rad about x and y of their frame, then level again.
-
-    The front one's centre is on their axis then: it is there that they look.
-    """
+    """The lenses turned by turns (F, 2) rad about x and y of their frame, then level again. The
+    front one's centre is on their axis then: it is there that they look."""
     assert lenses.axes is not None
     vectors = np.column_stack([turns, np.zeros(len(turns))])
     length = float(np.linalg.norm(lenses.centre))
@@ -159,7 +148,7 @@ def _candidates(world_T_rigs: np.ndarray) -> list[np.ndarray]:
     return [
         upright(directions @ Rotation.from_rotvec([0, yaw, 0]).as_matrix().T)
         for directions in (fixed, _headings(world_T_rigs))
-        for yaw in _YAWS_RAD
+        for yaw in np.deg2rad([0.0, 45, 90, 135])
     ]
 
 
@@ -169,7 +158,8 @@ def _headings(world_T_rigs: np.ndarray) -> np.ndarray:
     before, after = np.maximum(np.arange(num) - 1, 0), np.minimum(np.arange(num) + 1, num - 1)
     moved = world_T_rigs[after, :3, 3] - world_T_rigs[before, :3, 3]
     lengths = np.linalg.norm(moved, axis=1)
-    going = np.flatnonzero(lengths > _MIN_STEP_SHARE * np.median(lengths))
+    # shorter steps are of a frame that stands
+    going = np.flatnonzero(lengths > 0.1 * np.median(lengths))
     if not len(going):
         return np.tile([0.0, 0, 1], (num, 1))
     nearest = going[np.abs(np.arange(num)[:, None] - going).argmin(axis=1)]

@@ -25,11 +25,7 @@ from gsba.types import Counts, Keypoints, Landmarks, Solution
 
 logger = logging.getLogger(__name__)
 
-_MODEL_ERROR_SHARE = 0.005  # of the distance between lenses: its error where residuals promise
-# none, as measured on rendered walks (benchmarks/results/camera.md)
 _MIN_SIGMAS = 5.0  # least distance from one centre, in standard deviations
-_MIN_TRIAL_SIGMAS = 2.0  # that of centres on trial, with which matches are found before they are
-# judged
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,12 +74,8 @@ def estimate(
     so_far: Lenses,
     context: AdjustmentContext,
 ) -> LensCentres:
-    """Find the lenses' centres from a map, poses and points adjusted with them.
-
-    Args:
-        keypoints: of these, as rays under the lenses so far.
-        so_far: centres that the rays start at; `band_rad` is kept.
-    """
+    """Find the lenses' centres from a map, poses and points adjusted with them. Keypoints are rays
+    under the lenses so far, whose `band_rad` is kept."""
     chosen = context.settings.camera
     frames = keypoints.frames()
 
@@ -114,7 +106,8 @@ def estimate(
         # Matches that one centre has chosen hide the lenses from some parts of the sequence.
         if not (verdict.predicts if so_far else gains.sum() > 0):
             reason = "it does not predict parts of the sequence that it was not found from"
-        elif strength < (_MIN_SIGMAS if so_far else _MIN_TRIAL_SIGMAS):
+        # 2: centres on trial, with which matches are found before they are judged
+        elif strength < (_MIN_SIGMAS if so_far else 2.0):
             reason = f"one centre is as likely: {strength:.1f} standard deviations"
     where, untaken = np.array2string(found, precision=5), reason and f"; not taken: {reason}"
     gained = (
@@ -132,7 +125,8 @@ def baseline_of(centres: LensCentres, scale: float) -> tuple[float, float]:
     length = float(np.linalg.norm(half))
     along = half @ by_centres / max(length, 1e-300)
     sigma = float(np.sqrt(along @ centres.covariance @ along))
-    return 2 * scale * length, 2 * scale * float(np.hypot(sigma, _MODEL_ERROR_SHARE * length))
+    # .005 of the distance: measured on rendered walks (benchmarks/results/camera.md)
+    return 2 * scale * length, 2 * scale * float(np.hypot(sigma, 0.005 * length))
 
 
 def stitched_for(
@@ -143,14 +137,12 @@ def stitched_for(
     so_far: Lenses,
     context: AdjustmentContext,
 ) -> StitchRadius:
-    """Find the radius that panoramas are stitched for, centres, poses and points adjusted with it.
+    """Find the radius that panoramas are stitched for, centres, poses and points adjusted with it;
+    shown: (N, 3) directions of the keypoints in their pictures, which are rays of the lenses so
+    far.
 
     Where settings say it, that is it. Around lenses that were solved for without a radius it is a
     first estimate: their distance is wrong where there is one.
-
-    Args:
-        keypoints: of these, as rays of the lenses so far.
-        shown: (N, 3) directions of the keypoints in their pictures.
     """
     said = context.settings.camera.inverse_stitch_radius(so_far.baseline / 2)
     if said is not None:

@@ -2,23 +2,24 @@
 
 Priors on well-held steps are no help: drift is smooth, so that they all err the same way, and
 together bend a place that is held a little less than others. Such steps go without one.
+Covariances do not tell of frames close together with a tiny map of their own, nor of few points
+that err together: steps predicted by far frames, and distances by both sides of a step, do.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from factors import tangent_basis
 from gsba.config import PriorSettings, RefineSettings
-from gsba.geometry import inverse, rotation_angle, step_covariances
+from gsba.geometry import inverse, moved_to, pose, rotation_angle, step_covariances
 from gsba.types import Counts, JointErrors, Reconstruction, StepNoise
 from gsba.types.records import slices, spread_rows
 
 MAX_SCALE_SIGMA = 8e-4  # relative, of two successive baselines' ratio; frames above it are weak
-_REACH = 2  # frames before and after a weak one that count as weak
-_MAX_HELD_SHARE = 0.25  # largest share of a prior's standard deviation in any direction: the prior
-# then weighs 6 %
-_MIN_HELD_STEPS = 8  # least number of held steps from which the trajectory's noise is estimated
-_SHIFTED_POINTS = 24  # points of a frame whose shift in the next one is computed
+_WEAK_REACH = 2  # frames before and after a weak one that count as weak
 _DRAWS_AT_ONCE = 50  # errors drawn of all poses, in float64
 _MIN_NOISE_RATIO = 0.1  # least estimate, part of the settings' noise
 
@@ -53,16 +54,13 @@ def measure(
     """Judge a solution by the joint covariance of its poses under negligible priors.
 
     Args:
-        world_T_rigs: (F, 4, 4).
-        errors: covariances (F, 6, 6) [rotation rad, translation], rig frames, and what errors of
-            poses have in common.
-        coarse_world_T_rigs: (F, 4, 4) the trajectory.
-        seen: (F - 1,) bool, steps that images show.
-        believed: (F - 1,) bool, steps of the trajectory that they do not contradict.
-        settings: weak_frames: limits, and how far around a weak place frames count as near; priors:
-            noise of the trajectory's steps, as far as the images do not know it.
-        components: (F,) map of each frame, from 0; None = there is one.
-        recordings: (F,) recording of each frame, from 0; None = there is one.
+        world_T_rigs, coarse_world_T_rigs: (F, 4, 4) poses, and those of the trajectory.
+        errors: covariances (F, 6, 6) [rotation rad, translation], rig frames, and what errors
+            of poses have in common.
+        seen, believed: (F - 1,) bool, steps that images show, and those of the trajectory that
+            they do not contradict.
+        components, recordings: (F,) map and recording of each frame, from 0; None = there is
+            one.
     """
     covariances, joint = errors
     num, weak_frames, priors = len(world_T_rigs), settings.weak_frames, settings.priors
@@ -79,9 +77,18 @@ def measure(
     between = seen[:-1] & seen[1:] & np.isfinite(sigmas)
     poor = np.zeros(num, bool)
     poor[1:-1] = drifting[1:-1] & between & (np.nan_to_num(sigmas) > MAX_SCALE_SIGMA)
-    reach = np.ones(2 * _REACH + 1)
-    weak = np.convolve(poor, reach)[_REACH : _REACH + num] > 0
-    held = seen & _held(world_T_rigs, covariances, joint, priors)
+    reach = np.ones(2 * _WEAK_REACH + 1)
+    weak = np.convolve(poor, reach)[_WEAK_REACH : _WEAK_REACH + num] > 0
+    lengths = np.linalg.norm(np.diff(world_T_rigs[:, :3, 3], axis=0), axis=1)
+    typical = float(np.median(lengths[lengths > 0])) if (lengths > 0).any() else 1.0
+    allowed = np.full((len(lengths), 6), np.deg2rad(priors.rotation_deg))
+    allowed[:, 3:] = priors.translation * np.maximum(lengths, typical)[:, None]
+    found = step_covariances(world_T_rigs, covariances, joint.neighbours)
+    found = found / allowed[:, :, None] / allowed[:, None, :]
+    known = np.isfinite(found).all(axis=(1, 2))
+    found[~known] = np.eye(6)
+    # a quarter of the prior's sigma in every direction: it then weighs 6 %
+    held = seen & known & (np.linalg.eigvalsh(found)[:, -1] < 0.25**2)
     noise = _noise(world_T_rigs, coarse_world_T_rigs, held & believed, priors)
     num_held = int(held.sum())
     dropped = {"images hold the step far better": num_held}
@@ -133,7 +140,7 @@ def neighbour_shifts(result: Reconstruction) -> np.ndarray:
     for f, seen in enumerate(result.observations_by_frame()[:-1]):
         if not len(seen):
             continue
-        rows = seen[spread_rows(len(seen), min(len(seen), _SHIFTED_POINTS))]
+        rows = seen[spread_rows(len(seen), min(len(seen), 24))]
         points, moved = result.points_world[result.observation_points[rows]], []
         for frame in (f, f + 1):
             at_rig = (points - poses[frame, :3, 3]) @ poses[frame, :3, :3]
@@ -160,26 +167,11 @@ def _drift(world_T_rigs: np.ndarray, draws: np.ndarray, walks: np.ndarray) -> fl
     return float(np.sqrt(np.mean(errors[:, known] ** 2)) / max(path, 1e-300))
 
 
-def _held(
-    world_T_rigs: np.ndarray, covariances: np.ndarray, joint: JointErrors, priors: PriorSettings
-) -> np.ndarray:
-    """Steps (F - 1,) bool whose covariance is far below that of a prior in every direction."""
-    lengths = np.linalg.norm(np.diff(world_T_rigs[:, :3, 3], axis=0), axis=1)
-    typical = float(np.median(lengths[lengths > 0])) if (lengths > 0).any() else 1.0
-    allowed = np.full((len(lengths), 6), np.deg2rad(priors.rotation_deg))
-    allowed[:, 3:] = priors.translation * np.maximum(lengths, typical)[:, None]
-    found = step_covariances(world_T_rigs, covariances, joint.neighbours)
-    found = found / allowed[:, :, None] / allowed[:, None, :]
-    known = np.isfinite(found).all(axis=(1, 2))
-    found[~known] = np.eye(6)
-    return known & (np.linalg.eigvalsh(found)[:, -1] < _MAX_HELD_SHARE**2)
-
-
 def _noise(
     world_T_rigs: np.ndarray, coarse: np.ndarray, held: np.ndarray, priors: PriorSettings
 ) -> StepNoise | None:
     """Robust spread of the trajectory's steps about those that the images hold."""
-    if np.count_nonzero(held) < _MIN_HELD_STEPS:
+    if np.count_nonzero(held) < 8:
         return None
     found, given = (inverse(some[:-1])[held] @ some[1:][held] for some in (world_T_rigs, coarse))
     turned = rotation_angle(np.swapaxes(given[:, :3, :3], 1, 2) @ found[:, :3, :3])
@@ -191,3 +183,194 @@ def _noise(
     spreads = np.array(medians) / (1.5382, 1.1774, 0.6745)  # of normal errors in 3, 2 and 1 axes
     least = np.array([np.deg2rad(priors.rotation_deg), priors.translation, priors.translation])
     return StepNoise(*np.maximum(spreads, _MIN_NOISE_RATIO * least).tolist())
+
+
+_NEAR_FRAMES = 3  # frames to either side that do not count as far
+_STANDING_RATIO = 0.1  # of the rms step: shorter ones are of a camera that stands, and mere noise
+_ITERATIONS = 10
+
+
+def step_deviations(result: Reconstruction) -> np.ndarray:
+    """Deviation (F - 1,) of each step from the one that far frames predict, part of the longer of
+    both, and at least a tenth of the rms step; NaN = they predict none.
+    """
+    poses = result.world_T_rigs
+    predicted, known = poses.copy(), np.zeros(len(poses), bool)
+    # observations of each observation's point in frames out of reach
+    frames, num = result.observation_frames.astype(np.int64), len(poses)
+    first = result.observation_points.astype(np.int64) * num
+    keys = np.sort(first + frames)  # by point, then frame
+    last = np.searchsorted(keys, first + np.minimum(frames + _NEAR_FRAMES, num - 1), side="right")
+    near = last - np.searchsorted(keys, first + np.maximum(frames - _NEAR_FRAMES, 0))
+    every = np.bincount(result.observation_points)[result.observation_points]
+    usable = np.flatnonzero(every - near >= 2)  # that see a point
+    usable = usable[np.argsort(result.observation_frames[usable], kind="stable")]
+    bounds = np.searchsorted(result.observation_frames[usable], np.arange(len(poses) + 1))
+    for f in range(len(poses)):
+        rows = usable[bounds[f] : bounds[f + 1]]
+        known[f] = len(rows) >= 12  # of such points, in a frame
+        if known[f]:
+            predicted[f] = _resected(result, f, rows)
+    steps = [(inverse(some[:-1]) @ some[1:])[:, :3, 3] for some in (poses, predicted)]
+    lengths = np.linalg.norm(steps, axis=2)
+    least = _STANDING_RATIO * np.sqrt(np.mean(lengths[0] ** 2))
+    off = np.linalg.norm(steps[0] - steps[1], axis=1) / np.maximum(lengths.max(axis=0), least)
+    return np.where(known[1:] & known[:-1], off, np.nan)
+
+
+def _resected(result: Reconstruction, frame: int, rows: np.ndarray) -> np.ndarray:
+    """Pose (4, 4) of a frame by its observations `rows` (O,) of points, from that in the map."""
+    points = result.points_world[result.observation_points[rows]]
+    bearings, sigmas = result.observation_bearings[rows], result.observation_sigmas[rows]
+    origins = 0.0 if result.observation_origins is None else result.observation_origins[rows]
+    bases, world_T_rig = tangent_basis(bearings), result.world_T_rigs[frame]
+    for _ in range(_ITERATIONS):
+        at_rig = (points - world_T_rig[:3, 3]) @ world_T_rig[:3, :3]
+        depths = np.linalg.norm(at_rig - origins, axis=1)
+        rays = (at_rig - origins) / depths[:, None]
+        residuals = np.einsum("mij,mj->mi", bases, rays) / sigmas[:, None]
+        weights = 1 / (1 + np.sum(residuals**2, axis=1))
+        across = (np.eye(3) - rays[:, :, None] * rays[:, None, :]) / depths[:, None, None]
+        by_ray = bases @ across / sigmas[:, None, None]
+        jacobian = np.concatenate([np.cross(by_ray, at_rig[:, None, :]), -by_ray], axis=2)
+        weighted = weights[:, None, None] * jacobian
+        system = np.einsum("mij,mik->jk", weighted, jacobian)
+        step = np.linalg.lstsq(system, -np.einsum("mij,mi->j", weighted, residuals), rcond=None)[0]
+        turn = Rotation.from_rotvec(step[:3]).as_matrix()
+        world_T_rig = world_T_rig @ pose(turn, step[3:])
+    return world_T_rig
+
+
+def step_motion(
+    before_T_rigs: np.ndarray,
+    world_T_rigs: np.ndarray,
+    covariances: np.ndarray,
+    joint: JointErrors,
+) -> float:
+    """Motion of the steps from frame to frame in their own standard deviations, rms: sqrt(mean(d^T
+    C^-1 d) / 6) over all steps of known covariance C; NaN where there is none.
+
+    Args:
+        before_T_rigs, world_T_rigs: (F, 4, 4) poses before the round, in a world of any scale,
+            and after it.
+        covariances: (F, 6, 6) of these [rotation rad, translation], rig frames; NaN = not
+            known.
+    """
+    steps, former = _steps(world_T_rigs), _steps(before_T_rigs)
+    length, was = (np.linalg.norm(some[:, :3, 3], axis=1).sum() for some in (steps, former))
+    former[:, :3, 3] *= length / max(was, 1e-300)
+    motion = inverse(former) @ steps
+    tangents = np.column_stack(
+        [Rotation.from_matrix(motion[:, :3, :3]).as_rotvec(), motion[:, :3, 3]]
+    )
+    spread = step_covariances(world_T_rigs, covariances, joint.neighbours)
+    known = np.isfinite(spread).all(axis=(1, 2))
+    if not known.any():
+        return np.nan
+    # Radians and map units apart by orders of magnitude: each by its own standard deviation first.
+    sigmas = np.sqrt(np.maximum(np.einsum("fii->fi", spread[known]), 1e-300))
+    scaled = tangents[known] / sigmas
+    correlations = spread[known] / (sigmas[:, :, None] * sigmas[:, None, :])
+    inverses = np.linalg.pinv(correlations, hermitian=True)
+    return float(np.sqrt(np.einsum("fi,fij,fj->f", scaled, inverses, scaled).mean() / 6))
+
+
+def _steps(world_T_rigs: np.ndarray) -> np.ndarray:
+    return inverse(world_T_rigs[:-1]) @ world_T_rigs[1:]
+
+
+_SIDE_STEPS = 6.0  # usual steps that a side is long, and its fewest frames are two
+_MIN_POINTS = 8  # that both sides see
+_SIGMAS = 2.0  # standard errors of the median that count as uncertainty
+
+
+def scale_changes(result: Reconstruction, recordings: np.ndarray) -> np.ndarray:
+    """Largest relative change (F - 1,) of scale that may hide at each step: the median difference
+    of distances by both sides, and two standard errors of it by their scatter. inf = too few points
+    are seen by both sides; NaN = a side has one frame, of recordings (F,)."""
+    found = np.full(max(len(result.world_T_rigs) - 1, 0), np.nan)
+    observed = result.observations_by_frame()
+    for step, first, end in _sides(result.world_T_rigs[:, :3, 3], recordings):
+        before = np.concatenate(observed[first : step + 1])
+        behind = np.concatenate(observed[step + 1 : end])
+        middle = result.world_T_rigs[step : step + 2, :3, 3].mean(axis=0)
+        found[step] = _change(result, before, behind, middle)
+    return found
+
+
+def _sides(positions: np.ndarray, recordings: np.ndarray) -> Iterator[tuple[int, int, int]]:
+    """Steps with two frames and more on both sides: step, first before, end behind."""
+    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    walked = steps[steps > _STANDING_RATIO * np.sqrt(np.mean(steps**2))] if len(steps) else steps
+    if not len(walked):
+        return
+    along = np.concatenate([[0.0], np.cumsum(steps)])
+    reach = _SIDE_STEPS * float(np.median(walked)) * (1 + 1e-9)
+    for step in range(len(steps)):
+        own = np.flatnonzero(recordings == recordings[step])
+        first = max(int(np.searchsorted(along, along[step] - reach)), int(own[0]))
+        end = min(
+            int(np.searchsorted(along, along[step + 1] + reach, side="right")), int(own[-1]) + 1
+        )
+        if recordings[step] == recordings[step + 1] and step - first >= 1 and end - step >= 3:
+            yield step, first, end
+
+
+def _change(
+    result: Reconstruction, before: np.ndarray, behind: np.ndarray, middle: np.ndarray
+) -> float:
+    """Change of scale that may hide between two sides' observations; distances from `middle`."""
+    several = []
+    for rows in (before, behind):
+        names, counts = np.unique(result.observation_points[rows], return_counts=True)
+        several.append(names[counts > 1])
+    common = np.intersect1d(*several, assume_unique=True)
+    if len(common) < _MIN_POINTS:
+        return np.inf
+    ends, spreads = zip(
+        *(_triangulated(result, rows, common) for rows in (before, behind)), strict=True
+    )
+    mean = (ends[0] + ends[1]) / 2 - middle
+    lengths = np.maximum(np.linalg.norm(mean, axis=1), 1e-12)
+    towards = mean / lengths[:, None]
+    distances = [np.einsum("ni,ni->n", end - middle, towards) for end in ends]
+    known = np.ones(len(common), bool)
+    for distance, spread in zip(distances, spreads, strict=True):
+        variances = np.einsum("ni,nij,nj->n", towards, spread, towards)
+        known &= (distance > 0) & (variances < (0.1 * lengths) ** 2)
+    if np.count_nonzero(known) < _MIN_POINTS:
+        return np.inf
+    logs = np.log(distances[1][known] / distances[0][known])
+    median = float(np.median(logs))
+    # standard deviation of normal values
+    scatter = 1.4826 * float(np.median(np.abs(logs - median)))
+    # 1.2533: standard error of a median of normal values, over that of their mean
+    return abs(median) + _SIGMAS * 1.2533 * scatter / np.sqrt(len(logs))
+
+
+def _triangulated(
+    result: Reconstruction, rows: np.ndarray, points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Places (N, 3) of points (N,) by some observations alone, and covariances; NaN if parallel."""
+    index = np.searchsorted(points, result.observation_points[rows])
+    index[index == len(points)] = 0
+    own = points[index] == result.observation_points[rows]
+    rows, index = rows[own], index[own]
+    frames, origins = result.world_T_rigs[result.observation_frames[rows]], None
+    if result.observation_origins is not None:
+        origins = result.observation_origins[rows]
+    placed = moved_to(frames, origins)[:, :3, 3]
+    rays = np.einsum("oij,oj->oi", frames[:, :3, :3], result.observation_bearings[rows])
+    depths = np.linalg.norm(result.points_world[points[index]] - placed, axis=1)
+    weights = 1 / (np.maximum(depths, 1e-12) * result.observation_sigmas[rows]) ** 2
+    across = (np.eye(3) - rays[:, :, None] * rays[:, None, :]) * weights[:, None, None]
+    columns = np.hstack([across.reshape(-1, 9), np.einsum("oij,oj->oi", across, placed)])
+    sums = np.stack([np.bincount(index, column, len(points)) for column in columns.T], axis=1)
+    systems = sums[:, :9].reshape(-1, 3, 3)
+    lowest, _, highest = np.linalg.eigvalsh(systems).T
+    parallel = lowest <= 1e-9 * highest
+    systems[parallel] = np.eye(3)
+    covariances = np.linalg.inv(systems)
+    places = np.einsum("nij,nj->ni", covariances, sums[:, 9:])
+    covariances[parallel] = np.nan
+    return places, covariances

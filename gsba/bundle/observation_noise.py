@@ -14,8 +14,6 @@ from gsba.types import Keypoints, Landmarks, Tracks
 from gsba.types.records import slices
 
 _kernel, _part = kernel_and_part()
-_MIN_INFORMATION_SHARE = 1e-12  # of a point's information, added to it, as depth may be unknown
-_MIN_RESIDUAL_SHARE = 1e-3  # least share of a residual that its point cannot absorb
 
 
 @_kernel
@@ -88,7 +86,7 @@ def _by_point(o, point, pose, bearings, roots, origins, row):
 @_part
 def _inverse(normal):
     """Inverse (00 01 02 11 12 22) of a symmetric 3x3 in this form, its diagonal raised a little."""
-    added = _MIN_INFORMATION_SHARE * (normal[0] + normal[3] + normal[5]) + 2.3e-308
+    added = 1e-12 * (normal[0] + normal[3] + normal[5]) + 2.3e-308  # as depth may be unknown
     a, b, c = normal[0] + added, normal[1], normal[2]
     d, e, f = normal[3] + added, normal[4], normal[5] + added
     l00 = np.sqrt(a)
@@ -130,7 +128,7 @@ def _along(row, covariance):
     length = np.sqrt(x * x + y * y)
     x, y = (x / length, y / length) if length > 0 else (0.0, 1.0)
     left = 0.5 * (a + d) + radius
-    return (x * row[0] + y * row[1]) / np.sqrt(max(left, _MIN_RESIDUAL_SHARE))
+    return (x * row[0] + y * row[1]) / np.sqrt(max(left, 1e-3))
 
 
 _MIN_COSINE, _MIN_LENGTH = 0.1, 1e-12
@@ -175,7 +173,6 @@ def _face_root(o, bearings, axes, faces, sigmas, out):
 
 
 _AT_ONCE = 1 << 18  # keypoints whose noise is scaled together: 17 MB
-_MIN_REDUNDANCY = 0.1  # least share of residual dimensions beyond the unknowns
 
 
 def observation_noise(
@@ -185,7 +182,8 @@ def observation_noise(
     num_threads: int,
     chosen: np.ndarray | slice = slice(None),
 ) -> float:
-    """Noise in units of the features' sigmas: robust spread of residuals over its expectation.
+    """Noise in units of the features' sigmas: robust spread of residuals over its expectation, of
+    chosen observations (O,), poses (F, 4, 4); it does not depend on the number of threads.
 
     The points are placed by least squares: under the robust loss of the adjustment they would lie
     closer to most of their observations than the noise allows. A residual e of noise sigma has the
@@ -193,12 +191,6 @@ def observation_noise(
     of it is left along the epipolar line where a point has two observations, nearly all where it
     has many. So each residual is taken along the direction in which the point leaves the most of
     it, over the square root of that eigenvalue: all observations then spread alike.
-
-    Args:
-        landmarks: points and their observations, O of them.
-        world_T_rigs: (F, 4, 4) poses.
-        num_threads: that share the points; the result does not depend on them.
-        chosen: (O,) bool, observations whose spread is asked for.
     """
     tracks, num = landmarks.tracks, len(landmarks.tracks)
     spread, poses = np.empty(num), np.ascontiguousarray(world_T_rigs)
@@ -209,7 +201,8 @@ def observation_noise(
     for _ in map_runs(work, tracks, num_threads):
         pass
     unknowns = 6 * len(world_T_rigs)
-    redundancy = max(1 - unknowns / max(2 * num - 3 * tracks.num_points, 1), _MIN_REDUNDANCY)
+    # least share of residual dimensions
+    redundancy = max(1 - unknowns / max(2 * num - 3 * tracks.num_points, 1), 0.1)
     kept = spread[chosen]
     np.abs(kept, out=kept)
     return float(1.4826 * np.median(kept, overwrite_input=True) / np.sqrt(redundancy))
@@ -237,11 +230,8 @@ def _residuals(
 def with_scaled_noise(
     keypoints: Keypoints, factors: np.ndarray, folder: Path | None = None
 ) -> Keypoints:
-    """As `Keypoints.scaled_noise` by factors (N,), of keypoints that may be very many.
-
-    Args:
-        folder: on the disk that takes the noise; None = it is in memory.
-    """
+    """As `Keypoints.scaled_noise` by factors (N,), of keypoints that may be very many: a folder on
+    the disk takes the noise; None = it is in memory."""
     if folder is None:
         return keypoints.scaled_noise(factors)
     infos = keypoints.sqrt_infos

@@ -20,9 +20,6 @@ from gsba.types import Iteration, JointErrors
 logger = logging.getLogger(__name__)
 
 _MAX_DAMPING = 1e10
-_MIN_DAMPING = 1e-12
-_FREE_DAMPING = 1e-6  # part of the diagonal; a small step says nothing about convergence where
-# damping made it small, and a long chain of frames bends by modes this weak
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +51,7 @@ class _Damping:
 
     def lower(self, ratio: float) -> None:
         """Lower after a step whose decrease was `ratio` of the predicted one."""
-        self.value = max(self.value * max(0.1, 1 - (2 * ratio - 1) ** 3), _MIN_DAMPING)
+        self.value = max(self.value * max(0.1, 1 - (2 * ratio - 1) ** 3), 1e-12)
         self.growth = 2.0
 
 
@@ -127,17 +124,15 @@ def optimize(
     settings: SolverSettings | None = None,
     callback: Callable[[Iteration, gtsam.Values], None] | None = None,
 ) -> OptimizeResult:
-    """Minimize the cost of a graph and of blocks over all variables they name.
+    """Minimize the cost of a graph and of blocks over all variables they name, from `values`; those
+    that nothing constrains stay as they are. The blocks then hold the landmarks that belong to the
+    result.
 
     Args:
         graph: native or user factors, on variables of any type.
-        values: start; variables that nothing constrains stay as they are.
         blocks: batched factors on Pose3 variables; their landmarks move along.
         settings: tolerances and damping; None = the defaults.
         callback: called with each attempt and the best values so far.
-
-    Returns:
-        The best values met. The blocks hold the landmarks that belong to them.
 
     Raises:
         GsbaError: the cost at the start is not finite.
@@ -155,11 +150,8 @@ def minimize(
     settings: SolverSettings,
     callback: Callable[[Iteration, gtsam.Values], None] | None = None,
 ) -> OptimizeResult:
-    """Minimize the cost of a system by Levenberg-Marquardt: `optimize`, of any system.
-
-    Raises:
-        GsbaError: the cost at the start is not finite.
-    """
+    """Minimize the cost of a system by Levenberg-Marquardt: `optimize`, of any system. GsbaError:
+    the cost at the start is not finite."""
     history = _History(callback)
 
     def result(converged: bool, reason: str) -> OptimizeResult:
@@ -177,7 +169,11 @@ def minimize(
         if settings.absolute_tolerance is not None:
             negligible = min(negligible, settings.absolute_tolerance)
         used = damping.value
-        trial, trial_cost, predicted = _attempt(system, values, used)
+        steps = system.solve(used)
+        trial, trial_cost, predicted = values, np.inf, np.inf
+        if steps is not None:
+            trial = system.retract(values, steps)
+            trial_cost, predicted = system.propose(trial, steps), system.predicted_decrease()
         if not trial_cost <= cost:  # also where it is not a number
             history.add(values, trial_cost, {}, used, False)
             if predicted <= negligible:
@@ -188,24 +184,15 @@ def minimize(
         system.accept(trial)
         values, decrease = trial, cost - trial_cost
         damping.lower(decrease / predicted if predicted > 0 else 1.0)
-        converged = decrease <= negligible and used <= _FREE_DAMPING
+        # a small step says nothing about convergence where damping made it small, and a long chain
+        # of frames bends by modes of 1e-6 of the diagonal
+        converged = decrease <= negligible and used <= 1e-6
         costs = system.costs(values) if converged else system.linearize(values)
         cost = sum(costs.values())
         history.add(values, cost, costs, used, True)
         if converged:
             return result(True, f"decrease below {negligible:.3g}")
     return result(False, "iteration limit")
-
-
-def _attempt(
-    system: System, values: gtsam.Values, damping: float
-) -> tuple[gtsam.Values, float, float]:
-    """Values after one damped step, their cost and the decrease that the model expected."""
-    steps = system.solve(damping)
-    if steps is None:
-        return values, np.inf, np.inf
-    trial = system.retract(values, steps)
-    return trial, system.propose(trial, steps), system.predicted_decrease()
 
 
 @threadpool_limits.wrap(limits=1, user_api="blas")
@@ -218,17 +205,14 @@ def marginal_covariances(
     seed: int = 0,
     beside: Sequence[int] = (),
 ) -> tuple[np.ndarray, JointErrors]:
-    """Marginal covariances of Pose3 variables, and what their errors have in common.
-
-    Args:
-        graph, blocks: what constrains them, linearized at `values`.
-        keys: (F,) keys of Pose3 variables, in the order of the path.
-        num_draws: errors drawn of all poses at once.
-        beside: (B,) keys of other variables, of at most six dimensions: their covariances follow.
+    """Marginal covariances of Pose3 variables, keys (F,) in the order of the path, and of others
+    beside them (B,), of at most six dimensions; and what errors of poses have in common, by
+    num_draws errors drawn of all at once.
 
     Returns:
-        (F + B, 6, 6) float64, [rotation rad, translation], rig frame, and joint errors. NaN for one
-        that nothing constrains, and for all where the rest is singular (the gauge is not fixed).
+        (F + B, 6, 6) float64, [rotation rad, translation], rig frame, and joint errors. NaN for
+        one that nothing constrains, and for all where the rest is singular (the gauge is not
+        fixed).
     """
     num = len(keys)
     for block in blocks:

@@ -6,8 +6,6 @@ from factors import tangent_basis
 from gsba.geometry import moved_to
 from gsba.types import Reconstruction
 
-_PRIOR_EXTENTS = 10.0  # standard deviation of a point before any observation, extents of the map
-_MAX_DRAWS = 16  # of the poses' errors: standard deviations of 16 are right within a fifth
 _TRACKS_PER_CLASS, _MAX_CLASSES = 100, 10  # classes of points by the noise of their observations
 _MIN_TRACK_LENGTH = 3  # of two observations, only those across the baseline that agree are kept
 _MIN_SHARE = 1e-3  # least part of a shift across the baseline that no move of the point explains
@@ -23,22 +21,20 @@ def point_covariances(result: Reconstruction) -> np.ndarray:
     poses, num = result.world_T_rigs, len(result.points_world)
     positions = poses[:, :3, 3]
     extent = max(float(np.linalg.norm(np.ptp(positions, axis=0))), 1e-12)
-    informations = np.tile(np.eye(3) / (_PRIOR_EXTENTS * extent) ** 2, (num, 1, 1))
+    # before any observation, a point is known to ten extents of the map
+    informations = np.tile(np.eye(3) / (10.0 * extent) ** 2, (num, 1, 1))
     for some in result.pieces():
         np.add.at(informations, some.observation_points, _informations(some))
     return np.linalg.inv(informations)
 
 
 def depth_variances(result: Reconstruction, axes: np.ndarray) -> np.ndarray:
-    """Variances (O,) of the depths of observed points from their frames, map units^2.
+    """Variances (O,) of the depths of observed points from their frames, map units^2, along axes
+    (O, 3) float64, unit, world; without joint errors, the result's poses count as given.
 
     Poses in error move all points that they see: the depth of a point errs by how far its own shift
     differs from that of the frame. An error in the scale of all poses and points is no error here.
     Errors of one point's observations are not independent, see `_error_ratios`.
-
-    Args:
-        result: with the poses' joint errors; without them, poses count as given.
-        axes: (O, 3) float64, unit, world: direction in which each depth is measured.
     """
     covariances, poses = point_covariances(result), result.world_T_rigs
     turns, moves, scales = _pose_errors(result)
@@ -131,7 +127,8 @@ def _pose_errors(result: Reconstruction) -> tuple[np.ndarray, np.ndarray, np.nda
     """Turns and moves (D, F, 3) of pose errors drawn, in the world, and relative scales (D,)."""
     if result.joint_errors is None:
         return np.zeros((0, 0, 3)), np.zeros((0, 0, 3)), np.zeros(0)
-    draws = np.nan_to_num(result.joint_errors.draws[:_MAX_DRAWS].astype(float))
+    # standard deviations of 16 draws are right within a fifth
+    draws = np.nan_to_num(result.joint_errors.draws[:16].astype(float))
     world_R_rigs = result.world_T_rigs[:, :3, :3]
     turns = np.einsum("fij,dfj->dfi", world_R_rigs, draws[..., :3])
     moves = np.einsum("fij,dfj->dfi", world_R_rigs, draws[..., 3:])

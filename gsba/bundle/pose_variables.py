@@ -24,14 +24,9 @@ def poses_of(values: gtsam.Values, num_frames: int) -> np.ndarray:
 def fixed_scale(
     world_T_rigs: np.ndarray, components: np.ndarray | None = None, sigma: float = 1e-6
 ) -> gtsam.NonlinearFactorGraph:
-    """A tight factor on the distance from the first frame to the one furthest from it.
-
-    Args:
-        world_T_rigs: (F, 4, 4).
-        components: (F,) map of each frame; each gets such a factor, and those behind the first
-            frame's a fixed pose besides. None = there is one.
-        sigma: of the distance, part of it.
-    """
+    """A tight factor on the distance from the first frame to the one furthest from it, of sigma,
+    part of it. Each map of components (F,), None = there is one, gets such a factor, and those
+    behind the first frame's a fixed pose besides."""
     held = gtsam.NonlinearFactorGraph()
     if components is None:
         components = np.zeros(len(world_T_rigs), np.int32)

@@ -26,13 +26,8 @@ logger = logging.getLogger(__name__)
 
 _MIN_SIGMAS = 4.0  # least duration that is taken, in its standard deviations
 _ROTATION_SIGMA_RAD = np.deg2rad(0.12)  # rotation during a readout, standard deviation per axis
-_STABILISED_ROTATION_SIGMA_RAD = np.deg2rad(0.005)  # that where a stabiliser has removed it from
-# every row
-_TRANSLATION_SIGMA_SHARE = 0.3  # standard deviation of a translation about that by the velocity,
-# part of a typical translation
 _ROW_SCALE_SIGMA = 0.03  # relative; the distortion and field of view of lenses, which give the
 # number of rows between two directions, are not known from a stitched picture
-_MIN_PAUSE_INTERVALS = 50.0  # median intervals between frames; a longer one is a pause
 _AXES = np.eye(3)[:2]
 
 
@@ -67,19 +62,18 @@ def estimate(
     timestamps: np.ndarray,
     context: AdjustmentContext,
 ) -> CameraEstimate:
-    """Find how long the readout takes and which way rows are read, frames moving by velocity.
-
-    No readout is taken while another way of reading rows predicts unseen parts nearly as well.
-
-    Args:
-        keypoints: of these, as rays of the lenses.
-        shown: (N, 3) directions of the keypoints in their pictures: these tell rows.
-        lenses: read at one instant so far.
-        timestamps: (F,) seconds, whose differences give velocities.
-    """
+    """Find how long the readout takes and which way rows are read, frames moving by velocity,
+    timestamps (F,) in seconds; no readout is taken while another way of reading rows predicts
+    unseen parts nearly as well. Keypoints are rays of the lenses, read at one instant so far;
+    shown: (N, 3) their directions in the pictures: these tell rows."""
     turning = turning_of(lenses, context)
     motion = velocities(solved.world_T_rigs, timestamps, turning, context.maps)
-    offsets = _offsets(landmarks, keypoints, solved) if motion[:, :3].any() else None
+    offsets = None
+    if motion[:, :3].any():  # points in the rig frames of the keypoints that see them; 0 = none
+        tracks, offsets = landmarks.tracks, np.zeros((len(keypoints.faces), 3))
+        poses = solved.world_T_rigs[tracks.frames]
+        from_rigs = landmarks.points_world[tracks.points] - poses[:, :3, 3]
+        offsets[keypoints.rows(tracks)] = np.einsum("oji,oj->oi", poses[:, :3, :3], from_rigs)
     ways, frames = _ways(context.settings.camera, lenses), keypoints.frames()
     times = np.stack([lenses.fractions(shown, frames, way) for way in ways], axis=1)
 
@@ -118,11 +112,8 @@ def estimate(
 
 
 def total_sigma(found: CameraEstimate, sigma: float) -> float:
-    """Standard deviation of the duration, seconds, with that of the scale of rows.
-
-    Args:
-        sigma: by the covariance of the adjustment, in which rows are known exactly.
-    """
+    """Standard deviation of the duration, seconds, by the covariance of the adjustment, in which
+    rows are known exactly, and with that of the scale of rows."""
     scale_sigma = 0.0 if found.lenses.reference_calibration is not None else _ROW_SCALE_SIGMA
     return float(np.hypot(sigma, scale_sigma * found.readout_s))
 
@@ -132,18 +123,10 @@ def own_sigmas(found: CameraEstimate, motion: np.ndarray) -> np.ndarray:
     if found.own_sigmas is not None:
         return found.own_sigmas
     likely = found.readout_s * np.linalg.norm(motion[:, 3:], axis=1)
-    move = max(_TRANSLATION_SIGMA_SHARE * float(np.median(likely)), 1e-12)
-    turn = _ROTATION_SIGMA_RAD if found.lenses.axes is None else _STABILISED_ROTATION_SIGMA_RAD
+    move = max(0.3 * float(np.median(likely)), 1e-12)  # about that by the velocity
+    # from axes of their own, a stabiliser has removed rotations
+    turn = _ROTATION_SIGMA_RAD if found.lenses.axes is None else np.deg2rad(0.005)
     return np.repeat([turn, move], 3)
-
-
-def _offsets(landmarks: Landmarks, keypoints: Keypoints, solved: Solution) -> np.ndarray:
-    """Points (N, 3) in the rig frames of the keypoints that see them; 0 = none."""
-    tracks, offsets = landmarks.tracks, np.zeros((len(keypoints.faces), 3))
-    poses = solved.world_T_rigs[tracks.frames]
-    from_rigs = landmarks.points_world[tracks.points] - poses[:, :3, 3]
-    offsets[keypoints.rows(tracks)] = np.einsum("oji,oj->oi", poses[:, :3, :3], from_rigs)
-    return offsets
 
 
 def turning_of(lenses: Lenses, context: AdjustmentContext) -> GyroConstraints | None:
@@ -157,22 +140,17 @@ def velocities(
     turning: GyroConstraints | None = None,
     maps: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Mean velocity (F, 6) around each frame, [rotation rad/s, translation per s], rig frame.
+    """Mean velocity (F, 6) around each frame, [rotation rad/s, translation per s], rig frame, of
+    poses (F, 4, 4) at ascending timestamps (F,), seconds, in maps (F,), None = there is one.
 
     Between frames a walk turns to and fro: rotations say nothing of those during a readout, which
-    are 0 where no gyro knows them. Nothing is known of motion across a pause, such as that from
-    one recording to the next, nor from one map to another, whose worlds nothing relates.
-
-    Args:
-        world_T_rigs: (F, 4, 4) poses.
-        timestamps: (F,) seconds, ascending.
-        turning: rotation rates by a gyro; None = there is none.
-        maps: (F,) map of each frame; None = there is one.
+    are 0 where no gyro knows them. Nothing is known of motion across a pause, such as that from one
+    recording to the next, nor from one map to another, whose worlds nothing relates.
     """
     num = len(timestamps)
     before, after = np.arange(num) - 1, np.arange(num) + 1
     intervals = np.diff(timestamps)
-    breaks = intervals > _MIN_PAUSE_INTERVALS * np.median(intervals)
+    breaks = intervals > 50.0 * np.median(intervals)
     if maps is not None:
         breaks |= maps[1:] != maps[:-1]
     pauses = np.flatnonzero(breaks)
@@ -228,11 +206,7 @@ class CameraEstimates:
 
     @property
     def only(self) -> CameraEstimate:
-        """The estimate of a single camera.
-
-        Raises:
-            ValueError: there are several cameras.
-        """
+        """The estimate of a single camera. ValueError: there are several cameras."""
         (found,) = self.each
         return found
 
@@ -261,11 +235,8 @@ class CameraEstimates:
 
 
 def tracks_of_camera(tracks: Tracks, of_frame: Sequence[int], camera: int) -> Tracks:
-    """Tracks of what one camera observes: points that it sees twice or more.
-
-    Args:
-        of_frame: (F,) camera of each frame; () = there is one.
-    """
+    """Tracks of what one camera observes: points that it sees twice or more; of_frame: (F,) camera
+    of each frame, () = there is one."""
     if not of_frame:
         return tracks
     own = np.array(of_frame)[tracks.frames] == camera

@@ -62,6 +62,7 @@ def assemble(
         known, targets = known & (coarse.sources == PoseSource.SLAM), coarse.world_T_rigs
     groups = np.zeros(len(seen), np.int32) if components is None else components
     placed, points_world, stretch = _placed(adjustment, targets, known, groups)
+    scales = stretch[np.unique(groups, return_index=True)[1], 3]  # of each map
     points = landmarks.tracks.points
     lengths = np.maximum(np.bincount(points, minlength=len(landmarks.points_world)), 1)
     colors = np.zeros((len(lengths), 3), np.uint8)
@@ -88,7 +89,7 @@ def assemble(
         components=components,
         joint_errors=joint_errors and joint_errors.scaled(stretch),
         observation_origins=origins[0] if origins else None,
-        map_scales=None if components is None else _map_scales(stretch[:, 3], components),
+        map_scales=None if components is None else scales / scales[0],
     )
 
 
@@ -111,12 +112,6 @@ def _observations(
         moved = [] if origins is None else [scales[some.frames][:, None] * origins]
         yield (bearings, adjustment.noise * keypoints.sigmas_rad[rows], errors, *moved)
         release_mapped_files()
-
-
-def _map_scales(stretches: np.ndarray, components: np.ndarray) -> np.ndarray:
-    """Scale (C,) of each map's world relative to the largest one's, by each frame's own (F,)."""
-    scales = stretches[np.unique(components, return_index=True)[1]]
-    return scales / scales[0]
 
 
 def world_scale(solved: Solution, result: Reconstruction) -> float:

@@ -26,17 +26,17 @@ def refine(
     min_observations: int,
     parts: np.ndarray | None = None,
 ) -> Reconstruction:
-    """Refine the rotations of frames that were taken from one place.
+    """Refine the rotations of frames that were taken from one place: a result without points, whose
+    covariances are of rotations, NaN for positions.
 
     Args:
         found: which keypoints show one direction; some may be false.
-        world_T_rigs: (F, 4, 4) rotations right but for the drift of a chain; positions are kept.
+        world_T_rigs: (F, 4, 4) rotations right but for the drift of a chain; positions are
+            kept.
         coarse: poses that define the world.
         min_observations: frames with fewer count as unrefined.
-        parts: (F,) int, 0 = frames that matches tie together, others alone; None = all are tied.
-
-    Returns:
-        A result without points; covariances are of rotations, NaN for positions.
+        parts: (F,) int, 0 = frames that matches tie together, others alone; None = all are
+            tied.
     """
     rotations, covariances, used = solve(world_T_rigs[:, :3, :3], found, keypoints)
     six = np.full((len(rotations), 6, 6), np.nan)
@@ -50,11 +50,8 @@ def refine(
 def solve(
     world_R_rigs: np.ndarray, found: Tracks, keypoints: Keypoints
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rotations under which the rays of each track are parallel.
-
-    Args:
-        world_R_rigs: (F, 3, 3) to start from; the first is kept.
-        found: which keypoints show one direction; some may be false.
+    """Rotations under which the rays of each track are parallel, from (F, 3, 3) of which the first
+    is kept; some keypoints of a track may be false.
 
     Returns:
         (F, 3, 3) rotations; their covariances (F, 3, 3) in the rig frame, radians squared, with
@@ -69,7 +66,10 @@ def solve(
     system = None
     for _ in range(_ITERATIONS):
         rays = np.einsum("oij,oj->oi", rotations[found.frames], bearings)
-        bases = tangent_basis(_directions(rays, weights / sigmas**2, found))
+        pulls = ((weights / sigmas**2)[:, None] * rays).T  # towards the direction of each track
+        sums = np.stack([np.bincount(found.points, p, found.num_points) for p in pulls], axis=1)
+        sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-12)
+        bases = tangent_basis(sums[found.points])
         residuals = np.einsum("oij,oj->oi", bases, rays) / sigmas[:, None]
         lengths = np.linalg.norm(residuals, axis=1)
         noise = max(float(np.median(lengths)) / 1.1774, 1e-9)  # of a Rayleigh distribution
@@ -96,14 +96,6 @@ def solve(
     used = np.bincount(found.frames[weights > 0.1], minlength=num)
     logger.info("rotations of %d frames from %d observations", num, int(used.sum()))
     return rotations, covariances, used
-
-
-def _directions(rays: np.ndarray, information: np.ndarray, found: Tracks) -> np.ndarray:
-    """Unit direction (O, 3) of each observation's track."""
-    sums = [np.bincount(found.points, information * rays[:, k], found.num_points) for k in range(3)]
-    sums = np.stack(sums, axis=1)
-    sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-12)
-    return sums[found.points]
 
 
 def _system(

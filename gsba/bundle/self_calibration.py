@@ -28,13 +28,10 @@ from gsba.types import Counts, Keypoints, Landmarks, Solution
 
 logger = logging.getLogger(__name__)
 
-_NUM_DIRECTIONS = 500  # directions at which two calibrations are compared
 _TURN = 3  # number of the last parameters of a lens, its rotation
 OF_FRONT = PARAMETERS - _TURN  # parameters of the front lens
 _SIGMAS = np.array([0.05, 0.02, 0.02, 0.05, 0.02, 0.005, 0.001, 0.03, 0.03, 0.03])  # prior standard
 # deviations of a lens
-_MAX_SIGMA_SHARE = 0.5  # largest share of its prior standard deviation that a determined parameter
-# keeps
 _GROUPS = {  # parameters of each lens
     "focal lengths": [0],
     "principal points": [1, 2],
@@ -65,13 +62,9 @@ def estimate(
     context: AdjustmentContext,
     nominal: bool = False,
 ) -> SelfCalibration:
-    """Calibrate lenses by a map, poses, points and lens centres adjusted with them.
-
-    Args:
-        keypoints: of these, as rays under the lenses so far.
-        shown: (N, 3) directions of the keypoints in their panoramas.
-        nominal: whether the lenses so far are plain ones of unknown make, not calibrated.
-    """
+    """Calibrate lenses by a map, poses, points and lens centres adjusted with them. Keypoints are
+    rays under the lenses so far; shown: (N, 3) their directions in the panoramas; nominal: whether
+    these lenses are plain ones of unknown make, not calibrated."""
     frames, num = keypoints.frames(), num_parameters(so_far.num_lenses)
 
     def by_both(rows: np.ndarray, by_origin: np.ndarray, residuals: np.ndarray) -> np.ndarray:
@@ -138,7 +131,7 @@ def _of_nominal(
 def undetermined(sigmas: np.ndarray) -> tuple[str, ...]:
     """Groups of parameters whose standard deviations (K,) the adjustment hardly lowers."""
     num = num_lenses_of(len(sigmas))
-    loose = np.asarray(sigmas) > _MAX_SIGMA_SHARE * spread(num)
+    loose = np.asarray(sigmas) > 0.5 * spread(num)
     starts = [0, *(first_of(lens) for lens in range(1, num))]
     found = []
     for name, rows in _GROUPS.items():
@@ -180,16 +173,12 @@ def by_lenses(
     lenses: Lenses,
     residuals: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Jacobian (O, 2, K) of residuals of bearings by the parameters of lenses.
+    """Jacobian (O, 2, K) of residuals (O, 2) of bearings (O, 3), from observed to predicted, None =
+    0, by the parameters of lenses; shown: (O, 3) directions in the panoramas.
 
     Noise is of pixels: it is an angle that shrinks where a focal length grows, and least squares of
     angles would prefer long ones. Taken where points are predicted, not where they were observed,
     the Jacobian is free of that noise, and so is what it finds.
-
-    Args:
-        bearings_rig: (O, 3) of the rays.
-        shown: (O, 3) directions in the panoramas.
-        residuals: (O, 2) of the bearings, from observed to predicted; None = taken as 0.
     """
     out = np.zeros((len(shown), 2, num_parameters(lenses.num_lenses)))
     basis, there = -tangent_basis(bearings_rig), lenses.calibrated(shown)
@@ -233,7 +222,7 @@ def apart(one: Lenses, other: Lenses) -> float:
     """Difference of two calibrations of raw lenses in bearings of pixels, radians rms."""
     if one.reference_calibration is None or one.fisheyes == other.fisheyes:
         return 0.0
-    places = np.random.default_rng(0).normal(size=(_NUM_DIRECTIONS, 3))
+    places = np.random.default_rng(0).normal(size=(500, 3))
     places /= np.linalg.norm(places, axis=1, keepdims=True)
     there = recalibrated(places, now(one), now(other))
     return float(np.sqrt(np.mean(np.sum((there - places) ** 2, axis=1))))

@@ -4,10 +4,12 @@ and points eliminated. Others' parameters are believed where they predict a part
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from scipy.sparse import bsr_array
+from scipy.sparse import diags_array as diags
+from scipy.sparse.linalg import splu
 
 from factors.bearing import bearing_residuals, tangent_basis
 from factors.cholesky import BlockCholesky
@@ -20,7 +22,6 @@ BySharedParameters = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 MAX_OBSERVATIONS = 60_000  # observations that parameters are estimated from
 PARTS = 4  # parts of the sequence: each is predicted by the others
-_LEAST_FRAMES = 2 * PARTS
 _MIN_POINTS = 50  # least number of points of a part
 _POSE_DAMPING = 1e-4  # of the poses' information, against the map's free similarity
 _MIN_CURVATURE = 0.3  # lower curvatures give steps beyond the reach of the model
@@ -88,7 +89,7 @@ def sample_counts(landmarks: Landmarks, used: Landmarks) -> Counts:
 def parts_of(landmarks: Landmarks) -> list[Landmarks]:
     """The points of each part of the sequence; no part where there is too little."""
     tracks = landmarks.tracks
-    if len(np.unique(tracks.frames)) < _LEAST_FRAMES or tracks.num_points < _MIN_POINTS * PARTS:
+    if len(np.unique(tracks.frames)) < 2 * PARTS or tracks.num_points < _MIN_POINTS * PARTS:
         return []
     seen = np.bincount(tracks.points, minlength=tracks.num_points)
     means = np.bincount(tracks.points, tracks.frames, tracks.num_points) / np.maximum(seen, 1)
@@ -141,13 +142,8 @@ def models_of(
     by_shared: BySharedParameters,
     most: int = MAX_OBSERVATIONS,
 ) -> tuple[list[SharedModel], Counts]:
-    """Models of the cost of each part of the sequence, by at most so many observations.
-
-    Args: see `model_of`.
-
-    Returns:
-        (PARTS) models, none where there is too little; and how many observations they rest on.
-    """
+    """Models of the cost of each part of the sequence, see `model_of`, by at most so many
+    observations, none where there is too little; and how many observations they rest on."""
     used = drawn(landmarks, most, context.settings.seed)
     alone = replace(context, num_threads=1)  # parts run side by side
 
@@ -216,11 +212,8 @@ def without_points(
     by_frame: np.ndarray,
     by_shared: np.ndarray | None = None,
 ) -> LinearSystem:
-    """Normal equations of bearings with the points eliminated.
-
-    Args:
-        by_frame: Jacobian (O, 2, K) of residuals by K variables of their frames.
-        by_shared: Jacobian (O, 2, S) by variables of all frames; None = there are none.
+    """Normal equations of bearings with the points eliminated, by Jacobians (O, 2, K) of residuals
+    by K variables of their frames, and (O, 2, S) by variables of all frames; None = there are none.
     """
     residuals = np.einsum("oij,oj->oi", seen.roots, seen.residuals)
     shared = np.zeros((len(residuals), 2, 0)) if by_shared is None else seen.roots @ by_shared
@@ -233,33 +226,15 @@ def without_points(
 def by_origin(
     seen: Weighted, world_R_rigs: np.ndarray, bearings_rig: np.ndarray, inverse_stitch_radius: float
 ) -> np.ndarray:
-    """Jacobian (O, 2, 3) of residuals by the origin of rays, rig frame, and by their direction.
-
-    Args:
-        world_R_rigs: (O, 3, 3) of their poses.
-        bearings_rig: (O, 3) of their rays.
-        inverse_stitch_radius: see `Lenses`.
-    """
+    """Jacobian (O, 2, 3) of residuals by the origin of rays, rig frame, and by their direction, of
+    rays (O, 3) of poses turned by (O, 3, 3); for inverse_stitch_radius see `Lenses`."""
     return -seen.by_point @ world_R_rigs + inverse_stitch_radius * tangent_basis(bearings_rig)
 
 
 _MIN_GAIN_SIGMAS = 3.0  # least significant gain, in its standard deviations
 
 
-class SequencePart(Protocol):
-    """A part of the sequence, whose robust cost is a function of parameters."""
-
-    @property
-    def cost(self) -> float:
-        """The cost where all parameters are zero."""
-        ...
-
-    def gain(self, step: np.ndarray, /) -> float:
-        """Decrease of the cost from there by parameters."""
-        ...
-
-
-P = TypeVar("P", bound=SequencePart)
+P = TypeVar("P", "SharedModel", "FrameModel")
 
 
 @dataclass(frozen=True, slots=True)
@@ -281,13 +256,8 @@ def cross_validate(
     candidate: Callable[[list[P]], np.ndarray],
     baseline: Callable[[list[P]], np.ndarray] | None = None,
 ) -> Verdict:
-    """Predict each part of a sequence by the others.
-
-    Args:
-        candidate: parameters that some parts give.
-        baseline: the same by the simpler model that the candidate is compared with; None = all
-            parameters are zero.
-    """
+    """Predict each part of a sequence by the others: by the parameters of a candidate, and by those
+    of a simpler baseline; None = all parameters are zero."""
     gains, costs = np.zeros(len(parts)), np.array([part.cost for part in parts])
     for p, part in enumerate(parts):
         others = [*parts[:p], *parts[p + 1 :]]
@@ -308,3 +278,65 @@ def predicts(gains: np.ndarray) -> bool:
     sigma = np.sqrt(2 * max(total, 0.0))
     least = -_MIN_GAIN_SIGMAS * sigma / np.sqrt(len(gains))
     return bool(total > _MIN_GAIN_SIGMAS * sigma and np.all(gains > least))
+
+
+@dataclass(frozen=True, slots=True)
+class FrameModel:
+    """Second-order model of some points' cost over poses and K parameters of each frame."""
+
+    system: LinearSystem  # 6 + K variables of each frame, its pose first; by robust weights
+    curvature: float  # of that loss, part of its weights'
+
+    @property
+    def cost(self) -> float:
+        """At no step."""
+        return self.system.cost
+
+    def gain(self, step: np.ndarray) -> float:
+        """Decrease of the cost by a step of all of them."""
+        return float(-step @ (self.system.gradient + 0.5 * (self.system.hessian @ step)))
+
+
+def frame_models(
+    landmarks: Landmarks,
+    keypoints: Keypoints,
+    solved: Solution,
+    context: AdjustmentContext,
+    by_parameters: Callable[[Weighted], np.ndarray],
+) -> list[FrameModel]:
+    """Models of the robust cost of parts of some points, moved to their best first, at a solution's
+    poses; keypoints: where these really point; by_parameters: Jacobian (O, 2, K) of residuals by
+    parameters of their frames."""
+    drawn = np.random.default_rng(context.settings.seed).permutation(landmarks.tracks.num_points)
+
+    def model(part: int) -> FrameModel:
+        some = landmarks.of(drawn % PARTS == part)
+        seen = weighted(some, keypoints, solved, context)
+        by_frame = np.concatenate([seen.by_pose, by_parameters(seen)], axis=2)
+        system = without_points(seen, some.tracks, len(solved.world_T_rigs), by_frame)
+        return FrameModel(system, seen.curvature)
+
+    with ThreadPoolExecutor(context.num_threads) as pool:
+        return list(pool.map(model, range(PARTS)))
+
+
+def _frame_step(models: Sequence[FrameModel], sigmas: np.ndarray) -> np.ndarray:
+    """Change of poses and parameters (F * (6 + K),) by all points of the models; sigmas: (K,) how
+    strongly the parameters are drawn to what they are; 0 = they stay."""
+    systems = [model.system for model in models]
+    gradient = np.sum([system.gradient for system in systems], axis=0)
+    hessian = sum(system.hessian for system in systems[1:]) + systems[0].hessian
+    hessian = float(np.mean([model.curvature for model in models])) * hessian
+    held = _POSE_DAMPING * hessian.diagonal().reshape(-1, 6 + len(sigmas))
+    held[held <= 0] = 1.0
+    held[:, 6:] = np.maximum(sigmas, 1e-12) ** -2.0
+    return -splu((hessian + diags(held.ravel())).tocsc()).solve(gradient)
+
+
+def validated(models: Sequence[FrameModel], sigmas: np.ndarray) -> Verdict:
+    """Verdict on parameters with priors `sigmas` (K,), poses solved for with and without them."""
+    return cross_validate(
+        models,
+        lambda others: _frame_step(others, sigmas),
+        lambda others: _frame_step(others, np.zeros_like(sigmas)),
+    )

@@ -28,9 +28,6 @@ _MIN_GAIN = 0.03  # share by which the field must lower the robust cost of held-
 
 logger = logging.getLogger(__name__)
 
-_PRIOR_SIGMAS_RAD = (1e-4, 3e-4, 1e-3, 3e-3)  # radians: a priori, of coefficients of degree 1;
-# falls with the square of the degree
-_MIN_GAIN_SHARE = 0.95  # share of the best gain: the smoothest field that reaches it is taken
 _PROBE = 20_000, 4  # observations and degree of a first look: half the gain must show there
 
 
@@ -68,11 +65,8 @@ def corrected(keypoints: Keypoints, field: SphereField, rig: CubeRig) -> Keypoin
 def with_noise_of(
     keypoints: Keypoints, calibrated: Keypoints, scratch: Path | None = None
 ) -> Keypoints:
-    """Keypoints whose noise is scaled as in others of the same rows, where they were corrected.
-
-    Args:
-        scratch: folder on the disk that takes the noise of many; None = it is in memory.
-    """
+    """Keypoints whose noise is scaled as in others of the same rows, where they were corrected; a
+    folder on the disk takes the noise of many, None = it is in memory."""
     factors = calibrated.sigmas_rad / keypoints.sigmas_rad
     scaled = with_scaled_noise(keypoints, factors, scratch)
     return replace(scaled, sigmas_rad=calibrated.sigmas_rad)  # to the byte
@@ -87,15 +81,12 @@ def estimate(
     lenses: Cameras = ONE_CAMERA,
 ) -> Stitching:
     """Find the field, by cross-validation over parts of the sequence, and solve the map with it.
+    `sighted` and the keypoints are as observed, the latter with the noise they turned out to have.
 
     Points are shared out among parts of the sequence by their mean frame. A part's cost is a
-    quadratic function of the field once its points and poses are eliminated; sums of those of
-    the other parts give fields of every degree and smoothness, and the part itself says what they
-    are worth. The field is taken where every part gains, and all together enough.
-
-    Args:
-        sighted: candidate tracks and their keypoints, as observed.
-        keypoints: the same with the noise they turned out to have.
+    quadratic function of the field once its points and poses are eliminated; sums of those of the
+    other parts give fields of every degree and smoothness, and the part itself says what they are
+    worth. The field is taken where every part gains, and all together enough.
     """
     settings = context.settings
     chosen = settings.stitching
@@ -108,13 +99,14 @@ def estimate(
         if not systems:
             return replace(now, counts=counts)
         # the smoothest field that predicts parts well
+        # radians, of coefficients of degree 1; falls with the square of the degree
         tried = [
             (d, spread, cross_validate(systems, partial(_fitted, degree=d, spread=spread)))
-            for spread in _PRIOR_SIGMAS_RAD
+            for spread in (1e-4, 3e-4, 1e-3, 3e-3)
             for d in range(1, max_degree + 1)
         ]
         best = max(verdict.gains.sum() for _, _, verdict in tried)
-        enough = min(_MIN_GAIN_SHARE * best, best)
+        enough = min(0.95 * best, best)
         degree, spread, verdict = next(each for each in tried if each[2].gains.sum() >= enough)
         gains = verdict.gains
         costs = np.array([part.cost for part in systems])

@@ -24,18 +24,12 @@ _IN_MEMORY = 1 << 18  # observations of which the tracks are in memory in any ca
 def build(
     matches: Sequence[Matches], num_keypoints: np.ndarray, scratch: Path | None = None
 ) -> Tracks:
-    """Merge matches into tracks that see a frame at most once.
+    """Merge matches into tracks of at least two observations that see a frame at most once;
+    num_keypoints: (F,) of each frame; a folder on the disk takes very many tracks, None = they are
+    in memory.
 
-    Matches are taken in the order given, the most trusted first: one that would give a track two
-    keypoints of the same frame is left out, so that a false match cannot glue two points.
-
-    Args:
-        matches: sets of verified matches, the most trusted set and pair first.
-        num_keypoints: (F,) keypoints in each frame.
-        scratch: folder on the disk that takes very many tracks; None = they are in memory.
-
-    Returns:
-        Tracks of at least two observations.
+    Matches are taken in the order given, the most trusted set and pair first: one that would give a
+    track two keypoints of the same frame is left out, so that a false match cannot glue two points.
     """
     first_node = np.concatenate([[0], np.cumsum(num_keypoints)]).astype(np.int64)
     number = np.int32 if first_node[-1] < np.iinfo(np.int32).max else np.int64
@@ -79,11 +73,8 @@ def _edges(matches: Sequence[Matches], first_node: np.ndarray) -> Iterator[np.nd
 
 
 def runs(tracks: Tracks, most: int) -> Iterator[tuple[slice, slice, Tracks]]:
-    """Tracks in runs of at most `most` observations, or of a single longer one.
-
-    Yields:
-        The points of a run, its observations, and its tracks, whose points are numbered from 0.
-    """
+    """Tracks in runs of at most `most` observations, or of a single longer one: the points of a
+    run, its observations, and its tracks, whose points are numbered from 0."""
     for points, rows in _bounds_of_runs(tracks, most):
         yield points, rows, _run_of(tracks, points, rows)
 

@@ -12,10 +12,7 @@ from gsba.config import PriorSettings
 from gsba.geometry import inverse
 from gsba.types import GyroConstraints, StepNoise
 
-# Noise of a frame's pose in the trajectory's world, which only holds frames that nothing else does.
-_ABSOLUTE_DEG = 30.0
 LOSS_SIGMAS = 2.0  # Cauchy scale: limits the pull of wrong steps
-_WEAKER = 10.0  # times the noise of absolute priors, where another family holds the gauge
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,10 +49,27 @@ class TrajectoryPrior(Family):
         typical = float(np.median(lengths[lengths > 0])) if (lengths > 0).any() else 1.0
         extent = max(float(np.linalg.norm(np.ptp(world_T_rigs[:, :3, 3], axis=0))), typical)
         graph = gtsam.NonlinearFactorGraph()
-        self._add_steps(graph, np.maximum(lengths, typical))
-        weaker = 1.0 if held else _WEAKER
+        settings, spread, lengths = self.settings, self.noise, np.maximum(lengths, typical)
+        steps = inverse(self.world_T_rigs[:-1]) @ self.world_T_rigs[1:]
+        kept = np.ones(len(steps), bool) if self.false_steps is None else ~self.false_steps
+        # steps in a gapless run drift alike
+        runs = np.cumsum(np.diff(kept.astype(int), prepend=0) != 0)
+        in_a_row = np.bincount(runs, minlength=1)[runs] if len(kept) else runs
+        for k in np.flatnonzero(kept).tolist():
+            length = float(lengths[k])
+            if spread is None:
+                rotation, translation = np.deg2rad(settings.rotation_deg), settings.translation
+                of_step = self._robust(rotation, translation * length)
+            else:
+                covariance = in_a_row[k] * _step_covariance(steps[k], length, spread)
+                gaussian = gtsam.noiseModel.Gaussian.Covariance(covariance)
+                of_step = gtsam.noiseModel.Robust.Create(self._loss(), gaussian)
+            graph.add(gtsam.BetweenFactorPose3(X(k), X(k + 1), gtsam.Pose3(steps[k]), of_step))
+        # absolute priors, weaker where another family holds the gauge: they only hold frames that
+        # nothing else does
+        weaker = 1.0 if held else 10.0
         model = self._robust(
-            weaker * np.deg2rad(_ABSOLUTE_DEG),
+            weaker * np.deg2rad(30.0),
             weaker * 0.3 * extent,  # part of the trajectory's extent
         )
         for f, world_T_rig in enumerate(self.world_T_rigs):
@@ -66,25 +80,6 @@ class TrajectoryPrior(Family):
         fixed = gtsam.Pose3(world_T_rigs[0] if self.first is None else self.first)
         graph.add(gtsam.PriorFactorPose3(X(0), fixed, noise))
         return graph
-
-    def _add_steps(self, graph: gtsam.NonlinearFactorGraph, lengths: np.ndarray) -> None:
-        """Add relative priors of steps whose lengths (F - 1,) scale the noise."""
-        settings, noise = self.settings, self.noise
-        steps = inverse(self.world_T_rigs[:-1]) @ self.world_T_rigs[1:]
-        kept = np.ones(len(steps), bool) if self.false_steps is None else ~self.false_steps
-        # steps in a gapless run drift alike
-        runs = np.cumsum(np.diff(kept.astype(int), prepend=0) != 0)
-        in_a_row = np.bincount(runs, minlength=1)[runs] if len(kept) else runs
-        for f in np.flatnonzero(kept).tolist():
-            length = float(lengths[f])
-            if noise is None:
-                rotation, translation = np.deg2rad(settings.rotation_deg), settings.translation
-                model = self._robust(rotation, translation * length)
-            else:
-                covariance = in_a_row[f] * _step_covariance(steps[f], length, noise)
-                gaussian = gtsam.noiseModel.Gaussian.Covariance(covariance)
-                model = gtsam.noiseModel.Robust.Create(self._loss(), gaussian)
-            graph.add(gtsam.BetweenFactorPose3(X(f), X(f + 1), gtsam.Pose3(steps[f]), model))
 
     def _robust(self, rotation: float, translation: float) -> gtsam.noiseModel.Base:
         """Noise of a pose, radians and map units, under the loss."""
@@ -137,10 +132,6 @@ class HeldPoses(Family):
         return graph
 
 
-_FREE_EXTENTS = 1e4  # sigma of a step's translation, extents of the map: none is measured
-_MAX_RESIDUAL_SIGMAS = 3.0  # of a step; beyond it, the robust loss suppresses the step
-
-
 @dataclass(frozen=True, slots=True)
 class GyroTurns(Family):
     """Rotations between neighbours that a gyro measured, under a Cauchy loss."""
@@ -161,7 +152,7 @@ class GyroTurns(Family):
     def graph(self, snapshot: MapSnapshot) -> gtsam.NonlinearFactorGraph:
         """A relative prior for each step that was measured."""
         graph, turning = gtsam.NonlinearFactorGraph(), self.turning
-        free = _FREE_EXTENTS * max(self.extent, 1e-9)
+        free = 1e4 * max(self.extent, 1e-9)  # no translation is measured
         loss = gtsam.noiseModel.mEstimator.Cauchy.Create(self.loss_sigmas)
         for f in np.flatnonzero(np.isfinite(turning.step_sigmas)).tolist():
             sigmas = np.array([turning.step_sigmas[f]] * 3 + [free] * 3)
@@ -178,6 +169,7 @@ class GyroTurns(Family):
         rotations, turning = snapshot.world_T_rigs[:, :3, :3], self.turning
         found = Rotation.from_matrix(np.swapaxes(rotations[:-1], 1, 2) @ rotations[1:])
         off = (found.inv() * Rotation.from_rotvec(turning.steps)).as_rotvec()
-        limits = _MAX_RESIDUAL_SIGMAS * np.sqrt(3) * turning.step_sigmas
+        # beyond 3, the robust loss suppresses a step
+        limits = 3.0 * np.sqrt(3) * turning.step_sigmas
         near = np.linalg.norm(off, axis=1) < limits
         return {"steps_used": float(np.mean(near & np.isfinite(turning.step_sigmas)))}

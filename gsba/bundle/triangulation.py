@@ -15,7 +15,6 @@ from gsba.memory import release_mapped_files
 from gsba.types import Counts, Keypoints, Landmarks, Reconstruction, Tracks
 
 _kernel, _part = kernel_and_part()
-_MAX_HYPOTHESES = 12  # pairs of observations tried per track
 
 
 @_kernel
@@ -53,7 +52,7 @@ def triangulate_tracks(
         tried = 0
         for step in range(hi - lo - 1, 0, -1):  # wide pairs of the track first
             for a in range(lo, hi - step):
-                if tried == _MAX_HYPOTHESES or best_count == hi - lo:
+                if tried == 12 or best_count == hi - lo:  # pairs of observations
                     break
                 tried += 1
                 x, y, z, ok = _midpoint(rays, centres, a, a + step)
@@ -193,8 +192,7 @@ def triangulate(
     midpoint, then Gauss-Newton on tangent-plane residuals).
 
     Args:
-        bearings_rig: (O, 3) bearings of the observations.
-        sigmas_rad: (O,) their noise.
+        bearings_rig, sigmas_rad: (O, 3) bearings of the observations, and (O,) their noise.
         world_T_rigs: (F, 4, 4) current poses.
         max_error_sigmas: gate on the angle between observation and point, in sigmas.
         origins_rig: (O, 3) rig frame, where each ray starts; None = the rig's centre.
@@ -242,12 +240,8 @@ def place(
     num_threads: int = 1,
     scratch: Path | None = None,
 ) -> Landmarks:
-    """As `triangulate`, the observations being the tracks' own keypoints; some tracks at a time.
-
-    Args:
-        scratch: folder on the disk that takes the points of very many tracks; None = they are in
-            memory.
-    """
+    """As `triangulate`, the observations being the tracks' own keypoints; some tracks at a time. A
+    folder on the disk takes the points of very many tracks; None = they are in memory."""
     counts = [_NONE]
 
     def placed(_: slice, __: slice, some: Tracks) -> Landmarks:

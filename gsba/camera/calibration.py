@@ -42,11 +42,8 @@ _MAX_AXIS_ANGLE_RAD = np.deg2rad(20.0)  # between a lens's axis and the rig's z 
 
 
 def read_calibration(path: Path) -> Rig:
-    """The lenses that a file describes, or the folder of a COLMAP model.
-
-    Raises:
-        GsbaError: the file is unreadable, or its lenses do not look all around.
-    """
+    """The lenses that a file describes, or the folder of a COLMAP model. GsbaError: the file is
+    unreadable, or its lenses do not look all around."""
     try:
         rig = (
             from_colmap_model(path) if path.is_dir() else _lenses_of_tree(_parsed_file(path), path)
@@ -80,13 +77,8 @@ def read_calibration(path: Path) -> Rig:
 def calibration_json(
     rig: Rig, centre: np.ndarray, unit: str, more: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """The content of a calibration file.
-
-    Args:
-        rig: lenses, the front one first.
-        centre: (3 (L - 1),) centres of all but the last one, see `gsba.camera.lens.Lenses`.
-        unit: unit of `centre`, "m" or "map".
-    """
+    """The content of a calibration file of a rig, the front lens first; centre: (3 (L - 1),) of all
+    but the last one, see `gsba.camera.lens.Lenses`, in a unit, "m" or "map"."""
     return {
         "model": _MODEL,
         "unit": unit,
@@ -109,11 +101,7 @@ def calibration_json(
 
 
 def scaled_to_size(rig: Rig, size: tuple[int, int], path: Path) -> Rig:
-    """A calibration scaled to pictures of another size.
-
-    Raises:
-        GsbaError: the pictures have another aspect ratio.
-    """
+    """A calibration scaled to pictures of another size. GsbaError: it has another aspect ratio."""
     width, height = size
     for lens in rig:
         if abs(width * lens.height - height * lens.width) > 0.01 * width * lens.height:

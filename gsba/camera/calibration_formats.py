@@ -18,7 +18,6 @@ from gsba.types import Fisheye
 
 _log = logging.getLogger(__name__)
 
-_MAX_POSE_ENTRY = 1e6  # largest absolute entry of a pose, in any unit
 _MAX_LOG_RATIO = 0.01  # largest logarithm of the ratio of a camera's two focal lengths
 _MAX_ANGLE_RAD = np.deg2rad(95.0)  # largest angle from a lens's axis at which its model must
 # hold
@@ -34,14 +33,9 @@ def lens_of(
     radial: Sequence[Any],
     rig_T_lens: np.ndarray | None = None,
 ) -> Fisheye:
-    """A lens built from the numbers of a file.
-
-    Args:
-        size: width and height, pixels.
-        focal: pixels per radian.
-        principal: pixels, corner origin.
-        radial: up to four, of the odd powers from the third on.
-        rig_T_lens: (4, 4), metres; None = it is the rig.
+    """A lens built from the numbers of a file: size, focal length in pixels per radian, principal
+    point in pixels, corner origin, up to four radial terms, of the odd powers from the third on,
+    and its pose (4, 4), metres; None = it is the rig.
 
     Raises:
         ValueError: the values are no numbers, or no lens has them.
@@ -73,22 +67,15 @@ def lens_of(
 
 def metres_of(unit: Any) -> float:
     """Metres in a unit that a file names; 0 for "map", whose lengths have no known scale.
-
-    Raises:
-        ValueError: the unit is not known.
-    """
+    ValueError: the unit is not known."""
     if not isinstance(unit, str) or unit not in _METRES_OF_UNIT:
         raise ValueError(f"unit {brief(repr(unit))} is not known: use {', '.join(_METRES_OF_UNIT)}")
     return _METRES_OF_UNIT[unit]
 
 
 def fields_of(tree: Any, names: Sequence[str], where: str) -> list[Any]:
-    """Values of fields of a file.
-
-    Args:
-        tree: a group of fields, as JSON or YAML gives it.
-        names: of the fields.
-        where: name of the group in the file, for messages.
+    """Values of named fields of a group, as JSON or YAML gives it; where: the group's name in the
+    file.
 
     Raises:
         ValueError: this is no group of fields, or one is missing; the message names it.
@@ -103,10 +90,7 @@ def fields_of(tree: Any, names: Sequence[str], where: str) -> list[Any]:
 
 def numbers_of(tree: Any, name: str, where: str, count: int | None = None) -> np.ndarray:
     """Numbers (N,) float64 of a field of a file, see `fields_of`; nested lists are joined.
-
-    Raises:
-        ValueError: the field is missing, or is not `count` finite numbers; the message names it.
-    """
+    ValueError: the field is missing, or is not `count` finite numbers; the message names it."""
     (value,) = fields_of(tree, (name,), where)
     try:
         found = np.array(value, np.float64).ravel()
@@ -302,11 +286,8 @@ def _fit_to_omni(
 
 
 def of_projection(lens: RadialProjection, rig_T_lens: np.ndarray, where: str) -> Fisheye:
-    """Our lens model fitted to a lens of another projection.
-
-    Args:
-        rig_T_lens: (4, 4), metres.
-        where: file and projection, for error messages.
+    """Our lens model fitted to a lens of another projection at rig_T_lens (4, 4), metres; where:
+    file and projection, for error messages.
 
     Raises:
         GsbaError: the projection is not close to any lens of our model.
@@ -341,7 +322,7 @@ def _fitted(
 def _checked_rigid(a_T_b: np.ndarray) -> np.ndarray:
     """A pose (4, 4), checked to be a rigid motion."""
     turn = a_T_b[:3, :3]
-    small = bool((np.abs(a_T_b) < _MAX_POSE_ENTRY).all())  # no NaN either
+    small = bool((np.abs(a_T_b) < 1e6).all())  # in any unit; no NaN either
     if not small or np.abs(turn @ turn.T - np.eye(3)).max() > 1e-3:
         raise ValueError("the pose of a lens is no rigid motion")
     if np.linalg.det(turn) < 0:

@@ -43,11 +43,7 @@ class Cameras:
 
     @property
     def only(self) -> Lenses:
-        """The lenses of a single camera.
-
-        Raises:
-            ValueError: there are several cameras.
-        """
+        """The lenses of a single camera. ValueError: there are several cameras."""
         (lenses,) = self.lenses
         return lenses
 

@@ -20,8 +20,6 @@ from gsba.camera.sphere import table
 from gsba.camera.straighten import PAD, observed
 from gsba.types import FACES
 
-_MAX_OVERLAP = 1 / 8  # part of a square: cameras have 1/60 to 1/20
-
 # Storage of each face in FACES order: track, square from the left, and quarter turns
 # counterclockwise that set it upright.
 _STORED = ((0, 1, 0), (0, 2, 0), (1, 1, 1), (0, 0, 0), (1, 2, -1), (1, 0, -1))
@@ -44,7 +42,7 @@ def is_equiangular(width: int, height: int) -> bool:
     """True if one of two tracks can have this size, pixels."""
     extra = width - 3 * height
     even = extra % 2 == 0 and (height + extra // 2) % 2 == 0
-    return height > 0 and even and 0 <= extra <= 2 * _MAX_OVERLAP * height
+    return height > 0 and even and 0 <= extra <= height / 4  # cameras have 1/60 to 1/20
 
 
 def overlap_of(width: int, height: int) -> int:
@@ -54,15 +52,8 @@ def overlap_of(width: int, height: int) -> int:
 
 
 def square_pixels(directions: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels of directions in upright equi-angular squares of `size` pixels.
-
-    Args:
-        directions: (..., 3) float64, any length, rig frame.
-        size: pixels across a square.
-
-    Returns:
-        (...) uint8, indices into FACES; (..., 2) float64 pixels, corner origin.
-    """
+    """Pixels of directions (..., 3), rig frame, of any length, in upright equi-angular squares of
+    `size` pixels: (...) uint8, indices into FACES, and (..., 2) float64 pixels, corner origin."""
     magnitudes = np.abs(directions)
     axis = np.argmax(magnitudes, axis=-1)[..., None]
     along = np.take_along_axis(directions, axis, axis=-1)
@@ -97,14 +88,9 @@ def taps(directions: np.ndarray, width: int, height: int) -> Taps:
 
 
 def squares(tracks: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Upright equi-angular squares (6, S, S[, C]) uint8, FACES order, of two tracks.
-
-    The columns recorded twice are blended, each lens's weight falling linearly to nothing where
-    its picture ends; no pixel is resampled.
-
-    Args:
-        tracks: (S, width[, C]) uint8 each, see `is_equiangular`.
-    """
+    """Upright equi-angular squares (6, S, S[, C]) uint8, FACES order, of two tracks (S, width[,
+    C]), see `is_equiangular`. The columns recorded twice are blended, each lens's weight falling
+    linearly to nothing where its picture ends; no pixel is resampled."""
     height, width = tracks[0].shape[:2]
     overlap, out = overlap_of(width, height), []
     starts = 0, height + overlap, 2 * height + overlap
@@ -123,10 +109,8 @@ def shrunk(faces: np.ndarray, size: int) -> np.ndarray:
 
 
 def around_squares(faces: np.ndarray) -> np.ndarray:
-    """Join squares (6, S, S[, C]) in one picture, three beside three, for `Grid` to look up.
-
-    Each square gets PAD pixels of what lies beyond its border on the sphere.
-    """
+    """Join squares (6, S, S[, C]) in one picture, three beside three, for `Grid` to look up; each
+    gets PAD pixels of what lies beyond its border on the sphere."""
     size = faces.shape[1]
     cell = size + 2 * PAD
     out = np.empty((2 * cell, 3 * cell, *faces.shape[3:]), faces.dtype)

@@ -38,14 +38,9 @@ from gsba.types import Fisheye
 _GENERATIONS = {6: 1, 16: 2, 19: 3, 27: 6}  # numbers of one lens -> generation
 _COUNTS = {16: 6, 34: 16, 40: 19, 56: 27}  # numbers of a calibration -> numbers of one lens
 _REFERENCE_ANGLE_RAD = np.deg2rad(100.0)  # angle to which `radius` belongs
-_MAX_FITTED_ANGLE_RAD = np.deg2rad(100.0)  # largest angle to which radial terms are fitted
-_MAX_TILT_DEG = 5.0  # largest tilt of a lens's axis, by the first two angles
-_MAX_OFF_AXIS_SUM_DEG = 10.0  # largest deviation of the sum of both third angles from 180
 _RELATIVE_FOCAL_SIGMA = {1: 0.05, 2: 0.01, 3: 0.005, 6: 0.005}  # relative
 _DIRECTION_SIGMA_RAD = {n: np.deg2rad(deg) for n, deg in ((1, 1.5), (2, 0.7), (3, 0.4), (6, 0.4))}
 _ROTATION_SIGMA_RAD = np.deg2rad(1.5)
-_MAX_ABSOLUTE_NUMBER = 1e7
-_BASELINE_RANGE_M = 0.002, 0.2  # smallest and largest distance of two lenses
 _HALF_TURN_ABOUT_Y = np.diag([-1.0, 1.0, -1.0])  # rotation by pi about y
 
 
@@ -105,13 +100,8 @@ class FactoryLenses:
         return float(_ROTATION_SIGMA_RAD)
 
     def pairs(self, size: tuple[int, int]) -> list[Pair]:
-        """Lenses for pictures of a size that show the window or, less likely, all of the sensor.
-
-        Pictures of another aspect ratio show the middle of it.
-
-        Args:
-            size: width and height, pixels.
-        """
+        """Lenses for pictures of a size (width, height) that show the window or, less likely, all
+        of the sensor; pictures of another aspect ratio show the middle of it."""
         whole = (0.0, 0.0, float(self.canvas[0]), float(self.canvas[1]))
         windows = dict.fromkeys([whole if self.window is None else self.window, whole])
         return [self._pair(size, *window) for window in windows]
@@ -135,11 +125,8 @@ class FactoryLenses:
 
 
 def parse_factory_lenses(calibration: FactoryCalibration) -> FactoryLenses:
-    """Lenses that a calibration of Insta360 describes.
-
-    Raises:
-        GsbaError: the form is unknown, or no lenses have such numbers.
-    """
+    """Lenses that a calibration of Insta360 describes. GsbaError: the form is unknown, or no lenses
+    have such numbers."""
     try:
         return _of_numbers(np.array(calibration.text.split("_"), np.float64), calibration)
     except ValueError as error:
@@ -150,7 +137,7 @@ def parse_factory_lenses(calibration: FactoryCalibration) -> FactoryLenses:
 def _of_numbers(numbers: np.ndarray, calibration: FactoryCalibration) -> FactoryLenses:
     """Lenses from all numbers of a calibration."""
     count = _COUNTS.get(len(numbers))
-    if count is None or numbers[0] != 2 or not (abs(numbers) < _MAX_ABSOLUTE_NUMBER).all():
+    if count is None or numbers[0] != 2 or not (abs(numbers) < 1e7).all():
         raise ValueError("its form is not known")
     generation, parts = _GENERATIONS[count], numbers[1 : 1 + 2 * count].reshape(2, count)
     canvas = numbers[-3:-1] if generation == 1 else parts[0, -3:-1]
@@ -161,7 +148,7 @@ def _of_numbers(numbers: np.ndarray, calibration: FactoryCalibration) -> Factory
     angles = parts[:, at + 2 : at + 5]
     # degrees, the third ones about the axes and back to back
     tilts, about = abs(angles[:, :2]), angles[:, 2].sum() % 360
-    known = bool((tilts < _MAX_TILT_DEG).all() and abs(about - 180) < _MAX_OFF_AXIS_SUM_DEG)
+    known = bool((tilts < 5.0).all() and abs(about - 180) < 10.0)
     lenses = []
     for n in range(2):
         centre = parts[n, at : at + 2] - (n * half[0], 0)
@@ -177,7 +164,7 @@ def _of_numbers(numbers: np.ndarray, calibration: FactoryCalibration) -> Factory
             for each in lenses[::-1]
         ]
     apart = float(np.linalg.norm(parts[1, at + 5 : at + 8])) if generation > 1 else 0.0
-    low, high = _BASELINE_RANGE_M
+    low, high = 0.002, 0.2  # metres
     return FactoryLenses(
         generation=generation,
         lenses=(lenses[0], lenses[1]),
@@ -192,7 +179,7 @@ def _radial_model(
     generation: int, numbers: np.ndarray
 ) -> tuple[float, tuple[float, float, float, float]]:
     """Focal length, pixels per radian, and k1 to k4 of `Fisheye`, fitted over all angles."""
-    angles = np.linspace(0, _MAX_FITTED_ANGLE_RAD, 201)[1:]
+    angles = np.linspace(0, np.deg2rad(100.0), 201)[1:]
     if generation == 1:
         radii = numbers[0] * angles / _REFERENCE_ANGLE_RAD
     elif generation == 2:

@@ -60,11 +60,8 @@ def unproject(lens: Fisheye, pixels: np.ndarray) -> np.ndarray:
 
 
 def by_parameters(lens: Fisheye, directions: np.ndarray) -> np.ndarray:
-    """Jacobians (N, 3, PARAMETERS) of the directions of fixed pixels by the lens's parameters.
-
-    Args:
-        directions: (N, 3) unit, rig frame, of the pixels.
-    """
+    """Jacobians (N, 3, PARAMETERS) of the directions of fixed pixels, (N, 3) unit, rig frame, by
+    the lens's parameters."""
     rig_R_lens = rotation_of(lens)
     by_local, by_own = projection_of(lens).jacobians(directions @ rig_R_lens)
     basis = tangent_basis(directions)  # (N, 2, 3) float64: a unit direction moves on it only
@@ -110,11 +107,8 @@ def difference(lens: Fisheye, before: Fisheye) -> np.ndarray:
 def pixels_of(
     rig: Rig, directions: np.ndarray, lens: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Lens (...,) that faces directions (..., 3), and their pixels (..., 2) in it.
-
-    Args:
-        lens: (...,) int, the lens that each direction is projected by; None = that which faces it.
-    """
+    """Lens (...,) that faces directions (..., 3), or a given one of each, and their pixels (..., 2)
+    in it."""
     lens = facing(directions, optical_axes(rig)) if lens is None else lens
     pixels = project(rig[0], directions)
     for number, other in enumerate(rig[1:], 1):
@@ -125,11 +119,8 @@ def pixels_of(
 def recalibrated(
     directions: np.ndarray, before: Rig, after: Rig, lens: np.ndarray | None = None
 ) -> np.ndarray:
-    """Directions of pixels by lenses `after`, given their directions (N, 3) by lenses `before`.
-
-    Args:
-        lens: (N,) int, the lens of each direction; None = that which faces it.
-    """
+    """Directions of pixels by lenses `after`, given their directions (N, 3) by lenses `before`;
+    lens: (N,) int, of each direction, None = that which faces it."""
     out = np.empty_like(directions)
     lens = facing(directions, optical_axes(before)) if lens is None else lens
     for number, (old, new) in enumerate(zip(before, after, strict=True)):

@@ -16,30 +16,15 @@ import numpy as np
 from gsba.camera.fisheye import Rig, facing, optical_axes, pixels_of, recalibrated, rotation_of
 from gsba.geometry import pose
 
-_HALF_FOV_RAD = np.deg2rad(100.0)  # half field of view of a fisheye that fills its sensor, first to
-# last row
-_NUM_ROW_TIME_PASSES = 4  # fixed-point passes between a point's pixel and its row's time
-
-
-def _centre() -> np.ndarray:
-    return np.zeros(3)
-
-
-def _back_to_back() -> np.ndarray:
-    return np.array([[0.0, 0, 1], [0, 0, -1]])
-
 
 @dataclass(frozen=True, slots=True)
 class Lenses:
-    """The camera of a sequence. One centre, one instant by default.
+    """The camera of a sequence. One centre, one instant by default. The lenses' frame has its
+    origin in the middle of the lenses' centres, and z along the front lens's axis."""
 
-    The lenses' frame has its origin in the middle of the lenses' centres, and z along the front
-    lens's axis.
-    """
-
-    centre: np.ndarray = field(default_factory=_centre)  # (3 (L - 1),) float64, centres of all
-    # lenses but the last one, the front one first, lenses' frame, map units; the last one's is
-    # minus their sum: of a pair it is opposite
+    centre: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    # (3 (L - 1),) float64, centres of all lenses but the last one, the front one first, lenses'
+    # frame, map units; the last one's is minus their sum: of a pair it is opposite
     inverse_stitch_radius: float = 0.0  # 1 / map units; 0 = panoramas are stitched at infinity
     band_rad: float = 0.0  # half width of the seam's band in which both lenses are blended
     row_directions: np.ndarray | None = None  # (L, 3) float64, unit, lenses' frame: direction in
@@ -51,8 +36,8 @@ class Lenses:
     reference_calibration: Rig | None = None  # by which panoramas of raw pairs were cut; None =
     # the frames are panoramas
     fisheyes: Rig | None = None  # lenses of raw pairs as estimated; None = reference_calibration
-    optical_axes: np.ndarray = field(default_factory=_back_to_back)  # (L, 3) float64, unit, lenses'
-    # frame: each direction is seen by the lens whose axis is nearest
+    optical_axes: np.ndarray = field(default_factory=lambda: np.array([[0.0, 0, 1], [0, 0, -1]]))
+    # (L, 3) float64, unit, lenses' frame: each direction is seen by the lens whose axis is nearest
 
     def __bool__(self) -> bool:
         return bool(self.centre.any()) or self.fisheyes is not None
@@ -91,11 +76,8 @@ class Lenses:
     def origins(
         self, directions: np.ndarray, frames: np.ndarray, lens: np.ndarray | None = None
     ) -> np.ndarray:
-        """Centres (N, 3) of the lenses that face directions (N, 3), both in the rig frame.
-
-        Args:
-            lens: (N,) int, the lenses to take instead.
-        """
+        """Centres (N, 3) of the lenses that face directions (N, 3), both in the rig frame, or of
+        given ones."""
         lens = self.facing(directions, frames) if lens is None else lens
         centres = self.centres[lens]
         if self.axes is None:
@@ -144,7 +126,8 @@ class Lenses:
         radii = np.linalg.norm(across, axis=1)
         angles = np.arctan2(radii, ahead)
         along = np.einsum("ni,ni->n", across, np.asarray(row_directions)[lens])
-        return angles / (2 * _HALF_FOV_RAD) * along / np.maximum(radii, 1e-12)
+        # 200 degrees: a fisheye that fills its sensor, first row to last
+        return angles / (2 * np.deg2rad(100.0)) * along / np.maximum(radii, 1e-12)
 
     def rows_down(self) -> np.ndarray:
         """1 (L,) for the picture of a raw lens that is read from its top row down, -1 for one that
@@ -197,15 +180,13 @@ class Lenses:
     def seeing(
         self, points_rig: np.ndarray, frames: np.ndarray, lens: np.ndarray | None = None
     ) -> np.ndarray:
-        """Vectors (N, 3) along the directions in which pictures of frames (N,) show points (N, 3).
-
-        The lens that faces a point sees it, or `lens` as in `origins`. Points are in
-        the rig frame in the middle of the readout.
-        """
+        """Vectors (N, 3) along the directions in which pictures of frames (N,) show points (N, 3),
+        rig frame in the middle of the readout, by the lens that faces a point, or `lens` as in
+        `origins`."""
         vectors = self._directions_in_panorama(points_rig, frames, lens)
         if self.readout_motion is None:
             return vectors
-        for _ in range(_NUM_ROW_TIME_PASSES):
+        for _ in range(4):  # fixed-point passes between pixel and time
             units = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300)
             turns, moves = self._readout_motion_at(units, frames, lens)
             local = np.einsum("nij,nj->ni", np.swapaxes(turns, 1, 2), points_rig - moves)
@@ -307,10 +288,8 @@ def all_centres(centre: np.ndarray) -> np.ndarray:
 
 
 def seam_sines(directions: np.ndarray, axes: np.ndarray) -> np.ndarray:
-    """Distances (...,) of vectors (..., 3) from the nearest seam of lenses with axes (L, 3).
-
-    The seam of two lenses is the plane between their axes.
-    """
+    """Distances (...,) of vectors (..., 3) from the nearest seam of lenses with axes (L, 3): that
+    of two lenses is the plane between their axes."""
     along = directions @ axes.T
     nearest = np.argmax(along, axis=-1)
     best = np.take_along_axis(along, nearest[..., None], axis=-1)

@@ -19,8 +19,6 @@ from gsba.camera.views import depths_along, observed_points
 from gsba.types import Reconstruction
 
 _DEPTH_GRID_WIDTH = 128  # width of the grid that depths are taken on
-_MIN_DEPTH_IN_LENS_OFFSETS = 12.0  # smallest depth, in distances of a lens from the middle: nearer,
-# the seam lies beyond the rims
 _FAR_DEPTH = 1e9  # map units
 _ROWS_AT_ONCE = 128  # rows whose coordinates are held in double precision at once
 
@@ -31,12 +29,8 @@ class Stitcher:
     """Makes the panorama of one frame."""
 
     def __init__(self, lenses: Lenses, frame: int, scene: np.ndarray) -> None:
-        """Compute the offset from each direction of the rig to its direction in each lens.
-
-        Args:
-            frame: index of the frame in `lenses`.
-            scene: (N, 3) points in the rig frame of this frame, which give the depths.
-        """
+        """Compute the offset from each direction of the rig to its direction in each lens, in the
+        frame-th frame of the lenses, at the depths of scene points (N, 3), rig frame."""
         self._lenses = lenses.of_frame(frame)
         centres = (
             np.arange(pixels) + 0.5 for pixels in (_DEPTH_GRID_WIDTH, _DEPTH_GRID_WIDTH // 2)
@@ -45,7 +39,8 @@ class Stitcher:
         rays = bearings_from_erp(pixels, _DEPTH_GRID_WIDTH, _DEPTH_GRID_WIDTH // 2).reshape(-1, 3)
         depths = np.full(len(rays), _FAR_DEPTH)
         if len(scene):
-            nearest = _MIN_DEPTH_IN_LENS_OFFSETS * lenses.baseline / 2
+            # nearer points would lie beyond the rims at the seam
+            nearest = 12.0 * lenses.baseline / 2
             depths = np.maximum(depths_along(rays, scene), nearest)
         same, self._offsets = np.zeros(len(rays), int), []
         for lens in range(lenses.num_lenses):
@@ -65,12 +60,8 @@ class Stitcher:
     def stitched_squares(
         self, squares: np.ndarray, correction: tuple[float, ...] = ()
     ) -> np.ndarray:
-        """The panorama (2 S, 4 S, C) uint8 of an equi-angular cube map.
-
-        Args:
-            squares: (6, S, S, C) uint8, FACES order.
-            correction: coefficients of the stitching field, see `FrameSet`.
-        """
+        """The panorama (2 S, 4 S, C) uint8 of an equi-angular cube map (6, S, S, C), FACES order;
+        correction: coefficients of the stitching field, see `FrameSet`."""
         picture, grid = around_squares(squares), Grid(squares.shape[1], correction)
 
         def look(_: int, shown: np.ndarray) -> np.ndarray:
@@ -108,7 +99,10 @@ class Stitcher:
             joined = np.zeros((*rays.shape[:2], channels), np.float32)
             for lens, share in enumerate(self._weights(rays)):
                 columns = np.flatnonzero((share > 0).any(axis=0))
-                moved = self._moved(lens, top, columns, len(rays), width)
+                scale = _DEPTH_GRID_WIDTH / width
+                places = np.meshgrid(columns + 0.5, np.arange(top, top + len(rays)) + 0.5)
+                across, down = ((at * scale - 0.5 + PAD).astype(np.float32) for at in places)
+                moved = cv2.remap(self._offsets[lens], across, down, cv2.INTER_CUBIC)
                 part = look(lens, rays[:, columns] + moved).reshape(*moved.shape[:2], channels)
                 joined[:, columns] += share[:, columns, None] * part
             parts.append(np.rint(joined).astype(np.uint8))
@@ -128,15 +122,6 @@ class Stitcher:
             sides.append(np.clip(0.5 + np.arcsin(np.clip(sines, -1, 1)) / (2 * band), 0, 1))
         total = np.sum(sides, axis=0)  # 1 where two lenses meet
         return [(side / total).astype(np.float32) for side in sides]
-
-    def _moved(
-        self, lens: int, top: int, columns: np.ndarray, num_rows: int, width: int
-    ) -> np.ndarray:
-        """Offsets (h, w, 3) from directions of panorama rows and columns to a lens's directions."""
-        scale = _DEPTH_GRID_WIDTH / width
-        places = np.meshgrid(columns + 0.5, np.arange(top, top + num_rows) + 0.5)
-        across, down = ((at * scale - 0.5 + PAD).astype(np.float32) for at in places)
-        return cv2.remap(self._offsets[lens], across, down, cv2.INTER_CUBIC)
 
 
 def _panorama_lookup(erp: np.ndarray, how: int) -> _Look:

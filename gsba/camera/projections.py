@@ -13,7 +13,6 @@ from gsba.camera.sphere import bearings_from_erp, erp_from_bearings
 
 _NUM_NEWTON_STEPS = 8  # enough for angles to converge in double precision
 _MIN_SLOPE = 0.1  # of the radius by the angle, in Newton's steps beyond a polynomial's own range
-_ON_AXIS = 1e-9  # sine of the angle below which a ray counts as the axis
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +118,7 @@ class RadialProjection(ABC):
         across, squares = np.hypot(x, y), np.sum(directions**2, axis=1)
         angles = np.arctan2(across, z)
         reached, slope = self.radii(angles)
-        near = across <= _ON_AXIS * np.sqrt(squares)
+        near = across <= 1e-9 * np.sqrt(squares)  # sine
         safe = np.where(near, 1.0, across)
         away = np.where(near[:, None], [1.0, 0.0], directions[:, :2] / safe[:, None])
         stretch = np.where(near, slope / np.where(near, z, 1.0), reached / safe)
@@ -148,10 +147,8 @@ class RadialProjection(ABC):
 
 @dataclass(frozen=True, slots=True)
 class FisheyeProjection(RadialProjection):
-    """r = f (th + k1 th^3 + k2 th^5 + k3 th^7 + k4 th^9) (Kannala and Brandt, PAMI 2006).
-
-    Without radial terms it is the equidistant lens.
-    """
+    """r = f (th + k1 th^3 + k2 th^5 + k3 th^7 + k4 th^9) (Kannala and Brandt, PAMI 2006); without
+    radial terms it is the equidistant lens."""
 
     radial_sigmas: ClassVar[tuple[float, ...]] = (0.05, 0.02, 0.005, 0.001)
 

@@ -12,15 +12,9 @@ _ROWS_AT_ONCE = 64  # rows moved at once, so that they stay in the cache
 
 
 def bearings_from_erp(pixels: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Unit bearings of equirectangular pixels.
-
-    Args:
-        pixels: (..., 2) float64, (u, v), centre of the top-left pixel at (0.5, 0.5).
-        width, height: image size in pixels, width = 2 height.
-
-    Returns:
-        (..., 3) float64, rig frame (x right, y down, z forward = centre column).
-    """
+    """Unit bearings (..., 3) float64, rig frame (x right, y down, z forward = centre column), of
+    equirectangular pixels (..., 2), (u, v), of an image of this size, width = 2 height; the centre
+    of the top-left pixel is at (0.5, 0.5)."""
     longitude = 2 * np.pi * (pixels[..., 0] / width - 0.5)
     latitude = np.pi * (0.5 - pixels[..., 1] / height)
     c = np.cos(latitude)

@@ -11,15 +11,9 @@ _ROWS_AT_ONCE = 256  # rows whose coordinates are held in double precision at on
 
 
 def straightened(erp: np.ndarray, correction: tuple[float, ...]) -> np.ndarray:
-    """A panorama as a camera without the field would have taken it.
-
-    Args:
-        erp: (H, 2H[, C]) uint8, or bool for a mask.
-        correction: coefficients of the field, see `factors.sphere_field`.
-
-    Returns:
-        The resampled panorama, of the same shape (Lanczos; masks by their nearest pixel).
-    """
+    """A panorama (H, 2H[, C]) uint8, or bool for a mask, as a camera without the field would have
+    taken it: resampled by Lanczos, masks by their nearest pixel; correction: coefficients of the
+    field, see `factors.sphere_field`."""
     import cv2
 
     if erp.dtype == bool:
@@ -45,10 +39,8 @@ def straightened_inside(
 
 
 def observed(directions: np.ndarray, correction: tuple[float, ...]) -> np.ndarray:
-    """Directions (h, w, 3) in which bent pictures show true directions (h, w, 3), unit, rig frame.
-
-    The field is evaluated on a coarse grid and interpolated.
-    """
+    """Directions (h, w, 3) in which bent pictures show true directions (h, w, 3), unit, rig frame,
+    by the field on a coarse grid, interpolated."""
     import cv2
 
     padded = _padded_offsets(correction)

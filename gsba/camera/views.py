@@ -25,10 +25,6 @@ from gsba.types import FACES, Fisheye, PictureFormat, Reconstruction
 _FAR_DEPTH = 1e9  # map units: depth from which both lenses see alike
 _MAX_OVERSAMPLING = 1.5  # largest ratio of a picture's density to a view's: beyond it, detail
 # aliases
-_NUM_DEPTH_POINTS = 12  # map points that give the depth in a direction
-_MIN_SMOOTHING_RAD = np.deg2rad(3.0)  # least angle over which points are averaged
-_PLANE_TOLERANCE = 0.1  # relative depth error at which a point counts as off a plane
-_FRONTAL_PLANE_WEIGHT = 0.05  # weight of the fronto-parallel plane, relative to the points'
 _ROWS_AT_ONCE = 128  # rows whose coordinates are held in double precision at once
 _NODES_ACROSS_FACE = 33  # nodes across a face of the interpolated offsets, which vary over tens of
 # degrees
@@ -88,11 +84,8 @@ def rig_views(rig: CubeRig) -> tuple[View, ...]:
 
 
 def lens_views(lenses: Lenses, size: int) -> tuple[View, ...]:
-    """Ten views of two lenses, with pixels as large as those of cube faces of `size`.
-
-    Raises:
-        GsbaError: there are more than two lenses.
-    """
+    """Ten views of two lenses, with pixels as large as those of cube faces of `size`. GsbaError:
+    there are more than two lenses."""
     if lenses.num_lenses != 2:
         raise GsbaError(
             f"the camera has {lenses.num_lenses} lenses, and faces of one lens each are cut for "
@@ -180,7 +173,13 @@ def _by_camera(
 
 def _seen_from_lenses(reconstruction: Reconstruction, lenses: Lenses) -> Reconstruction:
     if lenses.readout_motion is not None:
-        reconstruction = _rays_from_lens_centres(reconstruction, lenses)
+        bearings, frames = reconstruction.observation_bearings, reconstruction.observation_frames
+        starts = lenses.origins(bearings, frames)
+        rays = observed_points(reconstruction) - starts
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        reconstruction = replace(
+            reconstruction, observation_bearings=rays, observation_origins=starts
+        )
     if lenses.axes is None:
         return reconstruction
     turns = lenses.axes[reconstruction.observation_frames]
@@ -198,15 +197,6 @@ def turned_rigs(world_T_rigs: np.ndarray, turns: np.ndarray) -> np.ndarray:
     turned = world_T_rigs.copy()
     turned[:, :3, :3] = turned[:, :3, :3] @ turns
     return turned
-
-
-def _rays_from_lens_centres(reconstruction: Reconstruction, lenses: Lenses) -> Reconstruction:
-    """Observed points as rays from the lenses' centres, all in the middle of the readout."""
-    bearings, frames = reconstruction.observation_bearings, reconstruction.observation_frames
-    origins = lenses.origins(bearings, frames)
-    rays = observed_points(reconstruction) - origins
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    return replace(reconstruction, observation_bearings=rays, observation_origins=origins)
 
 
 def shown_in_pictures(reconstruction: Reconstruction, cameras: Cameras) -> Reconstruction:
@@ -288,12 +278,9 @@ class ViewCutter:
         frame: int,
         scene: np.ndarray | None = None,
     ) -> None:
-        """Compute the offset from each view's rays to directions in frame `frame` of the lenses.
-
-        Args:
-            scene: (N, 3) points in the rig frame of this frame, which give the depths; None =
-            everything is far. Rolling shutter is undone at these depths.
-        """
+        """Compute the offset from each view's rays to directions in the frame-th frame of the
+        lenses, at the depths of scene points (N, 3), rig frame; None = everything is far. Rolling
+        shutter is undone at these depths."""
         self._views = views
         self._offsets = [_offsets(view, lenses, frame, scene) for view in views]
         self._turn = np.eye(3) if lenses.axes is None else lenses.axes[frame]
@@ -332,12 +319,8 @@ class ViewCutter:
     def cut_squares(
         self, squares: np.ndarray, correction: tuple[float, ...] = ()
     ) -> Iterator[np.ndarray]:
-        """Images (height, width[, C]) uint8, bicubic, of an equi-angular cube map.
-
-        Args:
-            squares: (6, S, S[, C]) uint8, FACES order.
-            correction: coefficients of the stitching field, see `PictureFormat`.
-        """
+        """Images (height, width[, C]) uint8, bicubic, of an equi-angular cube map (6, S, S, C),
+        FACES order; correction: coefficients of the stitching field, see `PictureFormat`."""
         width = dense_enough(4 * squares.shape[1], self._views[0].focal)
         squares = shrunk(squares, width // 4)
         places = Grid(squares.shape[1], correction).places
@@ -416,34 +399,28 @@ def depths_along(directions: np.ndarray, points: np.ndarray) -> np.ndarray:
     from scipy.spatial import KDTree
 
     lengths = np.linalg.norm(points, axis=1)
-    units, near = points / lengths[:, None], min(_NUM_DEPTH_POINTS, len(points))
+    units, near = points / lengths[:, None], min(12, len(points))
     apart, rows = KDTree(units).query(directions, k=near)
     apart, rows = apart.reshape(-1, near), rows.reshape(-1, near)
-    spread = np.maximum(apart[:, near // 2, None], _MIN_SMOOTHING_RAD)
+    spread = np.maximum(apart[:, near // 2, None], np.deg2rad(3.0))
     weights, inverse = np.exp(-((apart / spread) ** 2)), 1 / lengths[rows]
-    middle = _weighted_median(inverse, weights)
+    order = np.argsort(inverse, axis=1)
+    heights = np.cumsum(np.take_along_axis(weights, order, axis=1), axis=1)
+    half = np.argmax(heights >= heights[:, -1:] / 2, axis=1)
+    half = np.take_along_axis(order, half[:, None], axis=1)
+    middle = np.take_along_axis(inverse, half, axis=1)[:, 0]
     flat, beside = middle[:, None] * directions, units[rows]
     tilt, left = np.zeros_like(flat), inverse - np.einsum("nki,ni->nk", beside, flat)
-    facing_us = (_FRONTAL_PLANE_WEIGHT * spread**2 * weights.sum(axis=1, keepdims=True))[
-        ..., None
-    ] * np.eye(3)
+    facing_us = (0.05 * spread**2 * weights.sum(axis=1, keepdims=True))[..., None] * np.eye(3)
     for _ in range(4):  # reweighting rounds of the plane fit
-        off = (left - np.einsum("nki,ni->nk", beside, tilt)) / (_PLANE_TOLERANCE * middle[:, None])
+        # a relative error of depth of .1 counts as off a plane
+        off = (left - np.einsum("nki,ni->nk", beside, tilt)) / (0.1 * middle[:, None])
         shares = weights / (1 + off**2)
         normal = np.einsum("nk,nki,nkj->nij", shares, beside, beside) + facing_us
         right = np.einsum("nk,nki,nk->ni", shares, beside, left)
         tilt = np.linalg.solve(normal, right[..., None])[..., 0]
     found = np.einsum("ni,ni->n", flat + tilt, directions)
     return 1 / np.clip(found, inverse.min(axis=1), inverse.max(axis=1))
-
-
-def _weighted_median(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Weighted medians (N,) of rows of values (N, K)."""
-    order = np.argsort(values, axis=1)
-    heights = np.cumsum(np.take_along_axis(weights, order, axis=1), axis=1)
-    half = np.argmax(heights >= heights[:, -1:] / 2, axis=1)
-    middle = np.take_along_axis(order, half[:, None], axis=1)
-    return np.take_along_axis(values, middle, axis=1)[:, 0]
 
 
 def views_for(kind: PictureFormat, size: int, lenses: Lenses) -> tuple[View, ...]:

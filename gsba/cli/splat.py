@@ -122,7 +122,7 @@ def _compare(
     from gsba.camera.views import Optics
     from gsba.evaluate.splats import compare, poses_for
     from gsba.splat.backend import choose_backend
-    from gsba.splat.lpips import Lpips
+    from gsba.splat.scores import Lpips
     from gsba.store.finished import load_cameras, load_run
     from gsba.store.folder import claim
 

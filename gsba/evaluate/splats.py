@@ -23,9 +23,8 @@ from gsba.evaluate import charts
 from gsba.log import GsbaError
 from gsba.similarity import NoSimilarityError, pose_similarity
 from gsba.splat.backend import Backend
-from gsba.splat.gaussians import Gaussians
+from gsba.splat.gaussians import Gaussians, write_ply
 from gsba.splat.pictures import render_views
-from gsba.splat.ply import write_ply
 from gsba.splat.scene import (
     Faces,
     Split,

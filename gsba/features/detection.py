@@ -45,7 +45,6 @@ def search_settings(settings: RefineSettings) -> MatchingSettings:
 # Noise of SIFT keypoints along each axis, face pixels: of the smallest
 # ones, and what is added in proportion to a keypoint's size.
 SIGMA_PX, _SIGMA_PER_SIZE = 0.16, 0.033
-_SAME_PIXEL_PX = 0.01  # pixels of one keypoint on the faces of two rigs differ by more
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,12 +100,8 @@ class SiftExtractor:
 def extract(
     faces_rgb: np.ndarray, masks: np.ndarray | None, rig: CubeRig, extractor: Extractor
 ) -> Features:
-    """Find keypoints on all faces of a frame; each stays only in the face that owns its bearing.
-
-    Args:
-        faces_rgb: (6, N, N, 3) uint8 in FACES order.
-        masks: (6, N, N) bool, True = use, or None.
-    """
+    """Find keypoints on all faces (6, N, N, 3) uint8 of a frame, FACES order, where masks (6, N, N)
+    are True; each stays only in the face that owns its bearing."""
     wanted = _owned_pixels(rig) if masks is None else _owned_pixels(rig) & masks
     usable = [face for face in range(len(FACES)) if wanted[face].any()]
     parts, scores = [], []
@@ -164,7 +159,7 @@ def on_faces(keypoints: Keypoints, rig: CubeRig) -> Keypoints:
         keypoints: of frames of several runs, each on the faces of its own rig.
     """
     pixels = rig.project(keypoints.bearings_rig, keypoints.faces)
-    moved = np.abs(pixels - keypoints.pixels).max(axis=1, initial=0.0) > _SAME_PIXEL_PX
+    moved = np.abs(pixels - keypoints.pixels).max(axis=1, initial=0.0) > 0.01  # pixels
     if not moved.any():
         return keypoints
     return replace(keypoints, pixels=np.where(moved[:, None], pixels, keypoints.pixels))

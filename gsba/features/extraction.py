@@ -100,13 +100,9 @@ def extract(
     chosen_frames: np.ndarray | None = None,
     known: Mapping[str, Features] | None = None,
 ) -> PerFrame[Features]:
-    """Features by frame name; image and mask are read, cut and released one at a time.
-
-    Args:
-        files: that the extractor depends on: weights of a learned one.
-        chosen_frames: (F,) bool, frames to extract; None = all.
-        known: features of some of them by name, found by the same search; None = of none.
-    """
+    """Features by frame name, of frames chosen by (F,) bool, None = all; image and mask are read,
+    cut and released one at a time. Those that the same search found before are known by name;
+    files: that the extractor depends on, weights of a learned one."""
     frames, rig, settings = search.frames, search.rig, search.settings
     index = {
         frame: f
@@ -135,13 +131,8 @@ def adopted(
     stored: Sequence[Path],
     name: str = "features",
 ) -> PerFrame[Features]:
-    """Features that other runs have stored, by frame name; extracted again where a file is gone.
-
-    Args:
-        store, frames, rig, settings: those of the run.
-        make_extractor: makes an extractor, once for each frame.
-        stored: (F,) file of each frame in the folder of another run.
-    """
+    """Features that other runs have stored, a file (F,) for each frame, by frame name; extracted
+    again where a file is gone."""
     index = {frame: f for f, frame in enumerate(frames.names)}
     compute = _Extraction(frames, index, rig, settings, make_extractor)
     return store.adopt(name, dict(zip(frames.names, stored, strict=True)), compute, Features)

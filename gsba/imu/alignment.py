@@ -18,20 +18,12 @@ from gsba.types import Counts, GyroConstraints, Trajectory
 
 _MAX_SPACING_STEPS, _MAX_SPACING_S = 0.25, 0.05  # largest spacing of tried offsets: in steps, and
 # in seconds
-_MAX_OFFSETS = 60_000  # largest number of tried offsets
-_MAX_TURNS_AT_ONCE = 200_000  # largest number of rotations of all offsets tried together
 _LOSS_WIDTH_SIGMAS = 2.0  # width of their loss, standard deviations
 _TURNING_SIGMAS, _AGREEING_SIGMAS = 4.0, 3.0  # standard deviations: least rotation of a turn;
 # largest residual of agreement
 _MIN_TURNS = 4  # least number of steps that turn
 _MIN_EXPLAINED = 0.6  # least share of the turns that a gyro must explain
 _SCALE_SIGMA = 0.01  # prior standard deviation of a gyro's scale
-_MAX_AXES_SIGMA_RAD = np.deg2rad(5.0)  # largest standard deviation of the axes
-_TURNING_STEP_RAD = np.deg2rad(1.0)  # rotation of a turning step: a tenth of the steps must exceed
-# it
-_MIN_NOISE_RAD = np.deg2rad(0.003)  # least noise of a rotation: steady gyros on the move are no
-# more accurate
-_ORIENTATION_SPACING_S = 0.004  # s between stored orientations: rotation is uniform in between
 _RATE_SPAN_S = 0.01  # s over which an angular velocity is averaged
 
 
@@ -57,20 +49,26 @@ def align(
     readings: Readings,
     former: Alignment | None = None,
 ) -> Alignment:
-    """Estimate clock, bias, scales and axes of a gyro from rotations by images.
-
-    Args:
-        timestamps: (F,) times of frames, seconds.
-        f_R_nexts: (F - 1, 3, 3) rotations between consecutive frames, by images.
-        known: (F - 1,) bool, True for known rotations.
-        former: the estimate from less accurate rotations; None = try all offsets.
-    """
+    """Estimate clock, bias, scales and axes of a gyro from rotations (F - 1, 3, 3) by images, some
+    of which are known, between consecutive frames at timestamps (F,), seconds; former: the estimate
+    from less accurate rotations, None = try all offsets."""
     turns = merged(timestamps, f_R_nexts, known)
     num_known = int(known.sum())
     dropped = {"rotation not known from images": len(f_R_nexts) - num_known}
     counts = Counts(len(f_R_nexts), num_known, "steps", dropped)
     if len(turns) < MIN_STEPS:
-        return _rejected(timestamps, f"only {len(turns)} rotations are known from images", counts)
+        clock, nan = Clock(float(timestamps[0]), 0.0, 1.0), float("nan")
+        return Alignment(
+            clock,
+            nan,
+            Sensor.ideal(),
+            np.eye(3),
+            nan,
+            nan,
+            0.0,
+            counts,
+            f"only {len(turns)} rotations are known from images",
+        )
     if former is None:
         starts = [(p, np.zeros(3)) for p in _candidates(turns, readings)]  # no bias
     else:
@@ -89,7 +87,9 @@ def turning_of(readings: Readings, found: Alignment, timestamps: np.ndarray) -> 
     times = found.clock.times(timestamps)
     readings = readings.between(times[0] - _RATE_SPAN_S, times[-1] + _RATE_SPAN_S)
     spans = np.column_stack([times[:-1], times[1:]])
-    turned = _rotation_vectors(readings, found.sensor, spans) @ found.rig_R_imu.T
+    free = Turns(spans, np.zeros((len(spans), 3)))
+    fit = ClockFit(free, _orientation_trajectory(readings, found.sensor))
+    turned = fit.residuals(np.array([0.0, 1.0])) @ found.rig_R_imu.T
     rates = found.sensor.true(readings.mean_rates(times, _RATE_SPAN_S)) @ found.rig_R_imu.T
     noisy, every = readings.noise(), float(np.median(np.diff(readings.timestamps)))
     bent = float(np.std(np.diff(readings.rates, axis=0) / np.diff(readings.timestamps)[:, None]))
@@ -189,9 +189,10 @@ def _candidates(turns: Turns, readings: Readings) -> Iterator[np.ndarray]:
     over = 0.4 * float(np.ptp(turns.times))  # part of the video that may lie outside the readings
     ends = fit.span - turns.middle - turns.ends
     low, high = min(ends) - over, max(ends) + over
-    spacing = max(min(_MAX_SPACING_STEPS * turns.step, _MAX_SPACING_S), (high - low) / _MAX_OFFSETS)
+    # at most 60,000 offsets
+    spacing = max(min(_MAX_SPACING_STEPS * turns.step, _MAX_SPACING_S), (high - low) / 60_000)
     shifts = np.arange(low, high + spacing, spacing)
-    at_once = max(_MAX_TURNS_AT_ONCE // len(turns), 1)
+    at_once = max(200_000 // len(turns), 1)  # rotations of all offsets tried together
     spans, seen = np.diff(turns.times, axis=1), turns.rotvecs
     still = seen - spans * (np.sum(spans * seen, axis=0) / np.sum(spans**2))
     costs = []
@@ -218,15 +219,10 @@ def _orientation_trajectory(
 ) -> Trajectory:
     """Orientations integrated from angular velocities of sensor or rig, without translation."""
     turned = readings.turned(sensor)
-    every = max(int(_ORIENTATION_SPACING_S / float(np.median(np.diff(readings.timestamps)))), 1)
+    # s: rotation is uniform in between
+    every = max(int(0.004 / float(np.median(np.diff(readings.timestamps)))), 1)
     turned = turned[::every] if axes is None else axes @ turned[::every] @ axes.T
     return Trajectory(readings.timestamps[::every], pose(turned, np.zeros((len(turned), 3))))
-
-
-def _rotation_vectors(readings: Readings, sensor: Sensor, spans: np.ndarray) -> np.ndarray:
-    """Rotation vectors (n, 3) over spans of time (n, 2), on the sensor's clock and in its axes."""
-    free = Turns(spans, np.zeros((len(spans), 3)))
-    return ClockFit(free, _orientation_trajectory(readings, sensor)).residuals(np.array([0.0, 1.0]))
 
 
 def _with_reason(
@@ -239,54 +235,45 @@ def _with_reason(
     share = best.explained(turning, sigma)
     begin = turns.middle - timestamps[0]
     offset = parameters[0] - (parameters[1] - 1) * begin
+    # steady gyros on the move are no better
     found = Alignment(
         Clock(float(timestamps[0]), float(offset), float(parameters[1])),
         float(np.sqrt(fit.covariance(parameters, with_rate=False)[0, 0])),
         best.sensor,
         best.rig_R_imu,
         best.axes_sigma,
-        noise(fit.residuals(parameters), _MIN_NOISE_RAD),
+        noise(fit.residuals(parameters), np.deg2rad(0.003)),
         share,
         counts,
     )
     rivals = [o for o in others if abs(o.parameters[0] - parameters[0]) > turns.step]
     rival = max((one.explained(turning, sigma) for one in rivals), default=0.0)
-    if np.quantile(np.linalg.norm(turns.rotvecs, axis=1), 0.9) < _TURNING_STEP_RAD:
+    # a tenth of the steps must turn by a degree
+    if np.quantile(np.linalg.norm(turns.rotvecs, axis=1), 0.9) < np.deg2rad(1.0):
         return replace(found, reason="the camera turns too little to determine the gyro's clock")
     if share < _MIN_EXPLAINED or turning.sum() < _MIN_TURNS:
         return replace(found, reason="the gyro's rotations fit the images at no clock offset")
     if rival > 0.75 * share:  # share of the best offset's explained turns that no rival may reach
         return replace(found, reason="the gyro's rotations fit the images at several clock offsets")
-    if best.axes_sigma > _MAX_AXES_SIGMA_RAD:
+    if best.axes_sigma > np.deg2rad(5.0):
         return replace(
             found, reason="the camera turns about one axis only: the gyro's axes are undetermined"
         )
     return found
 
 
-def _rejected(timestamps: np.ndarray, reason: str, counts: Counts) -> Alignment:
-    clock, nan = Clock(float(timestamps[0]), 0.0, 1.0), float("nan")
-    return Alignment(clock, nan, Sensor.ideal(), np.eye(3), nan, nan, 0.0, counts, reason)
-
-
-_MEAN_SPAN_S = 1.05  # s over which a force is averaged: two steps, in which sways cancel out
 _GRAVITY_M_S2 = 9.80665  # m/s^2, standard gravity
-_MAX_RELATIVE_DEVIATION = 0.2  # largest relative deviation of a mean's length from gravity
 
 
 def up_axis(
     readings: Readings, found: Alignment, timestamps: np.ndarray, world_R_rigs: np.ndarray
 ) -> np.ndarray | None:
     """Unit vector (3,) along the vertical in the world; None if forces do not determine it.
+    Timestamps (F,) of frames, seconds, are on their own clock.
 
-    Forces are rotated into the world by the pose of the frame before and the gyro since then, and
-    averaged over two steps each. Longer accelerations are outliers: the result is the geometric
-    median of the means.
-
-    Args:
-        found: alignment of the readings with the frames.
-        timestamps: (F,) times of frames, seconds, on their own clock.
-        world_R_rigs: (F, 3, 3) refined rotations.
+    Forces are rotated into the world by the refined rotation (F, 3, 3) of the frame before and the
+    gyro since then, and averaged over two steps each. Longer accelerations are outliers: the result
+    is the geometric median of the means.
     """
     if readings.forces is None:
         return None
@@ -300,13 +287,13 @@ def up_axis(
     of_frames, of_forces = turned[: len(times)], turned[len(times) :]
     worlds = world_R_rigs @ np.swapaxes(of_frames, 1, 2)
     up = np.einsum("nij,njk,nk->ni", worlds[before], of_forces, forces)
-    part = ((at - at[0]) / _MEAN_SPAN_S).astype(int)
+    part = ((at - at[0]) / 1.05).astype(int)  # s: two steps, in which sways cancel out
     counts = np.bincount(part)
     full = counts > 0.5 * np.median(counts[counts > 0])
     means = np.column_stack([np.bincount(part, column) for column in up.T])
     means = means[full] / counts[full, None]
     lengths = np.linalg.norm(means, axis=1)
-    right = np.abs(lengths - _GRAVITY_M_S2) < _MAX_RELATIVE_DEVIATION * _GRAVITY_M_S2
+    right = np.abs(lengths - _GRAVITY_M_S2) < 0.2 * _GRAVITY_M_S2
     if right.sum() < 3:  # least number of such means
         return None
     return median_direction(means[right] / lengths[right, None])

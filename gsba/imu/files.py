@@ -22,7 +22,6 @@ from gsba.imu.readings import Readings
 from gsba.log import GsbaError, brief
 
 _TABLES = (".csv", ".txt", ".tsv", ".dat")
-_MAX_RATE_RAD_S = 40.0  # rad/s: gyros saturate at 35, which are 2000 deg/s
 _MIN_READINGS_HZ = 25.0  # readings per second: fewer do not resolve a readout of 10 to 30 ms
 _MIN_READINGS = 10  # least number of readings
 _STANDARD_GRAVITY = 9.80665
@@ -45,29 +44,50 @@ _DEFAULT_COLUMNS = ["t", *(f"gyro_{axis}" for axis in "xyz"), *(f"acc_{axis}" fo
 
 
 def read_imu(path: Path) -> Readings:
-    """Readings of a table, or of a maker's recording.
-
-    Raises:
-        GsbaError: the file cannot be read or used; the message names the line. Or
-            `telemetry_parser` is needed and not installed.
-    """
+    """Readings of a table, or of a maker's recording. GsbaError: the file cannot be read or used;
+    the message names the line. Or `telemetry_parser` is needed and not installed."""
     path = Path(path)
     if path.suffix.lower() in _TABLES or not path.is_file():
-        return _read_table(path)
+        lines = [(line, _cells(text)) for line, text in read_lines(path)]
+        # a header behind a #, which begins with the column of times
+        with path.open(encoding="utf-8-sig") as file:
+            first = file.readline().strip()
+        named = _cells(first.lstrip("# "))
+        timed = re.fullmatch(_COLUMN_PATTERNS["t"][0], _name_and_unit(named[0] if named else "")[0])
+        header = (1, named) if first.startswith("#") and timed else None
+        if lines and header is None and not _is_number(lines[0][1][0]):
+            header = lines[0]
+        if lines and header is not None and header[1] == lines[0][1]:
+            lines = lines[1:]
+        if not lines:
+            raise GsbaError(f"{path}: holds no readings")
+        if header is None and len(lines[0][1]) not in (4, 7):
+            raise GsbaError(
+                f"{path}:{lines[0][0]}: {len(lines[0][1])} columns; want t, gyro x y z [rad/s] and "
+                "accelerometer x y z [m/s^2], or a header that names them"
+            )
+        names = _DEFAULT_COLUMNS[: len(lines[0][1])] if header is None else header[1]
+        columns = _columns(f"{path}:{header[0]}" if header else str(path), names)
+        values = np.empty((len(lines), len(columns)))
+        for n, (line, cells) in enumerate(lines):
+            if len(cells) != len(names):
+                raise GsbaError(f"{path}:{line}: {len(cells)} values where {len(names)} are named")
+            for k, (column, scale) in enumerate(columns):
+                if not _is_number(cells[column]):
+                    raise GsbaError(
+                        f"{path}:{line}: '{brief(cells[column])}' is not a finite number"
+                    )
+                values[n, k] = float(cells[column]) * scale
+        forces = values[:, 4:] if values.shape[1] == 7 else None
+        where = [f"{line}" for line, _ in lines]
+        return _checked(path, values[:, 0], values[:, 1:4], forces, where)
     return read_telemetry(path)
 
 
 def read_telemetry(path: Path, lasting_s: float | None = None) -> Readings:
-    """Readings stored in a maker's recording.
-
-    Args:
-        lasting_s: duration of its pictures, seconds; readings timed from the first frame that begin
-            after it are of another recording. None = not known.
-
-    Raises:
-        GsbaError: the file holds no usable readings, or `telemetry_parser` is needed and not
-            installed.
-    """
+    """Readings stored in a maker's recording; those timed from the first frame that begin after its
+    pictures' duration, seconds, are of another recording; None = not known. GsbaError: the file
+    holds no usable readings, or `telemetry_parser` is needed and not installed."""
     trailer = read_trailer(path)
     if trailer is None:
         table = "a table (t, gyro x y z, accelerometer x y z)"
@@ -92,45 +112,6 @@ def read_telemetry(path: Path, lasting_s: float | None = None) -> Readings:
         )
     where = [f"reading {n + 1}" for n in range(len(gyro.times))]
     return _checked(path, gyro.times, gyro.rates, gyro.accelerations, where)
-
-
-def _read_table(path: Path) -> Readings:
-    """Readings of a table."""
-    lines = [(line, _cells(text)) for line, text in read_lines(path)]
-    header = _header(path)
-    if lines and header is None and not _is_number(lines[0][1][0]):
-        header = lines[0]
-    if lines and header is not None and header[1] == lines[0][1]:
-        lines = lines[1:]
-    if not lines:
-        raise GsbaError(f"{path}: holds no readings")
-    if header is None and len(lines[0][1]) not in (4, 7):
-        raise GsbaError(
-            f"{path}:{lines[0][0]}: {len(lines[0][1])} columns; want t, gyro x y z [rad/s] and "
-            "accelerometer x y z [m/s^2], or a header that names them"
-        )
-    names = _DEFAULT_COLUMNS[: len(lines[0][1])] if header is None else header[1]
-    columns = _columns(f"{path}:{header[0]}" if header else str(path), names)
-    values = np.empty((len(lines), len(columns)))
-    for n, (line, cells) in enumerate(lines):
-        if len(cells) != len(names):
-            raise GsbaError(f"{path}:{line}: {len(cells)} values where {len(names)} are named")
-        for k, (column, scale) in enumerate(columns):
-            if not _is_number(cells[column]):
-                raise GsbaError(f"{path}:{line}: '{brief(cells[column])}' is not a finite number")
-            values[n, k] = float(cells[column]) * scale
-    forces = values[:, 4:] if values.shape[1] == 7 else None
-    where = [f"{line}" for line, _ in lines]
-    return _checked(path, values[:, 0], values[:, 1:4], forces, where)
-
-
-def _header(path: Path) -> tuple[int, list[str]] | None:
-    """A header behind a # in the first line, which begins with the column of times."""
-    with path.open(encoding="utf-8-sig") as file:
-        first = file.readline().strip()
-    cells = _cells(first.lstrip("# "))
-    timed = re.fullmatch(_COLUMN_PATTERNS["t"][0], _name_and_unit(cells[0] if cells else "")[0])
-    return (1, cells) if first.startswith("#") and timed else None
 
 
 def _cells(text: str) -> list[str]:
@@ -202,7 +183,8 @@ def _checked(
             f"{path}:{where[late[0] + 1]}: time {times[late[0] + 1]:.9g} does not come after "
             f"{times[late[0]]:.9g}; sort the file"
         )
-    fast = np.flatnonzero(np.abs(rates).max(axis=1) > _MAX_RATE_RAD_S)
+    # rad/s: gyros saturate at 35, 2000 deg/s
+    fast = np.flatnonzero(np.abs(rates).max(axis=1) > 40.0)
     if len(fast):
         raise GsbaError(
             f"{path}:{where[fast[0]]}: {np.abs(rates[fast[0]]).max():.4g} rad/s, which no gyro "

@@ -5,8 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-_MAX_GAP_S = 0.1  # s between two readings: in longer gaps the rotation is unknown
-
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
@@ -27,10 +25,8 @@ class Sensor:
 
 @dataclass(frozen=True, slots=True)
 class Readings:
-    """Readings of a gyro and an accelerometer with common axes, right-handed, fixed to the camera.
-
-    Their rotation against the camera and the gyro's bias are not known.
-    """
+    """Readings of a gyro and an accelerometer with common axes, right-handed, fixed to the camera;
+    their rotation against the camera and the gyro's bias are not known."""
 
     timestamps: np.ndarray  # (N,) float64, seconds on a clock of their own, strictly increasing
     rates: np.ndarray  # (N, 3) float64, rad/s
@@ -52,7 +48,7 @@ class Readings:
 
     def covers(self, times: np.ndarray) -> np.ndarray:
         """True (n,) for spans of time (n, 2) within the readings, without a gap."""
-        late = np.diff(self.timestamps, append=np.inf) > _MAX_GAP_S
+        late = np.diff(self.timestamps, append=np.inf) > 0.1  # s: the rotation is unknown
         gaps = np.concatenate([[0], np.cumsum(late)])
         first = np.searchsorted(self.timestamps, times[:, 0], side="right") - 1
         last = np.searchsorted(self.timestamps, times[:, 1]) - 1

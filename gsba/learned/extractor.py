@@ -28,15 +28,8 @@ def make_extractor(
 
 
 class LearnedExtractor:
-    """ALIKED, DISK, XFeat or SuperPoint on one face, without rescaling.
-
-    Args:
-        settings: `extractor` names the network.
-        weights: file of its weights.
-
-    Raises:
-        GsbaError: the weights are of another network, or a library is not installed.
-    """
+    """ALIKED, DISK, XFeat or SuperPoint, as `settings.extractor` names it, on one face, without
+    rescaling. GsbaError: the weights are of another network, or a library is not installed."""
 
     def __init__(self, settings: FeatureSettings, weights: Path) -> None:
         self._most, self._traits = settings.max_per_face, TRAITS[settings.extractor]

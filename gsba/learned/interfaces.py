@@ -11,12 +11,9 @@ class Detector(Protocol):
     """Network that detects and describes keypoints on one image."""
 
     def __call__(self, image: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Keypoints of an image (N, N, 3) uint8, N a multiple of 32.
-
-        Returns:
-            pixels (K, 2) (u, v), with the origin in the centre of the first pixel, scores (K,), and
-            descriptors (K, D) float32 of length one.
-        """
+        """Keypoints of an image (N, N, 3) uint8, N a multiple of 32: pixels (K, 2) (u, v), with the
+        origin in the centre of the first pixel, scores (K,), and descriptors (K, D) float32 of
+        length one."""
         ...
 
 

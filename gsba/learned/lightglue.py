@@ -16,15 +16,9 @@ _UNUSED = re.compile(r"log_assignment\.\d+\.r")  # tensors of disk_lightglue.pth
 
 
 class LightGlue:
-    """Matcher of two faces with all layers and all keypoints, so that matches depend on these only.
-
-    Args:
-        extractor: network of the keypoints: aliked, disk, superpoint, or xfeat ("LighterGlue").
-        weights: file in the layout of its authors or of kornia.
-
-    Raises:
-        GsbaError: the weights are of another network.
-    """
+    """Matcher of two faces with all layers and all keypoints, so that matches depend on these only:
+    of aliked, disk, superpoint, or xfeat ("LighterGlue"), with weights in the layout of its authors
+    or of kornia. GsbaError: the weights are of another network."""
 
     def __init__(self, extractor: str, weights: Path) -> None:
         wide = kornia.feature.LightGlue.features[extractor]
@@ -53,10 +47,7 @@ class LightGlue:
         self, first: FaceKeypoints, second: FaceKeypoints, size: int
     ) -> tuple[np.ndarray, np.ndarray]:
         """Matches (m, 2) of keypoints of two faces of `size` pixels, and their scores (m,).
-
-        Raises:
-            GsbaError: descriptors of another length than the network's (ALIKED-T16's).
-        """
+        GsbaError: descriptors of another length than the network's (ALIKED-T16's)."""
         given, taken = first.descriptors.shape[1], self._length
         if given != taken:
             raise GsbaError(

@@ -20,7 +20,6 @@ from gsba.learned.device import device, inference
 from gsba.learned.interfaces import Detector
 from gsba.learned.weights import load_into, read_state
 
-_MIN_SCORE = 0.2  # published value of SuperGlue
 _HEAD_NAMES = {  # layer of superpoint_v1.pth -> layer of transformers
     "convPa": "keypoint_decoder.conv_score_a",
     "convPb": "keypoint_decoder.conv_score_b",
@@ -57,17 +56,11 @@ def _superpoint_name(name: str) -> str:
 
 
 class SuperGlue:
-    """SuperGlue (Sarlin et al., CVPR 2020) between SuperPoint keypoints of two faces.
-
-    Args:
-        weights: file of either layout.
-
-    Raises:
-        GsbaError: the weights are of another network.
-    """
+    """SuperGlue (Sarlin et al., CVPR 2020) between SuperPoint keypoints of two faces, with weights
+    of either layout. GsbaError: they are of another network."""
 
     def __init__(self, weights: Path) -> None:
-        model = SuperGlueForKeypointMatching(SuperGlueConfig(matching_threshold=_MIN_SCORE))
+        model = SuperGlueForKeypointMatching(SuperGlueConfig(matching_threshold=0.2))
         model.keypoint_detector = torch.nn.Identity()  # keypoints are detected once per frame
         state = read_state(weights)
         if "kenc.encoder.0.weight" in state:

@@ -22,24 +22,14 @@ from gsba.matching.guided_search import (
 )
 from gsba.types import FACES, Features
 
-_PARALLAX_RAD = np.deg2rad(10.0)  # assumed for near points, to find overlapping faces
-_MIN_OVERLAP = 0.05  # share of a face's keypoints that should be on the other one
-_MIN_KEYPOINTS = 8  # on either face
 # Pairs of faces that may show the same where the heading is unknown, as cameras are held upright.
 _UPRIGHT_FACES = [*product(range(4), range(4)), (4, 4), (5, 5)]
 
 
 def make_matcher(settings: RefineSettings, weights: Mapping[str, Path], size: int) -> Matcher:
-    """Matcher that settings choose: guided search, or a learned network.
-
-    Args:
-        settings: `matching.matcher` and `features.extractor`.
-        weights: files of learned networks (`find_weights`).
-        size: pixels of a face.
-
-    Raises:
-        GsbaError: the weights are of another network, or a library is not installed.
-    """
+    """Matcher that `matching.matcher` and `features.extractor` choose for faces of `size` pixels:
+    guided search, or a learned network with weights by `find_weights`. GsbaError: the weights are
+    of another network, or a library is not installed."""
     name = settings.matching.matcher
     if name == "guided":
         return guided
@@ -88,7 +78,7 @@ class FaceMatcher:
                 some[found.faces[some] == face]
                 for some, found, face in zip(chosen, (first, second), faces, strict=True)
             )
-            if min(len(k0), len(k1)) < _MIN_KEYPOINTS:
+            if min(len(k0), len(k1)) < 8:
                 continue
             matched, score = self._network(_on_face(first, k0), _on_face(second, k1), self._size)
             rows.append(np.column_stack([k0[matched[:, 0]], k1[matched[:, 1]]]))
@@ -111,19 +101,16 @@ def _on_face(features: Features, keypoints: np.ndarray) -> FaceKeypoints:
 def overlapping_faces(
     bearings0: np.ndarray, bearings1: np.ndarray, f0_T_f1: np.ndarray
 ) -> list[tuple[int, int]]:
-    """Pairs of overlapping faces, of frame 0 and frame 1.
+    """Pairs of overlapping faces of frames 0 and 1, whose keypoints are (n, 3) in either's rig
+    frame; f0_T_f1: (4, 4) predicted, its translation's length is unused.
 
     At least a twentieth of the keypoints of one must be on the other, for points at infinity or
     with a parallax of 10 degrees.
-
-    Args:
-        bearings0, bearings1: (n, 3) keypoints of both frames, each in its own rig frame.
-        f0_T_f1: (4, 4) predicted pose of frame 1 in frame 0; its translation's length is unused.
     """
     rotation, motion = f0_T_f1[:3, :3], f0_T_f1[:3, 3]
     onto1 = _shares(bearings0, bearings0 @ rotation, -motion @ rotation)
     onto0 = _shares(bearings1, bearings1 @ rotation.T, motion)
-    overlap = np.maximum(onto1, onto0.T) >= _MIN_OVERLAP
+    overlap = np.maximum(onto1, onto0.T) >= 0.05
     return [(int(face0), int(face1)) for face0, face1 in np.argwhere(overlap)]
 
 
@@ -136,7 +123,8 @@ def _shares(bearings: np.ndarray, seen: np.ndarray, towards: np.ndarray) -> np.n
         cosine = seen @ target
         aside = target - cosine[:, None] * seen
         aside /= np.maximum(np.linalg.norm(aside, axis=1, keepdims=True), 1e-12)
-        angle = np.minimum(_PARALLAX_RAD, np.arccos(np.clip(cosine, -1, 1)))[:, None]
+        # parallax of near points
+        angle = np.minimum(np.deg2rad(10.0), np.arccos(np.clip(cosine, -1, 1)))[:, None]
         places.append(owner_faces(np.cos(angle) * seen + np.sin(angle) * aside))
     counts = np.zeros((len(FACES), len(FACES)))
     for face in range(len(FACES)):

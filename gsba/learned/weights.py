@@ -67,19 +67,10 @@ PACKAGES = (
 )
 
 
-def install_command(names: Sequence[str]) -> str:
-    """Command that installs files of weights with some names; "" = no package holds them."""
-    commands = (package.command() for package in PACKAGES if package.sha256.keys() & set(names))
-    return next(commands, "")
-
-
 def packaged(names: Sequence[str]) -> Path | None:
     """File of weights with the first of some names that an installed package holds; None = no
-    package of them is installed.
-
-    Raises:
-        GsbaError: the package's file is missing or another one than that of the known version.
-    """
+    package of them is installed. GsbaError: the package's file is missing or another one than that
+    of the known version."""
     for name in names:
         for package in PACKAGES:
             if name in package.sha256:
@@ -206,12 +197,9 @@ SOURCES = {
 
 
 def find_weights(settings: RefineSettings) -> dict[str, Path]:
-    """Files of the learned networks that settings choose, by "features" and "matching".
-
-    Raises:
-        GsbaError: weights are missing and may not be downloaded, or their licence was not accepted;
-            the message names the file, its licence and its source.
-    """
+    """Files of the learned networks that settings choose, by "features" and "matching". GsbaError:
+    weights are missing and may not be downloaded, or their licence was not accepted; the message
+    names the file, its licence and its source."""
     chosen, wanted = settings.features, {}
     if chosen.extractor != "sift":
         wanted["features"] = (chosen.extractor, chosen.weights)
@@ -255,7 +243,8 @@ def _find(source: Source, given: str | None, setting: str, download: bool) -> Pa
         return at_hand
     if download and names is source.files:
         return _download(source)
-    command = install_command(names)
+    commands = (package.command() for package in PACKAGES if package.sha256.keys() & set(names))
+    command = next(commands, "")
     if given in names:
         raise GsbaError(f"no {given} at hand: {command}, or pass the path of the file")
     where = f"{given} holds no weights of" if given else "no weights of"

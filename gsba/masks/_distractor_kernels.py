@@ -139,15 +139,8 @@ def keep_best(differences, away, spread, best, away_best, spread_best):
 
 @_exact
 def witnesses(usable, n_T_own, rays, inverse):
-    """Number of neighbours that see an assumed distance, unmasked and from a similar viewpoint.
-
-    Args:
-        usable: (M, H, W) bool, the neighbours' masks.
-        n_T_own, rays, inverse: see `compare`.
-
-    Returns:
-        (H, W) uint8.
-    """
+    """Number (H, W) uint8 of neighbours, unmasked in `usable (M, H, W)`, that see an assumed
+    distance, from a similar viewpoint; n_T_own, rays, inverse: see `compare`."""
     num, height, width = usable.shape
     out = np.zeros((height, width), np.uint8)
     for r in range(height):

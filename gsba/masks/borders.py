@@ -14,11 +14,9 @@ from gsba.frames.pixels import load_erp
 from gsba.types import FrameSet
 
 _WIDTH_PX = 512  # pixels across the pictures that are compared
-_NUM_LOOKS = 8  # frames
 _MAX_BLACK_LEVEL = 6  # grey levels: JPEG's noise around 0
 _MIN_SHARE, _MAX_SHARE = 0.002, 0.6  # of the picture: smaller areas are dark corners of the scene,
 # with larger ones frames are dark
-_RIM_PX = 3  # masked beside black areas
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +33,7 @@ def find_borders(frames: FrameSet) -> Borders:
     if frames.format.layout != "erp" or frames.format.width < _WIDTH_PX:
         return Borders(everything, 0.0)
     brightest = np.zeros(everything.shape, np.uint8)
-    for f in np.unique(np.linspace(0, len(frames) - 1, _NUM_LOOKS).astype(int)):
+    for f in np.unique(np.linspace(0, len(frames) - 1, 8).astype(int)):
         grey = load_erp(frames, int(f), gray=True, width=_WIDTH_PX)
         np.maximum(brightest, cv2.resize(grey, everything.shape[::-1]), out=brightest)
         if not (brightest <= _MAX_BLACK_LEVEL).any():
@@ -44,7 +42,7 @@ def find_borders(frames: FrameSet) -> Borders:
     share = float(found.mean())
     if not share:
         return Borders(everything, 0.0)
-    return Borders(~widened(found, _RIM_PX), share)
+    return Borders(~widened(found, 3), share)  # pixels beside black areas
 
 
 def widened(places: np.ndarray, pixels: int) -> np.ndarray:
@@ -55,11 +53,8 @@ def widened(places: np.ndarray, pixels: int) -> np.ndarray:
 
 
 def black_areas(brightest: np.ndarray) -> np.ndarray:
-    """Large areas (h, 2h) bool of no pixels; none if most of the picture is as dark.
-
-    Args:
-        brightest: (h, 2h) uint8, largest grey level of each pixel in all pictures.
-    """
+    """Large areas (h, 2h) bool of no pixels, by the largest grey level uint8 of each in all
+    pictures; none if most of the picture is as dark."""
     black = (brightest <= _MAX_BLACK_LEVEL).astype(np.uint8)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(black, connectivity=4)
     large = stats[:, cv2.CC_STAT_AREA] >= _MIN_SHARE * black.size

@@ -3,7 +3,7 @@
 Head, shoulders, arm, stick, helmet, bag or vehicle move with the camera, so that their structure
 keeps its place in the picture (`gsba.masks.fixed_structure`), up to an outline
 (`gsba.masks.carrier_outline`). With direction lock on, pictures do not turn with the camera and the
-carrier turns against them: this rotation is estimated for each frame (`gsba.masks.carrier_turns`)
+carrier turns against them: this rotation is estimated for each frame (`gsba.masks.fixed_structure`)
 and undone first.
 """
 
@@ -22,9 +22,13 @@ from gsba.frames.pixels import load_erp
 from gsba.log import GsbaError, track
 from gsba.masks.borders import black_areas, widened
 from gsba.masks.carrier_outline import certain_places, outline_carrier
-from gsba.masks.carrier_turns import band_of, find_turns
-from gsba.masks.fixed_structure import FixedStructure, measure_fixed_structure
-from gsba.masks.medians import median_picture
+from gsba.masks.fixed_structure import (
+    FixedStructure,
+    band_of,
+    find_turns,
+    measure_fixed_structure,
+    median_picture,
+)
 from gsba.memory import usable_cpus
 from gsba.types import FrameSet
 
@@ -35,18 +39,11 @@ _MAX_FRAMES = 20
 _MIN_FRAMES = 6  # fewer agree by chance
 _MIN_FIXED_CORRELATION, _MAX_MOVING_CORRELATION = 0.75, 0.5  # least correlation of fixed structure;
 # largest of moving structure
-_MIN_MOVING_SHARE = 1 / 3  # share of the textured directions: with fewer, a carrier looks like the
-# distant world
-_STANDSTILL_SHARE = 0.9  # share of fixed textured directions from which the camera stands still
 VEHICLE_SHARE = 1 / 3  # share of the picture from which the carrier is a vehicle: people and sticks
 # fill less
-_MIN_TEXTURED_SHARE = 0.02  # share of all directions
 _STRUCTURE_WIDTH_PX, _TURNED_STRUCTURE_WIDTH_PX = 256, 128  # width in pixels of compared pictures:
 # the camera's tilt, which remains when turns are undone, moves the carrier by a pixel of the latter
-_BLACK_RIM_PX = 6  # of structure pictures, within which edges of black areas are compared
 _MIN_TURN_RAD = np.deg2rad(2.0)  # smaller turns are estimation noise
-_ROWS_ABOVE_SHARE = 0.55  # part of the height, from the zenith, where the world is seen
-_MIN_FRAMES_TURNED = 12  # fewer agree by chance once turns are free
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,14 +65,8 @@ def no_carrier(frames: FrameSet, reason: str) -> Carrier:
 
 
 def find_carrier(frames: FrameSet) -> Carrier:
-    """Detect the carrier in panoramas of a moving camera.
-
-    Args:
-        frames: panoramas or raw pairs.
-
-    Raises:
-        GsbaError: cube faces, too few frames, no texture, or too little motion.
-    """
+    """Detect the carrier in panoramas or raw pairs of a moving camera. GsbaError: cube faces, too
+    few frames, no texture, or too little motion."""
     if not frames.format.panoramic:
         raise GsbaError("the carrier is detected in panoramas; these frames are cube faces")
     _require_enough(len(frames))
@@ -84,7 +75,8 @@ def find_carrier(frames: FrameSet) -> Carrier:
         loaded = pool.map(partial(_load, frames), chosen.tolist())
         pictures = np.stack(list(track(loaded, "looking for the carrier", len(chosen))))
     structure, turns = _measure(pictures, _STRUCTURE_WIDTH_PX), np.zeros(len(frames))
-    if not certain_places(structure).any() and len(pictures) >= _MIN_FRAMES_TURNED:
+    # fewer agree by chance once turns are free
+    if not certain_places(structure).any() and len(pictures) >= 12:
         below = _measure_turned(pictures)
         if below is not None:
             bands = [band_of(_load(frames, f)) for f in track(range(len(frames)), "its turns")]
@@ -105,17 +97,9 @@ def find_carrier(frames: FrameSet) -> Carrier:
 
 
 def find_fixed_carrier(pictures: np.ndarray) -> np.ndarray:
-    """Mask of the world in pictures, False at a carrier that keeps its direction.
-
-    Args:
-        pictures: (N, h, 2h, 3) uint8 RGB, `PICTURE_WIDTH` across, of a moving camera.
-
-    Returns:
-        (h, 2h) bool, True = use; all True if nothing stays in place.
-
-    Raises:
-        GsbaError: too few pictures, no texture, or too little motion.
-    """
+    """Mask (h, 2h) bool of the world in pictures (N, h, 2h, 3) uint8 RGB, `PICTURE_WIDTH` across,
+    of a moving camera: False at a carrier that keeps its direction. GsbaError: too few pictures, no
+    texture, or too little motion."""
     _require_enough(len(pictures))
     return ~_outlined(pictures, _measure(pictures, _STRUCTURE_WIDTH_PX))[1]
 
@@ -127,7 +111,29 @@ def _require_enough(num: int) -> None:
 
 def _outlined(pictures: np.ndarray, structure: FixedStructure) -> tuple[np.ndarray, np.ndarray]:
     """The median (h, 2h, 3) uint8 of pictures, and the carrier in it (h, 2h) bool."""
-    _check_moving(structure)
+    heights = (np.arange(len(structure.strong)) + 0.5) / len(structure.strong)
+    weights = structure.textured * np.sin(np.pi * heights)[:, None]  # solid angles
+    if weights.mean() < 0.02:  # of all directions
+        raise GsbaError("the frames show too little texture to detect the carrier")
+    staying, moving = (
+        float((weights * places).sum() / weights.sum())
+        for places in (
+            structure.strong > _MIN_FIXED_CORRELATION,
+            structure.strong < _MAX_MOVING_CORRELATION,
+        )
+    )
+    logger.debug("textured: %.0f%% stay, %.0f%% move", 100 * staying, 100 * moving)
+    if staying > 0.9:
+        raise GsbaError(
+            f"the frames hardly differ ({100 * staying:.0f}% of textured directions stay fixed): "
+            "the camera must move to detect its carrier"
+        )
+    if moving < 1 / 3:
+        raise GsbaError(
+            f"{100 * staying:.0f}% of textured directions stay fixed, only "
+            f"{100 * moving:.0f}% move: most of the picture is a vehicle, or far away, or the "
+            "camera hardly moves; give a mask of the carrier (--masks FILE)"
+        )
     median = median_picture(pictures).astype(np.uint8)
     return median, outline_carrier(pictures, median, structure)
 
@@ -143,14 +149,11 @@ def carrier_mask(carrier: Carrier, frames: FrameSet, frame: int) -> np.ndarray:
 def write_carrier(
     carrier: Carrier, frames: FrameSet, out: Path, merge: bool = True, name: str = "carrier"
 ) -> list[Path]:
-    """Write the carrier's mask, and a picture to check it.
+    """Write the carrier's mask, and a picture to check it; returns the files.
 
     `NAME.png` is the mask (white = use), `NAME_check.jpg` the median picture with the outline. If
     the frames have masks of their own, or the carrier turns, `merged/FRAME.png` combines the masks
     of each frame, unless `merge` is False.
-
-    Returns:
-        the written files.
     """
     written = [out / f"{name}.png", out / f"{name}_check.jpg"]
     write_image(written[0], carrier_mask(carrier, frames, 0).astype(np.uint8) * 255)
@@ -187,7 +190,7 @@ def _measure(pictures: np.ndarray, width: int) -> FixedStructure:
     if not black.any():
         return found
     small = cv2.resize(black.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0
-    scene = ~widened(small, _BLACK_RIM_PX)
+    scene = ~widened(small, 6)  # pixels
     return FixedStructure(found.strong * scene, found.weak * scene, found.textured & scene)
 
 
@@ -212,33 +215,6 @@ def _measure_turned(pictures: np.ndarray) -> tuple[np.ndarray, FixedStructure] |
 
 def _steadiness_above(structure: FixedStructure) -> float:
     """Mean correlation of the textured directions above the carrier; 0 = there are none."""
-    rows = int(_ROWS_ABOVE_SHARE * len(structure.strong))
+    rows = int(0.55 * len(structure.strong))  # from the zenith, where the world is seen
     textured = structure.textured[:rows]
     return float(structure.strong[:rows][textured].mean()) if textured.any() else 0.0
-
-
-def _check_moving(structure: FixedStructure) -> None:
-    """Refuse frames in which too little moves to tell the carrier from the world."""
-    heights = (np.arange(len(structure.strong)) + 0.5) / len(structure.strong)
-    weights = structure.textured * np.sin(np.pi * heights)[:, None]  # solid angles
-    if weights.mean() < _MIN_TEXTURED_SHARE:
-        raise GsbaError("the frames show too little texture to detect the carrier")
-    staying, moving = (
-        float((weights * places).sum() / weights.sum())
-        for places in (
-            structure.strong > _MIN_FIXED_CORRELATION,
-            structure.strong < _MAX_MOVING_CORRELATION,
-        )
-    )
-    logger.debug("textured: %.0f%% stay, %.0f%% move", 100 * staying, 100 * moving)
-    if staying > _STANDSTILL_SHARE:
-        raise GsbaError(
-            f"the frames hardly differ ({100 * staying:.0f}% of textured directions stay fixed): "
-            "the camera must move to detect its carrier"
-        )
-    if moving < _MIN_MOVING_SHARE:
-        raise GsbaError(
-            f"{100 * staying:.0f}% of textured directions stay fixed, only "
-            f"{100 * moving:.0f}% move: most of the picture is a vehicle, or far away, or the "
-            "camera hardly moves; give a mask of the carrier (--masks FILE)"
-        )

@@ -12,16 +12,13 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from gsba.camera.sphere import around_sphere
-from gsba.masks.fixed_structure import FixedStructure
-from gsba.masks.medians import median_picture
+from gsba.masks.fixed_structure import FixedStructure, median_picture
 
 _PADDING_PX = 32  # pixels around the sphere
 _MIN_CERTAIN_STRONG, _MIN_CERTAIN_WEAK = 0.75, 0.6  # least strong and weak correlations that only a
 # carrier has, see docs/masks.md
 _MIN_LIKELY_WEAK = 0.2  # least weak correlation of pixels joined to certain ones
 _SPILL_PX = 6  # pixels by which fixed structure exceeds the outline
-_REACH_PX = 28  # pixels from fixed structure within which the outline is searched
-_MIN_MOVING_RATIO = 3.0  # multiple of the carrier's own change above which pixels show the world
 _MIN_CHANGE = 1.0  # grey levels, least change of a carrier without noise
 _NUM_ROUNDS = 2  # rounds of the graph cut and its colour models
 _DILATION_PX = 1  # pixels added: features on the carrier's blurred rim are useless
@@ -35,13 +32,8 @@ def certain_places(structure: FixedStructure) -> np.ndarray:
 def outline_carrier(
     pictures: np.ndarray, median: np.ndarray, structure: FixedStructure
 ) -> np.ndarray:
-    """The carrier's pixels, (h, 2h) bool; all False without a carrier.
-
-    Args:
-        pictures: (K, h, 2h, 3) uint8 panoramas in which the carrier does not move.
-        median: (h, 2h, 3) uint8, median of these pictures.
-        structure: fixed structure of these pictures, smaller.
-    """
+    """The carrier's pixels, (h, 2h) bool; all False without a carrier, in panoramas (K, h, 2h, 3)
+    uint8 in which it does not move, their median, and their fixed structure, smaller."""
     height, width = pictures.shape[1:3]
     nothing = np.zeros((height, width), bool)
     if not certain_places(structure).any():
@@ -57,24 +49,13 @@ def outline_carrier(
     core = _shrunk(likely, _SPILL_PX)
     if not core.any():
         return nothing
-    change = _change(pictures, median)
+    rows = np.array_split(np.arange(len(median)), 8)  # little memory at a time
+    parts = [np.abs(pictures[:, r].astype(np.int16) - median[r]).mean(axis=-1) for r in rows]
+    change = np.concatenate([median_picture(part) for part in parts]).astype(np.float32)
     own_change = max(float(np.median(change[core])), _MIN_CHANGE)
-    moves = (
-        _filtered_on_sphere(cv2.GaussianBlur, change, (0, 0), 1.0) > _MIN_MOVING_RATIO * own_change
-    ) & ~core
-    found = _parts_with(_cut(median, core, likely, moves), core)
-    plain = _enclosed(found)
-    found |= plain & ~_parts_with(plain, moves, least=0.5)
-    return (
-        _filtered_on_sphere(cv2.dilate, found, np.ones((3, 3), np.uint8), iterations=_DILATION_PX)
-        > 0
-    )
-
-
-def _cut(median: np.ndarray, core: np.ndarray, likely: np.ndarray, moves: np.ndarray) -> np.ndarray:
-    """The carrier (h, w) bool by colours and edges of the median picture (h, w, 3) uint8."""
+    moves = (_filtered_on_sphere(cv2.GaussianBlur, change, (0, 0), 1.0) > 3.0 * own_change) & ~core
     distance = _filtered_on_sphere(cv2.distanceTransform, ~likely, cv2.DIST_L2, 5)
-    far = distance > _REACH_PX
+    far = distance > 28  # pixels
     inside = _enclosed(~far)
     labels = np.full(core.shape, cv2.GC_PR_BGD, np.uint8)
     labels[inside | _shrunk(likely, _SPILL_PX // 2)] = cv2.GC_PR_FGD
@@ -85,16 +66,18 @@ def _cut(median: np.ndarray, core: np.ndarray, likely: np.ndarray, moves: np.nda
     nowhere, models = (0, 0, 0, 0), (np.zeros((1, 65)), np.zeros((1, 65)))
     cv2.setRNGSeed(0)
     cv2.grabCut(smooth, padded, nowhere, *models, _NUM_ROUNDS, cv2.GC_INIT_WITH_MASK)
-    return np.isin(
-        padded[_PADDING_PX:-_PADDING_PX, _PADDING_PX:-_PADDING_PX], (cv2.GC_FGD, cv2.GC_PR_FGD)
+    found = _parts_with(
+        np.isin(
+            padded[_PADDING_PX:-_PADDING_PX, _PADDING_PX:-_PADDING_PX], (cv2.GC_FGD, cv2.GC_PR_FGD)
+        ),
+        core,
     )
-
-
-def _change(pictures: np.ndarray, median: np.ndarray) -> np.ndarray:
-    """Median deviation (h, w) float32 of each pixel from the median picture, grey levels."""
-    rows = np.array_split(np.arange(len(median)), 8)  # little memory at a time
-    parts = [np.abs(pictures[:, r].astype(np.int16) - median[r]).mean(axis=-1) for r in rows]
-    return np.concatenate([median_picture(part) for part in parts]).astype(np.float32)
+    plain = _enclosed(found)
+    found |= plain & ~_parts_with(plain, moves, least=0.5)
+    return (
+        _filtered_on_sphere(cv2.dilate, found, np.ones((3, 3), np.uint8), iterations=_DILATION_PX)
+        > 0
+    )
 
 
 def _shrunk(places: np.ndarray, pixels: int) -> np.ndarray:

@@ -24,26 +24,18 @@ from gsba.geometry import inverse
 from gsba.masks import _distractor_kernels
 from gsba.store.shards import StoredRecords
 from gsba.store.store import PerFrame
-from gsba.types import FrameSet, Landmarks, PictureFormat, Tracks
+from gsba.types import FrameSet, Landmarks, Tracks
 
 _WIDTH_PX = 512  # pixels across the panoramas that are compared
-_NUM_NEIGHBOURS = 6  # neighbours that each frame is compared with
 _MIN_WITNESSES = 3  # least number of neighbours that can mark a pixel
 _MIN_SHARED_POINTS = 30  # least number of shared points of a neighbour
-_NUM_DISTANCES = 18  # assumed distances
-_DISTANCE_MARGIN = 1.4  # factor beyond the nearest and furthest points around a direction
-_CELL_PX = 8  # pixels: the grid on which distances are bounded
 _REACH_CELLS = 3  # cells around a direction whose points bound its distance
 _EMPTY_CELL = np.float32(-1e9)  # value of a cell without points
 _PATCH_PX = 5  # pixels over which differences are averaged
 _MAX_DIFFERENCE = 60.0  # grey levels at which differences are clipped
 _WEAK_DIFFERENCE, _STRONG_DIFFERENCE = 5.0, 14.0  # grey levels: of all pixels of a distractor, and
 # of at least some of them
-_TYPICAL_DIFFERENCE = 1.0  # grey levels, median difference of good pictures
-_MAX_MEDIAN_DIFFERENCE = 5.0  # grey levels, median difference from which a frame cannot be judged
-_MIN_SPREADS = 2.0  # spreads of the neighbours by which a pixel must differ from their median
 _MIN_WIDTH_PX = 5  # pixels: narrower regions are edges
-_MIN_AREA_PX = 120  # strong pixels at the equator
 _CLOSING_PX = 13  # pixels: gaps up to this are closed
 _DILATION_PX = 5  # pixels added: the rim is blurred, and a splat shows any remainder
 _MAX_SHARE = 0.35  # share of a picture: more is a wrong pose, or changed light
@@ -98,18 +90,12 @@ class _StoredMasks:
 
 
 class StaticScene:
-    """A solved map, prepared to search frames one by one, from any thread.
+    """A solved map, prepared to search frames of any layout one by one, from any thread.
 
-    Small pictures are kept in memory up to a limit; the others are read again.
-
-    Args:
-        frames: of any layout; masked pixels are neither compared nor marked.
-        world_T_rigs: (F, 4, 4) solved poses.
-        landmarks: the solved points.
-        known: distractors (h, w) bool of a frame found before: they are not compared, and stay
-            marked where too few neighbours are left to judge.
-        limit_mb: limit of memory for pictures, MB.
-        neighbours: neighbours of frames to search, if other frames are left out.
+    Masked pixels are neither compared nor marked, nor are distractors (h, w) bool of a frame found
+    before, which stay marked where too few neighbours are left to judge. Small pictures are kept in
+    memory up to a limit in MB; the others are read again. neighbours: of frames to search, if other
+    frames are left out.
     """
 
     def __init__(
@@ -123,7 +109,10 @@ class StaticScene:
     ) -> None:
         self._frames, self._poses, self._landmarks = frames, world_T_rigs, landmarks
         self._limit_mb, self._known_neighbours = limit_mb, neighbours or {}
-        self.width = min(_width_of(kind) for kind in frames.formats)
+        self.width = min(
+            (min(_WIDTH_PX, kind.width) if kind.panoramic else panorama.width_for(kind, _WIDTH_PX))
+            for kind in frames.formats
+        )
         self._known, self._rays = known, _rays(self.width)
         self._room = int(limit_mb * 2**20 / (1.5 * self.width**2))
         self._kept: dict[int, np.ndarray] = {}
@@ -138,11 +127,8 @@ class StaticScene:
         return StaticScene, (*own, self._limit_mb, self._known_neighbours)
 
     def taken(self, chosen: Sequence[int]) -> tuple["StaticScene", dict[int, int]]:
-        """The part of the scene that some frames need, for other processes.
-
-        Returns:
-            The scene, and the index in it of each of its frames.
-        """
+        """The part of the scene that some frames need, for other processes, and the index in it of
+        each."""
         near = {frame: self._neighbours(frame) for frame in chosen}
         rows = np.unique(np.concatenate([np.array(chosen, np.int64), *near.values()]))
         number = {int(row): n for n, row in enumerate(rows)}
@@ -175,18 +161,49 @@ class StaticScene:
         usable = own[..., 0] >= 0
         others = np.stack([self._exposed(n, frame, own) for n in near])
         n_T_own = (inverse(self._poses[near]) @ self._poses[frame]).astype(np.float32)
-        lowest, highest = self._bounds(frame, near)
+        points = np.unique(np.concatenate([self._seen[f] for f in (frame, *near)]))
+        width = self.width // 8
+        pixels, distances = self._pixels(frame, points, width)
+        u, v = pixels.T
+        logs = -np.log(distances).astype(np.float32)
+        high = np.full((width // 2, width), _EMPTY_CELL, np.float32)
+        low = high.copy()  # of the negative, so that both are maxima
+        np.maximum.at(high, (v, u), logs)
+        np.maximum.at(low, (v, u), -logs)
+        high, low = _spread_out(high), _spread_out(low)
+        size = (self.width, self.width // 2)
+        margin = np.float32(np.log(1.4))  # beyond the nearest and furthest points
+        lowest, highest = -cv2.resize(low, size) - margin, cv2.resize(high, size) + margin
         middle = np.exp(0.5 * (lowest + highest)).astype(np.float32)
         seen = _distractor_kernels.witnesses(others[..., 0] >= 0, n_T_own, self._rays, middle)
         score = _score(own, others, n_T_own, self._rays, lowest, highest)
         unjudged = seen < min(_MIN_WITNESSES, len(near))
         score[unjudged | ~usable] = 0
-        noise = max(1.0, float(np.median(score)) / _TYPICAL_DIFFERENCE)
-        found = _decide(score, noise)
+        noise = max(1.0, float(np.median(score)))
+        wide = _wrapped(score)
+        weak = cv2.morphologyEx(
+            (wide > noise * _WEAK_DIFFERENCE).astype(np.uint8),
+            cv2.MORPH_OPEN,
+            np.ones((_MIN_WIDTH_PX, _MIN_WIDTH_PX), np.uint8),
+        )
+        num, parts = cv2.connectedComponents(weak, connectivity=4)
+        labels = np.asarray(parts, np.int32)
+        rows = (np.arange(len(wide)) + 0.5) / len(wide)
+        areas = np.broadcast_to(np.sin(np.pi * rows)[:, None], wide.shape)
+        strong = (weak > 0) & (wide > noise * _STRONG_DIFFERENCE)
+        sums = np.bincount(labels[strong], weights=areas[strong], minlength=num)
+        sums[0] = 0
+        found = (sums >= 120)[labels].astype(np.uint8)  # strong pixels at the equator
+        ellipse = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (_CLOSING_PX, _CLOSING_PX))
+        found = cv2.morphologyEx(found, cv2.MORPH_CLOSE, ellipse)
+        outlines, _ = cv2.findContours(found, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        cv2.drawContours(found, outlines, -1, 1, cv2.FILLED)
+        grown = cv2.dilate(found, np.ones((_DILATION_PX, _DILATION_PX), np.uint8))
+        found = _unwrapped(grown) > 0
         if self._known is not None:  # marked in the first pass, with no neighbour left to judge
             found |= self._known(frame) & unjudged
         found &= usable
-        if np.median(score) > _MAX_MEDIAN_DIFFERENCE or _share(found) > _MAX_SHARE:
+        if np.median(score) > 5.0 or _share(found) > _MAX_SHARE:  # grey levels
             return _packed(np.ones(shape), "fits no neighbour: its pose or light is off")
         return _packed(np.where(found, 0, 1 / (1 + (score / (noise * _WEAK_DIFFERENCE)) ** 2)), "")
 
@@ -198,7 +215,7 @@ class StaticScene:
         inside[self._seen[frame]] = True
         shared = np.array([np.count_nonzero(inside[seen]) for seen in self._seen])
         shared[frame] = 0
-        best = np.argsort(-shared, kind="stable")[:_NUM_NEIGHBOURS]
+        best = np.argsort(-shared, kind="stable")[:6]
         return best[shared[best] >= _MIN_SHARED_POINTS]
 
     def _picture(self, frame: int) -> np.ndarray:
@@ -240,27 +257,6 @@ class StaticScene:
         uv[:, 0] %= width
         uv[:, 1] = np.clip(uv[:, 1], 0, width // 2 - 1)
         return uv, np.maximum(np.linalg.norm(local, axis=1), 1e-9)
-
-    def _bounds(self, frame: int, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Logarithms (h, w) float32 of the least and largest inverse distance to assume."""
-        points = np.unique(np.concatenate([self._seen[f] for f in (frame, *near)]))
-        width = self.width // _CELL_PX
-        pixels, distances = self._pixels(frame, points, width)
-        u, v = pixels.T
-        logs = -np.log(distances).astype(np.float32)
-        high = np.full((width // 2, width), _EMPTY_CELL, np.float32)
-        low = high.copy()  # of the negative, so that both are maxima
-        np.maximum.at(high, (v, u), logs)
-        np.maximum.at(low, (v, u), -logs)
-        high, low = _spread_out(high), _spread_out(low)
-        size = (self.width, self.width // 2)
-        margin = np.float32(np.log(_DISTANCE_MARGIN))
-        return -cv2.resize(low, size) - margin, cv2.resize(high, size) + margin
-
-
-def _width_of(kind: PictureFormat) -> int:
-    """Pixels across small panoramas of a camera's frames."""
-    return min(_WIDTH_PX, kind.width) if kind.panoramic else panorama.width_for(kind, _WIDTH_PX)
 
 
 def _rays(width: int) -> np.ndarray:
@@ -319,7 +315,7 @@ def _score(
         np.full(shape, 2 * _MAX_DIFFERENCE, np.float32),
     )
     nearest, furthest = np.exp(highest), np.exp(lowest)
-    for step in np.linspace(0, 1, _NUM_DISTANCES, dtype=np.float32):  # even steps in the pictures
+    for step in np.linspace(0, 1, 18, dtype=np.float32):  # even steps in the pictures
         assumed = (1 - step) * nearest + step * furthest
         _distractor_kernels.compare(
             own, least, most, others, n_T_own, rays, assumed, np.float32(_MAX_DIFFERENCE),
@@ -329,32 +325,9 @@ def _score(
         _distractor_kernels.keep_best(
             smooth, _averaged(away), _averaged(spread), best, away_best, spread_best
         )
-    contradicted = 0.5 * (away_best - _MIN_SPREADS * spread_best)
+    # a pixel must differ from its neighbours' median by two of their spreads
+    contradicted = 0.5 * (away_best - 2.0 * spread_best)
     return np.maximum(best[0], np.minimum(best[1], contradicted))
-
-
-def _decide(score: np.ndarray, noise: float) -> np.ndarray:
-    """Distractors (h, w) bool: connected, not thin, and strong somewhere."""
-    wide = _wrapped(score)
-    weak = cv2.morphologyEx(
-        (wide > noise * _WEAK_DIFFERENCE).astype(np.uint8),
-        cv2.MORPH_OPEN,
-        np.ones((_MIN_WIDTH_PX, _MIN_WIDTH_PX), np.uint8),
-    )
-    num, parts = cv2.connectedComponents(weak, connectivity=4)
-    labels = np.asarray(parts, np.int32)
-    rows = (np.arange(len(wide)) + 0.5) / len(wide)
-    areas = np.broadcast_to(np.sin(np.pi * rows)[:, None], wide.shape)
-    strong = (weak > 0) & (wide > noise * _STRONG_DIFFERENCE)
-    sums = np.bincount(labels[strong], weights=areas[strong], minlength=num)
-    sums[0] = 0
-    found = (sums >= _MIN_AREA_PX)[labels].astype(np.uint8)
-    ellipse = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (_CLOSING_PX, _CLOSING_PX))
-    found = cv2.morphologyEx(found, cv2.MORPH_CLOSE, ellipse)
-    outlines, _ = cv2.findContours(found, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    cv2.drawContours(found, outlines, -1, 1, cv2.FILLED)
-    grown = cv2.dilate(found, np.ones((_DILATION_PX, _DILATION_PX), np.uint8))
-    return _unwrapped(grown) > 0
 
 
 def _packed(weights: np.ndarray, reason: str) -> Distractors:

@@ -57,16 +57,10 @@ class Choice:
 
 
 def choose(masks: Masks, segment: Segment | None = None) -> Choice:
-    """The sources of masks that `--masks` and `--segment` name.
-
-    Args:
-        masks: a file or a folder, "auto", "carrier", "distractors", or several of these; "none" or
-            None = no masks. "carrier" is "auto" that fails if the carrier cannot be detected.
-        segment: see `gsba.masks.segmentation`.
-
-    Raises:
-        GsbaError: two files or folders, or "none" with others.
-    """
+    """The sources of masks that `--masks` (a file or a folder, "auto", "carrier", "distractors", or
+    several of these; "none" or None = no masks) and `--segment` (see `gsba.masks.segmentation`)
+    name. "carrier" is "auto" that fails if the carrier cannot be detected. GsbaError: two files or
+    folders, or "none" with others."""
     values = [masks] if isinstance(masks, Path | str) else list(masks or ())
     words = {str(value) for value in values} & {AUTO, CARRIER, DISTRACTORS, NONE}
     files = [Path(value) for value in values if str(value) not in words]
@@ -85,10 +79,7 @@ def choose(masks: Masks, segment: Segment | None = None) -> Choice:
 
 def before(store: RunStore, frames: FrameSet, choice: Choice) -> FrameSet:
     """Frames with masks known before any solution: segmentation, black borders, the carrier.
-
-    Raises:
-        GsbaError: a segmentation fails; or the carrier is required and cannot be detected.
-    """
+    GsbaError: a segmentation fails; or the carrier is required and cannot be detected."""
     parts: list[Callable[[int], np.ndarray | None]] = []
     names = []
     if choice.segment is not None:
@@ -164,15 +155,9 @@ def _carriers(
 def after(
     store: RunStore, frames: FrameSet, solved: Solution, stage: str
 ) -> tuple[FrameSet, Counts]:
-    """Frames with masks of pixels that no static scene explains.
-
+    """Frames with masks of pixels that no static scene explains, by a first solution and its stage.
     Distractors are searched twice: the second pass does not compare pixels that the first one
-    marked in other frames.
-
-    Args:
-        solved: a first solution.
-        stage: its stage name.
-    """
+    marked in other frames."""
     items = dict.fromkeys(frames.names)
 
     def look(name: str, before: PerFrame[Distractors] | None) -> PerFrame[Distractors]:
@@ -189,7 +174,25 @@ def after(
     shares = np.array([one.share for one in results])
     check = store.root / "masks_check.jpg"
     if not (check.exists() and store.records["masks"].resumed):
-        _write_check(check, merged, shares)
+        rows = []
+        for row in np.sort(np.argsort(-shares, kind="stable")[:_NUM_CHECK_FRAMES]):
+            size = (_CHECK_WIDTH_PX, _CHECK_WIDTH_PX // 2)
+            if merged.format_of(int(row)).panoramic:
+                shown = cv2.resize(load_erp(merged, int(row), width=_CHECK_WIDTH_PX), size)
+            else:
+                shown = np.full((size[1], size[0], 3), 128, np.uint8)
+            mask = load_mask(merged, int(row))
+            assert mask is not None
+            out = _fit(mask, _CHECK_WIDTH_PX) == 0
+            shown[out] = (shown[out] * 0.5 + np.array([128, 0, 60])).astype(np.uint8)
+            outlines, _ = cv2.findContours(
+                out.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE
+            )
+            cv2.drawContours(shown, outlines, -1, (255, 80, 160), 1)
+            place = (6, size[1] - 8)
+            cv2.putText(shown, merged.names[row], place, cv2.FONT_HERSHEY_PLAIN, 1, (255, 255, 255))
+            rows.append(shown)
+        write_image(check, np.concatenate(rows), jpeg_quality=88)
     store.claim(check)
     reasons = [one.reason.partition(":")[0] for one in results if one.reason]
     for name, one in zip(frames.names, results, strict=True):
@@ -201,14 +204,8 @@ def after(
 
 
 def recut(store: RunStore, frames: FrameSet, cut: int) -> FrameSet:
-    """Raw pairs cut anew by a better calibration, with the carrier detected again.
-
-    Masks of anything else are kept.
-
-    Args:
-        frames: frames with masks of an earlier cut.
-        cut: number of this cut, from 1.
-    """
+    """Raw pairs, with masks of an earlier cut, cut anew by a better calibration, the `cut`-th from
+    1, with the carrier detected again. Masks of anything else are kept."""
     earlier = ["carrier.png", *(f"carrier{n}.png" for n in range(1, cut))]
     if not set(frames.mask_paths) <= {store.root / name for name in earlier}:
         return frames
@@ -289,24 +286,3 @@ def _fit(weights: np.ndarray, width: int) -> np.ndarray:
     size = (width, width // 2)
     values, inside = (cv2.resize(part, size) for part in (values, (values > 0).astype(np.float32)))
     return np.where(inside > 0.5, values / np.maximum(inside, 0.5), 0)
-
-
-def _write_check(path: Path, frames: FrameSet, shares: np.ndarray) -> None:
-    """Write a picture of the frames with most distractors, masked pixels tinted."""
-    rows = []
-    for f in np.sort(np.argsort(-shares, kind="stable")[:_NUM_CHECK_FRAMES]):
-        size = (_CHECK_WIDTH_PX, _CHECK_WIDTH_PX // 2)
-        if frames.format_of(int(f)).panoramic:
-            shown = cv2.resize(load_erp(frames, int(f), width=_CHECK_WIDTH_PX), size)
-        else:
-            shown = np.full((size[1], size[0], 3), 128, np.uint8)
-        mask = load_mask(frames, int(f))
-        assert mask is not None
-        out = _fit(mask, _CHECK_WIDTH_PX) == 0
-        shown[out] = (shown[out] * 0.5 + np.array([128, 0, 60])).astype(np.uint8)
-        outlines, _ = cv2.findContours(out.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-        cv2.drawContours(shown, outlines, -1, (255, 80, 160), 1)
-        place = (6, size[1] - 8)
-        cv2.putText(shown, frames.names[f], place, cv2.FONT_HERSHEY_PLAIN, 1, (255, 255, 255))
-        rows.append(shown)
-    write_image(path, np.concatenate(rows), jpeg_quality=88)

@@ -36,11 +36,11 @@ def panorama_pose(
     """Pose of a panorama with the most inliers; None if no pose has enough.
 
     Args:
-        bearings: (m, 3) unit, rig frame.
-        points_world: (m, 3) candidate point of each bearing; many may be wrong.
+        bearings, points_world: (m, 3) unit, rig frame, and candidate point of each; many may be
+            wrong.
         max_error_rad: of an inlier.
-        least: number of inliers that is enough.
-        min_ratio: least inlier ratio that the number of trials allows for.
+        least, min_ratio: number of inliers that is enough, and least ratio that the trials
+            allow for.
     """
     import pycolmap
 
@@ -62,12 +62,8 @@ def camera_pose(
     *,
     estimate_focal: bool = False,
 ) -> FoundPose | None:
-    """As `panorama_pose`, of pixels (m, 2), corner origin, of a camera.
-
-    Args:
-        camera: whose first parameter is the focal length.
-        estimate_focal: whether the focal length is estimated with the pose.
-    """
+    """As `panorama_pose`, of pixels (m, 2), corner origin, of a camera, whose first parameter is
+    the focal length, estimated with the pose if `estimate_focal`."""
     import pycolmap
 
     if len(pixels) < least:

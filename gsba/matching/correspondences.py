@@ -22,14 +22,10 @@ _REFINED_DEG, _REFINED_DIRECTION = (
     0.005,
 )  # gate of the solved map: rotation, tangent of direction
 _POINT_DEG = 0.6  # gate around a known point's predicted bearing
-_DRIFT = 0.003  # of the solved chain, relative to the path between two frames
 _ROTATION_GAPS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)  # gaps in frames between
 # matched pairs
 _MAX_JOIN_ERROR_RAD = np.deg2rad(4.0)  # largest error of a joined part's pose, as an angle at the
 # median depth
-_UNPREDICTED_RAD = np.deg2rad(60.0)  # radius of a search from which it is of all points
-_UNPREDICTED_NEIGHBOURS = 2  # frames that each frame is matched with then
-_ROTATION_RADIUS_DEG = 2.0  # radius of the search around a keypoint's rotated bearing
 
 
 def match_neighbours(context: MatchContext, start: Solution) -> VerifiedPairs:
@@ -85,9 +81,11 @@ def match_loops(context: MatchContext, solved: Solution) -> VerifiedPairs:
     chosen = pairs.closing(positions, depth, settings.pairs)
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     along = np.concatenate([[0], np.cumsum(steps)])
-    drifts = _DRIFT * (along[chosen[:, 1]] - along[chosen[:, 0]])
+    # relative to the path between two frames
+    drifts = 0.003 * (along[chosen[:, 1]] - along[chosen[:, 0]])
     radii = np.deg2rad(_LOOP_DEG) + 2 * drifts / max(depth, 1e-12)
-    few = pairs.thinned(chosen, radii > _UNPREDICTED_RAD, _UNPREDICTED_NEIGHBOURS)
+    # from 60 degrees on, a search is of all points: two frames suffice then
+    few = pairs.thinned(chosen, radii > np.deg2rad(60.0), 2)
     chosen, drifts = chosen[few], drifts[few]
     gates = [Gate.around_points(radius) for radius in radii[few]]
     known = solved.points_by_keypoint(keypoints)
@@ -101,11 +99,8 @@ def match_along_epipolars(
 ) -> Matches:
     """Match neighbours in time again, along the epipolar lines of poses that are nearly right.
 
-    Neighbours of different maps are left out: repeated structure along the epipolar lines of a
-    step that only the trajectory gives agrees on another length of it.
-
-    Args:
-        maps: (F,) int, map of each frame; -1 = a frame of none; None = there is one map.
+    Neighbours of different maps (F,), -1 = of none, are left out: repeated structure along the
+    epipolar lines of a step that only the trajectory gives agrees on another length of it.
     """
     poses, settings = solved.world_T_rigs, context.settings
     turn = np.deg2rad(settings.pairs.gate_factor * _REFINED_DEG)
@@ -126,14 +121,9 @@ def match_along_epipolars(
 def match_across(
     context: MatchContext, solved: Solution, parts: np.ndarray, met: np.ndarray
 ) -> VerifiedPairs:
-    """Match frames of joined map parts that are close in space, and verify them.
-
-    Known points are searched within the error of a join around their predicted bearing.
-
-    Args:
-        parts: (F,) each frame's part before the join.
-        met: (F,) bool, frames whose part was joined by images, not by the trajectory alone.
-    """
+    """Match frames of joined map parts (F,) that are close in space, and verify them; met: (F,)
+    bool, frames whose part was joined by images, not by the trajectory alone. Known points are
+    searched within the error of a join around their predicted bearing."""
     poses, depth = solved.world_T_rigs, solved.median_depth()
     chosen = np.concatenate(pairs.covisible(poses[:, :3, 3], depth, context.settings.pairs))
     chosen = chosen[(parts[chosen[:, 0]] != parts[chosen[:, 1]]) & met[chosen].all(axis=1)]
@@ -147,14 +137,9 @@ def match_across(
 
 
 def match_known_points(context: MatchContext, solved: Solution, loops_closed: bool) -> Matches:
-    """Match frames further apart, around the predicted bearings of known points only.
-
-    The prediction verifies the match: repeated structure elsewhere, such as the next column, is no
-    candidate.
-
-    Args:
-        loops_closed: True if frames far apart in time are predictable too.
-    """
+    """Match frames further apart, around the predicted bearings of known points only; frames far
+    apart in time are predictable where loops are closed. The prediction verifies the match:
+    repeated structure elsewhere, such as the next column, is no candidate."""
     poses, settings = solved.world_T_rigs, context.settings.pairs
     near, loops = pairs.covisible(poses[:, :3, 3], solved.median_depth(), settings)
     chosen = near[near[:, 1] - near[:, 0] > 2]
@@ -185,14 +170,9 @@ def verified(
     context: MatchContext,
     rivals: bool = False,
 ) -> VerifiedPairs:
-    """Matches that fit one relative pose of their pair, which agrees with the prior.
-
-    Args:
-        gates: gate of each pair (P,).
-        f0_T_f1s: (P, 4, 4) relative poses of the trajectory; None = no prior.
-        sigmas: (P,) standard deviations of their positions, map units; None = no prior.
-        rivals: see `verification.estimate_relative_poses`.
-    """
+    """Matches that fit one relative pose of their pair, which agrees with the prior: poses (P, 4,
+    4) of the trajectory, of position sigmas (P,), map units; None = no prior. Gates are of each
+    pair; for rivals see `verification.estimate_relative_poses`."""
     settings, seed = context.settings.verify, context.settings.seed
     chances = np.array([gate.chance(np.deg2rad(settings.max_error_deg)) for gate in gates])
     estimates = verification.estimate_relative_poses(
@@ -217,6 +197,6 @@ def match_for_rotations(context: MatchContext, world_T_rigs: np.ndarray) -> Matc
     pairs = np.array(chosen, np.int32).reshape(-1, 2)
     still = world_T_rigs.copy()
     still[:, :3, 3] = 0
-    gates = [Gate.around_points(np.deg2rad(_ROTATION_RADIUS_DEG))] * len(pairs)
+    gates = [Gate.around_points(np.deg2rad(2.0))] * len(pairs)
     directions = [context.keypoints.bearings_of(f) for f in range(num)]
     return context.match(pairs, still, gates, directions)

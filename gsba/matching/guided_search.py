@@ -28,7 +28,6 @@ from gsba.types import Features, Keypoints, Matches
 MAX_PARALLAX_RAD = np.deg2rad(60.0)  # between two rays of a point
 T = TypeVar("T")
 _CELLS_PER_SIDE = 8  # cells along a face's side
-_NO_MATCHES = np.zeros((0, 2), np.int32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,13 +92,10 @@ def principal_axes(descriptors: np.ndarray) -> np.ndarray:
 def searchable(
     features: Features, axes: np.ndarray | None = None, strongest: int | None = None
 ) -> Searchable:
-    """Sort features into cells; keypoints at one place (several orientations) become one.
-
-    Args:
-        axes: (D, D) orthonormal columns, equal for all frames; similarities do not depend on them,
-            but the search is fast if the first columns hold most of the descriptors' energy.
-        strongest: keypoints of a face to search among, None for all.
-    """
+    """Sort features into cells, the strongest of each face or all; keypoints at one place (several
+    orientations) become one. axes: (D, D) orthonormal columns, equal for all frames; similarities
+    do not depend on them, but the search is fast if the first columns hold most of the descriptors'
+    energy."""
     chosen = strongest_of(features, strongest)
     bearings = features.bearings_rig[chosen]
     cells = cells_of(bearings, _CELLS_PER_SIDE)
@@ -146,16 +142,11 @@ def match_pair(
     settings: MatchingSettings,
     points_f0: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Mutual, distinctive nearest neighbours within the gate.
+    """Mutual, distinctive nearest neighbours within the gate around f0_T_f1 (4, 4), whose
+    translation's length is unused: (m, 2) int32 keypoint indices in either frame, sorted, unique.
 
-    Args:
-        f0_T_f1: (4, 4) predicted pose of frame 1 in frame 0; its translation's length is unused.
-        gate: allowed deviation from the prediction.
-        points_f0: (K, 3) scene points of frame 0's keypoints in its rig frame, NaN where unknown.
-            Given, only keypoints with a point are matched, close to where it must appear.
-
-    Returns:
-        (m, 2) int32 keypoint indices in frame 0 and frame 1, sorted, unique.
+    points_f0: (K, 3) scene points of frame 0's keypoints in its rig frame, NaN where unknown.
+    Given, only keypoints with a point are matched, close to where it must appear.
     """
     rotation = f0_T_f1[:3, :3].astype(np.float32)
     direction, limits = _limits(f0_T_f1, gate, settings)
@@ -279,13 +270,9 @@ class _Once(Generic[T]):
 
 
 class SearchableFrames:
-    """Features of frames, prepared for matching; read on demand, the most recent ones are kept.
-
-    Args:
-        strongest: keypoints of a face to match, None for all.
-        capacity: frames kept in memory.
-        axes: axes of the descriptors, see `searchable`; None = those of frame 0.
-    """
+    """Features of frames, prepared for matching, the strongest of a face or all; read on demand,
+    the most recent ones, up to a capacity, are kept. For axes of descriptors see `searchable`; None
+    = those of frame 0."""
 
     def __init__(
         self,
@@ -406,7 +393,7 @@ def match(
     chosen = [gates[p] for p in order]
     geometry = pairs[order], places, f0_T_f1s[order], chosen
     job = _PairJob(*geometry, frames, settings, points_rig, matcher)
-    rows = [_NO_MATCHES] * len(pairs)
+    rows = [np.zeros((0, 2), np.int32)] * len(pairs)
     for p, matched in zip(order, workers.map_shards(job), strict=True):
         rows[p] = matched
     return Matches.of_rows(np.asarray(pairs, np.int32).reshape(-1, 2), rows)

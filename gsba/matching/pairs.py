@@ -7,7 +7,6 @@ import numpy as np
 from gsba.config import PairSettings
 
 _FRAME_GAPS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
-_SAME_PLACE_SHARE = 0.125  # part of the reach within which a position counts as the same place
 MAX_INTERVALS = 2.5  # largest interval between neighbours, in median intervals
 
 
@@ -18,12 +17,8 @@ def adjacent(num_frames: int, reach: int = 2) -> np.ndarray:
 
 
 def without_pause(timestamps: np.ndarray, max_intervals: float = MAX_INTERVALS) -> np.ndarray:
-    """Pairs (P, 2) int64 of neighbours in time without a pause between them.
-
-    Args:
-        timestamps: (F,) seconds.
-        max_intervals: largest interval that is no pause, in median intervals.
-    """
+    """Pairs (P, 2) int64 of neighbours in time, timestamps (F,) in seconds, without a pause between
+    them: an interval of more than so many median ones."""
     intervals = np.diff(timestamps)
     close = np.flatnonzero(intervals <= max_intervals * np.median(intervals))
     return np.column_stack([close, close + 1])
@@ -32,16 +27,12 @@ def without_pause(timestamps: np.ndarray, max_intervals: float = MAX_INTERVALS) 
 def covisible(
     rigs_in_world: np.ndarray, median_depth: float, settings: PairSettings
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs that should see the same things, in time and in space.
+    """Pairs that should see the same things: within a time window (P, 2) int32, and those that
+    close loops (L, 2) int32, each with f0 < f1, the closest in time or space first.
 
     Args:
         rigs_in_world: (F, 3) positions, map units.
         median_depth: median distance of scene points from the frames that see them.
-        settings: reach in depths, and how many neighbours in space.
-
-    Returns:
-        Pairs within a time window (P, 2) int32 and pairs that close loops (L, 2) int32, each with
-        f0 < f1, the closest in time or space first.
     """
     num = len(rigs_in_world)
     reach = settings.max_baseline_depths * median_depth
@@ -51,49 +42,31 @@ def covisible(
     ).reshape(-1, 2)
     lengths = np.linalg.norm(rigs_in_world[window[:, 0]] - rigs_in_world[window[:, 1]], axis=1)
     window = window[(lengths < reach) | (window[:, 1] - window[:, 0] <= 2)]
-
-    def far_in_time(f: int, near: np.ndarray, _distances: np.ndarray) -> np.ndarray:
-        return np.abs(near - f) > settings.window
-
-    return window, _nearest(rigs_in_world, reach, settings, far_in_time)
+    return window, _nearest(
+        rigs_in_world, reach, settings, lambda f, near, _: np.abs(near - f) > settings.window
+    )
 
 
 def across(
     rigs_in_world: np.ndarray, median_depth: float, settings: PairSettings, parts: np.ndarray
 ) -> np.ndarray:
-    """Pairs of frames of different parts that should see the same things.
-
-    Args:
-        rigs_in_world, median_depth, settings: as for `covisible`.
-        parts: (F,) part of each frame.
-
-    Returns:
-        Pairs (P, 2) int32, f0 < f1, the closest in space first.
-    """
+    """Pairs (P, 2) int32, f0 < f1, the closest in space first, of frames of different parts (F,)
+    that should see the same things; see `covisible`."""
     reach = settings.max_baseline_depths * median_depth
-
-    def of_others(f: int, near: np.ndarray, _distances: np.ndarray) -> np.ndarray:
-        return parts[near] != parts[f]
-
-    return _nearest(rigs_in_world, reach, settings, of_others)
+    return _nearest(rigs_in_world, reach, settings, lambda f, near, _: parts[near] != parts[f])
 
 
 def closing(rigs_in_world: np.ndarray, median_depth: float, settings: PairSettings) -> np.ndarray:
-    """Pairs that close loops while drift between far frames is unknown.
+    """Pairs (L, 2) int32, f0 < f1, the closest in space first, that close loops while drift between
+    far frames is unknown; see `covisible`.
 
     However often a place is revisited, each visit is paired with the previous and the next one
     only: drift is least between these, and they imply the others.
-
-    Args:
-        rigs_in_world, median_depth, settings: as for `covisible`.
-
-    Returns:
-        Pairs (L, 2) int32, f0 < f1, the closest in space first.
     """
 
     def next_visits(f: int, near: np.ndarray, distances: np.ndarray) -> np.ndarray:
         apart = np.abs(near - f) > settings.window
-        met = near[apart & (distances <= _SAME_PLACE_SHARE * reach)]
+        met = near[apart & (distances <= 0.125 * reach)]  # positions that count as the same place
         last = met[met < f].max(initial=0) - settings.window
         following = met[met > f].min(initial=len(rigs_in_world)) + settings.window
         return apart & (near >= last) & (near <= following)
@@ -103,13 +76,9 @@ def closing(rigs_in_world: np.ndarray, median_depth: float, settings: PairSettin
 
 
 def thinned(pairs: np.ndarray, unpredicted: np.ndarray, most: int) -> np.ndarray:
-    """True (P,) for pairs to match, of which many would show the same without any prediction.
-
-    Args:
-        pairs: (P, 2) frames, the most promising first.
-        unpredicted: (P,) bool, pairs whose geometry is not predicted; all others are kept.
-        most: of these, kept for each frame, and more where its partner has fewer.
-    """
+    """True (P,) for pairs (P, 2) to match, the most promising first, of which many would show the
+    same without any prediction: of those that are unpredicted (P,), `most` are kept for each frame,
+    and more where its partner has fewer."""
     kept, times = ~unpredicted, np.zeros(pairs.max(initial=-1) + 1, int)
     for p in np.flatnonzero(unpredicted):
         kept[p] = times[pairs[p]].min() < most
@@ -118,19 +87,13 @@ def thinned(pairs: np.ndarray, unpredicted: np.ndarray, most: int) -> np.ndarray
 
 
 def by_place(pairs: np.ndarray, num_frames: int) -> tuple[np.ndarray, np.ndarray]:
-    """An order of pairs in which each frame is needed for a short while only.
+    """An order (P,) of pairs (P, 2) in which each frame is needed for a short while only, and for
+    each pair in that order the number of the frame it is grouped with, ascending: below F where it
+    is that of a frame in time.
 
     Pairs of frames close in time come first, one frame after the other. For the others, frames are
     numbered so that those with a pair get numbers close to one another (Cuthill and McKee, 1969):
     all visits to a place are consecutive.
-
-    Args:
-        pairs: (P, 2) frame indices.
-        num_frames: F.
-
-    Returns:
-        The order (P,), and for each pair in that order the number of the frame it is grouped with,
-        ascending: below F where it is that of a frame in time.
     """
     from scipy.sparse import csr_matrix
     from scipy.sparse.csgraph import reverse_cuthill_mckee

@@ -28,20 +28,8 @@ from gsba.trajectory.steps import (
 )
 from gsba.types import CoarsePoses, Counts, Keypoints, Trajectory, VerifiedPairs
 
-_MAX_CLOCK_SHIFT_S = 10.0  # largest offset of clocks that is looked for
-# Largest deviation of a pair over two steps from these steps' geometry: true pairs deviate by less
-# than 1 degree, pairs of look-alike places by 10.
-_MAX_TRIPLET_DEG = 3.0
-_WIDER_GAPS = 2, 4, 8  # gaps in frames of additional pairs
-_MIN_LOST_SHARE = 0.2  # share of lost neighbours from which whole panoramas are compared
 _MIN_COMMON_POINTS = 5  # common points that suffice for the ratio of two steps' lengths
-_MAX_STEP_RATIO = 4.0  # largest ratio of consecutive steps; a repeated pattern exceeds it
 _FAR_STEP_DEPTHS = 0.5  # steps from which repeated structure may mislead, median depths
-_NUM_TRIED_STEPS = 24  # steps that show whether it does
-_MAX_MISLED_SHARE = 0.15  # largest share of steps not found with which matches are believed: at
-# most .08 in flats, .33 and more in most halls of bays
-_REMATCHING_GATE = Gate(np.deg2rad(1.5), 0.03, np.pi)  # around relative poses estimated from few
-# matches
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,14 +134,15 @@ def _misleads(context: MatchContext, guided: VerifiedPairs) -> bool:
             lengths.append(1 / float(np.nanmedian(np.append(depths, np.inf))))
     if not steps or np.quantile(lengths, 0.75) < _FAR_STEP_DEPTHS:
         return False
-    tried = np.unique(np.linspace(0, len(steps) - 1, _NUM_TRIED_STEPS).astype(int))
+    tried = np.unique(np.linspace(0, len(steps) - 1, 24).astype(int))
     known = guided.taken([steps[n] for n in tried.tolist()])
     found = match_anywhere(context, known.matches.pairs)
     true, seen = (image_steps(some, context.keypoints) for some in (known, found))
     off = step_errors(true.f_T_nexts, seen)[1]
     agreeing = seen.verified & (off < np.deg2rad(context.settings.verify.max_direction_deg))
     missed = np.count_nonzero(true.verified & ~agreeing)
-    return bool(missed > _MAX_MISLED_SHARE * len(tried))
+    # at most .08 in flats, .33 and more in most halls of bays
+    return bool(missed > 0.15 * len(tried))
 
 
 def _walked_on(
@@ -175,7 +164,7 @@ def _walked_on(
 
 def _with_wider_pairs(context: MatchContext, found: VerifiedPairs) -> VerifiedPairs:
     """Neighbours, and wider pairs over steps too short to tell translation from rotation."""
-    for gap in _WIDER_GAPS:
+    for gap in 2, 4, 8:  # frames
         steps = image_steps(found, context.keypoints)
         short = steps.verified & ~steps.directed
         if 2 * np.count_nonzero(short) <= np.count_nonzero(steps.verified):
@@ -220,13 +209,11 @@ def check_clock(
     """
     settings, chosen = context.settings, pairs.without_pause(timestamps)
     lost = guided.missing(chosen)
-    if len(lost) > _MIN_LOST_SHARE * len(chosen):
+    if len(lost) > 0.2 * len(chosen):  # from here on, whole panoramas are compared
         guided = VerifiedPairs.joined([guided, match_anywhere(context, lost)])
     steps = image_steps(guided, context.keypoints)
     misread.refuse_misread(coarse, steps, settings.verify)
-    estimate = clock.estimate_clock(
-        timestamps, steps, trajectory, coarse.time_offset, _MAX_CLOCK_SHIFT_S
-    )
+    estimate = clock.estimate_clock(timestamps, steps, trajectory, coarse.time_offset, 10.0)  # s
     rate = clock.other_rate(timestamps, steps, trajectory, estimate)
     if rate is not None:
         raise GsbaError(
@@ -286,7 +273,8 @@ def match_again(context: MatchContext, found: VerifiedPairs, steps: set[int]) ->
     for p in chosen:
         poses = np.tile(np.eye(4), (len(context.keypoints.starts) - 1, 1, 1))
         poses[found.matches.pairs[p, 1]] = found.f0_T_f1s[p]
-        pair, gates = found.matches.pairs[p : p + 1], [_REMATCHING_GATE]
+        # around relative poses estimated from few matches
+        pair, gates = found.matches.pairs[p : p + 1], [Gate(np.deg2rad(1.5), 0.03, np.pi)]
         matches = context.match(pair, poses, gates, guided_only=True)
         again = verified(matches, gates, None, None, context, rivals=True)
         if len(again.matches.pairs) and len(again.matches.of(0)) > len(found.matches.of(p)):
@@ -333,16 +321,13 @@ def _is_supported(
 
 
 def _with_consistent_scale(context: MatchContext, found: VerifiedPairs) -> VerifiedPairs:
-    """Neighbours without steps that are many times too short, by points common to two steps.
+    """Neighbours, found without a trajectory, without steps that are many times too short, by
+    points common to two steps.
 
     Where a floor's pattern is matched one tile further on, relative poses look right. One of the
     two steps is dropped there, and pairs over it: the map splits, and the test of joins may rejoin
     it. Steps that share too few points for a ratio of their lengths are first matched with all
     keypoints.
-
-    Args:
-        context: features and settings of a run without a trajectory.
-        found: neighbours.
     """
     open_at = _frames_of_open_ratio(context, found)[0]
     found = match_again(context, found, {step for f in open_at for step in (f - 1, f)})
@@ -366,7 +351,7 @@ def _frames_of_open_ratio(context: MatchContext, found: VerifiedPairs) -> tuple[
             continue
         if np.isinf(sigmas[f - 1]):
             unknown.add(f)
-        elif abs(logs[f - 1]) > np.log(_MAX_STEP_RATIO):
+        elif abs(logs[f - 1]) > np.log(4.0):  # a repeated pattern exceeds it
             extreme.add(f)
     return unknown | extreme, extreme
 
@@ -376,5 +361,6 @@ def _consistent(
 ) -> VerifiedPairs:
     """Pairs without those over two steps that repeated structure contradicts, see `off_steps`."""
     off = off_steps(found, steps)
-    false = off > np.deg2rad(_MAX_TRIPLET_DEG)
+    # true pairs deviate by less than 1 degree, pairs of look-alike places by 10
+    false = off > np.deg2rad(3.0)
     return found.taken(np.flatnonzero(~false).tolist()) if false.any() else found

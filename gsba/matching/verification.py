@@ -16,16 +16,10 @@ from gsba.trajectory.turning import CELLS_PER_SIDE, rotation_of_most
 from gsba.types import Counts, Keypoints, Matches, VerifiedPairs
 
 _SAMPLE_SIZE = 5  # size of a minimal sample
-_RIVAL_FREE_BAND = 3.0  # inlier thresholds around a pose's epipolar planes within which matches
-# support no rival
 _MODEL_SIGMA_RAD = np.deg2rad(0.15)  # noise of bearings assumed to have one centre: lenses are
 # centimetres apart
 _CHI_SQUARE_MEDIANS = 1.3863, 0.4549  # medians of chi-square distributions with two and with one
 # degree of freedom
-_LOG_MEDIAN_RATIO_SIGMA = 2.75  # standard deviation of the logarithm of the ratio of two such
-# sample medians, times the root of the sample's size
-_MIN_TRANSLATION_SIGMAS = 4.75  # threshold on that ratio: one rotation in a million passes for a
-# translation
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,13 +40,9 @@ def agree_with_prior(
     position_sigmas: np.ndarray | None,
     settings: TwoViewLimits,
 ) -> VerifiedPairs:
-    """Keep pairs that have one relative pose, which agrees with the prior.
-
-    Args:
-        prior_f0_T_f1s: (P, 4, 4) relative poses of the trajectory; None = no prior.
-        position_sigmas: (P,) standard deviation of the prior's relative position, map units; it
-            sets the tolerance of the direction.
-    """
+    """Keep pairs that have one relative pose, which agrees with the prior: poses (P, 4, 4) of the
+    trajectory, whose position sigmas (P,), map units, set the tolerance of the direction; None = no
+    prior."""
     kept, kept_poses = [], []
     dropped: dict[str, int] = {
         "too few matches": 0,
@@ -108,13 +98,9 @@ def estimate_relative_poses(
     chances: np.ndarray,
     rivals: bool = False,
 ) -> list[RelativePose | None]:
-    """`relative_pose` of every pair by LO-RANSAC, without any prior.
-
-    Args:
-        chances: (P,) probability that a false match that passed the gate agrees with a pose near
-            the predicted one; 0 = nothing was predicted.
-        rivals: True if rival poses are searched too.
-    """
+    """`relative_pose` of every pair by LO-RANSAC, without any prior; rival poses are searched too
+    if `rivals`. chances: (P,) probability that a false match that passed the gate agrees with a
+    pose near the predicted one; 0 = nothing was predicted."""
 
     def rays(p: int) -> tuple[np.ndarray, np.ndarray]:
         return keypoints.matched(matches.pairs[p], matches.of(p))
@@ -159,12 +145,8 @@ def relative_pose(
     chance: float = 0.0,
     rivals: bool = False,
 ) -> RelativePose | None:
-    """The relative pose with the most inliers, or None if chance explains as many.
-
-    Args:
-        bearings0, bearings1: (m, 3) unit, rays of the matches in each frame.
-        chance, rivals: see `estimate_relative_poses`.
-    """
+    """The relative pose with the most inliers, or None if chance explains as many, of unit rays (m,
+    3) of the matches in each frame; chance, rivals: see `estimate_relative_poses`."""
     found = _significant_pose(bearings0, bearings1, settings, seed, chance)
     if found is None:
         return None
@@ -242,7 +224,8 @@ def _is_rivalled(
     A false pose from repeated structure has the true one as its rival, and vice versa.
     """
     sines = np.sum(_normals(f0_T_f1, bearings0) * (bearings1 @ f0_T_f1[:3, :3].T), axis=1)
-    rest = np.abs(sines) > np.sin(_RIVAL_FREE_BAND * np.deg2rad(settings.max_error_deg))
+    # matches within 3 thresholds of the pose's epipolar planes support no rival
+    rest = np.abs(sines) > np.sin(3.0 * np.deg2rad(settings.max_error_deg))
     rival = _significant_pose(bearings0[rest], bearings1[rest], settings, seed)
     if rival is None:
         return False
@@ -264,7 +247,10 @@ def _direction_sigma(f0_T_f1: np.ndarray, bearings0: np.ndarray, bearings1: np.n
     noise = np.median(across**2) / _CHI_SQUARE_MEDIANS[1]
     noise, left = noise + _MODEL_SIGMA_RAD**2, left + _MODEL_SIGMA_RAD**2
     num = witnesses(bearings0, CELLS_PER_SIDE)
-    if np.log(left / noise) < _MIN_TRANSLATION_SIGMAS * _LOG_MEDIAN_RATIO_SIGMA / np.sqrt(num):
+    # one rotation in a million passes for a translation
+    # 2.75: standard deviation of the log ratio of two such medians, times the root of the sample's
+    # size
+    if np.log(left / noise) < 4.75 * 2.75 / np.sqrt(num):
         return np.inf
     return _direction_error(f0_T_f1, bearings0, bearings1) * np.sqrt(noise * len(bearings0) / num)
 

@@ -4,9 +4,8 @@ Takes small panoramas in time order.
 Gives a pose for every frame, and a selection of frames to refine.
 """
 
-from gsba.odometry.frame_choice import choose_frames
 from gsba.odometry.panoramas import masked, of_frames, of_video, without_carrier
-from gsba.odometry.walk import Odometry, track_panoramas
+from gsba.odometry.walk import Odometry, choose_frames, track_panoramas
 
 __all__ = [
     "Odometry",

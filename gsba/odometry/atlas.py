@@ -19,7 +19,6 @@ _COLUMNS = 3  # faces side by side
 _PAD = 2  # pixels beyond seam and poles for interpolation
 _MAX_CUT_ERROR = np.deg2rad(6.0)  # largest rotation of a cut's axes against the world: maps are
 # computed anew beyond it
-_SAME_CUT = 1e-9  # largest angle, radians, between axes that count as equal
 # Minimax polynomial of arctan(t) / t in t^2 on [0, 1] (Chebyshev nodes): error 7e-7 at most.
 _A0, _A1, _A2, _A3, _A4, _A5, _A6 = (
     np.float32(a)
@@ -113,16 +112,12 @@ class Cutter:
         self.cut_R_rig = cut_R_rig  # axes of the last cut
 
     def cut(self, grey: np.ndarray, world_R_rig: np.ndarray, exactly: bool = False) -> Atlas:
-        """The atlas of a panorama (h, 2h) uint8 whose orientation is roughly known.
-
-        Args:
-            world_R_rig: (3, 3) predicted orientation.
-            exactly: cut along these axes, not along others near them.
-        """
+        """The atlas of a panorama (h, 2h) uint8 whose orientation (3, 3) is roughly known; exactly:
+        cut along these axes, not along others near them."""
         off = np.inf
         if self.cut_R_rig is not None:
             off = float(rotation_angle(self.cut_R_rig.T @ world_R_rig))
-        if off > (_SAME_CUT if exactly else _MAX_CUT_ERROR):
+        if off > (1e-9 if exactly else _MAX_CUT_ERROR):
             self.cut_R_rig, self._maps = world_R_rig.copy(), None
         assert self.cut_R_rig is not None
         if self._maps is None or self._height != len(grey):
@@ -136,11 +131,6 @@ class Cutter:
         first, second = self._maps
         image = cv2.remap(around_sphere(grey, _PAD), first, second, cv2.INTER_LINEAR)
         return Atlas(image, self.cut_R_rig)
-
-
-def shared_faces(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Face (N,) that best shows a feature with two bearings (N, 3), axes of the cut."""
-    return owner_faces(unit(one + other)).astype(np.int64)
 
 
 @_part
@@ -170,7 +160,6 @@ def _erp_pixels(xs, ys, zs, cut_R_rig, height, across, down):
         down[i] = half * height + per_radian * _arctangent(b, np.sqrt(a * a + c * c)) - half
 
 
-_MAX_RETURN_ERROR_PX = 0.6  # largest error of a feature followed forth and back
 _MAX_DIFFERENCE = 25.0  # largest mean difference of both patches, grey values
 
 
@@ -181,22 +170,17 @@ def follow(
     bearings_template: np.ndarray,
     predicted: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Bearings of one frame's features in another frame.
-
-    Each is followed, forth and back, on the face that best shows both bearings.
+    """Bearings (N, 3) of features in a frame's rig frame, and (N,) bool, True for found ones. Each
+    is followed, forth and back, on the face that best shows both bearings.
 
     Args:
-        layout: of both atlases.
         template, frame: cut along nearly the same axes of the world.
-        bearings_template: (N, 3) features in the template's rig frame.
-        predicted: (N, 3) unit, predicted bearings in the frame's rig frame.
-
-    Returns:
-        bearings (N, 3) in the frame's rig frame, and (N,) bool, True for found features.
+        bearings_template, predicted: (N, 3) unit, in the template's rig frame, and predicted in
+            the frame's.
     """
     before = bearings_template @ template.cut_R_rig.T
     guess = predicted @ frame.cut_R_rig.T
-    faces = shared_faces(before, guess)
+    faces = owner_faces(unit(before + guess)).astype(np.int64)
     starts, ends = layout.pixels(before, faces), layout.pixels(guess, faces)
     margin = WINDOW / 2 + 1
     rows = np.flatnonzero(layout.inside(starts, faces, margin) & layout.inside(ends, faces, margin))
@@ -208,7 +192,7 @@ def follow(
     expected = starts[rows] + there - ends[rows]  # as far off as the guess was
     back, home, _ = align_patches(frame.pyramid, template.pyramid, there, expected, 1)
     off = np.linalg.norm(back - starts[rows], axis=1)
-    good = forth & home & (off < _MAX_RETURN_ERROR_PX) & (difference < _MAX_DIFFERENCE)
+    good = forth & home & (off < 0.6) & (difference < _MAX_DIFFERENCE)  # pixels
     good &= layout.inside(there, faces[rows], margin)
     rows, there = rows[good], there[good]
     found[rows] = True
@@ -221,21 +205,19 @@ _BLOCK = 5  # pixels across the patch of which gradients are summed
 _APART_PX = 5  # least distance between features
 _MIN_EIGENVALUE = 3e-5  # least eigenvalue of a patch's gradients, in OpenCV's normalisation: less
 # is noise
-_NOISES = 4.0  # least response of a corner, in median responses of a picture's flattest quarter
 
 
 def new_corners(
     layout: AtlasLayout, atlas: Atlas, usable: np.ndarray | None, known: np.ndarray
 ) -> np.ndarray:
-    """Bearings (N, 3), rig frame, of corners in cells with too few features.
-
-    Args:
-        usable: (2 s, 3 s) bool, pixels of the scene; None = all.
-        known: (M, 3) bearings, rig frame, of features followed so far.
-    """
+    """Bearings (N, 3), rig frame, of corners in cells with too few features, known so far at (M,
+    3); usable: (2 s, 3 s) bool, pixels of the scene, None = all."""
     response = cv2.cornerMinEigenVal(atlas.image, _BLOCK)
     allowed = layout.owned if usable is None else layout.owned & usable
-    floor = max(_MIN_EIGENVALUE, _NOISES * _flat(response, allowed))
+    # median response of the flattest quarter of a picture: that of noise, if walls are bare
+    some = response[::4, ::4][allowed[::4, ::4]]
+    flat = float(np.quantile(some, 0.125)) if len(some) else 0.0
+    floor = max(_MIN_EIGENVALUE, 4.0 * flat)
     peaks = (response == cv2.dilate(response, np.ones((5, 5)))) & (response > floor) & allowed
     taken = np.zeros(6 * _PER_SIDE**2, int)
     if len(known):
@@ -256,12 +238,6 @@ def new_corners(
     kept = np.flatnonzero(rank < room[cells])  # features in a cell, including followed ones
     kept = kept[_apart(np.stack([u, v], axis=1)[kept])]
     return bearings[kept] @ atlas.cut_R_rig
-
-
-def _flat(response: np.ndarray, allowed: np.ndarray) -> float:
-    """Median response of the flattest quarter of a picture: that of noise, if walls are bare."""
-    some = response[::4, ::4][allowed[::4, ::4]]
-    return float(np.quantile(some, 0.125)) if len(some) else 0.0
 
 
 def _block(peaks: np.ndarray, layout: AtlasLayout, along: np.ndarray) -> None:

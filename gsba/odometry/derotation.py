@@ -9,12 +9,9 @@ import numpy as np
 from gsba.camera.sphere import around_sphere, bearings_from_erp, erp_from_bearings, table
 
 _WIDTH = 128  # pixels across the panoramas that are compared
-_BLUR = 1.2, 8.0  # pixels, standard deviations: band of detail that is compared
 _STEPS = 15
 _PAD = 2  # pixels beyond seam and poles for interpolation
 _CONVERGED = np.deg2rad(0.05)
-_MAX_STEP = np.deg2rad(15.0)
-_ROWS = (0.25, 0.75)  # band of rows that are correlated, parts of the height
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +28,7 @@ def miniature(grey: np.ndarray, usable: np.ndarray | None = None) -> Miniature:
     size = (_WIDTH, _WIDTH // 2)
     small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA).astype(np.float32)
     wide = np.concatenate([small[:, -32:], small, small[:, :32]], axis=1)
-    fine, coarse = (cv2.GaussianBlur(wide, (0, 0), sigma)[:, 32:-32] for sigma in _BLUR)
+    fine, coarse = (cv2.GaussianBlur(wide, (0, 0), sigma)[:, 32:-32] for sigma in (1.2, 8.0))
     detail = fine - coarse
     heights = (np.arange(len(small)) + 0.5) / len(small)
     weights = np.repeat(np.sin(np.pi * heights)[:, None], _WIDTH, axis=1).astype(np.float32)
@@ -43,14 +40,11 @@ def miniature(grey: np.ndarray, usable: np.ndarray | None = None) -> Miniature:
 
 
 def turned(one: Miniature, other: Miniature, guesses: list[np.ndarray]) -> np.ndarray:
-    """one_R_other (3, 3) that best aligns the two panoramas.
-
-    Args:
-        one, other: miniatures of frames at nearby positions.
-        guesses: initial rotations, besides the best rotation about the vertical axis.
-    """
+    """one_R_other (3, 3) that best aligns the two panoramas, of nearby positions, from guesses and
+    from the best rotation about the vertical axis."""
     best, least = np.eye(3), np.inf
-    rows = slice(*(round(part * len(one.detail)) for part in _ROWS))
+    # the middle half of the rows is correlated
+    rows = slice(*(round(part * len(one.detail)) for part in (0.25, 0.75)))
     spectra = [np.fft.rfft(m.detail[rows] * (m.weights[rows] > 0), axis=1) for m in (one, other)]
     correlation = np.fft.irfft(spectra[0] * np.conj(spectra[1]), axis=1).sum(axis=0)
     angle = 2 * np.pi * int(np.argmax(correlation)) / _WIDTH
@@ -68,7 +62,17 @@ def _aligned(one: Miniature, other: Miniature, start: np.ndarray) -> tuple[np.nd
 
     rays, rotation, cost = _rays(), start, np.inf
     weights = one.weights.ravel()
-    jacobian = _jacobian(one.detail)
+    per_radian = _WIDTH / (2 * np.pi)
+    by_u = 0.5 * (np.roll(one.detail, -1, axis=1) - np.roll(one.detail, 1, axis=1)) * per_radian
+    by_v = np.gradient(one.detail, axis=0) * per_radian
+    x, y, z = rays.T
+    level = np.maximum(np.hypot(x, z), 0.05)
+    # Rotating a ray r about w moves it by w x r: longitude and elevation angles follow.
+    by_longitude, by_height = by_u.ravel(), by_v.ravel()
+    east = np.stack([z, np.zeros_like(x), -x], axis=1) / level[:, None]
+    down = np.stack([-x * y, level**2, -z * y], axis=1) / level[:, None]
+    gradient = by_longitude[:, None] / level[:, None] * east + by_height[:, None] * down
+    jacobian = np.cross(rays, gradient)
     for _ in range(_STEPS):
         # The other picture, rotated by the estimate, is compared at the rays of the first.
         places = erp_from_bearings(rays @ rotation, _WIDTH, _WIDTH // 2) - 0.5
@@ -81,7 +85,7 @@ def _aligned(one: Miniature, other: Miniature, start: np.ndarray) -> tuple[np.nd
         weighted = jacobian * robust[:, None]
         normal = weighted.T @ jacobian + 1e-6 * np.eye(3)
         step = np.linalg.solve(normal, weighted.T @ residuals)
-        step *= min(1.0, _MAX_STEP / max(float(np.linalg.norm(step)), 1e-12))
+        step *= min(1.0, np.deg2rad(15.0) / max(float(np.linalg.norm(step)), 1e-12))
         rotation = Rotation.from_rotvec(step).as_matrix() @ rotation
         if np.linalg.norm(step) < _CONVERGED:
             break
@@ -102,19 +106,3 @@ def _rays() -> np.ndarray:
     rays = bearings_from_erp(np.stack([u, v], axis=-1), _WIDTH, _WIDTH // 2).reshape(-1, 3)
     rays.setflags(write=False)
     return rays
-
-
-def _jacobian(detail: np.ndarray) -> np.ndarray:
-    """Derivative (64 * 128, 3) of the detail at each ray by a rotation of the ray."""
-    per_radian = _WIDTH / (2 * np.pi)
-    by_u = 0.5 * (np.roll(detail, -1, axis=1) - np.roll(detail, 1, axis=1)) * per_radian
-    by_v = np.gradient(detail, axis=0) * per_radian
-    x, y, z = _rays().T
-    level = np.maximum(np.hypot(x, z), 0.05)
-    # Rotating a ray r about w moves it by w x r: longitude and elevation angles follow.
-    by_longitude, by_height = by_u.ravel(), by_v.ravel()
-    east = np.stack([z, np.zeros_like(x), -x], axis=1) / level[:, None]
-    down = np.stack([-x * y, level**2, -z * y], axis=1) / level[:, None]
-    rays = _rays()
-    gradient = by_longitude[:, None] / level[:, None] * east + by_height[:, None] * down
-    return np.cross(rays, gradient)

@@ -33,16 +33,14 @@ def align_patches(
     guesses: np.ndarray,
     levels: int,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where patches of one picture are in another.
+    """Pixels (N, 2) of one picture's patches in another, which (N,) bool were aligned, and the mean
+    difference (N,) of both patches, grey values.
 
     Args:
         template, picture: see `pyramid`, of one size.
-        starts, guesses: (N, 2) OpenCV pixels of patches in `template`, and where they are expected.
+        starts, guesses: (N, 2) OpenCV pixels of patches in `template`, and where they are
+            expected.
         levels: halvings to begin at, at most `LEVELS`.
-
-    Returns:
-        pixels (N, 2), which (N,) bool were aligned, and the mean difference (N,) of both patches,
-        grey values.
     """
     starts, ends = np.asarray(starts, float), np.array(guesses, float)
     aligned, difference = np.zeros(len(starts), bool), np.zeros(len(starts))

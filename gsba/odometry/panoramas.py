@@ -24,7 +24,6 @@ from gsba.masks.carrier import PICTURE_WIDTH, find_fixed_carrier
 from gsba.types import FrameSet
 from gsba.video.recording import (
     EXACT_S,
-    Picture,
     Recording,
     factory_calibration_of,
     read_recording,
@@ -33,7 +32,6 @@ from gsba.video.recording import (
 
 logger = logging.getLogger(__name__)
 
-_LOOKS = 8  # frames of a raw recording from which its lenses are initialised
 _CARRIER_LOOKS = 20  # frames in which the carrier is detected
 _LEAST = 3  # least number of frames of a sequence
 
@@ -54,15 +52,8 @@ class SmallPanoramas:
 
 
 def of_frames(frames: FrameSet, source: Path, width: int) -> SmallPanoramas:
-    """Panoramas of a folder.
-
-    Args:
-        frames: panoramas or raw pairs; pixels masked in all of them are masked.
-        width: pixels across; less if the frames are smaller.
-
-    Raises:
-        GsbaError: cube faces.
-    """
+    """Panoramas of a folder of panoramas or raw pairs, `width` pixels across, less if the frames
+    are smaller; pixels masked in all frames are masked. GsbaError: cube faces."""
     if not frames.format.panoramic:
         raise GsbaError(f"{source}: holds cube faces; odometry follows panoramas or raw fisheyes")
     width = min(width, frames.format.width)
@@ -94,13 +85,9 @@ def of_video(
     from_s: float | None = None,
     to_s: float | None = None,
 ) -> SmallPanoramas:
-    """Panoramas of a video: stitched, or raw and joined by its lenses' calibration.
-
-    Args:
-        width: pixels across; less if the video is smaller.
-        calibration: calibration file of a raw recording; None = from image circles or the maker's
-            file.
-        from_s, to_s: seconds since its first frame, the part that is read; None = all.
+    """Panoramas of a video: stitched, or raw and joined by its lenses' calibration file, None =
+    from image circles or the maker's file. They are `width` pixels across, less if the video is
+    smaller, from `from_s` to `to_s` seconds since its first frame; None = all.
 
     Raises:
         GsbaError: no such video, fewer than three frames, or a raw one without image circles.
@@ -126,7 +113,10 @@ def of_video(
     def read(chosen: Sequence[int], colour: bool) -> Iterator[tuple[int, np.ndarray]]:
         number = {int(rows[row]): int(row) for row in chosen}
         for index, pictures in shots(recording, [int(rows[row]) for row in chosen]):
-            planes = [_pixels(picture, colour) for picture in pictures]
+            planes = [
+                np.ascontiguousarray(picture.bgr()[..., ::-1]) if colour else picture.luma()
+                for picture in pictures
+            ]
             if recording.cube:
                 whole = panorama_of(squares((planes[0], planes[1])), width)
             else:
@@ -137,10 +127,8 @@ def of_video(
 
 
 def without_carrier(panoramas: SmallPanoramas) -> SmallPanoramas:
-    """The panoramas with the carrier masked, if it keeps its place in the pictures.
-
-    If it cannot be detected, a line in the log says so and nothing is masked.
-    """
+    """The panoramas with the carrier masked, if it keeps its place in the pictures; else nothing is
+    masked, and a line in the log says so."""
     rows = np.unique(np.linspace(0, len(panoramas) - 1, _CARRIER_LOOKS).astype(int)).tolist()
     size = (PICTURE_WIDTH, PICTURE_WIDTH // 2)
     pictures = [cv2.resize(picture, size) for _, picture in panoramas.read(rows, True)]
@@ -154,11 +142,8 @@ def without_carrier(panoramas: SmallPanoramas) -> SmallPanoramas:
 
 
 def masked(panoramas: SmallPanoramas, mask: Path) -> SmallPanoramas:
-    """The panoramas, masked by a 2:1 picture for all frames, white = use.
-
-    Raises:
-        GsbaError: the mask cannot be read, or is not 2:1.
-    """
+    """The panoramas, masked by a 2:1 picture for all frames, white = use. GsbaError: the mask
+    cannot be read, or is not 2:1."""
     levels = cv2.imread(str(mask), cv2.IMREAD_GRAYSCALE)
     if levels is None:
         raise GsbaError(f"{mask}: cannot be read as a picture; give a 2:1 mask, white = use")
@@ -175,13 +160,9 @@ def _narrowed(panoramas: SmallPanoramas, usable: np.ndarray) -> SmallPanoramas:
     return replace(panoramas, usable=fitted if before is None else fitted & before)
 
 
-def _pixels(picture: Picture, colour: bool) -> np.ndarray:
-    return np.ascontiguousarray(picture.bgr()[..., ::-1]) if colour else picture.luma()
-
-
 def _lenses(recording: Recording, rows: np.ndarray, calibration: Path | None) -> Rig:
     """Initial lenses of a raw recording, from a few of its frames."""
-    looks = np.unique(np.linspace(0, len(rows) - 1, _LOOKS).astype(int))
+    looks = np.unique(np.linspace(0, len(rows) - 1, 8).astype(int))
     size = (recording.width, recording.width)
     with TemporaryDirectory(prefix="gsba-") as name:
         pairs = []

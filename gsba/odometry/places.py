@@ -20,13 +20,10 @@ from gsba.types import Features, Solution
 
 _JPEG_QUALITY = 90
 _HFOV = np.deg2rad(94.0)  # of faces: keypoints near a border are described by pixels beyond it
-_STEP = 0.12  # least distance of consecutive places, in median distances of points
-_MAX_PER_FACE = 150  # keypoints
 _STRONGEST_PER_FACE = 100  # strongest of these, compared without any prediction
 _SETTINGS = RefineSettings(
     pairs=PairSettings(strongest_per_face=_STRONGEST_PER_FACE, far_drift=0.03)
 )
-_MAX_ERROR_SIGMAS = 6.0  # largest residual of an observation
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,18 +53,13 @@ def compressed(grey: np.ndarray) -> np.ndarray:
 def chosen_keyframes(
     world_T_rigs: np.ndarray, maps: np.ndarray, distances: np.ndarray
 ) -> np.ndarray:
-    """Numbers (P,) of keyframes at least a step from the one selected before.
-
-    Args:
-        world_T_rigs: (K, 4, 4) poses of all keyframes.
-        maps: (K,) map of each, -1 = a map without points.
-        distances: (K,) median distance of their points, map units.
-    """
+    """Numbers (P,) of keyframes at least a step from the one selected before, of poses (K, 4, 4),
+    maps (K,), -1 = a map without points, and median distances (K,) of points, map units."""
     chosen: list[int] = []
     for k in np.flatnonzero(maps >= 0).tolist():
         if chosen and maps[chosen[-1]] == maps[k]:
             moved = world_T_rigs[k, :3, 3] - world_T_rigs[chosen[-1], :3, 3]
-            if np.linalg.norm(moved) < _STEP * distances[k]:
+            if np.linalg.norm(moved) < 0.12 * distances[k]:
                 continue
         chosen.append(k)
     return np.array(chosen, np.int64)
@@ -76,17 +68,12 @@ def chosen_keyframes(
 def described(
     pictures: Sequence[np.ndarray], width: int, usable: np.ndarray | None
 ) -> list[Features]:
-    """Keypoints of keyframes.
-
-    Args:
-        pictures: panoramas, see `compressed`.
-        width: pixels across them.
-        usable: (h, 2h) bool, pixels of the scene; None = all.
-    """
+    """Keypoints of keyframes' panoramas, see `compressed`, `width` pixels across; usable: (h, 2h)
+    bool, pixels of the scene, None = all."""
     size = round(width / np.pi * np.tan(_HFOV / 2))
     rig = CubeRig(size, _HFOV)
     layout = AtlasLayout(rig)
-    cutter, extractor = Cutter(layout), SiftExtractor(FeatureSettings(max_per_face=_MAX_PER_FACE))
+    cutter, extractor = Cutter(layout), SiftExtractor(FeatureSettings(max_per_face=150))
 
     def faces(grey: np.ndarray) -> np.ndarray:
         atlas = cutter.cut(grey, np.eye(3)).image.reshape(2, size, 3, size)
@@ -109,13 +96,9 @@ def make_places(
     seed: int,
     workers: Workers,
 ) -> KeyframePlaces:
-    """Match each place with its neighbours, along the poses, and triangulate common points.
-
-    Args:
-        keyframes, maps: (P,) keyframe number and map of each place.
-        world_T_rigs: (P, 4, 4) poses, each in the world of its map.
-        features: (P) see `described`.
-    """
+    """Match each place with its neighbours, along poses (P, 4, 4), each in the world of its map,
+    and triangulate common points; keyframes and maps (P,) are their numbers, for features see
+    `described`."""
     context = MatchContext(
         SearchableFrames(features.__getitem__),
         SearchableFrames(features.__getitem__, _STRONGEST_PER_FACE),
@@ -129,5 +112,5 @@ def make_places(
     found, keypoints = found.taken(np.flatnonzero(same)), context.keypoints
     tracks = build([found], np.diff(keypoints.starts))
     settings = context.settings.triangulate
-    landmarks = place(tracks, keypoints, world_T_rigs, _MAX_ERROR_SIGMAS, settings)
+    landmarks = place(tracks, keypoints, world_T_rigs, 6.0, settings)
     return KeyframePlaces(keyframes, maps, features, replace(start, landmarks=landmarks), context)

@@ -17,11 +17,6 @@ from gsba.odometry.window import WindowObservations
 from gsba.similarity import Sim3
 
 _HELD = 1e-5  # standard deviation of the fixed first keyframe of a map, all parts of its tangent
-_HELD_LOG_DISTANCE = 1e-5  # of the distance to the furthest keyframe, in the gauge of covariances
-_FREE_LOG_SCALE = 1.0  # of the first keyframe's scale in that gauge
-_POSE_ROTATION = 0.007  # standard deviations of each frame's own errors: radians, and units of the
-_ERROR_RATE = 1e-9  # probability of rejecting a true loop, low because drift is partly systematic
-# while covariances are of random errors
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,14 +42,11 @@ class ClosedGraph:
 def close_loops(
     world_T_keys: np.ndarray, steps: Sequence[Constraint], loops: Sequence[Constraint]
 ) -> ClosedGraph:
-    """Deform the path so that its loops close, without loops that contradict its steps.
+    """Deform the path (K, 4, 4) of one map, its first pose fixed, so that its loops close, without
+    loops that contradict its steps, which lead to all keyframes but the first.
 
     Loops are added one after another, those of the shortest time first: drift is least there. A
     loop is rejected if closing it costs more than the noise of the steps explains.
-
-    Args:
-        world_T_keys: (K, 4, 4) poses of one map; the first is fixed.
-        steps: steps to all keyframes but the first.
     """
     from scipy.stats import chi2
 
@@ -65,7 +57,9 @@ def close_loops(
     graph.add(gtsam.PriorFactorSimilarity3(X(0), values.atSimilarity3(X(0)), held))
     for one in steps:
         graph.add(factor_of(one))
-    kept, cost, most = np.zeros(len(loops), bool), graph.error(values), chi2.isf(_ERROR_RATE, 7)
+    # 1e-9: probability of rejecting a true loop, low because drift is partly systematic while
+    # covariances are of random errors
+    kept, cost, most = np.zeros(len(loops), bool), graph.error(values), chi2.isf(1e-9, 7)
     for n in np.argsort([one.second - one.first for one in loops], kind="stable"):
         tried = gtsam.NonlinearFactorGraph(graph)
         tried.add(factor_of(loops[n]))
@@ -95,14 +89,10 @@ def similarity3(similarity: Sim3) -> gtsam.Similarity3:
 def covariances_of(
     world_T_keys: np.ndarray, scales: np.ndarray, constraints: Sequence[Constraint]
 ) -> np.ndarray:
-    """Marginal covariances (K, 6, 6) of poses, tangent [rotation, translation], map units.
+    """Marginal covariances (K, 6, 6) of the poses of one map, tangent [rotation, translation], map
+    units, by steps and loops that connect all keyframes; for scales see `ClosedGraph`.
 
     The gauge is that of refined maps: the first pose and its distance to the furthest are fixed.
-
-    Args:
-        world_T_keys: (K, 4, 4) poses of one map.
-        scales: (K,) scales of the keyframes, see `ClosedGraph`.
-        constraints: steps and loops that connect all keyframes.
     """
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for k, (world_T_key, scale) in enumerate(zip(world_T_keys, scales, strict=True)):
@@ -110,7 +100,7 @@ def covariances_of(
     away = np.linalg.norm(world_T_keys[:, :3, 3] - world_T_keys[0, :3, 3], axis=1)
     far = int(np.argmax(away))
     moving = away[far] > 0
-    sigmas = np.array([_HELD] * 6 + [_FREE_LOG_SCALE if moving else _HELD])
+    sigmas = np.array([_HELD] * 6 + [1.0 if moving else _HELD])
     noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
     graph.add(gtsam.PriorFactorSimilarity3(X(0), values.atSimilarity3(X(0)), noise))
     if moving:
@@ -128,20 +118,16 @@ def covariances_of(
 def carried_covariances(
     covariances: np.ndarray, key_T_rigs: np.ndarray, distances: np.ndarray
 ) -> np.ndarray:
-    """Covariances (F, 6, 6) of frames, from those of their keyframes.
+    """Covariances (F, 6, 6) of frames at poses (F, 4, 4) in their keyframes, map units, from those
+    of their keyframes, see `covariances_of`; distances: (F,) median, of points, map units.
 
     The keyframe's errors are increased by each pose's own: lenses have two centres, and rows are
     read one after another.
-
-    Args:
-        covariances: (F, 6, 6) those of each frame's keyframe, see `covariances_of`.
-        key_T_rigs: (F, 4, 4) poses of frames in their keyframes, map units.
-        distances: (F,) median distance of points, map units.
     """
     into_rigs = adjoint(inverse(key_T_rigs))
     own = np.zeros_like(into_rigs)
     turn, step = np.arange(3), np.arange(3, 6)
-    own[:, turn, turn] = _POSE_ROTATION**2
+    own[:, turn, turn] = 0.007**2  # radians
     own[:, step, step] = np.square(0.005 * distances)[:, None]  # median distance
     return into_rigs @ covariances @ np.swapaxes(into_rigs, 1, 2) + own
 
@@ -159,7 +145,7 @@ def _fixed_distance(far: int, world_T_ends: np.ndarray, scale: float) -> gtsam.C
             jacobians[0] = jacobian
         return np.zeros(1)
 
-    noise = gtsam.noiseModel.Isotropic.Sigma(1, _HELD_LOG_DISTANCE)
+    noise = gtsam.noiseModel.Isotropic.Sigma(1, 1e-5)
     return gtsam.CustomFactor(noise, [X(far)], error)
 
 
@@ -174,22 +160,14 @@ _UNKNOWN = np.deg2rad(2.0), 0.1, 0.05  # standard deviations of a step without c
 # rotation, translation in median distances, log scale
 
 
-@dataclass(frozen=True, slots=True)
-class MeasuredSteps:
-    """The step to each keyframe from its parent."""
-
-    parents: np.ndarray  # (K,) int64, keyframe it was tracked from; -1 = the first of its map
-    covariances: np.ndarray  # (K, 7, 7) float64, tangent [rotation, translation, log scale] on the
-    # right, units of the keyframe
-
-
 def measure_steps(
     features: Sequence[tuple[np.ndarray, np.ndarray]],
     world_T_keys: np.ndarray,
     maps: np.ndarray,
     distances: np.ndarray,
-) -> MeasuredSteps:
-    """Covariances of steps between keyframes, from common features; scale included.
+) -> tuple[np.ndarray, np.ndarray]:
+    """Keyframe (K,) int64 that each was tracked from, -1 = the first of its map, and covariances
+    (K, 7, 7) of the steps between both, from common features, as of a `Constraint`.
 
     Rotation and translation: information of the directions to points that the parent observes too.
     Scale: a point propagates it as accurately as the triangulation angle between its first keyframe
@@ -197,13 +175,21 @@ def measure_steps(
 
     Args:
         features: ids (N,) and bearings (N, 3), rig frame, of each keyframe; maps share no id.
-        world_T_keys: (K, 4, 4) poses, each in the world of its map.
-        maps: (K,) map of each keyframe.
+        world_T_keys, maps: (K, 4, 4) poses, each in the world of its map, and (K,) these maps.
         distances: (K,) median distances of points, map units.
     """
     num = len(features)
     parents, covariances = np.full(num, -1), np.zeros((num, 7, 7))
-    points, first_seen = _points(features, world_T_keys)
+    seen = WindowObservations.of(features)
+    sigmas = np.full(len(seen.ids), _SIGMA)
+    rays, settings = seen.bearings_rig.astype(float), TriangulateSettings()
+    found = triangulate(seen.tracks(), rays, sigmas, world_T_keys, _GATE, settings)
+    first_rows = np.unique(found.tracks.points, return_index=True)[1]
+    known = seen.features_of(found)
+    most = int(seen.ids.max(initial=-1)) + 1
+    points, first_seen = np.full((most, 3), np.nan), np.zeros(most, np.int64)
+    points[known] = found.points_world
+    first_seen[known] = found.tracks.frames[first_rows]
     for k in range(num):
         ids, bearings = features[k]
         before = [j for j in range(max(k - _REACH, 0), k) if maps[j] == maps[k]]
@@ -216,24 +202,7 @@ def measure_steps(
         origins = world_T_keys[first_seen[ids[rows]], :3, 3]
         given = points[ids[rows]], bearings[rows].astype(float), world_T_keys[k], origins
         covariances[k] = _covariance(*given, float(distances[k]))
-    return MeasuredSteps(parents, covariances)
-
-
-def _points(
-    features: Sequence[tuple[np.ndarray, np.ndarray]], world_T_keys: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """By id, the point (3,) of each feature, NaN = unknown, and its first keyframe."""
-    seen = WindowObservations.of(features)
-    sigmas = np.full(len(seen.ids), _SIGMA)
-    bearings, settings = seen.bearings_rig.astype(float), TriangulateSettings()
-    found = triangulate(seen.tracks(), bearings, sigmas, world_T_keys, _GATE, settings)
-    first_rows = np.unique(found.tracks.points, return_index=True)[1]
-    known = seen.features_of(found)
-    most = int(seen.ids.max(initial=-1)) + 1
-    points, first_seen = np.full((most, 3), np.nan), np.zeros(most, np.int64)
-    points[known] = found.points_world
-    first_seen[known] = found.tracks.frames[first_rows]
-    return points, first_seen
+    return parents, covariances
 
 
 def _covariance(

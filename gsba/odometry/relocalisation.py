@@ -10,13 +10,8 @@ from gsba.geometry import pose
 from gsba.matching.verification import relative_pose
 from gsba.odometry.atlas import Atlas, AtlasLayout
 
-_MAX_KEYPOINTS = 1500
-_CONTRAST = 0.02  # least contrast of a keypoint, in units of OpenCV's SIFT
-_RATIO = 0.85  # largest ratio of the distances of the best and the second best match
 _MIN_MATCHES = 20
 _VERIFY = TwoViewLimits(max_error_deg=0.4)
-_NEAR = np.deg2rad(4.0)  # largest angle between a match and the point whose distance it takes
-_MIN_PARALLAX = np.deg2rad(1.0)  # least parallax of a match whose distance is compared
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +29,7 @@ def describe(layout: AtlasLayout, atlas: Atlas, usable: np.ndarray | None) -> De
         usable: (2 s, 3 s) bool, pixels of the scene; None = all.
     """
     allowed = layout.owned if usable is None else layout.owned & usable
-    sift = cv2.SIFT.create(_MAX_KEYPOINTS, 3, _CONTRAST)
+    sift = cv2.SIFT.create(1500, 3, 0.02)
     found, descriptors = sift.detectAndCompute(atlas.image, allowed.astype(np.uint8) * 255)
     if descriptors is None:
         return Described(np.zeros((0, 3)), np.zeros((0, 128), np.float32))
@@ -52,16 +47,27 @@ def placed(
     distances: np.ndarray,
     seed: int,
 ) -> np.ndarray | None:
-    """key_T_rig (4, 4) of a frame, in the unit of the map; None if it is uncertain.
-
-    Args:
-        key, frame: keypoints of the keyframe and the frame.
-        bearings: (P, 3) unit, the keyframe's rig frame, of its points.
-        distances: (P,) distances of these points, map units.
-    """
+    """key_T_rig (4, 4) of a frame, in the unit of the map, by keypoints of the keyframe and the
+    frame; None if it is uncertain. Points of the keyframe are along unit bearings (P, 3), rig
+    frame, at distances (P,), map units."""
     if min(len(key.bearings_rig), len(frame.bearings_rig)) < _MIN_MATCHES:
         return None
-    rows = _matched(key.descriptors, frame.descriptors)
+    # mutual nearest neighbours that pass the ratio test
+    matcher = cv2.BFMatcher(cv2.NORM_L2)
+    forth = matcher.knnMatch(key.descriptors, frame.descriptors, k=2)
+    back = {
+        m[0].queryIdx: m[0].trainIdx
+        for m in matcher.knnMatch(frame.descriptors, key.descriptors, k=1)
+        if m
+    }
+    pairs = [
+        (m[0].queryIdx, m[0].trainIdx)
+        for m in forth
+        if len(m) == 2
+        and m[0].distance < 0.85 * m[1].distance
+        and back.get(m[0].trainIdx) == m[0].queryIdx
+    ]
+    rows = np.array(pairs, np.int64).reshape(-1, 2)
     if len(rows) < _MIN_MATCHES:
         return None
     one, other = key.bearings_rig[rows[:, 0]], frame.bearings_rig[rows[:, 1]]
@@ -74,21 +80,6 @@ def placed(
     one, other = one[found.inliers], other[found.inliers] @ rotation.T
     length = _length(one, other, direction, bearings, distances)
     return None if length is None else pose(rotation, length * direction)
-
-
-def _matched(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Rows (m, 2) of descriptors that are mutual nearest neighbours and pass the ratio test."""
-    matcher = cv2.BFMatcher(cv2.NORM_L2)
-    forth = matcher.knnMatch(one, other, k=2)
-    back = {m[0].queryIdx: m[0].trainIdx for m in matcher.knnMatch(other, one, k=1) if m}
-    rows = [
-        (m[0].queryIdx, m[0].trainIdx)
-        for m in forth
-        if len(m) == 2
-        and m[0].distance < _RATIO * m[1].distance
-        and back.get(m[0].trainIdx) == m[0].queryIdx
-    ]
-    return np.array(rows, np.int64).reshape(-1, 2)
 
 
 def _length(
@@ -105,7 +96,8 @@ def _length(
         return None
     parallax = np.linalg.norm(np.cross(one, other), axis=1)
     apart, nearest = KDTree(bearings).query(one)
-    use = (parallax > _MIN_PARALLAX) & (apart < _NEAR)
+    # a match takes the distance of a point within 4 degrees
+    use = (parallax > np.deg2rad(1.0)) & (apart < np.deg2rad(4.0))
     if np.count_nonzero(use) < 8:  # least number of matches near a point
         return None
     # |step x other| / |one x other| is the distance along `one` at a step of length 1.

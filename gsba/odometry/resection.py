@@ -19,7 +19,6 @@ _CELLS = 16  # cells along a cube face's side: all features within one, 6 degree
 _MIN_WITNESSES = 20  # least number of witnesses: fewer may be of one moving object
 _MAX_FALSE_ALARMS = 1e-6  # expected number of poses that chance explains as well as the accepted
 # one
-_CHANCE_SPAN = np.deg2rad(6.0)  # false matches lie anywhere within this angle of their prediction
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,14 +36,8 @@ class Resection:
 def resect(
     points_world: np.ndarray, bearings_rig: np.ndarray, start: np.ndarray, sigma: float
 ) -> Resection:
-    """Minimise the Geman-McClure loss of the angles between bearings and points over the pose.
-
-    Args:
-        points_world: (N, 3) map units.
-        bearings_rig: (N, 3) unit, rig frame.
-        start: (4, 4) initial world_T_rig.
-        sigma: radians, standard deviation of bearings per axis.
-    """
+    """Minimise the Geman-McClure loss of the angles between unit bearings (N, 3), rig frame, of
+    noise sigma, radians per axis, and points (N, 3), map units, over the pose (4, 4)."""
     pose, information, residuals, distances = _fitted(points_world, bearings_rig, start, sigma)
     squares = np.sum(residuals**2, axis=1)
     inliers = squares < (_GATE * sigma) ** 2
@@ -55,7 +48,8 @@ def resect(
     covariance = max(noise, 0.3 * sigma) ** 2 * np.linalg.pinv(information, hermitian=True)
     num = witnesses(bearings_rig, _CELLS) if len(bearings_rig) else 0
     agreeing = witnesses(bearings_rig[inliers], _CELLS) if inliers.any() else 0
-    chance = min((_GATE * sigma / _CHANCE_SPAN) ** 2, 0.5)
+    # false matches lie anywhere within 6 degrees of their prediction
+    chance = min((_GATE * sigma / np.deg2rad(6.0)) ** 2, 0.5)
     per_witness = 1 - (1 - chance) ** (len(bearings_rig) / max(num, 1))
     needed = least_agreeing(num, per_witness, _SAMPLE, _MAX_FALSE_ALARMS)
     significant = agreeing >= max(needed, _MIN_WITNESSES)
@@ -96,14 +90,11 @@ def _fitted(
 def linearised(
     points_world: np.ndarray, bases: np.ndarray, bearings_rig: np.ndarray, world_T_rig: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Residuals (N, 2), Jacobians (N, 2, 6) by the pose, and distances (N,) of the points.
+    """Residuals (N, 2), Jacobians (N, 2, 6) by the pose, and distances (N,) of the points, as for
+    `resect`; bases: (N, 2, 3) `tangent_basis` of the bearings.
 
     The residual is the unit direction to the point on the bearing's tangent plane; points behind
     count as a radian off. The tangent [rotation, translation] is applied on the right.
-
-    Args:
-        bases: (N, 2, 3) `tangent_basis` of the bearings.
-        points_world, bearings_rig, world_T_rig: as for `resect`.
     """
     num = len(bearings_rig)
     residuals, jacobians, distances = np.empty((num, 2)), np.empty((num, 2, 6)), np.empty(num)

@@ -35,25 +35,12 @@ from gsba.odometry.window import (
 logger = logging.getLogger(__name__)
 
 FREE, HELD = 8, 5  # keyframes of the window that are adjusted, and fixed ones before them
-_DESCRIBED = 4  # last keyframes with which it is compared by descriptors
 _MIN_CONTRAST = 1.5  # grey values: a lower contrast is darkness, or a hand over the lenses
-_KEYFRAME_PARALLAX = np.deg2rad(3.0)  # median parallax of the features since the last keyframe
-_KEYFRAME_SHARE = 0.7  # share of the last keyframe's trackable features that are still found
-_FADING_SHARE = 0.7  # share of the first keyframe's features below which less parallax suffices
 _START_SHARE = 0.45  # share of the first keyframe's features below which initialisation restarts
 _MIN_SIGMA, _MAX_SIGMA = np.deg2rad([0.05, 0.35])  # noise of bearings, per axis
-_ADAPTING = 0.1  # weight of one frame in the estimated noise of bearings
 _GATE = 4.0  # largest residual of a feature that fits, standard deviations
-_FEW_INLIERS = 60  # inliers below which less parallax makes a keyframe
-_SOME_PARALLAX = np.deg2rad(1.0)
-_MIN_FOUND_AGAIN = 0.4  # share of a keyframe's points in a lost frame: other doors show some
-_NUDGE = 0.03  # perturbation from which a relocalised pose must be found again: median distances
 _NUDGE_R = Rotation.from_rotvec(np.deg2rad([1.2, 1.2, 1.2])).as_matrix()  # its rotation
-_MIN_LEADING = 8  # least number of features whose pose predicts others
-_MAX_MISPREDICTED = np.deg2rad(1.5)  # error of predictions beyond which features are retried
 _MIN_FEATURES = 40  # least number of features of a picture that shows a scene
-_MAX_MISSES = 4  # consecutive frames in which a feature without a point may be missed
-_MAX_PENDING = 300  # frames before the start of a map that are posed once it has points
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,15 +55,7 @@ class _Attempt:
 
 @dataclass(slots=True)
 class Tracker:
-    """State of the odometry between frames.
-
-    Attributes:
-        records: of all frames so far.
-        keyframe_poses: (4, 4) each, of all keyframes so far, in the world of their map.
-        keyframe_frames: index of each keyframe's frame.
-        keyframe_features: of each keyframe, its features: ids (N,) int64, and bearings
-            (N, 3) float32, rig frame.
-    """
+    """State of the odometry between frames."""
 
     width: int  # pixels across the panoramas
     usable: np.ndarray | None = None  # (h, 2h) bool, pixels that show the scene in every frame
@@ -141,11 +120,11 @@ class Tracker:
             self._lose(grey, small, frame)
             return
         key.most_found = max(key.most_found, len(ids))
-        turn = median_turn(one, other)
-        world_R_rig = key.world_T_rig[:3, :3] @ turn.one_R_other
-        fading = len(ids) < _FADING_SHARE * key.most_found
+        one_R_other, parallaxes = median_turn(one, other)
+        world_R_rig = key.world_T_rig[:3, :3] @ one_R_other
+        fading = len(ids) < 0.7 * key.most_found  # less parallax suffices then
         seed = self.seed + frame
-        solved = start_map(ids, one, other, turn, self.state.sigma, seed, fading)
+        solved = start_map(ids, one, other, parallaxes, self.state.sigma, seed, fading)
         self.state.failures = 0
         if solved is not None:
             self._start(frame, solved, atlas, small, ids, other)
@@ -162,7 +141,7 @@ class Tracker:
             self._record(FrameStatus.TURNING, np.eye(4))
             return
         self.state.pending.append((frame, ids, other))
-        del self.state.pending[:-_MAX_PENDING]
+        del self.state.pending[:-300]  # frames that are posed once the map has points
         self._record(FrameStatus.TURNING, inverse(key.world_T_rig) @ self.state.world_T_rig)
 
     def _followed(
@@ -255,11 +234,11 @@ class Tracker:
         look(np.flatnonzero(known), predicted)
         rows = np.flatnonzero(known & found)
         fit = resect(points[rows], bearings[rows], predicted, self.state.sigma)
-        if np.count_nonzero(fit.inliers) >= _MIN_LEADING:
+        if np.count_nonzero(fit.inliers) >= 8:
             moved = angles_between(
                 _seen_from(predicted, points[rows]), _seen_from(fit.world_T_rig, points[rows])
             )
-            if np.median(moved) > _MAX_MISPREDICTED:
+            if np.median(moved) > np.deg2rad(1.5):
                 astray = known.copy()
                 astray[rows[fit.inliers]] = False
                 look(np.flatnonzero(astray), fit.world_T_rig)
@@ -275,7 +254,7 @@ class Tracker:
         assert features is not None
         self._step(fit.world_T_rig, small)
         noise = float(np.clip(fit.noise, _MIN_SIGMA, _MAX_SIGMA))
-        self.state.sigma += _ADAPTING * (noise - self.state.sigma)
+        self.state.sigma += 0.1 * (noise - self.state.sigma)
         fits = self._fitting(features, tried, key)
         position = self.state.world_T_rig[:3, 3]
         distances = np.linalg.norm(features.assumed_world[fits] - position, axis=1)
@@ -287,12 +266,13 @@ class Tracker:
         parallax = self._parallax(features, tried, fits, key)
         key.most_found = max(key.most_found, int(np.count_nonzero(fits)))
         share = np.count_nonzero(fits) / max(key.most_found, 1)
-        few = np.count_nonzero(fit.inliers) < _FEW_INLIERS and parallax > _SOME_PARALLAX
-        if parallax > _KEYFRAME_PARALLAX or share < _KEYFRAME_SHARE or few:
+        few = np.count_nonzero(fit.inliers) < 60 and parallax > np.deg2rad(1.0)
+        # median parallax, and share of the last keyframe's features that are still found
+        if parallax > np.deg2rad(3.0) or share < 0.7 or few:
             ids, bearings = features.ids[fits], tried.bearings[fits]
             self._become_keyframe(frame, tried.atlas, small, ids, bearings)
             return
-        kept = known | (features.misses <= _MAX_MISSES)
+        kept = known | (features.misses <= 4)  # consecutive frames
         self.state.features = features.taken(kept)
         number = int(np.count_nonzero(fit.inliers))
         key_T_rig = inverse(key.world_T_rig) @ self.state.world_T_rig
@@ -334,7 +314,27 @@ class Tracker:
         """Make the last posed frame a keyframe: add features, adjust the window."""
         corners = self._corners(atlas, bearings)
         self._add_keyframe(frame, self.state.world_T_rig, atlas, small, (ids, bearings), corners)
-        self._adjust()
+        # adjust the window, and drop features that do not fit it
+        window = self.state.window
+        held = max(len(window) - FREE, min(2, len(window) - 1))
+        seen = WindowObservations.of([(key.ids, key.bearings) for key in window])
+        poses = np.array([key.world_T_rig for key in window])
+        solved = adjust_window(poses, held, seen, self.state.sigma, _GATE)
+        for key, world_T_rig in zip(window[held:], solved.world_T_rigs[held:], strict=True):
+            key.world_T_rig = world_T_rig
+            self.state.keyframe_poses[key.number] = world_T_rig
+        everything = np.unique(seen.ids)
+        self.state.points[everything] = np.nan
+        self.state.points[solved.ids] = solved.points_world
+        for n, key in enumerate(window):
+            false = solved.outliers[solved.outliers[:, 0] == n, 1]
+            if len(false):
+                kept = ~np.isin(key.ids, false)
+                key.ids, key.bearings = key.ids[kept], key.bearings[kept]
+                self.state.keyframe_features[key.number] = key.ids, key.bearings.astype(np.float32)
+        last = window[-1]
+        self.state.world_T_rig = last.world_T_rig.copy()
+        self.state.features = self._followable(last)
         known = np.isfinite(self.state.points[ids, 0])
         distance = self._distance(ids[known], self.state.world_T_rig)
         self._record(FrameStatus.TRACKED, np.eye(4), distance, len(ids))
@@ -369,29 +369,6 @@ class Tracker:
             old.atlas = old.small = old.described = None
         state.features = self._followable(key)
 
-    def _adjust(self) -> None:
-        """Adjust the window, and drop features that do not fit it."""
-        window = self.state.window
-        held = max(len(window) - FREE, min(2, len(window) - 1))
-        seen = WindowObservations.of([(key.ids, key.bearings) for key in window])
-        poses = np.array([key.world_T_rig for key in window])
-        solved = adjust_window(poses, held, seen, self.state.sigma, _GATE)
-        for key, world_T_rig in zip(window[held:], solved.world_T_rigs[held:], strict=True):
-            key.world_T_rig = world_T_rig
-            self.state.keyframe_poses[key.number] = world_T_rig
-        everything = np.unique(seen.ids)
-        self.state.points[everything] = np.nan
-        self.state.points[solved.ids] = solved.points_world
-        for n, key in enumerate(window):
-            false = solved.outliers[solved.outliers[:, 0] == n, 1]
-            if len(false):
-                kept = ~np.isin(key.ids, false)
-                key.ids, key.bearings = key.ids[kept], key.bearings[kept]
-                self.state.keyframe_features[key.number] = key.ids, key.bearings.astype(np.float32)
-        last = window[-1]
-        self.state.world_T_rig = last.world_T_rig.copy()
-        self.state.features = self._followable(last)
-
     # Lost frames.
 
     def _relocalised(self, grey: np.ndarray, small: Miniature) -> _Attempt | None:
@@ -406,7 +383,7 @@ class Tracker:
             if found is not None:
                 return found
         frame = self._described(self._cutter.cut(grey, self.state.world_T_rig[:3, :3]))
-        for key in reversed(self.state.window[-_DESCRIBED:]):
+        for key in reversed(self.state.window[-4:]):  # the last four
             if key.atlas is None:
                 break
             if key.described is None:
@@ -431,7 +408,7 @@ class Tracker:
         Optical flow of features that are not visible stays near their predictions, and so agrees
         with any pose that predicted them.
         """
-        nudge = pose(_NUDGE_R, np.full(3, _NUDGE * self._distance(key.ids, tried.fit.world_T_rig)))
+        nudge = pose(_NUDGE_R, np.full(3, 0.03 * self._distance(key.ids, tried.fit.world_T_rig)))
         other = self._attempt(grey, key, features, tried.fit.world_T_rig @ nudge)
         if not other.fit.significant:
             return False
@@ -450,7 +427,7 @@ class Tracker:
             tried = self._attempt(grey, key, features, tried.fit.world_T_rig)
         known = np.count_nonzero(np.isfinite(self.state.points[key.ids, 0]))
         share = np.count_nonzero(tried.fit.inliers) / max(known, 1)
-        if not tried.fit.significant or share < _MIN_FOUND_AGAIN:
+        if not tried.fit.significant or share < 0.4:  # other doors show some
             return None
         if not self._confirmed(grey, key, features, tried):
             return None

@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from gsba import __version__
+from gsba.config import OdometrySettings
 from gsba.disk import atomic_write, write_json
-from gsba.geometry import inverse, quaternion_from_rotation
+from gsba.geometry import inverse, quaternion_from_rotation, rotation_angle
 from gsba.log import GsbaError, event, track
 from gsba.odometry.closing import ClosedKeyframes, TrackedKeyframes, close
 from gsba.odometry.panoramas import SmallPanoramas
@@ -29,7 +30,6 @@ from gsba.video.likeness import sharpness
 _PATIENCE_S, _MIN_PATIENCE = 1.5, 8  # seconds, and frames, before a lost camera begins a new map
 _CHECKPOINT_S = 60.0  # between checkpoints
 _MAX_SAVING_SHARE = 0.03  # of the time between checkpoints that writing one may take
-_POINTS_TOLD = 12  # most points of a keyframe that its event holds
 
 
 @dataclass(slots=True)
@@ -44,16 +44,9 @@ class Tracking:
 
 
 def track_frames(panoramas: SmallPanoramas, seed: int, checkpoint: Path | None) -> Tracking:
-    """Pose all frames of a sequence one after another.
-
-    Args:
-        panoramas: in time order; those that are damaged are left out.
-        checkpoint: written each minute; where it is of these panoramas, tracking goes on from it.
-            The caller removes it. None = there is none.
-
-    Raises:
-        GsbaError: the disk refuses a checkpoint.
-    """
+    """Pose all frames of a sequence in time order; damaged ones are left out. A checkpoint is
+    written each minute; where it is of these panoramas, tracking goes on from it. The caller
+    removes it. GsbaError: the disk refuses a checkpoint."""
     num, interval = len(panoramas), float(np.median(np.diff(panoramas.timestamps)))
     patience = max(_MIN_PATIENCE, round(_PATIENCE_S / interval))
     key = _key(panoramas, seed, patience) if checkpoint is not None else ""
@@ -87,7 +80,7 @@ def _tell_keyframe(state: TrackerState, number: int) -> None:
     ids, _ = state.keyframe_features[number]
     points = state.points[ids]
     points = points[np.isfinite(points).all(axis=1)]
-    points = points[:: max(1, -(-len(points) // _POINTS_TOLD))]
+    points = points[:: max(1, -(-len(points) // 12))]  # a dozen at most
     position = state.keyframe_poses[number][:3, 3]
     map_number = state.records[state.keyframe_frames[number]].map_number
     told = {"position": position.round(4).tolist(), "points": points.round(4).tolist()}
@@ -124,10 +117,6 @@ def _key(panoramas: SmallPanoramas, seed: int, patience: int) -> str:
 logger = logging.getLogger(__name__)
 
 
-def _no_pairs() -> np.ndarray:
-    return np.zeros((0, 2), np.int64)
-
-
 @dataclass(frozen=True, slots=True)
 class Stretch:
     """Frames in a row."""
@@ -153,10 +142,10 @@ class Odometry:
     covariances: np.ndarray | None = None  # (F, 6, 6) float64, of poses: tangent [rotation rad,
     # translation], map units; the first pose of each map and its distance to the furthest are held;
     # NaN and None = not known
-    loops: np.ndarray = field(default_factory=_no_pairs)  # (L, 2) int64, frames of loops within a
-    # map
-    joins: np.ndarray = field(default_factory=_no_pairs)  # (M, 2) int64, frames at which a map was
-    # joined to an earlier one
+    loops: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), np.int64))
+    # (L, 2) int64, frames of loops within a map
+    joins: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), np.int64))
+    # (M, 2) int64, frames at which a map was joined to an earlier one
     closing_cpu_s: float = 0.0  # processor time of joining maps and closing loops
 
     def __len__(self) -> int:
@@ -222,14 +211,10 @@ class Odometry:
             for a, b in zip(edges[::2], edges[1::2], strict=True)
         ]
 
-    def path_lengths(self) -> list[float]:
-        """Path length of each map, in its unit."""
-        steps = [np.diff(piece.world_T_rigs[:, :3, 3], axis=0) for piece in self.pieces()]
-        return [float(np.linalg.norm(some, axis=1).sum()) for some in steps]
-
     def report(self) -> dict[str, object]:
         """Summary of the odometry, for a JSON file."""
         posed = self.posed()
+        steps = [np.diff(piece.world_T_rigs[:, :3, 3], axis=0) for piece in self.pieces()]
         return {
             "frames": len(self),
             "posed": int(posed.sum()),
@@ -238,7 +223,7 @@ class Odometry:
             "maps": len(np.unique(self.maps[posed])),
             "loops": self.timestamps[self.loops].tolist(),
             "joins": self.timestamps[self.joins].tolist(),
-            "path_lengths": self.path_lengths(),
+            "path_lengths": [float(np.linalg.norm(some, axis=1).sum()) for some in steps],
             "lost": [asdict(stretch) for stretch in self.lost()],
             "cpu_ms_per_frame": 1e3 * self.cpu_s / max(len(self), 1),
             "closing_cpu_s": self.closing_cpu_s,
@@ -372,12 +357,6 @@ def write_odometry(found: Odometry, walk: Path, keyframes: Path, poses: Path, re
         path.parent.mkdir(parents=True, exist_ok=True)
     write_tum(keyframes, found.trajectory(keyframes=True))
     write_json(report, found.report())
-    _write_poses(poses, found)
-    write_tum(walk, found.trajectory())
-
-
-def _write_poses(path: Path, found: Odometry) -> None:
-    """Status, map, pose and upper triangle of the covariance [rotation, translation] of frames."""
     upper, covariances = np.triu_indices(6), found.covariances
     if covariances is None:
         covariances = np.full((len(found), 6, 6), np.nan)
@@ -403,7 +382,8 @@ def _write_poses(path: Path, found: Odometry) -> None:
                 known = [int(maps[f]), *values] if posed[f] else [""] * (1 + len(values))
                 table.writerow(row + known)
 
-    atomic_write(path, write)
+    atomic_write(poses, write)
+    write_tum(walk, found.trajectory())
 
 
 def write_chosen(found: Odometry, rows: np.ndarray, path: Path) -> None:
@@ -427,3 +407,92 @@ def _holds(path: Path, trajectory: Trajectory) -> bool:
     return np.array_equal(written.timestamps, trajectory.timestamps) and np.allclose(
         written.world_T_rigs, trajectory.world_T_rigs, rtol=0, atol=1e-12
     )
+
+
+def choose_frames(found: Odometry, settings: OdometrySettings) -> np.ndarray:
+    """Rows (N,) of the frames to refine.
+
+    From one frame to the next the camera moves by at most `step` times the median distance of the
+    scene, and rotates by at most `max_turn_deg`, wherever the video has frames that close; the
+    sharpest of the last part of each such stretch is selected. Frames without a pose are left out.
+    """
+    count = settings.max_frames
+    steps = _Steps.of(found, settings.step, np.deg2rad(settings.max_turn_deg))
+    rows = _chosen(found, steps, 1.0)
+    if count is None or len(rows) <= count:
+        return rows
+    low, high = 1.0, 2.0
+    while len(_chosen(found, steps, high)) > count:
+        low, high = high, 2 * high
+        if high > 1e6:  # more maps than frames are wanted
+            return rows[np.linspace(0, len(rows) - 1, count).round().astype(int)]
+    for _ in range(20):  # bisections of the interval of that factor
+        middle = 0.5 * (low + high)
+        if len(_chosen(found, steps, middle)) > count:
+            low = middle
+        else:
+            high = middle
+    return _chosen(found, steps, high)
+
+
+@dataclass(frozen=True, slots=True)
+class _Steps:
+    """Distances between frames, in steps of the allowed length."""
+
+    positions: np.ndarray  # (F, 3) float64, map units
+    rotations: np.ndarray  # (F, 3, 3) float64
+    allowed: np.ndarray  # (F,) float64, length of a step near each frame, map units
+    max_turn: float  # radians
+
+    @classmethod
+    def of(cls, found: Odometry, step: float, max_turn: float) -> "_Steps":
+        """Steps between frames; unknown distances of the scene are interpolated."""
+        known = np.flatnonzero(np.isfinite(found.distances) & found.posed())
+        distances = np.full(len(found), np.inf)
+        if len(known):
+            distances = np.interp(np.arange(len(found)), known, found.distances[known])
+        poses = found.world_T_rigs
+        return cls(poses[:, :3, 3], poses[:, :3, :3], step * distances, max_turn)
+
+    def between(self, one: int, others: np.ndarray) -> np.ndarray:
+        """Steps from one frame to others (N,)."""
+        moved = np.linalg.norm(self.positions[others] - self.positions[one], axis=1)
+        turned = rotation_angle(self.rotations[one].T @ self.rotations[others])
+        shorter = np.minimum(self.allowed[others], self.allowed[one])
+        return np.maximum(moved / shorter, turned / self.max_turn)
+
+
+def _chosen(found: Odometry, steps: _Steps, longer: float) -> np.ndarray:
+    """Rows of frames at most `longer` steps apart, including the first of each map."""
+    out: list[int] = []
+    posed = found.posed()
+    for number in np.unique(found.maps[posed]):
+        rows = np.flatnonzero(posed & (found.maps == number))
+        here = 0
+        while here is not None:
+            out.append(int(rows[here]))
+            here = _next(rows, here, steps, longer, found.sharpness)
+    return np.array(out, np.int64)
+
+
+def _next(
+    rows: np.ndarray, here: int, steps: _Steps, longer: float, sharpness: np.ndarray
+) -> int | None:
+    """Index into `rows` of the frame to select after `rows[here]`; None = no new frame follows."""
+    reach, end = 32, len(rows)
+    while True:
+        ahead = np.arange(here + 1, min(here + 1 + reach, end))
+        away = steps.between(int(rows[here]), rows[ahead]) / longer
+        beyond = np.flatnonzero(away > 1)
+        if len(beyond) or ahead[-1:].tolist() in ([], [end - 1]):
+            break
+        reach *= 2
+    if not len(ahead):
+        return None
+    stop = int(beyond[0]) if len(beyond) else len(ahead)
+    fit = np.flatnonzero(away[:stop] >= 0.6)  # the sharpest of the last part of the step
+    if len(fit):
+        return int(ahead[fit[np.argmax(sharpness[rows[ahead[fit]]])]])
+    if not len(beyond):
+        return None
+    return int(ahead[max(stop - 1, 0)])

@@ -63,12 +63,11 @@ class AdjustedWindow:
 def adjust_window(
     world_T_rigs: np.ndarray, num_held: int, seen: WindowObservations, sigma: float, gate: float
 ) -> AdjustedWindow:
-    """Triangulate all features of a window again, and adjust poses and points.
+    """Triangulate all features of a window again, and adjust its poses (K, 4, 4) and points.
 
     Args:
-        world_T_rigs: (K, 4, 4) initial poses.
-        num_held: number of first keyframes that are fixed. With one, its distance to the furthest
-            keyframe is fixed besides, as the scale is free otherwise.
+        num_held: number of first keyframes that are fixed. With one, its distance to the
+            furthest keyframe is fixed besides, as the scale is free otherwise.
         sigma: radians, noise of bearings per axis.
         gate: residual from which observations are outliers, standard deviations.
     """
@@ -85,7 +84,15 @@ def adjust_window(
     )
     keys = [pose_variables.X(k) for k in range(len(world_T_rigs))]
     block = LandmarkBlock(keys, marks.points_world, [term], RobustLoss("cauchy", 2.0), 1)
-    graph = _held(world_T_rigs, num_held)
+    extent = max(float(np.linalg.norm(np.ptp(world_T_rigs[:, :3, 3], axis=0))), 1e-9)
+    spread = np.array([_HELD] * 3 + [_HELD * extent] * 3)
+    noise = gtsam.noiseModel.Diagonal.Sigmas(spread)
+    graph = gtsam.NonlinearFactorGraph()
+    for k in range(num_held):
+        pose = gtsam.Pose3(world_T_rigs[k])
+        graph.add(gtsam.PriorFactorPose3(pose_variables.X(k), pose, noise))
+    if num_held == 1:
+        graph.push_back(pose_variables.fixed_scale(world_T_rigs))
     poses = poses_of(optimize(graph, values_of(world_T_rigs), [block], _SOLVER).values, len(keys))
     marks = place(poses, gate)
     kept = np.zeros(len(seen.ids), bool)
@@ -96,74 +103,43 @@ def adjust_window(
     return AdjustedWindow(poses, ids, marks.points_world, outliers)
 
 
-def _held(world_T_rigs: np.ndarray, num_held: int) -> gtsam.NonlinearFactorGraph:
-    """Priors that fix the gauge."""
-    extent = max(float(np.linalg.norm(np.ptp(world_T_rigs[:, :3, 3], axis=0))), 1e-9)
-    sigmas = np.array([_HELD] * 3 + [_HELD * extent] * 3)
-    noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
-    graph = gtsam.NonlinearFactorGraph()
-    for k in range(num_held):
-        pose = gtsam.Pose3(world_T_rigs[k])
-        graph.add(gtsam.PriorFactorPose3(pose_variables.X(k), pose, noise))
-    if num_held == 1:
-        graph.push_back(pose_variables.fixed_scale(world_T_rigs))
-    return graph
-
-
-_REFITS = 6  # refits of a rotation without the features that are furthest off
 _MOVED, _MOVED_LITTLE = np.deg2rad([4.0, 1.2])  # parallax of the upper quarter of the features from
 # which initialisation is tried; the latter while features are being lost
-_MAX_DIRECTION_SIGMA = np.deg2rad(6.0)  # largest standard deviation of the translation's direction
 _MIN_POINTS = 40  # least number of independent points, in cells of 6 degrees
 _CELLS = 16
 _VERIFY = TwoViewLimits(max_error_deg=0.3)
 _GATE = 4.0  # standard deviations
 
 
-@dataclass(frozen=True, slots=True)
-class StartTurn:
-    """The rotation that explains most features of two frames, and residuals."""
-
-    one_R_other: np.ndarray  # (3, 3) float64
-    parallaxes: np.ndarray  # (N,) float64, radians, residual of each feature under the rotation
-
-
-def median_turn(one: np.ndarray, other: np.ndarray) -> StartTurn:
-    """The rotation that maps most bearings (N, 3) of the other frame onto those of the first."""
+def median_turn(one: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation (3, 3) that maps most bearings (N, 3) of the other frame onto those of the first,
+    and parallaxes (N,) rad, the residual of each feature under it."""
     near, rotation = np.ones(len(one), bool), np.eye(3)
     off = np.zeros(len(one))
-    for _ in range(_REFITS if len(one) >= 3 else 0):
+    for _ in range(6 if len(one) >= 3 else 0):  # without the features that are furthest off
         rotation = nearest_rotation(one[near].T @ other[near])
         off = angles_between(one, other @ rotation.T)
         near = off <= np.median(off)
-    return StartTurn(rotation, off)
+    return rotation, off
 
 
 def start_map(
     ids: np.ndarray,
     one: np.ndarray,
     other: np.ndarray,
-    turn: StartTurn,
+    parallaxes: np.ndarray,
     sigma: float,
     seed: int,
     fading: bool,
 ) -> AdjustedWindow | None:
-    """Poses of two frames and their points; None if the camera may have rotated only.
-
-    The first pose is the identity; the median distance of points from it is 1.
-
-    Args:
-        ids: (N,) features.
-        one, other: (N, 3) their bearings in the two frames.
-        turn: rotation of the bearings.
-        sigma: radians, noise of bearings per axis.
-        fading: True if features are being lost; then little parallax suffices.
-    """
+    """Poses of two frames and points of features (N,), whose bearings are (N, 3) in either frame;
+    None if the camera may have rotated only. The first pose is the identity; the median distance of
+    points from it is 1. fading: features are being lost; then little parallax suffices."""
     moved = _MOVED_LITTLE if fading else _MOVED
-    if len(ids) < _MIN_POINTS or np.quantile(turn.parallaxes, 0.75) < moved:
+    if len(ids) < _MIN_POINTS or np.quantile(parallaxes, 0.75) < moved:
         return None
     found = relative_pose(one, other, _VERIFY, seed)
-    if found is None or found.direction_sigma > _MAX_DIRECTION_SIGMA:
+    if found is None or found.direction_sigma > np.deg2rad(6.0):
         return None
     poses = np.stack([np.eye(4), found.f0_T_f1])
     good = found.inliers

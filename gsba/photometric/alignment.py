@@ -23,19 +23,12 @@ from gsba.store.shards import Workers
 from gsba.types import Counts, Keypoints, Landmarks, Sighted, Solution
 from gsba.types.records import slices
 
-_MIN_ZNCC = 0.75  # correlation of the aligned patches
-_MAX_SIGMA_PX = 0.5  # along the least certain direction, panorama pixels
 _MIN_TRACK_LENGTH = 3  # of a point that is aligned in frames without an observation of it, too
 _TOO_UNCERTAIN = "position too uncertain"
 _SIGHTINGS_AT_ONCE = 1 << 15  # sightings that a thread processes together: some 20 MB
-_BYTES_PER_POINT = 8192  # of a point's patch and its sightings, about
 _MEMORY_SHARE = 64  # of the machine's memory, which the patches of one part take at most
 _POINTS_AT_ONCE = 1 << 15  # whose former observations a thread looks for together
 _PLACE_BITS = 10  # of a coordinate by which frames are put in order: cells of a 1024th of the map
-_ENOUGH_OBSERVATIONS = 100  # aligned observations of a frame from which points without aligned
-# patches are dropped
-_TILTED_STEP_PX = 1.4  # pixels to a step of patches tilted with their surfaces; 1 of patches facing
-# the host
 _MIN_SIGMA_PX = 0.03  # pixels, noise of the best patches: sampling, and a plane as the surface
 
 REJECTIONS = (*REASONS.values(), _TOO_UNCERTAIN)  # reasons why alignments are dropped
@@ -100,11 +93,11 @@ def align(
             chosen = np.zeros(len(rows), bool)
             chosen[points] = True
             some = replace(solved, landmarks=landmarks.of(chosen))
-            patches = _align_some(some, observed, greys, settings, workers, lenses, name, dropped)
-            normals_world[points] = patches.normals_world
-            num_found += len(patches.found)
-            yield patches.found.of(points)
-            yield patches.at_hosts.of(points)
+            given = observed, greys, settings, workers, lenses, name, dropped
+            found, at_hosts, normals_world[points] = _align_some(some, *given)
+            num_found += len(found)
+            yield found.of(points)
+            yield at_hosts.of(points)
             release_mapped_files()
 
     folder, keypoints = observed.folder, observed.keypoints
@@ -119,7 +112,8 @@ def align(
 
 def _by_hosts(hosts: np.ndarray, positions: np.ndarray) -> Iterator[np.ndarray]:
     """Points (n,), ascending, held together: those of hosts (J,) near one another, read at once."""
-    most = max(total_memory_bytes() // (_MEMORY_SHARE * _BYTES_PER_POINT), 1)
+    # 8192: bytes of a point's patch and its sightings, about
+    most = max(total_memory_bytes() // (_MEMORY_SHARE * 8192), 1)
     # numbers of cells, similar for near ones (Morton, 1966)
     low, edge = positions.min(axis=0), float(np.ptp(positions, axis=0).max())
     last = (1 << _PLACE_BITS) - 1
@@ -133,15 +127,6 @@ def _by_hosts(hosts: np.ndarray, positions: np.ndarray) -> Iterator[np.ndarray]:
         yield np.sort(order[some])
 
 
-@dataclass(frozen=True, slots=True)
-class _Aligned:
-    """Observations of some points by their patches."""
-
-    found: Observed  # in other frames
-    at_hosts: Observed
-    normals_world: np.ndarray  # (J, 3) of the surfaces, zero = unknown
-
-
 def _align_some(
     solved: Solution,
     observed: Observations,
@@ -151,8 +136,9 @@ def _align_some(
     lenses: Cameras,
     name: str,
     dropped: dict[str, int],
-) -> _Aligned:
-    """As `align`, of the points of a solution; rejections are added to `dropped`."""
+) -> tuple[Observed, Observed, np.ndarray]:
+    """Observations of a solution's points by their patches, in other frames and in their hosts, and
+    normals (J, 3) of the surfaces, world, zero = unknown; rejections are added to `dropped`."""
     landmarks, world_T_rigs = solved.landmarks, solved.world_T_rigs
     keypoints, field = observed.keypoints, observed.field
     rows = references(landmarks, world_T_rigs)
@@ -168,7 +154,11 @@ def _align_some(
         extended[tracks.points[observed.aligned[keypoints.rows(tracks)]]] = True
     views = visible_frames(landmarks, world_T_rigs, rows, extended)
     map_, threads = (landmarks, planes, world_T_rigs), workers.num_threads
-    points, seeing = _unblended(*map_, hosts, *views, lenses, threads)
+    points, seeing = views
+    if lenses:  # outside the band where two pictures are blended
+        at, _, _ = _projected_patches(*map_, *views, lenses, threads)
+        clear = ~(lenses.blended(planes.origins, hosts)[points] | lenses.blended(at, seeing))
+        points, seeing = points[clear], seeing[clear]
     at, across, rays = _projected_patches(*map_, points, seeing, lenses, threads)
     sightings = expect(points, field.observed(at), across)
     title, cut = f"{name}: templates", (planes.origins, planes.tilted)
@@ -190,7 +180,7 @@ def _align_some(
     at_hosts = at_hosts.enlarged(enlarged[at_hosts.frames])
     shown = found.bearings_rig, rays[kept]
     normals_world = _normals_world(sightings, kept, *shown, planes, world_T_rigs[hosts], threads)
-    return _Aligned(found, at_hosts, normals_world)
+    return found, at_hosts, normals_world
 
 
 def _planes(
@@ -211,31 +201,12 @@ def _planes(
     depths = np.linalg.norm(local, axis=1)
     origins = field.observed(local / np.maximum(depths, 1e-300)[:, None])
     spreads = pixel * np.swapaxes(tangent_basis(origins), 1, 2)
-    spreads[normals_rig.any(axis=1)] *= _TILTED_STEP_PX
+    spreads[normals_rig.any(axis=1)] *= 1.4  # pixels to a step of tilted patches; 1 of others
     slopes = slopes_of(normals_rig, origins, spreads)
     tilted = spreads + origins[:, :, None] * slopes[:, None, :]
     away = world_T_hosts[:, :3, :3] * depths[:, None, None]
     rays = np.einsum("jab,jb->ja", away, origins)
     return _Planes(origins, spreads, slopes, tilted, away @ tilted, rays)
-
-
-def _unblended(
-    landmarks: Landmarks,
-    planes: _Planes,
-    world_T_rigs: np.ndarray,
-    hosts: np.ndarray,
-    points: np.ndarray,
-    frames: np.ndarray,
-    lenses: Cameras,
-    num_threads: int,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Views of points (O,) in frames (O,) outside the band where two pictures are blended."""
-    if not lenses:
-        return points, frames
-    given = landmarks, planes, world_T_rigs, points, frames, lenses, num_threads
-    at, _, _ = _projected_patches(*given)
-    clear = ~(lenses.blended(planes.origins, hosts)[points] | lenses.blended(at, frames))
-    return points[clear], frames[clear]
 
 
 def _projected_patches(
@@ -305,9 +276,10 @@ def accepted_rows(
     shifts = np.linalg.norm(np.cross(sightings.origins, bearings), axis=1)
     tests = {reason: sightings.states != state for state, reason in REASONS.items()}
     aligned = sightings.states == ALIGNED
-    tests["look different"] &= ~aligned | (sightings.scores > _MIN_ZNCC)
+    tests["look different"] &= ~aligned | (sightings.scores > 0.75)
     tests["found too far off"] &= ~aligned | (shifts < MAX_SHIFT_PX * pixel)
-    tests[_TOO_UNCERTAIN] = ~aligned | (worst < _MAX_SIGMA_PX * pixel)
+    # pixels, along the least certain direction
+    tests[_TOO_UNCERTAIN] = ~aligned | (worst < 0.5 * pixel)
     left = np.ones(len(bearings), bool)
     for reason, passed in tests.items():
         dropped[reason] += int(np.count_nonzero(left & ~passed))
@@ -350,7 +322,8 @@ def _former_observations(
     tracks = landmarks.tracks
     wanted = np.zeros(tracks.num_points, bool)
     wanted[found.points] = True
-    scarce = np.bincount(found.frames, minlength=num_frames) < _ENOUGH_OBSERVATIONS
+    # from here on, points without aligned patches are dropped
+    scarce = np.bincount(found.frames, minlength=num_frames) < 100
     wanted[tracks.points[scarce[tracks.frames]]] = True
     parts = list(slices(tracks.num_points, _POINTS_AT_ONCE))
 
@@ -381,13 +354,9 @@ _MAX_TILT_TANGENT = 3.0  # tangent of a tilt beyond which a patch covers too lit
 
 
 def slopes_of(normals_rig: np.ndarray, origins: np.ndarray, spreads: np.ndarray) -> np.ndarray:
-    """Relative depth (J, 2) that a step across each patch adds on its surface; 0 = unknown.
-
-    Args:
-        normals_rig: (J, 3) of the surfaces, any length, rig frame of the host; zero = unknown.
-        origins: (J, 3) unit bearings of the points.
-        spreads: (J, 3, 2) steps across them, radians.
-    """
+    """Relative depth (J, 2) that a step across each patch adds on its surface, 0 = unknown, of
+    normals (J, 3) of any length, rig frame of the host, zero = unknown; origins: (J, 3) unit
+    bearings of the points; spreads: (J, 3, 2) steps across them, radians."""
     facing = np.einsum("ji,ji->j", normals_rig, origins)
     across = np.einsum("ji,jic->jc", normals_rig, spreads)
     known = facing > 0
@@ -424,16 +393,14 @@ def surface_normals(
     origins: np.ndarray,
     spreads: np.ndarray,
 ) -> np.ndarray:
-    """Normals (J, 3) of the surfaces, rig frames of the hosts, from their patches' alignments.
+    """Normals (J, 3) of the surfaces, of any length, rig frames of the hosts, from their patches'
+    alignments; zero where they are undetermined.
 
     Args:
         templates: (N,) template of each accepted sighting.
         shifts (N, 2), products (N, 2): see `shown_depths`.
-        slopes: (J, 2) slopes by which the patches were projected.
-        origins (J, 3), spreads (J, 3, 2): the patches in their hosts, before slopes.
-
-    Returns:
-        Normals of any length, zero where they are undetermined.
+        slopes (J, 2), origins (J, 3), spreads (J, 3, 2): by which patches were projected, and
+            the patches in their hosts, before slopes.
     """
     num = len(slopes)
     pulls = np.stack([np.bincount(templates, column, num) for column in products.T], axis=1)

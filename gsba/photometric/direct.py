@@ -38,18 +38,13 @@ class PatchGreys(Family):
         return (self.block,)
 
 
-_NOISE_CONTRAST = 0.1  # added noise, relative to the contrast
 _INFLATION = 2.0  # of sigmas: a patch's pixel errors are correlated
-_MAX_FRAME_RATIO = 2.0  # of a frame's residual to the median; above it, the frame is weighted down
-_MAX_FRAME_GROWTH = 1.2  # of a frame's geometric residual in the joint solve; as above
 _MAX_GROWTH = 1.05  # of the geometric cost, or the solve is undone
 _TOLERANCE = 1e-3  # relative decrease of the cost that ends the joint solve
 
 logger = logging.getLogger(__name__)
 
 _MIN_OBSERVATIONS = 10  # observations of a frame from which its fit is judged
-_OBSERVATIONS_AT_ONCE = 40_000  # observations whose depths are estimated at once: bounds the memory
-# of windows
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,11 +93,8 @@ def refine(
     context: AdjustmentContext,
     lenses: Cameras = ONE_CAMERA,
 ) -> PhotometricResult:
-    """Refine a solved map by the grey values of patches, level after level.
-
-    Args:
-        frames: panoramas; read twice a level, one at a time.
-    """
+    """Refine a solved map by the grey values of patches of panoramas, read twice a level, one at a
+    time, level after level."""
     solved, counts, settings = start, [], context.settings
     weights, residuals = np.ones(len(frames)), np.full(len(frames), np.nan)
     for level in settings.photometric.levels:
@@ -149,7 +141,7 @@ def _patches(
         left &= ~flag
     table, _ = table.select(left)
     trust = np.zeros(len(table.targets))
-    rows = np.cumsum(np.diff(table.offsets)) // _OBSERVATIONS_AT_ONCE
+    rows = np.cumsum(np.diff(table.offsets)) // 40_000  # at once: bounds the memory of windows
     for chunk in np.unique(rows):
         observations = (rows == chunk)[table.owners]
         part, own = table.select(observations)
@@ -270,11 +262,8 @@ def joint(
     num_threads: int,
     lenses: Cameras = ONE_CAMERA,
 ) -> list[PatchGreys]:
-    """The patches of a solved map, for a joint solve with another family; none if not selected.
-
-    Args:
-        frame_weights: (F,) weights of each frame's pixels, see `PhotometricResult`.
-    """
+    """The patches of a solved map, for a joint solve with another family; none if not selected;
+    frame_weights (F,): of each frame's pixels, see `PhotometricResult`."""
     if "photometric" not in settings.factors:
         return []
     level = settings.photometric.levels[-1]
@@ -297,7 +286,8 @@ def make_block(
 ) -> PhotometricBlock:
     """The factor block of gathered patches, with the settings' noise times `noise`."""
     contrasts = pixels.templates.std(axis=1).astype(np.float64)
-    sigmas = noise * np.hypot(2.0, _NOISE_CONTRAST * contrasts)  # grey values of a pixel
+    # noise of 2 grey values and a tenth of the contrast
+    sigmas = noise * np.hypot(2.0, 0.1 * contrasts)  # grey values of a pixel
     return PhotometricBlock(
         [pose_variables.X(f) for f in range(pixels.num_frames)],
         pixels,
@@ -349,8 +339,8 @@ def _frame_weights(
         if np.count_nonzero(rows) >= _MIN_OBSERVATIONS:
             residuals[f] = np.median(errors[rows])
     typical = np.nanmedian(residuals) if np.isfinite(residuals).any() else 1.0
-    ratios = np.nan_to_num(residuals / typical, nan=1.0) / _MAX_FRAME_RATIO
-    worst = np.maximum(1.0, np.maximum(ratios, growth / _MAX_FRAME_GROWTH))
+    ratios = np.nan_to_num(residuals / typical, nan=1.0) / 2.0  # twice the median is allowed
+    worst = np.maximum(1.0, np.maximum(ratios, growth / 1.2))
     return np.maximum(worst**-2.0, 1e-3), residuals  # least weight of a frame
 
 

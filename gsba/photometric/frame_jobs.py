@@ -15,11 +15,7 @@ from gsba.store.shards import Workers, blocks_of_frames
 
 MAX_SHIFT_PX = 3.0  # from the predicted pixel, panorama pixels
 _AFFINE_SIGMA = 0.15  # prior of the warp: a surface facing the ray
-_GREY_SIGMA = 3.0  # noise of pixels, grey values
-_WINDOW_SIGMA_SHARE = 0.6  # standard deviation of the patch's window, in half patches
-_SEARCH_SHIFT_RATIO = 1.5  # largest shift during alignment, in largest accepted shifts
 _MAX_STEPS = 12  # largest number of alignment steps
-_TOLERANCE_PX = 0.02  # of the last step, pixels
 
 
 def cut(
@@ -31,12 +27,8 @@ def cut(
     settings: PatchSettings,
     workers: Workers,
 ) -> PatchSet:
-    """Templates cut from their host frames.
-
-    Args:
-        hosts: (J,) frame of each template.
-        origins (J, 3), spreads (J, 3, 2): plane patches, rig frame of the host.
-    """
+    """Templates cut from their host frames (J,): plane patches, origins (J, 3) and spreads (J, 3,
+    2), rig frame of the host."""
     patches = _empty_patches(len(hosts), settings)
     rows = _by_frame(hosts, greys.num_frames)
     job = _CutJob(name, greys, rows, origins, spreads, settings)
@@ -56,12 +48,8 @@ def align(
     sightings: Sightings,
     workers: Workers,
 ) -> None:
-    """Align templates to the frames that should show them.
-
-    Args:
-        seeing: (O,) frame of each sighting.
-        sightings: predicted sightings; the results are filled in.
-    """
+    """Align templates to the frames (O,) that should show them; results are written to the
+    sightings."""
     rows = _by_frame(seeing, greys.num_frames)
     job = _AlignJob(name, greys, rows, patches, sightings)
     for chosen, found in zip(rows.each(), workers.map_shards(job), strict=True):
@@ -76,18 +64,16 @@ def align_to(
     patches: PatchSet,
     sightings: Sightings,
 ) -> None:
-    """Align templates to one picture; the results are filled in.
-
-    Args:
-        image: the picture. mask: (H, 2H) bool, True = use; None = all.
-    """
-    reach, every = _SEARCH_SHIFT_RATIO * MAX_SHIFT_PX, np.arange(len(sightings.templates))
-    patches.align(image, mask, every, sightings, reach, _MAX_STEPS, _TOLERANCE_PX)
+    """Align templates to one picture, where its mask (H, 2H) is True; results are written to the
+    sightings."""
+    reach, every = 1.5 * MAX_SHIFT_PX, np.arange(len(sightings.templates))
+    patches.align(image, mask, every, sightings, reach, _MAX_STEPS, 0.02)
 
 
 def _empty_patches(num: int, settings: PatchSettings) -> PatchSet:
     """Empty storage for templates."""
-    return PatchSet(num, settings.patch_size, _WINDOW_SIGMA_SHARE, _AFFINE_SIGMA, _GREY_SIGMA)
+    # noise of 3 grey values, a window of .6 half patches
+    return PatchSet(num, settings.patch_size, 0.6, _AFFINE_SIGMA, 3.0)
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,20 +20,14 @@ _DEPTH_TOLERANCE = 0.03  # relative, of map points on one plane
 _SLOPE_SIGMA = 0.7  # of a patch's tilt, as a tangent
 _NUM_PLANE_POINTS = 8  # map points that determine a patch's plane
 _MIN_GREY, _MAX_GREY = 3, 252  # grey values beyond which a pixel counts as saturated
-_MAX_LATITUDE_RAD = np.deg2rad(80.0)  # pixels of a panorama beyond are mostly interpolated
 
 
 def pyramid(
     frames: FrameSet, frame: int, settings: PhotometricSettings, top: int
 ) -> tuple[list[np.ndarray], np.ndarray]:
-    """Grey images of a frame, level 0 to `top`, and the mask of level 0.
-
-    Level 0 is the largest within `settings.max_width`; each further one has half the width, down
-    to 64 pixels, where the levels end.
-
-    Returns:
-        (H, 2 H) float32 of each level, and (H, 2 H) bool: not masked, neither black nor saturated.
-    """
+    """Grey images (H, 2 H) float32 of a frame, level 0 to `top`, and where level 0 is not masked,
+    neither black nor saturated, (H, 2 H) bool. Level 0 is the largest within `settings.max_width`;
+    each further one has half the width, down to 64 pixels, where the levels end."""
     grey = cv2.cvtColor(load_erp(frames, frame), cv2.COLOR_RGB2GRAY).astype(np.float32)
     usable = (grey > _MIN_GREY) & (grey < _MAX_GREY)
     mask = load_usable(frames, frame)
@@ -88,7 +82,8 @@ def candidates(grey: np.ndarray, usable: np.ndarray, settings: PhotometricSettin
     open_ = cv2.erode(usable.astype(np.uint8), np.ones((border, border), np.uint8)) > 0
     open_[:, : border // 2] = open_[:, -(border // 2) :] = False  # erosion does not wrap around the
     # seam
-    score = np.where(open_ & (np.abs(latitude) < _MAX_LATITUDE_RAD), score, 0.0).ravel()
+    # beyond 80 degrees, pixels of a panorama are mostly interpolated
+    score = np.where(open_ & (np.abs(latitude) < np.deg2rad(80.0)), score, 0.0).ravel()
     order, starts = _cells(width, height, settings.spacing_deg)
     ranked = score[order]
     best = np.maximum.reduceat(ranked, starts)
@@ -116,17 +111,12 @@ def _cells(width: int, height: int, spacing_deg: float) -> tuple[np.ndarray, np.
 
 
 def lay_planes(bearings: np.ndarray, points_rig: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Inverse-depth planes of patches, fitted to map points around them.
+    """Inverse-depth planes (K, 3), 1 / map units, of patches with unit centres (K, 3), fitted to
+    points (M, 3) that the host observes, its rig frame; and (K,) bool, True if the points around
+    agree on a plane.
 
     A plane's inverse depth is linear over the tangent plane, so that a weighted linear fit to the
     nearest points estimates it; a prior on its slopes makes the patch face its host.
-
-    Args:
-        bearings: (K, 3) unit, centres of patches.
-        points_rig: (M, 3) points that the host observes, its rig frame.
-
-    Returns:
-        planes (K, 3), 1 / map units, and (K,) bool, True if the points around agree on a plane.
     """
     from scipy.spatial import KDTree
 
@@ -168,13 +158,8 @@ def table_of(
     settings: PhotometricSettings,
     lenses: Cameras,
 ) -> tuple[PatchTable, Counts]:
-    """Patches of all frames with planes from the map, and the frames near each host.
-
-    Args:
-        bearings: of each frame, (K, 3) candidates.
-        world_T_rigs: (F, 4, 4) solved poses.
-        width: of the panoramas that patches are sampled from, pixels.
-    """
+    """Patches of all frames, solved poses (F, 4, 4), with planes from the map, and the frames near
+    each host; bearings: of each frame, (K, 3) candidates; width: of the panoramas, pixels."""
     tracks = landmarks.tracks
     positions = world_T_rigs[:, :3, 3]
     hosts, centres, planes, targets = [], [], [], []

@@ -11,7 +11,6 @@ MAX_ANGLE_DEG = 45.0  # between two rays of a point
 MAX_RATIO = 1.8  # of a point's distances from two frames
 
 _kernel, _part = kernel_and_part()
-_LOG_RATIO_WEIGHT = 0.25  # weight of a squared log ratio of distances, relative to a squared angle
 
 
 def references(landmarks: Landmarks, world_T_rigs: np.ndarray) -> np.ndarray:
@@ -32,18 +31,12 @@ def visible_frames(
     rows: np.ndarray,
     extended: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Frames in which each point is searched, without its reference.
+    """Frames (O,) int64 in which points (O,) int64, by point, are searched, without their
+    references.
 
-    They are the frames of its observations, and for `extended` points those near its reference in
-    space, at any time, that see it from a similar direction and distance: the most similar first.
-
-    Args:
-        world_T_rigs: (F, 4, 4) current poses.
-        rows: (J,) reference observation of each point.
-        extended: (J,) bool, points also searched in frames without an observation.
-
-    Returns:
-        points (O,) and frames (O,), int64, by point.
+    They are the frames of a point's observations, and for points of `extended (J,)` those near its
+    reference, observation rows (J,), in space, at any time, that see it from a similar direction
+    and distance: the most similar first.
     """
     centres = np.ascontiguousarray(world_T_rigs[:, :3, 3])
     frames, points = landmarks.tracks.frames, landmarks.points_world
@@ -66,15 +59,8 @@ def visible_frames(
 def view_differences(
     one: np.ndarray, other: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Differences between pairs of views of points.
-
-    Args:
-        one, other: (N, 3) vectors between each point and either centre.
-
-    Returns:
-        Cosines (N,) of the angles between the views, ratios (N,) of the second distance to the
-        first, and dissimilarities (N,).
-    """
+    """Cosines (N,) of the angles between two views of points, ratios (N,) of their distances, and
+    their dissimilarity (N,); one, other: (N, 3) vectors between each point and either centre."""
     out = np.empty((3, len(one)))
     _differences(one, other, out)
     return out[0], out[1], out[2]
@@ -93,7 +79,7 @@ def _difference(ax, ay, az, bx, by, bz):
         return -1.0, np.inf, np.inf
     cosine = (ax * bx + ay * by + az * bz) / np.sqrt(aa * bb)
     ratio = np.sqrt(bb / aa)
-    return cosine, ratio, 2.0 * (1.0 - cosine) + _LOG_RATIO_WEIGHT * np.log(ratio) ** 2
+    return cosine, ratio, 2.0 * (1.0 - cosine) + 0.25 * np.log(ratio) ** 2
 
 
 @_kernel

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gsba.bundle.predicted_steps import step_deviations
+from gsba.bundle.map_strength import step_deviations
 from gsba.frames.masks import load_mask
 from gsba.geometry import inverse, rotation_angle, step_covariances, unit
 from gsba.log import GsbaError

@@ -16,8 +16,12 @@ from gsba.bundle import (
     stitching,
 )
 from gsba.bundle.adjustment import GATE_SCALE, AdjustmentContext
-from gsba.bundle.camera_adjustment import solve_sighted_with_camera, solve_with_camera
-from gsba.bundle.camera_system import CameraCovariances, CameraSystem
+from gsba.bundle.camera_adjustment import (
+    CameraCovariances,
+    CameraSystem,
+    solve_sighted_with_camera,
+    solve_with_camera,
+)
 from gsba.bundle.lens_axes import LensAxes
 from gsba.bundle.lens_centres import LensCentres, StitchRadius
 from gsba.bundle.readout import CameraEstimate, CameraEstimates, tracks_of_camera

@@ -10,8 +10,7 @@ import numpy as np
 
 from gsba import odometry, video
 from gsba.bundle.families import Family
-from gsba.bundle.fixes import FrameFixes
-from gsba.bundle.gps_factors import MIN_FIXES, GpsFactors
+from gsba.bundle.gps_factors import MIN_FIXES, FrameFixes, GpsFactors
 from gsba.camera.calibration import read_calibration
 from gsba.compilation import compile_ahead
 from gsba.config import RefineSettings, VideoSettings, installed_families

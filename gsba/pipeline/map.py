@@ -6,7 +6,7 @@ import numpy as np
 
 from factors.sphere_field import SphereField
 from gsba.bundle import stitching
-from gsba.bundle.camera_system import CameraCovariances
+from gsba.bundle.camera_adjustment import CameraCovariances
 from gsba.bundle.lens_axes import LensAxes
 from gsba.bundle.lens_centres import LensCentres, StitchRadius
 from gsba.bundle.readout import CameraEstimate, CameraEstimates

@@ -4,7 +4,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import replace
 
-from gsba.bundle import adjustment, predicted_steps, stitching
+from gsba.bundle import adjustment, map_strength, stitching
 from gsba.bundle.reconstruction import MIN_OBSERVATIONS
 from gsba.bundle.stitching import Stitching
 from gsba.photometric import alignment
@@ -145,7 +145,7 @@ def is_settled(before: State, state: State, number: int) -> bool:
         keypoints, context = state.map.keypoints(run.rig), state.adjustment_context()
         covariances, joint = adjustment.pose_covariances(solution, keypoints, context, prior.parts)
         former = before.solution.world_T_rigs
-        return predicted_steps.step_motion(former, solution.world_T_rigs, covariances, joint)
+        return map_strength.step_motion(former, solution.world_T_rigs, covariances, joint)
 
     moved = run.stage(f"settled_aligned{number}", run.solving_key(), compute, float)
     logger.info("aligned %d times, steps moved by %.2f sigma", number - 1, moved)

@@ -8,8 +8,7 @@ from typing import TypeVar
 import numpy as np
 
 from gsba import learned
-from gsba.bundle.bearings import Bearings, Reprojections
-from gsba.bundle.families import Families, Family
+from gsba.bundle.families import Bearings, Families, Family, Reprojections
 from gsba.bundle.trajectory_prior import GyroTurns, TrajectoryPrior
 from gsba.camera.rig import CubeRig
 from gsba.config import CameraSettings, RefineSettings

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsba.bundle.fixes import FrameFixes
+from gsba.bundle.gps_factors import FrameFixes
 from gsba.config import GpsSettings
 from gsba.frames.exif import GpsTag, read_exif
 from gsba.frames.recordings import own_timestamps

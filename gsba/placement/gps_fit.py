@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gsba.bundle.fixes import MAX_DRIFT_SHARE, FrameFixes
+from gsba.bundle.gps_factors import MAX_DRIFT_SHARE, FrameFixes
 from gsba.similarity import (
     NoSimilarityError,
     Sim3,
@@ -62,7 +62,7 @@ def fit_fixes(
 ) -> GpsFit:
     """Maximum-likelihood similarity from a map to GPS fixes with correlated errors and outliers.
 
-    Least squares with the inverse covariance of all fixes (`gsba.bundle.fixes`), initialised by
+    Least squares with the inverse covariance of all fixes (`FrameFixes.whitened`), initialised by
     `gsba.similarity.robust_similarity`. For the gate of outliers see `FrameFixes.inliers`.
 
     Args:

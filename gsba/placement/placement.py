@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from gsba.bundle.fixes import MAX_DRIFT_SHARE, FrameFixes
+from gsba.bundle.gps_factors import MAX_DRIFT_SHARE, FrameFixes
 from gsba.config import GpsSettings, PlacementSettings
 from gsba.log import GsbaError, brief
 from gsba.placement.frame_fixes import fixes_of_frames, read_fixes

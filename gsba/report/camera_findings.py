@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from gsba.bundle.camera_system import CameraSigmas
+from gsba.bundle.camera_adjustment import CameraSigmas
 from gsba.bundle.lens_axes import LensAxes
 from gsba.bundle.lens_centres import LensCentres, StitchRadius, baseline_of
 from gsba.bundle.readout import CameraEstimate

@@ -13,9 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from gsba.bundle.map_strength import neighbour_shifts, position_errors
-from gsba.bundle.predicted_steps import step_deviations
-from gsba.bundle.scale_handover import scale_changes
+from gsba.bundle.map_strength import (
+    neighbour_shifts,
+    position_errors,
+    scale_changes,
+    step_deviations,
+)
 from gsba.report.maps import MIN_SHARE_OF_A_MAP
 from gsba.types import FrameSet, PoseStatus, Reconstruction, RunStart
 

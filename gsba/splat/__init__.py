@@ -5,7 +5,6 @@ Gives Gaussians, pictures and scores, or the map refined against a splat.
 """
 
 from gsba.splat.camera import FaceCamera
-from gsba.splat.gaussians import Gaussians, from_cloud
-from gsba.splat.ply import read_ply, write_ply
+from gsba.splat.gaussians import Gaussians, from_cloud, read_ply, write_ply
 
 __all__ = ["FaceCamera", "Gaussians", "from_cloud", "read_ply", "write_ply"]

@@ -25,9 +25,7 @@ _U, _V = np.uint64(0), np.uint64(_PIXELS)  # rows of a tile's buffer: pixel cent
 _T, _C = np.uint64(2 * _PIXELS), np.uint64(3 * _PIXELS)  # transmittance, five channels,
 _REST = np.uint64(8 * _PIXELS)  # and the rest of the loss's slope from splats behind
 _P = np.uint64(_PIXELS)
-_ENTRIES_BETWEEN_CHECKS = 16  # entries between tests for a full tile
 _ZERO, _ONE, _HALF, _LOG2E = (np.float32(x) for x in (0, 1, 0.5, 1.4426950408889634))
-_MIN_EXPONENT = np.float32(-80.0)
 _EXP2 = tuple(np.float32(np.log(2) ** k / f) for k, f in enumerate((1, 1, 2, 6, 24, 120, 720)))
 _E1, _E2, _E3, _E4, _E5, _E6 = _EXP2[1:]
 
@@ -63,7 +61,7 @@ def _power_of_two(typing_context, value):
 @_part
 def _exp(x):
     """Exponential of a float32 <= 0, to a relative 1.2e-7 (2 - x); e^-80 for anything less."""
-    t = max(min(x, _ZERO), _MIN_EXPONENT) * _LOG2E
+    t = max(min(x, _ZERO), np.float32(-80.0)) * _LOG2E
     n = _nearest_whole(t)  # type: ignore[call-arg]
     f = t - n
     series = _ONE + f * (_E1 + f * (_E2 + f * (_E3 + f * (_E4 + f * (_E5 + f * _E6)))))
@@ -228,7 +226,7 @@ def blend_tiles(splats, reach2, starts, owners, num_columns, image, used, first,
         buffer[3 * _PIXELS :] = _ZERO
         row = starts[tile]
         while row < starts[tile + 1]:
-            if (row - starts[tile]) % _ENTRIES_BETWEEN_CHECKS == 0 and _is_full(buffer):
+            if (row - starts[tile]) % 16 == 0 and _is_full(buffer):
                 break
             g = owners[row]
             begin, end = _pixel_rows(splats[g], reach2[g], top)

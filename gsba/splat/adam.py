@@ -56,12 +56,7 @@ class Moments:
 def step(
     gaussians: Gaussians, gradients: Gaussians, moments: Moments, rates: Rates, count: int
 ) -> None:
-    """Move all parameters in place by one step.
-
-    Args:
-        gaussians, gradients, moments: of equal shapes; gaussians and moments are changed.
-        count: number of this step, from 1.
-    """
+    """Move all parameters in place by one step, the count-th from 1; moments change, too."""
     correction1, correction2 = 1 - BETA1**count, np.sqrt(1 - BETA2**count)
     for entry in fields(Gaussians):
         rate = getattr(rates, entry.name)

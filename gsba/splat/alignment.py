@@ -25,7 +25,6 @@ from gsba.types import FrameSet
 MIN_ALPHA = 0.95  # least alpha of a rendered pixel that is used
 MAX_STEP = 0.1  # relative depth step between neighbouring pixels from which they are an edge
 _LUMA = np.array([0.299, 0.587, 0.114])
-_CAPTURED_HFOV_DEG = 100.0  # of captured faces, so that samples beyond a rendered edge find pixels
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,15 +86,8 @@ def splat_block(
     backend: Backend,
     loss: RobustLoss | None = None,
 ) -> SplatBlock:
-    """The block of captured frames against a fixed splat.
-
-    Args:
-        gaussians: the splat, in the world of the poses.
-        captured: frames; keys are graph.X(frame). Coarse to fine is one block after another.
-        near: least z of a Gaussian, map units.
-        backend: the renderer.
-        loss: see `factors.splat.SplatBlock`.
-    """
+    """The block of captured frames, keys X(frame), against a fixed splat in the world of the poses;
+    near: least z of a Gaussian, map units. Coarse to fine is one block after another."""
     views, turns = captured.views, captured.turns
     rotations, centres = (
         np.stack([v.rig_R_view for v in views]),
@@ -122,18 +114,19 @@ def render_view(
     near: float,
     backend: Backend,
 ) -> RenderedView:
-    """Opaque pixels of all views, as points with grey values.
-
-    Args:
-        world_T_rig: (4, 4) pose to render from.
-        views: views of that rig.
-    """
+    """Opaque pixels of views of a rig at a pose (4, 4), as points with grey values."""
     points, greys = [], []
     cameras = rig_cameras(world_T_rig, views)
     images = backend.render(gaussians, cameras, None, near)
     for camera, image in zip(cameras, images, strict=True):
         grid = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-        sure = (image.alpha > MIN_ALPHA) & ~_edges(image.depth)
+        # at a step, the expected depth is of neither side
+        low, high = image.depth.copy(), image.depth.copy()
+        for axis in (0, 1):
+            for shift in (1, -1):
+                other = np.roll(image.depth, shift, axis)
+                low, high = np.minimum(low, other), np.maximum(high, other)
+        sure = (image.alpha > MIN_ALPHA) & ~(high - low > MAX_STEP * np.maximum(image.depth, 1e-9))
         depth = image.depth[sure].astype(np.float64)
         offsets = (np.stack(grid, axis=-1)[sure] - camera.principal) / camera.focal
         local = np.column_stack([offsets, np.ones(len(offsets))]) * depth[:, None]
@@ -141,16 +134,6 @@ def render_view(
         # The scene behind a pixel that is not quite opaque is unknown: its share is left out.
         greys.append((image.color[sure] @ _LUMA) / image.alpha[sure])
     return RenderedView(np.concatenate(points), np.concatenate(greys))
-
-
-def _edges(depth: np.ndarray) -> np.ndarray:
-    """Pixels (H, W) bool at a step of the depth, where the expected depth is of neither side."""
-    low, high = depth.copy(), depth.copy()
-    for axis in (0, 1):
-        for shift in (1, -1):
-            other = np.roll(depth, shift, axis)
-            low, high = np.minimum(low, other), np.maximum(high, other)
-    return high - low > MAX_STEP * np.maximum(depth, 1e-9)
 
 
 def _captured_rig(frames: FrameSet, size: int) -> CubeRig:
@@ -163,7 +146,7 @@ def _captured_rig(frames: FrameSet, size: int) -> CubeRig:
 
 
 def _wide_rig(size: int) -> CubeRig:
-    hfov = np.deg2rad(_CAPTURED_HFOV_DEG)
+    hfov = np.deg2rad(100.0)  # samples beyond a rendered edge find pixels
     return CubeRig(round(size * np.tan(hfov / 2)), hfov)
 
 

@@ -67,16 +67,10 @@ class CpuBackend:
         near: float,
         ssim_weight: float,
     ) -> None:
-        """Take a step of Adam for each lesson, down `gsba.splat.metrics.training_loss` times the
-        view's share of a face, so that pixels of all views weigh equally.
-
-        Args:
-            gaussians, moments: changed in place.
-            pull: changed in place: each view is added; None = not recorded.
-            lessons: training views, in this order.
-            near: least z of a Gaussian, map units.
-            ssim_weight: see `training_loss`.
-        """
+        """Take a step of Adam for each lesson, in this order, down
+        `gsba.splat.metrics.training_loss` times the view's share of a face, so that pixels of all
+        views weigh equally. Gaussians, moments and pull (None = not recorded), to which each view
+        is added, change in place; near: least z of a Gaussian, map units."""
         for lesson in lessons:
             found = self.gradients(gaussians, lesson, near, ssim_weight)
             adam.step(gaussians, found.gaussians, moments, lesson.rates, lesson.number)
@@ -94,15 +88,8 @@ class CpuBackend:
 
 
 def choose_backend(name: str, num_threads: int | None = None) -> Backend:
-    """The renderer with a name.
-
-    Args:
-        name: "cpu", "gsplat", or "auto": gsplat if it and a CUDA device are available.
-        num_threads: of the CPU renderer; None = all cores.
-
-    Raises:
-        GsbaError: gsplat is requested and cannot be used.
-    """
+    """The renderer "cpu", "gsplat", or "auto": gsplat if it and a CUDA device are available;
+    num_threads: of the CPU, None = all cores. GsbaError: gsplat is requested and cannot be used."""
     if name == "cpu":
         return CpuBackend(num_threads)
     from gsba.splat.gpu import GsplatBackend

@@ -25,13 +25,8 @@ class Pull:
         return cls(np.zeros(num, np.float32), np.zeros(num, np.float32))
 
     def add(self, centres: np.ndarray, seen: np.ndarray, focal: float) -> None:
-        """Add one view, in place.
-
-        Args:
-            centres: (N, 2) gradients per pixel.
-            seen: (N,) bool, Gaussians rendered in the view.
-            focal: focal length, pixels: half the width of a face.
-        """
+        """Add one view, in place: centres (N, 2) gradients per pixel, seen (N,) bool, Gaussians
+        rendered in the view, and its focal length in pixels: half the width of a face."""
         self.sums[:] += focal * np.hypot(centres[:, 0], centres[:, 1])
         self.counts[:] += seen
 
@@ -54,11 +49,8 @@ def densify(
     limits: DensityLimits,
     rng: np.random.Generator,
 ) -> tuple[Gaussians, Moments, bool]:
-    """Clone small and split large Gaussians with strong gradients, then prune.
-
-    Returns:
-        The Gaussians, their moments (zero for new ones), and True if the limit kept some out.
-    """
+    """Clone small and split large Gaussians with strong gradients, then prune. Returns them, their
+    moments (zero for new ones), and True if the limit kept some out."""
     strength = pull.sums / np.maximum(pull.counts, 1)
     chosen = np.flatnonzero(strength >= limits.pull)
     room = max(limits.max_gaussians - len(gaussians), 0)

@@ -27,15 +27,8 @@ if TYPE_CHECKING:
 
 
 class GsplatBackend:
-    """Renders and trains by gsplat and PyTorch.
-
-    Args:
-        device: device of PyTorch.
-
-    Raises:
-        GsbaError: torch or gsplat is not installed, or there is no CUDA device, or its kernels
-            are missing.
-    """
+    """Renders and trains by gsplat and PyTorch on a device. GsbaError: torch or gsplat is not
+    installed, or there is no CUDA device, or its kernels are missing."""
 
     name, stretch = "gsplat", 100
 

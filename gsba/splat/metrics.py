@@ -15,25 +15,17 @@ _C1, _C2 = 0.01**2, 0.03**2
 
 
 def psnr(image: np.ndarray, truth: np.ndarray, use: np.ndarray | None = None) -> float:
-    """Peak signal-to-noise ratio in dB over all pixels together; inf for equal images.
-
-    Args:
-        image, truth: (..., C), values 0..1.
-        use: (...) bool, pixels that count; None = all. At least one.
-    """
+    """Peak signal-to-noise ratio in dB over all pixels of images (..., C), values 0..1, that are in
+    `use (...)`, at least one, None = all; inf for equal images."""
     error = (np.asarray(image, np.float64) - truth) ** 2
     mean = float(np.mean(error if use is None else error[use]))
     return float("inf") if mean == 0 else -10 * float(np.log10(mean))
 
 
 def ssim(image: np.ndarray, truth: np.ndarray, use: np.ndarray | None = None) -> float:
-    """Mean structural similarity over the pixels whose window lies inside the image.
-
-    Args:
-        image, truth: (H, W, C), values 0..1, at least 11 pixels high and wide.
-        use: (H, W) bool, pixels that count; the others count as equal in both images, and
-            NaN is returned if no pixel with a whole window counts.
-    """
+    """Mean structural similarity of images (H, W, C), values 0..1, at least 11 pixels high and
+    wide, over the pixels whose window lies inside. Pixels not in `use (H, W)` count as equal in
+    both, and NaN is returned if no pixel with a whole window counts."""
     x, y = np.asarray(image, np.float64), np.asarray(truth, np.float64)
     if use is not None:
         x = np.where(use[..., None], x, y)
@@ -50,15 +42,9 @@ def ssim(image: np.ndarray, truth: np.ndarray, use: np.ndarray | None = None) ->
 def training_loss(
     image: np.ndarray, truth: np.ndarray, use: np.ndarray | None, ssim_weight: float
 ) -> tuple[float, np.ndarray]:
-    """The loss (1 - w) L1 + w (1 - SSIM) of 3DGS, and its derivative (H, W, C) by the image.
-
-    SSIM is computed at every pixel, with black around the image, like the published trainer.
-
-    Args:
-        image, truth: (H, W, C) float32.
-        use: (H, W) bool, pixels that count (black in both elsewhere); None = all.
-        ssim_weight: w, 0..1.
-    """
+    """The loss (1 - w) L1 + w (1 - SSIM) of 3DGS for images (H, W, C) float32, and its derivative
+    by the first. SSIM is computed at every pixel, with black around the image, like the published
+    trainer; pixels not in `use (H, W)` are black in both."""
     if use is not None:
         image, truth = image * use[..., None], truth * use[..., None]
     difference = image - truth
@@ -71,14 +57,9 @@ def training_loss(
 
 
 def similarity(x: _Image, y: _Image, blur: Callable[[_Image], _Image]) -> tuple[_Image, _Image]:
-    """SSIM (H, W, C) at every pixel, and the derivative (H, W, C) of its sum by x.
-
-    The window is its own adjoint, so that the derivative takes three more passes of it.
-
-    Args:
-        x, y: (H, W, C), of NumPy or PyTorch.
-        blur: by `window` along both axes, with black around the image.
-    """
+    """SSIM (H, W, C) at every pixel of images of NumPy or PyTorch, and the derivative (H, W, C) of
+    its sum by x; blur: by `window` along both axes, with black around the image. The window is its
+    own adjoint, so that the derivative takes three more passes of it."""
     mean_x, mean_y = blur(x), blur(y)
     a1, b1 = 2 * mean_x * mean_y + _C1, mean_x**2 + mean_y**2 + _C1
     a2 = 2 * (blur(x * y) - mean_x * mean_y) + _C2

@@ -12,8 +12,6 @@ from gsba.splat.camera import rig_cameras
 from gsba.splat.gaussians import Gaussians
 from gsba.types import FACES
 
-_PANORAMA_HFOV_DEG = 94.0  # of the faces that a panorama is sampled from
-
 
 def render_views(
     gaussians: Gaussians,
@@ -24,19 +22,17 @@ def render_views(
 ) -> list[np.ndarray]:
     """Each view of a rig, (height, width, 3) uint8 RGB."""
     renderings = backend.render(gaussians, rig_cameras(world_T_rig, views), None, near)
-    return [to_uint8(rendering.color) for rendering in renderings]
+    return [(np.clip(one.color, 0, 1) * 255 + 0.5).astype(np.uint8) for one in renderings]
 
 
 def render_panorama(
     gaussians: Gaussians, world_T_rig: np.ndarray, width: int, near: float, backend: Backend
 ) -> np.ndarray:
-    """An equirectangular image (width / 2, width, 3) uint8 RGB as seen from the rig's centre.
-
-    It is sampled from wider faces.
-    """
+    """An equirectangular image (width / 2, width, 3) uint8 RGB as seen from the rig's centre,
+    sampled from wider faces."""
     import cv2
 
-    hfov = np.deg2rad(_PANORAMA_HFOV_DEG)
+    hfov = np.deg2rad(94.0)  # of the faces that a panorama is sampled from
     rig = CubeRig(round(width / np.pi * np.tan(hfov / 2)), hfov)  # as dense as the equator
     faces = render_views(gaussians, world_T_rig, rig_views(rig), near, backend)
     height = width // 2
@@ -49,8 +45,3 @@ def render_panorama(
         sampled = cv2.remap(faces[face], at[..., 0], at[..., 1], cv2.INTER_LINEAR)
         image[owners == face] = sampled[owners == face]
     return image
-
-
-def to_uint8(color: np.ndarray) -> np.ndarray:
-    """Colours 0..1 as 0..255, clipped and rounded."""
-    return (np.clip(color, 0, 1) * 255 + 0.5).astype(np.uint8)

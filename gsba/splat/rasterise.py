@@ -62,18 +62,9 @@ def render(
     near: float = 1e-2,
     num_threads: int | None = None,
 ) -> tuple[Rendering, Tape]:
-    """Render a splat.
-
-    Args:
-        gaussians: the splat.
-        camera: a pinhole image.
-        sh_degree: highest degree of harmonics to use; None = all.
-        near: least z of a Gaussian's mean, map units.
-        num_threads: None = all cores. Results do not depend on it.
-
-    Returns:
-        The image, and the tape for `differentiate`.
-    """
+    """The image of a splat, and the tape for `differentiate`; sh_degree: highest degree of
+    harmonics to use, None = all; near: least z of a Gaussian's mean, map units. Results do not
+    depend on the number of threads, None = all cores."""
     degree = gaussians.usable_degree(sh_degree)
     num = len(gaussians)
     across, down = (-(-pixels // _tiles.TILE) for pixels in (camera.width, camera.height))
@@ -111,15 +102,8 @@ def differentiate(
     d_alpha: np.ndarray | None = None,
     num_threads: int | None = None,
 ) -> Gradients:
-    """Gradients of a loss from its derivatives with respect to a rendering.
-
-    Args:
-        tape: tape of that rendering.
-        d_color: (H, W, 3).
-        d_depth: (H, W), with respect to the expected depth; None = zero.
-        d_alpha: (H, W); None = zero.
-        num_threads: None = all cores.
-    """
+    """Gradients of a loss from its derivatives by a rendering's colour (H, W, 3), and by its
+    expected depth and alpha (H, W), None = zero; tape: of that rendering."""
     image, slopes = tape.image, np.zeros_like(tape.image)
     inside = np.s_[:, : tape.camera.height, : tape.camera.width]
     shown, sloped = image[inside], slopes[inside]

@@ -38,7 +38,6 @@ from gsba.splat.train import TrainingState, advance, begin
 from gsba.store.records import load_checkpoint, save_record
 from gsba.types import Counts, FrameSet, Keypoints, Landmarks, Round, Solution
 
-_SOLVER_STEPS = 2  # Levenberg-Marquardt steps in a move
 _SH_DEGREE = 1  # of colours: low, so that views must agree on them
 
 logger = logging.getLogger(__name__)
@@ -95,16 +94,9 @@ def refine(
     key: str = "",
     optics: Optics = ONE_EYE,
 ) -> SplatResult:
-    """Refine a solved map against splats of its own frames, from coarse faces to fine.
-
-    Args:
-        frames: panoramas or cube faces; all their faces are held in memory, one size at a time.
-        keypoints: keypoints of all frames.
-        start: the solved map.
-        context: priors, families, loss, solver, splat; its threads render, too.
-        checkpoint: file to store finished turns in and to resume from; None = none.
-        key: digest of the inputs; a checkpoint with another key is not resumed.
-        optics: lenses of the frames.
+    """Refine a solved map against splats of its own frames, from coarse faces to fine; all faces
+    are held in memory, one size at a time. Finished turns are stored in a checkpoint and resumed
+    from it, if its key, a digest of the inputs, is this one.
 
     Raises:
         GsbaError: all frames are masked, or the splat is no longer finite.
@@ -121,7 +113,11 @@ def refine(
     turns = _Turns(keypoints, start, context, split)
     progress = load_checkpoint(checkpoint, key, _Progress, "the splat refinement starts anew")
     if progress is None:
-        cloud = _cloud(start.landmarks, keypoints, _SH_DEGREE)
+        points, rows = start.landmarks.tracks.points, keypoints.rows(start.landmarks.tracks)
+        lengths = np.bincount(points, minlength=len(start.landmarks.points_world))
+        sums = [np.bincount(points, keypoints.colors[rows, c], len(lengths)) for c in range(3)]
+        colors = np.rint(np.column_stack(sums) / np.maximum(lengths, 1)[:, None]).astype(np.uint8)
+        cloud = from_cloud(start.landmarks.points_world, colors, _SH_DEGREE)
         first = begin(cloud, turns.training(0))
         progress = _Progress(0, -1, start.world_T_rigs, first, (), ())
     else:
@@ -136,15 +132,6 @@ def refine(
                 break
         progress = replace(progress, level=progress.level + 1, turns=-1)
     return SplatResult(turns.adjusted(progress), (counts,), progress.moves)
-
-
-def _cloud(landmarks: Landmarks, keypoints: Keypoints, sh_degree: int) -> Gaussians:
-    """Gaussians at the map's points, in the mean colours of their observations."""
-    points, rows = landmarks.tracks.points, keypoints.rows(landmarks.tracks)
-    lengths = np.bincount(points, minlength=len(landmarks.points_world))
-    sums = [np.bincount(points, keypoints.colors[rows, c], len(lengths)) for c in range(3)]
-    colors = np.rint(np.column_stack(sums) / np.maximum(lengths, 1)[:, None]).astype(np.uint8)
-    return from_cloud(landmarks.points_world, colors, sh_degree)
 
 
 class _Turns:
@@ -202,18 +189,31 @@ class _Turns:
         costs = [self._point_costs(poses), self._point_costs(moved)]
         gains, savings = looks[1] - looks[0], costs[0] - costs[1]
         total, later = max(float(costs[0].sum()), 1e-12), float(costs[1].sum())
-        growth, chance = later / total, self._chance_gain(min(total, later))
+        seen = self.solved.landmarks.tracks
+        unknowns = 6 * len(np.unique(seen.frames))
+        redundancy = 2 * len(seen) - 3 * seen.num_points - unknowns
+        growth = later / total
+        chance = unknowns * min(total, later) / redundancy if redundancy > 0 else np.inf
         evidence = together(score(gains), score(savings, chance))
         after = self._placed(moved)
         accepted = evidence > chosen.min_sigmas and growth <= chosen.max_growth
         least = MIN_OBSERVATIONS
         accepted &= replace(self.solved, landmarks=after).carries(self.solved, least)
+        turns = np.einsum("fji,fjk->fik", poses[:, :3, :3], moved[:, :3, :3])
+        cosines = (np.trace(turns, axis1=1, axis2=2) - 1) / 2
+        shifts = np.linalg.norm(moved[:, :3, 3] - poses[:, :3, 3], axis=1)
+        angles = np.degrees(np.arccos(np.clip(cosines, -1, 1)))
         move = PoseMove(
             settings.face_size, float(looks[0].mean()), float(looks[1].mean()),
             standard_error(gains), growth, len(savings) * standard_error(savings) / total,
-            evidence, *_median_move(poses, moved), accepted,
+            evidence, float(np.median(angles)), float(np.median(shifts)), accepted,
         )  # fmt: skip
-        _log(move)
+        logger.info(
+            "faces of %d px: held out %+.4f dB (standard error %.4f), cost of observations times "
+            "%.4f (%.4f): evidence %+.1f, %s",
+            move.size, move.psnr_moved - move.psnr_stayed, move.psnr_sigma, move.growth,
+            move.growth_sigma, move.evidence, "accepted" if move.accepted else "undone",
+        )  # fmt: skip
         tracks = self.solved.landmarks.tracks
         note = Round(
             self._gate(), self.solved.noise, len(tracks), tracks.num_points, len(after.tracks),
@@ -248,7 +248,7 @@ class _Turns:
         terms = self.context.beside(greys).terms(replace(self.solved, world_T_rigs=world_T_rigs))
         values, landmarks = terms.values, self._block()
         landmarks.polish(values)
-        solver = settings.solver.model_copy(update={"max_iterations": _SOLVER_STEPS})
+        solver = settings.solver.model_copy(update={"max_iterations": 2})
         result = optimize(terms.graph, values, [landmarks, *terms.blocks], solver)
         return adjustment.poses_of(result.values, len(world_T_rigs)), result
 
@@ -267,13 +267,6 @@ class _Turns:
             losses = block.loss.rho(np.einsum("oi,oi->o", residuals, residuals))
             costs += np.bincount(term.points, losses, len(costs))
         return costs
-
-    def _chance_gain(self, cost: float) -> float:
-        """Part of a cost of observations that fitting all poses to noise gains by chance."""
-        tracks = self.solved.landmarks.tracks
-        unknowns = 6 * len(np.unique(tracks.frames))
-        redundancy = 2 * len(tracks) - 3 * tracks.num_points - unknowns
-        return unknowns * cost / redundancy if redundancy > 0 else np.inf
 
     def _trained(
         self, state: TrainingState, world_T_rigs: np.ndarray, settings: SplatSettings, steps: int
@@ -305,24 +298,6 @@ class _Turns:
         return rounds[-1].gate_sigmas if rounds else np.inf
 
 
-def _log(move: PoseMove) -> None:
-    gain, verdict = move.psnr_moved - move.psnr_stayed, "accepted" if move.accepted else "undone"
-    logger.info(
-        "faces of %d px: held out %+.4f dB (standard error %.4f), cost of observations times %.4f "
-        "(%.4f): evidence %+.1f, %s",
-        move.size, gain, move.psnr_sigma, move.growth, move.growth_sigma, move.evidence, verdict,
-    )  # fmt: skip
-
-
-def _median_move(before: np.ndarray, after: np.ndarray) -> tuple[float, float]:
-    """Median rotation in degrees and median translation in map units between poses (F, 4, 4)."""
-    turns = np.einsum("fji,fjk->fik", before[:, :3, :3], after[:, :3, :3])
-    cosines = (np.trace(turns, axis1=1, axis2=2) - 1) / 2
-    shifts = np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1)
-    angles = np.degrees(np.arccos(np.clip(cosines, -1, 1)))
-    return float(np.median(angles)), float(np.median(shifts))
-
-
 def standard_error(differences: np.ndarray) -> float:
     """Standard error of the mean of differences (N,); infinite for a single one."""
     num = len(differences)
@@ -330,14 +305,9 @@ def standard_error(differences: np.ndarray) -> float:
 
 
 def score(differences: np.ndarray, chance: float = 0.0) -> float:
-    """Significance of a positive sum of differences (N,), in standard errors.
-
-    Few differences determine their spread poorly: their t is mapped to the normal score of equal
-    probability (Wallace, Bounds on normal approximations, 1959).
-
-    Args:
-        chance: part of the sum that chance explains; only the excess counts.
-    """
+    """Significance of a positive sum of differences (N,) beyond what chance explains, in standard
+    errors. Few differences determine their spread poorly: their t is mapped to the normal score of
+    equal probability (Wallace, Bounds on normal approximations, 1959)."""
     total, num = float(differences.sum()), len(differences)
     beyond, spread = max(abs(total) - chance, 0.0), num * standard_error(differences)
     if beyond == 0 or not np.isfinite(spread):

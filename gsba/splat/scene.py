@@ -19,8 +19,6 @@ from gsba.splat.gaussians import Gaussians, from_cloud
 from gsba.splat.train import Images, Views, extent_of
 from gsba.types import FrameSet, Landmarks, PoseStatus, Reconstruction, Tracks
 
-_GATE_RAD = np.deg2rad(3.0)  # largest angle of an observation to its point, under poses that may
-# have drifted
 _MAX_OVERSAMPLING = 8  # largest number of samples of a panorama along a pixel of a face
 
 
@@ -47,15 +45,8 @@ class Split:
 
 
 def split_frames(usable: np.ndarray, every: int) -> Split:
-    """Hold out whole panoramas, as exports do.
-
-    Args:
-        usable: (F,) bool.
-        every: 2 or more.
-
-    Raises:
-        GsbaError: too few frames for both parts.
-    """
+    """Hold out every n-th of the usable panoramas (F,), n at least 2, as exports do. GsbaError: too
+    few frames for both parts."""
     rows = np.flatnonzero(usable)
     held = held_out_rows(len(rows), every)
     if len(rows) - len(held) < 2:
@@ -69,12 +60,7 @@ def refined_frames(reconstruction: Reconstruction) -> np.ndarray:
 
 
 def load_faces(frames: FrameSet, which: np.ndarray, size: int, optics: Optics = ONE_EYE) -> Faces:
-    """Faces of some frames (W,): six of 90 degrees, or those of one lens each.
-
-    Args:
-        size: pixels of a whole face.
-        optics: lenses of the frames.
-    """
+    """Faces of some frames (W,): six of 90 degrees, of `size` pixels, or those of one lens each."""
     rig, images, use = CubeRig(size, np.pi / 2), [], []
     views = optics.views(size)
     for f in track(which, "cutting faces", total=len(which)):
@@ -89,13 +75,11 @@ def load_faces(frames: FrameSet, which: np.ndarray, size: int, optics: Optics = 
 
 
 def cut_faces(frames: FrameSet, frame: int, rig: CubeRig) -> tuple[np.ndarray, np.ndarray | None]:
-    """Faces whose pixels are means over their area, like a renderer's.
+    """Faces (6, size, size, 3) uint8 RGB whose pixels are means over their area, like a renderer's,
+    and their masks, bool or None.
 
     Sampling a panorama shrunk to the density of a face's middle would blur the face's corners,
     where three times as many pixels share an angle.
-
-    Returns:
-        (6, size, size, 3) uint8 RGB, and their masks, bool or None.
     """
     kind = frames.format_of(frame)
     if not kind.panoramic:
@@ -208,7 +192,7 @@ def start_cloud(
         reconstruction, world_T_rigs, frames: see `place_points`.
         sh_degree: highest degree of the Gaussians' harmonics.
     """
-    landmarks, known = place_points(reconstruction, world_T_rigs, frames, float(_GATE_RAD))
+    landmarks, known = place_points(reconstruction, world_T_rigs, frames, float(np.deg2rad(3.0)))
     return from_cloud(landmarks.points_world, reconstruction.point_colors[known], sh_degree)
 
 

@@ -25,11 +25,6 @@ from gsba.store.records import load_checkpoint, save_record
 
 logger = logging.getLogger(__name__)
 
-_PUBLISHED_STEPS = 30_000  # steps of the published schedule
-_PARAMETER_COPIES = 8  # copies of all parameters in memory: gradients, two moments, and those of
-# density control
-_STEPS_BETWEEN_CHECKS = 20  # steps between checks for values that are not finite, at ends of
-# stretches
 
 Images = Sequence[np.ndarray] | np.ndarray  # of individual sizes, or of one size
 
@@ -82,7 +77,7 @@ class Times:
 
 def times_for(iterations: int) -> Times:
     """The published schedule, scaled to a number of steps."""
-    scale = iterations / _PUBLISHED_STEPS
+    scale = iterations / 30_000  # steps of the published schedule
     return Times(
         densify_from=max(round(500 * scale), 100),
         densify_until=iterations // 2,
@@ -90,12 +85,6 @@ def times_for(iterations: int) -> Times:
         reset_every=max(round(3000 * scale), 3000),  # short trainings cannot recover from a reset
         degree_every=max(round(1000 * scale), 1),
     )
-
-
-def extent_of(places: np.ndarray) -> float:
-    """Radius of the region of cameras at (N, 3), times 1.1; 1 for a single place."""
-    radius = float(np.linalg.norm(places - places.mean(axis=0), axis=1).max())
-    return 1.1 * radius if radius > 0 else 1.0
 
 
 def train(
@@ -135,7 +124,7 @@ def train(
             continue  # made together with an earlier one
         state = trainer.advance(state, settings.iterations)
         last = state.step == settings.iterations
-        if state.step % _STEPS_BETWEEN_CHECKS == 0 or last:
+        if state.step % 20 == 0 or last:
             _require_finite(state, checkpoint)
         if watch is not None:
             watch(state.step, state.gaussians)
@@ -202,20 +191,21 @@ def most_gaussians(views: Views, settings: SplatSettings, backend: Backend) -> t
     num = num_parameters(settings.sh_degree)
     pixels = views.num_pixels
     determined = max(3 * pixels // num, 1)
-    held = max(
-        backend.memory_bytes // 2 // (_PARAMETER_COPIES * np.dtype(np.float32).itemsize * num), 1
-    )
+    # 8 copies: gradients, two moments, and those of density control
+    held = max(backend.memory_bytes // 2 // (8 * np.dtype(np.float32).itemsize * num), 1)
     if determined <= held:
         return determined, f"that {pixels} pixels determine"
     return held, f"that half of {backend.memory_bytes / 1e9:.1f} GB of memory holds"
 
 
-class Trainer:
-    """Inputs that are constant over all steps.
+def extent_of(places: np.ndarray) -> float:
+    """Radius of the region of cameras at (N, 3), times 1.1; 1 for a single place."""
+    radius = float(np.linalg.norm(places - places.mean(axis=0), axis=1).max())
+    return 1.1 * radius if radius > 0 else 1.0
 
-    Raises:
-        GsbaError: all pixels are masked.
-    """
+
+class Trainer:
+    """Inputs that are constant over all steps. GsbaError: all pixels are masked."""
 
     def __init__(self, views: Views, settings: SplatSettings, backend: Backend) -> None:
         if views.num_pixels == 0:
@@ -232,7 +222,10 @@ class Trainer:
         place."""
         settings, times = self.settings, self.times
         gaussians, moments, pull = state.gaussians, state.moments, state.pull
-        step = self._stop(state.step, end)
+        due = self.times
+        rhythms = (self.backend.stretch, due.densify_every, due.reset_every)
+        stops = [end, *(state.step // every * every + every for every in rhythms)]
+        step = min([*stops, due.densify_until] if state.step < due.densify_until else stops)
         lessons = (self._lesson(number) for number in range(state.step + 1, step + 1))
         wanted = settings.densify and step <= times.densify_until
         self.backend.descend(
@@ -246,43 +239,29 @@ class Trainer:
                 gaussians, moments = reset_opacity(gaussians, moments)
         return TrainingState(step, gaussians, moments, pull)
 
-    def _stop(self, step: int, end: int) -> int:
-        """The next step at which density control may be due, or the end of the stretch."""
-        times = self.times
-        rhythms = (self.backend.stretch, times.densify_every, times.reset_every)
-        stops = [end, *(step // every * every + every for every in rhythms)]
-        return min([*stops, times.densify_until] if step < times.densify_until else stops)
-
     def _lesson(self, number: int) -> Lesson:
         """The view and rates of a step, counted from 1."""
-        views, view = self.views, self._view(number - 1)
+        turn, place = divmod(number - 1, len(self.views.cameras))
+        draw = np.random.default_rng([self.settings.seed, turn])
+        views, view = self.views, int(draw.permutation(len(self.views.cameras))[place])
+        settings = self.settings
+        done = number / settings.iterations
+        means = settings.rate_means ** (1 - done) * settings.rate_means_end**done
+        fade = settings.rate_fade**done
         return Lesson(
             views.cameras[view],
             views.images[view],
             None if views.use is None else views.use[view],
             min((number - 1) // self.times.degree_every, self.settings.sh_degree),
-            self._rates(number),
+            adam.Rates(
+                means=means * self.extent,
+                log_scales=fade * settings.rate_scales,
+                quaternions=fade * settings.rate_rotations,
+                opacity_logits=fade * settings.rate_opacities,
+                sh=fade * settings.rate_colors,
+                sh_rest=fade * settings.rate_colors / 20,
+            ),
             number,
-        )
-
-    def _view(self, step: int) -> int:
-        """Index of the view shown at a step."""
-        turn, place = divmod(step, len(self.views.cameras))
-        draw = np.random.default_rng([self.settings.seed, turn])
-        return int(draw.permutation(len(self.views.cameras))[place])
-
-    def _rates(self, step: int) -> adam.Rates:
-        settings = self.settings
-        done = step / settings.iterations
-        means = settings.rate_means ** (1 - done) * settings.rate_means_end**done
-        fade = settings.rate_fade**done
-        return adam.Rates(
-            means=means * self.extent,
-            log_scales=fade * settings.rate_scales,
-            quaternions=fade * settings.rate_rotations,
-            opacity_logits=fade * settings.rate_opacities,
-            sh=fade * settings.rate_colors,
-            sh_rest=fade * settings.rate_colors / 20,
         )
 
     def _densify(self, state: TrainingState, step: int) -> tuple[Gaussians, adam.Moments]:

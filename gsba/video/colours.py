@@ -11,11 +11,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-_UNSPECIFIED = 2  # AVCOL_SPC_UNSPECIFIED
 _FULL_RANGE = np.clip(np.rint((np.arange(256) - 16) * 255 / 219), 0, 255).astype(np.uint8)  # grey
 # values of a limited-range luma
 _PQ, _HLG = 16, 18  # transfer characteristics of ITU-T H.273, table 3
-_WIDE = 9  # colour primaries of BT.2020 in H.273, table 2
 _LEVELS = 1 << 12  # of the tables below: 16 bits are cut to 12
 _BT709_BY_BT2020 = np.array(
     [[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]],
@@ -48,8 +46,9 @@ def bgr(frame: Any) -> np.ndarray:
     """Colours (H, W, 3) uint8 BGR of an av.VideoFrame, sRGB; the default matrix is BT.709."""
     from av.video.reformatter import Colorspace
 
-    matrix = Colorspace.ITU709 if int(frame.colorspace) == _UNSPECIFIED else None
-    transfer, wide = int(frame.color_trc), int(frame.color_primaries) == _WIDE
+    matrix = Colorspace.ITU709 if int(frame.colorspace) == 2 else None  # AVCOL_SPC_UNSPECIFIED
+    # BT.2020 (H.273, table 2)
+    transfer, wide = int(frame.color_trc), int(frame.color_primaries) == 9
     if not (hdr_name(transfer) or wide):
         return frame.reformat(format="bgr24", src_colorspace=matrix).to_ndarray()
     signal = frame.reformat(format="rgb48le", src_colorspace=matrix).to_ndarray()

@@ -68,20 +68,12 @@ class _Kept:
 
 
 def extract(video: Path, out: Path, settings: VideoSettings, replace: bool = False) -> Counts:
-    """Write frames of a 360-degree video to a folder that `gsba.frames.scan` reads.
+    """Write frames of a 360-degree video, 2:1, GoPro's `.360`, or raw of two lenses (see
+    `gsba.video.recording`), either file of a pair, to a folder that `gsba.frames.scan` reads;
+    returns numbers of frames in the range, of kept frames, and of dropped ones by reason.
 
     Times are the container's presentation times since the first frame, also for variable frame
-    rates. An interrupted call resumes.
-
-    Args:
-        video: H.264, H.265 or another codec that FFmpeg decodes: 2:1, GoPro's `.360`, or raw of two
-            lenses (see `gsba.video.recording`), either file of a pair.
-        out: folder of the frames, made if missing.
-        settings: choice and size of the frames (of raw recordings: size of one lens's image).
-        replace: replace another extraction in `out`.
-
-    Returns:
-        Numbers of frames in the range, of kept frames, and of dropped ones by reason.
+    rates. An interrupted call resumes; another extraction in the folder is replaced if `replace`.
 
     Raises:
         GsbaError: the video or the folder cannot be used, or no frame is in the range.
@@ -113,14 +105,23 @@ def extract(video: Path, out: Path, settings: VideoSettings, replace: bool = Fal
         logger.info("%s", note)
     _write_marker(out, video, key, None, recording.folders)
     if recording.lenses:
-        _keep_calibration(recording, out)
+        found = factory_calibration_of(recording)
+        if found is not None:
+            write_factory_calibration(out, found)
     before = _read_journal(out, recording.folders)
     after, standing = _extract(recording, windows, out, settings, before)
     kept = before + after
     if not kept:
         raise GsbaError(f"{video}: none of its frames could be decoded; copy it again")
-    counts = _counts(received, windows, kept, standing)
-    _write_times(out, kept)
+    damaged = len(windows) - len(kept) - standing
+    left_out = {
+        "not chosen": received - len(windows),
+        "while the camera stood": standing,
+        "damaged": damaged,
+    }
+    counts = Counts(received, len(kept), "frames", left_out)
+    rows = "".join(f"{entry.name},{entry.timestamp!r}\n" for entry in kept)
+    write_text(out / TIMES, "name,timestamp\n" + rows)
     _write_marker(out, video, key, counts, recording.folders)
     (out / _JOURNAL).unlink(missing_ok=True)
     dropped = ", ".join(f"{n} {reason}" for reason, n in counts.dropped.items() if n)
@@ -129,16 +130,8 @@ def extract(video: Path, out: Path, settings: VideoSettings, replace: bool = Fal
 
 
 def refuse_darkness(video: Path, recording: Recording, instants: Sequence[int]) -> None:
-    """Refuse a video whose middle, first and last frames are black.
-
-    Args:
-        video: the file, for the message.
-        recording: the recording.
-        instants: instants that are `shown`, ascending.
-
-    Raises:
-        GsbaError: all of these frames that can be decoded are black.
-    """
+    """Refuse a video whose middle, first and last frames, of ascending instants that are `shown`,
+    are black. GsbaError: all of these frames that can be decoded are."""
     level = -1
     for row in dict.fromkeys([len(instants) // 2, 0, len(instants) - 1]):
         for _, pictures in shots(recording, [instants[row]]):
@@ -150,13 +143,6 @@ def refuse_darkness(video: Path, recording: Recording, instants: Sequence[int]) 
             f"{video}: its frames are black (99 % of their pixels at or below {level} of 255) and "
             "cannot be matched: check that the lenses were not covered"
         )
-
-
-def _keep_calibration(recording: Recording, out: Path) -> None:
-    """Write the maker's calibration beside the frames, if the video holds one."""
-    found = factory_calibration_of(recording)
-    if found is not None:
-        write_factory_calibration(out, found)
 
 
 def _windows(
@@ -229,7 +215,8 @@ def _extract(
     if before and todo and skip_standing:
         for _, pictures in shots(recording, [before[-1].index]):
             last = _small(pictures, recording.cube)
-    best = _best_of_each(shots(recording, _flat(todo)), todo, settings.sharpest)
+    wanted = [int(index) for window in todo for index in window]
+    best = _best_of_each(shots(recording, wanted), todo, settings.sharpest)
     for index, pictures in track(best, "extracting frames", len(todo)):
         if skip_standing:
             small = _small(pictures, recording.cube)
@@ -271,10 +258,6 @@ def _motion_deg(before: np.ndarray, after: np.ndarray, recording: Recording) -> 
     return apparent_motion_deg(before, after, used)
 
 
-def _flat(windows: list[np.ndarray]) -> list[int]:
-    return [int(index) for window in windows for index in window]
-
-
 def _encoded(picture: Picture, width: int | None) -> bytes:
     """JPEG of a decoded image, scaled to `width` if given."""
     import cv2
@@ -284,16 +267,6 @@ def _encoded(picture: Picture, width: int | None) -> bytes:
         height = width * pixels.shape[0] // pixels.shape[1]
         pixels = cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA)
     return cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
-
-
-def _counts(received: int, windows: list[np.ndarray], kept: list[_Kept], standing: int) -> Counts:
-    damaged = len(windows) - len(kept) - standing
-    dropped = {
-        "not chosen": received - len(windows),
-        "while the camera stood": standing,
-        "damaged": damaged,
-    }
-    return Counts(received, len(kept), "frames", dropped)
 
 
 def _take_over(out: Path, key: str, replace: bool) -> Counts | None:
@@ -314,7 +287,8 @@ def _take_over(out: Path, key: str, replace: bool) -> Counts | None:
         same = marker["key"] == key
     except (OSError, ValueError, TypeError, KeyError, RecursionError, RecordError):
         raise GsbaError(f"{out} is not empty and not an extraction: choose another --out") from None
-    written = _read_times(out)
+    path = out / TIMES
+    written = [row.name for row in read_times(path) if row.name] if path.is_file() else []
     folders = _folders(out, lenses)
     if same and (counts is None or all((f / n).is_file() for f in folders for n in written)):
         return counts
@@ -380,14 +354,3 @@ def _read_journal(out: Path, lenses: Sequence[str]) -> list[_Kept]:
     except (ValueError, IndexError, csv.Error) as error:
         raise GsbaError(f"{out / _JOURNAL} is damaged ({error}): remove {out}") from None
     return kept
-
-
-def _read_times(out: Path) -> list[str]:
-    """Names of the images of a complete extraction."""
-    path = out / TIMES
-    return [row.name for row in read_times(path) if row.name] if path.is_file() else []
-
-
-def _write_times(out: Path, kept: list[_Kept]) -> None:
-    rows = "".join(f"{entry.name},{entry.timestamp!r}\n" for entry in kept)
-    write_text(out / TIMES, "name,timestamp\n" + rows)

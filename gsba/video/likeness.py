@@ -4,9 +4,6 @@ import cv2
 import numpy as np
 
 _BAND = (0.2, 0.8)  # used part of the height: without the poles and the carrier
-_MINIATURE_WIDTH = 512  # pixels
-_SAFE_RADIUS = 0.44  # of a disc within every fisheye's image circle, part of the height
-_EDGE_SHARE = 0.2  # of a miniature's pixels: those with the steepest gradient
 
 
 def sharpness(grey: np.ndarray) -> float:
@@ -19,7 +16,7 @@ def sharpness(grey: np.ndarray) -> float:
 
 def miniature(grey: np.ndarray) -> np.ndarray:
     """Miniature, float32, of a panorama or of two fisheyes side by side, (H, 2H) uint8."""
-    width = min(_MINIATURE_WIDTH, grey.shape[1])
+    width = min(512, grey.shape[1])
     small = cv2.resize(grey, (width, width // 2), interpolation=cv2.INTER_AREA)
     return cv2.GaussianBlur(small.astype(np.float32), (0, 0), 1.0)
 
@@ -27,7 +24,8 @@ def miniature(grey: np.ndarray) -> np.ndarray:
 def lens_interior(height: int) -> np.ndarray:
     """Pixels (H, 2H) bool of two fisheyes side by side that are within every image circle."""
     v, u = np.ogrid[:height, : 2 * height]
-    return np.hypot(u % height + 0.5 - height / 2, v + 0.5 - height / 2) < _SAFE_RADIUS * height
+    # within every fisheye's image circle
+    return np.hypot(u % height + 0.5 - height / 2, v + 0.5 - height / 2) < 0.44 * height
 
 
 def apparent_motion_deg(
@@ -51,7 +49,7 @@ def apparent_motion_deg(
     steepness = np.hypot(gx, gy)[rows] / 2
     inside = np.ones(steepness.shape, bool) if used is None else used[rows]
     steepness = np.where(inside, steepness, 0.0)
-    edges = steepness >= max(float(np.quantile(steepness, 1 - _EDGE_SHARE)), 1e-6)
+    edges = steepness >= max(float(np.quantile(steepness, 0.8)), 1e-6)  # the steepest fifth
     if not edges.any():
         return 0.0
     gain = float(np.median(((after[rows] + 1) / (before[rows] + 1))[inside]))  # of the exposure

@@ -36,17 +36,22 @@ from gsba.frames.side_by_side import (
 )
 from gsba.log import GsbaError
 from gsba.types.records import spread_rows
-from gsba.video.claims import PictureClaims
 from gsba.video.colours import bgr, luma
-from gsba.video.timeline import Timeline, Track, decode, read_claims, read_timeline, track_sizes
+from gsba.video.timeline import (
+    PictureClaims,
+    Timeline,
+    Track,
+    decode,
+    read_claims,
+    read_timeline,
+    track_sizes,
+)
 
 LENSES = ("front", "back")
 EXACT_S = 1e-6  # closer times are equal
 
 _RAW_SUFFIX = ".insv"  # of videos that hold fisheyes even if no image circle is detected
 _STITCH = "stitch it in the camera's app and export an equirectangular (2:1) video"
-_MAX_SQUARE_RATIO = 1.1  # of the longer to the shorter side of a nearly square image
-_MAX_MISSING_SHARE = 0.1  # of the longer track's duration that the shorter one may lack
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,10 +114,7 @@ class Recording:
 
 def files_of(video: Path) -> tuple[Path, ...]:
     """Files of the recording that `video` is of: that file, or those of the front and back lens.
-
-    Raises:
-        GsbaError: the file is no video, or has an unknown layout.
-    """
+    GsbaError: the file is no video, or has an unknown layout."""
     pair = lens_files(video)
     if pair is None or not all(path.is_file() for path in pair):
         return (video,)
@@ -121,12 +123,8 @@ def files_of(video: Path) -> tuple[Path, ...]:
 
 
 def read_recording(video: Path) -> Recording:
-    """Recognise the layout of a video and read its times.
-
-    Raises:
-        GsbaError: the file is no video, holds neither panoramas nor a cube map nor two lenses, or
-            its lenses or tracks do not match.
-    """
+    """Recognise the layout of a video and read its times. GsbaError: the file is no video, holds
+    neither panoramas nor a cube map nor two lenses, or its lenses or tracks do not match."""
     files = files_of(video)
     size, *others = track_sizes(files[0])
     if (cube := cube_tracks(files[0], [size, *others])) is not None:
@@ -135,12 +133,21 @@ def read_recording(video: Path) -> Recording:
         tracks = Track(video, cube[0]), Track(video, cube[1])
         return _of_two_tracks(tracks, (width, height), note, cube=True)
     if len(files) == 2:
-        _check_pair(files, size)
+        front, back = files
+        if (both := track_sizes(back)) != [size]:
+            shapes = " and ".join(f"{width}x{height}" for width, height in both)
+            raise GsbaError(
+                f"{back} is {shapes}, but {front.name}, the front lens's file, is {size[0]}x"
+                f"{size[1]}: they are no pair; copy both again from the camera, or {_STITCH}"
+            )
         note = f"{files[0]}: raw, of the front lens; of the back one is {files[1]}"
         return _of_two_tracks((Track(files[0]), Track(files[1])), size, note)
     if others:
         sizes = [size, *others]
-        pair = _lens_tracks(sizes)
+        # the two largest tracks, if they are square and equal, as in DJI's `.osv`
+        largest = max(sizes, key=lambda size: size[0] * size[1])
+        two = [n for n, size in enumerate(sizes) if size == largest]
+        pair = two if len(two) == 2 and _is_nearly_square(largest) else list(range(len(sizes)))
         size = sizes[pair[0]]
         _check_tracks(video, sizes if len(pair) > 2 else [sizes[n] for n in pair])
         note = f"{video}: raw, two tracks of {size[0]}x{size[1]}: front lens, back lens"
@@ -155,12 +162,8 @@ def factory_calibration_of(recording: Recording) -> FactoryCalibration | None:
 
 
 def shots(recording: Recording, chosen: Sequence[int]) -> Iterator[tuple[int, tuple[Picture, ...]]]:
-    """Yield (instant, its images) of chosen instants in order; damaged ones are left out.
-
-    Args:
-        recording: the recording.
-        chosen: ascending instants that are `shown`.
-    """
+    """Yield (instant, its images) of chosen instants, ascending and `shown`; damaged ones are left
+    out."""
     frames = decode(recording.tracks[0], recording.timelines[0], chosen)
     if len(recording.tracks) == 1:
         for index, frame in frames:
@@ -183,13 +186,9 @@ def shots(recording: Recording, chosen: Sequence[int]) -> Iterator[tuple[int, tu
 
 
 def check_lengths(recording: Recording) -> None:
-    """Refuse a recording with one lens, or track, that is clearly shorter than the other.
-
-    Raises:
-        GsbaError: one is shorter.
-    """
+    """GsbaError where one lens, or track, of a recording is clearly shorter than the other."""
     lasting = [float(line.times[-1]) + line.interval_s for line in recording.timelines]
-    if min(lasting) >= (1 - _MAX_MISSING_SHARE) * max(lasting):
+    if min(lasting) >= 0.9 * max(lasting):
         return
     short, long = int(np.argmin(lasting)), int(np.argmax(lasting))
     end = recording.times[recording.shown][-1]
@@ -205,25 +204,7 @@ def check_lengths(recording: Recording) -> None:
 
 
 def _is_nearly_square(size: tuple[int, int]) -> bool:
-    return 0 < max(size) <= _MAX_SQUARE_RATIO * min(size)
-
-
-def _check_pair(files: tuple[Path, ...], size: tuple[int, int]) -> None:
-    """Refuse two files that are not of two lenses."""
-    front, back = files
-    if (sizes := track_sizes(back)) != [size]:
-        shapes = " and ".join(f"{width}x{height}" for width, height in sizes)
-        raise GsbaError(
-            f"{back} is {shapes}, but {front.name}, the front lens's file, is {size[0]}x{size[1]}: "
-            f"they are no pair; copy both again from the camera, or {_STITCH}"
-        )
-
-
-def _lens_tracks(sizes: Sequence[tuple[int, int]]) -> list[int]:
-    """The two largest tracks, if they are square and equal, as in DJI's `.osv`; else all."""
-    largest = max(sizes, key=lambda size: size[0] * size[1])
-    pair = [n for n, size in enumerate(sizes) if size == largest]
-    return pair if len(pair) == 2 and _is_nearly_square(largest) else list(range(len(sizes)))
+    return 0 < max(size) <= 1.1 * min(size)
 
 
 def _check_tracks(video: Path, sizes: list[tuple[int, int]]) -> None:
@@ -286,7 +267,20 @@ def _check_panorama(video: Path, size: tuple[int, int]) -> None:
 def _of_one_track(track: Track, size: tuple[int, int]) -> Recording:
     """Recording of panoramas, or of two lenses side by side or one above the other."""
     claims, timeline = read_claims(track), read_timeline(track)
-    _refuse_claims(track.path, claims)
+    left, top, right, bottom = claims.bounds
+    kind = ""
+    if claims.stereo:
+        kind = f"stereo, {claims.stereo}"
+    elif claims.projection:
+        kind = f"the projection '{claims.projection}', not equirectangular"
+    elif any(claims.bounds):
+        across, high = 360 * (1 - left - right), 180 * (1 - top - bottom)
+        kind = f"a cropped panorama of {across:.0f} x {high:.0f} degrees"
+    if kind:
+        raise GsbaError(
+            f"{track.path} holds {kind}, by its spherical video tags; gsba reads whole panoramas "
+            "of one eye: export it so"
+        )
     shown, looks = claims.shown_size(size), tee(_looks(track, timeline), 3)
     num, side = len(timeline.ticks), min(size[0], size[1] // 2)
     everything = np.ones(num, bool), np.arange(num)
@@ -304,7 +298,21 @@ def _of_one_track(track: Track, size: tuple[int, int]) -> Recording:
             _refuse_stereo(track.path, shown, (turned(g, claims.orientation) for g in looks[2]))
         _check_panorama(track.path, shown)
         places = ((slice(None), slice(None)),)
-        notes = (*found.notes, *_claim_notes(track.path, claims))
+        told = []
+        if claims.orientation > 1:
+            told.append(
+                f"{track.path}: turned by its display matrix, EXIF orientation {claims.orientation}"
+            )
+        if claims.pixel_aspect != 1:
+            told.append(f"{track.path}: pixels of {claims.pixel_aspect} are made square")
+        told += _hdr_notes(track.path, claims)
+        if any(claims.pose_deg):
+            turn = ", ".join(f"{angle:g}" for angle in claims.pose_deg)
+            told.append(
+                f"{track.path}: players turn its panoramas by yaw, pitch, roll {turn} deg; they "
+                "are read as stored"
+            )
+        notes = (*found.notes, *told)
         height = None if claims.pixel_aspect == 1 else shown[1]
         how = {"height": height, "orientation": claims.orientation}
         return Recording((track,), (timeline,), places, shown[0], *everything, notes, **how)
@@ -318,49 +326,12 @@ def _of_one_track(track: Track, size: tuple[int, int]) -> Recording:
     return Recording((track,), (timeline,), places, side, *everything, notes, height=unsqueezed)
 
 
-def _refuse_claims(video: Path, claims: PictureClaims) -> None:
-    """Refuse pictures that are no panoramas by their file's own claims."""
-    left, top, right, bottom = claims.bounds
-    kind = ""
-    if claims.stereo:
-        kind = f"stereo, {claims.stereo}"
-    elif claims.projection:
-        kind = f"the projection '{claims.projection}', not equirectangular"
-    elif any(claims.bounds):
-        across, high = 360 * (1 - left - right), 180 * (1 - top - bottom)
-        kind = f"a cropped panorama of {across:.0f} x {high:.0f} degrees"
-    if kind:
-        raise GsbaError(
-            f"{video} holds {kind}, by its spherical video tags; gsba reads whole panoramas of one "
-            "eye: export it so"
-        )
-
-
 def _refuse_stereo(video: Path, size: tuple[int, int], greys: Iterator[np.ndarray]) -> None:
     """Refuse pictures in 2:1, or square ones, that are no panoramas by what they show."""
     width, height = size
     kind = unlike_panorama(greys) if height in (width, width // 2) else ""
     if kind and (width == 2 * height or kind == OVER_UNDER):
         raise GsbaError(f"{video} holds no panoramas but {kind}: {REMEDIES[kind]}")
-
-
-def _claim_notes(video: Path, claims: PictureClaims) -> list[str]:
-    """Notes on claims that changed pixels, or that are left to the player."""
-    notes = []
-    if claims.orientation > 1:
-        notes.append(
-            f"{video}: turned by its display matrix, EXIF orientation {claims.orientation}"
-        )
-    if claims.pixel_aspect != 1:
-        notes.append(f"{video}: pixels of {claims.pixel_aspect} are made square")
-    notes += _hdr_notes(video, claims)
-    if any(claims.pose_deg):
-        turn = ", ".join(f"{angle:g}" for angle in claims.pose_deg)
-        notes.append(
-            f"{video}: players turn its panoramas by yaw, pitch, roll {turn} deg; they are read as "
-            "stored"
-        )
-    return notes
 
 
 def _hdr_notes(video: Path, claims: PictureClaims) -> list[str]:
@@ -423,15 +394,9 @@ TRACKS = ("track0", "track5")  # folders of their frames, by GoPro's numbers
 
 
 def cube_tracks(video: Path, sizes: Sequence[tuple[int, int]]) -> tuple[int, int] | None:
-    """Find the two tracks of an equi-angular cube map in a video; None if it holds none.
-
-    Args:
-        video: the file.
-        sizes: width and height of its tracks.
-
-    Raises:
-        GsbaError: a `.360` file does not hold exactly two such tracks of one size.
-    """
+    """Find the two tracks of an equi-angular cube map among those of a video, by their widths and
+    heights; None if it holds none. GsbaError: a `.360` file does not hold exactly two such tracks
+    of one size."""
     found = [n for n, size in enumerate(sizes) if is_equiangular(*size)]
     if len(found) == 2 and sizes[found[0]] == sizes[found[1]]:
         return found[0], found[1]

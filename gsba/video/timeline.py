@@ -5,6 +5,7 @@ before a frame is decoded, so that frames are chosen on the exact timeline and o
 pictures with a chosen frame are decoded.
 """
 
+import struct
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,14 +18,102 @@ import numpy as np
 
 from gsba.frames.files import turned
 from gsba.log import GsbaError
-from gsba.video.claims import PictureClaims, claims_of
-from gsba.video.colours import bgr
+from gsba.video.colours import bgr, hdr_name
+
+_STEREO = {
+    1: "side by side",
+    2: "over-under",
+    3: "frame by frame",
+    4: "checkerboard",
+    5: "side by side",
+    6: "line by line",
+    7: "column by column",
+}  # AVStereo3DType
+_PROJECTIONS = {
+    0: "",
+    1: "cube map",
+    2: "",
+    3: "half equirectangular",
+    4: "rectilinear",
+    5: "fisheye",
+}  # AVSphericalProjection; 2: equirectangular with bounds
+_ORIENTATIONS = {  # EXIF's, of the signs of a, b, c, d of a display matrix
+    (1, 0, 0, 1): 1,
+    (-1, 0, 0, 1): 2,
+    (-1, 0, 0, -1): 3,
+    (1, 0, 0, -1): 4,
+    (0, 1, 1, 0): 5,
+    (0, 1, -1, 0): 6,
+    (0, -1, -1, 0): 7,
+    (0, -1, 1, 0): 8,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class PictureClaims:
+    """Claims about the pictures of a video track, which FFmpeg reads from MP4 (`tkhd`, `pasp`,
+    `st3d`, `sv3d`), Matroska and the bitstream: records AVStereo3D and AVSphericalMapping of
+    libavutil."""
+
+    orientation: int = 1  # of EXIF, 1 to 8, in which stored pictures are shown
+    pixel_aspect: Fraction = Fraction(1)  # width over height of a pixel
+    stereo: str = ""  # arrangement of two eyes; "" = one eye, or not stated
+    projection: str = ""  # other than equirectangular; "" = equirectangular, or not stated
+    spherical: bool = False  # True if a projection is stated
+    bounds: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)  # parts of the sphere that
+    # are missing at the left, top, right and bottom
+    pose_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)  # yaw, pitch, roll by which pictures
+    # are to be turned for display
+    hdr: str = ""  # transfer function, "PQ" or "HLG"; "" = no HDR
+
+    def shown_size(self, size: tuple[int, int]) -> tuple[int, int]:
+        """Width and height as shown of pictures stored with a width and height: pixels are square,
+        and no row becomes longer."""
+        width, height = size
+        if self.orientation > 4:
+            return height, round(width * self.pixel_aspect)
+        return width, round(height / self.pixel_aspect)
+
+    @property
+    def whole(self) -> bool:
+        """True if the file states that pictures are whole panoramas for one eye."""
+        return self.spherical and not (self.stereo or self.projection or any(self.bounds))
+
+
+def claims_of(frame: Any, pixel_aspect: Fraction | None) -> PictureClaims:
+    """Claims that come with a decoded av.VideoFrame; pixel_aspect: of its stream, None = not
+    stated."""
+    records = {part.type.name: bytes(part) for part in frame.side_data}
+    orientation = 1
+    if len(matrix := records.get("DISPLAYMATRIX", b"")) >= 36:
+        a, b, _, c, d = struct.unpack("=5i", matrix[:20])
+        most = max(abs(value) for value in (a, b, c, d))
+        signs = tuple(round(value / most) if most else 0 for value in (a, b, c, d))
+        orientation = _ORIENTATIONS.get(signs, 1)  # type: ignore[arg-type]
+    stereo, spherical = records.get("STEREO3D", b""), records.get("SPHERICAL", b"")
+    eyes = _STEREO.get(struct.unpack("=i", stereo[:4])[0], "") if len(stereo) >= 4 else ""
+    aspect = pixel_aspect if pixel_aspect else Fraction(1)
+    hdr = hdr_name(frame.color_trc)
+    if len(spherical) < 32:
+        return PictureClaims(orientation, aspect, eyes, hdr=hdr)
+    kind, *turns = struct.unpack("=4i", spherical[:16])
+    bounds = [part / 2**32 for part in struct.unpack("=4I", spherical[16:32])]
+    return PictureClaims(
+        orientation,
+        aspect,
+        eyes,
+        _PROJECTIONS.get(kind, "unknown"),
+        True,
+        tuple(bounds) if kind == 2 else (0.0,) * 4,  # type: ignore[arg-type]
+        tuple(turn / 2**16 for turn in turns),  # type: ignore[arg-type]
+        hdr,
+    )
+
 
 VIDEO_SUFFIXES = frozenset(
     (".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi", ".ts", ".insv", ".360", ".lrv", ".osv")
 )
 _MAX_CLAIM_PACKETS = 60  # of a track until the first picture, which may be damaged
-_MAX_EXCESS_S = 1.0  # of the duration that a container claims over that of its frames
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +151,7 @@ class Timeline:
     def is_cut_short(self) -> bool:
         """True if the frames end clearly before the duration that the container claims."""
         last = float((self.ticks[-1] - self.ticks[0]) * self.tick_s)
-        return self.claimed_s - last > max(_MAX_EXCESS_S, 3 * last / len(self.ticks))
+        return self.claimed_s - last > max(1.0, 3 * last / len(self.ticks))
 
 
 def is_video(path: Path) -> bool:
@@ -71,43 +160,29 @@ def is_video(path: Path) -> bool:
 
 
 def track_sizes(video: Path) -> list[tuple[int, int]]:
-    """Width and height, pixels, of the video tracks of a file that can be decoded.
-
-    Raises:
-        GsbaError: the file is no video, or there is no decoder for it.
-    """
+    """Width and height, pixels, of the video tracks of a file that can be decoded. GsbaError: the
+    file is no video, or there is no decoder for it."""
     with _opened(video) as (_, streams):
         return [(stream.width, stream.height) for stream in streams]
 
 
 def claimed_duration_s(video: Path) -> float | None:
-    """Duration that the first track of a video claims, seconds; None = not stated.
-
-    Raises:
-        GsbaError: the file is no video, or there is no decoder for it.
-    """
+    """Duration that the first track of a video claims, seconds; None = not stated. GsbaError: the
+    file is no video, or there is no decoder for it."""
     with _opened(video) as (container, streams):
         return _claimed_end(container, streams[0])
 
 
 def container_tags(video: Path) -> dict[str, str]:
-    """Tags of a video's container by the last word of their names in lower case.
-
-    QuickTime's "com.apple.quicktime.model" is "model".
-
-    Raises:
-        GsbaError: the file is no video.
-    """
+    """Tags of a video's container by the last word of their names in lower case: QuickTime's
+    "com.apple.quicktime.model" is "model". GsbaError: the file is no video."""
     with _opened(video) as (container, _):
         return {key.lower().rpartition(".")[2]: text for key, text in container.metadata.items()}
 
 
 def read_timeline(track: Track) -> Timeline:
-    """Presentation times of all frames of a track, from its packets alone.
-
-    Raises:
-        GsbaError: the file is no video, there is no decoder for it, or it holds no frames.
-    """
+    """Presentation times of all frames of a track, from its packets alone. GsbaError: the file is
+    no video, there is no decoder for it, or it holds no frames."""
     video = track.path
     with _opened(video) as (container, streams):
         stream = streams[track.number]
@@ -133,11 +208,8 @@ def read_timeline(track: Track) -> Timeline:
 
 
 def read_claims(track: Track) -> PictureClaims:
-    """Claims of a track about its pictures; none if its first second cannot be decoded.
-
-    Raises:
-        GsbaError: the file is no video, or there is no decoder for it.
-    """
+    """Claims of a track about its pictures; none if its first second cannot be decoded. GsbaError:
+    the file is no video, or there is no decoder for it."""
     av = _pyav()
     with _opened(track.path) as (container, streams):
         stream = streams[track.number]
@@ -152,12 +224,8 @@ def read_claims(track: Track) -> PictureClaims:
 
 
 def decode(track: Track, timeline: Timeline, chosen: Sequence[int]) -> Iterator[tuple[int, Any]]:
-    """Yield (index, av.VideoFrame) of chosen frames in order; damaged ones are left out.
-
-    Args:
-        track, timeline: the track and its times.
-        chosen: ascending indices into `timeline.ticks`.
-    """
+    """Yield (index, av.VideoFrame) of chosen frames, ascending indices into `timeline.ticks`;
+    damaged ones are left out."""
     av = _pyav()
     wanted = {int(timeline.ticks[i]): i for i in chosen}
     begins = np.searchsorted(timeline.keyframes, timeline.ticks[list(chosen)], side="right") - 1
@@ -183,15 +251,9 @@ def decode(track: Track, timeline: Timeline, chosen: Sequence[int]) -> Iterator[
 
 
 def picture_near(video: Path, share: float) -> np.ndarray:
-    """Colours (H, W, 3) uint8 BGR of a picture near a place, without reading the whole file.
-
-    Args:
-        video: its first track is shown.
-        share: place, 0..1 of the duration: the last frame before it at which decoding can begin.
-
-    Raises:
-        GsbaError: the file is no video, or nothing can be decoded.
-    """
+    """Colours (H, W, 3) uint8 BGR of the last frame of a video's first track before a place, 0..1
+    of its duration, at which decoding can begin, without reading the whole file. GsbaError: the
+    file is no video, or nothing can be decoded."""
     av = _pyav()
     with _opened(video) as (container, streams):
         stream, end = streams[0], _claimed_end(container, streams[0])

@@ -17,8 +17,7 @@ from gsba.geometry import rotation_from_quaternion
 from gsba.log import GsbaError
 from gsba.placement.world import Placement, read_placement
 from gsba.report.html.figures import viewing_axes
-from gsba.splat.gaussians import SH_CONSTANT, Gaussians
-from gsba.splat.ply import read_ply
+from gsba.splat.gaussians import SH_CONSTANT, Gaussians, read_ply
 from gsba.store.finished import load_cameras, load_run
 from gsba.trajectory.files import read_trajectory
 from gsba.types import FACES, FrameSet, Reconstruction

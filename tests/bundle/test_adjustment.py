@@ -14,8 +14,7 @@ from gsba.bundle import adjustment, triangulation
 from gsba.bundle import observation_noise as observation_noise_module
 from gsba.bundle import tracks as tracks_module
 from gsba.bundle.adjustment import AdjustmentContext
-from gsba.bundle.bearings import Bearings, Reprojections
-from gsba.bundle.families import Families, Family
+from gsba.bundle.families import Bearings, Families, Family, Reprojections
 from gsba.bundle.observation_noise import observation_noise
 from gsba.bundle.optimizer import OptimizeResult
 from gsba.bundle.trajectory_prior import TrajectoryPrior

@@ -3,8 +3,7 @@
 import numpy as np
 
 from factors import tangent_basis
-from gsba.bundle.bearings import Bearings
-from gsba.bundle.families import PointObservations
+from gsba.bundle.families import Bearings, PointObservations
 from gsba.camera.rig import CubeRig, owner_faces
 
 RIG = CubeRig(512, np.deg2rad(95))

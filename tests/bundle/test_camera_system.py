@@ -15,11 +15,9 @@ from factors.direct_system import reduced_system
 from gsba import Family, MapSnapshot, X
 from gsba.bundle import adjustment
 from gsba.bundle.adjustment import values_of
-from gsba.bundle.bearings import Bearings
-from gsba.bundle.camera_adjustment import solve_with_camera
-from gsba.bundle.camera_system import CameraSystem
+from gsba.bundle.camera_adjustment import CameraSystem, solve_with_camera
 from gsba.bundle.camera_variables import CameraUnknowns
-from gsba.bundle.families import Families
+from gsba.bundle.families import Bearings, Families
 from gsba.bundle.readout import CameraEstimate, CameraEstimates
 from gsba.bundle.trajectory_prior import GyroTurns
 from gsba.camera.cameras import Cameras

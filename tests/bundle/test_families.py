@@ -12,8 +12,7 @@ from factors.block import PoseSystem
 from gsba import Family, MapSnapshot, X
 from gsba.bundle import adjustment, gauge
 from gsba.bundle.adjustment import AdjustmentContext
-from gsba.bundle.bearings import Bearings
-from gsba.bundle.families import Families, kept, restored
+from gsba.bundle.families import Bearings, Families, kept, restored
 from gsba.bundle.optimizer import optimize
 from gsba.bundle.trajectory_prior import TrajectoryPrior
 from gsba.config import RefineSettings, SolverSettings

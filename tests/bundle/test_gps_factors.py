@@ -11,10 +11,8 @@ from synthetic import RIG, World, drifted, make_world
 
 from gsba.bundle import adjustment, gps_factors
 from gsba.bundle.adjustment import AdjustmentContext, values_of
-from gsba.bundle.bearings import Bearings
-from gsba.bundle.families import Families, Family
-from gsba.bundle.fixes import FrameFixes
-from gsba.bundle.gps_factors import GpsFactors
+from gsba.bundle.families import Bearings, Families, Family
+from gsba.bundle.gps_factors import FrameFixes, GpsFactors
 from gsba.bundle.trajectory_prior import TrajectoryPrior
 from gsba.config import RefineSettings
 from gsba.geometry import furthest, inverse

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from synthetic import unit, with_noise
 
-from gsba.bundle.predicted_steps import step_deviations
+from gsba.bundle.map_strength import step_deviations
 from gsba.geometry import pose
 from gsba.types import Reconstruction
 

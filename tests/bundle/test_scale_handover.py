@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gsba.bundle.map_strength import neighbour_shifts, position_errors
-from gsba.bundle.scale_handover import scale_changes
+from gsba.bundle.map_strength import neighbour_shifts, position_errors, scale_changes
 from gsba.types import JointErrors, PoseStatus, Reconstruction
 
 SIGMA = 1e-3  # radians, of bearings

@@ -6,7 +6,7 @@ from lens_world import placed, problem_of, seen_through, solved_under, solved_wi
 
 from factors.bearing import bearing_residuals
 from gsba.bundle import self_calibration
-from gsba.bundle.camera_system import CameraSystem
+from gsba.bundle.camera_adjustment import CameraSystem
 from gsba.bundle.readout import CameraEstimate, CameraEstimates
 from gsba.bundle.self_calibration import SelfCalibration, num_parameters
 from gsba.camera.fisheye import Pair, Rig, changed, recalibrated

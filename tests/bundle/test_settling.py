@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from synthetic import loop_walk
 
-from gsba.bundle.predicted_steps import step_motion
+from gsba.bundle.map_strength import step_motion
 from gsba.geometry import pose
 from gsba.types import JointErrors
 

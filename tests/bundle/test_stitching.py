@@ -10,8 +10,7 @@ from synthetic import RIG, World, make_world
 from factors.sphere_field import SphereField, num_harmonics
 from gsba.bundle import adjustment, stitching
 from gsba.bundle.adjustment import AdjustmentContext
-from gsba.bundle.bearings import Bearings
-from gsba.bundle.families import Families
+from gsba.bundle.families import Bearings, Families
 from gsba.bundle.optimizer import optimize
 from gsba.bundle.shared_parameters import PARTS, SharedModel, model_of, parts_of
 from gsba.bundle.stitching import Stitching, corrected, with_noise_of

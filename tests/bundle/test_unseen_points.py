@@ -11,8 +11,7 @@ from synthetic import RIG, World, make_world
 
 from gsba.bundle import shared_parameters, triangulation
 from gsba.bundle.adjustment import AdjustmentContext
-from gsba.bundle.bearings import Bearings
-from gsba.bundle.families import Families
+from gsba.bundle.families import Bearings, Families
 from gsba.bundle.reconstruction import assemble
 from gsba.camera.cameras import Cameras
 from gsba.camera.lens import Lenses

@@ -12,8 +12,7 @@ from synthetic import RIG, GivenFactors, make_world
 
 from gsba.bundle import adjustment, pose_variables
 from gsba.bundle.adjustment import AdjustmentContext
-from gsba.bundle.bearings import Bearings
-from gsba.bundle.families import Families
+from gsba.bundle.families import Bearings, Families
 from gsba.config import RefineSettings
 from gsba.evaluate.consistency import (
     EXPECTED,

@@ -20,8 +20,7 @@ from gsba.export import ExportFormat, ExportOptions, export_all
 from gsba.export.photos import PhotoCamera, Photos, PlacedPhoto
 from gsba.frames.held_out import held_out_rows
 from gsba.geometry import pose
-from gsba.splat.gaussians import Gaussians
-from gsba.splat.ply import read_ply, write_ply
+from gsba.splat.gaussians import Gaussians, read_ply, write_ply
 from gsba.types import FrameSet, PictureFormat
 
 pytestmark = [pytest.mark.consumers, pytest.mark.filterwarnings("ignore")]  # of the programs

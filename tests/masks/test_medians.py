@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gsba.masks.medians import median_picture
+from gsba.masks.fixed_structure import median_picture
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.int16, np.float32, np.float64])

@@ -12,7 +12,7 @@ from gsba.evaluate.trajectory import evaluate
 from gsba.geometry import pose
 from gsba.loop_closure.map_similarity import Meeting
 from gsba.odometry import Odometry, track_panoramas
-from gsba.odometry.loops import fit_loop, moved
+from gsba.odometry.closing import fit_loop, moved
 from gsba.odometry.panoramas import SmallPanoramas
 from gsba.similarity import Sim3, similarity_along
 from gsba.types import Trajectory

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from factors.check import jacobian_errors
 from gsba.geometry import inverse, pose
-from gsba.odometry.loops import moved
+from gsba.odometry.closing import moved
 from gsba.odometry.pose_graph import (
     Constraint,
     carried_covariances,

@@ -19,8 +19,7 @@ from town_in_parts import NUM, SIGMA, town
 from gsba import disk
 from gsba.bundle import adjustment
 from gsba.bundle.adjustment import AdjustmentContext
-from gsba.bundle.bearings import Bearings, Reprojections
-from gsba.bundle.families import Families, Family
+from gsba.bundle.families import Bearings, Families, Family, Reprojections
 from gsba.bundle.trajectory_prior import GyroTurns, TrajectoryPrior
 from gsba.camera.rig import owner_faces
 from gsba.config import PriorSettings, RefineSettings

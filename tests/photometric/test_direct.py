@@ -13,8 +13,7 @@ from tiny_run import SETTINGS, Case, computed_stages
 from factors.patch_windows import PatchTable, patch_spans, pixel_grid
 from gsba.bundle import adjustment
 from gsba.bundle.adjustment import AdjustmentContext
-from gsba.bundle.bearings import Bearings
-from gsba.bundle.families import Families
+from gsba.bundle.families import Bearings, Families
 from gsba.bundle.trajectory_prior import TrajectoryPrior
 from gsba.camera.lens import Lenses
 from gsba.camera.sphere import erp_from_bearings

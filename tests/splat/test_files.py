@@ -7,8 +7,7 @@ import plyfile
 import pytest
 
 from gsba.log import GsbaError
-from gsba.splat.gaussians import SH_CONSTANT, Gaussians, from_cloud
-from gsba.splat.ply import read_ply, write_ply
+from gsba.splat.gaussians import SH_CONSTANT, Gaussians, from_cloud, read_ply, write_ply
 
 
 def some(num: int = 7, harmonics: int = 16) -> Gaussians:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gsba.log import GsbaError
-from gsba.splat.lpips import Lpips
+from gsba.splat.scores import Lpips
 
 torch = pytest.importorskip("torch")
 RNG = np.random.default_rng(0)

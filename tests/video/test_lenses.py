@@ -15,8 +15,8 @@ from gsba.log import GsbaError
 from gsba.pipeline.inputs import extract_video
 from gsba.store.store import RunStore
 from gsba.video import extract, extraction, is_video, recording
-from gsba.video.claims import PictureClaims
 from gsba.video.recording import read_recording
+from gsba.video.timeline import PictureClaims
 
 av = pytest.importorskip("av", reason="PyAV is not installed")
 
