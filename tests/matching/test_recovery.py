@@ -100,7 +100,7 @@ def test_a_lone_look_alike_without_a_third_view_is_not_believed() -> None:
     empty = recovery.match_anywhere(context, pair[:0])
     alone = recovery.match_anywhere(context, pair)
     assert len(empty.matches.pairs) == 0
-    assert not recovery._is_supported((1, 2), alone, context.keypoints, SETTINGS)
+    assert not recovery._is_supported((1, 2), alone, context.keypoints, True)
 
 
 def test_frames_of_two_pieces_are_never_tied_by_two_views() -> None:
