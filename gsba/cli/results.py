@@ -226,6 +226,13 @@ def export(
     if folder.resolve().is_relative_to(run.resolve()):
         claim(run.resolve(), folder.resolve())
     typer.echo("\n".join([f"{to}: {folder}", *how_to_start(name, folder, masks)]))
+    if placed.origin is not None:
+        latitude, longitude, _ = placed.origin
+        typer.echo(
+            f"placed by {gps} at latitude {latitude:.5f}, longitude {longitude:.5f}, with "
+            f"{placed.similarity.scale:.4g} m to a map unit: if that is elsewhere, latitude and "
+            "longitude may be swapped in the file, and the scale is wrong"
+        )
 
 
 def shutter_of(run: Path, exposure_ms: float | None = None) -> "Shutter":

@@ -405,7 +405,10 @@ def _common_size(paths: Sequence[tuple[Path, ...]], layout: str) -> tuple[int, i
                     f"{width}x{height}: both lenses' pictures are of one size; extract them again"
                 )
             if (w, h) != (width, height):
-                raise GsbaError(f"{path}: is {w}x{h}, but '{first.name}' is {width}x{height}")
+                raise GsbaError(
+                    f"{path}: is {w}x{h}, but '{first.name}' is {width}x{height}: frames of a "
+                    "folder are of one size; move others, as thumbnails, out of it"
+                )
     return width, height
 
 

@@ -110,7 +110,7 @@ def _gyro(path: Path) -> str:
     try:
         readings = read_telemetry(path)
     except GsbaError as error:
-        return f"none: {_reason(path, error)}"
+        return _nothing(path, error)
     rate = 1 / float(np.median(np.diff(readings.timestamps)))
     beside = " with accelerometer" if readings.forces is not None else ""
     return f"{len(readings.timestamps):,} readings at {rate:.0f} Hz{beside}"
@@ -120,8 +120,14 @@ def _gps(path: Path) -> str:
     try:
         fixes = read_video_gps(path)
     except GsbaError as error:
-        return f"none: {_reason(path, error)}"
+        return _nothing(path, error)
     return f"{len(fixes.geodetic):,} fixes, {np.median(fixes.sigmas[:, 0]):.2g} m across (1 sigma)"
+
+
+def _nothing(path: Path, error: GsbaError) -> str:
+    """Entry of data that were not found, or not looked for without the library that reads them."""
+    missing = isinstance(error.__cause__ or error.__context__, ImportError)
+    return f"{'not checked' if missing else 'none'}: {_reason(path, error)}"
 
 
 def _reason(path: Path, error: GsbaError) -> str:

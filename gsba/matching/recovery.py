@@ -70,7 +70,9 @@ def recover(
     settings, keypoints = context.settings, context.keypoints
     chosen = _pairs_of_one_piece(pairs.adjacent(len(coarse.sources)), coarse)
     guided = guided.within(coarse.segments)
-    lost = guided.missing(_pairs_of_one_piece(pairs.without_pause(timestamps), coarse))
+    close = _pairs_of_one_piece(pairs.without_pause(timestamps), coarse)
+    guided = _unless_misguided(context, guided, close)
+    lost = guided.missing(close)
     absent = coarse.absent
     pieces, (coarse, joints) = coarse, joining.join(coarse)
     found = match_anywhere(context, lost)
@@ -145,6 +147,31 @@ def _misleads(context: MatchContext, guided: VerifiedPairs) -> bool:
     return bool(missed > 0.15 * len(tried))
 
 
+def _unless_misguided(
+    context: MatchContext, guided: VerifiedPairs, chosen: np.ndarray
+) -> VerifiedPairs:
+    """Guided neighbours; none of them where many of `chosen` (P, 2) are lost and most of the others
+    have another pose without guidance, which explains more matches.
+
+    A gate around a false prediction keeps the false matches that fit it: guided neighbours confirm
+    a reversed trajectory.
+    """
+    rows = np.flatnonzero(np.diff(guided.matches.pairs, axis=1)[:, 0] == 1)
+    if not len(rows) or len(guided.missing(chosen)) <= _MIN_LOST_SHARE * len(chosen):
+        return guided
+    tried = np.unique(np.linspace(0, len(rows) - 1, min(_NUM_TRIED_STEPS, len(rows))).astype(int))
+    known = guided.taken(rows[tried].tolist())
+    free = match_anywhere(context, known.matches.pairs)
+    ours, theirs = (image_steps(some, context.keypoints) for some in (known, free))
+    turned, off = step_errors(ours.f_T_nexts, theirs)
+    verify, num = context.settings.verify, len(context.keypoints.starts) - 1
+    other = turned > np.deg2rad(verify.max_rotation_deg)
+    other |= ours.directed & theirs.directed & (off > np.deg2rad(verify.max_direction_deg))
+    other &= matches_of_steps(free, num) > matches_of_steps(known, num)
+    misguided = np.count_nonzero(other & ours.verified & theirs.verified)
+    return guided.taken([]) if misguided > 0.5 * len(tried) else guided
+
+
 def _walked_on(
     coarse: CoarsePoses, lost: np.ndarray, found: VerifiedPairs, timestamps: np.ndarray
 ) -> np.ndarray:
@@ -208,6 +235,7 @@ def check_clock(
             runs at another rate.
     """
     settings, chosen = context.settings, pairs.without_pause(timestamps)
+    guided = _unless_misguided(context, guided, chosen)
     lost = guided.missing(chosen)
     if len(lost) > 0.2 * len(chosen):  # from here on, whole panoramas are compared
         guided = VerifiedPairs.joined([guided, match_anywhere(context, lost)])

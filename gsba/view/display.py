@@ -176,7 +176,7 @@ class View:
             self.controls["Masks"] = masks
         with panel.add_tab("Run"):
             self._add_switch("Refined trajectory", "/refined")
-            self._add_switch("Coarse trajectory", "/coarse")
+            self._add_switch(f"Start: {scene.start}", "/coarse")
             self._add_switch("Rigs", "/rigs")
             self._add_switch("Rig axes", "/axes")
             self._add_switch("Cloud", "/cloud")

@@ -20,7 +20,7 @@ from gsba.report.html.figures import viewing_axes
 from gsba.splat.gaussians import SH_CONSTANT, Gaussians, read_ply
 from gsba.store.finished import load_cameras, load_run
 from gsba.trajectory.files import read_trajectory
-from gsba.types import FACES, FrameSet, Reconstruction
+from gsba.types import FACES, FrameSet, Reconstruction, RunStart
 
 logger = logging.getLogger(__name__)
 
@@ -54,6 +54,7 @@ class Scene:
     grounds: str  # source of the world's placement, for the terminal
     step: float  # median distance of successive frames, > 0: size of drawn rigs
     optics: Optics = ONE_EYE  # of the frames, unit of the world
+    start: str = RunStart.TRAJECTORY  # what the run started from
     judged: tuple[np.ndarray, np.ndarray] | None = None  # points (N, 3) and colours (N, 3) uint8
     # by their distance to a scan; None = not compared
 
@@ -89,8 +90,17 @@ def load_scene(run: Path) -> Scene:
         grounds=grounds,
         step=float(np.median(moving)) if len(moving) else 1.0,
         optics=Optics.of(lenses, placed),
+        start=_start(run),
         judged=_judged(run, placed),
     )
+
+
+def _start(run: Path) -> str:
+    """What the run started from, by its report."""
+    try:
+        return str(json.loads((run / "report.json").read_text(encoding="utf-8"))["start"])
+    except (OSError, ValueError, KeyError, TypeError):  # a view needs no report
+        return RunStart.TRAJECTORY
 
 
 def _judged(run: Path, placed: Reconstruction) -> tuple[np.ndarray, np.ndarray] | None:
@@ -173,7 +183,7 @@ def _latest_placement(run: Path) -> tuple[Placement, str]:
             continue
         if placement.up is not None or not np.array_equal(placement.matrix, np.eye(4)):
             return placement, f"placed as in {path.parent.name}"
-    return Placement(), "in the world of the trajectory"
+    return Placement(), "in the run's own world"
 
 
 def _coarse(run: Path, placement: Placement, num_frames: int) -> np.ndarray | None:

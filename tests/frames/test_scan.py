@@ -215,7 +215,7 @@ def test_refused_frames(folder: Path) -> None:
     with pytest.raises(GsbaError, match=r"48x32; .* cut out its faces, as front/NAME.jpg"):
         scan(folder, fps=1)
     write_image(bad, 128, 64)
-    with pytest.raises(GsbaError, match=r"0002.jpg: is 128x64, but '0000.jpg' is 64x32"):
+    with pytest.raises(GsbaError, match=r"0002.jpg: is 128x64, but '0000.jpg' is 64x32: frames"):
         scan(folder, fps=1)
     bad.unlink()
     png = write_image(folder / "0002.png")

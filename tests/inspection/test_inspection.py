@@ -2,6 +2,7 @@
 
 import json
 import shlex
+import sys
 from pathlib import Path
 
 import cv2
@@ -14,7 +15,7 @@ from two_fisheyes import made_pair, picture
 from video_files import encode, steady
 
 from gsba.frames.scan import scan
-from gsba.inspection import Inspection, inspect
+from gsba.inspection import Inspection, footage, inspect
 from gsba.log import GsbaError
 
 REAL = Path(__file__).parents[3] / "shared/data/real"
@@ -48,6 +49,16 @@ def test_panoramas_with_tags(tmp_path: Path) -> None:
     }
     assert not found.problem
     assert found.command == shlex.join(["gsba", "refine", str(tmp_path / "tour")])
+
+
+def test_data_whose_reader_is_absent_are_not_checked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "telemetry_parser", None)
+    (tmp_path / "walk.mp4").write_bytes(bytes(64))
+    for known, name in ((footage._gyro, "gyro"), (footage._gps, "GPS")):
+        wanted = f"not checked: reading its {name} needs telemetry-parser: pip install"
+        assert known(tmp_path / "walk.mp4").startswith(wanted)
 
 
 def test_raw_pairs_and_their_lenses(tmp_path: Path) -> None:

@@ -100,7 +100,7 @@ def test_a_lone_look_alike_without_a_third_view_is_not_believed() -> None:
     empty = recovery.match_anywhere(context, pair[:0])
     alone = recovery.match_anywhere(context, pair)
     assert len(empty.matches.pairs) == 0
-    assert not recovery._is_supported((1, 2), alone, context.keypoints, SETTINGS)
+    assert not recovery._is_supported((1, 2), alone, context.keypoints, True)
 
 
 def test_frames_of_two_pieces_are_never_tied_by_two_views() -> None:
@@ -203,6 +203,24 @@ def test_known_steps_of_frames_far_apart_tell_whether_matching_is_misled(
         patch.object(recovery, "_FAR_STEP_DEPTHS", 0.05 if far else 0.5),
     ):
         assert recovery._misleads(context, guided) == expected
+
+
+@pytest.mark.parametrize(
+    ("share", "lost", "kept"), [(0.5, 2, 0), (1.0, 2, NUM_FRAMES - 3), (0.5, 1, NUM_FRAMES - 2)]
+)
+def test_guided_steps_are_left_out_where_other_poses_explain_more_matches(
+    share: float, lost: int, kept: int
+) -> None:
+    """Gates around a reversed trajectory keep the few false matches that confirm it."""
+    context = _context()
+    steps = np.column_stack([np.arange(NUM_FRAMES - 1), np.arange(1, NUM_FRAMES)])
+    found = recovery.match_anywhere(context, steps)
+    poses = found.f0_T_f1s.copy()
+    poses[:, :3, 3] *= -1
+    rows = [found.matches.of(p)[: int(share * len(found.matches.of(p)))] for p in range(len(poses))]
+    matches = Matches.of_rows(found.matches.pairs, rows)
+    guided = replace(found, f0_T_f1s=poses, matches=matches).taken(range(lost, NUM_FRAMES - 1))
+    assert len(recovery._unless_misguided(context, guided, steps).f0_T_f1s) == kept
 
 
 def test_a_look_alike_at_a_lost_step_is_not_taken_where_matching_misleads() -> None:

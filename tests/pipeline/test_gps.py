@@ -67,6 +67,9 @@ def test_fixes_hold_a_run_and_are_reported(case: Case, plain_run: Path, tmp_path
         assert done.exit_code == 0, done.stderr
         said = json.loads((folder / "transform.json").read_text())
         assert (said["unit"], said["up"]) == ("m", "z")
+        place, scale = said["origin"], said["scale"]
+        told = f"at latitude {place['latitude']:.5f}, longitude {place['longitude']:.5f}, with "
+        assert f"placed by {file} {told}{scale:.4g} m to a map unit" in done.stdout
         claims.append(said["grounds"]["gps"]["scale_sigma"])
     assert claims[1] < 0.2 * claims[0]
     again = case.refine(out, _with_gps(table))
