@@ -59,7 +59,7 @@ class PictureCameras:
     def of_panorama(self, width: int, height: int, name: str) -> int:
         """Camera of a stitched panorama: that of its size, pixels, or the only one of stitched
         panoramas; GsbaError if it can be of several."""
-        stitched = self._those(lambda kind: kind.layout == "erp") or range(len(self.formats))
+        stitched = self.those(lambda kind: kind.layout == "erp") or range(len(self.formats))
         alike = [c for c in stitched if self.formats[c].width == width]
         return self._only(alike or list(stitched), f"{name}: is {width}x{height}")
 

@@ -109,7 +109,7 @@ def _nearest(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     return image[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)]
 
 
-def jpeg_text(image: np.ndarray, qualities: Sequence[int], room: int = 0) -> str:
+def jpeg_text(image: np.ndarray, qualities: Sequence[int], room: int | None = None) -> str:
     """JPEG (base64) of an RGB image in the first quality in which it has at most `room` bytes, else
     in the last one."""
     import cv2
@@ -117,8 +117,8 @@ def jpeg_text(image: np.ndarray, qualities: Sequence[int], room: int = 0) -> str
     encoded = b""
     for quality in qualities:
         how = [cv2.IMWRITE_JPEG_QUALITY, quality]
-        how += [cv2.IMWRITE_JPEG_OPTIMIZE, 1] if room else []
+        how += [] if room is None else [cv2.IMWRITE_JPEG_OPTIMIZE, 1]
         encoded = cv2.imencode(".jpg", image[..., ::-1], how)[1].tobytes()
-        if len(encoded) <= room:
+        if room is None or len(encoded) <= room:
             break
     return base64.b64encode(encoded).decode("ascii")
