@@ -170,9 +170,7 @@ CAMERAS: dict[str, tuple[tuple[float, float], float | None]] = {
     "insta360-x3": ((23.0, 1.5), None),
     "insta360-x5": ((32.0, 1.0), 11.8),
 }
-_RELATIVE_READOUT_SIGMA = 0.1  # of a published readout time: it differs between a camera's modes
 _RowDirection = Literal["+x", "-x", "+y", "-y"]
-_MAX_LENS_GAP_DEG = 190.0  # between neighbouring lenses: a fisheye covers about 200 degrees
 
 
 class CameraSettings(_Settings):
@@ -199,7 +197,8 @@ class CameraSettings(_Settings):
             return self
         yaws = sorted(yaw % 360 for yaw in self.lens_yaws_deg)
         gaps = [after - before for before, after in pairwise([*yaws, *(y + 360 for y in yaws[:1])])]
-        if len(yaws) < 2 or not (min(gaps) >= 10 and max(gaps) <= _MAX_LENS_GAP_DEG):
+        # a fisheye covers about 200 degrees
+        if len(yaws) < 2 or not (min(gaps) >= 10 and max(gaps) <= 190.0):
             raise ValueError("lens_yaws_deg: give the lenses' angles, e.g. [0, 120, 240]")
         if self.sweep is not None:
             raise ValueError("sweep is for two lenses, front and back: leave lens_yaws_deg out")
@@ -240,7 +239,8 @@ class CameraSettings(_Settings):
         ms = self.readout_ms
         if ms is None and self.name is not None:
             ms = CAMERAS[self.name][1]
-        return None if ms is None else (1e-3 * ms, 1e-3 * _RELATIVE_READOUT_SIGMA * ms)
+        # A published readout time differs between a camera's modes, by a sigma of a tenth.
+        return None if ms is None else (1e-3 * ms, 1e-3 * 0.1 * ms)
 
 
 class StitchingSettings(_Settings):

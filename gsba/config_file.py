@@ -1,7 +1,5 @@
-"""Settings from TOML files and `stage.key=value` overrides, and back to TOML.
-
-TOML has no null: the text `"none"` stands for None wherever a setting may be None.
-"""
+"""Settings from TOML files and `stage.key=value` overrides, and back; TOML's `"none"` stands for
+None."""
 
 import json
 import tomllib
@@ -57,11 +55,8 @@ def allowed_settings(settings: BaseModel, place: str = "") -> Iterator[tuple[str
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """Content of a TOML file, or of the preset of this name.
-
-    Raises:
-        GsbaError: the file cannot be read, or is not valid TOML.
-    """
+    """Content of a TOML file, or of the preset of this name. Raises GsbaError: the file cannot be
+    read, or is not valid TOML."""
     preset = PRESETS / f"{path}.toml"
     if path.parent == Path() and not path.exists() and preset.is_file():
         path = preset

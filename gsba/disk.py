@@ -1,5 +1,6 @@
 """Atomic writing of files, arrays on the disk, locks on folders, and disk errors in one line."""
 
+import csv
 import ctypes
 import errno
 import fcntl
@@ -69,6 +70,16 @@ def write_text(path: Path, text: str) -> None:
 def write_bytes(path: Path, content: bytes, parents: bool = True) -> None:
     """Write a file's content atomically; see `atomic_write`."""
     atomic_write(path, lambda temporary: temporary.write_bytes(content), parents)
+
+
+def write_csv(path: Path, header: Sequence[str], rows: Iterable[Iterable[object]]) -> None:
+    """Write a table as CSV, atomically; see `atomic_write`."""
+
+    def write(temporary: Path) -> None:
+        with temporary.open("w", newline="", encoding="utf-8") as file:
+            csv.writer(file).writerows([header, *rows])
+
+    atomic_write(path, write)
 
 
 def write_json(path: Path, content: object) -> None:

@@ -5,9 +5,6 @@ import numpy as np
 CV_R_GL = np.diag([1.0, -1, -1])  # axes of an OpenGL camera in ours: x right, y down, z forward
 
 
-_MAX_DISTANCE_EXTENTS = 10.0  # of positions from the origin: float32 keeps 1e-6 of the extent there
-
-
 def local_origin(positions: np.ndarray) -> np.ndarray | None:
     """Origin (3,) near positions (N, 3) that are too far from 0 for float32; None for others.
 
@@ -17,7 +14,8 @@ def local_origin(positions: np.ndarray) -> np.ndarray | None:
     if not len(finite):
         return None
     middle, extent = np.median(finite, axis=0), float(np.ptp(finite, axis=0).max())
-    if not (extent > 0 and np.abs(middle).max() > _MAX_DISTANCE_EXTENTS * extent):
+    # float32 keeps 1e-6 of the extent there
+    if not (extent > 0 and np.abs(middle).max() > 10.0 * extent):
         return None
     return np.round(middle, -int(np.ceil(np.log10(extent))))
 

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 EVENTS = "GSBA_EVENTS"  # environment variable that names the file of events
-_EVENT_INTERVAL_S = 0.5  # between two events on the progress of the same work
 
 
 class GsbaError(Exception):
@@ -95,7 +94,7 @@ def track(
         for count, item in enumerate(items, start=1):
             yield item
             now = time.monotonic()
-            due = now - told > _EVENT_INTERVAL_S or done + count == total
+            due = now - told > 0.5 or done + count == total  # s between two events
             if not (with_bar or due):
                 continue
             speed, more = count / max(now - began, 1e-6), "" if note is None else note()

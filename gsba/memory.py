@@ -12,8 +12,6 @@ from pathlib import Path
 from typing import IO
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # parameters of mallopt(3), from malloc.h
-_DEFAULT_THRESHOLDS = 32 << 20, 64 << 20  # bytes, glibc's own mapping and trimming thresholds
-_MIN_RETURNED_BYTES = 64 << 20  # fetching and clearing so much again takes a fortieth of a second
 _mapped_files = weakref.WeakSet[mmap.mmap]()
 
 
@@ -69,10 +67,10 @@ def freed_memory_kept() -> Iterator[None]:
     try:
         yield
     finally:
-        _set_thresholds(*_DEFAULT_THRESHOLDS)
+        _set_thresholds(32 << 20, 64 << 20)  # glibc's own
 
 
-def give_back_freed_memory(least: int = _MIN_RETURNED_BYTES) -> None:
+def give_back_freed_memory(least: int = 64 << 20) -> None:
     """Make glibc return freed memory to the system if it keeps at least `least` bytes."""
     libc = ctypes.CDLL(None)
     if hasattr(libc, "mallinfo2"):

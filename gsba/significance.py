@@ -2,10 +2,6 @@
 
 import numpy as np
 
-# Largest number of models that one robust estimate compares: three thousand samples with up to ten
-# poses each.
-_MAX_MODELS = 30_000
-
 
 def log10_false_alarms(
     num: int, agreeing: np.ndarray | int, chance: float, sample: int
@@ -25,7 +21,8 @@ def log10_false_alarms(
     from scipy.special import gammaln
 
     samples = gammaln(num + 1) - gammaln(sample + 1) - gammaln(max(num - sample, 0) + 1)
-    models = min(samples / np.log(10) + 1, np.log10(_MAX_MODELS))
+    # A robust estimate compares three thousand samples at most, with up to ten poses each.
+    models = min(samples / np.log(10) + 1, np.log10(30_000))
     beyond = np.asarray(agreeing) - sample
     with np.errstate(divide="ignore"):  # chance brings no more than all of them
         tail = np.log(_binomial_tail(beyond, max(num - sample, 0), chance)) / np.log(10)

@@ -14,11 +14,9 @@ from gsba.log import GsbaError
 _MIN_CORRELATION = 1e-6  # smallest correlation of positions that leaves a positive scale
 _MIN_DRAWS, _MAX_DRAWS, _SEED = 50, 500, 0  # samples of a robust similarity
 _MISS_CHANCE = 1e-9  # that all samples hold outliers, for a share of inliers as large as found
-_MIN_INLIER_CORRELATION = 0.5  # smallest correlation of inliers with their transformed positions
 _MEDIAN_LENGTH = 1.538  # median length of a 3-vector of independent unit normals
 _OUTLIER_SIGMAS = 4.6  # 99.99% of such vectors are shorter
 _NUM_TRIALS = 200  # samples of three points each
-_MAX_ANGLE_DEG = 1.0  # largest angle between a point's bearing and the other frame's point
 _MIN_POINTS = 15
 _RATIOS_AT_ONCE = 64  # lengths of a step tried in one array
 
@@ -186,7 +184,8 @@ def robust_similarity(
         fit = solve(source[used], target[used])
         if np.array_equal(before, used):
             break
-    turned_similarity(source[used], target[used], fit.rotation, _MIN_INLIER_CORRELATION)
+    # Inliers must correlate with their transformed positions
+    turned_similarity(source[used], target[used], fit.rotation, 0.5)
     rms = float(np.sqrt(np.mean(residuals_of(fit, source, target)[used] ** 2)))
     return fit, used, rms
 
@@ -228,7 +227,22 @@ def relative_similarity(
     scale, and its inliers (m,) bool; None if fewer than `least`."""
     if len(points0) < least:
         return None
-    inliers = _agree_with_triples(points0, points1, _triples(len(points0), seed))
+    # Inliers (T, m) bool of similarities that fit three points each, rows (T, 3)
+    triples = _triples(len(points0), seed)
+    source, target = points1[triples], points0[triples]
+    s, t = source - source.mean(axis=1, keepdims=True), target - target.mean(axis=1, keepdims=True)
+    u, _, vt = np.linalg.svd(np.swapaxes(t, 1, 2) @ s)
+    u[:, :, 2] *= np.sign(np.linalg.det(u) * np.linalg.det(vt))[:, None]
+    rotations = u @ vt
+    s = s @ np.swapaxes(rotations, 1, 2)
+    spread, across, wanted = (np.sum(a * b, axis=(1, 2)) for a, b in ((s, s), (s, t), (t, t)))
+    fits = across > np.maximum(_MIN_CORRELATION * np.sqrt(spread * wanted), 0.0)
+    scales = np.divide(across, spread, out=np.ones_like(across), where=fits)[:, None, None]
+    turned = source.mean(axis=1, keepdims=True) @ np.swapaxes(rotations, 1, 2)
+    shifts = target.mean(axis=1, keepdims=True) - scales * turned
+    agree = are_aligned(scales * (points1 @ np.swapaxes(rotations, 1, 2)) + shifts, points0)
+    agree &= are_aligned((points0 - shifts) @ rotations / scales, points1)
+    inliers = agree & fits[:, None]
     best = inliers[np.argmax(inliers.sum(axis=1))]
     for _ in range(3):
         if best.sum() < least:
@@ -297,26 +311,6 @@ def similarity_along(
     return None if best is None or agree.sum() < least else (best, agree)
 
 
-def _agree_with_triples(
-    points0: np.ndarray, points1: np.ndarray, triples: np.ndarray
-) -> np.ndarray:
-    """Inliers (T, m) bool of similarities that fit three points each, rows (T, 3); else none."""
-    source, target = points1[triples], points0[triples]
-    s, t = source - source.mean(axis=1, keepdims=True), target - target.mean(axis=1, keepdims=True)
-    u, _, vt = np.linalg.svd(np.swapaxes(t, 1, 2) @ s)
-    u[:, :, 2] *= np.sign(np.linalg.det(u) * np.linalg.det(vt))[:, None]
-    rotations = u @ vt
-    s = s @ np.swapaxes(rotations, 1, 2)
-    spread, across, wanted = (np.sum(a * b, axis=(1, 2)) for a, b in ((s, s), (s, t), (t, t)))
-    fits = across > np.maximum(_MIN_CORRELATION * np.sqrt(spread * wanted), 0.0)
-    scales = np.divide(across, spread, out=np.ones_like(across), where=fits)[:, None, None]
-    turned = source.mean(axis=1, keepdims=True) @ np.swapaxes(rotations, 1, 2)
-    shifts = target.mean(axis=1, keepdims=True) - scales * turned
-    agree = are_aligned(scales * (points1 @ np.swapaxes(rotations, 1, 2)) + shifts, points0)
-    agree &= are_aligned((points0 - shifts) @ rotations / scales, points1)
-    return agree & fits[:, None]
-
-
 def agreeing_points(points0: np.ndarray, points1: np.ndarray, fit: Sim3) -> np.ndarray:
     """Inliers (m,) bool: points (m, 3) whose bearings agree in both rigs; `fit`: rig 1 to rig 0."""
     in0, in1 = fit.points(points1), fit.points_back(points0)
@@ -324,7 +318,7 @@ def agreeing_points(points0: np.ndarray, points1: np.ndarray, fit: Sim3) -> np.n
 
 
 def are_aligned(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """True (..., m) where vectors (..., m, 3) and (m, 3) are less than `_MAX_ANGLE_DEG` apart."""
+    """True (..., m) where vectors (..., m, 3) and (m, 3) are less than a degree apart."""
     lengths = np.linalg.norm(one, axis=-1) * np.linalg.norm(other, axis=-1)
-    limit = np.cos(np.deg2rad(_MAX_ANGLE_DEG))
+    limit = np.cos(np.deg2rad(1.0))
     return np.einsum("...mi,...mi->...m", one, other) > limit * np.maximum(lengths, 1e-12)

@@ -14,11 +14,8 @@ _MAX_ENTRIES = 1000
 
 
 def inside(root: Path, name: str) -> Path:
-    """Path of a name relative to the root, links resolved.
-
-    Raises:
-        GsbaError: it leads out of the root.
-    """
+    """Path of a name relative to the root, links resolved. Raises GsbaError: it leads out of the
+    root."""
     if "\0" in name:
         raise GsbaError("a path holds no NUL characters")
     if holds_half_characters(name):
@@ -33,11 +30,8 @@ def inside(root: Path, name: str) -> Path:
 
 
 def listing(root: Path, name: str) -> dict[str, Any]:
-    """Entries of a folder below the root: folders first, hidden ones left out.
-
-    Raises:
-        GsbaError: it is no folder, cannot be read, or leads out of the root.
-    """
+    """Entries of a folder below the root: folders first, hidden ones left out. Raises GsbaError: it
+    is no folder, cannot be read, or leads out of the root."""
     folder = inside(root, name)
     try:
         paths = [Path(entry.path) for entry in os.scandir(folder) if not entry.name.startswith(".")]
@@ -47,27 +41,21 @@ def listing(root: Path, name: str) -> dict[str, Any]:
     entries = []
     for path in paths:
         if path.resolve().is_relative_to(base):
-            kind, place = _kind(path), _relative(base, path)
+            suffix, kind = path.suffix.lower(), "file"
+            if path.is_dir():
+                kind = "run" if is_run_folder(path) else "folder"
+            elif suffix in VIDEO_SUFFIXES or suffix in IMAGE_SUFFIXES:
+                kind = "video" if suffix in VIDEO_SUFFIXES else "image"
             size = path.stat().st_size if path.is_file() else None
+            place = path.relative_to(base).as_posix()
             entries.append({"name": path.name, "path": place, "kind": kind, "size": size})
     entries.sort(key=lambda entry: (entry["kind"] not in ("run", "folder"), entry["name"].lower()))
-    here = _relative(base, folder)
+    here = folder.relative_to(base).as_posix()
     return {
         "path": here,
-        "parent": None if here == "." else _relative(base, folder.parent),
+        "parent": None if here == "." else folder.parent.relative_to(base).as_posix(),
         "kind": "run" if is_run_folder(folder) else "folder",
         "images": sum(entry["kind"] == "image" for entry in entries),
         "entries": entries[:_MAX_ENTRIES],
         "left_out": max(0, len(entries) - _MAX_ENTRIES),
     }
-
-
-def _kind(path: Path) -> str:
-    if path.is_dir():
-        return "run" if is_run_folder(path) else "folder"
-    suffix = path.suffix.lower()
-    return "video" if suffix in VIDEO_SUFFIXES else "image" if suffix in IMAGE_SUFFIXES else "file"
-
-
-def _relative(base: Path, path: Path) -> str:
-    return path.relative_to(base).as_posix()

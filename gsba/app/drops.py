@@ -1,9 +1,6 @@
-"""Files that a browser drops into the page's folder: streamed, resumable, never half-written.
-
-What has arrived so far is a hidden file beside the final one, whose name holds the size and the
-time of change of what was dropped: the same file dropped again goes on from there. The final name
-appears when all bytes are on the disk. Names that are taken are never overwritten.
-"""
+"""Files that a browser drops into the page's folder: streamed to a hidden file beside the final
+one, whose name holds size and time of change, so that the same file dropped again goes on from
+there."""
 
 import errno
 import fcntl
@@ -32,7 +29,6 @@ _FORBIDDEN = re.compile(r'[\x00-\x1f\x7f-\x9f/\\:*?"<>|]')
 _MAX_NAME = 180  # bytes, so that names beside it fit
 _MAX_DEPTH, _MAX_NAMES = 4, 100  # folders in a dropped path; files tried as NAME-2, NAME-3, ...
 _SPARE = 100 * 2**20  # bytes of the disk that stay free
-_CLOCK_STEP_MS = 2000  # of the times of change on FAT, the coarsest
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +61,8 @@ class Drop:
         if not self.final.is_file():
             return False
         found = self.final.stat()
-        near = abs(found.st_mtime_ns / 1e6 - self.modified) <= _CLOCK_STEP_MS
+        # ms: times of change on FAT are the coarsest
+        near = abs(found.st_mtime_ns / 1e6 - self.modified) <= 2000
         return found.st_size == self.size and near
 
 
@@ -141,32 +138,24 @@ class Arrival:
             how = os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW
             self._file = os.open(self.drop.part, how, 0o644)
         try:
-            self._begin(offset)
+            try:
+                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise GsbaError(f"{self.drop.name} is being sent by another page") from None
+            self._arrived = os.fstat(self._file).st_size
+            if self._arrived != offset:
+                raise GsbaError(
+                    f"{self.drop.name} has arrived up to byte {self._arrived}: drop it again"
+                )
+            left, free = size - offset, shutil.disk_usage(folder).free - _SPARE
+            if left > free:
+                raise GsbaError(_no_room(self.drop, left, free))
         except BaseException:
             self.close()
             raise
 
-    def _begin(self, offset: int) -> None:
-        try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise GsbaError(f"{self.drop.name} is being sent by another page") from None
-        self._arrived = os.fstat(self._file).st_size
-        if self._arrived != offset:
-            raise GsbaError(
-                f"{self.drop.name} has arrived up to byte {self._arrived}: drop it again"
-            )
-        left = self.drop.size - offset
-        free = shutil.disk_usage(self.drop.folder).free - _SPARE
-        if left > free:
-            raise GsbaError(_no_room(self.drop, left, free))
-
     def write(self, content: bytes) -> None:
-        """Append bytes.
-
-        Raises:
-            GsbaError: there are more than announced, or the disk is full.
-        """
+        """Append bytes. Raises GsbaError: there are more than announced, or the disk is full."""
         if self._arrived + len(content) > self.drop.size:
             raise GsbaError(f"{self.drop.name} is longer than announced: drop it again")
         try:
@@ -216,11 +205,8 @@ def unfinished(folder: Path) -> list[dict[str, Any]]:
 
 
 def discard(root: Path, folder: str, part: str) -> None:
-    """Delete what has arrived of a dropped file.
-
-    Raises:
-        GsbaError: there is no such file, or it is still being sent.
-    """
+    """Delete what has arrived of a dropped file. Raises GsbaError: there is no such file, or it is
+    still being sent."""
     path = inside(root, folder) / part
     if "/" in part or not _PART.match(part) or path.is_symlink() or not path.is_file():
         raise GsbaError(f"{brief(part)} is no unfinished drop")

@@ -1,7 +1,7 @@
 """Forms of commands: their options as fields of a page, and arguments from the values of fields."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -61,7 +61,9 @@ class Form:
             elif field.parts > 1:
                 options += [field.option, *texts] if texts else []
             else:
-                options += [part for text in texts for part in _typed(field.option, text)]
+                for text in texts:
+                    word = f"{field.option}={text}"
+                    options += [word] if text.startswith("-") else [field.option, text]
         return [self.command, *positional, *options]
 
     def paths(self, values: Mapping[str, Any]) -> list[str]:
@@ -109,8 +111,3 @@ def _text(field: Field, value: Any) -> str:
     if holds_half_characters(text):
         raise GsbaError(f"{field.option or field.name}: half characters are not allowed")
     return text
-
-
-def _typed(option: str, text: str) -> Sequence[str]:
-    """An option and its value; in one word where the value would be taken for an option."""
-    return [f"{option}={text}"] if text.startswith("-") else [option, text]

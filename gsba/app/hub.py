@@ -57,7 +57,17 @@ class App:
         self.root, self.jobs = root.resolve(), Jobs(state)
         self.forms = {form.command: form for form in forms}
         self.choices, self.check = choices, check
-        self.token = _kept_token(state / "token")
+        # The secret of the address is kept: an open page finds a server that was restarted.
+        path = state / "token"
+        try:
+            token = path.read_text(encoding="ascii").strip()
+        except (OSError, ValueError):
+            token = ""
+        if len(token) < 16 or not token.replace("-", "").replace("_", "").isalnum():
+            token = secrets.token_urlsafe(16)
+            write_text(path, token)
+            path.chmod(0o600)
+        self.token = token
         self.previews = Previews(self.root, state.resolve() / "previews")
         self._followed: dict[str, Followed] = {}
         self._views: dict[Path, View] = {}
@@ -70,11 +80,8 @@ class App:
             return self._followed.setdefault(job.id, Followed(job.events)).now()
 
     def view(self, run: Path) -> str:
-        """Address of the viewer of a run, started if it is not shown yet.
-
-        Raises:
-            GsbaError: viser is missing, or the run is not finished.
-        """
+        """Address of the viewer of a run, started if it is not shown yet. Raises GsbaError: viser
+        is missing, or the run is not finished."""
         with self._lock:
             if run not in self._views:
                 self._views[run] = serve_view(load_scene(run), 0)
@@ -85,16 +92,3 @@ class App:
         self.previews.close()
         for view in self._views.values():
             view.stop()
-
-
-def _kept_token(path: Path) -> str:
-    """Secret of the address; it is kept, so that an open page finds a server that was restarted."""
-    try:
-        token = path.read_text(encoding="ascii").strip()
-    except (OSError, ValueError):
-        token = ""
-    if len(token) < 16 or not token.replace("-", "").replace("_", "").isalnum():
-        token = secrets.token_urlsafe(16)
-        write_text(path, token)
-        path.chmod(0o600)
-    return token

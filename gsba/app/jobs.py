@@ -1,9 +1,8 @@
 """Jobs on disk: commands of gsba that wait, run or have ended.
 
 A job is a folder: `job.json`, written once, is its command; `state.json` is replaced as a whole
-with every change; `log.txt` is the command's output; `events.jsonl` holds its events
-(`gsba.log.event`); `alive.lock` is locked for as long as a process of the job runs.
-States change only under a lock, so that a server, its successor and the worker agree.
+under a lock; `log.txt` is its output, `events.jsonl` its events; `alive.lock` is held while it
+runs.
 """
 
 import fcntl
@@ -133,11 +132,7 @@ class Jobs:
         return found
 
     def get(self, name: str) -> Job:
-        """A job by its id.
-
-        Raises:
-            GsbaError: there is none, or its files were edited.
-        """
+        """A job by its id. Raises GsbaError: there is none, or its files were edited."""
         path = self._folder / name
         if not name or "/" in name or name.startswith(".") or not path.is_dir():
             raise GsbaError(f"there is no job {name}")
@@ -168,11 +163,8 @@ class Jobs:
             return self.change(job, status="stopping", forced=again)
 
     def go_on(self, name: str) -> Job:
-        """Queue a job again that was stopped or has failed: gsba resumes what is done.
-
-        Raises:
-            GsbaError: the job waits, runs or is done.
-        """
+        """Queue a job again that was stopped or has failed: gsba resumes what is done. Raises
+        GsbaError: the job waits, runs or is done."""
         with self.locked():
             job = self.get(name)
             if job.state.status in ("waiting", "done", "partial", *ACTIVE):
@@ -180,11 +172,8 @@ class Jobs:
             return self.change(job, status="waiting", forced=False)
 
     def remove(self, name: str) -> None:
-        """Forget a job that neither waits nor runs; what it wrote elsewhere stays.
-
-        Raises:
-            GsbaError: the job waits or runs.
-        """
+        """Forget a job that neither waits nor runs; what it wrote elsewhere stays. Raises
+        GsbaError: the job waits or runs."""
         with self.locked():
             job = self.get(name)
             if job.state.status in ("waiting", *ACTIVE):

@@ -1,7 +1,5 @@
-"""Pictures of footage and facts about it, made by a process of its own.
-
-`python -m gsba.app.pictures` reads one JSON line for each task and answers with another. Decoders
-of damaged files may hang or crash: the server then ends this process and starts the next one.
+"""Pictures of footage and facts about it, by a process of its own (`python -m gsba.app.pictures`)
+that answers a JSON line for each task: the server ends it where a decoder of a damaged file hangs.
 """
 
 import json
@@ -16,8 +14,6 @@ from gsba.log import GsbaError, brief
 from gsba.video.timeline import is_video, picture_near
 
 SMALL, LARGE = 320, 2048  # pixels across a picture of the list, and of a panorama to look around in
-_QUALITY = 82  # of JPEGs
-_NICENESS = 10  # runs come first
 
 
 def picture_of(path: Path, width: int, share: float) -> bytes:
@@ -48,10 +44,7 @@ def _images_in(folder: Path) -> list[Path]:
 
 def frame_of(run: Path, frame: int, width: int) -> bytes:
     """JPEG of the panorama of a run's frame, read by the calibration that the run found, if it has.
-
-    Raises:
-        GsbaError: it is no run, has no such frame yet, or the frame cannot be decoded.
-    """
+    Raises GsbaError: it is no run, has no such frame yet, or the frame cannot be decoded."""
     from gsba.report.html.pictures import small_panorama
     from gsba.store.store import load_stage
     from gsba.types import FrameSet, Reconstruction
@@ -73,7 +66,7 @@ def _jpeg(image: Any, width: int) -> bytes:
     if image.shape[1] > width:
         height = max(1, round(image.shape[0] * width / image.shape[1]))
         image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()
+    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 82])[1].tobytes()
 
 
 def answer(task: dict[str, Any]) -> dict[str, Any]:
@@ -101,7 +94,7 @@ def main() -> None:
     """Answer the tasks of standard input until it ends."""
     import cv2
 
-    os.nice(_NICENESS)
+    os.nice(10)  # runs come first
     cv2.setNumThreads(1)
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "w")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # words of libraries are no answers

@@ -24,8 +24,6 @@ from gsba.version import __version__
 from gsba.video.timeline import is_video
 
 _LONGEST_S = 60.0  # that one task may take
-_MAX_KEPT = 6000  # files in the cache; the oldest go first
-_SOME_PLACE = 0.1  # of a video's duration: the first frame often shows a hand
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,10 +65,10 @@ class Previews:
         """
         found, missing = [], []
         for path in paths:
-            if not _has_preview(path):
+            if not (path.is_dir() or (path.is_file() and (is_video(path) or is_image(path)))):
                 found.append({"facts": {}, "problem": "", "picture": False, "pending": False})
                 continue
-            picture, facts = self._picture_task(path), self._facts_task(path)
+            picture, facts = self._picture_task(path), self._task(path, {"kind": "facts"})
             if is_run_folder(path):
                 known = {"facts": runs.brief_facts(path), "problem": ""}
             else:
@@ -93,38 +91,24 @@ class Previews:
         return found
 
     def facts(self, path: Path) -> dict[str, Any]:
-        """Facts about a path, as `gsba info --json` has them, as soon as they are known.
-
-        Raises:
-            GsbaError: it cannot be described.
-        """
+        """Facts about a path, as `gsba info --json` has them, as soon as they are known. Raises
+        GsbaError: it cannot be described."""
         if not stat.S_ISREG(path.stat().st_mode) and not path.is_dir():
             raise GsbaError(f"{path.name} is neither a file nor a folder")
-        return self._made(self._facts_task(path))
+        return self._made(self._task(path, {"kind": "facts"}))
 
     def picture(self, path: Path) -> Path:
-        """JPEG of the list's picture of a path.
-
-        Raises:
-            GsbaError: there is none.
-        """
+        """JPEG of the list's picture of a path. Raises GsbaError: there is none."""
         return self._file(self._picture_task(path))
 
     def panorama(self, path: Path, share: float) -> Path:
-        """JPEG of a panorama to look around in, at a place 0..1 of a video or folder.
-
-        Raises:
-            GsbaError: there is none.
-        """
+        """JPEG of a panorama to look around in, at a place 0..1 of a video or folder. Raises
+        GsbaError: there is none."""
         values = {"kind": "picture", "width": LARGE, "share": min(max(share, 0.0), 1.0)}
         return self._file(self._task(path, values))
 
     def frame(self, run: Path, frame: int) -> Path:
-        """JPEG of the panorama of a finished run's frame.
-
-        Raises:
-            GsbaError: there is none.
-        """
+        """JPEG of the panorama of a finished run's frame. Raises GsbaError: there is none."""
         return self._file(self._task(run, {"kind": "frame", "frame": frame, "width": LARGE}))
 
     def close(self) -> None:
@@ -136,13 +120,11 @@ class Previews:
             if self._process is not None:
                 self._process.kill()
 
-    def _facts_task(self, path: Path) -> _Task:
-        return self._task(path, {"kind": "facts"})
-
     def _picture_task(self, path: Path) -> _Task:
         if is_run_folder(path):
             return self._task(path, {"kind": "frame", "frame": 0, "width": SMALL})
-        return self._task(path, {"kind": "picture", "width": SMALL, "share": _SOME_PLACE})
+        # the first frame of a video often shows a hand
+        return self._task(path, {"kind": "picture", "width": SMALL, "share": 0.1})
 
     def _task(self, path: Path, values: dict[str, Any]) -> _Task:
         """A task whose result is kept under the state of the file, and of the other lens's."""
@@ -210,7 +192,8 @@ class Previews:
     def _work(self) -> None:
         self._cache.mkdir(parents=True, exist_ok=True)
         kept = sorted(self._cache.iterdir(), key=lambda path: path.stat().st_mtime)
-        for path in kept[: max(0, len(kept) - _MAX_KEPT)]:
+        # the oldest go first
+        for path in kept[: max(0, len(kept) - 6000)]:
             path.unlink(missing_ok=True)
         while True:
             with self._changed:
@@ -263,8 +246,3 @@ def _started(root: Path) -> subprocess.Popen[bytes]:
         stderr=subprocess.DEVNULL,
         env={**os.environ, "PYTHONWARNINGS": "ignore"},
     )
-
-
-def _has_preview(path: Path) -> bool:
-    """True for videos, images and folders."""
-    return path.is_dir() or (path.is_file() and (is_video(path) or is_image(path)))

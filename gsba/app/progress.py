@@ -7,9 +7,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-_MAX_WARNINGS = 200
-_MAX_PATH_POINTS = 4000
-
 
 def read_events(path: Path, offset: int = 0) -> tuple[list[dict[str, Any]], int]:
     """Whole lines of a file of events from an offset on, and the offset behind them.
@@ -64,14 +61,19 @@ class Progress:
             self.work = dict(entry)
         elif kind == "log" and entry.get("level") in ("WARNING", "ERROR", "CRITICAL"):
             text = str(entry.get("text"))
-            if text not in self.warnings and len(self.warnings) < _MAX_WARNINGS:
+            if text not in self.warnings and len(self.warnings) < 200:
                 self.warnings.append(text)
         elif kind == "error":
             self.error = str(entry.get("text"))
         elif kind == "end":
             self.stage = self.work = None
         elif kind == "keyframe":
-            self._add_keyframe(entry)
+            position, points = entry.get("position"), entry.get("points", [])
+            if _finite(position):
+                self.keyframes.append((entry.get("map", 0), list(position or ())))
+            self.points += [list(point) for point in points if _finite(point)]
+            if len(self.points) > 8000:
+                self.points = self.points[::2]
 
     def names(self) -> list[str]:
         """Names of the stages that have ended, in order."""
@@ -97,14 +99,6 @@ class Progress:
             "last": self.last,
             "keyframes": len(self.keyframes),
         }
-
-    def _add_keyframe(self, entry: Mapping[str, Any]) -> None:
-        position, points = entry.get("position"), entry.get("points", [])
-        if _finite(position):
-            self.keyframes.append((entry.get("map", 0), list(position or ())))
-        self.points += [list(point) for point in points if _finite(point)]
-        if len(self.points) > 2 * _MAX_PATH_POINTS:
-            self.points = self.points[::2]
 
 
 class Followed:

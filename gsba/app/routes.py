@@ -25,7 +25,6 @@ from gsba.log import GsbaError
 from gsba.view.server import allowed
 
 _MAX_BODY, _MAX_LOG = 256 * 1024, 64 * 1024  # bytes
-_MAX_ABOUT = 200  # paths of one request
 _SCRIPTS = (
     "elements",
     "files",
@@ -206,7 +205,7 @@ def _about(app: App, request: Request) -> Any:
     names = request.state.body.get("paths")
     if not isinstance(names, list):
         raise GsbaError("the request names no paths")
-    names = [str(name) for name in names[:_MAX_ABOUT]]
+    names = [str(name) for name in names[:200]]
     found = app.previews.about([inside(app.root, name) for name in names])
     return {"about": dict(zip(names, found, strict=True))}
 

@@ -1,8 +1,5 @@
-"""The process that runs queued jobs one after another: `python -m gsba.app.worker STATE`.
-
-It has a session of its own, so that jobs go on when the page, the server or the terminal is closed,
-and it ends when no job waits. One process at a time is the worker of a state folder.
-"""
+"""The process that runs queued jobs one after another (`python -m gsba.app.worker STATE`), in a
+session of its own that outlives page, server and terminal; it ends when no job waits."""
 
 import fcntl
 import os

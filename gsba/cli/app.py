@@ -59,7 +59,16 @@ def _expected_failures() -> Iterator[None]:
         where = f"{error.filename}: " if error.filename else ""
         _fail(f"{where}{error.strerror or error}")
     except MemoryError as error:
-        _fail(_memory_message(error))
+        stage = next(iter(getattr(error, "__notes__", ())), "")
+        details = "; ".join(filter(None, (stage and f"stage {stage}", str(error))))
+        kind = stage.removeprefix("first-")
+        lower = next(
+            (settings for name, settings in _MEMORY_SETTINGS.items() if kind.startswith(name)),
+            _DEFAULT_MEMORY_SETTING,
+        )
+        advice = f"lower {lower}" if stage else "give smaller input"
+        where = f" ({details})" if details else ""
+        _fail(f"out of memory{where}: {advice}, or use a machine with more memory")
     except (typer.Exit, typer.Abort):
         raise
     except Exception as error:
@@ -67,39 +76,20 @@ def _expected_failures() -> Iterator[None]:
             raise
         if isinstance(error, ModuleNotFoundError):
             _fail(f"the package {error.name} is missing: `gsba doctor` says how to get it")
-        _fail(_bug_message(error))
+        frames = traceback.extract_tb(error.__traceback__)
+        ours = [f for f in frames if Path(f.filename).is_relative_to(_SOURCE)] or frames
+        where = f"{Path(ours[-1].filename).name}:{ours[-1].lineno}"
+        _fail(
+            f"unforeseen {type(error).__name__} at {where} ({brief(str(error), 200)}): a bug in "
+            f"gsba {__version__}; please report this line, and the traceback that `gsba --debug` "
+            "before the same command shows"
+        )
 
 
 class _Call:
     """Global options of the running call."""
 
     debug = False
-
-
-def _memory_message(error: MemoryError) -> str:
-    """Message of a stage that ran out of memory, with the settings that lower its use."""
-    stage = next(iter(getattr(error, "__notes__", ())), "")
-    details = "; ".join(filter(None, (stage and f"stage {stage}", str(error))))
-    kind = stage.removeprefix("first-")
-    lower = next(
-        (settings for name, settings in _MEMORY_SETTINGS.items() if kind.startswith(name)),
-        _DEFAULT_MEMORY_SETTING,
-    )
-    advice = f"lower {lower}" if stage else "give smaller input"
-    where = f" ({details})" if details else ""
-    return f"out of memory{where}: {advice}, or use a machine with more memory"
-
-
-def _bug_message(error: Exception) -> str:
-    """Message of a bug: the error, its line in our code, and how to report it."""
-    frames = traceback.extract_tb(error.__traceback__)
-    ours = [f for f in frames if Path(f.filename).is_relative_to(_SOURCE)] or frames
-    where = f"{Path(ours[-1].filename).name}:{ours[-1].lineno}"
-    return (
-        f"unforeseen {type(error).__name__} at {where} ({brief(str(error), 200)}): a bug in gsba "
-        f"{__version__}; please report this line, and the traceback that `gsba --debug` before the "
-        "same command shows"
-    )
 
 
 def _fail(message: str, code: int = 1) -> NoReturn:

@@ -124,9 +124,6 @@ def remove(
     conclude([pipeline.remove_recordings(run, names, out)], allow_partial)
 
 
-_ENOUGH = 0.9  # share of the pictures that must be localised for exit code 0
-
-
 @command
 def localize(
     run: Run,
@@ -186,5 +183,5 @@ def localize(
     write_localized(out, run, found, pictures)
     num = sum(frame.found for frame in found.frames)
     typer.echo(f"{num} of {len(pictures)} pictures localised: {out}")
-    if num < _ENOUGH * len(pictures) and not allow_partial:
+    if num < 0.9 * len(pictures) and not allow_partial:
         raise typer.Exit(PARTIAL)

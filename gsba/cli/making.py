@@ -90,5 +90,5 @@ def _write_dataset(run: Path, to: str, face_size: int | None) -> None:
     lenses = cameras_of(run, reconstruction, frames, "auto", 1)
     options = ExportOptions(face_size, placement, lenses=lenses, shutter=shutter_of(run))
     export_all(reconstruction, frames, {format_of(to): folder}, options_for(to, options))
-    claim(run.resolve(), folder.resolve())
+    claim(run, folder)
     typer.echo("\n".join([f"{to}: {folder}", *how_to_start(to, folder)]))

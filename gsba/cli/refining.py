@@ -15,7 +15,7 @@ from gsba.log import GsbaError
 if TYPE_CHECKING:
     from gsba.config import RefineSettings
     from gsba.demo.two_lenses import TwoLenses
-    from gsba.pipeline import Recording, RunResult
+    from gsba.pipeline import RunResult
 
 PARTIAL = 3  # exit code of a run whose exported map has less than nine tenths of its frames, or is
 # not good to train on
@@ -247,7 +247,13 @@ def refine(
     overrides = [*_networks(weights, accept_noncommercial, download), *(overrides or ())]
     if trajectory_format is not None:
         overrides = [*overrides, f"read.trajectory_format={json.dumps(trajectory_format)}"]
-    settings = settings_of(config, *_with_sensors(overrides, factors, camera, gps))
+    if camera is not None:
+        overrides = [*overrides, f'camera.name="{camera}"']
+    if gps is not None:
+        overrides, families = [*overrides, f"gps.file={json.dumps(gps)}"], factors or "bearing"
+        named = [family.strip() for family in families.split(",")]
+        factors = families if "gps" in named else f"{families},gps"
+    settings = settings_of(config, overrides, factors)
     shared: dict[str, Any] = {"odometry": False if no_trajectory else None, "fps": fps}
     shared |= {"masks": masks or "auto", "calibration": calibration}
     shared["circles"] = [_circle(text) for text in circle or ()]
@@ -256,27 +262,19 @@ def refine(
         run: dict[str, Any] = {"segment": segment, "fresh": fresh, "client": client}
         if several:
             recordings = recordings_of(given, recording or (), shared)
-            out = _several_run_folder(own, recordings, out)
+            for name, path in own.items():
+                if path is not None:
+                    raise GsbaError(
+                        f"--{name} {path}: is of one recording, and {len(recordings)} are given: "
+                        f"pass --recording PATH,{name}={path}"
+                    )
+            if out is None:
+                raise GsbaError("several recordings need a name for their run: pass --out RUN")
             result = pipeline.refine_recordings(recordings, out, settings, **run)
         else:
             out = out or run_folder(given[0])
             result = pipeline.refine(given[0], trajectory, out, settings, **run, **shared, **own)
     conclude([result], allow_partial)
-
-
-def _several_run_folder(
-    own: dict[str, Path | None], recordings: "Sequence[Recording]", out: Path | None
-) -> Path:
-    """Folder of a run of several recordings; files `own` that only one can have are refused."""
-    for name, path in own.items():
-        if path is not None:
-            raise GsbaError(
-                f"--{name} {path}: is of one recording, and {len(recordings)} are given: pass "
-                f"--recording PATH,{name}={path}"
-            )
-    if out is None:
-        raise GsbaError("several recordings need a name for their run: pass --out RUN")
-    return out
 
 
 def run_folder(frames: Path) -> Path:
@@ -351,7 +349,44 @@ def demo(
         )
     else:
         frames, width = 40 if frames is None else frames, 1024 if width is None else width
-        _demo_of_frames(out, allow_partial, path, heading, frames, width, seed, camera, mesh)
+        from gsba.config import CameraSettings, RefineSettings
+        from gsba.demo import make_mesh_walk, make_walk
+        from gsba.evaluate.trajectory import evaluate as compare
+        from gsba.evaluate.trajectory import format_table
+        from gsba.trajectory.files import read_trajectory
+
+        if mesh is not None:
+            if (heading, camera) != ("locked", "ideal"):
+                raise GsbaError("--mesh needs an ideal camera: leave out --heading and --camera")
+            given = None if path == "rectangle" else Path(path)
+            walk = make_mesh_walk(out / "walk", mesh, given, frames, width, seed)
+        else:
+            walk = make_walk(out / "walk", path, heading, frames, width, seed, camera=camera)  # type: ignore[arg-type]
+        run, central = out / "run", out / "run-central"
+        from gsba import pipeline
+
+        runs = {"after": (run, RefineSettings())}
+        if walk.lenses is not None:
+            one = RefineSettings(camera=CameraSettings(model="central"))
+            runs = {"one centre": (central, one), "two lenses": (run, RefineSettings())}
+        truth = read_trajectory(walk.truth_path)
+        rows = {"before": compare(read_trajectory(walk.slam_path), truth)}
+        residuals, report, results = [], {}, []
+        for name, (folder, settings) in runs.items():
+            result = pipeline.refine(walk.frames_dir, walk.slam_path, folder, settings, fresh=True)
+            rows[name] = compare(read_trajectory(folder / "trajectory.tum"), truth)
+            report = result.report
+            residuals.append(report["summary"]["median_residual_deg"])
+            results.append(result)
+        residuals.insert(0, report["summary"]["median_residual_deg_coarse"])
+        pixels = [f"{degrees * width / 360:.3f}" for degrees in residuals]
+        typer.echo(format_table(rows, extra={"reproj. px": pixels}))
+        where = f"the run with its model in {run}"
+        if walk.lenses is not None:
+            typer.echo(_found_lenses(report["camera"], rows["two lenses"].scale, walk.lenses))
+            where += f", the run with one centre in {central}"
+        typer.echo(f"Frames, trajectories and truth in {out / 'walk'}, {where}.")
+        conclude(results, allow_partial)
 
 
 def _demo_of_video(out: Path, allow_partial: bool, **options: Any) -> None:
@@ -384,58 +419,6 @@ def _demo_of_video(out: Path, allow_partial: bool, **options: Any) -> None:
     conclude([result], allow_partial)
 
 
-def _demo_of_frames(
-    out: Path,
-    allow_partial: bool,
-    path: str,
-    heading: str,
-    frames: int,
-    width: int,
-    seed: int,
-    camera: str,
-    mesh: Path | None,
-) -> None:
-    """Render a walk, refine it from a drifting trajectory, and print errors before and after."""
-    from gsba.config import CameraSettings, RefineSettings
-    from gsba.demo import make_mesh_walk, make_walk
-    from gsba.evaluate.trajectory import evaluate as compare
-    from gsba.evaluate.trajectory import format_table
-    from gsba.trajectory.files import read_trajectory
-
-    if mesh is not None:
-        if (heading, camera) != ("locked", "ideal"):
-            raise GsbaError("--mesh needs an ideal camera: leave out --heading and --camera")
-        given = None if path == "rectangle" else Path(path)
-        walk = make_mesh_walk(out / "walk", mesh, given, frames, width, seed)
-    else:
-        walk = make_walk(out / "walk", path, heading, frames, width, seed, camera=camera)  # type: ignore[arg-type]
-    run, central = out / "run", out / "run-central"
-    from gsba import pipeline
-
-    runs = {"after": (run, RefineSettings())}
-    if walk.lenses is not None:
-        one = RefineSettings(camera=CameraSettings(model="central"))
-        runs = {"one centre": (central, one), "two lenses": (run, RefineSettings())}
-    truth = read_trajectory(walk.truth_path)
-    rows = {"before": compare(read_trajectory(walk.slam_path), truth)}
-    residuals, report, results = [], {}, []
-    for name, (folder, settings) in runs.items():
-        result = pipeline.refine(walk.frames_dir, walk.slam_path, folder, settings, fresh=True)
-        rows[name] = compare(read_trajectory(folder / "trajectory.tum"), truth)
-        report = result.report
-        residuals.append(report["summary"]["median_residual_deg"])
-        results.append(result)
-    residuals.insert(0, report["summary"]["median_residual_deg_coarse"])
-    pixels = [f"{degrees * width / 360:.3f}" for degrees in residuals]
-    typer.echo(format_table(rows, extra={"reproj. px": pixels}))
-    where = f"the run with its model in {run}"
-    if walk.lenses is not None:
-        typer.echo(_found_lenses(report["camera"], rows["two lenses"].scale, walk.lenses))
-        where += f", the run with one centre in {central}"
-    typer.echo(f"Frames, trajectories and truth in {out / 'walk'}, {where}.")
-    conclude(results, allow_partial)
-
-
 def _found_lenses(found: dict[str, Any], scale: float, lenses: "TwoLenses") -> str:
     """Line with the estimated baseline and readout (`camera` of report.json) beside true values;
     `scale` is metres per map unit."""
@@ -460,24 +443,6 @@ def show_config(
     from gsba.config_file import to_toml
 
     typer.echo(to_toml(settings_of(config, overrides, factors)), nl=False)
-
-
-def _with_sensors(
-    overrides: list[str], factors: str | None, camera: str | None, gps: str | None
-) -> tuple[list[str], str | None]:
-    """Overrides and families of residuals with those that --camera and --gps stand for."""
-    if camera is not None:
-        overrides = [*overrides, f'camera.name="{camera}"']
-    if gps is None:
-        return overrides, factors
-    return [*overrides, f"gps.file={json.dumps(gps)}"], _with_gps(factors)
-
-
-def _with_gps(factors: str | None) -> str:
-    """Families of residuals with that of GPS, which --gps adds."""
-    families = factors or "bearing"
-    named = [family.strip() for family in families.split(",")]
-    return families if "gps" in named else f"{families},gps"
 
 
 def _circle(text: str) -> tuple[float, float, float]:

@@ -223,8 +223,7 @@ def export(
     )
     with connected(cluster) as client, hired(client, folder, frames) as workers:
         export_all(reconstruction, frames, {to: folder}, options, workers)
-    if folder.resolve().is_relative_to(run.resolve()):
-        claim(run.resolve(), folder.resolve())
+    claim(run, folder)
     typer.echo("\n".join([f"{to}: {folder}", *how_to_start(name, folder, masks)]))
     if placed.origin is not None:
         latitude, longitude, _ = placed.origin

@@ -57,11 +57,8 @@ def form_of(name: str) -> "Form":
 
 
 def check(arguments: Sequence[str]) -> None:
-    """Parse arguments as the command line does, without running the command.
-
-    Raises:
-        GsbaError: the command line would refuse them.
-    """
+    """Parse arguments as the command line does, without running the command. Raises GsbaError: the
+    command line would refuse them."""
     name, *rest = arguments
     try:
         _command(name).make_context(name, list(rest))

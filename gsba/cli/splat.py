@@ -89,8 +89,7 @@ def render(
     panorama = render_panorama(gaussians, pose, 4 * settings.face_size, near, renderer)
     for name, image in [*zip([v.name for v in views], faces, strict=True), ("erp", panorama)]:
         write_image(folder / f"{frame}_{name}.png", image)
-    if folder.resolve().is_relative_to(run.resolve()):
-        claim(run.resolve(), folder.resolve())
+    claim(run, folder)
     typer.echo(f"{frame}: {folder}")
 
 
@@ -133,18 +132,14 @@ def _compare(
     renderer = choose_backend(settings.backend)
     optics = Optics.of(load_cameras(run, reconstruction, frames), reconstruction)
     results = compare(reconstruction, frames, sources, settings, renderer, out, lpips, optics)
-    claim(run.resolve(), out.resolve())
+    claim(run, out)
     return results
 
 
 def splat_settings(
     iterations: int | None, face_size: int | None, backend: str, max_gaussians: int | None = None
 ) -> "SplatSettings":
-    """Settings with the options of the command line.
-
-    Raises:
-        GsbaError: a value out of range.
-    """
+    """Settings with the options of the command line. Raises GsbaError: a value out of range."""
     from pydantic import ValidationError
 
     from gsba.config import SplatSettings

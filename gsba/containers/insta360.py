@@ -1,14 +1,10 @@
 """Trailer that Insta360 cameras append to their videos (`.insv`) and images (`.insp`).
 
-It is read from the end of the file: 32 bytes of signature, before them the size of the trailer and
-its version (u32 each), before these 32 bytes of unknown meaning. Records lie before that header,
-each followed by its format (u8), its number (u8) and its size (u32); some cameras leave gaps
-between records and list them in a directory, record 0. All numbers are little-endian.
-
-Layout, fields and units follow public descriptions: OpenSpeleo/insta360-rs, docs/INSV_FORMAT.md;
-AdrianEddy/telemetry-parser, src/insta360; and Insta360's description of its SDK, which gives rates
-in rad/s and accelerations in g. They were tested on one real file, of a ONE R: rates of the stated
-range rotate gravity as the accelerometer measures it, in the same right-handed axes.
+From the end of the file, little-endian: 32 bytes of signature, before them the size of the trailer
+and its version (u32 each), before these 32 bytes of unknown meaning. Records lie before that, each
+followed by its format (u8), number (u8) and size (u32), or are listed in a directory, record 0.
+Layout, fields and units follow OpenSpeleo/insta360-rs, docs/INSV_FORMAT.md, AdrianEddy's
+telemetry-parser, src/insta360, and Insta360's SDK (rad/s and g); tested on a real file of a ONE R.
 """
 
 import os
@@ -38,7 +34,6 @@ _SERIAL, _MODEL, _FIRMWARE, _CREATED = 1, 2, 3, 7  # fields of the metadata
 _SIZE, _FIRST_FRAME, _READOUT_MS, _WINDOW, _GYRO_DELAY_MS = 19, 24, 25, 27, 28
 _RAW_GYRO, _GYRO_RANGES, _TRACK_ORDER = 62, 65, 80
 _LENSES = 111, 54, 53, 5, 112, 56, 55, 17  # best first: current ones, then factory ones
-_BACK_TRACK_FIRST = 1  # value of _TRACK_ORDER
 
 _RAW = np.dtype([("time", "<i8"), ("values", "<u2", 6)])  # microseconds; 32768 is zero
 _SCALED = np.dtype([("time", "<i8"), ("values", "<f8", 6)])  # milliseconds; g, rad/s
@@ -51,15 +46,10 @@ _FIX = np.dtype(
     ]
 )
 _RAW_ZERO, _RAW_FULL = 32768, 32768  # raw value of zero; difference of the end of the range
-_RANGE_DEG_S = 2000.0  # of gyros whose range is not stated
 _RANGES_G = 8, 16, 32  # of accelerometers; if not stated, the one that gives about 1 g is taken
 _STANDARD_GRAVITY = 9.80665
-_MAX_RATE = 70.0  # rad/s: twice what gyros of 2000 deg/s measure
 _MIN_RATE_HZ, _MAX_RATE_HZ = 10.0, 20_000.0  # of gyro readings
-_MIN_USABLE_SHARE = 0.5  # of a record's rows; a record with fewer is damaged
 _MAX_TICK = 1 << 53  # of the camera's clock: exact as float64
-_MAX_SPAN_RATIO = 4.0  # of the readings' time span to their number times the median step
-_MAX_EXPOSURE_S = 100.0
 _YEAR_2100 = 4_102_444_800  # s since 1970: a larger creation time is in milliseconds
 
 
@@ -285,7 +275,8 @@ def _trailer(version: int, contents: _Contents) -> Insta360Trailer:
     values, whole = read_message(records.get(_METADATA, b""))
     if not whole:
         notes.append("damaged: the end of the metadata cannot be read")
-    raw = _flag(values, _RAW_GYRO)
+    found = values.get(_RAW_GYRO)
+    raw = bool(found) if isinstance(found, int) else None
     found = _gyro(records.get(_GYRO, b""), raw, values, notes)
     scaled_ms = raw is False if found is None else found.milliseconds
     tick_s = 1e-3 if scaled_ms else 1e-6
@@ -308,7 +299,7 @@ def _trailer(version: int, contents: _Contents) -> Insta360Trailer:
         lens_strings=tuple(text for key in _LENSES if (text := _text(values, key, 4096))),
         window=_window(values),
         picture_size=_size(values, _SIZE, 1, 2),
-        back_track_first=values.get(_TRACK_ORDER) == _BACK_TRACK_FIRST,
+        back_track_first=values.get(_TRACK_ORDER) == 1,
         first_frame_s=None if first_frame is None else first_frame * tick_s,
         created_unix_s=_creation_time(values),
         readout_s=1e-3 * readout_ms if readout_ms is not None and 0 < readout_ms < 1e3 else None,
@@ -341,14 +332,30 @@ def _gyro(
         rows = np.frombuffer(record, _RAW if is_raw else _SCALED, len(record) // _row(is_raw))
         ticks, (forces, turns) = rows["time"], np.split(rows["values"], 2, axis=1)
         if is_raw:
-            forces, turns = _from_raw(forces, turns, ranges)
+            # A raw value of 32768 is zero, and 32768 more is the end of the range in the metadata:
+            # 1024 a g for 32 g, 16.384 a deg/s for 2000 deg/s.
+            stated_g, stated_deg_s = (
+                float(found)
+                if isinstance(found := ranges.get(key), int) and 0 < found < 1e5
+                else None
+                for key in (1, 2)
+            )
+            of_full = (forces.astype(np.float64) - _RAW_ZERO) / _RAW_FULL
+            if stated_g is None and len(of_full):
+                length = float(np.median(np.linalg.norm(of_full, axis=1)))
+                stated_g = float(min(_RANGES_G, key=lambda g: abs(np.log(max(g * length, 1e-9)))))
+            full_rate = np.deg2rad(stated_deg_s or 2000.0)
+            forces = of_full * (stated_g or 1.0)
+            turns = (turns.astype(np.float64) - _RAW_ZERO) / _RAW_FULL * full_rate
         with np.errstate(invalid="ignore", over="ignore"):
-            fine = np.isfinite(rows["values"]).all(axis=1) & (abs(turns) < _MAX_RATE).all(axis=1)
+            # 70 rad/s are twice what gyros of 2000 deg/s measure.
+            fine = np.isfinite(rows["values"]).all(axis=1) & (abs(turns) < 70.0).all(axis=1)
         fine &= _near_others(ticks)
         later = np.maximum.accumulate(np.where(fine, ticks, -1))
         fine[1:] &= ticks[1:] > later[:-1]
         kept, step_s = int(fine.sum()), 1e-6 if is_raw else 1e-3
-        if kept < max(2, _MIN_USABLE_SHARE * len(rows)):
+        # a record with fewer usable rows is damaged
+        if kept < max(2, 0.5 * len(rows)):
             continue
         rate_hz = 1 / (float(np.median(np.diff(ticks[fine]))) * step_s)
         if not _MIN_RATE_HZ <= rate_hz <= _MAX_RATE_HZ:
@@ -367,34 +374,13 @@ def _near_others(ticks: np.ndarray) -> np.ndarray:
     if sound.sum() < 2:
         return sound
     step = float(np.median(abs(np.diff(ticks[sound]))))
-    return sound & (abs(ticks - np.median(ticks[sound])) <= _MAX_SPAN_RATIO * len(ticks) * step)
+    # Readings lie within four times their number times the median step.
+    return sound & (abs(ticks - np.median(ticks[sound])) <= 4.0 * len(ticks) * step)
 
 
 def _row(is_raw: bool) -> int:
     """Size of a reading in bytes."""
     return (_RAW if is_raw else _SCALED).itemsize
-
-
-def _from_raw(
-    forces: np.ndarray, turns: np.ndarray, ranges: Mapping[int, Any]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Accelerations (N, 3) in g and rates (N, 3) in rad/s of raw values.
-
-    A raw value of 32768 is zero, and 32768 more is the end of the range in the metadata: 1024 a g
-    for 32 g, 16.384 a deg/s for 2000 deg/s.
-    """
-    stated_g, stated_deg_s = (
-        float(found) if isinstance(found := ranges.get(key), int) and 0 < found < 1e5 else None
-        for key in (1, 2)
-    )
-    of_full = (forces.astype(np.float64) - _RAW_ZERO) / _RAW_FULL
-    if stated_g is None and len(of_full):
-        length = float(np.median(np.linalg.norm(of_full, axis=1)))
-        stated_g = float(min(_RANGES_G, key=lambda g: abs(np.log(max(g * length, 1e-9)))))
-    full_rate = np.deg2rad(stated_deg_s or _RANGE_DEG_S)
-    return of_full * (stated_g or 1.0), (
-        turns.astype(np.float64) - _RAW_ZERO
-    ) / _RAW_FULL * full_rate
 
 
 def _force_unit(forces: np.ndarray, is_raw: bool) -> float:
@@ -409,7 +395,7 @@ def _exposures(
     """Exposures of a record, with times since `start` ticks; None = there are none."""
     rows = np.frombuffer(record, _SHUTTER, len(record) // _SHUTTER.itemsize)
     with np.errstate(invalid="ignore"):
-        fine = (rows["duration"] > 0) & (rows["duration"] < _MAX_EXPOSURE_S)
+        fine = (rows["duration"] > 0) & (rows["duration"] < 100.0)
     fine &= (rows["time"] >= 0) & (rows["time"] < _MAX_TICK)
     if not len(rows):
         return None
@@ -457,11 +443,6 @@ def _real(values: Mapping[int, Any], key: int) -> float | None:
     """Finite floating-point number of a field; None = none."""
     found = values.get(key)
     return found if isinstance(found, float) and np.isfinite(found) else None
-
-
-def _flag(values: Mapping[int, Any], key: int) -> bool | None:
-    found = values.get(key)
-    return bool(found) if isinstance(found, int) else None
 
 
 def _size(values: Mapping[int, Any], key: int, across: int, down: int) -> tuple[int, int] | None:

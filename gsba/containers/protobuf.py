@@ -1,7 +1,4 @@
-"""Fields of protobuf messages, without a schema.
-
-https://protobuf.dev/programming-guides/encoding
-"""
+"""Fields of protobuf messages without a schema (https://protobuf.dev/programming-guides/encoding)."""
 
 import struct
 from collections.abc import Iterator

@@ -9,9 +9,6 @@ from scipy.spatial.transform import Rotation
 from gsba.geometry import inverse, pose
 from gsba.types import Trajectory
 
-SMOOTHING = 1.5  # frames, standard deviation of the filter that smooths drift
-MAX_GAP = 3  # most successive frames that are lost
-
 
 @dataclass(frozen=True, slots=True)
 class Drift:
@@ -46,7 +43,7 @@ def degrade(
             length in position, radians in rotation.
         num_jumps: number of sudden displacements of all later poses, like wrong relocalisations,
             of half a step and half a degree each.
-        num_lost: number of missing poses, in gaps of up to MAX_GAP, never the first or last.
+        num_lost: number of missing poses, in gaps of up to three, never the first or last.
 
     Returns:
         Trajectory of N - num_lost poses.
@@ -82,7 +79,7 @@ def _random_walk(
     """Smooth random walk (N, dimensions) over N - 1 path steps, from 0, up to norm `largest`."""
     increments = np.sqrt(lengths)[:, None] * rng.standard_normal((len(lengths), dimensions))
     walk = np.concatenate([np.zeros((1, dimensions)), np.cumsum(increments, axis=0)])
-    walk = gaussian_filter1d(walk, SMOOTHING, axis=0, mode="nearest")
+    walk = gaussian_filter1d(walk, 1.5, axis=0, mode="nearest")  # drift is smooth over 1.5 frames
     walk -= walk[0]
     return walk * largest / max(np.linalg.norm(walk, axis=1).max(), 1e-12)
 
@@ -98,6 +95,6 @@ def _kept(rng: np.random.Generator, count: int, num_lost: int) -> np.ndarray:
     num_lost = min(num_lost, count - 3)
     while (left := num_lost - np.count_nonzero(~kept)) > 0:
         start = int(rng.integers(1, count - 1))
-        gap = min(int(rng.integers(1, MAX_GAP + 1)), left)
+        gap = min(int(rng.integers(1, 4)), left)
         kept[start : min(start + gap, count - 1)] = False
     return kept

@@ -7,12 +7,8 @@ from scipy.ndimage import gaussian_filter1d, label
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
-_NUM_CELLS = 90  # along a level's longer side
 _NUM_LEVELS = 24  # heights that are tried
 _EYE_RANGE = (0.25, 0.75)  # of the camera's height, part of the height from floor to ceiling
-_MIN_CELLS = 60  # of a level with a path
-_NUM_STOPS = 6  # that the path visits
-_SMOOTHING_CELLS = 3.0  # standard deviation of the filter that rounds corners
 _DOWN = np.array([0.0, 1.0, 0.0])
 
 
@@ -38,7 +34,7 @@ def free_path(
     Returns:
         (num, 3) positions, None if there is no free room; and the median clearance.
     """
-    edge = float(np.max((high - low)[[0, 2]])) / _NUM_CELLS
+    edge = float(np.max((high - low)[[0, 2]])) / 90
     x = np.arange(low[0] + edge / 2, high[0], edge)
     z = np.arange(low[2] + edge / 2, high[2], edge)
     best, room = 0, None
@@ -47,7 +43,10 @@ def free_path(
         grid = np.stack(np.meshgrid(x, np.array([y]), z, indexing="ij"), axis=-1).reshape(-1, 3)
         free = clearance(grid)
         open_ = _walkable(free, seen(grid, _DOWN), seen(grid, -_DOWN), edge)
-        cells = _rooms(open_.reshape(len(x), len(z)))
+        walkable = open_.reshape(len(x), len(z))
+        found = label(walkable)
+        assert isinstance(found, tuple)
+        cells = found[0]
         counts = np.bincount(cells.ravel())
         counts[0] = 0
         largest = int(np.argmax(counts))
@@ -55,11 +54,11 @@ def free_path(
             best, room = int(counts[largest]), cells == largest
             at = free.reshape(room.shape)
             where = grid.reshape(*room.shape, 3)
-    if room is None or best < _MIN_CELLS:
+    if room is None or best < 60:
         return None, 0.0
     way = _round(room, at)
     points = where[way[:, 0], way[:, 1]]
-    points = gaussian_filter1d(points, _SMOOTHING_CELLS, axis=0, mode="wrap")
+    points = gaussian_filter1d(points, 3.0, axis=0, mode="wrap")  # rounds corners
     points = np.concatenate([points, points[:1]])
     length = np.r_[0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))]
     stops = np.linspace(0, length[-1], num, endpoint=False)
@@ -76,13 +75,6 @@ def _walkable(free: np.ndarray, below: np.ndarray, above: np.ndarray, edge: floa
     if not walkable.any():
         return walkable
     return walkable & (np.abs(below - np.median(below[walkable])) < 2 * edge)
-
-
-def _rooms(walkable: np.ndarray) -> np.ndarray:
-    """Number (X, Z) of the connected room of each cell, 0 = none."""
-    found = label(walkable)
-    assert isinstance(found, tuple)
-    return found[0]
 
 
 def _round(room: np.ndarray, clearance: np.ndarray) -> np.ndarray:
@@ -106,7 +98,7 @@ def _round(room: np.ndarray, clearance: np.ndarray) -> np.ndarray:
     ).tocsr()
     start = int(np.argmax(clearance[room]))
     stops = [int(np.argmax(dijkstra(graph, directed=False, indices=start)))]
-    for _ in range(_NUM_STOPS - 1):
+    for _ in range(5):  # stops that the path visits besides the first
         apart = dijkstra(graph, directed=False, indices=stops, min_only=True)
         stops.append(int(np.argmax(apart)))
     middle = cells.mean(axis=0)

@@ -11,7 +11,6 @@ HALF_X, HALF_Z, HEIGHT = 7.0, 5.0, 3.8  # outer walls and ceiling, units
 BLOCK_X, BLOCK_Z = 2.5, 0.9  # half extent of the inner block
 DOOR_X, DOOR_HEIGHT = 0.75, 2.5  # passage through the block
 TEXELS = 110.0  # per unit on walls and floor
-EYE_LEVEL = 1.65  # middle of the pictures
 SOUTH, NORTH, WEST, EAST = (0, 0, -1), (0, 0, 1), (-1, 0, 0), (1, 0, 0)
 
 
@@ -112,7 +111,7 @@ def _hang_pictures(mesh: MeshBuilder, rng: np.random.Generator) -> None:
             height = min(width * rng.uniform(0.75, 1.4), 1.6)
             texels = int(150 * height), int(150 * width)
             image = mesh.texture(picture(rng, *texels, style))
-            middle = -EYE_LEVEL + rng.uniform(-0.15, 0.15)
+            middle = -1.65 + rng.uniform(-0.15, 0.15)  # middle of the pictures at eye level
             center = (at + width / 2) * along - distance * np.array(facing) + [0, middle, 0]
             front = center + 0.03 * np.array(facing)
             mesh.panel(front, facing, (width, height), image)

@@ -5,9 +5,6 @@ import numpy as np
 from gsba.demo.raycast import Scene, coordinates, in_bands, kernel, nearest
 from gsba.demo.sampling import light_at
 
-OFFSET = 0.06  # units, of the points that gather light from their surface
-AMBIENT = 0.15  # light that reaches every surface
-NUM_BOUNCES = 2
 NUM_BOUNCE_RAYS = 48  # per light sample
 NUM_LAMP_POINTS = 3  # per axis of an emitting face, for soft shadows
 
@@ -16,8 +13,8 @@ def bake(scene: Scene) -> np.ndarray:
     """Irradiance / pi, (M, 3) float64, at every light sample of the scene."""
     points, normals = _samples(scene)
     lamps = _lamps(scene)
-    origins = points + OFFSET * normals
-    direct = np.full((len(points), 3), AMBIENT)
+    origins = points + 0.06 * normals
+    direct = np.full((len(points), 3), 0.15)  # light that reaches every surface
     in_bands(_gather_direct, len(points), scene, origins, normals, lamps, direct)
     k = np.arange(NUM_BOUNCE_RAYS) + 0.5
     radius = np.sqrt(k / NUM_BOUNCE_RAYS)  # cosine-weighted sunflower spiral
@@ -26,7 +23,7 @@ def bake(scene: Scene) -> np.ndarray:
         [radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - radius**2)], axis=1
     )
     light = direct
-    for _ in range(NUM_BOUNCES):
+    for _ in range(2):  # bounces
         bounced = direct.copy()
         in_bands(_gather_bounce, len(points), scene, origins, normals, directions, light, bounced)
         light = bounced

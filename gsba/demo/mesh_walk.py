@@ -1,7 +1,4 @@
-"""Walk through a user's mesh, rendered by open3d's ray caster.
-
-The truth is in the mesh's world: y up for OBJ and glTF, z up for PLY.
-"""
+"""Walk through a user's mesh, rendered by open3d's ray caster; the truth is in the mesh's world."""
 
 import logging
 from collections.abc import Iterator
@@ -24,7 +21,6 @@ logger = logging.getLogger(__name__)
 
 _RAYS_PER_PIXEL = 2  # along either axis
 _LOOKUP_WIDTH = 8192  # pixels of the images that OpenCV samples textures for
-_SKY_RGB = np.array([150.0, 170, 200])  # colour of rays that hit nothing
 _LEVEL = {  # rotation (3, 3) from x right, y down, z forward to a world with an axis up
     "y": np.diag([1.0, -1, -1]),
     "z": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
@@ -35,11 +31,8 @@ class MeshScene:
     """Mesh for ray casting, in its own world."""
 
     def __init__(self, path: Path) -> None:
-        """Read a mesh with colours.
-
-        Raises:
-            GsbaError: the mesh cannot be read, or has neither textures nor colours.
-        """
+        """Read a mesh with colours. Raises GsbaError: the mesh cannot be read, or has neither
+        textures nor colours."""
         if path.suffix.lower() not in (".ply", *MESHES):
             raise GsbaError(f"{path} is no mesh: give a file of .ply, {', '.join(MESHES)}")
         if not path.is_file():
@@ -89,7 +82,8 @@ class MeshScene:
         rays = bearings_from_erp(np.stack([u.ravel(), v.ravel()], axis=1), wide, high)
         origin = np.broadcast_to(world_T_rig[:3, 3], rays.shape)
         found = self.cast(origin, rays @ world_T_rig[:3, :3].T)
-        colors = np.broadcast_to(_SKY_RGB, rays.shape).copy()
+        # colour of rays that hit nothing
+        colors = np.broadcast_to(np.array([150.0, 170, 200]), rays.shape).copy()
         hit = np.isfinite(found["t_hit"])
         colors[hit] = self._colors(found["primitive_ids"][hit], found["primitive_uvs"][hit])
         fine = colors.reshape(high, wide, 3).astype(np.float32)

@@ -11,7 +11,6 @@ import numpy as np
 from factors.compiled import kernel_and_part
 
 kernel, part = kernel_and_part()
-_NUM_BANDS = 64  # independent of the number of threads
 
 
 class Scene(NamedTuple):
@@ -104,7 +103,8 @@ def in_bands(kernel: Callable[..., None], count: int, *args: object) -> None:
 
     The kernels release the GIL; plain threads spare them the compile time of parallel=True.
     """
-    bounds = np.unique(np.linspace(0, count, _NUM_BANDS + 1).astype(np.int64))
+    # 64 bands, whatever the number of threads
+    bounds = np.unique(np.linspace(0, count, 65).astype(np.int64))
     with ThreadPoolExecutor(numba.get_num_threads()) as pool:
         list(pool.map(lambda band: kernel(*band, *args), pairwise(bounds.tolist())))
 

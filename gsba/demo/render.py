@@ -11,7 +11,6 @@ from gsba.demo.sampling import albedo_at, light_at
 # distinguishes four levels of coverage along either axis.
 EDGE_SAMPLES = ((-0.375, 0.125), (-0.125, -0.375), (0.125, 0.375), (0.375, -0.125))
 EXPOSURE = 1.1  # of the tone curve 1 - exp(-EXPOSURE * radiance)
-_MARGIN = 3  # pixels beyond a lens's image for which faces are found, too
 
 
 class Eye(NamedTuple):
@@ -74,7 +73,7 @@ def _find_faces(start, stop, scene, eye, columns, faces):
     """
     height, width = faces.shape
     step = np.pi / height
-    least = eye.least - _MARGIN * step
+    least = eye.least - 3 * step  # pixels beyond a lens's image for which faces are found, too
     for row in range(start, stop):
         latitude = np.pi / 2 - (row + 0.5) * step
         cp, sp = np.cos(latitude), np.sin(latitude)

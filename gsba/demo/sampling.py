@@ -1,14 +1,9 @@
-"""Filtered albedo and baked light at a ray's hit on a face.
-
-Textures are sampled trilinearly with several taps along an anisotropic footprint, whose shape comes
-from exact ray differentials (Igehy, SIGGRAPH 1999).
-"""
+"""Filtered albedo and baked light at a ray's hit on a face: textures are sampled along an
+anisotropic footprint from exact ray differentials (Igehy, SIGGRAPH 1999)."""
 
 import numpy as np
 
 from gsba.demo.raycast import part
-
-MAX_TAPS = 8  # texture samples along the longer axis of a stretched footprint
 
 
 @part
@@ -72,7 +67,8 @@ def albedo_at(scene, q, a, b, d, t, du, dv):
     longer, shorter = np.sqrt(u[0] ** 2 + u[1] ** 2), np.sqrt(v[0] ** 2 + v[1] ** 2)
     if longer < shorter:
         u, longer, shorter = v, shorter, longer
-    size = max(shorter, longer / MAX_TAPS, 1.0)
+    # texture samples along the longer axis of a stretched footprint
+    size = max(shorter, longer / 8, 1.0)
     taps = int(np.ceil(longer / size - 1e-6))
     x = scene.windows[q, 0] + a * scene.windows[q, 2]
     y = scene.windows[q, 1] + b * scene.windows[q, 3]

@@ -1,6 +1,5 @@
 """Walk with a 360-degree camera through the gallery: frames, exact truth, SLAM-like poses."""
 
-import csv
 import logging
 import shutil
 from collections.abc import Iterator
@@ -17,7 +16,7 @@ from gsba.camera.sphere import bearings_from_erp
 from gsba.compilation import compile_ahead
 from gsba.demo.degrade import degrade
 from gsba.demo.two_lenses import TwoLenses
-from gsba.disk import disk_errors
+from gsba.disk import disk_errors, write_csv
 from gsba.geometry import pose
 from gsba.log import GsbaError, track
 from gsba.trajectory.files import write_tum
@@ -28,11 +27,7 @@ Heading = Literal["locked", "forward"]
 Camera = Literal["ideal", "two-lens"]
 
 FRAMES_PER_SECOND = 2.0
-EYE_HEIGHT = 1.5  # units above the floor
-CORNER_RADIUS = 0.45  # units, standard deviation of the filter that rounds corners
 WOBBLE_DEG = (1.5, 2.0, 1.5)  # pitch, yaw and roll of the hand, standard deviation
-WOBBLE_UNITS = 0.025  # standard deviation of the hand's position, per axis
-EXPOSURE_SWING = 0.05  # relative
 NOISE = 2.0  # grey values, standard deviation
 JPEG_QUALITY = 95
 MOST_FRAMES, MOST_WIDTH = 100_000, 16_384
@@ -128,7 +123,7 @@ def walk_poses(
     rng = np.random.default_rng(seed)
     at, tangent = _sample(path, num_frames)
     yaw = np.arctan2(tangent[:, 0], tangent[:, 1]) if heading == "forward" else 0.0
-    positions = np.stack([at[:, 0], np.full(num_frames, -EYE_HEIGHT), at[:, 1]], axis=1)
+    positions = np.stack([at[:, 0], np.full(num_frames, -1.5), at[:, 1]], axis=1)
     return held_by_hand(positions, yaw, rng, fps=fps)
 
 
@@ -152,7 +147,7 @@ def held_by_hand(
     wobble = [_wobble(rng, times) for _ in range(6)]
     pitch, turn, roll = (np.radians(w) * x for w, x in zip(WOBBLE_DEG, wobble, strict=False))
     rotations = _rotations(1, yaw + turn) @ _rotations(0, pitch) @ _rotations(2, roll)
-    swaying = positions + unit * WOBBLE_UNITS * np.stack(wobble[3:], axis=1)
+    swaying = positions + unit * 0.025 * np.stack(wobble[3:], axis=1)
     return Trajectory(times, pose(rotations, swaying))
 
 
@@ -189,7 +184,7 @@ def _sample(path: WalkPath, num_frames: int) -> tuple[np.ndarray, np.ndarray]:
     s = np.arange(0, length[-1], spacing)
     dense = np.stack([np.interp(s, length, corners[:, k]) for k in range(2)], axis=1)
     mode = "wrap" if closed else "nearest"
-    dense = gaussian_filter1d(dense, CORNER_RADIUS / spacing, axis=0, mode=mode)
+    dense = gaussian_filter1d(dense, 0.45 / spacing, axis=0, mode=mode)  # rounds corners
     if closed:
         dense = np.concatenate([dense, dense[:1]])
     length = _arc_length(dense)
@@ -233,16 +228,14 @@ def write_frames(out: Path, truth: Trajectory, pictures: Iterator[np.ndarray], s
             raise GsbaError(
                 f"{out / 'images' / name} cannot be written: check that the disk is not full"
             )
-    with (out / "images" / "timestamps.csv").open("w", newline="") as file:
-        rows = csv.writer(file)
-        rows.writerow(["name", "timestamp"])
-        rows.writerows((name, f"{t:.6f}") for name, t in zip(names, truth.timestamps, strict=True))
+    rows = ((name, f"{t:.6f}") for name, t in zip(names, truth.timestamps, strict=True))
+    write_csv(out / "images" / "timestamps.csv", ["name", "timestamp"], rows)
 
 
 def exposed(truth: Trajectory, pictures: Iterator[np.ndarray], seed: int) -> Iterator[np.ndarray]:
     """Images (H, W, 3) uint8 BGR with a sensor's exposure and noise, from RGB, 0..255."""
     rng = np.random.default_rng([seed, 1])
-    exposures = 1 + EXPOSURE_SWING * np.tanh(_wobble(rng, truth.timestamps - truth.timestamps[0]))
+    exposures = 1 + 0.05 * np.tanh(_wobble(rng, truth.timestamps - truth.timestamps[0]))
     frames = zip(pictures, exposures, strict=True)
     for picture, exposure in track(frames, "rendering the walk", total=len(exposures)):
         image = exposure * picture

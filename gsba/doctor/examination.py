@@ -30,7 +30,6 @@ _OWN = Requirement("gsba", "gsba.pipeline.refine", "", NEEDED)
 _WORDS = {"works": "ok", "partly": "partly", "absent": "absent", "broken": "BROKEN"}
 _NO_WHEEL = {("linux", "aarch64"): {"pycolmap", "open3d"}}  # as of 2026-11
 _ON_ARM = "there is no wheel for Linux on ARM (docs/install.md#linux-on-arm)"
-_SMALL_DISK_BYTES = 2 << 30
 _MAX_MESSAGE_LENGTH = 160  # characters of a package's message
 
 
@@ -77,7 +76,7 @@ class Examination:
             if self.works
             else "Some packages that a run needs do not work: see BROKEN above.",
         ]
-        if found.free_disk_bytes < _SMALL_DISK_BYTES:
+        if found.free_disk_bytes < (2 << 30):
             lines.insert(
                 2, "this disk is nearly full: a run takes several times the size of its frames"
             )

@@ -29,12 +29,16 @@ class Machine:
 def look() -> Machine:
     """Examine this machine."""
     total, free = _memory()
+    quota, _, period = _text(_CGROUP / "cpu.max").strip().partition(" ")
     return Machine(
         system=_system(),
         python=platform.python_version(),
         processor=_processor(),
         cores=os.cpu_count() or 1,
-        usable_cores=min(usable_cpus(), _quota()),
+        usable_cores=min(
+            usable_cpus(),
+            int(quota) / int(period) if quota.isdigit() and period.isdigit() else float("inf"),
+        ),
         memory_bytes=total,
         free_memory_bytes=free,
         free_disk_bytes=shutil.disk_usage(Path.cwd()).free,
@@ -68,12 +72,6 @@ def _memory() -> tuple[int, int]:
     if limit.isdigit() and int(limit) <= pages:
         return int(limit), min(free, int(limit) - int(used or 0))
     return pages, free
-
-
-def _quota() -> float:
-    """Number of cores that the container may use; infinite without a quota."""
-    quota, _, period = _text(_CGROUP / "cpu.max").strip().partition(" ")
-    return int(quota) / int(period) if quota.isdigit() and period.isdigit() else float("inf")
 
 
 def _text(path: Path) -> str:

@@ -77,7 +77,6 @@ def _requirement(line: str, extra: str) -> Requirement:
 
 _TIMEOUT_S = 120.0
 _MAX_MESSAGE_LENGTH = 160  # characters of an import's error
-_MAX_FILES = 300  # files of a package that are searched for missing libraries
 _LIBRARY = re.compile(r"([\w.+-]+\.so[\w.]*): cannot open shared object file")
 _DEBIAN = {"libglib-2.0.so.0": "libglib2.0-0", "libgthread-2.0.so.0": "libglib2.0-0"}
 _CHILD = "import sys; from gsba.doctor.child import answer; answer(sys.argv[1], sys.argv[2:])"
@@ -211,7 +210,7 @@ def _missing_libraries(module: str, error: str) -> tuple[str, ...]:
         return ()
     lacking = dict.fromkeys(named)
     bundled = {path.name for path in _shared_objects(module)}
-    for path in islice(_shared_objects(module), _MAX_FILES):
+    for path in islice(_shared_objects(module), 300):
         try:
             listed = subprocess.run(["ldd", path], capture_output=True, text=True, timeout=10)
         except (OSError, subprocess.TimeoutExpired):

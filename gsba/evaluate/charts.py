@@ -1,7 +1,4 @@
-"""Figures by matplotlib (extra `plot`), in one style and with reproducible bytes.
-
-A user's matplotlibrc is ignored, and files hold no dates.
-"""
+"""Figures by matplotlib (extra `plot`), in one style and with reproducible bytes."""
 
 from collections.abc import Callable, Iterator, Sequence
 from itertools import cycle

@@ -1,16 +1,10 @@
-"""Consistency of covariances: normalised errors against the truth, and NEES.
+"""Consistency of covariances: normalised errors against the truth, and NEES (Bar-Shalom, Li and
+Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 5.4).
 
-An estimator is consistent if its errors are as large as its covariances (Bar-Shalom, Li and
-Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 5.4). Errors are
-comparable with covariances only in the gauge of these: the first pose and its distance to the
-furthest position are fixed. The truth is therefore aligned by the similarity that makes exactly
-those agree. Along that distance the furthest frame has neither error nor variance, so that five of
-its degrees of freedom are tested instead of six.
-
-If errors were independent, six times the number of poses times the mean of their normalised squares
-would follow a chi-square distribution of as many degrees of freedom. Errors along one path are
-correlated and scatter more. The expected interval is therefore measured on samples that the run
-drew from the joint distribution of all its poses, whose marginals are the covariances.
+The gauge of covariances fixes the first pose and its distance to the furthest position: the truth
+is aligned by the similarity that makes those agree, and the furthest frame has five degrees of
+freedom tested. Errors along a path are correlated: the expected interval is measured on samples
+that the run drew from the joint distribution of its poses.
 """
 
 from collections.abc import Callable
@@ -18,6 +12,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
+from gsba.evaluate.trajectory import aligned_rows
 from gsba.geometry import adjoint, furthest, inverse, step_covariances
 from gsba.log import GsbaError
 from gsba.similarity import Sim3
@@ -146,7 +141,14 @@ def consistency_of(
             )
     true_T_rigs = np.full_like(poses, np.nan)
     true_T_rigs[rows] = truth.world_T_rigs[of_truth]
-    true_T_rigs = _in_gauge(true_T_rigs, poses, far)
+    # The truth in the estimate's gauge: its first pose and its distance to frame `far`
+    scales = [np.linalg.norm(some[far, :3, 3] - some[0, :3, 3]) for some in (poses, true_T_rigs)]
+    for owner, length in zip(("run", "truth"), scales, strict=True):
+        if not length > 0:
+            raise GsbaError(f"the {owner} does not move: its positions determine no scale")
+    scale = float(scales[0] / scales[1])
+    local = Sim3.of(scale, np.eye(4)).poses(inverse(true_T_rigs[0]) @ true_T_rigs)
+    true_T_rigs = poses[0] @ local
 
     toward = poses[far, :3, :3].T @ (poses[far, :3, 3] - poses[0, :3, 3])
     held = np.zeros((len(poses), 3))
@@ -184,27 +186,11 @@ def format_consistency(found: Consistency, name: Callable[[int], str] = str) -> 
             for one in (claims.rotation, claims.position, claims.nees)
         ]
         rows.append([title, str(claims.num), *cells])
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = [
-        "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in rows
-    ]
+    lines = aligned_rows(rows)
     first, far = name(found.first), name(found.furthest)
     lines.append(f"in the gauge that fixes the pose of {first} and its distance to {far}; in")
     lines.append(f"brackets: {EXPECTED:.0%} interval of errors distributed by these covariances.")
     return "\n".join(lines)
-
-
-def _in_gauge(true_T_rigs: np.ndarray, world_T_rigs: np.ndarray, far: int) -> np.ndarray:
-    """True poses (N, 4, 4) in the estimate's first pose, scaled to its distance to frame `far`."""
-    scales = [
-        np.linalg.norm(some[far, :3, 3] - some[0, :3, 3]) for some in (world_T_rigs, true_T_rigs)
-    ]
-    for owner, length in zip(("run", "truth"), scales, strict=True):
-        if not length > 0:
-            raise GsbaError(f"the {owner} does not move: its positions determine no scale")
-    scale = float(scales[0] / scales[1])
-    local = Sim3.of(scale, np.eye(4)).poses(inverse(true_T_rigs[0]) @ true_T_rigs)
-    return world_T_rigs[0] @ local
 
 
 def _errors(estimates: np.ndarray, truths: np.ndarray) -> np.ndarray:

@@ -16,7 +16,6 @@ from gsba.trajectory.association import matched_in_time
 from gsba.types import Trajectory
 
 STEPS = (1, 4)  # frames from a frame to the neighbours into which its pixels are projected
-_MAX_RANGE = 1e12  # truth units: larger values mean that nothing was measured
 _SPACING_PX = 4  # pixels of a depth map between samples
 
 
@@ -74,7 +73,10 @@ def induced_errors(
                 if other is not None:
                     seen = _seen(true_T_rigs[row], true_T_rigs[other], points)
                     shown = _seen(aligned[row], aligned[other], points)
-                    errors[step].append(_angles(seen, shown) * width / (2 * np.pi))
+                    across = np.linalg.norm(np.cross(seen, shown), axis=1)
+                    errors[step].append(
+                        np.arctan2(across, np.einsum("ni,ni->n", seen, shown)) * width / (2 * np.pi)
+                    )
     found = {step: np.concatenate(parts) for step, parts in errors.items() if parts}
     found = {step: part for step, part in found.items() if len(part)}
     pooled = np.concatenate(list(found.values())) if found else np.zeros(0)
@@ -139,7 +141,7 @@ def _points(ranges: np.ndarray) -> np.ndarray:
     columns = np.arange(_SPACING_PX // 2, width, _SPACING_PX)
     pixels = np.stack(np.meshgrid(columns + 0.5, rows + 0.5), axis=-1)
     depths = ranges[np.ix_(rows, columns)].astype(np.float64)
-    hit = (depths > 0) & (depths < _MAX_RANGE)
+    hit = (depths > 0) & (depths < 1e12)  # larger values mean that nothing was measured
     return depths[hit][:, None] * bearings_from_erp(pixels[hit], width, height)
 
 
@@ -147,9 +149,3 @@ def _seen(world_T_rig: np.ndarray, world_T_other: np.ndarray, points_rig: np.nda
     """Points (N, 3) of one rig frame in another rig frame."""
     points_world = points_rig @ world_T_rig[:3, :3].T + world_T_rig[:3, 3]
     return (points_world - world_T_other[:3, 3]) @ world_T_other[:3, :3]
-
-
-def _angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Angles (N,) between vectors, accurate when small."""
-    across = np.linalg.norm(np.cross(a, b), axis=1)
-    return np.arctan2(across, np.einsum("ni,ni->n", a, b))

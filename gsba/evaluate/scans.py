@@ -16,8 +16,6 @@ from gsba.similarity import Sim3, pose_similarity
 from gsba.types import Reconstruction
 from gsba.types.records import with_rows
 
-_MAX_COARSE_OFFSET = 0.08  # largest offset of the unrefined cloud, part of the cloud's size
-_HISTOGRAM_QUANTILE = 0.9  # share of points whose distance a histogram spans
 _COLOR_STOPS = np.array(  # colours (C, 3) from distance 0 to the largest shown one
     [[38, 70, 140], [60, 160, 190], [120, 190, 110], [240, 200, 70], [200, 50, 40]], np.float64
 )
@@ -37,7 +35,7 @@ class ScanErrors:
     def furthest(self) -> float:
         """Largest distance that histograms and colours show."""
         parts = [self.after.values] + ([] if self.before is None else [self.before.values])
-        return float(max(np.quantile(values, _HISTOGRAM_QUANTILE) for values in parts))
+        return float(max(np.quantile(values, 0.9) for values in parts))
 
     def to_json(self) -> dict[str, Any]:
         """Plain values."""
@@ -93,7 +91,8 @@ def scan_errors(
         coarse = replace(
             with_rows(cloud, np.flatnonzero(good)), points=at.points_back(placed[good])
         )
-        width = _MAX_COARSE_OFFSET * cloud.size * at.scale
+        # largest offset of the unrefined cloud, part of the cloud's size
+        width = 0.08 * cloud.size * at.scale
         near, sigma = approach(at, coarse, scan, width)
         fit = settle(near, coarse, scan, sigma)
         before = _distances(fit.similarity, coarse, scan, found.fit.noise)

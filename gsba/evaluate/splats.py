@@ -1,11 +1,6 @@
-"""Comparison of poses by splats that are trained on them and measured on held-out frames.
-
-Splats of all sources of poses are trained on the same frames with the same settings and seed. The
-start cloud is the run's tracks, triangulated under the source's poses. Splats are measured on
-held-out panoramas at the source's own poses. All sources are aligned to the run's world first:
-Gaussians start along the axes of the world, and walls along these axes gain some 0.2 dB that do not
-come from the poses.
-"""
+"""Comparison of poses by splats that are trained on them and measured on held-out panoramas, on the
+same frames with the same settings and seed. All poses are aligned to the run's world first:
+Gaussians start along its axes, and walls along these gain some 0.2 dB."""
 
 import json
 import logging
@@ -20,6 +15,7 @@ from gsba.camera.views import ONE_EYE, Optics
 from gsba.config import SplatSettings
 from gsba.disk import write_image, write_text
 from gsba.evaluate import charts
+from gsba.evaluate.trajectory import aligned_rows
 from gsba.log import GsbaError
 from gsba.similarity import NoSimilarityError, pose_similarity
 from gsba.splat.backend import Backend
@@ -47,7 +43,6 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 NO_LPIPS = "not computed: no weights"
-_NUM_CURVE_POINTS = 10  # measurements during a training
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,11 +76,8 @@ class PosedViews:
 
 
 def poses_for(frames: FrameSet, trajectory: Trajectory, tolerance_s: float = 0.01) -> np.ndarray:
-    """Pose (F, 4, 4) of each frame by time; NaN where the trajectory has none.
-
-    Raises:
-        GsbaError: no pose is within the tolerance of a frame's time.
-    """
+    """Pose (F, 4, 4) of each frame by time; NaN where the trajectory has none. Raises GsbaError: no
+    pose is within the tolerance of a frame's time."""
     expected = Trajectory(frames.timestamps, np.tile(np.eye(4), (len(frames), 1, 1)))
     rows, which = matched_in_time(trajectory, expected, tolerance_s)
     if len(which) == 0:
@@ -144,7 +136,17 @@ def compare(
             reconstruction, frames, source, settings, backend, out / name, key, lpips
         )
     _write(out, results, settings, lpips is not None)
-    _write_pictures(out / "pictures", frames, split, held_out, sources, splats, settings, backend)
+    # Write an image of each held-out frame: a row of captured faces, then a row per source
+    folder = out / "pictures"
+    each = len(held_out.views)
+    for i, f in enumerate(split.held_out):
+        rows = [_side_by_side(held_out.images[each * i : each * (i + 1)])]
+        for name, poses in sources.items():
+            near = near_of(poses[split.training], settings)
+            rig = held_out.poses(poses[split.held_out])[i]
+            views = render_views(splats[name], rig, held_out.views, near, backend)
+            rows.append(_side_by_side(views))
+        write_image(folder / f"{frames.names[f]}.jpg", np.concatenate(rows))
     return results
 
 
@@ -199,7 +201,7 @@ def train_and_measure(
     poses, split = source.poses, source.split
     near = near_of(poses[split.training], settings)
     curve = _read_curve(out / "curve.json", key)
-    every = max(settings.iterations // _NUM_CURVE_POINTS, 1)
+    every = max(settings.iterations // 10, 1)  # measurements during a training
 
     def watch(step: int, gaussians: Gaussians) -> None:
         if step // every > max(curve, default=0) // every:
@@ -244,14 +246,7 @@ def format_table(results: Mapping[str, SourceResult]) -> str:
         far = "" if mean.lpips is None else f"{mean.lpips:.4f}"
         cells = [name, f"{mean.psnr:.2f}", f"{mean.ssim:.4f}", far, f"{mean.psnr_exposed:.2f}"]
         rows.append([*cells, f"{mean.psnr - first:+.2f}", str(result.num_gaussians)])
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = [
-        "  ".join(
-            cell.rjust(width) if i else cell.ljust(width)
-            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in rows
-    ]
+    lines = aligned_rows(rows)
     num = len(next(iter(results.values())).frames)
     notes = [
         f"Means over {num} held-out panoramas at each source's own poses. exp.: with the best gain",
@@ -260,28 +255,6 @@ def format_table(results: Mapping[str, SourceResult]) -> str:
     if any(result.mean.lpips is None for result in results.values()):
         notes.append(f"LPIPS {NO_LPIPS}.")
     return "\n".join([*lines, *notes])
-
-
-def _write_pictures(
-    folder: Path,
-    frames: FrameSet,
-    split: Split,
-    captured: Faces,
-    sources: Mapping[str, np.ndarray],
-    splats: Mapping[str, Gaussians],
-    settings: SplatSettings,
-    backend: Backend,
-) -> None:
-    """Write an image of each held-out frame: a row of captured faces, then a row per source."""
-    each = len(captured.views)
-    for i, f in enumerate(split.held_out):
-        rows = [_side_by_side(captured.images[each * i : each * (i + 1)])]
-        for name, poses in sources.items():
-            near = near_of(poses[split.training], settings)
-            rig = captured.poses(poses[split.held_out])[i]
-            views = render_views(splats[name], rig, captured.views, near, backend)
-            rows.append(_side_by_side(views))
-        write_image(folder / f"{frames.names[f]}.jpg", np.concatenate(rows))
 
 
 def _side_by_side(images: Images) -> np.ndarray:

@@ -12,7 +12,6 @@ from gsba.trajectory.association import matched_in_time
 from gsba.types import Trajectory
 
 AUC_THRESHOLDS_DEG = (0.1, 0.25, 0.5, 1.0, 5.0, 10.0)
-ZERO_BASELINE = 1e-6  # part of the truth's extent; pairs with less have no direction
 _PAIRS_AT_ONCE = 1 << 18
 
 
@@ -182,12 +181,17 @@ def format_table(
     for title, cells in (extra or {}).items():
         for line, cell in zip(lines, [title, "", *cells], strict=True):
             line.append(cell)
-    columns = []
-    for index, column in enumerate(zip(*lines, strict=True)):
-        width = max(map(len, column))
-        columns.append([cell.rjust(width) if index else cell.ljust(width) for cell in column])
     note = "rotation, rel. rot. (consecutive poses) and RPE are medians; ATE after Sim(3)."
-    return "\n".join(["  ".join(line).rstrip() for line in zip(*columns, strict=True)] + [note])
+    return "\n".join([*aligned_rows(lines), note])
+
+
+def aligned_rows(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a table, the first column to the left, the others to the right."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]).rstrip()
+        for row in rows
+    ]
 
 
 def _step_errors(
@@ -208,7 +212,7 @@ def _pair_errors(world_T_rigs: np.ndarray, true_T_rigs: np.ndarray) -> np.ndarra
     """Errors (N (N - 1) / 2,) in radians of the relative poses of all pairs i < j.
 
     The error is the larger of two angles: of the relative rotation, and between true and estimated
-    direction to pose j, both in the axes of pose i. A true baseline under ZERO_BASELINE of the
+    direction to pose j, both in the axes of pose i. A true baseline under 1e-6 of the
     extent has no direction, so that the rotation alone counts. An estimate without baseline counts
     as a direction that is off by pi.
     """
@@ -219,7 +223,8 @@ def _pair_errors(world_T_rigs: np.ndarray, true_T_rigs: np.ndarray) -> np.ndarra
     # angle between its two D; four times the arc sine of half the chord of their quaternions.
     true_R_world = true_rotations @ np.swapaxes(rotations, 1, 2)
     quaternions = quaternion_from_rotation(true_R_world)
-    shortest = ZERO_BASELINE * np.linalg.norm(np.ptp(true_positions, axis=0))
+    # Pairs with a shorter baseline have no direction.
+    shortest = 1e-6 * np.linalg.norm(np.ptp(true_positions, axis=0))
     errors = []
     start = 0
     while start < num - 1:

@@ -1,23 +1,15 @@
 """COLMAP models (4.x) with rigs and frames; images.bin also serves readers without these.
 
-Layouts:
-
 * `colmap`: PINHOLE faces in one rig, `images/front/NAME.jpg`, `masks/front/NAME.jpg.png`,
-  `sparse/0`, and `rig_config.json` for COLMAP's own tools: six of one centre, or the ten of
-  `gsba.camera.views` where two lenses are known.
-* `colmap-flat`: the cameras of `colmap`, `images/00012_NAME_front.jpg` in an order by which
-  trainers hold out whole panoramas (`gsba.export.split`); `images/NAME_front.jpg` without a split.
-  For trainers that resolve images by their base name. `sparse/0/points3D.ply` is INRIA's start
-  cloud.
-* `colmap` and `colmap-flat` of raw fisheyes (`--images fisheye`): two OPENCV_FISHEYE cameras and
-  `images/front`, `images/back`; masks leave out pixels beyond the image circles; the rolling
-  shutter is not corrected.
-* `colmap-erp`: one EQUIRECTANGULAR camera and the panoramas; panoramas of two lenses are stitched
-  for one centre in the middle (`gsba.camera.one_centre`).
+  `sparse/0`, and `rig_config.json` for COLMAP's own tools.
+* `colmap-flat`: `images/00012_NAME_front.jpg` in the order of `gsba.export.split`, for trainers
+  that resolve images by their base name. `sparse/0/points3D.ply` is INRIA's start cloud.
+* raw fisheyes (`--images fisheye`): two OPENCV_FISHEYE cameras; masks leave out pixels beyond the
+  image circles; the rolling shutter is not corrected.
+* `colmap-erp`: one EQUIRECTANGULAR camera and the panoramas, of two lenses stitched for the middle.
 
-A frame's pose is stored as rig_from_world, where COLMAP's rig frame is that of the first camera.
-Images are numbered frame after frame, face after face, or in the split's order; point j + 1 is
-point j. Frames of several cameras have a rig for each of these.
+A pose is rig_from_world, where COLMAP's rig frame is that of the first camera. Point j + 1 is point
+j. Frames of several cameras have a rig for each of these.
 """
 
 import json
@@ -28,7 +20,7 @@ import numpy as np
 
 from gsba.camera.fisheye import lens_names
 from gsba.camera.one_centre import seen_from_the_middle
-from gsba.camera.views import View, scenes_of, seen_from_lenses, shown_in_pictures
+from gsba.camera.views import View, seen_from_lenses, shown_in_pictures
 from gsba.export.dataset import Dataset, ExportFormat
 from gsba.export.depths import write_depths
 from gsba.export.images import has_masks, panorama_writer, view_writer, views_of_cameras
@@ -68,13 +60,22 @@ def write_colmap(data: Dataset) -> FrameWriter:
         files = _write_flat_model(data, seen, rigs, files)
     else:
         write_model(folder / "sparse" / "0", seen, rigs, _names(files, frames), frames.cameras)
-        _write_rig_config(folder, rigs, files, frames)
+        if len(rigs) == 1:
+            configs = [_rig_config(rigs[0], files[0].views, "")]
+        else:
+            numbers = {
+                name: int(frames.cameras[rows[0]]) for name, rows in frames.recordings.items()
+            }
+            configs = [
+                _rig_config(rigs[number], files[number].views, f"{recording}/")
+                for recording, number in numbers.items()
+            ]
+        (folder / "rig_config.json").write_text(json.dumps(configs, indent=1) + "\n")
     if data.options.depths:
         write_depths(data, seen, files, views)
     if raw:
         return by_camera([RawPictures(own, data.options.link) for own in files], frames)
-    scenes = scenes_of(data.reconstruction)
-    return view_writer(files, frames, views, cameras, data.options.link, scenes)
+    return view_writer(data, files, views)
 
 
 def _write_flat_model(
@@ -98,11 +99,8 @@ def _write_flat_model(
 
 
 def write_colmap_erp(data: Dataset) -> FrameWriter:
-    """Write the equirectangular layout, without images; returns their writer.
-
-    Raises:
-        GsbaError: the frames are cube faces.
-    """
+    """Write the equirectangular layout, without images; returns their writer. Raises GsbaError: the
+    frames are cube faces."""
     frames, cameras = data.frames, data.cameras
     if not all(kind.panoramic for kind in frames.formats):
         raise GsbaError("colmap-erp needs panoramas, these frames are cube faces: use colmap")
@@ -115,8 +113,7 @@ def write_colmap_erp(data: Dataset) -> FrameWriter:
     seen = seen_from_the_middle(data.reconstruction) if cameras else data.reconstruction
     names = _names([files] * len(rigs), frames)
     write_model(data.folder / "sparse" / "0", seen, rigs, names, frames.cameras)
-    scenes = scenes_of(data.reconstruction)
-    return panorama_writer(files, frames, cameras, data.options.link, scenes)
+    return panorama_writer(data, files)
 
 
 def write_model(
@@ -157,7 +154,7 @@ def write_model(
     for f, (of_frame, rig) in enumerate(zip(names, rig_of_frame.tolist(), strict=True)):
         frame = pycolmap.Frame(frame_id=f + 1, rig_id=rig + 1)
         rig_T_ref = rigs[rig][0].rig_T_sensor
-        frame.rig_from_world = _rigid(inverse(rig_T_ref) @ rigs_T_world[f])
+        frame.rig_from_world = rigid(inverse(rig_T_ref) @ rigs_T_world[f])
         own = zip(ids[rig], of_frame, numbers[firsts[f] : firsts[f + 1]].tolist(), strict=True)
         kept = [(sensor_id, name, number) for sensor_id, name, number in own if number >= 0]
         for sensor_id, _, number in kept:
@@ -201,35 +198,33 @@ def _add_rigs(model, rigs: Sequence[Sequence[Sensor]]) -> list[list]:
     ids = list[list]()
     for number, sensors in enumerate(rigs):
         first = sum(map(len, ids)) + 1
-        ids.append([_add_camera(model, sensor, first + c) for c, sensor in enumerate(sensors)])
+        cameras = [
+            pycolmap.Camera(
+                model=sensor.model,
+                width=sensor.width,
+                height=sensor.height,
+                params=sensor.params,
+                camera_id=first + c,
+            )
+            for c, sensor in enumerate(sensors)
+        ]
+        for camera in cameras:
+            model.add_camera(camera)
+        ids.append([camera.sensor_id for camera in cameras])
         rig = pycolmap.Rig(rig_id=number + 1)
         rig.add_ref_sensor(ids[-1][0])
         rig_T_ref = sensors[0].rig_T_sensor
         for c in range(1, len(sensors)):
-            rig.add_sensor(ids[-1][c], _rigid(inverse(sensors[c].rig_T_sensor) @ rig_T_ref))
+            rig.add_sensor(ids[-1][c], rigid(inverse(sensors[c].rig_T_sensor) @ rig_T_ref))
         model.add_rig(rig)
     return ids
 
 
-def _rigid(a_T_b: np.ndarray):
+def rigid(a_T_b: np.ndarray):
+    """Pose (4, 4) as pycolmap has it."""
     import pycolmap
 
     return pycolmap.Rigid3d(pycolmap.Rotation3d(a_T_b[:3, :3]), a_T_b[:3, 3])
-
-
-def _add_camera(model, sensor: Sensor, camera_id: int):
-    """Add a camera to the model; returns its sensor id."""
-    import pycolmap
-
-    camera = pycolmap.Camera(
-        model=sensor.model,
-        width=sensor.width,
-        height=sensor.height,
-        params=sensor.params,
-        camera_id=camera_id,
-    )
-    model.add_camera(camera)
-    return camera.sensor_id
 
 
 def _add_points(
@@ -247,21 +242,6 @@ def _add_points(
         track = pycolmap.Track(list(map(pycolmap.TrackElement, image_ids, indices)))
         model.add_point3D_with_id(j + 1, pycolmap.Point3D(xyz=xyz, color=color, track=track))
     model.update_point_3d_errors()
-
-
-def _write_rig_config(
-    partial: Path, rigs: Sequence[Sequence[Sensor]], files: Sequence[Files], frames: FrameSet
-) -> None:
-    """Write `rig_config.json`: one rig, or where rigs differ one for each recording."""
-    if len(rigs) == 1:
-        configs = [_rig_config(rigs[0], files[0].views, "")]
-    else:
-        numbers = {name: int(frames.cameras[rows[0]]) for name, rows in frames.recordings.items()}
-        configs = [
-            _rig_config(rigs[number], files[number].views, f"{recording}/")
-            for recording, number in numbers.items()
-        ]
-    (partial / "rig_config.json").write_text(json.dumps(configs, indent=1) + "\n")
 
 
 def _rig_config(sensors: Sequence[Sensor], names: Sequence[str], folder: str) -> dict:

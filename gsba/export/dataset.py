@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from enum import StrEnum
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -29,11 +29,6 @@ class MaskStyle:
         """True if images are painted."""
         return self.paint != "files"
 
-    def path_beside(self, image: str) -> str:
-        """Path of the mask of an image, where `path` gives it."""
-        path = PurePosixPath(image)
-        return self.path.format(folder=path.parent, stem=path.stem)
-
     def painted(self, image: np.ndarray, used: np.ndarray) -> np.ndarray:
         """Image (h, w, 3) uint8, black where it is not used (h, w) bool; with `alpha` it has a
         fourth channel, 0 = ignore, 255 = use."""
@@ -49,8 +44,6 @@ class MaskStyle:
 
 
 MASK_FILES = MaskStyle()  # mask files alone, as most readers want them
-
-
 FITTING = ("colmap", "colmap-flat", "nerfstudio")  # formats of faces, that hold photos and depths
 
 

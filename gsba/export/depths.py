@@ -1,15 +1,8 @@
 """Depths of pinhole faces at the points that they show, from the map, with standard deviations.
 
-`sparse_depths/NAME.npz` holds, of each point that an image shows: `uv` (N, 2) float32, its observed
-pixel, corner origin; `depth` (N,) float32, its distance along the camera's axis in the unit of the
-exported world; `sigma` (N,) float32, the depth's standard deviation, errors of poses included;
-`point` (N,) int32, its number in the exported cloud.
-
-`depths/NAME.tiff` are the maps that nerfstudio 1.1.5 reads by `depth_file_path`: float32, depths in
-thousandths of the unit (its `depth_unit_scale_factor`) in the pixels of points, 0 elsewhere, which
-its depth losses leave out (`depth-nerfacto`: depth > 0; DN-Splatter: > `depth_tolerance`). Maps
-have no place for standard deviations, so that points of large ones are not in them. gsplat's
-`--depth_loss` and INRIA's `make_depth_scale.py` take the depths of points from `sparse/0`.
+`sparse_depths/NAME.npz` (docs/exports.md), and `depths/NAME.tiff`, maps that nerfstudio 1.1.5 reads
+by `depth_file_path`: float32, thousandths of the unit in the pixels of points, 0 elsewhere, without
+points of large standard deviations, for which they have no place.
 """
 
 import logging
@@ -31,7 +24,6 @@ from gsba.types import FrameSet, Reconstruction
 
 logger = logging.getLogger(__name__)
 
-_PER_UNIT = 1000.0  # value of a map for a depth of one unit
 _MAX_SIGMA = 0.1  # of a depth in a map, relative: beyond, errors of depths lean (by the square of
 # this, 1 %) and have long tails, while losses take all depths for equally good
 
@@ -51,7 +43,7 @@ class _Depths:
         columns, rows = np.floor(self.uv[order]).astype(int).T
         inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
         image = np.zeros((height, width), np.float32)
-        image[rows[inside], columns[inside]] = _PER_UNIT * self.depth[order][inside]
+        image[rows[inside], columns[inside]] = 1000.0 * self.depth[order][inside]
         return image
 
 
@@ -93,12 +85,13 @@ def write_depths(
             points = seen.observation_points[own]
             name = Path("sparse_depths", Path(image).relative_to("images")).with_suffix(".npz")
             (partial / name).parent.mkdir(parents=True, exist_ok=True)
-            given = shown.uv, shown.depth, shown.sigma
-            np.savez(partial / name, uv=given[0], depth=given[1], sigma=given[2], point=points)
+            np.savez(
+                partial / name, uv=shown.uv, depth=shown.depth, sigma=shown.sigma, point=points
+            )
             num_shown += len(own)
             if maps:
                 image_of_depths = shown.map(view.width, view.height)
-                _write_map(partial / map_path(image), image_of_depths)
+                write_map(partial / map_path(image), image_of_depths)
                 num_mapped += np.count_nonzero(image_of_depths)
     more = f", {num_mapped} of them in maps" if maps else ""
     logger.info("depths of %d points in %d frames%s", num_shown, len(frames), more)
@@ -125,12 +118,8 @@ def _depths(
     return depths, np.sqrt(depth_variances(reconstruction, axes))
 
 
-def write_empty_map(path: Path, width: int, height: int) -> None:
-    """Write the map of an image that shows no point."""
-    _write_map(path, np.zeros((height, width), np.float32))
-
-
-def _write_map(path: Path, image: np.ndarray) -> None:
+def write_map(path: Path, image: np.ndarray) -> None:
+    """Write a map (h, w) float32 of depths, 0 = unknown."""
     path.parent.mkdir(parents=True, exist_ok=True)
     # 1.3 ms and 64 KB for a face of 960; Adobe's deflate takes 37 ms for 27 KB.
     flags = [cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_PACKBITS]

@@ -1,12 +1,9 @@
 """Relative exposures of frames, from the brightness of the map's points in exported images.
 
-A frame's exposure is its brightness in stops (EV, powers of two), relative to the mean of all
-frames. The brightness of a point in a frame is the sum of both's, by robust least squares, of
-pixels made linear by sRGB's curve. Pixels near black or white tell nothing.
-gsplat's trainer (`--load_exposure`) and 3DGRUT read exposures from the EXIF of JPEG images, as
-log2(ExposureTime / FNumber^2 * ISO) less its mean: `ExposureTime` is written there, 10 ms for the
-mean. `exposures.json` holds the same of all images: {name: EV}. INRIA's `exposure.json` is written
-by its training, and read with a trained model only.
+The brightness of a point in a frame is the sum of both's in stops, by robust least squares, of
+pixels made linear by sRGB's curve. gsplat (`--load_exposure`) and 3DGRUT read log2(ExposureTime /
+FNumber^2 * ISO) less its mean from the EXIF of JPEGs: `ExposureTime` is written, 10 ms for the
+mean.
 """
 
 import logging
@@ -20,11 +17,7 @@ from gsba.disk import write_bytes, write_json
 logger = logging.getLogger(__name__)
 
 _DARKEST, _BRIGHTEST = 16, 245  # of 255: beyond, noise or clipping changes the brightness
-_MEAN_EXPOSURE_S = 0.01
 _NUM_ROUNDS = 10  # of reweighting
-_CAUCHY_SIGMAS = 2.4  # scale of the robust loss, robust standard deviations
-_MIN_SIGMA_EV = 1e-3
-_LUMINANCE = np.array([0.0722, 0.7152, 0.2126])  # of linear blue, green, red (BT.709)
 _EXIF_IFD, _EXPOSURE_TIME = 0x8769, 0x829A  # tags of EXIF
 _PER_SECOND = 100_000_000  # denominator of an exposure time
 
@@ -99,8 +92,8 @@ def relative_exposures(
         exposures = np.asarray(spsolve(normal.tocsc(), right))
         left_over = values - exposures[rows]
         residuals = left_over - (np.bincount(columns, weights * left_over) / per_point)[columns]
-        sigma = max(1.4826 * float(np.median(np.abs(residuals))), _MIN_SIGMA_EV)
-        weights = 1 / (1 + (residuals / (_CAUCHY_SIGMAS * sigma)) ** 2)
+        sigma = max(1.4826 * float(np.median(np.abs(residuals))), 1e-3)
+        weights = 1 / (1 + (residuals / (2.4 * sigma)) ** 2)  # robust standard deviations
     shared = np.bincount(columns, minlength=num_points)[columns] > 1
     tied = np.bincount(rows[shared], minlength=num_frames) > 0
     return np.where(tied, exposures - exposures[tied].sum() / max(tied.sum(), 1), np.nan)
@@ -117,7 +110,8 @@ def _brightness(path: Path, pixels: np.ndarray) -> np.ndarray:
     colors = small[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)]
     known = (colors >= _DARKEST).all(axis=1) & (colors <= _BRIGHTEST).all(axis=1)
     linear = ((colors / 255 + 0.055) / 1.055) ** 2.4  # the curve's foot is darker than _DARKEST
-    return np.where(known, np.log2(np.maximum(linear @ _LUMINANCE, 1e-6)), np.nan)
+    luminance = linear @ np.array([0.0722, 0.7152, 0.2126])  # of blue, green and red (BT.709)
+    return np.where(known, np.log2(np.maximum(luminance, 1e-6)), np.nan)
 
 
 def _insert_exposure(path: Path, exposure: float) -> bool:
@@ -131,7 +125,7 @@ def _insert_exposure(path: Path, exposure: float) -> bool:
     if b"Exif\0\0" in content[: 1 << 16]:
         return True
     exif = Image.Exif()
-    parts = round(_MEAN_EXPOSURE_S * 2**exposure * _PER_SECOND)
+    parts = round(0.01 * 2**exposure * _PER_SECOND)
     exif.get_ifd(_EXIF_IFD)[_EXPOSURE_TIME] = IFDRational(parts, _PER_SECOND)
     segment = exif.tobytes()
     header = b"\xff\xe1" + (len(segment) + 2).to_bytes(2, "big")

@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Mapping
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from gsba.export.pictures import FrameWriter
 from gsba.export.split import require_held_out
 from gsba.log import GsbaError
 from gsba.placement.placement import Placement
+from gsba.similarity import Sim3
 from gsba.store.finished import cameras_of_map, one_map
 from gsba.store.shards import Workers, content_digest
 from gsba.store.store import fingerprint
@@ -94,7 +96,15 @@ def export_all(
         cameras = cameras.taken(rows)
     if options.split:
         require_held_out(reconstruction)
-    _warn_of_gaps(reconstruction, frames, options)
+    if options.masks.paints and not has_masks(frames) and options.images != "fisheye":
+        logger.warning("no frame has a mask: images are not painted")
+    unrefined = np.flatnonzero(reconstruction.pose_statuses == PoseStatus.UNREFINED)
+    if len(unrefined):
+        names = ", ".join(frames.names[f] for f in unrefined[:5])
+        more = ", ... (all in poses.csv)" if len(unrefined) > 5 else ""
+        logger.warning("%d exported frames have unrefined poses: %s%s", len(unrefined), names, more)
+    if len(reconstruction.points_world) == 0:
+        logger.warning("the export holds poses but no points, and splat trainers need points")
     own = Placement(map_number=map_number).of_trajectory(reconstruction.origin)
     placement = options.placement or own
     unplaced, reconstruction = reconstruction, placement.apply(reconstruction)
@@ -131,7 +141,13 @@ def _write_dataset(
     from gsba.export import colmap, gltf, metashape, nerfstudio, opensfm, panoramas, photos, ply
 
     if to == ExportFormat.OPENSFM:
-        placement = opensfm.z_up(placement)
+        turn = Sim3(rotation=nerfstudio.z_up_R_world(placement.up))
+        placement = replace(
+            placement,
+            similarity=turn.after(placement.similarity),
+            up=placement.up and "z",
+            offset=turn.rotation @ placement.offset,
+        )
     placement.write(partial / "transform.json")
     images = options.images
     if (to, images) == (ExportFormat.METASHAPE, "auto") and all(
@@ -161,19 +177,6 @@ def _write_dataset(
     if options.photos.photos:
         photos.add_photos(data)
     return writers
-
-
-def _warn_of_gaps(reconstruction: Reconstruction, frames: FrameSet, options: ExportOptions) -> None:
-    """Warn of unrefined poses, of a missing point cloud, and of masks to paint that are missing."""
-    if options.masks.paints and not has_masks(frames) and options.images != "fisheye":
-        logger.warning("no frame has a mask: images are not painted")
-    unrefined = np.flatnonzero(reconstruction.pose_statuses == PoseStatus.UNREFINED)
-    if len(unrefined):
-        names = ", ".join(frames.names[f] for f in unrefined[:5])
-        more = ", ... (all in poses.csv)" if len(unrefined) > 5 else ""
-        logger.warning("%d exported frames have unrefined poses: %s%s", len(unrefined), names, more)
-    if len(reconstruction.points_world) == 0:
-        logger.warning("the export holds poses but no points, and splat trainers need points")
 
 
 def _require_fitting(to: ExportFormat, frames: FrameSet, options: ExportOptions) -> None:

@@ -1,15 +1,10 @@
-"""The walk as glTF 2.0: scene.glb, which Blender, Unreal and other programs import as it is.
+"""The walk as glTF 2.0, scene.glb: the cloud, a camera for each frame with a field of 90 degrees
+across 16:9, and the camera `walk`, which moves through all frames at their times.
 
-It holds the cloud (points with colours), a camera for each frame, which looks along the rig's z
-axis with a field of view of 90 degrees across a picture of 16:9 (Blender keeps the vertical field
-and takes the shape from its scene, which is 16:9), and the camera `walk`, which moves through all
-frames at their times. glTF's world has y up and its cameras have OpenGL axes. A world without a
-known vertical is turned by the axis that is nearest to the up axes of the rigs.
-
-`open_in_blender.py` beside it sets what glTF cannot say. It reads `extras`: of the scene `fps`,
-and `width` and `height` of the panoramas in pixels; of each frame's node `frame`, its place on the
-timeline, and `picture`, the path of its panorama. `fps` is an integer, as Blender 4.5 and 5.0
-import times by fps * fps_base, and play them by fps / fps_base.
+A world without a known vertical is turned by the axis nearest to the up axes of the rigs.
+`open_in_blender.py` beside it reads `extras`: of the scene `fps`, `width` and `height`; of each
+frame's node `frame`, its place on the timeline, and `picture`, the path of its panorama. `fps` is
+an integer, as Blender 4.5 and 5.0 import times by fps * fps_base, and play them by fps / fps_base.
 """
 
 import json
@@ -21,7 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from gsba.camera.views import scenes_of
 from gsba.disk import write_bytes
 from gsba.export.dataset import Dataset
 from gsba.export.images import panorama_writer
@@ -30,14 +24,12 @@ from gsba.geometry import CV_R_GL, quaternion_from_rotation
 from gsba.types import FrameSet, Reconstruction
 
 _RIG_UP = np.array([0.0, -1, 0])  # of a camera that is held level
-_MIN_COMMON_UP = 0.5  # length of the mean of the rigs' up axes; below it, they have none in common
 _FLOAT, _UBYTE, _POINTS = 5126, 5121, 0  # glTF's numbers of component types and modes
 _ASPECT = 16 / 9  # width to height of Blender's scenes
 _YFOV_RAD = 2 * np.arctan(1 / _ASPECT)  # vertical field, for a horizontal one of 90 degrees
 _NEAR_PER_EXTENT, _FAR_PER_DISTANCE = 1e-4, 10.0  # of the cameras' extent, of the furthest thing
 _SCRIPT = "open_in_blender.py"
 _MIN_FPS, _MAX_FPS = 24, 240  # of Blender's timeline
-_MAX_FRAME = 1_000_000  # of Blender's timeline, which ends at 1,048,574
 
 
 def write_blender(data: Dataset) -> list[FrameWriter]:
@@ -51,8 +43,7 @@ def write_blender(data: Dataset) -> list[FrameWriter]:
     shutil.copyfile(Path(__file__).with_name(_SCRIPT), data.folder / _SCRIPT)
     if not panoramas:
         return []
-    given = files, frames, data.cameras, data.options.link, scenes_of(data.reconstruction)
-    return [panorama_writer(*given)]
+    return [panorama_writer(data, files)]
 
 
 def write_gltf(
@@ -110,7 +101,13 @@ def write_gltf(
         **({"meshes": meshes} if meshes else {}),
         **scene.tables(),
     }
-    write_bytes(path, _glb(document, bytes(scene.content)))
+    # A JSON and a binary chunk, each padded to four bytes
+    text = json.dumps(document, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    content = bytes(scene.content) + b"\0" * (-len(scene.content) % 4)
+    chunks = struct.pack("<II", len(text), 0x4E4F534A) + text
+    chunks += struct.pack("<II", len(content), 0x004E4942) + content
+    write_bytes(path, struct.pack("<III", 0x46546C67, 2, 12 + len(chunks)) + chunks)
 
 
 def _walk(
@@ -144,7 +141,8 @@ def _fps(frames: FrameSet) -> int:
     shortest = float(np.diff(frames.timestamps).min(initial=1.0))
     fps = np.clip(np.ceil(1 / shortest - 1e-3), _MIN_FPS, _MAX_FPS)
     longest = float(frames.timestamps[-1] - frames.timestamps[0])
-    return int(min(fps, max(_MAX_FRAME // max(longest, 1.0), 1)))
+    # Blender's timeline ends at frame 1,048,574.
+    return int(min(fps, max(1_000_000 // max(longest, 1.0), 1)))
 
 
 def _extras(frames: FrameSet, pictures: Sequence[str] | None) -> list[dict[str, Any]]:
@@ -162,7 +160,8 @@ def _gltf_R_world(up: str | None, world_T_rigs: np.ndarray) -> np.ndarray:
     """Rotation (3, 3) that turns the world's up axis to y, by quarter turns about its axes."""
     if up is None:
         common = (world_T_rigs[:, :3, :3] @ _RIG_UP).mean(axis=0)
-        if np.linalg.norm(common) < _MIN_COMMON_UP:
+        # the rigs have no up axis in common
+        if np.linalg.norm(common) < 0.5:
             common = _RIG_UP
         axis = int(np.argmax(np.abs(common)))
         up = f"{'-' if common[axis] < 0 else ''}{'xyz'[axis]}"
@@ -212,13 +211,3 @@ def _steady(wxyz: np.ndarray) -> np.ndarray:
     """Quaternions (N, 4) with the signs that make each step a turn of less than 180 degrees."""
     flips = np.where(np.sum(wxyz[1:] * wxyz[:-1], axis=1) < 0, -1.0, 1.0)
     return wxyz * np.concatenate([[1.0], np.cumprod(flips)])[:, None]
-
-
-def _glb(document: dict[str, Any], content: bytes) -> bytes:
-    """File of a JSON and a binary chunk, each padded to four bytes."""
-    text = json.dumps(document, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 4)
-    content += b"\0" * (-len(content) % 4)
-    chunks = struct.pack("<II", len(text), 0x4E4F534A) + text
-    chunks += struct.pack("<II", len(content), 0x004E4942) + content
-    return struct.pack("<III", 0x46546C67, 2, 12 + len(chunks)) + chunks

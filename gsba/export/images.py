@@ -1,9 +1,6 @@
-"""Images and masks of an export, a few frames in memory at a time.
-
-Faces are cut with bicubic sampling, after a low pass if they are much coarser than the panorama.
-They are written with 8 bits and three colours: as PNG if the frame is PNG or TIFF, else as JPEG of
-quality 95. Panoramas, and input faces of the exported size, are exported unchanged where they are
-in formats that every trainer reads correctly.
+"""Images and masks of an export, a few frames in memory at a time: faces are cut with bicubic
+sampling, after a low pass if they are much coarser, as PNG of PNG or TIFF, else as JPEG; panoramas
+and input faces of the exported size are exported unchanged where every trainer reads their format.
 """
 
 import os
@@ -18,7 +15,8 @@ from gsba.camera.cameras import Cameras
 from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.camera.one_centre import Stitcher
 from gsba.camera.rig import CubeRig
-from gsba.camera.views import Scenes, View, ViewCutter, views_for
+from gsba.camera.views import Scenes, View, ViewCutter, scenes_of, views_for
+from gsba.export.dataset import Dataset
 from gsba.export.pictures import Files, FrameWriter, Pictures, Shown, by_camera
 from gsba.frames.dual_fisheye import load_raw
 from gsba.frames.pixels import load_faces
@@ -29,7 +27,6 @@ from gsba.store.shards import Threads, Workers
 from gsba.types import FACES, FrameSet, PictureFormat
 
 MIN_FACE_SIZE = 16  # pixels
-_MAX_FRAMES_AT_ONCE = 4  # an 8K panorama, a face and encoded images take 130 MB
 
 
 def face_size_for(kind: PictureFormat, face_size: int | None) -> int:
@@ -37,10 +34,7 @@ def face_size_for(kind: PictureFormat, face_size: int | None) -> int:
 
     The default is rounded to an even number and keeps the mean resolution: a face centre is sampled
     1.27 times coarser than the panorama, an edge 1.57 times finer. Frames that are cube faces keep
-    their size.
-
-    Raises:
-        GsbaError: `face_size` is too small.
+    their size. Raises GsbaError: `face_size` is too small.
     """
     if face_size is None:
         return 2 * round(kind.width / 8) if kind.panoramic else kind.width
@@ -85,29 +79,23 @@ def views_of_cameras(
 
 
 def view_writer(
-    files: Sequence[Files],
-    frames: FrameSet,
-    views: Sequence[tuple[View, ...]],
-    cameras: Cameras,
-    link: bool = False,
-    scenes: Scenes | None = None,
+    data: Dataset, files: Sequence[Files], views: Sequence[tuple[View, ...]]
 ) -> FrameWriter:
     """Writer of every view of a frame, and of its mask if the frames have masks.
 
     Args:
+        data: of panoramas, or of cube faces, of which missing ones are not written.
         files: (C,) files of the images of each camera's frames.
-        frames: panoramas, or cube faces, of which missing ones are not written.
         views: (C,) of each camera, see `views_of_cameras`.
-        cameras: cameras of these frames.
-        link: make hard links to images that are exported unchanged.
-        scenes: depths of the scene around these frames.
     """
-    writers = list[FrameWriter]()
-    for own, kind, seen, lenses in zip(files, frames.formats, views, cameras.lenses, strict=True):
+    writers, frames = list[FrameWriter](), data.frames
+    scenes = scenes_of(data.reconstruction)
+    given = zip(files, frames.formats, views, data.cameras.lenses, strict=True)
+    for own, kind, seen, lenses in given:
         if lenses and kind.panoramic:
             writers.append(_LensFaces(own, lenses, scenes, seen))
         else:
-            writers.append(_CubeFaces(own, seen[0].width, link))
+            writers.append(_CubeFaces(own, seen[0].width, data.options.link))
     return by_camera(writers, frames)
 
 
@@ -144,11 +132,10 @@ class _CubeFaces(FrameWriter):
 @dataclass(frozen=True, slots=True)
 class _OfLenses(FrameWriter):
     lenses: Lenses
-    scenes: Scenes | None  # None = everything is far
+    scenes: Scenes
 
     def taken(self, rows: np.ndarray) -> FrameWriter:
-        scenes = self.scenes and self.scenes.taken(rows)
-        return replace(self, lenses=self.lenses.taken(rows), scenes=scenes)
+        return replace(self, lenses=self.lenses.taken(rows), scenes=self.scenes.taken(rows))
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,7 +147,7 @@ class _LensFaces(_OfLenses):
 
         @cache
         def cutter() -> ViewCutter:
-            return ViewCutter(self.views, self.lenses, f, self.scenes and self.scenes(f))
+            return ViewCutter(self.views, self.lenses, f, self.scenes(f))
 
         def cut() -> Iterator[np.ndarray]:
             if shown.kind.fisheyes is not None:
@@ -189,37 +176,26 @@ def write_pictures(
         return
     for writer in writers:
         writer.make_folders(frames)
-    workers = (workers or Threads(os.cpu_count() or 1)).at_most(_MAX_FRAMES_AT_ONCE)
+    # An 8K panorama, a face and encoded images take 130 MB.
+    workers = (workers or Threads(os.cpu_count() or 1)).at_most(4)
     workers.must_see([writer.files.folder for writer in writers])
     give_back_freed_memory(0)
     for _ in workers.map_shards(Pictures(frames, writers)):
         pass
 
 
-def panorama_writer(
-    files: Files,
-    frames: FrameSet,
-    cameras: Cameras,
-    link: bool = False,
-    scenes: Scenes | None = None,
-) -> FrameWriter:
+def panorama_writer(data: Dataset, files: Files) -> FrameWriter:
     """Writer that copies the panorama of a frame, and writes its mask if the frames have masks.
 
     Panoramas that are corrected, those of raw pairs and of cube maps, and images that trainers
     misread are encoded again. Those of two lenses are stitched by `gsba.camera.one_centre`.
-
-    Args:
-        files: files of the images.
-        frames: panoramas.
-        cameras: cameras of these frames.
-        link: make hard links instead of copies.
-        scenes: depths of the scene around these frames.
     """
+    scenes = scenes_of(data.reconstruction)
     writers = [
-        _Stitched(files, lenses, scenes) if lenses else _Panoramas(files, link)
-        for lenses in cameras.lenses
+        _Stitched(files, lenses, scenes) if lenses else _Panoramas(files, data.options.link)
+        for lenses in data.cameras.lenses
     ]
-    return by_camera(writers, frames)
+    return by_camera(writers, data.frames)
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,8 +216,7 @@ class _Stitched(_OfLenses):
 
         @cache
         def stitcher() -> Stitcher:
-            scene = np.zeros((0, 3)) if self.scenes is None else self.scenes(f)
-            return Stitcher(self.lenses, f, scene)
+            return Stitcher(self.lenses, f, self.scenes(f))
 
         def stitched() -> list[np.ndarray]:
             if shown.kind.fisheyes is not None:

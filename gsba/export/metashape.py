@@ -1,12 +1,8 @@
-"""Agisoft Metashape's cameras.xml, with images and the cloud.
+"""Agisoft Metashape's cameras.xml, with images and the cloud; `gsba.trajectory.metashape` reads it.
 
-`--images panorama`, and `auto` where frames are panoramas, give one spherical sensor, which has no
-calibration: the panorama's middle column looks along z. Other images give frame sensors (pinhole
-faces), one where all faces are alike. A camera's transform is its pose in the chunk, row by row,
-with axes x right, y down, z forward, which are ours; `cx` and `cy` are offsets from the middle of
-the image. The one component has no transform of its own, so that the chunk is the exported world.
-Labels are names of files without folders, by which Metashape finds images.
-`gsba.trajectory.metashape` reads the file back.
+Panoramas are one spherical sensor, whose middle column looks along z; faces are frame sensors. A
+camera's transform is its pose in the chunk, with our axes; `cx` and `cy` are offsets from the
+middle of the image. Labels are names of files without folders, by which Metashape finds images.
 """
 
 import xml.etree.ElementTree as ET
@@ -16,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsba.camera.views import View, scenes_of, seen_from_lenses
+from gsba.camera.views import View, seen_from_lenses
 from gsba.export.dataset import Dataset
 from gsba.export.images import has_masks, panorama_writer, view_writer, views_of_cameras
 from gsba.export.names import base_names
@@ -27,8 +23,7 @@ from gsba.export.ply import write_cloud
 def write_metashape(data: Dataset) -> FrameWriter:
     """Write cloud and cameras.xml of panoramas or of pinhole faces, without images; returns their
     writer."""
-    frames, cameras, link = data.frames, data.cameras, data.options.link
-    scenes, faces = scenes_of(data.reconstruction), data.images != "panorama"
+    frames, cameras, faces = data.frames, data.cameras, data.images != "panorama"
     name = "{name}_{view}" if faces else "{name}"
     mask = f"masks/{name}.png" if has_masks(frames) else ""
     names, style = base_names(frames.names), data.options.masks
@@ -47,7 +42,7 @@ def write_metashape(data: Dataset) -> FrameWriter:
             for f, camera in enumerate(frames.cameras.tolist())
         ]
         _write(data, sensors, taken)
-        return panorama_writer(files, frames, cameras, link, scenes)
+        return panorama_writer(data, files)
     views = views_of_cameras(frames, data.options.face_size, cameras)
     of_cameras = [files_of([view.name for view in own]) for own in views]
     sensors, kinds = list[ET.Element](), list[list[int]]()
@@ -61,7 +56,7 @@ def write_metashape(data: Dataset) -> FrameWriter:
         poses = seen.world_T_rigs[f] @ np.stack([view.rig_T_view for view in views[camera]])
         taken.append(_Taken(of_cameras[camera].images(frames, f), poses, kinds[camera]))
     _write(data, sensors, taken)
-    return view_writer(of_cameras, frames, views, cameras, link, scenes)
+    return view_writer(data, of_cameras, views)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,11 +1,7 @@
-"""Velocities of the camera in each frame, for trainers that model blur and rolling rows.
-
-The keys are those of transforms.json of SpectacularAI's 3dgs-deblur (Seiskari et al., ECCV 2024):
-`camera_linear_velocity` and `camera_angular_velocity` of each frame in its camera's OpenGL axes,
-per second, and `rolling_shutter_time` and `exposure_time`, seconds, of all. A row of a picture is
-taken at (its height in the picture - 1/2) rolling_shutter_time after the frame's pose, and blurred
-over exposure_time around that.
-"""
+"""Velocities of the camera in each frame, in the keys of transforms.json of SpectacularAI's
+3dgs-deblur (Seiskari et al., ECCV 2024): in the camera's OpenGL axes, per second. A row is taken at
+(its height in the picture - 1/2) rolling_shutter_time after the pose, and blurred over
+exposure_time."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -15,8 +11,6 @@ import numpy as np
 from gsba.camera.cameras import Cameras
 from gsba.geometry import CV_R_GL, inverse
 from gsba.types import FrameSet, Reconstruction
-
-_MAX_INTERVAL_S = 0.25  # between frames whose poses tell how fast the camera moves in between
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +44,8 @@ def rig_velocities(
         parts = parts if lenses.axes is None else parts @ lenses.axes
         return parts.reshape(-1, 6)
     steps = np.diff(frames.timestamps)
-    if len(steps) < 2 or steps.max() > _MAX_INTERVAL_S:
+    # seconds: poses further apart do not tell how fast the camera moves in between
+    if len(steps) < 2 or steps.max() > 0.25:
         return None
     from scipy.spatial.transform import Rotation
 

@@ -1,9 +1,5 @@
-"""Names of exported images: in the order of the frames when sorted, and unique in one folder.
-
-Trainers sort names as text, Brush finds an image by the end of its name (`1_front.jpg` is also the
-end of `11_front.jpg`), and several readers drop folders. So numbers in the names of a recording's
-frames are padded with zeros to one length, and folders become a part of the name.
-"""
+"""Names of exported images: in the order of the frames when sorted as text, none the end of another
+(`1_front.jpg` of `11_front.jpg`, in Brush), and without folders, which several readers drop."""
 
 import re
 from collections import defaultdict

@@ -1,22 +1,17 @@
-"""nerfstudio datasets: pinhole faces in transforms.json, panoramas in transforms_erp.json; or,
-by the setting `export.images`, panoramas alone or raw fisheyes alone in transforms.json.
+"""nerfstudio datasets: pinhole faces in transforms.json and panoramas in transforms_erp.json (for
+models of equirectangular rays); or, by `export.images`, panoramas or raw fisheyes alone.
 
-nerfstudio's cameras have OpenGL axes (y up, z backward) and its world has z up, so the world and
-the cloud are rotated by NERFSTUDIO_R_WORLD, which `applied_transform` states. Base names are
-unique, because nerfstudio looks for down-scaled images by base name. One panorama in eight is held
-out with all its faces: a face in the training would show what the other faces are tested on. Splat
-trainers need the faces; the panoramas are for models that take equirectangular rays:
-`ns-train nerfacto --data OUT/transforms_erp.json`. nerfstudio applies top-level intrinsics to all
-frames, so that intrinsics that differ are in each frame's entry.
+nerfstudio's cameras have OpenGL axes and its world has z up: world and cloud are rotated by
+NERFSTUDIO_R_WORLD, which `applied_transform` states. Base names are unique, as nerfstudio looks for
+down-scaled images by them. It applies top-level intrinsics to all frames: those that differ are in
+each frame's entry.
 
-Raw fisheyes are OPENCV_FISHEYE with masks. If the motion during the readout is known, each frame
-also has `transform_matrix_start` and `transform_matrix_end`, the poses of the top and the bottom
-edge of the image in the format of instant-ngp, and `rolling_shutter` is [0, 0, 1, 0]: the pose of a
-pixel is interpolated between them by its row over the height. That is gsplat's
-ROLLING_TOP_TO_BOTTOM, with the inverses (in axes y down, z forward) as `viewmats` and
-`viewmats_rs`, and k1 to k4 as `radial_coeffs`. instant-ngp reads `is_fisheye` and k1 to k4 in each
-frame's entry, and the size of its box from `aabb_scale`; of a folder it loads all JSON files with
-frames, panoramas as pinholes. Velocities for 3dgs-deblur: `gsba.export.motion`.
+Raw fisheyes are OPENCV_FISHEYE with masks. With a known motion during the readout, a frame has
+`transform_matrix_start` and `_end`, poses of the top and the bottom edge in the format of
+instant-ngp, and `rolling_shutter` is [0, 0, 1, 0]; that is gsplat's ROLLING_TOP_TO_BOTTOM with the
+inverses as `viewmats` and `viewmats_rs`, and k1 to k4 as `radial_coeffs`. instant-ngp reads
+`is_fisheye` and k1 to k4 in each frame's entry, and the size of its box from `aabb_scale`; of a
+folder it loads all JSON files with frames, panoramas as pinholes.
 """
 
 import json
@@ -28,7 +23,7 @@ import numpy as np
 
 from gsba.camera.fisheye import Rig, lens_names, rotation_of
 from gsba.camera.lens import Lenses
-from gsba.camera.views import View, scenes_of, seen_from_lenses
+from gsba.camera.views import View, seen_from_lenses
 from gsba.export import motion
 from gsba.export.dataset import Dataset
 from gsba.export.depths import map_path, write_depths
@@ -39,13 +34,12 @@ from gsba.export.ply import write_splat_points
 from gsba.export.raw import RawPictures, raw_lenses
 from gsba.export.split import held_out_frames
 from gsba.geometry import CV_R_GL, pose
-from gsba.types import Fisheye, FrameSet, PictureFormat, Reconstruction
+from gsba.types import FrameSet, PictureFormat, Reconstruction
 
 NERFSTUDIO_R_WORLD = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 _Z_UP_R_WORLD = {"z": np.eye(3), "y": NERFSTUDIO_R_WORLD.T}  # of worlds whose y does not point down
 _CLOUD = "points3D.ply"
 _NGP_SCALE = 0.33  # of instant-ngp's unit cube, in this world's units, about the origin
-_NGP_MAX_BOXES = 128  # largest `aabb_scale`, a power of two
 
 
 def write_nerfstudio(data: Dataset) -> list[FrameWriter]:
@@ -120,7 +114,10 @@ class _RawRig:
                     entry[f"transform_matrix_{name}"] = matrix
             if velocity is not None:  # rows are read from the top, at these velocities
                 entry |= motion.velocity_keys(ways[number] * velocity, rig_T_lens)
-            entry |= _fisheye(lens)
+            cx, cy = lens.principal
+            lengths = {"fl_x": lens.focal, "fl_y": lens.focal, "cx": cx, "cy": cy}
+            radial = dict(zip(("k1", "k2", "k3", "k4"), lens.radial, strict=True))
+            entry |= {**lengths, "w": lens.width, "h": lens.height, **radial, "is_fisheye": True}
             entries.append({**entry, "mask_path": masks[number]} if masks else entry)
         return entries
 
@@ -167,8 +164,7 @@ def _write_faces(data: Dataset, out_R_world: np.ndarray) -> FrameWriter:
                 entry |= motion.velocity_keys(velocities[f], view.rig_T_view)
             entries[-1].append(entry)
     _write_transforms(data, "transforms.json", camera, entries, out_R_world)
-    scenes = scenes_of(data.reconstruction)
-    return view_writer(files, frames, views, cameras, options.link, scenes)
+    return view_writer(data, files, views)
 
 
 def _write_panoramas(data: Dataset, out_R_world: np.ndarray, which: str) -> FrameWriter:
@@ -193,8 +189,7 @@ def _write_panoramas(data: Dataset, out_R_world: np.ndarray, which: str) -> Fram
             entry["mask_path"] = hidden[0]
         entries.append([entry])
     _write_transforms(data, f"transforms{which}.json", camera, entries, out_R_world)
-    scenes = scenes_of(data.reconstruction)
-    return panorama_writer(files, frames, data.cameras, data.options.link, scenes)
+    return panorama_writer(data, files)
 
 
 def _files(data: Dataset, views: Sequence[str], masked: bool) -> Files:
@@ -213,13 +208,6 @@ def _intrinsics(view: View) -> dict[str, Any]:
     cx, cy = view.principal
     lengths = {"fl_x": view.focal, "fl_y": view.focal, "cx": cx, "cy": cy}
     return {**lengths, "w": view.width, "h": view.height}
-
-
-def _fisheye(lens: Fisheye) -> dict[str, Any]:
-    cx, cy = lens.principal
-    lengths = {"fl_x": lens.focal, "fl_y": lens.focal, "cx": cx, "cy": cy}
-    radial = dict(zip(("k1", "k2", "k3", "k4"), lens.radial, strict=True))
-    return {**lengths, "w": lens.width, "h": lens.height, **radial, "is_fisheye": True}
 
 
 def _entry(file_path: str, out_R_world: np.ndarray, world_T_camera: np.ndarray) -> dict[str, Any]:
@@ -254,7 +242,7 @@ def _write_transforms(
     document = {
         **camera,
         "applied_transform": applied.tolist(),
-        "aabb_scale": int(min(2.0 ** np.ceil(np.log2(max(2 * half, 1.0))), _NGP_MAX_BOXES)),
+        "aabb_scale": int(min(2.0 ** np.ceil(np.log2(max(2 * half, 1.0))), 128)),
         "ply_file_path": _CLOUD,
         "train_filenames": trained,
         "val_filenames": evaluated,

@@ -1,16 +1,12 @@
 """OpenSfM projects of panoramas: poses, cloud, tracks, camera models, images and masks.
 
-As OpenSfM's `io.py` and `tracks_manager.cc` read them (023d057): a shot's `rotation` (a rotation
-vector) and `translation` take the world to its camera, with axes x right, y down, z forward; a
-`spherical` camera shows what is straight ahead in the middle of its picture; `tracks.csv` (v2)
-holds, tab by tab, shot, track, feature, x and y from the picture's middle in widths of the picture,
-the feature's scale (here the observation's standard deviation, in widths), red, green, blue,
-segmentation and instance (-1 = none). The world is metric if the export is, z points up, and, where
-the export is placed by GPS, it lies around `reference_lla.json`. Shots go by their file names, all
-in one folder.
+As OpenSfM's `io.py` and `tracks_manager.cc` read them (023d057): `rotation` (a rotation vector) and
+`translation` take the world to a camera with our axes; `tracks.csv` (v2) holds shot, track,
+feature, x and y from the picture's middle in its widths, scale (here the standard deviation),
+colour, segmentation and instance (-1 = none). z points up; placed by GPS, the world lies around
+`reference_lla.json`. Shots go by their file names, all in one folder.
 """
 
-import dataclasses
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,38 +16,22 @@ import numpy as np
 
 from gsba.camera.one_centre import seen_from_the_middle
 from gsba.camera.sphere import erp_from_bearings
-from gsba.camera.views import scenes_of
 from gsba.export.dataset import Dataset
 from gsba.export.images import has_masks, panorama_writer
 from gsba.export.names import base_names
-from gsba.export.nerfstudio import z_up_R_world
 from gsba.export.pictures import Files, FrameWriter
 from gsba.geometry import inverse
 from gsba.log import GsbaError
-from gsba.placement.placement import Placement
-from gsba.similarity import Sim3
 from gsba.types import FrameSet, Reconstruction
 
 _NO_SEMANTICS = "-1\t-1"
 
 
-def z_up(placement: Placement) -> Placement:
-    """The placement, turned by a quarter turn or not at all to a world whose z points up."""
-    turn = Sim3(rotation=z_up_R_world(placement.up))
-    return dataclasses.replace(
-        placement,
-        similarity=turn.after(placement.similarity),
-        up=placement.up and "z",
-        offset=turn.rotation @ placement.offset,
-    )
-
-
 def write_opensfm(data: Dataset) -> FrameWriter:
-    """Write a project, in a world whose z points up, without images; returns their writer.
+    """Write a project, in a world whose z points up, without images; returns their writer. Raises
+    GsbaError: the frames are cube faces, or two of them get one file name."""
+    from scipy.spatial.transform import Rotation
 
-    Raises:
-        GsbaError: the frames are cube faces, or two of them get one file name.
-    """
     frames, partial, placement = data.frames, data.folder, data.placement
     if not all(kind.panoramic for kind in frames.formats):
         raise GsbaError("opensfm needs panoramas, these frames are cube faces: use colmap")
@@ -68,7 +48,21 @@ def write_opensfm(data: Dataset) -> FrameWriter:
         for kind in frames.formats
     }
     seen = seen_from_the_middle(data.reconstruction) if data.cameras else data.reconstruction
-    document: dict[str, Any] = {"cameras": models, "shots": _shots(seen, frames, shots)}
+    cameras_T_world = inverse(seen.world_T_rigs)
+    rotations = Rotation.from_matrix(cameras_T_world[:, :3, :3]).as_rotvec()
+    document: dict[str, Any] = {
+        "cameras": models,
+        "shots": {
+            name: {
+                "camera": _camera_name(frames.format_of(f).width, frames.format_of(f).height),
+                "rotation": rotations[f].tolist(),
+                "translation": cameras_T_world[f, :3, 3].tolist(),
+                "orientation": 1,
+                **({"capture_time": float(frames.timestamps[f])} if frames.timed else {}),
+            }
+            for f, name in enumerate(shots)
+        },
+    }
     document["points"] = {
         str(j): {"coordinates": xyz, "color": color}
         for j, (xyz, color) in enumerate(
@@ -84,31 +78,11 @@ def write_opensfm(data: Dataset) -> FrameWriter:
     with (partial / "tracks.csv").open("w", encoding="utf-8") as file:
         file.write("OPENSFM_TRACKS_VERSION_v2\n")
         file.writelines(_tracks(seen, frames, shots))
-    scenes = scenes_of(data.reconstruction)
-    return panorama_writer(files, frames, data.cameras, data.options.link, scenes)
+    return panorama_writer(data, files)
 
 
 def _camera_name(width: int, height: int) -> str:
     return f"v2 gsba panorama {width} {height} spherical 0"
-
-
-def _shots(
-    reconstruction: Reconstruction, frames: FrameSet, names: list[str]
-) -> dict[str, dict[str, Any]]:
-    from scipy.spatial.transform import Rotation
-
-    cameras_T_world = inverse(reconstruction.world_T_rigs)
-    rotations = Rotation.from_matrix(cameras_T_world[:, :3, :3]).as_rotvec()
-    return {
-        name: {
-            "camera": _camera_name(frames.format_of(f).width, frames.format_of(f).height),
-            "rotation": rotations[f].tolist(),
-            "translation": cameras_T_world[f, :3, 3].tolist(),
-            "orientation": 1,
-            **({"capture_time": float(frames.timestamps[f])} if frames.timed else {}),
-        }
-        for f, name in enumerate(names)
-    }
 
 
 def _tracks(reconstruction: Reconstruction, frames: FrameSet, names: list[str]) -> Iterator[str]:

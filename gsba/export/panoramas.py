@@ -1,12 +1,7 @@
-"""Trajectory file and folder of panoramas, for programs without a format of their own.
+"""Trajectory file and folder of panoramas, for programs without a format of their own; `gsba refine
+OUT/images OUT/trajectory.tum` reads them back."""
 
-`gsba refine OUT/images OUT/trajectory.tum` reads them back, or those of one of several recordings
-from OUT/images/RECORDING.
-"""
-
-import csv
-
-from gsba.camera.views import scenes_of
+from gsba.disk import write_csv
 from gsba.export.dataset import Dataset
 from gsba.export.images import has_masks, panorama_writer
 from gsba.export.pictures import Files, FrameWriter
@@ -23,14 +18,10 @@ def write_poses(data: Dataset) -> list[FrameWriter]:
     if data.images != "panorama":
         return []
     for recording, rows in (frames.recordings or {"": range(len(frames))}).items():
-        images = data.folder / "images" / recording
-        images.mkdir(parents=True, exist_ok=True)
-        with (images / "timestamps.csv").open("w", newline="") as file:
-            writer = csv.writer(file)
-            writer.writerow(["name", "timestamp"])
-            names = (frames.names[f].rpartition("/")[2] for f in rows)
-            writer.writerows(zip(names, map(float, frames.timestamps[rows]), strict=True))
+        names = (frames.names[f].rpartition("/")[2] for f in rows)
+        table = zip(names, map(float, frames.timestamps[rows]), strict=True)
+        path = data.folder / "images" / recording / "timestamps.csv"
+        write_csv(path, ["name", "timestamp"], table)
     mask = "masks/{name}.png" if has_masks(frames) else ""
     files = Files(data.folder, ("",), "images/{name}{suffix}", mask, data.options.masks)
-    given = files, frames, data.cameras, data.options.link, scenes_of(data.reconstruction)
-    return [panorama_writer(*given)]
+    return [panorama_writer(data, files)]

@@ -1,11 +1,6 @@
-"""Localised photos in datasets, as cameras of their own beside the faces of panoramas.
-
-COLMAP's `RADIAL` camera is the one of photos: focal length, principal point, two radial terms. For
-programs that cannot read it photos are undistorted, and their camera is `PINHOLE`.
-Photos are `images/photos/NAME`, in flat layouts and nerfstudio's `images/photo_NAME`, with a number
-before it where readers hold images out by their order; they have poses but no observations of
-points. They are for training, but for those that such readers hold out (`gsba.export.split`).
-"""
+"""Localised photos in datasets, as cameras of their own beside the faces of panoramas: COLMAP's
+`RADIAL`, or undistorted `PINHOLE`. They have poses but no observations of points, and are for
+training, but for those that readers hold out by their order (`gsba.export.split`)."""
 
 import json
 import shutil
@@ -16,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from gsba.disk import disk_errors, write_image
-from gsba.export.colmap import write_in_order
+from gsba.export.colmap import rigid, write_in_order
 from gsba.export.dataset import Dataset, PhotoCamera, Photos, PlacedPhoto
-from gsba.export.depths import map_path, write_empty_map
+from gsba.export.depths import map_path, write_map
 from gsba.export.images import has_masks
 from gsba.export.split import TRAIN_LIST, add_images
 from gsba.frames.files import decode, goes_out_as_it_is, image_size
@@ -46,7 +41,11 @@ def read_photos(folder: Path | None, run: Path) -> Photos:
     path = folder / LIST
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-        cameras = tuple(_camera(entry) for entry in content["cameras"])
+        fields = ("width", "height", "focal", "principal", "radial")
+        cameras = tuple(
+            typed({name: entry[name] for name in fields}, PhotoCamera)
+            for entry in content["cameras"]
+        )
         photos = tuple(
             _photo(entry)
             for entry in content["pictures"]
@@ -67,11 +66,6 @@ def read_photos(folder: Path | None, run: Path) -> Photos:
     return Photos(photos, cameras)
 
 
-def _camera(entry: dict[str, Any]) -> PhotoCamera:
-    fields = ("width", "height", "focal", "principal", "radial")
-    return typed({name: entry[name] for name in fields}, PhotoCamera)
-
-
 def _photo(entry: dict[str, Any]) -> PlacedPhoto:
     pose = np.array(entry["world_T_picture"], np.float64)
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
@@ -82,11 +76,8 @@ def _photo(entry: dict[str, Any]) -> PlacedPhoto:
 
 def add_photos(data: Dataset) -> None:
     """Add its photos to a dataset whose faces are written, of pinhole cameras if its reader knows
-    no others. Where frames have masks, photos get some that hide nothing.
-
-    Raises:
-        GsbaError: two photos would have one name, or one cannot be read.
-    """
+    no others. Where frames have masks, photos get some that hide nothing. Raises GsbaError: two
+    photos would have one name, or one cannot be read."""
     partial, to, photos, options = data.folder, data.to, data.options.photos, data.options
     undistort = bool(options.cameras) and "RADIAL" not in options.cameras
     masked = has_masks(data.frames) and not options.masks.path
@@ -119,7 +110,26 @@ def add_photos(data: Dataset) -> None:
     _write_photos(partial, photos, names, undistort)
     if masked and to == "colmap-flat":
         _write_masks(partial, photos, names)
-    _add_to_colmap(model, photos, poses, names, numbers, undistort)
+    import pycolmap
+
+    first = max(model.cameras, default=0) + 1
+    for c, camera in enumerate(photos.cameras):
+        kind, params = "RADIAL", (camera.focal, *camera.principal, *camera.radial)
+        if undistort:
+            matrix = _pinhole(camera)
+            principal = matrix[:2, 2] + 0.5
+            kind, params = "PINHOLE", (matrix[0, 0], matrix[1, 1], *principal)
+        size = {"width": camera.width, "height": camera.height}
+        model.add_camera_with_trivial_rig(
+            pycolmap.Camera(model=kind, params=params, camera_id=first + c, **size)
+        )
+    for photo, pose, name, number in zip(photos.photos, poses, names, numbers, strict=True):
+        image = pycolmap.Image(
+            name=name.removeprefix("images/"),
+            camera_id=first + photo.camera,
+            image_id=number + 1,
+        )
+        model.add_image_with_trivial_frame(image, rigid(inverse(pose)))
     write_in_order(model, partial / "sparse" / "0")
 
 
@@ -166,39 +176,6 @@ def _pinhole(camera: PhotoCamera) -> np.ndarray:
     return cv2.getOptimalNewCameraMatrix(*_opencv(camera), size, alpha=0)[0]
 
 
-def _add_to_colmap(
-    model,
-    photos: Photos,
-    poses: np.ndarray,
-    names: Sequence[str],
-    numbers: Sequence[int],
-    undistort: bool,
-) -> None:
-    import pycolmap
-
-    first = max(model.cameras, default=0) + 1
-    for c, camera in enumerate(photos.cameras):
-        kind, params = "RADIAL", (camera.focal, *camera.principal, *camera.radial)
-        if undistort:
-            matrix = _pinhole(camera)
-            principal = matrix[:2, 2] + 0.5
-            kind, params = "PINHOLE", (matrix[0, 0], matrix[1, 1], *principal)
-        size = {"width": camera.width, "height": camera.height}
-        model.add_camera_with_trivial_rig(
-            pycolmap.Camera(model=kind, params=params, camera_id=first + c, **size)
-        )
-    for photo, pose, name, number in zip(photos.photos, poses, names, numbers, strict=True):
-        camera_T_world = inverse(pose)
-        rotation = pycolmap.Rotation3d(camera_T_world[:3, :3])
-        image = pycolmap.Image(
-            name=name.removeprefix("images/"),
-            camera_id=first + photo.camera,
-            image_id=number + 1,
-        )
-        rigid = pycolmap.Rigid3d(rotation, camera_T_world[:3, 3])
-        model.add_image_with_trivial_frame(image, rigid)
-
-
 def _add_to_nerfstudio(
     path: Path, photos: Photos, poses: np.ndarray, names: Sequence[str], masks: Sequence[str]
 ) -> None:
@@ -225,7 +202,8 @@ def _add_to_nerfstudio(
         )
         if with_depths:  # readers want them of all images or of none
             frames[-1]["depth_file_path"] = map_path(name)
-            write_empty_map(path.parent / map_path(name), camera.width, camera.height)
+            empty = np.zeros((camera.height, camera.width), np.float32)
+            write_map(path.parent / map_path(name), empty)
     for entry, mask in zip(frames[len(frames) - len(masks) :], masks, strict=True):
         entry["mask_path"] = mask
     document["train_filenames"] = [*document["train_filenames"], *names]

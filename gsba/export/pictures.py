@@ -1,9 +1,5 @@
-"""Images of a frame for all datasets of an export: each is read, cut and encoded once.
-
-Images that are exported unchanged are copies. Copies share blocks with the original on file systems
-that can (reflinks), so that an export may be moved and edited. On request they are hard links: then
-an edit of one is an edit of the other.
-"""
+"""Images of a frame for all datasets of an export: each is read, cut and encoded once. Unchanged
+ones are copies that share blocks where file systems can (reflinks), or on request hard links."""
 
 import fcntl
 import os
@@ -13,7 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from types import NoneType
 from typing import Any
 
@@ -29,7 +25,6 @@ from gsba.log import GsbaError
 from gsba.store.shards import even_blocks
 from gsba.types import FrameSet
 
-_FICLONE = 0x40049409  # ioctl of Linux that clones a file; both share blocks until one is written
 _EXPORTED_SUFFIX = {".insp": ".jpg", ".webp": ".jpg", ".tif": ".png", ".tiff": ".png"}
 
 
@@ -63,7 +58,8 @@ class Files:
     def masks(self, frames: FrameSet, f: int) -> list[str]:
         """Paths of a frame's masks in the folder, by view; [] = there are none."""
         if self.mask and self.style.path:
-            return list(map(self.style.path_beside, self.images(frames, f)))
+            paths = map(PurePosixPath, self.images(frames, f))
+            return [self.style.path.format(folder=path.parent, stem=path.stem) for path in paths]
         return self._filled(self.mask, frames, f) if self.mask else []
 
     def make_folders(self, frames: FrameSet) -> None:
@@ -226,10 +222,6 @@ class Pictures:
         writers = [writer.taken(rows) for writer in self._writers]
         return Pictures(self.frames.taken(rows, absolute=True), writers)
 
-    def same_mask(self, f: int) -> bool:
-        """True if another frame has the mask file of frame f."""
-        return self._uses[self.frames.mask_paths[f]] > 1
-
     def masks(self, key: Hashable, make: Callable[[], list[bytes]]) -> list[bytes]:
         """Encoded masks under a key, made by the first frame that needs them."""
         with self._lock:  # so that only one thread makes them
@@ -303,7 +295,7 @@ class Shown:
             return list(map(encoded_image, drawn(), paths))
 
         key = "mask", key, style.hidden, self.frames.mask_paths[self.f]
-        if self._pictures.same_mask(self.f) and not differ:
+        if (self._pictures._uses[self._pictures.frames.mask_paths[self.f]] > 1) and not differ:
             _write(paths, self._pictures.masks(key, encode))
         else:
             self.write(key, paths, drawn)
@@ -327,6 +319,7 @@ def _copy(source: Path, path: Path, link: bool) -> None:
             os.link(source.resolve(), path)
             return
     with suppress(OSError), source.open("rb") as original, path.open("wb") as clone:
-        fcntl.ioctl(clone, _FICLONE, original.fileno())
+        # FICLONE of Linux: both files share blocks until one is written.
+        fcntl.ioctl(clone, 0x40049409, original.fileno())
         return
     shutil.copyfile(source, path)

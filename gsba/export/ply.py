@@ -13,10 +13,7 @@ def write_points(path: Path, reconstruction: Reconstruction) -> None:
     """Write the cloud with residuals and track lengths, in the world of the trajectory.
 
     Properties: x y z (map units), red green blue, error_deg (mean angular residual, degrees),
-    track_length (number of observations).
-
-    Raises:
-        GsbaError: the disk cannot be written.
+    track_length (number of observations). Raises GsbaError: the disk cannot be written.
     """
     num_points = len(reconstruction.points_world)
     columns = {

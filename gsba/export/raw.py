@@ -17,11 +17,7 @@ SEEN_DEG = 90.0  # largest angle from a lens's axis: beyond, COLMAP's fisheye ca
 
 
 def raw_lenses(kind: PictureFormat) -> Rig:
-    """Lenses of raw frames.
-
-    Raises:
-        GsbaError: the frames are not raw.
-    """
+    """Lenses of raw frames. Raises GsbaError: the frames are not raw."""
     if kind.fisheyes is None:
         raise GsbaError("--images fisheye is for runs on raw fisheyes: these frames are stitched")
     return kind.fisheyes

@@ -2,12 +2,9 @@
 
 Trainers that read COLMAP models hold out every eighth image: INRIA's (`--eval`), gsplat, 3DGRUT and
 Brush (`--eval-split-every 8`) in the order of names, nerfstudio's COLMAP parser in that of numbers,
-LichtFeld (`--eval`) as they come in the file. A face whose siblings are trained on tells nothing,
-as all faces of a panorama share their centre. Here images are numbered so that all orders agree and
-every eighth one is a face of a held-out panorama; faces of held-out panoramas beyond those are left
-out.
-Readers of lists (`train_list.txt`, `val_list.txt`, `test_list.txt` of nerfstudio's COLMAP parser,
-`sparse/0/test.txt` of forks of INRIA's) get the same split.
+LichtFeld (`--eval`) as they come in the file. Images are numbered so that all orders agree and
+every eighth one is a face of a held-out panorama; its other faces are left out, as they share its
+centre. Readers of lists (`train_list.txt`, ..., `sparse/0/test.txt`) get the same split.
 """
 
 import logging
@@ -98,11 +95,7 @@ def split_of(
 
 
 def require_held_out(reconstruction: Reconstruction) -> None:
-    """Refuse a split that leaves too few panoramas to train on.
-
-    Raises:
-        GsbaError: it does.
-    """
+    """Refuse a split that leaves too few panoramas to train on. Raises GsbaError: it does."""
     if not held_out_frames(reconstruction).any():
         num = np.count_nonzero(reconstruction.pose_statuses == PoseStatus.REFINED)
         raise GsbaError(

@@ -1,7 +1,4 @@
-"""Programs by name: which export each reads, and how it is started on that.
-
-What each reads is in its public documentation and source, see `docs/exports.md`.
-"""
+"""Programs by name: which export each reads (docs/exports.md), and how it is started on that."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -72,11 +69,8 @@ PROGRAMS = {
 
 
 def format_of(name: str) -> ExportFormat:
-    """Format of a name, which is a format's or a program's.
-
-    Raises:
-        GsbaError: the name is neither, or its program reads splats only.
-    """
+    """Format of a name, which is a format's or a program's. Raises GsbaError: the name is neither,
+    or its program reads splats only."""
     if name in PROGRAMS:
         return PROGRAMS[name].to
     if name == "supersplat":

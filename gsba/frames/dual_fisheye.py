@@ -11,7 +11,6 @@ from gsba.camera.sphere import erp_bands, table
 from gsba.frames.raw_pairs import decode_pair
 from gsba.types import FrameSet
 
-_ASIDE_PX = 1e-6  # a column that lies exactly on a seam goes whole to the lens on its right
 SEAM = np.deg2rad(1.5)  # angle from the seam within which a window shows both lenses
 
 
@@ -96,7 +95,8 @@ def _clear_of_seam(height: int, axes: tuple[tuple[float, ...], ...]) -> np.ndarr
 def _parts(rig: Rig, width: int) -> tuple[_Part, ...]:
     """The part of a panorama that each lens shows."""
     height, axes, faced = width // 2, optical_axes(rig), np.empty((width // 2, width), np.uint8)
-    aside = np.arange(width) + _ASIDE_PX
+    # a column that lies exactly on a seam goes whole to the lens on its right
+    aside = np.arange(width) + 1e-6
     for top, bearings in erp_bands(aside, width):
         faced[top : top + len(bearings)] = facing(bearings, axes)
     parts = []

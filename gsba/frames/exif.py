@@ -18,7 +18,6 @@ _TAKEN, _OFFSET, _SUBSECOND = 0x9003, 0x9011, 0x9291
 _FOCAL_35MM, _LENS = 0xA405, 0xA434
 _LATITUDE_REF, _LATITUDE, _LONGITUDE_REF, _LONGITUDE, _ALTITUDE_REF, _ALTITUDE = range(1, 7)
 _GPS_TIME, _STATUS, _DOP, _GPS_DATE, _ERROR = 7, 9, 11, 29, 31
-_MAX_OFFSET_H = 14  # largest offset of a time zone from UTC, hours
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,9 +95,7 @@ def _zone(text: str) -> timezone | None:
         offset = datetime.strptime(text, "%z").utcoffset()
     except ValueError:
         return None
-    if offset is None or abs(offset) > timedelta(hours=_MAX_OFFSET_H):
-        return None
-    return timezone(offset)
+    return None if offset is None or abs(offset) > timedelta(hours=14) else timezone(offset)
 
 
 def _gps_tag(gps: Mapping[int, Any]) -> GpsTag | None:

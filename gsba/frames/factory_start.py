@@ -27,7 +27,6 @@ _log = logging.getLogger(__name__)
 
 FACTORY_FILE = "factory_lenses.json"  # beside the frames of a video
 INSTA360_PICTURE = ".insp"  # suffix of JPEG images with both lenses side by side
-_NUM_COMPARED_FRAMES = 8  # frames in which rims are compared
 _QUARTER_TURNS = 4
 _MAX_FILE_BYTES = 1 << 16  # largest size of FACTORY_FILE
 _MIN_CORRELATION_GAIN = 0.1  # gain in rim correlation from which another reading is preferred to
@@ -78,11 +77,7 @@ def write_factory_calibration(folder: Path, calibration: FactoryCalibration) -> 
 
 def find_factory_lenses(folder: Path, images: Sequence[Path]) -> FactoryLenses | None:
     """The maker's calibration of frames: beside those of a video, or in pictures as the camera
-    wrote them; None = there is none.
-
-    Raises:
-        GsbaError: the file beside the frames is damaged.
-    """
+    wrote them; None = there is none. GsbaError if the file beside the frames is damaged."""
     found = _read_factory_calibration(folder)
     if found is None and images and images[0].suffix.lower() == INSTA360_PICTURE:
         found = factory_calibration(images[:1])
@@ -108,7 +103,7 @@ def starting_lenses(
         size: width and height of one lens's picture.
         factory: the maker's calibration.
     """
-    rows = np.unique(np.linspace(0, len(pairs) - 1, _NUM_COMPARED_FRAMES).astype(int))
+    rows = np.unique(np.linspace(0, len(pairs) - 1, 8).astype(int))
     looks = [decode_pair(pairs[f], size, gray=True) for f in rows]
     readings = [
         _with_back_turned(pair, quarters)

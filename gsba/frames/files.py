@@ -20,11 +20,8 @@ _MAX_PADDING_BYTES, _PADDING_VALUES = 1024, (b"\0", b"\xff")  # largest number o
 
 
 def entries_of(folder: Path) -> list[Path]:
-    """Files and folders in a folder, in the order of their names.
-
-    Raises:
-        GsbaError: it is no folder, or cannot be read.
-    """
+    """Files and folders in a folder, in the order of their names. Raises GsbaError: it is no
+    folder, or cannot be read."""
     try:
         return sorted(folder.iterdir())
     except FileNotFoundError:
@@ -36,11 +33,8 @@ def entries_of(folder: Path) -> list[Path]:
 
 
 def images_by_name(folder: Path, images: Iterable[Path]) -> dict[str, Path]:
-    """Images by frame name.
-
-    Raises:
-        GsbaError: two of them have one name in `folder`, the folder of all frames.
-    """
+    """Images by frame name. Raises GsbaError: two of them have one name in `folder`, the folder of
+    all frames."""
     found: dict[str, Path] = {}
     for path in images:
         if path.stem in found:
@@ -57,21 +51,14 @@ def is_image(path: Path) -> bool:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height of an image as shown (EXIF orientation respected), without decoding.
-
-    Raises:
-        GsbaError: see `image_header`.
-    """
+    """Width and height of an image as shown (EXIF orientation respected), without decoding. Raises
+    GsbaError: see `image_header`."""
     return image_header(path).size
 
 
 def image_header(path: Path) -> Header:
-    """The header of a JPEG, PNG, WebP or TIFF file.
-
-    Raises:
-        GsbaError: unreadable, no such image, its end is missing (truncated), an unsupported
-            variant, or more than MAX_PIXELS.
-    """
+    """The header of a JPEG, PNG, WebP or TIFF file. Raises GsbaError: unreadable, no such image,
+    its end is missing (truncated), an unsupported variant, or more than MAX_PIXELS."""
     try:
         with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
             return header_of(data, path)
@@ -196,7 +183,13 @@ def _decoded_jpeg(
         try:
             pixels = wanted()
         except ValueError as error:
-            if not _is_padding(str(error), encoded):
+            # Some cameras write padding before the end, which is no damage.
+            found = re.search(r"(\d+) extraneous bytes before marker 0xd9", str(error))
+            num = int(found[1]) if found else _MAX_PADDING_BYTES + 1
+            if not (
+                num <= _MAX_PADDING_BYTES
+                and any(fill * num + JPEG_END in encoded for fill in _PADDING_VALUES)
+            ):
                 raise
             pixels = wanted(strict=False)
     except (ValueError, KeyError) as error:  # KeyError: unknown colour space
@@ -204,12 +197,3 @@ def _decoded_jpeg(
             f"{path}: damaged ({error}); copy or extract it again, or remove it"
         ) from None
     return pixels[..., 0] if gray else pixels
-
-
-def _is_padding(complaint: str, encoded: bytes) -> bool:
-    """True if a decoder complains only of padding before the end, which some cameras write."""
-    found = re.search(r"(\d+) extraneous bytes before marker 0xd9", complaint)
-    num = int(found[1]) if found else _MAX_PADDING_BYTES + 1
-    return num <= _MAX_PADDING_BYTES and any(
-        fill * num + JPEG_END in encoded for fill in _PADDING_VALUES
-    )

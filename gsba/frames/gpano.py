@@ -1,14 +1,11 @@
-"""Tags of panoramas in XMP: the part of the sphere that a picture shows, and the camera's attitude.
-
-Photo Sphere XMP Metadata, developers.google.com/streetview/spherical-metadata.
-"""
+"""Tags of panoramas in XMP (developers.google.com/streetview/spherical-metadata): the part of the
+sphere that a picture shows, and the camera's attitude."""
 
 import math
 import re
 from dataclasses import dataclass
 
 _TAG = re.compile(rb"(?<!/)GPano:(\w+)\s*(?:=\s*[\"']\s*([^\"'<]*)[\"']|>([^<]*)<)")
-_MAX_SCALE_DIFFERENCE = 0.01  # between both sides of a picture that was made smaller
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +42,8 @@ class PanoramaTags:
         scale = size[0] / width
         inside = left >= 0 and top >= 0 and left + width <= self.full[0] + 0.5
         inside &= top + height <= self.full[1] + 0.5
-        alike = abs(size[1] / height / scale - 1) <= _MAX_SCALE_DIFFERENCE
+        # between both sides of a picture that was made smaller
+        alike = abs(size[1] / height / scale - 1) <= 0.01
         if not (inside and alike and abs(self.full[0] / self.full[1] / 2 - 1) < 0.01):
             return None
         high = max(round(scale * self.full[1]), size[1], -(-size[0] // 2))

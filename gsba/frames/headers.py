@@ -1,10 +1,6 @@
-"""Headers of image files, read without decoding pixels: JPEG, PNG, WebP and TIFF.
-
-Sizes are those on display: the orientation tag of EXIF turns or mirrors the stored picture.
-
-Pillow, which reads the other tags (`gsba.frames.exif`), does not notice here that a file's end is
-missing, skips damaged tags of a TIFF, of equal ones takes the last where decoders take the first,
-and decodes a PNG to find a tag behind its pixels.
+"""Headers of image files, read without decoding pixels: JPEG, PNG, WebP and TIFF, with sizes on
+display. Pillow does not notice here that a file's end is missing, skips damaged tags of a TIFF, of
+equal ones takes the last where decoders take the first, and decodes a PNG for tags behind pixels.
 """
 
 import mmap
@@ -21,15 +17,10 @@ MAX_PIXELS = 1 << 28  # pixels of one image: 768 MB of colours
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _PNG_END = b"IEND\xaeB`\x82"  # chunk type and its constant CRC
-_PNG_COLOURS = (2, 6)  # RGB, RGB with alpha
-_PNG_TAIL_BYTES = 1 << 16  # bytes before the end in which tags are searched
 _JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
-_JPEG_BARE = {0x01, *range(0xD0, 0xD9)}  # markers without a segment: TEM, RST0-7, SOI
-_JPEG_FRAME = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # SOF0-15; not DHT, JPG, DAC
 _JPEG_SCAN, _JPEG_APP1 = 0xDA, 0xE1  # SOS; where EXIF is
 _EXIF = b"Exif\0\0"
 _XMP, _PNG_XMP = b"http://ns.adobe.com/xap/1.0/\0", b"XML:com.adobe.xmp\0"
-_WEBP_ANIMATED = 0x02  # flag of an extended file
 _TIFF_STARTS = b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"  # with +: BigTIFF
 _TIFF_TYPES = {1: 1, 3: 2, 4: 4, 16: 8}  # bytes of an unsigned number
 _WIDTH, _HEIGHT, _BITS, _COMPRESSION, _COLOURS = 256, 257, 258, 259, 262
@@ -141,7 +132,7 @@ def _png(data: Bytes) -> Header:
     if data.rfind(_PNG_END) <= 0:
         raise _Truncated
     width, height = (int.from_bytes(data[at : at + 4], "big") for at in (16, 20))
-    plain = data[24] == 8 and data[25] in _PNG_COLOURS
+    plain = data[24] == 8 and data[25] in (2, 6)  # RGB, RGB with alpha
     turn = _orientation(_png_exif(data))
     return _shown("PNG", width, height, turn, plain, _png_xmp(data))
 
@@ -166,7 +157,7 @@ def _png_exif(data: Bytes) -> bytes:
         if kind == b"eXIf":
             return data[position + 8 : position + 8 + length]
         position += 12 + length
-    at = data.rfind(b"eXIf", max(len(data) - _PNG_TAIL_BYTES, position))
+    at = data.rfind(b"eXIf", max(len(data) - (1 << 16), position))
     length = int.from_bytes(data[at - 4 : at], "big") if at > 0 else 0
     found = data[at : at + 4 + length]
     checksum = int.from_bytes(data[at + 4 + length : at + 8 + length], "big")
@@ -187,10 +178,11 @@ def _jpeg(data: Bytes) -> Header:
             position += 1
         marker = data[position]
         position += 1
-        if marker in _JPEG_BARE:
+        # markers without a segment: TEM, RST0-7, SOI
+        if marker in {0x01, *range(0xD0, 0xD9)}:
             continue
         length = int.from_bytes(data[position : position + 2], "big")
-        if marker in _JPEG_FRAME:
+        if marker in set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}:  # SOF0-15; not DHT, JPG, DAC
             if data[position + 2] != 8:
                 raise _Unsupported(
                     f"a JPEG of {data[position + 2]} bits; save it with 8, or as PNG"
@@ -221,7 +213,7 @@ def _webp(data: Bytes) -> Header:
     if len(body) < 10:
         raise ValueError
     if kind == b"VP8X":
-        if body[0] & _WEBP_ANIMATED:
+        if body[0] & 0x02:
             raise _Unsupported("an animated WebP; extract its pictures to files of their own")
         width, height = (int.from_bytes(body[at : at + 3], "little") + 1 for at in (4, 7))
     elif kind == b"VP8L":

@@ -1,10 +1,6 @@
-"""Image circles of fisheyes: the borders in a picture of the light that came through a lens.
-
-The rim of an image circle is the strongest drop of brightness along most rays from the middle, at
-any level of stray light: glowing housings and flare are brighter than black, but the step at the
-rim remains. The median of several pictures keeps the rim and drops what moves. A circle through
-edges of three rays is tried many times; the one that most rays agree with is refined.
-"""
+"""Image circles of fisheyes: the strongest drop of brightness along most rays from the middle, at
+any level of stray light, in the median of several pictures. A circle through edges of three rays is
+tried many times; the one that most rays agree with is refined."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,21 +8,15 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-_SEARCH_SIZE_PX = 512  # pixels of the longer side at which edges are found
 _DARK_OFFSET = 8.0  # grey values added before the logarithm: noise of black pixels is no edge
-_BLUR_PX = 1.0  # pixels, standard deviation
 _NUM_RAYS = 360  # around the middle of a picture
 _SAMPLE_STEP_PX = 0.5  # pixels along a ray
 _WINDOW_SAMPLES = 6  # samples on either side of an edge, whose means are compared
-_MIN_DROP = 0.25  # least drop of the logarithm of the grey value at an edge
-_DROP_LIMIT = 1.0  # drop above which an edge gains no more weight
-_EDGES_PER_RAY = 3
 _MIN_EDGE_GAP = 8  # samples between two edges of a ray
 _NUM_TRIALS = 3000  # circles tried, each through three edges
 _TRIALS_AT_ONCE = 250
 _MAX_RELATIVE_DISTANCE = 0.006  # largest distance of an edge from a circle, relative to the radius
 _MAX_REFINED_DISTANCE = 0.01  # largest distance of an edge while the circle is refined, relative
-_NUM_REFINEMENTS = 8
 _MIN_RADIUS, _MAX_RADIUS = 0.3, 0.72  # in units of the shorter and of the longer side
 _MAX_OFF_CENTRE = 0.15  # distance of the centre from the middle, in units of each side
 _BORDER_PX = 1.5  # pixels at the picture's border in which edges are ignored
@@ -92,16 +82,23 @@ def find_circle(pictures: Sequence[np.ndarray]) -> CircleSearch:
         pictures: (h, w) uint8 each, of one lens, of one size; 5 to 10 from all over the capture.
     """
     height, width = pictures[0].shape
-    scale = min(1.0, _SEARCH_SIZE_PX / max(height, width))
+    scale = min(1.0, 512 / max(height, width))
     size = max(round(scale * width), 8), max(round(scale * height), 8)
     small = [cv2.resize(picture, size, interpolation=cv2.INTER_AREA) for picture in pictures]
     median = np.median(small, axis=0).astype(np.float32)
-    smooth = cv2.GaussianBlur(median, (0, 0), _BLUR_PX)
+    smooth = cv2.GaussianBlur(median, (0, 0), 1.0)
     best, num_rays = _best_circle(_edges(smooth), small)
     if best is not None:
         best = best.scaled(width / size[0])
     found = best is not None and best.support >= _MIN_SUPPORT and num_rays >= _MIN_AGREEING_RAYS
-    return CircleSearch(best, num_rays, found, *_greys(median))
+    # Median grey values of the middle and of the corners of a picture (h, w)
+    height, width = median.shape
+    down, across = max(height // 12, 1), max(width // 12, 1)
+    middle = median[4 * down : -4 * down, 4 * across : -4 * across]
+    ends = [median[rows][:, columns] for rows in (slice(down), slice(-down, None))
+            for columns in (slice(across), slice(-across, None))]  # fmt: skip
+    greys = (round(float(np.median(some))) for some in (middle, ends))
+    return CircleSearch(best, num_rays, found, *greys)
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +106,7 @@ class _Edges:
     """Edges at which brightness drops along rays from the middle of a picture."""
 
     places: np.ndarray  # (E, 2) float64, pixels, corner origin
-    drops: np.ndarray  # (E,) float64, of the logarithm of the grey value, at most _DROP_LIMIT
+    drops: np.ndarray  # (E,) float64, of the logarithm of the grey value, at most 1
     rays: np.ndarray  # (E,) int64
 
 
@@ -131,29 +128,28 @@ def _edges(smooth: np.ndarray) -> _Edges:
     drops = means[:, :-_WINDOW_SAMPLES] - means[:, _WINDOW_SAMPLES:]
     drops[~inside[:, 2 * _WINDOW_SAMPLES - 1 :]] = 0.0
     every, found = np.arange(_NUM_RAYS), []
-    for _ in range(_EDGES_PER_RAY):
+    for _ in range(3):  # edges of a ray
         at = np.argmax(drops, axis=1)
         depth = drops[every, at]
-        for ray in np.flatnonzero(depth >= _MIN_DROP):
+        # of the logarithm of the grey value at an edge
+        for ray in np.flatnonzero(depth >= 0.25):
             profile = values[ray, at[ray] : at[ray] + 2 * _WINDOW_SAMPLES]
-            radius = reach[at[ray]] + _SAMPLE_STEP_PX * _half_level(profile)
+            # Position in samples at which a falling profile (n,) is midway between its ends: blur
+            # moves the steepest place of its logarithm outwards
+            level = 0.5 * (profile[:2].mean() + profile[-2:].mean())
+            after = int(np.argmax(profile < level))
+            before = max(after - 1, 0)
+            step = profile[before] - profile[after]
+            radius = reach[at[ray]] + _SAMPLE_STEP_PX * (
+                before + float((profile[before] - level) / step) if step > 0 else len(profile) / 2
+            )
             found.append((radius, depth[ray], ray))
             drops[ray, max(at[ray] - _MIN_EDGE_GAP, 0) : at[ray] + _MIN_EDGE_GAP + 1] = 0.0
     radii, depths, rays = np.array(found).reshape(-1, 3).T
     rays = rays.astype(np.int64)
     away = np.stack([np.cos(angles[rays]), np.sin(angles[rays])], axis=1)
     places = np.array([width / 2, height / 2]) + radii[:, None] * away
-    return _Edges(places, np.minimum(depths, _DROP_LIMIT), rays)
-
-
-def _half_level(profile: np.ndarray) -> float:
-    """Position in samples at which a falling profile (n,) is midway between its ends: blur moves
-    the steepest place of its logarithm outwards."""
-    level = 0.5 * (profile[:2].mean() + profile[-2:].mean())
-    after = int(np.argmax(profile < level))
-    before = max(after - 1, 0)
-    step = profile[before] - profile[after]
-    return before + float((profile[before] - level) / step) if step > 0 else len(profile) / 2
+    return _Edges(places, np.minimum(depths, 1.0), rays)  # deeper drops gain no more weight
 
 
 def _best_circle(edges: _Edges, pictures: Sequence[np.ndarray]) -> tuple[ImageCircle | None, int]:
@@ -213,7 +209,7 @@ def _edges_on_circles(places: np.ndarray, circles: np.ndarray) -> np.ndarray:
 def _refined(edges: _Edges, circle: np.ndarray, width: int, height: int) -> tuple[ImageCircle, int]:
     """The circle fitted to all edges near a circle (3,), and the number of rays with such edges."""
     x, y, radius = circle
-    for _ in range(_NUM_REFINEMENTS):
+    for _ in range(8):
         away = np.hypot(edges.places[:, 0] - x, edges.places[:, 1] - y) - radius
         near = np.abs(away) < _MAX_REFINED_DISTANCE * radius
         if np.count_nonzero(near) < _MIN_AGREEING_RAYS // 2:
@@ -271,13 +267,3 @@ def _sampled(picture: np.ndarray, across: np.ndarray, down: np.ndarray) -> np.nd
 
 def _ray_angles() -> np.ndarray:
     return 2 * np.pi * (np.arange(_NUM_RAYS) + 0.5) / _NUM_RAYS
-
-
-def _greys(median: np.ndarray) -> tuple[int, int]:
-    """Median grey values of the middle and of the corners of a picture (h, w)."""
-    height, width = median.shape
-    down, across = max(height // 12, 1), max(width // 12, 1)
-    middle = median[4 * down : -4 * down, 4 * across : -4 * across]
-    ends = [median[rows][:, columns] for rows in (slice(down), slice(-down, None))
-            for columns in (slice(across), slice(-across, None))]  # fmt: skip
-    return round(float(np.median(middle))), round(float(np.median(ends)))

@@ -1,9 +1,5 @@
-"""The overlap of a raw pair's pictures at their rims, and the lens parameters it determines.
-
-Fisheyes of more than 180 degrees both show the seam. Their pictures agree there under the right
-quarter turn of the back lens about its axis, and under the focal length that puts the seam at 90
-degrees: this gives the angle of an image circle before anything is matched.
-"""
+"""The overlap of a raw pair's pictures at their rims: they agree at the seam under the right
+quarter turn of the back lens and the focal length that puts the seam at 90 degrees."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,9 +15,7 @@ _NUM_AROUND = 720  # places along the seam
 _OVERLAP_RAD = np.deg2rad(np.arange(-4.0, 4.5, 1.0))  # angles from the seam
 _SCALES = 100.0 / np.arange(90.0, 112.25, 0.5)[::-1]  # of focal lengths: circles of 90 to 112
 # degrees from the axis, where they are taken for 100
-_MAX_RELATIVE_RADIUS = 0.985  # part of a circle's radius: the rim beyond is dark
 _MIN_ROWS = 5  # least number of rows of _OVERLAP_RAD inside both image circles
-_MIN_HARMONIC = 3  # lowest harmonic used: those below are sky and ground at any focal length
 _MIN_TURN_MARGIN = 0.1  # margin in correlation of the right turn over any other
 _MIN_PEAK_CORRELATION = 0.25  # least correlation at the right focal length
 _PEAK_HALF_WIDTH = 5  # steps of _SCALES on either side of the peak, where the correlation must be
@@ -61,16 +55,20 @@ def measure_overlap(
     ]
     whole, fine = (np.full((len(behind), len(_SCALES)), -1.0) for _ in range(2))
     for s, scale in enumerate(_SCALES):
-        ring = _seam(front, radii, scale)
+        # Directions (R, A, 3) around the seam inside of both image circles, whose rims are dark
+        ring = np.array([[np.sin(a), np.cos(a)] for a in np.pi / 2 + np.abs(_OVERLAP_RAD)])
+        meridian = np.stack([ring[:, 0], np.zeros(len(ring)), ring[:, 1]], axis=1)
+        plain = replace(_scaled(front, scale), rotation=(0.0, 0.0, 0.0))
+        reach = np.linalg.norm(project(plain, meridian) - np.asarray(front.principal), axis=1)
+        ring = _rings(np.pi / 2 + _OVERLAP_RAD[reach < 0.985 * min(radii)])
         if len(ring) < _MIN_ROWS:
             continue
         ahead = [_harmonics(pictures[0], _scaled(front, scale), ring) for pictures in smooth]
         for t, lens in enumerate(behind):
             back = [_harmonics(pictures[1], _scaled(lens, scale), ring) for pictures in smooth]
             whole[t, s] = np.mean([_correlation(a, b, 1) for a, b in zip(ahead, back, strict=True)])
-            fine[t, s] = np.mean(
-                [_correlation(a, b, _MIN_HARMONIC) for a, b in zip(ahead, back, strict=True)]
-            )
+            # Harmonics below 3 are sky and ground at any focal length.
+            fine[t, s] = np.mean([_correlation(a, b, 3) for a, b in zip(ahead, back, strict=True)])
     best = whole.max(axis=1)
     order = np.argsort(best)[::-1]
     turn = int(order[0])
@@ -119,15 +117,6 @@ def _smooth(picture: np.ndarray, size: tuple[int, int], sigma: float) -> np.ndar
 
 def _scaled(lens: Fisheye, scale: float) -> Fisheye:
     return replace(lens, focal=lens.focal * scale)
-
-
-def _seam(front: Fisheye, radii: tuple[float, float], scale: float) -> np.ndarray:
-    """Directions (R, A, 3) around the seam that lie inside of both image circles."""
-    ring = np.array([[np.sin(a), np.cos(a)] for a in np.pi / 2 + np.abs(_OVERLAP_RAD)])
-    meridian = np.stack([ring[:, 0], np.zeros(len(ring)), ring[:, 1]], axis=1)
-    plain = replace(_scaled(front, scale), rotation=(0.0, 0.0, 0.0))
-    reach = np.linalg.norm(project(plain, meridian) - np.asarray(front.principal), axis=1)
-    return _rings(np.pi / 2 + _OVERLAP_RAD[reach < _MAX_RELATIVE_RADIUS * min(radii)])
 
 
 def _rings(angles: np.ndarray) -> np.ndarray:

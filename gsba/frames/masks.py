@@ -16,7 +16,6 @@ from gsba.types import FrameSet
 logger = logging.getLogger(__name__)
 
 _MAX_UNUSED_LEVEL = 127  # highest grey level of unused pixels
-_MAX_USUAL_SHARE = 0.6  # of the sphere: carriers and their riders hide up to half
 
 
 def find_masks(
@@ -55,25 +54,21 @@ def find_masks(
         if w != 2 * h:
             raise GsbaError(f"{path}: mask is {w}x{h}; masks are equirectangular, 2:1")
     if masks.is_file():
-        _warn_of_inversion(masks, image_size(masks))
+        size = image_size(masks)
+        rows = (np.arange(size[1]) + 0.5) / size[1]
+        levels = _levels_in(masks, size, masks.stat().st_mtime_ns)
+        unused = (levels <= _MAX_UNUSED_LEVEL).mean(axis=1)
+        hidden = float(np.average(unused, weights=np.sin(np.pi * rows)))
+        if hidden == 1:
+            raise GsbaError(f"{masks}: the mask hides all of each picture: 255 = use, 0 = ignore")
+        if hidden > 0.6:  # of the sphere: carriers and their riders hide up to half
+            logger.warning(
+                "%s hides %.0f %% of each picture (255 = use, 0 = ignore): invert it if it is to "
+                "hide the rest",
+                masks,
+                100 * hidden,
+            )
     return tuple(path.absolute() for path in paths)
-
-
-def _warn_of_inversion(path: Path, size: tuple[int, int]) -> None:
-    """Warn of a mask of all frames that hides most of the sphere."""
-    rows = (np.arange(size[1]) + 0.5) / size[1]
-    levels = _levels_in(path, size, path.stat().st_mtime_ns)
-    unused = (levels <= _MAX_UNUSED_LEVEL).mean(axis=1)
-    hidden = float(np.average(unused, weights=np.sin(np.pi * rows)))
-    if hidden == 1:
-        raise GsbaError(f"{path}: the mask hides all of each picture: 255 = use, 0 = ignore")
-    if hidden > _MAX_USUAL_SHARE:
-        logger.warning(
-            "%s hides %.0f %% of each picture (255 = use, 0 = ignore): invert it if it is to hide "
-            "the rest",
-            path,
-            100 * hidden,
-        )
 
 
 def load_mask(frames: FrameSet, f: int) -> np.ndarray | None:

@@ -12,7 +12,6 @@ from gsba.frames.masks import load_usable
 from gsba.frames.pixels import load_erp, load_faces
 from gsba.types import FACES, FrameSet, PictureFormat
 
-_NUM_BRIGHTNESS_FRAMES = 5  # frames by whose brightness `bright_level` judges all
 _PADDING_PX = 3  # pixels copied from a face's neighbours: the support of bicubic sampling, and one
 
 
@@ -98,7 +97,7 @@ class Greys:
 
 def bright_level(greys: Greys) -> int:
     """Grey value that 99 % of the usable pixels of some frames do not exceed; 255 without any."""
-    chosen = np.unique(np.linspace(0, greys.num_frames - 1, _NUM_BRIGHTNESS_FRAMES).astype(int))
+    chosen = np.unique(np.linspace(0, greys.num_frames - 1, 5).astype(int))
     found = [greys[int(f)] for f in chosen]
     used = [(grey if mask is None else grey[mask]).ravel() for grey, mask in found]
     values = np.concatenate(used)

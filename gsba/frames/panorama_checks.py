@@ -1,10 +1,9 @@
 """Detection of 2:1 pictures that are no panorama: stereo pairs and cropped panoramas.
 
-The left and right edge of a panorama meet, its first and last row are stretched points, and its
-halves differ. Thresholds lie beyond the extremes of 5,159 pictures of true panoramas, blurred,
-dark, overexposed, with seams 1 degree off, carriers and patches over the poles among them: of these
-none is refused, and of 38 sequences of each kind of stereo none is accepted. Of sequences that are
-cropped to 270 x 135 degrees nine in ten are recognised, with or without one of the poles.
+Thresholds lie beyond the extremes of 5,159 pictures of true panoramas, blurred, dark, overexposed,
+with seams 1 degree off, carriers and patches over the poles: none is refused. Of 38 sequences of
+each kind of stereo none is accepted; of those cropped to 270 x 135 degrees nine in ten are
+recognised.
 """
 
 from collections.abc import Iterable
@@ -26,12 +25,7 @@ REMEDIES = {  # of what `unlike_panorama` names
 }
 
 _WIDTH = 256  # pixels across, to which pictures are made smaller
-_MIN_WIDTH = 512  # pixels across pictures that are judged: noise of smaller ones is not averaged
-_DETAIL_SIGMA_PX = 6.0  # blur whose difference from a picture is its detail
 _MIN_LIT_LEVEL, _LIT_BORDER_PX = 16, 13  # black areas and their edges repeat without stereo
-_MIN_COMPARED_SHARE = 0.2  # part of a half that must be lit in both
-_MIN_DETAIL = 1.0  # grey levels, standard deviation; with less, noise or nothing is compared
-_MAX_DISPARITY_PX = 6  # between two eyes
 _MIN_REPEAT = 0.65  # correlation of the details of both eyes; 0.46 at most in panoramas
 _MIN_SEAM = 0.5  # step between both edges over that between far columns
 _MIN_SEAM_OF_HALVES = 0.4  # the same where halves repeat: tells half spheres from whole ones
@@ -40,7 +34,6 @@ _MIN_TORN = 0.5  # median step between edges that are shifted and scaled to meet
 # sequences of true panoramas, badly stitched ones included
 _MIN_TORN_LOOKS = 3  # pictures; of single ones, somebody who stands on the edge tears one in 400
 _MAX_SHIFT_PX, _MAX_GAIN = 4, 1.4  # between edges that two lenses saw
-_CERTAIN_SEAM = 0.3  # edges with a smaller step meet, so that one picture is enough
 _MIN_POLE_DETAIL = 0.45  # gradient along the rows over that across them; 0.44 at most at the more
 # constant pole of panoramas whose edges do not meet
 _POLE_ROWS, _POLE_SIGMA_PX, _MIN_GRADIENT = 6, 1.5, 0.3  # rows; blur; grey levels a pixel
@@ -69,11 +62,13 @@ def unlike_panorama(greys: Iterable[np.ndarray]) -> str:
     """
     found = list[_Evidence]()
     for grey in greys:
-        if grey.shape[1] < _MIN_WIDTH:
+        # noise of smaller pictures is not averaged
+        if grey.shape[1] < 512:
             return ""
         found.append(_measure(grey))
         first = found[0]
-        if max(first.beside, first.above) < _MIN_REPEAT and first.seam < _CERTAIN_SEAM:
+        # edges meet, so that one picture is enough
+        if max(first.beside, first.above) < _MIN_REPEAT and first.seam < 0.3:
             return ""
     if not found:
         return ""
@@ -92,7 +87,8 @@ def unlike_panorama(greys: Iterable[np.ndarray]) -> str:
 def _measure(grey: np.ndarray) -> _Evidence:
     size = _WIDTH, _WIDTH // 2
     small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA).astype(np.float32)
-    detail = small - cv2.GaussianBlur(small, (0, 0), _DETAIL_SIGMA_PX)
+    # blur whose difference from a picture is its detail
+    detail = small - cv2.GaussianBlur(small, (0, 0), 6.0)
     border = np.ones((_LIT_BORDER_PX, _LIT_BORDER_PX), np.uint8)
     lit = cv2.erode((small > _MIN_LIT_LEVEL).astype(np.uint8), border) > 0
     beside, above = (
@@ -130,15 +126,16 @@ def _torn(columns: np.ndarray, shifts: np.ndarray) -> float:
 
 def _repeat(one: np.ndarray, other: np.ndarray, lit: np.ndarray, other_lit: np.ndarray) -> float:
     """Largest correlation of two halves (h, w) over shifts of some columns; 0 = not comparable."""
-    most, best = _MAX_DISPARITY_PX, 0.0
+    most, best = 6, 0.0  # pixels between two eyes
     inner = (slice(None), slice(most, -most))
     for shift in range(-most, most + 1):
         both = (lit & np.roll(other_lit, shift, 1))[inner]
-        if both.mean() < _MIN_COMPARED_SHARE:
+        # part of a half that must be lit in both
+        if both.mean() < 0.2:
             continue
         x, y = one[inner][both], np.roll(other, shift, 1)[inner][both]
         norm = float(x.std() * y.std())
-        if norm > _MIN_DETAIL**2:
+        if norm > 1:  # with less than one grey level, noise or nothing is compared
             best = max(best, float(((x - x.mean()) * (y - y.mean())).mean()) / norm)
     return best
 

@@ -22,7 +22,6 @@ _log = logging.getLogger(__name__)
 
 _OF_FACE = re.compile(rf".+_({'|'.join(FACES)})", re.IGNORECASE)
 _NOMINAL_HALF_FOV_RAD = np.deg2rad(100.0)  # half angle of the image circle of an unknown fisheye
-_NUM_CIRCLE_FRAMES = 8  # frames in which image circles are searched
 _RIG_R_BACK_LENS = np.diag([-1.0, 1.0, -1.0])  # rig_R_lens of an upright back lens
 _QUARTER_TURNS = [
     Rotation.from_euler("z", turn).as_matrix() for turn in np.deg2rad([0, 90, 180, 270])
@@ -39,10 +38,7 @@ _FOLDERS = (("front", "back"), ""), (("lens0", "lens1"), ""), (("fr", "bk"), "Go
 
 def find_pairs(folder: Path) -> Found | None:
     """Pictures of raw lenses in a folder, one file for each lens; None = it holds something else.
-
-    Raises:
-        GsbaError: a picture of one lens has no counterpart.
-    """
+    Raises GsbaError: a picture of one lens has no counterpart."""
     entries = sorted(folder.iterdir())
     images = [path for path in entries if is_image(path) and path.is_file()]
     numbered = {int(m[1]): path for path in entries if (m := _NUMBERED.fullmatch(path.name))}
@@ -165,7 +161,7 @@ def lenses_of(
         GsbaError: a calibration of other pictures or of another number of lenses, circles outside
             of the pictures, or pictures without a visible circle.
     """
-    rows = np.unique(np.linspace(0, len(pairs) - 1, _NUM_CIRCLE_FRAMES).astype(int))
+    rows = np.unique(np.linspace(0, len(pairs) - 1, 8).astype(int))
     if calibration is not None:
         some = [pairs[f] for f in rows]
         return _calibrated(folder, some, size, calibration)

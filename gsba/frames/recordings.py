@@ -13,9 +13,7 @@ from gsba.types import NO_FILE_NAME, FrameSet, PictureFormat
 
 _log = logging.getLogger(__name__)
 
-_GAP_INTERVALS = 100.0  # least time between two recordings, in the longest median interval
 _GAP_MULTIPLE_S = 100.0  # recordings begin at multiples of this many seconds
-_NUM_COMPARED = 3  # frames of two recordings whose files are compared, to tell one given twice
 
 
 def combine(
@@ -46,7 +44,7 @@ def combine(
             _log.info(both, name, other_name)
     parts = list(recordings.values())
     formats, numbers = _cameras_of(recordings, cameras or {})
-    gap = _GAP_INTERVALS * max(float(np.median(np.diff(part.timestamps))) for part in parts)
+    gap = 100.0 * max(float(np.median(np.diff(part.timestamps))) for part in parts)
     times, shifts, end = list[np.ndarray](), list[float](), -gap
     for part in parts:
         begin = _GAP_MULTIPLE_S * math.ceil((end + gap) / _GAP_MULTIPLE_S)
@@ -94,7 +92,8 @@ def _refuse_same(name: str, one: FrameSet, other_name: str, other: FrameSet) -> 
         )
     if len(one) != len(other):
         return
-    rows = np.unique(np.linspace(0, len(one) - 1, _NUM_COMPARED).astype(int))
+    # frames whose files are compared, to tell a recording given twice
+    rows = np.unique(np.linspace(0, len(one) - 1, 3).astype(int))
     pairs = [pair for f in rows for pair in zip(one.paths[f], other.paths[f], strict=False)]
     if all(
         a.stat().st_size == b.stat().st_size and a.read_bytes() == b.read_bytes() for a, b in pairs

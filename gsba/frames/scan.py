@@ -6,7 +6,7 @@ import re
 import shlex
 import unicodedata
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -155,7 +155,18 @@ def _in_time_order(
     if table is None and fps is None and (folder / _TIMES_FILE).is_file():
         table = folder / _TIMES_FILE
     if fps is not None:
-        _warn_of_slots(folder, max(path.name for path in found[names[-1]]))
+        # stella_vslam gives every file of a folder a time slot, images or not
+        last = max(path.name for path in found[names[-1]])
+        early = [
+            p.name for p in entries_of(folder) if p.is_file() and not is_image(p) and p.name < last
+        ]
+        if early:
+            _log.warning(
+                "--fps counts images only; if stella_vslam read this folder with '%s' in it, its "
+                "times are %d frames later",
+                early[0],
+                len(early),
+            )
     pictures = [found[name] for name in names]
     times, timed = frame_times(names, table, fps, order_suffices, pictures)
     order = np.argsort(times, kind="stable")
@@ -237,11 +248,8 @@ def _lenses(
 
 
 def find_panoramas(folder: Path, masks: Path | None = None) -> FrameSet:
-    """The panoramas of a folder in name order; times are not needed, and are 0, 1, ...
-
-    Raises:
-        GsbaError: the folder holds no panoramas, or a mask does not fit.
-    """
+    """The panoramas of a folder in name order; times are not needed, and are 0, 1, ... Raises
+    GsbaError: the folder holds no panoramas, or a mask does not fit."""
     layout, _, found = _find_frames(Path(folder))
     if layout != "erp":
         raise GsbaError(f"{folder}: holds no panoramas; give a folder of equirectangular images")
@@ -303,7 +311,13 @@ def _find_frames(folder: Path) -> tuple[str, tuple[str, ...], dict[str, tuple[Pa
     if others:
         _log.info("%s: ignored %d other entries: %s", folder, len(others), ", ".join(others[:5]))
     places = [folder, *(path for path in entries if path.name.lower() in FACES and path.is_dir())]
-    foreign = _unsupported_images(path for place in places for path in entries_of(place))
+    # "2 TIFF and 1 WebP images", of unsupported formats, or ""
+    paths = (path for place in places for path in entries_of(place))
+    kinds = [_UNSUPPORTED_FORMATS.get(path.suffix.lower()) for path in paths if path.name[0] != "."]
+    counts = sorted(Counter(kind for kind in kinds if kind).items())
+    *front, last = [f"{n} {kind}" for kind, n in counts] or [""]
+    text = f"{', '.join(front)} and {last}" if front else last
+    foreign = text and f"{text} image{'s' if sum(n for _, n in counts) > 1 else ''}"
     if foreign and (subfolders or images):
         _log.warning("%s: left out %s: convert them to JPEG, PNG, WebP or TIFF", folder, foreign)
     if subfolders:
@@ -341,34 +355,21 @@ def _no_images(
         )
     folders = [path for path in entries if path.is_dir() and path.name[0] != "."]
     if below := [path for path in folders if any(map(is_image, entries_of(path)))]:
-        return GsbaError(_recordings_below(folder, below))
+        names = ", ".join(path.name for path in below[:5]) + (", ..." if len(below) > 5 else "")
+        if len(below) == 1:
+            return GsbaError(f"{folder}: its pictures are in {below[0]}: give that folder")
+        paths = " ".join(shlex.quote(str(path)) for path in below[:3])
+        paths += " ..." if below[3:] else ""
+        return GsbaError(
+            f"{folder}: its pictures are in {len(below)} folders ({names}): give one of them, or "
+            f"all as recordings of one place (gsba refine {paths} --out RUN)"
+        )
     counts = Counter(Path(name).suffix.lower() or Path(name).name for name in others)
     held = ", ".join(f"{n} {kind}" for kind, n in sorted(counts.items())[:5]) or "nothing"
     return GsbaError(
         f"{folder}: no JPEG, PNG, WebP or TIFF images (it holds {held}); extract the video's "
         "frames there first"
     )
-
-
-def _recordings_below(folder: Path, below: Sequence[Path]) -> str:
-    """The refusal of a folder whose pictures lie in folders of recordings."""
-    names = ", ".join(path.name for path in below[:5]) + (", ..." if len(below) > 5 else "")
-    if len(below) == 1:
-        return f"{folder}: its pictures are in {below[0]}: give that folder"
-    paths = " ".join(shlex.quote(str(path)) for path in below[:3]) + (" ..." if below[3:] else "")
-    return (
-        f"{folder}: its pictures are in {len(below)} folders ({names}): give one of them, or "
-        f"all as recordings of one place (gsba refine {paths} --out RUN)"
-    )
-
-
-def _unsupported_images(paths: Iterable[Path]) -> str:
-    """Number and format of images in unsupported formats: "2 TIFF and 1 WebP images", or ""."""
-    kinds = [_UNSUPPORTED_FORMATS.get(path.suffix.lower()) for path in paths if path.name[0] != "."]
-    counts = sorted(Counter(kind for kind in kinds if kind).items())
-    *front, last = [f"{n} {kind}" for kind, n in counts] or [""]
-    text = f"{', '.join(front)} and {last}" if front else last
-    return text and f"{text} image{'s' if sum(n for _, n in counts) > 1 else ''}"
 
 
 def _cube_frames(
@@ -430,9 +431,6 @@ def _stacked(path: Path, size: tuple[int, int]) -> str:
     return f". It is {kind}: {REMEDIES[kind]}" if kind == OVER_UNDER else ""
 
 
-_CUBE_LAYOUTS = (6, 1), (1, 6), (3, 2), (2, 3), (4, 3), (3, 4)  # faces across and down a picture
-
-
 def _no_panorama(path: Path, header: Header, more: str = "") -> GsbaError:
     """The refusal of an image that is not 2:1."""
     (w, h) = header.size
@@ -441,23 +439,9 @@ def _no_panorama(path: Path, header: Header, more: str = "") -> GsbaError:
     what = ": remove that tag" if turned else more
     if abs(w - 2 * h) <= MAX_ROUNDING * w:
         what = f", and this is nearly so: if it is a whole panorama, scale it to {w}x{w // 2}"
-    elif any(w * down == h * across for across, down in _CUBE_LAYOUTS):
+    elif (w / h) in (6, 1 / 6, 3 / 2, 2 / 3, 4 / 3, 3 / 4):  # faces across and down a picture
         what += ". If it is a cube map, cut out its faces, as front/NAME.jpg and so on"
     return GsbaError(f"{path}: is {w}x{h}{why}; an equirectangular frame is 2:1{what}")
-
-
-def _warn_of_slots(folder: Path, last: str) -> None:
-    """stella_vslam gives every file of a folder a time slot, images or not."""
-    early = [
-        p.name for p in entries_of(folder) if p.is_file() and not is_image(p) and p.name < last
-    ]
-    if early:
-        _log.warning(
-            "--fps counts images only; if stella_vslam read this folder with '%s' in it, its times "
-            "are %d frames later",
-            early[0],
-            len(early),
-        )
 
 
 def _natural(name: str) -> tuple[list[tuple[str, int]], str]:

@@ -1,13 +1,10 @@
-"""Two fisheyes side by side in one picture, front left and back right: recognised, cut, unsqueezed.
-
-Pictures of 2:1 hold two square ones. In pictures of 16:9 some cameras squeeze these, so that image
-circles are ellipses; others leave them round, with rows to spare.
-"""
+"""Two fisheyes side by side in one picture, front left and back right: two square ones in 2:1; in
+16:9 squeezed ones, whose image circles are ellipses, or round ones with rows to spare."""
 
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import chain
+from itertools import tee
 from pathlib import Path
 
 import cv2
@@ -20,15 +17,11 @@ from gsba.types.records import spread_rows
 
 LOOKED_AT = 5  # pictures in which two image circles side by side are searched
 
-_SEARCH_WIDTH_PX = 512  # sufficient width of these pictures, pixels
-_MIN_PICTURES = 2  # least number of pictures that must show two circles
 _MAX_BLACK_LEVEL, _MIN_LIT_LEVEL = 32, 40  # grey levels: darkest around image circles; lit inside
 _MAX_GLOW_LEVEL = 110  # largest grey level of corners that a glowing housing lights
 _MAX_RELATIVE_GLOW = 0.75  # the largest level relative to the median inside the circles
 _OUTSIDE_RADIUS, _INSIDE_RADIUS = 0.58, 0.42  # radii in heights: beyond all circles, including
 # those of 200 degrees, which the frame cuts off; well inside of them
-_MIN_LIT_ROWS = 0.25  # least part of the rows with black corners in which circles are lit
-_MAX_RELATIVE_HEIGHT = 0.6  # largest height of a picture that is not 2:1, relative to its width
 _MAKERS = (
     (re.compile(r"360_\d+", re.IGNORECASE), "Samsung Gear 360"),
     (re.compile(r"R00\d+", re.IGNORECASE), "Ricoh Theta"),
@@ -48,7 +41,7 @@ class SideBySide:
 def may_hold_two(size: tuple[int, int]) -> bool:
     """True if pictures of this width and height may hold two fisheyes side by side."""
     width, height = size
-    return width % 2 == 0 and 0.5 * width <= height <= _MAX_RELATIVE_HEIGHT * width and height > 0
+    return width % 2 == 0 and 0.5 * width <= height <= 0.6 * width and height > 0
 
 
 def lens_sizes(size: tuple[int, int]) -> list[tuple[int, int]]:
@@ -71,16 +64,18 @@ def recognise(greys: Iterable[np.ndarray], size: tuple[int, int], where: Path) -
     """
     if not may_hold_two(size):
         return SideBySide(None)
-    taken: list[np.ndarray] = []
-    rest = iter(greys)
+    greys, again = tee(greys)
     lens_size = lens_sizes(size)[0]
     if size[0] == 2 * size[1]:
-        shown, notes = two_circles(_collected(rest, taken), where)
+        shown, notes = two_circles(greys, where)
         if shown or notes:
             return SideBySide(lens_size if shown else None, notes)
     looks = []
-    for grey in chain(taken, rest):
-        if _corners_lit(grey):
+    for grey in again:
+        radii = _radii(grey.shape)
+        around = float(np.percentile(grey[radii > _OUTSIDE_RADIUS], 90))
+        inside = float(np.median(grey[radii < _INSIDE_RADIUS]))
+        if around >= min(_MAX_GLOW_LEVEL, max(_MAX_RELATIVE_GLOW * inside, _MAX_BLACK_LEVEL)):
             return SideBySide(None)
         looks.append(grey)
     return _by_circles(looks, size, where) if looks else SideBySide(None)
@@ -101,10 +96,10 @@ def two_circles(greys: Iterable[np.ndarray], where: Path) -> tuple[bool, tuple[s
         corners_black, rows = _circle_evidence(grey)
         if not corners_black:
             return False, ()
-        seen, lit = seen + 1, lit + (rows >= _MIN_LIT_ROWS)
+        seen, lit = seen + 1, lit + (rows >= 0.25)
     if not seen:
         return False, ()
-    if lit < min(_MIN_PICTURES, seen):
+    if lit < min(2, seen):  # pictures must show two circles
         return False, (f"{where}: black corners, but around no circles: read as a panorama",)
     note = (
         f"{where}: raw, two fisheyes side by side, front left and back right: corners black "
@@ -197,18 +192,12 @@ def _by_circles(looks: Sequence[np.ndarray], size: tuple[int, int], where: Path)
     return SideBySide(best, (note + squeezed,))
 
 
-def _collected(greys: Iterator[np.ndarray], taken: list[np.ndarray]) -> Iterator[np.ndarray]:
-    for grey in greys:
-        taken.append(grey)
-        yield grey
-
-
 def readable(paths: Iterable[Path], size: tuple[int, int]) -> Iterator[np.ndarray]:
     """Grey pictures, small ones where that is fast; damaged ones are skipped here and refused
     later."""
     for path in paths:
         try:
-            yield decode(path, size, gray=True, at_least=_SEARCH_WIDTH_PX)
+            yield decode(path, size, gray=True, at_least=512)
         except GsbaError:
             continue
 
@@ -219,14 +208,6 @@ def _radii(shape: tuple[int, ...]) -> np.ndarray:
     v, u = np.ogrid[:height, :width]
     side = width / 2
     return np.hypot(np.mod(u + 0.5, side) / side - 0.5, (v + 0.5) / height - 0.5)
-
-
-def _corners_lit(grey: np.ndarray) -> bool:
-    """True if a picture (h, w) uint8 is brighter around image circles than a glowing housing."""
-    radii = _radii(grey.shape)
-    around = float(np.percentile(grey[radii > _OUTSIDE_RADIUS], 90))
-    inside = float(np.median(grey[radii < _INSIDE_RADIUS]))
-    return around >= min(_MAX_GLOW_LEVEL, max(_MAX_RELATIVE_GLOW * inside, _MAX_BLACK_LEVEL))
 
 
 def _circle_evidence(grey: np.ndarray) -> tuple[bool, float]:

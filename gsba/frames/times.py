@@ -14,8 +14,6 @@ from gsba.log import GsbaError, brief, track
 
 _log = logging.getLogger(__name__)
 
-# Whole numbers that are Unix times between 2001 and 2100, by unit: ticks per second.
-_UNIX_RANGE_S = (1_000_000_000, 4_102_444_800)
 _TICKS_PER_SECOND = {
     "seconds": 1,
     "milliseconds": 10**3,
@@ -23,7 +21,6 @@ _TICKS_PER_SECOND = {
     "nanoseconds": 10**9,
 }
 
-_MAX_TIME_S = 1e20  # upper bound; even nanoseconds since 1970 read as seconds are below
 _FPS_RANGE = (1e-6, 1e6)  # range of --fps, frames per second
 _MIN_INTERVAL_S = 1e-3  # frame intervals shorter than this are numbering, not times
 _ADVICE = "pass --timestamps FILE or --fps F, or put a timestamps.csv (name,timestamp) beside them"
@@ -44,11 +41,8 @@ class TimeRow:
 
 
 def read_lines(path: Path) -> list[tuple[int, str]]:
-    """Numbered lines of a text file without blank lines and # comments.
-
-    Raises:
-        GsbaError: the file is missing, unreadable or not text.
-    """
+    """Numbered lines of a text file without blank lines and # comments. Raises GsbaError: the file
+    is missing, unreadable or not text."""
     try:
         if path.is_dir() or path.is_char_device() or path.is_block_device():
             raise GsbaError(f"{path}: is a folder or a device; give a text file")
@@ -69,7 +63,8 @@ def seconds(text: str) -> float:
     """
     unit = unix_unit(text)
     value = int(text) / _TICKS_PER_SECOND[unit] if unit else float(text)
-    if not abs(value) <= _MAX_TIME_S:
+    # even nanoseconds since 1970, read as seconds, are below
+    if not abs(value) <= 1e20:
         raise ValueError(text)
     return value
 
@@ -78,17 +73,15 @@ def unix_unit(text: str) -> str | None:
     """Unit in which a whole number is a Unix time of this century; None if in none."""
     if not re.fullmatch(r"[0-9]+", text):
         return None
-    low, high = _UNIX_RANGE_S
+    low, high = 1_000_000_000, 4_102_444_800  # Unix times between 2001 and 2100
     return next((u for u, t in _TICKS_PER_SECOND.items() if low * t <= int(text) < high * t), None)
 
 
 def read_times(path: Path) -> list[TimeRow]:
     """Rows of a table of times: `name,timestamp`, `timestamp name`, or one timestamp a line.
 
-    A header is optional. Columns are separated by commas or blanks.
-
-    Raises:
-        GsbaError: a line is malformed; the message names it.
+    A header is optional. Columns are separated by commas or blanks. Raises GsbaError: a line is
+    malformed; the message names it.
     """
     lines = read_lines(path)
     rows = [
@@ -157,7 +150,21 @@ def frame_times(
                     "order, or name,timestamp rows"
                 )
             return np.array([row.timestamp for row in rows]), True
-        return _times_by_name(names, table, rows), True
+        by_name: dict[str, float] = {}
+        for row in rows:
+            name = stem_of(row.name or "")
+            if name in by_name:
+                raise GsbaError(f"{table}:{row.line}: a second time for frame '{name}'")
+            by_name[name] = row.timestamp
+        missing = [name for name in names if name not in by_name]
+        if missing:
+            raise GsbaError(
+                f"{table}: no time for frame '{missing[0]}' "
+                f"({len(missing)} of {len(names)} missing)"
+            )
+        if len(by_name) > len(names):
+            _log.info("%s: %d rows name no frame here", table, len(by_name) - len(names))
+        return np.array([by_name[name] for name in names]), True
     try:
         if fps is not None:
             given = _times_at_rate(names, check_fps(fps))
@@ -174,34 +181,14 @@ def frame_times(
 
 
 def check_fps(fps: float) -> float:
-    """The frame rate, if it is valid.
-
-    Raises:
-        GsbaError: the rate is not positive, or no camera has it.
-    """
+    """The frame rate, if it is valid. Raises GsbaError: the rate is not positive, or no camera has
+    it."""
     if not _FPS_RANGE[0] <= fps <= _FPS_RANGE[1]:
         raise GsbaError(
             f"--fps {fps}: must be a positive number of frames per second, from "
             f"{_FPS_RANGE[0]:g} to {_FPS_RANGE[1]:g}"
         )
     return fps
-
-
-def _times_by_name(names: Sequence[str], path: Path, rows: list[TimeRow]) -> np.ndarray:
-    by_name: dict[str, float] = {}
-    for row in rows:
-        name = stem_of(row.name or "")
-        if name in by_name:
-            raise GsbaError(f"{path}:{row.line}: a second time for frame '{name}'")
-        by_name[name] = row.timestamp
-    missing = [name for name in names if name not in by_name]
-    if missing:
-        raise GsbaError(
-            f"{path}: no time for frame '{missing[0]}' ({len(missing)} of {len(names)} missing)"
-        )
-    if len(by_name) > len(names):
-        _log.info("%s: %d rows name no frame here", path, len(by_name) - len(names))
-    return np.array([by_name[name] for name in names])
 
 
 def stem_of(name: str) -> str:

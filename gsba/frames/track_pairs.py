@@ -1,7 +1,4 @@
-"""Equi-angular cube maps on disk: two tracks of GoPro's MAX cameras, two pictures a frame.
-
-They are resampled once, directly into the result: a panorama here, faces in `cubemap`.
-"""
+"""Equi-angular cube maps on disk: two tracks of GoPro's MAX cameras, two pictures a frame."""
 
 import logging
 import re
@@ -29,10 +26,8 @@ from gsba.types import FACES, FrameSet
 _log = logging.getLogger(__name__)
 
 _FOLDER = re.compile(r"track(\d+)", re.IGNORECASE)
-_NUM_CHECKED_FRAMES = 5  # frames in which edges of squares are compared
 _MIN_CORRELATION = 0.5  # median correlation of grey values along edges shared by both tracks:
 # 0.95 and more on real frames, 0.2 and less on pictures of several instants
-_NUM_SEGMENTS = 64  # segments of an edge, whose mean grey values are compared
 _MIN_CONTRAST = 4.0  # least standard deviation of grey levels along an edge that is used
 
 
@@ -103,7 +98,17 @@ def track_size(folder: Path, pairs: Sequence[tuple[Path, ...]]) -> tuple[int, in
         "%s: GoPro's equi-angular cube map, two tracks of %dx%d, %d columns from both lenses",
         folder, width, height, overlap_of(width, height),
     )  # fmt: skip
-    _check_edges(folder, pairs, (width, height))
+    # Refuse tracks whose grey values on both sides of common edges are not correlated
+    size = (width, height)
+    rows = np.unique(np.linspace(0, len(pairs) - 1, 5).astype(int))
+    found = [_edge_correlations(_decoded(pairs[row], size, gray=True)) for row in rows]
+    known = np.concatenate(found)
+    if len(known) and np.median(known) < _MIN_CORRELATION:
+        raise GsbaError(
+            f"{folder}: squares of {pairs[0][0].parent.name} and {pairs[0][1].parent.name} do not "
+            f"meet at their edges (correlation {np.median(known):.2f}): their pictures are not of "
+            "the same instants, or not of GoPro's equi-angular layout; extract both tracks again"
+        )
     return width, height
 
 
@@ -132,19 +137,6 @@ def _decoded(paths: Sequence[Path], size: tuple[int, int], gray: bool) -> np.nda
     return squares((first, second))
 
 
-def _check_edges(folder: Path, pairs: Sequence[tuple[Path, ...]], size: tuple[int, int]) -> None:
-    """Refuse tracks whose grey values on both sides of common edges are not correlated."""
-    rows = np.unique(np.linspace(0, len(pairs) - 1, _NUM_CHECKED_FRAMES).astype(int))
-    found = [_edge_correlations(_decoded(pairs[row], size, gray=True)) for row in rows]
-    known = np.concatenate(found)
-    if len(known) and np.median(known) < _MIN_CORRELATION:
-        raise GsbaError(
-            f"{folder}: squares of {pairs[0][0].parent.name} and {pairs[0][1].parent.name} do not "
-            f"meet at their edges (correlation {np.median(known):.2f}): their pictures are not of "
-            "the same instants, or not of GoPro's equi-angular layout; extract both tracks again"
-        )
-
-
 @table(maxsize=2)
 def _maps(grid: Grid, width: int) -> np.ndarray:
     """Places (2, width / 2, width) float32 of a panorama's pixels in a grid, OpenCV pixels."""
@@ -169,7 +161,7 @@ def _edge_correlations(faces: np.ndarray) -> np.ndarray:
             inner = np.clip(beyond, 0, size - 1).astype(int)
             there = np.clip(pixels, 0, size - 1).astype(int)
             sides = faces[n, inner[:, 1], inner[:, 0]], faces[others, there[:, 1], there[:, 0]]
-            parts = [np.array_split(values, min(_NUM_SEGMENTS, size)) for values in sides]
+            parts = [np.array_split(values, min(64, size)) for values in sides]
             a, b = ([part.mean() for part in side] for side in parts)
             if min(np.std(a), np.std(b)) > _MIN_CONTRAST:
                 found.append(np.corrcoef(a, b)[0, 1])

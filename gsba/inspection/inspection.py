@@ -34,17 +34,14 @@ class Inspection:
 
 
 def inspect(path: Path) -> Inspection:
-    """Collect facts about a video, an image or a folder of images.
-
-    Raises:
-        GsbaError: there is no such file or folder, or it is none of these.
-    """
+    """Collect facts about a video, an image or a folder of images. Raises GsbaError: there is no
+    such file or folder, or it is none of these."""
     if path.is_dir():
         found = pictures.of_folder(path)
     elif video.is_video(path):
         found = footage.of_video(path)
     elif is_image(path):
-        found = pictures.of_picture(path)
+        found = pictures.of_picture(path)  # which alone cannot be refined
     elif path.exists():
         raise GsbaError(f"{path} is no video, image or folder of images")
     else:

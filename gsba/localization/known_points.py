@@ -18,8 +18,6 @@ _FAMILY = "known_points"
 GATE_SIGMAS = 3.5  # of an inlier's residual
 COARSE = (8.0,)  # scales of the loss, round by round, standard deviations, of a first fit
 FINE = (2.0, 1.0)  # of the last one
-_KNOWN_NOISE = 2.0  # scale of the loss from which on residuals tell of the noise
-_MEDIAN_OF_SQUARES = 1.3863  # of a chi-square distribution with two degrees of freedom
 _MAX_POSITION_SIGMA = 0.05  # of a determined position, in median distances of points
 _MIN_NOISE = 0.5  # of keypoints, in their own standard deviations
 _SOLVER = SolverSettings(max_iterations=20, relative_tolerance=1e-5, absolute_tolerance=1e-2)
@@ -35,9 +33,8 @@ def isotropic(sigmas: np.ndarray) -> np.ndarray:
     return sigmas[:, None, None] ** 2 * np.eye(2)
 
 
-def num_parameters(projection: Projection) -> int:
-    """Number of a projection's parameters."""
-    return sum(parameter.size for parameter in projection.parameters())
+def _no_step(projection: Projection) -> np.ndarray:
+    return np.zeros(sum(parameter.size for parameter in projection.parameters()))
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +108,7 @@ class KnownPointBlock:
         self._pictures, self._loss = tuple(pictures), loss
         # Cameras at accepted values, and these: steps lead on from there.
         self._projections: list[Projection] = list(projections)
-        self._at = [np.zeros(num_parameters(one)) for one in projections]
+        self._at = [_no_step(one) for one in projections]
         self._roots: list[np.ndarray] = []  # (N, 2, 2) inverse square root of each covariance
         self.keys: list[int] = [X(p) for p in range(len(pictures))]
         self.keys += [K(c) for c in range(len(projections))]
@@ -164,13 +161,12 @@ class KnownPointBlock:
 
     def costs(self, values: gtsam.Values) -> dict[str, float]:
         """Cost, under the noise of the accepted values."""
-        squares = [np.sum(self._whitened(p, values)[0] ** 2, axis=1) for p in self._numbers()]
-        return {_FAMILY: float(sum(self._loss.rho(part).sum() for part in squares))}
+        return {_FAMILY: float(sum(self._loss.rho(part).sum() for part in self._squares(values)))}
 
     def squared_residuals(self, values: gtsam.Values) -> list[np.ndarray]:
         """Squared whitened residuals (N,) of each picture."""
         self.refresh(values)
-        return [np.sum(self._whitened(p, values)[0] ** 2, axis=1) for p in self._numbers()]
+        return self._squares(values)
 
     def projections(self, values: gtsam.Values) -> list[Projection]:
         """Projections (C) of the cameras."""
@@ -180,8 +176,10 @@ class KnownPointBlock:
         step = values.atVector(K(camera)) - self._at[camera]
         return self._projections[camera].stepped(step)
 
-    def _numbers(self) -> range:
-        return range(len(self._pictures))
+    def _squares(self, values: gtsam.Values) -> list[np.ndarray]:
+        return [
+            np.sum(self._whitened(p, values)[0] ** 2, axis=1) for p in range(len(self._pictures))
+        ]
 
     def _residuals(self, picture: int, values: gtsam.Values) -> Residuals:
         seen = self._pictures[picture]
@@ -233,7 +231,7 @@ def fit(
     for p, start in enumerate(starts):
         values.insert(X(p), gtsam.Pose3(start))
     for c, (projection, prior) in enumerate(zip(projections, priors, strict=True)):
-        values.insert(K(c), np.zeros(num_parameters(projection)))
+        values.insert(K(c), _no_step(projection))
         noise = gtsam.noiseModel.Diagonal.Sigmas(prior.sigmas)
         graph.push_back(gtsam.PriorFactorVector(K(c), prior.step, noise))
     noises = np.ones(len(pictures))
@@ -241,7 +239,8 @@ def fit(
         block = _block(pictures, noises, projections, scale)
         values = optimize(graph, values, [block], _SOLVER).values
         squares = block.squared_residuals(values)
-        if scale <= _KNOWN_NOISE:
+        # from this scale on, residuals tell of the noise
+        if scale <= 2.0:
             noises = np.array([_rescaled(*pair) for pair in zip(noises, squares, strict=True)])
     squares = _block(pictures, noises, projections, scales[-1]).squared_residuals(values)
     inliers = tuple(part < GATE_SIGMAS**2 for part in squares)
@@ -288,4 +287,5 @@ def _rescaled(noise: float, squares: np.ndarray) -> float:
     near = squares[squares < GATE_SIGMAS**2]
     if not len(near):
         return noise
-    return max(noise * float(np.sqrt(np.median(near) / _MEDIAN_OF_SQUARES)), _MIN_NOISE)
+    # Median of a chi-square distribution with two degrees of freedom: 1.3863.
+    return max(noise * float(np.sqrt(np.median(near) / 1.3863)), _MIN_NOISE)

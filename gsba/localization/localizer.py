@@ -12,7 +12,6 @@ from gsba.camera.cameras import Cameras
 from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.camera.rig import CubeRig, owner_faces
 from gsba.camera.sphere import dense_enough
-from gsba.config import RefineSettings
 from gsba.features.detection import extract, gather, search_settings
 from gsba.frames import cubemap
 from gsba.frames.files import image_size
@@ -31,19 +30,17 @@ from gsba.localization.known_points import (
 from gsba.localization.patch_sightings import PatchAligner
 from gsba.localization.picture_cameras import PictureCameras
 from gsba.localization.pictures import load_panorama
-from gsba.localization.place_index import open_index
+from gsba.localization.place_index import PlaceIndex, index_path, load_or_make, make_index
 from gsba.localization.pose_search import Candidates, is_significant, search_poses
 from gsba.localization.rival_poses import PlacedPose, best_of
 from gsba.localization.run_map import Query, RunMap, without_correction
 from gsba.localization.surroundings import Surroundings, open_rates
 from gsba.log import GsbaError
 from gsba.matching.guided_search import Gate, match_pair, searchable
-from gsba.types import Features, FrameSet, Keypoints, PictureFormat
+from gsba.types import Features, FrameSet, Keypoints
 from gsba.types.records import with_rows
 
 _NUM_PLACES = 5  # keyframes that look most like a frame
-_NUM_MORE_PLACES = 16  # where these do not suffice
-_NUM_POSES = 5  # poses that are compared
 NUM_NEAREST = 10  # keyframes whose points are searched along predicted bearings
 _MAX_FACE_PX = 288  # across the faces on which keypoints of panoramas are found: they serve to find
 # the place, and cost in proportion to the area
@@ -107,12 +104,19 @@ class Localizer:
         camera_of: str | None = None,
     ) -> None:
         self.map = RunMap.open(Path(run), map_number)
-        self.index = open_index(self.map)
+        path = index_path(self.map.root)
+        self.index = load_or_make(self.map, path, PlaceIndex, lambda: make_index(self.map))
         self.extractor = self.map.make_extractor()
         self.cameras = PictureCameras.of(self.map.root, self.map.frames, camera_of)
         self._precise = precise
         self.surroundings = Surroundings(self.map)
-        rigs = [_rig_for(kind, self.map.settings) for kind in self.map.frames.formats]
+        rigs = [cubemap.rig_for(kind, self.map.settings.cubemap) for kind in self.cameras.formats]
+        rigs = [
+            CubeRig(_MAX_FACE_PX, rig.hfov_rad)
+            if kind.panoramic and rig.size > _MAX_FACE_PX
+            else rig
+            for kind, rig in zip(self.cameras.formats, rigs, strict=True)
+        ]
         self.usual = open_rates(self.surroundings, rigs, self._extract, self.query_of)
         self._rigs = [
             CubeRig(size, rig.hfov_rad)
@@ -172,18 +176,15 @@ class Localizer:
     def _localize_panorama(self, erp: np.ndarray, name: str, camera: int) -> LocalizedFrame:
         import cv2
 
+        def grey() -> Grey:
+            return fitted_to(cv2.cvtColor(erp, cv2.COLOR_RGB2GRAY), self.aligner.width), None
+
         rig, small = self._rigs[camera], erp
         width = dense_enough(erp.shape[1], rig.focal)
         if width < erp.shape[1]:
             small = cv2.resize(erp, (width, width // 2), interpolation=cv2.INTER_AREA)
         features = extract(cubemap.cut(small, rig), None, rig, self.extractor)
-        return self._localize_features(name, features, lambda: self._grey(erp), camera)
-
-    def _grey(self, erp: np.ndarray) -> Grey:
-        """Grey panorama of the aligner's width."""
-        import cv2
-
-        return fitted_to(cv2.cvtColor(erp, cv2.COLOR_RGB2GRAY), self.aligner.width), None
+        return self._localize_features(name, features, grey, camera)
 
     def _localize_features(
         self, name: str, features: Features, load: Callable[[], Grey], camera: int
@@ -197,12 +198,12 @@ class Localizer:
     def _recognise(self, name: str, query: Query, camera: int) -> LocalizedFrame:
         """A camera's frame at the place that explains it best of those that look like it."""
         settings, reason = self.map.settings, NO_PLACE
-        places = self.index.nearest_panoramas(query.all.descriptors, _NUM_MORE_PLACES)
+        places = self.index.nearest_panoramas(query.all.descriptors, 16)
         max_error = np.deg2rad(settings.verify.max_error_deg)
         frames, poses = list[LocalizedFrame](), list[PlacedPose]()
         for strongest, chosen in ((True, places[:_NUM_PLACES]), (False, places)):
             candidates = self.candidates_of(query, chosen, strongest)
-            for start in search_poses(candidates, max_error, settings.seed, _NUM_POSES):
+            for start in search_poses(candidates, max_error, settings.seed, 5):
                 frame, placed = self._placed(name, query, start.world_T_rig, camera)
                 if placed is None:
                     reason = frame.reason
@@ -384,14 +385,6 @@ class Localizer:
     def nearest_keyframe(self, world_T_rig: np.ndarray) -> str:
         """Name of the keyframe nearest to a pose (4, 4)."""
         return self.map.frames.names[int(self.map.nearest(world_T_rig, 1)[0])]
-
-
-def _rig_for(kind: PictureFormat, settings: RefineSettings) -> CubeRig:
-    """Faces on which keypoints of pictures of a camera are found."""
-    rig = cubemap.rig_for(kind, settings.cubemap)
-    return (
-        CubeRig(_MAX_FACE_PX, rig.hfov_rad) if kind.panoramic and rig.size > _MAX_FACE_PX else rig
-    )
 
 
 def typical_sigma(covariances: np.ndarray) -> float:

@@ -1,13 +1,12 @@
 """Files of localised pictures: trajectory, table of poses with covariances, JSON."""
 
-import csv
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gsba.disk import atomic_write, write_json
+from gsba.disk import write_csv, write_json
 from gsba.geometry import quaternion_from_rotation
 from gsba.localization.localizer import LocalizedFrame
 from gsba.localization.photo_localizer import LocalizedPhotos, PhotoCamera
@@ -29,10 +28,7 @@ def write_localized(
     two.
 
     Covariances are of the tangent [rotation (radians), translation (map units)] in the picture's
-    frame, given the map.
-
-    Raises:
-        GsbaError: the disk cannot be written.
+    frame, given the map. Raises GsbaError: the disk cannot be written.
     """
     frames, times = found.frames, [picture.time for picture in pictures]
     rows = [n for n, frame in enumerate(frames) if frame.found and frame.camera is None]
@@ -44,7 +40,24 @@ def write_localized(
     poses = np.array([frames[n].world_T_rig for n in order]).reshape(-1, 4, 4)
     folder.mkdir(parents=True, exist_ok=True)
     write_tum(folder / "trajectory.tum", Trajectory(stamps, poses))
-    _write_table(folder / "poses.csv", frames, times)
+    header = ["picture", "timestamp", "status", "reason", "camera"]
+    header += ["points", "noise_deg", "nearest_frame"]
+    header += ["tx", "ty", "tz", "qw", "qx", "qy", "qz"]
+    header += [f"cov_{_AXES[i]}_{_AXES[j]}" for i, j in zip(*_UPPER, strict=True)]
+    table = []
+    for frame, time in zip(frames, times, strict=True):
+        status = "localised" if frame.found else "refused"
+        camera = "" if frame.camera is None else frame.camera
+        row = [frame.name, repr(float(time)), status, frame.reason, camera]
+        numbers = [""] * (len(header) - len(row))
+        if frame.found:
+            pose = frame.world_T_rig
+            values = [*pose[:3, 3], *quaternion_from_rotation(pose[:3, :3])]
+            values += [*frame.covariance[_UPPER]]
+            numbers = [frame.num_points, f"{np.degrees(frame.noise_rad):.6g}"]
+            numbers += [frame.nearest, *(f"{value:.15g}" for value in values)]
+        table.append(row + numbers)
+    write_csv(folder / "poses.csv", header, table)
     content = {
         "gsba": __version__,
         "run": str(run.resolve()),
@@ -54,32 +67,6 @@ def write_localized(
         "cameras": [_camera_json(camera) for camera in found.cameras],
     }
     write_json(folder / "localized.json", content)
-
-
-def _write_table(path: Path, frames: Sequence[LocalizedFrame], times: Sequence[float]) -> None:
-    header = ["picture", "timestamp", "status", "reason", "camera"]
-    header += ["points", "noise_deg", "nearest_frame"]
-    header += ["tx", "ty", "tz", "qw", "qx", "qy", "qz"]
-    header += [f"cov_{_AXES[i]}_{_AXES[j]}" for i, j in zip(*_UPPER, strict=True)]
-
-    def write(temporary: Path) -> None:
-        with temporary.open("w", newline="", encoding="utf-8") as file:
-            table = csv.writer(file)
-            table.writerow(header)
-            for frame, time in zip(frames, times, strict=True):
-                status = "localised" if frame.found else "refused"
-                camera = "" if frame.camera is None else frame.camera
-                row = [frame.name, repr(float(time)), status, frame.reason, camera]
-                numbers = [""] * (len(header) - len(row))
-                if frame.found:
-                    pose = frame.world_T_rig
-                    values = [*pose[:3, 3], *quaternion_from_rotation(pose[:3, :3])]
-                    values += [*frame.covariance[_UPPER]]
-                    numbers = [frame.num_points, f"{np.degrees(frame.noise_rad):.6g}"]
-                    numbers += [frame.nearest, *(f"{value:.15g}" for value in values)]
-                table.writerow(row + numbers)
-
-    atomic_write(path, write)
 
 
 def _as_json(frame: LocalizedFrame, picture: Picture) -> dict[str, Any]:

@@ -42,9 +42,8 @@ from gsba.localization.pose_search import (
     MIN_RATIO,
     MIN_WITNESSES,
     Candidates,
-    is_rivalled,
+    are_apart,
     is_significant,
-    least_of_rival,
 )
 from gsba.localization.rival_poses import LOOK_ALIKE, TWO_PLACES
 from gsba.localization.run_map import Query
@@ -68,7 +67,6 @@ _ANNEALED = (32.0, *COARSE, *FINE)  # scales of the loss of the first guided fit
 # that a wall leaves open is far off for what is beside the wall
 _STIFF = 0.1  # share of the priors' standard deviations but the focal length's, in a first fit
 _CELLS_PER_SIDE = 64  # along 90 degrees: keypoints within one are one witness of a guided fit
-_NUM_PATCH_ROUNDS = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -255,8 +253,13 @@ def _recognise(
         return None, ""
     if not _plausible(photo.projection(found.focal)):
         return None, ""
-    if is_rivalled(found, search(~found.inliers, least_of_rival(found)), candidates):
-        return None, TWO_PLACES
+    # A pose must outweigh the best one at another place by half, of the candidates left over.
+    rival = search(~found.inliers, max(MIN_WITNESSES, int(found.inliers.sum() / 1.5)))
+    if rival is not None:
+        offsets = candidates.points_world[found.inliers] - found.world_T_rig[:3, 3]
+        depth = float(np.median(np.linalg.norm(offsets, axis=1)))
+        if are_apart(found.world_T_rig, rival.world_T_rig, depth):
+            return None, TWO_PLACES
     start = photo.projection(found.focal)
     agreeing = with_rows(candidates, found.inliers)
     every = projection.project(features.bearings_rig)
@@ -301,7 +304,7 @@ def _fit_together(
         return fit(seen, poses, FINE, starts, beliefs)
 
     fitted = solve(pictures)
-    for _ in range(_NUM_PATCH_ROUNDS):
+    for _ in range(2):
         poses, starts = fitted.world_T_rigs, [_perspective(one) for one in fitted.projections]
         pictures = [
             _on_patches(localizer, one, pose, starts[c], seen)
@@ -341,8 +344,7 @@ def _on_patches(
     places = localizer.map.nearest(world_T_camera, NUM_NEAREST)
     expected = aligner.expected(world_T_camera, places).shown_by(projection, world_T_camera, map_)
     image = SphereImage.of(grey, smooth=True)
-    nothing = SphereField.none(), ONE_CENTRE  # of a photo
-    found = aligner.align(expected, world_T_camera, image, mask, *nothing)
+    found = aligner.align(expected, world_T_camera, image, mask, SphereField.none(), ONE_CENTRE)
     if len(found.points) < _MIN_POINTS:
         return before
     pixels = projection.project(found.bearings)

@@ -16,13 +16,8 @@ from gsba.geometry import unit
 from gsba.log import GsbaError
 from gsba.types import FACES, Features
 
-_FILM_DIAGONAL_MM = float(np.hypot(36.0, 24.0))  # of 35 mm film
 _MAX_FIELD_RAD = np.deg2rad(170.0)  # across a photo's diagonal by its tags
-_EXIF_FOCAL_SIGMA = 0.05  # relative: makers round to millimetres, and crop what they film
-_UNKNOWN_FOCAL_SIGMA = 0.5  # relative
 _PRINCIPAL_SIGMA = 0.01  # in focal lengths
-_RADIAL_SIGMAS = (0.1, 0.05)
-_MAX_DENSITY = 2.0  # of faces cut from photos, in pixel densities of the run's faces
 _MIN_SLOPE = (
     0.1  # of the radius by the angle, focal lengths: beyond it distortion folds the picture
 )
@@ -51,8 +46,9 @@ class Photo:
 
     def prior_sigmas(self) -> np.ndarray:
         """Standard deviations (5,) of the prior on the projection's parameters."""
-        focal = _UNKNOWN_FOCAL_SIGMA if self.focal is None else _EXIF_FOCAL_SIGMA
-        return np.array([focal, _PRINCIPAL_SIGMA, _PRINCIPAL_SIGMA, *_RADIAL_SIGMAS])
+        # Makers round focal lengths to millimetres, and crop what they film.
+        focal = 0.5 if self.focal is None else 0.05
+        return np.array([focal, _PRINCIPAL_SIGMA, _PRINCIPAL_SIGMA, 0.1, 0.05])
 
 
 def read_photo(path: Path) -> Photo:
@@ -66,7 +62,7 @@ def read_photo(path: Path) -> Photo:
         return Photo(path.stem, path, width, height, None, str(path))
     focal = None
     if np.isfinite(tags.focal_35mm):
-        pixels = tags.focal_35mm / _FILM_DIAGONAL_MM * float(np.hypot(width, height))
+        pixels = tags.focal_35mm / float(np.hypot(36.0, 24.0)) * float(np.hypot(width, height))
         if 2 * np.arctan(np.hypot(width, height) / 2 / pixels) < _MAX_FIELD_RAD:
             focal = pixels
     known = tags.camera and focal is not None
@@ -75,8 +71,9 @@ def read_photo(path: Path) -> Photo:
 
 
 def photo_rig(projection: PerspectiveProjection, rig: CubeRig) -> CubeRig:
-    """Faces for a photo: as dense as it, between one and `_MAX_DENSITY` times the run's."""
-    density = min(max(projection.focal / rig.focal, 1.0), _MAX_DENSITY)
+    """Faces for a photo: as dense as it, between one and two times the run's."""
+    # in pixel densities of the run's faces
+    density = min(max(projection.focal / rig.focal, 1.0), 2.0)
     return CubeRig(round(density * rig.size), rig.hfov_rad)
 
 
@@ -132,19 +129,15 @@ def _pixels_of(
     pixels = projection.project(np.where(ahead[..., None], bearings, [0.0, 0.0, 1.0]))
     size = np.array([projection.width, projection.height])
     inside = ahead & (pixels > _MARGIN_PX).all(axis=-1) & (pixels < size - _MARGIN_PX).all(axis=-1)
-    inside &= bearings[..., 2] > np.cos(_field_rad(projection))
-    return np.where(inside[..., None], pixels, 0.0), inside
-
-
-def _field_rad(projection: PerspectiveProjection) -> float:
-    """Angle from the axis up to which distortion carries rays outward, and into the picture."""
+    # Angle from the axis up to which distortion carries rays outward, and into the picture
     angles = np.linspace(0, _MAX_FIELD_RAD / 2, 500)
     radii, slopes = projection.radii(angles)
     size, middle = (projection.width, projection.height), np.array(projection.principal)
     corners = np.array([[0.0, 0], [size[0], 0], [0, size[1]], size]) - middle
     furthest = float(np.linalg.norm(corners, axis=1).max()) / projection.focal
     shown = np.logical_and.accumulate((slopes > _MIN_SLOPE) & (radii <= furthest))
-    return float(angles[shown].max(initial=0.0)) + angles[1]
+    inside &= bearings[..., 2] > np.cos(float(angles[shown].max(initial=0.0)) + angles[1])
+    return np.where(inside[..., None], pixels, 0.0), inside
 
 
 def _as_dense_as(

@@ -1,6 +1,6 @@
 """The camera of a new picture, of those that a run has: told by its layout and size."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -41,36 +41,32 @@ class PictureCameras:
             file = root / (f"calibration@{first[number]}.json" if several else _CALIBRATION)
             names.append(name if several else "")
             files.append(file if file.is_file() else None)
-        chosen = None if recording is None else _camera_of(root, frames, recording)
+        chosen = None
+        if recording is not None:
+            rows = frames.recordings.get(recording)
+            if rows is None:
+                known = ", ".join(frames.recordings) or "one recording alone"
+                raise GsbaError(
+                    f"{root} has no recording '{recording}' in this map: it has {known}"
+                )
+            chosen = int(frames.cameras[rows[0]])
         return cls(frames.formats, tuple(names), tuple(files), chosen)
 
     def layouts(self) -> set[str]:
         """Layouts that pictures may have, see `PictureFormat`."""
-        return {self.formats[c].layout for c in self._those(lambda kind: True)}
+        return {self.formats[c].layout for c in self.those(lambda kind: True)}
 
     def of_panorama(self, width: int, height: int, name: str) -> int:
         """Camera of a stitched panorama: that of its size, pixels, or the only one of stitched
         panoramas; GsbaError if it can be of several."""
-        stitched = self._those(lambda kind: kind.layout == "erp") or range(len(self.formats))
+        stitched = self.those(lambda kind: kind.layout == "erp") or range(len(self.formats))
         alike = [c for c in stitched if self.formats[c].width == width]
         return self._only(alike or list(stitched), f"{name}: is {width}x{height}")
-
-    def has_panoramas(self, width: int, height: int) -> bool:
-        """True if a camera's stitched panoramas have this size."""
-        return bool(
-            self._those(
-                lambda kind: (kind.layout, kind.width, kind.height) == ("erp", width, height)
-            )
-        )
-
-    def has_raw_lenses(self, sizes: Sequence[tuple[int, int]]) -> bool:
-        """True if pictures of a camera's raw lenses have one of these sizes, pixels."""
-        return bool(self._those(lambda kind: not set(_sizes(kind)).isdisjoint(sizes)))
 
     def of_raw(self, read: Mapping[int, PictureFormat], name: str) -> int:
         """Camera of raw fisheyes, of those whose calibrations can read them (with the formats
         read): that of their size; GsbaError if they can be of several."""
-        alike = [c for c, kind in read.items() if _sizes(kind) == _sizes(self.formats[c])]
+        alike = [c for c, kind in read.items() if raw_sizes(kind) == raw_sizes(self.formats[c])]
         return self._only(alike or list(read), f"{name}: holds raw fisheyes")
 
     def of_frames(self, kind: PictureFormat, name: str) -> int:
@@ -78,17 +74,17 @@ class PictureCameras:
         can be of several, or of none."""
         if len(self.formats) == 1:
             return 0
-        size = kind.width, kind.height, kind.tracks, _sizes(kind)
-        alike = self._those(
+        size = kind.width, kind.height, kind.tracks, raw_sizes(kind)
+        alike = self.those(
             lambda one: (
                 one.layout == kind.layout
-                and (one.width, one.height, one.tracks, _sizes(one)) == size
+                and (one.width, one.height, one.tracks, raw_sizes(one)) == size
             )
         )
         told = f"{name}: holds frames of layout {kind.layout} and {kind.width}x{kind.height}"
         return self._only(alike, told)
 
-    def _those(self, fits: Callable[[PictureFormat], bool]) -> list[int]:
+    def those(self, fits: Callable[[PictureFormat], bool]) -> list[int]:
         """Cameras that pictures may be of, whose format fits."""
         each = enumerate(self.formats)
         return [c for c, kind in each if self.chosen in (None, c) and fits(kind)]
@@ -110,14 +106,6 @@ class PictureCameras:
         )
 
 
-def _sizes(kind: PictureFormat) -> tuple[tuple[int, int], ...]:
+def raw_sizes(kind: PictureFormat) -> tuple[tuple[int, int], ...]:
     """Width and height of the picture of each raw lens."""
     return tuple((lens.width, lens.height) for lens in kind.fisheyes or ())
-
-
-def _camera_of(root: Path, frames: FrameSet, recording: str) -> int:
-    rows = frames.recordings.get(recording)
-    if rows is None:
-        known = ", ".join(frames.recordings) or "one recording alone"
-        raise GsbaError(f"{root} has no recording '{recording}' in this map: it has {known}")
-    return int(frames.cameras[rows[0]])

@@ -13,11 +13,9 @@ from gsba.frames.files import decode, image_size, is_image
 from gsba.frames.scan import scan
 from gsba.frames.side_by_side import lens_sizes
 from gsba.frames.times import frame_times
-from gsba.localization.picture_cameras import PictureCameras
+from gsba.localization.picture_cameras import PictureCameras, raw_sizes
 from gsba.log import GsbaError
 from gsba.types import FrameSet
-
-_TIMES_FILE = "timestamps.csv"
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +43,6 @@ def load_panorama(path: Path, at_least: int) -> np.ndarray:
 def find_pictures(sources: Sequence[Path], cameras: PictureCameras, work: Path) -> list[Picture]:
     """The pictures of files, folders and videos (one frame a second, in `work`), in this order;
     GsbaError for a source that holds none, frames of no camera of the run, or two of one name."""
-    layouts = cameras.layouts()
     found: list[Picture] = []
     for number, source in enumerate(sources):
         if not source.exists():
@@ -57,7 +54,7 @@ def find_pictures(sources: Sequence[Path], cameras: PictureCameras, work: Path) 
         if source.is_dir() and not _is_of_single_images(source, cameras):
             found += _frames_of_several_images(source, cameras)
         else:
-            found += _single_images(source, "erp" in layouts)
+            found += _single_images(source, "erp" in cameras.layouts())
     for name, count in Counter(picture.name for picture in found).items():
         if count > 1:
             raise GsbaError(f"two pictures are named '{name}': localise them in two calls")
@@ -77,9 +74,10 @@ def _is_of_single_images(folder: Path, cameras: PictureCameras) -> bool:
     if not images or layouts.isdisjoint(("erp", "cube")):
         return False
     size = image_size(images[0])
-    if not cameras.has_raw_lenses(lens_sizes(size)):
+    sizes = lens_sizes(size)
+    if not cameras.those(lambda kind: not set(raw_sizes(kind)).isdisjoint(sizes)):
         return True
-    if not cameras.has_panoramas(*size):
+    if not cameras.those(lambda kind: (kind.layout, kind.width, kind.height) == ("erp", *size)):
         return False
     return scan(folder, order_suffices=True, min_frames=1).format.layout == "erp"
 
@@ -97,7 +95,7 @@ def _single_images(source: Path, stitched: bool) -> list[Picture]:
     paths = _images(source)
     if not paths:
         raise GsbaError(f"{source}: holds no JPEG, PNG, WebP or TIFF image")
-    names, table = [path.stem for path in paths], source / _TIMES_FILE
+    names, table = [path.stem for path in paths], source / "timestamps.csv"
     given = table if table.is_file() else None
     tagged = [(path,) for path in paths] if all(map(_size_of, paths)) else []
     times, _ = frame_times(names, given, None, True, tagged)
@@ -114,19 +112,8 @@ def _size_of(path: Path) -> tuple[int, int] | None:
 
 
 def _frames_of_several_images(folder: Path, cameras: PictureCameras) -> list[Picture]:
-    found = _scanned(folder, cameras)
-    camera = next(iter(found))
-    if len(found) > 1:
-        camera = cameras.of_raw({c: frames.format for c, frames in found.items()}, str(folder))
-    frames = found[camera]
-    times = frames.timestamps.tolist()
-    return [Picture(n, times[f], None, frames, f, camera) for f, n in enumerate(frames.names)]
-
-
-def _scanned(folder: Path, cameras: PictureCameras) -> dict[int, FrameSet]:
-    """Frames of a folder by camera: raw fisheyes by each calibration that reads them."""
     chosen, errors = cameras.chosen, list[GsbaError]()
-    found = dict[int, FrameSet]()
+    found = dict[int, FrameSet]()  # by camera: raw fisheyes by each calibration that reads them
     for camera, calibration in enumerate(cameras.calibrations):
         if calibration is None or chosen not in (None, camera):
             continue
@@ -135,9 +122,14 @@ def _scanned(folder: Path, cameras: PictureCameras) -> dict[int, FrameSet]:
             found[camera] = scan(folder, order_suffices=True, **given)
         except GsbaError as error:
             errors.append(error)
-    if found:
-        return found
-    if len(errors) == len(cameras.formats):  # nothing but raw fisheyes
-        raise errors[0]
-    frames = scan(folder, order_suffices=True, min_frames=1)
-    return {cameras.of_frames(frames.format, str(folder)): frames}
+    if not found:
+        if len(errors) == len(cameras.formats):  # nothing but raw fisheyes
+            raise errors[0]
+        frames = scan(folder, order_suffices=True, min_frames=1)
+        found = {cameras.of_frames(frames.format, str(folder)): frames}
+    camera = next(iter(found))
+    if len(found) > 1:
+        camera = cameras.of_raw({c: frames.format for c, frames in found.items()}, str(folder))
+    frames = found[camera]
+    times = frames.timestamps.tolist()
+    return [Picture(n, times[f], None, frames, f, camera) for f, n in enumerate(frames.names)]

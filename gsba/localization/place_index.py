@@ -51,11 +51,6 @@ class PlaceIndex:
         return _best(alike.max(axis=1), most)
 
 
-def open_index(map_: RunMap) -> PlaceIndex:
-    """The index of a map: the one kept beside the run if it is the run's, else made and kept."""
-    return load_or_make(map_, index_path(map_.root), PlaceIndex, lambda: _make(map_))
-
-
 def load_or_make(map_: RunMap, path: Path, kind: type[T], make: Callable[[], T]) -> T:
     """Load a record that depends on a map's run alone; make and save it if this run has none."""
     key = _key(map_)
@@ -84,7 +79,8 @@ def _key(map_: RunMap) -> str:
     return digest(__version__, FORMAT, info.get("key", ""), map_.frames.names, map_.settings.seed)
 
 
-def _make(map_: RunMap) -> PlaceIndex:
+def make_index(map_: RunMap) -> PlaceIndex:
+    """Global descriptors of the keyframes of a map."""
     num = len(map_.frames)
     frames = SearchableFrames(lambda f: map_.load_keyframe(f).features, axes=map_.axes)
     words = visual_words(frames, num, map_.settings.seed, Threads(1))

@@ -15,7 +15,6 @@ CELLS_PER_SIDE = 16  # along a face's side: keypoints within one, 6 degrees, are
 _MAX_FALSE_ALARMS = 1e-6  # expected number of poses that chance explains as well as an accepted one
 MIN_WITNESSES = 10  # fewer may be of one moving object
 _MIN_SHARE = 0.25  # of the first pose's inliers, that further poses must have
-_MIN_RIVAL_RATIO = 1.5  # ratio by which a pose must outweigh the best one at another place
 _RIVAL_DISTANCE = 0.3  # distance of another place, in median depths or radians
 
 
@@ -72,21 +71,6 @@ def is_significant(
     per_witness = 1 - (1 - min(chance, 0.5)) ** (len(bearings) / num)
     needed = least_agreeing(num, per_witness, sample, _MAX_FALSE_ALARMS)
     return agreeing >= max(needed, MIN_WITNESSES)
-
-
-def least_of_rival(found: FoundPose) -> int:
-    """Number of inliers from which another pose counts as a rival of one that was found."""
-    return max(MIN_WITNESSES, int(found.inliers.sum() / _MIN_RIVAL_RATIO))
-
-
-def is_rivalled(found: FoundPose, rival: FoundPose | None, candidates: Candidates) -> bool:
-    """True if candidates that a pose leaves over agree about as well on `rival`, at another
-    place."""
-    if rival is None:
-        return False
-    offsets = candidates.points_world[found.inliers] - found.world_T_rig[:3, 3]
-    depth = float(np.median(np.linalg.norm(offsets, axis=1)))
-    return are_apart(found.world_T_rig, rival.world_T_rig, depth)
 
 
 def are_apart(one: np.ndarray, other: np.ndarray, depth: float) -> bool:

@@ -38,13 +38,6 @@ class PlacedPose:
         depth = float(np.median(np.linalg.norm(points_world - world_T_rig[:3, 3], axis=1)))
         return cls(world_T_rig, depth, np.unique(cells_of(bearings, CELLS_PER_SIDE)), evidence)
 
-    def explains_more_than(self, other: "PlacedPose") -> bool:
-        """True if significantly more cells agree with this pose alone than with the other alone:
-        a sign test."""
-        common = len(np.intersect1d(self.cells, other.cells, assume_unique=True))
-        own, others = len(self.cells) - common, len(other.cells) - common
-        return own - others > _NUM_SIGMAS * np.sqrt(own + others)
-
 
 def best_of(poses: Sequence[PlacedPose]) -> tuple[int, str]:
     """The pose that most cells agree with, and why it is not accepted; "" = its surroundings
@@ -55,6 +48,9 @@ def best_of(poses: Sequence[PlacedPose]) -> tuple[int, str]:
         return best, LOOK_ALIKE
     for other in poses:
         apart = are_apart(one.world_T_rig, other.world_T_rig, one.depth)
-        if apart and not is_look_alike(other.evidence) and not one.explains_more_than(other):
+        common = len(np.intersect1d(one.cells, other.cells, assume_unique=True))
+        own, others = len(one.cells) - common, len(other.cells) - common
+        more = own - others > _NUM_SIGMAS * np.sqrt(own + others)  # a sign test
+        if apart and not is_look_alike(other.evidence) and not more:
             return best, TWO_PLACES
     return best, ""

@@ -28,7 +28,6 @@ from gsba.types.records import with_rows
 from gsba.version import __version__
 
 _STAGES = "features_closer", "features"  # that store keypoints of frames, the last one first
-_NUM_KEPT = 64  # keyframes kept in memory
 _SAME_PLACE_SIGMAS = 6.0  # largest angle between a keypoint and the observation of a point that is
 # taken for the keypoint's, standard deviations of the keypoint
 _SAME_PLACE_RAD = np.deg2rad(0.25)  # and largest such angle
@@ -128,7 +127,7 @@ class RunMap:
             strongest = searchable(kept, axes, settings.pairs.strongest_per_face)
             return MapKeyframe(kept, strongest, searchable(kept, axes), points, numbers)
 
-        load = lru_cache(_NUM_KEPT)(keyframe)
+        load = lru_cache(64)(keyframe)  # keyframes kept in memory
         known = rig, point_covariances(result), axes
         first_look = partial(features_of, stages=("features",))
         return cls(root, frames, result, cameras, fields, settings, *known, first_look, load)

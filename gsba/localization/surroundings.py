@@ -30,7 +30,6 @@ from gsba.matching.guided_search import Gate, match_pair
 from gsba.types import Features, FrameSet
 
 _NUM_NEAREST = 6  # keyframes whose points are expected in a picture
-_NUM_MEASURED = 16  # frames of a camera whose pictures are compared with the map
 _MIN_OTHERS = 2  # observers without which a point is not of a map that lacks one of its frames
 # Share in regions that show next to nothing of what is expected there: at least .41 where places
 # look alike, at most .30 at true poses beyond the ends of a map.
@@ -157,8 +156,8 @@ def open_rates(
 
 
 def _some(frames: np.ndarray) -> list[int]:
-    """At most `_NUM_MEASURED` of the frames (N,), evenly."""
-    chosen = np.linspace(0, len(frames) - 1, min(len(frames), _NUM_MEASURED)).astype(int)
+    """At most 16 of the frames (N,), evenly."""
+    chosen = np.linspace(0, len(frames) - 1, min(len(frames), 16)).astype(int)
     return [int(f) for f in frames[chosen]]
 
 

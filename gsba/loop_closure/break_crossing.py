@@ -18,8 +18,6 @@ MIN_AGREEING = 3  # least number of pairs
 _REACH = 4  # steps of the map before or after a break that tell how fast the camera moves
 # Slowest and fastest motion over a break, in the median of these steps: other bays are elsewhere.
 _MIN_PACES, _MAX_PACES = 0.5, 1.5
-_MAX_TURN_RAD = np.deg2rad(60.0)  # largest turn over a break
-_TRIED_PACES = 0.8, 0.9, 1.0, 1.1, 1.25  # lengths of a step over a break, in the usual one
 
 
 def crossing(
@@ -85,7 +83,8 @@ class Breaks:
             paces = np.linalg.norm(velocity) / np.linalg.norm(usual[0])
             if velocity @ usual[0] < 0 or not _MIN_PACES < paces < _MAX_PACES:
                 return False
-            if rotation_angle(last[:3, :3].T @ moved[:3, :3]) > _MAX_TURN_RAD:
+            # largest turn over a break
+            if rotation_angle(last[:3, :3].T @ moved[:3, :3]) > np.deg2rad(60.0):
                 return False
         return bool(self.steps)
 
@@ -102,7 +101,7 @@ class Breaks:
                 across = step - (step @ along) * along
                 found += [
                     replace(move, translation=move.translation + across + paces * expected - step)
-                    for paces in _TRIED_PACES
+                    for paces in (0.8, 0.9, 1.0, 1.1, 1.25)
                 ]
         return found
 

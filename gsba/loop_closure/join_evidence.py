@@ -17,10 +17,8 @@ from gsba.types import Matches
 
 LOCAL = 12  # frames to either side of a meeting that are compared
 WIDER = 36  # frames to either side if the LOCAL ones leave it open
-_MAX_DISTANCE_DEPTHS = 2.0  # largest distance of two compared frames, local depths
 _NUM_NEAREST = 3  # nearest frames that each frame is compared with
 _MAX_PAIRS = 150  # largest number of compared pairs of frames
-_TRIANGULATION_GAP = 2  # largest gap in frames between matches that make points
 GATE_RAD = np.deg2rad(4.0)  # radius around a point's predicted bearing
 _PLACE_RAD = np.deg2rad(0.7)  # radius in which most true matches lie; chance, and things that only
 # stand at similar places, spread them over the gate
@@ -48,11 +46,8 @@ _LOOK_ALIKE_PLACED = 0.4
 # Share in strange regions: .30 to .41 in Sponza, whose other side is an exact copy turned about and
 # all that is found is at its place; .11 at most under true joins, in another light, too.
 _LOOK_ALIKE_STRANGE = 0.2
-_MIN_SEEN_SHARE = 0.15  # of what is expected in a region at its place: less is next to nothing
-_MIN_EXPECTED = 2.0  # points that a region must be expected to show at their places
 _NUM_SIGMAS = 3.09  # standard deviations of a one-sided error rate of 1e-3
 NUM_SIGMAS_LIKELY = 1.64  # of 5 %
-_ABSENT_SHARE = 0.1  # share that counts as nothing found
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,8 +167,8 @@ class JoinEvidence:
 
     @property
     def absent(self) -> bool:
-        """True if significantly less than `_ABSENT_SHARE` is found again."""
-        return self.share + _NUM_SIGMAS * self.sigma < _ABSENT_SHARE
+        """True if significantly less than a tenth is found again."""
+        return self.share + _NUM_SIGMAS * self.sigma < 0.1
 
     def beats(self, other: "JoinEvidence") -> bool:
         """True if significantly more is at its place than under another join."""
@@ -300,9 +295,9 @@ def _share(excess: np.ndarray, expected: np.ndarray) -> tuple[float, float]:
 
 def _strange(worth: np.ndarray, expected: np.ndarray) -> float:
     """Share of what is expected, in regions that show next to nothing of it, from sums (R,)."""
-    judged = expected > _MIN_EXPECTED
+    judged = expected > 2.0
     total = float(expected[judged].sum())
-    strange = judged & (worth < _MIN_SEEN_SHARE * expected)
+    strange = judged & (worth < 0.15 * expected)  # less is next to nothing
     return float(expected[strange].sum()) / total if total else 0.0
 
 
@@ -319,11 +314,9 @@ def nearest_pairs(places: Places, one: np.ndarray, other: np.ndarray) -> np.ndar
     found = set[tuple[int, int]]()
     for some, others in ((one, other), (other, one)):
         for f in some.tolist():
-            apart = others[np.abs(others - f) > _TRIANGULATION_GAP] if some is others else others
+            apart = others[np.abs(others - f) > 2] if some is others else others
             distances = np.linalg.norm(positions[apart] - positions[f], axis=1)
-            close = np.flatnonzero(
-                distances < _MAX_DISTANCE_DEPTHS * np.fmin(depths[apart], depths[f])
-            )
+            close = np.flatnonzero(distances < 2.0 * np.fmin(depths[apart], depths[f]))
             nearest = close[np.argsort(distances[close], kind="stable")][:_NUM_NEAREST]
             found |= {pair for g in apart[nearest].tolist() for pair in ((f, g), (g, f))}
     pairs = np.array(sorted(found), np.int32).reshape(-1, 2)

@@ -21,7 +21,7 @@ from gsba.matching import recovery
 from gsba.matching.guided_search import MatchContext
 from gsba.memory import release_mapped_files
 from gsba.similarity import relative_similarity
-from gsba.types import Counts, Keypoints, Solution, Tracks, VerifiedPairs
+from gsba.types import Counts, Solution
 from gsba.types.records import slices
 
 logger = logging.getLogger(__name__)
@@ -41,7 +41,6 @@ _STEP_SIGMA_DEG, _STEP_SIGMA_LENGTHS = 0.2, 0.02
 _LOOP_SIGMA_DEG, _LOOP_SIGMA_LENGTHS = 0.3, 0.05
 # Rotation noise of a step without matches, whose position noise is its length.
 _UNSEEN_SIGMA_RAD = 0.5
-_INLIER_PROBABILITY = 0.99  # that a true loop is within its noise
 
 
 def path(
@@ -91,7 +90,7 @@ def affordable(
     parameters.setLossType(gtsam.GncLossType.TLS)
     parameters.setKnownInliers(list(range(chain)))
     solver = gtsam.GncLMOptimizer(graph, values, parameters)
-    solver.setInlierCostThresholdsAtProbability(_INLIER_PROBABILITY)
+    solver.setInlierCostThresholdsAtProbability(0.99)  # that a true loop is within its noise
     solver.optimize()
     return np.asarray(solver.getWeights())[chain:] > 0.5
 
@@ -143,11 +142,25 @@ def close(
     settings, keypoints = context.settings, context.keypoints
     num = len(solved.world_T_rigs)
     looks = global_descriptors(context.strongest, num, settings.seed, context.workers, scratch)
-    held = _sharing_points(solved.landmarks.tracks, num)
-    chosen = candidates(looks, solved, unseen, settings, held)
-    strongest = context.of_strongest()
-    verified = recovery.match_anywhere(strongest, chosen)
-    loops = _measured_loops(verified, keypoints, solved, settings.seed)
+    # Frames that see `_ENOUGH_POINTS` or more in common are held together by the map already.
+    tracks = solved.landmarks.tracks
+    ones = np.ones(len(tracks), np.int32)
+    seen = csr_matrix((ones, (tracks.frames, tracks.points)), (num, tracks.num_points))
+    common = (seen @ seen.T).tocsr()
+    common.data[common.data < _ENOUGH_POINTS] = 0
+    common.eliminate_zeros()
+    chosen = candidates(looks, solved, unseen, settings, common)
+    verified = recovery.match_anywhere(context.of_strongest(), chosen)
+    known = solved.points_by_keypoint(keypoints)
+    loops = []
+    for p, (f0, f1) in enumerate(verified.matches.pairs.tolist()):
+        rows = verified.matches.of(p)
+        points0, points1 = known[f0][rows[:, 0]], known[f1][rows[:, 1]]
+        both = np.isfinite(points0).all(axis=1) & np.isfinite(points1).all(axis=1)
+        measured = relative_similarity(points0[both], points1[both], settings.seed)
+        if measured is not None:
+            step, inliers = measured
+            loops.append(Loop(f0, f1, step.new_T_old, int(inliers.sum())))
     poses, depth = solved.world_T_rigs, solved.median_depth()
     within = [loop for loop in loops if within_drift(loop, poses, depth, unseen, settings)]
     agreeing = consistent(within, solved, settings.pairs.window)
@@ -233,16 +246,6 @@ def candidates(
     return pairs[kept]
 
 
-def _sharing_points(tracks: Tracks, num_frames: int) -> csr_matrix:
-    """Sparse matrix (F, F) of the frames that see `_ENOUGH_POINTS` or more in common."""
-    ones = np.ones(len(tracks), np.int32)
-    seen = csr_matrix((ones, (tracks.frames, tracks.points)), (num_frames, tracks.num_points))
-    common = (seen @ seen.T).tocsr()
-    common.data[common.data < _ENOUGH_POINTS] = 0
-    common.eliminate_zeros()
-    return common
-
-
 def _least_similarity(
     looks: np.ndarray, solved: Solution, unseen_before: np.ndarray, window: int
 ) -> float:
@@ -272,22 +275,6 @@ def _max_step_drifts(
     """Largest error (N - 1,) of each step between positions (N, 3), map units."""
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     return np.where(unseen, 1.0, settings.pairs.far_drift) * steps
-
-
-def _measured_loops(
-    verified: VerifiedPairs, keypoints: Keypoints, solved: Solution, seed: int
-) -> list[Loop]:
-    known = solved.points_by_keypoint(keypoints)
-    loops = []
-    for p, (f0, f1) in enumerate(verified.matches.pairs.tolist()):
-        rows = verified.matches.of(p)
-        points0, points1 = known[f0][rows[:, 0]], known[f1][rows[:, 1]]
-        both = np.isfinite(points0).all(axis=1) & np.isfinite(points1).all(axis=1)
-        measured = relative_similarity(points0[both], points1[both], seed)
-        if measured is not None:
-            step, inliers = measured
-            loops.append(Loop(f0, f1, step.new_T_old, int(inliers.sum())))
-    return loops
 
 
 def within_drift(

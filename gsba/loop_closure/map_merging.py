@@ -29,7 +29,6 @@ from gsba.types import Counts, Matches, Solution
 
 logger = logging.getLogger(__name__)
 _NUM_CANDIDATES = 3  # candidate places for each frame of a part; twice as many for a single frame
-_NUM_SAMPLED_FRAMES = 24  # frames of a part for which candidates are searched
 _BREAK_REACH_FRAMES = 3  # frames from a break that are compared in any case
 _MAX_PAUSE_INTERVALS = 6.0  # longest pause over which these are compared, in median intervals
 _NUM_BEST_MEETINGS = 2  # best meetings whose neighbours are compared too
@@ -233,7 +232,7 @@ class _Joining:
             nearest = np.argmax(self.looks[rows] @ self.looks[others].T, axis=1)
             if not np.isin(others[nearest], inside).any():
                 return self._over_break(part, rows, inside)
-        sampled = np.linspace(0, len(rows) - 1, _NUM_SAMPLED_FRAMES).astype(int)
+        sampled = np.linspace(0, len(rows) - 1, 24).astype(int)
         sampled = rows[
             np.unique([*sampled, *range(_BREAK_REACH_FRAMES), *range(-_BREAK_REACH_FRAMES, 0)])
         ]
@@ -506,7 +505,14 @@ class _Joining:
     def result(self) -> Registered:
         """The map as it is, each in the world of its earliest part; lost frames beside the one
         before."""
-        self._keep_earliest_worlds()
+        # Move each map back to the world that its earliest part had before parts were joined
+        for component in range(int(self.components.max()) + 1):
+            rows = np.flatnonzero(self.components == component)
+            parts = rows[self.met[rows] & ~self.alone[rows]]
+            back = self.moves[int(parts[0])].inverse()
+            self.poses[rows] = back.poses(self.poses[rows])
+            for f in rows:
+                self.moves[f] = back.after(self.moves[f])
         lost, maps = self.components < 0, int(self.components.max()) + 1
         for n, f in enumerate(np.flatnonzero(lost).tolist()):
             placed = np.flatnonzero(~lost)
@@ -536,16 +542,6 @@ class _Joining:
             Counts(num - 1, kept, "parts", dropped),
             reasons,
         )
-
-    def _keep_earliest_worlds(self) -> None:
-        """Move each map back to the world that its earliest part had before parts were joined."""
-        for component in range(int(self.components.max()) + 1):
-            rows = np.flatnonzero(self.components == component)
-            parts = rows[self.met[rows] & ~self.alone[rows]]
-            back = self.moves[int(parts[0])].inverse()
-            self.poses[rows] = back.poses(self.poses[rows])
-            for f in rows:
-                self.moves[f] = back.after(self.moves[f])
 
     def _reasons(self, order: np.ndarray) -> tuple[str, ...]:
         """Why each map, by each frame's number (F,), was not joined to a larger one."""

@@ -16,10 +16,8 @@ from gsba.similarity import (
 )
 from gsba.types import Matches
 
-_MAX_LOG_SCALE_DIFFERENCE = 0.15  # largest difference of logarithms of scales that agree
 _LOSS_DEG = 0.2  # scale of the robust loss: points of two maps have correlated errors
 _MIN_COMMON_POINTS = 6  # least common inliers of two frames that propose a similarity
-_MAX_PROPOSALS = 6  # largest number of proposals that are tested
 _BESIDE = 3  # frames to either side of a meeting whose points it may count
 
 
@@ -77,7 +75,7 @@ def propose(meetings: list[Meeting], poses: np.ndarray, depth: float, seed: int)
     for one in sorted(found, key=lambda proposal: -proposal.support):
         if not any(alike(one, other, poses, depth) for other in distinct):
             distinct.append(one)
-    return distinct[:_MAX_PROPOSALS]
+    return distinct[:6]
 
 
 def _proposed(
@@ -160,7 +158,7 @@ def alike(
     off, turned, stretched = difference(one.move, other.move, frames)
     near = off < slack * AGREE * max(depth, 1e-12)
     near &= turned < slack * np.deg2rad(AGREE_DEG)
-    return bool(near and stretched < _MAX_LOG_SCALE_DIFFERENCE)
+    return bool(near and stretched < 0.15)
 
 
 def difference(one: Sim3, other: Sim3, poses: np.ndarray) -> tuple[float, float, float]:

@@ -9,8 +9,6 @@ from gsba.trajectory.joining import PLACES, SegmentAlignment
 from gsba.trajectory.judgement import StepChecks
 from gsba.types import CoarsePoses, Counts, PoseSource, Solution
 
-_MAP_SPACING_EXTENTS = 4.0  # distance between unconnected maps, in their extents
-
 
 @dataclass(frozen=True, slots=True)
 class Registered:
@@ -54,7 +52,8 @@ def laid_out(positions: np.ndarray, components: np.ndarray, reach: float) -> np.
     groups = [components == c for c in range(int(components.max()) + 1)]
     extent = max(float(np.linalg.norm(np.ptp(positions[group], axis=0))) for group in groups)
     for number, group in enumerate(groups[1:], 1):
-        away = np.array([number * _MAP_SPACING_EXTENTS * (extent + reach), 0, 0])
+        # maps lie four of their extents apart
+        away = np.array([number * 4.0 * (extent + reach), 0, 0])
         offsets[group] = positions[groups[0]].mean(axis=0) + away
         offsets[group] -= positions[group].mean(axis=0)
     return offsets

@@ -14,7 +14,6 @@ from gsba.disk import concatenated
 from gsba.matching.guided_search import SearchableFrames
 from gsba.store.shards import Workers, blocks_of_frames
 
-_NUM_WORDS = 64  # visual words of the vocabulary
 _NUM_SAMPLES = 20_000  # descriptors that train the vocabulary
 # Rounding of descriptors, float32 of unit length: a shorter sum has no direction.
 _MIN_SUM_LENGTH = 1e-5
@@ -43,7 +42,15 @@ def visual_words(
     draw = partial(_sampled_descriptors, share=share, seed=seed)
     job = _DescriptorJob("sampling", frames, np.arange(num_frames), draw)
     sample = np.concatenate(list(workers.map_shards(job)))
-    return _vocabulary(sample, np.random.default_rng(seed))
+    # Centres (W, D) of a k-means clustering
+    rng = np.random.default_rng(seed)
+    words = sample[rng.permutation(len(sample))[:64]].copy()
+    for _ in range(12):
+        nearest = _nearest(sample, words)
+        counts = np.bincount(nearest, minlength=len(words))
+        sums = _sums_by_group(sample, nearest, len(words))
+        words = np.where(counts[:, None] > 0, sums / np.maximum(counts, 1)[:, None], words)
+    return words
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,17 +85,6 @@ def _sampled_descriptors(descriptors: np.ndarray, frame: int, share: int, seed: 
 
 def _descriptor_of(descriptors: np.ndarray, _frame: int, words: np.ndarray) -> np.ndarray:
     return aggregate(descriptors, words)
-
-
-def _vocabulary(sample: np.ndarray, rng: np.random.Generator, rounds: int = 12) -> np.ndarray:
-    """Centres (W, D) of a k-means clustering."""
-    words = sample[rng.permutation(len(sample))[:_NUM_WORDS]].copy()
-    for _ in range(rounds):
-        nearest = _nearest(sample, words)
-        counts = np.bincount(nearest, minlength=len(words))
-        sums = _sums_by_group(sample, nearest, len(words))
-        words = np.where(counts[:, None] > 0, sums / np.maximum(counts, 1)[:, None], words)
-    return words
 
 
 def _nearest(descriptors: np.ndarray, words: np.ndarray) -> np.ndarray:

@@ -29,11 +29,10 @@ from gsba.version import __version__
 
 logger = logging.getLogger(__name__)
 
-_BYTES_PER_OBSERVATION = 400  # of an undivided adjustment, about
 _MEMORY_SHARE = 4  # of the machine's memory, beyond which an adjustment is divided
 _FRAMES = 1000  # of a part, where nothing else is asked for
-_FACTORS_AT_ONCE = 10_000  # of the graph, written together
 _MAX_CUT_SHARE = 0.5  # of all frames; where more are on cuts, parts have little of their own
+_FACTORS_AT_ONCE = 10_000  # of the graph, written together
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +102,8 @@ class DividedAdjustments:
         """Frames of a part at most; None = the map is not divided."""
         if self.part_frames is not None:
             return self.part_frames if map_.num_frames > self.part_frames else None
-        needed = _MEMORY_SHARE * _BYTES_PER_OBSERVATION * map_.num_observations
+        # bytes of an observation in an undivided adjustment, about
+        needed = _MEMORY_SHARE * 400 * map_.num_observations
         big = needed > total_memory_bytes() and map_.num_frames > _FRAMES
         return _FRAMES if big else None
 

@@ -16,7 +16,7 @@ from gsba.bundle.families import kept
 from gsba.bundle.optimizer import OptimizeResult, minimize
 from gsba.bundle.pose_variables import X
 from gsba.config import SolverSettings
-from gsba.parts.folder import At, Index, load, load_index, load_part
+from gsba.parts.folder import At, load, load_index, load_part
 from gsba.parts.jobs import (
     Covariances,
     Eliminate,
@@ -85,12 +85,7 @@ class DividedSystem:
         self._dims = [dims[key] for key in self._beside]  # of variables that are no frames
         firsts = np.cumsum([self.num_frames, *(-(-dim // DIM) for dim in self._dims)])
         self._firsts, self._num_nodes = firsts[:-1].tolist(), int(firsts[-1])
-        self._set_cuts(index)
-        self._tentative: list[Linearized] = []
-        self._linearized: list[Linearized] = []
-
-    def _set_cuts(self, index: Index) -> None:
-        """Fix the pattern of the nodes on cuts."""
+        # Fix the pattern of the nodes on cuts
         kept = [n[len(n) - k :] for n, k in zip(self.nodes, index.num_kept, strict=True)]
         self.cut_nodes = np.unique(np.concatenate(kept))
         self.kept = [np.searchsorted(self.cut_nodes, rows) for rows in kept]
@@ -101,6 +96,8 @@ class DividedSystem:
         self._codes = np.unique(np.concatenate(codes))
         pairs = np.column_stack(np.divmod(self._codes, max(num, 1)))
         self._cholesky = BlockCholesky(num, pairs) if num else None
+        self._tentative: list[Linearized] = []
+        self._linearized: list[Linearized] = []
 
     def linearize(self, values: gtsam.Values) -> dict[str, float]:
         """See `gsba.bundle.optimizer.System`; parts that just moved are linearized already."""
@@ -113,7 +110,13 @@ class DividedSystem:
 
     def solve(self, damping: float) -> np.ndarray | None:
         """See `gsba.bundle.optimizer.System`; steps (N, 6) of frames, then of other variables."""
-        self._save(damping)
+        # Note where the solution stands, and delete older and rejected versions
+        if self._saved != self._version:
+            save_record(self._folder / _STATE, SolverState(self._version, self._at, damping), {})
+            self._saved = self._version
+        for path in self._folder.glob("part-*/*-[0-9]*.npz"):
+            if not path.stem.endswith(f"-{self._version:06d}"):
+                path.unlink(missing_ok=True)
         factorized = self._factorized(damping)
         if factorized is None:
             return None
@@ -298,15 +301,6 @@ class DividedSystem:
         """Delete the workers' files of a pass that is through."""
         for path in self._scratch.glob("*") if self._scratch is not None else ():
             path.unlink(missing_ok=True)
-
-    def _save(self, damping: float) -> None:
-        """Note where the solution stands, and delete older and rejected versions."""
-        if self._saved != self._version:
-            save_record(self._folder / _STATE, SolverState(self._version, self._at, damping), {})
-            self._saved = self._version
-        for path in self._folder.glob("part-*/*-[0-9]*.npz"):
-            if not path.stem.endswith(f"-{self._version:06d}"):
-                path.unlink(missing_ok=True)
 
 
 def _places(nodes: np.ndarray, pairs: np.ndarray) -> np.ndarray:

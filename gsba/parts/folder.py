@@ -139,11 +139,8 @@ class PartsWriter:
     """Takes a stream of landmarks and factors, and writes them by parts."""
 
     def __init__(self, folder: Path) -> None:
-        """Start in a folder; what an interrupted writer left there is deleted.
-
-        Raises:
-            GsbaError: the folder holds a map already, or something else.
-        """
+        """Start in a folder; what an interrupted writer left there is deleted. Raises GsbaError:
+        the folder holds a map already, or something else."""
         if has_index(folder):
             raise GsbaError(f"{folder} holds the parts of a map: choose another folder")
         if folder.exists() and any(folder.iterdir()) and not (folder / "incoming").is_dir():

@@ -29,20 +29,6 @@ _kept: dict[_Key, PartElimination] = {}
 _lock = threading.Lock()  # of `_kept`
 
 
-def eliminated(file: Path, damping: float) -> PartElimination:
-    """Factorize the equations in a file; the factor is kept for `substituting` while all that are
-    kept take a share of the memory at most, older ones of its file left out."""
-    factor = PartElimination(load(file, PartEquations), damping)
-    if factor.regular:
-        with _lock:
-            for old in [old for old in _kept if old[0] == str(file)]:
-                del _kept[old]
-            num_bytes = sum(one.num_bytes for one in [factor, *_kept.values()])
-            if num_bytes <= total_memory_bytes() // _MEMORY_SHARE:
-                _kept[_key(file, damping)] = factor
-    return factor
-
-
 def substituting(file: Path, damping: float) -> PartElimination:
     """The factor that `eliminated` returned, which is kept no longer, or computed again."""
     with _lock:
@@ -169,7 +155,16 @@ class Eliminate(_PartJob):
     returns: Any = Condensed | None  # equations on nodes on cuts; None = its block is singular
 
     def __call__(self, item: int) -> Condensed | None:
-        factor = eliminated(self._file(item, "equations", self.version), self.damping)
+        # The factor is kept for `substituting` while all that are kept take a share of the memory.
+        file = self._file(item, "equations", self.version)
+        factor = PartElimination(load(file, PartEquations), self.damping)
+        if factor.regular:
+            with _lock:
+                for old in [old for old in _kept if old[0] == str(file)]:
+                    del _kept[old]
+                num_bytes = sum(one.num_bytes for one in [factor, *_kept.values()])
+                if num_bytes <= total_memory_bytes() // _MEMORY_SHARE:
+                    _kept[_key(file, self.damping)] = factor
         return factor.condensed() if factor.regular else None
 
 

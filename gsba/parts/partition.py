@@ -8,8 +8,6 @@ import numpy as np
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import breadth_first_order, maximum_bipartite_matching
 
-_LEAST_SHARE = 0.35  # of the frames, on the smaller side of a cut
-
 
 @dataclass(frozen=True, slots=True)
 class Partition:
@@ -106,7 +104,7 @@ def _cut(order: np.ndarray, pairs: np.ndarray) -> np.ndarray:
     low, high = np.sort(rank[pairs], axis=1).T
     change = np.bincount(low + 1, minlength=num + 2) - np.bincount(high + 1, minlength=num + 2)
     crossing = np.cumsum(change)  # pairs between the first c frames and the rest, for each c
-    least = max(1, int(_LEAST_SHARE * num))
+    least = max(1, int(0.35 * num))  # frames on the smaller side of a cut
     places = np.arange(least, max(num - least, least) + 1)
     places = places[np.lexsort((np.abs(2 * places - num), crossing[places]))]
     where = int(places[0])

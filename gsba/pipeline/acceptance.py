@@ -77,7 +77,16 @@ def require_motion(frames: FrameSet, result: Reconstruction) -> None:
             "of the vehicle, or a trajectory"
         )
     if not len(sigmas) or np.median(sigmas) >= MIN_STEP_SIGMAS:
-        _require_prediction(main)
+        deviations = step_deviations(main)  # from those that frames further away predict
+        tested = deviations[np.isfinite(deviations)]
+        wrong = np.count_nonzero(tested > MAX_STEP_DEVIATION)
+        if wrong > MAX_CONTRADICTED_SHARE * len(tested):
+            raise NoPositions(
+                f"the images determine no positions: {wrong} of {len(tested)} steps differ by more "
+                f"than {100 * MAX_STEP_DEVIATION:.0f} % from those that frames further away "
+                "predict: the camera hardly moves but turns; nothing is written: give frames of a "
+                "walk, the camera's calibration, or a trajectory"
+            )
         return
     vehicle = share >= VEHICLE_SHARE
     cause = where if vehicle else "the camera hardly moves, or little matches"
@@ -87,20 +96,6 @@ def require_motion(frames: FrameSet, result: Reconstruction) -> None:
         f"deviations long, and {MIN_STEP_SIGMAS:g} are needed: {cause}; nothing is written: give "
         "sharper frames, other frames per second, or a trajectory"
     )
-
-
-def _require_prediction(main: Reconstruction) -> None:
-    """Refuse a map whose steps differ from those that frames further away predict."""
-    deviations = step_deviations(main)
-    tested = deviations[np.isfinite(deviations)]
-    wrong = np.count_nonzero(tested > MAX_STEP_DEVIATION)
-    if wrong > MAX_CONTRADICTED_SHARE * len(tested):
-        raise NoPositions(
-            f"the images determine no positions: {wrong} of {len(tested)} steps differ by more "
-            f"than {100 * MAX_STEP_DEVIATION:.0f} % from those that frames further away predict: "
-            "the camera hardly moves but turns; nothing is written: give frames of a walk, the "
-            "camera's calibration, or a trajectory"
-        )
 
 
 def step_sigmas(result: Reconstruction) -> np.ndarray:

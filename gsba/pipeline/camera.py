@@ -47,18 +47,12 @@ from gsba.types import (
     Solution,
 )
 
-_SEAM_DEG = 4.0  # from the seam of a panorama: pixels that are blended of both lenses are not used
 T = TypeVar("T")
 
 Cuts = tuple[tuple[Rig, bool] | None, ...]  # (C,) calibration to cut raw frames of each camera by,
 # and whether it was estimated; None = they are cut well
 
 logger = logging.getLogger(__name__)
-
-_WIDE_GATE_SIGMAS = 30.0  # gate of observations that a wrong camera threw off
-_MAX_RECALIBRATIONS = 4  # of raw lenses from features, and the map matched anew under them
-_MIN_RECALIBRATION_RAD = np.deg2rad(0.01)  # stop when bearings change by less
-_MIN_RECUT_RAD = np.deg2rad(0.03)  # change of bearings for which raw frames are cut anew
 
 
 def find_camera(state: State, prefix: str = "") -> State:
@@ -170,7 +164,8 @@ def _on_trial(
     trial, raw = state, _raw_cameras(run)
     for camera in sought:
         own = run.settings_of(camera)
-        yaws, band = own.lens_yaws_deg, float(np.deg2rad(_SEAM_DEG))
+        # pixels near the seam are blended of both lenses
+        yaws, band = own.lens_yaws_deg, float(np.deg2rad(4.0))
         if camera in raw:
             fisheyes = run.frames.formats[camera].fisheyes
             assert fisheyes is not None
@@ -209,13 +204,13 @@ def _calibrate_raw(trial: State, raw: Sequence[int]) -> State:
     if not free:
         return trial
     trial = _settle_cameras(trial.through(trial.map.lenses), "recalibrated")
-    for n in range(_MAX_RECALIBRATIONS):
+    for n in range(4):
         before = trial.map.lenses.lenses
         trial = frontend.match_along_epipolars(trial, f"adjacent_raw{n}")
         trial = frontend.match_known_points(trial, f"wide_raw{n}")
         trial = _settle_cameras(trial, f"calibrated{n}")
         pairs = zip(before, trial.map.lenses.lenses, strict=True)
-        if max(self_calibration.apart(*pair) for pair in pairs) < _MIN_RECALIBRATION_RAD:
+        if max(self_calibration.apart(*pair) for pair in pairs) < np.deg2rad(0.01):
             break
     return trial
 
@@ -356,7 +351,7 @@ def _better(coarse: CoarsePoses, map_: Map, camera: int) -> tuple[Rig, bool] | N
     if (own.sources == PoseSource.SLAM).any():
         turn = quarter_turn(own, map_.solution.world_T_rigs[rows])
     off = self_calibration.apart(lenses, replace(lenses, fisheyes=None))
-    if off < _MIN_RECUT_RAD and np.array_equal(turn, np.eye(3)):
+    if off < np.deg2rad(0.03) and np.array_equal(turn, np.eye(3)):
         return None
     logger.info("lenses are %.2f deg from what panoramas were cut by: all anew", np.rad2deg(off))
     return turned(found, turn), lenses.fisheyes is not None
@@ -444,7 +439,7 @@ def _from_features(
     """
     run, observed, solution = state.run, state.observed, state.solution
     lenses = observed.cameras.lenses[number]
-    gate = GATE_SCALE if lenses else _WIDE_GATE_SIGMAS
+    gate = GATE_SCALE if lenses else 30.0  # a wrong camera throws observations off
 
     def compute() -> T:
         tracks = tracks_of_camera(backend.tracks_of(state), observed.cameras.of_frame, number)

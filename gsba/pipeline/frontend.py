@@ -34,9 +34,7 @@ from gsba.trajectory import judgement, steps, turning
 from gsba.trajectory.clock import ClockEstimate
 from gsba.types import CoarsePoses, Features, Keypoints, Matches, PoseSource, VerifiedPairs
 
-_WEAK_CONTRAST_THRESHOLD = 0.01  # of keypoints in weak frames: half of the default elsewhere
 _DARK = 32  # of 255
-_NUM_WIDE_PAIRS = 60  # pairs of frames of each wider gap that show whether a camera walks
 _NUM_STEPS = 3  # compared, spread over the walk
 _DRIFT_PER_FRAME = 0.13  # times frames over squared matches of a step: the drift of rendered walks
 # of 24 to 48 frames is 0.10 to 0.15 times it; a real one of 11 frames drifts eight times as much
@@ -44,7 +42,6 @@ _MAX_GAP_SHARE = 0.1  # largest distance of two positions at one place, part of 
 # them: the trajectory drifts by less
 _MIN_PATH_SHARE = 0.5  # of the whole path, that lies between them at least: shorter detours leave
 # the rest open
-_MAX_POSITIONS = 500  # compared with one another, evenly chosen
 
 
 def extract(run: Run) -> State:
@@ -60,7 +57,7 @@ def extract(run: Run) -> State:
 
 def _enlarged(settings: RefineSettings) -> RefineSettings:
     most = settings.weak_frames.max_per_face
-    more = {"max_per_face": most, "contrast_threshold": _WEAK_CONTRAST_THRESHOLD}
+    more = {"max_per_face": most, "contrast_threshold": 0.01}  # half of the default elsewhere
     return settings.model_copy(update={"features": settings.features.model_copy(update=more)})
 
 
@@ -256,7 +253,7 @@ def prove_turn(state: State) -> State | None:
     def compute() -> Recovered:
         chosen = [pairs.adjacent(num, 1)]
         for gap in 2 ** np.arange(1, max(num - 1, 1).bit_length()):
-            first = np.unique(np.linspace(0, num - 1 - gap, _NUM_WIDE_PAIRS).astype(np.int32))
+            first = np.unique(np.linspace(0, num - 1 - gap, 60).astype(np.int32))
             chosen.append(np.column_stack([first, first + gap]))
         found = recovery.match_anywhere(context, np.concatenate(chosen).astype(np.int32))
         verify = run.settings.verify
@@ -423,7 +420,7 @@ def comes_back(positions: np.ndarray) -> bool:
     if not along[-1] > 0:
         return True
     num = len(positions)
-    chosen = np.unique(np.linspace(0, num - 1, min(num, _MAX_POSITIONS)).astype(int))
+    chosen = np.unique(np.linspace(0, num - 1, min(num, 500)).astype(int))
     places, along = positions[chosen], along[chosen]
     distances = np.linalg.norm(places[:, None] - places, axis=2)
     between = np.abs(along[:, None] - along)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from gsba.config import CameraSettings, GpsSettings, PlacementSettings, RefineSettings
+from gsba.config import CameraSettings, GpsSettings, PlacementSettings
 from gsba.disk import disk_errors, exchange_folders, hold_folder, link_or_copy
 from gsba.frames.recordings import combine
 from gsba.log import GsbaError
@@ -191,7 +191,19 @@ def add_recordings(
         with place.store(finished.origin | given, client, finished) as work:
             scratch = work.root / SCRATCH
             named = [replace(one, name=name) for one, name in zip(recordings, names, strict=True)]
-            settings = _settings_of_new(finished.settings)
+            settings = finished.settings  # less what places its result
+            direct = settings.direct_families()
+            factors = tuple(
+                name for name in settings.factors if name != "gps" and name not in direct
+            )
+            settings = settings.model_copy(
+                update={
+                    "factors": factors,
+                    "gps": GpsSettings(),
+                    "placement": PlacementSettings(),
+                    "export": settings.export.model_copy(update={"formats": ()}),
+                }
+            )
             models = {one.name: one.camera for one in named}
 
             def adapt(found: Mapping[str, FrameSet]) -> dict[str, tuple[FrameSet, CameraSettings]]:
@@ -202,7 +214,19 @@ def add_recordings(
             refine_each(named, scratch, settings, **given)
             runs = [finished, FinishedRun.load(scratch)]
             state, maps = _joined(work, runs)
-            _require_joined(maps, state)
+            # Refuse new recordings of which no frame is in the map that is exported
+            merged = state.prior.merged
+            assert merged is not None
+            main = merged.components[maps.main_rows(0)[0]]
+            for name, rows in state.run.frames.recordings.items():
+                if rows[0] >= maps.starts[1] and not (merged.components[rows] == main).any():
+                    number = int(merged.components[rows].min())
+                    reason = merged.reasons[number] if number < len(merged.reasons) else ""
+                    raise ApartError(
+                        f"recording '{name}' does not meet the map of {maps.runs[0].root}"
+                        f"{f' ({reason})' if reason else ''}: nothing is added; recordings are "
+                        "joined where they show the same place, over six frames or more"
+                    )
             if fixed:
                 state = map_joining.hold(state, maps.rows(0))
             state = map_joining.tie(state, maps.parts)
@@ -276,7 +300,21 @@ def remove_recordings(
     root = Path(run)
     with held_runs([root]):
         finished = FinishedRun.load(root)
-        _refuse_unknown(finished, names)
+        # Refuse names that a run does not have, or to take out all that it has
+        known = list(finished.frames.recordings)
+        if not names:
+            raise GsbaError(
+                f"name the recordings to take out; {finished.root} has {', '.join(known)}"
+            )
+        for name in names:
+            if name not in known:
+                raise GsbaError(
+                    f"{finished.root} has no recording '{name}': it has {', '.join(known)}"
+                )
+        if set(names) == set(known):
+            raise GsbaError(
+                f"{finished.root} has no other recording than {', '.join(known)}: one must stay"
+            )
         left = finished.without(names)
         place = _Place.of(root, out)
         with place.store(left.origin, None, left) as work:
@@ -344,20 +382,6 @@ def _joined(store: RunStore, runs: Sequence[FinishedRun]) -> tuple[State, JointM
     return map_joining.register(map_joining.begin(store, maps, runs[0].settings), maps), maps
 
 
-def _settings_of_new(settings: RefineSettings) -> RefineSettings:
-    """Settings of a run, for recordings that are to join it: without what places its result."""
-    direct = settings.direct_families()
-    factors = tuple(name for name in settings.factors if name != "gps" and name not in direct)
-    return settings.model_copy(
-        update={
-            "factors": factors,
-            "gps": GpsSettings(),
-            "placement": PlacementSettings(),
-            "export": settings.export.model_copy(update={"formats": ()}),
-        }
-    )
-
-
 def _refuse_known(run: FinishedRun, recordings: Sequence[Recording], names: Sequence[str]) -> None:
     """Refuse recordings that are in a run already, or whose name is taken there."""
     taken = list(run.frames.recordings)
@@ -386,18 +410,6 @@ def _refuse_common(runs: Sequence[FinishedRun]) -> None:
                 )
 
 
-def _refuse_unknown(run: FinishedRun, names: Sequence[str]) -> None:
-    """Refuse names that a run does not have, or to take out all that it has."""
-    known = list(run.frames.recordings)
-    if not names:
-        raise GsbaError(f"name the recordings to take out; {run.root} has {', '.join(known)}")
-    for name in names:
-        if name not in known:
-            raise GsbaError(f"{run.root} has no recording '{name}': it has {', '.join(known)}")
-    if set(names) == set(known):
-        raise GsbaError(f"{run.root} has no other recording than {', '.join(known)}: one must stay")
-
-
 def _require_any_joined(maps: JointMaps, state: State) -> None:
     """Refuse runs of which none meets another."""
     merged = state.prior.merged
@@ -412,22 +424,6 @@ def _require_any_joined(maps: JointMaps, state: State) -> None:
         f"{f' ({reasons[0]})' if reasons else ''}: nothing is merged; maps are joined where they "
         "show the same place, over six frames or more"
     )
-
-
-def _require_joined(maps: JointMaps, state: State) -> None:
-    """Refuse new recordings of which no frame is in the map that is exported."""
-    merged = state.prior.merged
-    assert merged is not None
-    main = merged.components[maps.main_rows(0)[0]]
-    for name, rows in state.run.frames.recordings.items():
-        if rows[0] >= maps.starts[1] and not (merged.components[rows] == main).any():
-            number = int(merged.components[rows].min())
-            reason = merged.reasons[number] if number < len(merged.reasons) else ""
-            raise ApartError(
-                f"recording '{name}' does not meet the map of {maps.runs[0].root}"
-                f"{f' ({reason})' if reason else ''}: nothing is added; recordings are joined "
-                "where they show the same place, over six frames or more"
-            )
 
 
 def _write(
@@ -446,37 +442,7 @@ def _write(
             result = replace(result, joint_errors=None, **changes)
         return result if rigid is None else _with_rigid(result, state, maps, rigid)
 
-    state = replace(state, prior=replace(state.prior, of_recordings=_worlds(state, maps)))
-    if held is None and rigid is None:
-        state = camera.measure_camera(state)
-    result = backend.reconstruct(state, amended)
-    lenses = camera.keep_lenses(state, result)
-    state = _told(state, maps, result, rigid)
-    finished_run.keep(state)
-    return outputs.write(state, result, lenses)
-
-
-def _with_rigid(
-    result: Reconstruction, state: State, maps: JointMaps, rigid: RigidMoves
-) -> Reconstruction:
-    """The result with the covariances that maps have alone, and those of the moves between them."""
-    own, stretches = list[np.ndarray](), np.ones(len(maps.parts))
-    for number, run in enumerate(maps.runs):
-        own.append(run.result.pose_covariances)
-        for part in np.unique(maps.parts[maps.rows(number)]):
-            rows = np.flatnonzero(maps.parts == part)
-            before = run.result.world_T_rigs[rows - maps.starts[number]]
-            stretches[rows] = pose_similarity(before, result.world_T_rigs[rows]).scale
-    covariances = rigid.pose_covariances(
-        np.concatenate(own), state.solution.world_T_rigs, stretches, maps.parts
-    )
-    poses, first = result.world_T_rigs.copy(), maps.main_rows(0)
-    poses[first] = maps.runs[0].result.world_T_rigs[maps.runs[0].result.largest_map()]
-    return replace(result, world_T_rigs=poses, pose_covariances=covariances, joint_errors=None)
-
-
-def _worlds(state: State, maps: JointMaps) -> tuple[Prior, ...]:
-    """The poses of each recording that define its map's world: that of the first run in the map."""
+    # The poses of each recording that define its map's world: that of the first run in the map
     components = state.prior.parts
     if components is None:
         components = np.zeros(len(state.run.frames), np.int64)
@@ -492,11 +458,20 @@ def _worlds(state: State, maps: JointMaps) -> tuple[Prior, ...]:
         sources[inside[maps.parts[inside] == part]] = PoseSource.SLAM
     poses = np.concatenate([run.result.world_T_rigs for run in maps.runs])
     rows = state.run.frames.recordings.values()
-    return tuple(Prior.of(CoarsePoses(poses[own], sources[own], 0.0)) for own in rows)
-
-
-def _told(state: State, maps: JointMaps, result: Reconstruction, rigid: RigidMoves | None) -> State:
-    """The state as the report tells of it: trajectories before, in the worlds of the result."""
+    state = replace(
+        state,
+        prior=replace(
+            state.prior,
+            of_recordings=tuple(
+                Prior.of(CoarsePoses(poses[own], sources[own], 0.0)) for own in rows
+            ),
+        ),
+    )
+    if held is None and rigid is None:
+        state = camera.measure_camera(state)
+    result = backend.reconstruct(state, amended)
+    lenses = camera.keep_lenses(state, result)
+    # The state as the report tells of it: trajectories before, in the worlds of the result
     poses, sources = list[np.ndarray](), list[np.ndarray]()
     joints = list[SegmentAlignment]()
     main = set(result.largest_map().tolist())
@@ -519,4 +494,25 @@ def _told(state: State, maps: JointMaps, result: Reconstruction, rigid: RigidMov
     coarse = CoarsePoses(np.concatenate(poses), np.concatenate(sources), 0.0)
     prior = replace(state.prior, coarse=coarse, joints=tuple(joints))
     run = replace(state.run, settings=maps.runs[0].settings)
-    return replace(state, run=run, prior=prior)
+    state = replace(state, run=run, prior=prior)
+    finished_run.keep(state)
+    return outputs.write(state, result, lenses)
+
+
+def _with_rigid(
+    result: Reconstruction, state: State, maps: JointMaps, rigid: RigidMoves
+) -> Reconstruction:
+    """The result with the covariances that maps have alone, and those of the moves between them."""
+    own, stretches = list[np.ndarray](), np.ones(len(maps.parts))
+    for number, run in enumerate(maps.runs):
+        own.append(run.result.pose_covariances)
+        for part in np.unique(maps.parts[maps.rows(number)]):
+            rows = np.flatnonzero(maps.parts == part)
+            before = run.result.world_T_rigs[rows - maps.starts[number]]
+            stretches[rows] = pose_similarity(before, result.world_T_rigs[rows]).scale
+    covariances = rigid.pose_covariances(
+        np.concatenate(own), state.solution.world_T_rigs, stretches, maps.parts
+    )
+    poses, first = result.world_T_rigs.copy(), maps.main_rows(0)
+    poses[first] = maps.runs[0].result.world_T_rigs[maps.runs[0].result.largest_map()]
+    return replace(result, world_T_rigs=poses, pose_covariances=covariances, joint_errors=None)

@@ -38,7 +38,6 @@ logger = logging.getLogger(__name__)
 
 _WITH_GYRO = (".insv", ".osv", ".360")  # raw videos that may hold readings
 CHOSEN = Path("odometry/chosen.tum")  # in a run's folder: frames that the odometry has chosen
-_NO_MOTION = 1e-9  # extent in map units that is rounding alone
 
 
 def trajectory_files(
@@ -108,7 +107,8 @@ def coarse_poses(
         return without_trajectory(frames)
     coarse = associate_pieces(frames, given, settings.read)
     refuse_useless(coarse)
-    if np.ptp(coarse.world_T_rigs[:, :3, 3], axis=0).max() < _NO_MOTION:
+    # an extent that is rounding alone
+    if np.ptp(coarse.world_T_rigs[:, :3, 3], axis=0).max() < 1e-9:
         logger.warning("the trajectory only turns: positions come from the images alone")
         return without_trajectory(frames)
     return coarse

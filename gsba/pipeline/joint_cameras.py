@@ -150,7 +150,9 @@ def as_read_by(
         ]
         if len(alike) != 1:
             refuse_fields([run], several=True)
-            read[name] = frames, _without_model(run.settings.camera)
+            metric = isinstance(run.settings.camera.stitch_radius_m, float)
+            changes = _UNKNOWN_MODEL | ({"stitch_radius_m": None} if metric else {})
+            read[name] = frames, run.settings.camera.model_copy(update=changes)
             continue
         kind, settings = alike[0]
         if frames.format.lenses_nominal:
@@ -184,12 +186,6 @@ def _one_make(kind: PictureFormat, frames: FrameSet) -> bool:
 def _one_model(one: CameraSettings, other: CameraSettings) -> bool:
     """True unless settings name two models."""
     return one.name is None or other.name is None or one.name == other.name
-
-
-def _without_model(settings: CameraSettings) -> CameraSettings:
-    metric = isinstance(settings.stitch_radius_m, float)
-    changes = _UNKNOWN_MODEL | ({"stitch_radius_m": None} if metric else {})
-    return settings.model_copy(update=changes)
 
 
 def _best_run(runs: Sequence[FinishedRun], numbers: Sequence[tuple[int, ...]], camera: int) -> int:

@@ -36,7 +36,18 @@ class JointMaps:
         cameras = JointCameras.of(runs)
         frames = _frames_of(runs, cameras)
         starts = (0, *np.cumsum([len(run.frames) for run in runs]).tolist())
-        moves = _moves(runs, cameras)
+        # Similarities from solutions' to results' worlds, in the first run's unit if known
+        moves = [run.to_result() for run in runs]
+        for n in range(1, len(runs)):
+            for pair in cameras.shared(0, n):
+                apart = [
+                    moves[m].scale * runs[m].map.cameras[c].lenses.baseline
+                    for m, c in zip((0, n), pair, strict=True)
+                ]
+                if min(apart) > 0:
+                    moves[n] = Sim3.of(apart[0] / apart[1], np.eye(4)).after(moves[n])
+                    break
+        moves = tuple(moves)
         solutions = [_moved(run, move) for run, move in zip(runs, moves, strict=True)]
         observed = [run.map.observed.scaled_noise(run.map.solution.noise) for run in runs]
         rig = rig_for(frames.formats[0], runs[0].settings.cubemap)
@@ -113,21 +124,6 @@ def _frames_of(runs: Sequence[FinishedRun], cameras: JointCameras) -> FrameSet:
         camera_of_frame=cameras.of_frames(runs),
         fetched=tuple(fetched) if any(fetched) else (),
     )
-
-
-def _moves(runs: Sequence[FinishedRun], cameras: JointCameras) -> tuple[Sim3, ...]:
-    """Similarities from solutions' to results' worlds, in the first run's unit if known."""
-    moves = [run.to_result() for run in runs]
-    for n in range(1, len(runs)):
-        for pair in cameras.shared(0, n):
-            apart = [
-                moves[m].scale * runs[m].map.cameras[c].lenses.baseline
-                for m, c in zip((0, n), pair, strict=True)
-            ]
-            if min(apart) > 0:
-                moves[n] = Sim3.of(apart[0] / apart[1], np.eye(4)).after(moves[n])
-                break
-    return tuple(moves)
 
 
 def _moved(run: FinishedRun, move: Sim3) -> Solution:

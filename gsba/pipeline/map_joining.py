@@ -48,8 +48,6 @@ logger = logging.getLogger(__name__)
 _SAME_PLACE_SIGMAS = 6.0  # largest angle between a feature and an observation of a point that is
 # taken for the feature's, standard deviations of the feature
 _SAME_PLACE_RAD = np.deg2rad(0.25)  # and largest such angle
-_SAME_POINT_PX = 1.5  # pixels of a panorama between observations of one point of two maps
-_MIN_SAME_SHARE = 0.5  # share of a point's observations that are another one's, to be the same
 _MAX_SCALE_SIGMAS = 5.0  # by which two maps' units may contradict the distances of their lenses
 _MAX_SCALE_RATIO = 1.15  # and in any case
 _NOT_TIED = (
@@ -78,7 +76,21 @@ def begin(store: RunStore, maps: JointMaps, settings: RefineSettings) -> State:
     observed = frontend.adopt(run, [path for one in maps.runs for path in one.files])
     state = replace(State.begin(run, observed), map=maps.map)
     state = _tied_within(state, maps.parts).through(maps.map.lenses)
-    return replace(state, matches=MapMatches(_matches_of(_by_features(state).landmarks.tracks)))
+    # Matches that tracks consist of: each observation with the next one of its point
+    tracks = _by_features(state).landmarks.tracks
+    following = np.flatnonzero(tracks.points[1:] == tracks.points[:-1])
+    first, second = tracks.frames[following], tracks.frames[following + 1]
+    keypoints = np.column_stack([tracks.keypoints[following], tracks.keypoints[following + 1]])
+    order = np.lexsort((second, first))
+    pairs = np.column_stack([first, second])[order]
+    distinct, counts = np.unique(pairs, axis=0, return_counts=True)
+    offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    return replace(
+        state,
+        matches=MapMatches(
+            Matches(distinct.astype(np.int32).reshape(-1, 2), offsets, keypoints[order])
+        ),
+    )
 
 
 def register(state: State, maps: JointMaps) -> State:
@@ -401,18 +413,6 @@ def _by_features(state: State) -> Solution:
     return replace(solution, landmarks=replace(solution.landmarks, tracks=found))
 
 
-def _matches_of(tracks: Tracks) -> Matches:
-    """Matches that tracks consist of: each observation with the next one of its point."""
-    following = np.flatnonzero(tracks.points[1:] == tracks.points[:-1])
-    first, second = tracks.frames[following], tracks.frames[following + 1]
-    keypoints = np.column_stack([tracks.keypoints[following], tracks.keypoints[following + 1]])
-    order = np.lexsort((second, first))
-    pairs = np.column_stack([first, second])[order]
-    distinct, counts = np.unique(pairs, axis=0, return_counts=True)
-    offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-    return Matches(distinct.astype(np.int32).reshape(-1, 2), offsets, keypoints[order])
-
-
 def _across(state: State, parts: np.ndarray, merged: Registered) -> State:
     """The state with matches of frames of different parts (F,), around the joined maps' points."""
     if not merged.met.any():
@@ -473,7 +473,7 @@ def _without_same(base: Sighted, shared: Sighted, width: int) -> Sighted:
     """Observations without those of points that are observed anew among the shared ones."""
     from scipy.spatial import KDTree
 
-    radius, tracks = _SAME_POINT_PX * 2 * np.pi / width, base.tracks
+    radius, tracks = 1.5 * 2 * np.pi / width, base.tracks  # a pixel and a half of a panorama
     near = np.zeros(len(base.aligned), bool)
     for f in range(len(base.keypoints.starts) - 1):
         there = shared.keypoints.bearings_of(f)
@@ -485,5 +485,5 @@ def _without_same(base: Sighted, shared: Sighted, width: int) -> Sighted:
     same = np.bincount(
         tracks.points, near[base.keypoints.rows(tracks)], minlength=tracks.num_points
     )
-    left = same < _MIN_SAME_SHARE * np.maximum(lengths, 1)
+    left = same < 0.5 * np.maximum(lengths, 1)
     return replace(base, tracks=tracks.of(left))

@@ -165,7 +165,15 @@ def _report(state: State, result: Reconstruction) -> dict[str, Any]:
     report = build_report(run.settings, run.frames, coarse, result, stages, gauge, found)
     report["families"] = of_families
     if len(run.frames.formats) > 1:
-        report["cameras"] = _of_cameras(state, result)
+        frames = state.run.frames
+        every = list[dict[str, Any]]()
+        for number, kind in enumerate(frames.formats):
+            rows = frames.recordings.items()
+            recordings = [name for name, own in rows if frames.cameras[own[0]] == number]
+            content = {"recordings": recordings, "layout": kind.layout}
+            content |= {"width": kind.width, "height": kind.height}
+            every.append(content | {"lenses": plain(_of_camera(state, result, number)[0])})
+        report["cameras"] = every
     report["residual_sphere"] = plain(residual_sphere(result), digits=4)
     return report
 
@@ -231,18 +239,6 @@ def _of_camera(
         content["lenses"], of_raw = of_lenses(found.lenses, found.calibrated, known)
         notes += of_raw
     return content, notes
-
-
-def _of_cameras(state: State, result: Reconstruction) -> list[dict[str, Any]]:
-    frames = state.run.frames
-    every = list[dict[str, Any]]()
-    for number, kind in enumerate(frames.formats):
-        rows = frames.recordings.items()
-        recordings = [name for name, own in rows if frames.cameras[own[0]] == number]
-        content = {"recordings": recordings, "layout": kind.layout}
-        content |= {"width": kind.width, "height": kind.height}
-        every.append(content | {"lenses": plain(_of_camera(state, result, number)[0])})
-    return every
 
 
 def _gauge(run: Run, prior: Prior) -> str:

@@ -15,9 +15,6 @@ from gsba.types import Keypoints, Sighted, Solution
 
 logger = logging.getLogger(__name__)
 
-_SETTLED_SIGMAS = 1.0  # rms motion of steps by a round, below which rounds end
-_MIN_ROUNDS = 2  # of patches that face their hosts, and of patches that lie on their surfaces
-
 
 def align(state: State) -> State:
     """Align patches and adjust in rounds, until steps move by less than their noise."""
@@ -39,7 +36,29 @@ def _round(state: State, number: int) -> State:
         return state
     # Alignments of the gyro to camera estimates within a round are let go: `align` makes the next
     # one from the poses of the whole round.
-    return _straighten(replace(better, prior=state.prior), sighted, number)
+    state = replace(better, prior=state.prior)
+    run, map_, settings = state.run, state.map, state.run.settings
+    looked_for = number == 1 or map_.field
+    stitched = len(run.frames.formats) == 1 and run.frames.format.layout in ("erp", "eac")
+    if settings.stitching.mode == "off" or not stitched or not looked_for:
+        return state
+
+    def compute() -> Stitching:
+        context, solution = state.adjustment_context(), map_.solution
+        return stitching.estimate(
+            sighted, map_.observed, solution, map_.field, context, map_.lenses
+        )
+
+    key = [run.solving_key(), settings.stitching, settings.rounds.aligned]
+    found = run.stage(f"stitching{number}", key, compute, Stitching)
+    if not found.field:
+        return replace(state, map=replace(map_, stitching=found))
+    if not found.adjustment.carries(map_.solution, MIN_OBSERVATIONS):
+        return state
+    if map_.stitching is not None:  # its gain is measured against no field
+        found = replace(found, part_gains=map_.stitching.part_gains)
+    map_ = replace(map_, solution=found.adjustment, observed=found.keypoints, stitching=found)
+    return replace(state, map=map_)
 
 
 def _adjust_under_lenses(state: State, sighted: Sighted, number: int) -> State | None:
@@ -110,34 +129,10 @@ def carried(state: State, sighted: Sighted, solved: Solution, keypoints: Keypoin
     return replace(state, map=map_)
 
 
-def _straighten(state: State, sighted: Sighted, number: int) -> State:
-    run, map_, settings = state.run, state.map, state.run.settings
-    looked_for = number == 1 or map_.field
-    stitched = len(run.frames.formats) == 1 and run.frames.format.layout in ("erp", "eac")
-    if settings.stitching.mode == "off" or not stitched or not looked_for:
-        return state
-
-    def compute() -> Stitching:
-        context, solution = state.adjustment_context(), map_.solution
-        return stitching.estimate(
-            sighted, map_.observed, solution, map_.field, context, map_.lenses
-        )
-
-    key = [run.solving_key(), settings.stitching, settings.rounds.aligned]
-    found = run.stage(f"stitching{number}", key, compute, Stitching)
-    if not found.field:
-        return replace(state, map=replace(map_, stitching=found))
-    if not found.adjustment.carries(map_.solution, MIN_OBSERVATIONS):
-        return state
-    if map_.stitching is not None:  # its gain is measured against no field
-        found = replace(found, part_gains=map_.stitching.part_gains)
-    map_ = replace(map_, solution=found.adjustment, observed=found.keypoints, stitching=found)
-    return replace(state, map=map_)
-
-
 def is_settled(before: State, state: State, number: int) -> bool:
     """True if the last round (`number` is the next) moved steps by less than their noise."""
-    if number <= _MIN_ROUNDS:
+    # rounds of patches that face their hosts, and of patches that lie on their surfaces
+    if number <= 2:
         return False
     run, prior, solution = state.run, state.prior, state.solution
 
@@ -149,4 +144,4 @@ def is_settled(before: State, state: State, number: int) -> bool:
 
     moved = run.stage(f"settled_aligned{number}", run.solving_key(), compute, float)
     logger.info("aligned %d times, steps moved by %.2f sigma", number - 1, moved)
-    return not moved > _SETTLED_SIGMAS
+    return not moved > 1.0

@@ -16,8 +16,6 @@ from gsba.trajectory.joining import SegmentAlignment
 from gsba.trajectory.judgement import StepChecks
 from gsba.types import CoarsePoses, GyroConstraints, PoseSource, Solution
 
-_MIN_DEFINING_POSES = 3  # of a recording's trajectory, that define the world of a map
-
 
 @dataclass(frozen=True, slots=True)
 class Prior:
@@ -111,7 +109,7 @@ class Prior:
                 rows = rows[rows < begin + one.joints[0].first]
             for number in np.unique(maps[rows]).tolist():
                 own = rows[maps[rows] == number]
-                if len(own) >= _MIN_DEFINING_POSES and not defining[maps == number].any():
+                if len(own) >= 3 and not defining[maps == number].any():
                     poses[own], defining[own] = one.coarse.world_T_rigs[own - begin], True
             begin += len(one.coarse.sources)
         others = np.isin(maps, maps[defining]) & ~defining

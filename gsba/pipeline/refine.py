@@ -48,7 +48,6 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-_MAX_PASSES = 3  # over raw pairs, from the pictures
 
 __all__ = ["RunResult", "refine", "solve"]
 
@@ -154,7 +153,17 @@ def refine_from(
     compile_ahead("refine")
     warn_of_repeats(start.frames)
     if walk is not None:
-        start = _with_fetched(store, settings, chosen, given, start, source, walk)
+        # The start with more frames of a video where the map of features is weak
+        if start.coarse.segments is not None:
+            acceptance.refuse_vehicle_in_pieces(_begin(store, settings, chosen, start).frames)
+
+        def measure(some: FrameSet) -> Prior:
+            run = _begin(store, settings, chosen, Start.of(some, given, settings))
+            return _map_features(frontend.extract(run)).prior
+
+        frames = start.frames
+        whole = densify.fetch_where_weak(store, source, walk, frames, settings, measure)
+        start = start if whole is frames else Start.of(whole, given, settings)
     state, result = _solve_or_turn(_begin(store, settings, chosen, start), walk is not None)
     lenses = camera.keep_lenses(state, result)
     finished_run.keep(state)
@@ -183,28 +192,6 @@ def _solve_or_turn(run: Run, followed: bool) -> tuple[State, Reconstruction]:
     result = backend.reconstruct(turn)
     acceptance.require_motion(run.frames, result)  # a vehicle seems to turn on the spot
     return turn, result
-
-
-def _with_fetched(
-    store: RunStore,
-    settings: RefineSettings,
-    chosen: merging.Choice,
-    given: Evidence,
-    start: Start,
-    video_file: Path,
-    walk: Odometry,
-) -> Start:
-    """The start with more frames of a video where the map of features is weak."""
-    if start.coarse.segments is not None:
-        acceptance.refuse_vehicle_in_pieces(_begin(store, settings, chosen, start).frames)
-
-    def measure(some: FrameSet) -> Prior:
-        run = _begin(store, settings, chosen, Start.of(some, given, settings))
-        return _map_features(frontend.extract(run)).prior
-
-    frames = start.frames
-    whole = densify.fetch_where_weak(store, video_file, walk, frames, settings, measure)
-    return start if whole is frames else Start.of(whole, given, settings)
 
 
 def _begin(store: RunStore, settings: RefineSettings, chosen: merging.Choice, start: Start) -> Run:
@@ -250,14 +237,21 @@ def _solve_raw(run: Run) -> State:
             try:
                 state = solve(frontend.extract(run))
             except TurnedAboutForwardError as error:
-                better = _in_axes_of_trajectory(frames, error, first=n == 0)
+                lenses = frames.formats[0].fisheyes
+                if n or len(frames.formats) > 1 or lenses is None:
+                    raise
+                logger.info(
+                    "raw pictures are turned against the trajectory about its forward axis: "
+                    "cut anew"
+                )
+                better = ((turned(lenses, error.ours_R_theirs), False),)
             else:
                 unseen = int(state.prior.trust.unseen_steps.sum())
                 if best is not None and unseen > best[1]:
                     logger.info("frames cut anew match at fewer steps: the pass before is kept")
                     run.store.stage(f"recut{n - 1}_undone", known, lambda: True, bool, best[0])
                     return best[2]
-                best, last = (after, unseen, state), bool(kept) or n == _MAX_PASSES - 1
+                best, last = (after, unseen, state), bool(kept) or n == 2
                 better = None if last else camera.better_calibration(run.coarse, state.map)
                 if better is None:
                     return state
@@ -276,17 +270,6 @@ def _solve_raw(run: Run) -> State:
         )
         frames = merging.recut(run.store, frames, n)
         run = Run.begin(run.store, frames, run.coarse, run.settings, evidence, again, found)
-
-
-def _in_axes_of_trajectory(
-    frames: FrameSet, error: TurnedAboutForwardError, first: bool
-) -> camera.Cuts:
-    """Lenses by which raw frames of one camera are cut as upright as the trajectory is."""
-    lenses = frames.formats[0].fisheyes
-    if not first or len(frames.formats) > 1 or lenses is None:
-        raise error
-    logger.info("raw pictures are turned against the trajectory about its forward axis: cut anew")
-    return ((turned(lenses, error.ours_R_theirs), False),)
 
 
 def solve(state: State) -> State:

@@ -27,7 +27,6 @@ T = TypeVar("T")
 
 _NOMINAL_DEG = 0.5  # that epipolar planes of neighbours are off, at least, while lenses of unknown
 # make are taken for plain ones: 5 % of what pictures move by between them
-_NOMINAL_PIXELS = 2.0  # the same, pixels
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,12 +112,9 @@ class Run:
         journal: Journal | None = None,
         lenses_found: tuple[bool, ...] = (),
     ) -> "Run":
-        """Start a run, or take it up, on these frames and poses.
-
-        Raises:
-            GsbaError: frames that a chosen family cannot use, a family with a name of gsba's own,
-                none that observes points, or weights that are not there.
-        """
+        """Start a run, or take it up, on these frames and poses. Raises GsbaError: frames that a
+        chosen family cannot use, a family with a name of gsba's own, none that observes points, or
+        weights that are not there."""
         direct.check(frames, settings)
         if settings.camera.model == "two_lens" and not all(
             kind.panoramic for kind in frames.formats
@@ -221,7 +217,7 @@ class Run:
         for kind in self.frames.formats:
             if kind.fisheyes is not None:
                 focal = min(lens.focal for lens in kind.fisheyes)
-                pixels = _NOMINAL_PIXELS if kind.lenses_nominal else 1.0
+                pixels = 2.0 if kind.lenses_nominal else 1.0
                 least = max(float(np.rad2deg(pixels / focal)), _NOMINAL_DEG * kind.lenses_nominal)
                 widest = max(widest, least / own)
         return self.settings if widest == 1.0 else self.settings.with_gates(widest)

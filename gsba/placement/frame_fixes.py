@@ -2,7 +2,6 @@
 
 import logging
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,13 +13,12 @@ from gsba.frames.exif import GpsTag, read_exif
 from gsba.frames.recordings import own_timestamps
 from gsba.log import GsbaError, track
 from gsba.placement.gps import GpsFixes, fixes_of, local_from_geodetic, read_gps, sigmas_of
-from gsba.placement.gps_video import is_recording, read_video_gps
+from gsba.placement.gps_video import RECORDINGS, read_video_gps
 from gsba.types import FrameSet
 
 logger = logging.getLogger(__name__)
 
 EXIF = "exif"  # in place of a file: positions in the EXIF data of the images
-_ACCELERATION = 1.0  # m/s^2, of pedestrians: bounds the deviation from the line between fixes
 MIN_FIXES = 3
 
 
@@ -31,8 +29,12 @@ def read_exif_gps(frames: FrameSet, settings: GpsSettings | None = None) -> GpsF
     found: dict[str, GpsTag] = {}
     taken, damaged = set[tuple[float, float, float]](), 0
     for name, paths in zip(frames.names, track(frames.paths, "reading EXIF"), strict=True):
-        tag, failed = _first_tag(paths)
-        damaged += failed
+        tag = None
+        for path in paths:  # the first image of the frame that has a position
+            try:
+                tag = tag or read_exif(path).gps
+            except ValueError:
+                damaged += 1
         if tag is None:
             continue
         known = tag.latitude, tag.longitude, tag.unix_time
@@ -55,20 +57,6 @@ def read_exif_gps(frames: FrameSet, settings: GpsSettings | None = None) -> GpsF
     return fixes
 
 
-def _first_tag(paths: Sequence[Path]) -> tuple[GpsTag | None, int]:
-    """Position of the first image of a frame that has one, and the number of damaged images."""
-    damaged = 0
-    for path in paths:
-        try:
-            tag = read_exif(path).gps
-        except ValueError:
-            damaged += 1
-            continue
-        if tag is not None:
-            return tag, damaged
-    return None, damaged
-
-
 def read_fixes(
     source: str, frames: FrameSet | None = None, settings: GpsSettings | None = None
 ) -> GpsFixes | None:
@@ -76,8 +64,8 @@ def read_fixes(
     None where these are not known yet. GsbaError names the line that cannot be read."""
     if source == EXIF:
         return None if frames is None else read_exif_gps(frames, settings)
-    path = Path(source)
-    return read_video_gps(path, settings) if is_recording(path) else read_gps(path, settings)
+    read = read_video_gps if Path(source).suffix.lower() in RECORDINGS else read_gps
+    return read(Path(source), settings)
 
 
 def fixes_of_frames(
@@ -181,7 +169,8 @@ def _between(
         return columns[before] + part[:, None] * (columns[after] - columns[before])
 
     noise = mixed(fixes.sigmas)
-    stray = _ACCELERATION * gaps**2 / 2 * part * (1 - part)
+    # Pedestrians accelerate by 1 m/s^2: this bounds the deviation from the line between fixes.
+    stray = gaps**2 / 2 * part * (1 - part)
     near = stray <= noise[:, 0]
     total = np.hypot(noise, stray[:, None])
     return inside[near], mixed(fixes.geodetic)[near], total[near]

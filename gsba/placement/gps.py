@@ -17,9 +17,6 @@ from gsba.log import GsbaError, brief
 
 _A, _F = 6_378_137.0, 1 / 298.257223563  # WGS 84: semi-major axis in metres, flattening
 _E2 = _F * (2 - _F)  # squared eccentricity
-_MAX_ALTITUDE_M = 1e6  # no receiver works higher up
-_MIN_ALTITUDES = 3  # with so many known altitudes, fixes without one are left out
-_UNKNOWN_HEIGHT_SIGMA_M = 20.0  # of heights that are set to 0, as no altitudes are known
 _COLUMNS = {
     "name": ("name", "frame", "image", "file", "filename"),
     "time": ("time", "timestamp", "t", "seconds"),
@@ -68,10 +65,10 @@ def fixes_of(
     if not named:
         order = np.argsort(np.array(keys, np.float64), kind="stable")
     high = np.isfinite(geodetic[order, 2])
-    if high.all() or high.sum() >= _MIN_ALTITUDES:
+    if high.all() or high.sum() >= 3:
         order = order[high]
     else:
-        geodetic[:, 2], sigmas[:, 2] = 0.0, np.maximum(sigmas[:, 2], _UNKNOWN_HEIGHT_SIGMA_M)
+        geodetic[:, 2], sigmas[:, 2] = 0.0, np.maximum(sigmas[:, 2], 20.0)  # no altitudes are known
     geodetic, sigmas = geodetic[order], sigmas[order]
     geodetic[:, 1] = np.unwrap(geodetic[:, 1], period=360)  # no jump at the date line
     if named:
@@ -119,10 +116,8 @@ def read_gps(path: Path, settings: GpsSettings | None = None) -> GpsFixes:
     frame's name or the time in seconds on the frames' clock, and the noise of fixes: `hdop`,
     `vdop`, `pdop`, or `sigma`, `accuracy` and `sigma_up` in metres. Times of a GPX track are UTC
     and become Unix time; its `hdop`, `vdop` and `pdop` are read. Points that share a whole second
-    are spread over it. The settings' offset is added to all times.
-
-    Raises:
-        GsbaError: a line cannot be used; the message names it.
+    are spread over it. The settings' offset is added to all times. Raises GsbaError: a line cannot
+    be used; the message names it.
     """
     path, settings = Path(path), settings or GpsSettings()
     lines = read_lines(path)
@@ -264,7 +259,8 @@ def _position(latitude: str, longitude: str, altitude: str | None, place: str) -
             f"{place}: latitude {values[0]}, longitude {values[1]} are out of range (degrees)"
         )
     values.append(_number(altitude, "altitude", place) if altitude else math.nan)
-    if abs(values[2]) > _MAX_ALTITUDE_M:
+    # no receiver works higher up
+    if abs(values[2]) > 1e6:
         raise GsbaError(f"{place}: altitude {values[2]:g} is out of range (metres)")
     return values
 

@@ -17,8 +17,6 @@ from gsba.similarity import (
 
 _MAX_ROUNDS, _MAX_STEPS = 20, 20  # selections of inliers, and Gauss-Newton steps in each
 _MIN_STEP = 1e-10  # in units of the unknowns' own scale; a smaller one ends the fit
-_LEVEL_UNKNOWNS = (0, 3, 4, 5, 6)  # unknowns that are free if up is known
-_ALL_UNKNOWNS = tuple(range(7))
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +76,7 @@ def fit_fixes(
     limits = fixes.tolerances(), MAX_DRIFT_SHARE
     fit, used, _ = robust_similarity(positions, fixes.positions, solve, num, *limits)
     centre = positions[used].mean(axis=0)
-    free = _ALL_UNKNOWNS if up_sigma is None else _LEVEL_UNKNOWNS
+    free = tuple(range(7)) if up_sigma is None else (0, 3, 4, 5, 6)  # no tilt if up is known
     information = np.zeros((7, 7))
     for _ in range(_MAX_ROUNDS):
         fit, information = _most_probable(fit, positions, fixes, used, centre, free, scale)

@@ -9,25 +9,17 @@ from typing import Any
 import numpy as np
 
 from gsba.config import GpsSettings
-from gsba.containers.insta360 import GpsRecord, read_trailer
+from gsba.containers.insta360 import read_trailer
 from gsba.containers.telemetry import ask_telemetry_parser
 from gsba.log import GsbaError
 from gsba.placement.gps import GpsFixes, fixes_of, sigmas_of
 
-_RECORDINGS = (".360", ".insv", ".lrv", ".mov", ".mp4", ".osv")
+RECORDINGS = (".360", ".insv", ".lrv", ".mov", ".mp4", ".osv")
 _FIX, _DOP, _UTC = "0x47505346", "0x47505350", "0x47505355"  # GPSF, GPSP (DOP * 100), GPSU (ms)
 _GPS9 = "0x47505339"
-_GPS9_HEADER = 8  # bytes of key, type, size and repeat before its records
 _GPS9_RECORD = np.dtype([("values", ">i4", 7), ("dop", ">u2"), ("fix", ">u2")])
 _FIX_2D, _FIX_3D = 2, 3  # states of the receiver: position without and with an altitude
 _DAY_S = 86_400.0
-_PACKET_S = 1.0  # duration of the packet, if a video has only one
-_FIRST_FIX_S = -5.0, 3600.0  # earliest and latest plausible first fix after the recording began
-
-
-def is_recording(path: Path) -> bool:
-    """True if the file's suffix is that of a video."""
-    return path.suffix.lower() in _RECORDINGS
 
 
 def read_video_gps(path: Path, settings: GpsSettings | None = None) -> GpsFixes:
@@ -38,17 +30,11 @@ def read_video_gps(path: Path, settings: GpsSettings | None = None) -> GpsFixes:
         return _of_gopro(path, settings)
     if trailer.gps is None:
         raise GsbaError(f"{path}: its Insta360 trailer holds no GPS; give positions as CSV or GPX")
-    return _of_insta360(trailer.gps, trailer.created_unix_s, settings)
-
-
-def _of_insta360(
-    record: GpsRecord, created_unix_s: float | None, settings: GpsSettings | None
-) -> GpsFixes:
-    """Fixes with times since the recording's creation, or the first fix if that is implausible."""
+    # Fixes with times since the recording's creation, or the first fix if that is implausible
+    record, created_unix_s = trailer.gps, trailer.created_unix_s
     begin = float(record.unix_times[0])
-    if created_unix_s is not None:
-        low, high = _FIRST_FIX_S
-        begin = created_unix_s if low <= begin - created_unix_s <= high else begin
+    if created_unix_s is not None and -5.0 <= begin - created_unix_s <= 3600.0:
+        begin = created_unix_s
     geodetic = np.column_stack([record.latitudes, record.longitudes, record.altitudes])
     return fixes_of(record.unix_times - begin, geodetic, settings=settings)
 
@@ -74,7 +60,7 @@ def _of_gopro(path: Path, settings: GpsSettings | None) -> GpsFixes:
             "positions as CSV or GPX"
         )
     lengths = np.diff(starts)
-    lengths = np.append(lengths, lengths[-1] if len(lengths) else _PACKET_S)
+    lengths = np.append(lengths, lengths[-1] if len(lengths) else 1.0)
     times = np.concatenate(
         [
             start + length * np.arange(len(rows)) / max(len(rows), 1)
@@ -102,7 +88,7 @@ def _packet(groups: Mapping[str, Mapping[str, Any]]) -> tuple[float, np.ndarray]
     try:
         scale = np.array(tags["Scale"], np.float64)
         if _GPS9 in tags:
-            raw = bytes(tags[_GPS9])[_GPS9_HEADER:]
+            raw = bytes(tags[_GPS9])[8:]  # bytes of key, type, size and repeat
             size = _GPS9_RECORD.itemsize
             found = np.frombuffer(raw[: len(raw) // size * size], _GPS9_RECORD)
             rows = found["values"] / scale[:7]

@@ -16,16 +16,8 @@ logger = logging.getLogger(__name__)
 
 _MAX_FRAMES = 24  # frames in which edges are detected
 _FACE_PX = 640
-_MIN_LENGTH_PX = 40.0  # of an edge
-_GATES_DEG = (8.0, 4.0, 2.0, 1.0, 0.6)  # successive gates of edges around the vertical
-_MIN_EDGES = 40  # within the last gate; with fewer, edges are not used
 _MIN_SPREAD = 0.1  # of the edges' directions around the vertical: 0 = all in one plane, 1 = even
-_MAX_RIG_ANGLE_DEG = 10.0  # largest angle of the edges' vertical to the rigs' up axis
 _MAX_SPREAD_DEG = 30.0  # of the rigs' up axes; above it, they have no common axis
-_MAX_FORCE_ANGLE_DEG = 2.0  # largest angle of the edges' vertical to the accelerometer's
-_MIN_TAGGED = 3  # frames
-_MAX_TAG_ANGLE_DEG = 4.0  # largest angle of the edges' vertical to that of GPano tags
-_MAX_TAG_SPREAD_DEG = 4.0  # of the up axes by tags; above it, they contradict the poses
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,11 +67,11 @@ def estimate_gravity(reconstruction: Reconstruction, frames: FrameSet) -> Gravit
     chosen = good[np.unique(np.linspace(0, len(good) - 1, _MAX_FRAMES).astype(int))]
     found = [_edge_normals(frames, int(f), reconstruction.world_T_rigs[f]) for f in chosen]
     normals, weights = (np.concatenate(part) for part in zip(*found, strict=True))
-    start, most, source = by_rigs, _MAX_RIG_ANGLE_DEG, "the rigs' up axis"
+    start, most, source = by_rigs, 10.0, "the rigs' up axis"
     if forces is not None:
-        start, most, source = forces, _MAX_FORCE_ANGLE_DEG, "the accelerometer"
+        start, most, source = forces, 2.0, "the accelerometer"
     elif tags is not None:
-        start, most, source = tags, _MAX_TAG_ANGLE_DEG, "the GPano tags"
+        start, most, source = tags, 4.0, "the GPano tags"
     up, num_edges = _level_axis(normals, weights, start)
     gravity = Gravity(up, by_rigs, spread, num_edges, forces, tags)
     if (off := _degrees(up, start)) > most:
@@ -108,7 +100,7 @@ def _up_by_tags(
     """
     angles = np.radians([_tilt_deg(frames, f) for f in good.tolist()])
     known = np.isfinite(angles).all(axis=1)
-    if np.count_nonzero(known) < _MIN_TAGGED or not np.ptp(angles[known], axis=0).any():
+    if np.count_nonzero(known) < 3 or not np.ptp(angles[known], axis=0).any():
         return None
     (pitch, roll), found = angles[known].T, []
     for ahead, aside in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
@@ -123,7 +115,7 @@ def _up_by_tags(
         up = median_direction(ups)
         found.append((float(np.degrees(np.median(np.arccos(np.clip(ups @ up, -1, 1))))), up))
     off, up = min(found, key=lambda one: one[0])
-    return up if off < min(spread_deg, _MAX_TAG_SPREAD_DEG) else None
+    return up if off < min(spread_deg, 4.0) else None  # above it, they contradict the poses
 
 
 def _tilt_deg(frames: FrameSet, f: int) -> tuple[float, float]:
@@ -153,9 +145,7 @@ def _edge_normals(
         if lines is None:
             continue
         ends = lines.reshape(-1, 2, 2).astype(np.float64) + 0.5
-        long = (
-            np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) >= _MIN_LENGTH_PX * rig.size / _FACE_PX
-        )
+        long = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) >= 40.0 * rig.size / _FACE_PX
         if masks is not None:
             middle = np.clip(ends.mean(axis=1).astype(int), 0, rig.size - 1)
             long &= masks[face][middle[:, 1], middle[:, 0]]
@@ -172,10 +162,10 @@ def _level_axis(
 ) -> tuple[np.ndarray, int]:
     """Axis (3,) near `start` perpendicular to most normals, and their number; 0 = `start`."""
     up, near = start, np.zeros(len(normals), bool)
-    for gate in _GATES_DEG:
+    for gate in (8.0, 4.0, 2.0, 1.0, 0.6):
         for _ in range(5):
             near = np.abs(normals @ up) < np.sin(np.deg2rad(gate))
-            if near.sum() < _MIN_EDGES:
+            if near.sum() < 40:
                 return start, 0
             weighted = normals[near] * weights[near, None]
             values, axes = np.linalg.eigh(weighted.T @ weighted)

@@ -34,18 +34,13 @@ from gsba.types import FrameSet, PoseStatus, Reconstruction, Trajectory
 logger = logging.getLogger(__name__)
 
 _UP_WORLD = np.array([0.0, -1.0, 0.0])  # up of an upright world, whose y points down
-UPS = {"z": np.array([0.0, 0, 1]), "y": np.array([0.0, 1, 0])}  # up axes of scans
 _TOLERANCE_S = 0.02  # largest time from a frame to its true pose
 _SCALE_RANGE = (1e-12, 1e12)  # of a placed run; others come from wrong input
 _MAX_COORDINATE = 1e12  # in the placed unit
 _MAX_LENS_SCALE_SIGMA = 0.1  # relative, of a scale by the lenses
-_MAX_GPS_SCALE_SIGMA = 0.3  # relative, of a scale by GPS
 _MAX_GPS_ANGLE_SIGMA_DEG = 25.0  # of heading and tilt by GPS
 _MAX_SCALE_SIGMAS = 4.0  # of two scales that agree: true ones differ by more once in 16,000 runs
 _NUM_NAMED = 5  # false positions that a message names
-_SIGMA_BY_EDGES_DEG = 0.2  # of a vertical by edges, see docs/gyro.md
-_SIGMA_BY_FORCES_DEG = 0.5  # of a vertical by an accelerometer, for its bias
-_SIGMA_BY_RIGS_DEG = 3.0  # of a vertical by the rigs' up axes
 _MIN_EXTENT_RATIO = 0.02  # of a path's second extent to its first: less determines no roll
 
 
@@ -97,7 +92,16 @@ def _placement(
     if settings.align is not None:
         return _aligned(reconstruction, frames, Path(settings.align))
     if settings.scan is not None:
-        return _in_scan(reconstruction, frames, settings)
+        path = Path(settings.scan)
+        scan = read_scan(path)
+        guess, grounds = guess_in_scan(reconstruction, frames, settings, scan)
+        with in_file(path):
+            found = register(cloud_of(reconstruction, normals_of), scan, guess)
+        logger.info("--align-scan %s: %s", path, found)
+        grounds |= {"scan": {"file": str(path), **found.to_json()}}
+        up = upwards(path) if settings.up == "auto" else None
+        unit = "units of the scan"
+        return Placement(found.fit.similarity, unit, up, scan.offset, grounds=grounds)
     placement = Placement()
     if settings.up == "auto":
         placement = _upright(reconstruction, frames)
@@ -109,7 +113,19 @@ def _placement(
             placement = dataclasses.replace(placement, grounds=grounds)
         return _on_earth(reconstruction, frames, settings.gps, placement, scale, gps)
     if settings.length == "lens":
-        return _by_lenses(reconstruction, baseline, placement)
+        (scale, sigma), grounds = _scale_by_lenses(reconstruction, baseline)
+        if not sigma < _MAX_LENS_SCALE_SIGMA * scale:
+            raise GsbaError(
+                "--scale lens: the scale by the distance between the lenses has a sigma of "
+                f"{100 * sigma / scale:.0f} %; less than {100 * _MAX_LENS_SCALE_SIGMA:.0f} % is "
+                "needed: scale it by --scale LENGTH --between A B"
+            )
+        return dataclasses.replace(
+            placement,
+            similarity=dataclasses.replace(placement.similarity, scale=scale),
+            unit="m",
+            grounds={**placement.grounds, "lens": grounds},
+        )
     if settings.length is not None and settings.between is not None:
         first, second = (_point(end, reconstruction, frames) for end in settings.between)
         distance = float(np.linalg.norm(second - first))
@@ -202,24 +218,6 @@ def _scale_by_lenses(
     return (scale, sigma), {"baseline_m": baseline[0], "scale_sigma": sigma}
 
 
-def _by_lenses(
-    reconstruction: Reconstruction, baseline: tuple[float, float] | None, placement: Placement
-) -> Placement:
-    (scale, sigma), grounds = _scale_by_lenses(reconstruction, baseline)
-    if not sigma < _MAX_LENS_SCALE_SIGMA * scale:
-        raise GsbaError(
-            "--scale lens: the scale by the distance between the lenses has a sigma of "
-            f"{100 * sigma / scale:.0f} %; less than {100 * _MAX_LENS_SCALE_SIGMA:.0f} % is "
-            "needed: scale it by --scale LENGTH --between A B"
-        )
-    return dataclasses.replace(
-        placement,
-        similarity=dataclasses.replace(placement.similarity, scale=scale),
-        unit="m",
-        grounds={**placement.grounds, "lens": grounds},
-    )
-
-
 def _least_turn(source: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Smallest rotation (3, 3) that maps one unit vector to another."""
     axis, cosine = np.cross(source, target), float(source @ target)
@@ -268,7 +266,12 @@ def _on_earth(
     positions, level, up_sigma = reconstruction.world_T_rigs[fixes.frames, :3, 3], np.eye(3), None
     if upright.up is not None:
         level = _least_turn(_UP_WORLD, np.array([0.0, 0, 1])) @ upright.similarity.rotation
-        up_sigma = _up_sigma(upright)
+        gravity, degrees = upright.grounds.get("gravity", {}), 3.0  # by the rigs' up axes
+        if gravity.get("vertical_edges"):
+            degrees = 0.2  # see docs/gyro.md
+        elif "edges_to_accelerometer_deg" in gravity:
+            degrees = 0.5  # for the accelerometer's bias
+        up_sigma = float(np.radians(degrees))
     elif extents(positions)[1] <= _MIN_EXTENT_RATIO:
         raise GsbaError(
             f"{path}: the frames lie on a line, which determines no roll: add --up auto"
@@ -283,7 +286,21 @@ def _on_earth(
     if scale is not None:
         _require_one_scale(path, positions @ level.T, fixes, up_sigma, scale)
     fit = dataclasses.replace(found.similarity, rotation=found.similarity.rotation @ level)
-    grounds = {**upright.grounds, "gps": {"file": str(path), **_claims(found, positions @ level.T)}}
+    sigmas = found.position_sigmas(positions @ level.T)
+    grounds = {
+        **upright.grounds,
+        "gps": {
+            "file": str(path),
+            "fixes": len(found.used),
+            "outliers": int(np.sum(~found.used)),
+            "rmse_m": found.rms_m,
+            "misfit": found.misfit,
+            "scale_sigma": found.scale_sigma * found.similarity.scale,
+            "heading_sigma_deg": float(np.degrees(found.heading_sigma)),
+            "tilt_sigma_deg": float(np.degrees(found.tilt_sigma)),
+            "position_sigma_m": np.median(sigmas, axis=0).tolist(),  # east, north and up
+        },
+    }
     logger.info(
         "--gps %s: %d of %d positions are inliers, with an RMS residual of %.3g m, at latitude "
         "%.5f, longitude %.5f; sigmas: scale %.2g %%, heading %.2g degrees, tilt %.2g degrees, "
@@ -343,26 +360,12 @@ def _require_one_scale(
         )
 
 
-def _claims(found: GpsFit, positions: np.ndarray) -> dict[str, Any]:
-    """Entries of transform.json on a fit; position sigmas are medians, east, north and up."""
-    return {
-        "fixes": len(found.used),
-        "outliers": int(np.sum(~found.used)),
-        "rmse_m": found.rms_m,
-        "misfit": found.misfit,
-        "scale_sigma": found.scale_sigma * found.similarity.scale,
-        "heading_sigma_deg": float(np.degrees(found.heading_sigma)),
-        "tilt_sigma_deg": float(np.degrees(found.tilt_sigma)),
-        "position_sigma_m": np.median(found.position_sigmas(positions), axis=0).tolist(),
-    }
-
-
 def _require_determined(path: Path, found: GpsFit, fixes: FrameFixes) -> None:
     """Raise GsbaError if the fixes do not determine scale, heading or tilt."""
     extent = float(np.linalg.norm(np.ptp(fixes.positions[found.used], axis=0)[:2]))
     noise = float(np.median(fixes.sigmas[:, 0]))
     known = f"they spread over {extent:.3g} m with a sigma of {noise:.2g} m"
-    if not found.scale_sigma < _MAX_GPS_SCALE_SIGMA:
+    if not found.scale_sigma < 0.3:
         raise GsbaError(
             f"{path}: its positions determine the scale only to {100 * found.scale_sigma:.0f} % "
             f"({known}): add --scale lens, or place the run by --scale LENGTH --between A B"
@@ -378,18 +381,6 @@ def _require_determined(path: Path, found: GpsFit, fixes: FrameFixes) -> None:
             f"{path}: its positions determine the vertical only to "
             f"{np.degrees(found.tilt_sigma):.0f} degrees: add --up auto"
         )
-
-
-def _up_sigma(upright: Placement) -> float:
-    """Standard deviation of the vertical, radians, by the data that determined it."""
-    gravity = upright.grounds.get("gravity", {})
-    if gravity.get("vertical_edges"):
-        degrees = _SIGMA_BY_EDGES_DEG
-    elif "edges_to_accelerometer_deg" in gravity:
-        degrees = _SIGMA_BY_FORCES_DEG
-    else:
-        degrees = _SIGMA_BY_RIGS_DEG
-    return float(np.radians(degrees))
 
 
 def _aligned(reconstruction: Reconstruction, frames: FrameSet, path: Path) -> Placement:
@@ -426,30 +417,13 @@ def _aligned(reconstruction: Reconstruction, frames: FrameSet, path: Path) -> Pl
     return Placement(fit, unit=unit, grounds={"align": grounds})
 
 
-def _in_scan(
-    reconstruction: Reconstruction, frames: FrameSet, settings: PlacementSettings
-) -> Placement:
-    """Placement in the world of a scan; `pairs`, `gps` or `up` start the alignment."""
-    assert settings.scan is not None
-    path = Path(settings.scan)
-    scan = read_scan(path)
-    guess, grounds = guess_in_scan(reconstruction, frames, settings, scan)
-    with in_file(path):
-        found = register(cloud_of(reconstruction, normals_of), scan, guess)
-    logger.info("--align-scan %s: %s", path, found)
-    grounds |= {"scan": {"file": str(path), **found.to_json()}}
-    up = upwards(path) if settings.up == "auto" else None
-    unit = "units of the scan"
-    return Placement(found.fit.similarity, unit, up, scan.offset, grounds=grounds)
-
-
 def guess_in_scan(
     reconstruction: Reconstruction, frames: FrameSet, settings: PlacementSettings, scan: Scan
 ) -> tuple[Guess, dict[str, Any]]:
     """Initial guess of a run's placement in a scan, in its world less its offset, by `pairs`, else
     `gps`, else `up`, and entries of transform.json on it. GsbaError if files cannot be used, or
     frames have no common up axis."""
-    axis = UPS[upwards(Path(settings.scan or ""))]
+    axis = np.eye(3)["xyz".index(upwards(Path(settings.scan or "")))]
     if settings.pairs is not None:
         path = Path(settings.pairs)
         ends, target = read_pairs(path)

@@ -14,8 +14,6 @@ from gsba.camera.lens import Lenses, all_centres
 from gsba.config import CameraSettings
 from gsba.placement.placement import metres_per_unit
 
-_MAX_DEVIATION_SIGMAS = 3.0  # of the estimated readout time from the published one
-
 
 def of_camera(
     centres: LensCentres,
@@ -76,11 +74,26 @@ def of_camera(
             notes.append("the lenses rotate relative to the panoramas: a stabiliser was on")
     inverse_stitch_radius = centres.lenses.inverse_stitch_radius
     if radius is not None:
-        content["stitch_radius"] = _stitch_radius_row(radius, inverse_stitch_radius, known, scale)
+        deviation = radius.sigma if known is None else known.inverse_stitch_radius_sigma
+        content["stitch_radius"] = {
+            "taken": not radius.reason,
+            "reason": radius.reason,
+            "inverse": (inverse_stitch_radius or radius.inverse_stitch_radius) / scale,
+            "inverse_sigma": (deviation if inverse_stitch_radius else radius.sigma) / scale,
+            "gain_of_unseen_parts": radius.part_gains,
+        }
     if inverse_stitch_radius:
         notes.append(f"the stitch radius is {scale / inverse_stitch_radius:.3g} map units")
     if readout is not None:
-        content["readout"] = _readout_row(readout, timed)
+        taken = readout.lenses.readout_motion is not None
+        content["readout"] = {
+            "taken": taken,
+            "reason": readout.reason,
+            "ms": 1e3 * readout.readout_s if timed else None,
+            "ms_sigma": 1e3 * readout.readout_sigma if timed else None,
+            "rows_run_along": readout.lenses.row_directions if taken else None,
+            "gain_of_unseen_parts": readout.gains,
+        }
         if timed:
             notes += _readout_notes(readout, settings)
     return content, notes
@@ -136,34 +149,6 @@ def of_lenses(
     return content, notes
 
 
-def _stitch_radius_row(
-    radius: StitchRadius,
-    inverse_stitch_radius: float,
-    known: CameraSigmas | None,
-    scale: float,
-) -> dict[str, Any]:
-    sigma = radius.sigma if known is None else known.inverse_stitch_radius_sigma
-    return {
-        "taken": not radius.reason,
-        "reason": radius.reason,
-        "inverse": (inverse_stitch_radius or radius.inverse_stitch_radius) / scale,
-        "inverse_sigma": (sigma if inverse_stitch_radius else radius.sigma) / scale,
-        "gain_of_unseen_parts": radius.part_gains,
-    }
-
-
-def _readout_row(found: CameraEstimate, timed: bool) -> dict[str, Any]:
-    taken = found.lenses.readout_motion is not None
-    return {
-        "taken": taken,
-        "reason": found.reason,
-        "ms": 1e3 * found.readout_s if timed else None,
-        "ms_sigma": 1e3 * found.readout_sigma if timed else None,
-        "rows_run_along": found.lenses.row_directions if taken else None,
-        "gain_of_unseen_parts": found.gains,
-    }
-
-
 def _readout_notes(found: CameraEstimate, settings: CameraSettings) -> list[str]:
     """Notes on the estimated readout time, and on its deviation from the published one."""
     if found.lenses.readout_motion is None:
@@ -175,7 +160,7 @@ def _readout_notes(found: CameraEstimate, settings: CameraSettings) -> list[str]
     published = settings.readout()
     if published is not None:
         off = abs(found.readout_s - published[0])
-        if off > _MAX_DEVIATION_SIGMAS * np.hypot(found.readout_sigma, published[1]):
+        if off > 3.0 * np.hypot(found.readout_sigma, published[1]):
             notes.append(
                 f"the settings give a readout time of {1e3 * published[0]:g} ms: check the name of "
                 "the camera (--camera)"

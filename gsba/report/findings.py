@@ -186,7 +186,9 @@ def of_frames(
     unrefined = reconstruction.pose_statuses == PoseStatus.UNREFINED
     lost = np.flatnonzero(unrefined & (reconstruction.map_numbers() > 0))
     doubted = np.flatnonzero(frame_weights < 1)
-    weak = _weak_places(reconstruction, max_scale_sigma)
+    poses, joint, weak = reconstruction.world_T_rigs, reconstruction.joint_errors, np.zeros(0, int)
+    if joint is not None and len(poses) >= 3:
+        weak = 1 + np.flatnonzero(scale_sigmas(poses, joint.draws) > max_scale_sigma)
     notes = []
     if absent.all():
         notes.append("started from pairs of frames: the unit of the map is arbitrary")
@@ -211,14 +213,6 @@ def of_frames(
     for note in notes:
         logger.info(note)
     return lists, notes
-
-
-def _weak_places(reconstruction: Reconstruction, max_scale_sigma: float) -> np.ndarray:
-    """Frames at which the ratio of successive baselines is uncertain, after all keypoints."""
-    poses, joint = reconstruction.world_T_rigs, reconstruction.joint_errors
-    if joint is None or len(poses) < 3:
-        return np.zeros(0, np.intp)
-    return 1 + np.flatnonzero(scale_sigmas(poses, joint.draws) > max_scale_sigma)
 
 
 def named(names: Sequence[str], key: str, unit: str = "frames") -> str:

@@ -11,7 +11,6 @@ from gsba.types import FrameSet, PoseStatus, Reconstruction
 MIN_SHARE_IN_ONE_MAP = 0.9  # of a run's frames; a run with fewer in its largest map is partial
 MIN_SHARE_OF_A_MAP = 0.5  # of a run's frames; fewer are no map of the place
 _MAX_SHOWN_SPANS = 3  # spans of a map's frames in a line of the table
-_MAX_SHOWN_REASONS = 5  # of the verdict, on the terminal
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +84,7 @@ def format_outcome(report: Mapping[str, Any], run: object) -> str:
     apart = _apart(summary)
     first = f"{refined} of {frames} frames refined{apart}, {found}: {run}"
     verdict, table = report["verdict"], _table(maps) if len(maps) > 1 else []
-    reasons = [f"- {one['line']}" for one in verdict["reasons"][:_MAX_SHOWN_REASONS]]
+    reasons = [f"- {one['line']}" for one in verdict["reasons"][:5]]
     more = len(verdict["reasons"]) - len(reasons)
     reasons += [f"- {more} more in report.html"] if more > 0 else []
     return "\n".join([first, *table, *reasons, verdict["sentence"]])

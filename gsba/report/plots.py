@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
 
 _TOLERANCE_S = 0.01  # largest time between poses of two runs that correspond
-_MIN_COMMON_POSES = 3  # to align two runs
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +93,7 @@ def _with_errors(shown: Shown, truth: Trajectory) -> Shown:
 def _aligned_to(shown: Shown, first: Shown) -> Sim3 | None:
     """Similarity from a run to the first one; None = they are of different walks."""
     rows, others = matched_in_time(shown.refined, first.refined, _TOLERANCE_S)
-    if len(rows) < _MIN_COMMON_POSES:
+    if len(rows) < 3:
         return None
     try:
         return pose_similarity(shown.refined.world_T_rigs[rows], first.refined.world_T_rigs[others])
@@ -116,7 +115,6 @@ def _names(paths: Sequence[Path]) -> list[str]:
 
 _WIDTH_IN, _ROW_HEIGHT_IN = 7.2, 2.7  # text width of a paper; height of a row of panels
 _MAX_PANELS_PER_ROW = 3
-_MAX_CURVE_POINTS = 2000  # of a cumulative distribution
 
 Fill = Callable[["SubFigure | Figure"], None]
 
@@ -259,7 +257,5 @@ def _residuals(figure: "SubFigure | Figure", shown: Sequence[Shown]) -> None:
 def _shares(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Cumulative distribution: values (P,) ascending, and the share of all that is not larger."""
     ordered = np.sort(values)
-    rows = np.unique(
-        np.linspace(0, len(ordered) - 1, min(len(ordered), _MAX_CURVE_POINTS)).astype(int)
-    )
+    rows = np.unique(np.linspace(0, len(ordered) - 1, min(len(ordered), 2000)).astype(int))
     return ordered[rows], (rows + 1) / max(len(ordered), 1)

@@ -1,6 +1,5 @@
 """report.json and poses.csv: settings, costs, results and accuracy of a run."""
 
-import csv
 import dataclasses
 import logging
 import math
@@ -16,7 +15,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from gsba.bundle.triangulation import points_under
-from gsba.disk import atomic_write
+from gsba.disk import write_csv
 from gsba.geometry import angular_errors, moved_to, quaternion_from_rotation
 from gsba.memory import release_mapped_files, total_memory_bytes, usable_cpus
 from gsba.report.maps import summarize_maps
@@ -128,13 +127,6 @@ class StageLog:
     solver: Sequence[object] = ()  # a record for each round, with its iterations' cost by family
     seconds_again: float = 0.0  # of stages that were computed again later, and are in no row
 
-    def rows(self) -> list[dict[str, Any]]:
-        """Cost and counts of each stage."""
-        return [
-            {**dataclasses.asdict(stage), "counts": self.counts.get(stage.name, ())}
-            for stage in self.costs
-        ]
-
 
 def build_report(
     settings: BaseModel,
@@ -171,11 +163,25 @@ def build_report(
         "trajectory": found.trajectory,
         "stitching": found.stitching,
         **{name: section for name, section in optional.items() if section is not None},
-        "stages": stages.rows(),
+        "stages": [
+            {**dataclasses.asdict(stage), "counts": stages.counts.get(stage.name, ())}
+            for stage in stages.costs
+        ],
         "solver": stages.solver,
         "splat": found.moves,
         "frame_lists": found.frame_lists,
-        "frames": _frame_rows(frames, coarse, reconstruction, quality, found.start),
+        "frames": [
+            {
+                "name": name,
+                "status": PoseStatus(reconstruction.pose_statuses[f]).name.lower(),
+                "coarse_pose": source_name(coarse.sources[f], found.start),
+                "observations": quality.num_observations[f],
+                "median_residual_deg": quality.median_residuals_deg[f],
+                "std_rotation_deg": np.linalg.norm(quality.std_rotations_deg[f]),
+                "std_translation": np.linalg.norm(quality.std_translations[f]),
+            }
+            for f, name in enumerate(frames.names)
+        ],
         "settings": settings,
         "machine": _machine(),
         "versions": {name: _version(name) for name in _PACKAGES},
@@ -245,47 +251,15 @@ def write_poses(
     header += [f"std_{axis}_deg" for axis in _AXES[:3]] + [f"std_{axis}" for axis in _AXES[3:]]
     header += [f"cov_{_AXES[i]}_{_AXES[j]}" for i, j in zip(rows, columns, strict=True)]
     header += ["map", "fetched"]
-
-    def write(temporary: Path) -> None:
-        with temporary.open("w", newline="", encoding="utf-8") as file:
-            table = csv.writer(file)
-            table.writerow(header)
-            for f, name in enumerate(frames.names):
-                status = PoseStatus(reconstruction.pose_statuses[f]).name.lower()
-                source = source_name(coarse.sources[f], start)
-                table.writerow(
-                    [name, repr(float(frames.timestamps[f])), status, source]
-                    + [int(quality.num_observations[f]), _cell(quality.median_residuals_deg[f])]
-                    + [_cell(value) for value in numbers[f]]
-                    + [int(maps[f]) or "", int(frames.fetched[f]) if frames.fetched else 0]
-                )
-
-    atomic_write(path, write)
-
-
-def _cell(value: float) -> str:
-    return f"{value:.12g}" if math.isfinite(value) else ""
-
-
-def _frame_rows(
-    frames: FrameSet,
-    coarse: CoarsePoses,
-    reconstruction: Reconstruction,
-    quality: FrameQuality,
-    start: str,
-) -> list[dict[str, Any]]:
-    return [
-        {
-            "name": name,
-            "status": PoseStatus(reconstruction.pose_statuses[f]).name.lower(),
-            "coarse_pose": source_name(coarse.sources[f], start),
-            "observations": quality.num_observations[f],
-            "median_residual_deg": quality.median_residuals_deg[f],
-            "std_rotation_deg": np.linalg.norm(quality.std_rotations_deg[f]),
-            "std_translation": np.linalg.norm(quality.std_translations[f]),
-        }
-        for f, name in enumerate(frames.names)
-    ]
+    table = []
+    for f, name in enumerate(frames.names):
+        status = PoseStatus(reconstruction.pose_statuses[f]).name.lower()
+        row = [name, repr(float(frames.timestamps[f])), status]
+        row += [source_name(coarse.sources[f], start), int(quality.num_observations[f])]
+        values = [quality.median_residuals_deg[f], *numbers[f]]
+        row += [f"{value:.12g}" if math.isfinite(value) else "" for value in values]
+        table.append([*row, int(maps[f]) or "", int(frames.fetched[f]) if frames.fetched else 0])
+    write_csv(path, header, table)
 
 
 def _machine() -> dict[str, Any]:

@@ -1,9 +1,6 @@
 """The verdict on a run: whether its exported map is good to train on, and if not, where and why.
-
-Tests of figures that a finished run knows. Each that fails gives a reason: the frames that it holds
-for, the cause, and what to do. Limits are set by maps of known truth: those that are off by more
-than a hundredth of their extent shall not pass (benchmarks/results/verdict.md).
-"""
+Limits are set by maps of known truth: those that are off by more than a hundredth of their extent
+shall not pass (benchmarks/results/verdict.md)."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -24,7 +21,6 @@ from gsba.types import FrameSet, PoseStatus, Reconstruction, RunStart
 
 _ERROR_RATIO = 3.0  # largest error of a map's positions over the one that covariances foretell, of
 # 19 in 20 maps that are right
-_CONFIDENCE = 0.95
 _NO_START = {RunStart.PAIRS, "none"}  # sources of poses of a run that has no poses at its start
 
 
@@ -99,7 +95,7 @@ def _position_error(main: Reconstruction) -> float:
     errors = errors[:, np.isfinite(errors).all(axis=0)]
     if not errors.size:
         return math.nan
-    return _ERROR_RATIO * float(np.quantile(errors.max(axis=1), _CONFIDENCE))
+    return _ERROR_RATIO * float(np.quantile(errors.max(axis=1), 0.95))
 
 
 def _smaller_sides(positions: np.ndarray) -> np.ndarray:
@@ -131,9 +127,6 @@ def _held_steps(report: Mapping[str, Any], names: Sequence[str]) -> tuple[int, .
 
 MAX_POSITION_ERROR = 0.01  # of the extent, of a map that is good to train on
 MAX_UNSHARP_ERROR = 0.1  # of the extent; beyond, images do not determine the map
-# Of the extent, by a change of scale that may hide at a step: right maps have .0043 and less.
-MAX_MOVED_BY_SCALE = MAX_POSITION_ERROR / 2
-MAX_DEVIATION = 0.2  # of a step from the one that far frames predict, part of its length
 MAX_CONTRADICTED_SHARE = 0.25  # of the steps, by far frames
 MAX_HELD_SHARE = 0.25  # of the steps, by a start that images contradict elsewhere
 MAX_FALSE_SHARE = 0.1  # of the start's steps; above it the others are in doubt, too
@@ -279,7 +272,8 @@ class _Tests:
     def _loosely_scaled(self) -> Iterator[Reason]:
         """Steps over which the scale is not carried on."""
         changes = np.array(self.figures.scale_changes)
-        loose = np.flatnonzero(np.array(self.figures.moved_by_scale) > MAX_MOVED_BY_SCALE)
+        # Of the extent, by a change of scale that may hide at a step: right maps have .0043.
+        loose = np.flatnonzero(np.array(self.figures.moved_by_scale) > (MAX_POSITION_ERROR / 2))
         if not len(loose):
             return
         worst = changes[loose].max()
@@ -305,7 +299,8 @@ class _Tests:
 
     def _contradicted(self) -> Iterator[Reason]:
         """Steps that frames further away contradict."""
-        wrong = np.flatnonzero(np.array(self.figures.deviations) > MAX_DEVIATION).tolist()
+        # of a step from the one that far frames predict, part of its length
+        wrong = np.flatnonzero(np.array(self.figures.deviations) > 0.2).tolist()
         num = self.figures.num_steps
         if wrong:
             level = Level.REFUSED if len(wrong) > MAX_CONTRADICTED_SHARE * num else Level.LOOK

@@ -20,28 +20,41 @@ logger = logging.getLogger(__name__)
 CLOUDS, MESHES, LASER = (".pcd",), (".obj", ".glb", ".gltf"), (".las", ".laz")
 SUFFIXES = (".ply", *CLOUDS, *LASER, *MESHES)
 _MAX_POINTS = 400_000  # of a thinned scan
-_NUM_MESH_SAMPLES = 1_000_000  # points sampled on a mesh, before it is thinned
 _MAX_COORDINATE = 1e9  # in a scan's file
 _MIN_POINTS = 1000
 _MIN_PAIRS = 3
 _POINTS_AT_ONCE = 50_000
+_NUM_MESH_SAMPLES = 1_000_000  # points sampled on a mesh, before it is thinned
 _MIN_FLAT_SHARE = 0.1  # of points that are on planes: this quantile of the scatter is noise
 _MAX_SCATTER_RATIO = 3.5  # of a point's scatter to that noise, if its neighbours share a plane
-_LAS_HEADER_BYTES = 227  # of LAS 1.0 to 1.2; 375 of 1.4
 _VLR_BYTES, _EVLR_BYTES = 54, 60  # of the header of a variable-length record
-_MIN_LAZ_POINT_BYTES = 0.2  # of a compressed point: equal ones in a row take 0.3
-_MAX_PCD_RATIO = 255  # of uncompressed to compressed bytes in PCD
-_MAX_PCD_HEADER_BYTES = 1 << 16
 
 
 def check_claims(path: Path) -> None:
     """Refuse LAS, LAZ and PCD files that claim more points than their size allows."""
     suffix, size = path.suffix.lower(), path.stat().st_size
     with path.open("rb") as file:
-        head = file.read(_MAX_PCD_HEADER_BYTES)
+        head = file.read(1 << 16)
     try:
         if suffix in (".las", ".laz"):
-            _check_laser(head, size)
+            # LAS 1.4, section 2.4; LAZ sets high bits of the format
+            if head[:4] != b"LASF":
+                raise ValueError
+            head_size, first, num_records, kind, length, num = struct.unpack_from(
+                "<HIIBHI", head, 94
+            )
+            num_late = late = 0
+            if head[25] >= 4:
+                late, num_late, more = struct.unpack_from("<QIQ", head, 235)
+                num = max(num, more)
+            # of LAS 1.0 to 1.2
+            if head_size < 227 or not length:
+                raise ValueError
+            if head_size + _VLR_BYTES * num_records > size or late + _EVLR_BYTES * num_late > size:
+                raise _TooMuch(f"{num_records} and {num_late} variable-length records")
+            each = 0.2 if kind & 0xC0 else length  # equal points in a row take 0.3 bytes each
+            if num and first + each * num > size:
+                raise _TooMuch(f"{num} points")
         elif suffix == ".pcd":
             _check_pcd(head, size)
     except _TooMuch as claim:
@@ -57,24 +70,6 @@ def check_claims(path: Path) -> None:
 
 class _TooMuch(Exception):
     """A header claims more than the file can hold; the message is the claim."""
-
-
-def _check_laser(head: bytes, size: int) -> None:
-    """Check the header of LAS or LAZ (LAS 1.4, section 2.4; LAZ sets high bits of the format)."""
-    if head[:4] != b"LASF":
-        raise ValueError
-    head_size, first, num_records, kind, length, num = struct.unpack_from("<HIIBHI", head, 94)
-    num_late = late = 0
-    if head[25] >= 4:
-        late, num_late, more = struct.unpack_from("<QIQ", head, 235)
-        num = max(num, more)
-    if head_size < _LAS_HEADER_BYTES or not length:
-        raise ValueError
-    if head_size + _VLR_BYTES * num_records > size or late + _EVLR_BYTES * num_late > size:
-        raise _TooMuch(f"{num_records} and {num_late} variable-length records")
-    each = _MIN_LAZ_POINT_BYTES if kind & 0xC0 else length
-    if num and first + each * num > size:
-        raise _TooMuch(f"{num} points")
 
 
 def _check_pcd(head: bytes, size: int) -> None:
@@ -104,7 +99,8 @@ def _check_pcd(head: bytes, size: int) -> None:
         least, room = length * num, left
     else:
         packed, unpacked = struct.unpack_from("<II", head, at)
-        least, room = max(length * num, unpacked), _MAX_PCD_RATIO * min(packed, left - 8)
+        # of uncompressed to compressed bytes
+        least, room = max(length * num, unpacked), 255 * min(packed, left - 8)
         if packed > left - 8:
             raise _TooMuch(f"{packed} bytes of points")
     if least > room or width * height < num:

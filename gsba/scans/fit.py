@@ -9,11 +9,8 @@ from gsba.scans.types import Cloud, Scan
 from gsba.similarity import Sim3
 from gsba.types.records import with_rows
 
-_WIDTH_RATIO = 0.7  # of the loss's width, from round to round
 _MIN_STEP = 1e-6  # part of the cloud's size; a smaller step ends a round
 _FEW_STEPS, _MAX_STEPS = 3, 6  # Gauss-Newton steps at one width, at first and at the end
-_NUM_FINAL_ROUNDS = 6  # rounds with the whole cloud and the estimated noise
-_NUM_COARSE_POINTS = 1200  # points of the cloud in the rounds before
 _CELLS_PER_SIZE = (8, 4, 2, 1)  # cell edges, as divisors of the cloud's size, for the covariance
 _MEDIAN_ABS_NORMAL = 0.6745  # median of |x|, x unit normal
 LEAST_SIGMA = 0.1  # smallest sigma, part of the scan's spacing
@@ -123,22 +120,36 @@ def approach(start: Sim3, cloud: Cloud, scan: Scan, width: float) -> tuple[Sim3,
     """
     least = LEAST_SIGMA * scan.spacing
     every = np.arange(len(cloud.points))
-    fit, some = start, with_rows(cloud, every[:: -(-len(every) // _NUM_COARSE_POINTS)])
+    fit, some = start, with_rows(cloud, every[:: -(-len(every) // 1200)])
     while True:
         fit = _settle(fit, some, scan, Noise(width), _FEW_STEPS)
         sigma = max(scatter(fit, some, scan, width), least)
         if width <= 1.5 * sigma:
             return fit, sigma
-        width = max(_WIDTH_RATIO * width, 1.2 * sigma)
+        width = max(0.7 * width, 1.2 * sigma)
 
 
 def settle(start: Sim3, cloud: Cloud, scan: Scan, sigma: float) -> Fit:
     """Align the whole cloud to the scan, from a start by `approach` with its `sigma`."""
     fit = start
-    for _ in range(_NUM_FINAL_ROUNDS):
+    for _ in range(6):
         noise = noise_of(fit, cloud, scan, sigma)
         fit, sigma = _settle(fit, cloud, scan, noise, _MAX_STEPS), noise.sigma
-    return _with_covariance(fit, cloud, scan, noise)
+    # Sandwich covariance of clustered errors (Liang and Zeger, Biometrika 73, 1986): neighbours'
+    # errors are correlated. Of several sizes of cells the one with the largest variances is taken
+    # (Flyvbjerg and Petersen, J. Chem. Phys. 91).
+    jacobians, off, variances, weights, carried, middle = _weighted(fit, cloud, scan, noise)
+    gradients = jacobians * (weights * off)[:, None]
+    slopes = weights * (1 - 3 * off**2 / variances) / (1 + off**2 / variances)
+    hessian = (jacobians * slopes[:, None]).T @ jacobians
+    inverse = np.linalg.pinv(hessian, rcond=1e-14, hermitian=True)
+    found = []
+    for part in _CELLS_PER_SIZE:
+        cells = cells_of(carried, fit.scale * cloud.size / part)
+        sums = np.zeros((cells.max() + 1, 7))
+        np.add.at(sums, cells, gradients)
+        found.append(inverse @ (sums.T @ sums) @ inverse)
+    return Fit(fit, noise, max(found, key=lambda c: float(np.trace(c[3:6, 3:6]))), middle)
 
 
 def _settle(fit: Sim3, cloud: Cloud, scan: Scan, noise: Noise, most: int) -> Sim3:
@@ -206,26 +217,6 @@ def moved_by(fit: Sim3, step: np.ndarray, middle: np.ndarray) -> Sim3:
     turn, stretch = Rotation.from_rotvec(step[:3]).as_matrix(), float(np.exp(step[6]))
     shift = stretch * turn @ (fit.translation - middle) + middle + step[3:6]
     return Sim3(stretch * fit.scale, turn @ fit.rotation, shift)
-
-
-def _with_covariance(fit: Sim3, cloud: Cloud, scan: Scan, noise: Noise) -> Fit:
-    """Fit with the sandwich covariance of clustered errors (Liang and Zeger, Biometrika 73, 1986).
-
-    Residuals of a cell form a cluster, as neighbours' errors are correlated. Of several sizes of
-    cells the one with the largest variances is taken (Flyvbjerg and Petersen, J. Chem. Phys. 91).
-    """
-    jacobians, off, variances, weights, carried, middle = _weighted(fit, cloud, scan, noise)
-    gradients = jacobians * (weights * off)[:, None]
-    slopes = weights * (1 - 3 * off**2 / variances) / (1 + off**2 / variances)
-    hessian = (jacobians * slopes[:, None]).T @ jacobians
-    inverse = np.linalg.pinv(hessian, rcond=1e-14, hermitian=True)
-    found = []
-    for part in _CELLS_PER_SIZE:
-        cells = cells_of(carried, fit.scale * cloud.size / part)
-        sums = np.zeros((cells.max() + 1, 7))
-        np.add.at(sums, cells, gradients)
-        found.append(inverse @ (sums.T @ sums) @ inverse)
-    return Fit(fit, noise, max(found, key=lambda c: float(np.trace(c[3:6, 3:6]))), middle)
 
 
 def cells_of(points: np.ndarray, edge: float) -> np.ndarray:

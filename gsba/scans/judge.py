@@ -14,7 +14,6 @@ SIGMAS = 3.0  # largest distance of an explained point from its surface, standar
 _MAX_GRID_CELLS = 400  # along the scan's extent
 _MAX_BEHIND = 1.0  # part of the cloud's size: surfaces so far behind a point contradict it
 _MIN_SINE = 0.15  # of the angle between a ray and a surface that it crosses
-_MIN_BRIGHTNESS_POINTS = 100  # near points that a comparison of brightness needs
 _CELLS_PER_SIZE = (2, 4)  # cell edges, as divisors of the cloud's size, for the sign test
 
 
@@ -128,7 +127,7 @@ def verdict(fit: Sim3, cloud: Cloud, scan: Scan, grid: CellGrid, noise: Noise) -
 def _brightness_logs(cloud: Cloud, scan: Scan, nearest: np.ndarray, near: np.ndarray) -> np.ndarray:
     """Log likelihood ratio (N,) of correlated brightness: bivariate normal scores or none."""
     logs = np.zeros(len(near))
-    if scan.brightness is None or near.sum() < _MIN_BRIGHTNESS_POINTS:
+    if scan.brightness is None or near.sum() < 100:
         return logs
     a, b = _normal(cloud.brightness[near]), _normal(scan.brightness[nearest[near]])
     rho = float(np.clip(np.mean(a * b), 0.0, 0.95))

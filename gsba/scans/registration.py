@@ -19,11 +19,8 @@ from gsba.similarity import Sim3
 logger = logging.getLogger(__name__)
 
 _NUM_CANDIDATES = 16  # that are aligned to the scan
-_NUM_FINALISTS = 6  # best candidates, which are aligned with the whole cloud
-_INITIAL_WIDTH = 0.08  # of the loss, part of the cloud's size
 _MAX_SCALE_RATIO = 1.2  # of fit to candidate: a larger change is a collapse
 _MIN_DISTANCE = 0.05  # of distinct fits, part of the cloud's size
-_MIN_RIVAL_SHARE = 0.8  # of a rival's explained share to the best one's
 _MIN_SHARE = 0.25  # of explained points in the cloud
 _MIN_AGREEMENT = 0.75  # of explained points among explained and contradicted ones
 _MAX_DOUBT = 0.01  # largest p value of the lead over all rivals
@@ -81,14 +78,14 @@ def register(cloud: Cloud, scan: Scan, guess: Guess | None = None) -> Registrati
     """Unique similarity from a cloud to a scan, of those that `guess` allows; NoPlacementError if
     none explains enough, or several do about as well."""
     guess, grid = guess or Guess(), CellGrid(scan)
-    fits = _likeliest(cloud, scan, guess, grid, _NUM_FINALISTS)
+    fits = _likeliest(cloud, scan, guess, grid, 6)
     if not fits:
         raise NoPlacementError("no part of the scan resembles the run: " + _ADVICE)
     noise = fits[0].noise  # one for all, so that their likelihoods are comparable
     verdicts = [verdict(fit.similarity, cloud, scan, grid, noise) for fit in fits]
     doubts = np.array([[a.doubt(b) for b in verdicts] for a in verdicts])
     shares = np.array([one.share for one in verdicts])
-    able = shares >= _MIN_RIVAL_SHARE * shares.max()
+    able = shares >= 0.8 * shares.max()
     worst = np.max(doubts, axis=1, where=able & ~np.eye(len(fits), dtype=bool), initial=0.0)
     best = int(np.argmin(np.where(able, worst, 2.0)))
     rivals = able & (np.arange(len(fits)) != best)
@@ -105,8 +102,29 @@ def register(cloud: Cloud, scan: Scan, guess: Guess | None = None) -> Registrati
         )
     _check(found, reach_of(found.fit.similarity, cloud))
     if guess.similarity is None:
-        _check_handed(found, cloud, scan, guess, grid)
-    _check_alone(found)
+        # A scan that the mirrored cloud fits better cannot be of the same place.
+        twin, axis = cloud.mirrored(), guess.axis
+        if axis is not None:
+            axis = axis[0] * [-1, 1, 1], axis[1]
+        for fit in _likeliest(twin, scan, Guess(scale=guess.scale, axis=axis), grid, 1):
+            evidence = verdict(fit.similarity, twin, scan, grid, found.fit.noise)
+            doubt = evidence.doubt(found.verdict)
+            logger.debug("mirrored: %.3f explained, p = %.2g of its lead", evidence.share, doubt)
+            if evidence.share > found.verdict.share and doubt < _MAX_DOUBT:
+                raise NoPlacementError(
+                    "the mirrored run fits better: the scan is of another building, or its world "
+                    "is left-handed: change the sign of one of its axes"
+                )
+    if found.rival is not None and found.doubt > _MAX_DOUBT / found.rivals:
+        best = found.fit.similarity
+        cosine = (np.trace(best.rotation.T @ found.rival.rotation) - 1) / 2
+        turn = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+        raise NoPlacementError(
+            "several placements explain the run about equally: the lead of the best over another, "
+            f"rotated by {turn:.0f} deg at {found.rival.scale / best.scale:.3g} times the scale, "
+            f"has p = {found.doubt:.2g}: start the alignment by --pairs or --gps, or by --up auto "
+            "if one of them is not upright; or give a scan with colours"
+        )
     return found
 
 
@@ -143,43 +161,12 @@ def _check(found: Registration, reach: float) -> None:
         )
 
 
-def _check_handed(
-    found: Registration, cloud: Cloud, scan: Scan, guess: Guess, grid: CellGrid
-) -> None:
-    """Refuse a scan that the mirrored cloud fits better: it cannot be of the same place."""
-    twin, axis = cloud.mirrored(), guess.axis
-    if axis is not None:
-        axis = axis[0] * [-1, 1, 1], axis[1]
-    for fit in _likeliest(twin, scan, Guess(scale=guess.scale, axis=axis), grid, 1):
-        evidence = verdict(fit.similarity, twin, scan, grid, found.fit.noise)
-        doubt = evidence.doubt(found.verdict)
-        logger.debug("mirrored: %.3f explained, p = %.2g of its lead", evidence.share, doubt)
-        if evidence.share > found.verdict.share and doubt < _MAX_DOUBT:
-            raise NoPlacementError(
-                "the mirrored run fits better: the scan is of another building, or its world is "
-                "left-handed: change the sign of one of its axes"
-            )
-
-
-def _check_alone(found: Registration) -> None:
-    """Refuse a placement whose lead over a rival is not significant."""
-    if found.rival is not None and found.doubt > _MAX_DOUBT / found.rivals:
-        best = found.fit.similarity
-        cosine = (np.trace(best.rotation.T @ found.rival.rotation) - 1) / 2
-        turn = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
-        raise NoPlacementError(
-            "several placements explain the run about equally: the lead of the best over another, "
-            f"rotated by {turn:.0f} deg at {found.rival.scale / best.scale:.3g} times the scale, "
-            f"has p = {found.doubt:.2g}: start the alignment by --pairs or --gps, or by --up auto "
-            "if one of them is not upright; or give a scan with colours"
-        )
-
-
 def _aligned(starts: Sequence[Sim3], cloud: Cloud, scan: Scan) -> list[tuple[Sim3, float]]:
     """Distinct similarities that candidates converge to, with the residuals' sigma at each."""
     near: list[tuple[Sim3, float]] = []
     for start in starts:
-        fit, sigma = approach(start, cloud, scan, _INITIAL_WIDTH * cloud.size * start.scale)
+        # part of the cloud's size
+        fit, sigma = approach(start, cloud, scan, 0.08 * cloud.size * start.scale)
         same = (distance(fit, other, cloud) < _MIN_DISTANCE for other, _ in near)
         if 1 / _MAX_SCALE_RATIO < fit.scale / start.scale < _MAX_SCALE_RATIO and not any(same):
             near.append((fit, sigma))

@@ -12,14 +12,8 @@ from gsba.scans.types import Cloud, Scan, size_of
 from gsba.similarity import Sim3
 
 _SCALE_RANGE = (0.125, 2.5)  # of the ratio of both sizes: a cloud is rarely larger than its scan
-_SCALE_STEP = 1.012  # ratio of successive scales
 _BINS = 512  # of a profile, over the scan's extent
-_MAX_NORMAL_DEG = 12.0  # largest angle of a surface's normal to the axis of its profile
 _PEAKS = 4  # maxima of a correlation that are tried
-_CANDIDATES_PER_ROTATION = 150  # by profiles, for each rotation that maps axes to axes
-_MAX_SCORE_DISTANCE = 0.03  # of a scored point to a surface, part of the cloud's size
-_NUM_SCORE_POINTS = (80, 400)  # points of the cloud in the first and in the second scoring
-_NUM_SCORED = 300  # candidates that each scoring keeps
 _MIN_DISTANCE = 0.15  # of distinct candidates, part of the cloud's size
 
 
@@ -57,9 +51,9 @@ def candidates(cloud: Cloud, scan: Scan, guess: Guess, most: int) -> list[Sim3]:
     if guess.similarity is not None:
         return [guess.similarity]
     found = list(_by_axes(cloud, scan, guess))
-    for points in _NUM_SCORE_POINTS:
+    for points in (80, 400):
         scores = np.array([score(fit, cloud, scan, points) for fit in found])
-        found = [found[n] for n in np.argsort(-scores, kind="stable")[:_NUM_SCORED]]
+        found = [found[n] for n in np.argsort(-scores, kind="stable")[:300]]
     distinct: list[Sim3] = []
     for fit in found:
         if all(distance(fit, other, cloud) > _MIN_DISTANCE for other in distinct):
@@ -79,7 +73,7 @@ def distance(first: Sim3, second: Sim3, cloud: Cloud) -> float:
 def score(fit: Sim3, cloud: Cloud, scan: Scan, points: int = 400) -> float:
     """Mean score, 0 to 1, of a sample of the cloud's points near surfaces with similar normals."""
     rows = _rows(len(cloud.points), points)
-    reach = _MAX_SCORE_DISTANCE * cloud.size * fit.scale
+    reach = 0.03 * cloud.size * fit.scale
     gaps, nearest = scan.tree.query(fit.points(cloud.points[rows]), distance_upper_bound=reach)
     found = gaps < reach
     normals = scan.normals[np.asarray(nearest)[found]]
@@ -144,7 +138,7 @@ def _by_axes(cloud: Cloud, scan: Scan, guess: Guess) -> Iterator[Sim3]:
         low_scale, high_scale = np.array(_SCALE_RANGE) * size_of(scan.points) / cloud.size
     else:
         low_scale, high_scale = guess.scale / 1.1, guess.scale * 1.1
-    scales = np.exp(np.arange(np.log(low_scale), np.log(high_scale), np.log(_SCALE_STEP)))
+    scales = np.exp(np.arange(np.log(low_scale), np.log(high_scale), np.log(1.012)))
     profiles = [_profile(there[:, j] - low[j], scan.normals @ of_scan[j], width) for j in range(3)]
     spectra = np.fft.rfft(profiles, 2 * _BINS)
     values = np.zeros((3, 2, 3, len(scales), _PEAKS))  # by axis, its sign, and axis of the scan
@@ -162,7 +156,7 @@ def _by_axes(cloud: Cloud, scan: Scan, guess: Guess) -> Iterator[Sim3]:
         flips = (turn[range(3), axes] < 0).astype(int)
         x, y, z = (values[axes[j], flips[j], j] for j in range(3))
         sums = x[:, :, None, None] + y[:, None, :, None] + z[:, None, None, :]
-        for at in _largest(sums, _CANDIDATES_PER_ROTATION):
+        for at in _largest(sums, 150):
             n, *peaks = (int(k) for k in np.unravel_index(at, sums.shape))
             shift = [shifts[axes[j], flips[j], j, n, peaks[j]] for j in range(3)]
             moved = of_scan.T @ np.array(shift) - scales[n] * rotation @ (of_cloud.T @ middle)
@@ -192,7 +186,7 @@ def _peaks(correlated: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _profile(along: np.ndarray, cosines: np.ndarray, width: float) -> np.ndarray:
     """Density (_BINS,) along an axis of surfaces perpendicular to it, of length 1 and mean 0."""
-    facing = np.abs(cosines) > np.cos(np.radians(_MAX_NORMAL_DEG))
+    facing = np.abs(cosines) > np.cos(np.radians(12.0))
     bins = (along[facing] / width).astype(np.int64)
     counts = np.bincount(bins[(bins >= 0) & (bins < _BINS)], minlength=_BINS).astype(np.float64)
     smooth = np.convolve(counts, [0.25, 0.5, 1, 0.5, 0.25], "same")

@@ -15,7 +15,6 @@ from gsba.types.records import with_rows
 NEIGHBOURS = 24  # of a scan's point, through which its plane is fitted
 MIN_POINTS = 300  # of a cloud that can be registered
 _POINTS_AT_ONCE = 50_000
-_MIN_RAYS = 3  # of a point: two wrong rays may also meet
 _MAX_POINT_SIGMA = 0.02  # of a used point, part of the cloud's size
 _NUM_BINS = 30  # of a histogram
 
@@ -121,7 +120,7 @@ def cloud_of(
     covariances = np.einsum("nij,nj,nkj->nik", axes, 1 / values, axes)
     first = np.searchsorted(owners, np.arange(len(result.points_world)))
     counts = np.bincount(owners, minlength=len(result.points_world))
-    seen = counts >= _MIN_RAYS
+    seen = counts >= 3  # two wrong rays may also meet
     middle = np.minimum(first + counts // 2, max(len(owners) - 1, 0))
     every = np.flatnonzero(seen)
     cloud = Cloud(

@@ -41,15 +41,12 @@ _QUEUES = {  # kind of address -> module and class that starts workers
     "kubernetes": ("dask_kubernetes.operator", "KubeCluster"),
 }
 _ADDRESS = re.compile(r"(tcp|tls|wss?|ucx)://[^\s/:][^\s/]*")
-_SHARDS_AHEAD_PER_THREAD = 3  # shards that are written and submitted before they are needed
-_MAX_ATTEMPTS = 5  # workers that may die on a shard
 _LATE_RATIO = 4.0  # of a shard's time over the median; a late shard is also given to another worker
 _MIN_LATE_S = 60.0  # shortest time after which a shard is late
-_POLL_S = 5.0  # between checks for late shards
+_MAX_ATTEMPTS = 5  # workers that may die on a shard
 _SCHEDULER_TIMEOUT_S = 20.0  # for a scheduler's first answer
-_CLOSING_TIMEOUT_S = 60.0  # for workers that this process has started
+_POLL_S = 5.0  # between checks for late shards
 _MAX_LOCAL, _MAX_QUEUED = 256, 100_000  # workers that may be requested
-_DISK_TIMEOUT_S = 30.0  # until a shared disk shows a file that another machine has written
 
 
 def hire(
@@ -100,7 +97,7 @@ def connected(address: str | None) -> Iterator["Client | None"]:
         with suppress(Exception):  # workers or scheduler may have ended before
             client.close()
             if cluster is not None:
-                cluster.close(timeout=_CLOSING_TIMEOUT_S)  # a worker that restarts may not answer
+                cluster.close(timeout=60.0)  # a worker that restarts may not answer
 
 
 def connect(address: str) -> "Client":
@@ -127,23 +124,19 @@ def connect(address: str) -> "Client":
             )
         return Client(_local(int(count)) if kind == "local" else _queued(kind, int(count)))
     try:
-        return Client(_scheduler_address(address), timeout=_SCHEDULER_TIMEOUT_S)
+        found: Any = address
+        if address.endswith(".json"):
+            found = json.loads(Path(address).read_text(encoding="utf-8"))
+            found = found.get("address") if isinstance(found, dict) else None
+        if not isinstance(found, str) or not _ADDRESS.fullmatch(found):
+            raise ValueError("no address of the form tcp://HOST:PORT")
+        return Client(found, timeout=_SCHEDULER_TIMEOUT_S)
     except Exception as error:  # sockets, certificates and plugins raise errors of their own types
         reason = brief(" ".join(str(error).split()) or type(error).__name__, 200)
         raise GsbaError(
             f"--cluster {address}: no scheduler answers there ({reason}); pass tcp://HOST:PORT, "
             "its FILE.json, local:N or slurm:N"
         ) from error
-
-
-def _scheduler_address(address: str) -> str:
-    found: Any = address
-    if address.endswith(".json"):
-        found = json.loads(Path(address).read_text(encoding="utf-8"))
-        found = found.get("address") if isinstance(found, dict) else None
-    if not isinstance(found, str) or not _ADDRESS.fullmatch(found):
-        raise ValueError("no address of the form tcp://HOST:PORT")
-    return found
 
 
 def _local(num: int) -> Any:
@@ -204,7 +197,25 @@ class Cluster:
         self._cpu_seconds = 0.0
         self._done: dict[str, int] = {}
         _leave_task()
-        _prepare(client)
+        from distributed import WorkerPlugin
+
+        class Settings(WorkerPlugin):
+            """Turns off memory limits, which compiled code exceeds, and threads within threads, on
+            workers that join later, too."""
+
+            name = "gsba"
+
+            def setup(self, worker: Any) -> None:
+                import cv2
+                from threadpoolctl import threadpool_limits
+
+                memory = worker.memory_manager
+                memory.memory_target_fraction = memory.memory_spill_fraction = False
+                memory.memory_pause_fraction = False
+                threadpool_limits(limits=1, user_api="blas")
+                cv2.setNumThreads(1)
+
+        client.register_plugin(Settings())
         self._check(frames)
 
     def map_shards(self, job: Job[R]) -> Iterator[R]:
@@ -249,7 +260,7 @@ class Cluster:
     def _results(self, job: Job[R]) -> Iterator[R]:
         """Results of all items in order; a window of shards is submitted ahead of them."""
         blocks = list(job.blocks())
-        window = max(2, _SHARDS_AHEAD_PER_THREAD * sum(self._client.nthreads().values()))
+        window = max(2, 3 * sum(self._client.nthreads().values()))
         submitted: dict[int, _Shard] = {}
         lasted: list[float] = []
         try:
@@ -339,7 +350,7 @@ class Cluster:
             shard.futures.append(self._submit(shard, others))
 
     def _load(self, shard: _Shard, returns: Any) -> tuple[Any, ...]:
-        end = time.monotonic() + _DISK_TIMEOUT_S
+        end = time.monotonic() + 30.0  # a shared disk shows late what another machine has written
         while True:
             found = shards.load_shard(shard.path, returns)
             if found is not None:
@@ -371,25 +382,3 @@ def _leave_task() -> None:
     except ValueError:  # an ordinary process
         return
     secede()
-
-
-def _prepare(client: "Client") -> None:
-    """Configure memory and threads of all workers, those that join later included."""
-    from distributed import WorkerPlugin
-
-    class Settings(WorkerPlugin):
-        """Turns off memory limits, which compiled code exceeds, and threads within threads."""
-
-        name = "gsba"
-
-        def setup(self, worker: Any) -> None:
-            import cv2
-            from threadpoolctl import threadpool_limits
-
-            memory = worker.memory_manager
-            memory.memory_target_fraction = memory.memory_spill_fraction = False
-            memory.memory_pause_fraction = False
-            threadpool_limits(limits=1, user_api="blas")
-            cv2.setNumThreads(1)
-
-    client.register_plugin(Settings())

@@ -50,7 +50,21 @@ def open_run_folder(root: Path, origin: Mapping[str, Path], fresh: bool) -> int:
         refuse_links(root / STAGES, below=True)
         marker = read_marker(root)
         if marker and fresh:
-            _remove_claimed(root, marker)
+            # Delete the files that gsba wrote, and then the folders that are empty
+            with disk_errors(root):
+                if (root / STAGES).exists():
+                    shutil.rmtree(root / STAGES)
+                remove_unheld(root.glob(".*.partial-*"))  # exports that were stopped
+                for name in marker["wrote"]:
+                    path = root / name
+                    if root.resolve() not in path.resolve().parents:
+                        continue  # an edited marker must not reach outside
+                    path.unlink(missing_ok=True)
+                    for parent in path.relative_to(root).parents:
+                        with suppress(OSError):
+                            if parent != Path():
+                                (root / parent).rmdir()
+                (root / MARKER).unlink()
             marker = {}
         if marker and marker["origin"] != resolved:
             raise GsbaError(
@@ -77,7 +91,11 @@ def refuse_foreign(root: Path) -> None:
 
 
 def claim(root: Path, path: Path) -> None:
-    """List a file, or all files of a folder, as written by gsba into the run folder `root`."""
+    """List a file, or all files of a folder, as written by gsba into the run folder `root`; what
+    lies outside of it is not listed."""
+    root, path = root.resolve(), path.resolve()
+    if not path.is_relative_to(root):
+        return
     marker = read_marker(root)
     files = (entry for entry in path.rglob("*") if entry.is_file()) if path.is_dir() else [path]
     names = {entry.relative_to(root).as_posix() for entry in files}
@@ -105,21 +123,3 @@ def _write_marker(root: Path, origin: Mapping[str, str], wrote: Any) -> None:
     marker = {"gsba": __version__, "origin": origin, "wrote": sorted(wrote)}
     text = json.dumps(marker, indent=1) + "\n"
     write_text(root / MARKER, text)
-
-
-def _remove_claimed(root: Path, marker: Mapping[str, Any]) -> None:
-    """Delete the files that gsba wrote, and then the folders that are empty."""
-    with disk_errors(root):
-        if (root / STAGES).exists():
-            shutil.rmtree(root / STAGES)
-        remove_unheld(root.glob(".*.partial-*"))  # exports that were stopped
-        for name in marker["wrote"]:
-            path = root / name
-            if root.resolve() not in path.resolve().parents:
-                continue  # an edited marker must not reach outside
-            path.unlink(missing_ok=True)
-            for parent in path.relative_to(root).parents:
-                with suppress(OSError):
-                    if parent != Path():
-                        (root / parent).rmdir()
-        (root / MARKER).unlink()

@@ -1,11 +1,8 @@
 """Records on disk: one uncompressed `.npz` per record, checked against a type, never pickled.
 
 A record is any value built from numpy arrays, numbers, strings, paths, enums, None, tuples, string
-mappings and dataclasses of these. Arrays become members named after their place in the record
-(`points.npy`); all other values are a JSON tree in `manifest.json`. The type that the caller
-expects drives the reading, so that a file can neither name code to run nor have another type. The
-zip checksums reveal truncated or flipped bytes. Arrays begin at multiples of 64 bytes of the file,
-so that they can be used where they lie.
+mappings and dataclasses of these. Arrays are members named after their place in the record, at
+multiples of 64 bytes so that they are used where they lie; the rest is JSON in `manifest.json`.
 """
 
 import io
@@ -45,7 +42,6 @@ _MANIFEST = "manifest.json"
 _ALIGNMENT = 64  # bytes, of arrays in a file: that of .npy headers
 _LOCAL_HEADER = 30  # bytes of a member before its name
 _ZIP64_FIELD = 20  # bytes of its sizes behind it
-_PADDING_FIELD = 0xD935  # number of the extra field that zip files are aligned by
 _BYTES_AT_ONCE = 1 << 22  # that are checked, of an array that stays on the disk
 MIN_MAPPED_BYTES = 1 << 22  # of arrays that are worth a mapping
 _HEADER = re.compile(
@@ -92,7 +88,8 @@ def _aligned(name: str, archive: zipfile.ZipFile) -> zipfile.ZipInfo:
     header = _LOCAL_HEADER + len(name.encode()) + _ZIP64_FIELD + 4  # of the padding itself
     missing = -(archive.fp.tell() + header) % _ALIGNMENT
     member = zipfile.ZipInfo(name, date_time=time.localtime()[:6])
-    member.extra = struct.pack("<HH", _PADDING_FIELD, missing) + bytes(missing)
+    # the extra field that zip files are aligned by
+    member.extra = struct.pack("<HH", 0xD935, missing) + bytes(missing)
     member.external_attr = 0o600 << 16
     return member
 
@@ -278,13 +275,24 @@ def _decode(tree: Any, hint: Any, archive: _Archive | None) -> Any:
     if origin in (Union, types.UnionType):
         return _decode_union(tree, get_args(hint), archive)
     if origin in (tuple, list):
-        return _decode_sequence(tree, hint, archive)
+        _require(isinstance(tree, list), tree, hint)
+        items = get_args(hint)
+        if get_origin(hint) is list:
+            return [_decode(value, items[0], archive) for value in tree]
+        if len(items) == 2 and items[1] is Ellipsis:
+            items = (items[0],) * len(tree)
+        _require(len(items) == len(tree), tree, hint)
+        return tuple(_decode(value, item, archive) for value, item in zip(tree, items, strict=True))
     if origin is not None and origin is not Literal and issubclass(origin, Mapping):
         _require(isinstance(tree, dict), tree, hint)
         item = get_args(hint)[1]
         return {name: _decode(value, item, archive) for name, value in tree.items()}
     if is_dataclass(hint) and isinstance(hint, type):
-        return _decode_dataclass(tree, hint, archive)
+        needed, hints = _fields_of(hint)
+        if not isinstance(tree, dict) or not needed <= set(tree) <= set(hints):
+            where = f"{archive.filename}: " if archive is not None else ""
+            raise RecordError(f"{where}not a {hint.__name__} of this version")
+        return hint(**{name: _decode(value, hints[name], archive) for name, value in tree.items()})
     return _decode_scalar(tree, hint)
 
 
@@ -319,25 +327,6 @@ def _decode_union(tree: Any, hints: tuple[Any, ...], archive: _Archive | None) -
             except (RecordError, ValueError):
                 continue
     raise RecordError(f"{tree!r:.60} is none of {hints}")
-
-
-def _decode_sequence(tree: Any, hint: Any, archive: _Archive | None) -> Any:
-    _require(isinstance(tree, list), tree, hint)
-    items = get_args(hint)
-    if get_origin(hint) is list:
-        return [_decode(value, items[0], archive) for value in tree]
-    if len(items) == 2 and items[1] is Ellipsis:
-        items = (items[0],) * len(tree)
-    _require(len(items) == len(tree), tree, hint)
-    return tuple(_decode(value, item, archive) for value, item in zip(tree, items, strict=True))
-
-
-def _decode_dataclass(tree: Any, cls: type[T], archive: _Archive | None) -> T:
-    needed, hints = _fields_of(cls)
-    if not isinstance(tree, dict) or not needed <= set(tree) <= set(hints):
-        where = f"{archive.filename}: " if archive is not None else ""
-        raise RecordError(f"{where}not a {cls.__name__} of this version")
-    return cls(**{name: _decode(value, hints[name], archive) for name, value in tree.items()})
 
 
 @lru_cache(maxsize=256)

@@ -146,11 +146,7 @@ class StoredRecords(Generic[R]):
     returns: type[R]  # type of the records
 
     def __call__(self, number: int) -> R:
-        """Record of one frame.
-
-        Raises:
-            GsbaError: the file is missing, or has another key.
-        """
+        """Record of one frame. Raises GsbaError: the file is missing, or has another key."""
         path = self.paths[number]
         try:
             found = load_keyed(path, self.keys[number], self.returns)

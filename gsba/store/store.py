@@ -1,9 +1,8 @@
 """Store of stage results under keys: it resumes runs and recomputes only changed stages.
 
-A stage's key is the hash of everything its result depends on: its name and settings, the input
-files, the keys of the stages before it, and the version of gsba. A stored result whose key matches
-is used; a stage with other settings, another version or a damaged file is computed again. Results
-are in `RUN/stages/NAME.npz`, those of a per-frame stage in `RUN/stages/NAME/FRAME.npz`.
+A stage's key is the hash of its name and settings, the input files, the keys of the stages before
+it, and the version of gsba. Results are in `RUN/stages/NAME.npz`, of a per-frame stage in
+`RUN/stages/NAME/FRAME.npz`.
 """
 
 import dataclasses
@@ -124,7 +123,7 @@ class RunStore:
 
     @property
     def scratch_folder(self) -> Path:
-        """Folder of files without a name, which end with what is in them."""
+        """Folder for unnamed temporary files."""
         return self.root / STAGES
 
     @contextmanager

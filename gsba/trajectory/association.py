@@ -13,7 +13,6 @@ _MAX_INTERPOLATION_S = 10.0  # between an entry and a frame; poses further away 
 
 _log = logging.getLogger(__name__)
 
-_MIN_SHARED_SPAN = 0.5  # least part of the frames or of the entries within the other's span
 _GRID_TOLERANCE = 0.1  # tolerance of coinciding times when an offset is searched, in shortest
 # intervals
 # Extrapolation beyond an end: duration from which the velocity is taken, and time constants with
@@ -29,17 +28,6 @@ _MAX_ROUGH_LOG_DEVIATION = np.log10(5.0)  # the same limit if times as given mak
 _MAX_INTERVAL_RATIO = 8.0  # largest interval in the other side's intervals: no SLAM and no camera
 # is that slow
 _MIN_INTERVAL_S = 1e-9  # least interval: no camera is that fast
-_MAX_TIME_DIFFERENCE_S = 1e-3  # largest time difference of entries of one frame
-
-
-def refuse_intervals(frame_times: np.ndarray, entries: np.ndarray) -> None:
-    """Refuse times (F,), (N,) that lie closer together than a clock resolves."""
-    for owner, times in (("two frames are", frame_times), ("two poses are", entries)):
-        if np.diff(times).min() <= _MIN_INTERVAL_S:
-            at = float(times[np.argmin(np.diff(times))])
-            raise GsbaError(
-                f"{owner} less than {_MIN_INTERVAL_S:g} s apart, at {at!r} s: check the times"
-            )
 
 
 def refuse_other_unit(
@@ -67,8 +55,7 @@ def refuse_other_unit(
     sure = abs(ratio - power) <= _MAX_LOG_DEVIATION and sparse
     if power == 0 or not (sure or (senseless and abs(ratio - power) <= _MAX_ROUGH_LOG_DEVIATION)):
         return
-    whose, others = ("the trajectory's times", "the frames'")
-    what = "divide them"
+    whose, others, what = "the trajectory's times", "the frames'", "divide them"
     if power < 0:
         whose, others = "the frames' times", "the trajectory's"
         what = "check --fps, or divide the times"
@@ -117,7 +104,12 @@ def associate(frames: FrameSet, trajectory: Trajectory, settings: ReadSettings) 
             hardly any pose within the frames' time.
     """
     entries = trajectory.timestamps
-    refuse_intervals(frames.timestamps, entries)
+    for owner, times in (("two frames are", frames.timestamps), ("two poses are", entries)):
+        if np.diff(times).min() <= _MIN_INTERVAL_S:
+            at = float(times[np.argmin(np.diff(times))])
+            raise GsbaError(
+                f"{owner} less than {_MIN_INTERVAL_S:g} s apart, at {at!r} s: check the times"
+            )
     refuse_other_unit(frames.timestamps, entries)
     offset = _clock_offset(frames.timestamps, entries, settings.clock_offset_s)
     times = frames.timestamps + offset
@@ -128,23 +120,6 @@ def associate(frames: FrameSet, trajectory: Trajectory, settings: ReadSettings) 
     sources = np.where(
         seen, PoseSource.SLAM, np.where(outside, PoseSource.EXTRAPOLATED, PoseSource.INTERPOLATED)
     ).astype(np.uint8)
-    _log_sources(frames, sources, times, entries)
-    return CoarsePoses(poses_at(trajectory, times), sources, offset)
-
-
-def without_trajectory(frames: FrameSet) -> CoarsePoses:
-    """Placeholder poses for runs without a trajectory: one unit ahead for every frame."""
-    positions = np.outer(np.arange(len(frames)), [0.0, 0.0, 1.0])
-    poses = pose(np.tile(np.eye(3), (len(frames), 1, 1)), positions)
-    return CoarsePoses(poses, np.full(len(frames), PoseSource.NONE, np.uint8), 0.0)
-
-
-def _log_sources(
-    frames: FrameSet,
-    sources: np.ndarray,
-    times: np.ndarray,
-    entries: np.ndarray,
-) -> None:
     counts = np.bincount(sources, minlength=len(PoseSource))
     _log.info(
         "coarse poses: %d from the trajectory, %d interpolated, %d extrapolated",
@@ -165,49 +140,29 @@ def _log_sources(
             frames.names[f],
             distance[f],
         )
+    return CoarsePoses(poses_at(trajectory, times), sources, offset)
+
+
+def without_trajectory(frames: FrameSet) -> CoarsePoses:
+    """Placeholder poses for runs without a trajectory: one unit ahead for every frame."""
+    positions = np.outer(np.arange(len(frames)), [0.0, 0.0, 1.0])
+    poses = pose(np.tile(np.eye(3), (len(frames), 1, 1)), positions)
+    return CoarsePoses(poses, np.full(len(frames), PoseSource.NONE, np.uint8), 0.0)
 
 
 def _clock_offset(frame_times: np.ndarray, entries: np.ndarray, stated: float | None) -> float:
     """Offset to add to frame times to reach the trajectory's clock, seconds."""
-    shared = _shared_span(frame_times + (stated or 0.0), entries)
-    if shared >= _MIN_SHARED_SPAN or (stated is not None and shared > 0):
-        return stated or 0.0
-    ranges = (
-        f"frames span {span(frame_times + (stated or 0.0))} s, the trajectory {span(entries)} s"
-    )
-    if stated is not None:
-        raise GsbaError(f"no overlap in time with read.clock_offset_s = {stated}: {ranges}")
-    candidates = _offsets_that_fit(frame_times, entries)
-    overlap = "hardly overlap" if shared > 0 else "do not overlap"
-    if len(candidates) == 1:
-        _log.warning(
-            "frames and trajectory %s in time (%s): the only offset at which all times meet, "
-            "%.6f s, is added to frame times",
-            overlap,
-            ranges,
-            candidates[0],
-        )
-        return candidates[0]
-    refuse_other_unit(frame_times, entries, senseless=True)
-    why = "no offset makes all times meet"
-    if candidates:
-        why = f"several offsets fit, such as {candidates[0]:.6f} and {candidates[1]:.6f}"
-    raise GsbaError(
-        f"frames and trajectory {overlap} in time: {ranges}; {why}; correct the times or set "
-        "read.clock_offset_s (seconds to add to frame times)"
-    )
-
-
-def _shared_span(times: np.ndarray, entries: np.ndarray) -> float:
-    """Part of the frames in the trajectory's span or of the entries in the frames', the larger."""
+    times = frame_times + (stated or 0.0)
     half = _half_interval(times, entries)
     frames_in = np.mean((times >= entries[0] - half) & (times <= entries[-1] + half))
     entries_in = np.mean((entries >= times[0] - half) & (entries <= times[-1] + half))
-    return float(max(frames_in, entries_in)) if min(frames_in, entries_in) > 0 else 0.0
-
-
-def _offsets_that_fit(frame_times: np.ndarray, entries: np.ndarray) -> list[float]:
-    """At most two offsets at which the times of the smaller set all occur in the larger one."""
+    shared = float(max(frames_in, entries_in)) if min(frames_in, entries_in) > 0 else 0.0
+    if shared >= 0.5 or (stated is not None and shared > 0):
+        return stated or 0.0
+    ranges = f"frames span {span(times)} s, the trajectory {span(entries)} s"
+    if stated is not None:
+        raise GsbaError(f"no overlap in time with read.clock_offset_s = {stated}: {ranges}")
+    # Offsets at which the times of the smaller set all occur in the larger one, two at most
     sign = 1.0
     few, many = entries, frame_times
     if len(few) > len(many):
@@ -223,7 +178,24 @@ def _offsets_that_fit(frame_times: np.ndarray, entries: np.ndarray) -> list[floa
             found.append(float(sign * (shift + np.median(residuals))))
             if len(found) == 2:
                 break
-    return found
+    overlap = "hardly overlap" if shared > 0 else "do not overlap"
+    if len(found) == 1:
+        _log.warning(
+            "frames and trajectory %s in time (%s): the only offset at which all times meet, "
+            "%.6f s, is added to frame times",
+            overlap,
+            ranges,
+            found[0],
+        )
+        return found[0]
+    refuse_other_unit(frame_times, entries, senseless=True)
+    why = "no offset makes all times meet"
+    if found:
+        why = f"several offsets fit, such as {found[0]:.6f} and {found[1]:.6f}"
+    raise GsbaError(
+        f"frames and trajectory {overlap} in time: {ranges}; {why}; correct the times or set "
+        "read.clock_offset_s (seconds to add to frame times)"
+    )
 
 
 def poses_at(trajectory: Trajectory, times: np.ndarray) -> np.ndarray:
@@ -307,7 +279,7 @@ def follow_keyframes(frames: Trajectory, keyframes: Trajectory) -> Trajectory:
     nearest = np.clip(nearest, 1, len(frames.timestamps) - 1)
     gaps = np.abs(frames.timestamps[[nearest - 1, nearest]] - keyframes.timestamps)
     nearest = nearest - (gaps[0] < gaps[1])
-    shared = gaps.min(axis=0) < _MAX_TIME_DIFFERENCE_S
+    shared = gaps.min(axis=0) < 1e-3
     if shared.sum() < 2:
         raise GsbaError(
             f"only {shared.sum()} of {len(shared)} keyframes have the time of a frame of the "
@@ -321,18 +293,14 @@ def follow_keyframes(frames: Trajectory, keyframes: Trajectory) -> Trajectory:
     span = np.maximum(times[at[after]] - times[at[before]], 1e-12)
     share = np.clip((times - times[at[before]]) / span, 0, 1)
     first, second = moves[before] @ frames.world_T_rigs, moves[after] @ frames.world_T_rigs
-    followed = _interpolated(first, second, share)
-    times = np.concatenate([times, keyframes.timestamps[~shared]])
-    poses = np.concatenate([followed, keyframes.world_T_rigs[~shared]])
-    order = np.argsort(times)
-    return Trajectory(times[order], poses[order])
-
-
-def _interpolated(first: np.ndarray, second: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """Poses (N, 4, 4) interpolated from the first to the second by shares (N,)."""
+    # Poses (N, 4, 4) interpolated from the first to the second by shares (N,)
     from scipy.spatial.transform import Rotation
 
     turn = np.swapaxes(first[:, :3, :3], 1, 2) @ second[:, :3, :3]
     part = Rotation.from_rotvec(share[:, None] * Rotation.from_matrix(turn).as_rotvec())
     positions = (1 - share[:, None]) * first[:, :3, 3] + share[:, None] * second[:, :3, 3]
-    return pose(first[:, :3, :3] @ part.as_matrix(), positions)
+    followed = pose(first[:, :3, :3] @ part.as_matrix(), positions)
+    times = np.concatenate([times, keyframes.timestamps[~shared]])
+    poses = np.concatenate([followed, keyframes.world_T_rigs[~shared]])
+    order = np.argsort(times)
+    return Trajectory(times[order], poses[order])

@@ -1,9 +1,6 @@
 """The trajectory's clock against the video's: offset and rate by which it rotates as the images do.
-
-Angular velocities are compared over a grid; the best few are refined on relative rotations under a
-robust loss (cf. Furgale et al., IROS 2013). Another clock than the given one must be determined,
-have no rival, and explain the images markedly better.
-"""
+Angular velocities are compared over a grid; the best are refined on relative rotations under a
+robust loss (cf. Furgale et al., IROS 2013)."""
 
 from dataclasses import dataclass, replace
 
@@ -26,12 +23,9 @@ _SURE_EXPLAINED = 0.6  # share of the turns from which no other clocks are searc
 _MAX_NOISE_RAD = np.deg2rad(2.0)  # largest noise of a trajectory's steps per axis: by three
 # times as much, steps contradict the images (verify.max_rotation_deg)
 _MIN_GAIN = 0.2  # share of the turns by which another clock must explain more
-_MAX_RIVAL_SHARE = 0.75  # share of the best clock's explained turns that no rival may reach
 _OTHER_RATES = np.exp(np.delete(np.linspace(-1, 1, 81), 40) * np.log(10))  # spaced by twice what
 # the search around each of them reaches
-_NUM_REFINED_RATES = 4  # best of them
 _MAX_NOISE_RATIO = 0.5  # largest noise of rotations under another rate, in that under the given one
-_OTHER_RATE_ERROR = 1e-3  # probability that it is nearer at so many steps by chance
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,10 +72,8 @@ def estimate_clock(
     given = Clock(float(timestamps[0]), offset, 1.0)
     turns = merged(timestamps, found.f_T_nexts[:, :3, :3], found.verified)
     if len(turns) < MIN_STEPS:
-        nan, why = (
-            float("nan"),
-            f"the clock could not be checked: only {len(turns)} steps are known from images",
-        )
+        nan = float("nan")
+        why = f"the clock could not be checked: only {len(turns)} steps are known from images"
         return ClockEstimate(given, given, nan, nan, nan, nan, "unclear", why)
     fit = ClockFit(turns, trajectory)
     start = np.array([offset, 1.0])
@@ -93,7 +85,43 @@ def estimate_clock(
         sigma = min(noise(fit.residuals(p)) for p in tried)
         best, covariance = simplest(fit, min(tried, key=lambda p: fit.cost(p, sigma)))
         others = [p for p in tried if fit.apart(p, best) > interval]
-    return _with_verdict(fit, given, best, covariance, others, interval)
+    start = np.array([given.offset, 1.0])
+    degrees = [
+        float(np.degrees(np.median(np.linalg.norm(fit.residuals(p), axis=1))))
+        for p in (start, best)
+    ]
+    begin = fit.turns.middle - given.start
+    at_start = np.array([1.0, -begin])
+    found = Clock(given.start, float(best[0] - (best[1] - 1) * begin), float(best[1]))
+    offset_sigma = float(np.sqrt(at_start @ covariance @ at_start))
+    rate_sigma, certain = float(np.sqrt(covariance[1, 1])), fit.time_sigma(covariance)
+    before, after = (_explained(fit, p, best) for p in (start, best))
+    same = fit.apart(best, start) < _SIGNIFICANT_SIGMAS * certain or after < before + _MIN_GAIN
+    verdict, note = "unclear", ""
+    if _turning(fit, best).sum() < _MIN_TURNS or certain > max(
+        _MAX_SIGMA_INTERVALS * interval, _MAX_SIGMA_S
+    ):
+        note = f"the camera turns too little to check the clock (uncertain by {certain:.2g} s)"
+    elif after < _MIN_EXPLAINED or noise(fit.residuals(best)) > _MAX_NOISE_RAD:
+        note = "the trajectory's rotations fit the images at no clock offset: clock not checked"
+    elif same:
+        verdict = "agrees"
+    elif max((_explained(fit, p, best) for p in others), default=0.0) > 0.75 * after:
+        note = f"several clock offsets fit, such as {found.offset:.3f} s: the given one is kept"
+    else:
+        rate = ""
+        if found.rate != 1:
+            rate = f" and the rate {found.rate:.5f} +- {rate_sigma:.5f}"
+        verdict = "corrected"
+        note = (
+            f"the trajectory's clock was corrected by camera rotations: the offset is "
+            f"{found.offset:.3f} +- {offset_sigma:.3f} s at the first frame{rate} "
+            f"(median rotation residual of a step: {degrees[0]:.2f} degrees before, "
+            f"{degrees[1]:.2f} after)"
+        )
+    used = found if verdict == "corrected" else given
+    before, after = degrees
+    return ClockEstimate(used, found, offset_sigma, rate_sigma, before, after, verdict, note)
 
 
 def other_rate(
@@ -122,7 +150,7 @@ def other_rate(
         for p in fit.candidates(start, turns.step)
     ]
     tried.sort(key=lambda one: one[0])
-    nearest = [(rate, at_rate(rate), p) for _, rate, p in tried[:_NUM_REFINED_RATES]]
+    nearest = [(rate, at_rate(rate), p) for _, rate, p in tried[:4]]
     refined = [(rate, fit, fit.refine(p)) for rate, fit, p in nearest]
     sigma = min(noise(fit.residuals(p)) for _, fit, p in refined)
     rate, fit, best = min(refined, key=lambda one: one[1].cost(one[2], sigma))
@@ -132,7 +160,7 @@ def other_rate(
         _turning(fit, best).sum() >= _MIN_TURNS
         and _explained(fit, best, best) >= _SURE_EXPLAINED
         and noise(fit.residuals(best)) < _MAX_NOISE_RATIO * noise(before)
-        and outweighs(int(nearer), len(turns) - int(nearer), _OTHER_RATE_ERROR)
+        and outweighs(int(nearer), len(turns) - int(nearer), 1e-3)
     )
     return float(rate * best[1]) if contradicted else None
 
@@ -160,56 +188,3 @@ def simplest(fit: ClockFit, best: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     if worse and abs(best[1] - 1) > _SIGNIFICANT_SIGMAS * np.sqrt(covariance[1, 1]):
         return best, covariance
     return held, fit.covariance(held, with_rate=False)
-
-
-def _with_verdict(
-    fit: ClockFit,
-    given: Clock,
-    best: np.ndarray,
-    covariance: np.ndarray,
-    others: list[np.ndarray],
-    interval: float,
-) -> ClockEstimate:
-    """The verdict on the given clock, and the clock to use."""
-    start = np.array([given.offset, 1.0])
-    degrees = [
-        float(np.degrees(np.median(np.linalg.norm(fit.residuals(p), axis=1))))
-        for p in (start, best)
-    ]
-    begin = fit.turns.middle - given.start
-    at_start = np.array([1.0, -begin])
-    found = Clock(given.start, float(best[0] - (best[1] - 1) * begin), float(best[1]))
-    offset_sigma = float(np.sqrt(at_start @ covariance @ at_start))
-    rate_sigma, certain = float(np.sqrt(covariance[1, 1])), fit.time_sigma(covariance)
-    before, after = (_explained(fit, p, best) for p in (start, best))
-    same = fit.apart(best, start) < _SIGNIFICANT_SIGMAS * certain or after < before + _MIN_GAIN
-    verdict, note = "unclear", ""
-    if _turning(fit, best).sum() < _MIN_TURNS or certain > max(
-        _MAX_SIGMA_INTERVALS * interval, _MAX_SIGMA_S
-    ):
-        note = f"the camera turns too little to check the clock (uncertain by {certain:.2g} s)"
-    elif after < _MIN_EXPLAINED or noise(fit.residuals(best)) > _MAX_NOISE_RAD:
-        note = "the trajectory's rotations fit the images at no clock offset: clock not checked"
-    elif same:
-        verdict = "agrees"
-    elif max((_explained(fit, p, best) for p in others), default=0.0) > _MAX_RIVAL_SHARE * after:
-        note = f"several clock offsets fit, such as {found.offset:.3f} s: the given one is kept"
-    else:
-        verdict, note = "corrected", _correction_note(found, offset_sigma, rate_sigma, degrees)
-    used = found if verdict == "corrected" else given
-    before, after = degrees
-    return ClockEstimate(used, found, offset_sigma, rate_sigma, before, after, verdict, note)
-
-
-def _correction_note(
-    found: Clock, offset_sigma: float, rate_sigma: float, degrees: list[float]
-) -> str:
-    rate = ""
-    if found.rate != 1:
-        rate = f" and the rate {found.rate:.5f} +- {rate_sigma:.5f}"
-    return (
-        f"the trajectory's clock was corrected by camera rotations: the offset is "
-        f"{found.offset:.3f} +- {offset_sigma:.3f} s at the first frame{rate} "
-        f"(median rotation residual of a step: {degrees[0]:.2f} degrees before, {degrees[1]:.2f} "
-        "after)"
-    )

@@ -10,15 +10,11 @@ from gsba.geometry import quaternion_from_rotation
 from gsba.types import Trajectory
 
 _MAX_STEPS = 600  # largest number of steps; more are merged, as people turn slowly
-_MIN_STEP_S = 0.2  # least duration of a merged step
-_SPACING_STEPS = 0.25  # spacing of tried offsets, in steps
 _MAX_RATE_DEVIATION = 0.03  # largest tried deviation of the rate from one
 _RATE_SIGMA = 0.02  # prior standard deviation of the rate
 _NUM_CANDIDATES = 5  # candidates taken from the grid
 _MAX_CLOCKS, _MAX_RATES = 60_000, 100  # largest number of clocks on the grid, and of rates among
 # them
-_MAX_INSTANTS = 200_000  # largest number of instants with an angular velocity
-_NUM_ITERATIONS = 20  # of least squares
 _LOSS_WIDTH_SIGMAS = 2.0  # width of the loss, standard deviations
 _MIN_SIGMA_RAD = np.deg2rad(0.03)  # least noise of a rotation per axis: images are no more accurate
 _MIN_GRID_SIGMA_RAD = np.deg2rad(1.0)  # least noise of a rotation on the grid
@@ -60,7 +56,7 @@ def merged(timestamps: np.ndarray, f_R_nexts: np.ndarray, verified: np.ndarray) 
     3, 3), and which of them are known, (F - 1,) bool."""
     from scipy.spatial.transform import Rotation
 
-    least = max(_MIN_STEP_S, np.ptp(timestamps) / _MAX_STEPS) if len(timestamps) else 0.0
+    least = max(0.2, np.ptp(timestamps) / _MAX_STEPS) if len(timestamps) else 0.0
     times, rotations, last = [], [], -1
     for f in np.flatnonzero(verified):
         begin, end = timestamps[f], timestamps[f + 1]
@@ -122,7 +118,7 @@ class ClockFit:
         parameters, free = start.copy(), 1 + with_rate
         residuals = self.residuals(parameters)
         sigma, damping = widening * noise(residuals), 1e-3
-        for _ in range(_NUM_ITERATIONS):
+        for _ in range(20):
             jacobian, prior = self._jacobian(parameters)[..., :free], self._prior(free)
             weights = 1 / (1 + np.sum(residuals**2, axis=1) / (_LOSS_WIDTH_SIGMAS * sigma) ** 2)
             normal = np.einsum("n,nij,nik->jk", weights, jacobian, jacobian)
@@ -167,7 +163,13 @@ class ClockFit:
         inverse, choices = np.linalg.inv(normal), np.zeros((2, 2, 2))
         choices[:, :free, :free] = sigma**2 * inverse, inverse @ spread @ inverse
         larger = max(choices, key=self.time_sigma)
-        return larger * max(_SIGMA_INFLATION**2, self._width(parameters) ** 2 / larger[0, 0])
+        # Standard deviation of the shift, from the range of shifts that fit nearly as well
+        shifts, losses, _ = self._profile(parameters)
+        here = losses[len(losses) // 2]
+        as_good = np.abs(shifts[losses < here + _CERTAIN_SIGMAS**2])
+        spacing = float(shifts[1] - shifts[0])
+        width = max(float(as_good.max(initial=0)) - spacing, 0.0) / _CERTAIN_SIGMAS
+        return larger * max(_SIGMA_INFLATION**2, width**2 / larger[0, 0])
 
     def settle(self, parameters: np.ndarray, with_rate: bool = True) -> np.ndarray:
         """The best of the minima within a step: the trajectory's entries make the loss jagged."""
@@ -190,14 +192,6 @@ class ClockFit:
         losses = [_LOSS_WIDTH_SIGMAS**2 * len(r) * _bounded(r, sigma) for r in residuals]
         return shifts, np.array(losses), sigma
 
-    def _width(self, parameters: np.ndarray) -> float:
-        """Standard deviation of the shift, from the range of shifts that fit nearly as well."""
-        shifts, losses, _ = self._profile(parameters)
-        here = losses[len(losses) // 2]
-        as_good = np.abs(shifts[losses < here + _CERTAIN_SIGMAS**2])
-        spacing = float(shifts[1] - shifts[0])
-        return max(float(as_good.max(initial=0)) - spacing, 0.0) / _CERTAIN_SIGMAS
-
     def time_sigma(self, covariance: np.ndarray) -> float:
         """Standard deviation in seconds of an instant's time, at the worse end of the video."""
         at = np.column_stack([np.ones(2), self.turns.ends])
@@ -210,7 +204,7 @@ class ClockFit:
     def candidates(self, start: np.ndarray, reach_s: float) -> Iterator[np.ndarray]:
         """Parameters (2,) of the best clocks on a grid around a start, best first, up to `reach_s`
         away; less far where steps take a fraction of a second: the size of the grid is bounded."""
-        spacing = _SPACING_STEPS * self.turns.step
+        spacing = 0.25 * self.turns.step
         rates = max(
             round(min(_MAX_RATE_DEVIATION * self.turns.ends[1] / spacing, _MAX_RATES / 2)), 1
         )
@@ -218,7 +212,17 @@ class ClockFit:
         most = round(min(reach_s / spacing, _MAX_CLOCKS / len(rates) / 2))
         shifts = spacing * np.arange(-most, most + 1)
         tried = np.stack(np.meshgrid(shifts, rates), axis=-1).reshape(-1, 2) + start
-        lookup = self._angular_velocity(spacing, self.turns.middle + start[0], shifts[-1])
+        # Instants (n,) of the trajectory, its mean angular velocity (n, 3) over a step there
+        middle = self.turns.middle + start[0]
+        reach = shifts[-1]
+        half = 0.5 * min(self.turns.step, float(np.ptp(self.span)))
+        far = reach + (1 + _MAX_RATE_DEVIATION) * np.abs(self.turns.ends).max() + half
+        begin, end = self.span[0] + half, self.span[1] - half
+        begin, end = max(begin, min(middle - far, end)), min(end, max(middle + far, begin))
+        count = int(np.clip((end - begin) / (0.5 * spacing), 2, 200_000))
+        times = np.linspace(begin, end, count)
+        begin, end = self._rotations(times - half), self._rotations(times + half)
+        lookup = times, _log(_product(_conjugate(begin), end)) / (2 * half)
         order = np.argsort([self._rough_cost(p, *lookup) for p in tried], kind="stable")
         chosen: list[np.ndarray] = []
         for parameters in tried[order]:
@@ -227,19 +231,6 @@ class ClockFit:
                 yield parameters
             if len(chosen) == _NUM_CANDIDATES:
                 return
-
-    def _angular_velocity(
-        self, spacing: float, middle: float, reach: float
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Instants (n,) of the trajectory, its mean angular velocity (n, 3) over a step there."""
-        half = 0.5 * min(self.turns.step, float(np.ptp(self.span)))
-        far = reach + (1 + _MAX_RATE_DEVIATION) * np.abs(self.turns.ends).max() + half
-        begin, end = self.span[0] + half, self.span[1] - half
-        begin, end = max(begin, min(middle - far, end)), min(end, max(middle + far, begin))
-        count = int(np.clip((end - begin) / (0.5 * spacing), 2, _MAX_INSTANTS))
-        times = np.linspace(begin, end, count)
-        begin, end = self._rotations(times - half), self._rotations(times + half)
-        return times, _log(_product(_conjugate(begin), end)) / (2 * half)
 
     def _rough_cost(
         self, parameters: np.ndarray, times: np.ndarray, velocities: np.ndarray

@@ -21,9 +21,6 @@ _WAYS = {
     "forward": (2, 1),
     "back": (2, -1),
 }  # way -> index and sign of our axis
-_MIN_ROTATION_RAD = np.deg2rad(1.0)  # rotation of a step below which its axis is uncertain
-_MAX_RESIDUAL_RATIO = 0.6  # largest residual of an accepted rotation, relative to that of no
-# rotation
 QUARTER_TURNS = [Rotation.from_euler("z", 90 * n, degrees=True).as_matrix() for n in range(4)]
 
 
@@ -38,11 +35,8 @@ class Convention:
     @classmethod
     def parse(cls, text: str | None) -> "Convention":
         """The convention that words separated by commas name: "wxyz", "camera-from-world", and ways
-        of the camera's x, y and z axes like "forward-left-up".
-
-        Raises:
-            GsbaError: another word, or axes that are no right-handed system.
-        """
+        of the camera's x, y and z axes like "forward-left-up". Raises GsbaError: another word, or
+        axes that are no right-handed system."""
         words = [word.strip() for word in (text or "").split(",") if word.strip()]
         axes = [word for word in words if word not in (WXYZ, CAMERA_FROM_WORLD)]
         known = dict(axis_systems())
@@ -96,7 +90,7 @@ def quarter_turn(coarse: CoarsePoses, world_T_rigs: np.ndarray) -> np.ndarray:
     ours, theirs = _steps(world_T_rigs)[own], _steps(coarse.world_T_rigs)[own]
     left = [_residual(ours, theirs, turn) for turn in QUARTER_TURNS]
     best = int(np.argmin(left))
-    return QUARTER_TURNS[best if left[best] < _MAX_RESIDUAL_RATIO * left[0] else 0]
+    return QUARTER_TURNS[best if left[best] < 0.6 * left[0] else 0]
 
 
 def _steps(poses: np.ndarray) -> np.ndarray:
@@ -109,6 +103,7 @@ def _residual(ours: np.ndarray, theirs: np.ndarray, turn: np.ndarray) -> float:
     moves = [steps[:, :3, 3] for steps in (ours, theirs)]
     ways = [move / np.maximum(np.linalg.norm(move, axis=1), 1e-12)[:, None] for move in moves]
     sizes = [np.linalg.norm(vectors, axis=1) for vectors in turns]
-    turned = np.linalg.norm(turns[0] - turns[1] @ turn.T, axis=1) / (sum(sizes) + _MIN_ROTATION_RAD)
+    # Below one degree the axis of a step's rotation is uncertain.
+    turned = np.linalg.norm(turns[0] - turns[1] @ turn.T, axis=1) / (sum(sizes) + np.deg2rad(1.0))
     moved = np.linalg.norm(ways[0] - ways[1] @ turn.T, axis=1) / 2
     return float(np.sum(turned + moved))

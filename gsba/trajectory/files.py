@@ -33,10 +33,8 @@ def read_trajectory(path: Path, timestamps: Path | None = None) -> Trajectory:
     poses from before the closure, and interpolating the keyframes was three times more accurate.
 
     Rows by which a SLAM says that it lost a frame are rows without a pose, and left out: NaN or
-    infinite values, a quaternion of zeros, positions beyond 1e12.
-
-    Raises:
-        GsbaError: a line cannot be used; the message names file and line.
+    infinite values, a quaternion of zeros, positions beyond 1e12. Raises GsbaError: a line cannot
+    be used; the message names file and line.
     """
     path = Path(path)
     try:

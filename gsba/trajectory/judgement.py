@@ -14,24 +14,14 @@ from gsba.types import CoarsePoses, PoseSource
 
 logger = logging.getLogger(__name__)
 
-_MIN_LEAP_RATIO = 4.0  # median speeds: a faster step is a leap
 _MAX_PRIOR_SIGMAS = 3.0  # standard deviations of the prior beyond which a step starts from the
 # images
 
-_MAX_FALSE_RUN = 12  # largest number of consecutive false frames told apart from a jump
-_JUMP_COST = 1.5  # cost of a jump, in false frames
 _NOISE_QUANTILE = 0.25  # share of steps free of outliers: quantile from which noise is estimated
 # Multiple of the quantile from which an error is an outlier: drift exceeds it once in 1000 steps.
 _OUTLIER_RATIO = 4.0
-# Standard deviations of the trajectory by which a step may be off that only frames around it show.
-_UNSEEN_SIGMAS = 2.0
 _STEPS_AROUND = 6  # steps to either side whose lengths a step's is compared with
-_MIN_INTERVAL_RATIO = 1.5  # interval over missing frames, in median ones
-_STEPS_BESIDE = 4  # nearest steps whose direction is compared
-_USUAL_PACES = 0.6, 1.6  # slowest and fastest speed of such a step, in that of the steps around
 _LONG_STEP_DEPTHS = 0.3  # steps from which bays of a hall are taken for one another, median depths
-_BACK_COSINE = -0.5  # largest cosine between two steps that lead forth and back
-_MIN_JUDGED_STEPS = 6  # least steps of which any length is compared
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,8 +100,26 @@ def check_steps(
     else:
         start = coarse.world_T_rigs
     seen = _replaced(slam, found, lengths, found.verified)
+    # The better ones of its steps tell the noise of the trajectory: one that drifts quickly
+    # contradicts images in many steps, and none of its frames is an outlier.
+    judged = known & found.directed
+    turned = rotation_angle(np.swapaxes(slam[:, :3, :3], 1, 2) @ seen[:, :3, :3])
+    off = np.linalg.norm(slam[:, :3, 3] - seen[:, :3, 3], axis=1)
+    usual = [
+        float(np.quantile(x[judged], _NOISE_QUANTILE)) if judged.any() else 0.0
+        for x in (turned, off)
+    ]
     named = false_frames(
-        wrong, slam, chosen, own, outlier_limits(slam, seen, known & found.directed, verify)
+        wrong,
+        slam,
+        chosen,
+        own,
+        OutlierLimits(
+            np.deg2rad(verify.max_rotation_deg),
+            float(np.sin(np.deg2rad(verify.max_direction_deg))),
+            _OUTLIER_RATIO * usual[0],
+            _OUTLIER_RATIO * usual[1],
+        ),
     )
     return StepChecks(start, wrong, named, unseen, lengths, None)
 
@@ -164,11 +172,12 @@ def implausible_steps(
     judged = own[:-1] & own[1:] & ~(trust.unseen_steps & trust.false_steps)  # those are guesses
     judged &= (found > 0) & (slam > np.median(slam) / max_ratio)  # standing still measures nothing
     rows, wrong = np.flatnonzero(judged), np.zeros(len(slam), bool)
-    if len(rows) < _MIN_JUDGED_STEPS:
+    if len(rows) < 6:
         return wrong
     ratios = np.log(found[rows] / slam[rows])
     speeds = np.log(found[rows] / np.diff(timestamps)[rows])
-    limits = np.where(trust.unseen_steps, _UNSEEN_SIGMAS * noise, np.log(max_ratio))
+    # A step that only frames around it show may be off by two standard deviations.
+    limits = np.where(trust.unseen_steps, 2.0 * noise, np.log(max_ratio))
     for n, step in enumerate(rows.tolist()):
         around = slice(max(n - _STEPS_AROUND, 0), n + _STEPS_AROUND + 1)
         off = ratios[n] - np.median(ratios[around])
@@ -185,7 +194,7 @@ def over_missing_frames(timestamps: np.ndarray, recordings: np.ndarray) -> np.nd
         rows = np.flatnonzero(recordings == number)
         intervals = np.diff(timestamps[rows])
         if len(intervals):
-            found[rows[:-1]] = intervals > _MIN_INTERVAL_RATIO * np.median(intervals)
+            found[rows[:-1]] = intervals > 1.5 * np.median(intervals)
     return found
 
 
@@ -211,13 +220,14 @@ def unusual_paces(
     usual = ~missing & (recordings[1:] == recordings[:-1])
     velocities = np.diff(world_T_rigs[:, :3, 3], axis=0) / np.diff(timestamps)[:, None]
     speeds = np.linalg.norm(velocities, axis=1)
-    unusual, (slowest, fastest) = np.zeros(len(missing), bool), _USUAL_PACES
+    # in the speed of the steps around
+    unusual, (slowest, fastest) = np.zeros(len(missing), bool), (0.6, 1.6)
     for step in np.flatnonzero(missing).tolist():
         around = np.arange(max(step - _STEPS_AROUND, 0), min(step + _STEPS_AROUND + 1, len(speeds)))
         around = around[usual[around] & (recordings[around] == recordings[step])]
         if len(around):
             speed = float(np.median(speeds[around]))
-            near = around[np.argsort(np.abs(around - step), kind="stable")][:_STEPS_BESIDE]
+            near = around[np.argsort(np.abs(around - step), kind="stable")][:4]
             back = velocities[step] @ velocities[near].sum(axis=0) < 0
             unusual[step] = back or not slowest * speed < speeds[step] < fastest * speed
     return unusual
@@ -231,7 +241,7 @@ def back_and_forth(world_T_rigs: np.ndarray, shown: np.ndarray, depth: float) ->
     lengths = np.linalg.norm(steps, axis=1)
     found = np.zeros(len(steps), bool)
     at_rig = np.einsum("fji,fj->fi", world_T_rigs[:-1, :3, :3], steps)
-    far = _BACK_COSINE * lengths[:-1] * lengths[1:]
+    far = -0.5 * lengths[:-1] * lengths[1:]
     back = np.sum(steps[:-1] * steps[1:], axis=1) < far
     back &= np.sum(at_rig[:-1] * at_rig[1:], axis=1) < far
     back &= np.maximum(lengths[:-1], lengths[1:]) > _LONG_STEP_DEPTHS * depth
@@ -296,9 +306,7 @@ def leaps(world_T_rigs: np.ndarray, timestamps: np.ndarray) -> np.ndarray:
     lengths = np.linalg.norm(np.diff(world_T_rigs[:, :3, 3], axis=0), axis=1)
     speeds = lengths / np.diff(timestamps)
     moving = speeds[speeds > 0]
-    return (
-        speeds > _MIN_LEAP_RATIO * np.median(moving) if len(moving) else np.zeros(len(speeds), bool)
-    )
+    return speeds > 4.0 * np.median(moving) if len(moving) else np.zeros(len(speeds), bool)
 
 
 def _chain(world_T_rigs: np.ndarray, chosen: np.ndarray, own: np.ndarray) -> np.ndarray:
@@ -323,26 +331,6 @@ class OutlierLimits:
     noise_offset: float  # map units, of one step's position: smaller errors are noise
 
 
-def outlier_limits(
-    slam: np.ndarray, images: np.ndarray, judged: np.ndarray, settings: TwoViewLimits
-) -> OutlierLimits:
-    """Thresholds that mark an outlier, beyond the settings and the noise of the trajectory, as its
-    better ones of the steps judged (F - 1,) bool, (F - 1, 4, 4) each, tell: a quickly drifting
-    trajectory contradicts images in many steps, and none of its frames is an outlier."""
-    turned = rotation_angle(np.swapaxes(slam[:, :3, :3], 1, 2) @ images[:, :3, :3])
-    off = np.linalg.norm(slam[:, :3, 3] - images[:, :3, 3], axis=1)
-    usual = [
-        float(np.quantile(x[judged], _NOISE_QUANTILE)) if judged.any() else 0.0
-        for x in (turned, off)
-    ]
-    return OutlierLimits(
-        np.deg2rad(settings.max_rotation_deg),
-        float(np.sin(np.deg2rad(settings.max_direction_deg))),
-        _OUTLIER_RATIO * usual[0],
-        _OUTLIER_RATIO * usual[1],
-    )
-
-
 def false_frames(
     wrong: np.ndarray,
     slam: np.ndarray,
@@ -361,10 +349,11 @@ def false_frames(
     score, back = np.ones(len(ours)), np.full(len(ours), -1)
     broken = np.zeros(len(ours), bool)
     for n in range(1, len(ours)):
-        for m in range(n - 1, max(n - 1 - _MAX_FALSE_RUN, -1), -1):
+        # more consecutive false frames are a jump
+        for m in range(n - 1, max(n - 1 - 12, -1), -1):
             a, b = int(ours[m]), int(ours[n])
             agree = (b == a + 1 and not wrong[a]) or _agree(theirs, images, a, b, limits)
-            gain = score[m] + 1 - (0 if agree else _JUMP_COST)
+            gain = score[m] + 1 - (0 if agree else 1.5)
             if gain > score[n]:
                 score[n], back[n], broken[n] = gain, m, not agree
     named[ours] = True

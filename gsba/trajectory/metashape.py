@@ -16,7 +16,6 @@ from gsba.types import FrameSet, Trajectory
 
 _log = logging.getLogger(__name__)
 
-_ROTATION_TOLERANCE = 1e-3  # largest deviation of a 3x3 block from a rotation
 _FORMAT = "export the aligned panoramas by File > Export > Export Cameras, Agisoft XML"
 
 
@@ -56,11 +55,8 @@ def is_metashape(path: Path) -> bool:
 
 def read_metashape(path: Path) -> list[NamedPoses]:
     """Poses of the aligned spherical cameras of a cameras.xml, by component, the largest first.
-
-    Raises:
-        GsbaError: the file is damaged or of another program, no spherical camera is aligned, or
-            two cameras have one name.
-    """
+    Raises GsbaError: the file is damaged or of another program, no spherical camera is aligned, or
+    two cameras have one name."""
     try:
         root = ET.parse(path).getroot()
     except OSError as error:
@@ -106,6 +102,6 @@ def _pose(text: str, where: str) -> np.ndarray:
     u, _, vt = np.linalg.svd(matrix[:3, :3])
     rotation = u @ vt
     off = np.abs(rotation - matrix[:3, :3]).max()
-    if off > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
+    if off > 1e-3 or np.linalg.det(rotation) < 0:
         raise GsbaError(f"{where}: the left 3x3 block of its transform is not a rotation")
     return pose(rotation, matrix[:3, 3])

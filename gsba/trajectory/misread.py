@@ -12,10 +12,8 @@ from gsba.trajectory.steps import Steps, step_errors
 from gsba.types import CoarsePoses, PoseSource
 
 _MIN_STEPS = 5  # least number of steps that judge a whole trajectory
-_MIN_AGREEING_SHARE = 0.5  # least share of steps in loose agreement: of random ones, a third agrees
 _LOOSE_LIMITS = {"max_rotation_deg": 20.0, "max_direction_deg": 60.0}  # thresholds of loose
 # agreement
-_DOUBTFUL_SHARE = 0.6  # share of agreeing steps below which another convention is accepted
 _MIN_EXPLAINED_SHARE = 0.7  # least share of steps that another convention must explain
 _COMMON_SYSTEMS = "right-up-back", "left-down-back", "left-up-forward"  # half turns: of graphics,
 # about the vertical axis, about the forward axis
@@ -56,7 +54,7 @@ def refuse_misread(coarse: CoarsePoses, found: Steps, settings: TwoViewLimits) -
         reading for reading in shares if shares[reading] * judged.sum() > most * judged.sum() - 1
     ]
     best = min(likely, key=lambda reading: _mean_error(readings[reading], found, judged))
-    if not best or shares[best] < _MIN_EXPLAINED_SHARE or shares[""] >= _DOUBTFUL_SHARE:
+    if not best or shares[best] < _MIN_EXPLAINED_SHARE or shares[""] >= 0.6:
         return
     late, explained = _delay_in_frames(coarse, found, judged, settings)
     if explained >= shares[best] * judged.sum():
@@ -76,10 +74,8 @@ def refuse_misfit(coarse: CoarsePoses, found: Steps, settings: TwoViewLimits) ->
     refuse_misread(coarse, found, settings)
     judged, loose = _judged_steps(coarse, found), replace(settings, **_LOOSE_LIMITS)
     steps = _steps(coarse.world_T_rigs)
-    if (
-        judged.sum() < _MIN_STEPS
-        or _agreeing_share(steps, found, judged, loose) > _MIN_AGREEING_SHARE
-    ):
+    # of random steps, a third agrees
+    if judged.sum() < _MIN_STEPS or _agreeing_share(steps, found, judged, loose) > 0.5:
         return
     text = _contradiction_text(_agreeing_share(steps, found, judged, settings), judged)
     late, _ = _delay_in_frames(coarse, found, judged, settings)

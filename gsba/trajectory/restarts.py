@@ -13,15 +13,10 @@ from gsba.types import CoarsePoses, FrameSet, PoseSource, Trajectory
 
 _log = logging.getLogger(__name__)
 
-_MIN_JUMP_SPEEDS = 4.0  # median speeds: faster than any step of the walk itself
 _MIN_ENTRIES_BETWEEN_JUMPS = 12  # entries on either side without another jump: two nearby jumps are
 # false poses
-_NEAR_ORIGIN_STEPS = 3.0  # distance of a new map's first entry from the origin, in median steps
-_NEAR_ORIGIN_DEG = 20.0  # rotation of a new map's first entry
 _IDENTITY_TOLERANCE = 1e-9  # no tracked pose is this close to the identity by chance
-_MIN_ENTRIES = 3  # least entries of a piece with a map of its own
 _MIN_TURN_RAD = np.deg2rad(0.5)  # a smaller one is noise
-_MIN_JUMP_PACES = 4.0  # median speeds: faster than any step of the walk itself
 
 
 def without_lost_frames(trajectory: Trajectory) -> Trajectory:
@@ -81,7 +76,8 @@ def _lost_identity(trajectory: Trajectory, first: int, last: int, pace: float) -
     if last + 1 == len(trajectory.timestamps):
         return rows
     # Of equal rows, the last one may be the first frame of a map.
-    rows[-1] = _speed(trajectory, last, last + 1) > _MIN_JUMP_PACES * pace
+    # faster than any step of the walk itself
+    rows[-1] = _speed(trajectory, last, last + 1) > 4.0 * pace
     if first > 0:
         moved = _speed(trajectory, first - 1, last + 1) / _speed(trajectory, last, last + 1)
         turned = _turn(trajectory, first - 1, last + 1) / _turn(trajectory, last, last + 1)
@@ -106,17 +102,17 @@ def split_restarts(trajectory: Trajectory) -> list[Trajectory]:
     if not (speeds > 0).any():
         return [trajectory]
     pace = float(np.median(speeds[speeds > 0]))
-    jumps = np.flatnonzero(speeds > _MIN_JUMP_SPEEDS * pace)
+    jumps = np.flatnonzero(speeds > 4.0 * pace)  # faster than any step of the walk itself
     away, turned = np.linalg.norm(poses[:, :3, 3], axis=1), rotation_angle(poses[:, :3, :3])
     step = pace * float(np.median(intervals))
     exactly = (away < _IDENTITY_TOLERANCE) & (turned < _IDENTITY_TOLERANCE)
-    nearly = (away < _NEAR_ORIGIN_STEPS * step) & (turned < np.deg2rad(_NEAR_ORIGIN_DEG))
+    nearly = (away < 3.0 * step) & (turned < np.deg2rad(20.0))
     starts = [0]
     for n in range(1, len(poses)):
         fresh = exactly[n] and not exactly[n - 1]
         if n - 1 in jumps and nearly[n]:
             fresh |= np.count_nonzero(np.abs(jumps - (n - 1)) <= _MIN_ENTRIES_BETWEEN_JUMPS) == 1
-        if fresh and min(n - starts[-1], len(poses) - n) >= _MIN_ENTRIES:
+        if fresh and min(n - starts[-1], len(poses) - n) >= 3:
             starts.append(n)
     ends = [*starts[1:], len(poses)]
     return [Trajectory(times[a:b], poses[a:b]) for a, b in zip(starts, ends, strict=True)]

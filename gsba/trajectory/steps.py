@@ -9,16 +9,12 @@ import numpy as np
 from gsba.geometry import inverse, nearest_rotation, rotation_angle
 from gsba.types import Keypoints, VerifiedPairs
 
-_MIN_COMMON = 8  # least common points of two steps whose lengths are compared
 _MAX_LOG_DEVIATION = 0.15  # largest deviation of log ratios: points of rigid scenes are within it,
 # half of them within .02
 _MIN_TRIANGULATION_ANGLE_RAD = np.deg2rad(1.0)  # least triangulation angle of a point whose depth
 # is compared
 _MAX_STILL_RESIDUAL_RAD = np.deg2rad(0.1)  # median bearing residual after a mere rotation, below
 # which the camera stands still
-_MIN_LOG_RATIO_SIGMA = 0.02  # least standard deviation of the logarithm of a ratio of lengths
-_PRIOR_LOG_RATIO_SIGMA = 0.5  # prior standard deviation of that logarithm: walkers keep their pace
-_NUM_LENGTH_ROUNDS = 20  # reweighting rounds
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,11 +149,11 @@ def length_ratios(
         ratios = ratios[np.isfinite(ratios)]
         if least_alike is not None and len(ratios):
             ratios = ratios[np.abs(ratios - np.median(ratios)) < _MAX_LOG_DEVIATION]
-        if len(ratios) < (_MIN_COMMON if least_alike is None else least_alike):
+        if len(ratios) < (8 if least_alike is None else least_alike):
             continue
         logs[f - 1] = np.median(ratios)
         spread = 1.4826 * np.median(np.abs(ratios - logs[f - 1]))
-        sigmas[f - 1] = max(1.25 * spread / np.sqrt(len(ratios)), _MIN_LOG_RATIO_SIGMA)
+        sigmas[f - 1] = max(1.25 * spread / np.sqrt(len(ratios)), 0.02)
     return logs, sigmas
 
 
@@ -226,14 +222,13 @@ def step_lengths(
     target = np.log(np.maximum(slam_lengths, 1e-3 * typical))
     if not len(logs):
         return np.exp(target)
-    links = np.where(
-        np.isfinite(sigmas), 1 / np.minimum(sigmas, 1e3) ** 2, _PRIOR_LOG_RATIO_SIGMA**-2
-    )
+    # walkers keep their pace
+    links = np.where(np.isfinite(sigmas), 1 / np.minimum(sigmas, 1e3) ** 2, 0.5**-2)
     logs = np.where(np.isfinite(sigmas), logs, 0)
     information = np.where(np.isfinite(slam_sigmas), slam_sigmas**-2.0, 0)
     width = 30.0  # width of the loss, standard deviations
     lengths = np.full(len(target), np.median(target))
-    for _ in range(_NUM_LENGTH_ROUNDS):
+    for _ in range(20):
         misfit = (target - lengths) ** 2 * information
         weights = information / (1 + misfit / width**2) + 1e-9
         bands = np.zeros((2, len(target)))

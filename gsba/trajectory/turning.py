@@ -19,7 +19,6 @@ MAX_PARALLAX_RAD = np.deg2rad(1.0)  # largest angle between the bearings of a ma
 MAX_HAND_PARALLAX_RAD = np.deg2rad(3.0)  # the same where images determine no positions: 12 cm
 # between two frames of a hand, seen from 2.3 m
 _SAMPLE_SIZE = 2  # matches that determine a rotation
-_NUM_REFITS = 5  # refits of a rotation without the matches that are furthest off
 _MIN_FRAMES = 3  # least frames of a turn, unless there are only two
 
 
@@ -36,7 +35,7 @@ def rotation_of_most(rays0: np.ndarray, rays1: np.ndarray) -> tuple[np.ndarray, 
     """f0_R_f1 (3, 3) that best rotates most unit rays (m, 3) of frame 1 onto those of frame 0, and
     the distances (m,) that it leaves, radians."""
     near, rotation, off = np.ones(len(rays0), bool), np.eye(3), np.zeros(len(rays0))
-    for _ in range(_NUM_REFITS):
+    for _ in range(5):
         rotation = nearest_rotation(rays0[near].T @ rays1[near])
         off = np.linalg.norm(rays0 - rays1 @ rotation.T, axis=1)
         near = off <= np.median(off)

@@ -47,7 +47,8 @@ class View:
             self._add_paths()
             self._add_splats()
             self._add_controls()
-            self._place_camera()
+            camera, (position, centre) = self.server.initial_camera, self._outside()
+            camera.up, camera.position, camera.look_at = tuple(self.scene.up), position, centre
         self.show(0)
 
     def show(self, f: int) -> None:
@@ -62,7 +63,19 @@ class View:
             except GsbaError as error:
                 faces, problem = {}, str(error)
             with self.server.atomic():
-                self._place_frame(f, faces)
+                # Place images around the rig of a frame, and the points that it observes
+                add, found = self.server.scene, self.scene.reconstruction
+                world_T_rig = found.world_T_rigs[f]
+                position = self.scale * world_T_rig[:3, 3]
+                wxyz = quaternion_from_rotation(world_T_rig[:3, :3])
+                if "/frame" not in self.nodes:
+                    self.nodes["/frame"] = add.add_frame("/frame", show_axes=False)
+                self.nodes["/frame"].wxyz, self.nodes["/frame"].position = wxyz, position
+                for view in views_of(self.scene.frames, f, self.scene.optics):
+                    self._place_face(f, view, faces.get(view.name))
+                rows = found.observation_points[found.observation_frames == f]
+                shown = bool(self.controls["Observed points"].value)
+                self._add_points("/seen", found.points_world[rows], _SEEN, 0.035, shown)
                 self.controls["about"].content = self._about(f, problem)
 
     def stop(self) -> None:
@@ -171,7 +184,9 @@ class View:
             whole.on_click(lambda event: self._stand_outside(event.client))
             self._add_switch("Images", "/frame")
             self._add_switch("Observed points", "/seen")
-            masks = gui.add_checkbox("Masks", False, visible=_has_masks(scene))
+            masks = gui.add_checkbox(
+                "Masks", False, visible=any(path is not None for path in scene.frames.mask_paths)
+            )
             masks.on_update(lambda _: self.show(self.frame))
             self.controls["Masks"] = masks
         with panel.add_tab("Run"):
@@ -199,21 +214,6 @@ class View:
         box = self.server.gui.add_checkbox(label, visible)
         box.on_update(lambda _: setattr(self.nodes[name], "visible", box.value))
         self.controls[label] = box
-
-    def _place_frame(self, f: int, faces: dict[str, np.ndarray]) -> None:
-        """Place images around the rig of a frame, and the points that it observes."""
-        add, found = self.server.scene, self.scene.reconstruction
-        world_T_rig = found.world_T_rigs[f]
-        position = self.scale * world_T_rig[:3, 3]
-        wxyz = quaternion_from_rotation(world_T_rig[:3, :3])
-        if "/frame" not in self.nodes:
-            self.nodes["/frame"] = add.add_frame("/frame", show_axes=False)
-        self.nodes["/frame"].wxyz, self.nodes["/frame"].position = wxyz, position
-        for view in views_of(self.scene.frames, f, self.scene.optics):
-            self._place_face(f, view, faces.get(view.name))
-        rows = found.observation_points[found.observation_frames == f]
-        shown = bool(self.controls["Observed points"].value)
-        self._add_points("/seen", found.points_world[rows], _SEEN, 0.035, shown)
 
     def _place_face(self, f: int, view: Face, image: np.ndarray | None) -> None:
         """Place the image of a view at its pose; remove it if `image` is None."""
@@ -271,10 +271,6 @@ class View:
     def _resize_points(self, factor: float) -> None:
         self.nodes["/cloud"].point_size = 0.02 * self.size * factor
 
-    def _place_camera(self) -> None:
-        camera, (position, centre) = self.server.initial_camera, self._outside()
-        camera.up, camera.position, camera.look_at = tuple(self.scene.up), position, centre
-
     def _outside(self) -> tuple[np.ndarray, np.ndarray]:
         """Camera position from which the whole path is visible, and the middle of the path."""
         positions = self.scale * self.scene.reconstruction.world_T_rigs[:, :3, 3]
@@ -301,10 +297,6 @@ class View:
         with client.atomic():
             client.camera.position = position
             client.camera.look_at = centre
-
-
-def _has_masks(scene: Scene) -> bool:
-    return any(path is not None for path in scene.frames.mask_paths)
 
 
 def _pyramid(length: float) -> tuple[np.ndarray, np.ndarray]:

@@ -25,7 +25,6 @@ from gsba.types import FACES, FrameSet, Reconstruction, RunStart
 logger = logging.getLogger(__name__)
 
 _MAX_FACE_PX = 768  # of a shown cube face
-_MASK_RGB = np.array([192, 57, 43])  # colour of masked pixels
 _MASK_SHARE = 0.6  # of that colour in masked pixels
 
 
@@ -63,10 +62,8 @@ def load_scene(run: Path) -> Scene:
     """Scene of a finished run's largest map.
 
     Its world is that of the run's last export with a placement (upright, in metres, by GPS or
-    truth), or else the run's own. Splats in RUN/splat are transformed to it.
-
-    Raises:
-        GsbaError: the folder is no finished run, or a splat or transform.json cannot be read.
+    truth), or else the run's own. Splats in RUN/splat are transformed to it. Raises GsbaError: the
+    folder is no finished run, or a splat or transform.json cannot be read.
     """
     reconstruction, frames = load_run(run)
     placement, grounds = _latest_placement(run)
@@ -138,7 +135,13 @@ def faces_of(
     """
     kind = frames.format_of(f)
     if optics:
-        return _lens_faces(frames, f, masked, optics)
+        views = views_of(frames, f, optics)
+        cutter = optics.cutter(views, f)
+        images, mask = cut_views(frames, f, cutter), load_mask(frames, f) if masked else None
+        if mask is not None:
+            pairs = zip(images, cutter.cut_mask(mask), strict=True)
+            images = [_tinted(image, use) for image, use in pairs]
+        return {view.name: image for view, image in zip(views, images, strict=True)}
     rig = cubemap.native_rig(kind, _MAX_FACE_PX)
     images, use = cubemap.load(frames, f, rig)
     if masked and use is not None and frames.mask_paths[f] is not None:
@@ -152,19 +155,10 @@ def views_of(frames: FrameSet, f: int, optics: Optics) -> tuple[View, ...]:
     return optics.views(min(frames.format_of(f).native_face_size, _MAX_FACE_PX))
 
 
-def _lens_faces(frames: FrameSet, f: int, masked: bool, optics: Optics) -> dict[str, np.ndarray]:
-    views = views_of(frames, f, optics)
-    cutter = optics.cutter(views, f)
-    images, mask = cut_views(frames, f, cutter), load_mask(frames, f) if masked else None
-    if mask is not None:
-        pairs = zip(images, cutter.cut_mask(mask), strict=True)
-        images = [_tinted(image, use) for image, use in pairs]
-    return {view.name: image for view, image in zip(views, images, strict=True)}
-
-
 def _tinted(image: np.ndarray, use: np.ndarray) -> np.ndarray:
     """Images (..., 3) whose pixels outside of the mask `use` (...) bool are tinted."""
-    tinted = np.round((1 - _MASK_SHARE) * image + _MASK_SHARE * _MASK_RGB).astype(np.uint8)
+    red = _MASK_SHARE * np.array([192, 57, 43])
+    tinted = np.round((1 - _MASK_SHARE) * image + red).astype(np.uint8)
     return np.where(use[..., None], image, tinted)
 
 

@@ -19,9 +19,11 @@ from gsba.camera.cameras import Cameras
 from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.camera.rig import CubeRig
 from gsba.export import ExportFormat, ExportOptions, export, export_all, images, pictures
+from gsba.export.dataset import Dataset
 from gsba.frames import cubemap, masks, pixels
 from gsba.frames.pixels import load_erp
 from gsba.log import GsbaError
+from gsba.placement.placement import Placement
 from gsba.types import FrameSet
 
 FORMATS = [ExportFormat.COLMAP, ExportFormat.COLMAP_FLAT, ExportFormat.NERFSTUDIO]
@@ -177,9 +179,12 @@ def test_parts_write_what_the_whole_does(tmp_path, kind, lenses, to, chosen):
 def test_whoever_is_late_makes_no_folders(tmp_path):
     """A worker whose frames another one has written meanwhile, or that does not see the disk."""
     files = pictures.Files(tmp_path / "out", ("",), "images/{name}{suffix}", "")
-    writer = images.panorama_writer(files, _frames(tmp_path, "plain"), Cameras())
+    frames = _frames(tmp_path, "plain")
+    given = files.folder, reconstruction(), frames, Cameras(), ExportFormat.TUM, "panorama"
+    data = Dataset(*given, Placement(), ExportOptions())
+    writer = images.panorama_writer(data, files)
     with pytest.raises(GsbaError, match=r"cannot write .*out/images/frame_0000.jpg: No such file"):
-        pictures.Pictures(_frames(tmp_path, "plain"), [writer])(0)
+        pictures.Pictures(frames, [writer])(0)
     assert not (tmp_path / "out").exists()
 
 

@@ -13,8 +13,10 @@ from shard_jobs import DiesWriting
 from tiny_run import Case
 
 from gsba.camera.cameras import Cameras
-from gsba.export import ExportFormat, export_all, formats, images, pictures
+from gsba.export import ExportFormat, ExportOptions, export_all, formats, images, pictures
+from gsba.export.dataset import Dataset
 from gsba.log import GsbaError
+from gsba.placement.placement import Placement
 from gsba.store.cluster import hired
 from gsba.store.shards import even_blocks
 
@@ -74,7 +76,9 @@ def test_a_dataset_that_workers_do_not_see_is_named(client, tmp_path: Path, monk
     monkeypatch.setattr(pictures.Files, "make_folders", lambda files, _: files.folder.rmdir())
     files = pictures.Files(tmp_path / "unseen", ("",), "{name}{suffix}", "")
     files.folder.mkdir()
-    writer = images.panorama_writer(files, frames, Cameras())
+    given = files.folder, reconstruction(), frames, Cameras(), ExportFormat.TUM, "panorama"
+    data = Dataset(*given, Placement(), ExportOptions())
+    writer = images.panorama_writer(data, files)
     with (
         hired(client, tmp_path / "out", frames) as workers,
         pytest.raises(GsbaError, match=f"does not see {tmp_path}/unseen: put it on a disk"),

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from cube_map_tracks import picture_tracks
+from export_scene import reconstruction
 from scipy.spatial.transform import Rotation
 from two_fisheyes import colours, write
 
@@ -17,12 +18,14 @@ from gsba.camera.one_centre import Stitcher
 from gsba.camera.rig import CubeRig
 from gsba.camera.sphere import bearings_from_erp
 from gsba.camera.views import ViewCutter, cube_views, lens_views, rig_views
+from gsba.export.dataset import Dataset, ExportFormat, ExportOptions
 from gsba.export.images import panorama_writer, view_writer, write_pictures
 from gsba.export.pictures import Files
 from gsba.frames import cubemap, load_erp, load_grey, scan
 from gsba.frames.pixels import Buffers, cut_views, load_padded
 from gsba.frames.track_pairs import load_squares
 from gsba.log import GsbaError
+from gsba.placement.placement import Placement
 from gsba.types import FACES, FrameSet
 
 SIZE, OVERLAP, NUM = 96, 4, 3
@@ -109,10 +112,9 @@ def test_exports_write_panoramas_and_faces(tmp_path: Path, frames: FrameSet) -> 
     whole = Files(tmp_path, ("",), "erp/{name}{suffix}", "")
     faces = Files(tmp_path, FACES, "cube/{view}/{name}{suffix}", "")
     views = cube_views(FACES, 64)
-    writers = [
-        panorama_writer(whole, frames, Cameras()),
-        view_writer([faces], frames, [views], Cameras()),
-    ]
+    given = tmp_path, reconstruction(), frames, Cameras(), ExportFormat.COLMAP, "cube"
+    data = Dataset(*given, Placement(), ExportOptions())
+    writers = [panorama_writer(data, whole), view_writer(data, [faces], [views])]
     write_pictures(frames, writers)
     cut, _ = cubemap.load(frames, 2, CubeRig(64, np.pi / 2))
     for path, expected in [

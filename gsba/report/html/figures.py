@@ -14,9 +14,7 @@ if TYPE_CHECKING:
     from gsba.odometry import Odometry
 
 _MAX_POINTS = 4000  # points of the cloud on the map
-_MAX_CELLS = 240  # cells along a side of the match matrix
 _SPHERE_CELL_DEG = 5.0
-_MIN_IN_CELL = 5  # observations; cells with fewer stay empty
 
 
 def world_map(coarse: CoarsePoses, reconstruction: Reconstruction) -> dict[str, Any]:
@@ -89,7 +87,7 @@ def match_matrix(reconstruction: Reconstruction) -> dict[str, Any]:
     shape = (num_frames, len(reconstruction.points_world))
     seen = csr_array((ones, (frames, points)), shape=shape)
     shared = (seen @ seen.T).tocoo()
-    step = -(-num_frames // _MAX_CELLS)
+    step = -(-num_frames // 240)
     num = -(-num_frames // step)
     off = shared.row != shared.col
     cells = np.zeros((num, num), np.int64)
@@ -114,8 +112,9 @@ def residual_sphere(reconstruction: Reconstruction) -> dict[str, Any]:
         release_mapped_files()
     cell, num = np.concatenate(cells), rows * columns
     parts = zip(*values, strict=True)
+    # cells with fewer observations stay empty
     medians = [
-        medians_by_group(np.concatenate(part), cell, num, _MIN_IN_CELL).reshape(rows, columns)
+        medians_by_group(np.concatenate(part), cell, num, 5).reshape(rows, columns)
         for part in parts
     ]
     names = ("median_deg", "east_deg", "south_deg")
@@ -181,7 +180,6 @@ def tangent_residuals(reconstruction: Reconstruction) -> np.ndarray:
 
 
 _MAX_FRAMES = 4000  # drawn frames, besides keyframes and the first frames after losses
-_RELATIVE_GAP = 0.15  # between maps, part of the largest map's extent
 
 
 def odometry_plan(found: "Odometry") -> dict[str, Any]:
@@ -198,7 +196,7 @@ def odometry_plan(found: "Odometry") -> dict[str, Any]:
         poses = found.world_T_rigs[rows]
         level[rows] = poses[:, :3, 3] @ viewing_axes(poses)[0][:2].T
     extents = [np.ptp(level[rows], axis=0) for rows in rows_of]
-    gap, left = _RELATIVE_GAP * max((float(e.max()) for e in extents), default=0.0), 0.0
+    gap, left = 0.15 * max((float(e.max()) for e in extents), default=0.0), 0.0
     maps = []
     for rows, extent in zip(rows_of, extents, strict=True):
         level[rows] += [left, 0.0] - level[rows].min(axis=0)

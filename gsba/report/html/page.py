@@ -44,6 +44,12 @@ def write_html(
         reconstruction: poses after it, cloud and observations.
         report: content of report.json.
     """
+    found = []
+    for f in pictures.worst_frames(reconstruction):
+        try:
+            found.append(pictures.picture(frames, reconstruction, f))
+        except GsbaError as error:
+            logger.warning("report.html: no image of frame %s (%s)", frames.names[f], error)
     data = {
         "run": path.resolve().parent.name,
         "report": {name: value for name, value in report.items() if name != "residual_sphere"},
@@ -54,7 +60,7 @@ def write_html(
         "field": figures.field_sphere(frames.formats[0].correction),
         "erp_width": max(kind.panorama_width for kind in frames.formats),
         "recordings": list(frames.recordings),
-        "worst": _worst(frames, reconstruction),
+        "worst": found,
         "pictures": frame_pictures(frames, reconstruction, report.get("camera")),
         "scan": None,
         "odometry": None,
@@ -134,14 +140,3 @@ def _frames(
         "std_deg": np.linalg.norm(quality.std_rotations_deg, axis=1),
         "std": np.linalg.norm(quality.std_translations, axis=1),
     }
-
-
-def _worst(frames: FrameSet, reconstruction: Reconstruction) -> list[dict[str, Any]]:
-    """Images of the worst frames; unreadable files are left out with a warning."""
-    found = []
-    for f in pictures.worst_frames(reconstruction):
-        try:
-            found.append(pictures.picture(frames, reconstruction, f))
-        except GsbaError as error:
-            logger.warning("report.html: no image of frame %s (%s)", frames.names[f], error)
-    return found

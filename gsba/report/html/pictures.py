@@ -2,6 +2,7 @@
 
 import base64
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -46,7 +47,7 @@ def picture(frames: FrameSet, reconstruction: Reconstruction, f: int) -> dict[st
     vectors = np.column_stack([places, residuals[:, 0] / level, residuals[:, 1]])
     return {
         "frame": f,
-        "jpeg": _jpeg(small_panorama(frames, f, _WIDTH)),
+        "jpeg": jpeg_text(small_panorama(frames, f, _WIDTH), [_JPEG_QUALITY]),
         "width": _WIDTH,
         "height": _WIDTH // 2,
         "vectors": vectors.round(5),
@@ -108,8 +109,16 @@ def _nearest(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     return image[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)]
 
 
-def _jpeg(image: np.ndarray) -> str:
+def jpeg_text(image: np.ndarray, qualities: Sequence[int], room: int | None = None) -> str:
+    """JPEG (base64) of an RGB image in the first quality in which it has at most `room` bytes, else
+    in the last one."""
     import cv2
 
-    encoded = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1]
-    return base64.b64encode(encoded.tobytes()).decode("ascii")
+    encoded = b""
+    for quality in qualities:
+        how = [cv2.IMWRITE_JPEG_QUALITY, quality]
+        how += [] if room is None else [cv2.IMWRITE_JPEG_OPTIMIZE, 1]
+        encoded = cv2.imencode(".jpg", image[..., ::-1], how)[1].tobytes()
+        if room is None or len(encoded) <= room:
+            break
+    return base64.b64encode(encoded).decode("ascii")

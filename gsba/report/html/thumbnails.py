@@ -1,8 +1,5 @@
-"""Frames of the report as small panoramas, with masks, seams, circles and matches to draw in.
-
-The page is one file: pictures share a budget of bytes, and more than `MAX_PICTURES` frames are
-shown by some of them, evenly spread.
-"""
+"""Frames of the report as small panoramas with masks, seams, circles and matches to draw in, which
+share a budget of bytes."""
 
 import base64
 import logging
@@ -16,7 +13,7 @@ from gsba.camera.fisheye import unproject
 from gsba.camera.sphere import erp_from_bearings
 from gsba.frames.masks import load_mask
 from gsba.log import GsbaError
-from gsba.report.html.pictures import residuals_of_rows, small_panorama
+from gsba.report.html.pictures import jpeg_text, residuals_of_rows, small_panorama
 from gsba.types import FrameSet, PictureFormat, Reconstruction
 
 logger = logging.getLogger(__name__)
@@ -24,12 +21,9 @@ logger = logging.getLogger(__name__)
 MAX_PICTURES = 500
 _WIDTH = 256  # pixels across a picture
 _MASK_WIDTH = 128
-_MASK_BGRA = (40, 40, 220, 150)  # of masked pixels
 _MAX_BYTES = 2_600_000  # of all pictures; a third more in base64
 _LARGEST = 9_000  # bytes of a picture, where there are few
-_QUALITIES = (75, 60, 45, 30, 20)  # of JPEGs, until a picture fits
 _MAX_CANDIDATES, _MAX_MATCHES = 60, 24  # matches of a pair that are looked at, and drawn
-_MANY_FRAMES = 1000  # above it, half as many matches are drawn
 _STEPS = 72  # points of a circle or a seam
 
 
@@ -54,7 +48,8 @@ def frame_pictures(
     kept = dict[Any, int]()
     for f in (int(f) for f in wanted):
         try:
-            jpegs.append(_small_jpeg(small_panorama(frames, f, _WIDTH), _MAX_BYTES // len(wanted)))
+            room = min(_MAX_BYTES // len(wanted), _LARGEST)
+            jpegs.append(jpeg_text(small_panorama(frames, f, _WIDTH), (75, 60, 45, 30, 20), room))
         except GsbaError as error:
             logger.warning("report.html: no image of frame %s (%s)", frames.names[f], error)
             continue
@@ -77,19 +72,6 @@ def frame_pictures(
     }
 
 
-def _small_jpeg(image: np.ndarray, room: int) -> str:
-    """JPEG (base64) of an RGB image, as good as its room in bytes allows."""
-    import cv2
-
-    encoded = b""
-    for quality in _QUALITIES:
-        how = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
-        encoded = cv2.imencode(".jpg", image[..., ::-1], how)[1].tobytes()
-        if len(encoded) <= min(room, _LARGEST):
-            break
-    return base64.b64encode(encoded).decode("ascii")
-
-
 def _mask_number(frames: FrameSet, f: int, masks: dict[bytes, int]) -> int:
     """Number of a frame's mask among all, which it joins; -1 = it has none, or none readable."""
     import cv2
@@ -102,7 +84,7 @@ def _mask_number(frames: FrameSet, f: int, masks: dict[bytes, int]) -> int:
         return -1
     size = _MASK_WIDTH, _MASK_WIDTH // 2
     hidden = cv2.resize((~usable).astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.5
-    image = hidden[..., None] * np.array(_MASK_BGRA, np.uint8)
+    image = hidden[..., None] * np.array((40, 40, 220, 150), np.uint8)
     png = cv2.imencode(".png", image)[1].tobytes()
     return masks.setdefault(png, len(masks))
 
@@ -155,7 +137,7 @@ def _matches(frames: FrameSet, reconstruction: Reconstruction) -> dict[str, Any]
         np.linalg.norm(residuals_of_rows(reconstruction, pairs[:, k]), axis=1) for k in (1, 2)
     ]
     worst = np.degrees(np.max(lengths, axis=0))
-    most = _MAX_MATCHES // (2 if len(frames) > _MANY_FRAMES else 1)
+    most = _MAX_MATCHES // (2 if len(frames) > 1000 else 1)
     kept = _some_and_worst(pairs[:, 0], worst, most)
     pairs, worst = pairs[kept], worst[kept]
     bearings = [reconstruction.observation_bearings[pairs[:, k]] for k in (1, 2)]
