@@ -326,7 +326,7 @@ def _frame_step(models: Sequence[FrameModel], sigmas: np.ndarray) -> np.ndarray:
     systems = [model.system for model in models]
     gradient = np.sum([system.gradient for system in systems], axis=0)
     hessian = sum(system.hessian for system in systems[1:]) + systems[0].hessian
-    hessian = float(np.mean([model.curvature for model in models])) * hessian
+    hessian = hessian * float(np.mean([model.curvature for model in models]))
     held = _POSE_DAMPING * hessian.diagonal().reshape(-1, 6 + len(sigmas))
     held[held <= 0] = 1.0
     held[:, 6:] = np.maximum(sigmas, 1e-12) ** -2.0

@@ -28,8 +28,10 @@ from gsba.trajectory.steps import (
 )
 from gsba.types import CoarsePoses, Counts, Keypoints, Trajectory, VerifiedPairs
 
+_MIN_LOST_SHARE = 0.2  # share of lost neighbours from which whole panoramas are compared
 _MIN_COMMON_POINTS = 5  # common points that suffice for the ratio of two steps' lengths
 _FAR_STEP_DEPTHS = 0.5  # steps from which repeated structure may mislead, median depths
+_NUM_TRIED_STEPS = 24  # steps that show whether it does
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +138,7 @@ def _misleads(context: MatchContext, guided: VerifiedPairs) -> bool:
             lengths.append(1 / float(np.nanmedian(np.append(depths, np.inf))))
     if not steps or np.quantile(lengths, 0.75) < _FAR_STEP_DEPTHS:
         return False
-    tried = np.unique(np.linspace(0, len(steps) - 1, 24).astype(int))
+    tried = np.unique(np.linspace(0, len(steps) - 1, _NUM_TRIED_STEPS).astype(int))
     known = guided.taken([steps[n] for n in tried.tolist()])
     found = match_anywhere(context, known.matches.pairs)
     true, seen = (image_steps(some, context.keypoints) for some in (known, found))
@@ -237,7 +239,7 @@ def check_clock(
     settings, chosen = context.settings, pairs.without_pause(timestamps)
     guided = _unless_misguided(context, guided, chosen)
     lost = guided.missing(chosen)
-    if len(lost) > 0.2 * len(chosen):  # from here on, whole panoramas are compared
+    if len(lost) > _MIN_LOST_SHARE * len(chosen):
         guided = VerifiedPairs.joined([guided, match_anywhere(context, lost)])
     steps = image_steps(guided, context.keypoints)
     misread.refuse_misread(coarse, steps, settings.verify)

@@ -92,7 +92,7 @@ def estimate_clock(
     ]
     begin = fit.turns.middle - given.start
     at_start = np.array([1.0, -begin])
-    found = Clock(given.start, float(best[0] - (best[1] - 1) * begin), float(best[1]))
+    clock = Clock(given.start, float(best[0] - (best[1] - 1) * begin), float(best[1]))
     offset_sigma = float(np.sqrt(at_start @ covariance @ at_start))
     rate_sigma, certain = float(np.sqrt(covariance[1, 1])), fit.time_sigma(covariance)
     before, after = (_explained(fit, p, best) for p in (start, best))
@@ -107,21 +107,21 @@ def estimate_clock(
     elif same:
         verdict = "agrees"
     elif max((_explained(fit, p, best) for p in others), default=0.0) > 0.75 * after:
-        note = f"several clock offsets fit, such as {found.offset:.3f} s: the given one is kept"
+        note = f"several clock offsets fit, such as {clock.offset:.3f} s: the given one is kept"
     else:
         rate = ""
-        if found.rate != 1:
-            rate = f" and the rate {found.rate:.5f} +- {rate_sigma:.5f}"
+        if clock.rate != 1:
+            rate = f" and the rate {clock.rate:.5f} +- {rate_sigma:.5f}"
         verdict = "corrected"
         note = (
             f"the trajectory's clock was corrected by camera rotations: the offset is "
-            f"{found.offset:.3f} +- {offset_sigma:.3f} s at the first frame{rate} "
+            f"{clock.offset:.3f} +- {offset_sigma:.3f} s at the first frame{rate} "
             f"(median rotation residual of a step: {degrees[0]:.2f} degrees before, "
             f"{degrees[1]:.2f} after)"
         )
-    used = found if verdict == "corrected" else given
+    used = clock if verdict == "corrected" else given
     before, after = degrees
-    return ClockEstimate(used, found, offset_sigma, rate_sigma, before, after, verdict, note)
+    return ClockEstimate(used, clock, offset_sigma, rate_sigma, before, after, verdict, note)
 
 
 def other_rate(
