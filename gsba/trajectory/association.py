@@ -133,10 +133,9 @@ def associate(frames: FrameSet, trajectory: Trajectory, settings: ReadSettings) 
     if long.any():
         f = int(np.argmax(np.where(long, distance, 0)))
         _log.warning(
-            "%d frames lie in gaps of the trajectory longer than %g s (frame '%s': %.1f s); "
-            "their poses are rough",
-            long.sum(),
+            "rough poses in gaps of the trajectory longer than %g s: %d (frame '%s': %.1f s)",
             _MAX_INTERPOLATION_S,
+            long.sum(),
             frames.names[f],
             distance[f],
         )

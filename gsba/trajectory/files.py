@@ -117,7 +117,7 @@ def _tracked(
         )
     if len(lost):
         _log.warning(
-            "%s: %d of %d rows have no pose, as of lost frames (NaN, zeros, or positions beyond "
+            "%s: %d of %d rows without a pose, as of lost frames (NaN, zeros, or positions beyond "
             "%g; the first is %s): left out",
             path,
             len(lost),

@@ -47,8 +47,8 @@ def without_lost_frames(trajectory: Trajectory) -> Trajectory:
     if not lost.any() or np.count_nonzero(~lost) < 2:
         return trajectory
     _log.warning(
-        "%d of %d rows of the trajectory have no pose, as of lost frames (they repeat the identity "
-        "or the pose before; the first is of time %.6f): left out",
+        "%d of %d rows of the trajectory without a pose, as of lost frames (they repeat the "
+        "identity or the pose before; the first is of time %.6f): left out",
         lost.sum(),
         len(lost),
         times[lost][0],
