@@ -13,7 +13,7 @@ from gsba.log import GsbaError
 
 _MIN_CORRELATION = 1e-6  # smallest correlation of positions that leaves a positive scale
 _MIN_DRAWS, _MAX_DRAWS, _SEED = 50, 500, 0  # samples of a robust similarity
-_MISS_CHANCE = 1e-9  # that all samples hold outliers, for a share of inliers as large as found
+_MISS_CHANCE = 1e-9  # of an outlier in every sample, at the largest share of inliers so far
 _MEDIAN_LENGTH = 1.538  # median length of a 3-vector of independent unit normals
 _OUTLIER_SIGMAS = 4.6  # 99.99% of such vectors are shorter
 _NUM_TRIALS = 200  # samples of three points each

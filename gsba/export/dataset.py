@@ -1,4 +1,4 @@
-"""What is exported, and how: formats, options, and the dataset that a format's module writes."""
+"""Formats and options of an export, and the dataset that the module of a format writes."""
 
 from dataclasses import dataclass
 from enum import StrEnum

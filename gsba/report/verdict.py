@@ -33,7 +33,8 @@ class Figures:
     points: int
     # Part of the extent by which no position is further off, in 19 of 20 maps.
     position_error: float
-    neighbour_pixels: float  # the same of points in a neighbour's picture, median of the frames
+    # Pixels by which a point may be off in a neighbour's picture, median of the frames.
+    neighbour_pixels: float
     extent_metres: float  # NaN = no scale
     # (n,) steps that no image shows: their poses are those of the start.
     held_steps: tuple[int, ...]

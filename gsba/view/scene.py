@@ -93,7 +93,7 @@ def load_scene(run: Path) -> Scene:
 
 
 def _start(run: Path) -> str:
-    """What the run started from, by its report."""
+    """Source of the poses at the start, by the run's report."""
     try:
         return str(json.loads((run / "report.json").read_text(encoding="utf-8"))["start"])
     except (OSError, ValueError, KeyError, TypeError):  # a view needs no report
