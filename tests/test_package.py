@@ -62,6 +62,11 @@ def test_another_factors_package_is_refused(tmp_path: Path) -> None:
     assert str(tmp_path) in last and "fresh virtual environment" in last
 
 
+def test_no_folder_of_tests_hides_a_package() -> None:
+    """`tests` is on sys.path: an editable install finds its packages after a folder of their name."""
+    assert not [name for name in ("factors", "gsba") if (ROOT / "tests" / name).exists()]
+
+
 def test_public_names_exist() -> None:
     for name in gsba.__all__:
         assert getattr(gsba, name) is not None
