@@ -14,6 +14,7 @@ from gsba.config import CameraSettings
 from gsba.pipeline.stage_titles import LENS_CENTRES, READOUTS, RECONSTRUCTION, is_one_of
 from gsba.report.camera_findings import of_camera
 from gsba.report.html.figures import viewing_axes
+from gsba.report.maps import refined_frames
 from gsba.store.folder import STAGES, is_run_folder
 from gsba.store.records import RecordError, load_arrays, load_record
 
@@ -30,15 +31,14 @@ def overview(run: Path) -> dict[str, Any]:
     """Figures of a finished run for a page; "finished" is False where there is no report yet."""
     try:
         report = json.loads((run / "report.json").read_text(encoding="utf-8"))
-        summary, stages = report["summary"], report.get("stages", [])
-        seconds = sum(stage.get("seconds", 0.0) for stage in stages if isinstance(stage, dict))
+        summary, counts = report["summary"], refined_frames(report)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return {"finished": False, "run": is_run_folder(run)}
     return {
         "finished": True,
         "run": True,
         "summary": summary,
-        "seconds": seconds,
+        "counts": counts,
         "notes": report.get("notes", []),
         "camera": report.get("camera"),
         "verdict": _verdict(report),
@@ -57,10 +57,9 @@ def brief_facts(run: Path) -> dict[str, str]:
     found = overview(run)
     if not found["finished"]:
         return {"state": "not finished"}
-    summary, verdict = found["summary"], found["verdict"]
+    verdict = found["verdict"]
     facts = {"verdict": verdict["level"]} if verdict else {}
-    counts = f"{summary.get('refined')} of {summary.get('frames')} frames refined"
-    return facts | {"refined": counts}
+    return facts | {"refined": found["counts"]}
 
 
 def _verdict(report: dict[str, Any]) -> dict[str, Any] | None:

@@ -63,7 +63,8 @@ def recover(
     pieces is estimated by `gsba.loop_closure.map_merging`, from points that both maps hold.
 
     Args:
-        guided: neighbours verified under the trajectory's guidance; all of them where it is right.
+        guided: neighbours verified under the trajectory's guidance, see `unless_misguided`; all of
+            them where it is right.
         timestamps: (F,) seconds.
 
     Raises:
@@ -73,7 +74,6 @@ def recover(
     chosen = _pairs_of_one_piece(pairs.adjacent(len(coarse.sources)), coarse)
     guided = guided.within(coarse.segments)
     close = _pairs_of_one_piece(pairs.without_pause(timestamps), coarse)
-    guided = _unless_misguided(context, guided, close)
     lost = guided.missing(close)
     absent = coarse.absent
     pieces, (coarse, joints) = coarse, joining.join(coarse)
@@ -149,15 +149,17 @@ def _misleads(context: MatchContext, guided: VerifiedPairs) -> bool:
     return bool(missed > 0.15 * len(tried))
 
 
-def _unless_misguided(
-    context: MatchContext, guided: VerifiedPairs, chosen: np.ndarray
+def unless_misguided(
+    context: MatchContext, guided: VerifiedPairs, coarse: CoarsePoses, timestamps: np.ndarray
 ) -> VerifiedPairs:
-    """Guided neighbours; none of them where many of `chosen` (P, 2) are lost and most of the others
-    have another pose without guidance, which explains more matches.
+    """Guided neighbours; none of them where many are lost and most of the others have another pose
+    without guidance, which explains more matches.
 
     A gate around a false prediction keeps the false matches that fit it: guided neighbours confirm
     a reversed trajectory.
     """
+    guided = guided.within(coarse.segments)
+    chosen = _pairs_of_one_piece(pairs.without_pause(timestamps), coarse)
     rows = np.flatnonzero(np.diff(guided.matches.pairs, axis=1)[:, 0] == 1)
     if not len(rows) or len(guided.missing(chosen)) <= _MIN_LOST_SHARE * len(chosen):
         return guided
@@ -226,8 +228,8 @@ def check_clock(
     A trajectory that fits in another convention is refused first: it may turn at other times.
 
     Args:
-        guided: neighbours verified under the trajectory's guidance. Where it lost many, whole
-            panoramas are matched: a wrong clock loses the turns, which determine it.
+        guided: see `recover`. Where it lacks many neighbours, whole panoramas are matched: a wrong
+            clock loses the turns, which determine it.
         coarse: the trajectory at the frames' times.
         timestamps: (F,) seconds.
         trajectory: all entries of its file.
@@ -237,7 +239,6 @@ def check_clock(
             runs at another rate.
     """
     settings, chosen = context.settings, pairs.without_pause(timestamps)
-    guided = _unless_misguided(context, guided, chosen)
     lost = guided.missing(chosen)
     if len(lost) > _MIN_LOST_SHARE * len(chosen):
         guided = VerifiedPairs.joined([guided, match_anywhere(context, lost)])

@@ -164,8 +164,12 @@ def match_neighbours(state: State) -> State:
 def _match_neighbours(state: State, name: str) -> State:
     if state.prior.absent:
         return state.with_verified(VerifiedPairs.none())
-    run, context = state.run, state.observed.context
-    compute = partial(correspondences.match_neighbours, context, state.prior.start())
+    run, context, prior = state.run, state.observed.context, state.prior
+
+    def compute() -> VerifiedPairs:
+        found = correspondences.match_neighbours(context, prior.start())
+        return recovery.unless_misguided(context, found, prior.coarse, run.frames.timestamps)
+
     return state.with_verified(run.stage(name, run.matching_key(), compute, VerifiedPairs))
 
 

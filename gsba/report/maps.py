@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from gsba.types import FrameSet, PoseStatus, Reconstruction
+from gsba.types import FrameSet, PoseStatus, Reconstruction, RunStart
 
 MIN_SHARE_IN_ONE_MAP = 0.9  # of a run's frames; a run with fewer in its largest map is partial
 MIN_SHARE_OF_A_MAP = 0.5  # of a run's frames; fewer are no map of the place
@@ -76,13 +76,10 @@ def format_outcome(report: Mapping[str, Any], run: object) -> str:
         run: folder of the run.
     """
     summary, maps = report["summary"], report["maps"]
-    refined = summary["refined"] - summary["fetched"]
-    frames = summary["frames"] - summary["frames_fetched"]
     residual, found = summary["median_residual_deg"], "rotations only, no points"
     if residual is not None:
         found = f"{summary['points']} points, median residual {residual:.4f} deg"
-    apart = _apart(summary)
-    first = f"{refined} of {frames} frames refined{apart}, {found}: {run}"
+    first = f"{refined_frames(report)}, {found}: {run}"
     verdict, table = report["verdict"], _table(maps) if len(maps) > 1 else []
     reasons = [f"- {one['line']}" for one in verdict["reasons"][:5]]
     more = len(verdict["reasons"]) - len(reasons)
@@ -90,15 +87,26 @@ def format_outcome(report: Mapping[str, Any], run: object) -> str:
     return "\n".join([first, *table, *reasons, verdict["sentence"]])
 
 
-def _apart(summary: Mapping[str, Any]) -> str:
-    """Numbers of frames that no dataset has by report.json's `summary`, in brackets; "" = none."""
-    others = summary["maps"] - 1
+def refined_frames(report: Mapping[str, Any]) -> str:
+    """Number of refined frames by a report.json of any version, and in brackets where the other
+    frames are."""
+    numbers = {"exported": report["summary"]["refined"], **report["summary"]}
+
+    def number(name: str) -> int:
+        return numbers.get(name, 0)
+
+    others, start = number("maps") - 1, report.get("start", RunStart.TRAJECTORY)
     where = "another map" if others == 1 else f"{others} other maps"
-    counts = {where: summary["frames_in_other_maps"], "no map": summary["frames_in_no_map"]}
-    parts = [f"{count} in {name}" for name, count in counts.items() if count]
-    if summary["fetched"]:
-        parts.append(f"{summary['fetched']} more strengthened the map, and datasets skip them")
-    return f" ({', '.join(parts)})" if parts else ""
+    counts = {
+        f"with the pose of the {start}": number("exported") - number("refined"),
+        f"in {where}": number("frames_in_other_maps"),
+        "in no map": number("frames_in_no_map"),
+        "more strengthened the map, and datasets skip them": number("fetched"),
+    }
+    parts = [f"{count} {where}" for where, count in counts.items() if count]
+    refined, frames = number("refined") - number("fetched"), number("frames")
+    text = f"{refined} of {frames - number('frames_fetched')} frames refined"
+    return f"{text} ({', '.join(parts)})" if parts else text
 
 
 def _table(maps: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -61,11 +61,14 @@ def test_the_verdict_is_that_of_the_report(
 ) -> None:
     from gsba.app.runs import brief_facts, overview
 
-    report = {"summary": {"refined": 8, "frames": 9}, "verdict": verdict}
+    summary = {"refined": 9, "exported": 10, "frames": 11, "fetched": 1, "frames_fetched": 2}
+    report = {"summary": summary, "verdict": verdict}
     (tmp_path / "report.json").write_text(json.dumps(report))
     shown = overview(tmp_path)["verdict"]
     assert shown == {"level": level, "sentence": sentence, "reasons": reasons}
-    assert brief_facts(tmp_path) == {"verdict": level, "refined": "8 of 9 frames refined"}
+    apart = "1 with the pose of the trajectory file, 1 more strengthened the map, and datasets skip"
+    counts = f"8 of 9 frames refined ({apart} them)"
+    assert brief_facts(tmp_path) == {"verdict": level, "refined": counts}
     for nothing in ({}, {"level": "good"}, None, "good", []):
         (tmp_path / "report.json").write_text(json.dumps(report | {"verdict": nothing}))
         assert overview(tmp_path)["verdict"] is None

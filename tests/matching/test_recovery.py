@@ -45,10 +45,15 @@ def _context(cut: int | None = None) -> MatchContext:
     return MatchContext(frames, frames, keypoints, SETTINGS, Threads(1))
 
 
+def _coarse(slam: np.ndarray) -> CoarsePoses:
+    return CoarsePoses(slam, np.full(NUM_FRAMES, PoseSource.SLAM, np.uint8), 0.0)
+
+
 def _run(slam: np.ndarray, cut: int | None = None, times: np.ndarray = TIMES) -> Recovered:
     context = _context(cut)
     guided = correspondences.match_neighbours(context, Solution.without_points(slam))
-    coarse = CoarsePoses(slam, np.full(NUM_FRAMES, PoseSource.SLAM, np.uint8), 0.0)
+    coarse = _coarse(slam)
+    guided = recovery.unless_misguided(context, guided, coarse, times)
     return recovery.recover(context, guided, coarse, times)
 
 
@@ -220,7 +225,7 @@ def test_guided_steps_are_left_out_where_other_poses_explain_more_matches(
     rows = [found.matches.of(p)[: int(share * len(found.matches.of(p)))] for p in range(len(poses))]
     matches = Matches.of_rows(found.matches.pairs, rows)
     guided = replace(found, f0_T_f1s=poses, matches=matches).taken(range(lost, NUM_FRAMES - 1))
-    assert len(recovery._unless_misguided(context, guided, steps).f0_T_f1s) == kept
+    assert len(recovery.unless_misguided(context, guided, _coarse(TRUTH), TIMES).f0_T_f1s) == kept
 
 
 def test_a_look_alike_at_a_lost_step_is_not_taken_where_matching_misleads() -> None:

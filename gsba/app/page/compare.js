@@ -19,7 +19,7 @@ function compare(first) {
     }, "×"))));
     const done = found.filter((one) => one.finished);
     const rows = {};
-    done.forEach((one, k) => [["frames refined", `${one.summary.refined} of ${one.summary.frames}`], ...figures(one)]
+    done.forEach((one, k) => [["frames", one.counts], ...figures(one)]
       .forEach(([name, text]) => { (rows[name] = rows[name] || [])[k] = text; }));
     table.replaceChildren(done.length ? make("table", {},
       make("thead", {}, make("tr", {}, make("th", { scope: "col" }, "Figure"), ...done.map((one) => make("th", { scope: "col" }, one.path)))),

@@ -62,7 +62,7 @@ async function results(where, run, current) {
 
 // The verdict in one sentence; runs of earlier versions have none.
 function verdictCard(found) {
-  const summary = found.summary, counts = `${summary.refined} of ${summary.frames} frames refined`;
+  const counts = found.counts;
   if (!found.verdict) return card(counts);
   const { level, sentence, reasons } = found.verdict, title = { good: "Good to train", look: "Look at these places", stop: "Do not train" };
   return make("section", { class: `card verdict ${level}` }, make("h2", {}, title[level] || "Verdict"),
@@ -84,7 +84,7 @@ function figures(found) {
     ["points", String(summary.points)],
     ["median residual", `${degrees(summary.median_residual_deg)} (before: ${degrees(summary.median_residual_deg_coarse)})`],
     ["maps", String(summary.maps)],
-    ["time of all stages", spoken(found.seconds)],
+    ["time of all stages", spoken(summary.seconds)],
   ];
   if (camera && camera.taken) {
     rows.push(["lenses", `${camera.baseline.toPrecision(3)} map units apart`]);

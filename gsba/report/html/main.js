@@ -5,7 +5,7 @@ function tiles() {
   const length = path => path.reduce((sum, p, i) => i ? sum + Math.hypot(...p.map((v, k) => v - path[i - 1][k])) : 0, 0);
   const seconds = s.seconds;
   const px = degrees => degrees === null ? "–" : `${num(degrees * pxPerDeg)} px`;
-  const apart = [[s.exported - s.refined, "with poses of the trajectory"], [s.frames_in_other_maps, "in other maps"], [s.frames_in_no_map, "in no map"]]
+  const apart = [[s.exported - s.refined, `with the pose of the ${D.report.start}`], [s.frames_in_other_maps, "in other maps"], [s.frames_in_no_map, "in no map"]]
     .concat([[s.fetched, "more strengthened the map, datasets skip them"]]).filter(([count]) => count).map(([count, where]) => `${num(count)} ${where}`).join(", ");
   const rows = [
     ["Frames refined", `${num(s.refined - s.fetched)} / ${num(s.frames - extra)}`, apart || "all of them"],
