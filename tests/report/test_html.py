@@ -51,7 +51,7 @@ def _write(folder: Path, frames: FrameSet, result: Reconstruction) -> tuple[Path
             counts,
             [{"stage": "chain", "rounds": [ROUND, {**ROUND, "accepted": False}]}],
         ),
-        gauge="the world of the trajectory",
+        gauge="the gauge of the trajectory",
         found=Findings(["a note with <b>markup</b> & </script>"]),
     )
     report["residual_sphere"] = residual_sphere(result)
@@ -274,7 +274,7 @@ def test_several_maps_are_listed_and_the_largest_is_drawn(tmp_path: Path) -> Non
     )
     write_html(path, frames.taken(rows), own, result.of_map(1), report)
     *_, apart, maps = _run_script(path)
-    assert apart == "1 with poses of the trajectory, 2 in other maps, 1 in no map"
+    assert apart == "1 with the pose of the trajectory file, 2 in other maps, 1 in no map"
     assert maps[0][0] == "Map" and maps[0][-1] == "Reason why it was not joined"
     names = frames.names
     assert maps[1][:4] == ["1", "6", "5", "4"] and maps[2][:4] == ["2", "2", "2", "1"]
@@ -284,9 +284,17 @@ def test_several_maps_are_listed_and_the_largest_is_drawn(tmp_path: Path) -> Non
 
 def test_script_runs(page: Path) -> None:
     tiles, title, worst, rows, note, apart, maps = _run_script(page)
-    assert apart == "1 with poses of the trajectory" and maps is None
+    assert apart == "1 with the pose of the trajectory file" and maps is None
     assert (tiles, title, worst, rows) == (6, page.parent.name, pictures.NUM_PICTURES, 2)
     assert note == ["a note with <b>markup</b> & </script>"]  # a text, not markup
+
+
+def test_terms_of_the_page_are_those_of_the_glossary(page: Path) -> None:
+    listed = re.findall(r'^  "?([a-z ]+)"?: "(.+)",$', page.read_text(encoding="utf-8"), re.M)
+    glossary = (Path(__file__).parents[2] / "docs" / "glossary.md").read_text(encoding="utf-8")
+    rows = re.sub(r"\[([^]]+)\]\([^)]*\)", r"\1", glossary)
+    assert {"carrier", "gauge", "strength", "map unit"} <= dict(listed).keys()
+    assert [row for row in listed if f"| {row[0]} | {row[1]} |" not in rows] == []
 
 
 def test_distances_to_a_scan_are_added(page: Path, tmp_path: Path) -> None:
@@ -325,6 +333,8 @@ def test_browser_shows_it(page: Path) -> None:
         assert tab.locator(".tile").count() == 6 and tab.locator("figure img").count() == 6
         assert tab.evaluate("document.documentElement.dataset.theme") == "dark"
         assert tab.evaluate("document.documentElement.scrollWidth <= innerWidth")
+        tab.locator("footer a", has_text="gauge").click()
+        assert tab.evaluate("document.querySelector(':target').textContent") == "gauge"
         chart = tab.locator("#top")
         chart.scroll_into_view_if_needed()
         box = chart.bounding_box()

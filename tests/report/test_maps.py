@@ -77,9 +77,8 @@ def test_the_outcome_says_frames_in_other_maps_first(tmp_path: Path) -> None:
     text = format_outcome(_report(tmp_path, _in_maps(), ("", "too few matches")), "out")
     first, header, *rows = text.splitlines()[:4]
     *reasons, verdict = text.splitlines()[4:]
-    assert first.startswith(
-        "4 of 9 frames refined (1 with the pose of the trajectory file, 2 in another map, 2 in no map), "
-    )
+    held = "1 with the pose of the trajectory file"
+    assert first.startswith(f"4 of 9 frames refined ({held}, 2 in another map, 2 in no map), 5 poi")
     assert first.endswith(": out")
     assert [line.count("frame_000") for line in reasons] == [4, 1, 3]
     assert "(too few matches); gsba export RUN --map 2" in reasons[0]

@@ -17,7 +17,7 @@ function tiles() {
     ["Time", seconds < 90 ? `${num(seconds)} s` : `${num(seconds / 60)} min`, `${num(D.report.machine.cpus)} cores`],
   ];
   for (const [label, value, more] of rows)
-    el("tiles").append(make("div", { class: "tile" }, make("span", { class: "label" }, label), make("b", {}, value), make("span", {}, more)));
+    el("tiles").append(make("div", { class: "tile" }, make("span", { class: "label" }, label), make("b", {}, value), make("span", {}, ...termed(more))));
 }
 
 function maps() {
@@ -153,7 +153,7 @@ function stages() {
     counts.forEach((c, i) => {
       const dropped = c ? Object.entries(c.dropped).filter(([, n]) => n).map(([why, n]) => `${num(n)} ${why}`).join(", ") : "";
       table.append(make("tr", {},
-        make("td", {}, i ? "" : stage.name + (stage.workers ? `, ${stage.workers} workers` : "")), make("td", { class: "n" }, i ? "" : stage.seconds.toFixed(1)),
+        make("td", {}, ...termed(i ? "" : stage.name + (stage.workers ? `, ${stage.workers} workers` : ""))), make("td", { class: "n" }, i ? "" : stage.seconds.toFixed(1)),
         make("td", {}, i ? "" : make("div", { class: "bar" }, make("i", { style: `width:${100 * stage.seconds / longest}%` }))),
         make("td", { class: "n" }, c ? `${num(c.received)} ${c.unit}` : ""), make("td", { class: "n" }, c ? num(c.kept) : ""),
         make("td", {}, dropped)));
@@ -164,7 +164,8 @@ function stages() {
 el("run").textContent = D.run;
 document.title = `${D.run} – gsba`;
 el("when").textContent = `finished ${D.report.finished.replace("T", " ").replace("+00:00", " UTC")} · gsba ${D.report.gsba}`;
-el("gauge").textContent = `${D.report.gauge}. The numbers behind this page are in report.json and poses.csv.`;
+el("gauge").append(...termed(`${D.report.gauge}. The numbers behind this page are in report.json and poses.csv.`));
+terms();
 el("settings").textContent = JSON.stringify({ settings: D.report.settings, machine: D.report.machine, versions: D.report.versions }, null, 1);
 verdict();
 tiles();

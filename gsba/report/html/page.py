@@ -22,7 +22,7 @@ logger = logging.getLogger(__name__)
 
 _PARTS = {
     "/*STYLE*/": ("style.css",),
-    "/*SCRIPT*/": ("base.js", "charts.js", "verdict.js", "frames.js", "main.js"),
+    "/*SCRIPT*/": ("base.js", "terms.js", "charts.js", "verdict.js", "frames.js", "main.js"),
 }
 _DATA = "/*DATA*/"
 _BEFORE_DATA, _AFTER_DATA = '<script type="application/json" id="data">', "</script>"

@@ -5,7 +5,7 @@ function verdict() {
   const found = D.report.verdict, card = el("verdict");
   const [title, ...rest] = found.sentence.split(": ");
   card.classList.add({ "good to train": "good", "do not train": "bad" }[found.level] || "look");
-  card.append(make("h2", {}, title[0].toUpperCase() + title.slice(1)), make("p", {}, rest.join(": ")));
+  card.append(make("h2", {}, title[0].toUpperCase() + title.slice(1)), make("p", {}, ...termed(rest.join(": "))));
   if (found.reasons.length) {
     const list = make("ul", {});
     for (const reason of found.reasons) list.append(make("li", {},
@@ -14,7 +14,7 @@ function verdict() {
   }
   if (D.report.notes.length) {
     const notes = make("details", {}, make("summary", {}, `What else was found (${D.report.notes.length})`));
-    for (const note of D.report.notes) notes.append(make("p", { class: "quiet" }, note));
+    for (const note of D.report.notes) notes.append(make("p", { class: "quiet" }, ...termed(note)));
     card.append(notes);
   }
 }
