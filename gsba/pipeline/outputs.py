@@ -108,7 +108,7 @@ def write(state: State, result: Reconstruction, cameras: Cameras) -> RunResult:
     report = _report(state, result)
     write_json(out / "report.json", report)
     page = report | {"frames": [report["frames"][f] for f in rows]}
-    write_html(out / "report.html", shown, start, main, page)
+    write_html(out / "report.html", shown, start, main, page, cameras.taken(rows))
     for name in (*_OUTPUTS, CALIBRATION):
         store.claim(out / name)
     maps = summarize_maps(result, frames, _reasons(prior))

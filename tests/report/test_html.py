@@ -13,11 +13,14 @@ import cv2
 import export_scene as scene
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from gsba.camera.cameras import ONE_CAMERA
 from gsba.camera.sphere import bearings_from_erp
 from gsba.config import RefineSettings
 from gsba.log import GsbaError
 from gsba.report.html import add_scan, figures, pictures, residual_sphere, write_html
+from gsba.report.html.patches import worst_patches
 from gsba.report.report import Findings, StageLog, build_report
 from gsba.store.store import StageRecord
 from gsba.types import CoarsePoses, Counts, FrameSet, PoseStatus, Reconstruction
@@ -289,6 +292,32 @@ def test_script_runs(page: Path) -> None:
     assert note == ["a note with <b>markup</b> & </script>"]  # a text, not markup
 
 
+def _patches(frames: FrameSet, result: Reconstruction) -> list:
+    found = worst_patches(frames, result, ONE_CAMERA)
+    assert all(entry["frame"] != entry["reference"] for entry in found)
+    return found
+
+
+def test_patches_show_what_does_not_fit(tmp_path: Path) -> None:
+    frames, result = scene.panoramas(tmp_path / "images"), scene.reconstruction()
+    right = _patches(frames, result)
+    assert len(right) == pictures.NUM_PICTURES
+    assert min(entry["correlation"] for entry in right) > 0.95
+    turned = result.world_T_rigs.copy()
+    turned[4, :3, :3] @= Rotation.from_euler("y", 2, degrees=True).as_matrix()
+    wrong = _patches(frames, dataclasses.replace(result, world_T_rigs=turned))
+    assert wrong[0]["frame"] == 4 and wrong[0]["correlation"] < 0.7
+    assert wrong[0]["residual_deg"] == pytest.approx(2, abs=0.1)
+    png = np.frombuffer(base64.b64decode(wrong[0]["png"]), np.uint8)
+    patches = np.asarray(cv2.imdecode(png, cv2.IMREAD_GRAYSCALE), int)
+    assert patches.shape == (25, 75)
+    # 2 degrees to the right, the point lies 3 pixels to the left of where it is predicted
+    columns = [int(patch.mean(axis=0).argmax()) for patch in np.split(patches, 3, axis=1)[:2]]
+    assert abs(columns[0] - columns[1]) == 3
+    frames.paths[4][0].unlink()
+    assert 4 not in [entry["frame"] for entry in _patches(frames, result)]
+
+
 def test_terms_of_the_page_are_those_of_the_glossary(page: Path) -> None:
     listed = re.findall(r'^  "?([a-z ]+)"?: "(.+)",$', page.read_text(encoding="utf-8"), re.M)
     glossary = (Path(__file__).parents[2] / "docs" / "glossary.md").read_text(encoding="utf-8")
@@ -330,7 +359,7 @@ def test_browser_shows_it(page: Path) -> None:
         tab.on("request", lambda request: troubles.append(request.url[:80]))
         tab.goto(page.as_uri())
         tab.wait_for_timeout(300)
-        assert tab.locator(".tile").count() == 6 and tab.locator("figure img").count() == 6
+        assert tab.locator(".tile").count() == 6 and tab.locator("#worst img").count() == 6
         assert tab.evaluate("document.documentElement.dataset.theme") == "dark"
         assert tab.evaluate("document.documentElement.scrollWidth <= innerWidth")
         tab.locator("footer a", has_text="gauge").click()

@@ -148,7 +148,9 @@ def field_sphere(correction: tuple[float, ...]) -> dict[str, Any] | None:
     centres = np.meshgrid(np.arange(columns) + 0.5, np.arange(rows) + 0.5)
     bearings = bearings_from_erp(np.stack(centres, axis=-1).reshape(-1, 2), columns, rows)
     moved = np.degrees(SphereField(np.array(correction)).displacements(bearings))
-    parts = [np.einsum("oi,oi->o", moved, axis).reshape(rows, columns) for axis in _axes(bearings)]
+    parts = [
+        np.einsum("oi,oi->o", moved, axis).reshape(rows, columns) for axis in level_axes(bearings)
+    ]
     return {
         "rows": rows,
         "columns": columns,
@@ -158,7 +160,7 @@ def field_sphere(correction: tuple[float, ...]) -> dict[str, Any] | None:
     }
 
 
-def _axes(bearings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def level_axes(bearings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Unit vectors (O, 3) to the east and to the south on the sphere."""
     level = np.maximum(np.hypot(bearings[:, 0], bearings[:, 2]), 1e-9)
     east = np.column_stack([bearings[:, 2], np.zeros(len(level)), -bearings[:, 0]]) / level[:, None]
@@ -173,7 +175,7 @@ def tangent_residuals(reconstruction: Reconstruction) -> np.ndarray:
     predicted = np.einsum("oji,oj->oi", poses[:, :3, :3], offsets)
     predicted /= np.maximum(np.linalg.norm(predicted, axis=1, keepdims=True), 1e-12)
     bearings = reconstruction.observation_bearings
-    across = np.column_stack([np.einsum("oi,oi->o", predicted, a) for a in _axes(bearings)])
+    across = np.column_stack([np.einsum("oi,oi->o", predicted, a) for a in level_axes(bearings)])
     sine = np.linalg.norm(across, axis=1, keepdims=True)
     angle = np.arctan2(sine, np.einsum("oi,oi->o", predicted, bearings)[:, None])
     return across * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 1.0)

@@ -88,6 +88,10 @@ function worst() {
     figure.addEventListener("pointerleave", () => mark(-1));
     el("worst").append(figure);
   }
+  if (!D.patches.length) el("patches-lead").remove();
+  for (const p of D.patches) el("patches").append(make("figure", {},
+    make("img", { class: "patches", src: `data:image/png;base64,${p.png}`, alt: `Patches of ${F.name[p.reference]} and ${F.name[p.frame]}, and their difference` }),
+    make("figcaption", {}, make("b", {}, F.name[p.frame]), ` as in ${F.name[p.reference]} · ${residualText(p.residual_deg)} · correlation ${num(p.correlation, 2)}`)));
 }
 
 function cost() {

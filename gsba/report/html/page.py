@@ -9,11 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from gsba.camera.cameras import ONE_CAMERA, Cameras
 from gsba.disk import write_text
 from gsba.log import GsbaError
 from gsba.odometry import Odometry
 from gsba.report.html import figures, pictures
 from gsba.report.html.figures import odometry_plan
+from gsba.report.html.patches import worst_patches
 from gsba.report.html.thumbnails import frame_pictures
 from gsba.report.report import frame_quality, plain
 from gsba.types import CoarsePoses, FrameSet, Reconstruction
@@ -34,6 +36,7 @@ def write_html(
     coarse: CoarsePoses,
     reconstruction: Reconstruction,
     report: Mapping[str, Any],
+    cameras: Cameras = ONE_CAMERA,
 ) -> None:
     """Write the page of a run: poses before and after, residuals, costs.
 
@@ -43,6 +46,7 @@ def write_html(
         coarse: poses before refinement.
         reconstruction: poses after it, cloud and observations.
         report: content of report.json.
+        cameras: lenses of the frames, in the unit of the reconstruction.
     """
     found = []
     for f in pictures.worst_frames(reconstruction):
@@ -61,6 +65,7 @@ def write_html(
         "erp_width": max(kind.panorama_width for kind in frames.formats),
         "recordings": list(frames.recordings),
         "worst": found,
+        "patches": worst_patches(frames, reconstruction, cameras),
         "pictures": frame_pictures(frames, reconstruction, report.get("camera")),
         "scan": None,
         "odometry": None,
