@@ -120,6 +120,7 @@ def _compare(
     """Results of splats on the run's poses ("refined") and on others, by name."""
     from gsba.camera.views import Optics
     from gsba.evaluate.splats import compare, poses_for
+    from gsba.report.html import add_splats
     from gsba.splat.backend import choose_backend
     from gsba.splat.scores import Lpips
     from gsba.store.finished import load_cameras, load_run
@@ -132,6 +133,9 @@ def _compare(
     renderer = choose_backend(settings.backend)
     optics = Optics.of(load_cameras(run, reconstruction, frames), reconstruction)
     results = compare(reconstruction, frames, sources, settings, renderer, out, lpips, optics)
+    held_out = list(results["refined"].frames)
+    picture = out / "pictures" / f"{held_out[len(held_out) // 2]}.jpg"
+    add_splats(run / "report.html", picture, list(results))
     claim(run, out)
     return results
 

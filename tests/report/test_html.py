@@ -18,8 +18,9 @@ from scipy.spatial.transform import Rotation
 from gsba.camera.cameras import ONE_CAMERA
 from gsba.camera.sphere import bearings_from_erp
 from gsba.config import RefineSettings
+from gsba.disk import write_image
 from gsba.log import GsbaError
-from gsba.report.html import add_scan, figures, pictures, residual_sphere, write_html
+from gsba.report.html import add_scan, add_splats, figures, pictures, residual_sphere, write_html
 from gsba.report.html.patches import worst_patches
 from gsba.report.report import Findings, StageLog, build_report
 from gsba.store.store import StageRecord
@@ -340,6 +341,30 @@ def test_distances_to_a_scan_are_added(page: Path, tmp_path: Path) -> None:
     path.write_text("<html>")
     with pytest.raises(GsbaError, match="is not the report page of a run"):
         add_scan(path, {})
+
+
+def _over(path: Path) -> list[tuple[str, int]]:
+    """Names and grey values of the pictures that lie over one another."""
+    shown = _data(path.read_text(encoding="utf-8"))["splat"]
+    jpegs = [np.frombuffer(base64.b64decode(one["jpeg"]), np.uint8) for one in shown["pictures"]]
+    images = [np.asarray(cv2.imdecode(jpeg, cv2.IMREAD_GRAYSCALE)) for jpeg in jpegs]
+    assert [(w, h) for h, w in (image.shape for image in images)] == [(1080, 180)] * 2
+    names = [one["name"] for one in shown["pictures"]]
+    return [(name, round(image.mean())) for name, image in zip(names, images, strict=True)]
+
+
+def test_splats_before_and_after_lie_over_one_another(page: Path, tmp_path: Path) -> None:
+    path, picture = tmp_path / "report.html", tmp_path / "frame_0004.jpg"
+    shutil.copy(page, path)
+    for sources, before in (
+        (["refined"], ("captured", 50)),
+        (["refined", "slam"], ("splat on slam poses", 150)),
+    ):
+        rows = np.repeat(np.uint8([50, 100, 150])[: 1 + len(sources)], 32)
+        write_image(picture, np.tile(rows[:, None, None], (1, 192, 3)))
+        add_splats(path, picture, sources)
+        assert _over(path) == [before, ("splat on refined poses", 100)]
+        assert _run_script(path)[0] == 6
 
 
 def test_browser_shows_it(page: Path) -> None:

@@ -50,6 +50,7 @@ def test_train_writes_a_splat_and_its_metrics(run: Path) -> None:
     assert [int(step) for step in curve] == list(range(3, 31, 3))
     assert len(refined["frames"]) == 1 and curve["30"]["psnr"] > curve["3"]["psnr"] + 0.5
     assert content["lpips"].startswith("not computed")
+    assert '"name":"splat on refined poses"' in (run / "report.html").read_text()
 
 
 def test_render_writes_faces_and_a_panorama(run: Path) -> None:

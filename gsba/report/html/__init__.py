@@ -5,6 +5,6 @@ Gives one file that holds its figures and images.
 """
 
 from gsba.report.html.figures import residual_sphere
-from gsba.report.html.page import add_odometry, add_scan, write_html
+from gsba.report.html.page import add_odometry, add_scan, add_splats, write_html
 
-__all__ = ["add_odometry", "add_scan", "residual_sphere", "write_html"]
+__all__ = ["add_odometry", "add_scan", "add_splats", "residual_sphere", "write_html"]

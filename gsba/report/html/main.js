@@ -59,6 +59,19 @@ function scan() {
     ...parts.map((p, i) => bar(p, k, names[i])))));
 }
 
+function splat() {
+  const names = D.splat.pictures.map(one => one.name);
+  el("splat-lead").textContent = `Frame ${D.splat.frame}, which no splat was trained on: left of the border ${names[0]}, right of it ${names[1]}.`;
+  const [, over] = D.splat.pictures.map(one => {
+    const [width, height] = D.splat.size, picture = make("img", { src: `data:image/jpeg;base64,${one.jpeg}`, alt: one.name, width, height });
+    el("splat-pictures").append(picture);
+    return picture;
+  });
+  const move = () => { over.style.clipPath = `inset(0 0 0 ${el("splat-border").value}%)`; };
+  el("splat-border").addEventListener("input", move);
+  move();
+}
+
 function worst() {
   const lengths = D.worst.flatMap(w => w.vectors.map(v => Math.hypot(v[2], v[3]))).sort((a, b) => a - b);
   const median = lengths[lengths.length >> 1] || 1;
@@ -196,6 +209,8 @@ if (D.odometry) {
 } else el("odometry").remove();
 if (D.scan) scan();
 else el("scan").remove();
+if (D.splat) splat();
+else el("splat").remove();
 pictures();
 worst();
 cost();

@@ -2,7 +2,7 @@
 
 import json
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from gsba.odometry import Odometry
 from gsba.report.html import figures, pictures
 from gsba.report.html.figures import odometry_plan
 from gsba.report.html.patches import worst_patches
+from gsba.report.html.pictures import jpeg_text
 from gsba.report.html.thumbnails import frame_pictures
 from gsba.report.report import frame_quality, plain
 from gsba.types import CoarsePoses, FrameSet, Reconstruction
@@ -26,6 +27,7 @@ _PARTS = {
     "/*STYLE*/": ("style.css",),
     "/*SCRIPT*/": ("base.js", "terms.js", "charts.js", "verdict.js", "frames.js", "main.js"),
 }
+_SPLAT_WIDTH = 1080  # pixels of six faces in a row
 _DATA = "/*DATA*/"
 _BEFORE_DATA, _AFTER_DATA = '<script type="application/json" id="data">', "</script>"
 
@@ -68,6 +70,7 @@ def write_html(
         "patches": worst_patches(frames, reconstruction, cameras),
         "pictures": frame_pictures(frames, reconstruction, report.get("camera")),
         "scan": None,
+        "splat": None,
         "odometry": None,
     }
     write_text(path, _assembled(_dumped(data)))
@@ -77,15 +80,43 @@ def add_scan(path: Path, content: Mapping[str, Any]) -> None:
     """Add distances to a scan to a run's page.
 
     Args:
-        path: the page, written by `write_html`; nothing is done if it is missing.
+        path: the page, written by `write_html`.
         content: content of scan.json.
 
     Raises:
         GsbaError: the file is no page of a run, or cannot be written.
     """
-    if path.exists():
-        shown = {name: content[name] for name in ("scan", "before", "after") if name in content}
-        _add(path, "scan", shown)
+    shown = {name: content[name] for name in ("scan", "before", "after") if name in content}
+    _add(path, "scan", shown)
+
+
+def add_splats(path: Path, picture: Path, sources: Sequence[str]) -> None:
+    """Add a held-out frame and its renderings to a run's page, to be compared by a slider: after
+    refinement over before, or the splat over the frame where there is no other.
+
+    Args:
+        path: the page, written by `write_html`.
+        picture: rows of faces, of the frame and of the splat of each source, see
+            `gsba.evaluate.splats.compare`; its name is that of the frame.
+        sources: names of the sources, that on the run's poses first.
+
+    Raises:
+        GsbaError: the file is no page of a run, or cannot be written.
+    """
+    import cv2
+
+    image = np.asarray(cv2.imread(str(picture)))[..., ::-1]
+    size = _SPLAT_WIDTH, round(len(image) / (1 + len(sources)) / image.shape[1] * _SPLAT_WIDTH)
+    rows = np.split(image, 1 + len(sources))
+    beside = [f"splat on {name} poses" for name in sources]
+    shown = [("captured", rows[0]), (beside[0], rows[1])]
+    if len(rows) > 2:
+        shown = [(beside[1], rows[2]), (beside[0], rows[1])]
+    pictures_of = [
+        {"name": name, "jpeg": jpeg_text(cv2.resize(row, size, interpolation=cv2.INTER_AREA), [80])}
+        for name, row in shown
+    ]
+    _add(path, "splat", {"frame": picture.stem, "size": size, "pictures": pictures_of})
 
 
 def add_odometry(path: Path, found: Odometry) -> None:
@@ -102,7 +133,9 @@ def add_odometry(path: Path, found: Odometry) -> None:
 
 
 def _add(path: Path, name: str, content: Mapping[str, Any]) -> None:
-    """Add data to a page under a name."""
+    """Add data to a page under a name; nothing is done if there is no page."""
+    if not path.exists():
+        return
     try:
         text = path.read_text(encoding="utf-8")
         data = json.loads(text.partition(_BEFORE_DATA)[2].partition(_AFTER_DATA)[0])
