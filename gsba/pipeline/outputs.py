@@ -16,6 +16,7 @@ from gsba.export import ExportFormat, ExportOptions, export_all, seen_by, write_
 from gsba.frames.recordings import names_of_cameras, own_timestamps
 from gsba.pipeline.prior import Prior
 from gsba.pipeline.run import Run
+from gsba.pipeline.stage_titles import title_of
 from gsba.pipeline.state import State
 from gsba.placement.placement import Placement, metres_per_unit, place
 from gsba.report import findings
@@ -164,6 +165,7 @@ def _report(state: State, result: Reconstruction) -> dict[str, Any]:
     coarse = state.prior.coarse
     report = build_report(run.settings, run.frames, coarse, result, stages, gauge, found)
     report["families"] = of_families
+    report["stages"] = [one | {"title": title_of(one["name"])} for one in report["stages"]]
     if len(run.frames.formats) > 1:
         frames = state.run.frames
         every = list[dict[str, Any]]()

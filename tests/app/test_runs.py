@@ -15,7 +15,9 @@ pytest.importorskip("starlette")
 def test_the_camera_is_told_as_soon_as_its_stage_has_ended(case: Case) -> None:
     from gsba.app.runs import camera_so_far
 
-    names = [stage["name"] for stage in case.result.report["stages"]]
+    stages = case.result.report["stages"]
+    assert stages[0]["title"] == "find what turns with the camera"
+    names = [stage["name"] for stage in stages]
     first = next(n for n, name in enumerate(names) if is_one_of(name, LENS_CENTRES))
     assert camera_so_far(case.out, names[:first]) == []
     (line,) = camera_so_far(case.out, names[: first + 1])

@@ -387,6 +387,7 @@ def test_browser_shows_it(page: Path) -> None:
         assert tab.locator(".tile").count() == 6 and tab.locator("#worst img").count() == 6
         assert tab.evaluate("document.documentElement.dataset.theme") == "dark"
         assert tab.evaluate("document.documentElement.scrollWidth <= innerWidth")
+        assert tab.locator("#verdict .chip").count() == tab.locator(".chip img").count() == 3
         tab.locator("footer a", has_text="gauge").click()
         assert tab.evaluate("document.querySelector(':target').textContent") == "gauge"
         chart = tab.locator("#top")

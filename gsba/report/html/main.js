@@ -170,7 +170,7 @@ function stages() {
     counts.forEach((c, i) => {
       const dropped = c ? Object.entries(c.dropped).filter(([, n]) => n).map(([why, n]) => `${num(n)} ${why}`).join(", ") : "";
       table.append(make("tr", {},
-        make("td", {}, ...termed(i ? "" : stage.name + (stage.workers ? `, ${stage.workers} workers` : ""))), make("td", { class: "n" }, i ? "" : stage.seconds.toFixed(1)),
+        make("td", {}, ...termed(i ? "" : (stage.title || stage.name) + (stage.workers ? `, ${stage.workers} workers` : ""))), make("td", { class: "n" }, i ? "" : stage.seconds.toFixed(1)),
         make("td", {}, i ? "" : make("div", { class: "bar" }, make("i", { style: `width:${100 * stage.seconds / longest}%` }))),
         make("td", { class: "n" }, c ? `${num(c.received)} ${c.unit}` : ""), make("td", { class: "n" }, c ? num(c.kept) : ""),
         make("td", {}, dropped)));

@@ -24,7 +24,7 @@ function chips(names) {
   const shown = names.slice(0, MAX_CHIPS).map(name => {
     const f = F.name.indexOf(name);
     if (f < 0) return make("span", { class: "chip" }, name);
-    const chip = make("button", { type: "button", class: "chip", "aria-label": `mark frame ${name}` }, name);
+    const chip = make("button", { type: "button", class: "chip", "aria-label": `mark frame ${name}` }, P.shown.includes(f) ? make("img", { src: jpeg(P.shown.indexOf(f)), alt: "" }) : null, name);
     for (const event of ["pointerenter", "focus"]) chip.addEventListener(event, () => mark(f));
     for (const event of ["pointerleave", "blur"]) chip.addEventListener(event, () => mark(-1));
     return chip;
