@@ -4,8 +4,8 @@ A kernel is called from Python; parts are what kernels are made of. Parts are li
 kernel as they are, and optimised there alone: a function that is optimised and turned into machine
 code by itself, to be inlined afterwards, costs Numba most of the time that it takes to compile.
 Since each kernel holds its own copy of its parts, kernels leave no sums or products of arrays to
-numpy, whose copies would be shared and round differently. `tests/factor_graph/test_compiled.py` tests
-both.
+numpy, whose copies would be shared and round differently. Both are tested in
+`tests/factor_graph/test_compiled.py`.
 
 `factors.kernel_cache` keeps compiled kernels between processes.
 """

@@ -63,7 +63,7 @@ def test_another_factors_package_is_refused(tmp_path: Path) -> None:
 
 
 def test_no_folder_of_tests_hides_a_package() -> None:
-    """`tests` is on sys.path: an editable install finds its packages after a folder of their name."""
+    """`tests` is on sys.path, where an editable install would find its packages too late."""
     assert not [name for name in ("factors", "gsba") if (ROOT / "tests" / name).exists()]
 
 
