@@ -1,18 +1,15 @@
 """Compiled kernels on disk: what renews them, who shares them, and folders that cannot be used."""
 
 import hashlib
-import json
 import os
 import platform
 import subprocess
 import sys
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[2]
 PARTS = """
 from factors.compiled import kernel_and_part
 kernel, part = kernel_and_part()
@@ -45,23 +42,6 @@ show_log()
 from kernels import twice
 print(twice(3.0), *sorted(names))
 """
-# Numba is imported once, and each program runs in a fork of the process that has done so.
-SERVER = """
-import json, os, sys
-import factors.compiled, gsba.log, numba.core.event
-
-for line in sys.stdin:
-    package, cache, program, *outputs = json.loads(line)
-    if process := os.fork():
-        print(os.waitpid(process, 0)[1], flush=True)
-        continue
-    for number, path in enumerate(outputs, 1):
-        os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), number)
-    sys.path.insert(0, package)
-    numba.core.config.CACHE_DIR = cache
-    exec(program)
-    sys.exit()
-"""
 
 
 @pytest.fixture
@@ -74,62 +54,33 @@ def package(tmp_path: Path) -> Path:
     return folder
 
 
-def environment_of(*paths: object) -> dict[str, str]:
-    environment = os.environ | {"PYTHONPATH": ":".join(map(str, paths))}
-    environment.pop("NUMBA_DISABLE_JIT", None)
-    return environment | {"PYTHONDONTWRITEBYTECODE": "1"}  # to notice an edit within a second
-
-
 def start(package: Path, cache: Path, **variables: str) -> subprocess.CompletedProcess[str]:
-    """The program in a process of its own."""
-    environment = environment_of(package, ROOT) | {"NUMBA_CACHE_DIR": str(cache)} | variables
-    command = [sys.executable, "-c", PROGRAM]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
-
-
-class Forks:
-    """Runs the program in forks of a process that has imported Numba."""
-
-    def __init__(self, server: subprocess.Popen[str], folder: Path) -> None:
-        self._server, self._outputs = server, (folder / "stdout", folder / "stderr")
-
-    def __call__(self, package: Path, cache: Path) -> subprocess.CompletedProcess[str]:
-        assert self._server.stdin and self._server.stdout
-        words = map(str, (package, cache, PROGRAM, *self._outputs))
-        print(json.dumps(list(words)), file=self._server.stdin, flush=True)
-        status = int(self._server.stdout.readline())
-        told = subprocess.CompletedProcess([], status, *(p.read_text() for p in self._outputs))
-        told.check_returncode()
-        return told
-
-
-@pytest.fixture(scope="module")
-def fork(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Forks]:
-    with subprocess.Popen(
-        [sys.executable, "-c", SERVER],
-        env=environment_of(ROOT),
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
+    root = str(Path(__file__).parents[2])
+    environment = os.environ | {"PYTHONPATH": f"{package}:{root}", "NUMBA_CACHE_DIR": str(cache)}
+    environment.pop("NUMBA_DISABLE_JIT", None)
+    environment["PYTHONDONTWRITEBYTECODE"] = "1"  # an edit within a second must be noticed
+    return subprocess.run(
+        [sys.executable, "-c", PROGRAM],
+        env=environment | variables,
+        capture_output=True,
         text=True,
-    ) as server:
-        yield Forks(server, tmp_path_factory.mktemp("forks"))
+        check=True,
+    )
 
 
-def test_a_kernel_is_renewed_when_what_it_uses_changes(
-    package: Path, tmp_path: Path, fork: Forks
-) -> None:
+def test_a_kernel_is_renewed_when_what_it_uses_changes(package: Path, tmp_path: Path) -> None:
     """Also in another file, but not for a comment, a moved line or another installation."""
     cache = tmp_path / "cache"
-    assert fork(package, cache).stdout.split() == ["6.0", "scaled", "twice"]
+    assert start(package, cache).stdout.split() == ["6.0", "scaled", "twice"]
 
     (package / "parts.py").write_text("# A comment.\n" + PARTS)
     elsewhere = package.rename(tmp_path / "elsewhere")
-    assert fork(elsewhere, cache).stdout.split() == ["6.0"]
+    assert start(elsewhere, cache).stdout.split() == ["6.0"]
 
     (elsewhere / "parts.py").write_text(PARTS.replace("FACTOR = 2.0", "FACTOR = 5.0"))
-    assert fork(elsewhere, cache).stdout.split() == ["15.0", "scaled", "twice"]
+    assert start(elsewhere, cache).stdout.split() == ["15.0", "scaled", "twice"]
     (elsewhere / "parts.py").write_text(PARTS.replace("FACTOR * x", "FACTOR * x * x"))
-    assert fork(elsewhere, cache).stdout.split() == ["18.0", "scaled", "twice"]
+    assert start(elsewhere, cache).stdout.split() == ["18.0", "scaled", "twice"]
     options = PARTS.replace("kernel_and_part()", 'kernel_and_part(fastmath={"nsz", "arcp"})')
     (elsewhere / "parts.py").write_text(options)
     for seed in "01":  # sets of options in any order are the same options
@@ -137,11 +88,11 @@ def test_a_kernel_is_renewed_when_what_it_uses_changes(
         assert told == (["6.0", "scaled", "twice"] if seed == "0" else ["6.0"])
 
     (elsewhere / "parts.py").write_text(PARTS)
-    assert fork(elsewhere, cache).stdout.split() == ["6.0"]  # older kernels were kept
+    assert start(elsewhere, cache).stdout.split() == ["6.0"]  # older kernels were kept
 
 
 def test_a_kernel_is_renewed_when_a_record_that_it_takes_moves(
-    package: Path, tmp_path: Path, fork: Forks
+    package: Path, tmp_path: Path
 ) -> None:
     """Its file names the module of the record's type, which is no more there."""
     record = "from typing import NamedTuple\nclass Pair(NamedTuple):\n    x: float\n"
@@ -152,7 +103,7 @@ def test_a_kernel_is_renewed_when_a_record_that_it_takes_moves(
         (package / f"{home}.py").write_text(record)
         text = f"from parts import kernel\nfrom {home} import Pair\n{kernel}{call}"
         (package / "kernels.py").write_text(text)
-        assert fork(package, tmp_path / "cache").stdout.split() == ["6.0", "first"]
+        assert start(package, tmp_path / "cache").stdout.split() == ["6.0", "first"]
 
 
 def test_kernels_for_another_processor_are_kept_apart(package: Path, tmp_path: Path) -> None:
@@ -163,9 +114,9 @@ def test_kernels_for_another_processor_are_kept_apart(package: Path, tmp_path: P
     assert len(list((cache / "gsba").iterdir())) == 2
 
 
-def test_a_damaged_kernel_is_compiled_anew(package: Path, tmp_path: Path, fork: Forks) -> None:
+def test_a_damaged_kernel_is_compiled_anew(package: Path, tmp_path: Path) -> None:
     cache = tmp_path / "cache"
-    fork(package, cache)
+    start(package, cache)
     (file,) = (cache / "gsba").iterdir()
     content = file.read_bytes()
     middle = len(content) // 2
@@ -174,18 +125,16 @@ def test_a_damaged_kernel_is_compiled_anew(package: Path, tmp_path: Path, fork: 
     elsewhere = hashlib.sha256(moved).digest() + moved
     for damaged in (content[:middle], flipped, b"", elsewhere):
         file.write_bytes(damaged)
-        told = fork(package, cache)
+        told = start(package, cache)
         assert told.stdout.split() == ["6.0", "scaled", "twice"]
         assert told.stderr.count("\n") == 1 and "compiling kernels" in told.stderr
-    assert fork(package, cache).stdout.split() == ["6.0"]
+    assert start(package, cache).stdout.split() == ["6.0"]
 
 
 @pytest.mark.parametrize("folder", ["file/below", "/dev/full/below", "/proc/below"])
-def test_without_a_folder_each_process_compiles(
-    package: Path, tmp_path: Path, fork: Forks, folder: str
-) -> None:
+def test_without_a_folder_each_process_compiles(package: Path, tmp_path: Path, folder: str) -> None:
     (tmp_path / "file").write_text("no folder")
-    told = fork(package, tmp_path / folder)
+    told = start(package, tmp_path / folder)
     assert told.stdout.split() == ["6.0", "scaled", "twice"]
     first, second = told.stderr.strip().split("\n")
     assert "compiled kernels cannot be kept in" in first and folder in first
