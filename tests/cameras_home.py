@@ -20,6 +20,7 @@ from gsba.camera.sphere import around_sphere, erp_from_bearings
 from gsba.demo import DemoWalk
 from gsba.evaluate.trajectory import evaluate
 from gsba.frames.cubemap import cut
+from gsba.pipeline.recordings import refine_each
 from gsba.store.finished import load_run
 from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.types import FACES, Fisheye, Trajectory
@@ -152,6 +153,13 @@ def error_of(run: Path, home: Home) -> float:
 
 
 SMALL_EXPORT = exporting("colmap-flat", face_size=64)
+
+
+def make_single(home: Home, folder: Path) -> Path:
+    """A run of the first recording as panoramas."""
+    out = folder / "single"
+    refine_each([panoramas(home, 0, WIDTH)], out, SMALL_EXPORT)
+    return out
 
 
 def make_beside_faces(home: Home, folder: Path) -> Path:

@@ -14,7 +14,14 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read as NumPy loads: worke
 
 import numpy as np
 import pytest
-from cameras_home import Home, make_beside_faces, make_beside_fisheyes, make_home, make_two_sizes
+from cameras_home import (
+    Home,
+    make_beside_faces,
+    make_beside_fisheyes,
+    make_home,
+    make_single,
+    make_two_sizes,
+)
 from growing_home import GrowingHome, make_growing_home
 from made_once import MadeOnce
 from one_gallery import gallery, oval_walk
@@ -27,6 +34,7 @@ from gsba.features import FaceKeypoints, SiftExtractor
 # While the first file compiles the pipeline's kernels, the next ones need none of them.
 _FIRST = (
     "pipeline/test_growing_cameras.py",
+    "pipeline/test_growing.py",
     "scans",
     "loop_closure",
     "pipeline",
@@ -76,6 +84,12 @@ def oval(made_once: MadeOnce) -> DemoWalk:
 def cameras_home(oval: DemoWalk, made_once: MadeOnce) -> Home:
     """Recordings by different cameras; runs of them may be put into its folder."""
     return made_once("cameras", lambda folder: make_home(folder, oval))
+
+
+@pytest.fixture(scope="session")
+def single_run(cameras_home: Home, made_once: MadeOnce) -> Path:
+    """A finished run of the first recording; tests only read it."""
+    return made_once("single", lambda folder: make_single(cameras_home, folder))
 
 
 @pytest.fixture(scope="session")

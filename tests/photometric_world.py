@@ -26,8 +26,8 @@ class Texture:
         rows, sums = points.reshape(-1, 3), np.empty(points.shape[:-1]).reshape(-1)
         for first in range(0, len(rows), 512):  # the waves of so many points fit in a CPU's cache
             waves = rows[first : first + 512] / RADIUS @ self.waves.T
-            waves += self.phases
-            np.sin(waves, out=waves).sum(axis=-1, out=sums[first : first + 512])
+            angles = (waves + self.phases).astype(np.float32)  # its sines take a fifth of the time
+            np.sin(angles, out=angles).sum(axis=-1, out=sums[first : first + 512])
         return 127 + 8 * sums.reshape(points.shape[:-1])
 
 

@@ -25,7 +25,7 @@ LIGHTER = {
     "cubemap": {"face_size": 256},
     "features": {"max_per_face": 400},
     "weak_frames": {"mode": "off"},
-    "patches": {"rounds": 2},
+    "patches": {"rounds": 0},
 }
 
 
@@ -98,12 +98,12 @@ def _with_tags(image: np.ndarray, world_T_rig: np.ndarray, tags: list[np.ndarray
 def _fine_rays(width: int, height: int) -> np.ndarray:
     """Directions of the pixels of a panorama of twice the size, (2 height, 2 width, 3)."""
     v, u = np.mgrid[: 2 * height, : 2 * width] / 2 + 0.25
-    return bearings_from_erp(np.stack([u, v], -1), width, height)
+    return bearings_from_erp(np.stack([u, v], -1), width, height).astype(np.float32)
 
 
 def _around(rays: np.ndarray, world_T_rig: np.ndarray, tag: np.ndarray) -> np.ndarray:
     """Pixels (H, W) bool whose rays (H, W, 3) of the rig meet the sphere around a tag."""
-    centre = world_T_rig[:3, :3].T @ (tag[:3, 3] - world_T_rig[:3, 3])
+    centre = (world_T_rig[:3, :3].T @ (tag[:3, 3] - world_T_rig[:3, 3])).astype(np.float32)
     along = rays @ centre
     return (centre @ centre - along**2 < (0.9 * TAG) ** 2) & (along > 0)
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny_run import SETTINGS, Case, computed_stages
+from tiny_run import BARE, Case, computed_stages
 
 from gsba.config import FeatureSettings, RefineSettings
 from gsba.evaluate.trajectory import evaluate
@@ -66,7 +66,7 @@ def settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RefineSettings:
         "matching": {"matcher": "lightglue", "weights": str(tmp_path)},
         "patches": {"rounds": 0},
     }
-    return RefineSettings.model_validate(SETTINGS.model_dump() | changes)
+    return RefineSettings.model_validate(BARE.model_dump() | changes)
 
 
 def test_a_run_uses_both_and_resumes(case: Case, settings: RefineSettings, tmp_path: Path) -> None:

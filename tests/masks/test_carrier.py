@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from command import run_gsba
 from scipy.spatial.transform import Rotation
-from tiny_run import SETTINGS, Case, computed_stages
+from tiny_run import BARE, Case, computed_stages, settings_with
 from two_fisheyes import colours, made_pair, picture, write
 
 from gsba import refine
@@ -231,7 +231,8 @@ def test_refine_leaves_the_carrier_out(case: Case, tmp_path: Path) -> None:
         for (path,), t in zip(walk.paths, walk.timestamps.tolist(), strict=True)
     ]
     (tmp_path / "frames/timestamps.csv").write_text("\n".join(times))
-    result = refine(tmp_path / "frames", case.slam, tmp_path / "run", SETTINGS, masks="carrier")
+    settings = settings_with(patches={"rounds": 0})
+    result = refine(tmp_path / "frames", case.slam, tmp_path / "run", settings, masks="carrier")
     found = cv2.imread(str(tmp_path / "run/carrier.png"), cv2.IMREAD_UNCHANGED) == 0
     assert _overlap(found, mask) >= 0.9
     seen = erp_from_bearings(result.reconstruction.observation_bearings, WIDTH, HEIGHT)
@@ -239,13 +240,13 @@ def test_refine_leaves_the_carrier_out(case: Case, tmp_path: Path) -> None:
     assert not found[rows, columns].any()
     assert len(list((tmp_path / "run/colmap/masks").rglob("*.png"))) == 6 * len(walk)
     assert "carrier.png" in json.loads((tmp_path / "run/gsba.json").read_text())["wrote"]
-    again = refine(tmp_path / "frames", case.slam, tmp_path / "run", SETTINGS, masks="carrier")
+    again = refine(tmp_path / "frames", case.slam, tmp_path / "run", settings, masks="carrier")
     assert computed_stages(again) == []
 
 
 def test_masks_are_looked_for_by_default_and_can_be_turned_off(case: Case, tmp_path: Path) -> None:
     """Where there is no carrier, looking for it changes no pose and leaves no file."""
-    plain = case.refine(tmp_path / "none", masks="none")
+    plain = case.refine(tmp_path / "none", BARE, masks="none")
     stages = [{stage["name"] for stage in r.report["stages"]} for r in (plain, case.result)]
     assert "carrier" not in stages[0] and "carrier" in stages[1]
     assert not any((case.result.out / name).exists() for name in ("carrier.png", "masks"))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from photometric_world import Texture, planes_from, render
 from synthetic import unit
-from tiny_run import SETTINGS, Case, computed_stages
+from tiny_run import BARE, Case, computed_stages
 
 from factors.patch_windows import PatchTable, patch_spans, pixel_grid
 from gsba.bundle import adjustment
@@ -29,9 +29,7 @@ from gsba.types import FrameSet
 WIDTH = 512
 GREY = render(np.eye(4), Texture(np.random.default_rng(0)), WIDTH).astype(np.float32)
 ALL = np.ones(GREY.shape, bool)
-JOINT = RefineSettings.model_validate(
-    {**SETTINGS.model_dump(), "factors": ("bearing", "photometric")}
-)
+JOINT = RefineSettings.model_validate({**BARE.model_dump(), "factors": ("bearing", "photometric")})
 
 
 def test_patches_are_spread_over_the_sphere() -> None:

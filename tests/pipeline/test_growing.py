@@ -13,6 +13,7 @@ import pytest
 from accuracy import assert_as_accurate
 from command import run_gsba
 from growing_home import MAX_ERROR, NUM, SMALL_EXPORTS, GrowingHome
+from tiny_run import PLAIN
 from typer.testing import Result
 from waiting import until
 
@@ -38,7 +39,7 @@ def grown(home: GrowingHome, tmp_path_factory: pytest.TempPathFactory) -> Path:
     before = _content(home.run)
     result = _gsba("add", home.run, home.folders[1], home.trajectories[1], "--out", out)
     assert result.exit_code == 0, result.output
-    assert "20 of 20 frames refined" in result.output
+    assert f"{2 * NUM} of {2 * NUM} frames refined" in result.output
     assert _content(home.run) == before
     return out
 
@@ -241,7 +242,7 @@ def test_rigid_merging_keeps_both_maps_and_tells_how_sure_it_is(
 
 def test_runs_that_meet_nowhere_are_not_merged(home: GrowingHome, tmp_path: Path) -> None:
     other = tmp_path / "other"
-    refine(home.elsewhere, home.elsewhere_trajectory, other, SMALL_EXPORTS)
+    refine(home.elsewhere, home.elsewhere_trajectory, other, PLAIN)
     before, out = _content(home.run), tmp_path / "run"
     result = _gsba("merge", home.run, other, "--out", out)
     assert result.exit_code == 1 and not out.exists()
