@@ -127,13 +127,6 @@ class TwoViewLimits:
     max_length_ratio: float = 1.5
 
 
-class TriangulateSettings(_Settings):
-    """Scene points."""
-
-    min_track_length: int = Field(default=2, ge=2)  # observations of a point
-    min_parallax_deg: float = Field(default=0.5, gt=0)  # largest angle between two rays of a point
-
-
 class RoundSettings(_Settings):
     """Triangulate, adjust, filter: gates in standard deviations of the observations' noise."""
 
@@ -424,7 +417,6 @@ class RefineSettings(_Settings):
     weak_frames: WeakFrameSettings = WeakFrameSettings()
     matching: MatchingSettings = MatchingSettings()
     pairs: PairSettings = PairSettings()
-    triangulate: TriangulateSettings = TriangulateSettings()
     priors: PriorSettings = PriorSettings()
     rounds: RoundSettings = RoundSettings()
     patches: PatchSettings = PatchSettings()

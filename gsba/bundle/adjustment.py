@@ -269,7 +269,7 @@ def rescale_noise(
     poses = before.world_T_rigs
     gate = 20.0  # gate in sigmas for observations whose noise is not known yet
     threads = settings.solver.threads()
-    how = gate, settings.triangulate, threads, scratch
+    how = gate, threads, scratch
     placed = triangulation.place(tracks, keypoints, poses, *how)
     factors = np.ones(len(keypoints.faces))
     for group in (sighted.aligned, ~sighted.aligned):
@@ -361,9 +361,8 @@ class _Placement:
             seen, poses, before = self._asked
             if seen is keypoints and poses is world_T_rigs and before == gate:
                 return self._found
-        settings, threads = self._context.settings.triangulate, self._context.num_threads
         self._asked = keypoints, world_T_rigs, gate
-        given = self._tracks, keypoints, world_T_rigs, gate, settings, threads
+        given = self._tracks, keypoints, world_T_rigs, gate, self._context.num_threads
         self._found = triangulation.place(*given, self._context.scratch)
         return self._found
 

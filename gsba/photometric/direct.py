@@ -250,7 +250,7 @@ def _solve(
         weights = doubts
     accepted = landmarks.error(result.values) <= _MAX_GROWTH * before
     solved = replace(solved, variables=terms.own.variables(result.values)) if accepted else solved
-    adjusted = _adjusted(solved, keypoints, result, accepted, settings, num_threads)
+    adjusted = _adjusted(solved, keypoints, result, accepted, num_threads)
     return adjusted, weights, residuals
 
 
@@ -349,7 +349,6 @@ def _adjusted(
     keypoints: Keypoints,
     result: OptimizeResult,
     accepted: bool,
-    settings: RefineSettings,
     num_threads: int,
 ) -> Solution:
     """The solution with the joint solve's poses, or the old one if not accepted.
@@ -361,7 +360,7 @@ def _adjusted(
     gate = solved.rounds[-1].gate_sigmas if solved.rounds else np.inf
     poses = adjustment.poses_of(result.values, len(solved.world_T_rigs))
     limit = gate * solved.noise
-    placed = triangulation.place(tracks, keypoints, poses, limit, settings.triangulate, num_threads)
+    placed = triangulation.place(tracks, keypoints, poses, limit, num_threads)
     after = replace(solved, world_T_rigs=poses, landmarks=placed)
     accepted &= after.carries(solved, least)
     support = len(placed.tracks)

@@ -111,8 +111,7 @@ def separate_parts(state: State) -> np.ndarray | None:
     if not len(solution.landmarks.points_world):
         raise NoPositions(
             "no scene point is seen from enough frames, with enough parallax: frames must "
-            "follow one another closely (or lower triangulate.min_track_length or "
-            "triangulate.min_parallax_deg)"
+            "follow one another closely"
         )
     scarce = solution.observations() < MIN_OBSERVATIONS
     nothing = np.zeros_like(state.prior.trust.held_steps)

@@ -232,5 +232,5 @@ class Run:
     def solving_key(self) -> list[object]:
         """Settings that solutions rest on."""
         settings = self.settings
-        relevant = [settings.triangulate, settings.rounds, settings.priors, settings.solver]
+        relevant = [settings.rounds, settings.priors, settings.solver]
         return [*relevant, self.families.digests()]

@@ -289,7 +289,6 @@ class _Turns:
             self.keypoints,
             world_T_rigs,
             self._gate() * self.solved.noise,
-            self.settings.triangulate,
             self.context.num_threads,
         )
 

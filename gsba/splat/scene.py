@@ -8,7 +8,7 @@ import numpy as np
 from gsba.bundle import triangulation
 from gsba.camera.rig import CubeRig
 from gsba.camera.views import ONE_EYE, Optics, View, turned_rigs
-from gsba.config import SplatSettings, TriangulateSettings
+from gsba.config import SplatSettings
 from gsba.frames import cubemap
 from gsba.frames.held_out import held_out_rows
 from gsba.frames.masks import load_mask
@@ -174,7 +174,6 @@ def place_points(
         np.ones(len(rows)),
         world_T_rigs,
         gate_rad,
-        TriangulateSettings(),
         origins_rig=None if origins is None else origins[rows],
     )
     kept = np.empty(len(placed.points_world), np.int64)
