@@ -293,17 +293,9 @@ class SplatFactorSettings(_Settings):
     sizes: tuple[Annotated[int, Field(ge=16, le=_MAX_FACE_PX)], ...] = Field(
         default=(48, 96), min_length=1
     )  # pixels of a face, in order
-    first_steps: int = Field(default=400, ge=1)  # training steps before poses move at each size
-    steps: int = Field(
-        default=150, ge=1
-    )  # training steps after each move, before held-out panoramas compare the poses
-    moves: int = Field(default=3, ge=1)  # most updates of the poses at each size
     min_sigmas: float = Field(
         default=2.0, ge=0
     )  # gain on held-out panoramas in standard errors that a move needs, or it is undone
-    max_growth: float = Field(default=1.05, gt=0)  # of the geometric cost, or a move is undone
-    held_out_every: int = Field(default=8, ge=2)  # one panorama of so many is held out of training
-    max_gaussians: int = Field(default=30_000, ge=1)
     backend: Literal["auto", "gsplat", "cpu"] = "auto"
 
 
@@ -345,25 +337,12 @@ class SplatSettings(_Settings):
     iterations: int = Field(default=7000, ge=1, le=10**7)  # training steps of one view each
     face_size: int = Field(default=256, ge=16, le=_MAX_FACE_PX)  # pixels
     backend: Literal["auto", "gsplat", "cpu"] = "auto"
-    held_out_every: int = Field(default=8, ge=2)  # whole panoramas kept for evaluation
     sh_degree: int = Field(default=3, ge=0, le=3)
     max_gaussians: int | None = Field(default=None, ge=1)  # None = set by pixels and memory
-    ssim_weight: float = Field(default=0.2, ge=0, le=1)
-    near: float = Field(default=0.01, gt=0)  # near plane, part of the extent
     rate_means: float = Field(default=1.6e-4, gt=0)  # at the start, part of the extent
     rate_means_end: float = Field(default=1.6e-6, gt=0)
     rate_scales: float = Field(default=5e-3, gt=0)
-    rate_rotations: float = Field(default=1e-3, gt=0)
-    rate_opacities: float = Field(default=0.05, gt=0)
-    rate_colors: float = Field(default=2.5e-3, gt=0)  # of degree 0; a twentieth for higher degrees
     rate_fade: float = Field(default=1.0, gt=0, le=1)  # factor at the end on all rates but means'
-    densify: bool = True
-    densify_pull: float = Field(default=2e-4, gt=0)  # gradient of a centre, focal lengths
-    densify_scale: float = Field(default=0.01, gt=0)  # smaller Gaussians are cloned, larger ones
-    # split; part of the extent
-    min_opacity: float = Field(default=5e-3, gt=0, lt=1)
-    max_scale: float = Field(default=0.1, gt=0)  # of extent
-    checkpoint_every_s: float = Field(default=60.0, gt=0)
     seed: int = Field(default=0, ge=0, le=_MAX_SEED)
 
 
