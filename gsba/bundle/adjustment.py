@@ -73,6 +73,7 @@ class Division(Protocol):
         ...
 
 
+ALIGNED_GATES = 6.0, 3.0  # gates of rounds with aligned patches, standard deviations
 GATE_SCALE = 10.0  # gates wider than so many standard deviations widen the loss in proportion
 _TOLERANCE = 3e-4  # relative decrease of the cost that ends a round, but the run's last one
 _MIN_SUPPORT = 0.99  # share of the inliers that a round must keep, or it is undone

@@ -10,9 +10,10 @@ from factors import BearingTerm, LandmarkBlock, RobustLoss
 from gsba.bundle import optimize, pose_variables, triangulate
 from gsba.bundle.adjustment import poses_of, values_of
 from gsba.camera.rig import witnesses
-from gsba.config import SolverSettings, TwoViewLimits
+from gsba.config import SolverSettings
 from gsba.geometry import angles_between, nearest_rotation
 from gsba.matching.verification import relative_pose
+from gsba.trajectory.limits import TwoViewLimits
 from gsba.types import Landmarks, Tracks
 
 _SOLVER = SolverSettings(

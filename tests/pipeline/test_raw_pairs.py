@@ -101,6 +101,8 @@ def test_raw_pairs_of_known_lenses_become_faces_of_either(
     np.testing.assert_allclose(kept[0].centre, [0, 0, BASELINE / 2], atol=0.001)
     _check_fisheyes(tmp_path / "run")
     _check_panoramas(walk, tmp_path / "run")
+    monkeypatch.setattr("gsba.photometric.direct._DEPTH_LEVELS", 0)
+    monkeypatch.setattr("gsba.photometric.patches._SPACING_DEG", 20.0)
     shorten(monkeypatch, first_steps=30, steps=10, held_out_every=8)
     _check_families(walk, tmp_path / "run")
 
@@ -148,7 +150,6 @@ def _check_families(walk: Path, run: Path) -> None:
     """Pixels of the lenses have their say, each from its own; a splat is trained on them."""
     more = {
         "factors": ("bearing", "photometric", "splat"),
-        "photometric": {"spacing_deg": 20.0, "depth_levels": 0},
         "splat": {"sizes": (24,), "backend": "cpu"},
     }
     settings = RefineSettings.model_validate(RAW_SETTINGS.model_dump() | more)

@@ -11,6 +11,7 @@ from tiny_run import NUM_FRAMES, Case, computed_stages
 from gsba.config_file import load_config
 from gsba.evaluate.trajectory import evaluate
 from gsba.log import GsbaError
+from gsba.photometric import direct, patches
 from gsba.splat import refinement
 from gsba.types import Trajectory
 
@@ -117,11 +118,13 @@ def test_an_interrupted_refinement_goes_on_to_the_same_result(
 
 
 @pytest.mark.slow
-def test_a_run_with_all_families(case: Case, tmp_path: Path) -> None:
+def test_a_run_with_all_families(
+    case: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     out = case.copy(tmp_path / "run")
     settings = settings_for(("bearing", "photometric", "splat"))
-    few = settings.photometric.model_copy(update={"spacing_deg": 20.0, "depth_levels": 0})
-    settings = settings.model_copy(update={"photometric": few})
+    monkeypatch.setattr(direct, "_DEPTH_LEVELS", 0)
+    monkeypatch.setattr(patches, "_SPACING_DEG", 20.0)
     result = case.refine(out, settings)
     assert computed_stages(result)[:2] == ["photometric", "splat"]
     (move,) = result.report["splat"]
