@@ -79,12 +79,11 @@ def run(folder: Path, num_threads: int) -> dict[str, float]:
     """Align all points of the frames in a folder."""
     frames = scan(folder, None, None, None)
     landmarks, poses, keypoints, rig = make_map(len(frames), frames.format.width)
-    settings = PatchSettings()
-    greys = panorama.Greys(frames, settings.max_width)
+    greys = panorama.Greys(frames, PatchSettings().max_width)
     before = peak_mb()
     solved = replace(Solution.without_points(poses), landmarks=landmarks)
     observed, workers = alignment.Observations(keypoints), Threads(num_threads)
-    sighted = alignment.align(solved, observed, greys, rig, settings, workers)
+    sighted = alignment.align(solved, observed, greys, rig, workers)
     kept, received = sighted.counts.kept, sighted.counts.received
     return {"frames": len(frames), "before_mb": before, "peak_mb": peak_mb(),
             "kept": kept, "received": received}  # fmt: skip

@@ -1,12 +1,11 @@
 """Settings: one frozen model per stage, defaults that run a sensible job with no file."""
 
 import os
-from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from itertools import pairwise
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 _MAX_FACE_PX = 16_384  # OpenCV's remap takes at most 32,767 pixels across
 _MAX_SEED = 2**31 - 1
@@ -103,7 +102,6 @@ class PairSettings(_Settings):
     """Frame pairs to match, and the gates around their predicted geometry."""
 
     window: int = Field(default=32, ge=2)  # frames in time
-    max_baseline_depths: float = Field(default=2.0, gt=0)  # longest baseline in median scene depths
     max_loop_neighbours: int = Field(default=8, ge=0)  # nearest frames in space outside the window
     gate_factor: float = Field(default=1.0, gt=0)  # widens angular gates; a run widens them itself
     # for raw frames whose calibration is poorly known
@@ -113,35 +111,12 @@ class PairSettings(_Settings):
     )  # largest relative drift that a loop closure may correct
 
 
-@dataclass(frozen=True, slots=True)
-class TwoViewLimits:
-    """Limits of two-view geometry, and of its agreement with the trajectory."""
-
-    max_error_deg: float = 0.25  # RANSAC inlier threshold, for exact directions
-    max_false_alarms: float = 1e-3  # expected number of relative poses that fit random matches as
-    # well as the estimated one
-    max_error_rate: float = 0.05  # probability of preferring one of two poses that explain the
-    # matches equally well
-    max_rotation_deg: float = 6.0  # disagreement with the trajectory; the next two as well
-    max_direction_deg: float = 20.0
-    max_length_ratio: float = 1.5
-
-
-class TriangulateSettings(_Settings):
-    """Scene points."""
-
-    min_track_length: int = Field(default=2, ge=2)  # observations of a point
-    min_parallax_deg: float = Field(default=0.5, gt=0)  # largest angle between two rays of a point
-
-
 class RoundSettings(_Settings):
     """Triangulate, adjust, filter: gates in standard deviations of the observations' noise."""
 
-    chain: tuple[float, ...] = (60.0, 8.0)  # from the coarse trajectory
     dense: tuple[float, ...] = (4.0,)  # with matches along the solved chain
     loops: tuple[float, ...] = (100.0, 6.0)  # with loops closed
     refined: tuple[float, ...] = (4.0, 2.5)  # with matches along the solved map
-    aligned: tuple[float, ...] = (6.0, 3.0)  # with aligned patches
     map_passes: int = Field(default=1, ge=1)  # matching passes after loops are closed
 
 
@@ -150,15 +125,7 @@ class PatchSettings(_Settings):
 
     rounds: int = Field(default=4, ge=0)  # most rounds of alignment and bundle adjustment, which
     # end once the steps between frames no longer change; 0 = none
-    patch_size: int = Field(default=15, ge=5, le=41)  # pixels across, odd
     max_width: int = Field(default=4096, ge=64)  # pixels across a panorama; wider ones are halved
-
-    @field_validator("patch_size")
-    @classmethod
-    def _odd(cls, size: int) -> int:
-        if size % 2 == 0:
-            raise ValueError("must be odd: a patch has a pixel in its middle")
-        return size
 
 
 # Published data of cameras: baseline of the lenses with its standard deviation, millimetres, and
@@ -247,7 +214,6 @@ class StitchingSettings(_Settings):
     """Stitching field: smooth offsets of bearings on the sphere, shared by all frames."""
 
     mode: Literal["auto", "off"] = "auto"  # auto: applied where it predicts held-out observations
-    max_degree: int = Field(default=10, ge=1, le=16)  # of spherical harmonics; wavelength 360 / it
 
 
 class PriorSettings(_Settings):
@@ -281,36 +247,15 @@ class SolverSettings(_Settings):
         return self.num_threads or os.cpu_count() or 1
 
 
-class PhotometricSettings(_Settings):
-    """Direct alignment of patches, joint with the other families."""
-
-    levels: tuple[int, ...] = Field(
-        default=(0,), min_length=1
-    )  # halvings of the panorama, in order
-    max_width: int = Field(default=4096, ge=128)  # pixels of level 0; larger panoramas are halved
-    size: int = Field(default=9, ge=3, le=33)  # pixels across a patch
-    spacing_deg: float = Field(default=7.0, gt=0, le=60)  # between patches of a frame
-    targets: int = Field(default=8, ge=1)  # frames that a patch is aligned in, nearest in space
-    depth_levels: int = Field(default=2, ge=0)  # coarser levels on which depths are estimated first
-
-
 class SplatFactorSettings(_Settings):
     """Poses refined against a splat of their own frames; see also `SplatSettings`."""
 
     sizes: tuple[Annotated[int, Field(ge=16, le=_MAX_FACE_PX)], ...] = Field(
         default=(48, 96), min_length=1
     )  # pixels of a face, in order
-    first_steps: int = Field(default=400, ge=1)  # training steps before poses move at each size
-    steps: int = Field(
-        default=150, ge=1
-    )  # training steps after each move, before held-out panoramas compare the poses
-    moves: int = Field(default=3, ge=1)  # most updates of the poses at each size
     min_sigmas: float = Field(
         default=2.0, ge=0
     )  # gain on held-out panoramas in standard errors that a move needs, or it is undone
-    max_growth: float = Field(default=1.05, gt=0)  # of the geometric cost, or a move is undone
-    held_out_every: int = Field(default=8, ge=2)  # one panorama of so many is held out of training
-    max_gaussians: int = Field(default=30_000, ge=1)
     backend: Literal["auto", "gsplat", "cpu"] = "auto"
 
 
@@ -352,25 +297,12 @@ class SplatSettings(_Settings):
     iterations: int = Field(default=7000, ge=1, le=10**7)  # training steps of one view each
     face_size: int = Field(default=256, ge=16, le=_MAX_FACE_PX)  # pixels
     backend: Literal["auto", "gsplat", "cpu"] = "auto"
-    held_out_every: int = Field(default=8, ge=2)  # whole panoramas kept for evaluation
     sh_degree: int = Field(default=3, ge=0, le=3)
     max_gaussians: int | None = Field(default=None, ge=1)  # None = set by pixels and memory
-    ssim_weight: float = Field(default=0.2, ge=0, le=1)
-    near: float = Field(default=0.01, gt=0)  # near plane, part of the extent
     rate_means: float = Field(default=1.6e-4, gt=0)  # at the start, part of the extent
     rate_means_end: float = Field(default=1.6e-6, gt=0)
     rate_scales: float = Field(default=5e-3, gt=0)
-    rate_rotations: float = Field(default=1e-3, gt=0)
-    rate_opacities: float = Field(default=0.05, gt=0)
-    rate_colors: float = Field(default=2.5e-3, gt=0)  # of degree 0; a twentieth for higher degrees
     rate_fade: float = Field(default=1.0, gt=0, le=1)  # factor at the end on all rates but means'
-    densify: bool = True
-    densify_pull: float = Field(default=2e-4, gt=0)  # gradient of a centre, focal lengths
-    densify_scale: float = Field(default=0.01, gt=0)  # smaller Gaussians are cloned, larger ones
-    # split; part of the extent
-    min_opacity: float = Field(default=5e-3, gt=0, lt=1)
-    max_scale: float = Field(default=0.1, gt=0)  # of extent
-    checkpoint_every_s: float = Field(default=60.0, gt=0)
     seed: int = Field(default=0, ge=0, le=_MAX_SEED)
 
 
@@ -424,7 +356,6 @@ class RefineSettings(_Settings):
     weak_frames: WeakFrameSettings = WeakFrameSettings()
     matching: MatchingSettings = MatchingSettings()
     pairs: PairSettings = PairSettings()
-    triangulate: TriangulateSettings = TriangulateSettings()
     priors: PriorSettings = PriorSettings()
     rounds: RoundSettings = RoundSettings()
     patches: PatchSettings = PatchSettings()
@@ -433,7 +364,6 @@ class RefineSettings(_Settings):
     solver: SolverSettings = SolverSettings()
     factors: tuple[str, ...] = ("bearing",)  # BUILT_IN, and of packages by NAME or NAME:ARGUMENT
     gps: GpsSettings = GpsSettings()
-    photometric: PhotometricSettings = PhotometricSettings()
     splat: SplatFactorSettings = SplatFactorSettings()
     export: ExportSettings = ExportSettings()
     placement: PlacementSettings = PlacementSettings()
@@ -451,11 +381,6 @@ class RefineSettings(_Settings):
         """Settings without a readout time, for frames whose timestamps give only their order."""
         camera = self.camera.model_copy(update={"name": None, "readout_ms": None})
         return self.model_copy(update={"camera": camera})
-
-    @property
-    def verify(self) -> TwoViewLimits:
-        """Limits of two-view geometry under the gates."""
-        return TwoViewLimits(self.pairs.gate_factor * TwoViewLimits().max_error_deg)
 
     def with_gates(self, scale: float) -> "RefineSettings":
         """Settings with matching gates `scale` times as wide, for poorly calibrated lenses."""

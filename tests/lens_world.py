@@ -20,9 +20,7 @@ from gsba.geometry import inverse
 from gsba.types import Keypoints, Landmarks, Solution, Tracks
 
 SIGMA = 4e-4
-SETTINGS = RefineSettings.model_validate(
-    {"solver": {"num_threads": 2}, "triangulate": {"min_parallax_deg": 0.3}}
-)
+SETTINGS = RefineSettings.model_validate({"solver": {"num_threads": 2}})
 INTERVAL_S = 0.5
 
 
@@ -98,7 +96,7 @@ def placed(solved: Solution, keypoints: Keypoints, tracks: Tracks) -> Landmarks:
     rows = keypoints.rows(tracks)
     return triangulation.triangulate(
         tracks, keypoints.bearings_rig[rows], keypoints.sigmas_rad[rows], solved.world_T_rigs,
-        30 * solved.noise, SETTINGS.triangulate, 1, keypoints.origins_of(rows),
+        30 * solved.noise, 1, keypoints.origins_of(rows), min_parallax_deg=0.3,
     )  # fmt: skip
 
 

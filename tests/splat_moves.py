@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import gtsam
 import numpy as np
+import pytest
 from tiny_run import SETTINGS, Case
 
 from gsba.bundle.adjustment import AdjustmentContext
@@ -21,10 +22,16 @@ Given = tuple[FrameSet, Keypoints, Solution]
 
 
 def settings_for(factors: tuple[str, ...] = ("bearing", "splat"), **splat) -> RefineSettings:
-    """Small faces, few steps, a held-out frame in four."""
-    small = {"sizes": (24,), "first_steps": 60, "steps": 20, "moves": 1, "held_out_every": 4}
-    chosen = {"factors": factors, "splat": {**small, "backend": "cpu", **splat}}
+    """Small faces."""
+    chosen = {"factors": factors, "splat": {"sizes": (24,), "backend": "cpu", **splat}}
     return RefineSettings.model_validate({**SETTINGS.model_dump(), **chosen})
+
+
+def shorten(patch: pytest.MonkeyPatch, **changes: float) -> None:
+    """Few steps, one move, a held-out frame in four; or other constants of the refinement."""
+    few = {"first_steps": 60, "steps": 20, "max_moves": 1, "held_out_every": 4}
+    for name, value in {**few, **changes}.items():
+        patch.setattr(refinement, f"_{name.upper()}", value)
 
 
 def spoiled(case: Case, degrees: float, distance: float, noise: float, seed: int = 0) -> Given:

@@ -17,7 +17,7 @@ from gsba.types import Counts, Landmarks, Solution, Tracks
 NUM, POINTS, HALF = 40, 1500, 20
 TRUTH = loop_walk(NUM)
 EVERYTHING = np.ones(NUM)  # share of the points in reach that each frame shows
-SETTINGS = RefineSettings(pairs=PairSettings(window=8, max_baseline_depths=0.8))
+SETTINGS = RefineSettings(pairs=PairSettings(window=8))
 SCALE = 1.7
 MOVE = pose(Rotation.from_rotvec([0.4, -2.0, 0.7]).as_matrix(), np.array([5.0, -3.0, 8.0]))
 

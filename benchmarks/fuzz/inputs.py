@@ -354,7 +354,7 @@ def _flat(tree: Mapping[str, Any], place: str = "") -> Iterator[tuple[str, Any]]
 
 def _extreme(draft: Draft) -> str:
     """Setting at or beyond the ends of its range; most of these must still work."""
-    skipped = ("video.", "export.", "placement.", "splat.", "photometric.", "solver.num", "factors")
+    skipped = ("video.", "export.", "placement.", "splat.", "solver.num", "factors")
     numbers = [
         (key, value)
         for key, value in _flat(RefineSettings().model_dump())

@@ -73,6 +73,7 @@ class Division(Protocol):
         ...
 
 
+ALIGNED_GATES = 6.0, 3.0  # gates of rounds with aligned patches, standard deviations
 GATE_SCALE = 10.0  # gates wider than so many standard deviations widen the loss in proportion
 _TOLERANCE = 3e-4  # relative decrease of the cost that ends a round, but the run's last one
 _MIN_SUPPORT = 0.99  # share of the inliers that a round must keep, or it is undone
@@ -269,7 +270,7 @@ def rescale_noise(
     poses = before.world_T_rigs
     gate = 20.0  # gate in sigmas for observations whose noise is not known yet
     threads = settings.solver.threads()
-    how = gate, settings.triangulate, threads, scratch
+    how = gate, threads, scratch
     placed = triangulation.place(tracks, keypoints, poses, *how)
     factors = np.ones(len(keypoints.faces))
     for group in (sighted.aligned, ~sighted.aligned):
@@ -361,9 +362,8 @@ class _Placement:
             seen, poses, before = self._asked
             if seen is keypoints and poses is world_T_rigs and before == gate:
                 return self._found
-        settings, threads = self._context.settings.triangulate, self._context.num_threads
         self._asked = keypoints, world_T_rigs, gate
-        given = self._tracks, keypoints, world_T_rigs, gate, settings, threads
+        given = self._tracks, keypoints, world_T_rigs, gate, self._context.num_threads
         self._found = triangulation.place(*given, self._context.scratch)
         return self._found
 

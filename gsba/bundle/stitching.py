@@ -24,6 +24,7 @@ from gsba.camera.cameras import ONE_CAMERA, Cameras
 from gsba.camera.rig import CubeRig, owner_faces
 from gsba.types import Counts, Keypoints, Round, Sighted, Solution
 
+_MAX_DEGREE = 10  # of spherical harmonics: the shortest wavelength is 36 degrees
 _MIN_GAIN = 0.03  # share by which the field must lower the robust cost of held-out observations
 
 logger = logging.getLogger(__name__)
@@ -88,10 +89,8 @@ def estimate(
     other parts give fields of every degree and smoothness, and the part itself says what they are
     worth. The field is taken where every part gains, and all together enough.
     """
-    settings = context.settings
-    chosen = settings.stitching
-    whole = MAX_OBSERVATIONS, chosen.max_degree, _MIN_GAIN
-    probe = _PROBE[0], min(_PROBE[1], chosen.max_degree), 0.5 * _MIN_GAIN
+    whole = MAX_OBSERVATIONS, _MAX_DEGREE, _MIN_GAIN
+    probe = *_PROBE, 0.5 * _MIN_GAIN
     now = Stitching(field, before, keypoints, 0, np.zeros(PARTS), Counts(0, 0, "observations"))
     systems, spread = [], 0.0
     for most, max_degree, least in [whole] if field else [probe, whole]:
@@ -115,11 +114,11 @@ def estimate(
             return now
     for number in range(2):  # estimates of the field, each with a bundle adjustment
         if number:
-            systems, _ = _systems(now, MAX_OBSERVATIONS, chosen.max_degree, context, lenses)
+            systems, _ = _systems(now, MAX_OBSERVATIONS, _MAX_DEGREE, context, lenses)
         field = SphereField(_fitted(systems, now.degree, spread))
         straight = corrected(sighted.keypoints, field, context.rig)
         there = replace(sighted, keypoints=lenses.seen(straight))
-        gates = settings.rounds.aligned[-1:]
+        gates = adjustment.ALIGNED_GATES[-1:]
         solved, found = adjustment.adjust_sighted(there, now.adjustment, context, gates)
         keypoints = with_noise_of(sighted.keypoints, found)
         now = replace(now, field=field, adjustment=solved, keypoints=keypoints)

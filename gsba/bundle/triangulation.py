@@ -8,7 +8,6 @@ import numpy as np
 from factors.compiled import kernel_and_part
 from factors.threads import balanced_ranges, run_in_threads
 from gsba.bundle.tracks import map_runs
-from gsba.config import TriangulateSettings
 from gsba.disk import concatenated
 from gsba.geometry import moved_to
 from gsba.memory import release_mapped_files
@@ -171,6 +170,7 @@ def _gauss_newton_step(rays, centres, sigmas, lo, hi, point, gate):
     point[2] -= z
 
 
+_MIN_TRACK_LENGTH = 2  # observations of a point: one ray has no depth
 _IN_MEMORY = 1 << 18  # observations of which the tracks are in memory in any case
 _NONE = Counts(0, 0, "tracks")
 
@@ -181,9 +181,9 @@ def triangulate(
     sigmas_rad: np.ndarray,
     world_T_rigs: np.ndarray,
     max_error_sigmas: float,
-    settings: TriangulateSettings,
     num_threads: int = 1,
     origins_rig: np.ndarray | None = None,
+    min_parallax_deg: float = 0.5,
 ) -> Landmarks:
     """Triangulate every track and drop what does not fit.
 
@@ -196,6 +196,8 @@ def triangulate(
         world_T_rigs: (F, 4, 4) current poses.
         max_error_sigmas: gate on the angle between observation and point, in sigmas.
         origins_rig: (O, 3) rig frame, where each ray starts; None = the rig's centre.
+        min_parallax_deg: largest angle between two rays of a point, at least: the depth of a point
+            with less is noise.
     """
     starts = np.searchsorted(tracks.points, np.arange(tracks.num_points + 1))
     rays, centres = np.empty((len(tracks), 3)), np.empty((len(tracks), 3))
@@ -216,8 +218,8 @@ def triangulate(
 
     run_in_threads(work, len(ranges), num_threads)
     lengths = np.bincount(tracks.points[inliers > 0], minlength=tracks.num_points)
-    short = lengths < settings.min_track_length
-    flat = ~short & (parallaxes < np.deg2rad(settings.min_parallax_deg))
+    short = lengths < _MIN_TRACK_LENGTH
+    flat = ~short & (parallaxes < np.deg2rad(min_parallax_deg))
     dropped = {"observations disagree": short, "parallax too small": flat}
     if origins_rig is not None:
         distances = np.linalg.norm(points[tracks.points] - centres, axis=1)
@@ -236,7 +238,6 @@ def place(
     keypoints: Keypoints,
     world_T_rigs: np.ndarray,
     max_error_sigmas: float,
-    settings: TriangulateSettings,
     num_threads: int = 1,
     scratch: Path | None = None,
 ) -> Landmarks:
@@ -247,7 +248,7 @@ def place(
     def placed(_: slice, __: slice, some: Tracks) -> Landmarks:
         rows = keypoints.rows(some)
         rays = keypoints.bearings_rig.take(rows, axis=0), keypoints.sigmas_rad[rows]
-        how = max_error_sigmas, settings, 1, keypoints.origins_of(rows)
+        how = max_error_sigmas, 1, keypoints.origins_of(rows)
         return triangulate(some, *rays, world_T_rigs, *how)
 
     def found() -> Iterator[tuple[np.ndarray, ...]]:

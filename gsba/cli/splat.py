@@ -69,9 +69,10 @@ def render(
 
     from gsba.camera.views import Optics
     from gsba.disk import write_image
-    from gsba.splat import read_ply, scene
+    from gsba.splat import read_ply
     from gsba.splat.backend import choose_backend
     from gsba.splat.pictures import render_panorama, render_views
+    from gsba.splat.train import near_of
     from gsba.store.finished import load_cameras, load_run
     from gsba.store.folder import claim
 
@@ -80,7 +81,7 @@ def render(
     if frame not in frames.names:
         raise GsbaError(f"{run} has no frame {frame!r}: its first is {frames.names[0]!r}")
     gaussians, renderer = read_ply(splat), choose_backend(settings.backend)
-    near = scene.near_of(reconstruction.world_T_rigs, settings)
+    near = near_of(reconstruction.world_T_rigs)
     optics = Optics.of(load_cameras(run, reconstruction, frames), reconstruction)
     f, folder = frames.names.index(frame), out or run / "renderings"
     pose, views = reconstruction.world_T_rigs[f], optics.views(settings.face_size)

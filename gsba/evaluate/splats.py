@@ -26,13 +26,12 @@ from gsba.splat.scene import (
     Split,
     load_faces,
     make_views,
-    near_of,
     refined_frames,
     split_frames,
     start_cloud,
 )
 from gsba.splat.scores import Distance, Score, mean_score, measure
-from gsba.splat.train import Images, Views, train
+from gsba.splat.train import Images, Views, near_of, train
 from gsba.store.store import digest, fingerprint
 from gsba.trajectory.association import matched_in_time
 from gsba.types import FrameSet, Reconstruction, Trajectory
@@ -42,6 +41,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+_HELD_OUT_EVERY = 8  # one panorama of so many is measured, as in the literature
 NO_LPIPS = "not computed: no weights"
 
 
@@ -120,7 +120,7 @@ def compare(
     usable = refined_frames(reconstruction)
     for poses in sources.values():
         usable = usable & np.isfinite(poses).all(axis=(1, 2))
-    split = split_frames(usable, settings.held_out_every)
+    split = split_frames(usable, _HELD_OUT_EVERY)
     own = reconstruction.world_T_rigs[usable]
     sources = {name: _beside(poses, usable, own) for name, poses in sources.items()}
     size = settings.face_size
@@ -142,7 +142,7 @@ def compare(
     for i, f in enumerate(split.held_out):
         rows = [_side_by_side(held_out.images[each * i : each * (i + 1)])]
         for name, poses in sources.items():
-            near = near_of(poses[split.training], settings)
+            near = near_of(poses[split.training])
             rig = held_out.poses(poses[split.held_out])[i]
             views = render_views(splats[name], rig, held_out.views, near, backend)
             rows.append(_side_by_side(views))
@@ -199,7 +199,7 @@ def train_and_measure(
         lpips: see `compare`.
     """
     poses, split = source.poses, source.split
-    near = near_of(poses[split.training], settings)
+    near = near_of(poses[split.training])
     curve = _read_curve(out / "curve.json", key)
     every = max(settings.iterations // 10, 1)  # measurements during a training
 

@@ -37,6 +37,7 @@ from gsba.localization.run_map import Query, RunMap, without_correction
 from gsba.localization.surroundings import Surroundings, open_rates
 from gsba.log import GsbaError
 from gsba.matching.guided_search import Gate, match_pair, searchable
+from gsba.trajectory.limits import TwoViewLimits
 from gsba.types import Features, FrameSet, Keypoints
 from gsba.types.records import with_rows
 
@@ -199,7 +200,7 @@ class Localizer:
         """A camera's frame at the place that explains it best of those that look like it."""
         settings, reason = self.map.settings, NO_PLACE
         places = self.index.nearest_panoramas(query.all.descriptors, 16)
-        max_error = np.deg2rad(settings.verify.max_error_deg)
+        max_error = np.deg2rad(TwoViewLimits.of(settings).max_error_deg)
         frames, poses = list[LocalizedFrame](), list[PlacedPose]()
         for strongest, chosen in ((True, places[:_NUM_PLACES]), (False, places)):
             candidates = self.candidates_of(query, chosen, strongest)

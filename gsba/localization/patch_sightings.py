@@ -92,7 +92,7 @@ class PatchAligner:
             field: of what stitching bends in the picture.
             lenses: of the picture; one centre by default.
         """
-        map_, settings = self._map, self._map.settings.patches
+        map_ = self._map
         points = map_.result.points_world[expected.points]
         pixel, threads = 2 * np.pi / self.width, Threads(1)
         world_T_hosts = map_.result.world_T_rigs[expected.hosts]
@@ -110,9 +110,7 @@ class PatchAligner:
         at = field.observed(seen / distances)
         across = world_T_rig[:3, :3].T @ axes / distances[:, :, None]
         sightings = expect(np.arange(len(points)), at, across)
-        patches: PatchSet = cut(
-            "patches", self.greys, expected.hosts, origins, spreads, settings, threads
-        )
+        patches: PatchSet = cut("patches", self.greys, expected.hosts, origins, spreads, threads)
         align_to(image, mask, patches, sightings)
         dropped = dict.fromkeys(REJECTIONS, 0)
         kept, bearings, covariances = accepted_rows(patches, sightings, pixel, dropped)

@@ -19,6 +19,7 @@ from gsba.loop_closure.join_evidence import LOCAL, Places, around
 from gsba.loop_closure.retrieval import global_descriptors
 from gsba.matching import recovery
 from gsba.matching.guided_search import MatchContext
+from gsba.matching.pairs import MAX_BASELINE_DEPTHS
 from gsba.memory import release_mapped_files
 from gsba.similarity import relative_similarity
 from gsba.types import Counts, Solution
@@ -204,7 +205,7 @@ def candidates(
             out; None = none are.
     """
     positions, depth = solved.world_T_rigs[:, :3, 3], solved.median_depth()
-    num, reach = len(positions), settings.pairs.max_baseline_depths * depth
+    num, reach = len(positions), MAX_BASELINE_DEPTHS * depth
     drifts = np.concatenate([[0.0], np.cumsum(_max_step_drifts(positions, unseen, settings))])
     unseen_before = np.concatenate([[0], np.cumsum(unseen)])
     least = _least_similarity(looks, solved, unseen_before, settings.pairs.window)

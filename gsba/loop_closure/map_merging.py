@@ -25,6 +25,7 @@ from gsba.matching import pairs, recovery
 from gsba.matching.guided_search import Gate, MatchContext
 from gsba.similarity import Sim3
 from gsba.trajectory.judgement import long_steps, over_missing_frames
+from gsba.trajectory.limits import TwoViewLimits
 from gsba.types import Counts, Matches, Solution
 
 logger = logging.getLogger(__name__)
@@ -384,7 +385,9 @@ class _Joining:
         first, last = sorted(ends)
         step = inverse(ends[first]) @ ends[last]
         loop = Loop(first, last, step, proposal.support)
-        even = abs(np.log(proposal.move.scale)) < np.log(settings.verify.max_length_ratio)
+        even = abs(np.log(proposal.move.scale)) < np.log(
+            TwoViewLimits.of(settings).max_length_ratio
+        )
         return even and loops.within_drift(loop, poses, self.depth, self.held, settings)
 
     def _register_each(self, rows: np.ndarray, inside: np.ndarray) -> bool:
@@ -419,7 +422,7 @@ class _Joining:
         if len(rows) == 0:
             return None
         settings, bearings = self.context.settings, self.context.keypoints.bearings_of(f)[rows]
-        found = resect(bearings, points, settings.verify, settings.seed)
+        found = resect(bearings, points, TwoViewLimits.of(settings), settings.seed)
         if found is None or found.reason or not self._in_reach(f, found.world_T_rig):
             return None
         return found
@@ -521,7 +524,7 @@ class _Joining:
             self.moves[f] = self.moves[nearest]
             self.poses[f] = self.moves[f].poses(self.poses[f])
         reasons = self._reasons(order := by_size(self.components))
-        reach = self.context.settings.pairs.max_baseline_depths * self.depth
+        reach = pairs.MAX_BASELINE_DEPTHS * self.depth
         offsets = laid_out(self.poses[:, :3, 3], order, reach)
         poses = self.poses.copy()
         poses[:, :3, 3] += offsets

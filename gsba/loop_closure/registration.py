@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsba.config import TwoViewLimits
 from gsba.geometry import inverse
 from gsba.matching.absolute_pose import panorama_pose
+from gsba.trajectory.limits import TwoViewLimits
 
 _MIN_SPREAD = 0.02  # least middle eigenvalue of the inliers' bearings: they must not form one
 # narrow cone

@@ -9,6 +9,7 @@ from gsba.geometry import inverse
 from gsba.matching import pairs, verification
 from gsba.matching.guided_search import MAX_PARALLAX_RAD, PRIOR_GATE, Gate, MatchContext
 from gsba.matching.verification import RelativePose
+from gsba.trajectory.limits import TwoViewLimits
 from gsba.types import Matches, Solution, VerifiedPairs
 
 # Gates in degrees are for exact directions: `pairs.gate_factor` widens those of a solved map.
@@ -44,7 +45,7 @@ def match_neighbours(context: MatchContext, start: Solution) -> VerifiedPairs:
         verification.agree_with_prior,
         prior_f0_T_f1s=f0_T_f1s,
         position_sigmas=np.zeros(len(chosen)),
-        settings=settings.verify,
+        settings=TwoViewLimits.of(settings),
     )
     estimates = _estimates(found, PRIOR_GATE, context)
     neighbours = agreeing(found, estimates)
@@ -173,7 +174,7 @@ def verified(
     """Matches that fit one relative pose of their pair, which agrees with the prior: poses (P, 4,
     4) of the trajectory, of position sigmas (P,), map units; None = no prior. Gates are of each
     pair; for rivals see `verification.estimate_relative_poses`."""
-    settings, seed = context.settings.verify, context.settings.seed
+    settings, seed = TwoViewLimits.of(context.settings), context.settings.seed
     chances = np.array([gate.chance(np.deg2rad(settings.max_error_deg)) for gate in gates])
     estimates = verification.estimate_relative_poses(
         found, context.keypoints, settings, seed, context.workers, chances, rivals
@@ -183,7 +184,7 @@ def verified(
 
 def _estimates(found: Matches, gate: Gate, context: MatchContext) -> list[RelativePose | None]:
     """The relative pose of each pair within a gate, without the trajectory as prior."""
-    verify, seed = context.settings.verify, context.settings.seed
+    verify, seed = TwoViewLimits.of(context.settings), context.settings.seed
     chances = np.full(len(found.pairs), gate.chance(np.deg2rad(verify.max_error_deg)))
     return verification.estimate_relative_poses(
         found, context.keypoints, verify, seed, context.workers, chances

@@ -6,6 +6,7 @@ import numpy as np
 
 from gsba.config import PairSettings
 
+MAX_BASELINE_DEPTHS = 2.0  # longest baseline in median scene depths: views still overlap
 _FRAME_GAPS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
 MAX_INTERVALS = 2.5  # largest interval between neighbours, in median intervals
 
@@ -35,7 +36,7 @@ def covisible(
         median_depth: median distance of scene points from the frames that see them.
     """
     num = len(rigs_in_world)
-    reach = settings.max_baseline_depths * median_depth
+    reach = MAX_BASELINE_DEPTHS * median_depth
     window = np.array(
         [(f, f + gap) for gap in _FRAME_GAPS if gap <= settings.window for f in range(num - gap)],
         np.int32,
@@ -52,7 +53,7 @@ def across(
 ) -> np.ndarray:
     """Pairs (P, 2) int32, f0 < f1, the closest in space first, of frames of different parts (F,)
     that should see the same things; see `covisible`."""
-    reach = settings.max_baseline_depths * median_depth
+    reach = MAX_BASELINE_DEPTHS * median_depth
     return _nearest(rigs_in_world, reach, settings, lambda f, near, _: parts[near] != parts[f])
 
 
@@ -71,7 +72,7 @@ def closing(rigs_in_world: np.ndarray, median_depth: float, settings: PairSettin
         following = met[met > f].min(initial=len(rigs_in_world)) + settings.window
         return apart & (near >= last) & (near <= following)
 
-    reach = settings.max_baseline_depths * median_depth
+    reach = MAX_BASELINE_DEPTHS * median_depth
     return _nearest(rigs_in_world, reach, settings, next_visits)
 
 

@@ -14,6 +14,7 @@ from gsba.trajectory import clock, joining, judgement, misread, turning
 from gsba.trajectory.clock import ClockEstimate
 from gsba.trajectory.joining import SegmentAlignment
 from gsba.trajectory.judgement import StepChecks
+from gsba.trajectory.limits import TwoViewLimits
 from gsba.trajectory.steps import (
     Steps,
     chained,
@@ -80,7 +81,7 @@ def recover(
     found = match_anywhere(context, lost)
     alone = _all_neighbours(context, guided, found, pieces)
     steps = image_steps(alone, keypoints)
-    misread.refuse_misfit(coarse, steps, settings.verify)
+    misread.refuse_misfit(coarse, steps, TwoViewLimits.of(settings))
     if len(lost) and not absent and _misleads(context, guided):
         found = _match_along(context, _walked_on(pieces, lost, found, timestamps), lost)
         alone = _all_neighbours(context, guided, found, pieces)
@@ -143,7 +144,9 @@ def _misleads(context: MatchContext, guided: VerifiedPairs) -> bool:
     found = match_anywhere(context, known.matches.pairs)
     true, seen = (image_steps(some, context.keypoints) for some in (known, found))
     off = step_errors(true.f_T_nexts, seen)[1]
-    agreeing = seen.verified & (off < np.deg2rad(context.settings.verify.max_direction_deg))
+    agreeing = seen.verified & (
+        off < np.deg2rad(TwoViewLimits.of(context.settings).max_direction_deg)
+    )
     missed = np.count_nonzero(true.verified & ~agreeing)
     # at most .08 in flats, .33 and more in most halls of bays
     return bool(missed > 0.15 * len(tried))
@@ -168,7 +171,7 @@ def unless_misguided(
     free = match_anywhere(context, known.matches.pairs)
     ours, theirs = (image_steps(some, context.keypoints) for some in (known, free))
     turned, off = step_errors(ours.f_T_nexts, theirs)
-    verify, num = context.settings.verify, len(context.keypoints.starts) - 1
+    verify, num = TwoViewLimits.of(context.settings), len(context.keypoints.starts) - 1
     other = turned > np.deg2rad(verify.max_rotation_deg)
     other |= ours.directed & theirs.directed & (off > np.deg2rad(verify.max_direction_deg))
     other &= matches_of_steps(free, num) > matches_of_steps(known, num)
@@ -243,7 +246,7 @@ def check_clock(
     if len(lost) > _MIN_LOST_SHARE * len(chosen):
         guided = VerifiedPairs.joined([guided, match_anywhere(context, lost)])
     steps = image_steps(guided, context.keypoints)
-    misread.refuse_misread(coarse, steps, settings.verify)
+    misread.refuse_misread(coarse, steps, TwoViewLimits.of(settings))
     estimate = clock.estimate_clock(timestamps, steps, trajectory, coarse.time_offset, 10.0)  # s
     rate = clock.other_rate(timestamps, steps, trajectory, estimate)
     if rate is not None:
@@ -320,7 +323,7 @@ def _check_steps(
 ) -> StepChecks:
     steps = image_steps(found, keypoints)
     logs, sigmas = _length_ratios(found, steps, keypoints, coarse.absent)
-    moved, verify = steps.directed.any(), settings.verify
+    moved, verify = steps.directed.any(), TwoViewLimits.of(settings)
     turn = None if moved else turning.prove(found, keypoints, verify)
     return judgement.check_steps(coarse, steps, logs, sigmas, verify, settings.priors, turn)
 

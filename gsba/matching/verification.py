@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from gsba.camera.rig import witnesses
-from gsba.config import TwoViewLimits
 from gsba.geometry import inverse, pose, rotation_angle
 from gsba.significance import least_agreeing, outweighs
 from gsba.store.shards import ITEMS, Workers, even_blocks
+from gsba.trajectory.limits import TwoViewLimits
 from gsba.trajectory.turning import CELLS_PER_SIDE, rotation_of_most
 from gsba.types import Counts, Keypoints, Matches, VerifiedPairs
 

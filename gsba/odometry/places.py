@@ -111,6 +111,5 @@ def make_places(
     same = maps[found.pairs[:, 0]] == maps[found.pairs[:, 1]]
     found, keypoints = found.taken(np.flatnonzero(same)), context.keypoints
     tracks = build([found], np.diff(keypoints.starts))
-    settings = context.settings.triangulate
-    landmarks = place(tracks, keypoints, world_T_rigs, 6.0, settings)
+    landmarks = place(tracks, keypoints, world_T_rigs, 6.0)
     return KeyframePlaces(keyframes, maps, features, replace(start, landmarks=landmarks), context)

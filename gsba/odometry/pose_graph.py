@@ -10,7 +10,6 @@ import numpy as np
 from factors import tangent_basis
 from gsba.bundle import triangulate
 from gsba.bundle.pose_variables import X
-from gsba.config import TriangulateSettings
 from gsba.geometry import adjoint, inverse, pose
 from gsba.odometry.resection import linearised
 from gsba.odometry.window import WindowObservations
@@ -182,8 +181,8 @@ def measure_steps(
     parents, covariances = np.full(num, -1), np.zeros((num, 7, 7))
     seen = WindowObservations.of(features)
     sigmas = np.full(len(seen.ids), _SIGMA)
-    rays, settings = seen.bearings_rig.astype(float), TriangulateSettings()
-    found = triangulate(seen.tracks(), rays, sigmas, world_T_keys, _GATE, settings)
+    rays = seen.bearings_rig.astype(float)
+    found = triangulate(seen.tracks(), rays, sigmas, world_T_keys, _GATE)
     first_rows = np.unique(found.tracks.points, return_index=True)[1]
     known = seen.features_of(found)
     most = int(seen.ids.max(initial=-1)) + 1

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from gsba.config import TwoViewLimits
 from gsba.geometry import pose
 from gsba.matching.verification import relative_pose
 from gsba.odometry.atlas import Atlas, AtlasLayout
+from gsba.trajectory.limits import TwoViewLimits
 
 _MIN_MATCHES = 20
 _VERIFY = TwoViewLimits(max_error_deg=0.4)

@@ -10,14 +10,16 @@ from factors import BearingTerm, LandmarkBlock, RobustLoss
 from gsba.bundle import optimize, pose_variables, triangulate
 from gsba.bundle.adjustment import poses_of, values_of
 from gsba.camera.rig import witnesses
-from gsba.config import SolverSettings, TriangulateSettings, TwoViewLimits
+from gsba.config import SolverSettings
 from gsba.geometry import angles_between, nearest_rotation
 from gsba.matching.verification import relative_pose
+from gsba.trajectory.limits import TwoViewLimits
 from gsba.types import Landmarks, Tracks
 
 _SOLVER = SolverSettings(
     max_iterations=8, relative_tolerance=1e-3, absolute_tolerance=1.0, lambda_initial=1e-6
 )
+_MIN_PARALLAX_DEG = 1.0  # least triangulation angle of a point: keyframes are far apart
 _HELD = 1e-6  # standard deviation of fixed poses: radians, and parts of their extent
 
 
@@ -72,10 +74,10 @@ def adjust_window(
         gate: residual from which observations are outliers, standard deviations.
     """
     tracks, sigmas = seen.tracks(), np.full(len(seen.ids), sigma)
-    settings = TriangulateSettings(min_parallax_deg=1.0)  # least triangulation angle of a point
 
     def place(poses: np.ndarray, limit: float):
-        return triangulate(tracks, seen.bearings_rig, sigmas, poses, limit, settings)
+        rays = seen.bearings_rig
+        return triangulate(tracks, rays, sigmas, poses, limit, min_parallax_deg=_MIN_PARALLAX_DEG)
 
     marks = place(world_T_rigs, 2 * gate)
     used = marks.tracks.keypoints

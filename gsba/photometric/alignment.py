@@ -12,7 +12,6 @@ from factors.sphere_field import SphereField
 from factors.threads import map_in_threads, rows_in_threads
 from gsba.camera.cameras import ONE_CAMERA, Cameras
 from gsba.camera.rig import CubeRig
-from gsba.config import PatchSettings
 from gsba.frames import panorama
 from gsba.memory import release_mapped_files, total_memory_bytes
 from gsba.photometric import frame_jobs
@@ -65,7 +64,6 @@ def align(
     observed: Observations,
     greys: panorama.Greys,
     rig: CubeRig,
-    settings: PatchSettings,
     workers: Workers,
     lenses: Cameras = ONE_CAMERA,
     name: str = "align",
@@ -93,7 +91,7 @@ def align(
             chosen = np.zeros(len(rows), bool)
             chosen[points] = True
             some = replace(solved, landmarks=landmarks.of(chosen))
-            given = observed, greys, settings, workers, lenses, name, dropped
+            given = observed, greys, workers, lenses, name, dropped
             found, at_hosts, normals_world[points] = _align_some(some, *given)
             num_found += len(found)
             yield found.of(points)
@@ -131,7 +129,6 @@ def _align_some(
     solved: Solution,
     observed: Observations,
     greys: panorama.Greys,
-    settings: PatchSettings,
     workers: Workers,
     lenses: Cameras,
     name: str,
@@ -162,7 +159,7 @@ def _align_some(
     at, across, rays = _projected_patches(*map_, points, seeing, lenses, threads)
     sightings = expect(points, field.observed(at), across)
     title, cut = f"{name}: templates", (planes.origins, planes.tilted)
-    patches = frame_jobs.cut(title, greys, hosts, *cut, settings, workers)
+    patches = frame_jobs.cut(title, greys, hosts, *cut, workers)
     frame_jobs.align(name, greys, seeing, patches, sightings, workers)
     enlarged = greys.enlargements()
     kept, found = _accepted(patches, sightings, seeing, pixel, dropped, threads)

@@ -17,7 +17,7 @@ from gsba.bundle.families import Family, MapSnapshot
 from gsba.bundle.optimizer import OptimizeResult, optimize
 from gsba.bundle.reconstruction import MIN_OBSERVATIONS
 from gsba.camera.cameras import ONE_CAMERA, Cameras
-from gsba.config import PhotometricSettings, RefineSettings
+from gsba.config import RefineSettings
 from gsba.frames.masks import load_weights
 from gsba.log import GsbaError, track
 from gsba.photometric import patches
@@ -38,6 +38,7 @@ class PatchGreys(Family):
         return (self.block,)
 
 
+_DEPTH_LEVELS = 2  # halvings of the panorama on which depths are estimated first
 _INFLATION = 2.0  # of sigmas: a patch's pixel errors are correlated
 _MAX_GROWTH = 1.05  # of the geometric cost, or the solve is undone
 _TOLERANCE = 1e-3  # relative decrease of the cost that ends the joint solve
@@ -52,7 +53,7 @@ class PhotometricResult:
     """Poses and points after the joint solve, and counts and residuals of the patches."""
 
     adjustment: Solution
-    counts: tuple[Counts, ...]  # of patches, then of observations, for each level
+    counts: tuple[Counts, ...]  # of patches, then of observations
     frame_weights: np.ndarray  # (F,) float64, weight of each frame's pixels, 1 = full
     residuals: np.ndarray  # (F,) float64, median of each frame's patch residuals, sigmas
 
@@ -93,43 +94,29 @@ def refine(
     context: AdjustmentContext,
     lenses: Cameras = ONE_CAMERA,
 ) -> PhotometricResult:
-    """Refine a solved map by the grey values of patches of panoramas, read twice a level, one at a
-    time, level after level."""
-    solved, counts, settings = start, [], context.settings
-    weights, residuals = np.ones(len(frames)), np.full(len(frames), np.nan)
-    for level in settings.photometric.levels:
-        pixels, trust, found = _patches(
-            frames, solved, level, settings, context.num_threads, lenses
-        )
-        counts += found
-        if pixels is None:
-            logger.warning(
-                "no patch is observed twice at level %d: nothing is refined there", level
-            )
-            continue
-        solved, weights, residuals = _solve(pixels, trust, keypoints, solved, context)
+    """Refine a solved map by the grey values of patches of panoramas, which are read twice, one at
+    a time."""
+    pixels, trust, counts = _patches(frames, start, context.num_threads, lenses)
+    if pixels is None:
+        logger.warning("no patch is observed twice: grey values refine nothing")
+        nothing = np.ones(len(frames)), np.full(len(frames), np.nan)
+        return PhotometricResult(start, tuple(counts), *nothing)
+    solved, weights, residuals = _solve(pixels, trust, keypoints, start, context)
     return PhotometricResult(solved, tuple(counts), weights, residuals)
 
 
 def _patches(
-    frames: FrameSet,
-    solved: Solution,
-    level: int,
-    settings: RefineSettings,
-    num_threads: int,
-    lenses: Cameras,
+    frames: FrameSet, solved: Solution, num_threads: int, lenses: Cameras
 ) -> tuple[PatchPixels | None, np.ndarray, list[Counts]]:
     """Pixels of the patches and observations that are accepted, if any; weights; the counts."""
-    chosen, world_T_rigs = settings.photometric, solved.world_T_rigs
+    world_T_rigs = solved.world_T_rigs
     bearings, width = [], 0
     for f in track(range(len(frames)), "choosing patches"):
-        greys, usable = patches.pyramid(frames, f, chosen, level)
-        grey = greys[-1]
-        usable = patches.coarser(usable, len(usable) // len(grey))
-        bearings.append(patches.candidates(grey, usable, chosen))
-        width, level = grey.shape[1], len(greys) - 1  # a small panorama has fewer
+        (grey,), usable = patches.pyramid(frames, f, 0)
+        bearings.append(patches.candidates(grey, usable))
+        width = grey.shape[1]
     landmarks = solved.landmarks
-    table, counts = patches.table_of(bearings, world_T_rigs, landmarks, width, chosen, lenses)
+    table, counts = patches.table_of(bearings, world_T_rigs, landmarks, width, lenses)
     num, dropped = len(table.targets), {}
     left = np.ones(num, bool)
     poor = poor_views(table, world_T_rigs, table.planes)
@@ -145,13 +132,13 @@ def _patches(
     for chunk in np.unique(rows):
         observations = (rows == chunk)[table.owners]
         part, own = table.select(observations)
-        block = _with_depths(frames, part, world_T_rigs, level, settings, num_threads, dropped)
+        block = _with_depths(frames, part, world_T_rigs, num_threads, dropped)
         table.planes[own] = block.planes
         trust[observations] = block.weights
     kept = trust > 0
     seen = Counts(num, int(np.count_nonzero(kept)), "patch observations", dropped)
     table, _ = table.select(kept)
-    gathered, _ = _gather(frames, table, world_T_rigs, level, level, chosen)
+    gathered, _ = _gather(frames, table, world_T_rigs, 0)
     return next(iter(gathered), None), trust[kept], [counts, seen]
 
 
@@ -159,16 +146,12 @@ def _with_depths(
     frames: FrameSet,
     table: PatchTable,
     world_T_rigs: np.ndarray,
-    level: int,
-    settings: RefineSettings,
     num_threads: int,
     dropped: dict[str, int],
 ) -> PhotometricBlock:
     """Patches with planes estimated at fixed poses, coarse to fine; `dropped` counts others."""
-    chosen, values = settings.photometric, adjustment.values_of(world_T_rigs)
-    gathered, visible = _gather(
-        frames, table, world_T_rigs, level, level + chosen.depth_levels, chosen
-    )
+    values = adjustment.values_of(world_T_rigs)
+    gathered, visible = _gather(frames, table, world_T_rigs, _DEPTH_LEVELS)
     planes = table.planes
     for pixels in reversed(gathered):
         block = make_block(pixels, visible, num_threads)
@@ -191,20 +174,15 @@ def _with_depths(
 
 
 def _gather(
-    frames: FrameSet,
-    table: PatchTable,
-    world_T_rigs: np.ndarray,
-    level: int,
-    top: int,
-    settings: PhotometricSettings,
+    frames: FrameSet, table: PatchTable, world_T_rigs: np.ndarray, top: int
 ) -> tuple[list[PatchPixels], np.ndarray]:
-    """Pixels of patches at levels `level` to `top`; weights (O,) from the masks of both frames."""
+    """Pixels of patches at levels 0 to `top`; weights (O,) from the masks of both frames."""
     gathered: list[PatchPixels] = []
     visible, trusted = np.ones(len(table.targets)), np.ones(len(table))
     needed = np.union1d(table.hosts, table.targets)
     for f in track(needed.tolist(), "sampling patches"):
-        greys, usable = patches.pyramid(frames, f, settings, top)
-        for k, grey in enumerate(greys[level:]):
+        greys, usable = patches.pyramid(frames, f, top)
+        for k, grey in enumerate(greys):
             if k == len(gathered):
                 scaled = replace(table, grid=2.0**k * table.grid)
                 gathered.append(PatchPixels(scaled, world_T_rigs, grey.shape[1]))
@@ -250,7 +228,7 @@ def _solve(
         weights = doubts
     accepted = landmarks.error(result.values) <= _MAX_GROWTH * before
     solved = replace(solved, variables=terms.own.variables(result.values)) if accepted else solved
-    adjusted = _adjusted(solved, keypoints, result, accepted, settings, num_threads)
+    adjusted = _adjusted(solved, keypoints, result, accepted, num_threads)
     return adjusted, weights, residuals
 
 
@@ -266,8 +244,7 @@ def joint(
     frame_weights (F,): of each frame's pixels, see `PhotometricResult`."""
     if "photometric" not in settings.factors:
         return []
-    level = settings.photometric.levels[-1]
-    pixels, trust, _ = _patches(frames, solved, level, settings, num_threads, lenses)
+    pixels, trust, _ = _patches(frames, solved, num_threads, lenses)
     if pixels is None:
         return []
     start = make_block(pixels, trust, num_threads)
@@ -349,7 +326,6 @@ def _adjusted(
     keypoints: Keypoints,
     result: OptimizeResult,
     accepted: bool,
-    settings: RefineSettings,
     num_threads: int,
 ) -> Solution:
     """The solution with the joint solve's poses, or the old one if not accepted.
@@ -361,7 +337,7 @@ def _adjusted(
     gate = solved.rounds[-1].gate_sigmas if solved.rounds else np.inf
     poses = adjustment.poses_of(result.values, len(solved.world_T_rigs))
     limit = gate * solved.noise
-    placed = triangulation.place(tracks, keypoints, poses, limit, settings.triangulate, num_threads)
+    placed = triangulation.place(tracks, keypoints, poses, limit, num_threads)
     after = replace(solved, world_T_rigs=poses, landmarks=placed)
     accepted &= after.carries(solved, least)
     support = len(placed.tracks)

@@ -10,7 +10,6 @@ from scipy.ndimage import correlate1d
 from factors.patch_windows import PatchTable, PatchViews, over_poles, patch_axes, pixel_grid
 from gsba.camera.cameras import Cameras
 from gsba.camera.sphere import around_seam, bearings_from_erp, erp_from_bearings
-from gsba.config import PhotometricSettings
 from gsba.frames.masks import load_usable
 from gsba.frames.pixels import load_erp
 from gsba.types import Counts, FrameSet, Landmarks
@@ -19,21 +18,23 @@ _MIN_GRADIENT = 2.0  # grey values per pixel, smallest in a patch
 _DEPTH_TOLERANCE = 0.03  # relative, of map points on one plane
 _SLOPE_SIGMA = 0.7  # of a patch's tilt, as a tangent
 _NUM_PLANE_POINTS = 8  # map points that determine a patch's plane
+_MAX_WIDTH = 4096  # pixels of a panorama; wider ones are halved
+_SIZE = 9  # pixels across a patch
+_SPACING_DEG = 7.0  # between patches of a frame
+_MAX_TARGETS = 8  # frames that a patch is aligned in, nearest in space
 _MIN_GREY, _MAX_GREY = 3, 252  # grey values beyond which a pixel counts as saturated
 
 
-def pyramid(
-    frames: FrameSet, frame: int, settings: PhotometricSettings, top: int
-) -> tuple[list[np.ndarray], np.ndarray]:
+def pyramid(frames: FrameSet, frame: int, top: int) -> tuple[list[np.ndarray], np.ndarray]:
     """Grey images (H, 2 H) float32 of a frame, level 0 to `top`, and where level 0 is not masked,
-    neither black nor saturated, (H, 2 H) bool. Level 0 is the largest within `settings.max_width`;
+    neither black nor saturated, (H, 2 H) bool. Level 0 is the largest within `_MAX_WIDTH`;
     each further one has half the width, down to 64 pixels, where the levels end."""
     grey = cv2.cvtColor(load_erp(frames, frame), cv2.COLOR_RGB2GRAY).astype(np.float32)
     usable = (grey > _MIN_GREY) & (grey < _MAX_GREY)
     mask = load_usable(frames, frame)
     if mask is not None:
         usable &= mask
-    while grey.shape[1] > settings.max_width and _divides(grey):
+    while grey.shape[1] > _MAX_WIDTH and _divides(grey):
         grey = halved(grey)
         usable = coarser(usable, 2)
     levels = [grey]
@@ -64,11 +65,11 @@ def _divides(image: np.ndarray) -> bool:
     return len(image) % 4 == 0 and len(image) >= 64
 
 
-def candidates(grey: np.ndarray, usable: np.ndarray, settings: PhotometricSettings) -> np.ndarray:
+def candidates(grey: np.ndarray, usable: np.ndarray) -> np.ndarray:
     """Bearings (K, 3) of the best-textured pixel of each cell of an even grid on the sphere."""
     height, width = grey.shape
     latitude = np.pi * (0.5 - (np.arange(height) + 0.5) / height)[:, None]
-    size = (settings.size, settings.size)
+    size = (_SIZE, _SIZE)
     across = cv2.Scharr(around_seam(grey, 1), cv2.CV_32F, 1, 0)[:, 1:-1] / (32 * np.cos(latitude))
     down = cv2.Scharr(around_seam(grey, 1), cv2.CV_32F, 0, 1)[:, 1:-1] / 32
     xx, xy, yy = (
@@ -78,13 +79,13 @@ def candidates(grey: np.ndarray, usable: np.ndarray, settings: PhotometricSettin
     spread = np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
     least, most = 0.5 * (xx + yy) - spread, 0.5 * (xx + yy) + spread
     score = least + 0.05 * most  # weight of an edge's strength, beside that of a corner
-    border = 2 * (settings.size // 2) + 3
+    border = 2 * (_SIZE // 2) + 3
     open_ = cv2.erode(usable.astype(np.uint8), np.ones((border, border), np.uint8)) > 0
     open_[:, : border // 2] = open_[:, -(border // 2) :] = False  # erosion does not wrap around the
     # seam
     # beyond 80 degrees, pixels of a panorama are mostly interpolated
     score = np.where(open_ & (np.abs(latitude) < np.deg2rad(80.0)), score, 0.0).ravel()
-    order, starts = _cells(width, height, settings.spacing_deg)
+    order, starts = _cells(width, height, _SPACING_DEG)
     ranked = score[order]
     best = np.maximum.reduceat(ranked, starts)
     cell = np.repeat(np.arange(len(starts)), np.diff(np.append(starts, len(order))))
@@ -155,7 +156,6 @@ def table_of(
     world_T_rigs: np.ndarray,
     landmarks: Landmarks,
     width: int,
-    settings: PhotometricSettings,
     lenses: Cameras,
 ) -> tuple[PatchTable, Counts]:
     """Patches of all frames, solved poses (F, 4, 4), with planes from the map, and the frames near
@@ -173,7 +173,7 @@ def table_of(
         laid, clear = lay_planes(found, shown)
         distances = np.linalg.norm(positions - positions[f], axis=1)
         distances[f] = np.inf
-        near = np.argsort(distances, kind="stable")[: min(settings.targets, len(positions) - 1)]
+        near = np.argsort(distances, kind="stable")[: min(_MAX_TARGETS, len(positions) - 1)]
         hosts.append(np.full(np.count_nonzero(clear), f))
         centres.append(found[clear])
         planes.append(laid[clear])
@@ -187,7 +187,7 @@ def table_of(
         plane[:, :1] * np.array(sigmas),
         np.arange(len(plane) + 1, dtype=np.int64) * targets[0].shape[1],
         np.concatenate(targets).ravel(),
-        pixel_grid(settings.size, 2 * np.pi / width),
+        pixel_grid(_SIZE, 2 * np.pi / width),
     )
     if lenses:
         table = replace(table, views=views_of(table, world_T_rigs, lenses))

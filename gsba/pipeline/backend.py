@@ -111,8 +111,7 @@ def separate_parts(state: State) -> np.ndarray | None:
     if not len(solution.landmarks.points_world):
         raise NoPositions(
             "no scene point is seen from enough frames, with enough parallax: frames must "
-            "follow one another closely (or lower triangulate.min_track_length or "
-            "triangulate.min_parallax_deg)"
+            "follow one another closely"
         )
     scarce = solution.observations() < MIN_OBSERVATIONS
     nothing = np.zeros_like(state.prior.trust.held_steps)
@@ -207,7 +206,7 @@ def without_fixes(state: State, latest: Sequence[str]) -> State:
 def refine_photometric(state: State) -> State:
     """Joint refinement by the observations so far and the grey values of patches."""
     run, map_, solution = state.run, state.map, state.solution
-    key = [run.solving_key(), run.settings.photometric]
+    key = [run.solving_key()]
 
     def compute() -> PhotometricResult:
         frames, keypoints = map_.straightened(run.frames), map_.keypoints(run.rig)
@@ -222,7 +221,7 @@ def refine_photometric(state: State) -> State:
 def refine_on_splat(state: State) -> State:
     """Joint refinement by the observations so far, patches, and a splat of the frames."""
     run, map_, solution, settings = state.run, state.map, state.solution, state.run.settings
-    key = [run.solving_key(), settings.splat, settings.photometric, settings.factors]
+    key = [run.solving_key(), settings.splat, settings.factors]
     turns = run.store.root / "stages/splat/turns.npz"
 
     def compute() -> SplatResult:

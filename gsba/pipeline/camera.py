@@ -15,7 +15,7 @@ from gsba.bundle import (
     self_calibration,
     stitching,
 )
-from gsba.bundle.adjustment import GATE_SCALE, AdjustmentContext
+from gsba.bundle.adjustment import ALIGNED_GATES, GATE_SCALE, AdjustmentContext
 from gsba.bundle.camera_adjustment import (
     CameraCovariances,
     CameraSystem,
@@ -279,7 +279,7 @@ def adjust_with_patches(
     Returns the solution, the keypoints with the noise that they turned out to have, and the
     camera."""
     run, map_ = state.run, state.map
-    gates = run.settings.rounds.aligned if gates is None else gates
+    gates = ALIGNED_GATES if gates is None else gates
 
     def compute() -> tuple[Solution, Keypoints, CameraEstimates]:
         shown = stitching.corrected(sighted.keypoints, map_.field, run.rig)
@@ -466,7 +466,7 @@ def _from_patches(
     def compute() -> T:
         there = replace(sighted, keypoints=map_.rays(sighted.keypoints, run.rig))
         there = adjustment.rescale_noise(there, map_.solution, run.settings)
-        gate = run.settings.rounds.aligned[0]
+        gate = ALIGNED_GATES[0]
         tracks = tracks_of_camera(there.tracks, map_.of_frame, number)
         placed = state.triangulated(tracks, there.keypoints, gate)
         solution = replace(map_.solution, noise=1.0, landmarks=placed)

@@ -32,6 +32,7 @@ from gsba.pipeline.state import MapMatches, ObservedFrames, State
 from gsba.store.store import PerFrame
 from gsba.trajectory import judgement, steps, turning
 from gsba.trajectory.clock import ClockEstimate
+from gsba.trajectory.limits import TwoViewLimits
 from gsba.types import CoarsePoses, Features, Keypoints, Matches, PoseSource, VerifiedPairs
 
 _DARK = 32  # of 255
@@ -260,7 +261,7 @@ def prove_turn(state: State) -> State | None:
             first = np.unique(np.linspace(0, num - 1 - gap, 60).astype(np.int32))
             chosen.append(np.column_stack([first, first + gap]))
         found = recovery.match_anywhere(context, np.concatenate(chosen).astype(np.int32))
-        verify = run.settings.verify
+        verify = TwoViewLimits.of(run.settings)
         most = turning.MAX_HAND_PARALLAX_RAD
         turn = turning.prove(found, context.keypoints, verify, most)
         seen, none = steps.image_steps(found, context.keypoints), np.zeros(0)
@@ -281,7 +282,7 @@ def drop_implausible_steps(state: State) -> State:
     """
     run, prior, poses = state.run, state.prior, state.solution.world_T_rigs
     coarse, times = prior.coarse, run.frames.timestamps
-    limits = run.settings.verify.max_length_ratio, run.settings.priors.translation
+    limits = TwoViewLimits.of(run.settings).max_length_ratio, run.settings.priors.translation
     wrong = judgement.implausible_steps(coarse, prior.trust, poses, times, *limits)
     if not wrong.any():
         return state
@@ -400,7 +401,7 @@ def _matches(run: Run, found: Mapping[str, Features], steps: np.ndarray) -> floa
         return found[run.frames.names[frame]]
 
     settings, poses = run.matching_settings, run.coarse.world_T_rigs
-    chance = PRIOR_GATE.chance(np.deg2rad(settings.verify.max_error_deg))
+    chance = PRIOR_GATE.chance(np.deg2rad(TwoViewLimits.of(settings).max_error_deg))
     frames = SearchableFrames(load, settings.pairs.strongest_per_face)
 
     def verified(step: int) -> int:
@@ -410,7 +411,7 @@ def _matches(run: Run, found: Mapping[str, Features], steps: np.ndarray) -> floa
             frames, (f0, f1), f0_T_f1, PRIOR_GATE, search_settings(settings)
         )
         rays = load(f0).bearings_rig[rows[:, 0]], load(f1).bearings_rig[rows[:, 1]]
-        pose = relative_pose(*rays, settings.verify, settings.seed, chance)
+        pose = relative_pose(*rays, TwoViewLimits.of(settings), settings.seed, chance)
         return 0 if pose is None else int(np.count_nonzero(pose.inliers))
 
     return float(np.median(list(map_in_threads(verified, len(steps), run.num_threads))))

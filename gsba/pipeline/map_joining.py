@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from gsba.bundle.adjustment import ALIGNED_GATES
 from gsba.bundle.families import Families
 from gsba.bundle.lens_centres import baseline_of
 from gsba.bundle.readout import CameraEstimate
@@ -254,7 +255,7 @@ def tie(state: State, parts: np.ndarray) -> State:
 def _aligned(state: State, base: Sighted, features: Keypoints, parts: np.ndarray) -> State | None:
     """Shared points aligned to patches, then all around them, and solved; None = no better."""
     run, rounds = state.run, state.run.settings.patches.rounds
-    gate = run.settings.rounds.aligned[0]
+    gate = ALIGNED_GATES[0]
     rays = state.map.rays(features, run.rig)
     placed = state.triangulated(backend.tracks_of(state), rays, gate)
     known = replace(state.solution, landmarks=placed, noise=1.0)

@@ -49,7 +49,7 @@ def _round(state: State, number: int) -> State:
             sighted, map_.observed, solution, map_.field, context, map_.lenses
         )
 
-    key = [run.solving_key(), settings.stitching, settings.rounds.aligned]
+    key = [run.solving_key(), settings.stitching]
     found = run.stage(f"stitching{number}", key, compute, Stitching)
     if not found.field:
         return replace(state, map=replace(map_, stitching=found))
@@ -85,7 +85,7 @@ def observe(state: State, start: Solution, observed: Observations, name: str) ->
     run, settings = state.run, state.run.settings.patches
 
     def compute() -> Sighted:
-        given = run.greys, run.rig, settings, run.store.workers, state.map.lenses, name
+        given = run.greys, run.rig, run.store.workers, state.map.lenses, name
         return alignment.align(start, observed, *given)
 
     return run.stage(name, settings.model_dump(exclude={"rounds"}), compute, Sighted)
@@ -102,7 +102,7 @@ def adjust_aligned(
 ) -> State | None:
     """Bundle adjustment of aligned observations; None where that explains less."""
     run, map_ = state.run, state.map
-    gates = run.settings.rounds.aligned if gates is None else gates
+    gates = adjustment.ALIGNED_GATES if gates is None else gates
 
     def compute() -> tuple[Solution, Keypoints]:
         there = replace(sighted, keypoints=map_.rays(sighted.keypoints, run.rig))

@@ -48,6 +48,8 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+_CHAIN_GATES = 60.0, 8.0  # gates in standard deviations, from the coarse trajectory
+
 
 __all__ = ["RunResult", "refine", "solve"]
 
@@ -333,7 +335,7 @@ def _map_all(state: State) -> State:
         return state
     # A chain of relative poses, then all points that neighbours share.
     state = backend.align_gauge(state, "gauge")
-    gates = rounds.chain
+    gates = _CHAIN_GATES
     chain = backend.adjust(state, "chain", gates)
     # Without steps less plausible than the trajectory's.
     state = frontend.drop_implausible_steps(chain)

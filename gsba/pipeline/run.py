@@ -21,6 +21,7 @@ from gsba.log import GsbaError
 from gsba.parts import DividedAdjustments
 from gsba.photometric import direct
 from gsba.store.store import Chain, RunStore, fingerprint
+from gsba.trajectory.limits import TwoViewLimits
 from gsba.types import CoarsePoses, Counts, FrameSet, Round, RunStart, Trajectory
 
 T = TypeVar("T")
@@ -213,7 +214,7 @@ class Run:
     @property
     def matching_settings(self) -> RefineSettings:
         """Settings whose gates are as wide as directions of raw pairs are uncertain."""
-        own, widest = self.settings.verify.max_error_deg, 1.0
+        own, widest = TwoViewLimits.of(self.settings).max_error_deg, 1.0
         for kind in self.frames.formats:
             if kind.fisheyes is not None:
                 focal = min(lens.focal for lens in kind.fisheyes)
@@ -232,5 +233,5 @@ class Run:
     def solving_key(self) -> list[object]:
         """Settings that solutions rest on."""
         settings = self.settings
-        relevant = [settings.triangulate, settings.rounds, settings.priors, settings.solver]
+        relevant = [settings.rounds, settings.priors, settings.solver]
         return [*relevant, self.families.digests()]

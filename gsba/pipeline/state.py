@@ -134,8 +134,7 @@ class State:
         """Points of tracks under the poses as they are; `gate` in the keypoints' standard
         deviations."""
         poses, run = self.solution.world_T_rigs, self.run
-        settings, threads = run.settings.triangulate, run.num_threads
-        return triangulation.place(tracks, keypoints, poses, gate, settings, threads)
+        return triangulation.place(tracks, keypoints, poses, gate, run.num_threads)
 
     def adjustment_context(self) -> AdjustmentContext:
         """Families and settings of an adjustment of this map."""

@@ -32,13 +32,19 @@ from gsba.config import SplatSettings
 from gsba.splat.alignment import Captured, SplatGreys, capture, splat_block
 from gsba.splat.backend import choose_backend
 from gsba.splat.gaussians import Gaussians, from_cloud
-from gsba.splat.scene import Faces, Split, load_faces, make_views, near_of, split_frames
+from gsba.splat.scene import Faces, Split, load_faces, make_views, split_frames
 from gsba.splat.scores import face_psnrs
-from gsba.splat.train import TrainingState, advance, begin
+from gsba.splat.train import TrainingState, advance, begin, near_of
 from gsba.store.records import load_checkpoint, save_record
 from gsba.types import Counts, FrameSet, Keypoints, Landmarks, Round, Solution
 
 _SH_DEGREE = 1  # of colours: low, so that views must agree on them
+_MAX_GAUSSIANS = 30_000  # enough for faces of these sizes
+_FIRST_STEPS = 400  # training steps before poses move at each size
+_STEPS = 150  # training steps after each move, before held-out panoramas compare the poses
+_MAX_MOVES = 3  # most updates of the poses at each size
+_MAX_GROWTH = 1.05  # of the geometric cost, or a move is undone
+_HELD_OUT_EVERY = 8  # one panorama of so many is held out of training
 
 logger = logging.getLogger(__name__)
 
@@ -103,11 +109,11 @@ def refine(
     """
     chosen = context.settings.splat
     usable = start.observations() >= MIN_OBSERVATIONS
-    if np.count_nonzero(usable) <= chosen.held_out_every:
+    if np.count_nonzero(usable) <= _HELD_OUT_EVERY:
         few = int(np.count_nonzero(usable))
         logger.warning("%d refined frames are too few for a splat to judge poses by", few)
         return SplatResult(start, (Counts(len(frames), 0, "frames", {"too few": few}),), ())
-    split = split_frames(usable, chosen.held_out_every)
+    split = split_frames(usable, _HELD_OUT_EVERY)
     dropped = {"held out": len(split.held_out), "unrefined": int(np.count_nonzero(~usable))}
     counts = Counts(len(frames), len(split.training), "frames", dropped)
     turns = _Turns(keypoints, start, context, split)
@@ -124,7 +130,7 @@ def refine(
         logger.info("resuming after %d moves of %s", len(progress.moves), checkpoint)
     while progress.level < len(chosen.sizes):
         turns.look(frames, progress.level, optics)
-        while progress.turns < chosen.moves:
+        while progress.turns < _MAX_MOVES:
             progress = turns.turn(progress)
             if checkpoint is not None:
                 save_record(checkpoint, progress, {"key": key})
@@ -154,13 +160,12 @@ class _Turns:
     def training(self, level: int) -> SplatSettings:
         """Settings of the training that all turns share, at a level's size."""
         chosen = self.settings.splat
-        each = chosen.first_steps + chosen.moves * chosen.steps
+        each = _FIRST_STEPS + _MAX_MOVES * _STEPS
         return SplatSettings(
             iterations=len(chosen.sizes) * each,
             face_size=chosen.sizes[level],
             sh_degree=_SH_DEGREE,
-            max_gaussians=chosen.max_gaussians,
-            held_out_every=chosen.held_out_every,
+            max_gaussians=_MAX_GAUSSIANS,
             seed=self.settings.seed,
         )
 
@@ -176,12 +181,11 @@ class _Turns:
         chosen, poses = self.settings.splat, before.world_T_rigs
         settings = self.training(before.level)
         if before.turns < 0:
-            trained = self._trained(before.state, poses, settings, chosen.first_steps)
+            trained = self._trained(before.state, poses, settings, _FIRST_STEPS)
             return replace(before, turns=0, state=trained)
         moved, result = self._moved(before.state.gaussians, poses)
-        fixed = settings.model_copy(update={"densify": False})
-        stayed = self._trained(before.state, poses, fixed, chosen.steps)
-        went = self._trained(before.state, moved, fixed, chosen.steps)
+        stayed = self._trained(before.state, poses, settings, _STEPS, densifying=False)
+        went = self._trained(before.state, moved, settings, _STEPS, densifying=False)
         looks = [
             self._held_out_psnrs(stayed, poses, settings),
             self._held_out_psnrs(went, moved, settings),
@@ -196,7 +200,7 @@ class _Turns:
         chance = unknowns * min(total, later) / redundancy if redundancy > 0 else np.inf
         evidence = together(score(gains), score(savings, chance))
         after = self._placed(moved)
-        accepted = evidence > chosen.min_sigmas and growth <= chosen.max_growth
+        accepted = evidence > chosen.min_sigmas and growth <= _MAX_GROWTH
         least = MIN_OBSERVATIONS
         accepted &= replace(self.solved, landmarks=after).carries(self.solved, least)
         turns = np.einsum("fji,fjk->fik", poses[:, :3, :3], moved[:, :3, :3])
@@ -243,7 +247,7 @@ class _Turns:
     ) -> tuple[np.ndarray, OptimizeResult]:
         """Poses after a few joint steps, and the solver's result."""
         settings = self.settings
-        near = near_of(world_T_rigs[self.split.training], SplatSettings())
+        near = near_of(world_T_rigs[self.split.training])
         greys = SplatGreys(splat_block(gaussians, self.captured, near, self.backend))
         terms = self.context.beside(greys).terms(replace(self.solved, world_T_rigs=world_T_rigs))
         values, landmarks = terms.values, self._block()
@@ -269,17 +273,22 @@ class _Turns:
         return costs
 
     def _trained(
-        self, state: TrainingState, world_T_rigs: np.ndarray, settings: SplatSettings, steps: int
+        self,
+        state: TrainingState,
+        world_T_rigs: np.ndarray,
+        settings: SplatSettings,
+        steps: int,
+        densifying: bool = True,
     ) -> TrainingState:
         views = make_views(self.faces, world_T_rigs[self.split.training])
-        return advance(state, views, settings, self.backend, steps)
+        return advance(state, views, settings, self.backend, steps, densifying)
 
     def _held_out_psnrs(
         self, state: TrainingState, world_T_rigs: np.ndarray, settings: SplatSettings
     ) -> np.ndarray:
         """PSNR (V,) of each held-out face in dB, after fitting gains."""
         views = make_views(self.held_out, world_T_rigs[self.split.held_out])
-        near = near_of(world_T_rigs[self.split.training], settings)
+        near = near_of(world_T_rigs[self.split.training])
         return face_psnrs(state.gaussians, views, settings, near, self.backend)
 
     def _placed(self, world_T_rigs: np.ndarray) -> Landmarks:
@@ -289,7 +298,6 @@ class _Turns:
             self.keypoints,
             world_T_rigs,
             self._gate() * self.solved.noise,
-            self.settings.triangulate,
             self.context.num_threads,
         )
 

@@ -8,7 +8,6 @@ import numpy as np
 from gsba.bundle import triangulation
 from gsba.camera.rig import CubeRig
 from gsba.camera.views import ONE_EYE, Optics, View, turned_rigs
-from gsba.config import SplatSettings, TriangulateSettings
 from gsba.frames import cubemap
 from gsba.frames.held_out import held_out_rows
 from gsba.frames.masks import load_mask
@@ -16,7 +15,7 @@ from gsba.frames.pixels import cut_views
 from gsba.log import GsbaError, track
 from gsba.splat.camera import view_camera
 from gsba.splat.gaussians import Gaussians, from_cloud
-from gsba.splat.train import Images, Views, extent_of
+from gsba.splat.train import Images, Views
 from gsba.types import FrameSet, Landmarks, PoseStatus, Reconstruction, Tracks
 
 _MAX_OVERSAMPLING = 8  # largest number of samples of a panorama along a pixel of a face
@@ -174,7 +173,6 @@ def place_points(
         np.ones(len(rows)),
         world_T_rigs,
         gate_rad,
-        TriangulateSettings(),
         origins_rig=None if origins is None else origins[rows],
     )
     kept = np.empty(len(placed.points_world), np.int64)
@@ -194,8 +192,3 @@ def start_cloud(
     """
     landmarks, known = place_points(reconstruction, world_T_rigs, frames, float(np.deg2rad(3.0)))
     return from_cloud(landmarks.points_world, reconstruction.point_colors[known], sh_degree)
-
-
-def near_of(world_T_rigs: np.ndarray, settings: SplatSettings) -> float:
-    """Least z, map units, of a Gaussian rendered by rigs (N, 4, 4)."""
-    return settings.near * extent_of(world_T_rigs[:, :3, 3])

@@ -25,6 +25,15 @@ from gsba.store.records import load_checkpoint, save_record
 
 logger = logging.getLogger(__name__)
 
+# Values of Kerbl et al., 2023; lengths are relative to the extent of the cameras.
+_SSIM_WEIGHT = 0.2  # of the loss; the rest is the absolute difference of colours
+_RATE_ROTATIONS, _RATE_OPACITIES = 1e-3, 0.05  # learning rates
+_RATE_COLORS = 2.5e-3  # learning rate of degree 0; a twentieth for higher degrees
+_DENSIFY_PULL = 2e-4  # gradient of a centre, focal lengths, from which a Gaussian becomes two
+_DENSIFY_SCALE = 0.01  # smaller Gaussians are cloned, larger ones split
+_MIN_OPACITY, _MAX_SCALE = 5e-3, 0.1  # fainter or larger Gaussians are pruned
+_NEAR = 0.01  # near plane: nothing that a camera shows is closer
+_CHECKPOINT_EVERY_S = 60.0  # so that an interruption costs a minute at most
 
 Images = Sequence[np.ndarray] | np.ndarray  # of individual sizes, or of one size
 
@@ -128,7 +137,7 @@ def train(
             _require_finite(state, checkpoint)
         if watch is not None:
             watch(state.step, state.gaussians)
-        due = time.monotonic() - saved > settings.checkpoint_every_s
+        due = time.monotonic() - saved > _CHECKPOINT_EVERY_S
         if checkpoint is not None and (last or (due and state.gaussians.is_finite())):
             save_record(checkpoint, state, {"key": key})
             saved = time.monotonic()
@@ -157,14 +166,22 @@ def begin(start: Gaussians, settings: SplatSettings) -> TrainingState:
 
 
 def advance(
-    state: TrainingState, views: Views, settings: SplatSettings, backend: Backend, steps: int
+    state: TrainingState,
+    views: Views,
+    settings: SplatSettings,
+    backend: Backend,
+    steps: int,
+    densifying: bool = True,
 ) -> TrainingState:
     """Train for some steps; the given state is not changed.
+
+    Args:
+        densifying: False = the number of Gaussians stays.
 
     Raises:
         GsbaError: all pixels are masked, or parameters are no longer finite.
     """
-    trainer, state = Trainer(views, settings, backend), state.copy()
+    trainer, state = Trainer(views, settings, backend, densifying), state.copy()
     end = state.step + steps
     for step in track(range(state.step, end), "training the splat", total=steps):
         if step >= state.step:
@@ -204,32 +221,40 @@ def extent_of(places: np.ndarray) -> float:
     return 1.1 * radius if radius > 0 else 1.0
 
 
+def near_of(world_T_rigs: np.ndarray) -> float:
+    """Least z, map units, of a Gaussian rendered by rigs (N, 4, 4)."""
+    return _NEAR * extent_of(world_T_rigs[:, :3, 3])
+
+
 class Trainer:
     """Inputs that are constant over all steps. GsbaError: all pixels are masked."""
 
-    def __init__(self, views: Views, settings: SplatSettings, backend: Backend) -> None:
+    def __init__(
+        self, views: Views, settings: SplatSettings, backend: Backend, densifying: bool = True
+    ) -> None:
         if views.num_pixels == 0:
             raise GsbaError("no pixel to train a splat on: all frames are masked or held out")
         self.most, self.limit = most_gaussians(views, settings, backend)
         self.views, self.settings, self.backend = views, settings, backend
+        self.densifying = densifying
         self.times = times_for(settings.iterations)
         self.extent = extent_of(np.array([camera.face_in_world for camera in views.cameras]))
-        self.near = settings.near * self.extent
+        self.near = _NEAR * self.extent
         self.capped = False
 
     def advance(self, state: TrainingState, end: int) -> TrainingState:
         """Take a stretch of steps, at most to `end`; arrays of the state may be changed in
         place."""
-        settings, times = self.settings, self.times
+        times = self.times
         gaussians, moments, pull = state.gaussians, state.moments, state.pull
         due = self.times
         rhythms = (self.backend.stretch, due.densify_every, due.reset_every)
         stops = [end, *(state.step // every * every + every for every in rhythms)]
         step = min([*stops, due.densify_until] if state.step < due.densify_until else stops)
         lessons = (self._lesson(number) for number in range(state.step + 1, step + 1))
-        wanted = settings.densify and step <= times.densify_until
+        wanted = self.densifying and step <= times.densify_until
         self.backend.descend(
-            gaussians, moments, pull if wanted else None, lessons, self.near, settings.ssim_weight
+            gaussians, moments, pull if wanted else None, lessons, self.near, _SSIM_WEIGHT
         )
         if wanted:
             if step > times.densify_from and step % times.densify_every == 0:
@@ -256,24 +281,23 @@ class Trainer:
             adam.Rates(
                 means=means * self.extent,
                 log_scales=fade * settings.rate_scales,
-                quaternions=fade * settings.rate_rotations,
-                opacity_logits=fade * settings.rate_opacities,
-                sh=fade * settings.rate_colors,
-                sh_rest=fade * settings.rate_colors / 20,
+                quaternions=fade * _RATE_ROTATIONS,
+                opacity_logits=fade * _RATE_OPACITIES,
+                sh=fade * _RATE_COLORS,
+                sh_rest=fade * _RATE_COLORS / 20,
             ),
             number,
         )
 
     def _densify(self, state: TrainingState, step: int) -> tuple[Gaussians, adam.Moments]:
-        settings = self.settings
         limits = DensityLimits(
-            pull=settings.densify_pull,
-            clone_scale=settings.densify_scale * self.extent,
-            max_scale=settings.max_scale * self.extent if step > self.times.reset_every else None,
-            min_opacity=settings.min_opacity,
+            pull=_DENSIFY_PULL,
+            clone_scale=_DENSIFY_SCALE * self.extent,
+            max_scale=_MAX_SCALE * self.extent if step > self.times.reset_every else None,
+            min_opacity=_MIN_OPACITY,
             max_gaussians=self.most,
         )
-        draw = np.random.default_rng([settings.seed, step, 1])
+        draw = np.random.default_rng([self.settings.seed, step, 1])
         gaussians, moments, capped = densify(
             state.gaussians, state.moments, state.pull, limits, draw
         )

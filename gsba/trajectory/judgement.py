@@ -6,8 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsba.config import PriorSettings, TwoViewLimits
+from gsba.config import PriorSettings
 from gsba.geometry import inverse, nearest_rotation, pose, rotation_angle
+from gsba.trajectory.limits import TwoViewLimits
 from gsba.trajectory.steps import Steps, chained, step_errors, step_lengths
 from gsba.trajectory.turning import Turn
 from gsba.types import CoarsePoses, PoseSource

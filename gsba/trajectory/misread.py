@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsba.config import TwoViewLimits
 from gsba.geometry import inverse, pose
 from gsba.log import GsbaError
 from gsba.trajectory.conventions import CAMERA_FROM_WORLD, OURS, WXYZ, axis_systems, w_first
+from gsba.trajectory.limits import TwoViewLimits
 from gsba.trajectory.steps import Steps, step_errors
 from gsba.types import CoarsePoses, PoseSource
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsba.camera.rig import witnesses
-from gsba.config import TwoViewLimits
 from gsba.geometry import nearest_rotation
 from gsba.significance import log10_false_alarms, outweighs
+from gsba.trajectory.limits import TwoViewLimits
 from gsba.types import Keypoints, VerifiedPairs
 
 CELLS_PER_SIDE = 16  # cells along a face's side: all matches within one, 6 degrees, count as one

@@ -136,8 +136,7 @@ def test_the_noise_does_not_depend_on_the_length_of_tracks(length: int) -> None:
     short = Tracks(
         tracks.points[kept], tracks.frames[kept], tracks.keypoints[kept], tracks.num_points
     )
-    limits = RefineSettings().triangulate
-    placed = triangulation.place(short, world.keypoints, true, 100.0, limits)
+    placed = triangulation.place(short, world.keypoints, true, 100.0)
     freedom = 2 * len(placed.tracks) - 3 * placed.tracks.num_points
     redundancy = 1 - 6 * len(true) / freedom  # poses that are known take nothing
     noise = observation_noise(placed, world.keypoints, true, 1) * np.sqrt(redundancy)

@@ -22,9 +22,12 @@ from gsba.similarity import pose_similarity
 from gsba.types import Counts, Keypoints, Landmarks, Sighted, Solution, Tracks
 
 SIGMA = 2e-4  # radians
-SETTINGS = RefineSettings.model_validate(
-    {"stitching": {"max_degree": 5}, "solver": {"num_threads": 1}}
-)
+SETTINGS = RefineSettings.model_validate({"solver": {"num_threads": 1}})
+
+
+@pytest.fixture(autouse=True)
+def _few_degrees(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stitching, "_MAX_DEGREE", 5)
 
 
 def _bent(world: World, field: SphereField) -> Keypoints:

@@ -7,11 +7,9 @@ from scipy.spatial.transform import Rotation
 from synthetic import bearings_of, loop_walk, unit, with_noise
 
 from gsba.bundle import triangulation
-from gsba.config import TriangulateSettings
 from gsba.types import Landmarks, Tracks
 
 SIGMA = 5e-4
-SETTINGS = TriangulateSettings(min_parallax_deg=0.5)
 
 
 def _all_see_all(num_frames: int, num_points: int) -> Tracks:
@@ -29,11 +27,10 @@ def _run(
     bearings: np.ndarray,
     world_T_rigs: np.ndarray,
     gate: float = 8.0,
-    settings: TriangulateSettings = SETTINGS,
 ) -> Landmarks:
     tracks = _all_see_all(len(world_T_rigs), len(bearings) // len(world_T_rigs))
     sigmas = np.full(len(bearings), SIGMA)
-    return triangulation.triangulate(tracks, bearings, sigmas, world_T_rigs, gate, settings)
+    return triangulation.triangulate(tracks, bearings, sigmas, world_T_rigs, gate)
 
 
 def _points(num: int, rng: np.random.Generator) -> np.ndarray:
@@ -98,7 +95,7 @@ def test_a_point_within_the_camera_is_none(distance: float, kept: int) -> None:
     lenses_T[:, :3, 3] += lens
     bearings = _observe(lens + np.array([[0, 0, distance]]), lenses_T)
     found = triangulation.triangulate(
-        _all_see_all(2, 1), bearings, np.full(2, SIGMA), world_T_rigs, 8.0, SETTINGS, 1,
+        _all_see_all(2, 1), bearings, np.full(2, SIGMA), world_T_rigs, 8.0, 1,
         np.stack([lens] * 2),
     )  # fmt: skip
     assert found.counts.kept == kept and found.counts.dropped["within the camera"] == 1 - kept
@@ -119,14 +116,15 @@ def test_points_behind_are_refused() -> None:
     assert _run(-_observe(points, world_T_rigs), world_T_rigs).counts.kept == 0
 
 
-def test_tracks_can_be_required_to_be_long() -> None:
+def test_tracks_can_be_required_to_be_long(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(4)
     world_T_rigs, points = loop_walk(3, 1.0), _points(30, rng)
     bearings = _observe(points, world_T_rigs)
     bearings[::3] *= -1  # frame 0 sees nothing right
-    longest = _run(bearings, world_T_rigs, settings=TriangulateSettings(min_track_length=2))
+    longest = _run(bearings, world_T_rigs)
     assert longest.counts.kept >= 25 and len(longest.tracks) == 2 * longest.counts.kept
-    none = _run(bearings, world_T_rigs, settings=TriangulateSettings(min_track_length=3))
+    monkeypatch.setattr(triangulation, "_MIN_TRACK_LENGTH", 3)
+    none = _run(bearings, world_T_rigs)
     assert none.counts.kept == 0
 
 
@@ -136,7 +134,7 @@ def test_points_are_the_least_squares_ones() -> None:
     bearings = with_noise(_observe(points, world_T_rigs), SIGMA, rng)
     tracks = _all_see_all(6, 25)
     sigmas = SIGMA * rng.uniform(0.5, 2, len(bearings))
-    found = triangulation.triangulate(tracks, bearings, sigmas, world_T_rigs, 50.0, SETTINGS)
+    found = triangulation.triangulate(tracks, bearings, sigmas, world_T_rigs, 50.0)
     assert len(found.tracks) == len(tracks)  # no gate at work: the plain problem
     rays = np.einsum("fij,pfj->pfi", world_T_rigs[:, :3, :3], bearings.reshape(25, 6, 3))
     for j, (point, ray) in enumerate(zip(found.points_world, rays, strict=True)):
@@ -160,6 +158,5 @@ def test_no_tracks_make_no_points() -> None:
         np.zeros(0),
         loop_walk(3),
         8.0,
-        SETTINGS,
     )
     assert found.points_world.shape == (0, 3) and found.counts.received == 0

@@ -87,9 +87,7 @@ def test_what_lenses_blend_leaves_no_point_without_observations(band: float, x: 
     lenses = Lenses(band_rad=band, axes=np.tile(turn, (NUM_FRAMES, 1, 1)))
     kept = Cameras((lenses,)).clear(_world().tracks, _world().keypoints)
     np.testing.assert_array_equal(np.unique(kept.points), np.arange(kept.num_points))
-    found = triangulation.place(
-        kept, _world().keypoints, _world().world_T_rigs, 6.0, SETTINGS.triangulate
-    )
+    found = triangulation.place(kept, _world().keypoints, _world().world_T_rigs, 6.0)
     assert found.counts.received == kept.num_points
 
 
@@ -104,7 +102,7 @@ def test_hosts_are_those_of_the_seen(case: Case) -> None:
 @each
 @given(_cases())
 def test_triangulation_drops_the_unseen(case: Case) -> None:
-    given = _world().keypoints, _world().world_T_rigs, 6.0, SETTINGS.triangulate
+    given = _world().keypoints, _world().world_T_rigs, 6.0
     found, expected = (triangulation.place(t, *given) for t in (case.holed, case.compact))
     np.testing.assert_array_equal(found.points_world, expected.points_world)
     _assert_same(found.tracks, expected.tracks)

@@ -80,7 +80,8 @@ def test_wrong_settings_name_the_key() -> None:
     fails(run_gsba("show-config", "--set", "seed=" + "[" * 3000), "the value is not valid TOML")
     fails(run_gsba("show-config", "--set", 'placement.gps="a\\u0000"'), "placement.gps = ")
     fails(run_gsba("show-config", "--set", "video.width=99999"), "use an even integer >= 64")
-    fails(run_gsba("show-config", "--set", "patches.patch_size=8"), "not allowed: must be odd")
+    wrong = "camera.lens_yaws_deg=[0, 10]"
+    fails(run_gsba("show-config", "--set", wrong), "settings camera: lens_yaws_deg: give")
     fails(run_gsba("show-config", "--config", "nowhere.toml"), "cannot read settings nowhere.toml")
     fails(run_gsba("refine", "a", "b", "--out", "c", "--set", "x=1"), "unknown setting x")
     assert not Path("c").exists()

@@ -19,7 +19,7 @@ from gsba.store.shards import Threads
 from gsba.types import Counts, Keypoints, Landmarks, Solution, Tracks
 
 NUM_FRAMES, NUM_POINTS = 40, 1500
-SETTINGS = RefineSettings(pairs=PairSettings(window=8, max_baseline_depths=0.8))
+SETTINGS = RefineSettings(pairs=PairSettings(window=8))
 TRUTH = loop_walk(NUM_FRAMES)
 SEEN = np.zeros(NUM_FRAMES - 1, bool)
 

@@ -5,9 +5,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 from synthetic import bearings_of, unit, with_noise
 
-from gsba.config import TwoViewLimits
 from gsba.geometry import inverse, pose, rotation_angle
 from gsba.loop_closure.registration import resect
+from gsba.trajectory.limits import TwoViewLimits
 
 SETTINGS = TwoViewLimits()
 POSE = pose(Rotation.from_rotvec([0.3, 2.5, -0.4]).as_matrix(), np.array([0.5, -0.2, 0.3]))

@@ -3,12 +3,18 @@
 from functools import lru_cache
 
 import numpy as np
+import pytest
 from synthetic import loop_walk
 
 from gsba.config import PairSettings
 from gsba.matching import pairs
 
-SETTINGS = PairSettings(window=8, max_baseline_depths=1.0, max_loop_neighbours=3)
+SETTINGS = PairSettings(window=8, max_loop_neighbours=3)
+
+
+@pytest.fixture(autouse=True)
+def _short_reach(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pairs, "MAX_BASELINE_DEPTHS", 1.0)
 
 
 def _as_set(found: np.ndarray) -> set[tuple[int, int]]:

@@ -5,10 +5,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 from synthetic import bearings_of, unit, with_noise
 
-from gsba.config import TwoViewLimits
 from gsba.geometry import pose, rotation_angle
 from gsba.matching import verification
 from gsba.store.shards import Threads
+from gsba.trajectory.limits import TwoViewLimits
 from gsba.types import Keypoints, Matches, VerifiedPairs
 
 NUM = 200

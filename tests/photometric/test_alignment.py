@@ -14,7 +14,7 @@ from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.families import Bearings, Families
 from gsba.bundle.trajectory_prior import TrajectoryPrior
 from gsba.camera.rig import CubeRig
-from gsba.config import PatchSettings, RefineSettings
+from gsba.config import RefineSettings
 from gsba.frames.panorama import Greys
 from gsba.geometry import inverse, pose
 from gsba.photometric import alignment, frame_jobs, packing
@@ -34,7 +34,11 @@ from gsba.types import (
 NUM, WIDTH = 6, 512
 RIG = CubeRig(128, np.pi / 2)
 PIXEL = 2 * np.pi / WIDTH
-SETTINGS = PatchSettings(patch_size=11)
+
+
+@pytest.fixture(autouse=True)
+def _small_patches(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(frame_jobs, "_PATCH_SIZE", 11)
 
 
 def _bearings(width: int) -> np.ndarray:
@@ -116,7 +120,6 @@ def _start(
 
 def _run(
     walk: tuple[FrameSet, np.ndarray],
-    settings: PatchSettings = SETTINGS,
     sigma_px: float = 0.3,
     aligned: np.ndarray | None = None,
     folder: Path | None = None,
@@ -125,7 +128,7 @@ def _run(
     landmarks, keypoints = _start(world_T_rigs, sigma_px)
     solved = _solved(landmarks, world_T_rigs)
     observed = Observations(keypoints, aligned, folder=folder)
-    return alignment.align(solved, observed, Greys(frames, 4096), RIG, settings, Threads(2))
+    return alignment.align(solved, observed, Greys(frames, 4096), RIG, Threads(2))
 
 
 def _solved(landmarks: Landmarks, world_T_rigs: np.ndarray) -> Solution:
@@ -215,7 +218,7 @@ def test_tracks_and_keypoints_belong_together(walk) -> None:
 def test_poses_become_better_than_the_detector_leaves_them(walk) -> None:
     frames, world_T_rigs = walk
     landmarks, keypoints = _start(world_T_rigs)
-    settings = RefineSettings(patches=SETTINGS)
+    settings = RefineSettings()
     priors = TrajectoryPrior(world_T_rigs, settings.priors)
 
     def rotation_errors(solved: Solution) -> np.ndarray:
@@ -230,7 +233,7 @@ def test_poses_become_better_than_the_detector_leaves_them(walk) -> None:
     problem, gates = AdjustmentContext(Families((Bearings(), priors)), RIG, settings, 2), (6.0, 3.0)
     before = adjustment.adjust(landmarks.tracks, keypoints, start, problem, gates)
     greys, workers = Greys(frames, 4096), Threads(2)
-    sighted = alignment.align(before, Observations(keypoints), greys, RIG, SETTINGS, workers)
+    sighted = alignment.align(before, Observations(keypoints), greys, RIG, workers)
     after, known = adjustment.adjust_sighted(sighted, before, problem, gates)
     assert np.median(rotation_errors(after)) < 0.5 * np.median(rotation_errors(before))
     assert 0.5 <= after.noise < 2 and all(step.accepted for step in after.rounds)
@@ -276,7 +279,7 @@ def test_points_at_a_centre_and_behind_walls_do_no_harm(walk) -> None:
     moved = replace(landmarks, points_world=points)
     solved, greys = _solved(moved, world_T_rigs), Greys(frames, 4096)
     observed, workers = Observations(keypoints), Threads(2)
-    sighted = alignment.align(solved, observed, greys, RIG, SETTINGS, workers)
+    sighted = alignment.align(solved, observed, greys, RIG, workers)
     assert np.isfinite(sighted.keypoints.bearings_rig).all()
     infos = sighted.keypoints.sqrt_infos
     assert infos is not None and np.isfinite(infos).all()
@@ -286,8 +289,7 @@ def test_confirmed_points_are_looked_for_elsewhere(walk, monkeypatch: pytest.Mon
     _, keypoints = _start(walk[1])
     monkeypatch.setattr(alignment, "_MIN_TRACK_LENGTH", 4)  # longer than any here
     short, confirmed = (
-        _run(walk, SETTINGS, aligned=aligned)
-        for aligned in (None, np.ones(len(keypoints.faces), bool))
+        _run(walk, aligned=aligned) for aligned in (None, np.ones(len(keypoints.faces), bool))
     )
     assert short.counts.received == 2 * 400  # all observations but the references
     assert confirmed.counts.received > 3 * 400
@@ -311,7 +313,7 @@ def test_no_points_are_no_observations(walk) -> None:
     _, keypoints = _start(world_T_rigs)
     solved, greys = _solved(none, world_T_rigs), Greys(frames, 4096)
     observed, workers = Observations(keypoints), Threads(2)
-    sighted = alignment.align(solved, observed, greys, RIG, SETTINGS, workers)
+    sighted = alignment.align(solved, observed, greys, RIG, workers)
     assert len(sighted.tracks) == 0 and sighted.counts.received == 0
 
 
@@ -380,7 +382,7 @@ def test_patches_come_to_lie_on_their_surfaces(tmp_path: Path) -> None:
     for _ in range(2):
         solved, observed = _solved(landmarks, world_T_rigs), Observations(keypoints, None, normals)
         greys, workers = Greys(frames, 4096), Threads(2)
-        found = alignment.align(solved, observed, greys, RIG, SETTINGS, workers)
+        found = alignment.align(solved, observed, greys, RIG, workers)
         own = found.keypoints.rows(found.tracks)
         where, there = found.keypoints.bearings_rig[own], found.tracks.frames
         shown = [_walls(world_T_rigs[f, :3, 3], b) for f, b in zip(there, where, strict=True)]

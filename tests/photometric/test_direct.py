@@ -17,7 +17,7 @@ from gsba.bundle.families import Bearings, Families
 from gsba.bundle.trajectory_prior import TrajectoryPrior
 from gsba.camera.lens import Lenses
 from gsba.camera.sphere import erp_from_bearings
-from gsba.config import PhotometricSettings, RefineSettings
+from gsba.config import RefineSettings
 from gsba.config_file import load_config
 from gsba.disk import write_image
 from gsba.frames.masks import levels_of
@@ -32,9 +32,9 @@ ALL = np.ones(GREY.shape, bool)
 JOINT = RefineSettings.model_validate({**BARE.model_dump(), "factors": ("bearing", "photometric")})
 
 
-def test_patches_are_spread_over_the_sphere() -> None:
-    settings = PhotometricSettings(spacing_deg=10)
-    bearings = patches.candidates(GREY, ALL, settings)
+def test_patches_are_spread_over_the_sphere(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(patches, "_SPACING_DEG", 10)
+    bearings = patches.candidates(GREY, ALL)
     assert np.allclose(np.linalg.norm(bearings, axis=1), 1)
     # 4 pi / (10 deg)^2 cells, those beyond 80 degrees of latitude left empty
     assert 370 < len(bearings) < 430
@@ -43,15 +43,14 @@ def test_patches_are_spread_over_the_sphere() -> None:
 
 
 def test_masked_flat_and_saturated_places_have_no_patch() -> None:
-    settings = PhotometricSettings()
     usable = ALL.copy()
     usable[:, :200] = False
-    bearings = patches.candidates(GREY, usable, settings)
+    bearings = patches.candidates(GREY, usable)
     u = erp_from_bearings(bearings, WIDTH, WIDTH // 2)[:, 0]
-    reach = settings.size // 2
+    reach = patches._SIZE // 2
     assert len(bearings) and (u > 200 + reach).all() and (u < WIDTH - reach).all()
-    assert len(patches.candidates(np.full_like(GREY, 90), ALL, settings)) == 0
-    assert len(patches.candidates(GREY, ~ALL, settings)) == 0
+    assert len(patches.candidates(np.full_like(GREY, 90), ALL)) == 0
+    assert len(patches.candidates(GREY, ~ALL)) == 0
 
 
 def test_coarser_masks_want_all_pixels() -> None:
@@ -151,29 +150,30 @@ def _start(case: Case, settings: RefineSettings):
 
 def test_nothing_to_see_changes_nothing(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(patches, "_MIN_GRADIENT", 1e3)
-    settings = JOINT.model_copy(update={"photometric": PhotometricSettings(depth_levels=0)})
-    frames, keypoints, solved, priors, rig = _start(case, settings)
+    monkeypatch.setattr(direct, "_DEPTH_LEVELS", 0)
+    frames, keypoints, solved, priors, rig = _start(case, JOINT)
     result = direct.refine(
         frames,
         keypoints,
         solved,
-        AdjustmentContext(Families((Bearings(), priors)), rig, settings, 1),
+        AdjustmentContext(Families((Bearings(), priors)), rig, JOINT, 1),
     )
     assert np.array_equal(result.adjustment.world_T_rigs, solved.world_T_rigs)
     assert all(counts.kept == 0 for counts in result.counts)
 
 
-def test_observations_weigh_what_both_masks_say(case: Case, tmp_path: Path) -> None:
-    settings = JOINT.model_copy(
-        update={"photometric": PhotometricSettings(depth_levels=0, spacing_deg=10)}
-    )
-    frames, _, solved, *_ = _start(case, settings)
+def test_observations_weigh_what_both_masks_say(
+    case: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(direct, "_DEPTH_LEVELS", 0)
+    monkeypatch.setattr(patches, "_SPACING_DEG", 10)
+    frames, _, solved, *_ = _start(case, JOINT)
     half = np.ones((frames.format.height, frames.format.width))
     half[:, : frames.format.width // 2] = 0.5
     write_image(tmp_path / "half.png", levels_of(half))
     masked = replace(frames, mask_paths=(tmp_path / "half.png",) * len(frames))
-    plain, ones, _ = direct._patches(frames, solved, 0, settings, 1, Lenses())
-    pixels, trust, _ = direct._patches(masked, solved, 0, settings, 1, Lenses())
+    plain, ones, _ = direct._patches(frames, solved, 1, Lenses())
+    pixels, trust, _ = direct._patches(masked, solved, 1, Lenses())
     assert plain is not None and pixels is not None and (ones == 1).all()
     table = pixels.table
     points = table.bearings_rig / table.planes[:, :1]  # planes that face their hosts
@@ -194,15 +194,14 @@ def test_observations_weigh_what_both_masks_say(case: Case, tmp_path: Path) -> N
 
 def test_a_solve_against_the_map_is_undone(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(direct, "_MAX_GROWTH", 1e-3)
-    settings = JOINT.model_copy(
-        update={"photometric": PhotometricSettings(depth_levels=0, spacing_deg=20)}
-    )
-    frames, keypoints, solved, priors, rig = _start(case, settings)
+    monkeypatch.setattr(direct, "_DEPTH_LEVELS", 0)
+    monkeypatch.setattr(patches, "_SPACING_DEG", 20)
+    frames, keypoints, solved, priors, rig = _start(case, JOINT)
     result = direct.refine(
         frames,
         keypoints,
         solved,
-        AdjustmentContext(Families((Bearings(), priors)), rig, settings, 1),
+        AdjustmentContext(Families((Bearings(), priors)), rig, JOINT, 1),
     )
     assert not result.adjustment.rounds[-1].accepted
     assert np.array_equal(result.adjustment.world_T_rigs, solved.world_T_rigs)
@@ -223,16 +222,16 @@ def test_other_frames_are_refused_before_any_work(case: Case, change: dict, mess
         Run.begin(None, other, None, JOINT)  # type: ignore[arg-type]
 
 
-def test_a_small_panorama_has_fewer_levels(case: Case) -> None:
-    settings = JOINT.model_copy(
-        update={"photometric": PhotometricSettings(levels=(9,), spacing_deg=20, size=5)}
-    )
-    frames, keypoints, solved, priors, rig = _start(case, settings)
+def test_a_small_panorama_has_fewer_levels(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(direct, "_DEPTH_LEVELS", 9)
+    monkeypatch.setattr(patches, "_SPACING_DEG", 20)
+    monkeypatch.setattr(patches, "_SIZE", 5)
+    frames, keypoints, solved, priors, rig = _start(case, JOINT)
     result = direct.refine(
         frames,
         keypoints,
         solved,
-        AdjustmentContext(Families((Bearings(), priors)), rig, settings, 1),
+        AdjustmentContext(Families((Bearings(), priors)), rig, JOINT, 1),
     )
     assert np.isfinite(result.adjustment.world_T_rigs).all() and len(result.counts) == 2
 
@@ -242,9 +241,10 @@ def test_the_family_needs_another() -> None:
         load_config(None, ['factors=["photometric"]'])
 
 
-def test_wide_panoramas_are_halved(case: Case) -> None:
+def test_wide_panoramas_are_halved(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(patches, "_MAX_WIDTH", 256)
     frames, *_ = _start(case, JOINT)
-    levels, usable = patches.pyramid(frames, 0, PhotometricSettings(max_width=256), 2)
+    levels, usable = patches.pyramid(frames, 0, 2)
     assert [level.shape for level in levels] == [(128, 256), (64, 128), (32, 64)]
     assert usable.shape == (128, 256)
 

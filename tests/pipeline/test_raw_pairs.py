@@ -10,6 +10,7 @@ import pycolmap
 import pytest
 from command import run_gsba
 from one_gallery import gallery
+from splat_moves import shorten
 from tiny_run import SETTINGS
 
 from gsba.camera.calibration import calibration_json, read_calibration
@@ -86,7 +87,9 @@ def _refined(walk: Path, out: Path, calibration: str) -> tuple[dict, TrajectoryE
     return report, evaluate(read_trajectory(out / "trajectory.tum"), truth)
 
 
-def test_raw_pairs_of_known_lenses_become_faces_of_either(walk: Path, tmp_path: Path) -> None:
+def test_raw_pairs_of_known_lenses_become_faces_of_either(
+    walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     report, errors = _refined(walk, tmp_path / "run", "true.json")
     camera = report["camera"]
     assert camera["taken"] and not camera["lenses"]["taken"] and camera["lenses"]["reason"]
@@ -98,6 +101,9 @@ def test_raw_pairs_of_known_lenses_become_faces_of_either(walk: Path, tmp_path: 
     np.testing.assert_allclose(kept[0].centre, [0, 0, BASELINE / 2], atol=0.001)
     _check_fisheyes(tmp_path / "run")
     _check_panoramas(walk, tmp_path / "run")
+    monkeypatch.setattr("gsba.photometric.direct._DEPTH_LEVELS", 0)
+    monkeypatch.setattr("gsba.photometric.patches._SPACING_DEG", 20.0)
+    shorten(monkeypatch, first_steps=30, steps=10, held_out_every=8)
     _check_families(walk, tmp_path / "run")
 
 
@@ -144,8 +150,7 @@ def _check_families(walk: Path, run: Path) -> None:
     """Pixels of the lenses have their say, each from its own; a splat is trained on them."""
     more = {
         "factors": ("bearing", "photometric", "splat"),
-        "photometric": {"spacing_deg": 20.0, "depth_levels": 0},
-        "splat": {"sizes": (24,), "first_steps": 30, "steps": 10, "moves": 1, "backend": "cpu"},
+        "splat": {"sizes": (24,), "backend": "cpu"},
     }
     settings = RefineSettings.model_validate(RAW_SETTINGS.model_dump() | more)
     refine(walk / "frames", walk / "slam.tum", run, settings, calibration=walk / "true.json")

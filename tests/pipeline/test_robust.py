@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from tiny_run import BARE, SETTINGS, Case
 
 from gsba import refine
+from gsba.bundle import triangulation
 from gsba.evaluate.trajectory import evaluate
 from gsba.geometry import pose
 from gsba.log import GsbaError
@@ -76,9 +77,10 @@ def test_the_truth_needs_no_repair(case: Case, tmp_path: Path) -> None:
     assert evaluate(read_trajectory(tmp_path / "run/trajectory.tum"), case.truth).ate.rmse < 0.02
 
 
-def test_a_map_without_points_is_refused_at_once(case: Case, tmp_path: Path) -> None:
+def test_a_map_without_points_is_refused_at_once(
+    case: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Nothing can be registered against it, and trying takes minutes."""
-    long = SETTINGS.triangulate.model_copy(update={"min_track_length": 200})
-    settings = SETTINGS.model_copy(update={"triangulate": long})
-    with pytest.raises(GsbaError, match=r"no scene point .* triangulate\.min_track_length"):
-        refine(case.frames, case.slam, tmp_path / "run", settings)
+    monkeypatch.setattr(triangulation, "_MIN_TRACK_LENGTH", 200)
+    with pytest.raises(GsbaError, match="no scene point is seen from enough frames"):
+        refine(case.frames, case.slam, tmp_path / "run", SETTINGS)

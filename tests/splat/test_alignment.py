@@ -13,8 +13,8 @@ from gsba.geometry import pose
 from gsba.splat.alignment import render_view
 from gsba.splat.backend import CpuBackend
 from gsba.splat.gaussians import Gaussians, from_cloud
-from gsba.splat.scene import load_faces, make_views, near_of, start_cloud
-from gsba.splat.train import train
+from gsba.splat.scene import load_faces, make_views, start_cloud
+from gsba.splat.train import near_of, train
 
 BACKEND = CpuBackend(2)
 
@@ -22,14 +22,14 @@ BACKEND = CpuBackend(2)
 @pytest.fixture(scope="module")
 def splat(case: Case) -> Gaussians:
     """A splat of all frames, trained just long enough to show the larger things."""
-    settings = SplatSettings(
-        iterations=300, face_size=48, sh_degree=0, rate_scales=0.02, rate_colors=0.01
-    )
+    settings = SplatSettings(iterations=300, face_size=48, sh_degree=0, rate_scales=0.02)
     poses = case.result.reconstruction.world_T_rigs
     every = np.arange(len(poses))
     views = make_views(load_faces(case.result.frames, every, 48), poses)
     start = start_cloud(case.result.reconstruction, poses, every, 0)
-    return train(start, views, settings, BACKEND)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("gsba.splat.train._RATE_COLORS", 0.01)
+        return train(start, views, settings, BACKEND)
 
 
 def distances(found: np.ndarray, poses: np.ndarray) -> np.ndarray:
@@ -38,7 +38,7 @@ def distances(found: np.ndarray, poses: np.ndarray) -> np.ndarray:
 
 def test_perturbed_poses_come_back(case: Case, splat: Gaussians) -> None:
     frames, poses = case.result.frames, case.result.reconstruction.world_T_rigs
-    near = near_of(poses, SplatSettings())
+    near = near_of(poses)
     rng = np.random.default_rng(0)
     moved = np.stack(
         [gtsam.Pose3(p).retract(rng.normal(0, [0.003] * 3 + [0.02] * 3)).matrix() for p in poses]

@@ -131,9 +131,12 @@ def _views(splat: Gaussians, masked: bool) -> Views:
 
 
 @pytest.mark.parametrize("masked", [False, True])
-def test_a_stretch_of_training_is_that_of_the_cpu(backend: Backend, masked: bool) -> None:
+def test_a_stretch_of_training_is_that_of_the_cpu(
+    backend: Backend, masked: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gsba.splat.train._NEAR", NEAR / 3.5)
     views = _views(_gaussians(40, 1), masked)
-    settings = SplatSettings(iterations=3000, sh_degree=2, near=NEAR / 3.5, seed=2)
+    settings = SplatSettings(iterations=3000, sh_degree=2, seed=2)
     ends = []
     for renderer in (CpuBackend(1), backend):
         trainer, state = Trainer(views, settings, renderer), begin(_gaussians(30, 7), settings)
@@ -153,9 +156,10 @@ def test_a_stretch_of_training_is_that_of_the_cpu(backend: Backend, masked: bool
     np.testing.assert_allclose(theirs.pull.sums, ours.pull.sums, rtol=0.05, atol=1e-4)
 
 
-def test_density_control_is_at_its_time(backend: Backend) -> None:
+def test_density_control_is_at_its_time(backend: Backend, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gsba.splat.train._DENSIFY_PULL", 1e-6)
     views = _views(_gaussians(20, 1), False)
-    settings = SplatSettings(iterations=3000, sh_degree=1, seed=2, densify_pull=1e-6)
+    settings = SplatSettings(iterations=3000, sh_degree=1, seed=2)
     trainer = Trainer(views, settings, backend)
     state = dataclasses.replace(begin(_gaussians(12, 7), settings), step=140)
     before = trainer.advance(state, 3000)

@@ -5,24 +5,32 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from splat_moves import HARMS, harmed, run, settings_for, spoiled
+from splat_moves import HARMS, harmed, run, settings_for, shorten, spoiled
 from tiny_run import NUM_FRAMES, Case, computed_stages
 
 from gsba.config_file import load_config
 from gsba.evaluate.trajectory import evaluate
 from gsba.log import GsbaError
+from gsba.photometric import direct, patches
 from gsba.splat import refinement
 from gsba.types import Trajectory
+
+
+@pytest.fixture(autouse=True)
+def _few_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    shorten(monkeypatch)
 
 
 def errors(case: Case, world_T_rigs: np.ndarray):
     return evaluate(Trajectory(case.result.frames.timestamps, world_T_rigs), case.truth)
 
 
-def test_a_splat_corrects_poses_that_observations_hardly_hold(case: Case) -> None:
+def test_a_splat_corrects_poses_that_observations_hardly_hold(
+    case: Case, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shorten(monkeypatch, first_steps=80, steps=120, max_moves=2)
     given = spoiled(case, 0.1, 0.003, 50.0)
-    settings = settings_for(sizes=(48,), first_steps=80, steps=120, moves=2)
-    result = run(case, given, settings)
+    result = run(case, given, settings_for(sizes=(48,)))
     move = result.moves[0]
     assert move.accepted and move.evidence > 10 and move.growth + 10 * move.growth_sigma < 1
     # A pose is off by a twentieth of a pixel: two trainings must not differ by more than that does.
@@ -40,7 +48,8 @@ def test_a_harmful_move_is_undone(
     case: Case, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, harm: str
 ) -> None:
     given = spoiled(case, 0.1, 0.003, 50.0)
-    settings = settings_for(sizes=(48,), first_steps=80, steps=40, max_growth=100.0)
+    shorten(monkeypatch, first_steps=80, steps=40, max_growth=100.0)
+    settings = settings_for(sizes=(48,))
     worse = harmed(refinement._Turns._moved, HARMS[harm], 0)
     monkeypatch.setattr(refinement._Turns, "_moved", worse)
     with caplog.at_level(logging.INFO, "gsba"):
@@ -62,17 +71,23 @@ def test_a_move_that_nothing_speaks_for_is_undone(
     assert not move.accepted and abs(move.evidence) < 2
 
 
-def test_a_move_that_observations_contradict_is_undone(case: Case) -> None:
+def test_a_move_that_observations_contradict_is_undone(
+    case: Case, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shorten(monkeypatch, max_growth=1e-6)
     given = spoiled(case, 0.0, 0.0, 1.0)
-    result = run(case, given, settings_for(max_growth=1e-6))
+    result = run(case, given, settings_for())
     assert [move.accepted for move in result.moves] == [False]
     np.testing.assert_array_equal(result.adjustment.world_T_rigs, given[2].world_T_rigs)
     assert not result.adjustment.rounds[-1].accepted
 
 
-def test_few_frames_are_left_as_they_were(case: Case, caplog: pytest.LogCaptureFixture) -> None:
+def test_few_frames_are_left_as_they_were(
+    case: Case, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shorten(monkeypatch, held_out_every=NUM_FRAMES)
     given = spoiled(case, 0.0, 0.0, 1.0)
-    result = run(case, given, settings_for(held_out_every=NUM_FRAMES))
+    result = run(case, given, settings_for())
     assert result.adjustment is given[2] and result.moves == ()
     assert "too few" in caplog.text
 
@@ -103,11 +118,13 @@ def test_an_interrupted_refinement_goes_on_to_the_same_result(
 
 
 @pytest.mark.slow
-def test_a_run_with_all_families(case: Case, tmp_path: Path) -> None:
+def test_a_run_with_all_families(
+    case: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     out = case.copy(tmp_path / "run")
     settings = settings_for(("bearing", "photometric", "splat"))
-    few = settings.photometric.model_copy(update={"spacing_deg": 20.0, "depth_levels": 0})
-    settings = settings.model_copy(update={"photometric": few})
+    monkeypatch.setattr(direct, "_DEPTH_LEVELS", 0)
+    monkeypatch.setattr(patches, "_SPACING_DEG", 20.0)
     result = case.refine(out, settings)
     assert computed_stages(result)[:2] == ["photometric", "splat"]
     (move,) = result.report["splat"]

@@ -103,10 +103,12 @@ def test_stretches_end_where_something_is_due() -> None:
     assert {50, 100, 150, SETTINGS.iterations // 2} <= set(steps)
 
 
-def test_an_interrupted_training_goes_on_to_the_same_result(tmp_path: Path) -> None:
+def test_an_interrupted_training_goes_on_to_the_same_result(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gsba.splat.train._CHECKPOINT_EVERY_S", 1e-9)
     truth, views = scene()
-    often = SETTINGS.model_copy(update={"checkpoint_every_s": 1e-9})
-    whole = train(start(truth), views, often, CpuBackend(1))
+    whole = train(start(truth), views, SETTINGS, CpuBackend(1))
 
     def stop(step: int, gaussians: Gaussians) -> None:
         if step == 130:
@@ -114,14 +116,20 @@ def test_an_interrupted_training_goes_on_to_the_same_result(tmp_path: Path) -> N
 
     path = tmp_path / "checkpoint.npz"
     with pytest.raises(KeyboardInterrupt):
-        train(start(truth), views, often, CpuBackend(1), path, "key", stop)
+        train(start(truth), views, SETTINGS, CpuBackend(1), path, "key", stop)
     steps: list[int] = []
     rest = train(
-        start(truth), views, often, CpuBackend(1), path, "key", lambda step, _: steps.append(step)
+        start(truth),
+        views,
+        SETTINGS,
+        CpuBackend(1),
+        path,
+        "key",
+        lambda step, _: steps.append(step),
     )
     assert steps == list(range(130, 321)) and same(rest, whole)
-    assert same(train(start(truth), views, often, CpuBackend(1), path, "key"), whole)
-    short = often.model_copy(update={"iterations": 3})
+    assert same(train(start(truth), views, SETTINGS, CpuBackend(1), path, "key"), whole)
+    short = SETTINGS.model_copy(update={"iterations": 3})
     assert len(train(start(truth), views, short, CpuBackend(1), path, "other key")) == 150
 
 
@@ -138,17 +146,19 @@ class Poison(CpuBackend):
         return found
 
 
-def test_what_is_not_finite_stops_the_training(tmp_path: Path) -> None:
+def test_what_is_not_finite_stops_the_training(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gsba.splat.train._CHECKPOINT_EVERY_S", 1e-9)
     truth, views = scene()
-    often = SETTINGS.model_copy(update={"checkpoint_every_s": 1e-9})
     path = tmp_path / "checkpoint.npz"
     with pytest.raises(GsbaError, match=r"no longer finite at step 40; .*checkpoint\.npz"):
-        train(start(truth), views, often, Poison(1), path, "key")
+        train(start(truth), views, SETTINGS, Poison(1), path, "key")
     states: list[tuple[int, bool]] = []
     train(
         start(truth),
         views,
-        often.model_copy(update={"iterations": 31}),
+        SETTINGS.model_copy(update={"iterations": 31}),
         CpuBackend(1),
         path,
         "key",
@@ -170,9 +180,12 @@ def test_a_part_of_a_training_leaves_its_start_alone() -> None:
         advance(state, views, SETTINGS, Poison(1), 40)
 
 
-def test_the_cap_is_kept_and_said(caplog: pytest.LogCaptureFixture) -> None:
+def test_the_cap_is_kept_and_said(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gsba.splat.train._DENSIFY_PULL", 1e-9)
     truth, views = scene()
-    tight = SETTINGS.model_copy(update={"max_gaussians": 155, "densify_pull": 1e-9})
+    tight = SETTINGS.model_copy(update={"max_gaussians": 155})
     sizes: list[int] = []
     with caplog.at_level(logging.WARNING, "gsba"):
         train(start(truth), views, tight, CpuBackend(1), watch=lambda _, s: sizes.append(len(s)))
@@ -181,10 +194,13 @@ def test_the_cap_is_kept_and_said(caplog: pytest.LogCaptureFixture) -> None:
     assert len(train(start(truth), views, tiny, CpuBackend(1))) == 100
 
 
-def test_a_cap_follows_from_pixels_and_memory(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_cap_follows_from_pixels_and_memory(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """23 numbers a Gaussian; 6 views of 32 x 32 pixels have 18,432 values."""
+    monkeypatch.setattr("gsba.splat.train._DENSIFY_PULL", 1e-9)
     truth, views = scene()
-    eager = SETTINGS.model_copy(update={"densify_pull": 1e-9, "iterations": 600})
+    eager = SETTINGS.model_copy(update={"iterations": 600})
     backend = CpuBackend(1)
     splat = train(start(truth), views, eager, backend)
     assert 500 < len(splat) <= 18_432 // 23

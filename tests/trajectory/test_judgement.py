@@ -7,10 +7,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 from synthetic import RIG, bearings_of, drifted, loop_walk, unit, with_noise
 
-from gsba.config import PriorSettings, TwoViewLimits
+from gsba.config import PriorSettings
 from gsba.geometry import inverse, pose, rotation_angle
 from gsba.trajectory import judgement, turning
 from gsba.trajectory.judgement import StepChecks
+from gsba.trajectory.limits import TwoViewLimits
 from gsba.trajectory.steps import chained, image_steps, length_ratios, off_steps, step_lengths
 from gsba.types import CoarsePoses, Counts, Keypoints, Matches, PoseSource, VerifiedPairs
 

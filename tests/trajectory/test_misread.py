@@ -7,10 +7,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 from synthetic import drifted, loop_walk, unit
 
-from gsba.config import RefineSettings, TwoViewLimits
+from gsba.config import RefineSettings
 from gsba.geometry import inverse, pose
 from gsba.log import GsbaError
 from gsba.matching import recovery
+from gsba.trajectory.limits import TwoViewLimits
 from gsba.trajectory.misread import (
     TurnedAboutForwardError,
     refuse_misfit,

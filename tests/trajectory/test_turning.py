@@ -6,9 +6,9 @@ from scipy.spatial.transform import Rotation
 from synthetic import unit, with_noise
 
 from gsba.camera.rig import owner_faces
-from gsba.config import TwoViewLimits
 from gsba.geometry import rotation_angle
 from gsba.trajectory import turning
+from gsba.trajectory.limits import TwoViewLimits
 from gsba.types import Counts, Keypoints, Matches, VerifiedPairs
 
 NUM_FRAMES, SIGMA = 9, 5e-4  # radians
