@@ -1,0 +1,650 @@
+"""Relative poses of stills metres apart: patches searched along epipolar lines of hypotheses.
+
+    python benchmarks/tours.py OUT.md TOUR [TOUR ...] [--chains FOLDER]
+
+TOUR: a folder with images/*.jpg, groundtruth.tum and, if a carrier is in the pictures, mask.png, as
+`render_home.py OUT -n 20` writes it. Frames next to one another are compared:
+
+1. Hypotheses: RANSAC on mutual nearest neighbours of SIFT, each without the inliers of those
+   before, on several subsets of keypoints (without those that have a look-alike in their own frame,
+   without those below the horizon, where a floor repeats).
+2. Each keypoint of a frame is searched in the other picture along its epipolar line, at all
+   distances and a little beside the line, its patch warped by planes. The best place, unless
+   another one is about as good, is moved by Lucas and Kanade's method. A pose is fitted to these
+   matches, and so on from coarse to fine. No keypoint of the other frame is asked for.
+3. Hypotheses are ranked by the keypoints that fit: the geometric mean of all and of those
+   without look-alikes and floor.
+4. The best chain over all frames is chosen by these ranks and by keypoints whose distances agree in
+   both neighbouring steps, which also give the ratio of the steps' lengths.
+
+A prototype, not part of the product: results/tours.md says what it finds and what is open.
+"""
+
+import argparse
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+from common import write_table
+from scipy.spatial.transform import Rotation
+
+from factors.compiled import kernel_and_part
+from gsba.camera.rig import CubeRig, cells_of
+from gsba.config import FeatureSettings
+from gsba.evaluate.trajectory import pose_errors
+from gsba.features.detection import SiftExtractor, extract
+from gsba.frames import cubemap
+from gsba.geometry import angles_between, inverse, pose, rotation_angle, unit
+from gsba.trajectory.files import read_trajectory, write_tum
+from gsba.types import Trajectory
+
+_kernel, _part = kernel_and_part(allocating=True, fastmath={"contract", "reassoc", "nsz"})
+HALF = 4  # samples from the middle of a patch to its border
+SIDE = 2 * HALF + 1
+AREA = SIDE * SIDE
+SAMPLE_RAD = np.deg2rad(0.375)  # between samples of a patch, at full resolution
+LINE_STEP_DEG = 0.35  # along epipolar lines, and between lines beside them
+MIN_LIKENESS, MIN_MARGIN = 0.65, 0.06  # of the best place, and above any other
+MIN_PARALLAX = np.deg2rad(3.0)  # of keypoints that tell a direction
+FLOOR_Y = 0.25  # y of bearings below which a floor is likely
+NUM_KEYS, NUM_FEW = 1000, 300  # keypoints of a frame that are searched; for a first rank
+NUM_REFINED = 5  # hypotheses of a step that are refined
+LENGTH_SIGMA = 0.8  # of the logarithm of the ratio of two steps' lengths
+RATIO_WIDTH = 0.08  # of its logarithm, in which keypoints agree on a ratio
+BESIDE = 0.035  # radians along a line: places further from the best one are others
+
+
+@_part
+def _likeness(image, u0, v0, ui, uj, vi, vj, template, least):
+    """Correlation of the patch at u0 + ui i + uj j, v0 + vi i + vj j with a template of unit norm;
+    -1 outside, where it is flat, or where every second sample has less than `least`."""
+    height, width = image.shape
+    extent_u, extent_v = HALF * (abs(ui) + abs(uj)), HALF * (abs(vi) + abs(vj))
+    if v0 - extent_v < 0.0 or v0 + extent_v >= height - 1.001:
+        return np.float32(-1.0)
+    wraps = u0 - extent_u < 0.0 or u0 + extent_u >= width - 1.001
+    total = squares = products = of_template = of_squares = np.float32(0.0)
+    for stage in range(2):
+        for j in range(-HALF, HALF + 1):
+            for i in range(-HALF, HALF + 1):
+                if ((i & 1) == 0 and (j & 1) == 0) != (stage == 0):
+                    continue
+                u, v = u0 + ui * i + uj * j, v0 + vi * i + vj * j
+                if wraps:
+                    u += width if u < 0.0 else (-width if u >= width else 0.0)
+                x, y = int(u), int(v)
+                a, b = np.float32(u - x), np.float32(v - y)
+                right = 0 if x + 1 >= width else x + 1
+                above = image[y, x] + a * (image[y, right] - image[y, x])
+                below = image[y + 1, x] + a * (image[y + 1, right] - image[y + 1, x])
+                value = above + b * (below - above)
+                other = template[(j + HALF) * SIDE + i + HALF]
+                total += value
+                squares += value * value
+                products += value * other
+                if stage == 0:
+                    of_template += other
+                    of_squares += other * other
+        if stage == 0:
+            num = np.float32((HALF + 1) * (HALF + 1))
+            var = squares / num - (total / num) * (total / num)
+            of_var = of_squares / num - (of_template / num) * (of_template / num)
+            joint = products / num - total / num * of_template / num
+            if not var > 2.0 or not joint > 0.0 or joint * joint < least * least * var * of_var:
+                return np.float32(-1.0)
+    var = squares / AREA - (total / AREA) * (total / AREA)
+    return products / np.sqrt(var * AREA) if var > 4.0 else np.float32(-1.0)
+
+
+@_part
+def _cut(image, warp, out):
+    """The patch by its warp (u, v, ui, uj, vi, vj), without its mean, of unit norm; False outside
+    or where it is flat."""
+    height, width = image.shape
+    total = squares = np.float32(0.0)
+    for j in range(-HALF, HALF + 1):
+        for i in range(-HALF, HALF + 1):
+            u, v = warp[0] + warp[2] * i + warp[3] * j, warp[1] + warp[4] * i + warp[5] * j
+            if not (v >= 0.0 and v < height - 1.001 and u >= -width and u < 2 * width):
+                return False
+            u += width if u < 0.0 else (-width if u >= width else 0.0)
+            x, y = int(u), int(v)
+            a, b = np.float32(u - x), np.float32(v - y)
+            right = 0 if x + 1 >= width else x + 1
+            above = image[y, x] + a * (image[y, right] - image[y, x])
+            below = image[y + 1, x] + a * (image[y + 1, right] - image[y + 1, x])
+            value = above + b * (below - above)
+            out[(j + HALF) * SIDE + i + HALF] = value
+            total += value
+            squares += value * value
+    var = squares / AREA - (total / AREA) * (total / AREA)
+    if not var > 4.0:
+        return False
+    for n in range(AREA):
+        out[n] = (out[n] - total / AREA) / np.sqrt(var * AREA)
+    return True
+
+
+@_part
+def _place(x, y, z, by_i, by_j, width, height, sample, warp):
+    """Warp of a patch from the ray (x, y, z) of its middle and the ray's derivatives (3,) by i and
+    j, samples; False near a pole."""
+    flat2 = x * x + z * z
+    squared = flat2 + y * y
+    if y * y > 0.86 * squared:
+        return False
+    flat = np.sqrt(flat2)
+    warp[0] = width * (np.arctan2(x, z) / (2 * np.pi) + 0.5) - 0.5
+    warp[1] = height * (0.5 + np.arctan2(y, flat) / np.pi) - 0.5
+    along = sample * width / (2 * np.pi) / flat2
+    down = sample * height / np.pi / (flat * squared)
+    warp[2] = along * (z * by_i[0] - x * by_i[2])
+    warp[3] = along * (z * by_j[0] - x * by_j[2])
+    warp[4] = down * (flat2 * by_i[1] - y * (x * by_i[0] + z * by_i[2]))
+    warp[5] = down * (flat2 * by_j[1] - y * (x * by_j[0] + z * by_j[2]))
+    return True
+
+
+@_part
+def _derivatives(rotation, ray, tangents, plane, out):
+    """Derivatives (2, 3) of points on a plane through the ray's end, in the other frame's axes: 0
+    facing the camera, 1 level, 2 and 3 upright at 40 degrees to either side."""
+    nx, ny, nz = ray[0], ray[1], ray[2]
+    if plane == 1:
+        nx, ny, nz = 0.0, 1.0, 0.0
+    elif plane > 1:
+        azimuth = np.arctan2(ray[0], ray[2]) + (0.7 if plane == 2 else -0.7)
+        nx, ny, nz = np.sin(azimuth), 0.0, np.cos(azimuth)
+    depth = nx * ray[0] + ny * ray[1] + nz * ray[2]
+    for e in range(2):
+        t = tangents[e]
+        slope = (nx * t[0] + ny * t[1] + nz * t[2]) / depth
+        x, y, z = t[0] - ray[0] * slope, t[1] - ray[1] * slope, t[2] - ray[2] * slope
+        for r in range(3):
+            out[e, r] = rotation[r, 0] * x + rotation[r, 1] * y + rotation[r, 2] * z
+
+
+@_part
+def _to_ray(u, v, width, height, out):
+    """Unit ray of a pixel."""
+    lon, lat = ((u + 0.5) / width - 0.5) * 2 * np.pi, ((v + 0.5) / height - 0.5) * np.pi
+    out[0], out[1], out[2] = np.cos(lat) * np.sin(lon), np.sin(lat), np.cos(lat) * np.cos(lon)
+
+
+@_part
+def _align(image, template, patch, warp):
+    """Correlation after moving and bending an affine warp until the patch fits; -1 = lost."""
+    start_u, start_v = warp[0], warp[1]
+    normal, right, row = np.zeros((6, 6)), np.zeros(6), np.zeros(6)
+    for _ in range(12):
+        if not _cut(image, warp, patch):
+            return np.float32(-1.0)
+        normal[:], right[:] = 0.0, 0.0
+        for j in range(SIDE):
+            for i in range(SIDE):
+                west, east = max(i - 1, 0), min(i + 1, SIDE - 1)
+                north, south = max(j - 1, 0), min(j + 1, SIDE - 1)
+                by_i = (patch[j * SIDE + east] - patch[j * SIDE + west]) / (east - west)
+                by_j = (patch[south * SIDE + i] - patch[north * SIDE + i]) / (south - north)
+                x, y = i - HALF, j - HALF
+                row[0], row[1], row[2] = by_i, by_j, by_i * x
+                row[3], row[4], row[5] = by_i * y, by_j * x, by_j * y
+                off = template[j * SIDE + i] - patch[j * SIDE + i]
+                for a in range(6):
+                    right[a] += row[a] * off
+                    for b in range(6):
+                        normal[a, b] += row[a] * row[b]
+        for a in range(6):
+            normal[a, a] += 1e-4 if a < 2 else 1.2e-3
+        step = np.linalg.solve(normal, right)
+        ui, uj, vi, vj = warp[2], warp[3], warp[4], warp[5]
+        warp[0] += ui * step[0] + uj * step[1]
+        warp[1] += vi * step[0] + vj * step[1]
+        warp[2], warp[3] = ui * (1 + step[2]) + uj * step[4], ui * step[3] + uj * (1 + step[5])
+        warp[4], warp[5] = vi * (1 + step[2]) + vj * step[4], vi * step[3] + vj * (1 + step[5])
+        if abs(step[0]) + abs(step[1]) < 0.02:
+            break
+    moved = (warp[0] - start_u) ** 2 + (warp[1] - start_v) ** 2
+    if moved > 36.0 or warp[2] * warp[5] - warp[3] * warp[4] < 0.1 or not _cut(image, warp, patch):
+        return np.float32(-1.0)
+    return np.float32(np.sum(patch * template))
+
+
+@_kernel
+def _search(image0, image1, rays, rotation, direction, beside, step, sample, scores, places):
+    """Correlation (N,) and ray (N, 3) in the other picture of each patch; -1 = none or not alone.
+
+    Rays x1 = rotation x0 + depth^-1 direction; `beside`: lines to either side of the epipolar one,
+    `step` radians apart.
+    """
+    height0, width0 = image0.shape
+    height1, width1 = image1.shape
+    template, patch = np.empty(AREA, np.float32), np.empty(AREA, np.float32)
+    warp, tangents, normal = np.empty(6), np.empty((2, 3)), np.empty(3)
+    slopes, best, identity = np.empty((4, 2, 3)), np.empty(6), np.eye(3)
+    likes = np.empty(int(np.pi / step) + 1, np.float32)
+    for n in range(len(rays)):
+        scores[n] = -1.0
+        ray = rays[n]
+        flat = np.sqrt(ray[0] * ray[0] + ray[2] * ray[2])
+        tangents[0, 0], tangents[0, 1], tangents[0, 2] = ray[2] / flat, 0.0, -ray[0] / flat
+        tangents[1, 0], tangents[1, 1] = -ray[1] * ray[0] / flat, flat
+        tangents[1, 2] = -ray[1] * ray[2] / flat
+        _derivatives(identity, ray, tangents, 0, slopes[0])
+        if not _place(
+            ray[0], ray[1], ray[2], slopes[0, 0], slopes[0, 1], width0, height0, sample, warp
+        ) or not _cut(image0, warp, template):
+            continue
+        x0 = rotation[0, 0] * ray[0] + rotation[0, 1] * ray[1] + rotation[0, 2] * ray[2]
+        y0 = rotation[1, 0] * ray[0] + rotation[1, 1] * ray[1] + rotation[1, 2] * ray[2]
+        z0 = rotation[2, 0] * ray[0] + rotation[2, 1] * ray[1] + rotation[2, 2] * ray[2]
+        normal[0] = y0 * direction[2] - z0 * direction[1]
+        normal[1] = z0 * direction[0] - x0 * direction[2]
+        normal[2] = x0 * direction[1] - y0 * direction[0]
+        sine = np.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
+        if sine < 0.05:
+            continue  # the epipole: no direction to search
+        angle = np.arctan2(sine, x0 * direction[0] + y0 * direction[1] + z0 * direction[2])
+        for plane in range(4):
+            _derivatives(rotation, ray, tangents, plane, slopes[plane])
+        num, top, at = int((angle - 0.06) / step), np.float32(-1.0), 0
+        for k in range(num):
+            likes[k] = -1.0
+        for k in range(num):
+            nearness = np.sin(k * step) / np.sin(angle - k * step)
+            if nearness > 4.0:
+                break
+            for m in range(-beside, beside + 1):
+                x, y = x0 + nearness * direction[0], y0 + nearness * direction[1]
+                z = z0 + nearness * direction[2]
+                off = m * step * np.sqrt(x * x + y * y + z * z) / sine
+                x, y, z = x + off * normal[0], y + off * normal[1], z + off * normal[2]
+                for plane in range(4):
+                    if plane == 1 and abs(ray[1]) < 0.17:
+                        continue
+                    if not _place(
+                        x, y, z, slopes[plane, 0], slopes[plane, 1], width1, height1, sample, warp
+                    ):
+                        continue
+                    like = _likeness(
+                        image1, warp[0], warp[1], warp[2], warp[3], warp[4], warp[5], template, 0.4
+                    )
+                    likes[k] = max(likes[k], like)
+                    if like > top:
+                        top, at = like, k
+                        for c in range(6):
+                            best[c] = warp[c]
+        second = np.float32(-1.0)
+        for k in range(num):
+            if abs(k - at) * step > BESIDE:
+                second = max(second, likes[k])
+        if top < MIN_LIKENESS or top - second < MIN_MARGIN:
+            continue
+        like = _align(image1, template, patch, best)
+        if like > MIN_LIKENESS:
+            scores[n] = like
+            _to_ray(best[0], best[1], width1, height1, places[n])
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """A frame's pictures and the keypoints that are searched in others."""
+
+    picture: np.ndarray  # (h, 2h) float32
+    half: np.ndarray  # the same at half the resolution
+    rays: np.ndarray  # (K, 3) of all keypoints
+    descriptors: np.ndarray  # (K, D) of unit length
+    alikeness: np.ndarray  # (K,) largest cosine with another keypoint of the frame, 3 degrees away
+    keys: np.ndarray  # (N, 3) rays that are searched, those that are alone first
+    sound: np.ndarray  # (N,) bool, neither with a look-alike nor below the horizon
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """A hypothesis of the pose between two frames, and the keypoints that fit."""
+
+    f1_T_f0: np.ndarray  # (4, 4), unit translation
+    depths0: np.ndarray  # (N,) of the first frame's keys, in lengths of the step; nan = no fit
+    depths1: np.ndarray  # of the second frame's
+    rank: float
+    num: int
+
+
+def load(tour: Path) -> tuple[list[View], Trajectory]:
+    """The frames of a tour in order, and their true poses."""
+    mask = cv2.imread(str(tour / "mask.png"), cv2.IMREAD_GRAYSCALE)
+    rig = CubeRig(448, np.deg2rad(95.0))
+    masks = None if mask is None else cubemap.cut_mask(mask > 127, rig)
+    extractor, views = SiftExtractor(FeatureSettings(max_per_face=1200)), []
+    for path in sorted((tour / "images").glob("*.jpg")):
+        colours = np.ascontiguousarray(np.asarray(cv2.imread(str(path)))[..., ::-1])
+        found = extract(cubemap.cut(colours, rig), masks, rig, extractor)
+        rays, descriptors = found.bearings_rig.astype(float), unit(found.descriptors.astype(float))
+        likes = descriptors @ descriptors.T
+        likes[rays @ rays.T > np.cos(np.deg2rad(3.0))] = -1
+        alike = likes.max(axis=1)
+        order = np.random.default_rng(0).permutation(len(rays))
+        order = order[np.abs(rays[order, 1]) < 0.88]
+        worse = 2.0 * (alike[order] >= 0.95)
+        worse += (rays[order, 1] > FLOOR_Y) & (alike[order] >= 0.9)
+        chosen = order[np.argsort(worse, kind="stable")][:NUM_KEYS]
+        sound = (rays[chosen, 1] <= FLOOR_Y) & (alike[chosen] < 0.95)
+        grey = cv2.cvtColor(colours, cv2.COLOR_RGB2GRAY).astype(np.float32)
+        grey = cv2.GaussianBlur(grey, (0, 0), 0.7)
+        half = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        keys = np.ascontiguousarray(rays[chosen])
+        views.append(View(grey, half, rays, descriptors, alike, keys, sound))
+    return views, read_trajectory(tour / "groundtruth.tum")
+
+
+def search(
+    one: View, other: View, rows: np.ndarray, f1_T_f0: np.ndarray, beside_deg: float, coarse: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of keys that are found in the other frame, and their rays (M, 3) there."""
+    rays = np.ascontiguousarray(one.keys[rows])
+    scores, places = np.empty(len(rays), np.float32), np.zeros((len(rays), 3))
+    pictures = (one.half, other.half) if coarse else (one.picture, other.picture)
+    scale = 2 if coarse else 1
+    rotation = np.ascontiguousarray(f1_T_f0[:3, :3])
+    direction = np.ascontiguousarray(f1_T_f0[:3, 3])
+    step = np.deg2rad(LINE_STEP_DEG) * scale
+    beside = int(beside_deg / LINE_STEP_DEG / scale + 0.5)
+    sample = SAMPLE_RAD * scale
+    _search(*pictures, rays, rotation, direction, beside, step, sample, scores, places)
+    found = scores > 0
+    return rows[found], places[found]
+
+
+def triangulated(
+    rays0: np.ndarray, rays1: np.ndarray, f1_T_f0: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Depths (M,) in either frame, lengths of the step, and sines off the epipolar planes."""
+    turned, step = rays0 @ f1_T_f0[:3, :3].T, np.broadcast_to(f1_T_f0[:3, 3], rays1.shape)
+    across = np.cross(turned, rays1)
+    squared = np.maximum(np.sum(across**2, axis=1), 1e-12)
+    depths0 = np.sum(np.cross(rays1, step) * across, axis=1) / squared
+    depths1 = np.sum(np.cross(turned, step) * across, axis=1) / squared
+    return depths0, depths1, np.sum(unit(np.cross(turned, step)) * rays1, axis=1)
+
+
+def fits(
+    rays0: np.ndarray, rays1: np.ndarray, f1_T_f0: np.ndarray, most_deg: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Matches (M,) bool that fit a pose, their parallax, radians, and depths in frame 0."""
+    depths0, depths1, off = triangulated(rays0, rays1, f1_T_f0)
+    good = (np.abs(off) < np.deg2rad(most_deg)) & (depths0 > 0.15) & (depths1 > 0.1)
+    return good, angles_between(rays0 @ f1_T_f0[:3, :3].T, rays1), depths0
+
+
+def ransac(rays0: np.ndarray, rays1: np.ndarray, most_deg: float, seed: int = 0):
+    """f1_T_f0 (4, 4) of unit translation with the most inliers (M,) bool, or None."""
+    if len(rays0) < 8:
+        return None
+    options = pycolmap.RANSACOptions()
+    options.max_error, options.random_seed = np.deg2rad(most_deg), seed
+    options.min_num_trials, options.max_num_trials = 1000, 10000
+    options.min_inlier_ratio = 0.1
+    found = pycolmap.estimate_relative_pose(rays0, rays1, options)
+    if found is None:
+        return None
+    matrix = found["cam2_from_cam1"].matrix()
+    inliers = np.asarray(found["inlier_mask"], bool)
+    return pose(matrix[:, :3], unit(matrix[:, 3])), inliers
+
+
+def adjusted(rays0: np.ndarray, rays1: np.ndarray, f1_T_f0: np.ndarray, width: float) -> np.ndarray:
+    """The pose by least squares of sines off epipolar planes, Cauchy's loss of `width`."""
+    rotation, direction = f1_T_f0[:3, :3], f1_T_f0[:3, 3]
+    for _ in range(20):
+        turned = rays0 @ rotation.T
+        normals = np.cross(turned, direction)
+        lengths = np.linalg.norm(normals, axis=1, keepdims=True) + 1e-9
+        off = np.sum(normals / lengths * rays1, axis=1)
+        basis = np.linalg.svd(direction[None])[2][1:]
+        by_turn = np.cross(turned, np.cross(np.broadcast_to(direction, rays1.shape), rays1))
+        jacobian = np.hstack([by_turn, np.cross(rays1, turned) @ basis.T]) / lengths
+        weights = 1 / (1 + (off / width) ** 2)
+        normal = jacobian.T @ (weights[:, None] * jacobian) + 1e-9 * np.eye(5)
+        move = -np.linalg.solve(normal, jacobian.T @ (weights * off))
+        rotation = Rotation.from_rotvec(move[:3]).as_matrix() @ rotation
+        direction = unit(direction + basis.T @ move[3:])
+        if np.linalg.norm(move) < 1e-7:
+            break
+    return pose(rotation, direction)
+
+
+def better(
+    rays0: np.ndarray,
+    rays1: np.ndarray,
+    sound: np.ndarray,
+    f1_T_f0: np.ndarray,
+    most_deg: float,
+    width_deg: float,
+) -> np.ndarray:
+    """Of the pose so far and those by RANSAC, each adjusted, the one that most matches fit."""
+    starts = [f1_T_f0]
+    for rows in (sound, np.ones(len(sound), bool)):
+        found = ransac(rays0[rows], rays1[rows], most_deg)
+        starts += [found[0]] if found else []
+
+    def rank(one: np.ndarray) -> float:
+        good = fits(rays0, rays1, one, most_deg)[0]
+        return np.count_nonzero(good & sound) + 0.3 * np.count_nonzero(good & ~sound)
+
+    return max((adjusted(rays0, rays1, s, np.deg2rad(width_deg)) for s in starts), key=rank)
+
+
+def differ(one: np.ndarray, other: np.ndarray, turn_deg: float, direction_deg: float) -> bool:
+    """Whether two poses are further apart than these angles."""
+    turn, direction = errors(one, other)
+    return turn > turn_deg or direction > direction_deg
+
+
+def errors(one: np.ndarray, other: np.ndarray) -> tuple[float, float]:
+    """Angles of rotation and of direction between two poses, degrees."""
+    turn = rotation_angle(one[:3, :3] @ other[:3, :3].T)
+    direction = angles_between(one[:3, 3], other[:3, 3])
+    return float(np.degrees(turn)), float(np.degrees(direction))
+
+
+def hypotheses(one: View, other: View) -> list[np.ndarray]:
+    """Poses f1_T_f0 by descriptors, the best supported first."""
+    likes = one.descriptors @ other.descriptors.T
+    nearest = likes.argmax(axis=1)
+    rows = np.flatnonzero(likes.argmax(axis=0)[nearest] == np.arange(len(nearest)))
+    rows = rows[likes[rows, nearest[rows]] > 0.75]
+    rays0, rays1 = one.rays[rows], other.rays[nearest[rows]]
+    alike = np.maximum(one.alikeness[rows], other.alikeness[nearest[rows]])
+    level = (rays0[:, 1] < FLOOR_Y) & (rays1[:, 1] < FLOOR_Y)
+    found = []
+    for limit, above, most_deg, num in (
+        (2.0, False, 0.5, 3),
+        (0.95, False, 0.5, 3),
+        (0.93, True, 0.5, 2),
+        (0.9, False, 0.5, 2),
+        (0.95, True, 0.5, 2),
+        (0.95, True, 1.0, 2),
+        (2.0, True, 0.5, 2),
+    ):
+        chosen = np.flatnonzero((alike < limit) & (level | (not above)))
+        for seed in range(num):
+            best = ransac(rays0[chosen], rays1[chosen], most_deg, seed)
+            if best is None or np.count_nonzero(best[1]) < 8:
+                break
+            found.append((np.count_nonzero(best[1]), best[0]))
+            chosen = chosen[~best[1]]
+    return distinct(found, 3.0, 10.0)
+
+
+def distinct(
+    ranked: list[tuple[float, np.ndarray]], turn_deg: float, direction_deg: float
+) -> list[np.ndarray]:
+    """Poses by falling rank, without those that are near a better one."""
+    kept: list[np.ndarray] = []
+    for _, one in sorted(ranked, key=lambda pair: -pair[0]):
+        if all(differ(one, other, turn_deg, direction_deg) for other in kept):
+            kept.append(one)
+    return kept
+
+
+def ranked_roughly(one: View, other: View, f1_T_f0: np.ndarray) -> tuple[float, np.ndarray] | None:
+    """Rank and pose of a hypothesis after a search with few keypoints, coarse to fine."""
+    sound = np.flatnonzero(one.sound)[: NUM_FEW // 2]
+    rest = np.setdiff1d(np.arange(len(one.keys)), sound)
+    rest = np.random.default_rng(0).permutation(rest)[: NUM_FEW // 2]
+    few = np.concatenate([sound, rest])
+    for beside, coarse, most, width in (
+        (2.8, True, 0.6, 0.4),
+        (1.05, False, 0.4, 0.25),
+        (0.35, False, 0.3, 0.15),
+    ):
+        rows, places = search(one, other, few, f1_T_f0, beside, coarse)
+        if len(rows) < 8:
+            return None
+        f1_T_f0 = better(one.keys[rows], places, one.sound[rows], f1_T_f0, most, width)
+    good, parallax, _ = fits(one.keys[rows], places, f1_T_f0, 0.2)
+    good &= parallax > MIN_PARALLAX
+    num_sound = np.count_nonzero(good & one.sound[rows])
+    return float(np.sqrt((1 + num_sound) * (1 + np.count_nonzero(good)))), f1_T_f0
+
+
+def refined(one: View, other: View, f1_T_f0: np.ndarray) -> Step | None:
+    """A hypothesis refined by all keypoints of both frames."""
+    every0, every1 = np.arange(len(one.keys)), np.arange(len(other.keys))
+    for beside in (0.7, 0.35, 0.35):
+        rows0, places1 = search(one, other, every0, f1_T_f0, beside, False)
+        rows1, places0 = search(other, one, every1, inverse(f1_T_f0), beside, False)
+        rays0 = np.vstack([one.keys[rows0], places0])
+        rays1 = np.vstack([places1, other.keys[rows1]])
+        if len(rays0) < 8:
+            return None
+        sound = np.concatenate([one.sound[rows0], other.sound[rows1]])
+        f1_T_f0 = better(rays0, rays1, sound, f1_T_f0, 0.3, 0.15)
+    depths, num, num_sound = [], 0, 0
+    for view, rows, places, at in (
+        (one, rows0, places1, f1_T_f0),
+        (other, rows1, places0, inverse(f1_T_f0)),
+    ):
+        good, parallax, depth = fits(view.keys[rows], places, at, 0.2)
+        good &= parallax > MIN_PARALLAX
+        depths.append(np.full(len(view.keys), np.nan))
+        depths[-1][rows[good]] = depth[good]
+        num += np.count_nonzero(good)
+        num_sound += np.count_nonzero(good & view.sound[rows])
+    rank = float(np.sqrt((1 + num_sound) * (1 + num)))
+    return Step(f1_T_f0, depths[0], depths[1], rank, num)
+
+
+def steps_between(one: View, other: View) -> list[Step]:
+    """Hypotheses of the pose between two frames, by falling rank."""
+    rough = [ranked_roughly(one, other, start) for start in hypotheses(one, other)]
+    chosen = distinct([some for some in rough if some is not None], 1.5, 6.0)[:NUM_REFINED]
+    found = [step for start in chosen if (step := refined(one, other, start)) is not None]
+    ranks = [(step.rank, step.f1_T_f0) for step in found]
+    kept = distinct(ranks, 0.7, 3.0)
+    return [next(step for step in found if step.f1_T_f0 is one) for one in kept]
+
+
+def votes(before: Step, after: Step, keys: np.ndarray) -> tuple[int, int, float]:
+    """Keypoints of the frame between two steps that agree on the ratio of their lengths, cells of
+    the sphere that these are in, and its logarithm."""
+    both = np.isfinite(before.depths1) & np.isfinite(after.depths0)
+    if np.count_nonzero(both) < 3:
+        return 0, 0, 0.0
+    logs = np.log(before.depths1[both] / after.depths0[both])
+    ordered = np.sort(logs)
+    last = np.searchsorted(ordered, ordered + 2 * RATIO_WIDTH)
+    first = int(np.argmax(last - np.arange(len(ordered))))
+    ratio = float(np.median(ordered[first : last[first]]))
+    agreeing = np.abs(logs - ratio) < RATIO_WIDTH
+    return int(np.count_nonzero(agreeing)), len(np.unique(cells_of(keys[both][agreeing], 6))), ratio
+
+
+def best_chain(steps: list[list[Step]], views: list[View]) -> tuple[list[int], np.ndarray]:
+    """Hypothesis of each step in the best chain, and logarithms of the ratios of lengths."""
+    total, back, ratios = np.array([2 * np.log(s.rank) for s in steps[0]]), [], []
+    for k in range(1, len(steps)):
+        found = [[votes(a, b, views[k].keys) for b in steps[k]] for a in steps[k - 1]]
+        ratios.append(found)
+        tie = [
+            [np.log1p(n) + np.log1p(c) - (r / LENGTH_SIGMA) ** 2 / 2 for n, c, r in row]
+            for row in found
+        ]
+        total = total[:, None] + np.array(tie)
+        back.append(total.argmax(axis=0))
+        total = total.max(axis=0) + np.array([2 * np.log(s.rank) for s in steps[k]])
+    chain = [int(total.argmax())]
+    for came_from in back[::-1]:
+        chain.append(int(came_from[chain[-1]]))
+    chain = chain[::-1]
+    logs = [found[chain[k]][chain[k + 1]] for k, found in enumerate(ratios)]
+    return chain, np.array([ratio if num >= 5 else 0.0 for num, _, ratio in logs])
+
+
+def chained(steps: list[Step], logs: np.ndarray) -> np.ndarray:
+    """Poses (F, 4, 4) of the frames, the first step having length one."""
+    poses, length = [np.eye(4)], 1.0
+    for k, step in enumerate(steps):
+        length *= float(np.exp(logs[k - 1])) if k else 1.0
+        relative = step.f1_T_f0.copy()
+        relative[:3, 3] *= length
+        poses.append(poses[-1] @ inverse(relative))
+    return np.array(poses)
+
+
+def row_of(tour: Path, chains: Path | None) -> str:
+    """The table's row of a tour; its steps are printed."""
+    views, truth = load(tour)
+    began, true_poses, steps, right = time.process_time(), truth.world_T_rigs, [], []
+    for i in range(len(views) - 1):
+        true = inverse(true_poses[i + 1]) @ true_poses[i]
+        found = steps_between(views[i], views[i + 1])
+        steps.append(found)
+        off = [errors(step.f1_T_f0, true) for step in found]
+        right.append([turn < 1 and direction < 3 for turn, direction in off])
+        cells = [
+            f"{s.rank:.0f} ({s.num}) {a:.2f}/{b:.2f}" for s, (a, b) in zip(found, off, strict=True)
+        ]
+        print(i, *cells, sep="  ", flush=True)
+    cpu = time.process_time() - began
+    chain, logs = best_chain(steps, views)
+    kept = [found[c] for found, c in zip(steps, chain, strict=True)]
+    estimate = Trajectory(truth.timestamps, chained(kept, logs))
+    ate = np.sqrt(np.mean(pose_errors(estimate, truth).positions ** 2))
+    wrong = [i for i, (good, c) in enumerate(zip(right, chain, strict=True)) if not good[c]]
+    lead = [
+        max(s.rank for s, ok in zip(found, good, strict=True) if ok)
+        / max([s.rank for s, ok in zip(found, good, strict=True) if not ok] or [1.0])
+        for found, good in zip(steps, right, strict=True)
+        if any(good)
+    ]
+    if chains is not None:
+        write_tum(chains / f"{tour.name}.tum", estimate)
+    numbers = [sum(map(any, right)), sum(good[0] for good in right), len(steps) - len(wrong)]
+    cells = [tour.name, len(steps), *numbers, f"{min(lead):.1f}, {np.median(lead):.1f}"]
+    cells += [", ".join(map(str, wrong)) or "none", f"{ate:.3f}", f"{cpu:.0f}"]
+    return f"| {' | '.join(map(str, cells))} |"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("out", type=Path)
+    parser.add_argument("tours", type=Path, nargs="+")
+    parser.add_argument("--chains", type=Path, help="folder for the chains' trajectories, TUM")
+    options = parser.parse_args()
+    lines = [
+        "| tour | steps | a hypothesis is right | first is right | right in the chain | "
+        "lead of right ones: least, median | wrong steps | chain's ATE | CPU s |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for tour in options.tours:
+        lines.append(row_of(tour, options.chains))
+        print(lines[-1], flush=True)
+    write_table(lines, options.out)
+
+
+if __name__ == "__main__":
+    main()
