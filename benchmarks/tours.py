@@ -532,8 +532,8 @@ def refined(one: View, other: View, f1_T_f0: np.ndarray) -> Step | None:
         good &= parallax > MIN_PARALLAX
         depths.append(np.full(len(view.keys), np.nan))
         depths[-1][rows[good]] = depth[good]
-        num += np.count_nonzero(good)
-        num_sound += np.count_nonzero(good & view.sound[rows])
+        num += int(np.count_nonzero(good))
+        num_sound += int(np.count_nonzero(good & view.sound[rows]))
     rank = float(np.sqrt((1 + num_sound) * (1 + num)))
     return Step(f1_T_f0, depths[0], depths[1], rank, num)
 
