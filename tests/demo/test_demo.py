@@ -463,7 +463,8 @@ def test_demo_ends_like_refine_where_its_walk_falls_apart(tmp_path, monkeypatch)
         result = refine(*arguments, **options)
         whole = replace(result.reconstruction, components=np.array([0, 0, 1], np.int32))
         maps = summarize_maps(whole, result.frames)
-        summary = result.report["summary"] | {"frames_in_no_map": 1, "refined": 2}
+        changed = {"frames_in_no_map": 1, "refined": 2, "exported": 2}
+        summary = result.report["summary"] | changed
         return replace(result, maps=maps, report=result.report | {"summary": summary})
 
     few = ["-q", "demo", "--frames", "3", "--width", "256", "--out", str(tmp_path / "demo")]
