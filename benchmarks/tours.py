@@ -1,6 +1,6 @@
 """Relative poses of stills metres apart: patches searched along epipolar lines of hypotheses.
 
-    python benchmarks/tours.py OUT.md TOUR [TOUR ...] [--chains FOLDER]
+    python benchmarks/tours.py OUT.md TOUR [TOUR ...]
 
 TOUR: a folder with images/*.jpg, groundtruth.tum and, if a carrier is in the pictures, mask.png, as
 `render_home.py OUT -n 20` writes it. Frames next to one another are compared:
@@ -23,14 +23,18 @@ A prototype, not part of the product: results/tours.md says what it finds and wh
 import argparse
 import time
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
+import gtsam
 import numpy as np
 import pycolmap
 from common import write_table
 from scipy.spatial.transform import Rotation
 
+import gsba
+from factors import BearingTerm, LandmarkBlock, RobustLoss
 from factors.compiled import kernel_and_part
 from gsba.camera.rig import CubeRig, cells_of
 from gsba.config import FeatureSettings
@@ -38,7 +42,7 @@ from gsba.evaluate.trajectory import pose_errors
 from gsba.features.detection import SiftExtractor, extract
 from gsba.frames import cubemap
 from gsba.geometry import angles_between, inverse, pose, rotation_angle, unit
-from gsba.trajectory.files import read_trajectory, write_tum
+from gsba.trajectory.files import read_trajectory
 from gsba.types import Trajectory
 
 _kernel, _part = kernel_and_part(allocating=True, fastmath={"contract", "reassoc", "nsz"})
@@ -52,7 +56,9 @@ MIN_PARALLAX = np.deg2rad(3.0)  # of keypoints that tell a direction
 FLOOR_Y = 0.25  # y of bearings below which a floor is likely
 NUM_KEYS, NUM_FEW = 1000, 300  # keypoints of a frame that are searched; for a first rank
 NUM_REFINED = 5  # hypotheses of a step that are refined
+SIGMA_RAD = 2e-3  # of the places that the search finds
 LENGTH_SIGMA = 0.8  # of the logarithm of the ratio of two steps' lengths
+MIN_VOTES, MIN_CELLS = 15, 6  # keypoints that tie two steps, and cells of 15 degrees they are in
 RATIO_WIDTH = 0.08  # of its logarithm, in which keypoints agree on a ratio
 BESIDE = 0.035  # radians along a line: places further from the best one are others
 
@@ -309,6 +315,8 @@ class Step:
     f1_T_f0: np.ndarray  # (4, 4), unit translation
     depths0: np.ndarray  # (N,) of the first frame's keys, in lengths of the step; nan = no fit
     depths1: np.ndarray  # of the second frame's
+    places1: np.ndarray  # (N, 3) rays of the first frame's keys in the second; nan = no fit
+    places0: np.ndarray  # of the second frame's keys in the first
     rank: float
     num: int
 
@@ -395,7 +403,9 @@ def ransac(rays0: np.ndarray, rays1: np.ndarray, most_deg: float, seed: int = 0)
     return pose(matrix[:, :3], unit(matrix[:, 3])), inliers
 
 
-def adjusted(rays0: np.ndarray, rays1: np.ndarray, f1_T_f0: np.ndarray, width: float) -> np.ndarray:
+def adjusted_pose(
+    rays0: np.ndarray, rays1: np.ndarray, f1_T_f0: np.ndarray, width: float
+) -> np.ndarray:
     """The pose by least squares of sines off epipolar planes, Cauchy's loss of `width`."""
     rotation, direction = f1_T_f0[:3, :3], f1_T_f0[:3, 3]
     for _ in range(20):
@@ -434,7 +444,7 @@ def better(
         good = fits(rays0, rays1, one, most_deg)[0]
         return np.count_nonzero(good & sound) + 0.3 * np.count_nonzero(good & ~sound)
 
-    return max((adjusted(rays0, rays1, s, np.deg2rad(width_deg)) for s in starts), key=rank)
+    return max((adjusted_pose(rays0, rays1, s, np.deg2rad(width_deg)) for s in starts), key=rank)
 
 
 def differ(one: np.ndarray, other: np.ndarray, turn_deg: float, direction_deg: float) -> bool:
@@ -523,7 +533,7 @@ def refined(one: View, other: View, f1_T_f0: np.ndarray) -> Step | None:
             return None
         sound = np.concatenate([one.sound[rows0], other.sound[rows1]])
         f1_T_f0 = better(rays0, rays1, sound, f1_T_f0, 0.3, 0.15)
-    depths, num, num_sound = [], 0, 0
+    depths, rays, num, num_sound = [], [], 0, 0
     for view, rows, places, at in (
         (one, rows0, places1, f1_T_f0),
         (other, rows1, places0, inverse(f1_T_f0)),
@@ -532,10 +542,12 @@ def refined(one: View, other: View, f1_T_f0: np.ndarray) -> Step | None:
         good &= parallax > MIN_PARALLAX
         depths.append(np.full(len(view.keys), np.nan))
         depths[-1][rows[good]] = depth[good]
+        rays.append(np.full((len(view.keys), 3), np.nan))
+        rays[-1][rows[good]] = places[good]
         num += int(np.count_nonzero(good))
         num_sound += int(np.count_nonzero(good & view.sound[rows]))
     rank = float(np.sqrt((1 + num_sound) * (1 + num)))
-    return Step(f1_T_f0, depths[0], depths[1], rank, num)
+    return Step(f1_T_f0, depths[0], depths[1], rays[0], rays[1], rank, num)
 
 
 def steps_between(one: View, other: View) -> list[Step]:
@@ -563,12 +575,11 @@ def votes(before: Step, after: Step, keys: np.ndarray) -> tuple[int, int, float]
     return int(np.count_nonzero(agreeing)), len(np.unique(cells_of(keys[both][agreeing], 6))), ratio
 
 
-def best_chain(steps: list[list[Step]], views: list[View]) -> tuple[list[int], np.ndarray]:
-    """Hypothesis of each step in the best chain, and logarithms of the ratios of lengths."""
-    total, back, ratios = np.array([2 * np.log(s.rank) for s in steps[0]]), [], []
+def best_chain(steps: list[list[Step]], views: list[View]) -> list[Step]:
+    """The best hypothesis of each step, all steps at once."""
+    total, back = np.array([2 * np.log(s.rank) for s in steps[0]]), []
     for k in range(1, len(steps)):
         found = [[votes(a, b, views[k].keys) for b in steps[k]] for a in steps[k - 1]]
-        ratios.append(found)
         tie = [
             [np.log1p(n) + np.log1p(c) - (r / LENGTH_SIGMA) ** 2 / 2 for n, c, r in row]
             for row in found
@@ -579,9 +590,22 @@ def best_chain(steps: list[list[Step]], views: list[View]) -> tuple[list[int], n
     chain = [int(total.argmax())]
     for came_from in back[::-1]:
         chain.append(int(came_from[chain[-1]]))
-    chain = chain[::-1]
-    logs = [found[chain[k]][chain[k + 1]] for k, found in enumerate(ratios)]
-    return chain, np.array([ratio if num >= 5 else 0.0 for num, _, ratio in logs])
+    return [found[c] for found, c in zip(steps, chain[::-1], strict=True)]
+
+
+def maps_of(chain: list[Step], views: list[View]) -> list[tuple[int, np.ndarray]]:
+    """First frame and poses (F, 4, 4) of each map of three frames and more, whose steps are tied by
+    keypoints that agree on the ratio of their lengths."""
+    between = [votes(chain[f - 1], chain[f], views[f].keys) for f in range(1, len(chain))]
+    tied = [num >= MIN_VOTES and cells >= MIN_CELLS for num, cells, _ in between]
+    ends = [0, *(f + 1 for f, one in enumerate(tied) if not one), len(chain)]
+    found = []
+    for first, last in pairwise(ends):
+        if last - first >= 2:
+            logs = np.array([ratio for _, _, ratio in between[first : last - 1]])
+            some, seen = chain[first:last], views[first : last + 1]
+            found.append((first, adjusted(chained(some, logs), some, seen)))
+    return found
 
 
 def chained(steps: list[Step], logs: np.ndarray) -> np.ndarray:
@@ -595,7 +619,48 @@ def chained(steps: list[Step], logs: np.ndarray) -> np.ndarray:
     return np.array(poses)
 
 
-def row_of(tour: Path, chains: Path | None) -> str:
+def adjusted(poses: np.ndarray, steps: list[Step], views: list[View]) -> np.ndarray:
+    """Poses (F, 4, 4) by bundle adjustment of all keypoints that were found in a neighbour; those
+    found in both are points of three frames."""
+    frames, points, rays, starts = [], [], [], []
+    lengths = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    for f, view in enumerate(views):
+        beside = []  # neighbour, depths and rays of the frame's keys by the step to it
+        if f:
+            beside.append((f - 1, steps[f - 1].depths1 * lengths[f - 1], steps[f - 1].places0))
+        if f < len(steps):
+            beside.append((f + 1, steps[f].depths0 * lengths[f], steps[f].places1))
+        logs = np.log([depths for _, depths, _ in beside])
+        known = np.isfinite(logs)
+        agree = known.any(axis=0) & ~(np.ptp(logs, axis=0) > 0.5)  # true where one is unknown
+        for n in np.flatnonzero(agree):
+            depth = np.exp(logs[known[:, n], n].mean())
+            for g, ray in [(f, view.keys[n]), *((g, seen[n]) for g, _, seen in beside)]:
+                if np.isfinite(ray[0]):
+                    frames.append(g)
+                    points.append(len(starts))
+                    rays.append(ray)
+            starts.append(poses[f, :3, :3] @ view.keys[n] * depth + poses[f, :3, 3])
+    keys, values = [gsba.X(f) for f in range(len(poses))], gtsam.Values()
+    for key, one in zip(keys, poses, strict=True):
+        values.insert(key, gtsam.Pose3(one))
+    graph, first = gtsam.NonlinearFactorGraph(), gtsam.Pose3(poses[0])
+    fixed = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
+    graph.add(gtsam.PriorFactorPose3(keys[0], first, fixed))
+    # points leave the scale open
+    loose = gtsam.noiseModel.Diagonal.Sigmas(np.r_[np.full(3, 10.0), np.full(3, 0.1)])
+    step = first.between(gtsam.Pose3(poses[1]))
+    graph.add(gtsam.BetweenFactorPose3(keys[0], keys[1], step, loose))
+    term = BearingTerm(np.array(frames), np.array(points), np.array(rays), SIGMA_RAD)
+    world = np.array(starts)
+    for scale in (3.0, 1.0):
+        block = LandmarkBlock(keys, world, [term], RobustLoss("cauchy", scale))
+        values = gsba.optimize(graph, values, [block]).values
+        world = block.points_world
+    return np.array([values.atPose3(key).matrix() for key in keys])
+
+
+def row_of(tour: Path) -> str:
     """The table's row of a tour; its steps are printed."""
     views, truth = load(tour)
     began, true_poses, steps, right = time.process_time(), truth.world_T_rigs, [], []
@@ -610,22 +675,29 @@ def row_of(tour: Path, chains: Path | None) -> str:
         ]
         print(i, *cells, sep="  ", flush=True)
     cpu = time.process_time() - began
-    chain, logs = best_chain(steps, views)
-    kept = [found[c] for found, c in zip(steps, chain, strict=True)]
-    estimate = Trajectory(truth.timestamps, chained(kept, logs))
-    ate = np.sqrt(np.mean(pose_errors(estimate, truth).positions ** 2))
-    wrong = [i for i, (good, c) in enumerate(zip(right, chain, strict=True)) if not good[c]]
+    chain = best_chain(steps, views)
+    wrong = [
+        i
+        for i, (found, good) in enumerate(zip(steps, right, strict=True))
+        if not good[next(n for n, one in enumerate(found) if one is chain[i])]
+    ]
     lead = [
         max(s.rank for s, ok in zip(found, good, strict=True) if ok)
         / max([s.rank for s, ok in zip(found, good, strict=True) if not ok] or [1.0])
         for found, good in zip(steps, right, strict=True)
         if any(good)
     ]
-    if chains is not None:
-        write_tum(chains / f"{tour.name}.tum", estimate)
+    maps = []
+    for first, poses in maps_of(chain, views):
+        rows = slice(first, first + len(poses))
+        true = Trajectory(truth.timestamps[rows], true_poses[rows])
+        off = pose_errors(Trajectory(true.timestamps, poses), true).positions
+        extent = np.linalg.norm(np.ptp(true_poses[rows, :3, 3], axis=0))
+        ate = np.sqrt(np.mean(off**2)) / extent
+        maps.append(f"{first} to {first + len(poses) - 1}: {1e3 * ate:.1f}e-3")
     numbers = [sum(map(any, right)), sum(good[0] for good in right), len(steps) - len(wrong)]
     cells = [tour.name, len(steps), *numbers, f"{min(lead):.1f}, {np.median(lead):.1f}"]
-    cells += [", ".join(map(str, wrong)) or "none", f"{ate:.3f}", f"{cpu:.0f}"]
+    cells += [", ".join(map(str, wrong)) or "none", "; ".join(maps), f"{cpu:.0f}"]
     return f"| {' | '.join(map(str, cells))} |"
 
 
@@ -633,15 +705,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("out", type=Path)
     parser.add_argument("tours", type=Path, nargs="+")
-    parser.add_argument("--chains", type=Path, help="folder for the chains' trajectories, TUM")
     options = parser.parse_args()
     lines = [
         "| tour | steps | a hypothesis is right | first is right | right in the chain | "
-        "lead of right ones: least, median | wrong steps | chain's ATE | CPU s |",
+        "lead of right ones: least, median | wrong steps | maps: frames, ATE of extent | CPU s |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
     for tour in options.tours:
-        lines.append(row_of(tour, options.chains))
+        lines.append(row_of(tour))
         print(lines[-1], flush=True)
     write_table(lines, options.out)
 

@@ -4,6 +4,7 @@ With GSBA_PICTURES=FOLDER the pictures of docs/app.md are written to that folder
 """
 
 import base64
+import json
 import os
 import re
 import shutil
@@ -343,11 +344,24 @@ def test_all_that_can_be_used_has_a_name(browser: Any, server: Server) -> None:
     assert page.faults == []
 
 
+def held(server: Server, run: str) -> int:
+    """Process group of a running job, paused: it must not be done before it is stopped."""
+    (job,) = (
+        path.parent
+        for path in server.state.glob("jobs/*/job.json")
+        if json.loads(path.read_text())["run"] == run
+    )
+    group = json.loads((job / "state.json").read_text())["pid"]
+    os.killpg(group, signal.SIGSTOP)
+    return group
+
+
 def test_a_run_is_stopped_and_goes_on_and_the_next_one_waits(browser: Any, server: Server) -> None:
     page = opened(browser, server.address, PHONE)
     chosen(page, "third")
     page.get_by_role("button", name="Start").click()
     status(page, "running")
+    group = held(server, "third")
     page.goto(f"{server.address}#files")
     chosen(page, "fourth")
     page.get_by_role("button", name="Start").click()
@@ -357,7 +371,9 @@ def test_a_run_is_stopped_and_goes_on_and_the_next_one_waits(browser: Any, serve
     next_one = page.locator(".jobs li", has_text="refine fourth")
     next_one.get_by_role("button", name="Take out").click()
     next_one.locator(".badge.stopped").wait_for()
-    first.get_by_role("button", name="Stop").click()
+    with page.expect_response("**/stop"):
+        first.get_by_role("button", name="Stop").click()
+    os.killpg(group, signal.SIGCONT)
     first.locator(".badge.stopped").wait_for()
     assert fits(page)
     first.get_by_role("button", name="Go on").click()
