@@ -58,7 +58,7 @@ NUM_KEYS, NUM_FEW = 1000, 300  # keypoints of a frame that are searched; for a f
 NUM_REFINED = 5  # hypotheses of a step that are refined
 SIGMA_RAD = 2e-3  # of the places that the search finds
 LENGTH_SIGMA = 0.8  # of the logarithm of the ratio of two steps' lengths
-MIN_VOTES, MIN_CELLS = 15, 6  # keypoints that tie two steps, and cells of 15 degrees they are in
+MIN_VOTES, MIN_CELLS = 15, 7  # keypoints that tie two steps, and cells of 15 degrees they are in
 RATIO_WIDTH = 0.08  # of its logarithm, in which keypoints agree on a ratio
 BESIDE = 0.035  # radians along a line: places further from the best one are others
 
