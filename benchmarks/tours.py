@@ -16,6 +16,7 @@ TOUR: a folder with images/*.jpg, groundtruth.tum and, if a carrier is in the pi
    without look-alikes and floor.
 4. The best chain over all frames is chosen by these ranks and by keypoints whose distances agree in
    both neighbouring steps, which also give the ratio of the steps' lengths.
+5. Where few agree, the chain ends. Each map is adjusted with the places that the search found.
 
 A prototype, not part of the product: results/tours.md says what it finds and what is open.
 """
@@ -31,27 +32,24 @@ import gtsam
 import numpy as np
 import pycolmap
 from common import write_table
+from patch_search import search_patches
 from scipy.spatial.transform import Rotation
 
 import gsba
 from factors import BearingTerm, LandmarkBlock, RobustLoss
-from factors.compiled import kernel_and_part
 from gsba.camera.rig import CubeRig, cells_of
+from gsba.camera.sphere import bearings_from_erp
 from gsba.config import FeatureSettings
 from gsba.evaluate.trajectory import pose_errors
 from gsba.features.detection import SiftExtractor, extract
 from gsba.frames import cubemap
 from gsba.geometry import angles_between, inverse, pose, rotation_angle, unit
 from gsba.trajectory.files import read_trajectory
+from gsba.trajectory.steps import chained
 from gsba.types import Trajectory
 
-_kernel, _part = kernel_and_part(allocating=True, fastmath={"contract", "reassoc", "nsz"})
-HALF = 4  # samples from the middle of a patch to its border
-SIDE = 2 * HALF + 1
-AREA = SIDE * SIDE
 SAMPLE_RAD = np.deg2rad(0.375)  # between samples of a patch, at full resolution
 LINE_STEP_DEG = 0.35  # along epipolar lines, and between lines beside them
-MIN_LIKENESS, MIN_MARGIN = 0.65, 0.06  # of the best place, and above any other
 MIN_PARALLAX = np.deg2rad(3.0)  # of keypoints that tell a direction
 FLOOR_Y = 0.25  # y of bearings below which a floor is likely
 NUM_KEYS, NUM_FEW = 1000, 300  # keypoints of a frame that are searched; for a first rank
@@ -60,239 +58,6 @@ SIGMA_RAD = 2e-3  # of the places that the search finds
 LENGTH_SIGMA = 0.8  # of the logarithm of the ratio of two steps' lengths
 MIN_VOTES, MIN_CELLS = 15, 7  # keypoints that tie two steps, and cells of 15 degrees they are in
 RATIO_WIDTH = 0.08  # of its logarithm, in which keypoints agree on a ratio
-BESIDE = 0.035  # radians along a line: places further from the best one are others
-
-
-@_part
-def _likeness(image, u0, v0, ui, uj, vi, vj, template, least):
-    """Correlation of the patch at u0 + ui i + uj j, v0 + vi i + vj j with a template of unit norm;
-    -1 outside, where it is flat, or where every second sample has less than `least`."""
-    height, width = image.shape
-    extent_u, extent_v = HALF * (abs(ui) + abs(uj)), HALF * (abs(vi) + abs(vj))
-    if v0 - extent_v < 0.0 or v0 + extent_v >= height - 1.001:
-        return np.float32(-1.0)
-    wraps = u0 - extent_u < 0.0 or u0 + extent_u >= width - 1.001
-    total = squares = products = of_template = of_squares = np.float32(0.0)
-    for stage in range(2):
-        for j in range(-HALF, HALF + 1):
-            for i in range(-HALF, HALF + 1):
-                if ((i & 1) == 0 and (j & 1) == 0) != (stage == 0):
-                    continue
-                u, v = u0 + ui * i + uj * j, v0 + vi * i + vj * j
-                if wraps:
-                    u += width if u < 0.0 else (-width if u >= width else 0.0)
-                x, y = int(u), int(v)
-                a, b = np.float32(u - x), np.float32(v - y)
-                right = 0 if x + 1 >= width else x + 1
-                above = image[y, x] + a * (image[y, right] - image[y, x])
-                below = image[y + 1, x] + a * (image[y + 1, right] - image[y + 1, x])
-                value = above + b * (below - above)
-                other = template[(j + HALF) * SIDE + i + HALF]
-                total += value
-                squares += value * value
-                products += value * other
-                if stage == 0:
-                    of_template += other
-                    of_squares += other * other
-        if stage == 0:
-            num = np.float32((HALF + 1) * (HALF + 1))
-            var = squares / num - (total / num) * (total / num)
-            of_var = of_squares / num - (of_template / num) * (of_template / num)
-            joint = products / num - total / num * of_template / num
-            if not var > 2.0 or not joint > 0.0 or joint * joint < least * least * var * of_var:
-                return np.float32(-1.0)
-    var = squares / AREA - (total / AREA) * (total / AREA)
-    return products / np.sqrt(var * AREA) if var > 4.0 else np.float32(-1.0)
-
-
-@_part
-def _cut(image, warp, out):
-    """The patch by its warp (u, v, ui, uj, vi, vj), without its mean, of unit norm; False outside
-    or where it is flat."""
-    height, width = image.shape
-    total = squares = np.float32(0.0)
-    for j in range(-HALF, HALF + 1):
-        for i in range(-HALF, HALF + 1):
-            u, v = warp[0] + warp[2] * i + warp[3] * j, warp[1] + warp[4] * i + warp[5] * j
-            if not (v >= 0.0 and v < height - 1.001 and u >= -width and u < 2 * width):
-                return False
-            u += width if u < 0.0 else (-width if u >= width else 0.0)
-            x, y = int(u), int(v)
-            a, b = np.float32(u - x), np.float32(v - y)
-            right = 0 if x + 1 >= width else x + 1
-            above = image[y, x] + a * (image[y, right] - image[y, x])
-            below = image[y + 1, x] + a * (image[y + 1, right] - image[y + 1, x])
-            value = above + b * (below - above)
-            out[(j + HALF) * SIDE + i + HALF] = value
-            total += value
-            squares += value * value
-    var = squares / AREA - (total / AREA) * (total / AREA)
-    if not var > 4.0:
-        return False
-    for n in range(AREA):
-        out[n] = (out[n] - total / AREA) / np.sqrt(var * AREA)
-    return True
-
-
-@_part
-def _place(x, y, z, by_i, by_j, width, height, sample, warp):
-    """Warp of a patch from the ray (x, y, z) of its middle and the ray's derivatives (3,) by i and
-    j, samples; False near a pole."""
-    flat2 = x * x + z * z
-    squared = flat2 + y * y
-    if y * y > 0.86 * squared:
-        return False
-    flat = np.sqrt(flat2)
-    warp[0] = width * (np.arctan2(x, z) / (2 * np.pi) + 0.5) - 0.5
-    warp[1] = height * (0.5 + np.arctan2(y, flat) / np.pi) - 0.5
-    along = sample * width / (2 * np.pi) / flat2
-    down = sample * height / np.pi / (flat * squared)
-    warp[2] = along * (z * by_i[0] - x * by_i[2])
-    warp[3] = along * (z * by_j[0] - x * by_j[2])
-    warp[4] = down * (flat2 * by_i[1] - y * (x * by_i[0] + z * by_i[2]))
-    warp[5] = down * (flat2 * by_j[1] - y * (x * by_j[0] + z * by_j[2]))
-    return True
-
-
-@_part
-def _derivatives(rotation, ray, tangents, plane, out):
-    """Derivatives (2, 3) of points on a plane through the ray's end, in the other frame's axes: 0
-    facing the camera, 1 level, 2 and 3 upright at 40 degrees to either side."""
-    nx, ny, nz = ray[0], ray[1], ray[2]
-    if plane == 1:
-        nx, ny, nz = 0.0, 1.0, 0.0
-    elif plane > 1:
-        azimuth = np.arctan2(ray[0], ray[2]) + (0.7 if plane == 2 else -0.7)
-        nx, ny, nz = np.sin(azimuth), 0.0, np.cos(azimuth)
-    depth = nx * ray[0] + ny * ray[1] + nz * ray[2]
-    for e in range(2):
-        t = tangents[e]
-        slope = (nx * t[0] + ny * t[1] + nz * t[2]) / depth
-        x, y, z = t[0] - ray[0] * slope, t[1] - ray[1] * slope, t[2] - ray[2] * slope
-        for r in range(3):
-            out[e, r] = rotation[r, 0] * x + rotation[r, 1] * y + rotation[r, 2] * z
-
-
-@_part
-def _to_ray(u, v, width, height, out):
-    """Unit ray of a pixel."""
-    lon, lat = ((u + 0.5) / width - 0.5) * 2 * np.pi, ((v + 0.5) / height - 0.5) * np.pi
-    out[0], out[1], out[2] = np.cos(lat) * np.sin(lon), np.sin(lat), np.cos(lat) * np.cos(lon)
-
-
-@_part
-def _align(image, template, patch, warp):
-    """Correlation after moving and bending an affine warp until the patch fits; -1 = lost."""
-    start_u, start_v = warp[0], warp[1]
-    normal, right, row = np.zeros((6, 6)), np.zeros(6), np.zeros(6)
-    for _ in range(12):
-        if not _cut(image, warp, patch):
-            return np.float32(-1.0)
-        normal[:], right[:] = 0.0, 0.0
-        for j in range(SIDE):
-            for i in range(SIDE):
-                west, east = max(i - 1, 0), min(i + 1, SIDE - 1)
-                north, south = max(j - 1, 0), min(j + 1, SIDE - 1)
-                by_i = (patch[j * SIDE + east] - patch[j * SIDE + west]) / (east - west)
-                by_j = (patch[south * SIDE + i] - patch[north * SIDE + i]) / (south - north)
-                x, y = i - HALF, j - HALF
-                row[0], row[1], row[2] = by_i, by_j, by_i * x
-                row[3], row[4], row[5] = by_i * y, by_j * x, by_j * y
-                off = template[j * SIDE + i] - patch[j * SIDE + i]
-                for a in range(6):
-                    right[a] += row[a] * off
-                    for b in range(6):
-                        normal[a, b] += row[a] * row[b]
-        for a in range(6):
-            normal[a, a] += 1e-4 if a < 2 else 1.2e-3
-        step = np.linalg.solve(normal, right)
-        ui, uj, vi, vj = warp[2], warp[3], warp[4], warp[5]
-        warp[0] += ui * step[0] + uj * step[1]
-        warp[1] += vi * step[0] + vj * step[1]
-        warp[2], warp[3] = ui * (1 + step[2]) + uj * step[4], ui * step[3] + uj * (1 + step[5])
-        warp[4], warp[5] = vi * (1 + step[2]) + vj * step[4], vi * step[3] + vj * (1 + step[5])
-        if abs(step[0]) + abs(step[1]) < 0.02:
-            break
-    moved = (warp[0] - start_u) ** 2 + (warp[1] - start_v) ** 2
-    if moved > 36.0 or warp[2] * warp[5] - warp[3] * warp[4] < 0.1 or not _cut(image, warp, patch):
-        return np.float32(-1.0)
-    return np.float32(np.sum(patch * template))
-
-
-@_kernel
-def _search(image0, image1, rays, rotation, direction, beside, step, sample, scores, places):
-    """Correlation (N,) and ray (N, 3) in the other picture of each patch; -1 = none or not alone.
-
-    Rays x1 = rotation x0 + depth^-1 direction; `beside`: lines to either side of the epipolar one,
-    `step` radians apart.
-    """
-    height0, width0 = image0.shape
-    height1, width1 = image1.shape
-    template, patch = np.empty(AREA, np.float32), np.empty(AREA, np.float32)
-    warp, tangents, normal = np.empty(6), np.empty((2, 3)), np.empty(3)
-    slopes, best, identity = np.empty((4, 2, 3)), np.empty(6), np.eye(3)
-    likes = np.empty(int(np.pi / step) + 1, np.float32)
-    for n in range(len(rays)):
-        scores[n] = -1.0
-        ray = rays[n]
-        flat = np.sqrt(ray[0] * ray[0] + ray[2] * ray[2])
-        tangents[0, 0], tangents[0, 1], tangents[0, 2] = ray[2] / flat, 0.0, -ray[0] / flat
-        tangents[1, 0], tangents[1, 1] = -ray[1] * ray[0] / flat, flat
-        tangents[1, 2] = -ray[1] * ray[2] / flat
-        _derivatives(identity, ray, tangents, 0, slopes[0])
-        if not _place(
-            ray[0], ray[1], ray[2], slopes[0, 0], slopes[0, 1], width0, height0, sample, warp
-        ) or not _cut(image0, warp, template):
-            continue
-        x0 = rotation[0, 0] * ray[0] + rotation[0, 1] * ray[1] + rotation[0, 2] * ray[2]
-        y0 = rotation[1, 0] * ray[0] + rotation[1, 1] * ray[1] + rotation[1, 2] * ray[2]
-        z0 = rotation[2, 0] * ray[0] + rotation[2, 1] * ray[1] + rotation[2, 2] * ray[2]
-        normal[0] = y0 * direction[2] - z0 * direction[1]
-        normal[1] = z0 * direction[0] - x0 * direction[2]
-        normal[2] = x0 * direction[1] - y0 * direction[0]
-        sine = np.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
-        if sine < 0.05:
-            continue  # the epipole: no direction to search
-        angle = np.arctan2(sine, x0 * direction[0] + y0 * direction[1] + z0 * direction[2])
-        for plane in range(4):
-            _derivatives(rotation, ray, tangents, plane, slopes[plane])
-        num, top, at = int((angle - 0.06) / step), np.float32(-1.0), 0
-        for k in range(num):
-            likes[k] = -1.0
-        for k in range(num):
-            nearness = np.sin(k * step) / np.sin(angle - k * step)
-            if nearness > 4.0:
-                break
-            for m in range(-beside, beside + 1):
-                x, y = x0 + nearness * direction[0], y0 + nearness * direction[1]
-                z = z0 + nearness * direction[2]
-                off = m * step * np.sqrt(x * x + y * y + z * z) / sine
-                x, y, z = x + off * normal[0], y + off * normal[1], z + off * normal[2]
-                for plane in range(4):
-                    if plane == 1 and abs(ray[1]) < 0.17:
-                        continue
-                    if not _place(
-                        x, y, z, slopes[plane, 0], slopes[plane, 1], width1, height1, sample, warp
-                    ):
-                        continue
-                    like = _likeness(
-                        image1, warp[0], warp[1], warp[2], warp[3], warp[4], warp[5], template, 0.4
-                    )
-                    likes[k] = max(likes[k], like)
-                    if like > top:
-                        top, at = like, k
-                        for c in range(6):
-                            best[c] = warp[c]
-        second = np.float32(-1.0)
-        for k in range(num):
-            if abs(k - at) * step > BESIDE:
-                second = max(second, likes[k])
-        if top < MIN_LIKENESS or top - second < MIN_MARGIN:
-            continue
-        like = _align(image1, template, patch, best)
-        if like > MIN_LIKENESS:
-            scores[n] = like
-            _to_ray(best[0], best[1], width1, height1, places[n])
 
 
 @dataclass(frozen=True, slots=True)
@@ -353,7 +118,7 @@ def search(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Rows of keys that are found in the other frame, and their rays (M, 3) there."""
     rays = np.ascontiguousarray(one.keys[rows])
-    scores, places = np.empty(len(rays), np.float32), np.zeros((len(rays), 3))
+    scores, pixels = np.empty(len(rays), np.float32), np.zeros((len(rays), 2))
     pictures = (one.half, other.half) if coarse else (one.picture, other.picture)
     scale = 2 if coarse else 1
     rotation = np.ascontiguousarray(f1_T_f0[:3, :3])
@@ -361,9 +126,10 @@ def search(
     step = np.deg2rad(LINE_STEP_DEG) * scale
     beside = int(beside_deg / LINE_STEP_DEG / scale + 0.5)
     sample = SAMPLE_RAD * scale
-    _search(*pictures, rays, rotation, direction, beside, step, sample, scores, places)
+    search_patches(*pictures, rays, rotation, direction, beside, step, sample, scores, pixels)
     found = scores > 0
-    return rows[found], places[found]
+    height, width = pictures[1].shape
+    return rows[found], bearings_from_erp(pixels[found], width, height)
 
 
 def triangulated(
@@ -426,6 +192,11 @@ def adjusted_pose(
     return pose(rotation, direction)
 
 
+def rank_of(num: int, num_sound: int) -> float:
+    """Geometric mean of the keypoints that fit a hypothesis, all and sound ones."""
+    return float(np.sqrt((1 + num_sound) * (1 + num)))
+
+
 def better(
     rays0: np.ndarray,
     rays1: np.ndarray,
@@ -448,7 +219,7 @@ def better(
 
 
 def differ(one: np.ndarray, other: np.ndarray, turn_deg: float, direction_deg: float) -> bool:
-    """Whether two poses are further apart than these angles."""
+    """True if two poses differ by more than one of these angles."""
     turn, direction = errors(one, other)
     return turn > turn_deg or direction > direction_deg
 
@@ -518,7 +289,7 @@ def ranked_roughly(one: View, other: View, f1_T_f0: np.ndarray) -> tuple[float, 
     good, parallax, _ = fits(one.keys[rows], places, f1_T_f0, 0.2)
     good &= parallax > MIN_PARALLAX
     num_sound = np.count_nonzero(good & one.sound[rows])
-    return float(np.sqrt((1 + num_sound) * (1 + np.count_nonzero(good)))), f1_T_f0
+    return rank_of(int(np.count_nonzero(good)), int(num_sound)), f1_T_f0
 
 
 def refined(one: View, other: View, f1_T_f0: np.ndarray) -> Step | None:
@@ -546,7 +317,7 @@ def refined(one: View, other: View, f1_T_f0: np.ndarray) -> Step | None:
         rays[-1][rows[good]] = places[good]
         num += int(np.count_nonzero(good))
         num_sound += int(np.count_nonzero(good & view.sound[rows]))
-    rank = float(np.sqrt((1 + num_sound) * (1 + num)))
+    rank = rank_of(num, num_sound)
     return Step(f1_T_f0, depths[0], depths[1], rays[0], rays[1], rank, num)
 
 
@@ -604,19 +375,15 @@ def maps_of(chain: list[Step], views: list[View]) -> list[tuple[int, np.ndarray]
         if last - first >= 2:
             logs = np.array([ratio for _, _, ratio in between[first : last - 1]])
             some, seen = chain[first:last], views[first : last + 1]
-            found.append((first, adjusted(chained(some, logs), some, seen)))
+            found.append((first, adjusted(metric_chain(some, logs), some, seen)))
     return found
 
 
-def chained(steps: list[Step], logs: np.ndarray) -> np.ndarray:
+def metric_chain(steps: list[Step], logs: np.ndarray) -> np.ndarray:
     """Poses (F, 4, 4) of the frames, the first step having length one."""
-    poses, length = [np.eye(4)], 1.0
-    for k, step in enumerate(steps):
-        length *= float(np.exp(logs[k - 1])) if k else 1.0
-        relative = step.f1_T_f0.copy()
-        relative[:3, 3] *= length
-        poses.append(poses[-1] @ inverse(relative))
-    return np.array(poses)
+    f0_T_f1s = inverse(np.array([step.f1_T_f0 for step in steps]))
+    f0_T_f1s[:, :3, 3] *= np.exp(np.r_[0.0, np.cumsum(logs)])[:, None]
+    return chained(f0_T_f1s)
 
 
 def adjusted(poses: np.ndarray, steps: list[Step], views: list[View]) -> np.ndarray:

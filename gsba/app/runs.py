@@ -14,7 +14,7 @@ from gsba.config import CameraSettings
 from gsba.pipeline.stage_titles import LENS_CENTRES, READOUTS, RECONSTRUCTION, is_one_of
 from gsba.report.camera_findings import of_camera
 from gsba.report.html.figures import viewing_axes
-from gsba.report.maps import refined_frames
+from gsba.report.maps import format_frame_counts
 from gsba.store.folder import STAGES, is_run_folder
 from gsba.store.records import RecordError, load_arrays, load_record
 
@@ -31,7 +31,7 @@ def overview(run: Path) -> dict[str, Any]:
     """Figures of a finished run for a page; "finished" is False where there is no report yet."""
     try:
         report = json.loads((run / "report.json").read_text(encoding="utf-8"))
-        summary, counts = report["summary"], refined_frames(report)
+        summary, counts = report["summary"], format_frame_counts(report)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return {"finished": False, "run": is_run_folder(run)}
     return {

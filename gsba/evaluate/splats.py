@@ -41,7 +41,6 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-_HELD_OUT_EVERY = 8  # one panorama of so many is measured, as in the literature
 NO_LPIPS = "not computed: no weights"
 
 
@@ -120,7 +119,7 @@ def compare(
     usable = refined_frames(reconstruction)
     for poses in sources.values():
         usable = usable & np.isfinite(poses).all(axis=(1, 2))
-    split = split_frames(usable, _HELD_OUT_EVERY)
+    split = split_frames(usable)
     own = reconstruction.world_T_rigs[usable]
     sources = {name: _beside(poses, usable, own) for name, poses in sources.items()}
     size = settings.face_size

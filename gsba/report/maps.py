@@ -79,7 +79,7 @@ def format_outcome(report: Mapping[str, Any], run: object) -> str:
     residual, found = summary["median_residual_deg"], "rotations only, no points"
     if residual is not None:
         found = f"{summary['points']} points, median residual {residual:.4f} deg"
-    first = f"{refined_frames(report)}, {found}: {run}"
+    first = f"{format_frame_counts(report)}, {found}: {run}"
     verdict, table = report["verdict"], _table(maps) if len(maps) > 1 else []
     reasons = [f"- {one['line']}" for one in verdict["reasons"][:5]]
     more = len(verdict["reasons"]) - len(reasons)
@@ -87,7 +87,7 @@ def format_outcome(report: Mapping[str, Any], run: object) -> str:
     return "\n".join([first, *table, *reasons, verdict["sentence"]])
 
 
-def refined_frames(report: Mapping[str, Any]) -> str:
+def format_frame_counts(report: Mapping[str, Any]) -> str:
     """Number of refined frames by a report.json of any version, and in brackets where the other
     frames are."""
     numbers = {"exported": report["summary"]["refined"], **report["summary"]}

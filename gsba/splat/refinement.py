@@ -29,6 +29,7 @@ from gsba.bundle.optimizer import OptimizeResult, optimize
 from gsba.bundle.reconstruction import MIN_OBSERVATIONS
 from gsba.camera.views import ONE_EYE, Optics
 from gsba.config import SplatSettings
+from gsba.frames.held_out import HOLD_OUT_EVERY
 from gsba.splat.alignment import Captured, SplatGreys, capture, splat_block
 from gsba.splat.backend import choose_backend
 from gsba.splat.gaussians import Gaussians, from_cloud
@@ -44,7 +45,7 @@ _FIRST_STEPS = 400  # training steps before poses move at each size
 _STEPS = 150  # training steps after each move, before held-out panoramas compare the poses
 _MAX_MOVES = 3  # most updates of the poses at each size
 _MAX_GROWTH = 1.05  # of the geometric cost, or a move is undone
-_HELD_OUT_EVERY = 8  # one panorama of so many is held out of training
+_HELD_OUT_EVERY = HOLD_OUT_EVERY  # one panorama of so many judges the poses
 
 logger = logging.getLogger(__name__)
 

@@ -9,7 +9,7 @@ from gsba.bundle import triangulation
 from gsba.camera.rig import CubeRig
 from gsba.camera.views import ONE_EYE, Optics, View, turned_rigs
 from gsba.frames import cubemap
-from gsba.frames.held_out import held_out_rows
+from gsba.frames.held_out import HOLD_OUT_EVERY, held_out_rows
 from gsba.frames.masks import load_mask
 from gsba.frames.pixels import cut_views
 from gsba.log import GsbaError, track
@@ -43,9 +43,9 @@ class Split:
     held_out: np.ndarray  # (H,) int, frame indices: whole panoramas
 
 
-def split_frames(usable: np.ndarray, every: int) -> Split:
-    """Hold out every n-th of the usable panoramas (F,), n at least 2, as exports do. GsbaError: too
-    few frames for both parts."""
+def split_frames(usable: np.ndarray, every: int = HOLD_OUT_EVERY) -> Split:
+    """Hold out one of `every` usable panoramas (F,), by default as exports do. GsbaError: too few
+    frames for both parts."""
     rows = np.flatnonzero(usable)
     held = held_out_rows(len(rows), every)
     if len(rows) - len(held) < 2:

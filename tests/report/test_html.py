@@ -294,7 +294,7 @@ def test_script_runs(page: Path) -> None:
 
 
 def _patches(frames: FrameSet, result: Reconstruction) -> list:
-    found = worst_patches(frames, result, ONE_CAMERA)
+    found = worst_patches(frames, result, ONE_CAMERA, pictures.worst_frames(result))
     assert all(entry["frame"] != entry["reference"] for entry in found)
     return found
 

@@ -98,11 +98,11 @@ def test_bad_options_are_one_line(run: Path, option: tuple[str, str]) -> None:
 def test_held_out_frames_are_whole_and_spread() -> None:
     usable = np.ones(20, bool)
     usable[3] = False
-    split = scene.split_frames(usable, 8)
+    split = scene.split_frames(usable)
     assert split.held_out.tolist() == [4, 10, 16] and len(split.training) == 16
     assert not np.isin(3, split.training)
     with pytest.raises(GsbaError, match="too few"):
-        scene.split_frames(usable[:2], 8)
+        scene.split_frames(usable[:2])
 
 
 def test_start_cloud_lies_in_the_world_of_the_poses(case: Case) -> None:

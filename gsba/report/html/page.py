@@ -50,8 +50,8 @@ def write_html(
         report: content of report.json.
         cameras: lenses of the frames, in the unit of the reconstruction.
     """
-    found = []
-    for f in pictures.worst_frames(reconstruction):
+    found, worst = [], pictures.worst_frames(reconstruction)
+    for f in worst:
         try:
             found.append(pictures.picture(frames, reconstruction, f))
         except GsbaError as error:
@@ -67,7 +67,7 @@ def write_html(
         "erp_width": max(kind.panorama_width for kind in frames.formats),
         "recordings": list(frames.recordings),
         "worst": found,
-        "patches": worst_patches(frames, reconstruction, cameras),
+        "patches": worst_patches(frames, reconstruction, cameras, worst),
         "pictures": frame_pictures(frames, reconstruction, report.get("camera")),
         "scan": None,
         "splat": None,

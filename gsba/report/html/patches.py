@@ -1,6 +1,7 @@
 """Patches that fit worst: a point's surroundings in one frame, and as another frame shows them."""
 
 import base64
+from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
@@ -12,7 +13,7 @@ from gsba.camera.sphere import erp_from_bearings
 from gsba.geometry import unit
 from gsba.log import GsbaError
 from gsba.report.html.figures import level_axes
-from gsba.report.html.pictures import residuals_of_rows, small_panorama, worst_frames
+from gsba.report.html.pictures import residuals_of_rows, small_panorama
 from gsba.types import FrameSet, Reconstruction
 
 _REACH = 12  # pixels from a patch's centre to its edge
@@ -20,9 +21,9 @@ _MAX_WIDTH = 2048  # pixels of the panoramas that patches are cut from
 
 
 def worst_patches(
-    frames: FrameSet, reconstruction: Reconstruction, cameras: Cameras
+    frames: FrameSet, reconstruction: Reconstruction, cameras: Cameras, worst: Sequence[int]
 ) -> list[dict[str, Any]]:
-    """Of each frame with the largest residuals the point that fits worst.
+    """The point that fits worst of each of the worst frames.
 
     The surface around the point faces the reference, the frame in which the point fits best.
 
@@ -40,7 +41,7 @@ def worst_patches(
         return small_panorama(frames, f, width).mean(axis=2).astype(np.float32)
 
     found = []
-    for f in worst_frames(reconstruction):
+    for f in worst:
         row, host, residual = _worst_observation(reconstruction, f)
         point = reconstruction.points_world[reconstruction.observation_points[row]]
         grid = _facing_plane(point, reconstruction.world_T_rigs[host], 2 * np.pi / width)
