@@ -11,7 +11,9 @@ from gsba.camera.straighten import PAD
 from gsba.frames.masks import load_usable
 from gsba.frames.pixels import load_erp, load_faces
 from gsba.types import FACES, FrameSet, PictureFormat
+from gsba.types.records import slices
 
+_ROWS_AT_ONCE = 256  # rows whose coordinates are held in double precision at once
 _PADDING_PX = 3  # pixels copied from a face's neighbours: the support of bicubic sampling, and one
 
 
@@ -41,15 +43,15 @@ def load_grey(frames: FrameSet, frame: int, width: int) -> tuple[np.ndarray, np.
         grey = fitted_to(load_erp(frames, frame, gray=True, width=width), width)
         return grey, None if mask is None else fit_mask(mask, width)
     size = kind.width
+    while size % 2 == 0 and 2 * size >= width:  # averaged down before they are joined
+        size //= 2
     faces = np.zeros((len(FACES), size, size), np.uint8)
     present = [FACES.index(name) for name in kind.faces]
-    faces[present] = load_faces(frames, frame, gray=True)
+    faces[present] = load_faces(frames, frame, gray=True, size=size)
     native = 4 * size
     maps, owners = _erp_maps(size, native)
-    grey = np.empty(owners.shape, np.uint8)
-    for face, padded in enumerate(_padded(faces)):
-        own = owners == face
-        grey[own] = cv2.remap(padded, maps[0], maps[1], cv2.INTER_CUBIC)[own]
+    atlas = np.block([[left, right] for left, right in _padded(faces).reshape(3, 2, *_shape(size))])
+    grey = cv2.remap(atlas, maps[0], maps[1], cv2.INTER_CUBIC)
     usable = np.isin(owners, present)
     if mask is not None:
         usable &= fit_mask(mask, native)
@@ -124,14 +126,25 @@ def fit_mask(mask: np.ndarray, width: int) -> np.ndarray:
     return share > 0.999
 
 
+def _shape(size: int) -> tuple[int, int]:
+    """Height and width of a padded face."""
+    return size + 2 * _PADDING_PX, size + 2 * _PADDING_PX
+
+
 @functools.lru_cache(maxsize=2)
 def _erp_maps(size: int, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """Places (2, H, W) float32 in the padded owner faces, OpenCV pixels; owners (H, W) uint8."""
-    centres = np.meshgrid(np.arange(width) + 0.5, np.arange(width // 2) + 0.5)
-    bearings = bearings_from_erp(np.stack(centres, axis=-1), width, width // 2)
-    owners = owner_faces(bearings)
-    pixels = CubeRig(size, np.pi / 2).project(bearings, owners)
-    return np.moveaxis(pixels - 0.5 + _PADDING_PX, -1, 0).astype(np.float32), owners
+    """Places (2, H, W) float32, OpenCV pixels, in the padded owner faces, which lie in two columns
+    of three; owners (H, W) uint8."""
+    rig, shape = CubeRig(size, np.pi / 2), (width // 2, width)
+    maps, owners = np.empty((2, *shape), np.float32), np.empty(shape, np.uint8)
+    for rows in slices(width // 2, _ROWS_AT_ONCE):
+        centres = np.meshgrid(np.arange(width) + 0.5, np.arange(rows.start, rows.stop) + 0.5)
+        bearings = bearings_from_erp(np.stack(centres, axis=-1), width, width // 2)
+        owners[rows] = owner_faces(bearings)
+        pixels = rig.project(bearings, owners[rows])
+        corners = np.stack([owners[rows] % 2, owners[rows] // 2], axis=-1) * _shape(size)
+        maps[:, rows] = np.moveaxis(pixels - 0.5 + _PADDING_PX + corners, -1, 0)
+    return maps, owners
 
 
 @functools.lru_cache(maxsize=2)
@@ -139,11 +152,13 @@ def _border_maps(size: int) -> tuple[np.ndarray, np.ndarray]:
     """Owner pixels of the padding of each face, like `_erp_maps`: (2, 6, N, N) and (6, N, N)."""
     rig = CubeRig(size, np.pi / 2)
     places = np.arange(-_PADDING_PX, size + _PADDING_PX) + 0.5
-    grid = np.stack(np.meshgrid(places, places), axis=-1)
-    bearings = np.stack([rig.bearings(grid, face) for face in range(len(FACES))])
-    owners = owner_faces(bearings)
-    pixels = rig.project(bearings, owners)
-    return np.moveaxis(pixels - 0.5, -1, 0).astype(np.float32), owners
+    grid, shape = np.stack(np.meshgrid(places, places), axis=-1), (len(FACES), *2 * places.shape)
+    maps, owners = np.empty((2, *shape), np.float32), np.empty(shape, np.uint8)
+    for face in range(len(FACES)):
+        bearings = rig.bearings(grid, face)
+        owners[face] = owner_faces(bearings)
+        maps[:, face] = np.moveaxis(rig.project(bearings, owners[face]) - 0.5, -1, 0)
+    return maps, owners
 
 
 def _padded(faces: np.ndarray) -> np.ndarray:

@@ -45,7 +45,7 @@ MIN_FRAMES = 3
 _SIDE_FACES = ("front", "right", "back", "left")
 _TIMES_FILE = "timestamps.csv"
 _TAGGED = re.compile(rf"(?P<name>.+)_(?P<face>{'|'.join(FACES)})", re.IGNORECASE)
-_UNSUPPORTED_FORMATS = {  # images that are not read, by suffix
+UNSUPPORTED_FORMATS = {  # images that are not read, by suffix
     ".avif": "AVIF",
     ".36p": "GoPro .36P",
     ".bmp": "BMP",
@@ -313,7 +313,7 @@ def _find_frames(folder: Path) -> tuple[str, tuple[str, ...], dict[str, tuple[Pa
     places = [folder, *(path for path in entries if path.name.lower() in FACES and path.is_dir())]
     # "2 TIFF and 1 WebP images", of unsupported formats, or ""
     paths = (path for place in places for path in entries_of(place))
-    kinds = [_UNSUPPORTED_FORMATS.get(path.suffix.lower()) for path in paths if path.name[0] != "."]
+    kinds = [UNSUPPORTED_FORMATS.get(path.suffix.lower()) for path in paths if path.name[0] != "."]
     counts = sorted(Counter(kind for kind in kinds if kind).items())
     *front, last = [f"{n} {kind}" for kind, n in counts] or [""]
     text = f"{', '.join(front)} and {last}" if front else last

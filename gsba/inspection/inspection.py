@@ -7,6 +7,7 @@ from typing import Any
 
 from gsba import video
 from gsba.frames.files import is_image
+from gsba.frames.scan import UNSUPPORTED_FORMATS
 from gsba.inspection import footage, pictures
 from gsba.inspection.footage import Facts
 from gsba.log import GsbaError
@@ -42,6 +43,9 @@ def inspect(path: Path) -> Inspection:
         found = footage.of_video(path)
     elif is_image(path):
         found = pictures.of_picture(path)  # which alone cannot be refined
+    elif path.suffix.lower() in UNSUPPORTED_FORMATS:
+        kind = UNSUPPORTED_FORMATS[path.suffix.lower()]
+        raise GsbaError(f"{path}: {kind} is not read: convert it to JPEG, PNG, WebP or TIFF")
     elif path.exists():
         raise GsbaError(f"{path} is no video, image or folder of images")
     else:

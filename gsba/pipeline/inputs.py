@@ -38,6 +38,8 @@ logger = logging.getLogger(__name__)
 
 _WITH_GYRO = (".insv", ".osv", ".360")  # raw videos that may hold readings
 CHOSEN = Path("odometry/chosen.tum")  # in a run's folder: frames that the odometry has chosen
+# Odometry is lost in videos of frames far apart, as time lapses are: so many are matched as stills.
+_FRAMES_OF_A_LOST_VIDEO = 300
 
 
 def trajectory_files(
@@ -268,9 +270,14 @@ def extract_video(
     found: Odometry | None = None
     if by_odometry is not None:
         found = _follow(store, video_file, settings, by_odometry, calibration, name)
-    if found is not None:
-        at = store.root / chosen_frames(name)
-        chosen = chosen.model_copy(update={"at": str(at), "sharpest": False})
+        if found.usable():
+            at = store.root / chosen_frames(name)
+            chosen = chosen.model_copy(update={"at": str(at), "sharpest": False})
+        else:
+            times = found.timestamps
+            fps = max(chosen.fps, _FRAMES_OF_A_LOST_VIDEO / max(times[-1] - times[0], 1.0))
+            logger.warning("the odometry lost the camera in most of the video: frames are stills")
+            chosen, found = chosen.model_copy(update={"fps": fps}), None
     folder.parent.mkdir(parents=True, exist_ok=True)
     video.extract(video_file, folder, chosen, replace=True)
     store.claim(folder)
@@ -289,8 +296,8 @@ def _follow(
     masks: Choice,
     calibration: Path | None,
     name: str,
-) -> Odometry | None:
-    """Odometry of a video, written to the run's folder; None where it lost the camera mostly."""
+) -> Odometry:
+    """Odometry of a video; if it is usable, written to the run's folder with the chosen frames."""
     start, end = settings.video.from_s, settings.video.to_s
     width, seed = settings.odometry.width, settings.seed
     stage = f"odometry@{name}" if name else "odometry"
@@ -308,8 +315,7 @@ def _follow(
     key = [width, seed, (start, end), masks.carrier, files]
     found = store.stage(stage, key, compute, Odometry)
     if not found.usable():
-        logger.warning("the odometry lost the camera in most of the video: frames at a fixed rate")
-        return None
+        return found
     rows = odometry.choose_frames(found, settings.odometry)
     logger.info("%d of %d frames chosen by what they show", len(rows), len(found))
     at = store.root / chosen_frames(name)

@@ -129,7 +129,8 @@ def _held_steps(report: Mapping[str, Any], names: Sequence[str]) -> tuple[int, .
 MAX_POSITION_ERROR = 0.01  # of the extent, of a map that is good to train on
 MAX_UNSHARP_ERROR = 0.1  # of the extent; beyond, images do not determine the map
 MAX_CONTRADICTED_SHARE = 0.25  # of the steps, by far frames
-MAX_HELD_SHARE = 0.25  # of the steps, by a start that images contradict elsewhere
+MAX_HELD_SHARE = 0.5  # of the steps, by the start alone
+MAX_DOUBTED_SHARE = 0.25  # of the steps, by a start that images contradict elsewhere
 MAX_FALSE_SHARE = 0.1  # of the start's steps; above it the others are in doubt, too
 _MAX_NAMED_FRAMES = 6  # of a reason, in a line of text
 
@@ -259,7 +260,8 @@ class _Tests:
         false, doubt, level = self.figures.false_steps, "", Level.LOOK
         if false > MAX_FALSE_SHARE * num:
             doubt = f", though images contradict it at {false} others"
-            level = Level.REFUSED if len(held) > MAX_HELD_SHARE * num else level
+        if len(held) > (MAX_DOUBTED_SHARE if doubt else MAX_HELD_SHARE) * num:
+            level = Level.REFUSED
         cause = (
             f"no image shows {len(held)} of {num} steps: there the {self._start} is believed as it "
             f"is{doubt}"

@@ -49,6 +49,13 @@ def test_cube_faces_join_without_a_seam(tmp_path: Path) -> None:
     np.testing.assert_allclose(grey, _smooth(_erp_bearings(width)), atol=1.6)
 
 
+def test_large_cube_faces_are_averaged_down(tmp_path: Path) -> None:
+    frames, width = _cube(tmp_path, FACES), SIZE
+    grey, mask = load_grey(frames, 0, width)
+    assert grey.shape == (width // 2, width) and mask is None
+    np.testing.assert_allclose(grey, _smooth(_erp_bearings(width)), atol=2.0)
+
+
 def test_missing_faces_are_masked(tmp_path: Path) -> None:
     frames = _cube(tmp_path, FACES[:4])
     _, mask = load_grey(frames, 0, width_for(frames.format, 4096))

@@ -85,8 +85,10 @@ def test_what_would_be_refused_says_why(tmp_path: Path) -> None:
 
 
 def test_neither_footage_nor_there(tmp_path: Path) -> None:
-    (tmp_path / "notes.txt").write_text("hello")
-    for name, why in (("notes.txt", "no video, image or folder"), ("nowhere", "no such file")):
+    for name in ("notes.txt", "GS01.36P"):
+        (tmp_path / name).write_text("hello")
+    refused = ("notes.txt", "no video, image or folder"), ("GS01.36P", "GoPro .36P is not read")
+    for name, why in (*refused, ("nowhere", "no such file")):
         with pytest.raises(GsbaError, match=why):
             inspect(tmp_path / name)
 

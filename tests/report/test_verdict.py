@@ -65,6 +65,7 @@ def test_lengths_are_metres_where_the_scale_is_known_and_the_camera_is_named() -
     [
         ({"held_steps": (3,)}, Level.LOOK, "003 004", "no image shows 1 of 19 steps: there the"),
         ({"held_steps": tuple(range(9))}, Level.LOOK, None, "no image shows 9 of 19 steps"),
+        ({"held_steps": tuple(range(10))}, Level.REFUSED, None, "no image shows 10 of 19 steps"),
         (
             {"held_steps": tuple(range(9)), "false_steps": 3},
             Level.REFUSED,

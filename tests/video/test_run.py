@@ -6,11 +6,15 @@ import cv2
 import numpy as np
 import pytest
 from tiny_run import SETTINGS, Case, computed_stages
-from video_files import encode
+from video_files import encode, steady, times_of
+from wave_panorama import wave_panorama
 
 from gsba import refine
-from gsba.config import VideoSettings
+from gsba.config import RefineSettings, VideoSettings
 from gsba.log import GsbaError
+from gsba.masks.merging import choose
+from gsba.pipeline.inputs import extract_video
+from gsba.store import RunStore
 from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.video import extract
 
@@ -37,6 +41,15 @@ def test_video_and_folder_give_the_same(case: Case, tmp_path: Path) -> None:
     assert case.errors(out).ate.rmse < 3 * case.errors().ate.rmse  # as good as from the images
 
     assert computed_stages(refine(video, case.slam, out, settings)) == []  # resumed
+
+
+def test_where_odometry_is_lost_frames_are_stills(tmp_path: Path) -> None:
+    video, settings = tmp_path / "lapse.mp4", RefineSettings()
+    encode(video, ([wave_panorama(256, seed) for seed in range(8)], steady(8)))
+    with RunStore(tmp_path / "run", {"frames": video}) as store:
+        found = extract_video(store, video, settings, None, choose("none"))
+    assert found is None
+    assert len(times_of(tmp_path / "run/frames")) == 8  # at one a second it would be one
 
 
 def test_bad_input_fails_before_decoding(tmp_path: Path) -> None:
