@@ -39,6 +39,8 @@ class Figures:
     # (n,) steps that no image shows: their poses are those of the start.
     held_steps: tuple[int, ...]
     false_steps: int  # number of the start's steps that images contradict
+    # Number of steps between frames of the run that match nothing; 0 of a run that has a start.
+    unmatched_steps: int
     unrefined: tuple[int, ...]  # (n,) frames whose poses are those of the start
     scale_changes: tuple[float, ...]  # (F - 1,) that may hide at each step, see `scale_handover`
     moved_by_scale: tuple[float, ...]  # (F - 1,) part of the extent by which such a change moves
@@ -81,6 +83,7 @@ def measure(report: Mapping[str, Any], main: Reconstruction, shown: FrameSet) ->
         extent_metres=extent * _metres_per_unit(report),
         held_steps=_held_steps(report, shown.names),
         false_steps=len(checks.get("false_steps", ())),
+        unmatched_steps=len(checks.get("unseen_steps", ())) if _has_no_start(report) else 0,
         unrefined=tuple(np.flatnonzero(main.pose_statuses != PoseStatus.REFINED).tolist()),
         scale_changes=changes,
         moved_by_scale=moved,
@@ -116,10 +119,15 @@ def _metres_per_unit(report: Mapping[str, Any]) -> float:
     return float((report.get("camera") or {}).get("metres_per_unit") or math.nan)
 
 
+def _has_no_start(report: Mapping[str, Any]) -> bool:
+    """True if images alone gave all poses at the start."""
+    return {row["coarse_pose"] for row in report["frames"]} <= _NO_START
+
+
 def _held_steps(report: Mapping[str, Any], names: Sequence[str]) -> tuple[int, ...]:
     """Steps of the exported map whose poses the start alone gives, by their first frames' rows."""
     checks, rows = report["trajectory"] or {}, {name: row for row, name in enumerate(names)}
-    if {row["coarse_pose"] for row in report["frames"]} <= _NO_START:
+    if _has_no_start(report):
         return ()
     false = set(map(tuple, checks.get("false_steps", ())))
     held = [step for step in map(tuple, checks.get("unseen_steps", ())) if step not in false]
@@ -131,6 +139,7 @@ MAX_UNSHARP_ERROR = 0.1  # of the extent; beyond, images do not determine the ma
 MAX_CONTRADICTED_SHARE = 0.25  # of the steps, by far frames
 MAX_HELD_SHARE = 0.5  # of the steps, by the start alone
 MAX_DOUBTED_SHARE = 0.25  # of the steps, by a start that images contradict elsewhere
+MAX_UNMATCHED_SHARE = 0.25  # of a run's steps, where frames are missing and no start is given
 MAX_FALSE_SHARE = 0.1  # of the start's steps; above it the others are in doubt, too
 _MAX_NAMED_FRAMES = 6  # of a reason, in a line of text
 
@@ -242,6 +251,13 @@ class _Tests:
         if len(self.report["maps"]) > 1:
             remedy = f"gsba export RUN --map 2 exports the next map; {remedy}"
         level = Level.REFUSED if exported < MIN_SHARE_OF_A_MAP * num else Level.LOOK
+        unmatched = self.figures.unmatched_steps
+        if unmatched > MAX_UNMATCHED_SHARE * (num - 1):
+            level = Level.REFUSED
+            cause += (
+                f", {unmatched} of {num - 1} neighbours do not match: frames are so far apart that "
+                "those of the map may have matched what only looks alike"
+            )
         yield Reason(level, out, f"{cause} ({why})" if why else cause, remedy)
 
     def _unrefined(self) -> Iterator[Reason]:

@@ -21,6 +21,7 @@ GOOD = Figures(
     extent_metres=math.nan,
     held_steps=(),
     false_steps=0,
+    unmatched_steps=0,
     unrefined=(),
     scale_changes=(math.nan, *(0.003,) * (NUM - 3), math.nan),
     moved_by_scale=(math.nan, *(0.0007,) * (NUM - 3), math.nan),
@@ -116,6 +117,14 @@ def test_frames_that_are_not_exported_are_named(inside: int, level: Level) -> No
     assert f"tie {NUM - inside} of 20 frames to the exported map (too few matches)" in reason.cause
     assert "gsba export RUN --map 2" in reason.remedy
     assert f"{inside} of 20 frames are in the map" in found.sentence
+
+
+@pytest.mark.parametrize(("unmatched", "level"), [(4, "LOOK"), (5, "REFUSED")])
+def test_a_part_of_frames_far_apart_is_not_to_train_on(unmatched: int, level: str) -> None:
+    found = _verdict(replace(GOOD, exported=19, unmatched_steps=unmatched), NAMES[:19])
+    assert found.level == Level[level]
+    assert (f"{unmatched} of 19 neighbours do not match" in found.sentence) == (level == "REFUSED")
+    assert _verdict(replace(GOOD, unmatched_steps=unmatched)).level == Level.GOOD
 
 
 def test_the_worst_reason_is_the_first_and_gives_the_level() -> None:
