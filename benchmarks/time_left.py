@@ -90,7 +90,7 @@ def spent(events: Sequence[dict[str, Any]]) -> list[_Spent]:
         under_lenses |= UNDER_LENSES.fullmatch(name) is not None
         number = phase_of(name)
         if at is not None and number != at[0]:
-            known = replace(at[1], observations=told.size.observations)
+            known = replace(at[1], observations=told.size.observations, more=told.size.more)
             rows.append((at[0], passes, known, *(entry[c] - at[2][c] for c in ("quiet", "thread"))))
             passes += number is not None and number <= FEATURES < at[0]
             at = None
@@ -99,6 +99,7 @@ def spent(events: Sequence[dict[str, Any]]) -> list[_Spent]:
     if size is None:
         return []
     last = {phase for phase, number, *_ in rows if number == passes}
+    size = replace(size, more=told.size is not None and told.size.more)
     rows += [(n, passes, size, 0.0, 0.0) for n in range(1, len(PHASES)) if n not in last]
     total = events[-1]["quiet"]
     return [
@@ -118,7 +119,7 @@ def fit(runs: Sequence[Sequence[dict[str, Any]]]) -> None:
     rows = [row for events in runs for row in spent(events)]
     for number in range(len(PHASES)):
         chosen = [row for row in rows if row.phase == number]
-        weights = np.array([1 / row.total for row in chosen])
+        weights = np.array([1 / (row.seconds + 0.4 * row.total) for row in chosen])
         terms = np.array([row.size.terms(number) for row in chosen]) * weights[:, None]
         costs, _ = nnls(terms, np.array([row.seconds for row in chosen]) * weights)
         serial = sum(row.serial for row in chosen) / sum(row.seconds for row in chosen)

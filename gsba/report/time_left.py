@@ -32,28 +32,28 @@ PHASES = (
     r"\w*align(ed)?4(_\d+)?|stitching4|settled_aligned5",
     r"imu_final|camera|reconstruction|lenses|map|export-.*",
 )
-FEATURES, CAMERA, KNOWN, FIRST_PATCHES, LAST_PATCHES = 1, 5, 7, 8, 11  # numbers of phases
+FEATURES, CAMERA, WEAK, KNOWN, FIRST_PATCHES, LAST_PATCHES = 1, 5, 6, 7, 8, 11  # of phases
 # Of each phase: share of its seconds in which one thread works alone, and coefficients of
 # `Size.terms`, seconds on two cores. Made by `python -m benchmarks.time_left fit`.
 _COSTS = (
-    (0.556, 0.287, 0, 0.00376, 0, 0, 0.000328, 0, 0.00918),
-    (0.0254, 0.188, 0.013, 0, 0.0371, 0, 0, 0.01, 0),
-    (0.11, 0.081, 0.0118, 0.000121, 0.00341, 0.0167, 0, 0, 0.00356),
-    (0.473, 0.0959, 0.00623, 5.58e-05, 0.00506, 0, 0.000375, 0.000142, 0.00173),
-    (0.415, 0.0632, 0.0103, 0, 0.00404, 0, 0, 0.00104, 0),
-    (0.616, 0.11, 0, 0.00135, 0.00604, 0, 0.0328, 0.0156, 0.247),
-    (0.0582, 0, 0.0256, 0.00785, 0, 0.0349, 0, 0, 0),
-    (0.333, 0.0599, 0.0125, 0, 0, 0, 0, 0, 0),
-    (0.535, 0.0874, 0.0106, 0.0151, 0, 0, 0.0833, 0, 0.0133),
-    (0.526, 0.0186, 0.0124, 0.0132, 0, 0, 0.0657, 0, 0.00386),
-    (0.558, 0.141, 0.00514, 0.0107, 0, 0.00145, 0.059, 0, 0.0187),
-    (0.561, 0, 0, 0.00808, 0, 0, 0.0234, 0.0306, 0.0107),
-    (0.643, 0.18, 0, 0.0547, 0, 0, 0.0039, 0.0278, 0),
+    (0.586, 0.211, 0, 0.00338, 0, 0, 0, 0, 0.01, 0.0136),
+    (0.0246, 0.0791, 0.0161, 0.00024, 0.0318, 0, 0, 0.00946, 0, 0.0156),
+    (0.113, 0.0772, 0.0111, 4.07e-05, 0.00473, 0.0168, 0, 0.00656, 0, 0),
+    (0.465, 0.0601, 0.00743, 0.000394, 0.00248, 0, 0, 0.000324, 0.00225, 0.00556),
+    (0.457, 0.067, 0.00936, 0, 0.0029, 0, 0, 0.0331, 0, 0),
+    (0.637, 0.046, 0.00028, 0.000618, 0.00709, 0.00145, 0.0368, 0.00804, 0.203, 0.00638),
+    (0.0617, 0.069, 0.0163, 0.00124, 0, 0.0286, 0, 0.00909, 0.0057, 0),
+    (0.333, 0.0607, 0.0122, 0, 0, 0, 0, 0, 0, 0),
+    (0.594, 0.0707, 0.0129, 0.0108, 0, 0, 0.0833, 0, 0.0149, 0),
+    (0.584, 0.0197, 0.0136, 0.00919, 0, 0, 0.0646, 0, 0.0055, 0),
+    (0.607, 0.15, 0.00605, 0.00755, 0, 0.000629, 0.0593, 0, 0.0154, 0),
+    (0.601, 0, 0, 0.00724, 0, 0, 0.0263, 0.026, 0.0124, 0),
+    (0.65, 0.267, 0.000903, 0.0439, 0, 0, 0.000523, 0.0171, 0, 0),
 )
 # Nothing tells beforehand which of these comes: expectations that were off least in the runs of
 # the fit.
 _LENSES = 0.2  # that two lenses are found in panoramas, after which patches take twice as long
-_RAW_PASSES = 1.25  # of raw frames that nothing has calibrated, beyond the first one
+_RAW_PASSES = 1.5  # of raw frames that nothing has calibrated, beyond the first one
 _OBSERVATIONS = 950.0  # of the map for each frame
 _FRAMES_PER_KEYFRAME = 0.5  # that odometry chooses
 _ODOMETRY, _TRACKING = "odometry", "tracking"  # stage, and its work
@@ -83,6 +83,7 @@ class Size:
     threads: int
     uncut: bool  # True = raw frames are cut by lenses that nothing has calibrated
     observations: float  # thousands, of the map that patches are aligned for
+    more: bool = False  # True = all frames have the keypoints that weak ones get
 
     @classmethod
     def of(cls, entry: Mapping[str, Any]) -> "Size":
@@ -110,12 +111,14 @@ class Size:
             self.frames * self.megapixels,
             self.frames * min(self.megapixels, _MAX_MEGAPIXELS_SEARCHED),
         )
-        return 1.0, num, *pixels, absent, num * self.lenses, raw, uncut
+        more = num * self.more
+        return 1.0, num, *pixels, absent, num * self.lenses, raw, uncut, more
 
     def seconds(self, phase: int) -> float:
         """Expected seconds of a phase at the table's speed."""
         serial, *costs = _COSTS[phase]
-        if FIRST_PATCHES + self.rounds <= phase <= LAST_PATCHES:
+        too_late = FIRST_PATCHES + self.rounds <= phase <= LAST_PATCHES
+        if too_late or (self.more and phase == WEAK):
             return 0.0
         seconds = sum(cost * term for cost, term in zip(costs, self.terms(phase), strict=True))
         return seconds * (serial + (1 - serial) * _TABLE_THREADS / self.threads)
@@ -162,6 +165,7 @@ class TimeLeft:
         self._whole = True  # False = a stage of this phase was resumed
         self._stage = ""
         self._work: _Work | None = None
+        self._more = False
         self._keyframes = 0
         self._observations: float | None = None  # thousands
         self._tracked: _Work | None = None  # of odometry
@@ -173,6 +177,8 @@ class TimeLeft:
             self.__init__()
         elif kind == "run":
             self._size = Size.of(entry)
+        elif kind == "features":
+            self._more = bool(entry.get("more"))
         elif kind == "keyframe":
             self._keyframes += 1
         elif kind == "stage":
@@ -217,6 +223,7 @@ class TimeLeft:
 
     def _known(self, size: Size) -> Size:
         """The size by what the phases so far have shown."""
+        size = replace(size, more=self._more)
         if self._observations is not None:
             size = replace(size, observations=self._observations)
         if size.raw:

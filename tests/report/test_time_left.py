@@ -109,6 +109,13 @@ def test_what_is_known_of_the_run_counts() -> None:
     assert left(told(raw=True, uncut=True), 0.0) > 2 * left(told(raw=True), 0.0)
 
 
+def test_no_frames_are_weak_where_all_have_more_keypoints() -> None:
+    events = stages(STAGES)
+    now = events[10]["time"]
+    usual, more = (left(told({"event": "features", "more": m}, *events[:11]), now) for m in (0, 1))
+    assert more < usual
+
+
 def test_two_lenses_count_as_soon_as_they_are_found() -> None:
     events = stages(STAGES)
     now = events[12]["time"]
