@@ -52,7 +52,9 @@ _COSTS = (
 )
 # Nothing tells beforehand which of these comes: expectations that were off least in the runs of
 # the fit.
-_LENSES = 0.2  # that two lenses are found in panoramas, after which patches take twice as long
+# That two lenses are found in panoramas, after which patches take five times as long; by
+# `camera.model`.
+_LENSES = {"auto": 0.2, "central": 0.0, "two_lens": 1.0}
 _RAW_PASSES = 1.5  # of raw frames that nothing has calibrated, beyond the first one
 _OBSERVATIONS = 950.0  # of the map for each frame
 _FRAMES_PER_KEYFRAME = 0.5  # that odometry chooses
@@ -94,7 +96,7 @@ class Size:
             megapixels=float(entry["width"]) ** 2 / 2e6,
             trajectory=bool(entry["trajectory"]),
             raw=raw,
-            lenses=1.0 if raw else _LENSES if entry["lenses"] else 0.0,
+            lenses=1.0 if raw else _LENSES[entry["camera"]],
             passes=_RAW_PASSES if uncut else 0.0,
             rounds=int(entry["rounds"]),
             threads=max(int(entry["threads"]), 1),
@@ -333,7 +335,7 @@ def tell_size(
         trajectory=trajectory,
         raw=any(kind.layout == "fisheye" for kind in formats),
         uncut=any(kind.lenses_nominal for kind in formats),
-        lenses=settings.camera.model != "central",
+        camera=settings.camera.model,
         rounds=settings.patches.rounds,
         threads=settings.solver.threads(),
     )

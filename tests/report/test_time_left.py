@@ -13,7 +13,7 @@ from gsba.report import time_left
 from gsba.report.time_left import CAMERA, FEATURES, LAST_PATCHES, PHASES, Size, TimeLeft, phase_of
 
 RUN = {"event": "run", "frames": 100, "width": 2000, "trajectory": True, "video": False}
-RUN |= {"raw": False, "uncut": False, "lenses": False, "rounds": 4, "threads": 2}
+RUN |= {"raw": False, "uncut": False, "camera": "central", "rounds": 4, "threads": 2}
 STAGES = ("carrier", "features", "neighbours", "chain", "loops", "axes", "features_closer")
 STAGES += ("everywhere1", "align1", "align2", "align3", "align4", "reconstruction")
 CENTRAL = Size.of(RUN)
@@ -105,6 +105,7 @@ def test_what_is_known_of_the_run_counts() -> None:
     assert left(told(trajectory=False), 0.0) > start
     assert left(told(rounds=0), 0.0) < 0.8 * start
     assert 0.1 * start < left(told(threads=16), 0.0) < 0.7 * start
+    assert start < left(told(camera="auto"), 0.0) < left(told(camera="two_lens"), 0.0)
     assert left(told(raw=True), 0.0) > start
     assert left(told(raw=True, uncut=True), 0.0) > 2 * left(told(raw=True), 0.0)
 
@@ -119,10 +120,10 @@ def test_no_frames_are_weak_where_all_have_more_keypoints() -> None:
 def test_two_lenses_count_as_soon_as_they_are_found() -> None:
     events = stages(STAGES)
     now = events[12]["time"]
-    unknown = left(told(*events[:11], lenses=True), now)
+    unknown = left(told(*events[:11], camera="auto"), now)
     lensed = {"event": "stage", "name": "lensed0", "time": now}
-    none = left(told(*events[:13], lenses=True), now)
-    found = left(told(*events[:11], lensed, *events[11:13], lenses=True), now)
+    none = left(told(*events[:13], camera="auto"), now)
+    found = left(told(*events[:11], lensed, *events[11:13], camera="auto"), now)
     assert none < unknown < found and found > 1.5 * none
 
 
