@@ -200,6 +200,8 @@ class TimeLeft:
             if self._work is None or (name, total) != (self._work.name, self._work.total):
                 self._work = _Work(name, now, done, total, now, done)
             self._work = replace(self._work, at=now, done=done)
+            if self._phase == FEATURES and self._size is not None:
+                self._whole &= total >= self._size.frames  # others are of an earlier call
             if name == _TRACKING:
                 self._tracked = self._work
 
@@ -248,7 +250,7 @@ class TimeLeft:
         work = self._work
         if work is not None and self._phase == FEATURES:
             measured += work.at - work.began
-            expected += size.seconds(FEATURES) * (work.done - work.first) / work.total
+            expected += size.seconds(FEATURES) * (work.done - work.first) / size.frames
         return (measured + _PRIOR_S) / (expected + _PRIOR_S)
 
     def _seconds_of_odometry(self, size: Size, now: float) -> float | None:

@@ -98,6 +98,18 @@ def test_resumed_phases_are_no_measure() -> None:
     assert left(found, 1.0) == pytest.approx(rest + CENTRAL.seconds(7))
 
 
+def test_features_of_some_frames_are_no_measure_of_all() -> None:
+    events = stages(STAGES)[:6]
+    begin, ended = events[2]["time"], events[3]["time"]
+    some = [
+        {"event": "progress", "what": "features", "done": n, "total": 10, "time": begin + 0.1 * t}
+        for n, t in ((0, 0.0), (10, ended - begin))
+    ]
+    later = [{**entry, "time": entry["time"] - 0.9 * (ended - begin)} for entry in events[3:]]
+    stated = left(told(*events[:3], *some, *later), later[-1]["time"])
+    assert stated == pytest.approx(left(told(*events), events[-1]["time"]))
+
+
 def test_what_is_known_of_the_run_counts() -> None:
     start = left(told(), 0.0)
     assert left(told(frames=200), 0.0) > 1.5 * start
