@@ -4,6 +4,7 @@ import logging
 import re
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -178,7 +179,8 @@ class TimeLeft:
         if kind in ("start", "end"):
             self.__init__()
         elif kind == "run":
-            self._size = Size.of(entry)
+            with suppress(KeyError, TypeError, ValueError):  # of another version's run
+                self._size = Size.of(entry)
         elif kind == "features":
             self._more = bool(entry.get("more"))
         elif kind == "keyframe":

@@ -180,6 +180,7 @@ def test_odometry_tells_how_many_frames_come() -> None:
 
 def test_what_the_table_does_not_know_has_no_time() -> None:
     assert TimeLeft().seconds(0.0) is None
+    assert told(camera="of a later version").seconds(0.0) is None
     assert told({"event": "stage", "name": "similarities_of_two_maps"}).seconds(0.0) is None
     assert told({"event": "start"}).seconds(0.0) is None  # a job goes on: all is told again
 
