@@ -5,10 +5,10 @@ import logging
 import os
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Sized
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
 from contextlib import contextmanager, nullcontext, suppress
 from functools import cache
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -24,6 +24,21 @@ class GsbaError(Exception):
 
 class StoppedError(GsbaError):
     """Work that an outside cause ended, and that resumes when it is run again."""
+
+
+class Follower(Protocol):
+    """Object that takes each event, and has a word for all progress bars."""
+
+    def add(self, entry: Mapping[str, Any], /) -> None:
+        """Take up an event."""
+        ...
+
+    def note(self) -> str:
+        """Text beside progress bars; "" = none."""
+        ...
+
+
+_followers: list[Follower] = []
 
 
 def show_log(level: int = logging.INFO) -> None:
@@ -51,24 +66,36 @@ def brief(text: str, most: int = 60) -> str:
 
 
 def event(kind: str, **values: object) -> None:
-    """Append an event, as one line of JSON, to the file that GSBA_EVENTS names.
-
-    Nothing is done if the variable is not set. A file that cannot be written ends no run.
+    """Pass an event to those that follow it, and append it, as one line of JSON, to the file that
+    GSBA_EVENTS names, if it is set. A file that cannot be written ends no run.
 
     Args:
         kind: kind of the event, the entry "event" of the line; "time" is seconds since 1970.
         values: further entries, plain values for JSON.
     """
+    entry = {"event": kind, "time": round(time.time(), 3), **values}
+    for follower in _followers:
+        follower.add(entry)
     path = os.environ.get(EVENTS)
     if not path:
         return
-    line = json.dumps({"event": kind, "time": round(time.time(), 3), **values}) + "\n"
+    line = json.dumps(entry) + "\n"
     with suppress(OSError):
         file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o600)
         try:
             os.write(file, line.encode())  # one call: lines of two processes do not mix
         finally:
             os.close(file)
+
+
+@contextmanager
+def following(follower: Follower) -> Iterator[None]:
+    """Pass all events within this context to a follower."""
+    _followers.append(follower)
+    try:
+        yield
+    finally:
+        _followers.remove(follower)
 
 
 def track(
@@ -81,7 +108,7 @@ def track(
     """Yield `items` and show their progress, as a bar on a terminal's stderr unless the run is
     quiet, and as events (see `event`), out of `total`, with a note behind the speed."""
     with_bar = sys.stderr.isatty() and logging.getLogger("gsba").isEnabledFor(logging.INFO)
-    if not (with_bar or os.environ.get(EVENTS)):
+    if not (with_bar or _followers or os.environ.get(EVENTS)):
         yield from items
         return
     if total is None and isinstance(items, Sized):
@@ -98,7 +125,8 @@ def track(
             if not (with_bar or due):
                 continue
             speed, more = count / max(now - began, 1e-6), "" if note is None else note()
-            show(done + count, f"{speed:.3g} a second" + (more and f", {more}"))
+            parts = [f"{speed:.3g} a second", more, *(one.note() for one in _followers)]
+            show(done + count, ", ".join(filter(None, parts)))
             if due:
                 told = now
                 event("progress", **work, done=done + count, rate=round(speed, 4), note=more)

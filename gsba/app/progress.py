@@ -2,10 +2,13 @@
 
 import json
 import math
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+from gsba.report.time_left import TimeLeft
 
 
 def read_events(path: Path, offset: int = 0) -> tuple[list[dict[str, Any]], int]:
@@ -44,6 +47,7 @@ class Progress:
     last: float | None = None  # time of the last event
     keyframes: list[tuple[int, list[float]]] = field(default_factory=list)  # map and position
     points: list[list[float]] = field(default_factory=list)  # that keyframes see
+    time_left: TimeLeft = field(default_factory=TimeLeft)
 
     def add(self, entry: Mapping[str, Any]) -> None:
         """Take up an event."""
@@ -51,6 +55,7 @@ class Progress:
         if kind == "start":
             self.__init__()
         self.last = entry.get("time", self.last)
+        self.time_left.add(entry)
         if kind == "stage":
             self.stage, self.work = dict(entry), None
         elif kind == "done":
@@ -80,6 +85,10 @@ class Progress:
         return [str(stage.get("name")) for stage in self.stages]
 
     def seconds_left(self) -> float | None:
+        """Seconds that the whole run still takes; None = not known."""
+        return self.time_left.seconds(time.time())
+
+    def seconds_of_work(self) -> float | None:
         """Seconds that the work at hand still takes at its speed so far; None = not known."""
         work = self.work or {}
         rate, total, done = work.get("rate"), work.get("total"), work.get("done")
@@ -94,6 +103,7 @@ class Progress:
             "stage": self.stage,
             "work": self.work,
             "seconds_left": self.seconds_left(),
+            "seconds_of_work": self.seconds_of_work(),
             "warnings": self.warnings,
             "error": self.error,
             "last": self.last,

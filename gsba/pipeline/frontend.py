@@ -17,7 +17,7 @@ from gsba.features.extraction import FrameFeatures, Search
 from gsba.frames import panorama
 from gsba.geometry import inverse
 from gsba.imu.alignment import Alignment, align, turning_of
-from gsba.log import GsbaError
+from gsba.log import GsbaError, event
 from gsba.loop_closure import connectivity, loops
 from gsba.loop_closure.loops import Closed
 from gsba.matching import correspondences, guided_search, pairs, recovery
@@ -50,6 +50,7 @@ def extract(run: Run) -> State:
     many as weak frames get."""
     drift, known = expected_drift(run, _search(run, run.settings))
     more = drift > run.settings.weak_frames.max_drift
+    event("features", more=more)
     enlarged = _enlarged(run.settings)
     found = _extract(run, enlarged) if more else _extract(run, run.settings, known=known)
     observed = _observe(run, "keypoints", [found] * len(run.frames), "features")

@@ -14,6 +14,7 @@ from gsba.camera.fisheye import turned
 from gsba.compilation import compile_ahead
 from gsba.config import RefineSettings
 from gsba.frames.scan import scan, warn_of_repeats
+from gsba.log import following
 from gsba.masks import merging
 from gsba.masks.segmentation import Segment
 from gsba.odometry import Odometry
@@ -37,11 +38,13 @@ from gsba.pipeline.stage_titles import title_of
 from gsba.pipeline.state import State
 from gsba.placement import check
 from gsba.report.html import add_odometry
+from gsba.report.time_left import LoggedTimeLeft, tell_size
 from gsba.store import cluster
 from gsba.store.store import RunStore
 from gsba.trajectory.conventions import Convention
 from gsba.trajectory.misread import TurnedAboutForwardError
 from gsba.types import CoarsePoses, FrameSet, Reconstruction, RunStart, VerifiedPairs
+from gsba.video.timeline import track_sizes
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -103,11 +106,13 @@ def refine(
     chosen, readings = merging.choose(masks, segment), inputs.read_gyro(imu, frames)
     origin = {"frames": frames} | inputs.trajectory_files(trajectory, keyframes)
     convention, walk = Convention.parse(settings.read.trajectory_format), None
+    left = LoggedTimeLeft()
     given = inputs.read_trajectories(origin, timestamps, convention)  # fails before decoding
     if video.is_video(frames):
         by_odometry = chosen if inputs.follows(settings.video, fps, odometry, given) else None
         inputs.check_positions(settings)
-        with RunStore(out, origin, fresh, title_of=title_of) as store:
+        with RunStore(out, origin, fresh, title_of=title_of) as store, following(left):
+            tell_size(settings, None, track_sizes(frames)[0][0], False)
             walk = inputs.extract_video(store, frames, settings, fps, by_odometry, calibration)
         frames, timestamps, fps, fresh = out / "frames", None, None, False
     if walk is not None:  # made of these very images: no evidence beside them
@@ -118,7 +123,8 @@ def refine(
     timed = tuple(inputs.timed(given, found))
     evidence = Evidence(timed, readings, families=tuple(families), start=begin)
     start = Start.of(found, evidence, settings)
-    with RunStore(out, origin, fresh, cluster.hire(client, frames, settings), title_of) as store:
+    hired = cluster.hire(client, frames, settings)
+    with RunStore(out, origin, fresh, hired, title_of) as store, following(left):
         return refine_from(store, settings, chosen, evidence, start, origin["frames"], walk)
 
 
@@ -197,10 +203,18 @@ def _solve_or_turn(run: Run, followed: bool) -> tuple[State, Reconstruction]:
 
 
 def _begin(store: RunStore, settings: RefineSettings, chosen: merging.Choice, start: Start) -> Run:
+    _tell_size(settings, start)
     journal, frames = Journal(), merging.before(store, start.frames, chosen)
     if chosen.distractors:
         frames = _without_distractors(store, settings, replace(start, frames=frames), journal)
     return Run.begin(store, frames, start.coarse, settings, start.evidence, journal)
+
+
+def _tell_size(settings: RefineSettings, start: Start) -> None:
+    by_odometry = start.evidence.start is RunStart.ODOMETRY
+    width = max(kind.panorama_width for kind in start.frames.formats)
+    given = not (start.coarse.absent or by_odometry)
+    tell_size(settings, start.frames, width, given)
 
 
 def _without_distractors(

@@ -43,6 +43,7 @@ from gsba.store.records import (
     typed,
 )
 from gsba.store.shards import Spent, StoredRecords, Threads, Workers, even_blocks
+from gsba.types import Solution
 from gsba.version import __version__
 
 logger = logging.getLogger(__name__)
@@ -162,7 +163,7 @@ class RunStore:
         stored = _load_if_current(path, key, returns)
         if stored is not None:
             value, record = stored
-            self._note(replace(record, resumed=True))
+            self._note(replace(record, resumed=True), value)
             return value
         event("stage", name=name, title=self._title_of(name))
         clocks = _Clocks.now(self.workers)
@@ -171,7 +172,7 @@ class RunStore:
         record = clocks.measured(name, key, self.workers)
         save_record(path, value, dataclasses.asdict(record))
         self._forget_shards()
-        self._note(record)
+        self._note(record, value)
         with suppress(OSError, RecordError):  # large arrays stay on the disk from here on
             if path.stat().st_size >= MIN_MAPPED_BYTES:
                 value = load_record(path, returns, mapped=True)
@@ -266,7 +267,7 @@ class RunStore:
         keys = [self.records[self._prefix + stage].key for stage in after]
         return digest(__version__, FORMAT, self._prefix + name, settings, keys)
 
-    def _note(self, record: StageRecord) -> None:
+    def _note(self, record: StageRecord, value: object = None) -> None:
         if not record.resumed and record.name in self._computed:
             self.seconds_again += self.records[record.name].seconds
         self.records[record.name] = record
@@ -282,7 +283,7 @@ class RunStore:
             self._tell_resumed()
         logger.log(level, "%s: %s %.1f s, %.0f MB", shown, how, record.seconds, record.peak_mb)
         cost = {"seconds": round(record.seconds, 3), "resumed": record.resumed}
-        event("done", name=name, title=title, **cost)
+        event("done", name=name, title=title, **cost, **_counts(value))
 
     def _tell_resumed(self) -> None:
         """Log in a line how many stages were resumed since the last such line."""
@@ -455,6 +456,14 @@ def _jsonable(value: object) -> object:
     if isinstance(value, Path):
         return str(value)
     raise TypeError(f"a {type(value).__name__} cannot be part of a stage's key")
+
+
+def _counts(value: object) -> dict[str, int]:
+    """Number of observations of a stage's map; {} = its result is no map."""
+    map_ = value[0] if isinstance(value, tuple) and value else value
+    if not isinstance(map_, Solution):
+        return {}
+    return {"observations": len(map_.landmarks.tracks.points)}
 
 
 @contextmanager

@@ -5,8 +5,10 @@ import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import pytest
@@ -15,7 +17,9 @@ from tiny_run import BARE, NUM_FRAMES, SETTINGS, Case, computed_stages, exportin
 import gsba
 from gsba.bundle import map_strength
 from gsba.config import WeakFrameSettings
+from gsba.log import following
 from gsba.matching import correspondences
+from gsba.report.time_left import TimeLeft
 
 
 def test_a_second_call_takes_everything_up(case: Case, tmp_path: Path) -> None:
@@ -25,6 +29,27 @@ def test_a_second_call_takes_everything_up(case: Case, tmp_path: Path) -> None:
     assert computed_stages(again) == []
     for name in ("trajectory.tum", "poses.csv", "points.ply"):
         assert (out / name).read_bytes() == (case.out / name).read_bytes()
+
+
+def test_a_run_tells_its_size_and_the_time_left(case: Case, tmp_path: Path) -> None:
+    events, left = [], []
+
+    class Reader(TimeLeft):
+        def add(self, entry: Mapping[str, Any]) -> None:
+            super().add(entry)
+            events.append(entry)
+            left.append(self.seconds(entry["time"]))
+
+        def note(self) -> str:
+            return ""
+
+    with following(Reader()):
+        case.refine(case.copy(tmp_path / "run"))
+    (size,) = [entry for entry in events if entry["event"] == "run"]
+    assert size["frames"] == NUM_FRAMES and size["trajectory"] and not size["raw"]
+    stages = {entry["name"]: entry for entry in events if entry["event"] == "done"}
+    assert stages["dense"]["observations"] > 0 and "observations" not in stages["features"]
+    assert left[events.index(size)] > left[-1] >= 0.0
 
 
 def test_a_changed_setting_renews_what_depends_on_it(case: Case, tmp_path: Path) -> None:

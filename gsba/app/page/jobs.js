@@ -116,15 +116,16 @@ function fillHead(head, job) {
 }
 
 function fillNow(now, job) {
-  const { stage, work, seconds_left: left } = job.progress;
+  const { stage, work, seconds_left: left, seconds_of_work: stepLeft } = job.progress;
   if (ENDED.includes(job.status) || !(stage || work)) {
     now.replaceChildren();
     return;
   }
   const parts = [make("p", {}, make("strong", {}, stage ? stage.title : work.what))];
+  if (left !== null) parts.unshift(make("p", { class: "left" }, `About ${spoken(left)} left of the run`));
   if (work && work.total) {
     const rate = work.rate ? `${Number(work.rate.toPrecision(3))} a second` : "";
-    const more = [`${work.done} of ${work.total}`, rate, left ? `${spoken(left)} left` : "", work.note];
+    const more = [`${work.done} of ${work.total}`, rate, stepLeft ? `${spoken(stepLeft)} left of it` : "", work.note];
     parts.push(make("progress", { max: work.total, value: work.done, "aria-label": work.what }),
       make("p", { class: "faint" }, `${work.what}: ${more.filter(Boolean).join(", ")}`));
   } else {

@@ -1,0 +1,345 @@
+"""Time that a refinement still takes, from its events: costs by a table, at the speed so far."""
+
+import logging
+import re
+import time
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import Any
+
+from gsba.config import RefineSettings
+from gsba.log import event
+from gsba.types import FrameSet
+
+logger = logging.getLogger(__name__)
+
+# Phases of a refinement, regular expressions of their stages. They come in this order, and from the
+# second one on again where raw frames are cut anew or a video gives more frames.
+PHASES = (
+    r"carrier\d*|segmented|distractors\d*|masks|frames|expected_drift|fetch\d+|recut.*",
+    r"features|keypoints",
+    r"neighbours.*|clock|turn|steps|imu|gauge",
+    r"chain2?|adjacent|near|dense",
+    r"registered|across\w*|similarities|joined|adjacent2|loops2?|places|gauge_closed|closed"
+    r"|imu_closed",
+    r"axes|lens(es|ed)\d+|stitch_radius.*|settled(_far)?(_readout)?|(re)?calibrated\d*(_readout)?"
+    r"|(adjacent|wide)_(lenses|raw\d+)|imu_camera|strength",
+    r".*_closer",
+    r"everywhere\d+|refined\d+|again_.*",
+    r"\w*align(ed)?1(_\d+)?|stitching1|settled_aligned2",
+    r"\w*align(ed)?2(_\d+)?|stitching2|settled_aligned3",
+    r"\w*align(ed)?3(_\d+)?|stitching3|settled_aligned4",
+    r"\w*align(ed)?4(_\d+)?|stitching4|settled_aligned5",
+    r"imu_final|camera|reconstruction|lenses|map|export-.*",
+)
+FEATURES, CAMERA, WEAK, KNOWN, FIRST_PATCHES, LAST_PATCHES = 1, 5, 6, 7, 8, 11  # of phases
+# Of each phase: share of its seconds in which one thread works alone, and coefficients of
+# `Size.terms`, seconds on two cores. Made by `python -m benchmarks.time_left fit`.
+_COSTS = (
+    (0.586, 0.211, 0, 0.00338, 0, 0, 0, 0, 0.01, 0.0136),
+    (0.0246, 0.0791, 0.0161, 0.00024, 0.0318, 0, 0, 0.00946, 0, 0.0156),
+    (0.113, 0.0772, 0.0111, 4.07e-05, 0.00473, 0.0168, 0, 0.00656, 0, 0),
+    (0.465, 0.0601, 0.00743, 0.000394, 0.00248, 0, 0, 0.000324, 0.00225, 0.00556),
+    (0.457, 0.067, 0.00936, 0, 0.0029, 0, 0, 0.0331, 0, 0),
+    (0.637, 0.046, 0.00028, 0.000618, 0.00709, 0.00145, 0.0368, 0.00804, 0.203, 0.00638),
+    (0.0617, 0.069, 0.0163, 0.00124, 0, 0.0286, 0, 0.00909, 0.0057, 0),
+    (0.333, 0.0607, 0.0122, 0, 0, 0, 0, 0, 0, 0),
+    (0.594, 0.0707, 0.0129, 0.0108, 0, 0, 0.0833, 0, 0.0149, 0),
+    (0.584, 0.0197, 0.0136, 0.00919, 0, 0, 0.0646, 0, 0.0055, 0),
+    (0.607, 0.15, 0.00605, 0.00755, 0, 0.000629, 0.0593, 0, 0.0154, 0),
+    (0.601, 0, 0, 0.00724, 0, 0, 0.0263, 0.026, 0.0124, 0),
+    (0.65, 0.267, 0.000903, 0.0439, 0, 0, 0.000523, 0.0171, 0, 0),
+)
+# Nothing tells beforehand which of these comes: expectations that were off least in the runs of
+# the fit.
+# That two lenses are found in panoramas, after which patches take five times as long; by
+# `camera.model`.
+_LENSES = {"auto": 0.2, "central": 0.0, "two_lens": 1.0}
+_RAW_PASSES = 1.5  # of raw frames that nothing has calibrated, beyond the first one
+_OBSERVATIONS = 950.0  # of the map for each frame
+_FRAMES_PER_KEYFRAME = 0.5  # that odometry chooses
+_ODOMETRY, _TRACKING = "odometry", "tracking"  # stage, and its work
+_TRACKING_S, _CLOSING_S = 0.04, 0.1  # seconds of odometry for each frame of the video; thereafter
+# for each keyframe: .03 to .2, as the path comes back or not
+_PRIOR_S = 4.0  # seconds of the table that count as if they were measured at its speed
+_MAX_MEGAPIXELS_SEARCHED = 1.2  # of a panorama: faces and patches are cut no finer from more
+_TABLE_THREADS = 2
+_MIN_BETWEEN_LINES_S = 20.0  # seconds between lines of the log with the time left
+_MIN_TOLD_S = 10.0  # seconds left that a line is worth
+_ADJUSTED = re.compile(r"dense(_closer)?|closed|joined|refined\d+")  # maps of all observations
+_MIN_COUNTED_SHARE = 0.15  # of a work's items, from which on they tell how long it takes
+UNDER_LENSES = re.compile(r"(again_)?(lensed\d+|settled(_far)?)")  # stages where two were found
+
+
+@dataclass(frozen=True, slots=True)
+class Size:
+    """Size of a run, as far as it is known."""
+
+    frames: float
+    megapixels: float  # of a panorama
+    trajectory: bool  # True = one of a file
+    raw: bool  # True = fisheyes or tracks, not stitched
+    lenses: float  # probability that two lenses are found
+    passes: float  # expected beyond the first one
+    rounds: int  # most rounds of patches
+    threads: int
+    uncut: bool  # True = raw frames are cut by lenses that nothing has calibrated
+    observations: float  # thousands, of the map that patches are aligned for
+    more: bool = False  # True = all frames have the keypoints that weak ones get
+
+    @classmethod
+    def of(cls, entry: Mapping[str, Any]) -> "Size":
+        """Size by an event "run"."""
+        raw, uncut = bool(entry["raw"]), bool(entry["uncut"])
+        return cls(
+            frames=float(entry["frames"] or 0),
+            megapixels=float(entry["width"]) ** 2 / 2e6,
+            trajectory=bool(entry["trajectory"]),
+            raw=raw,
+            lenses=1.0 if raw else _LENSES[entry["camera"]],
+            passes=_RAW_PASSES if uncut else 0.0,
+            rounds=int(entry["rounds"]),
+            threads=max(int(entry["threads"]), 1),
+            uncut=uncut,
+            observations=1e-3 * _OBSERVATIONS * float(entry["frames"] or 0),
+        )
+
+    def terms(self, phase: int) -> tuple[float, ...]:
+        """Regressors of a phase's cost; that of adjusting known points, and of patches, goes by
+        their observations, any other by frames."""
+        num = self.observations if KNOWN <= phase <= LAST_PATCHES else self.frames
+        absent, raw, uncut = num * (not self.trajectory), num * self.raw, num * self.uncut
+        pixels = (
+            self.frames * self.megapixels,
+            self.frames * min(self.megapixels, _MAX_MEGAPIXELS_SEARCHED),
+        )
+        more = num * self.more
+        return 1.0, num, *pixels, absent, num * self.lenses, raw, uncut, more
+
+    def seconds(self, phase: int) -> float:
+        """Expected seconds of a phase at the table's speed."""
+        serial, *costs = _COSTS[phase]
+        too_late = FIRST_PATCHES + self.rounds <= phase <= LAST_PATCHES
+        if too_late or (self.more and phase == WEAK):
+            return 0.0
+        seconds = sum(cost * term for cost, term in zip(costs, self.terms(phase), strict=True))
+        return seconds * (serial + (1 - serial) * _TABLE_THREADS / self.threads)
+
+
+def phase_of(stage: str) -> int | None:
+    """Number of the phase that a stage belongs to; None = of none."""
+    name = stage.partition("@")[0]
+    found = (n for n, phase in enumerate(PHASES) if re.fullmatch(phase, name))
+    return next(found, None)
+
+
+@dataclass(frozen=True, slots=True)
+class _Work:
+    """Items that a stage works through."""
+
+    name: str
+    began: float  # time
+    first: int  # items that were done then
+    total: int
+    at: float  # time of the latest count
+    done: int
+
+    def seconds(self, now: float) -> float:
+        """Expected seconds from a time on, at the speed so far."""
+        done = self.done - self.first
+        if done < _MIN_COUNTED_SHARE * self.total:
+            return 0.0
+        return max((self.at - self.began) * (self.total - self.done) / done - (now - self.at), 0.0)
+
+
+class TimeLeft:
+    """Expected time to the end of a refinement, from its events.
+
+    Phases that have ended, and the part of one whose items are counted, tell the machine's speed.
+    """
+
+    def __init__(self) -> None:
+        self._size: Size | None = None
+        self._phase, self._phase_began = 0, 0.0
+        self._measured, self._expected = 0.0, 0.0  # seconds of ended phases; by the table
+        self._passes = 0
+        self._lenses = False  # True = an adjustment under two lenses was seen
+        self._whole = True  # False = a stage of this phase was resumed
+        self._stage = ""
+        self._work: _Work | None = None
+        self._more = False
+        self._keyframes = 0
+        self._observations: float | None = None  # thousands
+        self._tracked: _Work | None = None  # of odometry
+
+    def add(self, entry: Mapping[str, Any]) -> None:
+        """Take up an event."""
+        kind, now = entry.get("event"), float(entry.get("time") or 0.0)
+        if kind in ("start", "end"):
+            self.__init__()
+        elif kind == "run":
+            with suppress(KeyError, TypeError, ValueError):  # of another version's run
+                self._size = Size.of(entry)
+        elif kind == "features":
+            self._more = bool(entry.get("more"))
+        elif kind == "keyframe":
+            self._keyframes += 1
+        elif kind == "stage":
+            self._stage, self._work = str(entry.get("name")), None
+            self._enter(self._stage, now)
+        elif kind == "done":
+            self._stage, self._work = "", None
+            adjusted = _ADJUSTED.fullmatch(str(entry.get("name")).partition("@")[0])
+            if adjusted and entry.get("observations"):
+                self._observations = 1e-3 * float(entry["observations"])
+            if entry.get("resumed"):
+                self._enter(str(entry.get("name")), now)
+                self._whole = False
+        elif kind == "progress" and entry.get("total"):
+            name, done = str(entry.get("what")), int(entry.get("done") or 0)
+            total = int(entry["total"])
+            if self._work is None or (name, total) != (self._work.name, self._work.total):
+                self._work = _Work(name, now, done, total, now, done)
+            self._work = replace(self._work, at=now, done=done)
+            if self._phase == FEATURES and self._size is not None:
+                self._whole &= total >= self._size.frames  # others are of an earlier call
+            if name == _TRACKING:
+                self._tracked = self._work
+
+    def seconds(self, now: float) -> float | None:
+        """Expected seconds from a time on; None = the table does not tell."""
+        size = self._size
+        if size is None:
+            return None
+        if self._stage == _ODOMETRY or not size.frames:
+            return self._seconds_of_odometry(size, now)
+        if self._stage and phase_of(self._stage) is None:
+            return None
+        size = self._known(size)
+        speed, spent = self._speed(size), now - self._phase_began
+        work_left = 0.0 if self._work is None else self._work.seconds(now)
+        here = max(speed * size.seconds(self._phase) - spent, work_left)
+        return here + speed * self._ahead(size, self._phase + 1)
+
+    @property
+    def size(self) -> Size | None:
+        """Size by what the phases so far have shown; None = no event has told of it."""
+        return None if self._size is None else self._known(self._size)
+
+    def _known(self, size: Size) -> Size:
+        """The size by what the phases so far have shown."""
+        size = replace(size, more=self._more)
+        if self._observations is not None:
+            size = replace(size, observations=self._observations)
+        if size.raw:
+            return replace(size, uncut=size.uncut and self._passes == 0)
+        lenses = 1.0 if self._lenses else size.lenses if self._phase <= CAMERA else 0.0
+        return replace(size, lenses=lenses)
+
+    def _ahead(self, size: Size, phase: int) -> float:
+        """Seconds by the table of phases from `phase` on, and of further passes."""
+        more = max(size.passes - self._passes, 0.0)
+        again = replace(size, uncut=False)
+        repeated = range(FEATURES, (LAST_PATCHES if size.raw else CAMERA) + 1)
+        return sum(map(size.seconds, range(phase, len(PHASES)))) + more * sum(
+            map(again.seconds, repeated)
+        )
+
+    def _speed(self, size: Size) -> float:
+        """Seconds for each of the table."""
+        measured, expected = self._measured, self._expected
+        work = self._work
+        if work is not None and self._phase == FEATURES:
+            measured += work.at - work.began
+            expected += size.seconds(FEATURES) * (work.done - work.first) / size.frames
+        return (measured + _PRIOR_S) / (expected + _PRIOR_S)
+
+    def _seconds_of_odometry(self, size: Size, now: float) -> float | None:
+        """Seconds of the odometry, and of all that comes after it."""
+        work = self._tracked
+        if work is None or not work.done or not self._keyframes:
+            return None
+        keyframes = self._keyframes * work.total / work.done
+        frames = _FRAMES_PER_KEYFRAME * keyframes
+        size = replace(size, frames=frames, observations=1e-3 * _OBSERVATIONS * frames)
+        expected = _TRACKING_S * (work.done - work.first)
+        speed = (work.at - work.began + _PRIOR_S) / (expected + _PRIOR_S)
+        here = work.seconds(now)
+        if self._stage == _ODOMETRY:
+            gone = now - work.at if work.done == work.total else 0.0
+            here += max(speed * _CLOSING_S * keyframes - gone, 0.0)
+        return here + speed * self._ahead(size, 0)
+
+    def _enter(self, stage: str, now: float) -> None:
+        """Go on to the phase of a stage; one that ends tells the speed."""
+        phase = phase_of(stage)
+        if UNDER_LENSES.fullmatch(stage):
+            self._lenses = True
+        if phase is None or phase == self._phase or self._size is None:
+            return
+        if self._whole and self._phase >= FEATURES:
+            self._measured += now - self._phase_began
+            self._expected += self._known(self._size).seconds(self._phase)
+        if phase < self._phase and phase <= FEATURES:
+            self._passes += self._phase > FEATURES
+        self._phase, self._phase_began, self._whole = phase, now, True
+
+
+class LoggedTimeLeft:
+    """Time left as lines of the log, ever less often, and beside progress bars."""
+
+    def __init__(self) -> None:
+        self._left, self._began = TimeLeft(), time.time()
+        self._due = self._began + _MIN_BETWEEN_LINES_S
+
+    def add(self, entry: Mapping[str, Any]) -> None:
+        """Take up an event; see `gsba.log.Follower`."""
+        self._left.add(entry)
+        now = time.time()
+        if now < self._due or entry.get("event") == "log":
+            return
+        seconds = self._left.seconds(now)
+        if seconds is None or seconds < _MIN_TOLD_S:
+            return
+        self._due = now + max(_MIN_BETWEEN_LINES_S, 0.1 * (now - self._began))
+        logger.info("about %s left", duration(seconds))
+
+    def note(self) -> str:
+        """Text beside progress bars."""
+        seconds = self._left.seconds(time.time())
+        return "" if seconds is None else f"about {duration(seconds)} left of the run"
+
+
+def duration(seconds: float) -> str:
+    """Seconds in words, two digits at most."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 90 * 60 else f"{seconds / 3600:.1f} h"
+
+
+def tell_size(
+    settings: RefineSettings, frames: FrameSet | None, width: int, trajectory: bool
+) -> None:
+    """Pass on the size of a run; see `TimeLeft`. A run with families that the table does not know
+    has none.
+
+    Args:
+        frames: None = the odometry of a video has still to choose them.
+        width: pixels of a panorama.
+        trajectory: True = poses are of a file, not of the images.
+    """
+    if settings.direct_families():
+        return
+    formats = () if frames is None else frames.formats
+    event(
+        "run",
+        frames=0 if frames is None else len(frames),
+        width=width,
+        trajectory=trajectory,
+        raw=any(kind.layout == "fisheye" for kind in formats),
+        uncut=any(kind.lenses_nominal for kind in formats),
+        camera=settings.camera.model,
+        rounds=settings.patches.rounds,
+        threads=settings.solver.threads(),
+    )

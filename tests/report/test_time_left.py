@@ -1,0 +1,204 @@
+"""The time that a run still takes, by synthetic events of runs."""
+
+import logging
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from gsba.pipeline import stage_titles
+from gsba.report import time_left
+from gsba.report.time_left import CAMERA, FEATURES, LAST_PATCHES, PHASES, Size, TimeLeft, phase_of
+
+RUN = {"event": "run", "frames": 100, "width": 2000, "trajectory": True, "video": False}
+RUN |= {"raw": False, "uncut": False, "camera": "central", "rounds": 4, "threads": 2}
+STAGES = ("carrier", "features", "neighbours", "chain", "loops", "axes", "features_closer")
+STAGES += ("everywhere1", "align1", "align2", "align3", "align4", "reconstruction")
+CENTRAL = Size.of(RUN)
+
+
+def told(*entries: dict[str, Any], **size: Any) -> TimeLeft:
+    """The time left after the size of a run, and these events."""
+    found = TimeLeft()
+    for entry in ({**RUN, **size, "time": 0.0}, *entries):
+        found.add(entry)
+    return found
+
+
+def stages(names: Sequence[str], speed: float = 1.0, size: Size = CENTRAL) -> list[dict[str, Any]]:
+    """Events of stages that take as long as the table says, times `speed`."""
+    found, now = [], 0.0
+    for name in names:
+        phase = phase_of(name)
+        assert phase is not None
+        found.append({"event": "stage", "name": name, "time": now})
+        now += speed * size.seconds(phase)
+        found.append({"event": "done", "name": name, "time": now, "resumed": False})
+    return found
+
+
+def whole(size: Size) -> float:
+    return sum(map(size.seconds, range(len(PHASES))))
+
+
+def left(found: TimeLeft, now: float) -> float:
+    seconds = found.seconds(now)
+    assert seconds is not None
+    return seconds
+
+
+def names() -> Iterator[str]:
+    """A name for each stage that has a title."""
+    for pattern in stage_titles._TITLES:
+        yield re.sub("[#+]", "1", pattern)
+
+
+def test_every_stage_has_a_phase() -> None:
+    without = {name for name in names() if phase_of(name) is None}
+    assert without == {"odometry", "photometric", "splat"}
+    assert [phase_of(name) for name in STAGES] == list(range(len(PHASES)))
+    assert phase_of("lenses0") == phase_of("settled_far_readout") == CAMERA
+    assert phase_of("settled_aligned3") == phase_of("align2") == LAST_PATCHES - 2
+    assert phase_of("features@walk") == FEATURES and phase_of("again_lensed0") == CAMERA + 2
+    assert phase_of("first-features") is None  # of a first solution, which the table leaves out
+
+
+def test_a_run_as_the_table_says_takes_what_it_says() -> None:
+    events = stages(STAGES)
+    assert left(told(), 0.0) == pytest.approx(whole(CENTRAL))
+    for number, entry in enumerate(events):
+        now = entry["time"]
+        found = told(*events[: number + 1])
+        assert left(found, now) == pytest.approx(whole(CENTRAL) - now, abs=1e-6)
+
+
+def test_phases_tell_the_speed() -> None:
+    events = stages(STAGES, speed=3.0)
+    found, now = told(*events[:11]), events[10]["time"]
+    rest = sum(CENTRAL.seconds(n) for n in range(5, len(PHASES)))
+    assert 2.0 * rest < left(found, now) < 3.0 * rest
+    # items of features tell it before their phase ends
+    begin, half = events[2]["time"], 1.5 * CENTRAL.seconds(FEATURES)
+    counts = [
+        {"event": "progress", "what": "features", "done": n, "total": 100, "time": begin + t}
+        for n, t in ((0, 0.0), (50, half))
+    ]
+    later = sum(CENTRAL.seconds(n) for n in range(2, len(PHASES)))
+    stated = left(told(*events[:3], *counts), begin + half)
+    assert later + half < stated < 3.0 * later + half
+    assert stated > left(told(*events[:3]), begin + half)
+
+
+def test_resumed_phases_are_no_measure() -> None:
+    events = [{**entry, "resumed": True} for entry in stages(STAGES) if entry["event"] == "done"]
+    found = told(*({**entry, "time": 1.0} for entry in events[:8]))
+    rest = sum(CENTRAL.seconds(n) for n in range(8, len(PHASES)))
+    assert left(found, 1.0) == pytest.approx(rest + CENTRAL.seconds(7))
+
+
+def test_features_of_some_frames_are_no_measure_of_all() -> None:
+    events = stages(STAGES)[:6]
+    begin, ended = events[2]["time"], events[3]["time"]
+    some = [
+        {"event": "progress", "what": "features", "done": n, "total": 10, "time": begin + 0.1 * t}
+        for n, t in ((0, 0.0), (10, ended - begin))
+    ]
+    later = [{**entry, "time": entry["time"] - 0.9 * (ended - begin)} for entry in events[3:]]
+    stated = left(told(*events[:3], *some, *later), later[-1]["time"])
+    assert stated == pytest.approx(left(told(*events), events[-1]["time"]))
+
+
+def test_what_is_known_of_the_run_counts() -> None:
+    start = left(told(), 0.0)
+    assert left(told(frames=200), 0.0) > 1.5 * start
+    assert left(told(width=4000), 0.0) > start
+    assert left(told(trajectory=False), 0.0) > start
+    assert left(told(rounds=0), 0.0) < 0.8 * start
+    assert 0.1 * start < left(told(threads=16), 0.0) < 0.7 * start
+    assert start < left(told(camera="auto"), 0.0) < left(told(camera="two_lens"), 0.0)
+    assert left(told(raw=True), 0.0) > start
+    assert left(told(raw=True, uncut=True), 0.0) > 2 * left(told(raw=True), 0.0)
+
+
+def test_no_frames_are_weak_where_all_have_more_keypoints() -> None:
+    events = stages(STAGES)
+    now = events[10]["time"]
+    usual, more = (left(told({"event": "features", "more": m}, *events[:11]), now) for m in (0, 1))
+    assert more < usual
+
+
+def test_two_lenses_count_as_soon_as_they_are_found() -> None:
+    events = stages(STAGES)
+    now = events[12]["time"]
+    unknown = left(told(*events[:11], camera="auto"), now)
+    lensed = {"event": "stage", "name": "lensed0", "time": now}
+    none = left(told(*events[:13], camera="auto"), now)
+    found = left(told(*events[:11], lensed, *events[11:13], camera="auto"), now)
+    assert none < unknown < found and found > 1.5 * none
+
+
+def test_patches_take_as_long_as_the_map_has_observations() -> None:
+    events = stages(STAGES)
+    found = []
+    for observations in (20000, 40000):
+        adjusted = {**events[15], "name": "refined1", "observations": observations}
+        found.append(left(told(*events[:15], adjusted, width=500), adjusted["time"]))
+    assert 1.1 * found[0] < found[1] < 2.0 * found[0]
+
+
+def test_a_second_pass_of_raw_frames() -> None:
+    raw = replace(CENTRAL, raw=True, lenses=1.0)
+    first = stages(STAGES[:-1], size=replace(raw, uncut=True))
+    now = first[-1]["time"]
+    again = {"event": "stage", "name": "recut0", "time": now}
+    stated = left(told(*first, again, raw=True, uncut=True), now)
+    assert whole(raw) < stated < 2 * whole(raw)
+
+
+def test_odometry_tells_how_many_frames_come() -> None:
+    size = {"frames": 0, "trajectory": False, "video": True}
+    stage = {"event": "stage", "name": "odometry", "time": 0.0}
+    count = {"event": "progress", "what": "tracking", "total": 400, "time": 0.0, "done": 0}
+    assert told(stage, count, **size).seconds(0.0) is None
+    keyframes = [{"event": "keyframe", "time": 5.0}] * 20
+    half = {**count, "time": 10.0, "done": 100}
+    stated = left(told(stage, count, *keyframes, half, **size), 10.0)
+    assert stated > 30.0  # of the odometry alone
+    more = left(told(stage, count, *keyframes, *keyframes, half, **size), 10.0)
+    assert more > stated
+    ended = {"event": "done", "name": "odometry", "time": 40.0}
+    whole_walk = {**half, "time": 40.0, "done": 400}
+    extracting = {**count, "what": "extracting frames", "total": 80, "time": 41.0, "done": 1}
+    before = left(told(stage, count, *keyframes, whole_walk, **size), 40.0)
+    after = left(told(stage, count, *keyframes, whole_walk, ended, extracting, **size), 41.0)
+    assert 0.0 < after < before  # by the loops that were closed
+    places = {**count, "what": "describing places", "total": 80, "time": 40.0, "done": 1}
+    assert told(stage, *keyframes, places, **size).seconds(40.0) is None
+
+
+def test_what_the_table_does_not_know_has_no_time() -> None:
+    assert TimeLeft().seconds(0.0) is None
+    assert told(camera="of a later version").seconds(0.0) is None
+    assert told({"event": "stage", "name": "similarities_of_two_maps"}).seconds(0.0) is None
+    assert told({"event": "start"}).seconds(0.0) is None  # a job goes on: all is told again
+
+
+def test_lines_of_the_log(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = [1000.0]
+    monkeypatch.setattr(time_left.time, "time", lambda: clock[0])
+    found = time_left.LoggedTimeLeft()
+    with caplog.at_level(logging.INFO, "gsba"):
+        found.add({**RUN, "frames": 10000, "time": 1000.0})
+        assert not caplog.messages and found.note().endswith("left of the run")
+        for clock[0] in (1005.0, 1021.0, 1030.0, 1045.0):
+            found.add({"event": "stage", "name": "features", "time": 1005.0})
+    assert len(caplog.messages) == 2 and all("left" in line for line in caplog.messages)
+
+
+def test_durations_in_words() -> None:
+    words = [time_left.duration(seconds) for seconds in (12.3, 89, 150, 3 * 3600)]
+    assert words == ["12 s", "89 s", "2 min", "3.0 h"]
