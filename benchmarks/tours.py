@@ -13,7 +13,8 @@ TOUR: a folder with images/*.jpg, groundtruth.tum and, if a carrier is in the pi
    another one is about as good, is moved by Lucas and Kanade's method. A pose is fitted to these
    matches, and so on from coarse to fine. No keypoint of the other frame is asked for.
 3. Hypotheses are ranked by the keypoints that fit: the geometric mean of all and of those
-   without look-alikes and floor.
+   without look-alikes and floor. Few keypoints and a coarse picture choose those that are searched
+   finely, and what then comes near the best one is refined with all keypoints.
 4. The best chain over all frames is chosen by these ranks and by keypoints whose distances agree in
    both neighbouring steps, which also give the ratio of the steps' lengths.
 5. Where few agree, the chain ends. Each map is adjusted with the places that the search found.
@@ -53,7 +54,8 @@ LINE_STEP_DEG = 0.35  # along epipolar lines, and between lines beside them
 MIN_PARALLAX = np.deg2rad(3.0)  # of keypoints that tell a direction
 FLOOR_Y = 0.25  # y of bearings below which a floor is likely
 NUM_KEYS, NUM_FEW = 1000, 300  # keypoints of a frame that are searched; for a first rank
-NUM_REFINED = 5  # hypotheses of a step that are refined
+NUM_ROUGH, NUM_REFINED = 6, 4  # hypotheses of a step, the best by a coarse search; refined
+MIN_SHARE = 0.4  # of the best hypothesis' rank, below which others are not refined
 SIGMA_RAD = 2e-3  # of the places that the search finds
 LENGTH_SIGMA = 0.8  # of the logarithm of the ratio of two steps' lengths
 MIN_VOTES, MIN_CELLS = 15, 7  # keypoints that tie two steps, and cells of 15 degrees they are in
@@ -271,33 +273,32 @@ def distinct(
     return kept
 
 
-def ranked_roughly(one: View, other: View, f1_T_f0: np.ndarray) -> tuple[float, np.ndarray] | None:
-    """Rank and pose of a hypothesis after a search with few keypoints, coarse to fine."""
+def rough_ranks(
+    one: View, other: View, starts: list[np.ndarray], beside: float, coarse: bool, most_deg: float
+) -> list[tuple[float, np.ndarray]]:
+    """Hypotheses after a search with few keypoints, and their ranks."""
     sound = np.flatnonzero(one.sound)[: NUM_FEW // 2]
     rest = np.setdiff1d(np.arange(len(one.keys)), sound)
     rest = np.random.default_rng(0).permutation(rest)[: NUM_FEW // 2]
-    few = np.concatenate([sound, rest])
-    for beside, coarse, most, width in (
-        (2.8, True, 0.6, 0.4),
-        (1.05, False, 0.4, 0.25),
-        (0.35, False, 0.3, 0.15),
-    ):
-        rows, places = search(one, other, few, f1_T_f0, beside, coarse)
-        if len(rows) < 8:
-            return None
-        f1_T_f0 = better(one.keys[rows], places, one.sound[rows], f1_T_f0, most, width)
-    good, parallax, _ = fits(one.keys[rows], places, f1_T_f0, 0.2)
-    good &= parallax > MIN_PARALLAX
-    num_sound = np.count_nonzero(good & one.sound[rows])
-    return rank_of(int(np.count_nonzero(good)), int(num_sound)), f1_T_f0
+    few, found = np.concatenate([sound, rest]), []
+    for start in starts:
+        rows, places = search(one, other, few, start, beside, coarse)
+        if len(rows) >= 8:
+            rays, width = one.keys[rows], most_deg * 0.6
+            f1_T_f0 = better(rays, places, one.sound[rows], start, most_deg, width)
+            good, parallax, _ = fits(rays, places, f1_T_f0, 0.7 * most_deg)
+            good &= parallax > MIN_PARALLAX
+            num, num_sound = np.count_nonzero(good), np.count_nonzero(good & one.sound[rows])
+            found.append((rank_of(int(num), int(num_sound)), f1_T_f0))
+    return found
 
 
 def refined(one: View, other: View, f1_T_f0: np.ndarray) -> Step | None:
-    """A hypothesis refined by all keypoints of both frames."""
-    every0, every1 = np.arange(len(one.keys)), np.arange(len(other.keys))
-    for beside in (0.7, 0.35, 0.35):
-        rows0, places1 = search(one, other, every0, f1_T_f0, beside, False)
-        rows1, places0 = search(other, one, every1, inverse(f1_T_f0), beside, False)
+    """A hypothesis refined by keypoints of both frames, at last by all."""
+    for beside, every in ((0.7, 3), (0.35, 1)):
+        few0, few1 = np.arange(len(one.keys))[::every], np.arange(len(other.keys))[::every]
+        rows0, places1 = search(one, other, few0, f1_T_f0, beside, False)
+        rows1, places0 = search(other, one, few1, inverse(f1_T_f0), beside, False)
         rays0 = np.vstack([one.keys[rows0], places0])
         rays1 = np.vstack([places1, other.keys[rows1]])
         if len(rays0) < 8:
@@ -323,8 +324,11 @@ def refined(one: View, other: View, f1_T_f0: np.ndarray) -> Step | None:
 
 def steps_between(one: View, other: View) -> list[Step]:
     """Hypotheses of the pose between two frames, by falling rank."""
-    rough = [ranked_roughly(one, other, start) for start in hypotheses(one, other)]
-    chosen = distinct([some for some in rough if some is not None], 1.5, 6.0)[:NUM_REFINED]
+    rough = rough_ranks(one, other, hypotheses(one, other), 2.8, True, 0.6)
+    for beside, most in ((0.7, 0.4), (0.35, 0.3)):
+        rough = rough_ranks(one, other, distinct(rough, 1.5, 6.0)[:NUM_ROUGH], beside, False, most)
+    least = MIN_SHARE * max((rank for rank, _ in rough), default=0.0)
+    chosen = distinct([some for some in rough if some[0] >= least], 1.5, 6.0)[:NUM_REFINED]
     found = [step for start in chosen if (step := refined(one, other, start)) is not None]
     ranks = [(step.rank, step.f1_T_f0) for step in found]
     kept = distinct(ranks, 0.7, 3.0)
