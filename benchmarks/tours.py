@@ -35,6 +35,7 @@ import pycolmap
 from common import write_table
 from patch_search import search_patches
 from scipy.spatial.transform import Rotation
+from scipy.stats import binom
 
 import gsba
 from factors import BearingTerm, LandmarkBlock, RobustLoss
@@ -58,7 +59,7 @@ NUM_ROUGH, NUM_REFINED = 6, 4  # hypotheses of a step, the best by a coarse sear
 MIN_SHARE = 0.4  # of the best hypothesis' rank, below which others are not refined
 SIGMA_RAD = 2e-3  # of the places that the search finds
 LENGTH_SIGMA = 0.8  # of the logarithm of the ratio of two steps' lengths
-MIN_VOTES, MIN_CELLS = 15, 7  # keypoints that tie two steps, and cells of 15 degrees they are in
+MAX_DOUBT = 1e-3  # of a step against its rivals, and of a ratio of two steps' lengths
 RATIO_WIDTH = 0.08  # of its logarithm, in which keypoints agree on a ratio
 
 
@@ -328,11 +329,52 @@ def steps_between(one: View, other: View) -> list[Step]:
     for beside, most in ((0.7, 0.4), (0.35, 0.3)):
         rough = rough_ranks(one, other, distinct(rough, 1.5, 6.0)[:NUM_ROUGH], beside, False, most)
     least = MIN_SHARE * max((rank for rank, _ in rough), default=0.0)
-    chosen = distinct([some for some in rough if some[0] >= least], 1.5, 6.0)[:NUM_REFINED]
-    found = [step for start in chosen if (step := refined(one, other, start)) is not None]
-    ranks = [(step.rank, step.f1_T_f0) for step in found]
-    kept = distinct(ranks, 0.7, 3.0)
+    by_rank, found, kept = sorted(rough, key=lambda some: -some[0]), [], []
+    for rank, start in by_rank[:NUM_REFINED]:
+        if rank < least and len(kept) > 1:
+            break  # a rival is known, and others are far behind
+        step = refined(one, other, start)
+        found += [] if step is None else [step]
+        kept = distinct([(step.rank, step.f1_T_f0) for step in found], 0.7, 3.0)
     return [next(step for step in found if step.f1_T_f0 is one) for one in kept]
+
+
+def doubt(for_one: np.ndarray, for_other: np.ndarray, cells: np.ndarray) -> float:
+    """Chance that so many cells of the sphere have more keypoints for one of two rivals, were
+    either as likely in each cell, independently. Keypoints: (N,) bool, bool and cell."""
+    balance = np.bincount(cells, for_one.astype(float) - for_other.astype(float))
+    num = np.count_nonzero(balance > 0)
+    return float(binom.sf(num - 1, num + np.count_nonzero(balance < 0), 0.5))
+
+
+def doubt_of_step(step: Step, rivals: list[Step], one: View, other: View) -> float:
+    """`doubt` of a hypothesis against the best of its rivals, and against none."""
+    cells = np.r_[cells_of(one.keys, 6), cells_of(other.keys, 6)]
+    cells[len(one.keys) :] += cells.max() + 1
+
+    def fitting(some: Step) -> np.ndarray:
+        return np.isfinite(np.r_[some.depths0, some.depths1])
+
+    mine = fitting(step)
+    against = [np.zeros_like(mine), *(fitting(rival) for rival in rivals if rival is not step)]
+    return max(doubt(mine, theirs, cells) for theirs in against)
+
+
+def doubt_of_ratio(before: Step, after: Step, keys: np.ndarray) -> float:
+    """`doubt` of the ratio of two steps' lengths against the best other ratio, times the number of
+    ratios that were tried."""
+    both = np.isfinite(before.depths1) & np.isfinite(after.depths0)
+    num, _, ratio = votes(before, after, keys)
+    if num == 0:
+        return 1.0
+    logs, cells = np.log(before.depths1[both] / after.depths0[both]), cells_of(keys[both], 6)
+    others = np.abs(logs - ratio) > 2 * RATIO_WIDTH
+    centres = logs[others]
+    near = np.abs(centres[:, None] - centres) < RATIO_WIDTH
+    rival = centres[near.sum(axis=1).argmax()] if len(centres) else np.inf
+    tried = 1 + np.ptp(logs) / (2 * RATIO_WIDTH)
+    agreeing = np.abs(logs - ratio) < RATIO_WIDTH
+    return tried * doubt(agreeing, others & (np.abs(logs - rival) < RATIO_WIDTH), cells)
 
 
 def votes(before: Step, after: Step, keys: np.ndarray) -> tuple[int, int, float]:
@@ -368,18 +410,28 @@ def best_chain(steps: list[list[Step]], views: list[View]) -> list[Step]:
     return [found[c] for found, c in zip(steps, chain[::-1], strict=True)]
 
 
-def maps_of(chain: list[Step], views: list[View]) -> list[tuple[int, np.ndarray]]:
-    """First frame and poses (F, 4, 4) of each map of three frames and more, whose steps are tied by
-    keypoints that agree on the ratio of their lengths."""
-    between = [votes(chain[f - 1], chain[f], views[f].keys) for f in range(1, len(chain))]
-    tied = [num >= MIN_VOTES and cells >= MIN_CELLS for num, cells, _ in between]
-    ends = [0, *(f + 1 for f, one in enumerate(tied) if not one), len(chain)]
-    found = []
-    for first, last in pairwise(ends):
-        if last - first >= 2:
-            logs = np.array([ratio for _, _, ratio in between[first : last - 1]])
-            some, seen = chain[first:last], views[first : last + 1]
-            found.append((first, adjusted(metric_chain(some, logs), some, seen)))
+def maps_of(
+    chain: list[Step], steps: list[list[Step]], views: list[View]
+) -> list[tuple[int, np.ndarray]]:
+    """First frame and poses (F, 4, 4) of each map of three frames and more: of steps that are
+    certain, with ratios of their lengths that are."""
+    sure = [
+        doubt_of_step(step, steps[f], views[f], views[f + 1]) < MAX_DOUBT
+        for f, step in enumerate(chain)
+    ]
+    found, first = [], 0
+    for f in range(1, len(chain) + 1):
+        tied = f < len(chain) and sure[f - 1] and sure[f]
+        if tied and doubt_of_ratio(chain[f - 1], chain[f], views[f].keys) < MAX_DOUBT:
+            continue
+        if f - first >= 2:
+            some, seen = chain[first:f], views[first : f + 1]
+            logs = [
+                votes(*pair, view.keys)[2]
+                for pair, view in zip(pairwise(some), seen[1:-1], strict=True)
+            ]
+            found.append((first, adjusted(metric_chain(some, np.array(logs)), some, seen)))
+        first = f
     return found
 
 
@@ -459,7 +511,7 @@ def row_of(tour: Path) -> str:
         if any(good)
     ]
     maps = []
-    for first, poses in maps_of(chain, views):
+    for first, poses in maps_of(chain, steps, views):
         rows = slice(first, first + len(poses))
         true = Trajectory(truth.timestamps[rows], true_poses[rows])
         off = pose_errors(Trajectory(true.timestamps, poses), true).positions
