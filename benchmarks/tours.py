@@ -17,7 +17,11 @@ TOUR: a folder with images/*.jpg, groundtruth.tum and, if a carrier is in the pi
    finely, and what then comes near the best one is refined with all keypoints.
 4. The best chain over all frames is chosen by these ranks and by keypoints whose distances agree in
    both neighbouring steps, which also give the ratio of the steps' lengths.
-5. Where few agree, the chain ends. Each map is adjusted with the places that the search found.
+5. Where a step or a ratio is in doubt, the chain ends. Each cell of 15 degrees has one vote: for
+   the hypothesis, or the ratio, that more of its keypoints fit. A sign test over cells tells how
+   easily a rival as good would have come off so badly. Steps are in doubt, too, where keypoints
+   that do not fit prefer one rival to all that rank below it: a place that repeats.
+6. Each map is adjusted with the places that the search found.
 
 A prototype, not part of the product: results/tours.md says what it finds and what is open.
 """
@@ -25,7 +29,6 @@ A prototype, not part of the product: results/tours.md says what it finds and wh
 import argparse
 import time
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -331,8 +334,8 @@ def steps_between(one: View, other: View) -> list[Step]:
     least = MIN_SHARE * max((rank for rank, _ in rough), default=0.0)
     by_rank, found, kept = sorted(rough, key=lambda some: -some[0]), [], []
     for rank, start in by_rank[:NUM_REFINED]:
-        if rank < least and len(kept) > 1:
-            break  # a rival is known, and others are far behind
+        if rank < least and len(kept) > 2:
+            break  # two rivals are known, and others are far behind
         step = refined(one, other, start)
         found += [] if step is None else [step]
         kept = distinct([(step.rank, step.f1_T_f0) for step in found], 0.7, 3.0)
@@ -347,8 +350,10 @@ def doubt(for_one: np.ndarray, for_other: np.ndarray, cells: np.ndarray) -> floa
     return float(binom.sf(num - 1, num + np.count_nonzero(balance < 0), 0.5))
 
 
-def doubt_of_step(step: Step, rivals: list[Step], one: View, other: View) -> float:
-    """`doubt` of a hypothesis against the best of its rivals, and against none."""
+def doubts_of_step(step: Step, found: list[Step], one: View, other: View) -> tuple[float, float]:
+    """`doubt` of a hypothesis against the best of its rivals, and of the best rival, by keypoints
+    that do not fit the hypothesis, against those that rank below it: small where a place repeats.
+    """
     cells = np.r_[cells_of(one.keys, 6), cells_of(other.keys, 6)]
     cells[len(one.keys) :] += cells.max() + 1
 
@@ -356,8 +361,14 @@ def doubt_of_step(step: Step, rivals: list[Step], one: View, other: View) -> flo
         return np.isfinite(np.r_[some.depths0, some.depths1])
 
     mine = fitting(step)
-    against = [np.zeros_like(mine), *(fitting(rival) for rival in rivals if rival is not step)]
-    return max(doubt(mine, theirs, cells) for theirs in against)
+    rivals = [fitting(rival) for rival in found if rival is not step]
+    behind = max(doubt(mine, theirs, cells) for theirs in [np.zeros_like(mine), *rivals])
+    left = [theirs & ~mine for theirs in rivals]
+    repeated = [
+        max(doubt(theirs, later, cells) for later in left[k + 1 :])
+        for k, theirs in enumerate(left[:-1])
+    ]
+    return behind, min(repeated, default=1.0)
 
 
 def doubt_of_ratio(before: Step, after: Step, keys: np.ndarray) -> float:
@@ -410,15 +421,18 @@ def best_chain(steps: list[list[Step]], views: list[View]) -> list[Step]:
     return [found[c] for found, c in zip(steps, chain[::-1], strict=True)]
 
 
-def maps_of(
-    chain: list[Step], steps: list[list[Step]], views: list[View]
-) -> list[tuple[int, np.ndarray]]:
-    """First frame and poses (F, 4, 4) of each map of three frames and more: of steps that are
-    certain, with ratios of their lengths that are."""
-    sure = [
-        doubt_of_step(step, steps[f], views[f], views[f + 1]) < MAX_DOUBT
-        for f, step in enumerate(chain)
-    ]
+def certain(chain: list[Step], steps: list[list[Step]], views: list[View]) -> list[bool]:
+    """True for steps that are in doubt neither by a rival nor as places that repeat."""
+    sure = []
+    for f, step in enumerate(chain):
+        behind, repeated = doubts_of_step(step, steps[f], views[f], views[f + 1])
+        sure.append(behind < MAX_DOUBT and repeated > MAX_DOUBT)
+    return sure
+
+
+def maps_of(chain: list[Step], sure: list[bool], views: list[View]) -> list[tuple[int, np.ndarray]]:
+    """First frame and poses (F, 4, 4) of each map of three frames and more: of certain steps with
+    certain ratios of their lengths."""
     found, first = [], 0
     for f in range(1, len(chain) + 1):
         tied = f < len(chain) and sure[f - 1] and sure[f]
@@ -426,10 +440,8 @@ def maps_of(
             continue
         if f - first >= 2:
             some, seen = chain[first:f], views[first : f + 1]
-            logs = [
-                votes(*pair, view.keys)[2]
-                for pair, view in zip(pairwise(some), seen[1:-1], strict=True)
-            ]
+            beside = zip(some, some[1:], seen[1:], strict=False)
+            logs = [votes(before, after, view.keys)[2] for before, after, view in beside]
             found.append((first, adjusted(metric_chain(some, np.array(logs)), some, seen)))
         first = f
     return found
@@ -511,7 +523,8 @@ def row_of(tour: Path) -> str:
         if any(good)
     ]
     maps = []
-    for first, poses in maps_of(chain, steps, views):
+    sure = certain(chain, steps, views)
+    for first, poses in maps_of(chain, sure, views):
         rows = slice(first, first + len(poses))
         true = Trajectory(truth.timestamps[rows], true_poses[rows])
         off = pose_errors(Trajectory(true.timestamps, poses), true).positions
@@ -520,7 +533,8 @@ def row_of(tour: Path) -> str:
         maps.append(f"{first} to {first + len(poses) - 1}: {1e3 * ate:.1f}e-3")
     numbers = [sum(map(any, right)), sum(good[0] for good in right), len(steps) - len(wrong)]
     cells = [tour.name, len(steps), *numbers, f"{min(lead):.1f}, {np.median(lead):.1f}"]
-    cells += [", ".join(map(str, wrong)) or "none", "; ".join(maps), f"{cpu:.0f}"]
+    cells += [", ".join(map(str, wrong)) or "none", sum(sure), sum(sure[i] for i in wrong)]
+    cells += ["; ".join(maps) or "none", f"{cpu:.0f}"]
     return f"| {' | '.join(map(str, cells))} |"
 
 
@@ -531,8 +545,9 @@ def main() -> None:
     options = parser.parse_args()
     lines = [
         "| tour | steps | a hypothesis is right | first is right | right in the chain | "
-        "lead of right ones: least, median | wrong steps | maps: frames, ATE of extent | CPU s |",
-        "|---|---|---|---|---|---|---|---|---|",
+        "lead of right ones: least, median | wrong steps | certain steps | wrong ones of these | "
+        "maps: frames, ATE of extent | CPU s |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for tour in options.tours:
         lines.append(row_of(tour))
