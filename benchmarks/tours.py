@@ -17,7 +17,8 @@ TOUR: a folder with images/*.jpg, groundtruth.tum and, if a carrier is in the pi
    finely, and what then comes near the best one is refined with all keypoints.
 4. The best chain over all frames is chosen by these ranks and by keypoints whose distances agree in
    both neighbouring steps, which also give the ratio of the steps' lengths.
-5. Where a step or a ratio is in doubt, the chain ends. Each cell of 15 degrees has one vote: for
+   Of ratios, the one that most cells of 15 degrees agree on counts: a floor's pattern fills few.
+5. Where a step or a ratio is in doubt, the chain ends. Each cell has one vote: for
    the hypothesis, or the ratio, that more of its keypoints fit. A sign test over cells tells how
    easily a rival as good would have come off so badly. Steps are in doubt, too, where keypoints
    that do not fit prefer one rival to all that rank below it: a place that repeats.
@@ -62,7 +63,7 @@ NUM_ROUGH, NUM_REFINED = 6, 4  # hypotheses of a step, the best by a coarse sear
 MIN_SHARE = 0.4  # of the best hypothesis' rank, below which others are not refined
 SIGMA_RAD = 2e-3  # of the places that the search finds
 LENGTH_SIGMA = 0.8  # of the logarithm of the ratio of two steps' lengths
-MAX_DOUBT = 1e-3  # of a step against its rivals, and of a ratio of two steps' lengths
+MAX_DOUBT, MAX_DOUBT_OF_RATIO = 1e-3, 1e-2  # of a step; of the ratio of two steps' lengths
 RATIO_WIDTH = 0.08  # of its logarithm, in which keypoints agree on a ratio
 
 
@@ -371,36 +372,40 @@ def doubts_of_step(step: Step, found: list[Step], one: View, other: View) -> tup
     return behind, min(repeated, default=1.0)
 
 
-def doubt_of_ratio(before: Step, after: Step, keys: np.ndarray) -> float:
+def doubt_of_ratio(before: Step, after: Step, view: View) -> float:
     """`doubt` of the ratio of two steps' lengths against the best other ratio, times the number of
-    ratios that were tried."""
+    ratios that were tried; by all keypoints or by sound ones, times two."""
     both = np.isfinite(before.depths1) & np.isfinite(after.depths0)
-    num, _, ratio = votes(before, after, keys)
-    if num == 0:
-        return 1.0
-    logs, cells = np.log(before.depths1[both] / after.depths0[both]), cells_of(keys[both], 6)
-    others = np.abs(logs - ratio) > 2 * RATIO_WIDTH
-    centres = logs[others]
-    near = np.abs(centres[:, None] - centres) < RATIO_WIDTH
-    rival = centres[near.sum(axis=1).argmax()] if len(centres) else np.inf
-    tried = 1 + np.ptp(logs) / (2 * RATIO_WIDTH)
-    agreeing = np.abs(logs - ratio) < RATIO_WIDTH
-    return tried * doubt(agreeing, others & (np.abs(logs - rival) < RATIO_WIDTH), cells)
+    ratio, doubts = votes(before, after, view.keys)[2], [0.5]
+    for rows in (both, both & view.sound):
+        if not rows.any():
+            continue
+        logs, cells = (
+            np.log(before.depths1[rows] / after.depths0[rows]),
+            cells_of(view.keys[rows], 6),
+        )
+        agreeing, others = (
+            np.abs(logs - ratio) < RATIO_WIDTH,
+            np.abs(logs - ratio) > 2 * RATIO_WIDTH,
+        )
+        rivals = [others & (np.abs(logs - log) < RATIO_WIDTH) for log in logs[others]]
+        worst = max(doubt(agreeing, rival, cells) for rival in [np.zeros_like(others), *rivals])
+        doubts.append(worst * (1 + np.ptp(logs) / (2 * RATIO_WIDTH)))
+    return 2 * min(doubts)
 
 
 def votes(before: Step, after: Step, keys: np.ndarray) -> tuple[int, int, float]:
     """Keypoints of the frame between two steps that agree on the ratio of their lengths, cells of
-    the sphere that these are in, and its logarithm."""
+    the sphere that these are in, of which the ratio has most, and its logarithm."""
     both = np.isfinite(before.depths1) & np.isfinite(after.depths0)
     if np.count_nonzero(both) < 3:
         return 0, 0, 0.0
-    logs = np.log(before.depths1[both] / after.depths0[both])
-    ordered = np.sort(logs)
-    last = np.searchsorted(ordered, ordered + 2 * RATIO_WIDTH)
-    first = int(np.argmax(last - np.arange(len(ordered))))
-    ratio = float(np.median(ordered[first : last[first]]))
+    logs, cells = np.log(before.depths1[both] / after.depths0[both]), cells_of(keys[both], 6)
+    near = np.abs(logs[:, None] - logs) < RATIO_WIDTH
+    most = max(near, key=lambda some: (len(np.unique(cells[some])), np.count_nonzero(some)))
+    ratio = float(np.median(logs[most]))
     agreeing = np.abs(logs - ratio) < RATIO_WIDTH
-    return int(np.count_nonzero(agreeing)), len(np.unique(cells_of(keys[both][agreeing], 6))), ratio
+    return int(np.count_nonzero(agreeing)), len(np.unique(cells[agreeing])), ratio
 
 
 def best_chain(steps: list[list[Step]], views: list[View]) -> list[Step]:
@@ -436,7 +441,7 @@ def maps_of(chain: list[Step], sure: list[bool], views: list[View]) -> list[tupl
     found, first = [], 0
     for f in range(1, len(chain) + 1):
         tied = f < len(chain) and sure[f - 1] and sure[f]
-        if tied and doubt_of_ratio(chain[f - 1], chain[f], views[f].keys) < MAX_DOUBT:
+        if tied and doubt_of_ratio(chain[f - 1], chain[f], views[f]) < MAX_DOUBT_OF_RATIO:
             continue
         if f - first >= 2:
             some, seen = chain[first:f], views[first : f + 1]
