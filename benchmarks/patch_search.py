@@ -11,6 +11,7 @@ HALF = 4  # samples from the middle of a patch to its border
 SIDE = 2 * HALF + 1
 AREA = SIDE * SIDE
 MIN_LIKENESS, MIN_MARGIN = 0.65, 0.06  # of the best place, and above any other
+MIN_FACING = 0.1  # likeness of a plane that faces the camera, below which no other is tried
 BESIDE = 0.035  # radians along a line: places further from the best one are others
 
 
@@ -29,8 +30,8 @@ def _sample(image, u, v):
 
 @_part
 def _likeness(image, u0, v0, ui, uj, vi, vj, template, least):
-    """Correlation of the patch at u0 + ui i + uj j, v0 + vi i + vj j with a template of unit norm;
-    -1 outside, where it is flat, or where every second sample has less than `least`."""
+    """Correlation of the patch at u0 + ui i + uj j, v0 + vi i + vj j with a template of unit norm,
+    of every second sample where that is below `least`; -1 outside or where it is flat."""
     extent = HALF * (abs(vi) + abs(vj))
     if v0 - extent < 0.0 or v0 + extent >= len(image) - 1.001:
         return np.float32(-1.0)
@@ -53,8 +54,10 @@ def _likeness(image, u0, v0, ui, uj, vi, vj, template, least):
             var = squares / num - (total / num) * (total / num)
             of_var = of_squares / num - (of_template / num) * (of_template / num)
             joint = products / num - total / num * of_template / num
-            if not var > 2.0 or not joint > 0.0 or joint * joint < least * least * var * of_var:
+            if not var > 2.0:
                 return np.float32(-1.0)
+            if not joint > 0.0 or joint * joint < least * least * var * of_var:
+                return joint / np.sqrt(var * of_var)
     var = squares / AREA - (total / AREA) * (total / AREA)
     return products / np.sqrt(var * AREA) if var > 4.0 else np.float32(-1.0)
 
@@ -83,24 +86,29 @@ def _cut(image, warp, out):
 
 
 @_part
-def _place(x, y, z, by_i, by_j, width, height, sample, warp):
-    """Warp of a patch from the ray (x, y, z) of its middle and the ray's derivatives (3,) by i and
-    j, samples; False near a pole."""
-    flat2 = x * x + z * z
-    squared = flat2 + y * y
-    if y * y > 0.86 * squared:
+def _place(x, y, z, width, height, warp):
+    """Middle of a patch by its ray (x, y, z); False near a pole."""
+    if y * y > 0.86 * (x * x + y * y + z * z):
         return False
-    flat = np.sqrt(flat2)
     warp[0], warp[1] = erp_pixel(x, y, z, width, height)
     warp[0] -= 0.5
     warp[1] -= 0.5
+    return True
+
+
+@_part
+def _bend(x, y, z, by_i, by_j, width, height, sample, warp):
+    """The rest of a patch's warp, from the derivatives (3,) of its middle's ray (x, y, z) by i and
+    j, samples."""
+    flat2 = x * x + z * z
+    squared = flat2 + y * y
+    flat = np.sqrt(flat2)
     along = sample * width / (2 * np.pi) / flat2
     down = sample * height / np.pi / (flat * squared)
     warp[2] = along * (z * by_i[0] - x * by_i[2])
     warp[3] = along * (z * by_j[0] - x * by_j[2])
     warp[4] = down * (flat2 * by_i[1] - y * (x * by_i[0] + z * by_i[2]))
     warp[5] = down * (flat2 * by_j[1] - y * (x * by_j[0] + z * by_j[2]))
-    return True
 
 
 @_part
@@ -182,9 +190,10 @@ def search_patches(image0, image1, rays, rotation, direction, beside, step, samp
         tangents[1, 0], tangents[1, 1] = -ray[1] * ray[0] / flat, flat
         tangents[1, 2] = -ray[1] * ray[2] / flat
         _derivatives(identity, ray, tangents, 0, slopes[0])
-        if not _place(
-            ray[0], ray[1], ray[2], slopes[0, 0], slopes[0, 1], width0, height0, sample, warp
-        ) or not _cut(image0, warp, template):
+        if not _place(ray[0], ray[1], ray[2], width0, height0, warp):
+            continue
+        _bend(ray[0], ray[1], ray[2], slopes[0, 0], slopes[0, 1], width0, height0, sample, warp)
+        if not _cut(image0, warp, template):
             continue
         x0 = rotation[0, 0] * ray[0] + rotation[0, 1] * ray[1] + rotation[0, 2] * ray[2]
         y0 = rotation[1, 0] * ray[0] + rotation[1, 1] * ray[1] + rotation[1, 2] * ray[2]
@@ -210,13 +219,13 @@ def search_patches(image0, image1, rays, rotation, direction, beside, step, samp
                 z = z0 + nearness * direction[2]
                 off = m * step * np.sqrt(x * x + y * y + z * z) / sine
                 x, y, z = x + off * normal[0], y + off * normal[1], z + off * normal[2]
+                if not _place(x, y, z, width1, height1, warp):
+                    continue
                 for plane in range(4):
                     if plane == 1 and abs(ray[1]) < 0.17:
                         continue
-                    if not _place(
-                        x, y, z, slopes[plane, 0], slopes[plane, 1], width1, height1, sample, warp
-                    ):
-                        continue
+                    by_i, by_j = slopes[plane, 0], slopes[plane, 1]
+                    _bend(x, y, z, by_i, by_j, width1, height1, sample, warp)
                     like = _likeness(
                         image1, warp[0], warp[1], warp[2], warp[3], warp[4], warp[5], template, 0.4
                     )
@@ -225,6 +234,8 @@ def search_patches(image0, image1, rays, rotation, direction, beside, step, samp
                         top, at = like, k
                         for c in range(6):
                             best[c] = warp[c]
+                    if plane == 0 and like < MIN_FACING:
+                        break
         second = np.float32(-1.0)
         for k in range(num):
             if abs(k - at) * step > BESIDE:

@@ -13,10 +13,16 @@ TOUR: a folder with images/*.jpg, groundtruth.tum and, if a carrier is in the pi
    another one is about as good, is moved by Lucas and Kanade's method. A pose is fitted to these
    matches, and so on from coarse to fine. No keypoint of the other frame is asked for.
 3. Hypotheses are ranked by the keypoints that fit: the geometric mean of all and of those
-   without look-alikes and floor.
+   without look-alikes and floor. Few keypoints and a coarse picture choose those that are searched
+   finely, and what then comes near the best one is refined with all keypoints.
 4. The best chain over all frames is chosen by these ranks and by keypoints whose distances agree in
    both neighbouring steps, which also give the ratio of the steps' lengths.
-5. Where few agree, the chain ends. Each map is adjusted with the places that the search found.
+   Of ratios, the one that most cells of 15 degrees agree on counts: a floor's pattern fills few.
+5. Where a step or a ratio is in doubt, the chain ends. Each cell has one vote: for
+   the hypothesis, or the ratio, that more of its keypoints fit. A sign test over cells tells how
+   easily a rival as good would have come off so badly. Steps are in doubt, too, where keypoints
+   that do not fit prefer one rival to all that rank below it: a place that repeats.
+6. Each map is adjusted with the places that the search found.
 
 A prototype, not part of the product: results/tours.md says what it finds and what is open.
 """
@@ -24,7 +30,6 @@ A prototype, not part of the product: results/tours.md says what it finds and wh
 import argparse
 import time
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -34,6 +39,7 @@ import pycolmap
 from common import write_table
 from patch_search import search_patches
 from scipy.spatial.transform import Rotation
+from scipy.stats import binom
 
 import gsba
 from factors import BearingTerm, LandmarkBlock, RobustLoss
@@ -53,10 +59,11 @@ LINE_STEP_DEG = 0.35  # along epipolar lines, and between lines beside them
 MIN_PARALLAX = np.deg2rad(3.0)  # of keypoints that tell a direction
 FLOOR_Y = 0.25  # y of bearings below which a floor is likely
 NUM_KEYS, NUM_FEW = 1000, 300  # keypoints of a frame that are searched; for a first rank
-NUM_REFINED = 5  # hypotheses of a step that are refined
+NUM_ROUGH, NUM_REFINED = 6, 4  # hypotheses of a step, the best by a coarse search; refined
+MIN_SHARE = 0.4  # of the best hypothesis' rank, below which others are not refined
 SIGMA_RAD = 2e-3  # of the places that the search finds
 LENGTH_SIGMA = 0.8  # of the logarithm of the ratio of two steps' lengths
-MIN_VOTES, MIN_CELLS = 15, 7  # keypoints that tie two steps, and cells of 15 degrees they are in
+MAX_DOUBT, MAX_DOUBT_OF_RATIO = 1e-3, 1e-2  # of a step; of the ratio of two steps' lengths
 RATIO_WIDTH = 0.08  # of its logarithm, in which keypoints agree on a ratio
 
 
@@ -271,33 +278,32 @@ def distinct(
     return kept
 
 
-def ranked_roughly(one: View, other: View, f1_T_f0: np.ndarray) -> tuple[float, np.ndarray] | None:
-    """Rank and pose of a hypothesis after a search with few keypoints, coarse to fine."""
+def rough_ranks(
+    one: View, other: View, starts: list[np.ndarray], beside: float, coarse: bool, most_deg: float
+) -> list[tuple[float, np.ndarray]]:
+    """Hypotheses after a search with few keypoints, and their ranks."""
     sound = np.flatnonzero(one.sound)[: NUM_FEW // 2]
     rest = np.setdiff1d(np.arange(len(one.keys)), sound)
     rest = np.random.default_rng(0).permutation(rest)[: NUM_FEW // 2]
-    few = np.concatenate([sound, rest])
-    for beside, coarse, most, width in (
-        (2.8, True, 0.6, 0.4),
-        (1.05, False, 0.4, 0.25),
-        (0.35, False, 0.3, 0.15),
-    ):
-        rows, places = search(one, other, few, f1_T_f0, beside, coarse)
-        if len(rows) < 8:
-            return None
-        f1_T_f0 = better(one.keys[rows], places, one.sound[rows], f1_T_f0, most, width)
-    good, parallax, _ = fits(one.keys[rows], places, f1_T_f0, 0.2)
-    good &= parallax > MIN_PARALLAX
-    num_sound = np.count_nonzero(good & one.sound[rows])
-    return rank_of(int(np.count_nonzero(good)), int(num_sound)), f1_T_f0
+    few, found = np.concatenate([sound, rest]), []
+    for start in starts:
+        rows, places = search(one, other, few, start, beside, coarse)
+        if len(rows) >= 8:
+            rays, width = one.keys[rows], most_deg * 0.6
+            f1_T_f0 = better(rays, places, one.sound[rows], start, most_deg, width)
+            good, parallax, _ = fits(rays, places, f1_T_f0, 0.7 * most_deg)
+            good &= parallax > MIN_PARALLAX
+            num, num_sound = np.count_nonzero(good), np.count_nonzero(good & one.sound[rows])
+            found.append((rank_of(int(num), int(num_sound)), f1_T_f0))
+    return found
 
 
 def refined(one: View, other: View, f1_T_f0: np.ndarray) -> Step | None:
-    """A hypothesis refined by all keypoints of both frames."""
-    every0, every1 = np.arange(len(one.keys)), np.arange(len(other.keys))
-    for beside in (0.7, 0.35, 0.35):
-        rows0, places1 = search(one, other, every0, f1_T_f0, beside, False)
-        rows1, places0 = search(other, one, every1, inverse(f1_T_f0), beside, False)
+    """A hypothesis refined by keypoints of both frames, at last by all."""
+    for beside, every in ((0.7, 3), (0.35, 1)):
+        few0, few1 = np.arange(len(one.keys))[::every], np.arange(len(other.keys))[::every]
+        rows0, places1 = search(one, other, few0, f1_T_f0, beside, False)
+        rows1, places0 = search(other, one, few1, inverse(f1_T_f0), beside, False)
         rays0 = np.vstack([one.keys[rows0], places0])
         rays1 = np.vstack([places1, other.keys[rows1]])
         if len(rays0) < 8:
@@ -323,27 +329,83 @@ def refined(one: View, other: View, f1_T_f0: np.ndarray) -> Step | None:
 
 def steps_between(one: View, other: View) -> list[Step]:
     """Hypotheses of the pose between two frames, by falling rank."""
-    rough = [ranked_roughly(one, other, start) for start in hypotheses(one, other)]
-    chosen = distinct([some for some in rough if some is not None], 1.5, 6.0)[:NUM_REFINED]
-    found = [step for start in chosen if (step := refined(one, other, start)) is not None]
-    ranks = [(step.rank, step.f1_T_f0) for step in found]
-    kept = distinct(ranks, 0.7, 3.0)
+    rough = rough_ranks(one, other, hypotheses(one, other), 2.8, True, 0.6)
+    for beside, most in ((0.7, 0.4), (0.35, 0.3)):
+        rough = rough_ranks(one, other, distinct(rough, 1.5, 6.0)[:NUM_ROUGH], beside, False, most)
+    least = MIN_SHARE * max((rank for rank, _ in rough), default=0.0)
+    by_rank, found, kept = sorted(rough, key=lambda some: -some[0]), [], []
+    for rank, start in by_rank[:NUM_REFINED]:
+        if rank < least and len(kept) > 2:
+            break  # two rivals are known, and others are far behind
+        step = refined(one, other, start)
+        found += [] if step is None else [step]
+        kept = distinct([(step.rank, step.f1_T_f0) for step in found], 0.7, 3.0)
     return [next(step for step in found if step.f1_T_f0 is one) for one in kept]
+
+
+def doubt(for_one: np.ndarray, for_other: np.ndarray, cells: np.ndarray) -> float:
+    """Chance that so many cells of the sphere have more keypoints for one of two rivals, were
+    either as likely in each cell, independently. Keypoints: (N,) bool, bool and cell."""
+    balance = np.bincount(cells, for_one.astype(float) - for_other.astype(float))
+    num = np.count_nonzero(balance > 0)
+    return float(binom.sf(num - 1, num + np.count_nonzero(balance < 0), 0.5))
+
+
+def doubts_of_step(step: Step, found: list[Step], one: View, other: View) -> tuple[float, float]:
+    """`doubt` of a hypothesis against the best of its rivals, and of the best rival, by keypoints
+    that do not fit the hypothesis, against those that rank below it: small where a place repeats.
+    """
+    cells = np.r_[cells_of(one.keys, 6), cells_of(other.keys, 6)]
+    cells[len(one.keys) :] += cells.max() + 1
+
+    def fitting(some: Step) -> np.ndarray:
+        return np.isfinite(np.r_[some.depths0, some.depths1])
+
+    mine = fitting(step)
+    rivals = [fitting(rival) for rival in found if rival is not step]
+    behind = max(doubt(mine, theirs, cells) for theirs in [np.zeros_like(mine), *rivals])
+    left = [theirs & ~mine for theirs in rivals]
+    repeated = [
+        max(doubt(theirs, later, cells) for later in left[k + 1 :])
+        for k, theirs in enumerate(left[:-1])
+    ]
+    return behind, min(repeated, default=1.0)
+
+
+def doubt_of_ratio(before: Step, after: Step, view: View) -> float:
+    """`doubt` of the ratio of two steps' lengths against the best other ratio, times the number of
+    ratios that were tried; by all keypoints or by sound ones, times two."""
+    both = np.isfinite(before.depths1) & np.isfinite(after.depths0)
+    ratio, doubts = votes(before, after, view.keys)[2], [0.5]
+    for rows in (both, both & view.sound):
+        if not rows.any():
+            continue
+        logs, cells = (
+            np.log(before.depths1[rows] / after.depths0[rows]),
+            cells_of(view.keys[rows], 6),
+        )
+        agreeing, others = (
+            np.abs(logs - ratio) < RATIO_WIDTH,
+            np.abs(logs - ratio) > 2 * RATIO_WIDTH,
+        )
+        rivals = [others & (np.abs(logs - log) < RATIO_WIDTH) for log in logs[others]]
+        worst = max(doubt(agreeing, rival, cells) for rival in [np.zeros_like(others), *rivals])
+        doubts.append(worst * (1 + np.ptp(logs) / (2 * RATIO_WIDTH)))
+    return 2 * min(doubts)
 
 
 def votes(before: Step, after: Step, keys: np.ndarray) -> tuple[int, int, float]:
     """Keypoints of the frame between two steps that agree on the ratio of their lengths, cells of
-    the sphere that these are in, and its logarithm."""
+    the sphere that these are in, of which the ratio has most, and its logarithm."""
     both = np.isfinite(before.depths1) & np.isfinite(after.depths0)
     if np.count_nonzero(both) < 3:
         return 0, 0, 0.0
-    logs = np.log(before.depths1[both] / after.depths0[both])
-    ordered = np.sort(logs)
-    last = np.searchsorted(ordered, ordered + 2 * RATIO_WIDTH)
-    first = int(np.argmax(last - np.arange(len(ordered))))
-    ratio = float(np.median(ordered[first : last[first]]))
+    logs, cells = np.log(before.depths1[both] / after.depths0[both]), cells_of(keys[both], 6)
+    near = np.abs(logs[:, None] - logs) < RATIO_WIDTH
+    most = max(near, key=lambda some: (len(np.unique(cells[some])), np.count_nonzero(some)))
+    ratio = float(np.median(logs[most]))
     agreeing = np.abs(logs - ratio) < RATIO_WIDTH
-    return int(np.count_nonzero(agreeing)), len(np.unique(cells_of(keys[both][agreeing], 6))), ratio
+    return int(np.count_nonzero(agreeing)), len(np.unique(cells[agreeing])), ratio
 
 
 def best_chain(steps: list[list[Step]], views: list[View]) -> list[Step]:
@@ -364,18 +426,29 @@ def best_chain(steps: list[list[Step]], views: list[View]) -> list[Step]:
     return [found[c] for found, c in zip(steps, chain[::-1], strict=True)]
 
 
-def maps_of(chain: list[Step], views: list[View]) -> list[tuple[int, np.ndarray]]:
-    """First frame and poses (F, 4, 4) of each map of three frames and more, whose steps are tied by
-    keypoints that agree on the ratio of their lengths."""
-    between = [votes(chain[f - 1], chain[f], views[f].keys) for f in range(1, len(chain))]
-    tied = [num >= MIN_VOTES and cells >= MIN_CELLS for num, cells, _ in between]
-    ends = [0, *(f + 1 for f, one in enumerate(tied) if not one), len(chain)]
-    found = []
-    for first, last in pairwise(ends):
-        if last - first >= 2:
-            logs = np.array([ratio for _, _, ratio in between[first : last - 1]])
-            some, seen = chain[first:last], views[first : last + 1]
-            found.append((first, adjusted(metric_chain(some, logs), some, seen)))
+def certain(chain: list[Step], steps: list[list[Step]], views: list[View]) -> list[bool]:
+    """True for steps that are in doubt neither by a rival nor as places that repeat."""
+    sure = []
+    for f, step in enumerate(chain):
+        behind, repeated = doubts_of_step(step, steps[f], views[f], views[f + 1])
+        sure.append(behind < MAX_DOUBT and repeated > MAX_DOUBT)
+    return sure
+
+
+def maps_of(chain: list[Step], sure: list[bool], views: list[View]) -> list[tuple[int, np.ndarray]]:
+    """First frame and poses (F, 4, 4) of each map of three frames and more: of certain steps with
+    certain ratios of their lengths."""
+    found, first = [], 0
+    for f in range(1, len(chain) + 1):
+        tied = f < len(chain) and sure[f - 1] and sure[f]
+        if tied and doubt_of_ratio(chain[f - 1], chain[f], views[f]) < MAX_DOUBT_OF_RATIO:
+            continue
+        if f - first >= 2:
+            some, seen = chain[first:f], views[first : f + 1]
+            beside = zip(some, some[1:], seen[1:], strict=False)
+            logs = [votes(before, after, view.keys)[2] for before, after, view in beside]
+            found.append((first, adjusted(metric_chain(some, np.array(logs)), some, seen)))
+        first = f
     return found
 
 
@@ -455,7 +528,8 @@ def row_of(tour: Path) -> str:
         if any(good)
     ]
     maps = []
-    for first, poses in maps_of(chain, views):
+    sure = certain(chain, steps, views)
+    for first, poses in maps_of(chain, sure, views):
         rows = slice(first, first + len(poses))
         true = Trajectory(truth.timestamps[rows], true_poses[rows])
         off = pose_errors(Trajectory(true.timestamps, poses), true).positions
@@ -464,7 +538,8 @@ def row_of(tour: Path) -> str:
         maps.append(f"{first} to {first + len(poses) - 1}: {1e3 * ate:.1f}e-3")
     numbers = [sum(map(any, right)), sum(good[0] for good in right), len(steps) - len(wrong)]
     cells = [tour.name, len(steps), *numbers, f"{min(lead):.1f}, {np.median(lead):.1f}"]
-    cells += [", ".join(map(str, wrong)) or "none", "; ".join(maps), f"{cpu:.0f}"]
+    cells += [", ".join(map(str, wrong)) or "none", sum(sure), sum(sure[i] for i in wrong)]
+    cells += ["; ".join(maps) or "none", f"{cpu:.0f}"]
     return f"| {' | '.join(map(str, cells))} |"
 
 
@@ -475,8 +550,9 @@ def main() -> None:
     options = parser.parse_args()
     lines = [
         "| tour | steps | a hypothesis is right | first is right | right in the chain | "
-        "lead of right ones: least, median | wrong steps | maps: frames, ATE of extent | CPU s |",
-        "|---|---|---|---|---|---|---|---|---|",
+        "lead of right ones: least, median | wrong steps | certain steps | wrong ones of these | "
+        "maps: frames, ATE of extent | CPU s |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for tour in options.tours:
         lines.append(row_of(tour))
