@@ -10,6 +10,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from one_gallery import OVAL_FRAMES, OVAL_WIDTH
+from pixels import pixel_centres
 from tiny_run import exporting
 
 from gsba import Recording, refine_recordings
@@ -121,7 +122,7 @@ def fisheyes(home: Home, which: int = 1) -> Recording:
     def fill(folder: Path) -> None:
         for name, lens in zip(("front", "back"), PAIR, strict=True):
             (folder / name).mkdir()
-            grid = np.stack(np.meshgrid(np.arange(240) + 0.5, np.arange(240) + 0.5), axis=-1)
+            grid = pixel_centres(240, 240)
             places = erp_from_bearings(unproject(lens, grid), WIDTH, WIDTH // 2) - 0.5 + 4
             u, v = np.moveaxis(places, -1, 0).astype(np.float32)
             far = np.hypot(*(np.moveaxis(grid, -1, 0) - 120)) > 73 * np.deg2rad(95)

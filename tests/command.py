@@ -10,6 +10,13 @@ def run_gsba(*arguments: object) -> Result:
     return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
+def succeed(*arguments: object) -> Result:
+    """Output of `gsba` with these arguments, which must end with exit code 0."""
+    result = run_gsba(*arguments)
+    assert result.exit_code == 0, result.output
+    return result
+
+
 def fails(result: Result, message: str, code: int = 1) -> None:
     """The command ended with exactly one line on stderr and nothing on stdout."""
     lines = result.stderr.splitlines()

@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import cv2
 import numpy as np
+from synthetic import unit
 
 from gsba.camera.sphere import around_sphere, erp_from_bearings
 from gsba.camera.straighten import PAD
@@ -31,8 +32,7 @@ def picture_tracks(
     size: int, overlap: int, seen: Callable[[np.ndarray], np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Tracks (size, 3 size + 2 overlap[, C]) uint8 of what is seen in unit directions (..., 3)."""
-    directions = track_directions(size, overlap)
-    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    directions = unit(track_directions(size, overlap))
     first, second = np.rint(seen(directions)).astype(np.uint8)
     return first, second
 

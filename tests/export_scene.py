@@ -5,7 +5,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from pixels import pixel_centres
 from scipy.spatial.transform import Rotation
+from synthetic import unit
 
 from gsba.camera.lens import Lenses
 from gsba.camera.rig import RIG_R_FACE
@@ -84,7 +86,7 @@ def picture(directions: np.ndarray, point_bearings: np.ndarray) -> np.ndarray:
 
 
 def _grid(width: int, height: int) -> np.ndarray:
-    return np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1)
+    return pixel_centres(width, height)
 
 
 @functools.cache
@@ -129,8 +131,9 @@ def cube_frames(folder: Path, size: int = 128) -> FrameSet:
     """Write faces without up and down."""
     faces = ("front", "right", "back", "left")
     names = tuple(f"frame_{f:04d}" for f in range(NUM_FRAMES))
-    rays = np.concatenate([_grid(size, size) / (size / 2) - 1, np.ones((size, size, 1))], axis=-1)
-    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    rays = unit(
+        np.concatenate([_grid(size, size) / (size / 2) - 1, np.ones((size, size, 1))], axis=-1)
+    )
     for name, seen in zip(names, bearings(poses()), strict=True):
         for face in faces:
             directions = rays @ RIG_R_FACE[FACES.index(face)].T
@@ -166,7 +169,6 @@ def assert_blob(
     rows, columns = np.mgrid[-reach : reach + 1, -reach : reach + 1] + 0.5
     centre = [(contrast * columns).sum(), (contrast * rows).sum()] / contrast.sum()
     assert np.linalg.norm(centre + np.array([column, row]) - pixel) < 0.3
-    tints = np.array([image[row, column], color]) - 30.0
-    tints /= np.linalg.norm(tints, axis=1, keepdims=True)
+    tints = unit(np.array([image[row, column], color]) - 30.0)
     assert tints[0] @ tints[1] > 0.8  # JPEG blurs chroma; 0.6 or less for any other colour
     return True

@@ -6,6 +6,7 @@ They are upright ellipsoids with striped textures that move around the rig, and 
 from dataclasses import dataclass
 
 import numpy as np
+from pixels import pixel_centres
 
 from gsba.camera.sphere import bearings_from_erp
 
@@ -65,8 +66,7 @@ def paste_people(
     import cv2
 
     height, width = image.shape[:2]
-    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    rays = bearings_from_erp(np.stack([u, v], axis=-1), width, height) @ world_T_rig[:3, :3].T
+    rays = bearings_from_erp(pixel_centres(width, height), width, height) @ world_T_rig[:3, :3].T
     out, nearest = image.copy(), np.full(image.shape[:2], np.inf)
     for person in people:
         offset = person.positions_world[frame] - world_T_rig[:3, 3]

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
+from pixels import pixel_centres
 from synthetic import unit
 
 from factors._photometric_kernels import sample_many
@@ -95,8 +96,7 @@ def distances_to_ball(world_T_rig: np.ndarray, bearings: np.ndarray) -> np.ndarr
 
 def render(world_T_rig: np.ndarray, texture: Texture, width: int) -> np.ndarray:
     """Grey panorama (width / 2, width) of the ball from inside."""
-    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(width // 2) + 0.5)
-    bearings = bearings_from_erp(np.stack([u, v], axis=-1), width, width // 2)
+    bearings = bearings_from_erp(pixel_centres(width, width // 2), width, width // 2)
     points = distances_to_ball(world_T_rig, bearings)[..., None] * bearings
     return texture(points @ world_T_rig[:3, :3].T + world_T_rig[:3, 3])
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from one_gallery import gallery
+from pixels import pixel_centres
 from scipy.spatial.transform import Rotation
 
 from gsba.camera.fisheye import Rig, facing, lens_names, projection_of, rotation_of
@@ -67,8 +68,7 @@ def render(folder: Path, num: int, own: RadialProjection | None = None, model: s
         ring(num),
     )
     axes, names = np.array([rotation_of(lens)[:, 2] for lens in rig]), lens_names(num)
-    grid = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(WIDTH // 2) + 0.5)
-    faced = facing(bearings_from_erp(np.stack(grid, axis=-1), WIDTH, WIDTH // 2), axes)
+    faced = facing(bearings_from_erp(pixel_centres(WIDTH, WIDTH // 2), WIDTH, WIDTH // 2), axes)
     maps = [_maps(lens, own or projection_of(lens)) for lens in rig]
     for part in ("images", *(f"raw/{name}" for name in names)):
         (folder / part).mkdir(parents=True)
@@ -119,7 +119,7 @@ def turned_off(rig: Rig) -> Rig:
 
 def _maps(lens: Fisheye, own: RadialProjection) -> tuple[np.ndarray, np.ndarray]:
     """OpenCV pixels (2, h, w) in a panorama of 1024 pixels; True (h, w) beyond the circle."""
-    pixels = np.stack(np.meshgrid(*2 * [np.arange(SIZE) + 0.5]), axis=-1)
+    pixels = pixel_centres(SIZE, SIZE)
     directions = own.unproject(pixels) @ rotation_of(lens).T
     maps = np.moveaxis(erp_from_bearings(directions, 1024, 512) - 0.5, -1, 0).astype(np.float32)
     return maps, directions @ rotation_of(lens)[:, 2] < np.cos(_HALF_FOV)

@@ -113,7 +113,6 @@ def test_the_containers_steps_are_a_script_that_is_there() -> None:
     needed = {"gsba", "factors", "packaging", "pyproject.toml", "README.md", "LICENSE"}
     assert not needed & set(ignored) and all((ROOT / name).exists() for name in needed)
     extras = re.search(r"\.whl\)\[([a-z,]+)\]", (ROOT / "packaging" / "install.sh").read_text())
-    assert extras is not None
     assert set(extras[1].split(",")) <= set(PROJECT["project"]["optional-dependencies"])
 
 

@@ -17,7 +17,6 @@ FACTORS_MAY_USE = {"llvmlite", "factors", "gtsam", "numba", "numpy", "scipy"}
 
 def _load() -> ModuleType:
     spec = importlib.util.spec_from_file_location("architecture", ROOT / "docs/architecture.py")
-    assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules["architecture"] = module  # dataclasses look their module up
     spec.loader.exec_module(module)

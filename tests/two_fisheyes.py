@@ -6,6 +6,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from pixels import pixel_centres
 from scipy.spatial.transform import Rotation
 
 from gsba.camera.fisheye import Pair, unproject
@@ -49,7 +50,7 @@ def colours(directions: np.ndarray) -> np.ndarray:
 @lru_cache(maxsize=8)
 def _directions(lens: Fisheye) -> np.ndarray:
     """Directions (h, w, 3) of the pixels of a lens, which takes many pictures."""
-    pixels = np.stack(np.meshgrid(np.arange(lens.width), np.arange(lens.height)), axis=-1) + 0.5
+    pixels = pixel_centres(lens.width, lens.height)
     return unproject(lens, pixels)
 
 

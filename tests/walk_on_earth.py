@@ -1,10 +1,10 @@
 """A walk in a world of its own, and where it is on the earth."""
 
-import dataclasses
 from pathlib import Path
 
 import export_scene as scene
 import numpy as np
+from observing import observing
 from scipy.spatial.transform import Rotation
 
 from gsba.geometry import pose
@@ -34,18 +34,23 @@ def walk_result(num: int = 40, straight: bool = False) -> Reconstruction:
     poses = pose(Rotation.from_rotvec(rng.normal(0, 0.3, (num, 3))).as_matrix(), path)
     base = scene.reconstruction()
     keep = base.observation_frames < 0
-    world = dataclasses.replace(
+    world = observing(
         base,
+        keep,
         world_T_rigs=poses,
         pose_covariances=np.tile(np.diag([1.0, 2, 3, 4, 5, 6]) * 1e-6, (num, 1, 1)),
         pose_statuses=np.zeros(num, np.uint8),
-        observation_points=base.observation_points[keep],
-        observation_frames=base.observation_frames[keep],
-        observation_bearings=base.observation_bearings[keep],
-        observation_sigmas=base.observation_sigmas[keep],
     )
     turn = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()
     return Placement(Sim3(0.21, turn, np.array([3.0, -2.0, 5.0]))).apply(world)
+
+
+def write_fixes(path: Path, times: np.ndarray, geodetic: np.ndarray) -> Path:
+    """A table of fixes (N, 3), latitude, longitude and altitude, at these times (N,)."""
+    rows = np.column_stack([times, geodetic]).tolist()
+    lines = [f"{t!r},{lat:.12f},{lon:.12f},{alt:.6f}" for t, lat, lon, alt in rows]
+    path.write_text("\n".join(["timestamp,lat,lon,alt", *lines]) + "\n")
+    return path
 
 
 def level_metres(result: Reconstruction) -> np.ndarray:

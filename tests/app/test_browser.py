@@ -67,9 +67,7 @@ class Server:
             text=True,
             start_new_session=True,
         )
-        assert self.process.stdout is not None
         found = re.search(r"http://127\.0\.0\.1:(\d+)/\S+", self.process.stdout.readline())
-        assert found is not None
         self.address, self.port = found[0], int(found[1])
 
     def kill(self) -> None:

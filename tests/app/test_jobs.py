@@ -65,6 +65,13 @@ def has_begun(jobs: Jobs, job: Job) -> bool:
     return Followed(job.events).now().stage is not None
 
 
+def begun(jobs: Jobs, job: Job) -> threading.Thread:
+    """The worker's thread, once the job is in its first stage."""
+    thread = at_work(jobs)
+    until(lambda: has_begun(jobs, job), 120)
+    return thread
+
+
 def test_jobs_run_one_after_another_in_order(jobs: Jobs) -> None:
     codes = {"0": "done", "3": "partial", "1": "failed", "130": "stopped"}
     ids = [added(jobs, "exit", code) for code in codes]
@@ -78,8 +85,7 @@ def test_jobs_run_one_after_another_in_order(jobs: Jobs) -> None:
 
 def test_a_job_is_stopped_and_goes_on_without_fresh(jobs: Jobs) -> None:
     job = added(jobs, "wait", "--fresh")
-    thread = at_work(jobs)
-    until(lambda: has_begun(jobs, job), 120)
+    thread = begun(jobs, job)
     assert jobs.stop(job.id).state.status == "stopping"
     thread.join(120)
     assert status(jobs, job) == "stopped" and jobs.get(job.id).state.code == 130
@@ -94,8 +100,7 @@ def test_a_job_is_stopped_and_goes_on_without_fresh(jobs: Jobs) -> None:
 
 def test_stopping_again_kills(jobs: Jobs) -> None:
     job = added(jobs, "wait")
-    thread = at_work(jobs)
-    until(lambda: has_begun(jobs, job), 120)
+    thread = begun(jobs, job)
     os.kill(jobs.get(job.id).state.pid or 0, signal.SIGSTOP)  # it does not hear SIGINT
     jobs.stop(job.id)
     assert status(jobs, job) == "stopping"
@@ -164,8 +169,7 @@ def test_the_lock_of_an_earlier_start_does_not_hold_up_the_next(jobs: Jobs) -> N
     job = added(jobs, "wait")
     with alive_lock(job) as left_behind:
         assert alive(job)
-        thread = at_work(jobs)
-        until(lambda: has_begun(jobs, job), 120)
+        thread = begun(jobs, job)
         jobs.stop(job.id)
         thread.join(120)
         assert status(jobs, job) == "stopped" and not alive(jobs.get(job.id))
@@ -174,8 +178,7 @@ def test_the_lock_of_an_earlier_start_does_not_hold_up_the_next(jobs: Jobs) -> N
 
 def test_a_job_that_was_killed_is_lost(jobs: Jobs) -> None:
     job = added(jobs, "wait")
-    thread = at_work(jobs)
-    until(lambda: has_begun(jobs, job), 120)
+    thread = begun(jobs, job)
     os.kill(jobs.get(job.id).state.pid or 0, signal.SIGKILL)
     thread.join(120)
     assert status(jobs, job) == "lost"
@@ -184,8 +187,7 @@ def test_a_job_that_was_killed_is_lost(jobs: Jobs) -> None:
 
 def test_there_is_one_worker(jobs: Jobs) -> None:
     job = added(jobs, "wait")
-    thread = at_work(jobs)
-    until(lambda: has_begun(jobs, job), 120)
+    thread = begun(jobs, job)
     work(jobs)  # returns at once
     assert status(jobs, job) == "running"
     jobs.stop(job.id)

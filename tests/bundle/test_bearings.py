@@ -1,6 +1,7 @@
 """Bearings of points as a family: their noise is that of the faces that show them."""
 
 import numpy as np
+from synthetic import unit
 
 from factors import tangent_basis
 from gsba.bundle.families import Bearings, PointObservations
@@ -11,8 +12,7 @@ RIG = CubeRig(512, np.deg2rad(95))
 
 def _observed(num: int, sqrt_infos: np.ndarray | None = None) -> PointObservations:
     rng = np.random.default_rng(3)
-    bearings = rng.normal(size=(num, 3))
-    bearings /= np.linalg.norm(bearings, axis=1, keepdims=True)
+    bearings = unit(rng.normal(size=(num, 3)))
     faces = owner_faces(bearings)
     rows, pixels = np.arange(num), RIG.project(bearings, faces)
     sigmas = rng.uniform(1e-4, 1e-3, num)
@@ -30,7 +30,6 @@ def test_noise_is_equal_along_both_axes_of_the_face() -> None:
             rows = observed.faces == face
             change = (RIG.bearings(there[rows], face) - observed.bearings_rig[rows]) / step
             moved[rows, :, c] = np.einsum("oij,oj->oi", axes[rows], change)
-    assert term.sqrt_infos is not None
     whitened = term.sqrt_infos @ moved
     information = np.swapaxes(whitened, 1, 2) @ whitened  # of pixels
     np.testing.assert_allclose(information[:, 0, 1], 0, atol=1e-4 * information[:, 0, 0].min())

@@ -181,7 +181,6 @@ def test_a_joint_solve_agrees_with_gtsam(world: World) -> None:
 def test_a_block_on_a_small_variable_is_the_same_as_its_factors(world: World) -> None:
     one, _ = _adjusted(world, Sideways(_measured(world)))
     other, _ = _adjusted(world, SidewaysInOneBlock(_measured(world)))
-    assert one.variables is not None and other.variables is not None
     np.testing.assert_allclose(one.world_T_rigs, other.world_T_rigs, atol=1e-6)
     np.testing.assert_allclose(one.variables.data, other.variables.data, atol=1e-6)
 

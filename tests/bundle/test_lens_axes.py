@@ -37,7 +37,7 @@ def _off_deg(axes: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return np.degrees(np.arccos(np.minimum(cosines, 1)))
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_axes_below_a_stabilised_panorama_are_found(seed: int) -> None:
     truth = _held(seed)
     camera = Lenses(np.array([0, 0, LENGTH]), band_rad=BAND, axes=truth)
@@ -58,7 +58,7 @@ def test_axes_below_a_stabilised_panorama_are_found(seed: int) -> None:
     assert solved.noise < 1.2
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_lenses_that_look_as_their_panorama_does_are_not_turned(seed: int) -> None:
     camera = Lenses(np.array([0, 0, LENGTH]), band_rad=BAND)
     world, shown = seen_through(camera, seed)

@@ -47,7 +47,7 @@ def _found(world: World, shown: Keypoints, rounds: int = 5) -> tuple[LensCentres
     return found, solved
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_two_lenses_are_found(seed: int) -> None:
     world, shown = seen_through(Lenses(CENTRE, band_rad=BAND), seed)
     found, solved = _found(world, shown)
@@ -59,7 +59,7 @@ def test_two_lenses_are_found(seed: int) -> None:
     assert solved.noise < 1.3  # times the noise that there is
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(3))
 def test_one_centre_is_not_taken_for_two(seed: int) -> None:
     world, shown = seen_through(Lenses(), seed)
     found, _ = _found(world, shown)
@@ -78,7 +78,7 @@ class ThreeLenses:
         return points_rig - centres[np.argmax(points_rig @ centres.T, axis=1)]
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_three_lenses_are_not_taken_for_two(seed: int) -> None:
     found, solved = _found(*seen_through(ThreeLenses(), seed))  # type: ignore[arg-type]
     assert found.reason.startswith("it does not predict") and not found.lenses
@@ -86,9 +86,8 @@ def test_three_lenses_are_not_taken_for_two(seed: int) -> None:
 
 
 @pytest.mark.parametrize("inverse", [0.0, 0.05, 0.6])
-@pytest.mark.parametrize("seed", range(2))
-def test_a_stitch_radius_is_judged_by_what_is_solved_with_it(inverse: float, seed: int) -> None:
-    world, shown = seen_through(Lenses(CENTRE, inverse, BAND), seed)
+def test_a_stitch_radius_is_judged_by_what_is_solved_with_it(inverse: float) -> None:
+    world, shown = seen_through(Lenses(CENTRE, inverse, BAND))
     off, solved = _found(world, shown)
     problem = problem_of(world)
 

@@ -125,7 +125,6 @@ def test_the_noise_of_a_trajectory_is_read_from_held_steps() -> None:
     across -= moves * np.einsum("fi,fi->f", across, moves)[:, None]
     coarse[:, :3, 3] = np.exp(sigmas[2] * rng.normal(size=(num, 1))) * (moves + sigmas[1] * across)
     noise = map_strength._noise(_chain(steps), _chain(coarse), np.ones(num - 1, bool), PRIORS)
-    assert noise is not None
     found = [noise.rotation, noise.direction, noise.length]
     assert found == pytest.approx(sigmas, rel=0.1)  # medians of 4000
     few = np.arange(num - 1) < 5
@@ -182,7 +181,6 @@ def test_priors_of_steps_in_a_row_count_as_one_that_drifts() -> None:
 def test_a_drifting_trajectory_is_as_noisy_as_it_drifts() -> None:
     coarse = drifted(POSES, np.random.default_rng(0))
     noise = _measured(np.full(NUM - 2, 3e-4), coarse).noise
-    assert noise is not None
     steps, given = (inverse(some[:-1]) @ some[1:] for some in (POSES, coarse))
     turned = rotation_angle(np.swapaxes(given[:, :3, :3], 1, 2) @ steps[:, :3, :3])
     assert 0.5 < noise.rotation / np.sqrt(np.mean(turned**2) / 3) < 2

@@ -31,14 +31,13 @@ def _found(camera: Lenses, seed: int) -> tuple[CameraEstimate, float]:
     return found, solved.noise
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_duration_way_and_each_frames_motion_are_found(seed: int) -> None:
     found, noise = _found(replace(LENSES, row_directions=SWEEPS, readout_motion=TWISTS), seed)
     assert not found.reason and (found.gains > 0).all()
     assert found.lenses.row_directions is not None
     np.testing.assert_allclose(found.lenses.row_directions, SWEEPS)
     assert found.readout_s == pytest.approx(READOUT_S, rel=0.05)
-    assert found.lenses.readout_motion is not None
     off = found.lenses.readout_motion - TWISTS
     before = np.sqrt(np.mean(TWISTS**2, axis=0))
     left = np.sqrt(np.mean(off**2, axis=0)) / before
@@ -90,7 +89,7 @@ def test_the_duration_is_found_in_two_maps_of_one_recording() -> None:
     assert readout.estimate(apart, *known, replace(problem, maps=None)).readout_s < 0.1 * READOUT_S
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(3))
 def test_frames_of_one_instant_have_none(seed: int) -> None:
     found, _ = _found(LENSES, seed)
     assert found.reason and found.lenses.readout_motion is None

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from synthetic import World, make_world
+from synthetic import World, make_world, unit
 
 from gsba.bundle.reconstruction import assemble
 from gsba.camera.cameras import Cameras
@@ -76,8 +76,7 @@ def test_observations_still_point_at_their_points(world: World) -> None:
     found = _assemble(world)
     rig_T_world = inverse(found.world_T_rigs)[found.observation_frames]
     points = found.points_world[found.observation_points]
-    local = np.einsum("oij,oj->oi", rig_T_world[:, :3, :3], points) + rig_T_world[:, :3, 3]
-    local /= np.linalg.norm(local, axis=1, keepdims=True)
+    local = unit(np.einsum("oij,oj->oi", rig_T_world[:, :3, :3], points) + rig_T_world[:, :3, 3])
     angles = np.linalg.norm(np.cross(local, found.observation_bearings), axis=1)
     assert angles.max() < 5 * 5e-4  # the noise of the world, nothing more
     errors = np.bincount(found.observation_points, angles) / np.bincount(found.observation_points)
@@ -96,7 +95,6 @@ def test_covariances_scale_with_the_map(world: World) -> None:
     np.testing.assert_allclose(found[:, :3, :3], covariances[:, :3, :3])  # rig axes: no turning
     np.testing.assert_allclose(found[:, :3, 3:], SCALE * covariances[:, :3, 3:])
     np.testing.assert_allclose(found[:, 3:, 3:], SCALE**2 * covariances[:, 3:, 3:])
-    assert joint is not None
     np.testing.assert_allclose(joint.neighbours, found[:-1])
     np.testing.assert_allclose(joint.draws, draws * ([1.0] * 3 + [SCALE] * 3), rtol=1e-6)
 
@@ -202,7 +200,6 @@ def test_each_map_has_its_own_unit(world: World) -> None:
     lenses = Lenses(np.array([0.0, 0, 0.125]), readout_motion=np.arange(60.0).reshape(10, 6))
     of_other = cameras_of_map(Cameras((lenses,)), whole, 2).only
     assert 2 * of_other.centre[2] == pytest.approx(other.lens_baseline[0])
-    assert of_other.readout_motion is not None and lenses.readout_motion is not None
     np.testing.assert_allclose(of_other.readout_motion[:, :3], lenses.readout_motion[6:, :3])
     np.testing.assert_allclose(of_other.readout_motion[:, 3:], 3 * lenses.readout_motion[6:, 3:])
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from observing import observing
 
 from gsba.bundle.map_strength import neighbour_shifts, position_errors, scale_changes
 from gsba.types import JointErrors, PoseStatus, Reconstruction
@@ -40,17 +41,6 @@ def _corridor(along: np.ndarray, reach: float = 4.0) -> Reconstruction:
     )
 
 
-def _without(whole: Reconstruction, dropped: np.ndarray) -> Reconstruction:
-    kept = ~dropped
-    return replace(
-        whole,
-        observation_points=whole.observation_points[kept],
-        observation_frames=whole.observation_frames[kept],
-        observation_bearings=whole.observation_bearings[kept],
-        observation_sigmas=whole.observation_sigmas[kept],
-    )
-
-
 ONE = np.zeros(NUM, np.int64)  # recording of every frame
 
 
@@ -75,7 +65,9 @@ def test_where_nothing_is_seen_from_both_sides_any_scale_fits() -> None:
     whole = _corridor(np.arange(NUM) * 0.7)
     behind = whole.observation_frames > DOOR
     before = np.bincount(whole.observation_points[~behind], minlength=len(whole.points_world))
-    changes = scale_changes(_without(whole, behind & (before[whole.observation_points] > 0)), ONE)
+    changes = scale_changes(
+        observing(whole, ~(behind & (before[whole.observation_points] > 0))), ONE
+    )
     assert np.flatnonzero(np.isinf(changes)).tolist() == [DOOR - 1, DOOR, DOOR + 1]
 
 

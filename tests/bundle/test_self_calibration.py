@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from lens_world import placed, problem_of, seen_through, solved_under, solved_with, times
+from synthetic import unit
 
 from factors.bearing import bearing_residuals
 from gsba.bundle import self_calibration
@@ -92,7 +93,6 @@ def test_the_graph_settles_lenses_beside_poses_and_says_how_well() -> None:
     assert _off_deg(seeing.lenses.fisheyes) < 0.03
     system = CameraSystem(solved, shown, CameraEstimates((seeing,)), times(24), problem)
     sigmas = system.covariances().cameras[0].lens_sigmas
-    assert sigmas is not None
     off = self_calibration.from_calibrated(seeing.lenses) - _step_to(TRUE, 1.0)
     assert np.abs(off[[0, 7]] / sigmas[[0, 7]]).max() < 4
     assert np.all(sigmas < self_calibration.spread(2))
@@ -107,8 +107,7 @@ def _step_to(pair: Pair, share: float) -> np.ndarray:
 
 def test_residuals_change_with_lenses_as_their_jacobian_says() -> None:
     rng = np.random.default_rng(0)
-    shown = rng.normal(size=(40, 3))
-    shown /= np.linalg.norm(shown, axis=1, keepdims=True)
+    shown = unit(rng.normal(size=(40, 3)))
     lenses = Lenses(CENTRE, reference_calibration=CUT, fisheyes=TRUE)
     frames = np.zeros(40, int)
     bearings, origins = lenses.rays(shown, frames)
@@ -128,8 +127,7 @@ def test_residuals_change_with_lenses_as_their_jacobian_says() -> None:
 
 def test_lenses_take_rays_where_they_point_and_points_back_where_they_are_shown() -> None:
     rng = np.random.default_rng(1)
-    shown = rng.normal(size=(200, 3))
-    shown /= np.linalg.norm(shown, axis=1, keepdims=True)
+    shown = unit(rng.normal(size=(200, 3)))
     shown = shown[np.abs(shown[:, 2]) > 0.05]
     lenses = Lenses(CENTRE, reference_calibration=CUT, fisheyes=TRUE)
     frames = np.zeros(len(shown), int)

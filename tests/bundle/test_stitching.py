@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from pixels import pixel_centres
 from synthetic import RIG, World, make_world
 
 from factors.sphere_field import SphereField, num_harmonics
@@ -173,8 +174,7 @@ def test_noise_carries_over() -> None:
 def test_panoramas_are_straightened() -> None:
     """Brightness that depends on the observed direction must come to lie on the true one."""
     width = 512
-    centres = np.meshgrid(np.arange(width) + 0.5, np.arange(width // 2) + 0.5)
-    rays = bearings_from_erp(np.stack(centres, axis=-1), width, width // 2)
+    rays = bearings_from_erp(pixel_centres(width, width // 2), width, width // 2)
     field = SphereField(8 * _true_field().coefficients)  # 0.8 degrees, more than a pixel
 
     def shade(directions: np.ndarray) -> np.ndarray:

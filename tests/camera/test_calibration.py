@@ -312,14 +312,6 @@ def _check_refused(path: Path, message: str) -> None:
     assert "\n" not in line and line.startswith(str(path))
 
 
-@pytest.mark.parametrize("case", BAD_OURS)
-def test_refused_of_our_own_form(tmp_path: Path, case: str) -> None:
-    change, message = BAD_OURS[case]
-    tree = _ours()
-    change(tree)
-    _check_refused(_write(tmp_path / "c.json", tree), message)
-
-
 BAD_KALIBR = {
     "one camera": (lambda t: t.pop("cam1"), "holds cam0; of a raw pair"),
     "three cameras": (lambda t: t.update(cam2=t["cam0"]), "holds cam0, cam1, cam2"),
@@ -354,14 +346,6 @@ BAD_KALIBR = {
         "within 20 degrees",
     ),
 }
-
-
-@pytest.mark.parametrize("case", BAD_KALIBR)
-def test_refused_of_kalibr(tmp_path: Path, case: str) -> None:
-    change, message = BAD_KALIBR[case]
-    tree = _kalibr()
-    change(tree)
-    _check_refused(_write(tmp_path / "c.yaml", tree), message)
 
 
 BAD_RIG = {
@@ -399,12 +383,16 @@ BAD_RIG = {
 }
 
 
-@pytest.mark.parametrize("case", BAD_RIG)
-def test_refused_of_a_rig_config(tmp_path: Path, case: str) -> None:
-    change, message = BAD_RIG[case]
-    tree = _rig_config()
+FORMS = {"ours": (_ours, BAD_OURS), "kalibr": (_kalibr, BAD_KALIBR), "rig": (_rig_config, BAD_RIG)}
+
+
+@pytest.mark.parametrize(("form", "case"), [(f, case) for f in FORMS for case in FORMS[f][1]])
+def test_refused_of_each_form(tmp_path: Path, form: str, case: str) -> None:
+    make, cases = FORMS[form]
+    change, message = cases[case]
+    tree = make()
     change(tree)
-    _check_refused(_write(tmp_path / "c.json", tree), message)
+    _check_refused(_write(tmp_path / ("c.yaml" if form == "kalibr" else "c.json"), tree), message)
 
 
 def test_refused_models(tmp_path: Path) -> None:

@@ -4,6 +4,8 @@ import cv2
 import numpy as np
 import pytest
 from cube_map_tracks import picture_tracks, track_directions
+from pixels import pixel_centres
+from synthetic import unit
 from two_fisheyes import colours
 
 from gsba.camera.equiangular import (
@@ -96,7 +98,7 @@ def test_doubled_columns_pass_from_one_lens_to_the_other() -> None:
     front[1, :, :half] = front[1, :, width - half :] = True
     first, second = np.where(front, 200, 100).astype(np.uint8)
     faces = squares((first, second))
-    pixels = np.stack(np.meshgrid(*2 * (np.arange(size) + 0.5,)), axis=-1)
+    pixels = pixel_centres(size, size)
     for n in range(len(FACES)):
         ahead = square_directions(pixels, n, size)
         largest = np.abs(ahead).max(axis=-1)
@@ -110,8 +112,7 @@ def test_squares_and_directions_are_inverse() -> None:
     faces, pixels = square_pixels(5 * directions, 100)
     assert pixels.min() > -1e-9 and pixels.max() < 100 + 1e-9
     for n in range(len(FACES)):
-        back = square_directions(pixels[faces == n], n, 100)
-        back /= np.linalg.norm(back, axis=-1, keepdims=True)
+        back = unit(square_directions(pixels[faces == n], n, 100))
         np.testing.assert_allclose(back, directions[faces == n], atol=1e-12)
 
 

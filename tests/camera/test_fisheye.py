@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from synthetic import unit
 from two_fisheyes import made_pair
 
 from gsba.camera.fisheye import (
@@ -103,8 +104,7 @@ def test_each_direction_is_of_the_lens_that_faces_it() -> None:
 
 
 def test_other_lenses_keep_pixels() -> None:
-    directions = np.random.default_rng(2).normal(size=(300, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    directions = unit(np.random.default_rng(2).normal(size=(300, 3)))
     after = changed(PAIR[0], STEP), changed(PAIR[1], -STEP)
     found = recalibrated(directions, PAIR, after)
     behind = directions[:, 2] < 0

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pixels import pixel_centres
 from scipy.spatial.transform import Rotation
 from synthetic import unit
 from two_fisheyes import colours, made_pair
@@ -41,8 +42,7 @@ def _seen(starts: np.ndarray, rays: np.ndarray) -> np.ndarray:
 
 
 def _erp_rays() -> np.ndarray:
-    centres = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(WIDTH // 2) + 0.5)
-    return bearings_from_erp(np.stack(centres, axis=-1), WIDTH, WIDTH // 2)
+    return bearings_from_erp(pixel_centres(WIDTH, WIDTH // 2), WIDTH, WIDTH // 2)
 
 
 def _scene(num: int = 3000) -> np.ndarray:
@@ -83,7 +83,7 @@ def test_a_stitched_panorama_becomes_one_cameras(lenses: Lenses) -> None:
 
 def _picture(lens: Fisheye, sign: float, way: float) -> np.ndarray:
     """What a lens sees while the rig moves, (h, w, 3) uint8."""
-    pixels = np.stack(np.meshgrid(np.arange(lens.width), np.arange(lens.height)), axis=-1) + 0.5
+    pixels = pixel_centres(lens.width, lens.height)
     rays = unproject(lens, pixels)
     moved = (way * (pixels[..., 1] / lens.height - 0.5))[..., None] * TWIST[0]
     turns = Rotation.from_rotvec(moved[..., :3].reshape(-1, 3))

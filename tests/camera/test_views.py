@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from one_gallery import gallery
+from pixels import pixel_centres
 from scipy.spatial.transform import Rotation
 
 from gsba.camera.lens import Lenses
@@ -48,8 +49,7 @@ def _panorama() -> np.ndarray:
 
 def _seen(view: View, world_T_view: np.ndarray) -> np.ndarray:
     """What a pinhole camera at a pose sees: a panorama that looks along it, about its middle."""
-    centres = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
-    flat = (np.stack(centres, axis=-1) - view.principal) / view.focal
+    flat = (pixel_centres(view.width, view.height) - view.principal) / view.focal
     rays = np.concatenate([flat, np.ones_like(flat[..., :1])], axis=-1)
     at = (erp_from_bearings(rays, *SHAPE) - 0.5).astype(np.float32)
     return cv2.remap(_render(world_T_view), at[..., 0], at[..., 1], cv2.INTER_CUBIC)
@@ -59,7 +59,9 @@ def _blurred(image: np.ndarray) -> np.ndarray:
     return cv2.GaussianBlur(np.asarray(image, np.float32), (0, 0), 1.5)
 
 
-@pytest.mark.parametrize("name", VIEWS)
+@pytest.mark.parametrize(
+    "name", ["front", "back", "left_front", "up_front", "right_back", "down_back"]
+)
 def test_a_view_is_what_its_lens_sees(name: str) -> None:
     view = VIEWS[name]
     (found,) = ViewCutter((view,), TURNED, 0).cut(_panorama())

@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
-from command import run_gsba
+from command import run_gsba, succeed
 from tiny_run import Case
 
 from gsba.config import RefineSettings
@@ -31,8 +31,7 @@ def test_splat_writes_a_trainers_dataset(
     if not upright:
         monkeypatch.setattr("gsba.placement.placement.place", no_vertical)
     options = ("--out", run, "--to", "brush", "--config", "fast", "--face-size", 64)
-    done = run_gsba("splat", tmp_path / "walk.mp4", *options)
-    assert done.exit_code == 0, done.output
+    done = succeed("splat", tmp_path / "walk.mp4", *options)
     assert called == [(tmp_path / "walk.mp4", None, run, load_config(Path("fast")))]
     assert f"brush: brush {run / 'brush'}" in done.output
     assert (run / "brush/sparse/0/images.bin").is_file()

@@ -105,10 +105,9 @@ def test_all_kernels_of_a_kind_are_compiled_and_then_no_process_is_started(tmp_p
     assert run(program, NUMBA_CACHE_DIR=cache).split() == ["0"]
 
 
-@pytest.mark.parametrize("folder", ["/proc/none", "/dev/full/none"])
-def test_without_a_cache_nothing_is_begun(folder: str) -> None:
+def test_without_a_cache_nothing_is_begun() -> None:
     program = PARENT.replace('["demo", "refine"], ["refine"], ["demo"]', '["demo"],')
-    assert run(program, NUMBA_CACHE_DIR=folder).split() == ["0"]
+    assert run(program, NUMBA_CACHE_DIR="/proc/none").split() == ["0"]
 
 
 def is_alive(pid: int) -> bool:

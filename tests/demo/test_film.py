@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command import run_gsba
+from command import run_gsba, succeed
 
 from gsba.demo.walk import FPS, WHOLE_WALK, walk_poses
 from gsba.trajectory.files import read_trajectory
@@ -29,8 +29,7 @@ def test_a_video_is_filmed_and_refined_without_a_trajectory(tmp_path: Path) -> N
     pytest.importorskip("av", reason="PyAV is not installed")
     out = tmp_path / "demo"
     small = ["-q", "demo", "--video", "--frames", "24", "--width", "384", "--out", str(out)]
-    result = run_gsba(*small)
-    assert result.exit_code == 0, result.output
+    result = succeed(*small)
     rows = {line.split()[0]: line.split() for line in result.stdout.splitlines()}
     assert rows["odometry"][1] == "24/24" and float(rows["odometry"][2]) < 0.02
     count, of = rows["refined"][1].split("/")

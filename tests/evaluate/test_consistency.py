@@ -78,7 +78,6 @@ def _statistics(found: Consistency) -> list[Statistic]:
 def _claiming(result: Reconstruction, factor: float) -> Reconstruction:
     """The same errors, said to be larger by a factor."""
     joint = result.joint_errors
-    assert joint is not None
     return replace(
         result,
         pose_covariances=factor**2 * result.pose_covariances,
@@ -121,7 +120,6 @@ def test_the_world_and_scale_of_the_run_do_not_matter() -> None:
     result, truth = _solved(0)
     stretch = np.tile([1.0] * 3 + [250.0] * 3, (FRAMES, 1))
     joint, poses = result.joint_errors, result.world_T_rigs
-    assert joint is not None
     moved = _result(
         Sim3(250.0, Rotation.from_rotvec([1, 1, 0]).as_matrix(), np.full(3, 90.0)).poses(poses),
         stretch[:, :, None] * result.pose_covariances * stretch[:, None, :],
@@ -169,10 +167,8 @@ def test_steps_are_judged_by_what_neighbours_share() -> None:
     result, truth = _solved(0)
     found = consistency_of(result, TIMES, truth)
     joint = result.joint_errors
-    assert joint is not None
     apart = JointErrors(np.zeros_like(joint.neighbours), joint.draws)
     without = consistency_of(replace(result, joint_errors=apart), TIMES, truth)
-    assert without.consecutive is not None and found.consecutive is not None
     assert without.consecutive.nees.value < 0.7 * found.consecutive.nees.value
     assert without.absolute == found.absolute
 
@@ -184,7 +180,6 @@ def test_frames_without_truth_or_covariance_are_left_out() -> None:
     kept = np.arange(FRAMES) != 3
     part = Trajectory(TIMES[kept], truth.world_T_rigs[kept])
     found = consistency_of(replace(result, pose_covariances=covariances), TIMES, part)
-    assert found.consecutive is not None
     assert found.absolute.num == FRAMES - 3 and found.consecutive.num == FRAMES - 5
     assert all(np.isfinite(one.value) for one in _statistics(found))
 

@@ -50,7 +50,6 @@ def test_distances_after_and_before(monkeypatch: pytest.MonkeyPatch) -> None:
     coarse[:, :3, 3] += np.random.default_rng(2).normal(0, 0.05, (12, 3))
     errors = scan_errors(run, surfaces, coarse)
     np.testing.assert_allclose(errors.registration.fit.similarity.scale, INTO_SCAN.scale, rtol=1e-3)
-    assert errors.before is not None
     assert errors.after.median < 0.01 * INTO_SCAN.scale < errors.before.median
     content = errors.to_json()
     for part in (content["after"], content["before"]):

@@ -16,6 +16,7 @@ from export_scene import (
     panoramas,
     reconstruction,
 )
+from observing import observing
 from plyfile import PlyData
 
 from gsba.export import ExportFormat, export
@@ -162,13 +163,7 @@ def test_an_observation_across_the_seam_has_a_small_error(tmp_path):
     bearings[2 * NUM_FRAMES] = [1e-6, 0, -1]  # seen at u = width
     frames = panoramas(tmp_path / "frames")
     keep = np.arange(len(bearings)) == 2 * NUM_FRAMES
-    moved = replace(
-        scene,
-        points_world=points,
-        observation_points=scene.observation_points[keep],
-        observation_frames=scene.observation_frames[keep],
-        observation_bearings=bearings[keep],
-    )
+    moved = observing(scene, keep, observation_bearings=bearings[keep], points_world=points)
     export(moved, frames, tmp_path / "out", ExportFormat.COLMAP_ERP)
     model = pycolmap.Reconstruction(tmp_path / "out" / "sparse" / "0")
     assert model.points3D[3].error < 1e-3
@@ -192,12 +187,7 @@ def test_faces_that_were_not_captured_stay_out(tmp_path, face_size):
     frames = cube_frames(tmp_path / "frames")
     scene = reconstruction()
     side = np.argmax(np.abs(scene.observation_bearings), axis=1) != 1
-    scene = replace(
-        scene,
-        observation_points=scene.observation_points[side],
-        observation_frames=scene.observation_frames[side],
-        observation_bearings=scene.observation_bearings[side],
-    )
+    scene = observing(scene, side)
     export(scene, frames, tmp_path / "out", ExportFormat.COLMAP, face_size)
     model = pycolmap.Reconstruction(tmp_path / "out" / "sparse" / "0")
     assert {name.split("/")[0] for name in _names(model)} == {"front", "right", "back", "left"}
@@ -220,12 +210,7 @@ def test_a_rig_without_front_face_hangs_on_its_first(tmp_path):
     scene = reconstruction()
     right = np.argmax(scene.observation_bearings, axis=1) == 0
     right &= np.abs(scene.observation_bearings).max(axis=1) == scene.observation_bearings[:, 0]
-    scene = replace(
-        scene,
-        observation_points=scene.observation_points[right],
-        observation_frames=scene.observation_frames[right],
-        observation_bearings=scene.observation_bearings[right],
-    )
+    scene = observing(scene, right)
     export(scene, frames, tmp_path / "out", ExportFormat.COLMAP)
     model = pycolmap.Reconstruction(tmp_path / "out" / "sparse" / "0")
     seen = [(i, p) for i in model.images.values() for p in i.points2D]
@@ -241,12 +226,7 @@ def test_masks_of_captured_faces_are_cut_from_their_panorama(tmp_path):
     mask[:, :32] = mask[:, -32:] = 0  # the half that lies behind
     cv2.imwrite(str(tmp_path / "mask.png"), mask)
     frames = replace(frames, mask_paths=(tmp_path / "mask.png",) * NUM_FRAMES)
-    scene = replace(
-        reconstruction(),
-        observation_points=np.empty(0, np.int32),
-        observation_frames=np.empty(0, np.int32),
-        observation_bearings=np.empty((0, 3)),
-    )
+    scene = observing(reconstruction(), np.empty(0, int))
     export(scene, frames, tmp_path / "out", ExportFormat.COLMAP)
     folder = tmp_path / "out" / "masks"
     values = {

@@ -13,6 +13,7 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 from export_scene import COLORS, NUM_FRAMES, POINTS, panoramas, poses, reconstruction
+from synthetic import unit
 from two_fisheyes import made_pair, picture, write
 
 from gsba.camera.lens import Lenses
@@ -116,8 +117,7 @@ def test_nerfstudio_reads_faces(to: str, exported: Path) -> None:
             centre, directions = _rays(outputs, number, pixels)
             np.testing.assert_allclose(centre, world_T_rig[:3, 3], atol=1e-5)
             local = np.column_stack([pixels / 32 - 1, np.ones(len(pixels))])
-            expected = local @ (world_T_rig[:3, :3] @ rig_R_face).T
-            expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+            expected = unit(local @ (world_T_rig[:3, :3] @ rig_R_face).T)
             _assert_parallel(directions, expected)
 
 

@@ -10,6 +10,7 @@ import pycolmap
 import pytest
 from export_scene import HEIGHT, NUM_FRAMES, POINTS, WIDTH, panoramas, reconstruction
 from scipy.spatial.transform import Rotation
+from synthetic import unit
 
 from gsba.bundle.point_covariances import depth_variances, point_covariances
 from gsba.export import ExportFormat, export
@@ -23,7 +24,6 @@ from gsba.types import JointErrors, Reconstruction
 def _nerfstudio_map(path: Path, width: int, height: int, scale_factor: float = 1e-3) -> np.ndarray:
     """Depth map as nerfstudio 1.1.5 reads it (`get_depth_image_from_path`), in map units."""
     image = cv2.imread(str(path), cv2.IMREAD_ANYDEPTH)
-    assert image is not None
     image = image.astype(np.float32) * scale_factor
     return cv2.resize(image, (width, height), interpolation=cv2.INTER_NEAREST)
 
@@ -82,11 +82,9 @@ def test_standard_deviations_of_points_are_those_of_their_errors() -> None:
     frames = np.tile(np.arange(NUM_FRAMES, dtype=np.int32), len(points))
     numbers = np.repeat(np.arange(len(points), dtype=np.int32), NUM_FRAMES)
     poses, sigma = scene.world_T_rigs, 2e-3
-    rays = points[numbers] - poses[frames, :3, 3]
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    rays = unit(points[numbers] - poses[frames, :3, 3])
     noise = rng.normal(0, sigma, rays.shape)
-    noisy = rays + noise - np.sum(noise * rays, axis=1, keepdims=True) * rays
-    noisy /= np.linalg.norm(noisy, axis=1, keepdims=True)
+    noisy = unit(rays + noise - np.sum(noise * rays, axis=1, keepdims=True) * rays)
     found = _triangulated(poses[frames, :3, 3], noisy, numbers, points)
     bearings = np.einsum("oji,oj->oi", poses[frames][:, :3, :3], noisy)
     estimated = replace(_observed(scene, numbers, frames, bearings, sigma), points_world=found)
@@ -133,15 +131,13 @@ def test_shifts_that_grow_along_tracks_are_errors_of_depths(shift: float) -> Non
     frames = np.tile(np.arange(NUM_FRAMES, dtype=np.int32), len(points))
     numbers = np.repeat(np.arange(len(points), dtype=np.int32), NUM_FRAMES)
     poses = scene.world_T_rigs
-    rays = points[numbers] - poses[frames, :3, 3]
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    rays = unit(points[numbers] - poses[frames, :3, 3])
     means = rays.reshape(len(points), NUM_FRAMES, 3).mean(axis=1)
     moved = np.einsum(
         "oij,oj->oi", rng.normal(0, shift, (len(points), 3, 3))[numbers], rays - means[numbers]
     )
     moved += rng.normal(0, sigma, rays.shape)
-    noisy = rays + moved - np.sum(moved * rays, axis=1, keepdims=True) * rays
-    noisy /= np.linalg.norm(noisy, axis=1, keepdims=True)
+    noisy = unit(rays + moved - np.sum(moved * rays, axis=1, keepdims=True) * rays)
     found = _triangulated(poses[frames, :3, 3], noisy, numbers, points)
     bearings = np.einsum("oji,oj->oi", poses[frames][:, :3, :3], noisy)
     estimated = replace(_observed(scene, numbers, frames, bearings, sigma), points_world=found)

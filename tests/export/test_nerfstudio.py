@@ -16,6 +16,7 @@ from export_scene import (
     reconstruction,
 )
 from plyfile import PlyData
+from synthetic import unit
 
 from gsba.export import ExportFormat, export
 from gsba.types import FACES, PoseStatus
@@ -120,8 +121,7 @@ def test_points_land_on_their_pixels_in_panoramas(dataset):
     for f, frame in enumerate(meta["frames"]):
         matrix = np.array(frame["transform_matrix"])
         rays = _erp_rays(meta, matrix, np.column_stack([u[:, f], v[:, f]]))
-        towards = points - matrix[:3, 3]
-        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+        towards = unit(points - matrix[:3, 3])
         assert np.abs(rays - towards).max() < 1e-8  # a millionth of a pixel
         image = cv2.imread(str(dataset / frame["file_path"]))
         assert image.shape == (256, 512, 3)

@@ -55,7 +55,6 @@ def test_opensfm_sees_points_where_the_panoramas_do(tmp_path: Path) -> None:
         assert camera == {"projection_type": "spherical", "width": WIDTH, "height": HEIGHT}
         assert (out / "masks" / f"{name}.png").is_file()
         image = cv2.imread(str(out / "images" / name))
-        assert image is not None
         for at, color in zip(_projected(shot, points), COLORS, strict=True):
             pixel = at * WIDTH + np.array([WIDTH, HEIGHT]) / 2
             # Towards the poles, panoramas stretch blobs and shift their middles.

@@ -48,7 +48,6 @@ def test_metashape_holds_panoramas_as_nerfstudio_reads_them(tmp_path: Path) -> N
     (sensor,) = chunk.findall("sensors/sensor")
     resolution = sensor.find("resolution")
     assert sensor.get("type") == "spherical" and sensor.find("calibration") is None
-    assert resolution is not None
     assert (resolution.get("width"), resolution.get("height")) == ("512", "256")
     component = chunk.find("components/component/transform")
     assert component is not None and component.findtext("scale") == "1"
@@ -75,7 +74,6 @@ def test_metashape_faces_show_points_where_their_cameras_say(layout: str, tmp_pa
         assert sensor.get("type") == "frame" and calibration is not None
         f, cx, cy = (float(calibration.findtext(name) or "") for name in ("f", "cx", "cy"))
         image = cv2.imread(str(tmp_path / f"out/images/{camera.get('label')}.png"))
-        assert image is not None
         height, width = image.shape[:2]
         chunk_T_camera = np.array((camera.findtext("transform") or "").split(), float)
         local = (inverse(chunk_T_camera.reshape(4, 4)) @ np.column_stack([POINTS, [1] * 9]).T).T

@@ -20,7 +20,10 @@ from export_scene import (
     poses,
     reconstruction,
 )
+from observing import observing
+from pixels import pixel_centres
 from scipy.spatial.transform import Rotation, Slerp
+from synthetic import unit
 from two_fisheyes import made_pair
 
 from gsba.camera.fisheye import project, unproject
@@ -55,19 +58,11 @@ def _local() -> np.ndarray:
 def _scene(lenses: Lenses) -> Reconstruction:
     """Every point that is not at the seam, as the ray by which the lens that faces it sees it."""
     plain, local = reconstruction(), np.swapaxes(_local(), 0, 1).reshape(-1, 3)
-    shown = lenses.seeing(local, plain.observation_frames)
-    shown /= np.linalg.norm(shown, axis=1, keepdims=True)
+    shown = unit(lenses.seeing(local, plain.observation_frames))
     rays, origins = lenses.rays(shown, plain.observation_frames)
     clear = ~replace(lenses, band_rad=0.05).blended(shown, plain.observation_frames)
-    return replace(
-        plain,
-        observation_points=plain.observation_points[clear],
-        observation_frames=plain.observation_frames[clear],
-        observation_bearings=rays[clear],
-        observation_sigmas=plain.observation_sigmas[clear],
-        observation_origins=origins[clear],
-        lens_baseline=(0.4, 0.001),
-    )
+    own = {"observation_bearings": rays[clear], "observation_origins": origins[clear]}
+    return observing(plain, clear, **own, lens_baseline=(0.4, 0.001))
 
 
 def _raw_frames(folder: Path) -> FrameSet:
@@ -77,9 +72,8 @@ def _raw_frames(folder: Path) -> FrameSet:
         of_frame = []
         for number, lens in enumerate(PAIR):
             frames, of_lens = np.full(len(POINTS), f), np.full(len(POINTS), number)
-            seen = RAW.seeing(_local()[f], frames, of_lens)
-            seen /= np.linalg.norm(seen, axis=1, keepdims=True)
-            pixels = np.stack(np.meshgrid(np.arange(240) + 0.5, np.arange(240) + 0.5), axis=-1)
+            seen = unit(RAW.seeing(_local()[f], frames, of_lens))
+            pixels = pixel_centres(240, 240)
             path = folder / ("front", "back")[number] / f"{name}.png"
             write_image(path, picture(unproject(lens, pixels), seen))
             of_frame.append(path)
@@ -180,7 +174,6 @@ def _moved(entry: dict, after_s: float) -> np.ndarray:
 
 def _image(path: Path) -> np.ndarray:
     image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    assert image is not None
     return image if image.ndim == 2 else image[..., ::-1]
 
 
@@ -266,6 +259,5 @@ def test_raw_lenses_are_painted_where_masks_hide(tmp_path: Path) -> None:
     export(_scene(RAW), frames, tmp_path / "out", to, lenses=RAW, images="fisheye", masks=masks)
     entry = json.loads((tmp_path / "out/transforms.json").read_text())["frames"][0]
     shown = cv2.imread(str(tmp_path / "out" / entry["file_path"]), cv2.IMREAD_UNCHANGED)
-    assert shown is not None
     np.testing.assert_array_equal(shown[..., 3], _image(tmp_path / "out" / entry["mask_path"]))
     assert (shown[0, 0] == 0).all() and shown[120, 120, 3] == 255

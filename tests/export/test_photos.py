@@ -113,7 +113,6 @@ def test_photos_are_undistorted_for_programs_that_read_pinholes(
     assert {camera.model.name for camera in model.cameras.values()} == {"PINHOLE"}
     (shot,) = (image for image in model.images.values() if image.name == "photo_shot0.jpg")
     image = cv2.imread(str(out / "images/photo_shot0.jpg"))
-    assert image is not None
     for pixel in ([8, 8], [56, 8], [30, 40], [8, 40]):
         ray = np.append(shot.camera.cam_from_img(np.array(pixel) + 0.5), 1.0)
         seen = CAMERA.project(ray[None])[0]

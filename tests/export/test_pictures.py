@@ -80,7 +80,6 @@ def _threads(monkeypatch: pytest.MonkeyPatch, num: int) -> None:
     ("kind", "lenses"),
     [
         ("plain", ONE_CENTRE),
-        ("masked", ONE_CENTRE),
         ("masks of their own", ONE_CENTRE),
         ("corrected", ONE_CENTRE),
         ("masks of their own", TWO),

@@ -45,7 +45,6 @@ def test_each_lens_has_a_picture_of_its_own(tmp_path: Path, layout: str) -> None
     write_pictures(frames, [RawPictures(files, link=True)])
     for lens, wanted in enumerate(shown):
         read = pycolmap.Bitmap.read(tmp_path / f"out{lens}.{suffix}", True)
-        assert read is not None
         found = read.to_array()
         assert found.shape == wanted.shape
         off = np.abs(found.astype(int) - wanted)

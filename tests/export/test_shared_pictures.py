@@ -57,7 +57,6 @@ def test_killed_workers_leave_no_trace(client, tmp_path: Path, monkeypatch) -> N
     monkeypatch.setattr(pictures, "even_blocks", lambda num: even_blocks(num, 2))
     with hired(client, tmp_path / "there" / "any", frames) as workers:
         export_all(reconstruction(), frames, there, workers=workers)
-        assert workers is not None
         spent = workers.spent()
     assert (tmp_path / "there" / "died").exists()
     (tmp_path / "there" / "died").unlink()

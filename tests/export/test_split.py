@@ -34,7 +34,6 @@ def test_every_eighth_image_is_of_a_held_out_panorama_and_no_other_is(views: tup
     for num in range(3, 60):
         num_views = [views[f % len(views)] for f in range(num)]
         split = split_of(_of_frames(num), num_views)
-        assert split is not None
         frames, held = _numbers(split)
         assert set(frames[held]) == set(np.flatnonzero(split.held_out))
         assert not split.held_out[frames[~held]].any()
@@ -72,7 +71,6 @@ def test_photos_hold_no_other_panoramas_out(tmp_path: Path) -> None:
     alone = split_of(_of_frames(20), [6] * 20)
     for num in (1, 5, 30, 300):
         split = split_of(_of_frames(20), [6] * 20, num)
-        assert split is not None and alone is not None
         np.testing.assert_array_equal(split.held_out, alone.held_out)
         split.write_lists(tmp_path, [[f"{n:05d}" for n in own] for own in split.numbers])
         taken = [n for own in split.numbers for n in own if n >= 0]

@@ -9,7 +9,9 @@ import numpy as np
 import pycolmap
 import pytest
 from export_scene import NUM_FRAMES, POINTS, assert_blob, panoramas, reconstruction, shown_by
+from observing import observing
 from scipy.spatial.transform import Rotation
+from synthetic import unit
 
 from gsba.camera.lens import Lenses
 from gsba.camera.views import lens_views
@@ -38,12 +40,10 @@ def scene(lenses: Lenses) -> Reconstruction:
     shown = np.swapaxes(shown_by(lenses), 0, 1).reshape(-1, 3)
     clear = ~lenses.blended(shown, plain.observation_frames)
     bearings, origins = lenses.rays(shown, plain.observation_frames)
-    return replace(
+    return observing(
         plain,
-        observation_points=plain.observation_points[clear],
-        observation_frames=plain.observation_frames[clear],
+        clear,
         observation_bearings=bearings[clear],
-        observation_sigmas=plain.observation_sigmas[clear],
         observation_origins=origins[clear],
         lens_baseline=(0.4, 0.001),
     )
@@ -96,8 +96,7 @@ def test_every_image_has_its_lens_for_centre(written) -> None:
 @pytest.mark.parametrize("band_deg", [0.0, 4.0, 20.0])
 def test_views_hold_all_but_what_is_blended(band_deg: float) -> None:
     lenses, rng = replace(TWO, band_rad=np.deg2rad(band_deg)), np.random.default_rng(0)
-    rays = rng.normal(size=(20000, 3))
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    rays = unit(rng.normal(size=(20000, 3)))
     seen = np.zeros(len(rays), bool)
     for view in lens_views(lenses, 200):
         np.testing.assert_allclose(view.rig_R_view.T @ view.rig_R_view, np.eye(3), atol=1e-12)

@@ -102,13 +102,11 @@ def test_conjugate_gradients_reach_the_solution_and_say_what_is_left() -> None:
     x, residual = found
     assert np.allclose(system.matrix @ flat(x), flat(right), atol=1e-10)
     rough = conjugate_gradients(*given, 1e-2, 100)
-    assert rough is not None
     left = flat(right) - system.matrix @ flat(rough[0])
     assert np.allclose(flat(rough[1]), left, atol=1e-12)
     assert np.linalg.norm(residual) < np.linalg.norm(left) < 0.1 * np.linalg.norm(right)
     assert conjugate_gradients(*given, 1e-12, 2) is None
     short = conjugate_gradients(*given, 1e-12, 2, truncate=True)
-    assert short is not None
     assert np.allclose(flat(short[1]), flat(right) - system.matrix @ flat(short[0]), atol=1e-12)
     model = 0.5 * flat(short[0]) * (system.matrix @ flat(short[0])) - flat(short[0]) * flat(right)
     assert np.all(model.sum(axis=0) < 0)  # lower than where nothing is done

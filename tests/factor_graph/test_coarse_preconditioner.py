@@ -3,6 +3,7 @@
 import gtsam
 import numpy as np
 import pytest
+from dense_system import dense
 from gtsam.symbol_shorthand import X
 
 from factors import (
@@ -84,21 +85,15 @@ def held(monkeypatch) -> None:
     monkeypatch.setattr(direct_system, "_MAX_INVERSE_OPERATIONS", 0)
 
 
-def dense(world: World) -> np.ndarray:
+def of_landmarks(world: World) -> np.ndarray:
     """The landmarks' part of H (6 F, 6 F), written out."""
     block = world.block()
-    system = block.linearize(world.values)
-    H = np.zeros((NUM_FRAMES, 6, NUM_FRAMES, 6))
-    for f, diagonal in enumerate(system.diagonal):
-        H[f, :, f] = diagonal
-    for (f, g), off in zip(block.pairs, system.off_diagonal, strict=True):
-        H[f, :, g], H[g, :, f] = off, off.T
-    return H.reshape(6 * NUM_FRAMES, -1)
+    return dense(block.linearize(world.values), block.pairs)[0]
 
 
 @pytest.mark.parametrize("num_right", [1, 5])
 def test_products_are_those_of_the_system_written_out(world, num_right) -> None:
-    block, H = world.block(), dense(world)
+    block, H = world.block(), of_landmarks(world)
     complement, gradient, costs = block.eliminate(world.values)
     x = np.random.default_rng(0).normal(size=(NUM_FRAMES, 6, num_right))
     expected = (H @ x.reshape(len(H), -1)).reshape(x.shape)
@@ -116,8 +111,7 @@ def test_groups_feel_what_their_frames_feel_together(world, held) -> None:
     damped = system._written + 0.1 * np.eye(6)
     given = system._off_diagonal, system._pairs, system._complements, found, system._bases
     coarse = coarse_preconditioner.coarse_system(damped, *given)
-    assert coarse is not None
-    H = dense(world).reshape(NUM_FRAMES, 6, NUM_FRAMES, 6)
+    H = of_landmarks(world).reshape(NUM_FRAMES, 6, NUM_FRAMES, 6)
     for f, diagonal in enumerate(damped):
         H[f, :, f] += diagonal
     for (f, g), off in zip(system._pairs, system._off_diagonal, strict=True):

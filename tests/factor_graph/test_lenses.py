@@ -3,6 +3,7 @@
 import gtsam
 import numpy as np
 import pytest
+from dense_system import dense
 from gtsam.symbol_shorthand import C, L, X
 
 from factors import (
@@ -10,7 +11,6 @@ from factors import (
     FaceCameras,
     LandmarkBlock,
     LensBearingFactor,
-    PoseSystem,
     ReprojectionTerm,
     RobustLoss,
     jacobian_errors,
@@ -72,24 +72,14 @@ def _blocks(families: tuple[str, ...]) -> tuple[LandmarkBlock, LandmarkBlock, gt
     return beside, LandmarkBlock(own, start, terms(2 * frames + lenses, None), loss, 1), values
 
 
-def _dense(system: PoseSystem, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Hessian (6F, 6F) and gradient (6F,)."""
-    num = len(system.diagonal)
-    H = np.zeros((num, num, 6, 6))
-    H[np.arange(num), np.arange(num)] = system.diagonal
-    H[pairs[:, 0], pairs[:, 1]] = system.off_diagonal
-    H[pairs[:, 1], pairs[:, 0]] = np.swapaxes(system.off_diagonal, 1, 2)
-    return H.transpose(0, 2, 1, 3).reshape(6 * num, 6 * num), system.gradient.ravel()
-
-
 @pytest.mark.parametrize("families", [("bearing",), ("reprojection",), ("bearing", "reprojection")])
 def test_a_lens_beside_the_centre_is_a_camera_of_its_own(families: tuple[str, ...]) -> None:
     """The two systems are one, carried from the cameras to the rig by their adjoints."""
     beside, own, values = _blocks(families)
     assert beside.polish(values) == pytest.approx(own.polish(values), rel=1e-9)
     np.testing.assert_allclose(beside.points_world, own.points_world, atol=1e-7)
-    H, gradient = _dense(beside.linearize(values), beside.pairs)
-    of_own, own_gradient = _dense(own.linearize(values), own.pairs)
+    H, gradient = dense(beside.linearize(values), beside.pairs)
+    of_own, own_gradient = dense(own.linearize(values), own.pairs)
     carry = np.zeros((12 * FRAMES, 6 * FRAMES))
     for n in range(2 * FRAMES):
         lens_T_rig = gtsam.Pose3(gtsam.Rot3(), -CENTRES[n % 2])

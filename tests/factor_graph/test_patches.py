@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from pixels import pixel_centres
 from scipy.spatial.transform import Rotation
 
 from factors import tangent_basis
@@ -21,9 +22,7 @@ DIRECTIONS = {
     "near the pole": [0.05, -1.0, 0.03],
     "down": [0.3, 0.9, -0.4],
 }
-_CENTRES = bearings_from_erp(
-    np.stack(np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5), axis=-1), WIDTH, HEIGHT
-)
+_CENTRES = bearings_from_erp(pixel_centres(WIDTH, HEIGHT), WIDTH, HEIGHT)
 
 
 def _texture(vectors: np.ndarray, seed: int = 0) -> np.ndarray:

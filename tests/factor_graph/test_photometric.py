@@ -12,7 +12,7 @@ from synthetic import unit
 from factors import RobustLoss, jacobian_errors
 from factors.patch_windows import PatchPixels, PatchTable, PatchViews, patch_axes
 from factors.photometric import _MIN_THREAD_OBSERVATIONS, FAMILY, PhotometricBlock
-from factors.photometric_factor import PhotometricFactor, photometric_residuals
+from factors.photometric_factor import PhotometricFactor
 from factors.sphere_image import SphereImage
 from factors.threads import balanced_ranges
 from gsba.bundle.optimizer import optimize
@@ -149,7 +149,7 @@ def test_jacobians_through_lenses() -> None:
 
 @pytest.mark.parametrize("lenses", [False, True])
 def test_block_costs_what_the_reference_factors_do(lenses: bool) -> None:
-    world = small_world(2, 3, 20)
+    world = small_world(2, 3, 8)
     world = through_lenses(world) if lenses else world
     block = block_of(world)
     assert block.counted.all() and not any(block.dropped.values())
@@ -164,7 +164,7 @@ def test_block_costs_what_the_reference_factors_do(lenses: bool) -> None:
 
 @pytest.mark.parametrize("lenses", [False, True])
 def test_gradient_is_that_of_the_eliminated_cost(lenses: bool) -> None:
-    world = small_world(3, 3, 25)
+    world = small_world(3, 3, 12)
     world = through_lenses(world) if lenses else world
     block = block_of(world, RobustLoss())
     poses = moved(world, 1, 1e-3, 4e-3)
@@ -215,14 +215,6 @@ def test_both_doors_and_stock_gtsam_end_at_one_optimum() -> None:
         pose = fast.values.atPose3(f)
         assert pose.equals(slow_values.atPose3(f), 1e-5)
         assert pose.equals(plain_values.atPose3(f), 1e-5)
-
-
-def test_host_factors_error_is_the_eliminated_cost() -> None:
-    world = make_ball_world(5, 3, 30)
-    block = block_of(world)
-    values = world.values(moved(world, 3, 1e-3, 4e-3))
-    total = sum(factor.error(values) for factor in block.factors())
-    assert total == pytest.approx(block.polish(values, 50), rel=1e-6)
 
 
 def test_exact_world_is_recovered() -> None:
@@ -370,19 +362,3 @@ def test_no_patches_are_no_cost() -> None:
     block.refresh(world.values())
     assert block.linearize(world.values()).costs == {FAMILY: 0.0}
     assert block.propose(world.values(), np.zeros((2, 6))) == 0.0 and not block.factors()
-
-
-def test_residuals_vanish_at_the_truth() -> None:
-    world = make_ball_world(17, 2, 1)
-    table, pixels = world.pixels.table, world.pixels
-    host, target = int(table.hosts[0]), int(table.targets[0])
-    residuals, by_host, by_target, _ = photometric_residuals(
-        world.world_T_rigs[host], world.world_T_rigs[target], table.planes[0],
-        patch_axes(table.bearings_rig)[0], table.grid, pixels.templates[0].astype(float),
-        CodedImage(world.images[target]),
-    )  # fmt: skip
-    assert np.abs(residuals).max() < 1.0 < np.abs(by_host).max()  # the ball is not flat
-    # moving both frames together changes nothing: their Jacobians cancel in the world
-    world_R = [world.world_T_rigs[f][:3, :3] for f in (host, target)]
-    together = by_host[:, 3:] @ world_R[0].T + by_target[:, 3:] @ world_R[1].T
-    assert np.abs(together).max() < 1e-9 * np.abs(by_host).max()

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from pixels import pixel_centres
 from scipy.ndimage import map_coordinates, spline_filter
 
 from factors.sphere_image import SphereImage
@@ -13,8 +14,7 @@ DIRECTION = np.array([0.6, -0.48, 0.64])
 
 
 def _centres() -> np.ndarray:
-    u, v = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
-    return bearings_from_erp(np.stack([u, v], axis=-1), WIDTH, HEIGHT)
+    return bearings_from_erp(pixel_centres(WIDTH, HEIGHT), WIDTH, HEIGHT)
 
 
 def _smooth(bearings: np.ndarray) -> np.ndarray:

@@ -3,6 +3,7 @@
 import gtsam
 import numpy as np
 import pytest
+from pixels import pixel_centres
 
 from factors import FaceCameras, RobustLoss
 from factors.splat import RenderedView, SplatBlock
@@ -13,7 +14,7 @@ from gsba.geometry import pose
 
 RIG = CubeRig(48, np.deg2rad(100))
 CAMERAS = FaceCameras(RIG_R_FACE, np.full(6, RIG.focal), np.full((6, 2), RIG.principal))
-GRID = np.stack(np.meshgrid(np.arange(48) + 0.5, np.arange(48) + 0.5), axis=-1)
+GRID = pixel_centres(48, 48)
 CENTRES = np.random.default_rng(2).normal(0, 0.1, (6, 3))
 TURNS = np.stack(
     [gtsam.Rot3.Expmap(v).matrix() for v in np.random.default_rng(3).normal(0, 0.3, (3, 3))]

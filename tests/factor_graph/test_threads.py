@@ -5,6 +5,7 @@ import time
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import X
+from synthetic import unit
 
 from factors import BearingTerm, LandmarkBlock, RobustLoss
 from factors.threads import balanced_ranges, map_in_threads
@@ -39,8 +40,7 @@ def test_sums_over_landmarks_are_the_same_to_the_last_bit() -> None:
     points = rng.normal(0, 5, (num_points, 3))
     owners = np.repeat(np.arange(num_points), seen)
     frames = rng.permuted(np.tile(np.arange(num_frames), (num_points, 1)), axis=1)[:, :seen].ravel()
-    bearings = points[owners] + rng.normal(0, 0.02, (len(owners), 3))
-    bearings /= np.linalg.norm(bearings, axis=1, keepdims=True)
+    bearings = unit(points[owners] + rng.normal(0, 0.02, (len(owners), 3)))
     values, keys = gtsam.Values(), [X(f) for f in range(num_frames)]
     for key in keys:
         values.insert(key, gtsam.Pose3.Expmap(0.1 * rng.normal(size=6)))

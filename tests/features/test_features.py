@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from pixels import pixel_centres
 
 from gsba.camera.rig import CubeRig, owner_faces
 from gsba.camera.sphere import bearings_from_erp
@@ -150,7 +151,7 @@ def test_sigmas_follow_the_area_that_a_pixel_covers() -> None:
 
 def test_masks_reach_every_face() -> None:
     panorama = _noise(np.random.default_rng(7), 512, 1024, 3)
-    centres = np.stack(np.meshgrid(np.arange(1024) + 0.5, np.arange(512) + 0.5), axis=-1)
+    centres = pixel_centres(1024, 512)
     used = bearings_from_erp(centres, 1024, 512)[..., 1] < 0.2  # nothing below the horizon
     found = _extract(cubemap.cut(panorama, RIG), cubemap.cut_mask(used, RIG))
     assert len(found) > 200

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pixels import pixel_centres
 
 from gsba.camera.rig import CubeRig
 from gsba.camera.sphere import bearings_from_erp
@@ -24,7 +25,7 @@ def _picture(bearings: np.ndarray, frequency: float = 6.0) -> np.ndarray:
 
 
 def _pixel_centres(width: int, height: int) -> np.ndarray:
-    return np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1)
+    return pixel_centres(width, height)
 
 
 def _panorama(width: int, frequency: float = 6.0) -> np.ndarray:

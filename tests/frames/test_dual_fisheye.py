@@ -5,6 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from pixels import pixel_centres
 from two_fisheyes import colours, made_pair, picture, write
 
 from gsba.camera.sphere import bearings_from_erp
@@ -45,8 +46,7 @@ def frames(tmp_path_factory: pytest.TempPathFactory) -> FrameSet:
 
 def _true(width: int) -> np.ndarray:
     """The panorama of the sphere, (width / 2, width, 3)."""
-    centres = np.meshgrid(np.arange(width) + 0.5, np.arange(width // 2) + 0.5)
-    return colours(bearings_from_erp(np.stack(centres, axis=-1), width, width // 2))
+    return colours(bearings_from_erp(pixel_centres(width, width // 2), width, width // 2))
 
 
 def test_the_widest_panorama_is_as_dense_as_the_pictures(frames: FrameSet) -> None:

@@ -5,6 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from pixels import pixel_centres
 
 from gsba.camera.rig import CubeRig
 from gsba.camera.sphere import bearings_from_erp
@@ -20,8 +21,7 @@ def _smooth(bearings: np.ndarray) -> np.ndarray:
 
 
 def _erp_bearings(width: int) -> np.ndarray:
-    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(width // 2) + 0.5)
-    return bearings_from_erp(np.stack([u, v], axis=-1), width, width // 2)
+    return bearings_from_erp(pixel_centres(width, width // 2), width, width // 2)
 
 
 def _frames(paths: tuple[Path, ...], layout: str, faces: tuple[str, ...], size: tuple[int, int],

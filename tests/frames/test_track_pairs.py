@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from cube_map_tracks import picture_tracks
 from export_scene import reconstruction
+from pixels import pixel_centres
 from scipy.spatial.transform import Rotation
 from two_fisheyes import colours, write
 
@@ -47,8 +48,7 @@ def frames(tmp_path_factory: pytest.TempPathFactory) -> FrameSet:
 
 
 def _true(width: int) -> np.ndarray:
-    centres = np.meshgrid(np.arange(width) + 0.5, np.arange(width // 2) + 0.5)
-    return colours(bearings_from_erp(np.stack(centres, axis=-1), width, width // 2))
+    return colours(bearings_from_erp(pixel_centres(width, width // 2), width, width // 2))
 
 
 @pytest.mark.parametrize("second", ["track5", "track1", "Track4"])
@@ -81,7 +81,7 @@ def test_panoramas_show_the_sphere(frames: FrameSet, width: int) -> None:
 @pytest.mark.parametrize("rig", [CubeRig(64, np.pi / 2), CubeRig(120, np.deg2rad(100))])
 def test_faces_show_the_sphere(frames: FrameSet, rig: CubeRig) -> None:
     """Cut in one step, as features, splats and exports of one lens have them."""
-    pixels = np.stack(np.meshgrid(*2 * (np.arange(rig.size) + 0.5,)), axis=-1)
+    pixels = pixel_centres(rig.size, rig.size)
     true = np.stack([colours(rig.bearings(pixels, face)) for face in range(6)])
     images, masks = cubemap.load(frames, 1, rig)
     assert masks is None
@@ -96,8 +96,7 @@ def test_faces_of_one_lens(frames: FrameSet) -> None:
     views = lens_views(lenses, 64)
     cutter = ViewCutter(views, lenses, 0, 1e6 * np.random.default_rng(0).normal(size=(200, 3)))
     for view, image in zip(views, cut_views(frames, 0, cutter), strict=True):
-        centres = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
-        true = colours(view.rays(np.stack(centres, axis=-1)))
+        true = colours(view.rays(pixel_centres(view.width, view.height)))
         assert np.abs(image - true).mean() < 0.7
 
 
@@ -122,7 +121,6 @@ def test_exports_write_panoramas_and_faces(tmp_path: Path, frames: FrameSet) -> 
         *((tmp_path / "cube" / face / "2.png", cut[n]) for n, face in enumerate(FACES)),
     ]:
         shown = cv2.imread(str(path))
-        assert shown is not None
         np.testing.assert_array_equal(shown[..., ::-1], expected)
 
 
@@ -193,6 +191,5 @@ def test_panoramas_of_a_real_camera() -> None:
     assert found.names == tuple(f"GS018423_{n}" for n in (1, 2, 3, 4))
     for f, name in enumerate(found.names):
         stitched = cv2.imread(str(REAL / "STITCHED" / f"{name}.jpg"))
-        assert stitched is not None
         off = np.abs(load_erp(found, f, width=2272) - stitched[..., ::-1].astype(int))
         assert off.mean() < 3.0  # 2.6 to 3.0; sampled where the other program does, 0.65

@@ -61,7 +61,7 @@ def test_a_gyro_that_shows_too_much_is_found_out() -> None:
 
 
 def test_a_clock_that_runs_fast_is_followed() -> None:
-    on = ride(400)
+    on = ride(200)
     readings = on.readings()
     begin = on.timestamps[0] + OFFSET_S
     drifting = replace(readings, timestamps=begin + 1.001 * (readings.timestamps - begin))

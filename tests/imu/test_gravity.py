@@ -16,7 +16,6 @@ def _known(on: Ride, readings: Readings) -> Alignment:
 
 
 def _off_deg(found: np.ndarray | None) -> float:
-    assert found is not None
     return float(np.rad2deg(np.arccos(np.clip(found @ UP, -1, 1))))
 
 

@@ -9,7 +9,7 @@ import cv2
 import insta360_files as made
 import numpy as np
 import pytest
-from command import run_gsba
+from command import run_gsba, succeed
 from PIL import Image
 from two_fisheyes import made_pair, picture
 from video_files import encode, steady
@@ -113,8 +113,8 @@ def test_a_video_with_all_that_its_maker_appends(tmp_path: Path) -> None:
 
 def test_the_command_prints_text_or_json(tmp_path: Path) -> None:
     folder = _panoramas(tmp_path / "tour")
-    shown = run_gsba("--quiet", "info", folder)
-    assert shown.exit_code == 0 and f"gsba refine {folder}" in shown.stdout
+    shown = succeed("--quiet", "info", folder)
+    assert f"gsba refine {folder}" in shown.stdout
     tables = json.loads(run_gsba("info", "--json", folder).stdout)
     assert tables[0]["facts"]["camera"] == "GoPro GoPro Max"
     nowhere = run_gsba("info", tmp_path / "nowhere")

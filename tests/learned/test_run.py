@@ -62,7 +62,7 @@ def settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RefineSettings:
     for name in ("aliked-n16.pth", "aliked_lightglue.pth"):
         (tmp_path / name).write_bytes(b"weights")
     changes = {
-        "features": {"extractor": "aliked", "weights": str(tmp_path), "max_per_face": 400},
+        "features": {"extractor": "aliked", "weights": str(tmp_path), "max_per_face": 200},
         "matching": {"matcher": "lightglue", "weights": str(tmp_path)},
         "patches": {"rounds": 0},
     }

@@ -4,6 +4,7 @@ import gtsam
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from synthetic import unit
 
 from factors import RobustLoss
 from gsba.bundle.pose_variables import X
@@ -133,8 +134,7 @@ def _panorama(
     world_T_rig = pose(Rotation.from_quat(rng.normal(size=4)).as_matrix(), rng.normal(size=3))
     bearings, distances = _units(rng, num), rng.uniform(1, 8, (num, 1))
     points = (bearings * distances) @ world_T_rig[:3, :3].T + world_T_rig[:3, 3]
-    noisy = bearings + rng.normal(0, sigma, (num, 3))
-    noisy /= np.linalg.norm(noisy, axis=1, keepdims=True)
+    noisy = unit(bearings + rng.normal(0, sigma, (num, 3)))
     return PointSightings(
         points, np.zeros((num, 3, 3)), noisy, isotropic(np.full(num, sigma))
     ), world_T_rig

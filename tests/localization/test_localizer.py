@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from command import run_gsba
+from command import run_gsba, succeed
 from one_gallery import gallery
 from tiny_run import NUM_FRAMES, WIDTH, Case
 
@@ -75,8 +75,7 @@ def test_the_run_stays_as_it_is_to_the_byte(
 ) -> None:
     run = case.copy(tmp_path / "run")
     before = _contents(run)
-    result = run_gsba("localize", run, new[0], "--out", tmp_path / "out")
-    assert result.exit_code == 0, result.output
+    result = succeed("localize", run, new[0], "--out", tmp_path / "out")
     assert "3 of 3 pictures localised" in result.output
     assert _contents(run) == before
     written = json.loads((tmp_path / "out/localized.json").read_text())

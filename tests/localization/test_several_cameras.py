@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from cameras_home import NUM, SMALL, WIDTH, Home, faces, fisheyes, panoramas, read
-from command import run_gsba
+from command import run_gsba, succeed
 
 from gsba import GsbaError, Localizer
 from gsba.store.finished import load_run
@@ -54,8 +54,7 @@ def test_a_size_of_no_camera_is_refused_unless_the_camera_is_named(
         Localizer(sizes).localize(small)
     call = ["localize", str(sizes), str(small), "--out", str(tmp_path / "out")]
     assert "small: not localised: " in run_gsba(*call).output
-    named = run_gsba(*call, "--camera-of", f"stitched0at{WIDTH}")
-    assert named.exit_code == 0, named.output
+    succeed(*call, "--camera-of", f"stitched0at{WIDTH}")
     (told,) = json.loads((tmp_path / "out/localized.json").read_text())["pictures"]
     assert _distance(sizes, 4, np.array(told["world_T_picture"])) < 0.02
     missing = run_gsba(*call, "--camera-of", "attic")
@@ -72,8 +71,7 @@ def test_raw_fisheyes_and_faces_are_localised_beside_panoramas(
         (tmp_path / "new" / path.parent.name).mkdir(parents=True, exist_ok=True)
         shutil.copy(path, tmp_path / "new" / path.parent.name)
     call = ["localize", str(out), str(tmp_path / "new"), "--out", str(tmp_path / "found")]
-    result = run_gsba(*call)
-    assert result.exit_code == 0, result.output
+    succeed(*call)
     told = json.loads((tmp_path / "found/localized.json").read_text())["pictures"]
     for frame, one in zip((3, 6), told, strict=True):
         assert _distance(out, NUM + frame, np.array(one["world_T_picture"])) < 0.02

@@ -8,7 +8,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from command import run_gsba
+from command import run_gsba, succeed
+from pixels import pixel_centres
 from scipy.spatial.transform import Rotation
 from tiny_run import BARE, Case, computed_stages, settings_with
 from two_fisheyes import colours, made_pair, picture, write
@@ -36,7 +37,7 @@ def _outline() -> np.ndarray:
 
 
 def _rays() -> np.ndarray:
-    grid = np.stack(np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT)), axis=-1) + 0.5
+    grid = pixel_centres(WIDTH, HEIGHT)
     return bearings_from_erp(grid, WIDTH, HEIGHT)
 
 
@@ -85,8 +86,9 @@ def _overlap(found: np.ndarray, true: np.ndarray) -> float:
     return float(np.sum(found & true) / np.sum(found | true))
 
 
-@pytest.mark.parametrize("plain_floor", [False, True])
-@pytest.mark.parametrize("look", ["dark", "bright", "coloured"])
+@pytest.mark.parametrize(
+    ("look", "plain_floor"), [("dark", True), ("bright", False), ("coloured", True)]
+)
 def test_a_pasted_carrier_is_found(tmp_path: Path, look: str, plain_floor: bool) -> None:
     carrier = find_carrier(_walk(tmp_path, _looks()[look], plain_floor))
     assert _overlap(~carrier.mask, _outline()) >= 0.9
@@ -205,8 +207,8 @@ def test_command_writes_what_can_be_looked_at(tmp_path: Path) -> None:
     own[:40] = 0
     cv2.imwrite(str(tmp_path / "own.png"), own)
     arguments = ["mask", frames.paths[0][0].parent, "--out", tmp_path / "m"]
-    result = run_gsba(*arguments, "--masks", tmp_path / "own.png")
-    assert result.exit_code == 0 and "% of the image" in result.stdout
+    result = succeed(*arguments, "--masks", tmp_path / "own.png")
+    assert "% of the image" in result.stdout
     found = cv2.imread(str(tmp_path / "m/carrier.png"), cv2.IMREAD_UNCHANGED)
     assert set(np.unique(found)) == {0, 255} and _overlap(found == 0, _outline()) >= 0.9
     assert cv2.imread(str(tmp_path / "m/carrier_check.jpg")).shape == (HEIGHT, WIDTH, 3)
@@ -275,11 +277,10 @@ def test_raw_pairs_are_taken(tmp_path: Path) -> None:
 
             write(tmp_path / "raw" / name / f"{f}.png", picture(lens, seen))
     arguments = ["mask", str(tmp_path / "raw"), "--out", str(tmp_path / "m")]
-    result = run_gsba(*arguments)
-    assert result.exit_code == 0, result.stderr
+    succeed(*arguments)
     found = cv2.imread(str(tmp_path / "m/carrier.png"), cv2.IMREAD_UNCHANGED) == 0
     height, width = found.shape
-    grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1) + 0.5
+    grid = pixel_centres(width, height)
     cone = bearings_from_erp(grid, width, height)[..., 2] > np.cos(0.5)
     assert width == 2 * height and _overlap(found, cone) >= 0.8
 

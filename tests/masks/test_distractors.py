@@ -41,6 +41,11 @@ def _populated(case: Case, folder: Path) -> tuple[FrameSet, np.ndarray]:
     return dataclasses.replace(frames, paths=paths), np.stack(outlines)
 
 
+@pytest.fixture(scope="module")
+def populated(case: Case, tmp_path_factory: pytest.TempPathFactory) -> tuple[FrameSet, np.ndarray]:
+    return _populated(case, tmp_path_factory.mktemp("populated") / "people")
+
+
 def _scene(case: Case, frames: FrameSet, known=None) -> StaticScene:
     solved = load_stage(case.out, "refined1", Solution)
     return StaticScene(frames, solved.world_T_rigs, solved.landmarks, known)
@@ -51,8 +56,8 @@ def _overlap(found: np.ndarray, true: np.ndarray) -> float:
 
 
 @pytest.mark.slow
-def test_people_are_found_and_nothing_else(case: Case, tmp_path: Path) -> None:
-    frames, true = _populated(case, tmp_path / "people")
+def test_people_are_found_and_nothing_else(case: Case, populated) -> None:
+    frames, true = populated
     assert 0.01 < true.mean() < 0.1
     first = _scene(case, frames)
     once = [distractor_mask(first.find(f)) for f in range(len(frames))]
@@ -87,8 +92,8 @@ def test_frames_that_cannot_be_judged_are_left_alone(case: Case) -> None:
     assert "too few frames" in alone.reason and not distractor_mask(alone).any()
 
 
-def test_what_is_masked_already_is_not_judged(case: Case, tmp_path: Path) -> None:
-    frames, true = _populated(case, tmp_path / "people")
+def test_what_is_masked_already_is_not_judged(case: Case, populated, tmp_path: Path) -> None:
+    frames, true = populated
     write_image(tmp_path / "own.png", np.where(true[2], 0, 255).astype(np.uint8))
     masks = [tmp_path / "own.png" if f == 2 else None for f in range(len(frames))]
     scene = _scene(case, dataclasses.replace(frames, mask_paths=tuple(masks)))
@@ -156,12 +161,12 @@ def test_weights_are_written_as_grey_levels(tmp_path: Path, case: Case) -> None:
     np.testing.assert_array_equal(levels_of(mask), np.where(mask, 255, 0))
 
 
-def test_what_fits_badly_weighs_less(case: Case, tmp_path: Path) -> None:
+def test_what_fits_badly_weighs_less(case: Case, populated) -> None:
     """What is left of people beside the mask is trusted less than the rest of the picture."""
-    frames, true = _populated(case, tmp_path / "people")
+    frames, true = populated
     scene = _scene(case, frames)
     missed, scenery = [], []
-    for f in range(len(frames)):
+    for f in range(1, len(frames), 2):
         found = scene.find(f)
         weights, left = distractor_weights(found), ~distractor_mask(found)
         missed.append(weights[true[f] & left])

@@ -101,7 +101,6 @@ def test_a_walk_there_and_back_closes_its_loop(walk: RenderedWalk) -> None:
     assert met.max() < 1.0  # median distances of what is seen
     assert _ate(found, there.world_T_rigs) < 0.005
     assert "closed" in found.summary()
-    assert found.covariances is not None
     sigmas = np.sqrt(np.trace(found.covariances[:, 3:, 3:], axis1=1, axis2=2))
     assert np.isfinite(sigmas).all() and sigmas.max() < 0.2  # median distances
 

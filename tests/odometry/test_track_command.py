@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from command import run_gsba
+from command import run_gsba, succeed
 from dense_walk import RenderedWalk
 
 from gsba.evaluate.trajectory import evaluate
@@ -52,8 +52,7 @@ def test_every_frame_gets_a_pose(
 ) -> None:
     frames, out = request.getfixturevalue(source), tmp_path / "walk.tum"
     times = ["--fps", FPS] if source == "folder" else []
-    result = run_gsba("track", frames, "--out", out, "--masks", "none", *times)
-    assert result.exit_code == 0, result.output
+    result = succeed("track", frames, "--out", out, "--masks", "none", *times)
     assert f"{len(walk.frames)} of {len(walk.frames)} frames posed" in result.output
     assert len(read_trajectory(out).timestamps) == len(walk.frames)
     assert _ate(out, walk) < 0.01
@@ -93,14 +92,13 @@ def test_what_is_no_input_is_refused_in_one_line(folder: Path, video: Path, tmp_
 
 def test_frames_are_extracted_by_what_they_show(video: Path, tmp_path: Path) -> None:
     frames = tmp_path / "frames"
-    result = run_gsba("extract", video, "--every", "auto", "--out", frames)
-    assert result.exit_code == 0, result.output
+    succeed("extract", video, "--every", "auto", "--out", frames)
     chosen = read_trajectory(tmp_path / "frames.tum")
     names = sorted(path.name for path in frames.glob("*.jpg"))
     assert 3 < len(names) == len(chosen.timestamps) < 34
     assert [f"{round(t * FPS):06d}.jpg" for t in chosen.timestamps] == names
-    again = run_gsba("extract", video, "--every", "auto", "--out", frames)
-    assert again.exit_code == 0 and f"{len(names)} of" in again.output
+    again = succeed("extract", video, "--every", "auto", "--out", frames)
+    assert f"{len(names)} of" in again.output
 
 
 def test_a_video_is_refined_from_its_own_odometry(
@@ -108,13 +106,12 @@ def test_a_video_is_refined_from_its_own_odometry(
 ) -> None:
     out = tmp_path / "run"
     light = ["--set", "patches.rounds=0", "--set", "features.max_per_face=300"]
-    result = run_gsba("refine", video, "--masks", "none", "--out", out, *light)
-    assert result.exit_code == 0, result.output
+    result = succeed("refine", video, "--masks", "none", "--out", out, *light)
     assert (out / "odometry/walk.tum").is_file() and (out / "odometry/poses.csv").is_file()
     assert "Camera path by the odometry on the video" in (out / "report.html").read_text()
     assert '"odometry":{"summary":' in (out / "report.html").read_text()
     chosen = read_trajectory(out / "odometry/chosen.tum")
     assert len(list((out / "frames").glob("*.jpg"))) == len(chosen.timestamps)
     assert _ate(out / "trajectory.tum", walk) < 0.005
-    again = run_gsba("refine", video, "--masks", "none", "--out", out, *light)
-    assert again.exit_code == 0 and again.output.splitlines()[-1] == result.output.splitlines()[-1]
+    again = succeed("refine", video, "--masks", "none", "--out", out, *light)
+    assert again.output.splitlines()[-1] == result.output.splitlines()[-1]

@@ -7,7 +7,8 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from synthetic import bearings_of
+from pixels import pixel_centres
+from synthetic import bearings_of, unit
 
 from gsba.bundle import adjustment
 from gsba.bundle.adjustment import AdjustmentContext
@@ -44,8 +45,7 @@ def _small_patches(monkeypatch: pytest.MonkeyPatch) -> None:
 def _bearings(width: int) -> np.ndarray:
     from gsba.camera.sphere import bearings_from_erp
 
-    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(width // 2) + 0.5)
-    return bearings_from_erp(np.stack([u, v], axis=-1), width, width // 2)
+    return bearings_from_erp(pixel_centres(width, width // 2), width, width // 2)
 
 
 def _grey(points: np.ndarray) -> np.ndarray:
@@ -390,10 +390,8 @@ def test_patches_come_to_lie_on_their_surfaces(tmp_path: Path) -> None:
         apart = np.linalg.norm(hits[:, None] - points, axis=2)
         nearest = apart.argmin(axis=1)
         good = clear[nearest] & found.aligned[own] & (apart.min(axis=1) < 0.1)
-        wanted = points[nearest] - world_T_rigs[there, :3, 3]
-        wanted /= np.linalg.norm(wanted, axis=1, keepdims=True)
+        wanted = unit(points[nearest] - world_T_rigs[there, :3, 3])
         errors.append(np.median(np.linalg.norm(where - wanted, axis=1)[good]) / PIXEL)
-        assert found.normals_rig is not None
         lies = found.normals_rig[own][good]
         known = lies.any(axis=1)
         cosines = np.einsum("oi,oi->o", lies[known], walls[good][known])

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command import run_gsba
+from command import run_gsba, succeed
 from tiny_run import PLAIN, Case, computed_stages
-from walk_on_earth import geodetic_of
+from walk_on_earth import geodetic_of, write_fixes
 
 from gsba.config import RefineSettings
 from gsba.evaluate.trajectory import evaluate
@@ -33,12 +33,7 @@ def _table(
     level = metres * case.truth.world_T_rigs[:, :3, 3] @ upright
     level += np.random.default_rng(seed).normal(0, 0.3, level.shape)
     level[:, 1] *= stretch
-    rows = [
-        f"{t + shift_s!r},{lat:.10f},{lon:.10f},{alt:.4f}"
-        for t, (lat, lon, alt) in zip(times.tolist(), geodetic_of(level), strict=True)
-    ]
-    path.write_text("\n".join(["timestamp,lat,lon,alt", *rows]) + "\n")
-    return path
+    return write_fixes(path, times + shift_s, geodetic_of(level))
 
 
 def _apart(one: Path, other: Path) -> float:
@@ -63,8 +58,7 @@ def test_fixes_hold_a_run_and_are_reported(case: Case, plain_run: Path, tmp_path
     for file, more in ((table, ()), (late, ("--gps-sigma", "0.3", "--gps-offset", "-1000"))):
         folder = tmp_path / f"export{len(more)}"
         command = ["export", out, "--to", "tum", "--out", folder, "--gps", file, *more]
-        done = run_gsba(*command)
-        assert done.exit_code == 0, done.stderr
+        done = succeed(*command)
         said = json.loads((folder / "transform.json").read_text())
         assert (said["unit"], said["up"]) == ("m", "z")
         place, scale = said["origin"], said["scale"]
@@ -92,18 +86,9 @@ def test_the_command_takes_gps_as_a_family(case: Case, tmp_path: Path) -> None:
 
 
 def test_positions_elsewhere_have_no_say(case: Case, plain_run: Path, tmp_path: Path) -> None:
-    table = tmp_path / "gps.csv"
-    rng = np.random.default_rng(3)
-    rows = [
-        f"{t!r},{lat:.10f},{lon:.10f},{alt:.4f}"
-        for t, (lat, lon, alt) in zip(
-            case.truth.timestamps.tolist(),
-            geodetic_of(rng.normal(0, 2, (len(case.truth.timestamps), 3))),
-            strict=True,
-        )
-    ]
-    table.write_text("\n".join(["timestamp,lat,lon,alt", *rows]) + "\n")
-    out = tmp_path / "run"
+    elsewhere = np.random.default_rng(3).normal(0, 2, (len(case.truth.timestamps), 3))
+    table, out = tmp_path / "gps.csv", tmp_path / "run"
+    write_fixes(table, case.truth.timestamps, geodetic_of(elsewhere))
     report = case.refine(out, _with_gps(table)).report
     assert not report["gps"]["taken"]
     assert any(note.startswith("GPS was not used") for note in report["notes"])

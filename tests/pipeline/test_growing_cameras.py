@@ -17,7 +17,7 @@ from cameras_home import (
     error_of,
     panoramas,
 )
-from command import run_gsba
+from command import succeed
 from tiny_run import PLAIN
 
 from factors.sphere_field import SphereField, num_harmonics
@@ -56,8 +56,7 @@ def grown(single_run: Path, home: Home) -> Path:
     """The second recording added to the first one's run from the command line."""
     out, small = home.folder / "grown", panoramas(home, 1, SMALL)
     words = ["add", str(single_run), str(small.frames), str(small.trajectory), "--out", str(out)]
-    result = run_gsba("--quiet", *words)
-    assert result.exit_code == 0, result.output
+    succeed("--quiet", *words)
     return out
 
 
@@ -121,8 +120,7 @@ def test_recordings_of_two_models_have_two_cameras(home: Home, tmp_path: Path) -
     camera = PLAIN.camera.model_copy(update={"name": "insta360-x3"})
     refine_each([first], run, PLAIN.model_copy(update={"camera": camera}))
     call = f"{second.frames},trajectory={second.trajectory},camera=gopro-max"
-    result = run_gsba("--quiet", "add", run, "--recording", call)
-    assert result.exit_code == 0, result.output
+    succeed("--quiet", "add", run, "--recording", call)
     frames: FrameSet = load_run(run)[1]
     assert frames.camera_of_frame == (0,) * num + (1,) * num
     names = [one.name for one in FinishedRun.load(run).camera_settings]

@@ -29,6 +29,10 @@ def test_fixed_poses_of_a_run_of_several_cameras_stay(
     add_recordings(sizes, [fisheyes(home)], out, fixed=True)
     before, after = load_run(sizes)[0], load_run(out)[0]
     assert after.world_T_rigs[: 2 * NUM].tobytes() == before.world_T_rigs.tobytes()
+    assert after.pose_covariances[: 2 * NUM].tobytes() == before.pose_covariances.tobytes()
+    kept = "trajectories/stitched0at512.tum"
+    assert (out / kept).read_bytes() == (sizes / kept).read_bytes()
+    assert after.num_maps == 1
     assert [kind.layout for kind in load_run(out)[1].formats] == ["erp", "erp", "fisheye"]
     assert_as_accurate(out, error_of(out, home), sizes, 1.25)
 

@@ -56,7 +56,6 @@ def test_a_gyro_is_aligned_and_frames_turn_as_it_says(
     turned = [case.errors(run).rpe_rotation_deg.rmse for run in (out, plain_run)]
     assert turned[0] < 0.9 * turned[1]
     vertical, found = result.reconstruction.vertical, result.reconstruction.world_T_rigs
-    assert vertical is not None
     # It walks off from rest, as the spline has it: on average that looks like a slope of a degree.
     true = case.truth.world_T_rigs[0, :3, :3] @ found[0, :3, :3].T @ vertical
     assert true @ [0, -1, 0] > np.cos(np.deg2rad(3))

@@ -8,8 +8,9 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
-from command import run_gsba
+from command import run_gsba, succeed
 from one_gallery import gallery
+from pixels import pixel_centres
 from splat_moves import shorten
 from tiny_run import SETTINGS
 
@@ -66,7 +67,7 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def _maps(lens: Fisheye) -> np.ndarray:
     """Places (2, h, w) in a panorama of 1024 pixels; NaN beyond the circle."""
-    pixels = np.stack(np.meshgrid(np.arange(SIZE) + 0.5, np.arange(SIZE) + 0.5), axis=-1)
+    pixels = pixel_centres(SIZE, SIZE)
     directions = unproject(lens, pixels)
     maps = np.moveaxis(erp_from_bearings(directions, 1024, 512) - 0.5, -1, 0).astype(np.float32)
     maps[:, directions @ rotation_of(lens)[:, 2] < np.cos(np.deg2rad(100))] = np.nan
@@ -110,16 +111,15 @@ def test_raw_pairs_of_known_lenses_become_faces_of_either(
 def _check_fisheyes(run: Path) -> None:
     """Both pictures as they are, points where these show them; faces of one centre on request."""
     call = ["-q", "export", str(run), "--to", "colmap", "--images"]
-    result = run_gsba(*call, "fisheye", "--out", run / "raw")
-    assert result.exit_code == 0, result.output
+    result = succeed(*call, "fisheye", "--out", run / "raw")
     model = pycolmap.Reconstruction(run / "raw/sparse/0")
     assert {camera.model.name for camera in model.cameras.values()} == {"OPENCV_FISHEYE"}
     assert model.compute_mean_reprojection_error() < 0.5
     masks = [cv2.imread(str(path), 0) for path in sorted((run / "raw/masks/front").iterdir())]
     assert all(mask is not None and mask[SIZE // 2, SIZE // 2] == 255 for mask in masks)
     assert all(mask is not None and mask[0, 0] == 0 for mask in masks)
-    result = run_gsba(*call, "cube", "--out", run / "cube")
-    assert result.exit_code == 0 and len(list((run / "cube/images").iterdir())) == 6
+    result = succeed(*call, "cube", "--out", run / "cube")
+    assert len(list((run / "cube/images").iterdir())) == 6
     wrong = ["export", str(run), "--to", "tum", "--images", "fisheye"]
     result = run_gsba(*wrong, "--out", run / "no")
     assert result.exit_code == 1 and "colmap" in result.output and not (run / "no").exists()
@@ -128,8 +128,7 @@ def _check_fisheyes(run: Path) -> None:
 def _check_panoramas(walk: Path, run: Path) -> None:
     """Stitched at the map's depth they are what one camera sees, better than joined at infinity."""
     call = ["-q", "export", str(run), "--to", "tum", "--images", "panorama"]
-    result = run_gsba(*call, "--out", run / "panoramas")
-    assert result.exit_code == 0, result.output
+    succeed(*call, "--out", run / "panoramas")
     _, frames = load_run(run)
     truth, scene = read_trajectory(walk / "truth.tum"), gallery()
     size, off = (frames.format.width, frames.format.height), []
@@ -162,8 +161,7 @@ def _check_families(walk: Path, run: Path) -> None:
     assert computed[:2] == ["photometric", "splat"] and len(report["splat"]) == 1
     assert evaluate(read_trajectory(run / "trajectory.tum"), truth).ate.rmse < 0.004
     train = ["-q", "train", str(run), "--iterations", "20", "--face-size", "32", "--backend", "cpu"]
-    result = run_gsba(*train)
-    assert result.exit_code == 0, result.output
+    succeed(*train)
     (picture, *_) = sorted((run / "splat/pictures").iterdir())
     views = lens_views(load_cameras(run, *load_run(run)).only, 32)
     shown = cv2.imread(str(picture))

@@ -51,13 +51,6 @@ def test_poses_become_better_by_far(case: Case) -> None:
     assert (case.result.reconstruction.pose_statuses == PoseStatus.REFINED).all()
 
 
-def test_the_result_sits_in_the_slam_world(case: Case) -> None:
-    coarse = read_trajectory(case.slam).world_T_rigs[:, :3, 3]
-    offsets = case.result.reconstruction.world_T_rigs[:, :3, 3] - coarse
-    assert np.abs(offsets.mean(axis=0)).max() < 1e-9  # least squares over all positions
-    assert np.linalg.norm(offsets, axis=1).max() < 0.05 * np.linalg.norm(np.ptp(coarse, axis=0))
-
-
 def test_every_file_can_be_read(case: Case) -> None:
     reconstruction, out = case.result.reconstruction, case.out
     trajectory = read_trajectory(out / "trajectory.tum")
@@ -148,15 +141,15 @@ def test_dark_frames_are_said_to_be_dark(case: Case, tmp_path: Path) -> None:
     (tmp_path / "frames").mkdir()
     for path in sorted(case.frames.glob("*.jpg"))[:4]:
         image = cv2.imread(str(path))
-        assert image is not None
         twelve = image.astype(np.uint16) * 16
         assert cv2.imwrite(str(tmp_path / "frames" / f"{path.stem}.png"), twelve)
     with pytest.raises(GsbaError, match=r"no two .* very dark \(99 % of their pixels at or below"):
         refine(tmp_path / "frames", case.slam, tmp_path / "run", SETTINGS, fps=2)
 
 
-@pytest.mark.parametrize("missing", [(), ("up", "down")])
-def test_cube_faces_serve_as_well(case: Case, tmp_path: Path, missing: tuple[str, ...]) -> None:
+def test_cube_faces_serve_as_well(case: Case, tmp_path: Path) -> None:
+    """Of all six, see test_several_cameras.py; here without those above and below."""
+    missing = "up", "down"
     rig = CubeRig(WIDTH // 3, np.pi / 2)  # the panorama's own density
     frames = tmp_path / "frames"
     for path in sorted(case.frames.glob("*.jpg")):

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
-from command import run_gsba
+from command import run_gsba, succeed
 from splat_moves import shorten
 from tiny_run import SETTINGS
 
@@ -114,8 +114,7 @@ def _export_both(run: Path, scale: float) -> None:
     assert 2 * scale * np.linalg.norm(lenses.centre) == pytest.approx(BASELINE, rel=0.02)
     for images, number in (("--images", "lenses"), 10), ((), 6):
         call = ["-q", "export", str(run), "--to", "colmap", "--face-size", "64", *images]
-        result = run_gsba(*call)
-        assert result.exit_code == 0, result.output
+        succeed(*call)
         assert len(list((run / "colmap/images").iterdir())) == number
         centres = {}
         for image in pycolmap.Reconstruction(run / "colmap/sparse/0").images.values():
@@ -134,8 +133,7 @@ def _train_and_look(run: Path) -> None:
     splat, name = run / "splat/refined/point_cloud.ply", frames.names[3]
     calls = (["train", str(run), "--iterations", "30"], ["render", str(splat), str(run), "--frame"])
     for call in (calls[0], [*calls[1], name]):
-        result = run_gsba("-q", *call, *size)
-        assert result.exit_code == 0, result.output
+        succeed("-q", *call, *size)
     views = [view.name for view in lens_views(load_cameras(run, reconstruction, frames).only, 32)]
     rendered = {path.name for path in (run / "renderings").iterdir()}
     assert rendered == {f"{name}_{view}.png" for view in [*views, "erp"]} and len(rendered) == 11

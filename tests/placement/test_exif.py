@@ -17,7 +17,6 @@ from gsba.config import PlacementSettings, RefineSettings
 from gsba.frames.exif import read_exif
 from gsba.log import GsbaError
 from gsba.pipeline import refine
-from gsba.placement.frame_fixes import read_exif_gps
 from gsba.placement.placement import check, place
 from gsba.types import FrameSet
 
@@ -168,15 +167,6 @@ def test_frames_are_placed_by_their_tags(tmp_path: Path) -> None:
     moved = placed.similarity.points(result.world_T_rigs[:, :3, 3])
     assert np.allclose(moved - moved[0], level - level[0], atol=2e-3)  # altitudes are in mm
     assert placed.origin is not None and np.allclose(placed.origin[:2], ORIGIN[:2], atol=1e-3)
-
-
-def test_altitudes_are_all_or_none(tmp_path: Path) -> None:
-    flat = [(48.0, 11.0 + 1e-5 * k, None) for k in range(4)]
-    assert np.all(read_exif_gps(_set(tmp_path, [*flat, None])).geodetic[:, 2] == 0)
-    high = [(48.0, 11.0 + 1e-5 * k, 500.0) for k in range(4)]
-    found = read_exif_gps(_set(tmp_path, [*flat, *high]))
-    assert found.names == tuple(f"frame_{k:04d}" for k in range(4, 8))
-    assert np.all(found.geodetic[:, 2] == 500)
 
 
 def test_too_few_positions_are_one_line(tmp_path: Path) -> None:

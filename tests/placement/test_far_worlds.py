@@ -34,7 +34,6 @@ def _error_in_float32(world: np.ndarray, local: np.ndarray, offset: np.ndarray) 
 def test_the_origin_is_near_the_positions(far: np.ndarray, scale: float) -> None:
     near = scale * walk_result().world_T_rigs[:, :3, 3]
     origin = local_origin(near + far)
-    assert origin is not None
     assert _error_in_float32(near + far, near + far - origin, origin) < 1e-6
     assert local_origin(near) is None and local_origin(np.tile(far, (5, 1))) is None
 
@@ -44,7 +43,6 @@ def test_a_trajectory_comes_in_near_the_origin(far: np.ndarray) -> None:
     frames, poses = frame_set(40), walk_result().world_T_rigs.copy()
     poses[:, :3, 3] += far
     (near,) = inputs.timed([Trajectory(frames.timestamps, poses)], frames)
-    assert near.origin is not None
     assert np.abs(near.world_T_rigs[:, :3, 3]).max() < 30
     np.testing.assert_allclose(
         near.world_T_rigs[:, :3, 3] + near.origin, poses[:, :3, 3], atol=2e-9

@@ -244,7 +244,6 @@ def test_points_of_a_gpx_track_that_share_seconds_are_spread(tmp_path: Path) -> 
     path = tmp_path / "a.gpx"
     path.write_text(f'<gpx xmlns="http://www.topografix.com/GPX/1/1"><trk>{points}</trk></gpx>')
     times = read_gps(path).timestamps
-    assert times is not None
     np.testing.assert_allclose(times - times[0], np.arange(6) / 3, atol=1e-6)
     shifted = read_gps(path, GpsSettings(offset_s=-3600)).timestamps
     assert shifted is not None and shifted[0] == times[0] - 3600

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -10,8 +9,9 @@ import export_scene as scene
 import numpy as np
 import pytest
 from command import run_gsba
+from pixels import pixel_centres
 from scipy.spatial.transform import Rotation
-from walk_on_earth import ORIGIN, frame_set, geodetic_of, level_metres, walk_result
+from walk_on_earth import ORIGIN, frame_set, geodetic_of, level_metres, walk_result, write_fixes
 
 from gsba.camera.sphere import bearings_from_erp
 from gsba.config import PlacementSettings
@@ -24,15 +24,6 @@ from gsba.placement.placement import Placement, place
 from gsba.similarity import Sim3, level_similarity, robust_similarity, similarity
 from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.types import FrameSet, PictureFormat, Trajectory
-
-
-def _gps_csv(path: Path, times: Sequence[float] | np.ndarray, fixes: np.ndarray) -> Path:
-    rows = [
-        f"{t!r},{lat:.12f},{lon:.12f},{alt:.6f}"
-        for t, (lat, lon, alt) in zip(map(float, times), fixes, strict=True)
-    ]
-    path.write_text("\n".join(["timestamp,lat,lon,alt", *rows]) + "\n")
-    return path
 
 
 def test_local_metres_of_known_places() -> None:
@@ -140,7 +131,7 @@ def test_gps_is_exact_and_robust(tmp_path: Path, share: float, named: bool) -> N
         ]
         path.write_text("\n".join(["name,latitude,longitude,altitude", *rows]))
     else:
-        path = _gps_csv(tmp_path / "gps.csv", frames.timestamps, fixes)
+        path = write_fixes(tmp_path / "gps.csv", frames.timestamps, fixes)
     placed = place(result, frames, PlacementSettings(gps=str(path)))
     assert placed.similarity.scale == pytest.approx(1 / 0.21, rel=1e-6)
     assert (placed.unit, placed.up) == ("m", "z") and placed.origin is not None
@@ -155,7 +146,7 @@ def test_gps_is_exact_and_robust(tmp_path: Path, share: float, named: bool) -> N
 def test_gps_noise_averages_out(tmp_path: Path) -> None:
     result, frames = walk_result(), frame_set(40)
     noisy = level_metres(result) + np.random.default_rng(6).normal(0, 0.5, (40, 3))
-    path = _gps_csv(tmp_path / "gps.csv", frames.timestamps, geodetic_of(noisy))
+    path = write_fixes(tmp_path / "gps.csv", frames.timestamps, geodetic_of(noisy))
     placed = place(result, frames, PlacementSettings(gps=str(path)))
     assert placed.similarity.scale == pytest.approx(1 / 0.21, rel=0.02)
     assert placed.grounds["gps"]["rmse_m"] == pytest.approx(0.5 * np.sqrt(3), rel=0.25)
@@ -225,14 +216,14 @@ def test_a_stuck_receiver_is_refused(
     upright = Placement(up="-y")
     monkeypatch.setattr("gsba.placement.placement._upright", lambda *_: upright)
     result, frames = walk_result(), frame_set(40)
-    path = _gps_csv(tmp_path / "gps.csv", frames.timestamps, np.tile(ORIGIN, (40, 1)))
+    path = write_fixes(tmp_path / "gps.csv", frames.timestamps, np.tile(ORIGIN, (40, 1)))
     settings = PlacementSettings(gps=str(path), up=up)  # type: ignore[arg-type]
     with pytest.raises(
         GsbaError, match="all 40 positions are equal: the receiver repeated one fix"
     ):
         place(result, frames, settings)
     rng = np.random.default_rng(11)
-    path = _gps_csv(path, frames.timestamps, geodetic_of(rng.normal(0, 2, (40, 3))))
+    path = write_fixes(path, frames.timestamps, geodetic_of(rng.normal(0, 2, (40, 3))))
     with pytest.raises(
         GsbaError, match=r"gps.csv: its positions and the frames' are not correlated"
     ):
@@ -261,7 +252,7 @@ def test_times_that_are_only_an_order_place_nothing(tmp_path: Path) -> None:
     write_tum(tmp_path / "t.tum", Trajectory(frames.timestamps, result.world_T_rigs))
     with pytest.raises(GsbaError, match="the frames have no times"):
         place(result, frames, PlacementSettings(align=str(tmp_path / "t.tum")))
-    path = _gps_csv(tmp_path / "gps.csv", frames.timestamps, geodetic_of(level_metres(result)))
+    path = write_fixes(tmp_path / "gps.csv", frames.timestamps, geodetic_of(level_metres(result)))
     with pytest.raises(GsbaError, match="the frames have no times"):
         place(result, frames, PlacementSettings(gps=str(path)))
 
@@ -286,7 +277,7 @@ def _posts(folder: Path, tilt: np.ndarray, num: int = 6) -> tuple[FrameSet, np.n
     """Panoramas of a room of vertical posts, and the rotations world_R_rig they were taken with."""
     rng = np.random.default_rng(9)
     width, height = 1024, 512
-    grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1) + 0.5
+    grid = pixel_centres(width, height)
     rays = bearings_from_erp(grid, width, height)
     edges = np.sort(rng.uniform(-np.pi, np.pi, 36))
     shades = rng.uniform(40, 220, len(edges))
@@ -368,7 +359,7 @@ def test_bad_gps_files(tmp_path: Path, content: str, message: str) -> None:
 
 def test_positions_on_a_line_leave_a_roll_open(tmp_path: Path) -> None:
     result, frames = walk_result(straight=True), frame_set(40)
-    path = _gps_csv(tmp_path / "gps.csv", frames.timestamps, geodetic_of(level_metres(result)))
+    path = write_fixes(tmp_path / "gps.csv", frames.timestamps, geodetic_of(level_metres(result)))
     with pytest.raises(GsbaError, match="determines no roll: add --up auto"):
         place(result, frames, PlacementSettings(gps=str(path)))
 
@@ -413,6 +404,5 @@ def test_tags_of_attitude_make_up_where_they_agree_with_poses(
     if not true:
         assert found is None
         return
-    assert found is not None and found.by_tags is not None
     error = np.degrees(np.arccos(np.clip(found.by_tags @ world.apply([0, -1, 0]), -1, 1)))
     assert error < 0.5

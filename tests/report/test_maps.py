@@ -1,12 +1,12 @@
 """The table of a run's maps, the line that counts frames, and when a run is partial."""
 
-import dataclasses
 import json
 from pathlib import Path
 
 import export_scene as scene
 import numpy as np
 import pytest
+from observing import observing
 
 from gsba.config import RefineSettings
 from gsba.report.maps import MapSummary, format_outcome, is_partial, summarize_maps
@@ -23,15 +23,7 @@ def _in_maps(components: np.ndarray = COMPONENTS) -> Reconstruction:
     seen = owners == components[whole.observation_frames]
     statuses = whole.pose_statuses.copy()
     statuses[7] = PoseStatus.UNREFINED
-    return dataclasses.replace(
-        whole,
-        components=components,
-        pose_statuses=statuses,
-        observation_points=whole.observation_points[seen],
-        observation_frames=whole.observation_frames[seen],
-        observation_bearings=whole.observation_bearings[seen],
-        observation_sigmas=whole.observation_sigmas[seen],
-    )
+    return observing(whole, seen, components=components, pose_statuses=statuses)
 
 
 def _report(tmp_path: Path, result: Reconstruction, reasons: tuple[str, ...] = ()) -> dict:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from synthetic import unit
 
 from gsba.config import RefineSettings
 from gsba.disk import write_json
@@ -44,18 +45,15 @@ class _Iteration:
 def _world() -> tuple[FrameSet, CoarsePoses, Reconstruction]:
     """Frames 0..2 see all points, each bearing off by ERROR_DEG; frame 3 sees nothing."""
     rng = np.random.default_rng(1)
-    wxyz = rng.normal(size=(NUM_FRAMES, 4))
-    wxyz /= np.linalg.norm(wxyz, axis=1, keepdims=True)
+    wxyz = unit(rng.normal(size=(NUM_FRAMES, 4)))
     world_T_rigs = pose(rotation_from_quaternion(wxyz), rng.normal(size=(NUM_FRAMES, 3)))
     points_world = 5 * rng.normal(size=(NUM_POINTS, 3))
     observation_points = np.repeat(np.arange(NUM_POINTS), 3)
     observation_frames = np.tile(np.arange(3), NUM_POINTS)
     rig_T_worlds = inverse(world_T_rigs)[observation_frames]
     points_rig = np.einsum("oij,oj->oi", rig_T_worlds[:, :3, :3], points_world[observation_points])
-    bearings = points_rig + rig_T_worlds[:, :3, 3]
-    bearings /= np.linalg.norm(bearings, axis=1, keepdims=True)
-    sideways = np.cross(bearings, rng.normal(size=bearings.shape))
-    sideways /= np.linalg.norm(sideways, axis=1, keepdims=True)
+    bearings = unit(points_rig + rig_T_worlds[:, :3, 3])
+    sideways = unit(np.cross(bearings, rng.normal(size=bearings.shape)))
     angle = np.radians(ERROR_DEG)
     covariances = np.tile(np.diag([1e-6, 4e-6, 9e-6, 1.0, 4.0, 9.0]), (NUM_FRAMES, 1, 1))
     covariances[3] = np.nan

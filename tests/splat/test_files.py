@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import plyfile
 import pytest
+from synthetic import unit
 
 from gsba.log import GsbaError
 from gsba.splat.gaussians import SH_CONSTANT, Gaussians, from_cloud, read_ply, write_ply
@@ -12,8 +13,7 @@ from gsba.splat.gaussians import SH_CONSTANT, Gaussians, from_cloud, read_ply, w
 
 def some(num: int = 7, harmonics: int = 16) -> Gaussians:
     rng = np.random.default_rng(0)
-    quaternions = rng.normal(size=(num, 4))
-    quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
+    quaternions = unit(rng.normal(size=(num, 4)))
     parts = (rng.normal(size=(num, 3)), rng.normal(size=(num, 3)), quaternions)
     parts += (rng.normal(size=num), rng.normal(size=(num, harmonics, 3)))
     return Gaussians(*(part.astype(np.float32) for part in parts))

@@ -5,6 +5,7 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
+from pixels import pixel_centres
 from scipy.spatial.transform import Rotation
 from splat_alignment import align_to_splat
 
@@ -59,7 +60,7 @@ def taken(request: pytest.FixtureRequest, room: Gaussians, tmp_path_factory):
     """Panoramas of the room, each direction from the lens that faces it; and these lenses."""
     lenses, folder = request.param, tmp_path_factory.mktemp("frames")
     paths = [folder / f"{f}.png" for f in range(NUM_FRAMES)]
-    pixels = np.stack(np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(WIDTH // 2) + 0.5), axis=-1)
+    pixels = pixel_centres(WIDTH, WIDTH // 2)
     directions = bearings_from_erp(pixels, WIDTH, WIDTH // 2)
     for f, path in enumerate(paths):
         axes = np.eye(3) if lenses.axes is None else lenses.axes[f]
@@ -115,7 +116,7 @@ def test_what_is_blended_has_no_weight(taken) -> None:
     (weights,) = captured.weights
     assert weights is not None
     for view, weight in zip(captured.views, weights, strict=True):
-        pixels = np.stack(np.meshgrid(*2 * (np.arange(view.width) + 0.5,)), axis=-1)
+        pixels = pixel_centres(view.width, view.width)
         rays = view.rays(pixels).reshape(-1, 3)
         own = np.sign(view.centre @ lenses.centre) * rays[:, 2] > 0
         turned = rays if lenses.axes is None else rays @ lenses.axes[0].T

@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from command import run_gsba
+from command import run_gsba, succeed
 from tiny_run import Case
 
 from gsba.camera.rig import CubeRig
@@ -28,8 +28,7 @@ TINY = ["--iterations", "30", "--face-size", "32", "--backend", "cpu"]
 
 
 def call(*arguments: object) -> str:
-    result = run_gsba("-q", *arguments)
-    assert result.exit_code == 0, result.output
+    result = succeed("-q", *arguments)
     return result.output
 
 

@@ -94,7 +94,6 @@ def test_few_matches_prove_a_turn_only_if_all_agree() -> None:
 def test_only_frames_that_matches_tie_together_turned() -> None:
     frames = [(0, 1), (2, 3), (3, 4), (4, 6), (6, 7)]
     turn = _prove(*_seen(0.0, frames=frames))
-    assert turn is not None
     assert np.flatnonzero(turn.frames).tolist() == [2, 3, 4, 6, 7]
     found = turn.world_R_rigs[2].T @ turn.world_R_rigs[7]
     assert np.degrees(rotation_angle(found.T @ (ROTATIONS[2].T @ ROTATIONS[7]))) < 0.1

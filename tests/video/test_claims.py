@@ -173,14 +173,13 @@ def _halves(axis: int) -> np.ndarray:
     ("pixels", "name"),
     [
         (_halves(0), "stereo, one eye above the other"),
-        (_halves(1), "stereo, an eye on the left"),
-        (np.tile(_panorama()[:, 64:192], (1, 2, 1)), "VR180"),
         (wave_panorama(512)[32:224, 64:448], "a cropped panorama"),
         (np.concatenate([_panorama(), np.roll(_panorama(), -3, 1)]), "one eye above the other"),
     ],
-    ids=["over-under", "side by side", "vr180", "cropped", "square"],
+    ids=["over-under", "cropped", "square"],
 )
 def test_what_pictures_show_is_named(tmp_path: Path, pixels: np.ndarray, name: str) -> None:
+    """More of them, see frames/test_panorama_tags.py: the pictures are judged alike."""
     big = cv2.resize(pixels, (2 * WIDTH, 2 * WIDTH * pixels.shape[0] // pixels.shape[1]))
     with pytest.raises(GsbaError, match=name):
         read_recording(_write(tmp_path / "a.mp4", [big] * 3))

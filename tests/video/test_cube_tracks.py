@@ -116,37 +116,6 @@ def test_odometry_reads_panoramas_of_both_tracks(tmp_path: Path) -> None:
         assert np.abs(picture - expected).mean() < 3  # decoded once, not encoded again
 
 
-def test_an_interrupted_extraction_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    video, out = _recording(tmp_path / "GS010001.360", 8), tmp_path / "frames"
-    whole = extract(video, tmp_path / "whole", EVERY)
-    from gsba.video import extraction
-
-    written, write = [], extraction.write_bytes
-
-    def failing(path: Path, content: bytes) -> None:
-        if len(written) == 7:
-            raise KeyboardInterrupt
-        written.append(path)
-        write(path, content)
-
-    monkeypatch.setattr(extraction, "write_bytes", failing)
-    with pytest.raises(KeyboardInterrupt):
-        extract(video, out, EVERY)
-    monkeypatch.undo()
-    assert extract(video, out, EVERY) == whole
-    again = extract(video, out, VideoSettings(every=4, standing_deg=0), replace=True)
-    assert again.kept == 2
-    for track in ("track0", "track5"):
-        assert sorted(path.name for path in (out / track).iterdir()) == ["000000.jpg", "000004.jpg"]
-
-
-def test_standing_frames_are_left_out(tmp_path: Path) -> None:
-    both = [_tracks(i) for i in (0, 0, 0, 1, 1, 2)]
-    tracks = [([pictures[n] for pictures in both], _steady(6)) for n in (0, 1)]
-    counts = extract(_encode(tmp_path / "v.360", tracks), tmp_path / "f", VideoSettings(every=1))
-    assert counts.dropped["while the camera stood"] == 3
-
-
 def test_files_that_hold_no_cube_map_are_refused(tmp_path: Path) -> None:
     def refused(tracks: list[tuple[list[np.ndarray], list[int]]], why: str) -> None:
         video = _encode(tmp_path / "GS010001.360", tracks)

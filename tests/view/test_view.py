@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 import pytest
 from command import run_gsba
+from pixels import pixel_centres
 from scipy.spatial.transform import Rotation
 from tiny_run import NUM_FRAMES, Case
 
@@ -106,12 +107,10 @@ def test_the_scene_is_placed_as_the_latest_export(run: Path, scene: view.Scene) 
         assert np.allclose(after, PLACED.similarity.points(before.astype(np.float64)), atol=1e-5)
     turned = 2.5**2 * TURN @ scene.splats[0].covariances @ TURN.T
     assert np.allclose(placed.splats[0].covariances, turned, rtol=1e-4, atol=1e-6)
-    assert scene.coarse_T_rigs is not None and placed.coarse_T_rigs is not None
     assert np.allclose(placed.coarse_T_rigs[:, :3, :3], TURN @ scene.coarse_T_rigs[:, :3, :3])
 
 
 def _positions(poses: np.ndarray | None) -> np.ndarray:
-    assert poses is not None
     return poses[:, :3, 3]
 
 
@@ -149,7 +148,7 @@ def test_pictures_are_tinted_where_masks_are(case: Case, tmp_path: Path) -> None
     masked = replace(frames, mask_paths=(tmp_path / "mask.png",) * len(frames))
     plain, tinted = view.faces_of(masked, 0, False), view.faces_of(masked, 0, True)
     assert tuple(plain) == FACES and plain["front"].shape == (128, 128, 3)
-    pixels = np.stack(np.meshgrid(np.arange(128), np.arange(128)), axis=-1) + 0.5
+    pixels = pixel_centres(128, 128)
     for c, name in enumerate(FACES):
         below = np.degrees(np.arcsin(CubeRig(128, np.pi / 2).bearings(pixels, c)[..., 1])) - 22.5
         changed = np.any(plain[name] != tinted[name], axis=-1)
@@ -353,7 +352,6 @@ def test_ctrl_c_ends_it_quietly(run: Path) -> None:
         stderr=subprocess.PIPE,
         text=True,
     )
-    assert process.stdout is not None
     try:
         first = process.stdout.readline()
         assert first.startswith("http://127.0.0.1:") and "Ctrl-C ends it" in first
@@ -371,7 +369,6 @@ def test_distances_to_a_scan_colour_the_points(run: Path, scene: view.Scene) -> 
     try:
         path.write_text(json.dumps({"points": points}))
         judged = view.load_scene(run).judged
-        assert judged is not None
         np.testing.assert_array_equal(judged[0], scene.reconstruction.points_world[[2, 0]])
         assert judged[1][0, 2] > judged[1][0, 0] and judged[1][1, 0] > judged[1][1, 2]
         path.write_text(json.dumps({"points": points | {"of": num + 1}}))
