@@ -8,6 +8,7 @@ that make the inputs, DATA the sequences that they are made of.
 import argparse
 import json
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -132,10 +133,9 @@ def run(row: Row) -> str:
     """Run a command, and a line of the table on it."""
     out = Path("runs", row.name.replace(", ", "-").replace(" ", "-"))
     command = [sys.executable, "-c", "from gsba.cli import main; main()", *map(str, row.command)]
-    again = ["--fresh"] if row.command[0] == "refine" else []
-    done = subprocess.run(
-        [*command, "--out", str(out), *again], capture_output=True, text=True, check=False
-    )
+    shutil.rmtree(out, ignore_errors=True)
+    command += ["--out", str(out)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
     said = [line for line in (done.stderr + done.stdout).splitlines() if line.strip()]
     words = [line for line in said if line.startswith(STARTS)] or said[-1:]
     return f"| {row.name} | {done.returncode} | {_value(row, out)} | {words[0][:300]} |"
@@ -152,7 +152,7 @@ def _value(row: Row, out: Path) -> str:
     truth, found = read_trajectory(row.truth), read_trajectory(out / "trajectory.tum")
     extent = np.linalg.norm(np.ptp(truth.world_T_rigs[:, :3, 3], axis=0))
     ate = evaluate(found, truth).ate.rmse / extent
-    return f"{len(found.timestamps)} frames, ATE {1e3 * ate:.2g}e-3 of the extent"
+    return f"{len(found.timestamps)} frames, ATE {100 * ate:.2g} % of the extent"
 
 
 def main() -> None:

@@ -4,6 +4,7 @@ import json
 import logging
 import os
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
 from contextlib import contextmanager, nullcontext, suppress
@@ -39,6 +40,7 @@ class Follower(Protocol):
 
 
 _followers: list[Follower] = []
+_following = threading.RLock()  # what a follower logs is an event, too
 
 
 def show_log(level: int = logging.INFO) -> None:
@@ -74,8 +76,9 @@ def event(kind: str, **values: object) -> None:
         values: further entries, plain values for JSON.
     """
     entry = {"event": kind, "time": round(time.time(), 3), **values}
-    for follower in _followers:
-        follower.add(entry)
+    with _following:
+        for follower in _followers:
+            follower.add(entry)
     path = os.environ.get(EVENTS)
     if not path:
         return
