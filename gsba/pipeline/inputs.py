@@ -24,6 +24,7 @@ from gsba.log import GsbaError
 from gsba.masks.merging import Choice
 from gsba.odometry.walk import Odometry, write_chosen, write_odometry
 from gsba.placement import EXIF, check, fixes_of_frames, read_fixes
+from gsba.report.time_left import tell_size
 from gsba.store.store import RunStore, fingerprint
 from gsba.trajectory.association import follow_keyframes, without_trajectory
 from gsba.trajectory.conventions import Convention
@@ -33,6 +34,7 @@ from gsba.trajectory.misread import refuse_useless
 from gsba.trajectory.restarts import associate_pieces, split_restarts, without_lost_frames
 from gsba.types import CoarsePoses, FrameSet, Trajectory
 from gsba.video.recording import files_of
+from gsba.video.timeline import track_sizes
 
 logger = logging.getLogger(__name__)
 
@@ -269,6 +271,7 @@ def extract_video(
         chosen = chosen.model_copy(update={"fps": check_fps(fps), "every": None, "at": None})
     found: Odometry | None = None
     if by_odometry is not None:
+        tell_size(settings, None, track_sizes(video_file)[0][0], False)
         found = _follow(store, video_file, settings, by_odometry, calibration, name)
         if found.usable():
             at = store.root / chosen_frames(name)

@@ -44,7 +44,6 @@ from gsba.store.store import RunStore
 from gsba.trajectory.conventions import Convention
 from gsba.trajectory.misread import TurnedAboutForwardError
 from gsba.types import CoarsePoses, FrameSet, Reconstruction, RunStart, VerifiedPairs
-from gsba.video.timeline import track_sizes
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -112,7 +111,6 @@ def refine(
         by_odometry = chosen if inputs.follows(settings.video, fps, odometry, given) else None
         inputs.check_positions(settings)
         with RunStore(out, origin, fresh, title_of=title_of) as store, following(left):
-            tell_size(settings, None, track_sizes(frames)[0][0], False)
             walk = inputs.extract_video(store, frames, settings, fps, by_odometry, calibration)
         frames, timestamps, fps, fresh = out / "frames", None, None, False
     if walk is not None:  # made of these very images: no evidence beside them
