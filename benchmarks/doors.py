@@ -93,6 +93,12 @@ def _images(walk: Path) -> list[Path]:
     return sorted(path for path in (walk / "images").iterdir() if path.suffix.lower() == ".jpg")
 
 
+def _read(path: Path) -> np.ndarray:
+    picture = cv2.imread(str(path))
+    assert picture is not None
+    return picture
+
+
 def _saved(pictures: list[np.ndarray], folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     for n, picture in enumerate(pictures):
@@ -104,13 +110,13 @@ def _rooms(data: Path) -> Path:
     """Places that have nothing in common, but for two neighbours."""
     gallery, flat = _images(data / "gallery_forward"), _images(data / "apartment")
     chosen = [*gallery[:2], _images(data / "aisle_loop")[20], flat[0], flat[7], gallery[24]]
-    pictures = [cv2.resize(cv2.imread(str(path)), (1536, 768)) for path in chosen]
+    pictures = [cv2.resize(_read(path), (1536, 768)) for path in chosen]
     return _saved(pictures, Path("cases/rooms"))
 
 
 def _every(walk: Path, every: int) -> tuple[Path, Path]:
     """Frames of a walk, and a file of their true poses."""
-    frames = _saved([cv2.imread(str(p)) for p in _images(walk)[::every]], Path("cases", walk.name))
+    frames = _saved(list(map(_read, _images(walk)[::every])), Path("cases", walk.name))
     poses = read_trajectory(walk / "groundtruth.tum").world_T_rigs[::every]
     file = Path("cases", f"{walk.name}.tum")
     write_tum(file, Trajectory(np.arange(len(poses), dtype=np.float64), poses))
@@ -121,7 +127,7 @@ def _faces(data: Path) -> Path:
     """Nine panoramas of a real flat as large cube faces."""
     folder, rig = Path("cases/faces"), CubeRig(2048, np.pi / 2)
     for path in _images(data / "apartment")[:9]:
-        for name, face in zip(FACES, cut(cv2.imread(str(path)), rig), strict=True):
+        for name, face in zip(FACES, cut(_read(path), rig), strict=True):
             (folder / name).mkdir(parents=True, exist_ok=True)
             cv2.imwrite(str(folder / name / f"{path.stem}.jpg"), face)
     times = [f"{path.stem}.jpg,{n}" for n, path in enumerate(_images(data / "apartment")[:9])]
