@@ -276,7 +276,8 @@ class _Tests:
         false, doubt, level = self.figures.false_steps, "", Level.LOOK
         if false > MAX_FALSE_SHARE * num:
             doubt = f", though images contradict it at {false} others"
-        if len(held) > (MAX_DOUBTED_SHARE if doubt else MAX_HELD_SHARE) * num:
+        most_false = false > 0.5 * (num - len(held))  # of the steps that images show
+        if most_false or len(held) > (MAX_DOUBTED_SHARE if doubt else MAX_HELD_SHARE) * num:
             level = Level.REFUSED
         cause = (
             f"no image shows {len(held)} of {num} steps: there the {self._start} is believed as it "

@@ -73,6 +73,13 @@ def test_lengths_are_metres_where_the_scale_is_known_and_the_camera_is_named() -
             None,
             "though images contradict it at 3 others",
         ),
+        ({"held_steps": (3,), "false_steps": 9}, Level.LOOK, None, "contradict it at 9 others"),
+        (
+            {"held_steps": (3,), "false_steps": 10},
+            Level.REFUSED,
+            None,
+            "contradict it at 10 others",
+        ),
         ({"unrefined": (5, 6)}, Level.LOOK, "005 006", "the pose is that of the odometry"),
         (
             LOOSE,
