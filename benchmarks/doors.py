@@ -1,5 +1,5 @@
-"""Inputs that are not what they seem: exit code and last words of each command, and what came out
-beside the truth.
+"""Inputs that are not what they seem: exit code and message of each command, and the error of its
+result.
 
 `python benchmarks/doors.py MAKERS DATA --folder SCRATCH --markdown TABLE`: MAKERS holds the scripts
 that make the inputs, DATA the sequences that they are made of.
@@ -36,7 +36,8 @@ GPS = ("gps_good", "gps_null5", "gps_null10", "gps_stale6", "gps_stale8", "gpx_n
 GPS += ("gpx_dup_times",)
 NOON = 1782907200  # seconds, the first time of the makers' GPX files; frames begin at 0
 STARTS = "good to train", "look at", "do not train", "error: "  # of the line that is shown
-TRUE_SCALE = 54.12  # metres in a unit of the made GPS positions' run
+METRES = 20.0  # in a unit of the true poses, by the makers' GPS positions
+TRUTH = Path("small/groundtruth.tum")
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +51,7 @@ class Row:
 
 def rows(data: Path) -> Iterator[Row]:
     """The commands of all inputs, in a folder that holds them."""
-    small, slam, truth = Path("small/images"), Path("small/slam.tum"), Path("small/groundtruth.tum")
+    small, slam, truth = Path("small/images"), Path("small/slam.tum"), TRUTH
     _date(small)
     yield Row("right", ("refine", small, slam), truth)
     for name in TRAJECTORIES:
@@ -81,9 +82,11 @@ def rows(data: Path) -> Iterator[Row]:
     yield Row("faces of 2048", ("refine", _faces(data)))
 
 
-def _date(folder: Path) -> Path:
-    """The folder, with times of a frame a second."""
-    names = sorted(path.name for path in folder.iterdir() if path.suffix in (".jpg", ".png"))
+def _date(folder: Path, frames: Path | None = None) -> Path:
+    """The folder, with times of a frame a second; named as the images in `frames`, by default its
+    own."""
+    images = (frames or folder).iterdir()
+    names = sorted(path.name for path in images if path.suffix in (".jpg", ".png"))
     lines = [f"{name},{n}" for n, name in enumerate(names)]
     (folder / "timestamps.csv").write_text("\n".join(["name,timestamp", *lines, ""]))
     return folder
@@ -130,9 +133,7 @@ def _faces(data: Path) -> Path:
         for name, face in zip(FACES, cut(_read(path), rig), strict=True):
             (folder / name).mkdir(parents=True, exist_ok=True)
             cv2.imwrite(str(folder / name / f"{path.stem}.jpg"), face)
-    times = [f"{path.stem}.jpg,{n}" for n, path in enumerate(_images(data / "apartment")[:9])]
-    (folder / "timestamps.csv").write_text("\n".join(["name,timestamp", *times, ""]))
-    return folder
+    return _date(folder, folder / FACES[0])
 
 
 def run(row: Row) -> str:
@@ -148,11 +149,13 @@ def run(row: Row) -> str:
 
 
 def _value(row: Row, out: Path) -> str:
-    """What came out, beside the truth."""
+    """Scale of an exported world, or error of the refined positions, where the truth is known."""
     if row.command[0] == "export":
         file = out / "transform.json"
         scale = json.loads(file.read_text())["scale"] if file.exists() else None
-        return f"scale {scale:.1f}, true {TRUE_SCALE:.1f}" if scale else ""
+        run = read_trajectory(Path("runs/right/trajectory.tum"))
+        true = METRES * evaluate(run, read_trajectory(TRUTH)).scale
+        return f"scale {scale:.1f}, true {true:.1f}" if scale else ""
     if row.truth is None or not (out / "trajectory.tum").exists():
         return ""
     truth, found = read_trajectory(row.truth), read_trajectory(out / "trajectory.tum")

@@ -48,13 +48,13 @@ def load_grey(frames: FrameSet, frame: int, width: int) -> tuple[np.ndarray, np.
     faces = np.zeros((len(FACES), size, size), np.uint8)
     present = [FACES.index(name) for name in kind.faces]
     faces[present] = load_faces(frames, frame, gray=True, size=size)
-    native = 4 * size
-    maps, owners = _erp_maps(size, native)
+    joined = 4 * size
+    maps, owners = _erp_maps(size, joined)
     atlas = np.block([[left, right] for left, right in _padded(faces).reshape(3, 2, *_shape(size))])
     grey = cv2.remap(atlas, maps[0], maps[1], cv2.INTER_CUBIC)
     usable = np.isin(owners, present)
     if mask is not None:
-        usable &= fit_mask(mask, native)
+        usable &= fit_mask(mask, joined)
     whole = bool(usable.all())
     return fitted_to(grey, width), None if whole else fit_mask(usable, width)
 

@@ -274,7 +274,7 @@ def extract_video(
         tell_size(settings, None, track_sizes(video_file)[0][0], False)
         found = _follow(store, video_file, settings, by_odometry, calibration, name)
         if found.usable():
-            at = store.root / chosen_frames(name)
+            at = _choose_frames(store, found, settings, name)
             chosen = chosen.model_copy(update={"at": str(at), "sharpest": False})
         else:
             times = found.timestamps
@@ -287,11 +287,6 @@ def extract_video(
     return found
 
 
-def chosen_frames(name: str = "") -> Path:
-    """File in a run's folder of the frames that the odometry of a recording has chosen."""
-    return CHOSEN.parent / name / CHOSEN.name
-
-
 def _follow(
     store: RunStore,
     video_file: Path,
@@ -300,7 +295,7 @@ def _follow(
     calibration: Path | None,
     name: str,
 ) -> Odometry:
-    """Odometry of a video; if it is usable, written to the run's folder with the chosen frames."""
+    """Odometry of a video."""
     start, end = settings.video.from_s, settings.video.to_s
     width, seed = settings.odometry.width, settings.seed
     stage = f"odometry@{name}" if name else "odometry"
@@ -316,15 +311,18 @@ def _follow(
 
     files = fingerprint([*files_of(video_file), calibration, masks.given])
     key = [width, seed, (start, end), masks.carrier, files]
-    found = store.stage(stage, key, compute, Odometry)
-    if not found.usable():
-        return found
+    return store.stage(stage, key, compute, Odometry)
+
+
+def _choose_frames(store: RunStore, found: Odometry, settings: RefineSettings, name: str) -> Path:
+    """Write the odometry of a video to the run's folder, and the frames that are chosen by it to
+    the file that is returned."""
     rows = odometry.choose_frames(found, settings.odometry)
     logger.info("%d of %d frames chosen by what they show", len(rows), len(found))
-    at = store.root / chosen_frames(name)
-    folder = at.parent
+    folder = store.root / CHOSEN.parent / name
     names = "walk.tum", "keyframes.tum", "poses.csv", "odometry.json"
     write_odometry(found, *(folder / name for name in names))
+    at = folder / CHOSEN.name
     write_chosen(found, rows, at)
     store.claim(folder)
-    return found
+    return at
