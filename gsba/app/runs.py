@@ -23,6 +23,7 @@ T = TypeVar("T")
 _MAX_POINTS = 4000  # of a map from above
 _NO_MAP: dict[str, Any] = {"stage": "", "path": [], "points": [], "colors": None, "starts": []}
 _POSES, _POINTS, _COLORS = "world_T_rigs", "points_world", "point_colors"
+_MAPS, _OBSERVED, _OBSERVERS = "components", "observation_points", "observation_frames"
 _LEVELS = {"good to train": "good", "look at these places": "look", "do not train": "stop"}
 _FILES = ("report.html", "trajectory.tum", "points.ply", "poses.csv", "config.toml")
 
@@ -42,6 +43,9 @@ def overview(run: Path) -> dict[str, Any]:
         "notes": report.get("notes", []),
         "camera": report.get("camera"),
         "verdict": _verdict(report),
+        "map_sizes": [
+            one.get("frames") for one in report.get("maps") or () if isinstance(one, dict)
+        ],
         "recordings": [
             str(one["name"])
             for one in report.get("recordings") or ()
@@ -63,7 +67,8 @@ def brief_facts(run: Path) -> dict[str, str]:
 
 
 def _verdict(report: dict[str, Any]) -> dict[str, Any] | None:
-    """Verdict of a report: "level" (good, look or stop), "sentence" and "reasons"; None = none."""
+    """Verdict of a report: "level" (good, look or stop), "sentence", "reasons" (lines) and names of
+    the frames to leave out; None = none."""
     found = report.get("verdict")
     if not isinstance(found, dict) or not found.get("sentence"):
         return None
@@ -73,6 +78,9 @@ def _verdict(report: dict[str, Any]) -> dict[str, Any] | None:
         "level": _LEVELS.get(level, level if level in _LEVELS.values() else "look"),
         "sentence": str(found["sentence"]).removeprefix(f"{level}: "),
         "reasons": [str(one["line"]) for one in reasons if "line" in one],
+        "doubted": sorted(
+            {name for one in reasons if one.get("leave_out") for name in one["frames"]}
+        ),
     }
 
 
@@ -99,9 +107,9 @@ def map_so_far(run: Path, progress: Progress) -> dict[str, Any]:
     left out.
 
     Returns:
-        "stage", name of the stage or "odometry", "" where there is nothing; "path" (F, 2) and
-        "points" (P, 2) in two level axes, "colors" (P, 3) or None, "starts", the
-        rows at which a map of its own begins.
+        "stage", name of the stage or "odometry", "" where there is nothing; "path" (F, 2), None
+        where a frame is not in the largest map, and "points" (P, 2) in two level axes, "colors"
+        (P, 3) or None, "starts", the rows at which a map of its own begins.
     """
     names = progress.names()[::-1]
     if RECONSTRUCTION in names:  # the stage after it has the same poses, without colours
@@ -129,13 +137,21 @@ def _map_of_stage(run: Path, name: str) -> dict[str, Any] | None:
     """The map that a stage has stored, from above; None = it has stored none."""
     path = run / STAGES / f"{name}.npz"
     try:
-        arrays = load_arrays(path, (_POSES, _POINTS, _COLORS)) if path.is_file() else {}
+        names = (_POSES, _POINTS, _COLORS, _MAPS, _OBSERVED, _OBSERVERS)
+        arrays = load_arrays(path, names) if path.is_file() else {}
     except (RecordError, OSError):
         return None
     if _POSES not in arrays or arrays[_POSES].shape[1:] != (4, 4) or _POINTS not in arrays:
         return None
-    at, (axes, _) = arrays[_POSES][:, :3, 3], viewing_axes(arrays[_POSES])
-    return {"stage": name} | _plan(at, arrays[_POINTS], axes, arrays.get(_COLORS), [0])
+    poses, points, colors = arrays[_POSES], arrays[_POINTS], arrays.get(_COLORS)
+    at = poses[:, :3, 3]
+    if len(maps := arrays.get(_MAPS, ())) == len(at):  # other maps have worlds of their own
+        inside = np.equal(maps, 0)
+        at = np.where(inside[:, None], at, np.nan)
+        seen = np.unique(arrays[_OBSERVED][inside[arrays[_OBSERVERS]]])
+        poses, points = poses[inside], points[seen]
+        colors = None if colors is None else colors[seen]
+    return {"stage": name} | _plan(at, points, viewing_axes(poses)[0], colors, [0])
 
 
 def _plan(
@@ -152,10 +168,10 @@ def _plan(
     rows = np.unique(np.linspace(0, len(points) - 1, min(len(points), _MAX_POINTS)).astype(int))
     shown = (points[rows] - centre) @ axes.T if len(points) else np.zeros((0, 3))
     near = np.all(np.abs(shown) < 2 * extent, axis=1)  # NaN is not
-    path = np.where(finite[:, None], (at - centre) @ axes.T, 0.0)
     digits = max(0, 4 - int(np.floor(np.log10(extent))))
+    path = ((at - centre) @ axes.T)[:, :2].round(digits).tolist()
     return {
-        "path": path[:, :2].round(digits).tolist(),
+        "path": [one if known else None for one, known in zip(path, finite.tolist(), strict=True)],
         "points": shown[near, :2].round(digits).tolist(),
         "colors": colors[rows][near].tolist() if colors is not None and len(points) else None,
         "starts": starts,

@@ -1,6 +1,7 @@
 """Commands on finished runs: `export`, `evaluate`."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -86,6 +87,14 @@ MapNumber = Annotated[
         "--map",
         help="Number of the map to export, as in the run's report; 1: the largest.",
         metavar="NUMBER",
+    ),
+]
+Without = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="Frame to leave out; doubted: those that the run's verdict says to leave out. "
+        "Repeatable.",
+        metavar="NAME",
     ),
 ]
 Target = Annotated[
@@ -180,6 +189,7 @@ def export(
     pairs: Pairs = None,
     link: Link = False,
     map_number: MapNumber = 1,
+    without: Without = None,
     photos: Located = None,
     exposure_ms: Exposure = None,
     split: HoldOut = None,
@@ -215,6 +225,7 @@ def export(
         options,
         placement=placed,
         lenses=lenses,
+        without=_left_out(run, frames, without or ()),
         photos=read_photos(photos, run),
         shutter=shutter_of(run, exposure_ms),
         split=split,
@@ -264,6 +275,22 @@ def cameras_of(
     if not cameras and images in ("lenses", "fisheye"):
         raise GsbaError(f"{run}: the run has one centre: export it without --images {images}")
     return seen_by(images, frames, cameras)
+
+
+def _left_out(run: Path, frames: "FrameSet", names: Sequence[str]) -> tuple[str, ...]:
+    """Names of frames to leave out, with those that the verdict says to leave out for `doubted`."""
+    out = [name for name in names if name != "doubted"]
+    if "doubted" in names:
+        try:
+            report = json.loads((run / "report.json").read_text(encoding="utf-8"))
+            reasons = report["verdict"]["reasons"]
+            doubted = {name for one in reasons if one["leave_out"] for name in one["frames"]}
+        except (OSError, ValueError, KeyError, TypeError):
+            raise GsbaError(
+                f"{run}: its report names no frames to leave out: name them with --without NAME"
+            ) from None
+        out += [name for name in frames.names if name in doubted]
+    return tuple(out)
 
 
 def _baseline(run: Path, millimetres: float | None) -> tuple[float, float] | None:

@@ -105,6 +105,7 @@ class ExportOptions:
     images: str = "auto"  # the setting `export.images`
     map_number: int = 1  # 1 = the largest map
     fetched: bool = False  # with the frames that were added where the map was weak
+    without: tuple[str, ...] = ()  # names of frames to leave out
     shutter: Shutter = UNKNOWN  # for trainers that model blur and rolling rows
     photos: Photos = NO_PHOTOS  # localised photos, as cameras of their own
     split: bool | None = None  # hold panoramas out of the training, in formats of trainers; None =

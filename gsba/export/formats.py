@@ -17,7 +17,7 @@ from gsba.export.folder import output_folder
 from gsba.export.images import has_masks, write_pictures
 from gsba.export.pictures import FrameWriter
 from gsba.export.split import require_held_out
-from gsba.log import GsbaError
+from gsba.log import GsbaError, brief
 from gsba.placement.placement import Placement
 from gsba.similarity import Sim3
 from gsba.store.finished import cameras_of_map, one_map
@@ -90,8 +90,8 @@ def export_all(
     cameras = Cameras.of(options.lenses, frames)
     reconstruction, frames = one_map(whole, frames, map_number, "the reconstruction")
     cameras = cameras_of_map(cameras, whole, map_number)
-    if not options.fetched and any(frames.fetched):
-        rows = frames.chosen()
+    rows = _exported_rows(frames, options)
+    if len(rows) < len(frames):
         reconstruction, frames = reconstruction.taken(rows), frames.taken(rows)
         cameras = cameras.taken(rows)
     if options.split:
@@ -126,6 +126,18 @@ def export_all(
     for to, out in outs.items():
         num_points = len(reconstruction.points_world)
         logger.info("%s: %d frames, %d points, in %s", to, len(frames), num_points, out)
+
+
+def _exported_rows(frames: FrameSet, options: ExportOptions) -> np.ndarray:
+    """Frames (F',) int64 of a map that an export holds."""
+    for name in options.without:
+        if name not in frames.names:
+            raise GsbaError(f"there is no frame {brief(name)} in the map to leave out")
+    rows = np.arange(len(frames)) if options.fetched else frames.chosen()
+    kept = [row for row in rows.tolist() if frames.names[row] not in options.without]
+    if not kept:
+        raise GsbaError("no frame is left to export: leave out fewer")
+    return np.array(kept, np.int64)
 
 
 def _write_dataset(

@@ -1,5 +1,6 @@
 """Maps of a run in its report; each has its own world, and the largest one is exported."""
 
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -81,8 +82,12 @@ def format_outcome(report: Mapping[str, Any], run: object) -> str:
         found = f"{summary['points']} points, median residual {residual:.4f} deg"
     first = f"{format_frame_counts(report)}, {found}: {run}"
     verdict, table = report["verdict"], _table(maps) if len(maps) > 1 else []
-    reasons = [f"- {one['line']}" for one in verdict["reasons"][:5]]
-    more = len(verdict["reasons"]) - len(reasons)
+    shown, reasons = verdict["reasons"][:5], list[str]()
+    for one in shown:
+        reasons += [f"- {one['line']}"]
+        if one["command"]:
+            reasons += ["  " + one["command"].replace("RUN", shlex.quote(str(run)))]
+    more = len(verdict["reasons"]) - len(shown)
     reasons += [f"- {more} more in report.html"] if more > 0 else []
     return "\n".join([first, *table, *reasons, verdict["sentence"]])
 

@@ -92,11 +92,12 @@ def measure(report: Mapping[str, Any], main: Reconstruction, shown: FrameSet) ->
 
 
 def _position_error(main: Reconstruction) -> float:
-    """Length, map units, by which no position is further off in 19 of 20 maps."""
+    """Length, map units, by which no refined position is further off in 19 of 20 maps."""
     if main.joint_errors is None:
         return math.nan
     errors = position_errors(main.world_T_rigs, main.joint_errors.draws)
-    errors = errors[:, np.isfinite(errors).all(axis=0)]
+    refined = main.pose_statuses == PoseStatus.REFINED  # others are a reason of their own
+    errors = errors[:, refined & np.isfinite(errors).all(axis=0)]
     if not errors.size:
         return math.nan
     return _ERROR_RATIO * float(np.quantile(errors.max(axis=1), 0.95))
@@ -142,6 +143,8 @@ MAX_DOUBTED_SHARE = 0.25  # of the steps, by a start that images contradict else
 MAX_UNMATCHED_SHARE = 0.25  # of a run's steps, where frames are missing and no start is given
 MAX_FALSE_SHARE = 0.1  # of the start's steps; above it the others are in doubt, too
 _MAX_NAMED_FRAMES = 6  # of a reason, in a line of text
+_LOOK_AROUND = "gsba view RUN"
+_WITHOUT_DOUBTED = "gsba export RUN --to colmap --without doubted"
 
 
 class Level(StrEnum):
@@ -160,13 +163,19 @@ class Reason:
     frames: tuple[str, ...]  # names of the frames that it holds for; () = the whole map
     cause: str
     remedy: str  # what to do
+    leave_out: bool = False  # `gsba export --without doubted` leaves the frames out
+    command: str = ""  # that does what can be done now, of the run's folder RUN; "" = none
 
-    def line(self) -> str:
-        """Place, cause and remedy in a line."""
+    def placed_cause(self) -> str:
+        """Place and cause in a line."""
         place = f"{', '.join(self.frames)}: " if self.frames else ""
         if len(self.frames) > _MAX_NAMED_FRAMES:
             place = f"{self.frames[0]} to {self.frames[-1]} ({len(self.frames)} frames): "
-        return f"{place}{self.cause}; {self.remedy}"
+        return place + self.cause
+
+    def line(self) -> str:
+        """Place, cause and remedy in a line."""
+        return f"{self.placed_cause()}; {self.remedy}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,8 +216,8 @@ def verdict_on(figures: Figures, report: Mapping[str, Any], names: Sequence[str]
     if figures.exported < figures.frames:
         parts = [f"{figures.exported} of {figures.frames} frames are in the map"]
     # Where a step is in doubt, covariances do not tell how far the map is off.
-    doubted = [one.cause for one in reasons if one.level == Level.REFUSED or one.frames]
-    parts += [reasons[0].cause] if doubted else [_accuracy(figures)]
+    doubted = any(one.level == Level.REFUSED or one.frames for one in reasons)
+    parts += [reasons[0].placed_cause()] if doubted else [_accuracy(figures)]
     parts += [_camera(report)] if level != Level.REFUSED else []
     return Verdict(level, f"{level}: {'; '.join(filter(None, parts))}", reasons, figures)
 
@@ -245,20 +254,21 @@ class _Tests:
             return
         inside = {*self.names, *self.report["frame_lists"].get("fetched", ())}
         out = tuple(row["name"] for row in self.report["frames"] if row["name"] not in inside)
-        why = next((one["reason"] for one in self.report["maps"][1:] if one["reason"]), "")
+        level = Level.REFUSED if exported < MIN_SHARE_OF_A_MAP * num else Level.LOOK
         cause = f"no matches tie {len(out)} of {num} frames to the exported map"
         remedy = "film the way between without a pause next time, and slowly through doors"
-        if len(self.report["maps"]) > 1:
-            remedy = f"gsba export RUN --map 2 exports the next map; {remedy}"
-        level = Level.REFUSED if exported < MIN_SHARE_OF_A_MAP * num else Level.LOOK
+        command = "gsba export RUN --to colmap --map 2" if len(self.report["maps"]) > 1 else ""
         unmatched = self.figures.unmatched_steps
         if unmatched > MAX_UNMATCHED_SHARE * (num - 1):
-            level = Level.REFUSED
-            cause += (
-                f", {unmatched} of {num - 1} neighbours do not match: frames are so far apart that "
-                "those of the map may have matched what only looks alike"
+            doubt = (
+                f"{unmatched} of {num - 1} neighbours do not match: frames so far apart may have "
+                "matched what only looks alike"
             )
-        yield Reason(level, out, f"{cause} ({why})" if why else cause, remedy)
+            yield Reason(Level.REFUSED, (), doubt, "give frames closer together")
+            command = ""  # the next map is in doubt, too
+        elif command:
+            remedy = f"export the next map; {remedy}"
+        yield Reason(level, out, cause, remedy, command=command)
 
     def _unrefined(self) -> Iterator[Reason]:
         """Frames that images do not constrain."""
@@ -266,7 +276,8 @@ class _Tests:
         if rows:
             cause = f"hardly any matches: the pose is that of the {self._start}"
             remedy = "leave these frames out of the training, or give sharper ones"
-            yield Reason(Level.LOOK, tuple(self.names[f] for f in rows), cause, remedy)
+            frames = tuple(self.names[f] for f in rows)
+            yield Reason(Level.LOOK, frames, cause, remedy, True, _WITHOUT_DOUBTED)
 
     def _held(self) -> Iterator[Reason]:
         """Steps that no image shows."""
@@ -279,15 +290,26 @@ class _Tests:
         most_false = false > 0.5 * (num - len(held))  # of the steps that images show
         if most_false or len(held) > (MAX_DOUBTED_SHARE if doubt else MAX_HELD_SHARE) * num:
             level = Level.REFUSED
+        if level == Level.LOOK:
+            held = tuple(step for step in held if not self._is_of_unrefined(step))
+            if not held:
+                return
         cause = (
             f"no image shows {len(held)} of {num} steps: there the {self._start} is believed as it "
             f"is{doubt}"
         )
         remedy = (
-            "compare both sides of the place in gsba view RUN; next time walk slower there, with "
-            "more light, or give frames closer together"
+            "compare both sides of the place; next time walk slower there, with more light, or "
+            "give frames closer together"
         )
-        yield Reason(level, self._ends(held), cause, remedy)
+        yield Reason(level, self._ends(held), cause, remedy, command=_LOOK_AROUND)
+
+    def _is_of_unrefined(self, step: int) -> bool:
+        """True if a step ends at an unrefined frame, a reason of its own, and points that are seen
+        from both sides of it hand the scale on."""
+        moved = self.figures.moved_by_scale[step : step + 1]
+        at_one = step in self.figures.unrefined or step + 1 in self.figures.unrefined
+        return at_one and all(0 <= part <= MAX_POSITION_ERROR / 2 for part in moved)
 
     def _loosely_scaled(self) -> Iterator[Reason]:
         """Steps over which the scale is not carried on."""
@@ -306,7 +328,8 @@ class _Tests:
             "give frames closer together there (of a video leave --fps out), walk slowly through "
             "doors, and come back to places where you were"
         )
-        yield Reason(Level.LOOK, self._ends(loose.tolist()), cause, remedy)
+        ends = self._ends(loose.tolist())
+        yield Reason(Level.LOOK, ends, cause, remedy, command=_LOOK_AROUND)
 
     def _uncertain(self) -> Iterator[Reason]:
         """Positions that the images hold too loosely."""
@@ -329,7 +352,7 @@ class _Tests:
                 "look for things that move, and mask them (--masks distractors); leave these "
                 "frames out of the training"
             )
-            yield Reason(level, self._ends(wrong), cause, remedy)
+            yield Reason(level, self._ends(wrong), cause, remedy, True, _WITHOUT_DOUBTED)
 
     def _ends(self, steps: Sequence[int]) -> tuple[str, ...]:
         """Names of the frames at both ends of steps, in order."""

@@ -401,6 +401,36 @@ def test_the_command_is_of_the_newest_values_though_an_older_answer_comes_last(
     assert "--out later" in page.locator("#command").text_content()
 
 
+def test_a_dataset_is_of_the_chosen_map_and_goes_without_frames_in_doubt(
+    browser: Any, server: Server
+) -> None:
+    """The buttons of trainers ask for what is chosen above them."""
+    summary = {"frames": 9, "refined": 5, "exported": 5, "points": 50, "maps": 2, "seconds": 3.0}
+    summary |= {"median_residual_deg": 0.01, "median_residual_deg_coarse": 0.1}
+    reason = {"line": "000003: hardly any matches", "leave_out": True, "frames": ["000003"]}
+    verdict = {"level": "look at these places", "sentence": "some", "reasons": [reason]}
+    report = {"summary": summary, "verdict": verdict, "maps": [{"frames": 5}, {"frames": 3}]}
+    (server.root / "doubted").mkdir()
+    (server.root / "doubted/report.json").write_text(json.dumps(report))
+    page = opened(browser, f"{server.address}#run/doubted", DESK)
+    asked: list[Any] = []
+
+    def refused(route: Any) -> None:
+        asked.append(route.request.post_data_json["values"])
+        route.fulfill(status=400, json={"error": f"{len(asked)} heard"})
+
+    page.route("**/api/add", refused)
+    box, maps = page.get_by_label("Leave out frames in doubt"), page.locator("#map-number")
+    acts = (lambda: None, box.uncheck, lambda: maps.select_option("2: 3 frames"))
+    for number, act in enumerate(acts, start=1):
+        act()
+        page.get_by_role("button", name="Postshot").click()
+        page.get_by_text(f"{number} heard").wait_for()
+    plain = {"run": "doubted", "to": "postshot", "up": "auto"}
+    assert asked == [plain | {"without": ["doubted"]}, plain, plain | {"map_number": "2"}]
+    assert fits(page)
+
+
 def test_what_cannot_be_refined_is_said_in_one_line(browser: Any, server: Server) -> None:
     (server.root / "broken.mp4").write_bytes(b"no video")
     page = opened(browser, server.address, PHONE)

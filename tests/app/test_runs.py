@@ -4,9 +4,13 @@ import json
 from pathlib import Path
 from typing import Any
 
+import export_scene as scene
+import numpy as np
 import pytest
+from observing import observing
 
 from gsba.pipeline.stage_titles import LENS_CENTRES, READOUTS, RECONSTRUCTION, is_one_of, title_of
+from gsba.store.records import save_record
 from tests.tiny_run import Case
 
 pytest.importorskip("starlette")
@@ -67,10 +71,25 @@ def test_the_verdict_is_that_of_the_report(
     report = {"summary": summary, "verdict": verdict}
     (tmp_path / "report.json").write_text(json.dumps(report))
     shown = overview(tmp_path)["verdict"]
-    assert shown == {"level": level, "sentence": sentence, "reasons": reasons}
+    assert shown == {"level": level, "sentence": sentence, "reasons": reasons, "doubted": []}
     apart = "1 with the pose of the trajectory file, 1 more strengthened the map, and datasets skip"
     counts = f"8 of 9 frames refined ({apart} them)"
     assert brief_facts(tmp_path) == {"verdict": level, "refined": counts}
     for nothing in ({}, {"level": "good"}, None, "good", []):
         (tmp_path / "report.json").write_text(json.dumps(report | {"verdict": nothing}))
         assert overview(tmp_path)["verdict"] is None
+
+
+def test_the_map_from_above_has_places_and_points_of_the_largest_map_alone(tmp_path: Path) -> None:
+    from gsba.app.runs import finished_map
+
+    whole = scene.reconstruction()
+    maps = np.array([0, 0, 1, -1, 0, 0, 1, 0, 0], np.int32)
+    seen = maps[whole.observation_points] == maps[whole.observation_frames]
+    at = whole.world_T_rigs[:, :3, 3]
+    result = observing(whole, seen, components=maps, points_world=at)
+    (tmp_path / "stages").mkdir()
+    save_record(tmp_path / "stages" / "reconstruction.npz", result, {})
+    found = finished_map(tmp_path)
+    assert [place is not None for place in found["path"]] == (maps == 0).tolist()
+    assert len(found["points"]) == len(found["colors"]) == np.count_nonzero(maps == 0)

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 from pathlib import Path
 
 import cv2
@@ -126,7 +127,7 @@ def test_what_is_counted_is_what_is_exported(
         ["2", str(OTHERS), str(OTHERS - 1)],
     ]
     *reasons, verdict = result.stdout.splitlines()[4:]
-    assert any("gsba export RUN --map 2" in line for line in reasons)
+    assert f"  gsba export {out} --to colmap --map 2" in reasons
     assert verdict.startswith(f"look at these places: {NUM_FRAMES} of {len(NAMES)} frames are in")
     assert "exit code 3; --allow-partial makes it 0" in result.stderr
     report = _report(out)
@@ -168,6 +169,37 @@ def test_each_map_is_exported_on_request(two_places: tuple[Path, Result], tmp_pa
     export(whole, frames, tmp_path / "largest", ExportFormat.TUM)
     largest = read_trajectory(tmp_path / "largest/trajectory.tum")
     assert len(largest.timestamps) == NUM_FRAMES
+
+
+def test_an_export_goes_without_frames_by_name_and_without_doubted_ones(
+    two_places: tuple[Path, Result], tmp_path: Path
+) -> None:
+    run, out = tmp_path / "run", tmp_path / "tum"
+    shutil.copytree(two_places[0], run)
+
+    def exported(*names: str) -> Result:
+        words = [word for name in names for word in ("--without", name)]
+        return _gsba("export", run, "--to", "tum", "--out", out, *words)
+
+    def number() -> int:
+        return len(read_trajectory(out / "trajectory.tum").timestamps)
+
+    assert exported(*NAMES[:2]).exit_code == 0 and number() == NUM_FRAMES - 2
+    report = _report(run)
+    reasons = [{"leave_out": True, "frames": NAMES[:1]}, {"leave_out": True, "frames": NAMES[-1:]}]
+    report["verdict"]["reasons"] = [*reasons, {"leave_out": False, "frames": NAMES[1:3]}]
+    (run / "report.json").write_text(json.dumps(report))
+    assert exported("doubted", NAMES[1]).exit_code == 0 and number() == NUM_FRAMES - 2
+    everything = _gsba("export", run, "--to", "tum", "--without", "doubted", "--map", "2")
+    assert everything.exit_code == 0
+    other = read_trajectory(run / "tum-map2/trajectory.tum")
+    assert len(other.timestamps) == OTHERS - 1
+    strange = exported(NAMES[-1])  # of the other map
+    assert strange.exit_code == 1 and number() == NUM_FRAMES - 2
+    assert strange.stderr == f"error: there is no frame {NAMES[-1]} in the map to leave out\n"
+    assert "no frame is left to export" in exported(*NAMES[:NUM_FRAMES]).stderr
+    (run / "report.json").unlink()
+    assert "its report names no frames to leave out" in exported("doubted").stderr
 
 
 @pytest.mark.parametrize("number", ["0", "3", "-1"])

@@ -30,6 +30,8 @@ globalThis.document = {
   createElement: tag => element(tag), createElementNS: (_, tag) => element(tag),
 };
 globalThis.window = { devicePixelRatio: 2, addEventListener() {} };
+globalThis.location = { protocol: "file:", pathname: "/runs/a%20walk/report.html" };
+globalThis.getSelection = () => ({ selectAllChildren() {} });
 globalThis.innerWidth = 800; globalThis.innerHeight = 600;
 globalThis.getComputedStyle = () => ({ getPropertyValue: () => "#336699" });
 globalThis.matchMedia = () => ({ matches: true, addEventListener() {} });

@@ -388,6 +388,12 @@ def test_browser_shows_it(page: Path) -> None:
         assert tab.evaluate("document.documentElement.dataset.theme") == "dark"
         assert tab.evaluate("document.documentElement.scrollWidth <= innerWidth")
         assert tab.locator("#verdict .chip").count() == tab.locator(".chip img").count() == 3
+        code = tab.locator("#verdict code").first
+        assert code.inner_text() == f"gsba export {page.parent} --to colmap --without doubted"
+        tab.locator("#verdict .command button").first.click()
+        tab.wait_for_timeout(50)
+        copied = tab.locator("#verdict button", has_text="Copied").count()
+        assert copied or tab.evaluate("getSelection().toString()") == code.inner_text()
         tab.locator("footer a", has_text="gauge").click()
         assert tab.evaluate("document.querySelector(':target').textContent") == "gauge"
         chart = tab.locator("#top")

@@ -68,12 +68,13 @@ def test_the_summary_counts_the_exported_map_alone(tmp_path: Path) -> None:
 def test_the_outcome_says_frames_in_other_maps_first(tmp_path: Path) -> None:
     text = format_outcome(_report(tmp_path, _in_maps(), ("", "too few matches")), "out")
     first, header, *rows = text.splitlines()[:4]
-    *reasons, verdict = text.splitlines()[4:]
+    reason, command, *reasons, verdict = text.splitlines()[4:]
     held = "1 with the pose of the trajectory file"
     assert first.startswith(f"4 of 9 frames refined ({held}, 2 in another map, 2 in no map), 5 poi")
     assert first.endswith(": out")
-    assert [line.count("frame_000") for line in reasons] == [4, 1, 3]
-    assert "(too few matches); gsba export RUN --map 2" in reasons[0]
+    assert reason.count("frame_000") == 4
+    assert command == "  gsba export out --to colmap --map 2"
+    assert [line.count("frame_000") for line in reasons] == [1, 0, 3, 0]
     assert verdict.startswith("look at these places: 5 of 9 frames are in the map")
     assert header.split()[:5] == ["map", "frames", "steps", "points", "extent"]
     assert rows[0].split()[:4] == ["1", "5", "2", "5"] and len(rows) == 2

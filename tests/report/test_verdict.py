@@ -121,8 +121,8 @@ def test_frames_that_are_not_exported_are_named(inside: int, level: Level) -> No
     found = _verdict(figures, NAMES[:inside], maps=maps)
     (reason,) = found.reasons
     assert (found.level, reason.frames) == (level, NAMES[inside:])
-    assert f"tie {NUM - inside} of 20 frames to the exported map (too few matches)" in reason.cause
-    assert "gsba export RUN --map 2" in reason.remedy
+    assert f"tie {NUM - inside} of 20 frames to the exported map" in reason.cause
+    assert reason.command == "gsba export RUN --to colmap --map 2"
     assert f"{inside} of 20 frames are in the map" in found.sentence
 
 
@@ -139,6 +139,22 @@ def test_the_worst_reason_is_the_first_and_gives_the_level() -> None:
     found = _verdict(figures)
     assert [one.level for one in found.reasons] == [Level.REFUSED, Level.LOOK, Level.LOOK]
     assert found.level == Level.REFUSED and "30 %" in found.sentence
+
+
+def test_steps_at_a_frame_without_matches_are_no_reason_of_their_own_where_points_span_it() -> None:
+    dim = replace(GOOD, unrefined=(5,), held_steps=(4, 5))
+    (reason,) = _verdict(dim).reasons
+    assert reason.leave_out and reason.frames == ("005",)
+    assert reason.command == "gsba export RUN --to colmap --without doubted"
+    assert "; 005: hardly any matches" in _verdict(dim).sentence
+    parted = replace(dim, moved_by_scale=(0.0, 0.0, 0.0, 0.0, math.inf, 0.0))
+    assert [one.frames for one in _verdict(parted).reasons if "no image" in one.cause] == [
+        ("004", "005")
+    ]
+    elsewhere = _verdict(replace(dim, held_steps=(4, 5, 9))).reasons
+    assert [one.frames for one in elsewhere] == [("005",), ("009", "010")]
+    refused = _verdict(replace(dim, held_steps=tuple(range(10))))
+    assert refused.level == Level.REFUSED and "shows 10 of 19" in refused.sentence
 
 
 def test_many_frames_are_counted_in_a_line() -> None:

@@ -10,10 +10,11 @@ function drawPlan(canvas, map, chosen = -1) {
   context.setTransform(ratio, 0, 0, ratio, 0, 0);
   context.clearRect(0, 0, width, height);
   const path = map.path, points = map.points;
-  canvas.setAttribute("aria-label", path.length
-    ? `The path from above: ${path.length} poses, ${points.length} points shown`
+  const known = path.filter(Boolean); // frames of other maps, and of none, have no place
+  canvas.setAttribute("aria-label", known.length
+    ? `The path from above: ${known.length} poses, ${points.length} points shown`
     : "The path from above: nothing yet");
-  if (!path.length) return;
+  if (!known.length) return;
   const color = (name) => { // resolved for the light or the dark page
     canvas.style.color = `var(${name})`;
     return getComputedStyle(canvas).color;
@@ -24,7 +25,7 @@ function drawPlan(canvas, map, chosen = -1) {
     box[0] = Math.min(box[0], x); box[1] = Math.min(box[1], y);
     box[2] = Math.max(box[2], x); box[3] = Math.max(box[3], y);
   };
-  path.forEach(grow);
+  known.forEach(grow);
   // Points far from the path do not make it small: the box takes nine tenths of them.
   for (const axis of [0, 1]) {
     const values = points.map((point) => point[axis]).sort((a, b) => a - b);
@@ -52,8 +53,9 @@ function drawPlan(canvas, map, chosen = -1) {
   const starts = new Set(map.starts);
   context.beginPath();
   path.forEach((position, k) => {
+    if (!position) return;
     const [x, y] = at(position);
-    if (starts.has(k)) context.moveTo(x, y); else context.lineTo(x, y);
+    if (starts.has(k) || !path[k - 1]) context.moveTo(x, y); else context.lineTo(x, y);
   });
   context.stroke();
   const dot = (position, name) => {
@@ -62,19 +64,19 @@ function drawPlan(canvas, map, chosen = -1) {
     context.arc(...at(position), 5, 0, 2 * Math.PI);
     context.fill();
   };
-  dot(path[0], "--green");
-  dot(path[path.length - 1], "--orange");
+  dot(known[0], "--green");
+  dot(known[known.length - 1], "--orange");
   if (path[chosen]) {
     context.strokeStyle = color("--text");
     context.beginPath();
     context.arc(...at(path[chosen]), 9, 0, 2 * Math.PI);
     context.stroke();
   }
-  canvas.placed = path.map(at);
+  canvas.placed = path.map((position) => position && at(position));
 }
 
 // Number of the pose that is drawn nearest to a place; -1 = none.
 function nearestOnPlan(canvas, x, y) {
-  const away = ([a, b]) => (a - x) ** 2 + (b - y) ** 2, placed = canvas.placed || [];
+  const away = (place) => (place ? (place[0] - x) ** 2 + (place[1] - y) ** 2 : Infinity), placed = canvas.placed || [];
   return placed.reduce((best, place, k) => (best < 0 || away(place) < away(placed[best]) ? k : best), -1);
 }

@@ -38,13 +38,15 @@ async function results(where, run, current) {
     }
   };
   const button = (text, onclick, title = "", kind = "") => make("button", { type: "button", class: kind, title, onclick }, text);
-  const dataset = (to, text) => button(text, add("export", { run, to, up: "auto" }), `gsba export ${run} --to ${to} --up auto`);
+  const choices = datasetChoices(found);
+  const dataset = (to, text) => button(text, () => add("export", { run, to, up: "auto", ...choices.values() })(), `gsba export ${run} --to ${to} --up auto`);
   const report = make("a", { href: link(`${run}/report.html`), target: "_blank", rel: "noopener" }, "Report");
   const level = found.verdict ? found.verdict.level : "";
   where.replaceChildren(
     verdictCard(found),
     card("Dataset for your trainer",
       level === "stop" ? make("p", { class: "error" }, "The verdict is: do not train. A dataset of this map wastes the training.") : null,
+      ...choices.fields,
       make("div", { class: "row" }, ...start.choices.programs.map((to) => dataset(to, TRAINERS[to] || to))),
       make("details", {}, make("summary", {}, "Other formats"),
         make("div", { class: "row" }, ...start.choices.formats.map((to) => dataset(to, to)))),
@@ -58,6 +60,24 @@ async function results(where, run, current) {
     make("p", { class: "row" }, ...found.files.slice(1).map((name) => make("a", { href: link(`${run}/${name}`) }, name)))),
     growing(run, found),
     found.figures.length ? figureCard(found.figures.map((name) => `${run}/figures/${name}`)) : "");
+}
+
+// Fields of what a dataset holds, where there is a choice: the map, and frames in doubt; and their values as options.
+function datasetChoices(found) {
+  const sizes = found.map_sizes, doubted = found.verdict ? found.verdict.doubted : [];
+  const map = make("select", { id: "map-number" }, ...sizes.map((frames, n) => make("option", { value: String(n + 1) }, `${n + 1}: ${frames} frames`)));
+  const without = make("input", { type: "checkbox", id: "without", checked: doubted.length > 0 });
+  const values = () => ({
+    ...(map.value > 1 ? { map_number: map.value } : doubted.length && without.checked ? { without: ["doubted"] } : {}),
+  });
+  map.addEventListener("change", () => { without.disabled = map.value > 1; });
+  return {
+    values,
+    fields: [
+      sizes.length > 1 ? make("p", {}, make("label", {}, "Map ", map)) : null,
+      doubted.length ? make("p", {}, make("label", {}, without, " Leave out frames in doubt: "), make("span", { class: "faint" }, doubted.slice(0, 6).join(", ") + (doubted.length > 6 ? ` and ${doubted.length - 6} more` : ""))) : null,
+    ],
+  };
 }
 
 // The verdict in one sentence; runs of earlier versions have none.
@@ -118,7 +138,7 @@ function places(runOf) {
     if (next === address) return;
     address = next;
     clearTimeout(timer); // a slider passes many frames
-    timer = setTimeout(() => shown.load(next, true, `Frame ${frame + 1} of ${map.path.length}`), 150);
+    timer = setTimeout(() => shown.load(next, true, `Frame ${frame + 1} of ${map.path.length}${map.path[frame] ? "" : ", not in the map"}`), 150);
   };
   slider.addEventListener("input", () => choose(Number(slider.value)));
   canvas.addEventListener("click", (happening) => {

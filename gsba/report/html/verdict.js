@@ -5,11 +5,11 @@ function verdict() {
   const found = D.report.verdict, card = el("verdict");
   const [title, ...rest] = found.sentence.split(": ");
   card.classList.add({ "good to train": "good", "do not train": "bad" }[found.level] || "look");
-  card.append(make("h2", {}, title[0].toUpperCase() + title.slice(1)), make("p", {}, ...termed(rest.join(": "))));
+  card.append(make("h2", {}, upper(title)), make("p", {}, ...termed(upper(rest.join(": ")))));
   if (found.reasons.length) {
     const list = make("ul", {});
     for (const reason of found.reasons) list.append(make("li", {},
-      make("b", {}, reason.cause[0].toUpperCase() + reason.cause.slice(1) + "."), ` What to do: ${reason.remedy}. `, ...chips(reason.frames)));
+      make("b", {}, upper(reason.cause) + "."), ` What to do: ${reason.remedy}. `, make("div", {}, ...chips(reason.frames)), command(reason.command)));
     card.append(list);
   }
   if (D.report.notes.length) {
@@ -17,6 +17,23 @@ function verdict() {
     for (const note of D.report.notes) notes.append(make("p", { class: "quiet" }, ...termed(note)));
     card.append(notes);
   }
+}
+
+const upper = text => text[0].toUpperCase() + text.slice(1);
+
+/* A command of this run, and a button that copies it; the run's folder is known where the report lies in it. */
+function command(text) {
+  if (!text) return "";
+  const folder = location.protocol === "file:" ? decodeURIComponent(location.pathname.replace(/\/[^/]*$/, "")) : "RUN";
+  const line = text.replace("RUN", /^[\w./-]+$/.test(folder) ? folder : `'${folder.replaceAll("'", "'\\''")}'`);
+  const code = make("code", {}, line), button = make("button", { type: "button" }, "Copy");
+  button.addEventListener("click", async () => {
+    try {
+      await navigator.clipboard.writeText(line);
+      button.textContent = "Copied";
+    } catch { getSelection().selectAllChildren(code); }
+  });
+  return make("p", { class: "command" }, code, " ", button);
 }
 
 /* Names of frames; to point at one, or to reach it by the keyboard, marks it everywhere. */
