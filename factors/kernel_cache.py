@@ -36,6 +36,7 @@ from numba.core import config, types
 from numba.core.caching import _Cache
 from numba.core.compiler import CompileResult
 from numba.core.dispatcher import Dispatcher
+from numba.core.runtime.nrt import rtsys
 from numba.core.serialize import dumps
 
 logger = logging.getLogger(__name__)
@@ -65,7 +66,7 @@ class KernelCache(_Cache):
     def load_overload(self, sig: Any, target_context: Any) -> CompileResult | None:
         """The compiled form of a signature, or None: then this process is to compile it, and
         others wait until `save_overload`."""
-        target_context.refresh()
+        rtsys.initialize(target_context)  # what machine code calls; Numba's compiler loads the rest
         path = self._path(sig, target_context.codegen())
         result = _load(path, target_context)
         if result is None:
@@ -95,7 +96,6 @@ class KernelCache(_Cache):
 
     def is_missing(self, sig: Any, target_context: Any) -> bool:
         """True if a form is not in the cache, nor being compiled by any process."""
-        target_context.refresh()
         path = self._path(sig, target_context.codegen())
         if path.exists():
             return False

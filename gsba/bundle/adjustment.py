@@ -232,17 +232,26 @@ class FixedRays:
 
 
 def adjust_sighted(
-    sighted: Sighted, before: Solution, context: AdjustmentContext, gates: Sequence[float]
+    sighted: Sighted,
+    before: Solution,
+    context: AdjustmentContext,
+    gates: Sequence[float],
+    final: bool = True,
 ) -> tuple[Solution, Keypoints]:
     """As `adjust`, of aligned and former observations, the noise of either estimated on its own;
     and the keypoints with the noise that they turned out to have."""
     view = FixedRays(sighted.keypoints)
-    solved, seen = adjust_sighted_through(view, sighted, before, context, gates)
+    solved, seen = adjust_sighted_through(view, sighted, before, context, gates, final)
     return solved, seen.keypoints
 
 
 def adjust_sighted_through(
-    view: V, sighted: Sighted, before: Solution, context: AdjustmentContext, gates: Sequence[float]
+    view: V,
+    sighted: Sighted,
+    before: Solution,
+    context: AdjustmentContext,
+    gates: Sequence[float],
+    final: bool = True,
 ) -> tuple[Solution, V]:
     """As `adjust_sighted`, through a camera that may be solved for, too."""
     solved, rounds, settings = before, [], context.settings
@@ -250,7 +259,7 @@ def adjust_sighted_through(
         so_far = replace(sighted, keypoints=view.keypoints)
         there = rescale_noise(so_far, solved, settings, context.scratch)
         view, start = view.with_noise_of(there.keypoints), replace(solved, noise=1.0)
-        solver = _solver(settings, last=number == len(gates))
+        solver = _solver(settings, last=final and number == len(gates))
         looser = replace(context, settings=settings.model_copy(update={"solver": solver}))
         solved, view = adjust_through(view, sighted.tracks, start, looser, (gate,))
         rounds += solved.rounds

@@ -228,14 +228,17 @@ def _resected(result: Reconstruction, frame: int, rows: np.ndarray) -> np.ndarra
         at_rig = (points - world_T_rig[:3, 3]) @ world_T_rig[:3, :3]
         depths = np.linalg.norm(at_rig - origins, axis=1)
         rays = (at_rig - origins) / depths[:, None]
-        residuals = np.einsum("mij,mj->mi", bases, rays) / sigmas[:, None]
+        off = np.einsum("mij,mj->mi", bases, rays)
+        residuals = off / sigmas[:, None]
         weights = 1 / (1 + np.sum(residuals**2, axis=1))
-        across = (np.eye(3) - rays[:, :, None] * rays[:, None, :]) / depths[:, None, None]
-        by_ray = bases @ across / sigmas[:, None, None]
-        jacobian = np.concatenate([np.cross(by_ray, at_rig[:, None, :]), -by_ray], axis=2)
-        weighted = weights[:, None, None] * jacobian
-        system = np.einsum("mij,mik->jk", weighted, jacobian)
-        step = np.linalg.lstsq(system, -np.einsum("mij,mi->j", weighted, residuals), rcond=None)[0]
+        across = bases - off[:, :, None] * rays[:, None, :]
+        by_ray = across / (depths * sigmas)[:, None, None]
+        (a, b, c), (x, y, z) = np.moveaxis(by_ray, 2, 0), at_rig.T[:, :, None]
+        turned = np.stack([b * z - c * y, c * x - a * z, a * y - b * x], axis=2)
+        jacobian = np.concatenate([turned, -by_ray], axis=2).reshape(-1, 6)
+        weighted = np.repeat(weights, 2)[:, None] * jacobian
+        gradient = weighted.T @ residuals.ravel()
+        step = np.linalg.lstsq(weighted.T @ jacobian, -gradient, rcond=None)[0]
         turn = Rotation.from_rotvec(step[:3]).as_matrix()
         world_T_rig = world_T_rig @ pose(turn, step[3:])
     return world_T_rig

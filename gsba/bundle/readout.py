@@ -75,14 +75,15 @@ def estimate(
         from_rigs = landmarks.points_world[tracks.points] - poses[:, :3, 3]
         offsets[keypoints.rows(tracks)] = np.einsum("oji,oj->oi", poses[:, :3, :3], from_rigs)
     ways, frames = _ways(context.settings.camera, lenses), keypoints.frames()
-    times = np.stack([lenses.fractions(shown, frames, way) for way in ways], axis=1)
 
     def by_duration(rows: np.ndarray, by_origin: np.ndarray, _: np.ndarray) -> np.ndarray:
-        moving = motion[frames[rows], 3:]
+        directions, there = shown[rows], frames[rows]
+        times = np.stack([lenses.fractions(directions, there, way) for way in ways], axis=1)
+        moving = motion[there, 3:]
         if offsets is not None:  # a turning ray's point moves as if it were carried along
-            moving = moving + np.cross(motion[frames[rows], :3], offsets[rows])
+            moving = moving + np.cross(motion[there, :3], offsets[rows])
         moved = np.einsum("oij,oj->oi", by_origin, moving)
-        return moved[:, :, None] * times[rows, None, :]
+        return moved[:, :, None] * times[:, None, :]
 
     systems, counts = models_of(landmarks, keypoints, solved, context, by_duration)
     if not systems:

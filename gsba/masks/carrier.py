@@ -186,7 +186,7 @@ def _measure(pictures: np.ndarray, width: int) -> FixedStructure:
     size = width, width // 2
     small = [cv2.resize(p, size, interpolation=cv2.INTER_AREA) for p in pictures]
     found = measure_fixed_structure(np.stack(small))
-    black = black_areas(pictures.max(axis=(0, 3)))
+    black = black_areas(pictures.max(axis=0).max(axis=2))
     if not black.any():
         return found
     small = cv2.resize(black.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0

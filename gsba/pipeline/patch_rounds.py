@@ -65,7 +65,10 @@ def _adjust_under_lenses(state: State, sighted: Sighted, number: int) -> State |
     """Bundle adjustment of aligned observations, the camera found from them beside it."""
     name = f"aligned{number}"
     if not state.map.lenses:
-        return adjust_aligned(state, sighted, name)
+        # Later rounds begin at poses of the one before, whose outliers are known.
+        gates = adjustment.ALIGNED_GATES if number == 1 else adjustment.ALIGNED_GATES[-1:]
+        last = number > 1 or state.run.settings.patches.rounds == 1
+        return adjust_aligned(state, sighted, name, gates, final=last)
     for n in range(2):
         state = frontend.align_gyro_to_map(state, f"imu_{name}_{n}", with_noise=False)
         trial = camera.take_parts_from_patches(state, sighted, name, n)
@@ -98,19 +101,25 @@ def observations(state: State) -> Observations:
 
 
 def adjust_aligned(
-    state: State, sighted: Sighted, name: str, gates: Sequence[float] | None = None
+    state: State,
+    sighted: Sighted,
+    name: str,
+    gates: Sequence[float] | None = None,
+    *,
+    final: bool = True,
 ) -> State | None:
-    """Bundle adjustment of aligned observations; None where that explains less."""
+    """Bundle adjustment of aligned observations; None where that explains less. `final`: solve it
+    to the end."""
     run, map_ = state.run, state.map
     gates = adjustment.ALIGNED_GATES if gates is None else gates
 
     def compute() -> tuple[Solution, Keypoints]:
         there = replace(sighted, keypoints=map_.rays(sighted.keypoints, run.rig))
         context = state.adjustment_context()
-        solved, found = adjustment.adjust_sighted(there, map_.solution, context, gates)
+        solved, found = adjustment.adjust_sighted(there, map_.solution, context, gates, final)
         return solved, stitching.with_noise_of(sighted.keypoints, found, context.scratch)
 
-    key = [run.solving_key(), gates]
+    key = [run.solving_key(), gates, final]
     solved, keypoints = run.stage(name, key, compute, tuple[Solution, Keypoints])
     return carried(state, sighted, solved, keypoints)
 

@@ -288,12 +288,20 @@ def _version(package: str) -> str | None:
         return None
 
 
+_UNCHANGED = {int, str, bool, type(None)}  # types that JSON holds as they are
+
+
 def plain(value: Any, digits: int = 17) -> Any:
     """Value as JSON can hold it: floats with `digits`, null for numbers that are not finite."""
-    if type(value) is float:  # the most frequent type
+    kind = type(value)  # the most frequent ones first
+    if kind is float:
         if not math.isfinite(value):
             return None
         return value if digits >= 17 else float(f"{value:.{digits}g}")
+    if kind in _UNCHANGED:
+        return value
+    if kind is list:
+        return [plain(item, digits) for item in value]
     if isinstance(value, BaseModel):
         return value.model_dump(mode="json")
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
@@ -324,9 +332,10 @@ def medians_by_group(
         least: values that a group needs, at least one.
     """
     counts = np.bincount(groups, minlength=num_groups)
-    ordered = values[np.argsort(groups, kind="stable")]
-    ends = np.cumsum(counts)
+    ordered = values[np.lexsort((values, groups))]  # NaN last in its group
+    large = np.flatnonzero(counts >= least)
+    ends, counts = np.cumsum(counts)[large], counts[large]
+    middle = np.stack([ordered[ends - counts // 2 - 1], ordered[ends - (counts + 1) // 2]])
     found = np.full(num_groups, np.nan)
-    for group in np.flatnonzero(counts >= least):
-        found[group] = np.median(ordered[ends[group] - counts[group] : ends[group]])
+    found[large] = np.where(np.isnan(ordered[ends - 1]), np.nan, middle.mean(axis=0))
     return found

@@ -38,7 +38,8 @@ def worst_patches(
 
     @cache
     def grey(f: int) -> np.ndarray:
-        return small_panorama(frames, f, width).mean(axis=2).astype(np.float32)
+        red, green, blue = np.moveaxis(small_panorama(frames, f, width), 2, 0).astype(np.float32)
+        return (red + green + blue) / 3
 
     found = []
     for f in worst:
