@@ -28,12 +28,11 @@ def rig_for(kind: PictureFormat, settings: CubemapSettings) -> CubeRig:
     `max_face_size`.
     """
     if not kind.panoramic:
-        most = settings.face_size or settings.max_face_size
-        return CubeRig(min(kind.native_face_size, most), np.pi / 2)
+        return CubeRig(min(kind.native_face_size, settings.max_face_size), np.pi / 2)
     hfov = np.deg2rad(HFOV_DEG)
     native = 2 * kind.width / (2 * np.pi) * np.tan(hfov / 2)
     wanted = max(round(settings.oversampling * native), settings.min_face_size)
-    size = settings.face_size or min(wanted, settings.max_face_size)
+    size = min(wanted, settings.max_face_size)
     return CubeRig(size, hfov)
 
 
