@@ -27,13 +27,14 @@ from typing import Any
 import numpy as np
 from common import link_frames, machine
 
-from gsba.config import RefineSettings, SplatSettings
+from gsba.config import RefineSettings
 from gsba.demo import make_walk
 from gsba.disk import write_text
 from gsba.evaluate.splats import SourceResult, compare, poses_for
 from gsba.log import GsbaError, show_log
 from gsba.pipeline.refine import refine
 from gsba.splat.backend import choose_backend
+from gsba.splat.options import TrainingOptions
 from gsba.splat.scores import Score, mean_score
 from gsba.store.finished import load_run
 from gsba.trajectory.files import read_trajectory
@@ -134,7 +135,7 @@ def run_scene(
     coarse: Path,
     out: Path,
     rows: list[str],
-    settings: list[SplatSettings],
+    settings: list[TrainingOptions],
     threads: int,
 ) -> dict[str, list[SourceResult]]:
     """Refine, then train and measure on all sources of poses, once for each of the settings."""
@@ -222,7 +223,7 @@ def main() -> None:
     parser.add_argument("--markdown", type=Path)
     options = parser.parse_args()
     show_log()
-    settings = SplatSettings(
+    settings = TrainingOptions(
         iterations=options.iterations,
         face_size=options.face_size,
         sh_degree=options.sh_degree,
@@ -255,7 +256,9 @@ def main() -> None:
     sys.exit(0 if held else 1)
 
 
-def _write(options: argparse.Namespace, settings: SplatSettings, report: dict, text: list) -> None:
+def _write(
+    options: argparse.Namespace, settings: TrainingOptions, report: dict, text: list
+) -> None:
     """Write the results so far."""
     if options.json:
         content = {"machine": machine(), "settings": settings.model_dump(), "scenes": report}

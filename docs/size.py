@@ -73,7 +73,7 @@ def numbers(files: dict[Path, ast.Module]) -> list[str]:
 
 
 def settings() -> list[str]:
-    """Names of all fields of settings that hold a value, not another table of settings."""
+    """Names of fields of settings that hold a value, not another table; private ones are none."""
     classes = [
         node
         for node in trees("gsba")[ROOT / "gsba/config.py"].body
@@ -84,7 +84,9 @@ def settings() -> list[str]:
         f"{node.name}.{ast.unparse(field.target)}"
         for node in classes
         for field in node.body
-        if isinstance(field, ast.AnnAssign) and ast.unparse(field.annotation) not in tables
+        if isinstance(field, ast.AnnAssign)
+        and ast.unparse(field.annotation) not in tables
+        and not ast.unparse(field.target).startswith("_")
     ]
 
 

@@ -5,7 +5,7 @@ from importlib.metadata import EntryPoint, entry_points
 from itertools import pairwise
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, model_validator
 
 _MAX_FACE_PX = 16_384  # OpenCV's remap takes at most 32,767 pixels across
 _MAX_SEED = 2**31 - 1
@@ -44,11 +44,9 @@ class VideoSettings(_Settings):
 class OdometrySettings(_Settings):
     """Odometry of a video, and the frames that are chosen by it."""
 
-    width: int = Field(default=800, ge=256, le=4096, multiple_of=2)  # pixels across the panoramas
     step: float = Field(
         default=0.2, gt=0, le=1
     )  # baseline of successive chosen frames, relative to the scene's depth
-    max_turn_deg: float = Field(default=40.0, gt=0)  # rotation between successive chosen frames
     max_frames: int | None = Field(default=None, ge=3)  # most chosen frames, by longer steps; None
     # = no limit
     fetch_rounds: int = Field(default=3, ge=0)  # rounds that add frames of the video where the map
@@ -61,9 +59,8 @@ class OdometrySettings(_Settings):
 class CubemapSettings(_Settings):
     """Faces cut from a panorama for detection."""
 
-    face_size: _CutSize | None = None  # pixels; None = by oversampling
     oversampling: float = Field(default=0.5, ge=0.25, le=4)  # face pixels per panorama pixel
-    min_face_size: _CutSize = 192  # pixels; bounds on the automatic size
+    min_face_size: _CutSize = 192  # pixels; equal bounds set the size
     max_face_size: _CutSize = 448
 
 
@@ -94,8 +91,6 @@ class MatchingSettings(_Settings):
 
     matcher: Literal["guided", "lightglue", "superglue"] = "guided"
     weights: _Text | None = None  # of a learned matcher: file, or folder with the official file
-    min_similarity: Annotated[float, Field(ge=-1, le=1)] | None = None  # cosine of descriptors
-    max_ratio: Annotated[float, Field(gt=0, le=1)] | None = None  # ratio test; None = by extractor
 
 
 class PairSettings(_Settings):
@@ -103,21 +98,32 @@ class PairSettings(_Settings):
 
     window: int = Field(default=32, ge=2)  # frames in time
     max_loop_neighbours: int = Field(default=8, ge=0)  # nearest frames in space outside the window
-    gate_factor: float = Field(default=1.0, gt=0)  # widens angular gates; a run widens them itself
-    # for raw frames whose calibration is poorly known
     strongest_per_face: int = Field(default=150, ge=16)  # keypoints that give pairs' first geometry
-    far_drift: float = Field(
-        default=0.05, ge=0, le=1
-    )  # largest relative drift that a loop closure may correct
 
 
 class RoundSettings(_Settings):
-    """Triangulate, adjust, filter: gates in standard deviations of the observations' noise."""
+    """Triangulate, adjust, filter."""
 
-    dense: tuple[float, ...] = (4.0,)  # with matches along the solved chain
-    loops: tuple[float, ...] = (100.0, 6.0)  # with loops closed
-    refined: tuple[float, ...] = (4.0, 2.5)  # with matches along the solved map
+    filters: Literal["few", "many"] = "few"  # rounds of filtering: few, as aligned patches follow;
+    # many: for features alone
     map_passes: int = Field(default=1, ge=1)  # matching passes after loops are closed
+
+    # Gates of the rounds, in standard deviations of the observations' noise.
+
+    @property
+    def dense(self) -> tuple[float, ...]:
+        """Gates with matches along the solved chain."""
+        return (4.0,) if self.filters == "few" else (6.0, 3.0)
+
+    @property
+    def loops(self) -> tuple[float, ...]:
+        """Gates with loops closed."""
+        return (100.0, 6.0) if self.filters == "few" else (100.0, 20.0, 4.0)
+
+    @property
+    def refined(self) -> tuple[float, ...]:
+        """Gates with matches along the solved map."""
+        return (4.0, 2.5) if self.filters == "few" else (6.0, 3.0, 2.5)
 
 
 class PatchSettings(_Settings):
@@ -216,29 +222,33 @@ class StitchingSettings(_Settings):
     mode: Literal["auto", "off"] = "auto"  # auto: applied where it predicts held-out observations
 
 
+# Noise of the steps of a usual trajectory: half of a degree, and a tenth of the step.
+_STEP_ROTATION_DEG, _STEP_TRANSLATION = 0.5, 0.1
+
+
 class PriorSettings(_Settings):
     """Noise of the trajectory's steps and poses, as priors of the graph."""
 
-    rotation_deg: float = Field(default=0.5, gt=0)  # noise of a step's rotation
-    translation: float = Field(default=0.1, gt=0)  # noise of a step's translation, part of the step
+    scale: float = Field(default=1.0, gt=0)  # times the noise of a usual trajectory
+
+    @property
+    def rotation_deg(self) -> float:
+        """Noise of a step's rotation, degrees."""
+        return self.scale * _STEP_ROTATION_DEG
+
+    @property
+    def translation(self) -> float:
+        """Noise of a step's translation, part of the step."""
+        return self.scale * _STEP_TRANSLATION
 
     def faint(self) -> "PriorSettings":
         """Priors ten times as loose: they only hold steps that images do not constrain."""
-        looser = {"rotation_deg": 10 * self.rotation_deg, "translation": 10 * self.translation}
-        return self.model_copy(update=looser)
+        return self.model_copy(update={"scale": 10 * self.scale})
 
 
 class SolverSettings(_Settings):
-    """Levenberg-Marquardt."""
+    """Bundle adjustment on this machine."""
 
-    max_iterations: int = Field(default=50, ge=1)
-    relative_tolerance: float = Field(default=1e-5, gt=0, lt=1)  # smallest relative decrease of the
-    # cost; a smaller one ends the solve
-    absolute_tolerance: float | None = Field(default=0.05, gt=0)  # upper limit of that threshold,
-    # squared standard deviations; None = no limit
-    loss: Literal["none", "huber", "cauchy", "geman_mcclure"] = "cauchy"
-    loss_sigmas: float = Field(default=1.0, gt=0)  # scale of the loss, standard deviations
-    lambda_initial: float = Field(default=1e-4, gt=0)  # damping, part of the diagonal
     num_threads: int | None = Field(default=None, ge=1)  # None = all cores
     part_frames: int | None = Field(default=None, ge=2)  # of a part of a map; None = by memory
 
@@ -253,9 +263,6 @@ class SplatFactorSettings(_Settings):
     sizes: tuple[Annotated[int, Field(ge=16, le=_MAX_FACE_PX)], ...] = Field(
         default=(48, 96), min_length=1
     )  # pixels of a face, in order
-    min_sigmas: float = Field(
-        default=2.0, ge=0
-    )  # gain on held-out panoramas in standard errors that a move needs, or it is undone
     backend: Literal["auto", "gsplat", "cpu"] = "auto"
 
 
@@ -292,18 +299,12 @@ class ExportSettings(_Settings):
 
 
 class SplatSettings(_Settings):
-    """Training of a Gaussian splat: learning rates of Kerbl et al., 2023."""
+    """Training of a Gaussian splat."""
 
     iterations: int = Field(default=7000, ge=1, le=10**7)  # training steps of one view each
     face_size: int = Field(default=256, ge=16, le=_MAX_FACE_PX)  # pixels
     backend: Literal["auto", "gsplat", "cpu"] = "auto"
-    sh_degree: int = Field(default=3, ge=0, le=3)
     max_gaussians: int | None = Field(default=None, ge=1)  # None = set by pixels and memory
-    rate_means: float = Field(default=1.6e-4, gt=0)  # at the start, part of the extent
-    rate_means_end: float = Field(default=1.6e-6, gt=0)
-    rate_scales: float = Field(default=5e-3, gt=0)
-    rate_fade: float = Field(default=1.0, gt=0, le=1)  # factor at the end on all rates but means'
-    seed: int = Field(default=0, ge=0, le=_MAX_SEED)
 
 
 class GpsSettings(_Settings):
@@ -314,7 +315,6 @@ class GpsSettings(_Settings):
         default=3.0, gt=0
     )  # horizontal standard deviation per axis, metres: floor for all fixes, times DOP where given
     sigma_up_m: float = Field(default=5.0, gt=0)  # vertical standard deviation, metres
-    correlation_s: float = Field(default=60.0, gt=0)  # correlation time of the errors
     offset_s: float = 0.0  # seconds, added to the times of a file to give the frames' clock
 
 
@@ -369,6 +369,10 @@ class RefineSettings(_Settings):
     placement: PlacementSettings = PlacementSettings()
     seed: int = Field(default=0, ge=0, le=_MAX_SEED)
 
+    _gate_factor: float = PrivateAttr(
+        1.0
+    )  # no setting: a run knows how well its lenses are calibrated
+
     def direct_families(self) -> tuple[str, ...]:
         """Families that compare pixels of whole frames."""
         return tuple(name for name in self.factors if name in ("photometric", "splat"))
@@ -384,8 +388,14 @@ class RefineSettings(_Settings):
 
     def with_gates(self, scale: float) -> "RefineSettings":
         """Settings with matching gates `scale` times as wide, for poorly calibrated lenses."""
-        wider = {"gate_factor": scale * self.pairs.gate_factor}
-        return self.model_copy(update={"pairs": self.pairs.model_copy(update=wider)})
+        wider = self.model_copy()
+        wider._gate_factor = scale * self._gate_factor
+        return wider
+
+    @property
+    def gate_factor(self) -> float:
+        """Factor on angular matching gates; see `with_gates`."""
+        return self._gate_factor
 
     def with_faint_priors(self) -> "RefineSettings":
         """Settings with loose priors, for a trajectory that only gives initial poses."""

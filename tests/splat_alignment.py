@@ -6,15 +6,15 @@ import gtsam
 import numpy as np
 
 from gsba import optimize
+from gsba.bundle.optimizer import SolverOptions
 from gsba.bundle.pose_variables import poses_of, values_of
 from gsba.camera.views import ONE_EYE, Optics
-from gsba.config import SolverSettings
 from gsba.splat.alignment import capture, splat_block
 from gsba.splat.backend import Backend
 from gsba.splat.gaussians import Gaussians
 from gsba.types import FrameSet
 
-_SOLVER = SolverSettings(max_iterations=15, relative_tolerance=1e-5, absolute_tolerance=None)
+_SOLVER = SolverOptions(max_iterations=15, relative_tolerance=1e-5, absolute_tolerance=None)
 
 
 def align_to_splat(

@@ -18,7 +18,8 @@ from gsba.types import Trajectory
 
 NUM_FRAMES, WIDTH = 8, 512
 LIGHT = (  # changes of the defaults, as `--set` takes them
-    "cubemap.face_size=256",
+    "cubemap.min_face_size=256",
+    "cubemap.max_face_size=256",
     "features.max_per_face=400",
     "solver.num_threads=2",
     "weak_frames.mode=off",

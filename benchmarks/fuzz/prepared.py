@@ -17,7 +17,7 @@ from gsba.types import Trajectory
 
 NUM, WIDTH = 8, 512  # frames of the walk
 SETTINGS = {
-    "cubemap": {"face_size": 256},
+    "cubemap": {"min_face_size": 256, "max_face_size": 256},
     "features": {"max_per_face": 400},
     "patches": {"rounds": 0},
     "export": {"formats": []},

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol, Self, TypeVar
 
@@ -13,13 +13,13 @@ from factors import Block, LandmarkBlock, RobustLoss, Term
 from gsba.bundle import pose_variables, triangulation
 from gsba.bundle.families import Families, Family, FamilyTerms
 from gsba.bundle.observation_noise import observation_noise, with_scaled_noise
-from gsba.bundle.optimizer import OptimizeResult, marginal_covariances, optimize
+from gsba.bundle.optimizer import OptimizeResult, SolverOptions, marginal_covariances, optimize
 from gsba.bundle.pose_variables import poses_of, values_of
 from gsba.bundle.reconstruction import MIN_OBSERVATIONS
 from gsba.bundle.tracks import runs
 from gsba.bundle.trajectory_prior import GyroTurns
 from gsba.camera.rig import CubeRig
-from gsba.config import CameraSettings, RefineSettings, SolverSettings
+from gsba.config import CameraSettings, RefineSettings
 from gsba.memory import release_mapped_files
 from gsba.types import (
     GyroConstraints,
@@ -61,7 +61,7 @@ class DivisibleMap:
 class Division(Protocol):
     """Adjusts maps in parts."""
 
-    def minimized(self, map_: DivisibleMap, settings: SolverSettings) -> OptimizeResult | None:
+    def minimized(self, map_: DivisibleMap, options: SolverOptions) -> OptimizeResult | None:
         """The result of `gsba.bundle.optimizer.optimize`; None = the map is not to be divided."""
         ...
 
@@ -98,16 +98,16 @@ class Terms:
     observed: "ObservedPoints | None" = None  # landmarks seen along known rays, whose block is not
     # among `blocks`; None = there are none
 
-    def minimized(self, settings: SolverSettings) -> OptimizeResult:
+    def minimized(self, options: SolverOptions) -> OptimizeResult:
         """The best values, in parts where the context divides the map; see `optimizer.optimize`."""
         blocks, observed = self.blocks, self.observed
         if observed is not None:
             division, map_ = observed.context.division, observed._divisible(self)
-            found = division.minimized(map_, settings) if division and map_ else None
+            found = division.minimized(map_, options) if division and map_ else None
             if found is not None:
                 return found
             blocks = (observed.block(), *blocks)
-        return optimize(self.graph, self.values, blocks, settings)
+        return optimize(self.graph, self.values, blocks, options)
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,8 +116,9 @@ class AdjustmentContext:
 
     families: Families  # of residuals: of points, trajectory prior, sensors, callers
     rig: CubeRig  # the faces
-    settings: RefineSettings  # loss, solver, rounds
+    settings: RefineSettings  # of rounds, threads, camera
     num_threads: int  # of the solver
+    solver: SolverOptions = field(default_factory=SolverOptions)
     maps: np.ndarray | None = None  # (F,) map of each frame, for the families; None = there is one
     division: Division | None = None  # of large maps into parts; None = none is divided
     cameras: tuple[CameraSettings, ...] = ()  # (C,) of each camera; () = settings.camera of all
@@ -179,14 +180,13 @@ class ObservedPoints:
         """These and other terms as a map that may be divided; None = families have blocks."""
         if terms.blocks:
             return None
-        solver = self.context.settings.solver
         return DivisibleMap(
             self.landmarks,
             self._terms_of,
             terms.graph,
             terms.values,
             len(self.keypoints.starts) - 1,
-            RobustLoss(solver.loss, solver.loss_sigmas),
+            self.context.solver.loss,
         )
 
 
@@ -254,13 +254,13 @@ def adjust_sighted_through(
     final: bool = True,
 ) -> tuple[Solution, V]:
     """As `adjust_sighted`, through a camera that may be solved for, too."""
-    solved, rounds, settings = before, [], context.settings
+    solved, rounds = before, []
     for number, gate in enumerate(gates, 1):
         so_far = replace(sighted, keypoints=view.keypoints)
-        there = rescale_noise(so_far, solved, settings, context.scratch)
+        there = rescale_noise(so_far, solved, context.settings, context.scratch)
         view, start = view.with_noise_of(there.keypoints), replace(solved, noise=1.0)
-        solver = _solver(settings, last=final and number == len(gates))
-        looser = replace(context, settings=settings.model_copy(update={"solver": solver}))
+        solver = _options(context.solver, last=final and number == len(gates))
+        looser = replace(context, solver=solver)
         solved, view = adjust_through(view, sighted.tracks, start, looser, (gate,))
         rounds += solved.rounds
     return replace(solved, rounds=tuple(rounds)), view
@@ -323,17 +323,17 @@ def adjust_through(
 ) -> tuple[Solution, V]:
     """As `adjust`, through a camera that may be solved for beside the poses; and the view that
     belongs to the solution."""
-    solved, rounds, settings = replace(start, rounds=()), [], context.settings
+    solved, rounds = replace(start, rounds=()), []
     place = _Placement(tracks, context)
     last_gate = gates[-1] * start.noise
     support = len(place(view.keypoints, solved.world_T_rigs, last_gate).tracks)
     for number, gate in enumerate(gates, 1):
         landmarks = place(view.keypoints, solved.world_T_rigs, gate * solved.noise)
         spread = solved.noise * max(1.0, gate / GATE_SCALE)
-        solver = _solver(settings, last=final and number == len(gates))
+        solver = _options(context.solver, last=final and number == len(gates))
         if context.families.limit_drift:
-            finer = {"lambda_initial": _DRIFT_DAMPING, "relative_tolerance": _DRIFT_TOLERANCE}
-            solver = solver.model_copy(update=finer)
+            damping, tolerance = _DRIFT_DAMPING, _DRIFT_TOLERANCE
+            solver = replace(solver, lambda_initial=damping, relative_tolerance=tolerance)
         here = replace(solved, landmarks=landmarks)
         terms, after = view.terms(here, spread, context)
         result = terms.minimized(solver)
@@ -377,12 +377,11 @@ class _Placement:
         return self._found
 
 
-def _solver(settings: RefineSettings, last: bool) -> SolverSettings:
-    """Settings of a round: only the last of a run is solved to the end."""
-    if last or settings.solver.relative_tolerance > _TOLERANCE:
-        return settings.solver
-    looser = {"relative_tolerance": _TOLERANCE, "absolute_tolerance": None}
-    return settings.solver.model_copy(update=looser)
+def _options(options: SolverOptions, last: bool) -> SolverOptions:
+    """Options of a round: only the last of a run is solved to the end."""
+    if last or options.relative_tolerance > _TOLERANCE:
+        return options
+    return replace(options, relative_tolerance=_TOLERANCE, absolute_tolerance=None)
 
 
 def landmark_block(
@@ -390,12 +389,11 @@ def landmark_block(
 ) -> LandmarkBlock:
     """The factor block of the families that observe points; noise: of the observations, in units of
     the keypoints' own sigmas."""
-    solver = context.settings.solver
     return LandmarkBlock(
         [pose_variables.X(f) for f in range(len(keypoints.starts) - 1)],
         landmarks.points_world,
         context.families.landmark_terms(landmarks, keypoints, noise),
-        RobustLoss(solver.loss, solver.loss_sigmas),
+        context.solver.loss,
         context.num_threads,
     )
 

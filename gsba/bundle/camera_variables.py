@@ -8,7 +8,6 @@ from functools import partial
 import gtsam
 import numpy as np
 
-from factors import RobustLoss
 from factors.camera_block import CameraBlock, pixels_of, sightings_of
 from factors.camera_rows import (
     CameraVariables,
@@ -128,12 +127,11 @@ class CameraUnknowns:
         seen = shown.bearings_rig[rows], tracks.frames, shown.roots(rows) / noise
         measured, roots, seeing, fractions = self._sighted(*seen)
         given = tracks.frames, tracks.points, tracks.num_points, measured, roots, seeing, fractions
-        solver = self.context.settings.solver
         return CameraBlock(
             self.variables,
             sightings_of(*given)[0],
             landmarks.points_world,
-            RobustLoss(solver.loss, solver.loss_sigmas),
+            self.context.solver.loss,
             self.context.num_threads,
             curved=curved,
         )

@@ -11,15 +11,28 @@ import gtsam
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from factors import Block
+from factors import Block, RobustLoss
 from factors.direct_system import reduced_system
-from gsba.config import SolverSettings
 from gsba.log import GsbaError
 from gsba.types import Iteration, JointErrors
 
 logger = logging.getLogger(__name__)
 
 _MAX_DAMPING = 1e10
+
+
+@dataclass(frozen=True, slots=True)
+class SolverOptions:
+    """Levenberg-Marquardt: damping, tolerances, and the loss of observations."""
+
+    max_iterations: int = 50
+    relative_tolerance: float = 1e-5  # smallest relative decrease of the cost; a smaller one ends
+    # the solve
+    absolute_tolerance: float | None = 0.05  # upper limit of that threshold, squared standard
+    # deviations: the cost of many observations hides what the poses still move; None = no limit
+    lambda_initial: float = 1e-4  # damping, part of the diagonal
+    loss: RobustLoss = field(default_factory=lambda: RobustLoss("cauchy", 1.0))  # of residuals in
+    # standard deviations
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +134,7 @@ def optimize(
     graph: gtsam.NonlinearFactorGraph,
     values: gtsam.Values,
     blocks: Sequence[Block] = (),
-    settings: SolverSettings | None = None,
+    options: SolverOptions | None = None,
     callback: Callable[[Iteration, gtsam.Values], None] | None = None,
 ) -> OptimizeResult:
     """Minimize the cost of a graph and of blocks over all variables they name, from `values`; those
@@ -131,23 +144,23 @@ def optimize(
     Args:
         graph: native or user factors, on variables of any type.
         blocks: batched factors on Pose3 variables; their landmarks move along.
-        settings: tolerances and damping; None = the defaults.
+        options: tolerances and damping; None = the defaults.
         callback: called with each attempt and the best values so far.
 
     Raises:
         GsbaError: the cost at the start is not finite.
     """
-    settings = settings or SolverSettings()
+    options = options or SolverOptions()
     for block in blocks:
         block.refresh(values)
-    return minimize(reduced_system(graph, blocks, values), values, settings, callback)
+    return minimize(reduced_system(graph, blocks, values), values, options, callback)
 
 
 @threadpool_limits.wrap(limits=1, user_api="blas")  # sums keep their order, fronts are small
 def minimize(
     system: System,
     values: gtsam.Values,
-    settings: SolverSettings,
+    options: SolverOptions,
     callback: Callable[[Iteration, gtsam.Values], None] | None = None,
 ) -> OptimizeResult:
     """Minimize the cost of a system by Levenberg-Marquardt: `optimize`, of any system. GsbaError:
@@ -162,12 +175,12 @@ def minimize(
     if bad:
         raise GsbaError(f"the cost of {', '.join(bad)} is not finite at the start: check its input")
     cost = sum(costs.values())
-    damping = _Damping(settings.lambda_initial)
+    damping = _Damping(options.lambda_initial)
     history.add(values, cost, costs, damping.value, True)
-    for _ in range(settings.max_iterations):
-        negligible = settings.relative_tolerance * cost
-        if settings.absolute_tolerance is not None:
-            negligible = min(negligible, settings.absolute_tolerance)
+    for _ in range(options.max_iterations):
+        negligible = options.relative_tolerance * cost
+        if options.absolute_tolerance is not None:
+            negligible = min(negligible, options.absolute_tolerance)
         used = damping.value
         steps = system.solve(used)
         trial, trial_cost, predicted = values, np.inf, np.inf

@@ -14,7 +14,6 @@ from scipy.sparse.linalg import splu
 from factors.bearing import bearing_residuals, tangent_basis
 from factors.cholesky import BlockCholesky
 from factors.elimination import LinearSystem, eliminate
-from factors.robust import RobustLoss
 from gsba.bundle.adjustment import AdjustmentContext, landmark_block, values_of
 from gsba.types import Counts, Keypoints, Landmarks, Solution, Tracks
 
@@ -125,8 +124,7 @@ def weighted(
     )
     roots = keypoints.roots(rows)
     whitened = np.einsum("oij,oj->oi", roots, residuals) / solved.noise
-    solver = context.settings.solver
-    loss = RobustLoss(solver.loss, solver.loss_sigmas)
+    loss = context.solver.loss
     squares = np.sum(whitened**2, axis=1)
     weights = loss.weights(squares)
     curvature = float(np.sum(loss.curvatures(squares))) / max(float(np.sum(weights)), 1e-300)

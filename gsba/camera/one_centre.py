@@ -4,7 +4,7 @@ Each direction is looked up where its lens shows it, at the depth of map points 
 rows read in the middle of the exposure; both lenses are blended across the seam.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 
 import cv2
@@ -13,14 +13,13 @@ import numpy as np
 from gsba.camera.equiangular import Grid, around_squares
 from gsba.camera.fisheye import facing, project
 from gsba.camera.lens import Lenses
-from gsba.camera.sphere import around_sphere, bearings_from_erp, erp_from_bearings
+from gsba.camera.sphere import around_sphere, bearings_from_erp, erp_bands, erp_from_bearings
 from gsba.camera.straighten import PAD
 from gsba.camera.views import depths_along, observed_points
 from gsba.types import Reconstruction
 
 _DEPTH_GRID_WIDTH = 128  # width of the grid that depths are taken on
 _FAR_DEPTH = 1e9  # map units
-_ROWS_AT_ONCE = 128  # rows whose coordinates are held in double precision at once
 
 _Look = Callable[[int, np.ndarray], np.ndarray]  # lens and directions (h, w, 3) to pixels (h, w, C)
 
@@ -95,12 +94,12 @@ class Stitcher:
     def _joined(self, width: int, channels: int, look: _Look) -> np.ndarray:
         """The panorama (width / 2, width, C) uint8 joined from all lenses."""
         parts = []
-        for top, rays in _bands(width):
+        for rows, rays in erp_bands(np.arange(width), width):
             joined = np.zeros((*rays.shape[:2], channels), np.float32)
             for lens, share in enumerate(self._weights(rays)):
                 columns = np.flatnonzero((share > 0).any(axis=0))
                 scale = _DEPTH_GRID_WIDTH / width
-                places = np.meshgrid(columns + 0.5, np.arange(top, top + len(rays)) + 0.5)
+                places = np.meshgrid(columns + 0.5, np.arange(rows.start, rows.stop) + 0.5)
                 across, down = ((at * scale - 0.5 + PAD).astype(np.float32) for at in places)
                 moved = cv2.remap(self._offsets[lens], across, down, cv2.INTER_CUBIC)
                 part = look(lens, rays[:, columns] + moved).reshape(*moved.shape[:2], channels)
@@ -134,15 +133,6 @@ def _panorama_lookup(erp: np.ndarray, how: int) -> _Look:
         return cv2.remap(padded, maps[..., 0], maps[..., 1], how)
 
     return look
-
-
-def _bands(width: int) -> Iterator[tuple[int, np.ndarray]]:
-    """First row and directions (h, width, 3) of parts of a panorama."""
-    height = width // 2
-    for top in range(0, height, _ROWS_AT_ONCE):
-        rows = np.arange(top, min(top + _ROWS_AT_ONCE, height)) + 0.5
-        pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, rows), axis=-1)
-        yield top, bearings_from_erp(pixels, width, height)
 
 
 def seen_from_the_middle(reconstruction: Reconstruction) -> Reconstruction:

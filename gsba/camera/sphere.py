@@ -7,7 +7,7 @@ from typing import ParamSpec, TypeVar
 
 import numpy as np
 
-_BAND_ROWS = 256  # rows whose bearings are held in double precision at once
+_BAND_ROWS = 256  # rows whose coordinates are held in double precision at once
 _ROWS_AT_ONCE = 64  # rows moved at once, so that they stay in the cache
 
 
@@ -21,12 +21,18 @@ def bearings_from_erp(pixels: np.ndarray, width: int, height: int) -> np.ndarray
     return np.stack([c * np.sin(longitude), -np.sin(latitude), c * np.cos(longitude)], axis=-1)
 
 
-def erp_bands(columns: np.ndarray, width: int) -> Iterator[tuple[int, np.ndarray]]:
-    """Yield first row and bearings (h, C, 3) of bands of columns (C,) of a panorama."""
-    for top in range(0, width // 2, _BAND_ROWS):
-        rows = np.arange(top, min(top + _BAND_ROWS, width // 2)) + 0.5
-        pixels = np.stack(np.meshgrid(columns + 0.5, rows), axis=-1)
-        yield top, bearings_from_erp(pixels, width, width // 2)
+def pixel_bands(columns: np.ndarray, height: int) -> Iterator[tuple[slice, np.ndarray]]:
+    """Yield rows and centres (h, C, 2) of the pixels of bands of a picture's columns (C,)."""
+    for top in range(0, height, _BAND_ROWS):
+        rows = slice(top, min(top + _BAND_ROWS, height))
+        centres = np.meshgrid(columns + 0.5, np.arange(rows.start, rows.stop) + 0.5)
+        yield rows, np.stack(centres, axis=-1)
+
+
+def erp_bands(columns: np.ndarray, width: int) -> Iterator[tuple[slice, np.ndarray]]:
+    """Yield rows and bearings (h, C, 3) of bands of columns (C,) of a panorama."""
+    for rows, pixels in pixel_bands(columns, width // 2):
+        yield rows, bearings_from_erp(pixels, width, width // 2)
 
 
 def erp_from_bearings(bearings: np.ndarray, width: int, height: int) -> np.ndarray:

@@ -2,12 +2,17 @@
 
 import numpy as np
 
-from gsba.camera.sphere import around_sphere, bearings_from_erp, erp_from_bearings, table
+from gsba.camera.sphere import (
+    around_sphere,
+    bearings_from_erp,
+    erp_from_bearings,
+    pixel_bands,
+    table,
+)
 
 PAD = 4  # pixels of wrap-around: the support of bicubic sampling, and more
 _FIELD_GRID_WIDTH = 256  # width of the grid on which a field is evaluated; its shortest wave is 18
 # degrees or more
-_ROWS_AT_ONCE = 256  # rows whose coordinates are held in double precision at once
 
 
 def straightened(erp: np.ndarray, correction: tuple[float, ...]) -> np.ndarray:
@@ -56,14 +61,12 @@ def _maps(correction: tuple[float, ...], width: int, height: int) -> np.ndarray:
 
     offsets = _padded_offsets(correction)
     out = np.empty((2, height, width), np.float32)
-    columns, scale = np.arange(width) + 0.5, offsets.shape[1] - 2 * PAD
-    for first in range(0, height, _ROWS_AT_ONCE):
-        rows = np.arange(first, min(first + _ROWS_AT_ONCE, height)) + 0.5
-        pixels = np.stack(np.meshgrid(columns, rows), axis=-1)
+    scale = offsets.shape[1] - 2 * PAD
+    for rows, pixels in pixel_bands(np.arange(width), height):
         places = (pixels * (scale / width) - 0.5 + PAD).astype(np.float32)
         moved = cv2.remap(offsets, places[..., 0], places[..., 1], cv2.INTER_CUBIC)
         found = erp_from_bearings(bearings_from_erp(pixels, width, height) + moved, width, height)
-        out[:, first : first + len(rows)] = np.moveaxis(found - 0.5 + PAD, -1, 0)
+        out[:, rows] = np.moveaxis(found - 0.5 + PAD, -1, 0)
     return out
 
 

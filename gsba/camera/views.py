@@ -16,7 +16,13 @@ from gsba.camera.equiangular import Grid, around_squares, shrunk
 from gsba.camera.fisheye import project
 from gsba.camera.lens import Lenses
 from gsba.camera.rig import RIG_R_FACE, CubeRig
-from gsba.camera.sphere import around_sphere, dense_enough, erp_from_bearings, low_passed
+from gsba.camera.sphere import (
+    around_sphere,
+    dense_enough,
+    erp_from_bearings,
+    low_passed,
+    pixel_bands,
+)
 from gsba.camera.straighten import PAD
 from gsba.geometry import pose
 from gsba.log import GsbaError
@@ -25,7 +31,6 @@ from gsba.types import FACES, Fisheye, PictureFormat, Reconstruction
 _FAR_DEPTH = 1e9  # map units: depth from which both lenses see alike
 _MAX_OVERSAMPLING = 1.5  # largest ratio of a picture's density to a view's: beyond it, detail
 # aliases
-_ROWS_AT_ONCE = 128  # rows whose coordinates are held in double precision at once
 _NODES_ACROSS_FACE = 33  # nodes across a face of the interpolated offsets, which vary over tens of
 # degrees
 
@@ -352,9 +357,7 @@ class ViewCutter:
     ) -> np.ndarray:
         """OpenCV pixels (2, height, width) float32 of a view; `places`: directions to pixels."""
         maps = np.empty((2, view.height, view.width), np.float32)
-        for top in range(0, view.height, _ROWS_AT_ONCE):
-            rows = np.arange(top, min(top + _ROWS_AT_ONCE, view.height)) + 0.5
-            pixels = np.stack(np.meshgrid(np.arange(view.width) + 0.5, rows), axis=-1)
+        for rows, pixels in pixel_bands(np.arange(view.width), view.height):
             nodes = pixels * ((_NODES_ACROSS_FACE - 1) / np.array([view.width, view.height]))
             nodes = nodes.astype(np.float32)
             moved = cv2.remap(
@@ -362,7 +365,7 @@ class ViewCutter:
                 borderMode=cv2.BORDER_REPLICATE,
             )  # fmt: skip
             found = places(view.rays(pixels) @ self._turn.T + moved)
-            maps[:, top : top + len(rows)] = np.moveaxis(found, -1, 0)
+            maps[:, rows] = np.moveaxis(found, -1, 0)
         return maps
 
 

@@ -86,7 +86,7 @@ def _chosen_by_odometry(
     if path.is_file() and (out / "extract.json").is_file() and not fresh:
         return path  # chosen before
     settings = validated({"odometry": {} if frames is None else {"max_frames": frames}}).odometry
-    panoramas = odometry.without_carrier(odometry.of_video(video, settings.width, None, *part))
+    panoramas = odometry.without_carrier(odometry.of_video(video, from_s=part[0], to_s=part[1]))
     found = odometry.track_panoramas(panoramas)
     if not found.usable():
         raise GsbaError(
@@ -145,8 +145,10 @@ Poses = Annotated[
     ),
 ]
 Width = Annotated[
-    int | None,
-    typer.Option(help="Width in pixels of the panoramas that odometry uses; default: 800."),
+    int,
+    typer.Option(
+        min=256, max=4096, help="Width in pixels of the panoramas that odometry uses; even."
+    ),
 ]
 
 
@@ -166,7 +168,7 @@ def track(
         str,
         typer.Option(help="auto: mask the carrier of the camera; none; or a mask, white = use."),
     ] = "auto",
-    width: Width = None,
+    width: Width = 800,
     fps: Annotated[float | None, typer.Option(help="Frame rate of a folder without times.")] = None,
     timestamps: Annotated[
         Path | None, typer.Option(help="File with the times of a folder's frames.", metavar="FILE")
@@ -175,13 +177,13 @@ def track(
 ) -> None:
     """Estimate a pose for every frame by visual odometry."""
     from gsba import odometry
-    from gsba.config_file import validated
     from gsba.odometry.walk import write_odometry
     from gsba.video import is_video
 
     if out.is_dir():
         raise GsbaError(f"{out}: is a folder; --out names the trajectory file to write")
-    width = validated({"odometry": {} if width is None else {"width": width}}).odometry.width
+    if width % 2:
+        raise GsbaError(f"--width {width}: use an even number")
     mask = None if masks in ("auto", "none") else Path(masks)
     if is_video(frames):
         if fps is not None or timestamps is not None:

@@ -10,7 +10,7 @@ from gsba.cli.app import Run, command
 from gsba.log import GsbaError
 
 if TYPE_CHECKING:
-    from gsba.config import SplatSettings
+    from gsba.splat.options import TrainingOptions
 
 Iterations = Annotated[int | None, typer.Option(help="Training steps of one view each.")]
 FaceSize = Annotated[int | None, typer.Option(help="Width of a cube face in pixels.")]
@@ -40,7 +40,7 @@ def train(
     train_on(run, splat_settings(iterations, face_size, backend, max_gaussians), lpips or [])
 
 
-def train_on(run: Path, settings: "SplatSettings", lpips: Sequence[Path] = ()) -> None:
+def train_on(run: Path, settings: "TrainingOptions", lpips: Sequence[Path] = ()) -> None:
     """Train a splat on a run's refined poses, and print how good it is and where it lies."""
     results = _compare(run, {}, settings, run / "splat", lpips)
     mean = results["refined"].mean
@@ -95,7 +95,7 @@ def render(
 
 
 def evaluate_splat(
-    run: Path, against: Sequence[Path], settings: "SplatSettings", lpips: Sequence[Path]
+    run: Path, against: Sequence[Path], settings: "TrainingOptions", lpips: Sequence[Path]
 ) -> None:
     """Train splats on the run's poses and on others, and compare their held-out frames."""
     from gsba.evaluate.splats import format_table
@@ -116,7 +116,7 @@ def evaluate_splat(
 
 
 def _compare(
-    run: Path, others, settings: "SplatSettings", out: Path, lpips_weights: Sequence[Path]
+    run: Path, others, settings: "TrainingOptions", out: Path, lpips_weights: Sequence[Path]
 ):
     """Results of splats on the run's poses ("refined") and on others, by name."""
     from gsba.camera.views import Optics
@@ -143,16 +143,16 @@ def _compare(
 
 def splat_settings(
     iterations: int | None, face_size: int | None, backend: str, max_gaussians: int | None = None
-) -> "SplatSettings":
+) -> "TrainingOptions":
     """Settings with the options of the command line. Raises GsbaError: a value out of range."""
     from pydantic import ValidationError
 
-    from gsba.config import SplatSettings
+    from gsba.splat.options import TrainingOptions
 
     options = {"iterations": iterations, "face_size": face_size, "backend": backend}
     options["max_gaussians"] = max_gaussians
     try:
-        return SplatSettings.model_validate({k: v for k, v in options.items() if v is not None})
+        return TrainingOptions.model_validate({k: v for k, v in options.items() if v is not None})
     except ValidationError as error:
         first = error.errors()[0]
         option = str(first["loc"][0]).replace("_", "-")

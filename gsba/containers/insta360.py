@@ -11,6 +11,7 @@ import os
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from enum import IntEnum
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -28,11 +29,22 @@ _MAX_RECORDS = 256
 _MAX_METADATA_BYTES = 8 << 20
 _MAX_RECORD_BYTES = 1 << 29  # seven hours of a gyro at 1 kHz
 _BINARY, _PROTOBUF = 0, 1  # formats of records
-_DIRECTORY, _METADATA, _GYRO, _EXPOSURES, _GPS, _BACK_EXPOSURES = 0, 1, 3, 4, 7, 12
 
-_SERIAL, _MODEL, _FIRMWARE, _CREATED = 1, 2, 3, 7  # fields of the metadata
-_SIZE, _FIRST_FRAME, _READOUT_MS, _WINDOW, _GYRO_DELAY_MS = 19, 24, 25, 27, 28
-_RAW_GYRO, _GYRO_RANGES, _TRACK_ORDER = 62, 65, 80
+
+class _Record(IntEnum):
+    """Numbers of records."""
+
+    DIRECTORY, METADATA, GYRO, EXPOSURES, GPS, BACK_EXPOSURES = 0, 1, 3, 4, 7, 12
+
+
+class _Field(IntEnum):
+    """Fields of the metadata."""
+
+    SERIAL, MODEL, FIRMWARE, CREATED = 1, 2, 3, 7
+    SIZE, FIRST_FRAME, READOUT_MS, WINDOW, GYRO_DELAY_MS = 19, 24, 25, 27, 28
+    RAW_GYRO, GYRO_RANGES, TRACK_ORDER = 62, 65, 80
+
+
 _LENSES = 111, 54, 53, 5, 112, 56, 55, 17  # best first: current ones, then factory ones
 
 _RAW = np.dtype([("time", "<i8"), ("values", "<u2", 6)])  # microseconds; 32768 is zero
@@ -199,8 +211,12 @@ def _read(path: Path, file: BinaryIO, telemetry: bool) -> Insta360Trailer | None
         contents.notes.append(
             f"damaged: the trailer claims {size:,} of the file's {length:,} bytes"
         )
-    wanted = {_METADATA}
-    wanted |= {_GYRO, _EXPOSURES, _GPS, _BACK_EXPOSURES} if telemetry else set()
+    wanted = {_Record.METADATA}
+    wanted |= (
+        {_Record.GYRO, _Record.EXPOSURES, _Record.GPS, _Record.BACK_EXPOSURES}
+        if telemetry
+        else set()
+    )
     _find_records(file, start, length - _HEADER.size, wanted, contents)
     if not contents.records:
         raise GsbaError(f"{path}: its Insta360 trailer is damaged: no record can be read")
@@ -230,7 +246,9 @@ def _find_records(
         first = at - _FOOTER.size - size
         if first < start or form > 2:
             break
-        is_directory = (form, number) == (_BINARY, _DIRECTORY) and size and not size % _ENTRY.size
+        is_directory = (
+            (form, number) == (_BINARY, _Record.DIRECTORY) and size and not size % _ENTRY.size
+        )
         if is_directory and _read_listed(file, start, first, size, wanted, contents):
             return  # such files have gaps between records, which cannot be read backwards
         if number in wanted:
@@ -263,7 +281,7 @@ def _add(file: BinaryIO, start: int, size: int, number: int, contents: _Contents
     """Read a record, unless one with this number was read before."""
     if number in contents.records or not size:
         return
-    if size > (_MAX_METADATA_BYTES if number == _METADATA else _MAX_RECORD_BYTES):
+    if size > (_MAX_METADATA_BYTES if number == _Record.METADATA else _MAX_RECORD_BYTES):
         contents.notes.append(f"damaged: record {number} claims {size:,} bytes")
         return
     contents.records[number] = _bytes_at(file, start, size)
@@ -272,41 +290,43 @@ def _add(file: BinaryIO, start: int, size: int, number: int, contents: _Contents
 def _trailer(version: int, contents: _Contents) -> Insta360Trailer:
     """Trailer from its records."""
     records, notes = contents.records, contents.notes
-    values, whole = read_message(records.get(_METADATA, b""))
+    values, whole = read_message(records.get(_Record.METADATA, b""))
     if not whole:
         notes.append("damaged: the end of the metadata cannot be read")
-    found = values.get(_RAW_GYRO)
+    found = values.get(_Field.RAW_GYRO)
     raw = bool(found) if isinstance(found, int) else None
-    found = _gyro(records.get(_GYRO, b""), raw, values, notes)
+    found = _gyro(records.get(_Record.GYRO, b""), raw, values, notes)
     scaled_ms = raw is False if found is None else found.milliseconds
     tick_s = 1e-3 if scaled_ms else 1e-6
-    start = first_frame = values.get(_FIRST_FRAME)
+    start = first_frame = values.get(_Field.FIRST_FRAME)
     if not isinstance(first_frame, int) or not 0 <= first_frame < _MAX_TICK:
         start = first_frame = None
-    delay_s = 1e-3 * (_real(values, _GYRO_DELAY_MS) or 0.0)
+    delay_s = 1e-3 * (_real(values, _Field.GYRO_DELAY_MS) or 0.0)
     if start is None and found is not None:
         start, delay_s = found.ticks[0], 0.0
-    readout_ms = _real(values, _READOUT_MS)
+    readout_ms = _real(values, _Field.READOUT_MS)
     gyro = None
     if found is not None and start is not None:
         times = (found.ticks - start) * tick_s - delay_s
         gyro = GyroRecord(times, found.rates, found.accelerations)
     return Insta360Trailer(
         version=version,
-        serial=_text(values, _SERIAL),
-        model=_text(values, _MODEL),
-        firmware=_text(values, _FIRMWARE),
+        serial=_text(values, _Field.SERIAL),
+        model=_text(values, _Field.MODEL),
+        firmware=_text(values, _Field.FIRMWARE),
         lens_strings=tuple(text for key in _LENSES if (text := _text(values, key, 4096))),
         window=_window(values),
-        picture_size=_size(values, _SIZE, 1, 2),
-        back_track_first=values.get(_TRACK_ORDER) == 1,
+        picture_size=_size(values, _Field.SIZE, 1, 2),
+        back_track_first=values.get(_Field.TRACK_ORDER) == 1,
         first_frame_s=None if first_frame is None else first_frame * tick_s,
         created_unix_s=_creation_time(values),
         readout_s=1e-3 * readout_ms if readout_ms is not None and 0 < readout_ms < 1e3 else None,
         gyro=gyro,
-        exposures=_exposures(records.get(_EXPOSURES, b""), start, tick_s, "front", notes),
-        back_exposures=_exposures(records.get(_BACK_EXPOSURES, b""), start, tick_s, "back", notes),
-        gps=_gps(records.get(_GPS, b""), notes),
+        exposures=_exposures(records.get(_Record.EXPOSURES, b""), start, tick_s, "front", notes),
+        back_exposures=_exposures(
+            records.get(_Record.BACK_EXPOSURES, b""), start, tick_s, "back", notes
+        ),
+        gps=_gps(records.get(_Record.GPS, b""), notes),
         notes=tuple(notes),
     )
 
@@ -327,7 +347,7 @@ def _gyro(
     """Readings of a record, in the layout that the metadata states, or else in the other one."""
     if not record:
         return None
-    ranges = read_message(values.get(_GYRO_RANGES, b""))[0]
+    ranges = read_message(values.get(_Field.GYRO_RANGES, b""))[0]
     for is_raw in (False, True) if raw is False else (True, False):
         rows = np.frombuffer(record, _RAW if is_raw else _SCALED, len(record) // _row(is_raw))
         ticks, (forces, turns) = rows["time"], np.split(rows["values"], 2, axis=1)
@@ -455,10 +475,10 @@ def _size(values: Mapping[int, Any], key: int, across: int, down: int) -> tuple[
 
 
 def _window(values: Mapping[int, Any]) -> SensorWindow | None:
-    source, size = _size(values, _WINDOW, 1, 2), _size(values, _WINDOW, 3, 4)
+    source, size = _size(values, _Field.WINDOW, 1, 2), _size(values, _Field.WINDOW, 3, 4)
     if source is None or size is None or size[0] > source[0] or size[1] > source[1]:
         return None
-    inner = read_message(values[_WINDOW])[0]
+    inner = read_message(values[_Field.WINDOW])[0]
     right, down = (found if isinstance(found := inner.get(key, 0), int) else 0 for key in (5, 6))
     if abs(right) > source[0] or abs(down) > source[1]:
         return None
@@ -467,7 +487,7 @@ def _window(values: Mapping[int, Any]) -> SensorWindow | None:
 
 def _creation_time(values: Mapping[int, Any]) -> float | None:
     """Creation time in seconds since 1970, of a field in seconds or milliseconds; None = none."""
-    found = values.get(_CREATED)
+    found = values.get(_Field.CREATED)
     if not isinstance(found, int) or found <= 0 or found > 1000 * _YEAR_2100:
         return None
     return float(found) if found < _YEAR_2100 else 1e-3 * found

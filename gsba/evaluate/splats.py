@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gsba.camera.views import ONE_EYE, Optics
-from gsba.config import SplatSettings
 from gsba.disk import write_image, write_text
 from gsba.evaluate import charts
 from gsba.evaluate.trajectory import aligned_rows
@@ -20,6 +19,7 @@ from gsba.log import GsbaError
 from gsba.similarity import NoSimilarityError, pose_similarity
 from gsba.splat.backend import Backend
 from gsba.splat.gaussians import Gaussians, write_ply
+from gsba.splat.options import TrainingOptions
 from gsba.splat.pictures import render_views
 from gsba.splat.scene import (
     Faces,
@@ -93,7 +93,7 @@ def compare(
     reconstruction: Reconstruction,
     frames: FrameSet,
     sources: Mapping[str, np.ndarray],
-    settings: SplatSettings,
+    settings: TrainingOptions,
     backend: Backend,
     out: Path,
     lpips: Distance | None = None,
@@ -166,7 +166,7 @@ def _beside(poses: np.ndarray, usable: np.ndarray, own: np.ndarray) -> np.ndarra
 
 
 def _write(
-    out: Path, results: Mapping[str, SourceResult], settings: SplatSettings, with_lpips: bool
+    out: Path, results: Mapping[str, SourceResult], settings: TrainingOptions, with_lpips: bool
 ) -> None:
     """Write table, numbers and curves."""
     lines = format_table(results)
@@ -181,7 +181,7 @@ def train_and_measure(
     reconstruction: Reconstruction,
     frames: FrameSet,
     source: PosedViews,
-    settings: SplatSettings,
+    settings: TrainingOptions,
     backend: Backend,
     out: Path,
     key: str,

@@ -5,13 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsba.camera.fisheye import Rig, rotation_of, unproject
-from gsba.camera.sphere import erp_from_bearings, table
+from gsba.camera.sphere import erp_from_bearings, pixel_bands, table
 from gsba.export.pictures import FrameWriter, Shown
 from gsba.frames.dual_fisheye import load_raw
 from gsba.log import GsbaError
 from gsba.types import Fisheye, PictureFormat
 
-_ROWS_AT_ONCE = 256  # image rows whose coordinates are held in double precision
 SEEN_DEG = 90.0  # largest angle from a lens's axis: beyond, COLMAP's fisheye cameras give no ray or
 # a wrong one, and gsplat renders nothing
 
@@ -53,13 +52,10 @@ def _circle(lens: Fisheye, width: int, height: int) -> tuple[np.ndarray, np.ndar
     """Mask (h, w) bool of what a lens sees within SEEN_DEG; the panorama's pixel, (h, w) int32."""
     seen = np.empty((lens.height, lens.width), bool)
     pixels = np.empty((lens.height, lens.width), np.int32)
-    for top in range(0, lens.height, _ROWS_AT_ONCE):
-        rows = np.arange(top, min(top + _ROWS_AT_ONCE, lens.height)) + 0.5
-        grid = np.meshgrid(np.arange(lens.width) + 0.5, rows)
-        directions = unproject(lens, np.stack(grid, axis=-1))
-        part = slice(top, top + len(rows))
-        seen[part] = directions @ rotation_of(lens)[:, 2] > np.cos(np.deg2rad(SEEN_DEG))
+    for rows, centres in pixel_bands(np.arange(lens.width), lens.height):
+        directions = unproject(lens, centres)
+        seen[rows] = directions @ rotation_of(lens)[:, 2] > np.cos(np.deg2rad(SEEN_DEG))
         places = erp_from_bearings(directions.astype(np.float32), width, height)
         u, v = np.moveaxis(np.minimum(places, (width - 1, height - 1)), -1, 0).astype(int)
-        pixels[part] = v * width + u
+        pixels[rows] = v * width + u
     return seen, pixels

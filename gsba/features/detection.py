@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from gsba.camera.rig import RIG_R_FACE, CubeRig, owner_faces
-from gsba.config import FeatureSettings, MatchingSettings, RefineSettings
+from gsba.config import FeatureSettings, RefineSettings
 from gsba.disk import concatenated
 from gsba.types import FACES, Features, Keypoints
 
@@ -34,12 +34,9 @@ TRAITS = {
 }
 
 
-def search_settings(settings: RefineSettings) -> MatchingSettings:
-    """Settings of the descriptor search, with the extractor's limits where none are given."""
-    chosen, traits = settings.matching, TRAITS[settings.features.extractor]
-    measured = {"min_similarity": traits.min_similarity, "max_ratio": traits.max_ratio}
-    missing = {name: value for name, value in measured.items() if getattr(chosen, name) is None}
-    return chosen.model_copy(update=missing)
+def traits_of(settings: RefineSettings) -> ExtractorTraits:
+    """Traits of a run's extractor."""
+    return TRAITS[settings.features.extractor]
 
 
 # Noise of SIFT keypoints along each axis, face pixels: of the smallest

@@ -7,7 +7,14 @@ import numpy as np
 
 from gsba.camera.equiangular import Grid, around_squares, shrunk
 from gsba.camera.rig import CubeRig
-from gsba.camera.sphere import around_sphere, dense_enough, erp_from_bearings, low_passed, table
+from gsba.camera.sphere import (
+    around_sphere,
+    dense_enough,
+    erp_from_bearings,
+    low_passed,
+    pixel_bands,
+    table,
+)
 from gsba.camera.straighten import PAD
 from gsba.config import CubemapSettings
 from gsba.frames.masks import load_usable
@@ -16,7 +23,6 @@ from gsba.frames.track_pairs import load_squares
 from gsba.types import FACES, FrameSet, PictureFormat
 
 HFOV_DEG = 96.0  # of a face: keypoints near an edge are whole on one of both faces
-_ROWS_AT_ONCE = 256  # rows whose coordinates are held in double precision at once
 
 
 def rig_for(kind: PictureFormat, settings: CubemapSettings) -> CubeRig:
@@ -28,12 +34,11 @@ def rig_for(kind: PictureFormat, settings: CubemapSettings) -> CubeRig:
     `max_face_size`.
     """
     if not kind.panoramic:
-        most = settings.face_size or settings.max_face_size
-        return CubeRig(min(kind.native_face_size, most), np.pi / 2)
+        return CubeRig(min(kind.native_face_size, settings.max_face_size), np.pi / 2)
     hfov = np.deg2rad(HFOV_DEG)
     native = 2 * kind.width / (2 * np.pi) * np.tan(hfov / 2)
     wanted = max(round(settings.oversampling * native), settings.min_face_size)
-    size = settings.face_size or min(wanted, settings.max_face_size)
+    size = min(wanted, settings.max_face_size)
     return CubeRig(size, hfov)
 
 
@@ -137,11 +142,8 @@ def _grid_maps(rig: CubeRig, grid: Grid) -> np.ndarray:
 
 
 def _maps_by(rig: CubeRig, places: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    centres = np.arange(rig.size) + 0.5
     maps = np.empty((len(FACES), 2, rig.size, rig.size), np.float32)
     for face in range(len(FACES)):
-        for top in range(0, rig.size, _ROWS_AT_ONCE):
-            grid = np.stack(np.meshgrid(centres, centres[top : top + _ROWS_AT_ONCE]), axis=-1)
-            found = places(rig.bearings(grid, face))
-            maps[face, :, top : top + _ROWS_AT_ONCE] = np.moveaxis(found, -1, 0)
+        for rows, centres in pixel_bands(np.arange(rig.size), rig.size):
+            maps[face][:, rows] = np.moveaxis(places(rig.bearings(centres, face)), -1, 0)
     return maps

@@ -85,8 +85,8 @@ def clear_of_seam(height: int, rig: Rig) -> np.ndarray:
 @table(maxsize=2)
 def _clear_of_seam(height: int, axes: tuple[tuple[float, ...], ...]) -> np.ndarray:
     clear, of_lenses = np.empty((height, 2 * height), bool), np.array(axes)
-    for top, bearings in erp_bands(np.arange(2 * height), 2 * height):
-        clear[top : top + len(bearings)] = seam_sines(bearings, of_lenses) > np.sin(SEAM)
+    for rows, bearings in erp_bands(np.arange(2 * height), 2 * height):
+        clear[rows] = seam_sines(bearings, of_lenses) > np.sin(SEAM)
     clear.setflags(write=False)
     return clear
 
@@ -97,15 +97,15 @@ def _parts(rig: Rig, width: int) -> tuple[_Part, ...]:
     height, axes, faced = width // 2, optical_axes(rig), np.empty((width // 2, width), np.uint8)
     # a column that lies exactly on a seam goes whole to the lens on its right
     aside = np.arange(width) + 1e-6
-    for top, bearings in erp_bands(aside, width):
-        faced[top : top + len(bearings)] = facing(bearings, axes)
+    for rows, bearings in erp_bands(aside, width):
+        faced[rows] = facing(bearings, axes)
     parts = []
     for number, lens in enumerate(rig):
         own = faced == number
         columns = np.flatnonzero(own.any(axis=0))
         places = np.empty((height, len(columns), 2), np.float32)
-        for top, bearings in erp_bands(columns, width):
-            places[top : top + len(bearings)] = project(lens, bearings) - 0.5
+        for rows, bearings in erp_bands(columns, width):
+            places[rows] = project(lens, bearings) - 0.5
         own = own[:, columns]
         parts.append(_Part(columns, places, None if own.all() else own))
     return tuple(parts)

@@ -6,18 +6,27 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta, timezone
+from enum import IntEnum
 from pathlib import Path
 from typing import Any
 
 from gsba.log import GsbaError
 
-# Tags of Exif 3.0 (CIPA DC-008), sections 4.6.5 and 4.6.6.
-_MAKE, _MODEL = 0x010F, 0x0110
-_EXIF_DIRECTORY, _GPS_DIRECTORY = 0x8769, 0x8825
-_TAKEN, _OFFSET, _SUBSECOND = 0x9003, 0x9011, 0x9291
-_FOCAL_35MM, _LENS = 0xA405, 0xA434
-_LATITUDE_REF, _LATITUDE, _LONGITUDE_REF, _LONGITUDE, _ALTITUDE_REF, _ALTITUDE = range(1, 7)
-_GPS_TIME, _STATUS, _DOP, _GPS_DATE, _ERROR = 7, 9, 11, 29, 31
+
+class _Tag(IntEnum):
+    """Tags of Exif 3.0 (CIPA DC-008), section 4.6.5."""
+
+    MAKE, MODEL = 0x010F, 0x0110
+    EXIF_DIRECTORY, GPS_DIRECTORY = 0x8769, 0x8825
+    TAKEN, OFFSET, SUBSECOND = 0x9003, 0x9011, 0x9291
+    FOCAL_35MM, LENS = 0xA405, 0xA434
+
+
+class _PositionTag(IntEnum):
+    """Tags of the GPS directory, section 4.6.6."""
+
+    LATITUDE_REF, LATITUDE, LONGITUDE_REF, LONGITUDE, ALTITUDE_REF, ALTITUDE = range(1, 7)
+    TIME, STATUS, DOP, DATE, ERROR = 7, 9, 11, 29, 31
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +69,7 @@ def read_exif(path: Path) -> ExifTags:
             warnings.simplefilter("error", UserWarning)  # Pillow reports damage as warnings
             with Image.open(path) as picture:  # reads no pixels
                 exif = picture.getexif()
-                shot, gps = exif.get_ifd(_EXIF_DIRECTORY), exif.get_ifd(_GPS_DIRECTORY)
+                shot, gps = exif.get_ifd(_Tag.EXIF_DIRECTORY), exif.get_ifd(_Tag.GPS_DIRECTORY)
     except UnidentifiedImageError:
         raise GsbaError(f"{path}: cannot be read as a picture") from None
     except OSError as error:
@@ -68,9 +77,9 @@ def read_exif(path: Path) -> ExifTags:
     except Exception:  # the parser raises errors of many types
         raise ValueError(f"{path}: damaged EXIF data") from None
     try:
-        named = [text for text in (_text(exif, _MAKE), _text(exif, _MODEL)) if text]
-        focal = _number(shot, _FOCAL_35MM)
-        lens = _text(shot, _LENS)
+        named = [text for text in (_text(exif, _Tag.MAKE), _text(exif, _Tag.MODEL)) if text]
+        focal = _number(shot, _Tag.FOCAL_35MM)
+        lens = _text(shot, _Tag.LENS)
         return ExifTags(*_taken(shot), _gps_tag(gps), " ".join(named), focal, lens)
     except (TypeError, IndexError, AttributeError, ZeroDivisionError):
         raise ValueError(f"{path}: damaged EXIF data") from None
@@ -79,11 +88,11 @@ def read_exif(path: Path) -> ExifTags:
 def _taken(tags: Mapping[int, Any]) -> tuple[float | None, bool, bool]:
     """Time of DateTimeOriginal with its fraction; whether zone and fraction are given."""
     try:
-        moment = datetime.strptime(_text(tags, _TAKEN), "%Y:%m:%d %H:%M:%S")
+        moment = datetime.strptime(_text(tags, _Tag.TAKEN), "%Y:%m:%d %H:%M:%S")
     except ValueError:  # absent, or blank as written by cameras without a clock
         return None, False, False
-    zone = _zone(_text(tags, _OFFSET))
-    digits = _text(tags, _SUBSECOND)
+    zone = _zone(_text(tags, _Tag.OFFSET))
+    digits = _text(tags, _Tag.SUBSECOND)
     fraction = float(f"0.{digits}") if digits.isascii() and digits.isdigit() else None
     whole = moment.replace(tzinfo=zone or UTC).timestamp()
     return whole + (fraction or 0.0), zone is not None, fraction is not None
@@ -100,28 +109,34 @@ def _zone(text: str) -> timezone | None:
 
 def _gps_tag(gps: Mapping[int, Any]) -> GpsTag | None:
     """The position of a GPS directory, if it is valid."""
-    if not {_LATITUDE, _LONGITUDE} <= gps.keys() or _text(gps, _STATUS).upper() == "V":
+    if (
+        not {_PositionTag.LATITUDE, _PositionTag.LONGITUDE} <= gps.keys()
+        or _text(gps, _PositionTag.STATUS).upper() == "V"
+    ):
         return None
-    latitude, longitude = _sexagesimal(gps[_LATITUDE]), _sexagesimal(gps[_LONGITUDE])
-    latitude *= -1 if _text(gps, _LATITUDE_REF).upper() == "S" else 1
-    longitude *= -1 if _text(gps, _LONGITUDE_REF).upper() == "W" else 1
+    latitude, longitude = (
+        _sexagesimal(gps[_PositionTag.LATITUDE]),
+        _sexagesimal(gps[_PositionTag.LONGITUDE]),
+    )
+    latitude *= -1 if _text(gps, _PositionTag.LATITUDE_REF).upper() == "S" else 1
+    longitude *= -1 if _text(gps, _PositionTag.LONGITUDE_REF).upper() == "W" else 1
     valid = math.isfinite(latitude + longitude) and abs(latitude) <= 90 and abs(longitude) <= 180
     if not valid or latitude == longitude == 0:  # cameras write zeros before the first fix
         return None
-    altitude = _number(gps, _ALTITUDE, -math.inf)
-    below = gps.get(_ALTITUDE_REF) in (1, b"\x01")
+    altitude = _number(gps, _PositionTag.ALTITUDE, -math.inf)
+    below = gps.get(_PositionTag.ALTITUDE_REF) in (1, b"\x01")
     unix_time = math.nan
     try:
-        day = datetime.strptime(_text(gps, _GPS_DATE), "%Y:%m:%d").replace(tzinfo=UTC)
-        unix_time = day.timestamp() + 3600 * _sexagesimal(gps[_GPS_TIME])
+        day = datetime.strptime(_text(gps, _PositionTag.DATE), "%Y:%m:%d").replace(tzinfo=UTC)
+        unix_time = day.timestamp() + 3600 * _sexagesimal(gps[_PositionTag.TIME])
     except (ValueError, KeyError):
         pass
     return GpsTag(
         latitude,
         longitude,
         -altitude if below else altitude,
-        _number(gps, _DOP),
-        _number(gps, _ERROR),
+        _number(gps, _PositionTag.DOP),
+        _number(gps, _PositionTag.ERROR),
         unix_time,
     )
 

@@ -6,6 +6,7 @@ equal ones takes the last where decoders take the first, and decodes a PNG for t
 import mmap
 import zlib
 from dataclasses import dataclass
+from enum import IntEnum
 from pathlib import Path
 
 import numpy as np
@@ -23,14 +24,17 @@ _EXIF = b"Exif\0\0"
 _XMP, _PNG_XMP = b"http://ns.adobe.com/xap/1.0/\0", b"XML:com.adobe.xmp\0"
 _TIFF_STARTS = b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"  # with +: BigTIFF
 _TIFF_TYPES = {1: 1, 3: 2, 4: 4, 16: 8}  # bytes of an unsigned number
-_WIDTH, _HEIGHT, _BITS, _COMPRESSION, _COLOURS = 256, 257, 258, 259, 262
-_ORIENTATION, _SAMPLES, _PLANES, _FORMAT = 274, 277, 284, 339
-_STRIPS, _STRIP_SIZES, _TILES, _TILE_SIZES = 273, 279, 324, 325
-_TIFF_PARTS = {_STRIPS, _STRIP_SIZES, _TILES, _TILE_SIZES}
-_TIFF_TAGS = {
-    *(_WIDTH, _HEIGHT, _BITS, _COMPRESSION, _COLOURS, _ORIENTATION, _SAMPLES, _PLANES, _FORMAT),
-    *_TIFF_PARTS,
-}
+
+
+class _TiffTag(IntEnum):
+    """Tags of a TIFF directory that are read."""
+
+    WIDTH, HEIGHT, BITS, COMPRESSION, COLOURS = 256, 257, 258, 259, 262
+    ORIENTATION, SAMPLES, PLANES, FORMAT = 274, 277, 284, 339
+    STRIPS, STRIP_SIZES, TILES, TILE_SIZES = 273, 279, 324, 325
+
+
+_TIFF_PARTS = {_TiffTag.STRIPS, _TiffTag.STRIP_SIZES, _TiffTag.TILES, _TiffTag.TILE_SIZES}
 _MAX_TAGS, _MAX_VALUES = 4096, 64  # largest number of tags of a directory; of values of a tag
 # that lists no parts
 _NOTHING = np.zeros(0, np.uint64)
@@ -235,26 +239,29 @@ def _webp(data: Bytes) -> Header:
 def _tiff(data: Bytes) -> Header:
     """TIFF 6.0, sections 2, 3 and 8, of its first picture."""
     tags = _directory(data)
-    bits, planes = tags.get(_BITS, (1,)), tags.get(_PLANES, (1,))[0]
-    colours, samples = tags.get(_COLOURS, (1,))[0], tags.get(_SAMPLES, (1,))[0]
+    bits, planes = tags.get(_TiffTag.BITS, (1,)), tags.get(_TiffTag.PLANES, (1,))[0]
+    colours, samples = tags.get(_TiffTag.COLOURS, (1,))[0], tags.get(_TiffTag.SAMPLES, (1,))[0]
     deep = max(bits) > 8
     what = ""
-    if any(form != 1 for form in tags.get(_FORMAT, (1,))):
+    if any(form != 1 for form in tags.get(_TiffTag.FORMAT, (1,))):
         what = "signed or floating-point numbers"
     elif deep and (set(bits) != {16} or colours not in (1, 2) or (planes != 1 and samples > 1)):
         what = f"{max(bits)} bits in an order of its own"
-    elif tags.get(_COMPRESSION, (1,))[0] not in _TIFF_COMPRESSIONS:
-        what = f"compression {tags[_COMPRESSION][0]}"
+    elif tags.get(_TiffTag.COMPRESSION, (1,))[0] not in _TIFF_COMPRESSIONS:
+        what = f"compression {tags[_TiffTag.COMPRESSION][0]}"
     if what:
         raise _Unsupported(f"a TIFF of {what}; save it as PNG, or as TIFF of 8 or 16 bits with LZW")
-    for parts, part_sizes in ((_STRIPS, _STRIP_SIZES), (_TILES, _TILE_SIZES)):
+    for parts, part_sizes in (
+        (_TiffTag.STRIPS, _TiffTag.STRIP_SIZES),
+        (_TiffTag.TILES, _TiffTag.TILE_SIZES),
+    ):
         starts, sizes = tags.get(parts, _NOTHING), tags.get(part_sizes, _NOTHING)
         starts, sizes = (values[: min(len(starts), len(sizes))] for values in (starts, sizes))
         if ((starts > len(data)) | (sizes > len(data) - np.minimum(starts, len(data)))).any():
             raise _Truncated
-    if _STRIPS not in tags and _TILES not in tags:
+    if _TiffTag.STRIPS not in tags and _TiffTag.TILES not in tags:
         raise ValueError
-    width, height = (int(tags.get(tag, (0,))[0]) for tag in (_WIDTH, _HEIGHT))
+    width, height = (int(tags.get(tag, (0,))[0]) for tag in (_TiffTag.WIDTH, _TiffTag.HEIGHT))
     return _shown("TIFF", width, height, _turn(tags), False)
 
 
@@ -273,14 +280,14 @@ def _directory(data: Bytes) -> dict[int, np.ndarray]:
     big = number(2, 2) == 43
     wide, of_count, entry = (8, 8, 20) if big else (4, 2, 12)
     first = number(8 if big else 4, wide)
-    tags: dict[int, np.ndarray] = {}
+    tags, wanted = dict[int, np.ndarray](), set(_TiffTag)
     num = number(first, of_count)
     if num > _MAX_TAGS:
         raise ValueError
     for k in range(num):
         at = first + of_count + k * entry
         tag, size, count = number(at, 2), _TIFF_TYPES.get(number(at + 2, 2)), number(at + 4, wide)
-        if tag not in _TIFF_TAGS or tag in tags or size is None or not count:
+        if tag not in wanted or tag in tags or size is None or not count:
             continue
         if count > _MAX_VALUES and tag not in _TIFF_PARTS:
             raise ValueError
@@ -302,5 +309,5 @@ def _orientation(exif: bytes) -> int:
 
 
 def _turn(tags: dict[int, np.ndarray]) -> int:
-    turn = int(tags.get(_ORIENTATION, (1,))[0])
+    turn = int(tags.get(_TiffTag.ORIENTATION, (1,))[0])
     return turn if 1 <= turn <= 8 else 1

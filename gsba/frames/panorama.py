@@ -6,14 +6,12 @@ import cv2
 import numpy as np
 
 from gsba.camera.rig import CubeRig, owner_faces
-from gsba.camera.sphere import around_sphere, bearings_from_erp
+from gsba.camera.sphere import around_sphere, erp_bands
 from gsba.camera.straighten import PAD
 from gsba.frames.masks import load_usable
 from gsba.frames.pixels import load_erp, load_faces
 from gsba.types import FACES, FrameSet, PictureFormat
-from gsba.types.records import slices
 
-_ROWS_AT_ONCE = 256  # rows whose coordinates are held in double precision at once
 _PADDING_PX = 3  # pixels copied from a face's neighbours: the support of bicubic sampling, and one
 
 
@@ -137,9 +135,7 @@ def _erp_maps(size: int, width: int) -> tuple[np.ndarray, np.ndarray]:
     of three; owners (H, W) uint8."""
     rig, shape = CubeRig(size, np.pi / 2), (width // 2, width)
     maps, owners = np.empty((2, *shape), np.float32), np.empty(shape, np.uint8)
-    for rows in slices(width // 2, _ROWS_AT_ONCE):
-        centres = np.meshgrid(np.arange(width) + 0.5, np.arange(rows.start, rows.stop) + 0.5)
-        bearings = bearings_from_erp(np.stack(centres, axis=-1), width, width // 2)
+    for rows, bearings in erp_bands(np.arange(width), width):
         owners[rows] = owner_faces(bearings)
         pixels = rig.project(bearings, owners[rows])
         corners = np.stack([owners[rows] % 2, owners[rows] // 2], axis=-1) * _shape(size)

@@ -141,8 +141,8 @@ def _decoded(paths: Sequence[Path], size: tuple[int, int], gray: bool) -> np.nda
 def _maps(grid: Grid, width: int) -> np.ndarray:
     """Places (2, width / 2, width) float32 of a panorama's pixels in a grid, OpenCV pixels."""
     maps = np.empty((2, width // 2, width), np.float32)
-    for top, bearings in erp_bands(np.arange(width), width):
-        maps[:, top : top + len(bearings)] = np.moveaxis(grid.places(bearings), -1, 0)
+    for rows, bearings in erp_bands(np.arange(width), width):
+        maps[:, rows] = np.moveaxis(grid.places(bearings), -1, 0)
     return maps
 
 

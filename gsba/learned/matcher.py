@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from gsba.camera.rig import owner_faces
-from gsba.config import MatchingSettings, RefineSettings
-from gsba.features.detection import FaceKeypoints
+from gsba.config import RefineSettings
+from gsba.features.detection import ExtractorTraits, FaceKeypoints
 from gsba.learned.interfaces import FaceNetwork
 from gsba.learned.weights import missing_library
 from gsba.matching.guided_search import (
@@ -65,7 +65,7 @@ class FaceMatcher:
         pair: tuple[int, int],
         f0_T_f1: np.ndarray,
         gate: Gate,
-        settings: MatchingSettings,
+        traits: ExtractorTraits,
         points_f0: np.ndarray | None = None,
     ) -> np.ndarray:
         first, second = (frames.features(frame) for frame in pair)

@@ -7,10 +7,9 @@ import gtsam
 import numpy as np
 
 from factors import PoseSystem, RobustLoss, tangent_basis
-from gsba.bundle.optimizer import marginal_covariances, optimize
+from gsba.bundle.optimizer import SolverOptions, marginal_covariances, optimize
 from gsba.bundle.pose_variables import X
 from gsba.camera.projections import Projection
-from gsba.config import SolverSettings
 from gsba.types.records import with_rows
 
 _BEHIND = 1e3  # whitened residual of a point that the picture cannot show
@@ -20,7 +19,7 @@ COARSE = (8.0,)  # scales of the loss, round by round, standard deviations, of a
 FINE = (2.0, 1.0)  # of the last one
 _MAX_POSITION_SIGMA = 0.05  # of a determined position, in median distances of points
 _MIN_NOISE = 0.5  # of keypoints, in their own standard deviations
-_SOLVER = SolverSettings(max_iterations=20, relative_tolerance=1e-5, absolute_tolerance=1e-2)
+_SOLVER = SolverOptions(max_iterations=20, relative_tolerance=1e-5, absolute_tolerance=1e-2)
 
 
 def K(camera: int) -> int:

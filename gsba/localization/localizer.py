@@ -12,7 +12,7 @@ from gsba.camera.cameras import Cameras
 from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.camera.rig import CubeRig, owner_faces
 from gsba.camera.sphere import dense_enough
-from gsba.features.detection import extract, gather, search_settings
+from gsba.features.detection import extract, gather, traits_of
 from gsba.frames import cubemap
 from gsba.frames.files import image_size
 from gsba.frames.panorama import fitted_to, load_grey
@@ -307,7 +307,7 @@ class Localizer:
 
     def candidates_of(self, query: Query, places: np.ndarray, strongest: bool) -> Candidates:
         """Points of keyframes (N,) that look like keypoints, wherever they are."""
-        chosen = search_settings(self.map.settings)
+        chosen = traits_of(self.map.settings)
 
         def match(place: int) -> np.ndarray:
             keyframe = self.map.load_keyframe(place)
@@ -329,7 +329,7 @@ class Localizer:
         poses, places = self.map.result.world_T_rigs, self.map.nearest(world_T_rig, NUM_NEAREST)
         if recognised is not None:
             places = np.union1d(places, recognised)
-        gate, chosen = Gate.around_points(gate_rad), search_settings(self.map.settings)
+        gate, chosen = Gate.around_points(gate_rad), traits_of(self.map.settings)
 
         def match(place: int) -> np.ndarray:
             keyframe, f0_T_f1 = self.map.load_keyframe(place), inverse(poses[place]) @ world_T_rig

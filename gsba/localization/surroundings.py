@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsba.camera.rig import CubeRig
-from gsba.features.detection import search_settings
+from gsba.features.detection import traits_of
 from gsba.frames import cubemap
 from gsba.geometry import inverse
 from gsba.localization.place_index import index_path, load_or_make
@@ -103,7 +103,7 @@ class Surroundings:
         points = np.unique(np.concatenate([keyframe.points for keyframe in keyframes]))
         points = result.points_world[points[of_map[points]]]
         around = (points - world_T_rig[:3, 3]) @ world_T_rig[:3, :3]
-        gate, chosen, found = Gate.around_points(GATE_RAD), search_settings(map_.settings), []
+        gate, chosen, found = Gate.around_points(GATE_RAD), traits_of(map_.settings), []
         for f, keyframe in zip(nearest, keyframes, strict=True):
             f_T_rig = inverse(result.world_T_rigs[f]) @ world_T_rig
             own = keyframe.points_rig

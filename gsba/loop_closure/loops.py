@@ -18,7 +18,7 @@ from gsba.loop_closure import join_evidence
 from gsba.loop_closure.join_evidence import LOCAL, Places, around
 from gsba.loop_closure.retrieval import global_descriptors
 from gsba.matching import recovery
-from gsba.matching.guided_search import MatchContext
+from gsba.matching.guided_search import FAR_DRIFT, MatchContext
 from gsba.matching.pairs import MAX_BASELINE_DEPTHS
 from gsba.memory import release_mapped_files
 from gsba.similarity import relative_similarity
@@ -150,7 +150,7 @@ def close(
     common = (seen @ seen.T).tocsr()
     common.data[common.data < _ENOUGH_POINTS] = 0
     common.eliminate_zeros()
-    chosen = candidates(looks, solved, unseen, settings, common)
+    chosen = candidates(looks, solved, unseen, settings, common, context.far_drift)
     verified = recovery.match_anywhere(context.of_strongest(), chosen)
     known = solved.points_by_keypoint(keypoints)
     loops = []
@@ -163,7 +163,7 @@ def close(
             step, inliers = measured
             loops.append(Loop(f0, f1, step.new_T_old, int(inliers.sum())))
     poses, depth = solved.world_T_rigs, solved.median_depth()
-    within = [loop for loop in loops if within_drift(loop, poses, depth, unseen, settings)]
+    within = [loop for loop in loops if within_drift(loop, poses, depth, unseen, context.far_drift)]
     agreeing = consistent(within, solved, settings.pairs.window)
     upheld = _not_refuted(context, solved, agreeing)
     ends = np.array([(loop.f0, loop.f1) for loop in upheld], np.int32).reshape(-1, 2)
@@ -191,6 +191,7 @@ def candidates(
     unseen: np.ndarray,
     settings: RefineSettings,
     held: csr_matrix | None = None,
+    far_drift: float = FAR_DRIFT,
 ) -> np.ndarray:
     """Pairs (P, 2) int32 with the most similar global descriptors within reach of drift.
 
@@ -203,10 +204,11 @@ def candidates(
         unseen: (F - 1,) bool, steps that no images confirm.
         held: sparse matrix (F, F) of frames that the map holds together already, which are left
             out; None = none are.
+        far_drift: largest relative drift that a loop closure may correct.
     """
     positions, depth = solved.world_T_rigs[:, :3, 3], solved.median_depth()
     num, reach = len(positions), MAX_BASELINE_DEPTHS * depth
-    drifts = np.concatenate([[0.0], np.cumsum(_max_step_drifts(positions, unseen, settings))])
+    drifts = np.concatenate([[0.0], np.cumsum(_max_step_drifts(positions, unseen, far_drift))])
     unseen_before = np.concatenate([[0], np.cumsum(unseen)])
     least = _least_similarity(looks, solved, unseen_before, settings.pairs.window)
     blocks = list(slices(num, _FRAMES_AT_ONCE))
@@ -270,22 +272,20 @@ def _least_similarity(
     return float(np.quantile(some, _LEAST_ALIKE_SHARE)) if len(some) else -1.0
 
 
-def _max_step_drifts(
-    positions: np.ndarray, unseen: np.ndarray, settings: RefineSettings
-) -> np.ndarray:
+def _max_step_drifts(positions: np.ndarray, unseen: np.ndarray, far_drift: float) -> np.ndarray:
     """Largest error (N - 1,) of each step between positions (N, 3), map units."""
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
-    return np.where(unseen, 1.0, settings.pairs.far_drift) * steps
+    return np.where(unseen, 1.0, far_drift) * steps
 
 
 def within_drift(
-    loop: Loop, poses: np.ndarray, depth: float, unseen: np.ndarray, settings: RefineSettings
+    loop: Loop, poses: np.ndarray, depth: float, unseen: np.ndarray, far_drift: float
 ) -> bool:
     """True if a loop needs no more drift than the path (F, 4, 4) between its frames can have, whose
     steps `unseen` (F - 1,) bool no images confirm; `depth`, the median, in map units."""
     first, last = min(loop.f0, loop.f1), max(loop.f0, loop.f1)
     between, steps = poses[first : last + 1, :3, 3], unseen[first:last]
-    slack = float(_max_step_drifts(between, steps, settings).sum())
+    slack = float(_max_step_drifts(between, steps, far_drift).sum())
     expected = poses[loop.f0] @ loop.f0_T_f1
     moved = np.linalg.norm(expected[:3, 3] - poses[loop.f1, :3, 3])
     turned = np.degrees(rotation_angle(expected[:3, :3].T @ poses[loop.f1, :3, :3]))

@@ -388,7 +388,9 @@ class _Joining:
         even = abs(np.log(proposal.move.scale)) < np.log(
             TwoViewLimits.of(settings).max_length_ratio
         )
-        return even and loops.within_drift(loop, poses, self.depth, self.held, settings)
+        return even and loops.within_drift(
+            loop, poses, self.depth, self.held, self.context.far_drift
+        )
 
     def _register_each(self, rows: np.ndarray, inside: np.ndarray) -> bool:
         """True if any frame gets a pose from points of the map; those next to it come first."""

@@ -12,7 +12,7 @@ from gsba.matching.verification import RelativePose
 from gsba.trajectory.limits import TwoViewLimits
 from gsba.types import Matches, Solution, VerifiedPairs
 
-# Gates in degrees are for exact directions: `pairs.gate_factor` widens those of a solved map.
+# Gates in degrees are for exact directions: `gate_factor` of settings widens those of a solved map.
 SCARCE_MATCHES = 60  # pairs with fewer are matched with all keypoints
 _MIN_INLIER_RATIO = (
     0.5  # of a step's matches to its pose; steps below are matched with all keypoints
@@ -104,7 +104,7 @@ def match_along_epipolars(
     epipolar lines of a step that only the trajectory gives agrees on another length of it.
     """
     poses, settings = solved.world_T_rigs, context.settings
-    turn = np.deg2rad(settings.pairs.gate_factor * _REFINED_DEG)
+    turn = np.deg2rad(settings.gate_factor * _REFINED_DEG)
     chosen = pairs.adjacent(len(poses))
     if maps is not None:
         first, second = maps[chosen].T
@@ -141,8 +141,8 @@ def match_known_points(context: MatchContext, solved: Solution, loops_closed: bo
     """Match frames further apart, around the predicted bearings of known points only; frames far
     apart in time are predictable where loops are closed. The prediction verifies the match:
     repeated structure elsewhere, such as the next column, is no candidate."""
-    poses, settings = solved.world_T_rigs, context.settings.pairs
-    near, loops = pairs.covisible(poses[:, :3, 3], solved.median_depth(), settings)
+    poses, settings = solved.world_T_rigs, context.settings
+    near, loops = pairs.covisible(poses[:, :3, 3], solved.median_depth(), settings.pairs)
     chosen = near[near[:, 1] - near[:, 0] > 2]
     if loops_closed:
         chosen = np.concatenate([chosen, loops])
@@ -156,8 +156,8 @@ def match_known_points_across(
     context: MatchContext, solved: Solution, parts: np.ndarray
 ) -> Matches:
     """Match frames of different parts (F,) of a map around predicted bearings of known points."""
-    poses, settings = solved.world_T_rigs, context.settings.pairs
-    chosen = pairs.across(poses[:, :3, 3], solved.median_depth(), settings, parts)
+    poses, settings = solved.world_T_rigs, context.settings
+    chosen = pairs.across(poses[:, :3, 3], solved.median_depth(), settings.pairs, parts)
     gates = [Gate.around_points(np.deg2rad(settings.gate_factor * _POINT_DEG))] * len(chosen)
     known = solved.points_by_keypoint(context.keypoints)
     return context.match(chosen, poses, gates, known, guided_only=True)

@@ -16,8 +16,8 @@ import numpy as np
 from gsba.camera.cameras import ONE_CAMERA, Cameras
 from gsba.camera.lens import Lenses
 from gsba.camera.rig import cells_of
-from gsba.config import MatchingSettings, RefineSettings
-from gsba.features.detection import search_settings
+from gsba.config import RefineSettings
+from gsba.features.detection import ExtractorTraits, traits_of
 from gsba.features.extraction import FrameFeatures
 from gsba.geometry import inverse
 from gsba.matching._search_kernels import HEAD, Cells, Limits, Rows, passes, search
@@ -27,6 +27,7 @@ from gsba.types import Features, Keypoints, Matches
 
 MAX_PARALLAX_RAD = np.deg2rad(60.0)  # between two rays of a point
 T = TypeVar("T")
+FAR_DRIFT = 0.05  # largest relative drift that a loop closure may correct
 _CELLS_PER_SIDE = 8  # cells along a face's side
 
 
@@ -139,7 +140,7 @@ def match_pair(
     second: Searchable,
     f0_T_f1: np.ndarray,
     gate: Gate,
-    settings: MatchingSettings,
+    traits: ExtractorTraits,
     points_f0: np.ndarray | None = None,
 ) -> np.ndarray:
     """Mutual, distinctive nearest neighbours within the gate around f0_T_f1 (4, 4), whose
@@ -149,7 +150,7 @@ def match_pair(
     Given, only keypoints with a point are matched, close to where it must appear.
     """
     rotation = f0_T_f1[:3, :3].astype(np.float32)
-    direction, limits = _limits(f0_T_f1, gate, settings)
+    direction, limits = _limits(f0_T_f1, gate, traits)
     best, similarity = search(
         Rows(first.bearings, first.descriptors, first.tails),
         Rows(second.bearings @ rotation.T, second.descriptors, second.tails),
@@ -174,7 +175,7 @@ def within_gate(
 ) -> np.ndarray:
     """True (m,) for matches (m, 2) that `match_pair` would compare under the gate."""
     rotation = f0_T_f1[:3, :3].astype(np.float32)
-    any_likeness = MatchingSettings(min_similarity=-1, max_ratio=1)
+    any_likeness = ExtractorTraits(min_similarity=-1, max_ratio=1)
     direction, limits = _limits(f0_T_f1, gate, any_likeness)
     return passes(
         first.bearings_rig[pairs[:, 0]].astype(np.float32),
@@ -187,18 +188,17 @@ def within_gate(
 
 
 def _limits(
-    f0_T_f1: np.ndarray, gate: Gate, settings: MatchingSettings
+    f0_T_f1: np.ndarray, gate: Gate, traits: ExtractorTraits
 ) -> tuple[tuple[np.float32, ...], Limits]:
     """Unit vector of the predicted motion, and a gate as the compiled search takes it."""
-    assert settings.min_similarity is not None and settings.max_ratio is not None
     length = np.linalg.norm(f0_T_f1[:3, 3])
     limits = Limits(
         np.float32(gate.rotation_rad),
         np.float32(gate.direction if length > 1e-12 else 1e3),
         np.float32(2 * np.sin(min(gate.max_parallax_rad, np.pi) / 2)),
         np.float32(gate.point_rad),
-        np.float32(settings.min_similarity),
-        np.float32(settings.max_ratio),
+        np.float32(traits.min_similarity),
+        np.float32(traits.max_ratio),
     )
     return tuple((f0_T_f1[:3, 3] / max(length, 1e-12)).astype(np.float32)), limits
 
@@ -249,7 +249,7 @@ class Matcher(Protocol):
         pair: tuple[int, int],
         f0_T_f1: np.ndarray,
         gate: Gate,
-        settings: MatchingSettings,
+        traits: ExtractorTraits,
         points_f0: np.ndarray | None = None,
     ) -> np.ndarray:
         """Matches (m, 2) int32 of a pair of frames, sorted, one to one; see `match_pair`."""
@@ -319,12 +319,12 @@ def guided(
     pair: tuple[int, int],
     f0_T_f1: np.ndarray,
     gate: Gate,
-    settings: MatchingSettings,
+    traits: ExtractorTraits,
     points_f0: np.ndarray | None = None,
 ) -> np.ndarray:
     """The Matcher that searches the gate for each descriptor's nearest: `match_pair`."""
     first, second = frames[pair[0]], frames[pair[1]]
-    return match_pair(first, second, f0_T_f1, gate, settings, points_f0)
+    return match_pair(first, second, f0_T_f1, gate, traits, points_f0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -338,6 +338,7 @@ class MatchContext:
     workers: Workers  # workers that match pairs
     matcher: Matcher = guided  # compares two frames
     cameras: Cameras = ONE_CAMERA  # cameras of the keypoints
+    far_drift: float = FAR_DRIFT  # largest relative drift that a loop closure may correct
 
     def by_search(self) -> "MatchContext":
         """Guided search, whatever the run's matcher."""
@@ -364,7 +365,7 @@ class MatchContext:
                 for gate, (_, f1) in zip(gates, pairs, strict=True)
             ]
         frames = self.strongest if strongest else self.frames
-        how = search_settings(self.settings), self.workers
+        how = traits_of(self.settings), self.workers
         matcher = guided if guided_only else self.matcher
         return match(pairs, world_T_rigs, gates, frames, *how, points_rig, matcher)
 
@@ -374,7 +375,7 @@ def match(
     world_T_rigs: np.ndarray,
     gates: Sequence[Gate],
     frames: SearchableFrames,
-    settings: MatchingSettings,
+    traits: ExtractorTraits,
     workers: Workers,
     points_rig: Points | None = None,
     matcher: Matcher = guided,
@@ -385,14 +386,14 @@ def match(
         pairs: (P, 2) frame indices.
         world_T_rigs: (F, 4, 4) poses that predict the pairs' geometry.
         gates: (P) uncertainty of each prediction.
-        settings: thresholds on similarity and distinctiveness, see `search_settings`.
+        traits: of the descriptors, see `traits_of`.
         points_rig: points (K_f, 3) of each frame, see `match_pair`.
     """
     f0_T_f1s = inverse(world_T_rigs[pairs[:, 0]]) @ world_T_rigs[pairs[:, 1]]
     order, places = by_place(pairs, len(world_T_rigs))  # pairs that share frames follow one another
     chosen = [gates[p] for p in order]
     geometry = pairs[order], places, f0_T_f1s[order], chosen
-    job = _PairJob(*geometry, frames, settings, points_rig, matcher)
+    job = _PairJob(*geometry, frames, traits, points_rig, matcher)
     rows = [np.zeros((0, 2), np.int32)] * len(pairs)
     for p, matched in zip(order, workers.map_shards(job), strict=True):
         rows[p] = matched
@@ -408,7 +409,7 @@ class _PairJob:
     f0_T_f1s: np.ndarray  # (P, 4, 4)
     gates: Sequence[Gate]  # (P)
     frames: SearchableFrames
-    settings: MatchingSettings
+    traits: ExtractorTraits
     points: Points | None  # points of first frames
     matcher: Matcher
     title: str = "matching"
@@ -421,7 +422,7 @@ class _PairJob:
         f0, f1 = (int(f) for f in self.pairs[p])
         points = None if self.points is None else self.points[f0]
         gate, f0_T_f1 = self.gates[p], self.f0_T_f1s[p]
-        return self.matcher(self.frames, (f0, f1), f0_T_f1, gate, self.settings, points)
+        return self.matcher(self.frames, (f0, f1), f0_T_f1, gate, self.traits, points)
 
     def blocks(self) -> Sequence[tuple[int, int]]:
         return blocks_of_frames(self.places)

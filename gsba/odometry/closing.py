@@ -39,7 +39,7 @@ def find_loops(places: KeyframePlaces, unseen: np.ndarray) -> list[Constraint]:
     geometry and surroundings; unseen: (P - 1,) bool, steps between places without matches."""
     solved, context, num = places.solved, places.context, len(places.keyframes)
     looks = global_descriptors(context.strongest, num, context.settings.seed, context.workers)
-    chosen = loops.candidates(looks, solved, unseen, context.settings)
+    chosen = loops.candidates(looks, solved, unseen, context.settings, far_drift=context.far_drift)
     strongest = context.of_strongest()
     verified = recovery.match_anywhere(strongest, chosen, rivals=False)
     test = _join_test(places)
@@ -133,7 +133,7 @@ def _plausible(
     (f, g), poses = proposal.frames, places.solved.world_T_rigs
     g_T_f = inverse(poses[g]) @ proposal.move.poses(poses[f])
     loop = Loop(g, f, g_T_f, proposal.support)
-    return loops.within_drift(loop, poses, depth, unseen, places.context.settings)
+    return loops.within_drift(loop, poses, depth, unseen, places.context.far_drift)
 
 
 def _rivals(one: Judged, judged: list[Judged], test: JoinTest) -> list[Judged]:

@@ -32,6 +32,7 @@ from gsba.video.recording import (
 
 logger = logging.getLogger(__name__)
 
+WIDTH = 800  # pixels across: fast, and a run measures its keypoints in the full pictures
 _CARRIER_LOOKS = 20  # frames in which the carrier is detected
 _LEAST = 3  # least number of frames of a sequence
 
@@ -51,7 +52,7 @@ class SmallPanoramas:
         return len(self.timestamps)
 
 
-def of_frames(frames: FrameSet, source: Path, width: int) -> SmallPanoramas:
+def of_frames(frames: FrameSet, source: Path, width: int = WIDTH) -> SmallPanoramas:
     """Panoramas of a folder of panoramas or raw pairs, `width` pixels across, less if the frames
     are smaller; pixels masked in all frames are masked. GsbaError: cube faces."""
     if not frames.format.panoramic:
@@ -80,7 +81,7 @@ def of_frames(frames: FrameSet, source: Path, width: int) -> SmallPanoramas:
 
 def of_video(
     video: Path,
-    width: int,
+    width: int = WIDTH,
     calibration: Path | None = None,
     from_s: float | None = None,
     to_s: float | None = None,

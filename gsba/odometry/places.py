@@ -9,7 +9,7 @@ import numpy as np
 from gsba.bundle.tracks import build
 from gsba.bundle.triangulation import place
 from gsba.camera.rig import CubeRig
-from gsba.config import FeatureSettings, PairSettings, RefineSettings
+from gsba.config import FeatureSettings, RefineSettings
 from gsba.features.detection import SiftExtractor, extract, gather
 from gsba.log import track
 from gsba.matching.correspondences import match_along_epipolars
@@ -21,9 +21,7 @@ from gsba.types import Features, Solution
 _JPEG_QUALITY = 90
 _HFOV = np.deg2rad(94.0)  # of faces: keypoints near a border are described by pixels beyond it
 _STRONGEST_PER_FACE = 100  # strongest of these, compared without any prediction
-_SETTINGS = RefineSettings(
-    pairs=PairSettings(strongest_per_face=_STRONGEST_PER_FACE, far_drift=0.03)
-)
+_FAR_DRIFT = 0.03  # largest relative drift that a loop closure may correct
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,8 +101,9 @@ def make_places(
         SearchableFrames(features.__getitem__),
         SearchableFrames(features.__getitem__, _STRONGEST_PER_FACE),
         gather(features),
-        _SETTINGS.model_copy(update={"seed": seed}),
+        RefineSettings(seed=seed),
         workers,
+        far_drift=_FAR_DRIFT,
     )
     start = Solution.without_points(world_T_rigs)
     found = match_along_epipolars(context, start)

@@ -409,15 +409,18 @@ def _holds(path: Path, trajectory: Trajectory) -> bool:
     )
 
 
+MAX_TURN_DEG = 40.0  # rotation between successive chosen frames: doorways and turns keep frames
+
+
 def choose_frames(found: Odometry, settings: OdometrySettings) -> np.ndarray:
     """Rows (N,) of the frames to refine.
 
     From one frame to the next the camera moves by at most `step` times the median distance of the
-    scene, and rotates by at most `max_turn_deg`, wherever the video has frames that close; the
+    scene, and rotates by at most `MAX_TURN_DEG`, wherever the video has frames that close; the
     sharpest of the last part of each such stretch is selected. Frames without a pose are left out.
     """
     count = settings.max_frames
-    steps = _Steps.of(found, settings.step, np.deg2rad(settings.max_turn_deg))
+    steps = _Steps.of(found, settings.step, np.deg2rad(MAX_TURN_DEG))
     rows = _chosen(found, steps, 1.0)
     if count is None or len(rows) <= count:
         return rows

@@ -9,14 +9,14 @@ import numpy as np
 from factors import BearingTerm, LandmarkBlock, RobustLoss
 from gsba.bundle import optimize, pose_variables, triangulate
 from gsba.bundle.adjustment import poses_of, values_of
+from gsba.bundle.optimizer import SolverOptions
 from gsba.camera.rig import witnesses
-from gsba.config import SolverSettings
 from gsba.geometry import angles_between, nearest_rotation
 from gsba.matching.verification import relative_pose
 from gsba.trajectory.limits import TwoViewLimits
 from gsba.types import Landmarks, Tracks
 
-_SOLVER = SolverSettings(
+_SOLVER = SolverOptions(
     max_iterations=8, relative_tolerance=1e-3, absolute_tolerance=1.0, lambda_initial=1e-6
 )
 _MIN_PARALLAX_DEG = 1.0  # least triangulation angle of a point: keyframes are far apart

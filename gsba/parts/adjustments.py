@@ -8,8 +8,7 @@ import gtsam
 import numpy as np
 
 from gsba.bundle.adjustment import DivisibleMap
-from gsba.bundle.optimizer import OptimizeResult
-from gsba.config import SolverSettings
+from gsba.bundle.optimizer import OptimizeResult, SolverOptions
 from gsba.memory import give_back_freed_memory, total_memory_bytes
 from gsba.parts.divided_system import divided_covariances, optimize_divided
 from gsba.parts.folder import (
@@ -55,7 +54,7 @@ class DividedAdjustments:
     part_frames: int | None  # frames of a part; None = by memory
     told: set[str] = field(default_factory=set)  # reasons that were logged
 
-    def minimized(self, map_: DivisibleMap, settings: SolverSettings) -> OptimizeResult | None:
+    def minimized(self, map_: DivisibleMap, options: SolverOptions) -> OptimizeResult | None:
         """See `gsba.bundle.adjustment.Division`.
 
         A call that goes on has what earlier ones solved, and goes on within what they had begun.
@@ -63,7 +62,7 @@ class DividedAdjustments:
         most = self._frames_of_parts(map_)
         if most is None:
             return None
-        name = self._digest(map_, most, settings.model_dump_json())
+        name = self._digest(map_, most, repr(options))
         if name is None:
             return None
         folder, finished = self.folder / name, self.folder / f"{name}.npz"
@@ -72,7 +71,7 @@ class DividedAdjustments:
             values = stored.at.values(range(map_.num_frames))
             result = OptimizeResult(values, stored.history, stored.converged, stored.reason)
         elif self._written(folder, map_, most):
-            result = optimize_divided(folder, self.workers, settings, self.scratch)
+            result = optimize_divided(folder, self.workers, options, self.scratch)
             at = At.of(result.values, range(map_.num_frames), keys_beside(result.values))
             stored = _Finished(at, result.history, result.converged, result.reason)
             save_record(finished, stored, {})

@@ -1,7 +1,7 @@
 """The normal equations of a map in parts, which `gsba.bundle.optimizer.minimize` solves."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -13,9 +13,8 @@ from factors import RobustLoss
 from factors.cholesky import DIM, BlockCholesky
 from factors.normal_equations import damping_of
 from gsba.bundle.families import kept
-from gsba.bundle.optimizer import OptimizeResult, minimize
+from gsba.bundle.optimizer import OptimizeResult, SolverOptions, minimize
 from gsba.bundle.pose_variables import X
-from gsba.config import SolverSettings
 from gsba.parts.folder import At, load, load_index, load_part
 from gsba.parts.jobs import (
     Covariances,
@@ -315,7 +314,7 @@ def _places(nodes: np.ndarray, pairs: np.ndarray) -> np.ndarray:
 def optimize_divided(
     folder: Path,
     workers: Workers,
-    settings: SolverSettings,
+    options: SolverOptions,
     scratch: Path | None = None,
     callback: Callable[[Iteration, gtsam.Values], None] | None = None,
 ) -> OptimizeResult:
@@ -325,7 +324,7 @@ def optimize_divided(
 
     Args:
         folder: of the map, from `folder.PartsWriter`, on a disk that the workers share.
-        settings: loss, damping, tolerances; `max_iterations` counts from where this call starts.
+        options: loss, damping, tolerances; `max_iterations` counts from where this call starts.
         scratch: folder of the workers' own files, emptied after each pass; None = they have none.
         callback: called with each attempt and the best values so far.
 
@@ -333,13 +332,12 @@ def optimize_divided(
         GsbaError: the disk is full or damaged, the cost at the start is not finite, or workers fail
             again and again.
     """
-    loss = RobustLoss(settings.loss, settings.loss_sigmas)
-    system = DividedSystem(folder, workers, loss, scratch)
+    system = DividedSystem(folder, workers, options.loss, scratch)
     start = system.start
     if np.isfinite(start.damping):
-        settings = settings.model_copy(update={"lambda_initial": start.damping})
+        options = replace(options, lambda_initial=start.damping)
     values = start.at.values(range(system.num_frames))
-    result = minimize(system, values, settings, callback)
+    result = minimize(system, values, options, callback)
     system.finish(result.values)
     return result
 

@@ -206,10 +206,9 @@ def _solve(
     context: AdjustmentContext,
 ) -> tuple[Solution, np.ndarray, np.ndarray]:
     """The joint solve, once more with lower weights of bad frames; undone if the map fits worse."""
-    settings, num_threads = context.settings, context.num_threads
+    num_threads = context.num_threads
     values = adjustment.values_of(solved.world_T_rigs)
-    looser = {"relative_tolerance": _TOLERANCE, "absolute_tolerance": None}
-    solver = settings.solver.model_copy(update=looser)
+    solver = replace(context.solver, relative_tolerance=_TOLERANCE, absolute_tolerance=None)
     start = make_block(pixels, trust, num_threads)
     noise = _noise(start, values) * _INFLATION
     weights = np.ones(pixels.num_frames)

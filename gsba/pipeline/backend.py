@@ -21,7 +21,6 @@ from gsba.bundle.lens_centres import baseline_of
 from gsba.bundle.map_strength import MapStrength
 from gsba.bundle.reconstruction import MIN_OBSERVATIONS, assemble, world_scale
 from gsba.camera.views import Optics, scenes_around
-from gsba.features.detection import search_settings
 from gsba.imu.alignment import up_axis
 from gsba.loop_closure import connectivity, map_merging
 from gsba.loop_closure.merged_map import Registered, follow
@@ -346,6 +345,5 @@ def _reconstruct_rotations(state: State) -> Reconstruction:
         result = rotation_only.refine(*given)
         return replace(result, origin=_origin(run, result))
 
-    return run.stage(
-        "reconstruction", [search_settings(run.settings), least], compute, Reconstruction
-    )
+    key = [run.matching_key(), least]
+    return run.stage("reconstruction", key, compute, Reconstruction)

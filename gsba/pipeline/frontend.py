@@ -12,7 +12,7 @@ from gsba import learned
 from gsba.camera.cameras import Cameras
 from gsba.config import RefineSettings
 from gsba.features import detection, extraction
-from gsba.features.detection import search_settings
+from gsba.features.detection import traits_of
 from gsba.features.extraction import FrameFeatures, Search
 from gsba.frames import panorama
 from gsba.geometry import inverse
@@ -408,9 +408,7 @@ def _matches(run: Run, found: Mapping[str, Features], steps: np.ndarray) -> floa
     def verified(step: int) -> int:
         f0, f1 = steps[step].tolist()
         f0_T_f1 = inverse(poses[f0]) @ poses[f1]
-        rows = guided_search.guided(
-            frames, (f0, f1), f0_T_f1, PRIOR_GATE, search_settings(settings)
-        )
+        rows = guided_search.guided(frames, (f0, f1), f0_T_f1, PRIOR_GATE, traits_of(settings))
         rays = load(f0).bearings_rig[rows[:, 0]], load(f1).bearings_rig[rows[:, 1]]
         pose = relative_pose(*rays, TwoViewLimits.of(settings), settings.seed, chance)
         return 0 if pose is None else int(np.count_nonzero(pose.inliers))

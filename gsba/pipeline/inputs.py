@@ -297,11 +297,11 @@ def _follow(
 ) -> Odometry:
     """Odometry of a video."""
     start, end = settings.video.from_s, settings.video.to_s
-    width, seed = settings.odometry.width, settings.seed
+    seed = settings.seed
     stage = f"odometry@{name}" if name else "odometry"
 
     def compute() -> Odometry:
-        panoramas = odometry.of_video(video_file, width, calibration, start, end)
+        panoramas = odometry.of_video(video_file, odometry.WIDTH, calibration, start, end)
         if masks.given is not None and masks.given.is_file():
             panoramas = odometry.masked(panoramas, masks.given)
         if masks.carrier:
@@ -310,7 +310,7 @@ def _follow(
         return odometry.track_panoramas(panoramas, seed, checkpoint=unfinished)
 
     files = fingerprint([*files_of(video_file), calibration, masks.given])
-    key = [width, seed, (start, end), masks.carrier, files]
+    key = [odometry.WIDTH, seed, (start, end), masks.carrier, files]
     return store.stage(stage, key, compute, Odometry)
 
 

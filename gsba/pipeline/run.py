@@ -12,7 +12,6 @@ from gsba.bundle.families import Bearings, Families, Family, Reprojections
 from gsba.bundle.trajectory_prior import GyroTurns, TrajectoryPrior
 from gsba.camera.rig import CubeRig
 from gsba.config import CameraSettings, RefineSettings
-from gsba.features.detection import search_settings
 from gsba.frames import cubemap
 from gsba.frames.panorama import Greys
 from gsba.frames.recordings import own_timestamps
@@ -227,8 +226,8 @@ class Run:
         """Settings that matches rest on."""
         settings = self.matching_settings
         files = fingerprint(path for stage, path in self.weights.items() if stage == "matching")
-        how = search_settings(settings).model_dump(exclude={"weights"}), files
-        return [settings.pairs, how, settings.seed]
+        how = settings.matching.matcher, settings.features.extractor, files
+        return [settings.pairs, settings.gate_factor, how, settings.seed]
 
     def solving_key(self) -> list[object]:
         """Settings that solutions rest on."""

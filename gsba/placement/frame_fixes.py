@@ -20,6 +20,7 @@ logger = logging.getLogger(__name__)
 
 EXIF = "exif"  # in place of a file: positions in the EXIF data of the images
 MIN_FIXES = 3
+_CORRELATION_S = 60.0  # time constant of the fixes' errors: see `gsba/bundle/gps_factors.py`
 
 
 def read_exif_gps(frames: FrameSet, settings: GpsSettings | None = None) -> GpsFixes:
@@ -82,7 +83,7 @@ def fixes_of_frames(
 
     Args:
         frames: frames of the run; they need times unless fixes name frames.
-        settings: smallest noise, and correlation time of the errors.
+        settings: smallest noise of the fixes.
 
     Raises:
         GsbaError: the source cannot be read, its receiver had no lock, or its times do not overlap
@@ -103,7 +104,7 @@ def fixes_of_frames(
     local = local_from_geodetic(geodetic, origin)
     times = frames.timestamps[rows] if frames.timed else None
     origin[1] = (origin[1] + 180) % 360 - 180
-    return FrameFixes(rows, local, sigmas, times, origin, settings.correlation_s)
+    return FrameFixes(rows, local, sigmas, times, origin, _CORRELATION_S)
 
 
 def _locked(source: str, fixes: GpsFixes) -> GpsFixes:

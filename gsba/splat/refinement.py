@@ -28,11 +28,11 @@ from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.optimizer import OptimizeResult, optimize
 from gsba.bundle.reconstruction import MIN_OBSERVATIONS
 from gsba.camera.views import ONE_EYE, Optics
-from gsba.config import SplatSettings
 from gsba.frames.held_out import HOLD_OUT_EVERY
 from gsba.splat.alignment import Captured, SplatGreys, capture, splat_block
 from gsba.splat.backend import choose_backend
 from gsba.splat.gaussians import Gaussians, from_cloud
+from gsba.splat.options import TrainingOptions
 from gsba.splat.scene import Faces, Split, load_faces, make_views, split_frames
 from gsba.splat.scores import face_psnrs
 from gsba.splat.train import TrainingState, advance, begin, near_of
@@ -44,6 +44,8 @@ _MAX_GAUSSIANS = 30_000  # enough for faces of these sizes
 _FIRST_STEPS = 400  # training steps before poses move at each size
 _STEPS = 150  # training steps after each move, before held-out panoramas compare the poses
 _MAX_MOVES = 3  # most updates of the poses at each size
+_MIN_SIGMAS = 2.0  # gain on held-out panoramas that a move needs, standard errors: chance alone
+# reaches it once in forty moves; see docs/splats.md
 _MAX_GROWTH = 1.05  # of the geometric cost, or a move is undone
 _HELD_OUT_EVERY = HOLD_OUT_EVERY  # one panorama of so many judges the poses
 
@@ -158,11 +160,11 @@ class _Turns:
         self.held_out: Faces
         self.captured: Captured
 
-    def training(self, level: int) -> SplatSettings:
+    def training(self, level: int) -> TrainingOptions:
         """Settings of the training that all turns share, at a level's size."""
         chosen = self.settings.splat
         each = _FIRST_STEPS + _MAX_MOVES * _STEPS
-        return SplatSettings(
+        return TrainingOptions(
             iterations=len(chosen.sizes) * each,
             face_size=chosen.sizes[level],
             sh_degree=_SH_DEGREE,
@@ -179,7 +181,7 @@ class _Turns:
 
     def turn(self, before: _Progress) -> _Progress:
         """The first training of a level, or a move of the poses and the training after it."""
-        chosen, poses = self.settings.splat, before.world_T_rigs
+        poses = before.world_T_rigs
         settings = self.training(before.level)
         if before.turns < 0:
             trained = self._trained(before.state, poses, settings, _FIRST_STEPS)
@@ -201,7 +203,7 @@ class _Turns:
         chance = unknowns * min(total, later) / redundancy if redundancy > 0 else np.inf
         evidence = together(score(gains), score(savings, chance))
         after = self._placed(moved)
-        accepted = evidence > chosen.min_sigmas and growth <= _MAX_GROWTH
+        accepted = evidence > _MIN_SIGMAS and growth <= _MAX_GROWTH
         least = MIN_OBSERVATIONS
         accepted &= replace(self.solved, landmarks=after).carries(self.solved, least)
         turns = np.einsum("fji,fjk->fik", poses[:, :3, :3], moved[:, :3, :3])
@@ -247,13 +249,12 @@ class _Turns:
         self, gaussians: Gaussians, world_T_rigs: np.ndarray
     ) -> tuple[np.ndarray, OptimizeResult]:
         """Poses after a few joint steps, and the solver's result."""
-        settings = self.settings
         near = near_of(world_T_rigs[self.split.training])
         greys = SplatGreys(splat_block(gaussians, self.captured, near, self.backend))
         terms = self.context.beside(greys).terms(replace(self.solved, world_T_rigs=world_T_rigs))
         values, landmarks = terms.values, self._block()
         landmarks.polish(values)
-        solver = settings.solver.model_copy(update={"max_iterations": 2})
+        solver = replace(self.context.solver, max_iterations=2)
         result = optimize(terms.graph, values, [landmarks, *terms.blocks], solver)
         return adjustment.poses_of(result.values, len(world_T_rigs)), result
 
@@ -277,7 +278,7 @@ class _Turns:
         self,
         state: TrainingState,
         world_T_rigs: np.ndarray,
-        settings: SplatSettings,
+        settings: TrainingOptions,
         steps: int,
         densifying: bool = True,
     ) -> TrainingState:
@@ -285,7 +286,7 @@ class _Turns:
         return advance(state, views, settings, self.backend, steps, densifying)
 
     def _held_out_psnrs(
-        self, state: TrainingState, world_T_rigs: np.ndarray, settings: SplatSettings
+        self, state: TrainingState, world_T_rigs: np.ndarray, settings: TrainingOptions
     ) -> np.ndarray:
         """PSNR (V,) of each held-out face in dB, after fitting gains."""
         views = make_views(self.held_out, world_T_rigs[self.split.held_out])

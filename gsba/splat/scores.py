@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from gsba.config import SplatSettings
 from gsba.log import GsbaError
 from gsba.splat.backend import Backend
 from gsba.splat.gaussians import Gaussians
 from gsba.splat.metrics import psnr, ssim
+from gsba.splat.options import TrainingOptions
 from gsba.splat.train import Views
 
 _CHANNEL_MEANS, _CHANNEL_SIGMAS = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)  # constants of
@@ -124,7 +124,7 @@ class Score:
 def measure(
     gaussians: Gaussians,
     views: Views,
-    settings: SplatSettings,
+    settings: TrainingOptions,
     near: float,
     backend: Backend,
     lpips: Distance | None = None,
@@ -150,7 +150,7 @@ def measure(
 
 
 def face_psnrs(
-    gaussians: Gaussians, views: Views, settings: SplatSettings, near: float, backend: Backend
+    gaussians: Gaussians, views: Views, settings: TrainingOptions, near: float, backend: Backend
 ) -> np.ndarray:
     """PSNR of each view (V,) in dB, after fitting a gain for each channel of its panorama.
 
@@ -210,7 +210,7 @@ def _pairs(
     gaussians: Gaussians,
     views: Views,
     rows: np.ndarray,
-    settings: SplatSettings,
+    settings: TrainingOptions,
     near: float,
     backend: Backend,
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:

@@ -14,13 +14,13 @@ from pathlib import Path
 
 import numpy as np
 
-from gsba.config import SplatSettings
 from gsba.log import GsbaError, track
 from gsba.splat import adam
 from gsba.splat.backend import Backend, Lesson
 from gsba.splat.camera import FaceCamera
 from gsba.splat.density import DensityLimits, Pull, densify, reset_opacity
 from gsba.splat.gaussians import Gaussians, num_parameters
+from gsba.splat.options import TrainingOptions
 from gsba.store.records import load_checkpoint, save_record
 
 logger = logging.getLogger(__name__)
@@ -99,7 +99,7 @@ def times_for(iterations: int) -> Times:
 def train(
     start: Gaussians,
     views: Views,
-    settings: SplatSettings,
+    settings: TrainingOptions,
     backend: Backend,
     checkpoint: Path | None = None,
     key: str = "",
@@ -144,7 +144,7 @@ def train(
     return state.gaussians
 
 
-def begin(start: Gaussians, settings: SplatSettings) -> TrainingState:
+def begin(start: Gaussians, settings: TrainingOptions) -> TrainingState:
     """A training before its first step; if there are too many Gaussians, with a sample of them.
 
     Args:
@@ -168,7 +168,7 @@ def begin(start: Gaussians, settings: SplatSettings) -> TrainingState:
 def advance(
     state: TrainingState,
     views: Views,
-    settings: SplatSettings,
+    settings: TrainingOptions,
     backend: Backend,
     steps: int,
     densifying: bool = True,
@@ -196,7 +196,7 @@ def _require_finite(state: TrainingState, checkpoint: Path | None) -> None:
         raise GsbaError(f"the splat is no longer finite at step {state.step}{kept}")
 
 
-def most_gaussians(views: Views, settings: SplatSettings, backend: Backend) -> tuple[int, str]:
+def most_gaussians(views: Views, settings: TrainingOptions, backend: Backend) -> tuple[int, str]:
     """Limit on the number of Gaussians of a training, and its reason.
 
     The limit is that of the settings, if given. Otherwise Gaussians have at most as many parameters
@@ -230,7 +230,7 @@ class Trainer:
     """Inputs that are constant over all steps. GsbaError: all pixels are masked."""
 
     def __init__(
-        self, views: Views, settings: SplatSettings, backend: Backend, densifying: bool = True
+        self, views: Views, settings: TrainingOptions, backend: Backend, densifying: bool = True
     ) -> None:
         if views.num_pixels == 0:
             raise GsbaError("no pixel to train a splat on: all frames are masked or held out")

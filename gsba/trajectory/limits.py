@@ -21,4 +21,4 @@ class TwoViewLimits:
     @classmethod
     def of(cls, settings: RefineSettings) -> "TwoViewLimits":
         """Limits under the matching gates of a run."""
-        return cls(settings.pairs.gate_factor * cls().max_error_deg)
+        return cls(settings.gate_factor * cls().max_error_deg)

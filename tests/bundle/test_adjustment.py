@@ -10,13 +10,14 @@ import pytest
 from scipy.stats import chi2
 from synthetic import RIG, World, drifted, make_world
 
+from factors import RobustLoss
 from gsba.bundle import adjustment, triangulation
 from gsba.bundle import observation_noise as observation_noise_module
 from gsba.bundle import tracks as tracks_module
 from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.families import Bearings, Families, Family, Reprojections
 from gsba.bundle.observation_noise import observation_noise
-from gsba.bundle.optimizer import OptimizeResult
+from gsba.bundle.optimizer import OptimizeResult, SolverOptions
 from gsba.bundle.trajectory_prior import TrajectoryPrior
 from gsba.config import RefineSettings
 from gsba.geometry import inverse, rotation_angle
@@ -47,11 +48,16 @@ def _world(seed: int = 0) -> tuple[World, np.ndarray]:
 
 
 def _run(
-    world: World, coarse: np.ndarray, settings: RefineSettings, gates: tuple[float, ...] = GATES
+    world: World,
+    coarse: np.ndarray,
+    settings: RefineSettings,
+    gates: tuple[float, ...] = GATES,
+    solver: SolverOptions | None = None,
 ) -> Solution:
     priors = TrajectoryPrior(coarse, settings.priors)
     start = Solution.without_points(coarse)
-    problem = AdjustmentContext(Families((*_observing(settings), priors)), RIG, settings, 1)
+    families = Families((*_observing(settings), priors))
+    problem = AdjustmentContext(families, RIG, settings, 1, solver or SolverOptions())
     return adjustment.adjust(world.tracks, world.keypoints, start, problem, gates)
 
 
@@ -145,7 +151,7 @@ def test_the_noise_does_not_depend_on_the_length_of_tracks(length: int) -> None:
 
 def test_the_noise_does_not_depend_on_the_loss() -> None:
     world, coarse, robust, _ = _solved("bearing")
-    plain = _run(world, coarse, _settings(solver={"loss": "none"}))
+    plain = _run(world, coarse, _settings(), solver=SolverOptions(loss=RobustLoss()))
     assert robust.noise == pytest.approx(plain.noise, rel=0.03)
 
 

@@ -13,9 +13,9 @@ from gsba import Family, MapSnapshot, X
 from gsba.bundle import adjustment, gauge
 from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.families import Bearings, Families, kept, restored
-from gsba.bundle.optimizer import optimize
+from gsba.bundle.optimizer import SolverOptions, optimize
 from gsba.bundle.trajectory_prior import TrajectoryPrior
-from gsba.config import RefineSettings, SolverSettings
+from gsba.config import RefineSettings
 from gsba.log import GsbaError
 from gsba.similarity import Sim3
 from gsba.types import Solution
@@ -165,7 +165,7 @@ def test_own_variables_are_solved_with_the_poses(world: World) -> None:
 def test_a_joint_solve_agrees_with_gtsam(world: World) -> None:
     solved, problem = _adjusted(world, Sideways(_measured(world)))
     block = adjustment.landmark_block(solved.landmarks, world.keypoints, solved.noise, problem)
-    tight = SolverSettings(relative_tolerance=1e-12, absolute_tolerance=1e-8, max_iterations=100)
+    tight = SolverOptions(relative_tolerance=1e-12, absolute_tolerance=1e-8, max_iterations=100)
     terms = problem.terms(solved)
     ours = optimize(terms.graph, terms.values, [block], tight)
     graph = gtsam.NonlinearFactorGraph(terms.graph)

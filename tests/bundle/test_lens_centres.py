@@ -18,9 +18,10 @@ from scipy.optimize import least_squares
 from scipy.sparse import lil_matrix
 from synthetic import World
 
-from factors import bearing_residuals
+from factors import RobustLoss, bearing_residuals
 from gsba.bundle import adjustment, lens_centres
 from gsba.bundle.lens_centres import LensCentres, StitchRadius
+from gsba.bundle.optimizer import SolverOptions
 from gsba.bundle.readout import CameraEstimate
 from gsba.camera.cameras import Cameras
 from gsba.camera.lens import Lenses
@@ -133,16 +134,10 @@ def test_a_step_is_that_of_an_independent_solver() -> None:
     tracks = Tracks(
         world.tracks.points[few], world.tracks.frames[few], world.tracks.keypoints[few], 220
     )
-    plain = SETTINGS.model_copy(
-        update={
-            "solver": SETTINGS.solver.model_copy(
-                update={"loss": "none", "relative_tolerance": 1e-10}
-            ),
-            "camera": CameraSettings(model="two_lens"),
-        }
-    )
+    plain = SETTINGS.model_copy(update={"camera": CameraSettings(model="two_lens")})
+    exact = SolverOptions(relative_tolerance=1e-10, loss=RobustLoss())
     world = replace(world, tracks=tracks)
-    problem = replace(problem_of(world), settings=plain)
+    problem = replace(problem_of(world), settings=plain, solver=exact)
     lenses, solved = Lenses(band_rad=BAND), Solution.without_points(world.world_T_rigs)
     for _ in range(6):
         cameras = Cameras((lenses,))

@@ -19,8 +19,7 @@ from factors import (
 )
 from factors.direct_system import DirectSystem
 from factors.system_layout import SystemLayout
-from gsba.bundle.optimizer import marginal_covariances, optimize
-from gsba.config import SolverSettings
+from gsba.bundle.optimizer import SolverOptions, marginal_covariances, optimize
 from gsba.log import GsbaError
 
 SIGMA_RAD, SIGMA_PX = 1e-3, 0.5
@@ -31,7 +30,7 @@ CAMERAS = FaceCameras(
     principals=np.full((4, 2), 256.0),
 )
 PRIOR = gtsam.noiseModel.Isotropic.Sigma(6, 0.02)
-TIGHT = SolverSettings(relative_tolerance=1e-12, absolute_tolerance=1e-6, max_iterations=200)
+TIGHT = SolverOptions(relative_tolerance=1e-12, absolute_tolerance=1e-6, max_iterations=200)
 
 
 class World:
@@ -167,7 +166,7 @@ def test_reference_host_factors_and_fast_door_agree(world, solved):
 def test_a_plain_graph_ends_where_gtsam_ends(world):
     """Poses and points to 1e-9, of our single factors and GTSAM's priors, without any block."""
     graph, values = world.reference()
-    exact = SolverSettings(relative_tolerance=1e-15, absolute_tolerance=1e-15, max_iterations=200)
+    exact = SolverOptions(relative_tolerance=1e-15, absolute_tolerance=1e-15, max_iterations=200)
     ours = gsba.optimize(graph, values, settings=exact).values
     params = gtsam.LevenbergMarquardtParams()
     params.setRelativeErrorTol(0)
@@ -429,6 +428,6 @@ def test_weak_modes_settle_beside_a_large_cost_that_stays() -> None:
         graph.add(gtsam.PriorFactorPose3(X(0), claim, rigid))
     aside = gtsam.noiseModel.Isotropic.Sigma(6, 0.5)
     graph.add(gtsam.PriorFactorPose3(X(num - 1), at(num - 1, 3), aside))
-    result = optimize(graph, values, settings=SolverSettings())
+    result = optimize(graph, values, options=SolverOptions())
     best = optimize(graph, result.values, settings=TIGHT)
     assert result.converged and result.cost - best.cost < 0.05

@@ -8,11 +8,12 @@ import pytest
 from pixels import pixel_centres
 from synthetic import RIG, World, make_world
 
+from factors import RobustLoss
 from factors.sphere_field import SphereField, num_harmonics
 from gsba.bundle import adjustment, stitching
 from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.families import Bearings, Families
-from gsba.bundle.optimizer import optimize
+from gsba.bundle.optimizer import SolverOptions, optimize
 from gsba.bundle.shared_parameters import PARTS, SharedModel, model_of, parts_of
 from gsba.bundle.stitching import Stitching, corrected, with_noise_of
 from gsba.bundle.trajectory_prior import TrajectoryPrior
@@ -127,12 +128,10 @@ def test_too_little_is_left_alone() -> None:
 def test_model_predicts_the_cost() -> None:
     """Gain of the quadratic model against what bundle adjustment with the field really gains."""
     world = make_world(1, num_frames=10, num_points=300, sigma_rad=SIGMA, false_share=0)
-    keypoints, plain = _bent(world, _true_field()), SETTINGS.solver.model_copy(
-        update={"loss": "none", "relative_tolerance": 1e-9}
-    )  # fmt: skip
-    settings = SETTINGS.model_copy(update={"solver": plain})
-    priors = TrajectoryPrior(world.world_T_rigs, settings.priors)
-    problem = AdjustmentContext(Families((Bearings(), priors)), RIG, settings, 1)
+    keypoints = _bent(world, _true_field())
+    plain = SolverOptions(relative_tolerance=1e-9, loss=RobustLoss())
+    priors = TrajectoryPrior(world.world_T_rigs, SETTINGS.priors)
+    problem = AdjustmentContext(Families((Bearings(), priors)), RIG, SETTINGS, 1, plain)
     landmarks = Landmarks(world.points_world, world.tracks, Counts(0, 0, "tracks"))
 
     def solved(field: SphereField) -> tuple[Solution, float]:

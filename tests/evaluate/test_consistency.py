@@ -10,9 +10,11 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 from synthetic import RIG, GivenFactors, make_world
 
+from factors import RobustLoss
 from gsba.bundle import adjustment, pose_variables
 from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.families import Bearings, Families
+from gsba.bundle.optimizer import SolverOptions
 from gsba.config import RefineSettings
 from gsba.evaluate.consistency import (
     EXPECTED,
@@ -36,7 +38,7 @@ LEAST_EXPECTED = 16  # of 20 draws from a 95 % interval: fewer in one case of 40
 def _solved(seed: int) -> tuple[Reconstruction, Trajectory]:
     """A map of bearings with the noise that keypoints claim, of least squares, and its truth."""
     world = make_world(seed, num_frames=FRAMES, num_points=200, false_share=0)
-    settings = RefineSettings.model_validate({"factors": ("bearing",), "solver": {"loss": "none"}})
+    settings = RefineSettings.model_validate({"factors": ("bearing",)})
     true = world.world_T_rigs
     held = gtsam.NonlinearFactorGraph()
     gauge = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
@@ -44,7 +46,11 @@ def _solved(seed: int) -> tuple[Reconstruction, Trajectory]:
     priors = gtsam.NonlinearFactorGraph(held)
     priors.push_back(pose_variables.fixed_scale(true))
     start = Solution.without_points(true)
-    problem = AdjustmentContext(Families((Bearings(), GivenFactors(priors))), RIG, settings, 1)
+    families, solver = (
+        Families((Bearings(), GivenFactors(priors))),
+        SolverOptions(loss=RobustLoss()),
+    )
+    problem = AdjustmentContext(families, RIG, settings, 1, solver)
     solved = adjustment.adjust(world.tracks, world.keypoints, start, problem, (8.0,))
     solved = replace(solved, noise=1.0)
     problem = replace(problem, families=Families((Bearings(), GivenFactors(held))))

@@ -22,7 +22,7 @@ from gsba.trajectory.files import read_trajectory
 EXAMPLES = Path(__file__).parents[2] / "examples"
 NUM_FRAMES, WIDTH, TAG = 14, 1024, 0.5
 LIGHTER = {
-    "cubemap": {"face_size": 256},
+    "cubemap": {"min_face_size": 256, "max_face_size": 256},
     "features": {"max_per_face": 400},
     "weak_frames": {"mode": "off"},
     "patches": {"rounds": 0},

@@ -13,8 +13,7 @@ from synthetic import unit
 from factors import RobustLoss, tangent_basis
 from factors.camera_block import CameraBlock, sightings_of
 from factors.camera_rows import CameraVariables, LensVariables, lens_sizes, vector
-from gsba.bundle.optimizer import optimize
-from gsba.config import SolverSettings
+from gsba.bundle.optimizer import SolverOptions, optimize
 
 FRAMES, POINTS = 5, 24
 FISHEYES = np.array(
@@ -295,7 +294,7 @@ def test_optimum_is_that_of_gtsam_on_the_same_factors(kind: str) -> None:
     block, values, _, rows = _world(kind, num_points=14)
     frames, which, _, measured, whiteners, seeing, fractions = rows
     camera, graph = block.camera, _priors(values, block.camera)
-    tight = SolverSettings(relative_tolerance=1e-13, absolute_tolerance=None, max_iterations=100)
+    tight = SolverOptions(relative_tolerance=1e-13, absolute_tolerance=None, max_iterations=100)
     found = optimize(graph, values, [block], tight)
     whole, start = gtsam.NonlinearFactorGraph(graph), gtsam.Values(values)
     for j, point in enumerate(block.points_world):

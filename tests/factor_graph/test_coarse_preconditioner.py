@@ -22,8 +22,7 @@ from factors.iterative_system import IterativeSystem
 from factors.reduced_camera_system import ReducedSystem
 from factors.schur_complement import GROUP_DIM
 from factors.system_layout import SystemLayout
-from gsba.bundle.optimizer import optimize
-from gsba.config import SolverSettings
+from gsba.bundle.optimizer import SolverOptions, optimize
 
 NUM_FRAMES, NUM_POINTS, SIGMA = 30, 300, 1e-3
 
@@ -160,7 +159,7 @@ def test_blocks_without_products_are_written_out_beside_those_with(
 
 
 def test_the_optimum_is_the_same(world, held, monkeypatch) -> None:
-    tight = SolverSettings(relative_tolerance=1e-12, max_iterations=200)
+    tight = SolverOptions(relative_tolerance=1e-12, max_iterations=200)
     iterated = optimize(world.graph, world.values, [world.block()], tight)
     monkeypatch.setattr(direct_system, "_MAX_OPERATIONS", np.inf)
     direct = optimize(world.graph, world.values, [world.block()], tight)

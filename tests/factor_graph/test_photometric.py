@@ -15,12 +15,11 @@ from factors.photometric import _MIN_THREAD_OBSERVATIONS, FAMILY, PhotometricBlo
 from factors.photometric_factor import PhotometricFactor
 from factors.sphere_image import SphereImage
 from factors.threads import balanced_ranges
-from gsba.bundle.optimizer import optimize
-from gsba.config import SolverSettings
+from gsba.bundle.optimizer import SolverOptions, optimize
 
 SIGMA = 2.0
 LOSS = RobustLoss("cauchy", 2.0)
-TIGHT = SolverSettings(relative_tolerance=1e-10, max_iterations=100)
+TIGHT = SolverOptions(relative_tolerance=1e-10, max_iterations=100)
 PLANE = 1000  # first key of a plane
 STEP = 1e-6  # of differences: the spline has kinks in its third derivative
 

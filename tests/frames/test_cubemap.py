@@ -121,7 +121,10 @@ def test_automatic_size_follows_the_panoramas_density(oversampling: float) -> No
 
 def test_sizes_can_be_set_and_bounded() -> None:
     erp = _frame_set("erp", 8192)
-    assert cubemap.rig_for(erp.format, CubemapSettings(face_size=300)).size == 300
+    assert (
+        cubemap.rig_for(erp.format, CubemapSettings(min_face_size=300, max_face_size=300)).size
+        == 300
+    )
     assert cubemap.rig_for(erp.format, CubemapSettings(max_face_size=700)).size == 700
 
 

@@ -21,7 +21,7 @@ from synthetic import features_of, unit
 from gsba.camera.rig import CubeRig
 from gsba.config import RefineSettings
 from gsba.features import detection
-from gsba.features.detection import search_settings
+from gsba.features.detection import traits_of
 from gsba.geometry import pose
 from gsba.learned import FaceMatcher, LearnedExtractor, make_matcher, overlapping_faces
 from gsba.learned.lightglue import LightGlue
@@ -104,7 +104,7 @@ def test_contract(
         poses: np.ndarray, strongest: int | None = None, num: int = 1
     ) -> guided_search.Matches:
         pairs, frames = np.array([[0, 1]] * num), _frames(found, strongest)
-        how = search_settings(settings), Threads(num)
+        how = traits_of(settings), Threads(num)
         return guided_search.match(pairs, poses, [GATE] * num, frames, *how, matcher=compare)
 
     matched = match(poses, num=2)

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from synthetic import bearings_of, features_of, unit, with_noise
 
-from gsba.config import MatchingSettings
+from gsba.features.detection import ExtractorTraits
 from gsba.geometry import pose
 from gsba.matching import guided_search
 from gsba.matching.guided_search import Gate, SearchableFrames, match_pair, searchable, within_gate
@@ -20,7 +20,7 @@ NUM = 400
 F0_T_F1 = pose(Rotation.from_rotvec([0.05, 0.3, -0.02]).as_matrix(), np.array([0.4, 0.05, 0.6]))
 BAND = Gate(np.deg2rad(0.5), 0.01, np.deg2rad(80))
 POINT = Gate(np.pi, 1.0, np.pi, np.deg2rad(0.5))
-SETTINGS = MatchingSettings(min_similarity=0.8, max_ratio=0.9)
+TRAITS = ExtractorTraits(min_similarity=0.8, max_ratio=0.9)
 
 
 class Scene:
@@ -64,9 +64,9 @@ def _match(
     gate: Gate = BAND,
     points_f0: np.ndarray | None = None,
     f0_T_f1: np.ndarray = F0_T_F1,
-    settings: MatchingSettings = SETTINGS,
+    traits: ExtractorTraits = TRAITS,
 ) -> np.ndarray:
-    return match_pair(searchable(first), searchable(second), f0_T_f1, gate, settings, points_f0)
+    return match_pair(searchable(first), searchable(second), f0_T_f1, gate, traits, points_f0)
 
 
 def test_true_matches_pass(scene: Scene) -> None:
@@ -240,9 +240,9 @@ def test_matches_are_one_to_one_and_mutual() -> None:
     first = features_of(bearings, descriptors)
     second = features_of(bearings[:1], descriptors[:1])
     everything = Gate(np.pi, 1.0, np.pi)
-    loose = MatchingSettings(max_ratio=1.0, min_similarity=0.0)
+    loose = ExtractorTraits(max_ratio=1.0, min_similarity=0.0)
     for f0, f1 in ((first, second), (second, first)):
-        found = _match(f0, f1, everything, f0_T_f1=np.eye(4), settings=loose)
+        found = _match(f0, f1, everything, f0_T_f1=np.eye(4), traits=loose)
         np.testing.assert_array_equal(found, [[0, 0]])
 
 
@@ -251,8 +251,8 @@ def test_an_unrequited_match_is_none() -> None:
     bearings = unit(np.array([[0.0, 0, 1], [0.3, 0, 1]]))
     first = features_of(bearings, _directions(0.0, 0.35))
     second = features_of(bearings, _directions(0.2, 0.36))
-    loose = MatchingSettings(max_ratio=1.0, min_similarity=0.0)
-    found = _match(first, second, Gate(np.pi, 1.0, np.pi), f0_T_f1=np.eye(4), settings=loose)
+    loose = ExtractorTraits(max_ratio=1.0, min_similarity=0.0)
+    found = _match(first, second, Gate(np.pi, 1.0, np.pi), f0_T_f1=np.eye(4), traits=loose)
     np.testing.assert_array_equal(found, [[1, 1]])
 
 
@@ -271,13 +271,13 @@ def test_ratio_and_similarity_are_those_of_the_descriptors(ratio: float) -> None
     for rival, expected in ((ratio * 1.03, 1), (ratio * 0.97, 0)):
         other = 2 * np.arcsin(np.sin(best / 2) / ratio * (rival / ratio))
         second = features_of(bearings, _directions(best, -other))
-        settings = MatchingSettings(max_ratio=ratio, min_similarity=0.5)
-        found = _match(first, second, everything, f0_T_f1=np.eye(4), settings=settings)
+        traits = ExtractorTraits(max_ratio=ratio, min_similarity=0.5)
+        found = _match(first, second, everything, f0_T_f1=np.eye(4), traits=traits)
         assert len(found) == expected
     alone = features_of(bearings[:1], _directions(best))
     for similarity, expected in ((np.cos(best) - 0.01, 1), (np.cos(best) + 0.01, 0)):
-        settings = MatchingSettings(min_similarity=similarity, max_ratio=0.9)
-        found = _match(first, alone, everything, f0_T_f1=np.eye(4), settings=settings)
+        traits = ExtractorTraits(min_similarity=similarity, max_ratio=0.9)
+        found = _match(first, alone, everything, f0_T_f1=np.eye(4), traits=traits)
         assert len(found) == expected
 
 
@@ -309,7 +309,7 @@ def test_pairs_are_matched_in_order_whatever_the_threads(scene: Scene) -> None:
             world_T_rigs,
             [BAND] * 3,
             SearchableFrames(_reader(frames)),
-            SETTINGS,
+            TRAITS,
             Threads(threads),
         )
         for threads in (1, 3)
@@ -323,7 +323,7 @@ def test_pairs_are_matched_in_order_whatever_the_threads(scene: Scene) -> None:
 def test_no_pairs_are_no_error(scene: Scene) -> None:
     none = np.zeros((0, 2), np.int32)
     frames = SearchableFrames(_reader([scene.first()]))
-    found = guided_search.match(none, np.eye(4)[None], [], frames, SETTINGS, Threads(2))
+    found = guided_search.match(none, np.eye(4)[None], [], frames, TRAITS, Threads(2))
     assert found.keypoints.shape == (0, 2) and found.pairs.shape == (0, 2)
 
 

@@ -20,6 +20,7 @@ from gsba import disk
 from gsba.bundle import adjustment
 from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.families import Bearings, Families, Family, Reprojections
+from gsba.bundle.optimizer import SolverOptions
 from gsba.bundle.trajectory_prior import GyroTurns, TrajectoryPrior
 from gsba.camera.rig import owner_faces
 from gsba.config import PriorSettings, RefineSettings
@@ -84,12 +85,11 @@ def context(
 ) -> AdjustmentContext:
     """Context of an adjustment whose maps are divided."""
     factors = ("bearing", "reprojection") if kind == "reprojection" else ("bearing",)
-    settings = RefineSettings.model_validate(
-        {"factors": factors, "solver": {"relative_tolerance": 1e-9, "absolute_tolerance": None}}
-    )
+    settings = RefineSettings(factors=factors)
+    solver = SolverOptions(relative_tolerance=1e-9, absolute_tolerance=None)
     workers = Threads(2) if workers is None else workers
     division = DividedAdjustments(folder / "parts", folder / "shards", workers, part_frames)
-    return AdjustmentContext(families(poses, kind), RIG, settings, 1, division=division)
+    return AdjustmentContext(families(poses, kind), RIG, settings, 1, solver, division=division)
 
 
 @pytest.fixture(scope="module")

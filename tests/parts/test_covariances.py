@@ -9,8 +9,7 @@ from gtsam.symbol_shorthand import B, X
 from town_in_parts import NUM, town
 
 from factors import LandmarkBlock, RobustLoss
-from gsba.bundle.optimizer import marginal_covariances, optimize
-from gsba.config import SolverSettings
+from gsba.bundle.optimizer import SolverOptions, marginal_covariances, optimize
 from gsba.parts.divided_system import divided_covariances, optimize_divided
 from gsba.parts.folder import PartsWriter, load_index, values_at
 from gsba.store.shards import Threads
@@ -77,7 +76,7 @@ def test_parts_give_the_undivided_covariances(most: int, tmp_path: Path) -> None
 
 @pytest.mark.parametrize("most", [15, NUM + 2])
 def test_variables_that_all_share_move_as_undivided(most: int, tmp_path: Path) -> None:
-    settings = SolverSettings(relative_tolerance=1e-10, absolute_tolerance=None, loss_sigmas=2.0)
+    settings = SolverOptions(relative_tolerance=1e-10, absolute_tolerance=None, loss=LOSS)
     points, term, rows, graph = town()
     values = values_at(range(NUM), rows)
     values.insert(with_biases(graph, values))

@@ -17,8 +17,7 @@ from town_in_parts import NUM, town, write
 
 from factors import LandmarkBlock, RobustLoss
 from gsba import disk
-from gsba.bundle.optimizer import OptimizeResult, optimize
-from gsba.config import SolverSettings
+from gsba.bundle.optimizer import OptimizeResult, SolverOptions, optimize
 from gsba.disk import FullDiskError
 from gsba.log import GsbaError
 from gsba.parts import folder as parts_folder
@@ -27,8 +26,9 @@ from gsba.parts.folder import PartsWriter, load_index, load_part, values_at
 from gsba.store.cluster import Cluster
 from gsba.store.shards import Job, Spent, Threads
 
-SETTINGS = SolverSettings(
-    relative_tolerance=1e-10, absolute_tolerance=None, loss_sigmas=2.0, lambda_initial=1e-2
+LOSS = RobustLoss("cauchy", 2.0)
+SETTINGS = SolverOptions(
+    relative_tolerance=1e-10, absolute_tolerance=None, loss=LOSS, lambda_initial=1e-2
 )
 
 
@@ -41,9 +41,8 @@ def poses_of(values: gtsam.Values) -> np.ndarray:
 def undivided() -> tuple[OptimizeResult, np.ndarray]:
     """The town solved by one system of all frames; its landmarks."""
     points, term, rows, graph = town()
-    loss = RobustLoss(SETTINGS.loss, SETTINGS.loss_sigmas)
     keys = [X(f) for f in range(NUM)]
-    block = LandmarkBlock(keys, points, [term], loss, num_threads=1)
+    block = LandmarkBlock(keys, points, [term], LOSS, num_threads=1)
     result = optimize(graph, values_at(np.arange(NUM), rows), [block], SETTINGS)
     return result, block.points_world
 

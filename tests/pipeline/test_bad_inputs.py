@@ -96,9 +96,9 @@ BAD: dict[str, tuple[Callable[[Path], None], tuple[str, ...]]] = {
     "square mask": (_mask_of_another_shape, ("mask.png", "64x64")),
 }
 OPTIONS = {
-    "unknown key": (["--set", "solver.max_iteration=5"], ("max_iteration",)),
+    "unknown key": (["--set", "solver.num_thread=5"], ("num_thread",)),
     "out of range": (["--set", "features.max_per_face=1"], ("max_per_face", "16")),
-    "wrong kind": (["--set", "solver.max_iterations=many"], ("max_iterations", "integer")),
+    "wrong kind": (["--set", "solver.num_threads=many"], ("num_threads", "integer")),
     "unknown family": (["--factors", "magic"], ("magic", "bearing")),
     "no settings file": (["--config", "nowhere.toml"], ("nowhere.toml",)),
     "no masks": (["--masks", "nowhere.png"], ("nowhere.png",)),

@@ -6,8 +6,7 @@ import pytest
 from tiny_run import NUM_FRAMES, Case, computed_stages, settings_with
 
 from gsba.bundle.adjustment import DivisibleMap
-from gsba.bundle.optimizer import OptimizeResult
-from gsba.config import SolverSettings
+from gsba.bundle.optimizer import OptimizeResult, SolverOptions
 from gsba.parts import adjustments
 
 
@@ -19,9 +18,9 @@ def test_a_run_in_parts_is_as_good_and_leaves_none_behind(
     minimized, used = adjustments.DividedAdjustments.minimized, list[bool]()
 
     def noted(
-        self: adjustments.DividedAdjustments, map_: DivisibleMap, settings: SolverSettings
+        self: adjustments.DividedAdjustments, map_: DivisibleMap, options: SolverOptions
     ) -> OptimizeResult | None:
-        found = minimized(self, map_, settings)
+        found = minimized(self, map_, options)
         used.append(found is not None)
         return found
 

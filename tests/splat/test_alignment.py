@@ -8,11 +8,11 @@ from tiny_run import Case
 
 from gsba.camera.rig import RIG_R_FACE, CubeRig
 from gsba.camera.views import rig_views
-from gsba.config import SplatSettings
 from gsba.geometry import pose
 from gsba.splat.alignment import render_view
 from gsba.splat.backend import CpuBackend
 from gsba.splat.gaussians import Gaussians, from_cloud
+from gsba.splat.options import TrainingOptions
 from gsba.splat.scene import load_faces, make_views, start_cloud
 from gsba.splat.train import near_of, train
 
@@ -22,7 +22,7 @@ BACKEND = CpuBackend(2)
 @pytest.fixture(scope="module")
 def splat(case: Case) -> Gaussians:
     """A splat of all frames, trained just long enough to show the larger things."""
-    settings = SplatSettings(iterations=300, face_size=48, sh_degree=0, rate_scales=0.02)
+    settings = TrainingOptions(iterations=300, face_size=48, sh_degree=0, rate_scales=0.02)
     poses = case.result.reconstruction.world_T_rigs
     every = np.arange(len(poses))
     views = make_views(load_faces(case.result.frames, every, 48), poses)

@@ -12,12 +12,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from gsba.config import SplatSettings
 from gsba.geometry import rotation_from_quaternion
 from gsba.log import GsbaError
 from gsba.splat.backend import Backend, CpuBackend, choose_backend
 from gsba.splat.camera import FaceCamera
 from gsba.splat.gaussians import Gaussians
+from gsba.splat.options import TrainingOptions
 from gsba.splat.train import Trainer, Views, begin
 
 torch = pytest.importorskip("torch", reason="torch is not installed: pip install '.[splat]'")
@@ -136,7 +136,7 @@ def test_a_stretch_of_training_is_that_of_the_cpu(
 ) -> None:
     monkeypatch.setattr("gsba.splat.train._NEAR", NEAR / 3.5)
     views = _views(_gaussians(40, 1), masked)
-    settings = SplatSettings(iterations=3000, sh_degree=2, seed=2)
+    settings = TrainingOptions(iterations=3000, sh_degree=2, seed=2)
     ends = []
     for renderer in (CpuBackend(1), backend):
         trainer, state = Trainer(views, settings, renderer), begin(_gaussians(30, 7), settings)
@@ -159,7 +159,7 @@ def test_a_stretch_of_training_is_that_of_the_cpu(
 def test_density_control_is_at_its_time(backend: Backend, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gsba.splat.train._DENSIFY_PULL", 1e-6)
     views = _views(_gaussians(20, 1), False)
-    settings = SplatSettings(iterations=3000, sh_degree=1, seed=2)
+    settings = TrainingOptions(iterations=3000, sh_degree=1, seed=2)
     trainer = Trainer(views, settings, backend)
     state = dataclasses.replace(begin(_gaussians(12, 7), settings), step=140)
     before = trainer.advance(state, 3000)
@@ -169,7 +169,7 @@ def test_density_control_is_at_its_time(backend: Backend, monkeypatch: pytest.Mo
 
 
 def test_harmonics_that_are_not_there_are_not_asked_for(backend: Backend) -> None:
-    settings, plain = SplatSettings(iterations=3000, sh_degree=3, seed=2), _gaussians(12, 7)
+    settings, plain = TrainingOptions(iterations=3000, sh_degree=3, seed=2), _gaussians(12, 7)
     first = begin(dataclasses.replace(plain, sh=plain.sh[:, :1].copy()), settings)
     trainer = Trainer(_views(_gaussians(20, 1), False), settings, backend)
     after = trainer.advance(dataclasses.replace(first, step=140), 142)
@@ -193,7 +193,7 @@ def test_too_little_memory_is_one_line(backend: Backend, monkeypatch: pytest.Mon
     monkeypatch.setattr(backend, "_rasterize", full)
     with pytest.raises(GsbaError, match="too small for 5 Gaussians"):
         backend.render(_gaussians(5, 1), _cameras(1), None, NEAR)
-    settings = SplatSettings(iterations=100)
+    settings = TrainingOptions(iterations=100)
     trainer = Trainer(_views(_gaussians(5, 1), False), settings, backend)
     with pytest.raises(GsbaError, match="too small for 4 Gaussians"):
         trainer.advance(begin(_gaussians(4, 1), settings), 100)

@@ -12,20 +12,20 @@ from splat_alignment import align_to_splat
 from gsba.camera.lens import Lenses
 from gsba.camera.sphere import bearings_from_erp
 from gsba.camera.views import ONE_EYE, Optics
-from gsba.config import SplatSettings
 from gsba.disk import write_image
 from gsba.geometry import pose
 from gsba.splat import Gaussians, from_cloud
 from gsba.splat.alignment import capture
 from gsba.splat.backend import CpuBackend
 from gsba.splat.gaussians import concatenate
+from gsba.splat.options import TrainingOptions
 from gsba.splat.pictures import render_panorama
 from gsba.splat.scene import load_faces, make_views
 from gsba.splat.scores import mean_score, measure
 from gsba.types import FrameSet, PictureFormat
 
 WIDTH, SIZE, NEAR, NUM_FRAMES = 512, 96, 0.01, 2
-BACKEND, SETTINGS = CpuBackend(2), SplatSettings(sh_degree=0)
+BACKEND, SETTINGS = CpuBackend(2), TrainingOptions(sh_degree=0)
 RNG = np.random.default_rng(0)
 FIXED = Lenses(np.array([0.0, 0.01, 0.1]), band_rad=np.deg2rad(3))
 AXES = Rotation.from_rotvec(RNG.normal(0, 0.4, (NUM_FRAMES, 3))).as_matrix()

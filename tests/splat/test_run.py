@@ -11,12 +11,12 @@ from tiny_run import Case
 
 from gsba.camera.rig import CubeRig
 from gsba.camera.views import rig_views
-from gsba.config import SplatSettings
 from gsba.evaluate.splats import compare, poses_for
 from gsba.geometry import pose
 from gsba.log import GsbaError
 from gsba.splat import from_cloud, read_ply, scene
 from gsba.splat.backend import CpuBackend
+from gsba.splat.options import TrainingOptions
 from gsba.splat.pictures import render_panorama, render_views
 from gsba.splat.scores import measure
 from gsba.store.finished import load_run
@@ -146,7 +146,7 @@ def test_a_masked_face_is_left_out(case: Case) -> None:
     nothing = scene.make_views(scene.Faces(SIX, images, np.zeros_like(use)), np.eye(4)[None])
     gaussians = from_cloud(np.ones((2, 3)), np.zeros((2, 3), np.uint8))
     with pytest.raises(GsbaError, match="held-out frames are masked"):
-        measure(gaussians, nothing, SplatSettings(), 0.01, CpuBackend(1))
+        measure(gaussians, nothing, TrainingOptions(), 0.01, CpuBackend(1))
 
 
 def test_panoramas_at_one_place_are_scored_apart() -> None:
@@ -155,7 +155,7 @@ def test_panoramas_at_one_place_are_scored_apart() -> None:
     faces = scene.Faces(SIX, images, np.ones((12, 16, 16), bool))
     views = scene.make_views(faces, np.eye(4)[None].repeat(2, 0))
     gaussians = from_cloud(np.full((2, 3), 99.0), np.zeros((2, 3), np.uint8))
-    scores = measure(gaussians, views, SplatSettings(), 0.01, CpuBackend(1))
+    scores = measure(gaussians, views, TrainingOptions(), 0.01, CpuBackend(1))
     assert list(scores) == [0, 1] and scores[0].psnr > scores[1].psnr
     assert scores[1].psnr == pytest.approx(-20 * np.log10(128 / 255), abs=1e-3)
 
@@ -163,7 +163,7 @@ def test_panoramas_at_one_place_are_scored_apart() -> None:
 def test_too_few_common_frames_are_refused(case: Case, tmp_path: Path) -> None:
     frames = case.result.frames
     sources = {"none": np.full((len(frames), 4, 4), np.nan)}
-    settings = SplatSettings(iterations=2, face_size=16)
+    settings = TrainingOptions(iterations=2, face_size=16)
     with pytest.raises(GsbaError, match="too few"):
         compare(
             case.result.reconstruction, frames, sources, settings, CpuBackend(1), tmp_path / "out"

@@ -9,7 +9,6 @@ import pytest
 
 from gsba.camera.rig import CubeRig
 from gsba.camera.views import rig_views
-from gsba.config import SplatSettings
 from gsba.geometry import pose
 from gsba.log import GsbaError
 from gsba.splat import adam
@@ -18,12 +17,13 @@ from gsba.splat.camera import view_camera
 from gsba.splat.density import DensityLimits, Pull, densify, reset_opacity
 from gsba.splat.gaussians import Gaussians, from_cloud
 from gsba.splat.metrics import psnr
+from gsba.splat.options import TrainingOptions
 from gsba.splat.rasterise import render
 from gsba.splat.train import Views, advance, begin, extent_of, most_gaussians, times_for, train
 
 SIZE = 32
 RIG = CubeRig(SIZE, np.pi / 2)
-SETTINGS = SplatSettings(iterations=320, face_size=SIZE, sh_degree=1, seed=3)
+SETTINGS = TrainingOptions(iterations=320, face_size=SIZE, sh_degree=1, seed=3)
 LIMITS = DensityLimits(2e-4, 0.1, 1.0, 5e-3, 1000)
 
 
