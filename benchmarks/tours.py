@@ -5,8 +5,8 @@ lines.
 
 TOUR: a folder with images/*.jpg, groundtruth.tum and, if a carrier is in the pictures, mask.png, as
 `render_home.py OUT -n 20` writes it. Each is refined by `gsba refine` with its defaults and with
-`pairs.tour=0`; maps are compared with the truth, each after alignment with scale, and steps that
-the search confirms with the true ones.
+`pairs.max_tour_frames=0`. Maps are compared with the truth, each after alignment with scale, and
+the steps that the search confirms with the true ones.
 """
 
 import argparse
@@ -93,7 +93,7 @@ def main() -> None:
     ]
     for tour in options.tours:
         for name, most in (("no", 0), ("yes", 100)):
-            settings = load_config(None, [f"pairs.tour={most}", "export.formats=[]"])
+            settings = load_config(None, [f"pairs.max_tour_frames={most}", "export.formats=[]"])
             lines.append(f"| {' | '.join([tour.name, name, *row_of(tour, settings)])} |")
             print(lines[-1], flush=True)
     write_table(lines, options.out)

@@ -109,8 +109,8 @@ class PairSettings(_Settings):
     far_drift: float = Field(
         default=0.05, ge=0, le=1
     )  # largest relative drift that a loop closure may correct
-    tour: int = Field(default=100, ge=0)  # most frames, without a trajectory, whose keypoints are
-    # searched along epipolar lines where descriptors tie few of them; 8 s a step; 0 = never
+    max_tour_frames: int = Field(default=100, ge=0)  # most frames of a tour without a trajectory
+    # whose keypoints are searched along epipolar lines, which takes 8 s a step; 0 = never
 
 
 class RoundSettings(_Settings):

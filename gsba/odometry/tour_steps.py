@@ -228,6 +228,8 @@ def _distinct(
 
 def _proposals(one: TourFrame, other: TourFrame) -> list[np.ndarray]:
     """Poses f1_T_f0 by descriptors, those with most inliers first."""
+    if not (len(one.rays) and len(other.rays)):
+        return []
     likes = one.descriptors @ other.descriptors.T
     nearest = likes.argmax(axis=1)
     rows = np.flatnonzero(likes.argmax(axis=0)[nearest] == np.arange(len(nearest)))

@@ -13,6 +13,7 @@ from gsba.loop_closure import connectivity
 from gsba.matching.recovery import Recovered
 from gsba.odometry.tour_maps import TourMatches, match_tour
 from gsba.pipeline import frontend
+from gsba.pipeline.run import Run
 from gsba.pipeline.state import ObservedFrames, State
 from gsba.trajectory import judgement
 from gsba.trajectory.limits import TwoViewLimits
@@ -22,6 +23,7 @@ from gsba.types import Features, Matches
 logger = logging.getLogger(__name__)
 
 _MAX_TIED_SHARE = 0.8  # of frames in maps of descriptors, below which places are searched
+_MIN_INTERVAL_S = 2.0  # between stills metres apart; frames of a video can be had closer together
 _STAGE = "features_tour"
 
 
@@ -30,14 +32,15 @@ def match_places(state: State, found: Recovered) -> State | None:
     frames, or where places tie no more."""
     run, prior = state.run, state.prior
     num = len(run.frames)
-    if not prior.absent or found.trust.turning_only or not 3 <= num <= run.settings.pairs.tour:
+    if not prior.absent or found.trust.turning_only or not _may_be_tour(run):
         return None
     before = _num_tied(found.neighbours.matches, num)
     if before > _MAX_TIED_SHARE * num:
         return None
     logger.info(
-        "%d of %d frames are in maps of 3 frames and more: their keypoints are searched along "
-        "epipolar lines (about 8 s of processor time a step; --set pairs.tour=0 leaves it out)",
+        "descriptors tie %d of %d frames in maps of 3 and more: keypoints of neighbours are "
+        "searched along epipolar lines, 8 s of processor time a step "
+        "(--set pairs.max_tour_frames=0 leaves it out)",
         before,
         num,
     )
@@ -54,6 +57,14 @@ def match_places(state: State, found: Recovered) -> State | None:
         prior, coarse=replace(prior.coarse, world_T_rigs=trust.world_T_rigs), trust=trust
     )
     return replace(state, observed=observed, places=places).begun(prior, near)
+
+
+def _may_be_tour(run: Run) -> bool:
+    """True for few frames that no video has taken."""
+    frames, num = run.frames, len(run.frames)
+    if not 3 <= num <= run.settings.pairs.max_tour_frames:
+        return False
+    return not frames.timed or bool(np.median(np.diff(frames.timestamps)) >= _MIN_INTERVAL_S)
 
 
 def _num_tied(matches: Matches, num: int) -> int:

@@ -22,6 +22,7 @@ from gsba.odometry.tour_steps import (
     adjusted_pose,
     found_places,
     frame_of,
+    hypotheses,
     pose_errors_deg,
     step_of,
 )
@@ -85,6 +86,13 @@ def test_a_step_with_another_direction_fits_few_places() -> None:
     none = np.zeros(0, int), NONE
     wrong = step_of(one, other, turned, found_places(one, other, rows, turned, 0.35), none)
     assert wrong.num < right.num / 10
+
+
+def test_a_blank_picture_has_no_hypotheses() -> None:
+    blank = frame_of(np.full((512, 1024), 90, np.uint8), None)
+    assert hypotheses(frames()[0], blank) == [] == hypotheses(blank, frames()[0])
+    steps = list[list[Step]]([[], [hypothesis()], []])
+    assert confirmed(steps, [{}, {}])[1] == [None, None]
 
 
 def test_a_pose_is_fitted_to_places_with_false_ones() -> None:

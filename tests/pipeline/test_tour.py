@@ -45,7 +45,7 @@ def test_searched_places_make_a_map_where_descriptors_make_none(
 
 
 def test_the_search_can_be_turned_off(stills: Path, tmp_path: Path) -> None:
-    settings = settings_with(**STRANGE, pairs={"tour": 0})
+    settings = settings_with(**STRANGE, pairs={"max_tour_frames": 0})
     with pytest.raises(GsbaError, match="no two neighbouring frames match"):
         refine(stills, None, tmp_path / "run", settings, masks="none")
 
@@ -70,3 +70,9 @@ def test_added_keypoints_follow_the_others_of_their_face() -> None:
         added[owner_faces(added) == 0],
         atol=1e-12,
     )
+
+
+def test_frames_of_a_video_are_not_searched(stills: Path, tmp_path: Path) -> None:
+    settings = settings_with(**STRANGE)
+    with pytest.raises(GsbaError, match="no two neighbouring frames match"):
+        refine(stills, None, tmp_path / "run", settings, masks="none", fps=2.0)
