@@ -34,6 +34,8 @@ _MAX_OFF_RAD = np.deg2rad(0.5)  # of a place found in a third frame from the pre
 _MIN_PARALLAX_RAD = np.deg2rad(3.0)  # between the first and the third frame
 MIN_CELLS, MIN_LEAD = 7, 1.5  # cells that confirm three frames; times those of any rival
 MIN_CELLS_OF_RATIO = 5  # where both steps are confirmed
+MIN_END_RANK = 120.0  # of a step at an end, which one triple holds alone: in flats, three of five
+# steps below it were off by 1 to 7 degrees
 MAX_RIVAL_CELLS = 12  # of other steps or another ratio, from which the place repeats
 MAX_RIVALLED_SHARE = 0.25  # of frames with such rivals, above which no place is believed
 _ALIKE_DEG, _ALIKE_LOG = (3.0, 8.0), 0.25  # rotation, direction; ratio: below these, hypotheses are
@@ -181,7 +183,20 @@ def confirmed(
             }
             best, rival = _best_and_rival(steps[f : f + 2], left, pair)
             chosen[f] = best if _is_sure(best, rival, before and after) else None
-    return chain, chosen
+    ranks = [some[c].rank if some else 0.0 for some, c in zip(steps, chain, strict=True)]
+    return chain, _without_weak_ends(chosen, ranks)
+
+
+def _without_weak_ends(chosen: list[Triple | None], ranks: Sequence[float]) -> list[Triple | None]:
+    """Triples (F - 2,) without those that hold a step of low rank (F - 1,) alone."""
+    left = list(chosen)
+    while True:
+        held = [some is not None for some in left]
+        beside = zip([*held, False], [False, *held], ranks, strict=True)
+        weak = [here != before and rank < MIN_END_RANK for here, before, rank in beside]
+        if not any(weak):
+            return left
+        left = [None if weak[f] or weak[f + 1] else some for f, some in enumerate(left)]
 
 
 def _is_sure(best: Triple | None, rival: int, steps_known: bool = False) -> bool:

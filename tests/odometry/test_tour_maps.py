@@ -1,5 +1,6 @@
 """Steps of tours: hypotheses by searched places, and their confirmation by three frames."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -34,7 +35,7 @@ NONE = np.zeros((0, 3))
 def hypothesis(turn_deg: float = 0.0) -> Step:
     """A hypothesis without keypoints, turned against others."""
     f1_T_f0 = pose(Rotation.from_euler("y", turn_deg, degrees=True).as_matrix(), np.eye(3)[2])
-    return Step(f1_T_f0, NONE[:, 0], NONE[:, 0], NONE, NONE, 1.0, 1)
+    return Step(f1_T_f0, NONE[:, 0], NONE[:, 0], NONE, NONE, 500.0, 1)
 
 
 def of_cells(cells: int, log_ratio: float = 0.0) -> Triple:
@@ -142,6 +143,15 @@ def test_where_places_repeat_nothing_is_confirmed() -> None:
     repeated = clear | {(1, 1): [of_cells(MAX_RIVAL_CELLS)]}
     assert None not in confirmed(steps, [clear, clear, clear, repeated])[1]
     assert confirmed(steps, [clear, clear, repeated, repeated])[1] == [None] * 4
+
+
+def test_a_step_of_low_rank_needs_frames_on_both_sides() -> None:
+    low = replace(hypothesis(), rank=50.0)
+    clear = {(0, 0): [of_cells(20)]}
+    held = [clear[0, 0][0]] * 2
+    assert confirmed([[hypothesis()], [low], [hypothesis()]], [clear, clear])[1] == held
+    at_end = confirmed([[hypothesis()], [hypothesis()], [low]], [clear, clear])[1]
+    assert at_end == [held[0], None]
 
 
 def test_steps_are_kept_between_which_the_ratio_is_known() -> None:
