@@ -23,7 +23,7 @@ from gsba.types import Features, Matches
 logger = logging.getLogger(__name__)
 
 _MAX_TIED_SHARE = 0.8  # of frames in maps of descriptors, below which places are searched
-_MIN_INTERVAL_S = 2.0  # between stills metres apart; frames of a video can be had closer together
+_MIN_INTERVAL_S = 1.5  # between stills metres apart; frames of a video can be had closer together
 _STAGE = "features_tour"
 
 
