@@ -99,6 +99,8 @@ class PairSettings(_Settings):
     window: int = Field(default=32, ge=2)  # frames in time
     max_loop_neighbours: int = Field(default=8, ge=0)  # nearest frames in space outside the window
     strongest_per_face: int = Field(default=150, ge=16)  # keypoints that give pairs' first geometry
+    max_tour_frames: int = Field(default=100, ge=0)  # most frames of a tour without a trajectory
+    # whose keypoints are searched along epipolar lines, which takes 8 s a step; 0 = never
 
 
 class RoundSettings(_Settings):

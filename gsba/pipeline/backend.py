@@ -92,7 +92,8 @@ def place_points(state: State, name: str) -> State:
 def tracks_of(state: State) -> Tracks:
     """Tracks that matches make, within parts that nothing ties together yet."""
     keypoints, parts = state.observed.keypoints, state.prior.parts
-    tied = [connectivity.within(matches, parts) for matches in state.matches.sets()]
+    every = [*([] if state.places is None else [state.places]), *state.matches.sets()]
+    tied = [connectivity.within(matches, parts) for matches in every]
     found = tracks.build(tied, np.diff(keypoints.starts), state.run.store.scratch_folder)
     return state.observed.cameras.clear(found, keypoints, state.run.num_threads)
 
@@ -129,8 +130,11 @@ def separate_parts(state: State) -> np.ndarray | None:
 
 
 def _doubtful_steps(state: State) -> np.ndarray:
-    """Unguided steps (F - 1,) bool of an unusual pace over missing frames, or long, to and fro."""
+    """Unguided steps (F - 1,) bool of an unusual pace over missing frames, or long, to and fro;
+    none of a tour, whose steps three frames confirm."""
     frames, unguided, solution = state.run.frames, state.prior.unguided, state.solution
+    if state.places is not None:
+        return np.zeros(len(frames) - 1, bool)
     times, poses = (frames.timestamps, frames.recording_of_frame), solution.world_T_rigs
     found = judgement.unusual_paces(poses, *times)
     shown = ~(state.prior.trust.unseen_steps | judgement.over_missing_frames(*times))

@@ -48,7 +48,8 @@ def _match(state: State, number: int) -> State:
     """One recording with its neighbours matched, its trajectory judged, its gyro aligned."""
     with naming_recording(state.run.evidence.recordings[number].name):
         found = frontend.match_neighbours(frontend.of_recording(state, number))
-        found = frontend.align_gyro_to_neighbours(frontend.judge_trajectory(found))
+        found = frontend.judge_trajectory(found, frontend.check_steps(found))
+        found = frontend.align_gyro_to_neighbours(found)
         if found.prior.turning_only:
             raise GsbaError(
                 "the camera only turned, so that its frames have no place among those of others: "

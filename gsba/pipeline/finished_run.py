@@ -25,7 +25,11 @@ from gsba.types import CoarsePoses, FrameSet, Landmarks, Reconstruction, Solutio
 _STAGE = "map"
 _CAMERAS = "camera_settings"  # of runs of several cameras, JSON of each
 _MIN_SHARED_POINTS = 12  # least points that two recordings share, to be tied to one another
-_FEATURES = "features_closer", "features"  # stages that hold a frame's features, the last one first
+_FEATURES = (
+    "features_closer",
+    "features_tour",
+    "features",
+)  # stages that hold a frame's features, the last one first
 
 
 @dataclass(frozen=True, slots=True)

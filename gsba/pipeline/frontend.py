@@ -53,7 +53,7 @@ def extract(run: Run) -> State:
     event("features", more=more)
     enlarged = _enlarged(run.settings)
     found = _extract(run, enlarged) if more else _extract(run, run.settings, known=known)
-    observed = _observe(run, "keypoints", [found] * len(run.frames), "features")
+    observed = observe(run, "keypoints", [found] * len(run.frames), "features")
     return State.begin(run, replace(observed, more=more))
 
 
@@ -77,7 +77,7 @@ def extract_more(state: State, weak: np.ndarray) -> State:
     run, before = state.run, state.observed
     found = _extract(run, _enlarged(run.settings), "features_closer", weak)
     each = [found if more else old for more, old in zip(weak, before.features, strict=True)]
-    observed = _observe(run, "keypoints_closer", each, "features_closer")
+    observed = observe(run, "keypoints_closer", each, "features_closer")
     observed = observed.through(before.cameras)
     return replace(state, observed=observed, map=replace(state.map, observed=observed.shown))
 
@@ -98,9 +98,7 @@ def _search(run: Run, settings: RefineSettings) -> Search:
     return Search(run.frames, run.rig, settings, make)
 
 
-def _observe(
-    run: Run, name: str, found: Sequence[PerFrame[Features]], stage: str
-) -> ObservedFrames:
+def observe(run: Run, name: str, found: Sequence[PerFrame[Features]], stage: str) -> ObservedFrames:
     """Features of each frame (F,), ready to be matched; `stage`: the last one they are of."""
     frames = run.frames
     load = FrameFeatures(found, frames.names)
@@ -175,15 +173,20 @@ def _match_neighbours(state: State, name: str) -> State:
     return state.with_verified(run.stage(name, run.matching_key(), compute, VerifiedPairs))
 
 
-def judge_trajectory(state: State) -> State:
-    """The trajectory without what images contradict; neighbours once more where it misled.
-    NoPositions if neighbours show neither a way nor a turn, GsbaError if images contradict most of
-    it."""
+def check_steps(state: State) -> Recovered:
+    """Neighbours with and without the trajectory's guidance, and its steps by these; GsbaError if
+    images contradict most of it."""
     run, prior, times = state.run, state.prior, state.run.frames.timestamps
     context = state.observed.context
     compute = partial(recovery.recover, context, state.verified, prior.coarse, times)
-    key = [run.matching_key(), run.settings.priors]
-    found = run.stage("steps", key, compute, Recovered)
+    return run.stage("steps", [run.matching_key(), run.settings.priors], compute, Recovered)
+
+
+def judge_trajectory(state: State, found: Recovered) -> State:
+    """The trajectory without what images contradict, as `check_steps` has found; neighbours once
+    more where it misled. NoPositions if neighbours show neither a way nor a turn, GsbaError if none
+    match."""
+    run, prior = state.run, state.prior
     near, trust, coarse = found.neighbours, found.trust, found.coarse
     if len(near.matches.pairs) == 0:
         raise GsbaError(

@@ -30,6 +30,7 @@ from gsba.pipeline import (
     inputs,
     outputs,
     patch_rounds,
+    tour,
 )
 from gsba.pipeline.outputs import RunResult
 from gsba.pipeline.prior import Prior
@@ -341,7 +342,8 @@ def _map_all(state: State) -> State:
         state = each_recording.match_neighbours(state)
     else:
         state = frontend.match_neighbours(state)
-        state = frontend.judge_trajectory(state)
+        found = frontend.check_steps(state)
+        state = tour.match_places(state, found) or frontend.judge_trajectory(state, found)
         state = frontend.align_gyro_to_neighbours(state)
     if state.prior.turning_only:
         return state

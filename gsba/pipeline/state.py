@@ -75,6 +75,7 @@ class State:
     map: Map  # poses, points and camera; at the start the poses of the trajectory
     verified: VerifiedPairs  # neighbours in time with their relative poses
     matches: MapMatches  # that the map is made of
+    places: Matches | None = None  # of a tour, searched along epipolar lines; None = not searched
 
     @classmethod
     def begin(cls, run: Run, observed: ObservedFrames) -> "State":

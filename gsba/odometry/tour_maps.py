@@ -1,0 +1,333 @@
+"""Maps of a tour: steps and the ratios of their lengths, confirmed by three frames at a time.
+
+Two steps and a ratio give the pose of a third frame. Points that the first two frames triangulate
+are searched there along whole epipolar lines: a place found where the point must appear is hardly
+chance, and under another step or ratio next to none is.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from factors.threads import map_in_threads
+from gsba.camera.rig import cells_of
+from gsba.geometry import angles_between, inverse, unit
+from gsba.log import track
+from gsba.odometry.tour_steps import (
+    Step,
+    TourFrame,
+    found_places,
+    hypotheses,
+    pose_errors_deg,
+    read_frame,
+)
+from gsba.types import Counts, FrameSet, Matches, VerifiedPairs
+
+_CELLS_PER_SIDE = 6  # of 15 degrees; keypoints of one surface agree together
+_RATIO_WIDTH = 0.08  # of a ratio's logarithm, within which keypoints agree on it
+_MAX_LOG_RATIO = np.log(4.0)  # of two steps' lengths
+_NUM_RATIOS = 3  # that are tried for two hypotheses of steps
+_MIN_VOTES = 3  # keypoints that propose a ratio
+_MAX_OFF_RAD = np.deg2rad(0.5)  # of a place found in a third frame from the predicted one
+_MIN_PARALLAX_RAD = np.deg2rad(3.0)  # between the first and the third frame
+MIN_CELLS, MIN_LEAD = 7, 1.5  # cells that confirm three frames; times those of any rival
+MIN_CELLS_OF_RATIO = 5  # where both steps are confirmed
+MIN_END_RANK = 120.0  # of a step at an end, which one triple holds alone: in flats, three of five
+# steps below it were off by 1 to 7 degrees
+MAX_RIVAL_CELLS = 12  # of other steps or another ratio, from which the place repeats
+MAX_RIVALLED_SHARE = 0.25  # of frames with such rivals, above which no place is believed
+_ALIKE_DEG, _ALIKE_LOG = (3.0, 8.0), 0.25  # rotation, direction; ratio: below these, hypotheses are
+# no rivals but less accurate ones
+_PLACE_SIGMA_RAD = 1.5e-3  # noise of a place that a search has found
+_LOG_SIGMA, _DIRECTION_SIGMA_RAD = 0.02, 0.01  # of confirmed ratios and steps
+
+
+@dataclass(frozen=True, slots=True)
+class Triple:
+    """Three frames in a row: two steps, and the ratio of their lengths."""
+
+    log_ratio: float  # logarithm of the second step's length by the first one's
+    cells: int  # of the sphere, in the first and the third frame, in which most places confirm it
+    places2: np.ndarray  # (N,) + (3,) rays of the first frame's keys in the third; NaN = no fit
+    places0: np.ndarray  # of the third frame's keys in the first
+
+
+@dataclass(frozen=True, slots=True)
+class TourMatches:
+    """Confirmed steps of a tour, and the places of keypoints that hold them."""
+
+    starts: np.ndarray  # (F + 1,) int64, rays of each frame
+    rays: np.ndarray  # (N, 3) of keypoints, and of places of those of other frames
+    sigmas_rad: np.ndarray  # (N,) noise of the rays
+    near: VerifiedPairs  # steps, and pairs over two steps; matches number the rays of a frame
+    log_ratios: np.ndarray  # (F - 2,) logarithm of each step's length by that of the step before
+    log_sigmas: np.ndarray  # (F - 2,) infinite = not known
+
+
+def match_tour(run_frames: FrameSet, num_threads: int = 1) -> TourMatches:
+    """Confirmed steps of a tour whose frames are in the order of the way."""
+    num = len(run_frames)
+    frames = list(map_in_threads(lambda f: read_frame(run_frames, f), num, num_threads))
+    found = map_in_threads(lambda f: hypotheses(frames[f], frames[f + 1]), num - 1, num_threads)
+    steps = list(track(found, "searching along epipolar lines", num - 1))
+
+    def triples(f: int) -> dict[tuple[int, int], list[Triple]]:
+        return triples_of(frames[f], frames[f + 1], frames[f + 2], steps[f], steps[f + 1])
+
+    return _matches(
+        frames, steps, *confirmed(steps, list(map_in_threads(triples, num - 2, num_threads)))
+    )
+
+
+def ratios(before: Step, after: Step, keys: np.ndarray) -> list[float]:
+    """Logarithms of ratios of two steps' lengths that keypoints (N, 3) of the frame between them
+    propose: those with most cells first, each without the keypoints of those before."""
+    both = np.isfinite(before.depths1) & np.isfinite(after.depths0)
+    logs, cells = (
+        np.log(before.depths1[both] / after.depths0[both]),
+        cells_of(keys[both], _CELLS_PER_SIDE),
+    )
+    near, left, found = np.abs(logs[:, None] - logs) < _RATIO_WIDTH, np.ones(len(logs), bool), []
+    while np.count_nonzero(left) >= _MIN_VOTES and len(found) < _NUM_RATIOS:
+        agreeing = max(
+            (near[n] & left for n in np.flatnonzero(left)),
+            key=lambda some: (len(np.unique(cells[some])), np.count_nonzero(some)),
+        )
+        if np.count_nonzero(agreeing) < _MIN_VOTES:
+            break
+        found.append(float(np.median(logs[agreeing])))
+        left &= np.abs(logs - found[-1]) > 2 * _RATIO_WIDTH
+    return [log for log in found if abs(log) < _MAX_LOG_RATIO]
+
+
+def triple(
+    first: TourFrame, third: TourFrame, before: Step, after: Step, log_ratio: float
+) -> Triple:
+    """Three frames, with the places in the first and the third that confirm two steps and a
+    ratio."""
+    length = np.exp(log_ratio)
+    f2_T_f1 = after.f1_T_f0.copy()
+    f2_T_f1[:3, 3] *= length
+    f2_T_f0 = f2_T_f1 @ before.f1_T_f0
+    places2, cells2 = _confirming(first, third, before.depths0, f2_T_f0)
+    places0, cells0 = _confirming(third, first, after.depths1 * length, inverse(f2_T_f0))
+    return Triple(log_ratio, cells2 + cells0, places2, places0)
+
+
+def _confirming(
+    one: TourFrame, other: TourFrame, depths: np.ndarray, f1_T_f0: np.ndarray
+) -> tuple[np.ndarray, int]:
+    """Places (N, 3) in another frame of keys with depths (N,), where these predict them; NaN =
+    elsewhere or not found; and cells in which most places found are predicted."""
+    places = np.full((len(one.keys), 3), np.nan)
+    rows = np.flatnonzero(np.isfinite(depths))
+    length = np.linalg.norm(f1_T_f0[:3, 3])
+    if not len(rows) or not length > 0:
+        return places, 0
+    along = f1_T_f0.copy()
+    along[:3, 3] /= length
+    rows, found = found_places(one, other, rows, along, 0.35)
+    turned = one.keys[rows] @ f1_T_f0[:3, :3].T
+    predicted = unit(turned * depths[rows, None] + f1_T_f0[:3, 3])
+    good = angles_between(predicted, found) < _MAX_OFF_RAD
+    good &= angles_between(turned, found) > _MIN_PARALLAX_RAD
+    places[rows[good]] = found[good]
+    balance = np.bincount(cells_of(one.keys[rows], _CELLS_PER_SIDE), np.where(good, 1.0, -1.0))
+    return places, int(np.count_nonzero(balance > 0))
+
+
+def triples_of(
+    first: TourFrame,
+    middle: TourFrame,
+    third: TourFrame,
+    before: Sequence[Step],
+    after: Sequence[Step],
+) -> dict[tuple[int, int], list[Triple]]:
+    """Triples of each hypothesis of the first step and each of the second, most cells first."""
+    found = dict[tuple[int, int], list[Triple]]()
+    for i, one in enumerate(before):
+        for j, other in enumerate(after):
+            logs = ratios(one, other, middle.keys)
+            some = [triple(first, third, one, other, log) for log in logs]
+            found[i, j] = sorted(some, key=lambda each: -each.cells)
+    return found
+
+
+def confirmed(
+    steps: Sequence[Sequence[Step]], triples: Sequence[dict[tuple[int, int], list[Triple]]]
+) -> tuple[list[int], list[Triple | None]]:
+    """Hypothesis of each step (F - 1,), of the chain with most cells; and the triple (F - 2,) of
+    each frame between two of these, None where it has few cells or another one rivals it. All are
+    None where other ones have many cells at many frames: the place repeats, as a hall of bays
+    does, and a shift by a bay is as consistent as the truth."""
+    chain = _best_chain([max(len(some), 1) for some in steps], triples)
+    pairs = list(pairwise(chain))
+    first = [
+        _best_and_rival(steps[f : f + 2], found, pair)
+        for f, (found, pair) in enumerate(zip(triples, pairs, strict=True))
+    ]
+    if sum(rival >= MAX_RIVAL_CELLS for _, rival in first) > MAX_RIVALLED_SHARE * len(first):
+        return chain, [None] * len(first)
+    chosen = [best if _is_sure(best, rival) else None for best, rival in first]
+    # Where frames beside confirm a step, rivals have it, too; of two such steps the ratio is open.
+    known = [False, *(one is not None for one in chosen), False]
+    for f, (found, pair) in enumerate(zip(triples, pairs, strict=True)):
+        before, after = known[f], known[f + 2]
+        if chosen[f] is None and (before or after):
+            left = {
+                at: some
+                for at, some in found.items()
+                if (at[0] == pair[0] or not before) and (at[1] == pair[1] or not after)
+            }
+            best, rival = _best_and_rival(steps[f : f + 2], left, pair)
+            chosen[f] = best if _is_sure(best, rival, before and after) else None
+    ranks = [some[c].rank if some else 0.0 for some, c in zip(steps, chain, strict=True)]
+    return chain, _without_weak_ends(chosen, ranks)
+
+
+def _without_weak_ends(chosen: list[Triple | None], ranks: Sequence[float]) -> list[Triple | None]:
+    """Triples (F - 2,) without those that hold a step of low rank (F - 1,) alone."""
+    left = list(chosen)
+    while True:
+        held = [some is not None for some in left]
+        beside = zip([*held, False], [False, *held], ranks, strict=True)
+        weak = [here != before and rank < MIN_END_RANK for here, before, rank in beside]
+        if not any(weak):
+            return left
+        left = [None if weak[f] or weak[f + 1] else some for f, some in enumerate(left)]
+
+
+def _is_sure(best: Triple | None, rival: int, steps_known: bool = False) -> bool:
+    """True if a triple has enough cells, and enough more than its rivals."""
+    if best is None or rival >= MAX_RIVAL_CELLS:
+        return False
+    least = MIN_CELLS_OF_RATIO if steps_known else MIN_CELLS
+    return best.cells >= max(least, MIN_LEAD * rival)
+
+
+def _best_and_rival(
+    steps: Sequence[Sequence[Step]],
+    found: dict[tuple[int, int], list[Triple]],
+    pair: tuple[int, int],
+) -> tuple[Triple | None, int]:
+    """The triple of a pair of hypotheses with most cells, and the most cells of one that is not
+    nearly the same."""
+    best = next(iter(found.get(pair, ())), None)
+    others = [(at, one) for at, some in found.items() for one in some if one is not best]
+    if best is None:
+        return None, max((one.cells for _, one in others), default=0)
+    rivals = [one.cells for at, one in others if not _alike(steps, pair, at, best, one)]
+    return best, max(rivals, default=0)
+
+
+def _best_chain(
+    sizes: Sequence[int], triples: Sequence[dict[tuple[int, int], list[Triple]]]
+) -> list[int]:
+    """Hypothesis of each step, of `sizes` hypotheses, whose triples have most cells."""
+    total, back = np.zeros(sizes[0]), list[np.ndarray]()
+    for found, size in zip(triples, sizes[1:], strict=True):
+        gain = np.zeros((len(total), size))
+        for (i, j), some in found.items():
+            gain[i, j] = some[0].cells if some else 0
+        total = total[:, None] + gain
+        back.append(total.argmax(axis=0))
+        total = total.max(axis=0)
+    chain = [int(total.argmax())]
+    for came_from in back[::-1]:
+        chain.append(int(came_from[chain[-1]]))
+    return chain[::-1]
+
+
+def _alike(
+    steps: Sequence[Sequence[Step]],
+    pair: tuple[int, int],
+    other_pair: tuple[int, int],
+    one: Triple,
+    other: Triple,
+) -> bool:
+    """True if two triples, of these hypotheses of both steps, are nearly the same."""
+    errors = [
+        pose_errors_deg(found[a].f1_T_f0, found[b].f1_T_f0)
+        for found, a, b in zip(steps, pair, other_pair, strict=True)
+    ]
+    near = all(turn < _ALIKE_DEG[0] and direction < _ALIKE_DEG[1] for turn, direction in errors)
+    return near and abs(one.log_ratio - other.log_ratio) < _ALIKE_LOG
+
+
+def _matches(
+    frames: Sequence[TourFrame],
+    steps: Sequence[Sequence[Step]],
+    chain: Sequence[int],
+    triples: Sequence[Triple | None],
+) -> TourMatches:
+    """Confirmed steps and triples, and the places that fit them."""
+    kept = kept_steps(
+        [some is not None for some in triples],
+        [some[c].num if some else 0 for some, c in zip(steps, chain, strict=True)],
+    )
+    rays = [[frame.keys] for frame in frames]
+    sigmas = [[frame.sigmas_rad] for frame in frames]
+    pairs, rows, poses = list[tuple[int, int]](), list[np.ndarray](), list[np.ndarray]()
+
+    def add(f0: int, f1: int, found1: np.ndarray, found0: np.ndarray) -> None:
+        """Add matches of a pair: places (N, 3) of either frame's keys in the other one."""
+        both = list[np.ndarray]()
+        for f, g, found in ((f0, f1, found1), (f1, f0, found0)):
+            seen = np.flatnonzero(np.isfinite(found[:, 0]))
+            places = sum(map(len, rays[g])) + np.arange(len(seen))
+            rays[g].append(found[seen])
+            sigmas[g].append(np.full(len(seen), _PLACE_SIGMA_RAD))
+            both.append(np.column_stack([seen, places] if f < g else [places, seen]))
+        pairs.append((f0, f1))
+        rows.append(np.concatenate(both).astype(np.int32))
+
+    logs, log_sigmas = np.zeros(len(triples)), np.full(len(triples), np.inf)
+    agreeing = [np.ones(len(frame.keys), bool) for frame in frames]
+    for f, found in enumerate(triples, start=1):
+        if found is None or not (kept[f - 1] and kept[f]):
+            continue
+        logs[f - 1], log_sigmas[f - 1] = found.log_ratio, _LOG_SIGMA
+        before, after = steps[f - 1][chain[f - 1]], steps[f][chain[f]]
+        off = np.abs(np.log(before.depths1 / after.depths0) - found.log_ratio)
+        agreeing[f] = ~(off > _RATIO_WIDTH)  # true where a neighbour does not show the key
+    for f in np.flatnonzero(kept).tolist():
+        step = steps[f][chain[f]]
+        found1 = np.where(agreeing[f][:, None], step.places1, np.nan)
+        add(f, f + 1, found1, np.where(agreeing[f + 1][:, None], step.places0, np.nan))
+        poses.append(inverse(step.f1_T_f0))
+    for f, found in enumerate(triples, start=1):
+        if found is not None and kept[f - 1] and kept[f]:
+            add(f - 1, f + 1, found.places2, found.places0)
+            first, second = (inverse(steps[g][chain[g]].f1_T_f0) for g in (f - 1, f))
+            second[:3, 3] *= np.exp(found.log_ratio)
+            over = first @ second
+            over[:3, 3] = unit(over[:3, 3])
+            poses.append(over)
+    return TourMatches(
+        np.cumsum([0, *(sum(map(len, some)) for some in rays)]),
+        np.concatenate([one for some in rays for one in some]),
+        np.concatenate([one for some in sigmas for one in some]),
+        VerifiedPairs(
+            Matches.of_rows(np.array(pairs, np.int32).reshape(-1, 2), rows),
+            np.array(poses).reshape(-1, 4, 4),
+            np.full(len(pairs), _DIRECTION_SIGMA_RAD),
+            Counts(len(chain), int(np.count_nonzero(kept)), "pairs"),
+        ),
+        logs,
+        log_sigmas,
+    )
+
+
+def kept_steps(tied: Sequence[bool], sizes: Sequence[int]) -> np.ndarray:
+    """Steps (F - 1,) bool that a triple confirms, so that all neighbours among them have a known
+    ratio of lengths: `tied` (F - 2,) says so of frames between two; of two steps without one, the
+    one with the smaller size (F - 1,) is left out, and steps that have no neighbour then."""
+    known = np.array(tied, bool)
+    kept = np.append(known, False) | np.append(False, known)
+    for f in np.flatnonzero(~known).tolist():
+        if kept[f] and kept[f + 1]:
+            kept[f if sizes[f] < sizes[f + 1] else f + 1] = False
+    tied_steps = known & kept[:-1] & kept[1:]
+    return np.append(tied_steps, False) | np.append(False, tied_steps)

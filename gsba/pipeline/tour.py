@@ -1,0 +1,135 @@
+"""Tours, stills metres apart without a trajectory: steps whose descriptors do not match, by patches
+searched along epipolar lines (`gsba.odometry.tour_maps`)."""
+
+import logging
+from dataclasses import fields, replace
+from functools import partial
+
+import numpy as np
+
+from gsba.camera.rig import CubeRig, owner_faces
+from gsba.frames import cubemap
+from gsba.loop_closure import connectivity
+from gsba.matching.recovery import Recovered
+from gsba.odometry.tour_maps import TourMatches, match_tour
+from gsba.pipeline import frontend
+from gsba.pipeline.run import Run
+from gsba.pipeline.state import ObservedFrames, State
+from gsba.trajectory import judgement
+from gsba.trajectory.limits import TwoViewLimits
+from gsba.trajectory.steps import image_steps
+from gsba.types import Features, Matches
+
+logger = logging.getLogger(__name__)
+
+_MAX_TIED_SHARE = 0.8  # of frames in maps of descriptors, below which places are searched
+_MIN_INTERVAL_S = 1.5  # between stills metres apart; frames of a video can be had closer together
+_STAGE = "features_tour"
+
+
+def match_places(state: State, found: Recovered) -> State | None:
+    """The state before the map, its steps by searched places; None where descriptors tie most
+    frames, or where places tie no more."""
+    run, prior = state.run, state.prior
+    num = len(run.frames)
+    if not prior.absent or found.trust.turning_only or not _may_be_tour(run):
+        return None
+    before = _num_tied(found.neighbours.matches, num)
+    if before > _MAX_TIED_SHARE * num:
+        return None
+    logger.info(
+        "descriptors tie %d of %d frames in maps of 3 and more: keypoints of neighbours are "
+        "searched along epipolar lines, 8 s of processor time a step "
+        "(--set pairs.max_tour_frames=0 leaves it out)",
+        before,
+        num,
+    )
+    compute = partial(match_tour, run.frames, run.num_threads)
+    tour = run.stage("tour", None, compute, TourMatches)
+    if not _num_tied(tour.near.matches, num) > before:
+        return None
+    observed, places = _with_places(state, tour)
+    near = replace(tour.near, matches=places)
+    steps = image_steps(near, observed.keypoints)
+    given = tour.log_ratios, tour.log_sigmas, TwoViewLimits.of(run.settings), run.settings.priors
+    trust = judgement.check_steps(prior.coarse, steps, *given)
+    prior = replace(
+        prior, coarse=replace(prior.coarse, world_T_rigs=trust.world_T_rigs), trust=trust
+    )
+    return replace(state, observed=observed, places=places).begun(prior, near)
+
+
+def _may_be_tour(run: Run) -> bool:
+    """True for few frames that no video has taken."""
+    frames, num = run.frames, len(run.frames)
+    if not 3 <= num <= run.settings.pairs.max_tour_frames:
+        return False
+    return not frames.timed or bool(np.median(np.diff(frames.timestamps)) >= _MIN_INTERVAL_S)
+
+
+def _num_tied(matches: Matches, num: int) -> int:
+    """Frames of `num` that matches tie to others, in maps of three frames and more."""
+    return int(np.count_nonzero(connectivity.maps_of_images(matches.pairs, num) >= 0))
+
+
+def _with_places(state: State, tour: TourMatches) -> tuple[ObservedFrames, Matches]:
+    """The frames with the rays of a tour as further keypoints, and its matches of these."""
+    run, before = state.run, state.observed
+    frames, rays = run.frames, np.split(tour.rays, tour.starts[1:-1])
+    sigmas = np.split(tour.sigmas_rad, tour.starts[1:-1])
+    index = {name: f for f, name in enumerate(frames.names)}
+
+    def compute(name: str) -> Features:
+        f = index[name]
+        faces = cubemap.load(frames, f, run.rig)[0]
+        return with_keypoints(before.features[f][name], rays[f], sigmas[f], faces, run.rig)
+
+    inputs = dict.fromkeys(frames.names, 0)
+    after = run.chain.latest
+    found = run.store.per_frame(_STAGE, None, inputs, compute, Features, after, alone=True)
+    each = [found] * len(frames)
+    observed = replace(frontend.observe(run, "keypoints_tour", each, _STAGE), more=True)
+    rows = list[np.ndarray]()
+    shown = before.shown
+    numbers = [
+        rows_of_added(shown.faces[first:last], owner_faces(some))
+        for first, last, some in zip(shown.starts[:-1], shown.starts[1:], rays, strict=True)
+    ]
+    matches = tour.near.matches
+    for p, (f0, f1) in enumerate(matches.pairs):
+        own = matches.of(p)
+        rows.append(np.column_stack([numbers[f0][own[:, 0]], numbers[f1][own[:, 1]]]))
+    return observed, Matches.of_rows(matches.pairs, [one.astype(np.int32) for one in rows])
+
+
+def with_keypoints(
+    found: Features, rays: np.ndarray, sigmas_rad: np.ndarray, faces: np.ndarray, rig: CubeRig
+) -> Features:
+    """Features of a frame and further keypoints without a descriptor, face after face, by their
+    rays (N, 3), noise (N,) and the pictures (6, size, size, 3) of the faces."""
+    owners = owner_faces(rays)
+    pixels = rig.project(rays, owners)
+    columns, lines = np.clip(pixels, 0, rig.size - 1).astype(int).T
+    num = len(rays)
+    added = Features(
+        pixels,
+        owners,
+        rays,
+        sigmas_rad,
+        np.zeros((num, found.descriptors.shape[1]), found.descriptors.dtype),
+        faces[owners, lines, columns],
+        None if found.scores is None else np.zeros(num, np.float32),
+    )
+    order = np.argsort(np.append(found.faces, owners), kind="stable")
+    columns = {
+        entry.name: np.concatenate([getattr(found, entry.name), value])[order]
+        for entry in fields(Features)
+        if (value := getattr(added, entry.name)) is not None
+    }
+    return Features(**columns)
+
+
+def rows_of_added(faces: np.ndarray, added: np.ndarray) -> np.ndarray:
+    """Rows (N,) of keypoints on faces `added` (N,) behind others on their face (K,)."""
+    order = np.argsort(np.append(faces, added), kind="stable")
+    return np.argsort(order)[len(faces) :]

@@ -1,0 +1,78 @@
+"""Stills of a tour whose descriptors tie nothing."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from gsba import GsbaError, refine
+from gsba.camera.rig import CubeRig, owner_faces
+from gsba.evaluate.trajectory import pose_errors
+from gsba.geometry import unit
+from gsba.odometry import tour_steps
+from gsba.pipeline.tour import rows_of_added, with_keypoints
+from gsba.trajectory.files import read_trajectory
+from gsba.types import Features, Trajectory
+from tests.room_tour import pictures, true_poses
+from tests.tiny_run import settings_with
+
+NUM = 3
+# No descriptor is so alike.
+STRANGE = {"matching": {"min_similarity": 0.9999}, "patches": {"rounds": 0}}
+
+
+@pytest.fixture(scope="module")
+def stills(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("stills")
+    for n, picture in enumerate(pictures()[:NUM]):
+        cv2.imwrite(str(folder / f"{n}.png"), picture)
+    return folder
+
+
+def test_searched_places_make_a_map_where_descriptors_make_none(
+    stills: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tour_steps, "_NUM_KEYS", 400)  # as many as this room needs
+    settings = settings_with(**STRANGE, export={"formats": ()})
+    result = refine(stills, None, tmp_path / "run", settings, masks="none")
+    found = read_trajectory(result.out / "trajectory.tum")
+    assert len(found.timestamps) == NUM
+    off = pose_errors(found, Trajectory(found.timestamps, true_poses()[:NUM]))
+    assert off.positions.max() < 0.01 and np.rad2deg(off.rotations.max()) < 0.1
+    stages = [stage["name"] for stage in result.report["stages"]]
+    assert "tour" in stages
+
+
+def test_the_search_can_be_turned_off(stills: Path, tmp_path: Path) -> None:
+    settings = settings_with(**STRANGE, pairs={"max_tour_frames": 0})
+    with pytest.raises(GsbaError, match="no two neighbouring frames match"):
+        refine(stills, None, tmp_path / "run", settings, masks="none")
+
+
+def test_added_keypoints_follow_the_others_of_their_face() -> None:
+    rng, rig = np.random.default_rng(0), CubeRig(64, np.pi / 2)
+    rays = unit(rng.normal(size=(40, 3)))
+    own, added = rays[np.argsort(owner_faces(rays[:25]), kind="stable")], rays[25:]
+    faces = owner_faces(own)
+    descriptors = np.full((25, 8), 7, np.uint8)
+    colors = np.zeros((25, 3), np.uint8)
+    before = Features(rig.project(own, faces), faces, own, np.full(25, 1e-3), descriptors, colors)
+    pictures_rgb = np.full((6, 64, 64, 3), 9, np.uint8)
+    found = with_keypoints(before, added, np.full(15, 2e-3), pictures_rgb, rig)
+    rows = rows_of_added(faces, owner_faces(added))
+    assert (np.diff(found.faces.astype(int)) >= 0).all() and len(found) == 40
+    np.testing.assert_array_equal(found.bearings_rig[rows], added)
+    np.testing.assert_array_equal(np.delete(found.bearings_rig, rows, axis=0), own)
+    assert not found.descriptors[rows].any() and (found.colors[rows] == 9).all()
+    np.testing.assert_allclose(
+        rig.bearings(found.pixels[rows], 0)[found.faces[rows] == 0],
+        added[owner_faces(added) == 0],
+        atol=1e-12,
+    )
+
+
+def test_frames_of_a_video_are_not_searched(stills: Path, tmp_path: Path) -> None:
+    settings = settings_with(**STRANGE)
+    with pytest.raises(GsbaError, match="no two neighbouring frames match"):
+        refine(stills, None, tmp_path / "run", settings, masks="none", fps=2.0)

@@ -1,0 +1,56 @@
+"""Stills of a tour through one room with painted walls, far apart, and their true poses."""
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from gsba.camera.sphere import bearings_from_erp
+from gsba.geometry import pose
+from tests.pixels import pixel_centres
+
+_HALF = np.array([3.0, 1.3, 2.5])  # of the room's sides, x, y, z
+_WALL = 512  # pixels of a wall's side
+WIDTH = 1024
+POSITIONS = np.array([[-1.6, 0.1, -1.2], [-0.6, 0.0, -0.3], [0.5, 0.1, 0.3], [1.3, 0.0, 1.2]])
+
+
+def true_poses() -> np.ndarray:
+    """World poses (4, 4, 4) of the stills."""
+    turns = Rotation.from_rotvec(np.deg2rad([[0, turn, 0] for turn in (0, 25, 10, 60)])).as_matrix()
+    return pose(turns, POSITIONS)
+
+
+def pictures() -> list[np.ndarray]:
+    """Panoramas (h, 2h) uint8 of the stills."""
+    walls = [_wall(np.random.default_rng(n)) for n in range(6)]
+    return [_seen(walls, one) for one in true_poses()]
+
+
+def _wall(rng: np.random.Generator) -> np.ndarray:
+    """Noise of several scales, which nowhere repeats."""
+    noise = [
+        cv2.resize(rng.normal(size=(_WALL // size, _WALL // size)), (_WALL, _WALL))
+        for size in (4, 8, 16, 64)
+    ]
+    total = cv2.GaussianBlur(sum(noise), (0, 0), 1.0)
+    return np.clip(128 + 40 * total, 0, 255).astype(np.float32)
+
+
+def _seen(walls: list[np.ndarray], world_T_rig: np.ndarray) -> np.ndarray:
+    rays = bearings_from_erp(pixel_centres(WIDTH, WIDTH // 2), WIDTH, WIDTH // 2)
+    rays = rays @ world_T_rig[:3, :3].T
+    with np.errstate(divide="ignore"):
+        away = (np.sign(rays) * _HALF - world_T_rig[:3, 3]) / rays
+    axis = away.argmin(axis=-1)
+    places = world_T_rig[:3, 3] + rays * away.min(axis=-1, keepdims=True)
+    out = np.zeros(axis.shape, np.float32)
+    for a in range(3):
+        b, c = (a + 1) % 3, (a + 2) % 3
+        u, v = ((places[..., d] / _HALF[d] + 1) / 2 * (_WALL - 1) for d in (b, c))
+        for side in range(2):
+            chosen = (axis == a) & ((rays[..., a] > 0) == (side == 1))
+            wall = cv2.remap(
+                walls[2 * a + side], u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR
+            )
+            out[chosen] = wall[chosen]
+    return np.rint(out).astype(np.uint8)
