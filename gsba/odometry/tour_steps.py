@@ -21,6 +21,7 @@ from gsba.frames.panorama import Greys
 from gsba.geometry import angles_between, inverse, pose, rotation_angle, unit
 from gsba.odometry.patch_search import search_patches
 from gsba.types import FrameSet
+from gsba.types.records import slices
 
 WIDTH = 1280  # pixels across the panoramas that are searched
 _FACES = CubeRig(448, np.deg2rad(95.0))  # on which keypoints are found
@@ -32,6 +33,7 @@ _FLOOR_Y = 0.25  # y of bearings below which a floor is likely
 _NUM_KEYS, _NUM_FEW = 1000, 300  # keypoints of a frame that are searched; that give a first rank
 _NUM_ROUGH, _NUM_REFINED = 6, 4  # best hypotheses of a step that are searched finely; refined
 _MIN_RANK_SHARE = 0.4  # of the best hypothesis' rank, below which others are not refined
+_ROWS_AT_ONCE = 512  # of descriptors that are compared with all others
 _MIN_MATCHES = 8  # that a pose is estimated from
 # Subsets of matches that propose poses: largest cosine with another keypoint of the same frame,
 # True = above the floor only, largest error in degrees, number of poses, each without the inliers
@@ -54,7 +56,7 @@ class TourFrame:
     picture: np.ndarray  # (h, 2h) float32
     half: np.ndarray  # (h / 2, h) float32
     rays: np.ndarray  # (K, 3) of all keypoints
-    descriptors: np.ndarray  # (K, D) of unit length
+    descriptors: np.ndarray  # (K, D) float32, of unit length
     alikeness: np.ndarray  # (K,) largest cosine with another keypoint of the frame, 3 degrees away
     keys: np.ndarray  # (N, 3) rays that are searched, those without a look-alike first
     sound: np.ndarray  # (N,) bool, neither with a look-alike nor below the horizon
@@ -78,10 +80,8 @@ def frame_of(grey: np.ndarray, masks: np.ndarray | None) -> TourFrame:
     """A frame by its panorama (h, 2h) uint8 and the masks (6, N, N) bool of its faces."""
     faces = np.repeat(cubemap.cut(grey, _FACES)[..., None], 3, axis=3)
     found = extract(faces, masks, _FACES, SiftExtractor(_FEATURES))
-    rays, descriptors = found.bearings_rig.astype(float), unit(found.descriptors.astype(float))
-    likes = descriptors @ descriptors.T
-    likes[rays @ rays.T > np.cos(np.deg2rad(3.0))] = -1
-    alike = likes.max(axis=1, initial=-1)
+    rays, descriptors = found.bearings_rig, unit(found.descriptors.astype(float)).astype(np.float32)
+    alike = _alikeness(rays, descriptors)
     order = np.random.default_rng(0).permutation(len(rays))
     order = order[np.abs(rays[order, 1]) < 0.88]
     worse = 2.0 * (alike[order] >= 0.95)
@@ -98,6 +98,22 @@ def read_frame(frames: FrameSet, frame: int) -> TourFrame:
     """A frame of a run."""
     grey, mask = Greys(frames, WIDTH, width=WIDTH)[frame]
     return frame_of(grey, None if mask is None else cubemap.cut_mask(mask, _FACES))
+
+
+def _alikeness(rays: np.ndarray, descriptors: np.ndarray) -> np.ndarray:
+    """Largest cosine (K,) of each descriptor with that of a keypoint 3 degrees away or more."""
+    alike = np.full(len(rays), -1.0)
+    for some in slices(len(rays), _ROWS_AT_ONCE):
+        likes = descriptors[some] @ descriptors.T
+        likes[rays[some] @ rays.T > np.cos(np.deg2rad(3.0))] = -1
+        alike[some] = likes.max(axis=1, initial=-1)
+    return alike
+
+
+def _nearest(descriptors0: np.ndarray, descriptors1: np.ndarray) -> np.ndarray:
+    """Row (K0,) of the most similar one of other descriptors (K1, D) for each of some (K0, D)."""
+    some = slices(len(descriptors0), _ROWS_AT_ONCE)
+    return np.concatenate([(descriptors0[rows] @ descriptors1.T).argmax(axis=1) for rows in some])
 
 
 def found_places(
@@ -230,10 +246,11 @@ def _proposals(one: TourFrame, other: TourFrame) -> list[np.ndarray]:
     """Poses f1_T_f0 by descriptors, those with most inliers first."""
     if not (len(one.rays) and len(other.rays)):
         return []
-    likes = one.descriptors @ other.descriptors.T
-    nearest = likes.argmax(axis=1)
-    rows = np.flatnonzero(likes.argmax(axis=0)[nearest] == np.arange(len(nearest)))
-    rows = rows[likes[rows, nearest[rows]] > 0.75]
+    nearest = _nearest(one.descriptors, other.descriptors)
+    back = _nearest(other.descriptors, one.descriptors)
+    rows = np.flatnonzero(back[nearest] == np.arange(len(nearest)))
+    likes = np.sum(one.descriptors[rows] * other.descriptors[nearest[rows]], axis=1)
+    rows = rows[likes > 0.75]
     rays0, rays1 = one.rays[rows], other.rays[nearest[rows]]
     alike = np.maximum(one.alikeness[rows], other.alikeness[nearest[rows]])
     level = (rays0[:, 1] < _FLOOR_Y) & (rays1[:, 1] < _FLOOR_Y)
