@@ -15,8 +15,8 @@ from factors.camera_rows import (
     CameraRows,
     CameraVariables,
     Columns,
+    LensSightings,
     LensVariables,
-    Sightings,
     lens_sizes,
 )
 from factors.elimination import Eliminated
@@ -40,7 +40,7 @@ class CameraBlock:
     def __init__(
         self,
         camera: CameraVariables,
-        sightings: Sightings,
+        sightings: LensSightings,
         points_world: np.ndarray,
         loss: RobustLoss | None = None,
         num_threads: int = 1,
@@ -238,24 +238,24 @@ def sightings_of(
     whiteners: np.ndarray,
     lenses: np.ndarray,
     fractions: np.ndarray,
-) -> tuple[Sightings, np.ndarray]:
-    """Observations (O, ...) as in `Sightings`, sorted by landmark and frame, and the row each was
-    given in."""
+) -> tuple[LensSightings, np.ndarray]:
+    """Observations (O, ...) as in `LensSightings`, sorted by landmark and frame, and the row each
+    was given in."""
     order = np.lexsort((frames, points))
     offsets = np.zeros(num_points + 1, np.int64)
     np.cumsum(np.bincount(points, minlength=num_points), out=offsets[1:])
     rows = (frames, points, measured, whiteners, lenses, fractions)
     kinds: Sequence[type] = (np.int64, np.int64, float, float, np.int64, float)
     sorted_ = [np.asarray(row)[order].astype(kind) for row, kind in zip(rows, kinds, strict=True)]
-    return Sightings(offsets, *sorted_), order
+    return LensSightings(offsets, *sorted_), order
 
 
 def pixels_of(
     directions: np.ndarray, lenses: np.ndarray, calibration: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (O, 3) that raw lenses (O,) show unit directions (O, 3), rig frame, in, as `Sightings`
-    has them, and how these move, on their tangent_basis, with the pixels (O, 2, 2); calibration (L,
-    16) as in `CameraRows`."""
+    """Pixels (O, 3) that raw lenses (O,) show unit directions (O, 3), rig frame, in, as
+    `LensSightings` has them, and how these move, on their tangent_basis, with the pixels
+    (O, 2, 2); calibration (L, 16) as in `CameraRows`."""
     num = len(directions)
     frames, rows = np.zeros(num, np.int64), np.arange(num)
     plain = np.zeros((num, 3)), np.tile(np.eye(2), (num, 1, 1)), lenses, np.zeros(num)

@@ -14,7 +14,7 @@ MOTION, TURNS = 6, 2  # coordinates of what frames have of their own
 FRONT, OTHER = 7, 10  # coordinates of what raw lenses are: all but the front one are turned, too
 
 
-class Sightings(NamedTuple):
+class LensSightings(NamedTuple):
     """Observations of landmarks by the lenses of frames, sorted by landmark, then frame."""
 
     offsets: np.ndarray  # (J + 1,) int64: landmark j owns rows offsets[j]:offsets[j + 1]

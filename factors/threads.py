@@ -7,7 +7,8 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import lru_cache
 from itertools import pairwise
-from typing import TypeVar
+from threading import Lock
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -68,3 +69,16 @@ def pool(num: int) -> ThreadPoolExecutor:
 
 
 os.register_at_fork(after_in_child=pool.cache_clear)  # a child process has no threads of its parent
+
+
+class Once(Generic[T]):
+    """A value computed by the first caller, while only callers that need it wait."""
+
+    def __init__(self, make: Callable[[], T]) -> None:
+        self._make, self._lock, self._made = make, Lock(), []
+
+    def __call__(self) -> T:
+        with self._lock:
+            if not self._made:
+                self._made.append(self._make())
+            return self._made[0]

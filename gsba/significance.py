@@ -2,6 +2,12 @@
 
 import numpy as np
 
+MEDIAN_ABS_NORMAL = 0.6745  # median of |x|, x unit normal
+MEDIAN_NORMAL_LENGTH = 1.538  # median length of a 3-vector of independent unit normals
+OUTLIER_LENGTH = 4.6  # 99.99 % of such vectors are shorter
+SIGMAS_OF_1E_3 = 3.09  # standard deviations of a one-sided error rate of 1e-3
+MAX_FALSE_POSES = 1e-6  # expected number of poses that chance explains as well as an accepted one
+
 
 def log10_false_alarms(
     num: int, agreeing: np.ndarray | int, chance: float, sample: int

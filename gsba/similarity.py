@@ -10,12 +10,11 @@ import numpy as np
 
 from gsba.geometry import nearest_rotation, pose
 from gsba.log import GsbaError
+from gsba.significance import MEDIAN_NORMAL_LENGTH, OUTLIER_LENGTH
 
 _MIN_CORRELATION = 1e-6  # smallest correlation of positions that leaves a positive scale
 _MIN_DRAWS, _MAX_DRAWS, _SEED = 50, 500, 0  # samples of a robust similarity
 _MISS_CHANCE = 1e-9  # of an outlier in every sample, at the largest share of inliers so far
-_MEDIAN_LENGTH = 1.538  # median length of a 3-vector of independent unit normals
-_OUTLIER_SIGMAS = 4.6  # 99.99% of such vectors are shorter
 _NUM_TRIALS = 200  # samples of three points each
 _MIN_POINTS = 15
 _RATIOS_AT_ONCE = 64  # lengths of a step tried in one array
@@ -176,8 +175,8 @@ def robust_similarity(
     used = np.ones(len(source), bool)
     for _ in range(20):
         residuals = residuals_of(fit, source, target)
-        sigma = max(float(np.median(residuals)) / _MEDIAN_LENGTH, 1e-9 * extent)
-        gates = np.minimum(_OUTLIER_SIGMAS * sigma, tolerances + reach * fit.scale)
+        sigma = max(float(np.median(residuals)) / MEDIAN_NORMAL_LENGTH, 1e-9 * extent)
+        gates = np.minimum(OUTLIER_LENGTH * sigma, tolerances + reach * fit.scale)
         before, used = used, residuals <= gates
         if used.sum() < num_needed:
             raise NoSimilarityError(f"only {used.sum()} of {len(used)} positions agree")

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from gsba.disk import atomic_write
-from gsba.export.pictures import FrameWriter, Shown
+from gsba.export.pictures import FrameWriter, SharedPixels
 from gsba.store.shards import Job, Threads, even_blocks
 
 R = TypeVar("R")
@@ -108,7 +108,7 @@ class DiesWriting(FrameWriter):
 
     at: str  # name of the frame
 
-    def __call__(self, shown: Shown) -> None:
+    def __call__(self, shown: SharedPixels) -> None:
         marker = self.files.folder.with_name("died")
         if shown.frames.names[shown.f] == self.at and not marker.exists():
             marker.touch()

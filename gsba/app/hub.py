@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gsba.app.forms import Form
-from gsba.app.jobs import Job, Jobs
+from gsba.app.jobs import AppJob, Jobs
 from gsba.app.previews import Previews
 from gsba.app.progress import Followed, Progress
 from gsba.app.worker import ensure_worker
@@ -18,7 +18,7 @@ from gsba.view import load_scene
 from gsba.view import serve as serve_view
 
 if TYPE_CHECKING:
-    from gsba.view.display import View
+    from gsba.view.display import SceneView
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,11 +70,11 @@ class App:
         self.token = token
         self.previews = Previews(self.root, state.resolve() / "previews")
         self._followed: dict[str, Followed] = {}
-        self._views: dict[Path, View] = {}
+        self._views: dict[Path, SceneView] = {}
         self._lock = threading.Lock()  # of viewers and of progress: requests come from threads
         ensure_worker(self.jobs)
 
-    def progress(self, job: Job) -> Progress:
+    def progress(self, job: AppJob) -> Progress:
         """Progress of a job by its events so far."""
         with self._lock:
             return self._followed.setdefault(job.id, Followed(job.events)).now()

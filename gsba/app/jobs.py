@@ -40,7 +40,7 @@ class Command:
 
 
 @dataclass(frozen=True, slots=True)
-class State:
+class JobState:
     """Status of a job, and its process."""
 
     status: Status
@@ -53,13 +53,13 @@ class State:
 
 
 @dataclass(frozen=True, slots=True)
-class Job:
+class AppJob:
     """A job and its state when it was read."""
 
     id: str  # sorts by time of creation
     path: Path  # its folder
     command: Command
-    state: State
+    state: JobState
 
     @property
     def log(self) -> Path:
@@ -113,17 +113,17 @@ class Jobs:
             else:
                 yield file
 
-    def add(self, command: Command) -> Job:
+    def add(self, command: Command) -> AppJob:
         """Queue a command."""
         name = f"{time.strftime('%Y%m%d-%H%M%S')}-{time.time_ns() % 10**9:09d}"
         path = self._folder / f"{name}-{secrets.token_hex(2)}"
         with self.locked():
             path.mkdir()
-            write_json(path / "state.json", asdict(State("waiting")))
+            write_json(path / "state.json", asdict(JobState("waiting")))
             write_json(path / "job.json", asdict(command))
         return self.get(path.name)
 
-    def all(self) -> list[Job]:
+    def all(self) -> list[AppJob]:
         """All jobs that can be read, the oldest first."""
         found = []
         for path in sorted(self._folder.iterdir()):
@@ -131,25 +131,25 @@ class Jobs:
                 found.append(self.get(path.name))
         return found
 
-    def get(self, name: str) -> Job:
+    def get(self, name: str) -> AppJob:
         """A job by its id. Raises GsbaError: there is none, or its files were edited."""
         path = self._folder / name
         if not name or "/" in name or name.startswith(".") or not path.is_dir():
             raise GsbaError(f"there is no job {name}")
         try:
             command = typed(json.loads((path / "job.json").read_text()), Command)
-            state = typed(json.loads((path / "state.json").read_text()), State)
+            state = typed(json.loads((path / "state.json").read_text()), JobState)
         except (OSError, ValueError, RecordError) as error:
             raise GsbaError(f"job {name} cannot be read: remove {path}") from error
-        return Job(name, path, command, state)
+        return AppJob(name, path, command, state)
 
-    def change(self, job: Job, **values: Any) -> Job:
+    def change(self, job: AppJob, **values: Any) -> AppJob:
         """Store a new state of a job; the caller holds the lock."""
         state = replace(job.state, **values)
         write_json(job.path / "state.json", asdict(state))
         return replace(job, state=state)
 
-    def stop(self, name: str) -> Job:
+    def stop(self, name: str) -> AppJob:
         """Take a job out of the queue, or interrupt it as Ctrl-C does; asked again, kill it."""
         with self.locked():
             job = self.get(name)
@@ -162,7 +162,7 @@ class Jobs:
                 os.killpg(job.state.pid or 0, signal.SIGKILL if again else signal.SIGINT)
             return self.change(job, status="stopping", forced=again)
 
-    def go_on(self, name: str) -> Job:
+    def go_on(self, name: str) -> AppJob:
         """Queue a job again that was stopped or has failed: gsba resumes what is done. Raises
         GsbaError: the job waits, runs or is done."""
         with self.locked():
@@ -189,7 +189,7 @@ class Jobs:
             os.close(file)
 
 
-def alive(job: Job) -> bool:
+def alive(job: AppJob) -> bool:
     """True if a process of a job runs: the system drops the lock when the last one has ended."""
     try:
         with job.alive_lock.open("rb") as file:
@@ -202,7 +202,7 @@ def alive(job: Job) -> bool:
 
 
 @contextmanager
-def alive_lock(job: Job) -> Iterator[int]:
+def alive_lock(job: AppJob) -> Iterator[int]:
     """A new lock of a job, for its process to inherit; an earlier one is no longer looked at."""
     job.alive_lock.unlink(missing_ok=True)
     file = os.open(job.alive_lock, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
@@ -213,7 +213,7 @@ def alive_lock(job: Job) -> Iterator[int]:
         os.close(file)  # what inherited it holds the lock
 
 
-def ending(code: int, state: State) -> Status:
+def ending(code: int, state: JobState) -> Status:
     """Status of a job whose process ended with an exit code, negative of a signal."""
     if code == 0:
         return "done"

@@ -19,7 +19,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from gsba.app import drops, runs
 from gsba.app.browse import inside, listing
 from gsba.app.hub import App
-from gsba.app.jobs import ACTIVE, Command, Job
+from gsba.app.jobs import ACTIVE, AppJob, Command
 from gsba.app.worker import ensure_worker
 from gsba.log import GsbaError
 from gsba.view.server import allowed
@@ -350,7 +350,7 @@ def _file(app: App, request: Request) -> Response:
     return FileResponse(path, media_type=kind, headers={"content-security-policy": _REPORT_POLICY})
 
 
-def _row(app: App, job: Job) -> dict[str, Any]:
+def _row(app: App, job: AppJob) -> dict[str, Any]:
     """A job for lists."""
     state, progress = job.state, app.progress(job)
     active = state.status in ACTIVE

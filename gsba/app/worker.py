@@ -10,7 +10,7 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-from gsba.app.jobs import ACTIVE, Job, Jobs, alive, alive_lock, ending, last_code
+from gsba.app.jobs import ACTIVE, AppJob, Jobs, alive, alive_lock, ending, last_code
 from gsba.app.progress import read_events
 from gsba.log import EVENTS
 
@@ -52,7 +52,7 @@ def work(jobs: Jobs) -> None:
                 jobs.change(job, status=ending(code, job.state), code=code, ended=time.time())
 
 
-def _start(jobs: Jobs, job: Job) -> tuple[Job, subprocess.Popen[bytes]]:
+def _start(jobs: Jobs, job: AppJob) -> tuple[AppJob, subprocess.Popen[bytes]]:
     """Start a job in a process group of its own."""
     began = time.time()
     with job.events.open("a") as events:
@@ -73,7 +73,7 @@ def _start(jobs: Jobs, job: Job) -> tuple[Job, subprocess.Popen[bytes]]:
     return jobs.change(job, status="running", **known, **times), process
 
 
-def _see_out(jobs: Jobs, job: Job) -> None:
+def _see_out(jobs: Jobs, job: AppJob) -> None:
     """Wait for the end of a job that a worker started which is no more."""
     while alive(job):
         time.sleep(_POLL_S)

@@ -190,7 +190,7 @@ class ObservedPoints:
         )
 
 
-class View(Protocol):
+class RaySource(Protocol):
     """Source of an adjustment's rays: known rays, or a camera that is solved for."""
 
     @property
@@ -210,7 +210,7 @@ class View(Protocol):
         ...
 
 
-V = TypeVar("V", bound=View)
+V = TypeVar("V", bound=RaySource)
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,11 +24,10 @@ import numpy as np
 
 from gsba.bundle.families import Family, MapSnapshot, digest_of
 from gsba.bundle.pose_variables import X, values_of
+from gsba.significance import MEDIAN_NORMAL_LENGTH, OUTLIER_LENGTH
 from gsba.similarity import NoSimilarityError, Sim3, extent_of, robust_similarity, similarity
 
 WHITE_SHARE = 0.1  # of the variance of a fix: independent from fix to fix, the rest lasts
-_MEDIAN_LENGTH = 1.538  # median length of a 3-vector of independent unit normals
-_OUTLIER_SIGMAS = 4.6  # 99.99 % of such vectors are shorter
 # Largest ratio of the true noise of fixes to the claimed one. Claims hold under an open sky: with
 # the default of 3 m it is 10.5 m per axis, a mean horizontal error of 13 m, the largest that
 # Merry and Bettinger (PLoS ONE 14(7), e0219890, 2019) measured with a phone in a town.
@@ -72,7 +71,7 @@ class FrameFixes:
 
     def tolerances(self) -> np.ndarray:
         """Largest error (G,) of a fix, metres, by its claimed noise."""
-        return _OUTLIER_SIGMAS * np.sqrt(np.mean(self.sigmas**2, axis=1))
+        return OUTLIER_LENGTH * np.sqrt(np.mean(self.sigmas**2, axis=1))
 
     def inliers(self, residuals: np.ndarray, extent: float) -> tuple[np.ndarray, float]:
         """Fixes that agree with a map, and the scatter of all.
@@ -90,12 +89,12 @@ class FrameFixes:
             (G,) bool, and the scatter in standard deviations of the fixes, at least 1.
         """
         distances = np.linalg.norm(residuals / self.sigmas, axis=1)
-        drift = MAX_DRIFT_SHARE * extent / _OUTLIER_SIGMAS / float(np.median(self.sigmas[:, 0]))
+        drift = MAX_DRIFT_SHARE * extent / OUTLIER_LENGTH / float(np.median(self.sigmas[:, 0]))
         most = float(np.hypot(_MAX_NOISE_RATIO, drift))
-        scatter = max(1.0, float(np.median(distances)) / _MEDIAN_LENGTH)
+        scatter = max(1.0, float(np.median(distances)) / MEDIAN_NORMAL_LENGTH)
         if scatter > most:
-            return distances < _MEDIAN_LENGTH * most, most
-        return distances <= _OUTLIER_SIGMAS * scatter, scatter
+            return distances < MEDIAN_NORMAL_LENGTH * most, most
+        return distances <= OUTLIER_LENGTH * scatter, scatter
 
     def digest(self) -> str:
         """Fingerprint of all that results rest on."""

@@ -4,12 +4,12 @@ import numpy as np
 
 from factors import tangent_basis
 from gsba.geometry import moved_to
+from gsba.significance import MEDIAN_ABS_NORMAL
 from gsba.types import Reconstruction
 
 _TRACKS_PER_CLASS, _MAX_CLASSES = 100, 10  # classes of points by the noise of their observations
 _MIN_TRACK_LENGTH = 3  # of two observations, only those across the baseline that agree are kept
 _MIN_SHARE = 1e-3  # least part of a shift across the baseline that no move of the point explains
-_MEDIAN_ABS_NORMAL = 0.6745  # median of |x|, x unit normal
 # Errors of depths, in units of what shifts across the baseline predict: 1.7 to 1.9 in four maps of
 # two rendered scenes, on surfaces that are flat for two pixels around. Shifts along the baseline
 # are larger, and slant turns errors across the ray into errors of depth (1.25 of it).
@@ -79,7 +79,7 @@ def _error_ratios(result: Reconstruction, covariances: np.ndarray) -> np.ndarray
     bounds = bounds[bounds < noise[usable].max()]
     which, ratios = np.searchsorted(bounds, noise), np.empty(len(bounds) + 1)
     for number in range(len(ratios)):
-        ratios[number] = np.median(np.abs(shifts[usable & (which == number)])) / _MEDIAN_ABS_NORMAL
+        ratios[number] = np.median(np.abs(shifts[usable & (which == number)])) / MEDIAN_ABS_NORMAL
     return ratios[which]
 
 

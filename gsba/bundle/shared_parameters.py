@@ -236,7 +236,7 @@ P = TypeVar("P", "SharedModel", "FrameModel")
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class PartGains:
     """Gains of parts by parameters that were found from the other parts."""
 
     gains: np.ndarray  # (PARTS,) float64, decrease of each part's robust cost by the
@@ -253,7 +253,7 @@ def cross_validate(
     parts: Sequence[P],
     candidate: Callable[[list[P]], np.ndarray],
     baseline: Callable[[list[P]], np.ndarray] | None = None,
-) -> Verdict:
+) -> PartGains:
     """Predict each part of a sequence by the others: by the parameters of a candidate, and by those
     of a simpler baseline; None = all parameters are zero."""
     gains, costs = np.zeros(len(parts)), np.array([part.cost for part in parts])
@@ -262,7 +262,7 @@ def cross_validate(
         before = 0.0 if baseline is None else part.gain(baseline(others))
         gains[p] = part.gain(candidate(others)) - before
         costs[p] -= before
-    return Verdict(gains, gains / costs)
+    return PartGains(gains, gains / costs)
 
 
 def predicts(gains: np.ndarray) -> bool:
@@ -331,7 +331,7 @@ def _frame_step(models: Sequence[FrameModel], sigmas: np.ndarray) -> np.ndarray:
     return -splu((hessian + diags(held.ravel())).tocsc()).solve(gradient)
 
 
-def validated(models: Sequence[FrameModel], sigmas: np.ndarray) -> Verdict:
+def validated(models: Sequence[FrameModel], sigmas: np.ndarray) -> PartGains:
     """Verdict on parameters with priors `sigmas` (K,), poses solved for with and without them."""
     return cross_validate(
         models,

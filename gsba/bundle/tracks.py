@@ -18,7 +18,7 @@ _kernel, _ = kernel_and_part()
 _AT_ONCE = 1 << 18  # matches that are numbered together
 _OF_THREAD = 1 << 14  # observations that one thread works on: 2 MB of rays
 _RELEASED_EVERY = 16  # of these runs, pages of files that they have read
-_IN_MEMORY = 1 << 18  # observations of which the tracks are in memory in any case
+MAX_IN_MEMORY = 1 << 18  # observations of which the tracks are in memory in any case
 
 
 def build(
@@ -55,7 +55,7 @@ def build(
     points, frames, keypoints = np.empty((3, int(lengths.sum())), np.int32)
     _collect(nodes, frame_of_node, roots, numbers, first_node, rows, points, frames, keypoints)
     del nodes, frame_of_node, roots, numbers, several, rows
-    if scratch is not None and len(points) > _IN_MEMORY:
+    if scratch is not None and len(points) > MAX_IN_MEMORY:
         points, frames, keypoints = concatenated([(points, frames, keypoints)], scratch)
     return Tracks(points, frames, keypoints, len(lengths))
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from factors.compiled import kernel_and_part
 from factors.threads import balanced_ranges, run_in_threads
-from gsba.bundle.tracks import map_runs
+from gsba.bundle.tracks import MAX_IN_MEMORY, map_runs
 from gsba.disk import concatenated
 from gsba.geometry import moved_to
 from gsba.memory import release_mapped_files
@@ -171,7 +171,6 @@ def _gauss_newton_step(rays, centres, sigmas, lo, hi, point, gate):
 
 
 _MIN_TRACK_LENGTH = 2  # observations of a point: one ray has no depth
-_IN_MEMORY = 1 << 18  # observations of which the tracks are in memory in any case
 _NONE = Counts(0, 0, "tracks")
 
 
@@ -261,7 +260,7 @@ def place(
             yield own.points_world, numbers, own.tracks.frames, own.tracks.keypoints
             num += own.tracks.num_points
 
-    folder = scratch if len(tracks) > _IN_MEMORY else None
+    folder = scratch if len(tracks) > MAX_IN_MEMORY else None
     points_world, points, frames, rows = concatenated(found(), folder)
     seen = Tracks(points, frames, rows, len(points_world))
     dropped: dict[str, int] = {}

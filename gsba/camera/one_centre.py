@@ -15,11 +15,10 @@ from gsba.camera.fisheye import facing, project
 from gsba.camera.lens import Lenses
 from gsba.camera.sphere import around_sphere, bearings_from_erp, erp_bands, erp_from_bearings
 from gsba.camera.straighten import PAD
-from gsba.camera.views import depths_along, observed_points
+from gsba.camera.views import FAR_DEPTH, depths_along, observed_points
 from gsba.types import Reconstruction
 
 _DEPTH_GRID_WIDTH = 128  # width of the grid that depths are taken on
-_FAR_DEPTH = 1e9  # map units
 
 _Look = Callable[[int, np.ndarray], np.ndarray]  # lens and directions (h, w, 3) to pixels (h, w, C)
 
@@ -36,7 +35,7 @@ class Stitcher:
         )
         pixels = np.stack(np.meshgrid(*centres), axis=-1)
         rays = bearings_from_erp(pixels, _DEPTH_GRID_WIDTH, _DEPTH_GRID_WIDTH // 2).reshape(-1, 3)
-        depths = np.full(len(rays), _FAR_DEPTH)
+        depths = np.full(len(rays), FAR_DEPTH)
         if len(scene):
             # nearer points would lie beyond the rims at the seam
             nearest = 12.0 * lenses.baseline / 2

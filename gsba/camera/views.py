@@ -28,7 +28,7 @@ from gsba.geometry import pose
 from gsba.log import GsbaError
 from gsba.types import FACES, Fisheye, PictureFormat, Reconstruction
 
-_FAR_DEPTH = 1e9  # map units: depth from which both lenses see alike
+FAR_DEPTH = 1e9  # map units: depth from which both lenses see alike
 _MAX_OVERSAMPLING = 1.5  # largest ratio of a picture's density to a view's: beyond it, detail
 # aliases
 _NODES_ACROSS_FACE = 33  # nodes across a face of the interpolated offsets, which vary over tens of
@@ -385,7 +385,7 @@ def _offsets(view: View, lenses: Lenses, frame: int, scene: np.ndarray | None) -
     rays = view.rays(np.stack(np.meshgrid(*places.T), axis=-1)).reshape(-1, 3)
     turned = rays if lenses.axes is None else rays @ lenses.axes[frame].T
     frames = np.full(len(rays), frame)
-    ends = _FAR_DEPTH * turned
+    ends = FAR_DEPTH * turned
     if scene is not None and len(scene):
         ends = lenses.origins(turned, frames) + depths_along(turned, scene)[:, None] * turned
     shown = lenses.seeing(ends, frames)

@@ -9,7 +9,7 @@ telemetry-parser, src/insta360, and Insta360's SDK (rad/s and g); tested on a re
 
 import os
 import struct
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
 from pathlib import Path
@@ -59,7 +59,7 @@ _FIX = np.dtype(
 )
 _RAW_ZERO, _RAW_FULL = 32768, 32768  # raw value of zero; difference of the end of the range
 _RANGES_G = 8, 16, 32  # of accelerometers; if not stated, the one that gives about 1 g is taken
-_STANDARD_GRAVITY = 9.80665
+STANDARD_GRAVITY = 9.80665
 _MIN_RATE_HZ, _MAX_RATE_HZ = 10.0, 20_000.0  # of gyro readings
 _MAX_TICK = 1 << 53  # of the camera's clock: exact as float64
 _YEAR_2100 = 4_102_444_800  # s since 1970: a larger creation time is in milliseconds
@@ -233,7 +233,7 @@ def _bytes_at(file: BinaryIO, start: int, count: int) -> bytes:
 
 
 def _find_records(
-    file: BinaryIO, start: int, end: int, wanted: set[int], contents: _Contents
+    file: BinaryIO, start: int, end: int, wanted: Container[int], contents: _Contents
 ) -> None:
     """Read wanted records backwards from the end, or at the offsets of a directory."""
     at = end
@@ -258,7 +258,7 @@ def _find_records(
 
 
 def _read_listed(
-    file: BinaryIO, start: int, at: int, size: int, wanted: set[int], contents: _Contents
+    file: BinaryIO, start: int, at: int, size: int, wanted: Container[int], contents: _Contents
 ) -> bool:
     """Read records that a directory of `size` bytes at offset `at` lists; True if all are valid."""
     before = len(contents.notes)
@@ -406,7 +406,7 @@ def _row(is_raw: bool) -> int:
 def _force_unit(forces: np.ndarray, is_raw: bool) -> float:
     """Unit of accelerations (N, 3) in m/s^2: g, unless they are far longer than 1."""
     length = float(np.median(np.linalg.norm(forces, axis=1)))
-    return 1.0 if length > np.sqrt(_STANDARD_GRAVITY) and not is_raw else _STANDARD_GRAVITY
+    return 1.0 if length > np.sqrt(STANDARD_GRAVITY) and not is_raw else STANDARD_GRAVITY
 
 
 def _exposures(

@@ -10,7 +10,15 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from gsba.doctor import facts, machine
-from gsba.doctor.packages import NEEDED, Package, Requirement, debian_package, look_at, requirements
+from gsba.doctor.packages import (
+    MAX_MESSAGE_LENGTH,
+    NEEDED,
+    Package,
+    Requirement,
+    debian_package,
+    look_at,
+    requirements,
+)
 from gsba.log import brief
 from gsba.version import __version__
 
@@ -30,7 +38,6 @@ _OWN = Requirement("gsba", "gsba.pipeline.refine", "", NEEDED)
 _WORDS = {"works": "ok", "partly": "partly", "absent": "absent", "broken": "BROKEN"}
 _NO_WHEEL = {("linux", "aarch64"): {"pycolmap", "open3d"}}  # as of 2026-11
 _ON_ARM = "there is no wheel for Linux on ARM (docs/install.md#linux-on-arm)"
-_MAX_MESSAGE_LENGTH = 160  # characters of a package's message
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,7 +141,7 @@ def _conclusions(answers: dict[str, Any]) -> tuple[list[str], str]:
     """Notes on the abilities of working packages, and the command that adds missing ones."""
     notes, remedy = [], ""
     if "trouble" in answers:
-        notes.append(brief(answers["trouble"], _MAX_MESSAGE_LENGTH))
+        notes.append(brief(answers["trouble"], MAX_MESSAGE_LENGTH))
     if "codecs" in answers:
         able = [name for name, decodes in answers["codecs"].items() if decodes]
         lost = [name for name, decodes in answers["codecs"].items() if not decodes]

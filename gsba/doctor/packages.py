@@ -76,7 +76,7 @@ def _requirement(line: str, extra: str) -> Requirement:
 
 
 _TIMEOUT_S = 120.0
-_MAX_MESSAGE_LENGTH = 160  # characters of an import's error
+MAX_MESSAGE_LENGTH = 160  # characters of an import's error
 _LIBRARY = re.compile(r"([\w.+-]+\.so[\w.]*): cannot open shared object file")
 _DEBIAN = {"libglib-2.0.so.0": "libglib2.0-0", "libgthread-2.0.so.0": "libglib2.0-0"}
 _CHILD = "import sys; from gsba.doctor.child import answer; answer(sys.argv[1], sys.argv[2:])"
@@ -200,7 +200,7 @@ def _fault(report: dict[str, Any], libraries: Sequence[str]) -> str:
         return f"lacks {', '.join(libraries)}"
     if report.get("absent"):
         return f"needs {report['absent']}, which is not installed"
-    return brief(" ".join(str(report["error"]).split()), _MAX_MESSAGE_LENGTH)
+    return brief(" ".join(str(report["error"]).split()), MAX_MESSAGE_LENGTH)
 
 
 def _missing_libraries(module: str, error: str) -> tuple[str, ...]:

@@ -28,7 +28,7 @@ from gsba.export.names import base_names, padded_names
 from gsba.export.pictures import Files, FrameWriter, by_camera
 from gsba.export.ply import write_cloud
 from gsba.export.raw import RawPictures
-from gsba.export.sensors import Sensor, pinholes, project_in_rigs, raw_sensors
+from gsba.export.sensors import RigSensor, pinholes, project_in_rigs, raw_sensors
 from gsba.export.split import split_of
 from gsba.geometry import inverse, quaternion_from_rotation
 from gsba.log import GsbaError
@@ -81,7 +81,7 @@ def write_colmap(data: Dataset) -> FrameWriter:
 def _write_flat_model(
     data: Dataset,
     seen: Reconstruction,
-    rigs: Sequence[Sequence[Sensor]],
+    rigs: Sequence[Sequence[RigSensor]],
     files: Sequence[Files],
 ) -> Sequence[Files]:
     """Write the model with INRIA's cloud, in a split's order; returns each camera's files in it."""
@@ -106,7 +106,7 @@ def write_colmap_erp(data: Dataset) -> FrameWriter:
         raise GsbaError("colmap-erp needs panoramas, these frames are cube faces: use colmap")
     sizes = [(kind.width, kind.height) for kind in frames.formats]
     rigs = [
-        [Sensor("EQUIRECTANGULAR", *size, (float(size[0]), float(size[1])), np.eye(4))]
+        [RigSensor("EQUIRECTANGULAR", *size, (float(size[0]), float(size[1])), np.eye(4))]
         for size in sizes
     ]
     files = _files(data, "{name}{suffix}", ("",), has_masks(frames))
@@ -119,7 +119,7 @@ def write_colmap_erp(data: Dataset) -> FrameWriter:
 def write_model(
     folder: Path,
     reconstruction: Reconstruction,
-    rigs: Sequence[Sequence[Sensor]],
+    rigs: Sequence[Sequence[RigSensor]],
     names: list[list[str]],
     rig_of_frame: np.ndarray,
     order: Sequence[Sequence[int]] | None = None,
@@ -191,7 +191,7 @@ def write_in_order(model, folder: Path) -> None:
         file.writelines(records)
 
 
-def _add_rigs(model, rigs: Sequence[Sequence[Sensor]]) -> list[list]:
+def _add_rigs(model, rigs: Sequence[Sequence[RigSensor]]) -> list[list]:
     """Add all rigs and their cameras to the model; returns the sensor ids, by rig."""
     import pycolmap
 
@@ -244,7 +244,7 @@ def _add_points(
     model.update_point_3d_errors()
 
 
-def _rig_config(sensors: Sequence[Sensor], names: Sequence[str], folder: str) -> dict:
+def _rig_config(sensors: Sequence[RigSensor], names: Sequence[str], folder: str) -> dict:
     """Rig in the format of `colmap rig_configurator`; rotations are cam_from_rig, wxyz."""
     configs = []
     for sensor, name in zip(sensors, names, strict=True):

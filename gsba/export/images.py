@@ -17,7 +17,7 @@ from gsba.camera.one_centre import Stitcher
 from gsba.camera.rig import CubeRig
 from gsba.camera.views import Scenes, View, ViewCutter, scenes_of, views_for
 from gsba.export.dataset import Dataset
-from gsba.export.pictures import Files, FrameWriter, Pictures, Shown, by_camera
+from gsba.export.pictures import Files, FrameWriter, Pictures, SharedPixels, by_camera
 from gsba.frames.dual_fisheye import load_raw
 from gsba.frames.pixels import load_faces
 from gsba.frames.track_pairs import load_squares
@@ -104,7 +104,7 @@ class _CubeFaces(FrameWriter):
     size: int  # pixels
     link: bool
 
-    def __call__(self, shown: Shown) -> None:
+    def __call__(self, shown: SharedPixels) -> None:
         from gsba.frames import cubemap
 
         f, frames, size = shown.f, shown.frames, self.size
@@ -142,7 +142,7 @@ class _OfLenses(FrameWriter):
 class _LensFaces(_OfLenses):
     views: tuple[View, ...]
 
-    def __call__(self, shown: Shown) -> None:
+    def __call__(self, shown: SharedPixels) -> None:
         f, frames, size = shown.f, shown.frames, self.views[0].width
 
         @cache
@@ -202,7 +202,7 @@ def panorama_writer(data: Dataset, files: Files) -> FrameWriter:
 class _Panoramas(FrameWriter):
     link: bool
 
-    def __call__(self, shown: Shown) -> None:
+    def __call__(self, shown: SharedPixels) -> None:
         as_it_is = shown.kind.layout == "erp" and not shown.kind.correction
         originals = shown.frames.paths[shown.f] if as_it_is else ()
         given = shown, "panorama", lambda: [shown.erp], lambda: [shown.mask]
@@ -211,7 +211,7 @@ class _Panoramas(FrameWriter):
 
 @dataclass(frozen=True, slots=True)
 class _Stitched(_OfLenses):
-    def __call__(self, shown: Shown) -> None:
+    def __call__(self, shown: SharedPixels) -> None:
         f, frames = shown.f, shown.frames
 
         @cache

@@ -89,7 +89,7 @@ class FrameWriter:
 
     files: Files
 
-    def __call__(self, shown: "Shown") -> None:
+    def __call__(self, shown: "SharedPixels") -> None:
         """Write images and masks into existing folders."""
         raise NotImplementedError
 
@@ -101,17 +101,17 @@ class FrameWriter:
         """Make the folders of all images and masks."""
         self.files.make_folders(frames)
 
-    def images(self, shown: "Shown") -> list[Path]:
+    def images(self, shown: "SharedPixels") -> list[Path]:
         """Files of the frame's images."""
         return [self.files.folder / name for name in self.files.images(shown.frames, shown.f)]
 
-    def masks(self, shown: "Shown") -> list[Path]:
+    def masks(self, shown: "SharedPixels") -> list[Path]:
         """Files of the frame's masks; [] = there are none."""
         return [self.files.folder / name for name in self.files.masks(shown.frames, shown.f)]
 
     def write(
         self,
-        shown: "Shown",
+        shown: "SharedPixels",
         key: Hashable,
         images: Callable[[], Iterable[np.ndarray]],
         masks: Callable[[], Iterable[np.ndarray]],
@@ -143,7 +143,7 @@ class FrameWriter:
         if hidden:
             shown.write_masks(key, hidden, masks, style, masks_differ)
 
-    def wrote(self, shown: "Shown") -> bool:
+    def wrote(self, shown: "SharedPixels") -> bool:
         """True if an interrupted export has written all files of this frame."""
         return all(path.exists() for path in (*self.images(shown), *self.masks(shown)))
 
@@ -155,7 +155,7 @@ class _ByCamera(FrameWriter):
     writers: tuple[FrameWriter, ...]  # (C,)
     of_frame: tuple[int, ...]  # (F,) index of the camera that took each frame
 
-    def __call__(self, shown: "Shown") -> None:
+    def __call__(self, shown: "SharedPixels") -> None:
         self.writers[self.of_frame[shown.f]](shown)
 
     def taken(self, rows: np.ndarray) -> FrameWriter:
@@ -167,10 +167,10 @@ class _ByCamera(FrameWriter):
         for writer in self.writers:
             writer.make_folders(frames)
 
-    def images(self, shown: "Shown") -> list[Path]:
+    def images(self, shown: "SharedPixels") -> list[Path]:
         return self.writers[self.of_frame[shown.f]].images(shown)
 
-    def masks(self, shown: "Shown") -> list[Path]:
+    def masks(self, shown: "SharedPixels") -> list[Path]:
         return self.writers[self.of_frame[shown.f]].masks(shown)
 
 
@@ -209,7 +209,7 @@ class Pictures:
         return len(self.frames)
 
     def __call__(self, item: int) -> None:
-        shown = Shown(self, item)
+        shown = SharedPixels(self, item)
         for writer in self._writers:
             if not writer.wrote(shown):
                 writer(shown)
@@ -230,7 +230,7 @@ class Pictures:
             return self._masks[key]
 
 
-class Shown:
+class SharedPixels:
     """Pixels and encoded images of one frame, shared by all datasets of an export."""
 
     def __init__(self, pictures: Pictures, f: int) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 
 from gsba.camera.fisheye import Rig, rotation_of, unproject
 from gsba.camera.sphere import erp_from_bearings, pixel_bands, table
-from gsba.export.pictures import FrameWriter, Shown
+from gsba.export.pictures import FrameWriter, SharedPixels
 from gsba.frames.dual_fisheye import load_raw
 from gsba.log import GsbaError
 from gsba.types import Fisheye, PictureFormat
@@ -31,7 +31,7 @@ class RawPictures(FrameWriter):
 
     link: bool = False  # make hard links instead of copies
 
-    def __call__(self, shown: Shown) -> None:
+    def __call__(self, shown: SharedPixels) -> None:
         f, frames = shown.f, shown.frames
         two = frames.paths[f][0] != frames.paths[f][1]
 

@@ -15,7 +15,7 @@ from gsba.types import Fisheye, PictureFormat, Reconstruction
 
 
 @dataclass(frozen=True, slots=True)
-class Sensor:
+class RigSensor:
     """A camera of the rig."""
 
     model: str  # COLMAP's name
@@ -26,15 +26,15 @@ class Sensor:
     fisheye: Fisheye | None = None  # lens of an OPENCV_FISHEYE camera
 
 
-def pinholes(views: Sequence[Sequence[View]]) -> list[list[Sensor]]:
+def pinholes(views: Sequence[Sequence[View]]) -> list[list[RigSensor]]:
     """The cameras of each rig."""
     return [list(map(_pinhole, own)) for own in views]
 
 
-def raw_sensors(kind: PictureFormat, lenses: Lenses) -> list[Sensor]:
+def raw_sensors(kind: PictureFormat, lenses: Lenses) -> list[RigSensor]:
     """Raw lenses as cameras of the rig."""
     return [
-        Sensor(
+        RigSensor(
             "OPENCV_FISHEYE",
             lens.width,
             lens.height,
@@ -47,7 +47,7 @@ def raw_sensors(kind: PictureFormat, lenses: Lenses) -> list[Sensor]:
 
 
 def project_in_rigs(
-    reconstruction: Reconstruction, rigs: Sequence[Sequence[Sensor]], rig_of_frame: np.ndarray
+    reconstruction: Reconstruction, rigs: Sequence[Sequence[RigSensor]], rig_of_frame: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Sensor (O,) of its frame's rig that sees each observation, -1 = its camera model reaches less
     far, and its pixel (O, 2) there."""
@@ -62,7 +62,7 @@ def project_in_rigs(
 
 
 def _project(
-    sensors: Sequence[Sensor], bearings: np.ndarray, origins: np.ndarray | None
+    sensors: Sequence[RigSensor], bearings: np.ndarray, origins: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Sensor (O,) of the origin's lens that sees each bearing (O, 3) furthest from its border, and
     the pixel (O, 2) there."""
@@ -85,7 +85,7 @@ def _project(
 
 
 def _project_raw(
-    sensors: Sequence[Sensor], bearings: np.ndarray, origins: np.ndarray | None
+    sensors: Sequence[RigSensor], bearings: np.ndarray, origins: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Sensor (O,) and pixel (O, 2) of each bearing (O, 3) in the raw lenses; -1 beyond SEEN_DEG."""
     if origins is None:
@@ -105,6 +105,6 @@ def _project_raw(
     return which, pixels
 
 
-def _pinhole(view: View) -> Sensor:
+def _pinhole(view: View) -> RigSensor:
     params = (view.focal, view.focal, *view.principal)
-    return Sensor("PINHOLE", view.width, view.height, params, view.rig_T_view)
+    return RigSensor("PINHOLE", view.width, view.height, params, view.rig_T_view)

@@ -30,7 +30,7 @@ _TEST_LISTS = ("val_list.txt", "test_list.txt", "sparse/0/test.txt")  # and of t
 
 
 @dataclass(frozen=True, slots=True)
-class Split:
+class DatasetSplit:
     """Held-out panoramas of a dataset, and the order of its images."""
 
     held_out: np.ndarray  # (F,) bool
@@ -66,7 +66,7 @@ class Split:
 
 def split_of(
     reconstruction: Reconstruction, num_views: Sequence[int], num_photos: int = 0
-) -> Split | None:
+) -> DatasetSplit | None:
     """Split of a dataset by whole panoramas; None = too few are left to train on.
 
     Args:
@@ -91,7 +91,7 @@ def split_of(
         numbers[f][view] = HOLD_OUT_EVERY * place
     for place, (f, view) in enumerate(training):
         numbers[f][view] = place + place // (HOLD_OUT_EVERY - 1) + 1
-    return Split(held_out, tuple(map(tuple, numbers)))
+    return DatasetSplit(held_out, tuple(map(tuple, numbers)))
 
 
 def require_held_out(reconstruction: Reconstruction) -> None:

@@ -8,14 +8,13 @@ from gsba.frames.cubemap import cut, native_rig, rig_for
 from gsba.frames.masks import levels_of, load_mask, load_weights
 from gsba.frames.panorama import Greys, load_grey
 from gsba.frames.pixels import load_erp, load_faces
-from gsba.frames.scan import find_panoramas, scan
+from gsba.frames.scan import scan
 from gsba.frames.times import check_fps
 
 __all__ = [
     "Greys",
     "check_fps",
     "cut",
-    "find_panoramas",
     "levels_of",
     "load_erp",
     "load_faces",

@@ -247,30 +247,6 @@ def _lenses(
     return None, False
 
 
-def find_panoramas(folder: Path, masks: Path | None = None) -> FrameSet:
-    """The panoramas of a folder in name order; times are not needed, and are 0, 1, ... Raises
-    GsbaError: the folder holds no panoramas, or a mask does not fit."""
-    layout, _, found = _find_frames(Path(folder))
-    if layout != "erp":
-        raise GsbaError(f"{folder}: holds no panoramas; give a folder of equirectangular images")
-    names = sorted(found, key=_natural)
-    _check_names(Path(folder), names)
-    paths = tuple(found[name] for name in names)
-    width, height = _common_size(paths, layout)
-    if _pair_size(Path(folder), [path for (path,) in paths], (width, height)) is not None:
-        raise GsbaError(
-            f"{folder}: holds raw fisheyes side by side; give a folder of equirectangular images"
-        )
-    return FrameSet(
-        names=tuple(names),
-        paths=_absolute(paths),
-        timestamps=np.arange(len(names), dtype=np.float64),
-        mask_paths=find_masks(masks, names, (width, height)),
-        formats=(PictureFormat(layout, width, height),),
-        timed=False,
-    )
-
-
 def _check_names(folder: Path, names: Sequence[str]) -> None:
     """Refuse names that a table or a dataset cannot hold."""
     for name in names:

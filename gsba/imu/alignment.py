@@ -12,16 +12,19 @@ import numpy as np
 
 from gsba.geometry import median_direction, nearest_rotation, pose
 from gsba.imu.readings import Readings, Sensor
-from gsba.trajectory.clock import MIN_STEPS, Clock, simplest
-from gsba.trajectory.clock_search import ClockFit, Turns, merged, noise
+from gsba.trajectory.clock import (
+    AGREEING_SIGMAS,
+    MIN_STEPS,
+    MIN_TURNS,
+    TURNING_SIGMAS,
+    Clock,
+    simplest,
+)
+from gsba.trajectory.clock_search import LOSS_WIDTH_SIGMAS, ClockFit, Turns, merged, noise
 from gsba.types import Counts, GyroConstraints, Trajectory
 
 _MAX_SPACING_STEPS, _MAX_SPACING_S = 0.25, 0.05  # largest spacing of tried offsets: in steps, and
 # in seconds
-_LOSS_WIDTH_SIGMAS = 2.0  # width of their loss, standard deviations
-_TURNING_SIGMAS, _AGREEING_SIGMAS = 4.0, 3.0  # standard deviations: least rotation of a turn;
-# largest residual of agreement
-_MIN_TURNS = 4  # least number of steps that turn
 _MIN_EXPLAINED = 0.6  # least share of the turns that a gyro must explain
 _SCALE_SIGMA = 0.01  # prior standard deviation of a gyro's scale
 _RATE_SPAN_S = 0.01  # s over which an angular velocity is averaged
@@ -157,7 +160,7 @@ class _Candidate:
     def explained(self, turning: np.ndarray, sigma: float) -> float:
         """Share of the turns `turning (n,)` that the gyro explains within the noise."""
         off = np.linalg.norm(self.fit.residuals(self.parameters), axis=1)
-        return float(np.mean(off[turning] < _AGREEING_SIGMAS * sigma)) if turning.any() else 0.0
+        return float(np.mean(off[turning] < AGREEING_SIGMAS * sigma)) if turning.any() else 0.0
 
 
 def _sensor_and_axes(turns: Turns, turned: np.ndarray) -> tuple[Sensor, np.ndarray, float]:
@@ -174,9 +177,7 @@ def _sensor_and_axes(turns: Turns, turned: np.ndarray) -> tuple[Sensor, np.ndarr
         bias = by_time[1] - axes.T @ by_time[0] / scales
         off = seen - scales * (turned - spans * bias) @ axes.T
         sigma = noise(off)
-        weights = 1 / (
-            1 + np.sum(off**2, axis=1, keepdims=True) / (_LOSS_WIDTH_SIGMAS * sigma) ** 2
-        )
+        weights = 1 / (1 + np.sum(off**2, axis=1, keepdims=True) / (LOSS_WIDTH_SIGMAS * sigma) ** 2)
     scatter = (weights * left[1]).T @ left[1]
     information = np.linalg.eigvalsh(np.trace(scatter) * np.eye(3) - scatter)[0]
     return Sensor(bias, scales), axes, float(sigma / np.sqrt(max(information, 1e-300)))
@@ -231,7 +232,7 @@ def _with_reason(
     """The alignment of the best candidate, with the reason if it is rejected."""
     fit, parameters, turns = best.fit, best.parameters, best.turns
     sigma = noise(fit.residuals(parameters))
-    turning = np.linalg.norm(turns.rotvecs, axis=1) > _TURNING_SIGMAS * sigma
+    turning = np.linalg.norm(turns.rotvecs, axis=1) > TURNING_SIGMAS * sigma
     share = best.explained(turning, sigma)
     begin = turns.middle - timestamps[0]
     offset = parameters[0] - (parameters[1] - 1) * begin
@@ -251,7 +252,7 @@ def _with_reason(
     # a tenth of the steps must turn by a degree
     if np.quantile(np.linalg.norm(turns.rotvecs, axis=1), 0.9) < np.deg2rad(1.0):
         return replace(found, reason="the camera turns too little to determine the gyro's clock")
-    if share < _MIN_EXPLAINED or turning.sum() < _MIN_TURNS:
+    if share < _MIN_EXPLAINED or turning.sum() < MIN_TURNS:
         return replace(found, reason="the gyro's rotations fit the images at no clock offset")
     if rival > 0.75 * share:  # share of the best offset's explained turns that no rival may reach
         return replace(found, reason="the gyro's rotations fit the images at several clock offsets")

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsba.containers.insta360 import read_trailer
+from gsba.containers.insta360 import STANDARD_GRAVITY, read_trailer
 from gsba.containers.telemetry import ask_telemetry_parser
 from gsba.frames.times import read_lines
 from gsba.imu.readings import Readings
@@ -24,11 +24,10 @@ from gsba.log import GsbaError, brief
 _TABLES = (".csv", ".txt", ".tsv", ".dat")
 _MIN_READINGS_HZ = 25.0  # readings per second: fewer do not resolve a readout of 10 to 30 ms
 _MIN_READINGS = 10  # least number of readings
-_STANDARD_GRAVITY = 9.80665
 _DEGREE = np.pi / 180
 _SECONDS_OF_UNIT = {"": 1.0, "s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _RAD_S_OF_UNIT = {"": 1.0, "rad/s": 1.0, "deg/s": _DEGREE, "dps": _DEGREE}
-_M_S2_OF_UNIT = {"": 1.0, "m/s2": 1.0, "g": _STANDARD_GRAVITY}
+_M_S2_OF_UNIT = {"": 1.0, "m/s2": 1.0, "g": STANDARD_GRAVITY}
 _COLUMN_PATTERNS = {
     "t": (r"t|time|timestamp", _SECONDS_OF_UNIT),
     "gyro": (

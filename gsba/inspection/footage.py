@@ -10,7 +10,7 @@ from gsba.imu.files import read_telemetry
 from gsba.log import GsbaError
 from gsba.placement.gps_video import read_video_gps
 from gsba.video.extraction import refuse_darkness
-from gsba.video.recording import Recording, read_recording
+from gsba.video.recording import VideoRecording, read_recording
 from gsba.video.timeline import container_tags
 
 Facts = tuple[tuple[str, str], ...]  # name and text of each, in the order of the output
@@ -68,7 +68,7 @@ def _camera(path: Path, trailer: Insta360Trailer | None) -> Facts:
     return (*facts, *([("created", created)] if created else []))
 
 
-def _layout(recording: Recording) -> str:
+def _layout(recording: VideoRecording) -> str:
     """Layout of the frames."""
     line = recording.timelines[0]
     if recording.cube:
@@ -79,7 +79,7 @@ def _layout(recording: Recording) -> str:
     return f"raw, two fisheyes, {tracks} of {line.width}x{line.height}"
 
 
-def _frames(recording: Recording) -> str:
+def _frames(recording: VideoRecording) -> str:
     """Number of frames, rate and duration."""
     times, num = recording.times, int(np.count_nonzero(recording.shown))
     steps = np.diff(times)

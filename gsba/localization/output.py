@@ -9,8 +9,8 @@ import numpy as np
 from gsba.disk import write_csv, write_json
 from gsba.geometry import quaternion_from_rotation
 from gsba.localization.localizer import LocalizedFrame
-from gsba.localization.photo_localizer import LocalizedPhotos, PhotoCamera
-from gsba.localization.pictures import Picture
+from gsba.localization.photo_localizer import CameraOfPhotos, LocalizedPhotos
+from gsba.localization.pictures import QueryPicture
 from gsba.trajectory.files import write_tum
 from gsba.types import Trajectory
 from gsba.version import __version__
@@ -20,7 +20,7 @@ _UPPER = np.triu_indices(6)
 
 
 def write_localized(
-    folder: Path, run: Path, found: LocalizedPhotos, pictures: Sequence[Picture]
+    folder: Path, run: Path, found: LocalizedPhotos, pictures: Sequence[QueryPicture]
 ) -> None:
     """Write `trajectory.tum`, `poses.csv` and `localized.json`, each whole or not at all.
 
@@ -69,7 +69,7 @@ def write_localized(
     write_json(folder / "localized.json", content)
 
 
-def _as_json(frame: LocalizedFrame, picture: Picture) -> dict[str, Any]:
+def _as_json(frame: LocalizedFrame, picture: QueryPicture) -> dict[str, Any]:
     content: dict[str, Any] = {"name": frame.name, "timestamp": picture.time}
     content |= {"reason": frame.reason, "camera": frame.camera}
     if picture.path is not None:
@@ -85,7 +85,7 @@ def _as_json(frame: LocalizedFrame, picture: Picture) -> dict[str, Any]:
     return content
 
 
-def _camera_json(camera: PhotoCamera) -> dict[str, Any]:
+def _camera_json(camera: CameraOfPhotos) -> dict[str, Any]:
     """Camera of photos: r = focal (t + k1 t^3 + k2 t^5), t the tangent of the angle to z."""
     projection = camera.projection
     sigmas = np.sqrt(np.maximum(np.diag(camera.covariance), 0)) * np.array(

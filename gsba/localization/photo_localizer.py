@@ -37,7 +37,7 @@ from gsba.localization.photos import (
     read_photo,
     shows,
 )
-from gsba.localization.pictures import Picture
+from gsba.localization.pictures import QueryPicture
 from gsba.localization.pose_search import (
     MIN_RATIO,
     MIN_WITNESSES,
@@ -70,7 +70,7 @@ _CELLS_PER_SIDE = 64  # along 90 degrees: keypoints within one are one witness o
 
 
 @dataclass(frozen=True, slots=True)
-class PhotoCamera:
+class CameraOfPhotos:
     """A camera that photos share."""
 
     projection: PerspectiveProjection
@@ -85,7 +85,7 @@ class LocalizedPhotos:
 
     frames: tuple[LocalizedFrame, ...]  # of all photos; the pose is world_T_camera: x right, y
     # down, z forward
-    cameras: tuple[PhotoCamera, ...]
+    cameras: tuple[CameraOfPhotos, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -284,7 +284,7 @@ def _sightings(
 
 def _fit_together(
     localizer: Localizer, placed: Sequence[_Placed]
-) -> tuple[list[LocalizedFrame], list[PhotoCamera]]:
+) -> tuple[list[LocalizedFrame], list[CameraOfPhotos]]:
     """Poses and shared cameras of placed photos, by keypoints, then by patches."""
     names = list(dict.fromkeys(one.photo.camera for one in placed))
     numbers = [names.index(one.photo.camera) for one in placed]
@@ -316,7 +316,7 @@ def _fit_together(
         for p, (one, seen) in enumerate(zip(placed, pictures, strict=True))
     ]
     cameras = [
-        PhotoCamera(
+        CameraOfPhotos(
             _perspective(fitted.projections[c]),
             fitted.camera_covariances[c][:5, :5],
             tuple(one.photo.name for one in group),
@@ -380,7 +380,7 @@ def _judged(
     return localizer.with_map_error(frame)
 
 
-def localize_all(localizer: Localizer, pictures: Sequence[Picture]) -> LocalizedPhotos:
+def localize_all(localizer: Localizer, pictures: Sequence[QueryPicture]) -> LocalizedPhotos:
     """Localise panoramas and photos, in the order of the pictures; one that cannot be read is
     refused with the reason. With the cameras of photos."""
     found: dict[str, LocalizedFrame] = {}

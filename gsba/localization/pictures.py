@@ -19,7 +19,7 @@ from gsba.types import FrameSet
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
+class QueryPicture:
     """A picture to localise."""
 
     name: str  # without folder and extension
@@ -40,10 +40,12 @@ def load_panorama(path: Path, at_least: int) -> np.ndarray:
     return decode(path, (width, height), at_least=at_least)
 
 
-def find_pictures(sources: Sequence[Path], cameras: PictureCameras, work: Path) -> list[Picture]:
+def find_pictures(
+    sources: Sequence[Path], cameras: PictureCameras, work: Path
+) -> list[QueryPicture]:
     """The pictures of files, folders and videos (one frame a second, in `work`), in this order;
     GsbaError for a source that holds none, frames of no camera of the run, or two of one name."""
-    found: list[Picture] = []
+    found: list[QueryPicture] = []
     for number, source in enumerate(sources):
         if not source.exists():
             raise GsbaError(f"{source}: no such file or folder")
@@ -82,13 +84,13 @@ def _is_of_single_images(folder: Path, cameras: PictureCameras) -> bool:
     return scan(folder, order_suffices=True, min_frames=1).format.layout == "erp"
 
 
-def _single_images(source: Path, stitched: bool) -> list[Picture]:
+def _single_images(source: Path, stitched: bool) -> list[QueryPicture]:
     """Panoramas or photos, one file each; 2:1 pictures are panoramas where the run has such."""
 
-    def picture(path: Path, time: float) -> Picture:
+    def picture(path: Path, time: float) -> QueryPicture:
         width, height = _size_of(path) or (2, 1)  # is refused where its pixels are read
         panoramic = stitched and width == 2 * height
-        return Picture(path.stem, time, path, photo=not panoramic)
+        return QueryPicture(path.stem, time, path, photo=not panoramic)
 
     if source.is_file():
         return [picture(source, 0.0)]
@@ -111,7 +113,7 @@ def _size_of(path: Path) -> tuple[int, int] | None:
         return None
 
 
-def _frames_of_several_images(folder: Path, cameras: PictureCameras) -> list[Picture]:
+def _frames_of_several_images(folder: Path, cameras: PictureCameras) -> list[QueryPicture]:
     chosen, errors = cameras.chosen, list[GsbaError]()
     found = dict[int, FrameSet]()  # by camera: raw fisheyes by each calibration that reads them
     for camera, calibration in enumerate(cameras.calibrations):
@@ -132,4 +134,4 @@ def _frames_of_several_images(folder: Path, cameras: PictureCameras) -> list[Pic
         camera = cameras.of_raw({c: frames.format for c, frames in found.items()}, str(folder))
     frames = found[camera]
     times = frames.timestamps.tolist()
-    return [Picture(n, times[f], None, frames, f, camera) for f, n in enumerate(frames.names)]
+    return [QueryPicture(n, times[f], None, frames, f, camera) for f, n in enumerate(frames.names)]

@@ -6,16 +6,15 @@ import numpy as np
 
 from gsba.camera.rig import witnesses
 from gsba.geometry import inverse, rotation_angle
+from gsba.loop_closure.registration import RIVAL_DISTANCE
 from gsba.matching.absolute_pose import FoundPose, panorama_pose
-from gsba.significance import least_agreeing
+from gsba.significance import MAX_FALSE_POSES, least_agreeing
+from gsba.trajectory.turning import CELLS_PER_SIDE
 from gsba.types.records import with_rows
 
 MIN_RATIO = 0.02  # least inlier ratio that the number of trials allows for
-CELLS_PER_SIDE = 16  # along a face's side: keypoints within one, 6 degrees, are one witness
-_MAX_FALSE_ALARMS = 1e-6  # expected number of poses that chance explains as well as an accepted one
 MIN_WITNESSES = 10  # fewer may be of one moving object
 _MIN_SHARE = 0.25  # of the first pose's inliers, that further poses must have
-_RIVAL_DISTANCE = 0.3  # distance of another place, in median depths or radians
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +68,7 @@ def is_significant(
     num = witnesses(bearings, per_side)
     agreeing = witnesses(bearings[inliers], per_side)
     per_witness = 1 - (1 - min(chance, 0.5)) ** (len(bearings) / num)
-    needed = least_agreeing(num, per_witness, sample, _MAX_FALSE_ALARMS)
+    needed = least_agreeing(num, per_witness, sample, MAX_FALSE_POSES)
     return agreeing >= max(needed, MIN_WITNESSES)
 
 
@@ -77,4 +76,4 @@ def are_apart(one: np.ndarray, other: np.ndarray, depth: float) -> bool:
     """True if two poses (4, 4) are of different places, for points at a median depth."""
     moved = inverse(one) @ other
     turned = float(rotation_angle(moved[:3, :3]))
-    return max(float(np.linalg.norm(moved[:3, 3])) / depth, turned) > _RIVAL_DISTANCE
+    return max(float(np.linalg.norm(moved[:3, 3])) / depth, turned) > RIVAL_DISTANCE

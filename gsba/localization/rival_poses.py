@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsba.camera.rig import cells_of
-from gsba.localization.pose_search import CELLS_PER_SIDE, are_apart
+from gsba.localization.pose_search import are_apart
 from gsba.localization.surroundings import is_look_alike
 from gsba.loop_closure.join_evidence import JoinEvidence
-
-_NUM_SIGMAS = 3.09  # of a sign test, one-sided error rate of 1e-3
+from gsba.significance import SIGMAS_OF_1E_3
+from gsba.trajectory.turning import CELLS_PER_SIDE
 
 TWO_PLACES = "two places of the map look like it"
 LOOK_ALIKE = "the place that it looks like shows other things around"
@@ -50,7 +50,7 @@ def best_of(poses: Sequence[PlacedPose]) -> tuple[int, str]:
         apart = are_apart(one.world_T_rig, other.world_T_rig, one.depth)
         common = len(np.intersect1d(one.cells, other.cells, assume_unique=True))
         own, others = len(one.cells) - common, len(other.cells) - common
-        more = own - others > _NUM_SIGMAS * np.sqrt(own + others)  # a sign test
+        more = own - others > SIGMAS_OF_1E_3 * np.sqrt(own + others)  # a sign test
         if apart and not is_look_alike(other.evidence) and not more:
             return best, TWO_PLACES
     return best, ""

@@ -32,9 +32,9 @@ _STAGES = (
     "features_tour",
     "features",
 )  # that store keypoints of frames, the last one first
-_SAME_PLACE_SIGMAS = 6.0  # largest angle between a keypoint and the observation of a point that is
+SAME_PLACE_SIGMAS = 6.0  # largest angle between a keypoint and the observation of a point that is
 # taken for the keypoint's, standard deviations of the keypoint
-_SAME_PLACE_RAD = np.deg2rad(0.25)  # and largest such angle
+SAME_PLACE_RAD = np.deg2rad(0.25)  # and largest such angle
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +121,7 @@ class RunMap:
             known = np.zeros(len(features), bool)
             if len(rows) and len(features):
                 gaps, nearest = KDTree(result.observation_bearings[rows]).query(seen.bearings_rig)
-                allowed = np.minimum(_SAME_PLACE_SIGMAS * seen.sigmas_rad, _SAME_PLACE_RAD)
+                allowed = np.minimum(SAME_PLACE_SIGMAS * seen.sigmas_rad, SAME_PLACE_RAD)
                 known = np.asarray(gaps) < allowed
                 numbers = result.observation_points[rows].astype(np.int64)[np.asarray(nearest)]
             chosen = np.flatnonzero(known)

@@ -17,10 +17,10 @@ from gsba.log import GsbaError
 from gsba.loop_closure.join_evidence import (
     GATE_RAD,
     NUM_SIGMAS_LIKELY,
+    FindingRates,
     JoinEvidence,
     Places,
     Predictions,
-    Rates,
     evidence_of,
     predicted,
     rates_of,
@@ -49,9 +49,9 @@ class PictureRates:
     placed: np.ndarray  # (C + 1, B) float64
     face_px: np.ndarray  # (C,) int64, across the faces on which keypoints are to be found
 
-    def of_camera(self, camera: int) -> Rates:
+    def of_camera(self, camera: int) -> FindingRates:
         """Rates of a camera's panoramas."""
-        return Rates(self.within[camera], float(self.chance[camera]), self.placed[camera])
+        return FindingRates(self.within[camera], float(self.chance[camera]), self.placed[camera])
 
 
 class Surroundings:
@@ -62,7 +62,7 @@ class Surroundings:
         num = len(map_.result.points_world)
         self._num_observers = np.bincount(map_.result.observation_points, None, num)
 
-    def rates(self, frames: Sequence[int], seen: Sequence[Query]) -> Rates:
+    def rates(self, frames: Sequence[int], seen: Sequence[Query]) -> FindingRates:
         """Rates at which frames (N,) of the map show what the map without them would expect, by
         their keypoints (N), found as those of the pictures to test."""
         poses = self.map.result.world_T_rigs
@@ -73,7 +73,7 @@ class Surroundings:
         return rates_of(Predictions.joined(at), Predictions.joined(away))
 
     def evidence(
-        self, seen: Query, world_T_rig: np.ndarray, usual: Rates, shown: Shown | None = None
+        self, seen: Query, world_T_rig: np.ndarray, usual: FindingRates, shown: Shown | None = None
     ) -> JoinEvidence:
         """Evidence for and against a pose (4, 4); `shown` tells the points within a picture with
         edges."""
@@ -127,7 +127,7 @@ def open_rates(
     `rigs` (C) and kept; where pictures of the run are gone, by its stored keypoints."""
     map_ = surroundings.map
 
-    def rates_of_camera(camera: int) -> tuple[Rates, Rates, int]:
+    def rates_of_camera(camera: int) -> tuple[FindingRates, FindingRates, int]:
         """Rates of a camera's panoramas, of photos by its frames, and pixels across faces."""
         frames, rig = _some(np.flatnonzero(map_.frames.cameras == camera)), rigs[camera]
         own = cubemap.rig_for(map_.frames.formats[camera], map_.settings.cubemap)

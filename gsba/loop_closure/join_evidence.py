@@ -13,6 +13,7 @@ from scipy.spatial import KDTree
 
 from gsba.geometry import angles_between, inverse
 from gsba.matching.guided_search import Gate, MatchContext
+from gsba.significance import SIGMAS_OF_1E_3
 from gsba.types import Matches
 
 LOCAL = 12  # frames to either side of a meeting that are compared
@@ -46,7 +47,6 @@ _LOOK_ALIKE_PLACED = 0.4
 # Share in strange regions: .30 to .41 in Sponza, whose other side is an exact copy turned about and
 # all that is found is at its place; .11 at most under true joins, in another light, too.
 _LOOK_ALIKE_STRANGE = 0.2
-_NUM_SIGMAS = 3.09  # standard deviations of a one-sided error rate of 1e-3
 NUM_SIGMAS_LIKELY = 1.64  # of 5 %
 
 
@@ -101,7 +101,7 @@ class Predictions:
 
 
 @dataclass(frozen=True, slots=True)
-class Rates:
+class FindingRates:
     """Rates at which predicted points are found."""
 
     within: np.ndarray  # (B,) float64, within parts, by change of view
@@ -134,7 +134,7 @@ class JoinEvidence:
             f"none in {100 * _LOOK_ALIKE_STRANGE:.0f} % of the regions"
         )
 
-    def margin(self, num_sigmas: float = _NUM_SIGMAS) -> float:
+    def margin(self, num_sigmas: float = SIGMAS_OF_1E_3) -> float:
         """Lower bounds of both shares, less what look-alikes have: the lesser of the two."""
         found = self.share - num_sigmas * self.sigma - _LOOK_ALIKE_SHARE
         return min(found, self.placed - num_sigmas * self.placed_sigma - _LOOK_ALIKE_PLACED)
@@ -163,17 +163,17 @@ class JoinEvidence:
     @property
     def refuted(self) -> bool:
         """True if significantly less is found again than under a true join."""
-        return self.share + _NUM_SIGMAS * self.sigma < _LOOK_ALIKE_SHARE
+        return self.share + SIGMAS_OF_1E_3 * self.sigma < _LOOK_ALIKE_SHARE
 
     @property
     def absent(self) -> bool:
         """True if significantly less than a tenth is found again."""
-        return self.share + _NUM_SIGMAS * self.sigma < 0.1
+        return self.share + SIGMAS_OF_1E_3 * self.sigma < 0.1
 
     def beats(self, other: "JoinEvidence") -> bool:
         """True if significantly more is at its place than under another join."""
         sigma = float(np.hypot(self.placed_sigma, other.placed_sigma))
-        return self.placed - other.placed > _NUM_SIGMAS * sigma
+        return self.placed - other.placed > SIGMAS_OF_1E_3 * sigma
 
 
 def rates(
@@ -182,7 +182,7 @@ def rates(
     parts: np.ndarray,
     surfaces: bool = True,
     chosen: np.ndarray | None = None,
-) -> Rates:
+) -> FindingRates:
     """Rates at which points of a frame are found again in frames of its own part (F,), if both are
     `chosen` (F,) bool; for `surfaces` see `predict`."""
     compared = np.ones(len(parts), bool) if chosen is None else chosen
@@ -206,7 +206,7 @@ def turned_away(world_T_rigs: np.ndarray) -> np.ndarray:
     return poses
 
 
-def rates_of(seen: Predictions, away: Predictions) -> Rates:
+def rates_of(seen: Predictions, away: Predictions) -> FindingRates:
     """Rates of predictions at true poses, and of others at poses that are `turned_away`."""
     numbers = np.bincount(seen.bins, None, _NUM_BINS)
 
@@ -216,14 +216,14 @@ def rates_of(seen: Predictions, away: Predictions) -> Rates:
         return (hits + _PRIOR_COUNT * mean) / (numbers + _PRIOR_COUNT)
 
     chance = float(away.found.mean()) if len(away.found) else 0.0
-    return Rates(by_change_of_view(seen.found), chance, by_change_of_view(seen.placed))
+    return FindingRates(by_change_of_view(seen.found), chance, by_change_of_view(seen.placed))
 
 
 def weigh(
     context: MatchContext,
     places: Places,
     groups: tuple[np.ndarray, np.ndarray],
-    usual: Rates,
+    usual: FindingRates,
     depth: float,
     surfaces: bool = True,
 ) -> tuple[JoinEvidence, Matches]:
@@ -237,7 +237,7 @@ def weigh(
     return evidence_of(seen, usual, depth), found
 
 
-def evidence_of(seen: Predictions, usual: Rates, depth: float) -> JoinEvidence:
+def evidence_of(seen: Predictions, usual: FindingRates, depth: float) -> JoinEvidence:
     """Evidence of predicted points: the weaker of two estimates, unless it is little anyway.
 
     By cells, a look-alike with many points is one witness. By points, so is a place of which only
@@ -268,7 +268,7 @@ def evidence_of(seen: Predictions, usual: Rates, depth: float) -> JoinEvidence:
         for numbers in (each, one)
     )
     if by_cells.likely:
-        return min(by_cells, by_points, key=lambda one: one.share - _NUM_SIGMAS * one.sigma)
+        return min(by_cells, by_points, key=lambda one: one.share - SIGMAS_OF_1E_3 * one.sigma)
     return by_cells
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from gsba.loop_closure import join_evidence
-from gsba.loop_closure.join_evidence import JoinEvidence, Places, Rates, around
+from gsba.loop_closure.join_evidence import FindingRates, JoinEvidence, Places, around
 from gsba.loop_closure.map_similarity import (
     Meeting,
     Proposal,
@@ -48,8 +48,8 @@ class JoinTest:
     owners: np.ndarray  # (F,) int, recording of each frame
     # Measures the rates at which points of frames (F,) bool are found again: those of the
     # recordings that meet, as rooms of others may show more or fewer of their points again.
-    measure_rates: Callable[[np.ndarray], Rates]
-    _usual: dict[tuple[int, ...], Rates] = field(default_factory=dict)
+    measure_rates: Callable[[np.ndarray], FindingRates]
+    _usual: dict[tuple[int, ...], FindingRates] = field(default_factory=dict)
     # Proposals judged before, by their similarity and the frames compared. A part is tested again
     # whenever the map has grown; until it is joined, poses of these frames do not change.
     _tested: dict[tuple[object, ...], Judged] = field(default_factory=dict)
@@ -92,7 +92,7 @@ class JoinTest:
         usual, places = self._rates(np.concatenate([rows, inside])), Places(poses, known)
         return join_evidence.weigh(self.context, places, (rows, inside), usual, self.depth)
 
-    def _rates(self, frames: np.ndarray) -> Rates:
+    def _rates(self, frames: np.ndarray) -> FindingRates:
         owners = np.unique(self.owners[frames])
         key = tuple(owners.tolist())
         if key not in self._usual:

@@ -14,7 +14,7 @@ from gsba.geometry import angles_between, inverse, unit
 from gsba.loop_closure import join_evidence, loops
 from gsba.loop_closure.break_crossing import Breaks, agreed, crossing
 from gsba.loop_closure.connectivity import MIN_MAP_FRAMES, by_size
-from gsba.loop_closure.join_evidence import GATE_RAD, Places, Rates
+from gsba.loop_closure.join_evidence import GATE_RAD, FindingRates, Places
 from gsba.loop_closure.join_test import JoinTest, Judged
 from gsba.loop_closure.loops import Loop
 from gsba.loop_closure.map_similarity import Meeting, Proposal, propose
@@ -106,7 +106,7 @@ class _Joining:
         self.test = JoinTest(
             context, self.poses, self.known, self.depth, recordings, lambda rows: usual(chosen=rows)
         )
-        self.usual_anywhere: Rates | None = None
+        self.usual_anywhere: FindingRates | None = None
         self.min_testable = min_testable  # frames of a map that joins can be tested by
         self.recordings = recordings
         # Steps over which bays of a hall may be taken for one another.

@@ -13,7 +13,7 @@ _MIN_SPREAD = 0.02  # least middle eigenvalue of the inliers' bearings: they mus
 _MIN_INLIERS = 25  # least number of inliers
 _MIN_INLIER_RATIO = 0.2  # least inlier ratio of the candidates
 _MIN_RIVAL_RATIO = 1.5  # ratio by which a pose must outweigh the best one at another place
-_RIVAL_DISTANCE = 0.3  # distance of another place, in median depths or radians
+RIVAL_DISTANCE = 0.3  # distance of another place, in median depths or radians
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +51,6 @@ def resect(
         if rival is not None and inliers.sum() < _MIN_RIVAL_RATIO * rival.inliers.sum():
             moved = inverse(world_T_rig) @ rival.world_T_rig
             turned = np.linalg.norm(moved[:3, :3] - np.eye(3)) / np.sqrt(2)
-            if max(np.linalg.norm(moved[:3, 3]) / depth, turned) > _RIVAL_DISTANCE:
+            if max(np.linalg.norm(moved[:3, 3]) / depth, turned) > RIVAL_DISTANCE:
                 reason = "another place explains it nearly as well"
     return RegisteredFrame(world_T_rig, inliers, reason)

@@ -8,7 +8,6 @@ import functools
 import shlex
 import shutil
 import subprocess
-import threading
 import uuid
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from factors.threads import Once
 from gsba.camera.rig import CubeRig, owner_faces
 from gsba.camera.sphere import bearings_from_erp
 from gsba.disk import disk_errors, write_image
@@ -53,7 +53,7 @@ def segmented(store: RunStore, frames: FrameSet, segment: Segment) -> PerFrame[S
     """
     index = {name: f for f, name in enumerate(frames.names)}
     folder = store.root / "stages" / "segmented-faces"
-    ask = _Once(lambda: _run(str(segment), frames, folder))
+    ask = Once(lambda: _run(str(segment), frames, folder))
 
     def compute(name: str) -> Segmented:
         kind = frames.format_of(index[name])
@@ -89,19 +89,6 @@ def load_segmented(found: PerFrame[Segmented], frames: FrameSet, frame: int) -> 
 def _face_file(name: str, face: int) -> str:
     """File name of a frame's face; folders are flat, whatever recordings the frames are of."""
     return f"{name.replace('/', '@')}_{FACES[face]}.png"
-
-
-class _Once:
-    """A function that is called once, by its first caller."""
-
-    def __init__(self, work: Callable[[], None]) -> None:
-        self._work, self._lock, self._done = work, threading.Lock(), False
-
-    def __call__(self) -> None:
-        with self._lock:
-            if not self._done:
-                self._work()
-                self._done = True
 
 
 def _present(kind: PictureFormat) -> list[int]:

@@ -9,10 +9,11 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from threading import Lock
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
+from factors.threads import Once
 from gsba.camera.cameras import ONE_CAMERA, Cameras
 from gsba.camera.lens import Lenses
 from gsba.camera.rig import cells_of
@@ -256,19 +257,6 @@ class Matcher(Protocol):
         ...
 
 
-class _Once(Generic[T]):
-    """A value computed by the first caller, while only callers that need it wait."""
-
-    def __init__(self, make: Callable[[], T]) -> None:
-        self._make, self._lock, self._made = make, Lock(), []
-
-    def __call__(self) -> T:
-        with self._lock:
-            if not self._made:
-                self._made.append(self._make())
-            return self._made[0]
-
-
 class SearchableFrames:
     """Features of frames, prepared for matching, the strongest of a face or all; read on demand,
     the most recent ones, up to a capacity, are kept. For axes of descriptors see `searchable`; None
@@ -285,9 +273,9 @@ class SearchableFrames:
             first = load(0).descriptors
             axes = principal_axes(first) if len(first) else np.eye(first.shape[1], dtype=np.float32)
         self._get = lru_cache(capacity)(
-            lambda frame: _Once(lambda: searchable(load(frame), axes, strongest))
+            lambda frame: Once(lambda: searchable(load(frame), axes, strongest))
         )
-        self._features = lru_cache(max(capacity // 8, 2))(lambda frame: _Once(lambda: load(frame)))
+        self._features = lru_cache(max(capacity // 8, 2))(lambda frame: Once(lambda: load(frame)))
         self._load, self._axes, self._capacity = load, axes, capacity
         self._lock = Lock()
         self.strongest = strongest

@@ -90,7 +90,7 @@ def _join_test(places: KeyframePlaces) -> JoinTest:
     frames = np.arange(len(places.keyframes))
     known = [by_keypoint[int(f)] for f in frames]
 
-    def rates(chosen: np.ndarray) -> join_evidence.Rates:
+    def rates(chosen: np.ndarray) -> join_evidence.FindingRates:
         beside = KnownPlaces(solved.world_T_rigs, known)
         return join_evidence.rates(context, beside, frames // (2 * LOCAL), chosen=chosen)
 

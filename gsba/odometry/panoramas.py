@@ -24,7 +24,7 @@ from gsba.masks.carrier import PICTURE_WIDTH, find_fixed_carrier
 from gsba.types import FrameSet
 from gsba.video.recording import (
     EXACT_S,
-    Recording,
+    VideoRecording,
     factory_calibration_of,
     read_recording,
     shots,
@@ -161,7 +161,7 @@ def _narrowed(panoramas: SmallPanoramas, usable: np.ndarray) -> SmallPanoramas:
     return replace(panoramas, usable=fitted if before is None else fitted & before)
 
 
-def _lenses(recording: Recording, rows: np.ndarray, calibration: Path | None) -> Rig:
+def _lenses(recording: VideoRecording, rows: np.ndarray, calibration: Path | None) -> Rig:
     """Initial lenses of a raw recording, from a few of its frames."""
     looks = np.unique(np.linspace(0, len(rows) - 1, 8).astype(int))
     size = (recording.width, recording.width)

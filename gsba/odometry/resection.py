@@ -7,18 +7,15 @@ import numpy as np
 from factors import tangent_basis
 from factors.compiled import kernel_and_part
 from gsba.camera.rig import witnesses
-from gsba.significance import least_agreeing
+from gsba.significance import MAX_FALSE_POSES, least_agreeing
+from gsba.trajectory.turning import CELLS_PER_SIDE
 
 _kernel, _part = kernel_and_part()
 _CONVERGED = 1e-6  # radians, and parts of the median distance
 _ANNEALED = (8.0, 4.0, 2.0, 1.0)  # factors on the scale of the loss in the first steps
 _GATE = 3.5  # standard deviations of an inlier
 _SAMPLE = 3  # bearings that determine a pose
-_CELLS = 16  # cells along a cube face's side: all features within one, 6 degrees, count as one
-# witness
 _MIN_WITNESSES = 20  # least number of witnesses: fewer may be of one moving object
-_MAX_FALSE_ALARMS = 1e-6  # expected number of poses that chance explains as well as the accepted
-# one
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,12 +43,12 @@ def resect(
         noise = float(np.sqrt(np.median(squares[inliers]) / 1.386))
     distance = float(np.median(distances)) if len(distances) else 1.0
     covariance = max(noise, 0.3 * sigma) ** 2 * np.linalg.pinv(information, hermitian=True)
-    num = witnesses(bearings_rig, _CELLS) if len(bearings_rig) else 0
-    agreeing = witnesses(bearings_rig[inliers], _CELLS) if inliers.any() else 0
+    num = witnesses(bearings_rig, CELLS_PER_SIDE) if len(bearings_rig) else 0
+    agreeing = witnesses(bearings_rig[inliers], CELLS_PER_SIDE) if inliers.any() else 0
     # false matches lie anywhere within 6 degrees of their prediction
     chance = min((_GATE * sigma / np.deg2rad(6.0)) ** 2, 0.5)
     per_witness = 1 - (1 - chance) ** (len(bearings_rig) / max(num, 1))
-    needed = least_agreeing(num, per_witness, _SAMPLE, _MAX_FALSE_ALARMS)
+    needed = least_agreeing(num, per_witness, _SAMPLE, MAX_FALSE_POSES)
     significant = agreeing >= max(needed, _MIN_WITNESSES)
     spread = np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1])
     significant &= spread < 0.05 * distance  # of the position, in median distances of the points

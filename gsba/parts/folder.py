@@ -52,7 +52,7 @@ class At:
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class MapPart:
     """Frames, landmarks and factors that a part owns.
 
     A node is 6 coordinates of a variable: those of the frames come first in the map, then those of
@@ -100,9 +100,9 @@ def part_folder(folder: Path, part: int) -> Path:
     return folder / f"part-{part:05d}"
 
 
-def load_part(folder: Path, part: int) -> Part:
+def load_part(folder: Path, part: int) -> MapPart:
     """Read what a part owns."""
-    return load(part_folder(folder, part) / "given.npz", Part)
+    return load(part_folder(folder, part) / "given.npz", MapPart)
 
 
 def load_index(folder: Path) -> Index:
@@ -284,7 +284,7 @@ class PartsWriter:
         numbers = np.concatenate([np.empty(0, np.int64), *(chunk.numbers for chunk in chunks)])
         sightings = merged([chunk.sightings for chunk in chunks], local)
         keys, num_kept = variables.keys_of(rows), len(variables.nodes_of(shared))
-        part = Part(frames, keys, num_kept, sightings, numbers, serialized(graph))
+        part = MapPart(frames, keys, num_kept, sightings, numbers, serialized(graph))
         save_record(folder / "given.npz", part, {})
         for path in paths:
             path.unlink()

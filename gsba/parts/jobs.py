@@ -16,7 +16,7 @@ from factors.part_system import Condensed, PartElimination, PartEquations, PartS
 from factors.system_layout import SystemLayout
 from gsba.bundle.pose_variables import X
 from gsba.memory import total_memory_bytes
-from gsba.parts.folder import At, Part, deserialized, load, load_part, part_folder
+from gsba.parts.folder import At, MapPart, deserialized, load, load_part, part_folder
 from gsba.store.records import save_record
 from gsba.store.shards import even_blocks
 
@@ -216,13 +216,13 @@ class Covariances(_PartJob):
         return inverse, between, drawn
 
 
-def _block(part: Part, points_world: np.ndarray, loss: RobustLoss) -> LandmarkBlock:
+def _block(part: MapPart, points_world: np.ndarray, loss: RobustLoss) -> LandmarkBlock:
     keys = [X(frame) for frame in part.frames.tolist()]
     return LandmarkBlock(keys, points_world, part.sightings.terms, loss, num_threads=1)
 
 
 def _linearized(
-    part: Part,
+    part: MapPart,
     block: LandmarkBlock,
     graph: gtsam.NonlinearFactorGraph,
     values: gtsam.Values,

@@ -16,7 +16,7 @@ from gsba.frames import panorama
 from gsba.memory import release_mapped_files, total_memory_bytes
 from gsba.photometric import frame_jobs
 from gsba.photometric.frame_jobs import MAX_SHIFT_PX
-from gsba.photometric.packing import Observed, Shown, pack
+from gsba.photometric.packing import Observed, PointsInFrames, pack
 from gsba.photometric.references import references, visible_frames
 from gsba.store.shards import Workers
 from gsba.types import Counts, Keypoints, Landmarks, Sighted, Solution
@@ -48,7 +48,7 @@ class _Planes:
 
 
 @dataclass(frozen=True, slots=True)
-class Observations:
+class AlignedObservations:
     """Observations of a map's points, and what earlier alignments have shown of them."""
 
     keypoints: Keypoints  # as pictures show them
@@ -61,7 +61,7 @@ class Observations:
 
 def align(
     solved: Solution,
-    observed: Observations,
+    observed: AlignedObservations,
     greys: panorama.Greys,
     rig: CubeRig,
     workers: Workers,
@@ -103,7 +103,7 @@ def align(
     given = landmarks, keypoints, solved.noise, new, greys.num_frames, workers.num_threads
     former = Observed.joined(_former_observations(*given), folder)
     own = keypoints.starts[landmarks.tracks.frames[rows]] + landmarks.tracks.keypoints[rows]
-    shown = Shown(keypoints.colors[own], normals_world, world_T_rigs)
+    shown = PointsInFrames(keypoints.colors[own], normals_world, world_T_rigs)
     counts = Counts(num_found + sum(dropped.values()), num_found, "observations", dropped)
     return pack(new, former, shown, rig, counts, folder, workers.num_threads)
 
@@ -127,7 +127,7 @@ def _by_hosts(hosts: np.ndarray, positions: np.ndarray) -> Iterator[np.ndarray]:
 
 def _align_some(
     solved: Solution,
-    observed: Observations,
+    observed: AlignedObservations,
     greys: panorama.Greys,
     workers: Workers,
     lenses: Cameras,

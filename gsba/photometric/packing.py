@@ -63,7 +63,7 @@ class Observed:
 
 
 @dataclass(frozen=True, slots=True)
-class Shown:
+class PointsInFrames:
     """Further properties of the points (J,), and the frames (F,)."""
 
     colors: np.ndarray  # (J, 3) uint8, RGB
@@ -74,7 +74,7 @@ class Shown:
 def pack(
     new: Observed,
     former: Observed,
-    shown: Shown,
+    shown: PointsInFrames,
     rig: CubeRig,
     counts: Counts,
     folder: Path | None,
@@ -106,7 +106,7 @@ def _by_frame(
     parts: Sequence[Observed],
     several: np.ndarray,
     sizes: np.ndarray,
-    shown: Shown,
+    shown: PointsInFrames,
     rig: CubeRig,
     num_threads: int,
 ) -> Iterator[tuple[np.ndarray, ...]]:

@@ -22,6 +22,7 @@ from gsba.bundle.map_strength import MapStrength
 from gsba.bundle.reconstruction import MIN_OBSERVATIONS, assemble, world_scale
 from gsba.camera.views import Optics, scenes_around
 from gsba.imu.alignment import up_axis
+from gsba.log import event
 from gsba.loop_closure import connectivity, map_merging
 from gsba.loop_closure.merged_map import Registered, follow
 from gsba.matching import correspondences
@@ -56,7 +57,9 @@ def adjust(state: State, name: str, gates: Sequence[float], *, final: bool = Fal
         return adjustment.adjust(found, keypoints, state.solution, context, gates, final)
 
     key = [run.solving_key(), gates, final]
-    return state.with_solution(run.stage(name, key, compute, Solution))
+    solution = run.stage(name, key, compute, Solution)
+    event("map", name=name, observations=len(solution.landmarks.tracks))
+    return state.with_solution(solution)
 
 
 def align_gauge(state: State, name: str) -> State:

@@ -15,6 +15,7 @@ from gsba.bundle.readout import CameraEstimate
 from gsba.bundle.trajectory_prior import HeldPoses
 from gsba.config import RefineSettings
 from gsba.geometry import adjoint, inverse
+from gsba.localization.run_map import SAME_PLACE_RAD, SAME_PLACE_SIGMAS
 from gsba.log import GsbaError
 from gsba.loop_closure import connectivity, map_merging
 from gsba.loop_closure.map_similarity import (
@@ -24,7 +25,7 @@ from gsba.loop_closure.map_similarity import (
     similarity_covariance,
 )
 from gsba.loop_closure.merged_map import Registered, carried
-from gsba.photometric.alignment import Observations
+from gsba.photometric.alignment import AlignedObservations
 from gsba.pipeline import backend, camera, frontend, inputs, patch_rounds
 from gsba.pipeline.joint_map import JointMaps, joined_keypoints
 from gsba.pipeline.prior import Prior
@@ -46,9 +47,6 @@ from gsba.types import (
 
 logger = logging.getLogger(__name__)
 
-_SAME_PLACE_SIGMAS = 6.0  # largest angle between a feature and an observation of a point that is
-# taken for the feature's, standard deviations of the feature
-_SAME_PLACE_RAD = np.deg2rad(0.25)  # and largest such angle
 _MAX_SCALE_SIGMAS = 5.0  # by which two maps' units may contradict the distances of their lenses
 _MAX_SCALE_RATIO = 1.15  # and in any case
 _NOT_TIED = (
@@ -262,7 +260,7 @@ def _aligned(state: State, base: Sighted, features: Keypoints, parts: np.ndarray
     found = frontend.match_known_points_across(state.with_solution(known), parts, "across2")
     state = replace(state, matches=found.matches)
     start = replace(known, landmarks=state.triangulated(_crossing(state, parts), rays, gate))
-    seen = Observations(features, field=state.map.field)
+    seen = AlignedObservations(features, field=state.map.field)
     shared = patch_rounds.observe(state, start, seen, "align1")
     left, before, better = _without_same(base, shared, run.greys.width), state, None
     for n in range(1, rounds + 1):
@@ -396,7 +394,7 @@ def _by_features(state: State) -> Solution:
             continue
         gaps, near = KDTree(shown.bearings_rig[there]).query(seen.bearings_rig[own])
         gaps, near = np.asarray(gaps), np.asarray(near)
-        allowed = np.minimum(_SAME_PLACE_SIGMAS * shown.sigmas_rad[there][near], _SAME_PLACE_RAD)
+        allowed = np.minimum(SAME_PLACE_SIGMAS * shown.sigmas_rad[there][near], SAME_PLACE_RAD)
         order = np.argsort(gaps, kind="stable")
         _, first = np.unique(near[order], return_index=True)
         best = order[first]  # the nearest observation of each feature

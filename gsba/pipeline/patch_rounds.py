@@ -8,7 +8,7 @@ from gsba.bundle import adjustment, map_strength, stitching
 from gsba.bundle.reconstruction import MIN_OBSERVATIONS
 from gsba.bundle.stitching import Stitching
 from gsba.photometric import alignment
-from gsba.photometric.alignment import Observations
+from gsba.photometric.alignment import AlignedObservations
 from gsba.pipeline import camera, frontend
 from gsba.pipeline.state import State
 from gsba.types import Keypoints, Sighted, Solution
@@ -83,7 +83,7 @@ def _adjust_under_lenses(state: State, sighted: Sighted, number: int) -> State |
     return state
 
 
-def observe(state: State, start: Solution, observed: Observations, name: str) -> Sighted:
+def observe(state: State, start: Solution, observed: AlignedObservations, name: str) -> Sighted:
     """Points of a solution observed anew, by aligned patches."""
     run, settings = state.run, state.run.settings.patches
 
@@ -94,10 +94,10 @@ def observe(state: State, start: Solution, observed: Observations, name: str) ->
     return run.stage(name, settings.model_dump(exclude={"rounds"}), compute, Sighted)
 
 
-def observations(state: State) -> Observations:
+def observations(state: State) -> AlignedObservations:
     """Observations of the map's points."""
     map_, folder = state.map, state.run.store.scratch_folder
-    return Observations(map_.observed, map_.aligned, map_.normals_rig, map_.field, folder)
+    return AlignedObservations(map_.observed, map_.aligned, map_.normals_rig, map_.field, folder)
 
 
 def adjust_aligned(

@@ -29,7 +29,7 @@ _TOLERANCE_S = 0.01  # largest time between poses of two runs that correspond
 
 
 @dataclass(frozen=True, slots=True)
-class Shown:
+class PlottedRun:
     """Run, or trajectory file, for figures."""
 
     name: str
@@ -43,7 +43,7 @@ class Shown:
     before: str = "before"  # name of `coarse` in legends: what the run started from
 
 
-def load(paths: Sequence[Path], truth: Trajectory | None = None) -> tuple[Shown, ...]:
+def load(paths: Sequence[Path], truth: Trajectory | None = None) -> tuple[PlottedRun, ...]:
     """Read runs, and align them to the truth, or without a truth to the first run.
 
     Args:
@@ -60,14 +60,14 @@ def load(paths: Sequence[Path], truth: Trajectory | None = None) -> tuple[Shown,
     return tuple(_with_errors(one, truth) for one in found)
 
 
-def _read(name: str, path: Path) -> Shown:
+def _read(name: str, path: Path) -> PlottedRun:
     if not path.is_dir():
-        return Shown(name, read_trajectory(path))
+        return PlottedRun(name, read_trajectory(path))
     reconstruction, frames = load_run(path)
     coarse, start = path / "coarse.tum", ""
     with suppress(OSError, ValueError, KeyError):  # of an older run
         start = f" ({json.loads((path / 'report.json').read_text(encoding='utf-8'))['start']})"
-    return Shown(
+    return PlottedRun(
         name,
         Trajectory(frames.timestamps, reconstruction.world_T_rigs),
         read_trajectory(coarse) if coarse.is_file() else None,
@@ -77,7 +77,7 @@ def _read(name: str, path: Path) -> Shown:
     )
 
 
-def _with_errors(shown: Shown, truth: Trajectory) -> Shown:
+def _with_errors(shown: PlottedRun, truth: Trajectory) -> PlottedRun:
     """Run with its errors, and those of its coarse trajectory if they can be computed."""
     try:
         errors = pose_errors(shown.refined, truth)
@@ -90,7 +90,7 @@ def _with_errors(shown: Shown, truth: Trajectory) -> Shown:
     return replace(shown, errors=errors, coarse_errors=before, placed=errors.fit)
 
 
-def _aligned_to(shown: Shown, first: Shown) -> Sim3 | None:
+def _aligned_to(shown: PlottedRun, first: PlottedRun) -> Sim3 | None:
     """Similarity from a run to the first one; None = they are of different walks."""
     rows, others = matched_in_time(shown.refined, first.refined, _TOLERANCE_S)
     if len(rows) < 3:
@@ -119,7 +119,7 @@ _MAX_PANELS_PER_ROW = 3
 Fill = Callable[["SubFigure | Figure"], None]
 
 
-def draw(shown: Sequence[Shown], out: Path, truth: Trajectory | None = None) -> list[Path]:
+def draw(shown: Sequence[PlottedRun], out: Path, truth: Trajectory | None = None) -> list[Path]:
     """Write the figures of several runs.
 
     They show trajectories from above, each run in a panel; with the truth, errors of every pose
@@ -168,7 +168,7 @@ def draw(shown: Sequence[Shown], out: Path, truth: Trajectory | None = None) -> 
 
 
 def _trajectories(
-    figure: "SubFigure | Figure", shown: Sequence[Shown], truth: Trajectory | None
+    figure: "SubFigure | Figure", shown: Sequence[PlottedRun], truth: Trajectory | None
 ) -> None:
     """Draw trajectories from above, before and after; the truth is dotted."""
     beside = min(len(shown), _MAX_PANELS_PER_ROW)
@@ -212,7 +212,7 @@ class _TopView:
         return axes.plot(across, up, color=color, linestyle=style)[0]
 
 
-def _errors(figure: "SubFigure | Figure", shown: Sequence[Shown]) -> None:
+def _errors(figure: "SubFigure | Figure", shown: Sequence[PlottedRun]) -> None:
     """Draw errors of positions (above) and rotations (below), over time and as distributions."""
     panels = figure.subplots(2, 2)
     lines: dict[str, Any] = {}
@@ -235,7 +235,7 @@ def _errors(figure: "SubFigure | Figure", shown: Sequence[Shown]) -> None:
     figure.legend(lines.values(), lines.keys(), loc="outside lower center", ncols=4)
 
 
-def _residuals(figure: "SubFigure | Figure", shown: Sequence[Shown]) -> None:
+def _residuals(figure: "SubFigure | Figure", shown: Sequence[PlottedRun]) -> None:
     """Draw angular residuals: the median of every frame over time, and the distribution of all."""
     left, right = figure.subplots(1, 2)
     lines: dict[str, Any] = {}

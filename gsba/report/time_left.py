@@ -185,14 +185,13 @@ class TimeLeft:
             self._more = bool(entry.get("more"))
         elif kind == "keyframe":
             self._keyframes += 1
+        elif kind == "map" and _ADJUSTED.fullmatch(str(entry.get("name"))):
+            self._observations = 1e-3 * float(entry["observations"])
         elif kind == "stage":
             self._stage, self._work = str(entry.get("name")), None
             self._enter(self._stage, now)
         elif kind == "done":
             self._stage, self._work = "", None
-            adjusted = _ADJUSTED.fullmatch(str(entry.get("name")).partition("@")[0])
-            if adjusted and entry.get("observations"):
-                self._observations = 1e-3 * float(entry["observations"])
             if entry.get("resumed"):
                 self._enter(str(entry.get("name")), now)
                 self._whole = False

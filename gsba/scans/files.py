@@ -13,7 +13,7 @@ from gsba.frames.times import read_lines
 from gsba.geometry import local_origin
 from gsba.log import GsbaError, brief
 from gsba.scans.trial import limited, try_in_process
-from gsba.scans.types import NEIGHBOURS, Scan
+from gsba.scans.types import NEIGHBOURS, POINTS_AT_ONCE, Scan
 
 logger = logging.getLogger(__name__)
 
@@ -23,7 +23,6 @@ _MAX_POINTS = 400_000  # of a thinned scan
 _MAX_COORDINATE = 1e9  # in a scan's file
 _MIN_POINTS = 1000
 _MIN_PAIRS = 3
-_POINTS_AT_ONCE = 50_000
 _NUM_MESH_SAMPLES = 1_000_000  # points sampled on a mesh, before it is thinned
 _MIN_FLAT_SHARE = 0.1  # of points that are on planes: this quantile of the scatter is noise
 _MAX_SCATTER_RATIO = 3.5  # of a point's scatter to that noise, if its neighbours share a plane
@@ -322,8 +321,8 @@ def on_planes(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     tree = KDTree(points)
     neighbours = min(NEIGHBOURS, len(points))
     normals, offsets, scatters = [], [], []
-    for start in range(0, len(points), _POINTS_AT_ONCE):
-        some = points[start : start + _POINTS_AT_ONCE]
+    for start in range(0, len(points), POINTS_AT_ONCE):
+        some = points[start : start + POINTS_AT_ONCE]
         around = points[tree.query(some, neighbours)[1]]
         middles = around.mean(axis=1)
         around = around - middles[:, None]

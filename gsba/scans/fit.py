@@ -6,13 +6,13 @@ from typing import NamedTuple
 import numpy as np
 
 from gsba.scans.types import Cloud, Scan
+from gsba.significance import MEDIAN_ABS_NORMAL
 from gsba.similarity import Sim3
 from gsba.types.records import with_rows
 
 _MIN_STEP = 1e-6  # part of the cloud's size; a smaller step ends a round
 _FEW_STEPS, _MAX_STEPS = 3, 6  # Gauss-Newton steps at one width, at first and at the end
 _CELLS_PER_SIZE = (8, 4, 2, 1)  # cell edges, as divisors of the cloud's size, for the covariance
-_MEDIAN_ABS_NORMAL = 0.6745  # median of |x|, x unit normal
 LEAST_SIGMA = 0.1  # smallest sigma, part of the scan's spacing
 _MAX_NEAR_DISTANCE = 0.02  # of a point to a near surface, part of the cloud's size
 _MAX_LOG_CHANGE = 20.0  # of log parameters from their start: beyond, likelihoods are constant
@@ -166,7 +166,7 @@ def scatter(fit: Sim3, cloud: Cloud, scan: Scan, width: float) -> float:
     _, nearest, off, gaps = residuals_of(fit, cloud, scan, 3 * width + scan.reach)
     near = (np.abs(off) < 3 * width) & (gaps < 3 * width + scan.reaches[nearest])
     near &= Noise(0.0).variances(fit, cloud, scan, nearest) < width**2
-    return float(np.median(np.abs(off[near])) / _MEDIAN_ABS_NORMAL) if near.sum() > 20 else width
+    return float(np.median(np.abs(off[near])) / MEDIAN_ABS_NORMAL) if near.sum() > 20 else width
 
 
 class _Weighted(NamedTuple):

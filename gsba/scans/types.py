@@ -14,7 +14,7 @@ from gsba.types.records import with_rows
 
 NEIGHBOURS = 24  # of a scan's point, through which its plane is fitted
 MIN_POINTS = 300  # of a cloud that can be registered
-_POINTS_AT_ONCE = 50_000
+POINTS_AT_ONCE = 50_000
 _MAX_POINT_SIGMA = 0.02  # of a used point, part of the cloud's size
 _NUM_BINS = 30  # of a histogram
 
@@ -38,7 +38,7 @@ class Scan:
     @cached_property
     def reaches(self) -> np.ndarray:
         """Radius (M,) of the plane around each point: the distance of its furthest neighbour."""
-        parts = np.array_split(self.points, -(-len(self.points) // _POINTS_AT_ONCE))
+        parts = np.array_split(self.points, -(-len(self.points) // POINTS_AT_ONCE))
         some = min(NEIGHBOURS, len(self.points))
         return np.concatenate([self.tree.query(part, some)[0][:, -1] for part in parts])
 

@@ -12,7 +12,7 @@ BETA1, BETA2, EPS = 0.9, 0.999, 1e-15
 
 
 @dataclass(frozen=True, slots=True)
-class Rates:
+class LearningRates:
     """Learning rates of a step."""
 
     means: float  # map units
@@ -54,7 +54,7 @@ class Moments:
 
 
 def step(
-    gaussians: Gaussians, gradients: Gaussians, moments: Moments, rates: Rates, count: int
+    gaussians: Gaussians, gradients: Gaussians, moments: Moments, rates: LearningRates, count: int
 ) -> None:
     """Move all parameters in place by one step, the count-th from 1; moments change, too."""
     correction1, correction2 = 1 - BETA1**count, np.sqrt(1 - BETA2**count)

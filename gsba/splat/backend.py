@@ -25,7 +25,7 @@ class Lesson:
     truth: np.ndarray  # (H, W, 3) uint8, RGB
     use: np.ndarray | None  # (H, W) bool, pixels of the loss; None = all
     sh_degree: int  # highest degree of the harmonics
-    rates: adam.Rates
+    rates: adam.LearningRates
     number: int  # of the step, from 1
 
 

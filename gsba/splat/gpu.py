@@ -16,7 +16,7 @@ from gsba.log import GsbaError
 from gsba.memory import total_memory_bytes
 from gsba.splat import metrics
 from gsba.splat._project import DILATION
-from gsba.splat.adam import BETA1, BETA2, EPS, Moments, Rates
+from gsba.splat.adam import BETA1, BETA2, EPS, LearningRates, Moments
 from gsba.splat.camera import FaceCamera
 from gsba.splat.density import Pull
 from gsba.splat.gaussians import Gaussians
@@ -182,7 +182,12 @@ class GsplatBackend:
         return image
 
     def _move(
-        self, values: list[Any], first: list[Any], second: list[Any], rates: Rates, number: int
+        self,
+        values: list[Any],
+        first: list[Any],
+        second: list[Any],
+        rates: LearningRates,
+        number: int,
     ) -> None:
         """`gsba.splat.adam.step` on the device."""
         correction1, correction2 = 1 - BETA1**number, (1 - BETA2**number) ** 0.5

@@ -278,7 +278,7 @@ class Trainer:
             views.images[view],
             None if views.use is None else views.use[view],
             min((number - 1) // self.times.degree_every, self.settings.sh_degree),
-            adam.Rates(
+            adam.LearningRates(
                 means=means * self.extent,
                 log_scales=fade * settings.rate_scales,
                 quaternions=fade * _RATE_ROTATIONS,

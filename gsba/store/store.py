@@ -43,7 +43,6 @@ from gsba.store.records import (
     typed,
 )
 from gsba.store.shards import Spent, StoredRecords, Threads, Workers, even_blocks
-from gsba.types import Solution
 from gsba.version import __version__
 
 logger = logging.getLogger(__name__)
@@ -283,7 +282,7 @@ class RunStore:
             self._tell_resumed()
         logger.log(level, "%s: %s %.1f s, %.0f MB", shown, how, record.seconds, record.peak_mb)
         cost = {"seconds": round(record.seconds, 3), "resumed": record.resumed}
-        event("done", name=name, title=title, **cost, **_counts(value))
+        event("done", name=name, title=title, **cost)
 
     def _tell_resumed(self) -> None:
         """Log in a line how many stages were resumed since the last such line."""
@@ -456,14 +455,6 @@ def _jsonable(value: object) -> object:
     if isinstance(value, Path):
         return str(value)
     raise TypeError(f"a {type(value).__name__} cannot be part of a stage's key")
-
-
-def _counts(value: object) -> dict[str, int]:
-    """Number of observations of a stage's map; {} = its result is no map."""
-    map_ = value[0] if isinstance(value, tuple) and value else value
-    if not isinstance(map_, Solution):
-        return {}
-    return {"observations": len(map_.landmarks.tracks.points)}
 
 
 @contextmanager

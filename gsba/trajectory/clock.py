@@ -15,9 +15,9 @@ MIN_STEPS = 5  # least number of steps that determine a clock
 _MAX_SIGMA_INTERVALS, _MAX_SIGMA_S = 0.25, 0.05  # largest standard deviation of a known clock: in
 # frame intervals, and in seconds
 _SIGNIFICANT_SIGMAS = 2.5  # standard deviations from 1 of a significant rate
-_TURNING_SIGMAS, _AGREEING_SIGMAS = 4.0, 3.0  # standard deviations: least rotation of a turn;
+TURNING_SIGMAS, AGREEING_SIGMAS = 4.0, 3.0  # standard deviations: least rotation of a turn;
 # largest residual of agreement
-_MIN_TURNS = 4  # least number of steps that turn
+MIN_TURNS = 4  # least number of steps that turn
 _MIN_EXPLAINED = 0.4  # least share of the turns that the right clock explains
 _SURE_EXPLAINED = 0.6  # share of the turns from which no other clocks are searched
 _MAX_NOISE_RAD = np.deg2rad(2.0)  # largest noise of a trajectory's steps per axis: by three
@@ -98,7 +98,7 @@ def estimate_clock(
     before, after = (_explained(fit, p, best) for p in (start, best))
     same = fit.apart(best, start) < _SIGNIFICANT_SIGMAS * certain or after < before + _MIN_GAIN
     verdict, note = "unclear", ""
-    if _turning(fit, best).sum() < _MIN_TURNS or certain > max(
+    if _turning(fit, best).sum() < MIN_TURNS or certain > max(
         _MAX_SIGMA_INTERVALS * interval, _MAX_SIGMA_S
     ):
         note = f"the camera turns too little to check the clock (uncertain by {certain:.2g} s)"
@@ -157,7 +157,7 @@ def other_rate(
     after = [np.linalg.norm(residuals, axis=1) for residuals in (before, fit.residuals(best))]
     nearer = np.count_nonzero(after[1] < after[0])
     contradicted = (
-        _turning(fit, best).sum() >= _MIN_TURNS
+        _turning(fit, best).sum() >= MIN_TURNS
         and _explained(fit, best, best) >= _SURE_EXPLAINED
         and noise(fit.residuals(best)) < _MAX_NOISE_RATIO * noise(before)
         and outweighs(int(nearer), len(turns) - int(nearer), 1e-3)
@@ -168,14 +168,14 @@ def other_rate(
 def _turning(fit: ClockFit, best: np.ndarray) -> np.ndarray:
     """Steps (N,) whose rotation exceeds the noise."""
     sigma = noise(fit.residuals(best))
-    return np.linalg.norm(fit.turns.rotvecs, axis=1) > _TURNING_SIGMAS * sigma
+    return np.linalg.norm(fit.turns.rotvecs, axis=1) > TURNING_SIGMAS * sigma
 
 
 def _explained(fit: ClockFit, parameters: np.ndarray, best: np.ndarray) -> float:
     """Share of the turns that the trajectory explains under a clock."""
     turning, sigma = _turning(fit, best), noise(fit.residuals(best))
     off = np.linalg.norm(fit.residuals(parameters), axis=1)
-    return float(np.mean(off[turning] < _AGREEING_SIGMAS * sigma)) if turning.any() else 0.0
+    return float(np.mean(off[turning] < AGREEING_SIGMAS * sigma)) if turning.any() else 0.0
 
 
 def simplest(fit: ClockFit, best: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

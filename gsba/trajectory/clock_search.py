@@ -15,7 +15,7 @@ _RATE_SIGMA = 0.02  # prior standard deviation of the rate
 _NUM_CANDIDATES = 5  # candidates taken from the grid
 _MAX_CLOCKS, _MAX_RATES = 60_000, 100  # largest number of clocks on the grid, and of rates among
 # them
-_LOSS_WIDTH_SIGMAS = 2.0  # width of the loss, standard deviations
+LOSS_WIDTH_SIGMAS = 2.0  # width of the loss, standard deviations
 _MIN_SIGMA_RAD = np.deg2rad(0.03)  # least noise of a rotation per axis: images are no more accurate
 _MIN_GRID_SIGMA_RAD = np.deg2rad(1.0)  # least noise of a rotation on the grid
 _NOISE_QUANTILE, _UNIT_NOISE_QUANTILE = 0.4, 1.367  # quantile from which noise is estimated; its
@@ -120,7 +120,7 @@ class ClockFit:
         sigma, damping = widening * noise(residuals), 1e-3
         for _ in range(20):
             jacobian, prior = self._jacobian(parameters)[..., :free], self._prior(free)
-            weights = 1 / (1 + np.sum(residuals**2, axis=1) / (_LOSS_WIDTH_SIGMAS * sigma) ** 2)
+            weights = 1 / (1 + np.sum(residuals**2, axis=1) / (LOSS_WIDTH_SIGMAS * sigma) ** 2)
             normal = np.einsum("n,nij,nik->jk", weights, jacobian, jacobian)
             slope = np.einsum("n,nij,ni->j", weights, jacobian, residuals)
             slope[1:] += prior[1:, 1:] @ (parameters[1:free] - 1) * sigma**2
@@ -151,7 +151,7 @@ class ClockFit:
         residuals, free = self.residuals(parameters), 1 + with_rate
         sigma = noise(residuals)
         jacobian = self._jacobian(parameters)[..., :free]
-        weights = 1 / (1 + np.sum(residuals**2, axis=1) / (_LOSS_WIDTH_SIGMAS * sigma) ** 2)
+        weights = 1 / (1 + np.sum(residuals**2, axis=1) / (LOSS_WIDTH_SIGMAS * sigma) ** 2)
         normal = np.einsum("n,nij,nik->jk", weights, jacobian, jacobian)
         normal += self._prior(free) * sigma**2 + 1e-15 * np.eye(free)
         pulls = np.einsum("n,nij,ni->nj", weights, jacobian, residuals)
@@ -189,7 +189,7 @@ class ClockFit:
         tried = parameters + np.column_stack([shifts, np.zeros(_NUM_SHIFTS)])
         residuals = self.residuals(tried)
         sigma = min(map(noise, residuals))
-        losses = [_LOSS_WIDTH_SIGMAS**2 * len(r) * _bounded(r, sigma) for r in residuals]
+        losses = [LOSS_WIDTH_SIGMAS**2 * len(r) * _bounded(r, sigma) for r in residuals]
         return shifts, np.array(losses), sigma
 
     def time_sigma(self, covariance: np.ndarray) -> float:
@@ -258,8 +258,8 @@ class ClockFit:
         return np.diag([0, _RATE_SIGMA**-2])[:free, :free]
 
     def _total(self, residuals: np.ndarray, parameters: np.ndarray, sigma: float) -> float:
-        squares = np.sum(residuals**2, axis=1) / (_LOSS_WIDTH_SIGMAS * sigma) ** 2
-        return float(_LOSS_WIDTH_SIGMAS**2 * np.log1p(squares).sum()) + float(
+        squares = np.sum(residuals**2, axis=1) / (LOSS_WIDTH_SIGMAS * sigma) ** 2
+        return float(LOSS_WIDTH_SIGMAS**2 * np.log1p(squares).sum()) + float(
             (parameters[1] - 1) ** 2 / _RATE_SIGMA**2
         )
 
@@ -267,7 +267,7 @@ class ClockFit:
 def _bounded(residuals: np.ndarray, sigma: float) -> float:
     """Mean of r^2 / (r^2 + width^2) over rotations (N, 3)."""
     squares = np.sum(residuals**2, axis=1)
-    return float(np.mean(squares / (squares + (_LOSS_WIDTH_SIGMAS * sigma) ** 2)))
+    return float(np.mean(squares / (squares + (LOSS_WIDTH_SIGMAS * sigma) ** 2)))
 
 
 def noise(residuals: np.ndarray, least: float = _MIN_SIGMA_RAD) -> float:

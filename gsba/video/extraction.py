@@ -39,8 +39,8 @@ from gsba.video.recording import (
     EXACT_S,
     LENSES,
     TRACKS,
-    Picture,
-    Recording,
+    VideoPicture,
+    VideoRecording,
     check_lengths,
     factory_calibration_of,
     files_of,
@@ -129,7 +129,7 @@ def extract(video: Path, out: Path, settings: VideoSettings, replace: bool = Fal
     return counts
 
 
-def refuse_darkness(video: Path, recording: Recording, instants: Sequence[int]) -> None:
+def refuse_darkness(video: Path, recording: VideoRecording, instants: Sequence[int]) -> None:
     """Refuse a video whose middle, first and last frames, of ascending instants that are `shown`,
     are black. GsbaError: all of these frames that can be decoded are."""
     level = -1
@@ -146,7 +146,7 @@ def refuse_darkness(video: Path, recording: Recording, instants: Sequence[int]) 
 
 
 def _windows(
-    video: Path, recording: Recording, settings: VideoSettings
+    video: Path, recording: VideoRecording, settings: VideoSettings
 ) -> tuple[list[np.ndarray], int]:
     """Groups of frame indices, of which one each is kept; and the number of frames in the range."""
     times = recording.times
@@ -187,7 +187,7 @@ def _nearest_to(path: Path, times: np.ndarray, inside: np.ndarray) -> list[np.nd
     return [np.array([index]) for index in np.unique(nearest[met])]
 
 
-def _check_end(video: Path, recording: Recording, to_s: float | None) -> None:
+def _check_end(video: Path, recording: VideoRecording, to_s: float | None) -> None:
     last = float(recording.times[recording.shown][-1])
     if to_s is not None and to_s <= last + EXACT_S:
         return
@@ -201,7 +201,7 @@ def _check_end(video: Path, recording: Recording, to_s: float | None) -> None:
 
 
 def _extract(
-    recording: Recording,
+    recording: VideoRecording,
     windows: list[np.ndarray],
     out: Path,
     settings: VideoSettings,
@@ -233,19 +233,21 @@ def _extract(
 
 
 def _best_of_each(
-    frames: Iterable[tuple[int, tuple[Picture, ...]]], windows: list[np.ndarray], sharpest: bool
-) -> Iterator[tuple[int, tuple[Picture, ...]]]:
+    frames: Iterable[tuple[int, tuple[VideoPicture, ...]]],
+    windows: list[np.ndarray],
+    sharpest: bool,
+) -> Iterator[tuple[int, tuple[VideoPicture, ...]]]:
     """Yield the sharpest, or only, decoded frame of each window, by the mean over its images."""
     window_of = {int(index): w for w, window in enumerate(windows) for index in window}
     for _, group in groupby(frames, key=lambda item: window_of[item[0]]):
         yield max(group, key=lambda item: _sharpness(item[1]) if sharpest else 0.0)
 
 
-def _sharpness(pictures: tuple[Picture, ...]) -> float:
+def _sharpness(pictures: tuple[VideoPicture, ...]) -> float:
     return sum(sharpness(picture.luma()) for picture in pictures) / len(pictures)
 
 
-def _small(pictures: tuple[Picture, ...], cube: bool) -> np.ndarray:
+def _small(pictures: tuple[VideoPicture, ...], cube: bool) -> np.ndarray:
     """Miniature of a panorama, of two lenses side by side, or of two tracks one below the other.
 
     All have about the same angular width.
@@ -253,12 +255,12 @@ def _small(pictures: tuple[Picture, ...], cube: bool) -> np.ndarray:
     return miniature(np.concatenate([p.luma() for p in pictures], axis=0 if cube else 1))
 
 
-def _motion_deg(before: np.ndarray, after: np.ndarray, recording: Recording) -> float:
+def _motion_deg(before: np.ndarray, after: np.ndarray, recording: VideoRecording) -> float:
     used = lens_interior(after.shape[0]) if recording.lenses else None
     return apparent_motion_deg(before, after, used)
 
 
-def _encoded(picture: Picture, width: int | None) -> bytes:
+def _encoded(picture: VideoPicture, width: int | None) -> bytes:
     """JPEG of a decoded image, scaled to `width` if given."""
     import cv2
 

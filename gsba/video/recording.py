@@ -55,7 +55,7 @@ _STITCH = "stitch it in the camera's app and export an equirectangular (2:1) vid
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
+class VideoPicture:
     """Panorama, or image of one lens; converted on access."""
 
     frame: Any  # av.VideoFrame
@@ -81,7 +81,7 @@ class Picture:
 
 
 @dataclass(frozen=True, slots=True)
-class Recording:
+class VideoRecording:
     """One or two videos as instants, with numbers and times of the first track's frames."""
 
     tracks: tuple[Track, ...]  # (1), or (2) of front and back lens
@@ -122,7 +122,7 @@ def files_of(video: Path) -> tuple[Path, ...]:
     return pair if len(sizes) == 1 and _is_nearly_square(sizes[0]) else (video,)
 
 
-def read_recording(video: Path) -> Recording:
+def read_recording(video: Path) -> VideoRecording:
     """Recognise the layout of a video and read its times. GsbaError: the file is no video, holds
     neither panoramas nor a cube map nor two lenses, or its lenses or tracks do not match."""
     files = files_of(video)
@@ -155,13 +155,15 @@ def read_recording(video: Path) -> Recording:
     return _of_one_track(Track(video), size)
 
 
-def factory_calibration_of(recording: Recording) -> FactoryCalibration | None:
+def factory_calibration_of(recording: VideoRecording) -> FactoryCalibration | None:
     """Maker's calibration in the files of a raw recording; None = there is none."""
     files = [track.path for track in recording.tracks]
     return factory_calibration(files, two_tracks=len(files) == 2 and files[0] == files[1])
 
 
-def shots(recording: Recording, chosen: Sequence[int]) -> Iterator[tuple[int, tuple[Picture, ...]]]:
+def shots(
+    recording: VideoRecording, chosen: Sequence[int]
+) -> Iterator[tuple[int, tuple[VideoPicture, ...]]]:
     """Yield (instant, its images) of chosen instants, ascending and `shown`; damaged ones are left
     out."""
     frames = decode(recording.tracks[0], recording.timelines[0], chosen)
@@ -169,7 +171,7 @@ def shots(recording: Recording, chosen: Sequence[int]) -> Iterator[tuple[int, tu
         for index, frame in frames:
             places = recording.places
             shape = recording.height, recording.orientation
-            yield index, tuple(Picture(frame, place, *shape) for place in places)
+            yield index, tuple(VideoPicture(frame, place, *shape) for place in places)
         return
     partners = recording.partners[list(chosen)].tolist()
     instants = dict(zip(partners, chosen, strict=True))
@@ -182,10 +184,10 @@ def shots(recording: Recording, chosen: Sequence[int]) -> Iterator[tuple[int, tu
             return
         if instants[other[0]] == index:
             pair = zip((frame, other[1]), recording.places, strict=True)
-            yield index, tuple(Picture(each, place) for each, place in pair)
+            yield index, tuple(VideoPicture(each, place) for each, place in pair)
 
 
-def check_lengths(recording: Recording) -> None:
+def check_lengths(recording: VideoRecording) -> None:
     """GsbaError where one lens, or track, of a recording is clearly shorter than the other."""
     lasting = [float(line.times[-1]) + line.interval_s for line in recording.timelines]
     if min(lasting) >= 0.9 * max(lasting):
@@ -264,7 +266,7 @@ def _check_panorama(video: Path, size: tuple[int, int]) -> None:
     )
 
 
-def _of_one_track(track: Track, size: tuple[int, int]) -> Recording:
+def _of_one_track(track: Track, size: tuple[int, int]) -> VideoRecording:
     """Recording of panoramas, or of two lenses side by side or one above the other."""
     claims, timeline = read_claims(track), read_timeline(track)
     left, top, right, bottom = claims.bounds
@@ -288,7 +290,7 @@ def _of_one_track(track: Track, size: tuple[int, int]) -> Recording:
         note = f"{track.path}: raw, two fisheyes one above the other, front above"
         places = tuple((slice(at, at + side), slice(None)) for at in (0, side))
         notes = (note, *_hdr_notes(track.path, claims))
-        return Recording((track,), (timeline,), places, side, *everything, notes)
+        return VideoRecording((track,), (timeline,), places, side, *everything, notes)
     found = recognise(looks[1], size, track.path)
     if found.lens_size is None and track.path.suffix.lower() == _RAW_SUFFIX and may_hold_two(size):
         note = f"{track.path}: raw, two fisheyes side by side, by its suffix"
@@ -315,7 +317,7 @@ def _of_one_track(track: Track, size: tuple[int, int]) -> Recording:
         notes = (*found.notes, *told)
         height = None if claims.pixel_aspect == 1 else shown[1]
         how = {"height": height, "orientation": claims.orientation}
-        return Recording((track,), (timeline,), places, shown[0], *everything, notes, **how)
+        return VideoRecording((track,), (timeline,), places, shown[0], *everything, notes, **how)
     width, height = size
     side, unsqueezed = width // 2, None
     rows = slice(found.top, found.top + side)
@@ -323,7 +325,9 @@ def _of_one_track(track: Track, size: tuple[int, int]) -> Recording:
         rows, unsqueezed = slice(None), side
     places = (rows, slice(side)), (rows, slice(side, None))
     notes = (*found.notes, *_hdr_notes(track.path, claims))
-    return Recording((track,), (timeline,), places, side, *everything, notes, height=unsqueezed)
+    return VideoRecording(
+        (track,), (timeline,), places, side, *everything, notes, height=unsqueezed
+    )
 
 
 def _refuse_stereo(video: Path, size: tuple[int, int], greys: Iterator[np.ndarray]) -> None:
@@ -343,7 +347,7 @@ def _hdr_notes(video: Path, claims: PictureClaims) -> list[str]:
 
 def _of_two_tracks(
     tracks: tuple[Track, Track], size: tuple[int, int], note: str, cube: bool = False
-) -> Recording:
+) -> VideoRecording:
     """Recording of two lenses, or of two tracks of a cube map, whose frames are paired by time."""
     one, other = TRACKS if cube else LENSES
     kind = "track" if cube else "lens"
@@ -370,7 +374,7 @@ def _of_two_tracks(
             f"{kind} has ({len(ours) - num} {one}, {len(theirs) - num} {other})"
         )
     places, lines = ((slice(None), slice(None)),) * 2, (front, back)
-    return Recording(tracks, lines, places, size[0], shown, nearest, tuple(notes), cube=cube)
+    return VideoRecording(tracks, lines, places, size[0], shown, nearest, tuple(notes), cube=cube)
 
 
 def _nearest(times: np.ndarray, wanted: np.ndarray) -> np.ndarray:

@@ -4,8 +4,8 @@ Takes the folder of a run.
 Gives a page on a local port, until it is stopped.
 """
 
-from gsba.view.display import View
-from gsba.view.scene import Scene, Splat, faces_of, load_scene
+from gsba.view.display import SceneView
+from gsba.view.scene import RunScene, Splat, faces_of, load_scene
 from gsba.view.server import serve
 
-__all__ = ["Scene", "Splat", "View", "faces_of", "load_scene", "serve"]
+__all__ = ["RunScene", "SceneView", "Splat", "faces_of", "load_scene", "serve"]

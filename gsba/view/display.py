@@ -12,7 +12,7 @@ from gsba.geometry import quaternion_from_rotation
 from gsba.log import GsbaError
 from gsba.report.report import frame_quality
 from gsba.types import PoseStatus
-from gsba.view.scene import Scene, faces_of, views_of
+from gsba.view.scene import RunScene, faces_of, views_of
 
 if TYPE_CHECKING:
     import viser  # pyright: ignore[reportMissingImports]
@@ -23,14 +23,14 @@ _RECORDINGS = (_AFTER, _BEFORE, _SEEN, (142, 79, 168), (160, 103, 47), (93, 125,
 _JPEG_QUALITY = 85
 
 
-class View:
+class SceneView:
     """View of a scene on a running server, with its nodes and controls.
 
     Nodes are in the scene's world times `scale`, so that steps are about 1 if the world is not
     metric: viewers have fixed near and far planes.
     """
 
-    def __init__(self, server: "viser.ViserServer", scene: Scene, address: str) -> None:
+    def __init__(self, server: "viser.ViserServer", scene: RunScene, address: str) -> None:
         self.server, self.scene, self.address = server, scene, address
         self.scale = 1.0 if scene.unit == "m" else 1.0 / scene.step
         self.size = self.scale * scene.step  # of a drawn rig

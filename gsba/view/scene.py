@@ -40,7 +40,7 @@ class Splat:
 
 
 @dataclass(frozen=True, slots=True)
-class Scene:
+class RunScene:
     """Run with its splats and its comparison to a scan, in one world."""
 
     name: str
@@ -58,7 +58,7 @@ class Scene:
     # by their distance to a scan; None = not compared
 
 
-def load_scene(run: Path) -> Scene:
+def load_scene(run: Path) -> RunScene:
     """Scene of a finished run's largest map.
 
     Its world is that of the run's last export with a placement (upright, in metres, by GPS or
@@ -76,7 +76,7 @@ def load_scene(run: Path) -> Scene:
     lenses = load_cameras(run, reconstruction, frames).scaled(placement.similarity.scale)
     steps = np.linalg.norm(np.diff(placed.world_T_rigs[:, :3, 3], axis=0), axis=1)
     moving = steps[steps > 1e-9 * (1 + steps.max(initial=0))]
-    return Scene(
+    return RunScene(
         name=run.resolve().name,
         frames=frames,
         reconstruction=placed,

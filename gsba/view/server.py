@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from gsba.log import GsbaError
-from gsba.view.display import View
-from gsba.view.scene import Scene
+from gsba.view.display import SceneView
+from gsba.view.scene import RunScene
 
 if TYPE_CHECKING:
     import viser  # pyright: ignore[reportMissingImports]
@@ -25,7 +25,7 @@ logger = logging.getLogger(__name__)
 HOST = "127.0.0.1"  # not reachable from other machines
 
 
-def serve(scene: Scene, port: int) -> View:
+def serve(scene: RunScene, port: int) -> SceneView:
     """Show a scene at an address of this machine until the view is stopped; returns at once.
 
     Only browsers that know `view.address` get answers: see `gsba.view.server`.
@@ -52,7 +52,7 @@ def serve(scene: Scene, port: int) -> View:
         with redirect_stdout(io.StringIO()):
             server.stop()
         raise GsbaError(_IN_USE.format(port=port))
-    return View(server, scene, f"http://{HOST}:{server.get_port()}/{token}/")
+    return SceneView(server, scene, f"http://{HOST}:{server.get_port()}/{token}/")
 
 
 _IN_USE = "port {port} of 127.0.0.1 is in use: pass another --port, or 0 for any free one"

@@ -14,7 +14,7 @@ import pytest
 from waiting import until
 
 from gsba.app import worker
-from gsba.app.jobs import Command, Job, Jobs, alive, alive_lock, ending
+from gsba.app.jobs import AppJob, Command, Jobs, alive, alive_lock, ending
 from gsba.app.progress import Followed, Progress, read_events
 from gsba.app.worker import work
 from gsba.log import EVENTS, GsbaError, track
@@ -47,7 +47,7 @@ def jobs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Jobs]:
     signal.signal(signal.SIGINT, before)
 
 
-def added(jobs: Jobs, *arguments: str) -> Job:
+def added(jobs: Jobs, *arguments: str) -> AppJob:
     return jobs.add(Command(arguments, str(jobs.root.parent), None))
 
 
@@ -57,15 +57,15 @@ def at_work(jobs: Jobs) -> threading.Thread:
     return thread
 
 
-def status(jobs: Jobs, job: Job) -> str:
+def status(jobs: Jobs, job: AppJob) -> str:
     return jobs.get(job.id).state.status
 
 
-def has_begun(jobs: Jobs, job: Job) -> bool:
+def has_begun(jobs: Jobs, job: AppJob) -> bool:
     return Followed(job.events).now().stage is not None
 
 
-def begun(jobs: Jobs, job: Job) -> threading.Thread:
+def begun(jobs: Jobs, job: AppJob) -> threading.Thread:
     """The worker's thread, once the job is in its first stage."""
     thread = at_work(jobs)
     until(lambda: has_begun(jobs, job), 120)

@@ -10,13 +10,13 @@ import pytest
 from export_scene import panoramas, reconstruction
 
 from gsba.export import ExportFormat, export
-from gsba.export.split import TRAIN_LIST, Split, add_images, split_of
+from gsba.export.split import TRAIN_LIST, DatasetSplit, add_images, split_of
 from gsba.frames.held_out import held_out_rows
 from gsba.log import GsbaError
 from gsba.types import PoseStatus, Reconstruction
 
 
-def _numbers(split: Split) -> tuple[np.ndarray, np.ndarray]:
+def _numbers(split: DatasetSplit) -> tuple[np.ndarray, np.ndarray]:
     """Frame of each image in order, and whether a reader holds it out."""
     images = sorted((n, f) for f, own in enumerate(split.numbers) for n in own if n >= 0)
     places, frames = np.array(images).T

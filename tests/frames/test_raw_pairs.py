@@ -15,7 +15,7 @@ from gsba.camera.calibration import calibration_json
 from gsba.camera.fisheye import Pair, rotation_of
 from gsba.frames.image_circles import ImageCircle
 from gsba.frames.pixels import load_erp
-from gsba.frames.scan import find_panoramas, scan
+from gsba.frames.scan import scan
 from gsba.frames.side_by_side import two_circles
 from gsba.log import GsbaError
 from gsba.types import FACES, Fisheye
@@ -448,11 +448,3 @@ def test_a_calibration_of_another_shape_or_size(tmp_path: Path, layout: str) -> 
     message = r"c\.json: calibrates pictures of 480x270, but these are 240x240: another aspect"
     with pytest.raises(GsbaError, match=message):
         scan(root, fps=1, calibration=tmp_path / "c.json")
-
-
-def test_panoramas_are_wanted_where_lenses_are_not(tmp_path: Path) -> None:
-    raw = _write_pairs(tmp_path / "raw", "beside", _nominal())
-    with pytest.raises(GsbaError, match=r"raw fisheyes side by side; give a folder of"):
-        find_panoramas(raw)
-    with pytest.raises(GsbaError, match=r"holds no panoramas"):
-        find_panoramas(_write_pairs(tmp_path / "folders", "front"))

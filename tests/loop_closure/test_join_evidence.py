@@ -9,7 +9,7 @@ from two_maps import HALF, NUM, TRUTH, scene
 
 from gsba.geometry import pose
 from gsba.loop_closure import join_evidence
-from gsba.loop_closure.join_evidence import JoinEvidence, Places, Rates, around
+from gsba.loop_closure.join_evidence import FindingRates, JoinEvidence, Places, around
 from gsba.loop_closure.join_test import JoinTest
 from gsba.loop_closure.map_similarity import Proposal
 from gsba.matching.guided_search import MatchContext
@@ -80,7 +80,7 @@ def test_corners_and_what_covers_walls_must_both_be_found_again(
     tenths = np.where(np.arange(len(cells)) < 4000, corners, textures)
     off = np.where(np.arange(len(cells)) % 10 < tenths, 0.0, np.nan)
     seen = join_evidence.Predictions(cells + 0.5, np.zeros(len(cells), np.int64), off)
-    usual = join_evidence.Rates(np.full(24, 0.4), 0.1, np.full(24, 0.4))
+    usual = join_evidence.FindingRates(np.full(24, 0.4), 0.1, np.full(24, 0.4))
     assert join_evidence.evidence_of(seen, usual, depth).confirmed == confirmed
 
 
@@ -91,7 +91,7 @@ def _of_cells(off: np.ndarray) -> JoinEvidence:
     """Evidence of a point in each of `CELLS`, found `off` radians from its place or not at all;
     within parts, 4 of 10 are found."""
     seen = join_evidence.Predictions(CELLS + 0.5, np.zeros(len(CELLS), np.int64), off)
-    usual = join_evidence.Rates(np.full(24, 0.4), 0.0, np.full(24, 0.4))
+    usual = join_evidence.FindingRates(np.full(24, 0.4), 0.0, np.full(24, 0.4))
     return join_evidence.evidence_of(seen, usual, 4.0)
 
 
@@ -128,7 +128,7 @@ def test_points_are_expected_as_often_as_the_recordings_that_meet_find_them() ->
     known = [points[f] for f in range(NUM)]
     measured = []
 
-    def rates(chosen: np.ndarray) -> Rates:
+    def rates(chosen: np.ndarray) -> FindingRates:
         measured.append(np.unique(owners[chosen]).tolist())
         return join_evidence.rates(context, Places(TRUTH, known), owners, chosen=chosen)
 

@@ -17,7 +17,7 @@ from two_fisheyes import colours, made_pair, picture, write
 from gsba import refine
 from gsba.camera.sphere import bearings_from_erp, erp_from_bearings
 from gsba.disk import write_image
-from gsba.frames.scan import find_panoramas
+from gsba.frames.scan import scan
 from gsba.log import GsbaError
 from gsba.masks.carrier import carrier_mask, find_carrier, write_carrier
 from gsba.masks.merging import choose
@@ -70,7 +70,7 @@ def _walk(folder: Path, look: np.ndarray | None, plain_floor: bool = False, spee
             image[mask] = look[mask]
         image = image * (1 + 0.06 * np.sin(1.7 * f)) + rng.normal(0, 2, image.shape)
         write_image(folder / f"{f:03d}.png", np.clip(image, 0, 255).astype(np.uint8))
-    return find_panoramas(folder)
+    return scan(folder, order_suffices=True)
 
 
 def _looks() -> dict[str, np.ndarray]:
@@ -120,7 +120,7 @@ def test_a_carrier_that_turns_below_the_picture_is_found(tmp_path: Path, look: s
         assert _overlap(found[f], np.roll(mask, turn, axis=1)) >= 0.9
     written = write_carrier(carrier, frames, tmp_path / "m")
     assert len(written) == 2 + len(frames)
-    merged = find_panoramas(tmp_path / "frames", tmp_path / "m/merged")
+    merged = scan(tmp_path / "frames", masks=tmp_path / "m/merged", order_suffices=True)
     last = cv2.imread(str(merged.mask_paths[-1]), cv2.IMREAD_UNCHANGED)
     np.testing.assert_array_equal(last == 0, found[-1])
 
@@ -142,7 +142,7 @@ def _noise_frames(folder: Path, mask: np.ndarray, look: np.ndarray, num: int = 1
         image = np.clip(128 + 45 * world / world.std(), 0, 255)
         image[mask] = look[mask] + rng.normal(0, 2, look[mask].shape)
         write_image(folder / f"{f:03d}.png", np.clip(image, 0, 255).astype(np.uint8))
-    return find_panoramas(folder)
+    return scan(folder, order_suffices=True)
 
 
 @pytest.mark.parametrize("look", ["dark", "coloured"])
@@ -212,7 +212,7 @@ def test_command_writes_what_can_be_looked_at(tmp_path: Path) -> None:
     found = cv2.imread(str(tmp_path / "m/carrier.png"), cv2.IMREAD_UNCHANGED)
     assert set(np.unique(found)) == {0, 255} and _overlap(found == 0, _outline()) >= 0.9
     assert cv2.imread(str(tmp_path / "m/carrier_check.jpg")).shape == (HEIGHT, WIDTH, 3)
-    merged = find_panoramas(frames.paths[0][0].parent, tmp_path / "m/merged")
+    merged = scan(frames.paths[0][0].parent, masks=tmp_path / "m/merged", order_suffices=True)
     both = cv2.imread(str(merged.mask_paths[3]), cv2.IMREAD_UNCHANGED)
     np.testing.assert_array_equal(both > 0, (found > 0) & (own > 0))
     bad = run_gsba("mask", tmp_path / "nowhere", "--out", tmp_path / "n")
@@ -295,5 +295,5 @@ def test_a_camera_that_turns_is_no_carrier_that_turns(tmp_path: Path) -> None:
         turned[90:140, 200:360] += 5 * near[90:140, 200:360]
         noisy = np.clip(turned + rng.normal(0, 2, turned.shape), 0, 255).astype(np.uint8)
         write_image(tmp_path / f"turn/{f:03d}.png", noisy)
-    carrier = find_carrier(find_panoramas(tmp_path / "turn"))
+    carrier = find_carrier(scan(tmp_path / "turn", order_suffices=True))
     assert carrier.mask.all() and not carrier.turns.any()

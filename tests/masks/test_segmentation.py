@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from gsba.frames.masks import load_mask
-from gsba.frames.scan import find_panoramas
+from gsba.frames.scan import scan
 from gsba.log import GsbaError
 from gsba.masks.merging import before, choose
 from gsba.masks.segmentation import Segment, load_segmented, segmented
@@ -29,7 +29,7 @@ def frames(tmp_path: Path) -> FrameSet:
         image = rng.integers(60, 200, (WIDTH // 2, WIDTH, 3), dtype=np.uint8)
         image[:, : WIDTH // 4] = 0  # half of the back face and of the left one
         cv2.imwrite(str(folder / f"f{f}.png"), image)
-    return find_panoramas(folder)
+    return scan(folder, order_suffices=True)
 
 
 def _python(tmp_path: Path, code: str) -> str:

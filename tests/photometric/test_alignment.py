@@ -19,7 +19,7 @@ from gsba.config import RefineSettings
 from gsba.frames.panorama import Greys
 from gsba.geometry import inverse, pose
 from gsba.photometric import alignment, frame_jobs, packing
-from gsba.photometric.alignment import Observations
+from gsba.photometric.alignment import AlignedObservations
 from gsba.store.shards import Threads
 from gsba.types import (
     Counts,
@@ -127,7 +127,7 @@ def _run(
     frames, world_T_rigs = walk
     landmarks, keypoints = _start(world_T_rigs, sigma_px)
     solved = _solved(landmarks, world_T_rigs)
-    observed = Observations(keypoints, aligned, folder=folder)
+    observed = AlignedObservations(keypoints, aligned, folder=folder)
     return alignment.align(solved, observed, Greys(frames, 4096), RIG, Threads(2))
 
 
@@ -233,7 +233,7 @@ def test_poses_become_better_than_the_detector_leaves_them(walk) -> None:
     problem, gates = AdjustmentContext(Families((Bearings(), priors)), RIG, settings, 2), (6.0, 3.0)
     before = adjustment.adjust(landmarks.tracks, keypoints, start, problem, gates)
     greys, workers = Greys(frames, 4096), Threads(2)
-    sighted = alignment.align(before, Observations(keypoints), greys, RIG, workers)
+    sighted = alignment.align(before, AlignedObservations(keypoints), greys, RIG, workers)
     after, known = adjustment.adjust_sighted(sighted, before, problem, gates)
     assert np.median(rotation_errors(after)) < 0.5 * np.median(rotation_errors(before))
     assert 0.5 <= after.noise < 2 and all(step.accepted for step in after.rounds)
@@ -278,7 +278,7 @@ def test_points_at_a_centre_and_behind_walls_do_no_harm(walk) -> None:
     points[100] = world_T_rigs[landmarks.tracks.frames[300], :3, 3]
     moved = replace(landmarks, points_world=points)
     solved, greys = _solved(moved, world_T_rigs), Greys(frames, 4096)
-    observed, workers = Observations(keypoints), Threads(2)
+    observed, workers = AlignedObservations(keypoints), Threads(2)
     sighted = alignment.align(solved, observed, greys, RIG, workers)
     assert np.isfinite(sighted.keypoints.bearings_rig).all()
     infos = sighted.keypoints.sqrt_infos
@@ -312,7 +312,7 @@ def test_no_points_are_no_observations(walk) -> None:
     none = Solution.without_points(world_T_rigs).landmarks
     _, keypoints = _start(world_T_rigs)
     solved, greys = _solved(none, world_T_rigs), Greys(frames, 4096)
-    observed, workers = Observations(keypoints), Threads(2)
+    observed, workers = AlignedObservations(keypoints), Threads(2)
     sighted = alignment.align(solved, observed, greys, RIG, workers)
     assert len(sighted.tracks) == 0 and sighted.counts.received == 0
 
@@ -380,7 +380,10 @@ def test_patches_come_to_lie_on_their_surfaces(tmp_path: Path) -> None:
         bearings[keypoints.rows(tracks)[rows]] = bearings_of(towards, world_T_rigs[f])
     keypoints = replace(keypoints, bearings_rig=bearings)
     for _ in range(2):
-        solved, observed = _solved(landmarks, world_T_rigs), Observations(keypoints, None, normals)
+        solved, observed = (
+            _solved(landmarks, world_T_rigs),
+            AlignedObservations(keypoints, None, normals),
+        )
         greys, workers = Greys(frames, 4096), Threads(2)
         found = alignment.align(solved, observed, greys, RIG, workers)
         own = found.keypoints.rows(found.tracks)

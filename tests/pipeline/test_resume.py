@@ -16,7 +16,7 @@ from tiny_run import BARE, NUM_FRAMES, SETTINGS, Case, computed_stages, exportin
 
 import gsba
 from gsba.bundle import map_strength
-from gsba.config import WeakFrameSettings
+from gsba.config import RoundSettings, WeakFrameSettings
 from gsba.log import following
 from gsba.matching import correspondences
 from gsba.report.time_left import TimeLeft
@@ -48,7 +48,8 @@ def test_a_run_tells_its_size_and_the_time_left(case: Case, tmp_path: Path) -> N
     (size,) = [entry for entry in events if entry["event"] == "run"]
     assert size["frames"] == NUM_FRAMES and size["trajectory"] and not size["raw"]
     stages = {entry["name"]: entry for entry in events if entry["event"] == "done"}
-    assert stages["dense"]["observations"] > 0 and "observations" not in stages["features"]
+    sizes = {entry["name"]: entry["observations"] for entry in events if entry["event"] == "map"}
+    assert sizes["dense"] > 0 and sizes.keys() < stages.keys()
     assert left[events.index(size)] > left[-1] >= 0.0
 
 
@@ -59,8 +60,8 @@ def test_a_changed_setting_renews_what_depends_on_it(case: Case, tmp_path: Path)
     (image, *_) = (out / "colmap/images/front").iterdir()
     pixels = cv2.imread(str(image))
     assert pixels is not None and pixels.shape[:2] == (64, 64)
-    looser = exported.model_copy(update={"priors": exported.priors.faint()})
-    computed = computed_stages(case.refine(out, looser))
+    more = exported.model_copy(update={"rounds": RoundSettings(filters="many")})
+    computed = computed_stages(case.refine(out, more))
     assert computed[0] == "chain" and "reconstruction" in computed
     assert not {"frames", "features", "keypoints", "neighbours"} & set(computed)
 

@@ -143,8 +143,9 @@ def test_patches_take_as_long_as_the_map_has_observations() -> None:
     events = stages(STAGES)
     found = []
     for observations in (20000, 40000):
-        adjusted = {**events[15], "name": "refined1", "observations": observations}
-        found.append(left(told(*events[:15], adjusted, width=500), adjusted["time"]))
+        now = events[15]["time"]
+        map_ = {"event": "map", "name": "refined1", "observations": observations, "time": now}
+        found.append(left(told(*events[:16], map_, width=500), now))
     assert 1.1 * found[0] < found[1] < 2.0 * found[0]
 
 

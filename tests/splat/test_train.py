@@ -80,7 +80,7 @@ def test_halves_of_a_view_teach_what_the_whole_does() -> None:
         middle = (half - first, half)
         camera = dataclasses.replace(whole, width=last - first, principal=middle)
         truth_there = views.images[2][:, first:last]
-        lesson = Lesson(camera, truth_there, None, 1, adam.Rates(*[1.0] * 6), 1)
+        lesson = Lesson(camera, truth_there, None, 1, adam.LearningRates(*[1.0] * 6), 1)
         found.append(CpuBackend(1).gradients(small, lesson, 0.01, ssim_weight=0.0))
     for entry in dataclasses.fields(Gaussians):
         one, left, right = (getattr(part.gaussians, entry.name) for part in found)
@@ -243,7 +243,7 @@ def test_first_step_of_adam_is_the_rate() -> None:
     rng = np.random.default_rng(0)
     parts = (rng.normal(size=array.shape).astype(np.float32) for array in gaussians.arrays())
     gradients = Gaussians(*parts)
-    rates = adam.Rates(1e-3, 2e-3, 3e-3, 4e-3, 5e-3, 6e-3)
+    rates = adam.LearningRates(1e-3, 2e-3, 3e-3, 4e-3, 5e-3, 6e-3)
     adam.step(gaussians, gradients, adam.Moments.zero(gaussians), rates, 1)
     moved = gaussians.means - before.means
     assert np.allclose(moved, -1e-3 * np.sign(gradients.means), atol=1e-6)

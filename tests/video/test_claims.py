@@ -15,7 +15,7 @@ from wave_panorama import wave_panorama
 from gsba.frames.files import turned
 from gsba.log import GsbaError
 from gsba.video.colours import bgr
-from gsba.video.recording import Picture, Recording, read_recording, shots
+from gsba.video.recording import VideoPicture, VideoRecording, read_recording, shots
 
 av = pytest.importorskip("av", reason="PyAV is not installed")
 
@@ -86,7 +86,7 @@ def _spherical(yaw: float = 0.0, bounds: tuple[float, float, float, float] = (0,
     return _box(b"sv3d", _box(b"svhd", bytes(4), b"made here\0"), projection)
 
 
-def _first(recording: Recording) -> Picture:
+def _first(recording: VideoRecording) -> VideoPicture:
     return next(shots(recording, [0]))[1][0]
 
 
