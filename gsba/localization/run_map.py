@@ -27,11 +27,8 @@ from gsba.types import Features, FrameSet, Reconstruction
 from gsba.types.records import with_rows
 from gsba.version import __version__
 
-_STAGES = (
-    "features_closer",
-    "features_tour",
-    "features",
-)  # that store keypoints of frames, the last one first
+# Stages that store keypoints of frames, the last one first.
+FEATURE_STAGES = "features_closer", "features_tour", "features"
 SAME_PLACE_SIGMAS = 6.0  # largest angle between a keypoint and the observation of a point that is
 # taken for the keypoint's, standard deviations of the keypoint
 SAME_PLACE_RAD = np.deg2rad(0.25)  # and largest such angle
@@ -104,7 +101,7 @@ class RunMap:
             own = cubemap.rig_for(raw.format_of(f), settings.cubemap)
             return extract(*cubemap.load(raw, f, own), own, make())
 
-        first = features_of(0, _STAGES).descriptors
+        first = features_of(0, FEATURE_STAGES).descriptors
         if not len(first):
             raise GsbaError(f"{root}: its first frame has no keypoints: refine again with --fresh")
         axes, observed = principal_axes(first), result.observations_by_frame()
@@ -114,7 +111,7 @@ class RunMap:
             """Keypoints of a frame that lie where the frame observes a point of the map."""
             from scipy.spatial import KDTree
 
-            features, rows, lenses = features_of(f, _STAGES), observed[f], cameras.at(f)
+            features, rows, lenses = features_of(f, FEATURE_STAGES), observed[f], cameras.at(f)
             seen = corrected(gather([features]), fields[frames.cameras[f]], rig)
             seen = Cameras((lenses.of_frame(f),)).seen(seen) if lenses else seen
             numbers = np.zeros(len(features), np.int64)

@@ -11,7 +11,7 @@ from gsba.bundle.reconstruction import world_scale
 from gsba.config import CameraSettings, RefineSettings
 from gsba.config_file import load_config
 from gsba.frames.recordings import own_timestamps
-from gsba.localization.run_map import require_own_version
+from gsba.localization.run_map import FEATURE_STAGES, require_own_version
 from gsba.log import GsbaError
 from gsba.loop_closure.connectivity import by_size
 from gsba.pipeline.map import FoundCamera, Map
@@ -25,11 +25,6 @@ from gsba.types import CoarsePoses, FrameSet, Landmarks, Reconstruction, Solutio
 _STAGE = "map"
 _CAMERAS = "camera_settings"  # of runs of several cameras, JSON of each
 _MIN_SHARED_POINTS = 12  # least points that two recordings share, to be tied to one another
-_FEATURES = (
-    "features_closer",
-    "features_tour",
-    "features",
-)  # stages that hold a frame's features, the last one first
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +81,7 @@ class FinishedRun:
         num, points = len(frames), len(kept.map.solution.landmarks.points_world)
         if len(kept.map.solution.world_T_rigs) != num or points != len(result.points_world):
             raise GsbaError(f"{root}: its results do not fit together: refine again with --fresh")
-        stages = [root / STAGES / stage for stage in _FEATURES]
+        stages = [root / STAGES / stage for stage in FEATURE_STAGES]
         each = [[stage / f"{name}.npz" for stage in stages] for name in frames.names]
         files = tuple(next(filter(Path.is_file, paths), paths[-1]) for paths in each)
         origin = {what: Path(path) for what, path in read_marker(root)["origin"].items()}
