@@ -1,5 +1,6 @@
 """Stills of a tour whose descriptors tie nothing."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -9,6 +10,7 @@ import pytest
 from gsba import GsbaError, refine
 from gsba.camera.rig import CubeRig, owner_faces
 from gsba.evaluate.trajectory import pose_errors
+from gsba.features.detection import TRAITS
 from gsba.geometry import unit
 from gsba.odometry import tour_steps
 from gsba.pipeline.tour import rows_of_added, with_keypoints
@@ -18,8 +20,12 @@ from tests.room_tour import pictures, true_poses
 from tests.tiny_run import settings_with
 
 NUM = 3
-# No descriptor is so alike.
-STRANGE = {"matching": {"min_similarity": 0.9999}, "patches": {"rounds": 0}}
+WITHOUT_PATCHES = {"patches": {"rounds": 0}}
+
+
+@pytest.fixture(autouse=True)
+def _no_descriptor_is_so_alike(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(TRAITS, "sift", replace(TRAITS["sift"], min_similarity=0.9999))
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +40,7 @@ def test_searched_places_make_a_map_where_descriptors_make_none(
     stills: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(tour_steps, "_NUM_KEYS", 400)  # as many as this room needs
-    settings = settings_with(**STRANGE, export={"formats": ()})
+    settings = settings_with(**WITHOUT_PATCHES, export={"formats": ()})
     result = refine(stills, None, tmp_path / "run", settings, masks="none")
     found = read_trajectory(result.out / "trajectory.tum")
     assert len(found.timestamps) == NUM
@@ -45,7 +51,7 @@ def test_searched_places_make_a_map_where_descriptors_make_none(
 
 
 def test_the_search_can_be_turned_off(stills: Path, tmp_path: Path) -> None:
-    settings = settings_with(**STRANGE, pairs={"max_tour_frames": 0})
+    settings = settings_with(**WITHOUT_PATCHES, pairs={"max_tour_frames": 0})
     with pytest.raises(GsbaError, match="no two neighbouring frames match"):
         refine(stills, None, tmp_path / "run", settings, masks="none")
 
@@ -73,6 +79,6 @@ def test_added_keypoints_follow_the_others_of_their_face() -> None:
 
 
 def test_frames_of_a_video_are_not_searched(stills: Path, tmp_path: Path) -> None:
-    settings = settings_with(**STRANGE)
+    settings = settings_with(**WITHOUT_PATCHES)
     with pytest.raises(GsbaError, match="no two neighbouring frames match"):
         refine(stills, None, tmp_path / "run", settings, masks="none", fps=2.0)
