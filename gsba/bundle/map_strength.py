@@ -366,14 +366,15 @@ def _triangulated(
     rays = np.einsum("oij,oj->oi", frames[:, :3, :3], result.observation_bearings[rows])
     depths = np.linalg.norm(result.points_world[points[index]] - placed, axis=1)
     weights = 1 / (np.maximum(depths, 1e-12) * result.observation_sigmas[rows]) ** 2
-    across = (np.eye(3) - rays[:, :, None] * rays[:, None, :]) * weights[:, None, None]
-    columns = np.hstack([across.reshape(-1, 9), np.einsum("oij,oj->oi", across, placed)])
-    sums = np.stack([np.bincount(index, column, len(points)) for column in columns.T], axis=1)
-    systems = sums[:, :9].reshape(-1, 3, 3)
+    off = placed - np.einsum("oi,oi->o", rays, placed)[:, None] * rays
+    (x, y, z), (a, b, c) = rays.T, (weights[:, None] * off).T
+    upper = weights * np.stack([1 - x * x, -x * y, -x * z, 1 - y * y, -y * z, 1 - z * z])
+    sums = np.stack([np.bincount(index, row, len(points)) for row in (*upper, a, b, c)], axis=1)
+    systems = sums[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
     lowest, _, highest = np.linalg.eigvalsh(systems).T
     parallel = lowest <= 1e-9 * highest
     systems[parallel] = np.eye(3)
     covariances = np.linalg.inv(systems)
-    places = np.einsum("nij,nj->ni", covariances, sums[:, 9:])
+    places = np.einsum("nij,nj->ni", covariances, sums[:, 6:])
     covariances[parallel] = np.nan
     return places, covariances

@@ -193,7 +193,7 @@ def _ransac(
 
     options = pycolmap.RANSACOptions()
     options.max_error = np.deg2rad(settings.max_error_deg)
-    options.min_num_trials, options.max_num_trials = 100, 3000
+    options.min_num_trials, options.max_num_trials = 50, 3000
     options.min_inlier_ratio = least / len(bearings0)
     options.random_seed = seed
     found = pycolmap.estimate_relative_pose(bearings0, bearings1, options)

@@ -269,7 +269,9 @@ def accepted_rows(
     of_shifts = patches.shift_covariances(sightings.templates, sightings.variances)
     covariances = axes @ of_shifts @ np.swapaxes(axes, 1, 2)
     covariances += (_MIN_SIGMA_PX * pixel) ** 2 * np.eye(2)
-    worst = np.sqrt(np.maximum(np.linalg.eigvalsh(covariances)[:, 1], 0))
+    half = 0.5 * (covariances[:, 0, 0] - covariances[:, 1, 1])
+    middle = 0.5 * (covariances[:, 0, 0] + covariances[:, 1, 1])
+    worst = np.sqrt(middle + np.hypot(half, covariances[:, 0, 1]))
     shifts = np.linalg.norm(np.cross(sightings.origins, bearings), axis=1)
     tests = {reason: sightings.states != state for state, reason in REASONS.items()}
     aligned = sightings.states == ALIGNED
@@ -377,7 +379,9 @@ def shown_depths(
             distance there.
     """
     axes = tangent_basis(bearings)
-    shifts = np.linalg.solve(axes @ spreads, axes @ rays[:, :, None])[:, :, 0]
+    (a, b), (c, d) = np.moveaxis(axes @ spreads, 0, 2)
+    x, y = np.moveaxis(axes @ rays[:, :, None], 0, 2)[:, 0]
+    shifts = np.stack([d * x - b * y, a * y - c * x], axis=1) / (a * d - b * c)[:, None]
     affine = np.swapaxes(warps[:, 2:].reshape(-1, 2, 2), 1, 2)
     return shifts, np.einsum("oij,oi->oj", affine, shifts)
 
