@@ -27,11 +27,8 @@ from gsba.types import Features, FrameSet, Reconstruction
 from gsba.types.records import with_rows
 from gsba.version import __version__
 
-_STAGES = (
-    "features_closer",
-    "features_tour",
-    "features",
-)  # that store keypoints of frames, the last one first
+# Stages that store keypoints of frames, the last one first.
+_STAGES = "features_closer", "features_tour", "features"
 _SAME_PLACE_SIGMAS = 6.0  # largest angle between a keypoint and the observation of a point that is
 # taken for the keypoint's, standard deviations of the keypoint
 _SAME_PLACE_RAD = np.deg2rad(0.25)  # and largest such angle

@@ -8,6 +8,7 @@ import pytest
 
 from gsba import GsbaError, refine
 from gsba.camera.rig import CubeRig, owner_faces
+from gsba.config import FeatureSettings
 from gsba.evaluate.trajectory import pose_errors
 from gsba.geometry import unit
 from gsba.odometry import tour_steps
@@ -33,7 +34,9 @@ def stills(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_searched_places_make_a_map_where_descriptors_make_none(
     stills: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(tour_steps, "_NUM_KEYS", 400)  # as many as this room needs
+    few = FeatureSettings(max_per_face=150)  # as many as this room needs
+    monkeypatch.setattr(tour_steps, "_FEATURES", few)
+    monkeypatch.setattr(tour_steps, "_NUM_KEYS", 400)
     settings = settings_with(**STRANGE, export={"formats": ()})
     result = refine(stills, None, tmp_path / "run", settings, masks="none")
     found = read_trajectory(result.out / "trajectory.tum")
@@ -42,6 +45,14 @@ def test_searched_places_make_a_map_where_descriptors_make_none(
     assert off.positions.max() < 0.01 and np.rad2deg(off.rotations.max()) < 0.1
     stages = [stage["name"] for stage in result.report["stages"]]
     assert "tour" in stages
+    assert (result.out / "stages/features_tour/0.npz").is_file()
+    # Keypoints of the first call have other numbers than those of a call that needs no search.
+    usual = settings_with(export={"formats": ()}, patches={"rounds": 0})
+    assert (
+        len(refine(stills, None, result.out, usual, masks="none").reconstruction.world_T_rigs)
+        == NUM
+    )
+    assert not (result.out / "stages/features_tour").exists()
 
 
 def test_the_search_can_be_turned_off(stills: Path, tmp_path: Path) -> None:
