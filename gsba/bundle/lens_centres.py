@@ -26,8 +26,8 @@ from gsba.types import Counts, Keypoints, Landmarks, Solution
 logger = logging.getLogger(__name__)
 
 _MIN_SIGMAS = 5.0  # least distance from one centre, in standard deviations
-_MIN_TRIAL_SIGMAS = 3.0  # the same before matches are found with the centres: one centre exceeds it
-# by chance in 3 % of maps (2: 26 %); matches found with two lenses raise the distance threefold
+_MIN_TRIAL_SIGMAS = 2.0  # the same before matches are found with the centres, which may raise the
+# distance threefold
 
 
 @dataclass(frozen=True, slots=True)

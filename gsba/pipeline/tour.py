@@ -2,6 +2,7 @@
 searched along epipolar lines (`gsba.odometry.tour_maps`)."""
 
 import logging
+import shutil
 from dataclasses import fields, replace
 from functools import partial
 
@@ -15,6 +16,7 @@ from gsba.odometry.tour_maps import TourMatches, match_tour
 from gsba.pipeline import frontend
 from gsba.pipeline.run import Run
 from gsba.pipeline.state import ObservedFrames, State
+from gsba.store.folder import STAGES
 from gsba.trajectory import judgement
 from gsba.trajectory.limits import TwoViewLimits
 from gsba.trajectory.steps import image_steps
@@ -31,8 +33,25 @@ def match_places(state: State, found: Recovered) -> State | None:
     """The state before the map, its steps by searched places; None where descriptors tie most
     frames, or where places tie no more."""
     run, prior = state.run, state.prior
-    num = len(run.frames)
-    if not prior.absent or found.trust.turning_only or not _may_be_tour(run):
+    tour = _search(state, found)
+    if tour is None:  # of an earlier call, whose keypoints have other numbers
+        shutil.rmtree(run.store.root / STAGES / _STAGE, ignore_errors=True)
+        return None
+    observed, places = _with_places(state, tour)
+    near = replace(tour.near, matches=places)
+    steps = image_steps(near, observed.keypoints)
+    given = tour.log_ratios, tour.log_sigmas, TwoViewLimits.of(run.settings), run.settings.priors
+    trust = judgement.check_steps(prior.coarse, steps, *given)
+    prior = replace(
+        prior, coarse=replace(prior.coarse, world_T_rigs=trust.world_T_rigs), trust=trust
+    )
+    return replace(state, observed=observed, places=places).begun(prior, near)
+
+
+def _search(state: State, found: Recovered) -> TourMatches | None:
+    """Steps of a tour by searched places; None where these are not needed, or tie no more."""
+    run, num = state.run, len(state.run.frames)
+    if not state.prior.absent or found.trust.turning_only or not _may_be_tour(run):
         return None
     before = _num_tied(found.neighbours.matches, num)
     if before > _MAX_TIED_SHARE * num:
@@ -46,17 +65,7 @@ def match_places(state: State, found: Recovered) -> State | None:
     )
     compute = partial(match_tour, run.frames, run.num_threads)
     tour = run.stage("tour", None, compute, TourMatches)
-    if not _num_tied(tour.near.matches, num) > before:
-        return None
-    observed, places = _with_places(state, tour)
-    near = replace(tour.near, matches=places)
-    steps = image_steps(near, observed.keypoints)
-    given = tour.log_ratios, tour.log_sigmas, TwoViewLimits.of(run.settings), run.settings.priors
-    trust = judgement.check_steps(prior.coarse, steps, *given)
-    prior = replace(
-        prior, coarse=replace(prior.coarse, world_T_rigs=trust.world_T_rigs), trust=trust
-    )
-    return replace(state, observed=observed, places=places).begun(prior, near)
+    return tour if _num_tied(tour.near.matches, num) > before else None
 
 
 def _may_be_tour(run: Run) -> bool:

@@ -9,6 +9,7 @@ import pytest
 
 from gsba import GsbaError, refine
 from gsba.camera.rig import CubeRig, owner_faces
+from gsba.config import FeatureSettings
 from gsba.evaluate.trajectory import pose_errors
 from gsba.features.detection import TRAITS
 from gsba.geometry import unit
@@ -23,7 +24,7 @@ NUM = 3
 WITHOUT_PATCHES = {"patches": {"rounds": 0}}
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture
 def _no_descriptor_is_so_alike(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(TRAITS, "sift", replace(TRAITS["sift"], min_similarity=0.9999))
 
@@ -39,8 +40,12 @@ def stills(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_searched_places_make_a_map_where_descriptors_make_none(
     stills: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(tour_steps, "_NUM_KEYS", 400)  # as many as this room needs
+    few = FeatureSettings(max_per_face=150)  # as many as this room needs
+    monkeypatch.setattr(tour_steps, "_FEATURES", few)
+    monkeypatch.setattr(tour_steps, "_NUM_KEYS", 400)
     settings = settings_with(**WITHOUT_PATCHES, export={"formats": ()})
+    usual, strange = TRAITS["sift"], replace(TRAITS["sift"], min_similarity=0.9999)
+    monkeypatch.setitem(TRAITS, "sift", strange)
     result = refine(stills, None, tmp_path / "run", settings, masks="none")
     found = read_trajectory(result.out / "trajectory.tum")
     assert len(found.timestamps) == NUM
@@ -48,8 +53,16 @@ def test_searched_places_make_a_map_where_descriptors_make_none(
     assert off.positions.max() < 0.01 and np.rad2deg(off.rotations.max()) < 0.1
     stages = [stage["name"] for stage in result.report["stages"]]
     assert "tour" in stages
+    assert (result.out / "stages/features_tour/0.npz").is_file()
+    # Keypoints of the first call have other numbers than those of a call that needs no search.
+    monkeypatch.setitem(TRAITS, "sift", usual)
+    other = settings_with(**WITHOUT_PATCHES, export={"formats": ()}, pairs={"window": 31})
+    again = refine(stills, None, result.out, other, masks="none")
+    assert len(again.reconstruction.world_T_rigs) == NUM
+    assert not (result.out / "stages/features_tour").exists()
 
 
+@pytest.mark.usefixtures("_no_descriptor_is_so_alike")
 def test_the_search_can_be_turned_off(stills: Path, tmp_path: Path) -> None:
     settings = settings_with(**WITHOUT_PATCHES, pairs={"max_tour_frames": 0})
     with pytest.raises(GsbaError, match="no two neighbouring frames match"):
@@ -78,6 +91,7 @@ def test_added_keypoints_follow_the_others_of_their_face() -> None:
     )
 
 
+@pytest.mark.usefixtures("_no_descriptor_is_so_alike")
 def test_frames_of_a_video_are_not_searched(stills: Path, tmp_path: Path) -> None:
     settings = settings_with(**WITHOUT_PATCHES)
     with pytest.raises(GsbaError, match="no two neighbouring frames match"):
