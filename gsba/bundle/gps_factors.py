@@ -397,10 +397,7 @@ def factors(anchors: Anchors) -> gtsam.NonlinearFactorGraph:
 
 
 def linear_factors(
-    anchors: Anchors,
-    world_T_rigs: np.ndarray,
-    *,
-    free_similarity: bool = True,
+    anchors: Anchors, world_T_rigs: np.ndarray
 ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
     """Linear factors of fixes for covariances, and the variables beside the poses: lasting errors,
     and the map's similarity, as it must be free where the first pose is held. They are linearized
@@ -409,7 +406,7 @@ def linear_factors(
     own = gtsam.Values()
     for a in range(len(anchors.frames)):
         own.insert(E(a), np.zeros(3))
-    for number in anchors.level_from_map if free_similarity else ():
+    for number in anchors.level_from_map:
         own.insert(S(number), np.zeros(7))
     values = values_of(world_T_rigs)
     values.insert(own)
@@ -430,9 +427,8 @@ def linear_factors(
             whitened = weight * fit.scale * fit.rotation / fixes.sigmas[i][:, None]
             by_pose = np.hstack([np.zeros((3, 3)), world_T_rigs[frame, :3, :3]])
             terms = {X(frame): whitened @ by_pose, E(a): -weight * np.eye(3)}
-            if free_similarity:
-                by_similarity = np.column_stack([arm, *np.cross(np.eye(3), arm), np.eye(3)])
-                terms[S(number)] = -whitened @ by_similarity
+            by_similarity = np.column_stack([arm, *np.cross(np.eye(3), arm), np.eye(3)])
+            terms[S(number)] = -whitened @ by_similarity
             graph.add(_linear(terms, -whitened @ off, values))
     return graph, own
 

@@ -9,8 +9,6 @@ from typing import ClassVar, Protocol, Self
 
 import numpy as np
 
-from gsba.camera.sphere import bearings_from_erp, erp_from_bearings
-
 _NUM_NEWTON_STEPS = 8  # enough for angles to converge in double precision
 _MIN_SLOPE = 0.1  # of the radius by the angle, in Newton's steps beyond a polynomial's own range
 
@@ -189,42 +187,6 @@ class PerspectiveProjection(RadialProjection):
         scale = np.divide(tangents, radii, out=np.ones_like(radii), where=radii > 0)
         rays = np.concatenate([scale[..., None] * away, np.ones_like(radii)[..., None]], axis=-1)
         return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
-
-
-@dataclass(frozen=True, slots=True)
-class EquirectangularProjection:
-    """A 2:1 panorama: longitude across, latitude down. It has no parameters."""
-
-    width: int  # pixels
-    height: int  # pixels, half the width
-
-    def parameters(self) -> tuple[Parameter, ...]:
-        """None."""
-        return ()
-
-    def project(self, directions: np.ndarray) -> np.ndarray:
-        """See `Projection`."""
-        return erp_from_bearings(directions, self.width, self.height)
-
-    def unproject(self, pixels: np.ndarray) -> np.ndarray:
-        """See `Projection`."""
-        return bearings_from_erp(pixels, self.width, self.height)
-
-    def jacobians(self, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """See `Projection`; not finite at the poles, where a longitude has no derivative."""
-        x, y, z = directions.T
-        level = x**2 + z**2
-        radius, squares = np.sqrt(level), level + y**2
-        out = np.zeros((len(directions), 2, 3))
-        across, down = self.width / (2 * np.pi), self.height / np.pi
-        out[:, 0, 0], out[:, 0, 2] = across * z / level, -across * x / level
-        out[:, 1, 1] = down * radius / squares
-        out[:, 1, 0], out[:, 1, 2] = (-down * y * part / (radius * squares) for part in (x, z))
-        return out, np.zeros((len(directions), 2, 0))
-
-    def stepped(self, step: np.ndarray) -> "EquirectangularProjection":
-        """The projection itself."""
-        return self
 
 
 PROJECTIONS: dict[str, Callable[..., RadialProjection]] = {  # by "model" in calibration files

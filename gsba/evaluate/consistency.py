@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from gsba.evaluate.trajectory import aligned_rows
+from gsba.evaluate.trajectory import TOLERANCE_S, aligned_rows
 from gsba.geometry import adjoint, furthest, inverse, step_covariances
 from gsba.log import GsbaError
 from gsba.similarity import Sim3
@@ -113,7 +113,6 @@ def consistency_of(
     reconstruction: Reconstruction,
     timestamps: np.ndarray,
     truth: Trajectory,
-    tolerance_s: float = 0.01,
 ) -> Consistency:
     """Compare the covariances of a map's poses with the errors of these.
 
@@ -121,7 +120,6 @@ def consistency_of(
         reconstruction: one map, from `load_run`.
         timestamps: (F,) times of its frames, seconds.
         truth: true poses in any world and scale; frames without a true pose are not tested.
-        tolerance_s: largest difference of timestamps, seconds.
 
     Raises:
         GsbaError: the run has no covariances, or the truth lacks the frames that fix the gauge.
@@ -132,11 +130,11 @@ def consistency_of(
     if joint is None or not len(known):
         raise GsbaError("the run has no covariances of its poses")
     far, _ = furthest(poses[:, :3, 3])
-    rows, of_truth = matched_in_time(Trajectory(timestamps, poses), truth, tolerance_s)
+    rows, of_truth = matched_in_time(Trajectory(timestamps, poses), truth, TOLERANCE_S)
     for frame in (0, far):
         if not np.any(rows == frame):
             raise GsbaError(
-                f"no true pose is within {tolerance_s:g} s of {timestamps[frame]:.3f} s, the time "
+                f"no true pose is within {TOLERANCE_S:g} s of {timestamps[frame]:.3f} s, the time "
                 "of a frame that fixes the gauge of the covariances"
             )
     true_T_rigs = np.full_like(poses, np.nan)

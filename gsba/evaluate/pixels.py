@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from gsba.camera.sphere import bearings_from_erp
+from gsba.evaluate.trajectory import TOLERANCE_S
 from gsba.log import GsbaError
 from gsba.similarity import similarity
 from gsba.store.records import HEADER_ERRORS
@@ -36,7 +37,6 @@ def induced_errors(
     depth_of: Callable[[int], np.ndarray],
     width: int,
     steps: Sequence[int] = STEPS,
-    tolerance_s: float = 0.01,
 ) -> InducedErrors:
     """Project sampled pixels of each frame into its neighbours, under true and estimated poses.
 
@@ -51,15 +51,14 @@ def induced_errors(
             that size, truth units; 0 = no surface.
         width: width of the full panorama, in whose pixels (at the equator) errors are given.
         steps: frames from a frame to its neighbours.
-        tolerance_s: largest difference of timestamps, seconds.
 
     Raises:
         GsbaError: fewer than three poses associate, or no frame has a neighbour.
     """
-    rows_e, rows_t = matched_in_time(estimate, truth, tolerance_s)
+    rows_e, rows_t = matched_in_time(estimate, truth, TOLERANCE_S)
     if len(rows_t) < 3:
         raise GsbaError(
-            f"only {len(rows_t)} poses have a true pose within {tolerance_s:g} s; alignment needs 3"
+            f"only {len(rows_t)} poses have a true pose within {TOLERANCE_S:g} s; alignment needs 3"
         )
     true_T_rigs = truth.world_T_rigs[rows_t]
     poses = estimate.world_T_rigs[rows_e]

@@ -14,7 +14,7 @@ import numpy as np
 from gsba.camera.views import ONE_EYE, Optics
 from gsba.disk import write_image, write_text
 from gsba.evaluate import charts
-from gsba.evaluate.trajectory import aligned_rows
+from gsba.evaluate.trajectory import TOLERANCE_S, aligned_rows
 from gsba.log import GsbaError
 from gsba.similarity import NoSimilarityError, pose_similarity
 from gsba.splat.backend import Backend
@@ -74,14 +74,14 @@ class PosedViews:
         )
 
 
-def poses_for(frames: FrameSet, trajectory: Trajectory, tolerance_s: float = 0.01) -> np.ndarray:
+def poses_for(frames: FrameSet, trajectory: Trajectory) -> np.ndarray:
     """Pose (F, 4, 4) of each frame by time; NaN where the trajectory has none. Raises GsbaError: no
     pose is within the tolerance of a frame's time."""
     expected = Trajectory(frames.timestamps, np.tile(np.eye(4), (len(frames), 1, 1)))
-    rows, which = matched_in_time(trajectory, expected, tolerance_s)
+    rows, which = matched_in_time(trajectory, expected, TOLERANCE_S)
     if len(which) == 0:
         raise GsbaError(
-            f"no pose of the trajectory is within {tolerance_s:g} s of a frame: "
+            f"no pose of the trajectory is within {TOLERANCE_S:g} s of a frame: "
             "check that both use one clock"
         )
     poses = np.full((len(frames), 4, 4), np.nan)

@@ -12,6 +12,7 @@ from gsba.trajectory.association import matched_in_time
 from gsba.types import Trajectory
 
 AUC_THRESHOLDS_DEG = (0.1, 0.25, 0.5, 1.0, 5.0, 10.0)
+TOLERANCE_S = 0.01  # largest difference of the times of a pose and its true one, seconds
 _PAIRS_AT_ONCE = 1 << 18
 
 
@@ -65,7 +66,9 @@ class PoseErrors:
     rotations: np.ndarray  # (M,) float64, radians, after the best common rotation
 
 
-def pose_errors(estimate: Trajectory, truth: Trajectory, tolerance_s: float = 0.01) -> PoseErrors:
+def pose_errors(
+    estimate: Trajectory, truth: Trajectory, tolerance_s: float = TOLERANCE_S
+) -> PoseErrors:
     """Errors of single poses; for alignment, arguments and exceptions see `evaluate`."""
     rows_e, rows_t = matched_in_time(estimate, truth, tolerance_s)
     if len(rows_t) < 3:
@@ -87,7 +90,7 @@ def pose_errors(estimate: Trajectory, truth: Trajectory, tolerance_s: float = 0.
 
 
 def evaluate(
-    estimate: Trajectory, truth: Trajectory, tolerance_s: float = 0.01
+    estimate: Trajectory, truth: Trajectory, tolerance_s: float = TOLERANCE_S
 ) -> TrajectoryErrors:
     """Compare a trajectory of any world and scale with the truth.
 

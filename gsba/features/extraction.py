@@ -129,10 +129,9 @@ def adopted(
     settings: CubemapSettings,
     make_extractor: Callable[[], Extractor],
     stored: Sequence[Path],
-    name: str = "features",
 ) -> PerFrame[Features]:
     """Features that other runs have stored, a file (F,) for each frame, by frame name; extracted
     again where a file is gone."""
     index = {frame: f for f, frame in enumerate(frames.names)}
     compute = _Extraction(frames, index, rig, settings, make_extractor)
-    return store.adopt(name, dict(zip(frames.names, stored, strict=True)), compute, Features)
+    return store.adopt("features", dict(zip(frames.names, stored, strict=True)), compute, Features)

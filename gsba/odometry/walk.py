@@ -21,7 +21,7 @@ from gsba.odometry.pose_graph import carried_covariances
 from gsba.odometry.tracker import Tracker
 from gsba.odometry.tracker_state import FrameStatus, TrackerState
 from gsba.store.records import load_checkpoint, save_record
-from gsba.store.shards import Threads, Workers, content_digest
+from gsba.store.shards import Threads, content_digest
 from gsba.store.store import fingerprint
 from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.types import Trajectory
@@ -248,16 +248,12 @@ class Odometry:
 def track_panoramas(
     panoramas: SmallPanoramas,
     seed: int = 0,
-    workers: Workers | None = None,
-    with_loops: bool = True,
     checkpoint: Path | None = None,
 ) -> Odometry:
     """Track a camera through a sequence, then join its maps and close its loops.
 
     Args:
         panoramas: all frames, in time order; damaged ones count as lost.
-        workers: threads or processes that compare places; None = threads of this process.
-        with_loops: False = join no maps, close no loops, estimate no covariances.
         checkpoint: file that tracking is saved to each minute, continued from if it is of the same
             panoramas, and removed at the end; None = no file.
 
@@ -269,9 +265,7 @@ def track_panoramas(
         raise GsbaError(f"{panoramas.source}: none of its pictures could be decoded; copy it again")
     began = time.process_time()
     keyframes = _tracked_keyframes(tracked, panoramas)
-    closed = ClosedKeyframes.unchanged(keyframes)
-    if with_loops:
-        closed = close(keyframes, seed, workers or Threads(os.cpu_count() or 1))
+    closed = close(keyframes, seed, Threads(os.cpu_count() or 1))
     closing_cpu_s = time.process_time() - began
     found = _odometry(tracked, keyframes, closed, panoramas.timestamps, closing_cpu_s)
     if checkpoint is not None:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from factors import Block, FaceCameras, RobustLoss
+from factors import Block, FaceCameras
 from factors.splat import RenderedView, SplatBlock
 from gsba.bundle import pose_variables
 from gsba.bundle.families import Family, MapSnapshot
@@ -84,7 +84,6 @@ def splat_block(
     captured: Captured,
     near: float,
     backend: Backend,
-    loss: RobustLoss | None = None,
 ) -> SplatBlock:
     """The block of captured frames, keys X(frame), against a fixed splat in the world of the poses;
     near: least z of a Gaussian, map units. Coarse to fine is one block after another."""
@@ -103,7 +102,7 @@ def splat_block(
     keys = [pose_variables.X(int(f)) for f in captured.which]
     cameras = FaceCameras(rotations, focals, principals)
     return SplatBlock(
-        keys, captured.images, captured.weights, cameras, render, loss, centres=centres, turns=turns
+        keys, captured.images, captured.weights, cameras, render, centres=centres, turns=turns
     )
 
 

@@ -71,7 +71,6 @@ def from_cloud(
     colors: np.ndarray,
     sh_degree: int = MAX_SH_DEGREE,
     opacity: float = 0.1,
-    neighbours: int = 3,
 ) -> Gaussians:
     """Round Gaussians at the points (N, 3) of a cloud, map units, with RGB colours (N, 3) uint8, as
     wide as the distance to their neighbours; harmonics but the constant one start at zero.
@@ -91,7 +90,7 @@ def from_cloud(
 
     spread = np.linalg.norm(points.std(axis=0))
     if len(points) > 1:
-        distances, _ = cKDTree(points).query(points, k=min(neighbours, len(points) - 1) + 1)
+        distances, _ = cKDTree(points).query(points, k=min(3, len(points) - 1) + 1)
         widths = np.sqrt(np.mean(np.square(distances[:, 1:]), axis=1))
         widths = np.clip(widths, 1e-4 * spread + 1e-9, max(0.1 * spread, 1e-8))
     else:

@@ -167,7 +167,7 @@ def test_a_plain_graph_ends_where_gtsam_ends(world):
     """Poses and points to 1e-9, of our single factors and GTSAM's priors, without any block."""
     graph, values = world.reference()
     exact = SolverOptions(relative_tolerance=1e-15, absolute_tolerance=1e-15, max_iterations=200)
-    ours = gsba.optimize(graph, values, settings=exact).values
+    ours = gsba.optimize(graph, values, options=exact).values
     params = gtsam.LevenbergMarquardtParams()
     params.setRelativeErrorTol(0)
     params.setAbsoluteErrorTol(0)
@@ -429,5 +429,5 @@ def test_weak_modes_settle_beside_a_large_cost_that_stays() -> None:
     aside = gtsam.noiseModel.Isotropic.Sigma(6, 0.5)
     graph.add(gtsam.PriorFactorPose3(X(num - 1), at(num - 1, 3), aside))
     result = optimize(graph, values, options=SolverOptions())
-    best = optimize(graph, result.values, settings=TIGHT)
+    best = optimize(graph, result.values, options=TIGHT)
     assert result.converged and result.cost - best.cost < 0.05

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 from gsba.camera.projections import (
-    EquirectangularProjection,
     FisheyeProjection,
     PerspectiveProjection,
     Projection,
@@ -20,7 +19,6 @@ LENSES: dict[str, tuple[Projection, float]] = {  # with the largest angle from t
     ),
     "perspective": (PerspectiveProjection(640, 480, 400.0, (322.0, 238.0), (-0.1, 0.02)), 50),
     "pinhole": (PerspectiveProjection(640, 480, 400.0, (322.0, 238.0)), 80),
-    "panorama": (EquirectangularProjection(800, 400), 180),
 }
 OF_EACH = pytest.mark.parametrize(("lens", "furthest"), LENSES.values(), ids=LENSES)
 STEP = np.array([0.02, 0.03, -0.01, 0.004, -0.002, 0.0005, -0.00004])

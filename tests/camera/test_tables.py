@@ -56,8 +56,7 @@ def test_places_are_the_same_band_by_band(monkeypatch: pytest.MonkeyPatch) -> No
     erp = np.random.default_rng(2).integers(0, 255, (256, 512, 3), dtype=np.uint8)
     compute = cubemap._face_maps.__wrapped__  # type: ignore[attr-defined]
     found = compute(rig, 512, 256), ViewCutter(views, lenses, 0, scene).cut(erp)
-    monkeypatch.setattr(cubemap, "_ROWS_AT_ONCE", 1000)
-    monkeypatch.setattr("gsba.camera.views._ROWS_AT_ONCE", 1000)
+    monkeypatch.setattr("gsba.camera.sphere._BAND_ROWS", 1000)
     assert np.array_equal(compute(rig, 512, 256), found[0])
     for part, wanted in zip(ViewCutter(views, lenses, 0, scene).cut(erp), found[1], strict=True):
         assert np.array_equal(part, wanted)

@@ -8,6 +8,7 @@ from gsba.config import OdometrySettings
 from gsba.geometry import pose, rotation_angle
 from gsba.odometry import Odometry, choose_frames
 from gsba.odometry.tracker_state import FrameStatus
+from gsba.odometry.walk import MAX_TURN_DEG
 
 SETTINGS = OdometrySettings()
 
@@ -63,8 +64,8 @@ def test_turning_counts_and_swaying_does_not() -> None:
     rows = choose_frames(turning, SETTINGS)
     rotations = turning.world_T_rigs[rows, :3, :3]
     turns = rotation_angle(np.swapaxes(rotations[:-1], 1, 2) @ rotations[1:])
-    assert np.rad2deg(turns).max() <= SETTINGS.max_turn_deg + 1e-6
-    assert len(rows) >= 400 / SETTINGS.max_turn_deg
+    assert np.rad2deg(turns).max() <= MAX_TURN_DEG + 1e-6
+    assert len(rows) >= 400 / MAX_TURN_DEG
     swaying = _odometry(still, np.deg2rad(10 * np.sin(np.arange(400.0))))
     assert choose_frames(swaying, SETTINGS).tolist() == [0]
 
