@@ -166,7 +166,10 @@ def _align(image, template, patch, warp):
     moved = (warp[0] - start_u) ** 2 + (warp[1] - start_v) ** 2
     if moved > 36.0 or warp[2] * warp[5] - warp[3] * warp[4] < 0.1 or not _cut(image, warp, patch):
         return np.float32(-1.0)
-    return np.float32(np.sum(patch * template))
+    product = np.float32(0.0)
+    for n in range(AREA):
+        product += patch[n] * template[n]
+    return product
 
 
 @_kernel

@@ -19,7 +19,7 @@ logger = logging.getLogger(__name__)
 PHASES = (
     r"carrier\d*|segmented|distractors\d*|masks|frames|expected_drift|fetch\d+|recut.*",
     r"features|keypoints",
-    r"neighbours.*|clock|turn|steps|imu|gauge",
+    r"neighbours.*|clock|turn|steps|(features|keypoints)_tour|imu|gauge",
     r"chain2?|adjacent|near|dense",
     r"registered|across\w*|similarities|joined|adjacent2|loops2?|places|gauge_closed|closed"
     r"|imu_closed",
@@ -60,6 +60,7 @@ _RAW_PASSES = 1.5  # of raw frames that nothing has calibrated, beyond the first
 _OBSERVATIONS = 950.0  # of the map for each frame
 _FRAMES_PER_KEYFRAME = 0.5  # that odometry chooses
 _ODOMETRY, _TRACKING = "odometry", "tracking"  # stage, and its work
+_TOUR = "tour"  # stage of few runs, which its own work tells the time of
 _TRACKING_S, _CLOSING_S = 0.04, 0.1  # seconds of odometry for each frame of the video; thereafter
 # for each keyframe: .03 to .2, as the path comes back or not
 _PRIOR_S = 4.0  # seconds of the table that count as if they were measured at its speed
@@ -213,11 +214,13 @@ class TimeLeft:
             return None
         if self._stage == _ODOMETRY or not size.frames:
             return self._seconds_of_odometry(size, now)
-        if self._stage and phase_of(self._stage) is None:
-            return None
         size = self._known(size)
         speed, spent = self._speed(size), now - self._phase_began
         work_left = 0.0 if self._work is None else self._work.seconds(now)
+        if self._stage == _TOUR:
+            return work_left + speed * self._ahead(size, self._phase + 1) if work_left else None
+        if self._stage and phase_of(self._stage) is None:
+            return None
         here = max(speed * size.seconds(self._phase) - spent, work_left)
         return here + speed * self._ahead(size, self._phase + 1)
 
@@ -275,6 +278,7 @@ class TimeLeft:
         phase = phase_of(stage)
         if UNDER_LENSES.fullmatch(stage):
             self._lenses = True
+        self._whole &= stage != _TOUR  # whose time is none of the phase's
         if phase is None or phase == self._phase or self._size is None:
             return
         if self._whole and self._phase >= FEATURES:

@@ -294,7 +294,7 @@ def test_points_and_noise_on_the_disk_are_those_in_memory(
     expected = adjustment.adjust_sighted(sighted, start, context, GATES[:3])
     for name, value in {"_OF_THREAD": 300, "_RELEASED_EVERY": 2}.items():
         monkeypatch.setattr(tracks_module, name, value)
-    monkeypatch.setattr(triangulation, "_IN_MEMORY", 500)
+    monkeypatch.setattr(triangulation, "MAX_IN_MEMORY", 500)
     monkeypatch.setattr(observation_noise_module, "_AT_ONCE", 300)
     there = replace(context, scratch=tmp_path, num_threads=2)
     solved, keypoints = adjustment.adjust_sighted(sighted, start, there, GATES[:3])

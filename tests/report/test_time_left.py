@@ -57,7 +57,7 @@ def names() -> Iterator[str]:
 
 def test_every_stage_has_a_phase() -> None:
     without = {name for name in names() if phase_of(name) is None}
-    assert without == {"odometry", "photometric", "splat"}
+    assert without == {"odometry", "photometric", "splat", "tour"}
     assert [phase_of(name) for name in STAGES] == list(range(len(PHASES)))
     assert phase_of("lenses0") == phase_of("settled_far_readout") == CAMERA
     assert phase_of("settled_aligned3") == phase_of("align2") == LAST_PATCHES - 2
@@ -89,6 +89,23 @@ def test_phases_tell_the_speed() -> None:
     stated = left(told(*events[:3], *counts), begin + half)
     assert later + half < stated < 3.0 * later + half
     assert stated > left(told(*events[:3]), begin + half)
+
+
+def test_a_search_along_epipolar_lines_is_timed_by_its_steps_and_is_no_measure_of_others() -> None:
+    events = stages(STAGES)
+    now = events[5]["time"]  # the end of neighbours
+    begin = {"event": "stage", "name": "tour", "time": now}
+    assert told(*events[:5], begin).seconds(now) is None
+    counts = [
+        {"event": "progress", "what": "steps", "done": n, "total": 20, "time": now + 10.0 * n}
+        for n in (0, 5)
+    ]
+    rest = sum(CENTRAL.seconds(n) for n in range(3, len(PHASES)))
+    assert left(told(*events[:5], begin, *counts), now + 50.0) == pytest.approx(150.0 + rest)
+    ended = {"event": "done", "name": "tour", "time": now + 200.0, "resumed": False}
+    chain = {"event": "stage", "name": "chain", "time": now + 200.0}
+    found = told(*events[:5], begin, *counts, ended, chain)
+    assert left(found, now + 200.0) == pytest.approx(rest)
 
 
 def test_resumed_phases_are_no_measure() -> None:

@@ -59,19 +59,19 @@ def run(case: Case, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def scene(run: Path) -> view.Scene:
+def scene(run: Path) -> view.RunScene:
     return view.load_scene(run)
 
 
 @pytest.fixture
-def shown(scene: view.Scene) -> Iterator[view.View]:
+def shown(scene: view.RunScene) -> Iterator[view.SceneView]:
     pytest.importorskip("viser", reason="viser is not installed: pip install 'gsba[view]'")
     started = view.serve(scene, 0)
     yield started
     started.stop()
 
 
-def test_the_scene_is_the_run(case: Case, scene: view.Scene) -> None:
+def test_the_scene_is_the_run(case: Case, scene: view.RunScene) -> None:
     found = case.result.reconstruction
     assert np.array_equal(scene.reconstruction.world_T_rigs, found.world_T_rigs)
     assert np.array_equal(scene.reconstruction.points_world, found.points_world)
@@ -83,7 +83,7 @@ def test_the_scene_is_the_run(case: Case, scene: view.Scene) -> None:
     assert scene.step == pytest.approx(np.median(steps))
 
 
-def test_the_scene_is_placed_as_the_latest_export(run: Path, scene: view.Scene) -> None:
+def test_the_scene_is_placed_as_the_latest_export(run: Path, scene: view.RunScene) -> None:
     first, second = run / "first", run / "second"
     first.mkdir()
     second.mkdir()
@@ -114,7 +114,7 @@ def _positions(poses: np.ndarray | None) -> np.ndarray:
     return poses[:, :3, 3]
 
 
-def test_gaussians_are_what_the_file_says(run: Path, scene: view.Scene) -> None:
+def test_gaussians_are_what_the_file_says(run: Path, scene: view.RunScene) -> None:
     from gsba.splat import read_ply
 
     stored, (shown_splat,) = read_ply(run / "splat/refined/point_cloud.ply"), scene.splats
@@ -158,7 +158,7 @@ def test_pictures_are_tinted_where_masks_are(case: Case, tmp_path: Path) -> None
     assert all(np.array_equal(unmasked[name], plain[name]) for name in FACES)
 
 
-def test_everything_is_on_show(scene: view.Scene, shown: view.View) -> None:
+def test_everything_is_on_show(scene: view.RunScene, shown: view.SceneView) -> None:
     nodes = shown.nodes
     wanted = {"/cloud", "/refined", "/coarse", "/rigs", "/axes", "/frame", "/seen"}
     assert nodes.keys() == wanted | {"/splat/refined"}
@@ -174,14 +174,14 @@ def test_everything_is_on_show(scene: view.Scene, shown: view.View) -> None:
     assert not shown.controls["Masks"].visible  # there are none
 
 
-def test_switches_show_and_hide(shown: view.View) -> None:
+def test_switches_show_and_hide(shown: view.SceneView) -> None:
     for label, name in (("Start: odometry", "/coarse"), ("Splat refined", "/splat/refined")):
         before = shown.nodes[name].visible
         shown.controls[label].value = not before
         _wait_for(lambda name=name, before=before: shown.nodes[name].visible == (not before))
 
 
-def test_a_clicked_rig_shows_its_pictures(scene: view.Scene, shown: view.View) -> None:
+def test_a_clicked_rig_shows_its_pictures(scene: view.RunScene, shown: view.SceneView) -> None:
     shown._select(3)
     _wait_for(lambda: shown.frame == 3)
     world_T_rig = scene.reconstruction.world_T_rigs[3]
@@ -197,7 +197,7 @@ def test_a_clicked_rig_shows_its_pictures(scene: view.Scene, shown: view.View) -
         assert np.allclose(turn, RIG_R_FACE[FACES.index(name)], atol=1e-6)
 
 
-def test_a_frame_whose_picture_is_gone_says_so(scene: view.Scene) -> None:
+def test_a_frame_whose_picture_is_gone_says_so(scene: view.RunScene) -> None:
     pytest.importorskip("viser", reason="viser is not installed: pip install 'gsba[view]'")
     gone = (*scene.frames.paths[:-1], (Path("nowhere.jpg"),))
     shown = view.serve(replace(scene, frames=replace(scene.frames, paths=gone)), 0)
@@ -211,7 +211,7 @@ def test_a_frame_whose_picture_is_gone_says_so(scene: view.Scene) -> None:
         shown.stop()
 
 
-def test_only_this_machine_is_served(shown: view.View) -> None:
+def test_only_this_machine_is_served(shown: view.SceneView) -> None:
     port = shown.server.get_port()
     assert shown.server.get_host() == "127.0.0.1"
     assert {address for address, at in _listening() if at == port} == {"127.0.0.1"}
@@ -220,7 +220,7 @@ def test_only_this_machine_is_served(shown: view.View) -> None:
     assert shown.server.request_share_url() is None  # no tunnel, whoever asks
 
 
-def _head(shown: view.View, path: str, *lines: str) -> str:
+def _head(shown: view.SceneView, path: str, *lines: str) -> str:
     """First line of the answer to a request."""
     port = shown.server.get_port()
     request = [f"GET {path} HTTP/1.1", *(line.format(port=port) for line in lines), "", ""]
@@ -240,7 +240,7 @@ LOCAL, UPGRADE = (
 )
 
 
-def test_other_pages_of_the_browser_get_nothing(shown: view.View) -> None:
+def test_other_pages_of_the_browser_get_nothing(shown: view.SceneView) -> None:
     """Neither by the address of this machine, nor by a name of theirs that points to it."""
     path = "/" + shown.address.split("/", 3)[3]
     own = "Origin: http://127.0.0.1:{port}"
@@ -266,14 +266,14 @@ def test_other_pages_of_the_browser_get_nothing(shown: view.View) -> None:
     assert len(path) > 20
 
 
-def test_the_token_is_another_each_time(scene: view.Scene, shown: view.View) -> None:
+def test_the_token_is_another_each_time(scene: view.RunScene, shown: view.SceneView) -> None:
     second = view.serve(scene, 0)
     second.stop()
     assert second.address.split("/")[3] != shown.address.split("/")[3]
 
 
 def test_a_viser_that_cannot_be_guarded_is_refused(
-    scene: view.Scene, monkeypatch: pytest.MonkeyPatch
+    scene: view.RunScene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("viser", reason="viser is not installed: pip install 'gsba[view]'")
     monkeypatch.setattr("gsba.view.server.guarded", lambda token: nullcontext([]))
@@ -362,7 +362,7 @@ def test_ctrl_c_ends_it_quietly(run: Path) -> None:
     assert (process.returncode, rest.strip(), errors) == (0, "", "")
 
 
-def test_distances_to_a_scan_colour_the_points(run: Path, scene: view.Scene) -> None:
+def test_distances_to_a_scan_colour_the_points(run: Path, scene: view.RunScene) -> None:
     num, path = len(scene.reconstruction.points_world), run / "scan.json"
     points = {"of": num, "furthest": 1.0, "rows": [2, 0], "distances": [0.0, 5.0]}
     assert scene.judged is None
