@@ -307,9 +307,9 @@ class _Tests:
     def _is_of_unrefined(self, step: int) -> bool:
         """True if a step ends at an unrefined frame, a reason of its own, and points that are seen
         from both sides of it hand the scale on."""
-        moved = self.figures.moved_by_scale[step : step + 1]
-        at_one = step in self.figures.unrefined or step + 1 in self.figures.unrefined
-        return at_one and all(0 <= part <= MAX_POSITION_ERROR / 2 for part in moved)
+        if step not in self.figures.unrefined and step + 1 not in self.figures.unrefined:
+            return False
+        return 0 <= self.figures.moved_by_scale[step] <= MAX_POSITION_ERROR / 2
 
     def _loosely_scaled(self) -> Iterator[Reason]:
         """Steps over which the scale is not carried on."""
