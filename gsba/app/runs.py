@@ -79,7 +79,7 @@ def _verdict(report: dict[str, Any]) -> dict[str, Any] | None:
         "sentence": str(found["sentence"]).removeprefix(f"{level}: "),
         "reasons": [str(one["line"]) for one in reasons if "line" in one],
         "doubted": sorted(
-            {name for one in reasons if one.get("leave_out") for name in one["frames"]}
+            {name for one in reasons if one.get("leave_out") for name in one.get("frames") or ()}
         ),
     }
 

@@ -189,20 +189,37 @@ def _ransac(
     bearings0: np.ndarray, bearings1: np.ndarray, least: int, settings: TwoViewLimits, seed: int
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """f0_T_f1 (4, 4) and inliers (m,) bool of the pose with the most inliers, at least `least`."""
+    share, trials = least / len(bearings0), (50, 3000)
+    found = sampled_pose(bearings0, bearings1, settings.max_error_deg, share, trials, seed)
+    if found is None:
+        return None
+    f0_T_f1 = inverse(found[0])
+    f0_T_f1[:3, 3] /= max(np.linalg.norm(f0_T_f1[:3, 3]), 1e-12)
+    return f0_T_f1, found[1]
+
+
+def sampled_pose(
+    bearings0: np.ndarray,
+    bearings1: np.ndarray,
+    max_error_deg: float,
+    min_inlier_share: float,
+    trials: tuple[int, int],
+    seed: int,
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """f1_T_f0 (4, 4) of any scale and inliers (m,) bool of the pose with the most inliers, by
+    COLMAP's RANSAC with a least and a largest number of trials; None = no pose."""
     import pycolmap
 
     options = pycolmap.RANSACOptions()
-    options.max_error = np.deg2rad(settings.max_error_deg)
-    options.min_num_trials, options.max_num_trials = 50, 3000
-    options.min_inlier_ratio = least / len(bearings0)
+    options.max_error = np.deg2rad(max_error_deg)
+    options.min_num_trials, options.max_num_trials = trials
+    options.min_inlier_ratio = min_inlier_share
     options.random_seed = seed
     found = pycolmap.estimate_relative_pose(bearings0, bearings1, options)
     if found is None:
         return None
-    f1_T_f0 = found["cam2_from_cam1"].matrix()
-    f0_T_f1 = inverse(pose(f1_T_f0[:, :3], f1_T_f0[:, 3]))
-    f0_T_f1[:3, 3] /= max(np.linalg.norm(f0_T_f1[:3, 3]), 1e-12)
-    return f0_T_f1, np.asarray(found["inlier_mask"], bool)
+    matrix = found["cam2_from_cam1"].matrix()
+    return pose(matrix[:, :3], matrix[:, 3]), np.asarray(found["inlier_mask"], bool)
 
 
 def _normals(f0_T_f1: np.ndarray, bearings0: np.ndarray) -> np.ndarray:

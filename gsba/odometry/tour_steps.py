@@ -19,6 +19,7 @@ from gsba.features.detection import SiftExtractor, extract
 from gsba.frames import cubemap
 from gsba.frames.panorama import Greys
 from gsba.geometry import angles_between, inverse, pose, rotation_angle, unit
+from gsba.matching.verification import sampled_pose
 from gsba.odometry.patch_search import search_patches
 from gsba.types import FrameSet
 from gsba.types.records import slices
@@ -159,20 +160,13 @@ def _ransac(
     rays0: np.ndarray, rays1: np.ndarray, max_error_deg: float, seed: int = 0
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """f1_T_f0 (4, 4) of unit translation with the most inliers (M,) bool, or None."""
-    import pycolmap
-
     if len(rays0) < _MIN_MATCHES:
         return None
-    options = pycolmap.RANSACOptions()
-    options.max_error, options.random_seed = np.deg2rad(max_error_deg), seed
-    options.min_num_trials, options.max_num_trials = 1000, 10000
-    options.min_inlier_ratio = 0.1
-    found = pycolmap.estimate_relative_pose(rays0, rays1, options)
+    found = sampled_pose(rays0, rays1, max_error_deg, 0.1, (1000, 10000), seed)
     if found is None:
         return None
-    matrix = found["cam2_from_cam1"].matrix()
-    inliers = np.asarray(found["inlier_mask"], bool)
-    return pose(matrix[:, :3], unit(matrix[:, 3])), inliers
+    f1_T_f0, inliers = found
+    return pose(f1_T_f0[:3, :3], unit(f1_T_f0[:3, 3])), inliers
 
 
 def adjusted_pose(
