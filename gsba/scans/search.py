@@ -99,8 +99,11 @@ def main_axes(normals: np.ndarray) -> np.ndarray:
     z = (np.arange(1500) + 0.5) / 1500  # over half the sphere, by Fibonacci's lattice
     turn, flat = np.pi * (1 + np.sqrt(5)) * np.arange(1500), np.sqrt(1 - z * z)
     tried = np.stack([flat * np.cos(turn), flat * np.sin(turn), z], axis=1)
-    cosines = np.abs(tried @ some.T)
-    votes = np.sum(np.exp((cosines**2 - 1) / np.radians(5) ** 2 / 2), axis=1)
+    votes = np.zeros(len(tried))
+    cosines = tried @ some.T
+    for rows in np.split(np.arange(len(tried)), 50):  # few at a time stay in the processor's cache
+        exponents = (cosines[rows] ** 2 - 1) / np.radians(5) ** 2 / 2
+        votes[rows] = np.sum(np.exp(exponents, out=exponents), axis=1)
     first = _centred(some, tried[np.argmax(votes)])
     level = np.abs(tried @ first) < np.sin(np.radians(8))
     second = _centred(some, tried[np.argmax(np.where(level, votes, -1))])
@@ -150,17 +153,18 @@ def _by_axes(cloud: Cloud, scan: Scan, guess: Guess) -> Iterator[Sim3]:
         correlated = np.fft.irfft(np.conj(np.fft.rfft(own, 2 * _BINS)) * spectra, axis=1)
         values[i, flip, :, n], bins = _peaks(correlated)
         shifts[i, flip, :, n] = bins * width - start + low[:, None]
+    centre = of_cloud.T @ middle
     for turn in _turns():
         rotation = of_scan.T @ turn @ of_cloud
+        centres = [scale * rotation @ centre for scale in scales]
         axes = np.argmax(np.abs(turn), axis=1)
         flips = (turn[range(3), axes] < 0).astype(int)
         x, y, z = (values[axes[j], flips[j], j] for j in range(3))
         sums = x[:, :, None, None] + y[:, None, :, None] + z[:, None, None, :]
-        for at in _largest(sums, 150):
-            n, *peaks = (int(k) for k in np.unravel_index(at, sums.shape))
-            shift = [shifts[axes[j], flips[j], j, n, peaks[j]] for j in range(3)]
-            moved = of_scan.T @ np.array(shift) - scales[n] * rotation @ (of_cloud.T @ middle)
-            fit = Sim3(float(scales[n]), rotation, moved)
+        numbers, *peaks = np.unravel_index(_largest(sums, 150), sums.shape)
+        at = [shifts[axes[j], flips[j], j, numbers, peaks[j]] for j in range(3)]
+        for n, shift in zip(numbers.tolist(), np.stack(at, axis=1), strict=True):
+            fit = Sim3(float(scales[n]), rotation, of_scan.T @ shift - centres[n])
             if not guess.allows(fit):
                 break
             yield fit
