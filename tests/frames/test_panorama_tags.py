@@ -1,6 +1,7 @@
 """GPano tags of stills, and pictures without tags that are no panoramas."""
 
 import struct
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -106,16 +107,19 @@ def _stereo(axis: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("pixels", "name"),
+    ("draw", "name"),
     [
-        (_panorama()[ROWS, COLUMNS], "a cropped panorama"),
-        (_panorama()[:384, COLUMNS], "a cropped panorama"),
-        (_panorama()[128:, COLUMNS], "a cropped panorama"),
-        (_stereo(0), "stereo, one eye above the other"),
-        (_stereo(1), "stereo, an eye on the left"),
-        (np.tile(_panorama()[:, 256:768], (1, 2, 1)), "VR180"),
-        (np.concatenate([_panorama(), np.roll(_panorama(), -8, 1)]), "one eye above the other"),
-        (np.concatenate([picture(lens) for lens in made_pair()]), "two fisheyes one above"),
+        (lambda: _panorama()[ROWS, COLUMNS], "a cropped panorama"),
+        (lambda: _panorama()[:384, COLUMNS], "a cropped panorama"),
+        (lambda: _panorama()[128:, COLUMNS], "a cropped panorama"),
+        (lambda: _stereo(0), "stereo, one eye above the other"),
+        (lambda: _stereo(1), "stereo, an eye on the left"),
+        (lambda: np.tile(_panorama()[:, 256:768], (1, 2, 1)), "VR180"),
+        (
+            lambda: np.concatenate([_panorama(), np.roll(_panorama(), -8, 1)]),
+            "one eye above the other",
+        ),
+        (lambda: np.concatenate([picture(lens) for lens in made_pair()]), "two fisheyes one above"),
     ],
     ids=[
         "cropped",
@@ -128,8 +132,10 @@ def _stereo(axis: int) -> np.ndarray:
         "stacked",
     ],
 )
-def test_what_pictures_show_is_named(tmp_path: Path, pixels: np.ndarray, name: str) -> None:
-    folder = _folder(tmp_path / "a", [pixels] * 3, None, ".jpg")
+def test_what_pictures_show_is_named(
+    tmp_path: Path, draw: Callable[[], np.ndarray], name: str
+) -> None:
+    folder = _folder(tmp_path / "a", [draw()] * 3, None, ".jpg")
     with pytest.raises(GsbaError, match=name):
         scan(folder, order_suffices=True)
 

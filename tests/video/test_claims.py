@@ -1,6 +1,7 @@
 """Claims of video files about their pictures, each read from a file made here."""
 
 import struct
+from collections.abc import Callable
 from fractions import Fraction
 from functools import partial
 from pathlib import Path
@@ -170,16 +171,22 @@ def _halves(axis: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("pixels", "name"),
+    ("draw", "name"),
     [
-        (_halves(0), "stereo, one eye above the other"),
-        (wave_panorama(512)[32:224, 64:448], "a cropped panorama"),
-        (np.concatenate([_panorama(), np.roll(_panorama(), -3, 1)]), "one eye above the other"),
+        (lambda: _halves(0), "stereo, one eye above the other"),
+        (lambda: wave_panorama(512)[32:224, 64:448], "a cropped panorama"),
+        (
+            lambda: np.concatenate([_panorama(), np.roll(_panorama(), -3, 1)]),
+            "one eye above the other",
+        ),
     ],
     ids=["over-under", "cropped", "square"],
 )
-def test_what_pictures_show_is_named(tmp_path: Path, pixels: np.ndarray, name: str) -> None:
+def test_what_pictures_show_is_named(
+    tmp_path: Path, draw: Callable[[], np.ndarray], name: str
+) -> None:
     """More of them, see frames/test_panorama_tags.py: the pictures are judged alike."""
+    pixels = draw()
     big = cv2.resize(pixels, (2 * WIDTH, 2 * WIDTH * pixels.shape[0] // pixels.shape[1]))
     with pytest.raises(GsbaError, match=name):
         read_recording(_write(tmp_path / "a.mp4", [big] * 3))
