@@ -24,10 +24,11 @@ from cameras_home import (
 )
 from growing_home import GrowingHome, make_growing_home
 from made_once import MadeOnce
-from one_gallery import gallery, oval_walk
+from one_gallery import oval_walk
 from tiny_run import PLAIN, Case, make_case
 
 from gsba.demo import DemoWalk
+from gsba.demo.gallery import build_gallery
 from gsba.features import FaceKeypoints, SiftExtractor
 
 # Files and folders whose tests take longest begin first, so that no worker is left alone with them.
@@ -125,7 +126,7 @@ def plain_run(case: Case, made_once: MadeOnce) -> Path:
 @pytest.fixture(scope="session", autouse=True)
 def _found_once(made_once: MadeOnce) -> Iterator[None]:
     """Dozens of runs read the same pictures: keypoints of a face, a third of a run's time, are
-    found once for all workers, and the demo's gallery is built once in each."""
+    found once for all workers, and the demo's gallery is built once."""
     find, folder = SiftExtractor.__call__, made_once("keypoints", lambda folder: folder)
 
     def find_once(
@@ -140,6 +141,7 @@ def _found_once(made_once: MadeOnce) -> Iterator[None]:
             new.rename(kept)
         return pickle.loads(kept.read_bytes())
 
+    gallery = cache(lambda: made_once("gallery", lambda _: build_gallery()))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(SiftExtractor, "__call__", find_once)
         patch.setattr("gsba.demo.gallery.build_gallery", gallery)

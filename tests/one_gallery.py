@@ -1,18 +1,17 @@
-"""The demo's gallery, built once per process for all tests, and a walk that is rendered in it."""
+"""The demo's gallery, built once for all tests, and a walk that is rendered in it."""
 
-from functools import cache
 from pathlib import Path
 
+import gsba.demo.gallery
 from gsba.demo import DemoWalk, make_walk
-from gsba.demo.gallery import build_gallery
 from gsba.demo.raycast import Scene
 
 OVAL_FRAMES, OVAL_WIDTH = 20, 512
 
 
-@cache
 def gallery() -> Scene:
-    return build_gallery()
+    """The scene that `conftest.py` keeps; tests only read it."""
+    return gsba.demo.gallery.build_gallery()
 
 
 def oval_walk(out: Path) -> DemoWalk:

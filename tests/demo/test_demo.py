@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 import pytest
 from command import run_gsba, succeed
-from one_gallery import gallery
 from pixels import pixel_centres
 from scipy.spatial.transform import Rotation
 from synthetic import unit
@@ -20,6 +19,7 @@ from gsba.camera.sphere import bearings_from_erp, erp_from_bearings
 from gsba.cli.refining import _found_lenses
 from gsba.demo import degrade, make_walk
 from gsba.demo.degrade import Drift
+from gsba.demo.gallery import build_gallery
 from gsba.demo.mesh import MeshBuilder
 from gsba.demo.raycast import ranges
 from gsba.demo.render import render_erp
@@ -196,7 +196,7 @@ def test_depth_and_truth_carry_one_frame_into_the_next(walk):
 
 
 def test_walk_is_reproducible_and_replaces_only_walks(walk, tmp_path, monkeypatch):
-    monkeypatch.setattr("gsba.demo.gallery.build_gallery", gallery.__wrapped__)  # built anew
+    monkeypatch.setattr("gsba.demo.gallery.build_gallery", build_gallery)  # built anew
     again = make_walk(tmp_path / "again", num_frames=FRAMES, width=WIDTH, seed=3)
     for first, second in ((walk.slam_path, again.slam_path), (walk.truth_path, again.truth_path)):
         assert first.read_bytes() == second.read_bytes()
