@@ -422,12 +422,16 @@ def test_a_dataset_is_of_the_chosen_map_and_goes_without_frames_in_doubt(
     page.route("**/api/add", refused)
     box, maps = page.get_by_label("Leave out frames in doubt"), page.locator("#map-number")
     acts = (lambda: None, box.uncheck, lambda: maps.select_option("2: 3 frames"))
+    trainer, titles = page.get_by_role("button", name="Postshot"), []
     for number, act in enumerate(acts, start=1):
         act()
-        page.get_by_role("button", name="Postshot").click()
+        titles.append(trainer.get_attribute("title"))
+        trainer.click()
         page.get_by_text(f"{number} heard").wait_for()
     plain = {"run": "doubted", "to": "postshot", "up": "auto"}
     assert asked == [plain | {"without": ["doubted"]}, plain, plain | {"map_number": "2"}]
+    line = "gsba export doubted --to postshot --up auto"
+    assert titles == [f"{line} --without doubted", line, f"{line} --map 2"]
     assert fits(page)
 
 
