@@ -108,6 +108,8 @@ def opened(browser: Any, address: str, size: dict[str, int]) -> Any:
 
 def picture(page: Any, name: str) -> None:
     if folder := os.environ.get("GSBA_PICTURES"):
+        # The folder of a test is nobody's.
+        page.evaluate("scrollTo(0, 0); document.getElementById('root').textContent = '~/footage'")
         page.screenshot(path=f"{folder}/{name}.jpg", type="jpeg", quality=80)
 
 
@@ -238,6 +240,7 @@ def test_from_a_video_to_a_dataset(browser: Any, server: Server) -> None:
         page.get_by_role("button", name="Take this folder").click()
         page.get_by_role("columnheader", name=name).wait_for()
     assert fits(page)
+    page.locator(".files .shot img").nth(2).wait_for()
     picture(page, "app-compare")
     page.get_by_role("button", name="Plot them side by side").click()
     page.get_by_role("heading", name="plot compared/first-second").wait_for()
@@ -340,6 +343,37 @@ def test_all_that_can_be_used_has_a_name(browser: Any, server: Server) -> None:
     assert nameless == []
     assert page.evaluate("document.querySelectorAll('h1').length") == 1
     assert page.faults == []
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_axe_finds_no_fault(browser: Any, server: Server, scheme: str) -> None:
+    """Lists, a start with its options, the queue, a run and its report, on a desk and a phone."""
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
+    folder, found = server.root / "seen", list[str]()
+    if not (folder / "report.html").exists():
+        line = ("refine", "walk.mp4", "--out", "seen", "--config", "fast")
+        subprocess.run([*GSBA, *line], cwd=server.root, check=True, capture_output=True)
+    ready = {
+        f"{server.address}#files": "refined",
+        f"{server.address}#start/walk.mp4": "Drag to look around.",
+        f"{server.address}#jobs": "One job runs at a time.",
+        f"{server.address}#run/seen": "Dataset for your trainer",
+        f"{server.address}#compare/seen": "Figures",
+        folder.joinpath("report.html").as_uri(): "Share of time",
+    }
+    for address, text in ready.items():
+        page = browser.new_page(viewport=DESK, color_scheme=scheme)
+        page.set_default_timeout(RUN_MS)
+        page.goto(address)
+        page.get_by_text(text).first.wait_for(state="attached")
+        for each in page.locator("details").all():
+            each.evaluate("(one) => { one.open = true; }")
+        for size in (DESK, PHONE):
+            page.set_viewport_size(size)
+            faults = axe.run(page).response["violations"]
+            found += [f"{address} {one['id']}: {one['nodes'][0]['html']}" for one in faults]
+        page.close()
+    assert found == []
 
 
 def held(server: Server, run: str) -> int:
