@@ -49,6 +49,10 @@ trajectories are alike: rates are less certain than their bounds. The limits wer
 first 184 of 248 runs.
 """
 EVERY = {1: "every frame", 2: "every second frame", 3: "every third frame"}
+_UNSHOWN = (
+    "no image shows",
+    "hardly any matches",
+)  # reasons: what the run started from is believed
 STARTS = {  # arguments of `degrade`; none = no trajectory
     "none": None,
     "good": {},
@@ -251,7 +255,10 @@ def table(rows: Sequence[Judged]) -> list[str]:
     passed = sum(row.level == Level.GOOD for row in off)
     doubted = sum(row.level != Level.GOOD for row in right)
     lines += ["", f"Called good though off: {_rate(passed, len(off))}."]
-    lines += [f"Doubted though right: {_rate(doubted, len(right))}.", ""]
+    lines += [f"Doubted though right: {_rate(doubted, len(right))}."]
+    shown = [row for row in right if not any(test.startswith(_UNSHOWN) for test in row.tests)]
+    doubted = sum(row.level != Level.GOOD for row in shown)
+    lines += [f"Of these, where images show every step: {_rate(doubted, len(shown))}.", ""]
     ratios = np.array([row.error / row.bound for row in right if row.bound > 0])
     beyond = int(np.count_nonzero(ratios > 1))
     lines.append(

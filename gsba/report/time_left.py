@@ -11,6 +11,8 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from gsba.config import RefineSettings
 from gsba.log import event
 from gsba.types import FrameSet
@@ -37,6 +39,7 @@ PHASES = (
     r"imu_final|camera|reconstruction|lenses|map|export-.*",
 )
 FEATURES, CAMERA, WEAK, KNOWN, FIRST_PATCHES, LAST_PATCHES = 1, 5, 6, 7, 8, 11  # of phases
+_PATCHES = range(FIRST_PATCHES, LAST_PATCHES + 1)
 OPTIONAL = {WEAK, FIRST_PATCHES + 2, LAST_PATCHES}  # phases that what was found so far decides on
 # Of each phase: share of its seconds in which one thread works alone, and coefficients of
 # `Size.terms`, seconds on two cores. Made by `python -m benchmarks.time_left fit`.
@@ -67,6 +70,7 @@ _TOUR = "tour"  # stage of few runs, which its own work tells the time of
 _TRACKING_S = 0.04  # seconds of odometry for each frame of the video
 _CLOSING_S = (0.03, 0.2)  # thereafter for each keyframe, as the path comes back or not
 _PRIOR_S = 4.0  # seconds of the table that count as if they were measured at its speed
+_PATCHES_PRIOR_S = 0.5  # seconds of the table of patches that count as if measured at its speed
 _MAX_MEGAPIXELS_SEARCHED = 1.2  # of a panorama: faces and patches are cut no finer from more
 _TABLE_THREADS = 2
 _MIN_BETWEEN_LINES_S = 20.0  # seconds between lines of the log with the time left
@@ -167,7 +171,8 @@ class TimeLeft:
     def __init__(self) -> None:
         self._size: Size | None = None
         self._phase, self._phase_began = 0, 0.0
-        self._measured, self._expected = 0.0, 0.0  # seconds of ended phases; by the table
+        # Seconds of ended phases and seconds by the table, of all and of rounds of patches.
+        self._ended, self._aligned = np.zeros(2), np.zeros(2)
         self._passes = 0
         self._lenses = False  # True = an adjustment under two lenses was seen
         self._whole = True  # False = a stage of this phase was resumed
@@ -230,8 +235,9 @@ class TimeLeft:
             return work_left + ahead if work_left else None
         if self._stage and phase_of(self._stage) is None:
             return None
-        here = max(speed * size.seconds(self._phase) - spent, work_left)
-        return here + speed * self._ahead(size, self._phase + 1, is_most)
+        pace = self._pace(speed) if self._phase in _PATCHES else speed
+        here = max(pace * size.seconds(self._phase) - spent, work_left)
+        return here + speed * self._ahead(size, self._phase + 1, is_most, self._pace(speed) / speed)
 
     @property
     def size(self) -> Size | None:
@@ -252,27 +258,36 @@ class TimeLeft:
             return replace(size, lenses=float(is_most and self._phase <= CAMERA))
         return replace(size, lenses=size.lenses if self._phase <= CAMERA else 0.0)
 
-    def _ahead(self, size: Size, phase: int, is_most: bool) -> float:
-        """Seconds by the table of phases from `phase` on, and of further passes; of optional phases
-        if `is_most`."""
+    def _ahead(self, size: Size, phase: int, is_most: bool, pace: float = 1.0) -> float:
+        """Seconds by the table of phases from `phase` on, rounds of patches times `pace`, and of
+        further passes; of optional phases if `is_most`."""
         more = max(size.passes[is_most] - self._passes, 0.0)
         again = replace(size, uncut=False)
         left_out = set() if is_most else OPTIONAL
         repeated = range(FEATURES, (LAST_PATCHES if size.raw else CAMERA) + 1)
         ahead, further = (
-            sum(one.seconds(number) for number in phases if number not in left_out)
+            sum(
+                one.seconds(number) * (pace if number in _PATCHES else 1.0)
+                for number in phases
+                if number not in left_out
+            )
             for one, phases in ((size, range(phase, len(PHASES))), (again, repeated))
         )
         return ahead + more * further
 
     def _speed(self, size: Size) -> float:
         """Seconds for each of the table."""
-        measured, expected = self._measured, self._expected
-        work = self._work
+        (measured, expected), work = self._ended, self._work
         if work is not None and self._phase == FEATURES:
             measured += work.at - work.began
             expected += size.seconds(FEATURES) * (work.done - work.first) / size.frames
         return (measured + _PRIOR_S) / (expected + _PRIOR_S)
+
+    def _pace(self, speed: float) -> float:
+        """Seconds of a round of patches for each of the table, by the rounds that have ended; the
+        machine's `speed` before."""
+        measured, expected = self._aligned
+        return (measured + _PATCHES_PRIOR_S * speed) / (expected + _PATCHES_PRIOR_S)
 
     def _seconds_of_odometry(self, size: Size, now: float, is_most: bool) -> float | None:
         """Seconds of the odometry, and of all that comes after it."""
@@ -300,8 +315,10 @@ class TimeLeft:
         if phase is None or phase == self._phase or self._size is None:
             return
         if self._whole and self._phase >= FEATURES:
-            self._measured += now - self._phase_began
-            self._expected += self._known(self._size).seconds(self._phase)
+            expected = self._known(self._size).seconds(self._phase)
+            self._ended += now - self._phase_began, expected
+            if self._phase in _PATCHES:
+                self._aligned += now - self._phase_began, expected
         if phase < self._phase and phase <= FEATURES:
             self._passes += self._phase > FEATURES
         self._phase, self._phase_began, self._whole = phase, now, True

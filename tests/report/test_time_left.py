@@ -13,6 +13,7 @@ from gsba.report import time_left
 from gsba.report.time_left import (
     CAMERA,
     FEATURES,
+    FIRST_PATCHES,
     LAST_PATCHES,
     OPTIONAL,
     PHASES,
@@ -196,6 +197,21 @@ def test_patches_take_as_long_as_the_map_has_observations() -> None:
         map_ = {"event": "map", "name": "refined1", "observations": observations, "time": now}
         found.append(left(told(*events[:16], map_, width=500), now))
     assert 1.1 * found[0] < found[1] < 2.0 * found[0]
+
+
+def test_rounds_of_patches_tell_the_time_of_the_next_ones() -> None:
+    usual, slow = (stages(STAGES, speed=1.0) for _ in range(2))
+    second = STAGES.index("align2")
+    for entry in slow[2 * second :]:  # the first round has taken twice as long
+        entry["time"] += CENTRAL.seconds(FIRST_PATCHES)
+    now = usual[2 * second]["time"]
+    stated, other = (
+        left(told(*events[: 2 * second + 1]), events[2 * second]["time"])
+        for events in (usual, slow)
+    )
+    rounds = sum(CENTRAL.seconds(n) for n in range(second, LAST_PATCHES + 1))
+    assert stated == pytest.approx(whole(CENTRAL) - now)
+    assert stated + 0.5 * rounds < other < 2.0 * stated
 
 
 def test_a_second_pass_of_raw_frames() -> None:
