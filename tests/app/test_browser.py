@@ -181,6 +181,7 @@ def test_from_a_video_to_a_dataset(browser: Any, server: Server) -> None:
     phone.get_by_role("heading", name="Stages").wait_for()
     assert fits(phone)
     page.locator(".stages li").nth(12).wait_for()
+    page.locator("canvas.panorama[data-shown*='frame=']").wait_for()
     picture(page, "app-watch")
     # The server is killed: the run goes on, both pages say so and find the next server.
     server.kill()
