@@ -21,8 +21,16 @@ from typing import Any
 import numpy as np
 from scipy.optimize import nnls
 
-from gsba.app.progress import Progress
-from gsba.report.time_left import FEATURES, PHASES, UNDER_LENSES, Size, TimeLeft, phase_of
+from gsba.report.time_left import (
+    FEATURES,
+    OPTIONAL,
+    PHASES,
+    UNDER_LENSES,
+    Size,
+    TimeLeft,
+    in_words,
+    phase_of,
+)
 
 SHARES = (0.1, 0.25, 0.5, 0.75)  # of a run, after which its time left is compared
 
@@ -118,7 +126,8 @@ def fit(runs: Sequence[Sequence[dict[str, Any]]]) -> None:
     """Print the phases with costs that fit the shares of all runs best, none below zero."""
     rows = [row for events in runs for row in spent(events)]
     for number in range(len(PHASES)):
-        chosen = [row for row in rows if row.phase == number]
+        # What an optional phase costs is asked where it has come.
+        chosen = [r for r in rows if r.phase == number and (r.seconds or number not in OPTIONAL)]
         weights = np.array([1 / (row.seconds + 0.4 * row.total) for row in chosen])
         terms = np.array([row.size.terms(number) for row in chosen]) * weights[:, None]
         costs, _ = nnls(terms, np.array([row.seconds for row in chosen]) * weights)
@@ -126,23 +135,30 @@ def fit(runs: Sequence[Sequence[dict[str, Any]]]) -> None:
         print(f"    ({', '.join(f'{value:.3g}' for value in (serial, *costs))}),")
 
 
-def ratios(events: Sequence[dict[str, Any]], clock: str) -> list[tuple[float, float | None]]:
-    """Stated time left over the one that the run took, at each of SHARES of it: of the whole run,
-    and of the work at hand (None = not stated)."""
+def stated(
+    events: Sequence[dict[str, Any]], clock: str
+) -> list[tuple[float, tuple[float, float] | None]]:
+    """Seconds that were left at each of SHARES of a run, and the least and most that were stated
+    (None = nothing was)."""
     began, end = (events[n]["time"] if clock == "time" else 0.0 for n in (0, -1))
     end = end if clock == "time" else events[-1]["quiet"]
     found = []
     for share in SHARES:
-        now, whole, progress = began + share * (end - began), TimeLeft(), Progress()
+        now, whole = began + share * (end - began), TimeLeft()
         for entry in events:
             if entry[clock] <= now:
                 whole.add({**entry, "time": entry[clock]})
-                progress.add(entry)
-        work = progress.seconds_of_work()
-        left = (1 - share) * (end - began)
-        stated = whole.seconds(now)
-        found.append((np.nan if stated is None else stated / left, work and work / left))
+        found.append(((1 - share) * (end - began), whole.seconds(now)))
     return found
+
+
+def holds(left: float, seconds: tuple[float, float]) -> bool:
+    """True if a statement is right: its one duration, or the nearer end of its range, within a
+    third."""
+    least, most = seconds
+    if in_words(seconds).startswith("about"):
+        least = most = (least * most) ** 0.5
+    return 2 / 3 * least <= left <= 4 / 3 * most
 
 
 def main() -> None:
@@ -160,15 +176,19 @@ def main() -> None:
     if given.what == "fit":
         fit(list(runs.values()))
         return
-    print(
-        "| run | s |"
-        + "".join(f" {kind} {share:.0%} |" for kind in ("before", "after") for share in SHARES)
-    )
-    print("|---|---:|" + 2 * len(SHARES) * "---:|")
-    for name, events in runs.items():
-        whole, work = zip(*ratios(events, given.clock), strict=True)
-        cells = ["" if ratio is None else f"{ratio:.2f}" for ratio in (*work, *whole)]
-        print(f"| {name} | {events[-1]['quiet']:.0f} | {' | '.join(cells)} |")
+    print(f"| run | s |{''.join(f' {share:.0%} |' for share in SHARES)}")
+    print("|---|---:|" + len(SHARES) * "---:|")
+    table = {name: stated(events, given.clock) for name, events in runs.items()}
+    for name, row in table.items():
+        cells = [f"{left:.0f}: {in_words(told) if told else ''}" for left, told in row]
+        print(f"| {name} | {runs[name][-1]['quiet']:.0f} | {' | '.join(cells)} |")
+    for title, chosen in (("one duration", True), ("a range", False)):
+        cells = []
+        for column in zip(*table.values(), strict=True):
+            told = [(left, one) for left, one in column if one]
+            told = [(x, one) for x, one in told if in_words(one).startswith("about") == chosen]
+            cells.append(f"{sum(holds(*one) for one in told)} of {len(told)}")
+        print(f"| right within a third, {title} | | {' | '.join(cells)} |")
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ there."""
 
 import errno
 import fcntl
+import math
 import os
 import re
 import shutil
@@ -294,9 +295,14 @@ def _refuse_other_files(name: str) -> None:
 
 def _no_room(drop: Drop, left: int, free: int) -> str:
     """Line about a disk that is too small."""
-    missing, arrived, usable = max(left - free, 1) / 1e9, drop.arrived, max(free, 0) / 1e9
+    missing, arrived = max(left - free, 1), drop.arrived
     kept = f"; {100 * arrived // drop.size} % of it is kept" if arrived else ""
     return (
-        f"the disk is full: {drop.name} needs {left / 1e9:.1f} GB more, and {usable:.1f} GB can be "
-        f"used: free {missing:.2g} GB, then drop it again{kept}"
+        f"the disk is full: {drop.name} needs {_size(left)} more, and {_size(max(free, 0))} can be "
+        f"used: free {_size(missing)}, then drop it again{kept}"
     )
+
+
+def _size(num: float) -> str:
+    """Bytes in GB, or in whole MB, rounded up."""
+    return f"{num / 1e9:.1f} GB" if num >= 1e9 else f"{math.ceil(num / 1e6)} MB"

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gsba.report.time_left import TimeLeft
+from gsba.report.time_left import TimeLeft, in_words
 
 
 def read_events(path: Path, offset: int = 0) -> tuple[list[dict[str, Any]], int]:
@@ -84,9 +84,10 @@ class Progress:
         """Names of the stages that have ended, in order."""
         return [str(stage.get("name")) for stage in self.stages]
 
-    def seconds_left(self) -> float | None:
-        """Seconds that the whole run still takes; None = not known."""
-        return self.time_left.seconds(time.time())
+    def left_in_words(self) -> str:
+        """Time that the whole run still takes, in words; "" = not known."""
+        seconds = self.time_left.seconds(time.time())
+        return "" if seconds is None else in_words(seconds)
 
     def seconds_of_work(self) -> float | None:
         """Seconds that the work at hand still takes at its speed so far; None = not known."""
@@ -102,7 +103,7 @@ class Progress:
             "stages": self.stages,
             "stage": self.stage,
             "work": self.work,
-            "seconds_left": self.seconds_left(),
+            "left": self.left_in_words(),
             "seconds_of_work": self.seconds_of_work(),
             "warnings": self.warnings,
             "error": self.error,

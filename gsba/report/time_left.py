@@ -1,12 +1,17 @@
-"""Time that a refinement still takes, from its events: costs by a table, at the speed so far."""
+"""Time that a refinement still takes, from its events: costs by a table, at the speed so far. It is
+a range, from the least to the most that is still possible: nothing tells beforehand whether two
+lenses will be found, weak frames need more keypoints, or patches a third round."""
 
 import logging
+import math
 import re
 import time
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
+
+import numpy as np
 
 from gsba.config import RefineSettings
 from gsba.log import event
@@ -34,6 +39,8 @@ PHASES = (
     r"imu_final|camera|reconstruction|lenses|map|export-.*",
 )
 FEATURES, CAMERA, WEAK, KNOWN, FIRST_PATCHES, LAST_PATCHES = 1, 5, 6, 7, 8, 11  # of phases
+_PATCHES = range(FIRST_PATCHES, LAST_PATCHES + 1)
+OPTIONAL = {WEAK, FIRST_PATCHES + 2, LAST_PATCHES}  # phases that what was found so far decides on
 # Of each phase: share of its seconds in which one thread works alone, and coefficients of
 # `Size.terms`, seconds on two cores. Made by `python -m benchmarks.time_left fit`.
 _COSTS = (
@@ -51,23 +58,24 @@ _COSTS = (
     (0.601, 0, 0, 0.00724, 0, 0, 0.0263, 0.026, 0.0124, 0),
     (0.65, 0.267, 0.000903, 0.0439, 0, 0, 0.000523, 0.0171, 0, 0),
 )
-# Nothing tells beforehand which of these comes: expectations that were off least in the runs of
-# the fit.
-# That two lenses are found in panoramas, after which patches take five times as long; by
-# `camera.model`.
-_LENSES = {"auto": 0.2, "central": 0.0, "two_lens": 1.0}
-_RAW_PASSES = 1.5  # of raw frames that nothing has calibrated, beyond the first one
+# Whether two lenses are found in panoramas, after which patches take five times as long; by
+# `camera.model`. None = nothing tells beforehand.
+_LENSES = {"auto": None, "central": 0.0, "two_lens": 1.0}
+_RAW_PASSES = (1.0, 2.0)  # least and most, of raw frames that nothing has calibrated, beyond the
+# first one
 _OBSERVATIONS = 950.0  # of the map for each frame
 _FRAMES_PER_KEYFRAME = 0.5  # that odometry chooses
 _ODOMETRY, _TRACKING = "odometry", "tracking"  # stage, and its work
 _TOUR = "tour"  # stage of few runs, which its own work tells the time of
-_TRACKING_S, _CLOSING_S = 0.04, 0.1  # seconds of odometry for each frame of the video; thereafter
-# for each keyframe: .03 to .2, as the path comes back or not
+_TRACKING_S = 0.04  # seconds of odometry for each frame of the video
+_CLOSING_S = (0.03, 0.2)  # thereafter for each keyframe, as the path comes back or not
 _PRIOR_S = 4.0  # seconds of the table that count as if they were measured at its speed
+_PATCHES_PRIOR_S = 0.5  # seconds of the table of patches that count as if measured at its speed
 _MAX_MEGAPIXELS_SEARCHED = 1.2  # of a panorama: faces and patches are cut no finer from more
 _TABLE_THREADS = 2
 _MIN_BETWEEN_LINES_S = 20.0  # seconds between lines of the log with the time left
 _MIN_TOLD_S = 10.0  # seconds left that a line is worth
+_MAX_SINGLE_RATIO = (4 / 3) ** 2  # of most to least time left, whose mean is a third off at most
 _ADJUSTED = re.compile(r"dense(_closer)?|closed|joined|refined\d+")  # maps of all observations
 _MIN_COUNTED_SHARE = 0.15  # of a work's items, from which on they tell how long it takes
 UNDER_LENSES = re.compile(r"(again_)?(lensed\d+|settled(_far)?)")  # stages where two were found
@@ -81,8 +89,8 @@ class Size:
     megapixels: float  # of a panorama
     trajectory: bool  # True = one of a file
     raw: bool  # True = fisheyes or tracks, not stitched
-    lenses: float  # probability that two lenses are found
-    passes: float  # expected beyond the first one
+    lenses: float | None  # 1 = two lenses, 0 = one centre, None = not known yet
+    passes: tuple[float, float]  # least and most beyond the first one
     rounds: int  # most rounds of patches
     threads: int
     uncut: bool  # True = raw frames are cut by lenses that nothing has calibrated
@@ -99,7 +107,7 @@ class Size:
             trajectory=bool(entry["trajectory"]),
             raw=raw,
             lenses=1.0 if raw else _LENSES[entry["camera"]],
-            passes=_RAW_PASSES if uncut else 0.0,
+            passes=_RAW_PASSES if uncut else (0.0, 0.0),
             rounds=int(entry["rounds"]),
             threads=max(int(entry["threads"]), 1),
             uncut=uncut,
@@ -116,7 +124,7 @@ class Size:
             self.frames * min(self.megapixels, _MAX_MEGAPIXELS_SEARCHED),
         )
         more = num * self.more
-        return 1.0, num, *pixels, absent, num * self.lenses, raw, uncut, more
+        return 1.0, num, *pixels, absent, num * (self.lenses or 0.0), raw, uncut, more
 
     def seconds(self, phase: int) -> float:
         """Expected seconds of a phase at the table's speed."""
@@ -163,7 +171,8 @@ class TimeLeft:
     def __init__(self) -> None:
         self._size: Size | None = None
         self._phase, self._phase_began = 0, 0.0
-        self._measured, self._expected = 0.0, 0.0  # seconds of ended phases; by the table
+        # Seconds of ended phases and seconds by the table, of all and of rounds of patches.
+        self._ended, self._aligned = np.zeros(2), np.zeros(2)
         self._passes = 0
         self._lenses = False  # True = an adjustment under two lenses was seen
         self._whole = True  # False = a stage of this phase was resumed
@@ -207,71 +216,95 @@ class TimeLeft:
             if name == _TRACKING:
                 self._tracked = self._work
 
-    def seconds(self, now: float) -> float | None:
-        """Expected seconds from a time on; None = the table does not tell."""
+    def seconds(self, now: float) -> tuple[float, float] | None:
+        """Least and most seconds from a time on; None = the table does not tell."""
+        least, most = (self._seconds(now, is_most) for is_most in (False, True))
+        return None if least is None or most is None else (least, most)
+
+    def _seconds(self, now: float, is_most: bool) -> float | None:
         size = self._size
         if size is None:
             return None
         if self._stage == _ODOMETRY or not size.frames:
-            return self._seconds_of_odometry(size, now)
-        size = self._known(size)
+            return self._seconds_of_odometry(size, now, is_most)
+        size = self._known(size, is_most)
         speed, spent = self._speed(size), now - self._phase_began
         work_left = 0.0 if self._work is None else self._work.seconds(now)
         if self._stage == _TOUR:
-            return work_left + speed * self._ahead(size, self._phase + 1) if work_left else None
+            ahead = speed * self._ahead(size, self._phase + 1, is_most)
+            return work_left + ahead if work_left else None
         if self._stage and phase_of(self._stage) is None:
             return None
-        here = max(speed * size.seconds(self._phase) - spent, work_left)
-        return here + speed * self._ahead(size, self._phase + 1)
+        pace = self._pace(speed) if self._phase in _PATCHES else speed
+        here = max(pace * size.seconds(self._phase) - spent, work_left)
+        return here + speed * self._ahead(size, self._phase + 1, is_most, self._pace(speed) / speed)
 
     @property
     def size(self) -> Size | None:
         """Size by what the phases so far have shown; None = no event has told of it."""
         return None if self._size is None else self._known(self._size)
 
-    def _known(self, size: Size) -> Size:
-        """The size by what the phases so far have shown."""
+    def _known(self, size: Size, is_most: bool = False) -> Size:
+        """The size by what the phases so far have shown; two lenses that may still be found are if
+        `is_most`."""
         size = replace(size, more=self._more)
         if self._observations is not None:
             size = replace(size, observations=self._observations)
         if size.raw:
             return replace(size, uncut=size.uncut and self._passes == 0)
-        lenses = 1.0 if self._lenses else size.lenses if self._phase <= CAMERA else 0.0
-        return replace(size, lenses=lenses)
+        if self._lenses:
+            return replace(size, lenses=1.0)
+        if size.lenses is None:
+            return replace(size, lenses=float(is_most and self._phase <= CAMERA))
+        return replace(size, lenses=size.lenses if self._phase <= CAMERA else 0.0)
 
-    def _ahead(self, size: Size, phase: int) -> float:
-        """Seconds by the table of phases from `phase` on, and of further passes."""
-        more = max(size.passes - self._passes, 0.0)
+    def _ahead(self, size: Size, phase: int, is_most: bool, pace: float = 1.0) -> float:
+        """Seconds by the table of phases from `phase` on, rounds of patches times `pace`, and of
+        further passes; of optional phases if `is_most`."""
+        more = max(size.passes[is_most] - self._passes, 0.0)
         again = replace(size, uncut=False)
+        left_out = set() if is_most else OPTIONAL
         repeated = range(FEATURES, (LAST_PATCHES if size.raw else CAMERA) + 1)
-        return sum(map(size.seconds, range(phase, len(PHASES)))) + more * sum(
-            map(again.seconds, repeated)
+        ahead, further = (
+            sum(
+                one.seconds(number) * (pace if number in _PATCHES else 1.0)
+                for number in phases
+                if number not in left_out
+            )
+            for one, phases in ((size, range(phase, len(PHASES))), (again, repeated))
         )
+        return ahead + more * further
 
     def _speed(self, size: Size) -> float:
         """Seconds for each of the table."""
-        measured, expected = self._measured, self._expected
-        work = self._work
+        (measured, expected), work = self._ended, self._work
         if work is not None and self._phase == FEATURES:
             measured += work.at - work.began
             expected += size.seconds(FEATURES) * (work.done - work.first) / size.frames
         return (measured + _PRIOR_S) / (expected + _PRIOR_S)
 
-    def _seconds_of_odometry(self, size: Size, now: float) -> float | None:
+    def _pace(self, speed: float) -> float:
+        """Seconds of a round of patches for each of the table, by the rounds that have ended; the
+        machine's `speed` before."""
+        measured, expected = self._aligned
+        return (measured + _PATCHES_PRIOR_S * speed) / (expected + _PATCHES_PRIOR_S)
+
+    def _seconds_of_odometry(self, size: Size, now: float, is_most: bool) -> float | None:
         """Seconds of the odometry, and of all that comes after it."""
         work = self._tracked
         if work is None or not work.done or not self._keyframes:
             return None
         keyframes = self._keyframes * work.total / work.done
         frames = _FRAMES_PER_KEYFRAME * keyframes
+        size = self._known(size, is_most)
         size = replace(size, frames=frames, observations=1e-3 * _OBSERVATIONS * frames)
         expected = _TRACKING_S * (work.done - work.first)
         speed = (work.at - work.began + _PRIOR_S) / (expected + _PRIOR_S)
         here = work.seconds(now)
         if self._stage == _ODOMETRY:
             gone = now - work.at if work.done == work.total else 0.0
-            here += max(speed * _CLOSING_S * keyframes - gone, 0.0)
-        return here + speed * self._ahead(size, 0)
+            here += max(speed * _CLOSING_S[is_most] * keyframes - gone, 0.0)
+        return here + speed * self._ahead(size, 0, is_most)
 
     def _enter(self, stage: str, now: float) -> None:
         """Go on to the phase of a stage; one that ends tells the speed."""
@@ -282,8 +315,10 @@ class TimeLeft:
         if phase is None or phase == self._phase or self._size is None:
             return
         if self._whole and self._phase >= FEATURES:
-            self._measured += now - self._phase_began
-            self._expected += self._known(self._size).seconds(self._phase)
+            expected = self._known(self._size).seconds(self._phase)
+            self._ended += now - self._phase_began, expected
+            if self._phase in _PATCHES:
+                self._aligned += now - self._phase_began, expected
         if phase < self._phase and phase <= FEATURES:
             self._passes += self._phase > FEATURES
         self._phase, self._phase_began, self._whole = phase, now, True
@@ -303,15 +338,25 @@ class LoggedTimeLeft:
         if now < self._due or entry.get("event") == "log":
             return
         seconds = self._left.seconds(now)
-        if seconds is None or seconds < _MIN_TOLD_S:
+        if seconds is None or seconds[1] < _MIN_TOLD_S:
             return
         self._due = now + max(_MIN_BETWEEN_LINES_S, 0.1 * (now - self._began))
-        logger.info("about %s left", duration(seconds))
+        logger.info("%s left", in_words(seconds))
 
     def note(self) -> str:
         """Text beside progress bars."""
         seconds = self._left.seconds(time.time())
-        return "" if seconds is None else f"about {duration(seconds)} left of the run"
+        return "" if seconds is None else f"{in_words(seconds)} left of the run"
+
+
+def in_words(seconds: tuple[float, float]) -> str:
+    """Least and most seconds in words: one duration where it is a third off at most."""
+    least, most = seconds
+    if most <= _MAX_SINGLE_RATIO * least:
+        return f"about {duration(math.sqrt(least * most))}"
+    words = [duration(one) for one in seconds]
+    numbers, units = zip(*(one.split() for one in words), strict=True)
+    return f"{numbers[0] if units[0] == units[1] else words[0]} to {words[1]}"
 
 
 def duration(seconds: float) -> str:

@@ -108,6 +108,8 @@ def opened(browser: Any, address: str, size: dict[str, int]) -> Any:
 
 def picture(page: Any, name: str) -> None:
     if folder := os.environ.get("GSBA_PICTURES"):
+        # The folder of a test is nobody's.
+        page.evaluate("scrollTo(0, 0); document.getElementById('root').textContent = '~/footage'")
         page.screenshot(path=f"{folder}/{name}.jpg", type="jpeg", quality=80)
 
 
@@ -179,6 +181,7 @@ def test_from_a_video_to_a_dataset(browser: Any, server: Server) -> None:
     phone.get_by_role("heading", name="Stages").wait_for()
     assert fits(phone)
     page.locator(".stages li").nth(12).wait_for()
+    page.locator("canvas.panorama[data-shown*='frame=']").wait_for()
     picture(page, "app-watch")
     # The server is killed: the run goes on, both pages say so and find the next server.
     server.kill()
@@ -238,6 +241,7 @@ def test_from_a_video_to_a_dataset(browser: Any, server: Server) -> None:
         page.get_by_role("button", name="Take this folder").click()
         page.get_by_role("columnheader", name=name).wait_for()
     assert fits(page)
+    page.locator(".files .shot img").nth(2).wait_for()
     picture(page, "app-compare")
     page.get_by_role("button", name="Plot them side by side").click()
     page.get_by_role("heading", name="plot compared/first-second").wait_for()
@@ -342,6 +346,37 @@ def test_all_that_can_be_used_has_a_name(browser: Any, server: Server) -> None:
     assert page.faults == []
 
 
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_axe_finds_no_fault(browser: Any, server: Server, scheme: str) -> None:
+    """Lists, a start with its options, the queue, a run and its report, on a desk and a phone."""
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
+    folder, found = server.root / "seen", list[str]()
+    if not (folder / "report.html").exists():
+        line = ("refine", "walk.mp4", "--out", "seen", "--config", "fast")
+        subprocess.run([*GSBA, *line], cwd=server.root, check=True, capture_output=True)
+    ready = {
+        f"{server.address}#files": "refined",
+        f"{server.address}#start/walk.mp4": "Drag to look around.",
+        f"{server.address}#jobs": "One job runs at a time.",
+        f"{server.address}#run/seen": "Dataset for your trainer",
+        f"{server.address}#compare/seen": "Figures",
+        folder.joinpath("report.html").as_uri(): "Share of time",
+    }
+    for address, text in ready.items():
+        page = browser.new_page(viewport=DESK, color_scheme=scheme)
+        page.set_default_timeout(RUN_MS)
+        page.goto(address)
+        page.get_by_text(text).first.wait_for(state="attached")
+        for each in page.locator("details").all():
+            each.evaluate("(one) => { one.open = true; }")
+        for size in (DESK, PHONE):
+            page.set_viewport_size(size)
+            faults = axe.run(page).response["violations"]
+            found += [f"{address} {one['id']}: {one['nodes'][0]['html']}" for one in faults]
+        page.close()
+    assert found == []
+
+
 def held(server: Server, run: str) -> int:
     """Process group of a running job, paused: it must not be done before it is stopped."""
     (job,) = (
@@ -422,12 +457,16 @@ def test_a_dataset_is_of_the_chosen_map_and_goes_without_frames_in_doubt(
     page.route("**/api/add", refused)
     box, maps = page.get_by_label("Leave out frames in doubt"), page.locator("#map-number")
     acts = (lambda: None, box.uncheck, lambda: maps.select_option("2: 3 frames"))
+    trainer, titles = page.get_by_role("button", name="Postshot"), []
     for number, act in enumerate(acts, start=1):
         act()
-        page.get_by_role("button", name="Postshot").click()
+        titles.append(trainer.get_attribute("title"))
+        trainer.click()
         page.get_by_text(f"{number} heard").wait_for()
     plain = {"run": "doubted", "to": "postshot", "up": "auto"}
     assert asked == [plain | {"without": ["doubted"]}, plain, plain | {"map_number": "2"}]
+    line = "gsba export doubted --to postshot --up auto"
+    assert titles == [f"{line} --without doubted", line, f"{line} --map 2"]
     assert fits(page)
 
 

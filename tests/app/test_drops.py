@@ -136,7 +136,8 @@ def test_a_full_disk_keeps_what_has_arrived(root: Path, monkeypatch: pytest.Monk
     monkeypatch.undo()
     usage = namedtuple("usage", "free")(100 * 2**20 + 5)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
-    assert "disk is full" in planned(root, FILM)[0]["error"]  # 6 bytes are missing
+    error = planned(root, FILM)[0]["error"]  # 1 byte is missing
+    assert "disk is full" in error and "free 1 MB" in error
     assert planned(root, FILM | {"size": 5, "name": "a.mp4"})[0]["error"] == ""
     monkeypatch.undo()
     assert sent(root, FILM, b"0123456789")["done"]

@@ -50,7 +50,7 @@ def test_a_run_tells_its_size_and_the_time_left(case: Case, tmp_path: Path) -> N
     stages = {entry["name"]: entry for entry in events if entry["event"] == "done"}
     sizes = {entry["name"]: entry["observations"] for entry in events if entry["event"] == "map"}
     assert sizes["dense"] > 0 and sizes.keys() < stages.keys()
-    assert left[events.index(size)] > left[-1] >= 0.0
+    assert left[events.index(size)][1] > left[-1][1] >= 0.0
 
 
 def test_a_changed_setting_renews_what_depends_on_it(case: Case, tmp_path: Path) -> None:

@@ -10,7 +10,18 @@ import pytest
 
 from gsba.pipeline import stage_titles
 from gsba.report import time_left
-from gsba.report.time_left import CAMERA, FEATURES, LAST_PATCHES, PHASES, Size, TimeLeft, phase_of
+from gsba.report.time_left import (
+    CAMERA,
+    FEATURES,
+    FIRST_PATCHES,
+    LAST_PATCHES,
+    OPTIONAL,
+    PHASES,
+    WEAK,
+    Size,
+    TimeLeft,
+    phase_of,
+)
 
 RUN = {"event": "run", "frames": 100, "width": 2000, "trajectory": True, "video": False}
 RUN |= {"raw": False, "uncut": False, "camera": "central", "rounds": 4, "threads": 2}
@@ -44,8 +55,13 @@ def whole(size: Size) -> float:
 
 
 def left(found: TimeLeft, now: float) -> float:
+    """The most that is stated: all phases of `STAGES` come."""
+    return both(found, now)[1]
+
+
+def both(found: TimeLeft, now: float) -> tuple[float, float]:
     seconds = found.seconds(now)
-    assert seconds is not None
+    assert seconds is not None and seconds[0] <= seconds[1]
     return seconds
 
 
@@ -134,9 +150,26 @@ def test_what_is_known_of_the_run_counts() -> None:
     assert left(told(trajectory=False), 0.0) > start
     assert left(told(rounds=0), 0.0) < 0.8 * start
     assert 0.1 * start < left(told(threads=16), 0.0) < 0.7 * start
-    assert start < left(told(camera="auto"), 0.0) < left(told(camera="two_lens"), 0.0)
+    assert start < left(told(camera="auto"), 0.0) == left(told(camera="two_lens"), 0.0)
     assert left(told(raw=True), 0.0) > start
     assert left(told(raw=True, uncut=True), 0.0) > 2 * left(told(raw=True), 0.0)
+
+
+def test_the_least_is_without_what_may_not_come() -> None:
+    start = both(told(), 0.0)
+    optional = sum(CENTRAL.seconds(n) for n in OPTIONAL)
+    assert start[1] - start[0] == pytest.approx(optional) and optional > 0
+    assert both(told(camera="auto"), 0.0)[0] == start[0]
+    two = both(told(camera="two_lens"), 0.0)
+    assert two[0] > start[0]
+    # the last phase is certain, and a phase that has begun is not optional
+    events = stages(STAGES)
+    least, most = both(told(*events[:-1]), events[-2]["time"])
+    assert least == most
+    weak = stages(STAGES)[2 * WEAK]
+    least, _ = both(told(*events[: 2 * WEAK + 1]), weak["time"])
+    certain = [n for n in range(WEAK, len(PHASES)) if n == WEAK or n not in OPTIONAL]
+    assert least == pytest.approx(sum(map(CENTRAL.seconds, certain)))
 
 
 def test_no_frames_are_weak_where_all_have_more_keypoints() -> None:
@@ -153,7 +186,7 @@ def test_two_lenses_count_as_soon_as_they_are_found() -> None:
     lensed = {"event": "stage", "name": "lensed0", "time": now}
     none = left(told(*events[:13], camera="auto"), now)
     found = left(told(*events[:11], lensed, *events[11:13], camera="auto"), now)
-    assert none < unknown < found and found > 1.5 * none
+    assert none < found <= unknown and found > 1.5 * none
 
 
 def test_patches_take_as_long_as_the_map_has_observations() -> None:
@@ -164,6 +197,21 @@ def test_patches_take_as_long_as_the_map_has_observations() -> None:
         map_ = {"event": "map", "name": "refined1", "observations": observations, "time": now}
         found.append(left(told(*events[:16], map_, width=500), now))
     assert 1.1 * found[0] < found[1] < 2.0 * found[0]
+
+
+def test_rounds_of_patches_tell_the_time_of_the_next_ones() -> None:
+    usual, slow = (stages(STAGES, speed=1.0) for _ in range(2))
+    second = STAGES.index("align2")
+    for entry in slow[2 * second :]:  # the first round has taken twice as long
+        entry["time"] += CENTRAL.seconds(FIRST_PATCHES)
+    now = usual[2 * second]["time"]
+    stated, other = (
+        left(told(*events[: 2 * second + 1]), events[2 * second]["time"])
+        for events in (usual, slow)
+    )
+    rounds = sum(CENTRAL.seconds(n) for n in range(second, LAST_PATCHES + 1))
+    assert stated == pytest.approx(whole(CENTRAL) - now)
+    assert stated + 0.5 * rounds < other < 2.0 * stated
 
 
 def test_a_second_pass_of_raw_frames() -> None:
@@ -220,3 +268,9 @@ def test_lines_of_the_log(
 def test_durations_in_words() -> None:
     words = [time_left.duration(seconds) for seconds in (12.3, 89, 150, 3 * 3600)]
     assert words == ["12 s", "89 s", "2 min", "3.0 h"]
+
+
+def test_a_range_is_one_duration_where_its_mean_is_a_third_off_at_most() -> None:
+    ranges = [(9.0, 16.0), (9.0, 16.1), (120.0, 600.0), (60.0, 600.0), (0.0, 4.0)]
+    words = [time_left.in_words(one) for one in ranges]
+    assert words == ["about 12 s", "9 to 16 s", "2 to 10 min", "60 s to 10 min", "0 to 4 s"]

@@ -116,13 +116,13 @@ function fillHead(head, job) {
 }
 
 function fillNow(now, job) {
-  const { stage, work, seconds_left: left, seconds_of_work: stepLeft } = job.progress;
+  const { stage, work, left, seconds_of_work: stepLeft } = job.progress;
   if (ENDED.includes(job.status) || !(stage || work)) {
     now.replaceChildren();
     return;
   }
   const parts = [make("p", {}, make("strong", {}, stage ? stage.title : work.what))];
-  if (left !== null) parts.unshift(make("p", { class: "left" }, `About ${spoken(left)} left of the run`));
+  if (left) parts.unshift(make("p", { class: "left" }, `${left[0].toUpperCase()}${left.slice(1)} left of the run`));
   if (work && work.total) {
     const rate = work.rate ? `${Number(work.rate.toPrecision(3))} a second` : "";
     const more = [`${work.done} of ${work.total}`, rate, stepLeft ? `${spoken(stepLeft)} left of it` : "", work.note];

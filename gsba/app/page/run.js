@@ -39,7 +39,11 @@ async function results(where, run, current) {
   };
   const button = (text, onclick, title = "", kind = "") => make("button", { type: "button", class: kind, title, onclick }, text);
   const choices = datasetChoices(found);
-  const dataset = (to, text) => button(text, () => add("export", { run, to, up: "auto", ...choices.values() })(), `gsba export ${run} --to ${to} --up auto`);
+  const dataset = (to, text) => {
+    const made = button(text, () => add("export", { run, to, up: "auto", ...choices.values() })());
+    choices.follow((options) => { made.title = `gsba export ${quoted(run)} --to ${to} --up auto${options}`; });
+    return made;
+  };
   const report = make("a", { href: link(`${run}/report.html`), target: "_blank", rel: "noopener" }, "Report");
   const level = found.verdict ? found.verdict.level : "";
   where.replaceChildren(
@@ -62,7 +66,8 @@ async function results(where, run, current) {
     found.figures.length ? figureCard(found.figures.map((name) => `${run}/figures/${name}`)) : "");
 }
 
-// Fields of what a dataset holds, where there is a choice: the map, and frames in doubt; and their values as options.
+// Fields of what a dataset holds, where there is a choice: the map, and frames in doubt. `values` gives their values;
+// `follow` calls `told` now and at each change with the options of the command line that they stand for.
 function datasetChoices(found) {
   const sizes = found.map_sizes, doubted = found.verdict ? found.verdict.doubted : [];
   const map = make("select", { id: "map-number" }, ...sizes.map((frames, n) => make("option", { value: String(n + 1) }, `${n + 1}: ${frames} frames`)));
@@ -70,9 +75,18 @@ function datasetChoices(found) {
   const values = () => ({
     ...(map.value > 1 ? { map_number: map.value } : doubted.length && without.checked ? { without: ["doubted"] } : {}),
   });
+  const options = () => {
+    const { map_number: number, without: left } = values();
+    return (number ? ` --map ${number}` : "") + (left ? ` --without ${left}` : "");
+  };
   map.addEventListener("change", () => { without.disabled = map.value > 1; });
+  const follow = (told) => {
+    told(options());
+    for (const field of [map, without]) field.addEventListener("change", () => told(options()));
+  };
   return {
     values,
+    follow,
     fields: [
       sizes.length > 1 ? make("p", {}, make("label", {}, "Map ", map)) : null,
       doubted.length ? make("p", {}, make("label", {}, without, " Leave out frames in doubt: "), make("span", { class: "faint" }, doubted.slice(0, 6).join(", ") + (doubted.length > 6 ? ` and ${doubted.length - 6} more` : ""))) : null,

@@ -69,5 +69,5 @@ function presets(values, changed) {
     }), make("span", {}, make("strong", {}, label), " ", make("span", { class: "faint" }, help)));
   return make("fieldset", { class: "presets" }, make("legend", { class: "unseen" }, "Preset"),
     one("fast", "Fast", `A first look in less time. ${about.fast || ""}`), one("", "Normal", "What most footage needs: the defaults."),
-    one("accurate", "Accurate", about.accurate || ""));
+    one("accurate", "Accurate", `Slower. ${about.accurate || ""}`));
 }

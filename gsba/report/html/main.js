@@ -164,7 +164,7 @@ function cost() {
 
 function stages() {
   const table = el("stages"), longest = Math.max(...D.report.stages.map(s => s.seconds), 1e-9);
-  table.append(make("tr", {}, ...["Stage", "Seconds", "", "Received", "Kept", "Dropped, with reasons"].map((t, i) => make("th", i === 1 || i === 3 || i === 4 ? { class: "n" } : {}, t))));
+  table.append(make("tr", {}, ...["Stage", "Seconds", "Share of time", "Received", "Kept", "Dropped, with reasons"].map((t, i) => make("th", i === 1 || i === 3 || i === 4 ? { class: "n" } : {}, t))));
   for (const stage of D.report.stages) {
     const counts = stage.counts.length ? stage.counts : [null];
     counts.forEach((c, i) => {
