@@ -19,8 +19,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from camera import judged, judged_peer
-from common import code_digest, digest, kept_row, refine_command, run_row, write_table
+from common import (
+    code_digest,
+    digest,
+    judged,
+    judged_peer,
+    kept_row,
+    refine_command,
+    run_row,
+    write_table,
+)
 from filmed_camera import ALL, EFFECTS, HAND_MOTION, Camera, Hands, write_film
 
 from gsba.demo.degrade import degrade
@@ -91,7 +99,7 @@ def refined(film: Path, start: str, home: Path, sets: list[str]) -> dict[str, An
 
 
 def _outcome(run: Path, film: Path, truth: Trajectory) -> dict[str, Any]:
-    errors = judged(run, truth, {})["errors"]
+    errors = judged(run, truth)["errors"]
     estimate = read_trajectory(run / "trajectory.tum")
     maps = depth_maps(film / "depth", len(truth.timestamps))
     induced = induced_errors(estimate, truth, maps, WIDTH, steps=(1,))
