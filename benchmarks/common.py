@@ -22,8 +22,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 if TYPE_CHECKING:
     import numpy as np
 
-    from gsba.types import Trajectory
-
 
 @dataclass(frozen=True, slots=True)
 class Measurement:
@@ -105,42 +103,6 @@ def outcome(finish: Callable[[], dict]) -> dict[str, Any]:
         return finish()
     except GsbaError as error:
         return {"reason": str(error)}
-
-
-def judged(run: Path, truth: "Trajectory") -> dict[str, Any]:
-    """Errors of a run's poses, also relative to their covariances."""
-    from gsba.evaluate.consistency import consistency_of
-    from gsba.evaluate.trajectory import evaluate
-    from gsba.store.finished import load_run
-    from gsba.trajectory.files import read_trajectory
-
-    errors = evaluate(read_trajectory(run / "trajectory.tum"), truth)
-    reconstruction, frames = load_run(run)
-    claims = consistency_of(reconstruction, frames.timestamps, truth).absolute
-    row: dict[str, Any] = {
-        "ate": errors.ate.rmse,
-        "rpe": errors.rpe_translation.rmse,
-        "rotation": errors.rpe_rotation_deg.rmse,
-        "rotation_claims": claims.rotation.value,
-        "position_claims": claims.position.value,
-    }
-    return {"errors": row}
-
-
-def judged_peer(out: Path, truth: "Trajectory") -> dict[str, Any]:
-    """Errors of a peer's poses, whose times are the numbers of frames."""
-    import numpy as np
-
-    from gsba.evaluate.trajectory import evaluate
-    from gsba.trajectory.files import read_trajectory
-    from gsba.types import Trajectory
-
-    found = read_trajectory(out / "trajectory.tum")
-    rows = np.rint(found.timestamps).astype(int)
-    timed = Trajectory(truth.timestamps[rows], found.world_T_rigs)
-    errors = evaluate(timed, truth)
-    row = {"ate": errors.ate.rmse, "rpe": errors.rpe_translation.rmse}
-    return {"errors": row | {"rotation": errors.rpe_rotation_deg.rmse, "posed": len(rows)}}
 
 
 def refine_command(frames: Path, run: Path, options: Sequence[str]) -> list[str]:

@@ -19,23 +19,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import (
-    code_digest,
-    digest,
-    judged,
-    judged_peer,
-    kept_row,
-    refine_command,
-    run_row,
-    write_table,
-)
+from common import code_digest, digest, kept_row, refine_command, run_row, write_table
 from filmed_camera import ALL, EFFECTS, HAND_MOTION, Camera, Hands, write_film
 
 from gsba.demo.degrade import degrade
 from gsba.demo.gallery import build_gallery
 from gsba.demo.raycast import Scene
 from gsba.demo.walk import walk_poses
+from gsba.evaluate.consistency import consistency_of
 from gsba.evaluate.pixels import depth_maps, induced_errors
+from gsba.evaluate.trajectory import evaluate
+from gsba.store.finished import load_run
 from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.types import Trajectory
 
@@ -87,7 +81,7 @@ def refined(film: Path, start: str, home: Path, sets: list[str]) -> dict[str, An
         key |= {"peer": "spherical-incremental"}
         script = Path(__file__).with_name("peer.py")
         command = [sys.executable, str(script), "spherical-incremental", str(frames), str(run)]
-        finish = partial(judged_peer, run, truth)
+        finish = partial(_outcome_of_peer, run, truth)
     else:
         key |= {"code": code_digest()}
         options = [str(film / "slam.tum")] if start == "trajectory" else ["--no-trajectory"]
@@ -99,12 +93,32 @@ def refined(film: Path, start: str, home: Path, sets: list[str]) -> dict[str, An
 
 
 def _outcome(run: Path, film: Path, truth: Trajectory) -> dict[str, Any]:
-    errors = judged(run, truth)["errors"]
     estimate = read_trajectory(run / "trajectory.tum")
+    errors = evaluate(estimate, truth)
+    reconstruction, frames = load_run(run)
+    claims = consistency_of(reconstruction, frames.timestamps, truth).absolute
     maps = depth_maps(film / "depth", len(truth.timestamps))
     induced = induced_errors(estimate, truth, maps, WIDTH, steps=(1,))
-    found = {"posed": len(estimate.timestamps), "induced_px": induced.median_px}
-    return {"errors": errors | found}
+    row = {
+        "ate": errors.ate.rmse,
+        "rpe": errors.rpe_translation.rmse,
+        "rotation": errors.rpe_rotation_deg.rmse,
+        "rotation_claims": claims.rotation.value,
+        "position_claims": claims.position.value,
+        "posed": len(estimate.timestamps),
+        "induced_px": induced.median_px,
+    }
+    return {"errors": row}
+
+
+def _outcome_of_peer(out: Path, truth: Trajectory) -> dict[str, Any]:
+    """Errors of a peer's poses, whose times are the numbers of frames."""
+    found = read_trajectory(out / "trajectory.tum")
+    rows = np.rint(found.timestamps).astype(int)
+    timed = Trajectory(truth.timestamps[rows], found.world_T_rigs)
+    errors = evaluate(timed, truth)
+    row = {"ate": errors.ate.rmse, "rpe": errors.rpe_translation.rmse}
+    return {"errors": row | {"rotation": errors.rpe_rotation_deg.rmse, "posed": len(rows)}}
 
 
 def asked(words: list[str]) -> dict[str, frozenset[str]]:

@@ -29,6 +29,7 @@ from gsba.report.time_left import (
     Size,
     TimeLeft,
     in_words,
+    is_single,
     phase_of,
 )
 
@@ -126,7 +127,7 @@ def fit(runs: Sequence[Sequence[dict[str, Any]]]) -> None:
     """Print the phases with costs that fit the shares of all runs best, none below zero."""
     rows = [row for events in runs for row in spent(events)]
     for number in range(len(PHASES)):
-        # What an optional phase costs is asked where it has come.
+        # Costs of an optional phase are fitted to the runs that had it.
         chosen = [r for r in rows if r.phase == number and (r.seconds or number not in OPTIONAL)]
         weights = np.array([1 / (row.seconds + 0.4 * row.total) for row in chosen])
         terms = np.array([row.size.terms(number) for row in chosen]) * weights[:, None]
@@ -156,7 +157,7 @@ def holds(left: float, seconds: tuple[float, float]) -> bool:
     """True if a statement is right: its one duration, or the nearer end of its range, within a
     third."""
     least, most = seconds
-    if in_words(seconds).startswith("about"):
+    if is_single(seconds):
         least = most = (least * most) ** 0.5
     return 2 / 3 * least <= left <= 4 / 3 * most
 
@@ -186,7 +187,7 @@ def main() -> None:
         cells = []
         for column in zip(*table.values(), strict=True):
             told = [(left, one) for left, one in column if one]
-            told = [(x, one) for x, one in told if in_words(one).startswith("about") == chosen]
+            told = [(x, one) for x, one in told if is_single(one) == chosen]
             cells.append(f"{sum(holds(*one) for one in told)} of {len(told)}")
         print(f"| right within a third, {title} | | {' | '.join(cells)} |")
 

@@ -58,8 +58,8 @@ _COSTS = (
     (0.601, 0, 0, 0.00724, 0, 0, 0.0263, 0.026, 0.0124, 0),
     (0.65, 0.267, 0.000903, 0.0439, 0, 0, 0.000523, 0.0171, 0, 0),
 )
-# Whether two lenses are found in panoramas, after which patches take five times as long; by
-# `camera.model`. None = nothing tells beforehand.
+# Probability that two lenses are found in panoramas, by `camera.model`; None = not known
+# beforehand. Patches then take five times as long.
 _LENSES = {"auto": None, "central": 0.0, "two_lens": 1.0}
 _RAW_PASSES = (1.0, 2.0)  # least and most, of raw frames that nothing has calibrated, beyond the
 # first one
@@ -235,9 +235,10 @@ class TimeLeft:
             return work_left + ahead if work_left else None
         if self._stage and phase_of(self._stage) is None:
             return None
-        pace = self._pace(speed) if self._phase in _PATCHES else speed
-        here = max(pace * size.seconds(self._phase) - spent, work_left)
-        return here + speed * self._ahead(size, self._phase + 1, is_most, self._pace(speed) / speed)
+        pace = self._pace(speed)
+        here = pace if self._phase in _PATCHES else speed
+        left = max(here * size.seconds(self._phase) - spent, work_left)
+        return left + speed * self._ahead(size, self._phase + 1, is_most, pace / speed)
 
     @property
     def size(self) -> Size | None:
@@ -252,11 +253,10 @@ class TimeLeft:
             size = replace(size, observations=self._observations)
         if size.raw:
             return replace(size, uncut=size.uncut and self._passes == 0)
-        if self._lenses:
-            return replace(size, lenses=1.0)
-        if size.lenses is None:
-            return replace(size, lenses=float(is_most and self._phase <= CAMERA))
-        return replace(size, lenses=size.lenses if self._phase <= CAMERA else 0.0)
+        lenses = float(is_most) if size.lenses is None else size.lenses
+        if self._lenses or self._phase > CAMERA:
+            lenses = float(self._lenses)
+        return replace(size, lenses=lenses)
 
     def _ahead(self, size: Size, phase: int, is_most: bool, pace: float = 1.0) -> float:
         """Seconds by the table of phases from `phase` on, rounds of patches times `pace`, and of
@@ -349,10 +349,15 @@ class LoggedTimeLeft:
         return "" if seconds is None else f"{in_words(seconds)} left of the run"
 
 
+def is_single(seconds: tuple[float, float]) -> bool:
+    """True if the mean of least and most seconds is a third off at most."""
+    return seconds[1] <= _MAX_SINGLE_RATIO * seconds[0]
+
+
 def in_words(seconds: tuple[float, float]) -> str:
-    """Least and most seconds in words: one duration where it is a third off at most."""
+    """Least and most seconds in words: one duration if `is_single`."""
     least, most = seconds
-    if most <= _MAX_SINGLE_RATIO * least:
+    if is_single(seconds):
         return f"about {duration(math.sqrt(least * most))}"
     words = [duration(one) for one in seconds]
     numbers, units = zip(*(one.split() for one in words), strict=True)
