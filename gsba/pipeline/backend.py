@@ -12,6 +12,7 @@ from gsba.bundle import (
     common_errors,
     gauge,
     map_strength,
+    residual_correlation,
     rotation_only,
     tracks,
 )
@@ -263,15 +264,18 @@ def reconstruct(
 
     def compute() -> Reconstruction:
         observed, frames = map_.keypoints(run.rig), map_.straightened(run.frames)
+        context = state.adjustment_context()
         if map_.covariances is None:
-            context = state.adjustment_context()
             covariances, joint = adjustment.pose_covariances(
                 solution, observed, context, prior.parts
             )
         else:
             covariances, joint = map_.covariances.poses, map_.covariances.joint
+        ratio = residual_correlation.variance_ratio(solution, observed, context)
+        logger.info("residuals of a frame err together: sigmas of poses times %.2f", ratio**0.5)
+        factors = np.full((len(solution.world_T_rigs), 6), ratio**0.5)
         covariances, joint = common_errors.added(
-            covariances, joint, solution.world_T_rigs, prior.parts
+            ratio * covariances, joint.scaled(factors), solution.world_T_rigs, prior.parts
         )
         result = assemble(
             solution,

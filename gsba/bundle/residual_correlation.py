@@ -1,0 +1,96 @@
+"""Residuals that err together within a frame, by which covariances of independent ones grow."""
+
+import numpy as np
+
+from factors import bearing_residuals
+from factors.robust import RobustLoss
+from gsba.bundle.adjustment import AdjustmentContext
+from gsba.bundle.tracks import map_runs
+from gsba.types import Keypoints, Solution, Tracks
+
+_ROWS = 3  # cells along each side of a face of the cube, 30 degrees wide
+_MIN_OBSERVATIONS = 100  # of a frame
+_MIN_FRAMES = 3
+
+
+def variance_ratio(solution: Solution, keypoints: Keypoints, context: AdjustmentContext) -> float:
+    """Variance of poses over that which residuals independent of one another give, at least 1.
+
+    A codec, denoising or a lens that is modelled roughly shifts neighbouring points of a frame
+    alike. Gradients by the frame's pose are summed over cells of directions. The sums' covariance
+    over that of independent observations is the ratio: a cluster-robust ("sandwich") covariance,
+    Liang and Zeger, Biometrika 73(1), 1986. The median over frames, each with the mean of its six
+    parameters, is returned; what shifts whole frames alike shows in none of them.
+    """
+    tracks, poses = solution.landmarks.tracks, solution.world_T_rigs
+    points_world, num_frames = solution.landmarks.points_world, len(poses)
+    noise, loss = solution.noise, context.solver.loss
+
+    def work(points: slice, rows: slice, some: Tracks) -> tuple[np.ndarray, ...]:
+        return _gradients(points_world[points], some, keypoints, noise, poses, loss)
+
+    gradients = np.zeros((num_frames, _CELLS, 6))
+    information, alone = np.zeros((2, num_frames, 6, 6))
+    for found in map_runs(work, tracks, context.num_threads):
+        for target, more in zip((gradients, information, alone), found, strict=True):
+            target += more
+    usable = solution.observations() >= _MIN_OBSERVATIONS
+    if np.count_nonzero(usable) < _MIN_FRAMES:
+        return 1.0
+    together = np.einsum("fci,fcj->fij", gradients[usable], gradients[usable])
+    inverses = np.linalg.pinv(information[usable], hermitian=True)
+    squares = [np.sum(inverses * one, axis=(1, 2)) for one in (together, alone[usable])]
+    ratios = squares[0] / np.maximum(squares[1], 1e-300)
+    return max(float(np.median(ratios)), 1.0)
+
+
+def _gradients(
+    points_world: np.ndarray,
+    tracks: Tracks,
+    keypoints: Keypoints,
+    noise: float,
+    poses: np.ndarray,
+    loss: RobustLoss,
+) -> tuple[np.ndarray, ...]:
+    """Of observations of points (J, 3), without what moves of the points take up: gradients by
+    poses summed in each cell (F, C, 6), information on poses (F, 6, 6), and the sum of each
+    observation's gradient times itself (F, 6, 6)."""
+    frames, numbers, rows = tracks.frames, tracks.points, keypoints.rows(tracks)
+    bearings = keypoints.bearings_rig[rows]
+    found = bearing_residuals(
+        poses[frames], points_world[numbers], bearings, keypoints.origins_of(rows)
+    )
+    whitening = keypoints.roots(rows) / noise
+    residuals = np.einsum("oij,oj->oi", whitening, found[0])
+    weights = loss.weights(np.einsum("oi,oi->o", residuals, residuals))
+    whitening *= np.sqrt(weights)[:, None, None]
+    residuals *= np.sqrt(weights)[:, None]
+    by_pose, by_point = whitening @ found[1], whitening @ found[2]
+    information = np.zeros((len(points_world), 3, 3))
+    np.add.at(information, numbers, np.swapaxes(by_point, 1, 2) @ by_point)
+    covariances = np.linalg.pinv(information, rcond=1e-12, hermitian=True)
+    # residuals' covariance once their points are solved for, in units of independent ones
+    left = np.eye(2) - by_point @ covariances[numbers] @ np.swapaxes(by_point, 1, 2)
+    projected = np.swapaxes(by_pose, 1, 2) @ left
+    each = np.einsum("oij,oj->oi", projected, residuals)
+    gradients = np.zeros((len(poses), _CELLS, 6))
+    information, alone = np.zeros((2, len(poses), 6, 6))
+    np.add.at(gradients, (frames, _cells(bearings)), each)
+    np.add.at(information, frames, projected @ by_pose)
+    np.add.at(alone, frames, each[:, :, None] * each[:, None, :])
+    return gradients, information, alone
+
+
+def _cells(bearings: np.ndarray) -> np.ndarray:
+    """Cell (O,) of each unit bearing (O, 3): squares of the faces of a cube, alike in angle."""
+    axes, every = np.argmax(np.abs(bearings), axis=1), np.arange(len(bearings))
+    depths = bearings[every, axes]
+    angles = np.arctan2(
+        np.column_stack([bearings[every, (axes + k) % 3] for k in (1, 2)]), np.abs(depths)[:, None]
+    )
+    squares = np.clip(((angles / np.pi * 2 + 0.5) * _ROWS).astype(int), 0, _ROWS - 1)
+    faces = 2 * axes + (depths > 0)
+    return (faces * _ROWS + squares[:, 0]) * _ROWS + squares[:, 1]
+
+
+_CELLS = 6 * _ROWS**2
