@@ -16,7 +16,7 @@ function commandLine(command, values) {
       answer = { command: "", error: error.message };
     }
     if (own !== newest) return;
-    line.textContent = answer.command;
+    line.replaceChildren(...words(answer.command));
     problem.textContent = answer.error;
     button.disabled = Boolean(answer.error);
   };

@@ -23,6 +23,10 @@ const picture = (path, more = "") => `api/picture?path=${encodeURIComponent(path
 const link = (path) => "files/" + path.split("/").map(encodeURIComponent).join("/");
 const open = (kind, name) => `#${kind}/${encodeURIComponent(name)}`;
 
+// Words of a command: a line does not break within an option.
+const words = (command) => command.split(/(\s+)/).map((word) =>
+  word.startsWith("-") ? make("span", { class: "option" }, word) : word);
+
 function spoken(seconds) {
   if (seconds === null || seconds === undefined) return "";
   if (seconds < 100) return `${seconds < 10 ? seconds.toFixed(1) : Math.round(seconds)} s`;

@@ -28,7 +28,7 @@ function jobRow(job) {
     make("div", { class: "row" }, badge(job.status),
       make("a", { href: open("job", job.id) }, `${job.kind} ${job.run || ""}`),
       job.stage ? make("span", { class: "faint" }, job.stage) : null, ...actions(job)),
-    make("code", { class: "faint" }, job.command),
+    make("code", { class: "faint" }, ...words(job.command)),
     job.error ? make("div", { class: "error" }, job.error) : null);
 }
 
@@ -111,7 +111,7 @@ function fillHead(head, job) {
   head.replaceChildren(make("h1", {}, `${job.kind} ${job.run || ""}`),
     card("", make("div", { class: "row" }, badge(job.status),
       make("span", { class: "faint" }, taken), ...actions(job), copy),
-      make("pre", { class: "command" }, job.command),
+      make("pre", { class: "command" }, ...words(job.command)),
       job.error ? make("p", { class: "error", role: "alert" }, job.error) : null));
 }
 

@@ -26,7 +26,7 @@ function command(text) {
   if (!text) return "";
   const folder = location.protocol === "file:" ? decodeURIComponent(location.pathname.replace(/\/[^/]*$/, "")) : "RUN";
   const line = text.replace("RUN", /^[\w./-]+$/.test(folder) ? folder : `'${folder.replaceAll("'", "'\\''")}'`);
-  const code = make("code", {}, line), button = make("button", { type: "button" }, "Copy");
+  const code = make("code", {}, ...line.split(/(\s+)/).map(word => word.startsWith("-") ? make("span", { class: "option" }, word) : word)), button = make("button", { type: "button" }, "Copy");
   button.addEventListener("click", async () => {
     try {
       await navigator.clipboard.writeText(line);
