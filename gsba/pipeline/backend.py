@@ -272,7 +272,7 @@ def reconstruct(
         else:
             covariances, joint = map_.covariances.poses, map_.covariances.joint
         ratio = residual_correlation.variance_ratio(solution, observed, context)
-        logger.info("residuals of a frame err together: sigmas of poses times %.2f", ratio**0.5)
+        logger.debug("residuals of a frame err together: sigmas of poses times %.2f", ratio**0.5)
         factors = np.full((len(solution.world_T_rigs), 6), ratio**0.5)
         covariances, joint = common_errors.added(
             ratio * covariances, joint.scaled(factors), solution.world_T_rigs, prior.parts
