@@ -8,15 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from accuracy import assert_as_accurate, predicted_error
-from cameras_home import (
-    NUM,
-    SMALL,
-    WIDTH,
-    Home,
-    beginning,
-    error_of,
-    panoramas,
-)
+from cameras_home import NUM, SMALL, WIDTH, Home, beginning, error_of, panoramas
 from command import succeed
 from tiny_run import PLAIN
 

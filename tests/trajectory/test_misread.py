@@ -68,15 +68,9 @@ def _another() -> np.ndarray:
             "pass --trajectory-format left-down-back; or it is on another clock",
         ),
         (ROLLED @ SLAM @ ROLLED, "pass --trajectory-format left-up-forward, or"),
-        (
-            SLAM @ ROS,
-            "x forward, y left, z up: pass --trajectory-format forward-left-up, or",
-        ),
+        (SLAM @ ROS, "x forward, y left, z up: pass --trajectory-format forward-left-up, or"),
         (_w_first(SLAM), "order w, x, y, z: pass --trajectory-format wxyz, or"),
-        (
-            _w_first(SLAM @ ROS),
-            "z up: pass --trajectory-format wxyz,forward-left-up, or",
-        ),
+        (_w_first(SLAM @ ROS), "z up: pass --trajectory-format wxyz,forward-left-up, or"),
         (_another(), "another recording"),
     ],
 )
