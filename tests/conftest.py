@@ -92,21 +92,21 @@ def oval(made_once: MadeOnce) -> DemoWalk:
 
 
 @pytest.fixture(scope="session")
-def cameras_home(oval: DemoWalk, made_once: MadeOnce) -> Home:
+def home(oval: DemoWalk, made_once: MadeOnce) -> Home:
     """Recordings by different cameras; runs of them may be put into its folder."""
     return made_once("cameras", lambda folder: make_home(folder, oval))
 
 
 @pytest.fixture(scope="session")
-def single_run(cameras_home: Home, made_once: MadeOnce) -> Path:
+def single_run(home: Home, made_once: MadeOnce) -> Path:
     """A finished run of the first recording; tests only read it."""
-    return made_once("single", lambda folder: make_single(cameras_home, folder))
+    return made_once("single", lambda folder: make_single(home, folder))
 
 
 @pytest.fixture(scope="session")
-def two_sizes(cameras_home: Home, made_once: MadeOnce) -> Path:
+def two_sizes(home: Home, made_once: MadeOnce) -> Path:
     """A finished run of recordings of two sizes; copy it before going on from it."""
-    return made_once("two-sizes", lambda folder: make_two_sizes(cameras_home, folder))
+    return made_once("two-sizes", lambda folder: make_two_sizes(home, folder))
 
 
 @pytest.fixture(scope="session")
@@ -116,15 +116,15 @@ def growing_home(oval: DemoWalk, made_once: MadeOnce) -> GrowingHome:
 
 
 @pytest.fixture(scope="session")
-def faces_run(cameras_home: Home, made_once: MadeOnce) -> Path:
+def faces_run(home: Home, made_once: MadeOnce) -> Path:
     """A finished run of panoramas and cube faces; copy it before going on from it."""
-    return made_once("faces-run", lambda folder: make_beside_faces(cameras_home, folder))
+    return made_once("faces-run", lambda folder: make_beside_faces(home, folder))
 
 
 @pytest.fixture(scope="session")
-def fisheyes_run(cameras_home: Home, made_once: MadeOnce) -> Path:
+def fisheyes_run(home: Home, made_once: MadeOnce) -> Path:
     """A finished run of panoramas and raw fisheyes; copy it before going on from it."""
-    return made_once("fisheyes-run", lambda folder: make_beside_fisheyes(cameras_home, folder))
+    return made_once("fisheyes-run", lambda folder: make_beside_fisheyes(home, folder))
 
 
 @pytest.fixture(scope="session")

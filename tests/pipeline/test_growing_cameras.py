@@ -27,11 +27,6 @@ SMALL_ALONE = 0.00165
 
 
 @pytest.fixture(scope="module")
-def home(cameras_home: Home) -> Home:
-    return cameras_home
-
-
-@pytest.fixture(scope="module")
 def sizes(two_sizes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of two recordings of two sizes, made at once."""
     return Path(shutil.copytree(two_sizes, tmp_path_factory.mktemp("two") / "sizes"))
