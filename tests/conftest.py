@@ -1,13 +1,15 @@
 """Fixtures that several files share."""
 
+import gc
 import hashlib
 import logging
 import os
 import pickle
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 from threading import get_ident
+from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read as NumPy loads: workers fill the cores
 
@@ -29,7 +31,10 @@ from tiny_run import PLAIN, Case, make_case
 
 from gsba.demo import DemoWalk
 from gsba.demo.gallery import build_gallery
-from gsba.features import FaceKeypoints, SiftExtractor
+from gsba.features import SiftExtractor
+from gsba.matching import verification
+
+gc.disable()  # while tests are collected: nothing of them goes away
 
 # Files and folders whose tests take longest begin first, so that no worker is left alone with them.
 # While the first file compiles the pipeline's kernels, the next ones need none of them.
@@ -54,6 +59,11 @@ _FIRST = (
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Order files by how long they take; each file's tests stay in one worker and in order."""
     items.sort(key=lambda item: _place_in_queue(item.path))
+
+
+def pytest_collection_finish() -> None:
+    gc.freeze()
+    gc.enable()
 
 
 @cache
@@ -82,21 +92,21 @@ def oval(made_once: MadeOnce) -> DemoWalk:
 
 
 @pytest.fixture(scope="session")
-def cameras_home(oval: DemoWalk, made_once: MadeOnce) -> Home:
+def home(oval: DemoWalk, made_once: MadeOnce) -> Home:
     """Recordings by different cameras; runs of them may be put into its folder."""
     return made_once("cameras", lambda folder: make_home(folder, oval))
 
 
 @pytest.fixture(scope="session")
-def single_run(cameras_home: Home, made_once: MadeOnce) -> Path:
+def single_run(home: Home, made_once: MadeOnce) -> Path:
     """A finished run of the first recording; tests only read it."""
-    return made_once("single", lambda folder: make_single(cameras_home, folder))
+    return made_once("single", lambda folder: make_single(home, folder))
 
 
 @pytest.fixture(scope="session")
-def two_sizes(cameras_home: Home, made_once: MadeOnce) -> Path:
+def two_sizes(home: Home, made_once: MadeOnce) -> Path:
     """A finished run of recordings of two sizes; copy it before going on from it."""
-    return made_once("two-sizes", lambda folder: make_two_sizes(cameras_home, folder))
+    return made_once("two-sizes", lambda folder: make_two_sizes(home, folder))
 
 
 @pytest.fixture(scope="session")
@@ -106,15 +116,15 @@ def growing_home(oval: DemoWalk, made_once: MadeOnce) -> GrowingHome:
 
 
 @pytest.fixture(scope="session")
-def faces_run(cameras_home: Home, made_once: MadeOnce) -> Path:
+def faces_run(home: Home, made_once: MadeOnce) -> Path:
     """A finished run of panoramas and cube faces; copy it before going on from it."""
-    return made_once("faces-run", lambda folder: make_beside_faces(cameras_home, folder))
+    return made_once("faces-run", lambda folder: make_beside_faces(home, folder))
 
 
 @pytest.fixture(scope="session")
-def fisheyes_run(cameras_home: Home, made_once: MadeOnce) -> Path:
+def fisheyes_run(home: Home, made_once: MadeOnce) -> Path:
     """A finished run of panoramas and raw fisheyes; copy it before going on from it."""
-    return made_once("fisheyes-run", lambda folder: make_beside_fisheyes(cameras_home, folder))
+    return made_once("fisheyes-run", lambda folder: make_beside_fisheyes(home, folder))
 
 
 @pytest.fixture(scope="session")
@@ -123,27 +133,34 @@ def plain_run(case: Case, made_once: MadeOnce) -> Path:
     return made_once("plain", lambda folder: case.refine(folder / "run", PLAIN).out)
 
 
-@pytest.fixture(scope="session", autouse=True)
-def _found_once(made_once: MadeOnce) -> Iterator[None]:
-    """Dozens of runs read the same pictures: keypoints of a face, a third of a run's time, are
-    found once for all workers, and the demo's gallery is built once."""
-    find, folder = SiftExtractor.__call__, made_once("keypoints", lambda folder: folder)
+def _kept(find: Callable, folder: Path) -> Callable:
+    """The function; a folder keeps what it finds, by the content of its arguments."""
 
-    def find_once(
-        extractor: SiftExtractor, face_rgb: np.ndarray, mask: np.ndarray | None
-    ) -> FaceKeypoints:
-        given = repr((extractor._settings, face_rgb.shape)).encode(), face_rgb.tobytes()
-        content = b"".join((*given, b"" if mask is None else mask.tobytes()))
-        kept = folder / hashlib.sha1(content).hexdigest()
+    def found(*given: Any) -> Any:
+        content = hashlib.sha1(find.__qualname__.encode())
+        for one in given:
+            array = isinstance(one, np.ndarray)
+            told = (one.shape, one.dtype) if array else getattr(one, "_settings", one)
+            content.update(repr(told).encode() + (one.tobytes() if array else b""))
+        kept = folder / content.hexdigest()
         if not kept.exists():
             new = kept.with_suffix(f".{os.getpid()}-{get_ident()}")
-            new.write_bytes(pickle.dumps(find(extractor, face_rgb, mask)))
+            new.write_bytes(pickle.dumps(find(*given)))
             new.rename(kept)
         return pickle.loads(kept.read_bytes())
 
+    return found
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _found_once(made_once: MadeOnce) -> Iterator[None]:
+    """Dozens of runs read the same pictures: keypoints of a face and the pose of a pair are found
+    once for all workers, and the demo's gallery is built once."""
+    folder = made_once("found", lambda folder: folder)
     gallery = cache(lambda: made_once("gallery", lambda _: build_gallery()))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(SiftExtractor, "__call__", find_once)
+        for owner, name in ((SiftExtractor, "__call__"), (verification, "sampled_pose")):
+            patch.setattr(owner, name, _kept(getattr(owner, name), folder))
         patch.setattr("gsba.demo.gallery.build_gallery", gallery)
         yield
 

@@ -172,3 +172,10 @@ def assert_blob(
     tints = unit(np.array([image[row, column], color]) - 30.0)
     assert tints[0] @ tints[1] > 0.8  # JPEG blurs chroma; 0.6 or less for any other colour
     return True
+
+
+def moved_by_velocities(entry: dict, after_s: float) -> np.ndarray:
+    """Pose of a frame of transforms.json after a time, as a trainer moves its camera."""
+    turn, move = (np.array(entry[f"camera_{kind}_velocity"]) for kind in ("angular", "linear"))
+    step = pose(Rotation.from_rotvec(turn * after_s).as_matrix(), move * after_s)
+    return np.array(entry["transform_matrix"]) @ step

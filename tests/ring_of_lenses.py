@@ -62,11 +62,7 @@ def write_calibration(
 def render(folder: Path, num: int, own: RadialProjection | None = None, model: str = "") -> None:
     """Write `images/` (stitched), `raw/` (a folder of each lens), calibration, truth and coarse
     trajectories of three seeds."""
-    truth, scene, rig = (
-        walk_poses("rectangle", "forward", NUM_FRAMES, 0),
-        gallery(),
-        ring(num),
-    )
+    truth, scene, rig = (walk_poses("rectangle", "forward", NUM_FRAMES, 0), gallery(), ring(num))
     axes, names = np.array([rotation_of(lens)[:, 2] for lens in rig]), lens_names(num)
     faced = facing(bearings_from_erp(pixel_centres(WIDTH, WIDTH // 2), WIDTH, WIDTH // 2), axes)
     maps = [_maps(lens, own or projection_of(lens)) for lens in rig]

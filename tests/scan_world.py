@@ -44,10 +44,7 @@ def sampled(
 
 
 def visible(
-    rng: np.random.Generator,
-    size: tuple[float, float, float],
-    boxes: tuple[Box, ...],
-    num: int,
+    rng: np.random.Generator, size: tuple[float, float, float], boxes: tuple[Box, ...], num: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Points and normals on what of a room no box stands against."""
     points, normals = sampled(rng, rectangles(size, boxes), 2 * num)

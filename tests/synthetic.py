@@ -12,6 +12,7 @@ from gsba.geometry import inverse, pose
 from gsba.types import Features, Keypoints, Tracks
 
 RIG = CubeRig(512, np.pi / 2)
+ROS = pose(np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), np.zeros(3))  # ours_T_forward-left-up
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,12 @@ class GivenFactors(Family):
 def unit(vectors: np.ndarray) -> np.ndarray:
     """Vectors (..., 3) of length one."""
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def w_first(world_T_rigs: np.ndarray) -> np.ndarray:
+    """Poses as read where their file has quaternions w, x, y, z."""
+    xyzw = Rotation.from_matrix(world_T_rigs[:, :3, :3]).as_quat()
+    return pose(Rotation.from_quat(xyzw[:, [3, 0, 1, 2]]).as_matrix(), world_T_rigs[:, :3, 3])
 
 
 def bearings_of(points_world: np.ndarray, world_T_rig: np.ndarray) -> np.ndarray:

@@ -14,9 +14,7 @@ NUM = 90
 SIGMA = 5e-4
 
 
-def town(
-    seed: int = 0,
-) -> tuple[np.ndarray, BearingTerm, np.ndarray, gtsam.NonlinearFactorGraph]:
+def town(seed: int = 0) -> tuple[np.ndarray, BearingTerm, np.ndarray, gtsam.NonlinearFactorGraph]:
     """Landmarks (J, 3), observations, pose rows (F, 12) to start from, and factors on poses."""
     rng = np.random.default_rng(seed)
     angle = 4 * np.pi * np.arange(NUM) / NUM

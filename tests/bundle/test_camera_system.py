@@ -51,10 +51,7 @@ def _settled(
 
 def test_all_of_a_camera_is_found_from_a_start_that_is_off() -> None:
     start = replace(
-        LENSES,
-        centre=0.8 * CENTRE,
-        inverse_stitch_radius=0.1,
-        readout_motion=0.7 * MOTION,
+        LENSES, centre=0.8 * CENTRE, inverse_stitch_radius=0.1, readout_motion=0.7 * MOTION
     )
     world, found, given = _settled(LENSES, CameraEstimate(start, 0.7 * READOUT_S))
     scale = pose_similarity(given[0].world_T_rigs, world.world_T_rigs).scale

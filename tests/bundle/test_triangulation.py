@@ -23,11 +23,7 @@ def _observe(points_world: np.ndarray, world_T_rigs: np.ndarray) -> np.ndarray:
     return seen.swapaxes(0, 1).reshape(-1, 3)
 
 
-def _run(
-    bearings: np.ndarray,
-    world_T_rigs: np.ndarray,
-    gate: float = 8.0,
-) -> Landmarks:
+def _run(bearings: np.ndarray, world_T_rigs: np.ndarray, gate: float = 8.0) -> Landmarks:
     tracks = _all_see_all(len(world_T_rigs), len(bearings) // len(world_T_rigs))
     sigmas = np.full(len(bearings), SIGMA)
     return triangulation.triangulate(tracks, bearings, sigmas, world_T_rigs, gate)
@@ -153,10 +149,6 @@ def test_points_are_the_least_squares_ones() -> None:
 def test_no_tracks_make_no_points() -> None:
     nothing = np.zeros(0, np.int32)
     found = triangulation.triangulate(
-        Tracks(nothing, nothing, nothing, 0),
-        np.zeros((0, 3)),
-        np.zeros(0),
-        loop_walk(3),
-        8.0,
+        Tracks(nothing, nothing, nothing, 0), np.zeros((0, 3)), np.zeros(0), loop_walk(3), 8.0
     )
     assert found.points_world.shape == (0, 3) and found.counts.received == 0

@@ -331,10 +331,7 @@ BAD_KALIBR = {
     "no camera": (lambda t: t.update(cam1=None), "cam1 is None, not a group of fields"),
     "no resolution": (lambda t: t["cam0"].pop("resolution"), "cam0 has no resolution"),
     "text": (lambda t: t["cam0"].update(intrinsics="a"), "cam0: intrinsics is 'a', not numbers"),
-    "scaled": (
-        lambda t: t["cam1"].update(T_cn_cnm1=(2 * np.eye(4)).tolist()),
-        "no rigid motion",
-    ),
+    "scaled": (lambda t: t["cam1"].update(T_cn_cnm1=(2 * np.eye(4)).tolist()), "no rigid motion"),
     "side by side": (
         lambda t: t["cam1"].update(T_cn_cnm1=np.eye(4).tolist()),
         "look less than 90 degrees apart",

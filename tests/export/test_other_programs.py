@@ -16,6 +16,7 @@ from export_scene import (
     POINTS,
     assert_blob,
     cube_frames,
+    moved_by_velocities,
     panoramas,
     poses,
     reconstruction,
@@ -271,15 +272,6 @@ def test_unknown_names_are_refused() -> None:
         format_of("supersplat")
 
 
-def _row_pose(entry: dict, after_s: float) -> np.ndarray:
-    """Pose of a row `after_s` after the frame's, as a trainer moves the camera by velocities."""
-    turn = np.array(entry["camera_angular_velocity"]) * after_s
-    moved = np.eye(4)
-    moved[:3, :3] = Rotation.from_rotvec(turn).as_matrix()
-    moved[:3, 3] = np.array(entry["camera_linear_velocity"]) * after_s
-    return np.array(entry["transform_matrix"]) @ moved
-
-
 def test_velocities_say_where_neighbouring_frames_are(tmp_path: Path) -> None:
     """A camera that turns and moves steadily: each face is where its velocity puts it."""
     frames = panoramas(tmp_path / "frames")
@@ -298,7 +290,7 @@ def test_velocities_say_where_neighbouring_frames_are(tmp_path: Path) -> None:
     assert (meta["exposure_time"], meta["rolling_shutter_time"]) == (0.005, 0.0)
     for before, after in zip(meta["frames"][:-6], meta["frames"][6:], strict=True):
         wanted = np.array(after["transform_matrix"])
-        np.testing.assert_allclose(_row_pose(before, 0.01), wanted, atol=2e-4)
+        np.testing.assert_allclose(moved_by_velocities(before, 0.01), wanted, atol=2e-4)
 
 
 def test_frames_far_apart_have_no_velocities(tmp_path: Path) -> None:

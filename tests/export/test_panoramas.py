@@ -15,6 +15,7 @@ from export_scene import (
     assert_blob,
     bearings,
     cube_frames,
+    moved_by_velocities,
     panoramas,
     picture,
     poses,
@@ -165,13 +166,6 @@ def _between(start: np.ndarray, end: np.ndarray, shares: np.ndarray) -> np.ndarr
     return pose(turns(shares).as_matrix(), start[:3, 3] + np.outer(shares, (end - start)[:3, 3]))
 
 
-def _moved(entry: dict, after_s: float) -> np.ndarray:
-    """Pose (y down, z forward) of a frame's camera after a time, by its velocities."""
-    turn, move = (np.array(entry[f"camera_{kind}_velocity"]) for kind in ("angular", "linear"))
-    step = pose(Rotation.from_rotvec(turn * after_s).as_matrix(), move * after_s)
-    return np.array(entry["transform_matrix"]) @ step @ np.diag([1.0, -1, -1, 1])
-
-
 def _image(path: Path) -> np.ndarray:
     image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     return image if image.ndim == 2 else image[..., ::-1]
@@ -208,7 +202,8 @@ def test_rows_of_raw_fisheyes_have_their_poses(tmp_path: Path) -> None:
         )
         for edge, sign in ((start, -1), (end, 1)):  # velocities say the same as these poses, but
             # for the arc of a lens about the rig's centre, which is of second order in the turn
-            np.testing.assert_allclose(_moved(entry, sign * 0.01), edge, atol=2e-4)
+            row = moved_by_velocities(entry, sign * 0.01) @ np.diag([1.0, -1, -1, 1])
+            np.testing.assert_allclose(row, edge, atol=2e-4)
         shares = np.floor(expected[:, 1]) / (entry["h"] - 1)
         cameras_T_world = {
             "instant-ngp": inverse(_between(start, end, expected[:, 1] / entry["h"])),

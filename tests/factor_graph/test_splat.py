@@ -192,11 +192,7 @@ def test_both_doors_lead_to_the_same_place() -> None:
 def test_a_frame_that_shows_nothing_stays_where_it_is() -> None:
     poses = truth(1)
     blind = SplatBlock(
-        [X(0)],
-        [np.zeros((6, 48, 48), np.float32)],
-        [np.zeros((6, 48, 48), bool)],
-        CAMERAS,
-        render,
+        [X(0)], [np.zeros((6, 48, 48), np.float32)], [np.zeros((6, 48, 48), bool)], CAMERAS, render
     )
     blind.refresh(values_of(poses))
     system = blind.linearize(values_of(poses))

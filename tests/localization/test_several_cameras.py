@@ -15,11 +15,6 @@ from gsba.store.finished import load_run
 
 
 @pytest.fixture(scope="module")
-def home(cameras_home: Home) -> Home:
-    return cameras_home
-
-
-@pytest.fixture(scope="module")
 def sizes(two_sizes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of panoramas of two sizes."""
     return Path(shutil.copytree(two_sizes, tmp_path_factory.mktemp("localized") / "sizes"))

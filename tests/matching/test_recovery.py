@@ -187,8 +187,7 @@ def test_at_lost_steps_of_frames_far_apart_the_camera_walks_on() -> None:
 
 
 @pytest.mark.parametrize(
-    ("far", "misled", "expected"),
-    [(True, 0.5, True), (True, 0.05, False), (False, 0.5, False)],
+    ("far", "misled", "expected"), [(True, 0.5, True), (True, 0.05, False), (False, 0.5, False)]
 )
 def test_known_steps_of_frames_far_apart_tell_whether_matching_is_misled(
     far: bool, misled: float, expected: bool

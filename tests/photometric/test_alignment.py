@@ -226,10 +226,7 @@ def test_poses_become_better_than_the_detector_leaves_them(walk) -> None:
         found = inverse(solved.world_T_rigs[:-1]) @ solved.world_T_rigs[1:]
         return np.linalg.norm(found[:, :3, :3] - true[:, :3, :3], axis=(1, 2))
 
-    start = replace(
-        Solution.without_points(world_T_rigs),
-        landmarks=landmarks,
-    )
+    start = replace(Solution.without_points(world_T_rigs), landmarks=landmarks)
     problem, gates = AdjustmentContext(Families((Bearings(), priors)), RIG, settings, 2), (6.0, 3.0)
     before = adjustment.adjust(landmarks.tracks, keypoints, start, problem, gates)
     greys, workers = Greys(frames, 4096), Threads(2)

@@ -153,10 +153,7 @@ def test_nothing_to_see_changes_nothing(case: Case, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(direct, "_DEPTH_LEVELS", 0)
     frames, keypoints, solved, priors, rig = _start(case, JOINT)
     result = direct.refine(
-        frames,
-        keypoints,
-        solved,
-        AdjustmentContext(Families((Bearings(), priors)), rig, JOINT, 1),
+        frames, keypoints, solved, AdjustmentContext(Families((Bearings(), priors)), rig, JOINT, 1)
     )
     assert np.array_equal(result.adjustment.world_T_rigs, solved.world_T_rigs)
     assert all(counts.kept == 0 for counts in result.counts)
@@ -198,10 +195,7 @@ def test_a_solve_against_the_map_is_undone(case: Case, monkeypatch: pytest.Monke
     monkeypatch.setattr(patches, "_SPACING_DEG", 20)
     frames, keypoints, solved, priors, rig = _start(case, JOINT)
     result = direct.refine(
-        frames,
-        keypoints,
-        solved,
-        AdjustmentContext(Families((Bearings(), priors)), rig, JOINT, 1),
+        frames, keypoints, solved, AdjustmentContext(Families((Bearings(), priors)), rig, JOINT, 1)
     )
     assert not result.adjustment.rounds[-1].accepted
     assert np.array_equal(result.adjustment.world_T_rigs, solved.world_T_rigs)
@@ -228,10 +222,7 @@ def test_a_small_panorama_has_fewer_levels(case: Case, monkeypatch: pytest.Monke
     monkeypatch.setattr(patches, "_SIZE", 5)
     frames, keypoints, solved, priors, rig = _start(case, JOINT)
     result = direct.refine(
-        frames,
-        keypoints,
-        solved,
-        AdjustmentContext(Families((Bearings(), priors)), rig, JOINT, 1),
+        frames, keypoints, solved, AdjustmentContext(Families((Bearings(), priors)), rig, JOINT, 1)
     )
     assert np.isfinite(result.adjustment.world_T_rigs).all() and len(result.counts) == 2
 

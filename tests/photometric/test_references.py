@@ -35,12 +35,7 @@ def test_views_are_similar_and_never_the_reference(monkeypatch: pytest.MonkeyPat
     points, frames = visible_frames(landmarks, _poses(x), np.array([1]), ALL)
     assert list(points) == [0, 0] and list(frames) == [1, 3]  # 0 and 4 are 27 degrees off
     monkeypatch.setattr(references_, "MAX_ANGLE_DEG", 30.0)
-    assert set(visible_frames(landmarks, _poses(x), np.array([1]), ALL)[1]) == {
-        0,
-        1,
-        3,
-        4,
-    }
+    assert set(visible_frames(landmarks, _poses(x), np.array([1]), ALL)[1]) == {0, 1, 3, 4}
 
 
 def test_revisits_are_views_whatever_their_time(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,12 +21,7 @@ def _with_gps(file: Path, **options: float) -> RefineSettings:
 
 
 def _table(
-    path: Path,
-    case: Case,
-    metres: float,
-    seed: int = 0,
-    shift_s: float = 0.0,
-    stretch: float = 1.0,
+    path: Path, case: Case, metres: float, seed: int = 0, shift_s: float = 0.0, stretch: float = 1.0
 ) -> Path:
     """Fixes of the true positions, blown up to metres and along north, with .3 m of noise."""
     times, upright = case.truth.timestamps, np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])

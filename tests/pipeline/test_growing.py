@@ -107,14 +107,7 @@ def test_pictures_are_localised_in_a_grown_run(grown: Path, home: GrowingHome) -
 
 def test_a_recording_of_another_place_is_refused(home: GrowingHome, tmp_path: Path) -> None:
     before, out = _content(home.run), tmp_path / "run"
-    result = _gsba(
-        "add",
-        home.run,
-        home.elsewhere,
-        home.elsewhere_trajectory,
-        "--out",
-        out,
-    )
+    result = _gsba("add", home.run, home.elsewhere, home.elsewhere_trajectory, "--out", out)
     assert result.exit_code == 1 and not out.exists()
     assert "recording 'elsewhere' does not meet the map of" in result.output
     assert _content(home.run) == before and not list(tmp_path.iterdir())
@@ -135,14 +128,8 @@ def test_refusals_are_one_line_and_leave_the_run(home: GrowingHome, tmp_path: Pa
         ([unfinished, home.folders[1]], "is not finished"),
         ([older, home.folders[1]], "is a run of gsba 0.0.1"),
         ([home.run, home.folders[0]], "has recording"),
-        (
-            [home.run, "--recording", f"{home.folders[1]},name=ground"],
-            "named 'ground'",
-        ),
-        (
-            [home.run, home.folders[1], "--out", home.folders[0]],
-            "exists: choose another --out",
-        ),
+        ([home.run, "--recording", f"{home.folders[1]},name=ground"], "named 'ground'"),
+        ([home.run, home.folders[1], "--out", home.folders[0]], "exists: choose another --out"),
         ([home.run, home.folders[1], tmp_path / "missing.tum"], "missing.tum"),
     ]
     for arguments, told in cases:

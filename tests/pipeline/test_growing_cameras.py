@@ -8,15 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from accuracy import assert_as_accurate, predicted_error
-from cameras_home import (
-    NUM,
-    SMALL,
-    WIDTH,
-    Home,
-    beginning,
-    error_of,
-    panoramas,
-)
+from cameras_home import NUM, SMALL, WIDTH, Home, beginning, error_of, panoramas
 from command import succeed
 from tiny_run import PLAIN
 
@@ -32,11 +24,6 @@ from gsba.types import Counts, FrameSet
 
 # Error that a run of the second recording at 384 pixels predicts; it scatters by a twentieth.
 SMALL_ALONE = 0.00165
-
-
-@pytest.fixture(scope="module")
-def home(cameras_home: Home) -> Home:
-    return cameras_home
 
 
 @pytest.fixture(scope="module")

@@ -16,11 +16,6 @@ from gsba.pipeline.joint_cameras import as_read_by
 from gsba.pipeline.recordings import refine_each
 
 
-@pytest.fixture(scope="module")
-def home(cameras_home: Home) -> Home:
-    return cameras_home
-
-
 def test_fixed_poses_of_a_run_of_several_cameras_stay(
     two_sizes: Path, home: Home, tmp_path: Path
 ) -> None:

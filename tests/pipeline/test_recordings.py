@@ -104,10 +104,7 @@ def test_a_second_call_resumes(run: Path, home: GrowingHome) -> None:
 def test_recordings_with_and_without_a_trajectory_are_joined(
     home: GrowingHome, tmp_path: Path
 ) -> None:
-    recordings = [
-        Recording(home.folders[0]),
-        Recording(home.folders[1], home.trajectories[1]),
-    ]
+    recordings = [Recording(home.folders[0]), Recording(home.folders[1], home.trajectories[1])]
     result = refine_recordings(recordings, tmp_path / "run", SETTINGS)
     assert len(result.maps) == 1
     first, second = result.report["recordings"]

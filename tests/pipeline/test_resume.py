@@ -15,8 +15,9 @@ import pytest
 from tiny_run import BARE, NUM_FRAMES, SETTINGS, Case, computed_stages, exporting
 
 import gsba
+from gsba import RunResult
 from gsba.bundle import map_strength
-from gsba.config import RoundSettings, WeakFrameSettings
+from gsba.config import RefineSettings, RoundSettings, WeakFrameSettings
 from gsba.log import following
 from gsba.matching import correspondences
 from gsba.report.time_left import TimeLeft
@@ -144,16 +145,12 @@ def test_a_weak_map_gets_more_keypoints_and_resumes(
     monkeypatch.setattr(map_strength, "MAX_SCALE_SIGMA", 1e-12)
     closer = {"max_drift": 1e-12, "max_per_face": 600, "mode": "measured"}
     settings = SETTINGS.model_copy(update={"weak_frames": WeakFrameSettings(**closer)})
-    out = case.copy(tmp_path / "run")
-    result = case.refine(out, settings)
+    result = case.refine(case.copy(tmp_path / "run"), settings)
     stages = {stage["name"]: stage for stage in result.report["stages"]}
     dropped = stages["strength"]["counts"][0]["dropped"]
     assert dropped == {"images hold the step far better": NUM_FRAMES - 1}
     assert stages["features"]["resumed"] and not stages["dense_closer"]["resumed"]
-    points = [len(run.reconstruction.points_world) for run in (case.result, result)]
-    assert points[1] > 1.2 * points[0]
-    assert case.errors(out).rpe_rotation_deg.max < 0.1  # ten times what chance leaves
-    assert computed_stages(case.refine(out, settings)) == []
+    _has_more_points_and_resumes(case, result, settings)
 
 
 @pytest.mark.slow
@@ -163,11 +160,14 @@ def test_a_walk_that_does_not_return_gets_more_keypoints_at_once(
     """Where few matches foretell a weak map: its frames are searched once."""
     closer = {"max_drift": 1e-12, "max_per_face": 600}
     settings = SETTINGS.model_copy(update={"weak_frames": WeakFrameSettings(**closer)})
-    out = case.copy(tmp_path / "run")
-    result = case.refine(out, settings)
+    result = case.refine(case.copy(tmp_path / "run"), settings)
     names = [stage["name"] for stage in result.report["stages"]]
     assert "expected_drift" in names and "features_closer" not in names
+    _has_more_points_and_resumes(case, result, settings)
+
+
+def _has_more_points_and_resumes(case: Case, result: RunResult, settings: RefineSettings) -> None:
     points = [len(run.reconstruction.points_world) for run in (case.result, result)]
     assert points[1] > 1.2 * points[0]
-    assert case.errors(out).rpe_rotation_deg.max < 0.1  # ten times what chance leaves
-    assert computed_stages(case.refine(out, settings)) == []
+    assert case.errors(result.out).rpe_rotation_deg.max < 0.1  # ten times what chance leaves
+    assert computed_stages(case.refine(result.out, settings)) == []

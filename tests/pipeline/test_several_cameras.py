@@ -23,11 +23,6 @@ COARSER = 0.00083
 
 
 @pytest.fixture(scope="module")
-def home(cameras_home: Home) -> Home:
-    return cameras_home
-
-
-@pytest.fixture(scope="module")
 def sizes(two_sizes: Path, home: Home, tmp_path_factory: pytest.TempPathFactory) -> RunResult:
     """A recording at 512 pixels and one at 384, in several formats."""
     out = Path(shutil.copytree(two_sizes, tmp_path_factory.mktemp("several") / "sizes"))

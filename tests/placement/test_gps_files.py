@@ -8,6 +8,7 @@ from pathlib import Path
 import insta360_files
 import numpy as np
 import pytest
+from gopro_files import item, nest, words, write_mp4
 from PIL import Image
 from walk_on_earth import frame_set
 
@@ -101,17 +102,10 @@ def test_a_fix_that_pictures_repeat_counts_once(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.sigmas, [LEAST, [6, 6, 10], LEAST])
 
 
-def _item(key: str, kind: str, size: int, data: bytes) -> bytes:
-    """One item of GPMF: key, type, size of an element, number of them, and the elements."""
-    head = struct.pack(">4scBH", key.encode(), kind.encode(), size, len(data) // size)
-    return head + data + bytes(-len(data) % 4)
-
-
 def _device(tags: bytes, first_us: int | None) -> bytes:
-    stamp = b"" if first_us is None else _item("STMP", "J", 8, struct.pack(">Q", first_us))
-    stream = _item("STRM", "\0", 1, stamp + tags)
-    name = _item("DVNM", "c", 1, b"MAX ")
-    return _item("DEVC", "\0", 1, _item("DVID", "L", 4, struct.pack(">I", 1)) + name + stream)
+    stamp = b"" if first_us is None else item("STMP", "J", 8, struct.pack(">Q", first_us))
+    name = item("DVNM", "c", 1, b"MAX ")
+    return nest("DEVC", item("DVID", "L", 4, words(1)), name, nest("STRM", stamp, tags))
 
 
 def _gps5(start: float, count: int, state: int = 3, stamped: bool = True) -> bytes:
@@ -121,10 +115,10 @@ def _gps5(start: float, count: int, state: int = 3, stamped: bool = True) -> byt
         [480_000_000 + 100 * times, *np.tile([[115_000_000], [520_000], [1], [1]], count)]
     )
     utc = f"2405011000{int(start):02d}.{round(1000 * (start % 1)):03d}".encode()
-    tags = _item("GPSF", "L", 4, struct.pack(">I", state)) + _item("GPSU", "U", 16, utc)
-    tags += _item("GPSP", "S", 2, struct.pack(">H", 250))
-    tags += _item("SCAL", "l", 4, struct.pack(">5i", 10**7, 10**7, 1000, 1000, 100))
-    tags += _item("GPS5", "l", 20, rows.round().astype(">i4").tobytes())
+    tags = item("GPSF", "L", 4, struct.pack(">I", state)) + item("GPSU", "U", 16, utc)
+    tags += item("GPSP", "S", 2, struct.pack(">H", 250))
+    tags += item("SCAL", "l", 4, struct.pack(">5i", 10**7, 10**7, 1000, 1000, 100))
+    tags += item("GPS5", "l", 20, rows.round().astype(">i4").tobytes())
     return _device(tags, round(1e6 * (start + 0.3)) if stamped else None)
 
 
@@ -136,46 +130,9 @@ def _gps9(start: float, count: int) -> bytes:
         place = round(480_000_000 + 100 * t), 115_000_000, 520_000, 1, 1
         state = 2 if start == 0 and k == 0 else 3
         data += struct.pack(">7i2H", *place, 8887, round(1000 * (36000 + t)), 400, state)
-    tags = _item("TYPE", "c", 1, b"lllllllSS")
-    tags += _item(
-        "SCAL", "l", 4, struct.pack(">9i", 10**7, 10**7, 1000, 1000, 100, 1, 1000, 100, 1)
-    )
-    return _device(tags + _item("GPS9", "?", 32, data), None)
-
-
-def _box(kind: str, *parts: bytes) -> bytes:
-    body = b"".join(parts)
-    return struct.pack(">I4s", 8 + len(body), kind.encode()) + body
-
-
-def _full(kind: str, *parts: bytes, flags: int = 0) -> bytes:
-    return _box(kind, struct.pack(">I", flags), *parts)
-
-
-def _video(path: Path, packets: Sequence[bytes]) -> Path:
-    """An MP4 file (ISO/IEC 14496-12) with a track of metadata alone, a packet a second."""
-    matrix = struct.pack(">9i", 65536, 0, 0, 0, 65536, 0, 0, 0, 1 << 30)
-    ends, num = np.cumsum([len(packet) for packet in packets]), len(packets)
-    brand = _box("ftyp", b"mp41", bytes(4), b"mp41")
-    places = len(brand) + 8 + ends - [len(packet) for packet in packets]
-    table = _box(
-        "stbl",
-        _full("stsd", struct.pack(">I", 1), _box("gpmd", bytes(6), b"\0\1", bytes(4))),
-        _full("stts", struct.pack(">III", 1, num, 1000)),
-        _full("stsc", struct.pack(">IIII", 1, 1, 1, 1)),
-        _full("stsz", struct.pack(">II", 0, num), *(struct.pack(">I", len(p)) for p in packets)),
-        _full("stco", struct.pack(">I", num), *(struct.pack(">I", int(at)) for at in places)),
-    )
-    times = struct.pack(">IIII", 0, 0, 1000, 1000 * num)
-    handler = _full("hdlr", bytes(4), b"meta", bytes(12), b"\x0bGoPro MET  \0")
-    data = _box("dinf", _full("dref", struct.pack(">I", 1), _full("url ", flags=1)))
-    media = _box("mdia", _full("mdhd", times, bytes(4)), handler, _box("minf", data, table))
-    head = _full("tkhd", struct.pack(">IIIII", 0, 0, 1, 0, 1000 * num), bytes(16), matrix, bytes(8))
-    whole = _full("mvhd", times, struct.pack(">IH", 65536, 256), bytes(10), matrix, bytes(28))
-    path.write_bytes(
-        brand + _box("mdat", *packets) + _box("moov", whole, _box("trak", head, media))
-    )
-    return path
+    tags = item("TYPE", "c", 1, b"lllllllSS")
+    tags += item("SCAL", "l", 4, struct.pack(">9i", 10**7, 10**7, 1000, 1000, 100, 1, 1000, 100, 1))
+    return _device(tags + item("GPS9", "?", 32, data), None)
 
 
 @pytest.mark.parametrize("stamped", [True, False])
@@ -183,7 +140,7 @@ def test_gopro_videos_hold_fixes_on_their_clock(tmp_path: Path, stamped: bool) -
     pytest.importorskip("telemetry_parser", reason="telemetry-parser (gsba[imu]) is not there")
     states = [0, 3, 3, 2]
     packets = [_gps5(float(k), 18, state, stamped) for k, state in enumerate(states)]
-    found = read_fixes(str(_video(tmp_path / "GS01.360", packets)))
+    found = read_fixes(str(write_mp4(tmp_path / "GS01.360", packets)))
     assert found is not None and found.timestamps is not None
     times = np.arange(18, 54) / 18  # no fix yet in the first second, none with height in the last
     np.testing.assert_allclose(found.timestamps, times, atol=1e-6)
@@ -194,7 +151,7 @@ def test_gopro_videos_hold_fixes_on_their_clock(tmp_path: Path, stamped: bool) -
 
 def test_later_gopros_rate_each_fix(tmp_path: Path) -> None:
     pytest.importorskip("telemetry_parser", reason="telemetry-parser (gsba[imu]) is not there")
-    found = read_fixes(str(_video(tmp_path / "a.mp4", [_gps9(0.0, 10), _gps9(1.0, 10)])))
+    found = read_fixes(str(write_mp4(tmp_path / "a.mp4", [_gps9(0.0, 10), _gps9(1.0, 10)])))
     assert found is not None and found.timestamps is not None
     np.testing.assert_allclose(found.timestamps, np.arange(1, 20) / 10, atol=1e-6)
     np.testing.assert_allclose(found.sigmas[:, 0], 12)
@@ -202,13 +159,13 @@ def test_later_gopros_rate_each_fix(tmp_path: Path) -> None:
 
 def test_videos_without_fixes_are_one_line(tmp_path: Path) -> None:
     pytest.importorskip("telemetry_parser", reason="telemetry-parser (gsba[imu]) is not there")
-    lost = _video(tmp_path / "lost.mp4", [_gps5(float(k), 18, 0) for k in range(3)])
+    lost = write_mp4(tmp_path / "lost.mp4", [_gps5(float(k), 18, 0) for k in range(3)])
     with pytest.raises(GsbaError, match=r"lost\.mp4: its GPS receiver had no fix"):
         read_fixes(str(lost))
-    crossed = _video(tmp_path / "crossed.mp4", [_gps5(1.0, 18), _gps5(0.0, 18)])
+    crossed = write_mp4(tmp_path / "crossed.mp4", [_gps5(1.0, 18), _gps5(0.0, 18)])
     with pytest.raises(GsbaError, match="packet 1 is not later than packet 0"):
         read_fixes(str(crossed))
-    none = _video(tmp_path / "none.mp4", [_device(_item("GYRO", "s", 6, bytes(60)), 0)] * 2)
+    none = write_mp4(tmp_path / "none.mp4", [_device(item("GYRO", "s", 6, bytes(60)), 0)] * 2)
     with pytest.raises(GsbaError, match="finds no GPS in it"):
         read_fixes(str(none))
     whole = lost.read_bytes()

@@ -147,8 +147,7 @@ def test_part_of_a_video_and_part_of_a_track_need_no_offset() -> None:
 
 @needs_shared
 @pytest.mark.parametrize(
-    ("name", "unseen"),
-    [("frame_trajectory", 2), ("other_runs/rect_default_rt_frame", 6)],
+    ("name", "unseen"), [("frame_trajectory", 2), ("other_runs/rect_default_rt_frame", 6)]
 )
 def test_real_slam_output_with_a_late_start(name: str, unseen: int) -> None:
     frames = scan(SHARED / "aisle_slam" / "images")

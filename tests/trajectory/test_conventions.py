@@ -4,22 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
-from synthetic import loop_walk
+from synthetic import ROS, loop_walk, w_first
 
-from gsba.geometry import inverse, pose
+from gsba.geometry import inverse
 from gsba.log import GsbaError
 from gsba.trajectory.conventions import Convention, axis_systems
 from gsba.types import Trajectory
 
 WALK = Trajectory(np.arange(9.0), loop_walk(9))
-ROS = pose(np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), np.zeros(3))  # ours_T_forward-left-up
-
-
-def _w_first(world_T_rigs: np.ndarray) -> np.ndarray:
-    """Poses as read where their file has quaternions w, x, y, z."""
-    xyzw = Rotation.from_matrix(world_T_rigs[:, :3, :3]).as_quat()
-    return pose(Rotation.from_quat(xyzw[:, [3, 0, 1, 2]]).as_matrix(), world_T_rigs[:, :3, 3])
 
 
 @pytest.mark.parametrize(
@@ -27,11 +19,11 @@ def _w_first(world_T_rigs: np.ndarray) -> np.ndarray:
     [
         (None, WALK.world_T_rigs),
         ("right-down-forward", WALK.world_T_rigs),
-        ("wxyz", _w_first(WALK.world_T_rigs)),
+        ("wxyz", w_first(WALK.world_T_rigs)),
         ("camera-from-world", inverse(WALK.world_T_rigs)),
         ("forward-left-up", WALK.world_T_rigs @ ROS),
-        ("wxyz, camera-from-world", _w_first(inverse(WALK.world_T_rigs))),
-        ("wxyz,forward-left-up", _w_first(WALK.world_T_rigs @ ROS)),
+        ("wxyz, camera-from-world", w_first(inverse(WALK.world_T_rigs))),
+        ("wxyz,forward-left-up", w_first(WALK.world_T_rigs @ ROS)),
     ],
 )
 def test_other_conventions_become_ours(words: str | None, read: np.ndarray) -> None:

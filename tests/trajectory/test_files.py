@@ -78,8 +78,7 @@ def test_refused_tum_lines(tmp_path: Path, line: str, message: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "row",
-    ["nan nan nan nan nan nan nan", "1 2 3 0 0 0 0", "1e27 0 0 0 0 0 1", "0 inf 0 0 0 0 1"],
+    "row", ["nan nan nan nan nan nan nan", "1 2 3 0 0 0 0", "1e27 0 0 0 0 0 1", "0 inf 0 0 0 0 1"]
 )
 def test_rows_of_lost_frames_have_no_pose(tmp_path: Path, row: str) -> None:
     lines = [f"{n} {n} 0 0 0 0 0 1" for n in range(4)]

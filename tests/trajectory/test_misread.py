@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from synthetic import drifted, loop_walk, unit
+from synthetic import ROS, drifted, loop_walk, unit, w_first
 
 from gsba.config import RefineSettings
 from gsba.geometry import inverse, pose
@@ -24,18 +24,7 @@ from gsba.types import CoarsePoses, PoseSource, Trajectory, VerifiedPairs
 NUM = 30
 SLAM = drifted(loop_walk(NUM), np.random.default_rng(0))
 MIRROR, OPENGL = np.diag([-1.0, 1, 1, 1]), np.diag([1.0, -1, -1, 1])
-
-
 TURNED, ROLLED = np.diag([-1.0, 1, -1, 1]), np.diag([-1.0, -1, 1, 1])
-ROS = np.array(
-    [[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]]
-)  # ours_T_forward-left-up
-
-
-def _w_first(world_T_rigs: np.ndarray) -> np.ndarray:
-    """Poses as read where their file has quaternions w, x, y, z."""
-    xyzw = Rotation.from_matrix(world_T_rigs[:, :3, :3]).as_quat()
-    return pose(Rotation.from_quat(xyzw[:, [3, 0, 1, 2]]).as_matrix(), world_T_rigs[:, :3, 3])
 
 
 def _coarse(world_T_rigs: np.ndarray) -> CoarsePoses:
@@ -68,15 +57,9 @@ def _another() -> np.ndarray:
             "pass --trajectory-format left-down-back; or it is on another clock",
         ),
         (ROLLED @ SLAM @ ROLLED, "pass --trajectory-format left-up-forward, or"),
-        (
-            SLAM @ ROS,
-            "x forward, y left, z up: pass --trajectory-format forward-left-up, or",
-        ),
-        (_w_first(SLAM), "order w, x, y, z: pass --trajectory-format wxyz, or"),
-        (
-            _w_first(SLAM @ ROS),
-            "z up: pass --trajectory-format wxyz,forward-left-up, or",
-        ),
+        (SLAM @ ROS, "x forward, y left, z up: pass --trajectory-format forward-left-up, or"),
+        (w_first(SLAM), "order w, x, y, z: pass --trajectory-format wxyz, or"),
+        (w_first(SLAM @ ROS), "z up: pass --trajectory-format wxyz,forward-left-up, or"),
         (_another(), "another recording"),
     ],
 )

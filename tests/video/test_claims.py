@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from gopro_files import box
 from two_fisheyes import made_pair, picture
 from wave_panorama import wave_panorama
 
@@ -56,11 +57,6 @@ def _write(path: Path, pictures: list[np.ndarray], orientation: int = 1, aspect:
     return path
 
 
-def _box(kind: bytes, *parts: bytes) -> bytes:
-    body = b"".join(parts)
-    return struct.pack(">I4s", 8 + len(body), kind) + body
-
-
 def _with_boxes(path: Path, boxes: bytes) -> Path:
     """Boxes appended to the sample entry of an MP4 whose `moov` lies at the end."""
     data = path.read_bytes()
@@ -76,15 +72,15 @@ def _with_boxes(path: Path, boxes: bytes) -> Path:
 
 
 def _stereo(mode: int) -> bytes:
-    return _box(b"st3d", bytes(4), bytes([mode]))
+    return box("st3d", bytes(4), bytes([mode]))
 
 
 def _spherical(yaw: float = 0.0, bounds: tuple[float, float, float, float] = (0, 0, 0, 0)) -> bytes:
     """Boxes of an equirectangular projection; bounds top, bottom, left, right, parts of 1."""
     turn = struct.pack(">3i", round(yaw * ONE), 0, 0)
     edges = struct.pack(">4I", *(round(part * 2**32) for part in bounds))
-    projection = _box(b"proj", _box(b"prhd", bytes(4), turn), _box(b"equi", bytes(4), edges))
-    return _box(b"sv3d", _box(b"svhd", bytes(4), b"made here\0"), projection)
+    projection = box("proj", box("prhd", bytes(4), turn), box("equi", bytes(4), edges))
+    return box("sv3d", box("svhd", bytes(4), b"made here\0"), projection)
 
 
 def _first(recording: VideoRecording) -> VideoPicture:

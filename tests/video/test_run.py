@@ -56,10 +56,7 @@ def test_bad_input_fails_before_decoding(tmp_path: Path) -> None:
     (tmp_path / "walk.mp4").write_bytes(b"no video")
     with pytest.raises(GsbaError, match=r"nowhere\.tum"):
         refine(tmp_path / "walk.mp4", tmp_path / "nowhere.tum", tmp_path / "run")
-    write_tum(
-        tmp_path / "slam.tum",
-        read_trajectory(_two_poses(tmp_path / "two.tum")),
-    )
+    write_tum(tmp_path / "slam.tum", read_trajectory(_two_poses(tmp_path / "two.tum")))
     with pytest.raises(GsbaError, match=r"walk\.mp4: cannot be read as video"):
         refine(tmp_path / "walk.mp4", tmp_path / "slam.tum", tmp_path / "run")
     with pytest.raises(GsbaError, match="--fps 0: must be a positive"):
