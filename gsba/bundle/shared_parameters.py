@@ -4,6 +4,7 @@ and points eliminated. Others' parameters are believed where they predict a part
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TypeVar
 
 import numpy as np
@@ -13,6 +14,7 @@ from scipy.sparse.linalg import splu
 from factors.bearing import bearing_residuals, tangent_basis
 from factors.cholesky import BlockCholesky
 from factors.elimination import Eliminated, LinearSystem, eliminate
+from factors.threads import Once
 from gsba.bundle.adjustment import AdjustmentContext, landmark_block, values_of
 from gsba.types import Counts, Keypoints, Landmarks, Solution, Tracks
 
@@ -131,25 +133,36 @@ def weighted(
     return Weighted(rows, residuals, by_pose, by_point, roots, max(curvature, _MIN_CURVATURE))
 
 
-def models_of(
-    landmarks: Landmarks,
-    keypoints: Keypoints,
-    solved: Solution,
-    context: AdjustmentContext,
-    by_shared: BySharedParameters,
-    most: int = MAX_OBSERVATIONS,
-) -> tuple[list[SharedModel], Counts]:
-    """Models of the cost of each part of the sequence, see `model_of`, by at most so many
-    observations, none where there is too little; and how many observations they rest on."""
-    used = drawn(landmarks, most, context.settings.seed)
-    alone = replace(context, num_threads=1)  # parts run side by side
+class PartsOfMap:
+    """Parts of a map's sequence; residuals of their bearings are computed once for all models."""
 
-    def model(part: Landmarks) -> SharedModel:
-        return model_of(part, keypoints, solved, alone, by_shared)
+    def __init__(
+        self,
+        landmarks: Landmarks,
+        keypoints: Keypoints,
+        solved: Solution,
+        context: AdjustmentContext,
+        most: int = MAX_OBSERVATIONS,
+    ) -> None:
+        """Draw at most so many observations; none where there is too little."""
+        used = drawn(landmarks, most, context.settings.seed)
+        self.counts = sample_counts(landmarks, used)  # observations that models rest on
+        self._solved, self._num_threads = solved, context.num_threads
+        alone = replace(context, num_threads=1)  # parts run side by side
+        self._each = [
+            (part.tracks, Once(partial(weighted, part, keypoints, solved, alone)))
+            for part in parts_of(used)
+        ]
 
-    with ThreadPoolExecutor(context.num_threads) as pool:
-        models = list(pool.map(model, parts_of(used)))
-    return models, sample_counts(landmarks, used)
+    def models(self, by_shared: BySharedParameters) -> list[SharedModel]:
+        """Models of the cost of each part, see `model_of`."""
+
+        def model(part: tuple[Tracks, Once[Weighted]]) -> SharedModel:
+            tracks, seen = part
+            return _model(seen(), tracks, self._solved, by_shared)
+
+        with ThreadPoolExecutor(self._num_threads) as pool:
+            return list(pool.map(model, self._each))
 
 
 def model_of(
@@ -168,10 +181,16 @@ def model_of(
             Jacobian (O, 2, 3) by where each ray starts, and the residuals (O, 2).
     """
     seen = weighted(landmarks, keypoints, solved, context)
-    by_origin = -seen.by_point @ solved.world_T_rigs[landmarks.tracks.frames, :3, :3]
+    return _model(seen, landmarks.tracks, solved, by_shared)
+
+
+def _model(
+    seen: Weighted, tracks: Tracks, solved: Solution, by_shared: BySharedParameters
+) -> SharedModel:
+    by_origin = -seen.by_point @ solved.world_T_rigs[tracks.frames, :3, :3]
     num = len(solved.world_T_rigs)
     sums = without_points(
-        seen, landmarks.tracks, num, seen.by_pose, by_shared(seen.rows, by_origin, seen.residuals)
+        seen, tracks, num, seen.by_pose, by_shared(seen.rows, by_origin, seen.residuals)
     )
     return _without_poses(sums, seen.curvature)
 
