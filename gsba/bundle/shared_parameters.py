@@ -4,7 +4,7 @@ and points eliminated. Others' parameters are believed where they predict a part
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import TypeVar
 
 import numpy as np
@@ -145,23 +145,36 @@ class PartsOfMap:
         most: int = MAX_OBSERVATIONS,
     ) -> None:
         """Draw at most so many observations; none where there is too little."""
-        used = drawn(landmarks, most, context.settings.seed)
-        self.counts = sample_counts(landmarks, used)  # observations that models rest on
-        self._solved, self._num_threads = solved, context.num_threads
+        self._landmarks, self._most = landmarks, most
+        self._given = keypoints, solved, context
+
+    @cached_property
+    def _used(self) -> Landmarks:
+        return drawn(self._landmarks, self._most, self._given[2].settings.seed)
+
+    @property
+    def counts(self) -> Counts:
+        """Counts of the observations that models rest on."""
+        return sample_counts(self._landmarks, self._used)
+
+    @cached_property
+    def _each(self) -> list[tuple[Tracks, Once[Weighted]]]:
+        keypoints, solved, context = self._given
         alone = replace(context, num_threads=1)  # parts run side by side
-        self._each = [
+        return [
             (part.tracks, Once(partial(weighted, part, keypoints, solved, alone)))
-            for part in parts_of(used)
+            for part in parts_of(self._used)
         ]
 
     def models(self, by_shared: BySharedParameters) -> list[SharedModel]:
         """Models of the cost of each part, see `model_of`."""
+        _, solved, context = self._given
 
         def model(part: tuple[Tracks, Once[Weighted]]) -> SharedModel:
             tracks, seen = part
-            return _model(seen(), tracks, self._solved, by_shared)
+            return _model(seen(), tracks, solved, by_shared)
 
-        with ThreadPoolExecutor(self._num_threads) as pool:
+        with ThreadPoolExecutor(context.num_threads) as pool:
             return list(pool.map(model, self._each))
 
 
