@@ -206,6 +206,19 @@ class Eliminated:
             self.shared_gradient,
         )  # fmt: skip
 
+    def system(self) -> LinearSystem:
+        """The sums as one sparse system."""
+        num, own, common = self.to_shared.shape
+        size, rows = num * own, np.arange(num + 1)
+        above = bsr_array((self.off_diagonal, self.columns, self.starts), shape=(size, size))
+        among = above + above.T + bsr_array((self.diagonal, rows[:-1], rows), shape=(size, size))
+        across = self.to_shared.reshape(size, common)
+        hessian = block_array(
+            [[among, csr_array(across)], [csr_array(across.T), csr_array(self.shared)]]
+        )
+        whole = np.concatenate([self.gradient.ravel(), self.shared_gradient])
+        return LinearSystem(self.cost, whole, csr_array(hessian))
+
 
 def eliminate(
     num_frames: int,
@@ -215,7 +228,7 @@ def eliminate(
     by_point: np.ndarray,
     by_frame: np.ndarray,
     by_shared: np.ndarray,
-) -> LinearSystem:
+) -> Eliminated:
     """The Schur complement of landmarks in a linear least-squares problem of whitened residuals (O,
     2), each of a frame and a landmark (O,); their Jacobians by the landmark (O, 2, 3), by the
     variables of the frame (O, 2, K) and by the shared variables (O, 2, S)."""
@@ -226,12 +239,4 @@ def eliminate(
     starts, columns, _ = covisible_pairs(offsets, frames, num_frames)
     sums = Eliminated.zeros(starts, columns, own, common)
     sums.add(offsets, frames, residuals[order], by_point[order], by_frame[order], by_shared[order])
-    size, rows = num_frames * own, np.arange(num_frames + 1)
-    above = bsr_array((sums.off_diagonal, columns, starts), shape=(size, size))
-    among = above + above.T + bsr_array((sums.diagonal, rows[:-1], rows), shape=(size, size))
-    across = sums.to_shared.reshape(size, common)
-    hessian = block_array(
-        [[among, csr_array(across)], [csr_array(across.T), csr_array(sums.shared)]]
-    )
-    whole = np.concatenate([sums.gradient.ravel(), sums.shared_gradient])
-    return LinearSystem(sums.cost, whole, csr_array(hessian))
+    return sums

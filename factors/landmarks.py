@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Sequence
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -42,7 +43,6 @@ class LandmarkBlock:
 
     Attributes:
         keys: (F,) keys of the Pose3 variables `world_T_rig`.
-        shared: (P,) float32, number of landmarks that each of `pairs` shares.
         points_world: (J, 3) float64, current landmarks in the order given.
     """
 
@@ -83,21 +83,30 @@ class LandmarkBlock:
             self.terms, len(self.keys), len(points), self.loss
         )
         self._points = points[self._point_order]
-        self._visits = visits_of(
-            self._obs.offsets, self._obs.frames, len(self.keys), _MAX_VISITS_AT_ONCE
-        )
-        self._row_starts, self._columns, self.shared = covisible_pairs(
-            self._obs.offsets, self._obs.frames, len(self.keys)
-        )
         self._trial: tuple[np.ndarray, np.ndarray] | None = None
         self._poses: np.ndarray | None = None
         self._point_costs = np.full(len(points), np.inf)
 
+    @cached_property
+    def _covisible(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return covisible_pairs(self._obs.offsets, self._obs.frames, len(self.keys))
+
     @property
     def pairs(self) -> np.ndarray:
         """(P, 2) int64, rows f < g of keys with a common landmark."""
-        rows = np.repeat(np.arange(len(self.keys)), np.diff(self._row_starts))
-        return np.column_stack([rows, self._columns])
+        starts, columns, _ = self._covisible
+        rows = np.repeat(np.arange(len(self.keys)), np.diff(starts))
+        return np.column_stack([rows, columns])
+
+    @property
+    def shared(self) -> np.ndarray:
+        """(P,) float32, number of landmarks that each of `pairs` shares."""
+        return self._covisible[2]
+
+    @cached_property
+    def _visits(self) -> list[Visits]:
+        given = self._obs.offsets, self._obs.frames, len(self.keys)
+        return visits_of(*given, _MAX_VISITS_AT_ONCE)
 
     @property
     def visits(self) -> Sequence[Visits]:
@@ -131,7 +140,7 @@ class LandmarkBlock:
         """Reduced pose system at `values`: robust weights, landmarks eliminated."""
         self._poses = pose_rows(values, self.keys)
         system, costs, self._point_costs = eliminate_points(
-            self._obs, self._visits, self._points, self._poses, self._row_starts, self._columns,
+            self._obs, self._visits, self._points, self._poses, *self._covisible[:2],
             len(self.families), self.num_threads,
         )  # fmt: skip
         return PoseSystem(*system, self._named(costs))

@@ -1,6 +1,7 @@
 """Supernodes of a sparse Cholesky factor: runs of columns with common rows below."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -11,6 +12,7 @@ _kernel, _ = kernel_and_part()
 # A run may absorb the one before it if few zeros arise: up to a number of columns, a share of the
 # entries (columns here are blocks of 6).
 _RELAXED = ((2, 0.8), (6, 0.2), (np.inf, 0.05))
+_MAX_KEPT_PAIRS = 2048  # of a pattern whose supernodes are kept: 32 kB
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,13 +26,25 @@ class Supernodes:
 
 
 def find_supernodes(num: int, pairs: np.ndarray, num_kept: int = 0) -> Supernodes:
-    """Order a symmetric pattern, pairs (P, 2), i < j, distinct, by minimum degree and find the
-    supernodes of its factor. The last num_kept rows come last in the order, as they are, and are a
-    supernode of their own; `pairs` must pair each of them with each.
+    """Order a symmetric pattern, pairs (P, 2) int64, i < j, distinct, by minimum degree and find
+    the supernodes of its factor. The last num_kept rows come last in the order, as they are, and
+    are a supernode of their own; `pairs` must pair each of them with each. What is found of small
+    patterns is kept, as models of short walks share a few.
 
     Liu, "The role of elimination trees in sparse factorization", 1990; runs are relaxed as in
     Ashcraft and Grimes, 1989.
     """
+    if len(pairs) > _MAX_KEPT_PAIRS:
+        return _supernodes_of(num, pairs, num_kept)
+    return _kept_supernodes(num, pairs.tobytes(), num_kept)
+
+
+@lru_cache(maxsize=64)
+def _kept_supernodes(num: int, pairs: bytes, num_kept: int) -> Supernodes:
+    return _supernodes_of(num, np.frombuffer(pairs, np.int64).reshape(-1, 2), num_kept)
+
+
+def _supernodes_of(num: int, pairs: np.ndarray, num_kept: int) -> Supernodes:
     from scipy.sparse import coo_matrix, identity
     from scipy.sparse.linalg import splu
 

@@ -70,8 +70,10 @@ def freed_memory_kept() -> Iterator[None]:
         _set_thresholds(32 << 20, 64 << 20)  # glibc's own
 
 
-def give_back_freed_memory(least: int = 64 << 20) -> None:
-    """Make glibc return freed memory to the system if it keeps at least `least` bytes."""
+def give_back_freed_memory(least: int = 256 << 20) -> None:
+    """Make glibc return freed memory to the system if it keeps at least `least` bytes: less is
+    taken again by what follows, and fetching and clearing its pages costs a short run some percent
+    of its time."""
     libc = ctypes.CDLL(None)
     if hasattr(libc, "mallinfo2"):
         libc.mallinfo2.restype = _Mallinfo

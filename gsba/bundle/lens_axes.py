@@ -12,6 +12,7 @@ from gsba.bundle import shared_parameters
 from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.shared_parameters import (
     PARTS,
+    PartsOfMap,
     SharedModel,
     Weighted,
     by_origin,
@@ -62,9 +63,8 @@ def guess(
             columns.append(clear[:, None, None] * under.by_centre(by_start, *of))
         return np.concatenate(columns, axis=2)
 
-    systems, counts = shared_parameters.models_of(
-        landmarks, keypoints, solved, context, by_centres, most=20_000
-    )
+    parts = PartsOfMap(landmarks, keypoints, solved, context, most=20_000)
+    systems, counts = parts.models(by_centres), parts.counts
     if not systems:
         return LensAxes(so_far, np.full(PARTS, np.nan), "too few points", counts)
     starts = range(0, 3 * len(tried), 3)

@@ -13,11 +13,11 @@ from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.shared_parameters import (
     MAX_OBSERVATIONS,
     PARTS,
+    PartsOfMap,
     SharedModel,
     cross_validate,
     drawn,
     model_of,
-    models_of,
     summed,
 )
 from gsba.camera.lens import Lenses
@@ -75,16 +75,18 @@ def estimate(
     solved: Solution,
     so_far: Lenses,
     context: AdjustmentContext,
+    parts: PartsOfMap | None = None,
 ) -> LensCentres:
     """Find the lenses' centres from a map, poses and points adjusted with them. Keypoints are rays
-    under the lenses so far, whose `band_rad` is kept."""
+    under the lenses so far, whose `band_rad` is kept; parts: of this map, if they are at hand."""
     chosen = context.settings.camera
     frames = keypoints.frames()
 
     def by_centre(rows: np.ndarray, by_origin: np.ndarray, _: np.ndarray) -> np.ndarray:
         return so_far.by_centre(by_origin, keypoints.bearings_rig[rows], frames[rows])
 
-    systems, counts = models_of(landmarks, keypoints, solved, context, by_centre)
+    parts = parts or PartsOfMap(landmarks, keypoints, solved, context)
+    systems, counts = parts.models(by_centre), parts.counts
     whole, used = None, drawn(landmarks, MAX_OBSERVATIONS, context.settings.seed)
     # raw pairs have two lenses, even where frames are few
     if not systems and so_far.reference_calibration is not None and used.tracks.num_points:
@@ -158,7 +160,7 @@ def stitched_for(
         by_origin = by_origin + before * tangent_basis(bearings)
         return np.concatenate([so_far.by_centre(by_origin, directions, there), by_near], axis=2)
 
-    systems, _ = models_of(landmarks, keypoints, solved, context, by_both)
+    systems = PartsOfMap(landmarks, keypoints, solved, context).models(by_both)
     if not systems:
         return StitchRadius(so_far, 0.0, np.nan, np.full(PARTS, np.nan), "too few points")
     num = len(so_far.centre)

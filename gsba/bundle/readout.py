@@ -11,9 +11,9 @@ import numpy as np
 from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.shared_parameters import (
     PARTS,
+    PartsOfMap,
     SharedModel,
     cross_validate,
-    models_of,
     predicts,
     summed,
 )
@@ -61,11 +61,13 @@ def estimate(
     lenses: Lenses,
     timestamps: np.ndarray,
     context: AdjustmentContext,
+    parts: PartsOfMap | None = None,
 ) -> CameraEstimate:
     """Find how long the readout takes and which way rows are read, frames moving by velocity,
     timestamps (F,) in seconds; no readout is taken while another way of reading rows predicts
     unseen parts nearly as well. Keypoints are rays of the lenses, read at one instant so far;
-    shown: (N, 3) their directions in the pictures: these tell rows."""
+    shown: (N, 3) their directions in the pictures: these tell rows; parts: of this map, if
+    they are at hand."""
     turning = turning_of(lenses, context)
     motion = velocities(solved.world_T_rigs, timestamps, turning, context.maps)
     offsets = None
@@ -85,11 +87,12 @@ def estimate(
         moved = np.einsum("oij,oj->oi", by_origin, moving)
         return moved[:, :, None] * times[:, None, :]
 
-    systems, counts = models_of(landmarks, keypoints, solved, context, by_duration)
+    parts = parts or PartsOfMap(landmarks, keypoints, solved, context)
+    systems, counts = parts.models(by_duration), parts.counts
     if not systems:
         return CameraEstimate(lenses, reason="too few points to tell rows apart", counts=counts)
-    of_ways = [[part.of(slice(way, way + 1)) for part in systems] for way in range(len(ways))]
-    verdicts = [cross_validate(parts, _newton_step) for parts in of_ways]
+    of_ways = [[model.of(slice(way, way + 1)) for model in systems] for way in range(len(ways))]
+    verdicts = [cross_validate(models, _newton_step) for models in of_ways]
     best = int(np.argmax([verdict.gains.sum() for verdict in verdicts]))
     total = summed(of_ways[best])
     curved = max(float(total.hessian[0, 0]), 1e-300)

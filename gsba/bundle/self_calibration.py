@@ -15,11 +15,11 @@ from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.shared_parameters import (
     MAX_OBSERVATIONS,
     PARTS,
+    PartsOfMap,
     SharedModel,
     cross_validate,
     drawn,
     model_of,
-    models_of,
     summed,
 )
 from gsba.camera.fisheye import PARAMETERS, Rig, by_parameters, changed, difference, recalibrated
@@ -71,7 +71,8 @@ def estimate(
         own = by_lenses(keypoints.bearings_rig[rows], shown[rows], so_far, residuals)
         return np.concatenate([own, so_far.by_centre(by_origin, shown[rows], frames[rows])], axis=2)
 
-    systems, counts = models_of(landmarks, keypoints, solved, context, by_both)
+    parts = PartsOfMap(landmarks, keypoints, solved, context)
+    systems, counts = parts.models(by_both), parts.counts
     off = from_calibrated(so_far)
     if nominal:
         whole = summed(systems) if systems else None

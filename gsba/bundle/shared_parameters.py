@@ -4,16 +4,17 @@ and points eliminated. Others' parameters are believed where they predict a part
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from typing import TypeVar
 
 import numpy as np
-from scipy.sparse import bsr_array
 from scipy.sparse import diags_array as diags
 from scipy.sparse.linalg import splu
 
 from factors.bearing import bearing_residuals, tangent_basis
 from factors.cholesky import BlockCholesky
-from factors.elimination import LinearSystem, eliminate
+from factors.elimination import Eliminated, LinearSystem, eliminate
+from factors.threads import Once
 from gsba.bundle.adjustment import AdjustmentContext, landmark_block, values_of
 from gsba.types import Counts, Keypoints, Landmarks, Solution, Tracks
 
@@ -132,25 +133,49 @@ def weighted(
     return Weighted(rows, residuals, by_pose, by_point, roots, max(curvature, _MIN_CURVATURE))
 
 
-def models_of(
-    landmarks: Landmarks,
-    keypoints: Keypoints,
-    solved: Solution,
-    context: AdjustmentContext,
-    by_shared: BySharedParameters,
-    most: int = MAX_OBSERVATIONS,
-) -> tuple[list[SharedModel], Counts]:
-    """Models of the cost of each part of the sequence, see `model_of`, by at most so many
-    observations, none where there is too little; and how many observations they rest on."""
-    used = drawn(landmarks, most, context.settings.seed)
-    alone = replace(context, num_threads=1)  # parts run side by side
+class PartsOfMap:
+    """Parts of a map's sequence; residuals of their bearings are computed once for all models."""
 
-    def model(part: Landmarks) -> SharedModel:
-        return model_of(part, keypoints, solved, alone, by_shared)
+    def __init__(
+        self,
+        landmarks: Landmarks,
+        keypoints: Keypoints,
+        solved: Solution,
+        context: AdjustmentContext,
+        most: int = MAX_OBSERVATIONS,
+    ) -> None:
+        """Draw at most so many observations; none where there is too little."""
+        self._landmarks, self._most = landmarks, most
+        self._given = keypoints, solved, context
 
-    with ThreadPoolExecutor(context.num_threads) as pool:
-        models = list(pool.map(model, parts_of(used)))
-    return models, sample_counts(landmarks, used)
+    @cached_property
+    def _used(self) -> Landmarks:
+        return drawn(self._landmarks, self._most, self._given[2].settings.seed)
+
+    @property
+    def counts(self) -> Counts:
+        """Counts of the observations that models rest on."""
+        return sample_counts(self._landmarks, self._used)
+
+    @cached_property
+    def _each(self) -> list[tuple[Tracks, Once[Weighted]]]:
+        keypoints, solved, context = self._given
+        alone = replace(context, num_threads=1)  # parts run side by side
+        return [
+            (part.tracks, Once(partial(weighted, part, keypoints, solved, alone)))
+            for part in parts_of(self._used)
+        ]
+
+    def models(self, by_shared: BySharedParameters) -> list[SharedModel]:
+        """Models of the cost of each part, see `model_of`."""
+        _, solved, context = self._given
+
+        def model(part: tuple[Tracks, Once[Weighted]]) -> SharedModel:
+            tracks, seen = part
+            return _model(seen(), tracks, solved, by_shared)
+
+        with ThreadPoolExecutor(context.num_threads) as pool:
+            return list(pool.map(model, self._each))
 
 
 def model_of(
@@ -169,36 +194,35 @@ def model_of(
             Jacobian (O, 2, 3) by where each ray starts, and the residuals (O, 2).
     """
     seen = weighted(landmarks, keypoints, solved, context)
-    by_origin = -seen.by_point @ solved.world_T_rigs[landmarks.tracks.frames, :3, :3]
+    return _model(seen, landmarks.tracks, solved, by_shared)
+
+
+def _model(
+    seen: Weighted, tracks: Tracks, solved: Solution, by_shared: BySharedParameters
+) -> SharedModel:
+    by_origin = -seen.by_point @ solved.world_T_rigs[tracks.frames, :3, :3]
     num = len(solved.world_T_rigs)
-    system = without_points(
-        seen, landmarks.tracks, num, seen.by_pose, by_shared(seen.rows, by_origin, seen.residuals)
+    sums = without_points(
+        seen, tracks, num, seen.by_pose, by_shared(seen.rows, by_origin, seen.residuals)
     )
-    return _without_poses(system, num, seen.curvature)
+    return _without_poses(sums, seen.curvature)
 
 
-def _without_poses(system: LinearSystem, num_frames: int, curvature: float) -> SharedModel:
+def _without_poses(sums: Eliminated, curvature: float) -> SharedModel:
     """Eliminate poses as well."""
-    num = 6 * num_frames
-    of_poses, across = system.hessian[:num, :num], system.hessian[:num, num:].toarray()
-    right = np.column_stack([across, system.gradient[:num]])
-    blocks = bsr_array(of_poses, blocksize=(6, 6))
-    rows = np.repeat(np.arange(len(blocks.indptr) - 1), np.diff(blocks.indptr))
-    own, upper = rows == blocks.indices, rows < blocks.indices
-    diagonal = np.zeros((len(blocks.indptr) - 1, 6, 6))
-    diagonal[rows[own]] = blocks.data[own]
+    num, diagonal = len(sums.diagonal), sums.diagonal
+    right = np.concatenate([sums.to_shared, sums.gradient[:, :, None]], axis=2).reshape(6 * num, -1)
     entries = np.einsum("nii->ni", diagonal)
     entries += np.where(entries > 0, _POSE_DAMPING * entries, 1.0)
-    cholesky = BlockCholesky(len(diagonal), np.column_stack([rows[upper], blocks.indices[upper]]))
-    if not cholesky.factorize(diagonal, blocks.data[upper]):
+    rows = np.repeat(np.arange(num), np.diff(sums.starts))
+    cholesky = BlockCholesky(num, np.column_stack([rows, sums.columns]))
+    if not cholesky.factorize(diagonal, sums.off_diagonal):
         raise ArithmeticError("a damped Hessian of poses is not positive definite")
-    coupled = (
-        right.T @ cholesky.solve_all(right.T.reshape(-1, len(diagonal), 6)).reshape(right.T.shape).T
-    )
+    coupled = right.T @ cholesky.solve_all(right.T.reshape(-1, num, 6)).reshape(right.T.shape).T
     return SharedModel(
-        system.cost - 0.5 * float(coupled[-1, -1]),
-        system.gradient[num:] - coupled[:-1, -1],
-        system.hessian[num:, num:].toarray() - coupled[:-1, :-1],
+        sums.cost - 0.5 * float(coupled[-1, -1]),
+        sums.shared_gradient - coupled[:-1, -1],
+        sums.shared - coupled[:-1, :-1],
         curvature,
     )
 
@@ -209,7 +233,7 @@ def without_points(
     num_frames: int,
     by_frame: np.ndarray,
     by_shared: np.ndarray | None = None,
-) -> LinearSystem:
+) -> Eliminated:
     """Normal equations of bearings with the points eliminated, by Jacobians (O, 2, K) of residuals
     by K variables of their frames, and (O, 2, S) by variables of all frames; None = there are none.
     """
@@ -311,8 +335,8 @@ def frame_models(
         some = landmarks.of(drawn % PARTS == part)
         seen = weighted(some, keypoints, solved, context)
         by_frame = np.concatenate([seen.by_pose, by_parameters(seen)], axis=2)
-        system = without_points(seen, some.tracks, len(solved.world_T_rigs), by_frame)
-        return FrameModel(system, seen.curvature)
+        sums = without_points(seen, some.tracks, len(solved.world_T_rigs), by_frame)
+        return FrameModel(sums.system(), seen.curvature)
 
     with ThreadPoolExecutor(context.num_threads) as pool:
         return list(pool.map(model, range(PARTS)))

@@ -16,9 +16,9 @@ from gsba.bundle.shared_parameters import (
     MAX_OBSERVATIONS,
     PARTS,
     BySharedParameters,
+    PartsOfMap,
     SharedModel,
     cross_validate,
-    models_of,
 )
 from gsba.camera.cameras import ONE_CAMERA, Cameras
 from gsba.camera.rig import CubeRig, owner_faces
@@ -132,8 +132,9 @@ def _systems(
     """Models of the cost of each part of the sequence; none where there is too little."""
     there, solved = lenses.seen(corrected(now.keypoints, now.field, context.rig)), now.adjustment
     by_field = _by_field(now.keypoints, there, max_degree)
-    models, counts = models_of(solved.landmarks, there, solved, context, by_field, most)
-    return [model.around(now.field.coefficients) for model in models], counts
+    parts = PartsOfMap(solved.landmarks, there, solved, context, most)
+    models = [model.around(now.field.coefficients) for model in parts.models(by_field)]
+    return models, parts.counts
 
 
 def _by_field(keypoints: Keypoints, there: Keypoints, max_degree: int) -> BySharedParameters:

@@ -27,6 +27,7 @@ from gsba.bundle.lens_centres import LensCentres, StitchRadius
 from gsba.bundle.readout import CameraEstimate, CameraEstimates, tracks_of_camera
 from gsba.bundle.reconstruction import world_scale
 from gsba.bundle.self_calibration import SelfCalibration
+from gsba.bundle.shared_parameters import PartsOfMap
 from gsba.camera.cameras import Cameras
 from gsba.camera.fisheye import Rig, turned
 from gsba.camera.lens import ONE_CENTRE, Lenses
@@ -405,10 +406,11 @@ class _Rays:
         they see, one instant does not. Estimated centres are kept with the reason why they were not
         taken. A camera whose lenses are known to be apart has rows only if it has these.
         """
-        found = lens_centres.estimate(*self._map, self.context)
+        parts = PartsOfMap(self.solution.landmarks, self.keypoints, self.solution, self.context)
+        found = lens_centres.estimate(*self._map, self.context, parts)
         known = self.state.run.settings_of(self.number).baseline() is not None
         raw = self.camera.lenses.reference_calibration is not None
-        if not found.reason or known or raw or self.readout().reason:
+        if not found.reason or known or raw or self.readout(parts).reason:
             return found
         return replace(found, lenses=replace(found.lenses, centre=found.found))
 
@@ -419,8 +421,8 @@ class _Rays:
         nominal = self.state.run.frames.formats[self.number].lenses_nominal
         return self_calibration.estimate(*self._pictured_map, self.context, nominal)
 
-    def readout(self) -> CameraEstimate:
-        return readout.estimate(*self._pictured_map, self.times, self.context)
+    def readout(self, parts: PartsOfMap | None = None) -> CameraEstimate:
+        return readout.estimate(*self._pictured_map, self.times, self.context, parts)
 
 
 def _from_features(

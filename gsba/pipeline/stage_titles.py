@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Sequence
+from functools import cache
 
 # Name of a stage, and its title. In names, `#` stands for a number that counts from 1, and `+` for
 # one that counts from 0; titles show both from 1.
@@ -121,6 +122,7 @@ def _matched(pattern: str, name: str) -> re.Match[str] | None:
     return re.fullmatch(re.sub("[#+]", r"(\\d+?)", pattern), name)
 
 
+@cache
 def title_of(name: str) -> str:
     """What a stage of this name does, in words; its name where there are none."""
     for prefix, words in _PREFIXES.items():

@@ -312,12 +312,24 @@ def plain(value: Any, digits: int = 17) -> Any:
     if isinstance(value, Mapping):
         return {str(key): plain(item, digits) for key, item in value.items()}
     if isinstance(value, np.ndarray | np.generic):
-        return plain(value.tolist(), digits)
+        return _plain_array(np.asarray(value), digits)
     if isinstance(value, list | tuple):
         return [plain(item, digits) for item in value]
     if isinstance(value, Enum):
         return value.value
     return str(value) if isinstance(value, Path) else value
+
+
+def _plain_array(values: np.ndarray, digits: int) -> Any:
+    """An array as `plain` gives its list, without a call for each number."""
+    if values.dtype.kind in "biu":
+        return values.tolist()
+    if values.dtype.kind != "f" or not np.isfinite(values).all():
+        return plain(values.tolist(), digits)
+    if digits < 17:
+        rounded = [float(f"{value:.{digits}g}") for value in values.ravel().tolist()]
+        values = np.array(rounded).reshape(values.shape)
+    return values.tolist()
 
 
 def medians_by_group(

@@ -38,7 +38,7 @@ def _dense(frames, points, residuals, by_point, by_frame, by_shared) -> LinearSy
 @pytest.mark.parametrize("seed", range(3))
 def test_it_is_the_schur_complement(seed: int) -> None:
     problem = _problem(seed)
-    found, expected = eliminate(FRAMES, *problem), _dense(*problem)
+    found, expected = eliminate(FRAMES, *problem).system(), _dense(*problem)
     assert found.cost == pytest.approx(expected.cost)
     np.testing.assert_allclose(found.gradient, expected.gradient, atol=1e-7)
     np.testing.assert_allclose(found.hessian.toarray(), expected.hessian, atol=1e-7)
@@ -46,7 +46,7 @@ def test_it_is_the_schur_complement(seed: int) -> None:
 
 def test_nothing_need_be_shared() -> None:
     frames, points, *parts, shared = _problem(0)
-    found = eliminate(FRAMES, frames, points, *parts, np.zeros((len(frames), 2, 0)))
+    found = eliminate(FRAMES, frames, points, *parts, np.zeros((len(frames), 2, 0))).system()
     whole = _dense(frames, points, *parts, shared)
     size = FRAMES * OWN
     np.testing.assert_allclose(found.hessian.toarray(), whole.hessian[:size, :size], atol=1e-7)
@@ -57,8 +57,8 @@ def test_a_point_upon_a_camera_does_no_harm() -> None:
     frames, points, residuals, by_point, by_frame, by_shared = _problem(1)
     near = np.flatnonzero((points == 5) & (frames == 0))
     by_point[near], by_frame[near] = 1e7 * by_point[near], 1e7 * by_frame[near]
-    found = eliminate(FRAMES, frames, points, residuals, by_point, by_frame, by_shared)
-    hessian = found.hessian.toarray()
+    sums = eliminate(FRAMES, frames, points, residuals, by_point, by_frame, by_shared)
+    hessian = sums.system().hessian.toarray()
     np.testing.assert_array_equal(hessian, hessian.T)
     eigenvalues = np.linalg.eigvalsh(hessian)
     assert eigenvalues.min() > -1e-14 * eigenvalues.max()

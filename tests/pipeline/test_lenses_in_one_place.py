@@ -28,7 +28,7 @@ def _kept(
     monkeypatch: pytest.MonkeyPatch, reason: str, settings: CameraSettings, lenses: Lenses = ONE
 ) -> LensCentres:
     read = CameraEstimate(Lenses(), reason=reason)
-    monkeypatch.setattr(camera._Rays, "readout", lambda _: read)
+    monkeypatch.setattr(camera._Rays, "readout", lambda *_: read)
     monkeypatch.setattr(camera.lens_centres, "estimate", lambda *_: CENTRES)
     state = MagicMock()
     state.run.settings_of = lambda _: settings
