@@ -3,7 +3,7 @@ and points eliminated. Others' parameters are believed where they predict a part
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 import numpy as np
@@ -15,6 +15,7 @@ from factors.bearing import bearing_residuals, tangent_basis
 from factors.cholesky import BlockCholesky
 from factors.elimination import LinearSystem, eliminate
 from gsba.bundle.adjustment import AdjustmentContext, landmark_block, values_of
+from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.types import Counts, Keypoints, Landmarks, Solution, Tracks
 
 BySharedParameters = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
@@ -24,6 +25,27 @@ PARTS = 4  # parts of the sequence: each is predicted by the others
 _MIN_POINTS = 50  # least number of points of a part
 _POSE_DAMPING = 1e-4  # of the poses' information, against the map's free similarity
 _MIN_CURVATURE = 0.3  # lower curvatures give steps beyond the reach of the model
+
+
+@dataclass(frozen=True, slots=True)
+class ObservedRays:
+    """Points of a map and the rays that observe them: all that an estimate of a camera rests on."""
+
+    solved: Solution  # poses and points, noise of the observations
+    keypoints: Keypoints  # of its observations, as rays of the lenses so far
+    context: AdjustmentContext
+    lenses: Lenses = ONE_CENTRE  # so far
+    shown: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))  # (N, 3) directions of the
+    # keypoints in their pictures, unit, rig frame
+    timestamps: np.ndarray = field(default_factory=lambda: np.zeros(0))  # (F,) seconds
+
+    def of(self, landmarks: Landmarks) -> "ObservedRays":
+        """The rays that observe other points."""
+        return replace(self, solved=replace(self.solved, landmarks=landmarks))
+
+    def drawn(self, most: int) -> "ObservedRays":
+        """Those of a share of the points, see `drawn`."""
+        return self.of(drawn(self.solved.landmarks, most, self.context.settings.seed))
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,13 +131,12 @@ class Weighted:
     curvature: float  # see `SharedModel`
 
 
-def weighted(
-    landmarks: Landmarks, keypoints: Keypoints, solved: Solution, context: AdjustmentContext
-) -> Weighted:
-    """Residuals of some points' bearings at a solution's poses, and their Jacobians."""
-    block = landmark_block(landmarks, keypoints, solved.noise, context)
+def weighted(rays: ObservedRays) -> Weighted:
+    """Residuals of bearings at a solution's poses, points at their best, and their Jacobians."""
+    keypoints, solved = rays.keypoints, rays.solved
+    block = landmark_block(solved.landmarks, keypoints, solved.noise, rays.context)
     block.polish(values_of(solved.world_T_rigs))
-    tracks, rows = landmarks.tracks, keypoints.rows(landmarks.tracks)
+    tracks, rows = solved.landmarks.tracks, keypoints.rows(solved.landmarks.tracks)
     residuals, by_pose, by_point = bearing_residuals(
         solved.world_T_rigs[tracks.frames],
         block.points_world[tracks.points],
@@ -124,7 +145,7 @@ def weighted(
     )
     roots = keypoints.roots(rows)
     whitened = np.einsum("oij,oj->oi", roots, residuals) / solved.noise
-    loss = context.solver.loss
+    loss = rays.context.solver.loss
     squares = np.sum(whitened**2, axis=1)
     weights = loss.weights(squares)
     curvature = float(np.sum(loss.curvatures(squares))) / max(float(np.sum(weights)), 1e-300)
@@ -133,47 +154,29 @@ def weighted(
 
 
 def models_of(
-    landmarks: Landmarks,
-    keypoints: Keypoints,
-    solved: Solution,
-    context: AdjustmentContext,
-    by_shared: BySharedParameters,
-    most: int = MAX_OBSERVATIONS,
+    rays: ObservedRays, by_shared: BySharedParameters, most: int = MAX_OBSERVATIONS
 ) -> tuple[list[SharedModel], Counts]:
     """Models of the cost of each part of the sequence, see `model_of`, by at most so many
     observations, none where there is too little; and how many observations they rest on."""
-    used = drawn(landmarks, most, context.settings.seed)
-    alone = replace(context, num_threads=1)  # parts run side by side
-
-    def model(part: Landmarks) -> SharedModel:
-        return model_of(part, keypoints, solved, alone, by_shared)
-
-    with ThreadPoolExecutor(context.num_threads) as pool:
-        models = list(pool.map(model, parts_of(used)))
-    return models, sample_counts(landmarks, used)
+    used = rays.drawn(most).solved.landmarks
+    alone = replace(rays, context=replace(rays.context, num_threads=1))  # parts run side by side
+    with ThreadPoolExecutor(rays.context.num_threads) as pool:
+        models = list(pool.map(lambda part: model_of(alone.of(part), by_shared), parts_of(used)))
+    return models, sample_counts(rays.solved.landmarks, used)
 
 
-def model_of(
-    landmarks: Landmarks,
-    keypoints: Keypoints,
-    solved: Solution,
-    context: AdjustmentContext,
-    by_shared: BySharedParameters,
-) -> SharedModel:
-    """Model of the robust cost of some points and their bearings, at a solution's poses.
+def model_of(rays: ObservedRays, by_shared: BySharedParameters) -> SharedModel:
+    """Model of the robust cost of points, moved to their best first, and their bearings, at a
+    solution's poses.
 
     Args:
-        landmarks: points, moved to their best first, and their observations.
-        keypoints: where these really point.
         by_shared: Jacobian (O, 2, K) of bearings' residuals, from the rows (O,) of keypoints, the
             Jacobian (O, 2, 3) by where each ray starts, and the residuals (O, 2).
     """
-    seen = weighted(landmarks, keypoints, solved, context)
-    by_origin = -seen.by_point @ solved.world_T_rigs[landmarks.tracks.frames, :3, :3]
-    num = len(solved.world_T_rigs)
-    system = without_points(
-        seen, landmarks.tracks, num, seen.by_pose, by_shared(seen.rows, by_origin, seen.residuals)
-    )
+    seen, poses, tracks = weighted(rays), rays.solved.world_T_rigs, rays.solved.landmarks.tracks
+    by_origin = -seen.by_point @ poses[tracks.frames, :3, :3]
+    jacobian, num = by_shared(seen.rows, by_origin, seen.residuals), len(poses)
+    system = without_points(seen, tracks, num, seen.by_pose, jacobian)
     return _without_poses(system, num, seen.curvature)
 
 
@@ -296,25 +299,21 @@ class FrameModel:
 
 
 def frame_models(
-    landmarks: Landmarks,
-    keypoints: Keypoints,
-    solved: Solution,
-    context: AdjustmentContext,
-    by_parameters: Callable[[Weighted], np.ndarray],
+    rays: ObservedRays, by_parameters: Callable[[Weighted], np.ndarray]
 ) -> list[FrameModel]:
-    """Models of the robust cost of parts of some points, moved to their best first, at a solution's
-    poses; keypoints: where these really point; by_parameters: Jacobian (O, 2, K) of residuals by
-    parameters of their frames."""
-    drawn = np.random.default_rng(context.settings.seed).permutation(landmarks.tracks.num_points)
+    """Models of the robust cost of parts of the points, moved to their best first, at a solution's
+    poses; by_parameters: Jacobian (O, 2, K) of residuals by parameters of their frames."""
+    landmarks, num = rays.solved.landmarks, len(rays.solved.world_T_rigs)
+    rng = np.random.default_rng(rays.context.settings.seed)
+    drawn = rng.permutation(landmarks.tracks.num_points)
 
     def model(part: int) -> FrameModel:
         some = landmarks.of(drawn % PARTS == part)
-        seen = weighted(some, keypoints, solved, context)
+        seen = weighted(rays.of(some))
         by_frame = np.concatenate([seen.by_pose, by_parameters(seen)], axis=2)
-        system = without_points(seen, some.tracks, len(solved.world_T_rigs), by_frame)
-        return FrameModel(system, seen.curvature)
+        return FrameModel(without_points(seen, some.tracks, num, by_frame), seen.curvature)
 
-    with ThreadPoolExecutor(context.num_threads) as pool:
+    with ThreadPoolExecutor(rays.context.num_threads) as pool:
         return list(pool.map(model, range(PARTS)))
 
 

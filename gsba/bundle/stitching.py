@@ -16,6 +16,7 @@ from gsba.bundle.shared_parameters import (
     MAX_OBSERVATIONS,
     PARTS,
     BySharedParameters,
+    ObservedRays,
     SharedModel,
     cross_validate,
     models_of,
@@ -132,7 +133,7 @@ def _systems(
     """Models of the cost of each part of the sequence; none where there is too little."""
     there, solved = lenses.seen(corrected(now.keypoints, now.field, context.rig)), now.adjustment
     by_field = _by_field(now.keypoints, there, max_degree)
-    models, counts = models_of(solved.landmarks, there, solved, context, by_field, most)
+    models, counts = models_of(ObservedRays(solved, there, context), by_field, most)
     return [model.around(now.field.coefficients) for model in models], counts
 
 
