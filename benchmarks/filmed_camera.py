@@ -16,12 +16,11 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from learned import turned
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from gsba.camera.sphere import bearings_from_erp
+from gsba.camera.sphere import around_seam, bearings_from_erp, erp_from_bearings
 from gsba.demo.raycast import Scene, ranges
 from gsba.demo.render import EXPOSURE, Eye, render_eye
 from gsba.demo.two_lenses import KNOTS, STEPS_HZ, SWEEP, SWING_DEG, SWING_UNITS, TwoLenses
@@ -59,6 +58,19 @@ ELECTRONS, READ_NOISE = 1200.0, 4.0  # signal at radiance 1, standard deviation
 SMOOTH_S = 0.5  # standard deviation of the filter that separates hands from the walk
 _MAX_RADIANCE = 5.0  # of a saturated pixel
 _MARGIN_DEG = 14.0  # each lens is rendered to this angle beyond the seam: filters see no border
+
+
+def turned(
+    panorama: np.ndarray, rotation: np.ndarray, interpolation: int = cv2.INTER_LANCZOS4
+) -> np.ndarray:
+    """The panorama (H, W, 3) of a camera turned by `rotation` (3, 3)."""
+    height, width = panorama.shape[:2]
+    pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1)
+    rays = bearings_from_erp(pixels, width, height) @ rotation.T
+    u, v = np.moveaxis(erp_from_bearings(rays, width, height), -1, 0)
+    places = (u + 7.5).astype(np.float32), (v - 0.5).astype(np.float32)
+    padded = around_seam(panorama, 8)
+    return cv2.remap(padded, *places, interpolation, borderMode=cv2.BORDER_REPLICATE)
 
 
 class View(NamedTuple):
