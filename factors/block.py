@@ -51,21 +51,14 @@ class Block(Protocol):
 
     The optimizer calls, in this order: `refresh` and `linearize` at accepted values, then any
     number of `propose`, of which the last is followed by `accept` if its values are accepted.
+    Subclass it: `refresh`, `products` and `accept` do nothing unless they are overridden.
     """
 
-    @property
-    def keys(self) -> Sequence[int]:
-        """(F,) keys of its variables: Pose3, or of any type with at most six dimensions."""
-        ...
-
-    @property
-    def pairs(self) -> np.ndarray:
-        """(P, 2) int, rows f < g of keys that share a residual; fixed for a run."""
-        ...
+    keys: Sequence[int]  # (F,) of its variables: Pose3, or of any type with at most six dimensions
+    pairs: np.ndarray  # (P, 2) int, rows f < g of keys that share a residual; fixed for a run
 
     def refresh(self, values: gtsam.Values) -> None:
-        """Recompute data that depend on accepted values (renderings, patches); may do nothing."""
-        ...
+        """Recompute data that depend on accepted values (renderings, patches)."""
 
     def linearize(self, values: gtsam.Values) -> PoseSystem:
         """Model of the cost at accepted values, inner variables eliminated; the caller may
@@ -75,7 +68,7 @@ class Block(Protocol):
     def products(self) -> Products | None:
         """The Hessian in factored form, if all the block's variables are poses; None = it is only
         written out."""
-        ...
+        return None
 
     def propose(self, values: gtsam.Values, steps: np.ndarray) -> float:
         """Cost at tentative values, `steps (F, 6)` away from the linearization point."""
@@ -83,29 +76,22 @@ class Block(Protocol):
 
     def accept(self) -> None:
         """Keep the inner variables of the last proposal."""
-        ...
 
     def costs(self, values: gtsam.Values) -> dict[str, float]:
         """Cost of each family, at the current inner variables."""
         ...
 
 
-class QuadraticBlock:
+class QuadraticBlock(Block):
     """c + g^T x + x^T H x / 2 over steps x of variables, from where it was linearized."""
 
     def __init__(self, keys: Sequence[int], pairs: np.ndarray, system: PoseSystem) -> None:
         """A block's system over its `keys (V,)` and `pairs (P, 2)`."""
         self.keys, self.pairs, self._system = list(keys), pairs, system
 
-    def refresh(self, values: gtsam.Values) -> None:
-        """Do nothing: the function is fixed."""
-
     def linearize(self, values: gtsam.Values) -> PoseSystem:
         """The function itself, whatever the values."""
         return replace(self._system, off_diagonal=self._system.off_diagonal.copy())
-
-    def products(self) -> None:
-        """None: the Hessian is only written out."""
 
     def propose(self, values: gtsam.Values, steps: np.ndarray) -> float:
         """Cost at `steps (V, 6)`."""
@@ -114,9 +100,6 @@ class QuadraticBlock:
         across = np.einsum("pi,pij,pj->", steps[first], system.off_diagonal, steps[second])
         cost = sum(system.costs.values()) + np.sum(steps * system.gradient)
         return float(cost + 0.5 * own + across)
-
-    def accept(self) -> None:
-        """Do nothing: there are no inner variables."""
 
     def costs(self, values: gtsam.Values) -> dict[str, float]:
         """Cost where it was linearized."""

@@ -9,7 +9,7 @@ from factors._camera_kernels import polish_range, see_range
 from factors._observations import covisible_pairs
 from factors._terms import pose_rows
 from factors.bearing import tangent_basis
-from factors.block import PoseSystem
+from factors.block import Block, PoseSystem
 from factors.camera_rows import (
     DIM,
     CameraRows,
@@ -26,7 +26,7 @@ from factors.threads import balanced_ranges, map_in_threads, run_in_threads
 _POLISH_TOLERANCE = 1e-6  # of a landmark's cost: further steps gain less than the others do
 
 
-class CameraBlock:
+class CameraBlock(Block):
     """All observations of a set of landmarks by a camera whose parts are variables.
 
     Implements `factors.block.Block`. Landmarks are eliminated inside.
@@ -118,9 +118,6 @@ class CameraBlock:
             bent += float(curvatures.sum())
         stretch = max(bent / max(weights, 1e-300), 0.3) if self.curved else 1.0
         return self._in_blocks(sums, stretch, float(self._point_costs.sum()))
-
-    def products(self) -> None:
-        """None: the Hessian is only written out."""
 
     def propose(self, values: gtsam.Values, steps: np.ndarray) -> float:
         """Robust cost at `values`, `steps` from the linearization, landmarks moved along."""

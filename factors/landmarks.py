@@ -24,7 +24,7 @@ from factors._observations import (
     visits_of,
 )
 from factors._terms import pose_rows
-from factors.block import PoseSystem, Products
+from factors.block import Block, PoseSystem, Products
 from factors.reduced_factor import reduced_factor
 from factors.robust import RobustLoss
 from factors.schur_complement import SchurComplement, project_visits
@@ -35,7 +35,7 @@ _MAX_VISITS_AT_ONCE = 1 << 17  # visits of landmarks that are eliminated togethe
 _MIN_THREAD_OBSERVATIONS = 1 << 14  # least observations that a thread accumulates on its own
 
 
-class LandmarkBlock:
+class LandmarkBlock(Block):
     """All observations of a set of landmarks, by any number of families.
 
     Implements `factors.block.Block`; `factors()` gives ordinary GTSAM factors instead. Threads
@@ -132,9 +132,6 @@ class LandmarkBlock:
         """Take up the linearization of an equal block: at `values`, with these `point_costs`."""
         self._poses = pose_rows(values, self.keys)
         self._point_costs = np.asarray(point_costs, np.float64)[self._point_order]
-
-    def refresh(self, values: gtsam.Values) -> None:
-        """Do nothing: no data depend on accepted values."""
 
     def linearize(self, values: gtsam.Values) -> PoseSystem:
         """Reduced pose system at `values`: robust weights, landmarks eliminated."""

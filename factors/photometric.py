@@ -12,7 +12,7 @@ import numpy as np
 from factors._photometric_kernels import DIMS, PatchData, observe_range
 from factors._photometric_schur import eliminate_range
 from factors._terms import matrix_rows, moved_rows, pose_rows
-from factors.block import PoseSystem
+from factors.block import Block, PoseSystem
 from factors.patch_windows import PatchPixels, covisible_frames, patch_axes, poor_views
 from factors.reduced_factor import reduced_factor
 from factors.robust import RobustLoss
@@ -23,7 +23,7 @@ _MIN_THREAD_OBSERVATIONS = 128  # least observations of a thread
 _MIN_CONTRAST = 1.0  # least standard deviation of a template's grey values
 
 
-class PhotometricBlock:
+class PhotometricBlock(Block):
     """Patches of any number of frames, each with an inverse-depth plane of its own.
 
     Implements `factors.block.Block`; `factors()` gives ordinary GTSAM factors instead. `refresh`
@@ -140,9 +140,6 @@ class PhotometricBlock:
         )  # fmt: skip
         self._schur = couplings, inverses, downs
         return PoseSystem(diagonal, off_diagonal, gradient, {FAMILY: float(self._costs.sum())})
-
-    def products(self) -> None:
-        """None: the Hessian is only written out."""
 
     def propose(self, values: gtsam.Values, steps: np.ndarray) -> float:
         """Robust cost at `values`, `steps (F, 6)` from the linearization, with planes moved."""

@@ -14,7 +14,7 @@ import gtsam
 import numpy as np
 
 from factors._terms import pose_rows
-from factors.block import PoseSystem
+from factors.block import Block, PoseSystem
 from factors.compiled import kernel_and_part
 from factors.reduced_factor import reduced_factor
 from factors.reprojection import FaceCameras
@@ -46,7 +46,7 @@ class _Frame:
 Render = Callable[[int, np.ndarray], RenderedView]  # row of keys, world_T_rig (4, 4)
 
 
-class SplatBlock:
+class SplatBlock(Block):
     """Alignment of frames to a fixed splat; implements `factors.block.Block`.
 
     No two frames share a residual: the map is the splat's, and its gauge is fixed by other factors
@@ -121,15 +121,9 @@ class SplatBlock:
             cost += part
         return PoseSystem(diagonal, np.zeros((0, 6, 6)), gradient, {NAME: cost})
 
-    def products(self) -> None:
-        """None: the Hessian is only written out."""
-
     def propose(self, values: gtsam.Values, steps: np.ndarray) -> float:
         """Robust cost at tentative values."""
         return self.costs(values)[NAME]
-
-    def accept(self) -> None:
-        """Do nothing: there are no inner variables."""
 
     def costs(self, values: gtsam.Values) -> dict[str, float]:
         """Robust cost under the last renderings."""

@@ -23,9 +23,7 @@ from damage import (
     copied,
     spoil_file,
 )
-from inputs import small_settings
-from prepared import NUM
-from prepared import prepare as prepare_usual
+from inputs import NUM, small_settings
 
 from gsba.camera.calibration import calibration_json
 from gsba.store.finished import load_run
@@ -70,7 +68,7 @@ def spoil(number: int, seed: int, family: str | None = None) -> Spoiled:
 
 def prepare(out: Path) -> None:
     """Make the inputs of all cases once."""
-    prepare_usual(out)
+    usual.prepare(out)
     if (out / "strangers").exists():
         return
     front = Fisheye(

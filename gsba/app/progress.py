@@ -89,14 +89,6 @@ class Progress:
         seconds = self.time_left.seconds(time.time())
         return "" if seconds is None else in_words(seconds)
 
-    def seconds_of_work(self) -> float | None:
-        """Seconds that the work at hand still takes at its speed so far; None = not known."""
-        work = self.work or {}
-        rate, total, done = work.get("rate"), work.get("total"), work.get("done")
-        if not (rate and total and done is not None):
-            return None
-        return max(0.0, (total - done) / rate)
-
     def table(self) -> dict[str, Any]:
         """Plain values for JSON."""
         return {
@@ -104,7 +96,6 @@ class Progress:
             "stage": self.stage,
             "work": self.work,
             "left": self.left_in_words(),
-            "seconds_of_work": self.seconds_of_work(),
             "warnings": self.warnings,
             "error": self.error,
             "last": self.last,

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import gtsam
 import numpy as np
@@ -16,9 +17,9 @@ from gsba.bundle import pose_variables, readout
 from gsba.bundle.adjustment import (
     DRAWS,
     AdjustmentContext,
+    FixedRays,
     Terms,
-    adjust,
-    adjust_sighted,
+    V,
     adjust_sighted_through,
     adjust_through,
 )
@@ -275,15 +276,13 @@ def solve_with_camera(
     pictures show them, timestamps (F,) in seconds; what the cameras leave out (a readout, axes, raw
     lenses) is left out. For start, context, gates and final see `adjustment.adjust`.
     """
-    wide, last = _split(gates)
+
+    def adjusted(view: V, so_far: Solution, some: Sequence[float]) -> tuple[Solution, V]:
+        return adjust_through(view, tracks, so_far, context, some, final)
+
     view = CameraView.of(shown, cameras, timestamps)
-
-    def adjust_once(so_far: Solution, seen: CameraView, gate: float) -> tuple[Solution, CameraView]:
-        return adjust_through(seen, tracks, so_far, context, (gate,), final)
-
-    found, view = _settled(start, view, wide, adjust_once)
-    solved = adjust(tracks, view.keypoints, found, context, last, final)
-    return replace(solved, rounds=found.rounds + solved.rounds), view.cameras
+    solved, view, _ = _settled(start, view, gates, adjusted)
+    return solved, view.cameras
 
 
 def solve_sighted_with_camera(
@@ -296,45 +295,39 @@ def solve_sighted_with_camera(
 ) -> tuple[Solution, Keypoints, CameraEstimates]:
     """As `solve_with_camera`, of aligned and former observations as pictures show them, as
     `adjust_sighted` takes them; and the keypoints with the noise that they turned out to have."""
-    wide, last = _split(gates)
+
+    def adjusted(view: V, so_far: Solution, some: Sequence[float]) -> tuple[Solution, V]:
+        return adjust_sighted_through(view, sighted, so_far, context, some)
+
     view = CameraView.of(sighted.keypoints, cameras, timestamps)
+    solved, view, rays = _settled(before, view, gates, adjusted)
+    return solved, view.with_noise_of(rays).shown, view.cameras
 
-    def adjust_once(so_far: Solution, seen: CameraView, gate: float) -> tuple[Solution, CameraView]:
-        return adjust_sighted_through(seen, sighted, so_far, context, (gate,))
 
-    found, view = _settled(before, view, wide, adjust_once)
-    seen = replace(sighted, keypoints=view.keypoints)
-    solved, keypoints = adjust_sighted(seen, found, context, last)
-    solved = replace(solved, rounds=found.rounds + solved.rounds)
-    return solved, view.with_noise_of(keypoints).shown, view.cameras
+class _Adjusted(Protocol):
+    """Adjustment of some observations through a view, under some gates."""
+
+    def __call__(self, view: V, so_far: Solution, some: Sequence[float]) -> tuple[Solution, V]: ...
 
 
 def _settled(
-    start: Solution,
-    view: CameraView,
-    gates: Sequence[float],
-    adjust_once: Callable[[Solution, CameraView, float], tuple[Solution, CameraView]],
-) -> tuple[Solution, CameraView]:
-    """Solve for the camera under each gate until it takes in what it was solved with.
+    start: Solution, view: CameraView, gates: Sequence[float], adjusted: _Adjusted
+) -> tuple[Solution, CameraView, Keypoints]:
+    """Solve for the camera under each gate until it takes in what it was solved with; the last
+    round is of poses and points alone, and of the rays returned.
 
     Few observations, of near points that both lenses see, tell how far apart the lenses are. Under
-    a wrong distance the gate leaves them out, and what is left confirms it.
+    a wrong distance the gate leaves them out, and what is left confirms it. The tightest gate
+    chooses observations by the camera so far, and these would confirm it: raw lenses came out worse
+    by them.
     """
     solved, rounds = start, ()
-    for gate in gates:
+    for gate in gates[:-1] or gates:
         for _ in range(8):  # of a round; three to six settle it
-            solved, view = adjust_once(solved, view, gate)
+            solved, view = adjusted(view, solved, (gate,))
             rounds += solved.rounds
             last = solved.rounds[-1]
             if not last.accepted or last.support == last.observations:
                 break
-    return replace(solved, rounds=rounds), view
-
-
-def _split(gates: Sequence[float]) -> tuple[Sequence[float], Sequence[float]]:
-    """Gates of the rounds that solve for the camera, and of the last, of poses and points alone.
-
-    The tightest gate chooses observations by the camera so far, and these would confirm it: raw
-    lenses came out worse by them.
-    """
-    return gates[:-1] or gates, gates[-1:]
+    solved, rays = adjusted(FixedRays(view.keypoints), solved, gates[-1:])
+    return replace(solved, rounds=rounds + solved.rounds), view, rays.keypoints

@@ -8,24 +8,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gsba.bundle import shared_parameters
-from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.shared_parameters import (
     PARTS,
-    PartsOfMap,
+    ObservedRays,
     SharedModel,
     Weighted,
     by_origin,
     cross_validate,
-    drawn,
     frame_models,
+    models_of,
     predicts,
     sample_counts,
     summed,
     validated,
 )
 from gsba.camera.lens import Lenses
-from gsba.types import Counts, Keypoints, Landmarks, Solution
+from gsba.types import Counts
 
 logger = logging.getLogger(__name__)
 
@@ -43,17 +41,11 @@ class LensAxes:
     counts: Counts  # of observations
 
 
-def guess(
-    landmarks: Landmarks,
-    keypoints: Keypoints,
-    solved: Solution,
-    so_far: Lenses,
-    context: AdjustmentContext,
-) -> LensAxes:
+def guess(rays: ObservedRays) -> LensAxes:
     """Lenses with axes that explain most with two centres: the rig's, turned ones, or the walk's;
     keypoints are seen from one centre, whose `band_rad` is kept."""
-    frames = keypoints.frames()
-    tried = [replace(so_far, axes=axes) for axes in _candidates(solved.world_T_rigs)]
+    keypoints, so_far, frames = rays.keypoints, rays.lenses, rays.keypoints.frames()
+    tried = [replace(so_far, axes=axes) for axes in _candidates(rays.solved.world_T_rigs)]
 
     def by_centres(rows: np.ndarray, by_start: np.ndarray, _: np.ndarray) -> np.ndarray:
         columns = []
@@ -63,8 +55,7 @@ def guess(
             columns.append(clear[:, None, None] * under.by_centre(by_start, *of))
         return np.concatenate(columns, axis=2)
 
-    parts = PartsOfMap(landmarks, keypoints, solved, context, most=20_000)
-    systems, counts = parts.models(by_centres), parts.counts
+    systems, counts = models_of(replace(rays, most=20_000), by_centres)
     if not systems:
         return LensAxes(so_far, np.full(PARTS, np.nan), "too few points", counts)
     starts = range(0, 3 * len(tried), 3)
@@ -80,17 +71,12 @@ def guess(
     return LensAxes(tried[best], shares[best], "", counts)
 
 
-def loosened(
-    landmarks: Landmarks,
-    keypoints: Keypoints,
-    solved: Solution,
-    so_far: Lenses,
-    context: AdjustmentContext,
-) -> LensAxes:
+def loosened(rays: ObservedRays) -> LensAxes:
     """Axes of each frame's own, the rig's yet, if turning them by some points predicts others.
     Keypoints are rays of the two lenses so far."""
-    used = drawn(landmarks, shared_parameters.MAX_OBSERVATIONS, context.settings.seed)
-    counts = sample_counts(landmarks, used)
+    solved, keypoints, so_far = rays.solved, rays.keypoints, rays.lenses
+    used = rays.drawn
+    counts = sample_counts(solved.landmarks, used.solved.landmarks)
     frames, num = keypoints.frames(), len(solved.world_T_rigs)
 
     def by_axes(seen: Weighted) -> np.ndarray:
@@ -99,7 +85,7 @@ def loosened(
         by_start = by_origin(seen, rotations, bearings, so_far.inverse_stitch_radius)
         return so_far.by_centre(by_start, bearings, there) @ by_turn(so_far)
 
-    models = frame_models(used, keypoints, solved, context, by_axes)
+    models = frame_models(used, by_axes)
     tried = [validated(models, np.full(2, width)) for width in TURNS]
     verdict = max(tried, key=lambda trial: float(trial.gains.sum()))
     shares = verdict.shares

@@ -9,19 +9,17 @@ import numpy as np
 
 from factors.bearing import tangent_basis
 from factors.camera_rows import half_baseline
-from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.shared_parameters import (
-    MAX_OBSERVATIONS,
     PARTS,
-    PartsOfMap,
+    ObservedRays,
     SharedModel,
     cross_validate,
-    drawn,
     model_of,
+    models_of,
     summed,
 )
 from gsba.camera.lens import Lenses
-from gsba.types import Counts, Keypoints, Landmarks, Solution
+from gsba.types import Counts
 
 logger = logging.getLogger(__name__)
 
@@ -69,28 +67,21 @@ class StitchRadius:
         return None
 
 
-def estimate(
-    landmarks: Landmarks,
-    keypoints: Keypoints,
-    solved: Solution,
-    so_far: Lenses,
-    context: AdjustmentContext,
-    parts: PartsOfMap | None = None,
-) -> LensCentres:
-    """Find the lenses' centres from a map, poses and points adjusted with them. Keypoints are rays
-    under the lenses so far, whose `band_rad` is kept; parts: of this map, if they are at hand."""
-    chosen = context.settings.camera
-    frames = keypoints.frames()
+def estimate(rays: ObservedRays) -> LensCentres:
+    """Find the lenses' centres from a map, poses and points adjusted with them; `band_rad` of the
+    lenses so far is kept."""
+    chosen, so_far = rays.context.settings.camera, rays.lenses
+    keypoints, frames = rays.keypoints, rays.keypoints.frames()
 
     def by_centre(rows: np.ndarray, by_origin: np.ndarray, _: np.ndarray) -> np.ndarray:
         return so_far.by_centre(by_origin, keypoints.bearings_rig[rows], frames[rows])
 
-    parts = parts or PartsOfMap(landmarks, keypoints, solved, context)
-    systems, counts = parts.models(by_centre), parts.counts
-    whole, used = None, drawn(landmarks, MAX_OBSERVATIONS, context.settings.seed)
+    systems, counts = models_of(rays, by_centre)
+    whole, used = None, rays.drawn
+    some = used.solved.landmarks.tracks.num_points
     # raw pairs have two lenses, even where frames are few
-    if not systems and so_far.reference_calibration is not None and used.tracks.num_points:
-        whole = model_of(used, keypoints, solved, context, by_centre)
+    if not systems and so_far.reference_calibration is not None and some:
+        whole = model_of(used, by_centre)
     if not systems and whole is None:
         num = len(so_far.centre)
         unknown, nothing = np.full((num, num), np.nan), np.full(PARTS, np.nan)
@@ -133,22 +124,14 @@ def baseline_of(centres: LensCentres, scale: float) -> tuple[float, float]:
     return 2 * scale * length, 2 * scale * float(np.hypot(sigma, 0.005 * length))
 
 
-def stitched_for(
-    landmarks: Landmarks,
-    keypoints: Keypoints,
-    shown: np.ndarray,
-    solved: Solution,
-    so_far: Lenses,
-    context: AdjustmentContext,
-) -> StitchRadius:
-    """Find the radius that panoramas are stitched for, centres, poses and points adjusted with it;
-    shown: (N, 3) directions of the keypoints in their pictures, which are rays of the lenses so
-    far.
+def stitched_for(rays: ObservedRays) -> StitchRadius:
+    """Find the radius that panoramas are stitched for, centres, poses and points adjusted with it.
 
     Where settings say it, that is it. Around lenses that were solved for without a radius it is a
     first estimate: their distance is wrong where there is one.
     """
-    said = context.settings.camera.inverse_stitch_radius(so_far.baseline / 2)
+    keypoints, shown, so_far = rays.keypoints, rays.shown, rays.lenses
+    said = rays.context.settings.camera.inverse_stitch_radius(so_far.baseline / 2)
     if said is not None:
         reason, unknown = "" if said else "camera.stitch_radius_m says so", np.full(PARTS, np.nan)
         return StitchRadius(replace(so_far, inverse_stitch_radius=said), said, 0.0, unknown, reason)
@@ -160,7 +143,7 @@ def stitched_for(
         by_origin = by_origin + before * tangent_basis(bearings)
         return np.concatenate([so_far.by_centre(by_origin, directions, there), by_near], axis=2)
 
-    systems = PartsOfMap(landmarks, keypoints, solved, context).models(by_both)
+    systems, _ = models_of(rays, by_both)
     if not systems:
         return StitchRadius(so_far, 0.0, np.nan, np.full(PARTS, np.nan), "too few points")
     num = len(so_far.centre)

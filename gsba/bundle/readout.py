@@ -11,16 +11,17 @@ import numpy as np
 from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.shared_parameters import (
     PARTS,
-    PartsOfMap,
+    ObservedRays,
     SharedModel,
     cross_validate,
+    models_of,
     predicts,
     summed,
 )
 from gsba.camera.cameras import Cameras
 from gsba.camera.lens import Lenses, rows_run
 from gsba.config import CameraSettings
-from gsba.types import Counts, GyroConstraints, Keypoints, Landmarks, Solution, Tracks
+from gsba.types import Counts, GyroConstraints, Tracks
 
 logger = logging.getLogger(__name__)
 
@@ -53,23 +54,14 @@ class CameraEstimate:
         return replace(self, lenses=self.lenses.scaled(scale), own_sigmas=own)
 
 
-def estimate(
-    landmarks: Landmarks,
-    keypoints: Keypoints,
-    shown: np.ndarray,
-    solved: Solution,
-    lenses: Lenses,
-    timestamps: np.ndarray,
-    context: AdjustmentContext,
-    parts: PartsOfMap | None = None,
-) -> CameraEstimate:
-    """Find how long the readout takes and which way rows are read, frames moving by velocity,
-    timestamps (F,) in seconds; no readout is taken while another way of reading rows predicts
-    unseen parts nearly as well. Keypoints are rays of the lenses, read at one instant so far;
-    shown: (N, 3) their directions in the pictures: these tell rows; parts: of this map, if
-    they are at hand."""
+def estimate(rays: ObservedRays) -> CameraEstimate:
+    """Find how long the readout takes and which way rows are read, frames moving by velocity; no
+    readout is taken while another way of reading rows predicts unseen parts nearly as well. Lenses
+    are read at one instant so far; directions in the pictures tell rows."""
+    solved, keypoints, shown, lenses = rays.solved, rays.keypoints, rays.shown, rays.lenses
+    landmarks, context = solved.landmarks, rays.context
     turning = turning_of(lenses, context)
-    motion = velocities(solved.world_T_rigs, timestamps, turning, context.maps)
+    motion = velocities(solved.world_T_rigs, rays.timestamps, turning, context.maps)
     offsets = None
     if motion[:, :3].any():  # points in the rig frames of the keypoints that see them; 0 = none
         tracks, offsets = landmarks.tracks, np.zeros((len(keypoints.faces), 3))
@@ -87,12 +79,11 @@ def estimate(
         moved = np.einsum("oij,oj->oi", by_origin, moving)
         return moved[:, :, None] * times[:, None, :]
 
-    parts = parts or PartsOfMap(landmarks, keypoints, solved, context)
-    systems, counts = parts.models(by_duration), parts.counts
+    systems, counts = models_of(rays, by_duration)
     if not systems:
         return CameraEstimate(lenses, reason="too few points to tell rows apart", counts=counts)
-    of_ways = [[model.of(slice(way, way + 1)) for model in systems] for way in range(len(ways))]
-    verdicts = [cross_validate(models, _newton_step) for models in of_ways]
+    of_ways = [[part.of(slice(way, way + 1)) for part in systems] for way in range(len(ways))]
+    verdicts = [cross_validate(parts, _newton_step) for parts in of_ways]
     best = int(np.argmax([verdict.gains.sum() for verdict in verdicts]))
     total = summed(of_ways[best])
     curved = max(float(total.hessian[0, 0]), 1e-300)

@@ -11,20 +11,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from factors.bearing import tangent_basis
-from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.shared_parameters import (
-    MAX_OBSERVATIONS,
     PARTS,
-    PartsOfMap,
+    ObservedRays,
     SharedModel,
     cross_validate,
-    drawn,
     model_of,
+    models_of,
     summed,
 )
 from gsba.camera.fisheye import PARAMETERS, Rig, by_parameters, changed, difference, recalibrated
 from gsba.camera.lens import Lenses
-from gsba.types import Counts, Keypoints, Landmarks, Solution
+from gsba.types import Counts
 
 logger = logging.getLogger(__name__)
 
@@ -49,36 +47,25 @@ class SelfCalibration:
     # sequence that the calibration of the other parts removes, beside centres alone
     reason: str  # why no calibration was taken; empty if one was
     counts: Counts  # of observations
-    undetermined: tuple[str, ...] = ()  # parameters that observations hardly determine beyond their
-    # priors
 
 
-def estimate(
-    landmarks: Landmarks,
-    keypoints: Keypoints,
-    shown: np.ndarray,
-    solved: Solution,
-    so_far: Lenses,
-    context: AdjustmentContext,
-    nominal: bool = False,
-) -> SelfCalibration:
-    """Calibrate lenses by a map, poses, points and lens centres adjusted with them. Keypoints are
-    rays under the lenses so far; shown: (N, 3) their directions in the panoramas; nominal: whether
-    these lenses are plain ones of unknown make, not calibrated."""
+def estimate(rays: ObservedRays, nominal: bool = False) -> SelfCalibration:
+    """Calibrate lenses by a map, poses, points and lens centres adjusted with them; nominal:
+    whether these lenses are plain ones of unknown make, not calibrated."""
+    keypoints, shown, so_far = rays.keypoints, rays.shown, rays.lenses
     frames, num = keypoints.frames(), num_parameters(so_far.num_lenses)
 
     def by_both(rows: np.ndarray, by_origin: np.ndarray, residuals: np.ndarray) -> np.ndarray:
         own = by_lenses(keypoints.bearings_rig[rows], shown[rows], so_far, residuals)
         return np.concatenate([own, so_far.by_centre(by_origin, shown[rows], frames[rows])], axis=2)
 
-    parts = PartsOfMap(landmarks, keypoints, solved, context)
-    systems, counts = parts.models(by_both), parts.counts
+    systems, counts = models_of(rays, by_both)
     off = from_calibrated(so_far)
     if nominal:
         whole = summed(systems) if systems else None
-        used = drawn(landmarks, MAX_OBSERVATIONS, context.settings.seed)
-        if whole is None and used.tracks.num_points:
-            whole = model_of(used, keypoints, solved, context, by_both)
+        used = rays.drawn
+        if whole is None and used.solved.landmarks.tracks.num_points:
+            whole = model_of(used, by_both)
         if whole is not None:
             return _of_nominal(whole, so_far, off, counts)
     if not systems:
@@ -126,7 +113,7 @@ def _of_nominal(
         reason and f"; not taken: {reason}",
     )
     lenses = so_far if reason else _moved_all(so_far, found)
-    return SelfCalibration(lenses, np.full(PARTS, np.nan), reason, counts, loose)
+    return SelfCalibration(lenses, np.full(PARTS, np.nan), reason, counts)
 
 
 def undetermined(sigmas: np.ndarray) -> tuple[str, ...]:

@@ -3,7 +3,7 @@ and points eliminated. Others' parameters are believed where they predict a part
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import TypeVar
 
@@ -16,6 +16,7 @@ from factors.cholesky import BlockCholesky
 from factors.elimination import Eliminated, LinearSystem, eliminate
 from factors.threads import Once
 from gsba.bundle.adjustment import AdjustmentContext, landmark_block, values_of
+from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.types import Counts, Keypoints, Landmarks, Solution, Tracks
 
 BySharedParameters = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
@@ -25,6 +26,39 @@ PARTS = 4  # parts of the sequence: each is predicted by the others
 _MIN_POINTS = 50  # least number of points of a part
 _POSE_DAMPING = 1e-4  # of the poses' information, against the map's free similarity
 _MIN_CURVATURE = 0.3  # lower curvatures give steps beyond the reach of the model
+
+
+@dataclass(frozen=True)
+class ObservedRays:
+    """Points of a map and the rays that observe them: all that an estimate of a camera rests on."""
+
+    solved: Solution  # poses and points, noise of the observations
+    keypoints: Keypoints  # of its observations, as rays of the lenses so far
+    context: AdjustmentContext
+    lenses: Lenses = ONE_CENTRE  # so far
+    shown: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))  # (N, 3) directions of the
+    # keypoints in their pictures, unit, rig frame
+    timestamps: np.ndarray = field(default_factory=lambda: np.zeros(0))  # (F,) seconds
+    most: int = MAX_OBSERVATIONS  # observations that an estimate uses
+
+    def of(self, landmarks: Landmarks) -> "ObservedRays":
+        """The rays that observe other points."""
+        return replace(self, solved=replace(self.solved, landmarks=landmarks))
+
+    @cached_property
+    def drawn(self) -> "ObservedRays":
+        """Those of a share of the points, see `drawn`."""
+        return self.of(drawn(self.solved.landmarks, self.most, self.context.settings.seed))
+
+    @cached_property
+    def parts(self) -> "list[tuple[Tracks, Once[Weighted]]]":
+        """Tracks of each part of the sequence, see `parts_of`, and their residuals, computed once
+        for all models; parts run side by side."""
+        alone = replace(self, context=replace(self.context, num_threads=1))
+        return [
+            (part.tracks, Once(partial(weighted, alone.of(part))))
+            for part in parts_of(self.drawn.solved.landmarks)
+        ]
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,13 +144,12 @@ class Weighted:
     curvature: float  # see `SharedModel`
 
 
-def weighted(
-    landmarks: Landmarks, keypoints: Keypoints, solved: Solution, context: AdjustmentContext
-) -> Weighted:
-    """Residuals of some points' bearings at a solution's poses, and their Jacobians."""
-    block = landmark_block(landmarks, keypoints, solved.noise, context)
+def weighted(rays: ObservedRays) -> Weighted:
+    """Residuals of bearings at a solution's poses, points at their best, and their Jacobians."""
+    keypoints, solved = rays.keypoints, rays.solved
+    block = landmark_block(solved.landmarks, keypoints, solved.noise, rays.context)
     block.polish(values_of(solved.world_T_rigs))
-    tracks, rows = landmarks.tracks, keypoints.rows(landmarks.tracks)
+    tracks, rows = solved.landmarks.tracks, keypoints.rows(solved.landmarks.tracks)
     residuals, by_pose, by_point = bearing_residuals(
         solved.world_T_rigs[tracks.frames],
         block.points_world[tracks.points],
@@ -125,7 +158,7 @@ def weighted(
     )
     roots = keypoints.roots(rows)
     whitened = np.einsum("oij,oj->oi", roots, residuals) / solved.noise
-    loss = context.solver.loss
+    loss = rays.context.solver.loss
     squares = np.sum(whitened**2, axis=1)
     weights = loss.weights(squares)
     curvature = float(np.sum(loss.curvatures(squares))) / max(float(np.sum(weights)), 1e-300)
@@ -133,78 +166,39 @@ def weighted(
     return Weighted(rows, residuals, by_pose, by_point, roots, max(curvature, _MIN_CURVATURE))
 
 
-class PartsOfMap:
-    """Parts of a map's sequence; residuals of their bearings are computed once for all models."""
+def models_of(
+    rays: ObservedRays, by_shared: BySharedParameters
+) -> tuple[list[SharedModel], Counts]:
+    """Models of the cost of each part of the sequence, see `model_of`, none where there is too
+    little; and how many observations they rest on."""
 
-    def __init__(
-        self,
-        landmarks: Landmarks,
-        keypoints: Keypoints,
-        solved: Solution,
-        context: AdjustmentContext,
-        most: int = MAX_OBSERVATIONS,
-    ) -> None:
-        """Draw at most so many observations; none where there is too little."""
-        self._landmarks, self._most = landmarks, most
-        self._given = keypoints, solved, context
+    def model(part: tuple[Tracks, Once[Weighted]]) -> SharedModel:
+        tracks, seen = part
+        return _model(seen(), tracks, rays.solved.world_T_rigs, by_shared)
 
-    @cached_property
-    def _used(self) -> Landmarks:
-        return drawn(self._landmarks, self._most, self._given[2].settings.seed)
-
-    @property
-    def counts(self) -> Counts:
-        """Counts of the observations that models rest on."""
-        return sample_counts(self._landmarks, self._used)
-
-    @cached_property
-    def _each(self) -> list[tuple[Tracks, Once[Weighted]]]:
-        keypoints, solved, context = self._given
-        alone = replace(context, num_threads=1)  # parts run side by side
-        return [
-            (part.tracks, Once(partial(weighted, part, keypoints, solved, alone)))
-            for part in parts_of(self._used)
-        ]
-
-    def models(self, by_shared: BySharedParameters) -> list[SharedModel]:
-        """Models of the cost of each part, see `model_of`."""
-        _, solved, context = self._given
-
-        def model(part: tuple[Tracks, Once[Weighted]]) -> SharedModel:
-            tracks, seen = part
-            return _model(seen(), tracks, solved, by_shared)
-
-        with ThreadPoolExecutor(context.num_threads) as pool:
-            return list(pool.map(model, self._each))
+    with ThreadPoolExecutor(rays.context.num_threads) as pool:
+        models = list(pool.map(model, rays.parts))
+    return models, sample_counts(rays.solved.landmarks, rays.drawn.solved.landmarks)
 
 
-def model_of(
-    landmarks: Landmarks,
-    keypoints: Keypoints,
-    solved: Solution,
-    context: AdjustmentContext,
-    by_shared: BySharedParameters,
-) -> SharedModel:
-    """Model of the robust cost of some points and their bearings, at a solution's poses.
+def model_of(rays: ObservedRays, by_shared: BySharedParameters) -> SharedModel:
+    """Model of the robust cost of points, moved to their best first, and their bearings, at a
+    solution's poses.
 
     Args:
-        landmarks: points, moved to their best first, and their observations.
-        keypoints: where these really point.
         by_shared: Jacobian (O, 2, K) of bearings' residuals, from the rows (O,) of keypoints, the
             Jacobian (O, 2, 3) by where each ray starts, and the residuals (O, 2).
     """
-    seen = weighted(landmarks, keypoints, solved, context)
-    return _model(seen, landmarks.tracks, solved, by_shared)
+    solved = rays.solved
+    return _model(weighted(rays), solved.landmarks.tracks, solved.world_T_rigs, by_shared)
 
 
 def _model(
-    seen: Weighted, tracks: Tracks, solved: Solution, by_shared: BySharedParameters
+    seen: Weighted, tracks: Tracks, world_T_rigs: np.ndarray, by_shared: BySharedParameters
 ) -> SharedModel:
-    by_origin = -seen.by_point @ solved.world_T_rigs[tracks.frames, :3, :3]
-    num = len(solved.world_T_rigs)
-    sums = without_points(
-        seen, tracks, num, seen.by_pose, by_shared(seen.rows, by_origin, seen.residuals)
-    )
+    by_origin = -seen.by_point @ world_T_rigs[tracks.frames, :3, :3]
+    jacobian = by_shared(seen.rows, by_origin, seen.residuals)
+    sums = without_points(seen, tracks, len(world_T_rigs), seen.by_pose, jacobian)
     return _without_poses(sums, seen.curvature)
 
 
@@ -320,25 +314,22 @@ class FrameModel:
 
 
 def frame_models(
-    landmarks: Landmarks,
-    keypoints: Keypoints,
-    solved: Solution,
-    context: AdjustmentContext,
-    by_parameters: Callable[[Weighted], np.ndarray],
+    rays: ObservedRays, by_parameters: Callable[[Weighted], np.ndarray]
 ) -> list[FrameModel]:
-    """Models of the robust cost of parts of some points, moved to their best first, at a solution's
-    poses; keypoints: where these really point; by_parameters: Jacobian (O, 2, K) of residuals by
-    parameters of their frames."""
-    drawn = np.random.default_rng(context.settings.seed).permutation(landmarks.tracks.num_points)
+    """Models of the robust cost of parts of the points, moved to their best first, at a solution's
+    poses; by_parameters: Jacobian (O, 2, K) of residuals by parameters of their frames."""
+    landmarks, num = rays.solved.landmarks, len(rays.solved.world_T_rigs)
+    rng = np.random.default_rng(rays.context.settings.seed)
+    drawn = rng.permutation(landmarks.tracks.num_points)
 
     def model(part: int) -> FrameModel:
         some = landmarks.of(drawn % PARTS == part)
-        seen = weighted(some, keypoints, solved, context)
+        seen = weighted(rays.of(some))
         by_frame = np.concatenate([seen.by_pose, by_parameters(seen)], axis=2)
-        sums = without_points(seen, some.tracks, len(solved.world_T_rigs), by_frame)
+        sums = without_points(seen, some.tracks, num, by_frame)
         return FrameModel(sums.system(), seen.curvature)
 
-    with ThreadPoolExecutor(context.num_threads) as pool:
+    with ThreadPoolExecutor(rays.context.num_threads) as pool:
         return list(pool.map(model, range(PARTS)))
 
 

@@ -16,9 +16,10 @@ from gsba.bundle.shared_parameters import (
     MAX_OBSERVATIONS,
     PARTS,
     BySharedParameters,
-    PartsOfMap,
+    ObservedRays,
     SharedModel,
     cross_validate,
+    models_of,
 )
 from gsba.camera.cameras import ONE_CAMERA, Cameras
 from gsba.camera.rig import CubeRig, owner_faces
@@ -132,9 +133,8 @@ def _systems(
     """Models of the cost of each part of the sequence; none where there is too little."""
     there, solved = lenses.seen(corrected(now.keypoints, now.field, context.rig)), now.adjustment
     by_field = _by_field(now.keypoints, there, max_degree)
-    parts = PartsOfMap(solved.landmarks, there, solved, context, most)
-    models = [model.around(now.field.coefficients) for model in parts.models(by_field)]
-    return models, parts.counts
+    models, counts = models_of(ObservedRays(solved, there, context, most=most), by_field)
+    return [model.around(now.field.coefficients) for model in models], counts
 
 
 def _by_field(keypoints: Keypoints, there: Keypoints, max_degree: int) -> BySharedParameters:

@@ -394,11 +394,7 @@ def evaluate(
         if not splat and scan is None:
             raise GsbaError("nothing to compare with: give --truth FILE, --scan FILE, or --splat")
         return
-    _against_truth(estimate, truth, depth, json_file)
-
-
-def _against_truth(estimate: Path, truth: Path, depth: Path | None, json_file: Path | None) -> None:
-    """Compare a run or a trajectory with a true one: pose errors and induced pixel errors."""
+    # Compare a run or a trajectory with a true one: pose errors and induced pixel errors.
     from gsba.disk import write_text
     from gsba.evaluate.pixels import depth_maps, induced_errors
     from gsba.evaluate.trajectory import evaluate as compare

@@ -7,7 +7,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from gsba.memory import total_memory_bytes, usable_cpus
+from gsba.memory import processor_name, total_memory_bytes, usable_cpus
 
 _CGROUP = Path("/sys/fs/cgroup")
 
@@ -33,7 +33,7 @@ def look() -> Machine:
     return Machine(
         system=_system(),
         python=platform.python_version(),
-        processor=_processor(),
+        processor=processor_name(),
         cores=os.cpu_count() or 1,
         usable_cores=min(
             usable_cpus(),
@@ -54,13 +54,6 @@ def _system() -> str:
         name = platform.system()
     library, version = platform.libc_ver()
     return ", ".join(filter(None, (name, platform.machine(), f"{library} {version}".strip())))
-
-
-def _processor() -> str:
-    for line in _text(Path("/proc/cpuinfo")).splitlines():
-        if line.startswith("model name"):
-            return line.partition(":")[2].strip()
-    return platform.processor() or "unknown processor"
 
 
 def _memory() -> tuple[int, int]:

@@ -90,7 +90,15 @@ def export_all(
     cameras = Cameras.of(options.lenses, frames)
     reconstruction, frames = one_map(whole, frames, map_number, "the reconstruction")
     cameras = cameras_of_map(cameras, whole, map_number)
-    rows = _exported_rows(frames, options)
+    # Frames (F',) int64 of a map that an export holds.
+    for name in options.without:
+        if name not in frames.names:
+            raise GsbaError(f"there is no frame {brief(name)} in the map to leave out")
+    rows = np.arange(len(frames)) if options.fetched else frames.chosen()
+    kept = [row for row in rows.tolist() if frames.names[row] not in options.without]
+    if not kept:
+        raise GsbaError("no frame is left to export: leave out fewer")
+    rows = np.array(kept, np.int64)
     if len(rows) < len(frames):
         reconstruction, frames = reconstruction.taken(rows), frames.taken(rows)
         cameras = cameras.taken(rows)
@@ -126,18 +134,6 @@ def export_all(
     for to, out in outs.items():
         num_points = len(reconstruction.points_world)
         logger.info("%s: %d frames, %d points, in %s", to, len(frames), num_points, out)
-
-
-def _exported_rows(frames: FrameSet, options: ExportOptions) -> np.ndarray:
-    """Frames (F',) int64 of a map that an export holds."""
-    for name in options.without:
-        if name not in frames.names:
-            raise GsbaError(f"there is no frame {brief(name)} in the map to leave out")
-    rows = np.arange(len(frames)) if options.fetched else frames.chosen()
-    kept = [row for row in rows.tolist() if frames.names[row] not in options.without]
-    if not kept:
-        raise GsbaError("no frame is left to export: leave out fewer")
-    return np.array(kept, np.int64)
 
 
 def _write_dataset(

@@ -110,8 +110,6 @@ def add_photos(data: Dataset) -> None:
     _write_photos(partial, photos, names, undistort)
     if masked and to == "colmap-flat":
         _write_masks(partial, photos, names)
-    import pycolmap
-
     first = max(model.cameras, default=0) + 1
     for c, camera in enumerate(photos.cameras):
         kind, params = "RADIAL", (camera.focal, *camera.principal, *camera.radial)

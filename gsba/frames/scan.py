@@ -112,7 +112,7 @@ def scan(
     kind = PictureFormat(layout, width, height, faces, (), fisheyes, tracks, nominal)
     return FrameSet(
         names=names,
-        paths=_absolute(paths),
+        paths=tuple(tuple(path.absolute() for path in group) for group in paths),
         timestamps=times,
         mask_paths=find_masks(masks, names, (width, height) if kind.panoramic else None),
         formats=(kind,),
@@ -255,11 +255,6 @@ def _check_names(folder: Path, names: Sequence[str]) -> None:
                 f"{folder}: the file name {name!r} holds control characters or is not UTF-8: "
                 "rename it"
             )
-
-
-def _absolute(paths: Sequence[Sequence[Path]]) -> tuple[tuple[Path, ...], ...]:
-    """Paths that do not depend on the working folder."""
-    return tuple(tuple(path.absolute() for path in group) for group in paths)
 
 
 def _find_frames(folder: Path) -> tuple[str, tuple[str, ...], dict[str, tuple[Path, ...]]]:

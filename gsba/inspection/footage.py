@@ -127,9 +127,4 @@ def _gps(path: Path) -> str:
 def _nothing(path: Path, error: GsbaError) -> str:
     """Entry of data that were not found, or not looked for without the library that reads them."""
     missing = isinstance(error.__cause__ or error.__context__, ImportError)
-    return f"{'not checked' if missing else 'none'}: {_reason(path, error)}"
-
-
-def _reason(path: Path, error: GsbaError) -> str:
-    """Message of an error without the path, which the output names above."""
-    return str(error).removeprefix(f"{path}: ")
+    return f"{'not checked' if missing else 'none'}: {str(error).removeprefix(f'{path}: ')}"

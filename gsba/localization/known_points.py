@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from factors import PoseSystem, RobustLoss, tangent_basis
+from factors import Block, PoseSystem, RobustLoss, tangent_basis
 from gsba.bundle.optimizer import SolverOptions, marginal_covariances, optimize
 from gsba.bundle.pose_variables import X
 from gsba.camera.projections import Projection
@@ -87,7 +87,7 @@ def residuals_of(
     return Residuals(values, by_pose, by_camera, spread, behind)
 
 
-class KnownPointBlock:
+class KnownPointBlock(Block):
     """Robust residuals of sightings over the poses of pictures and the cameras that they share.
 
     The noise of a residual, which holds what a point is uncertain by, is taken at accepted values.
@@ -148,15 +148,9 @@ class KnownPointBlock:
             pair += 1
         return PoseSystem(diagonal, mixed, gradient, {_FAMILY: cost})
 
-    def products(self) -> None:
-        """None: the Hessian is only written out."""
-
     def propose(self, values: gtsam.Values, steps: np.ndarray) -> float:
         """Cost at tentative values."""
         return self.costs(values)[_FAMILY]
-
-    def accept(self) -> None:
-        """Nothing is inside of the block."""
 
     def costs(self, values: gtsam.Values) -> dict[str, float]:
         """Cost, under the noise of the accepted values."""

@@ -31,8 +31,13 @@ from gsba.localization.patch_sightings import PatchAligner
 from gsba.localization.picture_cameras import PictureCameras
 from gsba.localization.pictures import load_panorama
 from gsba.localization.place_index import PlaceIndex, index_path, load_or_make, make_index
-from gsba.localization.pose_search import Candidates, is_significant, search_poses
-from gsba.localization.rival_poses import PlacedPose, best_of
+from gsba.localization.pose_search import (
+    Candidates,
+    PlacedPose,
+    best_of,
+    is_significant,
+    search_poses,
+)
 from gsba.localization.run_map import Query, RunMap, without_correction
 from gsba.localization.surroundings import Surroundings, open_rates
 from gsba.log import GsbaError
@@ -226,7 +231,14 @@ class Localizer:
             candidates = self.candidates_around(query, world_T_rig, gate)
             if len(candidates) < _MIN_POINTS:
                 return LocalizedFrame.refused(name, NO_PLACE), None
-            seen = self._sightings(query, candidates)
+            rows, origins = candidates.keypoints, query.origins_rig
+            seen = PointSightings(
+                candidates.points_world,
+                self.map.point_covariances[candidates.points],
+                query.bearings[rows],
+                isotropic(query.features.sigmas_rad[rows]),
+                None if origins is None else origins[rows],
+            )
             fitted = fit([seen], world_T_rig[None], scales)
             world_T_rig = fitted.world_T_rigs[0]
         assert fitted is not None and seen is not None and candidates is not None
@@ -350,16 +362,6 @@ class Localizer:
         keypoints, points = np.unique(np.concatenate(pairs), axis=0).T
         positions = self.map.result.points_world[points]
         return Candidates(keypoints, query.bearings[keypoints], points, positions)
-
-    def _sightings(self, query: Query, candidates: Candidates) -> PointSightings:
-        rows, origins = candidates.keypoints, query.origins_rig
-        return PointSightings(
-            candidates.points_world,
-            self.map.point_covariances[candidates.points],
-            query.bearings[rows],
-            isotropic(query.features.sigmas_rad[rows]),
-            None if origins is None else origins[rows],
-        )
 
     def _judged(
         self, name: str, fitted: PoseFit, seen: PointSightings, candidates: Candidates

@@ -39,13 +39,14 @@ from gsba.localization.photos import (
 )
 from gsba.localization.pictures import QueryPicture
 from gsba.localization.pose_search import (
+    LOOK_ALIKE,
     MIN_RATIO,
     MIN_WITNESSES,
+    TWO_PLACES,
     Candidates,
     are_apart,
     is_significant,
 )
-from gsba.localization.rival_poses import LOOK_ALIKE, TWO_PLACES
 from gsba.localization.run_map import Query
 from gsba.localization.surroundings import is_contradicted
 from gsba.log import GsbaError, track

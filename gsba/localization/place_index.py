@@ -53,7 +53,11 @@ class PlaceIndex:
 
 def load_or_make(map_: RunMap, path: Path, kind: type[T], make: Callable[[], T]) -> T:
     """Load a record that depends on a map's run alone; make and save it if this run has none."""
-    key = _key(map_)
+    try:
+        info = read_info(map_.root / STAGES / "reconstruction.npz")
+    except RecordError as error:  # it was read a moment ago
+        raise GsbaError(f"{map_.root} changed while it was read: run again") from error
+    key = digest(__version__, FORMAT, info.get("key", ""), map_.frames.names, map_.settings.seed)
     found = load_checkpoint(path, key, kind, "the map is indexed again")
     if found is not None:
         return found
@@ -69,14 +73,6 @@ def index_path(root: Path) -> Path:
     """File of a run's index: in a folder beside the run, which stays as it is."""
     root = root.resolve()
     return root.with_name(f"{root.name}-index") / "places.npz"
-
-
-def _key(map_: RunMap) -> str:
-    try:
-        info = read_info(map_.root / STAGES / "reconstruction.npz")
-    except RecordError as error:  # it was read a moment ago
-        raise GsbaError(f"{map_.root} changed while it was read: run again") from error
-    return digest(__version__, FORMAT, info.get("key", ""), map_.frames.names, map_.settings.seed)
 
 
 def make_index(map_: RunMap) -> PlaceIndex:

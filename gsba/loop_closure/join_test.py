@@ -89,15 +89,13 @@ class JoinTest:
         poses[rows] = move.poses(poses[rows])
         for f in rows:
             known[f] = move.scale * known[f]
-        usual, places = self._rates(np.concatenate([rows, inside])), Places(poses, known)
-        return join_evidence.weigh(self.context, places, (rows, inside), usual, self.depth)
-
-    def _rates(self, frames: np.ndarray) -> FindingRates:
+        frames = np.concatenate([rows, inside])
         owners = np.unique(self.owners[frames])
         key = tuple(owners.tolist())
         if key not in self._usual:
             self._usual[key] = self.measure_rates(np.isin(self.owners, owners))
-        return self._usual[key]
+        usual, places = self._usual[key], Places(poses, known)
+        return join_evidence.weigh(self.context, places, (rows, inside), usual, self.depth)
 
     def meetings(
         self, matches: Matches, outside: np.ndarray, f0_T_f1s: np.ndarray | None = None

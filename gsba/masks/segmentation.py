@@ -112,7 +112,12 @@ def _run(command: str, frames: FrameSet, folder: Path) -> None:
             sizes[_face_file(name, c)] = rig.size
             write_image(images / _face_file(name, c), faces[c])
     names = list(sizes)
-    words = _words(command)
+    try:
+        words = shlex.split(command)
+    except ValueError as error:
+        raise GsbaError(f"--segment {command}: {error}") from None
+    if not words:
+        raise GsbaError("--segment: no command given")
     if any("{image}" in word or "{mask}" in word for word in words):
         for name in track(names, "segmenting"):
             _call(words, {"{image}": images / name, "{mask}": masks / name}, command)
@@ -132,16 +137,6 @@ def _run(command: str, frames: FrameSet, folder: Path) -> None:
             raise GsbaError(
                 f"--segment {command}: mask {name} is {width}x{height}, its face is {size}x{size}"
             )
-
-
-def _words(command: str) -> list[str]:
-    try:
-        words = shlex.split(command)
-    except ValueError as error:
-        raise GsbaError(f"--segment {command}: {error}") from None
-    if not words:
-        raise GsbaError("--segment: no command given")
-    return words
 
 
 def _call(words: list[str], values: dict[str, Path], command: str) -> None:

@@ -36,7 +36,7 @@ from gsba.pipeline.state import MapMatches, State
 from gsba.placement.placement import metres_per_unit
 from gsba.splat import refinement
 from gsba.splat.refinement import SplatResult
-from gsba.store.store import Chain, digest
+from gsba.store.store import digest
 from gsba.trajectory import judgement, steps
 from gsba.types import PoseStatus, Reconstruction, Solution, Tracks
 
@@ -206,8 +206,8 @@ def without_fixes(state: State, latest: Sequence[str]) -> State:
         replace(one, contradicted=True) if isinstance(one, GpsFactors) else one
         for one in run.families.members
     ]
-    chain, families = Chain(run.store, latest), run.families.with_members(members)
-    return replace(state, run=replace(run, chain=chain, families=families, suffix=WITHOUT_GPS))
+    families, names = run.families.with_members(members), list(latest)
+    return replace(state, run=replace(run, latest=names, families=families, suffix=WITHOUT_GPS))
 
 
 def refine_photometric(state: State) -> State:

@@ -2,7 +2,8 @@
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from typing import TypeVar
 
 import numpy as np
@@ -15,7 +16,7 @@ from gsba.bundle import (
     self_calibration,
     stitching,
 )
-from gsba.bundle.adjustment import ALIGNED_GATES, GATE_SCALE, AdjustmentContext
+from gsba.bundle.adjustment import ALIGNED_GATES, GATE_SCALE
 from gsba.bundle.camera_adjustment import (
     CameraCovariances,
     CameraSystem,
@@ -27,7 +28,7 @@ from gsba.bundle.lens_centres import LensCentres, StitchRadius
 from gsba.bundle.readout import CameraEstimate, CameraEstimates, tracks_of_camera
 from gsba.bundle.reconstruction import world_scale
 from gsba.bundle.self_calibration import SelfCalibration
-from gsba.bundle.shared_parameters import PartsOfMap
+from gsba.bundle.shared_parameters import ObservedRays
 from gsba.camera.cameras import Cameras
 from gsba.camera.fisheye import Rig, turned
 from gsba.camera.lens import ONE_CENTRE, Lenses
@@ -41,7 +42,6 @@ from gsba.trajectory.conventions import quarter_turn
 from gsba.types import (
     CoarsePoses,
     Keypoints,
-    Landmarks,
     PoseSource,
     Reconstruction,
     Sighted,
@@ -98,7 +98,9 @@ def _find_lenses(state: State, sought: Sequence[int], prefix: str) -> State:
         lenses = list(trial.observed.cameras.lenses)
         for camera in left:
             name = f"{prefix}lenses{n}"
-            centres = _from_features(trial, name, camera, _Rays.centres, LensCentres, noted=True)
+            known = run.settings_of(camera).baseline() is not None
+            find = partial(_centres, known=known)
+            centres = _from_features(trial, name, camera, find, LensCentres, noted=True)
             map_, lenses[camera] = map_.changed(camera, centres=centres), centres.lenses
         left = [camera for camera in left if lenses[camera]]
         if not left:
@@ -132,7 +134,9 @@ def _with_stitch_radii(start: State, stitched: Sequence[int], prefix: str) -> St
     tried = dict[int, Lenses]()
 
     def asked(state: State, stage: str, camera: int) -> StitchRadius:
-        return _from_features(state, prefix + stage, camera, _Rays.stitch_radius, StitchRadius)
+        return _from_features(
+            state, prefix + stage, camera, lens_centres.stitched_for, StitchRadius
+        )
 
     for camera in stitched:
         first = asked(start, "stitch_radius", camera)
@@ -175,7 +179,7 @@ def _on_trial(
         lenses = Lenses() if yaws is None else Lenses.ring(np.deg2rad(yaws))
         trial = _through(trial, camera, lenses)
         if not _axes_known(run, camera):
-            given = f"{prefix}axes", camera, _Rays.guessed_axes, LensAxes
+            given = f"{prefix}axes", camera, lens_axes.guess, LensAxes
             guesses[camera] = _from_features(trial, *given)
             lenses = guesses[camera].lenses
         trial = _through(trial, camera, replace(lenses, band_rad=band))
@@ -198,7 +202,8 @@ def _calibrate_raw(trial: State, raw: Sequence[int]) -> State:
             lenses = replace(lenses, fisheyes=lenses.reference_calibration)
             trial = trial.with_lenses(camera, lenses)
             continue
-        known = _from_features(trial, "calibrated", camera, _Rays.calibration, SelfCalibration)
+        find = _calibration(run, camera)
+        known = _from_features(trial, "calibrated", camera, find, SelfCalibration)
         trial = replace(trial, map=trial.map.changed(camera, calibrated=known))
         if not known.reason:
             trial, free = trial.with_lenses(camera, known.lenses), True
@@ -222,7 +227,9 @@ def _settle_cameras(state: State, name: str) -> State:
     for camera, one in enumerate(found.each):
         if one.lenses and one.lenses.readout_motion is None:
             stage = f"{name}_readout"
-            read = _from_features(state, stage, camera, _Rays.readout, CameraEstimate, noted=True)
+            read = _from_features(
+                state, stage, camera, readout.estimate, CameraEstimate, noted=True
+            )
             found = found.changed(camera, lambda _, read=read: read)
     rounds = run.settings.rounds
     gates = GATE_SCALE, *rounds.dense  # a camera that is off throws observations off
@@ -255,18 +262,18 @@ def take_parts_from_patches(state: State, sighted: Sighted, name: str, number: i
         if not lenses:
             continue
         if number == 0 and lenses.readout_motion is None:
-            given = f"readout_{name}", camera, _Rays.readout, CameraEstimate
+            given = f"readout_{name}", camera, readout.estimate, CameraEstimate
             read = _from_patches(state, sighted, *given)
             changed = state.map.estimates().changed(camera, lambda _, read=read: read)
             state = state.with_cameras(changed)
         raw = camera in _raw_cameras(run)
         if number == 1 and raw and lenses.fisheyes is None:  # the rest has settled
-            given = f"calibrated_{name}", camera, _Rays.calibration, SelfCalibration
+            given = f"calibrated_{name}", camera, _calibration(run, camera), SelfCalibration
             known = _from_patches(state, sighted, *given)
             state = replace(state, map=state.map.changed(camera, calibrated=known))
             state = state.with_lenses(camera, known.lenses)
         if number == 1 and not _axes_known(run, camera) and lenses.axes is None:
-            given = f"axes_{name}", camera, _Rays.loose_axes, LensAxes
+            given = f"axes_{name}", camera, lens_axes.loosened, LensAxes
             axes = _from_patches(state, sighted, *given)
             state = replace(state, map=state.map.changed(camera, axes=axes))
             state = state.with_lenses(camera, axes.lenses)
@@ -358,78 +365,25 @@ def _better(coarse: CoarsePoses, map_: Map, camera: int) -> tuple[Rig, bool] | N
     return turned(found, turn), lenses.fisheyes is not None
 
 
-@dataclass(frozen=True, slots=True)
-class _Rays:
-    """Points and the rays that see them: all that an estimate of the camera rests on."""
+def _centres(rays: ObservedRays, known: bool) -> LensCentres:
+    """Centres of the lenses, kept about zero, too, if rows are read one after another.
 
-    solution: Solution  # poses and points, noise of the observations
-    keypoints: Keypoints  # of its observations, as rays of the camera so far
-    pictured: Keypoints  # these keypoints where pictures show them
-    camera: CameraEstimate  # so far
-    number: int  # of the camera
-    state: State  # priors, times, settings
-
-    @property
-    def shown(self) -> np.ndarray:
-        """Directions of the keypoints in their pictures, (N, 3) float64, unit, rig frame."""
-        return self.pictured.bearings_rig
-
-    @property
-    def context(self) -> AdjustmentContext:
-        """Priors, loss and settings."""
-        return self.state.adjustment_context().of_camera(self.number)
-
-    @property
-    def times(self) -> np.ndarray:
-        """Of the frames, (F,) float64, seconds."""
-        return self.state.run.frames.timestamps
-
-    @property
-    def _map(self) -> tuple[Landmarks, Keypoints, Solution, Lenses]:
-        return self.solution.landmarks, self.keypoints, self.solution, self.camera.lenses
-
-    @property
-    def _pictured_map(self) -> tuple[Landmarks, Keypoints, np.ndarray, Solution, Lenses]:
-        landmarks, keypoints, solution, lenses = self._map
-        return landmarks, keypoints, self.shown, solution, lenses
-
-    def guessed_axes(self) -> LensAxes:
-        return lens_axes.guess(*self._map, self.context)
-
-    def loose_axes(self) -> LensAxes:
-        return lens_axes.loosened(*self._map, self.context)
-
-    def centres(self) -> LensCentres:
-        """Centres of the lenses, kept about zero, too, if rows are read one after another.
-
-        Mirrors and prisms can put both lenses in about one place: one centre then explains what
-        they see, one instant does not. Estimated centres are kept with the reason why they were not
-        taken. A camera whose lenses are known to be apart has rows only if it has these.
-        """
-        parts = PartsOfMap(self.solution.landmarks, self.keypoints, self.solution, self.context)
-        found = lens_centres.estimate(*self._map, self.context, parts)
-        known = self.state.run.settings_of(self.number).baseline() is not None
-        raw = self.camera.lenses.reference_calibration is not None
-        if not found.reason or known or raw or self.readout(parts).reason:
-            return found
-        return replace(found, lenses=replace(found.lenses, centre=found.found))
-
-    def stitch_radius(self) -> StitchRadius:
-        return lens_centres.stitched_for(*self._pictured_map, self.context)
-
-    def calibration(self) -> SelfCalibration:
-        nominal = self.state.run.frames.formats[self.number].lenses_nominal
-        return self_calibration.estimate(*self._pictured_map, self.context, nominal)
-
-    def readout(self, parts: PartsOfMap | None = None) -> CameraEstimate:
-        return readout.estimate(*self._pictured_map, self.times, self.context, parts)
+    Mirrors and prisms can put both lenses in about one place: one centre then explains what they
+    see, one instant does not. Estimated centres are kept with the reason why they were not taken. A
+    camera whose lenses are known to be apart has rows only if it has these.
+    """
+    found = lens_centres.estimate(rays)
+    raw = rays.lenses.reference_calibration is not None
+    if not found.reason or known or raw or readout.estimate(rays).reason:
+        return found
+    return replace(found, lenses=replace(found.lenses, centre=found.found))
 
 
 def _from_features(
     state: State,
     stage: str,
     number: int,
-    estimate: Callable[[_Rays], T],
+    estimate: Callable[[ObservedRays], T],
     returns: type[T],
     *,
     noted: bool = False,
@@ -447,8 +401,8 @@ def _from_features(
         tracks = tracks_of_camera(backend.tracks_of(state), observed.cameras.of_frame, number)
         placed = state.triangulated(tracks, observed.keypoints, gate * solution.noise)
         wide = replace(solution, landmarks=placed, noise=solution.noise * gate / GATE_SCALE)
-        given = observed.keypoints, observed.shown, CameraEstimate(lenses), number, state
-        return estimate(_Rays(wide, *given))
+        shown = observed.shown.bearings_rig
+        return estimate(_rays(state, number, wide, observed.keypoints, lenses, shown))
 
     name = _named(run, stage, number)
     return run.stage(name, _settings_of_cameras(run), compute, returns, noted=noted)
@@ -459,7 +413,7 @@ def _from_patches(
     sighted: Sighted,
     stage: str,
     number: int,
-    estimate: Callable[[_Rays], T],
+    estimate: Callable[[ObservedRays], T],
     returns: type[T],
 ) -> T:
     """An estimate of one camera from aligned patches; arguments as for `_from_features`."""
@@ -472,12 +426,29 @@ def _from_patches(
         tracks = tracks_of_camera(there.tracks, map_.of_frame, number)
         placed = state.triangulated(tracks, there.keypoints, gate)
         solution = replace(map_.solution, noise=1.0, landmarks=placed)
-        shown = stitching.corrected(sighted.keypoints, map_.field, run.rig)
-        camera = map_.cameras[number].estimate()
-        return estimate(_Rays(solution, there.keypoints, shown, camera, number, state))
+        shown = stitching.corrected(sighted.keypoints, map_.field, run.rig).bearings_rig
+        lenses = map_.cameras[number].lenses
+        return estimate(_rays(state, number, solution, there.keypoints, lenses, shown))
 
     name = _named(run, stage, number)
     return run.stage(name, _settings_of_cameras(run), compute, returns, noted=True)
+
+
+def _rays(
+    state: State,
+    number: int,
+    solution: Solution,
+    keypoints: Keypoints,
+    lenses: Lenses,
+    shown: np.ndarray,
+) -> ObservedRays:
+    """Rays of one camera, with the priors and settings of its estimates."""
+    context, times = state.adjustment_context().of_camera(number), state.run.frames.timestamps
+    return ObservedRays(solution, keypoints, context, lenses, shown, times)
+
+
+def _calibration(run: Run, camera: int) -> Callable[[ObservedRays], SelfCalibration]:
+    return partial(self_calibration.estimate, nominal=run.frames.formats[camera].lenses_nominal)
 
 
 def _axes_known(run: Run, camera: int) -> bool:

@@ -24,7 +24,7 @@ def match_neighbours(state: State) -> State:
     GsbaError names one whose images do not match, contradict it, or show no motion."""
     run = state.run
     apart = [_match(state, number) for number in range(len(run.evidence.recordings))]
-    run.chain.join([one.run.chain for one in apart])
+    run.latest[:] = [name for one in apart for name in one.run.latest]
     begins = np.cumsum([0, *(len(one.run.frames) for one in apart)]).tolist()
     near = list[VerifiedPairs]()
     for one, first in zip(apart, begins, strict=False):

@@ -106,7 +106,8 @@ def observe(run: Run, name: str, found: Sequence[PerFrame[Features]], stage: str
     def gather() -> Keypoints:
         return detection.gather(map(load, range(len(frames))), run.store.scratch_folder)
 
-    keypoints = run.chain.stage(name, None, gather, Keypoints, also=[stage])
+    keypoints = run.store.stage(name, None, gather, Keypoints, [*run.latest, stage])
+    run.latest[:] = [name]
     return _matchable(run, found, keypoints)
 
 
@@ -394,7 +395,7 @@ def expected_drift(run: Run, search: Search) -> tuple[float, dict[str, Features]
         return _DRIFT_PER_FRAME * num / max(_matches(run, found, steps), 1.0) ** 2
 
     key = [run.matching_key(), settings.features, settings.cubemap]
-    drift = run.store.stage("expected_drift", key, compute, float, run.chain.latest)
+    drift = run.store.stage("expected_drift", key, compute, float, run.latest)
     return drift, found
 
 

@@ -328,16 +328,15 @@ class _Place:
     """Where a run that grows is written."""
 
     out: Path
-    in_place: bool  # True = a run is there, which is kept under another name
 
     @classmethod
     def of(cls, root: Path | None, out: Path | str | None) -> "_Place":
         """A place for the result of a run that grows; GsbaError if there is something."""
         if root is not None and (out is None or Path(out).resolve() == root.resolve()):
-            return cls(root, True)
+            return cls(root)
         assert out is not None
         refuse_existing(Path(out))
-        return cls(Path(out), False)
+        return cls(Path(out))
 
     @contextmanager
     def store(

@@ -268,7 +268,7 @@ def _export(
     for to, folder in folders.items():
         if not folder.exists():
             store.forget(f"export-{to.value}")
-        if store.stored(f"export-{to.value}", key, Counts, run.chain.latest) is None:
+        if store.stored(f"export-{to.value}", key, Counts, run.latest) is None:
             waiting[to] = folder
 
     def compute() -> Counts:
@@ -285,5 +285,5 @@ def _export(
         return Counts(len(run.frames), len(shown) - left_out, "frames", dropped)
 
     for to, folder in folders.items():
-        store.stage(f"export-{to.value}", key, compute, Counts, run.chain.latest)
+        store.stage(f"export-{to.value}", key, compute, Counts, run.latest)
         store.claim(folder)

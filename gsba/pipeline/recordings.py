@@ -129,7 +129,17 @@ def refine_each(
     ]
     settings = _with_camera(plain, given)
     check(settings.placement, baseline=settings.camera.baseline())
-    chosen = _masks(given, segment)
+    # Sources of masks of all recordings; files belong to each recording alone.
+    choices = {one.name: merging.choose(one.recording.masks, segment) for one in given}
+    every = list(choices.values())
+    chosen = merging.Choice(
+        None,
+        any(one.carrier for one in every),
+        any(one.distractors for one in every),
+        segment,
+        any(one.carrier_required for one in every),
+        tuple(name for name, one in choices.items() if not one.carrier),
+    )
     origin = {name: path for one in given for name, path in one.files.items()}
     given, fresh = _with_videos(given, out, origin, settings, fresh)
     found = {one.name: one.scanned() for one in given}
@@ -221,20 +231,6 @@ def _with_camera(settings: RefineSettings, given: Sequence[_Given]) -> RefineSet
     for one in given:
         settings = inputs.with_baseline(settings, _path(one.recording.calibration))
     return settings
-
-
-def _masks(given: Sequence[_Given], segment: Segment | None) -> merging.Choice:
-    """Sources of masks of all recordings; files belong to each recording alone."""
-    choices = {one.name: merging.choose(one.recording.masks, segment) for one in given}
-    every = list(choices.values())
-    return merging.Choice(
-        None,
-        any(one.carrier for one in every),
-        any(one.distractors for one in every),
-        segment,
-        any(one.carrier_required for one in every),
-        tuple(name for name, one in choices.items() if not one.carrier),
-    )
 
 
 def _with_videos(

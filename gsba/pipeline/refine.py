@@ -202,18 +202,14 @@ def _solve_or_turn(run: Run, followed: bool) -> tuple[State, Reconstruction]:
 
 
 def _begin(store: RunStore, settings: RefineSettings, chosen: merging.Choice, start: Start) -> Run:
-    _tell_size(settings, start)
-    journal, frames = Journal(), merging.before(store, start.frames, chosen)
-    if chosen.distractors:
-        frames = _without_distractors(store, settings, replace(start, frames=frames), journal)
-    return Run.begin(store, frames, start.coarse, settings, start.evidence, journal)
-
-
-def _tell_size(settings: RefineSettings, start: Start) -> None:
     by_odometry = start.evidence.start is RunStart.ODOMETRY
     width = max(kind.panorama_width for kind in start.frames.formats)
     given = not (start.coarse.absent or by_odometry)
     tell_size(settings, start.frames, width, given)
+    journal, frames = Journal(), merging.before(store, start.frames, chosen)
+    if chosen.distractors:
+        frames = _without_distractors(store, settings, replace(start, frames=frames), journal)
+    return Run.begin(store, frames, start.coarse, settings, start.evidence, journal)
 
 
 def _without_distractors(
@@ -229,7 +225,7 @@ def _without_distractors(
         state = solve(frontend.extract(run))
     if state.prior.turning_only:
         return frames
-    first = f"first-{run.chain.latest[0]}"
+    first = f"first-{run.latest[0]}"
     frames, counts = merging.after(store, frames, state.solution, first)
     journal.note("distractors", counts)
     return frames
@@ -244,7 +240,7 @@ def _solve_raw(run: Run) -> State:
     n, best = 0, None  # the pass before: the stage it rests on, number of steps without matches,
     # state
     while True:
-        name, after, better = f"recut{n}", run.chain.latest, None
+        name, after, better = f"recut{n}", list(run.latest), None
         kept = run.store.stored(f"{name}_undone", known, bool, after)
         if any(kind.fisheyes is not None for kind in frames.formats) and not kept:
             better = run.store.stored(name, known, camera.Cuts, after)
@@ -325,7 +321,7 @@ def solve(state: State) -> State:
 
 def _map_features(state: State) -> State:
     """The map of all frames' features, without GPS fixes that its images contradict."""
-    latest, run = list(state.run.chain.latest), state.run
+    latest, run = list(state.run.latest), state.run
     mapped = _map_all(state)
     strength = mapped.prior.strength
     if strength is None or not strength.contradiction > backend.MAX_CONTRADICTION:

@@ -19,7 +19,7 @@ from gsba.imu.readings import Readings
 from gsba.log import GsbaError
 from gsba.parts import DividedAdjustments
 from gsba.photometric import direct
-from gsba.store.store import Chain, RunStore, fingerprint
+from gsba.store.store import RunStore, fingerprint
 from gsba.trajectory.limits import TwoViewLimits
 from gsba.types import CoarsePoses, Counts, FrameSet, Round, RunStart, Trajectory
 
@@ -83,7 +83,7 @@ class Run:
     """Inputs, settings and store of a run, which no stage changes."""
 
     store: RunStore
-    chain: Chain  # of stages, each resting on the one before
+    latest: list[str]  # names of the last stages, on which the next one rests
     journal: Journal
     frames: FrameSet  # as read, not straightened
     coarse: CoarsePoses  # start poses, as the trajectories say
@@ -134,15 +134,14 @@ class Run:
         families = Families(members, frames.names, frames.timestamps)
         if not families.observing_points.members:
             raise GsbaError("factors: no family observes points; add bearing or reprojection")
-        chain = Chain(store)
         paths = [*(path for group in frames.paths for path in group), *frames.mask_paths]
         start = coarse.world_T_rigs.tolist(), settings.read
         inputs = [fingerprint(paths), frames.timestamps.tolist(), frames.timed, *start]
         inputs += [frames.camera_of_frame, *map(asdict, frames.formats), lenses_found]
-        chain.stage("frames", inputs, lambda: frames, FrameSet)
+        store.stage("frames", inputs, lambda: frames, FrameSet)
         return cls(
             store=store,
-            chain=chain,
+            latest=["frames"],
             journal=journal or Journal(),
             frames=frames,
             coarse=coarse,
@@ -171,7 +170,8 @@ class Run:
         """Result of a stage that rests on the one before it; `noted`: whether the report tells of
         it."""
         name += self.suffix
-        result = self.chain.stage(name, key, compute, returns)
+        result = self.store.stage(name, key, compute, returns, self.latest)
+        self.latest[:] = [name]
         if noted:
             self.journal.note(name, result)
         return result
@@ -186,7 +186,7 @@ class Run:
         times = own_timestamps(frames)
         return replace(
             self,
-            chain=Chain(self.store, self.chain.latest),
+            latest=list(self.latest),
             frames=replace(frames, timestamps=times, clock_shifts=(0.0,) * len(times)),
             coarse=given.coarse,
             evidence=Evidence(given.trajectories, given.imu),

@@ -94,7 +94,7 @@ def _with_places(state: State, tour: TourMatches) -> tuple[ObservedFrames, Match
         return with_keypoints(before.features[f][name], rays[f], sigmas[f], faces, run.rig)
 
     inputs = dict.fromkeys(frames.names, 0)
-    after = run.chain.latest
+    after = list(run.latest)
     found = run.store.per_frame(_STAGE, None, inputs, compute, Features, after, alone=True)
     each = [found] * len(frames)
     observed = replace(frontend.observe(run, "keypoints_tour", each, _STAGE), more=True)

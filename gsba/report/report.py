@@ -17,7 +17,7 @@ from pydantic import BaseModel
 from gsba.bundle.triangulation import points_under
 from gsba.disk import write_csv
 from gsba.geometry import angular_errors, moved_to, quaternion_from_rotation
-from gsba.memory import release_mapped_files, total_memory_bytes, usable_cpus
+from gsba.memory import processor_name, release_mapped_files, total_memory_bytes, usable_cpus
 from gsba.report.maps import summarize_maps
 from gsba.report.verdict import judge
 from gsba.store.store import StageRecord
@@ -265,20 +265,11 @@ def write_poses(
 def _machine() -> dict[str, Any]:
     return {
         "platform": platform.platform(),
-        "processor": _processor(),
+        "processor": processor_name(),
         "cpus": usable_cpus(),
         "memory_mb": round(total_memory_bytes() / 2**20),
         "python": platform.python_version(),
     }
-
-
-def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return platform.processor()
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.machine()
 
 
 def _version(package: str) -> str | None:

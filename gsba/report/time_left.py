@@ -235,7 +235,10 @@ class TimeLeft:
             return work_left + ahead if work_left else None
         if self._stage and phase_of(self._stage) is None:
             return None
-        pace = self._pace(speed)
+        # Seconds of a round of patches for each of the table, by the rounds that have
+        # ended; the machine's `speed` before.
+        measured, expected = self._aligned
+        pace = (measured + _PATCHES_PRIOR_S * speed) / (expected + _PATCHES_PRIOR_S)
         here = pace if self._phase in _PATCHES else speed
         left = max(here * size.seconds(self._phase) - spent, work_left)
         return left + speed * self._ahead(size, self._phase + 1, is_most, pace / speed)
@@ -282,12 +285,6 @@ class TimeLeft:
             measured += work.at - work.began
             expected += size.seconds(FEATURES) * (work.done - work.first) / size.frames
         return (measured + _PRIOR_S) / (expected + _PRIOR_S)
-
-    def _pace(self, speed: float) -> float:
-        """Seconds of a round of patches for each of the table, by the rounds that have ended; the
-        machine's `speed` before."""
-        measured, expected = self._aligned
-        return (measured + _PATCHES_PRIOR_S * speed) / (expected + _PATCHES_PRIOR_S)
 
     def _seconds_of_odometry(self, size: Size, now: float, is_most: bool) -> float | None:
         """Seconds of the odometry, and of all that comes after it."""

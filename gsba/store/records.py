@@ -293,10 +293,6 @@ def _decode(tree: Any, hint: Any, archive: _Archive | None) -> Any:
             where = f"{archive.filename}: " if archive is not None else ""
             raise RecordError(f"{where}not a {hint.__name__} of this version")
         return hint(**{name: _decode(value, hints[name], archive) for name, value in tree.items()})
-    return _decode_scalar(tree, hint)
-
-
-def _decode_scalar(tree: Any, hint: Any) -> Any:
     if get_origin(hint) is Literal:
         _require(tree in get_args(hint), tree, hint)
         return tree

@@ -293,36 +293,6 @@ class RunStore:
             self._resumed.clear()
 
 
-class Chain:
-    """Stages that each depend on the one before.
-
-    Args:
-        latest: names of the stages that the first one depends on.
-    """
-
-    def __init__(self, store: RunStore, latest: Sequence[str] = ()) -> None:
-        self._store = store
-        self.latest = list(latest)  # names of the last stages; [] before the first
-
-    def stage(
-        self,
-        name: str,
-        settings: object,
-        compute: Callable[[], T],
-        returns: type[T],
-        also: Sequence[str] = (),
-    ) -> T:
-        """Result of `RunStore.stage` after the latest stage and those named in `also`."""
-        after = [*self.latest, *also]
-        result = self._store.stage(name, settings, compute, returns, after)
-        self.latest = [name]
-        return result
-
-    def join(self, others: "Sequence[Chain]") -> None:
-        """Let the next stage depend on the latest stages of other chains, which branched off."""
-        self.latest = [name for chain in others for name in chain.latest]
-
-
 @runtime_checkable
 class Taken(Protocol[T_co]):
     """Per-frame computation that can be restricted to some frames, for remote workers."""

@@ -84,24 +84,20 @@ def read_metashape(path: Path) -> list[NamedPoses]:
             raise GsbaError(f"{path}: two cameras are named '{brief(label)}': rename one")
         where = f"{path}: camera '{brief(label)}'"
         of_component = found.setdefault(camera.get("component_id") or "", {})
-        of_component[name] = _pose(transform, where)
+        # World_T_rig (4, 4) from 16 numbers, row by row.
+        try:
+            matrix = np.array(transform.split(), np.float64).reshape(4, 4)
+        except ValueError:
+            raise GsbaError(f"{where}: its transform is not 16 numbers") from None
+        if not np.isfinite(matrix).all():
+            raise GsbaError(f"{where}: its transform is not finite")
+        u, _, vt = np.linalg.svd(matrix[:3, :3])
+        rotation = u @ vt
+        off = np.abs(rotation - matrix[:3, :3]).max()
+        if off > 1e-3 or np.linalg.det(rotation) < 0:
+            raise GsbaError(f"{where}: the left 3x3 block of its transform is not a rotation")
+        of_component[name] = pose(rotation, matrix[:3, 3])
     if not found:
         raise GsbaError(f"{path}: none of its spherical cameras is aligned: align them first")
     largest_first = sorted(found.values(), key=len, reverse=True)
     return [NamedPoses(path, tuple(one), np.stack(list(one.values()))) for one in largest_first]
-
-
-def _pose(text: str, where: str) -> np.ndarray:
-    """World_T_rig (4, 4) from 16 numbers, row by row."""
-    try:
-        matrix = np.array(text.split(), np.float64).reshape(4, 4)
-    except ValueError:
-        raise GsbaError(f"{where}: its transform is not 16 numbers") from None
-    if not np.isfinite(matrix).all():
-        raise GsbaError(f"{where}: its transform is not finite")
-    u, _, vt = np.linalg.svd(matrix[:3, :3])
-    rotation = u @ vt
-    off = np.abs(rotation - matrix[:3, :3]).max()
-    if off > 1e-3 or np.linalg.det(rotation) < 0:
-        raise GsbaError(f"{where}: the left 3x3 block of its transform is not a rotation")
-    return pose(rotation, matrix[:3, 3])

@@ -43,7 +43,11 @@ class SceneView:
         self._quality = frame_quality(scene.reconstruction)
         with server.atomic():
             server.scene.set_up_direction(scene.up)
-            self._add_cloud()
+            found = self.scene.reconstruction
+            self._add_points("/cloud", found.points_world, found.point_colors, 0.02)
+            if self.scene.judged is not None:
+                points, colors = self.scene.judged
+                self._add_points("/judged", points, colors, 0.025, visible=False)
             self._add_paths()
             self._add_splats()
             self._add_controls()
@@ -82,13 +86,6 @@ class SceneView:
         """Stop the server without output."""
         with redirect_stdout(io.StringIO()):  # viser prints a message
             self.server.stop()
-
-    def _add_cloud(self) -> None:
-        found = self.scene.reconstruction
-        self._add_points("/cloud", found.points_world, found.point_colors, 0.02)
-        if self.scene.judged is not None:
-            points, colors = self.scene.judged
-            self._add_points("/judged", points, colors, 0.025, visible=False)
 
     def _add_points(
         self, name: str, points: np.ndarray, colors: Any, size: float, visible: bool = True

@@ -223,7 +223,7 @@ def test_progress_of_a_run() -> None:
         {"event": "log", "level": "WARNING", "text": "dark"},
     ):
         progress.add(entry)
-    assert progress.seconds_of_work() == 10.0 and progress.left_in_words() == ""
+    assert progress.left_in_words() == ""
     assert progress.warnings == ["dark"] and len(progress.keyframes) == 1
     assert progress.stage is not None and progress.stage["title"] == "track the video"
     progress.add({"event": "done", "name": "odometry", "title": "track the video"})

@@ -1,5 +1,7 @@
 """The way lenses look: the panorama's own, or one that turns below a stabilised panorama."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from lens_world import placed, problem_of, seen_through, solved_under, solved_with
@@ -9,6 +11,7 @@ from synthetic import loop_walk
 from gsba.bundle import lens_axes, lens_centres
 from gsba.bundle.lens_axes import upright
 from gsba.bundle.readout import CameraEstimate
+from gsba.bundle.shared_parameters import ObservedRays
 from gsba.camera.lens import Lenses
 from gsba.similarity import pose_similarity
 from gsba.types import Solution
@@ -44,10 +47,11 @@ def test_axes_below_a_stabilised_panorama_are_found(seed: int) -> None:
     world, shown = seen_through(camera, seed, _stabilised())
     start, problem = Solution.without_points(world.world_T_rigs), problem_of(world)
     solved, keypoints, tracks = solved_under(world, shown, Lenses(), start)
-    around = placed(solved, keypoints, tracks)
-    lenses = lens_axes.guess(around, keypoints, solved, Lenses(band_rad=BAND), problem).lenses
+    around = replace(solved, landmarks=placed(solved, keypoints, tracks))
+    rays = ObservedRays(around, keypoints, problem, Lenses(band_rad=BAND))
+    lenses = lens_axes.guess(rays).lenses
     assert lenses.axes is not None and np.median(_off_deg(lenses.axes, truth)) < 20
-    found = lens_centres.estimate(around, keypoints, solved, lenses, problem)
+    found = lens_centres.estimate(replace(rays, lenses=lenses))
     assert not found.reason
     camera = CameraEstimate(found.lenses)
     solved, camera = solved_with(world, shown, camera, solved, problem)
@@ -64,13 +68,13 @@ def test_lenses_that_look_as_their_panorama_does_are_not_turned(seed: int) -> No
     world, shown = seen_through(camera, seed)
     start, problem = Solution.without_points(world.world_T_rigs), problem_of(world)
     solved, keypoints, tracks = solved_under(world, shown, Lenses(), start)
-    around = placed(solved, keypoints, tracks)
-    guess = lens_axes.guess(around, keypoints, solved, Lenses(), problem)
+    around = replace(solved, landmarks=placed(solved, keypoints, tracks))
+    guess = lens_axes.guess(ObservedRays(around, keypoints, problem))
     assert guess.reason and guess.lenses.axes is None
     for _ in range(3):
         solved, keypoints, tracks = solved_under(world, shown, camera, solved)
-    around = placed(solved, keypoints, tracks)
-    found = lens_axes.loosened(around, keypoints, solved, camera, problem)
+    around = replace(solved, landmarks=placed(solved, keypoints, tracks))
+    found = lens_axes.loosened(ObservedRays(around, keypoints, problem, camera))
     assert found.reason and found.lenses.axes is None
 
 

@@ -23,6 +23,7 @@ from gsba.bundle import adjustment, lens_centres
 from gsba.bundle.lens_centres import LensCentres, StitchRadius
 from gsba.bundle.optimizer import SolverOptions
 from gsba.bundle.readout import CameraEstimate
+from gsba.bundle.shared_parameters import ObservedRays
 from gsba.camera.cameras import Cameras
 from gsba.camera.lens import Lenses
 from gsba.config import CameraSettings
@@ -38,8 +39,8 @@ def _found(world: World, shown: Keypoints, rounds: int = 5) -> tuple[LensCentres
     solved, keypoints, tracks = solved_under(world, shown, lenses, start)
     found = None
     for _ in range(rounds):
-        landmarks = placed(solved, keypoints, tracks)
-        found = lens_centres.estimate(landmarks, keypoints, solved, lenses, problem_of(world))
+        around = replace(solved, landmarks=placed(solved, keypoints, tracks))
+        found = lens_centres.estimate(ObservedRays(around, keypoints, problem_of(world), lenses))
         if not found.lenses:
             break
         lenses = found.lenses
@@ -95,8 +96,9 @@ def test_a_stitch_radius_is_judged_by_what_is_solved_with_it(inverse: float) -> 
     def estimate(lenses: Lenses) -> StitchRadius:
         keypoints = Cameras((lenses,)).seen(shown)
         points = placed(solved, keypoints, Cameras((lenses,)).clear(world.tracks, keypoints))
-        given = points, keypoints, shown.bearings_rig, solved, lenses, problem
-        return lens_centres.stitched_for(*given)
+        around = replace(solved, landmarks=points)
+        given = around, keypoints, problem, lenses, shown.bearings_rig
+        return lens_centres.stitched_for(ObservedRays(*given))
 
     found = estimate(off.lenses)
     tried = found.on_trial(off.lenses)
@@ -116,13 +118,13 @@ def test_what_is_asked_for_is_taken_and_too_little_is_named() -> None:
     )
     problem = problem_of(world)
     asked = SETTINGS.model_copy(update={"camera": camera})
-    landmarks, lenses = placed(solved, keypoints, tracks), Lenses(band_rad=BAND)
-    given = landmarks, keypoints, solved, lenses
-    taken = lens_centres.estimate(*given, replace(problem, settings=asked))
+    around = replace(solved, landmarks=placed(solved, keypoints, tracks))
+    rays = ObservedRays(around, keypoints, problem, Lenses(band_rad=BAND))
+    taken = lens_centres.estimate(replace(rays, context=replace(problem, settings=asked)))
     assert taken.lenses and not taken.reason
     rows = np.flatnonzero(tracks.points < 30)
     some = Tracks(tracks.points[rows], tracks.frames[rows], tracks.keypoints[rows], 30)
-    none = lens_centres.estimate(placed(solved, keypoints, some), *given[1:], problem)
+    none = lens_centres.estimate(rays.of(placed(solved, keypoints, some)))
     assert none.reason.startswith("too few points") and not none.lenses
 
 
@@ -145,9 +147,8 @@ def test_a_step_is_that_of_an_independent_solver() -> None:
         clear = cameras.clear(tracks, keypoints)
         solved = adjustment.adjust(clear, keypoints, solved, problem, (60.0,))
         landmarks = solved.landmarks
-        lenses = lens_centres.estimate(
-            landmarks, keypoints, replace(solved, noise=1.0), lenses, problem
-        ).lenses
+        rays = ObservedRays(replace(solved, noise=1.0), keypoints, problem, lenses)
+        lenses = lens_centres.estimate(rays).lenses
     used = landmarks.tracks
     bearings = shown.bearings_rig[shown.rows(used)]
     signs = np.where(bearings[:, 2] >= 0, 1.0, -1.0)

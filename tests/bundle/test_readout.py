@@ -9,6 +9,7 @@ from synthetic import loop_walk
 
 from gsba.bundle import readout
 from gsba.bundle.readout import CameraEstimate
+from gsba.bundle.shared_parameters import ObservedRays
 from gsba.camera.lens import Lenses
 from gsba.types import Fisheye, Solution
 
@@ -24,8 +25,8 @@ def _found(camera: Lenses, seed: int) -> tuple[CameraEstimate, float]:
     start, moments = Solution.without_points(world.world_T_rigs), times(len(world.world_T_rigs))
     solved, keypoints, tracks = solved_under(world, shown, LENSES, start)
     around, problem = placed(solved, keypoints, tracks), problem_of(world)
-    known = keypoints, shown.bearings_rig
-    found = readout.estimate(around, *known, solved, LENSES, moments, problem)
+    given = keypoints, problem, LENSES, shown.bearings_rig, moments
+    found = readout.estimate(ObservedRays(replace(solved, landmarks=around), *given))
     if not found.reason:
         solved, found = solved_with(world, shown, found, solved, problem)
     return found, solved.noise
@@ -81,12 +82,14 @@ def test_the_duration_is_found_in_two_maps_of_one_recording() -> None:
     poses, points = solved.world_T_rigs.copy(), around.points_world.copy()
     poses[12:, :3, 3] += [500.0, 0.0, 0.0]
     points[hosts == 1] += [500.0, 0.0, 0.0]
-    apart, torn = replace(around, points_world=points).of(own), replace(solved, world_T_rigs=poses)
+    apart = replace(around, points_world=points).of(own)
+    torn = replace(solved, world_T_rigs=poses, landmarks=apart)
     problem = replace(problem_of(world), maps=maps)
-    known = keypoints, shown.bearings_rig, torn, LENSES, times(24)
-    found = readout.estimate(apart, *known, problem)
+    rays = ObservedRays(torn, keypoints, problem, LENSES, shown.bearings_rig, times(24))
+    found = readout.estimate(rays)
     assert not found.reason and found.readout_s == pytest.approx(READOUT_S, rel=0.2)
-    assert readout.estimate(apart, *known, replace(problem, maps=None)).readout_s < 0.1 * READOUT_S
+    whole = replace(rays, context=replace(problem, maps=None))
+    assert readout.estimate(whole).readout_s < 0.1 * READOUT_S
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -105,11 +108,12 @@ def test_no_way_is_taken_while_another_explains_as_much() -> None:
     seen = around.tracks
     behind = shown.bearings_rig[keypoints.rows(seen), 2] < 0
     ahead = around.of(np.bincount(seen.points[behind], minlength=seen.num_points) == 0)
-    known = keypoints, shown.bearings_rig, solved, LENSES, times(24), problem_of(world)
-    found = readout.estimate(ahead, *known)
+    given = keypoints, problem_of(world), LENSES, shown.bearings_rig, times(24)
+    rays = ObservedRays(replace(solved, landmarks=around), *given)
+    found = readout.estimate(rays.of(ahead))
     assert found.reason == "rows may be read in other directions as well"
     assert found.lenses.row_directions is None and found.lenses.readout_motion is None
-    assert readout.estimate(around, *known).lenses.row_directions is not None
+    assert readout.estimate(rays).lenses.row_directions is not None
 
 
 def test_rows_of_stitched_pictures_are_known_to_three_per_cent() -> None:

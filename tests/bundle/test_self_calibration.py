@@ -1,5 +1,7 @@
 """What raw lenses are, found from a map: with their centre, and only where it predicts."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from lens_world import placed, problem_of, seen_through, solved_under, solved_with, times
@@ -10,6 +12,7 @@ from gsba.bundle import self_calibration
 from gsba.bundle.camera_adjustment import CameraSystem
 from gsba.bundle.readout import CameraEstimate, CameraEstimates
 from gsba.bundle.self_calibration import SelfCalibration, num_parameters
+from gsba.bundle.shared_parameters import ObservedRays
 from gsba.camera.fisheye import Pair, Rig, changed, recalibrated
 from gsba.camera.lens import Lenses
 from gsba.types import Fisheye, Solution
@@ -37,9 +40,9 @@ def _estimated(
     problem = problem_of(world)
     for _ in range(rounds):
         solved, keypoints, tracks = solved_under(world, shown, lenses, solved)
-        around = placed(solved, keypoints, tracks)
-        given = around, keypoints, shown.bearings_rig, solved, lenses, problem
-        found = self_calibration.estimate(*given)
+        around = replace(solved, landmarks=placed(solved, keypoints, tracks))
+        given = around, keypoints, problem, lenses, shown.bearings_rig
+        found = self_calibration.estimate(ObservedRays(*given))
         lenses = found.lenses
     return found, solved
 
@@ -71,8 +74,9 @@ def test_noise_makes_no_lens_longer(seed: int) -> None:
     )
     problem = problem_of(world)
     solved, keypoints, tracks = solved_under(world, shown, lenses, solved)
-    given = placed(solved, keypoints, tracks), keypoints, shown.bearings_rig, solved, lenses
-    found = self_calibration.estimate(*given, problem, nominal=True)
+    around = replace(solved, landmarks=placed(solved, keypoints, tracks))
+    given = around, keypoints, problem, lenses, shown.bearings_rig
+    found = self_calibration.estimate(ObservedRays(*given), nominal=True)
     assert not found.reason
     assert _off_deg(found.lenses.fisheyes) < 0.05
 

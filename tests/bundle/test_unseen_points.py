@@ -139,7 +139,9 @@ def test_eliminating_points_gives_the_same_system(case: Case) -> None:
     solved = Solution(_world().world_T_rigs, case.landmarks()[1], 1.0, ())
     systems = []
     for landmarks in case.landmarks():
-        seen = shared_parameters.weighted(landmarks, _world().keypoints, solved, PROBLEM)
+        around = replace(solved, landmarks=landmarks)
+        rays = shared_parameters.ObservedRays(around, _world().keypoints, PROBLEM)
+        seen = shared_parameters.weighted(rays)
         sums = shared_parameters.without_points(seen, landmarks.tracks, NUM_FRAMES, seen.by_pose)
         systems.append(sums.system())
     np.testing.assert_allclose(systems[0].cost, systems[1].cost, rtol=1e-12)

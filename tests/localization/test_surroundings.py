@@ -8,8 +8,14 @@ from scipy.spatial.transform import Rotation
 from tiny_run import Case
 
 from gsba import GsbaError, Localizer, refine
-from gsba.localization.pose_search import Candidates, search_poses
-from gsba.localization.rival_poses import LOOK_ALIKE, TWO_PLACES, PlacedPose, best_of
+from gsba.localization.pose_search import (
+    LOOK_ALIKE,
+    TWO_PLACES,
+    Candidates,
+    PlacedPose,
+    best_of,
+    search_poses,
+)
 from gsba.localization.run_map import Query
 from gsba.localization.surroundings import is_contradicted, is_look_alike
 from gsba.loop_closure.join_evidence import JoinEvidence

@@ -7,6 +7,7 @@ import pytest
 
 from gsba.bundle.lens_centres import LensCentres
 from gsba.bundle.readout import CameraEstimate
+from gsba.bundle.shared_parameters import ObservedRays
 from gsba.camera.lens import Lenses
 from gsba.config import CameraSettings
 from gsba.pipeline import camera
@@ -28,11 +29,10 @@ def _kept(
     monkeypatch: pytest.MonkeyPatch, reason: str, settings: CameraSettings, lenses: Lenses = ONE
 ) -> LensCentres:
     read = CameraEstimate(Lenses(), reason=reason)
-    monkeypatch.setattr(camera._Rays, "readout", lambda *_: read)
-    monkeypatch.setattr(camera.lens_centres, "estimate", lambda *_: CENTRES)
-    state = MagicMock()
-    state.run.settings_of = lambda _: settings
-    return camera._Rays(*3 * [MagicMock()], CameraEstimate(lenses), 0, state).centres()
+    monkeypatch.setattr(camera.readout, "estimate", lambda _: read)
+    monkeypatch.setattr(camera.lens_centres, "estimate", lambda _: CENTRES)
+    rays = ObservedRays(*3 * [MagicMock()], lenses)
+    return camera._centres(rays, settings.baseline() is not None)
 
 
 def test_a_readout_keeps_estimated_centres_and_the_reason(monkeypatch) -> None:

@@ -116,7 +116,7 @@ function fillHead(head, job) {
 }
 
 function fillNow(now, job) {
-  const { stage, work, left, seconds_of_work: stepLeft } = job.progress;
+  const { stage, work, left } = job.progress;
   if (ENDED.includes(job.status) || !(stage || work)) {
     now.replaceChildren();
     return;
@@ -125,6 +125,7 @@ function fillNow(now, job) {
   if (left) parts.unshift(make("p", { class: "left" }, `${left[0].toUpperCase()}${left.slice(1)} left of the run`));
   if (work && work.total) {
     const rate = work.rate ? `${Number(work.rate.toPrecision(3))} a second` : "";
+    const stepLeft = work.rate ? (work.total - work.done) / work.rate : 0;
     const more = [`${work.done} of ${work.total}`, rate, stepLeft ? `${spoken(stepLeft)} left of it` : "", work.note];
     parts.push(make("progress", { max: work.total, value: work.done, "aria-label": work.what }),
       make("p", { class: "faint" }, `${work.what}: ${more.filter(Boolean).join(", ")}`));

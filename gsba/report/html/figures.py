@@ -106,7 +106,12 @@ def residual_sphere(reconstruction: Reconstruction) -> dict[str, Any]:
     rows, columns = round(180 / _SPHERE_CELL_DEG), round(360 / _SPHERE_CELL_DEG)
     cells, values = [], []
     for some in reconstruction.pieces():
-        cells.append(_cells(some.observation_bearings, rows, columns))
+        # Cell (O,) uint16 of an equirectangular grid that each bearing (O, 3) points to.
+        longitude = np.arctan2(some.observation_bearings[:, 0], some.observation_bearings[:, 2])
+        latitude = np.arcsin(np.clip(some.observation_bearings[:, 1], -1, 1))
+        column = np.clip(((longitude / np.pi + 1) / 2 * columns).astype(int), 0, columns - 1)
+        row = np.clip(((latitude / np.pi + 0.5) * rows).astype(int), 0, rows - 1)
+        cells.append((row * columns + column).astype(np.uint16))
         residuals = np.degrees(tangent_residuals(some)).T
         values.append(np.stack([np.hypot(*residuals), *residuals]).astype(np.float32))
         release_mapped_files()
@@ -124,15 +129,6 @@ def residual_sphere(reconstruction: Reconstruction) -> dict[str, Any]:
         "count": np.bincount(cell, minlength=num).reshape(rows, columns),
         **dict(zip(names, medians, strict=True)),
     }
-
-
-def _cells(bearings: np.ndarray, rows: int, columns: int) -> np.ndarray:
-    """Cell (O,) uint16 of an equirectangular grid that each bearing (O, 3) points to."""
-    longitude = np.arctan2(bearings[:, 0], bearings[:, 2])
-    latitude = np.arcsin(np.clip(bearings[:, 1], -1, 1))
-    column = np.clip(((longitude / np.pi + 1) / 2 * columns).astype(int), 0, columns - 1)
-    row = np.clip(((latitude / np.pi + 0.5) * rows).astype(int), 0, rows - 1)
-    return (row * columns + column).astype(np.uint16)
 
 
 def field_sphere(correction: tuple[float, ...]) -> dict[str, Any] | None:
