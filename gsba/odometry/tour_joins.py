@@ -9,14 +9,12 @@ sphere confirm it than any other.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
-from itertools import pairwise, product
+from itertools import product
 
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from factors.threads import map_in_threads
 from gsba.camera.rig import cells_of
 from gsba.geometry import angles_between, inverse, pose, unit
 from gsba.odometry.tour_steps import (
@@ -25,7 +23,6 @@ from gsba.odometry.tour_steps import (
     found_places,
     pose_errors_deg,
     rough_poses,
-    step_at,
 )
 
 _CELLS_PER_SIDE = 6  # of 15 degrees; keypoints of one surface agree together
@@ -34,14 +31,13 @@ _LENGTH_WIDTH, _NUM_LENGTHS = 0.15, 2  # of a length's logarithm, within which k
 _MIN_VOTES = 3  # keys that propose a length
 _MAX_LOG_SCALE = np.log(8.0)  # of the units of two maps, whose first steps they are
 _NUM_STARTS, _NUM_FINAL = 12, 3  # hypotheses that are fitted to two frames; to all near the step
-_NEAR = 3  # frames of either map beside the step
+NEAR = 3  # frames of either map beside the step
 _MIN_FITTED = 6  # places that a join is fitted to
-_MIN_HELD = 6  # places of a pair of frames that enter the map
 _MAX_OFF_RAD = np.deg2rad(0.5)  # of a place that confirms a join
 _MIN_PARALLAX_RAD = np.deg2rad(3.0)
 _ALIKE_DEG, _ALIKE_LOG = (3.0, 8.0), 0.25  # rotation, direction; lengths and scales: below these,
 # joins are no rivals but less accurate ones
-MIN_SCORE, MIN_LEAD = 9.0, 1.7  # that confirm a join; times that of any rival
+MIN_SCORE, MIN_LEAD = 16.0, 1.7  # that confirm a join; times that of any rival
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +55,12 @@ class TourMap:
     @property
     def last(self) -> int:
         return self.first + len(self.f_T_firsts) - 1
+
+    def part(self, first: int, last: int) -> "TourMap":
+        """The map of some of its frames, in the same units."""
+        rows = slice(first - self.first, last - self.first + 1)
+        poses = self.f_T_firsts[rows]
+        return TourMap(first, poses @ inverse(poses[0]), self.depths[rows])
 
     def between(self, f: int, g: int) -> np.ndarray:
         """Pose g_T_f (4, 4)."""
@@ -92,7 +94,7 @@ def join(frames: Sequence[TourFrame], one: TourMap, other: TourMap) -> tuple[Joi
     """The join of a map and the one that follows it which most places confirm, and the score of
     its best rival."""
     f, g = one.last, other.first
-    joining = _Joining(frames, one, other)
+    joining = Joining(frames, one, other)
     starts = list[tuple[int, Join]]()
     for g_T_f in rough_poses(frames[f], frames[g]):
         starts += joining.starts(g_T_f)
@@ -103,7 +105,7 @@ def join(frames: Sequence[TourFrame], one: TourMap, other: TourMap) -> tuple[Joi
         found.append(joining.fitted(rough, [(f, g)], 0.7, 2.0))
     near = [
         list(product(range(max(f - n, one.first), f + 1), range(g, min(g + n, other.last) + 1)))
-        for n in range(_NEAR)
+        for n in range(NEAR)
     ]
     final = list[Join]()
     for rough in _distinct(found)[:_NUM_FINAL]:
@@ -113,89 +115,13 @@ def join(frames: Sequence[TourFrame], one: TourMap, other: TourMap) -> tuple[Joi
     return next(iter(ranked), None), ranked[1].score if len(ranked) > 1 else 0.0
 
 
-def held(
-    frames: Sequence[TourFrame], one: TourMap, other: TourMap, at: Join
-) -> list[tuple[tuple[int, int], np.ndarray, np.ndarray, np.ndarray]]:
-    """Pairs of frames over a join, their poses f0_T_f1 (4, 4) of unit translation, and places
-    (N, 3) in either frame of the other one's keys that confirm it; NaN = none."""
-    joining, found = _Joining(frames, one, other), dict[tuple[int, int], np.ndarray]()
-    for some in at.places:
-        rows = joining.confirms(at, some)
-        found[some.f, some.g] = np.full((len(frames[some.f].keys), 3), np.nan)
-        found[some.f, some.g][some.rows[rows]] = some.found[rows]
-    pairs = list[tuple[tuple[int, int], np.ndarray, np.ndarray, np.ndarray]]()
-    for f, g in sorted({(min(pair), max(pair)) for pair in found}):
-        found_g, found_f = (
-            found.get(pair, np.full((len(frames[pair[0]].keys), 3), np.nan))
-            for pair in ((f, g), (g, f))
-        )
-        num = np.count_nonzero(np.isfinite(np.append(found_g[:, 0], found_f[:, 0])))
-        if num >= _MIN_HELD:
-            f_T_g = joining.between(at, g, f)
-            unit_pose = pose(f_T_g[:3, :3], unit(f_T_g[:3, 3]))
-            pairs.append(((f, g), unit_pose, found_g, found_f))
-    return pairs
-
-
-def all_joined(
-    frames: Sequence[TourFrame], maps: Sequence[TourMap], num_threads: int
-) -> list[tuple[TourMap, TourMap, Join]]:
-    """Joins of maps and single frames in the order of the way, with the maps before each; joined
-    ones are joined further as one map."""
-    maps, made = list(maps), list[tuple[TourMap, TourMap, Join]]()
-    known = dict[tuple[int, int], Join | None]()
-    while True:
-        pairs = [pair for pair in pairwise(maps) if _seen(*pair) not in known]
-        found = map_in_threads(partial(_sure_join, frames, pairs), len(pairs), num_threads)
-        known |= {_seen(*pair): at for pair, at in zip(pairs, found, strict=True)}
-        sure = [(n, at) for n, pair in enumerate(pairwise(maps)) if (at := known[_seen(*pair)])]
-        if not sure:
-            return made
-        n, at = max(sure, key=lambda some: some[1].score)
-        made.append((maps[n], maps[n + 1], at))
-        maps[n : n + 2] = [_merged(frames, *made[-1])]
-
-
-def _seen(one: TourMap, other: TourMap) -> tuple[int, int]:
-    """First and last frame of those beside the step between two maps."""
-    return max(one.first, one.last - _NEAR + 1), min(other.last, other.first + _NEAR - 1)
-
-
-def _sure_join(
-    frames: Sequence[TourFrame], pairs: Sequence[tuple[TourMap, TourMap]], n: int
-) -> Join | None:
-    """The join of one of several pairs of maps; None if it is not sure."""
-    one, other = pairs[n]
-    if one.single and other.single:
-        return None
-    best, rival = join(frames, one, other)
-    return best if is_sure(best, rival) else None
-
-
-def _merged(frames: Sequence[TourFrame], one: TourMap, other: TourMap, at: Join) -> TourMap:
-    """The map of two, in the units of the first one."""
-    scale = float(np.exp(at.log_scale))
-    start = at.g_T_f @ one.f_T_firsts[-1]
-    poses = [_scaled(g_T_first, scale) @ start for g_T_first in other.f_T_firsts]
-    depths = [*one.depths, *(some * scale for some in other.depths)]
-    if one.single or other.single:
-        length = np.linalg.norm(at.g_T_f[:3, 3])
-        step = step_at(frames[one.last], frames[other.first], at.g_T_f)
-        n = len(one.depths)
-        if one.single:
-            depths[n - 1] = step.depths0 * length
-        if other.single:
-            depths[n] = step.depths1 * length
-    return TourMap(one.first, np.concatenate([one.f_T_firsts, poses]), depths)
-
-
 def is_sure(best: Join | None, rival: float) -> bool:
     """True if places confirm a join clearly, and no rival nearly as well."""
     return best is not None and best.score >= max(MIN_SCORE, MIN_LEAD * rival)
 
 
 @dataclass(frozen=True, slots=True)
-class _Joining:
+class Joining:
     """Two maps whose join is searched."""
 
     frames: Sequence[TourFrame]
@@ -218,7 +144,7 @@ class _Joining:
                 if abs(log0 - log1) < _MAX_LOG_SCALE
             ]
         return [
-            (cells, Join(_scaled(g_T_f, np.exp(log0)), log0 - log1, 0.0, []))
+            (cells, Join(scaled(g_T_f, np.exp(log0)), log0 - log1, 0.0, []))
             for log0, log1, cells in lengths
         ]
 
@@ -240,8 +166,8 @@ class _Joining:
         """Pose g_T_f (4, 4) of frames of different maps, units of the map of f."""
         if f > self.one.last:
             g_T_f = inverse(self.between(at, g, f))
-            return _scaled(g_T_f, np.exp(-at.log_scale))
-        after = _scaled(self.other.between(self.other.first, g), np.exp(at.log_scale))
+            return scaled(g_T_f, np.exp(-at.log_scale))
+        after = scaled(self.other.between(self.other.first, g), np.exp(at.log_scale))
         return after @ at.g_T_f @ self.one.between(f, self.one.last)
 
     def fitted(
@@ -261,7 +187,7 @@ class _Joining:
             length = float(np.linalg.norm(g_T_f[:3, 3]))
             if not len(rows) or not length > 0:
                 continue
-            frame, along = self.frames[f], _scaled(g_T_f, 1 / length)
+            frame, along = self.frames[f], scaled(g_T_f, 1 / length)
             rows, found = found_places(frame, self.frames[g], rows, along, beside_deg, coarse)
             if len(rows):
                 keys, sound = frame.keys[rows], frame.sound[rows]
@@ -331,7 +257,8 @@ def agreed_logs(logs: np.ndarray, cells: np.ndarray) -> list[tuple[float, int]]:
     return found
 
 
-def _scaled(g_T_f: np.ndarray, by: float) -> np.ndarray:
+def scaled(g_T_f: np.ndarray, by: float) -> np.ndarray:
+    """A pose (4, 4) with a longer translation."""
     return pose(g_T_f[:3, :3], g_T_f[:3, 3] * by)
 
 
@@ -339,12 +266,13 @@ def _distinct(joins: Sequence[Join]) -> list[Join]:
     """Joins by falling score, without those that are nearly the same as a better one."""
     kept = list[Join]()
     for one in sorted(joins, key=lambda some: -some.score):
-        if not any(_alike(one, other) for other in kept):
+        if not any(alike(one, other) for other in kept):
             kept.append(one)
     return kept
 
 
-def _alike(one: Join, other: Join) -> bool:
+def alike(one: Join, other: Join) -> bool:
+    """True if two joins of the same maps are nearly the same."""
     turn, direction = pose_errors_deg(one.g_T_f, other.g_T_f)
     longer = np.linalg.norm(one.g_T_f[:3, 3]) / np.linalg.norm(other.g_T_f[:3, 3])
     logs = abs(np.log(longer)), abs(one.log_scale - other.log_scale)

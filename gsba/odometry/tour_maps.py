@@ -15,7 +15,8 @@ from factors.threads import map_in_threads
 from gsba.camera.rig import cells_of
 from gsba.geometry import angles_between, inverse, unit
 from gsba.log import track
-from gsba.odometry.tour_joins import Join, TourMap, all_joined, held
+from gsba.odometry.tour_joins import Join, TourMap
+from gsba.odometry.tour_merging import all_joined, held
 from gsba.odometry.tour_steps import (
     Step,
     TourFrame,

@@ -15,11 +15,10 @@ from gsba.odometry.tour_joins import (
     Join,
     TourMap,
     agreed_logs,
-    all_joined,
-    held,
     is_sure,
     join,
 )
+from gsba.odometry.tour_merging import all_joined, held
 from gsba.odometry.tour_steps import TourFrame, frame_of, pose_errors_deg, step_at
 from tests.room_tour import pictures, true_poses
 
