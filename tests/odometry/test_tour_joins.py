@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from gsba.config import FeatureSettings
 from gsba.geometry import inverse, pose, unit
-from gsba.odometry import tour_joins, tour_steps
+from gsba.odometry import tour_joins, tour_merging, tour_steps
 from gsba.odometry.tour_joins import (
     MIN_LEAD,
     MIN_SCORE,
@@ -17,6 +17,7 @@ from gsba.odometry.tour_joins import (
     agreed_logs,
     is_sure,
     join,
+    scaled,
 )
 from gsba.odometry.tour_merging import all_joined, held
 from gsba.odometry.tour_steps import TourFrame, frame_of, pose_errors_deg, step_at
@@ -109,3 +110,44 @@ def test_lengths_are_proposed_by_keys_that_agree() -> None:
     assert abs(first) < 0.05 and num == 4
     assert abs(second - 1.01) < 0.01 and few == 2
     assert agreed_logs(logs[-2:], cells[-2:]) == []
+
+
+def test_maps_that_share_little_at_a_door_are_joined_further_inside(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rng = np.random.default_rng(0)
+    turns = Rotation.from_rotvec(0.3 * rng.normal(size=(9, 3))).as_matrix()
+    poses = inverse(pose(turns, rng.normal(size=(9, 3))))  # f_T_world
+    scores = {(5, 6): 40.0, (2, 6): 60.0}
+
+    def true(f: int, g: int, unit_length: float) -> np.ndarray:
+        return scaled(poses[g] @ inverse(poses[f]), 1 / unit_length)
+
+    def unit_of(some: TourMap) -> float:
+        first = some.first
+        step = np.linalg.norm(true(first, first + 1, 1.0)[:3, 3])
+        return float(step / np.linalg.norm(some.between(first, first + 1)[:3, 3]))
+
+    def found(frames: object, one: TourMap, other: TourMap) -> tuple[Join | None, float]:
+        score, units = scores.get((one.last, other.first)), (unit_of(one), unit_of(other))
+        if score is None:
+            return None, 0.0
+        return Join(
+            true(one.last, other.first, units[0]), np.log(units[1] / units[0]), score, []
+        ), 0
+
+    monkeypatch.setattr(tour_merging, "join", found)
+    maps = [
+        TourMap(
+            first, np.array([true(first, first + n, size) for n in range(3)]), [np.zeros(0)] * 3
+        )
+        for first, size in ((0, 1.0), (3, 2.0), (6, 0.5))
+    ]
+    inside, door = all_joined([], maps, 1)
+    assert (inside[0].last, inside[1].first) == (5, 6)
+    one, other, at = door
+    assert (one.last, other.first, other.last) == (2, 3, 8)
+    np.testing.assert_allclose(at.g_T_f, true(2, 3, 1.0), atol=1e-9)
+    assert at.log_scale == pytest.approx(np.log(2.0))
+    scores.pop((2, 6))
+    assert len(all_joined([], maps, 1)) == 1
