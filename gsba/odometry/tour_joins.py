@@ -8,7 +8,7 @@ sphere confirm it than any other.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -31,6 +31,7 @@ _LENGTH_WIDTH, _NUM_LENGTHS = 0.15, 2  # of a length's logarithm, within which k
 _MIN_VOTES = 3  # keys that propose a length
 _MAX_LOG_SCALE = np.log(8.0)  # of the units of two maps, whose first steps they are
 _NUM_STARTS, _NUM_FINAL = 12, 3  # hypotheses that are fitted to two frames; to all near the step
+_OTHER_SCALES = (-0.2, -0.1, 0.1, 0.2)  # of the best join, added to its logarithm
 NEAR = 3  # frames of either map beside the step
 _MIN_FITTED = 6  # places that a join is fitted to
 _MAX_OFF_RAD = np.deg2rad(0.5)  # of a place that confirms a join
@@ -111,6 +112,12 @@ def join(frames: Sequence[TourFrame], one: TourMap, other: TourMap) -> tuple[Joi
     for rough in _distinct(found)[:_NUM_FINAL]:
         better = joining.fitted(rough, near[1], 0.7, 1.5)
         final.append(joining.fitted(better, near[-1], 0.35, 0.8))
+    if final and not (one.single or other.single):  # few places hold a scale: others are near
+        best = max(final, key=lambda some: some.score)
+        for log in _OTHER_SCALES:
+            final.append(
+                joining.fitted(replace(best, log_scale=best.log_scale + log), near[-1], 0.35, 0.8)
+            )
     ranked = _distinct(final)
     return next(iter(ranked), None), ranked[1].score if len(ranked) > 1 else 0.0
 
