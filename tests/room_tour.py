@@ -20,9 +20,9 @@ def true_poses() -> np.ndarray:
     return pose(turns, POSITIONS)
 
 
-def pictures() -> list[np.ndarray]:
-    """Panoramas (h, 2h) uint8 of the stills."""
-    walls = [_wall(np.random.default_rng(n)) for n in range(6)]
+def pictures(room: int = 0) -> list[np.ndarray]:
+    """Panoramas (h, 2h) uint8 of the stills; rooms differ in the paint of their walls."""
+    walls = [_wall(np.random.default_rng(6 * room + n)) for n in range(6)]
     return [_seen(walls, one) for one in true_poses()]
 
 

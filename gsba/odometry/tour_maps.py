@@ -15,6 +15,8 @@ from factors.threads import map_in_threads
 from gsba.camera.rig import cells_of
 from gsba.geometry import angles_between, inverse, unit
 from gsba.log import track
+from gsba.odometry.tour_joins import Join, TourMap
+from gsba.odometry.tour_merging import all_joined, held
 from gsba.odometry.tour_steps import (
     Step,
     TourFrame,
@@ -41,6 +43,7 @@ MAX_RIVALLED_SHARE = 0.25  # of frames with such rivals, above which no place is
 _ALIKE_DEG, _ALIKE_LOG = (3.0, 8.0), 0.25  # rotation, direction; ratio: below these, hypotheses are
 # no rivals but less accurate ones
 _PLACE_SIGMA_RAD = 1.5e-3  # noise of a place that a search has found
+_MAX_LOG_DEVIATION = 0.15  # of depths of a key by two steps, which agree
 _LOG_SIGMA, _DIRECTION_SIGMA_RAD = 0.02, 0.01  # of confirmed ratios and steps
 
 
@@ -56,12 +59,13 @@ class Triple:
 
 @dataclass(frozen=True, slots=True)
 class TourMatches:
-    """Confirmed steps of a tour, and the places of keypoints that hold them."""
+    """Confirmed steps of a tour, joined maps, and the places of keypoints that hold them."""
 
     starts: np.ndarray  # (F + 1,) int64, rays of each frame
     rays: np.ndarray  # (N, 3) of keypoints, and of places of those of other frames
     sigmas_rad: np.ndarray  # (N,) noise of the rays
-    near: VerifiedPairs  # steps, and pairs over two steps; matches number the rays of a frame
+    near: VerifiedPairs  # steps, pairs over two steps, and pairs over a join; matches number the
+    # rays of a frame
     log_ratios: np.ndarray  # (F - 2,) logarithm of each step's length by that of the step before
     log_sigmas: np.ndarray  # (F - 2,) infinite = not known
 
@@ -76,9 +80,9 @@ def match_tour(run_frames: FrameSet, num_threads: int = 1) -> TourMatches:
     def triples(f: int) -> dict[tuple[int, int], list[Triple]]:
         return triples_of(frames[f], frames[f + 1], frames[f + 2], steps[f], steps[f + 1])
 
-    return _matches(
-        frames, steps, *confirmed(steps, list(map_in_threads(triples, num - 2, num_threads)))
-    )
+    found = confirmed(steps, list(map_in_threads(triples, num - 2, num_threads)))
+    joined = all_joined(frames, maps_of(frames, steps, *found), num_threads)
+    return _matches(frames, steps, *found, joined)
 
 
 def ratios(before: Step, after: Step, keys: np.ndarray) -> list[float]:
@@ -256,17 +260,56 @@ def _alike(
     return near and abs(one.log_ratio - other.log_ratio) < _ALIKE_LOG
 
 
+def maps_of(
+    frames: Sequence[TourFrame],
+    steps: Sequence[Sequence[Step]],
+    chain: Sequence[int],
+    triples: Sequence[Triple | None],
+) -> list[TourMap]:
+    """Maps of the steps kept, and frames alone, in the order of the way."""
+    kept, maps = _kept(steps, chain, triples), list[TourMap]()
+    for f, frame in enumerate(frames):
+        if not (f and kept[f - 1]):
+            maps.append(TourMap(f, np.eye(4)[None], [np.full(len(frame.keys), np.nan)]))
+            continue
+        last, step = maps[-1], steps[f - 1][chain[f - 1]]
+        before, length = triples[f - 2] if f > 1 and not last.single else None, 1.0
+        if before is not None:
+            length = np.linalg.norm(last.between(f - 2, f - 1)[:3, 3]) * np.exp(before.log_ratio)
+        moved = step.f1_T_f0.copy()
+        moved[:3, 3] *= length
+        poses = np.append(last.f_T_firsts, (moved @ last.f_T_firsts[-1])[None], axis=0)
+        known = _agreeing(last.depths[-1], step.depths0 * length)
+        maps[-1] = TourMap(last.first, poses, [*last.depths[:-1], known, step.depths1 * length])
+    return maps
+
+
+def _agreeing(depths: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Depths (N,) of two steps that agree, or of one where the other has none; NaN = none."""
+    one, other = np.where(np.isfinite(depths), depths, others), others
+    other = np.where(np.isfinite(other), other, one)
+    agree = np.abs(np.log(one / other)) < _MAX_LOG_DEVIATION
+    return np.where(agree, (one + other) / 2, np.nan)
+
+
+def _kept(
+    steps: Sequence[Sequence[Step]], chain: Sequence[int], triples: Sequence[Triple | None]
+) -> np.ndarray:
+    return kept_steps(
+        [some is not None for some in triples],
+        [some[c].num if some else 0 for some, c in zip(steps, chain, strict=True)],
+    )
+
+
 def _matches(
     frames: Sequence[TourFrame],
     steps: Sequence[Sequence[Step]],
     chain: Sequence[int],
     triples: Sequence[Triple | None],
+    joined: Sequence[tuple[TourMap, TourMap, Join]],
 ) -> TourMatches:
-    """Confirmed steps and triples, and the places that fit them."""
-    kept = kept_steps(
-        [some is not None for some in triples],
-        [some[c].num if some else 0 for some, c in zip(steps, chain, strict=True)],
-    )
+    """Confirmed steps, triples and joins of maps, and the places that fit them."""
+    kept = _kept(steps, chain, triples)
     rays = [[frame.keys] for frame in frames]
     sigmas = [[frame.sigmas_rad] for frame in frames]
     pairs, rows, poses = list[tuple[int, int]](), list[np.ndarray](), list[np.ndarray]()
@@ -305,6 +348,18 @@ def _matches(
             over = first @ second
             over[:3, 3] = unit(over[:3, 3])
             poses.append(over)
+    for one, other, at in joined:
+        f, g = one.last, other.first
+        length = np.log(np.linalg.norm(at.g_T_f[:3, 3]))
+        if not one.single:
+            before = np.linalg.norm(one.between(f - 1, f)[:3, 3])
+            logs[f - 1], log_sigmas[f - 1] = length - np.log(before), _LOG_SIGMA
+        if not other.single:
+            after = np.linalg.norm(other.between(g, g + 1)[:3, 3])
+            logs[g - 1], log_sigmas[g - 1] = at.log_scale + np.log(after) - length, _LOG_SIGMA
+        for (f0, f1), f0_T_f1, found1, found0 in held(frames, one, other, at):
+            add(f0, f1, found1, found0)
+            poses.append(f0_T_f1)
     return TourMatches(
         np.cumsum([0, *(sum(map(len, some)) for some in rays)]),
         np.concatenate([one for some in rays for one in some]),

@@ -141,7 +141,7 @@ def found_places(
     return rows[found], bearings_from_erp(pixels[found], width, height)
 
 
-def _fits(
+def fits(
     rays0: np.ndarray, rays1: np.ndarray, f1_T_f0: np.ndarray, max_error_deg: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Matches (M,) bool that fit a pose, their parallax, radians, and depths in frame 0, lengths of
@@ -212,7 +212,7 @@ def _best_pose(
         starts += [found[0]] if found else []
 
     def weight(one: np.ndarray) -> float:
-        good = _fits(rays0, rays1, one, max_error_deg)[0]
+        good = fits(rays0, rays1, one, max_error_deg)[0]
         return np.count_nonzero(good & sound) + 0.3 * np.count_nonzero(good & ~sound)
 
     return max((adjusted_pose(rays0, rays1, s, np.deg2rad(width_deg)) for s in starts), key=weight)
@@ -278,7 +278,7 @@ def _roughly_ranked(
         if len(rows) >= _MIN_MATCHES:
             rays, sound_rows = one.keys[rows], one.sound[rows]
             best = _best_pose(rays, places, sound_rows, start, max_error_deg, max_error_deg * 0.6)
-            good, parallax, _ = _fits(rays, places, best, 0.7 * max_error_deg)
+            good, parallax, _ = fits(rays, places, best, 0.7 * max_error_deg)
             found.append((_rank(good & (parallax > _MIN_PARALLAX_RAD), sound_rows), best))
     return found
 
@@ -311,7 +311,7 @@ def step_of(
         (one, found1, f1_T_f0),
         (other, found0, inverse(f1_T_f0)),
     ):
-        good, parallax, depth = _fits(frame.keys[rows], places, at, 0.2)
+        good, parallax, depth = fits(frame.keys[rows], places, at, 0.2)
         good &= parallax > _MIN_PARALLAX_RAD
         depths.append(np.full(len(frame.keys), np.nan))
         depths[-1][rows[good]] = depth[good]
@@ -324,9 +324,27 @@ def step_of(
     return Step(f1_T_f0, depths[0], depths[1], rays[0], rays[1], rank, num)
 
 
+def step_at(one: TourFrame, other: TourFrame, f1_T_f0: np.ndarray) -> Step:
+    """A step of a known pose (4, 4), with all places that a search finds there."""
+    f1_T_f0 = pose(f1_T_f0[:3, :3], unit(f1_T_f0[:3, 3]))
+    every = np.arange(len(one.keys)), np.arange(len(other.keys))
+    found1 = found_places(one, other, every[0], f1_T_f0, 0.35)
+    found0 = found_places(other, one, every[1], inverse(f1_T_f0), 0.35)
+    return step_of(one, other, f1_T_f0, found1, found0)
+
+
+def rough_poses(one: TourFrame, other: TourFrame) -> list[np.ndarray]:
+    """All poses f1_T_f0 between two frames that descriptors propose, roughly fitted to places."""
+    return [found for _, found in _rough(one, other)]
+
+
+def _rough(one: TourFrame, other: TourFrame) -> list[tuple[float, np.ndarray]]:
+    return _roughly_ranked(one, other, _proposals(one, other), 2.8, True, 0.6)
+
+
 def hypotheses(one: TourFrame, other: TourFrame) -> list[Step]:
     """Hypotheses of the pose between two frames, by falling rank."""
-    rough = _roughly_ranked(one, other, _proposals(one, other), 2.8, True, 0.6)
+    rough = _rough(one, other)
     for beside_deg, max_error_deg in ((0.7, 0.4), (0.35, 0.3)):
         starts = _distinct(rough, 1.5, 6.0)[:_NUM_ROUGH]
         rough = _roughly_ranked(one, other, starts, beside_deg, False, max_error_deg)

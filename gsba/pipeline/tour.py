@@ -58,7 +58,7 @@ def _search(state: State, found: Recovered) -> TourMatches | None:
         return None
     logger.info(
         "descriptors tie %d of %d frames in maps of 3 and more: keypoints of neighbours are "
-        "searched along epipolar lines, 8 s of processor time a step "
+        "searched along epipolar lines, 8 s of processor time a step, 15 s a door "
         "(--set pairs.max_tour_frames=0 leaves it out)",
         before,
         num,

@@ -4,6 +4,7 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from gsba.geometry import inverse, pose, unit
@@ -14,6 +15,7 @@ from gsba.odometry.tour_maps import (
     Triple,
     confirmed,
     kept_steps,
+    maps_of,
     ratios,
     triple,
 )
@@ -25,6 +27,7 @@ from gsba.odometry.tour_steps import (
     frame_of,
     hypotheses,
     pose_errors_deg,
+    step_at,
     step_of,
 )
 from tests.room_tour import pictures, true_poses
@@ -48,15 +51,9 @@ def frames() -> list[TourFrame]:
 
 
 def true_step(first: int) -> Step:
-    """The step at its true pose, with all places that a search finds there."""
-    one, other, poses = frames()[first], frames()[first + 1], true_poses()
-    f1_T_f0 = inverse(poses[first + 1]) @ poses[first]
-    f1_T_f0[:3, 3] = unit(f1_T_f0[:3, 3])
-    every = np.arange(len(one.keys)), np.arange(len(other.keys))
-    found1 = found_places(one, other, every[0], f1_T_f0, 0.35)
-    return step_of(
-        one, other, f1_T_f0, found1, found_places(other, one, every[1], inverse(f1_T_f0), 0.35)
-    )
+    """The step at its true pose."""
+    poses = true_poses()
+    return step_at(frames()[first], frames()[first + 1], inverse(poses[first + 1]) @ poses[first])
 
 
 def test_a_third_frame_confirms_the_true_ratio_and_no_other() -> None:
@@ -166,3 +163,24 @@ def test_steps_are_kept_between_which_the_ratio_is_known() -> None:
         False,
     ]
     assert not kept_steps([False, False], [1, 1, 1]).any()
+
+
+def test_steps_kept_make_maps_and_other_frames_are_alone() -> None:
+    keys = np.eye(3)
+
+    def step(depths0: list[float], depths1: list[float]) -> Step:
+        return replace(hypothesis(), depths0=np.array(depths0), depths1=np.array(depths1))
+
+    steps = [
+        [step([2, 2, 2], [1, 1, np.nan])],
+        [step([0.51, 0.9, np.nan], [0.6, 0.6, 0.6])],
+        [],
+    ]
+    few = replace(frames()[0], keys=keys)
+    one, alone = maps_of([few] * 4, steps, [0, 0, 0], [of_cells(9, np.log(2)), None])
+    assert (one.first, one.last, alone.first) == (0, 2, 3)
+    assert alone.single and np.isnan(alone.depths[0]).all()
+    assert np.linalg.norm(one.between(1, 2)[:3, 3]) == pytest.approx(2)
+    # The second step is twice as long; depths by both must agree.
+    np.testing.assert_allclose(one.depths[1], [1.01, np.nan, np.nan])
+    np.testing.assert_allclose(one.depths[2], [1.2, 1.2, 1.2])

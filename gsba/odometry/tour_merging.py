@@ -1,0 +1,134 @@
+"""All maps of a tour, joined where places confirm it, in the order of the way."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from itertools import pairwise
+
+import numpy as np
+
+from factors.threads import map_in_threads
+from gsba.geometry import pose, unit
+from gsba.odometry.tour_joins import NEAR, Join, Joining, TourMap, alike, is_sure, join, scaled
+from gsba.odometry.tour_steps import TourFrame, step_at
+
+_MIN_HELD = 6  # places of a pair of frames that enter the map
+_CLEAR_SCORE = 30.0  # of a join, below which others of the same maps are tried
+
+
+def all_joined(
+    frames: Sequence[TourFrame], maps: Sequence[TourMap], num_threads: int
+) -> list[tuple[TourMap, TourMap, Join]]:
+    """Joins of maps and single frames in the order of the way, with the maps before each; joined
+    ones are joined further as one map. Where frames on both sides share little, as on either side
+    of a doorway, a join further inside one of the maps is tried."""
+    maps, made = list(maps), list[tuple[TourMap, TourMap, Join]]()
+    known = dict[tuple[int, ...], Join | None]()
+
+    def decide(pairs: Sequence[tuple[TourMap, TourMap]]) -> list[Join | None]:
+        new = [pair for pair in pairs if _seen(*pair) not in known]
+        found = map_in_threads(partial(_sure_join, frames, new), len(new), num_threads)
+        known.update((_seen(*pair), at) for pair, at in zip(new, found, strict=True))
+        return [known[_seen(*pair)] for pair in pairs]
+
+    while True:
+        pairs = list(pairwise(maps))
+        found = dict(enumerate(decide(pairs)))
+        if not any(at and at.score >= _CLEAR_SCORE for at in found.values()):
+            cuts = [other.first for _, other, _ in made]
+            inside = [(n, part) for n, pair in enumerate(pairs) for part in _parts(*pair, cuts)]
+            for (n, part), at in zip(inside, decide([part for _, part in inside]), strict=True):
+                best = found[n]
+                if at and (best is None or at.score > best.score):
+                    carried = _carried(*pairs[n], *part, at)
+                    if best and alike(best, carried):
+                        carried = replace(carried, places=[*carried.places, *best.places])
+                    found[n] = carried
+        sure = [(at.score, n, at) for n, at in found.items() if at]
+        if not sure:
+            return made
+        _, n, at = max(sure, key=lambda some: some[0])
+        made.append((*pairs[n], at))
+        maps[n : n + 2] = [_merged(frames, *made[-1])]
+
+
+def held(
+    frames: Sequence[TourFrame], one: TourMap, other: TourMap, at: Join
+) -> list[tuple[tuple[int, int], np.ndarray, np.ndarray, np.ndarray]]:
+    """Pairs of frames over a join, their poses f0_T_f1 (4, 4) of unit translation, and places
+    (N, 3) in either frame of the other one's keys that fit it; NaN = none. Of the frames next to
+    it, all places along epipolar lines if few have a known depth."""
+    joining, found = Joining(frames, one, other), dict[tuple[int, int], np.ndarray]()
+    for some in at.places:
+        rows = joining.confirms(at, some)
+        found[some.f, some.g] = np.full((len(frames[some.f].keys), 3), np.nan)
+        found[some.f, some.g][some.rows[rows]] = some.found[rows]
+    ends = one.last, other.first
+    pairs = list[tuple[tuple[int, int], np.ndarray, np.ndarray, np.ndarray]]()
+    for f, g in sorted({ends, *((min(pair), max(pair)) for pair in found)}):
+        found_g, found_f = (
+            found.get(pair, np.full((len(frames[pair[0]].keys), 3), np.nan))
+            for pair in ((f, g), (g, f))
+        )
+        f_T_g = joining.between(at, g, f)
+        few = np.count_nonzero(np.isfinite(np.append(found_g[:, 0], found_f[:, 0]))) < _MIN_HELD
+        if few and (f, g) != ends:
+            continue
+        if few:
+            step = step_at(frames[f], frames[g], joining.between(at, f, g))
+            found_g, found_f = step.places1, step.places0
+        pairs.append(((f, g), pose(f_T_g[:3, :3], unit(f_T_g[:3, 3])), found_g, found_f))
+    return pairs
+
+
+def _seen(one: TourMap, other: TourMap) -> tuple[int, ...]:
+    """Frames beside the step between two maps: the first, those next to it, the last."""
+    first, last = max(one.first, one.last - NEAR + 1), min(other.last, other.first + NEAR - 1)
+    return first, one.last, other.first, last
+
+
+def _sure_join(
+    frames: Sequence[TourFrame], pairs: Sequence[tuple[TourMap, TourMap]], n: int
+) -> Join | None:
+    """The join of one of several pairs of maps; None if it is not sure."""
+    one, other = pairs[n]
+    if one.single and other.single:
+        return None
+    best, rival = join(frames, one, other)
+    return best if is_sure(best, rival) else None
+
+
+def _parts(one: TourMap, other: TourMap, cuts: Sequence[int]) -> list[tuple[TourMap, TourMap]]:
+    """Both maps, one of them only as far as a frame at which it was joined itself."""
+    before = max((cut for cut in cuts if one.first + 1 < cut <= one.last), default=None)
+    after = min((cut for cut in cuts if other.first < cut < other.last), default=None)
+    found = list[tuple[TourMap, TourMap]]()
+    if before is not None:
+        found.append((one.part(one.first, before - 1), other))
+    if after is not None:
+        found.append((one, other.part(after, other.last)))
+    return [pair for pair in found if not (pair[0].single or pair[1].single)]
+
+
+def _carried(one: TourMap, other: TourMap, part: TourMap, after: TourMap, at: Join) -> Join:
+    """The join of two maps by that of parts of them."""
+    back = scaled(other.between(after.first, other.first), float(np.exp(at.log_scale)))
+    g_T_f = back @ at.g_T_f @ one.between(one.last, part.last)
+    return Join(g_T_f, at.log_scale, at.score, at.places)
+
+
+def _merged(frames: Sequence[TourFrame], one: TourMap, other: TourMap, at: Join) -> TourMap:
+    """The map of two, in the units of the first one."""
+    scale = float(np.exp(at.log_scale))
+    start = at.g_T_f @ one.f_T_firsts[-1]
+    poses = [scaled(g_T_first, scale) @ start for g_T_first in other.f_T_firsts]
+    depths = [*one.depths, *(some * scale for some in other.depths)]
+    if one.single or other.single:
+        length = np.linalg.norm(at.g_T_f[:3, 3])
+        step = step_at(frames[one.last], frames[other.first], at.g_T_f)
+        n = len(one.depths)
+        if one.single:
+            depths[n - 1] = step.depths0 * length
+        if other.single:
+            depths[n] = step.depths1 * length
+    return TourMap(one.first, np.concatenate([one.f_T_firsts, poses]), depths)

@@ -1,0 +1,153 @@
+"""Maps of a tour, joined across a step that no three frames confirm."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gsba.config import FeatureSettings
+from gsba.geometry import inverse, pose, unit
+from gsba.odometry import tour_joins, tour_merging, tour_steps
+from gsba.odometry.tour_joins import (
+    MIN_LEAD,
+    MIN_SCORE,
+    Join,
+    TourMap,
+    agreed_logs,
+    is_sure,
+    join,
+    scaled,
+)
+from gsba.odometry.tour_merging import all_joined, held
+from gsba.odometry.tour_steps import TourFrame, frame_of, pose_errors_deg, step_at
+from tests.room_tour import pictures, true_poses
+
+
+@cache
+def frames(room: int) -> list[TourFrame]:
+    return [frame_of(picture, None) for picture in pictures(room)]
+
+
+@pytest.fixture(autouse=True)
+def _few_keys_and_hypotheses(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Keys of stills, and of the step from the second one to the third a rough pose and a wrong
+    one."""
+    monkeypatch.setattr(tour_steps, "_FEATURES", FeatureSettings(max_per_face=150))
+    monkeypatch.setattr(tour_steps, "_NUM_KEYS", 200)
+    true = inverse(true_poses()[2]) @ true_poses()[1]
+    found = [
+        pose(
+            Rotation.from_euler("y", turn, degrees=True).as_matrix() @ true[:3, :3],
+            unit(true[:3, 3]),
+        )
+        for turn in (1.5, 90.0)
+    ]
+    monkeypatch.setattr(tour_joins, "rough_poses", lambda one, other: found)
+
+
+def true_map(some: list[TourFrame], first: int) -> TourMap:
+    """The map of two stills, whose step has length 1."""
+    poses = true_poses()
+    step = step_at(some[first], some[first + 1], inverse(poses[first + 1]) @ poses[first])
+    return TourMap(first, np.stack([np.eye(4), step.f1_T_f0]), [step.depths0, step.depths1])
+
+
+def test_maps_of_one_room_are_joined_in_pose_and_scale() -> None:
+    some, poses = frames(0), true_poses()
+    one, other = true_map(some, 0), true_map(some, 2)
+    best, rival = join(some, one, other)
+    assert is_sure(best, rival) and best is not None
+    true = inverse(poses[2]) @ poses[1]
+    assert max(pose_errors_deg(best.g_T_f, true)) < 0.5
+    lengths = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    assert np.linalg.norm(best.g_T_f[:3, 3]) == pytest.approx(lengths[1] / lengths[0], rel=0.01)
+    assert np.exp(best.log_scale) == pytest.approx(lengths[2] / lengths[0], rel=0.01)
+    pairs = held(some, one, other, best)
+    assert [pair for pair, *_ in pairs] == [(0, 2), (0, 3), (1, 2), (1, 3)]
+    for (f, g), f_T_g, found_g, found_f in pairs:
+        assert max(pose_errors_deg(f_T_g, inverse(poses[f]) @ poses[g])) < 0.5
+        assert len(found_g) == len(some[f].keys) and len(found_f) == len(some[g].keys)
+
+
+def test_single_frames_join_the_map_beside_them() -> None:
+    some, poses = frames(0), true_poses()
+    alone = [TourMap(f, np.eye(4)[None], [np.full(len(some[f].keys), np.nan)]) for f in range(4)]
+    lengths = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    for one, other, unit_length in (
+        (true_map(some, 0), alone[2], lengths[0]),
+        (alone[1], true_map(some, 2), lengths[2]),
+    ):
+        best, rival = join(some, one, other)
+        assert best is not None and is_sure(best, rival) and best.log_scale == 0
+        found = np.linalg.norm(best.g_T_f[:3, 3])
+        assert found == pytest.approx(lengths[1] / unit_length, rel=0.01)
+    assert all_joined(some, alone, 1) == []
+
+
+def test_all_maps_beside_each_other_are_joined_as_one() -> None:
+    some = frames(0)
+    ((one, other, at),) = all_joined(some, [true_map(some, 0), true_map(some, 2)], 1)
+    assert one.last == 1 and other.first == 2 and is_sure(at, 0.0)
+
+
+def test_maps_of_different_rooms_are_not_joined() -> None:
+    some = [*frames(0)[:2], *frames(1)[2:]]
+    assert not is_sure(*join(some, true_map(some, 0), true_map(some, 2)))
+
+
+def test_a_join_that_another_rivals_is_not_sure() -> None:
+    at = Join(np.eye(4), 0.0, 2 * MIN_SCORE, [])
+    assert is_sure(at, 0.0) and not is_sure(at, 2.1 * MIN_SCORE / MIN_LEAD)
+    assert not is_sure(Join(np.eye(4), 0.0, 0.9 * MIN_SCORE, []), 0.0)
+    assert not is_sure(None, 0.0)
+
+
+def test_lengths_are_proposed_by_keys_that_agree() -> None:
+    logs = np.array([0.0, 0.02, -0.03, 0.05, 1.0, 1.01, 1.02, -2.0, 3.0])
+    cells = np.array([1, 2, 3, 4, 5, 5, 6, 7, 8])
+    (first, num), (second, few) = agreed_logs(logs, cells)
+    assert abs(first) < 0.05 and num == 4
+    assert abs(second - 1.01) < 0.01 and few == 2
+    assert agreed_logs(logs[-2:], cells[-2:]) == []
+
+
+def test_maps_that_share_little_at_a_door_are_joined_further_inside(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rng = np.random.default_rng(0)
+    turns = Rotation.from_rotvec(0.3 * rng.normal(size=(9, 3))).as_matrix()
+    poses = inverse(pose(turns, rng.normal(size=(9, 3))))  # f_T_world
+    scores = {(5, 6): 40.0, (2, 6): 60.0}
+
+    def true(f: int, g: int, unit_length: float) -> np.ndarray:
+        return scaled(poses[g] @ inverse(poses[f]), 1 / unit_length)
+
+    def unit_of(some: TourMap) -> float:
+        first = some.first
+        step = np.linalg.norm(true(first, first + 1, 1.0)[:3, 3])
+        return float(step / np.linalg.norm(some.between(first, first + 1)[:3, 3]))
+
+    def found(frames: object, one: TourMap, other: TourMap) -> tuple[Join | None, float]:
+        score, units = scores.get((one.last, other.first)), (unit_of(one), unit_of(other))
+        if score is None:
+            return None, 0.0
+        return Join(
+            true(one.last, other.first, units[0]), np.log(units[1] / units[0]), score, []
+        ), 0
+
+    monkeypatch.setattr(tour_merging, "join", found)
+    maps = [
+        TourMap(
+            first, np.array([true(first, first + n, size) for n in range(3)]), [np.zeros(0)] * 3
+        )
+        for first, size in ((0, 1.0), (3, 2.0), (6, 0.5))
+    ]
+    inside, door = all_joined([], maps, 1)
+    assert (inside[0].last, inside[1].first) == (5, 6)
+    one, other, at = door
+    assert (one.last, other.first, other.last) == (2, 3, 8)
+    np.testing.assert_allclose(at.g_T_f, true(2, 3, 1.0), atol=1e-9)
+    assert at.log_scale == pytest.approx(np.log(2.0))
+    scores.pop((2, 6))
+    assert len(all_joined([], maps, 1)) == 1
