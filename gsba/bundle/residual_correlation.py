@@ -6,9 +6,11 @@ from factors import bearing_residuals
 from factors.robust import RobustLoss
 from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.tracks import map_runs
+from gsba.camera.rig import cells_of
 from gsba.types import Keypoints, Solution, Tracks
 
-_ROWS = 3  # cells along each side of a face of the cube, 30 degrees wide
+_CELLS_PER_SIDE = 3  # of 30 degrees
+_CELLS = 6 * _CELLS_PER_SIDE**2
 _MIN_OBSERVATIONS = 100  # of a frame
 _MIN_FRAMES = 3
 
@@ -75,22 +77,7 @@ def _gradients(
     each = np.einsum("oij,oj->oi", projected, residuals)
     gradients = np.zeros((len(poses), _CELLS, 6))
     information, alone = np.zeros((2, len(poses), 6, 6))
-    np.add.at(gradients, (frames, _cells(bearings)), each)
+    np.add.at(gradients, (frames, cells_of(bearings, _CELLS_PER_SIDE)), each)
     np.add.at(information, frames, projected @ by_pose)
     np.add.at(alone, frames, each[:, :, None] * each[:, None, :])
     return gradients, information, alone
-
-
-def _cells(bearings: np.ndarray) -> np.ndarray:
-    """Cell (O,) of each unit bearing (O, 3): squares of the faces of a cube, alike in angle."""
-    axes, every = np.argmax(np.abs(bearings), axis=1), np.arange(len(bearings))
-    depths = bearings[every, axes]
-    angles = np.arctan2(
-        np.column_stack([bearings[every, (axes + k) % 3] for k in (1, 2)]), np.abs(depths)[:, None]
-    )
-    squares = np.clip(((angles / np.pi * 2 + 0.5) * _ROWS).astype(int), 0, _ROWS - 1)
-    faces = 2 * axes + (depths > 0)
-    return (faces * _ROWS + squares[:, 0]) * _ROWS + squares[:, 1]
-
-
-_CELLS = 6 * _ROWS**2
