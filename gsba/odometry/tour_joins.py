@@ -18,14 +18,17 @@ from scipy.spatial.transform import Rotation
 from gsba.camera.rig import cells_of
 from gsba.geometry import angles_between, inverse, pose, unit
 from gsba.odometry.tour_steps import (
+    CELLS_PER_SIDE,
+    MAX_ALIKE_LOG,
+    MAX_OFF_RAD,
+    MIN_PARALLAX_RAD,
     TourFrame,
+    alike_poses,
     fits,
     found_places,
-    pose_errors_deg,
     rough_poses,
 )
 
-_CELLS_PER_SIDE = 6  # of 15 degrees; keypoints of one surface agree together
 _NUM_VOTERS = 300  # keys of a frame that propose lengths
 _LENGTH_WIDTH, _NUM_LENGTHS = 0.15, 2  # of a length's logarithm, within which keys agree; tried
 _MIN_VOTES = 3  # keys that propose a length
@@ -34,10 +37,6 @@ _NUM_STARTS, _NUM_FINAL = 12, 3  # hypotheses that are fitted to two frames; to 
 _OTHER_SCALES = (-0.2, -0.1, 0.1, 0.2)  # of the best join, added to its logarithm
 NEAR = 3  # frames of either map beside the step
 _MIN_FITTED = 6  # places that a join is fitted to
-_MAX_OFF_RAD = np.deg2rad(0.5)  # of a place that confirms a join
-_MIN_PARALLAX_RAD = np.deg2rad(3.0)
-_ALIKE_DEG, _ALIKE_LOG = (3.0, 8.0), 0.25  # rotation, direction; lengths and scales: below these,
-# joins are no rivals but less accurate ones
 MIN_SCORE, MIN_LEAD = 16.0, 1.7  # that confirm a join; times that of any rival
 
 
@@ -165,9 +164,9 @@ class Joining:
         rows = np.unique(np.append(known[:half], known[::-1][:half]))
         rows, found = found_places(frame, self.frames[g], rows, g_T_f, 2.8, True)
         good, parallax, steps = fits(frame.keys[rows], found, g_T_f, 2.0)
-        good &= parallax > _MIN_PARALLAX_RAD
+        good &= parallax > MIN_PARALLAX_RAD
         logs = np.log(depths[rows[good]] / steps[good])
-        return agreed_logs(logs, cells_of(frame.keys[rows[good]], _CELLS_PER_SIDE))
+        return agreed_logs(logs, cells_of(frame.keys[rows[good]], CELLS_PER_SIDE))
 
     def between(self, at: Join, f: int, g: int) -> np.ndarray:
         """Pose g_T_f (4, 4) of frames of different maps, units of the map of f."""
@@ -235,14 +234,14 @@ class Joining:
     def confirms(self, at: Join, some: Places) -> np.ndarray:
         """Places (M,) bool that are where a join predicts them, and not where a mere turn does."""
         turned = some.rays @ self.between(at, some.f, some.g)[:3, :3].T
-        good = angles_between(self._predicted(at, some), some.found) < _MAX_OFF_RAD
-        return good & (angles_between(turned, some.found) > _MIN_PARALLAX_RAD)
+        good = angles_between(self._predicted(at, some), some.found) < MAX_OFF_RAD
+        return good & (angles_between(turned, some.found) > MIN_PARALLAX_RAD)
 
     def _score(self, at: Join, places: Sequence[Places]) -> float:
         cells = np.zeros(2)
         for some in places:
             good = np.where(self.confirms(at, some), 1.0, -1.0)
-            where = cells_of(some.rays, _CELLS_PER_SIDE)
+            where = cells_of(some.rays, CELLS_PER_SIDE)
             for n, weight in enumerate((good, good * some.sound)):
                 cells[n] += np.count_nonzero(np.bincount(where, weight) > 0)
         return float(np.sqrt(np.prod(1 + cells)) - 1)
@@ -280,7 +279,6 @@ def _distinct(joins: Sequence[Join]) -> list[Join]:
 
 def alike(one: Join, other: Join) -> bool:
     """True if two joins of the same maps are nearly the same."""
-    turn, direction = pose_errors_deg(one.g_T_f, other.g_T_f)
     longer = np.linalg.norm(one.g_T_f[:3, 3]) / np.linalg.norm(other.g_T_f[:3, 3])
     logs = abs(np.log(longer)), abs(one.log_scale - other.log_scale)
-    return turn < _ALIKE_DEG[0] and direction < _ALIKE_DEG[1] and max(logs) < _ALIKE_LOG
+    return alike_poses(one.g_T_f, other.g_T_f) and max(logs) < MAX_ALIKE_LOG

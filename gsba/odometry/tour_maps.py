@@ -18,30 +18,29 @@ from gsba.log import track
 from gsba.odometry.tour_joins import Join, TourMap
 from gsba.odometry.tour_merging import all_joined, held
 from gsba.odometry.tour_steps import (
+    CELLS_PER_SIDE,
+    MAX_ALIKE_LOG,
+    MAX_OFF_RAD,
+    MIN_PARALLAX_RAD,
     Step,
     TourFrame,
+    alike_poses,
     found_places,
     hypotheses,
-    pose_errors_deg,
     read_frame,
 )
 from gsba.types import Counts, FrameSet, Matches, VerifiedPairs
 
-_CELLS_PER_SIDE = 6  # of 15 degrees; keypoints of one surface agree together
 _RATIO_WIDTH = 0.08  # of a ratio's logarithm, within which keypoints agree on it
 _MAX_LOG_RATIO = np.log(4.0)  # of two steps' lengths
 _NUM_RATIOS = 3  # that are tried for two hypotheses of steps
 _MIN_VOTES = 3  # keypoints that propose a ratio
-_MAX_OFF_RAD = np.deg2rad(0.5)  # of a place found in a third frame from the predicted one
-_MIN_PARALLAX_RAD = np.deg2rad(3.0)  # between the first and the third frame
 MIN_CELLS, MIN_LEAD = 7, 1.5  # cells that confirm three frames; times those of any rival
 MIN_CELLS_OF_RATIO = 5  # where both steps are confirmed
 MIN_END_RANK = 120.0  # of a step at an end, which one triple holds alone: in flats, three of five
 # steps below it were off by 1 to 7 degrees
 MAX_RIVAL_CELLS = 12  # of other steps or another ratio, from which the place repeats
 MAX_RIVALLED_SHARE = 0.25  # of frames with such rivals, above which no place is believed
-_ALIKE_DEG, _ALIKE_LOG = (3.0, 8.0), 0.25  # rotation, direction; ratio: below these, hypotheses are
-# no rivals but less accurate ones
 _PLACE_SIGMA_RAD = 1.5e-3  # noise of a place that a search has found
 _MAX_LOG_DEVIATION = 0.15  # of depths of a key by two steps, which agree
 _LOG_SIGMA, _DIRECTION_SIGMA_RAD = 0.02, 0.01  # of confirmed ratios and steps
@@ -91,7 +90,7 @@ def ratios(before: Step, after: Step, keys: np.ndarray) -> list[float]:
     both = np.isfinite(before.depths1) & np.isfinite(after.depths0)
     logs, cells = (
         np.log(before.depths1[both] / after.depths0[both]),
-        cells_of(keys[both], _CELLS_PER_SIDE),
+        cells_of(keys[both], CELLS_PER_SIDE),
     )
     near, left, found = np.abs(logs[:, None] - logs) < _RATIO_WIDTH, np.ones(len(logs), bool), []
     while np.count_nonzero(left) >= _MIN_VOTES and len(found) < _NUM_RATIOS:
@@ -135,10 +134,10 @@ def _confirming(
     rows, found = found_places(one, other, rows, along, 0.35)
     turned = one.keys[rows] @ f1_T_f0[:3, :3].T
     predicted = unit(turned * depths[rows, None] + f1_T_f0[:3, 3])
-    good = angles_between(predicted, found) < _MAX_OFF_RAD
-    good &= angles_between(turned, found) > _MIN_PARALLAX_RAD
+    good = angles_between(predicted, found) < MAX_OFF_RAD
+    good &= angles_between(turned, found) > MIN_PARALLAX_RAD
     places[rows[good]] = found[good]
-    balance = np.bincount(cells_of(one.keys[rows], _CELLS_PER_SIDE), np.where(good, 1.0, -1.0))
+    balance = np.bincount(cells_of(one.keys[rows], CELLS_PER_SIDE), np.where(good, 1.0, -1.0))
     return places, int(np.count_nonzero(balance > 0))
 
 
@@ -252,12 +251,11 @@ def _alike(
     other: Triple,
 ) -> bool:
     """True if two triples, of these hypotheses of both steps, are nearly the same."""
-    errors = [
-        pose_errors_deg(found[a].f1_T_f0, found[b].f1_T_f0)
+    near = all(
+        alike_poses(found[a].f1_T_f0, found[b].f1_T_f0)
         for found, a, b in zip(steps, pair, other_pair, strict=True)
-    ]
-    near = all(turn < _ALIKE_DEG[0] and direction < _ALIKE_DEG[1] for turn, direction in errors)
-    return near and abs(one.log_ratio - other.log_ratio) < _ALIKE_LOG
+    )
+    return near and abs(one.log_ratio - other.log_ratio) < MAX_ALIKE_LOG
 
 
 def maps_of(

@@ -29,7 +29,10 @@ _FACES = CubeRig(448, np.deg2rad(95.0))  # on which keypoints are found
 _FEATURES = FeatureSettings(max_per_face=1200)
 _SAMPLE_RAD = np.deg2rad(0.375)  # between samples of a patch, at full resolution
 _LINE_STEP_DEG = 0.35  # along epipolar lines, and between lines beside them
-_MIN_PARALLAX_RAD = np.deg2rad(3.0)  # of keypoints that count for a pose
+MIN_PARALLAX_RAD = np.deg2rad(3.0)  # of keypoints that count for a pose
+CELLS_PER_SIDE = 6  # of 15 degrees; keypoints of one surface agree together
+MAX_OFF_RAD = np.deg2rad(0.5)  # of a place found in a third frame from the predicted one
+MAX_ALIKE_LOG = 0.25  # of lengths and scales, below which hypotheses are no rivals
 _FLOOR_Y = 0.25  # y of bearings below which a floor is likely
 _NUM_KEYS, _NUM_FEW = 1000, 300  # keypoints of a frame that are searched; that give a first rank
 _NUM_ROUGH, _NUM_REFINED = 6, 4  # best hypotheses of a step that are searched finely; refined
@@ -224,6 +227,12 @@ def pose_errors_deg(one: np.ndarray, other: np.ndarray) -> tuple[float, float]:
     return float(np.degrees(turn)), float(np.degrees(angles_between(one[:3, 3], other[:3, 3])))
 
 
+def alike_poses(one: np.ndarray, other: np.ndarray) -> bool:
+    """True if two poses (4, 4) are so near that they are no rivals: one is less accurate."""
+    turn, direction = pose_errors_deg(one, other)
+    return turn < 3.0 and direction < 8.0
+
+
 def _distinct(
     ranked: list[tuple[float, np.ndarray]], turn_deg: float, direction_deg: float
 ) -> list[np.ndarray]:
@@ -279,7 +288,7 @@ def _roughly_ranked(
             rays, sound_rows = one.keys[rows], one.sound[rows]
             best = _best_pose(rays, places, sound_rows, start, max_error_deg, max_error_deg * 0.6)
             good, parallax, _ = fits(rays, places, best, 0.7 * max_error_deg)
-            found.append((_rank(good & (parallax > _MIN_PARALLAX_RAD), sound_rows), best))
+            found.append((_rank(good & (parallax > MIN_PARALLAX_RAD), sound_rows), best))
     return found
 
 
@@ -312,7 +321,7 @@ def step_of(
         (other, found0, inverse(f1_T_f0)),
     ):
         good, parallax, depth = fits(frame.keys[rows], places, at, 0.2)
-        good &= parallax > _MIN_PARALLAX_RAD
+        good &= parallax > MIN_PARALLAX_RAD
         depths.append(np.full(len(frame.keys), np.nan))
         depths[-1][rows[good]] = depth[good]
         rays.append(np.full((len(frame.keys), 3), np.nan))
