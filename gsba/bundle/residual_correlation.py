@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from factors import bearing_residuals
 from factors.robust import RobustLoss
 from gsba.bundle.adjustment import AdjustmentContext
+from gsba.bundle.shared_parameters import weighted_at
 from gsba.bundle.tracks import map_runs
 from gsba.camera.rig import cells_of
 from gsba.types import Keypoints, Solution, Tracks
@@ -24,16 +24,14 @@ def variance_ratio(solution: Solution, keypoints: Keypoints, context: Adjustment
     Liang and Zeger, Biometrika 73(1), 1986. The median over frames, each with the mean of its six
     parameters, is returned; what shifts whole frames alike shows in none of them.
     """
-    tracks, poses = solution.landmarks.tracks, solution.world_T_rigs
-    points_world, num_frames = solution.landmarks.points_world, len(poses)
-    noise, loss = solution.noise, context.solver.loss
+    points_world, num_frames = solution.landmarks.points_world, len(solution.world_T_rigs)
 
     def work(points: slice, rows: slice, some: Tracks) -> tuple[np.ndarray, ...]:
-        return _gradients(points_world[points], some, keypoints, noise, poses, loss)
+        return _gradients(points_world[points], some, keypoints, solution, context.solver.loss)
 
     gradients = np.zeros((num_frames, _CELLS, 6))
     information, alone = np.zeros((2, num_frames, 6, 6))
-    for found in map_runs(work, tracks, context.num_threads):
+    for found in map_runs(work, solution.landmarks.tracks, context.num_threads):
         for target, more in zip((gradients, information, alone), found, strict=True):
             target += more
     usable = solution.observations() >= _MIN_OBSERVATIONS
@@ -50,24 +48,16 @@ def _gradients(
     points_world: np.ndarray,
     tracks: Tracks,
     keypoints: Keypoints,
-    noise: float,
-    poses: np.ndarray,
+    solution: Solution,
     loss: RobustLoss,
 ) -> tuple[np.ndarray, ...]:
     """Of observations of points (J, 3), without what moves of the points take up: gradients by
     poses summed in each cell (F, C, 6), information on poses (F, 6, 6), and the sum of each
     observation's gradient times itself (F, 6, 6)."""
-    frames, numbers, rows = tracks.frames, tracks.points, keypoints.rows(tracks)
-    bearings = keypoints.bearings_rig[rows]
-    found = bearing_residuals(
-        poses[frames], points_world[numbers], bearings, keypoints.origins_of(rows)
-    )
-    whitening = keypoints.roots(rows) / noise
-    residuals = np.einsum("oij,oj->oi", whitening, found[0])
-    weights = loss.weights(np.einsum("oi,oi->o", residuals, residuals))
-    whitening *= np.sqrt(weights)[:, None, None]
-    residuals *= np.sqrt(weights)[:, None]
-    by_pose, by_point = whitening @ found[1], whitening @ found[2]
+    frames, numbers, num_frames = tracks.frames, tracks.points, len(solution.world_T_rigs)
+    seen = weighted_at(points_world, tracks, keypoints, solution, loss)
+    residuals = np.einsum("oij,oj->oi", seen.roots, seen.residuals)
+    by_pose, by_point = seen.roots @ seen.by_pose, seen.roots @ seen.by_point
     information = np.zeros((len(points_world), 3, 3))
     np.add.at(information, numbers, np.swapaxes(by_point, 1, 2) @ by_point)
     covariances = np.linalg.pinv(information, rcond=1e-12, hermitian=True)
@@ -75,9 +65,10 @@ def _gradients(
     left = np.eye(2) - by_point @ covariances[numbers] @ np.swapaxes(by_point, 1, 2)
     projected = np.swapaxes(by_pose, 1, 2) @ left
     each = np.einsum("oij,oj->oi", projected, residuals)
-    gradients = np.zeros((len(poses), _CELLS, 6))
-    information, alone = np.zeros((2, len(poses), 6, 6))
-    np.add.at(gradients, (frames, cells_of(bearings, _CELLS_PER_SIDE)), each)
+    gradients = np.zeros((num_frames, _CELLS, 6))
+    information, alone = np.zeros((2, num_frames, 6, 6))
+    cells = cells_of(keypoints.bearings_rig[seen.rows], _CELLS_PER_SIDE)
+    np.add.at(gradients, (frames, cells), each)
     np.add.at(information, frames, projected @ by_pose)
     np.add.at(alone, frames, each[:, :, None] * each[:, None, :])
     return gradients, information, alone

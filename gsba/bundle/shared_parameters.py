@@ -14,6 +14,7 @@ from scipy.sparse.linalg import splu
 from factors.bearing import bearing_residuals, tangent_basis
 from factors.cholesky import BlockCholesky
 from factors.elimination import Eliminated, LinearSystem, eliminate
+from factors.robust import RobustLoss
 from factors.threads import Once
 from gsba.bundle.adjustment import AdjustmentContext, landmark_block, values_of
 from gsba.camera.lens import ONE_CENTRE, Lenses
@@ -134,7 +135,7 @@ def parts_of(landmarks: Landmarks) -> list[Landmarks]:
 
 @dataclass(frozen=True, slots=True)
 class Weighted:
-    """Residuals of bearings under a robust loss, points at their optimum."""
+    """Residuals of bearings under a robust loss."""
 
     rows: np.ndarray  # (O,) of the keypoints
     residuals: np.ndarray  # (O, 2) radians
@@ -149,16 +150,27 @@ def weighted(rays: ObservedRays) -> Weighted:
     keypoints, solved = rays.keypoints, rays.solved
     block = landmark_block(solved.landmarks, keypoints, solved.noise, rays.context)
     block.polish(values_of(solved.world_T_rigs))
-    tracks, rows = solved.landmarks.tracks, keypoints.rows(solved.landmarks.tracks)
+    tracks, loss = solved.landmarks.tracks, rays.context.solver.loss
+    return weighted_at(block.points_world, tracks, keypoints, solved, loss)
+
+
+def weighted_at(
+    points_world: np.ndarray,
+    tracks: Tracks,
+    keypoints: Keypoints,
+    solved: Solution,
+    loss: RobustLoss,
+) -> Weighted:
+    """As `weighted`, of points (J, 3) and their tracks as they are, at a solution's poses."""
+    rows = keypoints.rows(tracks)
     residuals, by_pose, by_point = bearing_residuals(
         solved.world_T_rigs[tracks.frames],
-        block.points_world[tracks.points],
+        points_world[tracks.points],
         keypoints.bearings_rig[rows],
         keypoints.origins_of(rows),
     )
     roots = keypoints.roots(rows)
     whitened = np.einsum("oij,oj->oi", roots, residuals) / solved.noise
-    loss = rays.context.solver.loss
     squares = np.sum(whitened**2, axis=1)
     weights = loss.weights(squares)
     curvature = float(np.sum(loss.curvatures(squares))) / max(float(np.sum(weights)), 1e-300)

@@ -23,6 +23,7 @@ from gsba.odometry.tour_steps import (
     MAX_OFF_RAD,
     MIN_PARALLAX_RAD,
     TourFrame,
+    agreed_logs,
     alike_poses,
     fits,
     found_places,
@@ -31,7 +32,6 @@ from gsba.odometry.tour_steps import (
 
 _NUM_VOTERS = 300  # keys of a frame that propose lengths
 _LENGTH_WIDTH, _NUM_LENGTHS = 0.15, 2  # of a length's logarithm, within which keys agree; tried
-_MIN_VOTES = 3  # keys that propose a length
 _MAX_LOG_SCALE = np.log(8.0)  # of the units of two maps, whose first steps they are
 _NUM_STARTS, _NUM_FINAL = 12, 3  # hypotheses that are fitted to two frames; to all near the step
 _OTHER_SCALES = (-0.2, -0.1, 0.1, 0.2)  # of the best join, added to its logarithm
@@ -166,7 +166,8 @@ class Joining:
         good, parallax, steps = fits(frame.keys[rows], found, g_T_f, 2.0)
         good &= parallax > MIN_PARALLAX_RAD
         logs = np.log(depths[rows[good]] / steps[good])
-        return agreed_logs(logs, cells_of(frame.keys[rows[good]], CELLS_PER_SIDE))
+        cells = cells_of(frame.keys[rows[good]], CELLS_PER_SIDE)
+        return agreed_logs(logs, cells, _LENGTH_WIDTH, _NUM_LENGTHS)
 
     def between(self, at: Join, f: int, g: int) -> np.ndarray:
         """Pose g_T_f (4, 4) of frames of different maps, units of the map of f."""
@@ -245,22 +246,6 @@ class Joining:
             for n, weight in enumerate((good, good * some.sound)):
                 cells[n] += np.count_nonzero(np.bincount(where, weight) > 0)
         return float(np.sqrt(np.prod(1 + cells)) - 1)
-
-
-def agreed_logs(logs: np.ndarray, cells: np.ndarray) -> list[tuple[float, int]]:
-    """Values (N,) on which keys in most cells (N,) agree, and the number of these cells."""
-    near, left = np.abs(logs[:, None] - logs) < _LENGTH_WIDTH, np.ones(len(logs), bool)
-    found = list[tuple[float, int]]()
-    while np.count_nonzero(left) >= _MIN_VOTES and len(found) < _NUM_LENGTHS:
-        agreeing = max(
-            (near[n] & left for n in np.flatnonzero(left)),
-            key=lambda some: (len(np.unique(cells[some])), np.count_nonzero(some)),
-        )
-        if np.count_nonzero(agreeing) < _MIN_VOTES:
-            break
-        found.append((float(np.median(logs[agreeing])), len(np.unique(cells[agreeing]))))
-        left &= np.abs(logs - found[-1][0]) > 2 * _LENGTH_WIDTH
-    return found
 
 
 def scaled(g_T_f: np.ndarray, by: float) -> np.ndarray:

@@ -24,6 +24,7 @@ from gsba.odometry.tour_steps import (
     MIN_PARALLAX_RAD,
     Step,
     TourFrame,
+    agreed_logs,
     alike_poses,
     found_places,
     hypotheses,
@@ -34,7 +35,6 @@ from gsba.types import Counts, FrameSet, Matches, VerifiedPairs
 _RATIO_WIDTH = 0.08  # of a ratio's logarithm, within which keypoints agree on it
 _MAX_LOG_RATIO = np.log(4.0)  # of two steps' lengths
 _NUM_RATIOS = 3  # that are tried for two hypotheses of steps
-_MIN_VOTES = 3  # keypoints that propose a ratio
 MIN_CELLS, MIN_LEAD = 7, 1.5  # cells that confirm three frames; times those of any rival
 MIN_CELLS_OF_RATIO = 5  # where both steps are confirmed
 MIN_END_RANK = 120.0  # of a step at an end, which one triple holds alone: in flats, three of five
@@ -92,17 +92,8 @@ def ratios(before: Step, after: Step, keys: np.ndarray) -> list[float]:
         np.log(before.depths1[both] / after.depths0[both]),
         cells_of(keys[both], CELLS_PER_SIDE),
     )
-    near, left, found = np.abs(logs[:, None] - logs) < _RATIO_WIDTH, np.ones(len(logs), bool), []
-    while np.count_nonzero(left) >= _MIN_VOTES and len(found) < _NUM_RATIOS:
-        agreeing = max(
-            (near[n] & left for n in np.flatnonzero(left)),
-            key=lambda some: (len(np.unique(cells[some])), np.count_nonzero(some)),
-        )
-        if np.count_nonzero(agreeing) < _MIN_VOTES:
-            break
-        found.append(float(np.median(logs[agreeing])))
-        left &= np.abs(logs - found[-1]) > 2 * _RATIO_WIDTH
-    return [log for log in found if abs(log) < _MAX_LOG_RATIO]
+    found = agreed_logs(logs, cells, _RATIO_WIDTH, _NUM_RATIOS)
+    return [log for log, _ in found if abs(log) < _MAX_LOG_RATIO]
 
 
 def triple(

@@ -38,6 +38,7 @@ _NUM_KEYS, _NUM_FEW = 1000, 300  # keypoints of a frame that are searched; that 
 _NUM_ROUGH, _NUM_REFINED = 6, 4  # best hypotheses of a step that are searched finely; refined
 _MIN_RANK_SHARE = 0.4  # of the best hypothesis' rank, below which others are not refined
 _ROWS_AT_ONCE = 512  # of descriptors that are compared with all others
+_MIN_VOTES = 3  # keys that propose a length or a ratio of lengths
 _MIN_MATCHES = 8  # that a pose is estimated from
 # Subsets of matches that propose poses: largest cosine with another keypoint of the same frame,
 # True = above the floor only, largest error in degrees, number of poses, each without the inliers
@@ -231,6 +232,25 @@ def alike_poses(one: np.ndarray, other: np.ndarray) -> bool:
     """True if two poses (4, 4) are so near that they are no rivals: one is less accurate."""
     turn, direction = pose_errors_deg(one, other)
     return turn < 3.0 and direction < 8.0
+
+
+def agreed_logs(
+    logs: np.ndarray, cells: np.ndarray, width: float, most: int
+) -> list[tuple[float, int]]:
+    """At most so many logarithms (N,) on which keys of most cells (N,) agree within a width, each
+    without the keys of those before, and the number of these cells."""
+    near, left = np.abs(logs[:, None] - logs) < width, np.ones(len(logs), bool)
+    found = list[tuple[float, int]]()
+    while np.count_nonzero(left) >= _MIN_VOTES and len(found) < most:
+        agreeing = max(
+            (near[n] & left for n in np.flatnonzero(left)),
+            key=lambda some: (len(np.unique(cells[some])), np.count_nonzero(some)),
+        )
+        if np.count_nonzero(agreeing) < _MIN_VOTES:
+            break
+        found.append((float(np.median(logs[agreeing])), len(np.unique(cells[agreeing]))))
+        left &= np.abs(logs - found[-1][0]) > 2 * width
+    return found
 
 
 def _distinct(

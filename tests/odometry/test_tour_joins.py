@@ -14,13 +14,12 @@ from gsba.odometry.tour_joins import (
     MIN_SCORE,
     Join,
     TourMap,
-    agreed_logs,
     is_sure,
     join,
     scaled,
 )
 from gsba.odometry.tour_merging import all_joined, held
-from gsba.odometry.tour_steps import TourFrame, frame_of, pose_errors_deg, step_at
+from gsba.odometry.tour_steps import TourFrame, agreed_logs, frame_of, pose_errors_deg, step_at
 from tests.room_tour import pictures, true_poses
 
 
@@ -106,10 +105,10 @@ def test_a_join_that_another_rivals_is_not_sure() -> None:
 def test_lengths_are_proposed_by_keys_that_agree() -> None:
     logs = np.array([0.0, 0.02, -0.03, 0.05, 1.0, 1.01, 1.02, -2.0, 3.0])
     cells = np.array([1, 2, 3, 4, 5, 5, 6, 7, 8])
-    (first, num), (second, few) = agreed_logs(logs, cells)
+    (first, num), (second, few) = agreed_logs(logs, cells, 0.15, 2)
     assert abs(first) < 0.05 and num == 4
     assert abs(second - 1.01) < 0.01 and few == 2
-    assert agreed_logs(logs[-2:], cells[-2:]) == []
+    assert agreed_logs(logs[-2:], cells[-2:], 0.15, 2) == []
 
 
 def test_maps_that_share_little_at_a_door_are_joined_further_inside(
