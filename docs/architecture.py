@@ -68,13 +68,16 @@ def room_of(module: str) -> str:
     return rest.partition(".")[0] if top == "gsba" else top
 
 
-def _statements(node: ast.AST) -> Iterator[ast.AST]:
-    """All nodes, without what only type checkers see."""
-    for child in ast.iter_child_nodes(node):
-        if isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test):
+def _statements(tree: ast.Module) -> Iterator[ast.AST]:
+    """All statements of a file, without what only type checkers see."""
+    todo: list[ast.AST] = [tree]
+    while todo:
+        node = todo.pop()
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
             continue
-        yield child
-        yield from _statements(child)
+        yield node
+        kinds = ast.stmt | ast.ExceptHandler | ast.match_case
+        todo += [child for child in ast.iter_child_nodes(node) if isinstance(child, kinds)]
 
 
 @cache

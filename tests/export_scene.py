@@ -79,9 +79,10 @@ def picture(directions: np.ndarray, point_bearings: np.ndarray) -> np.ndarray:
     """Image (..., 3) uint8 with a soft blob of each point's colour, along directions (..., 3)."""
     image = np.full((*directions.shape[:-1], 3), 30.0)
     for bearing, color in zip(point_bearings, COLORS, strict=True):
-        chord = np.linalg.norm(directions - bearing, axis=-1, keepdims=True)
+        near = directions @ bearing > 1 - 32 * BLOB_RAD**2  # within eight times the spread
+        chord = np.linalg.norm(directions[near] - bearing, axis=-1, keepdims=True)
         weight = np.exp(-0.5 * np.square(chord / BLOB_RAD))
-        image = image * (1 - weight) + color * weight
+        image[near] = image[near] * (1 - weight) + color * weight
     return np.round(image).astype(np.uint8)
 
 

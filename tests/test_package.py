@@ -38,7 +38,10 @@ def test_files_and_functions_stay_short() -> None:
     for module, path in FILES.items():
         text = path.read_text(encoding="utf-8")
         lengths[module] = len(text.splitlines()), 600
-        for node in ast.walk(ast.parse(text)):
+        statements: list[ast.AST] = [ast.parse(text)]
+        for node in statements:  # which grow
+            kinds = ast.stmt | ast.ExceptHandler | ast.match_case
+            statements += [one for one in ast.iter_child_nodes(node) if isinstance(one, kinds)]
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
                 length = (node.end_lineno or 0) - node.lineno + 1
                 lengths[f"{module}.{node.name}:{node.lineno}"] = length, 100

@@ -54,12 +54,15 @@ def _directions(lens: Fisheye) -> np.ndarray:
     return unproject(lens, pixels)
 
 
+@lru_cache(maxsize=32)
 def picture(lens: Fisheye, seen=colours, half_fov: float = HALF_FOV) -> np.ndarray:
-    """What a lens sees, (h, w, 3) uint8 RGB, black beyond its circle."""
+    """What a lens sees, (h, w, 3) uint8 RGB, black beyond its circle; tests only read it."""
     directions = _directions(lens)
     axis = Rotation.from_rotvec(lens.rotation).as_matrix()[:, 2]
     within = directions @ axis > np.cos(half_fov)
-    return np.where(within[..., None], np.rint(seen(directions)), 0).astype(np.uint8)
+    shown = np.where(within[..., None], np.rint(seen(directions)), 0).astype(np.uint8)
+    shown.flags.writeable = False
+    return shown
 
 
 def write(path: Path, rgb: np.ndarray) -> Path:

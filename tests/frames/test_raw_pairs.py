@@ -3,6 +3,7 @@
 import json
 import logging
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -35,6 +36,7 @@ LAYOUTS = {
 }
 
 
+@cache
 def _moved(shift: float):
     """Colours of a sphere turned about its vertical, by frame."""
     turn = Rotation.from_euler("y", shift).as_matrix()
@@ -140,6 +142,7 @@ def test_circles_that_the_frame_cuts_off(tmp_path: Path) -> None:
         assert lens.focal * HALF_FOV == pytest.approx(true.focal * HALF_FOV, abs=0.5)
 
 
+@cache
 def _four_alike(shift: float):
     """The same after every quarter turn about the lenses' axes."""
 
@@ -222,6 +225,7 @@ def test_circles_that_are_given(tmp_path: Path) -> None:
             scan(root, fps=1, circles=[wrong])
 
 
+@cache
 def _fine(shift: float):
     """Fine structure: what is smooth looks alike under any focal length."""
     waves = np.random.default_rng(5).normal(size=(40, 3)) * 9 + shift
