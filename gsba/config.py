@@ -411,7 +411,7 @@ class RefineSettings(_Settings):
 
     @model_validator(mode="after")
     def _geometry_first(self) -> "RefineSettings":
-        for name in self.factors:
+        for name in self.package_families():
             known = (*BUILT_IN, *installed_families())
             if name.partition(":")[0] not in known:
                 listed = ", ".join(f'"{one}"' for one in known)

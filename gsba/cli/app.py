@@ -9,7 +9,7 @@ import threading
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from functools import wraps
+from functools import cache, wraps
 from pathlib import Path
 from typing import Annotated, NoReturn, ParamSpec
 
@@ -122,10 +122,15 @@ def loading() -> Iterator[None]:
             import pycolmap  # noqa: F401
     finally:
         _end_on_sigterm()
-        if gc.get_freeze_count() == 0:  # once: frozen objects are never collected
-            gc.freeze()
+        _exempt_loaded_objects()
         if collected:
             gc.enable()
+
+
+@cache
+def _exempt_loaded_objects() -> None:
+    """Exempt all objects from garbage collection, once: such objects are never collected."""
+    gc.freeze()
 
 
 def _end_on_sigterm() -> None:

@@ -2,6 +2,7 @@
 
 import json
 import logging
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -24,6 +25,7 @@ SIDE, BITS = 96, 6
 EVERY = VideoSettings(every=1, standing_deg=0)
 
 
+@cache
 def _texture(seed: int, height: int, width: int) -> np.ndarray:
     """Smooth noise (height, width, 3) uint8 that is nowhere black."""
     noise = np.random.default_rng(seed).normal(size=(height, width, 3))

@@ -1,6 +1,7 @@
 """Frames from videos made here: which, when, how sharp, resumed, and what is refused."""
 
 import json
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -24,6 +25,7 @@ HEIGHT, WIDTH, BITS = 128, 256, 10
 NTSC = 3003  # ticks between frames at 29.97 per second
 
 
+@cache
 def _world(seed: int = 0, width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
     """A smooth random panorama (H, W, 3) uint8, continuous over the seam."""
     rng = np.random.default_rng(seed)
