@@ -32,6 +32,7 @@ from tiny_run import PLAIN, Case, make_case
 from gsba.demo import DemoWalk
 from gsba.demo.gallery import build_gallery
 from gsba.features import SiftExtractor
+from gsba.loop_closure import retrieval
 from gsba.matching import verification
 
 gc.disable()  # while tests are collected: nothing of them goes away
@@ -154,12 +155,16 @@ def _kept(find: Callable, folder: Path) -> Callable:
 
 @pytest.fixture(scope="session", autouse=True)
 def _found_once(made_once: MadeOnce) -> Iterator[None]:
-    """Dozens of runs read the same pictures: keypoints of a face and the pose of a pair are found
-    once for all workers, and the demo's gallery is built once."""
+    """Dozens of runs read the same pictures: keypoints of a face, the pose of a pair and words of
+    descriptors are found once for all workers, and the demo's gallery is built once."""
     folder = made_once("found", lambda folder: folder)
     gallery = cache(lambda: made_once("gallery", lambda _: build_gallery()))
     with pytest.MonkeyPatch.context() as patch:
-        for owner, name in ((SiftExtractor, "__call__"), (verification, "sampled_pose")):
+        for owner, name in (
+            (SiftExtractor, "__call__"),
+            (verification, "sampled_pose"),
+            (retrieval, "_centres"),
+        ):
             patch.setattr(owner, name, _kept(getattr(owner, name), folder))
         patch.setattr("gsba.demo.gallery.build_gallery", gallery)
         yield

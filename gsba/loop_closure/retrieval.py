@@ -41,8 +41,11 @@ def visual_words(
     share = max(_NUM_SAMPLES // max(num_frames, 1), 8)
     draw = partial(_sampled_descriptors, share=share, seed=seed)
     job = _DescriptorJob("sampling", frames, np.arange(num_frames), draw)
-    sample = np.concatenate(list(workers.map_shards(job)))
-    # Centres (W, D) of a k-means clustering
+    return _centres(np.concatenate(list(workers.map_shards(job))), seed)
+
+
+def _centres(sample: np.ndarray, seed: int) -> np.ndarray:
+    """Centres (W, D) of the k-means clusters of descriptors (K, D)."""
     rng = np.random.default_rng(seed)
     words = sample[rng.permutation(len(sample))[:64]].copy()
     for _ in range(12):

@@ -1,6 +1,7 @@
 """Clock, bias and axes of a gyro, from turns that images show."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -13,9 +14,16 @@ from gsba.imu.readings import Readings
 SIGMA = np.deg2rad(0.1)  # of turns, per axis
 
 
-def _aligned(on: Ride, readings: Readings, sigma: float = SIGMA) -> Alignment:
+def _aligned(on: Ride, readings: Readings) -> Alignment:
     known = np.ones(len(on.timestamps) - 1, bool)
-    return align(on.timestamps, on.steps(sigma), known, readings)
+    return align(on.timestamps, on.steps(SIGMA), known, readings)
+
+
+@cache
+def _usual(seed: int = 0) -> Alignment:
+    """Alignment of a ride's own readings."""
+    on = ride(seed=seed)
+    return _aligned(on, on.readings())
 
 
 def _off_deg(found: Alignment) -> float:
@@ -24,8 +32,7 @@ def _off_deg(found: Alignment) -> float:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_clock_bias_and_axes_are_found_from_turns(seed: int) -> None:
-    on = ride(seed=seed)
-    found = _aligned(on, on.readings())
+    found = _usual(seed)
     assert found.reason == ""
     # Turns of .1 degrees at up to 18 degrees per second tell the clock to some milliseconds,
     # within the deviation that is claimed.
@@ -38,8 +45,7 @@ def test_clock_bias_and_axes_are_found_from_turns(seed: int) -> None:
 
 
 def test_better_turns_tell_more_from_where_worse_ones_ended() -> None:
-    on = ride()
-    first = _aligned(on, on.readings())
+    on, first = ride(), _usual()
     better = align(on.timestamps, on.steps(), np.ones(49, bool), on.readings(), first)
     assert abs(better.clock.offset - OFFSET_S) < 1e-4
     assert _off_deg(better) < 0.02 < _off_deg(first)
@@ -85,8 +91,7 @@ def test_steps_of_dense_frames_and_unseen_ones() -> None:
 def test_what_a_gyro_says_of_frames_is_how_they_turn() -> None:
     on = ride()
     readings = on.readings()
-    first = _aligned(on, readings)
-    exact = align(on.timestamps, on.steps(), np.ones(49, bool), readings, first)
+    exact = align(on.timestamps, on.steps(), np.ones(49, bool), readings, _usual())
     said = turning_of(readings, exact, on.timestamps)
     true = Rotation.from_matrix(on.steps()).as_rotvec()
     # White noise of .001 rad/s at 200 Hz adds up to 5e-5 rad in half a second.

@@ -51,9 +51,15 @@ def taken(case: Case, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, d
     return folder, truth
 
 
-def test_photos_are_found_with_their_cameras(case: Case, taken: tuple[Path, dict]) -> None:
+@pytest.fixture(scope="module")
+def localizer(case: Case) -> Localizer:
+    return Localizer(case.out)
+
+
+def test_photos_are_found_with_their_cameras(
+    case: Case, localizer: Localizer, taken: tuple[Path, dict]
+) -> None:
     folder, truth = taken
-    localizer = Localizer(case.out)
     photos = [read_photo(path) for path in sorted(folder.glob("*.jpg"))]
     assert [photo.focal is None for photo in photos] == [False, False, True]
     found = localize_photos(localizer, photos)
@@ -70,11 +76,11 @@ def test_photos_are_found_with_their_cameras(case: Case, taken: tuple[Path, dict
         assert np.degrees(rotation_angle(moved[:3, :3].T @ pose[:3, :3])) < 0.3
 
 
-def test_a_photo_of_something_else_is_refused(case: Case, tmp_path: Path) -> None:
+def test_a_photo_of_something_else_is_refused(localizer: Localizer, tmp_path: Path) -> None:
     noise = np.random.default_rng(0).integers(0, 255, (30, 40, 3)).astype(np.uint8)
     path = tmp_path / "other.png"
     cv2.imwrite(str(path), cv2.resize(noise, (640, 480), interpolation=cv2.INTER_CUBIC))
-    found = localize_photos(Localizer(case.out), [read_photo(path)])
+    found = localize_photos(localizer, [read_photo(path)])
     assert found.frames[0].reason == "no place of the map looks like it"
     assert found.cameras == ()
 

@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gsba.geometry import inverse, pose, unit
+from gsba.odometry import tour_steps
 from gsba.odometry.tour_maps import (
     MAX_RIVAL_CELLS,
     MIN_CELLS,
@@ -47,9 +48,12 @@ def of_cells(cells: int, log_ratio: float = 0.0) -> Triple:
 
 @cache
 def frames() -> list[TourFrame]:
-    return [frame_of(picture, None) for picture in pictures()[:3]]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tour_steps, "_NUM_KEYS", 300)
+        return [frame_of(picture, None) for picture in pictures()[:3]]
 
 
+@cache
 def true_step(first: int) -> Step:
     """The step at its true pose."""
     poses = true_poses()

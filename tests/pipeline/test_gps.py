@@ -1,6 +1,7 @@
 """Runs with GPS fixes as factors: on the command line, from a table or from tags, and refused."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -39,7 +40,8 @@ def _apart(one: Path, other: Path) -> float:
 
 
 def test_fixes_hold_a_run_and_are_reported(case: Case, plain_run: Path, tmp_path: Path) -> None:
-    table, out = _table(tmp_path / "gps.csv", case, 30.0), tmp_path / "run"
+    table = _table(tmp_path / "gps.csv", case, 30.0)
+    out = Path(shutil.copytree(plain_run, tmp_path / "run"))
     result = case.refine(out, _with_gps(table))
     said = json.loads((out / "report.json").read_text())["gps"]
     assert said["taken"] and said["used"] == said["fixes"] == len(case.truth.timestamps)
@@ -94,7 +96,8 @@ def test_fixes_that_images_contradict_are_left_out(
     case: Case, plain_run: Path, tmp_path: Path
 ) -> None:
     """Precise by their claim, but stretched: they would bend the map."""
-    table, out = _table(tmp_path / "gps.csv", case, 300.0, stretch=1.1), tmp_path / "run"
+    table = _table(tmp_path / "gps.csv", case, 300.0, stretch=1.1)
+    out = Path(shutil.copytree(plain_run, tmp_path / "run"))
     report = case.refine(out, _with_gps(table, sigma_m=0.05, sigma_up_m=0.05)).report
     assert report["gps"] | {"taken": False, "contradicted": True} == report["gps"]
     assert any("would bend the map" in note for note in report["notes"])

@@ -1,6 +1,7 @@
 """A run with the readings of a gyro that rode along, and with readings of something else."""
 
 import json
+import shutil
 from pathlib import Path
 
 import insta360_files as made
@@ -42,7 +43,8 @@ def _readings(on: Trajectory, seed: int = 0) -> np.ndarray:
 def test_a_gyro_is_aligned_and_frames_turn_as_it_says(
     case: Case, plain_run: Path, tmp_path: Path
 ) -> None:
-    out, readings = tmp_path / "run", _write(tmp_path / "imu.csv", case.truth)
+    out = Path(shutil.copytree(plain_run, tmp_path / "run"))
+    readings = _write(tmp_path / "imu.csv", case.truth)
     result = case.refine(out, PLAIN, imu=readings)
     report = json.loads((out / "report.json").read_text())
     said = report["gyro"]
@@ -69,7 +71,7 @@ def test_a_camera_s_own_readings_are_aligned(case: Case, plain_run: Path, tmp_pa
     begin_us = 7_000_000
     ticks = np.rint(1e6 * (table[:, 0] - OFFSET_S - case.truth.timestamps[0])).astype(int)
     record = made.raw_gyro(begin_us + ticks, table[:, 1:4], table[:, 4:] / 9.80665)
-    path, out = tmp_path / "v.insv", tmp_path / "run"
+    path, out = tmp_path / "v.insv", Path(shutil.copytree(plain_run, tmp_path / "run"))
     metadata = made.metadata(first_frame=begin_us)
     path.write_bytes(made.trailer(((0, made.GYRO, record), (1, made.METADATA, metadata))))
     case.refine(out, PLAIN, imu=path)
