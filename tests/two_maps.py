@@ -1,6 +1,7 @@
 """A walk once around that two maps hold: what of them is tested."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -22,8 +23,14 @@ SCALE = 1.7
 MOVE = pose(Rotation.from_rotvec([0.4, -2.0, 0.7]).as_matrix(), np.array([5.0, -3.0, 8.0]))
 
 
-def scene(
-    strange: bool = False, truth: np.ndarray = TRUTH, shown: np.ndarray = EVERYTHING
+@cache
+def scene(strange: bool = False) -> tuple[MatchContext, Solution, np.ndarray]:
+    """`scene_of` the true walk; tests only read it."""
+    return scene_of(TRUTH, strange=strange)
+
+
+def scene_of(
+    truth: np.ndarray, shown: np.ndarray = EVERYTHING, strange: bool = False
 ) -> tuple[MatchContext, Solution, np.ndarray]:
     """Once around, mapped in two halves; `strange`: the second half looks like nothing else;
     `shown`: (F,) share of the points in reach that each frame shows.

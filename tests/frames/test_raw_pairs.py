@@ -178,16 +178,6 @@ def test_a_fusion_folder_is_said_to_be_one(
     assert "raw pairs of a GoPro Fusion, front lens in FR/, back in BK/" in caplog.text
 
 
-@pytest.mark.parametrize("gone", ["FR", "BK"])
-def test_a_fusion_folder_without_a_side(tmp_path: Path, gone: str) -> None:
-    root = _write_pairs(tmp_path, "FR")
-    for path in (root / gone).iterdir():
-        path.unlink()
-    left = {"FR": "BK", "BK": "FR"}[gone]
-    with pytest.raises(GsbaError, match=rf"holds {left}/ but no pictures in {gone}/: of raw pairs"):
-        scan(root, fps=1)
-
-
 def test_squeezed_pairs_are_read_unsqueezed(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -261,8 +251,9 @@ def test_a_calibration_that_the_seam_contradicts(
     assert ("c.json does not fit these pictures" in caplog.text) == (off != 1)
 
 
-@pytest.mark.parametrize("shown", ["lit", "dark", "lamp"])
-@pytest.mark.parametrize("name", ["front", "back"])
+@pytest.mark.parametrize(
+    ("shown", "name"), [("lit", "front"), ("lit", "back"), ("dark", "back"), ("lamp", "front")]
+)
 def test_pictures_without_a_circle(tmp_path: Path, shown: str, name: str) -> None:
     root = _write_pairs(tmp_path, "front")
     pixels = np.zeros((SIDE, SIDE, 3), np.uint8)
@@ -286,8 +277,9 @@ def test_a_picture_of_another_size(tmp_path: Path) -> None:
         scan(root, fps=1)
 
 
-@pytest.mark.parametrize("layout", ["front", "lens0", "files"])
-@pytest.mark.parametrize("lens", [0, 1])
+@pytest.mark.parametrize(
+    ("layout", "lens"), [("lens0", 0), ("lens0", 1), ("files", 0), ("files", 1)]
+)
 def test_a_picture_that_is_missing(tmp_path: Path, layout: str, lens: int) -> None:
     root = _write_pairs(tmp_path, layout)
     names = [name.format("001") for name in LAYOUTS[layout]]
@@ -299,11 +291,17 @@ def test_a_picture_that_is_missing(tmp_path: Path, layout: str, lens: int) -> No
 
 
 def test_one_lens_alone(tmp_path: Path) -> None:
-    for layout, empty in (("front", "front"), ("lens0", "lens1")):
-        root = _write_pairs(tmp_path / layout, layout)
+    for layout, left, empty in (
+        ("front", "back", "front"),
+        ("lens0", "lens0", "lens1"),
+        ("FR", "FR", "BK"),
+        ("FR", "BK", "FR"),
+    ):
+        root = _write_pairs(tmp_path / f"without {empty}", layout)
         for path in (root / empty).iterdir():
             path.unlink()
-        with pytest.raises(GsbaError, match=rf"but no pictures in {empty}/: of raw pairs"):
+        message = rf"holds {left}/ but no pictures in {empty}/: of raw pairs"
+        with pytest.raises(GsbaError, match=message):
             scan(root, fps=1)
     root = _write_pairs(tmp_path / "files", "files")
     for path in root.glob("*_10_*"):

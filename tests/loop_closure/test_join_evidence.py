@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from two_maps import HALF, NUM, TRUTH, scene
+from two_maps import HALF, NUM, TRUTH, scene, scene_of
 
 from gsba.geometry import pose
 from gsba.loop_closure import join_evidence
@@ -123,7 +123,7 @@ def test_an_exact_copy_of_a_place_shows_nothing_in_some_regions(
 def test_points_are_expected_as_often_as_the_recordings_that_meet_find_them() -> None:
     """A third recording, in a room that shows all of its points again, says nothing of theirs."""
     owners = np.digitize(np.arange(NUM), [10, 30])  # both ends, and the third between them
-    context, solved, _ = scene(shown=np.where(owners == 1, 1.0, 0.4))
+    context, solved, _ = scene_of(TRUTH, np.where(owners == 1, 1.0, 0.4))
     points, depth = solved.points_by_keypoint(context.keypoints), solved.median_depth()
     known = [points[f] for f in range(NUM)]
     measured = []

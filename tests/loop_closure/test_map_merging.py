@@ -1,11 +1,12 @@
 """Parts of a torn map: joined where they meet, frames alone registered, strangers kept apart."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from two_maps import HALF, MOVE, NUM, SCALE, TRUTH, scene, torn
+from two_maps import HALF, MOVE, NUM, SCALE, TRUTH, scene, scene_of, torn
 
 from gsba.geometry import inverse, pose, rotation_angle
 from gsba.loop_closure import connectivity, join_evidence, map_merging
@@ -70,16 +71,22 @@ def test_a_map_keeps_the_world_of_its_earliest_part() -> None:
     assert off < 0.05 and turned < 0.5
 
 
-@pytest.mark.parametrize("scale", [SCALE, 0.3])
-def test_two_maps_of_any_scale_are_joined_where_they_meet(scale: float) -> None:
+@cache
+def _joined(scale: float) -> Registered:
+    """Both halves, the later one in a world and scale of its own."""
     context, whole, late = scene()
     parts = torn(whole, late, scale, MOVE)
-    found = map_merging.merge(context, parts, _halves(), NOBODY, ~BREAK, TIMES)
+    return map_merging.merge(context, parts, _halves(), NOBODY, ~BREAK, TIMES)
+
+
+@pytest.mark.parametrize("scale", [SCALE, 0.3])
+def test_two_maps_of_any_scale_are_joined_where_they_meet(scale: float) -> None:
+    found = _joined(scale)
     assert not found.components.any() and found.met.all() and not found.lost.any()
     np.testing.assert_allclose(found.scales[HALF:], 1 / scale, rtol=0.005)
     off, turned = _errors(found)
     assert off < 0.02 and turned < 0.2  # of a loop 8 across; bearings have 0.02 degrees of noise
-    points = found.solved.landmarks.points_world
+    points, whole = found.solved.landmarks.points_world, scene()[1]
     assert np.median(np.linalg.norm(points - whole.landmarks.points_world, axis=1)) < 0.02
 
 
@@ -89,7 +96,7 @@ def test_a_camera_may_be_held_in_another_way_in_another_recording(
 ) -> None:
     truth, tilt = TRUTH.copy(), Rotation.from_euler("x", tilt_deg, degrees=True).as_matrix()
     truth[HALF:, :3, :3] = tilt @ truth[HALF:, :3, :3]  # to one side, whatever the heading
-    context, whole, late = scene(truth=truth)
+    context, whole, late = scene_of(truth)
     owners = np.arange(NUM) // HALF
     times = TIMES + 1000 * owners
     given = context, torn(whole, late, SCALE, MOVE), _halves(), NOBODY, ~BREAK, times
@@ -115,7 +122,7 @@ def test_a_likely_join_is_taken_where_the_camera_walks_on(
         truth[HALF:, :3, :3] = truth[HALF:, :3, :3] @ about
     if what == "carried":  # a recording that begins elsewhere, whatever its clock says
         truth[HALF:] = np.roll(truth[HALF:], -5, axis=0)
-    context, whole, late = scene(truth=truth)
+    context, whole, late = scene_of(truth)
     likely = JoinEvidence(0.5, 0.1, 200, 0.6, 0.08)
     assert likely.likely and not likely.confirmed
     weigh = join_evidence.weigh
@@ -154,7 +161,7 @@ def test_a_join_a_bay_off_is_left_for_one_at_the_usual_pace(
     held: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Pairs over the break agree on a step that leads back; a trajectory would know better."""
-    context, whole, late = scene(shown=np.full(NUM, 0.4))
+    context, whole, late = scene_of(TRUTH, np.full(NUM, 0.4))
     parts, true = torn(whole, late, SCALE, MOVE), Sim3.of(SCALE, MOVE).inverse()
     step = TRUTH[HALF, :3, 3] - TRUTH[HALF - 1, :3, 3]
     bay_off = replace(true, translation=true.translation - 1.4 * step)
@@ -349,7 +356,7 @@ def _trust(poses: np.ndarray, unseen: np.ndarray) -> StepChecks:
 
 
 def test_a_piece_of_the_trajectory_goes_where_its_frames_were_carried() -> None:
-    context, whole, late = scene()
+    _, whole, late = scene()
     parts = torn(whole, late, SCALE, MOVE)
     unseen = NOBODY.copy()
     unseen[HALF - 1] = True
@@ -357,7 +364,7 @@ def test_a_piece_of_the_trajectory_goes_where_its_frames_were_carried() -> None:
     slam = np.full(NUM, PoseSource.SLAM, np.uint8)
     coarse = CoarsePoses(parts.world_T_rigs, slam, 0.0, segments)
     joints = (SegmentAlignment(HALF, NUM - 1, 2.0, MOVE, GUESS),)
-    found = map_merging.merge(context, parts, _halves(), NOBODY, ~BREAK, TIMES)
+    found = _joined(SCALE)
     moved, trust, joints = follow(found, coarse, _trust(parts.world_T_rigs, unseen), joints)
     np.testing.assert_allclose(moved.world_T_rigs, found.solved.world_T_rigs, atol=1e-9)
     assert joints[0].how == PLACES and trust.false_steps[HALF - 1]
