@@ -212,17 +212,12 @@ def test_an_export_that_does_not_end_keeps_the_last_one(
     assert (tmp_path / "out" / "points3D.ply").exists()
 
 
-def test_an_earlier_export_is_replaced(tmp_path, frames):
-    export(reconstruction(), frames, tmp_path / "out", ExportFormat.TUM)
-    export(reconstruction(), frames, tmp_path / "out", ExportFormat.PLY)
-    assert _entries(tmp_path / "out") == ["export.json", "points3D.ply", "transform.json"]
-    assert _entries(tmp_path) == ["out"]
-
-
-def test_an_empty_folder_is_used(tmp_path, frames):
+def test_an_empty_folder_is_used_and_an_earlier_export_replaced(tmp_path, frames):
     (tmp_path / "out").mkdir()
-    export(reconstruction(), frames, tmp_path / "out", ExportFormat.TUM)
-    assert _entries(tmp_path / "out") == ["export.json", "trajectory.tum", "transform.json"]
+    for to, name in ((ExportFormat.TUM, "trajectory.tum"), (ExportFormat.PLY, "points3D.ply")):
+        export(reconstruction(), frames, tmp_path / "out", to)
+        assert _entries(tmp_path / "out") == sorted(["export.json", name, "transform.json"])
+    assert _entries(tmp_path) == ["out"]
 
 
 def test_what_others_wrote_is_refused_and_kept(tmp_path, frames):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -21,16 +22,21 @@ from gsba.store.store import RunStore, StageRecord
 from gsba.types import Counts, JointErrors, Reconstruction
 
 
-@pytest.fixture
-def run(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What `load_run` needs of a finished run."""
-    root = tmp_path / "run"
+    root = tmp_path_factory.mktemp("made") / "run"
     (root / "stages").mkdir(parents=True)
     (root / "gsba.json").write_text('{"origin": {}, "wrote": []}')
     save_record(root / "stages/reconstruction.npz", scene.reconstruction(), {})
-    save_record(root / "stages/frames.npz", scene.panoramas(tmp_path / "frames"), {})
+    save_record(root / "stages/frames.npz", scene.panoramas(root.parent / "frames"), {})
     load_run(root)
     return root
+
+
+@pytest.fixture
+def run(made: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(made, tmp_path / "run"))
 
 
 def _edit(path: Path, change: Callable[[dict[str, Any]], Any]) -> None:
@@ -89,29 +95,13 @@ def test_arrays_that_do_not_fit_are_refused(
 
 
 @pytest.mark.parametrize(
-    "name",
-    [
-        "../stolen",
-        "../../stolen",
-        "/tmp/stolen",
-        "a/b",
-        "..",
-        ".",
-        "",
-        "a\nb",
-        "a\0b",
-        "{0}/stolen",
-    ],
+    "name", ["../stolen", "../../stolen", "/tmp/stolen", "a/b", "..", ".", "", "a\nb", "a\0b"]
 )
-@pytest.mark.parametrize("to", ["colmap", "nerfstudio"])
-def test_names_that_leave_the_folder_are_refused(
-    run: Path, tmp_path: Path, to: str, name: str
-) -> None:
+def test_names_that_leave_the_folder_are_refused(run: Path, tmp_path: Path, name: str) -> None:
     """Exports name pictures after frames: the run of a stranger must not say where they go."""
-    name = name.format(tmp_path)
     _edit(run / "stages/frames.npz", lambda tree: tree["value"]["names"].__setitem__(3, name))
     before = sorted(tmp_path.rglob("*"))
-    told = run_gsba("export", run, "--to", to, "--out", tmp_path / "o/u")
+    told = run_gsba("export", run, "--to", "colmap", "--out", tmp_path / "o/u")
     assert told.exit_code == 1 and sorted(tmp_path.rglob("*")) == before
     line = told.stderr.splitlines()
     assert len(line) == 1 and "cannot be the name of a frame" in line[0], told.stderr

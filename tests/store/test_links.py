@@ -1,6 +1,7 @@
 """Links and pipes in folders of runs: nothing elsewhere is deleted or written, nothing waits."""
 
 import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -30,17 +31,22 @@ def elsewhere(tmp_path: Path) -> Path:
     return folder
 
 
-@pytest.fixture
-def run(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of which something is finished."""
-    with RunStore(tmp_path / "run", {}) as store:
+    root = tmp_path_factory.mktemp("made") / "run"
+    with RunStore(root, {}) as store:
         store.stage("some", None, lambda: Counts(3, 2, "frames"), Counts)
         list(store.per_frame("many", None, {"a": 1}, lambda _: np.zeros(3), np.ndarray))
-    save_record(tmp_path / "run/stages/reconstruction.npz", scene.reconstruction(), {})
-    frames = scene.panoramas(tmp_path / "frames")
-    save_record(tmp_path / "run/stages/frames.npz", frames, {})
-    load_run(tmp_path / "run")
-    return tmp_path / "run"
+    save_record(root / "stages/reconstruction.npz", scene.reconstruction(), {})
+    save_record(root / "stages/frames.npz", scene.panoramas(root.parent / "frames"), {})
+    load_run(root)
+    return root
+
+
+@pytest.fixture
+def run(made: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(made, tmp_path / "run"))
 
 
 def _contents(folder: Path) -> dict[str, str]:
