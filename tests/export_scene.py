@@ -12,7 +12,7 @@ from synthetic import unit
 from gsba.camera.lens import Lenses
 from gsba.camera.rig import RIG_R_FACE
 from gsba.camera.sphere import bearings_from_erp
-from gsba.disk import write_image
+from gsba.disk import encoded_image, write_bytes, write_image
 from gsba.geometry import inverse, pose
 from gsba.types import FACES, FrameSet, PictureFormat, PoseStatus, Reconstruction
 
@@ -90,10 +90,15 @@ def _grid(width: int, height: int) -> np.ndarray:
     return pixel_centres(width, height)
 
 
-@functools.cache
-def _panoramas() -> np.ndarray:
+def _encoded(shown: np.ndarray, suffix: str) -> list[bytes]:
+    """Files of panoramas that show POINTS in directions (F, J, 3)."""
     directions = bearings_from_erp(_grid(WIDTH, HEIGHT), WIDTH, HEIGHT)
-    return np.stack([picture(directions, seen) for seen in bearings(poses())])
+    return [encoded_image(picture(directions, seen), Path(f"a{suffix}")) for seen in shown]
+
+
+@functools.cache
+def _of_one_centre(suffix: str) -> list[bytes]:
+    return _encoded(bearings(poses()), suffix)
 
 
 def shown_by(lenses: Lenses) -> np.ndarray:
@@ -108,12 +113,11 @@ def panoramas(
     folder: Path, suffix: str = ".png", masked: bool = False, lenses: Lenses | None = None
 ) -> FrameSet:
     """Write the panoramas, and masks that hide the lower fifth of the sphere."""
-    names, images = tuple(f"frame_{f:04d}" for f in range(NUM_FRAMES)), _panoramas()
-    if lenses is not None:
-        directions = bearings_from_erp(_grid(WIDTH, HEIGHT), WIDTH, HEIGHT)
-        images = np.stack([picture(directions, seen) for seen in shown_by(lenses)])
-    for name, image in zip(names, images, strict=True):
-        write_image(folder / f"{name}{suffix}", image)
+    names = tuple(f"frame_{f:04d}" for f in range(NUM_FRAMES))
+    shared = lenses is None
+    files = _of_one_centre(suffix) if shared else _encoded(shown_by(lenses), suffix)
+    for name, content in zip(names, files, strict=True):
+        write_bytes(folder / f"{name}{suffix}", content)
     mask_path = None
     if masked:
         mask_path = folder.parent / "mask.png"
