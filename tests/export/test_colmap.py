@@ -19,7 +19,7 @@ from export_scene import (
 from observing import observing
 from plyfile import PlyData
 
-from gsba.export import ExportFormat, export
+from gsba.export import ExportFormat, ExportOptions, export, export_all
 from gsba.log import GsbaError
 from gsba.types import FACES
 
@@ -31,8 +31,8 @@ def exports(tmp_path_factory):
     """The scene in each COLMAP layout, with masks."""
     folder = tmp_path_factory.mktemp("colmap")
     frames = panoramas(folder / "frames", masked=True)
-    for to in LAYOUTS:
-        export(reconstruction(), frames, folder / to, to, split=False)
+    outs = {to: folder / to for to in LAYOUTS}
+    export_all(reconstruction(), frames, outs, ExportOptions(split=False))
     return folder
 
 

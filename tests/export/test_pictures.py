@@ -165,9 +165,9 @@ def _peak(call: Callable[[], object]) -> int:
 )
 def test_parts_write_what_the_whole_does(tmp_path, kind, lenses, to, chosen):
     frames = cube_frames(tmp_path / "cube") if kind == "faces" else _frames(tmp_path, kind)
-    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    whole, parts, rows = tmp_path / "whole", tmp_path / "parts", np.arange(3, 7)
+    frames, scene, lenses = frames.taken(rows), reconstruction().taken(rows), lenses.taken(rows)
     options = {"lenses": lenses, "images": chosen}
-    scene = reconstruction()
     origins = lenses.origins(scene.observation_bearings, scene.observation_frames)
     scene = replace(scene, observation_origins=origins)
     export(scene, frames, whole, ExportFormat(to), **options)

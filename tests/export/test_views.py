@@ -15,7 +15,7 @@ from synthetic import unit
 
 from gsba.camera.lens import Lenses
 from gsba.camera.views import lens_views
-from gsba.export import ExportFormat, export
+from gsba.export import ExportFormat, ExportOptions, export, export_all
 from gsba.placement.placement import Placement
 from gsba.similarity import Sim3
 from gsba.types import Reconstruction
@@ -53,8 +53,9 @@ def scene(lenses: Lenses) -> Reconstruction:
 def written(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory):
     lenses, folder = request.param, tmp_path_factory.mktemp("lenses")
     frames = panoramas(folder / "frames", masked=True, lenses=lenses)
-    for to in (ExportFormat.COLMAP, ExportFormat.COLMAP_FLAT, ExportFormat.NERFSTUDIO):
-        export(scene(lenses), frames, folder / to, to, lenses=lenses, split=False)
+    formats = ExportFormat.COLMAP, ExportFormat.COLMAP_FLAT, ExportFormat.NERFSTUDIO
+    options = ExportOptions(lenses=lenses, split=False)
+    export_all(scene(lenses), frames, {to: folder / to for to in formats}, options)
     return lenses, folder
 
 
