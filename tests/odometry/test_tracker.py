@@ -33,7 +33,9 @@ def _error(tracker: Tracker, walk: RenderedWalk, rows: np.ndarray) -> tuple[floa
 
 
 def test_every_frame_of_a_walk_is_posed_in_one_map(walk: RenderedWalk) -> None:
+    """Within the memory of the window."""
     tracker = _track(walk)
+    assert len(tracker.state.keyframe_poses) > FREE + HELD == len(tracker.state.window)
     assert not (_statuses(tracker) == FrameStatus.LOST).any()
     assert {record.map_number for record in tracker.state.records} == {0}
     ate, rotation = _error(tracker, walk, np.arange(len(walk.frames)))
@@ -110,12 +112,6 @@ def test_what_is_masked_is_not_followed(walk: RenderedWalk) -> None:
     bearings = tracker.state.window[0].bearings
     longitudes = np.arctan2(bearings[:, 0], bearings[:, 2])
     assert len(bearings) > 50 and (longitudes > -0.05).all()
-
-
-def test_memory_is_that_of_the_window(walk: RenderedWalk) -> None:
-    tracker = _track(walk)
-    assert len(tracker.state.keyframe_poses) > FREE + HELD
-    assert len(tracker.state.window) == FREE + HELD
 
 
 def test_a_picture_that_shows_nothing_begins_no_map() -> None:
