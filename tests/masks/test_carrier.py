@@ -133,13 +133,22 @@ def _head() -> np.ndarray:
     return head | ((np.abs(across - 12 - (v - 150) / 4) < 9) & (v > 140) & (v < 215))
 
 
-def _noise_frames(folder: Path, mask: np.ndarray, look: np.ndarray, num: int = 12) -> FrameSet:
-    """Panoramas of a world that is new in every frame, with `look` where `mask`."""
-    rng = np.random.default_rng(5)
-    for f in range(num):
+@cache
+def _worlds() -> list[np.ndarray]:
+    """Panoramas (H, W, 3) float of worlds that have nothing in common."""
+    rng, images = np.random.default_rng(5), []
+    for _ in range(12):
         noise = np.tile(rng.normal(size=(HEIGHT, WIDTH, 3)), (1, 2, 1))  # its edges meet
         world = np.roll(cv2.GaussianBlur(noise, (0, 0), 3), -WIDTH // 2, 1)[:, :WIDTH]
-        image = np.clip(128 + 45 * world / world.std(), 0, 255)
+        images.append(np.clip(128 + 45 * world / world.std(), 0, 255))
+    return images
+
+
+def _noise_frames(folder: Path, mask: np.ndarray, look: np.ndarray) -> FrameSet:
+    """Panoramas of a world that is new in every frame, with `look` where `mask`."""
+    rng = np.random.default_rng(6)
+    for f, world in enumerate(_worlds()):
+        image = world.copy()
         image[mask] = look[mask] + rng.normal(0, 2, look[mask].shape)
         write_image(folder / f"{f:03d}.png", np.clip(image, 0, 255).astype(np.uint8))
     return scan(folder, order_suffices=True)
