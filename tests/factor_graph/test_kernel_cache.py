@@ -131,10 +131,10 @@ def test_a_damaged_kernel_is_compiled_anew(package: Path, tmp_path: Path) -> Non
     assert start(package, cache).stdout.split() == ["6.0"]
 
 
-@pytest.mark.parametrize("folder", ["file/below", "/proc/below"])
-def test_without_a_folder_each_process_compiles(package: Path, tmp_path: Path, folder: str) -> None:
+def test_without_a_folder_each_process_compiles(package: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("no folder")
-    told = start(package, tmp_path / folder)
+    folder = str(tmp_path / "file/below")
+    told = start(package, Path(folder))
     assert told.stdout.split() == ["6.0", "scaled", "twice"]
     first, second = told.stderr.strip().split("\n")
     assert "compiled kernels cannot be kept in" in first and folder in first
