@@ -49,10 +49,8 @@ def measure_overlap(
     share = min(1.0, _MAX_WIDTH_PX / front.width)
     front, behind = _shrunk(front, share), [_shrunk(lens, share) for lens in behind]
     radii, size = (share * radii[0], share * radii[1]), (front.width, front.height)
-    smooth = [
-        [_smooth(picture, size, front.focal / _NUM_AROUND * np.pi) for picture in pictures]
-        for pictures in looks
-    ]
+    sigma = front.focal / _NUM_AROUND * np.pi
+    fronts, backs = ([_smooth(pictures[n], size, sigma) for pictures in looks] for n in range(2))
     whole, fine = (np.full((len(behind), len(_SCALES)), -1.0) for _ in range(2))
     for s, scale in enumerate(_SCALES):
         # Directions (R, A, 3) around the seam inside of both image circles, whose rims are dark
@@ -63,9 +61,9 @@ def measure_overlap(
         ring = _rings(np.pi / 2 + _OVERLAP_RAD[reach < 0.985 * min(radii)])
         if len(ring) < _MIN_ROWS:
             continue
-        ahead = [_harmonics(pictures[0], _scaled(front, scale), ring) for pictures in smooth]
+        ahead = _harmonics(fronts, _scaled(front, scale), ring)
         for t, lens in enumerate(behind):
-            back = [_harmonics(pictures[1], _scaled(lens, scale), ring) for pictures in smooth]
+            back = _harmonics(backs, _scaled(lens, scale), ring)
             whole[t, s] = np.mean([_correlation(a, b, 1) for a, b in zip(ahead, back, strict=True)])
             # Harmonics below 3 are sky and ground at any focal length.
             fine[t, s] = np.mean([_correlation(a, b, 3) for a, b in zip(ahead, back, strict=True)])
@@ -87,14 +85,11 @@ def rim_likeness(looks: Sequence[Sequence[np.ndarray]], pair: Pair) -> float:
     front, back = (_shrunk(lens, share) for lens in pair)
     size, sigma = (front.width, front.height), front.focal / _NUM_AROUND * np.pi
     ring = _rings(np.pi / 2 + _OVERLAP_RAD)
-    scores = []
-    for pictures in looks:
-        ahead, behind = (
-            _harmonics(_smooth(picture, size, sigma), lens, ring)
-            for picture, lens in zip(pictures, (front, back), strict=True)
-        )
-        scores.append(_correlation(ahead, behind, 1))
-    return float(np.mean(scores))
+    ahead, behind = (
+        _harmonics([_smooth(pictures[n], size, sigma) for pictures in looks], lens, ring)
+        for n, lens in enumerate((front, back))
+    )
+    return float(np.mean([_correlation(a, b, 1) for a, b in zip(ahead, behind, strict=True)]))
 
 
 def scaled(pair: Pair, scale: float) -> Pair:
@@ -129,11 +124,13 @@ def _rings(angles: np.ndarray) -> np.ndarray:
     return out
 
 
-def _harmonics(picture: np.ndarray, lens: Fisheye, ring: np.ndarray) -> np.ndarray:
-    """Fourier coefficients (R, A / 2 + 1) of the brightness along rings of directions."""
+def _harmonics(pictures: Sequence[np.ndarray], lens: Fisheye, ring: np.ndarray) -> list[np.ndarray]:
+    """Fourier coefficients (R, A / 2 + 1) of each picture's brightness along rings of
+    directions."""
     places = (project(lens, ring) - 0.5).astype(np.float32)
-    seen = cv2.remap(picture, places[..., 0], places[..., 1], cv2.INTER_LINEAR)
-    return np.fft.rfft(seen.astype(np.float64), axis=1)
+    u, v = places[..., 0], places[..., 1]
+    seen = (cv2.remap(picture, u, v, cv2.INTER_LINEAR) for picture in pictures)
+    return [np.fft.rfft(brightness.astype(np.float64), axis=1) for brightness in seen]
 
 
 def _correlation(one: np.ndarray, other: np.ndarray, lowest: int) -> float:
