@@ -229,7 +229,7 @@ def _calibrate_raw(trial: State, raw: Sequence[int]) -> State:
 
 def _settle_cameras(state: State, name: str) -> State:
     """Map and cameras solved together, after a first estimate of how rows are read."""
-    run, found = state.run, state.map.estimates()
+    found = state.map.estimates()
     for camera, one in enumerate(found.each):
         if one.lenses and one.lenses.readout_motion is None:
             stage = f"{name}_readout"
