@@ -52,6 +52,21 @@ class CameraCovariances:
     joint: JointErrors  # what the poses' errors have in common
     cameras: tuple[CameraSigmas, ...]  # (C,)
 
+    def grown(self, ratio: float) -> "CameraCovariances":
+        """All covariances times a ratio, see `residual_correlation.variance_ratio`."""
+        root = ratio**0.5
+        joint = self.joint.scaled(np.full((len(self.poses), 6), root))
+        cameras = [
+            CameraSigmas(
+                ratio * one.centre,
+                root * one.readout_sigma,
+                root * one.inverse_stitch_radius_sigma,
+                None if one.lens_sigmas is None else root * one.lens_sigmas,
+            )
+            for one in self.cameras
+        ]
+        return CameraCovariances(ratio * self.poses, joint, tuple(cameras))
+
 
 @dataclass(frozen=True, slots=True)
 class CameraSystem:

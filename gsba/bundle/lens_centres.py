@@ -16,6 +16,7 @@ from gsba.bundle.shared_parameters import (
     cross_validate,
     model_of,
     models_of,
+    predicts,
     summed,
 )
 from gsba.camera.lens import Lenses
@@ -26,6 +27,8 @@ logger = logging.getLogger(__name__)
 _MIN_SIGMAS = 5.0  # least distance from one centre, in standard deviations
 _MIN_TRIAL_SIGMAS = 2.0  # the same before matches are found with the centres, which may raise the
 # distance threefold
+_UNMODELLED = 0.005  # standard deviation of what no covariance shows, of the lenses' distance and
+# the radius: measured on rendered walks (benchmarks/results/camera.md)
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +49,7 @@ class StitchRadius:
     """Stitching radius: the distance at which panoramas have no parallax between lenses."""
 
     lenses: Lenses  # with inverse_stitch_radius, if it was taken
+    centre: np.ndarray  # (3 (L - 1),) float64, as `Lenses.centre`, found beside the radius
     inverse_stitch_radius: float  # 1 / map units, inverse of the radius, taken or not
     sigma: float
     part_gains: np.ndarray  # (PARTS,) float64, share of the robust cost of each part of the
@@ -61,9 +65,9 @@ class StitchRadius:
         """
         inverse = self.inverse_stitch_radius
         if not self.reason or inverse > self.sigma:
-            return replace(lenses, inverse_stitch_radius=inverse)
+            return replace(lenses, centre=self.centre, inverse_stitch_radius=inverse)
         if inverse < -_MIN_SIGMAS * self.sigma:
-            return replace(lenses, centre=-lenses.centre, inverse_stitch_radius=-inverse)
+            return replace(lenses, centre=-self.centre, inverse_stitch_radius=-inverse)
         return None
 
 
@@ -120,8 +124,13 @@ def baseline_of(centres: LensCentres, scale: float) -> tuple[float, float]:
     length = float(np.linalg.norm(half))
     along = half @ by_centres / max(length, 1e-300)
     sigma = float(np.sqrt(along @ centres.covariance @ along))
-    # .005 of the distance: measured on rendered walks (benchmarks/results/camera.md)
-    return 2 * scale * length, 2 * scale * float(np.hypot(sigma, 0.005 * length))
+    return 2 * scale * length, 2 * scale * float(np.hypot(sigma, _UNMODELLED * length))
+
+
+def radius_sigma(inverse: float, sigma: float) -> float:
+    """Standard deviation of the inverse of a stitching radius, by the covariance of the adjustment
+    and what is not modelled."""
+    return float(np.hypot(sigma, _UNMODELLED * inverse))
 
 
 def stitched_for(rays: ObservedRays) -> StitchRadius:
@@ -134,7 +143,8 @@ def stitched_for(rays: ObservedRays) -> StitchRadius:
     said = rays.context.settings.camera.inverse_stitch_radius(so_far.baseline / 2)
     if said is not None:
         reason, unknown = "" if said else "camera.stitch_radius_m says so", np.full(PARTS, np.nan)
-        return StitchRadius(replace(so_far, inverse_stitch_radius=said), said, 0.0, unknown, reason)
+        lenses = replace(so_far, inverse_stitch_radius=said)
+        return StitchRadius(lenses, so_far.centre, said, 0.0, unknown, reason)
     frames, before = keypoints.frames(), so_far.inverse_stitch_radius
 
     def by_both(rows: np.ndarray, by_origin: np.ndarray, _: np.ndarray) -> np.ndarray:
@@ -145,18 +155,27 @@ def stitched_for(rays: ObservedRays) -> StitchRadius:
 
     systems, _ = models_of(rays, by_both)
     if not systems:
-        return StitchRadius(so_far, 0.0, np.nan, np.full(PARTS, np.nan), "too few points")
+        unknown = np.full(PARTS, np.nan)
+        return StitchRadius(so_far, so_far.centre, 0.0, np.nan, unknown, "too few points")
     num = len(so_far.centre)
     found, total = _step(systems), summed(systems)
-    sigma = float(np.sqrt(np.linalg.inv(total.hessian)[num, num] / total.curvature))
+    centre, shortened = so_far.centre + found[:num], 1.0
+    if so_far.centre @ centre > 0.1 * centre @ centre:
+        # directions are bent by the centre times the inverse of the radius
+        shortened = float(so_far.centre @ centre / (centre @ centre))
+    else:
+        centre = so_far.centre
+    sigma = float(np.sqrt(np.linalg.inv(total.hessian)[num, num] / total.curvature)) * shortened
     verdict = cross_validate(systems, _step, lambda others: _step_to(others, -before))
-    inverse_stitch_radius, shares = before + float(found[num]), verdict.shares
+    inverse_stitch_radius, shares = before + shortened * float(found[num]), verdict.shares
     logger.info("inverse of the stitching radius: %.3f (sigma %.3f)", inverse_stitch_radius, sigma)
     reason = ""
-    if not verdict.predicts or inverse_stitch_radius < _MIN_SIGMAS * sigma:
+    # of one number that is 4 standard deviations from none, unseen parts show less than of many
+    sure = predicts(verdict.gains, least=1.0) and inverse_stitch_radius >= 4.0 * sigma
+    if not sure:
         reason = "as well stitched at infinity"
     lenses = replace(so_far, inverse_stitch_radius=0.0 if reason else inverse_stitch_radius)
-    return StitchRadius(lenses, inverse_stitch_radius, sigma, shares, reason)
+    return StitchRadius(lenses, centre, inverse_stitch_radius, sigma, shares, reason)
 
 
 def _step(systems: Sequence[SharedModel]) -> np.ndarray:

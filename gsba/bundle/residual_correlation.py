@@ -1,5 +1,7 @@
 """Residuals that err together within a frame, by which covariances of independent ones grow."""
 
+import logging
+
 import numpy as np
 
 from factors.robust import RobustLoss
@@ -8,6 +10,8 @@ from gsba.bundle.shared_parameters import weighted_at
 from gsba.bundle.tracks import map_runs
 from gsba.camera.rig import cells_of
 from gsba.types import Keypoints, Solution, Tracks
+
+logger = logging.getLogger(__name__)
 
 _CELLS_PER_SIDE = 3  # of 30 degrees
 _CELLS = 6 * _CELLS_PER_SIDE**2
@@ -41,7 +45,9 @@ def variance_ratio(solution: Solution, keypoints: Keypoints, context: Adjustment
     inverses = np.linalg.pinv(information[usable], hermitian=True)
     squares = [np.sum(inverses * one, axis=(1, 2)) for one in (together, alone[usable])]
     ratios = squares[0] / np.maximum(squares[1], 1e-300)
-    return max(float(np.median(ratios)), 1.0)
+    ratio = max(float(np.median(ratios)), 1.0)
+    logger.debug("residuals of a frame err together: sigmas of poses times %.2f", ratio**0.5)
+    return ratio
 
 
 def _gradients(

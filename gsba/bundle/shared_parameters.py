@@ -295,17 +295,17 @@ def cross_validate(
     return PartGains(gains, gains / costs)
 
 
-def predicts(gains: np.ndarray) -> bool:
+def predicts(gains: np.ndarray, least: float = _MIN_GAIN_SIGMAS) -> bool:
     """True if gains (PARTS,) in log-likelihood are surely more than chance.
 
     A gain of G by parameters that are true has a standard deviation of sqrt(2 G): the residuals'
-    noise along their change. The sum of all parts must exceed none by several of these, and no part
-    may surely lose.
+    noise along their change. The sum of all parts must exceed none by at least `least` of these,
+    and no part may surely lose.
     """
     total = float(gains.sum())
     sigma = np.sqrt(2 * max(total, 0.0))
-    least = -_MIN_GAIN_SIGMAS * sigma / np.sqrt(len(gains))
-    return bool(total > _MIN_GAIN_SIGMAS * sigma and np.all(gains > least))
+    loss = _MIN_GAIN_SIGMAS * sigma / np.sqrt(len(gains))
+    return bool(total > least * sigma and np.all(gains > -loss))
 
 
 @dataclass(frozen=True, slots=True)

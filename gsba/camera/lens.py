@@ -44,8 +44,10 @@ class Lenses:
 
     @property
     def parts(self) -> tuple[bool, ...]:
-        """Which parts were taken: a readout, axes of frames' own, raw lenses of their own."""
-        return tuple(part is not None for part in (self.readout_motion, self.axes, self.fisheyes))
+        """Which parts were taken: a readout, axes of frames' own, raw lenses of their own, a
+        stitching radius."""
+        optional = self.readout_motion, self.axes, self.fisheyes
+        return (*(part is not None for part in optional), bool(self.inverse_stitch_radius))
 
     @property
     def num_lenses(self) -> int:

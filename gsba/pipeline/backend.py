@@ -16,6 +16,7 @@ from gsba.bundle import (
     rotation_only,
     tracks,
 )
+from gsba.bundle.camera_adjustment import CameraCovariances
 from gsba.bundle.gauge import Gauge
 from gsba.bundle.gps_factors import GpsFactors
 from gsba.bundle.lens_centres import baseline_of
@@ -266,16 +267,13 @@ def reconstruct(
         observed, frames = map_.keypoints(run.rig), map_.straightened(run.frames)
         context = state.adjustment_context()
         if map_.covariances is None:
-            covariances, joint = adjustment.pose_covariances(
-                solution, observed, context, prior.parts
-            )
+            poses = adjustment.pose_covariances(solution, observed, context, prior.parts)
+            ratio = residual_correlation.variance_ratio(solution, observed, context)
+            measured = CameraCovariances(*poses, ()).grown(ratio)
         else:
-            covariances, joint = map_.covariances.poses, map_.covariances.joint
-        ratio = residual_correlation.variance_ratio(solution, observed, context)
-        logger.debug("residuals of a frame err together: sigmas of poses times %.2f", ratio**0.5)
-        factors = np.full((len(solution.world_T_rigs), 6), ratio**0.5)
+            measured = map_.covariances
         covariances, joint = common_errors.added(
-            ratio * covariances, joint.scaled(factors), solution.world_T_rigs, prior.parts
+            measured.poses, measured.joint, solution.world_T_rigs, prior.parts
         )
         result = assemble(
             solution,

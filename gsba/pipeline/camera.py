@@ -13,6 +13,7 @@ from gsba.bundle import (
     lens_axes,
     lens_centres,
     readout,
+    residual_correlation,
     self_calibration,
     stitching,
 )
@@ -144,7 +145,12 @@ def _with_stitch_radii(start: State, stitched: Sequence[int], prefix: str) -> St
         lenses = first.on_trial(start.observed.cameras.lenses[camera])
         if lenses is not None:
             tried[camera] = lenses
-    trial = _settle_cameras(_with_lenses(start, tried), f"{prefix}settled")
+    trial = _with_lenses(start, tried)
+    if tried:  # matches found without a radius miss what crosses the seam
+        trial = _solve_with_cameras(trial, trial.map.estimates(), f"{prefix}stitched")
+        trial = frontend.match_along_epipolars(trial, f"{prefix}adjacent_stitched")
+        trial = frontend.match_known_points(trial, f"{prefix}wide_stitched")
+    trial = _settle_cameras(trial, f"{prefix}settled")
     judged = {camera: asked(trial, "stitch_radius_tried", camera) for camera in tried}
     for camera, radius in judged.items():
         start = replace(start, map=start.map.changed(camera, radius=radius))
@@ -223,7 +229,7 @@ def _calibrate_raw(trial: State, raw: Sequence[int]) -> State:
 
 def _settle_cameras(state: State, name: str) -> State:
     """Map and cameras solved together, after a first estimate of how rows are read."""
-    run, found = state.run, state.map.estimates()
+    found = state.map.estimates()
     for camera, one in enumerate(found.each):
         if one.lenses and one.lenses.readout_motion is None:
             stage = f"{name}_readout"
@@ -231,8 +237,13 @@ def _settle_cameras(state: State, name: str) -> State:
                 state, stage, camera, readout.estimate, CameraEstimate, noted=True
             )
             found = found.changed(camera, lambda _, read=read: read)
-    rounds = run.settings.rounds
-    gates = GATE_SCALE, *rounds.dense  # a camera that is off throws observations off
+    return _solve_with_cameras(state, found, name)
+
+
+def _solve_with_cameras(state: State, found: CameraEstimates, name: str) -> State:
+    """Map and cameras solved together."""
+    run = state.run
+    gates = GATE_SCALE, *run.settings.rounds.dense  # a camera that is off throws observations off
     state = state.through(found.cameras)
 
     def compute() -> tuple[Solution, CameraEstimates]:
@@ -277,6 +288,12 @@ def take_parts_from_patches(state: State, sighted: Sighted, name: str, number: i
             axes = _from_patches(state, sighted, *given)
             state = replace(state, map=state.map.changed(camera, axes=axes))
             state = state.with_lenses(camera, axes.lenses)
+        unstitched = raw or _in_one_place(state.map, camera)
+        if number == 1 and not unstitched and not lenses.inverse_stitch_radius:
+            given = f"stitch_radius_{name}", camera, lens_centres.stitched_for, StitchRadius
+            radius = _from_patches(state, sighted, *given)
+            state = replace(state, map=state.map.changed(camera, radius=radius))
+            state = state.with_lenses(camera, radius.lenses)
     return state
 
 
@@ -315,7 +332,9 @@ def measure_camera(state: State) -> State:
         straight = stitching.corrected(map_.observed, map_.field, state.run.rig)
         times, context = state.run.frames.timestamps, state.adjustment_context()
         system = CameraSystem(map_.solution, straight, map_.estimates(), times, context)
-        return system.covariances(state.prior.parts)
+        rays = map_.keypoints(state.run.rig)
+        ratio = residual_correlation.variance_ratio(map_.solution, rays, context)
+        return system.covariances(state.prior.parts).grown(ratio)
 
     key = _settings_of_cameras(state.run)
     measured = state.run.stage("camera", key, compute, CameraCovariances, noted=False)

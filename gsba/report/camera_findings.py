@@ -6,7 +6,12 @@ import numpy as np
 
 from gsba.bundle.camera_adjustment import CameraSigmas
 from gsba.bundle.lens_axes import LensAxes
-from gsba.bundle.lens_centres import LensCentres, StitchRadius, baseline_of
+from gsba.bundle.lens_centres import (
+    LensCentres,
+    StitchRadius,
+    baseline_of,
+    radius_sigma,
+)
 from gsba.bundle.readout import CameraEstimate
 from gsba.bundle.self_calibration import SelfCalibration, first_of, num_parameters, undetermined
 from gsba.camera.fisheye import lens_names
@@ -74,12 +79,15 @@ def of_camera(
             notes.append("the lenses rotate relative to the panoramas: a stabiliser was on")
     inverse_stitch_radius = centres.lenses.inverse_stitch_radius
     if radius is not None:
-        deviation = radius.sigma if known is None else known.inverse_stitch_radius_sigma
+        deviation = radius.sigma
+        if inverse_stitch_radius and known is not None:
+            adjusted = known.inverse_stitch_radius_sigma
+            deviation = radius_sigma(inverse_stitch_radius, adjusted)
         content["stitch_radius"] = {
             "taken": not radius.reason,
             "reason": radius.reason,
             "inverse": (inverse_stitch_radius or radius.inverse_stitch_radius) / scale,
-            "inverse_sigma": (deviation if inverse_stitch_radius else radius.sigma) / scale,
+            "inverse_sigma": deviation / scale,
             "gain_of_unseen_parts": radius.part_gains,
         }
     if inverse_stitch_radius:

@@ -28,8 +28,8 @@ PHASES = (
     r"chain2?|adjacent|near|dense",
     r"registered|across\w*|similarities|joined|adjacent2|loops2?|places|gauge_closed|closed"
     r"|imu_closed",
-    r"axes|lens(es|ed)\d+|stitch_radius.*|settled(_far)?(_readout)?|(re)?calibrated\d*(_readout)?"
-    r"|(adjacent|wide)_(lenses|raw\d+)|imu_camera|strength",
+    r"axes|lens(es|ed)\d+|stitch(ed|_radius(_tried)?)|settled(_far)?(_readout)?|(re)?calibrated\d*(_readout)?"
+    r"|(adjacent|wide)_(lenses|stitched|raw\d+)|imu_camera|strength",
     r".*_closer",
     r"everywhere\d+|refined\d+|again_.*",
     r"\w*align(ed)?1(_\d+)?|stitching1|settled_aligned2",

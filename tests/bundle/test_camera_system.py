@@ -91,8 +91,13 @@ def test_a_stitch_radius_that_is_said_goes_with_the_lenses() -> None:
         LENSES.inverse_stitch_radius * front
     )
     np.testing.assert_allclose(scale * found.lenses.centre, CENTRE, atol=0.001)
-    (measured,) = CameraSystem(*given).covariances().cameras
+    covariances = CameraSystem(*given).covariances()
+    (measured,) = covariances.cameras
     assert np.isnan(measured.inverse_stitch_radius_sigma) and np.isfinite(measured.readout_sigma)
+    grown = covariances.grown(4.0)
+    np.testing.assert_allclose(grown.poses, 4 * covariances.poses)
+    np.testing.assert_allclose(grown.cameras[0].centre, 4 * measured.centre)
+    assert grown.cameras[0].readout_sigma == pytest.approx(2 * measured.readout_sigma)
 
 
 def _turning(readout_motion: np.ndarray, known: np.ndarray) -> GyroConstraints:

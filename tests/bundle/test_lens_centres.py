@@ -107,6 +107,12 @@ def test_a_stitch_radius_is_judged_by_what_is_solved_with_it(inverse: float) -> 
 
     found = estimate(off.lenses)
     tried = found.on_trial(off.lenses)
+    scale = pose_similarity(solved.world_T_rigs, world.world_T_rigs).scale
+    if inverse == 0.05:  # without a radius the lenses are a sixth too near each other
+        assert tried is not None
+        np.testing.assert_allclose(scale * tried.centre[2], CENTRE[2], rtol=0.02)
+        np.testing.assert_allclose(tried.inverse_stitch_radius, scale * inverse, rtol=0.1)
+        assert scale * off.lenses.centre[2] < 0.9 * CENTRE[2]
     if tried is not None:
         solved, camera = solved_with(world, shown, CameraEstimate(tried), solved, problem)
         found = estimate(camera.lenses)

@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pycolmap
 import pytest
@@ -11,7 +12,8 @@ from splat_moves import shorten
 from tiny_run import SETTINGS
 
 from gsba.app.runs import camera_so_far
-from gsba.camera.sphere import bearings_from_erp
+from gsba.bundle.lens_centres import StitchRadius
+from gsba.camera.sphere import bearings_from_erp, erp_from_bearings
 from gsba.camera.views import lens_views
 from gsba.config import PlacementSettings, RefineSettings
 from gsba.demo import make_walk
@@ -29,7 +31,7 @@ from gsba.view import faces_of, load_scene
 
 pytestmark = pytest.mark.slow
 
-BASELINE, NUM_FRAMES, WIDTH = 0.05, 16, 768
+BASELINE, RADIUS, NUM_FRAMES, WIDTH = 0.05, 3.0, 16, 768
 WALK_SETTINGS = SETTINGS.model_copy(update={"patches": RefineSettings().patches})
 
 
@@ -57,6 +59,21 @@ def _stabilised(scene, world_T_rig: np.ndarray, width: int, height: int) -> np.n
     ahead = positions[(f + 1) % NUM_FRAMES] - positions[f - 1]
     axis = world_T_rig[:3, :3].T @ ahead / np.linalg.norm(ahead) + np.array([0, 0.1, 0])
     return _through_lenses(scene, world_T_rig, axis / np.linalg.norm(axis), (width, height))
+
+
+def _stitched(scene, world_T_rig: np.ndarray, width: int, height: int) -> np.ndarray:
+    """As `_fixed`, stitched so that what is RADIUS away has no parallax between the lenses."""
+    halves, shape = [], (width, height)
+    centres = np.meshgrid(*(np.arange(pixels) + 0.5 for pixels in shape))
+    directions = bearings_from_erp(np.stack(centres, axis=-1), *shape)
+    for sign in (1, -1):
+        centre = np.array([0.0, 0, 0.5 * sign * BASELINE])
+        lens = world_T_rig.copy()
+        lens[:3, 3] += world_T_rig[:3, :3] @ centre
+        seen = render_erp(scene, lens, 2 * width, 2 * height)
+        pixels = erp_from_bearings(RADIUS * directions - centre, 2 * width, 2 * height) - 0.5
+        halves.append(cv2.remap(seen, *np.float32(np.moveaxis(pixels, -1, 0)), cv2.INTER_LINEAR))
+    return np.where(directions[..., 2:] > 0, *halves)
 
 
 def _walk(out: Path, camera, heading: str):
@@ -151,6 +168,21 @@ def test_lenses_that_turn_below_a_stabilised_panorama_are_found(tmp_path: Path) 
     assert errors.scale * camera["baseline"] == pytest.approx(BASELINE, rel=0.03)
     _, central = _refine(walk, tmp_path / "one", model="central")
     assert errors.ate.rmse < 0.2 * central.ate.rmse
+
+
+def test_a_radius_that_features_do_not_show_is_found_from_patches(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    walk = _walk(tmp_path / "walk", _stitched, "forward")
+    _, found = _refine(walk, tmp_path / "both")
+    monkeypatch.setattr(StitchRadius, "on_trial", lambda *_: None)
+    report, errors = _refine(walk, tmp_path / "patches")
+    radius = report["camera"]["stitch_radius"]
+    assert radius["taken"] and not radius["reason"]
+    off = radius["inverse"] - errors.scale / RADIUS
+    assert abs(off) < 4 * radius["inverse_sigma"] < 0.2 / RADIUS
+    assert errors.scale * report["camera"]["baseline"] == pytest.approx(BASELINE, rel=0.02)
+    assert errors.ate.rmse < 1.5 * found.ate.rmse
 
 
 def test_cube_faces_cannot_be_of_two_lenses() -> None:
