@@ -108,7 +108,7 @@ def estimate(rays: ObservedRays) -> LensCentres:
     gained = (
         f"{100 * float(shares.mean()):.1f} % of unseen parts' cost" if systems else "few frames"
     )
-    logger.info("lens centres: %s, %s%s", where, gained, untaken)
+    logger.debug("lens centres: %s, %s%s", where, gained, untaken)
     taken = replace(so_far, centre=np.zeros_like(found) if reason else found)
     return LensCentres(taken, found, covariance, shares, reason, counts)
 
@@ -151,7 +151,7 @@ def stitched_for(rays: ObservedRays) -> StitchRadius:
     sigma = float(np.sqrt(np.linalg.inv(total.hessian)[num, num] / total.curvature))
     verdict = cross_validate(systems, _step, lambda others: _step_to(others, -before))
     inverse_stitch_radius, shares = before + float(found[num]), verdict.shares
-    logger.info("inverse of the stitching radius: %.3f (sigma %.3f)", inverse_stitch_radius, sigma)
+    logger.debug("inverse of the stitching radius: %.3f (sigma %.3f)", inverse_stitch_radius, sigma)
     reason = ""
     if not verdict.predicts or inverse_stitch_radius < _MIN_SIGMAS * sigma:
         reason = "as well stitched at infinity"
