@@ -61,6 +61,30 @@ def show_log(level: int = logging.INFO) -> None:
         logger.propagate = False
 
 
+@contextmanager
+def held_until_computing() -> Iterator[None]:
+    """Hold lines of level INFO back until a stage is computed. Where none is, one line says so in
+    their place, as they repeat those of an earlier call. With `-v` nothing is held back."""
+    logger = logging.getLogger("gsba")
+    shown = [one for one in logger.handlers if not isinstance(one, _EventHandler)]
+    if logger.isEnabledFor(logging.DEBUG) or not shown:
+        yield
+        return
+    held = _HeldLines(shown[0])
+    shown[0].addFilter(held)
+    try:
+        with following(held):
+            yield
+        if held.resumed and not held.released:
+            held.drop()
+            stages, seconds = len(held.resumed), sum(held.resumed.values())
+            text = "nothing changed: %d stages of an earlier call resumed, which took %.0f s"
+            logger.info(text, stages, seconds)
+    finally:
+        held.release()
+        shown[0].removeFilter(held)
+
+
 def brief(text: str, most: int = 60) -> str:
     """Text of at most `most` characters; of a longer one the middle is left out."""
     kept = most // 2 - 1
@@ -156,6 +180,47 @@ def _bar(description: str, total: int | None, done: int) -> Iterator[Callable[[i
     with Progress(*columns, console=_console(), transient=True) as bar:
         task = bar.add_task(description, total=total, completed=done, note="")
         yield lambda count, note: bar.update(task, completed=count, note=note)
+
+
+class _HeldLines(logging.Filter):
+    """Filter of a handler that holds lines back until it is released, by work that begins."""
+
+    def __init__(self, handler: logging.Handler) -> None:
+        super().__init__()
+        self.released = False
+        self.resumed: dict[str, float] = {}  # stage -> seconds of the call that computed it
+        self._handler = handler
+        self._lines: list[logging.LogRecord] = []
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """False for a line that is held back."""
+        if self.released or record.levelno != logging.INFO:
+            return True
+        self._lines.append(record)
+        return False
+
+    def release(self) -> None:
+        """Show the lines that were held back, and hold no others."""
+        self.released = True
+        lines, self._lines = self._lines, []
+        for record in lines:
+            self._handler.handle(record)
+
+    def drop(self) -> None:
+        """Show none of the lines that were held back, and hold no others."""
+        self._lines = []
+        self.release()
+
+    def add(self, entry: Mapping[str, Any]) -> None:
+        """Take up an event; see `Follower`."""
+        if entry["event"] == "stage" and not self.released:
+            self.release()
+        elif entry["event"] == "done":
+            self.resumed[str(entry["name"])] = float(entry["seconds"])
+
+    def note(self) -> str:
+        """No text beside progress bars."""
+        return ""
 
 
 class _EventHandler(logging.Handler):

@@ -63,7 +63,7 @@ def guess(rays: ObservedRays) -> LensAxes:
     gains = np.array([cross_validate(parts, _newton_step).gains for parts in tried_parts])
     best = int(np.argmax(gains.sum(axis=1)))
     shares = gains / np.array([part.cost for part in systems])
-    logger.info("lens axes: gains %s %%", (100 * shares.mean(axis=1)).round(2).tolist())
+    logger.debug("lens axes: gains %s %%", (100 * shares.mean(axis=1)).round(2).tolist())
     gain = gains[best] - np.maximum(gains[0], 0)
     if not predicts(gain.sum(keepdims=True)):  # of all parts together: with rough axes none is
         # significant alone
@@ -89,7 +89,7 @@ def loosened(rays: ObservedRays) -> LensAxes:
     tried = [validated(models, np.full(2, width)) for width in TURNS]
     verdict = max(tried, key=lambda trial: float(trial.gains.sum()))
     shares = verdict.shares
-    logger.info("lens axes: %s %% of unseen points' cost", (100 * shares).round(2).tolist())
+    logger.debug("lens axes: %s %% of unseen points' cost", (100 * shares).round(2).tolist())
     if not verdict.predicts:
         return LensAxes(so_far, shares, "turning them does not predict unseen points", counts)
     return LensAxes(replace(so_far, axes=np.tile(np.eye(3), (num, 1, 1))), shares, "", counts)

@@ -112,7 +112,7 @@ def estimate(rays: ObservedRays) -> LensCentres:
     gained = (
         f"{100 * float(shares.mean()):.1f} % of unseen parts' cost" if systems else "few frames"
     )
-    logger.info("lens centres: %s, %s%s", where, gained, untaken)
+    logger.debug("lens centres: %s, %s%s", where, gained, untaken)
     taken = replace(so_far, centre=np.zeros_like(found) if reason else found)
     return LensCentres(taken, found, covariance, shares, reason, counts)
 
@@ -159,16 +159,15 @@ def stitched_for(rays: ObservedRays) -> StitchRadius:
         return StitchRadius(so_far, so_far.centre, 0.0, np.nan, unknown, "too few points")
     num = len(so_far.centre)
     found, total = _step(systems), summed(systems)
-    centre, shortened = so_far.centre + found[:num], 1.0
-    if so_far.centre @ centre > 0.1 * centre @ centre:
-        # directions are bent by the centre times the inverse of the radius
-        shortened = float(so_far.centre @ centre / (centre @ centre))
-    else:
-        centre = so_far.centre
+    centre = so_far.centre + found[:num]
+    # directions are bent by the centre times the inverse of the radius
+    shortened = float(so_far.centre @ centre / max(centre @ centre, 1e-300))
+    if not 0.1 < shortened < 10:  # beyond the reach of a linear model
+        centre, shortened = so_far.centre, 1.0
     sigma = float(np.sqrt(np.linalg.inv(total.hessian)[num, num] / total.curvature)) * shortened
     verdict = cross_validate(systems, _step, lambda others: _step_to(others, -before))
     inverse_stitch_radius, shares = before + shortened * float(found[num]), verdict.shares
-    logger.info("inverse of the stitching radius: %.3f (sigma %.3f)", inverse_stitch_radius, sigma)
+    logger.debug("inverse of the stitching radius: %.3f (sigma %.3f)", inverse_stitch_radius, sigma)
     reason = ""
     # of one number that is 4 standard deviations from none, unseen parts show less than of many
     sure = predicts(verdict.gains, least=1.0) and inverse_stitch_radius >= 4.0 * sigma

@@ -91,7 +91,7 @@ def estimate(rays: ObservedRays) -> CameraEstimate:
     duration = -float(total.gradient[0]) / curved / total.curvature
     sign = -1.0 if duration < 0 else 1.0  # rows are read the other way
     found = CameraEstimate(lenses, abs(duration), sigma, gains=verdict.shares, counts=counts)
-    logger.info("readout: %.2f ms (sigma %.2f)", 1e3 * abs(duration), 1e3 * sigma)
+    logger.debug("readout: %.2f ms (sigma %.2f)", 1e3 * abs(duration), 1e3 * sigma)
     if not verdict.predicts or abs(duration) < _MIN_SIGMAS * sigma:
         return replace(found, reason="motion during the readout does not predict unseen parts")
     others = [other for way, other in enumerate(verdicts) if way != best]

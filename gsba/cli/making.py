@@ -19,7 +19,7 @@ from gsba.cli.refining import (
 )
 from gsba.cli.results import cameras_of, shutter_of
 from gsba.cli.splat import BackendName, FaceSize, Iterations, splat_settings, train_on
-from gsba.log import GsbaError
+from gsba.log import GsbaError, held_until_computing
 
 logger = logging.getLogger(__name__)
 
@@ -57,12 +57,13 @@ def splat(
     if to is not None:
         format_of(to)  # fails before hours of work
     training = splat_settings(iterations, face_size, backend)
-    out = out or run_folder(frames)
     camera_name = [f'camera.name="{camera}"'] if camera is not None else []
     settings = settings_of(config, [*camera_name, *(overrides or ())], None)
     with loading():
         from gsba import pipeline
-    result = pipeline.refine(frames, None, out, settings)
+    with held_until_computing():
+        out = out or run_folder(frames)
+        result = pipeline.refine(frames, None, out, settings)
     if to is None:
         train_on(out, training)
         typer.echo(f"walk around in it: gsba view {out}")

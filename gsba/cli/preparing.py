@@ -80,10 +80,11 @@ def _chosen_by_odometry(
     """Trajectory file beside the folder of frames, with the poses of frames that odometry chose."""
     from gsba import odometry
     from gsba.config_file import validated
+    from gsba.frames.files import EXTRACTED
     from gsba.odometry.walk import write_chosen
 
     path = out.with_name(f"{out.name}.tum")
-    if path.is_file() and (out / "extract.json").is_file() and not fresh:
+    if path.is_file() and (out / EXTRACTED).is_file() and not fresh:
         return path  # chosen before
     settings = validated({"odometry": {} if frames is None else {"max_frames": frames}}).odometry
     panoramas = odometry.without_carrier(odometry.of_video(video, from_s=part[0], to_s=part[1]))

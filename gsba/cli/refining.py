@@ -10,7 +10,7 @@ import typer
 
 from gsba.cli.app import command, loading
 from gsba.cli.recordings import grouped, recordings_of
-from gsba.log import GsbaError
+from gsba.log import GsbaError, held_until_computing
 
 if TYPE_CHECKING:
     from gsba.config import RefineSettings
@@ -258,7 +258,7 @@ def refine(
     shared |= {"masks": masks or "auto", "calibration": calibration}
     shared["circles"] = [_circle(text) for text in circle or ()]
     own: dict[str, Any] = {"keyframes": keyframes, "timestamps": timestamps, "imu": imu}
-    with connected(cluster) as client:
+    with held_until_computing(), connected(cluster) as client:
         run: dict[str, Any] = {"segment": segment, "fresh": fresh, "client": client}
         if several:
             recordings = recordings_of(given, recording or (), shared)
@@ -280,8 +280,11 @@ def refine(
 def run_folder(frames: Path) -> Path:
     """Folder of a run, in the working folder, named after its frames or its video."""
     name = frames.resolve().stem if frames.is_file() else f"{frames.resolve().name}-run"
+    from gsba.store.folder import is_run_folder
+
     folder = Path(name)
-    if folder.resolve() == frames.resolve() or folder.is_file():
+    others = folder.is_dir() and any(folder.iterdir()) and not is_run_folder(folder)
+    if folder.resolve() == frames.resolve() or folder.is_file() or others:
         folder = Path(f"{name}-run")
     logging.getLogger(__name__).info("results go to %s", folder)
     return folder

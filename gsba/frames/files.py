@@ -14,6 +14,7 @@ from gsba.frames.headers import JPEG_END, Header, header_of
 from gsba.log import GsbaError
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".insp")  # the last: JPEG
+EXTRACTED = "extract.json"  # marker of a folder of extracted frames
 
 _MAX_PADDING_BYTES, _PADDING_VALUES = 1024, (b"\0", b"\xff")  # largest number of padding bytes
 # before the end, and their values

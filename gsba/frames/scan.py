@@ -18,7 +18,15 @@ from gsba.camera.factory_lenses import FactoryLenses
 from gsba.camera.fisheye import Rig
 from gsba.frames.dual_fisheye import width_of
 from gsba.frames.factory_start import FACTORY_FILE, find_factory_lenses, starting_lenses
-from gsba.frames.files import decode, entries_of, image_header, image_size, images_by_name, is_image
+from gsba.frames.files import (
+    EXTRACTED,
+    decode,
+    entries_of,
+    image_header,
+    image_size,
+    images_by_name,
+    is_image,
+)
 from gsba.frames.headers import Header
 from gsba.frames.image_circles import ImageCircle
 from gsba.frames.masks import find_masks
@@ -278,7 +286,7 @@ def _find_frames(folder: Path) -> tuple[str, tuple[str, ...], dict[str, tuple[Pa
             f"('{next(iter(subfolders.values())).name}'); keep one of them"
         )
     others = [p.name for p in entries if p not in images and p not in subfolders.values()]
-    others = [name for name in others if name not in (_TIMES_FILE, FACTORY_FILE)]
+    others = [name for name in others if name not in (_TIMES_FILE, FACTORY_FILE, EXTRACTED)]
     if others:
         _log.info("%s: ignored %d other entries: %s", folder, len(others), ", ".join(others[:5]))
     places = [folder, *(path for path in entries if path.name.lower() in FACES and path.is_dir())]

@@ -150,7 +150,7 @@ def is_settled(before: State, state: State, number: int) -> bool:
         covariances, joint = adjustment.pose_covariances(solution, keypoints, context, prior.parts)
         former = before.solution.world_T_rigs
         moved = map_strength.step_motion(former, solution.world_T_rigs, covariances, joint)
-        logger.info("aligned %d times, steps moved by %.2f sigma", number - 1, moved)
+        logger.debug("aligned %d times, steps moved by %.2f sigma", number - 1, moved)
         return moved
 
     moved = run.stage(f"settled_aligned{number}", run.solving_key(), compute, float)

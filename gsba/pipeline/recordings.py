@@ -24,7 +24,7 @@ from gsba.pipeline.run import Evidence, RecordingEvidence
 from gsba.pipeline.stage_titles import title_of
 from gsba.placement import check
 from gsba.store import cluster
-from gsba.store.store import RunStore
+from gsba.store.store import RunStore, StageRecord
 from gsba.trajectory.conventions import Convention
 from gsba.trajectory.metashape import NamedPoses
 from gsba.types import FrameSet, RunStart, Trajectory
@@ -141,7 +141,7 @@ def refine_each(
         tuple(name for name, one in choices.items() if not one.carrier),
     )
     origin = {name: path for one in given for name, path in one.files.items()}
-    given, fresh = _with_videos(given, out, origin, settings, fresh)
+    given, fresh, extracted = _with_videos(given, out, origin, settings, fresh)
     found = {one.name: one.scanned() for one in given}
     plain_of = dict.fromkeys(found, plain)
     if adapt is not None:
@@ -164,6 +164,7 @@ def refine_each(
     start = Start.of(frames, evidence, settings)
     hired = cluster.hire(client, frames.paths[0][0], settings)
     with RunStore(out, origin, fresh, hired, title_of) as store:
+        store.records.update(extracted)  # their time is the run's, too
         return refine_from(store, settings, chosen, evidence, start, given[0].folder, None)
 
 
@@ -239,16 +240,17 @@ def _with_videos(
     origin: dict[str, Path],
     settings: RefineSettings,
     fresh: bool,
-) -> tuple[list[_Given], bool]:
-    """Recordings with the frames of videos extracted, and whether to forget an earlier run yet."""
+) -> tuple[list[_Given], bool, dict[str, StageRecord]]:
+    """Recordings with the frames of videos extracted, whether to forget an earlier run yet, and
+    the stages that extracted them."""
     if not any(video.is_video(one.folder) for one in given):
-        return list(given), fresh
+        return list(given), fresh, {}
     inputs.check_positions(settings)
     ready = []
     with RunStore(out, origin, fresh, title_of=title_of) as store:
         for one in given:
             ready.append(_extracted(one, store, settings) if video.is_video(one.folder) else one)
-    return ready, False
+    return ready, False, store.records
 
 
 def _extracted(one: _Given, store: RunStore, settings: RefineSettings) -> _Given:

@@ -41,7 +41,7 @@ from gsba.placement import check
 from gsba.report.html import add_odometry
 from gsba.report.time_left import LoggedTimeLeft, tell_size
 from gsba.store import cluster
-from gsba.store.store import RunStore
+from gsba.store.store import RunStore, StageRecord
 from gsba.trajectory.conventions import Convention
 from gsba.trajectory.misread import TurnedAboutForwardError
 from gsba.types import CoarsePoses, FrameSet, Reconstruction, RunStart, VerifiedPairs
@@ -106,13 +106,14 @@ def refine(
     chosen, readings = merging.choose(masks, segment), inputs.read_gyro(imu, frames)
     origin = {"frames": frames} | inputs.trajectory_files(trajectory, keyframes)
     convention, walk = Convention.parse(settings.read.trajectory_format), None
-    left = LoggedTimeLeft()
+    left, extracted = LoggedTimeLeft(), dict[str, StageRecord]()
     given = inputs.read_trajectories(origin, timestamps, convention)  # fails before decoding
     if video.is_video(frames):
         by_odometry = chosen if inputs.follows(settings.video, fps, odometry, given) else None
         inputs.check_positions(settings)
         with RunStore(out, origin, fresh, title_of=title_of) as store, following(left):
             walk = inputs.extract_video(store, frames, settings, fps, by_odometry, calibration)
+            extracted = store.records
         frames, timestamps, fps, fresh = out / "frames", None, None, False
     if walk is not None:  # made of these very images: no evidence beside them
         given, settings = walk.pieces(), inputs.for_odometry(settings)
@@ -124,6 +125,7 @@ def refine(
     start = Start.of(found, evidence, settings)
     hired = cluster.hire(client, frames, settings)
     with RunStore(out, origin, fresh, hired, title_of) as store, following(left):
+        store.records.update(extracted)  # their time is the run's, too
         return refine_from(store, settings, chosen, evidence, start, origin["frames"], walk)
 
 

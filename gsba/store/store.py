@@ -288,8 +288,8 @@ class RunStore:
         """Log in a line how many stages were resumed since the last such line."""
         if self._resumed:
             seconds = sum(self._resumed.values())
-            text = "resumed %d stages of an earlier call, which took %.0f s"
-            logger.info(text, len(self._resumed), seconds)
+            num = f"{len(self._resumed)} stage{'s' * (len(self._resumed) > 1)}"
+            logger.info("resumed %s of an earlier call, which took %.0f s", num, seconds)
             self._resumed.clear()
 
 

@@ -121,7 +121,8 @@ def associate(frames: FrameSet, trajectory: Trajectory, settings: ReadSettings) 
         seen, PoseSource.SLAM, np.where(outside, PoseSource.EXTRAPOLATED, PoseSource.INTERPOLATED)
     ).astype(np.uint8)
     counts = np.bincount(sources, minlength=len(PoseSource))
-    _log.info(
+    _log.log(
+        logging.INFO if (sources != PoseSource.SLAM).any() else logging.DEBUG,
         "coarse poses: %d from the trajectory, %d interpolated, %d extrapolated",
         *(counts[s] for s in PoseSource if s != PoseSource.NONE),
     )

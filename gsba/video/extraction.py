@@ -27,6 +27,7 @@ from gsba.frames.factory_start import (
     FACTORY_FILE,
     write_factory_calibration,
 )
+from gsba.frames.files import EXTRACTED
 from gsba.frames.times import read_times
 from gsba.log import GsbaError, track
 from gsba.store.records import RecordError, typed
@@ -50,7 +51,6 @@ from gsba.video.recording import (
 
 logger = logging.getLogger(__name__)
 
-MARKER = "extract.json"
 TIMES = "timestamps.csv"
 _JOURNAL = "extract.partial.csv"  # frames written so far; deleted when all are written
 _JPEG_QUALITY = 95
@@ -282,7 +282,7 @@ def _take_over(out: Path, key: str, replace: bool) -> Counts | None:
         return None
     refuse_links(out)
     try:
-        marker = json.loads((out / MARKER).read_text(encoding="utf-8"))
+        marker = json.loads((out / EXTRACTED).read_text(encoding="utf-8"))
         counts = typed(marker["counts"], Counts | None)  # type: ignore[arg-type]
         known = (LENSES, TRACKS) if "lenses" in marker else ()
         lenses = next((names for names in known if list(names) == marker["lenses"]), LENSES[:0])
@@ -302,7 +302,7 @@ def _take_over(out: Path, key: str, replace: bool) -> Counts | None:
     with disk_errors(out):
         names = [*written, *(kept.name for kept in _read_journal(out, lenses))]
         _remove_images(out, lenses, names)
-        for name in (TIMES, FACTORY_FILE, _JOURNAL, MARKER):
+        for name in (TIMES, FACTORY_FILE, _JOURNAL, EXTRACTED):
             (out / name).unlink(missing_ok=True)
     return None
 
@@ -332,7 +332,7 @@ def _write_marker(
     if lenses:
         marker["lenses"] = list(lenses)
     text = json.dumps(marker, indent=1, ensure_ascii=False) + "\n"
-    write_text(out / MARKER, text)
+    write_text(out / EXTRACTED, text)
 
 
 def _append(path: Path, kept: _Kept) -> None:

@@ -110,6 +110,10 @@ def test_a_video_is_refined_from_its_own_odometry(
     assert (out / "odometry/walk.tum").is_file() and (out / "odometry/poses.csv").is_file()
     assert "Camera path by the odometry on the video" in (out / "report.html").read_text()
     assert '"odometry":{"summary":' in (out / "report.html").read_text()
+    report = json.loads((out / "report.json").read_text())
+    followed = report["stages"][0]
+    assert followed["title"] == "track the video"
+    assert report["summary"]["seconds"] > followed["seconds"] > 0
     chosen = read_trajectory(out / "odometry/chosen.tum")
     assert len(list((out / "frames").glob("*.jpg"))) == len(chosen.timestamps)
     assert _ate(out / "trajectory.tum", walk) < 0.005

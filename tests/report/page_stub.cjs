@@ -29,6 +29,7 @@ globalThis.document = {
   getElementById: id => byId[id] ??= element(id),
   createElement: tag => element(tag), createElementNS: (_, tag) => element(tag),
 };
+document.querySelectorAll = () => [];
 globalThis.window = { devicePixelRatio: 2, addEventListener() {} };
 globalThis.location = { protocol: "file:", pathname: "/runs/a%20walk/report.html" };
 globalThis.getSelection = () => ({ selectAllChildren() {} });

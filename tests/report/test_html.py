@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -320,10 +321,10 @@ def test_patches_show_what_does_not_fit(tmp_path: Path) -> None:
 
 
 def test_terms_of_the_page_are_those_of_the_glossary(page: Path) -> None:
-    listed = re.findall(r'^  "?([a-z ]+)"?: "(.+)",$', page.read_text(encoding="utf-8"), re.M)
+    listed = re.findall(r'^  "?([a-zσ ]+)"?: "(.+)",$', page.read_text(encoding="utf-8"), re.M)
     glossary = (Path(__file__).parents[2] / "docs" / "glossary.md").read_text(encoding="utf-8")
     rows = re.sub(r"\[([^]]+)\]\([^)]*\)", r"\1", glossary)
-    assert {"carrier", "gauge", "strength", "map unit"} <= dict(listed).keys()
+    assert {"carrier", "gauge", "strength", "map unit", "σ"} <= dict(listed).keys()
     assert [row for row in listed if f"| {row[0]} | {row[1]} |" not in rows] == []
 
 
@@ -365,6 +366,24 @@ def test_splats_before_and_after_lie_over_one_another(page: Path, tmp_path: Path
         add_splats(path, picture, sources)
         assert _over(path) == [before, ("splat on refined poses", 100)]
         assert _run_script(path)[0] == 6
+
+
+def test_a_page_written_again_keeps_splats_and_scan_of_the_same_map(tmp_path: Path) -> None:
+    frames, result = scene.panoramas(tmp_path / "images"), scene.reconstruction()
+    path, _ = _write(tmp_path, frames, result)
+    picture = tmp_path / "000003.png"
+    write_image(picture, np.full((64, 192, 3), 90, np.uint8))
+    add_splats(path, picture, ["refined"])
+    content = {"scan": "hall.ply", "after": {"median": 1.0}}
+    add_scan(path, content)
+    _write(tmp_path, frames, result)
+    kept = _data(path.read_text(encoding="utf-8"))
+    assert kept["splat"]["frame"] == "000003" and kept["scan"] == content
+    moved = result.world_T_rigs.copy()
+    moved[1, :3, 3] += 0.5
+    _write(tmp_path, frames, replace(result, world_T_rigs=moved))
+    other = _data(path.read_text(encoding="utf-8"))
+    assert other["splat"] is None and other["scan"] is None
 
 
 def test_browser_shows_it(page: Path) -> None:

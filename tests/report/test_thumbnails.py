@@ -56,10 +56,13 @@ def test_long_runs_show_some_frames_within_the_budget(
 ) -> None:
     monkeypatch.setattr(thumbnails, "MAX_PICTURES", 3)
     best = frame_pictures(frames, scene.reconstruction(), None)
-    assert best["shown"] == [0, 4, 8] and decoded(best["jpegs"][1]).shape == (128, 256, 3)
+    assert best["shown"] == [0, 4, 8] and decoded(best["jpegs"][1]).shape == (256, 512, 3)
+    monkeypatch.setattr(thumbnails, "_MAX_BYTES", 3 * 9_000)
+    many = frame_pictures(frames, scene.reconstruction(), None)["jpegs"]
+    assert decoded(many[1]).shape == (128, 256, 3)
     monkeypatch.setattr(thumbnails, "_MAX_BYTES", 1)
     small = frame_pictures(frames, scene.reconstruction(), None)["jpegs"]
-    assert sum(map(len, small)) < 0.7 * sum(map(len, best["jpegs"]))
+    assert sum(map(len, small)) < 0.7 * sum(map(len, many))
 
 
 def test_a_mask_of_all_frames_is_held_once(frames: FrameSet, tmp_path: Path) -> None:

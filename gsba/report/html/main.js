@@ -215,4 +215,5 @@ pictures();
 worst();
 cost();
 stages();
+linkTerms();
 redraw();

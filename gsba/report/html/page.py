@@ -73,7 +73,18 @@ def write_html(
         "splat": None,
         "odometry": None,
     }
+    data |= _kept_of(path, data["map"])
     write_text(path, _assembled(_dumped(data)))
+
+
+def _kept_of(path: Path, shown: Mapping[str, Any]) -> dict[str, Any]:
+    """What was added to an earlier page of the same poses and points: splats, and a scan."""
+    try:
+        earlier = _read(path)
+        same = earlier["map"] == json.loads(_dumped(shown))
+        return {name: earlier[name] for name in ("scan", "splat")} if same else {}
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
 
 
 def add_scan(path: Path, content: Mapping[str, Any]) -> None:
@@ -137,12 +148,17 @@ def _add(path: Path, name: str, content: Mapping[str, Any]) -> None:
     if not path.exists():
         return
     try:
-        text = path.read_text(encoding="utf-8")
-        data = json.loads(text.partition(_BEFORE_DATA)[2].partition(_AFTER_DATA)[0])
+        data = _read(path)
         data[name] = content
     except (OSError, ValueError, KeyError, TypeError):
         raise GsbaError(f"{path} is not the report page of a run: refine again") from None
     write_text(path, _assembled(_dumped(data)))
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """Data of a page. Raises OSError, ValueError: it cannot be read, or holds none."""
+    text = path.read_text(encoding="utf-8")
+    return json.loads(text.partition(_BEFORE_DATA)[2].partition(_AFTER_DATA)[0])
 
 
 def _dumped(data: Mapping[str, Any]) -> str:

@@ -19,10 +19,10 @@ from gsba.types import FrameSet, PictureFormat, Reconstruction
 logger = logging.getLogger(__name__)
 
 MAX_PICTURES = 500
-_WIDTH = 256  # pixels across a picture
+_WIDTH, _LARGE_WIDTH = 256, 512  # pixels across a picture, and across one where there are few
 _MASK_WIDTH = 128
 _MAX_BYTES = 2_600_000  # of all pictures; a third more in base64
-_LARGEST = 9_000  # bytes of a picture, where there are few
+_LARGEST, _LARGEST_WIDE = 9_000, 24_000  # bytes of a picture of either width
 _MAX_CANDIDATES, _MAX_MATCHES = 60, 24  # matches of a pair that are looked at, and drawn
 _STEPS = 72  # points of a circle or a seam
 
@@ -45,11 +45,12 @@ def frame_pictures(
     num = len(frames)
     wanted = np.unique(np.linspace(0, num - 1, min(num, MAX_PICTURES)).astype(int)) if num else []
     shown, jpegs, masks, mask = list[int](), list[str](), dict[bytes, int](), list[int]()
-    kept = dict[Any, int]()
+    kept, room = dict[Any, int](), _MAX_BYTES // max(len(wanted), 1)
+    large = room >= _LARGEST_WIDE
+    width, room = (_LARGE_WIDTH, _LARGEST_WIDE) if large else (_WIDTH, min(room, _LARGEST))
     for f in (int(f) for f in wanted):
         try:
-            room = min(_MAX_BYTES // len(wanted), _LARGEST)
-            jpegs.append(jpeg_text(small_panorama(frames, f, _WIDTH), (75, 60, 45, 30, 20), room))
+            jpegs.append(jpeg_text(small_panorama(frames, f, width), (75, 60, 45, 30, 20), room))
         except GsbaError as error:
             logger.warning("report.html: no image of frame %s (%s)", frames.names[f], error)
             continue
