@@ -9,11 +9,13 @@ from pixels import pixel_centres
 from scipy.spatial.transform import Rotation
 from synthetic import unit
 
+from gsba import load_run
 from gsba.camera.lens import Lenses
 from gsba.camera.rig import RIG_R_FACE
 from gsba.camera.sphere import bearings_from_erp
 from gsba.disk import encoded_image, write_bytes, write_image
 from gsba.geometry import inverse, pose
+from gsba.store.records import save_record
 from gsba.types import FACES, FrameSet, PictureFormat, PoseStatus, Reconstruction
 
 NUM_FRAMES = 9
@@ -37,6 +39,13 @@ POINTS = np.array(
 COLORS = np.array(
     [[255, 60, 60], [60, 255, 60], [60, 60, 255], [255, 255, 60], [60, 255, 255]] * 2, np.uint8
 )[: len(POINTS)]
+
+
+def save_run(root: Path) -> None:
+    """Save the scene as the records of a finished run, in whose folder the rest is."""
+    save_record(root / "stages/reconstruction.npz", reconstruction(), {})
+    save_record(root / "stages/frames.npz", panoramas(root.parent / "frames"), {})
+    load_run(root)  # whose reader takes them
 
 
 def poses() -> np.ndarray:

@@ -56,7 +56,7 @@ def _directions(lens: Fisheye) -> np.ndarray:
 
 @lru_cache(maxsize=32)
 def picture(lens: Fisheye, seen=colours, half_fov: float = HALF_FOV) -> np.ndarray:
-    """What a lens sees, (h, w, 3) uint8 RGB, black beyond its circle; tests only read it."""
+    """Picture (h, w, 3) uint8 RGB of a lens, black beyond its circle; cached: not to be changed."""
     directions = _directions(lens)
     axis = Rotation.from_rotvec(lens.rotation).as_matrix()[:, 2]
     within = directions @ axis > np.cos(half_fov)

@@ -27,6 +27,7 @@ logger = logging.getLogger(__name__)
 _MIN_SIGMAS = 5.0  # least distance from one centre, in standard deviations
 _MIN_TRIAL_SIGMAS = 2.0  # the same before matches are found with the centres, which may raise the
 # distance threefold
+_MIN_RADIUS_SIGMAS = 4.0  # least inverse of the stitching radius, in standard deviations
 _UNMODELLED = 0.005  # standard deviation of what no covariance shows, of the lenses' distance and
 # the radius: measured on rendered walks (benchmarks/results/camera.md)
 
@@ -169,9 +170,9 @@ def stitched_for(rays: ObservedRays) -> StitchRadius:
     inverse_stitch_radius, shares = before + shortened * float(found[num]), verdict.shares
     logger.debug("inverse of the stitching radius: %.3f (sigma %.3f)", inverse_stitch_radius, sigma)
     reason = ""
-    # of one number that is 4 standard deviations from none, unseen parts show less than of many
-    sure = predicts(verdict.gains, least=1.0) and inverse_stitch_radius >= 4.0 * sigma
-    if not sure:
+    # one number gains less on unseen parts than many do
+    predicted = predicts(verdict.gains, least=1.0)
+    if not predicted or inverse_stitch_radius < _MIN_RADIUS_SIGMAS * sigma:
         reason = "as well stitched at infinity"
     lenses = replace(so_far, inverse_stitch_radius=0.0 if reason else inverse_stitch_radius)
     return StitchRadius(lenses, centre, inverse_stitch_radius, sigma, shares, reason)

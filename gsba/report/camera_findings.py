@@ -6,12 +6,7 @@ import numpy as np
 
 from gsba.bundle.camera_adjustment import CameraSigmas
 from gsba.bundle.lens_axes import LensAxes
-from gsba.bundle.lens_centres import (
-    LensCentres,
-    StitchRadius,
-    baseline_of,
-    radius_sigma,
-)
+from gsba.bundle.lens_centres import LensCentres, StitchRadius, baseline_of, radius_sigma
 from gsba.bundle.readout import CameraEstimate
 from gsba.bundle.self_calibration import SelfCalibration, first_of, num_parameters, undetermined
 from gsba.camera.fisheye import lens_names
@@ -81,8 +76,7 @@ def of_camera(
     if radius is not None:
         deviation = radius.sigma
         if inverse_stitch_radius and known is not None:
-            adjusted = known.inverse_stitch_radius_sigma
-            deviation = radius_sigma(inverse_stitch_radius, adjusted)
+            deviation = radius_sigma(inverse_stitch_radius, known.inverse_stitch_radius_sigma)
         content["stitch_radius"] = {
             "taken": not radius.reason,
             "reason": radius.reason,

@@ -28,9 +28,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("made") / "run"
     (root / "stages").mkdir(parents=True)
     (root / "gsba.json").write_text('{"origin": {}, "wrote": []}')
-    save_record(root / "stages/reconstruction.npz", scene.reconstruction(), {})
-    save_record(root / "stages/frames.npz", scene.panoramas(root.parent / "frames"), {})
-    load_run(root)
+    scene.save_run(root)
     return root
 
 

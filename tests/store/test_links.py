@@ -10,11 +10,9 @@ import numpy as np
 import pytest
 from command import run_gsba
 
-from gsba import load_run
 from gsba.disk import refuse_links
 from gsba.export.folder import output_folder
 from gsba.log import GsbaError
-from gsba.store.records import save_record
 from gsba.store.store import RunStore
 from gsba.types import Counts
 
@@ -38,9 +36,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with RunStore(root, {}) as store:
         store.stage("some", None, lambda: Counts(3, 2, "frames"), Counts)
         list(store.per_frame("many", None, {"a": 1}, lambda _: np.zeros(3), np.ndarray))
-    save_record(root / "stages/reconstruction.npz", scene.reconstruction(), {})
-    save_record(root / "stages/frames.npz", scene.panoramas(root.parent / "frames"), {})
-    load_run(root)
+    scene.save_run(root)
     return root
 
 

@@ -78,7 +78,7 @@ def write_html(
 
 
 def _kept_of(path: Path, shown: Mapping[str, Any]) -> dict[str, Any]:
-    """What was added to an earlier page of the same poses and points: splats, and a scan."""
+    """Splats and distances to a scan of an earlier page, if its poses and points are the same."""
     try:
         earlier = _read(path)
         same = earlier["map"] == json.loads(_dumped(shown))
