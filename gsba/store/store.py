@@ -412,8 +412,8 @@ def digest(*parts: object) -> str:
 
 
 def fingerprint(paths: Iterable[Path | None]) -> tuple[tuple[str, int, int], ...]:
-    """Path, size in bytes and modification time in ns of each input file."""
-    stats = ((path, path.stat()) for path in paths if path is not None)
+    """Resolved path, size in bytes and modification time in ns of each input file."""
+    stats = ((path.resolve(), path.stat()) for path in paths if path is not None)
     return tuple((str(path), stat.st_size, stat.st_mtime_ns) for path, stat in stats)
 
 

@@ -85,7 +85,8 @@ def extract(video: Path, out: Path, settings: VideoSettings, replace: bool = Fal
         raise GsbaError(f"{video} is a folder: give a video (frames need no extraction)")
     if not video.is_file():
         raise GsbaError(f"{video}: no such file")
-    key = digest(__version__, settings, fingerprint([*files_of(video), trajectory]))
+    chosen = settings.model_copy(update={"at": None})  # its file is an input
+    key = digest(__version__, chosen, fingerprint([*files_of(video), trajectory]))
     done = _take_over(out, key, replace)
     if done is not None:
         logger.info("%s: %d frames, extracted before", out, done.kept)

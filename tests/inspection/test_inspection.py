@@ -2,6 +2,7 @@
 
 import json
 import shlex
+import shutil
 import sys
 from pathlib import Path
 
@@ -37,6 +38,20 @@ def _panoramas(folder: Path, num: int = 4) -> Path:
         exif.get_ifd(0x8825).update({1: "N", 2: (48.0, 10.0, n), 3: "E", 4: (11.0, 30.0, 0.0)})
         Image.fromarray(pixels).save(folder / f"pano{n}.jpg", exif=exif)
     return folder
+
+
+def test_a_run_tells_its_result_or_how_to_go_on(plain_run: Path, tmp_path: Path) -> None:
+    found = inspect(plain_run)
+    verdict = json.loads((plain_run / "report.json").read_text())["verdict"]["sentence"]
+    assert _facts(found)["verdict"] == verdict and not found.problem
+    assert found.command == shlex.join(["gsba", "view", str(plain_run)])
+    copy = Path(shutil.copytree(plain_run, tmp_path / "stopped"))
+    (copy / "report.json").unlink()
+    stopped = inspect(copy)
+    assert "not finished" in _facts(stopped)["run"]
+    facts = _facts(stopped)
+    inputs = [facts["frames"], facts["trajectory"], "--out", str(copy)]
+    assert stopped.command == shlex.join(["gsba", "refine", *inputs])
 
 
 def test_panoramas_with_tags(tmp_path: Path) -> None:

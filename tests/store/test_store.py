@@ -453,7 +453,9 @@ def test_atomic_write_keeps_the_old_file_when_the_writer_fails(tmp_path: Path) -
     assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
 
 
-def test_keys_see_settings_paths_and_file_changes(tmp_path: Path) -> None:
+def test_keys_see_settings_paths_and_file_changes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     class Settings(BaseModel):
         sigma: float = 0.5
 
@@ -466,6 +468,8 @@ def test_keys_see_settings_paths_and_file_changes(tmp_path: Path) -> None:
     before = fingerprint([path, None])
     path.write_text("longer")
     assert len(before) == 1 and fingerprint([path, None]) != before
+    monkeypatch.chdir(tmp_path)
+    assert fingerprint([Path("frame.jpg")]) == fingerprint([path])
 
 
 def test_a_resumed_call_says_so_in_one_line(
