@@ -172,8 +172,8 @@ function stages() {
       table.append(make("tr", {},
         make("td", {}, ...termed(i ? "" : (stage.title || stage.name) + (stage.workers ? `, ${stage.workers} workers` : ""))), make("td", { class: "n" }, i ? "" : stage.seconds.toFixed(1)),
         make("td", {}, i ? "" : make("div", { class: "bar" }, make("i", { style: `width:${100 * stage.seconds / longest}%` }))),
-        make("td", { class: "n" }, c ? `${num(c.received)} ${c.unit}` : ""), make("td", { class: "n" }, c ? num(c.kept) : ""),
-        make("td", {}, dropped)));
+        make("td", { class: "n", "data-head": "received " }, c ? `${num(c.received)} ${c.unit}` : ""),
+        make("td", { class: "n", "data-head": "kept " }, c ? num(c.kept) : ""), make("td", { "data-head": "dropped " }, dropped)));
     });
   }
 }
