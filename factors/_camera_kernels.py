@@ -16,6 +16,7 @@ measured one, whitened.
 
 import numpy as np
 
+from factors._kernels import tangent_axes
 from factors.compiled import kernel_and_part
 from factors.robust import rho_and_weight
 
@@ -69,11 +70,7 @@ def _times_transposed(matrix, v, out):
 def _direction_residual(measured, whitener, p, r, by_p):
     """Whitened log map r (2,) of a unit direction p at a measured one, and its Jacobian by p."""
     mx, my, mz = measured
-    sign = 1.0 if mz >= 0 else -1.0  # as `factors.bearing.tangent_basis`
-    a = -1.0 / (sign + mz)
-    b = mx * my * a
-    ax, ay, az = 1.0 + sign * mx * mx * a, sign * b, -sign * mx
-    bx, by, bz = b, sign + my * my * a, -my
+    ax, ay, az, bx, by, bz = tangent_axes(mx, my, mz)
     x = ax * p[0] + ay * p[1] + az * p[2]
     y = bx * p[0] + by * p[1] + bz * p[2]
     z = mx * p[0] + my * p[1] + mz * p[2]

@@ -1,6 +1,6 @@
 """Observations of landmarks: families give them as terms, kernels read them sorted."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from typing import NamedTuple, Protocol
 
@@ -145,8 +145,13 @@ def sort_observations(
     names = list(dict.fromkeys(term.name for term in terms))
     given = [term.kind.address for term in terms if not isinstance(term.kind, int)]
     kinds, families = np.zeros(len(frames), np.uint8), np.zeros(len(frames), np.uint8)
+    measured, num_cameras = list[np.ndarray](), 0
     for term, span in zip(terms, spans, strict=True):
-        kind = term.kind
+        kind, own = term.kind, len(term.cameras())
+        # cameras are numbered on from those of the terms before
+        rows = term.measurements()
+        measured.append(rows + np.array([0, 0, num_cameras]) if own else rows)
+        num_cameras += own
         kinds[span] = kind if isinstance(kind, int) else GIVEN + given.index(kind.address)
         families[span] = names.index(term.name)
     obs = Observations(
@@ -154,7 +159,7 @@ def sort_observations(
         frames=frames[order],
         kinds=kinds[order],
         families=families[order],
-        measurements=ordered(_measurements(terms)),
+        measurements=ordered(measured),
         whiteners=ordered(term.whiteners() for term in terms),
         origins=ordered(
             np.zeros((len(term.frames), 3)) if term.origins_rig is None else term.origins_rig
@@ -166,15 +171,6 @@ def sort_observations(
         loss_scale=float(loss.scale),
     )
     return obs, order, point_order
-
-
-def _measurements(terms: Sequence[Term]) -> Iterator[np.ndarray]:
-    """Measurements of each term, whose cameras are numbered on from those of the terms before."""
-    num_cameras = 0
-    for term in terms:
-        own = len(term.cameras())
-        yield term.measurements() + np.array([0, 0, num_cameras]) if own else term.measurements()
-        num_cameras += own
 
 
 def visits_of(offsets: np.ndarray, frames: np.ndarray, num_frames: int, most: int) -> list[Visits]:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from factors.compiled import kernel_and_part
+from factors.sphere_image import spline_weights, tap
 
 # States of a sighting: aligned; without texture; masked; shifted too far; not converged in the
 # allowed steps; uncorrelated.
@@ -78,27 +79,6 @@ def _arctan2(y, x):
     angle = np.pi / 2 - angle if q > p else angle
     angle = np.pi - angle if x < 0 else angle
     return -angle if y < 0 else angle
-
-
-@_part
-def _weights(t):
-    """Cubic B-spline weights of the four samples around a position t in [0, 1) after the second."""
-    s = np.float32(1.0) - t
-    sixth = np.float32(1.0 / 6.0)
-    w0, w3 = sixth * s * s * s, sixth * t * t * t
-    w1 = np.float32(2.0 / 3.0) - t * t * (np.float32(1.0) - np.float32(0.5) * t)
-    return w0, w1, np.float32(1.0) - w0 - w1 - w3, w3
-
-
-@_part
-def _tap(coefficients, row, column):
-    """Coefficient at any row and column, continued across the seam and the poles."""
-    height, width = coefficients.shape
-    if row < 0:
-        row, column = -1 - row, column + width // 2
-    elif row >= height:
-        row, column = 2 * height - 1 - row, column + width // 2
-    return coefficients[row, column % width]
 
 
 @_part
@@ -236,8 +216,8 @@ def _find_taps(pixels, width, height, before, weights):
     for k in range(pixels.shape[1]):
         u, v = pixels[0, k] - 0.5, pixels[1, k] - 0.5
         column, row = np.floor(u), np.floor(v)
-        a0, a1, a2, a3 = _weights(np.float32(u - column))
-        b0, b1, b2, b3 = _weights(np.float32(v - row))
+        a0, a1, a2, a3 = spline_weights(np.float32(u - column))
+        b0, b1, b2, b3 = spline_weights(np.float32(v - row))
         weights[0, k], weights[1, k], weights[2, k], weights[3, k] = a0, a1, a2, a3
         weights[4, k], weights[5, k], weights[6, k], weights[7, k] = b0, b1, b2, b3
         before[0, k], before[1, k] = np.int32(column), np.int32(row)
@@ -270,8 +250,8 @@ def _sum_anywhere(coefficients, before, weights, out):
         value = np.float32(0.0)
         for i in range(4):
             for j in range(4):
-                tap = _tap(coefficients, before[1, k] - 1 + i, before[0, k] - 1 + j)
-                value += weights[4 + i, k] * weights[j, k] * tap
+                sample = tap(coefficients, before[1, k] - 1 + i, before[0, k] - 1 + j)
+                value += weights[4 + i, k] * weights[j, k] * sample
         out[k] = value
 
 

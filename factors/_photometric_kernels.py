@@ -110,18 +110,6 @@ def sample(pixels, start, column, row, columns, rows, width, x, y, z):
     )  # fmt: skip
 
 
-@_kernel
-def sample_many(pixels, window, width, directions, values, gradients):
-    """Values (N,) and gradients (N, 3) along directions (N, 3) in one window; NaN outside it."""
-    for i in range(len(directions)):
-        inside, value, x, y, z = sample(
-            pixels, 0, window[0], window[1], window[2], window[3], width,
-            directions[i, 0], directions[i, 1], directions[i, 2],
-        )  # fmt: skip
-        values[i] = value if inside else np.nan
-        gradients[i, 0], gradients[i, 1], gradients[i, 2] = x, y, z
-
-
 @_part
 def _relative(host, target, A, c):
     """A = target_R_host and c = host_in_target."""

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from factors._kernels import invert_symmetric, rig_vector
 from factors.compiled import kernel_and_part
 
 _kernel, _part = kernel_and_part(fastmath={"contract"})
@@ -16,10 +17,7 @@ def _to_poses(host, target, by_host, by_target):
     """
     by_host[:] = 0.0
     by_target[:] = 0.0
-    x, y, z = host[9] - target[9], host[10] - target[10], host[11] - target[11]
-    cx = target[0] * x + target[3] * y + target[6] * z
-    cy = target[1] * x + target[4] * y + target[7] * z
-    cz = target[2] * x + target[5] * y + target[8] * z
+    cx, cy, cz = rig_vector(target, host[9:])
     for i in range(3):
         by_target[i, i] = -1.0
         by_target[3 + i, 3 + i] = -1.0
@@ -52,28 +50,6 @@ def _through(view, J):
         J[r, 1] = turned[1] + view[11] * x - view[9] * z
         J[r, 2] = turned[2] + view[9] * y - view[10] * x
         J[r, 3], J[r, 4], J[r, 5] = x, y, z
-
-
-@_part
-def _invert(V, out):
-    """Inverse of a symmetric positive definite 3x3, damped by 1e-12 of its trace."""
-    eps = 1e-12 * (V[0, 0] + V[1, 1] + V[2, 2]) + 1e-200
-    a, b, c = V[0, 0] + eps, V[0, 1], V[0, 2]
-    d, e, f = V[1, 1] + eps, V[1, 2], V[2, 2] + eps
-    l00 = np.sqrt(a)
-    l10, l20 = b / l00, c / l00
-    l11 = np.sqrt(max(d - l10 * l10, eps))
-    l21 = (e - l10 * l20) / l11
-    l22 = np.sqrt(max(f - l20 * l20 - l21 * l21, eps))
-    i00, i11, i22 = 1 / l00, 1 / l11, 1 / l22
-    i10, i21 = -l10 * i00 * i11, -l21 * i11 * i22
-    i20 = -(l20 * i00 + l21 * i10) * i22
-    out[0, 0] = i00 * i00 + i10 * i10 + i20 * i20
-    out[0, 1] = out[1, 0] = i10 * i11 + i20 * i21
-    out[0, 2] = out[2, 0] = i20 * i22
-    out[1, 1] = i11 * i11 + i21 * i21
-    out[1, 2] = out[2, 1] = i21 * i22
-    out[2, 2] = i22 * i22
 
 
 @_allocating
@@ -194,7 +170,11 @@ def eliminate_range(
                 for j in range(3):
                     V[k, j] += G[k, j]
         inverse = inverses[p]
-        _invert(V, inverse)
+        upper = V[0, 0], V[0, 1], V[0, 2], V[1, 1], V[1, 2], V[2, 2]
+        a, b, c, d, e, f = invert_symmetric(upper, 0.0)
+        inverse[0, 0], inverse[0, 1], inverse[0, 2] = a, b, c
+        inverse[1, 0], inverse[1, 1], inverse[1, 2] = b, d, e
+        inverse[2, 0], inverse[2, 1], inverse[2, 2] = c, e, f
         _reduce(
             host, targets[offsets[p] : offsets[p + 1]], W, inverse, down, row_starts, columns,
             diagonal, off_diagonal, gradient,

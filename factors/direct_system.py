@@ -37,7 +37,14 @@ class DirectSystem(ReducedSystem):
     def _step(self, added: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         damped = self._diagonal.copy()
         np.einsum("nii->ni", damped)[:] += added
-        return self._step_by_iterations(damped) or self._step_by_factorization(damped)
+        found = self._step_by_iterations(damped)
+        if found is not None:
+            return found
+        self._factorized = self._cholesky.factorize(damped, self._off_diagonal)
+        if not self._factorized:
+            return None
+        steps = self._cholesky.solve(-self._gradient)
+        return (steps, np.zeros_like(steps)) if np.all(np.isfinite(steps)) else None
 
     def _step_by_iterations(self, damped: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         """Step and residual of the gradient; None if a factorization is cheaper."""
@@ -54,14 +61,6 @@ class DirectSystem(ReducedSystem):
         return conjugate_gradients(
             multiply, right, precondition, STEP_TOLERANCE, self._max_iterations
         )
-
-    def _step_by_factorization(self, damped: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        """Step and zero residual; None if singular."""
-        self._factorized = self._cholesky.factorize(damped, self._off_diagonal)
-        if not self._factorized:
-            return None
-        steps = self._cholesky.solve(-self._gradient)
-        return (steps, np.zeros_like(steps)) if np.all(np.isfinite(steps)) else None
 
     def _inverse(
         self, diagonal: np.ndarray, num_draws: int, rng: np.random.Generator

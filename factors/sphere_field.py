@@ -123,12 +123,6 @@ def _norms(degree: int) -> np.ndarray:
 
 
 @_part
-def _start_of(n):
-    """First coefficient of a degree."""
-    return 0 if n == 1 else 2 * n * n - 5
-
-
-@_part
 def _put(n, column, norm, value, gx, gy, gz, x, y, z, out):
     """Write a harmonic's gradient, the tangent part of the solid harmonic's, and its curl."""
     gx, gy, gz = (
@@ -136,7 +130,7 @@ def _put(n, column, norm, value, gx, gy, gz, x, y, z, out):
         norm * (gy - n * value * y),
         norm * (gz - n * value * z),
     )
-    k = _start_of(n) + column
+    k = column if n == 1 else 2 * n * n - 5 + column  # behind those of lower degrees
     out[0, k], out[1, k], out[2, k] = gx, gy, gz
     if n > 1:
         k += 2 * n + 1

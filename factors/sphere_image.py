@@ -69,7 +69,7 @@ def erp_pixel(x, y, z, width, height):
 
 
 @_part
-def _weights(t):
+def spline_weights(t):
     """Cubic B-spline weights of the four samples around a position t in [0, 1) after the second."""
     s = np.float32(1.0) - t
     sixth = np.float32(1.0 / 6.0)
@@ -80,7 +80,7 @@ def _weights(t):
 
 @_part
 def _slopes(t):
-    """Derivatives of `_weights` by t."""
+    """Derivatives of `spline_weights` by t."""
     s = np.float32(1.0) - t
     half = np.float32(0.5)
     d1 = t * (np.float32(1.5) * t - np.float32(2.0))
@@ -88,7 +88,7 @@ def _slopes(t):
 
 
 @_part
-def _tap(coefficients, row, column):
+def tap(coefficients, row, column):
     """Coefficient at any row and column, continued across the seam and the poles."""
     height, width = coefficients.shape
     if row < 0:
@@ -104,17 +104,17 @@ def sample_gradient(coefficients, u, v):
     u, v = u - 0.5, v - 0.5
     column, row = int(np.floor(u)), int(np.floor(v))
     t, s = np.float32(u - column), np.float32(v - row)
-    a0, a1, a2, a3 = _weights(t)
+    a0, a1, a2, a3 = spline_weights(t)
     d0, d1, d2, d3 = _slopes(t)
-    b0, b1, b2, b3 = _weights(s)
+    b0, b1, b2, b3 = spline_weights(s)
     e0, e1, e2, e3 = _slopes(s)
     value = by_u = by_v = np.float32(0.0)
     for k in range(4):
         b = b0 if k == 0 else (b1 if k == 1 else (b2 if k == 2 else b3))
         e = e0 if k == 0 else (e1 if k == 1 else (e2 if k == 2 else e3))
         r = row - 1 + k
-        c0, c1 = _tap(coefficients, r, column - 1), _tap(coefficients, r, column)
-        c2, c3 = _tap(coefficients, r, column + 1), _tap(coefficients, r, column + 2)
+        c0, c1 = tap(coefficients, r, column - 1), tap(coefficients, r, column)
+        c2, c3 = tap(coefficients, r, column + 1), tap(coefficients, r, column + 2)
         across = a0 * c0 + a1 * c1 + a2 * c2 + a3 * c3
         value += b * across
         by_v += e * across

@@ -69,6 +69,11 @@ def inverse(a_T_b: np.ndarray) -> np.ndarray:
     return pose(b_R_a, -np.einsum("...ij,...j->...i", b_R_a, a_T_b[..., :3, 3]))
 
 
+def relative_steps(world_T_rigs: np.ndarray) -> np.ndarray:
+    """Poses (F - 1, 4, 4) of each rig but the first in the frame of the one before."""
+    return inverse(world_T_rigs[:-1]) @ world_T_rigs[1:]
+
+
 def moved_to(world_T_rigs: np.ndarray, origins_rig: np.ndarray | None) -> np.ndarray:
     """Poses (O, 4, 4) moved to the rays' origins (O, 3), rig frame; None = not moved."""
     if origins_rig is None:

@@ -7,7 +7,8 @@ import numpy as np
 from pixels import pixel_centres
 from synthetic import unit
 
-from factors._photometric_kernels import sample_many
+from factors._photometric_kernels import sample
+from factors.compiled import kernel_and_part
 from factors.patch_windows import PAD, PatchPixels, PatchTable, coded, patch_axes, pixel_grid
 from factors.sphere_image import SphereImage
 from gsba.camera.sphere import bearings_from_erp
@@ -55,6 +56,18 @@ def planes_from(
     return planes
 
 
+@kernel_and_part()[0]
+def _sample_many(pixels, window, width, directions, values, gradients):
+    """Values (N,) and gradients (N, 3) along directions (N, 3) in one window; NaN outside it."""
+    for i in range(len(directions)):
+        inside, value, x, y, z = sample(
+            pixels, 0, window[0], window[1], window[2], window[3], width,
+            directions[i, 0], directions[i, 1], directions[i, 2],
+        )  # fmt: skip
+        values[i] = value if inside else np.nan
+        gradients[i, 0], gradients[i, 1], gradients[i, 2] = x, y, z
+
+
 class CodedImage:
     """A whole sphere image as windows hold it, in double precision: what the block samples."""
 
@@ -67,7 +80,7 @@ class CodedImage:
         """Values (...) and gradients (..., 3) along vectors (..., 3); NaN where there is none."""
         flat = np.ascontiguousarray(vectors_rig, dtype=np.float64).reshape(-1, 3)
         values, gradients = np.empty(len(flat)), np.empty((len(flat), 3))
-        sample_many(self.codes, self.window, self.width, flat, values, gradients)
+        _sample_many(self.codes, self.window, self.width, flat, values, gradients)
         return values.reshape(vectors_rig.shape[:-1]), gradients.reshape(vectors_rig.shape)
 
 

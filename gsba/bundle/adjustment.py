@@ -331,7 +331,7 @@ def adjust_through(
         landmarks = place(view.keypoints, solved.world_T_rigs, gate * solved.noise)
         spread = solved.noise * max(1.0, gate / GATE_SCALE)
         solver = _options(context.solver, last=final and number == len(gates))
-        if context.families.limit_drift:
+        if any(family.limits_drift for family in context.families.members):
             damping, tolerance = _DRIFT_DAMPING, _DRIFT_TOLERANCE
             solver = replace(solver, lambda_initial=damping, relative_tolerance=tolerance)
         here = replace(solved, landmarks=landmarks)

@@ -167,11 +167,6 @@ class Families:
         """The families whose residuals are of the map's points."""
         return self.with_members(family for family in self.members if family.observes_points)
 
-    @property
-    def limit_drift(self) -> bool:
-        """True if a family limits drift: see `Family.limits_drift`."""
-        return any(family.limits_drift for family in self.members)
-
     def landmark_terms(
         self, landmarks: Landmarks, keypoints: Keypoints, noise: float
     ) -> list[Term]:

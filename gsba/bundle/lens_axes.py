@@ -2,8 +2,8 @@
 the heading while the camera turns with the walk."""
 
 import logging
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -11,15 +11,14 @@ from scipy.spatial.transform import Rotation
 from gsba.bundle.shared_parameters import (
     PARTS,
     ObservedRays,
-    SharedModel,
     Weighted,
     by_origin,
     cross_validate,
     frame_models,
     models_of,
+    newton_step,
     predicts,
     sample_counts,
-    summed,
     validated,
 )
 from gsba.camera.lens import Lenses
@@ -60,7 +59,9 @@ def guess(rays: ObservedRays) -> LensAxes:
         return LensAxes(so_far, np.full(PARTS, np.nan), "too few points", counts)
     starts = range(0, 3 * len(tried), 3)
     tried_parts = [[part.of(slice(k, k + 3)) for part in systems] for k in starts]
-    gains = np.array([cross_validate(parts, _newton_step).gains for parts in tried_parts])
+    gains = np.array(
+        [cross_validate(parts, partial(newton_step, curved=False)).gains for parts in tried_parts]
+    )
     best = int(np.argmax(gains.sum(axis=1)))
     shares = gains / np.array([part.cost for part in systems])
     logger.debug("lens axes: gains %s %%", (100 * shares.mean(axis=1)).round(2).tolist())
@@ -119,13 +120,6 @@ def upright(directions: np.ndarray) -> np.ndarray:
     y = np.cross(z, x)
     y /= np.linalg.norm(y, axis=1, keepdims=True)
     return np.stack([np.cross(y, z), y, z], axis=2)
-
-
-def _newton_step(parts: Sequence[SharedModel]) -> np.ndarray:
-    """Centre (3,) that minimises the cost of the parts, the loss's curvature left out."""
-    total = summed(parts)
-    damping = 1e-9 * np.trace(total.hessian) * np.eye(3)
-    return -np.linalg.solve(total.hessian + damping, total.gradient)
 
 
 def _candidates(world_T_rigs: np.ndarray) -> list[np.ndarray]:

@@ -4,6 +4,7 @@ parts of the sequence gain by them, and believed where they then predict other p
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from gsba.bundle.shared_parameters import (
     cross_validate,
     model_of,
     models_of,
+    newton_step,
     predicts,
     summed,
 )
@@ -178,21 +180,13 @@ def stitched_for(rays: ObservedRays) -> StitchRadius:
     return StitchRadius(lenses, centre, inverse_stitch_radius, sigma, shares, reason)
 
 
-def _step(systems: Sequence[SharedModel]) -> np.ndarray:
-    """Change of the parameters (K,) that minimises the cost of the parts."""
-    hessian, gradient = _second_order(systems)
-    return -np.linalg.solve(hessian, gradient)
+_step = partial(newton_step, curved=True)
 
 
 def _step_to(systems: Sequence[SharedModel], last: float) -> np.ndarray:
     """As `_step`, where the last parameter changes by `last`."""
-    hessian, gradient = _second_order(systems)
-    rest = -np.linalg.solve(hessian[:-1, :-1], gradient[:-1] + last * hessian[:-1, -1])
-    return np.r_[rest, last]
-
-
-def _second_order(systems: Sequence[SharedModel]) -> tuple[np.ndarray, np.ndarray]:
-    """Hessian (K, K) and gradient (K,) of the parts' cost."""
     total = summed(systems)
     hessian = total.curvature * total.hessian
-    return hessian + 1e-9 * np.trace(hessian) * np.eye(len(hessian)), total.gradient
+    hessian += 1e-9 * np.trace(hessian) * np.eye(len(hessian))
+    rest = -np.linalg.solve(hessian[:-1, :-1], total.gradient[:-1] + last * hessian[:-1, -1])
+    return np.r_[rest, last]

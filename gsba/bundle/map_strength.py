@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from factors import tangent_basis
 from gsba.config import PriorSettings, RefineSettings
-from gsba.geometry import inverse, moved_to, pose, rotation_angle, step_covariances
+from gsba.geometry import inverse, moved_to, pose, relative_steps, rotation_angle, step_covariances
 from gsba.types import Counts, JointErrors, Reconstruction, StepNoise
 from gsba.types.records import slices, spread_rows
 
@@ -211,7 +211,7 @@ def step_deviations(result: Reconstruction) -> np.ndarray:
         known[f] = len(rows) >= 12  # of such points, in a frame
         if known[f]:
             predicted[f] = _resected(result, f, rows)
-    steps = [(inverse(some[:-1]) @ some[1:])[:, :3, 3] for some in (poses, predicted)]
+    steps = [relative_steps(some)[:, :3, 3] for some in (poses, predicted)]
     lengths = np.linalg.norm(steps, axis=2)
     least = _STANDING_RATIO * np.sqrt(np.mean(lengths[0] ** 2))
     off = np.linalg.norm(steps[0] - steps[1], axis=1) / np.maximum(lengths.max(axis=0), least)
@@ -259,7 +259,7 @@ def step_motion(
         covariances: (F, 6, 6) of these [rotation rad, translation], rig frames; NaN = not
             known.
     """
-    steps, former = _steps(world_T_rigs), _steps(before_T_rigs)
+    steps, former = relative_steps(world_T_rigs), relative_steps(before_T_rigs)
     length, was = (np.linalg.norm(some[:, :3, 3], axis=1).sum() for some in (steps, former))
     former[:, :3, 3] *= length / max(was, 1e-300)
     motion = inverse(former) @ steps
@@ -276,10 +276,6 @@ def step_motion(
     correlations = spread[known] / (sigmas[:, :, None] * sigmas[:, None, :])
     inverses = np.linalg.pinv(correlations, hermitian=True)
     return float(np.sqrt(np.einsum("fi,fij,fj->f", scaled, inverses, scaled).mean() / 6))
-
-
-def _steps(world_T_rigs: np.ndarray) -> np.ndarray:
-    return inverse(world_T_rigs[:-1]) @ world_T_rigs[1:]
 
 
 _SIDE_STEPS = 6.0  # usual steps that a side is long, and its fewest frames are two

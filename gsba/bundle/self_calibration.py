@@ -18,6 +18,7 @@ from gsba.bundle.shared_parameters import (
     cross_validate,
     model_of,
     models_of,
+    newton_step,
     summed,
 )
 from gsba.camera.fisheye import PARAMETERS, Rig, by_parameters, changed, difference, recalibrated
@@ -71,10 +72,15 @@ def estimate(rays: ObservedRays, nominal: bool = False) -> SelfCalibration:
     if not systems:
         why = "too few points to tell what lenses are"
         return SelfCalibration(so_far, np.full(PARTS, np.nan), why, counts)
+
+    def centre_step(parts: list[SharedModel]) -> np.ndarray:
+        """Change of the centres alone, lenses held."""
+        return newton_step([each.of(slice(num, None)) for each in parts], curved=True)
+
     verdict = cross_validate(
         systems,
         lambda others: _step(others, off),
-        lambda others: np.concatenate([np.zeros(num), _centre_step(others, num)]),
+        lambda others: np.r_[np.zeros(num), centre_step(others)],
     )
     found, shares = _step(systems, off), verdict.shares
     reason = ""
@@ -241,9 +247,3 @@ def _step(systems: list[SharedModel], off: np.ndarray) -> np.ndarray:
 
 def _shown(values: np.ndarray) -> str:
     return " and ".join(f"{value:+.3f}" for value in values)
-
-
-def _centre_step(systems: list[SharedModel], num: int) -> np.ndarray:
-    """Change (3 (L - 1),) of the centres that minimises the parts' cost, K lens parameters held."""
-    total = summed([each.of(slice(num, None)) for each in systems])
-    return -np.linalg.solve(total.curvature * total.hessian, total.gradient)

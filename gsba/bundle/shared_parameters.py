@@ -105,6 +105,15 @@ def summed(models: Sequence[SharedModel]) -> SharedModel:
     )
 
 
+def newton_step(models: Sequence[SharedModel], *, curved: bool) -> np.ndarray:
+    """Change of the parameters (K,) that minimises the parts' cost, the curvature of the loss taken
+    into account or not."""
+    total = summed(models)
+    hessian = (total.curvature if curved else 1.0) * total.hessian
+    damping = 1e-9 * np.trace(hessian) * np.eye(len(hessian))
+    return -np.linalg.solve(hessian + damping, total.gradient)
+
+
 def drawn(landmarks: Landmarks, most: int, seed: int) -> Landmarks:
     """A share of the points, drawn at random, where there are more than `most` observations."""
     tracks = landmarks.tracks

@@ -9,7 +9,7 @@ import numpy as np
 from gsba.bundle.families import Family, MapSnapshot, digest_of
 from gsba.bundle.pose_variables import X
 from gsba.config import PriorSettings
-from gsba.geometry import inverse
+from gsba.geometry import relative_steps
 from gsba.types import GyroConstraints, StepNoise
 
 LOSS_SIGMAS = 2.0  # Cauchy scale: limits the pull of wrong steps
@@ -50,7 +50,7 @@ class TrajectoryPrior(Family):
         extent = max(float(np.linalg.norm(np.ptp(world_T_rigs[:, :3, 3], axis=0))), typical)
         graph = gtsam.NonlinearFactorGraph()
         settings, spread, lengths = self.settings, self.noise, np.maximum(lengths, typical)
-        steps = inverse(self.world_T_rigs[:-1]) @ self.world_T_rigs[1:]
+        steps = relative_steps(self.world_T_rigs)
         kept = np.ones(len(steps), bool) if self.false_steps is None else ~self.false_steps
         # steps in a gapless run drift alike
         runs = np.cumsum(np.diff(kept.astype(int), prepend=0) != 0)

@@ -99,9 +99,7 @@ def difference(lens: Fisheye, before: Fisheye) -> np.ndarray:
     from scipy.spatial.transform import Rotation
 
     turn = Rotation.from_rotvec(lens.rotation) * Rotation.from_rotvec(before.rotation).inv()
-    away = (np.asarray(lens.principal) - before.principal) / before.focal
-    radial = np.asarray(lens.radial) - before.radial
-    return np.array([np.log(lens.focal / before.focal), *away, *radial, *turn.as_rotvec()])
+    return np.array([*projection_of(lens).step_from(projection_of(before)), *turn.as_rotvec()])
 
 
 def pixels_of(

@@ -4,23 +4,21 @@ Each direction is looked up where its lens shows it, at the depth of map points 
 rows read in the middle of the exposure; both lenses are blended across the seam.
 """
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import replace
 
 import cv2
 import numpy as np
 
-from gsba.camera.equiangular import Grid, around_squares
-from gsba.camera.fisheye import facing, project
+from gsba.camera.fisheye import facing
 from gsba.camera.lens import Lenses
-from gsba.camera.sphere import around_sphere, bearings_from_erp, erp_bands, erp_from_bearings
+from gsba.camera.pictures import Picture, cube_map, lens_picture, panorama
+from gsba.camera.sphere import around_sphere, erp_bands, erp_directions
 from gsba.camera.straighten import PAD
 from gsba.camera.views import FAR_DEPTH, depths_along, observed_points
 from gsba.types import Reconstruction
 
 _DEPTH_GRID_WIDTH = 128  # width of the grid that depths are taken on
-
-_Look = Callable[[int, np.ndarray], np.ndarray]  # lens and directions (h, w, 3) to pixels (h, w, C)
 
 
 class Stitcher:
@@ -30,11 +28,8 @@ class Stitcher:
         """Compute the offset from each direction of the rig to its direction in each lens, in the
         frame-th frame of the lenses, at the depths of scene points (N, 3), rig frame."""
         self._lenses = lenses.of_frame(frame)
-        centres = (
-            np.arange(pixels) + 0.5 for pixels in (_DEPTH_GRID_WIDTH, _DEPTH_GRID_WIDTH // 2)
-        )
-        pixels = np.stack(np.meshgrid(*centres), axis=-1)
-        rays = bearings_from_erp(pixels, _DEPTH_GRID_WIDTH, _DEPTH_GRID_WIDTH // 2).reshape(-1, 3)
+        grid = erp_directions(_DEPTH_GRID_WIDTH)
+        rays = grid.reshape(-1, 3)
         depths = np.full(len(rays), FAR_DEPTH)
         if len(scene):
             # nearer points would lie beyond the rims at the seam
@@ -44,55 +39,41 @@ class Stitcher:
         for lens in range(lenses.num_lenses):
             shown = self._lenses.seeing(depths[:, None] * rays, same, np.full(len(rays), lens))
             shown /= np.linalg.norm(shown, axis=1, keepdims=True)
-            offsets = (
-                (shown - rays)
-                .reshape(_DEPTH_GRID_WIDTH // 2, _DEPTH_GRID_WIDTH, 3)
-                .astype(np.float32)
-            )
+            offsets = (shown - rays).reshape(grid.shape).astype(np.float32)
             self._offsets.append(around_sphere(offsets, PAD))
 
     def stitched(self, erp: np.ndarray) -> np.ndarray:
         """The panorama (H, 2 H, C) uint8, resampled from a stitcher's one of that shape."""
-        return self._joined(erp.shape[1], erp.shape[2], _panorama_lookup(erp, cv2.INTER_LANCZOS4))
+        pictures = [panorama(erp)] * len(self._offsets)
+        return self._joined(erp.shape[1], pictures, cv2.INTER_LANCZOS4)
 
     def stitched_squares(
         self, squares: np.ndarray, correction: tuple[float, ...] = ()
     ) -> np.ndarray:
         """The panorama (2 S, 4 S, C) uint8 of an equi-angular cube map (6, S, S, C), FACES order;
         correction: coefficients of the stitching field, see `FrameSet`."""
-        picture, grid = around_squares(squares), Grid(squares.shape[1], correction)
-
-        def look(_: int, shown: np.ndarray) -> np.ndarray:
-            maps = grid.places(shown).astype(np.float32)
-            return cv2.remap(picture, maps[..., 0], maps[..., 1], cv2.INTER_LANCZOS4)
-
-        return self._joined(4 * grid.size, squares.shape[3], look)
+        pictures = [cube_map(squares, correction)] * len(self._offsets)
+        return self._joined(4 * squares.shape[1], pictures, cv2.INTER_LANCZOS4)
 
     def stitched_mask(self, mask: np.ndarray) -> np.ndarray:
         """The mask (H, 2 H) bool for the resampled panorama, from the mask of a stitcher's panorama
         or of a raw pair: a direction is used where all pixels blended into it are."""
-        white = mask.astype(np.uint8)[..., None] * 255
-        joined = self._joined(mask.shape[1], 1, _panorama_lookup(white, cv2.INTER_NEAREST))
-        return joined[..., 0] == 255
+        white = panorama(mask.astype(np.uint8)[..., None] * 255)
+        pictures = [white] * len(self._offsets)
+        return self._joined(mask.shape[1], pictures, cv2.INTER_NEAREST)[..., 0] == 255
 
     def stitched_raw(self, pictures: list[np.ndarray], width: int) -> np.ndarray:
         """The panorama (width / 2, width, C) uint8 of all pictures (h, w, C) uint8 of raw
         lenses."""
         pair = self._lenses.reference_calibration
         assert pair is not None
+        of_lenses = [lens_picture(*each) for each in zip(pair, pictures, strict=True)]
+        return self._joined(width, of_lenses, cv2.INTER_LANCZOS4)
 
-        def look(lens: int, shown: np.ndarray) -> np.ndarray:
-            places = (project(pair[lens], shown) - 0.5).astype(np.float32)
-            return cv2.remap(
-                pictures[lens], places[..., 0], places[..., 1], cv2.INTER_LANCZOS4,
-                borderMode=cv2.BORDER_REPLICATE,
-            )  # fmt: skip
-
-        return self._joined(width, pictures[0].shape[2], look)
-
-    def _joined(self, width: int, channels: int, look: _Look) -> np.ndarray:
-        """The panorama (width / 2, width, C) uint8 joined from all lenses."""
-        parts = []
+    def _joined(self, width: int, pictures: Sequence[Picture], how: int) -> np.ndarray:
+        """The panorama (width / 2, width, C) uint8 joined from the pictures (L) that show what each
+        lens sees."""
+        parts, channels = [], pictures[0].image.shape[2]
         for rows, rays in erp_bands(np.arange(width), width):
             joined = np.zeros((*rays.shape[:2], channels), np.float32)
             for lens, share in enumerate(self._weights(rays)):
@@ -101,8 +82,10 @@ class Stitcher:
                 places = np.meshgrid(columns + 0.5, np.arange(rows.start, rows.stop) + 0.5)
                 across, down = ((at * scale - 0.5 + PAD).astype(np.float32) for at in places)
                 moved = cv2.remap(self._offsets[lens], across, down, cv2.INTER_CUBIC)
-                part = look(lens, rays[:, columns] + moved).reshape(*moved.shape[:2], channels)
-                joined[:, columns] += share[:, columns, None] * part
+                part = pictures[lens].sample(rays[:, columns] + moved, how)
+                joined[:, columns] += share[:, columns, None] * part.reshape(
+                    *moved.shape[:2], channels
+                )
             parts.append(np.rint(joined).astype(np.uint8))
         return np.concatenate(parts)
 
@@ -120,18 +103,6 @@ class Stitcher:
             sides.append(np.clip(0.5 + np.arcsin(np.clip(sines, -1, 1)) / (2 * band), 0, 1))
         total = np.sum(sides, axis=0)  # 1 where two lenses meet
         return [(side / total).astype(np.float32) for side in sides]
-
-
-def _panorama_lookup(erp: np.ndarray, how: int) -> _Look:
-    """A lookup into a panorama (H, 2 H, C), which shows both lenses."""
-    height, width = erp.shape[:2]
-    padded = around_sphere(erp, PAD)
-
-    def look(_: int, shown: np.ndarray) -> np.ndarray:
-        maps = (erp_from_bearings(shown, width, height) - 0.5 + PAD).astype(np.float32)
-        return cv2.remap(padded, maps[..., 0], maps[..., 1], how)
-
-    return look
 
 
 def seen_from_the_middle(reconstruction: Reconstruction) -> Reconstruction:

@@ -142,6 +142,12 @@ class RadialProjection(ABC):
             radial=tuple(float(term) for term in terms),
         )
 
+    def step_from(self, before: Self) -> np.ndarray:
+        """The step (K,) by which `stepped` turns the projection `before` into this one."""
+        away = (np.asarray(self.principal) - before.principal) / before.focal
+        bent = np.asarray(self.radial) - np.asarray(before.radial)
+        return np.array([np.log(self.focal / before.focal), *away, *bent])
+
 
 @dataclass(frozen=True, slots=True)
 class FisheyeProjection(RadialProjection):

@@ -35,6 +35,11 @@ def erp_bands(columns: np.ndarray, width: int) -> Iterator[tuple[slice, np.ndarr
         yield rows, bearings_from_erp(pixels, width, width // 2)
 
 
+def erp_directions(width: int) -> np.ndarray:
+    """Bearings (width / 2, width, 3) of all pixels of a panorama that is held at once."""
+    return np.concatenate([rays for _, rays in erp_bands(np.arange(width), width)])
+
+
 def erp_from_bearings(bearings: np.ndarray, width: int, height: int) -> np.ndarray:
     """Equirectangular pixels, (..., 2) float64 with u in [0, width], of vectors (..., 3)."""
     x, y, z = bearings[..., 0], bearings[..., 1], bearings[..., 2]

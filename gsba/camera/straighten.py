@@ -5,6 +5,7 @@ import numpy as np
 from gsba.camera.sphere import (
     around_sphere,
     bearings_from_erp,
+    erp_directions,
     erp_from_bearings,
     pixel_bands,
     table,
@@ -22,25 +23,25 @@ def straightened(erp: np.ndarray, correction: tuple[float, ...]) -> np.ndarray:
     import cv2
 
     if erp.dtype == bool:
-        height, width = erp.shape
-        maps = _maps(correction, width, height)
-        nearest = cv2.remap(
-            around_sphere(erp.astype(np.uint8), PAD), maps[0], maps[1], cv2.INTER_NEAREST
-        )
-        return nearest > 0
+        padded = around_sphere(erp.astype(np.uint8), PAD)
+        return straightened_inside(padded, correction, how=cv2.INTER_NEAREST) > 0
     return straightened_inside(around_sphere(erp, PAD), correction)
 
 
 def straightened_inside(
-    padded: np.ndarray, correction: tuple[float, ...], out: np.ndarray | None = None
+    padded: np.ndarray,
+    correction: tuple[float, ...],
+    out: np.ndarray | None = None,
+    how: int | None = None,
 ) -> np.ndarray:
-    """Like `straightened`, uint8, for a panorama padded by PAD pixels; written to `out`, if
-    given."""
+    """Like `straightened`, uint8, for a panorama padded by PAD pixels; written to `out`, if given;
+    how: an interpolation of OpenCV, None = by Lanczos."""
     import cv2
 
     height, width = (size - 2 * PAD for size in padded.shape[:2])
     maps = _maps(correction, width, height)
-    return cv2.remap(padded, maps[0], maps[1], cv2.INTER_LANCZOS4, dst=out)
+    how = cv2.INTER_LANCZOS4 if how is None else how
+    return cv2.remap(padded, maps[0], maps[1], how, dst=out)
 
 
 def observed(directions: np.ndarray, correction: tuple[float, ...]) -> np.ndarray:
@@ -74,11 +75,6 @@ def _maps(correction: tuple[float, ...], width: int, height: int) -> np.ndarray:
 def _padded_offsets(correction: tuple[float, ...]) -> np.ndarray:
     from factors.sphere_field import SphereField
 
-    centres = np.meshgrid(
-        np.arange(_FIELD_GRID_WIDTH) + 0.5, np.arange(_FIELD_GRID_WIDTH // 2) + 0.5
-    )
-    directions = bearings_from_erp(
-        np.stack(centres, axis=-1), _FIELD_GRID_WIDTH, _FIELD_GRID_WIDTH // 2
-    )
+    directions = erp_directions(_FIELD_GRID_WIDTH)
     observed = SphereField(np.array(correction)).observed(directions)
     return around_sphere((observed - directions).astype(np.float32), PAD)

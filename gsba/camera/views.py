@@ -6,27 +6,20 @@ as with all rows read in the middle of the exposure, at the depths that map poin
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import cv2
 import numpy as np
 
 from gsba.camera.cameras import Cameras
-from gsba.camera.equiangular import Grid, around_squares, shrunk
-from gsba.camera.fisheye import project
+from gsba.camera.equiangular import shrunk
 from gsba.camera.lens import Lenses
+from gsba.camera.pictures import Picture, cube_map, lens_picture, padded_panorama, panorama
 from gsba.camera.rig import RIG_R_FACE, CubeRig
-from gsba.camera.sphere import (
-    around_sphere,
-    dense_enough,
-    erp_from_bearings,
-    low_passed,
-    pixel_bands,
-)
+from gsba.camera.sphere import dense_enough, low_passed, pixel_bands
 from gsba.camera.straighten import PAD
 from gsba.geometry import pose
 from gsba.log import GsbaError
-from gsba.types import FACES, Fisheye, PictureFormat, Reconstruction
+from gsba.types import FACES, PictureFormat, Reconstruction
 
 FAR_DEPTH = 1e9  # map units: depth from which both lenses see alike
 _MAX_OVERSAMPLING = 1.5  # largest ratio of a picture's density to a view's: beyond it, detail
@@ -293,17 +286,16 @@ class ViewCutter:
 
     def cut(self, erp: np.ndarray) -> list[np.ndarray]:
         """Images (height, width[, C]) uint8, bicubic, of a panorama (H, 2 H[, C]) uint8."""
-        padded = around_sphere(low_passed(erp, self._views[0].focal), PAD)
-        return list(self._sampled(padded, cv2.INTER_CUBIC))
+        picture = panorama(low_passed(erp, self._views[0].focal))
+        return list(self._sampled(picture, cv2.INTER_CUBIC))
 
     def cut_padded(self, padded: np.ndarray) -> Iterator[np.ndarray]:
         """Images like those of `cut`, one after the other, of a panorama with PAD pixels around
         it."""
         inner = padded[PAD:-PAD, PAD:-PAD]
         small = low_passed(inner, self._views[0].focal)
-        if small is not inner:
-            padded = around_sphere(small, PAD)
-        return self._sampled(padded, cv2.INTER_CUBIC)
+        picture = padded_panorama(padded) if small is inner else panorama(small)
+        return self._sampled(picture, cv2.INTER_CUBIC)
 
     def cut_raw(self, pictures: list[np.ndarray]) -> Iterator[np.ndarray]:
         """Images like those of `cut_padded`, cut directly from all pictures (h, w[, C]) uint8 of
@@ -312,14 +304,11 @@ class ViewCutter:
         for view, offsets in zip(self._views, self._offsets, strict=True):
             number = nearest_lens(view, self._centres)
             lens, picture = self._cut_by[number], pictures[number]
-            share, scale = min(_MAX_OVERSAMPLING * view.focal / lens.focal, 1.0), np.ones(2)
+            share = min(_MAX_OVERSAMPLING * view.focal / lens.focal, 1.0)
             if share * _MAX_OVERSAMPLING < 1:
-                picture = cv2.resize(
-                    picture, None, fx=share, fy=share, interpolation=cv2.INTER_AREA
-                )
-                scale = np.array(picture.shape[1::-1]) / (lens.width, lens.height)
-            u, v = self._maps(view, offsets, partial(_in_picture, lens, scale))
-            yield cv2.remap(picture, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+                how = cv2.INTER_AREA
+                picture = cv2.resize(picture, None, fx=share, fy=share, interpolation=how)
+            yield self._view(view, offsets, lens_picture(lens, picture), cv2.INTER_CUBIC)
 
     def cut_squares(
         self, squares: np.ndarray, correction: tuple[float, ...] = ()
@@ -328,35 +317,21 @@ class ViewCutter:
         FACES order; correction: coefficients of the stitching field, see `PictureFormat`."""
         width = dense_enough(4 * squares.shape[1], self._views[0].focal)
         squares = shrunk(squares, width // 4)
-        places = Grid(squares.shape[1], correction).places
-        return self._looked_up(around_squares(squares), places, cv2.INTER_CUBIC)
+        return self._sampled(cube_map(squares, correction), cv2.INTER_CUBIC)
 
     def cut_mask(self, mask: np.ndarray) -> list[np.ndarray]:
         """Masks (height, width) cut out of one of a panorama (H, 2 H), bool or float32 weights."""
-        whole = around_sphere(mask.astype(np.uint8) if mask.dtype == bool else mask, PAD)
-        return [part.astype(mask.dtype) for part in self._sampled(whole, cv2.INTER_NEAREST)]
+        picture = panorama(mask.astype(np.uint8) if mask.dtype == bool else mask)
+        return [part.astype(mask.dtype) for part in self._sampled(picture, cv2.INTER_NEAREST)]
 
-    def _sampled(self, padded: np.ndarray, how: int) -> Iterator[np.ndarray]:
-        height, width = (size - 2 * PAD for size in padded.shape[:2])
-
-        def places(shown: np.ndarray) -> np.ndarray:
-            return erp_from_bearings(shown, width, height) - 0.5 + PAD
-
-        return self._looked_up(padded, places, how)
-
-    def _looked_up(
-        self, picture: np.ndarray, places: Callable[[np.ndarray], np.ndarray], how: int
-    ) -> Iterator[np.ndarray]:
-        """Sample each view; `places` maps directions (h, w, 3) to OpenCV pixels (h, w, 2)."""
+    def _sampled(self, picture: Picture, how: int) -> Iterator[np.ndarray]:
         for view, offsets in zip(self._views, self._offsets, strict=True):
-            u, v = self._maps(view, offsets, places)
-            yield cv2.remap(picture, u, v, how)
+            yield self._view(view, offsets, picture, how)
 
-    def _maps(
-        self, view: View, offsets: np.ndarray, places: Callable[[np.ndarray], np.ndarray]
-    ) -> np.ndarray:
-        """OpenCV pixels (2, height, width) float32 of a view; `places`: directions to pixels."""
-        maps = np.empty((2, view.height, view.width), np.float32)
+    def _view(self, view: View, offsets: np.ndarray, picture: Picture, how: int) -> np.ndarray:
+        """A view (height, width[, C]) of a picture."""
+        image = picture.image
+        out = np.empty((view.height, view.width, *image.shape[2:]), image.dtype)
         for rows, pixels in pixel_bands(np.arange(view.width), view.height):
             nodes = pixels * ((_NODES_ACROSS_FACE - 1) / np.array([view.width, view.height]))
             nodes = nodes.astype(np.float32)
@@ -364,19 +339,14 @@ class ViewCutter:
                 offsets, nodes[..., 0], nodes[..., 1], cv2.INTER_CUBIC,
                 borderMode=cv2.BORDER_REPLICATE,
             )  # fmt: skip
-            found = places(view.rays(pixels) @ self._turn.T + moved)
-            maps[:, rows] = np.moveaxis(found, -1, 0)
-        return maps
+            sampled = picture.sample(view.rays(pixels) @ self._turn.T + moved, how)
+            out[rows] = sampled.reshape(out[rows].shape)
+        return out
 
 
 def nearest_lens(view: View, centres: np.ndarray) -> int:
     """The lens in whose centre, of (L, 3), a view is."""
     return int(np.argmin(np.linalg.norm(centres - view.centre, axis=1)))
-
-
-def _in_picture(lens: Fisheye, scale: np.ndarray, shown: np.ndarray) -> np.ndarray:
-    """OpenCV pixels (..., 2) of directions (..., 3), in a lens's picture scaled by (2,)."""
-    return project(lens, shown) * scale - 0.5
 
 
 def _offsets(view: View, lenses: Lenses, frame: int, scene: np.ndarray | None) -> np.ndarray:

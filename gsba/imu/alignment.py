@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from gsba.containers.insta360 import STANDARD_GRAVITY
 from gsba.geometry import median_direction, nearest_rotation, pose
 from gsba.imu.readings import Readings, Sensor
 from gsba.trajectory.clock import (
@@ -263,9 +264,6 @@ def _with_reason(
     return found
 
 
-_GRAVITY_M_S2 = 9.80665  # m/s^2, standard gravity
-
-
 def up_axis(
     readings: Readings, found: Alignment, timestamps: np.ndarray, world_R_rigs: np.ndarray
 ) -> np.ndarray | None:
@@ -294,7 +292,7 @@ def up_axis(
     means = np.column_stack([np.bincount(part, column) for column in up.T])
     means = means[full] / counts[full, None]
     lengths = np.linalg.norm(means, axis=1)
-    right = np.abs(lengths - _GRAVITY_M_S2) < 0.2 * _GRAVITY_M_S2
+    right = np.abs(lengths - STANDARD_GRAVITY) < 0.2 * STANDARD_GRAVITY
     if right.sum() < 3:  # least number of such means
         return None
     return median_direction(means[right] / lengths[right, None])

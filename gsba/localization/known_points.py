@@ -234,7 +234,10 @@ def fit(
         squares = block.squared_residuals(values)
         # from this scale on, residuals tell of the noise
         if scale <= 2.0:
-            noises = np.array([_rescaled(*pair) for pair in zip(noises, squares, strict=True)])
+            for p, near in enumerate(part[part < GATE_SIGMAS**2] for part in squares):
+                if len(near):  # 1.3863: median of a chi-square of two degrees of freedom
+                    found = noises[p] * float(np.sqrt(np.median(near) / 1.3863))
+                    noises[p] = max(found, _MIN_NOISE)
     squares = _block(pictures, noises, projections, scales[-1]).squared_residuals(values)
     inliers = tuple(part < GATE_SIGMAS**2 for part in squares)
     kept = [with_rows(*pair) for pair in zip(pictures, inliers, strict=True)]
@@ -273,12 +276,3 @@ def _block(
         for seen, noise in zip(pictures, noises, strict=True)
     ]
     return KnownPointBlock(scaled, projections, RobustLoss(loss, scale))  # type: ignore[arg-type]
-
-
-def _rescaled(noise: float, squares: np.ndarray) -> float:
-    """Noise of a picture's keypoints after a fit with squared residuals (N,)."""
-    near = squares[squares < GATE_SIGMAS**2]
-    if not len(near):
-        return noise
-    # Median of a chi-square distribution with two degrees of freedom: 1.3863.
-    return max(noise * float(np.sqrt(np.median(near) / 1.3863)), _MIN_NOISE)

@@ -44,14 +44,13 @@ from gsba.localization.pose_search import (
     MIN_WITNESSES,
     TWO_PLACES,
     Candidates,
-    are_apart,
     is_significant,
 )
 from gsba.localization.run_map import Query
 from gsba.localization.surroundings import is_contradicted
 from gsba.log import GsbaError, track
 from gsba.loop_closure.join_evidence import JoinEvidence
-from gsba.matching.absolute_pose import FoundPose, camera_pose
+from gsba.matching.absolute_pose import FoundPose, are_apart, camera_pose
 from gsba.matching.guided_search import searchable
 from gsba.types import Features
 from gsba.types.records import with_rows
@@ -164,7 +163,7 @@ def _refine(
     expected = photo.projection(photo.focal or start.focal)
     stiff = np.concatenate([prior[:1], _STIFF * prior[1:]])
     seen = _sightings(localizer, first.candidates, first.pixels, first.features, first.cut_by)
-    belief = CameraPrior(_step(start, expected), stiff)
+    belief = CameraPrior(expected.step_from(start), stiff)
     fitted = fit([seen], first.world_T_camera[None], COARSE, [start], [belief])
     features, cut_by = first.features, first.cut_by
     for n, gate in enumerate(_GATES_RAD):
@@ -179,7 +178,7 @@ def _refine(
         if len(candidates) < _MIN_POINTS:
             return None
         seen = _sightings(localizer, candidates, pixels, features, cut_by)
-        belief = CameraPrior(_step(projection, expected), prior)
+        belief = CameraPrior(expected.step_from(projection), prior)
         scales = _ANNEALED if n == 0 else FINE
         fitted = fit([seen], pose[None], scales, [projection], [belief])
     pose, projection = fitted.world_T_rigs[0], _perspective(fitted.projections[0])
@@ -199,13 +198,6 @@ def _plausible(projection: PerspectiveProjection) -> bool:
     """True if a camera could have this focal length."""
     share = projection.focal / max(projection.width, projection.height)
     return _FOCALS[0] < share < _FOCALS[1]
-
-
-def _step(start: PerspectiveProjection, to: PerspectiveProjection) -> np.ndarray:
-    """Step (5,) of the parameters from one projection to another, see `RadialProjection`."""
-    moved = (np.array(to.principal) - np.array(start.principal)) / start.focal
-    bent = np.array(to.radial) - np.array(start.radial)
-    return np.concatenate([[np.log(to.focal / start.focal)], moved, bent])
 
 
 def _features(
@@ -256,11 +248,9 @@ def _recognise(
         return None, ""
     # A pose must outweigh the best one at another place by half, of the candidates left over.
     rival = search(~found.inliers, max(MIN_WITNESSES, int(found.inliers.sum() / 1.5)))
-    if rival is not None:
-        offsets = candidates.points_world[found.inliers] - found.world_T_rig[:3, 3]
-        depth = float(np.median(np.linalg.norm(offsets, axis=1)))
-        if are_apart(found.world_T_rig, rival.world_T_rig, depth):
-            return None, TWO_PLACES
+    depth = found.depth(candidates.points_world)
+    if rival is not None and are_apart(found.world_T_rig, rival.world_T_rig, depth):
+        return None, TWO_PLACES
     start = photo.projection(found.focal)
     agreeing = with_rows(candidates, found.inliers)
     every = projection.project(features.bearings_rig)
@@ -300,7 +290,7 @@ def _fit_together(
     poses = np.array([one.world_T_camera for one in placed])
 
     def solve(seen: Sequence[PointSightings]) -> PoseFit:
-        steps = [_step(*pair) for pair in zip(starts, expected, strict=True)]
+        steps = [to.step_from(start) for start, to in zip(starts, expected, strict=True)]
         beliefs = [CameraPrior(*pair) for pair in zip(steps, sigmas, strict=True)]
         return fit(seen, poses, FINE, starts, beliefs)
 

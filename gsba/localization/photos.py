@@ -8,7 +8,7 @@ import numpy as np
 
 from gsba.camera.projections import PerspectiveProjection
 from gsba.camera.rig import CubeRig
-from gsba.camera.sphere import bearings_from_erp
+from gsba.camera.sphere import erp_bands
 from gsba.features.detection import Extractor, extract
 from gsba.frames.exif import read_exif
 from gsba.frames.files import decode, image_size
@@ -18,9 +18,6 @@ from gsba.types import FACES, Features
 
 _MAX_FIELD_RAD = np.deg2rad(170.0)  # across a photo's diagonal by its tags
 _PRINCIPAL_SIGMA = 0.01  # in focal lengths
-_MIN_SLOPE = (
-    0.1  # of the radius by the angle, focal lengths: beyond it distortion folds the picture
-)
 _MARGIN_PX = 2.0  # of a photo's border that is not sampled
 
 
@@ -105,14 +102,10 @@ def as_panorama(
     grey, scales = _as_dense_as(grey, projection, width / (2 * np.pi))
     out = np.zeros((width // 2, width), np.uint8)
     mask = np.zeros(out.shape, bool)
-    columns = np.arange(width) + 0.5
-    for top in range(0, width // 2, 128):
-        rows = np.arange(top, min(top + 128, width // 2)) + 0.5
-        grid = np.stack(np.meshgrid(columns, rows), axis=-1)
-        pixels, inside = _pixels_of(bearings_from_erp(grid, width, width // 2), projection)
+    for rows, bearings in erp_bands(np.arange(width), width):
+        pixels, inside = _pixels_of(bearings, projection)
         if inside.any():
-            found = slice(top, top + len(rows))
-            out[found], mask[found] = _sampled(grey, scales, pixels), inside
+            out[rows], mask[rows] = _sampled(grey, scales, pixels), inside
     return out, mask
 
 
@@ -127,15 +120,15 @@ def _pixels_of(
     """Pixels (..., 2) of bearings (..., 3), and True (...) where the photo shows them."""
     ahead = bearings[..., 2] > 0.02
     pixels = projection.project(np.where(ahead[..., None], bearings, [0.0, 0.0, 1.0]))
-    size = np.array([projection.width, projection.height])
+    size = np.array([projection.width, projection.height], np.float64)
     inside = ahead & (pixels > _MARGIN_PX).all(axis=-1) & (pixels < size - _MARGIN_PX).all(axis=-1)
     # Angle from the axis up to which distortion carries rays outward, and into the picture
     angles = np.linspace(0, _MAX_FIELD_RAD / 2, 500)
     radii, slopes = projection.radii(angles)
-    size, middle = (projection.width, projection.height), np.array(projection.principal)
-    corners = np.array([[0.0, 0], [size[0], 0], [0, size[1]], size]) - middle
+    corners = np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * size - np.array(projection.principal)
     furthest = float(np.linalg.norm(corners, axis=1).max()) / projection.focal
-    shown = np.logical_and.accumulate((slopes > _MIN_SLOPE) & (radii <= furthest))
+    # a radius that grows by less than .1 focal lengths per radian folds the picture
+    shown = np.logical_and.accumulate((slopes > 0.1) & (radii <= furthest))
     inside &= bearings[..., 2] > np.cos(float(angles[shown].max(initial=0.0)) + angles[1])
     return np.where(inside[..., None], pixels, 0.0), inside
 
@@ -154,11 +147,6 @@ def _as_dense_as(
 
 def _sampled(image: np.ndarray, scales: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     """Values of a photo, averaged down by factors (2,), at pixels (h, w, 2) of the original."""
-    u, v = np.moveaxis((scales * pixels - 0.5).astype(np.float32), -1, 0)
-    return cv2.remap(
-        image,
-        np.ascontiguousarray(u),
-        np.ascontiguousarray(v),
-        cv2.INTER_CUBIC,
-        borderMode=cv2.BORDER_REPLICATE,
-    )
+    at = (scales * pixels - 0.5).astype(np.float32)
+    border = cv2.BORDER_REPLICATE
+    return cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_CUBIC, borderMode=border)

@@ -18,6 +18,7 @@ from gsba.store.records import FORMAT, RecordError, load_checkpoint, read_info, 
 from gsba.store.shards import Threads
 from gsba.store.store import digest
 from gsba.types import FACES
+from gsba.types.records import slices
 from gsba.version import __version__
 
 logger = logging.getLogger(__name__)
@@ -40,15 +41,20 @@ class PlaceIndex:
 
     def nearest_panoramas(self, descriptors: np.ndarray, most: int) -> np.ndarray:
         """Keyframes (N,) whose whole panoramas look most like descriptors (K, D) of a panorama."""
-        look = aggregate(descriptors, self.words).astype(np.float32)
-        return _best(_products(self.panoramas, look) * self.panorama_scales, most)
+        alike = self._products(self.panoramas, descriptors) * self.panorama_scales
+        return np.argsort(-alike, kind="stable")[:most]
 
     def nearest_faces(self, descriptors: np.ndarray, most: int) -> np.ndarray:
         """Keyframes (N,) with a face that looks most like descriptors (K, D) of a picture."""
-        look = aggregate(descriptors, self.words).astype(np.float32)
         flat = self.faces.reshape(-1, self.faces.shape[2])
-        alike = _products(flat, look).reshape(self.face_scales.shape) * self.face_scales
-        return _best(alike.max(axis=1), most)
+        alike = self._products(flat, descriptors).reshape(self.face_scales.shape)
+        return np.argsort(-(alike * self.face_scales).max(axis=1), kind="stable")[:most]
+
+    def _products(self, rows: np.ndarray, descriptors: np.ndarray) -> np.ndarray:
+        """Inner products (N,) of int8 rows (N, W D) with the aggregate of descriptors (K, D)."""
+        look = aggregate(descriptors, self.words).astype(np.float32)
+        blocks = [rows[some].astype(np.float32) @ look for some in slices(len(rows), 512)]
+        return np.concatenate(blocks)
 
 
 def load_or_make(map_: RunMap, path: Path, kind: type[T], make: Callable[[], T]) -> T:
@@ -98,13 +104,3 @@ def _quantised(look: np.ndarray) -> tuple[np.ndarray, float]:
     """Levels (D,) int8 of a descriptor, and the size of one."""
     scale = float(np.abs(look).max()) / _LEVELS or 1.0
     return np.rint(look / scale).astype(np.int8), scale
-
-
-def _products(rows: np.ndarray, look: np.ndarray, at_once: int = 512) -> np.ndarray:
-    """Inner products (N,) of int8 rows (N, D) with a descriptor (D,) float32."""
-    blocks = [rows[n : n + at_once].astype(np.float32) @ look for n in range(0, len(rows), at_once)]
-    return np.concatenate(blocks)
-
-
-def _best(alike: np.ndarray, most: int) -> np.ndarray:
-    return np.argsort(-alike, kind="stable")[:most]

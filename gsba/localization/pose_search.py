@@ -8,11 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsba.camera.rig import cells_of, witnesses
-from gsba.geometry import inverse, rotation_angle
 from gsba.localization.surroundings import is_look_alike
 from gsba.loop_closure.join_evidence import JoinEvidence
-from gsba.loop_closure.registration import RIVAL_DISTANCE
-from gsba.matching.absolute_pose import FoundPose, panorama_pose
+from gsba.matching.absolute_pose import FoundPose, are_apart, panorama_pose
 from gsba.significance import MAX_FALSE_POSES, SIGMAS_OF_1E_3, least_agreeing
 from gsba.trajectory.turning import CELLS_PER_SIDE
 from gsba.types.records import with_rows
@@ -77,13 +75,6 @@ def is_significant(
     per_witness = 1 - (1 - min(chance, 0.5)) ** (len(bearings) / num)
     needed = least_agreeing(num, per_witness, sample, MAX_FALSE_POSES)
     return agreeing >= max(needed, MIN_WITNESSES)
-
-
-def are_apart(one: np.ndarray, other: np.ndarray, depth: float) -> bool:
-    """True if two poses (4, 4) are of different places, for points at a median depth."""
-    moved = inverse(one) @ other
-    turned = float(rotation_angle(moved[:3, :3]))
-    return max(float(np.linalg.norm(moved[:3, 3])) / depth, turned) > RIVAL_DISTANCE
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,7 @@ from scipy.spatial import KDTree
 from factors.threads import map_in_threads
 from gsba.bundle.pose_variables import X
 from gsba.config import RefineSettings
-from gsba.geometry import inverse, rotation_angle
+from gsba.geometry import inverse, relative_steps, rotation_angle
 from gsba.loop_closure import join_evidence
 from gsba.loop_closure.join_evidence import LOCAL, Places, around
 from gsba.loop_closure.retrieval import global_descriptors
@@ -53,7 +53,7 @@ def path(
     for f, world_T_rig in enumerate(world_T_rigs):
         values.insert(X(f), gtsam.Pose3(world_T_rig))
     graph.add(gtsam.PriorFactorPose3(X(0), gtsam.Pose3(world_T_rigs[0]), _noise_model(1e-6, 1e-6)))
-    steps = inverse(world_T_rigs[:-1]) @ world_T_rigs[1:]
+    steps = relative_steps(world_T_rigs)
     lengths = np.linalg.norm(steps[:, :3, 3], axis=1)
     typical = float(np.median(lengths)) or 1.0
     for f, step in enumerate(steps):

@@ -19,9 +19,10 @@ from gsba.loop_closure.join_test import JoinTest, Judged
 from gsba.loop_closure.loops import Loop
 from gsba.loop_closure.map_similarity import Meeting, Proposal, propose
 from gsba.loop_closure.merged_map import Registered, carried, laid_out
-from gsba.loop_closure.registration import RegisteredFrame, resect
+from gsba.loop_closure.registration import resect
 from gsba.loop_closure.retrieval import global_descriptors
 from gsba.matching import pairs, recovery
+from gsba.matching.absolute_pose import FoundPose
 from gsba.matching.guided_search import Gate, MatchContext
 from gsba.similarity import Sim3
 from gsba.trajectory.judgement import long_steps, over_missing_frames
@@ -419,15 +420,13 @@ class _Joining:
                 return True
         return False
 
-    def _resected(self, f: int, rows: np.ndarray, points: np.ndarray) -> RegisteredFrame | None:
+    def _resected(self, f: int, rows: np.ndarray, points: np.ndarray) -> FoundPose | None:
         """Accepted pose of a frame whose keypoints (m,) may observe points (m, 3)."""
         if len(rows) == 0:
             return None
         settings, bearings = self.context.settings, self.context.keypoints.bearings_of(f)[rows]
         found = resect(bearings, points, TwoViewLimits.of(settings), settings.seed)
-        if found is None or found.reason or not self._in_reach(f, found.world_T_rig):
-            return None
-        return found
+        return found if found and self._in_reach(f, found.world_T_rig) else None
 
     def _resected_at_pace(self, f: int, inside: np.ndarray, found: np.ndarray) -> np.ndarray | None:
         """The pose (4, 4) found, or one at the usual pace; None if wide steps leave both unsure."""

@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gsba.camera.sphere import erp_from_bearings
-from gsba.geometry import inverse, pose
+from gsba.geometry import inverse, pose, rotation_angle
 
 if TYPE_CHECKING:
     import pycolmap
 
 _PANORAMA_WIDTH_PX = 4096  # of the virtual panorama
 _MIN_TRIALS, _MAX_TRIALS = 100, 10_000
+_APART = 0.3  # distance of another place, in median depths or radians
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,6 +24,18 @@ class FoundPose:
     world_T_rig: np.ndarray  # (4, 4) float64
     inliers: np.ndarray  # (m,) bool
     focal: float = 0.0  # pixels, if it was estimated
+
+    def depth(self, points_world: np.ndarray) -> float:
+        """Median distance of the inliers of its candidate points (m, 3)."""
+        offsets = points_world[self.inliers] - self.world_T_rig[:3, 3]
+        return float(np.median(np.linalg.norm(offsets, axis=1)))
+
+
+def are_apart(one: np.ndarray, other: np.ndarray, depth: float) -> bool:
+    """True if two poses (4, 4) are of different places, for points at a median depth."""
+    moved = inverse(one) @ other
+    turned = float(rotation_angle(moved[:3, :3]))
+    return max(float(np.linalg.norm(moved[:3, 3])) / depth, turned) > _APART
 
 
 def panorama_pose(

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsba.config import RefineSettings
-from gsba.geometry import inverse
+from gsba.geometry import inverse, relative_steps
 from gsba.log import GsbaError
 from gsba.matching import guided_search, pairs
 from gsba.matching.correspondences import SCARCE_MATCHES, verified
@@ -184,7 +184,7 @@ def _walked_on(
 ) -> np.ndarray:
     """Poses (F, 4, 4) chained along the trajectory, at lost steps (P, 2) by pairs without it."""
     poses, intervals = coarse.world_T_rigs, np.diff(timestamps)
-    steps = inverse(poses[:-1]) @ poses[1:]
+    steps = relative_steps(poses)
     steps[found.matches.pairs[:, 0], :3, :3] = found.f0_T_f1s[:, :3, :3]
     world_R_rigs = poses[0, :3, :3] @ chained(steps)[:, :3, :3]
     velocities = np.diff(poses[:, :3, 3], axis=0) / intervals[:, None]

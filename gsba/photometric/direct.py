@@ -206,15 +206,11 @@ def _solve(
     context: AdjustmentContext,
 ) -> tuple[Solution, np.ndarray, np.ndarray]:
     """The joint solve, once more with lower weights of bad frames; undone if the map fits worse."""
-    num_threads = context.num_threads
     values = adjustment.values_of(solved.world_T_rigs)
     solver = replace(context.solver, relative_tolerance=_TOLERANCE, absolute_tolerance=None)
-    start = make_block(pixels, trust, num_threads)
-    noise = _noise(start, values) * _INFLATION
     weights = np.ones(pixels.num_frames)
     for _ in range(2):
-        block = make_block(pixels, start.counted * trust, num_threads, noise)
-        block.weigh(weights)
+        block = _weighted_block(pixels, trust, weights, values, context.num_threads)
         landmarks = adjustment.landmark_block(solved.landmarks, keypoints, solved.noise, context)
         landmarks.polish(values)
         before, fits = landmarks.error(values), _geometric_fits(landmarks, values)
@@ -227,7 +223,7 @@ def _solve(
         weights = doubts
     accepted = landmarks.error(result.values) <= _MAX_GROWTH * before
     solved = replace(solved, variables=terms.own.variables(result.values)) if accepted else solved
-    adjusted = _adjusted(solved, keypoints, result, accepted, num_threads)
+    adjusted = _adjusted(solved, keypoints, result, accepted, context.num_threads)
     return adjusted, weights, residuals
 
 
@@ -246,12 +242,8 @@ def joint(
     pixels, trust, _ = _patches(frames, solved, num_threads, lenses)
     if pixels is None:
         return []
-    start = make_block(pixels, trust, num_threads)
     values = adjustment.values_of(solved.world_T_rigs)
-    noise = _noise(start, values) * _INFLATION
-    block = make_block(pixels, start.counted * trust, num_threads, noise)
-    block.weigh(frame_weights)
-    return [PatchGreys(block)]
+    return [PatchGreys(_weighted_block(pixels, trust, frame_weights, values, num_threads))]
 
 
 def make_block(
@@ -274,12 +266,23 @@ def make_block(
     )
 
 
-def _noise(block: PhotometricBlock, values: gtsam.Values) -> float:
-    """Typical residual of a pixel at the start, in units of the settings' sigma."""
-    block.refresh(values)
-    if not block.counted.any():
-        return 1.0
-    return float(np.sqrt(np.median(block.errors(values)[block.counted])))
+def _weighted_block(
+    pixels: PatchPixels,
+    trust: np.ndarray,
+    frame_weights: np.ndarray,
+    values: gtsam.Values,
+    num_threads: int,
+) -> PhotometricBlock:
+    """The block of observations that count at the start, `values`, with the noise that they have
+    there, and weights of frames (F,)."""
+    start = make_block(pixels, trust, num_threads)
+    start.refresh(values)
+    noise, counted = 1.0, start.counted
+    if counted.any():  # typical residual of a pixel in units of the settings' sigma
+        noise = float(np.sqrt(np.median(start.errors(values)[counted])))
+    block = make_block(pixels, counted * trust, num_threads, noise * _INFLATION)
+    block.weigh(frame_weights)
+    return block
 
 
 def _geometric_fits(landmarks: LandmarkBlock, values: gtsam.Values) -> np.ndarray:

@@ -11,7 +11,7 @@ from gsba.camera.rig import CubeRig, owner_faces
 from gsba.disk import concatenated
 from gsba.memory import release_mapped_files
 from gsba.types import Counts, Keypoints, Sighted, Tracks
-from gsba.types.records import slices
+from gsba.types.records import slices, with_rows
 
 _FRAMES_AT_ONCE = 32  # whose observations a thread holds: some 50 MB
 _POINTS_AT_ONCE = 1 << 17
@@ -46,15 +46,6 @@ class Observed:
     def of(self, points: np.ndarray) -> "Observed":
         """The observations with their points renumbered: n becomes `points[n]`."""
         return replace(self, points=points[self.points])
-
-    def taken(self, rows: np.ndarray) -> "Observed":
-        """The observations of some rows (n,)."""
-        return Observed(
-            self.points[rows],
-            self.frames[rows],
-            self.bearings_rig.take(rows, axis=0),
-            self.covariances.take(rows, axis=0),
-        )
 
     def enlarged(self, factors: np.ndarray) -> "Observed":
         """The observations with the noise of pictures that were enlarged by factors (N,): their
@@ -118,10 +109,10 @@ def _by_frame(
         for part in parts:
             inside = (part.frames >= some.start) & (part.frames < some.stop)
             rows = np.flatnonzero(inside)
-            chosen.append(part.taken(rows[several[part.points[rows]]]))
+            chosen.append(with_rows(part, rows[several[part.points[rows]]]))
         every = Observed.joined(iter(chosen), None)
         order = np.lexsort((every.points, every.frames))
-        is_new, every = order < len(chosen[0]), every.taken(order)
+        is_new, every = order < len(chosen[0]), with_rows(every, order)
         bearings, faces = every.bearings_rig, owner_faces(every.bearings_rig)
         lower = np.linalg.cholesky(np.linalg.inv(every.covariances))
         rotations = shown.world_T_rigs[every.frames, :3, :3]

@@ -13,14 +13,6 @@ _MAX_INTERPOLATION_S = 10.0  # between an entry and a frame; poses further away 
 
 _log = logging.getLogger(__name__)
 
-_GRID_TOLERANCE = 0.1  # tolerance of coinciding times when an offset is searched, in shortest
-# intervals
-# Extrapolation beyond an end: duration from which the velocity is taken, and time constants with
-# which its two parts fade. Chosen by predicting real SLAM output of walks 0.1 to 4 s ahead: people
-# keep walking but do not keep turning.
-_VELOCITY_S = 0.5
-_TRANSLATION_FADE_S = 10.0
-_ROTATION_FADE_S = 1.0
 _UNIT_OF_POWER = {3: "milliseconds", 6: "microseconds", 9: "nanoseconds"}  # by their power of ten
 _MAX_LOG_DEVIATION = np.log10(1.5)  # largest log10 deviation of the ratio of durations from a
 # unit's power
@@ -167,7 +159,8 @@ def _clock_offset(frame_times: np.ndarray, entries: np.ndarray, stated: float | 
     few, many = entries, frame_times
     if len(few) > len(many):
         sign, few, many = -1.0, many, few
-    tolerance = _GRID_TOLERANCE * min(np.diff(few).min(), np.diff(many).min())
+    # times coincide within a tenth of the shortest interval
+    tolerance = 0.1 * min(np.diff(few).min(), np.diff(many).min())
     found: list[float] = []
     for shift in few[0] - many:
         shifted = few - shift
@@ -208,19 +201,22 @@ def poses_at(trajectory: Trajectory, times: np.ndarray) -> np.ndarray:
     positions = np.stack(
         [np.interp(inside, entries, world_T_rigs[:, axis, 3]) for axis in range(3)], axis=1
     )
+    # Beyond an end the velocity over half a second goes on and fades, with time constants chosen by
+    # predicting real SLAM output of walks 0.1 to 4 s ahead: people keep walking but do not keep
+    # turning.
     for end, direction in ((0, -1), (-1, 1)):
         beyond = direction * (times - entries[end]) > 0
         if not beyond.any():
             continue
         reach = np.abs(entries - entries[end])
-        other = int(np.argmin(np.abs(reach - _VELOCITY_S) + (reach == 0) * np.ptp(entries)))
+        other = int(np.argmin(np.abs(reach - 0.5) + (reach == 0) * np.ptp(entries)))
         ahead = np.abs(times[beyond] - entries[end])[:, None]
         last = Rotation.from_matrix(world_T_rigs[end, :3, :3])
         turn = (Rotation.from_matrix(world_T_rigs[other, :3, :3]).inv() * last).as_rotvec()
         step = world_T_rigs[end, :3, 3] - world_T_rigs[other, :3, 3]
-        turned = _faded_duration(ahead, _ROTATION_FADE_S) * turn / reach[other]
+        turned = _faded_duration(ahead, 1.0) * turn / reach[other]
         rotations[beyond] = last * Rotation.from_rotvec(turned)
-        moved = _faded_duration(ahead, _TRANSLATION_FADE_S) * step / reach[other]
+        moved = _faded_duration(ahead, 10.0) * step / reach[other]
         positions[beyond] = world_T_rigs[end, :3, 3] + moved
     return pose(rotations.as_matrix(), positions)
 

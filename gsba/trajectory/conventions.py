@@ -7,9 +7,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gsba.geometry import inverse, pose, quaternion_from_rotation, rotation_from_quaternion
+from gsba.geometry import (
+    inverse,
+    pose,
+    quaternion_from_rotation,
+    relative_steps,
+    rotation_from_quaternion,
+)
 from gsba.log import GsbaError
-from gsba.types import CoarsePoses, PoseSource, Trajectory
+from gsba.trajectory.steps import tracked_steps
+from gsba.types import CoarsePoses, Trajectory
 
 WXYZ, CAMERA_FROM_WORLD = "wxyz", "camera-from-world"
 OURS = "right-down-forward"
@@ -85,16 +92,11 @@ def axis_systems() -> Iterator[tuple[str, np.ndarray]]:
 def quarter_turn(coarse: CoarsePoses, world_T_rigs: np.ndarray) -> np.ndarray:
     """ours_R_theirs (3, 3), by quarter turns about the forward axis, under which steps agree best
     with estimated poses (F, 4, 4): sensors may be mounted turned, unlike upright panoramas."""
-    own = coarse.sources == PoseSource.SLAM
-    own = own[:-1] & own[1:]
-    ours, theirs = _steps(world_T_rigs)[own], _steps(coarse.world_T_rigs)[own]
+    own = tracked_steps(coarse)
+    ours, theirs = relative_steps(world_T_rigs)[own], relative_steps(coarse.world_T_rigs)[own]
     left = [_residual(ours, theirs, turn) for turn in QUARTER_TURNS]
     best = int(np.argmin(left))
     return QUARTER_TURNS[best if left[best] < 0.6 * left[0] else 0]
-
-
-def _steps(poses: np.ndarray) -> np.ndarray:
-    return inverse(poses[:-1]) @ poses[1:]
 
 
 def _residual(ours: np.ndarray, theirs: np.ndarray, turn: np.ndarray) -> float:

@@ -2,14 +2,15 @@
 and initial poses are chained past them."""
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gsba.config import PriorSettings
-from gsba.geometry import inverse, nearest_rotation, pose, rotation_angle
+from gsba.geometry import inverse, nearest_rotation, pose, relative_steps, rotation_angle
 from gsba.trajectory.limits import TwoViewLimits
-from gsba.trajectory.steps import Steps, chained, step_errors, step_lengths
+from gsba.trajectory.steps import Steps, chained, step_errors, step_lengths, tracked_steps
 from gsba.trajectory.turning import Turn
 from gsba.types import CoarsePoses, PoseSource
 
@@ -70,7 +71,7 @@ def check_steps(
 ) -> StepChecks:
     """Compare the trajectory's steps with those of the images, by logarithms (F - 2,) of ratios of
     lengths and their standard deviations; `turn` proves that the camera turned on the spot."""
-    slam = inverse(coarse.world_T_rigs[:-1]) @ coarse.world_T_rigs[1:]
+    slam = relative_steps(coarse.world_T_rigs)
     slam_lengths = np.linalg.norm(slam[:, :3, 3], axis=1)
     own = coarse.sources == PoseSource.SLAM
     turned, off = step_errors(slam, found)
@@ -81,7 +82,7 @@ def check_steps(
     wrong = found.verified & (turned > np.deg2rad(verify.max_rotation_deg))
     unsure = 3 * np.where(found.directed, found.direction_sigmas, 0.0)
     wrong |= found.directed & (off > np.deg2rad(verify.max_direction_deg) + unsure)
-    known = own[:-1] & own[1:]
+    known = tracked_steps(coarse)
     noise = np.where(known, np.where(wrong, 10 * priors.translation, priors.translation), np.inf)
     lengths = step_lengths(slam_lengths, noise, logs, sigmas)
     strain = np.abs(np.log(np.maximum(slam_lengths, 1e-12) / lengths))
@@ -106,22 +107,12 @@ def check_steps(
     judged = known & found.directed
     turned = rotation_angle(np.swapaxes(slam[:, :3, :3], 1, 2) @ seen[:, :3, :3])
     off = np.linalg.norm(slam[:, :3, 3] - seen[:, :3, 3], axis=1)
-    usual = [
-        float(np.quantile(x[judged], _NOISE_QUANTILE)) if judged.any() else 0.0
+    noise = [
+        _OUTLIER_RATIO * float(np.quantile(x[judged], _NOISE_QUANTILE)) if judged.any() else 0.0
         for x in (turned, off)
     ]
-    named = false_frames(
-        wrong,
-        slam,
-        chosen,
-        own,
-        OutlierLimits(
-            np.deg2rad(verify.max_rotation_deg),
-            float(np.sin(np.deg2rad(verify.max_direction_deg))),
-            _OUTLIER_RATIO * usual[0],
-            _OUTLIER_RATIO * usual[1],
-        ),
-    )
+    limits = np.deg2rad([verify.max_rotation_deg, verify.max_direction_deg])
+    named = false_frames(wrong, slam, chosen, own, (limits[0], np.sin(limits[1])), noise)
     return StepChecks(start, wrong, named, unseen, lengths, None)
 
 
@@ -135,12 +126,11 @@ def _replaced(slam: np.ndarray, found: Steps, lengths: np.ndarray, rows: np.ndar
 
 def confirmed(coarse: CoarsePoses, found: Steps, priors: PriorSettings) -> np.ndarray:
     """Steps (F - 1,) bool on which images and trajectory agree within the latter's noise."""
-    slam = inverse(coarse.world_T_rigs[:-1]) @ coarse.world_T_rigs[1:]
+    slam = relative_steps(coarse.world_T_rigs)
     turned, off = step_errors(slam, found)
-    own = coarse.sources == PoseSource.SLAM
     close = turned < _MAX_PRIOR_SIGMAS * np.deg2rad(priors.rotation_deg)
     close &= off < np.arctan(_MAX_PRIOR_SIGMAS * priors.translation) + 3 * found.direction_sigmas
-    return found.directed & close & own[:-1] & own[1:]
+    return found.directed & close & tracked_steps(coarse)
 
 
 def implausible_steps(
@@ -165,12 +155,11 @@ def implausible_steps(
         max_ratio: of the lengths of a step in both, relative to steps around it.
         noise: standard deviation of the trajectory's steps, part of the step.
     """
-    own = coarse.sources == PoseSource.SLAM
     slam, found = (
         np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
         for poses in (coarse.world_T_rigs, world_T_rigs)
     )
-    judged = own[:-1] & own[1:] & ~(trust.unseen_steps & trust.false_steps)  # those are guesses
+    judged = tracked_steps(coarse) & ~(trust.unseen_steps & trust.false_steps)  # those are guesses
     judged &= (found > 0) & (slam > np.median(slam) / max_ratio)  # standing still measures nothing
     rows, wrong = np.flatnonzero(judged), np.zeros(len(slam), bool)
     if len(rows) < 6:
@@ -254,9 +243,7 @@ def back_and_forth(world_T_rigs: np.ndarray, shown: np.ndarray, depth: float) ->
 
 def without_steps(coarse: CoarsePoses, trust: StepChecks, steps: np.ndarray) -> StepChecks:
     """Checks after some steps (F - 1,) bool of the images were given up for the trajectory's."""
-    slam, chosen = (
-        inverse(poses[:-1]) @ poses[1:] for poses in (coarse.world_T_rigs, trust.world_T_rigs)
-    )
+    slam, chosen = relative_steps(coarse.world_T_rigs), relative_steps(trust.world_T_rigs)
     chosen[steps] = slam[steps]
     named = trust.false_frames.copy()
     named[:-1] &= ~steps
@@ -322,26 +309,22 @@ def _chain(world_T_rigs: np.ndarray, chosen: np.ndarray, own: np.ndarray) -> np.
     return pose(rotation @ poses[:, :3, :3], positions + shift)
 
 
-@dataclass(frozen=True, slots=True)
-class OutlierLimits:
-    """Thresholds on the error of two frames' relative pose that mark an outlier."""
-
-    rotation: float  # radians
-    offset: float  # relative to the distance between the frames
-    noise_rotation: float  # radians, of one step: smaller errors are noise
-    noise_offset: float  # map units, of one step's position: smaller errors are noise
-
-
 def false_frames(
     wrong: np.ndarray,
     slam: np.ndarray,
     chosen: np.ndarray,
     own: np.ndarray,
-    limits: OutlierLimits,
+    limits: tuple[float, float],
+    noise: Sequence[float],
 ) -> np.ndarray:
     """Frames (F,) with a false pose: the fewest whose removal explains the steps that are `wrong`
     (F - 1,) bool. Of `own` frames (F,) bool the longest chain is kept whose relative poses agree
-    with the images; a permanent jump breaks it, at a cost, and marks the frame behind."""
+    with the images; a permanent jump breaks it, at a cost, and marks the frame behind.
+
+    Args:
+        limits: radians of rotation, and position relative to the distance between two frames.
+        noise: of one step, rotation (radians) and position (map units): smaller errors are noise.
+    """
     named = np.zeros(len(own), bool)
     if not wrong.any():
         return named
@@ -353,7 +336,8 @@ def false_frames(
         # more consecutive false frames are a jump
         for m in range(n - 1, max(n - 1 - 12, -1), -1):
             a, b = int(ours[m]), int(ours[n])
-            agree = (b == a + 1 and not wrong[a]) or _agree(theirs, images, a, b, limits)
+            agree = b == a + 1 and not wrong[a]
+            agree = agree or _agree(theirs, images, a, b, limits, noise)
             gain = score[m] + 1 - (0 if agree else 1.5)
             if gain > score[n]:
                 score[n], back[n], broken[n] = gain, m, not agree
@@ -365,12 +349,19 @@ def false_frames(
     return named
 
 
-def _agree(theirs: np.ndarray, images: np.ndarray, a: int, b: int, limits: OutlierLimits) -> bool:
+def _agree(
+    theirs: np.ndarray,
+    images: np.ndarray,
+    a: int,
+    b: int,
+    limits: tuple[float, float],
+    noise: Sequence[float],
+) -> bool:
     """True if a trajectory's relative pose of two frames fits the steps of the images."""
     one, other = inverse(theirs[a]) @ theirs[b], inverse(images[a]) @ images[b]
     turned = rotation_angle(one[:3, :3].T @ other[:3, :3])
     off, length = np.linalg.norm(one[:3, 3] - other[:3, 3]), np.linalg.norm(other[:3, 3])
     walked = np.sqrt(b - a)  # noise of steps accumulates like a random walk
-    rotation = max(limits.rotation, walked * limits.noise_rotation)
-    offset = max(limits.offset * length, walked * limits.noise_offset)
+    rotation = max(limits[0], walked * noise[0])
+    offset = max(limits[1] * length, walked * noise[1])
     return bool(turned < rotation and off < offset)

@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsba.geometry import inverse, pose
+from gsba.geometry import inverse, pose, relative_steps
 from gsba.log import GsbaError
 from gsba.trajectory.conventions import CAMERA_FROM_WORLD, OURS, WXYZ, axis_systems, w_first
 from gsba.trajectory.limits import TwoViewLimits
-from gsba.trajectory.steps import Steps, step_errors
-from gsba.types import CoarsePoses, PoseSource
+from gsba.trajectory.steps import Steps, step_errors, tracked_steps
+from gsba.types import CoarsePoses
 
 _MIN_STEPS = 5  # least number of steps that judge a whole trajectory
 _LOOSE_LIMITS = {"max_rotation_deg": 20.0, "max_direction_deg": 60.0}  # thresholds of loose
@@ -41,7 +41,7 @@ def refuse_useless(coarse: CoarsePoses) -> None:
 def refuse_misread(coarse: CoarsePoses, found: Steps, settings: TwoViewLimits) -> None:
     """Refuse a trajectory that most steps of the images contradict, but not in another convention;
     TurnedAboutForwardError if its axes are turned about the forward one."""
-    judged = _judged_steps(coarse, found)
+    judged = found.directed & tracked_steps(coarse)
     if judged.sum() < _MIN_STEPS:
         return
     readings = _steps_in_other_conventions(coarse.world_T_rigs)
@@ -53,7 +53,13 @@ def refuse_misread(coarse: CoarsePoses, found: Steps, settings: TwoViewLimits) -
     likely = [
         reading for reading in shares if shares[reading] * judged.sum() > most * judged.sum() - 1
     ]
-    best = min(likely, key=lambda reading: _mean_error(readings[reading], found, judged))
+
+    def mean_error(reading: str) -> float:
+        """Radians per judged step: tells readings apart that differ in small motions."""
+        turned, off = step_errors(readings[reading], found)
+        return float(np.mean((turned + off)[judged]))
+
+    best = min(likely, key=mean_error)
     if not best or shares[best] < _MIN_EXPLAINED_SHARE or shares[""] >= 0.6:
         return
     late, explained = _delay_in_frames(coarse, found, judged, settings)
@@ -72,8 +78,8 @@ def refuse_misread(coarse: CoarsePoses, found: Steps, settings: TwoViewLimits) -
 def refuse_misfit(coarse: CoarsePoses, found: Steps, settings: TwoViewLimits) -> None:
     """Refuse a trajectory that most steps of the images contradict, with the likely reason."""
     refuse_misread(coarse, found, settings)
-    judged, loose = _judged_steps(coarse, found), replace(settings, **_LOOSE_LIMITS)
-    steps = _steps(coarse.world_T_rigs)
+    judged, loose = found.directed & tracked_steps(coarse), replace(settings, **_LOOSE_LIMITS)
+    steps = relative_steps(coarse.world_T_rigs)
     # of random steps, a third agrees
     if judged.sum() < _MIN_STEPS or _agreeing_share(steps, found, judged, loose) > 0.5:
         return
@@ -94,9 +100,8 @@ def _delay_in_frames(
     coarse: CoarsePoses, found: Steps, judged: np.ndarray, settings: TwoViewLimits
 ) -> tuple[int, float]:
     """Delay of the trajectory in frames, 0 if none explains enough, and the share explained."""
-    steps, best = _steps(coarse.world_T_rigs), (0, 0.0)
-    own = coarse.sources[:-1] == PoseSource.SLAM
-    own &= coarse.sources[1:] == PoseSource.SLAM
+    steps, best = relative_steps(coarse.world_T_rigs), (0, 0.0)
+    own = tracked_steps(coarse)
     for late in range(1 - len(steps), len(steps)):
         theirs = slice(max(late, 0), len(steps) + min(late, 0))
         ours = slice(max(-late, 0), len(steps) - max(late, 0))
@@ -110,29 +115,19 @@ def _delay_in_frames(
     return best
 
 
-def _judged_steps(coarse: CoarsePoses, found: Steps) -> np.ndarray:
-    """Steps (F - 1,) bool between SLAM poses, with a direction known from images."""
-    own = coarse.sources == PoseSource.SLAM
-    return found.directed & own[:-1] & own[1:]
-
-
 def _contradiction_text(share: float, judged: np.ndarray) -> str:
     total = int(judged.sum())
     return f"the images contradict {round((1 - share) * total)} of {total} steps"
 
 
-def _steps(poses: np.ndarray) -> np.ndarray:
-    return inverse(poses[:-1]) @ poses[1:]
-
-
 def _steps_in_other_conventions(world_T_rigs: np.ndarray) -> dict[str, np.ndarray]:
     """Steps (F - 1,) of a trajectory in other conventions, the commoner ones first."""
-    steps = _steps(world_T_rigs)
-    reordered = _steps(pose(w_first(world_T_rigs[:, :3, :3]), world_T_rigs[:, :3, 3]))
+    steps = relative_steps(world_T_rigs)
+    reordered = relative_steps(pose(w_first(world_T_rigs[:, :3, :3]), world_T_rigs[:, :3, 3]))
     readings = {
         "": steps,
-        "reversed in time: check its timestamps": _steps(world_T_rigs[::-1]),
-        f"{CAMERA_FROM_WORLD}: {_pass(CAMERA_FROM_WORLD)}": _steps(inverse(world_T_rigs)),
+        "reversed in time: check its timestamps": relative_steps(world_T_rigs[::-1]),
+        f"{CAMERA_FROM_WORLD}: {_pass(CAMERA_FROM_WORLD)}": relative_steps(inverse(world_T_rigs)),
     }
     systems = {name: rotation for name, rotation in axis_systems() if name != OURS}
     for name in sorted(systems, key=lambda name: name not in _COMMON_SYSTEMS):
@@ -175,9 +170,3 @@ def _agreeing_share(
     agree = turned < np.deg2rad(settings.max_rotation_deg)
     agree &= off < np.deg2rad(settings.max_direction_deg)
     return float(agree[judged].mean())
-
-
-def _mean_error(steps: np.ndarray, found: Steps, judged: np.ndarray) -> float:
-    """Mean error of judged steps, radians: tells readings apart that differ in small motions."""
-    turned, off = step_errors(steps, found)
-    return float(np.mean((turned + off)[judged]))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsba.geometry import inverse, nearest_rotation, rotation_angle
-from gsba.types import Keypoints, VerifiedPairs
+from gsba.types import CoarsePoses, Keypoints, PoseSource, VerifiedPairs
 
 _MAX_LOG_DEVIATION = 0.15  # largest deviation of log ratios: points of rigid scenes are within it,
 # half of them within .02
@@ -84,6 +84,12 @@ def _set_short_directions(
         spread = 2 * (1 - lengths / counts[known])
         sigmas[known] = np.sqrt(squares[known] / counts[known] + spread)
         short = short & ~known
+
+
+def tracked_steps(coarse: CoarsePoses) -> np.ndarray:
+    """Steps (F - 1,) bool between two frames that the SLAM has tracked."""
+    tracked = coarse.sources == PoseSource.SLAM
+    return tracked[:-1] & tracked[1:]
 
 
 def step_errors(steps: np.ndarray, found: Steps) -> tuple[np.ndarray, np.ndarray]:

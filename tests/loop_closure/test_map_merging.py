@@ -13,7 +13,7 @@ from gsba.loop_closure import connectivity, join_evidence, map_merging
 from gsba.loop_closure.join_evidence import JoinEvidence
 from gsba.loop_closure.map_similarity import Proposal
 from gsba.loop_closure.merged_map import Registered, follow
-from gsba.loop_closure.registration import RegisteredFrame
+from gsba.matching.absolute_pose import FoundPose
 from gsba.similarity import Sim3
 from gsba.trajectory import judgement
 from gsba.trajectory.joining import GUESS, PLACES, SegmentAlignment
@@ -188,7 +188,7 @@ def test_a_frame_a_bay_off_is_registered_at_the_usual_pace(
     step, calls = TRUTH[f, :3, 3] - TRUTH[f - 1, :3, 3], list[int]()
     resect = map_merging.resect
 
-    def misled(*given) -> RegisteredFrame | None:
+    def misled(*given) -> FoundPose | None:
         found = resect(*given)
         calls.append(f)
         if found is None or len(calls) > 1:

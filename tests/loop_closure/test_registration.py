@@ -35,7 +35,7 @@ def test_most_bearings_may_be_false(false_share: float) -> None:
     false = rng.random(len(points)) < false_share
     bearings[false] = unit(rng.normal(size=(false.sum(), 3)))
     found = resect(bearings, points, SETTINGS, 0)
-    assert found is not None and found.reason == ""
+    assert found is not None
     off = inverse(POSE) @ found.world_T_rig
     assert np.linalg.norm(off[:3, 3]) < 0.01 and np.degrees(rotation_angle(off[:3, :3])) < 0.1
     assert found.inliers[~false].mean() > 0.98 and found.inliers[false].sum() < 0.05 * 200
@@ -44,19 +44,18 @@ def test_most_bearings_may_be_false(false_share: float) -> None:
 def test_points_in_one_narrow_cone_are_not_believed() -> None:
     rng = np.random.default_rng(1)
     points = _points(rng, 100, cone_deg=6.0)
-    found = resect(_seen(points, POSE, rng), points, SETTINGS, 0)
-    assert found is not None and found.reason == "all points lie one way"
+    assert resect(_seen(points, POSE, rng), points, SETTINGS, 0) is None
+    wider = _points(rng, 100, cone_deg=30.0)
+    assert resect(_seen(wider, POSE, rng), wider, SETTINGS, 0) is not None
 
 
 def test_two_places_that_explain_it_alike_are_not_believed() -> None:
     rng = np.random.default_rng(3)
     points = _points(rng, 160)
     bearings = np.concatenate([_seen(points[:80], POSE, rng), _seen(points[80:], OTHER, rng)])
-    found = resect(bearings, points, SETTINGS, 0)
-    assert found is not None and found.reason == "another place explains it nearly as well"
+    assert resect(bearings, points, SETTINGS, 0) is None
     clear = np.concatenate([bearings[:80], bearings[80:110]])
-    found = resect(clear, points[:110], SETTINGS, 0)
-    assert found is not None and found.reason == ""
+    assert resect(clear, points[:110], SETTINGS, 0) is not None
 
 
 def test_too_few_are_nothing() -> None:
