@@ -42,7 +42,7 @@ FEATURES, CAMERA, WEAK, KNOWN, FIRST_PATCHES, LAST_PATCHES = 1, 5, 6, 7, 8, 11  
 _PATCHES = range(FIRST_PATCHES, LAST_PATCHES + 1)
 OPTIONAL = {WEAK, FIRST_PATCHES + 2, LAST_PATCHES}  # phases that what was found so far decides on
 # Of each phase: share of its seconds in which one thread works alone, and coefficients of
-# `Size.terms`, seconds on two cores. Fitted by benchmarks/time_left.py of 0a607a7b.
+# `Size.terms`, seconds on two cores. Made by `python -m benchmarks.time_left fit`.
 _COSTS = (
     (0.586, 0.211, 0, 0.00338, 0, 0, 0, 0, 0.01, 0.0136),
     (0.0246, 0.0791, 0.0161, 0.00024, 0.0318, 0, 0, 0.00946, 0, 0.0156),
