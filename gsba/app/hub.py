@@ -39,8 +39,6 @@ class App:
     Args:
         root: folder below which files may be chosen; commands run in it.
         state: folder of jobs and of the token.
-        forms: forms of the commands, by name.
-        choices: known values of fields.
         check: refuses arguments that the command line would refuse, with a GsbaError.
     """
 

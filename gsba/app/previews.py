@@ -32,7 +32,6 @@ class Previews:
     """Facts and pictures below a root; one process makes them, the newest wish first.
 
     Args:
-        root: folder below which paths lie.
         cache: folder of results, made if missing.
     """
 

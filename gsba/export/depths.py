@@ -42,7 +42,6 @@ def write_depths(
     """Write the depths of all images of a dataset.
 
     Args:
-        data: the dataset.
         seen: its map as seen from its cameras, see `seen_from_lenses`.
         files: (C,) files of the images of each camera's frames.
         views: (C,) of each camera.

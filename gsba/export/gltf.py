@@ -52,8 +52,6 @@ def write_gltf(
     """Write `path`, a binary glTF file.
 
     Args:
-        path: file to write (.glb).
-        reconstruction, frames: poses and cloud, and their frames.
         up: axis of the world that points up, "-y", "y" or "z"; None = unknown.
         pictures: (F,) paths of the frames' panoramas, relative to the file's folder; None = there
             are none.

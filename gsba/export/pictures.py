@@ -123,14 +123,12 @@ class FrameWriter:
         """Write a frame's images, painted where masks hide them if wanted, and its masks.
 
         Args:
-            shown: the frame.
             key: of these images, one for all datasets that have the same.
             images: makes the images (h, w, 3) uint8 RGB, by view.
             masks: makes the masks (h, w) bool, True = use, by view.
             masks_differ: masks depend on the frame beyond its mask file.
             originals: files with the same pixels, by view, to be copied if readers understand
                 them; () = there are none.
-            link: make hard links instead of copies.
         """
         paths, hidden, style = self.images(shown), self.masks(shown), self.files.style
         if self.files.paints:
@@ -184,7 +182,6 @@ def by_camera(writers: Sequence[FrameWriter], frames: FrameSet) -> FrameWriter:
 
     Args:
         writers: (C,) of each camera's frames.
-        frames: all frames.
     """
     if len(writers) == 1:
         return writers[0]

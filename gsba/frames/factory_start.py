@@ -98,10 +98,8 @@ def starting_lenses(
     kept unless another one makes both lenses' rims clearly more alike.
 
     Args:
-        folder: of the pictures, for the log.
         pairs: pictures of the front and back lens of each frame, or twice the one that holds both.
         size: width and height of one lens's picture.
-        factory: the maker's calibration.
     """
     rows = np.unique(np.linspace(0, len(pairs) - 1, 8).astype(int))
     looks = [decode_pair(pairs[f], size, gray=True) for f in rows]

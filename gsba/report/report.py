@@ -43,7 +43,6 @@ def source_name(pose: int, start: str) -> str:
 
     Args:
         pose: a `PoseSource`.
-        start: what the run started from.
     """
     if pose in (PoseSource.SLAM, PoseSource.NONE):
         return start
@@ -140,13 +139,7 @@ def build_report(
     """Content of report.json: plain values only.
 
     Args:
-        settings: settings of the run.
-        frames: its frames.
-        coarse: their initial poses.
-        reconstruction: the result.
-        stages: their costs and counts.
         gauge: a sentence on the gauge of the refined map.
-        found: findings beside the result.
     """
     quality = frame_quality(reconstruction)
     optional: dict[str, Any] = {"camera": found.camera, "gyro": found.gyro, "gps": found.gps}

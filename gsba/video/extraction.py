@@ -74,9 +74,7 @@ def extract(video: Path, out: Path, settings: VideoSettings, replace: bool = Fal
 
     Times are the container's presentation times since the first frame, also for variable frame
     rates. An interrupted call resumes; another extraction in the folder is replaced if `replace`.
-
-    Raises:
-        GsbaError: the video or the folder cannot be used, or no frame is in the range.
+    Raises GsbaError: the video or the folder cannot be used, or no frame is in the range.
     """
     trajectory = None if settings.at is None else Path(settings.at)
     if settings.at is not None and settings.sharpest:
