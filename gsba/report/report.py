@@ -272,9 +272,6 @@ def _version(package: str) -> str | None:
         return None
 
 
-_UNCHANGED = {int, str, bool, type(None)}  # types that JSON holds as they are
-
-
 def plain(value: Any, digits: int = 17) -> Any:
     """Value as JSON can hold it: floats with `digits`, null for numbers that are not finite."""
     kind = type(value)  # the most frequent ones first
@@ -282,7 +279,7 @@ def plain(value: Any, digits: int = 17) -> Any:
         if not math.isfinite(value):
             return None
         return value if digits >= 17 else float(f"{value:.{digits}g}")
-    if kind in _UNCHANGED:
+    if kind in (int, str, bool, type(None)):  # JSON holds them as they are
         return value
     if kind is list:
         return [plain(item, digits) for item in value]

@@ -3,6 +3,7 @@
 import json
 import logging
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -70,18 +71,11 @@ def write_html(
         "splat": None,
         "odometry": None,
     }
-    data |= _kept_of(path, data["map"])
-    write_text(path, _assembled(_dumped(data)))
-
-
-def _kept_of(path: Path, shown: Mapping[str, Any]) -> dict[str, Any]:
-    """Splats and distances to a scan of an earlier page, if its poses and points are the same."""
-    try:
+    with suppress(OSError, ValueError, KeyError, TypeError):  # there is no earlier page
         earlier = _read(path)
-        same = earlier["map"] == json.loads(_dumped(shown))
-        return {name: earlier[name] for name in ("scan", "splat")} if same else {}
-    except (OSError, ValueError, KeyError, TypeError):
-        return {}
+        if earlier["map"] == json.loads(_dumped(data["map"])):  # of the same poses and points
+            data |= {name: earlier[name] for name in ("scan", "splat")}
+    write_text(path, _assembled(_dumped(data)))
 
 
 def add_scan(path: Path, content: Mapping[str, Any]) -> None:
