@@ -495,12 +495,6 @@ def test_too_many_pixels_are_refused_by_the_header(tmp_path: Path) -> None:
     refused(r"0\.png: is 40000x20000, 800 megapixels; 268 are read", scan, tmp_path, fps=1)
 
 
-def test_a_picture_that_grew_is_refused_before_it_is_decoded(folder: Path) -> None:
-    frames = scan(folder, fps=1)
-    write_image(folder / "0001.jpg", 128, 64)
-    refused(r"0001\.jpg: is 128x64, was 64x32 when the run began", load_erp, frames, 1)
-
-
 def test_pictures_of_other_kinds_are_counted(folder: Path, caplog) -> None:
     for name in ("a.avif", "b.AViF", "c.jxl", "d.jxl", "e.heic", "notes.txt"):
         (folder / name).write_bytes(b"x")
