@@ -71,7 +71,6 @@ def plan(root: Path, folder: str, files: Sequence[Any]) -> list[dict[str, Any]]:
     """Where dropped files go, how much of each is here, and which are refused.
 
     Args:
-        root: folder of the page.
         folder: in it, where they were dropped.
         files: of each "name", which may be a path in a dropped folder, "size" in bytes and
             "modified" in ms since 1970.
@@ -117,7 +116,6 @@ class Arrival:
     """A part of a dropped file on its way to the disk; other pages wait for its end.
 
     Args:
-        root: folder of the page.
         path: final path relative to the root, as `plan` gave it.
         size, modified: of the dropped file.
         offset: byte at which the part begins.

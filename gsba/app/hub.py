@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from gsba.app.forms import Form
 from gsba.app.jobs import AppJob, Jobs
 from gsba.app.previews import Previews
-from gsba.app.progress import Followed, Progress
+from gsba.app.progress import Progress, read_events
 from gsba.app.worker import ensure_worker
 from gsba.disk import write_text
 from gsba.log import GsbaError
@@ -39,8 +39,6 @@ class App:
     Args:
         root: folder below which files may be chosen; commands run in it.
         state: folder of jobs and of the token.
-        forms: forms of the commands, by name.
-        choices: known values of fields.
         check: refuses arguments that the command line would refuse, with a GsbaError.
     """
 
@@ -69,7 +67,7 @@ class App:
             path.chmod(0o600)
         self.token = token
         self.previews = Previews(self.root, state.resolve() / "previews")
-        self._followed: dict[str, Followed] = {}
+        self._followed: dict[str, tuple[Progress, int]] = {}  # and bytes of events it holds
         self._views: dict[Path, SceneView] = {}
         self._lock = threading.Lock()  # of viewers and of progress: requests come from threads
         ensure_worker(self.jobs)
@@ -77,7 +75,12 @@ class App:
     def progress(self, job: AppJob) -> Progress:
         """Progress of a job by its events so far."""
         with self._lock:
-            return self._followed.setdefault(job.id, Followed(job.events)).now()
+            progress, offset = self._followed.get(job.id, (Progress(), 0))
+            events, offset = read_events(job.events, offset)
+            for event in events:
+                progress.add(event)
+            self._followed[job.id] = progress, offset
+            return progress
 
     def view(self, run: Path) -> str:
         """Address of the viewer of a run, started if it is not shown yet. Raises GsbaError: viser

@@ -9,7 +9,6 @@ import subprocess
 import sys
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,31 +25,21 @@ from gsba.video.timeline import is_video
 _LONGEST_S = 60.0  # that one task may take
 
 
-@dataclass(frozen=True, slots=True)
-class _Task:
-    """A picture or facts to be made."""
-
-    values: tuple[tuple[str, Any], ...]  # of the task, as `pictures.answer` takes them
-    kept: Path  # file of the result
-
-    @property
-    def kind(self) -> str:
-        return dict(self.values)["kind"]
+_Task = dict[str, Any]  # a picture or facts to be made, as `pictures.answer` takes it
 
 
 class Previews:
     """Facts and pictures below a root; one process makes them, the newest wish first.
 
     Args:
-        root: folder below which paths lie.
         cache: folder of results, made if missing.
     """
 
     def __init__(self, root: Path, cache: Path) -> None:
         self._root, self._cache = root, cache
-        self._wanted: dict[Path, _Task] = {}  # by file of the result; the last is made first
-        self._now: Path | None = None  # file of the result that is being made
-        self._results: dict[Path, dict[str, Any]] = {}  # answers since the start
+        self._wanted: dict[str, _Task] = {}  # by file of the result; the last is made first
+        self._now: str | None = None  # file of the result that is being made
+        self._results: dict[str, dict[str, Any]] = {}  # answers since the start
         self._changed = threading.Condition()
         self._process: subprocess.Popen[bytes] | None = None
         self._thread: threading.Thread | None = None
@@ -142,20 +131,20 @@ class Previews:
         name = hashlib.sha256(key.encode("utf-8", "replace")).hexdigest()[:24]
         kept = self._cache / f"{name}{'.json' if values['kind'] == 'facts' else '.jpg'}"
         relative = f"./{path.relative_to(self._root).as_posix()}"
-        return _Task((*values.items(), ("path", relative), ("out", str(kept))), kept)
+        return values | {"path": relative, "out": str(kept)}
 
     def _result(self, task: _Task) -> dict[str, Any] | None:
         """Result of a task; None = it is not known yet."""
-        known = self._results.get(task.kept)
-        if known is not None or not task.kept.is_file():
+        known, kept = self._results.get(task["out"]), Path(task["out"])
+        if known is not None or not kept.is_file():
             return known
         known = {}
-        if task.kind == "facts":
+        if task["kind"] == "facts":
             try:
-                known = json.loads(task.kept.read_text(encoding="utf-8"))
+                known = json.loads(kept.read_text(encoding="utf-8"))
             except (OSError, ValueError):
                 return None
-        self._results[task.kept] = known
+        self._results[task["out"]] = known
         return known
 
     def _made(self, task: _Task) -> dict[str, Any]:
@@ -164,7 +153,7 @@ class Previews:
         if known is None:
             self._want([task])
             with self._changed:
-                while (known := self._results.get(task.kept)) is None:
+                while (known := self._results.get(task["out"])) is None:
                     if not self._changed.wait(2 * _LONGEST_S) or self._closed:
                         raise GsbaError("the server is busy: try again")
         if "error" in known:
@@ -174,16 +163,16 @@ class Previews:
     def _file(self, task: _Task) -> Path:
         """File of a task's result; waits for it."""
         self._made(task)
-        return task.kept
+        return Path(task["out"])
 
     def _want(self, tasks: Sequence[_Task]) -> None:
         """Queue tasks; the last of them is made next."""
         with self._changed:
             for task in tasks:
-                if task.kept == self._now or task.kept in self._results:
+                if task["out"] == self._now or task["out"] in self._results:
                     continue
-                self._wanted.pop(task.kept, None)
-                self._wanted[task.kept] = task
+                self._wanted.pop(task["out"], None)
+                self._wanted[task["out"]] = task
             if self._wanted and self._thread is None:
                 self._thread = threading.Thread(target=self._work, daemon=True)
                 self._thread.start()
@@ -202,13 +191,13 @@ class Previews:
                 if self._closed:
                     return
                 task = self._wanted.popitem()[1]
-                self._now = task.kept
-            answer = self._ask(dict(task.values))
+                self._now = task["out"]
+            answer = self._ask(task)
             may_grow = "pip install" in json.dumps(answer)  # a package that is missing today
-            if task.kind == "facts" and "error" not in answer and not may_grow:
-                write_json(task.kept, answer)
+            if task["kind"] == "facts" and "error" not in answer and not may_grow:
+                write_json(Path(task["out"]), answer)
             with self._changed:
-                self._results[task.kept], self._now = answer, None
+                self._results[task["out"]], self._now = answer, None
                 self._changed.notify_all()
 
     def _ask(self, values: dict[str, Any]) -> dict[str, Any]:

@@ -84,42 +84,19 @@ class Progress:
         """Names of the stages that have ended, in order."""
         return [str(stage.get("name")) for stage in self.stages]
 
-    def left_in_words(self) -> str:
-        """Time that the whole run still takes, in words; "" = not known."""
-        seconds = self.time_left.seconds(time.time())
-        return "" if seconds is None else in_words(seconds)
-
     def table(self) -> dict[str, Any]:
-        """Plain values for JSON."""
+        """Plain values for JSON; "left" is the time that the whole run still takes, in words."""
+        seconds = self.time_left.seconds(time.time())
         return {
             "stages": self.stages,
             "stage": self.stage,
             "work": self.work,
-            "left": self.left_in_words(),
+            "left": "" if seconds is None else in_words(seconds),
             "warnings": self.warnings,
             "error": self.error,
             "last": self.last,
             "keyframes": len(self.keyframes),
         }
-
-
-class Followed:
-    """Progress of a job, read on from where it was read before.
-
-    Args:
-        path: file of the events.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self._path, self._offset = path, 0
-        self.progress = Progress()
-
-    def now(self) -> Progress:
-        """The progress with all events so far."""
-        events, self._offset = read_events(self._path, self._offset)
-        for entry in events:
-            self.progress.add(entry)
-        return self.progress
 
 
 def _finite(values: Sequence[Any] | None) -> bool:

@@ -25,23 +25,9 @@ from gsba.log import GsbaError
 from gsba.view.server import allowed
 
 _MAX_BODY, _MAX_LOG = 256 * 1024, 64 * 1024  # bytes
-_SCRIPTS = (
-    "elements",
-    "files",
-    "drop",
-    "panorama",
-    "plan",
-    "command",
-    "start",
-    "jobs",
-    "run",
-    "growing",
-    "compare",
-    "app",
-)
-_PAGE = {"": "index.html", "app.css": "app.css"} | {f"{n}.js": f"{n}.js" for n in _SCRIPTS}
 _UPLOAD = "/upload"
 _TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript"}
+PAGE = {one.name: one for one in (files("gsba.app") / "page").iterdir() if one.name[0] != "."}
 _PAGE_POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
     "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -181,12 +167,11 @@ def _receiving(app: App) -> Callable[[Request], Awaitable[Response]]:
 
 
 def _page(app: App, request: Request) -> Response:
-    name = _PAGE.get(request.path_params.get("name", ""))
-    if name is None:
+    file = PAGE.get(request.path_params.get("name", "index.html"))
+    if file is None:
         return PlainTextResponse("Not found\n", 404)
-    content = (files("gsba.app") / "page" / name).read_bytes()
-    kind = _TYPES[Path(name).suffix]
-    return Response(content, media_type=kind, headers={"content-security-policy": _PAGE_POLICY})
+    kind, policy = _TYPES[Path(file.name).suffix], {"content-security-policy": _PAGE_POLICY}
+    return Response(file.read_bytes(), media_type=kind, headers=policy)
 
 
 def _start(app: App, request: Request) -> Any:

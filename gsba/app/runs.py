@@ -88,7 +88,6 @@ def camera_so_far(run: Path, done: Sequence[str]) -> list[str]:
     """Lines about the camera from the results of stages that have ended.
 
     Args:
-        run: folder of the run.
         done: names of these stages, in order.
     """
     centres = _latest(run, done, LENS_CENTRES, LensCentres)

@@ -21,7 +21,6 @@ def serve(app: App, port: int, started: Callable[[str], None]) -> None:
     """Answer browsers of this machine until the process is interrupted.
 
     Args:
-        app: what pages show.
         port: 1 to 65535, or 0 for any free one.
         started: called with the address when browsers get answers.
 

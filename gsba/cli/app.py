@@ -1,6 +1,7 @@
 """The typer application: registration of commands, and their failures in one line."""
 
 import gc
+import inspect
 import logging
 import os
 import signal
@@ -9,6 +10,7 @@ import threading
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from copy import copy
 from functools import cache, wraps
 from pathlib import Path
 from typing import Annotated, NoReturn, ParamSpec
@@ -16,11 +18,11 @@ from typing import Annotated, NoReturn, ParamSpec
 import typer
 from typer.core import TyperCommand
 
+from gsba.cli.options import OPTIONS
 from gsba.log import GsbaError, brief, event, show_log
 from gsba.version import __version__
 
 P = ParamSpec("P")
-Run = Annotated[Path, typer.Argument(help="Folder of a finished run.", metavar="RUN")]
 
 _SOURCE = Path(__file__).parents[1]  # folder of gsba's own code
 _MAX_MESSAGE_LENGTH = 1000  # characters
@@ -140,7 +142,8 @@ def _end_on_sigterm() -> None:
 
 
 def command(function: Callable[P, None]) -> Callable[P, None]:
-    """Register a command whose failures end in one line."""
+    """Register a command whose failures end in one line; its help is in `OPTIONS`."""
+    name = function.__name__.replace("_", "-")
 
     @wraps(function)
     def run(*args: P.args, **kwargs: P.kwargs) -> None:
@@ -156,8 +159,19 @@ def command(function: Callable[P, None]) -> Callable[P, None]:
         finally:
             event("end", code=code)
 
-    name = function.__name__.replace("_", "-")
+    signature = inspect.signature(function)
+    parameters = [_described(name, parameter) for parameter in signature.parameters.values()]
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
     return app.command(name, cls=_Command)(run)
+
+
+def _described(command_name: str, parameter: inspect.Parameter) -> inspect.Parameter:
+    """The parameter of a command as typer reads it: with its entry in `OPTIONS`."""
+    entry = copy(OPTIONS.get(f"{command_name}.{parameter.name}") or OPTIONS[parameter.name])
+    if parameter.annotation is bool and entry.default is ...:  # no names: typer would add --no-NAME
+        entry.default = f"--{parameter.name.replace('_', '-')}"
+    return parameter.replace(annotation=Annotated[parameter.annotation, entry])
 
 
 def _print_version(wanted: bool) -> None:

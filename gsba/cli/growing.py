@@ -1,62 +1,30 @@
 """Commands on finished runs: `add`, `merge`, `remove`, `localize`."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 
-from gsba.cli.app import Run, command, loading
+from gsba.cli.app import command, loading
 from gsba.cli.recordings import recordings_of
-from gsba.cli.refining import (
-    PARTIAL,
-    AllowPartial,
-    Calibration,
-    Cluster,
-    Fps,
-    Masks,
-    NoTrajectory,
-    Recordings,
-    Segment,
-    conclude,
-)
+from gsba.cli.refining import PARTIAL, conclude
 from gsba.log import GsbaError
-
-Out = Annotated[
-    Path | None,
-    typer.Option(
-        help="Folder of the result, which leaves RUN as it is; default: RUN, and what was there is "
-        "kept as RUN-before.",
-        metavar="DIR",
-    ),
-]
 
 
 @command
 def add(
-    run: Run,
-    new: Annotated[
-        list[Path] | None,
-        typer.Argument(
-            help="Folder or video of a recording to add, with trajectory files after it; more "
-            "recordings after these.",
-            metavar="RECORDING",
-        ),
-    ] = None,
-    out: Out = None,
-    fixed: Annotated[
-        bool,
-        typer.Option(
-            "--fixed", help="Keep the poses of RUN to the byte; solve new ones against them."
-        ),
-    ] = False,
-    recording: Recordings = None,
-    no_trajectory: NoTrajectory = False,
-    masks: Masks = None,
-    segment: Segment = None,
-    calibration: Calibration = None,
-    fps: Fps = None,
-    cluster: Cluster = None,
-    allow_partial: AllowPartial = False,
+    run: Path,
+    new: list[Path] | None = None,
+    out: Path | None = None,
+    fixed: bool = False,
+    recording: list[str] | None = None,
+    no_trajectory: bool = False,
+    masks: list[Path] | None = None,
+    segment: str | None = None,
+    calibration: Path | None = None,
+    fps: float | None = None,
+    cluster: str | None = None,
+    allow_partial: bool = False,
 ) -> None:
     """Add recordings of the same place to a finished run.
 
@@ -80,17 +48,11 @@ def add(
 
 @command
 def merge(
-    runs: Annotated[list[Path], typer.Argument(help="Folders of finished runs.", metavar="RUN...")],
-    out: Annotated[Path, typer.Option(help="Folder of the result.", metavar="DIR")],
-    rigid: Annotated[
-        bool,
-        typer.Option(
-            "--rigid",
-            help="Move each map as it is; report the covariance of the similarity between them.",
-        ),
-    ] = False,
-    cluster: Cluster = None,
-    allow_partial: AllowPartial = False,
+    runs: list[Path],
+    out: Path,
+    rigid: bool = False,
+    cluster: str | None = None,
+    allow_partial: bool = False,
 ) -> None:
     """Merge finished runs of one place into one.
 
@@ -108,12 +70,10 @@ def merge(
 
 @command
 def remove(
-    run: Run,
-    names: Annotated[
-        list[str], typer.Argument(help="Names of recordings to take out.", metavar="NAME...")
-    ],
-    out: Out = None,
-    allow_partial: AllowPartial = False,
+    run: Path,
+    names: list[str],
+    out: Path | None = None,
+    allow_partial: bool = False,
 ) -> None:
     """Take recordings out of a finished run.
 
@@ -126,41 +86,13 @@ def remove(
 
 @command
 def localize(
-    run: Run,
-    images: Annotated[
-        list[Path],
-        typer.Argument(help="Pictures of the run's cameras, or photos: files, folders, videos."),
-    ],
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder to write; default: beside the pictures, NAME-localized.", metavar="DIR"
-        ),
-    ] = None,
-    map_number: Annotated[
-        int, typer.Option("--map", help="Number of the map; 1: the largest.", metavar="NUMBER")
-    ] = 1,
-    camera_of: Annotated[
-        str | None,
-        typer.Option(
-            help="Recording whose camera took the pictures; default: their layout and size tell.",
-            metavar="RECORDING",
-        ),
-    ] = None,
-    fast: Annotated[
-        bool,
-        typer.Option(
-            "--fast",
-            help="Rest on keypoints alone: half the time, errors about three times as large.",
-        ),
-    ] = False,
-    allow_partial: Annotated[
-        bool,
-        typer.Option(
-            "--allow-partial",
-            help="Exit with 0 even if less than nine tenths of the pictures are localised.",
-        ),
-    ] = False,
+    run: Path,
+    images: list[Path],
+    out: Path | None = None,
+    map_number: int = 1,
+    camera_of: str | None = None,
+    fast: bool = False,
+    allow_partial: bool = False,
 ) -> None:
     """Find the poses of new pictures in a finished run.
 

@@ -2,23 +2,13 @@
 
 import logging
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
 from gsba.cli.app import command, loading
-from gsba.cli.refining import (
-    AllowPartial,
-    Camera,
-    Config,
-    Out,
-    Overrides,
-    conclude,
-    run_folder,
-    settings_of,
-)
+from gsba.cli.refining import conclude, run_folder, settings_of
 from gsba.cli.results import cameras_of, shutter_of
-from gsba.cli.splat import BackendName, FaceSize, Iterations, splat_settings, train_on
+from gsba.cli.splat import splat_settings, train_on
 from gsba.log import GsbaError, held_until_computing
 
 logger = logging.getLogger(__name__)
@@ -26,24 +16,16 @@ logger = logging.getLogger(__name__)
 
 @command
 def splat(
-    frames: Annotated[
-        Path, typer.Argument(help="A video, or a folder of frames, as of `gsba refine`.")
-    ],
-    out: Out = None,
-    to: Annotated[
-        str | None,
-        typer.Option(
-            help="Write a dataset for this program, as in `gsba export`; default: train a splat.",
-            metavar="TRAINER",
-        ),
-    ] = None,
-    config: Config = None,
-    overrides: Overrides = None,
-    camera: Camera = None,
-    face_size: FaceSize = None,
-    iterations: Iterations = None,
-    backend: BackendName = "auto",
-    allow_partial: AllowPartial = False,
+    frames: Path,
+    out: Path | None = None,
+    to: str | None = None,
+    config: Path | None = None,
+    overrides: list[str] | None = None,
+    camera: str | None = None,
+    face_size: int | None = None,
+    iterations: int | None = None,
+    backend: str = "auto",
+    allow_partial: bool = False,
 ) -> None:
     """Make a splat of a video: refine, then train or export.
 

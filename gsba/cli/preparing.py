@@ -1,50 +1,27 @@
 """Commands on footage: `extract`, `mask`, `track`."""
 
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
 from gsba.cli.app import command
-from gsba.cli.refining import Calibration
 from gsba.log import GsbaError
 
 
 @command
 def extract(
-    video: Annotated[Path, typer.Argument(help="Video: 2:1, .360, or raw of two fisheyes.")],
-    out: Annotated[Path, typer.Option(help="Folder to write the frames to.", metavar="FRAMES")],
-    fps: Annotated[
-        float | None, typer.Option(help="Frames to keep per second; default: 1.")
-    ] = None,
-    every: Annotated[
-        str | None,
-        typer.Option(
-            help="Keep one of N frames. auto: keep sharp frames with baselines that suit the "
-            "scene's depth, which odometry on the video estimates.",
-            metavar="N|auto",
-        ),
-    ] = None,
-    frames: Annotated[
-        int | None, typer.Option(help="With --every auto: largest number of frames to keep.")
-    ] = None,
-    at: Annotated[
-        Path | None,
-        typer.Option(help="Keep the frames at the times of this file.", metavar="TRAJECTORY"),
-    ] = None,
-    sharpest: Annotated[
-        bool,
-        typer.Option("--sharpest", help="Keep the sharpest frame of each interval, not the first."),
-    ] = False,
-    from_s: Annotated[float | None, typer.Option("--from", help="Seconds to start at.")] = None,
-    to_s: Annotated[float | None, typer.Option("--to", help="Seconds to end at.")] = None,
-    width: Annotated[
-        int | None, typer.Option(help="Width of a frame in pixels; default: as the video.")
-    ] = None,
-    keep_standing: Annotated[
-        bool, typer.Option("--keep-standing", help="Also keep frames while the camera stands.")
-    ] = False,
-    fresh: Annotated[bool, typer.Option("--fresh", help="Replace an earlier extraction.")] = False,
+    video: Path,
+    out: Path,
+    fps: float | None = None,
+    every: str | None = None,
+    frames: int | None = None,
+    at: Path | None = None,
+    sharpest: bool = False,
+    from_s: float | None = None,
+    to_s: float | None = None,
+    width: int | None = None,
+    keep_standing: bool = False,
+    fresh: bool = False,
 ) -> None:
     """Extract frames of a video with their exact times.
 
@@ -100,14 +77,10 @@ def _chosen_by_odometry(
 
 @command
 def mask(
-    frames: Annotated[
-        Path, typer.Argument(help="Folder of 2:1 panoramas, tracks or raw fisheyes.")
-    ],
-    out: Annotated[Path, typer.Option(help="Folder to write the masks to.", metavar="DIR")],
-    masks: Annotated[
-        Path | None, typer.Option(help="Masks of your own, merged with the carrier's.")
-    ] = None,
-    calibration: Calibration = None,
+    frames: Path,
+    out: Path,
+    masks: Path | None = None,
+    calibration: Path | None = None,
 ) -> None:
     """Find the carrier of the camera and write its mask.
 
@@ -125,56 +98,18 @@ def mask(
     typer.echo(f"{result}: {written[0]}" + (f", {out / 'merged'}" if len(written) > 2 else ""))
 
 
-Keyframes = Annotated[
-    Path | None,
-    typer.Option(
-        help="Keyframes to write, TUM; default: beside --out, named -keyframes.", metavar="FILE"
-    ),
-]
-Report = Annotated[
-    Path | None,
-    typer.Option(
-        help="Report to write, JSON; default: beside --out, named -report.", metavar="FILE"
-    ),
-]
-Poses = Annotated[
-    Path | None,
-    typer.Option(
-        help="Maps, statuses and covariances of poses to write, CSV; default: beside --out, "
-        "named -poses.",
-        metavar="FILE",
-    ),
-]
-Width = Annotated[
-    int,
-    typer.Option(
-        min=256, max=4096, help="Width in pixels of the panoramas that odometry uses; even."
-    ),
-]
-
-
 @command
 def track(
-    frames: Annotated[
-        Path,
-        typer.Argument(help="Video, or folder of 2:1 panoramas or raw fisheyes, in time order."),
-    ],
-    out: Annotated[
-        Path, typer.Option(help="Trajectory to write: TUM, poses of all frames.", metavar="FILE")
-    ],
-    keyframes: Keyframes = None,
-    poses: Poses = None,
-    report: Report = None,
-    masks: Annotated[
-        str,
-        typer.Option(help="auto: mask the carrier of the camera; none; or a mask, white = use."),
-    ] = "auto",
-    width: Width = 800,
-    fps: Annotated[float | None, typer.Option(help="Frame rate of a folder without times.")] = None,
-    timestamps: Annotated[
-        Path | None, typer.Option(help="File with the times of a folder's frames.", metavar="FILE")
-    ] = None,
-    calibration: Calibration = None,
+    frames: Path,
+    out: Path,
+    keyframes: Path | None = None,
+    poses: Path | None = None,
+    report: Path | None = None,
+    masks: str = "auto",
+    width: int = 800,
+    fps: float | None = None,
+    timestamps: Path | None = None,
+    calibration: Path | None = None,
 ) -> None:
     """Estimate a pose for every frame by visual odometry."""
     from gsba import odometry

@@ -4,7 +4,7 @@ import json
 import logging
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
@@ -20,213 +20,34 @@ if TYPE_CHECKING:
 PARTIAL = 3  # exit code of a run whose exported map has less than nine tenths of its frames, or is
 # not good to train on
 
-Config = Annotated[
-    Path | None,
-    typer.Option(
-        help="TOML file of settings, or a preset: fast, accurate, bearing, photometric, "
-        "reprojection.",
-        metavar="FILE|PRESET",
-    ),
-]
-Overrides = Annotated[
-    list[str] | None,
-    typer.Option("--set", help="Override a setting; repeatable.", metavar="STAGE.KEY=VALUE"),
-]
-
-
-def _list_families(value: str | None) -> str | None:
-    """`--factors list`: the installed families, and nothing else is done."""
-    if value == "list":
-        from gsba.config import BUILT_IN, installed_families
-
-        packages = {name: f"of {point.value}" for name, point in installed_families().items()}
-        shown = {**BUILT_IN, **packages}
-        width = max(map(len, shown)) + 2
-        typer.echo("\n".join(f"{name:<{width}}{summary}" for name, summary in shown.items()))
-        raise typer.Exit
-    return value
-
-
-Factors = Annotated[
-    str | None,
-    typer.Option(
-        callback=_list_families,
-        help="Families of residuals, separated by commas: bearing, reprojection, gps, photometric, "
-        "splat, and those of packages, as NAME or NAME:ARGUMENT; list: shows all that there are.",
-    ),
-]
-Weights = Annotated[
-    list[Path] | None,
-    typer.Option(
-        help="Weights of a learned extractor or matcher: a file, or a folder that holds them under "
-        "their official names; repeatable.",
-        metavar="PATH",
-    ),
-]
-Consent = Annotated[
-    bool,
-    typer.Option(
-        "--accept-noncommercial", help="Use weights whose licence forbids commercial use."
-    ),
-]
-Download = Annotated[
-    bool, typer.Option("--download", help="Fetch missing weights from their authors.")
-]
-
-Frames = Annotated[
-    Path | None,
-    typer.Argument(
-        help="Folder of 2:1 panoramas, raw fisheyes, .360 tracks or cube faces, or a video."
-    ),
-]
-Trajectories = Annotated[
-    list[Path] | None,
-    typer.Argument(
-        help="TUM, KITTI, stella_vslam map.msg or Metashape cameras.xml; several files are pieces "
-        "of one trajectory. Default: odometry on a video; pairs of images of stills. A further "
-        "folder or video is another recording of the place, and files after it are its trajectory."
-    ),
-]
-Recordings = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--recording",
-        help="One of several recordings, with what belongs to it: name, trajectory, keyframes, "
-        "masks, timestamps, fps, calibration, imu, camera. Repeatable.",
-        metavar="PATH,KEY=VALUE,...",
-    ),
-]
-Out = Annotated[
-    Path | None,
-    typer.Option(
-        help="Folder of the run; default: named after the video, or FRAMES-run.", metavar="RUN"
-    ),
-]
-NoTrajectory = Annotated[
-    bool,
-    typer.Option(
-        "--no-trajectory",
-        help="Start from pairs of images, for a video without odometry, too.",
-    ),
-]
-Times = Annotated[
-    Path | None, typer.Option(help="File with the times of the frames.", metavar="FILE")
-]
-Fps = Annotated[
-    float | None,
-    typer.Option(
-        help="Frame rate of a folder, from time 0. Of a video: frames to keep per second; default: "
-        "odometry chooses them."
-    ),
-]
-Keyframes = Annotated[
-    Path | None,
-    typer.Option(help="Keyframe trajectory of the same SLAM run.", metavar="FILE"),
-]
-TrajectoryFormat = Annotated[
-    str | None,
-    typer.Option(
-        help="Convention of the trajectory, where it is not x right, y down, z forward with "
-        "quaternions x, y, z, w: wxyz, camera-from-world, ways of the camera's x, y and z as "
-        "forward-left-up; several with commas between.",
-        metavar="WORDS",
-    ),
-]
-Masks = Annotated[
-    list[Path] | None,
-    typer.Option(
-        help="One mask for all frames, or a folder of masks; white = use. auto (default): mask the "
-        "carrier of the camera where it is found; carrier: fail where it is not; distractors: mask "
-        "moving objects; none. Repeatable.",
-        metavar="PATH",
-    ),
-]
-Camera = Annotated[
-    str | None,
-    typer.Option(
-        help="Camera model, e.g. insta360-x5: sets priors for lens distance and readout time.",
-        metavar="NAME",
-    ),
-]
-Calibration = Annotated[
-    Path | None, typer.Option(help="Calibration of the lenses of raw fisheyes.", metavar="FILE")
-]
-Circle = Annotated[
-    list[str] | None,
-    typer.Option(
-        help="Image circle of raw fisheyes where none is found: centre and radius in pixels of one "
-        "lens's image. Repeatable: front, then back; one value is for both.",
-        metavar="X,Y,R",
-    ),
-]
-Imu = Annotated[
-    Path | None,
-    typer.Option(
-        help="Recording of a gyro and an accelerometer on the camera: t [s], gyro x y z [rad/s], "
-        "accelerometer x y z [m/s^2]; or a camera maker's file.",
-        metavar="FILE",
-    ),
-]
-Gps = Annotated[
-    str | None,
-    typer.Option(
-        help="GPS positions that limit drift, as factors: CSV, GPX, a video, or exif (of the "
-        "frames).",
-        metavar="FILE",
-    ),
-]
-Cluster = Annotated[
-    str | None,
-    typer.Option(
-        help="Dask scheduler whose workers share the work of frames and pairs: tcp://HOST:PORT, "
-        "its FILE.json, local:N, slurm:N, ...",
-        metavar="ADDRESS",
-    ),
-]
-AllowPartial = Annotated[
-    bool,
-    typer.Option(
-        "--allow-partial",
-        help="Exit with 0 even if less than nine tenths of the frames are in one map, or the "
-        "verdict on it is not to train.",
-    ),
-]
-Segment = Annotated[
-    str | None,
-    typer.Option(
-        help="Command that makes masks of cube faces: called with two folders, IMAGES MASKS.",
-        metavar="COMMAND",
-    ),
-]
-
 
 @command
 def refine(
-    frames: Frames = None,
-    trajectory: Trajectories = None,
-    out: Out = None,
-    recording: Recordings = None,
-    keyframes: Keyframes = None,
-    trajectory_format: TrajectoryFormat = None,
-    no_trajectory: NoTrajectory = False,
-    config: Config = None,
-    overrides: Overrides = None,
-    masks: Masks = None,
-    segment: Segment = None,
-    factors: Factors = None,
-    timestamps: Times = None,
-    camera: Camera = None,
-    calibration: Calibration = None,
-    circle: Circle = None,
-    imu: Imu = None,
-    gps: Gps = None,
-    fps: Fps = None,
-    weights: Weights = None,
-    accept_noncommercial: Consent = False,
-    download: Download = False,
-    cluster: Cluster = None,
-    allow_partial: AllowPartial = False,
-    fresh: Annotated[bool, typer.Option("--fresh", help="Replace an earlier run.")] = False,
+    frames: Path | None = None,
+    trajectory: list[Path] | None = None,
+    out: Path | None = None,
+    recording: list[str] | None = None,
+    keyframes: Path | None = None,
+    trajectory_format: str | None = None,
+    no_trajectory: bool = False,
+    config: Path | None = None,
+    overrides: list[str] | None = None,
+    masks: list[Path] | None = None,
+    segment: str | None = None,
+    factors: str | None = None,
+    timestamps: Path | None = None,
+    camera: str | None = None,
+    calibration: Path | None = None,
+    circle: list[str] | None = None,
+    imu: Path | None = None,
+    gps: str | None = None,
+    fps: float | None = None,
+    weights: list[Path] | None = None,
+    accept_noncommercial: bool = False,
+    download: bool = False,
+    cluster: str | None = None,
+    allow_partial: bool = False,
+    fresh: bool = False,
 ) -> None:
     """Refine the pose of every frame; the same call again resumes.
 
@@ -307,36 +128,16 @@ def conclude(results: "Sequence[RunResult]", allow_partial: bool) -> None:
 
 @command
 def demo(
-    path: Annotated[
-        str, typer.Option(help="rectangle, oval or open; with --mesh: a TUM file of poses.")
-    ] = "rectangle",
-    heading: Annotated[str, typer.Option(help="locked or forward.")] = "locked",
-    out: Annotated[Path, typer.Option(help="Folder for the walk and its run.")] = Path("gsba-demo"),
-    frames: Annotated[
-        int | None, typer.Option(help="Frames of the walk; default: 40, of a video 240.")
-    ] = None,
-    width: Annotated[
-        int | None,
-        typer.Option(help="Width of a panorama in pixels; default: 1024, of a video 720."),
-    ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of the walk's wobble, noise and drift.")] = 0,
-    camera: Annotated[
-        str,
-        typer.Option(help="ideal: one centre; two-lens: two lenses with a rolling shutter."),
-    ] = "ideal",
-    mesh: Annotated[
-        Path | None,
-        typer.Option(help="Mesh to walk through in place of the gallery: OBJ, GLB or PLY."),
-    ] = None,
-    video: Annotated[
-        bool,
-        typer.Option(
-            "--video",
-            help="Render the walk as a video of eight frames a second and refine it without a "
-            "trajectory.",
-        ),
-    ] = False,
-    allow_partial: AllowPartial = False,
+    path: str = "rectangle",
+    heading: str = "locked",
+    out: Path = Path("gsba-demo"),
+    frames: int | None = None,
+    width: int | None = None,
+    seed: int = 0,
+    camera: str = "ideal",
+    mesh: Path | None = None,
+    video: bool = False,
+    allow_partial: bool = False,
 ) -> None:
     """Render a walk with exact truth, refine it and compare.
 
@@ -440,7 +241,7 @@ def _found_lenses(found: dict[str, Any], scale: float, lenses: "TwoLenses") -> s
 
 @command
 def show_config(
-    config: Config = None, overrides: Overrides = None, factors: Factors = None
+    config: Path | None = None, overrides: list[str] | None = None, factors: str | None = None
 ) -> None:
     """Print all settings as TOML, with their allowed values."""
     from gsba.config_file import to_toml

@@ -4,21 +4,12 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
-from gsba.cli.app import Run, command, loading
-from gsba.cli.refining import Cluster
-from gsba.cli.splat import (
-    BackendName,
-    FaceSize,
-    Iterations,
-    LpipsWeights,
-    MaxGaussians,
-    evaluate_splat,
-    splat_settings,
-)
+from gsba.cli.app import command, loading
+from gsba.cli.splat import evaluate_splat, splat_settings
 from gsba.log import GsbaError
 
 if TYPE_CHECKING:
@@ -29,174 +20,33 @@ if TYPE_CHECKING:
     from gsba.types import FrameSet, Reconstruction, Trajectory
 
 
-Length = Annotated[
-    str | None,
-    typer.Option(
-        help="Metres between the two ends of --between; lens: scale from the lens distance.",
-        metavar="LENGTH",
-    ),
-]
-Millimetres = Annotated[
-    float | None,
-    typer.Option(help="Millimetres between the lenses, for --scale lens.", metavar="MM"),
-]
-Images = Annotated[
-    str,
-    typer.Option(
-        help="cube: six faces of one centre; lenses: ten faces of one lens each, where two lenses "
-        "were found; fisheye: the raw fisheyes; panorama: two lenses stitched at the map's depth, "
-        "else the frames; auto: lenses for raw fisheyes, else cube.",
-        metavar="auto|cube|lenses|fisheye|panorama",
-    ),
-]
-Between = Annotated[
-    tuple[str, str] | None,
-    typer.Option(help="Two frames, or points x,y,z of the run's world.", metavar="A B"),
-]
-Gps = Annotated[
-    str | None,
-    typer.Option(
-        help="GPS positions: CSV, GPX, a GoPro video, or exif (of the frames); export in metres "
-        "east, north, up.",
-        metavar="FILE",
-    ),
-]
-GpsSigma = Annotated[
-    float | None,
-    typer.Option(
-        help="With --gps: smallest horizontal sigma of a fix in metres; default: 3.", metavar="M"
-    ),
-]
-GpsOffset = Annotated[
-    float | None,
-    typer.Option(
-        help="With --gps: seconds to add to the file's times to reach the frames' clock.",
-        metavar="SECONDS",
-    ),
-]
-AlignScan = Annotated[
-    str | None,
-    typer.Option(
-        help="Scan to align with: PLY, PCD, LAS, LAZ, OBJ or GLB; export in its world and unit.",
-        metavar="SCAN",
-    ),
-]
-MapNumber = Annotated[
-    int,
-    typer.Option(
-        "--map",
-        help="Number of the map to export, as in the run's report; 1: the largest.",
-        metavar="NUMBER",
-    ),
-]
-Without = Annotated[
-    list[str] | None,
-    typer.Option(
-        help="Frame to leave out; doubted: those that the run's verdict says to leave out. "
-        "Repeatable.",
-        metavar="NAME",
-    ),
-]
-Target = Annotated[
-    str,
-    typer.Option(
-        help="colmap, colmap-flat, colmap-erp, nerfstudio, opensfm, metashape, gltf, ply or tum; "
-        "or a program: inria, postshot, brush, lichtfeld, gsplat, 3dgrut, opensplat, nerfstudio, "
-        "instant-ngp, 3dgs-deblur, blender.",
-        metavar="FORMAT",
-    ),
-]
-Exposure = Annotated[
-    float | None,
-    typer.Option(
-        help="Exposure of a frame in milliseconds, for trainers that model motion blur.",
-        metavar="MS",
-    ),
-]
-Pairs = Annotated[
-    str | None,
-    typer.Option(
-        help="With --align-scan: point pairs, one a line: a frame or x,y,z of the run, and X,Y,Z "
-        "of the scan.",
-        metavar="FILE",
-    ),
-]
-
-HoldOut = Annotated[
-    bool | None,
-    typer.Option(
-        "--split/--no-split",
-        help="Hold one panorama in eight out of the training, with all its faces; default: if two "
-        "are left to train on.",
-    ),
-]
-Masks = Annotated[
-    str,
-    typer.Option(
-        help="files: masks beside the images, by the names that the program reads; alpha, black: "
-        "images are painted where masks hide them, too, for programs that read none.",
-        metavar="files|alpha|black",
-    ),
-]
-Align = Annotated[
-    str | None, typer.Option(help="True poses: export in their world.", metavar="TRUTH.tum")
-]
-Link = Annotated[
-    bool, typer.Option("--link", help="Make hard links to unchanged frames, not copies.")
-]
-Depths = Annotated[
-    bool,
-    typer.Option(
-        "--depths",
-        help="Also write the depths of the map's points in each face, with standard deviations.",
-    ),
-]
-Exposures = Annotated[
-    bool,
-    typer.Option(
-        "--exposures",
-        help="Also estimate how frames are exposed, as EXIF of their images (colmap, colmap-flat).",
-    ),
-]
-Located = Annotated[
-    Path | None,
-    typer.Option(
-        help="Folder of gsba localize: also write its photos, as cameras of their own.",
-        metavar="DIR",
-    ),
-]
-
-
 @command
 def export(
-    run: Run,
-    to: Target,
-    out: Annotated[
-        Path | None,
-        typer.Option(help="Folder to write; default: RUN/FORMAT, of map 2 RUN/FORMAT-map2."),
-    ] = None,
-    face_size: FaceSize = None,
-    images: Images = "auto",
-    up: Annotated[str, typer.Option(help="auto: turn the world upright; none: do not.")] = "none",
-    scale: Length = None,
-    baseline: Millimetres = None,
-    between: Between = None,
-    gps: Gps = None,
-    gps_sigma: GpsSigma = None,
-    gps_offset: GpsOffset = None,
-    align: Align = None,
-    align_scan: AlignScan = None,
-    pairs: Pairs = None,
-    link: Link = False,
-    map_number: MapNumber = 1,
-    without: Without = None,
-    photos: Located = None,
-    exposure_ms: Exposure = None,
-    split: HoldOut = None,
-    masks: Masks = "files",
-    depths: Depths = False,
-    exposures: Exposures = False,
-    cluster: Cluster = None,
+    run: Path,
+    to: str,
+    out: Path | None = None,
+    face_size: int | None = None,
+    images: str = "auto",
+    up: str = "none",
+    scale: str | None = None,
+    baseline: float | None = None,
+    between: tuple[str, str] | None = None,
+    gps: str | None = None,
+    gps_sigma: float | None = None,
+    gps_offset: float | None = None,
+    align: str | None = None,
+    align_scan: str | None = None,
+    pairs: str | None = None,
+    link: bool = False,
+    map_number: int = 1,
+    without: list[str] | None = None,
+    photos: Path | None = None,
+    exposure_ms: float | None = None,
+    split: bool | None = None,
+    masks: str = "files",
+    depths: bool = False,
+    exposures: bool = False,
+    cluster: str | None = None,
 ) -> None:
     """Write a finished run as a dataset for another program."""
     with loading():
@@ -323,60 +173,23 @@ def _length(text: str | None) -> float | str | None:
         return text
 
 
-ScanFile = Annotated[
-    Path | None,
-    typer.Option(help="Scan of the place, to measure the run's points against.", metavar="FILE"),
-]
-ScanPairs = Annotated[
-    Path | None,
-    typer.Option(help="With --scan: point pairs that start the alignment.", metavar="FILE"),
-]
-ScanGps = Annotated[
-    str | None,
-    typer.Option(
-        help="With --scan: GPS positions, or exif, that start the alignment.", metavar="FILE"
-    ),
-]
-ScanUp = Annotated[
-    str | None, typer.Option(help="With --scan: auto = the scan is upright.", metavar="auto")
-]
-Depth = Annotated[
-    Path | None,
-    typer.Option(
-        help="True depth maps: also measure by how many pixels pose errors move points.",
-        metavar="DIR",
-    ),
-]
-
-
 @command
 def evaluate(
-    estimate: Annotated[Path, typer.Argument(help="A run, or a trajectory file.", metavar="RUN")],
-    truth: Annotated[Path | None, typer.Option(help="True trajectory (TUM).")] = None,
-    depth: Depth = None,
-    json_file: Annotated[
-        Path | None,
-        typer.Option("--json", help="File to write the numbers to as well.", metavar="FILE"),
-    ] = None,
-    scan: ScanFile = None,
-    pairs: ScanPairs = None,
-    gps: ScanGps = None,
-    up: ScanUp = None,
-    splat: Annotated[
-        bool,
-        typer.Option("--splat", help="Train splats on the poses and measure held-out frames."),
-    ] = False,
-    against: Annotated[
-        list[Path] | None,
-        typer.Option(
-            help="With --splat: trajectory to compare the run's with; repeatable.", metavar="FILE"
-        ),
-    ] = None,
-    iterations: Iterations = None,
-    face_size: FaceSize = None,
-    max_gaussians: MaxGaussians = None,
-    backend: BackendName = "auto",
-    lpips: LpipsWeights = None,
+    estimate: Path,
+    truth: Path | None = None,
+    depth: Path | None = None,
+    json_file: Path | None = None,
+    scan: Path | None = None,
+    pairs: Path | None = None,
+    gps: str | None = None,
+    up: str | None = None,
+    splat: bool = False,
+    against: list[Path] | None = None,
+    iterations: int | None = None,
+    face_size: int | None = None,
+    max_gaussians: int | None = None,
+    backend: str = "auto",
+    lpips: list[Path] | None = None,
 ) -> None:
     """Compare a run or a trajectory with true poses or a scan.
 

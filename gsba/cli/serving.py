@@ -3,7 +3,7 @@
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Any, get_type_hints
 
 import typer
 import typer.main
@@ -22,17 +22,9 @@ _USAGE_ERROR: Any = typer.BadParameter.__bases__[0]  # of click, or of the copy 
 
 @command
 def app(
-    root: Annotated[
-        Path,
-        typer.Argument(help="Folder whose files can be chosen; runs are written into it."),
-    ] = Path(),
-    port: Annotated[int, typer.Option(help="Port of 127.0.0.1; 0: any free one.")] = 8360,
-    state: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder of the queue; default: one for each ROOT in ~/.local/state/gsba/app."
-        ),
-    ] = None,
+    root: Path = Path(),
+    port: int = 8360,
+    state: Path | None = None,
 ) -> None:
     """Open a page in the browser to start, watch and compare runs.
 

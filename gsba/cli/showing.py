@@ -3,18 +3,17 @@
 import json
 import time
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
-from gsba.cli.app import Run, command
+from gsba.cli.app import command
 from gsba.log import GsbaError
 
 
 @command
 def view(
-    run: Run,
-    port: Annotated[int, typer.Option(help="Port of 127.0.0.1; 0: any free one.")] = 8080,
+    run: Path,
+    port: int = 8080,
 ) -> None:
     """Show a run in the browser.
 
@@ -35,8 +34,8 @@ def view(
 
 @command
 def info(
-    files: Annotated[list[Path], typer.Argument(help="Videos, folders of frames, pictures.")],
-    as_json: Annotated[bool, typer.Option("--json", help="As JSON, for programs.")] = False,
+    files: list[Path],
+    as_json: bool = False,
 ) -> None:
     """Describe footage and print the command that refines it.
 
@@ -53,7 +52,7 @@ def info(
 
 @command
 def doctor(
-    as_json: Annotated[bool, typer.Option("--json", help="As JSON, for reports.")] = False,
+    as_json: bool = False,
 ) -> None:
     """Check the installation and suggest repairs.
 
@@ -72,15 +71,9 @@ def doctor(
 
 @command
 def plot(
-    runs: Annotated[
-        list[Path],
-        typer.Argument(help="Folders of finished runs, or trajectory files.", metavar="RUN..."),
-    ],
-    out: Annotated[
-        Path,
-        typer.Option(help="Folder or one file to write: PNG, SVG, PDF.", metavar="DIR|FILE"),
-    ],
-    truth: Annotated[Path | None, typer.Option(help="True trajectory (TUM).")] = None,
+    runs: list[Path],
+    out: Path,
+    truth: Path | None = None,
 ) -> None:
     """Plot trajectories, errors and residuals of several runs."""
     from gsba.report.plots import draw, load

@@ -2,36 +2,25 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
-from gsba.cli.app import Run, command
+from gsba.cli.app import command
 from gsba.log import GsbaError
 
 if TYPE_CHECKING:
     from gsba.splat.options import TrainingOptions
 
-Iterations = Annotated[int | None, typer.Option(help="Training steps of one view each.")]
-FaceSize = Annotated[int | None, typer.Option(help="Width of a cube face in pixels.")]
-LpipsWeights = Annotated[
-    list[Path] | None, typer.Option("--lpips", help="Weights of LPIPS; repeatable.", metavar="FILE")
-]
-MaxGaussians = Annotated[
-    int | None,
-    typer.Option(help="Most Gaussians; default: set by pixels and memory.", metavar="N"),
-]
-BackendName = Annotated[str, typer.Option(help="Renderer: auto, gsplat (CUDA) or cpu.")]
-
 
 @command
 def train(
-    run: Run,
-    iterations: Iterations = None,
-    face_size: FaceSize = None,
-    max_gaussians: MaxGaussians = None,
-    backend: BackendName = "auto",
-    lpips: LpipsWeights = None,
+    run: Path,
+    iterations: int | None = None,
+    face_size: int | None = None,
+    max_gaussians: int | None = None,
+    backend: str = "auto",
+    lpips: list[Path] | None = None,
 ) -> None:
     """Train a splat on a run's refined poses.
 
@@ -52,14 +41,12 @@ def train_on(run: Path, settings: "TrainingOptions", lpips: Sequence[Path] = ())
 
 @command
 def render(
-    splat: Annotated[Path, typer.Argument(help="point_cloud.ply.", metavar="SPLAT")],
-    run: Run,
-    frame: Annotated[str, typer.Option(help="Frame of the run, by name.", metavar="NAME")],
-    out: Annotated[
-        Path | None, typer.Option(help="Folder to write; default: RUN/renderings.")
-    ] = None,
-    face_size: FaceSize = None,
-    backend: BackendName = "auto",
+    splat: Path,
+    run: Path,
+    frame: str,
+    out: Path | None = None,
+    face_size: int | None = None,
+    backend: str = "auto",
 ) -> None:
     """Render a splat at the refined pose of a frame.
 

@@ -15,8 +15,6 @@ def ask_telemetry_parser(
     """Result of a method of the library's parser for a recording.
 
     Args:
-        path: file of the recording.
-        method: method of `telemetry_parser.Parser`.
         what: name of the data for messages, e.g. "gyro".
         instead: alternative input for messages.
 

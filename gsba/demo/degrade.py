@@ -36,7 +36,6 @@ def degrade(
 
     Args:
         truth: N exact poses.
-        seed: seed of all random numbers.
         scale: SLAM units per unit of `truth`.
         drift: errors that grow along the path; None = those of a good SLAM system.
         jitter: standard deviation of each pose's independent error, per axis: part of the mean step

@@ -76,8 +76,6 @@ class MeshBuilder:
             center: (3,) middle of the rectangle.
             facing: (3,) horizontal direction.
             size: width and height in units.
-            texture: handle of its texture.
-            emission: radiance that it emits.
         """
         right = np.cross(DOWN, -np.asarray(facing, dtype=np.float64))
         edge_a, edge_b = size[0] * right / np.linalg.norm(right), size[1] * DOWN

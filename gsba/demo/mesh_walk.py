@@ -114,7 +114,6 @@ def make_mesh_walk(
     """Render a walk through a mesh into the folder `out`; an earlier walk there is replaced.
 
     Args:
-        out: folder to write.
         mesh: OBJ, GLB, glTF or PLY with a texture or colours.
         path: TUM file of the poses to render, in the mesh's world; None = a closed path through
             free space is computed.

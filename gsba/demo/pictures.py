@@ -112,7 +112,6 @@ def picture(rng: np.random.Generator, height: int, width: int, style: int) -> np
     """Framed picture, (height, width, 3) uint8 RGB.
 
     Args:
-        rng: random numbers of its content.
         height, width: pixels.
         style: any integer, modulo the number of styles; contents are random.
     """

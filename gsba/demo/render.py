@@ -30,7 +30,6 @@ def render_erp(scene: Scene, world_T_rig: np.ndarray, width: int, height: int) -
     """Equirectangular image of the scene from one point, filtered over each pixel.
 
     Args:
-        scene: the scene.
         world_T_rig: (4, 4) float64, pose of the panorama.
         width, height: pixels, width = 2 height.
 
@@ -47,8 +46,6 @@ def render_eye(scene: Scene, eye: Eye, width: int, height: int) -> np.ndarray:
     of the filter each cover it.
 
     Args:
-        scene: the scene.
-        eye: the lens.
         width, height: pixels, width = 2 height.
 
     Returns:

@@ -60,10 +60,8 @@ def render_stitched(
     """Equirectangular image stitched from both lenses, each in the half that it faces.
 
     Args:
-        scene: the scene.
         world_T_rigs: (K, 4, 4) float64, poses from the first row to the last one; the rig's centre
             is in the middle between the lenses.
-        camera: the two lenses.
         width, height: pixels, width = 2 height.
 
     Returns:
@@ -115,7 +113,6 @@ def poses_during(truth: Trajectory, readout_s: float, seed: int) -> np.ndarray:
     Args:
         truth: F poses, at least 3.
         readout_s: readout time from the first row to the last one, seconds.
-        seed: seed of the phase.
 
     Returns:
         (F, KNOTS, 4, 4) float64, evenly spaced in time; (F, 1, 4, 4) for a readout time of 0.

@@ -58,7 +58,6 @@ def make_walk(
     """Render a walk into the folder `out`; an earlier walk there is replaced.
 
     Args:
-        out: folder to write.
         path: "rectangle" and "oval" end one step before their start, "open" does not return.
         heading: "locked" keeps one direction, "forward" follows the path.
         num_frames: at least 3.
@@ -139,7 +138,6 @@ def held_by_hand(
     Args:
         positions: (N, 3) positions.
         yaw: headings (N,), or one heading, radians.
-        rng: random numbers of the wobble.
         unit: unit of the positions, in units of the gallery.
         fps: poses per second; the wobble's frequency in Hz does not depend on it.
     """
@@ -317,7 +315,6 @@ def make_film(
     """Film a walk into `out`/walk.mp4; an earlier walk in `out` is replaced.
 
     Args:
-        out: folder to write.
         num_frames: at least 3; with fewer than WHOLE_WALK the walk covers a part of the path.
         path, heading, width, seed, camera: see `gsba.demo.make_walk`.
 

@@ -63,16 +63,13 @@ def requirements() -> tuple[Requirement, ...]:
             marker = re.search(r"extra\s*==\s*['\"]([^'\"]+)", line)
             lines.append((line, marker[1] if marker else NEEDED))
     kept = [(line, extra) for line, extra in lines if extra not in _NOT_EXAMINED]
-    return tuple(_requirement(line, extra) for line, extra in kept)
-
-
-def _requirement(line: str, extra: str) -> Requirement:
-    """Requirement from a line such as `laspy[lazrs]>=2.5`."""
-    parsed = requirements_of.Requirement(line)
-    name = canonicalize_name(parsed.name)
-    return Requirement(
-        name, _MODULES.get(name, name.replace("-", "_")), str(parsed.specifier), extra
-    )
+    found = []
+    for line, extra in kept:
+        parsed = requirements_of.Requirement(line)  # a line such as `laspy[lazrs]>=2.5`
+        name = canonicalize_name(parsed.name)
+        module = _MODULES.get(name, name.replace("-", "_"))
+        found.append(Requirement(name, module, str(parsed.specifier), extra))
+    return tuple(found)
 
 
 _TIMEOUT_S = 120.0
@@ -110,7 +107,11 @@ def look_at(
         state of each package, and the facts; no facts if a package is missing.
     """
     versions = {one.name: _version(one.name) for one in wanted}
-    unfit = {one.name: _unfit(one, versions[one.name]) for one in wanted}
+    unfit = {}  # reason why a package is not imported; "" = it is
+    for one in wanted:
+        version = versions[one.name]
+        why = "" if version and one.allows(version) else f"{one.range} is needed"
+        unfit[one.name] = "is not installed" if version is None else why
     tried = [one for one in wanted if not unfit[one.name]]
     all_there = len(tried) == len(wanted)
     reports, answers = _imported([one.module for one in tried], facts if all_there else "")
@@ -141,13 +142,6 @@ def _version(name: str) -> str | None:
         return metadata.version(name)
     except metadata.PackageNotFoundError:
         return None
-
-
-def _unfit(wanted: Requirement, version: str | None) -> str:
-    """Reason why a package is not imported; "" = it is imported."""
-    if version is None:
-        return "is not installed"
-    return "" if wanted.allows(version) else f"{wanted.range} is needed"
 
 
 def _imported(

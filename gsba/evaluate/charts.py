@@ -46,7 +46,6 @@ def write(
     Args:
         paths: files, each with a suffix of KINDS.
         size_in: width and height, inches.
-        fill: function that draws into the figure.
 
     Raises:
         NoMatplotlibError: matplotlib is not installed.

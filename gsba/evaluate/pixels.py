@@ -97,7 +97,6 @@ def depth_maps(folder: Path, num: int) -> Callable[[int], np.ndarray]:
     """Reader of the depth maps `NAME.npz` with a `range` array (h, 2h), in name order.
 
     Args:
-        folder: folder of the maps.
         num: number of true poses, each of which has a map.
 
     Raises:

@@ -69,8 +69,6 @@ def scan_errors(
     aligned to the scan by its own best similarity: differences of their worlds do not count.
 
     Args:
-        reconstruction: the refined run.
-        scan: scan of the same place.
         coarse_T_rigs: (F, 4, 4) initial poses of the frames, of any world and scale.
         guess: see `gsba.scans.registration`.
 

@@ -107,9 +107,6 @@ def compare(
     Args:
         reconstruction, frames: result of a finished run; its tracks make the start clouds.
         sources: name -> world_T_rigs (F, 4, 4), each in any world and scale, NaN = no pose.
-        settings: settings of all trainings.
-        backend: the renderer.
-        out: folder to write.
         lpips: perceptual distance for the last measurement; None = do not compute it.
         optics: optics of the frames, in the run's unit; of two lenses each face is of one lens.
 

@@ -127,9 +127,6 @@ def write_model(
     """Write rigs, cameras, frames, images and points3D in binary.
 
     Args:
-        folder: made, with its parents.
-        reconstruction: poses, points and observations.
-        rigs: the cameras of each rig.
         names: image names, by frame and sensor.
         rig_of_frame: (F,) int, rig of each frame.
         order: numbers of the images from 0, by frame and sensor, -1 = left out of the model; None =

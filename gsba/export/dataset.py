@@ -90,9 +90,6 @@ class Photos:
     cameras: tuple[PhotoCamera, ...] = ()
 
 
-NO_PHOTOS = Photos()
-
-
 @dataclass(frozen=True, slots=True)
 class ExportOptions:
     """Choices of an export, see `export`."""
@@ -107,7 +104,7 @@ class ExportOptions:
     fetched: bool = False  # with the frames that were added where the map was weak
     without: tuple[str, ...] = ()  # names of frames to leave out
     shutter: Shutter = UNKNOWN  # for trainers that model blur and rolling rows
-    photos: Photos = NO_PHOTOS  # localised photos, as cameras of their own
+    photos: Photos = Photos()  # localised photos, as cameras of their own
     split: bool | None = None  # hold panoramas out of the training, in formats of trainers; None =
     # if enough are left to train on
     masks: MaskStyle = MASK_FILES

@@ -7,7 +7,6 @@ points of large standard deviations, for which they have no place.
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -28,25 +27,6 @@ _MAX_SIGMA = 0.1  # of a depth in a map, relative: beyond, errors of depths lean
 # this, 1 %) and have long tails, while losses take all depths for equally good
 
 
-@dataclass(frozen=True, slots=True)
-class _Depths:
-    """Points that one image shows."""
-
-    uv: np.ndarray  # (N, 2) float32, pixels, corner origin
-    depth: np.ndarray  # (N,) float32
-    sigma: np.ndarray  # (N,) float32
-
-    def map(self, width: int, height: int) -> np.ndarray:
-        """Image (h, w) float32 of well-known depths; where two share a pixel, the better one."""
-        order = np.argsort(-self.sigma)
-        order = order[self.sigma[order] <= _MAX_SIGMA * self.depth[order]]
-        columns, rows = np.floor(self.uv[order]).astype(int).T
-        inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
-        image = np.zeros((height, width), np.float32)
-        image[rows[inside], columns[inside]] = 1000.0 * self.depth[order][inside]
-        return image
-
-
 def map_path(image: str) -> str:
     """Path of the depth map of an image, both within the dataset."""
     return str(Path("depths", Path(image).relative_to("images")).with_suffix(".tiff"))
@@ -62,7 +42,6 @@ def write_depths(
     """Write the depths of all images of a dataset.
 
     Args:
-        data: the dataset.
         seen: its map as seen from its cameras, see `seen_from_lenses`.
         files: (C,) files of the images of each camera's frames.
         views: (C,) of each camera.
@@ -81,16 +60,21 @@ def write_depths(
             if image.startswith(f"{LEFT_OUT}/"):
                 continue
             own = observed[f][which[observed[f]] == number]
-            shown = _Depths(*(all_[own].astype(np.float32) for all_ in (pixels, depths, sigmas)))
+            uv, depth, sigma = (all_[own].astype(np.float32) for all_ in (pixels, depths, sigmas))
             points = seen.observation_points[own]
             name = Path("sparse_depths", Path(image).relative_to("images")).with_suffix(".npz")
             (partial / name).parent.mkdir(parents=True, exist_ok=True)
-            np.savez(
-                partial / name, uv=shown.uv, depth=shown.depth, sigma=shown.sigma, point=points
-            )
+            np.savez(partial / name, uv=uv, depth=depth, sigma=sigma, point=points)
             num_shown += len(own)
             if maps:
-                image_of_depths = shown.map(view.width, view.height)
+                # Well-known depths; where two share a pixel, the better one
+                order = np.argsort(-sigma)
+                order = order[sigma[order] <= _MAX_SIGMA * depth[order]]
+                columns, rows = np.floor(uv[order]).astype(int).T
+                inside = (columns >= 0) & (columns < view.width)
+                inside &= (rows >= 0) & (rows < view.height)
+                image_of_depths = np.zeros((view.height, view.width), np.float32)
+                image_of_depths[rows[inside], columns[inside]] = 1000.0 * depth[order][inside]
                 write_map(partial / map_path(image), image_of_depths)
                 num_mapped += np.count_nonzero(image_of_depths)
     more = f", {num_mapped} of them in maps" if maps else ""

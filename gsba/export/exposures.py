@@ -23,14 +23,8 @@ _PER_SECOND = 100_000_000  # denominator of an exposure time
 
 
 def write_exposures(partial: Path) -> None:
-    """Write the exposures of a COLMAP dataset, whose images and model are complete.
-
-    Args:
-        partial: folder of the dataset.
-
-    Raises:
-        GsbaError: the disk cannot be written.
-    """
+    """Write the exposures of a COLMAP dataset, whose images and model are complete. Raises
+    GsbaError: the disk cannot be written."""
     import pycolmap
 
     model = pycolmap.Reconstruction(partial / "sparse" / "0")

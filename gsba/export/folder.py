@@ -25,7 +25,6 @@ def output_folder(out: Path, to: str, key: str) -> Iterator[Path]:
 
     Args:
         out: final folder; missing parents are made.
-        to: name of the format, for the marker.
         key: hash of everything that images in the folder depend on.
     Raises:
         GsbaError: `out` is not an earlier export, another process writes it, or the disk cannot be

@@ -48,7 +48,6 @@ def export(
             `applied_transform`.
         frames: the frames it was made from, still on disk.
         out: folder to write; an earlier export there is replaced, other folders are refused.
-        to: the format.
         face_size: pixels of a cube face; None = see `gsba.export.images.face_size_for`.
         placement: placement of the exported world, which `transform.json` states; None = the run's
             world.
@@ -75,8 +74,6 @@ def export_all(
 
     Args:
         reconstruction, frames: see `export`.
-        outs: folder of each format.
-        options: choices that hold for all formats.
         workers: see `export`.
 
     Raises:

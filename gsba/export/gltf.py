@@ -25,11 +25,7 @@ from gsba.types import FrameSet, Reconstruction
 
 _RIG_UP = np.array([0.0, -1, 0])  # of a camera that is held level
 _FLOAT, _UBYTE, _POINTS = 5126, 5121, 0  # glTF's numbers of component types and modes
-_ASPECT = 16 / 9  # width to height of Blender's scenes
-_YFOV_RAD = 2 * np.arctan(1 / _ASPECT)  # vertical field, for a horizontal one of 90 degrees
-_NEAR_PER_EXTENT, _FAR_PER_DISTANCE = 1e-4, 10.0  # of the cameras' extent, of the furthest thing
 _SCRIPT = "open_in_blender.py"
-_MIN_FPS, _MAX_FPS = 24, 240  # of Blender's timeline
 
 
 def write_blender(data: Dataset) -> list[FrameWriter]:
@@ -56,8 +52,6 @@ def write_gltf(
     """Write `path`, a binary glTF file.
 
     Args:
-        path: file to write (.glb).
-        reconstruction, frames: poses and cloud, and their frames.
         up: axis of the world that points up, "-y", "y" or "z"; None = unknown.
         pictures: (F,) paths of the frames' panoramas, relative to the file's folder; None = there
             are none.
@@ -131,15 +125,16 @@ def _perspective(reconstruction: Reconstruction) -> dict[str, float]:
     centres = reconstruction.world_T_rigs[:, :3, 3]
     extent = max(float(np.ptp(centres, axis=0).max()), 1e-3)
     things = np.concatenate([centres, reconstruction.points_world])
-    far = _FAR_PER_DISTANCE * max(float(np.linalg.norm(np.ptp(things, axis=0))), extent)
-    near = _NEAR_PER_EXTENT * extent
-    return {"yfov": _YFOV_RAD, "aspectRatio": _ASPECT, "znear": near, "zfar": far}
+    far = 10.0 * max(float(np.linalg.norm(np.ptp(things, axis=0))), extent)
+    aspect = 16 / 9  # width to height of Blender's scenes
+    yfov = 2 * np.arctan(1 / aspect)  # vertical field, for a horizontal one of 90 degrees
+    return {"yfov": yfov, "aspectRatio": aspect, "znear": 1e-4 * extent, "zfar": far}
 
 
 def _fps(frames: FrameSet) -> int:
     """Frames per second of a timeline on which each picture has a frame of its own."""
     shortest = float(np.diff(frames.timestamps).min(initial=1.0))
-    fps = np.clip(np.ceil(1 / shortest - 1e-3), _MIN_FPS, _MAX_FPS)
+    fps = np.clip(np.ceil(1 / shortest - 1e-3), 24, 240)
     longest = float(frames.timestamps[-1] - frames.timestamps[0])
     # Blender's timeline ends at frame 1,048,574.
     return int(min(fps, max(1_000_000 // max(longest, 1.0), 1)))

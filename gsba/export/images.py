@@ -55,7 +55,6 @@ def seen_by(images: str, frames: FrameSet, cameras: Cameras) -> Cameras:
 
     Args:
         images: the setting `export.images`.
-        frames, cameras: of the dataset.
     """
     own = zip(frames.formats, cameras.lenses, strict=True)
     return cameras.with_lenses(
@@ -168,7 +167,6 @@ def write_pictures(
     """Write the images of all datasets of an export, frame by frame.
 
     Args:
-        frames: frames of the export.
         writers: writers of the datasets, whose folders exist.
         workers: workers that share the disk; None = threads of this process.
     """

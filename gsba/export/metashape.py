@@ -7,7 +7,6 @@ middle of the image. Labels are names of files without folders, by which Metasha
 
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +17,8 @@ from gsba.export.images import has_masks, panorama_writer, view_writer, views_of
 from gsba.export.names import base_names
 from gsba.export.pictures import Files, FrameWriter
 from gsba.export.ply import write_cloud
+
+_Image = tuple[str, np.ndarray, int]  # path, world_T_camera (4, 4), number of the sensor
 
 
 def write_metashape(data: Dataset) -> FrameWriter:
@@ -37,11 +38,8 @@ def write_metashape(data: Dataset) -> FrameWriter:
             _sensor(number, "panorama", "spherical", kind.width, kind.height)
             for number, kind in enumerate(frames.formats)
         ]
-        taken = [
-            _Taken(files.images(frames, f), poses[[f]], [camera])
-            for f, camera in enumerate(frames.cameras.tolist())
-        ]
-        _write(data, sensors, taken)
+        paths = [files.images(frames, f)[0] for f in range(len(frames))]
+        _write(data, sensors, list(zip(paths, poses, frames.cameras.tolist(), strict=True)))
         return panorama_writer(data, files)
     views = views_of_cameras(frames, data.options.face_size, cameras)
     of_cameras = [files_of([view.name for view in own]) for own in views]
@@ -51,21 +49,13 @@ def write_metashape(data: Dataset) -> FrameWriter:
         first = len(sensors)
         sensors += [_pinhole(first + n, view) for n, view in enumerate(own[:1] if alike else own)]
         kinds.append([first + n * (not alike) for n in range(len(own))])
-    seen, taken = seen_from_lenses(data.reconstruction, cameras), list[_Taken]()
+    seen, images = seen_from_lenses(data.reconstruction, cameras), list[_Image]()
     for f, camera in enumerate(frames.cameras.tolist()):
         poses = seen.world_T_rigs[f] @ np.stack([view.rig_T_view for view in views[camera]])
-        taken.append(_Taken(of_cameras[camera].images(frames, f), poses, kinds[camera]))
-    _write(data, sensors, taken)
+        paths = of_cameras[camera].images(frames, f)
+        images += zip(paths, poses, kinds[camera], strict=True)
+    _write(data, sensors, images)
     return view_writer(data, of_cameras, views)
-
-
-@dataclass(frozen=True, slots=True)
-class _Taken:
-    """The images of one frame."""
-
-    paths: Sequence[str]  # (C,)
-    world_T_cameras: np.ndarray  # (C, 4, 4) float64
-    sensors: Sequence[int]  # (C,) number of each image's sensor
 
 
 def _pinhole(number: int, view: View) -> ET.Element:
@@ -91,7 +81,7 @@ def _resolution(parent: ET.Element, width: int, height: int) -> None:
     ET.SubElement(parent, "resolution", {"width": str(width), "height": str(height)})
 
 
-def _write(data: Dataset, sensors: Sequence[ET.Element], taken: Sequence[_Taken]) -> None:
+def _write(data: Dataset, sensors: Sequence[ET.Element], images: Sequence[_Image]) -> None:
     """Write cameras.xml and the cloud."""
     write_cloud(data.folder / "points3D.ply", data.reconstruction)
     document = ET.Element("document", {"version": "1.5.0"})
@@ -103,11 +93,6 @@ def _write(data: Dataset, sensors: Sequence[ET.Element], taken: Sequence[_Taken]
     ET.SubElement(transform, "rotation").text = "1 0 0 0 1 0 0 0 1"
     ET.SubElement(transform, "translation").text = "0 0 0"
     ET.SubElement(transform, "scale").text = "1"
-    images = [
-        image
-        for one in taken
-        for image in zip(one.paths, one.world_T_cameras, one.sensors, strict=True)
-    ]
     cameras = ET.SubElement(chunk, "cameras", {"next_id": str(len(images))})
     for number, (path, world_T_camera, sensor) in enumerate(images):
         camera = {"id": str(number), "sensor_id": str(sensor)}

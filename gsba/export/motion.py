@@ -34,9 +34,6 @@ def rig_velocities(
 
     Args:
         reconstruction: poses of the exported rigs, which have the lenses' axes.
-        frames: their frames.
-        cameras: cameras of the frames.
-        shutter: times of the exposure.
     """
     lenses = cameras.lenses[0]
     if len(cameras.lenses) == 1 and lenses.readout_motion is not None and shutter.readout_s:

@@ -16,13 +16,11 @@ folder it loads all JSON files with frames, panoramas as pinholes.
 
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from gsba.camera.fisheye import Rig, lens_names, rotation_of
-from gsba.camera.lens import Lenses
+from gsba.camera.fisheye import lens_names, rotation_of
 from gsba.camera.views import View, seen_from_lenses
 from gsba.export import motion
 from gsba.export.dataset import Dataset
@@ -34,12 +32,10 @@ from gsba.export.ply import write_splat_points
 from gsba.export.raw import RawPictures, raw_lenses
 from gsba.export.split import held_out_frames
 from gsba.geometry import CV_R_GL, pose
-from gsba.types import FrameSet, PictureFormat, Reconstruction
+from gsba.types import Fisheye, FrameSet, Reconstruction
 
 NERFSTUDIO_R_WORLD = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-_Z_UP_R_WORLD = {"z": np.eye(3), "y": NERFSTUDIO_R_WORLD.T}  # of worlds whose y does not point down
 _CLOUD = "points3D.ply"
-_NGP_SCALE = 0.33  # of instant-ngp's unit cube, in this world's units, about the origin
 
 
 def write_nerfstudio(data: Dataset) -> list[FrameWriter]:
@@ -60,71 +56,46 @@ def write_nerfstudio(data: Dataset) -> list[FrameWriter]:
 
 def _write_raw(data: Dataset, out_R_world: np.ndarray) -> FrameWriter:
     frames, cameras, shutter = data.frames, data.cameras, data.options.shutter
-    own = zip(frames.formats, cameras.lenses, strict=True)
-    rigs = [_RawRig.of(kind, lenses) for kind, lenses in own]
-    files = [_files(data, lens_names(len(one.rig)), True) for one in rigs]
+    rigs = [raw_lenses(kind) for kind in frames.formats]
+    moving = [  # (C,) True where the motion during the readout is known
+        lenses.readout_motion is not None and lenses.row_directions is not None
+        for lenses in cameras.lenses
+    ]
+    files = [_files(data, lens_names(len(rig)), True) for rig in rigs]
     velocities = motion.rig_velocities(data.reconstruction, frames, cameras, shutter)
     entries = list[list[dict[str, Any]]]()
     for f, (world_T_rig, c) in enumerate(_posed(data.reconstruction, frames)):
-        names = files[c].images(frames, f), _mask_paths(files[c], frames, f)
-        velocity = None if velocities is None else velocities[f]
-        entries.append(rigs[c].entries(f, world_T_rig, *names, out_R_world, velocity))
+        images, masks = files[c].images(frames, f), _mask_paths(files[c], frames, f)
+        lenses = cameras.lenses[c]
+        swept = lenses.swept(f) if moving[c] else None
+        ways = lenses.rows_down() if moving[c] else (1.0,) * len(rigs[c])
+        entries.append([])
+        for number, (lens, centre) in enumerate(zip(rigs[c], lenses.centres, strict=True)):
+            rig_T_lens = pose(rotation_of(lens), centre)
+            entry = _entry(images[number], out_R_world, world_T_rig @ rig_T_lens)
+            if swept is not None:
+                for name, rig_T_rig in zip(("start", "end"), swept[number], strict=True):
+                    matrix = _matrix(out_R_world, world_T_rig @ rig_T_rig @ rig_T_lens)
+                    entry[f"transform_matrix_{name}"] = matrix
+            if velocities is not None:  # rows are read from the top, at these velocities
+                entry |= motion.velocity_keys(ways[number] * velocities[f], rig_T_lens)
+            radial = dict(zip(("k1", "k2", "k3", "k4"), lens.radial, strict=True))
+            entry |= {**_intrinsics(lens), **radial, "is_fisheye": True}
+            if masks:
+                entry["mask_path"] = masks[number]
+            entries[-1].append(entry)
     camera: dict[str, Any] = {"camera_model": "OPENCV_FISHEYE", "is_fisheye": True}
-    moving = any(one.moving for one in rigs)
-    if moving:
+    if any(moving):
         camera["rolling_shutter"] = [0, 0, 1, 0]
     if velocities is not None:
-        camera |= motion.shutter_keys(shutter, rolling=moving)
+        camera |= motion.shutter_keys(shutter, rolling=any(moving))
     _write_transforms(data, "transforms.json", camera, entries, out_R_world)
     return by_camera([RawPictures(one, data.options.link) for one in files], frames)
 
 
-@dataclass(frozen=True, slots=True)
-class _RawRig:
-    """Raw lenses of one camera."""
-
-    rig: Rig
-    lenses: Lenses
-    moving: bool  # True if the motion during the readout is known
-
-    @classmethod
-    def of(cls, kind: PictureFormat, lenses: Lenses) -> "_RawRig":
-        moving = lenses.readout_motion is not None and lenses.row_directions is not None
-        return cls(raw_lenses(kind), lenses, moving)
-
-    def entries(
-        self,
-        f: int,
-        world_T_rig: np.ndarray,
-        images: Sequence[str],
-        masks: Sequence[str],
-        out_R_world: np.ndarray,
-        velocity: np.ndarray | None,
-    ) -> list[dict[str, Any]]:
-        """Entries of a frame in transforms.json, one for each lens."""
-        entries = []
-        rigs = self.lenses.swept(f) if self.moving else None
-        ways = self.lenses.rows_down() if self.moving else (1.0,) * len(self.rig)
-        for number, (lens, centre) in enumerate(zip(self.rig, self.lenses.centres, strict=True)):
-            rig_T_lens = pose(rotation_of(lens), centre)
-            entry = _entry(images[number], out_R_world, world_T_rig @ rig_T_lens)
-            if rigs is not None:
-                for name, rig_T_rig in zip(("start", "end"), rigs[number], strict=True):
-                    matrix = _matrix(out_R_world, world_T_rig @ rig_T_rig @ rig_T_lens)
-                    entry[f"transform_matrix_{name}"] = matrix
-            if velocity is not None:  # rows are read from the top, at these velocities
-                entry |= motion.velocity_keys(ways[number] * velocity, rig_T_lens)
-            cx, cy = lens.principal
-            lengths = {"fl_x": lens.focal, "fl_y": lens.focal, "cx": cx, "cy": cy}
-            radial = dict(zip(("k1", "k2", "k3", "k4"), lens.radial, strict=True))
-            entry |= {**lengths, "w": lens.width, "h": lens.height, **radial, "is_fisheye": True}
-            entries.append({**entry, "mask_path": masks[number]} if masks else entry)
-        return entries
-
-
 def z_up_R_world(up: str | None) -> np.ndarray:
     """Rotation (3, 3) of a world to one whose z points up, taken for y down if unknown."""
-    return _Z_UP_R_WORLD.get(up or "-y", NERFSTUDIO_R_WORLD)
+    return {"z": np.eye(3), "y": NERFSTUDIO_R_WORLD.T}.get(up or "-y", NERFSTUDIO_R_WORLD)
 
 
 def _posed(reconstruction: Reconstruction, frames: FrameSet) -> Iterator[tuple[np.ndarray, int]]:
@@ -204,10 +175,10 @@ def _mask_paths(files: Files, frames: FrameSet, f: int) -> list[str]:
     return files.masks(frames, f) if files.style.hidden == 0 else []
 
 
-def _intrinsics(view: View) -> dict[str, Any]:
-    cx, cy = view.principal
-    lengths = {"fl_x": view.focal, "fl_y": view.focal, "cx": cx, "cy": cy}
-    return {**lengths, "w": view.width, "h": view.height}
+def _intrinsics(camera: View | Fisheye) -> dict[str, Any]:
+    cx, cy = camera.principal
+    lengths = {"fl_x": camera.focal, "fl_y": camera.focal, "cx": cx, "cy": cy}
+    return {**lengths, "w": camera.width, "h": camera.height}
 
 
 def _entry(file_path: str, out_R_world: np.ndarray, world_T_camera: np.ndarray) -> dict[str, Any]:
@@ -238,7 +209,8 @@ def _write_transforms(
     trained = [n for held, own in zip(apart, names, strict=True) if not held for n in own]
     every = [entry["transform_matrix"] for of_frame in entries for entry in of_frame]
     applied = np.column_stack([out_R_world, np.zeros(3)])
-    half = _NGP_SCALE * np.abs(np.array(every)[:, :3, 3]).max(initial=0.0)  # side of the box
+    # Half the side of the box; a unit of this world is 0.33 of instant-ngp's unit cube
+    half = 0.33 * np.abs(np.array(every)[:, :3, 3]).max(initial=0.0)
     document = {
         **camera,
         "applied_transform": applied.tolist(),

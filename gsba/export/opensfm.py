@@ -24,8 +24,6 @@ from gsba.geometry import inverse
 from gsba.log import GsbaError
 from gsba.types import FrameSet, Reconstruction
 
-_NO_SEMANTICS = "-1\t-1"
-
 
 def write_opensfm(data: Dataset) -> FrameWriter:
     """Write a project, in a world whose z points up, without images; returns their writer. Raises
@@ -101,7 +99,7 @@ def _tracks(reconstruction: Reconstruction, frames: FrameSet, names: list[str]) 
         for feature, (point, (x, y), scale, (red, green, blue)) in enumerate(columns):
             yield (
                 f"{name}\t{point}\t{feature}\t{x:.9g}\t{y:.9g}\t{scale:.6g}\t{red}\t{green}\t{blue}"
-                f"\t{_NO_SEMANTICS}\n"
+                "\t-1\t-1\n"
             )
 
 

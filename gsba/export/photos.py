@@ -30,7 +30,6 @@ def read_photos(folder: Path | None, run: Path) -> Photos:
 
     Args:
         folder: that `gsba localize` wrote; None = no photos.
-        run: folder of the run.
 
     Raises:
         GsbaError: the folder holds no list of localised photos, or one of another run; a photo is

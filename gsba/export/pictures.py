@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path, PurePosixPath
 from types import NoneType
 from typing import Any
@@ -122,14 +123,12 @@ class FrameWriter:
         """Write a frame's images, painted where masks hide them if wanted, and its masks.
 
         Args:
-            shown: the frame.
             key: of these images, one for all datasets that have the same.
             images: makes the images (h, w, 3) uint8 RGB, by view.
             masks: makes the masks (h, w) bool, True = use, by view.
             masks_differ: masks depend on the frame beyond its mask file.
             originals: files with the same pixels, by view, to be copied if readers understand
                 them; () = there are none.
-            link: make hard links instead of copies.
         """
         paths, hidden, style = self.images(shown), self.masks(shown), self.files.style
         if self.files.paints:
@@ -137,7 +136,11 @@ class FrameWriter:
             shown.write((key, painted), paths, lambda: map(style.painted, images(), masks()))
         elif originals and all(map(goes_out_as_it_is, originals, paths)):
             for source, path in zip(originals, paths, strict=True):
-                _pass_on(source, path, link)
+                if not source.is_file():
+                    raise GsbaError(
+                        f"{source} is missing; it existed when the run began: restore it"
+                    )
+                atomic_write(path, partial(_copy, source, link=link), parents=False)
         else:
             shown.write(key, paths, images)
         if hidden:
@@ -179,7 +182,6 @@ def by_camera(writers: Sequence[FrameWriter], frames: FrameSet) -> FrameWriter:
 
     Args:
         writers: (C,) of each camera's frames.
-        frames: all frames.
     """
     if len(writers) == 1:
         return writers[0]
@@ -306,14 +308,8 @@ def _write(paths: Sequence[Path], contents: Sequence[bytes]) -> None:
         write_bytes(path, content, parents=False)
 
 
-def _pass_on(source: Path, path: Path, link: bool) -> None:
-    """Copy `source` to `path`, sharing its blocks on disk if the file system can."""
-    if not source.is_file():
-        raise GsbaError(f"{source} is missing; it existed when the run began: restore it")
-    atomic_write(path, lambda temporary: _copy(source, temporary, link), parents=False)
-
-
 def _copy(source: Path, path: Path, link: bool) -> None:
+    """Copy `source` to `path`, sharing its blocks on disk if the file system can."""
     if link:
         with suppress(OSError):  # another file system
             os.link(source.resolve(), path)

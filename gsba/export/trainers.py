@@ -89,7 +89,6 @@ def options_for(name: str, options: ExportOptions, paint: str = "files") -> Expo
 
     Args:
         name: of a program or a format.
-        options: the others.
         paint: the option `--masks`.
 
     Raises:

@@ -72,7 +72,6 @@ def cut(erp: np.ndarray, rig: CubeRig) -> np.ndarray:
 
     Args:
         erp: (H, 2H) or (H, 2H, C) uint8 equirectangular image.
-        rig: faces to cut.
 
     Returns:
         (6, size, size[, C]) uint8, in FACES order.
@@ -102,7 +101,6 @@ def cut_squares(
 
     Args:
         squares: (6, S, S[, C]) uint8 of `gsba.camera.equiangular.squares`, FACES order.
-        rig: faces to cut.
         correction: coefficients of the stitching field, see `FrameSet`.
 
     Returns:

@@ -40,8 +40,6 @@ def join_pictures(pictures: list[np.ndarray], rig: Rig, width: int, share: float
 
     Args:
         pictures: (h, w[, 3]) uint8 of each lens.
-        rig: their lenses.
-        width: pixels across the panorama.
         share: its width over that of a panorama as dense as the pictures.
     """
     joined = np.empty((width // 2, width, *pictures[0].shape[2:]), np.uint8)

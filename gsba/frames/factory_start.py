@@ -11,11 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gsba.camera.factory_lenses import (
-    FactoryCalibration,
-    FactoryLenses,
-    parse_factory_lenses,
-)
+from gsba.camera.factory_lenses import FactoryCalibration, FactoryLenses, parse_factory_lenses
 from gsba.camera.fisheye import Pair
 from gsba.containers.insta360 import read_trailer
 from gsba.disk import write_json
@@ -29,9 +25,6 @@ FACTORY_FILE = "factory_lenses.json"  # beside the frames of a video
 INSTA360_PICTURE = ".insp"  # suffix of JPEG images with both lenses side by side
 _QUARTER_TURNS = 4
 _MAX_FILE_BYTES = 1 << 16  # largest size of FACTORY_FILE
-_MIN_CORRELATION_GAIN = 0.1  # gain in rim correlation from which another reading is preferred to
-# the usual one
-_MIN_CONFIRMING_CORRELATION = 0.3  # rim correlation above which a reading counts as confirmed
 
 
 def factory_calibration(
@@ -98,10 +91,8 @@ def starting_lenses(
     kept unless another one makes both lenses' rims clearly more alike.
 
     Args:
-        folder: of the pictures, for the log.
         pairs: pictures of the front and back lens of each frame, or twice the one that holds both.
         size: width and height of one lens's picture.
-        factory: the maker's calibration.
     """
     rows = np.unique(np.linspace(0, len(pairs) - 1, 8).astype(int))
     looks = [decode_pair(pairs[f], size, gray=True) for f in rows]
@@ -112,8 +103,12 @@ def starting_lenses(
     ]
     scores = [rim_likeness(looks, pair) for pair in readings]
     best = int(np.argmax(scores))
-    if scores[best] <= scores[0] + _MIN_CORRELATION_GAIN:
+    # gain in rim correlation from which another reading is preferred to the usual one
+    if scores[best] <= scores[0] + 0.1:
         best = 0
+    whole, quarters = divmod(best, _QUARTER_TURNS)
+    parts = [f"the back lens turned by {90 * quarters} degrees"] if quarters else []
+    parts += ["the whole sensor in the picture"] if whole else []
     _log.warning(
         "%s: lenses start from the maker's calibration (generation %d; standard "
         "deviations: directions %.1f degrees, rotation between lenses %.1f%s), %s; for a better "
@@ -122,12 +117,10 @@ def starting_lenses(
         factory.generation,
         np.rad2deg(factory.direction_sigma),
         np.rad2deg(factory.rotation_sigma),
-        _difference_to_usual_reading(best)
+        (f"; as images show, {' and '.join(parts)}" if parts else "")
         if factory.angles_known
         else "; its angles have no known form",
-        "which both lenses' rims confirm"
-        if scores[best] > _MIN_CONFIRMING_CORRELATION
-        else "unconfirmed by images",
+        "which both lenses' rims confirm" if scores[best] > 0.3 else "unconfirmed by images",
     )
     return readings[best]
 
@@ -168,11 +161,3 @@ def _with_back_turned(pair: Pair, quarters: int) -> Pair:
     turn = Rotation.from_rotvec(back.rotation) * Rotation.from_euler("z", 90 * quarters, True)
     a, b, c = turn.as_rotvec().tolist()
     return front, replace(back, rotation=(a, b, c))
-
-
-def _difference_to_usual_reading(reading: int) -> str:
-    """Difference of a reading to the usual one, for the log; "" = it is the usual one."""
-    turned = reading % _QUARTER_TURNS
-    parts = [f"the back lens turned by {90 * turned} degrees"] if turned else []
-    parts += ["the whole sensor in the picture"] if reading >= _QUARTER_TURNS else []
-    return f"; as images show, {' and '.join(parts)}" if parts else ""

@@ -91,7 +91,6 @@ def decode(
     Args:
         path: JPEG, PNG, WebP or TIFF.
         size: the width and height it must have, as shown.
-        gray: one channel instead of RGB.
         at_least: width that is enough: a JPEG is decoded at a half, a quarter or an eighth of its
             size, which is fast, as long as it stays that wide.
         room: (N,) uint8, one for each value of the result: most JPEGs are decoded into it.

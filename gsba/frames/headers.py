@@ -75,16 +75,8 @@ class _Truncated(Exception):
 
 
 def header_of(data: Bytes, path: Path) -> Header:
-    """The header of an image file's content.
-
-    Args:
-        data: the whole file.
-        path: its path, for error messages.
-
-    Raises:
-        GsbaError: no such image, its end is missing, an unsupported variant, or more than
-            MAX_PIXELS.
-    """
+    """The header of an image file's content. Raises GsbaError: no such image, its end is missing,
+    an unsupported variant, or more than MAX_PIXELS."""
     try:
         header = _header(data)
     except _Truncated:

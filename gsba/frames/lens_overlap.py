@@ -42,7 +42,6 @@ def measure_overlap(
 
     Args:
         looks: pictures (h, w) uint8 of both lenses of each frame.
-        front: the front lens.
         behind: back lenses, one for each turn about the axis that it may have.
         radii: radii of both image circles, pixels.
     """
@@ -79,7 +78,6 @@ def rim_likeness(looks: Sequence[Sequence[np.ndarray]], pair: Pair) -> float:
 
     Args:
         looks: pictures (h, w) uint8 of both lenses of each frame.
-        pair: the lenses.
     """
     share = min(1.0, _MAX_WIDTH_PX / pair[0].width)
     front, back = (_shrunk(lens, share) for lens in pair)

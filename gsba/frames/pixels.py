@@ -37,8 +37,6 @@ def load_erp(frames: FrameSet, f: int, gray: bool = False, width: int | None = N
 
     Args:
         frames: panoramas.
-        f: index of the frame.
-        gray: one channel instead of RGB.
         width: pixels across, even: wider frames are averaged down to it.
     """
     kind = frames.format_of(f)
@@ -82,8 +80,6 @@ def load_faces(frames: FrameSet, f: int, gray: bool = False, size: int | None = 
 
     Args:
         frames: cube faces.
-        f: index of the frame.
-        gray: one channel instead of RGB.
         size: pixels across: larger faces are averaged down to it.
     """
     import cv2
@@ -103,7 +99,6 @@ def cut_views(frames: FrameSet, f: int, cutter: ViewCutter) -> list[np.ndarray]:
 
     Args:
         frames: panoramas; raw pairs and equi-angular cube maps are cut in one step.
-        cutter: the cutter for that frame.
     """
     kind = frames.format_of(f)
     if kind.fisheyes is not None:

@@ -126,7 +126,6 @@ def decode_pair(
     Args:
         paths: of each lens, or twice that of a file with both side by side, perhaps squeezed.
         size: width and height of one lens's picture, not squeezed.
-        gray: one channel instead of RGB.
     """
     if paths[0] == paths[1]:
         width, height = image_size(paths[0])
@@ -147,10 +146,8 @@ def lenses_of(
     """Initial lenses of raw frames: from a calibration, or of a pair from the image circles.
 
     Args:
-        folder: folder of the pictures.
         pairs: files of each frame.
         size: width and height of one lens's picture.
-        calibration: file; None = there is none.
         circles: image circles of the front and the back lens, or one for both; none = detect them.
 
     Returns:

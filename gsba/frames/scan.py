@@ -155,7 +155,12 @@ def _in_time_order(
 ) -> tuple[tuple[str, ...], np.ndarray, bool]:
     """Names (F,) of the frames, ascending times (F,), and True if these are real times."""
     names = sorted(found, key=_natural)
-    _check_names(folder, names)
+    for name in names:  # of tables and datasets
+        if any(unicodedata.category(letter) in ("Cc", "Cs") for letter in name):
+            raise GsbaError(
+                f"{folder}: the file name {name!r} holds control characters or is not UTF-8: "
+                "rename it"
+            )
     if names != sorted(names):
         swap = next((a, b) for a, b in pairwise(names) if a > b)
         _log.warning("frames are taken in numeric order (%s before %s)", *swap)
@@ -253,16 +258,6 @@ def _lenses(
     if circles:
         raise GsbaError(f"{folder}: holds {held}, but --circle is for raw fisheyes: leave it out")
     return None, False
-
-
-def _check_names(folder: Path, names: Sequence[str]) -> None:
-    """Refuse names that a table or a dataset cannot hold."""
-    for name in names:
-        if any(unicodedata.category(letter) in ("Cc", "Cs") for letter in name):
-            raise GsbaError(
-                f"{folder}: the file name {name!r} holds control characters or is not UTF-8: "
-                "rename it"
-            )
 
 
 def _find_frames(folder: Path) -> tuple[str, tuple[str, ...], dict[str, tuple[Path, ...]]]:

@@ -59,7 +59,6 @@ def recognise(greys: Iterable[np.ndarray], size: tuple[int, int], where: Path) -
 
     Args:
         greys: (h, w) uint8 each, perhaps smaller than `size`; no more are taken than needed.
-        size: width and height of the pictures.
         where: source of the pictures, for the notes.
     """
     if not may_hold_two(size):
@@ -124,9 +123,7 @@ def in_folder(
     """Detect two fisheyes side by side in the images of a folder.
 
     Args:
-        folder: folder of the images.
         paths: the images in order.
-        size: width and height of each image.
         shape: width and height of the lens's picture that a calibration belongs to; None = no
             calibration is given. With one, images are assumed to be raw.
         source: the calibration's name.

@@ -56,11 +56,8 @@ def read_lines(path: Path) -> list[tuple[int, str]]:
 
 
 def seconds(text: str) -> float:
-    """Seconds written as a decimal number, or as Unix time in whole ms, us or ns.
-
-    Raises:
-        ValueError: the text is no finite number, or no clock shows it.
-    """
+    """Seconds written as a decimal number, or as Unix time in whole ms, us or ns. Raises
+    ValueError: the text is no finite number, or no clock shows it."""
     unit = unix_unit(text)
     value = int(text) / _TICKS_PER_SECOND[unit] if unit else float(text)
     # even nanoseconds since 1970, read as seconds, are below

@@ -74,7 +74,6 @@ def track_size(folder: Path, pairs: Sequence[tuple[Path, ...]]) -> tuple[int, in
     frames.
 
     Args:
-        folder: folder of both tracks.
         pairs: paths of both pictures of each frame.
 
     Raises:

@@ -255,11 +255,8 @@ def _find(source: Source, given: str | None, setting: str, download: bool) -> Pa
 
 
 def weights_at_hand() -> dict[str, Path]:
-    """Files of weights in caches and installed packages, by key in SOURCES.
-
-    Raises:
-        GsbaError: a package's file is incomplete or of another version.
-    """
+    """Files of weights in caches and installed packages, by key in SOURCES. Raises GsbaError: a
+    package's file is incomplete or of another version."""
     found = {
         key: _held(source.files, [*_torch_cache(), *_hub_cache(source.hub)])
         or packaged(source.files)
@@ -319,11 +316,8 @@ def _copy(reply: Any, to: Path) -> None:
 
 
 def read_state(path: Path) -> dict[str, Any]:
-    """Tensors of a file of weights, by name; pickled code in it is not run.
-
-    Raises:
-        GsbaError: the file holds no weights.
-    """
+    """Tensors of a file of weights, by name; pickled code in it is not run. Raises GsbaError: the
+    file holds no weights."""
     import torch  # pyright: ignore[reportMissingImports]
 
     try:
@@ -341,11 +335,8 @@ def read_state(path: Path) -> dict[str, Any]:
 
 
 def load_into(model: Any, state: dict[str, Any], key: str, path: Path) -> Any:
-    """Load weights into a network and put it into inference mode.
-
-    Raises:
-        GsbaError: the weights are of another network.
-    """
+    """Load weights into a network and put it into inference mode. Raises GsbaError: the weights are
+    of another network."""
     needed = dict(model.named_parameters()) | {
         name: value for name, value in model.named_buffers() if "running" in name
     }

@@ -17,20 +17,8 @@ from gsba.frames.masks import levels_of, load_mask, load_weights
 from gsba.frames.pixels import load_erp
 from gsba.log import GsbaError, track
 from gsba.masks.borders import Borders, find_borders, padded
-from gsba.masks.carrier import (
-    Carrier,
-    carrier_mask,
-    find_carrier,
-    no_carrier,
-    write_carrier,
-)
-from gsba.masks.distractors import (
-    Distractors,
-    KnownMasks,
-    Look,
-    StaticScene,
-    distractor_weights,
-)
+from gsba.masks.carrier import Carrier, carrier_mask, find_carrier, no_carrier, write_carrier
+from gsba.masks.distractors import Distractors, KnownMasks, Look, StaticScene, distractor_weights
 from gsba.masks.segmentation import Segment, load_segmented, segmented
 from gsba.store.store import PerFrame, RunStore, fingerprint
 from gsba.types import Counts, FrameSet, Solution
@@ -90,17 +78,10 @@ def before(store: RunStore, frames: FrameSet, choice: Choice) -> FrameSet:
         for name, mask in _borders(store, frames).items():
             parts.append(mask)
             names.append(name)
-    if choice.carrier and frames.recordings:
+    if choice.carrier:
         frames, more, stages = _carriers(store, frames, choice, alone=not parts)
         parts += more
         names += stages
-    elif choice.carrier:
-        carrier = _carrier(store, frames, choice.carrier_required)
-        if carrier.share and not (parts or carrier.turns.any() or any(frames.mask_paths)):
-            frames = replace(frames, mask_paths=(store.root / "carrier.png",) * len(frames))
-        elif carrier.share:
-            parts.append(lambda f: carrier_mask(carrier, frames, f))
-            names.append("carrier")
     if not parts:
         return frames
     final = not choice.distractors
@@ -129,19 +110,21 @@ def _carriers(
     store: RunStore, frames: FrameSet, choice: Choice, alone: bool
 ) -> tuple[FrameSet, list[Callable[[int], np.ndarray | None]], list[str]]:
     """Frames with the mask of each recording's carrier, or else parts of masks and their stages."""
+    recordings = frames.recordings or {"": np.arange(len(frames))}
+    stages = {name: f"carrier@{name}" if name else "carrier" for name in recordings}
     found: dict[str, Carrier] = {}
-    for name, rows in frames.recordings.items():
+    for name, rows in recordings.items():
         if name not in choice.without_carrier:
-            own = frames.taken(rows)
-            carrier = _carrier(store, own, choice.carrier_required, f"carrier@{name}")
+            own = frames.taken(rows) if frames.recordings else frames
+            carrier = _carrier(store, own, choice.carrier_required, stages[name])
             if carrier.share:
                 found[name] = carrier
     turning = any(carrier.turns.any() for carrier in found.values())
     if alone and not (turning or any(frames.mask_paths)):
         paths = [name.rpartition("/")[0] for name in frames.names]
-        masks = [store.root / f"carrier@{name}.png" if name in found else None for name in paths]
+        masks = [store.root / f"{stages[name]}.png" if name in found else None for name in paths]
         return replace(frames, mask_paths=tuple(masks)), [], []
-    first = {name: int(rows[0]) for name, rows in frames.recordings.items()}
+    first = {name: int(rows[0]) for name, rows in recordings.items()}
 
     def part(f: int) -> np.ndarray | None:
         name = frames.names[f].rpartition("/")[0]
@@ -149,7 +132,7 @@ def _carriers(
             return None
         return carrier_mask(found[name], frames, f - first[name])
 
-    return frames, [part] if found else [], [f"carrier@{name}" for name in found]
+    return frames, [part] if found else [], [stages[name] for name in found]
 
 
 def after(

@@ -46,10 +46,7 @@ def segmented(store: RunStore, frames: FrameSet, segment: Segment) -> PerFrame[S
     A command is called once, `COMMAND IMAGES MASKS` with two folders: for each PNG of a face it
     must write a mask of the same name and size. `{images}` and `{masks}` in the command stand for
     the folders; `{image}` and `{mask}` make it a call for every face. A callable's results are
-    never resumed.
-
-    Raises:
-        GsbaError: the command fails, or a mask is missing or of another size.
+    never resumed. Raises GsbaError: the command fails, or a mask is missing or of another size.
     """
     index = {name: f for f, name in enumerate(frames.names)}
     folder = store.root / "stages" / "segmented-faces"

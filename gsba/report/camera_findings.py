@@ -28,7 +28,6 @@ def of_camera(
     """Baseline, axes, stitch radius and readout of two lenses.
 
     Args:
-        centres: estimated centres of the lenses.
         readout, axes, radius: further estimates; None = not estimated.
         known: covariances of these; None = one centre is as likely.
         scale: units of the result per map unit.
@@ -107,9 +106,7 @@ def of_lenses(
     """Self-calibrated lenses of raw fisheyes.
 
     Args:
-        lenses: lenses of the map.
         voted: check of the given calibration by features; None = the lenses were estimated.
-        known: covariances of the lenses.
 
     Returns:
         Content of report.json and notes.

@@ -33,11 +33,8 @@ def of_trajectory(
     """Checks of the trajectory by images, for report.json, and notes.
 
     Args:
-        trust: checks of its steps.
         clock: its clock; None = not checked.
         merged: parts of the map that were joined; None = the map never was in parts.
-        joints: alignments of its pieces.
-        frames: frames of the run.
         absent: True = there is no trajectory, so that images contradict none of its steps.
     """
     found, notes = _steps(trust, frames, absent)
@@ -173,13 +170,9 @@ def of_frames(
     """Names of frames with a finding, for `frame_lists` of report.json, and notes.
 
     Args:
-        frames: frames of the run.
-        coarse: their initial poses.
-        reconstruction: the result.
         frame_weights: (F,) weight of each frame's pixels, below 1 if they contradict the others.
         max_scale_sigma: relative sigma of the ratio of two successive baselines; frames above it
             are listed.
-        start: what the run started from.
     """
     absent = coarse.sources == PoseSource.NONE
     filled = np.flatnonzero((coarse.sources != PoseSource.SLAM) & ~absent)
@@ -227,7 +220,6 @@ def notes_on_gps(content: Mapping[str, Any], num_frames: int) -> list[str]:
 
     Args:
         content: report of the family, see `gsba.bundle.gps_factors.GpsFactors.report`.
-        num_frames: frames of the run.
     """
     if not content["taken"]:
         why = (
@@ -262,7 +254,6 @@ def of_gyro(
     """Clock, bias and axes of a gyro, and the share of its steps that agree with the poses.
 
     Args:
-        found: alignment of the gyro with the frames.
         steps_used: share of its steps that agree with the poses; None = it was not used.
         readout: estimated readout of the frames; None = a global shutter.
 
@@ -312,8 +303,6 @@ def of_recordings(
     """Content of report.json on each of several recordings, in order; [] if there is only one.
 
     Args:
-        frames: frames of the run.
-        reconstruction: the result.
         sources: (F,) `PoseSource` of the frames' initial poses.
         clocks: clock of each recording's trajectory; None = not checked.
     """

@@ -34,8 +34,6 @@ def summarize_maps(
     """Summaries of a reconstruction's maps, the largest first; frames in no map are left out.
 
     Args:
-        reconstruction: all maps of a run.
-        frames: its frames.
         reasons: reason why each map is not joined to a larger one, the largest map first; there may
             be fewer reasons than maps.
     """
@@ -74,7 +72,6 @@ def format_outcome(report: Mapping[str, Any], run: object) -> str:
 
     Args:
         report: content of report.json.
-        run: folder of the run.
     """
     summary, maps = report["summary"], report["maps"]
     residual, found = summary["median_residual_deg"], "rotations only, no points"

@@ -48,7 +48,6 @@ def load(paths: Sequence[Path], truth: Trajectory | None = None) -> tuple[Plotte
 
     Args:
         paths: folders of finished runs, or trajectory files.
-        truth: true poses.
 
     Raises:
         GsbaError: a run cannot be read, or has too few poses in common with the truth.
@@ -130,7 +129,6 @@ def draw(shown: Sequence[PlottedRun], out: Path, truth: Trajectory | None = None
         shown: runs from `gsba.report.plots.load`, with the same truth.
         out: folder for trajectories, errors and residuals, each as PNG and SVG; or a file (PNG,
             SVG or PDF) for all of them in one figure.
-        truth: true poses.
 
     Returns:
         the files.

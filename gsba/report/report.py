@@ -43,7 +43,6 @@ def source_name(pose: int, start: str) -> str:
 
     Args:
         pose: a `PoseSource`.
-        start: what the run started from.
     """
     if pose in (PoseSource.SLAM, PoseSource.NONE):
         return start
@@ -140,13 +139,7 @@ def build_report(
     """Content of report.json: plain values only.
 
     Args:
-        settings: settings of the run.
-        frames: its frames.
-        coarse: their initial poses.
-        reconstruction: the result.
-        stages: their costs and counts.
         gauge: a sentence on the gauge of the refined map.
-        found: findings beside the result.
     """
     quality = frame_quality(reconstruction)
     optional: dict[str, Any] = {"camera": found.camera, "gyro": found.gyro, "gps": found.gps}
@@ -279,9 +272,6 @@ def _version(package: str) -> str | None:
         return None
 
 
-_UNCHANGED = {int, str, bool, type(None)}  # types that JSON holds as they are
-
-
 def plain(value: Any, digits: int = 17) -> Any:
     """Value as JSON can hold it: floats with `digits`, null for numbers that are not finite."""
     kind = type(value)  # the most frequent ones first
@@ -289,7 +279,7 @@ def plain(value: Any, digits: int = 17) -> Any:
         if not math.isfinite(value):
             return None
         return value if digits >= 17 else float(f"{value:.{digits}g}")
-    if kind in _UNCHANGED:
+    if kind in (int, str, bool, type(None)):  # JSON holds them as they are
         return value
     if kind is list:
         return [plain(item, digits) for item in value]

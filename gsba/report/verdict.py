@@ -196,13 +196,7 @@ class Verdict:
 
 
 def judge(report: Mapping[str, Any], main: Reconstruction, shown: FrameSet) -> Verdict:
-    """Verdict on a run.
-
-    Args:
-        report: content of report.json.
-        main: the exported map.
-        shown: its frames.
-    """
+    """Verdict on a run."""
     return verdict_on(measure(report, main, shown), report, shown.names)
 
 

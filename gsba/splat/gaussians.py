@@ -76,10 +76,8 @@ def from_cloud(
     wide as the distance to their neighbours; harmonics but the constant one start at zero.
 
     The start of Kerbl et al., 3D Gaussian Splatting, 2023: the standard deviation is the root mean
-    square distance to the three nearest points, limited to a tenth of the cloud's extent.
-
-    Raises:
-        GsbaError: the cloud has no points, or points that are not finite.
+    square distance to the three nearest points, limited to a tenth of the cloud's extent. Raises
+    GsbaError: the cloud has no points, or points that are not finite.
     """
     points = np.asarray(points_world, np.float64)
     if len(points) == 0:

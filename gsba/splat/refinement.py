@@ -105,11 +105,8 @@ def refine(
 ) -> SplatResult:
     """Refine a solved map against splats of its own frames, from coarse faces to fine; all faces
     are held in memory, one size at a time. Finished turns are stored in a checkpoint and resumed
-    from it, if its key, a digest of the inputs, is this one.
-
-    Raises:
-        GsbaError: all frames are masked, or the splat is no longer finite.
-    """
+    from it, if its key, a digest of the inputs, is this one. Raises GsbaError: all frames are
+    masked, or the splat is no longer finite."""
     chosen = context.settings.splat
     usable = start.observations() >= MIN_OBSERVATIONS
     if np.count_nonzero(usable) <= _HELD_OUT_EVERY:

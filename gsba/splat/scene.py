@@ -131,7 +131,6 @@ def make_views(faces: Faces, world_T_rigs: np.ndarray) -> Views:
     """Posed faces, without those that are masked altogether.
 
     Args:
-        faces: result of `load_faces`.
         world_T_rigs: (W, 4, 4) poses of their frames.
     """
     each, poses = len(faces.views), faces.poses(world_T_rigs)
@@ -149,9 +148,7 @@ def place_points(
     """The run's points, triangulated again from some frames under given poses.
 
     Args:
-        reconstruction: source of the observations.
         world_T_rigs: (F, 4, 4) poses, in a world of their own; only those of `frames` are used.
-        frames: frame indices.
         gate_rad: observations further from their point are left out.
 
     Returns:
@@ -188,7 +185,6 @@ def start_cloud(
 
     Args:
         reconstruction, world_T_rigs, frames: see `place_points`.
-        sh_degree: highest degree of the Gaussians' harmonics.
     """
     landmarks, known = place_points(reconstruction, world_T_rigs, frames, float(np.deg2rad(3.0)))
     return from_cloud(landmarks.points_world, reconstruction.point_colors[known], sh_degree)

@@ -132,11 +132,9 @@ def measure(
     """Scores of panoramas, by their number in the views.
 
     Args:
-        gaussians: the splat.
         views: held-out faces; a panorama that is masked altogether has no faces and no score.
         settings: degree of the harmonics.
         near: least z of a Gaussian, map units.
-        backend: the renderer.
         lpips: see `gsba.splat.scores`; None = not measured.
 
     Raises:

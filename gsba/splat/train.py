@@ -109,9 +109,6 @@ def train(
 
     Args:
         start: initial Gaussians, e.g. of `from_cloud`.
-        views: views to train on.
-        settings: length, rates and thresholds.
-        backend: the renderer.
         checkpoint: file to store the training in and to resume from; None = none.
         key: digest of the inputs; a checkpoint with another key is not resumed.
         watch: called with the steps made and the splat, after each stretch of the backend's.

@@ -46,7 +46,6 @@ _MIN_LATE_S = 60.0  # shortest time after which a shard is late
 _MAX_ATTEMPTS = 5  # workers that may die on a shard
 _SCHEDULER_TIMEOUT_S = 20.0  # for a scheduler's first answer
 _POLL_S = 5.0  # between checks for late shards
-_MAX_LOCAL, _MAX_QUEUED = 256, 100_000  # workers that may be requested
 
 
 def hire(
@@ -117,7 +116,7 @@ def connect(address: str) -> "Client":
         raise GsbaError("--cluster needs Dask: pip install 'gsba[cluster]'") from None
     kind, _, count = address.partition(":")
     if kind == "local" or kind in _QUEUES:
-        most = _MAX_LOCAL if kind == "local" else _MAX_QUEUED
+        most = 256 if kind == "local" else 100_000  # workers
         if not count.isdecimal() or len(count) > 9 or not 0 < int(count) <= most:
             raise GsbaError(
                 f"--cluster {address}: give the number of workers, 1 to {most}, as in {kind}:8"
@@ -196,8 +195,11 @@ class Cluster:
         self._folder = folder.absolute()
         self._cpu_seconds = 0.0
         self._done: dict[str, int] = {}
-        _leave_task()
-        from distributed import WorkerPlugin
+        from distributed import WorkerPlugin, get_worker, secede
+
+        with suppress(ValueError):  # an ordinary process
+            get_worker()
+            secede()  # leave the pool of the worker that calls this: shards may need its slot
 
         class Settings(WorkerPlugin):
             """Turns off memory limits, which compiled code exceeds, and threads within threads, on
@@ -233,9 +235,7 @@ class Cluster:
     def must_see(self, paths: Sequence[Path]) -> None:
         """See `gsba.store.shards.Workers`; also compares versions of gsba."""
 
-        def ask(
-            paths: list[str],
-        ) -> tuple[str, list[str]]:  # strings: gsba's types may differ there
+        def ask(paths: list[str]) -> tuple[str, list[str]]:  # strings: types may differ there
             import os
 
             try:
@@ -371,14 +371,3 @@ class Cluster:
         write_text(token, __version__)
         self.must_see([token, frames])
         token.unlink(missing_ok=True)
-
-
-def _leave_task() -> None:
-    """Leave the thread pool of the worker that calls this, if any: shards may need its slot."""
-    from distributed import get_worker, secede
-
-    try:
-        get_worker()
-    except ValueError:  # an ordinary process
-        return
-    secede()

@@ -42,12 +42,10 @@ from gsba.store.records import (
     save_record,
     typed,
 )
-from gsba.store.shards import Spent, StoredRecords, Threads, Workers, even_blocks
+from gsba.store.shards import StoredRecords, Threads, Workers, even_blocks
 from gsba.version import __version__
 
 logger = logging.getLogger(__name__)
-_SHARDS = "shards"  # folder of shards of the stage that is being computed
-_PARTS = "parts"  # folder of maps in parts of that stage
 T = TypeVar("T")
 T_co = TypeVar("T_co", covariant=True)
 
@@ -114,12 +112,12 @@ class RunStore:
     @property
     def shards_folder(self) -> Path:
         """Folder of the workers' files, emptied when a stage is stored."""
-        return self.root / STAGES / _SHARDS
+        return self.root / STAGES / "shards"
 
     @property
     def parts_folder(self) -> Path:
         """Folder of maps that a stage solves in parts, deleted when the stage is stored."""
-        return self.root / STAGES / _PARTS
+        return self.root / STAGES / "parts"
 
     @property
     def scratch_folder(self) -> Path:
@@ -165,10 +163,10 @@ class RunStore:
             self._note(replace(record, resumed=True), value)
             return value
         event("stage", name=name, title=self._title_of(name))
-        clocks = _Clocks.now(self.workers)
+        measured = _measuring(name, key, self.workers)
         with _named_in_memory_errors(name):
             value = compute()
-        record = clocks.measured(name, key, self.workers)
+        record = measured()
         save_record(path, value, dataclasses.asdict(record))
         self._forget_shards()
         self._note(record, value)
@@ -202,11 +200,15 @@ class RunStore:
         keys = {item: digest(base, item, depends) for item, depends in items.items()}
         folder = self.root / STAGES / name
         frames = PerFrame(folder, keys, compute, returns)
-        frames.discard_others()
-        missing = [item for item in frames if not frames.is_stored(item)]
-        spent = _read_cost(folder / "cost.json", base) if len(missing) < len(keys) else None
+        for path in {*folder.rglob("*.npz")} - {folder / f"{item}.npz" for item in keys}:
+            path.unlink()  # results of frames that are not among these
+        missing, spent = [item for item in frames if not frames.is_stored(item)], None
+        with suppress(OSError, ValueError, RecursionError, RecordError):
+            spent = typed(json.loads((folder / "cost.json").read_text()), StageRecord)
+        if spent is not None and (spent.key != base or len(missing) == len(keys)):
+            spent = None  # of another stage, or of results that are gone
         workers = Threads(1) if alone else self.workers
-        clocks = _Clocks.now(workers)
+        measured = _measuring(name, base, workers, spent)
         if missing:
             event("stage", name=name, title=self._title_of(name))
         try:
@@ -214,9 +216,8 @@ class RunStore:
                 for _ in workers.map_shards(_Missing(name, frames, tuple(missing))):
                     pass
         finally:
-            record = clocks.measured(name, base, workers, spent)
-            text = json.dumps(dataclasses.asdict(record))
-            write_text(folder / "cost.json", text)
+            record = measured()
+            write_text(folder / "cost.json", json.dumps(dataclasses.asdict(record)))
         self._forget_shards()
         self._note(replace(record, key=digest(base, keys), resumed=not missing))
         return frames
@@ -358,11 +359,6 @@ class PerFrame(Generic[T]):
         keys = {number: self._keys[name] for number, name in names.items()}
         return StoredRecords(paths, keys, self._returns)
 
-    def discard_others(self) -> None:
-        """Delete results of frames that are not among these."""
-        for path in set(self._folder.rglob("*.npz")) - {self._path(name) for name in self}:
-            path.unlink()
-
     def _path(self, name: str) -> Path:
         return self._folder / f"{name}.npz"
 
@@ -455,26 +451,17 @@ def _load_if_current(path: Path, key: str, returns: type[T]) -> tuple[T, StageRe
         return None
 
 
-@dataclass(frozen=True, slots=True)
-class _Clocks:
-    """Clocks of this process and of remote workers at the start of a stage."""
+def _measuring(
+    name: str, key: str, workers: Workers, spent: StageRecord | None = None
+) -> Callable[[], StageRecord]:
+    """Function that gives the cost of a stage since now, added to that `spent` by an interrupted
+    call."""
+    wall, cpu, own = time.perf_counter(), time.process_time(), time.thread_time()
+    before = workers.spent()
 
-    wall: float  # seconds
-    cpu: float  # seconds, of this process
-    own: float  # seconds of CPU, of this thread
-    elsewhere: Spent  # work of remote workers
-
-    @classmethod
-    def now(cls, workers: Workers) -> "_Clocks":
-        return cls(time.perf_counter(), time.process_time(), time.thread_time(), workers.spent())
-
-    def measured(
-        self, name: str, key: str, workers: Workers, spent: StageRecord | None = None
-    ) -> StageRecord:
-        """Cost since the start, added to the cost `spent` by an interrupted call."""
-        elsewhere, before = workers.spent(), self.elsewhere
-        seconds = time.perf_counter() - self.wall
-        cpu_seconds, serial = time.process_time() - self.cpu, time.thread_time() - self.own
+    def measured() -> StageRecord:
+        elsewhere, seconds = workers.spent(), time.perf_counter() - wall
+        cpu_seconds, serial = time.process_time() - cpu, time.thread_time() - own
         cpu_seconds += elsewhere.cpu_seconds - before.cpu_seconds
         took_part = [w for w, n in elsewhere.shards.items() if n > before.shards.get(w, 0)]
         peak_mb = peak_memory_bytes() / 2**20
@@ -486,10 +473,4 @@ class _Clocks:
         figures = seconds, cpu_seconds, peak_mb, len(took_part), serial
         return StageRecord(name, key, False, *figures)
 
-
-def _read_cost(path: Path, key: str) -> StageRecord | None:
-    try:
-        record = typed(json.loads(path.read_text()), StageRecord)
-    except (OSError, ValueError, RecursionError, RecordError):
-        return None
-    return record if record.key == key else None
+    return measured

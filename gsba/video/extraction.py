@@ -15,7 +15,7 @@ import logging
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, astuple, dataclass
 from itertools import groupby
 from pathlib import Path
 
@@ -23,10 +23,7 @@ import numpy as np
 
 from gsba.config import VideoSettings
 from gsba.disk import disk_errors, refuse_links, remove_temporaries, write_bytes, write_text
-from gsba.frames.factory_start import (
-    FACTORY_FILE,
-    write_factory_calibration,
-)
+from gsba.frames.factory_start import FACTORY_FILE, write_factory_calibration
 from gsba.frames.files import EXTRACTED
 from gsba.frames.times import read_times
 from gsba.log import GsbaError, track
@@ -74,9 +71,7 @@ def extract(video: Path, out: Path, settings: VideoSettings, replace: bool = Fal
 
     Times are the container's presentation times since the first frame, also for variable frame
     rates. An interrupted call resumes; another extraction in the folder is replaced if `replace`.
-
-    Raises:
-        GsbaError: the video or the folder cannot be used, or no frame is in the range.
+    Raises GsbaError: the video or the folder cannot be used, or no frame is in the range.
     """
     trajectory = None if settings.at is None else Path(settings.at)
     if settings.at is not None and settings.sharpest:
@@ -114,12 +109,8 @@ def extract(video: Path, out: Path, settings: VideoSettings, replace: bool = Fal
     kept = before + after
     if not kept:
         raise GsbaError(f"{video}: none of its frames could be decoded; copy it again")
-    damaged = len(windows) - len(kept) - standing
-    left_out = {
-        "not chosen": received - len(windows),
-        "while the camera stood": standing,
-        "damaged": damaged,
-    }
+    left_out = {"not chosen": received - len(windows), "while the camera stood": standing}
+    left_out["damaged"] = len(windows) - len(kept) - standing
     counts = Counts(received, len(kept), "frames", left_out)
     rows = "".join(f"{entry.name},{entry.timestamp!r}\n" for entry in kept)
     write_text(out / TIMES, "name,timestamp\n" + rows)
@@ -209,7 +200,7 @@ def _extract(
     before: list[_Kept],
 ) -> tuple[list[_Kept], int]:
     """Write frames after those kept `before`; kept ones, and windows left out for standing."""
-    times, kept, last = recording.times, list[_Kept](), None
+    times, kept, last, journal = recording.times, list[_Kept](), None, out / _JOURNAL
     standing = before[-1].standing if before else 0
     todo = [window for window in windows if not before or window[0] > before[-1].index]
     skip_standing = settings.standing_deg > 0 and settings.at is None
@@ -221,7 +212,8 @@ def _extract(
     for index, pictures in track(best, "extracting frames", len(todo)):
         if skip_standing:
             small = _small(pictures, recording.cube)
-            if last is not None and _motion_deg(last, small, recording) < settings.standing_deg:
+            used = lens_interior(len(small)) if recording.lenses else None
+            if last is not None and apparent_motion_deg(last, small, used) < settings.standing_deg:
                 standing += 1
                 continue
             last = small
@@ -229,7 +221,8 @@ def _extract(
         for folder, image in zip(_folders(out, recording.folders), images, strict=True):
             write_bytes(folder / name, image)
         kept.append(_Kept(name, float(times[index]), index, standing))
-        _append(out / _JOURNAL, kept[-1])
+        with disk_errors(journal), journal.open("a", newline="", encoding="utf-8") as file:
+            csv.writer(file).writerow(astuple(kept[-1]))
     return kept, standing
 
 
@@ -241,11 +234,9 @@ def _best_of_each(
     """Yield the sharpest, or only, decoded frame of each window, by the mean over its images."""
     window_of = {int(index): w for w, window in enumerate(windows) for index in window}
     for _, group in groupby(frames, key=lambda item: window_of[item[0]]):
-        yield max(group, key=lambda item: _sharpness(item[1]) if sharpest else 0.0)
-
-
-def _sharpness(pictures: tuple[VideoPicture, ...]) -> float:
-    return sum(sharpness(picture.luma()) for picture in pictures) / len(pictures)
+        yield max(
+            group, key=lambda item: sum(sharpness(p.luma()) for p in item[1]) if sharpest else 0.0
+        )
 
 
 def _small(pictures: tuple[VideoPicture, ...], cube: bool) -> np.ndarray:
@@ -254,11 +245,6 @@ def _small(pictures: tuple[VideoPicture, ...], cube: bool) -> np.ndarray:
     All have about the same angular width.
     """
     return miniature(np.concatenate([p.luma() for p in pictures], axis=0 if cube else 1))
-
-
-def _motion_deg(before: np.ndarray, after: np.ndarray, recording: VideoRecording) -> float:
-    used = lens_interior(after.shape[0]) if recording.lenses else None
-    return apparent_motion_deg(before, after, used)
 
 
 def _encoded(picture: VideoPicture, width: int | None) -> bytes:
@@ -334,11 +320,6 @@ def _write_marker(
         marker["lenses"] = list(lenses)
     text = json.dumps(marker, indent=1, ensure_ascii=False) + "\n"
     write_text(out / EXTRACTED, text)
-
-
-def _append(path: Path, kept: _Kept) -> None:
-    with disk_errors(path), path.open("a", newline="", encoding="utf-8") as file:
-        csv.writer(file).writerow([kept.name, repr(kept.timestamp), kept.index, kept.standing])
 
 
 def _read_journal(out: Path, lenses: Sequence[str]) -> list[_Kept]:

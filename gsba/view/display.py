@@ -164,9 +164,8 @@ class SceneView:
         gui, scene = self.server.gui, self.scene
         gui.configure_theme(show_logo=False, show_share_button=False, brand_color=_AFTER)
         num = len(scene.reconstruction.points_world)
-        gui.add_markdown(
-            f"## {scene.name}\n{len(scene.frames)} frames, {num} points, {self._where()}"
-        )
+        about = f"{len(scene.frames)} frames, {num} points, {scene.grounds} ({scene.unit})"
+        gui.add_markdown(f"## {scene.name}\n{about}")
         panel = gui.add_panel()  # on phones it begins folded, so that the scene has room
         with panel.add_tab("Frame"):
             slider = gui.add_slider("Number", 0, len(scene.frames) - 1, 1, 0)
@@ -176,9 +175,9 @@ class SceneView:
             inside = gui.add_button(
                 "Stand inside", hint="Move to the frame and look at its images from inside."
             )
-            inside.on_click(lambda event: self._stand_inside(event.client))
+            inside.on_click(lambda event: self._stand(event.client, inside=True))
             whole = gui.add_button("Show the whole run")
-            whole.on_click(lambda event: self._stand_outside(event.client))
+            whole.on_click(lambda event: self._stand(event.client, inside=False))
             self._add_switch("Images", "/frame")
             self._add_switch("Observed points", "/seen")
             masks = gui.add_checkbox(
@@ -194,7 +193,8 @@ class SceneView:
             self._add_switch("Cloud", "/cloud")
             self._add_switch("Distance to the scan", "/judged")
             size = gui.add_slider("Point size", 0.1, 5.0, 0.1, 1.0)
-            size.on_update(lambda _: self._resize_points(size.value))
+            cloud, one = self.nodes["/cloud"], 0.02 * self.size
+            size.on_update(lambda _: setattr(cloud, "point_size", one * size.value))
             for splat in scene.splats:
                 self._add_switch(f"Splat {splat.name}", f"/splat/{splat.name}")
         gui.main_panel.dock_right()
@@ -258,15 +258,9 @@ class SceneView:
             rows.append(f"moved {np.linalg.norm(shift):.3g} {scene.unit} by the refinement")
         return "\n\n".join([*rows, *([f"No image: {problem}"] if problem else [])])
 
-    def _where(self) -> str:
-        return f"{self.scene.grounds} ({self.scene.unit})"
-
     def _select(self, f: int | None) -> None:
         if f is not None:
             self.controls["Number"].value = int(f)  # its callback shows the frame
-
-    def _resize_points(self, factor: float) -> None:
-        self.nodes["/cloud"].point_size = 0.02 * self.size * factor
 
     def _outside(self) -> tuple[np.ndarray, np.ndarray]:
         """Camera position from which the whole path is visible, and the middle of the path."""
@@ -278,22 +272,18 @@ class SceneView:
         level /= np.linalg.norm(level)
         return centre + extent * (0.7 * up + 0.7 * level), centre
 
-    def _stand_inside(self, client: "viser.ClientHandle | None") -> None:
+    def _stand(self, client: "viser.ClientHandle | None", inside: bool) -> None:
+        """Move a browser's camera to the shown frame, to look ahead, or to see the whole run."""
         if client is None:
             return
-        world_T_rig = self.scene.reconstruction.world_T_rigs[self.frame]
-        centre, ahead = self.scale * world_T_rig[:3, 3], world_T_rig[:3, 2]
-        with client.atomic():
-            client.camera.position = centre
-            client.camera.look_at = centre + 0.05 * self.size * ahead
-
-    def _stand_outside(self, client: "viser.ClientHandle | None") -> None:
-        if client is None:
-            return
-        position, centre = self._outside()
+        position, target = self._outside()
+        if inside:
+            world_T_rig = self.scene.reconstruction.world_T_rigs[self.frame]
+            position = self.scale * world_T_rig[:3, 3]
+            target = position + 0.05 * self.size * world_T_rig[:3, 2]
         with client.atomic():
             client.camera.position = position
-            client.camera.look_at = centre
+            client.camera.look_at = target
 
 
 def _pyramid(length: float) -> tuple[np.ndarray, np.ndarray]:

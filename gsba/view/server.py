@@ -31,7 +31,6 @@ def serve(scene: RunScene, port: int) -> SceneView:
     Only browsers that know `view.address` get answers: see `gsba.view.server`.
 
     Args:
-        scene: see `load_scene`.
         port: 1 to 65535, or 0 for any free one (`view.server.get_port()`).
 
     Raises:

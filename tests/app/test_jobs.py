@@ -15,7 +15,7 @@ from waiting import until
 
 from gsba.app import worker
 from gsba.app.jobs import AppJob, Command, Jobs, alive, alive_lock, ending
-from gsba.app.progress import Followed, Progress, read_events
+from gsba.app.progress import Progress, read_events
 from gsba.app.worker import work
 from gsba.log import EVENTS, GsbaError, track
 
@@ -62,7 +62,10 @@ def status(jobs: Jobs, job: AppJob) -> str:
 
 
 def has_begun(jobs: Jobs, job: AppJob) -> bool:
-    return Followed(job.events).now().stage is not None
+    progress = Progress()
+    for event in read_events(job.events)[0]:
+        progress.add(event)
+    return progress.stage is not None
 
 
 def begun(jobs: Jobs, job: AppJob) -> threading.Thread:
@@ -223,7 +226,7 @@ def test_progress_of_a_run() -> None:
         {"event": "log", "level": "WARNING", "text": "dark"},
     ):
         progress.add(entry)
-    assert progress.left_in_words() == ""
+    assert progress.table()["left"] == ""
     assert progress.warnings == ["dark"] and len(progress.keyframes) == 1
     assert progress.stage is not None and progress.stage["title"] == "track the video"
     progress.add({"event": "done", "name": "odometry", "title": "track the video"})

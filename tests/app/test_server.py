@@ -16,7 +16,7 @@ pytest.importorskip("httpx")
 from starlette.testclient import TestClient
 
 from gsba.app import App, Form, serve
-from gsba.app.routes import _SCRIPTS, application
+from gsba.app.routes import PAGE, application
 from gsba.cli.serving import COMMANDS, check, choices, form_of
 from gsba.log import GsbaError
 from gsba.trajectory.files import read_trajectory
@@ -98,7 +98,7 @@ def test_a_form_of_another_page_changes_nothing(client: TestClient) -> None:
 
 
 def test_the_page_loads_nothing_from_elsewhere(client: TestClient) -> None:
-    for name in ("", "app.css", *(f"{name}.js" for name in _SCRIPTS)):
+    for name in ("", *PAGE):
         answer = client.get(name)
         assert answer.status_code == 200
         assert "default-src 'none'" in answer.headers["content-security-policy"]

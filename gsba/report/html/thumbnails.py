@@ -33,8 +33,6 @@ def frame_pictures(
     """Pictures of frames, and what is drawn in.
 
     Args:
-        frames: frames of the page.
-        reconstruction: their map.
         camera: entry "camera" of report.json; None = there is none.
 
     Returns:
