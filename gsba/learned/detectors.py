@@ -30,7 +30,8 @@ def aliked(weights: Path, num: int) -> Detector:
     state = read_state(weights)
     samples, channels = getattr(state.get("desc_head.agg_weights"), "shape", (16, 128, 128))[:2]
     name = _ALIKED_MODELS.get((channels, samples), "aliked-n16")
-    model = kornia.feature.ALIKED(name, max_num_keypoints=num)
+    # A threshold above 0 leaves most faces with a fraction of the keypoints that are wanted.
+    model = kornia.feature.ALIKED(name, max_num_keypoints=num, detection_threshold=-1.0)
     model = load_into(model, state, "aliked", weights)
 
     def detect(image: np.ndarray) -> tuple[np.ndarray, ...]:
