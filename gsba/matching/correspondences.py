@@ -23,8 +23,6 @@ _REFINED_DEG, _REFINED_DIRECTION = (
     0.005,
 )  # gate of the solved map: rotation, tangent of direction
 _POINT_DEG = 0.6  # gate around a known point's predicted bearing
-_ROTATION_GAPS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)  # gaps in frames between
-# matched pairs
 _MAX_JOIN_ERROR_RAD = np.deg2rad(4.0)  # largest error of a joined part's pose, as an angle at the
 # median depth
 
@@ -194,7 +192,8 @@ def _estimates(found: Matches, gate: Gate, context: MatchContext) -> list[Relati
 def match_for_rotations(context: MatchContext, world_T_rigs: np.ndarray) -> Matches:
     """Matches of frames near and far in time, around bearings predicted by their rotations."""
     num = len(world_T_rigs)
-    chosen = [(f, f + gap) for gap in _ROTATION_GAPS for f in range(num - gap)]
+    gaps = 1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128
+    chosen = [(f, f + gap) for gap in gaps for f in range(num - gap)]
     pairs = np.array(chosen, np.int32).reshape(-1, 2)
     still = world_T_rigs.copy()
     still[:, :3, 3] = 0
