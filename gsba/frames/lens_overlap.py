@@ -2,7 +2,7 @@
 quarter turn of the back lens and the focal length that puts the seam at 90 degrees."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -23,22 +23,15 @@ _PEAK_HALF_WIDTH = 5  # steps of _SCALES on either side of the peak, where the c
 _PEAK_DROP = 0.13  # by this part of the peak's
 
 
-@dataclass(frozen=True, slots=True)
-class Overlap:
-    """The relation of two lenses that their pictures at the seam determine."""
-
-    turn: int  # index of the back lens whose pictures continue the front one's
-    turn_is_clear: bool  # True if they match clearly better than under any other turn
-    scale: float | None  # of focal lengths at which pictures correlate best; None = undetermined
-
-
 def measure_overlap(
     looks: Sequence[Sequence[np.ndarray]],
     front: Fisheye,
     behind: Sequence[Fisheye],
     radii: tuple[float, float],
-) -> Overlap:
-    """Correlate both lenses' pictures at the seam under several turns and focal lengths.
+) -> tuple[int | None, float | None]:
+    """Index of the back lens whose pictures continue the front one's at the seam, None = no one
+    matches clearly better than all others; and the scale of focal lengths at which they correlate
+    best, None = undetermined.
 
     Args:
         looks: pictures (h, w) uint8 of both lenses of each frame.
@@ -70,7 +63,7 @@ def measure_overlap(
     order = np.argsort(best)[::-1]
     turn = int(order[0])
     clear = len(behind) == 1 or bool(best[turn] > best[order[1]] + _MIN_TURN_MARGIN)
-    return Overlap(turn, clear, _peak(fine[turn]))
+    return turn if clear else None, _peak(fine[turn])
 
 
 def rim_likeness(looks: Sequence[Sequence[np.ndarray]], pair: Pair) -> float:
