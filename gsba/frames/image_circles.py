@@ -15,7 +15,6 @@ _WINDOW_SAMPLES = 6  # samples on either side of an edge, whose means are compar
 _MIN_EDGE_GAP = 8  # samples between two edges of a ray
 _NUM_TRIALS = 3000  # circles tried, each through three edges
 _TRIALS_AT_ONCE = 250
-_MAX_RELATIVE_DISTANCE = 0.006  # largest distance of an edge from a circle, relative to the radius
 _MAX_REFINED_DISTANCE = 0.01  # largest distance of an edge while the circle is refined, relative
 _MIN_RADIUS, _MAX_RADIUS = 0.3, 0.72  # in units of the shorter and of the longer side
 _MAX_OFF_CENTRE = 0.15  # distance of the centre from the middle, in units of each side
@@ -24,9 +23,6 @@ _MIN_SUPPORT = 0.5  # share of the visible rim on which an edge must lie
 _MIN_AGREEING_RAYS = 54  # rays that must have an edge on the circle
 _INNER_RADII = 0.75, 0.97  # range of radii of a circle within a housing's, relative to the outer
 # one
-_MAX_CENTRE_DISTANCE = 0.03  # largest distance of their centres, relative to the radius
-_MIN_INNER_SCORE = 0.4  # least score of a circle within a housing's, relative to the outer one's
-_MAX_HOUSING_CONTRAST = 0.6  # largest contrast of a housing, relative to that of the scene within
 _TEXTURE_BLUR_PX, _TEXTURE_PARTS = 1.5, 12  # pixels; parts of a circle over which the mean is
 # removed
 _CORRELATED_RAYS = 8  # neighbouring rays with correlated errors
@@ -168,13 +164,14 @@ def _best_circle(edges: _Edges, pictures: Sequence[np.ndarray]) -> tuple[ImageCi
     outer = circles[best]
     parts = circles[:, 2] / outer[2]
     apart = np.hypot(*(circles[:, :2] - outer[:2]).T) / outer[2]
-    within = (parts > _INNER_RADII[0]) & (parts < _INNER_RADII[1]) & (apart < _MAX_CENTRE_DISTANCE)
-    within &= scores > _MIN_INNER_SCORE * scores[best]
+    within = (parts > _INNER_RADII[0]) & (parts < _INNER_RADII[1]) & (apart < 0.03)
+    within &= scores > 0.4 * scores[best]
     if within.any():
         inner = circles[int(np.argmax(np.where(within, scores, -1.0)))]
         between = outer - 0.5 * (outer - inner)
         scene = inner * np.array([1.0, 1.0, 0.93])
-        if _contrast(pictures, between) < _MAX_HOUSING_CONTRAST * _contrast(pictures, scene):
+        # a housing has little contrast beside the scene within it
+        if _contrast(pictures, between) < 0.6 * _contrast(pictures, scene):
             outer = inner
     return _refined(edges, outer, width, height)
 
@@ -201,9 +198,9 @@ def _trials(places: np.ndarray, width: int, height: int) -> np.ndarray:
 
 
 def _edges_on_circles(places: np.ndarray, circles: np.ndarray) -> np.ndarray:
-    """True (C, E) where edges (E, 2) lie on circles (C, 3)."""
+    """True (C, E) where edges (E, 2) lie on circles (C, 3), within 0.6 % of the radius."""
     away = np.hypot(places[:, 0] - circles[:, :1], places[:, 1] - circles[:, 1:2])
-    return np.abs(away - circles[:, 2:]) < _MAX_RELATIVE_DISTANCE * circles[:, 2:]
+    return np.abs(away - circles[:, 2:]) < 0.006 * circles[:, 2:]
 
 
 def _refined(edges: _Edges, circle: np.ndarray, width: int, height: int) -> tuple[ImageCircle, int]:

@@ -16,11 +16,8 @@ _OVERLAP_RAD = np.deg2rad(np.arange(-4.0, 4.5, 1.0))  # angles from the seam
 _SCALES = 100.0 / np.arange(90.0, 112.25, 0.5)[::-1]  # of focal lengths: circles of 90 to 112
 # degrees from the axis, where they are taken for 100
 _MIN_ROWS = 5  # least number of rows of _OVERLAP_RAD inside both image circles
-_MIN_TURN_MARGIN = 0.1  # margin in correlation of the right turn over any other
-_MIN_PEAK_CORRELATION = 0.25  # least correlation at the right focal length
 _PEAK_HALF_WIDTH = 5  # steps of _SCALES on either side of the peak, where the correlation must be
 # lower
-_PEAK_DROP = 0.13  # by this part of the peak's
 
 
 def measure_overlap(
@@ -62,7 +59,7 @@ def measure_overlap(
     best = whole.max(axis=1)
     order = np.argsort(best)[::-1]
     turn = int(order[0])
-    clear = len(behind) == 1 or bool(best[turn] > best[order[1]] + _MIN_TURN_MARGIN)
+    clear = len(behind) == 1 or bool(best[turn] > best[order[1]] + 0.1)
     return turn if clear else None, _peak(fine[turn])
 
 
@@ -135,9 +132,9 @@ def _peak(scores: np.ndarray) -> float | None:
     """Scale of focal lengths at a clear peak of correlations (S,); None = there is none."""
     best = int(np.argmax(scores))
     sides = best - _PEAK_HALF_WIDTH, best + _PEAK_HALF_WIDTH
-    if sides[0] < 0 or sides[1] >= len(scores) or scores[best] < _MIN_PEAK_CORRELATION:
+    if sides[0] < 0 or sides[1] >= len(scores) or scores[best] < 0.25:
         return None
-    if max(scores[list(sides)]) > (1 - _PEAK_DROP) * scores[best]:
+    if max(scores[list(sides)]) > 0.87 * scores[best]:
         return None
     before, at, after = scores[best - 1 : best + 2]
     bend = before - 2 * at + after

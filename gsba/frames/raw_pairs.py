@@ -26,8 +26,6 @@ _RIG_R_BACK_LENS = np.diag([-1.0, 1.0, -1.0])  # rig_R_lens of an upright back l
 _QUARTER_TURNS = [
     Rotation.from_euler("z", turn).as_matrix() for turn in np.deg2rad([0, 90, 180, 270])
 ]
-_MAX_FOCAL_CHANGE = 0.025  # relative change of focal lengths from which pictures contradict a
-# calibration; parallax of near things looks like one or two percent
 
 Found = dict[str, tuple[Path, ...]]  # frame -> picture of each lens, the front one first
 _NUMBERED = re.compile(r"lens(\d+)", re.IGNORECASE)  # folders of more than two lenses
@@ -219,7 +217,8 @@ def _calibrated(
         return pair, False
     radii = circles[0].radius, circles[1].radius
     scale = measure_overlap(looks, pair[0], [pair[1]], radii)[1] or 1.0
-    if abs(scale - 1) < _MAX_FOCAL_CHANGE:
+    # parallax of near things looks like one or two percent
+    if abs(scale - 1) < 0.025:
         return pair, False
     _log.warning(
         "%s: %s does not fit these pictures: both lenses match at the seam with focal lengths "
