@@ -213,3 +213,9 @@ def moved_by_velocities(entry: dict, after_s: float) -> np.ndarray:
     turn, move = (np.array(entry[f"camera_{kind}_velocity"]) for kind in ("angular", "linear"))
     step = pose(Rotation.from_rotvec(turn * after_s).as_matrix(), move * after_s)
     return np.array(entry["transform_matrix"]) @ step
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Every file below a folder, by its relative path."""
+    files = (path for path in folder.rglob("*") if path.is_file())
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
