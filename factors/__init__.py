@@ -16,6 +16,7 @@ from factors.patch_windows import PatchPixels, PatchTable
 from factors.patches import PatchSet
 from factors.photometric import PhotometricBlock
 from factors.photometric_factor import PhotometricFactor, photometric_residuals
+from factors.reduced_factor import block_factor
 from factors.reprojection import (
     FaceCameras,
     ReprojectionFactor,
@@ -46,6 +47,7 @@ __all__ = [
     "SphereImage",
     "Term",
     "bearing_residuals",
+    "block_factor",
     "jacobian_errors",
     "photometric_residuals",
     "reprojection_residuals",

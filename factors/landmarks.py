@@ -1,4 +1,4 @@
-"""Batched observations of shared landmarks, eliminated inside: the block and its two interfaces."""
+"""Batched observations of shared landmarks, eliminated inside."""
 
 import os
 from collections.abc import Sequence
@@ -25,7 +25,6 @@ from factors._observations import (
 )
 from factors._terms import pose_rows
 from factors.block import Block, PoseSystem, Products
-from factors.reduced_factor import reduced_factor
 from factors.robust import RobustLoss
 from factors.schur_complement import SchurComplement, project_visits
 from factors.threads import balanced_ranges, map_in_threads, run_in_threads
@@ -198,61 +197,6 @@ class LandmarkBlock(Block):
     def error(self, values: gtsam.Values) -> float:
         """Robust cost at the current landmarks."""
         return sum(self.costs(values).values())
-
-    def factors(self) -> list[gtsam.CustomFactor]:
-        """The cost as ordinary GTSAM factors on poses, one per first frame of landmarks.
-
-        The landmarks of a group are eliminated inside the callback, each optimised for the given
-        poses. If derivatives are requested too, these landmarks become the block's current ones.
-        """
-        offsets, frames = self._obs.offsets, self._obs.frames
-        seen = np.flatnonzero(np.diff(offsets))  # landmarks without observations are left out
-        hosts = frames[offsets[seen]]  # observations are sorted by frame: the first one
-        bounds = np.flatnonzero(np.diff(hosts, prepend=-1))
-        return [
-            self._host_factor(int(rows[0]), int(rows[-1]) + 1)
-            for rows in np.split(seen, bounds[1:])
-            if len(rows)
-        ]
-
-    def _host_factor(self, first: int, last: int) -> gtsam.CustomFactor:
-        """One factor for the landmarks first..last."""
-        obs = self._obs
-        rows = slice(int(obs.offsets[first]), int(obs.offsets[last]))
-        global_frames, local_frames = np.unique(obs.frames[rows], return_inverse=True)
-        local = obs._replace(
-            offsets=obs.offsets[first : last + 1] - obs.offsets[first],
-            frames=local_frames.astype(np.int32),
-            kinds=obs.kinds[rows],
-            families=obs.families[rows],
-            measurements=obs.measurements[rows],
-            whiteners=obs.whiteners[rows],
-            origins=obs.origins[rows],
-        )
-        keys = [self.keys[f] for f in global_frames]
-        num = len(keys)
-        pairs = np.stack(np.triu_indices(num, 1), axis=1)
-        row_starts = np.concatenate([[0], np.cumsum(np.arange(num - 1, -1, -1))]).astype(np.int64)
-        columns = pairs[:, 1].astype(np.int64)
-        visits = visits_of(local.offsets, local.frames, num, _MAX_VISITS_AT_ONCE)
-
-        def evaluate(values: gtsam.Values, with_system: bool) -> tuple[float, PoseSystem | None]:
-            poses = pose_rows(values, keys)
-            start, no_steps = self._points[first:last], np.zeros((num, 6))
-            points, costs = np.empty_like(start), np.empty(last - first)
-            polish_range(
-                0, last - first, local, start, poses, poses, no_steps, False, 50,
-                _POLISH_TOLERANCE, costs, points, costs,
-            )  # fmt: skip
-            if not with_system:
-                return float(costs.sum()), None
-            self._points[first:last] = points
-            system, _, _ = eliminate_points(
-                local, visits, points, poses, row_starts, columns, len(self.families), 1
-            )
-            return float(costs.sum()), PoseSystem(*system, {})
-
-        return reduced_factor(keys, pairs, evaluate)
 
     def _residuals(self, values: gtsam.Values) -> tuple[np.ndarray, np.ndarray]:
         """Whitened residuals (O, 2) and validity (O,), in the order of the sorted observations."""

@@ -1,10 +1,7 @@
-"""Photometric family: patches of one frame observed in others, planes eliminated, two
-interfaces."""
+"""Photometric family: patches of one frame observed in others, planes eliminated."""
 
 import os
 from collections.abc import Sequence
-from copy import copy
-from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -14,7 +11,6 @@ from factors._photometric_schur import eliminate_range
 from factors._terms import matrix_rows, moved_rows, pose_rows
 from factors.block import Block, PoseSystem
 from factors.patch_windows import PatchPixels, covisible_frames, patch_axes, poor_views
-from factors.reduced_factor import reduced_factor
 from factors.robust import RobustLoss
 from factors.threads import balanced_ranges, run_in_threads
 
@@ -26,10 +22,10 @@ _MIN_CONTRAST = 1.0  # least standard deviation of a template's grey values
 class PhotometricBlock(Block):
     """Patches of any number of frames, each with an inverse-depth plane of its own.
 
-    Implements `factors.block.Block`; `factors()` gives ordinary GTSAM factors instead. `refresh`
-    selects observations at accepted values: those that see a patch's back or at a grazing angle,
-    far larger or smaller, or beyond their window are left out and counted. A plane
-    never leaves the front of its host: no step takes more than 80% of an inverse depth.
+    Implements `factors.block.Block`. `refresh` selects observations at accepted values: those that
+    see a patch's back or at a grazing angle, far larger or smaller, or beyond their window are left
+    out and counted. A plane never leaves the front of its host: no step takes more than 80% of an
+    inverse depth.
 
     Attributes:
         keys: (F,) keys of the Pose3 variables `world_T_rig`.
@@ -88,9 +84,19 @@ class PhotometricBlock(Block):
             pixels.pixels(), pixels.starts, pixels.windows, table.grid, pixels.width, floor,
             self.loss.code, float(self.loss.scale),
         )  # fmt: skip
-        self._set_views()
+        views, sizes = table.views, (len(table), len(table.targets))
+        if views is None:
+            nothing = matrix_rows(np.eye(4)[None])
+            self._views = tuple(np.repeat(nothing, size, axis=0) for size in sizes)
+        else:
+            self._views = matrix_rows(views.rig_T_hosts), matrix_rows(views.rig_T_targets)
         self._prior_weights = 1.0 / table.plane_sigmas**2
-        self._set_pairs()
+        self._row_starts, self._columns = covisible_frames(table, len(self.keys))
+        rows = np.repeat(np.arange(len(self.keys)), np.diff(self._row_starts))
+        self.pairs = np.column_stack([rows, self._columns]).astype(np.int64)
+        self._costs = np.full(len(table), np.inf)
+        self._trial: tuple[np.ndarray, np.ndarray] | None = None
+        self._schur: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
     def weigh(self, frame_weights: np.ndarray) -> None:
         """Multiply the weights of observations by those (F,) of their host and target."""
@@ -195,65 +201,6 @@ class PhotometricBlock(Block):
         """(O,) bool, observations selected by the last `refresh`."""
         return self.weights > 0
 
-    def subset(self, rows: np.ndarray) -> "PhotometricBlock":
-        """A block of some patches (rows, ascending, all observed) on their frames: it copies the
-        current planes and selection of observations, and shares the pixels."""
-        chosen = np.zeros(len(self.table), bool)
-        chosen[rows] = True
-        observations = chosen[self.table.owners]
-        table, _ = self.table.select(observations)
-        frames = np.unique(np.concatenate([table.hosts, table.targets]))
-        part, data = copy(self), self._data
-        part.table = replace(
-            table,
-            hosts=np.searchsorted(frames, table.hosts),
-            targets=np.searchsorted(frames, table.targets),
-        )
-        part.keys = [self.keys[f] for f in frames]
-        part.planes, part._prior_weights = self.planes[rows], self._prior_weights[rows]
-        part._flat = self._flat[rows]
-        part._weights, part.num_threads = self._weights[observations], 1
-        part._data = data._replace(
-            hosts=part.table.hosts.astype(np.int32),
-            axes=data.axes[rows],
-            templates=data.templates[rows],
-            scales=data.scales[rows],
-            offsets=part.table.offsets,
-            targets=part.table.targets.astype(np.int32),
-            weights=data.weights[observations],
-            starts=data.starts[observations],
-            windows=data.windows[observations],
-        )
-        part._set_views()
-        part._set_pairs()
-        return part
-
-    def factors(self) -> list[gtsam.CustomFactor]:
-        """The cost as ordinary GTSAM factors on poses, one per host frame.
-
-        The planes of a host's patches are eliminated inside the callback, each optimised for the
-        given poses, starting at the block's planes. The selection of observations is that of the
-        last `refresh`.
-        """
-        hosts = self.table.hosts
-        observed = np.diff(self.table.offsets) > 0  # patches without observations are left out
-        groups = [np.flatnonzero(observed & (hosts == host)) for host in np.unique(hosts)]
-        return [self._host_factor(rows) for rows in groups if len(rows)]
-
-    def _host_factor(self, rows: np.ndarray) -> gtsam.CustomFactor:
-        """One factor for some patches."""
-        part, starts = self.subset(rows), self.planes[rows].copy()
-
-        def evaluate(values: gtsam.Values, with_system: bool) -> tuple[float, PoseSystem | None]:
-            part.planes = starts
-            cost = part.polish(values)
-            if not with_system:
-                return cost, None
-            self.planes[rows] = part.planes
-            return cost, part.linearize(values)
-
-        return reduced_factor(part.keys, part.pairs, evaluate)
-
     def _observe(self, poses: np.ndarray, planes: np.ndarray, dims: int):
         """Models (hessians, gradients) of the observations, and their mean squares (O,)."""
         num_o = len(self.table.targets)
@@ -334,23 +281,3 @@ class PhotometricBlock(Block):
         if self.table.views is None:
             return seen_from
         return moved_rows(seen_from[0], self._views[0]), moved_rows(seen_from[1], self._views[1])
-
-    def _set_views(self) -> None:
-        """Pose rows of `table.views`, or identities."""
-        views, table = self.table.views, self.table
-        if views is None:
-            nothing = matrix_rows(np.eye(4)[None])
-            self._views = tuple(
-                np.repeat(nothing, n, axis=0) for n in (len(table), len(table.targets))
-            )
-        else:
-            self._views = matrix_rows(views.rig_T_hosts), matrix_rows(views.rig_T_targets)
-
-    def _set_pairs(self) -> None:
-        """Frame pairs that share a patch, without a linearization."""
-        self._row_starts, self._columns = covisible_frames(self.table, len(self.keys))
-        rows = np.repeat(np.arange(len(self.keys)), np.diff(self._row_starts))
-        self.pairs = np.column_stack([rows, self._columns]).astype(np.int64)
-        self._costs = np.full(len(self.table), np.inf)
-        self._trial: tuple[np.ndarray, np.ndarray] | None = None
-        self._schur: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None

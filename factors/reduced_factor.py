@@ -1,33 +1,31 @@
-"""A block's reduced system as one ordinary GTSAM factor on its poses."""
+"""A block as one ordinary GTSAM factor on its poses."""
 
-from collections.abc import Callable, Sequence
+from copy import copy
 
 import gtsam
 import numpy as np
 
-from factors.block import PoseSystem
+from factors.block import Block
 from factors.compiled import kernel_and_part
 
 _kernel, _ = kernel_and_part()
 
-Evaluate = Callable[[gtsam.Values, bool], tuple[float, PoseSystem | None]]
 
-
-def reduced_factor(
-    keys: Sequence[int], pairs: np.ndarray, evaluate: Evaluate
-) -> gtsam.CustomFactor:
-    """A factor on Pose3 variables, keys (F,), whose error is a robust cost, and whose linearization
-    is that cost's model, with off-diagonal blocks of rows f < g of keys, pairs (P, 2); evaluate:
-    cost at values, with inner variables optimised for them; and, if requested, the model there."""
-    num, columns = len(keys), np.asarray(pairs).reshape(-1, 2)
+def block_factor(block: Block) -> gtsam.CustomFactor:
+    """A factor on a block's Pose3 variables, for any GTSAM optimizer: its error is the robust cost,
+    inner variables optimised for the poses, and its linearization that cost's model, dense over all
+    poses. If derivatives are requested, these inner variables become the block's current ones."""
+    num, pairs = len(block.keys), np.asarray(block.pairs).reshape(-1, 2)
 
     def error(_factor, values: gtsam.Values, jacobians) -> np.ndarray:
-        cost, system = evaluate(values, jacobians is not None)
+        tried = copy(block) if jacobians is None else block
+        polish = getattr(tried, "polish", None)  # of a block with inner variables
+        cost = polish(values) if polish else sum(tried.costs(values).values())
         out = np.zeros(6 * num + 1)
-        if system is not None:
-            H = np.zeros((num, 6, num, 6))
+        if jacobians is not None:
+            system, H = block.linearize(values), np.zeros((num, 6, num, 6))
             H[np.arange(num), :, np.arange(num), :] = system.diagonal
-            H[columns[:, 0], :, columns[:, 1], :] = system.off_diagonal
+            H[pairs[:, 0], :, pairs[:, 1], :] = system.off_diagonal
             root = H.reshape(6 * num, 6 * num)
             out[:-1] = _square_root(root, system.gradient.ravel())
             padded = np.vstack([root, np.zeros((1, 6 * num))])
@@ -36,7 +34,8 @@ def reduced_factor(
         out[-1] = np.sqrt(max(2 * cost - float(out @ out), 0.0))
         return out
 
-    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(6 * num + 1), list(keys), error)
+    noise = gtsam.noiseModel.Unit.Create(6 * num + 1)
+    return gtsam.CustomFactor(noise, list(block.keys), error)
 
 
 @_kernel

@@ -16,7 +16,6 @@ import numpy as np
 from factors._terms import pose_rows
 from factors.block import Block, PoseSystem
 from factors.compiled import kernel_and_part
-from factors.reduced_factor import reduced_factor
 from factors.reprojection import FaceCameras
 from factors.robust import RobustLoss
 
@@ -134,20 +133,6 @@ class SplatBlock(Block):
         """Whitened residuals (N,) of each frame's samples, 0 where a sample is not visible."""
         poses = pose_rows(values, self.keys)
         return [self._residuals(f, pose, False)[0] for f, pose in enumerate(poses)]
-
-    def factors(self) -> list[gtsam.CustomFactor]:
-        """The cost under the last renderings as ordinary GTSAM factors, one per frame."""
-        return [self._factor(f, key) for f, key in enumerate(self.keys)]
-
-    def _factor(self, f: int, key: int) -> gtsam.CustomFactor:
-        def evaluate(values: gtsam.Values, with_system: bool) -> tuple[float, PoseSystem | None]:
-            pose = pose_rows(values, [key])[0]
-            if not with_system:
-                return self._frame_cost(f, pose), None
-            H, gradient, cost = self._frame_system(f, pose)
-            return cost, PoseSystem(H[None], np.zeros((0, 6, 6)), gradient[None], {})
-
-        return reduced_factor([key], np.zeros((0, 2), np.int64), evaluate)
 
     def _frame_system(self, f: int, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
         """H (6, 6), gradient (6,) and cost of a frame at a pose row (12,)."""

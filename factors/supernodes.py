@@ -12,7 +12,6 @@ _kernel, _ = kernel_and_part()
 # A run may absorb the one before it if few zeros arise: up to a number of columns, a share of the
 # entries (columns here are blocks of 6).
 _RELAXED = ((2, 0.8), (6, 0.2), (np.inf, 0.05))
-_MAX_KEPT_PAIRS = 2048  # of a pattern whose supernodes are kept: 32 kB
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +33,7 @@ def find_supernodes(num: int, pairs: np.ndarray, num_kept: int = 0) -> Supernode
     Liu, "The role of elimination trees in sparse factorization", 1990; runs are relaxed as in
     Ashcraft and Grimes, 1989.
     """
-    if len(pairs) > _MAX_KEPT_PAIRS:
+    if len(pairs) > 2048:  # 32 kB
         return _supernodes_of(num, pairs, num_kept)
     return _kept_supernodes(num, pairs.tobytes(), num_kept)
 

@@ -1,10 +1,13 @@
 """A small scene with known poses, points and pictures, for the export tests."""
 
 import functools
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
+import pycolmap
+from observing import observing
 from pixels import pixel_centres
 from scipy.spatial.transform import Rotation
 from synthetic import unit
@@ -118,6 +121,23 @@ def shown_by(lenses: Lenses) -> np.ndarray:
     return shown / np.linalg.norm(shown, axis=-1, keepdims=True)
 
 
+def seen_by_lenses(lenses: Lenses, band_rad: float | None = None) -> Reconstruction:
+    """Every point that is not blended, or not in a band around the seam, as its lens sees it."""
+    plain, shown = reconstruction(), np.swapaxes(shown_by(lenses), 0, 1).reshape(-1, 3)
+    band = lenses if band_rad is None else replace(lenses, band_rad=band_rad)
+    clear = ~band.blended(shown, plain.observation_frames)
+    rays, origins = lenses.rays(shown, plain.observation_frames)
+    own = {"observation_bearings": rays[clear], "observation_origins": origins[clear]}
+    return observing(plain, clear, **own, lens_baseline=(0.4, 0.001))
+
+
+def reprojection_errors(model: pycolmap.Reconstruction) -> np.ndarray:
+    """Distances (O,) in pixels of a model's observations from its projected points."""
+    seen = [(image, point) for image in model.images.values() for point in image.points2D]
+    pairs = [(image.project_point(model.points3D[p.point3D_id].xyz), p.xy) for image, p in seen]
+    return np.array([np.linalg.norm(shown - xy) for shown, xy in pairs])
+
+
 def panoramas(
     folder: Path, suffix: str = ".png", masked: bool = False, lenses: Lenses | None = None
 ) -> FrameSet:
@@ -193,3 +213,9 @@ def moved_by_velocities(entry: dict, after_s: float) -> np.ndarray:
     turn, move = (np.array(entry[f"camera_{kind}_velocity"]) for kind in ("angular", "linear"))
     step = pose(Rotation.from_rotvec(turn * after_s).as_matrix(), move * after_s)
     return np.array(entry["transform_matrix"]) @ step
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Every file below a folder, by its relative path."""
+    files = (path for path in folder.rglob("*") if path.is_file())
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}

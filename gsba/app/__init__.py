@@ -5,7 +5,7 @@ Gives a server for browsers of this machine; jobs are processes that outlive it.
 """
 
 from gsba.app.forms import Field, Form
-from gsba.app.hub import App, Choices
+from gsba.app.hub import App
 from gsba.app.server import serve, state_folder
 
-__all__ = ["App", "Choices", "Field", "Form", "serve", "state_folder"]
+__all__ = ["App", "Field", "Form", "serve", "state_folder"]

@@ -3,9 +3,8 @@
 import secrets
 import threading
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from gsba.app.forms import Form
 from gsba.app.jobs import AppJob, Jobs
@@ -21,24 +20,13 @@ if TYPE_CHECKING:
     from gsba.view.display import SceneView
 
 
-@dataclass(frozen=True, slots=True)
-class Choices:
-    """Known values of some fields, from the definitions of settings."""
-
-    cameras: tuple[str, ...]  # names for --camera
-    presets: tuple[tuple[str, str], ...]  # name for --config, and what it is for
-    masks: tuple[str, ...]  # words for --masks
-    programs: tuple[str, ...]  # programs for --to
-    formats: tuple[str, ...]  # formats for --to
-    settings: tuple[tuple[str, str, str], ...]  # name for --set, default, allowed values
-
-
 class App:
     """The root, the commands, the jobs and the viewers behind a server.
 
     Args:
         root: folder below which files may be chosen; commands run in it.
         state: folder of jobs and of the token.
+        choices: known values of fields, by their kind.
         check: refuses arguments that the command line would refuse, with a GsbaError.
     """
 
@@ -47,7 +35,7 @@ class App:
         root: Path,
         state: Path,
         forms: Iterable[Form],
-        choices: Choices,
+        choices: dict[str, Any],
         check: Callable[[Sequence[str]], None],
     ) -> None:
         if not root.is_dir():

@@ -177,7 +177,7 @@ def _page(app: App, request: Request) -> Response:
 def _start(app: App, request: Request) -> Any:
     """All that a page needs once: the forms of commands and known values of fields."""
     forms = {name: asdict(form) for name, form in app.forms.items()}
-    return {"root": str(app.root), "forms": forms, "choices": asdict(app.choices)}
+    return {"root": str(app.root), "forms": forms, "choices": app.choices}
 
 
 def _browse(app: App, request: Request) -> Any:

@@ -34,10 +34,6 @@ K = partial(gtsam.symbol, "k")  # radial terms (4,) of a lens
 N = partial(gtsam.symbol, "n")  # inverse of the stitching radius (1,), 1 / map units
 W = partial(gtsam.symbol, "w")  # own motion (6,) of a frame, beside that of its velocity
 
-_MOVES_ALIKE = 3.0  # standard deviation of own translations in their spread, where lenses are
-# solved for: frames are often taken at about the pace of steps, and successive ones then move
-# alike; held as if each moved by chance, they bend the radial profile of the lenses instead
-
 
 @dataclass(frozen=True, slots=True)
 class OwnMotion:
@@ -103,7 +99,9 @@ class CameraUnknowns:
     @property
     def graph(self) -> gtsam.NonlinearFactorGraph:
         """Priors on the cameras' variables."""
-        return self.priors(_MOVES_ALIKE)
+        # Frames are often taken at about the pace of steps, and successive ones then move alike;
+        # held as if each moved by chance, they bend the radial profile of the lenses instead.
+        return self.priors(moves_alike=3.0)
 
     def priors(self, moves_alike: float = 1.0) -> gtsam.NonlinearFactorGraph:
         """As `graph`; own translations have this times their spread where lenses are solved for."""

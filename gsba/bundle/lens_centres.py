@@ -27,9 +27,6 @@ from gsba.types import Counts
 logger = logging.getLogger(__name__)
 
 _MIN_SIGMAS = 5.0  # least distance from one centre, in standard deviations
-_MIN_TRIAL_SIGMAS = 2.0  # the same before matches are found with the centres, which may raise the
-# distance threefold
-_MIN_RADIUS_SIGMAS = 4.0  # least inverse of the stitching radius, in standard deviations
 _UNMODELLED = 0.005  # standard deviation of what no covariance shows, of the lenses' distance and
 # the radius: measured on rendered walks (benchmarks/results/camera.md)
 
@@ -108,8 +105,9 @@ def estimate(rays: ObservedRays) -> LensCentres:
         # Matches that one centre has chosen hide the lenses from some parts of the sequence.
         if not (verdict.predicts if so_far else gains.sum() > 0):
             reason = "it does not predict parts of the sequence that it was not found from"
-        # centres on trial are judged after matches were found with them
-        elif strength < (_MIN_SIGMAS if so_far else _MIN_TRIAL_SIGMAS):
+        # centres on trial are judged after matches were found with them, which may raise the
+        # distance threefold
+        elif strength < (_MIN_SIGMAS if so_far else 2.0):
             reason = f"one centre is as likely: {strength:.1f} standard deviations"
     where, untaken = np.array2string(found, precision=5), reason and f"; not taken: {reason}"
     gained = (
@@ -174,7 +172,7 @@ def stitched_for(rays: ObservedRays) -> StitchRadius:
     reason = ""
     # one number gains less on unseen parts than many do
     predicted = predicts(verdict.gains, least=1.0)
-    if not predicted or inverse_stitch_radius < _MIN_RADIUS_SIGMAS * sigma:
+    if not predicted or inverse_stitch_radius < 4.0 * sigma:
         reason = "as well stitched at infinity"
     lenses = replace(so_far, inverse_stitch_radius=0.0 if reason else inverse_stitch_radius)
     return StitchRadius(lenses, centre, inverse_stitch_radius, sigma, shares, reason)

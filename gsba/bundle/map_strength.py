@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from factors import tangent_basis
+from factors import bearing_residuals
 from gsba.config import PriorSettings, RefineSettings
 from gsba.geometry import inverse, moved_to, pose, relative_steps, rotation_angle, step_covariances
 from gsba.types import Counts, JointErrors, Reconstruction, StepNoise
@@ -222,20 +222,14 @@ def _resected(result: Reconstruction, frame: int, rows: np.ndarray) -> np.ndarra
     """Pose (4, 4) of a frame by its observations `rows` (O,) of points, from that in the map."""
     points = result.points_world[result.observation_points[rows]]
     bearings, sigmas = result.observation_bearings[rows], result.observation_sigmas[rows]
-    origins = 0.0 if result.observation_origins is None else result.observation_origins[rows]
-    bases, world_T_rig = tangent_basis(bearings), result.world_T_rigs[frame]
+    origins, world_T_rig = result.observation_origins, result.world_T_rigs[frame]
+    origins = None if origins is None else origins[rows]
     for _ in range(_ITERATIONS):
-        at_rig = (points - world_T_rig[:3, 3]) @ world_T_rig[:3, :3]
-        depths = np.linalg.norm(at_rig - origins, axis=1)
-        rays = (at_rig - origins) / depths[:, None]
-        off = np.einsum("mij,mj->mi", bases, rays)
-        residuals = off / sigmas[:, None]
+        poses = np.broadcast_to(world_T_rig, (len(rows), 4, 4))
+        off, by_pose, _ = bearing_residuals(poses, points, bearings, origins)
+        residuals, by_pose = off / sigmas[:, None], by_pose / sigmas[:, None, None]
         weights = 1 / (1 + np.sum(residuals**2, axis=1))
-        across = bases - off[:, :, None] * rays[:, None, :]
-        by_ray = across / (depths * sigmas)[:, None, None]
-        (a, b, c), (x, y, z) = np.moveaxis(by_ray, 2, 0), at_rig.T[:, :, None]
-        turned = np.stack([b * z - c * y, c * x - a * z, a * y - b * x], axis=2)
-        jacobian = np.concatenate([turned, -by_ray], axis=2).reshape(-1, 6)
+        jacobian = by_pose.reshape(-1, 6)
         weighted = np.repeat(weights, 2)[:, None] * jacobian
         gradient = weighted.T @ residuals.ravel()
         step = np.linalg.lstsq(weighted.T @ jacobian, -gradient, rcond=None)[0]
@@ -278,7 +272,6 @@ def step_motion(
     return float(np.sqrt(np.einsum("fi,fij,fj->f", scaled, inverses, scaled).mean() / 6))
 
 
-_SIDE_STEPS = 6.0  # usual steps that a side is long, and its fewest frames are two
 _MIN_POINTS = 8  # that both sides see
 _SIGMAS = 2.0  # standard errors of the median that count as uncertainty
 
@@ -304,7 +297,7 @@ def _sides(positions: np.ndarray, recordings: np.ndarray) -> Iterator[tuple[int,
     if not len(walked):
         return
     along = np.concatenate([[0.0], np.cumsum(steps)])
-    reach = _SIDE_STEPS * float(np.median(walked)) * (1 + 1e-9)
+    reach = 6.0 * float(np.median(walked)) * (1 + 1e-9)  # a side is six usual steps long
     for step in range(len(steps)):
         own = np.flatnonzero(recordings == recordings[step])
         first = max(int(np.searchsorted(along, along[step] - reach)), int(own[0]))

@@ -10,10 +10,6 @@ from gsba.types import Reconstruction
 _TRACKS_PER_CLASS, _MAX_CLASSES = 100, 10  # classes of points by the noise of their observations
 _MIN_TRACK_LENGTH = 3  # of two observations, only those across the baseline that agree are kept
 _MIN_SHARE = 1e-3  # least part of a shift across the baseline that no move of the point explains
-# Errors of depths, in units of what shifts across the baseline predict: 1.7 to 1.9 in four maps of
-# two rendered scenes, on surfaces that are flat for two pixels around. Shifts along the baseline
-# are larger, and slant turns errors across the ray into errors of depth (1.25 of it).
-_ALONG_BASELINE = 1.8
 
 
 def point_covariances(result: Reconstruction) -> np.ndarray:
@@ -38,7 +34,10 @@ def depth_variances(result: Reconstruction, axes: np.ndarray) -> np.ndarray:
     """
     covariances, poses = point_covariances(result), result.world_T_rigs
     turns, moves, scales = _pose_errors(result)
-    ratios = np.square(_ALONG_BASELINE * _error_ratios(result, covariances))
+    # Errors of depths, in units of what shifts across the baseline predict: 1.7 to 1.9 in four maps
+    # of two rendered scenes, on surfaces that are flat for two pixels around. Shifts along the
+    # baseline are larger, and slant turns errors across the ray into errors of depth (1.25 of it).
+    ratios = np.square(1.8 * _error_ratios(result, covariances))
     variances, start = np.empty(len(axes)), 0
     for some in result.pieces():
         points, frames = some.observation_points, some.observation_frames

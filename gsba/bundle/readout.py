@@ -27,8 +27,6 @@ logger = logging.getLogger(__name__)
 
 _MIN_SIGMAS = 4.0  # least duration that is taken, in its standard deviations
 _ROTATION_SIGMA_RAD = np.deg2rad(0.12)  # rotation during a readout, standard deviation per axis
-_ROW_SCALE_SIGMA = 0.03  # relative; the distortion and field of view of lenses, which give the
-# number of rows between two directions, are not known from a stitched picture
 _AXES = np.eye(3)[:2]
 
 
@@ -109,7 +107,9 @@ def estimate(rays: ObservedRays) -> CameraEstimate:
 def total_sigma(found: CameraEstimate, sigma: float) -> float:
     """Standard deviation of the duration, seconds, by the covariance of the adjustment, in which
     rows are known exactly, and with that of the scale of rows."""
-    scale_sigma = 0.0 if found.lenses.reference_calibration is not None else _ROW_SCALE_SIGMA
+    # 3 %: the distortion and field of view of lenses, which give the number of rows between two
+    # directions, are not known from a stitched picture
+    scale_sigma = 0.0 if found.lenses.reference_calibration is not None else 0.03
     return float(np.hypot(sigma, scale_sigma * found.readout_s))
 
 

@@ -14,7 +14,6 @@ from gsba.types import CoarsePoses, Keypoints, PoseStatus, Reconstruction, Solut
 logger = logging.getLogger(__name__)
 
 _ITERATIONS = 30
-_OUTLIER_SIGMAS = 10.0  # of the noise, scale of the loss at the start
 _COLUMNS = 384  # columns of the inverse computed at a time
 
 
@@ -62,7 +61,7 @@ def solve(
     rotations, num = world_R_rigs.copy(), len(world_R_rigs)
     rows = keypoints.rows(found)
     bearings, sigmas = keypoints.bearings_rig[rows], keypoints.sigmas_rad[rows]
-    wide, noise, weights = _OUTLIER_SIGMAS, 1.0, np.ones(len(rows))
+    wide, noise, weights = 10.0, 1.0, np.ones(len(rows))  # the loss is wide at the start
     system = None
     for _ in range(_ITERATIONS):
         rays = np.einsum("oij,oj->oi", rotations[found.frames], bearings)

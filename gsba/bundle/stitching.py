@@ -30,8 +30,6 @@ _MIN_GAIN = 0.03  # share by which the field must lower the robust cost of held-
 
 logger = logging.getLogger(__name__)
 
-_PROBE = 20_000, 4  # observations and degree of a first look: half the gain must show there
-
 
 @dataclass(frozen=True, slots=True)
 class Stitching:
@@ -91,7 +89,7 @@ def estimate(
     worth. The field is taken where every part gains, and all together enough.
     """
     whole = MAX_OBSERVATIONS, _MAX_DEGREE, _MIN_GAIN
-    probe = *_PROBE, 0.5 * _MIN_GAIN
+    probe = 20_000, 4, 0.5 * _MIN_GAIN  # a first look, of a low degree
     now = Stitching(field, before, keypoints, 0, np.zeros(PARTS), Counts(0, 0, "observations"))
     systems, spread = [], 0.0
     for most, max_degree, least in [whole] if field else [probe, whole]:

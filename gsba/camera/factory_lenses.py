@@ -38,7 +38,6 @@ from gsba.types import Fisheye
 _GENERATIONS = {6: 1, 16: 2, 19: 3, 27: 6}  # numbers of one lens -> generation
 _COUNTS = {16: 6, 34: 16, 40: 19, 56: 27}  # numbers of a calibration -> numbers of one lens
 _REFERENCE_ANGLE_RAD = np.deg2rad(100.0)  # angle to which `radius` belongs
-_RELATIVE_FOCAL_SIGMA = {1: 0.05, 2: 0.01, 3: 0.005, 6: 0.005}  # relative
 _DIRECTION_SIGMA_RAD = {n: np.deg2rad(deg) for n, deg in ((1, 1.5), (2, 0.7), (3, 0.4), (6, 0.4))}
 _ROTATION_SIGMA_RAD = np.deg2rad(1.5)
 _HALF_TURN_ABOUT_Y = np.diag([-1.0, 1.0, -1.0])  # rotation by pi about y
@@ -84,7 +83,7 @@ class FactoryLenses:
 
         The first generation takes lenses for equidistant; those of an X4 are not, by 5 percent.
         """
-        return _RELATIVE_FOCAL_SIGMA[self.generation]
+        return {1: 0.05, 2: 0.01, 3: 0.005, 6: 0.005}[self.generation]
 
     @property
     def direction_sigma(self) -> float:

@@ -25,7 +25,6 @@ from gsba.version import __version__
 P = ParamSpec("P")
 
 _SOURCE = Path(__file__).parents[1]  # folder of gsba's own code
-_MAX_MESSAGE_LENGTH = 1000  # characters
 _MEMORY_SETTINGS = {  # first letters of a stage's name -> settings that lower its memory
     "features": "cubemap.max_face_size, features.max_per_face or solver.num_threads",
     "align": "patches.max_width or solver.num_threads",
@@ -97,7 +96,7 @@ class _Call:
 def _fail(message: str, code: int = 1) -> NoReturn:
     """Print one line of limited length that any terminal can show, and exit."""
     line = " ".join(message.splitlines()).encode("utf-8", "backslashreplace").decode()
-    message = brief(line, _MAX_MESSAGE_LENGTH)
+    message = brief(line, 1000)
     typer.echo(f"error: {message}", err=True)
     event("error", text=message)
     raise typer.Exit(code)

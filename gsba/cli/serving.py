@@ -13,7 +13,7 @@ from gsba.cli.app import command
 from gsba.log import GsbaError
 
 if TYPE_CHECKING:
-    from gsba.app import Choices, Field, Form
+    from gsba.app import Field, Form
 
 COMMANDS = ("refine", "add", "merge", "remove", "localize", "export", "plot")  # that pages can run
 _NOT_ON_A_PAGE = ("segment", "help")  # --segment runs any command of the machine
@@ -58,23 +58,22 @@ def check(arguments: Sequence[str]) -> None:
         raise GsbaError(" ".join(error.format_message().split())) from None
 
 
-def choices() -> "Choices":
+def choices() -> dict[str, Any]:
     """Known values of fields, from the definitions of settings and formats."""
-    from gsba.app import Choices
     from gsba.config import CAMERAS, RefineSettings
     from gsba.config_file import PRESETS, allowed_settings
     from gsba.export import ExportFormat
     from gsba.export.trainers import PROGRAMS
 
     presets = [(path.stem, _first_sentence(path)) for path in sorted(PRESETS.glob("*.toml"))]
-    return Choices(
-        tuple(CAMERAS),
-        tuple(presets),
-        ("auto", "carrier", "distractors", "none"),
-        tuple(PROGRAMS),
-        tuple(ExportFormat),
-        tuple(allowed_settings(RefineSettings())),
-    )
+    return {
+        "cameras": list(CAMERAS),
+        "presets": presets,  # name and purpose of each
+        "masks": ["auto", "carrier", "distractors", "none"],
+        "programs": list(PROGRAMS),
+        "formats": list(ExportFormat),
+        "settings": list(allowed_settings(RefineSettings())),  # name, default, allowed values
+    }
 
 
 def _command(name: str) -> Any:

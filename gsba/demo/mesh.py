@@ -8,7 +8,6 @@ import numpy as np
 from gsba.demo.light import bake
 from gsba.demo.raycast import Scene
 
-LIGHT_SPACING = 0.3  # units between light samples
 Vector = Sequence[float] | np.ndarray
 DOWN = np.array([0.0, 1.0, 0.0])
 
@@ -139,7 +138,8 @@ class MeshBuilder:
         normals = np.cross(edges[:, 1], edges[:, 0])
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         texels, levels = _pyramids(self._images)
-        grid = np.ceil(np.linalg.norm(edges, axis=2) / LIGHT_SPACING).astype(np.int64) + 1
+        # light is sampled every 0.3 units
+        grid = np.ceil(np.linalg.norm(edges, axis=2) / 0.3).astype(np.int64) + 1
         counts = grid[:, 0] * grid[:, 1]
         scene = Scene(
             corners=corners,

@@ -27,7 +27,6 @@ Heading = Literal["locked", "forward"]
 Camera = Literal["ideal", "two-lens"]
 
 FRAMES_PER_SECOND = 2.0
-WOBBLE_DEG = (1.5, 2.0, 1.5)  # pitch, yaw and roll of the hand, standard deviation
 NOISE = 2.0  # grey values, standard deviation
 JPEG_QUALITY = 95
 MOST_FRAMES, MOST_WIDTH = 100_000, 16_384
@@ -143,7 +142,8 @@ def held_by_hand(
     """
     times = np.arange(len(positions)) / fps
     wobble = [_wobble(rng, times) for _ in range(6)]
-    pitch, turn, roll = (np.radians(w) * x for w, x in zip(WOBBLE_DEG, wobble, strict=False))
+    # standard deviations of the hand's pitch, yaw and roll, degrees
+    pitch, turn, roll = (np.radians(w) * x for w, x in zip((1.5, 2.0, 1.5), wobble, strict=False))
     rotations = _rotations(1, yaw + turn) @ _rotations(0, pitch) @ _rotations(2, roll)
     swaying = positions + unit * 0.025 * np.stack(wobble[3:], axis=1)
     return Trajectory(times, pose(rotations, swaying))

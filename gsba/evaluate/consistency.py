@@ -63,50 +63,39 @@ class Consistency:
         return asdict(self)
 
 
-@dataclass(frozen=True, slots=True)
-class _NormalisedErrors:
-    """Covariances of errors, factored to normalise them."""
+def _claims(
+    covariances: np.ndarray, held: np.ndarray, errors: np.ndarray, drawn: np.ndarray
+) -> Claims:
+    """Statistics of errors (N, 6) normalised by covariances (N, 6, 6), without positions along
+    `held` (N, 3) unless 0, with intervals from sampled errors (D, N, 6)."""
+    num = len(errors)
+    axes = np.tile(np.eye(6), (num, 1, 1))  # orthogonal: rows are tangents in the rig frame
+    kept = np.ones((num, 6), bool)  # axes that are tested; the gauge fixes the others
+    for n in np.flatnonzero(held.any(axis=1)):
+        axes[n, 3:, 3:] = np.linalg.svd(held[n, None])[2]  # its first row is along `held`
+        kept[n, 3] = False
+    along = axes @ covariances @ np.swapaxes(axes, 1, 2)
+    along = np.where(kept[:, :, None] & kept[:, None, :], along, np.eye(6))
+    sigmas = np.sqrt(np.maximum(np.einsum("nii->ni", along), 1e-300))  # along the axes
+    values, vectors = np.linalg.eigh(along / (sigmas[:, :, None] * sigmas[:, None, :]))
+    roots = vectors / np.sqrt(np.maximum(values, _MIN_EIGENVALUE))[:, None, :]
+    whiteners, counts = roots @ np.swapaxes(vectors, 1, 2), kept.sum(axis=0)
 
-    rows: np.ndarray  # (N,) int, rows of these among all errors
-    axes: np.ndarray  # (N, 6, 6) orthogonal: rows are the axes, as tangents in the rig frame
-    kept: np.ndarray  # (N, 6) bool, axes that are tested; the gauge fixes the others
-    sigmas: np.ndarray  # (N, 6) standard deviations along the axes
-    whiteners: np.ndarray  # (N, 6, 6) whiten errors along the axes that are divided by sigmas
-
-    @classmethod
-    def of(cls, rows: np.ndarray, covariances: np.ndarray, held: np.ndarray) -> "_NormalisedErrors":
-        """Normaliser for covariances (N, 6, 6), without positions along `held` (N, 3) unless 0."""
-        axes, kept = np.tile(np.eye(6), (len(rows), 1, 1)), np.ones((len(rows), 6), bool)
-        for n in np.flatnonzero(held.any(axis=1)):
-            axes[n, 3:, 3:] = np.linalg.svd(held[n, None])[2]  # its first row is along `held`
-            kept[n, 3] = False
-        along = axes @ covariances @ np.swapaxes(axes, 1, 2)
-        both = kept[:, :, None] & kept[:, None, :]
-        along = np.where(both, along, np.eye(6))
-        sigmas = np.sqrt(np.maximum(np.einsum("nii->ni", along), 1e-300))
-        values, vectors = np.linalg.eigh(along / (sigmas[:, :, None] * sigmas[:, None, :]))
-        roots = vectors / np.sqrt(np.maximum(values, _MIN_EIGENVALUE))[:, None, :]
-        return cls(rows, axes, kept, sigmas, roots @ np.swapaxes(vectors, 1, 2))
-
-    def measures(self, errors: np.ndarray) -> np.ndarray:
-        """Statistics (..., 3) of errors (..., N, 6): rms rotation / sigma, rms position / sigma,
-        and NEES."""
-        scaled = np.einsum("nij,...nj->...ni", self.axes, errors) / self.sigmas * self.kept
-        squares, counts = np.sum(scaled**2, axis=-2), self.kept.sum(axis=0)
+    def measures(errors: np.ndarray) -> np.ndarray:
+        """Rms rotation / sigma, rms position / sigma, and NEES (..., 3) of errors (..., N, 6)."""
+        scaled = np.einsum("nij,...nj->...ni", axes, errors) / sigmas * kept
+        squares = np.sum(scaled**2, axis=-2)
         rms = [
             np.sqrt(squares[..., part].sum(axis=-1) / counts[part].sum())
             for part in (slice(3), slice(3, 6))
         ]
-        whitened = np.einsum("nij,...nj->...ni", self.whiteners, scaled)
-        return np.stack([*rms, np.sum(whitened**2, axis=(-2, -1)) / len(self.rows)], axis=-1)
+        whitened = np.einsum("nij,...nj->...ni", whiteners, scaled)
+        return np.stack([*rms, np.sum(whitened**2, axis=(-2, -1)) / num], axis=-1)
 
-    def claims(self, errors: np.ndarray, drawn: np.ndarray) -> Claims:
-        """Statistics of errors (N, 6), with intervals from sampled errors (D, N, 6)."""
-        tails = (1 - EXPECTED) / 2
-        found, spread = self.measures(errors), self.measures(drawn)
-        lows, highs = np.quantile(spread, [tails, 1 - tails], axis=0)
-        three = [Statistic(*map(float, one)) for one in zip(found, lows, highs, strict=True)]
-        return Claims(len(self.rows), *three)
+    tails = (1 - EXPECTED) / 2
+    lows, highs = np.quantile(measures(drawn), [tails, 1 - tails], axis=0)
+    three = zip(measures(errors), lows, highs, strict=True)
+    return Claims(num, *(Statistic(*map(float, one)) for one in three))
 
 
 def consistency_of(
@@ -163,12 +152,12 @@ def consistency_of(
     only = held[1:].copy()
     only[1:] = 0  # the gauge fixes a step only if the furthest frame is the second one
     drawn = joint.draws.astype(np.float64)
-    found = _NormalisedErrors.of(judged, covariances[judged], held[judged])
-    absolute, consecutive = found.claims(errors[judged], drawn[:, judged]), None
+    consecutive = None
+    absolute = _claims(covariances[judged], held[judged], errors[judged], drawn[:, judged])
     if len(chosen):
-        found = _NormalisedErrors.of(chosen, of_steps[chosen], only[chosen])
         drawn = drawn[:, 1:] + np.einsum("fij,dfj->dfi", before, drawn[:, :-1])
-        consecutive = found.claims(step_errors[chosen], drawn[:, chosen])
+        given = of_steps[chosen], only[chosen], step_errors[chosen], drawn[:, chosen]
+        consecutive = _claims(*given)
     return Consistency(0, far, absolute, consecutive)
 
 

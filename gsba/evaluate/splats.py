@@ -4,7 +4,7 @@ Gaussians start along its axes, and walls along these gain some 0.2 dB."""
 
 import json
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -22,8 +22,6 @@ from gsba.splat.gaussians import Gaussians, write_ply
 from gsba.splat.options import TrainingOptions
 from gsba.splat.pictures import render_views
 from gsba.splat.scene import (
-    Faces,
-    Split,
     load_faces,
     make_views,
     refined_frames,
@@ -52,26 +50,6 @@ class SourceResult:
     mean: Score  # over held-out frames
     curve: Mapping[int, Score]  # training steps -> mean over held-out frames
     num_gaussians: int
-
-
-@dataclass(frozen=True, slots=True)
-class PosedViews:
-    """Views of frames at the poses of one source, some of them held out of the training."""
-
-    poses: np.ndarray  # (F, 4, 4) float64, world_T_rig
-    split: Split  # training and held-out frames
-    training: Views
-    held_out: Views
-
-    @classmethod
-    def of(cls, poses: np.ndarray, split: Split, training: Faces, held_out: Faces) -> "PosedViews":
-        """Views of the faces of either part at poses (F, 4, 4)."""
-        return cls(
-            poses,
-            split,
-            make_views(training, poses[split.training]),
-            make_views(held_out, poses[split.held_out]),
-        )
 
 
 def poses_for(frames: FrameSet, trajectory: Trajectory) -> np.ndarray:
@@ -125,12 +103,20 @@ def compare(
     results, splats = {}, {}
     for name, poses in sources.items():
         logger.info("splat on %s poses, %d frames", name, len(split.training))
-        source = PosedViews.of(poses, split, training, held_out)
+        views = [
+            make_views(faces, poses[rows])
+            for faces, rows in ((training, split.training), (held_out, split.held_out))
+        ]
         files = fingerprint([p[0] for p in frames.paths])
         key = digest(files, poses.tolist(), settings, backend.name, *_key_of(optics))
-        splats[name], results[name] = train_and_measure(
-            reconstruction, frames, source, settings, backend, out / name, key, lpips
+        start = start_cloud(reconstruction, poses, split.training, settings.sh_degree)
+        near = near_of(poses[split.training])
+        splats[name], scores, curve = _train_and_measure(
+            start, views, settings, near, backend, out / name, key, lpips
         )
+        by_frame = {frames.names[split.held_out[i]]: score for i, score in scores.items()}
+        mean = mean_score(scores.values())
+        results[name] = SourceResult(by_frame, mean, curve, len(splats[name]))
     _write(out, results, settings, lpips is not None)
     # Write an image of each held-out frame: a row of captured faces, then a row per source
     folder = out / "pictures"
@@ -174,45 +160,33 @@ def _write(
     _write_curves(out, results)
 
 
-def train_and_measure(
-    reconstruction: Reconstruction,
-    frames: FrameSet,
-    source: PosedViews,
+def _train_and_measure(
+    start: Gaussians,
+    views: Sequence[Views],
     settings: TrainingOptions,
+    near: float,
     backend: Backend,
     out: Path,
     key: str,
-    lpips: Distance | None = None,
-) -> tuple[Gaussians, SourceResult]:
-    """Train a splat on one source of poses, and measure it during and after the training.
-
-    Args:
-        reconstruction, frames: see `compare`.
-        source: views of the frames at poses of one source.
-        settings, backend: settings and renderer of the training.
-        out: folder to write, see `compare`.
-        key: hash of everything the training depends on; checkpoints of another key are ignored.
-        lpips: see `compare`.
-    """
-    poses, split = source.poses, source.split
-    near = near_of(poses[split.training])
+    lpips: Distance | None,
+) -> tuple[Gaussians, dict[int, Score], dict[int, Score]]:
+    """A splat trained on the first of two views, its scores by panorama of the second ones, and
+    means of those by steps of the training; checkpoints with another `key`, a hash of everything
+    that the training depends on, are ignored."""
+    training, held_out = views
     curve = _read_curve(out / "curve.json", key)
     every = max(settings.iterations // 10, 1)  # measurements during a training
 
     def watch(step: int, gaussians: Gaussians) -> None:
         if step // every > max(curve, default=0) // every:
-            curve[step] = mean_score(
-                measure(gaussians, source.held_out, settings, near, backend).values()
-            )
+            scores = measure(gaussians, held_out, settings, near, backend)
+            curve[step] = mean_score(scores.values())
             content = {"key": key, "curve": {s: asdict(score) for s, score in curve.items()}}
             write_text(out / "curve.json", json.dumps(content))
 
-    start = start_cloud(reconstruction, poses, split.training, settings.sh_degree)
-    splat = train(start, source.training, settings, backend, out / "checkpoint.npz", key, watch)
+    splat = train(start, training, settings, backend, out / "checkpoint.npz", key, watch)
     write_ply(out / "point_cloud.ply", splat)
-    scores = measure(splat, source.held_out, settings, near, backend, lpips)
-    by_frame = {frames.names[split.held_out[i]]: score for i, score in scores.items()}
-    return splat, SourceResult(by_frame, mean_score(scores.values()), curve, len(splat))
+    return splat, measure(splat, held_out, settings, near, backend, lpips), curve
 
 
 def _read_curve(path: Path, key: str) -> dict[int, Score]:

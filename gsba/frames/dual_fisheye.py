@@ -1,7 +1,5 @@
 """Panoramas of raw fisheyes: the lens that faces a direction shows it; nothing is blended."""
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 
@@ -43,8 +41,7 @@ def join_pictures(pictures: list[np.ndarray], rig: Rig, width: int, share: float
         share: its width over that of a panorama as dense as the pictures.
     """
     joined = np.empty((width // 2, width, *pictures[0].shape[2:]), np.uint8)
-    for picture, part in zip(pictures, _parts(rig, width), strict=True):
-        places = part.places
+    for picture, (columns, places, own) in zip(pictures, _parts(rig, width), strict=True):
         if share < 1:
             size = picture.shape[1::-1]
             shrunk = [max(round(share * pixels), 1) for pixels in size]
@@ -53,45 +50,29 @@ def join_pictures(pictures: list[np.ndarray], rig: Rig, width: int, share: float
             places = ((places + 0.5) * scale - 0.5).astype(np.float32)
         nothing, how = np.zeros(0, np.float32), cv2.INTER_LANCZOS4
         shown = cv2.remap(picture, places, nothing, how, borderMode=cv2.BORDER_REPLICATE)
-        if part.own is None:
-            joined[:, part.columns] = shown
-        else:
-            joined[:, part.columns] = np.where(
-                part.own.reshape(*part.own.shape, *[1] * (shown.ndim - 2)),
-                shown,
-                joined[:, part.columns],
-            )
+        if own is not None:
+            own = own.reshape(*own.shape, *[1] * (shown.ndim - 2))
+            shown = np.where(own, shown, joined[:, columns])
+        joined[:, columns] = shown
     return joined
 
 
-@dataclass(frozen=True, slots=True)
-class _Part:
-    """Part of a panorama that one lens shows."""
-
-    columns: np.ndarray  # (C,) int of the panorama
-    places: np.ndarray  # (H, C, 2) float32, OpenCV pixels in the lens's picture
-    own: np.ndarray | None  # (H, C) bool, True where this lens faces the direction; None = all
-
-
+@table(maxsize=2)
 def clear_of_seam(height: int, rig: Rig) -> np.ndarray:
     """Mask (height, 2 height) bool, True where windows of raw fisheyes' panorama show one lens
-    only."""
-    axes = optical_axes(rig)
-    return _clear_of_seam(height, tuple(map(tuple, axes.tolist())))
-
-
-@table(maxsize=2)
-def _clear_of_seam(height: int, axes: tuple[tuple[float, ...], ...]) -> np.ndarray:
-    clear, of_lenses = np.empty((height, 2 * height), bool), np.array(axes)
+    only; read-only."""
+    clear, axes = np.empty((height, 2 * height), bool), optical_axes(rig)
     for rows, bearings in erp_bands(np.arange(2 * height), 2 * height):
-        clear[rows] = seam_sines(bearings, of_lenses) > np.sin(SEAM)
+        clear[rows] = seam_sines(bearings, axes) > np.sin(SEAM)
     clear.setflags(write=False)
     return clear
 
 
 @table(maxsize=2)
-def _parts(rig: Rig, width: int) -> tuple[_Part, ...]:
-    """The part of a panorama that each lens shows."""
+def _parts(rig: Rig, width: int) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray | None], ...]:
+    """The part of a panorama that each lens shows: columns (C,) of the panorama; their places
+    (H, C, 2) float32, OpenCV pixels in the lens's picture; and (H, C) bool, True where this lens
+    faces the direction, None = everywhere."""
     height, axes, faced = width // 2, optical_axes(rig), np.empty((width // 2, width), np.uint8)
     # a column that lies exactly on a seam goes whole to the lens on its right
     aside = np.arange(width) + 1e-6
@@ -105,5 +86,5 @@ def _parts(rig: Rig, width: int) -> tuple[_Part, ...]:
         for rows, bearings in erp_bands(columns, width):
             places[rows] = project(lens, bearings) - 0.5
         own = own[:, columns]
-        parts.append(_Part(columns, places, None if own.all() else own))
+        parts.append((columns, places, None if own.all() else own))
     return tuple(parts)

@@ -129,35 +129,29 @@ def _png(data: Bytes) -> Header:
         raise _Truncated
     width, height = (int.from_bytes(data[at : at + 4], "big") for at in (16, 20))
     plain = data[24] == 8 and data[25] in (2, 6)  # RGB, RGB with alpha
-    turn = _orientation(_png_exif(data))
-    return _shown("PNG", width, height, turn, plain, _png_xmp(data))
+    xmp, exif = _png_tags(data)
+    return _shown("PNG", width, height, _orientation(exif), plain, xmp)
 
 
-def _png_xmp(data: Bytes) -> bytes:
-    """The text chunk of XMP before the pixels."""
-    position = 8
+def _png_tags(data: Bytes) -> tuple[bytes, bytes]:
+    """The text chunk of XMP before the pixels, and the eXIf chunk there or behind them, near the
+    end."""
+    position, xmp, exif = 8, b"", b""
     while (kind := data[position + 4 : position + 8]) not in (b"IDAT", b"IEND", b""):
         length = int.from_bytes(data[position : position + 4], "big")
         start = position + 8
         if kind == b"iTXt" and data[start : start + len(_PNG_XMP)] == _PNG_XMP:
-            return data[start : start + length]
+            xmp = xmp or data[start : start + length]
+        elif kind == b"eXIf":
+            exif = exif or data[start : start + length]
         position += 12 + length
-    return b""
-
-
-def _png_exif(data: Bytes) -> bytes:
-    """The eXIf chunk: before the pixels, or behind them near the end."""
-    position = 8
-    while (kind := data[position + 4 : position + 8]) not in (b"IDAT", b"IEND", b""):
-        length = int.from_bytes(data[position : position + 4], "big")
-        if kind == b"eXIf":
-            return data[position + 8 : position + 8 + length]
-        position += 12 + length
+    if exif:
+        return xmp, exif
     at = data.rfind(b"eXIf", max(len(data) - (1 << 16), position))
     length = int.from_bytes(data[at - 4 : at], "big") if at > 0 else 0
     found = data[at : at + 4 + length]
     checksum = int.from_bytes(data[at + 4 + length : at + 8 + length], "big")
-    return found[4:] if length and zlib.crc32(found) == checksum else b""
+    return xmp, found[4:] if length and zlib.crc32(found) == checksum else b""
 
 
 def _jpeg(data: Bytes) -> Header:

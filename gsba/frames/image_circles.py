@@ -9,13 +9,12 @@ import cv2
 import numpy as np
 
 _DARK_OFFSET = 8.0  # grey values added before the logarithm: noise of black pixels is no edge
-_NUM_RAYS = 360  # around the middle of a picture
+_ANGLES = 2 * np.pi * (np.arange(360) + 0.5) / 360  # of rays around the middle of a picture
 _SAMPLE_STEP_PX = 0.5  # pixels along a ray
 _WINDOW_SAMPLES = 6  # samples on either side of an edge, whose means are compared
 _MIN_EDGE_GAP = 8  # samples between two edges of a ray
 _NUM_TRIALS = 3000  # circles tried, each through three edges
 _TRIALS_AT_ONCE = 250
-_MAX_RELATIVE_DISTANCE = 0.006  # largest distance of an edge from a circle, relative to the radius
 _MAX_REFINED_DISTANCE = 0.01  # largest distance of an edge while the circle is refined, relative
 _MIN_RADIUS, _MAX_RADIUS = 0.3, 0.72  # in units of the shorter and of the longer side
 _MAX_OFF_CENTRE = 0.15  # distance of the centre from the middle, in units of each side
@@ -24,9 +23,6 @@ _MIN_SUPPORT = 0.5  # share of the visible rim on which an edge must lie
 _MIN_AGREEING_RAYS = 54  # rays that must have an edge on the circle
 _INNER_RADII = 0.75, 0.97  # range of radii of a circle within a housing's, relative to the outer
 # one
-_MAX_CENTRE_DISTANCE = 0.03  # largest distance of their centres, relative to the radius
-_MIN_INNER_SCORE = 0.4  # least score of a circle within a housing's, relative to the outer one's
-_MAX_HOUSING_CONTRAST = 0.6  # largest contrast of a housing, relative to that of the scene within
 _TEXTURE_BLUR_PX, _TEXTURE_PARTS = 1.5, 12  # pixels; parts of a circle over which the mean is
 # removed
 _CORRELATED_RAYS = 8  # neighbouring rays with correlated errors
@@ -113,21 +109,19 @@ class _Edges:
 def _edges(smooth: np.ndarray) -> _Edges:
     """The strongest relative drops of brightness along each ray of a picture (h, w)."""
     height, width = smooth.shape
-    angles = _ray_angles()
     reach = np.arange(
         0.5 * _MIN_RADIUS * min(height, width), np.hypot(height, width) / 2, _SAMPLE_STEP_PX
     )
-    across = width / 2 + reach * np.cos(angles)[:, None]
-    down = height / 2 + reach * np.sin(angles)[:, None]
-    inside = (across > _BORDER_PX) & (across < width - _BORDER_PX)
-    inside &= (down > _BORDER_PX) & (down < height - _BORDER_PX)
+    across = width / 2 + reach * np.cos(_ANGLES)[:, None]
+    down = height / 2 + reach * np.sin(_ANGLES)[:, None]
+    inside = _inside(across, down, smooth.shape, _BORDER_PX)
     values = _sampled(smooth, across, down)
     logs = np.log(values + _DARK_OFFSET)
     sums = np.cumsum(np.pad(logs, ((0, 0), (1, 0))), axis=1)
     means = (sums[:, _WINDOW_SAMPLES:] - sums[:, :-_WINDOW_SAMPLES]) / _WINDOW_SAMPLES
     drops = means[:, :-_WINDOW_SAMPLES] - means[:, _WINDOW_SAMPLES:]
     drops[~inside[:, 2 * _WINDOW_SAMPLES - 1 :]] = 0.0
-    every, found = np.arange(_NUM_RAYS), []
+    every, found = np.arange(len(_ANGLES)), []
     for _ in range(3):  # edges of a ray
         at = np.argmax(drops, axis=1)
         depth = drops[every, at]
@@ -147,7 +141,7 @@ def _edges(smooth: np.ndarray) -> _Edges:
             drops[ray, max(at[ray] - _MIN_EDGE_GAP, 0) : at[ray] + _MIN_EDGE_GAP + 1] = 0.0
     radii, depths, rays = np.array(found).reshape(-1, 3).T
     rays = rays.astype(np.int64)
-    away = np.stack([np.cos(angles[rays]), np.sin(angles[rays])], axis=1)
+    away = np.stack([np.cos(_ANGLES[rays]), np.sin(_ANGLES[rays])], axis=1)
     places = np.array([width / 2, height / 2]) + radii[:, None] * away
     return _Edges(places, np.minimum(depths, 1.0), rays)  # deeper drops gain no more weight
 
@@ -168,13 +162,14 @@ def _best_circle(edges: _Edges, pictures: Sequence[np.ndarray]) -> tuple[ImageCi
     outer = circles[best]
     parts = circles[:, 2] / outer[2]
     apart = np.hypot(*(circles[:, :2] - outer[:2]).T) / outer[2]
-    within = (parts > _INNER_RADII[0]) & (parts < _INNER_RADII[1]) & (apart < _MAX_CENTRE_DISTANCE)
-    within &= scores > _MIN_INNER_SCORE * scores[best]
+    within = (parts > _INNER_RADII[0]) & (parts < _INNER_RADII[1]) & (apart < 0.03)
+    within &= scores > 0.4 * scores[best]
     if within.any():
         inner = circles[int(np.argmax(np.where(within, scores, -1.0)))]
         between = outer - 0.5 * (outer - inner)
         scene = inner * np.array([1.0, 1.0, 0.93])
-        if _contrast(pictures, between) < _MAX_HOUSING_CONTRAST * _contrast(pictures, scene):
+        # a housing has little contrast beside the scene within it
+        if _contrast(pictures, between) < 0.6 * _contrast(pictures, scene):
             outer = inner
     return _refined(edges, outer, width, height)
 
@@ -201,9 +196,9 @@ def _trials(places: np.ndarray, width: int, height: int) -> np.ndarray:
 
 
 def _edges_on_circles(places: np.ndarray, circles: np.ndarray) -> np.ndarray:
-    """True (C, E) where edges (E, 2) lie on circles (C, 3)."""
+    """True (C, E) where edges (E, 2) lie on circles (C, 3), within 0.6 % of the radius."""
     away = np.hypot(places[:, 0] - circles[:, :1], places[:, 1] - circles[:, 1:2])
-    return np.abs(away - circles[:, 2:]) < _MAX_RELATIVE_DISTANCE * circles[:, 2:]
+    return np.abs(away - circles[:, 2:]) < 0.006 * circles[:, 2:]
 
 
 def _refined(edges: _Edges, circle: np.ndarray, width: int, height: int) -> tuple[ImageCircle, int]:
@@ -221,10 +216,9 @@ def _refined(edges: _Edges, circle: np.ndarray, width: int, height: int) -> tupl
         radius = float(np.sqrt(max(rest + x * x + y * y, 1e-9)))
     away = np.hypot(edges.places[:, 0] - x, edges.places[:, 1] - y) - radius
     near = np.abs(away) < _MAX_REFINED_DISTANCE * radius
-    num, angles = len(np.unique(edges.rays[near])), _ray_angles()
-    across, down = x + radius * np.cos(angles), y + radius * np.sin(angles)
-    visible = (across > 2 * _BORDER_PX) & (across < width - 2 * _BORDER_PX)
-    visible &= (down > 2 * _BORDER_PX) & (down < height - 2 * _BORDER_PX)
+    num = len(np.unique(edges.rays[near]))
+    across, down = x + radius * np.cos(_ANGLES), y + radius * np.sin(_ANGLES)
+    visible = _inside(across, down, (height, width), 2 * _BORDER_PX)
     support = min(num / max(int(np.count_nonzero(visible)), 1), 1.0)
     sigma = _sigma(edges.places[near] - np.array([x, y]), away[near])
     return ImageCircle(float(x), float(y), radius, support, sigma), num
@@ -246,9 +240,7 @@ def _contrast(pictures: Sequence[np.ndarray], circle: np.ndarray) -> float:
     x, y, radius = circle
     angles = np.arange(0, 2 * np.pi, 1.0 / radius)
     across, down = x + radius * np.cos(angles), y + radius * np.sin(angles)
-    height, width = pictures[0].shape
-    inside = (across > _BORDER_PX) & (across < width - _BORDER_PX)
-    inside &= (down > _BORDER_PX) & (down < height - _BORDER_PX)
+    inside = _inside(across, down, pictures[0].shape, _BORDER_PX)
     if not inside.any():
         return 0.0
     smooth = [cv2.GaussianBlur(picture, (0, 0), _TEXTURE_BLUR_PX) for picture in pictures]
@@ -265,5 +257,10 @@ def _sampled(picture: np.ndarray, across: np.ndarray, down: np.ndarray) -> np.nd
     return cv2.remap(picture, *places, cv2.INTER_LINEAR, borderMode=nearest).astype(np.float64)
 
 
-def _ray_angles() -> np.ndarray:
-    return 2 * np.pi * (np.arange(_NUM_RAYS) + 0.5) / _NUM_RAYS
+def _inside(
+    across: np.ndarray, down: np.ndarray, shape: tuple[int, ...], border: float
+) -> np.ndarray:
+    """True where places lie in a picture (h, w), off its border by more than some pixels."""
+    return np.logical_and.reduce(
+        [across > border, across < shape[1] - border, down > border, down < shape[0] - border]
+    )

@@ -2,7 +2,7 @@
 quarter turn of the back lens and the focal length that puts the seam at 90 degrees."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -16,20 +16,8 @@ _OVERLAP_RAD = np.deg2rad(np.arange(-4.0, 4.5, 1.0))  # angles from the seam
 _SCALES = 100.0 / np.arange(90.0, 112.25, 0.5)[::-1]  # of focal lengths: circles of 90 to 112
 # degrees from the axis, where they are taken for 100
 _MIN_ROWS = 5  # least number of rows of _OVERLAP_RAD inside both image circles
-_MIN_TURN_MARGIN = 0.1  # margin in correlation of the right turn over any other
-_MIN_PEAK_CORRELATION = 0.25  # least correlation at the right focal length
 _PEAK_HALF_WIDTH = 5  # steps of _SCALES on either side of the peak, where the correlation must be
 # lower
-_PEAK_DROP = 0.13  # by this part of the peak's
-
-
-@dataclass(frozen=True, slots=True)
-class Overlap:
-    """The relation of two lenses that their pictures at the seam determine."""
-
-    turn: int  # index of the back lens whose pictures continue the front one's
-    turn_is_clear: bool  # True if they match clearly better than under any other turn
-    scale: float | None  # of focal lengths at which pictures correlate best; None = undetermined
 
 
 def measure_overlap(
@@ -37,8 +25,10 @@ def measure_overlap(
     front: Fisheye,
     behind: Sequence[Fisheye],
     radii: tuple[float, float],
-) -> Overlap:
-    """Correlate both lenses' pictures at the seam under several turns and focal lengths.
+) -> tuple[int | None, float | None]:
+    """Index of the back lens whose pictures continue the front one's at the seam, None = no one
+    matches clearly better than all others; and the scale of focal lengths at which they correlate
+    best, None = undetermined.
 
     Args:
         looks: pictures (h, w) uint8 of both lenses of each frame.
@@ -69,8 +59,8 @@ def measure_overlap(
     best = whole.max(axis=1)
     order = np.argsort(best)[::-1]
     turn = int(order[0])
-    clear = len(behind) == 1 or bool(best[turn] > best[order[1]] + _MIN_TURN_MARGIN)
-    return Overlap(turn, clear, _peak(fine[turn]))
+    clear = len(behind) == 1 or bool(best[turn] > best[order[1]] + 0.1)
+    return turn if clear else None, _peak(fine[turn])
 
 
 def rim_likeness(looks: Sequence[Sequence[np.ndarray]], pair: Pair) -> float:
@@ -142,9 +132,9 @@ def _peak(scores: np.ndarray) -> float | None:
     """Scale of focal lengths at a clear peak of correlations (S,); None = there is none."""
     best = int(np.argmax(scores))
     sides = best - _PEAK_HALF_WIDTH, best + _PEAK_HALF_WIDTH
-    if sides[0] < 0 or sides[1] >= len(scores) or scores[best] < _MIN_PEAK_CORRELATION:
+    if sides[0] < 0 or sides[1] >= len(scores) or scores[best] < 0.25:
         return None
-    if max(scores[list(sides)]) > (1 - _PEAK_DROP) * scores[best]:
+    if max(scores[list(sides)]) > 0.87 * scores[best]:
         return None
     before, at, after = scores[best - 1 : best + 2]
     bend = before - 2 * at + after

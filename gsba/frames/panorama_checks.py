@@ -7,7 +7,6 @@ recognised.
 """
 
 from collections.abc import Iterable
-from dataclasses import astuple, dataclass
 
 import cv2
 import numpy as np
@@ -40,19 +39,6 @@ _POLE_ROWS, _POLE_SIGMA_PX, _MIN_GRADIENT = 6, 1.5, 0.3  # rows; blur; grey leve
 _MIN_CONTRAST = 6.0  # grey levels between far columns; with less, noise is compared
 
 
-@dataclass(frozen=True, slots=True)
-class _Evidence:
-    """Measures of one picture."""
-
-    beside: float  # correlation of the left and the right half
-    above: float  # correlation of the upper and the lower half
-    seam: float  # step between both edges over that between far columns, medians over rows; 0 = no
-    # contrast
-    poles: float  # detail of the more constant pole
-    torn: float  # as seam, with edges shifted along each other and scaled so that they meet best
-    middle: float  # step between the middle rows over the 95th percentile of steps between rows
-
-
 def unlike_panorama(greys: Iterable[np.ndarray]) -> str:
     """Name of what 2:1 pictures hold instead of panoramas; "" = nothing speaks against panoramas.
 
@@ -60,21 +46,21 @@ def unlike_panorama(greys: Iterable[np.ndarray]) -> str:
         greys: (h, w) uint8 each, of one sequence; NUM_LOOKS suffice, and fewer are taken if the
             first one is clearly a panorama. Those narrower than 512 pixels are not judged.
     """
-    found = list[_Evidence]()
+    found = list[tuple[float, ...]]()
     for grey in greys:
         # noise of smaller pictures is not averaged
         if grey.shape[1] < 512:
             return ""
         found.append(_measure(grey))
-        first = found[0]
+        beside, above, seam, *_ = found[0]
         # edges meet, so that one picture is enough
-        if max(first.beside, first.above) < _MIN_REPEAT and first.seam < 0.3:
+        if max(beside, above) < _MIN_REPEAT and seam < 0.3:
             return ""
     if not found:
         return ""
-    beside, above, seam, poles, torn, middle = np.median([astuple(one) for one in found], axis=0)
+    beside, above, seam, poles, torn, middle = np.median(found, axis=0)
     if beside >= max(_MIN_REPEAT, above):
-        of_contrast = [one.seam for one in found if one.seam > 0]
+        of_contrast = [step for _, _, step, *_ in found if step > 0]
         whole = not of_contrast or np.median(of_contrast) < _MIN_SEAM_OF_HALVES
         return SIDE_BY_SIDE if whole else VR180
     if above >= _MIN_REPEAT and middle >= _MIN_MIDDLE_STEP:
@@ -84,7 +70,11 @@ def unlike_panorama(greys: Iterable[np.ndarray]) -> str:
     return CROPPED if cropped else ""
 
 
-def _measure(grey: np.ndarray) -> _Evidence:
+def _measure(grey: np.ndarray) -> tuple[float, ...]:
+    """Correlations of the left with the right half and of the upper with the lower one; step
+    between both edges over that between far columns, medians over rows, 0 = no contrast; detail of
+    the more constant pole; that step with edges shifted along each other and scaled so that they
+    meet best; and step between the middle rows over the 95th percentile of steps between rows."""
     size = _WIDTH, _WIDTH // 2
     small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA).astype(np.float32)
     # blur whose difference from a picture is its detail
@@ -103,7 +93,7 @@ def _measure(grey: np.ndarray) -> _Evidence:
     steps = np.abs(np.diff(small, axis=0)).mean(axis=1)
     middle = float(steps[len(steps) // 2] / max(np.percentile(steps, 95), 1e-6))
     torn = _torn(columns, shifts) if far > _MIN_CONTRAST else 0.0
-    return _Evidence(beside, above, float(seam), poles, torn, middle)
+    return beside, above, float(seam), poles, torn, middle
 
 
 def _torn(columns: np.ndarray, shifts: np.ndarray) -> float:

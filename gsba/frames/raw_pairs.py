@@ -26,8 +26,6 @@ _RIG_R_BACK_LENS = np.diag([-1.0, 1.0, -1.0])  # rig_R_lens of an upright back l
 _QUARTER_TURNS = [
     Rotation.from_euler("z", turn).as_matrix() for turn in np.deg2rad([0, 90, 180, 270])
 ]
-_MAX_FOCAL_CHANGE = 0.025  # relative change of focal lengths from which pictures contradict a
-# calibration; parallax of near things looks like one or two percent
 
 Found = dict[str, tuple[Path, ...]]  # frame -> picture of each lens, the front one first
 _NUMBERED = re.compile(r"lens(\d+)", re.IGNORECASE)  # folders of more than two lenses
@@ -174,13 +172,13 @@ def lenses_of(
     front = _nominal_lens(size, front_circle, np.eye(3))
     behind = [_nominal_lens(size, back_circle, _RIG_R_BACK_LENS @ turn) for turn in _QUARTER_TURNS]
     radii = front_circle.radius, back_circle.radius
-    overlap = measure_overlap(looks, front, behind, radii)
-    if not overlap.turn_is_clear:
+    turn, found_scale = measure_overlap(looks, front, behind, radii)
+    if turn is None:
         raise GsbaError(
             f"{folder}: raw fisheyes of unknown lenses, and their overlap at the rims does not "
             "determine how one is turned against the other: give --calibration FILE"
         )
-    scale = overlap.scale or 1.0
+    scale = found_scale or 1.0
     off = max(front_circle.sigma, back_circle.sigma)
     _log.warning(
         "%s: raw fisheyes of unknown lenses, assumed to cover %.0f degrees in circles of %.0f "
@@ -189,9 +187,9 @@ def lenses_of(
         np.rad2deg(2 * _NOMINAL_HALF_FOV_RAD) / scale,
         *(2 * radius for radius in radii),
         "given" if circles else f"found to {off:.1f} pixels",
-        "" if overlap.scale is None else "; degrees by both lenses' overlap at the seam",
+        "" if found_scale is None else "; degrees by both lenses' overlap at the seam",
     )
-    return scaled((front, behind[overlap.turn]), scale), True
+    return scaled((front, behind[turn]), scale), True
 
 
 def _calibrated(
@@ -217,9 +215,10 @@ def _calibrated(
     circles = [find_circle(pictures).circle for pictures in zip(*looks, strict=True)]
     if circles[0] is None or circles[1] is None:
         return pair, False
-    overlap = measure_overlap(looks, pair[0], [pair[1]], (circles[0].radius, circles[1].radius))
-    scale = overlap.scale or 1.0
-    if abs(scale - 1) < _MAX_FOCAL_CHANGE:
+    radii = circles[0].radius, circles[1].radius
+    scale = measure_overlap(looks, pair[0], [pair[1]], radii)[1] or 1.0
+    # parallax of near things looks like one or two percent
+    if abs(scale - 1) < 0.025:
         return pair, False
     _log.warning(
         "%s: %s does not fit these pictures: both lenses match at the seam with focal lengths "

@@ -206,23 +206,18 @@ def find_weights(settings: RefineSettings) -> dict[str, Path]:
     if settings.matching.matcher != "guided":
         matcher = f"{chosen.extractor}-{settings.matching.matcher}"
         wanted["matching"] = matcher, settings.matching.weights
-    for key, _ in wanted.values():
-        _check_licence(SOURCES[key], chosen.accept_noncommercial)
+    for source in (SOURCES[key] for key, _ in wanted.values() if not SOURCES[key].free):
+        if not chosen.accept_noncommercial:
+            raise GsbaError(
+                f"{source.network}'s weights are under {source.licence} ({source.place}); if your "
+                "use is non-commercial, pass --accept-noncommercial "
+                "(features.accept_noncommercial = true)"
+            )
+        logger.warning("%s's weights are under %s", source.network, source.licence)
     return {
         stage: _find(SOURCES[key], given, f"{stage}.weights", chosen.download)
         for stage, (key, given) in wanted.items()
     }
-
-
-def _check_licence(source: Source, accepted: bool) -> None:
-    if source.free:
-        return
-    if not accepted:
-        raise GsbaError(
-            f"{source.network}'s weights are under {source.licence} ({source.place}); if your use "
-            "is non-commercial, pass --accept-noncommercial (features.accept_noncommercial = true)"
-        )
-    logger.warning("%s's weights are under %s", source.network, source.licence)
 
 
 def _find(source: Source, given: str | None, setting: str, download: bool) -> Path:

@@ -17,7 +17,6 @@ _FAMILY = "known_points"
 GATE_SIGMAS = 3.5  # of an inlier's residual
 COARSE = (8.0,)  # scales of the loss, round by round, standard deviations, of a first fit
 FINE = (2.0, 1.0)  # of the last one
-_MAX_POSITION_SIGMA = 0.05  # of a determined position, in median distances of points
 _MIN_NOISE = 0.5  # of keypoints, in their own standard deviations
 _SOLVER = SolverOptions(max_iterations=20, relative_tolerance=1e-5, absolute_tolerance=1e-2)
 
@@ -260,7 +259,7 @@ def is_determined(
     if not len(points_world) or not np.isfinite(covariance).all():
         return False
     depth = float(np.median(np.linalg.norm(points_world - world_T_rig[:3, 3], axis=1)))
-    return bool(np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1]) <= _MAX_POSITION_SIGMA * depth)
+    return bool(np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1]) <= 0.05 * depth)
 
 
 def _block(

@@ -56,16 +56,12 @@ from gsba.types import Features
 from gsba.types.records import with_rows
 
 _NUM_PLACES = 10  # keyframes with a face that looks most like a photo
-_FIELDS_RAD = tuple(np.deg2rad([70.0, 45.0, 105.0]))  # of the longer side, tried where the focal
-# length is not known
-_MAX_ERROR_RAD = np.deg2rad(0.6)  # of a first pose's inliers: it leaves out the distortion
 _GATES_RAD = tuple(np.deg2rad([2.5, 1.0, 0.5]))  # around predicted bearings, round by round
 _MIN_POINTS = 15  # inliers of a fit
 _SAMPLE = 4  # points that determine a pose and a focal length
 _FOCALS = (0.1, 20.0)  # least and largest focal length, in longer sides
 _ANNEALED = (32.0, *COARSE, *FINE)  # scales of the loss of the first guided fit: a focal length
 # that a wall leaves open is far off for what is beside the wall
-_STIFF = 0.1  # share of the priors' standard deviations but the focal length's, in a first fit
 _CELLS_PER_SIDE = 64  # along 90 degrees: keypoints within one are one witness of a guided fit
 
 
@@ -138,7 +134,9 @@ def _place(localizer: Localizer, photo: Photo) -> _Placed | str:
     image, reason = photo.load(), NO_PLACE
     known = photo.focal is not None
     half = max(photo.width, photo.height) / 2
-    focals = [photo.focal] if photo.focal else [half / np.tan(f / 2) for f in _FIELDS_RAD]
+    # fields of view of the longer side that are tried where the focal length is not known
+    fields = np.deg2rad([70.0, 45.0, 105.0])
+    focals = [photo.focal] if photo.focal else [half / np.tan(f / 2) for f in fields]
     best: _Placed | None = None
     for focal in focals:
         projection = photo.projection(focal)
@@ -161,7 +159,7 @@ def _refine(
     """A recognised photo fitted to all points around it; None if they contradict its pose."""
     start, prior = first.projection, photo.prior_sigmas()
     expected = photo.projection(photo.focal or start.focal)
-    stiff = np.concatenate([prior[:1], _STIFF * prior[1:]])
+    stiff = np.concatenate([prior[:1], 0.1 * prior[1:]])  # a first fit is of the focal length
     seen = _sightings(localizer, first.candidates, first.pixels, first.features, first.cut_by)
     belief = CameraPrior(expected.step_from(start), stiff)
     fitted = fit([seen], first.world_T_camera[None], COARSE, [start], [belief])
@@ -234,7 +232,8 @@ def _recognise(
     camera = pycolmap.Camera(
         model="SIMPLE_PINHOLE", width=photo.width, height=photo.height, params=params
     )
-    max_error, seed = _MAX_ERROR_RAD * projection.focal, localizer.map.settings.seed
+    # of inliers: a first pose leaves out the distortion
+    max_error, seed = np.deg2rad(0.6) * projection.focal, localizer.map.settings.seed
 
     def search(rows: np.ndarray, least: int) -> FoundPose | None:
         given = pixels[rows], candidates.points_world[rows], camera, max_error, seed, least

@@ -30,7 +30,6 @@ from gsba.matching.guided_search import Gate, match_pair
 from gsba.types import Features, FrameSet
 
 _NUM_NEAREST = 6  # keyframes whose points are expected in a picture
-_MIN_OTHERS = 2  # observers without which a point is not of a map that lacks one of its frames
 # Share in regions that show next to nothing of what is expected there: at least .41 where places
 # look alike, at most .30 at true poses beyond the ends of a map.
 _LOOK_ALIKE_STRANGE = 0.35
@@ -98,7 +97,7 @@ class Surroundings:
         if left_out is not None:
             num_observers = num_observers.copy()
             num_observers[result.observation_points[result.observation_frames == left_out]] -= 1
-        of_map = num_observers >= _MIN_OTHERS
+        of_map = num_observers >= 2  # others are no points of a map that lacks one of its frames
         keyframes = [map_.load_keyframe(int(f)) for f in nearest]
         points = np.unique(np.concatenate([keyframe.points for keyframe in keyframes]))
         points = result.points_world[points[of_map[points]]]

@@ -12,8 +12,6 @@ from gsba.trajectory.steps import ray_depths
 from gsba.types import Keypoints, VerifiedPairs
 
 _MIN_SHARED_POINTS = 8  # points of a pair that either map must hold
-# Largest standard deviation of the logarithm of a length: far points determine no scale.
-_MAX_LOG_LENGTH_SIGMA = 0.1
 MIN_AGREEING = 3  # least number of pairs
 _REACH = 4  # steps of the map before or after a break that tell how fast the camera moves
 # Slowest and fastest motion over a break, in the median of these steps: other bays are elsewhere.
@@ -133,4 +131,4 @@ def _step_length(known: np.ndarray, depths: np.ndarray) -> float | None:
         return None
     middle = float(np.median(logs))
     sigma = 1.25 * 1.4826 * float(np.median(np.abs(logs - middle))) / np.sqrt(len(logs))
-    return float(np.exp(middle)) if sigma < _MAX_LOG_LENGTH_SIGMA else None
+    return float(np.exp(middle)) if sigma < 0.1 else None  # far points determine no scale

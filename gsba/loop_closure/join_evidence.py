@@ -25,20 +25,14 @@ _PLACE_RAD = np.deg2rad(0.7)  # radius in which most true matches lie; chance, a
 # stand at similar places, spread them over the gate
 _BESIDE = -(_PLACE_RAD**2) / (GATE_RAD**2 - _PLACE_RAD**2)  # worth of a match outside this radius:
 # matches by chance cancel
-# Chord around the predicted bearing within which a frame must know a surface.
-_SURFACE_CHORD = 2 * np.sin(np.deg2rad(6.0) / 2)
-_NUM_SURFACE_POINTS = 3  # points of the frame nearest to the bearing that represent the surface
-_MAX_SURFACE_RATIO = 1.25  # largest ratio of the distances of a surface and of a point on it
 # Edges of bins of the angle between two views.
 _ANGLE_EDGES_RAD = np.deg2rad([6.0, 12.0, 20.0, 30.0, 45.0])
 _LOG_RATIO_EDGES = np.log([1.15, 1.35, 1.7])  # edges of bins of the ratio of distances
 _NUM_BINS = (len(_ANGLE_EDGES_RAD) + 1) * (len(_LOG_RATIO_EDGES) + 1)
 _PRIOR_COUNT = 20.0  # prior count of points in each bin, found at the mean rate of all bins
-_DEFAULT_RATE = 0.3  # rate assumed if no two frames of one part can be compared
 # Rotation about the vertical after which predictions are found by chance only.
 _CHANCE_ROTATION_RAD = 2.0
 _CELL_DEPTHS, _REGION_DEPTHS = 0.25, 1.0  # edges of cells of space, median depths
-_PRIOR_REGIONS = 1.0  # prior number of regions with nothing found, and of regions with all found
 # Share found again at a look-alike: as much as in a hall of repeated arches, one arch further on.
 _LOOK_ALIKE_SHARE = 0.3
 # Share found at its place, above what two homes of one plan with furniture at the same places have:
@@ -212,7 +206,8 @@ def rates_of(seen: Predictions, away: Predictions) -> FindingRates:
 
     def by_change_of_view(worth: np.ndarray) -> np.ndarray:
         hits = np.bincount(seen.bins, worth, _NUM_BINS)
-        mean = (hits.sum() + _PRIOR_COUNT * _DEFAULT_RATE) / (numbers.sum() + _PRIOR_COUNT)
+        # .3 is assumed where no two frames of one part can be compared
+        mean = (hits.sum() + _PRIOR_COUNT * 0.3) / (numbers.sum() + _PRIOR_COUNT)
         return (hits + _PRIOR_COUNT * mean) / (numbers + _PRIOR_COUNT)
 
     chance = float(away.found.mean()) if len(away.found) else 0.0
@@ -285,7 +280,7 @@ def _distinct(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _share(excess: np.ndarray, expected: np.ndarray) -> tuple[float, float]:
     """Share found again and its standard deviation, from sums (R,) of regions."""
-    unseen = _PRIOR_REGIONS * float(expected.mean())
+    unseen = float(expected.mean())  # a region with nothing found, and one with all, as a prior
     total = float(expected.sum()) + 2 * unseen
     share = (float(excess.sum()) + unseen) / total
     squares = float(np.sum((excess - share * expected) ** 2))
@@ -371,9 +366,8 @@ def _on_surface(known: np.ndarray, directions: np.ndarray, distances: np.ndarray
         return np.zeros(len(distances), bool)
     lengths = np.linalg.norm(points, axis=1)
     tree = KDTree(points / lengths[:, None])
-    chords, nearest = tree.query(
-        directions, _NUM_SURFACE_POINTS, distance_upper_bound=_SURFACE_CHORD
-    )
+    # the three points of the frame that are nearest, within 6 degrees, represent the surface
+    chords, nearest = tree.query(directions, 3, distance_upper_bound=2 * np.sin(np.deg2rad(3.0)))
     around = np.append(lengths, np.inf)[nearest].min(axis=1)
     known_there = np.isfinite(chords[:, 0])
-    return known_there & (np.abs(np.log(around / distances)) < np.log(_MAX_SURFACE_RATIO))
+    return known_there & (np.abs(np.log(around / distances)) < np.log(1.25))

@@ -19,14 +19,6 @@ from gsba.matching.guided_search import MatchContext
 from gsba.similarity import Sim3
 from gsba.types import Matches
 
-# Times the differences of two estimates of one join within which proposals are of one place:
-# drifting parts meet a little differently at either end.
-_SAME_PLACE_FACTOR = 2.0
-# Points found again improve a proposal, and a better one finds other points again: repeated until
-# it hardly changes, at most so many times.
-_MAX_REFINEMENTS = 8
-_SETTLED_RAD = np.deg2rad(0.1)  # largest change of a bearing to a point at median depth
-
 
 @dataclass(frozen=True, slots=True)
 class Judged:
@@ -73,12 +65,14 @@ class JoinTest:
         return wider and max((found, wider), key=lambda one: one.evidence.margin())
 
     def rivals(self, best: Judged, others: Sequence[Judged]) -> list[Judged]:
-        """Accepted proposals for another place that `best` does not significantly beat."""
+        """Accepted proposals for another place that `best` does not significantly beat. Those of
+        one place may differ by twice as much as two estimates of one join: drifting parts meet a
+        little differently at either end."""
         return [
             other
             for other in others
             if not best.evidence.beats(other.evidence)
-            if not alike(best.proposal, other.proposal, self.poses, self.depth, _SAME_PLACE_FACTOR)
+            if not alike(best.proposal, other.proposal, self.poses, self.depth, 2.0)
         ]
 
     def weigh(
@@ -128,7 +122,8 @@ class JoinTest:
         """The proposal refined until it settles; None once it leads to a known one's place."""
         rows, inside = groups
         evidence, found = self.weigh(rows, inside, proposal.move)
-        for _ in range(_MAX_REFINEMENTS):
+        # Points found again improve a proposal, and a better one finds other points again.
+        for _ in range(8):
             again = self.meetings(found, rows)
             if not again:
                 break
@@ -137,7 +132,8 @@ class JoinTest:
             proposal = replace(proposal, move=move)
             if self._leads_to(proposal, known):
                 return None
-            if off / self.depth + turned + stretched < _SETTLED_RAD:
+            # of a bearing to a point at median depth
+            if off / self.depth + turned + stretched < np.deg2rad(0.1):
                 break
             evidence, found = self.weigh(rows, inside, move)
         return Judged(proposal, evidence)

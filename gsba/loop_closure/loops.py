@@ -28,20 +28,14 @@ from gsba.types.records import slices
 logger = logging.getLogger(__name__)
 _NUM_CANDIDATES = 3  # candidate places for each frame
 _ENOUGH_POINTS = 15  # common points by which two frames are held together in the map
-_NEAR_DEPTHS = 0.25, 0.5  # distances of neighbours that places met again are compared with, depths
-_LEAST_ALIKE_SHARE = 0.01  # share of these neighbours that look less alike
 _FRAMES_AT_ONCE, _ROWS_AT_ONCE = 32, 512  # frames compared together, each with so many others at a
 # time: 16 MB of global descriptors
-MIN_GROUP = 3  # least number of pairs that agree
-RIVAL = 1.5  # ratio by which a group must outweigh one that contradicts it
 # Largest rotation error of the map between two frames; of each step without matches besides.
 _MAX_ROTATION_DEG, _UNSEEN_ROTATION_DEG = 10.0, 45.0
 AGREE_DEG, AGREE = 2.0, 0.1  # between two pairs; relative to the median depth
 # Noise of a verified step, and of a loop: rotation; position in typical lengths of steps.
 _STEP_SIGMA_DEG, _STEP_SIGMA_LENGTHS = 0.2, 0.02
 _LOOP_SIGMA_DEG, _LOOP_SIGMA_LENGTHS = 0.3, 0.05
-# Rotation noise of a step without matches, whose position noise is its length.
-_UNSEEN_SIGMA_RAD = 0.5
 
 
 def path(
@@ -57,12 +51,9 @@ def path(
     lengths = np.linalg.norm(steps[:, :3, 3], axis=1)
     typical = float(np.median(lengths)) or 1.0
     for f, step in enumerate(steps):
-        loose = _noise_model(_UNSEEN_SIGMA_RAD, float(max(lengths[f], typical)))
-        noise = (
-            loose
-            if unseen[f]
-            else _noise_model(np.deg2rad(_STEP_SIGMA_DEG), _STEP_SIGMA_LENGTHS * typical)
-        )
+        noise = _noise_model(np.deg2rad(_STEP_SIGMA_DEG), _STEP_SIGMA_LENGTHS * typical)
+        if unseen[f]:  # half a radian, and its length
+            noise = _noise_model(0.5, float(max(lengths[f], typical)))
         graph.add(gtsam.BetweenFactorPose3(X(f), X(f + 1), gtsam.Pose3(step), noise))
     return graph, values, _noise_model(np.deg2rad(_LOOP_SIGMA_DEG), _LOOP_SIGMA_LENGTHS * typical)
 
@@ -264,12 +255,11 @@ def _least_similarity(
             ]
         )
         distances = np.linalg.norm(positions[first + gap] - positions[first], axis=1)
-        low, high = (share * depth for share in _NEAR_DEPTHS)
-        near.append(found[(distances > low) & (distances < high)])
+        near.append(found[(distances > 0.25 * depth) & (distances < 0.5 * depth)])
         successive = found if gap == 1 else successive
     some = np.concatenate(near)
     some = some if len(some) else successive
-    return float(np.quantile(some, _LEAST_ALIKE_SHARE)) if len(some) else -1.0
+    return float(np.quantile(some, 0.01)) if len(some) else -1.0  # of almost all
 
 
 def _max_step_drifts(positions: np.ndarray, unseen: np.ndarray, far_drift: float) -> np.ndarray:
@@ -319,7 +309,8 @@ def consistent(loops: list[Loop], solved: Solution, window: int) -> list[Loop]:
             (sum(loops[k].support for k in against if agree.get((j, k))) for j in against),
             default=0,
         )
-        if len(group) >= MIN_GROUP and weight >= RIVAL * contrary:
+        # three pairs agree, and outweigh those that contradict them by half
+        if len(group) >= 3 and weight >= 1.5 * contrary:
             believed.append(loops[i])
     return believed
 

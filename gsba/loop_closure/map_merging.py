@@ -32,11 +32,6 @@ from gsba.types import Counts, Matches, Solution
 logger = logging.getLogger(__name__)
 _NUM_CANDIDATES = 3  # candidate places for each frame of a part; twice as many for a single frame
 _BREAK_REACH_FRAMES = 3  # frames from a break that are compared in any case
-_MAX_PAUSE_INTERVALS = 6.0  # longest pause over which these are compared, in median intervals
-_NUM_BEST_MEETINGS = 2  # best meetings whose neighbours are compared too
-# Least frames of a map for the test of joins: two small parts in rooms with one floor look like one
-# place all around.
-_MIN_TESTABLE_FRAMES = 6
 _MAX_PACES = 3.0  # largest distance of a single frame from its neighbours, in median paces
 # Largest angle between the verticals of two parts, besides the spread within each: of one
 # recording, and of two, whose cameras may be held in another way.
@@ -64,7 +59,8 @@ def merge(
         recordings: (F,) int, number of each frame's recording; None = there is one. Single frames
             do not join recordings.
     """
-    min_testable = _MIN_TESTABLE_FRAMES if absent else MIN_MAP_FRAMES
+    # two small parts in rooms with one floor look like one place all around
+    min_testable = 6 if absent else MIN_MAP_FRAMES
     owners = np.zeros(len(parts), np.int64) if recordings is None else recordings
     ties = held | seen
     joining = _Joining(context, solved, parts, held, ties, timestamps, min_testable, owners)
@@ -314,7 +310,7 @@ class _Joining:
         A camera that walks on cannot have moved far in between, but a bay of a hall can be as near:
         what the surroundings do not confirm must continue the map at its pace.
         """
-        for outer, inner in self._next_in_time(rows, inside, _MAX_PAUSE_INTERVALS):
+        for outer, inner in self._next_in_time(rows, inside, 6.0):  # median intervals
             earlier, later = (rows, inside) if outer < inner else (inside, rows)
             last = min(outer, inner)
             ends = (
@@ -363,8 +359,8 @@ class _Joining:
     def _around(
         self, meetings: list[Meeting], rows: np.ndarray, inside: np.ndarray, chosen: np.ndarray
     ) -> np.ndarray:
-        """Pairs (P, 2) not yet compared, beside the meetings with the most points."""
-        best = sorted(meetings, key=lambda meeting: -len(meeting.own))[:_NUM_BEST_MEETINGS]
+        """Pairs (P, 2) not yet compared, beside the two meetings with the most points."""
+        best = sorted(meetings, key=lambda meeting: -len(meeting.own))[:2]
         reach = range(-_BREAK_REACH_FRAMES + 1, _BREAK_REACH_FRAMES)
         found = {(m.f + i, m.g + j) for m in best for i in reach for j in reach}
         free, taken = set(rows.tolist()), set(inside.tolist())

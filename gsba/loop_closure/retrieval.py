@@ -14,10 +14,6 @@ from gsba.disk import concatenated
 from gsba.matching.guided_search import SearchableFrames
 from gsba.store.shards import Workers, blocks_of_frames
 
-_NUM_SAMPLES = 20_000  # descriptors that train the vocabulary
-# Rounding of descriptors, float32 of unit length: a shorter sum has no direction.
-_MIN_SUM_LENGTH = 1e-5
-
 
 def global_descriptors(
     frames: SearchableFrames,
@@ -38,7 +34,7 @@ def visual_words(
     frames: SearchableFrames, num_frames: int, seed: int, workers: Workers
 ) -> np.ndarray:
     """Vocabulary (W, D) float32 of the descriptors of all frames, for `aggregate`."""
-    share = max(_NUM_SAMPLES // max(num_frames, 1), 8)
+    share = max(20_000 // max(num_frames, 1), 8)  # descriptors of all frames train it
     draw = partial(_sampled_descriptors, share=share, seed=seed)
     job = _DescriptorJob("sampling", frames, np.arange(num_frames), draw)
     return _centres(np.concatenate(list(workers.map_shards(job))), seed)
@@ -106,5 +102,6 @@ def aggregate(descriptors: np.ndarray, words: np.ndarray) -> np.ndarray:
     nearest = _nearest(descriptors, words)
     sums = _sums_by_group(descriptors - words[nearest], nearest, len(words))
     lengths = np.linalg.norm(sums, axis=1, keepdims=True)
-    sums = np.divide(sums, lengths, out=np.zeros_like(sums), where=lengths > _MIN_SUM_LENGTH)
+    # descriptors are rounded, float32 of unit length: a shorter sum has no direction
+    sums = np.divide(sums, lengths, out=np.zeros_like(sums), where=lengths > 1e-5)
     return sums.ravel() / max(float(np.linalg.norm(sums)), 1e-12)

@@ -74,19 +74,14 @@ class KnownMasks:
     def __call__(self, frame: int) -> np.ndarray:
         return distractor_mask(self.found[self.names[frame]])
 
-    def taken(self, chosen: Sequence[int]) -> "_StoredMasks":
-        """The masks of some frames, renumbered, with paths for other processes."""
-        return _StoredMasks(self.found.records({n: self.names[f] for n, f in enumerate(chosen)}))
+    def taken(self, chosen: Sequence[int]) -> Callable[[int], np.ndarray]:
+        """The masks of some frames, renumbered, read from files alone by other processes."""
+        records = self.found.records({n: self.names[f] for n, f in enumerate(chosen)})
+        return partial(_stored_mask, records)
 
 
-@dataclass(frozen=True, slots=True)
-class _StoredMasks:
-    """Distractors of an earlier pass, read from files alone."""
-
-    records: StoredRecords[Distractors]
-
-    def __call__(self, frame: int) -> np.ndarray:
-        return distractor_mask(self.records(frame))
+def _stored_mask(records: StoredRecords[Distractors], frame: int) -> np.ndarray:
+    return distractor_mask(records(frame))
 
 
 class StaticScene:

@@ -14,17 +14,8 @@ from gsba.types import Matches, Solution, VerifiedPairs
 
 # Gates in degrees are for exact directions: `gate_factor` of settings widens those of a solved map.
 SCARCE_MATCHES = 60  # pairs with fewer are matched with all keypoints
-_MIN_INLIER_RATIO = (
-    0.5  # of a step's matches to its pose; steps below are matched with all keypoints
-)
+_MIN_INLIER_RATIO = 0.5  # of a step's matches to its pose; others are matched with all keypoints
 _LOOP_DEG = 2.0  # gate around a known point, added to drift
-_REFINED_DEG, _REFINED_DIRECTION = (
-    0.4,
-    0.005,
-)  # gate of the solved map: rotation, tangent of direction
-_POINT_DEG = 0.6  # gate around a known point's predicted bearing
-_ROTATION_GAPS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)  # gaps in frames between
-# matched pairs
 _MAX_JOIN_ERROR_RAD = np.deg2rad(4.0)  # largest error of a joined part's pose, as an angle at the
 # median depth
 
@@ -47,7 +38,7 @@ def match_neighbours(context: MatchContext, start: Solution) -> VerifiedPairs:
         position_sigmas=np.zeros(len(chosen)),
         settings=TwoViewLimits.of(settings),
     )
-    estimates = _estimates(found, PRIOR_GATE, context)
+    estimates = _estimates(found, [PRIOR_GATE] * len(chosen), context)
     neighbours = agreeing(found, estimates)
     scarce = np.diff(found.offsets) < SCARCE_MATCHES
     steps = chosen[:, 1] - chosen[:, 0] == 1
@@ -59,8 +50,9 @@ def match_neighbours(context: MatchContext, start: Solution) -> VerifiedPairs:
     rows = np.flatnonzero(scarce | doubtful)
     if len(rows) == 0:
         return neighbours
-    again = context.match(chosen[rows], world_T_rigs, [PRIOR_GATE] * len(rows))
-    for p, estimate in zip(rows, _estimates(again, PRIOR_GATE, context), strict=True):
+    gates = [PRIOR_GATE] * len(rows)
+    again = context.match(chosen[rows], world_T_rigs, gates)
+    for p, estimate in zip(rows, _estimates(again, gates, context), strict=True):
         estimates[p] = estimate
     each = [found.of(p) for p in range(len(found.pairs))]
     for n, p in enumerate(rows):
@@ -76,10 +68,8 @@ def match_loops(context: MatchContext, solved: Solution) -> VerifiedPairs:
     so long a way that drift predicts nothing, all points of both frames are compared, and the
     nearest few frames are enough: the rest is found when the loop is closed.
     """
-    settings, keypoints = context.settings, context.keypoints
-    world_T_rigs, positions = solved.world_T_rigs, solved.world_T_rigs[:, :3, 3]
-    depth = solved.median_depth()
-    chosen = pairs.closing(positions, depth, settings.pairs)
+    positions, depth = solved.world_T_rigs[:, :3, 3], solved.median_depth()
+    chosen = pairs.closing(positions, depth, context.settings.pairs)
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     along = np.concatenate([[0], np.cumsum(steps)])
     # relative to the path between two frames
@@ -87,12 +77,8 @@ def match_loops(context: MatchContext, solved: Solution) -> VerifiedPairs:
     radii = np.deg2rad(_LOOP_DEG) + 2 * drifts / max(depth, 1e-12)
     # from 60 degrees on, a search is of all points: two frames suffice then
     few = pairs.thinned(chosen, radii > np.deg2rad(60.0), 2)
-    chosen, drifts = chosen[few], drifts[few]
     gates = [Gate.around_points(radius) for radius in radii[few]]
-    known = solved.points_by_keypoint(keypoints)
-    found = context.match(chosen, world_T_rigs, gates, known)
-    f0_T_f1s = inverse(world_T_rigs[chosen[:, 0]]) @ world_T_rigs[chosen[:, 1]]
-    return verified(found, gates, f0_T_f1s, drifts, context)
+    return _verified_known_points(context, solved, chosen[few], gates, drifts[few])
 
 
 def match_along_epipolars(
@@ -104,17 +90,15 @@ def match_along_epipolars(
     epipolar lines of a step that only the trajectory gives agrees on another length of it.
     """
     poses, settings = solved.world_T_rigs, context.settings
-    turn = np.deg2rad(settings.gate_factor * _REFINED_DEG)
+    # The solved map is right to 0.4 degrees of rotation and a direction of tangent 0.005.
+    turn = np.deg2rad(settings.gate_factor * 0.4)
     chosen = pairs.adjacent(len(poses))
     if maps is not None:
         first, second = maps[chosen].T
         chosen = chosen[(first == second) | (np.minimum(first, second) < 0)]
     lengths = np.linalg.norm(poses[chosen[:, 1], :3, 3] - poses[chosen[:, 0], :3, 3], axis=1)
     apart = context.cameras.baseline  # a ray may start at either lens
-    gates = [
-        Gate(turn, _REFINED_DIRECTION + apart / max(length, 1e-12), MAX_PARALLAX_RAD)
-        for length in lengths
-    ]
+    gates = [Gate(turn, 0.005 + apart / max(length, 1e-12), MAX_PARALLAX_RAD) for length in lengths]
     # A learned matcher adds nothing where poses are known this well.
     return context.match(chosen, poses, gates, guided_only=True)
 
@@ -129,38 +113,52 @@ def match_across(
     chosen = np.concatenate(pairs.covisible(poses[:, :3, 3], depth, context.settings.pairs))
     chosen = chosen[(parts[chosen[:, 0]] != parts[chosen[:, 1]]) & met[chosen].all(axis=1)]
     gates = [Gate.around_points(_MAX_JOIN_ERROR_RAD)] * len(chosen)
-    known = solved.points_by_keypoint(context.keypoints)
-    found = context.match(chosen, poses, gates, known)
+    sigmas = np.full(len(chosen), _MAX_JOIN_ERROR_RAD * depth)
+    return _verified_known_points(context, solved, chosen, gates, sigmas)
+
+
+def _verified_known_points(
+    context: MatchContext,
+    solved: Solution,
+    chosen: np.ndarray,
+    gates: Sequence[Gate],
+    sigmas: np.ndarray,
+) -> VerifiedPairs:
+    """Verified matches of chosen pairs (P, 2), of known points within each pair's gate; sigmas
+    (P,) of their relative positions, map units."""
+    poses = solved.world_T_rigs
+    found = context.match(chosen, poses, gates, solved.points_by_keypoint(context.keypoints))
     f0_T_f1s = inverse(poses[chosen[:, 0]]) @ poses[chosen[:, 1]]
-    return verified(
-        found, gates, f0_T_f1s, np.full(len(chosen), _MAX_JOIN_ERROR_RAD * depth), context
-    )
+    return verified(found, gates, f0_T_f1s, sigmas, context)
 
 
 def match_known_points(context: MatchContext, solved: Solution, loops_closed: bool) -> Matches:
     """Match frames further apart, around the predicted bearings of known points only; frames far
     apart in time are predictable where loops are closed. The prediction verifies the match:
     repeated structure elsewhere, such as the next column, is no candidate."""
-    poses, settings = solved.world_T_rigs, context.settings
-    near, loops = pairs.covisible(poses[:, :3, 3], solved.median_depth(), settings.pairs)
+    positions = solved.world_T_rigs[:, :3, 3]
+    near, loops = pairs.covisible(positions, solved.median_depth(), context.settings.pairs)
     chosen = near[near[:, 1] - near[:, 0] > 2]
     if loops_closed:
         chosen = np.concatenate([chosen, loops])
-    gates = [Gate.around_points(np.deg2rad(settings.gate_factor * _POINT_DEG))] * len(chosen)
-    known = solved.points_by_keypoint(context.keypoints)
-    # A learned matcher adds nothing where a point is known this well.
-    return context.match(chosen, poses, gates, known, guided_only=True)
+    return _known_points_of(context, solved, chosen)
 
 
 def match_known_points_across(
     context: MatchContext, solved: Solution, parts: np.ndarray
 ) -> Matches:
     """Match frames of different parts (F,) of a map around predicted bearings of known points."""
-    poses, settings = solved.world_T_rigs, context.settings
-    chosen = pairs.across(poses[:, :3, 3], solved.median_depth(), settings.pairs, parts)
-    gates = [Gate.around_points(np.deg2rad(settings.gate_factor * _POINT_DEG))] * len(chosen)
+    positions = solved.world_T_rigs[:, :3, 3]
+    chosen = pairs.across(positions, solved.median_depth(), context.settings.pairs, parts)
+    return _known_points_of(context, solved, chosen)
+
+
+def _known_points_of(context: MatchContext, solved: Solution, chosen: np.ndarray) -> Matches:
+    """Matches of chosen pairs (P, 2) within 0.6 degrees of predicted bearings of known points."""
+    gate = Gate.around_points(np.deg2rad(context.settings.gate_factor * 0.6))
     known = solved.points_by_keypoint(context.keypoints)
-    return context.match(chosen, poses, gates, known, guided_only=True)
+    # A learned matcher adds nothing where a point is known this well.
+    return context.match(chosen, solved.world_T_rigs, [gate] * len(chosen), known, guided_only=True)
 
 
 def verified(
@@ -174,27 +172,27 @@ def verified(
     """Matches that fit one relative pose of their pair, which agrees with the prior: poses (P, 4,
     4) of the trajectory, of position sigmas (P,), map units; None = no prior. Gates are of each
     pair; for rivals see `verification.estimate_relative_poses`."""
-    settings, seed = TwoViewLimits.of(context.settings), context.settings.seed
-    chances = np.array([gate.chance(np.deg2rad(settings.max_error_deg)) for gate in gates])
-    estimates = verification.estimate_relative_poses(
-        found, context.keypoints, settings, seed, context.workers, chances, rivals
-    )
-    return verification.agree_with_prior(found, estimates, f0_T_f1s, sigmas, settings)
+    estimates = _estimates(found, gates, context, rivals)
+    limits = TwoViewLimits.of(context.settings)
+    return verification.agree_with_prior(found, estimates, f0_T_f1s, sigmas, limits)
 
 
-def _estimates(found: Matches, gate: Gate, context: MatchContext) -> list[RelativePose | None]:
-    """The relative pose of each pair within a gate, without the trajectory as prior."""
-    verify, seed = TwoViewLimits.of(context.settings), context.settings.seed
-    chances = np.full(len(found.pairs), gate.chance(np.deg2rad(verify.max_error_deg)))
+def _estimates(
+    found: Matches, gates: Sequence[Gate], context: MatchContext, rivals: bool = False
+) -> list[RelativePose | None]:
+    """The relative pose of each pair within its gate, without the trajectory as prior."""
+    limits, seed = TwoViewLimits.of(context.settings), context.settings.seed
+    chances = np.array([gate.chance(np.deg2rad(limits.max_error_deg)) for gate in gates])
     return verification.estimate_relative_poses(
-        found, context.keypoints, verify, seed, context.workers, chances
+        found, context.keypoints, limits, seed, context.workers, chances, rivals
     )
 
 
 def match_for_rotations(context: MatchContext, world_T_rigs: np.ndarray) -> Matches:
     """Matches of frames near and far in time, around bearings predicted by their rotations."""
     num = len(world_T_rigs)
-    chosen = [(f, f + gap) for gap in _ROTATION_GAPS for f in range(num - gap)]
+    gaps = 1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128
+    chosen = [(f, f + gap) for gap in gaps for f in range(num - gap)]
     pairs = np.array(chosen, np.int32).reshape(-1, 2)
     still = world_T_rigs.copy()
     still[:, :3, 3] = 0

@@ -172,30 +172,19 @@ def _significant_pose(
 
     if len(bearings0) <= _SAMPLE_SIZE or needed(max(chance, largest)) > num:
         return None
-    found = _ransac(bearings0, bearings1, needed(max(chance, largest)), settings, seed)
-    if found is None:
-        return None
-    # Where bearings crowd around one plane, many agree with poses along it by chance.
-    sines = _normals(found[0], bearings0) @ (found[0][:3, :3] @ bearings1.T)
-    np.fill_diagonal(sines, np.inf)
-    agreeing = np.count_nonzero(np.abs(sines) < largest) / (sines.size - len(sines))
-    enough = witnesses(bearings0[found[1]], CELLS_PER_SIDE) >= needed(
-        max(chance, agreeing, largest)
-    )
-    return found if enough else None
-
-
-def _ransac(
-    bearings0: np.ndarray, bearings1: np.ndarray, least: int, settings: TwoViewLimits, seed: int
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """f0_T_f1 (4, 4) and inliers (m,) bool of the pose with the most inliers, at least `least`."""
-    share, trials = least / len(bearings0), (50, 3000)
+    share, trials = needed(max(chance, largest)) / len(bearings0), (50, 3000)
     found = sampled_pose(bearings0, bearings1, settings.max_error_deg, share, trials, seed)
     if found is None:
         return None
-    f0_T_f1 = inverse(found[0])
+    f0_T_f1, inliers = inverse(found[0]), found[1]
     f0_T_f1[:3, 3] /= max(np.linalg.norm(f0_T_f1[:3, 3]), 1e-12)
-    return f0_T_f1, found[1]
+    # Where bearings crowd around one plane, many agree with poses along it by chance.
+    sines = _normals(f0_T_f1, bearings0) @ (f0_T_f1[:3, :3] @ bearings1.T)
+    np.fill_diagonal(sines, np.inf)
+    agreeing = np.count_nonzero(np.abs(sines) < largest) / (sines.size - len(sines))
+    least = needed(max(chance, agreeing, largest))
+    enough = witnesses(bearings0[inliers], CELLS_PER_SIDE) >= least
+    return (f0_T_f1, inliers) if enough else None
 
 
 def sampled_pose(

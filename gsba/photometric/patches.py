@@ -21,7 +21,6 @@ _NUM_PLANE_POINTS = 8  # map points that determine a patch's plane
 _MAX_WIDTH = 4096  # pixels of a panorama; wider ones are halved
 _SIZE = 9  # pixels across a patch
 _SPACING_DEG = 7.0  # between patches of a frame
-_MAX_TARGETS = 8  # frames that a patch is aligned in, nearest in space
 _MIN_GREY, _MAX_GREY = 3, 252  # grey values beyond which a pixel counts as saturated
 
 
@@ -173,7 +172,7 @@ def table_of(
         laid, clear = lay_planes(found, shown)
         distances = np.linalg.norm(positions - positions[f], axis=1)
         distances[f] = np.inf
-        near = np.argsort(distances, kind="stable")[: min(_MAX_TARGETS, len(positions) - 1)]
+        near = np.argsort(distances, kind="stable")[: min(8, len(positions) - 1)]
         hosts.append(np.full(np.count_nonzero(clear), f))
         centres.append(found[clear])
         planes.append(laid[clear])

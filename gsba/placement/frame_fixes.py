@@ -20,7 +20,6 @@ logger = logging.getLogger(__name__)
 
 EXIF = "exif"  # in place of a file: positions in the EXIF data of the images
 MIN_FIXES = 3
-_CORRELATION_S = 60.0  # time constant of the fixes' errors: see `gsba/bundle/gps_factors.py`
 
 
 def read_exif_gps(frames: FrameSet, settings: GpsSettings | None = None) -> GpsFixes:
@@ -104,7 +103,7 @@ def fixes_of_frames(
     local = local_from_geodetic(geodetic, origin)
     times = frames.timestamps[rows] if frames.timed else None
     origin[1] = (origin[1] + 180) % 360 - 180
-    return FrameFixes(rows, local, sigmas, times, origin, _CORRELATION_S)
+    return FrameFixes(rows, local, sigmas, times, origin, correlation_s=60.0)  # see `FrameFixes`
 
 
 def _locked(source: str, fixes: GpsFixes) -> GpsFixes:

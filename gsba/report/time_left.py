@@ -61,23 +61,14 @@ _COSTS = (
 # Probability that two lenses are found in panoramas, by `camera.model`; None = not known
 # beforehand. Patches then take five times as long.
 _LENSES = {"auto": None, "central": 0.0, "two_lens": 1.0}
-_RAW_PASSES = (1.0, 2.0)  # least and most, of raw frames that nothing has calibrated, beyond the
-# first one
 _OBSERVATIONS = 950.0  # of the map for each frame
-_FRAMES_PER_KEYFRAME = 0.5  # that odometry chooses
 _ODOMETRY, _TRACKING = "odometry", "tracking"  # stage, and its work
 _TOUR = "tour"  # stage of few runs, which its own work tells the time of
-_TRACKING_S = 0.04  # seconds of odometry for each frame of the video
-_CLOSING_S = (0.03, 0.2)  # thereafter for each keyframe, as the path comes back or not
 _PRIOR_S = 4.0  # seconds of the table that count as if they were measured at its speed
 _PATCHES_PRIOR_S = 0.5  # seconds of the table of patches that count as if measured at its speed
-_MAX_MEGAPIXELS_SEARCHED = 1.2  # of a panorama: faces and patches are cut no finer from more
-_TABLE_THREADS = 2
 _MIN_BETWEEN_LINES_S = 20.0  # seconds between lines of the log with the time left
-_MIN_TOLD_S = 10.0  # seconds left that a line is worth
 _MAX_SINGLE_RATIO = (4 / 3) ** 2  # of most to least time left, whose mean is a third off at most
 _ADJUSTED = re.compile(r"dense(_closer)?|closed|joined|refined\d+")  # maps of all observations
-_MIN_COUNTED_SHARE = 0.15  # of a work's items, from which on they tell how long it takes
 UNDER_LENSES = re.compile(r"(again_)?(lensed\d+|settled(_far)?)")  # stages where two were found
 
 
@@ -107,7 +98,8 @@ class Size:
             trajectory=bool(entry["trajectory"]),
             raw=raw,
             lenses=1.0 if raw else _LENSES[entry["camera"]],
-            passes=_RAW_PASSES if uncut else (0.0, 0.0),
+            # least and most beyond the first one, of raw frames that nothing has calibrated
+            passes=(1.0, 2.0) if uncut else (0.0, 0.0),
             rounds=int(entry["rounds"]),
             threads=max(int(entry["threads"]), 1),
             uncut=uncut,
@@ -121,7 +113,8 @@ class Size:
         absent, raw, uncut = num * (not self.trajectory), num * self.raw, num * self.uncut
         pixels = (
             self.frames * self.megapixels,
-            self.frames * min(self.megapixels, _MAX_MEGAPIXELS_SEARCHED),
+            # faces and patches are cut no finer from larger panoramas
+            self.frames * min(self.megapixels, 1.2),
         )
         more = num * self.more
         return 1.0, num, *pixels, absent, num * (self.lenses or 0.0), raw, uncut, more
@@ -133,7 +126,7 @@ class Size:
         if too_late or (self.more and phase == WEAK):
             return 0.0
         seconds = sum(cost * term for cost, term in zip(costs, self.terms(phase), strict=True))
-        return seconds * (serial + (1 - serial) * _TABLE_THREADS / self.threads)
+        return seconds * (serial + (1 - serial) * 2 / self.threads)  # the table: of two threads
 
 
 def phase_of(stage: str) -> int | None:
@@ -157,7 +150,7 @@ class _Work:
     def seconds(self, now: float) -> float:
         """Expected seconds from a time on, at the speed so far."""
         done = self.done - self.first
-        if done < _MIN_COUNTED_SHARE * self.total:
+        if done < 0.15 * self.total:  # fewer do not tell how long it takes
             return 0.0
         return max((self.at - self.began) * (self.total - self.done) / done - (now - self.at), 0.0)
 
@@ -292,15 +285,16 @@ class TimeLeft:
         if work is None or not work.done or not self._keyframes:
             return None
         keyframes = self._keyframes * work.total / work.done
-        frames = _FRAMES_PER_KEYFRAME * keyframes
+        frames = 0.5 * keyframes
         size = self._known(size, is_most)
         size = replace(size, frames=frames, observations=1e-3 * _OBSERVATIONS * frames)
-        expected = _TRACKING_S * (work.done - work.first)
+        expected = 0.04 * (work.done - work.first)  # seconds for each frame of the video
         speed = (work.at - work.began + _PRIOR_S) / (expected + _PRIOR_S)
         here = work.seconds(now)
         if self._stage == _ODOMETRY:
             gone = now - work.at if work.done == work.total else 0.0
-            here += max(speed * _CLOSING_S[is_most] * keyframes - gone, 0.0)
+            # thereafter for each keyframe, least and most
+            here += max(speed * (0.03, 0.2)[is_most] * keyframes - gone, 0.0)
         return here + speed * self._ahead(size, 0, is_most)
 
     def _enter(self, stage: str, now: float) -> None:
@@ -335,7 +329,7 @@ class LoggedTimeLeft:
         if now < self._due or entry.get("event") == "log":
             return
         seconds = self._left.seconds(now)
-        if seconds is None or seconds[1] < _MIN_TOLD_S:
+        if seconds is None or seconds[1] < 10.0:  # not worth a line
             return
         self._due = now + max(_MIN_BETWEEN_LINES_S, 0.1 * (now - self._began))
         logger.info("%s left", in_words(seconds))

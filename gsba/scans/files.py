@@ -24,8 +24,6 @@ _MAX_COORDINATE = 1e9  # in a scan's file
 _MIN_POINTS = 1000
 _MIN_PAIRS = 3
 _NUM_MESH_SAMPLES = 1_000_000  # points sampled on a mesh, before it is thinned
-_MIN_FLAT_SHARE = 0.1  # of points that are on planes: this quantile of the scatter is noise
-_MAX_SCATTER_RATIO = 3.5  # of a point's scatter to that noise, if its neighbours share a plane
 _VLR_BYTES, _EVLR_BYTES = 54, 60  # of the header of a variable-length record
 
 
@@ -331,6 +329,7 @@ def on_planes(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         offsets.append(np.einsum("ni,ni->n", axes[:, :, 0], middles - some))
         scatters.append(np.sqrt(np.maximum(values[:, 0], 0)))
     across, off, scatter = (np.concatenate(parts) for parts in (normals, offsets, scatters))
-    flat = scatter <= _MAX_SCATTER_RATIO * np.quantile(scatter, _MIN_FLAT_SHARE)
+    # a tenth of the points at least are on planes: their scatter is noise
+    flat = scatter <= 3.5 * np.quantile(scatter, 0.1)
     laid = points + np.where(flat, off, 0)[:, None] * across
     return laid, across, np.where(flat, 0, scatter)

@@ -22,7 +22,6 @@ _NUM_CANDIDATES = 16  # that are aligned to the scan
 _MAX_SCALE_RATIO = 1.2  # of fit to candidate: a larger change is a collapse
 _MIN_DISTANCE = 0.05  # of distinct fits, part of the cloud's size
 _MIN_SHARE = 0.25  # of explained points in the cloud
-_MIN_AGREEMENT = 0.75  # of explained points among explained and contradicted ones
 _MAX_DOUBT = 0.01  # largest p value of the lead over all rivals
 
 
@@ -153,7 +152,7 @@ def _check(found: Registration, reach: float) -> None:
             f"no placement explains the run: in the best, its points are {sigma:.3g} units (rms) "
             f"off the scan's surfaces, and {reach:.3g} are allowed: " + _ADVICE
         )
-    if evidence.share < _MIN_SHARE or evidence.agreement < _MIN_AGREEMENT:
+    if evidence.share < _MIN_SHARE or evidence.agreement < 0.75:
         raise NoPlacementError(
             f"no placement explains the run: in the best, {100 * evidence.share:.0f} % of its "
             f"points are on the scan's surfaces, and {100 * evidence.contradicted.mean():.0f} % "

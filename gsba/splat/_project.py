@@ -9,7 +9,6 @@ import numpy as np
 from factors.compiled import kernel_and_part
 
 DILATION = 0.3  # pixels^2 added to both variances: no splat is thinner than a pixel
-GUARD = 1.3  # slopes x / z beyond an image this much wider are clamped in the affine map
 _INVERSE_MIN_ALPHA = 255.0  # 1 / the smallest alpha that is blended, see _tiles.MIN_ALPHA
 
 _C0 = 0.28209479177387814
@@ -112,7 +111,8 @@ def _project_gaussian(camera, mean, log_scale, rotation, scales, at, slope, flat
     focal, z = camera[12], at[2]
     for r in range(2):
         half = 0.5 * camera[15 + r] / focal
-        middle, limit = half - camera[13 + r] / focal, GUARD * half
+        # slopes x / z beyond an image 1.3 times as wide are clamped in the affine map
+        middle, limit = half - camera[13 + r] / focal, 1.3 * half
         at[3 + r] = min(max(at[r] / z, middle - limit), middle + limit)
     for k in range(3):
         slope[0, k] = focal / z * (camera[k] - at[3] * camera[6 + k])

@@ -23,7 +23,6 @@ from gsba.splat.scene import cut_faces, cut_lens_faces
 from gsba.types import FrameSet
 
 MIN_ALPHA = 0.95  # least alpha of a rendered pixel that is used
-MAX_STEP = 0.1  # relative depth step between neighbouring pixels from which they are an edge
 _LUMA = np.array([0.299, 0.587, 0.114])
 
 
@@ -125,7 +124,8 @@ def render_view(
             for shift in (1, -1):
                 other = np.roll(image.depth, shift, axis)
                 low, high = np.minimum(low, other), np.maximum(high, other)
-        sure = (image.alpha > MIN_ALPHA) & ~(high - low > MAX_STEP * np.maximum(image.depth, 1e-9))
+        # neighbouring pixels whose depths differ by more than a tenth are an edge
+        sure = (image.alpha > MIN_ALPHA) & ~(high - low > 0.1 * np.maximum(image.depth, 1e-9))
         depth = image.depth[sure].astype(np.float64)
         offsets = (np.stack(grid, axis=-1)[sure] - camera.principal) / camera.focal
         local = np.column_stack([offsets, np.ones(len(offsets))]) * depth[:, None]

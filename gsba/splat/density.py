@@ -8,8 +8,7 @@ from gsba.geometry import rotation_from_quaternion
 from gsba.splat.adam import Moments
 from gsba.splat.gaussians import Gaussians, concatenate
 
-SPLIT_SHRINK = 1.6  # factor by which a split Gaussian's halves are smaller
-RESET_OPACITY = 0.01
+_DENSIFY_PULL = 2e-4  # gradient of a centre, focal lengths, from which a Gaussian becomes two
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,33 +30,26 @@ class Pull:
         self.counts[:] += seen
 
 
-@dataclass(frozen=True, slots=True)
-class DensityLimits:
-    """Thresholds of the density control."""
-
-    pull: float  # mean gradient from which a Gaussian is densified, focal lengths
-    clone_scale: float  # map units, smaller Gaussians are cloned, larger ones split
-    max_scale: float | None  # map units, larger Gaussians are pruned; None = no limit
-    min_opacity: float  # fainter Gaussians are pruned
-    max_gaussians: int  # limit; the strongest gradients are densified first
-
-
 def densify(
     gaussians: Gaussians,
     moments: Moments,
     pull: Pull,
-    limits: DensityLimits,
+    extent: float,
+    most: int,
+    prunes_huge: bool,
     rng: np.random.Generator,
 ) -> tuple[Gaussians, Moments, bool]:
-    """Clone small and split large Gaussians with strong gradients, then prune. Returns them, their
-    moments (zero for new ones), and True if the limit kept some out."""
+    """Clone small and split large Gaussians with strong gradients, up to `most` and the strongest
+    first, then prune faint and, if wanted, huge ones; thresholds are those of Kerbl et al., 2023,
+    relative to the cameras' extent, map units. Returns them, their moments (zero for new ones), and
+    True if the limit kept some out."""
     strength = pull.sums / np.maximum(pull.counts, 1)
-    chosen = np.flatnonzero(strength >= limits.pull)
-    room = max(limits.max_gaussians - len(gaussians), 0)
+    chosen = np.flatnonzero(strength >= _DENSIFY_PULL)
+    room = max(most - len(gaussians), 0)
     capped = len(chosen) > room
     if capped:
         chosen = np.sort(chosen[np.argsort(-strength[chosen], kind="stable")[:room]])
-    small = np.exp(gaussians.log_scales[chosen].max(axis=1)) <= limits.clone_scale
+    small = np.exp(gaussians.log_scales[chosen].max(axis=1)) <= 0.01 * extent
     halves = gaussians.select(np.repeat(chosen[~small], 2))
     scales = np.exp(halves.log_scales)
     within = scales * rng.standard_normal(scales.shape, dtype=np.float32)
@@ -66,16 +58,16 @@ def densify(
     halves = replace(
         halves,
         means=halves.means + shifts.astype(np.float32),
-        log_scales=halves.log_scales - np.float32(np.log(SPLIT_SHRINK)),
+        log_scales=halves.log_scales - np.float32(np.log(1.6)),  # a half is smaller by this factor
     )
     kept = np.ones(len(gaussians), bool)
     kept[chosen[~small]] = False
     new = concatenate([gaussians.select(chosen[small]), halves])
     gaussians = concatenate([gaussians.select(kept), new])
     moments = moments.select(kept).extended(new)
-    stays = 1 / (1 + np.exp(-gaussians.opacity_logits)) >= limits.min_opacity
-    if limits.max_scale is not None:
-        stays &= np.exp(gaussians.log_scales.max(axis=1)) <= limits.max_scale
+    stays = 1 / (1 + np.exp(-gaussians.opacity_logits)) >= 5e-3
+    if prunes_huge:
+        stays &= np.exp(gaussians.log_scales.max(axis=1)) <= 0.1 * extent
     if not stays.any():  # an empty splat could never recover
         return gaussians, moments, capped
     return gaussians.select(stays), moments.select(stays), capped
@@ -83,6 +75,6 @@ def densify(
 
 def reset_opacity(gaussians: Gaussians, moments: Moments) -> tuple[Gaussians, Moments]:
     """Make every Gaussian almost transparent, so that only necessary ones regain opacity."""
-    highest = np.float32(np.log(RESET_OPACITY / (1 - RESET_OPACITY)))
+    highest = np.float32(np.log(0.01 / (1 - 0.01)))
     logits = np.minimum(gaussians.opacity_logits, highest)
     return replace(gaussians, opacity_logits=logits), moments.without_opacity()

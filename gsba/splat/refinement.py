@@ -40,7 +40,6 @@ from gsba.store.records import load_checkpoint, save_record
 from gsba.types import Counts, FrameSet, Keypoints, Landmarks, Round, Solution
 
 _SH_DEGREE = 1  # of colours: low, so that views must agree on them
-_MAX_GAUSSIANS = 30_000  # enough for faces of these sizes
 _FIRST_STEPS = 400  # training steps before poses move at each size
 _STEPS = 150  # training steps after each move, before held-out panoramas compare the poses
 _MAX_MOVES = 3  # most updates of the poses at each size
@@ -165,7 +164,7 @@ class _Turns:
             iterations=len(chosen.sizes) * each,
             face_size=chosen.sizes[level],
             sh_degree=_SH_DEGREE,
-            max_gaussians=_MAX_GAUSSIANS,
+            max_gaussians=30_000,  # enough for faces of these sizes
             seed=self.settings.seed,
         )
 

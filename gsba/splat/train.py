@@ -18,7 +18,7 @@ from gsba.log import GsbaError, track
 from gsba.splat import adam
 from gsba.splat.backend import Backend, Lesson
 from gsba.splat.camera import FaceCamera
-from gsba.splat.density import DensityLimits, Pull, densify, reset_opacity
+from gsba.splat.density import Pull, densify, reset_opacity
 from gsba.splat.gaussians import Gaussians, num_parameters
 from gsba.splat.options import TrainingOptions
 from gsba.store.records import load_checkpoint, save_record
@@ -29,9 +29,6 @@ logger = logging.getLogger(__name__)
 _SSIM_WEIGHT = 0.2  # of the loss; the rest is the absolute difference of colours
 _RATE_ROTATIONS, _RATE_OPACITIES = 1e-3, 0.05  # learning rates
 _RATE_COLORS = 2.5e-3  # learning rate of degree 0; a twentieth for higher degrees
-_DENSIFY_PULL = 2e-4  # gradient of a centre, focal lengths, from which a Gaussian becomes two
-_DENSIFY_SCALE = 0.01  # smaller Gaussians are cloned, larger ones split
-_MIN_OPACITY, _MAX_SCALE = 5e-3, 0.1  # fainter or larger Gaussians are pruned
 _NEAR = 0.01  # near plane: nothing that a camera shows is closer
 _CHECKPOINT_EVERY_S = 60.0  # so that an interruption costs a minute at most
 
@@ -242,12 +239,11 @@ class Trainer:
     def advance(self, state: TrainingState, end: int) -> TrainingState:
         """Take a stretch of steps, at most to `end`; arrays of the state may be changed in
         place."""
-        times = self.times
         gaussians, moments, pull = state.gaussians, state.moments, state.pull
-        due = self.times
-        rhythms = (self.backend.stretch, due.densify_every, due.reset_every)
+        times = self.times
+        rhythms = (self.backend.stretch, times.densify_every, times.reset_every)
         stops = [end, *(state.step // every * every + every for every in rhythms)]
-        step = min([*stops, due.densify_until] if state.step < due.densify_until else stops)
+        step = min([*stops, times.densify_until] if state.step < times.densify_until else stops)
         lessons = (self._lesson(number) for number in range(state.step + 1, step + 1))
         wanted = self.densifying and step <= times.densify_until
         self.backend.descend(
@@ -255,7 +251,13 @@ class Trainer:
         )
         if wanted:
             if step > times.densify_from and step % times.densify_every == 0:
-                gaussians, moments = self._densify(state, step)
+                draw = np.random.default_rng([self.settings.seed, step, 1])
+                prunes_huge = step > times.reset_every
+                given = gaussians, moments, pull, self.extent, self.most, prunes_huge, draw
+                gaussians, moments, capped = densify(*given)
+                if capped and not self.capped:
+                    self.capped = True
+                    logger.warning("%d Gaussians are the most %s", self.most, self.limit)
                 pull = Pull.none(len(gaussians))
             if step % times.reset_every == 0 and step < times.densify_until:
                 gaussians, moments = reset_opacity(gaussians, moments)
@@ -285,20 +287,3 @@ class Trainer:
             ),
             number,
         )
-
-    def _densify(self, state: TrainingState, step: int) -> tuple[Gaussians, adam.Moments]:
-        limits = DensityLimits(
-            pull=_DENSIFY_PULL,
-            clone_scale=_DENSIFY_SCALE * self.extent,
-            max_scale=_MAX_SCALE * self.extent if step > self.times.reset_every else None,
-            min_opacity=_MIN_OPACITY,
-            max_gaussians=self.most,
-        )
-        draw = np.random.default_rng([self.settings.seed, step, 1])
-        gaussians, moments, capped = densify(
-            state.gaussians, state.moments, state.pull, limits, draw
-        )
-        if capped and not self.capped:
-            self.capped = True
-            logger.warning("%d Gaussians are the most %s", self.most, self.limit)
-        return gaussians, moments

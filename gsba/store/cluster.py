@@ -41,7 +41,6 @@ _QUEUES = {  # kind of address -> module and class that starts workers
     "kubernetes": ("dask_kubernetes.operator", "KubeCluster"),
 }
 _ADDRESS = re.compile(r"(tcp|tls|wss?|ucx)://[^\s/:][^\s/]*")
-_LATE_RATIO = 4.0  # of a shard's time over the median; a late shard is also given to another worker
 _MIN_LATE_S = 60.0  # shortest time after which a shard is late
 _MAX_ATTEMPTS = 5  # workers that may die on a shard
 _SCHEDULER_TIMEOUT_S = 20.0  # for a scheduler's first answer
@@ -337,7 +336,7 @@ class Cluster:
     def _help_if_late(self, shard: _Shard, seconds: float, lasted: list[float]) -> None:
         """Submit a shard that takes far longer than others to a second worker as well."""
         usual = statistics.median(lasted) if lasted else 0.0
-        if len(shard.futures) != 1 or seconds < max(_MIN_LATE_S, _LATE_RATIO * usual):
+        if len(shard.futures) != 1 or seconds < max(_MIN_LATE_S, 4.0 * usual):
             return
         if not self._client.nthreads():
             logger.warning("the scheduler has no workers left: waiting for new ones")

@@ -20,11 +20,7 @@ TURNING_SIGMAS, AGREEING_SIGMAS = 4.0, 3.0  # standard deviations: least rotatio
 MIN_TURNS = 4  # least number of steps that turn
 _MIN_EXPLAINED = 0.4  # least share of the turns that the right clock explains
 _SURE_EXPLAINED = 0.6  # share of the turns from which no other clocks are searched
-_MAX_NOISE_RAD = np.deg2rad(2.0)  # largest noise of a trajectory's steps per axis: by three
-# times as much, steps contradict the images (verify.max_rotation_deg)
 _MIN_GAIN = 0.2  # share of the turns by which another clock must explain more
-_OTHER_RATES = np.exp(np.delete(np.linspace(-1, 1, 81), 40) * np.log(10))  # spaced by twice what
-# the search around each of them reaches
 _MAX_NOISE_RATIO = 0.5  # largest noise of rotations under another rate, in that under the given one
 
 
@@ -102,7 +98,8 @@ def estimate_clock(
         _MAX_SIGMA_INTERVALS * interval, _MAX_SIGMA_S
     ):
         note = f"the camera turns too little to check the clock (uncertain by {certain:.2g} s)"
-    elif after < _MIN_EXPLAINED or noise(fit.residuals(best)) > _MAX_NOISE_RAD:
+    # by three times as much, steps contradict the images (see `TwoViewLimits`)
+    elif after < _MIN_EXPLAINED or noise(fit.residuals(best)) > np.deg2rad(2.0):
         note = "the trajectory's rotations fit the images at no clock offset: clock not checked"
     elif same:
         verdict = "agrees"
@@ -144,9 +141,11 @@ def other_rate(
 
     usual = ClockFit(turns, trajectory)
     before = usual.residuals(usual.refine(start))
+    # spaced by twice what the search around each of them reaches
+    rates = np.exp(np.delete(np.linspace(-1, 1, 81), 40) * np.log(10)).tolist()
     tried = [
         (fit.cost(p, noise(before)), rate, p)
-        for rate, fit in ((rate, at_rate(rate)) for rate in _OTHER_RATES.tolist())
+        for rate, fit in ((rate, at_rate(rate)) for rate in rates)
         for p in fit.candidates(start, turns.step)
     ]
     tried.sort(key=lambda one: one[0])

@@ -17,11 +17,9 @@ _MAX_CLOCKS, _MAX_RATES = 60_000, 100  # largest number of clocks on the grid, a
 # them
 LOSS_WIDTH_SIGMAS = 2.0  # width of the loss, standard deviations
 _MIN_SIGMA_RAD = np.deg2rad(0.03)  # least noise of a rotation per axis: images are no more accurate
-_MIN_GRID_SIGMA_RAD = np.deg2rad(1.0)  # least noise of a rotation on the grid
 _NOISE_QUANTILE, _UNIT_NOISE_QUANTILE = 0.4, 1.367  # quantile from which noise is estimated; its
 # value for unit Gaussian 3-vectors
 _NUM_SHIFTS = 41  # shifts within one step of the best, tried for its uncertainty
-_SIGMA_INFLATION = 3.0  # factor on standard deviations
 _CERTAIN_SIGMAS = 4.0  # standard deviations beyond which every shift must fit worse
 
 
@@ -85,7 +83,7 @@ class ClockFit:
         self._onward = _log(_product(_conjugate(self._at[:-1]), self._at[1:]))
         self._seen = _exp(turns.rotvecs)
         typical = float(np.quantile(np.linalg.norm(turns.rotvecs, axis=1), 0.75))
-        self._rough_sigma = max(0.5 * typical, _MIN_GRID_SIGMA_RAD)
+        self._rough_sigma = max(0.5 * typical, np.deg2rad(1.0))  # on the grid
 
     def residuals(self, parameters: np.ndarray) -> np.ndarray:
         """Rotation residuals (..., N, 3), radians, from the images' to the trajectory's, at shifts
@@ -169,7 +167,7 @@ class ClockFit:
         as_good = np.abs(shifts[losses < here + _CERTAIN_SIGMAS**2])
         spacing = float(shifts[1] - shifts[0])
         width = max(float(as_good.max(initial=0)) - spacing, 0.0) / _CERTAIN_SIGMAS
-        return larger * max(_SIGMA_INFLATION**2, width**2 / larger[0, 0])
+        return larger * max(3.0**2, width**2 / larger[0, 0])  # sigmas are three times as large
 
     def settle(self, parameters: np.ndarray, with_rate: bool = True) -> np.ndarray:
         """The best of the minima within a step: the trajectory's entries make the loss jagged."""

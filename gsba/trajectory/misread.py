@@ -12,8 +12,6 @@ from gsba.trajectory.steps import Steps, step_errors, tracked_steps
 from gsba.types import CoarsePoses
 
 _MIN_STEPS = 5  # least number of steps that judge a whole trajectory
-_LOOSE_LIMITS = {"max_rotation_deg": 20.0, "max_direction_deg": 60.0}  # thresholds of loose
-# agreement
 _MIN_EXPLAINED_SHARE = 0.7  # least share of steps that another convention must explain
 _COMMON_SYSTEMS = "right-up-back", "left-down-back", "left-up-forward"  # half turns: of graphics,
 # about the vertical axis, about the forward axis
@@ -78,7 +76,8 @@ def refuse_misread(coarse: CoarsePoses, found: Steps, settings: TwoViewLimits) -
 def refuse_misfit(coarse: CoarsePoses, found: Steps, settings: TwoViewLimits) -> None:
     """Refuse a trajectory that most steps of the images contradict, with the likely reason."""
     refuse_misread(coarse, found, settings)
-    judged, loose = found.directed & tracked_steps(coarse), replace(settings, **_LOOSE_LIMITS)
+    judged = found.directed & tracked_steps(coarse)
+    loose = replace(settings, max_rotation_deg=20.0, max_direction_deg=60.0)
     steps = relative_steps(coarse.world_T_rigs)
     # of random steps, a third agrees
     if judged.sum() < _MIN_STEPS or _agreeing_share(steps, found, judged, loose) > 0.5:

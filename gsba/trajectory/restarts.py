@@ -13,8 +13,6 @@ from gsba.types import CoarsePoses, FrameSet, PoseSource, Trajectory
 
 _log = logging.getLogger(__name__)
 
-_MIN_ENTRIES_BETWEEN_JUMPS = 12  # entries on either side without another jump: two nearby jumps are
-# false poses
 _IDENTITY_TOLERANCE = 1e-9  # no tracked pose is this close to the identity by chance
 _MIN_TURN_RAD = np.deg2rad(0.5)  # a smaller one is noise
 
@@ -111,7 +109,8 @@ def split_restarts(trajectory: Trajectory) -> list[Trajectory]:
     for n in range(1, len(poses)):
         fresh = exactly[n] and not exactly[n - 1]
         if n - 1 in jumps and nearly[n]:
-            fresh |= np.count_nonzero(np.abs(jumps - (n - 1)) <= _MIN_ENTRIES_BETWEEN_JUMPS) == 1
+            # another jump within 12 entries: poses between are false
+            fresh |= np.count_nonzero(np.abs(jumps - (n - 1)) <= 12) == 1
         if fresh and min(n - starts[-1], len(poses) - n) >= 3:
             starts.append(n)
     ends = [*starts[1:], len(poses)]

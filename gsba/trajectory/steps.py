@@ -11,10 +11,6 @@ from gsba.types import CoarsePoses, Keypoints, PoseSource, VerifiedPairs
 
 _MAX_LOG_DEVIATION = 0.15  # largest deviation of log ratios: points of rigid scenes are within it,
 # half of them within .02
-_MIN_TRIANGULATION_ANGLE_RAD = np.deg2rad(1.0)  # least triangulation angle of a point whose depth
-# is compared
-_MAX_STILL_RESIDUAL_RAD = np.deg2rad(0.1)  # median bearing residual after a mere rotation, below
-# which the camera stands still
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,8 +41,9 @@ def image_steps(pairs: VerifiedPairs, keypoints: Keypoints) -> Steps:
         rays0, bearings1 = keypoints.matched(pairs.matches.pairs[p], pairs.matches.of(p))
         f_T_nexts[f0], verified[f0], sigmas[f0] = f0_T_f1, True, pairs.direction_sigmas[p]
         turn = nearest_rotation(rays0.T @ bearings1)
-        if np.median(np.linalg.norm(rays0 - bearings1 @ turn.T, axis=1)) < _MAX_STILL_RESIDUAL_RAD:
-            f_T_nexts[f0, :3, :3] = turn  # an essential matrix determines it less well
+        if np.median(np.linalg.norm(rays0 - bearings1 @ turn.T, axis=1)) < np.deg2rad(0.1):
+            # The camera stands: an essential matrix determines its turn less well.
+            f_T_nexts[f0, :3, :3] = turn
     short = verified & ~np.isfinite(sigmas)
     if short.any():
         _set_short_directions(f_T_nexts, sigmas, short, verified, pairs)
@@ -191,12 +188,13 @@ def matches_of_steps(pairs: VerifiedPairs, num_frames: int) -> np.ndarray:
 
 
 def ray_depths(rays0: np.ndarray, rays1: np.ndarray, f0_T_f1: np.ndarray) -> np.ndarray:
-    """Depths (m,) along rays of frame 0 at which both rays meet; NaN if uncertain."""
+    """Depths (m,) along rays of frame 0 at which both rays meet; NaN if uncertain: behind a frame,
+    or at an angle of less than a degree."""
     across = rays1 @ f0_T_f1[:3, :3].T
     cosine = np.einsum("mi,mi->m", rays0, across)
     sine2 = 1 - cosine**2
     along0, along1 = rays0 @ f0_T_f1[:3, 3], across @ f0_T_f1[:3, 3]
-    clear = sine2 > np.sin(_MIN_TRIANGULATION_ANGLE_RAD) ** 2
+    clear = sine2 > np.sin(np.deg2rad(1.0)) ** 2
     safe = np.where(clear, sine2, 1)
     depth0, depth1 = (along0 - cosine * along1) / safe, (cosine * along0 - along1) / safe
     return np.where(clear & (depth0 > 0) & (depth1 > 0), depth0, np.nan)

@@ -147,7 +147,11 @@ def faces_of(
     if masked and use is not None and frames.mask_paths[f] is not None:
         images = _tinted(images, use)
     names = kind.faces or FACES
-    return {name: _shrunk(images[FACES.index(name)]) for name in names}
+    images = [images[FACES.index(name)] for name in names]
+    if rig.size > _MAX_FACE_PX:
+        size = _MAX_FACE_PX, _MAX_FACE_PX
+        images = [cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in images]
+    return dict(zip(names, images, strict=True))
 
 
 def views_of(frames: FrameSet, f: int, optics: Optics) -> tuple[View, ...]:
@@ -160,12 +164,6 @@ def _tinted(image: np.ndarray, use: np.ndarray) -> np.ndarray:
     red = _MASK_SHARE * np.array([192, 57, 43])
     tinted = np.round((1 - _MASK_SHARE) * image + red).astype(np.uint8)
     return np.where(use[..., None], image, tinted)
-
-
-def _shrunk(image: np.ndarray) -> np.ndarray:
-    if len(image) <= _MAX_FACE_PX:
-        return image
-    return cv2.resize(image, (_MAX_FACE_PX, _MAX_FACE_PX), interpolation=cv2.INTER_AREA)
 
 
 def _latest_placement(run: Path) -> tuple[Placement, str]:

@@ -16,7 +16,6 @@ from gsba.view.scene import RunScene
 
 if TYPE_CHECKING:
     import viser  # pyright: ignore[reportMissingImports]
-if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
     from websockets.http11 import Request, Response
 

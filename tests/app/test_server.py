@@ -205,8 +205,8 @@ def test_forms_come_from_the_commands() -> None:
     kinds = {field.name: field.kind for field in refine.fields}
     assert (kinds["fresh"], kinds["fps"], kinds["masks"]) == ("flag", "number", "path")
     known = choices()
-    assert {"fast", "accurate"} <= {name for name, _ in known.presets}
-    for target in (*known.programs, *known.formats):
+    assert {"fast", "accurate"} <= {name for name, _ in known["presets"]}
+    for target in (*known["programs"], *known["formats"]):
         check(["export", "run", "--to", target])
     with pytest.raises(GsbaError, match="has no option nope"):
         Form("refine", "", ()).arguments({"nope": 1})

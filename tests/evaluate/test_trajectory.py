@@ -39,10 +39,6 @@ def _moved(trajectory: Trajectory, scale: float, seed: int = 2) -> Trajectory:
     return Trajectory(trajectory.timestamps, world @ scaled)
 
 
-def _angle_deg(a: np.ndarray, b: np.ndarray) -> float:
-    return np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b))
-
-
 def _reference_auc(estimate: Trajectory, truth: Trajectory) -> dict[float, float]:
     """All pairs one by one, and the curve in the words of the literature."""
     errors = []
@@ -51,7 +47,9 @@ def _reference_auc(estimate: Trajectory, truth: Trajectory) -> dict[float, float
             e = inverse(estimate.world_T_rigs[i]) @ estimate.world_T_rigs[j]
             t = inverse(truth.world_T_rigs[i]) @ truth.world_T_rigs[j]
             rotation = np.degrees(Rotation.from_matrix(e[:3, :3].T @ t[:3, :3]).magnitude())
-            errors.append(max(rotation, _angle_deg(e[:3, 3], t[:3, 3])))
+            a, b = e[:3, 3], t[:3, 3]
+            angle = np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b))
+            errors.append(max(rotation, angle))
     errors = np.array([0.0, *sorted(errors)])
     recall = np.arange(len(errors)) / (len(errors) - 1)
     fine = {}

@@ -17,12 +17,13 @@ from synthetic import unit
 from two_fisheyes import made_pair, picture, write
 
 from gsba.camera.lens import Lenses
+from gsba.camera.rig import RIG_R_FACE
 from gsba.export import ExportFormat, ExportOptions, export_all
 from gsba.export.photos import PhotoCamera, Photos, PlacedPhoto
 from gsba.frames.held_out import held_out_rows
 from gsba.geometry import pose
 from gsba.splat.gaussians import Gaussians, read_ply, write_ply
-from gsba.types import FrameSet, PictureFormat
+from gsba.types import FACES, FrameSet, PictureFormat
 
 pytestmark = [pytest.mark.consumers, pytest.mark.filterwarnings("ignore")]  # of the programs
 
@@ -90,14 +91,6 @@ def _frame_name(f: int) -> str:
     return f"frame_{f:04d}"
 
 
-def _faces() -> dict[str, np.ndarray]:
-    """Rotation rig_R_face by name of the face."""
-    from gsba.camera.rig import RIG_R_FACE
-    from gsba.types import FACES
-
-    return dict(zip(FACES, RIG_R_FACE, strict=True))
-
-
 @pytest.mark.parametrize("to", ["nerfstudio", "colmap-flat"])
 def test_nerfstudio_reads_faces(to: str, exported: Path) -> None:
     train, test = (_read(exported / to, split) for split in ("train", "test"))
@@ -113,7 +106,7 @@ def test_nerfstudio_reads_faces(to: str, exported: Path) -> None:
             if not _frame_of(path):
                 continue
             world_T_rig = poses()[int(_frame_of(path)[-4:])]
-            rig_R_face = _faces()[path.stem.rpartition("_")[2]]
+            rig_R_face = RIG_R_FACE[FACES.index(path.stem.rpartition("_")[2])]
             centre, directions = _rays(outputs, number, pixels)
             np.testing.assert_allclose(centre, world_T_rig[:3, 3], atol=1e-5)
             local = np.column_stack([pixels / 32 - 1, np.ones(len(pixels))])

@@ -26,13 +26,10 @@ def _pixels(path: Path) -> np.ndarray:
     return np.array(Image.open(path)).astype(int)
 
 
-def _by_name(folder: Path, suffix: str) -> dict[str, np.ndarray]:
-    return {path.stem: _pixels(path) for path in sorted(folder.glob(f"*{suffix}"))}
-
-
 def test_3dgrut_and_instant_ngp_find_masks_beside_images(tmp_path: Path) -> None:
     frames = panoramas(tmp_path / "frames", masked=True).taken(ROWS)
-    plain = _by_name(_exported("gsplat", tmp_path / "plain", frames) / "masks", ".png")
+    masks = (_exported("gsplat", tmp_path / "plain", frames) / "masks").glob("*.png")
+    plain = {path.stem: _pixels(path) for path in masks}
     assert len(plain) == 12 and {0, 255} == set(np.unique(list(plain.values())))
     grut = _exported("3dgrut", tmp_path / "grut", frames)
     ngp = _exported("instant-ngp", tmp_path / "ngp", frames)

@@ -3,6 +3,7 @@
 import csv
 import json
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -20,8 +21,8 @@ from export_scene import (
     picture,
     poses,
     reconstruction,
+    seen_by_lenses,
 )
-from observing import observing
 from pixels import pixel_centres
 from scipy.spatial.transform import Rotation, Slerp
 from synthetic import unit
@@ -35,7 +36,7 @@ from gsba.export.dataset import MaskStyle
 from gsba.geometry import inverse, pose
 from gsba.log import GsbaError
 from gsba.trajectory.files import read_trajectory
-from gsba.types import FrameSet, PictureFormat, Reconstruction
+from gsba.types import FrameSet, PictureFormat
 
 TWO = Lenses(np.array([0.01, -0.02, 0.2]), band_rad=np.deg2rad(3))
 TURNED = replace(TWO, axes=Rotation.from_rotvec(0.3 * np.eye(3)).as_matrix().repeat(3, axis=0))
@@ -56,14 +57,7 @@ def _local() -> np.ndarray:
     return (POINTS - poses()[:, None, :3, 3]) @ poses()[:, :3, :3]
 
 
-def _scene(lenses: Lenses) -> Reconstruction:
-    """Every point that is not at the seam, as the ray by which the lens that faces it sees it."""
-    plain, local = reconstruction(), np.swapaxes(_local(), 0, 1).reshape(-1, 3)
-    shown = unit(lenses.seeing(local, plain.observation_frames))
-    rays, origins = lenses.rays(shown, plain.observation_frames)
-    clear = ~replace(lenses, band_rad=0.05).blended(shown, plain.observation_frames)
-    own = {"observation_bearings": rays[clear], "observation_origins": origins[clear]}
-    return observing(plain, clear, **own, lens_baseline=(0.4, 0.001))
+_scene = partial(seen_by_lenses, band_rad=0.05)  # points that are not at the seam
 
 
 def _raw_frames(folder: Path) -> FrameSet:

@@ -1,6 +1,5 @@
 """Pictures of several datasets at once: the same bytes as one by one, each frame read once."""
 
-import hashlib
 import tracemalloc
 from collections import Counter
 from collections.abc import Callable
@@ -10,7 +9,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from export_scene import HEIGHT, NUM_FRAMES, WIDTH, cube_frames, panoramas, reconstruction
+from export_scene import (
+    HEIGHT,
+    NUM_FRAMES,
+    WIDTH,
+    contents,
+    cube_frames,
+    panoramas,
+    reconstruction,
+)
 from scipy.spatial.transform import Rotation
 from shard_jobs import Parts
 
@@ -52,14 +59,6 @@ def _frames(folder: Path, kind: str) -> FrameSet:
     return frames
 
 
-def _written(folder: Path) -> dict[str, str]:
-    return {
-        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in folder.rglob("*")
-        if path.is_file()
-    }
-
-
 def _count(monkeypatch: pytest.MonkeyPatch, module, name: str) -> Counter:
     """How often each file is decoded from there."""
     decode, counts = getattr(module, name), Counter()
@@ -93,7 +92,7 @@ def test_files_are_the_same_together_and_alone(tmp_path, monkeypatch, kind, lens
     _threads(monkeypatch, 1)
     for to in FORMATS:
         export(scene, frames, tmp_path / "one" / to, to, 64, lenses=lenses)
-    together, alone = _written(tmp_path / "all"), _written(tmp_path / "one")
+    together, alone = contents(tmp_path / "all"), contents(tmp_path / "one")
     assert together == alone and len(together) > 80
 
 
@@ -172,7 +171,7 @@ def test_parts_write_what_the_whole_does(tmp_path, kind, lenses, to, chosen):
     scene = replace(scene, observation_origins=origins)
     export(scene, frames, whole, ExportFormat(to), **options)
     export(scene, frames, parts, ExportFormat(to), **options, workers=Parts(1))
-    assert _written(whole) == _written(parts)
+    assert contents(whole) == contents(parts)
 
 
 def test_whoever_is_late_makes_no_folders(tmp_path):

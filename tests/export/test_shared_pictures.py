@@ -8,7 +8,7 @@ import pycolmap
 import pytest
 from command import run_gsba
 from dask_workers import some_workers
-from export_scene import NUM_FRAMES, panoramas, reconstruction
+from export_scene import NUM_FRAMES, contents, panoramas, reconstruction
 from shard_jobs import DiesWriting
 from tiny_run import Case
 
@@ -36,14 +36,6 @@ def client() -> Iterator["Client"]:
         yield client
 
 
-def _written(folder: Path) -> dict[str, bytes]:
-    return {
-        path.relative_to(folder).as_posix(): path.read_bytes()
-        for path in folder.rglob("*")
-        if path.is_file()
-    }
-
-
 def test_killed_workers_leave_no_trace(client, tmp_path: Path, monkeypatch) -> None:
     frames = panoramas(tmp_path / "frames", ".jpg", masked=True)
     here, there = ({to: tmp_path / who / to for to in FORMATS} for who in ("here", "there"))
@@ -61,7 +53,7 @@ def test_killed_workers_leave_no_trace(client, tmp_path: Path, monkeypatch) -> N
     assert (tmp_path / "there" / "died").exists()
     (tmp_path / "there" / "died").unlink()
     assert sum(spent.shards.values()) == 5 and spent.cpu_seconds > 0
-    assert _written(tmp_path / "here") == _written(tmp_path / "there")
+    assert contents(tmp_path / "here") == contents(tmp_path / "there")
     model = pycolmap.Reconstruction(there[ExportFormat.COLMAP] / "sparse/0")
     assert model.num_images() == 6 * NUM_FRAMES
     for image in model.images.values():
@@ -91,5 +83,5 @@ def test_a_finished_run_is_exported_by_workers(case: Case, client, tmp_path: Pat
     for out, more in (("here", ()), ("there", ("--cluster", address))):
         arguments = ["export", case.out, "--to", "nerfstudio", "--out", tmp_path / out, *more]
         assert run_gsba(*arguments).exit_code == 0
-    assert _written(tmp_path / "here") == _written(tmp_path / "there")
+    assert contents(tmp_path / "here") == contents(tmp_path / "there")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["here", "there"]

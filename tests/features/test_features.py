@@ -28,12 +28,6 @@ def _blobs(centres: np.ndarray, size: int = SIZE, spread: float = 3.0) -> np.nda
     return np.repeat(np.rint(image)[..., None], 3, axis=-1).astype(np.uint8)
 
 
-def _grid(rng: np.random.Generator) -> np.ndarray:
-    """Centres (25, 2) far from one another, at sub-pixel positions."""
-    cells = np.stack(np.meshgrid(np.arange(5), np.arange(5)), axis=-1).reshape(-1, 2)
-    return 36 + 45 * cells + rng.uniform(-0.5, 0.5, (25, 2))
-
-
 def _noise(rng: np.random.Generator, *shape: int) -> np.ndarray:
     """Texture with detail at several scales, uint8."""
     fine = rng.integers(0, 256, shape).astype(np.float32)
@@ -65,7 +59,8 @@ def test_contract_descriptors_share_one_length(make: Callable[[], Extractor]) ->
 
 @extractors
 def test_contract_keypoints_lie_where_the_image_has_them(make: Callable[[], Extractor]) -> None:
-    centres = _grid(np.random.default_rng(2))
+    cells = np.stack(np.meshgrid(np.arange(5), np.arange(5)), axis=-1).reshape(-1, 2)
+    centres = 36 + 45 * cells + np.random.default_rng(2).uniform(-0.5, 0.5, (25, 2))
     found = make()(_blobs(centres), None)
     distances = np.linalg.norm(found.pixels[:, None] - centres, axis=2)
     nearest = distances.argmin(axis=0)

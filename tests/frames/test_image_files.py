@@ -76,10 +76,6 @@ def save_tiff(
     return path
 
 
-def grey_of(rgb: np.ndarray) -> np.ndarray:
-    return cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-
-
 def check(path: Path, wanted: np.ndarray, off: int) -> None:
     """A file holds pixels RGB, also in grey, to so many levels."""
     size = wanted.shape[1::-1]
@@ -89,7 +85,7 @@ def check(path: Path, wanted: np.ndarray, off: int) -> None:
     assert np.abs(found.astype(int) - wanted).max() <= off
     grey = decode(path, size, gray=True)
     assert grey.shape == wanted.shape[:2]
-    assert np.abs(grey.astype(int) - grey_of(wanted)).max() <= off + 1
+    assert np.abs(grey.astype(int) - cv2.cvtColor(wanted, cv2.COLOR_RGB2GRAY)).max() <= off + 1
 
 
 @pytest.mark.parametrize("name", KINDS)

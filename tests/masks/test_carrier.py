@@ -37,17 +37,13 @@ def _outline() -> np.ndarray:
     return bag | (stick & (v > 0.68 * HEIGHT))
 
 
-def _rays() -> np.ndarray:
-    grid = pixel_centres(WIDTH, HEIGHT)
-    return bearings_from_erp(grid, WIDTH, HEIGHT)
-
-
 @cache
 def _box(plain_floor: bool, speed: float) -> list[np.ndarray]:
     """Panoramas (H, W, 3) float of a walk through a textured box."""
     noise = cv2.GaussianBlur(np.random.default_rng(0).normal(size=(256, 256, 3)), (0, 0), 2.5)
     texture = np.clip(128 + 45 * noise / noise.std(), 0, 255).astype(np.float32)
-    rays, images = _rays(), []
+    rays = bearings_from_erp(pixel_centres(WIDTH, HEIGHT), WIDTH, HEIGHT)
+    images = []
     for f in range(NUM):
         centre = np.array([speed * f - 1.7, 0.1 * np.sin(f), 0.3 * np.cos(f)])
         walls = np.array([4.0, 1.6, 3.0])

@@ -43,11 +43,6 @@ def scene(
     ), camera
 
 
-def stacked(gaussians: Gaussians, camera: FaceCamera, **options) -> np.ndarray:
-    image, _ = render(gaussians, camera, **options)
-    return np.dstack([image.color, image.depth, image.alpha])
-
-
 def test_exponential() -> None:
     x = np.linspace(-79, 0, 100_001, dtype=np.float32)
     error = _tiles.exp_of(x) / np.exp(x.astype(np.float64)) - 1
@@ -59,7 +54,8 @@ def test_exponential() -> None:
 @pytest.mark.parametrize("degree", range(4))
 def test_image_is_that_of_the_dense_reference(seed: int, degree: int) -> None:
     gaussians, camera = scene(seed, 150, wide=seed > 1)
-    ours = stacked(gaussians, camera, sh_degree=degree, num_threads=2)
+    image, _ = render(gaussians, camera, sh_degree=degree, num_threads=2)
+    ours = np.dstack([image.color, image.depth, image.alpha])
     reference = dense_splat.render(gaussians, camera, degree)
     scale = np.array([1, 1, 1, 6, 1])  # depths reach 6
     # An alpha within rounding of 1/255 may fall on either side: such a pixel is off by 1/255.

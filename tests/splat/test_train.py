@@ -14,7 +14,7 @@ from gsba.log import GsbaError
 from gsba.splat import adam
 from gsba.splat.backend import CpuBackend, Lesson, choose_backend
 from gsba.splat.camera import view_camera
-from gsba.splat.density import DensityLimits, Pull, densify, reset_opacity
+from gsba.splat.density import Pull, densify, reset_opacity
 from gsba.splat.gaussians import Gaussians, from_cloud
 from gsba.splat.metrics import psnr
 from gsba.splat.options import TrainingOptions
@@ -24,7 +24,7 @@ from gsba.splat.train import Views, advance, begin, extent_of, most_gaussians, t
 SIZE = 32
 RIG = CubeRig(SIZE, np.pi / 2)
 SETTINGS = TrainingOptions(iterations=320, face_size=SIZE, sh_degree=1, seed=3)
-LIMITS = DensityLimits(2e-4, 0.1, 1.0, 5e-3, 1000)
+LIMITS = 10.0, 1000, True  # extent, most Gaussians, huge ones are pruned
 
 
 def scene() -> tuple[Gaussians, Views]:
@@ -183,7 +183,7 @@ def test_a_part_of_a_training_leaves_its_start_alone() -> None:
 def test_the_cap_is_kept_and_said(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gsba.splat.train._DENSIFY_PULL", 1e-9)
+    monkeypatch.setattr("gsba.splat.density._DENSIFY_PULL", 1e-9)
     truth, views = scene()
     tight = SETTINGS.model_copy(update={"max_gaussians": 155})
     sizes: list[int] = []
@@ -198,7 +198,7 @@ def test_a_cap_follows_from_pixels_and_memory(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """23 numbers a Gaussian; 6 views of 32 x 32 pixels have 18,432 values."""
-    monkeypatch.setattr("gsba.splat.train._DENSIFY_PULL", 1e-9)
+    monkeypatch.setattr("gsba.splat.density._DENSIFY_PULL", 1e-9)
     truth, views = scene()
     eager = SETTINGS.model_copy(update={"iterations": 600})
     backend = CpuBackend(1)
@@ -265,7 +265,7 @@ def grid(scales: list[float], pulls: list[float]) -> tuple[Gaussians, adam.Momen
 def test_small_are_cloned_and_large_are_split() -> None:
     gaussians, moments, pull = grid([0.05, 0.5, 0.5], [1, 1, 0])
     moments.first.means[:] = 1
-    found, after, capped = densify(gaussians, moments, pull, LIMITS, np.random.default_rng(0))
+    found, after, capped = densify(gaussians, moments, pull, *LIMITS, np.random.default_rng(0))
     assert not capped and len(found) == 5
     near = [np.flatnonzero(np.abs(found.means[:, 0] - x) < 3) for x in (0, 10, 20)]
     assert [len(rows) for rows in near] == [2, 2, 1]
@@ -278,17 +278,17 @@ def test_small_are_cloned_and_large_are_split() -> None:
 def test_faint_and_huge_are_pruned() -> None:
     gaussians, moments, pull = grid([0.05, 2.0, 0.05], [0, 0, 0])
     gaussians.opacity_logits[2] = -7
-    found, _, _ = densify(gaussians, moments, pull, LIMITS, np.random.default_rng(0))
+    found, _, _ = densify(gaussians, moments, pull, *LIMITS, np.random.default_rng(0))
     assert found.means[:, 0].tolist() == [0]
     gaussians.opacity_logits[:] = -7
-    found, _, _ = densify(gaussians, moments, pull, LIMITS, np.random.default_rng(0))
+    found, _, _ = densify(gaussians, moments, pull, *LIMITS, np.random.default_rng(0))
     assert len(found) == 3  # rather than none
 
 
 def test_strongest_pulls_come_first_under_the_cap() -> None:
     gaussians, moments, pull = grid([0.05] * 4, [1, 3, 2, 4])
-    limits = dataclasses.replace(LIMITS, max_gaussians=6)
-    found, _, capped = densify(gaussians, moments, pull, limits, np.random.default_rng(0))
+    given = gaussians, moments, pull, 10.0, 6, True, np.random.default_rng(0)
+    found, _, capped = densify(*given)
     assert capped and found.means[4:, 0].tolist() == [10, 30]
 
 

@@ -15,7 +15,6 @@ from gsba.log import GsbaError
 from gsba.masks.merging import choose
 from gsba.pipeline.inputs import extract_video
 from gsba.store import RunStore
-from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.video import extract
 
 pytest.importorskip("av", reason="PyAV is not installed")
@@ -56,13 +55,8 @@ def test_bad_input_fails_before_decoding(tmp_path: Path) -> None:
     (tmp_path / "walk.mp4").write_bytes(b"no video")
     with pytest.raises(GsbaError, match=r"nowhere\.tum"):
         refine(tmp_path / "walk.mp4", tmp_path / "nowhere.tum", tmp_path / "run")
-    write_tum(tmp_path / "slam.tum", read_trajectory(_two_poses(tmp_path / "two.tum")))
+    (tmp_path / "slam.tum").write_text("0 0 0 0 0 0 0 1\n1 1 0 0 0 0 0 1\n")
     with pytest.raises(GsbaError, match=r"walk\.mp4: cannot be read as video"):
         refine(tmp_path / "walk.mp4", tmp_path / "slam.tum", tmp_path / "run")
     with pytest.raises(GsbaError, match="--fps 0: must be a positive"):
         refine(tmp_path / "walk.mp4", tmp_path / "slam.tum", tmp_path / "run", fps=0)
-
-
-def _two_poses(path: Path) -> Path:
-    path.write_text("0 0 0 0 0 0 0 1\n1 1 0 0 0 0 0 1\n")
-    return path
