@@ -55,6 +55,15 @@ class Sim3:
         """Points (N, 3) transformed from the new world to the old one."""
         return (new - self.translation) @ self.rotation / self.scale
 
+    def moved(self, step: np.ndarray, about: np.ndarray) -> "Sim3":
+        """This one, then a step (7,) about a point (3,) of the new world: rotation vector, radians,
+        translation, and logarithm of the scale."""
+        from scipy.spatial.transform import Rotation
+
+        turn, stretch = Rotation.from_rotvec(step[:3]).as_matrix(), float(np.exp(step[6]))
+        shift = stretch * turn @ (self.translation - about) + about + step[3:6]
+        return Sim3(stretch * self.scale, turn @ self.rotation, shift)
+
     def poses(self, old_T_rigs: np.ndarray) -> np.ndarray:
         """Poses (..., 4, 4) transformed from the old world to the new one."""
         positions = self.scale * old_T_rigs[..., :3, 3] @ self.rotation.T + self.translation

@@ -14,10 +14,8 @@ from gsba.containers.insta360 import STANDARD_GRAVITY
 from gsba.geometry import median_direction, nearest_rotation, pose
 from gsba.imu.readings import Readings, Sensor
 from gsba.trajectory.clock import (
-    AGREEING_SIGMAS,
     MIN_STEPS,
     MIN_TURNS,
-    TURNING_SIGMAS,
     Clock,
     simplest,
 )
@@ -158,11 +156,6 @@ class _Candidate:
                 break
         return one
 
-    def explained(self, turning: np.ndarray, sigma: float) -> float:
-        """Share of the turns `turning (n,)` that the gyro explains within the noise."""
-        off = np.linalg.norm(self.fit.residuals(self.parameters), axis=1)
-        return float(np.mean(off[turning] < AGREEING_SIGMAS * sigma)) if turning.any() else 0.0
-
 
 def _sensor_and_axes(turns: Turns, turned: np.ndarray) -> tuple[Sensor, np.ndarray, float]:
     """Bias and scales, axes (3, 3) and their sigma, by sensor and image rotations (n, 3)."""
@@ -233,8 +226,7 @@ def _with_reason(
     """The alignment of the best candidate, with the reason if it is rejected."""
     fit, parameters, turns = best.fit, best.parameters, best.turns
     sigma = noise(fit.residuals(parameters))
-    turning = np.linalg.norm(turns.rotvecs, axis=1) > TURNING_SIGMAS * sigma
-    share = best.explained(turning, sigma)
+    share = fit.explained(parameters, sigma)
     begin = turns.middle - timestamps[0]
     offset = parameters[0] - (parameters[1] - 1) * begin
     # steady gyros on the move are no better
@@ -249,11 +241,11 @@ def _with_reason(
         counts,
     )
     rivals = [o for o in others if abs(o.parameters[0] - parameters[0]) > turns.step]
-    rival = max((one.explained(turning, sigma) for one in rivals), default=0.0)
+    rival = max((one.fit.explained(one.parameters, sigma) for one in rivals), default=0.0)
     # a tenth of the steps must turn by a degree
     if np.quantile(np.linalg.norm(turns.rotvecs, axis=1), 0.9) < np.deg2rad(1.0):
         return replace(found, reason="the camera turns too little to determine the gyro's clock")
-    if share < _MIN_EXPLAINED or turning.sum() < MIN_TURNS:
+    if share < _MIN_EXPLAINED or fit.turning(sigma).sum() < MIN_TURNS:
         return replace(found, reason="the gyro's rotations fit the images at no clock offset")
     if rival > 0.75 * share:  # share of the best offset's explained turns that no rival may reach
         return replace(found, reason="the gyro's rotations fit the images at several clock offsets")

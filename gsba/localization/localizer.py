@@ -232,9 +232,8 @@ class Localizer:
             if len(candidates) < _MIN_POINTS:
                 return LocalizedFrame.refused(name, NO_PLACE), None
             rows, origins = candidates.keypoints, query.origins_rig
-            seen = PointSightings(
-                candidates.points_world,
-                self.map.point_covariances[candidates.points],
+            seen = self.map.sightings(
+                candidates.points,
                 query.bearings[rows],
                 isotropic(query.features.sigmas_rad[rows]),
                 None if origins is None else origins[rows],
@@ -276,23 +275,13 @@ class Localizer:
         bearings, origins = field.corrected(found.bearings), None
         if lenses:
             bearings, origins = lenses.rays(bearings, np.zeros(len(bearings), np.int64))
-        points = self.map.result.points_world[found.points]
-        uncertain = self.map.point_covariances[found.points]
-        seen = PointSightings(points, uncertain, bearings, found.covariances, origins)
+        seen = self.map.sightings(found.points, bearings, found.covariances, origins)
         fitted = fit([seen], frame.world_T_rig[None], FINE)
-        world_T_rig, inliers = fitted.world_T_rigs[0], fitted.inliers[0]
-        if not np.isfinite(fitted.covariances[0]).all() or inliers.sum() < _MIN_POINTS:
+        world_T_rig, num = fitted.world_T_rigs[0], int(fitted.inliers[0].sum())
+        if not np.isfinite(fitted.covariances[0]).all() or num < _MIN_POINTS:
             return frame
         noise = float(fitted.noises[0]) * typical_sigma(found.covariances)
-        num = int(inliers.sum())
-        return replace(
-            frame,
-            world_T_rig=world_T_rig,
-            covariance=fitted.covariances[0],
-            num_points=num,
-            noise_rad=noise,
-            nearest=self.nearest_keyframe(world_T_rig),
-        )
+        return self.frame_at(frame.name, world_T_rig, fitted.covariances[0], num, noise)
 
     def _own_lenses(self, camera: int) -> Lenses:
         """Lenses of a picture whose motion during the readout is not known."""
@@ -375,19 +364,22 @@ class Localizer:
             return LocalizedFrame.refused(name, NO_PLACE)
         if not is_determined(world_T_rig, covariance, candidates.points_world[inliers]):
             return LocalizedFrame.refused(name, NOT_DETERMINED)
-        return LocalizedFrame(
-            name,
-            world_T_rig,
-            covariance,
-            len(np.unique(candidates.points[inliers])),
-            sigma,
-            self.nearest_keyframe(world_T_rig),
-            "",
-        )
+        num = len(np.unique(candidates.points[inliers]))
+        return self.frame_at(name, world_T_rig, covariance, num, sigma)
 
-    def nearest_keyframe(self, world_T_rig: np.ndarray) -> str:
-        """Name of the keyframe nearest to a pose (4, 4)."""
-        return self.map.frames.names[int(self.map.nearest(world_T_rig, 1)[0])]
+    def frame_at(
+        self,
+        name: str,
+        world_T_rig: np.ndarray,
+        covariance: np.ndarray,
+        num_points: int,
+        noise_rad: float,
+        camera: int | None = None,
+    ) -> LocalizedFrame:
+        """A frame in the map, and its nearest keyframe."""
+        nearest = self.map.frames.names[int(self.map.nearest(world_T_rig, 1)[0])]
+        given = world_T_rig, covariance, num_points, noise_rad, nearest
+        return LocalizedFrame(name, *given, reason="", camera=camera)
 
 
 def typical_sigma(covariances: np.ndarray) -> float:

@@ -268,8 +268,7 @@ def _sightings(
     by_bearing = cut_by.jacobians(features.bearings_rig[rows])[0]
     spreads = by_bearing @ np.swapaxes(by_bearing, 1, 2)
     spreads *= features.sigmas_rad[rows, None, None] ** 2
-    covariances = localizer.map.point_covariances[candidates.points]
-    return PointSightings(candidates.points_world, covariances, pixels[rows], spreads, camera=0)
+    return localizer.map.sightings(candidates.points, pixels[rows], spreads, camera=0)
 
 
 def _fit_together(
@@ -342,9 +341,7 @@ def _on_patches(
         tangent_basis(found.bearings), 1, 2
     )
     spreads = axes @ found.covariances @ np.swapaxes(axes, 1, 2)
-    points = map_.result.points_world[found.points]
-    uncertain = map_.point_covariances[found.points]
-    return PointSightings(points, uncertain, pixels, spreads, camera=before.camera)
+    return map_.sightings(found.points, pixels, spreads, camera=before.camera)
 
 
 def _judged(
@@ -357,16 +354,7 @@ def _judged(
         return LocalizedFrame.refused(name, NOT_DETERMINED)
     focal = _perspective(fitted.projections[camera]).focal
     noise = float(fitted.noises[number]) * typical_sigma(seen.spreads) / focal
-    frame = LocalizedFrame(
-        name,
-        pose,
-        covariance,
-        int(inliers.sum()),
-        noise,
-        localizer.nearest_keyframe(pose),
-        "",
-        camera,
-    )
+    frame = localizer.frame_at(name, pose, covariance, int(inliers.sum()), noise, camera)
     return localizer.with_map_error(frame)
 
 

@@ -18,6 +18,7 @@ from gsba.config import RefineSettings
 from gsba.config_file import load_config
 from gsba.features.detection import Extractor, extract, gather
 from gsba.frames import cubemap
+from gsba.localization.known_points import PointSightings
 from gsba.log import GsbaError
 from gsba.matching.guided_search import Searchable, principal_axes, searchable
 from gsba.store.finished import load_cameras, load_run
@@ -148,6 +149,18 @@ class RunMap:
             own = cameras == camera
             found[own] = field.observed(directions[own])
         return found
+
+    def sightings(
+        self,
+        points: np.ndarray,
+        measured: np.ndarray,
+        spreads: np.ndarray,
+        origins_rig: np.ndarray | None = None,
+        camera: int | None = None,
+    ) -> PointSightings:
+        """Points (N,) of the map in a picture; for the rest see `PointSightings`."""
+        positions, covariances = self.result.points_world[points], self.point_covariances[points]
+        return PointSightings(positions, covariances, measured, spreads, origins_rig, camera)
 
     def make_extractor(self) -> Extractor:
         """Extractor of the kind that found the run's keypoints."""

@@ -177,17 +177,19 @@ def refined(meetings: list[Meeting], start: Sim3, poses: np.ndarray) -> Sim3:
 
     residuals = _residuals_of(_inliers_of(meetings, start, poses), poses)
     given = {"loss": "soft_l1", "f_scale": np.deg2rad(_LOSS_DEG)}
-    x = least_squares(lambda x: residuals(nudged(start, x)).ravel(), np.zeros(7), **given).x
-    return nudged(start, x)
+    about = start.translation
+    x = least_squares(lambda x: residuals(start.moved(x, about)).ravel(), np.zeros(7), **given).x
+    return start.moved(x, about)
 
 
 def similarity_covariance(meetings: list[Meeting], move: Sim3, poses: np.ndarray) -> np.ndarray:
-    """Covariance (7, 7) of a similarity that `refined` has found, of the parameters of `nudged`.
+    """Covariance (7, 7) of a similarity that `refined` has found, of a step of `Sim3.moved`
+    about its translation.
 
     Points of one meeting have common errors: residuals count as correlated within a meeting, and
     as independent between meetings (Liang and Zeger, Biometrika 73(1), 1986).
     """
-    step, every = 1e-6, _inliers_of(meetings, move, poses)
+    step, about, every = 1e-6, move.translation, _inliers_of(meetings, move, poses)
     normal, scores = np.zeros((7, 7)), np.zeros((7, 7))
     for meeting in every:
         residuals = _residuals_of([meeting], poses)
@@ -195,7 +197,7 @@ def similarity_covariance(meetings: list[Meeting], move: Sim3, poses: np.ndarray
         if not len(found):
             continue
         columns = [
-            (residuals(nudged(move, x)) - residuals(nudged(move, -x))) / (2 * step)
+            (residuals(move.moved(x, about)) - residuals(move.moved(-x, about))) / (2 * step)
             for x in step * np.eye(7)
         ]
         jacobian = np.stack([column.ravel() for column in columns], axis=1)
@@ -207,15 +209,6 @@ def similarity_covariance(meetings: list[Meeting], move: Sim3, poses: np.ndarray
     few = len(every) / max(len(every) - 7, 1)  # residuals of few meetings are fitted away
     inverse_ = np.linalg.pinv(normal)
     return few * inverse_ @ scores @ inverse_
-
-
-def nudged(move: Sim3, x: np.ndarray) -> Sim3:
-    """A similarity changed by (7,): rotation vector from the left, radians, change of the
-    translation, and of the logarithm of the scale."""
-    from scipy.spatial.transform import Rotation
-
-    rotation = Rotation.from_rotvec(x[:3]).as_matrix() @ move.rotation
-    return Sim3(move.scale * float(np.exp(x[6])), rotation, move.translation + x[3:6])
 
 
 def _residuals_of(meetings: list[Meeting], poses: np.ndarray) -> Callable[[Sim3], np.ndarray]:

@@ -22,7 +22,6 @@ from gsba.parts.jobs import (
     Linearize,
     Linearized,
     Move,
-    PartPoints,
     Shared,
     Substitute,
     version_file,
@@ -340,15 +339,6 @@ def optimize_divided(
     result = minimize(system, values, options, callback)
     system.finish(result.values)
     return result
-
-
-def read_landmarks(folder: Path, part: int) -> tuple[np.ndarray, np.ndarray]:
-    """Landmarks of a part of a map that `optimize_divided` has solved: place (J,) int64 in the
-    stream that the map was written from, and (J, 3) float64, world. GsbaError if it is not solved
-    yet."""
-    version = load(folder / _RESULT, SolverState).version
-    points = load(version_file(folder, part, "points", version), PartPoints).points_world
-    return load_part(folder, part).numbers, points
 
 
 @threadpool_limits.wrap(limits=1, user_api="blas")

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from gsba.bundle.gps_factors import MAX_DRIFT_SHARE, FrameFixes
 from gsba.similarity import (
@@ -137,10 +136,7 @@ def _most_probable(
         step = np.zeros(7)
         step[rows] = inverse @ right[rows]
         step[0] = np.clip(step[0], -1, 1)
-        turn = Rotation.from_rotvec(step[1:4]).as_matrix()
-        grown, rotation = fit.scale * np.exp(step[0]), turn @ fit.rotation
-        placed = fit.points(centre[None])[0] + step[4:]
-        fit = Sim3(grown, rotation, placed - grown * rotation @ centre)
+        fit = fit.moved(np.roll(step, -1), about=fit.points(centre[None])[0])
         reach = np.array([1.0, 1, 1, 1, *[max(float(np.ptp(chosen.positions)), 1e-9)] * 3])
         if np.all(np.abs(step) <= _MIN_STEP * reach):
             break

@@ -206,17 +206,7 @@ def _step(fit: Sim3, cloud: Cloud, scan: Scan, noise: Noise) -> tuple[Sim3, floa
     moved = float(np.linalg.norm(step / units))
     if moved > 0.3 * size:
         step, moved = step * 0.3 * size / moved, 0.3 * size
-    return moved_by(fit, step, middle), moved
-
-
-def moved_by(fit: Sim3, step: np.ndarray, middle: np.ndarray) -> Sim3:
-    """Similarity followed by a step (7,) around a point `middle` (3,): rotation vector, translation
-    and log scale."""
-    from scipy.spatial.transform import Rotation
-
-    turn, stretch = Rotation.from_rotvec(step[:3]).as_matrix(), float(np.exp(step[6]))
-    shift = stretch * turn @ (fit.translation - middle) + middle + step[3:6]
-    return Sim3(stretch * fit.scale, turn @ fit.rotation, shift)
+    return fit.moved(step, middle), moved
 
 
 def cells_of(points: np.ndarray, edge: float) -> np.ndarray:

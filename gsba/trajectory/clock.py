@@ -15,8 +15,6 @@ MIN_STEPS = 5  # least number of steps that determine a clock
 _MAX_SIGMA_INTERVALS, _MAX_SIGMA_S = 0.25, 0.05  # largest standard deviation of a known clock: in
 # frame intervals, and in seconds
 _SIGNIFICANT_SIGMAS = 2.5  # standard deviations from 1 of a significant rate
-TURNING_SIGMAS, AGREEING_SIGMAS = 4.0, 3.0  # standard deviations: least rotation of a turn;
-# largest residual of agreement
 MIN_TURNS = 4  # least number of steps that turn
 _MIN_EXPLAINED = 0.4  # least share of the turns that the right clock explains
 _SURE_EXPLAINED = 0.6  # share of the turns from which no other clocks are searched
@@ -76,7 +74,8 @@ def estimate_clock(
     interval = float(np.median(np.diff(timestamps)))
     best, covariance = simplest(fit, fit.refine(start))
     others: list[np.ndarray] = []
-    if fit.apart(best, start) > interval or _explained(fit, best, best) < _SURE_EXPLAINED:
+    explained = fit.explained(best, noise(fit.residuals(best)))
+    if fit.apart(best, start) > interval or explained < _SURE_EXPLAINED:
         tried = [best, *(fit.refine(p) for p in fit.candidates(start, reach_s))]
         sigma = min(noise(fit.residuals(p)) for p in tried)
         best, covariance = simplest(fit, min(tried, key=lambda p: fit.cost(p, sigma)))
@@ -91,19 +90,20 @@ def estimate_clock(
     clock = Clock(given.start, float(best[0] - (best[1] - 1) * begin), float(best[1]))
     offset_sigma = float(np.sqrt(at_start @ covariance @ at_start))
     rate_sigma, certain = float(np.sqrt(covariance[1, 1])), fit.time_sigma(covariance)
-    before, after = (_explained(fit, p, best) for p in (start, best))
+    sigma = noise(fit.residuals(best))
+    before, after = (fit.explained(p, sigma) for p in (start, best))
     same = fit.apart(best, start) < _SIGNIFICANT_SIGMAS * certain or after < before + _MIN_GAIN
     verdict, note = "unclear", ""
-    if _turning(fit, best).sum() < MIN_TURNS or certain > max(
+    if fit.turning(sigma).sum() < MIN_TURNS or certain > max(
         _MAX_SIGMA_INTERVALS * interval, _MAX_SIGMA_S
     ):
         note = f"the camera turns too little to check the clock (uncertain by {certain:.2g} s)"
     # by three times as much, steps contradict the images (see `TwoViewLimits`)
-    elif after < _MIN_EXPLAINED or noise(fit.residuals(best)) > np.deg2rad(2.0):
+    elif after < _MIN_EXPLAINED or sigma > np.deg2rad(2.0):
         note = "the trajectory's rotations fit the images at no clock offset: clock not checked"
     elif same:
         verdict = "agrees"
-    elif max((_explained(fit, p, best) for p in others), default=0.0) > 0.75 * after:
+    elif max((fit.explained(p, sigma) for p in others), default=0.0) > 0.75 * after:
         note = f"several clock offsets fit, such as {clock.offset:.3f} s: the given one is kept"
     else:
         rate = ""
@@ -155,26 +155,14 @@ def other_rate(
     rate, fit, best = min(refined, key=lambda one: one[1].cost(one[2], sigma))
     after = [np.linalg.norm(residuals, axis=1) for residuals in (before, fit.residuals(best))]
     nearer = np.count_nonzero(after[1] < after[0])
+    sigma = noise(fit.residuals(best))
     contradicted = (
-        _turning(fit, best).sum() >= MIN_TURNS
-        and _explained(fit, best, best) >= _SURE_EXPLAINED
-        and noise(fit.residuals(best)) < _MAX_NOISE_RATIO * noise(before)
+        fit.turning(sigma).sum() >= MIN_TURNS
+        and fit.explained(best, sigma) >= _SURE_EXPLAINED
+        and sigma < _MAX_NOISE_RATIO * noise(before)
         and outweighs(int(nearer), len(turns) - int(nearer), 1e-3)
     )
     return float(rate * best[1]) if contradicted else None
-
-
-def _turning(fit: ClockFit, best: np.ndarray) -> np.ndarray:
-    """Steps (N,) whose rotation exceeds the noise."""
-    sigma = noise(fit.residuals(best))
-    return np.linalg.norm(fit.turns.rotvecs, axis=1) > TURNING_SIGMAS * sigma
-
-
-def _explained(fit: ClockFit, parameters: np.ndarray, best: np.ndarray) -> float:
-    """Share of the turns that the trajectory explains under a clock."""
-    turning, sigma = _turning(fit, best), noise(fit.residuals(best))
-    off = np.linalg.norm(fit.residuals(parameters), axis=1)
-    return float(np.mean(off[turning] < AGREEING_SIGMAS * sigma)) if turning.any() else 0.0
 
 
 def simplest(fit: ClockFit, best: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

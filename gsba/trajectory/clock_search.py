@@ -108,6 +108,15 @@ class ClockFit:
         rate."""
         return _bounded(self.residuals(parameters), sigma)
 
+    def turning(self, sigma: float) -> np.ndarray:
+        """Turns (N,) bool that rotate by more than noise."""
+        return np.linalg.norm(self.turns.rotvecs, axis=1) > 4.0 * sigma
+
+    def explained(self, parameters: np.ndarray, sigma: float) -> float:
+        """Share of what turns that the trajectory explains within noise, at shift and rate (2,)."""
+        off = np.linalg.norm(self.residuals(parameters), axis=1)[self.turning(sigma)]
+        return float(np.mean(off < 3.0 * sigma)) if len(off) else 0.0
+
     def refine(
         self, start: np.ndarray, with_rate: bool = True, widening: float = 3.0
     ) -> np.ndarray:

@@ -6,7 +6,6 @@ from scipy.spatial.transform import Rotation
 from gsba.geometry import inverse, pose
 from gsba.loop_closure.map_similarity import (
     Meeting,
-    nudged,
     propose,
     refined,
     similarity_covariance,
@@ -52,7 +51,7 @@ def test_covariances_of_similarities_are_as_large_as_their_errors() -> None:
 
 def test_nudging_by_nothing_changes_nothing() -> None:
     move = Sim3.of(2.0, pose(Rotation.from_rotvec([0.3, 0.1, 0.2]).as_matrix(), np.arange(3.0)))
-    same = nudged(move, np.zeros(7))
+    same = move.moved(np.zeros(7), move.translation)
     assert same.scale == move.scale and np.allclose(same.new_T_old, move.new_T_old)
 
 

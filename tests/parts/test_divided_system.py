@@ -22,8 +22,9 @@ from gsba.bundle.optimizer import OptimizeResult, SolverOptions, optimize
 from gsba.disk import FullDiskError
 from gsba.log import GsbaError
 from gsba.parts import folder as parts_folder
-from gsba.parts.divided_system import optimize_divided, read_landmarks
-from gsba.parts.folder import PartsWriter, load_index, load_part, values_at
+from gsba.parts.divided_system import SolverState, optimize_divided
+from gsba.parts.folder import PartsWriter, load, load_index, load_part, values_at
+from gsba.parts.jobs import PartPoints, version_file
 from gsba.store.cluster import Cluster
 from gsba.store.shards import Job, Spent, Threads
 
@@ -69,9 +70,11 @@ def test_parts_give_the_undivided_result(most: int, undivided, tmp_path: Path) -
     assert found.history[-1].costs.keys() == expected.history[-1].costs.keys()
     np.testing.assert_allclose(poses_of(found.values), poses_of(expected.values), atol=1e-9)
     for number in range(len(index.num_kept)):
-        numbers, moved = read_landmarks(tmp_path / "map", number)
-        seen = np.unique(load_part(tmp_path / "map", number).sightings.points)
-        off = np.abs(moved - points[numbers])[seen].max(axis=1)
+        part = load_part(tmp_path / "map", number)
+        version = load(tmp_path / "map" / "result.npz", SolverState).version
+        file = version_file(tmp_path / "map", number, "points", version)
+        moved, seen = load(file, PartPoints).points_world, np.unique(part.sightings.points)
+        off = np.abs(moved - points[part.numbers])[seen].max(axis=1)
         assert np.median(off) < 1e-9 and off.max() < 1e-5  # a few are almost free along a ray
 
 

@@ -8,7 +8,7 @@ from scan_world import HALL, INTO_SCAN, SIZE, cloud, rectangles, sampled, scan
 from scipy.spatial.transform import Rotation
 from synthetic import unit
 
-from gsba.scans.fit import Noise, _weighted, moved_by, settle
+from gsba.scans.fit import Noise, _weighted, settle
 from gsba.scans.judge import CellGrid, verdict
 from gsba.scans.registration import NoPlacementError, register
 from gsba.scans.search import Guess, candidates, main_axes
@@ -120,7 +120,7 @@ def test_residuals_follow_their_jacobian() -> None:
     for k in range(7):
         sides = []
         for sign in (-h, h):
-            points = moved_by(INTO_SCAN, sign * np.eye(7)[k], middle).points(run.points)
+            points = INTO_SCAN.moved(sign * np.eye(7)[k], middle).points(run.points)
             offsets = points - surfaces.points[rows]
             sides.append(np.einsum("ni,ni->n", surfaces.normals[rows], offsets))
         numerical = (sides[1] - sides[0]) / (2 * h)
