@@ -1,15 +1,17 @@
 """Tours: stills metres apart without a trajectory, refined with and without a search along epipolar
 lines.
 
-    python benchmarks/tours.py OUT.md TOUR [TOUR ...]
+    python benchmarks/tours.py OUT.md TOUR [TOUR ...] [--shuffle SEED]
 
 TOUR: a folder with images/*.jpg, groundtruth.tum and, if a carrier is in the pictures, mask.png, as
 `render_home.py OUT -n 20` writes it. Each is refined by `gsba refine` with its defaults and with
 `pairs.max_tour_frames=0`. Maps are compared with the truth, each after alignment with scale, and
-the steps that the search confirms with the true ones.
+the steps that the search confirms with the true ones. `--shuffle` permutes the names of the files
+and leaves out their times: stills in no order.
 """
 
 import argparse
+import shutil
 import tempfile
 import time
 from pathlib import Path
@@ -26,11 +28,26 @@ from gsba.log import GsbaError
 from gsba.odometry.tour_maps import TourMatches
 from gsba.odometry.tour_steps import pose_errors_deg
 from gsba.store.store import load_stage
-from gsba.trajectory.files import read_trajectory
+from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.types import PoseStatus, Reconstruction, Trajectory
 
 MAX_RIGHT_DEG = 1.0, 3.0  # rotation and direction of a step that is right
 MAX_RIGHT_SHARE = 0.02  # ATE of a right map, part of its extent
+
+
+def shuffled(tour: Path, seed: int, out: Path) -> Path:
+    """The pictures and true poses of a tour under permuted names, without times, in a folder."""
+    images = sorted((tour / "images").glob("*.jpg"))
+    order = np.random.default_rng(seed).permutation(len(images))
+    (out / "images").mkdir(parents=True)
+    for n, row in enumerate(order):
+        shutil.copy(images[row], out / "images" / f"{n:06}.jpg")
+    if (tour / "mask.png").is_file():
+        shutil.copy(tour / "mask.png", out)
+    true = read_trajectory(tour / "groundtruth.tum")
+    poses = true.world_T_rigs[order]
+    write_tum(out / "groundtruth.tum", Trajectory(true.timestamps, poses))
+    return out
 
 
 def maps_of(out: Path, truth: Trajectory) -> list[tuple[np.ndarray, float]]:
@@ -65,15 +82,17 @@ def steps_of(out: Path, truth: Trajectory) -> str:
     return f"{num}; {', '.join(wrong) or 'none'}"
 
 
-def row_of(tour: Path, settings: RefineSettings) -> list[str]:
-    """Cells of a tour and settings: frames in maps, maps, wrong ones, steps, CPU s."""
-    truth, mask = read_trajectory(tour / "groundtruth.tum"), tour / "mask.png"
+def row_of(tour: Path, settings: RefineSettings, seed: int | None) -> list[str]:
+    """Cells of a tour and settings: frames in maps, maps, wrong ones, steps, CPU s; its stills in
+    no order with a seed."""
     with tempfile.TemporaryDirectory() as folder:
         out, began = Path(folder) / "run", time.process_time()
+        tour = tour if seed is None else shuffled(tour, seed, Path(folder) / "shuffled")
+        mask = tour / "mask.png"
         masks = mask if mask.is_file() else "auto"
         gsba.refine(tour / "images", None, out, settings, masks=masks)
-        cpu, maps = time.process_time() - began, maps_of(out, truth)
-        steps = steps_of(out, truth)
+        cpu, truth = time.process_time() - began, read_trajectory(tour / "groundtruth.tum")
+        maps, steps = maps_of(out, truth), steps_of(out, truth)
     said = [f"{rows[0]} to {rows[-1]} ({len(rows)}): {1e3 * ate:.1f}e-3" for rows, ate in maps]
     wrong = sum(ate > MAX_RIGHT_SHARE for _, ate in maps)
     inside = sum(len(rows) for rows, _ in maps)
@@ -85,6 +104,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("out", type=Path)
     parser.add_argument("tours", type=Path, nargs="+")
+    parser.add_argument("--shuffle", type=int, metavar="SEED")
     options = parser.parse_args()
     lines = [
         "| tour | search | frames in maps | maps: frames, ATE of extent | wrong maps | "
@@ -94,7 +114,8 @@ def main() -> None:
     for tour in options.tours:
         for name, most in (("no", 0), ("yes", 100)):
             settings = load_config(None, [f"pairs.max_tour_frames={most}", "export.formats=[]"])
-            lines.append(f"| {' | '.join([tour.name, name, *row_of(tour, settings)])} |")
+            cells = [tour.name, name, *row_of(tour, settings, options.shuffle)]
+            lines.append(f"| {' | '.join(cells)} |")
             print(lines[-1], flush=True)
     write_table(lines, options.out)
 

@@ -32,6 +32,7 @@ from gsba.odometry.tour_steps import (
 )
 from gsba.types import Counts, FrameSet, Matches, VerifiedPairs
 
+STEPS_SEARCH = "searching along epipolar lines"  # work that progress is told of
 _RATIO_WIDTH = 0.08  # of a ratio's logarithm, within which keypoints agree on it
 _MAX_LOG_RATIO = np.log(4.0)  # of two steps' lengths
 _NUM_RATIOS = 3  # that are tried for two hypotheses of steps
@@ -74,7 +75,7 @@ def match_tour(run_frames: FrameSet, num_threads: int = 1) -> TourMatches:
     num = len(run_frames)
     frames = list(map_in_threads(lambda f: read_frame(run_frames, f), num, num_threads))
     found = map_in_threads(lambda f: hypotheses(frames[f], frames[f + 1]), num - 1, num_threads)
-    steps = list(track(found, "searching along epipolar lines", num - 1))
+    steps = list(track(found, STEPS_SEARCH, num - 1))
 
     def triples(f: int) -> dict[tuple[int, int], list[Triple]]:
         return triples_of(frames[f], frames[f + 1], frames[f + 2], steps[f], steps[f + 1])

@@ -9,6 +9,7 @@ import numpy as np
 
 from factors.threads import map_in_threads
 from gsba.geometry import pose, unit
+from gsba.log import track
 from gsba.odometry.tour_joins import NEAR, Join, Joining, TourMap, alike, is_sure, join, scaled
 from gsba.odometry.tour_steps import TourFrame, step_at
 
@@ -28,7 +29,8 @@ def all_joined(
     def decide(pairs: Sequence[tuple[TourMap, TourMap]]) -> list[Join | None]:
         new = [pair for pair in pairs if _seen(*pair) not in known]
         found = map_in_threads(partial(_sure_join, frames, new), len(new), num_threads)
-        known.update((_seen(*pair), at) for pair, at in zip(new, found, strict=True))
+        tried = track(found, "joining maps", len(new)) if new else found
+        known.update((_seen(*pair), at) for pair, at in zip(new, tried, strict=True))
         return [known[_seen(*pair)] for pair in pairs]
 
     while True:

@@ -63,7 +63,9 @@ _COSTS = (
 _LENSES = {"auto": None, "central": 0.0, "two_lens": 1.0}
 _OBSERVATIONS = 950.0  # of the map for each frame
 _ODOMETRY, _TRACKING = "odometry", "tracking"  # stage, and its work
-_TOUR = "tour"  # stage of few runs, which its own work tells the time of
+_TOUR = "tour"  # stage of few runs, whose own work tells the time of it
+_SEARCH = "searching along epipolar lines"  # its work, before maps are joined
+_JOINING = (0.2, 0.6)  # least and most seconds of joining maps, for each of the search before it
 _PRIOR_S = 4.0  # seconds of the table that count as if they were measured at its speed
 _PATCHES_PRIOR_S = 0.5  # seconds of the table of patches that count as if measured at its speed
 _MIN_BETWEEN_LINES_S = 20.0  # seconds between lines of the log with the time left
@@ -171,6 +173,7 @@ class TimeLeft:
         self._whole = True  # False = a stage of this phase was resumed
         self._stage = ""
         self._work: _Work | None = None
+        self._search: _Work | None = None  # along epipolar lines
         self._more = False
         self._keyframes = 0
         self._observations: float | None = None  # thousands
@@ -191,7 +194,7 @@ class TimeLeft:
         elif kind == "map" and _ADJUSTED.fullmatch(str(entry.get("name"))):
             self._observations = 1e-3 * float(entry["observations"])
         elif kind == "stage":
-            self._stage, self._work = str(entry.get("name")), None
+            self._stage, self._work, self._search = str(entry.get("name")), None, None
             self._enter(self._stage, now)
         elif kind == "done":
             self._stage, self._work = "", None
@@ -208,6 +211,8 @@ class TimeLeft:
                 self._whole &= total >= self._size.frames  # others are of an earlier call
             if name == _TRACKING:
                 self._tracked = self._work
+            if name == _SEARCH:
+                self._search = self._work
 
     def seconds(self, now: float) -> tuple[float, float] | None:
         """Least and most seconds from a time on; None = the table does not tell."""
@@ -224,8 +229,8 @@ class TimeLeft:
         speed, spent = self._speed(size), now - self._phase_began
         work_left = 0.0 if self._work is None else self._work.seconds(now)
         if self._stage == _TOUR:
-            ahead = speed * self._ahead(size, self._phase + 1, is_most)
-            return work_left + ahead if work_left else None
+            left = self._seconds_of_tour(work_left, now, is_most)
+            return left and left + speed * self._ahead(size, self._phase + 1, is_most)
         if self._stage and phase_of(self._stage) is None:
             return None
         # Seconds of a round of patches for each of the table, by the rounds that have
@@ -278,6 +283,14 @@ class TimeLeft:
             measured += work.at - work.began
             expected += size.seconds(FEATURES) * (work.done - work.first) / size.frames
         return (measured + _PRIOR_S) / (expected + _PRIOR_S)
+
+    def _seconds_of_tour(self, work_left: float, now: float, is_most: bool) -> float | None:
+        """Seconds of the search along epipolar lines and of joining maps; None = not known."""
+        search, joining = self._search, _JOINING[is_most]
+        if search is None or search.done < search.total:
+            searched = 0.0 if search is None else search.at - search.began + work_left
+            return work_left + joining * searched if work_left else None
+        return max(joining * (search.at - search.began) - (now - search.at), work_left)
 
     def _seconds_of_odometry(self, size: Size, now: float, is_most: bool) -> float | None:
         """Seconds of the odometry, and of all that comes after it."""

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from gsba.odometry.tour_maps import STEPS_SEARCH
 from gsba.pipeline import stage_titles
 from gsba.report import time_left
 from gsba.report.time_left import (
@@ -118,6 +119,24 @@ def test_a_search_along_epipolar_lines_is_timed_by_its_steps_and_is_no_measure_o
     ]
     rest = sum(CENTRAL.seconds(n) for n in range(3, len(PHASES)))
     assert left(told(*events[:5], begin, *counts), now + 50.0) == pytest.approx(150.0 + rest)
+    # Maps are joined after the steps.
+    steps = [{**entry, "what": STEPS_SEARCH} for entry in counts]
+    found = told(*events[:5], begin, *steps).seconds(now + 50.0)
+    assert found is not None
+    assert found[0] < 190.0 + rest + 1.0 and found[1] > 269.0 + rest
+    joins = [
+        {"event": "progress", "what": "joining maps", "done": n, "total": 4, "time": now + t}
+        for n, t in ((0, 200.0), (1, 220.0))
+    ]
+    searched = {**steps[0], "done": 20, "time": now + 200.0}
+    found = told(*events[:5], begin, *steps, searched, *joins).seconds(now + 220.0)
+    assert found is not None
+    assert found[0] < 61.0 + rest and found[1] == pytest.approx(100.0 + rest)
+    # A few joins at once are not all of them.
+    tried = {**joins[1], "done": 4, "time": now + 250.0}
+    found = told(*events[:5], begin, *steps, searched, joins[0], tried).seconds(now + 250.0)
+    assert found is not None
+    assert found[0] < rest + 0.1 and found[1] == pytest.approx(70.0 + rest)
     ended = {"event": "done", "name": "tour", "time": now + 200.0, "resumed": False}
     chain = {"event": "stage", "name": "chain", "time": now + 200.0}
     found = told(*events[:5], begin, *counts, ended, chain)
