@@ -157,7 +157,7 @@ def test_a_stretch_of_training_is_that_of_the_cpu(
 
 
 def test_density_control_is_at_its_time(backend: Backend, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gsba.splat.train._DENSIFY_PULL", 1e-6)
+    monkeypatch.setattr("gsba.splat.density._DENSIFY_PULL", 1e-6)
     views = _views(_gaussians(20, 1), False)
     settings = TrainingOptions(iterations=3000, sh_degree=1, seed=2)
     trainer = Trainer(views, settings, backend)
