@@ -21,6 +21,7 @@ import gsba
 from gsba import log
 from gsba.cli import app
 from gsba.cli.app import loading
+from gsba.cli.options import OPTIONS
 from gsba.config import RefineSettings
 from gsba.config_file import load_config
 from gsba.export import ExportFormat
@@ -49,6 +50,15 @@ def _tum(path: Path, num: int = 5, scale: float = 1.0) -> Path:
     rows = [[t, scale * np.sin(t), 0, scale * np.cos(t), 0, 0, 0, 1] for t in angles]
     np.savetxt(path, rows)
     return path
+
+
+def test_each_entry_of_the_table_of_options_is_of_a_command() -> None:
+    used = set[str]()
+    for command in app.registered_commands:
+        assert command.callback is not None
+        own = {name: f"{command.name}.{name}" for name in command.callback.__annotations__}
+        used |= {one if one in OPTIONS else name for name, one in own.items()}
+    assert used == OPTIONS.keys()
 
 
 def test_help_names_every_command_and_format() -> None:
