@@ -305,7 +305,7 @@ OPTIONS = {  # PARAMETER, or COMMAND.PARAMETER where commands differ -> its help
     "root": _argument("Folder whose files can be chosen; runs are written into it."),
     "state": _option("Folder of the queue; default: one for each ROOT in ~/.local/state/gsba/app."),
     # info
-    "files": _argument("Videos, folders of frames, pictures."),
+    "files": _argument("Videos, folders of frames, pictures, runs."),
     "info.as_json": _option("As JSON, for programs.", None, "--json"),
     # doctor
     "doctor.as_json": _option("As JSON, for reports.", None, "--json"),

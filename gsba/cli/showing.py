@@ -37,9 +37,10 @@ def info(
     files: list[Path],
     as_json: bool = False,
 ) -> None:
-    """Describe footage and print the command that refines it.
+    """Describe footage or a run, and print the command to give next.
 
-    The description names camera, layout, times, gyro, GPS and lenses.
+    The description names camera, layout, times, gyro, GPS and lenses; of a run, its inputs, result
+    and verdict.
     """
     from gsba.inspection import inspect
 

@@ -22,7 +22,6 @@ class Found:
 
     facts: Facts
     problem: str = ""  # reason why it cannot be refined; "" = it can
-    command: str | None = None  # to give next; "" = unknown, None = `gsba refine` with the path
 
 
 def spoken_seconds(duration_s: float) -> str:

@@ -39,8 +39,9 @@ def inspect(path: Path) -> Inspection:
     """Collect facts about a video, an image, a folder of images or one of a run. Raises GsbaError:
     there is no such file or folder, or it is none of these."""
     if is_run_folder(path):
-        found = runs.of_run(path)
-    elif path.is_dir():
+        facts, command = runs.of_run(path)
+        return Inspection(str(path), facts, "", command)
+    if path.is_dir():
         found = pictures.of_folder(path)
     elif video.is_video(path):
         found = footage.of_video(path)
@@ -53,7 +54,5 @@ def inspect(path: Path) -> Inspection:
         raise GsbaError(f"{path} is no video, image or folder of images")
     else:
         raise GsbaError(f"{path}: no such file or folder")
-    command = found.command
-    if command is None:
-        command = "" if found.problem else shlex.join(["gsba", "refine", str(path)])
+    command = "" if found.problem else shlex.join(["gsba", "refine", str(path)])
     return Inspection(str(path), found.facts, found.problem, command)

@@ -4,30 +4,29 @@ import json
 import shlex
 from pathlib import Path
 
-from gsba.inspection.footage import Found, spoken_seconds
+from gsba.inspection.footage import Facts, spoken_seconds
 from gsba.report.maps import format_frame_counts
 from gsba.store.folder import read_marker
 
 
-def of_run(folder: Path) -> Found:
-    """Facts about a run folder, and the command that shows it or goes on with it."""
+def of_run(folder: Path) -> tuple[Facts, str]:
+    """Facts about a run folder, and the command that shows it or goes on with it; "" = unknown."""
     origin = read_marker(folder)["origin"]
-    facts = tuple((name, path) for name, path in origin.items())
+    facts = list(origin.items())
     try:
         report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
         took = spoken_seconds(report["summary"]["seconds"])
-        result = (
+        result = [
             ("result", f"{format_frame_counts(report)}, {report['summary']['points']:,} points"),
             ("finished", f"{report['finished']}, in {took}, by gsba {report['gsba']}"),
             ("verdict", report["verdict"]["sentence"]),
-        )
+        ]
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        going_on = (("run", "not finished: the call that began it goes on where it stopped"),)
+        facts.append(("run", "not finished: the call that began it goes on where it stopped"))
         inputs = [origin[name] for name in ("frames", "trajectory") if name in origin]
         command = shlex.join(["gsba", "refine", *inputs, "--out", str(folder)])
-        return Found((*facts, *going_on), command=command if inputs else "")
+        return tuple(facts), command if inputs else ""
     datasets = sorted(path.parent.name for path in folder.glob("*/export.json"))
-    return Found(
-        (*facts, *result, *((("datasets", ", ".join(datasets)),) if datasets else ())),
-        command=shlex.join(["gsba", "view", str(folder)]),
-    )
+    if datasets:
+        result.append(("datasets", ", ".join(datasets)))
+    return (*facts, *result), shlex.join(["gsba", "view", str(folder)])
