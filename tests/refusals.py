@@ -7,7 +7,13 @@ import pytest
 from gsba.log import GsbaError
 
 
-def refused(message: str, call: Callable[..., object], *given: object, **options: object) -> None:
-    """The call raises a GsbaError whose text matches the regular expression `message`."""
-    with pytest.raises(GsbaError, match=message):
+def refused(message: str, call: Callable[..., object], *given: object, **options: object) -> str:
+    """The call raises a GsbaError of one line that matches the regular expression `message`.
+
+    Returns the line.
+    """
+    with pytest.raises(GsbaError, match=message) as caught:
         call(*given, **options)
+    line = str(caught.value)
+    assert "\n" not in line
+    return line

@@ -13,6 +13,7 @@ import pytest
 from export_scene import COLORS, NUM_FRAMES, POINTS, cube_frames, panoramas, reconstruction
 from PIL import Image
 from plyfile import PlyData
+from refusals import refused
 
 from gsba.export import ExportFormat, export, write_points
 from gsba.export.images import face_size_for
@@ -174,8 +175,7 @@ def test_a_link_to_an_earlier_export_stays_a_link(tmp_path, frames):
 def test_face_size_defaults_to_a_quarter_and_is_even(frames):
     assert face_size_for(frames.format, None) == 128
     assert face_size_for(frames.format, 77) == 77
-    with pytest.raises(GsbaError, match="face size 8"):
-        face_size_for(frames.format, 8)
+    refused("face size 8", face_size_for, frames.format, 8)
 
 
 @pytest.mark.parametrize(
@@ -229,8 +229,7 @@ def test_what_others_wrote_is_refused_and_kept(tmp_path, frames):
     assert _entries(folder) == ["thesis.tex"]
     file = tmp_path / "file"
     file.write_text("x")
-    with pytest.raises(GsbaError, match="is a file"):
-        export(reconstruction(), frames, file, ExportFormat.TUM)
+    refused("is a file", export, reconstruction(), frames, file, ExportFormat.TUM)
     assert file.read_text() == "x" and _entries(tmp_path) == ["file", "out"]
 
 

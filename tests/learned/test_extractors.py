@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from learned_networks import DIMENSIONS, EXTRACTORS, OfficialSuperPoint, save_extractors, torch
+from refusals import refused
 from scipy.ndimage import map_coordinates
 
 import gsba.learned
@@ -179,9 +180,9 @@ def test_wrong_weights_are_one_line(weights: dict[str, Path], name: str, tmp_pat
         (tmp_path / "list.pth", f"weights of another network than {name}"),
         (other, f"weights of another network than {name}"),
     ):
-        with pytest.raises(GsbaError, match=message) as failure:
-            LearnedExtractor(FeatureSettings.model_validate({"extractor": name}), path)
-        assert "\n" not in str(failure.value)
+        refused(
+            message, LearnedExtractor, FeatureSettings.model_validate({"extractor": name}), path
+        )
 
 
 @pytest.mark.parametrize(
@@ -195,8 +196,7 @@ def test_missing_library_is_one_line(
         monkeypatch.delitem(sys.modules, f"gsba.learned.{ours}", raising=False)
         monkeypatch.delattr(gsba.learned, ours, raising=False)
     monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(GsbaError, match=r"pip install 'gsba\[learned\]'"):
-        _extractor(weights, name)
+    refused(r"pip install 'gsba\[learned\]'", _extractor, weights, name)
 
 
 def _settings(extractor: str, matcher: str = "guided", **features: object) -> RefineSettings:
@@ -214,9 +214,7 @@ def test_missing_weights_are_one_line(tmp_path: Path) -> None:
         (tmp_path, r"holds no weights of ALIKED; .*get aliked"),
     ):
         settings = _settings("aliked", weights=None if given is None else str(given))
-        with pytest.raises(GsbaError, match=message) as failure:
-            find_weights(settings)
-        assert "\n" not in str(failure.value)
+        refused(message, find_weights, settings)
     with pytest.raises(GsbaError, match=r"LightGlue for disk; .*get disk_lightglue\.pth \(Apache"):
         (tmp_path / "depth-save.pth").touch()
         find_weights(_settings("disk", "lightglue", weights=str(tmp_path)))
@@ -247,8 +245,7 @@ def test_weights_are_found_in_folders_and_caches(
     found = find_weights(_settings("superpoint", accept_noncommercial=True))
     assert found["features"] == snapshot / "snapshots/abc/model.safetensors"
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "elsewhere"))
-    with pytest.raises(GsbaError, match="no weights of ALIKED"):
-        find_weights(_settings("aliked"))
+    refused("no weights of ALIKED", find_weights, _settings("aliked"))
 
 
 def test_noncommercial_weights_need_consent(
@@ -284,8 +281,7 @@ def test_weights_are_fetched_only_when_asked(
         return source.open("rb")
 
     monkeypatch.setattr(module.urllib.request, "urlopen", urlopen)
-    with pytest.raises(GsbaError, match="or pass --download"):
-        find_weights(_settings("aliked"))
+    refused("or pass --download", find_weights, _settings("aliked"))
     assert not asked
     found = find_weights(_settings("aliked", download=True))["features"]
     assert found == tmp_path / "cache/torch/hub/checkpoints/aliked-n16.pth"

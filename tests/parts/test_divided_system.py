@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from dask_workers import some_workers
 from gtsam.symbol_shorthand import X
+from refusals import refused
 from town_in_parts import NUM, town, write
 
 from factors import LandmarkBlock, RobustLoss
@@ -160,16 +161,14 @@ def test_a_full_disk_ends_in_one_line_and_costs_nothing_else(
 
 def test_damaged_and_foreign_folders_are_refused(tmp_path: Path) -> None:
     write(tmp_path / "map", 15)
-    with pytest.raises(GsbaError, match="holds the parts of a map"):
-        PartsWriter(tmp_path / "map")
+    refused("holds the parts of a map", PartsWriter, tmp_path / "map")
     given = tmp_path / "map/part-00001/given.npz"
     given.write_bytes(given.read_bytes()[:2000])
     with pytest.raises(GsbaError, match="the parts of this map again"):
         optimize_divided(tmp_path / "map", Threads(1), SETTINGS)
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos/one.jpg").touch()
-    with pytest.raises(GsbaError, match="is not empty"):
-        PartsWriter(tmp_path / "photos")
+    refused("is not empty", PartsWriter, tmp_path / "photos")
     assert (tmp_path / "photos/one.jpg").exists()
 
 

@@ -1,4 +1,7 @@
-"""Input that cannot be used, through the command line: one line, exit 1, nothing left behind."""
+"""Input that cannot be used, through the command line: one line, exit 1, nothing left behind.
+
+A case of each file and option; what else a file is refused for is tested with its reader.
+"""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -9,6 +12,7 @@ import pytest
 from command import run_gsba
 
 NUM_FRAMES = 6
+LINES = [f"{f} {f} 0 0 0 0 0 1" for f in range(NUM_FRAMES)]  # of the trajectory
 
 
 @pytest.fixture
@@ -19,7 +23,7 @@ def inputs(tmp_path: Path) -> Path:
     for f in range(NUM_FRAMES):
         _write(tmp_path / f"frames/{f}.png", rng.integers(0, 256, (32, 64, 3), np.uint8))
     _write(tmp_path / "mask.png", np.full((32, 64), 255, np.uint8))
-    _trajectory(tmp_path, [f"{f} {f} 0 0 0 0 0 1" for f in range(NUM_FRAMES)])
+    _trajectory(tmp_path, LINES)
     return tmp_path
 
 
@@ -31,42 +35,13 @@ def _trajectory(folder: Path, lines: list[str]) -> None:
     (folder / "slam.tum").write_text("\n".join(lines) + "\n")
 
 
-def _replace_line(number: int, line: str) -> Callable[[Path], None]:
-    """Put `line` where line `number` of the trajectory was, counted from one."""
-
-    def change(folder: Path) -> None:
-        lines = (folder / "slam.tum").read_text().splitlines()
-        lines[number - 1] = line
-        _trajectory(folder, lines)
-
-    return change
-
-
-def _empty(folder: Path) -> None:
-    for path in (folder / "frames").iterdir():
-        path.unlink()
-
-
-def _two_frames(folder: Path) -> None:
-    for f in range(2, NUM_FRAMES):
-        (folder / f"frames/{f}.png").unlink()
-
-
 def _truncated(folder: Path) -> None:
     path = folder / "frames/2.png"
     path.write_bytes(path.read_bytes()[:-300])
 
 
-def _resized(height: int, width: int) -> Callable[[Path], None]:
-    return lambda folder: _write(folder / "frames/2.png", np.zeros((height, width, 3), np.uint8))
-
-
 def _small_mask(folder: Path) -> None:
     _write(folder / "mask.png", np.full((16, 32), 255, np.uint8))
-
-
-def _mask_of_another_shape(folder: Path) -> None:
-    _write(folder / "mask.png", np.full((64, 64), 255, np.uint8))
 
 
 def _other_clock(folder: Path) -> None:
@@ -75,30 +50,16 @@ def _other_clock(folder: Path) -> None:
 
 BAD: dict[str, tuple[Callable[[Path], None], tuple[str, ...]]] = {
     "no frames folder": (lambda folder: (folder / "frames").rename(folder / "x"), ("no such",)),
-    "empty folder": (_empty, ("frames", "no JPEG, PNG, WebP or TIFF")),
-    "two frames": (_two_frames, ("2 frames", "3")),
-    "not an image": (
-        lambda folder: (folder / "frames/2.png").write_text("hello") and None,
-        ("2.png", "not a JPEG, PNG"),
-    ),
     "truncated image": (_truncated, ("2.png", "truncated")),
-    "not 2:1": (_resized(32, 32), ("2.png", "32x32")),
-    "another size": (_resized(16, 32), ("2.png", "32x16", "64x32")),
     "no trajectory": (lambda folder: (folder / "slam.tum").unlink(), ("slam.tum",)),
-    "empty trajectory": (lambda folder: _trajectory(folder, []), ("slam.tum",)),
-    "malformed line": (_replace_line(4, "3 1 2"), ("slam.tum:4",)),
-    "words": (_replace_line(4, "3 a 0 0 0 0 0 1"), ("slam.tum:4",)),
-    "long quaternion": (_replace_line(4, "3 3 0 0 0 0 0 1.1"), ("slam.tum:4", "quaternion")),
-    "duplicate time": (_replace_line(4, "2 3 0 0 0 0 0 1"), ("slam.tum:4",)),
-    "unsorted times": (_replace_line(4, "1.5 3 0 0 0 0 0 1"), ("slam.tum:4",)),
+    "malformed line": (
+        lambda folder: _trajectory(folder, [*LINES[:3], "3 1 2", *LINES[4:]]),
+        ("slam.tum:4",),
+    ),
     "no overlap in time": (_other_clock, ("overlap",)),
     "small mask": (_small_mask, ("mask.png", "32x16", "64x32")),
-    "square mask": (_mask_of_another_shape, ("mask.png", "64x64")),
 }
 OPTIONS = {
-    "unknown key": (["--set", "solver.num_thread=5"], ("num_thread",)),
-    "out of range": (["--set", "features.max_per_face=1"], ("max_per_face", "16")),
-    "wrong kind": (["--set", "solver.num_threads=many"], ("num_threads", "integer")),
     "unknown family": (["--factors", "magic"], ("magic", "bearing")),
     "no settings file": (["--config", "nowhere.toml"], ("nowhere.toml",)),
     "no masks": (["--masks", "nowhere.png"], ("nowhere.png",)),

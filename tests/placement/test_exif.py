@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from command import run_gsba
 from PIL import Image
+from refusals import refused
 from walk_on_earth import ORIGIN, frame_set, geodetic_of, level_metres, walk_result
 
 from gsba.config import PlacementSettings, RefineSettings
@@ -138,8 +139,7 @@ def test_damage_is_told_apart_from_absence(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="damaged EXIF data"):
         gps_of(_jpeg(tmp_path / "endless.jpg", endless))
     (tmp_path / "text.jpg").write_text("no picture")
-    with pytest.raises(GsbaError, match=r"text\.jpg: cannot be read as a picture"):
-        gps_of(tmp_path / "text.jpg")
+    refused(r"text\.jpg: cannot be read as a picture", gps_of, tmp_path / "text.jpg")
 
 
 def test_what_pillow_writes_is_read(tmp_path: Path) -> None:
@@ -179,8 +179,7 @@ def test_too_few_positions_are_one_line(tmp_path: Path) -> None:
             lambda frames=frames: check(PlacementSettings(gps="exif"), frames),
             lambda frames=frames: place(walk_result(), frames, PlacementSettings(gps="exif")),
         ):
-            with pytest.raises(GsbaError, match=message):
-                fails()
+            refused(message, fails)
 
 
 def test_a_run_is_refused_before_it_begins(tmp_path: Path) -> None:
@@ -191,8 +190,7 @@ def test_a_run_is_refused_before_it_begins(tmp_path: Path) -> None:
         _jpeg(folder / f"{k}.jpg", None)
     slam = tmp_path / "slam.tum"
     slam.write_text("".join(f"{k} {k} 0 0 0 0 0 1\n" for k in range(4)))
-    with pytest.raises(GsbaError, match="--gps exif: 0 of 4 frames"):
-        refine(folder, slam, tmp_path / "run", settings, fps=1)
+    refused("--gps exif: 0 of 4 frames", refine, folder, slam, tmp_path / "run", settings, fps=1)
     (tmp_path / "walk.mp4").write_bytes(b"")
     with pytest.raises(GsbaError, match="a video's frames have no tags"):
         refine(tmp_path / "walk.mp4", slam, tmp_path / "run", settings)

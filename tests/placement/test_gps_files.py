@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from gopro_files import item, nest, words, write_mp4
 from PIL import Image
+from refusals import refused
 from walk_on_earth import frame_set
 
 from gsba.config import GpsSettings
@@ -160,20 +161,15 @@ def test_later_gopros_rate_each_fix(tmp_path: Path) -> None:
 def test_videos_without_fixes_are_one_line(tmp_path: Path) -> None:
     pytest.importorskip("telemetry_parser", reason="telemetry-parser (gsba[imu]) is not there")
     lost = write_mp4(tmp_path / "lost.mp4", [_gps5(float(k), 18, 0) for k in range(3)])
-    with pytest.raises(GsbaError, match=r"lost\.mp4: its GPS receiver had no fix"):
-        read_fixes(str(lost))
+    refused(r"lost\.mp4: its GPS receiver had no fix", read_fixes, str(lost))
     crossed = write_mp4(tmp_path / "crossed.mp4", [_gps5(1.0, 18), _gps5(0.0, 18)])
-    with pytest.raises(GsbaError, match="packet 1 is not later than packet 0"):
-        read_fixes(str(crossed))
+    refused("packet 1 is not later than packet 0", read_fixes, str(crossed))
     none = write_mp4(tmp_path / "none.mp4", [_device(item("GYRO", "s", 6, bytes(60)), 0)] * 2)
-    with pytest.raises(GsbaError, match="finds no GPS in it"):
-        read_fixes(str(none))
+    refused("finds no GPS in it", read_fixes, str(none))
     whole = lost.read_bytes()
     for cut in range(0, len(whole), 37):
         (tmp_path / "cut.mp4").write_bytes(whole[:cut])
-        with pytest.raises(GsbaError, match=r"cut\.mp4: ") as failure:
-            read_fixes(str(tmp_path / "cut.mp4"))
-        assert "\n" not in str(failure.value)
+        refused(r"cut\.mp4: ", read_fixes, str(tmp_path / "cut.mp4"))
 
 
 def test_fixes_of_insta360_are_on_the_clock_of_the_video(tmp_path: Path) -> None:
@@ -189,8 +185,7 @@ def test_fixes_of_insta360_are_on_the_clock_of_the_video(tmp_path: Path) -> None
         np.testing.assert_allclose(found.timestamps, begins + np.arange(3))
         np.testing.assert_allclose(found.geodetic, [[-10.5, 20.25, 12.0]] * 3)
     path.write_bytes(b"pictures" + insta360_files.trailer(records[1:]))
-    with pytest.raises(GsbaError, match="holds no GPS"):
-        read_video_gps(path)
+    refused("holds no GPS", read_video_gps, path)
 
 
 def test_points_of_a_gpx_track_that_share_seconds_are_spread(tmp_path: Path) -> None:

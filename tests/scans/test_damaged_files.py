@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import refused
 
-from gsba.log import GsbaError
 from gsba.scans import read_scan, trial
 from gsba.scans.files import check_claims
 from gsba.scans.fit import noise_of
@@ -83,8 +83,7 @@ def test_counts_beyond_a_file_are_refused(
     tmp_path: Path, name: str, content: bytes, claim: str
 ) -> None:
     (tmp_path / name).write_bytes(content)
-    with pytest.raises(GsbaError, match=claim):
-        check_claims(tmp_path / name)
+    refused(claim, check_claims, tmp_path / name)
 
 
 _HEAD = "import sys, json; sys.path[:] = json.loads(sys.argv[1])\nfrom pathlib import Path\n"
@@ -112,8 +111,7 @@ def test_crashes_of_libraries_are_refusals(
     path = tmp_path / "a.pcd"
     path.write_bytes(b"")
     monkeypatch.setattr(trial, "_CHILD", (_TRIAL if "trial." in code else _HEAD) + code)
-    with pytest.raises(GsbaError, match=message):
-        try_in_process(path)
+    refused(message, try_in_process, path)
 
 
 def test_what_is_read_on_trial_passes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -163,5 +161,4 @@ def test_points_of_one_place_are_refused(tmp_path: Path, kind: str) -> None:
     else:
         corner = "1e30" if kind == "far" else "1"
         path.write_text(f"v {corner} 2 3\n" * 30 + "f 1 2 3\nf 4 5 6\n")
-    with pytest.raises(GsbaError, match=r"triangles is 0|distinct points|beyond 1e\+09 units"):
-        read_scan(path)
+    refused(r"triangles is 0|distinct points|beyond 1e\+09 units", read_scan, path)

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command import run_gsba
+from refusals import refused
 from scan_world import HALL, SIZE, rectangles, sampled
 
-from gsba.log import GsbaError
 from gsba.scans import check_scan, distances_to, files, read_pairs, read_scan
 from gsba.scans.files import on_planes
 from gsba.scans.types import Scan
@@ -85,15 +85,13 @@ def test_what_is_no_scan_is_refused_in_one_line(tmp_path: Path) -> None:
         "a.las": "cannot be read",
         "a.ply": r"to its end \(RPly: Unexpected end of file\)",
     }.items():
-        with pytest.raises(GsbaError, match=message):
-            read_scan(tmp_path / name)
+        refused(message, read_scan, tmp_path / name)
 
 
 def test_a_missing_library_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a.ply").write_text("ply\n")
     monkeypatch.setitem(sys.modules, "open3d", None)
-    with pytest.raises(GsbaError, match=r"pip install 'gsba\[scan\]'"):
-        check_scan(tmp_path / "a.ply")
+    refused(r"pip install 'gsba\[scan\]'", check_scan, tmp_path / "a.ply")
 
 
 def test_pairs(tmp_path: Path) -> None:
@@ -104,8 +102,7 @@ def test_pairs(tmp_path: Path) -> None:
     np.testing.assert_array_equal(points, [[1, 2, 3], [4, 5, 6], [7, 8, 9.5]])
     for text, message in (("a 1,2\n", "pairs.txt:1"), ("a 1,2,3\n", "holds 1 pairs; 3 are needed")):
         path.write_text(text)
-        with pytest.raises(GsbaError, match=message):
-            read_pairs(path)
+        refused(message, read_pairs, path)
 
 
 def test_distances_are_to_surfaces_and_not_to_the_next_point() -> None:

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import refused
 
-from gsba.log import GsbaError
 from gsba.splat.scores import Lpips
 
 torch = pytest.importorskip("torch")
@@ -97,8 +97,7 @@ def test_masked_pixels_have_no_say(tmp_path: Path) -> None:
     lpips = Lpips(weights("alex", tmp_path)[0])
     use = np.zeros((64, 64), bool)
     assert lpips(IMAGE, TRUTH, use) == 0
-    with pytest.raises(GsbaError, match="32 pixels"):
-        lpips(IMAGE[:16, :16], TRUTH[:16, :16])
+    refused("32 pixels", lpips, IMAGE[:16, :16], TRUTH[:16, :16])
 
 
 def test_other_files_are_refused(tmp_path: Path) -> None:
@@ -112,8 +111,6 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
         ([backbone_path], "linear heads of LPIPS are missing"),
         ([backbone_path, vgg[1]], "another network than alex"),
     ):
-        with pytest.raises(GsbaError, match=message):
-            Lpips(paths)
+        refused(message, Lpips, paths)
     (tmp_path / "text.pth").write_text("hello")
-    with pytest.raises(GsbaError, match="not a file of weights"):
-        Lpips([tmp_path / "text.pth"])
+    refused("not a file of weights", Lpips, [tmp_path / "text.pth"])

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import refused
 from splat_moves import HARMS, harmed, run, settings_for, shorten, spoiled
 from tiny_run import NUM_FRAMES, Case, computed_stages
 
 from gsba.config_file import load_config
 from gsba.evaluate.trajectory import evaluate
-from gsba.log import GsbaError
 from gsba.photometric import direct, patches
 from gsba.splat import refinement
 from gsba.types import Trajectory
@@ -139,7 +139,5 @@ def test_a_run_with_all_families(
 
 
 def test_settings_are_checked() -> None:
-    with pytest.raises(GsbaError, match="splat needs bearing or reprojection"):
-        load_config(None, ['factors=["splat"]'])
-    with pytest.raises(GsbaError, match="16"):
-        load_config(None, ["splat.sizes=[8]"])
+    refused("splat needs bearing or reprojection", load_config, None, ['factors=["splat"]'])
+    refused("16", load_config, None, ["splat.sizes=[8]"])

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from dask_workers import some_workers
+from refusals import refused
 from shard_jobs import Squares
 from tiny_run import Case
 
@@ -155,8 +156,7 @@ def test_a_worker_that_asks_for_others_does_not_wait_for_itself(tmp_path: Path) 
 
 def test_other_versions_are_refused_with_both(client, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(workers, "__version__", "0.0.7")
-    with pytest.raises(GsbaError, match=r"worker tcp://.* has gsba [\d.]+.*, this machine 0\.0\.7"):
-        _cluster(client, tmp_path)
+    refused(r"worker tcp://.* has gsba [\d.]+.*, this machine 0\.0\.7", _cluster, client, tmp_path)
 
 
 def test_a_folder_that_workers_do_not_see_is_named(client, tmp_path: Path) -> None:
@@ -209,8 +209,7 @@ def test_addresses_that_lead_nowhere(
     monkeypatch.setitem(sys.modules, "dask_jobqueue", None)
     for name, content in (("empty", "{}"), ("list", "[" * 100_000), ("text", "\udcff")):
         (tmp_path / f"{name}.json").write_text(content, errors="surrogateescape")
-    with pytest.raises(GsbaError, match=message):
-        connect(address.format(folder=tmp_path))
+    refused(message, connect, address.format(folder=tmp_path))
 
 
 def test_queues_are_configured_by_dask_and_asked_for_workers(monkeypatch) -> None:

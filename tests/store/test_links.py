@@ -9,6 +9,7 @@ import export_scene as scene
 import numpy as np
 import pytest
 from command import run_gsba
+from refusals import refused
 
 from gsba.disk import refuse_links
 from gsba.export.folder import output_folder
@@ -81,8 +82,7 @@ def test_a_run_goes_on_in_no_other_folder(
 ) -> None:
     plant(run / place, elsewhere)
     before, marker = _contents(elsewhere), (run / "gsba.json").read_bytes()
-    with pytest.raises(GsbaError, match=_KINDS):
-        RunStore(run, {}, fresh)
+    refused(_KINDS, RunStore, run, {}, fresh)
     assert _contents(elsewhere) == before and (run / "gsba.json").read_bytes() == marker
     (run / place).unlink()
     RunStore(run, {}, fresh).__exit__()  # and it is not held any more
@@ -133,7 +133,5 @@ def test_folders_of_files_alone_are_kept(tmp_path: Path) -> None:
     (tmp_path / "a/b/c").symlink_to(tmp_path)
     refuse_links(tmp_path)
     refuse_links(tmp_path / "not there", below=True)
-    with pytest.raises(GsbaError, match=r"a/b/c is a link"):
-        refuse_links(tmp_path, below=True)
-    with pytest.raises(GsbaError, match=r"a/b/c is a link"):
-        refuse_links(tmp_path / "a/b/c")
+    refused(r"a/b/c is a link", refuse_links, tmp_path, below=True)
+    refused(r"a/b/c is a link", refuse_links, tmp_path / "a/b/c")

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from gopro_files import box
+from refusals import refused
 from two_fisheyes import made_pair, picture
 from wave_panorama import wave_panorama
 
@@ -116,15 +117,13 @@ def test_pixels_that_are_not_square_are_made_square(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("mode", "name"), [(1, "over-under"), (2, "side by side")])
 def test_claimed_stereo_is_refused_by_name(tmp_path: Path, mode: int, name: str) -> None:
     path = _with_boxes(_write(tmp_path / "a.mp4", [_panorama()] * 3), _stereo(mode))
-    with pytest.raises(GsbaError, match=f"stereo, {name}, by its spherical video tags"):
-        read_recording(path)
+    refused(f"stereo, {name}, by its spherical video tags", read_recording, path)
 
 
 def test_claimed_bounds_are_refused_with_their_angles(tmp_path: Path) -> None:
     boxes = _spherical(bounds=(0.125, 0.125, 0.125, 0.125))
     path = _with_boxes(_write(tmp_path / "a.mp4", [_panorama()] * 3), boxes)
-    with pytest.raises(GsbaError, match="cropped panorama of 270 x 135 degrees"):
-        read_recording(path)
+    refused("cropped panorama of 270 x 135 degrees", read_recording, path)
 
 
 def test_a_claimed_pose_is_noted_and_pixels_stay_as_stored(tmp_path: Path) -> None:
@@ -184,8 +183,7 @@ def test_what_pictures_show_is_named(
     """More of them, see frames/test_panorama_tags.py: the pictures are judged alike."""
     pixels = draw()
     big = cv2.resize(pixels, (2 * WIDTH, 2 * WIDTH * pixels.shape[0] // pixels.shape[1]))
-    with pytest.raises(GsbaError, match=name):
-        read_recording(_write(tmp_path / "a.mp4", [big] * 3))
+    refused(name, read_recording, _write(tmp_path / "a.mp4", [big] * 3))
 
 
 def test_two_fisheyes_one_above_the_other_are_read(tmp_path: Path) -> None:

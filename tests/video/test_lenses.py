@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 import pytest
 from command import fails, run_gsba
+from refusals import refused
 from video_files import Track, encode, steady, times_of
 
 from gsba.config import RefineSettings, VideoSettings
-from gsba.log import GsbaError
 from gsba.pipeline.inputs import extract_video
 from gsba.store.store import RunStore
 from gsba.video import extract, extraction, is_video, recording
@@ -159,8 +159,7 @@ def test_the_other_file_counts_for_what_was_extracted(tmp_path: Path) -> None:
     extract(paths[0], tmp_path / "frames", EVERY)
     extract(paths[1], tmp_path / "frames", EVERY)  # the same
     encode(paths[1], _seen("back", range(1, 9), steady(9), -3000))
-    with pytest.raises(GsbaError, match="another extraction"):
-        extract(paths[0], tmp_path / "frames", EVERY)
+    refused("another extraction", extract, paths[0], tmp_path / "frames", EVERY)
 
 
 def test_a_panorama_named_like_one_of_a_pair_is_a_panorama(tmp_path: Path) -> None:
@@ -241,8 +240,7 @@ def test_range_and_width(film: Path, tmp_path: Path) -> None:
     extract(film, tmp_path / "frames", settings)
     _check_shown(tmp_path / "frames", [15, 20, 25, 30], steady(40))
     assert cv2.imread(str(tmp_path / "frames/back/000015.jpg")).shape == (64, 64, 3)
-    with pytest.raises(GsbaError, match="has only 96 pixels"):
-        extract(film, tmp_path / "wide", VideoSettings(width=128))
+    refused("has only 96 pixels", extract, film, tmp_path / "wide", VideoSettings(width=128))
 
 
 def test_nearly_square_pictures_stay_whole(tmp_path: Path) -> None:
@@ -301,8 +299,7 @@ def test_raw_and_stitched_extractions_replace_each_other(film: Path, tmp_path: P
     stitched = encode(tmp_path / "v.mp4", (panorama, steady(4)))
     out = tmp_path / "frames"
     extract(film, out, VideoSettings(every=10))
-    with pytest.raises(GsbaError, match="another extraction"):
-        extract(stitched, out, EVERY)
+    refused("another extraction", extract, stitched, out, EVERY)
     extract(stitched, out, EVERY, replace=True)
     assert not (out / "front").exists() and len(list(out.glob("*.jpg"))) == 4
     extract(film, out, VideoSettings(every=10), replace=True)

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from command import fails, run_gsba, succeed
+from refusals import refused
 from video_files import encode, steady, times_of
 
 from gsba.config import VideoSettings
@@ -174,8 +175,7 @@ def test_an_interrupted_extraction_goes_on(
 def test_frames_of_two_extractions_do_not_mix(film: Path, tmp_path: Path) -> None:
     out = tmp_path / "frames"
     extract(film, out, VideoSettings(every=30))
-    with pytest.raises(GsbaError, match=r"another extraction.*--fresh"):
-        extract(film, out, VideoSettings(every=20))
+    refused(r"another extraction.*--fresh", extract, film, out, VideoSettings(every=20))
     extract(film, out, VideoSettings(every=20), replace=True)
     assert _indices(out) == [0, 20, 40, 60, 80]
     assert json.loads((out / "extract.json").read_text())["counts"]["kept"] == 5
@@ -208,8 +208,7 @@ def test_edited_extractions_are_refused(
         marker = json.loads((out / "extract.json").read_text()) | {"counts": None}
         (out / "extract.json").write_text(json.dumps(marker))
     (out / name).write_text(content)
-    with pytest.raises(GsbaError, match=message):
-        extract(film, out, settings)
+    refused(message, extract, film, out, settings)
 
 
 def test_colours_survive(tmp_path: Path) -> None:
