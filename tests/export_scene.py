@@ -7,8 +7,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pycolmap
-from observing import observing
 from pixels import pixel_centres
+from plain_records import frames_of, map_of, observing
 from scipy.spatial.transform import Rotation
 from synthetic import unit
 
@@ -19,9 +19,10 @@ from gsba.camera.sphere import bearings_from_erp
 from gsba.disk import encoded_image, write_bytes, write_image
 from gsba.geometry import inverse, pose
 from gsba.store.records import save_record
-from gsba.types import FACES, FrameSet, PictureFormat, PoseStatus, Reconstruction
+from gsba.types import FACES, FrameSet, PictureFormat, Reconstruction
 
 NUM_FRAMES = 9
+TIMES = np.arange(NUM_FRAMES) * 0.5
 WIDTH, HEIGHT = 512, 256
 BLOB_RAD = 0.025  # spread of a point's picture; a panorama's pixel is 0.012
 
@@ -72,19 +73,9 @@ def reconstruction() -> Reconstruction:
     """Every point seen in every frame, without error."""
     world_T_rigs = poses()
     seen = np.swapaxes(bearings(world_T_rigs), 0, 1).reshape(-1, 3)  # by point, then frame
-    num_points = len(POINTS)
-    return Reconstruction(
-        world_T_rigs=world_T_rigs,
-        pose_covariances=np.full((NUM_FRAMES, 6, 6), np.nan),
-        pose_statuses=np.full(NUM_FRAMES, PoseStatus.REFINED, np.uint8),
-        points_world=POINTS,
-        point_colors=COLORS,
-        point_errors=np.linspace(0, 0.01, num_points),
-        observation_points=np.repeat(np.arange(num_points, dtype=np.int32), NUM_FRAMES),
-        observation_frames=np.tile(np.arange(NUM_FRAMES, dtype=np.int32), num_points),
-        observation_bearings=seen,
-        observation_sigmas=np.full(len(seen), 1e-3),
-    )
+    owners, frames = np.divmod(np.arange(len(seen)), NUM_FRAMES)
+    own = {"point_colors": COLORS, "point_errors": np.linspace(0, 0.01, len(POINTS))}
+    return map_of(world_T_rigs, POINTS, owners, frames, seen, **own)
 
 
 def picture(directions: np.ndarray, point_bearings: np.ndarray) -> np.ndarray:
@@ -152,13 +143,8 @@ def panoramas(
         mask_path = folder.parent / "mask.png"
         directions = bearings_from_erp(_grid(WIDTH, HEIGHT), WIDTH, HEIGHT)
         cv2.imwrite(str(mask_path), (directions[..., 1] < 0.6).astype(np.uint8) * 255)
-    return FrameSet(
-        names=names,
-        paths=tuple((folder / f"{name}{suffix}",) for name in names),
-        timestamps=np.arange(NUM_FRAMES) * 0.5,
-        mask_paths=(mask_path,) * NUM_FRAMES,
-        formats=(PictureFormat("erp", WIDTH, HEIGHT),),
-    )
+    paths = [(folder / f"{name}{suffix}",) for name in names]
+    return frames_of(PictureFormat("erp", WIDTH, HEIGHT), paths, TIMES, names, mask_path)
 
 
 def cube_frames(folder: Path, size: int = 128) -> FrameSet:
@@ -172,13 +158,8 @@ def cube_frames(folder: Path, size: int = 128) -> FrameSet:
         for face in faces:
             directions = rays @ RIG_R_FACE[FACES.index(face)].T
             write_image(folder / face / f"{name}.png", picture(directions, seen))
-    return FrameSet(
-        names=names,
-        paths=tuple(tuple(folder / face / f"{name}.png" for face in faces) for name in names),
-        timestamps=np.arange(NUM_FRAMES) * 0.5,
-        mask_paths=(None,) * NUM_FRAMES,
-        formats=(PictureFormat("cube", size, size, faces),),
-    )
+    paths = [tuple(folder / face / f"{name}.png" for face in faces) for name in names]
+    return frames_of(PictureFormat("cube", size, size, faces), paths, TIMES, names)
 
 
 def assert_blob(

@@ -114,17 +114,17 @@ def make_world(
     bearings = with_noise(bearings, sigma_rad, rng)
     false = rng.random(len(bearings)) < false_share
     bearings[false] = unit(rng.normal(size=(false.sum(), 3)))
-    faces = owner_faces(bearings)
-    keypoints = Keypoints(
-        starts,
-        RIG.project(bearings, faces),
-        faces,
-        bearings,
-        np.full(len(bearings), claimed_sigma_rad or sigma_rad),
-        np.full((len(bearings), 3), 128, np.uint8),
-    )
+    keypoints = keypoints_of(starts, bearings, claimed_sigma_rad or sigma_rad)
     tracks, order = tracks_of(which, frames, starts)
     return World(world_T_rigs, points[np.unique(which)], keypoints, tracks, false[order])
+
+
+def keypoints_of(starts: np.ndarray, bearings: np.ndarray, sigma: float) -> Keypoints:
+    """Grey keypoints of one noise (radians) with these bearings (K, 3)."""
+    faces, num = owner_faces(bearings), len(bearings)
+    grey = np.full((num, 3), 128, np.uint8)
+    pixels = RIG.project(bearings, faces)
+    return Keypoints(starts, pixels, faces, bearings, np.full(num, sigma), grey)
 
 
 def tracks_of(

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import export_scene as scene
 import numpy as np
-from observing import observing
+from plain_records import frames_of, observing
 from scipy.spatial.transform import Rotation
 
 from gsba.geometry import pose
@@ -17,11 +17,9 @@ ORIGIN = np.array([48.137, 11.575, 520.0])
 
 
 def frame_set(num: int = scene.NUM_FRAMES) -> FrameSet:
-    names = tuple(f"frame_{f:04d}" for f in range(num))
-    paths = tuple((Path(name),) for name in names)
-    return FrameSet(
-        names, paths, np.arange(num) * 0.5, (None,) * num, (PictureFormat("erp", 512, 256),)
-    )
+    names = [f"frame_{f:04d}" for f in range(num)]
+    paths = [(Path(name),) for name in names]
+    return frames_of(PictureFormat("erp", 512, 256), paths, np.arange(num) * 0.5, names)
 
 
 def walk_result(num: int = 40, straight: bool = False) -> Reconstruction:

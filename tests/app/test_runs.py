@@ -7,7 +7,7 @@ from typing import Any
 import export_scene as scene
 import numpy as np
 import pytest
-from observing import observing
+from plain_records import observing
 
 from gsba.pipeline.stage_titles import LENS_CENTRES, READOUTS, RECONSTRUCTION, is_one_of, title_of
 from gsba.store.records import save_record

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from plain_records import map_of
 from scipy.spatial.transform import Rotation
 from synthetic import unit, with_noise
 
@@ -22,25 +23,13 @@ def _map(nested: bool, noise: float = 0.0, standing: slice = slice(0)) -> Recons
     poses = pose(turns, rng.normal(0, 0.05, (NUM, 3)))
     poses[standing, :3, 3] = poses[standing.start or 0, :3, 3]
     points = unit(rng.normal(size=(NUM_POINTS, 3))) * rng.uniform(1, 4, (NUM_POINTS, 1))
-    which = np.repeat(np.arange(NUM_POINTS, dtype=np.int32), NUM)
-    frames = np.tile(np.arange(NUM, dtype=np.int32), NUM_POINTS)
+    which, frames = np.divmod(np.arange(NUM * NUM_POINTS), NUM)
     rays = points[which] - poses[frames, :3, 3]
     bearings = unit(np.einsum("oji,oj->oi", poses[frames, :3, :3], rays))
     bearings = with_noise(bearings, noise, rng)
     if nested:
         poses[NEST, :3, 3] = poses[4, :3, 3] + 0.01 * (poses[NEST, :3, 3] - poses[4, :3, 3])
-    return Reconstruction(
-        poses,
-        np.zeros((NUM, 6, 6)),
-        np.zeros(NUM, np.uint8),
-        points,
-        np.zeros((NUM_POINTS, 3), np.uint8),
-        np.zeros(NUM_POINTS),
-        which,
-        frames,
-        bearings,
-        np.full(len(bearings), 1e-3),
-    )
+    return map_of(poses, points, which, frames, bearings)
 
 
 def test_true_steps_are_predicted() -> None:

@@ -4,10 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from synthetic import RIG, unit, with_noise
+from synthetic import keypoints_of, unit, with_noise
 
 from gsba.bundle import rotation_only
-from gsba.camera.rig import owner_faces
 from gsba.geometry import rotation_angle
 from gsba.types import Keypoints, Tracks
 
@@ -24,11 +23,7 @@ def _scene(false_share: float) -> tuple[np.ndarray, Tracks, Keypoints]:
     bearings = np.concatenate(bearings)
     false = rng.random(len(bearings)) < false_share
     bearings[false] = unit(rng.normal(size=(false.sum(), 3)))
-    faces, count = owner_faces(bearings), len(bearings)
-    starts = np.arange(NUM + 1) * DIRECTIONS
-    grey = np.zeros((count, 3), np.uint8)
-    pixels = RIG.project(bearings, faces)
-    keypoints = Keypoints(starts, pixels, faces, bearings, np.full(count, SIGMA), grey)
+    keypoints = keypoints_of(np.arange(NUM + 1) * DIRECTIONS, bearings, SIGMA)
     which, frames = np.nonzero((rng.random((NUM, DIRECTIONS)) < 0.3).T)
     which, frames = which.astype(np.int32), frames.astype(np.int32)
     return rotations, Tracks(which, frames, which, DIRECTIONS), keypoints
@@ -58,11 +53,9 @@ def test_rotations_are_found_to_their_covariances() -> None:
 
 def test_exact_rays_give_exact_rotations() -> None:
     rotations, tracks, keypoints = _scene(false_share=0.0)
-    starts = keypoints.starts
     directions = np.random.default_rng(0).normal(size=(DIRECTIONS, 3))
     exact = np.concatenate([unit(directions) @ rotation for rotation in rotations])
-    keypoints = Keypoints(starts, keypoints.pixels, keypoints.faces, exact, keypoints.sigmas_rad,
-                          keypoints.colors)  # fmt: skip
+    keypoints = replace(keypoints, bearings_rig=exact)
     found, _, _ = rotation_only.solve(_drifting(rotations), tracks, keypoints)
     assert rotation_angle(np.swapaxes(rotations, 1, 2) @ found).max() < 1e-8
 

@@ -4,10 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from observing import observing
+from plain_records import map_of, observing
+from synthetic import unit
 
 from gsba.bundle.map_strength import neighbour_shifts, position_errors, scale_changes
-from gsba.types import JointErrors, PoseStatus, Reconstruction
+from gsba.types import JointErrors, Reconstruction
 
 SIGMA = 1e-3  # radians, of bearings
 NUM = 14
@@ -26,19 +27,8 @@ def _corridor(along: np.ndarray, reach: float = 4.0) -> Reconstruction:
     offsets = points[:, None] - poses[None, :, :3, 3]
     seen = np.argwhere(np.linalg.norm(offsets, axis=2) < reach)
     rays = offsets[seen[:, 0], seen[:, 1]]
-    rays = rays / np.linalg.norm(rays, axis=1, keepdims=True) + SIGMA * rng.normal(size=rays.shape)
-    return Reconstruction(
-        poses,
-        np.full((frames, 6, 6), np.nan),
-        np.full(frames, PoseStatus.REFINED, np.uint8),
-        points,
-        np.zeros((num, 3), np.uint8),
-        np.zeros(num),
-        seen[:, 0].astype(np.int32),
-        seen[:, 1].astype(np.int32),
-        rays / np.linalg.norm(rays, axis=1, keepdims=True),
-        np.full(len(seen), SIGMA),
-    )
+    rays = unit(rays) + SIGMA * rng.normal(size=rays.shape)
+    return map_of(poses, points, *seen.T, unit(rays), SIGMA)
 
 
 ONE = np.zeros(NUM, np.int64)  # recording of every frame

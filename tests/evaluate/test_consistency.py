@@ -6,6 +6,7 @@ from functools import cache
 import gtsam
 import numpy as np
 import pytest
+from plain_records import map_of
 from refusals import refused
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
@@ -61,19 +62,8 @@ def _solved(seed: int) -> tuple[Reconstruction, Trajectory]:
 def _result(poses: np.ndarray, covariances: np.ndarray, joint: JointErrors) -> Reconstruction:
     """Poses and what is known of their errors, without points."""
     none, nothing = np.zeros(0, np.int32), np.zeros((0, 3))
-    return Reconstruction(
-        world_T_rigs=poses,
-        pose_covariances=covariances,
-        pose_statuses=np.zeros(len(poses), np.uint8),
-        points_world=nothing,
-        point_colors=nothing,
-        point_errors=none,
-        observation_points=none,
-        observation_frames=none,
-        observation_bearings=nothing,
-        observation_sigmas=none,
-        joint_errors=joint,
-    )
+    known = {"pose_covariances": covariances, "joint_errors": joint}
+    return map_of(poses, nothing, none, none, nothing, **known)
 
 
 def _statistics(found: Consistency) -> list[Statistic]:

@@ -5,7 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from plain_records import frames_of, map_of
 from scan_world import HALL, INTO_SCAN, SIZE, cloud, scan
+from synthetic import unit
 
 from gsba.config import PlacementSettings
 from gsba.evaluate import scans
@@ -14,7 +16,7 @@ from gsba.geometry import pose
 from gsba.placement import guess_in_scan
 from gsba.scans.search import Guess
 from gsba.scans.types import Scan
-from gsba.types import FrameSet, PictureFormat, PoseStatus, Reconstruction
+from gsba.types import PictureFormat, Reconstruction
 
 
 def _run() -> Reconstruction:
@@ -24,19 +26,9 @@ def _run() -> Reconstruction:
     positions = rng.uniform([1, 1.5, 1], [5, 2.4, 1.6], (12, 3))
     frames = np.sort(rng.permuted(np.tile(np.arange(12), (1500, 1)), axis=1)[:, :3], axis=1).ravel()
     owners = np.repeat(np.arange(1500), 3)
-    rays = seen.points[owners] - positions[frames]
-    return Reconstruction(
-        pose(np.tile(np.eye(3), (12, 1, 1)), positions),
-        np.full((12, 6, 6), np.nan),
-        np.full(12, PoseStatus.REFINED, np.uint8),
-        seen.points,
-        np.full((1500, 3), 99, np.uint8),
-        np.zeros(1500),
-        owners.astype(np.int32),
-        frames.astype(np.int32),
-        rays / np.linalg.norm(rays, axis=1, keepdims=True),
-        np.full(len(owners), 5e-4),
-    )
+    rays = unit(seen.points[owners] - positions[frames])
+    poses = pose(np.tile(np.eye(3), (12, 1, 1)), positions)
+    return map_of(poses, seen.points, owners, frames, rays, 5e-4)
 
 
 def test_distances_after_and_before(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -72,10 +64,7 @@ def test_pairs_tell_where_to_look(tmp_path: Path) -> None:
     pairs.write_text(
         "".join(f"{','.join(map(repr, a))} {','.join(map(repr, b))}\n" for a, b in lines)
     )
-    names = tuple(f"{f:02}" for f in range(12))
-    frames = FrameSet(
-        names, ((),) * 12, np.arange(12.0), (None,) * 12, (PictureFormat("erp", 64, 32),)
-    )
+    frames = frames_of(PictureFormat("erp", 64, 32), ((),) * 12)
     offset = np.array([5.0, -7.0, 11.0])
     far = Scan(np.zeros((1, 3)), np.ones((1, 3)), offset)
     known = PlacementSettings(scan="scan.ply", pairs=str(pairs))

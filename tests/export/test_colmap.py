@@ -17,7 +17,7 @@ from export_scene import (
     reconstruction,
     reprojection_errors,
 )
-from observing import observing
+from plain_records import observing
 from plyfile import PlyData
 
 from gsba.export import ExportFormat, ExportOptions, export, export_all

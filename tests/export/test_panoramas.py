@@ -24,6 +24,7 @@ from export_scene import (
     seen_by_lenses,
 )
 from pixels import pixel_centres
+from plain_records import frames_of
 from scipy.spatial.transform import Rotation, Slerp
 from synthetic import unit
 from two_fisheyes import made_pair
@@ -73,13 +74,8 @@ def _raw_frames(folder: Path) -> FrameSet:
             write_image(path, picture(unproject(lens, pixels), seen))
             of_frame.append(path)
         paths.append(tuple(of_frame))
-    return FrameSet(
-        names=names,
-        paths=tuple(paths),
-        timestamps=np.arange(NUM_FRAMES) * 0.5,
-        mask_paths=(None,) * NUM_FRAMES,
-        formats=(PictureFormat("erp", 512, 256, fisheyes=PAIR),),
-    )
+    form = PictureFormat("erp", 512, 256, fisheyes=PAIR)
+    return frames_of(form, paths, np.arange(NUM_FRAMES) * 0.5, names)
 
 
 def _check_erp(image: np.ndarray, lenses: Lenses, f: int) -> int:

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
-from export_scene import panoramas
 from PIL import Image
+from plain_records import frames_of
 from two_fisheyes import made_pair, picture, write
 
 from gsba.export.images import write_pictures
@@ -20,21 +20,14 @@ PAIR = made_pair(120)
 def _frames(folder: Path, layout: str) -> tuple[FrameSet, list[np.ndarray]]:
     """One frame of two lenses, and their pictures."""
     shown = [picture(lens) for lens in PAIR]
-    base = panoramas(folder / "panoramas").taken(np.arange(1))
     if layout == "beside":
         paths = (write(folder / "0.png", np.concatenate(shown, axis=1)),) * 2
     else:
         paths = (folder / f"0_00.{layout}", folder / f"0_10.{layout}")
         for path, pixels in zip(paths, shown, strict=True):
             Image.fromarray(pixels).save(path, **({"lossless": True} if layout == "webp" else {}))
-    made = FrameSet(
-        base.names,
-        (paths,),
-        base.timestamps,
-        (None,),
-        (PictureFormat("fisheye", 240, 120, fisheyes=PAIR),),
-    )
-    return made, shown
+    form = PictureFormat("fisheye", 240, 120, fisheyes=PAIR)
+    return frames_of(form, [paths], names=["frame_0000"]), shown
 
 
 @pytest.mark.parametrize("layout", ["png", "beside", "tif", "webp"])

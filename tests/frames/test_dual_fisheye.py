@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from pixels import pixel_centres
+from plain_records import frames_of
 from two_fisheyes import colours, made_pair, picture, write
 
 from gsba.camera.sphere import bearings_from_erp
@@ -19,16 +20,8 @@ WIDTHS = [416, 360, 302, 300, 210, 130]  # the first as dense as the pictures; n
 
 
 def _frames(paths: list[tuple[Path, ...]]) -> FrameSet:
-    width, num = width_of(PAIR), len(paths)
-    names = tuple(map(str, range(num)))
-    times, masks = np.arange(num, dtype=np.float64), (None,) * num
-    return FrameSet(
-        names,
-        tuple(paths),
-        times,
-        masks,
-        (PictureFormat("fisheye", width, width // 2, fisheyes=PAIR),),
-    )
+    width = width_of(PAIR)
+    return frames_of(PictureFormat("fisheye", width, width // 2, fisheyes=PAIR), paths)
 
 
 @pytest.fixture(scope="module")

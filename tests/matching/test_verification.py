@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from synthetic import bearings_of, unit, with_noise
+from synthetic import bearings_of, keypoints_of, unit, with_noise
 
 from gsba.geometry import pose, rotation_angle
 from gsba.matching import verification
 from gsba.store.shards import Threads
 from gsba.trajectory.limits import TwoViewLimits
-from gsba.types import Keypoints, Matches, VerifiedPairs
+from gsba.types import Matches, VerifiedPairs
 
 NUM = 200
 SIGMA = 3e-4
@@ -132,15 +132,7 @@ def _run(
     """Each view as a pair of two frames of its own, keypoint k matched with k."""
     bearings = np.concatenate([np.zeros((0, 3)), *(b for view in views for b in view[:2])])
     starts = np.cumsum([0] + [len(b) for view in views for b in view[:2]])
-    num = len(bearings)
-    keypoints = Keypoints(
-        starts,
-        np.zeros((num, 2)),
-        np.zeros(num, np.uint8),
-        bearings,
-        np.full(num, SIGMA),
-        np.zeros((num, 3), np.uint8),
-    )
+    keypoints = keypoints_of(starts, bearings, SIGMA)
     rows = [np.repeat(np.arange(len(view[0]), dtype=np.int32)[:, None], 2, 1) for view in views]
     matches = Matches(
         np.arange(2 * len(views), dtype=np.int32).reshape(-1, 2),

@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 import pytest
 from pixels import pixel_centres
-from synthetic import bearings_of, unit
+from plain_records import frames_of
+from synthetic import bearings_of, keypoints_of, unit
 
 from gsba.bundle import adjustment
 from gsba.bundle.adjustment import AdjustmentContext
@@ -79,12 +80,7 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> tuple[FrameSet, np.ndarray
         image = _grey(_hit(positions[f], rays @ turns[f].T)) + rng.normal(0, 2, rays.shape[:2])
         paths.append((folder / f"{f}.png",))
         cv2.imwrite(str(paths[-1][0]), np.clip(image * (1 + 0.05 * f) - 5 * f, 0, 255))
-    names = tuple(str(f) for f in range(NUM))
-    times = np.arange(NUM, dtype=float)
-    frames = FrameSet(
-        names, tuple(paths), times, (None,) * NUM, (PictureFormat("erp", WIDTH, WIDTH // 2),)
-    )
-    return frames, world_T_rigs
+    return frames_of(PictureFormat("erp", WIDTH, WIDTH // 2), paths), world_T_rigs
 
 
 def _start(
@@ -106,11 +102,7 @@ def _start(
         bearings[starts[f] : starts[f + 1]] = bearings_of(points[owners[rows]], world_T_rigs[f])
     bearings += rng.normal(0, sigma_px * PIXEL, bearings.shape)
     bearings /= np.linalg.norm(bearings, axis=1, keepdims=True)
-    size = len(order)
-    keypoints = Keypoints(
-        starts, np.zeros((size, 2)), np.zeros(size, np.uint8), bearings,
-        np.full(size, sigma_px * PIXEL), np.full((size, 3), 50, np.uint8),
-    )  # fmt: skip
+    keypoints = keypoints_of(starts, bearings, sigma_px * PIXEL)
     tracks = Tracks(
         owners.astype(np.int32), frames.astype(np.int32),
         (rank - starts[frames]).astype(np.int32), num,
@@ -212,7 +204,7 @@ def test_tracks_and_keypoints_belong_together(walk) -> None:
     assert keypoints.sqrt_infos is not None
     determinant = np.linalg.det(keypoints.sqrt_infos)
     np.testing.assert_allclose(determinant, keypoints.sigmas_rad**-2, rtol=1e-9)
-    assert (keypoints.colors == 50).all()
+    assert (keypoints.colors == 128).all()
 
 
 def test_poses_become_better_than_the_detector_leaves_them(walk) -> None:
@@ -360,10 +352,7 @@ def test_patches_come_to_lie_on_their_surfaces(tmp_path: Path) -> None:
         image = _grey(2.5 * _walls(centre, rays)[0]) + rng.normal(0, 2, rays.shape[:2])
         paths.append((tmp_path / f"{f}.png",))
         cv2.imwrite(str(paths[-1][0]), np.clip(image, 0, 255))
-    names, times = tuple(map(str, range(NUM))), np.arange(NUM, dtype=float)
-    frames = FrameSet(
-        names, tuple(paths), times, (None,) * NUM, (PictureFormat("erp", WIDTH, WIDTH // 2),)
-    )
+    frames = frames_of(PictureFormat("erp", WIDTH, WIDTH // 2), paths)
     landmarks, keypoints = _start(world_T_rigs, num=800)
     outwards = landmarks.points_world * np.array([0.4, 1, 1])  # towards the walls beside the walk
     points, true = _walls(np.zeros(3), outwards / np.linalg.norm(outwards, axis=1, keepdims=True))

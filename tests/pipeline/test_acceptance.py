@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
+from plain_records import frames_of, map_of
 
 from gsba.log import GsbaError
 from gsba.pipeline.acceptance import (
@@ -29,20 +30,9 @@ def _result(step: float, num_points: int = 5) -> Reconstruction:
     poses[:, 0, 3] = step * np.arange(NUM)
     covariances = np.tile(np.diag([1e-12] * 3 + [SIGMA**2] * 3), (NUM, 1, 1))
     joint = JointErrors(np.zeros((NUM - 1, 6, 6)), np.zeros((0, NUM, 6), np.float32))
-    none = np.zeros(0)
-    return Reconstruction(
-        poses,
-        covariances,
-        np.zeros(NUM, np.uint8),
-        np.ones((num_points, 3)),
-        np.zeros((num_points, 3), np.uint8),
-        np.zeros(num_points),
-        none.astype(np.int32),
-        none.astype(np.int32),
-        none.reshape(0, 3),
-        none,
-        joint_errors=joint,
-    )
+    none, points = np.zeros(0), np.ones((num_points, 3))
+    known = {"pose_covariances": covariances, "joint_errors": joint}
+    return map_of(poses, points, none, none, none.reshape(0, 3), **known)
 
 
 def _frames(folder: Path, masked_rows: int) -> FrameSet:
@@ -50,13 +40,8 @@ def _frames(folder: Path, masked_rows: int) -> FrameSet:
     mask = np.full((32, 64), 255, np.uint8)
     mask[32 - masked_rows :] = 0
     cv2.imwrite(str(folder / "mask.png"), mask)
-    return FrameSet(
-        tuple(f"{n}" for n in range(NUM)),
-        ((folder / "0.jpg",),) * NUM,
-        np.arange(NUM, dtype=np.float64),
-        (folder / "mask.png",) * NUM,
-        (PictureFormat("erp", 64, 32),),
-    )
+    paths = ((folder / "0.jpg",),) * NUM
+    return frames_of(PictureFormat("erp", 64, 32), paths, mask=folder / "mask.png")
 
 
 def test_steps_are_measured_by_their_own_noise() -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from command import run_gsba
 from pixels import pixel_centres
+from plain_records import frames_of
 from refusals import refused
 from scipy.spatial.transform import Rotation
 from walk_on_earth import ORIGIN, frame_set, geodetic_of, level_metres, walk_result, write_fixes
@@ -271,12 +272,7 @@ def _posts(folder: Path, tilt: np.ndarray, num: int = 6) -> tuple[FrameSet, np.n
         image = shades[np.searchsorted(edges, longitude) % len(edges)].astype(np.float32)
         paths.append((folder / f"{f}.png",))
         cv2.imwrite(str(paths[-1][0]), cv2.GaussianBlur(image, (0, 0), 1.0))
-    names = tuple(str(f) for f in range(num))
-    times = np.arange(float(num))
-    frames = FrameSet(
-        names, tuple(paths), times, (None,) * num, (PictureFormat("erp", width, height),)
-    )
-    return frames, np.array(rotations)
+    return frames_of(PictureFormat("erp", width, height), paths), np.array(rotations)
 
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 5.0])

@@ -6,7 +6,7 @@ from pathlib import Path
 import export_scene as scene
 import numpy as np
 import pytest
-from observing import observing
+from plain_records import observing
 
 from gsba.config import RefineSettings
 from gsba.report.maps import MapSummary, format_outcome, is_partial, summarize_maps

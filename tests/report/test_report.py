@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from plain_records import frames_of, map_of
 from synthetic import unit
 
 from gsba.config import RefineSettings
@@ -57,26 +58,17 @@ def _world() -> tuple[FrameSet, CoarsePoses, Reconstruction]:
     angle = np.radians(ERROR_DEG)
     covariances = np.tile(np.diag([1e-6, 4e-6, 9e-6, 1.0, 4.0, 9.0]), (NUM_FRAMES, 1, 1))
     covariances[3] = np.nan
-    reconstruction = Reconstruction(
-        world_T_rigs=world_T_rigs,
-        pose_covariances=covariances,
-        pose_statuses=np.array([0, 0, 0, PoseStatus.UNREFINED], np.uint8),
-        points_world=points_world,
-        point_colors=np.zeros((NUM_POINTS, 3), np.uint8),
-        point_errors=np.full(NUM_POINTS, angle),
-        observation_points=observation_points.astype(np.int32),
-        observation_frames=observation_frames.astype(np.int32),
-        observation_bearings=np.cos(angle) * bearings + np.sin(angle) * sideways,
-        observation_sigmas=np.full(len(bearings), 1e-3),
-    )
-    names = tuple(f"{f:03d}, ä" for f in range(NUM_FRAMES))
-    frames = FrameSet(
-        names=names,
-        paths=tuple((Path(name),) for name in names),
-        timestamps=np.arange(NUM_FRAMES) / 3,
-        mask_paths=(None,) * NUM_FRAMES,
-        formats=(PictureFormat("erp", 64, 32),),
-    )
+    turned = np.cos(angle) * bearings + np.sin(angle) * sideways
+    known = {
+        "pose_covariances": covariances,
+        "pose_statuses": np.array([0, 0, 0, PoseStatus.UNREFINED], np.uint8),
+        "point_errors": np.full(NUM_POINTS, angle),
+    }
+    seen = points_world, observation_points, observation_frames, turned
+    reconstruction = map_of(world_T_rigs, *seen, **known)
+    names = [f"{f:03d}, ä" for f in range(NUM_FRAMES)]
+    paths, times = [(Path(name),) for name in names], np.arange(NUM_FRAMES) / 3
+    frames = frames_of(PictureFormat("erp", 64, 32), paths, times, names)
     sources = np.array([0, PoseSource.INTERPOLATED, 0, 0], np.uint8)
     return frames, CoarsePoses(world_T_rigs, sources, 0.0), reconstruction
 

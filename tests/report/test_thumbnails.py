@@ -8,6 +8,7 @@ import cv2
 import export_scene as scene
 import numpy as np
 import pytest
+from plain_records import frames_of
 
 from gsba.camera.sphere import bearings_from_erp, erp_from_bearings
 from gsba.report.html import thumbnails
@@ -103,13 +104,8 @@ def test_raw_lenses_are_joined_at_a_part_of_their_size(tmp_path: Path) -> None:
     front[160:180, 235:265] = (0, 255, 0)  # 0.8 rad to the right
     cv2.imwrite(str(tmp_path / "f.png"), front)
     cv2.imwrite(str(tmp_path / "b.png"), np.full((size, size, 3), (255, 0, 0), np.uint8))
-    frames = FrameSet(
-        ("0",),
-        ((tmp_path / "f.png", tmp_path / "b.png"),),
-        np.zeros(1),
-        (None,),
-        (PictureFormat("fisheye", 628, 314, fisheyes=(lens, back)),),
-    )
+    form = PictureFormat("fisheye", 628, 314, fisheyes=(lens, back))
+    frames = frames_of(form, [(tmp_path / "f.png", tmp_path / "b.png")])
     image = thumbnails.small_panorama(frames, 0, 200)
     assert image.shape == (100, 200, 3)
     assert image[50, 100].tolist() == [255, 0, 0] and image[50, 5].tolist() == [0, 0, 255]

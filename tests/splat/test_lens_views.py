@@ -6,6 +6,7 @@ import gtsam
 import numpy as np
 import pytest
 from pixels import pixel_centres
+from plain_records import frames_of
 from scipy.spatial.transform import Rotation
 from splat_alignment import align_to_splat
 
@@ -22,7 +23,7 @@ from gsba.splat.options import TrainingOptions
 from gsba.splat.pictures import render_panorama
 from gsba.splat.scene import load_faces, make_views
 from gsba.splat.scores import mean_score, measure
-from gsba.types import FrameSet, PictureFormat
+from gsba.types import PictureFormat
 
 WIDTH, SIZE, NEAR, NUM_FRAMES = 512, 96, 0.01, 2
 BACKEND, SETTINGS = CpuBackend(2), TrainingOptions(sh_degree=0)
@@ -69,11 +70,8 @@ def taken(request: pytest.FixtureRequest, room: Gaussians, tmp_path_factory):
             eye = POSES[f] @ pose(np.eye(3), sign * axes @ lenses.centre)
             halves.append(render_panorama(room, eye, WIDTH, NEAR, BACKEND))
         write_image(path, np.where(directions @ axes[:, 2:] > 0, *halves))
-    names, files = tuple(path.stem for path in paths), tuple((path,) for path in paths)
-    times, size = np.arange(NUM_FRAMES) / 2, (WIDTH, WIDTH // 2)
-    return FrameSet(
-        names, files, times, (None,) * NUM_FRAMES, (PictureFormat("erp", *size),)
-    ), lenses
+    form, files = PictureFormat("erp", WIDTH, WIDTH // 2), [(path,) for path in paths]
+    return frames_of(form, files, np.arange(NUM_FRAMES) / 2), lenses
 
 
 def test_a_splat_looks_like_faces_of_each_lens(taken, room: Gaussians) -> None:

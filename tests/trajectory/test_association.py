@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from plain_records import frames_of
 from refusals import refused
 from scipy.spatial.transform import Rotation
 
@@ -23,14 +24,8 @@ SPEED, RATE = np.array([0.5, -0.1, 1.0]), np.array([0.02, 0.1, -0.05])  # units/
 
 
 def frames_at(times: np.ndarray) -> FrameSet:
-    n = len(times)
-    return FrameSet(
-        names=tuple(f"{i:04d}" for i in range(n)),
-        paths=((Path("x.jpg"),),) * n,
-        timestamps=np.asarray(times, dtype=np.float64),
-        mask_paths=(None,) * n,
-        formats=(PictureFormat("erp", 64, 32),),
-    )
+    names, times = [f"{i:04d}" for i in range(len(times))], np.asarray(times, dtype=np.float64)
+    return frames_of(PictureFormat("erp", 64, 32), ((Path("x.jpg"),),) * len(times), times, names)
 
 
 def motion(times: np.ndarray) -> np.ndarray:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from synthetic import RIG, bearings_of, drifted, loop_walk, unit, with_noise
+from synthetic import RIG, bearings_of, drifted, keypoints_of, loop_walk, unit, with_noise
 
 from gsba.config import PriorSettings
 from gsba.geometry import inverse, pose, rotation_angle
@@ -27,14 +27,7 @@ def _seen(missing: tuple[int, ...] = ()) -> tuple[VerifiedPairs, Keypoints]:
     bearings = np.concatenate(
         [with_noise(bearings_of(points, world_T_rig), 3e-4, rng) for world_T_rig in TRUTH]
     )
-    keypoints = Keypoints(
-        np.arange(NUM_FRAMES + 1) * NUM_POINTS,
-        np.zeros((len(bearings), 2)),
-        np.zeros(len(bearings), np.uint8),
-        bearings,
-        np.full(len(bearings), RIG.focal),
-        np.zeros((len(bearings), 3), np.uint8),
-    )
+    keypoints = keypoints_of(np.arange(NUM_FRAMES + 1) * NUM_POINTS, bearings, RIG.focal)
     steps = [f for f in range(NUM_FRAMES - 1) if f not in missing]
     f0_T_f1s = (inverse(TRUTH[:-1]) @ TRUTH[1:])[steps]
     f0_T_f1s[:, :3, 3] = unit(f0_T_f1s[:, :3, 3])
@@ -183,14 +176,7 @@ def test_a_turn_on_the_spot_is_seen_as_one() -> None:
     bearings0 = unit(rng.normal(size=(NUM_POINTS, 3)))
     turn = Rotation.from_rotvec([0.02, 0.3, 0]).as_matrix()
     bearings = np.concatenate([bearings0, with_noise(bearings0 @ turn, 3e-4, rng)])
-    keypoints = Keypoints(
-        np.array([0, NUM_POINTS, 2 * NUM_POINTS]),
-        np.zeros((len(bearings), 2)),
-        np.zeros(len(bearings), np.uint8),
-        bearings,
-        np.full(len(bearings), 3e-4),
-        np.zeros((len(bearings), 3), np.uint8),
-    )
+    keypoints = keypoints_of(np.array([0, NUM_POINTS, 2 * NUM_POINTS]), bearings, 3e-4)
     rows = np.tile(np.arange(NUM_POINTS, dtype=np.int32)[:, None], (1, 2))
     rough = Rotation.from_rotvec([0.001, 0, 0]).as_matrix()
     f0_T_f1 = pose(turn @ rough, np.array([0.0, 0, 1]))[None]

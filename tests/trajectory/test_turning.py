@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from synthetic import unit, with_noise
+from synthetic import keypoints_of, unit, with_noise
 
-from gsba.camera.rig import owner_faces
 from gsba.geometry import rotation_angle
 from gsba.trajectory import turning
 from gsba.trajectory.limits import TwoViewLimits
@@ -35,12 +34,7 @@ def _seen(
         with_noise(unit(points - at[f]) @ rotation, SIGMA, rng)
         for f, rotation in enumerate(ROTATIONS)
     ]
-    bearings, count = np.concatenate(rays), num * NUM_FRAMES
-    starts, nothing = np.arange(NUM_FRAMES + 1) * num, np.zeros((count, 3), np.uint8)
-    sigmas = np.full(count, SIGMA)
-    keypoints = Keypoints(
-        starts, np.zeros((count, 2)), owner_faces(bearings), bearings, sigmas, nothing
-    )
+    keypoints = keypoints_of(np.arange(NUM_FRAMES + 1) * num, np.concatenate(rays), SIGMA)
     pairs, row = np.array(frames, np.int32).reshape(-1, 2), np.arange(num, dtype=np.int32)
     matches = Matches.of_rows(pairs, [np.column_stack([row, row])] * len(frames))
     poses = np.tile(np.eye(4), (len(frames), 1, 1))
