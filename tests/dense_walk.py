@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from one_gallery import gallery
 
-from gsba.camera.sphere import around_sphere, bearings_from_erp, erp_from_bearings
+from gsba.camera.sphere import around_sphere, erp_directions, erp_from_bearings
 from gsba.demo.render import render_erp
 from gsba.demo.walk import walk_poses
 
@@ -40,8 +40,7 @@ class RenderedWalk:
 def turn(grey: np.ndarray, rig_R_turned: np.ndarray) -> np.ndarray:
     """What a turned camera sees of a panorama (h, 2h) uint8."""
     height, width = grey.shape
-    v, u = np.mgrid[:height, :width] + 0.5
-    rays = bearings_from_erp(np.stack([u, v], axis=-1), width, height) @ rig_R_turned.T
+    rays = erp_directions(width) @ rig_R_turned.T
     u, v = np.moveaxis(erp_from_bearings(rays, width, height) + 1.5, -1, 0).astype(np.float32)
     return cv2.remap(around_sphere(grey, 2), u, v, cv2.INTER_LINEAR)
 

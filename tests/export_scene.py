@@ -15,7 +15,7 @@ from synthetic import unit
 from gsba import load_run
 from gsba.camera.lens import Lenses
 from gsba.camera.rig import RIG_R_FACE
-from gsba.camera.sphere import bearings_from_erp
+from gsba.camera.sphere import erp_directions
 from gsba.disk import encoded_image, write_bytes, write_image
 from gsba.geometry import inverse, pose
 from gsba.store.records import save_record
@@ -89,13 +89,9 @@ def picture(directions: np.ndarray, point_bearings: np.ndarray) -> np.ndarray:
     return np.round(image).astype(np.uint8)
 
 
-def _grid(width: int, height: int) -> np.ndarray:
-    return pixel_centres(width, height)
-
-
 def _encoded(shown: np.ndarray, suffix: str) -> list[bytes]:
     """Files of panoramas that show POINTS in directions (F, J, 3)."""
-    directions = bearings_from_erp(_grid(WIDTH, HEIGHT), WIDTH, HEIGHT)
+    directions = erp_directions(WIDTH)
     return [encoded_image(picture(directions, seen), Path(f"a{suffix}")) for seen in shown]
 
 
@@ -141,7 +137,7 @@ def panoramas(
     mask_path = None
     if masked:
         mask_path = folder.parent / "mask.png"
-        directions = bearings_from_erp(_grid(WIDTH, HEIGHT), WIDTH, HEIGHT)
+        directions = erp_directions(WIDTH)
         cv2.imwrite(str(mask_path), (directions[..., 1] < 0.6).astype(np.uint8) * 255)
     paths = [(folder / f"{name}{suffix}",) for name in names]
     return frames_of(PictureFormat("erp", WIDTH, HEIGHT), paths, TIMES, names, mask_path)
@@ -152,7 +148,9 @@ def cube_frames(folder: Path, size: int = 128) -> FrameSet:
     faces = ("front", "right", "back", "left")
     names = tuple(f"frame_{f:04d}" for f in range(NUM_FRAMES))
     rays = unit(
-        np.concatenate([_grid(size, size) / (size / 2) - 1, np.ones((size, size, 1))], axis=-1)
+        np.concatenate(
+            [pixel_centres(size, size) / (size / 2) - 1, np.ones((size, size, 1))], axis=-1
+        )
     )
     for name, seen in zip(names, bearings(poses()), strict=True):
         for face in faces:

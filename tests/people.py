@@ -6,9 +6,8 @@ They are upright ellipsoids with striped textures that move around the rig, and 
 from dataclasses import dataclass
 
 import numpy as np
-from pixels import pixel_centres
 
-from gsba.camera.sphere import bearings_from_erp
+from gsba.camera.sphere import erp_directions
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,8 +64,7 @@ def paste_people(
     """
     import cv2
 
-    height, width = image.shape[:2]
-    rays = bearings_from_erp(pixel_centres(width, height), width, height) @ world_T_rig[:3, :3].T
+    rays = erp_directions(image.shape[1]) @ world_T_rig[:3, :3].T
     out, nearest = image.copy(), np.full(image.shape[:2], np.inf)
     for person in people:
         offset = person.positions_world[frame] - world_T_rig[:3, 3]

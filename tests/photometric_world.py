@@ -4,14 +4,13 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from pixels import pixel_centres
 from synthetic import unit
 
 from factors._photometric_kernels import sample
 from factors.compiled import kernel_and_part
 from factors.patch_windows import PAD, PatchPixels, PatchTable, coded, patch_axes, pixel_grid
 from factors.sphere_image import SphereImage
-from gsba.camera.sphere import bearings_from_erp
+from gsba.camera.sphere import erp_directions
 
 RADIUS = 4.0
 
@@ -109,7 +108,7 @@ def distances_to_ball(world_T_rig: np.ndarray, bearings: np.ndarray) -> np.ndarr
 
 def render(world_T_rig: np.ndarray, texture: Texture, width: int) -> np.ndarray:
     """Grey panorama (width / 2, width) of the ball from inside."""
-    bearings = bearings_from_erp(pixel_centres(width, width // 2), width, width // 2)
+    bearings = erp_directions(width)
     points = distances_to_ball(world_T_rig, bearings)[..., None] * bearings
     return texture(points @ world_T_rig[:3, :3].T + world_T_rig[:3, 3])
 

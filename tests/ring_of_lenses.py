@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from gsba.camera.fisheye import Rig, facing, lens_names, projection_of, rotation_of
 from gsba.camera.projections import RadialProjection
-from gsba.camera.sphere import bearings_from_erp, erp_from_bearings
+from gsba.camera.sphere import erp_directions, erp_from_bearings
 from gsba.demo.degrade import degrade
 from gsba.demo.render import render_erp
 from gsba.demo.walk import walk_poses
@@ -64,7 +64,7 @@ def render(folder: Path, num: int, own: RadialProjection | None = None, model: s
     trajectories of three seeds."""
     truth, scene, rig = (walk_poses("rectangle", "forward", NUM_FRAMES, 0), gallery(), ring(num))
     axes, names = np.array([rotation_of(lens)[:, 2] for lens in rig]), lens_names(num)
-    faced = facing(bearings_from_erp(pixel_centres(WIDTH, WIDTH // 2), WIDTH, WIDTH // 2), axes)
+    faced = facing(erp_directions(WIDTH), axes)
     maps = [_maps(lens, own or projection_of(lens)) for lens in rig]
     for part in ("images", *(f"raw/{name}" for name in names)):
         (folder / part).mkdir(parents=True)

@@ -4,9 +4,8 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gsba.camera.sphere import bearings_from_erp
+from gsba.camera.sphere import erp_directions
 from gsba.geometry import pose
-from tests.pixels import pixel_centres
 
 _HALF = np.array([3.0, 1.3, 2.5])  # of the room's sides, x, y, z
 _WALL = 512  # pixels of a wall's side
@@ -37,8 +36,7 @@ def _wall(rng: np.random.Generator) -> np.ndarray:
 
 
 def _seen(walls: list[np.ndarray], world_T_rig: np.ndarray) -> np.ndarray:
-    rays = bearings_from_erp(pixel_centres(WIDTH, WIDTH // 2), WIDTH, WIDTH // 2)
-    rays = rays @ world_T_rig[:3, :3].T
+    rays = erp_directions(WIDTH) @ world_T_rig[:3, :3].T
     with np.errstate(divide="ignore"):
         away = (np.sign(rays) * _HALF - world_T_rig[:3, 3]) / rays
     axis = away.argmin(axis=-1)

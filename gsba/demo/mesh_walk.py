@@ -8,7 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from gsba.camera.sphere import bearings_from_erp
+from gsba.camera.sphere import erp_directions
 from gsba.demo.free_path import free_path
 from gsba.demo.walk import DemoWalk, check_walk, held_by_hand, walk_folder, write_frames
 from gsba.geometry import pose
@@ -78,8 +78,7 @@ class MeshScene:
     def picture(self, world_T_rig: np.ndarray, width: int) -> np.ndarray:
         """Panorama (width / 2, width, 3) float32, RGB, 0..255, averaged over each pixel."""
         wide, high = _RAYS_PER_PIXEL * width, _RAYS_PER_PIXEL * width // 2
-        u, v = np.meshgrid(np.arange(wide) + 0.5, np.arange(high) + 0.5)
-        rays = bearings_from_erp(np.stack([u.ravel(), v.ravel()], axis=1), wide, high)
+        rays = erp_directions(wide).reshape(-1, 3)
         origin = np.broadcast_to(world_T_rig[:3, 3], rays.shape)
         found = self.cast(origin, rays @ world_T_rig[:3, :3].T)
         # colour of rays that hit nothing

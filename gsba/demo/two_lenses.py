@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gsba.camera.sphere import bearings_from_erp
+from gsba.camera.sphere import erp_directions
 from gsba.geometry import pose
 from gsba.types import Trajectory
 
@@ -74,8 +74,7 @@ def render_stitched(
         gain * render_eye(scene, _eye(world_T_rigs, camera, side), width, height)
         for side, gain in zip((1.0, -1.0), camera.gains, strict=True)
     )
-    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    ahead = bearings_from_erp(np.stack([u, v], axis=-1), width, height)[..., 2]
+    ahead = erp_directions(width)[..., 2]
     share = np.clip(0.5 + np.arcsin(np.clip(ahead, -1, 1)) / (2 * band), 0, 1)
     return back + share[..., None].astype(np.float32) * (front - back)
 

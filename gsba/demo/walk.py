@@ -12,7 +12,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from gsba.camera.sphere import bearings_from_erp
+from gsba.camera.sphere import erp_directions
 from gsba.compilation import compile_ahead
 from gsba.demo.degrade import degrade
 from gsba.demo.two_lenses import TwoLenses
@@ -261,11 +261,10 @@ def write_depth(folder: Path, scene, truth: Trajectory, width: int) -> None:
     from gsba.demo.raycast import ranges
 
     folder.mkdir()
-    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(width // 2) + 0.5)
-    bearings = bearings_from_erp(np.stack([u.ravel(), v.ravel()], axis=1), width, width // 2)
+    bearings = erp_directions(width).reshape(-1, 3)
     for f, world_T_rig in enumerate(truth.world_T_rigs):
         hit = ranges(scene, world_T_rig[:3, 3], bearings @ world_T_rig[:3, :3].T)
-        depth = hit.reshape(u.shape).astype(np.float32)
+        depth = hit.reshape(width // 2, width).astype(np.float32)
         np.savez_compressed(folder / f"{f:06d}.npz", range=depth)
 
 

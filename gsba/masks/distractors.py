@@ -16,7 +16,7 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
-from gsba.camera.sphere import around_seam, bearings_from_erp, erp_from_bearings
+from gsba.camera.sphere import around_seam, erp_directions, erp_from_bearings
 from gsba.frames import panorama
 from gsba.frames.masks import load_mask
 from gsba.frames.pixels import load_erp
@@ -255,8 +255,7 @@ class StaticScene:
 
 
 def _rays(width: int) -> np.ndarray:
-    grid = np.stack(np.meshgrid(np.arange(width), np.arange(width // 2)), axis=-1) + 0.5
-    return bearings_from_erp(grid, width, width // 2).astype(np.float32)
+    return erp_directions(width).astype(np.float32)
 
 
 def _load(frames: FrameSet, frame: int, width: int) -> np.ndarray:

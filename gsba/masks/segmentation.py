@@ -17,7 +17,7 @@ import numpy as np
 
 from factors.threads import Once
 from gsba.camera.rig import CubeRig, owner_faces
-from gsba.camera.sphere import bearings_from_erp
+from gsba.camera.sphere import erp_directions
 from gsba.disk import disk_errors, write_image
 from gsba.frames import cubemap
 from gsba.frames.files import decode, image_size
@@ -166,9 +166,7 @@ def _checked(mask: np.ndarray, size: int, where: str) -> np.ndarray:
 @functools.lru_cache(maxsize=4)
 def _places(size: int) -> np.ndarray:
     """Index (2 size, 4 size) int64 into flat faces of each panorama pixel."""
-    width, height = 4 * size, 2 * size
-    grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1) + 0.5
-    bearings = bearings_from_erp(grid, width, height)
+    bearings = erp_directions(4 * size)
     owners = owner_faces(bearings)
     pixels = CubeRig(size, np.pi / 2).project(bearings, owners)
     u, v = np.clip(np.moveaxis(pixels, -1, 0).astype(np.int64), 0, size - 1)

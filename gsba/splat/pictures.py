@@ -5,7 +5,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from gsba.camera.rig import CubeRig, owner_faces
-from gsba.camera.sphere import bearings_from_erp
+from gsba.camera.sphere import erp_directions
 from gsba.camera.views import View, rig_views
 from gsba.splat.backend import Backend
 from gsba.splat.camera import rig_cameras
@@ -36,8 +36,7 @@ def render_panorama(
     rig = CubeRig(round(width / np.pi * np.tan(hfov / 2)), hfov)  # as dense as the equator
     faces = render_views(gaussians, world_T_rig, rig_views(rig), near, backend)
     height = width // 2
-    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    bearings = bearings_from_erp(np.stack([u, v], axis=-1), width, height)
+    bearings = erp_directions(width)
     owners = owner_faces(bearings)
     at = (rig.project(bearings, owners) - 0.5).astype(np.float32)
     image = np.empty((height, width, 3), np.uint8)

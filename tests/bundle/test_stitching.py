@@ -5,7 +5,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from pixels import pixel_centres
 from synthetic import RIG, World, make_world
 
 from factors import RobustLoss
@@ -17,7 +16,7 @@ from gsba.bundle.optimizer import SolverOptions, optimize
 from gsba.bundle.shared_parameters import PARTS, ObservedRays, SharedModel, model_of, parts_of
 from gsba.bundle.stitching import Stitching, corrected, with_noise_of
 from gsba.bundle.trajectory_prior import TrajectoryPrior
-from gsba.camera.sphere import bearings_from_erp
+from gsba.camera.sphere import erp_directions
 from gsba.camera.straighten import straightened
 from gsba.config import RefineSettings
 from gsba.similarity import pose_similarity
@@ -174,7 +173,7 @@ def test_noise_carries_over() -> None:
 def test_panoramas_are_straightened() -> None:
     """Brightness that depends on the observed direction must come to lie on the true one."""
     width = 512
-    rays = bearings_from_erp(pixel_centres(width, width // 2), width, width // 2)
+    rays = erp_directions(width)
     field = SphereField(8 * _true_field().coefficients)  # 0.8 degrees, more than a pixel
 
     def shade(directions: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ from two_fisheyes import colours, made_pair
 from gsba.camera.fisheye import Pair, rotation_of, unproject
 from gsba.camera.lens import Lenses, rows_run
 from gsba.camera.one_centre import Stitcher
-from gsba.camera.sphere import bearings_from_erp
+from gsba.camera.sphere import erp_directions
 from gsba.camera.views import depths_along
 from gsba.types import Fisheye
 
@@ -41,10 +41,6 @@ def _seen(starts: np.ndarray, rays: np.ndarray) -> np.ndarray:
     return colours(unit(_hit(starts, rays)))
 
 
-def _erp_rays() -> np.ndarray:
-    return bearings_from_erp(pixel_centres(WIDTH, WIDTH // 2), WIDTH, WIDTH // 2)
-
-
 def _scene(num: int = 3000) -> np.ndarray:
     """Points (N, 3) of the ball, rig frame."""
     rays = unit(np.random.default_rng(0).normal(size=(num, 3)))
@@ -53,7 +49,7 @@ def _scene(num: int = 3000) -> np.ndarray:
 
 def _stitched(lenses: Lenses) -> np.ndarray:
     """What a stitcher makes of it, (H, 2 H, 3) uint8: both lenses as shown, blended at the seam."""
-    shown, nowhere = _erp_rays().reshape(-1, 3), np.zeros(WIDTH * WIDTH // 2, int)
+    shown, nowhere = erp_directions(WIDTH).reshape(-1, 3), np.zeros(WIDTH * WIDTH // 2, int)
     along = lenses.own(shown, nowhere)[:, 2]
     ahead = np.clip(0.5 + np.arcsin(along) / (2 * lenses.band_rad), 0, 1)[:, None]
     image = 0.0
@@ -65,7 +61,7 @@ def _stitched(lenses: Lenses) -> np.ndarray:
 
 def _off(found: np.ndarray, near_seam: np.ndarray) -> tuple[float, float]:
     """Mean differences of grey values from one camera's panorama, at the seam and elsewhere."""
-    off = np.abs(found - colours(_erp_rays())).mean(axis=-1)
+    off = np.abs(found - colours(erp_directions(WIDTH))).mean(axis=-1)
     return float(off[near_seam].mean()), float(off[~near_seam].mean())
 
 
@@ -73,7 +69,7 @@ def _off(found: np.ndarray, near_seam: np.ndarray) -> tuple[float, float]:
 def test_a_stitched_panorama_becomes_one_cameras(lenses: Lenses) -> None:
     given = _stitched(lenses)
     nowhere = np.zeros(given[..., 0].size, int)
-    along = lenses.own(_erp_rays().reshape(-1, 3), nowhere)[:, 2].reshape(given.shape[:2])
+    along = lenses.own(erp_directions(WIDTH).reshape(-1, 3), nowhere)[:, 2].reshape(given.shape[:2])
     seam = np.abs(along) < np.sin(np.deg2rad(5))
     found = _off(Stitcher(lenses, 0, _scene()).stitched(given), seam)
     before = _off(given, seam)
@@ -112,7 +108,7 @@ def _raw(pair: Pair, ways: tuple[float, float]) -> tuple[Lenses, list[np.ndarray
 def test_raw_pictures_become_one_cameras_at_one_instant(ways: tuple[float, float]) -> None:
     pair = made_pair(400)
     lenses, pictures = _raw(pair, ways)
-    seam = np.abs(_erp_rays()[..., 2]) < np.sin(np.deg2rad(5))
+    seam = np.abs(erp_directions(WIDTH)[..., 2]) < np.sin(np.deg2rad(5))
     found = _off(Stitcher(lenses, 0, _scene()).stitched_raw(pictures, WIDTH), seam)
     assert max(found) < 0.6
     still = replace(lenses, readout_motion=None)
@@ -123,7 +119,7 @@ def test_raw_pictures_become_one_cameras_at_one_instant(ways: tuple[float, float
 
 def test_masks_move_along() -> None:
     lenses = Lenses(3 * CENTRE, band_rad=np.deg2rad(3))
-    stitcher, rays = Stitcher(lenses, 0, _scene()), _erp_rays()
+    stitcher, rays = Stitcher(lenses, 0, _scene()), erp_directions(WIDTH)
     spot = unit(np.array([1.0, 0.1, 0.5]))
     shown = unit(lenses.seeing(_hit(np.zeros(3), spot)[None], np.zeros(1, int)))[0]
     used = rays @ shown < np.cos(np.deg2rad(6))

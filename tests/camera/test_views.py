@@ -10,7 +10,7 @@ from pixels import pixel_centres
 from scipy.spatial.transform import Rotation
 
 from gsba.camera.lens import Lenses
-from gsba.camera.sphere import bearings_from_erp, erp_from_bearings
+from gsba.camera.sphere import erp_directions, erp_from_bearings
 from gsba.camera.views import View, ViewCutter, lens_views
 from gsba.demo.render import render_erp
 from gsba.demo.walk import walk_poses
@@ -37,8 +37,7 @@ def _lens(view: View) -> np.ndarray:
 @cache
 def _panorama() -> np.ndarray:
     """Each direction as the lens that faces it has it."""
-    centres = np.meshgrid(*(np.arange(pixels) + 0.5 for pixels in SHAPE))
-    own = bearings_from_erp(np.stack(centres, axis=-1), *SHAPE) @ AXES[0]
+    own = erp_directions(SHAPE[0]) @ AXES[0]
     halves = []
     for sign in (1, -1):
         lens = RIG.copy()

@@ -9,13 +9,12 @@ import cv2
 import numpy as np
 import pytest
 from command import run_gsba, succeed
-from pixels import pixel_centres
 from scipy.spatial.transform import Rotation
 from synthetic import unit
 
 from gsba import pipeline
 from gsba.camera.lens import Lenses
-from gsba.camera.sphere import bearings_from_erp, erp_from_bearings
+from gsba.camera.sphere import erp_directions, erp_from_bearings
 from gsba.cli.refining import _found_lenses
 from gsba.demo import degrade, make_walk
 from gsba.demo.degrade import Drift
@@ -32,10 +31,6 @@ from gsba.types import Trajectory
 
 WIDTH, FRAMES = 256, 6
 TRUTH = walk_poses("rectangle", "locked", 40, seed=0)
-
-
-def _grid(width):
-    return pixel_centres(width, width // 2)
 
 
 @pytest.fixture(scope="module")
@@ -179,7 +174,7 @@ def test_depth_and_truth_carry_one_frame_into_the_next(walk):
         depth = file["range"]
     assert depth.shape == (small // 2, small)
     assert depth.min() > 0  # the gallery is closed
-    points_rig = depth[..., None] * bearings_from_erp(_grid(small), small, small // 2)
+    points_rig = depth[..., None] * erp_directions(small)
     colors = cv2.resize(np.asarray(images[0]), (small, small // 2), interpolation=cv2.INTER_AREA)
 
     def difference(rig1_T_rig0):
@@ -301,7 +296,7 @@ STILL = TwoLenses(readout_s=0.0, gains=(1.0, 1.0))
 
 def _ahead(width):
     """Angles from the seam towards the front (H, W), degrees."""
-    bearings = bearings_from_erp(_grid(width), width, width // 2)
+    bearings = erp_directions(width)
     return np.degrees(np.arcsin(bearings[..., 2]))
 
 

@@ -15,7 +15,7 @@ from one_gallery import gallery
 
 from factors.check import jacobian_errors
 from gsba import RefineSettings, RunResult
-from gsba.camera.sphere import bearings_from_erp
+from gsba.camera.sphere import erp_directions
 from gsba.demo import make_walk
 from gsba.demo.raycast import ranges
 from gsba.similarity import pose_similarity
@@ -78,7 +78,7 @@ def _hung(world_T_rigs: np.ndarray) -> list[np.ndarray]:
 
 def _with_tags(image: np.ndarray, world_T_rig: np.ndarray, tags: list[np.ndarray]) -> np.ndarray:
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
-    rays = _fine_rays(image.shape[1], image.shape[0])
+    rays = _fine_rays(image.shape[1])
     fine = cv2.resize(image, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
     for number, tag in enumerate(tags):
         offset = (tag[:3, 3] - world_T_rig[:3, 3]) @ tag[:3, 2]
@@ -99,10 +99,9 @@ def _with_tags(image: np.ndarray, world_T_rig: np.ndarray, tags: list[np.ndarray
 
 
 @cache
-def _fine_rays(width: int, height: int) -> np.ndarray:
-    """Directions of the pixels of a panorama of twice the size, (2 height, 2 width, 3)."""
-    v, u = np.mgrid[: 2 * height, : 2 * width] / 2 + 0.25
-    return bearings_from_erp(np.stack([u, v], -1), width, height).astype(np.float32)
+def _fine_rays(width: int) -> np.ndarray:
+    """Directions of the pixels of a panorama of twice the width, (width, 2 width, 3)."""
+    return erp_directions(2 * width).astype(np.float32)
 
 
 def _around(rays: np.ndarray, world_T_rig: np.ndarray, tag: np.ndarray) -> np.ndarray:

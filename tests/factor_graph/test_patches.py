@@ -4,13 +4,12 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from pixels import pixel_centres
 from scipy.spatial.transform import Rotation
 
 from factors import tangent_basis
 from factors.patches import ALIGNED, REASONS, PatchSet, Sightings, expect, found_at
 from factors.sphere_image import SphereImage
-from gsba.camera.sphere import bearings_from_erp
+from gsba.camera.sphere import bearings_from_erp, erp_directions
 
 HEIGHT = 256
 WIDTH = 2 * HEIGHT
@@ -22,7 +21,7 @@ DIRECTIONS = {
     "near the pole": [0.05, -1.0, 0.03],
     "down": [0.3, 0.9, -0.4],
 }
-_CENTRES = bearings_from_erp(pixel_centres(WIDTH, HEIGHT), WIDTH, HEIGHT)
+_CENTRES = erp_directions(WIDTH)
 
 
 def _texture(vectors: np.ndarray, seed: int = 0) -> np.ndarray:

@@ -2,19 +2,14 @@
 
 import numpy as np
 import pytest
-from pixels import pixel_centres
 from scipy.ndimage import map_coordinates, spline_filter
 
 from factors.sphere_image import SphereImage
-from gsba.camera.sphere import bearings_from_erp
+from gsba.camera.sphere import bearings_from_erp, erp_directions
 
 HEIGHT = 64
 WIDTH = 2 * HEIGHT
 DIRECTION = np.array([0.6, -0.48, 0.64])
-
-
-def _centres() -> np.ndarray:
-    return bearings_from_erp(pixel_centres(WIDTH, HEIGHT), WIDTH, HEIGHT)
 
 
 def _smooth(bearings: np.ndarray) -> np.ndarray:
@@ -40,7 +35,7 @@ def _places() -> dict[str, np.ndarray]:
 @pytest.mark.parametrize("place", _places())
 def test_follows_a_smooth_function(place: str) -> None:
     vectors = _places()[place]
-    image = SphereImage.of(_smooth(_centres()))
+    image = SphereImage.of(_smooth(erp_directions(WIDTH)))
     values, _ = image.sample(vectors)
     bearings = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
     # An order-4 spline: (2 pi / 128)^4 of the fourth derivative, here up to about 3000.
@@ -49,7 +44,7 @@ def test_follows_a_smooth_function(place: str) -> None:
 
 def test_passes_through_pixels() -> None:
     pixels = np.random.default_rng(1).uniform(0, 255, (HEIGHT, WIDTH))
-    values, _ = SphereImage.of(pixels).sample(_centres())
+    values, _ = SphereImage.of(pixels).sample(erp_directions(WIDTH))
     np.testing.assert_allclose(values, pixels, atol=2e-3)  # float32 coefficients
 
 
@@ -80,7 +75,7 @@ def test_turning_the_panorama_changes_nothing_but_longitude() -> None:
 
 @pytest.mark.parametrize("place", _places())
 def test_gradient_is_the_derivative(place: str) -> None:
-    image = SphereImage.of(_smooth(_centres()))
+    image = SphereImage.of(_smooth(erp_directions(WIDTH)))
     vectors = _places()[place][:50]
     _, gradients = image.sample(vectors)
     step = 1e-3  # values carry float32 noise of about 1e-5
@@ -94,12 +89,12 @@ def test_gradient_is_the_derivative(place: str) -> None:
 
 def test_gradient_lies_across_the_vector() -> None:
     vectors = 3.0 * _unit(np.random.default_rng(6), 100)
-    _, gradients = SphereImage.of(_smooth(_centres())).sample(vectors)
+    _, gradients = SphereImage.of(_smooth(erp_directions(WIDTH))).sample(vectors)
     np.testing.assert_allclose(np.einsum("ni,ni->n", gradients, vectors), 0, atol=1e-9)
 
 
 def test_the_poles_themselves_are_finite() -> None:
-    values, gradients = SphereImage.of(_smooth(_centres())).sample(
+    values, gradients = SphereImage.of(_smooth(erp_directions(WIDTH))).sample(
         np.array([[0, 1.0, 0], [0, -1, 0]])
     )
     np.testing.assert_allclose(values, _smooth(np.array([[0, 1.0, 0], [0, -1, 0]])), atol=2e-2)

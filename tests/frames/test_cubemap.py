@@ -7,7 +7,7 @@ import pytest
 from pixels import pixel_centres
 
 from gsba.camera.rig import CubeRig
-from gsba.camera.sphere import bearings_from_erp
+from gsba.camera.sphere import erp_directions
 from gsba.config import CubemapSettings
 from gsba.frames import cubemap
 from gsba.types import FrameSet, PictureFormat
@@ -29,7 +29,7 @@ def _pixel_centres(width: int, height: int) -> np.ndarray:
 
 
 def _panorama(width: int, frequency: float = 6.0) -> np.ndarray:
-    bearings = bearings_from_erp(_pixel_centres(width, width // 2), width, width // 2)
+    bearings = erp_directions(width)
     return np.rint(_picture(bearings, frequency)).astype(np.uint8)
 
 
@@ -92,7 +92,7 @@ def test_coarse_faces_are_low_passed_and_not_shifted() -> None:
 
 def test_masks_are_cut_where_they_lie() -> None:
     rig = CubeRig(160, np.deg2rad(96))
-    bearings = bearings_from_erp(_pixel_centres(640, 320), 640, 320)
+    bearings = erp_directions(640)
     centre = np.array([-0.1, 0.05, -1.0])  # a disc across the seam
     centre /= np.linalg.norm(centre)
     for axis in (centre, np.array([0.0, -1.0, 0.0])):  # and one over a pole

@@ -5,11 +5,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from pixels import pixel_centres
 from plain_records import frames_of
 from two_fisheyes import colours, made_pair, picture, write
 
-from gsba.camera.sphere import bearings_from_erp
+from gsba.camera.sphere import erp_directions
 from gsba.frames.dual_fisheye import clear_of_seam, load_joined, load_raw, width_of
 from gsba.frames.files import decode
 from gsba.frames.pixels import load_erp
@@ -39,7 +38,7 @@ def frames(tmp_path_factory: pytest.TempPathFactory) -> FrameSet:
 
 def _true(width: int) -> np.ndarray:
     """The panorama of the sphere, (width / 2, width, 3)."""
-    return colours(bearings_from_erp(pixel_centres(width, width // 2), width, width // 2))
+    return colours(erp_directions(width))
 
 
 def test_the_widest_panorama_is_as_dense_as_the_pictures(frames: FrameSet) -> None:

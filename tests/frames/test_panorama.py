@@ -5,10 +5,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from pixels import pixel_centres
 
 from gsba.camera.rig import CubeRig
-from gsba.camera.sphere import bearings_from_erp
+from gsba.camera.sphere import erp_directions
 from gsba.frames.panorama import load_grey, width_for
 from gsba.types import FACES, FrameSet, PictureFormat
 
@@ -18,10 +17,6 @@ SIZE = 64
 def _smooth(bearings: np.ndarray) -> np.ndarray:
     x, y, z = np.moveaxis(bearings, -1, 0)
     return 120 + 40 * x * y + 30 * np.sin(4 * z) + 20 * x
-
-
-def _erp_bearings(width: int) -> np.ndarray:
-    return bearings_from_erp(pixel_centres(width, width // 2), width, width // 2)
 
 
 def _frames(paths: tuple[Path, ...], layout: str, faces: tuple[str, ...], size: tuple[int, int],
@@ -46,14 +41,14 @@ def test_cube_faces_join_without_a_seam(tmp_path: Path) -> None:
     grey, mask = load_grey(frames, 0, width)
     assert grey.shape == (2 * SIZE, 4 * SIZE) and mask is None
     # Rounded twice, once in the faces and once here; cubic between pixels.
-    np.testing.assert_allclose(grey, _smooth(_erp_bearings(width)), atol=1.6)
+    np.testing.assert_allclose(grey, _smooth(erp_directions(width)), atol=1.6)
 
 
 def test_large_cube_faces_are_averaged_down(tmp_path: Path) -> None:
     frames, width = _cube(tmp_path, FACES), SIZE
     grey, mask = load_grey(frames, 0, width)
     assert grey.shape == (width // 2, width) and mask is None
-    np.testing.assert_allclose(grey, _smooth(_erp_bearings(width)), atol=2.0)
+    np.testing.assert_allclose(grey, _smooth(erp_directions(width)), atol=2.0)
 
 
 def test_missing_faces_are_masked(tmp_path: Path) -> None:

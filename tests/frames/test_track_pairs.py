@@ -19,7 +19,7 @@ from gsba.camera.cameras import Cameras
 from gsba.camera.lens import ONE_CENTRE, Lenses
 from gsba.camera.one_centre import Stitcher
 from gsba.camera.rig import CubeRig
-from gsba.camera.sphere import bearings_from_erp
+from gsba.camera.sphere import erp_directions
 from gsba.camera.views import ViewCutter, cube_views, lens_views, rig_views
 from gsba.export.dataset import Dataset, ExportFormat, ExportOptions
 from gsba.export.images import panorama_writer, view_writer, write_pictures
@@ -50,7 +50,7 @@ def frames(tmp_path_factory: pytest.TempPathFactory) -> FrameSet:
 
 
 def _true(width: int) -> np.ndarray:
-    return colours(bearings_from_erp(pixel_centres(width, width // 2), width, width // 2))
+    return colours(erp_directions(width))
 
 
 @pytest.mark.parametrize("second", ["track5", "track1", "Track4"])

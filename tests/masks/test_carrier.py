@@ -9,14 +9,13 @@ import cv2
 import numpy as np
 import pytest
 from command import run_gsba, succeed
-from pixels import pixel_centres
 from refusals import refused
 from scipy.spatial.transform import Rotation
 from tiny_run import BARE, Case, computed_stages, settings_with
 from two_fisheyes import colours, made_pair, picture, write
 
 from gsba import refine
-from gsba.camera.sphere import bearings_from_erp, erp_from_bearings
+from gsba.camera.sphere import erp_directions, erp_from_bearings
 from gsba.disk import write_image
 from gsba.frames.scan import scan
 from gsba.log import GsbaError
@@ -42,7 +41,7 @@ def _box(plain_floor: bool, speed: float) -> list[np.ndarray]:
     """Panoramas (H, W, 3) float of a walk through a textured box."""
     noise = cv2.GaussianBlur(np.random.default_rng(0).normal(size=(256, 256, 3)), (0, 0), 2.5)
     texture = np.clip(128 + 45 * noise / noise.std(), 0, 255).astype(np.float32)
-    rays = bearings_from_erp(pixel_centres(WIDTH, HEIGHT), WIDTH, HEIGHT)
+    rays = erp_directions(WIDTH)
     images = []
     for f in range(NUM):
         centre = np.array([speed * f - 1.7, 0.1 * np.sin(f), 0.3 * np.cos(f)])
@@ -282,8 +281,7 @@ def test_raw_pairs_are_taken(tmp_path: Path) -> None:
     succeed(*arguments)
     found = cv2.imread(str(tmp_path / "m/carrier.png"), cv2.IMREAD_UNCHANGED) == 0
     height, width = found.shape
-    grid = pixel_centres(width, height)
-    cone = bearings_from_erp(grid, width, height)[..., 2] > np.cos(0.5)
+    cone = erp_directions(width)[..., 2] > np.cos(0.5)
     assert width == 2 * height and _overlap(found, cone) >= 0.8
 
 

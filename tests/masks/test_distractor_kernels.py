@@ -2,9 +2,8 @@
 
 import cv2
 import numpy as np
-from pixels import pixel_centres
 
-from gsba.camera.sphere import bearings_from_erp, erp_from_bearings
+from gsba.camera.sphere import erp_directions, erp_from_bearings
 from gsba.geometry import pose
 from gsba.masks import _distractor_kernels
 
@@ -37,8 +36,7 @@ def test_comparison_is_that_of_numpy() -> None:
     least, most = own - 3, own + 3
     rotations = [cv2.Rodrigues(draw.normal(0, 0.1, 3))[0] for _ in range(NUM)]
     n_T_own = np.stack([pose(R, draw.normal(0, 0.2, 3)) for R in rotations]).astype(np.float32)
-    grid = pixel_centres(WIDTH, HEIGHT)
-    rays = bearings_from_erp(grid, WIDTH, HEIGHT)
+    rays = erp_directions(WIDTH)
     inverse = draw.uniform(0.1, 0.9, (HEIGHT, WIDTH)).astype(np.float32)
 
     differences = np.empty((NUM, HEIGHT, WIDTH), np.float32)

@@ -6,7 +6,7 @@ from dense_walk import WIDTH, RenderedWalk, turn
 from one_gallery import gallery
 from scipy.spatial.transform import Rotation
 
-from gsba.camera.sphere import bearings_from_erp
+from gsba.camera.sphere import erp_directions
 from gsba.geometry import angles_between, inverse, pose, rotation_angle, unit
 from gsba.odometry.atlas import AtlasLayout, Cutter, follow, new_corners
 from gsba.odometry.derotation import miniature, turned
@@ -31,8 +31,7 @@ def test_pixels_of_an_atlas_and_bearings_are_each_others_inverse() -> None:
 
 
 def test_an_atlas_shows_what_the_panorama_does() -> None:
-    v, u = np.mgrid[: WIDTH // 2, :WIDTH] + 0.5
-    rays = bearings_from_erp(np.stack([u, v], axis=-1), WIDTH, WIDTH // 2)
+    rays = erp_directions(WIDTH)
     direction = unit(np.array([0.2, -0.3, -0.9]))  # near the seam
     grey = np.clip(128 + 100 * rays @ direction, 0, 255).astype(np.uint8)
     world_R_rig = _turn(70, (0.3, 1.0, 0.2))

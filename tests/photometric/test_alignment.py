@@ -7,7 +7,6 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from pixels import pixel_centres
 from plain_records import frames_of
 from synthetic import bearings_of, keypoints_of, unit
 
@@ -16,6 +15,7 @@ from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.families import Bearings, Families
 from gsba.bundle.trajectory_prior import TrajectoryPrior
 from gsba.camera.rig import CubeRig
+from gsba.camera.sphere import erp_directions
 from gsba.config import RefineSettings
 from gsba.frames.panorama import Greys
 from gsba.geometry import inverse, pose
@@ -43,12 +43,6 @@ def _small_patches(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(frame_jobs, "_PATCH_SIZE", 11)
 
 
-def _bearings(width: int) -> np.ndarray:
-    from gsba.camera.sphere import bearings_from_erp
-
-    return bearings_from_erp(pixel_centres(width, width // 2), width, width // 2)
-
-
 def _grey(points: np.ndarray) -> np.ndarray:
     """Texture of space: waves a little longer than two pixels seen from 3 units away."""
     rng = np.random.default_rng(0)
@@ -70,7 +64,7 @@ def _hit(centre: np.ndarray, rays: np.ndarray, radius: float = 3.0) -> np.ndarra
 def walk(tmp_path_factory: pytest.TempPathFactory) -> tuple[FrameSet, np.ndarray]:
     """Panoramas inside a textured sphere, and their true poses."""
     folder = tmp_path_factory.mktemp("frames")
-    rays = _bearings(WIDTH)
+    rays = erp_directions(WIDTH)
     at = np.linspace(-0.7, 0.7, NUM)
     positions = np.column_stack([at, 0.1 * np.sin(4 * at), 0.3 * at**2])
     turns = np.array([cv2.Rodrigues(np.array([0.02, 0.3, 0.01]) * a)[0] for a in at])
@@ -345,7 +339,7 @@ def _walls(centre: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 def test_patches_come_to_lie_on_their_surfaces(tmp_path: Path) -> None:
     """Walls that pass by askew: found once as if they faced the host, then as they lie."""
-    rng, rays, paths = np.random.default_rng(3), _bearings(WIDTH), []
+    rng, rays, paths = np.random.default_rng(3), erp_directions(WIDTH), []
     world_T_rigs = np.tile(np.eye(4), (NUM, 1, 1))
     world_T_rigs[:, 0, 3] = np.linspace(-0.75, 0.75, NUM)
     for f, centre in enumerate(world_T_rigs[:, :3, 3]):

@@ -8,11 +8,10 @@ import cv2
 import numpy as np
 import pytest
 from accuracy import assert_as_accurate
-from pixels import pixel_centres
 from tiny_run import SETTINGS
 
 from gsba import Recording, RefineSettings, add_recordings, load_run, refine, refine_recordings
-from gsba.camera.sphere import bearings_from_erp
+from gsba.camera.sphere import erp_directions
 from gsba.demo import make_walk
 from gsba.demo.render import render_erp
 from gsba.demo.walk import walk_poses
@@ -55,7 +54,7 @@ def _seen_by_turns(scene, world_T_rig: np.ndarray, width: int, height: int) -> n
         lens = world_T_rig.copy()
         lens[:3, 3] += sign * 0.5 * BASELINES[frame % 2] * world_T_rig[:3, 2]
         halves.append(render_erp(scene, lens, width, height))
-    ahead = bearings_from_erp(pixel_centres(width, height), width, height)[..., 2] > 0
+    ahead = erp_directions(width)[..., 2] > 0
     return np.where(ahead[..., None], *halves)
 
 

@@ -13,7 +13,7 @@ from tiny_run import SETTINGS
 
 from gsba.app.runs import camera_so_far
 from gsba.bundle.lens_centres import StitchRadius
-from gsba.camera.sphere import bearings_from_erp, erp_from_bearings
+from gsba.camera.sphere import erp_directions, erp_from_bearings
 from gsba.camera.views import lens_views
 from gsba.config import PlacementSettings, RefineSettings
 from gsba.demo import make_walk
@@ -42,8 +42,7 @@ def _through_lenses(scene, world_T_rig: np.ndarray, axis: np.ndarray, shape: tup
         lens = world_T_rig.copy()
         lens[:3, 3] += sign * 0.5 * BASELINE * world_T_rig[:3, :3] @ axis
         halves.append(render_erp(scene, lens, *shape))
-    centres = np.meshgrid(*(np.arange(pixels) + 0.5 for pixels in shape))
-    ahead = bearings_from_erp(np.stack(centres, axis=-1), *shape) @ axis > 0
+    ahead = erp_directions(shape[0]) @ axis > 0
     return np.where(ahead[..., None], *halves)
 
 
@@ -63,9 +62,7 @@ def _stabilised(scene, world_T_rig: np.ndarray, width: int, height: int) -> np.n
 
 def _stitched(scene, world_T_rig: np.ndarray, width: int, height: int) -> np.ndarray:
     """As `_fixed`, stitched so that what is RADIUS away has no parallax between the lenses."""
-    halves, shape = [], (width, height)
-    centres = np.meshgrid(*(np.arange(pixels) + 0.5 for pixels in shape))
-    directions = bearings_from_erp(np.stack(centres, axis=-1), *shape)
+    halves, directions = [], erp_directions(width)
     for sign in (1, -1):
         centre = np.array([0.0, 0, 0.5 * sign * BASELINE])
         lens = world_T_rig.copy()

@@ -9,13 +9,12 @@ import export_scene as scene
 import numpy as np
 import pytest
 from command import run_gsba
-from pixels import pixel_centres
 from plain_records import frames_of
 from refusals import refused
 from scipy.spatial.transform import Rotation
 from walk_on_earth import ORIGIN, frame_set, geodetic_of, level_metres, walk_result, write_fixes
 
-from gsba.camera.sphere import bearings_from_erp
+from gsba.camera.sphere import erp_directions
 from gsba.config import PlacementSettings
 from gsba.export import ExportFormat, export
 from gsba.geometry import angular_errors, pose
@@ -257,8 +256,7 @@ def _posts(folder: Path, tilt: np.ndarray, num: int = 6) -> tuple[FrameSet, np.n
     """Panoramas of a room of vertical posts, and the rotations world_R_rig they were taken with."""
     rng = np.random.default_rng(9)
     width, height = 1024, 512
-    grid = pixel_centres(width, height)
-    rays = bearings_from_erp(grid, width, height)
+    rays = erp_directions(width)
     edges = np.sort(rng.uniform(-np.pi, np.pi, 36))
     shades = rng.uniform(40, 220, len(edges))
     folder.mkdir()

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from splat_alignment import align_to_splat
 
 from gsba.camera.lens import Lenses
-from gsba.camera.sphere import bearings_from_erp
+from gsba.camera.sphere import erp_directions
 from gsba.camera.views import ONE_EYE, Optics
 from gsba.disk import write_image
 from gsba.geometry import pose
@@ -61,8 +61,7 @@ def taken(request: pytest.FixtureRequest, room: Gaussians, tmp_path_factory):
     """Panoramas of the room, each direction from the lens that faces it; and these lenses."""
     lenses, folder = request.param, tmp_path_factory.mktemp("frames")
     paths = [folder / f"{f}.png" for f in range(NUM_FRAMES)]
-    pixels = pixel_centres(WIDTH, WIDTH // 2)
-    directions = bearings_from_erp(pixels, WIDTH, WIDTH // 2)
+    directions = erp_directions(WIDTH)
     for f, path in enumerate(paths):
         axes = np.eye(3) if lenses.axes is None else lenses.axes[f]
         halves = []

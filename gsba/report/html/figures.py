@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gsba.camera.sphere import bearings_from_erp
+from gsba.camera.sphere import erp_directions
 from gsba.geometry import moved_to, rotation_angle
 from gsba.memory import release_mapped_files
 from gsba.report.report import medians_by_group
@@ -141,8 +141,7 @@ def field_sphere(correction: tuple[float, ...]) -> dict[str, Any] | None:
     from factors.sphere_field import SphereField
 
     rows, columns = round(180 / _SPHERE_CELL_DEG), round(360 / _SPHERE_CELL_DEG)
-    centres = np.meshgrid(np.arange(columns) + 0.5, np.arange(rows) + 0.5)
-    bearings = bearings_from_erp(np.stack(centres, axis=-1).reshape(-1, 2), columns, rows)
+    bearings = erp_directions(columns).reshape(-1, 3)
     moved = np.degrees(SphereField(np.array(correction)).displacements(bearings))
     parts = [
         np.einsum("oi,oi->o", moved, axis).reshape(rows, columns) for axis in level_axes(bearings)

@@ -9,7 +9,7 @@ import numpy as np
 
 from gsba.camera.fisheye import facing, optical_axes, project
 from gsba.camera.rig import CubeRig, owner_faces
-from gsba.camera.sphere import bearings_from_erp, erp_from_bearings
+from gsba.camera.sphere import erp_directions, erp_from_bearings
 from gsba.frames.files import decode
 from gsba.frames.pixels import load_erp, load_faces
 from gsba.report.html.figures import tangent_residuals
@@ -79,8 +79,7 @@ def small_panorama(frames: FrameSet, f: int, width: int) -> np.ndarray:
     if kind.panoramic and not raw:
         erp = load_erp(frames, f, width=width)
         return cv2.resize(erp, (width, width // 2), interpolation=cv2.INTER_AREA)
-    centres = np.stack(np.meshgrid(np.arange(width), np.arange(width // 2)), axis=-1) + 0.5
-    bearings = bearings_from_erp(centres, width, width // 2)
+    bearings = erp_directions(width)
     out = np.zeros((width // 2, width, 3), np.uint8)
     if raw:
         rig = kind.fisheyes or ()
