@@ -9,7 +9,8 @@ import gtsam
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-DIM = 6
+from factors.cholesky import DIM
+
 MOTION, TURNS = 6, 2  # coordinates of what frames have of their own
 FRONT, OTHER = 7, 10  # coordinates of what raw lenses are: all but the front one are turned, too
 

@@ -17,6 +17,7 @@ from gsba.report.html.figures import viewing_axes
 from gsba.report.maps import format_frame_counts
 from gsba.store.folder import STAGES, is_run_folder
 from gsba.store.records import RecordError, load_arrays, load_record
+from gsba.types import rows_across
 
 T = TypeVar("T")
 
@@ -164,7 +165,7 @@ def _plan(
     finite = np.isfinite(at.sum(axis=1))
     centre = np.median(at[finite], axis=0) if finite.any() else np.zeros(3)
     extent = float(np.ptp(at[finite], axis=0).max(initial=0.0)) or 1.0
-    rows = np.unique(np.linspace(0, len(points) - 1, min(len(points), _MAX_POINTS)).astype(int))
+    rows = rows_across(len(points), _MAX_POINTS)
     shown = (points[rows] - centre) @ axes.T if len(points) else np.zeros((0, 3))
     near = np.all(np.abs(shown) < 2 * extent, axis=1)  # NaN is not
     digits = max(0, 4 - int(np.floor(np.log10(extent))))

@@ -77,7 +77,7 @@ ALIGNED_GATES = 6.0, 3.0  # gates of rounds with aligned patches, standard devia
 GATE_SCALE = 10.0  # gates wider than so many standard deviations widen the loss in proportion
 _TOLERANCE = 3e-4  # relative decrease of the cost that ends a round, but the run's last one
 _MIN_SUPPORT = 0.99  # share of the inliers that a round must keep, or it is undone
-_MIN_NOISE = 0.5  # floor of the estimated noise, in feature sigmas
+MIN_NOISE = 0.5  # floor of the estimated noise, in feature sigmas
 
 logger = logging.getLogger(__name__)
 
@@ -348,7 +348,7 @@ def adjust_through(
             if len(placed.tracks):
                 seen, threads = view.keypoints, context.num_threads
                 noise = observation_noise(placed, seen, poses, threads)
-                solved = replace(solved, noise=max(noise, _MIN_NOISE))
+                solved = replace(solved, noise=max(noise, MIN_NOISE))
         used = len(landmarks.tracks), landmarks.tracks.num_points
         outcome = accepted, result.history, result.reason
         rounds.append(Round(gate, solved.noise, *used, new_support, *outcome))

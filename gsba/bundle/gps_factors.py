@@ -24,6 +24,7 @@ import numpy as np
 
 from gsba.bundle.families import Family, MapSnapshot, digest_of
 from gsba.bundle.pose_variables import X, values_of
+from gsba.bundle.trajectory_prior import LOSS_SIGMAS
 from gsba.significance import MEDIAN_NORMAL_LENGTH, OUTLIER_LENGTH
 from gsba.similarity import NoSimilarityError, Sim3, extent_of, robust_similarity, similarity
 
@@ -146,7 +147,6 @@ class FrameFixes:
         return self.sigmas * np.sqrt(lasting + WHITE_SHARE)[:, None]
 
 
-_LOSS_SIGMAS = 2.0  # Cauchy scale of the factors
 MIN_FIXES = 5  # in a map: seven unknowns leave little of fewer
 
 S: Callable[[int], int] = gtsam.symbol_shorthand.S  # what a map's similarity changes by (7,)
@@ -206,7 +206,7 @@ def anchor(
         return None
     chosen = np.sort(np.concatenate(rows))
     of_fix, kept = of_fix[chosen], fixes.taken(chosen)
-    sigmas, scales = kept.independent_sigmas(), _LOSS_SIGMAS * wide[chosen]
+    sigmas, scales = kept.independent_sigmas(), LOSS_SIGMAS * wide[chosen]
     places, covariances = np.empty((len(chosen), 3)), np.empty((len(chosen), 3, 3))
     for a, number in enumerate(of_fix.tolist()):
         fit = found[number]
@@ -299,7 +299,7 @@ class GpsFactors(Family):
     @property
     def digest(self) -> str:
         """Digest of the fixes and of the scale of the loss."""
-        return digest_of(self.fixes.digest(), _LOSS_SIGMAS, self.contradicted)
+        return digest_of(self.fixes.digest(), LOSS_SIGMAS, self.contradicted)
 
     def fitted(self, snapshot: MapSnapshot) -> "AnchoredFixes | None":
         """The fixes in the world of these poses; None where these contradict them."""

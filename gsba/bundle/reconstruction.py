@@ -20,11 +20,11 @@ from gsba.types import (
     Reconstruction,
     Solution,
 )
+from gsba.types.records import AT_ONCE
 
 MIN_OBSERVATIONS = 12  # of a refined frame: 24 residuals for the 6 unknowns of its pose
 _MIN_CORRELATION = 0.1  # least correlation of refined and coarse positions: with usual drift it is
 # .8
-_AT_ONCE = 1 << 16  # observations whose poses are held together: 9 MB
 
 
 def assemble(
@@ -100,7 +100,7 @@ def _observations(
     landmarks, poses = adjustment.landmarks, adjustment.world_T_rigs
     nothing, none = np.empty((0, 3)), np.empty(0)
     yield (nothing, none, none, *([] if keypoints.origins_rig is None else [nothing]))
-    for points, _, some in runs(landmarks.tracks, _AT_ONCE):
+    for points, _, some in runs(landmarks.tracks, AT_ONCE):
         rows = keypoints.rows(some)
         bearings, origins = keypoints.bearings_rig[rows], keypoints.origins_of(rows)
         ends = landmarks.points_world[points][some.points]

@@ -12,7 +12,7 @@ from gsba.config import PriorSettings
 from gsba.geometry import relative_steps
 from gsba.types import GyroConstraints, StepNoise
 
-LOSS_SIGMAS = 2.0  # Cauchy scale: limits the pull of wrong steps
+LOSS_SIGMAS = 2.0  # Cauchy scale: limits the pull of wrong measurements
 
 
 @dataclass(frozen=True, slots=True)

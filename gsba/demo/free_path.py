@@ -7,9 +7,10 @@ from scipy.ndimage import gaussian_filter1d, label
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
+from gsba.demo.mesh import DOWN
+
 _NUM_LEVELS = 24  # heights that are tried
 _EYE_RANGE = (0.25, 0.75)  # of the camera's height, part of the height from floor to ceiling
-_DOWN = np.array([0.0, 1.0, 0.0])
 
 
 def free_path(
@@ -42,7 +43,7 @@ def free_path(
     for y in np.linspace(low[1], high[1], _NUM_LEVELS + 2)[1:-1]:
         grid = np.stack(np.meshgrid(x, np.array([y]), z, indexing="ij"), axis=-1).reshape(-1, 3)
         free = clearance(grid)
-        open_ = _walkable(free, seen(grid, _DOWN), seen(grid, -_DOWN), edge)
+        open_ = _walkable(free, seen(grid, DOWN), seen(grid, -DOWN), edge)
         walkable = open_.reshape(len(x), len(z))
         found = label(walkable)
         assert isinstance(found, tuple)

@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from gsba.evaluate.trajectory import TOLERANCE_S, aligned_rows
-from gsba.geometry import adjoint, furthest, inverse, step_covariances
+from gsba.geometry import adjoint, furthest, inverse, relative_steps, step_covariances
 from gsba.log import GsbaError
 from gsba.similarity import Sim3
 from gsba.trajectory.association import matched_in_time
@@ -143,7 +143,7 @@ def consistency_of(
     judged = np.intersect1d(rows[rows > 0], known)
     errors = _errors(poses, true_T_rigs)
 
-    steps, true_steps = (inverse(some[:-1]) @ some[1:] for some in (poses, true_T_rigs))
+    steps, true_steps = map(relative_steps, (poses, true_T_rigs))
     before = -adjoint(inverse(steps))  # step error = error + before @ error of the frame before
     of_steps = step_covariances(poses, covariances, joint.neighbours)
     step_errors = _errors(steps, true_steps)

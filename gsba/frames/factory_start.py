@@ -18,12 +18,12 @@ from gsba.disk import write_json
 from gsba.frames.lens_overlap import rim_likeness
 from gsba.frames.raw_pairs import decode_pair
 from gsba.log import GsbaError
+from gsba.types import rows_across
 
 _log = logging.getLogger(__name__)
 
 FACTORY_FILE = "factory_lenses.json"  # beside the frames of a video
 INSTA360_PICTURE = ".insp"  # suffix of JPEG images with both lenses side by side
-_QUARTER_TURNS = 4
 _MAX_FILE_BYTES = 1 << 16  # largest size of FACTORY_FILE
 
 
@@ -94,19 +94,17 @@ def starting_lenses(
         pairs: pictures of the front and back lens of each frame, or twice the one that holds both.
         size: width and height of one lens's picture.
     """
-    rows = np.unique(np.linspace(0, len(pairs) - 1, 8).astype(int))
+    rows = rows_across(len(pairs), 8)
     looks = [decode_pair(pairs[f], size, gray=True) for f in rows]
     readings = [
-        _with_back_turned(pair, quarters)
-        for pair in factory.pairs(size)
-        for quarters in range(_QUARTER_TURNS)
+        _with_back_turned(pair, quarters) for pair in factory.pairs(size) for quarters in range(4)
     ]
     scores = [rim_likeness(looks, pair) for pair in readings]
     best = int(np.argmax(scores))
     # gain in rim correlation from which another reading is preferred to the usual one
     if scores[best] <= scores[0] + 0.1:
         best = 0
-    whole, quarters = divmod(best, _QUARTER_TURNS)
+    whole, quarters = divmod(best, 4)
     parts = [f"the back lens turned by {90 * quarters} degrees"] if quarters else []
     parts += ["the whole sensor in the picture"] if whole else []
     _log.warning(

@@ -10,7 +10,7 @@ from gsba.camera.sphere import around_sphere, erp_bands
 from gsba.camera.straighten import PAD
 from gsba.frames.masks import load_usable
 from gsba.frames.pixels import load_erp, load_faces
-from gsba.types import FACES, FrameSet, PictureFormat
+from gsba.types import FACES, FrameSet, PictureFormat, rows_across
 
 _PADDING_PX = 3  # pixels copied from a face's neighbours: the support of bicubic sampling, and one
 
@@ -97,7 +97,7 @@ class Greys:
 
 def bright_level(greys: Greys) -> int:
     """Grey value that 99 % of the usable pixels of some frames do not exceed; 255 without any."""
-    chosen = np.unique(np.linspace(0, greys.num_frames - 1, 5).astype(int))
+    chosen = rows_across(greys.num_frames, 5)
     found = [greys[int(f)] for f in chosen]
     used = [(grey if mask is None else grey[mask]).ravel() for grey, mask in found]
     values = np.concatenate(used)

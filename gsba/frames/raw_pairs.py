@@ -16,7 +16,7 @@ from gsba.frames.lens_names import FUSION_NAMES, LENS_NAMES, LensNames
 from gsba.frames.lens_overlap import measure_overlap, scaled
 from gsba.frames.side_by_side import cut
 from gsba.log import GsbaError
-from gsba.types import FACES, Fisheye
+from gsba.types import FACES, Fisheye, rows_across
 
 _log = logging.getLogger(__name__)
 
@@ -156,7 +156,7 @@ def lenses_of(
         GsbaError: a calibration of other pictures or of another number of lenses, circles outside
             of the pictures, or pictures without a visible circle.
     """
-    rows = np.unique(np.linspace(0, len(pairs) - 1, 8).astype(int))
+    rows = rows_across(len(pairs), 8)
     if calibration is not None:
         some = [pairs[f] for f in rows]
         return _calibrated(folder, some, size, calibration)

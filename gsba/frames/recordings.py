@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 
 from gsba.log import GsbaError
-from gsba.types import NO_FILE_NAME, FrameSet, PictureFormat
+from gsba.types import NO_FILE_NAME, FrameSet, PictureFormat, rows_across
 
 _log = logging.getLogger(__name__)
 
@@ -93,7 +93,7 @@ def _refuse_same(name: str, one: FrameSet, other_name: str, other: FrameSet) -> 
     if len(one) != len(other):
         return
     # frames whose files are compared, to tell a recording given twice
-    rows = np.unique(np.linspace(0, len(one) - 1, 3).astype(int))
+    rows = rows_across(len(one), 3)
     pairs = [pair for f in rows for pair in zip(one.paths[f], other.paths[f], strict=False)]
     if all(
         a.stat().st_size == b.stat().st_size and a.read_bytes() == b.read_bytes() for a, b in pairs

@@ -21,7 +21,7 @@ from gsba.camera.equiangular import (
 from gsba.camera.sphere import erp_bands, table
 from gsba.frames.files import decode, entries_of, image_size, images_by_name, is_image
 from gsba.log import GsbaError
-from gsba.types import FACES, FrameSet
+from gsba.types import FACES, FrameSet, rows_across
 
 _log = logging.getLogger(__name__)
 
@@ -99,7 +99,7 @@ def track_size(folder: Path, pairs: Sequence[tuple[Path, ...]]) -> tuple[int, in
     )  # fmt: skip
     # Refuse tracks whose grey values on both sides of common edges are not correlated
     size = (width, height)
-    rows = np.unique(np.linspace(0, len(pairs) - 1, 5).astype(int))
+    rows = rows_across(len(pairs), 5)
     found = [_edge_correlations(_decoded(pairs[row], size, gray=True)) for row in rows]
     known = np.concatenate(found)
     if len(known) and np.median(known) < _MIN_CORRELATION:

@@ -7,6 +7,7 @@ import gtsam
 import numpy as np
 
 from factors import Block, PoseSystem, RobustLoss, tangent_basis
+from gsba.bundle.adjustment import MIN_NOISE
 from gsba.bundle.optimizer import SolverOptions, marginal_covariances, optimize
 from gsba.bundle.pose_variables import X
 from gsba.camera.projections import Projection
@@ -17,7 +18,6 @@ _FAMILY = "known_points"
 GATE_SIGMAS = 3.5  # of an inlier's residual
 COARSE = (8.0,)  # scales of the loss, round by round, standard deviations, of a first fit
 FINE = (2.0, 1.0)  # of the last one
-_MIN_NOISE = 0.5  # of keypoints, in their own standard deviations
 _SOLVER = SolverOptions(max_iterations=20, relative_tolerance=1e-5, absolute_tolerance=1e-2)
 
 
@@ -236,7 +236,7 @@ def fit(
             for p, near in enumerate(part[part < GATE_SIGMAS**2] for part in squares):
                 if len(near):  # 1.3863: median of a chi-square of two degrees of freedom
                     found = noises[p] * float(np.sqrt(np.median(near) / 1.3863))
-                    noises[p] = max(found, _MIN_NOISE)
+                    noises[p] = max(found, MIN_NOISE)
     squares = _block(pictures, noises, projections, scales[-1]).squared_residuals(values)
     inliers = tuple(part < GATE_SIGMAS**2 for part in squares)
     kept = [with_rows(*pair) for pair in zip(pictures, inliers, strict=True)]

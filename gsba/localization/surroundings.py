@@ -27,7 +27,7 @@ from gsba.loop_closure.join_evidence import (
     turned_away,
 )
 from gsba.matching.guided_search import Gate, match_pair
-from gsba.types import Features, FrameSet
+from gsba.types import Features, FrameSet, rows_across
 
 _NUM_NEAREST = 6  # keyframes whose points are expected in a picture
 # Share in regions that show next to nothing of what is expected there: at least .41 where places
@@ -156,7 +156,7 @@ def open_rates(
 
 def _some(frames: np.ndarray) -> list[int]:
     """At most 16 of the frames (N,), evenly."""
-    chosen = np.linspace(0, len(frames) - 1, min(len(frames), 16)).astype(int)
+    chosen = rows_across(len(frames), 16)
     return [int(f) for f in frames[chosen]]
 
 

@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 from gsba.geometry import angles_between, inverse
 from gsba.matching.guided_search import Gate, MatchContext
 from gsba.significance import SIGMAS_OF_1E_3
-from gsba.types import Matches
+from gsba.types import Matches, rows_across
 
 LOCAL = 12  # frames to either side of a meeting that are compared
 WIDER = 36  # frames to either side if the LOCAL ones leave it open
@@ -182,7 +182,7 @@ def rates(
     compared = np.ones(len(parts), bool) if chosen is None else chosen
     rows = [np.flatnonzero(compared & (parts == p)) for p in np.unique(parts[compared])]
     pairs = np.concatenate([nearest_pairs(places, some, some) for some in rows])
-    pairs = pairs[np.linspace(0, len(pairs) - 1, min(len(pairs), _MAX_PAIRS)).astype(int)]
+    pairs = pairs[rows_across(len(pairs), _MAX_PAIRS)]
     seen = predict(context, places, pairs, surfaces)[0]
     poses, odd = places.world_T_rigs.copy(), np.arange(len(parts)) % 2 == 1
     poses[odd] = turned_away(poses[odd])

@@ -11,7 +11,7 @@ import numpy as np
 
 from gsba.frames.files import image_header
 from gsba.frames.pixels import load_erp
-from gsba.types import FrameSet
+from gsba.types import FrameSet, rows_across
 
 _WIDTH_PX = 512  # pixels across the pictures that are compared
 _MAX_BLACK_LEVEL = 6  # grey levels: JPEG's noise around 0
@@ -33,7 +33,7 @@ def find_borders(frames: FrameSet) -> Borders:
     if frames.format.layout != "erp" or frames.format.width < _WIDTH_PX:
         return Borders(everything, 0.0)
     brightest = np.zeros(everything.shape, np.uint8)
-    for f in np.unique(np.linspace(0, len(frames) - 1, 8).astype(int)):
+    for f in rows_across(len(frames), 8):
         grey = load_erp(frames, int(f), gray=True, width=_WIDTH_PX)
         np.maximum(brightest, cv2.resize(grey, everything.shape[::-1]), out=brightest)
         if not (brightest <= _MAX_BLACK_LEVEL).any():

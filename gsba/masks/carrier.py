@@ -30,7 +30,7 @@ from gsba.masks.fixed_structure import (
     median_picture,
 )
 from gsba.memory import usable_cpus
-from gsba.types import FrameSet
+from gsba.types import FrameSet, rows_across
 
 logger = logging.getLogger(__name__)
 
@@ -70,7 +70,7 @@ def find_carrier(frames: FrameSet) -> Carrier:
     if not frames.format.panoramic:
         raise GsbaError("the carrier is detected in panoramas; these frames are cube faces")
     _require_enough(len(frames))
-    chosen = np.unique(np.linspace(0, len(frames) - 1, _MAX_FRAMES).astype(int))
+    chosen = rows_across(len(frames), _MAX_FRAMES)
     with ThreadPoolExecutor(usable_cpus()) as pool:
         loaded = pool.map(partial(_load, frames), chosen.tolist())
         pictures = np.stack(list(track(loaded, "looking for the carrier", len(chosen))))

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from gsba.camera.sphere import around_sphere
+from gsba.types import rows_across
 
 _PADDING_PX = 16  # pixels padded around pictures
 _WINDOW_SIGMA_PX, _WINDOW_SIZE = 2.0, (7, 7)  # pixels, standard deviation and extent, around a
@@ -141,7 +142,7 @@ def find_turns(bands: np.ndarray) -> np.ndarray:
     spectra = np.fft.rfft(even, axis=-1)
     squares = np.fft.rfft(even**2, axis=-1)
     best, turns = 0.0, np.zeros(len(bands))
-    references = np.unique(np.linspace(0, len(bands) - 1, 3).astype(int))
+    references = rows_across(len(bands), 3)
     for reference in references:
         template, weights = even[reference], np.ones(even.shape[1:])
         shifts = np.zeros(len(bands))

@@ -27,7 +27,7 @@ from gsba.trajectory.steps import (
     step_errors,
     without_steps,
 )
-from gsba.types import CoarsePoses, Counts, Keypoints, Trajectory, VerifiedPairs
+from gsba.types import CoarsePoses, Counts, Keypoints, Trajectory, VerifiedPairs, rows_across
 
 _MIN_LOST_SHARE = 0.2  # share of lost neighbours from which whole panoramas are compared
 _MIN_COMMON_POINTS = 5  # common points that suffice for the ratio of two steps' lengths
@@ -139,7 +139,7 @@ def _misleads(context: MatchContext, guided: VerifiedPairs) -> bool:
             lengths.append(1 / float(np.nanmedian(np.append(depths, np.inf))))
     if not steps or np.quantile(lengths, 0.75) < _FAR_STEP_DEPTHS:
         return False
-    tried = np.unique(np.linspace(0, len(steps) - 1, _NUM_TRIED_STEPS).astype(int))
+    tried = rows_across(len(steps), _NUM_TRIED_STEPS)
     known = guided.taken([steps[n] for n in tried.tolist()])
     found = match_anywhere(context, known.matches.pairs)
     true, seen = (image_steps(some, context.keypoints) for some in (known, found))

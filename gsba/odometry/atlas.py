@@ -11,12 +11,12 @@ from factors.compiled import kernel_and_part
 from gsba.camera.rig import RIG_R_FACE, CubeRig, cells_of, owner_faces
 from gsba.camera.sphere import around_sphere
 from gsba.geometry import rotation_angle, unit
+from gsba.odometry.derotation import PAD
 from gsba.odometry.lucas_kanade import LEVELS, WINDOW, align_patches, pyramid
 
 _kernel, _part = kernel_and_part()
 HFOV = np.deg2rad(106.0)  # of a face: a feature may move 8 degrees beyond the face that owns it
 _COLUMNS = 3  # faces side by side
-_PAD = 2  # pixels beyond seam and poles for interpolation
 _MAX_CUT_ERROR = np.deg2rad(6.0)  # largest rotation of a cut's axes against the world: maps are
 # computed anew beyond it
 # Minimax polynomial of arctan(t) / t in t^2 on [0, 1] (Chebyshev nodes): error 7e-7 at most.
@@ -125,11 +125,11 @@ class Cutter:
             maps = np.empty_like(self._rays[:2])
             axes = self.cut_R_rig.astype(np.float32)
             _erp_pixels(*self._rays, axes, np.float32(len(grey)), *maps)
-            across, down = (maps + np.float32(_PAD)).reshape(2, *self._layout.directions.shape[:2])
+            across, down = (maps + np.float32(PAD)).reshape(2, *self._layout.directions.shape[:2])
             self._maps = cv2.convertMaps(across, down, cv2.CV_16SC2)
         assert self._maps is not None
         first, second = self._maps
-        image = cv2.remap(around_sphere(grey, _PAD), first, second, cv2.INTER_LINEAR)
+        image = cv2.remap(around_sphere(grey, PAD), first, second, cv2.INTER_LINEAR)
         return Atlas(image, self.cut_R_rig)
 
 

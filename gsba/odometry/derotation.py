@@ -10,7 +10,7 @@ from gsba.camera.sphere import around_sphere, bearings_from_erp, erp_from_bearin
 
 _WIDTH = 128  # pixels across the panoramas that are compared
 _STEPS = 15
-_PAD = 2  # pixels beyond seam and poles for interpolation
+PAD = 2  # pixels beyond seam and poles for interpolation
 _CONVERGED = np.deg2rad(0.05)
 
 
@@ -94,8 +94,8 @@ def _aligned(one: Miniature, other: Miniature, start: np.ndarray) -> tuple[np.nd
 
 def _sampled(image: np.ndarray, maps: np.ndarray) -> np.ndarray:
     """A panorama at OpenCV pixels (h, w, 2)."""
-    padded = around_sphere(image, _PAD)
-    u, v = maps[..., 0] + _PAD, maps[..., 1] + _PAD
+    padded = around_sphere(image, PAD)
+    u, v = maps[..., 0] + PAD, maps[..., 1] + PAD
     return cv2.remap(padded, u, v, cv2.INTER_LINEAR)
 
 

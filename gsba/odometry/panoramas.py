@@ -21,7 +21,7 @@ from gsba.frames.raw_pairs import lenses_of
 from gsba.frames.track_pairs import panorama_of
 from gsba.log import GsbaError
 from gsba.masks.carrier import PICTURE_WIDTH, find_fixed_carrier
-from gsba.types import FrameSet
+from gsba.types import FrameSet, rows_across
 from gsba.video.recording import (
     EXACT_S,
     VideoRecording,
@@ -70,7 +70,7 @@ def of_frames(frames: FrameSet, source: Path, width: int = WIDTH) -> SmallPanora
     if frames.format.fisheyes is not None:
         usable &= clear_of_seam(width // 2, frames.format.fisheyes)
     masked = any(path is not None for path in frames.mask_paths)
-    looks = np.unique(np.linspace(0, len(frames) - 1, _CARRIER_LOOKS).astype(int))
+    looks = rows_across(len(frames), _CARRIER_LOOKS)
     for row in looks.tolist() if masked else ():
         mask = load_mask(frames, row)
         if mask is not None:
@@ -130,7 +130,7 @@ def of_video(
 def without_carrier(panoramas: SmallPanoramas) -> SmallPanoramas:
     """The panoramas with the carrier masked, if it keeps its place in the pictures; else nothing is
     masked, and a line in the log says so."""
-    rows = np.unique(np.linspace(0, len(panoramas) - 1, _CARRIER_LOOKS).astype(int)).tolist()
+    rows = rows_across(len(panoramas), _CARRIER_LOOKS).tolist()
     size = (PICTURE_WIDTH, PICTURE_WIDTH // 2)
     pictures = [cv2.resize(picture, size) for _, picture in panoramas.read(rows, True)]
     try:
@@ -163,7 +163,7 @@ def _narrowed(panoramas: SmallPanoramas, usable: np.ndarray) -> SmallPanoramas:
 
 def _lenses(recording: VideoRecording, rows: np.ndarray, calibration: Path | None) -> Rig:
     """Initial lenses of a raw recording, from a few of its frames."""
-    looks = np.unique(np.linspace(0, len(rows) - 1, 8).astype(int))
+    looks = rows_across(len(rows), 8)
     size = (recording.width, recording.width)
     with TemporaryDirectory(prefix="gsba-") as name:
         pairs = []

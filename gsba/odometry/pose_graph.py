@@ -12,7 +12,7 @@ from gsba.bundle import triangulate
 from gsba.bundle.pose_variables import X
 from gsba.geometry import adjoint, inverse, pose
 from gsba.odometry.resection import linearised
-from gsba.odometry.window import WindowObservations
+from gsba.odometry.window import GATE, WindowObservations
 from gsba.similarity import Sim3
 
 _HELD = 1e-5  # standard deviation of the fixed first keyframe of a map, all parts of its tangent
@@ -154,7 +154,6 @@ _CORRELATED = 13.0  # factor on the variance of independent features: those of a
 _MODEL = 0.0003, 0.001, 0.002  # standard deviations of model errors (two lens centres, rolling
 # shutter): rotation, translation in median distances, log scale
 _SIGMA = np.deg2rad(0.15)  # radians per axis, of bearings
-_GATE = 4.0  # largest residual of a feature, standard deviations
 _UNKNOWN = np.deg2rad(2.0), 0.1, 0.05  # standard deviations of a step without common points:
 # rotation, translation in median distances, log scale
 
@@ -182,7 +181,7 @@ def measure_steps(
     seen = WindowObservations.of(features)
     sigmas = np.full(len(seen.ids), _SIGMA)
     rays = seen.bearings_rig.astype(float)
-    found = triangulate(seen.tracks(), rays, sigmas, world_T_keys, _GATE)
+    found = triangulate(seen.tracks(), rays, sigmas, world_T_keys, GATE)
     first_rows = np.unique(found.tracks.points, return_index=True)[1]
     known = seen.features_of(found)
     most = int(seen.ids.max(initial=-1)) + 1

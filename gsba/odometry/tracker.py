@@ -25,6 +25,7 @@ from gsba.odometry.tracker_state import (
     TrackerState,
 )
 from gsba.odometry.window import (
+    GATE,
     AdjustedWindow,
     WindowObservations,
     adjust_window,
@@ -38,7 +39,6 @@ FREE, HELD = 8, 5  # keyframes of the window that are adjusted, and fixed ones b
 _MIN_CONTRAST = 1.5  # grey values: a lower contrast is darkness, or a hand over the lenses
 _START_SHARE = 0.45  # share of the first keyframe's features below which initialisation restarts
 _MIN_SIGMA, _MAX_SIGMA = np.deg2rad([0.05, 0.35])  # noise of bearings, per axis
-_GATE = 4.0  # largest residual of a feature that fits, standard deviations
 _NUDGE_R = Rotation.from_rotvec(np.deg2rad([1.2, 1.2, 1.2])).as_matrix()  # its rotation
 _MIN_FEATURES = 40  # least number of features of a picture that shows a scene
 
@@ -293,7 +293,7 @@ class Tracker:
         across = np.abs(np.sum(normals * rays, axis=1)) / np.maximum(lengths, 1e-12)
         # Near the epipole, and without a step, rays are compared with the bearing itself.
         off = angles_between(features.bearings[rows], rays)
-        fits[rows] = np.minimum(across, off) < _GATE * self.state.sigma
+        fits[rows] = np.minimum(across, off) < GATE * self.state.sigma
         return fits
 
     def _parallax(
@@ -319,7 +319,7 @@ class Tracker:
         held = max(len(window) - FREE, min(2, len(window) - 1))
         seen = WindowObservations.of([(key.ids, key.bearings) for key in window])
         poses = np.array([key.world_T_rig for key in window])
-        solved = adjust_window(poses, held, seen, self.state.sigma, _GATE)
+        solved = adjust_window(poses, held, seen, self.state.sigma)
         for key, world_T_rig in zip(window[held:], solved.world_T_rigs[held:], strict=True):
             key.world_T_rig = world_T_rig
             self.state.keyframe_poses[key.number] = world_T_rig

@@ -20,6 +20,7 @@ _SOLVER = SolverOptions(
     max_iterations=8, relative_tolerance=1e-3, absolute_tolerance=1.0, lambda_initial=1e-6
 )
 _MIN_PARALLAX_DEG = 1.0  # least triangulation angle of a point: keyframes are far apart
+GATE = 4.0  # largest residual of a feature that fits, standard deviations
 _HELD = 1e-6  # standard deviation of fixed poses: radians, and parts of their extent
 
 
@@ -63,7 +64,7 @@ class AdjustedWindow:
 
 
 def adjust_window(
-    world_T_rigs: np.ndarray, num_held: int, seen: WindowObservations, sigma: float, gate: float
+    world_T_rigs: np.ndarray, num_held: int, seen: WindowObservations, sigma: float
 ) -> AdjustedWindow:
     """Triangulate all features of a window again, and adjust its poses (K, 4, 4) and points.
 
@@ -71,7 +72,6 @@ def adjust_window(
         num_held: number of first keyframes that are fixed. With one, its distance to the
             furthest keyframe is fixed besides, as the scale is free otherwise.
         sigma: radians, noise of bearings per axis.
-        gate: residual from which observations are outliers, standard deviations.
     """
     tracks, sigmas = seen.tracks(), np.full(len(seen.ids), sigma)
 
@@ -79,7 +79,7 @@ def adjust_window(
         rays = seen.bearings_rig
         return triangulate(tracks, rays, sigmas, poses, limit, min_parallax_deg=_MIN_PARALLAX_DEG)
 
-    marks = place(world_T_rigs, 2 * gate)
+    marks = place(world_T_rigs, 2 * GATE)
     used = marks.tracks.keypoints
     term = BearingTerm(
         marks.tracks.frames, marks.tracks.points, seen.bearings_rig[used], sigmas[used], None
@@ -96,7 +96,7 @@ def adjust_window(
     if num_held == 1:
         graph.push_back(pose_variables.fixed_scale(world_T_rigs))
     poses = poses_of(optimize(graph, values_of(world_T_rigs), [block], _SOLVER).values, len(keys))
-    marks = place(poses, gate)
+    marks = place(poses, GATE)
     kept = np.zeros(len(seen.ids), bool)
     kept[marks.tracks.keypoints] = True
     ids = seen.features_of(marks)
@@ -110,7 +110,6 @@ _MOVED, _MOVED_LITTLE = np.deg2rad([4.0, 1.2])  # parallax of the upper quarter 
 _MIN_POINTS = 40  # least number of independent points, in cells of 6 degrees
 _CELLS = 16
 _VERIFY = TwoViewLimits(max_error_deg=0.3)
-_GATE = 4.0  # standard deviations
 
 
 def median_turn(one: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -146,7 +145,7 @@ def start_map(
     poses = np.stack([np.eye(4), found.f0_T_f1])
     good = found.inliers
     seen = WindowObservations.of([(ids[good], one[good]), (ids[good], other[good])])
-    solved = adjust_window(poses, 1, seen, sigma, _GATE)
+    solved = adjust_window(poses, 1, seen, sigma)
     distances = np.linalg.norm(solved.points_world, axis=1)
     if len(distances) < _MIN_POINTS:
         return None

@@ -17,6 +17,7 @@ from gsba.memory import release_mapped_files, total_memory_bytes
 from gsba.photometric import frame_jobs
 from gsba.photometric.frame_jobs import MAX_SHIFT_PX
 from gsba.photometric.packing import Observed, PointsInFrames, pack
+from gsba.photometric.patches import SLOPE_SIGMA
 from gsba.photometric.references import references, visible_frames
 from gsba.store.shards import Workers
 from gsba.types import Counts, Keypoints, Landmarks, Sighted, Solution
@@ -348,7 +349,6 @@ def _former_observations(
 
 
 _AFFINE_SIGMA = 0.07  # noise of an alignment's affine part
-_SLOPE_SIGMA = 0.7  # prior of surface slopes, tangents of their tilt
 _MAX_TILT_TANGENT = 3.0  # tangent of a tilt beyond which a patch covers too little of its surface
 
 
@@ -407,7 +407,7 @@ def surface_normals(
     pulls = np.stack([np.bincount(templates, column, num) for column in products.T], axis=1)
     weights = np.bincount(templates, np.einsum("oi,oi->o", shifts, shifts), num)
     sizes = np.linalg.norm(spreads[:, :, 0], axis=1)
-    prior = (_AFFINE_SIGMA / (_SLOPE_SIGMA * np.maximum(sizes, 1e-300))) ** 2
+    prior = (_AFFINE_SIGMA / (SLOPE_SIGMA * np.maximum(sizes, 1e-300))) ** 2
     found = slopes + (pulls - prior[:, None] * slopes) / (weights + prior)[:, None]
     gradients = np.einsum("jic,jc->ji", spreads, found) / sizes[:, None] ** 2
     return np.where((weights > prior)[:, None], origins - gradients, 0.0)

@@ -16,7 +16,7 @@ from gsba.types import Counts, FrameSet, Landmarks
 
 _MIN_GRADIENT = 2.0  # grey values per pixel, smallest in a patch
 _DEPTH_TOLERANCE = 0.03  # relative, of map points on one plane
-_SLOPE_SIGMA = 0.7  # of a patch's tilt, as a tangent
+SLOPE_SIGMA = 0.7  # prior of a patch's slope, tangent of its tilt
 _NUM_PLANE_POINTS = 8  # map points that determine a patch's plane
 _MAX_WIDTH = 4096  # pixels of a panorama; wider ones are halved
 _SIZE = 9  # pixels across a patch
@@ -136,7 +136,7 @@ def lay_planes(bearings: np.ndarray, points_rig: np.ndarray) -> tuple[np.ndarray
     for _ in range(4):  # reweighted: points of another surface lose weight
         typical = (trust * y).sum(axis=1) / np.maximum(trust.sum(axis=1), 1e-300)
         V = np.einsum("pn,pni,pnj->pij", trust, x, x)
-        ridge = (_DEPTH_TOLERANCE / _SLOPE_SIGMA) ** 2 * weights.max(axis=1)
+        ridge = (_DEPTH_TOLERANCE / SLOPE_SIGMA) ** 2 * weights.max(axis=1)
         V[:, [1, 2], [1, 2]] += ridge[:, None]
         V += 1e-12 * np.eye(3)
         planes = np.linalg.solve(V, np.einsum("pn,pni,pn->pi", trust, x, y)[..., None])[..., 0]
@@ -178,7 +178,7 @@ def table_of(
         planes.append(laid[clear])
         targets.append(np.broadcast_to(near, (int(np.count_nonzero(clear)), len(near))))
     plane = np.concatenate(planes)
-    sigmas = [0.2, _SLOPE_SIGMA, _SLOPE_SIGMA]  # relative, of a patch's depth
+    sigmas = [0.2, SLOPE_SIGMA, SLOPE_SIGMA]  # relative, of a patch's depth
     table = PatchTable(
         np.concatenate(hosts),
         np.concatenate(centres),

@@ -4,7 +4,7 @@ import numpy as np
 
 from gsba.bundle.map_strength import step_deviations
 from gsba.frames.masks import load_mask
-from gsba.geometry import inverse, rotation_angle, step_covariances, unit
+from gsba.geometry import relative_steps, rotation_angle, step_covariances, unit
 from gsba.log import GsbaError
 from gsba.masks.borders import find_borders
 from gsba.masks.carrier import VEHICLE_SHARE
@@ -107,7 +107,7 @@ def step_sigmas(result: Reconstruction) -> np.ndarray:
     poses, joint = result.world_T_rigs, result.joint_errors
     if joint is None or len(poses) < 2:
         return np.zeros(0)
-    steps = inverse(poses[:-1]) @ poses[1:]
+    steps = relative_steps(poses)
     spread = step_covariances(poses, result.pose_covariances, joint.neighbours)
     turn_variances, variances = (
         np.trace(spread[:, part, part], axis1=1, axis2=2) for part in (np.s_[:3], np.s_[3:])
@@ -126,8 +126,7 @@ def share_ahead(result: Reconstruction) -> float:
     over the root of n adds up. No step counts for more than the median one, as false ones are of
     any length. 1 for a map without steps.
     """
-    poses = result.world_T_rigs
-    steps = (inverse(poses[:-1]) @ poses[1:])[:, :3, 3]
+    steps = relative_steps(result.world_T_rigs)[:, :3, 3]
     lengths = np.linalg.norm(steps, axis=1)
     weights = np.minimum(lengths, np.median(lengths)) if len(lengths) else lengths
     if not weights.sum() > 0:

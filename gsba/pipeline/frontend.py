@@ -33,7 +33,15 @@ from gsba.store.store import PerFrame
 from gsba.trajectory import judgement, steps, turning
 from gsba.trajectory.clock import ClockEstimate
 from gsba.trajectory.limits import TwoViewLimits
-from gsba.types import CoarsePoses, Features, Keypoints, Matches, PoseSource, VerifiedPairs
+from gsba.types import (
+    CoarsePoses,
+    Features,
+    Keypoints,
+    Matches,
+    PoseSource,
+    VerifiedPairs,
+    rows_across,
+)
 
 _DARK = 32  # of 255
 _NUM_STEPS = 3  # compared, spread over the walk
@@ -263,7 +271,7 @@ def prove_turn(state: State) -> State | None:
     def compute() -> Recovered:
         chosen = [pairs.adjacent(num, 1)]
         for gap in 2 ** np.arange(1, max(num - 1, 1).bit_length()):
-            first = np.unique(np.linspace(0, num - 1 - gap, 60).astype(np.int32))
+            first = rows_across(num - int(gap), 60)
             chosen.append(np.column_stack([first, first + gap]))
         found = recovery.match_anywhere(context, np.concatenate(chosen).astype(np.int32))
         verify = TwoViewLimits.of(run.settings)
@@ -428,7 +436,7 @@ def comes_back(positions: np.ndarray) -> bool:
     if not along[-1] > 0:
         return True
     num = len(positions)
-    chosen = np.unique(np.linspace(0, num - 1, min(num, 500)).astype(int))
+    chosen = rows_across(num, 500)
     places, along = positions[chosen], along[chosen]
     distances = np.linalg.norm(places[:, None] - places, axis=2)
     between = np.abs(along[:, None] - along)

@@ -19,7 +19,6 @@ _FIX, _DOP, _UTC = "0x47505346", "0x47505350", "0x47505355"  # GPSF, GPSP (DOP *
 _GPS9 = "0x47505339"
 _GPS9_RECORD = np.dtype([("values", ">i4", 7), ("dop", ">u2"), ("fix", ">u2")])
 _FIX_2D, _FIX_3D = 2, 3  # states of the receiver: position without and with an altitude
-_DAY_S = 86_400.0
 
 
 def read_video_gps(path: Path, settings: GpsSettings | None = None) -> GpsFixes:
@@ -101,7 +100,7 @@ def _packet(groups: Mapping[str, Mapping[str, Any]]) -> tuple[float, np.ndarray]
         if start is not None:
             seconds = 1e-6 * float(start)
         elif _GPS9 in tags:
-            seconds = float(rows[0, 5] * _DAY_S + rows[0, 6])
+            seconds = float(rows[0, 5] * 86_400 + rows[0, 6])
         else:
             seconds = 1e-3 * float(tags[_UTC])
     except (KeyError, TypeError, ValueError, IndexError):

@@ -10,7 +10,7 @@ from gsba.camera.rig import CubeRig
 from gsba.frames import cubemap
 from gsba.frames.files import image_header
 from gsba.geometry import median_direction
-from gsba.types import FACES, FrameSet, PoseStatus, Reconstruction
+from gsba.types import FACES, FrameSet, PoseStatus, Reconstruction, rows_across
 
 logger = logging.getLogger(__name__)
 
@@ -64,7 +64,7 @@ def estimate_gravity(reconstruction: Reconstruction, frames: FrameSet) -> Gravit
     if spread > _MAX_SPREAD_DEG and forces is None and tags is None:
         logger.warning("the rigs have no common up axis (median deviation %.0f degrees)", spread)
         return None
-    chosen = good[np.unique(np.linspace(0, len(good) - 1, _MAX_FRAMES).astype(int))]
+    chosen = good[rows_across(len(good), _MAX_FRAMES)]
     found = [_edge_normals(frames, int(f), reconstruction.world_T_rigs[f]) for f in chosen]
     normals, weights = (np.concatenate(part) for part in zip(*found, strict=True))
     start, most, source = by_rigs, 10.0, "the rigs' up axis"

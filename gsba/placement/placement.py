@@ -28,15 +28,13 @@ from gsba.similarity import (
     similarity,
 )
 from gsba.trajectory.association import matched_in_time
-from gsba.trajectory.files import read_trajectory
+from gsba.trajectory.files import MAX_COORDINATE, read_trajectory
 from gsba.types import FrameSet, PoseStatus, Reconstruction, Trajectory
 
 logger = logging.getLogger(__name__)
 
 _UP_WORLD = np.array([0.0, -1.0, 0.0])  # up of an upright world, whose y points down
 _TOLERANCE_S = 0.02  # largest time from a frame to its true pose
-_SCALE_RANGE = (1e-12, 1e12)  # of a placed run; others come from wrong input
-_MAX_COORDINATE = 1e12  # in the placed unit
 _MAX_LENS_SCALE_SIGMA = 0.1  # relative, of a scale by the lenses
 _MAX_GPS_ANGLE_SIGMA_DEG = 25.0  # of heading and tilt by GPS
 _MAX_SCALE_SIGMAS = 4.0  # of two scales that agree: true ones differ by more once in 16,000 runs
@@ -71,7 +69,7 @@ def place(
     placed = placement.similarity.points(reconstruction.world_T_rigs[:, :3, 3])
     far = np.abs(placed).max(initial=0)
     scale = placement.similarity.scale
-    if not (_SCALE_RANGE[0] <= scale <= _SCALE_RANGE[1] and far <= _MAX_COORDINATE):
+    if not (1 / MAX_COORDINATE <= scale <= MAX_COORDINATE and far <= MAX_COORDINATE):
         raise GsbaError(
             f"the placed run would have a scale of {scale:g} and coordinates up to {far:g}: check "
             "the values of --scale, --between, --gps, --align or --align-scan"
@@ -239,7 +237,7 @@ def _point(text: str, reconstruction: Reconstruction, frames: FrameSet) -> np.nd
         point = np.array([float(part) for part in text.split(",")])
     except ValueError:
         point = np.zeros(0)
-    if len(point) != 3 or not (np.abs(point) <= _MAX_COORDINATE).all():
+    if len(point) != 3 or not (np.abs(point) <= MAX_COORDINATE).all():
         raise GsbaError(
             f"--between {brief(text)}: this is neither a frame (such as {frames.names[0]}) nor a "
             "point x,y,z"

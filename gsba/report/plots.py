@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gsba.evaluate import charts
-from gsba.evaluate.trajectory import PoseErrors, pose_errors
+from gsba.evaluate.trajectory import TOLERANCE_S, PoseErrors, pose_errors
 from gsba.log import GsbaError
 from gsba.report.html.figures import viewing_axes
 from gsba.report.report import angular_residuals, frame_quality
@@ -18,14 +18,11 @@ from gsba.similarity import NoSimilarityError, Sim3, pose_similarity
 from gsba.store.finished import load_run
 from gsba.trajectory.association import matched_in_time
 from gsba.trajectory.files import read_trajectory
-from gsba.types import Trajectory
+from gsba.types import Trajectory, rows_across
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, SubFigure
-
-
-_TOLERANCE_S = 0.01  # largest time between poses of two runs that correspond
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +88,7 @@ def _with_errors(shown: PlottedRun, truth: Trajectory) -> PlottedRun:
 
 def _aligned_to(shown: PlottedRun, first: PlottedRun) -> Sim3 | None:
     """Similarity from a run to the first one; None = they are of different walks."""
-    rows, others = matched_in_time(shown.refined, first.refined, _TOLERANCE_S)
+    rows, others = matched_in_time(shown.refined, first.refined, TOLERANCE_S)
     if len(rows) < 3:
         return None
     try:
@@ -255,5 +252,5 @@ def _residuals(figure: "SubFigure | Figure", shown: Sequence[PlottedRun]) -> Non
 def _shares(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Cumulative distribution: values (P,) ascending, and the share of all that is not larger."""
     ordered = np.sort(values)
-    rows = np.unique(np.linspace(0, len(ordered) - 1, min(len(ordered), 2000)).astype(int))
+    rows = rows_across(len(ordered), 2000)
     return ordered[rows], (rows + 1) / max(len(ordered), 1)

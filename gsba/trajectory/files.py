@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-_MAX_COORDINATE = 1e12  # largest coordinate, in any unit: beyond, differences lose precision
+MAX_COORDINATE = 1e12  # largest coordinate, in any unit: beyond, differences lose precision
 _UNIT_TOLERANCE = 1e-3  # largest deviation of a quaternion's norm, or of a matrix from a rotation
 
 
@@ -108,11 +108,11 @@ def _tracked(
 ) -> np.ndarray:
     """Rows (M,) of N that have a pose, at least 2 unless N is less; others are logged."""
     known = np.isfinite(values).all(axis=1) & turned
-    known &= (np.abs(np.where(known[:, None], positions, 0)) <= _MAX_COORDINATE).all(axis=1)
+    known &= (np.abs(np.where(known[:, None], positions, 0)) <= MAX_COORDINATE).all(axis=1)
     lost = np.flatnonzero(~known)
     if len(lost) and known.sum() < 2:
         raise GsbaError(
-            f"{where[lost[0]]}: no pose (NaN, zeros, or a position beyond {_MAX_COORDINATE:g}), as "
+            f"{where[lost[0]]}: no pose (NaN, zeros, or a position beyond {MAX_COORDINATE:g}), as "
             f"in {len(lost)} of {len(known)} rows; at least 2 poses are needed"
         )
     if len(lost):
@@ -122,7 +122,7 @@ def _tracked(
             path,
             len(lost),
             len(known),
-            _MAX_COORDINATE,
+            MAX_COORDINATE,
             where[lost[0]],
         )
     return np.flatnonzero(known)
@@ -249,10 +249,10 @@ def _trajectory(
 ) -> Trajectory:
     if len(times) < 2:
         raise GsbaError(f"{path}: {len(times)} poses; at least 2 are needed")
-    far = np.flatnonzero(np.abs(world_T_rigs[:, :3, 3]).max(axis=1) > _MAX_COORDINATE)
+    far = np.flatnonzero(np.abs(world_T_rigs[:, :3, 3]).max(axis=1) > MAX_COORDINATE)
     if len(far):
         raise GsbaError(
-            f"{where[far[0]]}: a position further than {_MAX_COORDINATE:g} from the origin"
+            f"{where[far[0]]}: a position further than {MAX_COORDINATE:g} from the origin"
         )
     late = np.flatnonzero(np.diff(times) <= 0)
     if len(late):

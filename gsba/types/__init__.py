@@ -4,7 +4,15 @@ Takes arrays of one stage.
 Gives them to the next one under names, with shapes and units.
 """
 
-from gsba.types.frame_set import FACES, NO_FILE_NAME, Fisheye, FrameSet, PictureFormat, cameras_of
+from gsba.types.frame_set import (
+    FACES,
+    NO_FILE_NAME,
+    Fisheye,
+    FrameSet,
+    PictureFormat,
+    cameras_of,
+    rows_across,
+)
 from gsba.types.records import (
     CoarsePoses,
     Counts,
@@ -59,4 +67,5 @@ __all__ = [
     "Trajectory",
     "VerifiedPairs",
     "cameras_of",
+    "rows_across",
 ]

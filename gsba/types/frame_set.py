@@ -77,6 +77,11 @@ class PictureFormat:
         return self.width // 4 if self.panoramic else self.width
 
 
+def rows_across(num: int, most: int) -> np.ndarray:
+    """At most `most` rows (N,) int64 of `num`, evenly from the first to the last."""
+    return np.unique(np.linspace(0, num - 1, min(num, most)).astype(int))
+
+
 def cameras_of(of_frame: Sequence[int], rows: np.ndarray) -> tuple[np.ndarray, tuple[int, ...]]:
     """Cameras (C',) that took frames `rows` (F',), and the one of each frame among these.
 

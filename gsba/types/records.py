@@ -11,7 +11,7 @@ from gsba.types.frame_set import PictureFormat
 
 T = TypeVar("T", bound=Any)  # a dataclass
 
-_AT_ONCE = 1 << 16  # observations whose poses are held together: 9 MB
+AT_ONCE = 1 << 16  # observations whose poses are held together: 9 MB
 
 
 def with_rows(record: T, rows: np.ndarray) -> T:
@@ -410,7 +410,7 @@ class Solution:
         """Median distance of points from observing frames, map units; 0 without points."""
         tracks, points = self.landmarks.tracks, self.landmarks.points_world
         depths = np.empty(len(tracks))
-        for some in slices(len(tracks), _AT_ONCE):
+        for some in slices(len(tracks), AT_ONCE):
             offsets = points[tracks.points[some]] - self.world_T_rigs[tracks.frames[some], :3, 3]
             depths[some] = np.linalg.norm(offsets, axis=1)
         return float(np.median(depths, overwrite_input=True)) if len(depths) else 0.0
@@ -554,7 +554,7 @@ class Reconstruction:
         origins, points = self.observation_origins, self.observation_points
         stop = 0
         while True:
-            start, stop = stop, min(stop + _AT_ONCE, len(points))
+            start, stop = stop, min(stop + AT_ONCE, len(points))
             if stop < len(points):
                 before = int(np.searchsorted(points, points[stop]))
                 after = int(np.searchsorted(points, points[start], side="right"))

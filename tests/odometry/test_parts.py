@@ -84,7 +84,7 @@ def test_a_window_is_adjusted_to_its_true_poses_and_scale() -> None:
     start = truth.copy()
     start[2:, :3, 3] += rng.normal(size=(4, 3)) * 0.01
     sigma = np.deg2rad(0.1)
-    solved = adjust_window(start, 2, WindowObservations.of(frames), sigma, 4.0)
+    solved = adjust_window(start, 2, WindowObservations.of(frames), sigma)
     off = inverse(truth) @ solved.world_T_rigs
     assert np.abs(off[:, :3, 3]).max() < 1e-3
     assert len(solved.ids) >= 198  # of 200: a point straight ahead has no parallax

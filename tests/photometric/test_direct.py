@@ -66,7 +66,7 @@ def test_planes_pass_through_the_map(monkeypatch: pytest.MonkeyPatch) -> None:
     points = rays * (offset / (rays @ normal))[:, None]
     points[::15] *= 1.5  # of another surface
     bearings = unit(np.array([0, 0, 1.0]) + 0.05 * rng.normal(size=(50, 3)))
-    monkeypatch.setattr(patches, "_SLOPE_SIGMA", 10.0)
+    monkeypatch.setattr(patches, "SLOPE_SIGMA", 10.0)
     planes, clear = patches.lay_planes(bearings, points)
     assert np.count_nonzero(clear) > 40
     expected = bearings @ normal / offset

@@ -100,7 +100,7 @@ def test_observations_some_at_a_time(monkeypatch: pytest.MonkeyPatch, most: int)
     moved = coarse.world_T_rigs.copy()
     moved[1, :3, 3] += 6.0
     residuals, under = angular_residuals(whole), median_residual_deg(whole, moved)
-    monkeypatch.setattr("gsba.types.records._AT_ONCE", most)
+    monkeypatch.setattr("gsba.types.records.AT_ONCE", most)
     pieces = list(whole.pieces())
     assert len(pieces) > 1
     assert max(len(one.observation_points) for one in pieces) <= max(most, 3)

@@ -8,7 +8,7 @@ from gsba.camera.sphere import erp_directions
 from gsba.geometry import moved_to, rotation_angle
 from gsba.memory import release_mapped_files
 from gsba.report.report import medians_by_group
-from gsba.types import CoarsePoses, Reconstruction
+from gsba.types import CoarsePoses, Reconstruction, rows_across
 
 if TYPE_CHECKING:
     from gsba.odometry import Odometry
@@ -31,7 +31,7 @@ def world_map(coarse: CoarsePoses, reconstruction: Reconstruction) -> dict[str, 
     axes, upright = viewing_axes(reconstruction.world_T_rigs)
     centre = np.median(positions, axis=0)
     num = len(reconstruction.points_world)
-    which = np.unique(np.linspace(0, num - 1, min(num, _MAX_POINTS)).astype(int)) if num else []
+    which = rows_across(num, _MAX_POINTS)
     extent = float(np.ptp(positions, axis=0).max()) or 1.0
     points = (reconstruction.points_world[which] - centre) @ axes.T
     near = np.abs(points).max(axis=1, initial=0) < 3 * extent

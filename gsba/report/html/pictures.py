@@ -14,7 +14,7 @@ from gsba.frames.files import decode
 from gsba.frames.pixels import load_erp, load_faces
 from gsba.report.html.figures import tangent_residuals
 from gsba.report.report import frame_quality
-from gsba.types import FACES, FrameSet, Reconstruction
+from gsba.types import FACES, FrameSet, Reconstruction, rows_across
 
 NUM_PICTURES = 6
 _WIDTH = 720  # pixels across an image
@@ -39,7 +39,7 @@ def picture(frames: FrameSet, reconstruction: Reconstruction, f: int) -> dict[st
     """
     rows = np.flatnonzero(reconstruction.observation_frames == f)
     if len(rows) > _MAX_VECTORS:
-        rows = rows[np.linspace(0, len(rows) - 1, _MAX_VECTORS).astype(int)]
+        rows = rows[rows_across(len(rows), _MAX_VECTORS)]
     bearings = reconstruction.observation_bearings[rows]
     residuals = np.degrees(residuals_of_rows(reconstruction, rows))
     level = np.maximum(np.hypot(bearings[:, 0], bearings[:, 2]), 0.05)

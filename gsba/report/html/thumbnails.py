@@ -14,7 +14,7 @@ from gsba.camera.sphere import erp_from_bearings
 from gsba.frames.masks import load_mask
 from gsba.log import GsbaError
 from gsba.report.html.pictures import jpeg_text, residuals_of_rows, small_panorama
-from gsba.types import FrameSet, PictureFormat, Reconstruction
+from gsba.types import FrameSet, PictureFormat, Reconstruction, rows_across
 
 logger = logging.getLogger(__name__)
 
@@ -41,7 +41,7 @@ def frame_pictures(
         "circles": lines of places relative to width and height; "matches", see `_matches`.
     """
     num = len(frames)
-    wanted = np.unique(np.linspace(0, num - 1, min(num, MAX_PICTURES)).astype(int)) if num else []
+    wanted = rows_across(num, MAX_PICTURES)
     shown, jpegs, masks, mask = list[int](), list[str](), dict[bytes, int](), list[int]()
     kept, room = dict[Any, int](), _MAX_BYTES // max(len(wanted), 1)
     large = room >= _LARGEST_WIDE
@@ -129,7 +129,7 @@ def _matches(frames: FrameSet, reconstruction: Reconstruction) -> dict[str, Any]
         points = reconstruction.observation_points
         _, a, b = np.intersect1d(points[rows], points[others], return_indices=True)
         shared[f] = len(a)
-        some = np.linspace(0, len(a) - 1, min(len(a), _MAX_CANDIDATES)).astype(int)
+        some = rows_across(len(a), _MAX_CANDIDATES)
         chosen.append(np.column_stack([np.full(len(some), f), rows[a[some]], others[b[some]]]))
     pairs = np.concatenate(chosen) if chosen else np.zeros((0, 3), int)
     lengths = [
@@ -157,6 +157,6 @@ def _some_and_worst(pairs: np.ndarray, worst: np.ndarray, most: int) -> np.ndarr
     for first, end in pairwise(bounds):
         order = first + np.argsort(-worst[first:end], kind="stable")
         rest = order[most // 2 :]
-        evenly = np.linspace(0, len(rest) - 1, min(len(rest), most - most // 2)).astype(int)
+        evenly = rows_across(len(rest), most - most // 2)
         kept.append(np.sort(np.concatenate([order[: most // 2], rest[evenly]])))
     return np.concatenate(kept) if kept else np.zeros(0, int)
