@@ -82,14 +82,8 @@ def test_defaults_need_no_file() -> None:
 
 
 def test_resolved_settings_round_trip(tmp_path: Path) -> None:
-    settings = load_config(
-        None, ["features.max_per_face=321", "cubemap.min_face_size=640", "seed=7"]
-    )
-    assert (settings.features.max_per_face, settings.cubemap.min_face_size, settings.seed) == (
-        321,
-        640,
-        7,
-    )
+    settings = load_config(None, ["features.max_per_face=321", "seed=7"])
+    assert (settings.features.max_per_face, settings.seed) == (321, 7)
     assert load_config(_written(tmp_path, to_toml(settings))) == settings
 
 

@@ -67,6 +67,8 @@ def test_help_names_every_command_and_format() -> None:
         assert command in out
     out = run_gsba("export", "--help").stdout
     assert all(to in out for to in ExportFormat)
+    for command in typer.main.get_command(app).commands:  # type: ignore[attr-defined]
+        assert "[Path]" not in run_gsba(command, "--help").stdout  # nothing of Python
 
 
 def test_version() -> None:
@@ -149,11 +151,6 @@ def test_messages_are_short_and_printable(pipeline: Callable[[BaseException], No
     line = run_gsba("refine", "frames", "slam.tum", "--out", "run").stderr
     assert len(line) < 1100 and line.startswith("error: 999") and line.endswith("end\n")
     assert "\\udcff" in line
-
-
-def test_help_says_nothing_of_python() -> None:
-    for command in typer.main.get_command(app).commands:  # type: ignore[attr-defined]
-        assert "[Path]" not in run_gsba(command, "--help").stdout
 
 
 def test_export_checks_its_options(tmp_path: Path) -> None:

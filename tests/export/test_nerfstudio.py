@@ -105,14 +105,8 @@ def test_points_land_on_their_pixels_in_pinhole_faces(dataset):
 def test_points_land_on_their_pixels_in_panoramas(dataset):
     meta = _meta(dataset, "transforms_erp.json")
     assert meta["camera_model"] == "EQUIRECTANGULAR"
-    assert [meta[k] for k in ("w", "h", "fl_x", "fl_y", "cx", "cy")] == [
-        512,
-        256,
-        256,
-        256,
-        256,
-        128,
-    ]
+    sizes = [meta[k] for k in ("w", "h", "fl_x", "fl_y", "cx", "cy")]
+    assert sizes == [512, 256, 256, 256, 256, 128]
     points = POINTS @ np.array(meta["applied_transform"])[:, :3].T
     bearings = reconstruction().observation_bearings.reshape(len(POINTS), NUM_FRAMES, 3)
     x, y, z = np.moveaxis(bearings, -1, 0)

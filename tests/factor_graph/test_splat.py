@@ -122,22 +122,21 @@ def test_jacobians_of_the_residuals(apart: bool) -> None:
     assert same_face.mean() > 0.995  # a point that changes its face has no derivative
 
 
-@pytest.mark.parametrize("apart", [False, True])
-def test_poses_are_found_again_under_another_exposure(apart: bool) -> None:
-    poses = truth(3)
-    start = values_of(moved(poses, 0.03))  # 1.7 degrees, 0.03 of a room 4 wide
-    block = block_at(poses, apart=apart)
-    result = optimize(gtsam.NonlinearFactorGraph(), start, [block])
-    assert errors(start, poses).max() > 0.03
-    assert errors(result.values, poses).max() < 5e-4
-
-
-def test_somebody_in_the_picture_is_let_go() -> None:
-    poses = truth(2)
-    start = values_of(moved(poses, 0.02))
-    block = block_at(poses, spoil=0.5)
-    result = optimize(gtsam.NonlinearFactorGraph(), start, [block])
-    assert errors(result.values, poses).max() < 2e-3
+@pytest.mark.parametrize(
+    ("num", "off", "given", "most"),
+    [
+        (3, 0.03, {"apart": False}, 5e-4),  # 1.7 degrees, 0.03 of a room 4 wide
+        (3, 0.03, {"apart": True}, 5e-4),
+        (2, 0.02, {"spoil": 0.5}, 2e-3),  # somebody in the picture
+    ],
+)
+def test_poses_are_found_again(num: int, off: float, given: dict, most: float) -> None:
+    """Under another exposure, and beside somebody who is let go."""
+    poses = truth(num)
+    start = values_of(moved(poses, off))
+    result = optimize(gtsam.NonlinearFactorGraph(), start, [block_at(poses, **given)])
+    assert errors(start, poses).max() > off
+    assert errors(result.values, poses).max() < most
 
 
 def test_masked_pixels_are_not_sampled() -> None:

@@ -68,10 +68,8 @@ def test_why_they_are_no_times(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, times: list[str | None], why: str
 ) -> None:
     folder = _folder(tmp_path / "frames", times)
-    with pytest.raises(NoTimesError) as failure:
+    with pytest.raises(NoTimesError, match=f"EXIF times are not used: {why}.*$"):
         scan(folder)
-    assert f"EXIF times are not used: {why}" in str(failure.value)
-    assert "\n" not in str(failure.value)
     caplog.set_level(logging.INFO, "gsba")
     frames = scan(folder, order_suffices=True)
     assert not frames.timed and frames.names == ("a", "b", "c")

@@ -150,18 +150,16 @@ def test_a_gyro_of_another_recording_is_refused(
     assert len(read_telemetry(path, lasting_s=5.0 if first_frame == 0 else None).timestamps) == 500
 
 
-def test_what_telemetry_parser_cannot_read_is_named(tmp_path: Path) -> None:
-    pytest.importorskip("telemetry_parser", reason="needs gsba[imu]")
-    path = tmp_path / "walk.insv"
-    path.write_bytes(bytes(2000))
-    refused(r"walk\.insv: telemetry-parser finds no gyro", read_imu, path)
+_PANIC = b"GYROFLOW IMU LOG\ntscale,often\nt,gx,gy,gz\n0,1,2,3\n"  # of the library
 
 
-def test_a_panic_of_the_library_is_one_line_too(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("name", "content"), [("walk.insv", bytes(2000)), ("walk.gcsv", _PANIC)])
+def test_what_telemetry_parser_cannot_read_is_named(
+    tmp_path: Path, name: str, content: bytes
+) -> None:
     pytest.importorskip("telemetry_parser", reason="needs gsba[imu]")
-    path = tmp_path / "walk.gcsv"
-    path.write_text("GYROFLOW IMU LOG\ntscale,often\nt,gx,gy,gz\n0,1,2,3\n")
-    refused(r"walk\.gcsv: telemetry-parser finds no gyro", read_imu, path)
+    (tmp_path / name).write_bytes(content)
+    refused(f"{name}: telemetry-parser finds no gyro", read_imu, tmp_path / name)
 
 
 def test_without_telemetry_parser_a_line_says_what_to_install(

@@ -87,7 +87,7 @@ def test_a_panorama_is_fitted_despite_outliers_with_a_fair_covariance() -> None:
         seen, world_T_rig = _panorama(rng, 200, 1e-3)
         wrong = rng.permutation(200)[:60]
         bearings = seen.measured.copy()
-        bearings[wrong] = _units(rng, 60)
+        bearings[wrong] = unit(rng.normal(size=(60, 3)))
         seen = PointSightings(seen.points_world, seen.covariances, bearings, seen.spreads)
         start = _moved(_moved(world_T_rig, 0.01, 1), 0.05, 3)
         start = fit([seen], start[None], COARSE).world_T_rigs
@@ -132,7 +132,7 @@ def _panorama(
 ) -> tuple[PointSightings, np.ndarray]:
     """Sightings of points around a panorama, and its pose."""
     world_T_rig = pose(Rotation.from_quat(rng.normal(size=4)).as_matrix(), rng.normal(size=3))
-    bearings, distances = _units(rng, num), rng.uniform(1, 8, (num, 1))
+    bearings, distances = unit(rng.normal(size=(num, 3))), rng.uniform(1, 8, (num, 1))
     points = (bearings * distances) @ world_T_rig[:3, :3].T + world_T_rig[:3, 3]
     noisy = unit(bearings + rng.normal(0, sigma, (num, 3)))
     return PointSightings(
@@ -151,11 +151,6 @@ def _photo(
     noisy = pixels + rng.normal(0, sigma_px, (num, 2))
     spreads = isotropic(np.full(num, sigma_px))
     return PointSightings(points, np.zeros((num, 3, 3)), noisy, spreads, camera=0), world_T_rig
-
-
-def _units(rng: np.random.Generator, num: int) -> np.ndarray:
-    vectors = rng.normal(size=(num, 3))
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
 def _moved(world_T_rig: np.ndarray, by: float, axis: int) -> np.ndarray:

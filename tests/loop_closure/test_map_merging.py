@@ -332,22 +332,16 @@ def test_a_single_frame_does_not_join_two_recordings() -> None:
     np.testing.assert_array_equal(found.components, np.arange(NUM) == 30)
 
 
-def test_a_frame_of_elsewhere_is_not_registered() -> None:
+def test_a_frame_of_elsewhere_stays_where_its_steps_have_it_or_is_not_registered() -> None:
     context, whole, _ = scene(strange=True)
     parts_of = (np.arange(NUM) == 30).astype(int)
-    rest = _without_map(whole, tuple(range(HALF, NUM)))
-    found = map_merging.merge(context, rest, parts_of, NOBODY, NOBODY, TIMES)
+    given = context, _without_map(whole, tuple(range(HALF, NUM))), parts_of, NOBODY
+    found = map_merging.merge(*given, NOBODY, TIMES)
     np.testing.assert_array_equal(np.flatnonzero(found.lost), [30])
     np.testing.assert_array_equal(found.components, parts_of)  # apart: a guess is not exported
     assert not found.alone.any() and found.counts.dropped == {"frames alone": 1, "apart": 0}
-
-
-def test_a_frame_with_too_few_points_stays_where_its_steps_have_it() -> None:
-    context, whole, _ = scene(strange=True)
-    parts_of = (np.arange(NUM) == 30).astype(int)
-    rest = _without_map(whole, tuple(range(HALF, NUM)))
-    found = map_merging.merge(context, rest, parts_of, NOBODY, ~NOBODY, TIMES)
-    assert not found.lost.any() and not found.components.any()
+    by_steps = map_merging.merge(*given, ~NOBODY, TIMES)
+    assert not by_steps.lost.any() and not by_steps.components.any()
 
 
 def _trust(poses: np.ndarray, unseen: np.ndarray) -> StepChecks:

@@ -171,21 +171,18 @@ def test_pairs_that_agree_with_the_prior_are_kept() -> None:
         assert _direction_error(found.f0_T_f1s[row], F0_T_F1) < 0.3
 
 
-def test_rotation_is_vetoed() -> None:
-    limit = SETTINGS.max_rotation_deg
-    views = [_see(F0_T_F1, 0.2)] * 2
-    found = _run(views, [_turned(F0_T_F1, 0.8 * limit), _turned(F0_T_F1, 1.2 * limit)])
+@pytest.mark.parametrize(
+    ("part", "change", "limit"),
+    [
+        ("rotation", _turned, SETTINGS.max_rotation_deg),
+        ("direction", _redirected, SETTINGS.max_direction_deg),
+    ],
+)
+def test_contradictions_are_vetoed(part: str, change, limit: float) -> None:
+    priors = [change(F0_T_F1, angle) for angle in (0.8 * limit, 1.2 * limit, 180)]
+    found = _run([_see(F0_T_F1, 0.2)] * 3, priors)
     np.testing.assert_array_equal(found.matches.pairs, [[0, 1]])
-    assert found.counts.dropped["rotation contradicts"] == 1
-
-
-def test_direction_is_vetoed() -> None:
-    limit = SETTINGS.max_direction_deg
-    views = [_see(F0_T_F1, 0.2)] * 3
-    priors = [_redirected(F0_T_F1, angle) for angle in (0.8 * limit, 1.2 * limit, 180)]
-    found = _run(views, priors)
-    np.testing.assert_array_equal(found.matches.pairs, [[0, 1]])
-    assert found.counts.dropped["direction contradicts"] == 2
+    assert found.counts.dropped[f"{part} contradicts"] == 2
 
 
 def test_direction_counts_for_as_much_as_the_prior_knows_it() -> None:

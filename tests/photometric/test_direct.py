@@ -23,8 +23,9 @@ from gsba.disk import write_image
 from gsba.frames.masks import levels_of
 from gsba.log import GsbaError
 from gsba.photometric import direct, patches
+from gsba.photometric.direct import PhotometricResult
 from gsba.pipeline.run import Run
-from gsba.types import FrameSet
+from gsba.types import FrameSet, Solution
 
 WIDTH = 512
 GREY = render(np.eye(4), Texture(np.random.default_rng(0)), WIDTH).astype(np.float32)
@@ -148,13 +149,16 @@ def _start(case: Case, settings: RefineSettings):
     return frames, keypoints, solved, priors, cubemap.rig_for(frames.format, settings.cubemap)
 
 
+def _refined(case: Case) -> tuple[Solution, PhotometricResult]:
+    frames, keypoints, solved, priors, rig = _start(case, JOINT)
+    context = AdjustmentContext(Families((Bearings(), priors)), rig, JOINT, 1)
+    return solved, direct.refine(frames, keypoints, solved, context)
+
+
 def test_nothing_to_see_changes_nothing(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(patches, "_MIN_GRADIENT", 1e3)
     monkeypatch.setattr(direct, "_DEPTH_LEVELS", 0)
-    frames, keypoints, solved, priors, rig = _start(case, JOINT)
-    result = direct.refine(
-        frames, keypoints, solved, AdjustmentContext(Families((Bearings(), priors)), rig, JOINT, 1)
-    )
+    solved, result = _refined(case)
     assert np.array_equal(result.adjustment.world_T_rigs, solved.world_T_rigs)
     assert all(counts.kept == 0 for counts in result.counts)
 
@@ -193,10 +197,7 @@ def test_a_solve_against_the_map_is_undone(case: Case, monkeypatch: pytest.Monke
     monkeypatch.setattr(direct, "_MAX_GROWTH", 1e-3)
     monkeypatch.setattr(direct, "_DEPTH_LEVELS", 0)
     monkeypatch.setattr(patches, "_SPACING_DEG", 20)
-    frames, keypoints, solved, priors, rig = _start(case, JOINT)
-    result = direct.refine(
-        frames, keypoints, solved, AdjustmentContext(Families((Bearings(), priors)), rig, JOINT, 1)
-    )
+    solved, result = _refined(case)
     assert not result.adjustment.rounds[-1].accepted
     assert np.array_equal(result.adjustment.world_T_rigs, solved.world_T_rigs)
 
@@ -220,10 +221,7 @@ def test_a_small_panorama_has_fewer_levels(case: Case, monkeypatch: pytest.Monke
     monkeypatch.setattr(direct, "_DEPTH_LEVELS", 9)
     monkeypatch.setattr(patches, "_SPACING_DEG", 20)
     monkeypatch.setattr(patches, "_SIZE", 5)
-    frames, keypoints, solved, priors, rig = _start(case, JOINT)
-    result = direct.refine(
-        frames, keypoints, solved, AdjustmentContext(Families((Bearings(), priors)), rig, JOINT, 1)
-    )
+    _, result = _refined(case)
     assert np.isfinite(result.adjustment.world_T_rigs).all() and len(result.counts) == 2
 
 

@@ -63,10 +63,13 @@ def test_searched_places_make_a_map_where_descriptors_make_none(
 
 
 @pytest.mark.usefixtures("_no_descriptor_is_so_alike")
-def test_the_search_can_be_turned_off(stills: Path, tmp_path: Path) -> None:
-    settings = settings_with(**WITHOUT_PATCHES, pairs={"max_tour_frames": 0})
+@pytest.mark.parametrize(("pairs", "fps"), [({"max_tour_frames": 0}, None), ({}, 2.0)])
+def test_frames_of_a_video_and_more_than_is_allowed_are_not_searched(
+    stills: Path, tmp_path: Path, pairs: dict[str, int], fps: float | None
+) -> None:
+    settings = settings_with(**WITHOUT_PATCHES, pairs=pairs)
     with pytest.raises(GsbaError, match="no two neighbouring frames match"):
-        refine(stills, None, tmp_path / "run", settings, masks="none")
+        refine(stills, None, tmp_path / "run", settings, masks="none", fps=fps)
 
 
 def test_added_keypoints_follow_the_others_of_their_face() -> None:
@@ -89,10 +92,3 @@ def test_added_keypoints_follow_the_others_of_their_face() -> None:
         added[owner_faces(added) == 0],
         atol=1e-12,
     )
-
-
-@pytest.mark.usefixtures("_no_descriptor_is_so_alike")
-def test_frames_of_a_video_are_not_searched(stills: Path, tmp_path: Path) -> None:
-    settings = settings_with(**WITHOUT_PATCHES)
-    with pytest.raises(GsbaError, match="no two neighbouring frames match"):
-        refine(stills, None, tmp_path / "run", settings, masks="none", fps=2.0)
