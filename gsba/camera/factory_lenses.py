@@ -39,7 +39,8 @@ _GENERATIONS = {6: 1, 16: 2, 19: 3, 27: 6}  # numbers of one lens -> generation
 _COUNTS = {16: 6, 34: 16, 40: 19, 56: 27}  # numbers of a calibration -> numbers of one lens
 _REFERENCE_ANGLE_RAD = np.deg2rad(100.0)  # angle to which `radius` belongs
 _DIRECTION_SIGMA_RAD = {n: np.deg2rad(deg) for n, deg in ((1, 1.5), (2, 0.7), (3, 0.4), (6, 0.4))}
-_ROTATION_SIGMA_RAD = np.deg2rad(1.5)
+ROTATION_SIGMA_RAD = np.deg2rad(1.5)  # of one lens against the other about each axis, standard
+# deviation; an X4 Air's own calibration was off by 2.4 degrees (Kjerag's study)
 _HALF_TURN_ABOUT_Y = np.diag([-1.0, 1.0, -1.0])  # rotation by pi about y
 
 
@@ -78,25 +79,9 @@ class FactoryLenses:
     angles_known: bool  # True if angles have the form described above; else they are unused
 
     @property
-    def focal_sigma(self) -> float:
-        """Standard deviation of the focal lengths, relative.
-
-        The first generation takes lenses for equidistant; those of an X4 are not, by 5 percent.
-        """
-        return {1: 0.05, 2: 0.01, 3: 0.005, 6: 0.005}[self.generation]
-
-    @property
     def direction_sigma(self) -> float:
         """Standard deviation of directions of pixels in the axes of their own lens, rad."""
         return float(_DIRECTION_SIGMA_RAD[self.generation])
-
-    @property
-    def rotation_sigma(self) -> float:
-        """Standard deviation of the rotation of one lens against the other about each axis, rad.
-
-        An X4 Air's own calibration was off by 2.4 degrees (Kjerag's study).
-        """
-        return float(_ROTATION_SIGMA_RAD)
 
     def pairs(self, size: tuple[int, int]) -> list[Pair]:
         """Lenses for pictures of a size (width, height) that show the window or, less likely, all

@@ -28,7 +28,7 @@ _VERSION = 3
 _MAX_RECORDS = 256
 _MAX_METADATA_BYTES = 8 << 20
 _MAX_RECORD_BYTES = 1 << 29  # seven hours of a gyro at 1 kHz
-_BINARY, _PROTOBUF = 0, 1  # formats of records
+_BINARY = 0  # format of records; 1 = protobuf
 
 
 class _Record(IntEnum):

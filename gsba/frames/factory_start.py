@@ -11,7 +11,12 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gsba.camera.factory_lenses import FactoryCalibration, FactoryLenses, parse_factory_lenses
+from gsba.camera.factory_lenses import (
+    ROTATION_SIGMA_RAD,
+    FactoryCalibration,
+    FactoryLenses,
+    parse_factory_lenses,
+)
 from gsba.camera.fisheye import Pair
 from gsba.containers.insta360 import read_trailer
 from gsba.disk import write_json
@@ -114,7 +119,7 @@ def starting_lenses(
         folder,
         factory.generation,
         np.rad2deg(factory.direction_sigma),
-        np.rad2deg(factory.rotation_sigma),
+        np.rad2deg(ROTATION_SIGMA_RAD),
         (f"; as images show, {' and '.join(parts)}" if parts else "")
         if factory.angles_known
         else "; its angles have no known form",

@@ -1,6 +1,5 @@
 """The normal equations of a map in parts, which `gsba.bundle.optimizer.minimize` solves."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
@@ -28,7 +27,7 @@ from gsba.parts.jobs import (
 )
 from gsba.store.records import save_record
 from gsba.store.shards import Job, Workers
-from gsba.types import Iteration, JointErrors
+from gsba.types import JointErrors
 
 R = TypeVar("R")
 
@@ -315,7 +314,6 @@ def optimize_divided(
     workers: Workers,
     options: SolverOptions,
     scratch: Path | None = None,
-    callback: Callable[[Iteration, gtsam.Values], None] | None = None,
 ) -> OptimizeResult:
     """Minimize the cost of a map in parts, from where an earlier call was stopped if there is one.
 
@@ -325,7 +323,6 @@ def optimize_divided(
         folder: of the map, from `folder.PartsWriter`, on a disk that the workers share.
         options: loss, damping, tolerances; `max_iterations` counts from where this call starts.
         scratch: folder of the workers' own files, emptied after each pass; None = they have none.
-        callback: called with each attempt and the best values so far.
 
     Raises:
         GsbaError: the disk is full or damaged, the cost at the start is not finite, or workers fail
@@ -336,7 +333,7 @@ def optimize_divided(
     if np.isfinite(start.damping):
         options = replace(options, lambda_initial=start.damping)
     values = start.at.values(range(system.num_frames))
-    result = minimize(system, values, options, callback)
+    result = minimize(system, values, options)
     system.finish(result.values)
     return result
 
