@@ -1,9 +1,10 @@
 """The peer of `benchmarks/pipeline.py`: COLMAP's panorama reconstruction of a folder of frames.
 
-    python benchmarks/peer.py spherical-incremental FRAMES OUT
+    python benchmarks/peer.py spherical-incremental FRAMES OUT [--matcher exhaustive]
 
-Writes the peer's model and, of the largest model, `trajectory.tum`: T_world_panorama of its posed
-frames. Times of frames are their numbers in name order. The perspective modes need Pillow.
+Writes the peer's models and T_world_panorama of their posed frames: `trajectory.tum` of the largest
+model, `trajectory1.tum` and so on of smaller ones. Times of frames are their numbers in name order.
+The perspective modes need Pillow.
 """
 
 import argparse
@@ -18,8 +19,8 @@ MODES = (
 )
 
 
-def reconstruct(mode: str, frames: Path, out: Path) -> None:
-    """Run one mode with the peer's defaults on the CPU, and write its largest model's poses.
+def reconstruct(mode: str, frames: Path, out: Path, matcher: str) -> None:
+    """Run one mode with the peer's defaults on the CPU, and write its models' poses.
 
     Raises:
         SystemExit: the peer found no model.
@@ -34,6 +35,7 @@ def reconstruct(mode: str, frames: Path, out: Path) -> None:
     kind = panorama.PanoRenderType
     options = panorama.PanoramaReconstructionOptions(
         mapper=panorama.Mapper(mapper),
+        matcher=panorama.Matcher(matcher),
         render_type=kind.SPHERICAL if spherical else kind.PERSPECTIVE_OVERLAPPING,
         random_seed=0,
         use_gpu=False,
@@ -43,11 +45,12 @@ def reconstruct(mode: str, frames: Path, out: Path) -> None:
     models = panorama.reconstruct(frames, out, options)
     if not models:
         sys.exit("the peer found no model")
-    largest = max(models, key=lambda index: models[index].num_reg_frames())
-    model = models[largest]
-    if not spherical:  # the peer's own conversion of its rig of views
-        model = pycolmap.Reconstruction(out / "sparse_equirectangular" / str(largest))
-    write_tum(out / "trajectory.tum", _trajectory(model, frames))
+    largest_first = sorted(models, key=lambda index: -models[index].num_reg_frames())
+    for n, index in enumerate(largest_first):
+        model = models[index]
+        if not spherical:  # the peer's own conversion of its rig of views
+            model = pycolmap.Reconstruction(out / "sparse_equirectangular" / str(index))
+        write_tum(out / f"trajectory{n or ''}.tum", _trajectory(model, frames))
 
 
 def _trajectory(model, frames: Path):
@@ -71,5 +74,6 @@ if __name__ == "__main__":
     parser.add_argument("mode", choices=MODES)
     parser.add_argument("frames", type=Path)
     parser.add_argument("out", type=Path)
+    parser.add_argument("--matcher", choices=("sequential", "exhaustive"), default="sequential")
     arguments = parser.parse_args()
-    reconstruct(arguments.mode, arguments.frames, arguments.out)
+    reconstruct(arguments.mode, arguments.frames, arguments.out, arguments.matcher)

@@ -1,21 +1,26 @@
 """Tours: stills metres apart without a trajectory, refined with and without a search along epipolar
 lines.
 
-    python benchmarks/tours.py OUT.md TOUR [TOUR ...] [--shuffle SEED]
+    python benchmarks/tours.py OUT.md TOUR [TOUR ...] [--shuffle SEED] [--peer]
 
 TOUR: a folder with images/*.jpg, groundtruth.tum and, if a carrier is in the pictures, mask.png, as
 `render_home.py OUT -n 20` writes it. Each is refined by `gsba refine` with its defaults and with
 `pairs.max_tour_frames=0`. Maps are compared with the truth, each after alignment with scale, and
 the steps that the search confirms with the true ones. `--shuffle` permutes the names of the files
-and leaves out their times: stills in no order.
+and leaves out their times: stills in no order. `--peer` adds both spherical modes of
+`pycolmap.panorama`, which compare all pairs; they take no mask, so the carrier is painted grey.
 """
 
 import argparse
+import resource
 import shutil
+import subprocess
+import sys
 import tempfile
 import time
 from pathlib import Path
 
+import cv2
 import numpy as np
 from common import write_table
 
@@ -50,20 +55,28 @@ def shuffled(tour: Path, seed: int, out: Path) -> Path:
     return out
 
 
-def maps_of(out: Path, truth: Trajectory) -> list[tuple[np.ndarray, float]]:
-    """Frames of each map of a run, and its ATE, part of its extent."""
-    result, found = load_stage(out, "reconstruction", Reconstruction), []
-    refined = result.pose_statuses == PoseStatus.REFINED
-    labels = np.zeros(len(refined), int) if result.components is None else result.components
-    for label in np.unique(labels[refined]):
-        rows = np.flatnonzero(refined & (labels == label))
-        if len(rows) < 3:
+def errors_of(maps: list[Trajectory], truth: Trajectory) -> list[tuple[np.ndarray, float]]:
+    """Frames of maps of three frames and more, whose times are among the true ones, largest first,
+    and the maps' ATE, part of their extent."""
+    found = []
+    for one in maps:
+        if len(one.timestamps) < 3:
             continue
-        times, true = truth.timestamps[rows], truth.world_T_rigs[rows]
-        off = pose_errors(Trajectory(times, result.world_T_rigs[rows]), Trajectory(times, true))
+        rows = np.searchsorted(truth.timestamps, one.timestamps - 1e-6)
+        true = truth.world_T_rigs[rows]
+        off = pose_errors(one, Trajectory(one.timestamps, true))
         extent = np.linalg.norm(np.ptp(true[:, :3, 3], axis=0))
         found.append((rows, float(np.sqrt(np.mean(off.positions**2)) / extent)))
     return sorted(found, key=lambda one: -len(one[0]))
+
+
+def maps_of(out: Path, truth: Trajectory) -> list[Trajectory]:
+    """Poses of each map of a run."""
+    result = load_stage(out, "reconstruction", Reconstruction)
+    refined = result.pose_statuses == PoseStatus.REFINED
+    labels = np.zeros(len(refined), int) if result.components is None else result.components
+    rows = [refined & (labels == label) for label in np.unique(labels[refined])]
+    return [Trajectory(truth.timestamps[own], result.world_T_rigs[own]) for own in rows]
 
 
 def steps_of(out: Path, truth: Trajectory) -> str:
@@ -92,11 +105,41 @@ def row_of(tour: Path, settings: RefineSettings, seed: int | None) -> list[str]:
         masks = mask if mask.is_file() else "auto"
         gsba.refine(tour / "images", None, out, settings, masks=masks)
         cpu, truth = time.process_time() - began, read_trajectory(tour / "groundtruth.tum")
-        maps, steps = maps_of(out, truth), steps_of(out, truth)
-    said = [f"{rows[0]} to {rows[-1]} ({len(rows)}): {1e3 * ate:.1f}e-3" for rows, ate in maps]
-    wrong = sum(ate > MAX_RIGHT_SHARE for _, ate in maps)
-    inside = sum(len(rows) for rows, _ in maps)
-    total = f"{inside} of {len(truth.timestamps)}"
+        return cells_of(maps_of(out, truth), truth, steps_of(out, truth), cpu)
+
+
+def row_of_peer(tour: Path, mode: str, seed: int | None) -> list[str]:
+    """Cells of a tour by a mode of the peer, as of `row_of`."""
+    with tempfile.TemporaryDirectory() as folder:
+        tour = tour if seed is None else shuffled(tour, seed, Path(folder) / "shuffled")
+        frames, out = Path(folder) / "frames", Path(folder) / "peer"
+        frames.mkdir()
+        mask = cv2.imread(str(tour / "mask.png"), cv2.IMREAD_GRAYSCALE)
+        for path in sorted((tour / "images").glob("*.jpg")):
+            picture = cv2.imread(str(path))
+            if mask is not None:
+                picture[mask == 0] = 128
+            cv2.imwrite(str(frames / path.name), picture, [cv2.IMWRITE_JPEG_QUALITY, 98])
+        truth = read_trajectory(tour / "groundtruth.tum")
+        truth = Trajectory(np.arange(float(len(truth.timestamps))), truth.world_T_rigs)
+        script, began = Path(__file__).with_name("peer.py"), _cpu_of_children()
+        command = [sys.executable, str(script), mode, str(frames), str(out)]
+        subprocess.run([*command, "--matcher", "exhaustive"], capture_output=True, check=False)
+        cpu, found = _cpu_of_children() - began, sorted(out.glob("trajectory*.tum"))
+        return cells_of([read_trajectory(path) for path in found], truth, "", cpu)
+
+
+def _cpu_of_children() -> float:
+    spent = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return spent.ru_utime + spent.ru_stime
+
+
+def cells_of(maps: list[Trajectory], truth: Trajectory, steps: str, cpu: float) -> list[str]:
+    """Cells of a row: frames in maps, maps, wrong ones, steps, CPU s."""
+    found = errors_of(maps, truth)
+    said = [f"{rows[0]} to {rows[-1]} ({len(rows)}): {1e3 * ate:.1f}e-3" for rows, ate in found]
+    wrong = sum(ate > MAX_RIGHT_SHARE for _, ate in found)
+    total = f"{sum(len(rows) for rows, _ in found)} of {len(truth.timestamps)}"
     return [total, "; ".join(said) or "none", str(wrong), steps, f"{cpu:.0f}"]
 
 
@@ -105,6 +148,7 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("tours", type=Path, nargs="+")
     parser.add_argument("--shuffle", type=int, metavar="SEED")
+    parser.add_argument("--peer", action="store_true")
     options = parser.parse_args()
     lines = [
         "| tour | search | frames in maps | maps: frames, ATE of extent | wrong maps | "
@@ -115,6 +159,10 @@ def main() -> None:
         for name, most in (("no", 0), ("yes", 100)):
             settings = load_config(None, [f"pairs.max_tour_frames={most}", "export.formats=[]"])
             cells = [tour.name, name, *row_of(tour, settings, options.shuffle)]
+            lines.append(f"| {' | '.join(cells)} |")
+            print(lines[-1], flush=True)
+        for mode in ("spherical-incremental", "spherical-global") if options.peer else ():
+            cells = [tour.name, f"peer, {mode}", *row_of_peer(tour, mode, options.shuffle)]
             lines.append(f"| {' | '.join(cells)} |")
             print(lines[-1], flush=True)
     write_table(lines, options.out)
