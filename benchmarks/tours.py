@@ -116,7 +116,7 @@ def row_of_peer(tour: Path, mode: str, seed: int | None) -> list[str]:
         frames.mkdir()
         mask = cv2.imread(str(tour / "mask.png"), cv2.IMREAD_GRAYSCALE)
         for path in sorted((tour / "images").glob("*.jpg")):
-            picture = cv2.imread(str(path))
+            picture = np.asarray(cv2.imread(str(path)))
             if mask is not None:
                 picture[mask == 0] = 128
             cv2.imwrite(str(frames / path.name), picture, [cv2.IMWRITE_JPEG_QUALITY, 98])
