@@ -8,7 +8,7 @@ TOUR: a folder with images/*.jpg, groundtruth.tum and, if a carrier is in the pi
 `pairs.max_tour_frames=0`. Maps are compared with the truth, each after alignment with scale, and
 the steps that the search confirms with the true ones. `--shuffle` permutes the names of the files
 and leaves out their times: stills in no order. `--peer` adds both spherical modes of
-`pycolmap.panorama`, which compare all pairs; they take no mask, so the carrier is painted grey.
+`pycolmap.panorama`, which compare all pairs; they take no mask, so the carrier fades into grey.
 """
 
 import argparse
@@ -114,11 +114,14 @@ def row_of_peer(tour: Path, mode: str, seed: int | None) -> list[str]:
         tour = tour if seed is None else shuffled(tour, seed, Path(folder) / "shuffled")
         frames, out = Path(folder) / "frames", Path(folder) / "peer"
         frames.mkdir()
-        mask = cv2.imread(str(tour / "mask.png"), cv2.IMREAD_GRAYSCALE)
+        shown = np.ones((1, 1, 1), np.float32)
+        if (tour / "mask.png").is_file():
+            mask = np.asarray(cv2.imread(str(tour / "mask.png"), cv2.IMREAD_GRAYSCALE))
+            away = cv2.erode((mask > 0).astype(np.float32), np.ones((61, 61)))
+            shown = cv2.GaussianBlur(away, (0, 0), 15)[:, :, None]
         for path in sorted((tour / "images").glob("*.jpg")):
-            picture = np.asarray(cv2.imread(str(path)))
-            if mask is not None:
-                picture[mask == 0] = 128
+            picture = np.asarray(cv2.imread(str(path)), np.float32)
+            picture = (shown * picture + (1 - shown) * 128).astype(np.uint8)
             cv2.imwrite(str(frames / path.name), picture, [cv2.IMWRITE_JPEG_QUALITY, 98])
         truth = read_trajectory(tour / "groundtruth.tum")
         truth = Trajectory(np.arange(float(len(truth.timestamps))), truth.world_T_rigs)
