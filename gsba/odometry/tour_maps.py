@@ -82,7 +82,7 @@ def match_tour(run_frames: FrameSet, num_threads: int = 1) -> TourMatches:
 
     found = confirmed(steps, list(map_in_threads(triples, num - 2, num_threads)))
     joined = all_joined(frames, maps_of(frames, steps, *found), num_threads)
-    return _matches(frames, steps, *found, joined)
+    return matches_of(frames, steps, *found, joined)
 
 
 def ratios(before: Step, after: Step, keys: np.ndarray) -> list[float]:
@@ -291,7 +291,7 @@ def _kept(
     )
 
 
-def _matches(
+def matches_of(
     frames: Sequence[TourFrame],
     steps: Sequence[Sequence[Step]],
     chain: Sequence[int],
