@@ -7,13 +7,15 @@ TOUR: a folder with images/*.jpg, groundtruth.tum and, if a carrier is in the pi
 `render_home.py OUT -n 20` writes it. Each is refined by `gsba refine` with its defaults and with
 `pairs.max_tour_frames=0`. Maps are compared with the truth, each after alignment with scale, and
 the steps that the search confirms with the true ones. `--shuffle` permutes the names of the files
-and leaves out their times: stills in no order.
+and leaves out their times: stills in no order. Frames of such a tour are numbered in the order
+found.
 """
 
 import argparse
 import shutil
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +31,7 @@ from gsba.odometry.tour_maps import TourMatches
 from gsba.odometry.tour_steps import pose_errors_deg
 from gsba.store.store import load_stage
 from gsba.trajectory.files import read_trajectory, write_tum
-from gsba.types import PoseStatus, Reconstruction, Trajectory
+from gsba.types import FrameSet, PoseStatus, Reconstruction, Trajectory
 
 MAX_RIGHT_DEG = 1.0, 3.0  # rotation and direction of a step that is right
 MAX_RIGHT_SHARE = 0.02  # ATE of a right map, part of its extent
@@ -92,6 +94,8 @@ def row_of(tour: Path, settings: RefineSettings, seed: int | None) -> list[str]:
         masks = mask if mask.is_file() else "auto"
         gsba.refine(tour / "images", None, out, settings, masks=masks)
         cpu, truth = time.process_time() - began, read_trajectory(tour / "groundtruth.tum")
+        names = load_stage(out, "frames", FrameSet).names  # in the order that was found
+        truth = replace(truth, world_T_rigs=truth.world_T_rigs[[int(name) for name in names]])
         maps, steps = maps_of(out, truth), steps_of(out, truth)
     said = [f"{rows[0]} to {rows[-1]} ({len(rows)}): {1e3 * ate:.1f}e-3" for rows, ate in maps]
     wrong = sum(ate > MAX_RIGHT_SHARE for _, ate in maps)
