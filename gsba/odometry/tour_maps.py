@@ -68,6 +68,7 @@ class TourMatches:
     log_ratios: np.ndarray  # (F - 2,) logarithm of each step's length by that of the step before
     log_sigmas: np.ndarray  # (F - 2,) infinite = not known
     names: tuple[str, ...]  # (F,) of the frames, in the order of the way
+    order_found: bool = False  # by likeness; False = that of the frames as they were given
 
 
 def match_tour(

@@ -43,7 +43,7 @@ _MIN_END_SCORE = 6.0  # of a step beyond which there is one frame
 
 def match_stills(run_frames: FrameSet, num_threads: int = 1) -> TourMatches:
     """Confirmed steps of a tour, in the order of its frames; in another one where neighbours in the
-    order of names are hardly more alike than any frames are."""
+    order of names are hardly more alike than any frames are, unless no step is confirmed there."""
     num = len(run_frames)
     frames = list(map_in_threads(lambda f: read_frame(run_frames, f), num, num_threads))
     if run_frames.timed or num > MAX_UNORDERED:
@@ -52,7 +52,7 @@ def match_stills(run_frames: FrameSet, num_threads: int = 1) -> TourMatches:
     if in_given_order(alike_frames):
         return match_tour(frames, run_frames.names, num_threads)
     path = most_alike_path(alike_frames)
-    frames = [frames[f] for f in path]
+    given, frames = frames, [frames[f] for f in path]
     found = map_in_threads(lambda f: hypotheses(frames[f], frames[f + 1]), num - 1, num_threads)
     steps = list(track(found, STEPS_SEARCH, num - 1))
 
@@ -62,7 +62,11 @@ def match_stills(run_frames: FrameSet, num_threads: int = 1) -> TourMatches:
     every = list(map_in_threads(triples, num - 2, num_threads))
     chain, sure = confirmed(steps, every)
     sure = without_unsupported(frames, steps, chain, sure, num_threads)
-    return matches_of(frames, tuple(run_frames.names[f] for f in path), steps, chain, sure, [])
+    if not any(sure):
+        none: list[list[Step]] = [[] for _ in steps]
+        return matches_of(given, run_frames.names, none, chain, sure, [])
+    names = tuple(run_frames.names[f] for f in path)
+    return replace(matches_of(frames, names, steps, chain, sure, []), order_found=True)
 
 
 def without_unsupported(

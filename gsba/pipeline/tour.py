@@ -64,18 +64,22 @@ def _search(state: State, found: Recovered) -> TourMatches | None:
         or not _may_be_tour(run.frames, run.settings)
     ):
         return None
-    before = _num_tied(found.neighbours.matches, num)
+    compute, key = partial(match_stills, run.frames, run.num_threads), _search_key(run.frames)
+    known = run.store.stored(_SEARCH, key, TourMatches)
+    # In an order found by likeness, descriptors match what is only alike.
+    ordered = known is not None and known.order_found
+    before = 0 if ordered else _num_tied(found.neighbours.matches, num)
     if before > _MAX_TIED_SHARE * num:
         return None
-    logger.info(
-        "descriptors tie %d of %d frames in maps of 3 and more: keypoints of neighbours are "
-        "searched along epipolar lines, 8 s of processor time a step, 15 s a door "
-        "(--set pairs.max_tour_frames=0 leaves it out)",
-        before,
-        num,
-    )
-    compute = partial(match_stills, run.frames, run.num_threads)
-    tour = run.store.stage(_SEARCH, _search_key(run.frames), compute, TourMatches)
+    if known is None:
+        logger.info(
+            "descriptors tie %d of %d frames in maps of 3 and more: keypoints of neighbours are "
+            "searched along epipolar lines, 8 s of processor time a step, 15 s a door "
+            "(--set pairs.max_tour_frames=0 leaves it out)",
+            before,
+            num,
+        )
+    tour = run.store.stage(_SEARCH, key, compute, TourMatches)
     if tour.names != run.frames.names:
         raise OrderFoundError("the stills are in no order: refine them in the order found")
     run.latest.append(_SEARCH)
