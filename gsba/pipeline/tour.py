@@ -95,7 +95,10 @@ def in_known_order(store: RunStore, frames: FrameSet, settings: RefineSettings) 
     tour = store.stored(_SEARCH, _search_key(frames), TourMatches)
     if tour is None or tour.names == frames.names:
         return frames
-    logger.info("stills are in no order: refined in the one found by their likeness")
+    logger.info(
+        "the stills are in no order: they are refined in the one found by their likeness, in which "
+        "trajectory.tum has them; poses.csv names them"
+    )
     rows = np.array([frames.names.index(name) for name in tour.names])
     return replace(frames.taken(rows), timestamps=frames.timestamps)
 
