@@ -37,8 +37,8 @@ from gsba.odometry.tour_steps import Step, TourFrame, hypotheses, read_frame
 from gsba.types import FrameSet
 
 MAX_UNORDERED = 60  # most frames whose order is searched: each is compared with all
-_MIN_STEP_SCORE = 14.0  # of the places on both sides of a step, which do not hold it themselves
-_MIN_END_SCORE = 6.0  # of a step beyond which there is one frame
+_MIN_STEP_SCORE = 15.0  # of the places on both sides of a step, which do not hold it themselves
+_MIN_END_SCORE = 8.0  # of a step beyond which there is one frame
 
 
 def match_stills(run_frames: FrameSet, num_threads: int = 1) -> TourMatches:
