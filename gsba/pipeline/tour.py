@@ -88,8 +88,8 @@ def _search(state: State, found: Recovered) -> TourMatches | None:
 
 
 def in_known_order(store: RunStore, frames: FrameSet, settings: RefineSettings) -> FrameSet:
-    """Stills in the order that a search has found, where one did; their times, which only give an
-    order, are those of this one."""
+    """Stills in the order that a search has found, where one did; their times are the
+    places in it."""
     if not _may_be_tour(frames, settings):
         return frames
     tour = store.stored(_SEARCH, _search_key(frames), TourMatches)
@@ -100,7 +100,7 @@ def in_known_order(store: RunStore, frames: FrameSet, settings: RefineSettings) 
         "trajectory.tum has them; poses.csv names them"
     )
     rows = np.array([frames.names.index(name) for name in tour.names])
-    return replace(frames.taken(rows), timestamps=frames.timestamps)
+    return replace(frames.taken(rows), timestamps=np.arange(len(rows), dtype=float))
 
 
 def _search_key(frames: FrameSet) -> object:
