@@ -14,8 +14,8 @@ from factors.threads import map_in_threads
 from gsba.odometry.tour_steps import TourFrame, nearest_descriptors
 
 _MIN_COSINE, _MIN_COSINE_LEAD = 0.75, 0.05  # of matches; over look-alikes within a frame
-MIN_FRAMES = 8  # fewer are taken in the order given
-_NUM_RANDOM, _MAX_BETTER_SHARE = 1000, 0.01  # random orders; of them above one that is believed
+MIN_FRAMES = 12  # fewer are taken in the order given
+_NUM_RANDOM, _MAX_BETTER_SHARE = 1000, 0.001  # random orders; of them above one that is believed
 _MAX_MOVED = 3  # frames in a row that are moved at once to make a path better
 _MIN_GAIN = 1e-9
 
@@ -48,7 +48,7 @@ def _num_matches(one: TourFrame, other: TourFrame) -> int:
 
 
 def in_given_order(alike: np.ndarray) -> bool:
-    """True if neighbours are more alike (F, F) as given than in 99 % of random orders; of a few
+    """True if neighbours are more alike (F, F) as given than in 99.9 % of random orders; of a few
     frames that tells nothing."""
     rng, num = np.random.default_rng(0), len(alike)
     if num < MIN_FRAMES:
