@@ -7,8 +7,9 @@ TOUR: a folder with images/*.jpg, groundtruth.tum and, if a carrier is in the pi
 `render_home.py OUT -n 20` writes it. Each is refined by `gsba refine` with its defaults and with
 `pairs.max_tour_frames=0`. Maps are compared with the truth, each after alignment with scale, and
 the steps that the search confirms with the true ones. `--shuffle` permutes the names of the files
-and leaves out their times: stills in no order. `--peer` adds both spherical modes of
-`pycolmap.panorama`, which compare all pairs; they take no mask, so the carrier fades into grey.
+and leaves out their times: stills in no order, numbered in the order found. `--peer` adds both
+spherical modes of `pycolmap.panorama`, which compare all pairs; they take no mask, so the carrier
+fades into grey.
 """
 
 import argparse
@@ -18,6 +19,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -34,7 +36,7 @@ from gsba.odometry.tour_maps import TourMatches
 from gsba.odometry.tour_steps import pose_errors_deg
 from gsba.store.store import load_stage
 from gsba.trajectory.files import read_trajectory, write_tum
-from gsba.types import PoseStatus, Reconstruction, Trajectory
+from gsba.types import FrameSet, PoseStatus, Reconstruction, Trajectory
 
 MAX_RIGHT_DEG = 1.0, 3.0  # rotation and direction of a step that is right
 MAX_RIGHT_SHARE = 0.02  # ATE of a right map, part of its extent
@@ -105,6 +107,9 @@ def row_of(tour: Path, settings: RefineSettings, seed: int | None) -> list[str]:
         masks = mask if mask.is_file() else "auto"
         gsba.refine(tour / "images", None, out, settings, masks=masks)
         cpu, truth = time.process_time() - began, read_trajectory(tour / "groundtruth.tum")
+        names = load_stage(out, "frames", FrameSet).names  # in the order that was found
+        rows = [sorted(names).index(name) for name in names]
+        truth = replace(truth, world_T_rigs=truth.world_T_rigs[rows])
         return cells_of(maps_of(out, truth), truth, steps_of(out, truth), cpu)
 
 

@@ -28,9 +28,8 @@ from gsba.odometry.tour_steps import (
     alike_poses,
     found_places,
     hypotheses,
-    read_frame,
 )
-from gsba.types import Counts, FrameSet, Matches, VerifiedPairs
+from gsba.types import Counts, Matches, VerifiedPairs
 
 STEPS_SEARCH = "searching along epipolar lines"  # work that progress is told of
 _RATIO_WIDTH = 0.08  # of a ratio's logarithm, within which keypoints agree on it
@@ -68,12 +67,15 @@ class TourMatches:
     # rays of a frame
     log_ratios: np.ndarray  # (F - 2,) logarithm of each step's length by that of the step before
     log_sigmas: np.ndarray  # (F - 2,) infinite = not known
+    names: tuple[str, ...]  # (F,) of the frames, in the order of the way
+    order_found: bool = False  # by likeness; False = that of the frames as they were given
 
 
-def match_tour(run_frames: FrameSet, num_threads: int = 1) -> TourMatches:
-    """Confirmed steps of a tour whose frames are in the order of the way."""
-    num = len(run_frames)
-    frames = list(map_in_threads(lambda f: read_frame(run_frames, f), num, num_threads))
+def match_tour(
+    frames: Sequence[TourFrame], names: tuple[str, ...], num_threads: int = 1
+) -> TourMatches:
+    """Confirmed steps of a tour whose frames (F,), of these names, are in the order of the way."""
+    num = len(frames)
     found = map_in_threads(lambda f: hypotheses(frames[f], frames[f + 1]), num - 1, num_threads)
     steps = list(track(found, STEPS_SEARCH, num - 1))
 
@@ -82,7 +84,7 @@ def match_tour(run_frames: FrameSet, num_threads: int = 1) -> TourMatches:
 
     found = confirmed(steps, list(map_in_threads(triples, num - 2, num_threads)))
     joined = all_joined(frames, maps_of(frames, steps, *found), num_threads)
-    return _matches(frames, steps, *found, joined)
+    return matches_of(frames, names, steps, *found, joined)
 
 
 def ratios(before: Step, after: Step, keys: np.ndarray) -> list[float]:
@@ -291,8 +293,9 @@ def _kept(
     )
 
 
-def _matches(
+def matches_of(
     frames: Sequence[TourFrame],
+    names: tuple[str, ...],
     steps: Sequence[Sequence[Step]],
     chain: Sequence[int],
     triples: Sequence[Triple | None],
@@ -362,6 +365,7 @@ def _matches(
         ),
         logs,
         log_sigmas,
+        names,
     )
 
 

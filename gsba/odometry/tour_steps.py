@@ -115,7 +115,7 @@ def _alikeness(rays: np.ndarray, descriptors: np.ndarray) -> np.ndarray:
     return alike
 
 
-def _nearest(descriptors0: np.ndarray, descriptors1: np.ndarray) -> np.ndarray:
+def nearest_descriptors(descriptors0: np.ndarray, descriptors1: np.ndarray) -> np.ndarray:
     """Row (K0,) of the most similar one of other descriptors (K1, D) for each of some (K0, D)."""
     some = slices(len(descriptors0), _ROWS_AT_ONCE)
     return np.concatenate([(descriptors0[rows] @ descriptors1.T).argmax(axis=1) for rows in some])
@@ -269,8 +269,8 @@ def _proposals(one: TourFrame, other: TourFrame) -> list[np.ndarray]:
     """Poses f1_T_f0 by descriptors, those with most inliers first."""
     if not (len(one.rays) and len(other.rays)):
         return []
-    nearest = _nearest(one.descriptors, other.descriptors)
-    back = _nearest(other.descriptors, one.descriptors)
+    nearest = nearest_descriptors(one.descriptors, other.descriptors)
+    back = nearest_descriptors(other.descriptors, one.descriptors)
     rows = np.flatnonzero(back[nearest] == np.arange(len(nearest)))
     likes = np.sum(one.descriptors[rows] * other.descriptors[nearest[rows]], axis=1)
     rows = rows[likes > 0.75]

@@ -1,10 +1,10 @@
 """A run from frames and a coarse trajectory to refined poses, a cloud and datasets."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from threadpoolctl import threadpool_limits
 
@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from distributed import Client
 
 logger = logging.getLogger(__name__)
+T = TypeVar("T")
 
 _CHAIN_GATES = 60.0, 8.0  # gates in standard deviations, from the coarse trajectory
 
@@ -173,13 +174,25 @@ def refine_from(
         frames = start.frames
         whole = densify.fetch_where_weak(store, source, walk, frames, settings, measure)
         start = start if whole is frames else Start.of(whole, given, settings)
-    state, result = _solve_or_turn(_begin(store, settings, chosen, start), walk is not None)
+    state, result = _in_order(
+        lambda: _begin(store, settings, chosen, start),
+        lambda run: _solve_or_turn(run, walk is not None),
+    )
     lenses = camera.keep_lenses(state, result)
     finished_run.keep(state)
     written = outputs.write(state, result, lenses)
     if walk is not None:
         add_odometry(written.out / "report.html", walk)
     return written
+
+
+def _in_order(begin: Callable[[], Run], solution: Callable[[Run], T]) -> T:
+    """A run's solution; of stills in no order that of another run, which begins in the order that
+    the first one has found."""
+    try:
+        return solution(begin())
+    except tour.OrderFoundError:
+        return solution(begin())
 
 
 def _solve_or_turn(run: Run, followed: bool) -> tuple[State, Reconstruction]:
@@ -209,6 +222,7 @@ def _begin(store: RunStore, settings: RefineSettings, chosen: merging.Choice, st
     given = not (start.coarse.absent or by_odometry)
     tell_size(settings, start.frames, width, given)
     journal, frames = Journal(), merging.before(store, start.frames, chosen)
+    frames = tour.in_known_order(store, frames, settings)
     if chosen.distractors:
         frames = _without_distractors(store, settings, replace(start, frames=frames), journal)
     return Run.begin(store, frames, start.coarse, settings, start.evidence, journal)
@@ -220,11 +234,16 @@ def _without_distractors(
     """Mask what a first, plainer solution does not explain."""
     # Drift over the whole path does not show in what frames near one another do not explain.
     near = tuple(family for family in start.evidence.families if not family.limits_drift)
-    frames, evidence = start.frames, replace(start.evidence, imu=None, families=near)
-    direct.check(frames, settings)  # before the first solution, not after
+    evidence, plainer = replace(start.evidence, imu=None, families=near), settings.plainer()
+    direct.check(start.frames, settings)  # before the first solution, not after
+
+    def begin() -> Run:
+        frames = tour.in_known_order(store, start.frames, plainer)
+        return Run.begin(store, frames, start.coarse, plainer, evidence)
+
     with store.named("first"):
-        run = Run.begin(store, frames, start.coarse, settings.plainer(), evidence)
-        state = solve(frontend.extract(run))
+        run, state = _in_order(begin, lambda run: (run, solve(frontend.extract(run))))
+    frames = run.frames
     if state.prior.turning_only:
         return frames
     first = f"first-{run.latest[0]}"

@@ -3,30 +3,37 @@ searched along epipolar lines (`gsba.odometry.tour_maps`)."""
 
 import logging
 import shutil
-from dataclasses import fields, replace
+from dataclasses import asdict, fields, replace
 from functools import partial
 
 import numpy as np
 
 from gsba.camera.rig import CubeRig, owner_faces
+from gsba.config import RefineSettings
 from gsba.frames import cubemap
+from gsba.log import GsbaError
 from gsba.loop_closure import connectivity
 from gsba.matching.recovery import Recovered
-from gsba.odometry.tour_maps import TourMatches, match_tour
+from gsba.odometry.tour_maps import TourMatches
+from gsba.odometry.tour_unordered import match_stills
 from gsba.pipeline import frontend
-from gsba.pipeline.run import Run
 from gsba.pipeline.state import ObservedFrames, State
 from gsba.store.folder import STAGES
+from gsba.store.store import RunStore, fingerprint
 from gsba.trajectory import judgement
 from gsba.trajectory.limits import TwoViewLimits
 from gsba.trajectory.steps import image_steps
-from gsba.types import Features, Matches
+from gsba.types import Features, FrameSet, Matches
 
 logger = logging.getLogger(__name__)
 
 _MAX_TIED_SHARE = 0.8  # of frames in maps of descriptors, below which places are searched
 _MIN_INTERVAL_S = 1.5  # between stills metres apart; frames of a video can be had closer together
-_STAGE = "features_tour"
+_SEARCH, _STAGE = "tour", "features_tour"
+
+
+class OrderFoundError(GsbaError):
+    """Stills are in no order, and one was found: the run has to begin again in it."""
 
 
 def match_places(state: State, found: Recovered) -> State | None:
@@ -51,27 +58,62 @@ def match_places(state: State, found: Recovered) -> State | None:
 def _search(state: State, found: Recovered) -> TourMatches | None:
     """Steps of a tour by searched places; None where these are not needed, or tie no more."""
     run, num = state.run, len(state.run.frames)
-    if not state.prior.absent or found.trust.turning_only or not _may_be_tour(run):
+    if (
+        not state.prior.absent
+        or found.trust.turning_only
+        or not _may_be_tour(run.frames, run.settings)
+    ):
         return None
-    before = _num_tied(found.neighbours.matches, num)
+    compute, key = partial(match_stills, run.frames, run.num_threads), _search_key(run.frames)
+    known = run.store.stored(_SEARCH, key, TourMatches)
+    # In an order found by likeness, descriptors match what is only alike.
+    ordered = known is not None and known.order_found
+    before = 0 if ordered else _num_tied(found.neighbours.matches, num)
     if before > _MAX_TIED_SHARE * num:
         return None
-    logger.info(
-        "descriptors tie %d of %d frames in maps of 3 and more: keypoints of neighbours are "
-        "searched along epipolar lines, 8 s of processor time a step, 15 s a door "
-        "(--set pairs.max_tour_frames=0 leaves it out)",
-        before,
-        num,
-    )
-    compute = partial(match_tour, run.frames, run.num_threads)
-    tour = run.stage("tour", None, compute, TourMatches)
+    if known is None:
+        logger.info(
+            "descriptors tie %d of %d frames in maps of 3 and more: keypoints of neighbours are "
+            "searched along epipolar lines, 8 s of processor time a step, 15 s a door "
+            "(--set pairs.max_tour_frames=0 leaves it out)",
+            before,
+            num,
+        )
+    tour = run.store.stage(_SEARCH, key, compute, TourMatches)
+    if tour.names != run.frames.names:
+        raise OrderFoundError("the stills are in no order: refine them in the order found")
+    run.latest.append(_SEARCH)
+    run.journal.note(_SEARCH, tour)
     return tour if _num_tied(tour.near.matches, num) > before else None
 
 
-def _may_be_tour(run: Run) -> bool:
+def in_known_order(store: RunStore, frames: FrameSet, settings: RefineSettings) -> FrameSet:
+    """Stills in the order that a search has found, where one did; their times are the
+    places in it."""
+    if not _may_be_tour(frames, settings):
+        return frames
+    tour = store.stored(_SEARCH, _search_key(frames), TourMatches)
+    if tour is None or tour.names == frames.names:
+        return frames
+    logger.info(
+        "the stills are in no order: they are refined in the one found by their likeness, in which "
+        "trajectory.tum has them; poses.csv names them"
+    )
+    rows = np.array([frames.names.index(name) for name in tour.names])
+    return replace(frames.taken(rows), timestamps=np.arange(len(rows), dtype=float))
+
+
+def _search_key(frames: FrameSet) -> object:
+    """Pictures and masks that are searched, whatever their order is, unless times give it."""
+    files = zip(frames.names, frames.paths, frames.mask_paths, strict=True)
+    each = [(name, fingerprint(paths), fingerprint([mask])) for name, paths, mask in files]
+    times = frames.timestamps.tolist() if frames.timed else []
+    return sorted(each), times, [asdict(kind) for kind in frames.formats]
+
+
+def _may_be_tour(frames: FrameSet, settings: RefineSettings) -> bool:
     """True for few frames that no video has taken."""
-    frames, num = run.frames, len(run.frames)
-    if not 3 <= num <= run.settings.pairs.max_tour_frames:
+    if not 3 <= len(frames) <= settings.pairs.max_tour_frames:
         return False
     return not frames.timed or bool(np.median(np.diff(frames.timestamps)) >= _MIN_INTERVAL_S)
 

@@ -102,7 +102,8 @@ def _owner(name: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class FrameSet:
-    """The captured frames on disk, in time order, without pixels.
+    """The captured frames on disk, without pixels: in time order, or in that in which stills are
+    most alike.
 
     Raises:
         ValueError: a name that cannot be a file name; exported files carry them.
@@ -176,8 +177,8 @@ class FrameSet:
         return replace(self, formats=tuple(formats))
 
     def taken(self, rows: np.ndarray, absolute: bool = False) -> "FrameSet":
-        """Frames `rows` (F',), ascending, and their cameras; `absolute` paths serve processes in
-        other folders."""
+        """Frames `rows` (F',), in this order, and their cameras; `absolute` paths serve processes
+        in other folders."""
         paths = tuple(self.paths[f] for f in rows)
         mask_paths = tuple(self.mask_paths[f] for f in rows)
         if absolute:

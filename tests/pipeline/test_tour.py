@@ -13,7 +13,7 @@ from gsba.config import FeatureSettings
 from gsba.evaluate.trajectory import pose_errors
 from gsba.features.detection import TRAITS
 from gsba.geometry import unit
-from gsba.odometry import tour_steps
+from gsba.odometry import tour_order, tour_steps
 from gsba.pipeline.tour import rows_of_added, with_keypoints
 from gsba.trajectory.files import read_trajectory
 from gsba.types import Features, Trajectory
@@ -92,3 +92,27 @@ def test_added_keypoints_follow_the_others_of_their_face() -> None:
         added[owner_faces(added) == 0],
         atol=1e-12,
     )
+
+
+def test_stills_in_no_order_are_refined_in_the_one_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tour_steps, "_FEATURES", FeatureSettings(max_per_face=150))
+    monkeypatch.setattr(tour_steps, "_NUM_KEYS", 400)
+    monkeypatch.setattr(tour_order, "MIN_FRAMES", 4)
+    monkeypatch.setitem(TRAITS, "sift", replace(TRAITS["sift"], min_similarity=0.9999))
+    frames, way = tmp_path / "stills", [2, 0, 3, 1]
+    frames.mkdir()
+    for n, still in enumerate(way):
+        cv2.imwrite(str(frames / f"{n}.png"), pictures()[still])
+    settings = settings_with(**WITHOUT_PATCHES, export={"formats": ()})
+    result = refine(frames, None, tmp_path / "run", settings, masks="none")
+    stills = [way[int(name)] for name in result.frames.names]
+    assert stills in ([0, 1, 2, 3], [3, 2, 1, 0])
+    found = read_trajectory(result.out / "trajectory.tum")
+    off = pose_errors(found, Trajectory(found.timestamps, true_poses()[stills]))
+    assert off.positions.max() < 0.01 and np.rad2deg(off.rotations.max()) < 0.1
+    again = refine(frames, None, tmp_path / "run", settings, masks="none")
+    assert again.frames.names == result.frames.names
+    resumed = {stage["name"]: stage["resumed"] for stage in again.report["stages"]}
+    assert resumed["tour"] and resumed["reconstruction"]

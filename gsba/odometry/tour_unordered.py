@@ -1,0 +1,135 @@
+"""Steps of a tour whose stills are in no order.
+
+The path of most likeness proposes steps, which three frames confirm as in a tour in order. Among
+frames in no order chance confirms more, so that places on both sides must confirm a step without
+the points that it triangulates itself. Maps are not joined: any two might meet, and like pictures
+in two rooms join them as clearly as a door does.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+
+from factors.threads import map_in_threads
+from gsba.log import track
+from gsba.odometry.tour_joins import (
+    NEAR,
+    Join,
+    Joining,
+    TourMap,
+    alike,
+    scaled,
+)
+from gsba.odometry.tour_maps import (
+    STEPS_SEARCH,
+    TourMatches,
+    Triple,
+    confirmed,
+    maps_of,
+    match_tour,
+    matches_of,
+    triples_of,
+)
+from gsba.odometry.tour_order import in_given_order, likeness, most_alike_path
+from gsba.odometry.tour_steps import Step, TourFrame, hypotheses, read_frame
+from gsba.types import FrameSet
+
+MAX_UNORDERED = 60  # most frames whose order is searched: each is compared with all
+_MIN_STEP_SCORE = 15.0  # of the places on both sides of a step, which do not hold it themselves
+_MIN_END_SCORE = 8.0  # of a step beyond which there is one frame
+
+
+def match_stills(run_frames: FrameSet, num_threads: int = 1) -> TourMatches:
+    """Confirmed steps of a tour, in the order of its frames; in another one where neighbours in the
+    order of names are hardly more alike than any frames are, unless no step is confirmed there."""
+    num = len(run_frames)
+    frames = list(map_in_threads(lambda f: read_frame(run_frames, f), num, num_threads))
+    if run_frames.timed or num > MAX_UNORDERED:
+        return match_tour(frames, run_frames.names, num_threads)
+    alike_frames = likeness(frames, num_threads)
+    if in_given_order(alike_frames):
+        return match_tour(frames, run_frames.names, num_threads)
+    path = most_alike_path(alike_frames)
+    given, frames = frames, [frames[f] for f in path]
+    found = map_in_threads(lambda f: hypotheses(frames[f], frames[f + 1]), num - 1, num_threads)
+    steps = list(track(found, STEPS_SEARCH, num - 1))
+
+    def triples(f: int) -> dict[tuple[int, int], list[Triple]]:
+        return triples_of(frames[f], frames[f + 1], frames[f + 2], steps[f], steps[f + 1])
+
+    every = list(map_in_threads(triples, num - 2, num_threads))
+    chain, sure = confirmed(steps, every)
+    sure = without_unsupported(frames, steps, chain, sure, num_threads)
+    if not any(sure):
+        none: list[list[Step]] = [[] for _ in steps]
+        return matches_of(given, run_frames.names, none, chain, sure, [])
+    names = tuple(run_frames.names[f] for f in path)
+    return replace(matches_of(frames, names, steps, chain, sure, []), order_found=True)
+
+
+def without_unsupported(
+    frames: Sequence[TourFrame],
+    steps: Sequence[Sequence[Step]],
+    chain: Sequence[int],
+    triples: Sequence[Triple | None],
+    num_threads: int,
+) -> list[Triple | None]:
+    """Triples (F - 2,) without those of steps that places do not confirm which frames on either
+    side have triangulated without the step."""
+    maps = [some for some in maps_of(frames, steps, chain, triples) if not some.single]
+    cuts = [(some, f) for some in maps for f in range(some.first, some.last)]
+
+    def supported(n: int) -> bool:
+        some, f = cuts[n]
+        ends = some.first == f or some.last == f + 1
+        score = _score_without(frames, steps, chain, triples, some, f)
+        return score >= (_MIN_END_SCORE if ends else _MIN_STEP_SCORE)
+
+    left = list(triples)
+    for (_, f), good in zip(cuts, map_in_threads(supported, len(cuts), num_threads), strict=True):
+        if not good:
+            left[max(f - 1, 0) : f + 1] = [None] * (min(f, 1) + (f < len(left)))
+    return left
+
+
+def _score_without(
+    frames: Sequence[TourFrame],
+    steps: Sequence[Sequence[Step]],
+    chain: Sequence[int],
+    triples: Sequence[Triple | None],
+    whole: TourMap,
+    f: int,
+) -> float:
+    """Score of the join of both parts of a map, its frames up to f and those after, that this map
+    makes of it; without the pair of frames beside the step."""
+
+    def part(first: int, last: int) -> TourMap:
+        rows = slice(first, last)
+        between = triples[first : max(last - 1, first)]
+        some = maps_of(frames[first : last + 1], steps[rows], chain[rows], between)
+        if len(some) > 1:  # a single step, which no triple holds by itself
+            step = steps[first][chain[first]]
+            poses = np.stack([np.eye(4), step.f1_T_f0])
+            return TourMap(first, poses, [step.depths0, step.depths1])
+        return replace(some[0], first=first)
+
+    def length(g: int) -> float:
+        return float(np.linalg.norm(whole.between(g, g + 1)[:3, 3]))
+
+    one, other = part(whole.first, f), part(f + 1, whole.last)
+    after = length(f + 1) if not other.single else 1.0
+    before = length(whole.first) if not one.single else after
+    after = before if other.single else after
+    at = Join(scaled(whole.between(f, f + 1), 1 / before), float(np.log(after / before)), 0.0, [])
+    pairs = list(
+        product(
+            range(max(f - NEAR + 1, whole.first), f + 1),
+            range(f + 1, min(f + NEAR, whole.last) + 1),
+        )
+    )
+    fitted = Joining(frames, one, other).fitted(
+        at, [p for p in pairs if p != (f, f + 1)], 0.35, 0.8
+    )
+    return fitted.score if alike(at, fitted) else 0.0
