@@ -112,6 +112,15 @@ class PatchSet:
         residual variances (N,) in their grey values."""
         return self.templates.inverses[:, :2, :2][rows] * np.asarray(variances)[:, None, None]
 
+    def affine_informations(self) -> tuple[np.ndarray, np.ndarray]:
+        """Information (T, 4, 4) on each template's affine part, by columns, with its prior and
+        without it, for noise of one grey value; zero where a template is not usable."""
+        usable = self.templates.states == ALIGNED
+        posteriors = np.zeros((len(usable), 4, 4))
+        posteriors[usable] = np.linalg.inv(self.templates.inverses[usable, 2:6, 2:6].astype(float))
+        prior = np.where(usable, self.templates.prior, 0.0)[:, None, None] * np.eye(4)
+        return posteriors, posteriors - prior
+
 
 def _usable(mask: np.ndarray | None) -> np.ndarray:
     """A mask as the kernels are compiled for: one that cannot be written to is copied."""

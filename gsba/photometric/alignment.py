@@ -177,7 +177,8 @@ def _align_some(
     at_hosts = Observed(used, hosts[used], planes.origins[used], covariances)
     at_hosts = at_hosts.enlarged(enlarged[at_hosts.frames])
     shown = found.bearings_rig, rays[kept]
-    normals_world = _normals_world(sightings, kept, *shown, planes, world_T_rigs[hosts], threads)
+    seen = patches, sightings, kept, *shown
+    normals_world = _normals_world(*seen, planes, world_T_rigs[hosts], threads)
     return found, at_hosts, normals_world
 
 
@@ -289,6 +290,7 @@ def accepted_rows(
 
 
 def _normals_world(
+    patches: PatchSet,
     sightings: Sightings,
     kept: np.ndarray,
     bearings: np.ndarray,
@@ -298,15 +300,20 @@ def _normals_world(
     num_threads: int,
 ) -> np.ndarray:
     """Normals (J, 3) of surfaces by alignments of `kept` (N,) sightings, zero = unknown."""
+    posteriors, informations = patches.affine_informations()
 
-    def depths(some: slice) -> tuple[np.ndarray, ...]:
-        seen = sightings.spreads[kept[some]], sightings.warps[kept[some]]
-        return shown_depths(*seen, bearings[some], rays[some])
+    def shown(some: slice) -> tuple[np.ndarray, ...]:
+        rows = kept[some]
+        templates = sightings.templates[rows]
+        found = sightings.warps[rows], sightings.variances[rows]
+        known = posteriors[templates], informations[templates]
+        shifts = depth_shifts(sightings.spreads[rows], bearings[some], rays[some])
+        return shown_slopes(shifts, *found, *known)
 
     some = slices(len(kept), _SIGHTINGS_AT_ONCE)
-    shifts, products = rows_in_threads(depths, some, num_threads)
+    weights, pulls = rows_in_threads(shown, some, num_threads)
     laid = planes.slopes, planes.origins, planes.spreads
-    normals = surface_normals(sightings.templates[kept], shifts, products, *laid)
+    normals = surface_normals(sightings.templates[kept], weights, pulls, *laid)
     return np.einsum("jab,jb->ja", world_T_hosts[:, :3, :3], normals)
 
 
@@ -348,7 +355,7 @@ def _former_observations(
         release_mapped_files()
 
 
-_AFFINE_SIGMA = 0.07  # noise of an alignment's affine part
+_AFFINE_SIGMA = 0.03  # of an alignment's affine part, by surfaces that are no planes
 _MAX_TILT_TANGENT = 3.0  # tangent of a tilt beyond which a patch covers too little of its surface
 
 
@@ -366,14 +373,12 @@ def slopes_of(normals_rig: np.ndarray, origins: np.ndarray, spreads: np.ndarray)
     return np.where(known[:, None], slopes, 0.0)
 
 
-def shown_depths(
-    spreads: np.ndarray, warps: np.ndarray, bearings: np.ndarray, rays: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def depth_shifts(spreads: np.ndarray, bearings: np.ndarray, rays: np.ndarray) -> np.ndarray:
     """Shifts (N, 2) in template steps by which relative depth along the host's ray appears in each
-    aligned sighting, and their products (N, 2) with the affine part.
+    aligned sighting.
 
     Args:
-        spreads (N, 3, 2), warps (N, 6): of the sightings, see `factors.patches.Sightings`.
+        spreads: (N, 3, 2) of the sightings, see `factors.patches.Sightings`.
         bearings: (N, 3) where they were found, rig frame of the observing frame.
         rays: (N, 3) from the host to the template's point, in the observing frame, in units of its
             distance there.
@@ -381,15 +386,40 @@ def shown_depths(
     axes = tangent_basis(bearings)
     (a, b), (c, d) = np.moveaxis(axes @ spreads, 0, 2)
     x, y = np.moveaxis(axes @ rays[:, :, None], 0, 2)[:, 0]
-    shifts = np.stack([d * x - b * y, a * y - c * x], axis=1) / (a * d - b * c)[:, None]
-    affine = np.swapaxes(warps[:, 2:].reshape(-1, 2, 2), 1, 2)
-    return shifts, np.einsum("oij,oi->oj", affine, shifts)
+    return np.stack([d * x - b * y, a * y - c * x], axis=1) / (a * d - b * c)[:, None]
+
+
+def shown_slopes(
+    shifts: np.ndarray,
+    warps: np.ndarray,
+    variances: np.ndarray,
+    posteriors: np.ndarray,
+    informations: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """What sightings tell of their surfaces' slopes beyond those they were projected with:
+    information (N, 2, 2), and its product with the slopes (N, 2), relative depth a template step.
+
+    A slope (k_x, k_y) adds the affine part shift (k_x, k_y). Estimates of affine parts are drawn to
+    zero by their prior; information with it times the estimate is information without it times the
+    estimate that texture alone would give.
+
+    Args:
+        shifts: (N, 2), see `depth_shifts`.
+        warps (N, 6), variances (N,): of the sightings, see `factors.patches.Sightings`.
+        posteriors, informations: (N, 4, 4), see `PatchSet.affine_informations`.
+    """
+    noise = variances[:, None, None] * np.eye(4) + _AFFINE_SIGMA**2 * informations
+    known = np.concatenate([informations, posteriors @ warps[:, 2:, None]], axis=2)
+    weighted = np.linalg.solve(noise, known)
+    blocks = weighted[:, :, :4].reshape(-1, 2, 2, 2, 2)
+    weights = np.einsum("oi,oaibj,oj->oab", shifts, blocks, shifts)
+    return weights, np.einsum("oi,oai->oa", shifts, weighted[:, :, 4].reshape(-1, 2, 2))
 
 
 def surface_normals(
     templates: np.ndarray,
-    shifts: np.ndarray,
-    products: np.ndarray,
+    weights: np.ndarray,
+    pulls: np.ndarray,
     slopes: np.ndarray,
     origins: np.ndarray,
     spreads: np.ndarray,
@@ -399,15 +429,19 @@ def surface_normals(
 
     Args:
         templates: (N,) template of each accepted sighting.
-        shifts (N, 2), products (N, 2): see `shown_depths`.
+        weights (N, 2, 2), pulls (N, 2): see `shown_slopes`.
         slopes (J, 2), origins (J, 3), spreads (J, 3, 2): by which patches were projected, and
             the patches in their hosts, before slopes.
     """
     num = len(slopes)
-    pulls = np.stack([np.bincount(templates, column, num) for column in products.T], axis=1)
-    weights = np.bincount(templates, np.einsum("oi,oi->o", shifts, shifts), num)
+    pull = np.stack([np.bincount(templates, column, num) for column in pulls.T], axis=1)
+    columns = weights.reshape(-1, 4).T
+    weight = np.stack([np.bincount(templates, column, num) for column in columns], axis=1)
+    weight = weight.reshape(-1, 2, 2)
     sizes = np.linalg.norm(spreads[:, :, 0], axis=1)
-    prior = (_AFFINE_SIGMA / (SLOPE_SIGMA * np.maximum(sizes, 1e-300))) ** 2
-    found = slopes + (pulls - prior[:, None] * slopes) / (weights + prior)[:, None]
+    prior = 1 / (SLOPE_SIGMA * np.maximum(sizes, 1e-300)) ** 2
+    determined = np.trace(weight, axis1=1, axis2=2) > 2 * prior
+    weight += prior[:, None, None] * np.eye(2)
+    found = slopes + np.linalg.solve(weight, (pull - prior[:, None] * slopes)[:, :, None])[:, :, 0]
     gradients = np.einsum("jic,jc->ji", spreads, found) / sizes[:, None] ** 2
-    return np.where((weights > prior)[:, None], origins - gradients, 0.0)
+    return np.where(determined[:, None], origins - gradients, 0.0)

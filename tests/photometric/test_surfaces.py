@@ -6,7 +6,12 @@ from scipy.spatial.transform import Rotation
 
 from factors import tangent_basis
 from factors.patches import Sightings, expect
-from gsba.photometric.alignment import shown_depths, slopes_of, surface_normals
+from gsba.photometric.alignment import (
+    depth_shifts,
+    shown_slopes,
+    slopes_of,
+    surface_normals,
+)
 
 STEP = 2 * np.pi / 1536
 POINT = np.array([0.4, -0.3, 2.0])  # seen from the host at the origin
@@ -14,6 +19,8 @@ DEPTH = np.linalg.norm(POINT)
 ORIGIN = POINT / DEPTH
 SPREAD = STEP * tangent_basis(ORIGIN[None])[0].T
 VIEWS = [[0.5, 0.1, 0.2], [-0.4, 0.3, -0.3], [0.1, -0.6, 0.4]]
+TEXTURE = np.random.default_rng(3).normal(size=(4, 4)) + 3 * np.eye(4)
+INFORMATION = 50 * TEXTURE @ TEXTURE.T  # on affine parts, as an uneven texture gives it
 
 
 def _surface(tilt_deg: float, turn_deg: float) -> np.ndarray:
@@ -41,21 +48,28 @@ def _affine(normal: np.ndarray, slopes: np.ndarray, R: np.ndarray, centre: np.nd
     return np.column_stack(columns) - np.eye(2), origin, axes, R.T @ POINT / distance
 
 
-def _normal(surface: np.ndarray, slopes: np.ndarray) -> np.ndarray:
-    """The normal that three views of a surface show, carried with these slopes."""
+def _normal(surface: np.ndarray, slopes: np.ndarray, prior: float = 0.0) -> np.ndarray:
+    """The normal that three views of a surface show, carried with these slopes; affine parts are
+    drawn to zero by a prior of this information."""
     turns = Rotation.from_rotvec([[0.1, 0.2, 0], [0, -0.3, 0.1], [0.2, 0, 0]]).as_matrix()
     given = zip(turns, np.array(VIEWS), strict=True)
     parts = [_affine(surface, slopes, R, centre) for R, centre in given]
     origins, axes, rays = (np.array([part[i] for part in parts]) for i in (1, 2, 3))
     sightings = expect(np.zeros(3, np.int64), origins, axes)
+    posterior = INFORMATION + prior * np.eye(4)
     for warp, part in zip(sightings.warps, parts, strict=True):
-        warp[2:] = part[0].T.ravel()
-    return _from_sightings(sightings, rays, slopes)
+        warp[2:] = np.linalg.solve(posterior, INFORMATION @ part[0].T.ravel())
+    return _from_sightings(sightings, rays, slopes, posterior)
 
 
-def _from_sightings(sightings: Sightings, rays: np.ndarray, slopes: np.ndarray) -> np.ndarray:
+def _from_sightings(
+    sightings: Sightings, rays: np.ndarray, slopes: np.ndarray, posterior: np.ndarray
+) -> np.ndarray:
     """The normal from sightings of one template, none of them shifted."""
-    shown = shown_depths(sightings.spreads, sightings.warps, sightings.origins, rays)
+    sightings.variances[:] = 1e-2
+    shifts = depth_shifts(sightings.spreads, sightings.origins, rays)
+    known = (np.tile(one, (len(shifts), 1, 1)) for one in (posterior, INFORMATION))
+    shown = shown_slopes(shifts, sightings.warps, sightings.variances, *known)
     own = slopes[None], ORIGIN[None], SPREAD[None]
     return surface_normals(sightings.templates, *shown, *own)[0]
 
@@ -70,6 +84,11 @@ def test_affine_parts_tell_how_a_surface_lies(tilt: float, turn: float) -> None:
     slopes = slopes_of(found[None], ORIGIN[None], SPREAD[None])[0]
     again = _normal(surface, slopes)  # where it lies already, it stays
     assert again @ surface / np.linalg.norm(again) == pytest.approx(1, abs=2e-3)
+
+
+def test_the_prior_of_affine_parts_does_not_draw_surfaces() -> None:
+    surface, slopes = _surface(45, 130), np.zeros(2)
+    np.testing.assert_allclose(_normal(surface, slopes, prior=400.0), _normal(surface, slopes))
 
 
 def test_slopes_are_those_of_the_surface() -> None:
@@ -95,4 +114,4 @@ def test_a_point_without_parallax_tells_nothing() -> None:
     affine, origin, axes, ray = _affine(_surface(50, 0), np.zeros(2), np.eye(3), 0.3 * ORIGIN)
     sightings = expect(np.zeros(1, np.int64), origin[None], axes[None])
     sightings.warps[0, 2:] = affine.T.ravel()
-    assert not _from_sightings(sightings, ray[None], np.zeros(2)).any()
+    assert not _from_sightings(sightings, ray[None], np.zeros(2), INFORMATION).any()
