@@ -408,7 +408,8 @@ def shown_slopes(
         warps (N, 6), variances (N,): of the sightings, see `factors.patches.Sightings`.
         posteriors, informations: (N, 4, 4), see `PatchSet.affine_informations`.
     """
-    noise = variances[:, None, None] * np.eye(4) + _AFFINE_SIGMA**2 * informations
+    rounding = 1 / 12  # variance of grey values that are whole numbers
+    noise = (variances + rounding)[:, None, None] * np.eye(4) + _AFFINE_SIGMA**2 * informations
     known = np.concatenate([informations, posteriors @ warps[:, 2:, None]], axis=2)
     weighted = np.linalg.solve(noise, known)
     blocks = weighted[:, :, :4].reshape(-1, 2, 2, 2, 2)
