@@ -105,8 +105,12 @@ def row_of(tour: Path, settings: RefineSettings, seed: int | None) -> list[str]:
         tour = tour if seed is None else shuffled(tour, seed, Path(folder) / "shuffled")
         mask = tour / "mask.png"
         masks = mask if mask.is_file() else "auto"
-        gsba.refine(tour / "images", None, out, settings, masks=masks)
-        cpu, truth = time.process_time() - began, read_trajectory(tour / "groundtruth.tum")
+        truth = read_trajectory(tour / "groundtruth.tum")
+        try:
+            gsba.refine(tour / "images", None, out, settings, masks=masks)
+        except GsbaError:
+            return cells_of([], truth, "refused", time.process_time() - began)
+        cpu = time.process_time() - began
         names = load_stage(out, "frames", FrameSet).names  # in the order that was found
         rows = [sorted(names).index(name) for name in names]
         truth = replace(truth, world_T_rigs=truth.world_T_rigs[rows])
