@@ -442,7 +442,7 @@ def surface_normals(
     sizes = np.linalg.norm(spreads[:, :, 0], axis=1)
     prior = 1 / (SLOPE_SIGMA * np.maximum(sizes, 1e-300)) ** 2
     determined = np.trace(weight, axis1=1, axis2=2) > 2 * prior
-    weight += prior[:, None, None] * np.eye(2)
+    weight = weight + prior[:, None, None] * np.eye(2)
     found = slopes + np.linalg.solve(weight, (pull - prior[:, None] * slopes)[:, :, None])[:, :, 0]
     gradients = np.einsum("jic,jc->ji", spreads, found) / sizes[:, None] ** 2
     return np.where(determined[:, None], origins - gradients, 0.0)
