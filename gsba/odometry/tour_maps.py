@@ -75,6 +75,16 @@ def match_tour(
     frames: Sequence[TourFrame], names: tuple[str, ...], num_threads: int = 1
 ) -> TourMatches:
     """Confirmed steps of a tour whose frames (F,), of these names, are in the order of the way."""
+    found = searched(frames, num_threads)
+    joined = all_joined(frames, maps_of(frames, *found), num_threads)
+    return matches_of(frames, names, *found, joined)
+
+
+def searched(
+    frames: Sequence[TourFrame], num_threads: int
+) -> tuple[list[list[Step]], list[int], list[Triple | None]]:
+    """Hypotheses of the steps between frames (F,), and those that three frames confirm, see
+    `confirmed`."""
     num = len(frames)
     found = map_in_threads(lambda f: hypotheses(frames[f], frames[f + 1]), num - 1, num_threads)
     steps = list(track(found, STEPS_SEARCH, num - 1))
@@ -82,9 +92,7 @@ def match_tour(
     def triples(f: int) -> dict[tuple[int, int], list[Triple]]:
         return triples_of(frames[f], frames[f + 1], frames[f + 2], steps[f], steps[f + 1])
 
-    found = confirmed(steps, list(map_in_threads(triples, num - 2, num_threads)))
-    joined = all_joined(frames, maps_of(frames, steps, *found), num_threads)
-    return matches_of(frames, names, steps, *found, joined)
+    return steps, *confirmed(steps, list(map_in_threads(triples, num - 2, num_threads)))
 
 
 def ratios(before: Step, after: Step, keys: np.ndarray) -> list[float]:

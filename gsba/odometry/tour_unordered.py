@@ -13,7 +13,6 @@ from itertools import product
 import numpy as np
 
 from factors.threads import map_in_threads
-from gsba.log import track
 from gsba.odometry.tour_joins import (
     NEAR,
     Join,
@@ -23,17 +22,15 @@ from gsba.odometry.tour_joins import (
     scaled,
 )
 from gsba.odometry.tour_maps import (
-    STEPS_SEARCH,
     TourMatches,
     Triple,
-    confirmed,
     maps_of,
     match_tour,
     matches_of,
-    triples_of,
+    searched,
 )
 from gsba.odometry.tour_order import in_given_order, likeness, most_alike_path
-from gsba.odometry.tour_steps import Step, TourFrame, hypotheses, read_frame
+from gsba.odometry.tour_steps import Step, TourFrame, read_frame
 from gsba.types import FrameSet
 
 MAX_UNORDERED = 60  # most frames whose order is searched: each is compared with all
@@ -53,14 +50,7 @@ def match_stills(run_frames: FrameSet, num_threads: int = 1) -> TourMatches:
         return match_tour(frames, run_frames.names, num_threads)
     path = most_alike_path(alike_frames)
     given, frames = frames, [frames[f] for f in path]
-    found = map_in_threads(lambda f: hypotheses(frames[f], frames[f + 1]), num - 1, num_threads)
-    steps = list(track(found, STEPS_SEARCH, num - 1))
-
-    def triples(f: int) -> dict[tuple[int, int], list[Triple]]:
-        return triples_of(frames[f], frames[f + 1], frames[f + 2], steps[f], steps[f + 1])
-
-    every = list(map_in_threads(triples, num - 2, num_threads))
-    chain, sure = confirmed(steps, every)
+    steps, chain, sure = searched(frames, num_threads)
     sure = without_unsupported(frames, steps, chain, sure, num_threads)
     if not any(sure):
         none: list[list[Step]] = [[] for _ in steps]

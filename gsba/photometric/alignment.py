@@ -396,8 +396,8 @@ def shown_slopes(
     posteriors: np.ndarray,
     informations: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What sightings tell of their surfaces' slopes beyond those they were projected with:
-    information (N, 2, 2), and its product with the slopes (N, 2), relative depth a template step.
+    """Information (N, 2, 2) of sightings on the slopes of their surfaces, and its product (N, 2)
+    with the slopes, relative depth a template step, added to those of the projection.
 
     A slope (k_x, k_y) adds the affine part shift (k_x, k_y). Estimates of affine parts are drawn to
     zero by their prior; information with it times the estimate is information without it times the
@@ -435,10 +435,9 @@ def surface_normals(
             the patches in their hosts, before slopes.
     """
     num = len(slopes)
-    pull = np.stack([np.bincount(templates, column, num) for column in pulls.T], axis=1)
-    columns = weights.reshape(-1, 4).T
-    weight = np.stack([np.bincount(templates, column, num) for column in columns], axis=1)
-    weight = weight.reshape(-1, 2, 2)
+    columns = np.column_stack([weights.reshape(-1, 4), pulls]).T
+    sums = np.stack([np.bincount(templates, column, num) for column in columns], axis=1)
+    weight, pull = sums[:, :4].reshape(-1, 2, 2), sums[:, 4:]
     sizes = np.linalg.norm(spreads[:, :, 0], axis=1)
     prior = 1 / (SLOPE_SIGMA * np.maximum(sizes, 1e-300)) ** 2
     determined = np.trace(weight, axis1=1, axis2=2) > 2 * prior
