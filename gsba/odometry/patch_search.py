@@ -10,69 +10,90 @@ _kernel, _part = kernel_and_part(allocating=True, fastmath={"contract", "reassoc
 HALF = 4  # samples from the middle of a patch to its border
 SIDE = 2 * HALF + 1
 AREA = SIDE * SIDE
+_FEW = (HALF + 1) ** 2  # samples that are compared first, every second one of both axes
 MIN_LIKENESS, MIN_MARGIN = 0.65, 0.06  # of the best place, and above any other
 MIN_FACING = 0.1  # likeness of a plane that faces the camera, below which no other is tried
 BESIDE = 0.035  # radians along a line: places further from the best one are others
 
 
 @_part
+def _sums(image, u0, v0, ui, uj, vi, vj, columns, rows, template, first, last):
+    """Sums of some samples of a patch, of their squares, and of their products with a template; in
+    single precision and without branches, so that the compiler takes several samples at once."""
+    total = squares = products = np.float32(0.0)
+    for n in range(first, last):
+        u = u0 + ui * columns[n] + uj * rows[n]
+        v = v0 + vi * columns[n] + vj * rows[n]
+        left, top = np.int32(u), np.int32(v)
+        a, b = u - np.float32(left), v - np.float32(top)
+        x, y = np.uint32(left), np.uint32(top)
+        right, low = x + np.uint32(1), y + np.uint32(1)
+        above = image[y, x] + a * (image[y, right] - image[y, x])
+        below = image[low, x] + a * (image[low, right] - image[low, x])
+        value = above + b * (below - above)
+        total += value
+        squares += value * value
+        products += value * template[n]
+    return total, squares, products
+
+
+@_part
+def _likeness(image, warp, columns, rows, template, mean, variance, least):
+    """Correlation of a patch with a template of unit norm; that of every second sample, whose mean
+    and variance are given, where it is below `least`; -1 outside or where it is flat."""
+    if not _is_inside(image, warp):
+        return np.float32(-1.0)
+    u0, v0 = np.float32(warp[0]), np.float32(warp[1])
+    ui, uj = np.float32(warp[2]), np.float32(warp[3])
+    vi, vj = np.float32(warp[4]), np.float32(warp[5])
+    total, squares, products = _sums(
+        image, u0, v0, ui, uj, vi, vj, columns, rows, template, 0, _FEW
+    )
+    var = squares / _FEW - (total / _FEW) * (total / _FEW)
+    joint = products / _FEW - total / _FEW * mean
+    if not var > 2.0:
+        return np.float32(-1.0)
+    if not joint > 0.0 or joint * joint < least * least * var * variance:
+        return np.float32(joint / np.sqrt(var * variance))
+    more = _sums(image, u0, v0, ui, uj, vi, vj, columns, rows, template, _FEW, AREA)
+    total, squares, products = total + more[0], squares + more[1], products + more[2]
+    var = squares / AREA - (total / AREA) * (total / AREA)
+    return np.float32(products / np.sqrt(var * AREA)) if var > 4.0 else np.float32(-1.0)
+
+
+@_part
+def _is_inside(image, warp):
+    """True if a patch by its warp (u, v, ui, uj, vi, vj) lies in the image."""
+    across = HALF * (abs(warp[2]) + abs(warp[3]))
+    down = HALF * (abs(warp[4]) + abs(warp[5]))
+    height, width = image.shape
+    return (
+        warp[0] >= across
+        and warp[0] + across < width - 1.001
+        and warp[1] >= down
+        and warp[1] + down < height - 1.001
+    )
+
+
+@_part
 def _sample(image, u, v):
-    """Value at a pixel (u, v), OpenCV's origin, between rows of the image and across its seam."""
-    width = image.shape[1]
-    u += width if u < 0.0 else (-width if u >= width else 0.0)
+    """Value at a pixel (u, v), OpenCV's origin, between rows and columns of the image."""
     x, y = int(u), int(v)
     a, b = np.float32(u - x), np.float32(v - y)
-    right = 0 if x + 1 >= width else x + 1
-    above = image[y, x] + a * (image[y, right] - image[y, x])
-    below = image[y + 1, x] + a * (image[y + 1, right] - image[y + 1, x])
+    above = image[y, x] + a * (image[y, x + 1] - image[y, x])
+    below = image[y + 1, x] + a * (image[y + 1, x + 1] - image[y + 1, x])
     return above + b * (below - above)
 
 
 @_part
-def _likeness(image, u0, v0, ui, uj, vi, vj, template, least):
-    """Correlation of the patch at u0 + ui i + uj j, v0 + vi i + vj j with a template of unit norm,
-    of every second sample where that is below `least`; -1 outside or where it is flat."""
-    extent = HALF * (abs(vi) + abs(vj))
-    if v0 - extent < 0.0 or v0 + extent >= len(image) - 1.001:
-        return np.float32(-1.0)
-    total = squares = products = of_template = of_squares = np.float32(0.0)
-    for stage in range(2):
-        for j in range(-HALF, HALF + 1):
-            for i in range(-HALF, HALF + 1):
-                if ((i & 1) == 0 and (j & 1) == 0) != (stage == 0):
-                    continue
-                value = _sample(image, u0 + ui * i + uj * j, v0 + vi * i + vj * j)
-                other = template[(j + HALF) * SIDE + i + HALF]
-                total += value
-                squares += value * value
-                products += value * other
-                if stage == 0:
-                    of_template += other
-                    of_squares += other * other
-        if stage == 0:
-            num = np.float32((HALF + 1) * (HALF + 1))
-            var = squares / num - (total / num) * (total / num)
-            of_var = of_squares / num - (of_template / num) * (of_template / num)
-            joint = products / num - total / num * of_template / num
-            if not var > 2.0:
-                return np.float32(-1.0)
-            if not joint > 0.0 or joint * joint < least * least * var * of_var:
-                return joint / np.sqrt(var * of_var)
-    var = squares / AREA - (total / AREA) * (total / AREA)
-    return products / np.sqrt(var * AREA) if var > 4.0 else np.float32(-1.0)
-
-
-@_part
 def _cut(image, warp, out):
-    """The patch by its warp (u, v, ui, uj, vi, vj), without its mean, of unit norm; False outside
-    or where it is flat."""
-    height, width = image.shape
+    """The patch by its warp, without its mean, of unit norm; False outside or where it is flat."""
+    if not _is_inside(image, warp):
+        return False
     total = squares = np.float32(0.0)
     for j in range(-HALF, HALF + 1):
         for i in range(-HALF, HALF + 1):
             u, v = warp[0] + warp[2] * i + warp[3] * j, warp[1] + warp[4] * i + warp[5] * j
-            if not (v >= 0.0 and v < height - 1.001 and u >= -width and u < 2 * width):
-                return False
             value = _sample(image, u, v)
             out[(j + HALF) * SIDE + i + HALF] = value
             total += value
@@ -86,12 +107,12 @@ def _cut(image, warp, out):
 
 
 @_part
-def _place(x, y, z, width, height, warp):
-    """Middle of a patch by its ray (x, y, z); False near a pole."""
+def _place(x, y, z, width, height, pad, warp):
+    """Middle of a patch by its ray (x, y, z), in the padded image; False near a pole."""
     if y * y > 0.86 * (x * x + y * y + z * z):
         return False
     warp[0], warp[1] = erp_pixel(x, y, z, width, height)
-    warp[0] -= 0.5
+    warp[0] += pad - 0.5
     warp[1] -= 0.5
     return True
 
@@ -172,15 +193,36 @@ def _align(image, template, patch, warp):
     return product
 
 
+@_part
+def _order(columns, rows):
+    """Places (81,) of a patch's samples, from -4 to 4, those that are compared first before."""
+    n = 0
+    for few in (True, False):
+        for j in range(-HALF, HALF + 1):
+            for i in range(-HALF, HALF + 1):
+                if (i % 2 == 0 and j % 2 == 0) == few:
+                    columns[n], rows[n] = i, j
+                    n += 1
+
+
 @_kernel
-def search_patches(image0, image1, rays, rotation, direction, beside, step, sample, scores, pixels):
+def search_patches(
+    image0, image1, pad, rays, rotation, direction, beside, step, sample, scores, pixels
+):
     """Correlation (N,) and pixel (N, 2) in the other picture of each patch; -1 = none or not alone.
 
     Rays x1 = rotation x0 + depth^-1 direction; `beside`: lines to either side of the epipolar one,
-    `step` radians apart.
+    `step` radians apart. Images (h, 2h + 2 pad) go on beyond the seam by `pad` columns, which
+    pixels do not count.
     """
-    height0, width0 = image0.shape
-    height1, width1 = image1.shape
+    height0, width0 = image0.shape[0], image0.shape[1] - 2 * pad
+    height1, width1 = image1.shape[0], image1.shape[1] - 2 * pad
+    columns, rows, ordered = (
+        np.empty(AREA, np.float32),
+        np.empty(AREA, np.float32),
+        np.empty(AREA, np.float32),
+    )
+    _order(columns, rows)
     template, patch = np.empty(AREA, np.float32), np.empty(AREA, np.float32)
     warp, tangents, normal = np.empty(6), np.empty((2, 3)), np.empty(3)
     slopes, best, identity = np.empty((4, 2, 3)), np.empty(6), np.eye(3)
@@ -193,11 +235,18 @@ def search_patches(image0, image1, rays, rotation, direction, beside, step, samp
         tangents[1, 0], tangents[1, 1] = -ray[1] * ray[0] / flat, flat
         tangents[1, 2] = -ray[1] * ray[2] / flat
         _derivatives(identity, ray, tangents, 0, slopes[0])
-        if not _place(ray[0], ray[1], ray[2], width0, height0, warp):
+        if not _place(ray[0], ray[1], ray[2], width0, height0, pad, warp):
             continue
         _bend(ray[0], ray[1], ray[2], slopes[0, 0], slopes[0, 1], width0, height0, sample, warp)
         if not _cut(image0, warp, template):
             continue
+        mean = variance = np.float32(0.0)
+        for s in range(AREA):
+            ordered[s] = template[int((rows[s] + HALF) * SIDE + columns[s] + HALF)]
+            if s < _FEW:
+                mean += ordered[s] / _FEW
+                variance += ordered[s] * ordered[s] / _FEW
+        variance -= mean * mean
         x0 = rotation[0, 0] * ray[0] + rotation[0, 1] * ray[1] + rotation[0, 2] * ray[2]
         y0 = rotation[1, 0] * ray[0] + rotation[1, 1] * ray[1] + rotation[1, 2] * ray[2]
         z0 = rotation[2, 0] * ray[0] + rotation[2, 1] * ray[1] + rotation[2, 2] * ray[2]
@@ -222,16 +271,14 @@ def search_patches(image0, image1, rays, rotation, direction, beside, step, samp
                 z = z0 + nearness * direction[2]
                 off = m * step * np.sqrt(x * x + y * y + z * z) / sine
                 x, y, z = x + off * normal[0], y + off * normal[1], z + off * normal[2]
-                if not _place(x, y, z, width1, height1, warp):
+                if not _place(x, y, z, width1, height1, pad, warp):
                     continue
                 for plane in range(4):
                     if plane == 1 and abs(ray[1]) < 0.17:
                         continue
                     by_i, by_j = slopes[plane, 0], slopes[plane, 1]
                     _bend(x, y, z, by_i, by_j, width1, height1, sample, warp)
-                    like = _likeness(
-                        image1, warp[0], warp[1], warp[2], warp[3], warp[4], warp[5], template, 0.4
-                    )
+                    like = _likeness(image1, warp, columns, rows, ordered, mean, variance, 0.4)
                     likes[k] = max(likes[k], like)
                     if like > top:
                         top, at = like, k
@@ -248,4 +295,4 @@ def search_patches(image0, image1, rays, rotation, direction, beside, step, samp
         like = _align(image1, template, patch, best)
         if like > MIN_LIKENESS:
             scores[n] = like
-            pixels[n, 0], pixels[n, 1] = best[0] + 0.5, best[1] + 0.5
+            pixels[n, 0], pixels[n, 1] = best[0] + 0.5 - pad, best[1] + 0.5

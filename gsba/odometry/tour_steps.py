@@ -34,6 +34,7 @@ CELLS_PER_SIDE = 6  # of 15 degrees; keypoints of one surface agree together
 MAX_OFF_RAD = np.deg2rad(0.5)  # of a place found in a third frame from the predicted one
 MAX_ALIKE_LOG = 0.25  # of lengths and scales, below which hypotheses are no rivals
 _FLOOR_Y = 0.25  # y of bearings below which a floor is likely
+_PAD = 160  # columns beyond the seam: 45 degrees, more than a patch is wide
 _NUM_KEYS, _NUM_FEW = 1000, 300  # keypoints of a frame that are searched; that give a first rank
 _NUM_ROUGH, _NUM_REFINED = 6, 4  # best hypotheses of a step that are searched finely; refined
 _MIN_RANK_SHARE = 0.4  # of the best hypothesis' rank, below which others are not refined
@@ -58,8 +59,8 @@ _PROPOSALS = (
 class TourFrame:
     """A frame's pictures and the keypoints that are searched in others."""
 
-    picture: np.ndarray  # (h, 2h) float32
-    half: np.ndarray  # (h / 2, h) float32
+    picture: np.ndarray  # (h, 2h + 2 _PAD) float32, going on beyond the seam
+    half: np.ndarray  # (h / 2, h + 2 _PAD) float32
     rays: np.ndarray  # (K, 3) of all keypoints
     descriptors: np.ndarray  # (K, D) float32, of unit length
     alikeness: np.ndarray  # (K,) largest cosine with another keypoint of the frame, 3 degrees away
@@ -95,6 +96,7 @@ def frame_of(grey: np.ndarray, masks: np.ndarray | None) -> TourFrame:
     sound = (rays[chosen, 1] <= _FLOOR_Y) & (alike[chosen] < 0.95)
     picture = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), 0.7)
     half = cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    picture, half = (np.pad(one, ((0, 0), (_PAD, _PAD)), "wrap") for one in (picture, half))
     keys = np.ascontiguousarray(rays[chosen])
     return TourFrame(picture, half, rays, descriptors, alike, keys, sound, found.sigmas_rad[chosen])
 
@@ -139,10 +141,10 @@ def found_places(
     step = np.deg2rad(_LINE_STEP_DEG) * scale
     beside = int(beside_deg / _LINE_STEP_DEG / scale + 0.5)
     sample = _SAMPLE_RAD * scale
-    search_patches(*pictures, rays, rotation, direction, beside, step, sample, scores, pixels)
+    search_patches(*pictures, _PAD, rays, rotation, direction, beside, step, sample, scores, pixels)
     found = scores > 0
-    height, width = pictures[1].shape
-    return rows[found], bearings_from_erp(pixels[found], width, height)
+    height = len(pictures[1])
+    return rows[found], bearings_from_erp(pixels[found], 2 * height, height)
 
 
 def fits(
