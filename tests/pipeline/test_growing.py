@@ -144,6 +144,7 @@ def test_refusals_are_one_line_and_leave_the_run(home: GrowingHome, tmp_path: Pa
     assert _content(home.run) == before
 
 
+@pytest.mark.slow
 def test_a_killed_call_leaves_the_run_and_goes_on(
     home: GrowingHome, grown: Path, tmp_path: Path
 ) -> None:

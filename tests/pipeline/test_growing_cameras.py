@@ -68,6 +68,7 @@ def test_recordings_join_the_cameras_that_a_run_has(
     assert (out / "colmap-flat/images").is_dir()
 
 
+@pytest.mark.slow
 def test_a_camera_goes_with_its_recordings(
     grown: Path, single_run: Path, home: Home, tmp_path: Path
 ) -> None:

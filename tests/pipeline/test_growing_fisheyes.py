@@ -16,6 +16,7 @@ from gsba.pipeline.joint_cameras import as_read_by
 from gsba.pipeline.recordings import refine_each
 
 
+@pytest.mark.slow
 def test_fixed_poses_of_a_run_of_several_cameras_stay(
     two_sizes: Path, home: Home, tmp_path: Path
 ) -> None:
@@ -40,6 +41,7 @@ def raw(home: Home) -> Path:
     return out
 
 
+@pytest.mark.slow
 def test_raw_fisheyes_grow_by_recordings_of_their_calibration(
     raw: Path, home: Home, tmp_path: Path
 ) -> None:

@@ -94,6 +94,7 @@ def test_added_keypoints_follow_the_others_of_their_face() -> None:
     )
 
 
+@pytest.mark.slow
 def test_stills_in_no_order_are_refined_in_the_one_found(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
