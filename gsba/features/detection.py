@@ -83,11 +83,11 @@ class SiftExtractor:
         keypoints, descriptors = self._sift.detectAndCompute(grey, allowed)
         if descriptors is None:
             return FaceKeypoints(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 128), np.uint8))
-        order = np.argsort([-k.response for k in keypoints], kind="stable")
-        keypoints, descriptors = [keypoints[k] for k in order], descriptors[order]
-        pixels = np.array([k.pt for k in keypoints]) + 0.5
-        sizes = np.array([k.size for k in keypoints])
-        sigmas = np.hypot(SIGMA_PX, _SIGMA_PER_SIZE * sizes)
+        responses, sizes = np.array([(k.response, k.size) for k in keypoints]).T
+        order = np.argsort(-responses, kind="stable")
+        places = np.asarray(cv2.KeyPoint.convert(keypoints), float)
+        pixels, descriptors = places[order] + 0.5, descriptors[order]
+        sigmas = np.hypot(SIGMA_PX, _SIGMA_PER_SIZE * sizes[order])
         # Hellinger-normalised, quantised with factor 512
         mass = descriptors.sum(axis=1, keepdims=True)
         rooted = np.rint(512 * np.sqrt(descriptors / np.maximum(mass, 1e-12)))

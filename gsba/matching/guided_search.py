@@ -221,12 +221,17 @@ def _targets(
 
 def one_to_one(pairs: np.ndarray, similarity: np.ndarray) -> np.ndarray:
     """Keep the best match of every keypoint that occurs under several orientations or faces."""
-    order = np.argsort(-similarity, kind="stable")
-    pairs = pairs[order]
-    for column in (0, 1):
-        _, keep = np.unique(pairs[:, column], return_index=True)
-        pairs = pairs[np.sort(keep)]
-    return pairs[np.argsort(pairs[:, 0])].astype(np.int32)
+    pairs = pairs[np.argsort(-similarity, kind="stable")]
+    pairs = pairs[np.sort(_first_of_each(pairs[:, 0]))]
+    pairs = pairs[np.sort(_first_of_each(pairs[:, 1]))]
+    return pairs[_first_of_each(pairs[:, 0])].astype(np.int32)
+
+
+def _first_of_each(numbers: np.ndarray) -> np.ndarray:
+    """First row of each number >= 0 that occurs, by ascending number."""
+    rows = np.full(numbers.max(initial=-1) + 1, -1)
+    rows[numbers[::-1]] = np.arange(len(numbers))[::-1]  # of several, the last one assigned stays
+    return rows[rows >= 0]
 
 
 class Points(Protocol):

@@ -170,9 +170,12 @@ def _significant_pose(
         of_witness = 1 - (1 - of_match) ** (len(bearings0) / num)
         return least_agreeing(num, of_witness, _SAMPLE_SIZE, settings.max_false_alarms)
 
-    if len(bearings0) <= _SAMPLE_SIZE or needed(max(chance, largest)) > num:
+    if len(bearings0) <= _SAMPLE_SIZE:
         return None
-    share, trials = needed(max(chance, largest)) / len(bearings0), (50, 3000)
+    least = needed(max(chance, largest))
+    if least > num:
+        return None
+    share, trials = least / len(bearings0), (50, 3000)
     found = sampled_pose(bearings0, bearings1, settings.max_error_deg, share, trials, seed)
     if found is None:
         return None
@@ -246,8 +249,8 @@ def _direction_sigma(f0_T_f1: np.ndarray, bearings0: np.ndarray, bearings1: np.n
     Residuals of a pure rotation are noise in two directions; under a translation, only those across
     the epipolar planes are. Medians of both are compared.
     """
-    rotation, planes = f0_T_f1[:3, :3], _normals(f0_T_f1, bearings0)
-    across = np.sum(planes * (bearings1 @ rotation.T), axis=1)
+    planes, rays1 = _normals(f0_T_f1, bearings0), bearings1 @ f0_T_f1[:3, :3].T
+    across = np.sum(planes * rays1, axis=1)
     off = rotation_of_most(bearings0, bearings1)[1]
     left = np.median(off**2) / _CHI_SQUARE_MEDIANS[0]
     noise = np.median(across**2) / _CHI_SQUARE_MEDIANS[1]
@@ -258,13 +261,15 @@ def _direction_sigma(f0_T_f1: np.ndarray, bearings0: np.ndarray, bearings1: np.n
     # size
     if np.log(left / noise) < 4.75 * 2.75 / np.sqrt(num):
         return np.inf
-    return _direction_error(f0_T_f1, bearings0, bearings1) * np.sqrt(noise * len(bearings0) / num)
+    error = _direction_error(f0_T_f1[:3, 3], bearings0, rays1, planes)
+    return error * np.sqrt(noise * len(bearings0) / num)
 
 
-def _direction_error(f0_T_f1: np.ndarray, bearings0: np.ndarray, bearings1: np.ndarray) -> float:
-    """Largest standard deviation of the direction per radian of noise of the bearings."""
-    rotation, direction = f0_T_f1[:3, :3], f0_T_f1[:3, 3]
-    planes, rays1 = _normals(f0_T_f1, bearings0), bearings1 @ rotation.T
+def _direction_error(
+    direction: np.ndarray, bearings0: np.ndarray, rays1: np.ndarray, planes: np.ndarray
+) -> float:
+    """Largest standard deviation of the direction per radian of noise of the bearings (m, 3), both
+    in frame 0's axes, of epipolar planes (m, 3)."""
     lengths = np.linalg.norm(np.cross(direction, bearings0), axis=1, keepdims=True)
     by_direction = np.cross(bearings0, rays1) / np.maximum(lengths, 1e-6)
     basis = np.linalg.svd(direction[None])[2][1:]  # of the plane orthogonal to the direction
