@@ -23,10 +23,12 @@ class ExtractorTraits:
     max_ratio: float  # ratio of distances, best over second best, below which 90 % of them are
     sigma_px: float | None = None  # per-axis noise, face pixels; None = by a keypoint's size
     offset_px: tuple[float, float] = (0.0, 0.0)  # (u, v) to add to the network's pixels
+    patch_size: int = 27  # panorama pixels across the patches that are aligned around keypoints,
+    # odd; smaller ones around a network's keypoints move with the poses they are predicted by
 
 
 TRAITS = {
-    "sift": ExtractorTraits(0.8, 0.9),
+    "sift": ExtractorTraits(0.8, 0.9, patch_size=15),
     "aliked": ExtractorTraits(0.55, 0.95, 0.28, (-0.35, 0.1)),
     "disk": ExtractorTraits(0.55, 0.95, 0.37, (-0.45, -0.35)),
     "xfeat": ExtractorTraits(0.78, 0.97, 0.42, (-0.1, 1.05)),

@@ -5,11 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from factors import tangent_basis
-from factors.patches import PatchSet, expect
+from factors.patches import expect
 from factors.sphere_field import SphereField
 from factors.sphere_image import SphereImage
 from gsba.camera.lens import Lenses
 from gsba.camera.projections import PerspectiveProjection
+from gsba.features.detection import traits_of
 from gsba.frames.panorama import Greys
 from gsba.localization.photos import shows
 from gsba.localization.run_map import RunMap, without_correction
@@ -110,7 +111,8 @@ class PatchAligner:
         at = field.observed(seen / distances)
         across = world_T_rig[:3, :3].T @ axes / distances[:, :, None]
         sightings = expect(np.arange(len(points)), at, across)
-        patches: PatchSet = cut("patches", self.greys, expected.hosts, origins, spreads, threads)
+        size = traits_of(map_.settings).patch_size
+        patches = cut("patches", self.greys, expected.hosts, origins, spreads, size, threads)
         align_to(image, mask, patches, sightings)
         dropped = dict.fromkeys(REJECTIONS, 0)
         kept, bearings, covariances = accepted_rows(patches, sightings, pixel, dropped)

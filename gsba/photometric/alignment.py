@@ -58,6 +58,7 @@ class AlignedObservations:
     # None = unknown
     field: SphereField = _STRAIGHT  # errors of stitching: the map is corrected by it
     folder: Path | None = None  # on the disk that holds what is found; None = it is in memory
+    patch_size: int = 15  # panorama pixels across the patches around them, odd
 
 
 def align(
@@ -159,7 +160,7 @@ def _align_some(
         points, seeing = points[clear], seeing[clear]
     at, across, rays = _projected_patches(*map_, points, seeing, lenses, threads)
     sightings = expect(points, field.observed(at), across)
-    title, cut = f"{name}: templates", (planes.origins, planes.tilted)
+    title, cut = f"{name}: templates", (planes.origins, planes.tilted, observed.patch_size)
     patches = frame_jobs.cut(title, greys, hosts, *cut, workers)
     frame_jobs.align(name, greys, seeing, patches, sightings, workers)
     enlarged = greys.enlargements()

@@ -13,7 +13,6 @@ from gsba.frames.panorama import Greys
 from gsba.store.shards import Workers, blocks_of_frames
 
 MAX_SHIFT_PX = 3.0  # from the predicted pixel, panorama pixels
-_PATCH_SIZE = 15  # pixels across, odd: a patch has a pixel in its middle
 _AFFINE_SIGMA = 0.15  # prior of the warp: a surface facing the ray
 _MAX_STEPS = 12  # largest number of alignment steps
 
@@ -24,13 +23,14 @@ def cut(
     hosts: np.ndarray,
     origins: np.ndarray,
     spreads: np.ndarray,
+    size: int,
     workers: Workers,
 ) -> PatchSet:
-    """Templates cut from their host frames (J,): plane patches, origins (J, 3) and spreads (J, 3,
-    2), rig frame of the host."""
-    patches = _empty_patches(len(hosts))
+    """Templates of `size` pixels across, odd, cut from their host frames (J,): plane patches,
+    origins (J, 3) and spreads (J, 3, 2), rig frame of the host."""
+    patches = _empty_patches(len(hosts), size)
     rows = _by_frame(hosts, greys.num_frames)
-    job = _CutJob(name, greys, rows, origins, spreads)
+    job = _CutJob(name, greys, rows, origins, spreads, size)
     whole = patches.templates
     for chosen, found in zip(rows.each(), workers.map_shards(job), strict=True):
         arrays = whole.grey, whole.by_x, whole.by_y, whole.inverses, whole.states
@@ -69,10 +69,10 @@ def align_to(
     patches.align(image, mask, every, sightings, reach, _MAX_STEPS, 0.02)
 
 
-def _empty_patches(num: int) -> PatchSet:
+def _empty_patches(num: int, size: int) -> PatchSet:
     """Empty storage for templates."""
     # noise of 3 grey values, a window of .6 half patches
-    return PatchSet(num, _PATCH_SIZE, 0.6, _AFFINE_SIGMA, 3.0)
+    return PatchSet(num, size, 0.6, _AFFINE_SIGMA, 3.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,10 +134,11 @@ class _CutJob(_FrameJob):
 
     origins: np.ndarray  # (J, 3)
     spreads: np.ndarray  # (J, 3, 2)
+    size: int  # pixels across a template
 
     def __call__(self, item: int) -> tuple[np.ndarray, ...]:
         rows = self.rows.of(item)
-        found = _empty_patches(len(rows))
+        found = _empty_patches(len(rows), self.size)
         every, least = np.arange(len(rows)), 2.0  # grey values, standard deviation in a patch
         found.cut(*self.image(item), every, self.origins[rows], self.spreads[rows], least)
         own = found.templates

@@ -14,6 +14,7 @@ from gsba.bundle.lens_centres import baseline_of
 from gsba.bundle.readout import CameraEstimate
 from gsba.bundle.trajectory_prior import HeldPoses
 from gsba.config import RefineSettings
+from gsba.features.detection import traits_of
 from gsba.geometry import adjoint, inverse
 from gsba.localization.run_map import SAME_PLACE_RAD, SAME_PLACE_SIGMAS
 from gsba.log import GsbaError
@@ -260,7 +261,8 @@ def _aligned(state: State, base: Sighted, features: Keypoints, parts: np.ndarray
     found = frontend.match_known_points_across(state.with_solution(known), parts, "across2")
     state = replace(state, matches=found.matches)
     start = replace(known, landmarks=state.triangulated(_crossing(state, parts), rays, gate))
-    seen = AlignedObservations(features, field=state.map.field)
+    size = traits_of(run.settings).patch_size
+    seen = AlignedObservations(features, field=state.map.field, patch_size=size)
     shared = patch_rounds.observe(state, start, seen, "align1")
     left, before, better = _without_same(base, shared, run.greys.width), state, None
     for n in range(1, rounds + 1):

@@ -7,6 +7,7 @@ from dataclasses import replace
 from gsba.bundle import adjustment, map_strength, stitching
 from gsba.bundle.reconstruction import MIN_OBSERVATIONS
 from gsba.bundle.stitching import Stitching
+from gsba.features.detection import traits_of
 from gsba.photometric import alignment
 from gsba.photometric.alignment import AlignedObservations
 from gsba.pipeline import camera, frontend
@@ -97,7 +98,10 @@ def observe(state: State, start: Solution, observed: AlignedObservations, name: 
 def observations(state: State) -> AlignedObservations:
     """Observations of the map's points."""
     map_, folder = state.map, state.run.store.scratch_folder
-    return AlignedObservations(map_.observed, map_.aligned, map_.normals_rig, map_.field, folder)
+    size = traits_of(state.run.settings).patch_size
+    return AlignedObservations(
+        map_.observed, map_.aligned, map_.normals_rig, map_.field, folder, size
+    )
 
 
 def adjust_aligned(

@@ -11,7 +11,8 @@ from tiny_run import BARE, Case, computed_stages
 
 from gsba.config import FeatureSettings, RefineSettings
 from gsba.evaluate.trajectory import evaluate
-from gsba.features.detection import FaceKeypoints, SiftExtractor
+from gsba.features.detection import TRAITS, FaceKeypoints, SiftExtractor
+from gsba.photometric import frame_jobs
 from gsba.trajectory.files import read_trajectory
 
 
@@ -64,15 +65,24 @@ def settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RefineSettings:
     changes = {
         "features": {"extractor": "aliked", "weights": str(tmp_path), "max_per_face": 200},
         "matching": {"matcher": "lightglue", "weights": str(tmp_path)},
-        "patches": {"rounds": 0},
+        "patches": {"rounds": 1},
     }
     return RefineSettings.model_validate(BARE.model_dump() | changes)
 
 
-def test_a_run_uses_both_and_resumes(case: Case, settings: RefineSettings, tmp_path: Path) -> None:
+def test_a_run_uses_both_and_resumes(
+    case: Case, settings: RefineSettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     out, Nearest.asked = tmp_path / "run", 0
+    cut, sizes = frame_jobs.cut, set[int]()
+
+    def cutting(name, greys, hosts, origins, spreads, size, workers):
+        sizes.add(size)
+        return cut(name, greys, hosts, origins, spreads, size, workers)
+
+    monkeypatch.setattr(frame_jobs, "cut", cutting)
     result = case.refine(out, settings)
-    assert Nearest.asked > 50
+    assert Nearest.asked > 50 and sizes == {TRAITS["aliked"].patch_size}
     before = evaluate(read_trajectory(case.slam), case.truth)
     assert case.errors(out).ate.rmse < before.ate.rmse / 10
     assert result.report["summary"]["refined"] == len(case.truth.timestamps)

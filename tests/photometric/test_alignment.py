@@ -1,6 +1,7 @@
 """The alignment stage on a rendered walk: better poses, right bookkeeping, bad frames survived."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -36,11 +37,7 @@ from gsba.types import (
 NUM, WIDTH = 6, 512
 RIG = CubeRig(128, np.pi / 2)
 PIXEL = 2 * np.pi / WIDTH
-
-
-@pytest.fixture(autouse=True)
-def _small_patches(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(frame_jobs, "_PATCH_SIZE", 11)
+in_small_patches = partial(AlignedObservations, patch_size=11)
 
 
 def _grey(points: np.ndarray) -> np.ndarray:
@@ -113,7 +110,7 @@ def _run(
     frames, world_T_rigs = walk
     landmarks, keypoints = _start(world_T_rigs, sigma_px)
     solved = _solved(landmarks, world_T_rigs)
-    observed = AlignedObservations(keypoints, aligned, folder=folder)
+    observed = in_small_patches(keypoints, aligned, folder=folder)
     return alignment.align(solved, observed, Greys(frames, 4096), RIG, Threads(2))
 
 
@@ -216,7 +213,7 @@ def test_poses_become_better_than_the_detector_leaves_them(walk) -> None:
     problem, gates = AdjustmentContext(Families((Bearings(), priors)), RIG, settings, 2), (6.0, 3.0)
     before = adjustment.adjust(landmarks.tracks, keypoints, start, problem, gates)
     greys, workers = Greys(frames, 4096), Threads(2)
-    sighted = alignment.align(before, AlignedObservations(keypoints), greys, RIG, workers)
+    sighted = alignment.align(before, in_small_patches(keypoints), greys, RIG, workers)
     after, known = adjustment.adjust_sighted(sighted, before, problem, gates)
     assert np.median(rotation_errors(after)) < 0.5 * np.median(rotation_errors(before))
     assert 0.5 <= after.noise < 2 and all(step.accepted for step in after.rounds)
@@ -261,7 +258,7 @@ def test_points_at_a_centre_and_behind_walls_do_no_harm(walk) -> None:
     points[100] = world_T_rigs[landmarks.tracks.frames[300], :3, 3]
     moved = replace(landmarks, points_world=points)
     solved, greys = _solved(moved, world_T_rigs), Greys(frames, 4096)
-    observed, workers = AlignedObservations(keypoints), Threads(2)
+    observed, workers = in_small_patches(keypoints), Threads(2)
     sighted = alignment.align(solved, observed, greys, RIG, workers)
     assert np.isfinite(sighted.keypoints.bearings_rig).all()
     infos = sighted.keypoints.sqrt_infos
@@ -295,7 +292,7 @@ def test_no_points_are_no_observations(walk) -> None:
     none = Solution.without_points(world_T_rigs).landmarks
     _, keypoints = _start(world_T_rigs)
     solved, greys = _solved(none, world_T_rigs), Greys(frames, 4096)
-    observed, workers = AlignedObservations(keypoints), Threads(2)
+    observed, workers = in_small_patches(keypoints), Threads(2)
     sighted = alignment.align(solved, observed, greys, RIG, workers)
     assert len(sighted.tracks) == 0 and sighted.counts.received == 0
 
@@ -362,7 +359,7 @@ def test_patches_come_to_lie_on_their_surfaces(tmp_path: Path) -> None:
     for _ in range(2):
         solved, observed = (
             _solved(landmarks, world_T_rigs),
-            AlignedObservations(keypoints, None, normals),
+            in_small_patches(keypoints, None, normals),
         )
         greys, workers = Greys(frames, 4096), Threads(2)
         found = alignment.align(solved, observed, greys, RIG, workers)
