@@ -1,8 +1,10 @@
-"""What numbers frames follows them into the order that a search has found."""
+"""Stills whose names may be in no order, and what numbers frames in the order found."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import cast
 
 import cv2
 import numpy as np
@@ -11,26 +13,35 @@ from walk_on_earth import geodetic_of
 
 from gsba.bundle.gps_factors import GpsFactors
 from gsba.config import RefineSettings
+from gsba.log import GsbaError
 from gsba.masks import merging
+from gsba.matching.recovery import Recovered
+from gsba.odometry import tour_order
+from gsba.odometry.tour_maps import TourMatches
 from gsba.pipeline import frontend, tour
 from gsba.pipeline.refine import Start, _begin, _without_distractors
 from gsba.pipeline.run import Evidence, Journal
+from gsba.pipeline.state import State
 from gsba.store.store import RunStore
-from gsba.types import Counts, FrameSet, PictureFormat
+from gsba.types import Counts, FrameSet, PictureFormat, VerifiedPairs
 
 NAMES, FOUND = ("a", "b", "c", "d", "e"), np.array([3, 0, 4, 1, 2])
 
 
-@pytest.fixture
-def stills(tmp_path: Path) -> FrameSet:
-    paths = tuple((tmp_path / f"{name}.png",) for name in NAMES)
+def stills_named(folder: Path, names: Sequence[str]) -> FrameSet:
+    paths = tuple((folder / f"{name}.png",) for name in names)
     for (path,) in paths:
         cv2.imwrite(str(path), np.zeros((32, 64), np.uint8))
-    kind = PictureFormat("erp", 64, 32, ())
-    return FrameSet(NAMES, paths, np.arange(5.0), (None,) * 5, (kind,), timed=False)
+    num, kind = len(names), PictureFormat("erp", 64, 32, ())
+    return FrameSet(tuple(names), paths, np.arange(num * 1.0), (None,) * num, (kind,), timed=False)
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture
+def stills(tmp_path: Path) -> FrameSet:
+    return stills_named(tmp_path, NAMES)
+
+
+@pytest.fixture
 def _order_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
     def known(store: RunStore, frames: FrameSet, settings: RefineSettings) -> FrameSet:
         return replace(frames.taken(FOUND), timestamps=np.arange(5.0))
@@ -38,6 +49,7 @@ def _order_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tour, "in_known_order", known)
 
 
+@pytest.mark.usefixtures("_order_is_known")
 def test_fixes_by_name_stay_with_their_stills(stills: FrameSet, tmp_path: Path) -> None:
     metres = np.random.default_rng(0).normal(0, 30, (5, 3))
     rows = [
@@ -57,6 +69,7 @@ def test_fixes_by_name_stay_with_their_stills(stills: FrameSet, tmp_path: Path) 
     np.testing.assert_allclose(after.fixes.positions, before.fixes.positions[FOUND])
 
 
+@pytest.mark.usefixtures("_order_is_known")
 def test_masks_of_a_first_solution_are_of_stills_in_the_order_given(
     stills: FrameSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -77,3 +90,45 @@ def test_masks_of_a_first_solution_are_of_stills_in_the_order_given(
         masked = _without_distractors(store, RefineSettings(), start, Journal())
     assert masked.names == NAMES and masked.timestamps.tolist() == stills.timestamps.tolist()
     assert masked.mask_paths == tuple(tmp_path / f"{name}_mask.png" for name in NAMES)
+
+
+def match_nothing(stills: FrameSet) -> TourMatches:
+    """Stills whose steps no places confirm, in the order given."""
+    num, none = len(stills), np.zeros(0)
+    near = VerifiedPairs.none()
+    starts, open_logs = np.zeros(num + 1, np.int64), np.full(num - 2, np.inf)
+    return TourMatches(
+        starts, none.reshape(0, 3), none, near, np.zeros(num - 2), open_logs, stills.names
+    )
+
+
+def neighbours_tied(stills: FrameSet, store: RunStore, unseen: bool) -> tuple[State, Recovered]:
+    """A state whose descriptors tie all stills by name, but for one step."""
+    pairs = [(f, f + 1) for f in range(len(stills) - 1) if not unseen or f != 5]
+    near = SimpleNamespace(matches=SimpleNamespace(pairs=np.array(pairs)))
+    steps = np.arange(len(stills) - 1) == (5 if unseen else -1)
+    trust = SimpleNamespace(turning_only=False, unseen_steps=steps)
+    run = SimpleNamespace(frames=stills, settings=RefineSettings(), store=store, num_threads=1)
+    state = SimpleNamespace(prior=SimpleNamespace(absent=True), run=run)
+    return cast(State, state), cast(Recovered, SimpleNamespace(neighbours=near, trust=trust))
+
+
+@pytest.mark.parametrize(("shuffled", "unseen"), [(True, True), (False, True), (True, False)])
+def test_what_is_only_alike_makes_no_map_of_stills_in_no_order(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shuffled: bool, unseen: bool
+) -> None:
+    """A hall of bays: each frame is as alike to those a bay away as to its neighbours."""
+    stills, numbers = stills_named(tmp_path, "abcdefghijkl"), np.arange(12)
+    way = np.random.default_rng(0).permutation(numbers) if shuffled else numbers
+    gaps = np.abs(np.subtract.outer(way, way))
+    alike = (2 + np.cos(2 * np.pi * gaps / 3)) * np.exp(-gaps / 8.0)
+    nothing = match_nothing(stills)
+    monkeypatch.setattr(tour, "likeness_of", lambda *_: tour_order.Likeness(alike))
+    monkeypatch.setattr(tour, "match_stills", lambda *_: nothing)
+    with RunStore(tmp_path / "run", {"frames": tmp_path}) as store:
+        given = neighbours_tied(stills, store, unseen)
+        if shuffled and unseen:
+            with pytest.raises(GsbaError, match="the order of the stills is not known"):
+                tour.match_places(*given)
+        else:
+            assert tour.match_places(*given) is None
