@@ -72,7 +72,7 @@ def _search(state: State, found: Recovered) -> TourMatches | None:
     if known is None or not known.order_found:
         before = _num_tied(found.neighbours.matches, num)
         tied = before > _MAX_TIED_SHARE * num
-        if tied and not found.trust.unseen_steps.any():
+        if tied and _all_match(found.neighbours.matches, num):
             return None
         alike = _likeness(run, key)
         if tied and (alike is None or in_given_order(alike)):
@@ -144,6 +144,13 @@ def _may_be_tour(frames: FrameSet, settings: RefineSettings) -> bool:
 def _num_tied(matches: Matches, num: int) -> int:
     """Frames of `num` that matches tie to others, in maps of three frames and more."""
     return int(np.count_nonzero(connectivity.maps_of_images(matches.pairs, num) >= 0))
+
+
+def _all_match(matches: Matches, num: int) -> bool:
+    """True if all of `num` frames match the next one and the one after it, as those of a dense walk
+    in order do."""
+    gaps = matches.pairs[:, 1] - matches.pairs[:, 0]
+    return np.count_nonzero(gaps <= 2) == 2 * num - 3
 
 
 def _with_places(state: State, tour: TourMatches) -> tuple[ObservedFrames, Matches]:

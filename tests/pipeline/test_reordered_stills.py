@@ -102,20 +102,27 @@ def match_nothing(stills: FrameSet) -> TourMatches:
     )
 
 
-def neighbours_tied(stills: FrameSet, store: RunStore, unseen: bool) -> tuple[State, Recovered]:
-    """A state whose descriptors tie all stills by name, but for one step."""
-    pairs = [(f, f + 1) for f in range(len(stills) - 1) if not unseen or f != 5]
-    near = SimpleNamespace(matches=SimpleNamespace(pairs=np.array(pairs)))
-    steps = np.arange(len(stills) - 1) == (5 if unseen else -1)
-    trust = SimpleNamespace(turning_only=False, unseen_steps=steps)
+def neighbours_tied(
+    stills: FrameSet, store: RunStore, unmatched: tuple[int, int] | None
+) -> tuple[State, Recovered]:
+    """A state whose descriptors tie all stills by name, with or without a pair that matches not."""
+    some = [(f, f + gap) for gap in (1, 2) for f in range(len(stills) - gap)]
+    pairs = np.array([pair for pair in some if pair != unmatched])
+    near = SimpleNamespace(matches=SimpleNamespace(pairs=pairs))
+    trust = SimpleNamespace(turning_only=False)
     run = SimpleNamespace(frames=stills, settings=RefineSettings(), store=store, num_threads=1)
     state = SimpleNamespace(prior=SimpleNamespace(absent=True), run=run)
     return cast(State, state), cast(Recovered, SimpleNamespace(neighbours=near, trust=trust))
 
 
-@pytest.mark.parametrize(("shuffled", "unseen"), [(True, True), (False, True), (True, False)])
+@pytest.mark.parametrize(
+    ("shuffled", "unmatched"), [(True, (5, 6)), (True, (5, 7)), (False, (5, 6)), (True, None)]
+)
 def test_what_is_only_alike_makes_no_map_of_stills_in_no_order(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shuffled: bool, unseen: bool
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    shuffled: bool,
+    unmatched: tuple[int, int] | None,
 ) -> None:
     """A hall of bays: each frame is as alike to those a bay away as to its neighbours."""
     stills, numbers = stills_named(tmp_path, "abcdefghijkl"), np.arange(12)
@@ -126,8 +133,8 @@ def test_what_is_only_alike_makes_no_map_of_stills_in_no_order(
     monkeypatch.setattr(tour, "likeness_of", lambda *_: tour_order.Likeness(alike))
     monkeypatch.setattr(tour, "match_stills", lambda *_: nothing)
     with RunStore(tmp_path / "run", {"frames": tmp_path}) as store:
-        given = neighbours_tied(stills, store, unseen)
-        if shuffled and unseen:
+        given = neighbours_tied(stills, store, unmatched)
+        if shuffled and unmatched:
             with pytest.raises(GsbaError, match="the order of the stills is not known"):
                 tour.match_places(*given)
         else:
