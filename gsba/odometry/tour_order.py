@@ -6,18 +6,33 @@ most alike. It only proposes steps; places confirm them.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
 
 from factors.threads import map_in_threads
-from gsba.odometry.tour_steps import TourFrame, nearest_descriptors
+from gsba.odometry.tour_steps import TourFrame, mutual_nearest
 
 _MIN_COSINE, _MIN_COSINE_LEAD = 0.75, 0.05  # of matches; over look-alikes within a frame
 MIN_FRAMES = 12  # fewer are taken in the order given
+_MAX_FRAMES = 60  # most frames whose order is searched: each is compared with all
+_REACH = 3.0  # frames along a way over which likeness fades
 _NUM_RANDOM, _MAX_BETTER_SHARE = 1000, 0.001  # random orders; of them above one that is believed
 _MAX_MOVED = 3  # frames in a row that are moved at once to make a path better
 _MIN_GAIN = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Likeness:
+    """How alike a tour's frames are."""
+
+    alike: np.ndarray  # (F, F) see `likeness`
+
+
+def may_lack_order(num_frames: int) -> bool:
+    """True for as many frames as an order is told from none and found of."""
+    return MIN_FRAMES <= num_frames <= _MAX_FRAMES
 
 
 def likeness(frames: Sequence[TourFrame], num_threads: int = 1) -> np.ndarray:
@@ -38,27 +53,37 @@ def likeness(frames: Sequence[TourFrame], num_threads: int = 1) -> np.ndarray:
 def _num_matches(one: TourFrame, other: TourFrame) -> int:
     if not (len(one.rays) and len(other.rays)):
         return 0
-    nearest = nearest_descriptors(one.descriptors, other.descriptors)
-    back = nearest_descriptors(other.descriptors, one.descriptors)
-    rows = np.flatnonzero(back[nearest] == np.arange(len(nearest)))
-    cosines = np.sum(one.descriptors[rows] * other.descriptors[nearest[rows]], axis=1)
-    within = np.maximum(one.alikeness[rows], other.alikeness[nearest[rows]])
+    rows, others = mutual_nearest(one.descriptors, other.descriptors)
+    cosines = np.sum(one.descriptors[rows] * other.descriptors[others], axis=1)
+    within = np.maximum(one.alikeness[rows], other.alikeness[others])
     alike = (cosines > _MIN_COSINE) & (cosines > within + _MIN_COSINE_LEAD)
     return int(np.count_nonzero(alike))
 
 
 def in_given_order(alike: np.ndarray) -> bool:
-    """True if neighbours are more alike (F, F) as given than in 99.9 % of random orders; of a few
+    """True if neighbours are more alike (F, F) as given than in 99.9 % of random orders, or near
+    frames are, as neighbours of a hall of bays are less alike than frames a bay apart; of a few
     frames that tells nothing."""
     rng, num = np.random.default_rng(0), len(alike)
     if num < MIN_FRAMES:
         return True
-    given, orders = (
-        _total(alike, np.arange(num)),
-        (rng.permutation(num) for _ in range(_NUM_RANDOM)),
-    )
-    better = sum(_total(alike, order) > given + _MIN_GAIN for order in orders)
-    return better <= _MAX_BETTER_SHARE * _NUM_RANDOM
+    gaps = np.abs(np.subtract.outer(np.arange(num), np.arange(num)))
+    nearness, ranks = np.exp(-gaps / _REACH), _ranks(alike)
+
+    def totals(order: np.ndarray) -> tuple[float, float]:
+        return _total(alike, order), float(np.sum(nearness * ranks[np.ix_(order, order)]))
+
+    given = np.add(totals(np.arange(num)), _MIN_GAIN)
+    better = sum(np.greater(totals(rng.permutation(num)), given) for _ in range(_NUM_RANDOM))
+    return bool(np.min(better) <= _MAX_BETTER_SHARE * _NUM_RANDOM)
+
+
+def _ranks(alike: np.ndarray) -> np.ndarray:
+    """Ranks (F, F) of the likeness of pairs among all, as few pairs would outweigh the others."""
+    first, second = np.triu_indices(len(alike), 1)
+    ranks = np.zeros(alike.shape)
+    ranks[first, second] = np.unique(alike[first, second], return_inverse=True)[1]
+    return ranks + ranks.T
 
 
 def most_alike_path(alike: np.ndarray) -> np.ndarray:

@@ -117,10 +117,23 @@ def _alikeness(rays: np.ndarray, descriptors: np.ndarray) -> np.ndarray:
     return alike
 
 
-def nearest_descriptors(descriptors0: np.ndarray, descriptors1: np.ndarray) -> np.ndarray:
-    """Row (K0,) of the most similar one of other descriptors (K1, D) for each of some (K0, D)."""
-    some = slices(len(descriptors0), _ROWS_AT_ONCE)
-    return np.concatenate([(descriptors0[rows] @ descriptors1.T).argmax(axis=1) for rows in some])
+def mutual_nearest(
+    descriptors0: np.ndarray, descriptors1: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rows (M,) of some descriptors (K0, D) and of others (K1, D), each the most similar one of the
+    other."""
+    found, num = list[np.ndarray](), len(descriptors1)
+    back, best = np.zeros(num, np.int64), np.full(num, -np.inf, np.float32)
+    for rows in slices(len(descriptors0), _ROWS_AT_ONCE):
+        likes = descriptors0[rows] @ descriptors1.T
+        found.append(likes.argmax(axis=1))
+        top = likes.argmax(axis=0)
+        most = likes[top, np.arange(num)]
+        back = np.where(most > best, rows.start + top, back)
+        best = np.maximum(most, best)
+    nearest = np.concatenate(found)
+    rows0 = np.flatnonzero(back[nearest] == np.arange(len(nearest)))
+    return rows0, nearest[rows0]
 
 
 def found_places(
@@ -271,13 +284,11 @@ def _proposals(one: TourFrame, other: TourFrame) -> list[np.ndarray]:
     """Poses f1_T_f0 by descriptors, those with most inliers first."""
     if not (len(one.rays) and len(other.rays)):
         return []
-    nearest = nearest_descriptors(one.descriptors, other.descriptors)
-    back = nearest_descriptors(other.descriptors, one.descriptors)
-    rows = np.flatnonzero(back[nearest] == np.arange(len(nearest)))
-    likes = np.sum(one.descriptors[rows] * other.descriptors[nearest[rows]], axis=1)
-    rows = rows[likes > 0.75]
-    rays0, rays1 = one.rays[rows], other.rays[nearest[rows]]
-    alike = np.maximum(one.alikeness[rows], other.alikeness[nearest[rows]])
+    rows0, rows1 = mutual_nearest(one.descriptors, other.descriptors)
+    likes = np.sum(one.descriptors[rows0] * other.descriptors[rows1], axis=1)
+    rows0, rows1 = rows0[likes > 0.75], rows1[likes > 0.75]
+    rays0, rays1 = one.rays[rows0], other.rays[rows1]
+    alike = np.maximum(one.alikeness[rows0], other.alikeness[rows1])
     level = (rays0[:, 1] < _FLOOR_Y) & (rays1[:, 1] < _FLOOR_Y)
     found = list[tuple[float, np.ndarray]]()
     for limit, above, max_error_deg, num in _PROPOSALS:

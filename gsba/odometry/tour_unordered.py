@@ -29,24 +29,32 @@ from gsba.odometry.tour_maps import (
     matches_of,
     searched,
 )
-from gsba.odometry.tour_order import in_given_order, likeness, most_alike_path
+from gsba.odometry.tour_order import (
+    Likeness,
+    in_given_order,
+    likeness,
+    most_alike_path,
+)
 from gsba.odometry.tour_steps import Step, TourFrame, read_frame
 from gsba.types import FrameSet
 
-MAX_UNORDERED = 60  # most frames whose order is searched: each is compared with all
 _MIN_STEP_SCORE = 15.0  # of the places on both sides of a step, which do not hold it themselves
 _MIN_END_SCORE = 8.0  # of a step beyond which there is one frame
 
 
-def match_stills(run_frames: FrameSet, num_threads: int = 1) -> TourMatches:
-    """Confirmed steps of a tour, in the order of its frames; in another one where neighbours in the
-    order of names are hardly more alike than any frames are, unless no step is confirmed there."""
-    num = len(run_frames)
-    frames = list(map_in_threads(lambda f: read_frame(run_frames, f), num, num_threads))
-    if run_frames.timed or num > MAX_UNORDERED:
-        return match_tour(frames, run_frames.names, num_threads)
-    alike_frames = likeness(frames, num_threads)
-    if in_given_order(alike_frames):
+def likeness_of(run_frames: FrameSet, num_threads: int = 1) -> Likeness:
+    """Likeness of a run's frames."""
+    return Likeness(likeness(_read(run_frames, num_threads), num_threads))
+
+
+def match_stills(
+    run_frames: FrameSet, alike_frames: np.ndarray | None, num_threads: int = 1
+) -> TourMatches:
+    """Confirmed steps of a tour, in the order of its frames; in another one where neighbours are
+    hardly more alike (F, F) than any frames are, unless no step is confirmed there. No likeness:
+    frames are in order."""
+    frames = _read(run_frames, num_threads)
+    if alike_frames is None or in_given_order(alike_frames):
         return match_tour(frames, run_frames.names, num_threads)
     path = most_alike_path(alike_frames)
     given, frames = frames, [frames[f] for f in path]
@@ -57,6 +65,10 @@ def match_stills(run_frames: FrameSet, num_threads: int = 1) -> TourMatches:
         return matches_of(given, run_frames.names, none, chain, sure, [])
     names = tuple(run_frames.names[f] for f in path)
     return replace(matches_of(frames, names, steps, chain, sure, []), order_found=True)
+
+
+def _read(frames: FrameSet, num_threads: int) -> list[TourFrame]:
+    return list(map_in_threads(lambda f: read_frame(frames, f), len(frames), num_threads))
 
 
 def without_unsupported(

@@ -148,6 +148,15 @@ class Start:
             coarse = inputs.coarse_poses(frames, evidence.trajectories, settings)
         return cls(frames, coarse, replace(evidence, families=(*made, *evidence.families)))
 
+    def on(self, frames: FrameSet, settings: RefineSettings) -> "Start":
+        """The start with its frames (F,) as given: with other masks, or stills in another order,
+        for which GPS fixes and families of packages are made anew, as they number frames."""
+        families = self.evidence.families
+        if frames.names != self.frames.names:
+            made = inputs.families_of(frames, settings)
+            families = (*made, *families[len(made) :])
+        return replace(self, frames=frames, evidence=replace(self.evidence, families=families))
+
 
 def refine_from(
     store: RunStore,
@@ -222,34 +231,36 @@ def _begin(store: RunStore, settings: RefineSettings, chosen: merging.Choice, st
     given = not (start.coarse.absent or by_odometry)
     tell_size(settings, start.frames, width, given)
     journal, frames = Journal(), merging.before(store, start.frames, chosen)
-    frames = tour.in_known_order(store, frames, settings)
     if chosen.distractors:
-        frames = _without_distractors(store, settings, replace(start, frames=frames), journal)
-    return Run.begin(store, frames, start.coarse, settings, start.evidence, journal)
+        frames = _without_distractors(store, settings, start.on(frames, settings), journal)
+    start = start.on(tour.in_known_order(store, frames, settings), settings)
+    return Run.begin(store, start.frames, start.coarse, settings, start.evidence, journal)
 
 
 def _without_distractors(
     store: RunStore, settings: RefineSettings, start: Start, journal: Journal
 ) -> FrameSet:
-    """Mask what a first, plainer solution does not explain."""
-    # Drift over the whole path does not show in what frames near one another do not explain.
-    near = tuple(family for family in start.evidence.families if not family.limits_drift)
-    evidence, plainer = replace(start.evidence, imu=None, families=near), settings.plainer()
+    """The frames, in the order given, with masks of what a first, plainer solution does not
+    explain."""
+    plainer = settings.plainer()
     direct.check(start.frames, settings)  # before the first solution, not after
 
     def begin() -> Run:
-        frames = tour.in_known_order(store, start.frames, plainer)
-        return Run.begin(store, frames, start.coarse, plainer, evidence)
+        first = start.on(tour.in_known_order(store, start.frames, plainer), settings)
+        # Drift over the whole path does not show in what frames near one another do not explain.
+        near = tuple(family for family in first.evidence.families if not family.limits_drift)
+        evidence = replace(first.evidence, imu=None, families=near)
+        return Run.begin(store, first.frames, first.coarse, plainer, evidence)
 
     with store.named("first"):
         run, state = _in_order(begin, lambda run: (run, solve(frontend.extract(run))))
-    frames = run.frames
     if state.prior.turning_only:
-        return frames
+        return start.frames
     first = f"first-{run.latest[0]}"
-    frames, counts = merging.after(store, frames, state.solution, first)
+    masked, counts = merging.after(store, run.frames, state.solution, first)
     journal.note("distractors", counts)
-    return frames
+    masks = dict(zip(masked.names, masked.mask_paths, strict=True))
+    return replace(start.frames, mask_paths=tuple(masks[name] for name in start.frames.names))
 
 
 def _solve_raw(run: Run) -> State:

@@ -26,6 +26,7 @@ _TITLES = {
     "clock": "check the trajectory's clock",
     "turn": "prove a turn on the spot",
     "steps": "check the trajectory's steps",
+    "likeness": "compare all stills",
     "tour": "search stills along epipolar lines",
     "features_tour": "add the places found to features",
     "keypoints_tour": "gather keypoints, places found among them",

@@ -15,8 +15,10 @@ from gsba.log import GsbaError
 from gsba.loop_closure import connectivity
 from gsba.matching.recovery import Recovered
 from gsba.odometry.tour_maps import TourMatches
-from gsba.odometry.tour_unordered import match_stills
+from gsba.odometry.tour_order import Likeness, in_given_order, may_lack_order
+from gsba.odometry.tour_unordered import likeness_of, match_stills
 from gsba.pipeline import frontend
+from gsba.pipeline.run import Run
 from gsba.pipeline.state import ObservedFrames, State
 from gsba.store.folder import STAGES
 from gsba.store.store import RunStore, fingerprint
@@ -29,7 +31,7 @@ logger = logging.getLogger(__name__)
 
 _MAX_TIED_SHARE = 0.8  # of frames in maps of descriptors, below which places are searched
 _MIN_INTERVAL_S = 1.5  # between stills metres apart; frames of a video can be had closer together
-_SEARCH, _STAGE = "tour", "features_tour"
+_LIKENESS, _SEARCH, _STAGE = "likeness", "tour", "features_tour"
 
 
 class OrderFoundError(GsbaError):
@@ -64,27 +66,48 @@ def _search(state: State, found: Recovered) -> TourMatches | None:
         or not _may_be_tour(run.frames, run.settings)
     ):
         return None
-    compute, key = partial(match_stills, run.frames, run.num_threads), _search_key(run.frames)
+    key, before, alike = _search_key(run.frames), 0, None
     known = run.store.stored(_SEARCH, key, TourMatches)
     # In an order found by likeness, descriptors match what is only alike.
-    ordered = known is not None and known.order_found
-    before = 0 if ordered else _num_tied(found.neighbours.matches, num)
-    if before > _MAX_TIED_SHARE * num:
-        return None
+    if known is None or not known.order_found:
+        before = _num_tied(found.neighbours.matches, num)
+        tied = before > _MAX_TIED_SHARE * num
+        if tied and _all_match(found.neighbours.matches, num):
+            return None
+        alike = _likeness(run, key)
+        if tied and (alike is None or in_given_order(alike)):
+            return None
     if known is None:
         logger.info(
-            "descriptors tie %d of %d frames in maps of 3 and more: keypoints of neighbours are "
+            "descriptors tie %d of %d frames in maps of 3 and more%s: keypoints of neighbours are "
             "searched along epipolar lines, 8 s of processor time a step, 15 s a door "
             "(--set pairs.max_tour_frames=0 leaves it out)",
             before,
             num,
+            ", but names are in no order" if before > _MAX_TIED_SHARE * num else "",
         )
+    compute = partial(match_stills, run.frames, alike, run.num_threads)
     tour = run.store.stage(_SEARCH, key, compute, TourMatches)
     if tour.names != run.frames.names:
         raise OrderFoundError("the stills are in no order: refine them in the order found")
+    if before and alike is not None and not in_given_order(alike):
+        raise GsbaError(  # neighbours by name match what is only alike
+            "the order of the stills is not known: neighbours by name are hardly more alike than "
+            "any two, and images confirm no other order; rename them in the order of the way, or, "
+            "if they are in it, pass --timestamps or --fps"
+        )
     run.latest.append(_SEARCH)
     run.journal.note(_SEARCH, tour)
     return tour if _num_tied(tour.near.matches, num) > before else None
+
+
+def _likeness(run: Run, key: object) -> np.ndarray | None:
+    """Likeness (F, F) of stills whose names may be in no order; None = they are in order."""
+    frames = run.frames
+    if frames.timed or not may_lack_order(len(frames)):
+        return None
+    compute = partial(likeness_of, frames, run.num_threads)
+    return run.store.stage(_LIKENESS, [key, frames.names], compute, Likeness).alike
 
 
 def in_known_order(store: RunStore, frames: FrameSet, settings: RefineSettings) -> FrameSet:
@@ -121,6 +144,13 @@ def _may_be_tour(frames: FrameSet, settings: RefineSettings) -> bool:
 def _num_tied(matches: Matches, num: int) -> int:
     """Frames of `num` that matches tie to others, in maps of three frames and more."""
     return int(np.count_nonzero(connectivity.maps_of_images(matches.pairs, num) >= 0))
+
+
+def _all_match(matches: Matches, num: int) -> bool:
+    """True if all of `num` frames match the next one and the one after it, as those of a dense walk
+    in order do."""
+    gaps = matches.pairs[:, 1] - matches.pairs[:, 0]
+    return np.count_nonzero(gaps <= 2) == 2 * num - 3
 
 
 def _with_places(state: State, tour: TourMatches) -> tuple[ObservedFrames, Matches]:

@@ -185,6 +185,11 @@ def of_frames(
     notes = []
     if absent.all():
         notes.append("started from pairs of frames: the unit of the map is arbitrary")
+    if absent.all() and not frames.timed:
+        notes.append(
+            "frames have no times: unless poses.csv lists them in the order of the way, a place "
+            "that repeats makes a wrong map"
+        )
     if coarse.time_offset:
         notes.append(f"frame times were shifted by {coarse.time_offset:.6f} s")
     fetched = (

@@ -1,0 +1,141 @@
+"""Stills whose names may be in no order, and what numbers frames in the order found."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
+
+import cv2
+import numpy as np
+import pytest
+from walk_on_earth import geodetic_of
+
+from gsba.bundle.gps_factors import GpsFactors
+from gsba.config import RefineSettings
+from gsba.log import GsbaError
+from gsba.masks import merging
+from gsba.matching.recovery import Recovered
+from gsba.odometry import tour_order
+from gsba.odometry.tour_maps import TourMatches
+from gsba.pipeline import frontend, tour
+from gsba.pipeline.refine import Start, _begin, _without_distractors
+from gsba.pipeline.run import Evidence, Journal
+from gsba.pipeline.state import State
+from gsba.store.store import RunStore
+from gsba.types import Counts, FrameSet, PictureFormat, VerifiedPairs
+
+NAMES, FOUND = ("a", "b", "c", "d", "e"), np.array([3, 0, 4, 1, 2])
+
+
+def stills_named(folder: Path, names: Sequence[str]) -> FrameSet:
+    paths = tuple((folder / f"{name}.png",) for name in names)
+    for (path,) in paths:
+        cv2.imwrite(str(path), np.zeros((32, 64), np.uint8))
+    num, kind = len(names), PictureFormat("erp", 64, 32, ())
+    return FrameSet(tuple(names), paths, np.arange(num * 1.0), (None,) * num, (kind,), timed=False)
+
+
+@pytest.fixture
+def stills(tmp_path: Path) -> FrameSet:
+    return stills_named(tmp_path, NAMES)
+
+
+@pytest.fixture
+def _order_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    def known(store: RunStore, frames: FrameSet, settings: RefineSettings) -> FrameSet:
+        return replace(frames.taken(FOUND), timestamps=np.arange(5.0))
+
+    monkeypatch.setattr(tour, "in_known_order", known)
+
+
+@pytest.mark.usefixtures("_order_is_known")
+def test_fixes_by_name_stay_with_their_stills(stills: FrameSet, tmp_path: Path) -> None:
+    metres = np.random.default_rng(0).normal(0, 30, (5, 3))
+    rows = [
+        f"{name},{latitude:.9f},{longitude:.9f},{altitude:.4f}"
+        for name, (latitude, longitude, altitude) in zip(NAMES, geodetic_of(metres), strict=True)
+    ]
+    table = tmp_path / "gps.csv"
+    table.write_text("\n".join(["name,latitude,longitude,altitude", *rows]))
+    tree = {"factors": ("bearing", "gps"), "gps": {"file": str(table)}}
+    settings = RefineSettings.model_validate(tree)
+    start = Start.of(stills, Evidence(), settings)
+    with RunStore(tmp_path / "run", {"frames": tmp_path}) as store:
+        run = _begin(store, settings, merging.choose(merging.NONE), start)
+    assert run.frames.names == tuple(NAMES[f] for f in FOUND)
+    (before,), (after,) = start.evidence.families, run.evidence.families
+    assert isinstance(before, GpsFactors) and isinstance(after, GpsFactors)
+    np.testing.assert_allclose(after.fixes.positions, before.fixes.positions[FOUND])
+
+
+@pytest.mark.usefixtures("_order_is_known")
+def test_masks_of_a_first_solution_are_of_stills_in_the_order_given(
+    stills: FrameSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """So that the search that follows judges the order given, not one that was found before."""
+
+    def after(
+        store: RunStore, frames: FrameSet, solved: object, stage: str
+    ) -> tuple[FrameSet, Counts]:
+        masks = tuple(tmp_path / f"{name}_mask.png" for name in frames.names)
+        return replace(frames, mask_paths=masks), Counts(5, 5, "frames")
+
+    monkeypatch.setattr(merging, "after", after)
+    monkeypatch.setattr(frontend, "extract", lambda run: run)
+    monkeypatch.setitem(_without_distractors.__globals__, "solve", lambda run: solved)
+    solved = SimpleNamespace(prior=SimpleNamespace(turning_only=False), solution=None)
+    start = Start.of(stills, Evidence(), RefineSettings())
+    with RunStore(tmp_path / "run", {"frames": tmp_path}) as store:
+        masked = _without_distractors(store, RefineSettings(), start, Journal())
+    assert masked.names == NAMES and masked.timestamps.tolist() == stills.timestamps.tolist()
+    assert masked.mask_paths == tuple(tmp_path / f"{name}_mask.png" for name in NAMES)
+
+
+def match_nothing(stills: FrameSet) -> TourMatches:
+    """Stills whose steps no places confirm, in the order given."""
+    num, none = len(stills), np.zeros(0)
+    near = VerifiedPairs.none()
+    starts, open_logs = np.zeros(num + 1, np.int64), np.full(num - 2, np.inf)
+    return TourMatches(
+        starts, none.reshape(0, 3), none, near, np.zeros(num - 2), open_logs, stills.names
+    )
+
+
+def neighbours_tied(
+    stills: FrameSet, store: RunStore, unmatched: tuple[int, int] | None
+) -> tuple[State, Recovered]:
+    """A state whose descriptors tie all stills by name, with or without a pair that matches not."""
+    some = [(f, f + gap) for gap in (1, 2) for f in range(len(stills) - gap)]
+    pairs = np.array([pair for pair in some if pair != unmatched])
+    near = SimpleNamespace(matches=SimpleNamespace(pairs=pairs))
+    trust = SimpleNamespace(turning_only=False)
+    run = SimpleNamespace(frames=stills, settings=RefineSettings(), store=store, num_threads=1)
+    state = SimpleNamespace(prior=SimpleNamespace(absent=True), run=run)
+    return cast(State, state), cast(Recovered, SimpleNamespace(neighbours=near, trust=trust))
+
+
+@pytest.mark.parametrize(
+    ("shuffled", "unmatched"), [(True, (5, 6)), (True, (5, 7)), (False, (5, 6)), (True, None)]
+)
+def test_what_is_only_alike_makes_no_map_of_stills_in_no_order(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    shuffled: bool,
+    unmatched: tuple[int, int] | None,
+) -> None:
+    """A hall of bays: each frame is as alike to those a bay away as to its neighbours."""
+    stills, numbers = stills_named(tmp_path, "abcdefghijkl"), np.arange(12)
+    way = np.random.default_rng(0).permutation(numbers) if shuffled else numbers
+    gaps = np.abs(np.subtract.outer(way, way))
+    alike = (2 + np.cos(2 * np.pi * gaps / 3)) * np.exp(-gaps / 8.0)
+    nothing = match_nothing(stills)
+    monkeypatch.setattr(tour, "likeness_of", lambda *_: tour_order.Likeness(alike))
+    monkeypatch.setattr(tour, "match_stills", lambda *_: nothing)
+    with RunStore(tmp_path / "run", {"frames": tmp_path}) as store:
+        given = neighbours_tied(stills, store, unmatched)
+        if shuffled and unmatched:
+            with pytest.raises(GsbaError, match="the order of the stills is not known"):
+                tour.match_places(*given)
+        else:
+            assert tour.match_places(*given) is None
