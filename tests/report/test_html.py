@@ -14,13 +14,13 @@ import cv2
 import export_scene as scene
 import numpy as np
 import pytest
+from refusals import refused
 from scipy.spatial.transform import Rotation
 
 from gsba.camera.cameras import ONE_CAMERA
 from gsba.camera.sphere import bearings_from_erp
 from gsba.config import RefineSettings
 from gsba.disk import write_image
-from gsba.log import GsbaError
 from gsba.report.html import add_scan, add_splats, figures, pictures, residual_sphere, write_html
 from gsba.report.html.patches import worst_patches
 from gsba.report.report import Findings, StageLog, build_report
@@ -340,8 +340,7 @@ def test_distances_to_a_scan_are_added(page: Path, tmp_path: Path) -> None:
         assert _run_script(path)[0] == 6
     add_scan(tmp_path / "none.html", {})  # no page, nothing to do
     path.write_text("<html>")
-    with pytest.raises(GsbaError, match="is not the report page of a run"):
-        add_scan(path, {})
+    refused("is not the report page of a run", add_scan, path, {})
 
 
 def _over(path: Path) -> list[tuple[str, int]]:
