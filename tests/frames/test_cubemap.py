@@ -108,9 +108,9 @@ def test_automatic_size_follows_the_panoramas_density(oversampling: float) -> No
 
 
 def test_sizes_can_be_set_and_bounded() -> None:
-    for least, most in ((300, 300), (256, 700)):
+    for width, least, most, size in ((8192, 256, 700, 700), (512, 300, 700, 300)):
         settings = CubemapSettings(min_face_size=least, max_face_size=most)
-        assert cubemap.rig_for(PictureFormat("erp", 8192, 4096), settings).size == most
+        assert cubemap.rig_for(PictureFormat("erp", width, width // 2), settings).size == size
 
 
 def test_cube_frames_keep_their_own_faces_up_to_the_size_of_panoramas() -> None:
