@@ -3,6 +3,7 @@
 import functools
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,6 +18,7 @@ from gsba.camera.lens import Lenses
 from gsba.camera.rig import RIG_R_FACE
 from gsba.camera.sphere import erp_directions
 from gsba.disk import encoded_image, write_bytes, write_image
+from gsba.export import ExportFormat, export
 from gsba.geometry import inverse, pose
 from gsba.store.records import save_record
 from gsba.types import FACES, FrameSet, PictureFormat, Reconstruction
@@ -141,6 +143,15 @@ def panoramas(
         cv2.imwrite(str(mask_path), (directions[..., 1] < 0.6).astype(np.uint8) * 255)
     paths = [(folder / f"{name}{suffix}",) for name in names]
     return frames_of(PictureFormat("erp", WIDTH, HEIGHT), paths, TIMES, names, mask_path)
+
+
+def exported(
+    folder: Path, to: ExportFormat, *given: Any, frames: FrameSet | None = None, **options: Any
+) -> Path:
+    """Folder `out` with an export of the scene, of panoramas that lie beside it or other frames."""
+    frames = frames or panoramas(folder / "frames")
+    export(reconstruction(), frames, folder / "out", to, *given, **options)
+    return folder / "out"
 
 
 def cube_frames(folder: Path, size: int = 128) -> FrameSet:

@@ -98,6 +98,18 @@ class BallWorld:
             values.insert(f, gtsam.Pose3(pose))
         return values
 
+    def of(
+        self, table: PatchTable, images: dict[int, np.ndarray] | None = None, margin: float = 6.0
+    ) -> "BallWorld":
+        """The world with these patches, cut from its images or, of some frames, from others."""
+        shown = list(self.images)
+        for f, grey in (images or {}).items():
+            shown[f] = SphereImage.of(grey)
+        pixels = PatchPixels(table, self.world_T_rigs, self.pixels.width, margin)
+        for f, image in enumerate(shown):
+            pixels.take(f, image)
+        return BallWorld(self.world_T_rigs, shown, pixels, self.grey)
+
 
 def distances_to_ball(world_T_rig: np.ndarray, bearings: np.ndarray) -> np.ndarray:
     """Distances (...,) along bearings (..., 3) of a rig inside the ball."""

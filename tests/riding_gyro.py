@@ -5,10 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from gsba.imu.alignment import Alignment, align
 from gsba.imu.readings import Readings
 
 BIAS = np.deg2rad([0.6, -0.4, 0.3])  # rad/s
 IMU_R_RIG = Rotation.from_rotvec([2.0, -0.7, 1.1]).as_matrix()
+SIGMA = np.deg2rad(0.1)  # of turns that images show, per axis
 OFFSET_S = 7.31  # the sensor's clock is ahead
 UP = np.array([0.1, -0.9, 0.2]) / np.linalg.norm([0.1, -0.9, 0.2])  # in the world
 _SWINGS = np.array([[7.0, 1.2, 1.0], [11.0, 0.8, 0.8], [5.0, 1.5, 1.2]])  # degrees, about axes
@@ -54,3 +56,11 @@ class Ride:
 def ride(num_frames: int = 50, interval_s: float = 0.5, seed: int = 0) -> Ride:
     """A ride with evenly spaced frames."""
     return Ride(100.0 + interval_s * np.arange(num_frames), seed)
+
+
+def aligned(
+    on: Ride, readings: Readings, sigma: float = SIGMA, former: Alignment | None = None
+) -> Alignment:
+    """Alignment of readings with all turns of a ride, as images with a noise show them."""
+    known = np.ones(len(on.timestamps) - 1, bool)
+    return align(on.timestamps, on.steps(sigma), known, readings, former)

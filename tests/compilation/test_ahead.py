@@ -73,7 +73,7 @@ def test_writing_signatures_gives_the_same_file(
 def test_a_first_run_calls_only_recorded_kernels(tmp_path: Path) -> None:
     """Else it would compile in the foreground: `python benchmarks/cold.py --record`."""
     out = str(tmp_path / "demo")
-    told = run(CALLED, "demo", "--frames", "12", "--width", "512", "--out", out)
+    told = run(CALLED, "demo", "--frames", "10", "--width", "384", "--out", out)
     called = {json.dumps(row) for row in json.loads(told.splitlines()[-1])}
     recorded = {
         json.dumps([name, list(map(str, types))])

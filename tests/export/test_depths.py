@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
-from export_scene import HEIGHT, NUM_FRAMES, POINTS, WIDTH, panoramas, reconstruction
+from export_scene import HEIGHT, NUM_FRAMES, POINTS, WIDTH, exported, panoramas, reconstruction
 from scipy.spatial.transform import Rotation
 from synthetic import unit
 
@@ -29,8 +29,7 @@ def _nerfstudio_map(path: Path, width: int, height: int, scale_factor: float = 1
 
 
 def test_nerfstudio_reads_the_depth_of_each_point(tmp_path: Path) -> None:
-    frames, out = panoramas(tmp_path / "frames"), tmp_path / "out"
-    export(reconstruction(), frames, out, ExportFormat.NERFSTUDIO, 96, depths=True)
+    out = exported(tmp_path, ExportFormat.NERFSTUDIO, 96, depths=True)
     meta = json.loads((out / "transforms.json").read_text())
     world = np.array(meta["applied_transform"])[:, :3]
     found = 0
@@ -54,8 +53,7 @@ def test_nerfstudio_reads_the_depth_of_each_point(tmp_path: Path) -> None:
 @pytest.mark.parametrize("to", ["colmap", "colmap-flat"])
 def test_depths_beside_a_colmap_model_are_those_of_its_points(to: str, tmp_path: Path) -> None:
     """Of each image of the model, the same points in the same pixels as in images.bin."""
-    frames, out = panoramas(tmp_path / "frames"), tmp_path / "out"
-    export(reconstruction(), frames, out, ExportFormat(to), 64, depths=True)
+    out = exported(tmp_path, ExportFormat(to), 64, depths=True)
     model = pycolmap.Reconstruction(out / "sparse/0")
     files = {
         path.relative_to(out / "sparse_depths") for path in out.rglob("sparse_depths/**/*.npz")
@@ -77,19 +75,12 @@ def test_depths_beside_a_colmap_model_are_those_of_its_points(to: str, tmp_path:
 
 def test_standard_deviations_of_points_are_those_of_their_errors() -> None:
     """Points estimated from noisy bearings: errors over standard deviations have variance 1."""
-    scene, rng = reconstruction(), np.random.default_rng(0)
-    points = np.tile(scene.points_world, (40, 1)) * rng.uniform(0.5, 3, (360, 1))
-    frames = np.tile(np.arange(NUM_FRAMES, dtype=np.int32), len(points))
-    numbers = np.repeat(np.arange(len(points), dtype=np.int32), NUM_FRAMES)
-    poses, sigma = scene.world_T_rigs, 2e-3
-    rays = unit(points[numbers] - poses[frames, :3, 3])
+    rng, sigma = np.random.default_rng(0), 2e-3
+    points, frames, numbers, rays = _many(rng, 40, 0.5, 3)
     noise = rng.normal(0, sigma, rays.shape)
-    noisy = unit(rays + noise - np.sum(noise * rays, axis=1, keepdims=True) * rays)
-    found = _triangulated(poses[frames, :3, 3], noisy, numbers, points)
-    bearings = np.einsum("oji,oj->oi", poses[frames][:, :3, :3], noisy)
-    estimated = replace(_observed(scene, numbers, frames, bearings, sigma), points_world=found)
+    estimated = _estimated(points, frames, numbers, rays, noise, sigma)
     deviations = np.linalg.cholesky(np.linalg.inv(point_covariances(estimated)))
-    whitened = np.einsum("jba,jb->ja", deviations, found - points)
+    whitened = np.einsum("jba,jb->ja", deviations, estimated.points_world - points)
     # 1080 numbers: the standard deviation of their mean square is 0.043.
     assert np.mean(whitened**2) == pytest.approx(1, abs=0.17)
 
@@ -126,27 +117,49 @@ def test_shifts_that_grow_along_tracks_are_errors_of_depths(shift: float) -> Non
     """Observations of each point are shifted in proportion to the change of its viewing direction,
     as patches that show other surfaces, too: errors are then many times those of independent noise.
     They stay as far below `sigma`, for these shifts are as large across baselines as along."""
-    scene, rng, sigma = reconstruction(), np.random.default_rng(0), 1e-4
-    points = np.tile(scene.points_world, (80, 1)) * rng.uniform(0.8, 1.25, (720, 1))
-    frames = np.tile(np.arange(NUM_FRAMES, dtype=np.int32), len(points))
-    numbers = np.repeat(np.arange(len(points), dtype=np.int32), NUM_FRAMES)
-    poses = scene.world_T_rigs
-    rays = unit(points[numbers] - poses[frames, :3, 3])
+    rng, sigma = np.random.default_rng(0), 1e-4
+    points, frames, numbers, rays = _many(rng, 80, 0.8, 1.25)
     means = rays.reshape(len(points), NUM_FRAMES, 3).mean(axis=1)
-    moved = np.einsum(
-        "oij,oj->oi", rng.normal(0, shift, (len(points), 3, 3))[numbers], rays - means[numbers]
-    )
+    turns = rng.normal(0, shift, (len(points), 3, 3))[numbers]
+    moved = np.einsum("oij,oj->oi", turns, rays - means[numbers])
     moved += rng.normal(0, sigma, rays.shape)
-    noisy = unit(rays + moved - np.sum(moved * rays, axis=1, keepdims=True) * rays)
-    found = _triangulated(poses[frames, :3, 3], noisy, numbers, points)
-    bearings = np.einsum("oji,oj->oi", poses[frames][:, :3, :3], noisy)
-    estimated = replace(_observed(scene, numbers, frames, bearings, sigma), points_world=found)
-    axes = poses[frames, :3, 2]
-    errors = np.sum(axes * (found - points)[numbers], axis=1)
+    estimated = _estimated(points, frames, numbers, rays, moved, sigma)
+    axes = estimated.world_T_rigs[frames, :3, 2]
+    errors = np.sum(axes * (estimated.points_world - points)[numbers], axis=1)
     alone = np.einsum("oi,oij,oj->o", axes, point_covariances(estimated)[numbers], axes)
     off = np.median(np.abs(errors) / np.sqrt(depth_variances(estimated, axes))) / 0.6745
     assert off == pytest.approx(1 / 1.8, rel=0.2)
     assert (np.median(np.abs(errors) / np.sqrt(alone)) > 5) == (shift > 0)
+
+
+def _many(
+    rng: np.random.Generator, copies: int, nearest: float, farthest: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The scene's points many times at other distances; frame, point and ray of each sighting."""
+    scene = reconstruction()
+    num = copies * len(POINTS)
+    points = np.tile(scene.points_world, (copies, 1)) * rng.uniform(nearest, farthest, (num, 1))
+    frames = np.tile(np.arange(NUM_FRAMES, dtype=np.int32), num)
+    numbers = np.repeat(np.arange(num, dtype=np.int32), NUM_FRAMES)
+    rays = unit(points[numbers] - scene.world_T_rigs[frames, :3, 3])
+    return points, frames, numbers, rays
+
+
+def _estimated(
+    points: np.ndarray,
+    frames: np.ndarray,
+    numbers: np.ndarray,
+    rays: np.ndarray,
+    errors: np.ndarray,
+    sigma: float,
+) -> Reconstruction:
+    """A map of points that are triangulated from rays in error."""
+    scene = reconstruction()
+    poses = scene.world_T_rigs[frames]
+    noisy = unit(rays + errors - np.sum(errors * rays, axis=1, keepdims=True) * rays)
+    found = _triangulated(poses[:, :3, 3], noisy, numbers, points)
+    bearings = np.einsum("oji,oj->oi", poses[:, :3, :3], noisy)
+    return replace(_observed(scene, numbers, frames, bearings, sigma), points_world=found)
 
 
 def _observed(

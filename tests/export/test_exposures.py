@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from export_scene import NUM_FRAMES, panoramas, reconstruction
+from export_scene import NUM_FRAMES, exported, panoramas, reconstruction
 from PIL import Image
 
 from gsba.disk import write_image
@@ -88,8 +88,7 @@ def test_an_interrupted_export_does_not_go_on_as_one_without_exposures(
 def test_images_that_hold_no_exif_are_told(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    frames, out = panoramas(tmp_path / "frames"), tmp_path / "out"
-    export(reconstruction(), frames, out, ExportFormat.COLMAP_FLAT, 64, exposures=True)
+    out = exported(tmp_path, ExportFormat.COLMAP_FLAT, 64, exposures=True)
     assert json.loads((out / "exposures.json").read_text())
     assert "exposures are in exposures.json alone: no image is a JPEG" in caplog.text
     assert how_to_start("gsplat", out)[1:] == []

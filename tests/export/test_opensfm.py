@@ -15,6 +15,7 @@ from export_scene import (
     WIDTH,
     assert_blob,
     cube_frames,
+    exported,
     panoramas,
     reconstruction,
 )
@@ -65,8 +66,7 @@ def test_opensfm_sees_points_where_the_panoramas_do(tmp_path: Path) -> None:
 
 
 def test_tracks_are_the_observations_of_the_points(tmp_path: Path) -> None:
-    frames, out = panoramas(tmp_path / "frames"), tmp_path / "out"
-    export(reconstruction(), frames, out, ExportFormat.OPENSFM)
+    out = exported(tmp_path, ExportFormat.OPENSFM)
     project = _read(out)
     header, *lines = (out / "tracks.csv").read_text().splitlines()
     assert header == "OPENSFM_TRACKS_VERSION_v2"
@@ -89,8 +89,7 @@ def test_z_points_up_and_the_placement_says_so(up: str | None, tmp_path: Path) -
     move = Sim3(2.0, axes.get(up or "", np.eye(3)), np.array([1.0, 2, 3]))
     origin = (46.5, 7.25, 800.0) if up == "z" else None
     placement = Placement(move, up=up, origin=origin)
-    frames, out = panoramas(tmp_path / "frames"), tmp_path / "out"
-    export(reconstruction(), frames, out, ExportFormat.OPENSFM, placement=placement)
+    out = exported(tmp_path, ExportFormat.OPENSFM, placement=placement)
     project = _read(out)
     points = np.array([project["points"][str(j)]["coordinates"] for j in range(len(POINTS))])
     heights = points[:, 2] - points[:, 2].mean()

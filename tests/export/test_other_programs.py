@@ -15,6 +15,7 @@ from export_scene import (
     POINTS,
     assert_blob,
     cube_frames,
+    exported,
     moved_by_velocities,
     panoramas,
     poses,
@@ -197,8 +198,7 @@ def test_rigs_without_a_common_up_stay_in_a_world_whose_y_points_down(tmp_path: 
 @pytest.mark.parametrize("up", ["-y", "y", "z"])
 def test_nerfstudio_gets_a_world_whose_z_points_up(up: str, tmp_path: Path) -> None:
     placement = Placement(Sim3(rotation=_WORLD_R_LEVEL[up]), up=up)
-    frames, out = panoramas(tmp_path / "frames"), tmp_path / "out"
-    export(reconstruction(), frames, out, ExportFormat.NERFSTUDIO, 64, placement)
+    out = exported(tmp_path, ExportFormat.NERFSTUDIO, 64, placement)
     vertices = read_vertices(out / "points3D.ply")
     np.testing.assert_allclose(np.sort(vertices["z"]), np.sort(-POINTS[:, 1]), atol=1e-5)
 

@@ -50,6 +50,7 @@ RAW = Lenses(
     readout_motion=TWISTS,
     reference_calibration=PAIR,
 )
+ROWS = np.arange(4)  # of frames, where a few are as good as all
 PANORAMAS = {"two centres": TWO, "turned below the panorama": TURNED}
 
 
@@ -94,10 +95,11 @@ def _check_erp(image: np.ndarray, lenses: Lenses, f: int) -> int:
 def test_things_lie_where_one_camera_has_them(name: str, tmp_path: Path) -> None:
     lenses = PANORAMAS.get(name, RAW)
     frames = _raw_frames(tmp_path) if name == "raw" else panoramas(tmp_path, lenses=lenses)
-    to = ExportFormat.COLMAP_ERP
-    export(_scene(lenses), frames, tmp_path / "out", to, lenses=lenses, images="panorama")
+    scene, frames, to = _scene(lenses).taken(ROWS), frames.taken(ROWS), ExportFormat.COLMAP_ERP
+    lenses = lenses.taken(ROWS)
+    export(scene, frames, tmp_path / "out", to, lenses=lenses, images="panorama")
     model = pycolmap.Reconstruction(tmp_path / "out/sparse/0")
-    assert model.num_cameras() == 1 and model.num_images() == NUM_FRAMES
+    assert model.num_cameras() == 1 and model.num_images() == len(ROWS)
     assert model.compute_mean_reprojection_error() < 1e-4
     looked = 0
     for image in model.images.values():
@@ -105,16 +107,16 @@ def test_things_lie_where_one_camera_has_them(name: str, tmp_path: Path) -> None
         pixels = _image(tmp_path / "out/images" / image.name)
         np.testing.assert_allclose(image.projection_center(), poses()[f, :3, 3], atol=1e-9)
         looked += _check_erp(pixels, lenses, f)
-    assert looked > 2 * NUM_FRAMES
+    assert looked > 2 * len(ROWS)
 
 
 def test_all_formats_hold_the_same_panoramas(tmp_path: Path) -> None:
-    frames = panoramas(tmp_path / "frames", masked=True, lenses=TWO)
+    frames = panoramas(tmp_path / "frames", masked=True, lenses=TWO).taken(ROWS)
     for to in (ExportFormat.COLMAP_ERP, ExportFormat.NERFSTUDIO, ExportFormat.TUM):
-        export(_scene(TWO), frames, tmp_path / to, to, lenses=TWO, images="panorama")
+        export(_scene(TWO).taken(ROWS), frames, tmp_path / to, to, lenses=TWO, images="panorama")
     meta = json.loads((tmp_path / "nerfstudio/transforms.json").read_text())
     assert meta["camera_model"] == "EQUIRECTANGULAR" and (meta["w"], meta["h"]) == (512, 256)
-    assert len(meta["frames"]) == NUM_FRAMES
+    assert len(meta["frames"]) == len(ROWS)
     for entry in meta["frames"]:
         name = Path(entry["file_path"]).name
         exported = (tmp_path / "nerfstudio" / entry["file_path"]).read_bytes()
@@ -123,9 +125,9 @@ def test_all_formats_hold_the_same_panoramas(tmp_path: Path) -> None:
             assert (tmp_path / other / "images" / name).read_bytes() == exported
         assert (tmp_path / "colmap-erp/masks" / f"{name}.png").read_bytes() == mask
     rows = list(csv.reader((tmp_path / "tum/images/timestamps.csv").open()))
-    assert rows[0] == ["name", "timestamp"] and len(rows) == NUM_FRAMES + 1
+    assert rows[0] == ["name", "timestamp"] and len(rows) == len(ROWS) + 1
     kept = read_trajectory(tmp_path / "tum/trajectory.tum")
-    np.testing.assert_allclose(kept.world_T_rigs, poses(), atol=1e-6)
+    np.testing.assert_allclose(kept.world_T_rigs, poses()[ROWS], atol=1e-6)
     np.testing.assert_allclose(kept.timestamps, [float(row[1]) for row in rows[1:]])
 
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
-from export_scene import NUM_FRAMES, POINTS, panoramas, reconstruction
+from export_scene import NUM_FRAMES, POINTS, exported, panoramas, reconstruction
 from refusals import refused
 
 from gsba.camera.projections import PerspectiveProjection
@@ -147,8 +147,7 @@ def test_photos_that_would_overwrite_one_another_are_refused(located: Path, tmp_
 
 def test_nerfstudio_has_intrinsics_of_each_frame(located: Path, tmp_path: Path) -> None:
     photos = read_photos(located, tmp_path / "run")
-    frames, out = panoramas(tmp_path / "frames"), tmp_path / "out"
-    export(reconstruction(), frames, out, ExportFormat.NERFSTUDIO, photos=photos)
+    out = exported(tmp_path, ExportFormat.NERFSTUDIO, photos=photos)
     document = json.loads((out / "transforms.json").read_text())
     assert "fl_x" not in document and "k1" not in document
     assert all({"fl_x", "cx", "w", "k1"} <= entry.keys() for entry in document["frames"])

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
-from export_scene import panoramas, reconstruction
+from export_scene import exported, panoramas, reconstruction
 
 from gsba.export import ExportFormat, export
 from gsba.export.split import TRAIN_LIST, DatasetSplit, add_images, split_of
@@ -113,8 +113,7 @@ def test_readers_by_name_by_number_and_by_list_hold_the_same_panoramas_out(tmp_p
 
 def test_images_of_the_file_are_in_the_order_of_the_split(tmp_path: Path) -> None:
     """LichtFeld counts images as they come in images.bin."""
-    frames, out = panoramas(tmp_path / "frames"), tmp_path / "out"
-    export(reconstruction(), frames, out, ExportFormat.COLMAP_FLAT, face_size=16)
+    out = exported(tmp_path, ExportFormat.COLMAP_FLAT, face_size=16)
     content = (out / "sparse/0/images.bin").read_bytes()
     (num,), at, names = struct.unpack_from("<Q", content), 8, list[str]()
     for _ in range(num):
@@ -127,7 +126,6 @@ def test_images_of_the_file_are_in_the_order_of_the_split(tmp_path: Path) -> Non
 
 
 def test_without_a_split_names_are_those_of_frames(tmp_path: Path) -> None:
-    frames, out = panoramas(tmp_path / "frames"), tmp_path / "out"
-    export(reconstruction(), frames, out, ExportFormat.COLMAP_FLAT, face_size=16, split=False)
+    out = exported(tmp_path, ExportFormat.COLMAP_FLAT, face_size=16, split=False)
     assert (out / "images/frame_0000_front.png").is_file()
     assert not (out / "test_list.txt").exists() and not (out / "sparse/0/test.txt").exists()

@@ -296,7 +296,7 @@ def test_optimum_is_that_of_gtsam_on_the_same_factors(kind: str) -> None:
     camera, graph = block.camera, _priors(values, block.camera)
     tight = SolverOptions(relative_tolerance=1e-13, absolute_tolerance=None, max_iterations=100)
     found = optimize(graph, values, [block], tight)
-    whole, start = gtsam.NonlinearFactorGraph(graph), gtsam.Values(values)
+    whole, start = gtsam.NonlinearFactorGraph(graph), gtsam.Values(found.values)
     for j, point in enumerate(block.points_world):
         start.insert(L(j), gtsam.Point3(*point))
     for row in range(len(frames)):

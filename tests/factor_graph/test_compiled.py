@@ -3,10 +3,7 @@
 import ast
 import importlib
 import inspect
-import os
 import re
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from textwrap import dedent
@@ -24,16 +21,6 @@ MODULES = sorted(
     for path in (ROOT / folder).rglob("*.py")
     if re.search(r"^@_?(kernel|part)$", path.read_text(), re.MULTILINE)
 )
-PROGRAM = """
-import numpy as np
-from gsba.log import show_log
-show_log()
-from gsba.bundle.tracks import _merge
-for kind in (np.int32, np.int64):
-    nodes = np.arange(2, dtype=kind)
-    _merge(np.zeros((1, 2), kind), np.zeros(2, np.int32), nodes, nodes.copy(), np.ones_like(nodes))
-"""
-
 ROUNDED_ELSEWHERE = {"sum", "mean", "dot", "cross", "std", "var", "prod", "trace", "outer", "norm"}
 
 
@@ -88,16 +75,6 @@ def test_a_part_that_returns_an_array_is_refused() -> None:
 
     with pytest.raises(Exception, match="given returns an array"):
         outer(np.zeros(2))
-
-
-def test_compilation_is_announced_once_per_machine(tmp_path: Path) -> None:
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "NUMBA_CACHE_DIR": str(tmp_path)}
-    environment.pop("NUMBA_DISABLE_JIT", None)
-    command = [sys.executable, "-c", PROGRAM]
-    given = {"env": environment, "capture_output": True, "text": True, "check": True}
-    first, second = (subprocess.run(command, **given).stderr for _ in range(2))
-    assert first.count("compiling kernels, once per machine") == 1
-    assert second == ""
 
 
 def test_errors_of_numbas_own_functions_reach_the_caller() -> None:

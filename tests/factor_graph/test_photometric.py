@@ -67,10 +67,7 @@ def through_lenses(world: BallWorld, seed: int = 0) -> BallWorld:
         return np.array([gtsam.Pose3.Expmap(step).matrix() for step in steps])
 
     seen = PatchViews(views(len(table)), views(len(table.targets)))
-    pixels = PatchPixels(replace(table, views=seen), world.world_T_rigs, world.pixels.width, 30.0)
-    for f, image in enumerate(world.images):
-        pixels.take(f, image)
-    return replace(world, pixels=pixels)
+    return world.of(replace(table, views=seen), margin=30.0)
 
 
 def reference_graph(world: BallWorld, loss: RobustLoss) -> gtsam.NonlinearFactorGraph:
@@ -123,9 +120,7 @@ def test_jacobians(bearing: tuple[float, ...], spread: float) -> None:
     table = table_of(
         world.world_T_rigs, np.array([0]), unit(np.array([bearing], dtype=float)), 512, 9
     )
-    world = replace(world, pixels=PatchPixels(table, world.world_T_rigs, 512))
-    for f, image in enumerate(world.images):
-        world.pixels.take(f, image)
+    world = world.of(table)
     values = world.values()
     values.insert(PLANE, table.planes[0] * [1.02, 1.0, 1.0])
     factor = reference(world, 0, 0, RobustLoss())
@@ -182,8 +177,6 @@ def test_gradient_is_that_of_the_eliminated_cost(lenses: bool) -> None:
             assert system.gradient[f, k] == pytest.approx(
                 numerical, abs=2e-4 * np.abs(system.gradient).max()
             )
-    total = system.gradient.sum(axis=0)  # moving all frames along one rig axis is no gauge
-    assert np.isfinite(total).all()
 
 
 def test_block_its_factor_and_stock_gtsam_end_at_one_optimum() -> None:
@@ -263,11 +256,8 @@ def test_planes_of_normals() -> None:
 
 def test_textureless_and_saturated_frames_stay_finite() -> None:
     world = make_ball_world(10, 4, 60)
-    for f, grey in ((1, np.zeros((256, 512))), (2, np.full((256, 512), 255.0))):
-        world.images[f] = SphereImage.of(grey)
-    world.pixels = PatchPixels(world.pixels.table, world.world_T_rigs, 512)
-    for f, image in enumerate(world.images):
-        world.pixels.take(f, image)
+    blank = {1: np.zeros((256, 512)), 2: np.full((256, 512), 255.0)}
+    world = world.of(world.pixels.table, blank)
     block = block_of(world)
     system = block.linearize(world.values())
     for array in (system.diagonal, system.off_diagonal, system.gradient):
@@ -302,16 +292,12 @@ def test_no_step_takes_a_plane_behind_its_host() -> None:
 
 def test_a_frame_can_be_weighted_down() -> None:
     world = make_ball_world(13, 4, 80)
-    wrong = moved(world, 7, 0.0, 0.0)
-    world.images[3] = SphereImage.of(np.roll(world.grey[3], 2, axis=1))  # turned by two pixels
-    world.pixels = PatchPixels(world.pixels.table, world.world_T_rigs, 512)
-    for f, image in enumerate(world.images):
-        world.pixels.take(f, image)
-    block = block_of(world)
-    full = block.linearize(world.values(wrong)).diagonal[3].copy()
+    turned = {3: np.roll(world.grey[3], 2, axis=1)}  # by two pixels
+    block = block_of(world.of(world.pixels.table, turned))
+    full = block.linearize(world.values()).diagonal[3].copy()
     block.weigh(np.array([1, 1, 1, 0.01]))
-    block.refresh(world.values(wrong))
-    left = block.linearize(world.values(wrong)).diagonal[3]
+    block.refresh(world.values())
+    left = block.linearize(world.values()).diagonal[3]
     # not by 100 exactly: priors on the planes keep their weight
     assert 0.005 < np.trace(left) / np.trace(full) < 0.03
 

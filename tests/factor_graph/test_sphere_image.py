@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates, spline_filter
+from synthetic import unit
 
 from factors.sphere_image import SphereImage
 from gsba.camera.sphere import bearings_from_erp, erp_directions
@@ -18,15 +19,10 @@ def _smooth(bearings: np.ndarray) -> np.ndarray:
     return 100 + 50 * x * y + 30 * np.sin(3 * z) + 40 * bearings @ DIRECTION
 
 
-def _unit(rng: np.random.Generator, num: int) -> np.ndarray:
-    vectors = rng.normal(size=(num, 3))
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
-
-
 def _places() -> dict[str, np.ndarray]:
     rng = np.random.default_rng(0)
     near = 0.05 * rng.normal(size=(200, 3))
-    places = {"anywhere": _unit(rng, 500)}
+    places = {"anywhere": unit(rng.normal(size=(500, 3)))}
     for name, axis in {"seam": [0, 0, -1], "top": [0, -1, 0], "bottom": [0, 1, 0]}.items():
         places[name] = near + axis
     return places
@@ -37,9 +33,8 @@ def test_follows_a_smooth_function(place: str) -> None:
     vectors = _places()[place]
     image = SphereImage.of(_smooth(erp_directions(WIDTH)))
     values, _ = image.sample(vectors)
-    bearings = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
     # An order-4 spline: (2 pi / 128)^4 of the fourth derivative, here up to about 3000.
-    np.testing.assert_allclose(values, _smooth(bearings), atol=2e-2)
+    np.testing.assert_allclose(values, _smooth(unit(vectors)), atol=2e-2)
 
 
 def test_passes_through_pixels() -> None:
@@ -62,7 +57,7 @@ def test_turning_the_panorama_changes_nothing_but_longitude() -> None:
     pixels = np.random.default_rng(4).uniform(0, 255, (HEIGHT, WIDTH))
     shift = 37
     turned = SphereImage.of(np.roll(pixels, shift, axis=1))
-    bearings = _unit(np.random.default_rng(5), 300)
+    bearings = unit(np.random.default_rng(5).normal(size=(300, 3)))
     angle = 2 * np.pi * shift / WIDTH
     c, s = np.cos(angle), np.sin(angle)
     rotation = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
@@ -88,7 +83,7 @@ def test_gradient_is_the_derivative(place: str) -> None:
 
 
 def test_gradient_lies_across_the_vector() -> None:
-    vectors = 3.0 * _unit(np.random.default_rng(6), 100)
+    vectors = 3.0 * unit(np.random.default_rng(6).normal(size=(100, 3)))
     _, gradients = SphereImage.of(_smooth(erp_directions(WIDTH))).sample(vectors)
     np.testing.assert_allclose(np.einsum("ni,ni->n", gradients, vectors), 0, atol=1e-9)
 

@@ -101,25 +101,7 @@ def test_gradient_is_that_of_the_cost(loss: str, apart: bool) -> None:
                 other[f] = at[f].retract(sign * 1e-6 * np.eye(6)[i])
                 costs.append(block.costs(values_of(other))["splat"])
             expected = (costs[0] - costs[1]) / 2e-6
-            assert gradient[f, i] == pytest.approx(expected, abs=1e-3 * np.abs(gradient).max())
-
-
-@pytest.mark.parametrize("apart", [False, True])
-def test_jacobians_of_the_residuals(apart: bool) -> None:
-    poses = truth(1)
-    block = block_at(poses, apart=apart)
-    block.refresh(values_of(moved(poses, 0.03)))
-    row = np.r_[poses[0].matrix()[:3, :3].ravel(), poses[0].matrix()[:3, 3]]
-    _, analytic, _ = block._residuals(0, row, True)
-    numerical = np.empty_like(analytic)
-    for i in range(6):
-        pair = []
-        for sign in (1, -1):
-            pose = poses[0].retract(sign * 1e-6 * np.eye(6)[i])
-            pair.append(block.residuals(values_of([pose]))[0])
-        numerical[:, i] = (pair[0] - pair[1]) / 2e-6
-    same_face = np.abs(analytic - numerical).max(axis=1) < 1e-4 * np.abs(analytic).max()
-    assert same_face.mean() > 0.995  # a point that changes its face has no derivative
+            assert gradient[f, i] == pytest.approx(expected, abs=1e-7 * np.abs(gradient).max())
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,5 @@
 """Faces cut from panoramas, against a smooth picture known on the whole sphere."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from pixels import pixel_centres
@@ -10,7 +8,7 @@ from gsba.camera.rig import CubeRig
 from gsba.camera.sphere import erp_directions
 from gsba.config import CubemapSettings
 from gsba.frames import cubemap
-from gsba.types import FrameSet, PictureFormat
+from gsba.types import PictureFormat
 
 
 def _picture(bearings: np.ndarray, frequency: float = 6.0) -> np.ndarray:
@@ -24,17 +22,13 @@ def _picture(bearings: np.ndarray, frequency: float = 6.0) -> np.ndarray:
     return 127.5 + 120 * np.stack(waves, axis=-1)
 
 
-def _pixel_centres(width: int, height: int) -> np.ndarray:
-    return pixel_centres(width, height)
-
-
 def _panorama(width: int, frequency: float = 6.0) -> np.ndarray:
     bearings = erp_directions(width)
     return np.rint(_picture(bearings, frequency)).astype(np.uint8)
 
 
 def _faces(rig: CubeRig, frequency: float = 6.0) -> np.ndarray:
-    grid = _pixel_centres(rig.size, rig.size)
+    grid = pixel_centres(rig.size, rig.size)
     return np.stack([_picture(rig.bearings(grid, face), frequency) for face in range(6)])
 
 
@@ -98,37 +92,28 @@ def test_masks_are_cut_where_they_lie() -> None:
     for axis in (centre, np.array([0.0, -1.0, 0.0])):  # and one over a pole
         masks = cubemap.cut_mask(bearings @ axis > np.cos(0.4), rig)
         angles = np.stack(
-            [np.arccos(rig.bearings(_pixel_centres(160, 160), face) @ axis) for face in range(6)]
+            [np.arccos(rig.bearings(pixel_centres(160, 160), face) @ axis) for face in range(6)]
         )
         pixel = 2 * np.pi / 640
         assert masks[angles < 0.4 - pixel].all()
         assert not masks[angles > 0.4 + pixel].any()
 
 
-def _frame_set(layout: str, width: int) -> FrameSet:
-    height = width // 2 if layout == "erp" else width
-    empty: tuple[Path, ...] = ()
-    return FrameSet(("0",), (empty,), np.zeros(1), (None,), (PictureFormat(layout, width, height),))
-
-
 @pytest.mark.parametrize("oversampling", [0.5, 1.25])
 def test_automatic_size_follows_the_panoramas_density(oversampling: float) -> None:
     settings = CubemapSettings(oversampling=oversampling, min_face_size=64, max_face_size=2048)
-    rig = cubemap.rig_for(_frame_set("erp", 2048).format, settings)
+    rig = cubemap.rig_for(PictureFormat("erp", 2048, 1024), settings)
     assert 2 * np.pi * rig.focal == pytest.approx(oversampling * 2048, rel=0.5 / rig.size)
     assert rig.hfov_rad == pytest.approx(np.deg2rad(96))
 
 
 def test_sizes_can_be_set_and_bounded() -> None:
-    erp = _frame_set("erp", 8192)
-    assert (
-        cubemap.rig_for(erp.format, CubemapSettings(min_face_size=300, max_face_size=300)).size
-        == 300
-    )
-    assert cubemap.rig_for(erp.format, CubemapSettings(max_face_size=700)).size == 700
+    for width, least, most, size in ((8192, 256, 700, 700), (512, 300, 700, 300)):
+        settings = CubemapSettings(min_face_size=least, max_face_size=most)
+        assert cubemap.rig_for(PictureFormat("erp", width, width // 2), settings).size == size
 
 
 def test_cube_frames_keep_their_own_faces_up_to_the_size_of_panoramas() -> None:
     for own, size in ((333, 333), (2048, CubemapSettings().max_face_size)):
-        rig = cubemap.rig_for(_frame_set("cube", own).format, CubemapSettings())
+        rig = cubemap.rig_for(PictureFormat("cube", own, own), CubemapSettings())
         assert (rig.size, rig.hfov_rad) == (size, np.pi / 2)

@@ -5,6 +5,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from pixels import pixel_centres
+from plain_records import frames_of
 
 from gsba.camera.rig import CubeRig
 from gsba.camera.sphere import erp_directions
@@ -19,20 +21,13 @@ def _smooth(bearings: np.ndarray) -> np.ndarray:
     return 120 + 40 * x * y + 30 * np.sin(4 * z) + 20 * x
 
 
-def _frames(paths: tuple[Path, ...], layout: str, faces: tuple[str, ...], size: tuple[int, int],
-            mask: Path | None = None) -> FrameSet:  # fmt: skip
-    return FrameSet(("a",), (paths,), np.zeros(1), (mask,), (PictureFormat(layout, *size, faces),))
-
-
-def _cube(folder: Path, faces: tuple[str, ...], mask: Path | None = None) -> FrameSet:
-    rig, paths = CubeRig(SIZE, np.pi / 2), []
-    centres = np.arange(SIZE) + 0.5
-    grid = np.stack(np.meshgrid(centres, centres), axis=-1)
+def _cube(folder: Path, faces: tuple[str, ...]) -> FrameSet:
+    rig, paths, grid = CubeRig(SIZE, np.pi / 2), [], pixel_centres(SIZE, SIZE)
     for name in faces:
         paths.append(folder / f"{name}.png")
         image = np.rint(_smooth(rig.bearings(grid, FACES.index(name))))
         cv2.imwrite(str(paths[-1]), image.astype(np.uint8))
-    return _frames(tuple(paths), "cube", faces, (SIZE, SIZE), mask)
+    return frames_of(PictureFormat("cube", SIZE, SIZE, faces), [tuple(paths)])
 
 
 def test_cube_faces_join_without_a_seam(tmp_path: Path) -> None:
@@ -68,7 +63,7 @@ def test_wide_panoramas_are_averaged_down(tmp_path: Path) -> None:
     allowed = np.full((64, 128), 255, np.uint8)
     allowed[10, 20] = 0
     cv2.imwrite(str(mask_path), allowed)
-    frames = _frames((path,), "erp", (), (128, 64), mask_path)
+    frames = frames_of(PictureFormat("erp", 128, 64), [(path,)], mask=mask_path)
     width = width_for(frames.format, 100)
     assert width == 64
     grey, mask = load_grey(frames, 0, width)
@@ -79,5 +74,4 @@ def test_wide_panoramas_are_averaged_down(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("width", "limit", "expected"), [(1536, 4096, 1536), (5376, 4096, 2688)])
 def test_width(width: int, limit: int, expected: int) -> None:
-    frames = _frames((Path("a"),), "erp", (), (width, width // 2))
-    assert width_for(frames.format, limit) == expected
+    assert width_for(PictureFormat("erp", width, width // 2), limit) == expected

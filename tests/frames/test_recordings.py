@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from plain_records import frames_of
 from refusals import refused
 
 from gsba.frames.recordings import combine, own_timestamps
@@ -18,27 +19,20 @@ def _frames(folder: Path, start: float, interval: float = 0.5) -> FrameSet:
     names = tuple(f"{n:03d}" for n in range(NUM))
     for name in names:
         (folder / f"{name}.jpg").write_text(f"{folder.name} {name}")
-    paths = tuple((folder / f"{name}.jpg",) for name in names)
-    times = start + interval * np.arange(NUM)
-    return FrameSet(names, paths, times, (None,) * NUM, (PictureFormat("erp", 512, 256),))
+    paths, times = [(folder / f"{name}.jpg",) for name in names], start + interval * np.arange(NUM)
+    return frames_of(PictureFormat("erp", 512, 256), paths, times, names)
 
 
 def test_recordings_follow_one_another_whatever_their_clocks(tmp_path: Path) -> None:
     first, second = _frames(tmp_path / "a", 1.7e9), _frames(tmp_path / "b", 1.7e9 - 0.25, 2.0)
     frames = combine({"a": first, "b": second})
     assert frames.names[:1] == ("a/000",) and frames.names[NUM] == "b/000"
-    assert {name: rows.tolist() for name, rows in frames.recordings.items()} == {
-        "a": [0, 1, 2, 3],
-        "b": [4, 5, 6, 7],
-    }
+    rows = {name: rows.tolist() for name, rows in frames.recordings.items()}
+    assert rows == {"a": [0, 1, 2, 3], "b": [4, 5, 6, 7]}
     steps = np.diff(frames.timestamps)
     assert (steps > 0).all() and steps[NUM - 1] >= 100 * 2.0
-    np.testing.assert_allclose(
-        own_timestamps(frames),
-        np.concatenate([first.timestamps, second.timestamps]),
-        rtol=0,
-        atol=1e-6,
-    )
+    both = np.concatenate([first.timestamps, second.timestamps])
+    np.testing.assert_allclose(own_timestamps(frames), both, rtol=0, atol=1e-6)
     some = frames.taken(np.array([1, 5, 6]))
     assert list(some.recordings) == ["a", "b"]
     np.testing.assert_allclose(own_timestamps(some), own_timestamps(frames)[[1, 5, 6]])

@@ -26,6 +26,11 @@ def write_image(path: Path, width: int = 64, height: int = 32, level: int = 90) 
     return path
 
 
+def write_images(folder: Path, *names: str) -> None:
+    for name in names:
+        write_image(folder / f"{name}.jpg")
+
+
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     for i in range(4):
@@ -258,16 +263,14 @@ def test_refused_ways_to_give_times(folder: Path, tmp_path: Path) -> None:
 
 
 def test_fps_refuses_skipped_numbers_but_not_even_steps(tmp_path: Path) -> None:
-    for i in (0, 8, 16):
-        write_image(tmp_path / f"{i:03d}.jpg")
+    write_images(tmp_path, "000", "008", "016")
     np.testing.assert_array_equal(scan(tmp_path, fps=2).timestamps, [0, 0.5, 1])
     write_image(tmp_path / "032.jpg")
     refused(r"skip between '016' and '032'", scan, tmp_path, fps=2)
 
 
 def test_the_order_of_names_suffices_without_a_trajectory(tmp_path: Path) -> None:
-    for name in ("f1", "f2", "f10", "f11"):
-        write_image(tmp_path / f"{name}.jpg")
+    write_images(tmp_path, "f1", "f2", "f10", "f11")
     frames = scan(tmp_path, order_suffices=True)
     assert frames.names == ("f1", "f2", "f10", "f11") and not frames.timed
     np.testing.assert_array_equal(frames.timestamps, [0, 1, 9, 10])  # seven are missing
@@ -292,8 +295,7 @@ def test_the_order_of_names_suffices_without_a_trajectory(tmp_path: Path) -> Non
 def test_numbers_that_names_skip_are_missing_frames(
     names: str, expected: list[float], tmp_path: Path
 ) -> None:
-    for name in names.split():
-        write_image(tmp_path / f"{name}.jpg")
+    write_images(tmp_path, *names.split())
     np.testing.assert_array_equal(scan(tmp_path, order_suffices=True).timestamps, expected)
 
 
@@ -319,8 +321,7 @@ def test_names_that_no_table_holds_are_refused(folder: Path, name: bytes) -> Non
     ],
 )
 def test_names_that_are_times(tmp_path: Path, names: list[str], times: list[float]) -> None:
-    for name in names:
-        write_image(tmp_path / f"{name}.jpg")
+    write_images(tmp_path, *names)
     np.testing.assert_array_equal(scan(tmp_path).timestamps, times)
 
 
@@ -334,8 +335,7 @@ def test_names_that_are_times(tmp_path: Path, names: list[str], times: list[floa
     ],
 )
 def test_names_that_might_be_times_are_not_guessed(tmp_path: Path, names: list[str]) -> None:
-    for name in names:
-        write_image(tmp_path / f"{name}.jpg")
+    write_images(tmp_path, *names)
     refused(r"pass --timestamps FILE or --fps", scan, tmp_path)
 
 

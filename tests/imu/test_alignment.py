@@ -5,25 +5,18 @@ from functools import cache
 
 import numpy as np
 import pytest
-from riding_gyro import BIAS, IMU_R_RIG, OFFSET_S, Ride, ride
+from riding_gyro import BIAS, IMU_R_RIG, OFFSET_S, SIGMA, aligned, ride
 from scipy.spatial.transform import Rotation
 
 from gsba.imu.alignment import Alignment, align, turning_of
 from gsba.imu.readings import Readings
-
-SIGMA = np.deg2rad(0.1)  # of turns, per axis
-
-
-def _aligned(on: Ride, readings: Readings) -> Alignment:
-    known = np.ones(len(on.timestamps) - 1, bool)
-    return align(on.timestamps, on.steps(SIGMA), known, readings)
 
 
 @cache
 def _usual(seed: int = 0) -> Alignment:
     """Alignment of a ride's own readings."""
     on = ride(seed=seed)
-    return _aligned(on, on.readings())
+    return aligned(on, on.readings())
 
 
 def _off_deg(found: Alignment) -> float:
@@ -46,7 +39,7 @@ def test_clock_bias_and_axes_are_found_from_turns(seed: int) -> None:
 
 def test_better_turns_tell_more_from_where_worse_ones_ended() -> None:
     on, first = ride(), _usual()
-    better = align(on.timestamps, on.steps(), np.ones(49, bool), on.readings(), first)
+    better = aligned(on, on.readings(), 0.0, first)
     assert abs(better.clock.offset - OFFSET_S) < 1e-4
     assert _off_deg(better) < 0.02 < _off_deg(first)
     assert better.noise < 0.1 * first.noise
@@ -56,10 +49,8 @@ def test_a_gyro_that_shows_too_much_is_found_out() -> None:
     """By as much as they do: its axes by -1, +1.5 and +2 percent."""
     on, scales = ride(), np.array([0.99, 1.015, 1.02])
     readings = on.readings()
-    shown = BIAS + scales * (readings.rates - BIAS)
-    readings = replace(readings, rates=shown)
-    first = _aligned(on, readings)
-    found = align(on.timestamps, on.steps(), np.ones(49, bool), readings, first)
+    readings = replace(readings, rates=BIAS + scales * (readings.rates - BIAS))
+    found = aligned(on, readings, 0.0, aligned(on, readings))
     np.testing.assert_allclose(found.sensor.scales * scales, 1, atol=2e-3)
     said = turning_of(readings, found, on.timestamps)
     true = Rotation.from_matrix(on.steps()).as_rotvec()
@@ -71,7 +62,7 @@ def test_a_clock_that_runs_fast_is_followed() -> None:
     readings = on.readings()
     begin = on.timestamps[0] + OFFSET_S
     drifting = replace(readings, timestamps=begin + 1.001 * (readings.timestamps - begin))
-    found = _aligned(on, drifting)
+    found = aligned(on, drifting)
     assert found.reason == ""
     assert found.clock.rate == pytest.approx(1.001, abs=5e-5)
     assert found.clock.offset == pytest.approx(OFFSET_S, abs=0.005)
@@ -91,7 +82,7 @@ def test_steps_of_dense_frames_and_unseen_ones() -> None:
 def test_what_a_gyro_says_of_frames_is_how_they_turn() -> None:
     on = ride()
     readings = on.readings()
-    exact = align(on.timestamps, on.steps(), np.ones(49, bool), readings, _usual())
+    exact = aligned(on, readings, 0.0, _usual())
     said = turning_of(readings, exact, on.timestamps)
     true = Rotation.from_matrix(on.steps()).as_rotvec()
     # White noise of .001 rad/s at 200 Hz adds up to 5e-5 rad in half a second.
@@ -109,7 +100,7 @@ def test_where_readings_end_or_pause_nothing_is_said() -> None:
     begin, pause, end = on.timestamps[3] + 0.2, on.timestamps[20], on.timestamps[40] + 0.2
     kept = (at > begin) & (at < end) & (np.abs(at - pause) > 0.1)
     some = Readings(readings.timestamps[kept], readings.rates[kept])
-    found = _aligned(on, some)
+    found = aligned(on, some)
     assert found.reason == ""
     said = turning_of(some, found, on.timestamps)
     unknown = np.flatnonzero(~np.isfinite(said.step_sigmas))
@@ -120,30 +111,23 @@ def test_where_readings_end_or_pause_nothing_is_said() -> None:
 
 @pytest.mark.parametrize("seed", range(2))
 def test_another_ride_is_not_believed(seed: int) -> None:
-    found = _aligned(ride(seed=seed), ride(seed=seed + 10).readings())
+    found = aligned(ride(seed=seed), ride(seed=seed + 10).readings())
     assert "at no clock offset" in found.reason
 
 
 def test_a_mirrored_sensor_is_not_believed() -> None:
     on = ride()
     readings = on.readings()
-    found = _aligned(on, replace(readings, rates=readings.rates * np.array([1, 1, -1.0])))
+    found = aligned(on, replace(readings, rates=readings.rates * np.array([1, 1, -1.0])))
     assert found.reason
 
 
 def test_turns_too_poor_to_tell_are_named() -> None:
-    on = ride(8)
-    assert (
-        "rotations are known from images"
-        in align(on.timestamps[:4], on.steps()[:3], np.ones(3, bool), on.readings()).reason
-    )
-    still = np.tile(np.eye(3), (49, 1, 1))
-    on = ride()
-    noisy = (
-        still @ Rotation.from_rotvec(np.random.default_rng(0).normal(0, SIGMA, (49, 3))).as_matrix()
-    )
-    known = np.ones(49, bool)
-    assert "too little" in align(on.timestamps, noisy, known, on.readings()).reason
+    on = ride(4)
+    assert "rotations are known from images" in aligned(on, on.readings()).reason
+    on, noise = ride(), np.random.default_rng(0).normal(0, SIGMA, (49, 3))
+    still = Rotation.from_rotvec(noise).as_matrix()
+    assert "too little" in align(on.timestamps, still, np.ones(49, bool), on.readings()).reason
 
 
 def test_turns_about_one_axis_tell_no_axes() -> None:

@@ -14,13 +14,13 @@ import cv2
 import export_scene as scene
 import numpy as np
 import pytest
+from refusals import refused
 from scipy.spatial.transform import Rotation
 
 from gsba.camera.cameras import ONE_CAMERA
 from gsba.camera.sphere import bearings_from_erp
 from gsba.config import RefineSettings
 from gsba.disk import write_image
-from gsba.log import GsbaError
 from gsba.report.html import add_scan, add_splats, figures, pictures, residual_sphere, write_html
 from gsba.report.html.patches import worst_patches
 from gsba.report.report import Findings, StageLog, build_report
@@ -41,25 +41,28 @@ ROUND = {
 }
 
 
+STAGES = StageLog(
+    [StageRecord("verify", "key", False, 1.5, 2.5, 300.0)],
+    {"verify": [Counts(10, 7, "pairs", {"too few inliers": 3})]},
+    [{"stage": "chain", "rounds": [ROUND, {**ROUND, "accepted": False}]}],
+)
+
+
+def _report(
+    frames: FrameSet, coarse: CoarsePoses, result: Reconstruction, stages: StageLog, found: Findings
+) -> dict:
+    given = {"settings": RefineSettings(), "frames": frames, "coarse": coarse}
+    given |= {"reconstruction": result, "stages": stages, "found": found}
+    report = build_report(**given, gauge="the gauge of the trajectory")
+    return report | {"residual_sphere": residual_sphere(result)}
+
+
 def _write(folder: Path, frames: FrameSet, result: Reconstruction) -> tuple[Path, CoarsePoses]:
     before = result.world_T_rigs.copy()
     before[2, :3, 3] += [0.3, 0.0, 0.4]
     coarse = CoarsePoses(before, np.zeros(len(frames), np.uint8), 0.0)
-    counts = {"verify": [Counts(10, 7, "pairs", {"too few inliers": 3})]}
-    report = build_report(
-        settings=RefineSettings(),
-        frames=frames,
-        coarse=coarse,
-        reconstruction=result,
-        stages=StageLog(
-            [StageRecord("verify", "key", False, 1.5, 2.5, 300.0)],
-            counts,
-            [{"stage": "chain", "rounds": [ROUND, {**ROUND, "accepted": False}]}],
-        ),
-        gauge="the gauge of the trajectory",
-        found=Findings(["a note with <b>markup</b> & </script>"]),
-    )
-    report["residual_sphere"] = residual_sphere(result)
+    found = Findings(["a note with <b>markup</b> & </script>"])
+    report = _report(frames, coarse, result, STAGES, found)
     path = folder / "report.html"
     write_html(path, frames, coarse, result, report)
     return path, coarse
@@ -263,16 +266,8 @@ def test_several_maps_are_listed_and_the_largest_is_drawn(tmp_path: Path) -> Non
         pose_statuses=np.where(np.arange(9) == 8, PoseStatus.UNREFINED, PoseStatus.REFINED),
     )
     coarse = CoarsePoses(result.world_T_rigs, np.zeros(len(frames), np.uint8), 0.0)
-    report = build_report(
-        settings=RefineSettings(),
-        frames=frames,
-        coarse=coarse,
-        reconstruction=result,
-        stages=StageLog(),
-        gauge="",
-        found=Findings(reasons=("", "</script> two surfaces")),
-    )
-    report["residual_sphere"] = residual_sphere(result)
+    found = Findings(reasons=("", "</script> two surfaces"))
+    report = _report(frames, coarse, result, StageLog(), found)
     rows, path = result.largest_map(), tmp_path / "report.html"
     own = dataclasses.replace(
         coarse, world_T_rigs=coarse.world_T_rigs[rows], sources=coarse.sources[rows]
@@ -340,8 +335,7 @@ def test_distances_to_a_scan_are_added(page: Path, tmp_path: Path) -> None:
         assert _run_script(path)[0] == 6
     add_scan(tmp_path / "none.html", {})  # no page, nothing to do
     path.write_text("<html>")
-    with pytest.raises(GsbaError, match="is not the report page of a run"):
-        add_scan(path, {})
+    refused("is not the report page of a run", add_scan, path, {})
 
 
 def _over(path: Path) -> list[tuple[str, int]]:

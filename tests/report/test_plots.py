@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command import run_gsba
+from command import fails, run_gsba, succeed
 from PIL import Image
+from refusals import refused
 from scipy.spatial.transform import Rotation
 from tiny_run import Case
 
@@ -16,7 +17,6 @@ from gsba.evaluate import charts
 from gsba.evaluate.splats import SourceResult, _write_curves
 from gsba.evaluate.trajectory import evaluate
 from gsba.geometry import pose
-from gsba.log import GsbaError
 from gsba.report.plots import _errors, _residuals, _shares, _trajectories, draw, load
 from gsba.similarity import Sim3
 from gsba.splat.scores import Score
@@ -101,11 +101,8 @@ def test_without_truth_runs_are_laid_on_the_first_of_them(tmp_path: Path) -> Non
     assert shown[1].placed is not None and shown[2].placed is None
     assert shown[1].placed.scale == pytest.approx(1 / 3)
     panels, names = _drawn(lambda figure: _trajectories(figure, shown, None))
-    assert names == ["trajectory"] and [axes.get_title() for axes in panels] == [
-        "a.tum",
-        "b.tum",
-        "c.tum",
-    ]
+    assert names == ["trajectory"]
+    assert [axes.get_title() for axes in panels] == ["a.tum", "b.tum", "c.tum"]
     first, second, third = (axes.get_lines()[0].get_xydata() for axes in panels)
     np.testing.assert_allclose(first, second, atol=1e-6)
     assert np.ptp(third, axis=0).max() == pytest.approx(3 * np.ptp(first, axis=0).max(), rel=0.01)
@@ -168,8 +165,7 @@ def test_names_are_shown_as_they_are(tmp_path: Path) -> None:
         [out], (2, 2), lambda figure: figure.subplots().set_title(charts.plain("_x$1$")) and None
     )
     assert "_x$1$" in out.read_text()  # as a comment beside the glyphs
-    with pytest.raises(GsbaError, match="is given twice"):
-        load([paths[0], tmp_path / "b" / ".." / "a" / "_x$1$.tum"])
+    refused("is given twice", load, [paths[0], tmp_path / "b" / ".." / "a" / "_x$1$.tum"])
 
 
 def test_shares_of_many_values_keep_their_ends() -> None:
@@ -188,22 +184,19 @@ def test_the_command_says_what_it_wrote_or_why_not(
     def call(*arguments: object):
         return run_gsba("plot", *arguments)
 
-    done = call(walk, "--out", tmp_path / "figures", "--truth", walk)
-    assert done.exit_code == 0 and len(done.stdout.splitlines()) == 4
-    late = _written(
-        tmp_path / "late.tum", Trajectory(_walk().timestamps + 99, _walk().world_T_rigs)
-    )
+    done = succeed("plot", walk, "--out", tmp_path / "figures", "--truth", walk)
+    assert len(done.stdout.splitlines()) == 4
+    later = Trajectory(_walk().timestamps + 99, _walk().world_T_rigs)
+    late = _written(tmp_path / "late.tum", later)
     for arguments, message in (
         ((walk, "--out", tmp_path / "a.jpg"), "give a .png, .svg or .pdf file, or a folder"),
         ((tmp_path, "--out", tmp_path / "x"), str(tmp_path)),
         ((walk, late, "--out", tmp_path / "x", "--truth", walk), "late.tum: only 0 of 30 true"),
     ):
-        done = call(*arguments)
-        assert done.exit_code == 1 and message in done.stderr, done.stderr
-        assert len(done.stderr.splitlines()) == 1 and not (tmp_path / "x").exists()
+        fails(call(*arguments), message)
+        assert not (tmp_path / "x").exists()
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    done = call(walk, "--out", tmp_path / "x")
-    assert done.exit_code == 1 and "pip install 'gsba[plot]'" in done.stderr
+    fails(call(walk, "--out", tmp_path / "x"), "pip install 'gsba[plot]'")
 
 
 def _source(psnr: list[float]) -> SourceResult:

@@ -15,6 +15,11 @@ from gsba.report.html import thumbnails
 from gsba.report.html.thumbnails import frame_pictures
 from gsba.types import Fisheye, FrameSet, PictureFormat
 
+SIDE = 340  # pixels, at 100 a radian: the edge is 1.7 rad from the axis
+LENS = Fisheye(SIDE, SIDE, 100.0, (SIDE / 2, SIDE / 2), (0, 0, 0, 0), (0, 0, 0))
+BACK = dataclasses.replace(LENS, rotation=(0.0, np.pi, 0.0))
+RAW = PictureFormat("fisheye", 628, 314, fisheyes=(LENS, BACK))
+
 
 @pytest.fixture(scope="module")
 def frames(tmp_path_factory: pytest.TempPathFactory) -> FrameSet:
@@ -81,13 +86,9 @@ def test_a_mask_of_all_frames_is_held_once(frames: FrameSet, tmp_path: Path) -> 
 
 
 def test_seam_and_edges_of_raw_lenses(frames: FrameSet) -> None:
-    focal, size = 100.0, 340  # pixels: the edge is 1.7 rad from the axis
-    lens = Fisheye(size, size, focal, (size / 2, size / 2), (0, 0, 0, 0), (0, 0, 0))
-    back = dataclasses.replace(lens, rotation=(0.0, np.pi, 0.0))
-    raw = PictureFormat("fisheye", 628, 314, fisheyes=(lens, back))
-    ((seam,),) = (thumbnails._seams(raw, False),)
+    ((seam,),) = (thumbnails._seams(RAW, False),)
     np.testing.assert_allclose(np.abs(np.mod(seam[:, 0], 1) - 0.5), 0.25, atol=1e-3)
-    edges = thumbnails._circles(raw)
+    edges = thumbnails._circles(RAW)
     for line, axis in zip(edges, ([0, 0, 1], [0, 0, -1]), strict=True):
         angles = np.arccos(bearings_from_erp(line, 1, 1) @ axis)
         np.testing.assert_allclose(angles, 1.7, atol=1e-3)
@@ -97,15 +98,11 @@ def test_seam_and_edges_of_raw_lenses(frames: FrameSet) -> None:
 
 def test_raw_lenses_are_joined_at_a_part_of_their_size(tmp_path: Path) -> None:
     """Front red, back blue, and a green spot that lies to the right of the front."""
-    focal, size = 100.0, 340
-    lens = Fisheye(size, size, focal, (size / 2, size / 2), (0, 0, 0, 0), (0, 0, 0))
-    back = dataclasses.replace(lens, rotation=(0.0, np.pi, 0.0))
-    front = np.full((size, size, 3), (0, 0, 255), np.uint8)
+    front = np.full((SIDE, SIDE, 3), (0, 0, 255), np.uint8)
     front[160:180, 235:265] = (0, 255, 0)  # 0.8 rad to the right
     cv2.imwrite(str(tmp_path / "f.png"), front)
-    cv2.imwrite(str(tmp_path / "b.png"), np.full((size, size, 3), (255, 0, 0), np.uint8))
-    form = PictureFormat("fisheye", 628, 314, fisheyes=(lens, back))
-    frames = frames_of(form, [(tmp_path / "f.png", tmp_path / "b.png")])
+    cv2.imwrite(str(tmp_path / "b.png"), np.full((SIDE, SIDE, 3), (255, 0, 0), np.uint8))
+    frames = frames_of(RAW, [(tmp_path / "f.png", tmp_path / "b.png")])
     image = thumbnails.small_panorama(frames, 0, 200)
     assert image.shape == (100, 200, 3)
     assert image[50, 100].tolist() == [255, 0, 0] and image[50, 5].tolist() == [0, 0, 255]

@@ -133,14 +133,8 @@ def test_noise_of_a_wrong_scan_stays_a_number(monkeypatch: pytest.MonkeyPatch) -
     tried = []
 
     def wanders(cost, start, **_):
-        for step in (
-            np.zeros(3),
-            np.full(3, 1000.0),
-            np.full(3, -1000.0),
-            [0, 400, 0],
-            [0, -1e5, 0],
-        ):
-            tried.append(cost(start + step))
+        for step in (0.0, 1000.0, -1000.0, [0, 400, 0], [0, -1e5, 0]):
+            tried.append(cost(start + np.array(step)))
         return type("Result", (), {"x": start + 1000.0})
 
     monkeypatch.setattr("scipy.optimize.minimize", wanders)

@@ -5,10 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command import run_gsba
+from command import fails, run_gsba
 from refusals import refused
 from scan_world import HALL, SIZE, rectangles, sampled
 
+from gsba.config import PlacementSettings
+from gsba.placement.placement import check
 from gsba.scans import check_scan, distances_to, files, read_pairs, read_scan
 from gsba.scans.files import on_planes
 from gsba.scans.types import Scan
@@ -114,10 +116,8 @@ def test_distances_are_to_surfaces_and_not_to_the_next_point() -> None:
 
 
 def test_settings_that_exclude_one_another(tmp_path: Path) -> None:
-    told = run_gsba("export", tmp_path, "--to", "tum", "--pairs", "p.txt")
-    assert told.exit_code == 1 and "error: " in told.output
-    told = run_gsba("evaluate", tmp_path, "--pairs", "p.txt")
-    assert told.exit_code == 1 and "give --scan FILE" in told.output
+    refused("--pairs needs a scan", check, PlacementSettings(pairs="p.txt"))
+    fails(run_gsba("evaluate", tmp_path, "--pairs", "p.txt"), "give --scan FILE")
 
 
 def test_noise_shrinks_on_planes_and_steps_stay() -> None:

@@ -124,50 +124,6 @@ def test_gradients_are_those_of_the_dense_reference(seed: int, name: str) -> Non
     assert np.abs(analytic.flat[picks] - expected)[smooth].max() < 1e-4 * scale
 
 
-def test_gradients_of_a_torch_reference() -> None:
-    """Autograd through a dense image of one channel sum, where torch is installed."""
-    torch = pytest.importorskip("torch", reason="torch is not installed (extra 'splat')")
-    gaussians, camera = scene(3, 20, pixels=4)
-    means = torch.tensor(gaussians.means, dtype=torch.float64, requires_grad=True)
-    logits = torch.tensor(gaussians.opacity_logits, dtype=torch.float64, requires_grad=True)
-    world_R_face = torch.tensor(camera.world_R_face)
-    local = (means - torch.tensor(camera.face_in_world)) @ world_R_face
-    v, u = torch.meshgrid(*(torch.arange(SIZE) + 0.5,) * 2, indexing="ij")
-    alpha_sum, through = torch.zeros(SIZE, SIZE), torch.ones(SIZE, SIZE, dtype=torch.float64)
-    for g in torch.argsort(local[:, 2]):
-        x, y, z = local[g]
-        if z <= 1e-2:
-            continue
-        limit = 1.3 * 0.5 * SIZE / camera.focal
-        zero = torch.zeros(())
-        right = torch.stack(
-            [camera.focal / z, zero, -camera.focal / z * (x / z).clamp(-limit, limit)]
-        )
-        down = torch.stack(
-            [zero, camera.focal / z, -camera.focal / z * (y / z).clamp(-limit, limit)]
-        )
-        axes = torch.tensor(
-            dense_splat.rotation(gaussians.quaternions[g].astype(float))
-            * np.exp(gaussians.log_scales[g])
-        )
-        root = torch.stack([right, down]) @ world_R_face.T @ axes
-        inverse = torch.linalg.inv(root @ root.T + 0.3 * torch.eye(2))
-        du, dv = u - camera.focal * x / z - SIZE / 2, v - camera.focal * y / z - SIZE / 2
-        power = inverse[0, 0] * du**2 + 2 * inverse[0, 1] * du * dv + inverse[1, 1] * dv**2
-        alpha = (torch.sigmoid(logits[g]) * torch.exp(-power / 2)).clamp(max=0.99)
-        alpha = torch.where((alpha >= 1 / 255) & (through >= 1e-4), alpha, 0.0)
-        alpha_sum = alpha_sum + alpha * through
-        through = through * (1 - alpha)
-    weights = np.random.default_rng(0).normal(size=(SIZE, SIZE))
-    (alpha_sum * torch.tensor(weights)).sum().backward()
-    image, tape = render(gaussians, camera)
-    assert np.abs(image.alpha - alpha_sum.detach().numpy()).max() < 1e-4
-    gradients = differentiate(tape, np.zeros((SIZE, SIZE, 3)), None, weights).gaussians
-    for ours, theirs in ((gradients.means, means), (gradients.opacity_logits, logits)):
-        expected = theirs.grad.numpy()
-        assert np.abs(ours - expected).max() < 1e-4 * np.abs(expected).max()
-
-
 @pytest.mark.parametrize("off", [-1, 1])
 def test_a_border_that_two_kernels_round_apart_does_no_harm(off: int) -> None:
     """The last splat touches one tile more or less than was counted: no list is overrun."""

@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from command import run_gsba, succeed
+from command import fails, run_gsba, succeed
 from refusals import refused
 from tiny_run import Case
 
@@ -14,7 +14,6 @@ from gsba.camera.rig import CubeRig
 from gsba.camera.views import rig_views
 from gsba.evaluate.splats import compare, poses_for
 from gsba.geometry import pose
-from gsba.log import GsbaError
 from gsba.splat import from_cloud, read_ply, scene
 from gsba.splat.backend import CpuBackend
 from gsba.splat.options import TrainingOptions
@@ -29,8 +28,7 @@ TINY = ["--iterations", "30", "--face-size", "32", "--backend", "cpu"]
 
 
 def call(*arguments: object) -> str:
-    result = succeed("-q", *arguments)
-    return result.output
+    return succeed("-q", *arguments).output
 
 
 @pytest.fixture(scope="module")
@@ -60,8 +58,7 @@ def test_render_writes_faces_and_a_panorama(run: Path) -> None:
     shapes = {path.name: cv2.imread(str(path)).shape for path in (run / "renderings").iterdir()}
     assert shapes[f"{frame}_erp.png"] == (64, 128, 3)
     assert shapes[f"{frame}_down.png"] == (32, 32, 3) and len(shapes) == 7
-    failed = run_gsba("render", ply, run, "--frame", "nonsense")
-    assert failed.exit_code == 1 and "no frame 'nonsense'" in failed.output
+    fails(run_gsba("render", ply, run, "--frame", "nonsense"), "no frame 'nonsense'")
 
 
 def test_evaluate_compares_sources_and_resumes(case: Case, run: Path, tmp_path: Path) -> None:
@@ -82,8 +79,7 @@ def test_evaluate_compares_sources_and_resumes(case: Case, run: Path, tmp_path: 
 
 
 def test_evaluate_needs_something_to_compare_with(run: Path) -> None:
-    failed = run_gsba("evaluate", run)
-    assert failed.exit_code == 1 and "--truth" in failed.output
+    fails(run_gsba("evaluate", run), "--truth")
 
 
 @pytest.mark.parametrize(
@@ -91,8 +87,7 @@ def test_evaluate_needs_something_to_compare_with(run: Path) -> None:
     [("--iterations", "0"), ("--face-size", "3"), ("--backend", "x"), ("--max-gaussians", "0")],
 )
 def test_bad_options_are_one_line(run: Path, option: tuple[str, str]) -> None:
-    failed = run_gsba("train", run, *option)
-    assert failed.exit_code == 1 and failed.output.startswith(f"error: {option[0]} {option[1]}")
+    fails(run_gsba("train", run, *option), f"error: {option[0]} {option[1]}")
 
 
 def test_held_out_frames_are_whole_and_spread() -> None:
@@ -136,7 +131,7 @@ def test_a_panorama_shows_what_the_faces_show(run: Path) -> None:
     assert np.abs(panorama[64, 192].astype(int) - faces[1][32, 32]).max() < 12  # right
 
 
-def test_a_masked_face_is_left_out(case: Case) -> None:
+def test_a_masked_face_is_left_out() -> None:
     images = np.zeros((6, 16, 16, 3), np.uint8)
     use = np.ones((6, 16, 16), bool)
     use[5] = False
@@ -144,8 +139,8 @@ def test_a_masked_face_is_left_out(case: Case) -> None:
     assert len(views.cameras) == 5 and views.use is None
     nothing = scene.make_views(scene.Faces(SIX, images, np.zeros_like(use)), np.eye(4)[None])
     gaussians = from_cloud(np.ones((2, 3)), np.zeros((2, 3), np.uint8))
-    with pytest.raises(GsbaError, match="held-out frames are masked"):
-        measure(gaussians, nothing, TrainingOptions(), 0.01, CpuBackend(1))
+    given = gaussians, nothing, TrainingOptions(), 0.01, CpuBackend(1)
+    refused("held-out frames are masked", measure, *given)
 
 
 def test_panoramas_at_one_place_are_scored_apart() -> None:
@@ -163,8 +158,6 @@ def test_too_few_common_frames_are_refused(case: Case, tmp_path: Path) -> None:
     frames = case.result.frames
     sources = {"none": np.full((len(frames), 4, 4), np.nan)}
     settings = TrainingOptions(iterations=2, face_size=16)
-    with pytest.raises(GsbaError, match="too few"):
-        compare(
-            case.result.reconstruction, frames, sources, settings, CpuBackend(1), tmp_path / "out"
-        )
+    given = case.result.reconstruction, frames, sources, settings, CpuBackend(1)
+    refused("too few", compare, *given, tmp_path / "out")
     assert not (tmp_path / "out").exists()

@@ -25,6 +25,7 @@ from gsba.splat.train import Views, advance, begin, extent_of, most_gaussians, t
 SIZE = 32
 RIG = CubeRig(SIZE, np.pi / 2)
 SETTINGS = TrainingOptions(iterations=320, face_size=SIZE, sh_degree=1, seed=3)
+BACKEND = CpuBackend(1)
 LIMITS = 10.0, 1000, True  # extent, most Gaussians, huge ones are pruned
 
 
@@ -49,6 +50,22 @@ def start(truth: Gaussians) -> Gaussians:
     return from_cloud(points, np.full((len(truth), 3), 128, np.uint8), 1)
 
 
+@pytest.fixture(scope="module")
+def views() -> Views:
+    return scene()[1]
+
+
+@pytest.fixture(scope="module")
+def cloud() -> Gaussians:
+    return start(scene()[0])
+
+
+@pytest.fixture(scope="module")
+def trained(cloud: Gaussians, views: Views) -> Gaussians:
+    """The splat after a whole training."""
+    return train(cloud, views, SETTINGS, BACKEND)
+
+
 def quality(splat: Gaussians, views: Views) -> float:
     found = [render(splat, camera)[0].color for camera in views.cameras]
     return psnr(np.clip(found, 0, 1), np.asarray(views.images) / 255)
@@ -59,30 +76,27 @@ def same(one: Gaussians, other: Gaussians) -> bool:
     return all(np.array_equal(a, b) for a, b in pairs)
 
 
-def test_images_are_learned_the_same_way_every_time() -> None:
-    truth, views = scene()
-    first = start(truth)
-    kept = first.select(np.arange(len(first)))
-    splat = train(first, views, SETTINGS, CpuBackend(1))
-    assert same(first, kept)  # what was passed in stays
-    assert quality(splat, views) > quality(first, views) + 10
-    assert same(splat, train(first, views, SETTINGS, CpuBackend(2)))
+def test_images_are_learned_the_same_way_every_time(
+    cloud: Gaussians, views: Views, trained: Gaussians
+) -> None:
+    assert same(cloud, start(scene()[0]))  # what was passed in stays
+    assert quality(trained, views) > quality(cloud, views) + 10
+    assert same(trained, train(cloud, views, SETTINGS, CpuBackend(2)))
     other = SETTINGS.model_copy(update={"seed": 4})
-    assert not same(splat, train(first, views, other, CpuBackend(1)))
+    assert not same(trained, train(cloud, views, other, BACKEND))
 
 
-def test_halves_of_a_view_teach_what_the_whole_does() -> None:
-    truth, views = scene()
-    splat, whole = start(truth), views.cameras[2]
+def test_halves_of_a_view_teach_what_the_whole_does(cloud: Gaussians, views: Views) -> None:
+    whole = views.cameras[2]
     flat = np.array([-2.5, -2, -1.5], np.float32)
-    small = dataclasses.replace(splat, log_scales=splat.log_scales + flat)
+    small = dataclasses.replace(cloud, log_scales=cloud.log_scales + flat)
     half, found = SIZE // 2, []
     for first, last in ((0, SIZE), (0, half), (half, SIZE)):
         middle = (half - first, half)
         camera = dataclasses.replace(whole, width=last - first, principal=middle)
         truth_there = views.images[2][:, first:last]
         lesson = Lesson(camera, truth_there, None, 1, adam.LearningRates(*[1.0] * 6), 1)
-        found.append(CpuBackend(1).gradients(small, lesson, 0.01, ssim_weight=0.0))
+        found.append(BACKEND.gradients(small, lesson, 0.01, ssim_weight=0.0))
     for entry in dataclasses.fields(Gaussians):
         one, left, right = (getattr(part.gaussians, entry.name) for part in found)
         assert np.allclose(left + right, one, atol=1e-3 * np.abs(one).max()) and np.any(left)
@@ -95,21 +109,24 @@ class Hasty(CpuBackend):
     stretch = 20
 
 
-def test_stretches_end_where_something_is_due() -> None:
-    truth, views = scene()
+def test_stretches_end_where_something_is_due(
+    cloud: Gaussians, views: Views, trained: Gaussians
+) -> None:
     steps: list[int] = []
-    splat = train(start(truth), views, SETTINGS, Hasty(1), watch=lambda step, _: steps.append(step))
-    assert same(splat, train(start(truth), views, SETTINGS, CpuBackend(1)))
+    splat = train(cloud, views, SETTINGS, Hasty(1), watch=lambda step, _: steps.append(step))
+    assert same(splat, trained)
     assert steps[0] == 20 and steps[-1] == SETTINGS.iterations and max(np.diff(steps)) == 20
     assert {50, 100, 150, SETTINGS.iterations // 2} <= set(steps)
 
 
 def test_an_interrupted_training_goes_on_to_the_same_result(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    cloud: Gaussians,
+    views: Views,
+    trained: Gaussians,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("gsba.splat.train._CHECKPOINT_EVERY_S", 1e-9)
-    truth, views = scene()
-    whole = train(start(truth), views, SETTINGS, CpuBackend(1))
 
     def stop(step: int, gaussians: Gaussians) -> None:
         if step == 130:
@@ -117,21 +134,14 @@ def test_an_interrupted_training_goes_on_to_the_same_result(
 
     path = tmp_path / "checkpoint.npz"
     with pytest.raises(KeyboardInterrupt):
-        train(start(truth), views, SETTINGS, CpuBackend(1), path, "key", stop)
+        train(cloud, views, SETTINGS, BACKEND, path, "key", stop)
     steps: list[int] = []
-    rest = train(
-        start(truth),
-        views,
-        SETTINGS,
-        CpuBackend(1),
-        path,
-        "key",
-        lambda step, _: steps.append(step),
-    )
-    assert steps == list(range(130, 321)) and same(rest, whole)
-    assert same(train(start(truth), views, SETTINGS, CpuBackend(1), path, "key"), whole)
+    keep = lambda step, _: steps.append(step)  # noqa: E731
+    rest = train(cloud, views, SETTINGS, BACKEND, path, "key", keep)
+    assert steps == list(range(130, 321)) and same(rest, trained)
+    assert same(train(cloud, views, SETTINGS, BACKEND, path, "key"), trained)
     short = SETTINGS.model_copy(update={"iterations": 3})
-    assert len(train(start(truth), views, short, CpuBackend(1), path, "other key")) == 150
+    assert len(train(cloud, views, short, BACKEND, path, "other key")) == 150
 
 
 class Poison(CpuBackend):
@@ -148,61 +158,55 @@ class Poison(CpuBackend):
 
 
 def test_what_is_not_finite_stops_the_training(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    cloud: Gaussians, views: Views, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("gsba.splat.train._CHECKPOINT_EVERY_S", 1e-9)
-    truth, views = scene()
     path = tmp_path / "checkpoint.npz"
-    with pytest.raises(GsbaError, match=r"no longer finite at step 40; .*checkpoint\.npz"):
-        train(start(truth), views, SETTINGS, Poison(1), path, "key")
-    states: list[tuple[int, bool]] = []
-    train(
-        start(truth),
-        views,
-        SETTINGS.model_copy(update={"iterations": 31}),
-        CpuBackend(1),
-        path,
-        "key",
-        lambda step, splat: states.append((step, splat.is_finite())),
-    )
+    message = r"no longer finite at step 40; .*checkpoint\.npz"
+    refused(message, train, cloud, views, SETTINGS, Poison(1), path, "key")
+    short, states = SETTINGS.model_copy(update={"iterations": 31}), []
+    keep = lambda step, splat: states.append((step, splat.is_finite()))  # noqa: E731
+    train(cloud, views, short, BACKEND, path, "key", keep)
     assert states == [(31, True)]  # went on from step 30, the last good one
 
 
-def test_a_part_of_a_training_leaves_its_start_alone() -> None:
-    truth, views = scene()
-    state = begin(start(truth), SETTINGS)
+def test_a_part_of_a_training_leaves_its_start_alone(cloud: Gaussians, views: Views) -> None:
+    state = begin(cloud, SETTINGS)
     first = state.copy()
-    once = advance(
-        advance(state, views, SETTINGS, CpuBackend(1), 8), views, SETTINGS, CpuBackend(1), 4
-    )
+    there = advance(state, views, SETTINGS, BACKEND, 8)
+    once = advance(there, views, SETTINGS, BACKEND, 4)
     assert once.step == 12 and same(state.gaussians, first.gaussians)
-    assert same(once.gaussians, advance(state, views, SETTINGS, CpuBackend(1), 12).gaussians)
+    assert same(once.gaussians, advance(state, views, SETTINGS, BACKEND, 12).gaussians)
     refused("no longer finite at step 40", advance, state, views, SETTINGS, Poison(1), 40)
 
 
 def test_the_cap_is_kept_and_said(
-    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+    cloud: Gaussians,
+    views: Views,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("gsba.splat.density._DENSIFY_PULL", 1e-9)
-    truth, views = scene()
     tight = SETTINGS.model_copy(update={"max_gaussians": 155})
     sizes: list[int] = []
     with caplog.at_level(logging.WARNING, "gsba"):
-        train(start(truth), views, tight, CpuBackend(1), watch=lambda _, s: sizes.append(len(s)))
+        train(cloud, views, tight, BACKEND, watch=lambda _, s: sizes.append(len(s)))
     assert max(sizes) <= 155 and "155 Gaussians are the most allowed" in caplog.text
     tiny = SETTINGS.model_copy(update={"max_gaussians": 100, "iterations": 2})
-    assert len(train(start(truth), views, tiny, CpuBackend(1))) == 100
+    assert len(train(cloud, views, tiny, BACKEND)) == 100
 
 
 def test_a_cap_follows_from_pixels_and_memory(
-    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+    cloud: Gaussians,
+    views: Views,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """23 numbers a Gaussian; 6 views of 32 x 32 pixels have 18,432 values."""
     monkeypatch.setattr("gsba.splat.density._DENSIFY_PULL", 1e-9)
-    truth, views = scene()
     eager = SETTINGS.model_copy(update={"iterations": 600})
     backend = CpuBackend(1)
-    splat = train(start(truth), views, eager, backend)
+    splat = train(cloud, views, eager, backend)
     assert 500 < len(splat) <= 18_432 // 23
     assert "801 Gaussians are the most that 6144 pixels determine" in caplog.text
     half = np.zeros((6, SIZE, SIZE), bool)
@@ -211,18 +215,17 @@ def test_a_cap_follows_from_pixels_and_memory(
     assert most_gaussians(masked, eager, backend)[0] == 18_432 // 2 // 23
     backend.memory_bytes = 2 * 8 * 4 * 23 * 300
     assert most_gaussians(views, eager, backend) == (300, "that half of 0.0 GB of memory holds")
-    assert 150 < len(train(start(truth), views, eager, backend)) <= 300
+    assert 150 < len(train(cloud, views, eager, backend)) <= 300
     backend.memory_bytes //= 3
-    assert len(begin(start(truth), eager).gaussians) == 150  # points are kept, but not added to
-    assert len(train(start(truth), views, eager, backend)) <= 150
+    assert len(begin(cloud, eager).gaussians) == 150  # points are kept, but not added to
+    assert len(train(cloud, views, eager, backend)) <= 150
 
 
-def test_nothing_to_train_on_is_refused() -> None:
-    truth, views = scene()
+def test_nothing_to_train_on_is_refused(cloud: Gaussians, views: Views) -> None:
     masked = dataclasses.replace(views, use=np.zeros((6, SIZE, SIZE), bool))
-    refused("all frames are masked", train, start(truth), masked, SETTINGS, CpuBackend(1))
-    with pytest.raises(GsbaError, match="no Gaussian"):
-        train(start(truth).select(np.zeros(150, bool)), views, SETTINGS, CpuBackend(1))
+    refused("all frames are masked", train, cloud, masked, SETTINGS, BACKEND)
+    nothing = cloud.select(np.zeros(150, bool))
+    refused("no Gaussian", train, nothing, views, SETTINGS, BACKEND)
 
 
 def test_published_times_at_the_published_length() -> None:

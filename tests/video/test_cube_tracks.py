@@ -12,6 +12,7 @@ from cube_map_tracks import picture_tracks
 from refusals import refused
 from scipy.spatial.transform import Rotation
 from two_fisheyes import colours
+from video_files import steady
 
 from gsba.config import VideoSettings
 from gsba.frames import load_erp, scan
@@ -32,10 +33,6 @@ def _tracks(index: int) -> tuple[np.ndarray, np.ndarray]:
     """Both tracks at an instant, of a camera that turns 8 degrees from one to the next."""
     turn = Rotation.from_rotvec([0, np.deg2rad(8) * index, 0]).as_matrix()
     return picture_tracks(SIZE, OVERLAP, lambda directions: colours(directions @ turn.T))
-
-
-def _steady(num: int) -> list[int]:
-    return [3000 * i for i in range(num)]
 
 
 def _encode(
@@ -76,7 +73,7 @@ def _recording(path: Path, num: int, missing: Sequence[int] = ()) -> Path:
     """A `.360` file of instants; the second track lacks some."""
     both = [_tracks(i) for i in range(num)]
     second = [i for i in range(num) if i not in missing]
-    ticks, small = _steady(num), np.full((90, 160, 3), 90, np.uint8)
+    ticks, small = steady(num), np.full((90, 160, 3), 90, np.uint8)
     first = [pictures[0] for pictures in both], ticks
     last = [both[i][1] for i in second], [ticks[i] for i in second]
     return _encode(path, [first, ([small] * num, ticks), last])
@@ -125,14 +122,14 @@ def test_files_that_hold_no_cube_map_are_refused(tmp_path: Path) -> None:
         assert not (tmp_path / "f").exists() or not any((tmp_path / "f").iterdir())
 
     def plain(width: int, height: int, num: int = 5) -> tuple[list[np.ndarray], list[int]]:
-        return [np.full((height, width, 3), 90, np.uint8)] * num, _steady(num)
+        return [np.full((height, width, 3), 90, np.uint8)] * num, steady(num)
 
     refuse([plain(WIDTH, SIZE)], f"holds one video track of {WIDTH}x{SIZE}, but a .360 recording")
     refuse([plain(WIDTH, SIZE), plain(WIDTH - 8, SIZE)], "has two of one size, three squares wide")
     refuse([plain(320, 180), plain(160, 90)], "holds video tracks of 320x180 and 160x90")
     short = [plain(WIDTH, SIZE, 20), plain(WIDTH, SIZE, 10)]
     refuse(short, "pictures of track5 last 0.333 s, those of track0 0.667 s: one is truncated")
-    early = [plain(WIDTH, SIZE), (plain(WIDTH, SIZE)[0], [90_000 + t for t in _steady(5)])]
+    early = [plain(WIDTH, SIZE), (plain(WIDTH, SIZE)[0], [90_000 + t for t in steady(5)])]
     refuse(early, "the tracks share no times (track0 0 to 0.133 s, track5 1.000 to 1.133 s)")
 
 

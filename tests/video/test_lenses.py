@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from command import fails, run_gsba
+from command import fails, run_gsba, succeed
 from refusals import refused
 from video_files import Track, encode, steady, times_of
 
@@ -335,45 +335,41 @@ def _of_size(width: int, height: int, num: int = 4) -> Track:
     ],
 )
 def test_other_tracks_are_refused(tmp_path: Path, tracks: list[Track], message: str) -> None:
-    video = encode(tmp_path / "v.mp4", *tracks)
-    fails(run_gsba("extract", video, "--out", tmp_path / "f"), message)
+    _refuses(encode(tmp_path / "v.mp4", *tracks), tmp_path / "f", message)
 
 
 def test_lenses_that_do_not_match_are_refused(tmp_path: Path) -> None:
-    out = ("--out", tmp_path / "f")
+    out = tmp_path / "f"
     front, ticks = _seen("front", range(20), steady(60)), steady(60)
     later = ([_lens("back", i) for i in range(20)], ticks[30:50])
     video = encode(tmp_path / "later.mp4", front, later)
-    fails(
-        run_gsba("extract", video, *out), "the lenses share no times (front 0 to 0.633 s, back 1.0"
-    )
+    _refuses(video, out, "the lenses share no times (front 0 to 0.633 s, back 1.0")
     video = encode(tmp_path / "short.mp4", front, _seen("back", range(17), ticks))
-    result = run_gsba("extract", video, *out)
-    fails(
-        result, "the back lens's pictures last 0.567 s, the front one's 0.667 s: one is truncated"
-    )
-    fails(result, "pass --to 0.533")
-    assert run_gsba("extract", video, *out, "--to", 0.533, "--every", 4).exit_code == 0
+    message = "the back lens's pictures last 0.567 s, the front one's 0.667 s: one is truncated"
+    assert "pass --to 0.533" in _refuses(video, out, message)
+    succeed("extract", video, "--out", out, "--to", 0.533, "--every", 4)
     video = encode(tmp_path / "alike.mp4", front, _seen("back", range(18), ticks))
-    assert run_gsba("extract", video, "--out", tmp_path / "g").exit_code == 0
+    succeed("extract", video, "--out", tmp_path / "g")
+
+
+def _refuses(video: Path, out: Path, message: str) -> str:
+    """The line in which `gsba extract` refuses a video."""
+    result = run_gsba("extract", video, "--out", out)
+    fails(result, message)
+    return result.stderr
 
 
 def test_files_that_do_not_match_are_refused(tmp_path: Path) -> None:
-    out = ("--out", tmp_path / "f")
-    front, back = tmp_path / "v_00_1.insv", tmp_path / "v_10_1.insv"
+    front, back, out = (tmp_path / name for name in ("v_00_1.insv", "v_10_1.insv", "f"))
     encode(front, _seen("front", range(20), steady(20)), container_format="mp4")
-    fails(run_gsba("extract", front, *out), "v_10_1.insv is not beside it: copy the other lens's")
+    _refuses(front, out, "v_10_1.insv is not beside it: copy the other lens's")
     encode(back, _of_size(64, 64, 20), container_format="mp4")
-    fails(
-        run_gsba("extract", front, *out), "v_10_1.insv is 64x64, but v_00_1.insv, the front lens's"
-    )
-    fails(
-        run_gsba("extract", back, *out), "v_10_1.insv is 64x64, but v_00_1.insv, the front lens's"
-    )
+    for given in (front, back):
+        _refuses(given, out, "v_10_1.insv is 64x64, but v_00_1.insv, the front lens's")
     encode(back, _seen("back", range(10), steady(20)), container_format="mp4")
-    fails(run_gsba("extract", front, *out), "v_10_1.insv: the back lens's pictures last 0.333 s")
+    _refuses(front, out, "v_10_1.insv: the back lens's pictures last 0.333 s")
     back.write_bytes(b"no video")
-    fails(run_gsba("extract", front, *out), "v_10_1.insv: cannot be read as video")
+    _refuses(front, out, "v_10_1.insv: cannot be read as video")
     front.unlink()
     encode(back, _seen("back", range(4), steady(4)), container_format="mp4")
-    fails(run_gsba("extract", back, *out), "v_00_1.insv is not beside it")
+    _refuses(back, out, "v_00_1.insv is not beside it")

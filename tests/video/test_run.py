@@ -5,13 +5,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from refusals import refused
 from tiny_run import SETTINGS, Case, computed_stages
 from video_files import encode, steady, times_of
 from wave_panorama import wave_panorama
 
 from gsba import refine
 from gsba.config import RefineSettings, VideoSettings
-from gsba.log import GsbaError
 from gsba.masks.merging import choose
 from gsba.pipeline.inputs import extract_video
 from gsba.store import RunStore
@@ -52,11 +52,9 @@ def test_where_odometry_is_lost_frames_are_stills(tmp_path: Path) -> None:
 
 
 def test_bad_input_fails_before_decoding(tmp_path: Path) -> None:
-    (tmp_path / "walk.mp4").write_bytes(b"no video")
-    with pytest.raises(GsbaError, match=r"nowhere\.tum"):
-        refine(tmp_path / "walk.mp4", tmp_path / "nowhere.tum", tmp_path / "run")
-    (tmp_path / "slam.tum").write_text("0 0 0 0 0 0 0 1\n1 1 0 0 0 0 0 1\n")
-    with pytest.raises(GsbaError, match=r"walk\.mp4: cannot be read as video"):
-        refine(tmp_path / "walk.mp4", tmp_path / "slam.tum", tmp_path / "run")
-    with pytest.raises(GsbaError, match="--fps 0: must be a positive"):
-        refine(tmp_path / "walk.mp4", tmp_path / "slam.tum", tmp_path / "run", fps=0)
+    video, slam, run = (tmp_path / name for name in ("walk.mp4", "slam.tum", "run"))
+    video.write_bytes(b"no video")
+    refused(r"nowhere\.tum", refine, video, tmp_path / "nowhere.tum", run)
+    slam.write_text("0 0 0 0 0 0 0 1\n1 1 0 0 0 0 0 1\n")
+    refused(r"walk\.mp4: cannot be read as video", refine, video, slam, run)
+    refused("--fps 0: must be a positive", refine, video, slam, run, fps=0)
