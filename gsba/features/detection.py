@@ -24,7 +24,7 @@ class ExtractorTraits:
     sigma_px: float | None = None  # per-axis noise, face pixels; None = by a keypoint's size
     offset_px: tuple[float, float] = (0.0, 0.0)  # (u, v) to add to the network's pixels
     patch_size: int = 27  # panorama pixels across the patches that are aligned around keypoints,
-    # odd; smaller ones around a network's keypoints move with the poses they are predicted by
+    # odd; smaller ones around those of networks drift along a walk (benchmarks/results/learned.md)
 
 
 TRAITS = {
