@@ -148,6 +148,7 @@ def build_report(
         "gsba": __version__,
         "finished": datetime.now(UTC).isoformat(timespec="seconds"),
         "start": found.start,
+        "timed": frames.timed,
         "summary": _summary(frames, coarse, reconstruction)
         | {"seconds": stages.seconds_again + sum(stage.seconds for stage in stages.costs)},
         "maps": summarize_maps(reconstruction, frames, found.reasons),

@@ -16,6 +16,7 @@ from gsba.bundle.map_strength import (
     scale_changes,
     step_deviations,
 )
+from gsba.odometry.tour_order import MIN_FRAMES
 from gsba.report.maps import MIN_SHARE_OF_A_MAP
 from gsba.types import FrameSet, PoseStatus, Reconstruction, RunStart
 
@@ -231,6 +232,7 @@ class _Tests:
             cause = "the camera turned on the spot: there are rotations and no points"
             yield Reason(Level.REFUSED, (), cause, "walk while you film: a trainer needs parallax")
             return
+        yield from self._in_unknown_order()
         yield from self._unrefined()
         yield from self._held()
         yield from self._loosely_scaled()
@@ -263,6 +265,17 @@ class _Tests:
         elif command:
             remedy = f"export the next map; {remedy}"
         yield Reason(level, out, cause, remedy, command=command)
+
+    def _in_unknown_order(self) -> Iterator[Reason]:
+        """Stills too few to tell whether their names follow the way (`odometry.tour_order`)."""
+        few = self.figures.frames < MIN_FRAMES
+        if few and _has_no_start(self.report) and not self.report.get("timed", True):
+            cause = (
+                f"{self.figures.frames} stills without times are too few to tell whether their "
+                "names follow the way; if they do not, a place that repeats makes a wrong map"
+            )
+            remedy = "if their names are in order, pass --fps 1 or --timestamps"
+            yield Reason(Level.LOOK, tuple(self.names), cause, remedy)
 
     def _unrefined(self) -> Iterator[Reason]:
         """Frames that images do not constrain."""

@@ -23,6 +23,7 @@ _MAX_SCALE_RATIO = 1.2  # of fit to candidate: a larger change is a collapse
 _MIN_DISTANCE = 0.05  # of distinct fits, part of the cloud's size
 _MIN_SHARE = 0.25  # of explained points in the cloud
 _MAX_DOUBT = 0.01  # largest p value of the lead over all rivals
+_MAX_TWIN_LEAD = 0.05  # of the mirrored cloud's share: a room that is its own mirror image has none
 
 
 class NoPlacementError(GsbaError):
@@ -109,7 +110,8 @@ def register(cloud: Cloud, scan: Scan, guess: Guess | None = None) -> Registrati
             evidence = verdict(fit.similarity, twin, scan, grid, found.fit.noise)
             doubt = evidence.doubt(found.verdict)
             logger.debug("mirrored: %.3f explained, p = %.2g of its lead", evidence.share, doubt)
-            if evidence.share > found.verdict.share and doubt < _MAX_DOUBT:
+            lead = evidence.share - found.verdict.share
+            if lead > _MAX_TWIN_LEAD or (lead > 0 and doubt < _MAX_DOUBT):
                 raise NoPlacementError(
                     "the mirrored run fits better: the scan is of another building, or its world "
                     "is left-handed: change the sign of one of its axes"

@@ -49,6 +49,25 @@ def test_a_good_map_is_said_to_be_good_in_a_sentence() -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("num", "timed", "pose", "level"),
+    [
+        (11, False, RunStart.PAIRS, Level.LOOK),
+        (12, False, RunStart.PAIRS, Level.GOOD),  # whose order was looked for
+        (11, True, RunStart.PAIRS, Level.GOOD),
+        (11, False, RunStart.TRAJECTORY, Level.GOOD),
+    ],
+)
+def test_few_stills_without_times_or_trajectory_may_be_in_no_order(
+    num: int, timed: bool, pose: str, level: Level
+) -> None:
+    rows = [{"name": name, "coarse_pose": pose} for name in NAMES[:num]]
+    figures = replace(GOOD, frames=num, exported=num)
+    found = _verdict(figures, NAMES[:num], frames=rows, timed=timed)
+    assert found.level == level
+    assert ("11 stills without times are too few" in found.sentence) == (level == Level.LOOK)
+
+
 def test_lengths_are_metres_where_the_scale_is_known_and_the_camera_is_named() -> None:
     camera = {"taken": True, "reason": "", "baseline": 0.052, "metres_per_unit": 0.6}
     camera |= {"readout": {"taken": True, "ms": 13.24}}
