@@ -82,7 +82,7 @@ def run(folder: Path, num_threads: int) -> dict[str, float]:
     greys = panorama.Greys(frames, PatchSettings().max_width)
     before = peak_mb()
     solved = replace(Solution.without_points(poses), landmarks=landmarks)
-    observed, workers = alignment.AlignedObservations(keypoints), Threads(num_threads)
+    observed, workers = alignment.AlignedObservations(keypoints, 15), Threads(num_threads)
     sighted = alignment.align(solved, observed, greys, rig, workers)
     kept, received = sighted.counts.kept, sighted.counts.received
     return {"frames": len(frames), "before_mb": before, "peak_mb": peak_mb(),

@@ -25,7 +25,7 @@ _MIN_GAIN = 1e-9
 
 @dataclass(frozen=True, slots=True)
 class Likeness:
-    """How alike a tour's frames are."""
+    """Likeness of all pairs of a tour's frames."""
 
     alike: np.ndarray  # (F, F) see `likeness`
 

@@ -29,12 +29,7 @@ from gsba.odometry.tour_maps import (
     matches_of,
     searched,
 )
-from gsba.odometry.tour_order import (
-    Likeness,
-    in_given_order,
-    likeness,
-    most_alike_path,
-)
+from gsba.odometry.tour_order import most_alike_path
 from gsba.odometry.tour_steps import Step, TourFrame, read_frame
 from gsba.types import FrameSet
 
@@ -42,33 +37,30 @@ _MIN_STEP_SCORE = 15.0  # of the places on both sides of a step, which do not ho
 _MIN_END_SCORE = 8.0  # of a step beyond which there is one frame
 
 
-def likeness_of(run_frames: FrameSet, num_threads: int = 1) -> Likeness:
-    """Likeness of a run's frames."""
-    return Likeness(likeness(_read(run_frames, num_threads), num_threads))
+def read_stills(frames: FrameSet, num_threads: int = 1) -> list[TourFrame]:
+    """All frames of a run, with the keypoints that are searched."""
+    return list(map_in_threads(lambda f: read_frame(frames, f), len(frames), num_threads))
 
 
 def match_stills(
-    run_frames: FrameSet, alike_frames: np.ndarray | None, num_threads: int = 1
+    frames: Sequence[TourFrame],
+    given_names: tuple[str, ...],
+    likeness: np.ndarray | None,
+    num_threads: int = 1,
 ) -> TourMatches:
-    """Confirmed steps of a tour, in the order of its frames; in another one where neighbours are
-    hardly more alike (F, F) than any frames are, unless no step is confirmed there. No likeness:
-    frames are in order."""
-    frames = _read(run_frames, num_threads)
-    if alike_frames is None or in_given_order(alike_frames):
-        return match_tour(frames, run_frames.names, num_threads)
-    path = most_alike_path(alike_frames)
+    """Confirmed steps of a tour, in the order given; by their likeness (F, F), if that is known
+    since names are in no order, in another one, unless no step is confirmed there."""
+    if likeness is None:
+        return match_tour(frames, given_names, num_threads)
+    path = most_alike_path(likeness)
     given, frames = frames, [frames[f] for f in path]
     steps, chain, sure = searched(frames, num_threads)
     sure = without_unsupported(frames, steps, chain, sure, num_threads)
     if not any(sure):
         none: list[list[Step]] = [[] for _ in steps]
-        return matches_of(given, run_frames.names, none, chain, sure, [])
-    names = tuple(run_frames.names[f] for f in path)
+        return matches_of(given, given_names, none, chain, sure, [])
+    names = tuple(given_names[f] for f in path)
     return replace(matches_of(frames, names, steps, chain, sure, []), order_found=True)
-
-
-def _read(frames: FrameSet, num_threads: int) -> list[TourFrame]:
-    return list(map_in_threads(lambda f: read_frame(frames, f), len(frames), num_threads))
 
 
 def without_unsupported(

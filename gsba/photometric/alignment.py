@@ -53,12 +53,12 @@ class AlignedObservations:
     """Observations of a map's points, and what earlier alignments have shown of them."""
 
     keypoints: Keypoints  # as pictures show them
+    patch_size: int  # panorama pixels across the patches around them, odd
     aligned: np.ndarray | None = None  # (N,) bool, keypoints confirmed by patches; None = none
     normals_rig: np.ndarray | None = None  # (N, 3) of the surfaces that they show, as in `Sighted`;
     # None = unknown
     field: SphereField = _STRAIGHT  # errors of stitching: the map is corrected by it
     folder: Path | None = None  # on the disk that holds what is found; None = it is in memory
-    patch_size: int = 15  # panorama pixels across the patches around them, odd
 
 
 def align(

@@ -262,7 +262,7 @@ def _aligned(state: State, base: Sighted, features: Keypoints, parts: np.ndarray
     state = replace(state, matches=found.matches)
     start = replace(known, landmarks=state.triangulated(_crossing(state, parts), rays, gate))
     size = traits_of(run.settings).patch_size
-    seen = AlignedObservations(features, field=state.map.field, patch_size=size)
+    seen = AlignedObservations(features, size, field=state.map.field)
     shared = patch_rounds.observe(state, start, seen, "align1")
     left, before, better = _without_same(base, shared, run.greys.width), state, None
     for n in range(1, rounds + 1):

@@ -100,7 +100,7 @@ def observations(state: State) -> AlignedObservations:
     map_, folder = state.map, state.run.store.scratch_folder
     size = traits_of(state.run.settings).patch_size
     return AlignedObservations(
-        map_.observed, map_.aligned, map_.normals_rig, map_.field, folder, size
+        map_.observed, size, map_.aligned, map_.normals_rig, map_.field, folder
     )
 
 

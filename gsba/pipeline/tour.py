@@ -3,8 +3,9 @@ searched along epipolar lines (`gsba.odometry.tour_maps`)."""
 
 import logging
 import shutil
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, fields, replace
-from functools import partial
+from functools import cache
 
 import numpy as np
 
@@ -15,8 +16,9 @@ from gsba.log import GsbaError
 from gsba.loop_closure import connectivity
 from gsba.matching.recovery import Recovered
 from gsba.odometry.tour_maps import TourMatches
-from gsba.odometry.tour_order import Likeness, in_given_order, may_lack_order
-from gsba.odometry.tour_unordered import likeness_of, match_stills
+from gsba.odometry.tour_order import Likeness, in_given_order, likeness, may_lack_order
+from gsba.odometry.tour_steps import TourFrame
+from gsba.odometry.tour_unordered import match_stills, read_stills
 from gsba.pipeline import frontend
 from gsba.pipeline.run import Run
 from gsba.pipeline.state import ObservedFrames, State
@@ -66,7 +68,8 @@ def _search(state: State, found: Recovered) -> TourMatches | None:
         or not _may_be_tour(run.frames, run.settings)
     ):
         return None
-    key, before, alike = _search_key(run.frames), 0, None
+    key, before, tied, alike = _search_key(run.frames), 0, False, None
+    stills = cache(lambda: read_stills(run.frames, run.num_threads))  # for both stages
     known = run.store.stored(_SEARCH, key, TourMatches)
     # In an order found by likeness, descriptors match what is only alike.
     if known is None or not known.order_found:
@@ -74,8 +77,8 @@ def _search(state: State, found: Recovered) -> TourMatches | None:
         tied = before > _MAX_TIED_SHARE * num
         if tied and _all_match(found.neighbours.matches, num):
             return None
-        alike = _likeness(run, key)
-        if tied and (alike is None or in_given_order(alike)):
+        alike = _likeness_in_no_order(run, key, stills)
+        if tied and alike is None:
             return None
     if known is None:
         logger.info(
@@ -84,13 +87,16 @@ def _search(state: State, found: Recovered) -> TourMatches | None:
             "(--set pairs.max_tour_frames=0 leaves it out)",
             before,
             num,
-            ", but names are in no order" if before > _MAX_TIED_SHARE * num else "",
+            ", but names are in no order" if tied else "",
         )
-    compute = partial(match_stills, run.frames, alike, run.num_threads)
+
+    def compute() -> TourMatches:
+        return match_stills(stills(), run.frames.names, alike, run.num_threads)
+
     tour = run.store.stage(_SEARCH, key, compute, TourMatches)
     if tour.names != run.frames.names:
         raise OrderFoundError("the stills are in no order: refine them in the order found")
-    if before and alike is not None and not in_given_order(alike):
+    if before and alike is not None:
         raise GsbaError(  # neighbours by name match what is only alike
             "the order of the stills is not known: neighbours by name are hardly more alike than "
             "any two, and images confirm no other order; rename them in the order of the way, or, "
@@ -101,13 +107,19 @@ def _search(state: State, found: Recovered) -> TourMatches | None:
     return tour if _num_tied(tour.near.matches, num) > before else None
 
 
-def _likeness(run: Run, key: object) -> np.ndarray | None:
-    """Likeness (F, F) of stills whose names may be in no order; None = they are in order."""
+def _likeness_in_no_order(
+    run: Run, key: object, stills: Callable[[], Sequence[TourFrame]]
+) -> np.ndarray | None:
+    """Likeness (F, F) of stills whose names are in no order; None = they are in order."""
     frames = run.frames
     if frames.timed or not may_lack_order(len(frames)):
         return None
-    compute = partial(likeness_of, frames, run.num_threads)
-    return run.store.stage(_LIKENESS, [key, frames.names], compute, Likeness).alike
+
+    def compute() -> Likeness:
+        return Likeness(likeness(stills(), run.num_threads))
+
+    alike = run.store.stage(_LIKENESS, [key, frames.names], compute, Likeness).alike
+    return None if in_given_order(alike) else alike
 
 
 def in_known_order(store: RunStore, frames: FrameSet, settings: RefineSettings) -> FrameSet:

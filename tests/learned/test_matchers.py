@@ -350,8 +350,7 @@ def superglues(folder: Path) -> tuple[OfficialSuperGlue, SuperGlue]:
 def test_superglue_is_that_of_the_paper(
     num: int, superglues: tuple[OfficialSuperGlue, SuperGlue]
 ) -> None:
-    """The same probabilities, also where one face is filled up to the other's number of
-    keypoints."""
+    """Equal probabilities, also where one face has fewer keypoints and is padded to as many."""
     model, glue = superglues
     faces = _face(3, 40, 128, 256), _face(4, num, 128, 256)
     matched, scores = glue(*faces, 128)

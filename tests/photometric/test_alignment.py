@@ -110,7 +110,7 @@ def _run(
     frames, world_T_rigs = walk
     landmarks, keypoints = _start(world_T_rigs, sigma_px)
     solved = _solved(landmarks, world_T_rigs)
-    observed = in_small_patches(keypoints, aligned, folder=folder)
+    observed = in_small_patches(keypoints, aligned=aligned, folder=folder)
     return alignment.align(solved, observed, Greys(frames, 4096), RIG, Threads(2))
 
 
@@ -359,7 +359,7 @@ def test_patches_come_to_lie_on_their_surfaces(tmp_path: Path) -> None:
     for _ in range(2):
         solved, observed = (
             _solved(landmarks, world_T_rigs),
-            in_small_patches(keypoints, None, normals),
+            in_small_patches(keypoints, normals_rig=normals),
         )
         greys, workers = Greys(frames, 4096), Threads(2)
         found = alignment.align(solved, observed, greys, RIG, workers)

@@ -16,7 +16,6 @@ from gsba.config import RefineSettings
 from gsba.log import GsbaError
 from gsba.masks import merging
 from gsba.matching.recovery import Recovered
-from gsba.odometry import tour_order
 from gsba.odometry.tour_maps import TourMatches
 from gsba.pipeline import frontend, tour
 from gsba.pipeline.refine import Start, _begin, _without_distractors
@@ -130,7 +129,8 @@ def test_what_is_only_alike_makes_no_map_of_stills_in_no_order(
     gaps = np.abs(np.subtract.outer(way, way))
     alike = (2 + np.cos(2 * np.pi * gaps / 3)) * np.exp(-gaps / 8.0)
     nothing = match_nothing(stills)
-    monkeypatch.setattr(tour, "likeness_of", lambda *_: tour_order.Likeness(alike))
+    monkeypatch.setattr(tour, "read_stills", lambda *_: [])
+    monkeypatch.setattr(tour, "likeness", lambda *_: alike)
     monkeypatch.setattr(tour, "match_stills", lambda *_: nothing)
     with RunStore(tmp_path / "run", {"frames": tmp_path}) as store:
         given = neighbours_tied(stills, store, unmatched)
