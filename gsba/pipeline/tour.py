@@ -22,6 +22,7 @@ from gsba.odometry.tour_unordered import match_stills, read_stills
 from gsba.pipeline import frontend
 from gsba.pipeline.run import Run
 from gsba.pipeline.state import ObservedFrames, State
+from gsba.significance import outweighs
 from gsba.store.folder import STAGES
 from gsba.store.store import RunStore, fingerprint
 from gsba.trajectory import judgement
@@ -33,6 +34,7 @@ logger = logging.getLogger(__name__)
 
 _MAX_TIED_SHARE = 0.8  # of frames in maps of descriptors, below which places are searched
 _MIN_INTERVAL_S = 1.5  # between stills metres apart; frames of a video can be had closer together
+_MAX_ORDER_ERROR = 0.02  # probability that matches of stills in no order, if all match, show one
 _LIKENESS, _SEARCH, _STAGE = "likeness", "tour", "features_tour"
 
 
@@ -75,7 +77,7 @@ def _search(state: State, found: Recovered) -> TourMatches | None:
     if known is None or not known.order_found:
         before = _num_tied(found.neighbours.matches, num)
         tied = before > _MAX_TIED_SHARE * num
-        if tied and _all_match(found.neighbours.matches, num):
+        if tied and _show_order(found.neighbours.matches, num):
             return None
         alike = _likeness_in_no_order(run, key, stills)
         if tied and alike is None:
@@ -158,11 +160,20 @@ def _num_tied(matches: Matches, num: int) -> int:
     return int(np.count_nonzero(connectivity.maps_of_images(matches.pairs, num) >= 0))
 
 
-def _all_match(matches: Matches, num: int) -> bool:
-    """True if all of `num` frames match the next one and the one after it, as those of a dense walk
-    in order do."""
+def _show_order(matches: Matches, num: int) -> bool:
+    """True if all of `num` frames match the next one and the one after it, the next one with
+    significantly more matches, as those of a dense walk in order do. In a hall of bays, stills in
+    no order may all match, too."""
+    counts = np.zeros((2, num), np.int64)  # of the next one, of the one after it
     gaps = matches.pairs[:, 1] - matches.pairs[:, 0]
-    return np.count_nonzero(gaps <= 2) == 2 * num - 3
+    near = gaps <= 2
+    counts[gaps[near] - 1, matches.pairs[near, 0]] = np.diff(matches.offsets)[near]
+    nearest, further = counts[0, : num - 1], counts[1, : num - 2]
+    if np.count_nonzero(near) < 2 * num - 3:
+        return False
+    more = np.sign(nearest[:-1] + nearest[1:] - 2 * further)
+    wins, losses = int(np.count_nonzero(more > 0)), int(np.count_nonzero(more < 0))
+    return outweighs(wins, losses, _MAX_ORDER_ERROR)
 
 
 def _with_places(state: State, tour: TourMatches) -> tuple[ObservedFrames, Matches]:

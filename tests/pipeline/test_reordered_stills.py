@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import cast
+from typing import Any, cast
 
 import cv2
 import numpy as np
@@ -18,11 +18,14 @@ from gsba.masks import merging
 from gsba.matching.recovery import Recovered
 from gsba.odometry.tour_maps import TourMatches
 from gsba.pipeline import frontend, tour
+from gsba.pipeline.prior import Prior
 from gsba.pipeline.refine import Start, _begin, _without_distractors
-from gsba.pipeline.run import Evidence, Journal
+from gsba.pipeline.run import Evidence, Journal, Run
 from gsba.pipeline.state import State
 from gsba.store.store import RunStore
-from gsba.types import Counts, FrameSet, PictureFormat, VerifiedPairs
+from gsba.trajectory.association import without_trajectory
+from gsba.trajectory.judgement import StepChecks
+from gsba.types import Counts, FrameSet, Matches, PictureFormat, VerifiedPairs
 
 NAMES, FOUND = ("a", "b", "c", "d", "e"), np.array([3, 0, 4, 1, 2])
 
@@ -102,39 +105,65 @@ def match_nothing(stills: FrameSet) -> TourMatches:
 
 
 def neighbours_tied(
-    stills: FrameSet, store: RunStore, unmatched: tuple[int, int] | None
+    stills: FrameSet, store: RunStore, unmatched: tuple[int, int] | None = None, nearest: int = 8
 ) -> tuple[State, Recovered]:
-    """A state whose descriptors tie all stills by name, with or without a pair that matches not."""
-    some = [(f, f + gap) for gap in (1, 2) for f in range(len(stills) - gap)]
-    pairs = np.array([pair for pair in some if pair != unmatched])
-    near = SimpleNamespace(matches=SimpleNamespace(pairs=pairs))
-    trust = SimpleNamespace(turning_only=False)
-    run = SimpleNamespace(frames=stills, settings=RefineSettings(), store=store, num_threads=1)
-    state = SimpleNamespace(prior=SimpleNamespace(absent=True), run=run)
-    return cast(State, state), cast(Recovered, SimpleNamespace(neighbours=near, trust=trust))
+    """A state whose descriptors tie all stills by name, with or without a pair that matches not;
+    neighbours by `nearest` matches, frames further apart by 8."""
+    pairs = [(f, f + gap) for gap in (1, 2) for f in range(len(stills) - gap)]
+    pairs = [pair for pair in pairs if pair != unmatched]
+    rows = [np.zeros((nearest if g == f + 1 else 8, 2), np.int32) for f, g in pairs]
+    near = SimpleNamespace(matches=Matches.of_rows(np.array(pairs), rows))
+    trust, settings = StepChecks.of_all(np.tile(np.eye(4), (len(stills), 1, 1))), RefineSettings()
+    run = SimpleNamespace(frames=stills, settings=settings, store=store, num_threads=1, suffix="")
+    state = State(cast(Run, run), Prior.of(without_trajectory(stills)), *[cast(Any, None)] * 4)
+    return state, cast(Recovered, SimpleNamespace(neighbours=near, trust=trust))
+
+
+def in_a_hall_of_bays(monkeypatch: pytest.MonkeyPatch, way: np.ndarray) -> None:
+    """Each frame is as alike to those a bay away as to its neighbours on the way (F,)."""
+    gaps = np.abs(np.subtract.outer(way, way))
+    alike = (2 + np.cos(2 * np.pi * gaps / 3)) * np.exp(-gaps / 8.0)
+
+    def rows(frames: FrameSet, num_threads: int) -> list[int]:
+        return [int(name) for name in frames.names]
+
+    monkeypatch.setattr(tour, "read_stills", rows)
+    monkeypatch.setattr(tour, "likeness", lambda some, _: alike[np.ix_(some, some)])
+
+
+def numbered(folder: Path, num: int) -> FrameSet:
+    return stills_named(folder, [f"{n:03d}" for n in range(num)])
+
+
+def way_of(num: int, shuffled: bool) -> np.ndarray:
+    return np.random.default_rng(0).permutation(num) if shuffled else np.arange(num)
 
 
 @pytest.mark.parametrize(
-    ("shuffled", "unmatched"), [(True, (5, 6)), (True, (5, 7)), (False, (5, 6)), (True, None)]
+    ("shuffled", "unmatched", "nearest"),
+    [
+        (True, (5, 6), 8),
+        (True, (5, 7), 8),
+        (True, None, 8),
+        (True, None, 9),
+        (False, (5, 6), 8),
+        (False, None, 8),
+    ],
 )
 def test_what_is_only_alike_makes_no_map_of_stills_in_no_order(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     shuffled: bool,
     unmatched: tuple[int, int] | None,
+    nearest: int,
 ) -> None:
-    """A hall of bays: each frame is as alike to those a bay away as to its neighbours."""
-    stills, numbers = stills_named(tmp_path, "abcdefghijkl"), np.arange(12)
-    way = np.random.default_rng(0).permutation(numbers) if shuffled else numbers
-    gaps = np.abs(np.subtract.outer(way, way))
-    alike = (2 + np.cos(2 * np.pi * gaps / 3)) * np.exp(-gaps / 8.0)
+    stills = numbered(tmp_path, 12)
+    in_a_hall_of_bays(monkeypatch, way_of(12, shuffled))
     nothing = match_nothing(stills)
-    monkeypatch.setattr(tour, "read_stills", lambda *_: [])
-    monkeypatch.setattr(tour, "likeness", lambda *_: alike)
     monkeypatch.setattr(tour, "match_stills", lambda *_: nothing)
     with RunStore(tmp_path / "run", {"frames": tmp_path}) as store:
-        given = neighbours_tied(stills, store, unmatched)
-        if shuffled and unmatched:
+        given = neighbours_tied(stills, store, unmatched, nearest)
+        if shuffled and nearest == 8:  # matches show no order
             with pytest.raises(GsbaError, match="the order of the stills is not known"):
                 tour.match_places(*given)
         else:
