@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from gsba.log import GsbaError
-from gsba.pipeline import frontend
+from gsba.pipeline import frontend, tour
 from gsba.pipeline.prior import Prior
 from gsba.pipeline.state import State
 from gsba.similarity import Sim3
@@ -48,7 +48,8 @@ def _match(state: State, number: int) -> State:
     """One recording with its neighbours matched, its trajectory judged, its gyro aligned."""
     with naming_recording(state.run.evidence.recordings[number].name):
         found = frontend.match_neighbours(frontend.of_recording(state, number))
-        found = frontend.judge_trajectory(found, frontend.check_steps(found))
+        steps = frontend.check_steps(found)
+        found = frontend.judge_trajectory(tour.check_order(found, steps), steps)
         found = frontend.align_gyro_to_neighbours(found)
         if found.prior.turning_only:
             raise GsbaError(
@@ -79,6 +80,7 @@ def _combined(priors: Sequence[Prior]) -> Prior:
         replace(coarse, segments=None),
         trust,
         joints=joints,
+        order_doubted=any(one.order_doubted for one in priors),
         turning=_turning([(one.turning, len(one.coarse.sources)) for one in priors]),
         of_recordings=tuple(priors),
     )

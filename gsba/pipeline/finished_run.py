@@ -33,6 +33,7 @@ class KeptMap:
 
     map: Map
     coarse: CoarsePoses  # of its frames, in the world of the result
+    order_doubted: bool = False  # see `pipeline.tour.check_order`
 
 
 def keep(state: State) -> None:
@@ -46,7 +47,7 @@ def keep(state: State) -> None:
             keypoints=map_.observed.of_frames(np.zeros(0, np.int64)),
         )
         map_ = replace(map_, stitching=field)
-    kept = KeptMap(map_, state.prior.coarse)
+    kept = KeptMap(map_, state.prior.coarse, state.prior.order_doubted)
     state.run.stage(_STAGE, [], lambda: kept, KeptMap, noted=False)
     if settings := tuple(one.model_dump_json() for one in state.run.camera_settings):
         state.run.stage(_CAMERAS, [], lambda: settings, tuple[str, ...], noted=False)
@@ -65,6 +66,7 @@ class FinishedRun:
     settings: RefineSettings
     files: tuple[Path, ...]  # (F,) stored features of each frame; may be missing
     camera_settings: tuple[CameraSettings, ...]  # (C,)
+    order_doubted: bool = False  # see `pipeline.tour.check_order`
 
     @classmethod
     def load(cls, root: Path) -> "FinishedRun":
@@ -100,7 +102,7 @@ class FinishedRun:
         if len(cameras) > 1:
             known = load_stage(root, _CAMERAS, tuple[str, ...])
             cameras = tuple(CameraSettings.model_validate_json(one) for one in known)
-        return cls(root, origin, *given, settings, files, cameras)
+        return cls(root, origin, *given, settings, files, cameras, kept.order_doubted)
 
     def recordings(self) -> dict[str, FrameSet]:
         """Frames of each recording by its name, on its own clock, under their own names."""

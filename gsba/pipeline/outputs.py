@@ -214,7 +214,12 @@ def _findings(state: State, result: Reconstruction, gps: dict[str, Any] | None) 
     notes += notes_on_recordings(recordings)
     found = Findings(notes, trajectory, stitching, camera, gyro, gps, map_.moves)
     return replace(
-        found, recordings=recordings, reasons=_reasons(prior), frame_lists=lists, start=start
+        found,
+        recordings=recordings,
+        reasons=_reasons(prior),
+        frame_lists=lists,
+        start=start,
+        order_doubted=prior.order_doubted,
     )
 
 

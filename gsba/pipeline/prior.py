@@ -30,6 +30,7 @@ class Prior:
     strength: MapStrength | None = None  # of the map, by images alone; None = not measured
     gyro: Alignment | None = None  # of the sensor that rides along; None = there is none
     turning: GyroConstraints | None = None  # its constraints on frames; None = images contradict it
+    order_doubted: bool = False  # neighbours by the times given are hardly more alike than any two
     of_recordings: tuple["Prior", ...] = ()  # of each of several recordings, before they were
     # combined: clocks and gyros of their own; () = there is one recording
 

@@ -371,6 +371,7 @@ def _map_all(state: State) -> State:
     else:
         state = frontend.match_neighbours(state)
         found = frontend.check_steps(state)
+        state = tour.check_order(state, found)
         state = tour.match_places(state, found) or frontend.judge_trajectory(state, found)
         state = frontend.align_gyro_to_neighbours(state)
     if state.prior.turning_only:

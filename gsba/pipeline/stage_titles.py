@@ -27,6 +27,7 @@ _TITLES = {
     "turn": "prove a turn on the spot",
     "steps": "check the trajectory's steps",
     "likeness": "compare all stills",
+    "order": "compare neighbours with other frames",
     "tour": "search stills along epipolar lines",
     "features_tour": "add the places found to features",
     "keypoints_tour": "gather keypoints, places found among them",

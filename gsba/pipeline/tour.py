@@ -16,7 +16,13 @@ from gsba.log import GsbaError
 from gsba.loop_closure import connectivity
 from gsba.matching.recovery import Recovered
 from gsba.odometry.tour_maps import TourMatches
-from gsba.odometry.tour_order import Likeness, in_given_order, likeness, may_lack_order
+from gsba.odometry.tour_order import (
+    MIN_FRAMES,
+    Likeness,
+    in_given_order,
+    likeness,
+    may_lack_order,
+)
 from gsba.odometry.tour_steps import TourFrame
 from gsba.odometry.tour_unordered import match_stills, read_stills
 from gsba.pipeline import frontend
@@ -36,10 +42,55 @@ _MAX_TIED_SHARE = 0.8  # of frames in maps of descriptors, below which places ar
 _MIN_INTERVAL_S = 1.5  # between stills metres apart; frames of a video can be had closer together
 _MAX_ORDER_ERROR = 0.02  # probability that matches of stills in no order, if all match, show one
 _LIKENESS, _SEARCH, _STAGE = "likeness", "tour", "features_tour"
+_FRAMES_IN_ORDER, _NUM_PLACES = 20, 3  # of frames one after another that tell an order from none;
+# of these sequences, in one of which the camera may stand
+_NO_ORDER = (
+    "the order of the stills is not known: neighbours by name are hardly more alike than any two"
+)
+_IN_ORDER = "rename them in the order of the way, or, if they are in it, pass --timestamps or --fps"
 
 
 class OrderFoundError(GsbaError):
     """Stills are in no order, and one was found: the run has to begin again in it."""
+
+
+def check_order(state: State, found: Recovered) -> State:
+    """The state, with a doubt where neighbours by given times are hardly more alike than any two.
+
+    Images alone make a wrong map of stills in no order where a place repeats. Frames whose matches
+    show their order have one, and so have those of a video. Stills that `match_places` puts in
+    order are left to it.
+
+    Raises:
+        GsbaError: such frames have no times.
+    """
+    run, frames = state.run, state.run.frames
+    if (
+        not state.prior.absent
+        or found.trust.turning_only
+        or len(frames) < MIN_FRAMES
+        or run.store.root.absolute() in frames.paths[0][0].parents
+        or _may_be_in_no_order(run)
+        or _show_order(found.neighbours.matches, len(frames))
+    ):
+        return state
+    num = min(len(frames), _FRAMES_IN_ORDER)
+    begins = np.unique(np.linspace(0, len(frames) - num, _NUM_PLACES).astype(int))
+
+    def in_order(first: int) -> bool:
+        some = read_stills(frames.taken(np.arange(first, first + num)), run.num_threads)
+        return in_given_order(likeness(some, run.num_threads))
+
+    key = [_search_key(frames), frames.names]
+    if run.store.stage(
+        f"order{run.suffix}", key, lambda: any(map(in_order, begins.tolist())), bool
+    ):
+        return state
+    if frames.timed:
+        return replace(state, prior=replace(state.prior, order_doubted=True))
+    alone = may_lack_order(len(frames)) and bool(run.suffix)
+    remedy = "refine them alone, which puts them in order, and add them by gsba merge; or "
+    raise GsbaError(f"{_NO_ORDER}; {remedy * alone}{_IN_ORDER}")
 
 
 def match_places(state: State, found: Recovered) -> State | None:
@@ -99,11 +150,8 @@ def _search(state: State, found: Recovered) -> TourMatches | None:
     if tour.names != run.frames.names:
         raise OrderFoundError("the stills are in no order: refine them in the order found")
     if before and alike is not None:
-        raise GsbaError(  # neighbours by name match what is only alike
-            "the order of the stills is not known: neighbours by name are hardly more alike than "
-            "any two, and images confirm no other order; rename them in the order of the way, or, "
-            "if they are in it, pass --timestamps or --fps"
-        )
+        # neighbours by name match what is only alike
+        raise GsbaError(f"{_NO_ORDER}, and images confirm no other order; {_IN_ORDER}")
     run.latest.append(_SEARCH)
     run.journal.note(_SEARCH, tour)
     return tour if _num_tied(tour.near.matches, num) > before else None
@@ -113,15 +161,21 @@ def _likeness_in_no_order(
     run: Run, key: object, stills: Callable[[], Sequence[TourFrame]]
 ) -> np.ndarray | None:
     """Likeness (F, F) of stills whose names are in no order; None = they are in order."""
-    frames = run.frames
-    if frames.timed or not may_lack_order(len(frames)):
+    if not _may_be_in_no_order(run):
         return None
 
     def compute() -> Likeness:
         return Likeness(likeness(stills(), run.num_threads))
 
-    alike = run.store.stage(_LIKENESS, [key, frames.names], compute, Likeness).alike
+    alike = run.store.stage(_LIKENESS, [key, run.frames.names], compute, Likeness).alike
     return None if in_given_order(alike) else alike
+
+
+def _may_be_in_no_order(run: Run) -> bool:
+    """True for stills whose order `match_places` looks for."""
+    frames = run.frames
+    possible = not (frames.timed or run.suffix) and may_lack_order(len(frames))
+    return possible and _may_be_tour(frames, run.settings)
 
 
 def in_known_order(store: RunStore, frames: FrameSet, settings: RefineSettings) -> FrameSet:

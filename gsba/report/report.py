@@ -113,6 +113,7 @@ class Findings:
     )  # names of frames with a finding, see `findings.of_frames`
     reasons: Sequence[str] = ()  # why maps were not joined, see `maps.summarize_maps`
     start: str = RunStart.TRAJECTORY  # what the run started from
+    order_doubted: bool = False  # see `pipeline.tour.check_order`
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -149,6 +150,7 @@ def build_report(
         "finished": datetime.now(UTC).isoformat(timespec="seconds"),
         "start": found.start,
         "timed": frames.timed,
+        "order_doubted": found.order_doubted,
         "summary": _summary(frames, coarse, reconstruction)
         | {"seconds": stages.seconds_again + sum(stage.seconds for stage in stages.costs)},
         "maps": summarize_maps(reconstruction, frames, found.reasons),

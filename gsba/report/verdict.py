@@ -227,12 +227,13 @@ class _Tests:
 
     def failed(self) -> Iterator[Reason]:
         """Reasons of all tests that fail."""
+        if self.figures.points:
+            yield from self._in_unknown_order()
         yield from self._frames_out()
         if not self.figures.points:
             cause = "the camera turned on the spot: there are rotations and no points"
             yield Reason(Level.REFUSED, (), cause, "walk while you film: a trainer needs parallax")
             return
-        yield from self._in_unknown_order()
         yield from self._unrefined()
         yield from self._held()
         yield from self._loosely_scaled()
@@ -267,12 +268,20 @@ class _Tests:
         yield Reason(level, out, cause, remedy, command=command)
 
     def _in_unknown_order(self) -> Iterator[Reason]:
-        """Stills too few to tell whether their names follow the way (`odometry.tour_order`)."""
+        """Stills whose order may not be that of the way (`odometry.tour_order`)."""
+        wrong = "a place that repeats makes a wrong map"
+        if self.report.get("order_doubted"):
+            cause = (
+                "neighbours by the times given are hardly more alike than any two frames: if the "
+                f"way had another order, {wrong}"
+            )
+            remedy = "check --fps or --timestamps: frames must be in the order of the way"
+            yield Reason(Level.LOOK, tuple(self.names), cause, remedy)
         few = self.figures.frames < MIN_FRAMES
         if few and _has_no_start(self.report) and not self.report.get("timed", True):
             cause = (
                 f"{self.figures.frames} stills without times are too few to tell whether their "
-                "names follow the way; if they do not, a place that repeats makes a wrong map"
+                f"names follow the way; if they do not, {wrong}"
             )
             remedy = "if their names are in order, pass --fps 1 or --timestamps"
             yield Reason(Level.LOOK, tuple(self.names), cause, remedy)

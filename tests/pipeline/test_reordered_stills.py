@@ -168,3 +168,32 @@ def test_what_is_only_alike_makes_no_map_of_stills_in_no_order(
                 tour.match_places(*given)
         else:
             assert tour.match_places(*given) is None
+
+
+@pytest.mark.parametrize("shuffled", [False, True])
+def test_an_order_that_likeness_denies_is_doubted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shuffled: bool
+) -> None:
+    in_a_hall_of_bays(monkeypatch, way_of(61, shuffled))
+    stills = numbered(tmp_path, 61)
+    with RunStore(tmp_path / "run", {"frames": tmp_path}) as store:
+        timed = neighbours_tied(replace(stills, timed=True), store)
+        assert tour.check_order(*timed).prior.order_doubted == shuffled
+        given = neighbours_tied(stills, store)
+        if shuffled:  # more than are put in order
+            with pytest.raises(GsbaError, match="rename them in the order of the way"):
+                tour.check_order(*given)
+        else:
+            assert not tour.check_order(*given).prior.order_doubted
+
+
+def test_a_recording_of_stills_in_no_order_is_to_be_refined_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    in_a_hall_of_bays(monkeypatch, way_of(12, shuffled=True))
+    with RunStore(tmp_path / "run", {"frames": tmp_path}) as store:
+        state, found = neighbours_tied(numbered(tmp_path, 12), store)
+        assert tour.check_order(state, found) is state  # left to the search
+        run = cast(Run, SimpleNamespace(**vars(state.run) | {"suffix": "@upper"}))
+        with pytest.raises(GsbaError, match=r"refine them alone.*gsba merge"):
+            tour.check_order(replace(state, run=run), found)

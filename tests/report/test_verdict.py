@@ -68,6 +68,12 @@ def test_few_stills_without_times_or_trajectory_may_be_in_no_order(
     assert ("11 stills without times are too few" in found.sentence) == (level == Level.LOOK)
 
 
+def test_a_doubted_order_is_told_first() -> None:
+    found = _verdict(replace(GOOD, exported=NUM - 1), NAMES[1:], timed=True, order_doubted=True)
+    assert found.level == Level.LOOK
+    assert "neighbours by the times given are hardly more alike" in found.sentence
+
+
 def test_lengths_are_metres_where_the_scale_is_known_and_the_camera_is_named() -> None:
     camera = {"taken": True, "reason": "", "baseline": 0.052, "metres_per_unit": 0.6}
     camera |= {"readout": {"taken": True, "ms": 13.24}}
