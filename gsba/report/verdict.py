@@ -277,14 +277,21 @@ class _Tests:
             )
             remedy = "check --fps or --timestamps: frames must be in the order of the way"
             yield Reason(Level.LOOK, tuple(self.names), cause, remedy)
-        few = self.figures.frames < MIN_FRAMES
-        if few and _has_no_start(self.report) and not self.report.get("timed", True):
-            cause = (
-                f"{self.figures.frames} stills without times are too few to tell whether their "
-                f"names follow the way; if they do not, {wrong}"
-            )
-            remedy = "if their names are in order, pass --fps 1 or --timestamps"
-            yield Reason(Level.LOOK, tuple(self.names), cause, remedy)
+        if self.report.get("timed", True):
+            return
+        recordings = dict[str, list[Mapping[str, Any]]]()
+        for row in self.report["frames"]:
+            recordings.setdefault(row["name"].rpartition("/")[0], []).append(row)
+        for rows in recordings.values():
+            if len(rows) < MIN_FRAMES and {row["coarse_pose"] for row in rows} <= _NO_START:
+                cause = (
+                    f"{len(rows)} stills without times are too few to tell whether their names "
+                    f"follow the way; if they do not, {wrong}"
+                )
+                remedy = "if their names are in order, pass --fps 1 or --timestamps"
+                few = {row["name"] for row in rows}
+                if exported := tuple(name for name in self.names if name in few):
+                    yield Reason(Level.LOOK, exported, cause, remedy)
 
     def _unrefined(self) -> Iterator[Reason]:
         """Frames that images do not constrain."""

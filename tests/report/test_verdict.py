@@ -68,6 +68,14 @@ def test_few_stills_without_times_or_trajectory_may_be_in_no_order(
     assert ("11 stills without times are too few" in found.sentence) == (level == Level.LOOK)
 
 
+def test_stills_of_each_recording_may_be_too_few_to_tell_their_order() -> None:
+    names = tuple(f"{'ab'[n >= 14]}/{n:03d}" for n in range(NUM))
+    rows = [{"name": name, "coarse_pose": RunStart.PAIRS} for name in names]
+    found = _verdict(GOOD, names, frames=rows, timed=False)
+    assert [reason.frames for reason in found.reasons] == [names[14:]]
+    assert "6 stills without times are too few" in found.sentence
+
+
 def test_a_doubted_order_is_told_first() -> None:
     found = _verdict(replace(GOOD, exported=NUM - 1), NAMES[1:], timed=True, order_doubted=True)
     assert found.level == Level.LOOK
