@@ -148,7 +148,11 @@ def _doubtful_steps(state: State) -> np.ndarray:
 
 
 def merge_maps(state: State, parts: np.ndarray) -> State:
-    """Parts (F,) of the map joined where they meet, frames in none of them registered."""
+    """Parts (F,) of the map joined where they meet, frames in none of them registered.
+
+    Raises:
+        NoPositions: without a trajectory, no three frames are in one part.
+    """
     run, prior, trust, solution = state.run, state.prior, state.prior.trust, state.solution
 
     def compute() -> Registered:
@@ -164,6 +168,15 @@ def merge_maps(state: State, parts: np.ndarray) -> State:
         return map_merging.merge(context, solution, parts, held, shown, times, alone, owners)
 
     merged = run.stage("registered", run.matching_key(), compute, Registered)
+    sizes = np.unique(merged.components, return_counts=True)[1]
+    if prior.absent and sizes.max() < connectivity.MIN_MAP_FRAMES:
+        doubtful, num = np.count_nonzero(_doubtful_steps(state)), len(parts) - 1
+        cause = (
+            f"{doubtful} of {num} steps lead to and fro, or are of an unusual length, as those of "
+            "stills in no order and of look-alikes are: name stills in the order of the way, or"
+        )
+        cause = cause if doubtful else "few points are seen from both sides of a step:"
+        raise NoPositions(f"no three frames make a map: {cause} give frames closer together")
     coarse, followed, joints = follow(merged, prior.coarse, trust, prior.joints)
     apart = connectivity.several(merged.components)
     prior = replace(prior, merged=merged, parts=apart, coarse=coarse, trust=followed, joints=joints)

@@ -4,6 +4,7 @@ import importlib
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import cast
 
 import cv2
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 from plain_records import frames_of, map_of
 
 from gsba.log import GsbaError
+from gsba.pipeline import backend
 from gsba.pipeline.acceptance import (
     MIN_STEP_SIGMAS,
     NoPositions,
@@ -19,6 +21,7 @@ from gsba.pipeline.acceptance import (
     share_ahead,
     step_sigmas,
 )
+from gsba.pipeline.state import State
 from gsba.types import FrameSet, JointErrors, PictureFormat, Reconstruction
 
 NUM, SIGMA = 8, 0.02
@@ -141,3 +144,22 @@ def test_rotations_alone_are_refined_where_a_turn_is_proved(
         return
     with pytest.raises(NoPositions, match="determine no positions"):
         module._solve_or_turn(run, followed)
+
+
+@pytest.mark.parametrize(
+    ("doubtful", "cause"),
+    [
+        (True, "7 of 7 steps lead to and fro.*name stills in the order"),
+        (False, "few points are seen from both sides"),
+    ],
+)
+def test_steps_that_are_all_doubted_are_no_turn_on_the_spot(
+    monkeypatch: pytest.MonkeyPatch, doubtful: bool, cause: str
+) -> None:
+    apart, steps = np.arange(NUM), np.full(NUM - 1, doubtful)
+    monkeypatch.setattr(backend, "_doubtful_steps", lambda _: steps)
+    run = SimpleNamespace(stage=lambda *_: SimpleNamespace(components=apart), matching_key=list)
+    prior = SimpleNamespace(absent=True, trust=None, joints=())
+    state = SimpleNamespace(run=run, prior=prior, solution=None)
+    with pytest.raises(NoPositions, match=cause):
+        backend.merge_maps(cast(State, state), apart)
