@@ -80,6 +80,7 @@ def _combined(priors: Sequence[Prior]) -> Prior:
         replace(coarse, segments=None),
         trust,
         joints=joints,
+        lone_steps=tuple(step for one in priors for step in one.lone_steps),
         order_doubted=any(one.order_doubted for one in priors),
         turning=_turning([(one.turning, len(one.coarse.sources)) for one in priors]),
         of_recordings=tuple(priors),

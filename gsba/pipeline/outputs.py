@@ -220,6 +220,7 @@ def _findings(state: State, result: Reconstruction, gps: dict[str, Any] | None) 
         frame_lists=lists,
         start=start,
         order_doubted=prior.order_doubted,
+        lone_steps=prior.lone_steps,
     )
 
 

@@ -31,6 +31,7 @@ class Prior:
     gyro: Alignment | None = None  # of the sensor that rides along; None = there is none
     turning: GyroConstraints | None = None  # its constraints on frames; None = images contradict it
     order_doubted: bool = False  # neighbours by the times given are hardly more alike than any two
+    lone_steps: tuple[tuple[str, str], ...] = ()  # names of frames, see `pipeline.tour.check_order`
     of_recordings: tuple["Prior", ...] = ()  # of each of several recordings, before they were
     # combined: clocks and gyros of their own; () = there is one recording
 

@@ -55,7 +55,8 @@ class OrderFoundError(GsbaError):
 
 
 def check_order(state: State, found: Recovered) -> State:
-    """The state, with a doubt where neighbours by given times are hardly more alike than any two.
+    """The state, with a doubt where neighbours by given times are hardly more alike than any two,
+    and with the steps that two frames alone show.
 
     Images alone make a wrong map of stills in no order where a place repeats. Frames whose matches
     show their order have one, and so have those of a video. Stills that `match_places` puts in
@@ -65,10 +66,12 @@ def check_order(state: State, found: Recovered) -> State:
         GsbaError: such frames have no times.
     """
     run, frames = state.run, state.run.frames
+    if not state.prior.absent or found.trust.turning_only:
+        return state
+    lone = _lone_steps(found, frames.names)
+    state = replace(state, prior=replace(state.prior, lone_steps=lone))
     if (
-        not state.prior.absent
-        or found.trust.turning_only
-        or len(frames) < MIN_FRAMES
+        len(frames) < MIN_FRAMES
         or run.store.root.absolute() in frames.paths[0][0].parents
         or _may_be_in_no_order(run)
         or _show_order(found.neighbours.matches, len(frames))
@@ -106,9 +109,8 @@ def match_places(state: State, found: Recovered) -> State | None:
     steps = image_steps(near, observed.keypoints)
     given = tour.log_ratios, tour.log_sigmas, TwoViewLimits.of(run.settings), run.settings.priors
     trust = judgement.check_steps(prior.coarse, steps, *given)
-    prior = replace(
-        prior, coarse=replace(prior.coarse, world_T_rigs=trust.world_T_rigs), trust=trust
-    )
+    coarse = replace(prior.coarse, world_T_rigs=trust.world_T_rigs)
+    prior = replace(prior, coarse=coarse, trust=trust, lone_steps=())  # three frames confirm steps
     return replace(state, observed=observed, places=places).begun(prior, near)
 
 
@@ -218,16 +220,30 @@ def _show_order(matches: Matches, num: int) -> bool:
     """True if all of `num` frames match the next one and the one after it, the next one with
     significantly more matches, as those of a dense walk in order do. In a hall of bays, stills in
     no order may all match, too."""
-    counts = np.zeros((2, num), np.int64)  # of the next one, of the one after it
-    gaps = matches.pairs[:, 1] - matches.pairs[:, 0]
-    near = gaps <= 2
-    counts[gaps[near] - 1, matches.pairs[near, 0]] = np.diff(matches.offsets)[near]
-    nearest, further = counts[0, : num - 1], counts[1, : num - 2]
-    if np.count_nonzero(near) < 2 * num - 3:
+    nearest, further = _num_matches(matches, num)
+    if not (nearest.all() and further.all()):
         return False
     more = np.sign(nearest[:-1] + nearest[1:] - 2 * further)
     wins, losses = int(np.count_nonzero(more > 0)), int(np.count_nonzero(more < 0))
     return outweighs(wins, losses, _MAX_ORDER_ERROR)
+
+
+def _num_matches(matches: Matches, num: int) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers of matches of each of `num` frames with the next one (F - 1,), and with the one after
+    it (F - 2,)."""
+    counts = np.zeros((2, num), np.int64)
+    gaps = matches.pairs[:, 1] - matches.pairs[:, 0]
+    near = gaps <= 2
+    counts[gaps[near] - 1, matches.pairs[near, 0]] = np.diff(matches.offsets)[near]
+    return counts[0, : num - 1], counts[1, : num - 2]
+
+
+def _lone_steps(found: Recovered, names: Sequence[str]) -> tuple[tuple[str, str], ...]:
+    """Frames of each step across which no other frame beside it matches: it may lead to a place
+    that only looks alike."""
+    nearest, further = _num_matches(found.neighbours.matches, len(names))
+    lone = 1 + np.flatnonzero((nearest[1:-1] > 0) & (further[:-1] == 0) & (further[1:] == 0))
+    return tuple((names[f], names[f + 1]) for f in lone.tolist())
 
 
 def _with_places(state: State, tour: TourMatches) -> tuple[ObservedFrames, Matches]:

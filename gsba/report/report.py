@@ -114,6 +114,7 @@ class Findings:
     reasons: Sequence[str] = ()  # why maps were not joined, see `maps.summarize_maps`
     start: str = RunStart.TRAJECTORY  # what the run started from
     order_doubted: bool = False  # see `pipeline.tour.check_order`
+    lone_steps: Sequence[tuple[str, str]] = ()  # the same
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -151,6 +152,7 @@ def build_report(
         "start": found.start,
         "timed": frames.timed,
         "order_doubted": found.order_doubted,
+        "lone_steps": found.lone_steps,
         "summary": _summary(frames, coarse, reconstruction)
         | {"seconds": stages.seconds_again + sum(stage.seconds for stage in stages.costs)},
         "maps": summarize_maps(reconstruction, frames, found.reasons),

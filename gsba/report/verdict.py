@@ -236,6 +236,7 @@ class _Tests:
             return
         yield from self._unrefined()
         yield from self._held()
+        yield from self._shown_by_two_frames()
         yield from self._loosely_scaled()
         yield from self._uncertain()
         yield from self._contradicted()
@@ -333,6 +334,21 @@ class _Tests:
         if step not in self.figures.unrefined and step + 1 not in self.figures.unrefined:
             return False
         return 0 <= self.figures.moved_by_scale[step] <= MAX_POSITION_ERROR / 2
+
+    def _shown_by_two_frames(self) -> Iterator[Reason]:
+        """Steps of images alone across which no frame beside them matches."""
+        rows = {name: row for row, name in enumerate(self.names)}
+        lone = [rows[a] for a, b in self.report.get("lone_steps", ()) if a in rows and b in rows]
+        if lone:
+            cause = (
+                f"{len(lone)} of {self.figures.num_steps} steps are shown by their own two frames "
+                "alone: what lies behind may be another place that looks alike"
+            )
+            remedy = (
+                "compare both sides of the place; name stills in the order of the way, or give "
+                "frames closer together there"
+            )
+            yield Reason(Level.LOOK, self._ends(lone), cause, remedy, command=_LOOK_AROUND)
 
     def _loosely_scaled(self) -> Iterator[Reason]:
         """Steps over which the scale is not carried on."""

@@ -187,13 +187,26 @@ def test_an_order_that_likeness_denies_is_doubted(
             assert not tour.check_order(*given).prior.order_doubted
 
 
+def test_a_step_across_which_no_frame_beside_it_matches_is_named(tmp_path: Path) -> None:
+    with RunStore(tmp_path / "run", {"frames": tmp_path}) as store:
+        state, found = neighbours_tied(numbered(tmp_path, 10), store)
+        assert tour.check_order(state, found).prior.lone_steps == ()
+        matches = found.neighbours.matches
+        across = [(4, 6), (5, 7), (7, 9)]  # the last one alone leaves (6, 8) across its step
+        kept = [p for p, pair in enumerate(matches.pairs.tolist()) if tuple(pair) not in across]
+        near = SimpleNamespace(matches=matches.taken(kept))
+        fewer = cast(Recovered, SimpleNamespace(neighbours=near, trust=found.trust))
+        assert tour.check_order(state, fewer).prior.lone_steps == (("005", "006"),)
+
+
 def test_a_recording_of_stills_in_no_order_is_to_be_refined_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     in_a_hall_of_bays(monkeypatch, way_of(12, shuffled=True))
     with RunStore(tmp_path / "run", {"frames": tmp_path}) as store:
         state, found = neighbours_tied(numbered(tmp_path, 12), store)
-        assert tour.check_order(state, found) is state  # left to the search
+        # left to the search
+        assert not tour.check_order(state, found).prior.order_doubted
         run = cast(Run, SimpleNamespace(**vars(state.run) | {"suffix": "@upper"}))
         with pytest.raises(GsbaError, match=r"refine them alone.*gsba merge"):
             tour.check_order(replace(state, run=run), found)

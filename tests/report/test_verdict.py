@@ -76,6 +76,14 @@ def test_stills_of_each_recording_may_be_too_few_to_tell_their_order() -> None:
     assert "6 stills without times are too few" in found.sentence
 
 
+def test_a_step_that_two_frames_alone_show_is_to_be_looked_at() -> None:
+    steps = [("004", "005"), ("018", "019")]
+    found = _verdict(replace(GOOD, exported=NUM - 1), NAMES[:-1], lone_steps=steps)
+    assert [one.frames for one in found.reasons if "two frames alone" in one.cause] == [
+        ("004", "005")
+    ]
+
+
 def test_a_doubted_order_is_told_first() -> None:
     found = _verdict(replace(GOOD, exported=NUM - 1), NAMES[1:], timed=True, order_doubted=True)
     assert found.level == Level.LOOK
