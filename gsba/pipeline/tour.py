@@ -42,7 +42,7 @@ _MAX_TIED_SHARE = 0.8  # of frames in maps of descriptors, below which places ar
 _MIN_INTERVAL_S = 1.5  # between stills metres apart; frames of a video can be had closer together
 _MAX_ORDER_ERROR = 0.02  # probability that matches of stills in no order, if all match, show one
 _LIKENESS, _SEARCH, _STAGE = "likeness", "tour", "features_tour"
-_FRAMES_IN_ORDER, _NUM_PLACES = 20, 3  # of frames one after another that tell an order from none;
+_FRAMES_IN_ORDER, _NUM_PLACES = 14, 3  # of frames one after another that tell an order from none;
 # of these sequences, in one of which the camera may stand
 _NO_ORDER = (
     "the order of the stills is not known: neighbours by name are hardly more alike than any two"
