@@ -29,7 +29,7 @@ def cut(
 ) -> PatchSet:
     """Templates of `size` pixels across, odd, cut from their host frames (J,): plane patches,
     origins (J, 3) and spreads (J, 3, 2), rig frame of the host."""
-    patches = _empty_patches(len(hosts), size)
+    patches = empty_patches(len(hosts), size)
     rows = _by_frame(hosts, greys.num_frames)
     job = _CutJob(name, greys, rows, origins, spreads, size)
     for chosen, found in zip(rows.each(), workers.map_shards(job), strict=True):
@@ -69,7 +69,7 @@ def align_to(
     patches.align(image, mask, every, sightings, reach, _MAX_STEPS, 0.02)
 
 
-def _empty_patches(num: int, size: int) -> PatchSet:
+def empty_patches(num: int, size: int) -> PatchSet:
     """Empty storage for templates."""
     # noise of 3 grey values, a window of .6 half patches
     return PatchSet(num, size, 0.6, _AFFINE_SIGMA, _BLUR_SIGMA, 3.0)
@@ -144,7 +144,7 @@ class _CutJob(_FrameJob):
 
     def __call__(self, item: int) -> tuple[np.ndarray, ...]:
         rows = self.rows.of(item)
-        found = _empty_patches(len(rows), self.size)
+        found = empty_patches(len(rows), self.size)
         every, least = np.arange(len(rows)), 2.0  # grey values, standard deviation in a patch
         found.cut(*self.image(item), every, self.origins[rows], self.spreads[rows], least)
         return _cut_columns(found)
