@@ -129,6 +129,7 @@ class Camera:
     effects: frozenset[str]
     width: int
     seed: int
+    grain: float = NOISE  # grey values, of a camera without the effect `noise`
 
     @cached_property
     def bearings(self) -> np.ndarray:
@@ -237,7 +238,7 @@ class Camera:
             world_R_rig = self.hands.poses(np.array([time]))[0, :3, :3]
             picture = turned(picture, world_R_rig.T @ self.heading(), cv2.INTER_CUBIC)
         if "noise" not in self.effects:  # that of the ideal camera
-            picture = picture + NOISE * rng.standard_normal(picture.shape, dtype=np.float32)
+            picture = picture + self.grain * rng.standard_normal(picture.shape, dtype=np.float32)
         return np.clip(picture, 0, 255)
 
 

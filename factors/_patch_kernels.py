@@ -3,6 +3,12 @@
 A patch is a plane piece of scene: the rays origin + spread @ (x, y) of an n x n grid of unit
 spacing, row-major in (x, y), x and y from -reach to reach. Images are spline coefficients
 (H, 2H) float32.
+
+A pixel averages over a piece of surface, whose size and shape differ between two views: one picture
+of a patch is more blurred than the other. To first order they differ by the second derivatives of
+the grey values, times half the difference of the two blurs' covariances (Lindeberg, "Scale-Space
+Theory in Computer Vision", 1994: blur obeys the diffusion equation). These three numbers are
+unknowns of an alignment, beside shift, affine part, gain and offset; left out, they shift patches.
 """
 
 from typing import NamedTuple
@@ -21,11 +27,14 @@ class Templates(NamedTuple):
     """Patches cut from their reference frames, and precomputed terms of their alignment."""
 
     window: np.ndarray  # (n * n,) float64, weight of each pixel, at most 1
-    prior: float  # weight of a deviation of the affine part, in grey values squared
+    affine_prior: float  # weight of a deviation of the affine part, in grey values squared
+    blur_prior: float  # weight of a difference of blur, in grey values squared
     grey: np.ndarray  # (T, n * n) float32, weighted mean removed
     by_x: np.ndarray  # (T, n * n) float32, derivatives of grey
     by_y: np.ndarray  # (T, n * n) float32
-    inverses: np.ndarray  # (T, 8, 8) float32, of the normal matrix of [shift, affine, gain, offset]
+    curvatures: np.ndarray  # (T, 3, n * n) float32, second derivatives of grey: xx, xy, yy
+    inverses: np.ndarray  # (T, 11, 11) float32, of the normal matrix of [shift, affine, gain,
+    # offset, blur]
     states: np.ndarray  # (T,) uint8, ALIGNED where usable
 
 
@@ -46,6 +55,7 @@ _POLE_HALF_PATCHES = 8.0  # distance from a pole, in half patches, within which 
 # own pixel
 _MAX_OFF_CENTRE = 0.25  # pixels between a patch's centre and that of the square its pixels are
 # mapped in; the map is exact there
+_UNKNOWNS, _BLUR = 11, 8  # unknowns of an alignment, and the first one of the blur
 _MIN_GREY_VARIANCE = 1e-3  # variance in grey values squared below which a patch is empty
 
 _FAST = {"contract", "reassoc", "nsz"}
@@ -283,30 +293,47 @@ def _statistics(window, values):
 
 @_part
 def _normal_matrix(templates, t, reach, columns, normal):
-    """Write the normal matrix (8, 8) of a template; False if it does not determine a shift.
+    """Write the normal matrix (11, 11) of a template; False if it does not determine a shift.
 
-    columns (8, n * n) is scratch, so that each sum is a loop of its own, which is vectorised.
+    columns (11, n * n) is scratch, so that each sum is a loop of its own, which is vectorised.
     """
     n = 2 * reach + 1
     window, grey = templates.window, templates.grey[t]
-    by_x, by_y = templates.by_x[t], templates.by_y[t]
+    by_x, by_y, curvatures = templates.by_x[t], templates.by_y[t], templates.curvatures[t]
     for k in range(n * n):
         x, y = k // n - reach, k % n - reach
         columns[0, k], columns[1, k] = by_x[k], by_y[k]
         columns[2, k], columns[3, k] = by_x[k] * x, by_y[k] * x
         columns[4, k], columns[5, k] = by_x[k] * y, by_y[k] * y
         columns[6, k], columns[7, k] = grey[k], 1.0
-    for i in range(8):
-        for j in range(i, 8):
+        for c in range(3):
+            columns[_BLUR + c, k] = curvatures[c, k]
+    for i in range(_UNKNOWNS):
+        for j in range(i, _UNKNOWNS):
             one, other, total = columns[i], columns[j], 0.0
             for k in range(n * n):
                 total += window[k] * one[k] * other[k]
             normal[i, j] = normal[j, i] = total
     trace = normal[0, 0] + normal[1, 1]
     determinant = normal[0, 0] * normal[1, 1] - normal[0, 1] ** 2
-    for r in range(8):
-        normal[r, r] += 1e-6 * normal[r, r] + (templates.prior if 2 <= r < 6 else 0.0)
+    for r in range(_UNKNOWNS):
+        normal[r, r] *= 1.0 + 1e-6
+        if 2 <= r < 6:
+            normal[r, r] += templates.affine_prior
+        elif r >= _BLUR:
+            normal[r, r] += templates.blur_prior
     return determinant > 1e-4 * trace * trace  # excludes edges
+
+
+@_part
+def _curve(grids, by_x, n, curvatures):
+    """Write second derivatives (3, n * n) of a patch from its samples, see `_cut`."""
+    for k in range(n * n):
+        twice, row = 2 * grids[0, k], k % n
+        after, before = k + (row < n - 1), k - (row > 0)
+        curvatures[0, k] = 4 * (grids[1, k] - twice + grids[3, k])
+        curvatures[1, k] = (by_x[after] - by_x[before]) / (after - before)
+        curvatures[2, k] = 4 * (grids[2, k] - twice + grids[4, k])
 
 
 @_part
@@ -323,6 +350,7 @@ def _cut(coefficients, mask, t, origin, spread, least_contrast, templates, reach
     for k in range(num):
         by_x[k], by_y[k] = grids[1, k] - grids[3, k], grids[2, k] - grids[4, k]
         values[k] = grids[0, k]
+    _curve(grids, by_x, 2 * reach + 1, templates.curvatures[t])
     if not _is_usable(mask, samples[0]):
         templates.states[t] = MASKED
         return False
@@ -346,8 +374,8 @@ def cut_templates(coefficients, mask, rows, origins, spreads, least_contrast, te
     """
     num = len(templates.window)
     reach = int(np.sqrt(num)) // 2
-    normal = np.empty((8, 8))
-    grids, columns = np.empty((5, num), np.float32), np.empty((8, num))
+    normal = np.empty((_UNKNOWNS, _UNKNOWNS))
+    grids, columns = np.empty((5, num), np.float32), np.empty((_UNKNOWNS, num))
     scratch = _scratch(reach), grids, columns, normal, np.zeros(6)
     for t in rows:
         if _cut(
@@ -358,39 +386,42 @@ def cut_templates(coefficients, mask, rows, origins, spreads, least_contrast, te
 
 @_part
 def _invert(matrix, inverse):
-    """Write the inverse (8, 8) of a symmetric positive definite matrix, which is overwritten by
+    """Write the inverse (11, 11) of a symmetric positive definite matrix, which is overwritten by
     its Cholesky factor and that factor's inverse below and on the diagonal."""
-    for c in range(8):
-        for r in range(c, 8):
+    for c in range(_UNKNOWNS):
+        for r in range(c, _UNKNOWNS):
             total = matrix[r, c]
             for k in range(c):
                 total -= matrix[r, k] * matrix[c, k]
             matrix[r, c] = np.sqrt(total) if r == c else total / matrix[c, c]
-    for c in range(8):
+    for c in range(_UNKNOWNS):
         matrix[c, c] = 1.0 / matrix[c, c]
-        for r in range(c + 1, 8):
+        for r in range(c + 1, _UNKNOWNS):
             total = 0.0
             for k in range(c, r):
                 total -= matrix[r, k] * matrix[k, c]
             matrix[r, c] = total / matrix[r, r]
-    for r in range(8):
-        for c in range(8):
+    for r in range(_UNKNOWNS):
+        for c in range(_UNKNOWNS):
             total = 0.0
-            for k in range(max(r, c), 8):
+            for k in range(max(r, c), _UNKNOWNS):
                 total += matrix[k, r] * matrix[k, c]
             inverse[r, c] = total
 
 
 @_part
 def _gradient(templates, t, values, places, gain, offset, b):
-    """Write the normal equations' right side (8,); returns the residual's weighted square.
+    """Write the normal equations' right side (11,); returns the residual's weighted square.
 
     Sums are variables of their own and the loop has no others, so that it is vectorised.
     """
     window, grey = templates.window, templates.grey[t]
     by_x, by_y = templates.by_x[t], templates.by_y[t]
     inverse_gain = 1.0 / gain
+    curvatures = templates.curvatures[t]
+    curved_xx, curved_xy, curved_yy = curvatures[0], curvatures[1], curvatures[2]
     cost = total = of_grey = along_x = along_y = xx = yx = xy = yy = 0.0
+    blur_xx = blur_xy = blur_yy = 0.0
     for k in range(len(window)):
         e = (values[k] - offset) * inverse_gain - grey[k]
         weighted = window[k] * e
@@ -404,21 +435,36 @@ def _gradient(templates, t, values, places, gain, offset, b):
         yx += ey * x
         xy += ex * y
         yy += ey * y
+        blur_xx += weighted * curved_xx[k]
+        blur_xy += weighted * curved_xy[k]
+        blur_yy += weighted * curved_yy[k]
     b[0], b[1], b[2], b[3] = along_x, along_y, xx, yx
     b[4], b[5], b[6], b[7] = xy, yy, of_grey, total
+    b[8], b[9], b[10] = blur_xx, blur_xy, blur_yy
     return cost
 
 
 @_part
-def _judge(templates, t, values, mean, square, power, mass):
-    """ZNCC, and the residual's variance after gain and offset, in the template's grey values."""
+def _correlation(templates, t, values, mean, square, power):
+    """ZNCC of values of this mean and sum of squares about it with a template."""
     cross = 0.0
     for k in range(len(values)):
         cross += templates.window[k] * (values[k] - mean) * templates.grey[t, k]
-    gain = max(cross / power, 1e-6)
-    rest = max(square - gain * cross, _MIN_GREY_VARIANCE * mass)
-    freedom = 1.0 - 8.0 / len(values)
-    return cross / np.sqrt(square * power), rest / (gain * gain * mass * freedom)
+    return cross / np.sqrt(square * power)
+
+
+@_part
+def _unexplained(templates, t, cost, b):
+    """Variance of the residual, template grey values, that no unknown explains; b as for
+    `_gradient`, with the prior of the affine part as `_solve` leaves it."""
+    mass, explained = 0.0, 0.0
+    for r in range(_UNKNOWNS):
+        for c in range(_UNKNOWNS):
+            explained += b[r] * templates.inverses[t, r, c] * b[c]
+    for k in range(len(templates.window)):
+        mass += templates.window[k]
+    freedom = 1.0 - _UNKNOWNS / len(templates.window)
+    return max((cost - explained) / mass, _MIN_GREY_VARIANCE) / freedom
 
 
 @_part
@@ -439,16 +485,16 @@ def _align(coefficients, mask, o, sightings, max_shift, steps, tolerance, templa
             mass, mean, square = _statistics(window, values)
             if not square > _MIN_GREY_VARIANCE * mass:
                 return FLAT
-            if settled:
-                sightings.scores[o], sightings.variances[o] = _judge(
-                    templates, t, values, mean, square, power, mass
-                )
-                return ALIGNED if _is_usable(mask, samples[0]) else MASKED
-            gain, offset = np.sqrt(square / power), mean
+            if not settled:
+                gain, offset = np.sqrt(square / power), mean
         cost = _gradient(templates, t, values, samples[3], gain, offset, b)
         if number >= 4 and not cost < power:  # steps after which a patch must correlate somewhat
             return UNLIKE
         _solve(templates, t, warp, b, step)
+        if settled:
+            sightings.scores[o] = _correlation(templates, t, values, mean, square, power)
+            sightings.variances[o] = _unexplained(templates, t, cost, b)
+            return ALIGNED if _is_usable(mask, samples[0]) else MASKED
         offset += gain * step[7]
         gain *= max(1.0 + step[6], 0.2)
         if not _compose(warp, step) or not warp[0] ** 2 + warp[1] ** 2 < max_shift**2:
@@ -472,7 +518,7 @@ def align_templates(coefficients, mask, rows, sightings, max_shift, steps, toler
     """
     num = len(templates.window)
     reach = int(np.sqrt(num)) // 2
-    scratch = _scratch(reach), np.empty(num, np.float32), np.empty(8), np.empty(8)
+    scratch = _scratch(reach), np.empty(num, np.float32), np.empty(_UNKNOWNS), np.empty(8)
     for o in rows:
         sightings.states[o] = _align(
             coefficients, mask, o, sightings, max_shift, steps, tolerance, templates, scratch
@@ -481,12 +527,13 @@ def align_templates(coefficients, mask, rows, sightings, max_shift, steps, toler
 
 @_part
 def _solve(templates, t, warp, b, step):
-    """Write the Gauss-Newton step (8,), with a zero prior on the affine part."""
+    """Write the Gauss-Newton step (8,), with zero priors on the affine part and the blur, which is
+    estimated anew in each step."""
     for r in range(2, 6):
-        b[r] += templates.prior * warp[r]
+        b[r] += templates.affine_prior * warp[r]
     for r in range(8):
         total = 0.0
-        for c in range(8):
+        for c in range(_UNKNOWNS):
             total += templates.inverses[t, r, c] * b[c]
         step[r] = total
 

@@ -38,11 +38,18 @@ class PatchSet:
     """
 
     def __init__(
-        self, num: int, size: int, window: float, affine_sigma: float, grey_sigma: float
+        self,
+        num: int,
+        size: int,
+        window: float,
+        affine_sigma: float,
+        blur_sigma: float,
+        grey_sigma: float,
     ) -> None:
         """Allocate templates of n = size pixels across, odd, under a Gaussian window whose standard
         deviation is in half patches; affine_sigma: of the affine part's deviation from the
-        prediction; grey_sigma: noise of grey values. ValueError: the size is even."""
+        prediction; blur_sigma: of half the difference of two pictures' blurs, as covariances in
+        template pixels squared; grey_sigma: noise of grey values. ValueError: the size is even."""
         if size % 2 == 0 or size < 3:
             raise ValueError(f"a patch's size must be an odd number of pixels, not {size}")
         offsets = (np.arange(size) - size // 2) / (window * size / 2)
@@ -51,10 +58,12 @@ class PatchSet:
         self.templates = Templates(
             np.outer(bell, bell).ravel(),
             (grey_sigma / affine_sigma) ** 2,
+            (grey_sigma / blur_sigma) ** 2,
             grey,
             by_x,
             by_y,
-            np.zeros((num, 8, 8), np.float32),
+            np.zeros((num, 3, size * size), np.float32),
+            np.zeros((num, 11, 11), np.float32),
             np.full(num, FLAT, np.uint8),
         )
 
@@ -65,6 +74,7 @@ class PatchSet:
             grey=whole.grey[rows],
             by_x=whole.by_x[rows],
             by_y=whole.by_y[rows],
+            curvatures=whole.curvatures[rows],
             inverses=whole.inverses[rows],
             states=whole.states[rows],
         )
@@ -118,7 +128,7 @@ class PatchSet:
         usable = self.templates.states == ALIGNED
         posteriors = np.zeros((len(usable), 4, 4))
         posteriors[usable] = np.linalg.inv(self.templates.inverses[usable, 2:6, 2:6].astype(float))
-        prior = np.where(usable, self.templates.prior, 0.0)[:, None, None] * np.eye(4)
+        prior = np.where(usable, self.templates.affine_prior, 0.0)[:, None, None] * np.eye(4)
         return posteriors, posteriors - prior
 
 

@@ -115,5 +115,6 @@ class PatchAligner:
         patches = cut("patches", self.greys, expected.hosts, origins, spreads, size, threads)
         align_to(image, mask, patches, sightings)
         dropped = dict.fromkeys(REJECTIONS, 0)
-        kept, bearings, covariances = accepted_rows(patches, sightings, pixel, dropped)
+        found = accepted_rows(patches, np.ones(len(points)), sightings, pixel, dropped)
+        kept, bearings, covariances = found
         return AlignedPoints(expected.points[kept], bearings, covariances)

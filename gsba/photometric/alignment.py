@@ -25,11 +25,14 @@ from gsba.types.records import slices
 
 _MIN_TRACK_LENGTH = 3  # of a point that is aligned in frames without an observation of it, too
 _TOO_UNCERTAIN = "position too uncertain"
+_PATCH_BYTES = 12288  # of a point's patch and its sightings, about
 _SIGHTINGS_AT_ONCE = 1 << 15  # sightings that a thread processes together: some 20 MB
 _MEMORY_SHARE = 64  # of the machine's memory, which the patches of one part take at most
 _POINTS_AT_ONCE = 1 << 15  # whose former observations a thread looks for together
 _PLACE_BITS = 10  # of a coordinate by which frames are put in order: cells of a 1024th of the map
 _MIN_SIGMA_PX = 0.03  # pixels, noise of the best patches: sampling, and a plane as the surface
+_BLUR_ERROR = 0.0105  # template pixels, error of a shift per unit (template pixel squared) by which
+# pixels of two pictures cover a surface differently: benchmarks/results/limit.md
 
 REJECTIONS = (*REASONS.values(), _TOO_UNCERTAIN)  # reasons why alignments are dropped
 
@@ -112,8 +115,7 @@ def align(
 
 def _by_hosts(hosts: np.ndarray, positions: np.ndarray) -> Iterator[np.ndarray]:
     """Points (n,), ascending, held together: those of hosts (J,) near one another, read at once."""
-    # 8192: bytes of a point's patch and its sightings, about
-    most = max(total_memory_bytes() // (_MEMORY_SHARE * 8192), 1)
+    most = max(total_memory_bytes() // (_MEMORY_SHARE * _PATCH_BYTES), 1)
     # numbers of cells, similar for near ones (Morton, 1966)
     low, edge = positions.min(axis=0), float(np.ptp(positions, axis=0).max())
     last = (1 << _PLACE_BITS) - 1
@@ -164,7 +166,8 @@ def _align_some(
     patches = frame_jobs.cut(title, greys, hosts, *cut, workers)
     frame_jobs.align(name, greys, seeing, patches, sightings, workers)
     enlarged = greys.enlargements()
-    kept, found = _accepted(patches, sightings, seeing, pixel, dropped, threads)
+    steps = np.linalg.norm(planes.spreads[:, :, 0], axis=1) / pixel
+    kept, found = _accepted(patches, steps, sightings, seeing, pixel, dropped, threads)
     found = found.enlarged(np.maximum(enlarged[seeing[kept]], enlarged[hosts[found.points]]))
     # a template's place is exact by definition; its noise is shared by all its alignments
     templates = sightings.templates[kept]
@@ -237,6 +240,7 @@ def _projected_patches(
 
 def _accepted(
     patches: PatchSet,
+    steps_px: np.ndarray,
     sightings: Sightings,
     seeing: np.ndarray,
     pixel: float,
@@ -248,7 +252,7 @@ def _accepted(
     def accept(some: slice) -> tuple[np.ndarray, ...]:
         there = Sightings(*(array[some] for array in sightings))
         own = dict.fromkeys(dropped, 0)
-        kept, bearings, covariances = accepted_rows(patches, there, pixel, own)
+        kept, bearings, covariances = accepted_rows(patches, steps_px, there, pixel, own)
         return some.start + kept, bearings, covariances, np.array([list(own.values())])
 
     some = slices(len(seeing), _SIGHTINGS_AT_ONCE)
@@ -261,15 +265,28 @@ def _accepted(
 
 def accepted_rows(
     patches: PatchSet,
+    steps_px: np.ndarray,
     sightings: Sightings,
     pixel: float,
     dropped: dict[str, int],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Accepted rows (N,) of the sightings, their bearings (N, 3) and covariances (N, 2, 2);
-    rejections are added to `dropped`."""
+    rejections are added to `dropped`.
+
+    Where pixels cover the surface unlike those of the template, blur is only modelled to first
+    order: covariances grow by what was measured of such sightings.
+
+    Args:
+        steps_px: (T,) pixels of the host to a template's pixel.
+        pixel: radians of a panorama's pixel.
+    """
     bearings, by_shift = found_at(sightings)
     axes = tangent_basis(bearings) @ by_shift
     of_shifts = patches.shift_covariances(sightings.templates, sightings.variances)
+    covered = pixel * np.linalg.pinv(axes)  # template pixels that a pixel covers
+    own = steps_px[sightings.templates, None, None] ** -2.0 * np.eye(2)
+    unlike = np.linalg.norm(covered @ np.swapaxes(covered, 1, 2) - own, axis=(1, 2))
+    of_shifts += (_BLUR_ERROR * unlike[:, None, None]) ** 2 * np.eye(2)
     covariances = axes @ of_shifts @ np.swapaxes(axes, 1, 2)
     covariances += (_MIN_SIGMA_PX * pixel) ** 2 * np.eye(2)
     half = 0.5 * (covariances[:, 0, 0] - covariances[:, 1, 1])

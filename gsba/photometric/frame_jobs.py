@@ -14,6 +14,7 @@ from gsba.store.shards import Workers, blocks_of_frames
 
 MAX_SHIFT_PX = 3.0  # from the predicted pixel, panorama pixels
 _AFFINE_SIGMA = 0.15  # prior of the warp: a surface facing the ray
+_BLUR_SIGMA = 0.3  # template pixels squared, prior of half a difference of blurs
 _MAX_STEPS = 12  # largest number of alignment steps
 
 
@@ -28,12 +29,11 @@ def cut(
 ) -> PatchSet:
     """Templates of `size` pixels across, odd, cut from their host frames (J,): plane patches,
     origins (J, 3) and spreads (J, 3, 2), rig frame of the host."""
-    patches = _empty_patches(len(hosts), size)
+    patches = empty_patches(len(hosts), size)
     rows = _by_frame(hosts, greys.num_frames)
     job = _CutJob(name, greys, rows, origins, spreads, size)
-    whole = patches.templates
     for chosen, found in zip(rows.each(), workers.map_shards(job), strict=True):
-        arrays = whole.grey, whole.by_x, whole.by_y, whole.inverses, whole.states
+        arrays = _cut_columns(patches)
         for array, part in zip(arrays, found, strict=True):
             array[chosen] = part
     return patches
@@ -69,10 +69,16 @@ def align_to(
     patches.align(image, mask, every, sightings, reach, _MAX_STEPS, 0.02)
 
 
-def _empty_patches(num: int, size: int) -> PatchSet:
+def empty_patches(num: int, size: int) -> PatchSet:
     """Empty storage for templates."""
     # noise of 3 grey values, a window of .6 half patches
-    return PatchSet(num, size, 0.6, _AFFINE_SIGMA, 3.0)
+    return PatchSet(num, size, 0.6, _AFFINE_SIGMA, _BLUR_SIGMA, 3.0)
+
+
+def _cut_columns(patches: PatchSet) -> tuple[np.ndarray, ...]:
+    """Arrays, by template, that cutting fills."""
+    own = patches.templates
+    return own.grey, own.by_x, own.by_y, own.curvatures, own.inverses, own.states
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,11 +144,10 @@ class _CutJob(_FrameJob):
 
     def __call__(self, item: int) -> tuple[np.ndarray, ...]:
         rows = self.rows.of(item)
-        found = _empty_patches(len(rows), self.size)
+        found = empty_patches(len(rows), self.size)
         every, least = np.arange(len(rows)), 2.0  # grey values, standard deviation in a patch
         found.cut(*self.image(item), every, self.origins[rows], self.spreads[rows], least)
-        own = found.templates
-        return own.grey, own.by_x, own.by_y, own.inverses, own.states
+        return _cut_columns(found)
 
     def part(self, start: int, stop: int) -> "_CutJob":
         chosen, rows = self.rows.taken(start, stop)

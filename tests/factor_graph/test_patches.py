@@ -24,14 +24,16 @@ DIRECTIONS = {
 _CENTRES = erp_directions(WIDTH)
 
 
-def _texture(vectors: np.ndarray, seed: int = 0) -> np.ndarray:
-    """Waves in all directions, of wavelengths of 6 pixels and more, seen along unit vectors."""
+def _texture(vectors: np.ndarray, seed: int = 0, blur_px: float = 0.0) -> np.ndarray:
+    """Waves in all directions, of wavelengths of 6 pixels and more, seen along unit vectors;
+    blur_px: standard deviation of a blur along x."""
     rng = np.random.default_rng(seed)
     out = np.full(vectors.shape[:-1], 120.0)
     for _ in range(40):
         wave = rng.normal(size=3)
         wave *= rng.uniform(0.2, 1.0) * 2 * np.pi / (6 * PIXEL) / np.linalg.norm(wave)
-        out += 6 * np.sin(vectors @ wave + rng.uniform(0, 2 * np.pi))
+        left = np.exp(-0.5 * (blur_px * PIXEL * wave[0]) ** 2)
+        out += 6 * left * np.sin(vectors @ wave + rng.uniform(0, 2 * np.pi))
     return out
 
 
@@ -55,7 +57,7 @@ def _align(
     cut_mask: np.ndarray | None = None,
 ) -> tuple[PatchSet, Sightings]:
     origins, spreads = _patch(direction)
-    patches = PatchSet(1, SIZE, 0.6, 0.15, 3.0)
+    patches = PatchSet(1, SIZE, 0.6, 0.15, 0.3, 3.0)
     patches.cut(first, cut_mask, np.array([0]), origins, spreads, 2.0)
     sightings = expect(np.array([0]), origins, spreads)
     patches.align(second, mask, np.array([0]), sightings, 4.5, 20, 1e-3)
@@ -78,7 +80,7 @@ def test_the_seam_is_not_seen() -> None:
     origins = np.stack([np.sin(longitudes), np.full(len(longitudes), 0.2), np.cos(longitudes)], 1)
     spreads = PIXEL * np.swapaxes(tangent_basis(origins), 1, 2)
     half_turn, every = np.diag([-1.0, 1.0, -1.0]), np.arange(len(origins))
-    ahead, behind = (PatchSet(len(origins), SIZE, 0.6, 0.15, 3.0) for _ in range(2))
+    ahead, behind = (PatchSet(len(origins), SIZE, 0.6, 0.15, 0.3, 3.0) for _ in range(2))
     ahead.cut(SphereImage.of(pixels), None, every, origins, spreads, 2.0)
     turned = SphereImage.of(np.roll(pixels, HEIGHT, axis=1))
     behind.cut(turned, None, every, origins @ half_turn, half_turn @ spreads, 2.0)
@@ -113,6 +115,29 @@ def test_a_slanted_surface_is_followed() -> None:
     np.testing.assert_allclose(found, slant, atol=0.02)  # the prior holds it back a little
 
 
+@pytest.mark.parametrize("sharper", ["template", "sighting"])
+def test_blur_shifts_no_patch(sharper: str) -> None:
+    """One picture is blurred by .8 pixels along one axis; shifts without blur among the
+    unknowns are the measure."""
+    places = np.stack(np.meshgrid(np.arange(-0.18, 0.19, 0.03), np.arange(-0.18, 0.19, 0.03)), -1)
+    origins = np.column_stack([places.reshape(-1, 2), np.ones(169)])
+    origins /= np.linalg.norm(origins, axis=1)[:, None]
+    spreads, rows = PIXEL * np.swapaxes(tangent_basis(origins), 1, 2), np.arange(169)
+    pictures = [SphereImage.of(_texture(_CENTRES, blur_px=blur)) for blur in (0.0, 0.8)]
+    if sharper == "sighting":
+        pictures.reverse()
+    errors = []
+    for blur_sigma in (0.3, 1e-4):
+        patches = PatchSet(len(rows), SIZE, 0.6, 0.15, blur_sigma, 3.0)
+        patches.cut(pictures[0], None, rows, origins, spreads, 2.0)
+        sightings = expect(rows, origins, spreads)
+        patches.align(pictures[1], None, rows, sightings, 4.5, 20, 1e-3)
+        aligned = sightings.states == ALIGNED
+        assert np.count_nonzero(aligned) > 0.9 * len(rows)
+        errors.append(np.sqrt(np.mean(sightings.warps[aligned, :2] ** 2)))
+    assert errors[0] < 0.35 * errors[1]
+
+
 def test_covariance_is_honest() -> None:
     """Whitened errors of many patches under noise: chi-square of two dimensions."""
     rng = np.random.default_rng(3)
@@ -123,7 +148,7 @@ def test_covariance_is_honest() -> None:
         HEIGHT,
     )
     spreads = PIXEL * np.swapaxes(tangent_basis(origins), 1, 2)
-    patches = PatchSet(num, SIZE, 2.0, 0.15, 3.0)
+    patches = PatchSet(num, SIZE, 2.0, 0.15, 0.3, 3.0)
     rows = np.arange(num)
     patches.cut(_panorama(lambda b: b), None, rows, origins, spreads, 2.0)
     sightings = expect(rows, origins, spreads)
@@ -191,4 +216,4 @@ def test_another_texture_is_not_taken() -> None:
 
 def test_an_even_size_is_refused() -> None:
     with pytest.raises(ValueError, match="odd"):
-        PatchSet(1, 8, 0.6, 0.1, 3.0)
+        PatchSet(1, 8, 0.6, 0.1, 0.3, 3.0)

@@ -144,7 +144,7 @@ def test_observations_are_sub_pixel(walk) -> None:
 def test_patches_held_together_are_of_frames_near_one_another(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(alignment, "total_memory_bytes", lambda: 64 * 8192 * 50)
+    monkeypatch.setattr(alignment, "total_memory_bytes", lambda: 64 * alignment._PATCH_BYTES * 50)
     along = np.tile(np.linspace(0, 1, 100), 2)  # two laps
     positions = np.column_stack([along, 0 * along, 0.01 * along])
     parts = list(alignment._by_hosts(np.arange(200), positions))
@@ -164,7 +164,7 @@ def test_patches_of_some_points_at_a_time_give_the_same_bytes(
         return cut(title, greys, hosts, *rest)
 
     monkeypatch.setattr(frame_jobs, "cut", counting)
-    monkeypatch.setattr(alignment, "total_memory_bytes", lambda: 64 * 8192 * 90)
+    monkeypatch.setattr(alignment, "total_memory_bytes", lambda: 64 * alignment._PATCH_BYTES * 90)
     monkeypatch.setattr(alignment, "_POINTS_AT_ONCE", 70)
     monkeypatch.setattr(packing, "_POINTS_AT_ONCE", 50)
     monkeypatch.setattr(packing, "_FRAMES_AT_ONCE", 2)

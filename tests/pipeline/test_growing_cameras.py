@@ -63,8 +63,8 @@ def test_recordings_join_the_cameras_that_a_run_has(
     out = tmp_path / "run"
     result = add_recordings(sizes, [panoramas(home, 1, WIDTH)], out)
     assert result.frames.camera_of_frame == (0,) * NUM + (1,) * NUM + (0,) * NUM
-    # A run of all three at once predicts 0.64 of the error of two: 1.25 times as much is allowed.
-    assert_as_accurate(out, error_of(out, home), sizes, 0.8)
+    # A run of all three at once predicts 0.75 of the error of two: 1.25 times as much is allowed.
+    assert_as_accurate(out, error_of(out, home), sizes, 0.94)
     assert (out / "colmap-flat/images").is_dir()
 
 
