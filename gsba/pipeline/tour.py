@@ -14,6 +14,7 @@ from gsba.config import RefineSettings
 from gsba.frames import cubemap
 from gsba.log import GsbaError
 from gsba.loop_closure import connectivity
+from gsba.matching import recovery
 from gsba.matching.recovery import Recovered
 from gsba.odometry.tour_maps import TourMatches
 from gsba.odometry.tour_order import (
@@ -41,6 +42,7 @@ logger = logging.getLogger(__name__)
 _MAX_TIED_SHARE = 0.8  # of frames in maps of descriptors, below which places are searched
 _MIN_INTERVAL_S = 1.5  # between stills metres apart; frames of a video can be had closer together
 _MAX_ORDER_ERROR = 0.02  # probability that matches of stills in no order, if all match, show one
+_NUM_FAR_PAIRS = 12  # compared with as many neighbours
 _LIKENESS, _SEARCH, _STAGE = "likeness", "tour", "features_tour"
 _FRAMES_IN_ORDER, _NUM_PLACES = 14, 3  # of frames one after another that tell an order from none;
 # of these sequences, in one of which the camera may stand
@@ -74,7 +76,7 @@ def check_order(state: State, found: Recovered) -> State:
         len(frames) < MIN_FRAMES
         or run.store.root.absolute() in frames.paths[0][0].parents
         or _may_be_in_no_order(run)
-        or _show_order(found.neighbours.matches, len(frames))
+        or _show_order(state, found.neighbours.matches)
     ):
         return state
     num = min(len(frames), _FRAMES_IN_ORDER)
@@ -130,7 +132,7 @@ def _search(state: State, found: Recovered) -> TourMatches | None:
     if known is None or not known.order_found:
         before = _num_tied(found.neighbours.matches, num)
         tied = before > _MAX_TIED_SHARE * num
-        if tied and _show_order(found.neighbours.matches, num):
+        if tied and _show_order(state, found.neighbours.matches):
             return None
         alike = _likeness_in_no_order(run, key, stills)
         if tied and alike is None:
@@ -216,15 +218,36 @@ def _num_tied(matches: Matches, num: int) -> int:
     return int(np.count_nonzero(connectivity.maps_of_images(matches.pairs, num) >= 0))
 
 
-def _show_order(matches: Matches, num: int) -> bool:
-    """True if all of `num` frames match the next one and the one after it, the next one with
-    significantly more matches, as those of a dense walk in order do. In a hall of bays, stills in
-    no order may all match, too."""
+def _show_order(state: State, matches: Matches) -> bool:
+    """True if all frames match the next one and the one after it, the next one with significantly
+    more matches than that one or than frames far off, as those of a dense walk in order do. In a
+    hall of bays, stills in no order may all match, too."""
+    num = len(state.run.frames)
     nearest, further = _num_matches(matches, num)
     if not (nearest.all() and further.all()):
         return False
-    more = np.sign(nearest[:-1] + nearest[1:] - 2 * further)
-    wins, losses = int(np.count_nonzero(more > 0)), int(np.count_nonzero(more < 0))
+    return _significantly(nearest[:-1] + nearest[1:] - 2 * further) or _far_match_less(state, num)
+
+
+def _far_match_less(state: State, num: int) -> bool:
+    """True if neighbours have significantly more matches than frames a third to two thirds of `num`
+    frames apart, without any prediction."""
+    far = np.array(
+        [(f, f + gap) for gap in range(num // 3, 2 * num // 3) for f in range(num - gap)]
+    )
+    far = far[np.unique(np.linspace(0, len(far) - 1, _NUM_FAR_PAIRS).astype(int))]
+    near = np.column_stack([far[:, 0], far[:, 0] + 1])
+    chosen, rows = np.unique(np.concatenate([near, far]), axis=0, return_inverse=True)
+    found = recovery.match_anywhere(state.observed.context, chosen, rivals=False).matches
+    counts = np.zeros((num, num), np.int64)
+    counts[tuple(found.pairs.T)] = np.diff(found.offsets)
+    of_pairs = counts[tuple(chosen.T)][rows.ravel()]
+    return _significantly(of_pairs[: len(near)] - of_pairs[len(near) :])
+
+
+def _significantly(differences: np.ndarray) -> bool:
+    """True if significantly more differences (N,) are above than below zero."""
+    wins, losses = (int(np.count_nonzero(sign * differences > 0)) for sign in (1, -1))
     return outweighs(wins, losses, _MAX_ORDER_ERROR)
 
 

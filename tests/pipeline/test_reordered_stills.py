@@ -15,6 +15,7 @@ from gsba.bundle.gps_factors import GpsFactors
 from gsba.config import RefineSettings
 from gsba.log import GsbaError
 from gsba.masks import merging
+from gsba.matching import recovery
 from gsba.matching.recovery import Recovered
 from gsba.odometry.tour_maps import TourMatches
 from gsba.pipeline import frontend, tour
@@ -116,7 +117,18 @@ def neighbours_tied(
     trust, settings = StepChecks.of_all(np.tile(np.eye(4), (len(stills), 1, 1))), RefineSettings()
     run = SimpleNamespace(frames=stills, settings=settings, store=store, num_threads=1, suffix="")
     state = State(cast(Run, run), Prior.of(without_trajectory(stills)), *[cast(Any, None)] * 4)
+    state = replace(state, observed=cast(Any, SimpleNamespace(context=None)))
     return state, cast(Recovered, SimpleNamespace(neighbours=near, trust=trust))
+
+
+def matching_by(monkeypatch: pytest.MonkeyPatch, counts: np.ndarray) -> None:
+    """Any two frames have (F, F) matches without a prediction."""
+
+    def match(_context: object, chosen: np.ndarray, rivals: bool) -> SimpleNamespace:
+        rows = [np.zeros((int(counts[f, g]), 2), np.int32) for f, g in chosen]
+        return SimpleNamespace(matches=Matches.of_rows(chosen, rows))
+
+    monkeypatch.setattr(recovery, "match_anywhere", match)
 
 
 def in_a_hall_of_bays(monkeypatch: pytest.MonkeyPatch, way: np.ndarray) -> None:
@@ -129,6 +141,7 @@ def in_a_hall_of_bays(monkeypatch: pytest.MonkeyPatch, way: np.ndarray) -> None:
 
     monkeypatch.setattr(tour, "read_stills", rows)
     monkeypatch.setattr(tour, "likeness", lambda some, _: alike[np.ix_(some, some)])
+    matching_by(monkeypatch, 20 * alike)
 
 
 def numbered(folder: Path, num: int) -> FrameSet:
@@ -185,6 +198,17 @@ def test_an_order_that_likeness_denies_is_doubted(
                 tour.check_order(*given)
         else:
             assert not tour.check_order(*given).prior.order_doubted
+
+
+def test_frames_that_match_more_than_those_far_off_are_not_asked_for_their_likeness(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gaps = np.abs(np.subtract.outer(np.arange(24), np.arange(24)))
+    matching_by(monkeypatch, 100 * np.exp(-gaps / 8.0))
+    monkeypatch.delattr(tour, "read_stills")
+    with RunStore(tmp_path / "run", {"frames": tmp_path}) as store:
+        timed = neighbours_tied(replace(numbered(tmp_path, 24), timed=True), store)
+        assert not tour.check_order(*timed).prior.order_doubted
 
 
 def test_a_step_across_which_no_frame_beside_it_matches_is_named(tmp_path: Path) -> None:
