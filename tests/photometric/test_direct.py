@@ -119,9 +119,9 @@ def test_a_finished_run_goes_on(case: Case, joint) -> None:
     result, out = joint
     assert computed_stages(result)[0] == "photometric"
     before, after = case.errors(), case.errors(out)
-    # a walk of eight 512 px frames, aligned patches before
-    assert after.rpe_rotation_deg.rmse < 0.9 * before.rpe_rotation_deg.rmse
-    assert after.ate.rmse < before.ate.rmse
+    # a walk of eight 512 px frames, aligned patches before: about .5 and .6
+    assert after.rotation_deg.rmse < 0.75 * before.rotation_deg.rmse
+    assert after.ate.rmse < 0.8 * before.ate.rmse
 
 
 def test_the_report_tells_of_patches(joint) -> None:
