@@ -128,7 +128,8 @@ def informations(
     u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     rays = bearings_from_erp(np.stack([u, v], axis=-1), width, height).reshape(-1, 3)
     radius = patch / np.sqrt(np.pi) * 2 * np.pi / width
-    _, owners = KDTree(bearings).query(rays, distance_upper_bound=radius, workers=-1)
+    nearest = KDTree(bearings).query(rays, distance_upper_bound=radius, workers=-1)
+    owners = np.asarray(nearest[1])
     inside = owners < len(bearings)
     values = np.stack([one.ravel()[inside] for one in white])
     gram = np.zeros((len(bearings), 4, 4))
