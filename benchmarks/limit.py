@@ -35,15 +35,16 @@ from scipy.spatial import KDTree
 
 from factors import tangent_basis
 from factors.patches import ALIGNED, expect, found_at
-from factors.sphere_image import SphereImage
 from gsba.camera.sphere import bearings_from_erp
 from gsba.demo.raycast import Scene, ranges
 from gsba.disk import write_image
 from gsba.evaluate.trajectory import evaluate
-from gsba.photometric.alignment import slopes_of
-from gsba.photometric.frame_jobs import align_to, empty_patches
+from gsba.frames.panorama import Greys
+from gsba.photometric.alignment import coverage_differences, slopes_of
+from gsba.photometric.frame_jobs import align, cut
 from gsba.photometric.references import references
 from gsba.store.finished import load_run
+from gsba.store.shards import Threads
 from gsba.trajectory.files import read_trajectory
 from gsba.types import Counts, FrameSet, Landmarks, Reconstruction, Tracks, Trajectory
 
@@ -59,8 +60,6 @@ _HEAD = (
     "| film | from | frames | ATE 1e-3 | limit (90 % of runs) | ATE / limit | rel. rot. ° | limit "
     "| / limit | patch px, claimed | limit |"
 )
-
-
 _PATCH_HEAD = "| film | pixels cover | patches | error | claimed | error / claimed |"
 
 
@@ -289,23 +288,18 @@ def patch_rows(run: Path, film: Path, scene: Scene, patch: int) -> list[str]:
     ranged = np.linalg.norm(rays, axis=1)
     predicted = rays / ranged[:, None]
     across = to_rig @ (away @ tilted)[of] / ranged[:, None, None]
-    sightings, patches = expect(of, predicted, across), empty_patches(len(hosts), 15)
-    pictures = [SphereImage.of(grey_of(Path(one[0])), smooth=True) for one in frames.paths]
-    for f, picture in enumerate(pictures):
-        patches.cut(picture, None, np.flatnonzero((hosts == f) & plane), origins, tilted, 2.0)
+    greys, threads, sightings = Greys(frames, WIDTH), Threads(2), expect(of, predicted, across)
+    patches = cut("templates", greys, hosts, origins, tilted, 15, threads)
+    align("align", greys, at, patches, sightings, threads)
     seen = np.zeros(len(used), bool)
-    for f, picture in enumerate(pictures):
+    for f in range(len(frames)):
         rows = np.flatnonzero(at == f)
-        part = type(sightings)(*(column[rows] for column in sightings))
-        align_to(picture, None, patches, part)
-        for column, values in zip(sightings, part, strict=True):
-            column[rows] = values
         there = ranges(scene, truth[f, :3, 3], predicted[rows] @ truth[f, :3, :3].T)
         seen[rows] = np.abs(there - ranged[rows]) < 1e-3 * ranged[rows]
     bases = tangent_basis(predicted)
-    covered = pixel * np.linalg.inv(bases @ across)  # template pixels that a pixel covers
-    unlike = np.linalg.norm(covered @ np.swapaxes(covered, 1, 2) - np.eye(2) / step**2, axis=(1, 2))
-    errors = (covered @ bases @ found_at(sightings)[0][:, :, None])[..., 0] / pixel
+    axes = bases @ across
+    unlike = coverage_differences(axes, pixel, np.full(len(used), step))
+    errors = np.linalg.solve(axes, bases @ found_at(sightings)[0][:, :, None])[..., 0]
     claims = patches.shift_covariances(sightings.templates, sightings.variances)
     squares = np.einsum("oi,oij,oj->o", errors, np.linalg.pinv(claims), errors)
     kept = seen & (sightings.states == ALIGNED) & (sightings.scores > 0.75)
@@ -377,7 +371,8 @@ def main() -> None:
                         for start in options.starts
                     }
                     if options.patches:
-                        rows = patch_rows(runs["none"], film, scene_of(scene, seed)[0], PATCH)
+                        built, run = scene_of(scene, seed)[0], runs[options.starts[-1]]
+                        rows = patch_rows(run, film, built, PATCH)
                         rows = [f"| {scene} {name} {row}" for row in rows]
                     else:
                         clean = clean_film(scene, seed, effects, out)

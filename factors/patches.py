@@ -69,16 +69,16 @@ class PatchSet:
 
     def taken(self, rows: np.ndarray) -> "PatchSet":
         """Some of the templates (T',), by their rows."""
-        found, whole = copy.copy(self), self.templates
-        found.templates = whole._replace(
-            grey=whole.grey[rows],
-            by_x=whole.by_x[rows],
-            by_y=whole.by_y[rows],
-            curvatures=whole.curvatures[rows],
-            inverses=whole.inverses[rows],
-            states=whole.states[rows],
+        found = copy.copy(self)
+        found.templates = self.templates._replace(
+            **{name: array[rows] for name, array in self.columns().items()}
         )
         return found
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """Arrays with a row for each template, which `cut` fills, by their names."""
+        names = ("grey", "by_x", "by_y", "curvatures", "inverses", "states")
+        return {name: getattr(self.templates, name) for name in names}
 
     def cut(
         self,

@@ -283,9 +283,7 @@ def accepted_rows(
     bearings, by_shift = found_at(sightings)
     axes = tangent_basis(bearings) @ by_shift
     of_shifts = patches.shift_covariances(sightings.templates, sightings.variances)
-    covered = pixel * np.linalg.pinv(axes)  # template pixels that a pixel covers
-    own = steps_px[sightings.templates, None, None] ** -2.0 * np.eye(2)
-    unlike = np.linalg.norm(covered @ np.swapaxes(covered, 1, 2) - own, axis=(1, 2))
+    unlike = coverage_differences(axes, pixel, steps_px[sightings.templates])
     of_shifts += (_BLUR_ERROR * unlike[:, None, None]) ** 2 * np.eye(2)
     covariances = axes @ of_shifts @ np.swapaxes(axes, 1, 2)
     covariances += (_MIN_SIGMA_PX * pixel) ** 2 * np.eye(2)
@@ -305,6 +303,19 @@ def accepted_rows(
         left &= passed
     kept = np.flatnonzero(left)
     return kept, bearings[kept], covariances[kept]
+
+
+def coverage_differences(axes: np.ndarray, pixel: float, steps_px: np.ndarray) -> np.ndarray:
+    """Differences (N,) of what a pixel covers of a surface in two frames, template pixels squared.
+
+    Args:
+        axes: (N, 2, 2) radians in the observing frame to a template's pixel.
+        pixel: radians of a pixel of either frame.
+        steps_px: (N,) pixels of the host to a template's pixel.
+    """
+    covered = pixel * np.linalg.pinv(axes)  # template pixels that a pixel covers
+    own = steps_px[:, None, None] ** -2.0 * np.eye(2)
+    return np.linalg.norm(covered @ np.swapaxes(covered, 1, 2) - own, axis=(1, 2))
 
 
 def _normals_world(

@@ -29,12 +29,11 @@ def cut(
 ) -> PatchSet:
     """Templates of `size` pixels across, odd, cut from their host frames (J,): plane patches,
     origins (J, 3) and spreads (J, 3, 2), rig frame of the host."""
-    patches = empty_patches(len(hosts), size)
+    patches = _empty_patches(len(hosts), size)
     rows = _by_frame(hosts, greys.num_frames)
     job = _CutJob(name, greys, rows, origins, spreads, size)
     for chosen, found in zip(rows.each(), workers.map_shards(job), strict=True):
-        arrays = _cut_columns(patches)
-        for array, part in zip(arrays, found, strict=True):
+        for array, part in zip(patches.columns().values(), found, strict=True):
             array[chosen] = part
     return patches
 
@@ -69,16 +68,10 @@ def align_to(
     patches.align(image, mask, every, sightings, reach, _MAX_STEPS, 0.02)
 
 
-def empty_patches(num: int, size: int) -> PatchSet:
+def _empty_patches(num: int, size: int) -> PatchSet:
     """Empty storage for templates."""
     # noise of 3 grey values, a window of .6 half patches
     return PatchSet(num, size, 0.6, _AFFINE_SIGMA, _BLUR_SIGMA, 3.0)
-
-
-def _cut_columns(patches: PatchSet) -> tuple[np.ndarray, ...]:
-    """Arrays, by template, that cutting fills."""
-    own = patches.templates
-    return own.grey, own.by_x, own.by_y, own.curvatures, own.inverses, own.states
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,10 +137,10 @@ class _CutJob(_FrameJob):
 
     def __call__(self, item: int) -> tuple[np.ndarray, ...]:
         rows = self.rows.of(item)
-        found = empty_patches(len(rows), self.size)
+        found = _empty_patches(len(rows), self.size)
         every, least = np.arange(len(rows)), 2.0  # grey values, standard deviation in a patch
         found.cut(*self.image(item), every, self.origins[rows], self.spreads[rows], least)
-        return _cut_columns(found)
+        return tuple(found.columns().values())
 
     def part(self, start: int, stop: int) -> "_CutJob":
         chosen, rows = self.rows.taken(start, stop)

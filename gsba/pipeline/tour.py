@@ -132,9 +132,10 @@ def _search(state: State, found: Recovered) -> TourMatches | None:
     if known is None or not known.order_found:
         before = _num_tied(found.neighbours.matches, num)
         tied = before > _MAX_TIED_SHARE * num
-        if tied and _show_order(state, found.neighbours.matches):
+        known_order = not _may_be_in_no_order(run)
+        if tied and (known_order or _show_order(state, found.neighbours.matches)):
             return None
-        alike = _likeness_in_no_order(run, key, stills)
+        alike = None if known_order else _likeness_in_no_order(run, key, stills)
         if tied and alike is None:
             return None
     if known is None:
@@ -165,8 +166,6 @@ def _likeness_in_no_order(
     run: Run, key: object, stills: Callable[[], Sequence[TourFrame]]
 ) -> np.ndarray | None:
     """Likeness (F, F) of stills whose names are in no order; None = they are in order."""
-    if not _may_be_in_no_order(run):
-        return None
 
     def compute() -> Likeness:
         return Likeness(likeness(stills(), run.num_threads))
