@@ -82,9 +82,9 @@ def match_tour(
 
 def searched(
     frames: Sequence[TourFrame], num_threads: int
-) -> tuple[list[list[Step]], list[int], list[Triple | None]]:
-    """Hypotheses of the steps between frames (F,), and those that three frames confirm, see
-    `confirmed`."""
+) -> tuple[list[Step | None], list[Triple | None]]:
+    """Steps (F - 1,) between frames (F,), None where descriptors propose none, and the triples
+    (F - 2,) that confirm them, see `confirmed`."""
     num = len(frames)
     found = map_in_threads(lambda f: hypotheses(frames[f], frames[f + 1]), num - 1, num_threads)
     steps = list(track(found, STEPS_SEARCH, num - 1))
@@ -92,7 +92,8 @@ def searched(
     def triples(f: int) -> dict[tuple[int, int], list[Triple]]:
         return triples_of(frames[f], frames[f + 1], frames[f + 2], steps[f], steps[f + 1])
 
-    return steps, *confirmed(steps, list(map_in_threads(triples, num - 2, num_threads)))
+    chain, sure = confirmed(steps, list(map_in_threads(triples, num - 2, num_threads)))
+    return [some[c] if some else None for some, c in zip(steps, chain, strict=True)], sure
 
 
 def ratios(before: Step, after: Step, keys: np.ndarray) -> list[float]:
@@ -261,18 +262,16 @@ def _alike(
 
 
 def maps_of(
-    frames: Sequence[TourFrame],
-    steps: Sequence[Sequence[Step]],
-    chain: Sequence[int],
-    triples: Sequence[Triple | None],
+    frames: Sequence[TourFrame], steps: Sequence[Step | None], triples: Sequence[Triple | None]
 ) -> list[TourMap]:
     """Maps of the steps kept, and frames alone, in the order of the way."""
-    kept, maps = _kept(steps, chain, triples), list[TourMap]()
+    kept, maps = _kept(steps, triples), list[TourMap]()
     for f, frame in enumerate(frames):
-        if not (f and kept[f - 1]):
+        step = kept[f - 1] if f else None
+        if step is None:
             maps.append(TourMap(f, np.eye(4)[None], [np.full(len(frame.keys), np.nan)]))
             continue
-        last, step = maps[-1], steps[f - 1][chain[f - 1]]
+        last = maps[-1]
         before, length = triples[f - 2] if f > 1 and not last.single else None, 1.0
         if before is not None:
             length = np.linalg.norm(last.between(f - 2, f - 1)[:3, 3]) * np.exp(before.log_ratio)
@@ -292,25 +291,22 @@ def _agreeing(depths: np.ndarray, others: np.ndarray) -> np.ndarray:
     return np.where(agree, (one + other) / 2, np.nan)
 
 
-def _kept(
-    steps: Sequence[Sequence[Step]], chain: Sequence[int], triples: Sequence[Triple | None]
-) -> np.ndarray:
-    return kept_steps(
-        [some is not None for some in triples],
-        [some[c].num if some else 0 for some, c in zip(steps, chain, strict=True)],
-    )
+def _kept(steps: Sequence[Step | None], triples: Sequence[Triple | None]) -> list[Step | None]:
+    """Steps (F - 1,) that a triple confirms, see `kept_steps`; None = left out."""
+    sizes = [step.num if step else 0 for step in steps]
+    kept = kept_steps([some is not None for some in triples], sizes)
+    return [step if held else None for step, held in zip(steps, kept, strict=False)]
 
 
 def matches_of(
     frames: Sequence[TourFrame],
     names: tuple[str, ...],
-    steps: Sequence[Sequence[Step]],
-    chain: Sequence[int],
+    steps: Sequence[Step | None],
     triples: Sequence[Triple | None],
     joined: Sequence[tuple[TourMap, TourMap, Join]],
 ) -> TourMatches:
     """Confirmed steps, triples and joins of maps, and the places that fit them."""
-    kept = _kept(steps, chain, triples)
+    kept = _kept(steps, triples)
     rays = [[frame.keys] for frame in frames]
     sigmas = [[frame.sigmas_rad] for frame in frames]
     pairs, rows, poses = list[tuple[int, int]](), list[np.ndarray](), list[np.ndarray]()
@@ -329,26 +325,25 @@ def matches_of(
 
     logs, log_sigmas = np.zeros(len(triples)), np.full(len(triples), np.inf)
     agreeing = [np.ones(len(frame.keys), bool) for frame in frames]
-    for f, found in enumerate(triples, start=1):
-        if found is None or not (kept[f - 1] and kept[f]):
-            continue
+    threes = enumerate(zip(triples, kept[:-1], kept[1:], strict=True), start=1)
+    tied = [(f, three, one, other) for f, (three, one, other) in threes if three and one and other]
+    for f, found, before, after in tied:
         logs[f - 1], log_sigmas[f - 1] = found.log_ratio, _LOG_SIGMA
-        before, after = steps[f - 1][chain[f - 1]], steps[f][chain[f]]
         off = np.abs(np.log(before.depths1 / after.depths0) - found.log_ratio)
         agreeing[f] = ~(off > _RATIO_WIDTH)  # true where a neighbour does not show the key
-    for f in np.flatnonzero(kept).tolist():
-        step = steps[f][chain[f]]
+    for f, step in enumerate(kept):
+        if step is None:
+            continue
         found1 = np.where(agreeing[f][:, None], step.places1, np.nan)
         add(f, f + 1, found1, np.where(agreeing[f + 1][:, None], step.places0, np.nan))
         poses.append(inverse(step.f1_T_f0))
-    for f, found in enumerate(triples, start=1):
-        if found is not None and kept[f - 1] and kept[f]:
-            add(f - 1, f + 1, found.places2, found.places0)
-            first, second = (inverse(steps[g][chain[g]].f1_T_f0) for g in (f - 1, f))
-            second[:3, 3] *= np.exp(found.log_ratio)
-            over = first @ second
-            over[:3, 3] = unit(over[:3, 3])
-            poses.append(over)
+    for f, found, before, after in tied:
+        add(f - 1, f + 1, found.places2, found.places0)
+        first, second = inverse(before.f1_T_f0), inverse(after.f1_T_f0)
+        second[:3, 3] *= np.exp(found.log_ratio)
+        over = first @ second
+        over[:3, 3] = unit(over[:3, 3])
+        poses.append(over)
     for one, other, at in joined:
         f, g = one.last, other.first
         length = np.log(np.linalg.norm(at.g_T_f[:3, 3]))
@@ -369,7 +364,7 @@ def matches_of(
             Matches.of_rows(np.array(pairs, np.int32).reshape(-1, 2), rows),
             np.array(poses).reshape(-1, 4, 4),
             np.full(len(pairs), _DIRECTION_SIGMA_RAD),
-            Counts(len(chain), int(np.count_nonzero(kept)), "pairs"),
+            Counts(len(kept), sum(step is not None for step in kept), "pairs"),
         ),
         logs,
         log_sigmas,

@@ -54,31 +54,29 @@ def match_stills(
         return match_tour(frames, given_names, num_threads)
     path = most_alike_path(likeness)
     given, frames = frames, [frames[f] for f in path]
-    steps, chain, sure = searched(frames, num_threads)
-    sure = without_unsupported(frames, steps, chain, sure, num_threads)
+    steps, sure = searched(frames, num_threads)
+    sure = without_unsupported(frames, steps, sure, num_threads)
     if not any(sure):
-        none: list[list[Step]] = [[] for _ in steps]
-        return matches_of(given, given_names, none, chain, sure, [])
+        return matches_of(given, given_names, steps, sure, [])
     names = tuple(given_names[f] for f in path)
-    return replace(matches_of(frames, names, steps, chain, sure, []), order_found=True)
+    return replace(matches_of(frames, names, steps, sure, []), order_found=True)
 
 
 def without_unsupported(
     frames: Sequence[TourFrame],
-    steps: Sequence[Sequence[Step]],
-    chain: Sequence[int],
+    steps: Sequence[Step | None],
     triples: Sequence[Triple | None],
     num_threads: int,
 ) -> list[Triple | None]:
     """Triples (F - 2,) without those of steps that places do not confirm which frames on either
     side have triangulated without the step."""
-    maps = [some for some in maps_of(frames, steps, chain, triples) if not some.single]
+    maps = [some for some in maps_of(frames, steps, triples) if not some.single]
     cuts = [(some, f) for some in maps for f in range(some.first, some.last)]
 
     def supported(n: int) -> bool:
         some, f = cuts[n]
         ends = some.first == f or some.last == f + 1
-        score = _score_without(frames, steps, chain, triples, some, f)
+        score = _score_without(frames, steps, triples, some, f)
         return score >= (_MIN_END_SCORE if ends else _MIN_STEP_SCORE)
 
     left = list(triples)
@@ -90,8 +88,7 @@ def without_unsupported(
 
 def _score_without(
     frames: Sequence[TourFrame],
-    steps: Sequence[Sequence[Step]],
-    chain: Sequence[int],
+    steps: Sequence[Step | None],
     triples: Sequence[Triple | None],
     whole: TourMap,
     f: int,
@@ -100,11 +97,9 @@ def _score_without(
     makes of it; without the pair of frames beside the step."""
 
     def part(first: int, last: int) -> TourMap:
-        rows = slice(first, last)
-        between = triples[first : max(last - 1, first)]
-        some = maps_of(frames[first : last + 1], steps[rows], chain[rows], between)
-        if len(some) > 1:  # a single step, which no triple holds by itself
-            step = steps[first][chain[first]]
+        own = steps[first:last]
+        some = maps_of(frames[first : last + 1], own, triples[first : max(last - 1, first)])
+        if len(some) > 1 and (step := own[0]):  # a single step, which no triple holds by itself
             poses = np.stack([np.eye(4), step.f1_T_f0])
             return TourMap(first, poses, [step.depths0, step.depths1])
         return replace(some[0], first=first)

@@ -176,12 +176,12 @@ def test_steps_kept_make_maps_and_other_frames_are_alone() -> None:
         return replace(hypothesis(), depths0=np.array(depths0), depths1=np.array(depths1))
 
     steps = [
-        [step([2, 2, 2], [1, 1, np.nan])],
-        [step([0.51, 0.9, np.nan], [0.6, 0.6, 0.6])],
-        [],
+        step([2, 2, 2], [1, 1, np.nan]),
+        step([0.51, 0.9, np.nan], [0.6, 0.6, 0.6]),
+        None,
     ]
     few = replace(frames()[0], keys=keys)
-    one, alone = maps_of([few] * 4, steps, [0, 0, 0], [of_cells(9, np.log(2)), None])
+    one, alone = maps_of([few] * 4, steps, [of_cells(9, np.log(2)), None])
     assert (one.first, one.last, alone.first) == (0, 2, 3)
     assert alone.single and np.isnan(alone.depths[0]).all()
     assert np.linalg.norm(one.between(1, 2)[:3, 3]) == pytest.approx(2)

@@ -44,14 +44,13 @@ def turned(f: int, angle_deg: float) -> Step:
 
 
 def test_places_on_both_sides_confirm_right_steps() -> None:
-    steps, sure = [[true_step(f)] for f in range(3)], sure_triples()
-    assert without_unsupported(frames(), steps, [0, 0, 0], sure, 1) == sure
+    steps, sure = [true_step(f) for f in range(3)], sure_triples()
+    assert without_unsupported(frames(), steps, sure, 1) == sure
 
 
 def test_a_wrong_step_that_three_frames_confirm_is_left_out() -> None:
-    steps, sure = [[true_step(f)] for f in range(3)], sure_triples()
-    assert without_unsupported(
-        frames(), [steps[0], [turned(1, 60)], steps[2]], [0, 0, 0], sure, 1
-    ) == [None, None]
-    at_end = without_unsupported(frames(), [*steps[:2], [turned(2, 60)]], [0, 0, 0], sure, 1)
+    steps, sure = [true_step(f) for f in range(3)], sure_triples()
+    inside = without_unsupported(frames(), [steps[0], turned(1, 60), steps[2]], sure, 1)
+    assert inside == [None, None]
+    at_end = without_unsupported(frames(), [*steps[:2], turned(2, 60)], sure, 1)
     assert at_end == [sure[0], None]
