@@ -91,7 +91,7 @@ class CameraSystem:
             turning = readout.turning_of(cameras.each[number].lenses, self.context)
             if turning is not None:
                 by_gyro = self._agrees(number, turning.rates)
-                cameras = cameras.changed(number, lambda one, by=by_gyro: replace(one, by_gyro=by))
+                cameras = cameras.changed(number, replace(cameras.each[number], by_gyro=by_gyro))
         system = replace(self, cameras=cameras)._linearized()
         variances = system.own_variances()  # they hardly depend on the spread
         if variances is None:
@@ -114,7 +114,7 @@ class CameraSystem:
     def _agrees(self, number: int, rates: np.ndarray) -> bool:
         """True if images alone confirm a gyro's rates (F, 3) of a camera during the readout."""
         camera, num = self.cameras.each[number], len(rates)
-        without = self.cameras.changed(number, lambda one: replace(one, by_gyro=False))
+        without = self.cameras.changed(number, replace(camera, by_gyro=False))
         alone = replace(self, cameras=without)._linearized()
         motion, variances = alone.own_motion(), alone.own_variances()
         own = np.isin(np.arange(num), self.cameras.frames_of(number, num))

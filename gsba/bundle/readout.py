@@ -2,7 +2,7 @@
 `camera_adjustment` then finds each frame's own motion."""
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 
@@ -216,13 +216,9 @@ class CameraEstimates:
         pairs = zip(self.each, lenses, strict=True)
         return self.with_each([replace(one, lenses=own) for one, own in pairs])
 
-    def changed(
-        self, camera: int, change: Callable[[CameraEstimate], CameraEstimate]
-    ) -> "CameraEstimates":
-        """The estimates with that of one camera changed."""
-        each = list(self.each)
-        each[camera] = change(each[camera])
-        return self.with_each(each)
+    def changed(self, camera: int, found: CameraEstimate) -> "CameraEstimates":
+        """The estimates with another one of one camera."""
+        return self.with_each([*self.each[:camera], found, *self.each[camera + 1 :]])
 
     def frames_of(self, camera: int, num_frames: int) -> np.ndarray:
         """Frames (F',) int64 that a camera took, of `num_frames`."""

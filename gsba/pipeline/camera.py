@@ -236,7 +236,7 @@ def _settle_cameras(state: State, name: str) -> State:
             read = _from_features(
                 state, stage, camera, readout.estimate, CameraEstimate, noted=True
             )
-            found = found.changed(camera, lambda _, read=read: read)
+            found = found.changed(camera, read)
     return _solve_with_cameras(state, found, name)
 
 
@@ -275,8 +275,7 @@ def take_parts_from_patches(state: State, sighted: Sighted, name: str, number: i
         if number == 0 and lenses.readout_motion is None:
             given = f"readout_{name}", camera, readout.estimate, CameraEstimate
             read = _from_patches(state, sighted, *given)
-            changed = state.map.estimates().changed(camera, lambda _, read=read: read)
-            state = state.with_cameras(changed)
+            state = state.with_cameras(state.map.estimates().changed(camera, read))
         raw = camera in _raw_cameras(run)
         if number == 1 and raw and lenses.fisheyes is None:  # the rest has settled
             given = f"calibrated_{name}", camera, _calibration(run, camera), SelfCalibration

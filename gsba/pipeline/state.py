@@ -116,7 +116,7 @@ class State:
     def with_lenses(self, camera: int, lenses: Lenses) -> "State":
         """The state with other lenses of one camera of the map; keypoints stay as they are."""
         found = self.map.estimates()
-        return self.with_cameras(found.changed(camera, lambda one: replace(one, lenses=lenses)))
+        return self.with_cameras(found.changed(camera, replace(found.each[camera], lenses=lenses)))
 
     def through(self, cameras: Cameras) -> "State":
         """The state with its keypoints as rays of these cameras; the map's cameras stay."""
