@@ -51,9 +51,6 @@ class OdometrySettings(_Settings):
     # = no limit
     fetch_rounds: int = Field(default=3, ge=0)  # rounds that add frames of the video where the map
     # of the chosen frames is weak; 0 = add none
-    max_drift: float = Field(
-        default=3e-4, gt=0
-    )  # predicted position error relative to the path; maps above it get more frames
 
 
 class CubemapSettings(_Settings):

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from gsba import video
-from gsba.config import OdometrySettings, RefineSettings
+from gsba.config import RefineSettings
 from gsba.frames.times import read_times
 from gsba.odometry.walk import Odometry, write_chosen
 from gsba.pipeline.prior import Prior
@@ -20,6 +20,7 @@ logger = logging.getLogger(__name__)
 
 FOLDER = Path("fetched")  # in a run's folder: frames fetched in each round
 _MAX_SHARE = 3.0  # fetched frames, part of those that were chosen
+_MAX_DRIFT = 3e-4  # predicted position error relative to the path; maps above it get more frames
 
 
 def fetch_where_weak(
@@ -43,7 +44,7 @@ def fetch_where_weak(
         key = [settings.model_dump(exclude={"export", "placement"}), fingerprint(paths)]
         rows = store.stored(name, key, np.ndarray, ())
         if rows is None:
-            steps = weak_steps(measure(frames), settings.odometry)
+            steps = weak_steps(measure(frames))
             rows = rows_between(walk, frames.timestamps, steps, left)
             store.stage(name, key, lambda rows=rows: rows, np.ndarray)
         if not len(rows):
@@ -57,7 +58,7 @@ def fetch_where_weak(
     return frames
 
 
-def weak_steps(prior: Prior, settings: OdometrySettings) -> np.ndarray:
+def weak_steps(prior: Prior) -> np.ndarray:
     """Steps (F - 1,) bool between frames that images hold poorly, or do not show.
 
     These are steps that no image shows or that nothing ties together; and of maps that drift, those
@@ -70,7 +71,7 @@ def weak_steps(prior: Prior, settings: OdometrySettings) -> np.ndarray:
     if prior.strength is not None:
         maps = np.zeros(len(weak) + 1, np.int64) if prior.parts is None else prior.parts
         sigmas = np.pad(prior.strength.scale_sigmas, 1, constant_values=np.nan)
-        for number in np.flatnonzero(prior.strength.drift > settings.max_drift).tolist():
+        for number in np.flatnonzero(prior.strength.drift > _MAX_DRIFT).tolist():
             known = (maps == number) & np.isfinite(sigmas)
             if known.any():
                 poor = known & (sigmas >= np.median(sigmas[known]))

@@ -52,7 +52,7 @@ def _prior(num: int, unseen: list[int]) -> Prior:
 
 
 def test_steps_that_no_image_shows_are_weak() -> None:
-    found = densify.weak_steps(_prior(6, [3]), OdometrySettings())
+    found = densify.weak_steps(_prior(6, [3]))
     assert np.flatnonzero(found).tolist() == [3]
 
 
@@ -61,7 +61,7 @@ def test_of_a_map_that_drifts_the_poorer_half_is_weak() -> None:
     counts = Counts(7, 0, "frames")
     for drift, wanted in ((2e-3, [1, 2, 3, 4, 5]), (1e-5, [])):
         strength = MapStrength(sigmas, np.array([drift]), nobody, nobody[1:], None, counts)
-        found = densify.weak_steps(replace(_prior(7, []), strength=strength), OdometrySettings())
+        found = densify.weak_steps(replace(_prior(7, []), strength=strength))
         assert np.flatnonzero(found).tolist() == wanted
 
 
