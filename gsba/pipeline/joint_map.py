@@ -136,20 +136,13 @@ def _moved(run: FinishedRun, move: Sim3) -> Solution:
 
 
 def _back_to_back(solutions: Sequence[Solution], starts: Sequence[int]) -> Solution:
-    begins = np.cumsum([0, *(one.landmarks.tracks.num_points for one in solutions)])
     tracks = [one.landmarks.tracks for one in solutions]
-    points = [one.points + begin for one, begin in zip(tracks, begins, strict=False)]
-    frames = [one.frames + start for one, start in zip(tracks, starts, strict=False)]
-    joined = Tracks(
-        np.concatenate(points).astype(np.int32),
-        np.concatenate(frames).astype(np.int32),
-        np.concatenate([one.keypoints for one in tracks]),
-        int(begins[-1]),
-    )
+    pairs = zip(tracks, starts, strict=False)
+    moved = [replace(one, frames=one.frames + np.int32(start)) for one, start in pairs]
     counts = [one.counts for one in solutions]
     landmarks = Landmarks(
         np.concatenate([one.landmarks.points_world for one in solutions]),
-        joined,
+        Tracks.joined(moved),
         Counts(sum(c.received for c in counts), sum(c.kept for c in counts), "tracks"),
     )
     return Solution(np.concatenate([one.world_T_rigs for one in solutions]), landmarks, 1.0, ())

@@ -232,7 +232,7 @@ def tie(state: State, parts: np.ndarray) -> State:
     everything = Sighted(
         both,
         np.concatenate([base.aligned, np.zeros(len(order) - len(base.aligned), bool)])[order],
-        _with_tracks(base.tracks, replace(ties, keypoints=ties.keypoints + sizes[ties.frames])),
+        Tracks.joined([base.tracks, replace(ties, keypoints=ties.keypoints + sizes[ties.frames])]),
         base.counts,
     )
     solved = _solved(state, everything, "joined", run.settings.rounds.loops)
@@ -280,7 +280,7 @@ def _aligned(state: State, base: Sighted, features: Keypoints, parts: np.ndarray
         both = Sighted(
             keypoints,
             np.concatenate([left.aligned, shared.aligned])[order],
-            _with_tracks(left.tracks, tracks),
+            Tracks.joined([left.tracks, tracks]),
             shared.counts,
             np.concatenate(normals)[order],
         )
@@ -458,16 +458,6 @@ def _interleaved(one: Keypoints, other: Keypoints) -> tuple[Keypoints, np.ndarra
     frames = np.concatenate([one.frames(), other.frames()])
     order = np.argsort(frames, kind="stable")
     return joined_keypoints([one, other]).at(order, one.starts + other.starts), order
-
-
-def _with_tracks(one: Tracks, other: Tracks) -> Tracks:
-    """Tracks of both, those of `other` numbered after those of `one`."""
-    return Tracks(
-        np.concatenate([one.points, other.points + one.num_points]).astype(np.int32),
-        np.concatenate([one.frames, other.frames]),
-        np.concatenate([one.keypoints, other.keypoints]).astype(np.int32),
-        one.num_points + other.num_points,
-    )
 
 
 def _without_same(base: Sighted, shared: Sighted, width: int) -> Sighted:

@@ -292,6 +292,18 @@ class Tracks:
     def __len__(self) -> int:
         return len(self.points)
 
+    @classmethod
+    def joined(cls, parts: "Sequence[Tracks]") -> "Tracks":
+        """Tracks of several parts, the points of each numbered after those before."""
+        starts = np.cumsum([0, *(part.num_points for part in parts)])
+        points = [part.points + start for part, start in zip(parts, starts, strict=False)]
+        return cls(
+            np.concatenate(points).astype(np.int32),
+            np.concatenate([part.frames for part in parts]),
+            np.concatenate([part.keypoints for part in parts]).astype(np.int32),
+            int(starts[-1]),
+        )
+
     def hosts(self) -> np.ndarray:
         """First frame (J,) that observes each point: the point moves with it; -1 = none."""
         first = np.flatnonzero(np.diff(self.points, prepend=-1))
