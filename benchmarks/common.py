@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     import numpy as np
@@ -142,32 +142,6 @@ def code_digest() -> str:
 
     homes = [Path(str(package.__file__)).parent for package in (gsba, factors)]
     return digest(path for home in homes for path in sorted(home.rglob("*.py")))
-
-
-class Case(NamedTuple):
-    """Frames, their coarse trajectory and the truth."""
-
-    images: Path  # with timestamps.csv
-    trajectory: Path | None  # TUM
-    truth: Path  # TUM
-
-
-def cut_short(case: Case, num_frames: int, folder: Path) -> Case:
-    """Case of the first frames, as links in `folder`, with the poses up to the last of them."""
-    shutil.rmtree(folder, ignore_errors=True)
-    (folder / "images").mkdir(parents=True)
-    header, *rows = (case.images / "timestamps.csv").read_text().splitlines()
-    for row in rows[:num_frames]:
-        name = row.partition(",")[0]
-        (folder / "images" / name).symlink_to((case.images / name).resolve())
-    _write(folder / "images/timestamps.csv", "\n".join([header, *rows[:num_frames], ""]))
-    last = float(rows[:num_frames][-1].partition(",")[2])
-    for path in filter(None, (case.trajectory, case.truth)):
-        poses = path.read_text().splitlines(keepends=True)
-        kept = [one for one in poses if one[0] == "#" or float(one.split()[0]) <= last + 1e-6]
-        _write(folder / path.name, "".join(kept))
-    trajectory = case.trajectory and folder / case.trajectory.name
-    return Case(folder / "images", trajectory, folder / case.truth.name)
 
 
 def take_frames(walk: Path, rows: "np.ndarray", times: "np.ndarray", folder: Path) -> None:

@@ -1,12 +1,16 @@
 """Whole runs of `gsba refine` beside COLMAP's panorama reconstruction of the same frames.
 
     python benchmarks/pipeline.py --sequences aisle_loop,demo_rectangle --out WORK
+    python benchmarks/pipeline.py --pairs 3 --markdown benchmarks/results/short.md
 
 Every row is a separate process, measured from start to exit, and its trajectory is compared with
 the truth. Rows are kept in WORK and used again while code, options and frames stay the same, so
 that several calls can fill a table: dictionaries of `sequence`, `row`, `trajectory`, and either
 `errors` (gsba.evaluate.trajectory), `wall_s`, `cpu_s`, `peak_mb`, `load`, or `reason`. The last
 lines state whether the targets hold.
+
+With `--pairs`, rows are of short walks: runs from their coarse trajectory and of the peer's
+spherical mode that was faster in a first run of both, in turn, all of them anew.
 """
 
 import argparse
@@ -18,6 +22,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -32,6 +37,8 @@ from common import (
     outcome,
     refine_command,
     run_row,
+    take_frames,
+    write_table,
 )
 from peer import MODES
 
@@ -41,7 +48,7 @@ from gsba.evaluate.trajectory import evaluate
 from gsba.frames.scan import scan
 from gsba.log import GsbaError
 from gsba.trajectory.association import associate
-from gsba.trajectory.files import read_trajectory
+from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.types import FrameSet, Trajectory
 
 AUC_DEG = ("0.1", "0.25", "0.5", "1", "5")
@@ -66,7 +73,14 @@ RECORDED = {  # coarse trajectories; every row is run from the first, `DEFAULT` 
     ),
     "apartment": ("coarse.tum",),
 }
-WALKS = {"demo_rectangle": ("rectangle", "locked"), "demo_oval": ("oval", "forward")}
+WALKS = {  # arguments of `gsba.demo.make_walk`
+    "demo_rectangle": "'rectangle', 'locked'",
+    "demo_oval": "'oval', 'forward'",
+}
+SHORT_WALKS = {
+    "24 x 1536": "num_frames=24, width=1536",
+    "48 x 1024": "num_frames=48, width=1024",
+}
 FACTOR_SETS = {  # row -> options of `gsba refine`
     "slam": [],  # nothing runs
     "bearing": ["--factors", "bearing"],
@@ -99,10 +113,10 @@ def find_walk(name: str, data: Path, out: Path) -> Walk:
     Raises:
         GsbaError: the sequence is not on this machine.
     """
-    if name in WALKS:
+    if arguments := (WALKS | SHORT_WALKS).get(name):
         folder = out / name / "walk"
         if not folder.exists():
-            _make_walk(folder, "{!r}, {!r}".format(*WALKS[name]))
+            _make_walk(folder, arguments)
         return Walk(name, folder, ("slam.tum",), folder / "groundtruth.tum", None)
     folder = data / name
     if not folder.is_dir():
@@ -111,6 +125,19 @@ def find_walk(name: str, data: Path, out: Path) -> Walk:
     reference = truth if truth.exists() else folder / "peer_colmap.tum"
     trajectories = RECORDED.get(name, ("slam.tum",))
     return Walk(name, folder, trajectories, reference, mask if mask.exists() else None)
+
+
+def cut_short(walk: Walk, num_frames: int, folder: Path) -> Walk:
+    """The first frames of a walk, as links in a folder, with the poses up to the last of them."""
+    rows = (walk.folder / "images/timestamps.csv").read_text().splitlines()[1 : num_frames + 1]
+    times = np.array([float(row.partition(",")[2]) for row in rows])
+    take_frames(walk.folder, np.arange(len(rows)), times, folder / "images")
+    for name in (walk.trajectories[0], walk.reference.name):
+        poses = read_trajectory(walk.folder / name)
+        kept = poses.timestamps <= times[-1] + 1e-6
+        write_tum(folder / name, Trajectory(poses.timestamps[kept], poses.world_T_rigs[kept]))
+    name, reference = f"{walk.name}, {num_frames} frames", folder / walk.reference.name
+    return Walk(name, folder, walk.trajectories[:1], reference, None)
 
 
 class Bench:
@@ -312,6 +339,59 @@ def _cells(row: dict, ours: dict | None) -> list[str]:
     return [*cells, f"{row['peak_mb']:.0f}", f"{row['load']:.1f}"]
 
 
+def short_walks(data: Path, out: Path) -> Iterator[Walk]:
+    """Rendered short walks, and the first frames of one with the trajectory of a real SLAM."""
+    for name in SHORT_WALKS:
+        yield find_walk(name, data, out)
+    if (data / "aisle_slam").is_dir():
+        yield cut_short(find_walk("aisle_slam", data, out), 48, out / "aisle_slam_48")
+
+
+def in_pairs(bench: Bench, walk: Walk, num: int) -> str:
+    """Line of the table of short walks: one walk, in so many pairs of a run and the peer's.
+
+    Raises:
+        GsbaError: one of them has no result.
+    """
+    frames, start = scan(walk.folder / "images"), walk.trajectories[0]
+    bench.refine(walk, frames, start, DEFAULT)  # fills the disk's cache
+    modes = [mode for mode in MODES if mode.startswith("spherical")]
+    mode = min(modes, key=lambda each: bench.peer(walk, frames, each)["wall_s"])
+    ours, peers = list[dict](), list[dict]()
+    for _ in range(num):
+        ours.append(bench.refine(walk, frames, start, DEFAULT))
+        peers.append(bench.peer(walk, frames, mode))
+    for row in [*ours, *peers]:
+        if "errors" not in row:
+            raise GsbaError(f"{walk.name}: {row['row']}: {row['reason']}")
+    both = list(zip(ours, peers, strict=True))
+    cells = [walk.name]
+    cells += [_spread([row["wall_s"] for row in rows], 1) for rows in (ours, peers)]
+    cells += [mode.removeprefix("spherical-")]
+    cells += [_spread([a[cost] / b[cost] for a, b in both], 2) for cost in ("wall_s", "cpu_s")]
+    ates = [[row["errors"]["ate"]["rmse"] for row in rows] for rows in (ours, peers)]
+    return f"| {' | '.join([*cells, *(f'{median(each):.5f}' for each in ates)])} |"
+
+
+def _spread(values: Sequence[float], digits: int) -> str:
+    low, middle, high = (f"{v:.{digits}f}" for v in (min(values), median(values), max(values)))
+    return f"{middle} ({low} to {high})"
+
+
+def print_pairs(bench: Bench, data: Path, num: int, markdown: Path | None) -> None:
+    """Measure short walks in pairs, and print their table."""
+    lines = [
+        f"Wall s: median (least to most) of {num} pairs.",
+        "",
+        "| walk | gsba | COLMAP | mode | gsba / COLMAP | CPU, gsba / COLMAP | ATE gsba | COLMAP |",
+        "|---|---:|---:|---|---:|---:|---:|---:|",
+    ]
+    for walk in short_walks(data, bench.out):
+        lines.append(in_pairs(bench, walk, num))
+        print(lines[-1], flush=True)
+    write_table(lines, markdown)
+
+
 def main() -> None:
     """Parse, run, print; exit with 1 if a target is missed."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
@@ -326,9 +406,14 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("build/benchmark"), help="kept rows")
     parser.add_argument("--fresh", action="store_true", help="run these rows again")
     parser.add_argument("--timeout-min", type=float, default=40.0, help="of a row")
+    parser.add_argument("--pairs", type=int, metavar="N", help="short walks, in N pairs each")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--markdown", type=Path)
     options = parser.parse_args()
+    if options.pairs:
+        bench = Bench(options.out, 60 * options.timeout_min, fresh=True)
+        print_pairs(bench, options.data, options.pairs, options.markdown)
+        return
     there = ",".join(
         (every, *(name for name in options.sequences if (options.data / name).is_dir()))
     )
