@@ -158,12 +158,6 @@ def take_frames(walk: Path, rows: "np.ndarray", times: "np.ndarray", folder: Pat
     (folder / "timestamps.csv").write_text("\n".join(["name,timestamp", *lines, ""]))
 
 
-def peak_mb() -> float:
-    """Peak resident memory of this process since its program started, without its parent's."""
-    status = Path("/proc/self/status").read_text()
-    return int(status.partition("VmHWM:")[2].split()[0]) / 1024
-
-
 def machine() -> str:
     """Processor and cores that may be used, for the head of a table."""
     lines = Path("/proc/cpuinfo").read_text().splitlines()

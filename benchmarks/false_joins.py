@@ -56,66 +56,44 @@ _GSBA = [sys.executable, "-c", "from gsba.cli import main; main()"]
 _SET = ["--allow-partial", "--set", "export.formats=[]"]
 
 
-class Cut(NamedTuple):
-    """A recording cut from a walk."""
-
-    folder: Path  # of its frames, with timestamps.csv
-    trajectory: Path  # TUM, with drift, in a world and scale of its own
-    rows: np.ndarray  # (R,) frames of the walk
-
-
-def cut_rows(walk: Path, rows: np.ndarray, folder: Path, number: int) -> Cut:
-    """Cut frames out of a walk as a recording; its trajectory lies beside its folder.
-
-    Args:
-        walk: folder with `images/`, their timestamps.csv, and `groundtruth.tum`.
-        rows: (R,) frames of the walk.
-        folder: of the recording.
-        number: decides world, scale and drift of its trajectory.
-    """
-    truth = read_trajectory(walk / "groundtruth.tum")
-    times = truth.timestamps[rows] - truth.timestamps[rows[0]]
-    take_frames(walk, rows, times, folder)
-    given = Trajectory(times, truth.world_T_rigs[rows])
-    coarse = degrade(given, number, scale=_SCALES[number % 6])
-    turn = Rotation.from_rotvec([0.3, 1.1 * number, -0.2]).as_matrix()
-    moved = Sim3.of(1.0, pose(turn, np.array([3.0 * number, -2.0, 5.0])))
-    path = folder.with_name(f"{folder.name}.tum")
-    write_tum(path, Trajectory(coarse.timestamps, moved.poses(coarse.world_T_rigs)))
-    return Cut(folder, path, rows)
-
-
-def position_errors(found: np.ndarray, true: np.ndarray) -> np.ndarray:
-    """Errors (N,) of positions of poses (N, 4, 4) after one alignment to the truth (N, 4, 4), of
-    frames that may be of several clocks."""
-    times = np.arange(len(true), dtype=np.float64)
-    return pose_errors(Trajectory(times, found), Trajectory(times, true)).positions
-
-
 class Recording(NamedTuple):
-    """A part of a walk through a flat."""
+    """A part of a walk through a flat, cut out as a recording."""
 
     flat: str
-    walk: Path
-    cut: Cut
+    walk: Path  # folder with `images/`, their timestamps.csv, and `groundtruth.tum`
+    folder: Path  # of its frames, with timestamps.csv
+    rows: np.ndarray  # (R,) frames of the walk
 
     @property
     def name(self) -> str:
         """Name of its frames' folder."""
-        return self.cut.folder.name
+        return self.folder.name
+
+    @property
+    def trajectory(self) -> Path:
+        """TUM, with drift, in a world and scale of its own."""
+        return self.folder.with_name(f"{self.name}.tum")
 
     @property
     def files(self) -> list[Path]:
         """Files that runs read."""
-        return [*sorted(self.cut.folder.iterdir()), self.cut.trajectory, self.walk / "mask.png"]
+        return [*sorted(self.folder.iterdir()), self.trajectory, self.walk / "mask.png"]
 
 
 def recording_of(flat: str, walk: Path, first: int, home: Path) -> Recording:
-    """Recording of frames from `first` on of a walk, cut into the folder `home`."""
+    """Recording of frames from `first` on of a walk, cut into the folder `home`; `first` decides
+    world, scale and drift of its trajectory."""
+    truth = read_trajectory(walk / "groundtruth.tum")
     num = len((walk / "images/timestamps.csv").read_text().splitlines()) - 1
     rows = np.arange(first, min(first + NUM_FRAMES, num))
-    name = f"{walk.name}-from{first}"
-    return Recording(flat, walk, cut_rows(walk, rows, home / name, first))
+    one = Recording(flat, walk, home / f"{walk.name}-from{first}", rows)
+    times = truth.timestamps[rows] - truth.timestamps[first]
+    take_frames(walk, rows, times, one.folder)
+    coarse = degrade(Trajectory(times, truth.world_T_rigs[rows]), first, scale=_SCALES[first % 6])
+    turn = Rotation.from_rotvec([0.3, 1.1 * first, -0.2]).as_matrix()
+    moved = Sim3.of(1.0, pose(turn, np.array([3.0 * first, -2.0, 5.0])))
+    write_tum(one.trajectory, Trajectory(coarse.timestamps, moved.poses(coarse.world_T_rigs)))
+    return one
 
 
 def check_maps(run: Path, recordings: Sequence[Recording]) -> list[dict[str, Any]]:
@@ -134,7 +112,9 @@ def check_maps(run: Path, recordings: Sequence[Recording]) -> list[dict[str, Any
             truths = {one.name: read_trajectory(one.walk / "groundtruth.tum") for one in owners}
             pairs = zip(owners, names, strict=True)
             true = np.array([truths[one.name].world_T_rigs[int(name)] for one, (*_, name) in pairs])
-            errors = position_errors(reconstruction.world_T_rigs, true)
+            numbers = np.arange(len(true), dtype=np.float64)  # frames may be of several clocks
+            estimate = Trajectory(numbers, reconstruction.world_T_rigs)
+            errors = pose_errors(estimate, Trajectory(numbers, true)).positions
             worst = float(errors.max() / np.linalg.norm(np.ptp(true[:, :3, 3], axis=0)))
         both = len({one.name for one in owners}) > 1
         found = {"frames": len(names), "flats": flats, "worst": worst, "joined": both}
@@ -150,7 +130,7 @@ class Bench(NamedTuple):
 
     def alone(self, one: Recording) -> dict[str, Any]:
         """Row of a recording refined alone."""
-        words = ["refine", str(one.cut.folder), str(one.cut.trajectory), "--fresh", *_SET]
+        words = ["refine", str(one.folder), str(one.trajectory), "--fresh", *_SET]
         return self._row([one], "alone", [*words, "--masks", str(one.walk / "mask.png")])
 
     def merged(self, one: Recording, other: Recording) -> dict[str, Any]:
@@ -162,7 +142,7 @@ class Bench(NamedTuple):
         """Row of two recordings in one run, without trajectories."""
         words = ["refine", "--no-trajectory", "--fresh", *_SET]
         for each in (one, other):
-            words += ["--recording", f"{each.cut.folder},masks={each.walk / 'mask.png'}"]
+            words += ["--recording", f"{each.folder},masks={each.walk / 'mask.png'}"]
         return self._row([one, other], "refine", words)
 
     def _row(self, recordings: Sequence[Recording], by: str, words: list[str]) -> dict[str, Any]:
@@ -178,7 +158,7 @@ class Bench(NamedTuple):
         def finish() -> dict[str, Any]:
             return {"errors": check_maps(run, recordings)}
 
-        row = {"key": key, "by": by, "frames": sum(len(one.cut.rows) for one in recordings)}
+        row = {"key": key, "by": by, "frames": sum(len(one.rows) for one in recordings)}
         row = run_row([*_GSBA, *words, "--out", str(run)], folder, row, finish, TIMEOUT_S)
         if by == "merge" and MEET_NOWHERE in row.get("reason", ""):
             row["errors"] = []  # a result, not a failure: the row is kept
