@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from gsba.log import GsbaError
     from gsba.pipeline.growing import add_recordings, merge_runs, remove_recordings
     from gsba.pipeline.outputs import RunResult
-    from gsba.pipeline.recordings import Recording, refine_recordings
-    from gsba.pipeline.refine import refine
+    from gsba.pipeline.recordings import Recording
+    from gsba.pipeline.refine import refine, refine_recordings
     from gsba.store.finished import load_run
 
 __all__ = [
@@ -64,7 +64,7 @@ _HOMES = {
     "merge_runs": "gsba.pipeline.growing",
     "optimize": "gsba.bundle.optimizer",
     "refine": "gsba.pipeline.refine",
-    "refine_recordings": "gsba.pipeline.recordings",
+    "refine_recordings": "gsba.pipeline.refine",
     "remove_recordings": "gsba.pipeline.growing",
 }
 

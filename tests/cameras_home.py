@@ -21,7 +21,7 @@ from gsba.camera.sphere import around_sphere, erp_from_bearings
 from gsba.demo import DemoWalk
 from gsba.evaluate.trajectory import evaluate
 from gsba.frames.cubemap import cut
-from gsba.pipeline.recordings import refine_each
+from gsba.pipeline.refine import refine_each
 from gsba.store.finished import load_run
 from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.types import FACES, Fisheye, Trajectory

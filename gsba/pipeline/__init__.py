@@ -8,8 +8,8 @@ from gsba.pipeline.growing import add_recordings, merge_runs, remove_recordings
 from gsba.pipeline.map import Map
 from gsba.pipeline.outputs import RunResult
 from gsba.pipeline.prior import Prior
-from gsba.pipeline.recordings import Recording, refine_recordings
-from gsba.pipeline.refine import refine, solve
+from gsba.pipeline.recordings import Recording
+from gsba.pipeline.refine import refine, refine_recordings, solve
 from gsba.pipeline.run import Evidence, Run
 from gsba.pipeline.state import State
 

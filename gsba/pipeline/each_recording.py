@@ -37,10 +37,12 @@ def match_neighbours(state: State) -> State:
 
 @contextmanager
 def naming_recording(name: str) -> Iterator[None]:
-    """Name a recording in the message of a GsbaError."""
+    """Name a recording in the message of a GsbaError; "" = the only one, which needs no name."""
     try:
         yield
     except GsbaError as error:
+        if not name:
+            raise
         raise GsbaError(f"recording '{name}': {error}") from error
 
 

@@ -24,7 +24,8 @@ from gsba.pipeline.joint_map import JointMaps
 from gsba.pipeline.map_joining import ApartError, RigidMoves
 from gsba.pipeline.outputs import RunResult
 from gsba.pipeline.prior import Prior
-from gsba.pipeline.recordings import Recording, names_of, refine_each
+from gsba.pipeline.recordings import Recording, names_of
+from gsba.pipeline.refine import refine_each
 from gsba.pipeline.stage_titles import title_of
 from gsba.pipeline.state import State
 from gsba.similarity import NoSimilarityError, Sim3, pose_similarity

@@ -1,36 +1,24 @@
-"""A run from several recordings of a place to one world of refined poses."""
+"""Recordings as a caller gives them, one or several: their files, read, and frames of videos."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-from threadpoolctl import threadpool_limits
 
 from gsba import video
-from gsba.bundle.families import Family
 from gsba.config import CameraSettings, RefineSettings
 from gsba.config_file import validated
-from gsba.frames.recordings import combine
 from gsba.frames.scan import scan
 from gsba.log import GsbaError
 from gsba.masks import merging
-from gsba.masks.segmentation import Segment
+from gsba.odometry import Odometry
 from gsba.pipeline import inputs
 from gsba.pipeline.each_recording import naming_recording
-from gsba.pipeline.outputs import RunResult
-from gsba.pipeline.refine import Start, refine_from
-from gsba.pipeline.run import Evidence, RecordingEvidence
+from gsba.pipeline.run import RecordingEvidence
 from gsba.pipeline.stage_titles import title_of
-from gsba.placement import check
-from gsba.store import cluster
 from gsba.store.store import RunStore, StageRecord
 from gsba.trajectory.conventions import Convention
 from gsba.trajectory.metashape import NamedPoses
 from gsba.types import FrameSet, RunStart, Trajectory
-
-if TYPE_CHECKING:
-    from distributed import Client
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,118 +64,27 @@ def names_of(recordings: Sequence[Recording]) -> list[str]:
     return names
 
 
-@threadpool_limits.wrap(limits=1, user_api="blas")  # frames have threads; sums keep their order
-def refine_recordings(
-    recordings: Sequence[Recording],
-    out: Path | str,
-    settings: RefineSettings | None = None,
-    *,
-    segment: Segment | None = None,
-    fresh: bool = False,
-    families: Sequence[Family] = (),
-    client: "Client | None" = None,
-) -> RunResult:
-    """Refine the poses of several recordings of a place in one world with one scale.
-
-    Recordings are joined by the places that they share; those that share none stay maps of their
-    own. The world is that of the first recording with a trajectory.
-
-    Args:
-        recordings: at least two, each on a clock of its own. Those of one layout, size and
-            calibration are of one camera, unless they name different ones.
-        out, settings, segment, fresh, families, client: see `gsba.refine`.
-
-    Raises:
-        GsbaError: a recording or a setting that cannot be used; the message names the recording.
-    """
-    if len(recordings) < 2:
-        raise GsbaError("give two recordings or more; gsba.refine refines one")
-    given = {"segment": segment, "fresh": fresh, "families": families, "client": client}
-    return refine_each(recordings, Path(out), settings, **given)
-
-
-def refine_each(
-    recordings: Sequence[Recording],
-    out: Path,
-    settings: RefineSettings | None = None,
-    *,
-    segment: Segment | None = None,
-    fresh: bool = False,
-    families: Sequence[Family] = (),
-    client: "Client | None" = None,
-    adapt: Callable[[Mapping[str, FrameSet]], Mapping[str, tuple[FrameSet, CameraSettings]]]
-    | None = None,
-) -> RunResult:
-    """Refine recordings, one or more, in one run as `refine_recordings` does. `adapt` gives frames
-    as they are to be read, and settings of their camera, from frames by the name of their
-    recording."""
-    plain = settings or RefineSettings()
-    convention = Convention.parse(plain.read.trajectory_format)
-    given = [
-        _Given.of(one, name, convention)
-        for one, name in zip(recordings, names_of(recordings), strict=True)
-    ]
-    settings = _with_camera(plain, given)
-    check(settings.placement, baseline=settings.camera.baseline())
-    # Sources of masks of all recordings; files belong to each recording alone.
-    choices = {one.name: merging.choose(one.recording.masks, segment) for one in given}
-    every = list(choices.values())
-    chosen = merging.Choice(
-        None,
-        any(one.carrier for one in every),
-        any(one.distractors for one in every),
-        segment,
-        any(one.carrier_required for one in every),
-        tuple(name for name, one in choices.items() if not one.carrier),
-    )
-    origin = {name: path for one in given for name, path in one.files.items()}
-    given, fresh, extracted = _with_videos(given, out, origin, settings, fresh)
-    found = {one.name: one.scanned() for one in given}
-    plain_of = dict.fromkeys(found, plain)
-    if adapt is not None:
-        read = adapt(found)
-        found = {name: frames for name, (frames, _) in read.items()}
-        plain_of = {
-            name: plain.model_copy(update={"camera": own}) for name, (_, own) in read.items()
-        }
-        settings = _with_camera(plain_of[given[0].name], given)
-    if any(one.followed for one in given):  # no evidence beside the images that they are made of
-        settings = settings.with_faint_priors()
-    models = {one.name: one.recording.camera for one in given}
-    frames = combine(found, {name: model for name, model in models.items() if model})
-    evidence = Evidence(
-        families=tuple(families),
-        recordings=tuple(
-            one.evidence(found[one.name], settings, plain_of[one.name]) for one in given
-        ),
-    )
-    start = Start.of(frames, evidence, settings)
-    hired = cluster.hire(client, frames.paths[0][0], settings)
-    with RunStore(out, origin, fresh, hired, title_of) as store:
-        store.records.update(extracted)  # their time is the run's, too
-        return refine_from(store, settings, chosen, evidence, start, given[0].folder, None)
-
-
 @dataclass(frozen=True, slots=True)
-class _Given:
+class GivenRecording:
     """A recording with its name, its files, and what was read of them."""
 
-    name: str
+    name: str  # "" = the only one
     recording: Recording
     files: dict[str, Path]  # inputs of the run by what they are
     trajectories: tuple[Trajectory | NamedPoses, ...]  # in pieces, each with its own world
     folder: Path  # of its frames, or its video
     extracted: bool = False  # True if its frames were extracted from a video
-    followed: bool = False  # True if the trajectory is odometry of its own images
+    walk: Odometry | None = None  # of its own images, which gave the trajectory
 
     @classmethod
-    def of(cls, recording: Recording, name: str, convention: Convention) -> "_Given":
+    def of(cls, recording: Recording, name: str, convention: Convention) -> "GivenRecording":
         """A recording whose trajectory files are read, before any video is decoded."""
-        folder = Path(recording.frames)
+        folder, prefix = Path(recording.frames), f"{name}: " if name else ""
         poses = inputs.trajectory_files(recording.trajectory, _path(recording.keyframes))
+        origin = {"frames": folder} | poses
         with naming_recording(name):
-            pieces = inputs.read_trajectories(poses, _path(recording.timestamps), convention)
-        files = {f"{name}: {what}": path for what, path in ({"frames": folder} | poses).items()}
+            pieces = inputs.read_trajectories(origin, _path(recording.timestamps), convention)
+        files = {f"{prefix}{what}": path for what, path in origin.items()}
         return cls(name, recording, files, tuple(pieces), folder)
 
     def scanned(self) -> FrameSet:
@@ -216,7 +113,7 @@ class _Given:
             coarse = inputs.coarse_poses(frames, trajectories, settings)
             imu = inputs.read_gyro(_path(self.recording.imu), Path(self.recording.frames))
         start = RunStart.TRAJECTORY if trajectories else RunStart.PAIRS
-        start, camera = RunStart.ODOMETRY if self.followed else start, self.camera(plain)
+        start, camera = start if self.walk is None else RunStart.ODOMETRY, self.camera(plain)
         return RecordingEvidence(self.name, coarse, trajectories, imu, camera, start)
 
 
@@ -224,7 +121,7 @@ def _path(given: Path | str | None) -> Path | None:
     return None if given is None else Path(given)
 
 
-def _with_camera(settings: RefineSettings, given: Sequence[_Given]) -> RefineSettings:
+def with_camera(settings: RefineSettings, given: Sequence[GivenRecording]) -> RefineSettings:
     """Settings with the first camera model that is named, and the baseline of a calibration."""
     for name in [one.recording.camera for one in given if one.recording.camera is not None][:1]:
         camera = settings.camera.model_dump() | {"name": name}
@@ -234,13 +131,13 @@ def _with_camera(settings: RefineSettings, given: Sequence[_Given]) -> RefineSet
     return settings
 
 
-def _with_videos(
-    given: Sequence[_Given],
+def with_videos(
+    given: Sequence[GivenRecording],
     out: Path,
     origin: dict[str, Path],
     settings: RefineSettings,
     fresh: bool,
-) -> tuple[list[_Given], bool, dict[str, StageRecord]]:
+) -> tuple[list[GivenRecording], bool, dict[str, StageRecord]]:
     """Recordings with the frames of videos extracted, whether to forget an earlier run yet, and
     the stages that extracted them."""
     if not any(video.is_video(one.folder) for one in given):
@@ -253,7 +150,7 @@ def _with_videos(
     return ready, False, store.records
 
 
-def _extracted(one: _Given, store: RunStore, settings: RefineSettings) -> _Given:
+def _extracted(one: GivenRecording, store: RunStore, settings: RefineSettings) -> GivenRecording:
     """A recording with its video's frames extracted, and followed where it has no trajectory."""
     recording = one.recording
     followed = inputs.follows(settings.video, recording.fps, recording.odometry, one.trajectories)
@@ -264,4 +161,4 @@ def _extracted(one: _Given, store: RunStore, settings: RefineSettings) -> _Given
     ready = replace(one, folder=store.root / "frames" / one.name, extracted=True)
     if walk is None:
         return ready
-    return replace(ready, trajectories=tuple(walk.pieces()), followed=True)
+    return replace(ready, trajectories=tuple(walk.pieces()), walk=walk)

@@ -1,20 +1,21 @@
-"""A run from frames and a coarse trajectory to refined poses, a cloud and datasets."""
+"""A run from frames and a coarse trajectory, or from several recordings of a place, to refined
+poses, a cloud and datasets."""
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from threadpoolctl import threadpool_limits
 
-from gsba import video
 from gsba.bundle.families import Family
 from gsba.camera.fisheye import turned
 from gsba.compilation import compile_ahead
-from gsba.config import RefineSettings
-from gsba.frames.scan import scan, warn_of_repeats
-from gsba.log import following
+from gsba.config import CameraSettings, RefineSettings
+from gsba.frames.recordings import combine
+from gsba.frames.scan import warn_of_repeats
+from gsba.log import GsbaError, following
 from gsba.masks import merging
 from gsba.masks.segmentation import Segment
 from gsba.odometry import Odometry
@@ -34,6 +35,7 @@ from gsba.pipeline import (
 )
 from gsba.pipeline.outputs import RunResult
 from gsba.pipeline.prior import Prior
+from gsba.pipeline.recordings import GivenRecording, Recording, names_of, with_camera, with_videos
 from gsba.pipeline.run import Evidence, Journal, Run
 from gsba.pipeline.stage_titles import title_of
 from gsba.pipeline.state import State
@@ -41,7 +43,7 @@ from gsba.placement import check
 from gsba.report.html import add_odometry
 from gsba.report.time_left import LoggedTimeLeft, tell_size
 from gsba.store import cluster
-from gsba.store.store import RunStore, StageRecord
+from gsba.store.store import RunStore
 from gsba.trajectory.conventions import Convention
 from gsba.trajectory.misread import TurnedAboutForwardError
 from gsba.types import CoarsePoses, FrameSet, Reconstruction, RunStart, VerifiedPairs
@@ -55,7 +57,7 @@ T = TypeVar("T")
 _CHAIN_GATES = 60.0, 8.0  # gates in standard deviations, from the coarse trajectory
 
 
-__all__ = ["RunResult", "refine", "solve"]
+__all__ = ["RunResult", "refine", "refine_each", "refine_recordings", "solve"]
 
 
 @threadpool_limits.wrap(limits=1, user_api="blas")  # frames have threads; sums keep their order
@@ -101,33 +103,119 @@ def refine(
     Raises:
         GsbaError: an input or setting that cannot be used.
     """
-    frames, out = Path(frames), Path(out)
-    settings = inputs.with_baseline(settings or RefineSettings(), calibration)
+    out, settings = Path(out), settings or RefineSettings()
+    own = keyframes, masks, timestamps, fps, calibration, circles, imu, odometry
+    recording = Recording(frames, trajectory, "", *own)
+    one = GivenRecording.of(recording, "", Convention.parse(settings.read.trajectory_format))
+    settings = with_camera(settings, [one])
     check(settings.placement, baseline=settings.camera.baseline())
-    chosen, readings = merging.choose(masks, segment), inputs.read_gyro(imu, frames)
-    origin = {"frames": frames} | inputs.trajectory_files(trajectory, keyframes)
-    convention, walk = Convention.parse(settings.read.trajectory_format), None
-    left, extracted = LoggedTimeLeft(), dict[str, StageRecord]()
-    given = inputs.read_trajectories(origin, timestamps, convention)  # fails before decoding
-    if video.is_video(frames):
-        by_odometry = chosen if inputs.follows(settings.video, fps, odometry, given) else None
-        inputs.check_positions(settings)
-        with RunStore(out, origin, fresh, title_of=title_of) as store, following(left):
-            walk = inputs.extract_video(store, frames, settings, fps, by_odometry, calibration)
-            extracted = store.records
-        frames, timestamps, fps, fresh = out / "frames", None, None, False
-    if walk is not None:  # made of these very images: no evidence beside them
-        given, settings = walk.pieces(), inputs.for_odometry(settings)
-    image_circles = inputs.given_circles(circles, calibration)
-    found = scan(frames, timestamps, fps, chosen.given, not given, calibration, image_circles)
-    begin = RunStart.TRAJECTORY if walk is None else RunStart.ODOMETRY
-    timed = tuple(inputs.timed(given, found))
-    evidence = Evidence(timed, readings, families=tuple(families), start=begin)
-    start = Start.of(found, evidence, settings)
-    hired = cluster.hire(client, frames, settings)
+    chosen, readings = merging.choose(masks, segment), inputs.read_gyro(imu, one.folder)
+    origin, source, left = one.files, one.folder, LoggedTimeLeft()
+    with following(left):
+        (one,), fresh, extracted = with_videos([one], out, origin, settings, fresh)
+    start = RunStart.TRAJECTORY
+    if one.walk is not None:  # made of these very images: no evidence beside them
+        start, settings = RunStart.ODOMETRY, inputs.for_odometry(settings)
+    found = one.scanned()
+    timed = tuple(inputs.timed(one.trajectories, found))
+    evidence = Evidence(timed, readings, families=tuple(families), start=start)
+    begin = Start.of(found, evidence, settings)
+    hired = cluster.hire(client, one.folder, settings)
     with RunStore(out, origin, fresh, hired, title_of) as store, following(left):
         store.records.update(extracted)  # their time is the run's, too
-        return refine_from(store, settings, chosen, evidence, start, origin["frames"], walk)
+        return refine_from(store, settings, chosen, evidence, begin, source, one.walk)
+
+
+@threadpool_limits.wrap(limits=1, user_api="blas")  # frames have threads; sums keep their order
+def refine_recordings(
+    recordings: Sequence[Recording],
+    out: Path | str,
+    settings: RefineSettings | None = None,
+    *,
+    segment: Segment | None = None,
+    fresh: bool = False,
+    families: Sequence[Family] = (),
+    client: "Client | None" = None,
+) -> RunResult:
+    """Refine the poses of several recordings of a place in one world with one scale.
+
+    Recordings are joined by the places that they share; those that share none stay maps of their
+    own. The world is that of the first recording with a trajectory.
+
+    Args:
+        recordings: at least two, each on a clock of its own. Those of one layout, size and
+            calibration are of one camera, unless they name different ones.
+        out, settings, segment, fresh, families, client: see `gsba.refine`.
+
+    Raises:
+        GsbaError: a recording or a setting that cannot be used; the message names the recording.
+    """
+    if len(recordings) < 2:
+        raise GsbaError("give two recordings or more; gsba.refine refines one")
+    given = {"segment": segment, "fresh": fresh, "families": families, "client": client}
+    return refine_each(recordings, Path(out), settings, **given)
+
+
+def refine_each(
+    recordings: Sequence[Recording],
+    out: Path,
+    settings: RefineSettings | None = None,
+    *,
+    segment: Segment | None = None,
+    fresh: bool = False,
+    families: Sequence[Family] = (),
+    client: "Client | None" = None,
+    adapt: Callable[[Mapping[str, FrameSet]], Mapping[str, tuple[FrameSet, CameraSettings]]]
+    | None = None,
+) -> RunResult:
+    """Refine recordings, one or more, in one run as `refine_recordings` does. `adapt` gives frames
+    as they are to be read, and settings of their camera, from frames by the name of their
+    recording."""
+    plain = settings or RefineSettings()
+    convention = Convention.parse(plain.read.trajectory_format)
+    given = [
+        GivenRecording.of(one, name, convention)
+        for one, name in zip(recordings, names_of(recordings), strict=True)
+    ]
+    settings = with_camera(plain, given)
+    check(settings.placement, baseline=settings.camera.baseline())
+    # Sources of masks of all recordings; files belong to each recording alone.
+    choices = {one.name: merging.choose(one.recording.masks, segment) for one in given}
+    every = list(choices.values())
+    chosen = merging.Choice(
+        None,
+        any(one.carrier for one in every),
+        any(one.distractors for one in every),
+        segment,
+        any(one.carrier_required for one in every),
+        tuple(name for name, one in choices.items() if not one.carrier),
+    )
+    origin = {name: path for one in given for name, path in one.files.items()}
+    given, fresh, extracted = with_videos(given, out, origin, settings, fresh)
+    found = {one.name: one.scanned() for one in given}
+    plain_of = dict.fromkeys(found, plain)
+    if adapt is not None:
+        read = adapt(found)
+        found = {name: frames for name, (frames, _) in read.items()}
+        plain_of = {
+            name: plain.model_copy(update={"camera": own}) for name, (_, own) in read.items()
+        }
+        settings = with_camera(plain_of[given[0].name], given)
+    if any(one.walk for one in given):  # no evidence beside the images that they are made of
+        settings = settings.with_faint_priors()
+    models = {one.name: one.recording.camera for one in given}
+    frames = combine(found, {name: model for name, model in models.items() if model})
+    evidence = Evidence(
+        families=tuple(families),
+        recordings=tuple(
+            one.evidence(found[one.name], settings, plain_of[one.name]) for one in given
+        ),
+    )
+    start = Start.of(frames, evidence, settings)
+    hired = cluster.hire(client, frames.paths[0][0], settings)
+    with RunStore(out, origin, fresh, hired, title_of) as store:
+        store.records.update(extracted)  # their time is the run's, too
+        return refine_from(store, settings, chosen, evidence, start, given[0].folder, None)
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,7 @@ from gsba.frames.scan import scan
 from gsba.log import GsbaError
 from gsba.pipeline.finished_run import FinishedRun
 from gsba.pipeline.joint_cameras import as_read_by
-from gsba.pipeline.recordings import refine_each
+from gsba.pipeline.refine import refine_each
 from gsba.types import Counts, FrameSet
 
 # Error that a run of the second recording at 384 pixels predicts; it scatters by a twentieth.

@@ -13,7 +13,7 @@ from gsba import add_recordings, load_run, merge_runs
 from gsba.frames.scan import scan
 from gsba.pipeline.finished_run import FinishedRun
 from gsba.pipeline.joint_cameras import as_read_by
-from gsba.pipeline.recordings import refine_each
+from gsba.pipeline.refine import refine_each
 
 
 @pytest.mark.slow

@@ -16,6 +16,8 @@ from typer.testing import Result
 from gsba import Recording, load_run, refine_recordings
 from gsba.evaluate.trajectory import evaluate
 from gsba.log import GsbaError
+from gsba.pipeline.recordings import GivenRecording
+from gsba.trajectory.conventions import Convention
 from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.types import Trajectory
 from gsba.view import load_scene
@@ -164,3 +166,17 @@ def test_the_command_refuses_in_one_line(arguments: list[str], told: str, tmp_pa
     result = _refine(tmp_path / "run", tmp_path, *arguments)
     assert result.exit_code == 1 and told in result.output.strip().splitlines()[-1]
     assert not (tmp_path / "run").exists()
+
+
+def test_a_recording_may_start_from_metashape(tmp_path: Path) -> None:
+    unit, sensor = " ".join(map(str, np.eye(4).ravel())), '<sensor id="0" type="spherical"/>'
+    cameras = "".join(
+        f'<camera id="{n}" label="{n}" sensor_id="0"><transform>{unit}</transform></camera>'
+        for n in range(2)
+    )
+    content = f"<sensors>{sensor}</sensors><cameras>{cameras}</cameras>"
+    path = tmp_path / "cameras.xml"
+    path.write_text(f"<document><chunk>{content}</chunk></document>")
+    one = GivenRecording.of(Recording(tmp_path, path), "upper", Convention())
+    assert list(one.files) == ["upper: frames", "upper: trajectory"]
+    assert len(one.trajectories) == 1
