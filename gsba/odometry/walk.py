@@ -1,9 +1,9 @@
 """Odometry of a whole sequence: poses, statuses, covariances, and the report."""
 
-import csv
 import logging
 import os
 import time
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from gsba import __version__
 from gsba.config import OdometrySettings
-from gsba.disk import atomic_write, write_json
+from gsba.disk import write_csv, write_json
 from gsba.geometry import inverse, quaternion_from_rotation, rotation_angle
 from gsba.log import GsbaError, event, track
 from gsba.odometry.closing import ClosedKeyframes, TrackedKeyframes, close
@@ -365,18 +365,14 @@ def write_odometry(found: Odometry, walk: Path, keyframes: Path, poses: Path, re
     header = ["timestamp", "status", "keyframe", "map", "tx", "ty", "tz", "qw", "qx", "qy", "qz"]
     maps, posed = found.maps_in_turn(), found.posed()
 
-    def write(temporary: Path) -> None:
-        with temporary.open("w", newline="", encoding="utf-8") as file:
-            table = csv.writer(file)
-            table.writerow(header + names)
-            for f, timestamp in enumerate(found.timestamps):
-                status = FrameStatus(found.statuses[f]) if posed[f] else FrameStatus.LOST
-                row = [repr(float(timestamp)), status.name.lower(), int(found.keyframes[f])]
-                values = [f"{v:.9g}" if np.isfinite(v) else "" for v in numbers[f]]
-                known = [int(maps[f]), *values] if posed[f] else [""] * (1 + len(values))
-                table.writerow(row + known)
+    def rows() -> Iterator[list[object]]:
+        for f, timestamp in enumerate(found.timestamps):
+            status = FrameStatus(found.statuses[f]) if posed[f] else FrameStatus.LOST
+            row = [repr(float(timestamp)), status.name.lower(), int(found.keyframes[f])]
+            values = [f"{v:.9g}" if np.isfinite(v) else "" for v in numbers[f]]
+            yield [*row, *([int(maps[f]), *values] if posed[f] else [""] * (1 + len(values)))]
 
-    atomic_write(poses, write)
+    write_csv(poses, header + names, rows())
     write_tum(walk, found.trajectory())
 
 
