@@ -13,9 +13,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from factors import bearing_residuals
+from gsba.bundle.trajectory_prior import StepNoise
 from gsba.config import PriorSettings, RefineSettings
 from gsba.geometry import inverse, moved_to, pose, relative_steps, rotation_angle, step_covariances
-from gsba.types import Counts, JointErrors, Reconstruction, StepNoise
+from gsba.types import Counts, JointErrors, Reconstruction
 from gsba.types.records import slices, spread_rows
 
 MAX_SCALE_SIGMA = 8e-4  # relative, of two successive baselines' ratio; frames above it are weak

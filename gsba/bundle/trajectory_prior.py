@@ -10,9 +10,18 @@ from gsba.bundle.families import Family, MapSnapshot, digest_of
 from gsba.bundle.pose_variables import X
 from gsba.config import PriorSettings
 from gsba.geometry import relative_steps
-from gsba.types import GyroConstraints, StepNoise
+from gsba.types import GyroConstraints
 
 LOSS_SIGMAS = 2.0  # Cauchy scale: limits the pull of wrong measurements
+
+
+@dataclass(frozen=True, slots=True)
+class StepNoise:
+    """Standard deviations of the trajectory's steps between frames."""
+
+    rotation: float  # radians, per axis
+    direction: float  # of motion's direction, radians, per axis
+    length: float  # of the step's length, relative
 
 
 @dataclass(frozen=True, slots=True)

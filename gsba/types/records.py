@@ -95,15 +95,6 @@ class CoarsePoses:
 
 
 @dataclass(frozen=True, slots=True)
-class StepNoise:
-    """Standard deviations of the trajectory's steps between frames."""
-
-    rotation: float  # radians, per axis
-    direction: float  # of motion's direction, radians, per axis
-    length: float  # of the step's length, relative
-
-
-@dataclass(frozen=True, slots=True)
 class GyroConstraints:
     """Rotations between frames and rates, integrated from a gyro, rig axes."""
 
@@ -406,9 +397,8 @@ class Solution:
         """Solution with initial poses (F, 4, 4) and no points."""
         nothing = np.zeros(0, np.int32)
         tracks = Tracks(nothing, nothing, nothing, 0)
-        return cls(
-            world_T_rigs, Landmarks(np.zeros((0, 3)), tracks, Counts(0, 0, "tracks")), 1.0, ()
-        )
+        landmarks = Landmarks(np.zeros((0, 3)), tracks, Counts(0, 0, "tracks"))
+        return cls(world_T_rigs, landmarks, 1.0, ())
 
     def observations(self) -> np.ndarray:
         """Number of observations of each frame (F,)."""

@@ -7,10 +7,10 @@ from synthetic import drifted, loop_walk, unit
 from gsba.bundle import map_strength
 from gsba.bundle.families import Families
 from gsba.bundle.map_strength import MapStrength
-from gsba.bundle.trajectory_prior import TrajectoryPrior
+from gsba.bundle.trajectory_prior import StepNoise, TrajectoryPrior
 from gsba.config import RefineSettings
 from gsba.geometry import inverse, rotation_angle, step_covariances
-from gsba.types import Counts, JointErrors, Solution, StepNoise
+from gsba.types import Counts, JointErrors, Solution
 
 NUM = 24
 POSES = loop_walk(NUM)
