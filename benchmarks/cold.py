@@ -10,7 +10,6 @@ turn in one call. CPU seconds include those of processes that compile beside the
 
 import argparse
 import os
-import resource
 import statistics
 import subprocess
 import sys
@@ -18,6 +17,8 @@ import tempfile
 import time
 from itertools import product
 from pathlib import Path
+
+from common import cpu_of_children
 
 Measured = dict[tuple[str, str, str], list[tuple[float, float]]]
 
@@ -79,10 +80,10 @@ def _measure(folder: Path, pythons: dict[str, Path], runs: int) -> Measured:
         for (name, command), (code, python) in product(commands.items(), pythons.items()):
             cache = folder / f"{code}-{name}-{n}"
             for state in ("empty", "full"):
-                before, start = _cpu_s(), time.perf_counter()
+                before, start = cpu_of_children(), time.perf_counter()
                 _run(["-c", "from gsba.cli import main; main()", *command], cache, python)
                 wall = time.perf_counter() - start
-                found.setdefault((name, code, state), []).append((wall, _cpu_s() - before))
+                found.setdefault((name, code, state), []).append((wall, cpu_of_children() - before))
     return found
 
 
@@ -127,11 +128,6 @@ def _run(arguments: list[str], cache: Path, python: Path = Path(sys.executable))
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     if done.returncode:
         sys.exit(done.stderr)
-
-
-def _cpu_s() -> float:
-    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return usage.ru_utime + usage.ru_stime
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ import hashlib
 import json
 import os
 import platform
+import resource
 import shutil
 import subprocess
 import sys
@@ -59,6 +60,12 @@ def _stopwatch(timeout_s: float, command: Sequence[str]) -> dict[str, float | bo
         "exit_code": os.waitstatus_to_exitcode(status),
         "timed_out": wall_s >= timeout_s,
     }
+
+
+def cpu_of_children() -> float:
+    """CPU seconds, user and system, of the child processes that have ended."""
+    spent = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return spent.ru_utime + spent.ru_stime
 
 
 def kept_row(folder: Path, key: dict, timeout_s: float) -> dict | None:

@@ -8,7 +8,6 @@ start; `false loops` forces loop closures between different places into the run.
 
 import argparse
 import json
-import shutil
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
@@ -18,7 +17,7 @@ from typing import Any, NamedTuple
 from unittest.mock import patch
 
 import numpy as np
-from common import machine
+from common import link_frames, machine
 from scipy.spatial import cKDTree  # type: ignore[attr-defined]
 from scipy.spatial.transform import Rotation
 
@@ -96,15 +95,7 @@ def forged_loops(first: int, far: int, count: int) -> Iterator[list[int]]:
         pairs = [(first + n, first + n + far) for n in range(count)]
         false = forge(context, solved, pairs)
         sizes[:] = np.diff(false.matches.offsets).tolist()
-        ours, theirs = found.matches, false.matches
-        both = Matches(
-            np.concatenate([ours.pairs, theirs.pairs]),
-            np.concatenate([ours.offsets, ours.offsets[-1] + theirs.offsets[1:]]),
-            np.concatenate([ours.keypoints, theirs.keypoints]),
-        )
-        poses = np.concatenate([found.f0_T_f1s, false.f0_T_f1s])
-        sigmas = np.concatenate([found.direction_sigmas, false.direction_sigmas])
-        return VerifiedPairs(both, poses, sigmas, found.counts)
+        return VerifiedPairs.joined([found, false])
 
     with patch.object(correspondences, "match_loops", match_loops):
         yield sizes
@@ -226,11 +217,8 @@ def _report(
 
 def _without_last(frames: Path, truth: Trajectory, missing: int, folder: Path) -> Path:
     """Folder of links to all frames but the last ones, and their times."""
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
     images = sorted(path for path in frames.iterdir() if path.suffix != ".csv")[:-missing]
-    for image in images:
-        (folder / image.name).symlink_to(image.resolve())
+    link_frames(images, folder)
     rows = [
         f"{image.name},{t!r}" for image, t in zip(images, truth.timestamps.tolist(), strict=False)
     ]

@@ -13,7 +13,6 @@ fades into grey.
 """
 
 import argparse
-import resource
 import shutil
 import subprocess
 import sys
@@ -24,7 +23,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from common import write_table
+from common import cpu_of_children, write_table
 
 import gsba
 from gsba.config import RefineSettings
@@ -134,16 +133,11 @@ def row_of_peer(tour: Path, mode: str, seed: int | None) -> list[str]:
             cv2.imwrite(str(frames / path.name), picture, [cv2.IMWRITE_JPEG_QUALITY, 98])
         truth = read_trajectory(tour / "groundtruth.tum")
         truth = Trajectory(np.arange(float(len(truth.timestamps))), truth.world_T_rigs)
-        script, began = Path(__file__).with_name("peer.py"), _cpu_of_children()
+        script, began = Path(__file__).with_name("peer.py"), cpu_of_children()
         command = [sys.executable, str(script), mode, str(frames), str(out)]
         subprocess.run([*command, "--matcher", "exhaustive"], capture_output=True, check=False)
-        cpu, found = _cpu_of_children() - began, sorted(out.glob("trajectory*.tum"))
+        cpu, found = cpu_of_children() - began, sorted(out.glob("trajectory*.tum"))
         return cells_of([read_trajectory(path) for path in found], truth, "", cpu)
-
-
-def _cpu_of_children() -> float:
-    spent = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return spent.ru_utime + spent.ru_stime
 
 
 def cells_of(maps: list[Trajectory], truth: Trajectory, steps: str, cpu: float) -> list[str]:

@@ -75,7 +75,7 @@ class FactoryLenses:
     lenses: tuple[FactoryLens, FactoryLens]  # front, back
     canvas: tuple[int, int]  # width and height of one lens's half, pixels
     window: tuple[float, float, float, float] | None  # recorded part of that half: left, top,
-    baseline_m: float | None  # distance of the lenses, m; None = not stated
+    # width, height; None = not known
     angles_known: bool  # True if angles have the form described above; else they are unused
 
     @property
@@ -147,14 +147,11 @@ def _of_numbers(numbers: np.ndarray, calibration: FactoryCalibration) -> Factory
             replace(each, camera_R_lens=_HALF_TURN_ABOUT_Y @ each.camera_R_lens)
             for each in lenses[::-1]
         ]
-    apart = float(np.linalg.norm(parts[1, at + 5 : at + 8])) if generation > 1 else 0.0
-    low, high = 0.002, 0.2  # metres
     return FactoryLenses(
         generation=generation,
         lenses=(lenses[0], lenses[1]),
         canvas=(int(half[0]), int(half[1])),
         window=_window(half, calibration),
-        baseline_m=apart if low <= apart <= high else None,
         angles_known=known,
     )
 

@@ -40,8 +40,8 @@ class _Record(IntEnum):
 class _Field(IntEnum):
     """Fields of the metadata."""
 
-    SERIAL, MODEL, FIRMWARE, CREATED = 1, 2, 3, 7
-    SIZE, FIRST_FRAME, READOUT_MS, WINDOW, GYRO_DELAY_MS = 19, 24, 25, 27, 28
+    MODEL, FIRMWARE, CREATED = 2, 3, 7
+    FIRST_FRAME, READOUT_MS, WINDOW, GYRO_DELAY_MS = 24, 25, 27, 28
     RAW_GYRO, GYRO_RANGES, TRACK_ORDER = 62, 65, 80
 
 
@@ -98,8 +98,6 @@ class GpsRecord:
     latitudes: np.ndarray  # (N,) float64, degrees, north positive
     longitudes: np.ndarray  # (N,) float64, degrees, east positive
     altitudes: np.ndarray  # (N,) float64, m; the file does not state their reference surface
-    speeds: np.ndarray  # (N,) float64, m/s
-    courses: np.ndarray  # (N,) float64, degrees from north, clockwise
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,12 +117,10 @@ class Insta360Trailer:
     """
 
     version: int  # of the trailer's layout
-    serial: str  # "" = not stated
     model: str  # e.g. "Insta360 X4"; "" = not stated
     firmware: str  # "" = not stated
     lens_strings: tuple[str, ...]  # calibrations by the maker, best first; see gsba.camera
     window: SensorWindow | None  # None = not stated
-    picture_size: tuple[int, int] | None  # width and height of one lens's image, pixels
     back_track_first: bool  # True = the first of two video tracks is the back lens's
     first_frame_s: float | None  # time of the first frame on the camera's clock, s; None = unknown
     created_unix_s: float | None  # s since 1970; None = not stated
@@ -311,12 +307,10 @@ def _trailer(version: int, contents: _Contents) -> Insta360Trailer:
         gyro = GyroRecord(times, found.rates, found.accelerations)
     return Insta360Trailer(
         version=version,
-        serial=_text(values, _Field.SERIAL),
         model=_text(values, _Field.MODEL),
         firmware=_text(values, _Field.FIRMWARE),
         lens_strings=tuple(text for key in _LENSES if (text := _text(values, key, 4096))),
         window=_window(values),
-        picture_size=_size(values, _Field.SIZE, 1, 2),
         back_track_first=values.get(_Field.TRACK_ORDER) == 1,
         first_frame_s=None if first_frame is None else first_frame * tick_s,
         created_unix_s=_creation_time(values),
@@ -447,8 +441,6 @@ def _gps(record: bytes, notes: list[str]) -> GpsRecord | None:
         latitudes=np.where(rows["north"] == b"S", -abs(rows["latitude"]), rows["latitude"]),
         longitudes=np.where(rows["east"] == b"W", -abs(rows["longitude"]), rows["longitude"]),
         altitudes=rows["altitude"].astype(np.float64),
-        speeds=rows["speed"].astype(np.float64),
-        courses=rows["course"].astype(np.float64),
     )
 
 

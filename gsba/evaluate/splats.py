@@ -24,7 +24,6 @@ from gsba.splat.pictures import render_views
 from gsba.splat.scene import (
     load_faces,
     make_views,
-    refined_frames,
     split_frames,
     start_cloud,
 )
@@ -32,7 +31,7 @@ from gsba.splat.scores import Distance, Score, mean_score, measure
 from gsba.splat.train import Images, Views, near_of, train
 from gsba.store.store import digest, fingerprint
 from gsba.trajectory.association import matched_in_time
-from gsba.types import FrameSet, Reconstruction, Trajectory
+from gsba.types import FrameSet, PoseStatus, Reconstruction, Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -91,7 +90,7 @@ def compare(
     Raises:
         GsbaError: too few frames have a pose in every source, or a training fails.
     """
-    usable = refined_frames(reconstruction)
+    usable = reconstruction.pose_statuses == PoseStatus.REFINED
     for poses in sources.values():
         usable = usable & np.isfinite(poses).all(axis=(1, 2))
     split = split_frames(usable)

@@ -96,7 +96,7 @@ def join(frames: Sequence[TourFrame], one: TourMap, other: TourMap) -> tuple[Joi
     f, g = one.last, other.first
     joining = Joining(frames, one, other)
     starts = list[tuple[int, Join]]()
-    for g_T_f in rough_poses(frames[f], frames[g]):
+    for _, g_T_f in rough_poses(frames[f], frames[g]):
         starts += joining.starts(g_T_f)
     starts.sort(key=lambda start: -start[0])
     found = list[Join]()

@@ -375,18 +375,15 @@ def step_at(one: TourFrame, other: TourFrame, f1_T_f0: np.ndarray) -> Step:
     return step_of(one, other, f1_T_f0, found1, found0)
 
 
-def rough_poses(one: TourFrame, other: TourFrame) -> list[np.ndarray]:
-    """All poses f1_T_f0 between two frames that descriptors propose, roughly fitted to places."""
-    return [found for _, found in _rough(one, other)]
-
-
-def _rough(one: TourFrame, other: TourFrame) -> list[tuple[float, np.ndarray]]:
+def rough_poses(one: TourFrame, other: TourFrame) -> list[tuple[float, np.ndarray]]:
+    """Ranks of all poses f1_T_f0 between two frames that descriptors propose, and these poses,
+    roughly fitted to places."""
     return _roughly_ranked(one, other, _proposals(one, other), 2.8, True, 0.6)
 
 
 def hypotheses(one: TourFrame, other: TourFrame) -> list[Step]:
     """Hypotheses of the pose between two frames, by falling rank."""
-    rough = _rough(one, other)
+    rough = rough_poses(one, other)
     for beside_deg, max_error_deg in ((0.7, 0.4), (0.35, 0.3)):
         starts = _distinct(rough, 1.5, 6.0)[:_NUM_ROUGH]
         rough = _roughly_ranked(one, other, starts, beside_deg, False, max_error_deg)

@@ -16,7 +16,7 @@ from gsba.log import GsbaError, track
 from gsba.splat.camera import view_camera
 from gsba.splat.gaussians import Gaussians, from_cloud
 from gsba.splat.train import Images, Views
-from gsba.types import FrameSet, Landmarks, PoseStatus, Reconstruction, Tracks
+from gsba.types import FrameSet, Landmarks, Reconstruction, Tracks
 
 _MAX_OVERSAMPLING = 8  # largest number of samples of a panorama along a pixel of a face
 
@@ -51,11 +51,6 @@ def split_frames(usable: np.ndarray, every: int = HOLD_OUT_EVERY) -> Split:
     if len(rows) - len(held) < 2:
         raise GsbaError(f"{len(rows)} frames with poses are too few to hold one of {every} out")
     return Split(np.delete(rows, held), rows[held])
-
-
-def refined_frames(reconstruction: Reconstruction) -> np.ndarray:
-    """Frames (F,) bool whose refined poses images constrain."""
-    return reconstruction.pose_statuses == PoseStatus.REFINED
 
 
 def load_faces(frames: FrameSet, which: np.ndarray, size: int, optics: Optics = ONE_EYE) -> Faces:

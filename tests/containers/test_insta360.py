@@ -29,13 +29,13 @@ def _read(path: Path, content: bytes) -> Insta360Trailer:
 def test_a_real_file_to_the_number() -> None:
     found = read_trailer(made.REAL)
     assert found is not None and found.gyro is not None and found.exposures is not None
-    assert (found.version, found.serial) == (3, "IAEAN00000XXXX")
+    assert found.version == 3
     assert (found.model, found.firmware) == ("Insta360 OneR", "v2.0.0_build11")
     assert found.lens_strings == (
         "2_1480.69_1517.57_1520.13_-0.186949_0.0336344_-179.227_1479.61_4553.12_1526.43_0.82149"
         "_0.0305849_0.894074_6080_3040_3105",
     )
-    assert found.window is not None and found.picture_size == (2880, 2880)
+    assert found.window is not None
     assert (found.window.source, found.window.size) == ((3040, 3040), (2880, 2880))
     assert found.first_frame_s == pytest.approx(309.468418) and not found.back_track_first
     assert found.readout_s == pytest.approx(0.02227798)
@@ -102,7 +102,7 @@ def test_what_is_appended_is_read_back(tmp_path: Path, directory: bool) -> None:
     assert found.back_exposures is not None
     assert (found.gps.latitudes.tolist(), found.gps.longitudes.tolist()) == ([-10.5], [20.25])
     assert found.gps.unix_times.tolist() == [1_700_000_000.25]
-    assert (found.gps.altitudes.tolist(), found.gps.speeds.tolist()) == ([12.0], [1.5])
+    assert found.gps.altitudes.tolist() == [12.0]
     brief = read_trailer(tmp_path / "v.insv", telemetry=False)
     assert brief is not None and brief.model == found.model and brief.gyro is None
 

@@ -42,7 +42,8 @@ def _few_keys_and_hypotheses(monkeypatch: pytest.MonkeyPatch) -> None:
         )
         for turn in (1.5, 90.0)
     ]
-    monkeypatch.setattr(tour_joins, "rough_poses", lambda one, other: found)
+    ranked = [(1.0, one) for one in found]
+    monkeypatch.setattr(tour_joins, "rough_poses", lambda one, other: ranked)
 
 
 @cache
