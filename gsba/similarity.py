@@ -143,7 +143,7 @@ def robust_similarity(
     num_needed: int,
     tolerances: np.ndarray,
     drift: float,
-) -> tuple[Sim3, np.ndarray, float]:
+) -> tuple[Sim3, np.ndarray]:
     """Similarity of corresponding points, some of which are outliers.
 
     The largest consensus under a truncated loss over random draws (Torr and Zisserman, MLESAC,
@@ -158,7 +158,7 @@ def robust_similarity(
         drift: largest error of the sources, part of their extent.
 
     Returns:
-        the similarity, its inliers (N,) bool, and their RMS residual in target units.
+        the similarity, and its inliers (N,) bool.
 
     Raises:
         NoSimilarityError: too few agree, or the inliers of both worlds are barely correlated.
@@ -194,8 +194,7 @@ def robust_similarity(
             break
     # Inliers must correlate with their transformed positions
     turned_similarity(source[used], target[used], fit.rotation, 0.5)
-    rms = float(np.sqrt(np.mean(residuals_of(fit, source, target)[used] ** 2)))
-    return fit, used, rms
+    return fit, used
 
 
 def residuals_of(fit: Sim3, source: np.ndarray, target: np.ndarray) -> np.ndarray:

@@ -350,7 +350,6 @@ def _row(app: App, job: AppJob) -> dict[str, Any]:
         "ended": state.ended,
         "forced": state.forced,
         "stage": progress.stage["title"] if active and progress.stage else "",
-        "num_stages": len(progress.stages),
         "error": "" if active or state.status == "waiting" else progress.error,
     }
 

@@ -220,7 +220,7 @@ def anchor(
 def _level_from_map(positions: np.ndarray, fixes: FrameFixes) -> tuple[Sim3, np.ndarray, float]:
     """Map's similarity, fixes (G,) that agree, and their scatter in units of their noise, >= 1."""
     limits = fixes.tolerances(), MAX_DRIFT_SHARE
-    fit, used, _ = robust_similarity(positions, fixes.positions, similarity, 3, *limits)
+    fit, used = robust_similarity(positions, fixes.positions, similarity, 3, *limits)
     scatter = 1.0
     for _ in range(10):  # of choosing fixes
         extent = fit.scale * extent_of(positions)

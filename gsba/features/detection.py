@@ -68,7 +68,6 @@ class SiftExtractor:
     """OpenCV SIFT (Lowe, IJCV 2004) with RootSIFT descriptors (Arandjelovic, CVPR 2012)."""
 
     def __init__(self, settings: FeatureSettings) -> None:
-        self._settings = settings
         self._sift = cv2.SIFT.create(
             nfeatures=settings.max_per_face,
             nOctaveLayers=3,

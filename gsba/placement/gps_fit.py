@@ -73,7 +73,7 @@ def fit_fixes(
     """
     solve, num = (similarity, 3) if up_sigma is None else (level_similarity, 2)
     limits = fixes.tolerances(), MAX_DRIFT_SHARE
-    fit, used, _ = robust_similarity(positions, fixes.positions, solve, num, *limits)
+    fit, used = robust_similarity(positions, fixes.positions, solve, num, *limits)
     centre = positions[used].mean(axis=0)
     free = tuple(range(7)) if up_sigma is None else (0, 3, 4, 5, 6)  # no tilt if up is known
     information = np.zeros((7, 7))

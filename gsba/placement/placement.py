@@ -406,7 +406,7 @@ def _aligned(reconstruction: Reconstruction, frames: FrameSet, path: Path) -> Pl
             used = residuals_of(fit, source, target) <= MAX_DRIFT_SHARE * extent_of(target)
         else:
             limits = np.zeros(len(rows)), MAX_DRIFT_SHARE
-            fit, used, _ = robust_similarity(source, target, similarity, 3, *limits)
+            fit, used = robust_similarity(source, target, similarity, 3, *limits)
     residuals = residuals_of(fit, source, target)
     _require_majority(path, used, residuals, frames, rows, "its positions count as exact")
     sigma = float(np.sqrt(np.mean(residuals[slice(None) if straight else used] ** 2)))

