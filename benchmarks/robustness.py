@@ -95,7 +95,15 @@ def forged_loops(first: int, far: int, count: int) -> Iterator[list[int]]:
         pairs = [(first + n, first + n + far) for n in range(count)]
         false = forge(context, solved, pairs)
         sizes[:] = np.diff(false.matches.offsets).tolist()
-        return VerifiedPairs.joined([found, false])
+        ours, theirs = found.matches, false.matches
+        both = Matches(
+            np.concatenate([ours.pairs, theirs.pairs]),
+            np.concatenate([ours.offsets, ours.offsets[-1] + theirs.offsets[1:]]),
+            np.concatenate([ours.keypoints, theirs.keypoints]),
+        )
+        poses = np.concatenate([found.f0_T_f1s, false.f0_T_f1s])
+        sigmas = np.concatenate([found.direction_sigmas, false.direction_sigmas])
+        return VerifiedPairs(both, poses, sigmas, found.counts)
 
     with patch.object(correspondences, "match_loops", match_loops):
         yield sizes
