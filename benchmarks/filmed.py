@@ -56,10 +56,15 @@ def scene_of(name: str, seed: int) -> tuple[Scene, Trajectory]:
     return build_gallery(seed + 100), walk_poses("open", "forward", FRAMES, seed)
 
 
+def name_of(scene: str, seed: int, effects: frozenset[str]) -> str:
+    """Name of a film, which tells an invented gait from the motion of real hands."""
+    name = ("+".join(sorted(effects)) if effects != ALL else "all") or "ideal"
+    return f"{scene}-{seed}-{name}{'' if HAND_MOTION.exists() else '-invented'}"
+
+
 def film_of(scene: str, seed: int, effects: frozenset[str], out: Path) -> Path:
     """Folder of a film, made unless it is there."""
-    name = "+".join(sorted(effects)) if effects != ALL else "all"
-    folder = out / "films" / f"{scene}-{seed}-{name or 'ideal'}"
+    folder = out / "films" / name_of(scene, seed, effects)
     if (folder / "slam.tum").exists():
         return folder
     print(f"filming {folder.name}", file=sys.stderr, flush=True)

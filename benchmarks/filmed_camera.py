@@ -130,6 +130,7 @@ class Camera:
     width: int
     seed: int
     grain: float = NOISE  # grey values, of a camera without the effect `noise`
+    rays: int = 1  # rays across a pixel, averaged
 
     @cached_property
     def bearings(self) -> np.ndarray:
@@ -194,7 +195,10 @@ class Camera:
             eyes[:, :, 3] += facing * baseline / 2 * poses[:, :3, 2]
             least = -float(np.sin(np.radians(_MARGIN_DEG)))
             eye = Eye(eyes, facing, SWEEP, np.radians(lens.half_fov_deg), lens.bend, least)
-            total = total + _linear(render_eye(self.scene, eye, self.width, self.width // 2))
+            finer = self.rays * self.width
+            radiance = _linear(render_eye(self.scene, eye, finer, finer // 2))
+            size = self.width, self.width // 2
+            total = total + cv2.resize(radiance, size, interpolation=cv2.INTER_AREA)
         radiance = np.asarray(total / len(exposures), np.float32)
         if "people" in self.effects:
             self._add_people(radiance, time)

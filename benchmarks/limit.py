@@ -6,7 +6,7 @@
 
 CLEAN holds the run's frames as they were before noise, by the same names: what differs is noise.
 With `--films`, runs are those that `filmed.py --out WORK` kept, and clean frames are filmed anew,
-without the effects of `NOISY`.
+without the effects of `NOISY`, by `--rays` across a pixel: films have one, which aliases.
 
 No unbiased estimator errs less. The information is that of the pixels of a patch around each
 observation, each pixel counted once: gradients of the clean frame, whitened by the spectrum of the
@@ -28,7 +28,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from common import write_table
-from filmed import SCENES, STARTS, WIDTH, asked, film_of, scene_of
+from filmed import SCENES, STARTS, WIDTH, asked, film_of, name_of, scene_of
 from filmed_camera import Camera, Hands
 from scipy import sparse
 from scipy.spatial import KDTree
@@ -323,16 +323,16 @@ def central_observations(result: Reconstruction) -> np.ndarray:
     return references(Landmarks(result.points_world, tracks, counts), result.world_T_rigs)
 
 
-def clean_film(scene: str, seed: int, effects: frozenset[str], out: Path) -> Path:
+def clean_film(scene: str, seed: int, effects: frozenset[str], rays: int, out: Path) -> Path:
     """Folder of a film's frames without noise, made unless it is there."""
     kept = effects - NOISY
-    folder = out / "clean" / f"{scene}-{seed}-{'+'.join(sorted(kept)) or 'ideal'}"
+    folder = out / "clean" / f"{name_of(scene, seed, kept)}-{rays}"
     built, walk = scene_of(scene, seed)
     if (folder / f"{len(walk.timestamps) - 1:06d}.png").exists():
         return folder
     print(f"filming {folder.name} without noise", file=sys.stderr, flush=True)
     folder.mkdir(parents=True, exist_ok=True)
-    camera = Camera(built, Hands(walk, seed), kept, WIDTH, seed, grain=0)
+    camera = Camera(built, Hands(walk, seed), kept, WIDTH, seed, grain=0, rays=rays)
     for f, burst in enumerate(camera.frames()):
         write_image(folder / f"{f:06d}.png", (257 * burst[-1] + 0.5).astype(np.uint16))
     return folder
@@ -349,6 +349,7 @@ def main() -> None:
     parser.add_argument("--starts", nargs="+", choices=STARTS, default=list(STARTS))
     parser.add_argument("--patches", action="store_true")
     parser.add_argument("--patch", type=int, default=PATCH)
+    parser.add_argument("--rays", type=int, default=4)
     parser.add_argument("--markdown", type=Path)
     options = parser.parse_args()
     head = _PATCH_HEAD if options.patches else _HEAD
@@ -375,7 +376,7 @@ def main() -> None:
                         rows = patch_rows(run, film, built, PATCH)
                         rows = [f"| {scene} {name} {row}" for row in rows]
                     else:
-                        clean = clean_film(scene, seed, effects, out)
+                        clean = clean_film(scene, seed, effects, options.rays, out)
                         truth = read_trajectory(film / "groundtruth.tum")
                         rows = [
                             row_of(f"{scene} {name}", start, run, truth, clean, options.patch)

@@ -142,18 +142,21 @@ def track(
         total = len(items)
     work = {"what": description, "total": total}
     event("progress", **work, done=done, rate=None, note="")
-    began = told = time.monotonic()
+    began = told = drawn = time.monotonic()
     silent = nullcontext(lambda count, note: None)
     with _bar(description, total, done) if with_bar else silent as show:
         for count, item in enumerate(items, start=1):
             yield item
-            now = time.monotonic()
-            due = now - told > 0.5 or done + count == total  # s between two events
-            if not (with_bar or due):
+            now, last = time.monotonic(), done + count == total
+            due = now - told > 0.5 or last  # s between two events
+            draws = with_bar and (now - drawn > 0.1 or last)
+            if not (draws or due):
                 continue
             speed, more = count / max(now - began, 1e-6), "" if note is None else note()
-            parts = [f"{speed:.3g} a second", more, *(one.note() for one in _followers)]
-            show(done + count, ", ".join(filter(None, parts)))
+            if draws:
+                drawn = now
+                parts = [f"{speed:.3g} a second", more, *(one.note() for one in _followers)]
+                show(done + count, ", ".join(filter(None, parts)))
             if due:
                 told = now
                 event("progress", **work, done=done + count, rate=round(speed, 4), note=more)
