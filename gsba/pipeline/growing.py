@@ -491,8 +491,13 @@ def _write(
                 alignment = move.scale, move.new_T_old, PLACES, covariance
                 joints.append(SegmentAlignment(int(there[0]), int(there[-1]), *alignment))
     coarse = CoarsePoses(np.concatenate(poses), np.concatenate(sources), 0.0)
-    doubted = any(run.order_doubted for run in maps.runs)
-    prior = replace(state.prior, coarse=coarse, joints=tuple(joints), order_doubted=doubted)
+    prior = replace(
+        state.prior,
+        coarse=coarse,
+        joints=tuple(joints),
+        order_doubted=any(run.order_doubted for run in maps.runs),
+        lone_steps=tuple(step for run in maps.runs for step in run.lone_steps),
+    )
     run = replace(state.run, settings=maps.runs[0].settings)
     state = replace(state, run=run, prior=prior)
     finished_run.keep(state)

@@ -6,6 +6,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,11 @@ from gsba.disk import hold_folder
 from gsba.export import ExportFormat
 from gsba.localization import Localizer
 from gsba.log import GsbaError
+from gsba.pipeline.finished_run import KeptMap
 from gsba.similarity import Sim3
+from gsba.store.folder import STAGES
+from gsba.store.records import save_record
+from gsba.store.store import load_stage
 from gsba.types import VerifiedPairs
 from gsba.view import load_scene
 
@@ -198,7 +203,15 @@ def test_maps_are_tied_where_no_two_frames_share_enough_points(
 def test_rigid_merging_keeps_both_maps_and_tells_how_sure_it_is(
     home: GrowingHome, second_run: Path, tmp_path: Path
 ) -> None:
-    result = merge_runs([home.run, second_run], tmp_path / "run", rigid=True)
+    doubted = Path(shutil.copytree(second_run, tmp_path / "doubted"))
+    kept = load_stage(doubted, "map", KeptMap)
+    kept = replace(kept, order_doubted=True, lone_steps=(("000003", "000004"),))
+    save_record(doubted / STAGES / "map.npz", kept, {})
+    result = merge_runs([home.run, doubted], tmp_path / "run", rigid=True)
+    reasons = result.report["verdict"]["reasons"]  # those of the second run, too
+    assert any("hardly more alike than any two" in reason["cause"] for reason in reasons)
+    (lone,) = (reason for reason in reasons if "own two frames alone" in reason["cause"])
+    assert lone["frames"] == ["upper/000003", "upper/000004"]
     first, second = load_run(home.run)[0], load_run(second_run)[0]
     merged = load_run(tmp_path / "run")[0]
     assert merged.world_T_rigs[:NUM].tobytes() == first.world_T_rigs.tobytes()
