@@ -101,7 +101,7 @@ def fixes_of_frames(
         geodetic, sigmas = fixes.geodetic[chosen], fixes.sigmas[chosen]
     origin = np.median(geodetic, axis=0) if len(rows) else np.zeros(3)
     local = local_from_geodetic(geodetic, origin)
-    times = frames.timestamps[rows] if frames.timed else None
+    times = frames.timestamps[rows] if frames.timed_frames[rows].all() else None
     origin[1] = (origin[1] + 180) % 360 - 180
     return FrameFixes(rows, local, sigmas, times, origin, correlation_s=60.0)  # see `FrameFixes`
 
@@ -146,12 +146,13 @@ def _between(
     """Frames (G,) between fixes, their positions (G, 3) geodetic, and sigmas (G, 3) in metres."""
     times, entries = own_timestamps(frames), fixes.timestamps
     assert entries is not None
-    if not frames.timed:
+    if not frames.timed_frames.any():
         raise GsbaError(
             f"{source}: the frames have no times to interpolate positions at: refine with "
             "--timestamps"
         )
-    inside = np.flatnonzero((times >= entries[0]) & (times <= entries[-1]))
+    within = (times >= entries[0]) & (times <= entries[-1])
+    inside = np.flatnonzero(within & frames.timed_frames)
     if not len(inside):
         raise GsbaError(
             f"{source}: no overlap in time: positions span {entries[0]:.3f} to {entries[-1]:.3f} "

@@ -280,11 +280,16 @@ class _Tests:
             yield Reason(Level.LOOK, tuple(self.names), cause, remedy)
         if self.report.get("timed", True):
             return
+        ordered = {
+            one["name"]: one["timed"] or one["with_trajectory"]
+            for one in self.report.get("recordings", ())
+        }
         recordings = dict[str, list[Mapping[str, Any]]]()
         for row in self.report["frames"]:
             recordings.setdefault(row["name"].rpartition("/")[0], []).append(row)
-        for rows in recordings.values():
-            if len(rows) < MIN_FRAMES and {row["coarse_pose"] for row in rows} <= _NO_START:
+        for name, rows in recordings.items():
+            started = not {row["coarse_pose"] for row in rows} <= _NO_START
+            if len(rows) < MIN_FRAMES and not ordered.get(name, started):
                 cause = (
                     f"{len(rows)} stills without times are too few to tell whether their names "
                     f"follow the way; if they do not, {wrong}"
