@@ -43,6 +43,7 @@ _MAX_TIED_SHARE = 0.8  # of frames in maps of descriptors, below which places ar
 _MIN_INTERVAL_S = 1.5  # between stills metres apart; frames of a video can be had closer together
 _MAX_ORDER_ERROR = 0.02  # probability that matches of stills in no order, if all match, show one
 _NUM_FAR_PAIRS = 12  # compared with as many neighbours
+_MIN_TIMED = 4  # stills whose order by given times is tested
 _LIKENESS, _SEARCH, _STAGE = "likeness", "tour", "features_tour"
 _FRAMES_IN_ORDER, _NUM_PLACES = 14, 3  # of frames one after another that tell an order from none;
 # of these sequences, in one of which the camera may stand
@@ -73,7 +74,7 @@ def check_order(state: State, found: Recovered) -> State:
     lone = _lone_steps(found, frames.names)
     state = replace(state, prior=replace(state.prior, lone_steps=lone))
     if (
-        len(frames) < MIN_FRAMES
+        len(frames) < (_MIN_TIMED if frames.timed else MIN_FRAMES)
         or run.store.root.absolute() in frames.paths[0][0].parents
         or _may_be_in_no_order(run)
         or _show_order(state, found.neighbours.matches)

@@ -200,6 +200,16 @@ def test_an_order_that_likeness_denies_is_doubted(
             assert not tour.check_order(*given).prior.order_doubted
 
 
+@pytest.mark.parametrize("shuffled", [False, True])
+def test_times_of_a_few_stills_are_doubted_where_likeness_denies_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shuffled: bool
+) -> None:
+    in_a_hall_of_bays(monkeypatch, way_of(9, shuffled))
+    with RunStore(tmp_path / "run", {"frames": tmp_path}) as store:
+        timed = neighbours_tied(replace(numbered(tmp_path, 9), timed=True), store)
+        assert tour.check_order(*timed).prior.order_doubted == shuffled
+
+
 def test_frames_that_match_more_than_those_far_off_are_not_asked_for_their_likeness(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
