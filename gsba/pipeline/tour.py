@@ -24,18 +24,19 @@ from gsba.odometry.tour_order import (
     likeness,
     may_lack_order,
 )
-from gsba.odometry.tour_steps import TourFrame
+from gsba.odometry.tour_steps import Step, TourFrame
 from gsba.odometry.tour_unordered import match_stills, read_stills
 from gsba.pipeline import frontend
 from gsba.pipeline.run import Run
 from gsba.pipeline.state import ObservedFrames, State
 from gsba.significance import outweighs
 from gsba.store.folder import STAGES
-from gsba.store.store import RunStore, fingerprint
+from gsba.store.store import PerFrame, RunStore, digest, fingerprint
 from gsba.trajectory import judgement
 from gsba.trajectory.limits import TwoViewLimits
 from gsba.trajectory.steps import image_steps
 from gsba.types import Features, FrameSet, Matches
+from gsba.version import __version__
 
 logger = logging.getLogger(__name__)
 
@@ -45,6 +46,7 @@ _MAX_ORDER_ERROR = 0.02  # probability that matches of stills in no order, if al
 _NUM_FAR_PAIRS = 12  # compared with as many neighbours
 _MIN_TIMED = 4  # stills whose order by given times is tested
 _LIKENESS, _SEARCH, _STAGE = "likeness", "tour", "features_tour"
+_STEPS = "tour_steps"  # folder of the finished steps of a search that is not finished
 _FRAMES_IN_ORDER, _NUM_PLACES = 14, 3  # of frames one after another that tell an order from none;
 # of these sequences, in one of which the camera may stand
 _NO_ORDER = (
@@ -128,7 +130,7 @@ def _search(state: State, found: Recovered) -> TourMatches | None:
         return None
     key, before, tied, alike = _search_key(run.frames), 0, False, None
     stills = cache(lambda: read_stills(run.frames, run.num_threads))  # for both stages
-    known = run.store.stored(_SEARCH, key, TourMatches)
+    known, steps = run.store.stored(_SEARCH, key, TourMatches), run.store.root / STAGES / _STEPS
     # In an order found by likeness, descriptors match what is only alike.
     if known is None or not known.order_found:
         before = _num_tied(found.neighbours.matches, num)
@@ -150,9 +152,16 @@ def _search(state: State, found: Recovered) -> TourMatches | None:
         )
 
     def compute() -> TourMatches:
-        return match_stills(stills(), run.frames.names, alike, run.num_threads)
+        return match_stills(stills(), run.frames.names, alike, run.num_threads, kept)
+
+    def kept(names: tuple[str, str], compute: Callable[[], list[Step]]) -> list[Step]:
+        name = digest(__version__, key, names)
+        return list(
+            PerFrame(steps, {name: name}, lambda _: tuple(compute()), tuple[Step, ...])[name]
+        )
 
     tour = run.store.stage(_SEARCH, key, compute, TourMatches)
+    shutil.rmtree(steps, ignore_errors=True)
     if tour.names != run.frames.names:
         raise OrderFoundError("the stills are in no order: refine them in the order found")
     if before and alike is not None:
