@@ -247,7 +247,8 @@ def _far_match_less(state: State, num: int) -> bool:
     far = far[np.unique(np.linspace(0, len(far) - 1, _NUM_FAR_PAIRS).astype(int))]
     near = np.column_stack([far[:, 0], far[:, 0] + 1])
     chosen, rows = np.unique(np.concatenate([near, far]), axis=0, return_inverse=True)
-    found = recovery.match_anywhere(state.observed.context, chosen, rivals=False).matches
+    context = state.observed.context.by_search()  # of far pairs a network would take seconds each
+    found = recovery.match_anywhere(context, chosen, rivals=False).matches
     counts = np.zeros((num, num), np.int64)
     counts[tuple(found.pairs.T)] = np.diff(found.offsets)
     of_pairs = counts[tuple(chosen.T)][rows.ravel()]

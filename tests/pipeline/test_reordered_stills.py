@@ -108,6 +108,13 @@ def match_nothing(stills: FrameSet) -> TourMatches:
     )
 
 
+class Searching:
+    """A context whose network matches nothing: frames are compared by search alone."""
+
+    def by_search(self) -> str:
+        return "search"
+
+
 def neighbours_tied(
     stills: FrameSet, store: RunStore, unmatched: tuple[int, int] | None = None, nearest: int = 8
 ) -> tuple[State, Recovered]:
@@ -120,14 +127,15 @@ def neighbours_tied(
     trust, settings = StepChecks.of_all(np.tile(np.eye(4), (len(stills), 1, 1))), RefineSettings()
     run = SimpleNamespace(frames=stills, settings=settings, store=store, num_threads=1, suffix="")
     state = State(cast(Run, run), Prior.of(without_trajectory(stills)), *[cast(Any, None)] * 4)
-    state = replace(state, observed=cast(Any, SimpleNamespace(context=None)))
+    state = replace(state, observed=cast(Any, SimpleNamespace(context=Searching())))
     return state, cast(Recovered, SimpleNamespace(neighbours=near, trust=trust))
 
 
 def matching_by(monkeypatch: pytest.MonkeyPatch, counts: np.ndarray) -> None:
     """Any two frames have (F, F) matches without a prediction."""
 
-    def match(_context: object, chosen: np.ndarray, rivals: bool) -> SimpleNamespace:
+    def match(context: object, chosen: np.ndarray, rivals: bool) -> SimpleNamespace:
+        assert context == "search"
         rows = [np.zeros((int(counts[f, g]), 2), np.int32) for f, g in chosen]
         return SimpleNamespace(matches=Matches.of_rows(chosen, rows))
 
