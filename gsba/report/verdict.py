@@ -142,6 +142,7 @@ MAX_CONTRADICTED_SHARE = 0.25  # of the steps, by far frames
 MAX_HELD_SHARE = 0.5  # of the steps, by the start alone
 MAX_DOUBTED_SHARE = 0.25  # of the steps, by a start that images contradict elsewhere
 MAX_UNMATCHED_SHARE = 0.25  # of a run's steps, where frames are missing and no start is given
+MAX_RESIDUAL_RATIO = 3.0  # of a frame, in the median one's: right maps have up to 1.9
 MAX_FALSE_SHARE = 0.1  # of the start's steps; above it the others are in doubt, too
 _MAX_NAMED_FRAMES = 6  # of a reason, in a line of text
 _LOOK_AROUND = "gsba view RUN"
@@ -235,6 +236,7 @@ class _Tests:
             yield Reason(Level.REFUSED, (), cause, "walk while you film: a trainer needs parallax")
             return
         yield from self._unrefined()
+        yield from self._misfitting()
         yield from self._held()
         yield from self._shown_by_two_frames()
         yield from self._loosely_scaled()
@@ -306,6 +308,21 @@ class _Tests:
             cause = f"hardly any matches: the pose is that of the {self._start}"
             remedy = "leave these frames out of the training, or give sharper ones"
             frames = tuple(self.names[f] for f in rows)
+            yield Reason(Level.LOOK, frames, cause, remedy, True, _WITHOUT_DOUBTED)
+
+    def _misfitting(self) -> Iterator[Reason]:
+        """Frames whose points fit much worse than those of others."""
+        residuals = {row["name"]: row.get("median_residual_deg") for row in self.report["frames"]}
+        found = np.array([residuals.get(name) or 0.0 for name in self.names])
+        usual = float(np.median(found[found > 0])) if found.any() else math.inf
+        rows = np.flatnonzero(found > MAX_RESIDUAL_RATIO * usual)
+        if len(rows):
+            cause = (
+                f"points fit up to {found.max() / usual:.2g} times worse than in other frames: a "
+                "mirrored or edited picture fits in a wrong place"
+            )
+            remedy = "look at these pictures, or leave these frames out of the training"
+            frames = tuple(self.names[f] for f in rows.tolist())
             yield Reason(Level.LOOK, frames, cause, remedy, True, _WITHOUT_DOUBTED)
 
     def _held(self) -> Iterator[Reason]:

@@ -100,6 +100,18 @@ def test_a_step_that_two_frames_alone_show_is_to_be_looked_at() -> None:
     ]
 
 
+def test_a_frame_whose_points_fit_far_worse_is_to_be_looked_at() -> None:
+    rows = [{"name": name, "median_residual_deg": 0.016} for name in NAMES]
+    rows[3]["median_residual_deg"] = None  # it has no points
+    assert _verdict(GOOD, frames=rows).level == Level.GOOD
+    rows[7]["median_residual_deg"] = 0.031
+    assert _verdict(GOOD, frames=rows).level == Level.GOOD
+    rows[7]["median_residual_deg"] = 0.063
+    (reason,) = _verdict(GOOD, frames=rows).reasons
+    assert (reason.level, reason.frames, reason.leave_out) == (Level.LOOK, ("007",), True)
+    assert "3.9 times worse" in reason.cause
+
+
 def test_a_doubted_order_is_told_first() -> None:
     found = _verdict(replace(GOOD, exported=NUM - 1), NAMES[1:], timed=True, order_doubted=True)
     assert found.level == Level.LOOK
