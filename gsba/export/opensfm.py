@@ -56,7 +56,7 @@ def write_opensfm(data: Dataset) -> FrameWriter:
                 "rotation": rotations[f].tolist(),
                 "translation": cameras_T_world[f, :3, 3].tolist(),
                 "orientation": 1,
-                **({"capture_time": float(frames.timestamps[f])} if frames.timed else {}),
+                **({"capture_time": float(frames.timestamps[f])} if frames.timed_frames[f] else {}),
             }
             for f, name in enumerate(shots)
         },

@@ -52,6 +52,7 @@ def combine(
         times.append(part.timestamps + shift)
         shifts += [shift] * len(part)
         end = float(times[-1][-1])
+    timed = tuple(part.timed for part in parts for _ in range(len(part)))
     return FrameSet(
         names=tuple(f"{name}/{own}" for name, part in recordings.items() for own in part.names),
         paths=tuple(paths for part in parts for paths in part.paths),
@@ -63,8 +64,9 @@ def combine(
         )
         if len(formats) > 1
         else (),
-        timed=all(part.timed for part in parts),
+        timed=all(timed),
         clock_shifts=tuple(shifts),
+        timed_of_frame=timed if len({*timed}) > 1 else (),
     )
 
 

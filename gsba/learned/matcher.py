@@ -24,6 +24,8 @@ from gsba.types import FACES, Features
 
 # Pairs of faces that may show the same where the heading is unknown, as cameras are held upright.
 _UPRIGHT_FACES = [*product(range(4), range(4)), (4, 4), (5, 5)]
+_MIN_ALIKE_SHARE = 0.1  # of a face's mutual nearest neighbours: half of the pairs of faces have
+# nine tenths of the true matches (benchmarks/results/tours.md)
 
 
 def make_matcher(settings: RefineSettings, weights: Mapping[str, Path], size: int) -> Matcher:
@@ -51,9 +53,9 @@ class FaceMatcher:
     It replaces guided search between neighbours in time, along epipolar lines, at loops, and where
     nothing predicts the pose of neighbours. The network gets only pairs of faces that overlap by
     the predicted pose, and only its matches inside the gate are kept, so that the gate and then
-    two-view verification remove matches of repetitive structure. Without a prediction, each side
-    is compared with all sides, up with up and down with down. Known points with a gate of a
-    fraction of a degree are matched by `guided`.
+    two-view verification remove matches of repetitive structure. Without a prediction, sides may
+    overlap with sides, up with up and down with down. Of all these, only faces that are alike are
+    compared. Known points with a gate of a fraction of a degree are matched by `guided`.
     """
 
     def __init__(self, network: FaceNetwork, size: int) -> None:
@@ -70,10 +72,16 @@ class FaceMatcher:
     ) -> np.ndarray:
         first, second = (frames.features(frame) for frame in pair)
         chosen = [strongest_of(found, frames.strongest) for found in (first, second)]
-        bearings = first.bearings_rig[chosen[0]], second.bearings_rig[chosen[1]]
+        (bearings0, faces0, descriptors0), (bearings1, faces1, descriptors1) = (
+            (found.bearings_rig[some], found.faces[some], found.descriptors[some])
+            for some, found in zip(chosen, (first, second), strict=True)
+        )
         rows, scores = [np.zeros((0, 2), np.int64)], [np.zeros(0)]
-        predicted = gate.is_prediction or points_f0 is not None
-        for faces in overlapping_faces(*bearings, f0_T_f1) if predicted else _UPRIGHT_FACES:
+        compared = _UPRIGHT_FACES
+        if gate.is_prediction or points_f0 is not None:
+            compared = overlapping_faces(bearings0, bearings1, f0_T_f1)
+        alike = are_alike(faces0, faces1, descriptors0, descriptors1)
+        for faces in filter(alike.__getitem__, compared):
             k0, k1 = (
                 some[found.faces[some] == face]
                 for some, found, face in zip(chosen, (first, second), faces, strict=True)
@@ -96,6 +104,20 @@ def _on_face(features: Features, keypoints: np.ndarray) -> FaceKeypoints:
         features.descriptors[keypoints],
         None if features.scores is None else features.scores[keypoints],
     )
+
+
+def are_alike(
+    faces0: np.ndarray, faces1: np.ndarray, descriptors0: np.ndarray, descriptors1: np.ndarray
+) -> np.ndarray:
+    """Pairs (6, 6) bool of faces of frames 0 and 1 that hold a tenth of the mutual nearest
+    neighbours of one of them, by the faces (n,) and the descriptors (n, D) of keypoints."""
+    likes = descriptors0 @ descriptors1.T
+    nearest, back = likes.argmax(axis=1), likes.argmax(axis=0)
+    rows = np.flatnonzero(back[nearest] == np.arange(len(nearest)))
+    counts = np.zeros((len(FACES), len(FACES)))
+    np.add.at(counts, (faces0[rows], faces1[nearest[rows]]), 1)
+    most = _MIN_ALIKE_SHARE * np.minimum(counts.sum(axis=1)[:, None], counts.sum(axis=0))
+    return (counts > 0) & (counts >= most)
 
 
 def overlapping_faces(

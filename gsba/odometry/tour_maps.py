@@ -5,7 +5,7 @@ are searched there along whole epipolar lines: a place found where the point mus
 chance, and under another step or ratio next to none is.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -46,6 +46,11 @@ _MAX_LOG_DEVIATION = 0.15  # of depths of a key by two steps, which agree
 _LOG_SIGMA, _DIRECTION_SIGMA_RAD = 0.02, 0.01  # of confirmed ratios and steps
 
 
+# Hypotheses of the step between two frames of these names: those of a search that was interrupted,
+# or those that the function computes, kept.
+KeptSteps = Callable[[tuple[str, str], Callable[[], list[Step]]], list[Step]]
+
+
 @dataclass(frozen=True, slots=True)
 class Triple:
     """Three frames in a row: two steps, and the ratio of their lengths."""
@@ -72,21 +77,25 @@ class TourMatches:
 
 
 def match_tour(
-    frames: Sequence[TourFrame], names: tuple[str, ...], num_threads: int = 1
+    frames: Sequence[TourFrame], names: tuple[str, ...], num_threads: int, kept: KeptSteps
 ) -> TourMatches:
     """Confirmed steps of a tour whose frames (F,), of these names, are in the order of the way."""
-    found = searched(frames, num_threads)
+    found = searched(frames, names, num_threads, kept)
     joined = all_joined(frames, maps_of(frames, *found), num_threads)
     return matches_of(frames, names, *found, joined)
 
 
 def searched(
-    frames: Sequence[TourFrame], num_threads: int
+    frames: Sequence[TourFrame], names: Sequence[str], num_threads: int, kept: KeptSteps
 ) -> tuple[list[Step | None], list[Triple | None]]:
-    """Steps (F - 1,) between frames (F,), None where descriptors propose none, and the triples
-    (F - 2,) that confirm them, see `confirmed`."""
+    """Steps (F - 1,) between frames (F,), of these names, None where descriptors propose none, and
+    the triples (F - 2,) that confirm them, see `confirmed`."""
     num = len(frames)
-    found = map_in_threads(lambda f: hypotheses(frames[f], frames[f + 1]), num - 1, num_threads)
+
+    def step(f: int) -> list[Step]:
+        return kept((names[f], names[f + 1]), lambda: hypotheses(frames[f], frames[f + 1]))
+
+    found = map_in_threads(step, num - 1, num_threads)
     steps = list(track(found, STEPS_SEARCH, num - 1))
 
     def triples(f: int) -> dict[tuple[int, int], list[Triple]]:

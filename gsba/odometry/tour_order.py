@@ -15,10 +15,11 @@ from factors.threads import map_in_threads
 from gsba.odometry.tour_steps import TourFrame, mutual_nearest
 
 _MIN_COSINE, _MIN_COSINE_LEAD = 0.75, 0.05  # of matches; over look-alikes within a frame
-MIN_FRAMES = 12  # fewer are taken in the order given
+MIN_FRAMES = 12  # fewer are taken in the order given, which is doubted at most
 _MAX_FRAMES = 60  # most frames whose order is searched: each is compared with all
 _REACH = 3.0  # frames along a way over which likeness fades
 _NUM_RANDOM, _MAX_BETTER_SHARE = 1000, 0.001  # random orders; of them above one that is believed
+_MAX_BETTER_SHARE_OF_FEW = 0.05  # in flats, 8 stills and more in order have up to .064
 _MAX_MOVED = 3  # frames in a row that are moved at once to make a path better
 _MIN_GAIN = 1e-9
 
@@ -61,12 +62,10 @@ def _num_matches(one: TourFrame, other: TourFrame) -> int:
 
 
 def in_given_order(alike: np.ndarray) -> bool:
-    """True if neighbours are more alike (F, F) as given than in 99.9 % of random orders, or near
-    frames are, as neighbours of a hall of bays are less alike than frames a bay apart; of a few
-    frames that tells nothing."""
+    """True if neighbours are more alike (F, F) as given than in 99.9 % of random orders, of few
+    frames 95 %, or near frames are, as neighbours of a hall of bays are less alike than frames a
+    bay apart."""
     rng, num = np.random.default_rng(0), len(alike)
-    if num < MIN_FRAMES:
-        return True
     gaps = np.abs(np.subtract.outer(np.arange(num), np.arange(num)))
     nearness, ranks = np.exp(-gaps / _REACH), _ranks(alike)
 
@@ -75,7 +74,8 @@ def in_given_order(alike: np.ndarray) -> bool:
 
     given = np.add(totals(np.arange(num)), _MIN_GAIN)
     better = sum(np.greater(totals(rng.permutation(num)), given) for _ in range(_NUM_RANDOM))
-    return bool(np.min(better) <= _MAX_BETTER_SHARE * _NUM_RANDOM)
+    most = _MAX_BETTER_SHARE if num >= MIN_FRAMES else _MAX_BETTER_SHARE_OF_FEW
+    return bool(np.min(better) <= most * _NUM_RANDOM)
 
 
 def _ranks(alike: np.ndarray) -> np.ndarray:

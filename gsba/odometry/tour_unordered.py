@@ -22,6 +22,7 @@ from gsba.odometry.tour_joins import (
     scaled,
 )
 from gsba.odometry.tour_maps import (
+    KeptSteps,
     TourMatches,
     Triple,
     maps_of,
@@ -46,19 +47,20 @@ def match_stills(
     frames: Sequence[TourFrame],
     given_names: tuple[str, ...],
     likeness: np.ndarray | None,
-    num_threads: int = 1,
+    num_threads: int,
+    kept: KeptSteps,
 ) -> TourMatches:
     """Confirmed steps of a tour, in the order given; by their likeness (F, F), if that is known
     since names are in no order, in another one, unless no step is confirmed there."""
     if likeness is None:
-        return match_tour(frames, given_names, num_threads)
+        return match_tour(frames, given_names, num_threads, kept)
     path = most_alike_path(likeness)
     given, frames = frames, [frames[f] for f in path]
-    steps, sure = searched(frames, num_threads)
+    names = tuple(given_names[f] for f in path)
+    steps, sure = searched(frames, names, num_threads, kept)
     sure = without_unsupported(frames, steps, sure, num_threads)
     if not any(sure):
         return matches_of(given, given_names, steps, sure, [])
-    names = tuple(given_names[f] for f in path)
     return replace(matches_of(frames, names, steps, sure, []), order_found=True)
 
 

@@ -34,6 +34,7 @@ class KeptMap:
     map: Map
     coarse: CoarsePoses  # of its frames, in the world of the result
     order_doubted: bool = False  # see `pipeline.tour.check_order`
+    lone_steps: tuple[tuple[str, str], ...] = ()  # the same
 
 
 def keep(state: State) -> None:
@@ -47,7 +48,8 @@ def keep(state: State) -> None:
             keypoints=map_.observed.of_frames(np.zeros(0, np.int64)),
         )
         map_ = replace(map_, stitching=field)
-    kept = KeptMap(map_, state.prior.coarse, state.prior.order_doubted)
+    prior = state.prior
+    kept = KeptMap(map_, prior.coarse, prior.order_doubted, prior.lone_steps)
     state.run.stage(_STAGE, [], lambda: kept, KeptMap, noted=False)
     if settings := tuple(one.model_dump_json() for one in state.run.camera_settings):
         state.run.stage(_CAMERAS, [], lambda: settings, tuple[str, ...], noted=False)
@@ -67,6 +69,7 @@ class FinishedRun:
     files: tuple[Path, ...]  # (F,) stored features of each frame; may be missing
     camera_settings: tuple[CameraSettings, ...]  # (C,)
     order_doubted: bool = False  # see `pipeline.tour.check_order`
+    lone_steps: tuple[tuple[str, str], ...] = ()  # names of frames, see `pipeline.tour.check_order`
 
     @classmethod
     def load(cls, root: Path) -> "FinishedRun":
@@ -87,7 +90,7 @@ class FinishedRun:
         each = [[stage / f"{name}.npz" for stage in stages] for name in frames.names]
         files = tuple(next(filter(Path.is_file, paths), paths[-1]) for paths in each)
         origin = {what: Path(path) for what, path in read_marker(root)["origin"].items()}
-        settings = load_config(root / "config.toml")
+        settings, lone = load_config(root / "config.toml"), kept.lone_steps
         if not frames.recordings:
             path = origin.get("frames", root)
             name = (path.stem if path.is_file() else path.name) or "frames"
@@ -97,12 +100,13 @@ class FinishedRun:
                 names=tuple(f"{name}/{own}" for own in frames.names),
                 clock_shifts=(0.0,) * num,
             )
+            lone = tuple((f"{name}/{a}", f"{name}/{b}") for a, b in lone)
         given = frames, kept.map, kept.coarse, result
         cameras = settings.camera, *([settings.camera] * (len(frames.formats) - 1))
         if len(cameras) > 1:
             known = load_stage(root, _CAMERAS, tuple[str, ...])
             cameras = tuple(CameraSettings.model_validate_json(one) for one in known)
-        return cls(root, origin, *given, settings, files, cameras, kept.order_doubted)
+        return cls(root, origin, *given, settings, files, cameras, kept.order_doubted, lone)
 
     def recordings(self) -> dict[str, FrameSet]:
         """Frames of each recording by its name, on its own clock, under their own names."""

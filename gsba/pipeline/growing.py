@@ -94,18 +94,21 @@ def complete(store: RunStore, frames: FrameSet, sources: Sequence[Path], out: Pa
     returns the frames as they are read then."""
     roots = [root.resolve() for root in sources]
 
-    def kept(path: Path, frame: str, folder: str) -> Path:
+    def kept(path: Path, frame: str, folder: str, lens: str = "") -> Path:
         own = path.resolve()
         if not any(root in own.parents for root in roots):
             return path
-        name = Path(folder) / frame.rpartition("/")[0] / path.name
+        name = Path(folder) / frame.rpartition("/")[0] / lens / path.name
         if not (store.root / name).is_file():
             link_or_copy(own, store.root / name)
         return out.absolute() / name
 
     paths, masks = [], []
     for frame, group, mask in zip(frames.names, frames.paths, frames.mask_paths, strict=True):
-        paths.append(tuple(kept(path, frame, _FRAMES) for path in group))
+        several = len({*group}) > 1  # pictures of lenses, of one name in folders of theirs
+        paths.append(
+            tuple(kept(path, frame, _FRAMES, path.parent.name * several) for path in group)
+        )
         masks.append(mask and kept(mask, frame, _MASKS))
     for root in roots:
         for path in sorted((root / _ODOMETRY).rglob("*")):
@@ -492,8 +495,13 @@ def _write(
                 alignment = move.scale, move.new_T_old, PLACES, covariance
                 joints.append(SegmentAlignment(int(there[0]), int(there[-1]), *alignment))
     coarse = CoarsePoses(np.concatenate(poses), np.concatenate(sources), 0.0)
-    doubted = any(run.order_doubted for run in maps.runs)
-    prior = replace(state.prior, coarse=coarse, joints=tuple(joints), order_doubted=doubted)
+    prior = replace(
+        state.prior,
+        coarse=coarse,
+        joints=tuple(joints),
+        order_doubted=any(run.order_doubted for run in maps.runs),
+        lone_steps=tuple(step for run in maps.runs for step in run.lone_steps),
+    )
     run = replace(state.run, settings=maps.runs[0].settings)
     state = replace(state, run=run, prior=prior)
     finished_run.keep(state)

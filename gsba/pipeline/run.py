@@ -121,8 +121,12 @@ class Run:
         ):
             raise GsbaError("camera.model = two_lens is for panoramas: cube faces hide the seam")
         evidence = evidence or Evidence()
-        sensors = [evidence.imu, *(one.imu for one in evidence.recordings)]
-        if any(imu is not None for imu in sensors) and not frames.timed:
+        timed, rows = frames.timed_frames, frames.recordings
+        sensors = [
+            (evidence.imu, timed),
+            *((one.imu, timed[rows[one.name]]) for one in evidence.recordings),
+        ]
+        if any(imu is not None and not own.all() for imu, own in sensors):
             raise GsbaError("--imu: nothing says when frames are from: pass --timestamps or --fps")
         for family in evidence.families:
             if family.name in (TrajectoryPrior.name, GyroTurns.name):
@@ -136,7 +140,8 @@ class Run:
             raise GsbaError("factors: no family observes points; add bearing or reprojection")
         paths = [*(path for group in frames.paths for path in group), *frames.mask_paths]
         start = coarse.world_T_rigs.tolist(), settings.read
-        inputs = [fingerprint(paths), frames.timestamps.tolist(), frames.timed, *start]
+        timing = frames.timestamps.tolist(), frames.timed_of_frame or frames.timed
+        inputs = [fingerprint(paths), *timing, *start]
         inputs += [frames.camera_of_frame, *map(asdict, frames.formats), lenses_found]
         store.stage("frames", inputs, lambda: frames, FrameSet)
         return cls(

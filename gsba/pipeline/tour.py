@@ -24,18 +24,19 @@ from gsba.odometry.tour_order import (
     likeness,
     may_lack_order,
 )
-from gsba.odometry.tour_steps import TourFrame
+from gsba.odometry.tour_steps import Step, TourFrame
 from gsba.odometry.tour_unordered import match_stills, read_stills
 from gsba.pipeline import frontend
 from gsba.pipeline.run import Run
 from gsba.pipeline.state import ObservedFrames, State
 from gsba.significance import outweighs
 from gsba.store.folder import STAGES
-from gsba.store.store import RunStore, fingerprint
+from gsba.store.store import PerFrame, RunStore, digest, fingerprint
 from gsba.trajectory import judgement
 from gsba.trajectory.limits import TwoViewLimits
 from gsba.trajectory.steps import image_steps
 from gsba.types import Features, FrameSet, Matches
+from gsba.version import __version__
 
 logger = logging.getLogger(__name__)
 
@@ -43,7 +44,9 @@ _MAX_TIED_SHARE = 0.8  # of frames in maps of descriptors, below which places ar
 _MIN_INTERVAL_S = 1.5  # between stills metres apart; frames of a video can be had closer together
 _MAX_ORDER_ERROR = 0.02  # probability that matches of stills in no order, if all match, show one
 _NUM_FAR_PAIRS = 12  # compared with as many neighbours
+_MIN_TIMED = 4  # stills whose order by given times is tested
 _LIKENESS, _SEARCH, _STAGE = "likeness", "tour", "features_tour"
+_STEPS = "tour_steps"  # folder of the finished steps of a search that is not finished
 _FRAMES_IN_ORDER, _NUM_PLACES = 14, 3  # of frames one after another that tell an order from none;
 # of these sequences, in one of which the camera may stand
 _NO_ORDER = (
@@ -73,7 +76,7 @@ def check_order(state: State, found: Recovered) -> State:
     lone = _lone_steps(found, frames.names)
     state = replace(state, prior=replace(state.prior, lone_steps=lone))
     if (
-        len(frames) < MIN_FRAMES
+        len(frames) < (_MIN_TIMED if frames.timed else MIN_FRAMES)
         or run.store.root.absolute() in frames.paths[0][0].parents
         or _may_be_in_no_order(run)
         or _show_order(state, found.neighbours.matches)
@@ -127,7 +130,7 @@ def _search(state: State, found: Recovered) -> TourMatches | None:
         return None
     key, before, tied, alike = _search_key(run.frames), 0, False, None
     stills = cache(lambda: read_stills(run.frames, run.num_threads))  # for both stages
-    known = run.store.stored(_SEARCH, key, TourMatches)
+    known, steps = run.store.stored(_SEARCH, key, TourMatches), run.store.root / STAGES / _STEPS
     # In an order found by likeness, descriptors match what is only alike.
     if known is None or not known.order_found:
         before = _num_tied(found.neighbours.matches, num)
@@ -149,9 +152,16 @@ def _search(state: State, found: Recovered) -> TourMatches | None:
         )
 
     def compute() -> TourMatches:
-        return match_stills(stills(), run.frames.names, alike, run.num_threads)
+        return match_stills(stills(), run.frames.names, alike, run.num_threads, kept)
+
+    def kept(names: tuple[str, str], compute: Callable[[], list[Step]]) -> list[Step]:
+        name = digest(__version__, key, names)
+        return list(
+            PerFrame(steps, {name: name}, lambda _: tuple(compute()), tuple[Step, ...])[name]
+        )
 
     tour = run.store.stage(_SEARCH, key, compute, TourMatches)
+    shutil.rmtree(steps, ignore_errors=True)
     if tour.names != run.frames.names:
         raise OrderFoundError("the stills are in no order: refine them in the order found")
     if before and alike is not None:
@@ -237,7 +247,8 @@ def _far_match_less(state: State, num: int) -> bool:
     far = far[np.unique(np.linspace(0, len(far) - 1, _NUM_FAR_PAIRS).astype(int))]
     near = np.column_stack([far[:, 0], far[:, 0] + 1])
     chosen, rows = np.unique(np.concatenate([near, far]), axis=0, return_inverse=True)
-    found = recovery.match_anywhere(state.observed.context, chosen, rivals=False).matches
+    context = state.observed.context.by_search()  # of far pairs a network would take seconds each
+    found = recovery.match_anywhere(context, chosen, rivals=False).matches
     counts = np.zeros((num, num), np.int64)
     counts[tuple(found.pairs.T)] = np.diff(found.offsets)
     of_pairs = counts[tuple(chosen.T)][rows.ravel()]

@@ -2,6 +2,7 @@
 
 import logging
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -71,7 +72,8 @@ def read_fixes(
 def fixes_of_frames(
     source: str, frames: FrameSet, settings: GpsSettings | None = None
 ) -> FrameFixes:
-    """Fixes of frames by name, or interpolated between the fixes before and after.
+    """Fixes of frames by name, or interpolated between the fixes before and after. Names without a
+    recording are of the first one: fixes of a run stay when recordings are added.
 
     A receiver without a lock writes latitude 0 and longitude 0, or its last place again and again:
     both are left out, so that of equal places in a row the first remains.
@@ -95,15 +97,23 @@ def fixes_of_frames(
     if fixes.names is None:
         rows, geodetic, sigmas = _between(source, fixes, frames)
     else:
-        by_name = {name: g for g, name in enumerate(fixes.names)}
+        by_name = dict(zip(_names_in(frames, fixes.names), range(len(fixes.names)), strict=True))
         rows = np.array([f for f, name in enumerate(frames.names) if name in by_name], np.int64)
         chosen = [by_name[frames.names[f]] for f in rows]
         geodetic, sigmas = fixes.geodetic[chosen], fixes.sigmas[chosen]
     origin = np.median(geodetic, axis=0) if len(rows) else np.zeros(3)
     local = local_from_geodetic(geodetic, origin)
-    times = frames.timestamps[rows] if frames.timed else None
+    times = frames.timestamps[rows] if frames.timed_frames[rows].all() else None
     origin[1] = (origin[1] + 180) % 360 - 180
     return FrameFixes(rows, local, sigmas, times, origin, correlation_s=60.0)  # see `FrameFixes`
+
+
+def _names_in(frames: FrameSet, names: Sequence[str]) -> list[str]:
+    """Names (G,) of a table, which may have a folder, as frames are named."""
+    recordings = list(frames.recordings)
+    head = f"{recordings[0]}/" if recordings else ""
+    parts = [name.rpartition("/") for name in names]
+    return ["".join(some) if some[0] in recordings else head + some[2] for some in parts]
 
 
 def _locked(source: str, fixes: GpsFixes) -> GpsFixes:
@@ -146,12 +156,13 @@ def _between(
     """Frames (G,) between fixes, their positions (G, 3) geodetic, and sigmas (G, 3) in metres."""
     times, entries = own_timestamps(frames), fixes.timestamps
     assert entries is not None
-    if not frames.timed:
+    if not frames.timed_frames.any():
         raise GsbaError(
             f"{source}: the frames have no times to interpolate positions at: refine with "
             "--timestamps"
         )
-    inside = np.flatnonzero((times >= entries[0]) & (times <= entries[-1]))
+    within = (times >= entries[0]) & (times <= entries[-1])
+    inside = np.flatnonzero(within & frames.timed_frames)
     if not len(inside):
         raise GsbaError(
             f"{source}: no overlap in time: positions span {entries[0]:.3f} to {entries[-1]:.3f} "

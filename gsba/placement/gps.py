@@ -152,10 +152,15 @@ def read_gps(path: Path, settings: GpsSettings | None = None) -> GpsFixes:
         rows.append(_position(found["latitude"], found["longitude"], found.get("altitude"), place))
         noise.append([_noise(found.get(key), key, place) for key in _NOISE_COLUMNS])
         named = "name" in where
-        keys.append(stem_of(found["name"]) if named else _number(found["time"], "time", place))
+        keys.append(_frame(found["name"]) if named else _number(found["time"], "time", place))
     if not rows:
         raise GsbaError(f"{path} holds no positions")
     return _checked_fixes(path, keys, rows, noise, settings)
+
+
+def _frame(name: str) -> str:
+    """A frame's name, behind that of the file's folder if it has one, as frames of recordings."""
+    return "/".join([*name.replace("\\", "/").split("/")[-2:-1], stem_of(name)])
 
 
 def _cells(path: Path, number: int, line: str) -> list[str]:

@@ -185,10 +185,12 @@ def of_frames(
     notes = []
     if absent.all():
         notes.append("started from pairs of frames: the unit of the map is arbitrary")
-    if absent.all() and not frames.timed:
+    untimed = np.count_nonzero(absent & ~frames.timed_frames)
+    if absent.all() and untimed:
+        some = f"{untimed} of {len(absent)} " if untimed < len(absent) else ""
         notes.append(
-            "frames have no times: unless poses.csv lists them in the order of the way, a place "
-            "that repeats makes a wrong map"
+            f"{some}frames have no times: unless poses.csv lists them in the order of the way, a "
+            "place that repeats makes a wrong map"
         )
     if coarse.time_offset:
         notes.append(f"frame times were shifted by {coarse.time_offset:.6f} s")
@@ -322,6 +324,7 @@ def of_recordings(
             "frames_in_no_map": int(np.count_nonzero(numbers[rows] == 0)),
             "first": float(frames.timestamps[rows[0]]),
             "clock_shift_s": frames.clock_shifts[int(rows[0])],
+            "timed": bool(frames.timed_frames[rows].all()),
         }
         found.append(own if clock is None else own | {"clock": clock_section(clock)})
     return found

@@ -142,6 +142,7 @@ MAX_CONTRADICTED_SHARE = 0.25  # of the steps, by far frames
 MAX_HELD_SHARE = 0.5  # of the steps, by the start alone
 MAX_DOUBTED_SHARE = 0.25  # of the steps, by a start that images contradict elsewhere
 MAX_UNMATCHED_SHARE = 0.25  # of a run's steps, where frames are missing and no start is given
+MAX_RESIDUAL_RATIO = 3.0  # of a frame, in the median one's: right maps have up to 1.9
 MAX_FALSE_SHARE = 0.1  # of the start's steps; above it the others are in doubt, too
 _MAX_NAMED_FRAMES = 6  # of a reason, in a line of text
 _LOOK_AROUND = "gsba view RUN"
@@ -235,6 +236,7 @@ class _Tests:
             yield Reason(Level.REFUSED, (), cause, "walk while you film: a trainer needs parallax")
             return
         yield from self._unrefined()
+        yield from self._misfitting()
         yield from self._held()
         yield from self._shown_by_two_frames()
         yield from self._loosely_scaled()
@@ -280,11 +282,13 @@ class _Tests:
             yield Reason(Level.LOOK, tuple(self.names), cause, remedy)
         if self.report.get("timed", True):
             return
-        recordings = dict[str, list[Mapping[str, Any]]]()
-        for row in self.report["frames"]:
-            recordings.setdefault(row["name"].rpartition("/")[0], []).append(row)
-        for rows in recordings.values():
-            if len(rows) < MIN_FRAMES and {row["coarse_pose"] for row in rows} <= _NO_START:
+        ordered = {
+            one["name"]: one["timed"] or one["with_trajectory"]
+            for one in self.report.get("recordings", ())
+        }
+        for name, rows in self._recordings().items():
+            started = not {row["coarse_pose"] for row in rows} <= _NO_START
+            if len(rows) < MIN_FRAMES and not ordered.get(name, started):
                 cause = (
                     f"{len(rows)} stills without times are too few to tell whether their names "
                     f"follow the way; if they do not, {wrong}"
@@ -302,6 +306,29 @@ class _Tests:
             remedy = "leave these frames out of the training, or give sharper ones"
             frames = tuple(self.names[f] for f in rows)
             yield Reason(Level.LOOK, frames, cause, remedy, True, _WITHOUT_DOUBTED)
+
+    def _misfitting(self) -> Iterator[Reason]:
+        """Frames whose points fit much worse than those of others of their recording."""
+        ratios = dict[str, float]()
+        for rows in self._recordings().values():
+            found = {row["name"]: row.get("median_residual_deg") or 0.0 for row in rows}
+            usual = float(np.median([one for one in found.values() if one] or [math.inf]))
+            ratios |= {name: one / usual for name, one in found.items()}
+        frames = tuple(name for name in self.names if ratios[name] > MAX_RESIDUAL_RATIO)
+        if frames:
+            cause = (
+                f"points fit up to {max(ratios[name] for name in frames):.2g} times worse than in "
+                "other frames: a mirrored or edited picture fits in a wrong place"
+            )
+            remedy = "look at these pictures, or leave these frames out of the training"
+            yield Reason(Level.LOOK, frames, cause, remedy, True, _WITHOUT_DOUBTED)
+
+    def _recordings(self) -> dict[str, list[Mapping[str, Any]]]:
+        """Rows of the report's frames by the name of their recording, "" = the only one."""
+        found = dict[str, list[Mapping[str, Any]]]()
+        for row in self.report["frames"]:
+            found.setdefault(row["name"].rpartition("/")[0], []).append(row)
+        return found
 
     def _held(self) -> Iterator[Reason]:
         """Steps that no image shows."""

@@ -124,6 +124,8 @@ class FrameSet:
     # chosen ones was weak: datasets leave them out; () = none
     clock_shifts: tuple[float, ...] = ()  # (F,) seconds by which a frame's time on the clock of its
     # recording was shifted, so that recordings follow one another; () = none was
+    timed_of_frame: tuple[bool, ...] = ()  # (F,) `timed` of each frame's recording, where
+    # recordings differ; () = they do not
 
     def __post_init__(self) -> None:
         for name in self.names:
@@ -137,6 +139,11 @@ class FrameSet:
     def chosen(self) -> np.ndarray:
         """Frames (F',) int64 that datasets hold: all that were not added later (`fetched`)."""
         return np.flatnonzero(~np.array(self.fetched or (False,) * len(self), bool))
+
+    @property
+    def timed_frames(self) -> np.ndarray:
+        """Frames (F,) bool whose timestamps are times."""
+        return np.array(self.timed_of_frame or (self.timed,) * len(self), bool)
 
     @property
     def recordings(self) -> dict[str, np.ndarray]:
@@ -185,6 +192,7 @@ class FrameSet:
             paths = tuple(tuple(path.absolute() for path in group) for group in paths)
             mask_paths = tuple(path and path.absolute() for path in mask_paths)
         used, of_frame = cameras_of(self.camera_of_frame, rows)
+        timed = tuple(self.timed_frames[rows].tolist())
         return replace(
             self,
             names=tuple(self.names[f] for f in rows),
@@ -195,4 +203,6 @@ class FrameSet:
             camera_of_frame=of_frame,
             fetched=tuple(self.fetched[f] for f in rows) if self.fetched else (),
             clock_shifts=tuple(self.clock_shifts[f] for f in rows) if self.clock_shifts else (),
+            timed=all(timed),
+            timed_of_frame=timed if len({*timed}) > 1 else (),
         )

@@ -38,6 +38,17 @@ def test_recordings_follow_one_another_whatever_their_clocks(tmp_path: Path) -> 
     np.testing.assert_allclose(own_timestamps(some), own_timestamps(frames)[[1, 5, 6]])
 
 
+def test_each_recording_has_times_or_none(tmp_path: Path) -> None:
+    frames = {name: _frames(tmp_path / name, 0.0) for name in "abc"}
+    frames["b"] = replace(frames["b"], timed=False)
+    together = combine(frames)
+    assert not together.timed
+    of_each = {name: together.taken(rows) for name, rows in together.recordings.items()}
+    assert {name: one.timed for name, one in of_each.items()} == {"a": True, "b": False, "c": True}
+    assert combine({name: frames[name] for name in "ac"}).timed
+    assert together.taken(np.array([0, NUM])).timed_frames.tolist() == [True, False]
+
+
 def test_recordings_of_one_mode_share_a_camera(tmp_path: Path) -> None:
     names = "abcd"
     frames = {name: _frames(tmp_path / name, 0.0) for name in names}

@@ -47,6 +47,8 @@ def test_an_order_is_told_from_none() -> None:
     assert in_given_order(alike) and in_given_order(alike[::-1, ::-1])
     assert not in_given_order(alike[np.ix_(numbers, numbers)])
     few = numbers[numbers < tour_order.MIN_FRAMES - 1]
+    assert not in_given_order(alike[np.ix_(few, few)])
+    few.sort()
     assert in_given_order(alike[np.ix_(few, few)])
 
 

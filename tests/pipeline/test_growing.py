@@ -6,6 +6,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ import pytest
 from accuracy import assert_as_accurate
 from command import run_gsba, succeed
 from growing_home import MAX_ERROR, NUM, SMALL_EXPORTS, GrowingHome
+from plain_records import frames_of
 from tiny_run import PLAIN
 from typer.testing import Result
 from waiting import until
@@ -20,10 +22,16 @@ from waiting import until
 from gsba import add_recordings, load_run, merge_runs, refine
 from gsba.disk import hold_folder
 from gsba.export import ExportFormat
+from gsba.frames.recordings import combine
 from gsba.localization import Localizer
 from gsba.log import GsbaError
+from gsba.pipeline.finished_run import KeptMap
+from gsba.pipeline.growing import complete
 from gsba.similarity import Sim3
-from gsba.types import VerifiedPairs
+from gsba.store.folder import STAGES
+from gsba.store.records import save_record
+from gsba.store.store import RunStore, load_stage
+from gsba.types import FrameSet, PictureFormat, VerifiedPairs
 from gsba.view import load_scene
 
 
@@ -85,6 +93,23 @@ def test_a_grown_run_needs_no_other_run(grown: Path, home: GrowingHome, tmp_path
     inside = [path for group in frames.paths for path in group if home.run in path.parents]
     assert not inside
     assert not any(path and ".growing" in str(path) for path in frames.mask_paths)
+
+
+def test_pictures_of_both_lenses_of_a_video_are_kept(tmp_path: Path) -> None:
+    """Which have one name, in a folder for each lens in the run that extracted them."""
+    first, paths = tmp_path / "first", list[Path]()
+    for lens in ("front", "back"):
+        paths.append(first / "frames" / lens / "000000.jpg")
+        paths[-1].parent.mkdir(parents=True)
+        paths[-1].write_text(lens)
+    kind = PictureFormat("erp", 512, 256)
+    frames = combine({"walk": frames_of(kind, [tuple(paths)] * 2, names=["000000", "000001"])})
+    with RunStore(tmp_path / "run", {"frames": tmp_path}) as store:
+        store.stage("frames", [], lambda: frames, FrameSet)
+        complete(store, frames, [first, store.root], store.root)
+    kept = load_stage(tmp_path / "run", "frames", FrameSet).paths[0]
+    assert [path.read_text() for path in kept] == ["front", "back"]
+    assert all(tmp_path / "run" in path.parents for path in kept)
 
 
 def test_report_exports_and_viewer_tell_recordings_apart(grown: Path) -> None:
@@ -198,7 +223,15 @@ def test_maps_are_tied_where_no_two_frames_share_enough_points(
 def test_rigid_merging_keeps_both_maps_and_tells_how_sure_it_is(
     home: GrowingHome, second_run: Path, tmp_path: Path
 ) -> None:
-    result = merge_runs([home.run, second_run], tmp_path / "run", rigid=True)
+    doubted = Path(shutil.copytree(second_run, tmp_path / "doubted"))
+    kept = load_stage(doubted, "map", KeptMap)
+    kept = replace(kept, order_doubted=True, lone_steps=(("000003", "000004"),))
+    save_record(doubted / STAGES / "map.npz", kept, {})
+    result = merge_runs([home.run, doubted], tmp_path / "run", rigid=True)
+    reasons = result.report["verdict"]["reasons"]  # those of the second run, too
+    assert any("hardly more alike than any two" in reason["cause"] for reason in reasons)
+    (lone,) = (reason for reason in reasons if "own two frames alone" in reason["cause"])
+    assert lone["frames"] == ["upper/000003", "upper/000004"]
     first, second = load_run(home.run)[0], load_run(second_run)[0]
     merged = load_run(tmp_path / "run")[0]
     assert merged.world_T_rigs[:NUM].tobytes() == first.world_T_rigs.tobytes()

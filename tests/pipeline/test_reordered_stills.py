@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -17,7 +19,8 @@ from gsba.log import GsbaError
 from gsba.masks import merging
 from gsba.matching import recovery
 from gsba.matching.recovery import Recovered
-from gsba.odometry.tour_maps import TourMatches
+from gsba.odometry.tour_maps import KeptSteps, TourMatches
+from gsba.odometry.tour_steps import Step
 from gsba.pipeline import frontend, tour
 from gsba.pipeline.prior import Prior
 from gsba.pipeline.refine import Start, _begin, _without_distractors
@@ -105,6 +108,13 @@ def match_nothing(stills: FrameSet) -> TourMatches:
     )
 
 
+class Searching:
+    """A context whose network matches nothing: frames are compared by search alone."""
+
+    def by_search(self) -> str:
+        return "search"
+
+
 def neighbours_tied(
     stills: FrameSet, store: RunStore, unmatched: tuple[int, int] | None = None, nearest: int = 8
 ) -> tuple[State, Recovered]:
@@ -117,14 +127,15 @@ def neighbours_tied(
     trust, settings = StepChecks.of_all(np.tile(np.eye(4), (len(stills), 1, 1))), RefineSettings()
     run = SimpleNamespace(frames=stills, settings=settings, store=store, num_threads=1, suffix="")
     state = State(cast(Run, run), Prior.of(without_trajectory(stills)), *[cast(Any, None)] * 4)
-    state = replace(state, observed=cast(Any, SimpleNamespace(context=None)))
+    state = replace(state, observed=cast(Any, SimpleNamespace(context=Searching())))
     return state, cast(Recovered, SimpleNamespace(neighbours=near, trust=trust))
 
 
 def matching_by(monkeypatch: pytest.MonkeyPatch, counts: np.ndarray) -> None:
     """Any two frames have (F, F) matches without a prediction."""
 
-    def match(_context: object, chosen: np.ndarray, rivals: bool) -> SimpleNamespace:
+    def match(context: object, chosen: np.ndarray, rivals: bool) -> SimpleNamespace:
+        assert context == "search"
         rows = [np.zeros((int(counts[f, g]), 2), np.int32) for f, g in chosen]
         return SimpleNamespace(matches=Matches.of_rows(chosen, rows))
 
@@ -183,6 +194,41 @@ def test_what_is_only_alike_makes_no_map_of_stills_in_no_order(
             assert tour.match_places(*given) is None
 
 
+def test_a_search_that_is_interrupted_keeps_its_finished_steps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    in_a_hall_of_bays(monkeypatch, np.arange(12))
+    stills, computed = numbered(tmp_path, 12), list[tuple[str, str]]()
+    nan = np.full(3, np.nan)
+    step = Step(np.eye(4), nan, nan, np.tile(nan, (3, 1)), np.tile(nan, (3, 1)), 7.5, 4)
+
+    def match(_: object, names: tuple[str, ...], __: object, ___: int, kept: KeptSteps) -> Any:
+        done = len(computed)
+
+        def compute(pair: tuple[str, str]) -> list[Step]:
+            computed.append(pair)
+            if not done and len(computed) == 3:
+                raise KeyboardInterrupt
+            return [step]
+
+        for pair in pairwise(names[:5]):
+            (found,) = kept(pair, partial(compute, pair))
+            assert found.rank == 7.5 and np.array_equal(found.f1_T_f0, np.eye(4))
+        return match_nothing(stills)
+
+    monkeypatch.setattr(tour, "match_stills", match)
+    with RunStore(tmp_path / "run", {"frames": tmp_path}) as store:
+        given = neighbours_tied(replace(stills, timed=True, timestamps=2.0 * np.arange(12)), store)
+        vars(given[0].run).update(latest=[], journal=Journal())
+        near = SimpleNamespace(matches=Matches.of_rows(np.zeros((0, 2), np.int32), []))
+        found = cast(Recovered, SimpleNamespace(neighbours=near, trust=given[1].trust))
+        with pytest.raises(KeyboardInterrupt):
+            tour.match_places(given[0], found)
+        assert tour.match_places(given[0], found) is None
+        assert [int(first) for first, _ in computed] == [0, 1, 2, 2, 3]
+        assert not (store.root / "stages" / "tour_steps").exists()
+
+
 @pytest.mark.parametrize("shuffled", [False, True])
 def test_an_order_that_likeness_denies_is_doubted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shuffled: bool
@@ -198,6 +244,16 @@ def test_an_order_that_likeness_denies_is_doubted(
                 tour.check_order(*given)
         else:
             assert not tour.check_order(*given).prior.order_doubted
+
+
+@pytest.mark.parametrize("shuffled", [False, True])
+def test_times_of_a_few_stills_are_doubted_where_likeness_denies_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shuffled: bool
+) -> None:
+    in_a_hall_of_bays(monkeypatch, way_of(9, shuffled))
+    with RunStore(tmp_path / "run", {"frames": tmp_path}) as store:
+        timed = neighbours_tied(replace(numbered(tmp_path, 9), timed=True), store)
+        assert tour.check_order(*timed).prior.order_doubted == shuffled
 
 
 def test_frames_that_match_more_than_those_far_off_are_not_asked_for_their_likeness(

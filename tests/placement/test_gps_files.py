@@ -14,6 +14,7 @@ from refusals import refused
 from walk_on_earth import frame_set
 
 from gsba.config import GpsSettings
+from gsba.frames.recordings import combine
 from gsba.log import GsbaError
 from gsba.placement import fixes_of, fixes_of_frames, read_fixes, read_gps
 from gsba.placement.frame_fixes import read_exif_gps
@@ -53,6 +54,23 @@ def test_tracks_state_their_noise(tmp_path: Path) -> None:
     text = f"<?xml version='1.0'?><gpx><trk><trkseg>{points}</trkseg></trk></gpx>"
     found = _read(tmp_path / "walk.gpx", text)
     np.testing.assert_allclose(found, [LEAST, [6, 6, 9], [7.5, 7.5, 12.5]])
+
+
+def test_fixes_by_name_stay_with_a_recording_that_others_are_added_to(tmp_path: Path) -> None:
+    alone, path = frame_set(4), tmp_path / "gps.csv"
+    rows = [f"{name},48.000{n},11,500" for n, name in enumerate(alone.names)]
+    path.write_text("\n".join(["name,latitude,longitude,altitude", *rows]))
+    before = fixes_of_frames(str(path), alone)
+    upper = replace(frame_set(5), paths=tuple((Path(f"upper{n}"),) for n in range(5)))
+    both = combine({"ground": alone, "upper": upper})
+    after = fixes_of_frames(str(path), both)
+    np.testing.assert_array_equal(after.frames, before.frames)
+    np.testing.assert_array_equal(after.positions, before.positions)
+    table = path.read_text()
+    for folder, first in (("pictures", 0), ("ground", 0), ("upper", 4)):
+        path.write_text(table.replace("\nf", f"\n/walks/{folder}/f"))
+        found = fixes_of_frames(str(path), both).frames
+        assert found.tolist() == list(range(first, first + 4))
 
 
 def test_altitudes_are_all_or_none() -> None:

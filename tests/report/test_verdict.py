@@ -76,12 +76,40 @@ def test_stills_of_each_recording_may_be_too_few_to_tell_their_order() -> None:
     assert "6 stills without times are too few" in found.sentence
 
 
+@pytest.mark.parametrize(
+    ("timed", "with_trajectory", "num"),
+    [(True, False, 0), (False, True, 0), (False, False, 1)],
+)
+def test_recordings_with_times_or_a_trajectory_have_their_order(
+    timed: bool, with_trajectory: bool, num: int
+) -> None:
+    """Whatever the other recordings have; the start that is told is that of all."""
+    names = tuple(f"{'ab'[n >= 14]}/{n:03d}" for n in range(NUM))
+    rows = [{"name": name, "coarse_pose": RunStart.EARLIER_RUN} for name in names]
+    of_a, of_b = ({"name": name, "timed": False, "with_trajectory": False} for name in "ab")
+    of_b |= {"timed": timed, "with_trajectory": with_trajectory}
+    found = _verdict(GOOD, names, frames=rows, timed=False, recordings=[of_a, of_b])
+    assert [reason.frames for reason in found.reasons] == num * [names[14:]]
+
+
 def test_a_step_that_two_frames_alone_show_is_to_be_looked_at() -> None:
     steps = [("004", "005"), ("018", "019")]
     found = _verdict(replace(GOOD, exported=NUM - 1), NAMES[:-1], lone_steps=steps)
     assert [one.frames for one in found.reasons if "two frames alone" in one.cause] == [
         ("004", "005")
     ]
+
+
+def test_a_frame_whose_points_fit_far_worse_is_to_be_looked_at() -> None:
+    rows = [{"name": name, "median_residual_deg": 0.016} for name in NAMES]
+    rows[3]["median_residual_deg"] = None  # it has no points
+    assert _verdict(GOOD, frames=rows).level == Level.GOOD
+    rows[7]["median_residual_deg"] = 0.031
+    assert _verdict(GOOD, frames=rows).level == Level.GOOD
+    rows[7]["median_residual_deg"] = 0.063
+    (reason,) = _verdict(GOOD, frames=rows).reasons
+    assert (reason.level, reason.frames, reason.leave_out) == (Level.LOOK, ("007",), True)
+    assert "3.9 times worse" in reason.cause
 
 
 def test_a_doubted_order_is_told_first() -> None:
