@@ -110,6 +110,9 @@ def test_a_frame_whose_points_fit_far_worse_is_to_be_looked_at() -> None:
     (reason,) = _verdict(GOOD, frames=rows).reasons
     assert (reason.level, reason.frames, reason.leave_out) == (Level.LOOK, ("007",), True)
     assert "3.9 times worse" in reason.cause
+    names = tuple(f"{'ab'[n >= 14]}/{n:03d}" for n in range(NUM))  # b: a camera of fewer pixels
+    rows = [{"name": name, "median_residual_deg": (0.01, 0.05)[name > "b"]} for name in names]
+    assert _verdict(GOOD, names, frames=rows).level == Level.GOOD
 
 
 def test_a_doubted_order_is_told_first() -> None:
