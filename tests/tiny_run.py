@@ -42,6 +42,7 @@ def exporting(*formats: str, **options: object) -> RefineSettings:
 
 
 BARE = exporting()  # of runs whose exports no test reads
+ONE_ROUND = settings_with(export={"formats": ()}, patches={"rounds": 1})
 PLAIN = settings_with(export={"formats": ()}, patches={"rounds": 0})
 
 
