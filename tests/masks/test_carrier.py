@@ -24,7 +24,7 @@ from gsba.masks.merging import choose
 from gsba.pipeline.acceptance import masked_scene_share
 from gsba.types import FrameSet
 
-WIDTH, HEIGHT, NUM = 512, 256, 14
+WIDTH, HEIGHT, NUM = 512, 256, 12
 
 
 def _outline() -> np.ndarray:
