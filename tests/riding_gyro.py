@@ -42,7 +42,7 @@ class Ride:
         before, after = self.rotations(times - 1e-4), self.rotations(times + 1e-4)
         return Rotation.from_matrix(np.swapaxes(before, 1, 2) @ after).as_rotvec() / 2e-4
 
-    def readings(self, sigma: float = 1e-3, hz: float = 100.0) -> Readings:
+    def readings(self, sigma: float = 1e-3, hz: float = 200.0) -> Readings:
         """What a sensor with noise (rad/s) measures, from 3 s before the frames to 2 s after."""
         times = np.arange(self.timestamps[0] - 3, self.timestamps[-1] + 2, 1 / hz)
         rng = np.random.default_rng([self.seed, 3])

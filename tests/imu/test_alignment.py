@@ -85,7 +85,7 @@ def test_what_a_gyro_says_of_frames_is_how_they_turn() -> None:
     exact = aligned(on, readings, 0.0, _usual())
     said = turning_of(readings, exact, on.timestamps)
     true = Rotation.from_matrix(on.steps()).as_rotvec()
-    # White noise of .001 rad/s at 100 Hz adds up to 7e-5 rad in half a second.
+    # White noise of .001 rad/s at 200 Hz adds up to 5e-5 rad in half a second.
     np.testing.assert_allclose(said.steps, true, atol=3e-4)
     np.testing.assert_allclose(said.rates, on.rates(on.timestamps), atol=3e-3)
     off = np.sqrt(np.mean((said.rates - on.rates(on.timestamps)) ** 2))
