@@ -99,7 +99,7 @@ def test_stills_in_no_order_are_refined_in_the_one_found(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(tour_steps, "_FEATURES", FeatureSettings(max_per_face=150))
-    monkeypatch.setattr(tour_steps, "_NUM_KEYS", 200)
+    monkeypatch.setattr(tour_steps, "_NUM_KEYS", 400)
     monkeypatch.setattr(tour_order, "MIN_FRAMES", 4)
     monkeypatch.setitem(TRAITS, "sift", replace(TRAITS["sift"], min_similarity=0.9999))
     frames, way = tmp_path / "stills", [2, 0, 3, 1]
