@@ -62,14 +62,15 @@ def make_growing_home(folder: Path, walk: DemoWalk) -> GrowingHome:
         files.append(folder / f"{name}.txt")
         write_tum(files[-1], Trajectory(times, poses))
         truths.append(Trajectory(times, truth.world_T_rigs[n::2]))
-    elsewhere = _recording(folder / "elsewhere", images[1::2], times)
+    num = NUM // 2  # frames of another place
+    elsewhere = _recording(folder / "elsewhere", images[1 : 2 * num : 2], times[:num])
     for path in elsewhere.glob("*.jpg"):  # another place: what a mirror shows
         pixels = cv2.imread(str(path))
         assert pixels is not None
         cv2.imwrite(str(path), cv2.flip(pixels, 1))
     mirror = np.diag([-1.0, 1.0, 1.0, 1.0])
     away = folder / "elsewhere.txt"
-    write_tum(away, Trajectory(times, mirror @ slam.world_T_rigs[1::2] @ mirror))
+    write_tum(away, Trajectory(times[:num], mirror @ slam.world_T_rigs[1 : 2 * num : 2] @ mirror))
     refine(folders[0], files[0], folder / "run", SMALL_EXPORTS)
     recorded = (folders[0], folders[1]), (files[0], files[1]), (truths[0], truths[1])
     return GrowingHome(*recorded, elsewhere, away, folder / "run")

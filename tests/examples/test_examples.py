@@ -22,7 +22,7 @@ from gsba.similarity import pose_similarity
 from gsba.trajectory.files import read_trajectory
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
-NUM_FRAMES, WIDTH, TAG = 11, 1024, 0.5
+NUM_FRAMES, WIDTH, TAG = 11, 768, 0.5
 LIGHTER = {
     "cubemap": {"min_face_size": 256, "max_face_size": 256},
     "features": {"max_per_face": 400},

@@ -137,6 +137,7 @@ def test_a_likely_join_is_taken_where_the_camera_walks_on(
     given = torn(whole, late, SCALE, MOVE), _halves(), NOBODY, ~BREAK, times
     found = map_merging.merge(context, *given)
     assert found.components.any() != joined
+    assert [reason[:12] for reason in found.reasons if reason] == ["not certain:"] * (not joined)
     if joined:
         assert _errors(found, truth)[0] < 0.02
 

@@ -163,7 +163,7 @@ def test_what_fits_badly_weighs_less(case: Case, populated) -> None:
     frames, true = populated
     scene = _scene(case, frames)
     missed, scenery = [], []
-    for f in range(1, len(frames), 2):
+    for f in range(1, len(frames), 3):
         found = scene.find(f)
         weights, left = distractor_weights(found), ~distractor_mask(found)
         missed.append(weights[true[f] & left])

@@ -97,7 +97,7 @@ def test_dark_frames_get_no_pose_and_the_map_goes_on(walk: RenderedWalk) -> None
 
 def test_another_place_begins_a_map_of_its_own(walk: RenderedWalk) -> None:
     flipped = [np.ascontiguousarray(frame[:, ::-1]) for frame in walk.frames]  # no place of it
-    elsewhere = RenderedWalk(walk.frames[:12] + flipped[20:], walk.world_T_rigs)
+    elsewhere = RenderedWalk(walk.frames[:12] + flipped[24:], walk.world_T_rigs)
     tracker = _track(elsewhere, patience=3)
     numbers = [record.map_number for record in tracker.state.records]
     assert numbers[11] == 0 and numbers[-1] == 1

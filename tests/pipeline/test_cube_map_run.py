@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cube_map_tracks import looking_up, picture_tracks
-from tiny_run import BARE, NUM_FRAMES, WIDTH, Case
+from tiny_run import NUM_FRAMES, ONE_ROUND, WIDTH, Case
 from two_fisheyes import write
 
 from gsba import refine
@@ -30,7 +30,7 @@ def test_tracks_of_a_walk_give_its_poses(tmp_path: Path, case: Case) -> None:
             write(tracks / track / f"{name}.png", picture)
     times = (case.frames / "timestamps.csv").read_text()
     (tracks / "timestamps.csv").write_text(times)
-    result = refine(tracks, case.slam, tmp_path / "run", BARE)
+    result = refine(tracks, case.slam, tmp_path / "run", ONE_ROUND)
     assert _num_refined(result) == NUM_FRAMES
     own, other = case.errors(), case.errors(tmp_path / "run")
     assert other.ate.rmse < 2 * own.ate.rmse

@@ -59,6 +59,7 @@ def test_raw_fisheyes_grow_by_recordings_of_their_calibration(
     assert read["with"][1] == read["without"][1]
 
 
+@pytest.mark.slow
 def test_runs_of_different_cameras_are_merged(
     single_run: Path, raw: Path, home: Home, tmp_path: Path
 ) -> None:

@@ -12,7 +12,16 @@ import numpy as np
 import plyfile
 import pycolmap
 import pytest
-from tiny_run import BARE, NUM_FRAMES, SETTINGS, WIDTH, Case, computed_stages, exporting
+from tiny_run import (
+    NUM_FRAMES,
+    ONE_ROUND,
+    SETTINGS,
+    WIDTH,
+    Case,
+    computed_stages,
+    exporting,
+    settings_with,
+)
 
 from gsba import Family, MapSnapshot, refine
 from gsba.bundle.pose_variables import X
@@ -25,6 +34,8 @@ from gsba.log import GsbaError
 from gsba.store.store import load_stage
 from gsba.trajectory.files import read_trajectory
 from gsba.types import FACES, Keypoints, PoseStatus, Trajectory
+
+EXPORTED = settings_with(patches={"rounds": 1})  # of runs whose exports are read
 
 
 def _greyed(case: Case, to: Path, frames: list[int]) -> Path:
@@ -95,7 +106,7 @@ def blank(case: Case, tmp_path_factory: pytest.TempPathFactory) -> Case:
     """The walk with frame 3 grey."""
     folder = tmp_path_factory.mktemp("blank")
     frames = _greyed(case, folder / "frames", [3])
-    result = refine(frames, case.slam, folder / "run", BARE)
+    result = refine(frames, case.slam, folder / "run", ONE_ROUND)
     return replace(case, frames=frames, out=folder / "run", result=result)
 
 
@@ -127,12 +138,12 @@ def test_a_destroyed_picture_ends_the_run_by_name(case: Case, tmp_path: Path) ->
     whole = (frames / "000005.jpg").read_bytes()
     (frames / "000005.jpg").write_bytes(whole[:-9000] + bytes(3000) + whole[-6000:])
     with pytest.raises(GsbaError, match=r"000005\.jpg: damaged \("):
-        refine(frames, case.slam, out, SETTINGS)
+        refine(frames, case.slam, out, EXPORTED)
     assert not (out / "trajectory.tum").exists() and not (out / "colmap").exists()
     (frames / "000005.jpg").write_bytes(whole)
     kept = {path.stem for path in (out / "stages" / "features").glob("*.npz")}
     assert kept and "000005" not in kept
-    result = refine(frames, case.slam, out, SETTINGS)
+    result = refine(frames, case.slam, out, EXPORTED)
     assert (result.reconstruction.pose_statuses == PoseStatus.REFINED).all()
 
 
@@ -160,7 +171,7 @@ def test_cube_faces_serve_as_well(case: Case, tmp_path: Path) -> None:
                 cv2.imwrite(str(frames / name / f"{path.stem}.png"), image)
     shutil.copy(case.frames / "timestamps.csv", frames)
     out = tmp_path / "run"
-    result = refine(frames, case.slam, out, SETTINGS)
+    result = refine(frames, case.slam, out, EXPORTED)
     assert (result.reconstruction.pose_statuses == PoseStatus.REFINED).all()
     keypoints = load_stage(out, "keypoints", Keypoints)
     assert not {FACES.index(name) for name in missing} & set(keypoints.faces)
@@ -200,7 +211,7 @@ def test_masks_reach_features_and_exports(case: Case, tmp_path: Path) -> None:
     mask[WIDTH // 3 :] = 0  # nothing steeper than 30 degrees down: not even a face's corners
     cv2.imwrite(str(tmp_path / "mask.png"), mask)
     out = tmp_path / "run"
-    result = case.refine(out, masks=tmp_path / "mask.png")
+    result = case.refine(out, EXPORTED, masks=tmp_path / "mask.png")
     pixel = 2 * np.pi / WIDTH
     down = np.sin(np.pi / 6 + 2 * pixel)
     assert load_stage(out, "keypoints", Keypoints).bearings_rig[:, 1].max() < down
@@ -236,13 +247,13 @@ class _Height(Family):
 def test_a_family_of_ones_own_takes_part(blank: Case, tmp_path: Path) -> None:
     lift, out = 0.1, blank.copy(tmp_path / "run")
     height = blank.result.coarse.world_T_rigs[3, 1, 3] + lift
-    result = blank.refine(out, BARE, families=[_Height(height)])
+    result = blank.refine(out, ONE_ROUND, families=[_Height(height)])
     assert "chain" in computed_stages(result) and "features" not in computed_stages(result)
     heights = result.reconstruction.world_T_rigs[:, 1, 3]
     # Moving the solution back into the trajectory's world shifts heights by the drift it removed.
     assert heights[3] == pytest.approx(height, abs=0.02)
     plain = blank.result.reconstruction.world_T_rigs[:, 1, 3]
     assert np.abs(np.delete(heights - plain, 3)).max() < 1e-3 < heights[3] - plain[3]
-    assert not computed_stages(blank.refine(out, BARE, families=[_Height(height)]))
-    other = blank.refine(out, BARE, families=[_Height(height + lift)])
+    assert not computed_stages(blank.refine(out, ONE_ROUND, families=[_Height(height)]))
+    other = blank.refine(out, ONE_ROUND, families=[_Height(height + lift)])
     assert "chain" in computed_stages(other)

@@ -12,7 +12,7 @@ from typing import Any
 
 import cv2
 import pytest
-from tiny_run import BARE, NUM_FRAMES, SETTINGS, Case, computed_stages, exporting
+from tiny_run import NUM_FRAMES, PLAIN, SETTINGS, Case, computed_stages, settings_with
 
 import gsba
 from gsba import RunResult
@@ -21,6 +21,8 @@ from gsba.config import RefineSettings, RoundSettings, WeakFrameSettings
 from gsba.log import following
 from gsba.matching import correspondences
 from gsba.report.time_left import TimeLeft
+
+WITHOUT_PATCHES = settings_with(patches={"rounds": 0})
 
 
 def test_a_second_call_takes_everything_up(case: Case, tmp_path: Path) -> None:
@@ -54,9 +56,11 @@ def test_a_run_tells_its_size_and_the_time_left(case: Case, tmp_path: Path) -> N
     assert left[events.index(size)][1] > left[-1][1] >= 0.0
 
 
-def test_a_changed_setting_renews_what_depends_on_it(case: Case, tmp_path: Path) -> None:
-    out = case.copy(tmp_path / "run")
-    exported = exporting("colmap", face_size=64)
+def test_a_changed_setting_renews_what_depends_on_it(
+    case: Case, plain_run: Path, tmp_path: Path
+) -> None:
+    out = Path(shutil.copytree(plain_run, tmp_path / "run"))
+    exported = settings_with(patches={"rounds": 0}, export={"face_size": 64})
     assert computed_stages(case.refine(out, exported)) == ["export-colmap"]
     (image, *_) = (out / "colmap/images/front").iterdir()
     pixels = cv2.imread(str(image))
@@ -70,11 +74,11 @@ def test_a_changed_setting_renews_what_depends_on_it(case: Case, tmp_path: Path)
 def test_a_changed_frame_is_extracted_alone(case: Case, tmp_path: Path) -> None:
     frames = Path(shutil.copytree(case.frames, tmp_path / "frames"))
     out, own = tmp_path / "run", replace(case, frames=frames)
-    own.refine(out, BARE)
+    own.refine(out, PLAIN)
     stored = {path: path.stat().st_mtime_ns for path in (out / "stages/features").glob("*.npz")}
     assert len(stored) == NUM_FRAMES
     os.utime(frames / "000003.jpg")
-    computed = computed_stages(own.refine(out, BARE))
+    computed = computed_stages(own.refine(out, PLAIN))
     assert {"features", "neighbours", "reconstruction"} <= set(computed)
     renewed = [path.stem for path, time in stored.items() if path.stat().st_mtime_ns != time]
     assert renewed == ["000003"]
@@ -101,7 +105,7 @@ refine(Path(frames), Path(slam), Path(out), settings)
 def _kill_in(case: Case, out: Path, module: str, name: str, survived: int = 0) -> None:
     """Run in a process that is killed on a call of a function."""
     path = str(Path(gsba.__file__).parents[1])
-    words = [SETTINGS.model_dump_json(), case.frames, case.slam, out, module, name, survived]
+    words = [WITHOUT_PATCHES.model_dump_json(), case.frames, case.slam, out, module, name, survived]
     done = subprocess.run(
         [sys.executable, "-c", _DEADLY, *map(str, words)],
         env={**os.environ, "PYTHONPATH": path},
@@ -110,7 +114,7 @@ def _kill_in(case: Case, out: Path, module: str, name: str, survived: int = 0) -
     assert done.returncode == -signal.SIGKILL, done.stderr.decode()
 
 
-def test_a_killed_run_goes_on_where_it_was(case: Case, tmp_path: Path) -> None:
+def test_a_killed_run_goes_on_where_it_was(case: Case, plain_run: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     _kill_in(case, out, "gsba.features.detection", "extract", survived=5)
     stored = {path: path.stat().st_mtime_ns for path in (out / "stages/features").glob("0*.npz")}
@@ -118,9 +122,9 @@ def test_a_killed_run_goes_on_where_it_was(case: Case, tmp_path: Path) -> None:
     _kill_in(case, out, "gsba.matching.correspondences", "match_loops")
     assert all(path.stat().st_mtime_ns == time for path, time in stored.items())
     assert not any((out / name).exists() for name in ("trajectory.tum", "colmap", "report.json"))
-    result = case.refine(out)
+    result = case.refine(out, WITHOUT_PATCHES)
     assert computed_stages(result)[0] == "loops"
-    assert (out / "trajectory.tum").read_bytes() == (case.out / "trajectory.tum").read_bytes()
+    assert (out / "trajectory.tum").read_bytes() == (plain_run / "trajectory.tum").read_bytes()
     assert not list(out.rglob("*.partial*")) and not list(out.rglob(".*"))
 
 

@@ -101,6 +101,7 @@ def test_stitched_panoramas_and_raw_fisheyes_make_one_map(home: Home, fisheyes_r
     # The raw pictures are coarser, and resampled twice: .0018 to .0020 with three seeds. One camera
     # for all scatters from .0006 to .0011, too widely for a ratio.
     assert error_of(fisheyes_run, home) < 0.003
+    assert (fisheyes_run / "calibration@raw.json").is_file()
     model = pycolmap.Reconstruction(str(fisheyes_run / "colmap/sparse/0"))
     assert len(model.rigs) == 2 and len(model.frames) == 2 * NUM
 

@@ -42,7 +42,7 @@ def test_searched_places_make_a_map_where_descriptors_make_none(
 ) -> None:
     few = FeatureSettings(max_per_face=150)  # as many as this room needs
     monkeypatch.setattr(tour_steps, "_FEATURES", few)
-    monkeypatch.setattr(tour_steps, "_NUM_KEYS", 400)
+    monkeypatch.setattr(tour_steps, "_NUM_KEYS", 200)
     settings = settings_with(**WITHOUT_PATCHES, export={"formats": ()})
     usual, strange = TRAITS["sift"], replace(TRAITS["sift"], min_similarity=0.9999)
     monkeypatch.setitem(TRAITS, "sift", strange)

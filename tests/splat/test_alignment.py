@@ -39,7 +39,7 @@ def test_perturbed_poses_come_back(case: Case, splat: Gaussians) -> None:
     moved = np.stack(
         [gtsam.Pose3(p).retract(rng.normal(0, [0.003] * 3 + [0.02] * 3)).matrix() for p in poses]
     )
-    alone = align_to_splat(splat, frames, moved, near, BACKEND, (24, 48))
+    alone = align_to_splat(splat, frames, moved, near, BACKEND, (16, 32))
     off = np.stack([moved, alone])[..., :3, 3] - poses[:, :3, 3]
     start, first = np.median(np.linalg.norm(off, axis=-1), axis=1)
     assert first < 0.6 * start

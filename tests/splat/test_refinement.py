@@ -79,7 +79,7 @@ def test_evidence_of_tiny_moves_is_a_matter_of_chance(
     for seed in range(9):
         tiny = harmed(real, lambda steps, rng: rng.normal(0, 1e-6, (8, 6)), seed)
         monkeypatch.setattr(refinement._Turns, "_moved", tiny)
-        evidence.append(run(case, given, settings_for(sizes=(48,))).moves[0].evidence)
+        evidence.append(run(case, given, settings_for()).moves[0].evidence)
     assert 0 < np.median(np.abs(evidence)) < 2
 
 
