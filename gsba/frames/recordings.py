@@ -64,10 +64,8 @@ def combine(
         )
         if len(formats) > 1
         else (),
-        timed=all(timed),
         clock_shifts=tuple(shifts),
-        timed_of_frame=timed if len({*timed}) > 1 else (),
-    )
+    ).with_timed(timed)
 
 
 def own_timestamps(frames: FrameSet) -> np.ndarray:

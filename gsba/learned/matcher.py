@@ -16,6 +16,7 @@ from gsba.matching.guided_search import (
     Matcher,
     SearchableFrames,
     guided,
+    mutual_nearest,
     one_to_one,
     strongest_of,
     within_gate,
@@ -111,11 +112,9 @@ def are_alike(
 ) -> np.ndarray:
     """Pairs (6, 6) bool of faces of frames 0 and 1 that hold a tenth of the mutual nearest
     neighbours of one of them, by the faces (n,) and the descriptors (n, D) of keypoints."""
-    likes = descriptors0 @ descriptors1.T
-    nearest, back = likes.argmax(axis=1), likes.argmax(axis=0)
-    rows = np.flatnonzero(back[nearest] == np.arange(len(nearest)))
+    rows0, rows1 = mutual_nearest(descriptors0, descriptors1)
     counts = np.zeros((len(FACES), len(FACES)))
-    np.add.at(counts, (faces0[rows], faces1[nearest[rows]]), 1)
+    np.add.at(counts, (faces0[rows0], faces1[rows1]), 1)
     most = _MIN_ALIKE_SHARE * np.minimum(counts.sum(axis=1)[:, None], counts.sum(axis=0))
     return (counts > 0) & (counts >= most)
 

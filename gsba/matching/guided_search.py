@@ -25,11 +25,13 @@ from gsba.matching._search_kernels import HEAD, Cells, Limits, Rows, passes, sea
 from gsba.matching.pairs import by_place
 from gsba.store.shards import Workers, blocks_of_frames
 from gsba.types import Features, Keypoints, Matches
+from gsba.types.records import slices
 
 MAX_PARALLAX_RAD = np.deg2rad(60.0)  # between two rays of a point
 T = TypeVar("T")
 FAR_DRIFT = 0.05  # largest relative drift that a loop closure may correct
 _CELLS_PER_SIDE = 8  # cells along a face's side
+_ROWS_AT_ONCE = 512  # of descriptors that are compared with all others
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,6 +136,25 @@ def strongest_of(features: Features, per_face: int | None) -> np.ndarray:
         return np.arange(len(features))
     ranks = np.arange(len(features)) - np.searchsorted(features.faces, features.faces)
     return np.flatnonzero(ranks < per_face)
+
+
+def mutual_nearest(
+    descriptors0: np.ndarray, descriptors1: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rows (M,) of some descriptors (K0, D) and of others (K1, D), each the most similar one of the
+    other."""
+    found, num = list[np.ndarray](), len(descriptors1)
+    back, best = np.zeros(num, np.int64), np.full(num, -np.inf, np.float32)
+    for rows in slices(len(descriptors0), _ROWS_AT_ONCE):
+        likes = descriptors0[rows] @ descriptors1.T
+        found.append(likes.argmax(axis=1))
+        top = likes.argmax(axis=0)
+        most = likes[top, np.arange(num)]
+        back = np.where(most > best, rows.start + top, back)
+        best = np.maximum(most, best)
+    nearest = np.concatenate(found)
+    rows0 = np.flatnonzero(back[nearest] == np.arange(len(nearest)))
+    return rows0, nearest[rows0]
 
 
 def match_pair(

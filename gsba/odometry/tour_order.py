@@ -12,7 +12,8 @@ from itertools import combinations
 import numpy as np
 
 from factors.threads import map_in_threads
-from gsba.odometry.tour_steps import TourFrame, mutual_nearest
+from gsba.matching.guided_search import mutual_nearest
+from gsba.odometry.tour_steps import TourFrame
 
 _MIN_COSINE, _MIN_COSINE_LEAD = 0.75, 0.05  # of matches; over look-alikes within a frame
 MIN_FRAMES = 12  # fewer are taken in the order given, which is doubted at most

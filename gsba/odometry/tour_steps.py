@@ -19,6 +19,7 @@ from gsba.features.detection import SiftExtractor, extract
 from gsba.frames import cubemap
 from gsba.frames.panorama import Greys
 from gsba.geometry import angles_between, inverse, pose, rotation_angle, unit
+from gsba.matching.guided_search import mutual_nearest
 from gsba.matching.verification import sampled_pose
 from gsba.odometry.patch_search import search_patches
 from gsba.types import FrameSet
@@ -38,7 +39,7 @@ _PAD = 160  # columns beyond the seam: 45 degrees, more than a patch is wide
 _NUM_KEYS, _NUM_FEW = 1000, 300  # keypoints of a frame that are searched; that give a first rank
 _NUM_ROUGH, _NUM_REFINED = 6, 4  # best hypotheses of a step that are searched finely; refined
 _MIN_RANK_SHARE = 0.4  # of the best hypothesis' rank, below which others are not refined
-_ROWS_AT_ONCE = 512  # of descriptors that are compared with all others
+_ROWS_AT_ONCE = 512  # of descriptors that are compared with all others of their frame
 _MIN_VOTES = 3  # keys that propose a length or a ratio of lengths
 _MIN_MATCHES = 8  # that a pose is estimated from
 # Subsets of matches that propose poses: largest cosine with another keypoint of the same frame,
@@ -115,25 +116,6 @@ def _alikeness(rays: np.ndarray, descriptors: np.ndarray) -> np.ndarray:
         likes[rays[some] @ rays.T > np.cos(np.deg2rad(3.0))] = -1
         alike[some] = likes.max(axis=1, initial=-1)
     return alike
-
-
-def mutual_nearest(
-    descriptors0: np.ndarray, descriptors1: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Rows (M,) of some descriptors (K0, D) and of others (K1, D), each the most similar one of the
-    other."""
-    found, num = list[np.ndarray](), len(descriptors1)
-    back, best = np.zeros(num, np.int64), np.full(num, -np.inf, np.float32)
-    for rows in slices(len(descriptors0), _ROWS_AT_ONCE):
-        likes = descriptors0[rows] @ descriptors1.T
-        found.append(likes.argmax(axis=1))
-        top = likes.argmax(axis=0)
-        most = likes[top, np.arange(num)]
-        back = np.where(most > best, rows.start + top, back)
-        best = np.maximum(most, best)
-    nearest = np.concatenate(found)
-    rows0 = np.flatnonzero(back[nearest] == np.arange(len(nearest)))
-    return rows0, nearest[rows0]
 
 
 def found_places(

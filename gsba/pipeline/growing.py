@@ -105,10 +105,10 @@ def complete(store: RunStore, frames: FrameSet, sources: Sequence[Path], out: Pa
 
     paths, masks = [], []
     for frame, group, mask in zip(frames.names, frames.paths, frames.mask_paths, strict=True):
-        several = len({*group}) > 1  # pictures of lenses, of one name in folders of theirs
-        paths.append(
-            tuple(kept(path, frame, _FRAMES, path.parent.name * several) for path in group)
-        )
+        # pictures of several lenses have one name, in folders of theirs
+        lenses = [path.parent.name if len({*group}) > 1 else "" for path in group]
+        given = zip(group, lenses, strict=True)
+        paths.append(tuple(kept(path, frame, _FRAMES, lens) for path, lens in given))
         masks.append(mask and kept(mask, frame, _MASKS))
     for root in roots:
         for path in sorted((root / _ODOMETRY).rglob("*")):

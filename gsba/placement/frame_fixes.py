@@ -97,7 +97,7 @@ def fixes_of_frames(
     if fixes.names is None:
         rows, geodetic, sigmas = _between(source, fixes, frames)
     else:
-        by_name = dict(zip(_names_in(frames, fixes.names), range(len(fixes.names)), strict=True))
+        by_name = {name: g for g, name in enumerate(_names_in(frames, fixes.names))}
         rows = np.array([f for f, name in enumerate(frames.names) if name in by_name], np.int64)
         chosen = [by_name[frames.names[f]] for f in rows]
         geodetic, sigmas = fixes.geodetic[chosen], fixes.sigmas[chosen]

@@ -140,6 +140,11 @@ class FrameSet:
         """Frames (F',) int64 that datasets hold: all that were not added later (`fetched`)."""
         return np.flatnonzero(~np.array(self.fetched or (False,) * len(self), bool))
 
+    def with_timed(self, timed: tuple[bool, ...]) -> "FrameSet":
+        """The same frames, with times or without, each (F,)."""
+        differing = timed if len({*timed}) > 1 else ()
+        return replace(self, timed=all(timed), timed_of_frame=differing)
+
     @property
     def timed_frames(self) -> np.ndarray:
         """Frames (F,) bool whose timestamps are times."""
@@ -203,6 +208,4 @@ class FrameSet:
             camera_of_frame=of_frame,
             fetched=tuple(self.fetched[f] for f in rows) if self.fetched else (),
             clock_shifts=tuple(self.clock_shifts[f] for f in rows) if self.clock_shifts else (),
-            timed=all(timed),
-            timed_of_frame=timed if len({*timed}) > 1 else (),
-        )
+        ).with_timed(timed)

@@ -22,7 +22,7 @@ from gsba.log import GsbaError
 from gsba.placement import gravity
 from gsba.placement.gps import local_from_geodetic, read_gps
 from gsba.placement.placement import Placement, place
-from gsba.similarity import Sim3, level_similarity, robust_similarity, similarity
+from gsba.similarity import Sim3, level_similarity, residuals_of, robust_similarity, similarity
 from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.types import FrameSet, PictureFormat, Trajectory
 
@@ -175,6 +175,7 @@ def test_heading_and_scale_with_gravity_known() -> None:
     target = 4.0 * source @ turn.T + [7, 8, 9]
     target[:6] += rng.normal(0, 30, (6, 3))
     fit, used = robust_similarity(source, target, level_similarity, 2, np.zeros(30), 0.05)
+    assert np.sqrt(np.mean(residuals_of(fit, source, target)[used] ** 2)) < 1e-9
     assert fit.scale == pytest.approx(4) and not used[:6].any() and used[6:].all()
     np.testing.assert_allclose(fit.rotation, turn, atol=1e-9)
     np.testing.assert_allclose(fit.translation, [7, 8, 9], atol=1e-8)
