@@ -1,11 +1,17 @@
 """Stills of a tour through one room with painted walls, far apart, and their true poses."""
 
+from functools import cache
+
 import cv2
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from gsba.camera.sphere import erp_directions
-from gsba.geometry import pose
+from gsba.config import FeatureSettings
+from gsba.geometry import inverse, pose
+from gsba.odometry import tour_steps
+from gsba.odometry.tour_steps import Step, TourFrame, frame_of, step_at
 
 _HALF = np.array([3.0, 1.3, 2.5])  # of the room's sides, x, y, z
 _WALL = 512  # pixels of a wall's side
@@ -23,6 +29,22 @@ def pictures(room: int = 0) -> list[np.ndarray]:
     """Panoramas (h, 2h) uint8 of the stills; rooms differ in the paint of their walls."""
     walls = [_wall(np.random.default_rng(6 * room + n)) for n in range(6)]
     return [_seen(walls, one) for one in true_poses()]
+
+
+@cache
+def frames(room: int = 0) -> list[TourFrame]:
+    """The stills with as few keypoints as these rooms need."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tour_steps, "_FEATURES", FeatureSettings(max_per_face=150))
+        patch.setattr(tour_steps, "_NUM_KEYS", 200)
+        return [frame_of(picture, None) for picture in pictures(room)]
+
+
+@cache
+def true_step(first: int, room: int = 0) -> Step:
+    """The step from a still to the next one at its true pose."""
+    some, poses = frames(room), true_poses()
+    return step_at(some[first], some[first + 1], inverse(poses[first + 1]) @ poses[first])
 
 
 def _wall(rng: np.random.Generator) -> np.ndarray:

@@ -1,14 +1,11 @@
 """Maps of a tour, joined across a step that no three frames confirm."""
 
-from functools import cache
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gsba.config import FeatureSettings
 from gsba.geometry import inverse, pose, unit
-from gsba.odometry import tour_joins, tour_merging, tour_steps
+from gsba.odometry import tour_joins, tour_merging
 from gsba.odometry.tour_joins import (
     MIN_LEAD,
     MIN_SCORE,
@@ -19,21 +16,13 @@ from gsba.odometry.tour_joins import (
     scaled,
 )
 from gsba.odometry.tour_merging import all_joined, held
-from gsba.odometry.tour_steps import TourFrame, agreed_logs, frame_of, pose_errors_deg, step_at
-from tests.room_tour import pictures, true_poses
-
-
-@cache
-def frames(room: int) -> list[TourFrame]:
-    return [frame_of(picture, None) for picture in pictures(room)]
+from gsba.odometry.tour_steps import agreed_logs, pose_errors_deg
+from tests.room_tour import frames, true_poses, true_step
 
 
 @pytest.fixture(autouse=True)
-def _few_keys_and_hypotheses(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Keys of stills, and of the step from the second one to the third a rough pose and a wrong
-    one."""
-    monkeypatch.setattr(tour_steps, "_FEATURES", FeatureSettings(max_per_face=150))
-    monkeypatch.setattr(tour_steps, "_NUM_KEYS", 200)
+def _two_hypotheses(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the step from the second still to the third a rough pose and a wrong one."""
     true = inverse(true_poses()[2]) @ true_poses()[1]
     found = [
         pose(
@@ -46,11 +35,9 @@ def _few_keys_and_hypotheses(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tour_joins, "rough_poses", lambda one, other: ranked)
 
 
-@cache
 def true_map(room: int, first: int) -> TourMap:
     """The map of two stills, whose step has length 1."""
-    some, poses = frames(room), true_poses()
-    step = step_at(some[first], some[first + 1], inverse(poses[first + 1]) @ poses[first])
+    step = true_step(first, room)
     return TourMap(first, np.stack([np.eye(4), step.f1_T_f0]), [step.depths0, step.depths1])
 
 

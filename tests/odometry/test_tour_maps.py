@@ -1,14 +1,12 @@
 """Steps of tours: hypotheses by searched places, and their confirmation by three frames."""
 
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from gsba.geometry import inverse, pose, unit
-from gsba.odometry import tour_steps
 from gsba.odometry.tour_maps import (
     MAX_RIVAL_CELLS,
     MIN_CELLS,
@@ -22,16 +20,14 @@ from gsba.odometry.tour_maps import (
 )
 from gsba.odometry.tour_steps import (
     Step,
-    TourFrame,
     adjusted_pose,
     found_places,
     frame_of,
     hypotheses,
     pose_errors_deg,
-    step_at,
     step_of,
 )
-from tests.room_tour import pictures, true_poses
+from tests.room_tour import frames, true_poses, true_step
 
 NONE = np.zeros((0, 3))
 
@@ -46,26 +42,12 @@ def of_cells(cells: int, log_ratio: float = 0.0) -> Triple:
     return Triple(log_ratio, cells, NONE, NONE)
 
 
-@cache
-def frames() -> list[TourFrame]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tour_steps, "_NUM_KEYS", 300)
-        return [frame_of(picture, None) for picture in pictures()[:3]]
-
-
-@cache
-def true_step(first: int) -> Step:
-    """The step at its true pose."""
-    poses = true_poses()
-    return step_at(frames()[first], frames()[first + 1], inverse(poses[first + 1]) @ poses[first])
-
-
 def test_a_third_frame_confirms_the_true_ratio_and_no_other() -> None:
     before, after = true_step(0), true_step(1)
     positions = true_poses()[:3, :3, 3]
     lengths = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     true = np.log(lengths[1] / lengths[0])
-    assert before.num > 300
+    assert before.num > 200
     assert abs(ratios(before, after, frames()[1].keys)[0] - true) < 0.02
     first, third = frames()[0], frames()[2]
     right = triple(first, third, before, after, true)

@@ -1,32 +1,14 @@
 """Steps of stills in no order, confirmed without their own points."""
 
-from functools import cache
-
 import numpy as np
-import pytest
 from scipy.spatial.transform import Rotation
 
-from gsba.geometry import inverse
-from gsba.odometry import tour_steps
 from gsba.odometry.tour_maps import Triple
-from gsba.odometry.tour_steps import Step, TourFrame, frame_of, step_at
+from gsba.odometry.tour_steps import Step, step_at
 from gsba.odometry.tour_unordered import without_unsupported
-from tests.room_tour import pictures, true_poses
+from tests.room_tour import frames, true_poses, true_step
 
 NONE = np.zeros((0, 3))
-
-
-@cache
-def frames() -> list[TourFrame]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tour_steps, "_NUM_KEYS", 300)
-        return [frame_of(picture, None) for picture in pictures()]
-
-
-@cache
-def true_step(f: int) -> Step:
-    poses = true_poses()
-    return step_at(frames()[f], frames()[f + 1], inverse(poses[f + 1]) @ poses[f])
 
 
 def sure_triples() -> list[Triple | None]:
