@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from command import run_gsba
 from growing_home import MAX_ERROR, NUM, SMALL_EXPORTS, GrowingHome
-from tiny_run import LIGHT, SETTINGS, computed_stages
+from one_gallery import OVAL_KEYPOINTS
+from tiny_run import LIGHT, computed_stages
 from typer.testing import Result
 
 from gsba import Recording, load_run, refine_recordings
@@ -22,7 +23,12 @@ from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.types import Trajectory
 from gsba.view import load_scene
 
-SET = (*LIGHT, 'export.formats=["colmap-flat", "tum"]', "export.face_size=64")
+SET = (
+    *LIGHT,
+    f"features.max_per_face={OVAL_KEYPOINTS}",
+    'export.formats=["colmap-flat", "tum"]',
+    "export.face_size=64",
+)
 
 
 def _refine(out: Path, *arguments: object) -> Result:
@@ -107,7 +113,7 @@ def test_recordings_with_and_without_a_trajectory_are_joined(
     home: GrowingHome, tmp_path: Path
 ) -> None:
     recordings = [Recording(home.folders[0]), Recording(home.folders[1], home.trajectories[1])]
-    result = refine_recordings(recordings, tmp_path / "run", SETTINGS)
+    result = refine_recordings(recordings, tmp_path / "run", SMALL_EXPORTS)
     assert len(result.maps) == 1
     first, second = result.report["recordings"]
     assert not first["with_trajectory"] and second["with_trajectory"]
@@ -119,7 +125,7 @@ def test_recordings_with_and_without_a_trajectory_are_joined(
 
 def _refusal(out: Path, *recordings: Recording) -> str:
     with pytest.raises(GsbaError) as told:
-        refine_recordings(recordings, out, SETTINGS)
+        refine_recordings(recordings, out, SMALL_EXPORTS)
     assert not out.exists()
     return str(told.value)
 
@@ -150,7 +156,7 @@ def test_a_trajectory_of_another_recording_is_refused(home: GrowingHome, tmp_pat
         Recording(home.folders[1], path),
     )
     with pytest.raises(GsbaError, match="recording 'upper': the images contradict"):
-        refine_recordings(recordings, tmp_path / "run", SETTINGS)
+        refine_recordings(recordings, tmp_path / "run", SMALL_EXPORTS)
 
 
 @pytest.mark.parametrize(
