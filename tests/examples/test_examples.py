@@ -25,7 +25,7 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 NUM_FRAMES, WIDTH, TAG = 11, 768, 0.5
 LIGHTER = {
     "cubemap": {"min_face_size": 256, "max_face_size": 256},
-    "features": {"max_per_face": 400},
+    "features": {"max_per_face": 250},
     "weak_frames": {"mode": "off"},
     "patches": {"rounds": 0},
 }
