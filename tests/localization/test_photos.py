@@ -23,8 +23,9 @@ from gsba.similarity import pose_similarity
 from gsba.trajectory.files import read_trajectory
 
 CAMERA = PerspectiveProjection(640, 480, 430.0, (323.0, 238.0), (-0.03, 0.01))
-UPRIGHT = PerspectiveProjection(480, 640, 300.0, (241.0, 322.0), (0.02, 0.0))  # 94 degrees high
-_WIDTH = 1536  # pixels of the panoramas that photos are cut from
+SMALL = PerspectiveProjection(320, 240, 215.0, (161.5, 119.0), (-0.03, 0.01))
+UPRIGHT = PerspectiveProjection(240, 320, 150.0, (120.5, 161.0), (0.02, 0.0))  # 94 degrees high
+_WIDTH = 768  # pixels of the panoramas that photos are cut from
 
 
 @pytest.fixture(scope="module")
@@ -32,9 +33,7 @@ def taken(case: Case, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, d
     """Folder of photos, and their true poses and cameras by name."""
     folder, truth = tmp_path_factory.mktemp("photos"), {}
     rng, scene = np.random.default_rng(1), gallery()
-    for n, (frame, yaw, camera) in enumerate(
-        [(2, 20, CAMERA), (4, 110, CAMERA), (3, 300, UPRIGHT)]
-    ):
+    for n, (frame, yaw, camera) in enumerate([(2, 20, SMALL), (4, 110, SMALL), (3, 300, UPRIGHT)]):
         pose = case.truth.world_T_rigs[frame].copy()
         turn = Rotation.from_euler("yx", [yaw, -5], degrees=True)
         pose[:3, :3] = pose[:3, :3] @ turn.as_matrix()
@@ -42,9 +41,9 @@ def taken(case: Case, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, d
         image = _photographed(scene, pose, camera, rng)
         path = folder / f"photo{n}.jpg"
         tags = Image.Exif()
-        if camera is CAMERA:
+        if camera is SMALL:
             tags[0x010F], tags[0x0110] = "Maker", "Model"
-            diagonal = 430.0 * np.hypot(36, 24) / np.hypot(640, 480)
+            diagonal = SMALL.focal * np.hypot(36, 24) / np.hypot(320, 240)
             tags.get_ifd(0x8769)[0xA405] = round(diagonal)
         Image.fromarray(image).save(path, quality=95, exif=tags)
         truth[path.stem] = pose, camera
