@@ -9,15 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from export_scene import (
-    HEIGHT,
-    NUM_FRAMES,
-    WIDTH,
-    contents,
-    cube_frames,
-    panoramas,
-    reconstruction,
-)
+from export_scene import HEIGHT, NUM_FRAMES, WIDTH, contents, cube_frames, panoramas, reconstruction
 from refusals import refused
 from scipy.spatial.transform import Rotation
 from shard_jobs import Parts

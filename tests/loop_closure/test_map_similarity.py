@@ -4,12 +4,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gsba.geometry import inverse, pose
-from gsba.loop_closure.map_similarity import (
-    Meeting,
-    propose,
-    refined,
-    similarity_covariance,
-)
+from gsba.loop_closure.map_similarity import Meeting, propose, refined, similarity_covariance
 from gsba.similarity import Sim3
 
 _NUM_DRAWS = 60

@@ -6,15 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from gsba.geometry import inverse, pose, unit
 from gsba.odometry import tour_joins, tour_merging
-from gsba.odometry.tour_joins import (
-    MIN_LEAD,
-    MIN_SCORE,
-    Join,
-    TourMap,
-    is_sure,
-    join,
-    scaled,
-)
+from gsba.odometry.tour_joins import MIN_LEAD, MIN_SCORE, Join, TourMap, is_sure, join, scaled
 from gsba.odometry.tour_merging import all_joined, held
 from gsba.odometry.tour_steps import agreed_logs, pose_errors_deg
 from tests.room_tour import frames, true_poses, true_step

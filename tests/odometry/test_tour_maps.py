@@ -157,11 +157,7 @@ def test_steps_kept_make_maps_and_other_frames_are_alone() -> None:
     def step(depths0: list[float], depths1: list[float]) -> Step:
         return replace(hypothesis(), depths0=np.array(depths0), depths1=np.array(depths1))
 
-    steps = [
-        step([2, 2, 2], [1, 1, np.nan]),
-        step([0.51, 0.9, np.nan], [0.6, 0.6, 0.6]),
-        None,
-    ]
+    steps = [step([2, 2, 2], [1, 1, np.nan]), step([0.51, 0.9, np.nan], [0.6, 0.6, 0.6]), None]
     few = replace(frames()[0], keys=keys)
     one, alone = maps_of([few] * 4, steps, [of_cells(9, np.log(2)), None])
     assert (one.first, one.last, alone.first) == (0, 2, 3)

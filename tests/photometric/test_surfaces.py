@@ -6,12 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from factors import tangent_basis
 from factors.patches import Sightings, expect
-from gsba.photometric.alignment import (
-    depth_shifts,
-    shown_slopes,
-    slopes_of,
-    surface_normals,
-)
+from gsba.photometric.alignment import depth_shifts, shown_slopes, slopes_of, surface_normals
 
 STEP = 2 * np.pi / 1536
 POINT = np.array([0.4, -0.3, 2.0])  # seen from the host at the origin

@@ -77,8 +77,7 @@ def test_stills_of_each_recording_may_be_too_few_to_tell_their_order() -> None:
 
 
 @pytest.mark.parametrize(
-    ("timed", "with_trajectory", "num"),
-    [(True, False, 0), (False, True, 0), (False, False, 1)],
+    ("timed", "with_trajectory", "num"), [(True, False, 0), (False, True, 0), (False, False, 1)]
 )
 def test_recordings_with_times_or_a_trajectory_have_their_order(
     timed: bool, with_trajectory: bool, num: int
