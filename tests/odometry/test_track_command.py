@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from command import run_gsba, succeed
 from dense_walk import RenderedWalk
+from tiny_run import LIGHT
 
 from gsba.evaluate.trajectory import evaluate
 from gsba.trajectory.files import read_trajectory
@@ -105,7 +106,8 @@ def test_a_video_is_refined_from_its_own_odometry(
     video: Path, walk: RenderedWalk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "run"
-    light = ["--set", "patches.rounds=0", "--set", "features.max_per_face=300"]
+    changes = (*LIGHT, "patches.rounds=0", "features.max_per_face=300")
+    light = [word for change in changes for word in ("--set", change)]
     result = succeed("refine", video, "--masks", "none", "--out", out, *light)
     assert (out / "odometry/walk.tum").is_file() and (out / "odometry/poses.csv").is_file()
     assert "Camera path by the odometry on the video" in (out / "report.html").read_text()
