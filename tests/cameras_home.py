@@ -164,7 +164,7 @@ def make_single(home: Home, folder: Path) -> Path:
 
 def make_beside_faces(home: Home, folder: Path) -> Path:
     """A run of panoramas and, of the second recording, cube faces."""
-    out, settings = folder / "cube", oval_settings("colmap-flat")
+    out, settings = folder / "cube", oval_settings("colmap-flat", face_size=64)
     return refine_recordings([panoramas(home, 0, WIDTH), faces(home)], out, settings).out
 
 
