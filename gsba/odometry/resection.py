@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import gtsam
 import numpy as np
 
 from factors import tangent_basis
@@ -75,7 +76,7 @@ def _fitted(
         damping = 1e-9 * np.diag([1.0] * 3 + [distance**-2] * 3) * num
         tangent = -np.linalg.solve(information + damping, gradient)
         limit = 0.5 * distance / max(float(np.linalg.norm(tangent[3:])), 1e-12)
-        world_T_rig = retracted(world_T_rig, tangent * min(1.0, limit))
+        world_T_rig = gtsam.Pose3(world_T_rig).retract(tangent * min(1.0, limit)).matrix()
         small = max(np.abs(tangent[:3]).max(), np.abs(tangent[3:]).max() / distance) < _CONVERGED
         if small and step >= len(_ANNEALED):
             break
@@ -97,13 +98,6 @@ def linearised(
     residuals, jacobians, distances = np.empty((num, 2)), np.empty((num, 2, 6)), np.empty(num)
     _linearise(points_world, bases, bearings_rig, world_T_rig, residuals, jacobians, distances)
     return residuals, jacobians, distances
-
-
-def retracted(world_T_rig: np.ndarray, tangent: np.ndarray) -> np.ndarray:
-    """A pose (4, 4) moved by a tangent (6,) [rotation, translation] on its right (GTSAM's)."""
-    import gtsam
-
-    return gtsam.Pose3(world_T_rig).retract(tangent).matrix()
 
 
 @_part

@@ -24,8 +24,8 @@ from gsba.odometry.tour_order import (
     likeness,
     may_lack_order,
 )
-from gsba.odometry.tour_steps import Step, TourFrame
-from gsba.odometry.tour_unordered import match_stills, read_stills
+from gsba.odometry.tour_steps import Step, TourFrame, read_stills
+from gsba.odometry.tour_unordered import match_stills
 from gsba.pipeline import frontend
 from gsba.pipeline.run import Run
 from gsba.pipeline.state import ObservedFrames, State
@@ -73,8 +73,11 @@ def check_order(state: State, found: Recovered) -> State:
     run, frames = state.run, state.run.frames
     if not state.prior.absent or found.trust.turning_only:
         return state
-    lone = _lone_steps(found, frames.names)
-    state = replace(state, prior=replace(state.prior, lone_steps=lone))
+    # Steps across which no other frame beside them matches may lead to a place that looks alike.
+    nearest, further = _num_matches(found.neighbours.matches, len(frames))
+    lone = 1 + np.flatnonzero((nearest[1:-1] > 0) & (further[:-1] == 0) & (further[1:] == 0))
+    pairs = tuple(frames.names[f : f + 2] for f in lone.tolist())
+    state = replace(state, prior=replace(state.prior, lone_steps=pairs))
     if (
         len(frames) < (_MIN_TIMED if frames.timed else MIN_FRAMES)
         or run.store.root.absolute() in frames.paths[0][0].parents
@@ -269,14 +272,6 @@ def _num_matches(matches: Matches, num: int) -> tuple[np.ndarray, np.ndarray]:
     near = gaps <= 2
     counts[gaps[near] - 1, matches.pairs[near, 0]] = np.diff(matches.offsets)[near]
     return counts[0, : num - 1], counts[1, : num - 2]
-
-
-def _lone_steps(found: Recovered, names: Sequence[str]) -> tuple[tuple[str, str], ...]:
-    """Frames of each step across which no other frame beside it matches: it may lead to a place
-    that only looks alike."""
-    nearest, further = _num_matches(found.neighbours.matches, len(names))
-    lone = 1 + np.flatnonzero((nearest[1:-1] > 0) & (further[:-1] == 0) & (further[1:] == 0))
-    return tuple((names[f], names[f + 1]) for f in lone.tolist())
 
 
 def _with_places(state: State, tour: TourMatches) -> tuple[ObservedFrames, Matches]:
