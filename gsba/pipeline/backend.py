@@ -303,9 +303,9 @@ def reconstruct(
             result,
             formats=frames.formats,
             vertical=_vertical(state, result),
+            lens_baseline=_baseline(state, world_scale(solution, result)),
+            origin=_origin(run, result),
         )
-        baseline = _baseline(state, world_scale(solution, result))
-        result = replace(result, lens_baseline=baseline, origin=_origin(run, result))
         return result if amended is None else amended(result)
 
     return run.stage("reconstruction", run.solving_key(), compute, Reconstruction)
@@ -363,8 +363,7 @@ def _reconstruct_rotations(state: State) -> Reconstruction:
         matches = correspondences.match_for_rotations(observed.context, poses)
         tied = connectivity.within(matches, parts)
         found = tracks.build([tied], np.diff(observed.keypoints.starts))
-        given = found, observed.keypoints, poses, prior.coarse, least, parts
-        result = rotation_only.refine(*given)
+        result = rotation_only.refine(found, observed.keypoints, poses, prior.coarse, least, parts)
         return replace(result, origin=_origin(run, result))
 
     key = [run.matching_key(), least]
