@@ -247,7 +247,7 @@ def check_clock(
         guided = VerifiedPairs.joined([guided, match_anywhere(context, lost)])
     steps = image_steps(guided, context.keypoints)
     misread.refuse_misread(coarse, steps, TwoViewLimits.of(settings))
-    estimate = clock.estimate_clock(timestamps, steps, trajectory, coarse.time_offset, 10.0)  # s
+    estimate = clock.estimate_clock(timestamps, steps, trajectory, coarse.time_offset)
     rate = clock.other_rate(timestamps, steps, trajectory, estimate)
     if rate is not None:
         raise GsbaError(
