@@ -188,7 +188,6 @@ def _noise(
 
 _NEAR_FRAMES = 3  # frames to either side that do not count as far
 _STANDING_RATIO = 0.1  # of the rms step: shorter ones are of a camera that stands, and mere noise
-_ITERATIONS = 10
 
 
 def step_deviations(result: Reconstruction) -> np.ndarray:
@@ -225,7 +224,7 @@ def _resected(result: Reconstruction, frame: int, rows: np.ndarray) -> np.ndarra
     bearings, sigmas = result.observation_bearings[rows], result.observation_sigmas[rows]
     origins, world_T_rig = result.observation_origins, result.world_T_rigs[frame]
     origins = None if origins is None else origins[rows]
-    for _ in range(_ITERATIONS):
+    for _ in range(10):
         poses = np.broadcast_to(world_T_rig, (len(rows), 4, 4))
         off, by_pose, _ = bearing_residuals(poses, points, bearings, origins)
         residuals, by_pose = off / sigmas[:, None], by_pose / sigmas[:, None, None]

@@ -73,15 +73,11 @@ def estimate(rays: ObservedRays, nominal: bool = False) -> SelfCalibration:
         why = "too few points to tell what lenses are"
         return SelfCalibration(so_far, np.full(PARTS, np.nan), why, counts)
 
-    def centre_step(parts: list[SharedModel]) -> np.ndarray:
-        """Change of the centres alone, lenses held."""
-        return newton_step([each.of(slice(num, None)) for each in parts], curved=True)
+    def centres_alone(others: list[SharedModel]) -> np.ndarray:
+        centres = newton_step([each.of(slice(num, None)) for each in others], curved=True)
+        return np.r_[np.zeros(num), centres]
 
-    verdict = cross_validate(
-        systems,
-        lambda others: _step(others, off),
-        lambda others: np.r_[np.zeros(num), centre_step(others)],
-    )
+    verdict = cross_validate(systems, lambda others: _step(others, off), centres_alone)
     found, shares = _step(systems, off), verdict.shares
     reason = ""
     if so_far.fisheyes is None and not verdict.predicts:

@@ -15,7 +15,6 @@ _kernel, _part = kernel_and_part()
 _CONVERGED = 1e-6  # radians, and parts of the median distance
 _ANNEALED = (8.0, 4.0, 2.0, 1.0)  # factors on the scale of the loss in the first steps
 _GATE = 3.5  # standard deviations of an inlier
-_SAMPLE = 3  # bearings that determine a pose
 _MIN_WITNESSES = 20  # least number of witnesses: fewer may be of one moving object
 
 
@@ -49,7 +48,7 @@ def resect(
     # false matches lie anywhere within 6 degrees of their prediction
     chance = min((_GATE * sigma / np.deg2rad(6.0)) ** 2, 0.5)
     per_witness = 1 - (1 - chance) ** (len(bearings_rig) / max(num, 1))
-    needed = least_agreeing(num, per_witness, _SAMPLE, MAX_FALSE_POSES)
+    needed = least_agreeing(num, per_witness, 3, MAX_FALSE_POSES)  # 3 bearings give a pose
     significant = agreeing >= max(needed, _MIN_WITNESSES)
     spread = np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1])
     significant &= spread < 0.05 * distance  # of the position, in median distances of the points

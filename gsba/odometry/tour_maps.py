@@ -41,8 +41,6 @@ MIN_END_RANK = 120.0  # of a step at an end, which one triple holds alone: in fl
 # steps below it were off by 1 to 7 degrees
 MAX_RIVAL_CELLS = 12  # of other steps or another ratio, from which the place repeats
 MAX_RIVALLED_SHARE = 0.25  # of frames with such rivals, above which no place is believed
-_PLACE_SIGMA_RAD = 1.5e-3  # noise of a place that a search has found
-_MAX_LOG_DEVIATION = 0.15  # of depths of a key by two steps, which agree
 _LOG_SIGMA, _DIRECTION_SIGMA_RAD = 0.02, 0.01  # of confirmed ratios and steps
 
 
@@ -257,7 +255,7 @@ def _agreeing(depths: np.ndarray, others: np.ndarray) -> np.ndarray:
     """Depths (N,) of two steps that agree, or of one where the other has none; NaN = none."""
     one, other = np.where(np.isfinite(depths), depths, others), others
     other = np.where(np.isfinite(other), other, one)
-    agree = np.abs(np.log(one / other)) < _MAX_LOG_DEVIATION
+    agree = np.abs(np.log(one / other)) < 0.15  # of depths of a key by two steps, which agree
     return np.where(agree, (one + other) / 2, np.nan)
 
 
@@ -288,7 +286,7 @@ def matches_of(
             seen = np.flatnonzero(np.isfinite(found[:, 0]))
             places = sum(map(len, rays[g])) + np.arange(len(seen))
             rays[g].append(found[seen])
-            sigmas[g].append(np.full(len(seen), _PLACE_SIGMA_RAD))
+            sigmas[g].append(np.full(len(seen), 1.5e-3))  # noise of a place that a search has found
             both.append(np.column_stack([seen, places] if f < g else [places, seen]))
         pairs.append((f0, f1))
         rows.append(np.concatenate(both).astype(np.int32))

@@ -29,7 +29,6 @@ from gsba.types.records import slices
 WIDTH = 1280  # pixels across the panoramas that are searched
 _FACES = CubeRig(448, np.deg2rad(95.0))  # on which keypoints are found
 _FEATURES = FeatureSettings(max_per_face=1200)
-_SAMPLE_RAD = np.deg2rad(0.375)  # between samples of a patch, at full resolution
 _LINE_STEP_DEG = 0.35  # along epipolar lines, and between lines beside them
 MIN_PARALLAX_RAD = np.deg2rad(3.0)  # of keypoints that count for a pose
 CELLS_PER_SIDE = 6  # of 15 degrees; keypoints of one surface agree together
@@ -134,7 +133,7 @@ def found_places(
     direction = np.ascontiguousarray(f1_T_f0[:3, 3])
     step = np.deg2rad(_LINE_STEP_DEG) * scale
     beside = int(beside_deg / _LINE_STEP_DEG / scale + 0.5)
-    sample = _SAMPLE_RAD * scale
+    sample = np.deg2rad(0.375) * scale  # between samples of a patch, at full resolution
     search_patches(*pictures, _PAD, rays, rotation, direction, beside, step, sample, scores, pixels)
     found = scores > 0
     height = len(pictures[1])

@@ -108,7 +108,6 @@ def adjust_window(
 _MOVED, _MOVED_LITTLE = np.deg2rad([4.0, 1.2])  # parallax of the upper quarter of the features from
 # which initialisation is tried; the latter while features are being lost
 _MIN_POINTS = 40  # least number of independent points, in cells of 6 degrees
-_CELLS = 16
 _VERIFY = TwoViewLimits(max_error_deg=0.3)
 
 
@@ -149,7 +148,7 @@ def start_map(
     distances = np.linalg.norm(solved.points_world, axis=1)
     if len(distances) < _MIN_POINTS:
         return None
-    if witnesses(solved.points_world / distances[:, None], _CELLS) < _MIN_POINTS:
+    if witnesses(solved.points_world / distances[:, None], 16) < _MIN_POINTS:
         return None
     scale = 1 / float(np.median(distances))
     poses = solved.world_T_rigs.copy()

@@ -19,8 +19,6 @@ from gsba.types import CoarsePoses, FrameSet, PoseSource, PoseStatus, Reconstruc
 
 logger = logging.getLogger(__name__)
 
-_MAX_NAMED_FRAMES = 5  # frames whose names a note lists
-
 
 def of_trajectory(
     trust: StepChecks,
@@ -217,7 +215,7 @@ def of_frames(
 
 def named(names: Sequence[str], key: str, unit: str = "frames") -> str:
     """Names of a few frames or steps; of more, their number and the key in report.json."""
-    if len(names) <= _MAX_NAMED_FRAMES:
+    if len(names) <= 5:  # frames whose names a note lists
         return ", ".join(names)
     return f"{len(names)} {unit}, listed in report.json under {key}"
 
