@@ -178,9 +178,7 @@ class Anchors:
 
 
 def anchor(
-    world_T_rigs: np.ndarray,
-    fixes: FrameFixes,
-    maps: np.ndarray | None = None,
+    world_T_rigs: np.ndarray, fixes: FrameFixes, maps: np.ndarray | None = None
 ) -> Anchors | None:
     """Fixes carried into the world of poses (F, 4, 4), each map by a similarity of its own; None
     where no map has enough fixes of which most lie as its frames do.

@@ -239,10 +239,7 @@ def _resected(result: Reconstruction, frame: int, rows: np.ndarray) -> np.ndarra
 
 
 def step_motion(
-    before_T_rigs: np.ndarray,
-    world_T_rigs: np.ndarray,
-    covariances: np.ndarray,
-    joint: JointErrors,
+    before_T_rigs: np.ndarray, world_T_rigs: np.ndarray, covariances: np.ndarray, joint: JointErrors
 ) -> float:
     """Motion of the steps from frame to frame in their own standard deviations, rms: sqrt(mean(d^T
     C^-1 d) / 6) over all steps of known covariance C; NaN where there is none.

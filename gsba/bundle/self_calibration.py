@@ -158,10 +158,7 @@ def spread(num_lenses: int) -> np.ndarray:
 
 
 def by_lenses(
-    bearings_rig: np.ndarray,
-    shown: np.ndarray,
-    lenses: Lenses,
-    residuals: np.ndarray | None = None,
+    bearings_rig: np.ndarray, shown: np.ndarray, lenses: Lenses, residuals: np.ndarray | None = None
 ) -> np.ndarray:
     """Jacobian (O, 2, K) of residuals (O, 2) of bearings (O, 3), from observed to predicted, None =
     0, by the parameters of lenses; shown: (O, 3) directions in the panoramas.

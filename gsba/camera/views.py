@@ -270,11 +270,7 @@ class ViewCutter:
     """Cuts the views of one frame out of panoramas of it."""
 
     def __init__(
-        self,
-        views: tuple[View, ...],
-        lenses: Lenses,
-        frame: int,
-        scene: np.ndarray | None = None,
+        self, views: tuple[View, ...], lenses: Lenses, frame: int, scene: np.ndarray | None = None
     ) -> None:
         """Compute the offset from each view's rays to directions in the frame-th frame of the
         lenses, at the depths of scene points (N, 3), rig frame; None = everything is far. Rolling

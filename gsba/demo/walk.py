@@ -157,25 +157,11 @@ def _sample(path: WalkPath, num_frames: int) -> tuple[np.ndarray, np.ndarray]:
         corners = np.stack([-4.5 * np.cos(angle), -3.0 * np.sin(angle)], axis=1)
     elif path == "rectangle":
         corners = np.array(
-            [
-                [-4.4, 0],
-                [-4.4, -2.6],
-                [4.4, -2.6],
-                [4.4, 2.6],
-                [-4.4, 2.6],
-                [-4.4, 0],
-            ]
+            [[-4.4, 0], [-4.4, -2.6], [4.4, -2.6], [4.4, 2.6], [-4.4, 2.6], [-4.4, 0]]
         )
     else:  # through the passage
         corners = np.array(
-            [
-                [-4.4, 2.6],
-                [-4.4, -2.6],
-                [0, -2.6],
-                [0, 2.8],
-                [4.4, 2.8],
-                [4.4, -2.6],
-            ]
+            [[-4.4, 2.6], [-4.4, -2.6], [0, -2.6], [0, 2.8], [4.4, 2.8], [4.4, -2.6]]
         )
     spacing = 0.01
     length = _arc_length(corners)

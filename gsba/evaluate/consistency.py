@@ -99,9 +99,7 @@ def _claims(
 
 
 def consistency_of(
-    reconstruction: Reconstruction,
-    timestamps: np.ndarray,
-    truth: Trajectory,
+    reconstruction: Reconstruction, timestamps: np.ndarray, truth: Trajectory
 ) -> Consistency:
     """Compare the covariances of a map's poses with the errors of these.
 

@@ -82,10 +82,7 @@ def find_factory_lenses(folder: Path, images: Sequence[Path]) -> FactoryLenses |
 
 
 def starting_lenses(
-    folder: Path,
-    pairs: Sequence[tuple[Path, ...]],
-    size: tuple[int, int],
-    factory: FactoryLenses,
+    folder: Path, pairs: Sequence[tuple[Path, ...]], size: tuple[int, int], factory: FactoryLenses
 ) -> Pair:
     """Initial lenses of raw pairs by the maker's calibration, which leaves two questions to the
     images.

@@ -17,12 +17,7 @@ from gsba.loop_closure.map_similarity import Meeting, Proposal, propose
 from gsba.loop_closure.retrieval import global_descriptors
 from gsba.matching import recovery
 from gsba.odometry.places import KeyframePlaces, chosen_keyframes, described, make_places
-from gsba.odometry.pose_graph import (
-    Constraint,
-    close_loops,
-    covariances_of,
-    measure_steps,
-)
+from gsba.odometry.pose_graph import Constraint, close_loops, covariances_of, measure_steps
 from gsba.similarity import Sim3
 from gsba.store.shards import Workers
 

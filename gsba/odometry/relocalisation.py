@@ -41,11 +41,7 @@ def describe(layout: AtlasLayout, atlas: Atlas, usable: np.ndarray | None) -> De
 
 
 def placed(
-    key: Described,
-    frame: Described,
-    bearings: np.ndarray,
-    distances: np.ndarray,
-    seed: int,
+    key: Described, frame: Described, bearings: np.ndarray, distances: np.ndarray, seed: int
 ) -> np.ndarray | None:
     """key_T_rig (4, 4) of a frame, in the unit of the map, by keypoints of the keyframe and the
     frame; None if it is uncertain. Points of the keyframe are along unit bearings (P, 3), rig

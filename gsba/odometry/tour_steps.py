@@ -329,10 +329,7 @@ def step_of(
 ) -> Step:
     """A hypothesis with those of the places found in either frame (`found_places`) that fit it."""
     depths, rays, fitting = [], [], []
-    for frame, (rows, places), at in (
-        (one, found1, f1_T_f0),
-        (other, found0, inverse(f1_T_f0)),
-    ):
+    for frame, (rows, places), at in ((one, found1, f1_T_f0), (other, found0, inverse(f1_T_f0))):
         good, parallax, depth = fits(frame.keys[rows], places, at, 0.2)
         good &= parallax > MIN_PARALLAX_RAD
         depths.append(np.full(len(frame.keys), np.nan))

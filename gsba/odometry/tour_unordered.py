@@ -13,22 +13,8 @@ from itertools import product
 import numpy as np
 
 from factors.threads import map_in_threads
-from gsba.odometry.tour_joins import (
-    NEAR,
-    Join,
-    Joining,
-    TourMap,
-    alike,
-    scaled,
-)
-from gsba.odometry.tour_maps import (
-    KeptSteps,
-    TourMatches,
-    Triple,
-    maps_of,
-    matches_of,
-    searched,
-)
+from gsba.odometry.tour_joins import NEAR, Join, Joining, TourMap, alike, scaled
+from gsba.odometry.tour_maps import KeptSteps, TourMatches, Triple, maps_of, matches_of, searched
 from gsba.odometry.tour_merging import all_joined
 from gsba.odometry.tour_order import most_alike_path
 from gsba.odometry.tour_steps import Step, TourFrame

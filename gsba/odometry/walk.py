@@ -248,9 +248,7 @@ class Odometry:
 
 
 def track_panoramas(
-    panoramas: SmallPanoramas,
-    seed: int = 0,
-    checkpoint: Path | None = None,
+    panoramas: SmallPanoramas, seed: int = 0, checkpoint: Path | None = None
 ) -> Odometry:
     """Track a camera through a sequence, then join its maps and close its loops.
 

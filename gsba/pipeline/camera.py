@@ -40,14 +40,7 @@ from gsba.pipeline.map import Map
 from gsba.pipeline.run import Run
 from gsba.pipeline.state import State
 from gsba.trajectory.conventions import quarter_turn
-from gsba.types import (
-    CoarsePoses,
-    Keypoints,
-    PoseSource,
-    Reconstruction,
-    Sighted,
-    Solution,
-)
+from gsba.types import CoarsePoses, Keypoints, PoseSource, Reconstruction, Sighted, Solution
 
 T = TypeVar("T")
 

@@ -50,9 +50,7 @@ def fetch_where_weak(
         if not len(rows):
             break
         logger.info(
-            "the map is weak in places: %d more frames of the video, round %d",
-            len(rows),
-            n + 1,
+            "the map is weak in places: %d more frames of the video, round %d", len(rows), n + 1
         )
         folder = store.root / FOLDER / f"{n}"
         at = folder.with_suffix(".tum")

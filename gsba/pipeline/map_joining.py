@@ -18,12 +18,7 @@ from gsba.geometry import adjoint, inverse
 from gsba.localization.run_map import SAME_PLACE_RAD, SAME_PLACE_SIGMAS
 from gsba.log import GsbaError
 from gsba.loop_closure import connectivity, map_merging
-from gsba.loop_closure.map_similarity import (
-    Meeting,
-    meetings_of,
-    refined,
-    similarity_covariance,
-)
+from gsba.loop_closure.map_similarity import Meeting, meetings_of, refined, similarity_covariance
 from gsba.loop_closure.merged_map import Registered, carried
 from gsba.photometric.alignment import AlignedObservations
 from gsba.pipeline import backend, camera, frontend, inputs, patch_rounds

@@ -17,13 +17,7 @@ from gsba.loop_closure import connectivity
 from gsba.matching import recovery
 from gsba.matching.recovery import Recovered
 from gsba.odometry.tour_maps import TourMatches
-from gsba.odometry.tour_order import (
-    MIN_FRAMES,
-    Likeness,
-    in_given_order,
-    likeness,
-    may_lack_order,
-)
+from gsba.odometry.tour_order import MIN_FRAMES, Likeness, in_given_order, likeness, may_lack_order
 from gsba.odometry.tour_steps import Step, TourFrame, read_stills
 from gsba.odometry.tour_unordered import match_stills
 from gsba.pipeline import frontend

@@ -326,12 +326,7 @@ def _on_earth(
 
 
 def _require_majority(
-    path: Path,
-    used: np.ndarray,
-    off: np.ndarray,
-    frames: FrameSet,
-    rows: np.ndarray,
-    advice: str,
+    path: Path, used: np.ndarray, off: np.ndarray, frames: FrameSet, rows: np.ndarray, advice: str
 ) -> None:
     """Raise GsbaError, naming them, unless most of a file's positions (rows of frames) agree."""
     if 2 * used.sum() > len(used):

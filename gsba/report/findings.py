@@ -252,9 +252,7 @@ def notes_on_gps(content: Mapping[str, Any], num_frames: int) -> list[str]:
 
 
 def of_gyro(
-    found: Alignment,
-    steps_used: float | None,
-    readout: CameraEstimate | None,
+    found: Alignment, steps_used: float | None, readout: CameraEstimate | None
 ) -> tuple[dict[str, Any], list[str]]:
     """Clock, bias and axes of a gyro, and the share of its steps that agree with the poses.
 

@@ -55,10 +55,7 @@ class ClockEstimate:
 
 
 def estimate_clock(
-    timestamps: np.ndarray,
-    found: Steps,
-    trajectory: Trajectory,
-    offset: float,
+    timestamps: np.ndarray, found: Steps, trajectory: Trajectory, offset: float
 ) -> ClockEstimate:
     """Compare the given clock, by its offset to times (F,) of frames, with all others whose offset
     differs by up to 10 s; all in seconds."""

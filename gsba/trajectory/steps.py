@@ -186,10 +186,7 @@ def ray_depths(rays0: np.ndarray, rays1: np.ndarray, f0_T_f1: np.ndarray) -> np.
 
 
 def step_lengths(
-    slam_lengths: np.ndarray,
-    slam_sigmas: np.ndarray,
-    logs: np.ndarray,
-    sigmas: np.ndarray,
+    slam_lengths: np.ndarray, slam_sigmas: np.ndarray, logs: np.ndarray, sigmas: np.ndarray
 ) -> np.ndarray:
     """Lengths of steps that fit their measured ratios and, if consistent, the trajectory's lengths.
 
