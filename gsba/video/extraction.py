@@ -51,7 +51,6 @@ logger = logging.getLogger(__name__)
 
 TIMES = "timestamps.csv"
 _JOURNAL = "extract.partial.csv"  # frames written so far; deleted when all are written
-_JPEG_QUALITY = 95
 _MAX_BLACK_LEVEL = 16  # grey value; 99 % of the pixels of a black image are at or below it
 
 
@@ -244,7 +243,7 @@ def _encoded(picture: VideoPicture, width: int | None) -> bytes:
     if width is not None and width != pixels.shape[1]:
         height = width * pixels.shape[0] // pixels.shape[1]
         pixels = cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA)
-    return cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
+    return cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
 
 
 def _take_over(out: Path, key: str, replace: bool) -> Counts | None:

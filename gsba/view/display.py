@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 _BEFORE, _AFTER, _BAD = (217, 130, 43), (23, 105, 170), (192, 57, 43)  # colours of report.html
 _SEEN = (46, 125, 79)
 _RECORDINGS = (_AFTER, _BEFORE, _SEEN, (142, 79, 168), (160, 103, 47), (93, 125, 139))  # by turns
-_JPEG_QUALITY = 85
 
 
 class SceneView:
@@ -236,7 +235,7 @@ class SceneView:
             color=_AFTER,
             image=image,
             format="jpeg",
-            jpeg_quality=_JPEG_QUALITY,
+            jpeg_quality=85,
             wxyz=wxyz,
             position=position,
             cast_shadow=False,
