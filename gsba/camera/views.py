@@ -17,7 +17,7 @@ from gsba.camera.pictures import Picture, cube_map, lens_picture, padded_panoram
 from gsba.camera.rig import RIG_R_FACE, CubeRig
 from gsba.camera.sphere import dense_enough, low_passed, pixel_bands
 from gsba.camera.straighten import PAD
-from gsba.geometry import pose
+from gsba.geometry import pose, unit
 from gsba.log import GsbaError
 from gsba.types import FACES, PictureFormat, Reconstruction
 
@@ -54,7 +54,7 @@ class View:
         """Unit directions (..., 3), rig frame, of pixels (..., 2)."""
         xy = (pixels - self.principal) / self.focal
         rays = np.concatenate([xy, np.ones_like(xy[..., :1])], axis=-1)
-        return rays / np.linalg.norm(rays, axis=-1, keepdims=True) @ self.rig_R_view.T
+        return unit(rays) @ self.rig_R_view.T
 
     def finer(self, times: int) -> "View":
         """The view with `times` as many pixels either way."""

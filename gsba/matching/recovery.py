@@ -166,7 +166,7 @@ def unless_misguided(
     rows = np.flatnonzero(np.diff(guided.matches.pairs, axis=1)[:, 0] == 1)
     if not len(rows) or len(guided.missing(chosen)) <= _MIN_LOST_SHARE * len(chosen):
         return guided
-    tried = np.unique(np.linspace(0, len(rows) - 1, min(_NUM_TRIED_STEPS, len(rows))).astype(int))
+    tried = rows_across(len(rows), _NUM_TRIED_STEPS)
     known = guided.taken(rows[tried].tolist())
     free = match_anywhere(context, known.matches.pairs)
     ours, theirs = (image_steps(some, context.keypoints) for some in (known, free))

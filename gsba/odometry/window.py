@@ -11,7 +11,7 @@ from gsba.bundle import optimize, pose_variables, triangulate
 from gsba.bundle.adjustment import poses_of, values_of
 from gsba.bundle.optimizer import SolverOptions
 from gsba.camera.rig import witnesses
-from gsba.geometry import angles_between, nearest_rotation
+from gsba.geometry import angles_between, extent_of, nearest_rotation
 from gsba.matching.verification import relative_pose
 from gsba.trajectory.limits import TwoViewLimits
 from gsba.types import Landmarks, Tracks
@@ -86,7 +86,7 @@ def adjust_window(
     )
     keys = [pose_variables.X(k) for k in range(len(world_T_rigs))]
     block = LandmarkBlock(keys, marks.points_world, [term], RobustLoss("cauchy", 2.0), 1)
-    extent = max(float(np.linalg.norm(np.ptp(world_T_rigs[:, :3, 3], axis=0))), 1e-9)
+    extent = max(extent_of(world_T_rigs[:, :3, 3]), 1e-9)
     spread = np.array([_HELD] * 3 + [_HELD * extent] * 3)
     noise = gtsam.noiseModel.Diagonal.Sigmas(spread)
     graph = gtsam.NonlinearFactorGraph()

@@ -29,7 +29,7 @@ from gsba.store.store import PerFrame, RunStore, digest, fingerprint
 from gsba.trajectory import judgement
 from gsba.trajectory.limits import TwoViewLimits
 from gsba.trajectory.steps import image_steps
-from gsba.types import Features, FrameSet, Matches
+from gsba.types import Features, FrameSet, Matches, rows_across
 from gsba.version import __version__
 
 logger = logging.getLogger(__name__)
@@ -80,7 +80,7 @@ def check_order(state: State, found: Recovered) -> State:
     ):
         return state
     num = min(len(frames), _FRAMES_IN_ORDER)
-    begins = np.unique(np.linspace(0, len(frames) - num, _NUM_PLACES).astype(int))
+    begins = rows_across(len(frames) - num + 1, _NUM_PLACES)
 
     def in_order(first: int) -> bool:
         some = read_stills(frames.taken(np.arange(first, first + num)), run.num_threads)
@@ -241,7 +241,7 @@ def _far_match_less(state: State, num: int) -> bool:
     far = np.array(
         [(f, f + gap) for gap in range(num // 3, 2 * num // 3) for f in range(num - gap)]
     )
-    far = far[np.unique(np.linspace(0, len(far) - 1, _NUM_FAR_PAIRS).astype(int))]
+    far = far[rows_across(len(far), _NUM_FAR_PAIRS)]
     near = np.column_stack([far[:, 0], far[:, 0] + 1])
     chosen, rows = np.unique(np.concatenate([near, far]), axis=0, return_inverse=True)
     context = state.observed.context.by_search()  # of far pairs a network would take seconds each

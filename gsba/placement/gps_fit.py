@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsba.bundle.gps_factors import MAX_DRIFT_SHARE, FrameFixes
+from gsba.geometry import extent_of
 from gsba.similarity import (
     NoSimilarityError,
     Sim3,
-    extent_of,
     level_similarity,
     robust_similarity,
     similarity,

@@ -9,6 +9,7 @@ import numpy as np
 
 from gsba.bundle.gps_factors import MAX_DRIFT_SHARE, FrameFixes
 from gsba.config import GpsSettings, PlacementSettings
+from gsba.geometry import extent_of
 from gsba.log import GsbaError, brief
 from gsba.placement.frame_fixes import fixes_of_frames, read_fixes
 from gsba.placement.gps_fit import GpsFit, fit_fixes
@@ -19,7 +20,6 @@ from gsba.scans.search import Guess
 from gsba.scans.types import Scan, cloud_of
 from gsba.similarity import (
     Sim3,
-    extent_of,
     extents,
     naming,
     pose_similarity,

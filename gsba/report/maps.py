@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from gsba.geometry import extent_of
 from gsba.types import FrameSet, PoseStatus, Reconstruction, RunStart
 
 MIN_SHARE_IN_ONE_MAP = 0.9  # of a run's frames; a run with fewer in its largest map is partial
@@ -51,7 +52,7 @@ def summarize_maps(
                 int(np.count_nonzero(part.pose_statuses == PoseStatus.REFINED)),
                 len(rows) - len(first),
                 len(part.points_world),
-                float(np.linalg.norm(np.ptp(positions, axis=0))),
+                extent_of(positions),
                 tuple((frames.names[a], frames.names[b]) for a, b in zip(first, last, strict=True)),
                 (reasons[number - 1] or None) if number <= len(reasons) else None,
             )

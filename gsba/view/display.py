@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gsba.camera.views import View as Face
-from gsba.geometry import quaternion_from_rotation
+from gsba.geometry import extent_of, quaternion_from_rotation
 from gsba.log import GsbaError
 from gsba.report.report import frame_quality
 from gsba.types import PoseStatus
@@ -265,7 +265,7 @@ class SceneView:
         """Camera position from which the whole path is visible, and the middle of the path."""
         positions = self.scale * self.scene.reconstruction.world_T_rigs[:, :3, 3]
         centre = (positions.min(axis=0) + positions.max(axis=0)) / 2
-        extent = max(float(np.linalg.norm(np.ptp(positions, axis=0))), 2 * self.size)
+        extent = max(extent_of(positions), 2 * self.size)
         up = self.scene.up
         level = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
         level /= np.linalg.norm(level)
