@@ -85,11 +85,8 @@ def _verdict(report: dict[str, Any]) -> dict[str, Any] | None:
 
 
 def camera_so_far(run: Path, done: Sequence[str]) -> list[str]:
-    """Lines about the camera from the results of stages that have ended.
-
-    Args:
-        done: names of these stages, in order.
-    """
+    """Lines about the camera from the results of stages that have ended; done: names of these
+    stages, in order."""
     centres = _latest(run, done, LENS_CENTRES, LensCentres)
     if centres is None:
         return []

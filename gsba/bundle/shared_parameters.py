@@ -204,12 +204,8 @@ def models_of(
 
 def model_of(rays: ObservedRays, by_shared: BySharedParameters) -> SharedModel:
     """Model of the robust cost of points, moved to their best first, and their bearings, at a
-    solution's poses.
-
-    Args:
-        by_shared: Jacobian (O, 2, K) of bearings' residuals, from the rows (O,) of keypoints, the
-            Jacobian (O, 2, 3) by where each ray starts, and the residuals (O, 2).
-    """
+    solution's poses; by_shared: Jacobian (O, 2, K) of bearings' residuals, from the rows (O,) of
+    keypoints, the Jacobian (O, 2, 3) by where each ray starts, and the residuals (O, 2)."""
     solved = rays.solved
     return _model(weighted(rays), solved.landmarks.tracks, solved.world_T_rigs, by_shared)
 

@@ -51,11 +51,8 @@ def of_one_lens(images: str, kind: PictureFormat) -> bool:
 
 
 def seen_by(images: str, frames: FrameSet, cameras: Cameras) -> Cameras:
-    """The cameras that images of a dataset are of: one centre each, or the lenses as they are.
-
-    Args:
-        images: the setting `export.images`.
-    """
+    """The cameras that images of a dataset are of: one centre each, or the lenses as they are;
+    images: the setting `export.images`."""
     own = zip(frames.formats, cameras.lenses, strict=True)
     return cameras.with_lenses(
         [lenses if of_one_lens(images, kind) else ONE_CENTRE for kind, lenses in own]

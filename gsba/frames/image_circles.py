@@ -74,11 +74,8 @@ class CircleSearch:
 
 
 def find_circle(pictures: Sequence[np.ndarray]) -> CircleSearch:
-    """Find the image circle of a lens.
-
-    Args:
-        pictures: (h, w) uint8 each, of one lens, of one size; 5 to 10 from all over the capture.
-    """
+    """Find the image circle of a lens. `pictures`: (h, w) uint8 each, of one lens, of one size; 5
+    to 10 from all over the capture."""
     height, width = pictures[0].shape
     scale = min(1.0, 512 / max(height, width))
     size = max(round(scale * width), 8), max(round(scale * height), 8)

@@ -63,11 +63,8 @@ def measure_overlap(
 
 
 def rim_likeness(looks: Sequence[Sequence[np.ndarray]], pair: Pair) -> float:
-    """Mean correlation of both lenses' pictures around the seam, about 1 for correct lenses.
-
-    Args:
-        looks: pictures (h, w) uint8 of both lenses of each frame.
-    """
+    """Mean correlation of both lenses' pictures around the seam, about 1 for correct lenses; looks:
+    pictures (h, w) uint8 of both lenses of each frame."""
     share = min(1.0, _MAX_WIDTH_PX / pair[0].width)
     front, back = (_shrunk(lens, share) for lens in pair)
     size, sigma = (front.width, front.height), front.focal / _NUM_AROUND * np.pi

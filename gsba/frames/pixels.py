@@ -96,11 +96,8 @@ def load_faces(frames: FrameSet, f: int, gray: bool = False, size: int | None = 
 
 
 def cut_views(frames: FrameSet, f: int, cutter: ViewCutter) -> list[np.ndarray]:
-    """Images (height, width, 3) uint8 RGB of each view of frame f.
-
-    Args:
-        frames: panoramas; raw pairs and equi-angular cube maps are cut in one step.
-    """
+    """Images (height, width, 3) uint8 RGB of each view of frame f. `frames`: panoramas; raw pairs
+    and equi-angular cube maps are cut in one step."""
     kind = frames.format_of(f)
     if kind.fisheyes is not None:
         return list(cutter.cut_raw(load_raw(frames, f)))

@@ -294,10 +294,7 @@ def match_anywhere(context: MatchContext, chosen: np.ndarray, rivals: bool = Tru
 
 def match_again(context: MatchContext, found: VerifiedPairs, steps: set[int]) -> VerifiedPairs:
     """Match steps again with all keypoints along the epipolar lines found, and verify them anew.
-
-    Args:
-        steps: first frames of the steps; each keeps the pose with more inliers.
-    """
+    `steps`: first frames of the steps; each keeps the pose with more inliers."""
     chosen = [
         p
         for p, (f0, f1) in enumerate(found.matches.pairs.tolist())

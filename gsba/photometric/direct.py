@@ -64,11 +64,8 @@ class PhotometricResult:
 
 
 def check(frames: FrameSet, settings: RefineSettings) -> None:
-    """If the family is selected, refuse frames that patches cannot be sampled from.
-
-    Raises:
-        GsbaError: cube faces, or panoramas of an odd height.
-    """
+    """If the family is selected, refuse frames that patches cannot be sampled from. Raises
+    GsbaError: cube faces, or panoramas of an odd height."""
     if len({(kind.width, kind.panoramic) for kind in frames.formats}) > 1 and (
         direct := settings.direct_families()
     ):

@@ -148,11 +148,8 @@ def _doubtful_steps(state: State) -> np.ndarray:
 
 
 def merge_maps(state: State, parts: np.ndarray) -> State:
-    """Parts (F,) of the map joined where they meet, frames in none of them registered.
-
-    Raises:
-        NoPositions: without a trajectory, no three frames are in one part.
-    """
+    """Parts (F,) of the map joined where they meet, frames in none of them registered. Raises
+    NoPositions: without a trajectory, no three frames are in one part."""
     run, prior, trust, solution = state.run, state.prior, state.prior.trust, state.solution
 
     def compute() -> Registered:

@@ -221,11 +221,8 @@ def named(names: Sequence[str], key: str, unit: str = "frames") -> str:
 
 
 def notes_on_gps(content: Mapping[str, Any], num_frames: int) -> list[str]:
-    """Notes on used and false fixes.
-
-    Args:
-        content: report of the family, see `gsba.bundle.gps_factors.GpsFactors.report`.
-    """
+    """Notes on used and false fixes; content: report of the family, see
+    `gsba.bundle.gps_factors.GpsFactors.report`."""
     if not content["taken"]:
         why = (
             "most of them are further from where the images put the frames than their noise and a "

@@ -33,11 +33,8 @@ def summarize_maps(
     reconstruction: Reconstruction, frames: FrameSet, reasons: Sequence[str | None] = ()
 ) -> tuple[MapSummary, ...]:
     """Summaries of a reconstruction's maps, the largest first; frames in no map are left out.
-
-    Args:
-        reasons: reason why each map is not joined to a larger one, the largest map first; there may
-            be fewer reasons than maps.
-    """
+    `reasons`: reason why each map is not joined to a larger one, the largest map first; there may
+    be fewer reasons than maps."""
     found = []
     for number in range(1, reconstruction.num_maps + 1):
         rows = reconstruction.frames_of_map(number)

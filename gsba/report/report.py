@@ -39,11 +39,7 @@ _AXES = ("rx", "ry", "rz", "tx", "ty", "tz")  # of a pose covariance
 
 
 def source_name(pose: int, start: str) -> str:
-    """Name of the source of a frame's initial pose.
-
-    Args:
-        pose: a `PoseSource`.
-    """
+    """Name of the source of a frame's initial pose; pose: a `PoseSource`."""
     if pose in (PoseSource.SLAM, PoseSource.NONE):
         return start
     return PoseSource(pose).name.lower()
