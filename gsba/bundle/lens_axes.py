@@ -118,8 +118,7 @@ def upright(directions: np.ndarray) -> np.ndarray:
     x = np.cross([0.0, 1, 0], z)
     vertical = np.linalg.norm(x, axis=1) < 1e-3
     x[vertical] = [1.0, 0, 0]
-    y = np.cross(z, x)
-    y /= np.linalg.norm(y, axis=1, keepdims=True)
+    y = unit(np.cross(z, x))
     return np.stack([np.cross(y, z), y, z], axis=2)
 
 

@@ -23,6 +23,7 @@ from gsba.bundle.shared_parameters import (
 )
 from gsba.camera.fisheye import PARAMETERS, Rig, by_parameters, changed, difference, recalibrated
 from gsba.camera.lens import Lenses
+from gsba.geometry import unit
 from gsba.types import Counts
 
 logger = logging.getLogger(__name__)
@@ -170,8 +171,7 @@ def by_lenses(
     out = np.zeros((len(shown), 2, num_parameters(lenses.num_lenses)))
     basis, there = -tangent_basis(bearings_rig), lenses.calibrated(shown)
     if residuals is not None:
-        there = there - np.einsum("oij,oi->oj", basis, residuals)
-        there /= np.linalg.norm(there, axis=1, keepdims=True)
+        there = unit(there - np.einsum("oij,oi->oj", basis, residuals))
     facing = lenses.facing(shown, np.zeros(len(shown), int))
     for number, lens in enumerate(now(lenses)):
         part, columns = facing == number, slice(first_of(number), first_of(number + 1))
@@ -209,8 +209,7 @@ def apart(one: Lenses, other: Lenses) -> float:
     """Difference of two calibrations of raw lenses in bearings of pixels, radians rms."""
     if one.reference_calibration is None or one.fisheyes == other.fisheyes:
         return 0.0
-    places = np.random.default_rng(0).normal(size=(500, 3))
-    places /= np.linalg.norm(places, axis=1, keepdims=True)
+    places = unit(np.random.default_rng(0).normal(size=(500, 3)))
     there = recalibrated(places, now(one), now(other))
     return float(np.sqrt(np.mean(np.sum((there - places) ** 2, axis=1))))
 

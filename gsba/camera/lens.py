@@ -155,8 +155,7 @@ class Lenses:
         frame in the middle of the readout."""
         origins, seen = self.origins(directions, frames), self.calibrated(directions)
         if self.inverse_stitch_radius:
-            seen = directions - self.inverse_stitch_radius * origins
-            seen /= np.linalg.norm(seen, axis=1, keepdims=True)
+            seen = unit(directions - self.inverse_stitch_radius * origins)
         if self.readout_motion is None:
             return seen, origins
         turns, moves = self._readout_motion_at(directions, frames)

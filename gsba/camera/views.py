@@ -354,8 +354,7 @@ def _offsets(view: View, lenses: Lenses, frame: int, scene: np.ndarray | None) -
     ends = FAR_DEPTH * turned
     if scene is not None and len(scene):
         ends = lenses.origins(turned, frames) + depths_along(turned, scene)[:, None] * turned
-    shown = lenses.seeing(ends, frames)
-    shown /= np.linalg.norm(shown, axis=1, keepdims=True)
+    shown = unit(lenses.seeing(ends, frames))
     return (shown - turned).reshape(_NODES_ACROSS_FACE, _NODES_ACROSS_FACE, 3).astype(np.float32)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from gsba.bundle.map_strength import scale_sigmas
 from gsba.bundle.readout import CameraEstimate
 from gsba.bundle.stitching import Stitching
+from gsba.geometry import unit
 from gsba.imu.alignment import Alignment
 from gsba.loop_closure.merged_map import Registered
 from gsba.trajectory.clock import ClockEstimate
@@ -144,8 +145,7 @@ def clock_section(estimate: ClockEstimate) -> dict[str, Any]:
 def of_field(found: Stitching) -> dict[str, Any]:
     """Content of report.json on the stitching field."""
     field = found.field
-    rays = np.random.default_rng(0).normal(size=(2000, 3))
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    rays = unit(np.random.default_rng(0).normal(size=(2000, 3)))
     largest = np.linalg.norm(field.displacements(rays), axis=1).max()
     return {
         "taken": bool(field),

@@ -37,8 +37,7 @@ def picture(frames: FrameSet, reconstruction: Reconstruction, f: int) -> dict[st
         degrees of longitude and latitude.
     """
     rows = np.flatnonzero(reconstruction.observation_frames == f)
-    if len(rows) > _MAX_VECTORS:
-        rows = rows[rows_across(len(rows), _MAX_VECTORS)]
+    rows = rows[rows_across(len(rows), _MAX_VECTORS)]
     bearings = reconstruction.observation_bearings[rows]
     residuals = np.degrees(residuals_of_rows(reconstruction, rows))
     level = np.maximum(np.hypot(bearings[:, 0], bearings[:, 2]), 0.05)
