@@ -101,10 +101,7 @@ class BearingTerm:
 
 
 def BearingFactor(
-    pose_key: int,
-    point_key: int,
-    bearing_rig: np.ndarray,
-    noise_model: gtsam.noiseModel.Base,
+    pose_key: int, point_key: int, bearing_rig: np.ndarray, noise_model: gtsam.noiseModel.Base
 ) -> gtsam.CustomFactor:
     """One bearing observation as an ordinary GTSAM factor: the reference for the blocks.
 

@@ -186,12 +186,8 @@ class CameraSettings(_Settings):
         return self
 
     def inverse_stitch_radius(self, front: float) -> float | None:
-        """Inverse of the given stitch radius; 0 = far, None = not given.
-
-        Args:
-            front: distance of the front lens from the rig's centre, map units; the result is in
-                their inverse.
-        """
+        """Inverse of the given stitch radius; 0 = far, None = not given. `front`: distance of the
+        front lens from the rig's centre, map units; the result is in their inverse."""
         baseline = self.baseline()
         if not isinstance(self.stitch_radius_m, float) or baseline is None:
             return None if self.stitch_radius_m is None else 0.0

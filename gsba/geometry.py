@@ -116,6 +116,11 @@ def median_direction(directions: np.ndarray) -> np.ndarray:
     return median / length if length > 1e-9 else np.array([0.0, -1.0, 0.0])
 
 
+def extent_of(positions: np.ndarray) -> float:
+    """Diagonal of the box around positions (N, 3)."""
+    return float(np.linalg.norm(np.ptp(positions, axis=0)))
+
+
 def furthest(positions: np.ndarray) -> tuple[int, float]:
     """Row of the position, of (N, 3), that is furthest from the first, and its distance."""
     distances = np.linalg.norm(positions - positions[0], axis=1)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsba.geometry import nearest_rotation, pose
+from gsba.geometry import extent_of, nearest_rotation, pose
 from gsba.log import GsbaError
 from gsba.significance import MEDIAN_NORMAL_LENGTH, OUTLIER_LENGTH
 
@@ -200,11 +200,6 @@ def robust_similarity(
 def residuals_of(fit: Sim3, source: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Distances (N,) between targets and transformed sources."""
     return np.linalg.norm(fit.points(source) - target, axis=1)
-
-
-def extent_of(positions: np.ndarray) -> float:
-    """Diagonal of the box around positions (N, 3)."""
-    return float(np.linalg.norm(np.ptp(positions, axis=0)))
 
 
 def extents(positions: np.ndarray) -> np.ndarray:

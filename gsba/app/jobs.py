@@ -83,11 +83,8 @@ class AppJob:
 
 
 class Jobs:
-    """All jobs of a state folder, in order of their creation.
-
-    Args:
-        root: folder of the state, made if missing, readable by its owner alone.
-    """
+    """All jobs of a state folder, in order of their creation; root: folder of the state, made if
+    missing, readable by its owner alone."""
 
     def __init__(self, root: Path) -> None:
         self.root = root

@@ -29,11 +29,8 @@ _Task = dict[str, Any]  # a picture or facts to be made, as `pictures.answer` ta
 
 
 class Previews:
-    """Facts and pictures below a root; one process makes them, the newest wish first.
-
-    Args:
-        cache: folder of results, made if missing.
-    """
+    """Facts and pictures below a root; one process makes them, the newest wish first. `cache`:
+    folder of results, made if missing."""
 
     def __init__(self, root: Path, cache: Path) -> None:
         self._root, self._cache = root, cache

@@ -21,7 +21,6 @@ from gsba.types import rows_across
 
 T = TypeVar("T")
 
-_MAX_POINTS = 4000  # of a map from above
 _NO_MAP: dict[str, Any] = {"stage": "", "path": [], "points": [], "colors": None, "starts": []}
 _POSES, _POINTS, _COLORS = "world_T_rigs", "points_world", "point_colors"
 _MAPS, _OBSERVED, _OBSERVERS = "components", "observation_points", "observation_frames"
@@ -86,11 +85,8 @@ def _verdict(report: dict[str, Any]) -> dict[str, Any] | None:
 
 
 def camera_so_far(run: Path, done: Sequence[str]) -> list[str]:
-    """Lines about the camera from the results of stages that have ended.
-
-    Args:
-        done: names of these stages, in order.
-    """
+    """Lines about the camera from the results of stages that have ended; done: names of these
+    stages, in order."""
     centres = _latest(run, done, LENS_CENTRES, LensCentres)
     if centres is None:
         return []
@@ -165,7 +161,7 @@ def _plan(
     finite = np.isfinite(at.sum(axis=1))
     centre = np.median(at[finite], axis=0) if finite.any() else np.zeros(3)
     extent = float(np.ptp(at[finite], axis=0).max(initial=0.0)) or 1.0
-    rows = rows_across(len(points), _MAX_POINTS)
+    rows = rows_across(len(points), 4000)
     shown = (points[rows] - centre) @ axes.T if len(points) else np.zeros((0, 3))
     near = np.all(np.abs(shown) < 2 * extent, axis=1)  # NaN is not
     digits = max(0, 4 - int(np.floor(np.log10(extent))))

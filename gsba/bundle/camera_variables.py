@@ -9,13 +9,7 @@ import gtsam
 import numpy as np
 
 from factors.camera_block import CameraBlock, pixels_of, sightings_of
-from factors.camera_rows import (
-    CameraVariables,
-    LensVariables,
-    half_baseline,
-    lens_sizes,
-    vector,
-)
+from factors.camera_rows import CameraVariables, LensVariables, half_baseline, lens_sizes, vector
 from gsba.bundle import lens_axes, readout, self_calibration
 from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.pose_variables import X

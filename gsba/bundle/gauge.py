@@ -12,7 +12,6 @@ from gsba.bundle.pose_variables import X, values_of
 from gsba.similarity import Sim3
 from gsba.types import Solution
 
-_MAX_DAMPING = 1e8
 _MIN_CURVATURE = 1e-9  # least curvature that counts as determined, part of the largest
 
 
@@ -61,7 +60,7 @@ def align(families: Families, solved: Solution, maps: np.ndarray | None = None) 
         hessian, gradient = _projected(terms, poses, own, of_frames, numbers)
         curvature = np.diagonal(hessian)
         floor = _MIN_CURVATURE * max(float(curvature.max(initial=0)), 1e-300)
-        while damping < _MAX_DAMPING:
+        while damping < 1e8:
             damped = hessian + damping * np.diag(np.maximum(curvature, floor))
             step = -np.linalg.solve(damped + floor * np.eye(len(gradient)), gradient)
             of_maps = step[: 7 * len(numbers)].reshape(-1, 7)

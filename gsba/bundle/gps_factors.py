@@ -25,8 +25,9 @@ import numpy as np
 from gsba.bundle.families import Family, MapSnapshot, digest_of
 from gsba.bundle.pose_variables import X, values_of
 from gsba.bundle.trajectory_prior import LOSS_SIGMAS
+from gsba.geometry import extent_of
 from gsba.significance import MEDIAN_NORMAL_LENGTH, OUTLIER_LENGTH
-from gsba.similarity import NoSimilarityError, Sim3, extent_of, robust_similarity, similarity
+from gsba.similarity import NoSimilarityError, Sim3, robust_similarity, similarity
 
 WHITE_SHARE = 0.1  # of the variance of a fix: independent from fix to fix, the rest lasts
 # Largest ratio of the true noise of fixes to the claimed one. Claims hold under an open sky: with
@@ -178,9 +179,7 @@ class Anchors:
 
 
 def anchor(
-    world_T_rigs: np.ndarray,
-    fixes: FrameFixes,
-    maps: np.ndarray | None = None,
+    world_T_rigs: np.ndarray, fixes: FrameFixes, maps: np.ndarray | None = None
 ) -> Anchors | None:
     """Fixes carried into the world of poses (F, 4, 4), each map by a similarity of its own; None
     where no map has enough fixes of which most lie as its frames do.

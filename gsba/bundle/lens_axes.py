@@ -22,6 +22,7 @@ from gsba.bundle.shared_parameters import (
     validated,
 )
 from gsba.camera.lens import Lenses
+from gsba.geometry import unit
 from gsba.types import Counts
 
 logger = logging.getLogger(__name__)
@@ -113,12 +114,11 @@ def by_turn(lenses: Lenses) -> np.ndarray:
 
 def upright(directions: np.ndarray) -> np.ndarray:
     """Axes (F, 3, 3) whose z is a direction (F, 3), and whose x is as level as it can be."""
-    z = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    z = unit(directions)
     x = np.cross([0.0, 1, 0], z)
     vertical = np.linalg.norm(x, axis=1) < 1e-3
     x[vertical] = [1.0, 0, 0]
-    y = np.cross(z, x)
-    y /= np.linalg.norm(y, axis=1, keepdims=True)
+    y = unit(np.cross(z, x))
     return np.stack([np.cross(y, z), y, z], axis=2)
 
 
@@ -146,4 +146,4 @@ def _headings(world_T_rigs: np.ndarray) -> np.ndarray:
     local = np.einsum("fji,fj->fi", world_T_rigs[:, :3, :3], moved[nearest])
     local[:, 1] = 0
     local[np.linalg.norm(local, axis=1) == 0] = [0, 0, 1]
-    return local / np.linalg.norm(local, axis=1, keepdims=True)
+    return unit(local)

@@ -188,7 +188,6 @@ def _noise(
 
 _NEAR_FRAMES = 3  # frames to either side that do not count as far
 _STANDING_RATIO = 0.1  # of the rms step: shorter ones are of a camera that stands, and mere noise
-_ITERATIONS = 10
 
 
 def step_deviations(result: Reconstruction) -> np.ndarray:
@@ -225,7 +224,7 @@ def _resected(result: Reconstruction, frame: int, rows: np.ndarray) -> np.ndarra
     bearings, sigmas = result.observation_bearings[rows], result.observation_sigmas[rows]
     origins, world_T_rig = result.observation_origins, result.world_T_rigs[frame]
     origins = None if origins is None else origins[rows]
-    for _ in range(_ITERATIONS):
+    for _ in range(10):
         poses = np.broadcast_to(world_T_rig, (len(rows), 4, 4))
         off, by_pose, _ = bearing_residuals(poses, points, bearings, origins)
         residuals, by_pose = off / sigmas[:, None], by_pose / sigmas[:, None, None]
@@ -240,10 +239,7 @@ def _resected(result: Reconstruction, frame: int, rows: np.ndarray) -> np.ndarra
 
 
 def step_motion(
-    before_T_rigs: np.ndarray,
-    world_T_rigs: np.ndarray,
-    covariances: np.ndarray,
-    joint: JointErrors,
+    before_T_rigs: np.ndarray, world_T_rigs: np.ndarray, covariances: np.ndarray, joint: JointErrors
 ) -> float:
     """Motion of the steps from frame to frame in their own standard deviations, rms: sqrt(mean(d^T
     C^-1 d) / 6) over all steps of known covariance C; NaN where there is none.

@@ -209,10 +209,7 @@ def observation_noise(
 
 
 def _residuals(
-    points_world: np.ndarray,
-    tracks: Tracks,
-    keypoints: Keypoints,
-    world_T_rigs: np.ndarray,
+    points_world: np.ndarray, tracks: Tracks, keypoints: Keypoints, world_T_rigs: np.ndarray
 ) -> np.ndarray:
     """Residuals (O,) of the observations of points (J, 3), all of the same spread."""
     starts = np.searchsorted(tracks.points, np.arange(tracks.num_points + 1))

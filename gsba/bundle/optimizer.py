@@ -18,8 +18,6 @@ from gsba.types import Iteration, JointErrors
 
 logger = logging.getLogger(__name__)
 
-_MAX_DAMPING = 1e10
-
 
 @dataclass(frozen=True, slots=True)
 class SolverOptions:
@@ -60,7 +58,7 @@ class _Damping:
     def raised(self) -> bool:
         """Raise after a rejected step; False where it cannot go higher."""
         self.value, self.growth = self.value * self.growth, self.growth * 2.0
-        return self.value <= _MAX_DAMPING
+        return self.value <= 1e10
 
     def lower(self, ratio: float) -> None:
         """Lower after a step whose decrease was `ratio` of the predicted one."""

@@ -3,7 +3,7 @@
 import numpy as np
 
 from factors import tangent_basis
-from gsba.geometry import moved_to
+from gsba.geometry import extent_of, moved_to
 from gsba.significance import MEDIAN_ABS_NORMAL
 from gsba.types import Reconstruction
 
@@ -16,7 +16,7 @@ def point_covariances(result: Reconstruction) -> np.ndarray:
     """Covariances (J, 3, 3) of points by their observations, the poses given, map units^2."""
     poses, num = result.world_T_rigs, len(result.points_world)
     positions = poses[:, :3, 3]
-    extent = max(float(np.linalg.norm(np.ptp(positions, axis=0))), 1e-12)
+    extent = max(extent_of(positions), 1e-12)
     # before any observation, a point is known to ten extents of the map
     informations = np.tile(np.eye(3) / (10.0 * extent) ** 2, (num, 1, 1))
     for some in result.pieces():

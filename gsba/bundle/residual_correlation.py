@@ -15,8 +15,6 @@ logger = logging.getLogger(__name__)
 
 _CELLS_PER_SIDE = 3  # of 30 degrees
 _CELLS = 6 * _CELLS_PER_SIDE**2
-_MIN_OBSERVATIONS = 100  # of a frame
-_MIN_FRAMES = 3
 
 
 def variance_ratio(solution: Solution, keypoints: Keypoints, context: AdjustmentContext) -> float:
@@ -38,8 +36,8 @@ def variance_ratio(solution: Solution, keypoints: Keypoints, context: Adjustment
     for found in map_runs(work, solution.landmarks.tracks, context.num_threads):
         for target, more in zip((gradients, information, alone), found, strict=True):
             target += more
-    usable = solution.observations() >= _MIN_OBSERVATIONS
-    if np.count_nonzero(usable) < _MIN_FRAMES:
+    usable = solution.observations() >= 100  # of a frame
+    if np.count_nonzero(usable) < 3:
         return 1.0
     together = np.einsum("fci,fcj->fij", gradients[usable], gradients[usable])
     inverses = np.linalg.pinv(information[usable], hermitian=True)

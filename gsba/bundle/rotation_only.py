@@ -13,7 +13,6 @@ from gsba.types import CoarsePoses, Keypoints, PoseStatus, Reconstruction, Solut
 
 logger = logging.getLogger(__name__)
 
-_ITERATIONS = 30
 _COLUMNS = 384  # columns of the inverse computed at a time
 
 
@@ -63,7 +62,7 @@ def solve(
     bearings, sigmas = keypoints.bearings_rig[rows], keypoints.sigmas_rad[rows]
     wide, noise, weights = 10.0, 1.0, np.ones(len(rows))  # the loss is wide at the start
     system = None
-    for _ in range(_ITERATIONS):
+    for _ in range(30):
         rays = np.einsum("oij,oj->oi", rotations[found.frames], bearings)
         pulls = ((weights / sigmas**2)[:, None] * rays).T  # towards the direction of each track
         sums = np.stack([np.bincount(found.points, p, found.num_points) for p in pulls], axis=1)

@@ -23,6 +23,7 @@ from gsba.bundle.shared_parameters import (
 )
 from gsba.camera.fisheye import PARAMETERS, Rig, by_parameters, changed, difference, recalibrated
 from gsba.camera.lens import Lenses
+from gsba.geometry import unit
 from gsba.types import Counts
 
 logger = logging.getLogger(__name__)
@@ -73,15 +74,11 @@ def estimate(rays: ObservedRays, nominal: bool = False) -> SelfCalibration:
         why = "too few points to tell what lenses are"
         return SelfCalibration(so_far, np.full(PARTS, np.nan), why, counts)
 
-    def centre_step(parts: list[SharedModel]) -> np.ndarray:
-        """Change of the centres alone, lenses held."""
-        return newton_step([each.of(slice(num, None)) for each in parts], curved=True)
+    def centres_alone(others: list[SharedModel]) -> np.ndarray:
+        centres = newton_step([each.of(slice(num, None)) for each in others], curved=True)
+        return np.r_[np.zeros(num), centres]
 
-    verdict = cross_validate(
-        systems,
-        lambda others: _step(others, off),
-        lambda others: np.r_[np.zeros(num), centre_step(others)],
-    )
+    verdict = cross_validate(systems, lambda others: _step(others, off), centres_alone)
     found, shares = _step(systems, off), verdict.shares
     reason = ""
     if so_far.fisheyes is None and not verdict.predicts:
@@ -162,10 +159,7 @@ def spread(num_lenses: int) -> np.ndarray:
 
 
 def by_lenses(
-    bearings_rig: np.ndarray,
-    shown: np.ndarray,
-    lenses: Lenses,
-    residuals: np.ndarray | None = None,
+    bearings_rig: np.ndarray, shown: np.ndarray, lenses: Lenses, residuals: np.ndarray | None = None
 ) -> np.ndarray:
     """Jacobian (O, 2, K) of residuals (O, 2) of bearings (O, 3), from observed to predicted, None =
     0, by the parameters of lenses; shown: (O, 3) directions in the panoramas.
@@ -177,8 +171,7 @@ def by_lenses(
     out = np.zeros((len(shown), 2, num_parameters(lenses.num_lenses)))
     basis, there = -tangent_basis(bearings_rig), lenses.calibrated(shown)
     if residuals is not None:
-        there = there - np.einsum("oij,oi->oj", basis, residuals)
-        there /= np.linalg.norm(there, axis=1, keepdims=True)
+        there = unit(there - np.einsum("oij,oi->oj", basis, residuals))
     facing = lenses.facing(shown, np.zeros(len(shown), int))
     for number, lens in enumerate(now(lenses)):
         part, columns = facing == number, slice(first_of(number), first_of(number + 1))
@@ -216,8 +209,7 @@ def apart(one: Lenses, other: Lenses) -> float:
     """Difference of two calibrations of raw lenses in bearings of pixels, radians rms."""
     if one.reference_calibration is None or one.fisheyes == other.fisheyes:
         return 0.0
-    places = np.random.default_rng(0).normal(size=(500, 3))
-    places /= np.linalg.norm(places, axis=1, keepdims=True)
+    places = unit(np.random.default_rng(0).normal(size=(500, 3)))
     there = recalibrated(places, now(one), now(other))
     return float(np.sqrt(np.mean(np.sum((there - places) ** 2, axis=1))))
 

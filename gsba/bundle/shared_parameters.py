@@ -204,12 +204,8 @@ def models_of(
 
 def model_of(rays: ObservedRays, by_shared: BySharedParameters) -> SharedModel:
     """Model of the robust cost of points, moved to their best first, and their bearings, at a
-    solution's poses.
-
-    Args:
-        by_shared: Jacobian (O, 2, K) of bearings' residuals, from the rows (O,) of keypoints, the
-            Jacobian (O, 2, 3) by where each ray starts, and the residuals (O, 2).
-    """
+    solution's poses; by_shared: Jacobian (O, 2, K) of bearings' residuals, from the rows (O,) of
+    keypoints, the Jacobian (O, 2, 3) by where each ray starts, and the residuals (O, 2)."""
     solved = rays.solved
     return _model(weighted(rays), solved.landmarks.tracks, solved.world_T_rigs, by_shared)
 
@@ -220,11 +216,6 @@ def _model(
     by_origin = -seen.by_point @ world_T_rigs[tracks.frames, :3, :3]
     jacobian = by_shared(seen.rows, by_origin, seen.residuals)
     sums = without_points(seen, tracks, len(world_T_rigs), seen.by_pose, jacobian)
-    return _without_poses(sums, seen.curvature)
-
-
-def _without_poses(sums: Eliminated, curvature: float) -> SharedModel:
-    """Eliminate poses as well."""
     num, diagonal = len(sums.diagonal), sums.diagonal
     right = np.concatenate([sums.to_shared, sums.gradient[:, :, None]], axis=2).reshape(6 * num, -1)
     entries = np.einsum("nii->ni", diagonal)
@@ -238,7 +229,7 @@ def _without_poses(sums: Eliminated, curvature: float) -> SharedModel:
         sums.cost - 0.5 * float(coupled[-1, -1]),
         sums.shared_gradient - coupled[:-1, -1],
         sums.shared - coupled[:-1, :-1],
-        curvature,
+        seen.curvature,
     )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from gsba.bundle.families import Family, MapSnapshot, digest_of
 from gsba.bundle.pose_variables import X
 from gsba.config import PriorSettings
-from gsba.geometry import relative_steps
+from gsba.geometry import extent_of, relative_steps
 from gsba.types import GyroConstraints
 
 LOSS_SIGMAS = 2.0  # Cauchy scale: limits the pull of wrong measurements
@@ -56,7 +56,7 @@ class TrajectoryPrior(Family):
         world_T_rigs, held = self.world_T_rigs, not snapshot.gauge_held
         lengths = np.linalg.norm(np.diff(world_T_rigs[:, :3, 3], axis=0), axis=1)
         typical = float(np.median(lengths[lengths > 0])) if (lengths > 0).any() else 1.0
-        extent = max(float(np.linalg.norm(np.ptp(world_T_rigs[:, :3, 3], axis=0))), typical)
+        extent = max(extent_of(world_T_rigs[:, :3, 3]), typical)
         graph = gtsam.NonlinearFactorGraph()
         settings, spread, lengths = self.settings, self.noise, np.maximum(lengths, typical)
         steps = relative_steps(self.world_T_rigs)
@@ -132,7 +132,7 @@ class HeldPoses(Family):
     def graph(self, snapshot: MapSnapshot) -> gtsam.NonlinearFactorGraph:
         """A prior on each pose."""
         positions = self.world_T_rigs[:, :3, 3]
-        extent = max(float(np.linalg.norm(np.ptp(positions, axis=0))), 1e-12)
+        extent = max(extent_of(positions), 1e-12)
         sigmas = np.array([_SIGMA] * 3 + [_SIGMA * extent] * 3)
         noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
         graph = gtsam.NonlinearFactorGraph()

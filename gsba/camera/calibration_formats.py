@@ -35,11 +35,8 @@ def lens_of(
 ) -> Fisheye:
     """A lens built from the numbers of a file: size, focal length in pixels per radian, principal
     point in pixels, corner origin, up to four radial terms, of the odd powers from the third on,
-    and its pose (4, 4), metres; None = it is the rig.
-
-    Raises:
-        ValueError: the values are no numbers, or no lens has them.
-    """
+    and its pose (4, 4), metres; None = it is the rig. Raises ValueError: the values are no numbers,
+    or no lens has them."""
     from scipy.spatial.transform import Rotation
 
     width, height = (int(pixels) for pixels in size)
@@ -75,11 +72,7 @@ def metres_of(unit: Any) -> float:
 
 def fields_of(tree: Any, names: Sequence[str], where: str) -> list[Any]:
     """Values of named fields of a group, as JSON or YAML gives it; where: the group's name in the
-    file.
-
-    Raises:
-        ValueError: this is no group of fields, or one is missing; the message names it.
-    """
+    file. Raises ValueError: this is no group of fields, or one is missing; the message names it."""
     if not isinstance(tree, Mapping):
         raise ValueError(f"{where} is {brief(repr(tree))}, not a group of fields")
     for name in names:

@@ -137,9 +137,7 @@ class Cameras:
         return tracks.of_observations(~hidden)
 
     def _by_camera(
-        self,
-        frames: np.ndarray,
-        look: Callable[[Lenses, slice | np.ndarray], Sequence[np.ndarray]],
+        self, frames: np.ndarray, look: Callable[[Lenses, slice | np.ndarray], Sequence[np.ndarray]]
     ) -> Sequence[np.ndarray]:
         """Arrays (N, ...) of items in frames (N,), made from the rows of each camera's items."""
         if not self.of_frame:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from gsba.camera.fisheye import Rig, facing, optical_axes, pixels_of, recalibrated, rotation_of
-from gsba.geometry import pose
+from gsba.geometry import pose, unit
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,8 +155,7 @@ class Lenses:
         frame in the middle of the readout."""
         origins, seen = self.origins(directions, frames), self.calibrated(directions)
         if self.inverse_stitch_radius:
-            seen = directions - self.inverse_stitch_radius * origins
-            seen /= np.linalg.norm(seen, axis=1, keepdims=True)
+            seen = unit(directions - self.inverse_stitch_radius * origins)
         if self.readout_motion is None:
             return seen, origins
         turns, moves = self._readout_motion_at(directions, frames)
@@ -189,7 +188,7 @@ class Lenses:
         if self.readout_motion is None:
             return vectors
         for _ in range(4):  # fixed-point passes between pixel and time
-            units = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300)
+            units = unit(vectors)
             turns, moves = self._readout_motion_at(units, frames, lens)
             local = np.einsum("nij,nj->ni", np.swapaxes(turns, 1, 2), points_rig - moves)
             vectors = self._directions_in_panorama(local, frames, lens)

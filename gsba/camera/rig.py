@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gsba.geometry import unit
 from gsba.types import FACES
 
 # Rows are the face's axes (right, down, forward) in the rig frame.
@@ -41,8 +42,7 @@ class CubeRig:
     def bearings(self, pixels: np.ndarray, faces: np.ndarray | int) -> np.ndarray:
         """Unit bearings (..., 3) in the rig frame of face pixels (..., 2), corner origin."""
         xy = (np.asarray(pixels, dtype=np.float64) - self.principal) / self.focal
-        rays = np.concatenate([xy, np.ones_like(xy[..., :1])], axis=-1)
-        rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+        rays = unit(np.concatenate([xy, np.ones_like(xy[..., :1])], axis=-1))
         return np.einsum("...ij,...j->...i", RIG_R_FACE[faces], rays)
 
     def project(self, bearings_rig: np.ndarray, faces: np.ndarray | int) -> np.ndarray:

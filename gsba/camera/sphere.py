@@ -70,12 +70,9 @@ def around_seam(image: np.ndarray, columns: int) -> np.ndarray:
 
 
 def around_sphere(image: np.ndarray, pad: int, out: np.ndarray | None = None) -> np.ndarray:
-    """A panorama (h, 2h[, C]) padded by what lies beyond seam and poles on the sphere.
-
-    Args:
-        out: (h + 2 pad, 2h + 2 pad[, C]) to fill. The panorama may already be in its middle, or
-            occupy the end of its memory: no row is written over one that is still to be moved.
-    """
+    """A panorama (h, 2h[, C]) padded by what lies beyond seam and poles on the sphere; out: (h + 2
+    pad, 2h + 2 pad[, C]) to fill. The panorama may already be in its middle, or occupy the end of
+    its memory: no row is written over one that is still to be moved."""
     height, width = image.shape[:2]
     if out is None:
         shape = (height + 2 * pad, width + 2 * pad, *image.shape[2:])

@@ -17,7 +17,7 @@ from gsba.camera.pictures import Picture, cube_map, lens_picture, padded_panoram
 from gsba.camera.rig import RIG_R_FACE, CubeRig
 from gsba.camera.sphere import dense_enough, low_passed, pixel_bands
 from gsba.camera.straighten import PAD
-from gsba.geometry import pose
+from gsba.geometry import pose, unit
 from gsba.log import GsbaError
 from gsba.types import FACES, PictureFormat, Reconstruction
 
@@ -54,7 +54,7 @@ class View:
         """Unit directions (..., 3), rig frame, of pixels (..., 2)."""
         xy = (pixels - self.principal) / self.focal
         rays = np.concatenate([xy, np.ones_like(xy[..., :1])], axis=-1)
-        return rays / np.linalg.norm(rays, axis=-1, keepdims=True) @ self.rig_R_view.T
+        return unit(rays) @ self.rig_R_view.T
 
     def finer(self, times: int) -> "View":
         """The view with `times` as many pixels either way."""
@@ -270,11 +270,7 @@ class ViewCutter:
     """Cuts the views of one frame out of panoramas of it."""
 
     def __init__(
-        self,
-        views: tuple[View, ...],
-        lenses: Lenses,
-        frame: int,
-        scene: np.ndarray | None = None,
+        self, views: tuple[View, ...], lenses: Lenses, frame: int, scene: np.ndarray | None = None
     ) -> None:
         """Compute the offset from each view's rays to directions in the frame-th frame of the
         lenses, at the depths of scene points (N, 3), rig frame; None = everything is far. Rolling
@@ -358,8 +354,7 @@ def _offsets(view: View, lenses: Lenses, frame: int, scene: np.ndarray | None) -
     ends = FAR_DEPTH * turned
     if scene is not None and len(scene):
         ends = lenses.origins(turned, frames) + depths_along(turned, scene)[:, None] * turned
-    shown = lenses.seeing(ends, frames)
-    shown /= np.linalg.norm(shown, axis=1, keepdims=True)
+    shown = unit(lenses.seeing(ends, frames))
     return (shown - turned).reshape(_NODES_ACROSS_FACE, _NODES_ACROSS_FACE, 3).astype(np.float32)
 
 

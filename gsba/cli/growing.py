@@ -70,10 +70,7 @@ def merge(
 
 @command
 def remove(
-    run: Path,
-    names: list[str],
-    out: Path | None = None,
-    allow_partial: bool = False,
+    run: Path, names: list[str], out: Path | None = None, allow_partial: bool = False
 ) -> None:
     """Take recordings out of a finished run.
 

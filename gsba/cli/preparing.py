@@ -48,11 +48,7 @@ def extract(
 
 
 def _chosen_by_odometry(
-    video: Path,
-    out: Path,
-    frames: int | None,
-    fresh: bool,
-    part: tuple[float | None, float | None],
+    video: Path, out: Path, frames: int | None, fresh: bool, part: tuple[float | None, float | None]
 ) -> Path:
     """Trajectory file beside the folder of frames, with the poses of frames that odometry chose."""
     from gsba import odometry
@@ -77,10 +73,7 @@ def _chosen_by_odometry(
 
 @command
 def mask(
-    frames: Path,
-    out: Path,
-    masks: Path | None = None,
-    calibration: Path | None = None,
+    frames: Path, out: Path, masks: Path | None = None, calibration: Path | None = None
 ) -> None:
     """Find the carrier of the camera and write its mask.
 

@@ -21,11 +21,7 @@ _USAGE_ERROR: Any = typer.BadParameter.__bases__[0]  # of click, or of the copy 
 
 
 @command
-def app(
-    root: Path = Path(),
-    port: int = 8360,
-    state: Path | None = None,
-) -> None:
+def app(root: Path = Path(), port: int = 8360, state: Path | None = None) -> None:
     """Open a page in the browser to start, watch and compare runs.
 
     Runs go on when the page, this command or the terminal is closed.

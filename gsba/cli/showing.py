@@ -11,10 +11,7 @@ from gsba.log import GsbaError
 
 
 @command
-def view(
-    run: Path,
-    port: int = 8080,
-) -> None:
+def view(run: Path, port: int = 8080) -> None:
     """Show a run in the browser.
 
     The scene holds the point cloud, rigs, images, trajectories and splats.
@@ -33,10 +30,7 @@ def view(
 
 
 @command
-def info(
-    files: list[Path],
-    as_json: bool = False,
-) -> None:
+def info(files: list[Path], as_json: bool = False) -> None:
     """Describe footage or a run, and print the command to give next.
 
     The description names camera, layout, times, gyro, GPS and lenses; of a run, its inputs, result
@@ -52,9 +46,7 @@ def info(
 
 
 @command
-def doctor(
-    as_json: bool = False,
-) -> None:
+def doctor(as_json: bool = False) -> None:
     """Check the installation and suggest repairs.
 
     The exit code is 0 if everything that a run needs works, else 1; extras do not count.
@@ -71,11 +63,7 @@ def doctor(
 
 
 @command
-def plot(
-    runs: list[Path],
-    out: Path,
-    truth: Path | None = None,
-) -> None:
+def plot(runs: list[Path], out: Path, truth: Path | None = None) -> None:
     """Plot trajectories, errors and residuals of several runs."""
     from gsba.report.plots import draw, load
     from gsba.trajectory.files import read_trajectory

@@ -9,7 +9,6 @@ from scipy.sparse.csgraph import dijkstra
 
 from gsba.demo.mesh import DOWN
 
-_NUM_LEVELS = 24  # heights that are tried
 _EYE_RANGE = (0.25, 0.75)  # of the camera's height, part of the height from floor to ceiling
 
 
@@ -40,7 +39,7 @@ def free_path(
     z = np.arange(low[2] + edge / 2, high[2], edge)
     best, room = 0, None
     where = at = np.zeros((0, 0, 3))
-    for y in np.linspace(low[1], high[1], _NUM_LEVELS + 2)[1:-1]:
+    for y in np.linspace(low[1], high[1], 26)[1:-1]:
         grid = np.stack(np.meshgrid(x, np.array([y]), z, indexing="ij"), axis=-1).reshape(-1, 3)
         free = clearance(grid)
         open_ = _walkable(free, seen(grid, DOWN), seen(grid, -DOWN), edge)

@@ -7,11 +7,8 @@ Color = tuple[float, float, float]
 
 
 def noise(rng: np.random.Generator, height: int, width: int, coarsest: float = 256) -> np.ndarray:
-    """Multi-octave value noise, (height, width) float32, mean 0, standard deviation 1.
-
-    Args:
-        coarsest: cell size of the first octave in pixels; halved down to two pixels.
-    """
+    """Multi-octave value noise, (height, width) float32, mean 0, standard deviation 1. `coarsest`:
+    cell size of the first octave in pixels; halved down to two pixels."""
     out = np.zeros((height, width), np.float32)
     cell, weight = float(coarsest), 1.0
     while cell >= 2:

@@ -17,7 +17,7 @@ from gsba.compilation import compile_ahead
 from gsba.demo.degrade import degrade
 from gsba.demo.two_lenses import TwoLenses
 from gsba.disk import disk_errors, write_csv
-from gsba.geometry import pose
+from gsba.geometry import pose, unit
 from gsba.log import GsbaError, track
 from gsba.trajectory.files import write_tum
 from gsba.types import Trajectory
@@ -157,25 +157,11 @@ def _sample(path: WalkPath, num_frames: int) -> tuple[np.ndarray, np.ndarray]:
         corners = np.stack([-4.5 * np.cos(angle), -3.0 * np.sin(angle)], axis=1)
     elif path == "rectangle":
         corners = np.array(
-            [
-                [-4.4, 0],
-                [-4.4, -2.6],
-                [4.4, -2.6],
-                [4.4, 2.6],
-                [-4.4, 2.6],
-                [-4.4, 0],
-            ]
+            [[-4.4, 0], [-4.4, -2.6], [4.4, -2.6], [4.4, 2.6], [-4.4, 2.6], [-4.4, 0]]
         )
     else:  # through the passage
         corners = np.array(
-            [
-                [-4.4, 2.6],
-                [-4.4, -2.6],
-                [0, -2.6],
-                [0, 2.8],
-                [4.4, 2.8],
-                [4.4, -2.6],
-            ]
+            [[-4.4, 2.6], [-4.4, -2.6], [0, -2.6], [0, 2.8], [4.4, 2.8], [4.4, -2.6]]
         )
     spacing = 0.01
     length = _arc_length(corners)
@@ -192,7 +178,7 @@ def _sample(path: WalkPath, num_frames: int) -> tuple[np.ndarray, np.ndarray]:
         np.stack([np.interp(stops, length, x[:, k]) for k in range(2)], axis=1)
         for x in (dense, tangent)
     )
-    return at, along / np.linalg.norm(along, axis=1, keepdims=True)
+    return at, unit(along)
 
 
 def _arc_length(points: np.ndarray) -> np.ndarray:

@@ -1,9 +1,10 @@
 """Figures by matplotlib (extra `plot`), in one style and with reproducible bytes."""
 
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from itertools import cycle
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from gsba.disk import atomic_write
 from gsba.log import GsbaError
@@ -57,15 +58,11 @@ def write(
     except ImportError:
         raise NoMatplotlibError("figures need matplotlib: pip install 'gsba[plot]'") from None
 
-    def save(to: Path, metadata: dict[str, Any]) -> None:
-        figure.savefig(to, metadata=metadata)
-
     with style.context(["default", _STYLE]):
         figure = Figure(figsize=size_in, layout="constrained")
         fill(figure)
         for path in paths:
-            metadata = KINDS[path.suffix.lower()]
-            atomic_write(path, lambda to, metadata=metadata: save(to, metadata))
+            atomic_write(path, partial(figure.savefig, metadata=KINDS[path.suffix.lower()]))
 
 
 def colors() -> Iterator[str]:

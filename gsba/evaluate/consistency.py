@@ -20,7 +20,6 @@ from gsba.trajectory.association import matched_in_time
 from gsba.types import Reconstruction, Trajectory
 
 EXPECTED = 0.95  # share of sampled errors within the expected interval
-_MIN_EIGENVALUE = 1e-12  # of a correlation matrix: smaller ones are rounding errors
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +77,7 @@ def _claims(
     along = np.where(kept[:, :, None] & kept[:, None, :], along, np.eye(6))
     sigmas = np.sqrt(np.maximum(np.einsum("nii->ni", along), 1e-300))  # along the axes
     values, vectors = np.linalg.eigh(along / (sigmas[:, :, None] * sigmas[:, None, :]))
-    roots = vectors / np.sqrt(np.maximum(values, _MIN_EIGENVALUE))[:, None, :]
+    roots = vectors / np.sqrt(np.maximum(values, 1e-12))[:, None, :]
     whiteners, counts = roots @ np.swapaxes(vectors, 1, 2), kept.sum(axis=0)
 
     def measures(errors: np.ndarray) -> np.ndarray:
@@ -99,9 +98,7 @@ def _claims(
 
 
 def consistency_of(
-    reconstruction: Reconstruction,
-    timestamps: np.ndarray,
-    truth: Trajectory,
+    reconstruction: Reconstruction, timestamps: np.ndarray, truth: Trajectory
 ) -> Consistency:
     """Compare the covariances of a map's poses with the errors of these.
 

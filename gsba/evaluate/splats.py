@@ -21,12 +21,7 @@ from gsba.splat.backend import Backend
 from gsba.splat.gaussians import Gaussians, write_ply
 from gsba.splat.options import TrainingOptions
 from gsba.splat.pictures import render_views
-from gsba.splat.scene import (
-    load_faces,
-    make_views,
-    split_frames,
-    start_cloud,
-)
+from gsba.splat.scene import load_faces, make_views, split_frames, start_cloud
 from gsba.splat.scores import Distance, Score, mean_score, measure
 from gsba.splat.train import Images, Views, near_of, train
 from gsba.store.store import digest, fingerprint

@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from gsba.geometry import nearest_rotation, quaternion_from_rotation, rotation_angle
+from gsba.geometry import extent_of, nearest_rotation, quaternion_from_rotation, rotation_angle
 from gsba.log import GsbaError
 from gsba.similarity import Sim3, residuals_of, similarity
 from gsba.trajectory.association import matched_in_time
@@ -227,7 +227,7 @@ def _pair_errors(world_T_rigs: np.ndarray, true_T_rigs: np.ndarray) -> np.ndarra
     true_R_world = true_rotations @ np.swapaxes(rotations, 1, 2)
     quaternions = quaternion_from_rotation(true_R_world)
     # Pairs with a shorter baseline have no direction.
-    shortest = 1e-6 * np.linalg.norm(np.ptp(true_positions, axis=0))
+    shortest = 1e-6 * extent_of(true_positions)
     errors = []
     start = 0
     while start < num - 1:

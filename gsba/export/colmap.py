@@ -57,7 +57,17 @@ def write_colmap(data: Dataset) -> FrameWriter:
     masked = raw or has_masks(frames)
     files = [_files(data, _FLAT if flat else _BY_VIEW, own, masked) for own in names]
     if flat:
-        files = _write_flat_model(data, seen, rigs, files)
+        num_views = [len(rigs[rig]) for rig in frames.cameras.tolist()]
+        num_photos = len(data.options.photos.photos)
+        split = split_of(seen, num_views, num_photos) if data.split else None
+        if split is not None:
+            files = [split.files(own, frames) for own in files]
+        in_model, model = _names(files, frames), folder / "sparse" / "0"
+        order = None if split is None else split.numbers
+        write_model(model, seen, rigs, in_model, frames.cameras, order)
+        write_cloud(model / "points3D.ply", seen)  # INRIA's
+        if split is not None:
+            split.write_lists(folder, in_model)
     else:
         write_model(folder / "sparse" / "0", seen, rigs, _names(files, frames), frames.cameras)
         if len(rigs) == 1:
@@ -76,26 +86,6 @@ def write_colmap(data: Dataset) -> FrameWriter:
     if raw:
         return by_camera([RawPictures(own, data.options.link) for own in files], frames)
     return view_writer(data, files, views)
-
-
-def _write_flat_model(
-    data: Dataset,
-    seen: Reconstruction,
-    rigs: Sequence[Sequence[RigSensor]],
-    files: Sequence[Files],
-) -> Sequence[Files]:
-    """Write the model with INRIA's cloud, in a split's order; returns each camera's files in it."""
-    frames, num_photos = data.frames, len(data.options.photos.photos)
-    num_views = [len(rigs[rig]) for rig in frames.cameras.tolist()]
-    split = split_of(seen, num_views, num_photos) if data.split else None
-    if split is not None:
-        files = [split.files(own, frames) for own in files]
-    names, model = _names(files, frames), data.folder / "sparse" / "0"
-    write_model(model, seen, rigs, names, frames.cameras, None if split is None else split.numbers)
-    write_cloud(model / "points3D.ply", seen)
-    if split is not None:
-        split.write_lists(data.folder, names)
-    return files
 
 
 def write_colmap_erp(data: Dataset) -> FrameWriter:

@@ -19,7 +19,7 @@ from gsba.export.dataset import Dataset
 from gsba.export.pictures import Files
 from gsba.export.sensors import pinholes, project_in_rigs
 from gsba.export.split import LEFT_OUT
-from gsba.types import FrameSet, Reconstruction
+from gsba.types import Reconstruction
 
 logger = logging.getLogger(__name__)
 
@@ -52,7 +52,18 @@ def write_depths(
     """
     partial, frames = data.folder, data.frames
     which, pixels = project_in_rigs(seen, pinholes(views), frames.cameras)
-    depths, sigmas = _depths(data.reconstruction, seen, frames, views, which)
+    # Depths (O,) of observed points from the views that show them, and their standard deviations
+    poses, of_frame = seen.world_T_rigs, seen.observation_frames
+    axes, depths = np.empty((len(which), 3)), np.empty(len(which))
+    for camera, own in enumerate(views):
+        taken = frames.cameras[of_frame] == camera
+        for number, view in enumerate(own):
+            rows = np.flatnonzero(taken & (which == number))
+            world_T_view = poses[of_frame[rows]] @ view.rig_T_view
+            axes[rows] = world_T_view[:, :3, 2]
+            reaches = seen.points_world[seen.observation_points[rows]] - world_T_view[:, :3, 3]
+            depths[rows] = np.sum(reaches * axes[rows], axis=1)
+    sigmas = np.sqrt(depth_variances(data.reconstruction, axes))
     observed, num_shown, num_mapped = seen.observations_by_frame(), 0, 0
     for f, camera in enumerate(frames.cameras.tolist()):
         images = zip(views[camera], files[camera].images(frames, f), strict=True)
@@ -79,27 +90,6 @@ def write_depths(
                 num_mapped += np.count_nonzero(image_of_depths)
     more = f", {num_mapped} of them in maps" if maps else ""
     logger.info("depths of %d points in %d frames%s", num_shown, len(frames), more)
-
-
-def _depths(
-    reconstruction: Reconstruction,
-    seen: Reconstruction,
-    frames: FrameSet,
-    views: Sequence[tuple[View, ...]],
-    which: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Depths (O,) of observed points from the views (O,) that show them, and their sigmas (O,)."""
-    poses, of_frame = seen.world_T_rigs, seen.observation_frames
-    axes, depths = np.empty((len(which), 3)), np.empty(len(which))
-    for camera, own in enumerate(views):
-        taken = frames.cameras[of_frame] == camera
-        for number, view in enumerate(own):
-            rows = np.flatnonzero(taken & (which == number))
-            world_T_view = poses[of_frame[rows]] @ view.rig_T_view
-            axes[rows] = world_T_view[:, :3, 2]
-            reaches = seen.points_world[seen.observation_points[rows]] - world_T_view[:, :3, 3]
-            depths[rows] = np.sum(reaches * axes[rows], axis=1)
-    return depths, np.sqrt(depth_variances(reconstruction, axes))
 
 
 def write_map(path: Path, image: np.ndarray) -> None:

@@ -17,7 +17,6 @@ from gsba.disk import write_bytes, write_json
 logger = logging.getLogger(__name__)
 
 _DARKEST, _BRIGHTEST = 16, 245  # of 255: beyond, noise or clipping changes the brightness
-_NUM_ROUNDS = 10  # of reweighting
 _EXIF_IFD, _EXPOSURE_TIME = 0x8769, 0x829A  # tags of EXIF
 _PER_SECOND = 100_000_000  # denominator of an exposure time
 
@@ -74,7 +73,7 @@ def relative_exposures(
     labels, columns = np.unique(points[seen], return_inverse=True)
     num_points, weights = len(labels), np.ones(len(values))
     exposures = np.zeros(num_frames)
-    for _ in range(_NUM_ROUNDS if len(values) else 0):
+    for _ in range(10 if len(values) else 0):  # of reweighting
         table = csr_array((weights, (rows, columns)), (num_frames, num_points))
         per_frame = np.bincount(rows, weights, num_frames)
         per_point = np.bincount(columns, weights, num_points)

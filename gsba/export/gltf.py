@@ -20,7 +20,7 @@ from gsba.disk import write_bytes
 from gsba.export.dataset import Dataset
 from gsba.export.images import panorama_writer
 from gsba.export.pictures import Files, FrameWriter
-from gsba.geometry import CV_R_GL, quaternion_from_rotation
+from gsba.geometry import CV_R_GL, extent_of, quaternion_from_rotation
 from gsba.types import FrameSet, Reconstruction
 
 _RIG_UP = np.array([0.0, -1, 0])  # of a camera that is held level
@@ -125,7 +125,7 @@ def _perspective(reconstruction: Reconstruction) -> dict[str, float]:
     centres = reconstruction.world_T_rigs[:, :3, 3]
     extent = max(float(np.ptp(centres, axis=0).max()), 1e-3)
     things = np.concatenate([centres, reconstruction.points_world])
-    far = 10.0 * max(float(np.linalg.norm(np.ptp(things, axis=0))), extent)
+    far = 10.0 * max(extent_of(things), extent)
     aspect = 16 / 9  # width to height of Blender's scenes
     yfov = 2 * np.arctan(1 / aspect)  # vertical field, for a horizontal one of 90 degrees
     return {"yfov": yfov, "aspectRatio": aspect, "znear": 1e-4 * extent, "zfar": far}

@@ -51,11 +51,8 @@ def of_one_lens(images: str, kind: PictureFormat) -> bool:
 
 
 def seen_by(images: str, frames: FrameSet, cameras: Cameras) -> Cameras:
-    """The cameras that images of a dataset are of: one centre each, or the lenses as they are.
-
-    Args:
-        images: the setting `export.images`.
-    """
+    """The cameras that images of a dataset are of: one centre each, or the lenses as they are;
+    images: the setting `export.images`."""
     own = zip(frames.formats, cameras.lenses, strict=True)
     return cameras.with_lenses(
         [lenses if of_one_lens(images, kind) else ONE_CENTRE for kind, lenses in own]
@@ -104,6 +101,8 @@ class _CubeFaces(FrameWriter):
     link: bool
 
     def __call__(self, shown: SharedPixels) -> None:
+        import cv2
+
         from gsba.frames import cubemap
 
         f, frames, size = shown.f, shown.frames, self.size
@@ -115,7 +114,9 @@ class _CubeFaces(FrameWriter):
                 return cubemap.cut_squares(load_squares(frames, f), rig, shown.kind.correction)
             if shown.kind.panoramic:
                 return cubemap.cut_padded(shown.padded, rig, shown.room("face", (size, size, 3)))
-            return _resized(load_faces(frames, f), size)
+            how = cv2.INTER_AREA if size < shown.kind.width else cv2.INTER_CUBIC
+            faces = load_faces(frames, f)
+            return [cv2.resize(face, (size, size), interpolation=how) for face in faces]
 
         def cut_mask() -> np.ndarray:
             chosen = [FACES.index(face) for face in shown.kind.faces or FACES]
@@ -228,10 +229,3 @@ class _Stitched(_OfLenses):
             return [stitcher().stitched_mask(shown.mask)]
 
         self.write(shown, "stitched", stitched, mask, masks_differ=True)
-
-
-def _resized(faces: np.ndarray, size: int) -> np.ndarray:
-    import cv2
-
-    how = cv2.INTER_AREA if size < faces[0].shape[0] else cv2.INTER_CUBIC
-    return np.stack([cv2.resize(face, (size, size), interpolation=how) for face in faces])

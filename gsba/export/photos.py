@@ -122,9 +122,7 @@ def add_photos(data: Dataset) -> None:
         )
     for photo, pose, name, number in zip(photos.photos, poses, names, numbers, strict=True):
         image = pycolmap.Image(
-            name=name.removeprefix("images/"),
-            camera_id=first + photo.camera,
-            image_id=number + 1,
+            name=name.removeprefix("images/"), camera_id=first + photo.camera, image_id=number + 1
         )
         model.add_image_with_trivial_frame(image, rigid(inverse(pose)))
     write_in_order(model, partial / "sparse" / "0")

@@ -178,11 +178,7 @@ class _ByCamera(FrameWriter):
 
 
 def by_camera(writers: Sequence[FrameWriter], frames: FrameSet) -> FrameWriter:
-    """Writer of frames of several cameras.
-
-    Args:
-        writers: (C,) of each camera's frames.
-    """
+    """Writer of frames of several cameras; writers: (C,) of each camera's frames."""
     if len(writers) == 1:
         return writers[0]
     return _ByCamera(writers[0].files, tuple(writers), frames.camera_of_frame)

@@ -28,7 +28,12 @@ class RigSensor:
 
 def pinholes(views: Sequence[Sequence[View]]) -> list[list[RigSensor]]:
     """The cameras of each rig."""
-    return [list(map(_pinhole, own)) for own in views]
+
+    def pinhole(view: View) -> RigSensor:
+        params = (view.focal, view.focal, *view.principal)
+        return RigSensor("PINHOLE", view.width, view.height, params, view.rig_T_view)
+
+    return [list(map(pinhole, own)) for own in views]
 
 
 def raw_sensors(kind: PictureFormat, lenses: Lenses) -> list[RigSensor]:
@@ -103,8 +108,3 @@ def _project_raw(
         far = bearings @ rotation_of(sensor.fisheye)[:, 2] < np.cos(np.deg2rad(SEEN_DEG))
         which[own & far] = -1
     return which, pixels
-
-
-def _pinhole(view: View) -> RigSensor:
-    params = (view.focal, view.focal, *view.principal)
-    return RigSensor("PINHOLE", view.width, view.height, params, view.rig_T_view)

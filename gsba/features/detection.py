@@ -134,11 +134,8 @@ def _owned_pixels(rig: CubeRig) -> np.ndarray:
 
 
 def gather(frames: Iterable[Features], folder: Path | None = None) -> Keypoints:
-    """Keypoints of all frames in one record, without descriptors.
-
-    Args:
-        folder: on the disk that holds the arrays while they are used; None = they are in memory.
-    """
+    """Keypoints of all frames in one record, without descriptors. `folder`: on the disk that holds
+    the arrays while they are used; None = they are in memory."""
     lengths = [0]
 
     def columns() -> Iterator[tuple[np.ndarray, ...]]:
@@ -151,11 +148,8 @@ def gather(frames: Iterable[Features], folder: Path | None = None) -> Keypoints:
 
 
 def on_faces(keypoints: Keypoints, rig: CubeRig) -> Keypoints:
-    """Keypoints whose pixels are given on the faces of a rig, where they were on others.
-
-    Args:
-        keypoints: of frames of several runs, each on the faces of its own rig.
-    """
+    """Keypoints whose pixels are given on the faces of a rig, where they were on others; keypoints:
+    of frames of several runs, each on the faces of its own rig."""
     pixels = rig.project(keypoints.bearings_rig, keypoints.faces)
     moved = np.abs(pixels - keypoints.pixels).max(axis=1, initial=0.0) > 0.01  # pixels
     if not moved.any():

@@ -29,7 +29,6 @@ _log = logging.getLogger(__name__)
 
 FACTORY_FILE = "factory_lenses.json"  # beside the frames of a video
 INSTA360_PICTURE = ".insp"  # suffix of JPEG images with both lenses side by side
-_MAX_FILE_BYTES = 1 << 16  # largest size of FACTORY_FILE
 
 
 def factory_calibration(
@@ -83,10 +82,7 @@ def find_factory_lenses(folder: Path, images: Sequence[Path]) -> FactoryLenses |
 
 
 def starting_lenses(
-    folder: Path,
-    pairs: Sequence[tuple[Path, ...]],
-    size: tuple[int, int],
-    factory: FactoryLenses,
+    folder: Path, pairs: Sequence[tuple[Path, ...]], size: tuple[int, int], factory: FactoryLenses
 ) -> Pair:
     """Initial lenses of raw pairs by the maker's calibration, which leaves two questions to the
     images.
@@ -133,7 +129,7 @@ def _read_factory_calibration(folder: Path) -> FactoryCalibration | None:
     path = folder / FACTORY_FILE
     try:
         with path.open("rb") as file:
-            tree = json.loads(file.read(_MAX_FILE_BYTES))
+            tree = json.loads(file.read(1 << 16))  # largest size of FACTORY_FILE
         texts = {key: tree[key] for key in ("text", "camera")}
         sizes = {key: tree[key] and _two_whole(tree[key]) for key in ("sensor", "window")}
         if not all(isinstance(text, str) for text in texts.values()):

@@ -8,13 +8,15 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from gsba.geometry import unit
+from gsba.types.records import slices
+
 _DARK_OFFSET = 8.0  # grey values added before the logarithm: noise of black pixels is no edge
 _ANGLES = 2 * np.pi * (np.arange(360) + 0.5) / 360  # of rays around the middle of a picture
 _SAMPLE_STEP_PX = 0.5  # pixels along a ray
 _WINDOW_SAMPLES = 6  # samples on either side of an edge, whose means are compared
 _MIN_EDGE_GAP = 8  # samples between two edges of a ray
 _NUM_TRIALS = 3000  # circles tried, each through three edges
-_TRIALS_AT_ONCE = 250
 _MAX_REFINED_DISTANCE = 0.01  # largest distance of an edge while the circle is refined, relative
 _MIN_RADIUS, _MAX_RADIUS = 0.3, 0.72  # in units of the shorter and of the longer side
 _MAX_OFF_CENTRE = 0.15  # distance of the centre from the middle, in units of each side
@@ -72,11 +74,8 @@ class CircleSearch:
 
 
 def find_circle(pictures: Sequence[np.ndarray]) -> CircleSearch:
-    """Find the image circle of a lens.
-
-    Args:
-        pictures: (h, w) uint8 each, of one lens, of one size; 5 to 10 from all over the capture.
-    """
+    """Find the image circle of a lens. `pictures`: (h, w) uint8 each, of one lens, of one size; 5
+    to 10 from all over the capture."""
     height, width = pictures[0].shape
     scale = min(1.0, 512 / max(height, width))
     size = max(round(scale * width), 8), max(round(scale * height), 8)
@@ -152,12 +151,11 @@ def _best_circle(edges: _Edges, pictures: Sequence[np.ndarray]) -> tuple[ImageCi
     circles = _trials(edges.places, width, height)
     if not len(circles):
         return None, 0
-    scores = np.concatenate(
-        [
-            _edges_on_circles(edges.places, circles[start : start + _TRIALS_AT_ONCE]) @ edges.drops
-            for start in range(0, len(circles), _TRIALS_AT_ONCE)
-        ]
-    )
+    scores = np.empty(len(circles))
+    for some in slices(len(circles), 250):
+        x, y, radii = (circles[some, k, None] for k in range(3))
+        away = np.hypot(edges.places[:, 0] - x, edges.places[:, 1] - y)
+        scores[some] = (np.abs(away - radii) < 0.006 * radii) @ edges.drops
     best = int(np.argmax(scores))
     outer = circles[best]
     parts = circles[:, 2] / outer[2]
@@ -195,12 +193,6 @@ def _trials(places: np.ndarray, width: int, height: int) -> np.ndarray:
     return circles[good]
 
 
-def _edges_on_circles(places: np.ndarray, circles: np.ndarray) -> np.ndarray:
-    """True (C, E) where edges (E, 2) lie on circles (C, 3), within 0.6 % of the radius."""
-    away = np.hypot(places[:, 0] - circles[:, :1], places[:, 1] - circles[:, 1:2])
-    return np.abs(away - circles[:, 2:]) < 0.006 * circles[:, 2:]
-
-
 def _refined(edges: _Edges, circle: np.ndarray, width: int, height: int) -> tuple[ImageCircle, int]:
     """The circle fitted to all edges near a circle (3,), and the number of rays with such edges."""
     x, y, radius = circle
@@ -220,19 +212,14 @@ def _refined(edges: _Edges, circle: np.ndarray, width: int, height: int) -> tupl
     across, down = x + radius * np.cos(_ANGLES), y + radius * np.sin(_ANGLES)
     visible = _inside(across, down, (height, width), 2 * _BORDER_PX)
     support = min(num / max(int(np.count_nonzero(visible)), 1), 1.0)
-    sigma = _sigma(edges.places[near] - np.array([x, y]), away[near])
+    sigma = np.inf  # largest of the centre and the radius
+    if np.count_nonzero(near) > _CORRELATED_RAYS * 3:
+        jacobian = np.ones((np.count_nonzero(near), 3))
+        jacobian[:, :2] = unit(edges.places[near] - np.array([x, y]))
+        variance = _CORRELATED_RAYS * float(np.mean(away[near] ** 2))
+        covariance = variance * np.linalg.inv(jacobian.T @ jacobian + 1e-9 * np.eye(3))
+        sigma = float(np.sqrt(np.diag(covariance).max()))
     return ImageCircle(float(x), float(y), radius, support, sigma), num
-
-
-def _sigma(away: np.ndarray, residuals: np.ndarray) -> float:
-    """Largest standard deviation of centre and radius, pixels, by edges (E, 2) from the centre."""
-    if len(away) <= _CORRELATED_RAYS * 3:
-        return float("inf")
-    units = away / np.linalg.norm(away, axis=1, keepdims=True)
-    jacobian = np.column_stack([units, np.ones(len(units))])
-    variance = _CORRELATED_RAYS * float(np.mean(residuals**2))
-    covariance = variance * np.linalg.inv(jacobian.T @ jacobian + 1e-9 * np.eye(3))
-    return float(np.sqrt(np.diag(covariance).max()))
 
 
 def _contrast(pictures: Sequence[np.ndarray], circle: np.ndarray) -> float:

@@ -15,7 +15,6 @@ _NUM_AROUND = 720  # places along the seam
 _OVERLAP_RAD = np.deg2rad(np.arange(-4.0, 4.5, 1.0))  # angles from the seam
 _SCALES = 100.0 / np.arange(90.0, 112.25, 0.5)[::-1]  # of focal lengths: circles of 90 to 112
 # degrees from the axis, where they are taken for 100
-_MIN_ROWS = 5  # least number of rows of _OVERLAP_RAD inside both image circles
 _PEAK_HALF_WIDTH = 5  # steps of _SCALES on either side of the peak, where the correlation must be
 # lower
 
@@ -48,7 +47,7 @@ def measure_overlap(
         plain = replace(_scaled(front, scale), rotation=(0.0, 0.0, 0.0))
         reach = np.linalg.norm(project(plain, meridian) - np.asarray(front.principal), axis=1)
         ring = _rings(np.pi / 2 + _OVERLAP_RAD[reach < 0.985 * min(radii)])
-        if len(ring) < _MIN_ROWS:
+        if len(ring) < 5:  # least number of rows of _OVERLAP_RAD inside both image circles
             continue
         ahead = _harmonics(fronts, _scaled(front, scale), ring)
         for t, lens in enumerate(behind):
@@ -64,11 +63,8 @@ def measure_overlap(
 
 
 def rim_likeness(looks: Sequence[Sequence[np.ndarray]], pair: Pair) -> float:
-    """Mean correlation of both lenses' pictures around the seam, about 1 for correct lenses.
-
-    Args:
-        looks: pictures (h, w) uint8 of both lenses of each frame.
-    """
+    """Mean correlation of both lenses' pictures around the seam, about 1 for correct lenses; looks:
+    pictures (h, w) uint8 of both lenses of each frame."""
     share = min(1.0, _MAX_WIDTH_PX / pair[0].width)
     front, back = (_shrunk(lens, share) for lens in pair)
     size, sigma = (front.width, front.height), front.focal / _NUM_AROUND * np.pi

@@ -9,7 +9,8 @@ import numpy as np
 
 from gsba.camera.straighten import straightened
 from gsba.frames.dual_fisheye import clear_of_seam
-from gsba.frames.files import IMAGE_SUFFIXES, decode, image_size, is_image
+from gsba.frames.files import decode, image_size, is_image
+from gsba.frames.times import stem_of
 from gsba.log import GsbaError
 from gsba.types import FrameSet
 
@@ -37,7 +38,7 @@ def find_masks(
     if masks is None:
         return (None,) * len(names)
     if masks.is_dir():
-        by_name = {_frame_name(path): path for path in sorted(masks.iterdir()) if is_image(path)}
+        by_name = {stem_of(path.stem): path for path in sorted(masks.iterdir()) if is_image(path)}
         missing = [name for name in names if name not in by_name]
         if missing:
             raise GsbaError(
@@ -135,9 +136,3 @@ def _levels_in(path: Path, size: tuple[int, int], written: int | None) -> np.nda
         raise GsbaError(f"{path}: mask holds 0 and 1; write 255 for pixels to be used")
     values.setflags(write=False)
     return values
-
-
-def _frame_name(path: Path) -> str:
-    """`NAME` of `NAME.png` and of `NAME.jpg.png`."""
-    inner = Path(path.stem)
-    return inner.stem if inner.suffix.lower() in IMAGE_SUFFIXES else path.stem

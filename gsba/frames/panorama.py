@@ -48,7 +48,8 @@ def load_grey(frames: FrameSet, frame: int, width: int) -> tuple[np.ndarray, np.
     faces[present] = load_faces(frames, frame, gray=True, size=size)
     joined = 4 * size
     maps, owners = _erp_maps(size, joined)
-    atlas = np.block([[left, right] for left, right in _padded(faces).reshape(3, 2, *_shape(size))])
+    side = size + 2 * _PADDING_PX
+    atlas = np.block(list(map(list, _padded(faces).reshape(3, 2, side, side))))
     grey = cv2.remap(atlas, maps[0], maps[1], cv2.INTER_CUBIC)
     usable = np.isin(owners, present)
     if mask is not None:
@@ -124,11 +125,6 @@ def fit_mask(mask: np.ndarray, width: int) -> np.ndarray:
     return share > 0.999
 
 
-def _shape(size: int) -> tuple[int, int]:
-    """Height and width of a padded face."""
-    return size + 2 * _PADDING_PX, size + 2 * _PADDING_PX
-
-
 @functools.lru_cache(maxsize=2)
 def _erp_maps(size: int, width: int) -> tuple[np.ndarray, np.ndarray]:
     """Places (2, H, W) float32, OpenCV pixels, in the padded owner faces, which lie in two columns
@@ -138,7 +134,8 @@ def _erp_maps(size: int, width: int) -> tuple[np.ndarray, np.ndarray]:
     for rows, bearings in erp_bands(np.arange(width), width):
         owners[rows] = owner_faces(bearings)
         pixels = rig.project(bearings, owners[rows])
-        corners = np.stack([owners[rows] % 2, owners[rows] // 2], axis=-1) * _shape(size)
+        corners = np.stack([owners[rows] % 2, owners[rows] // 2], axis=-1).astype(int)
+        corners *= size + 2 * _PADDING_PX
         maps[:, rows] = np.moveaxis(pixels - 0.5 + _PADDING_PX + corners, -1, 0)
     return maps, owners
 

@@ -41,11 +41,8 @@ _MIN_CONTRAST = 6.0  # grey levels between far columns; with less, noise is comp
 
 def unlike_panorama(greys: Iterable[np.ndarray]) -> str:
     """Name of what 2:1 pictures hold instead of panoramas; "" = nothing speaks against panoramas.
-
-    Args:
-        greys: (h, w) uint8 each, of one sequence; NUM_LOOKS suffice, and fewer are taken if the
-            first one is clearly a panorama. Those narrower than 512 pixels are not judged.
-    """
+    `greys`: (h, w) uint8 each, of one sequence; NUM_LOOKS suffice, and fewer are taken if the first
+    one is clearly a panorama. Those narrower than 512 pixels are not judged."""
     found = list[tuple[float, ...]]()
     for grey in greys:
         # noise of smaller pictures is not averaged

@@ -10,7 +10,7 @@ from gsba.camera.straighten import PAD, straightened, straightened_inside
 from gsba.camera.views import ViewCutter
 from gsba.frames.dual_fisheye import load_joined, load_raw
 from gsba.frames.files import decode
-from gsba.frames.track_pairs import load_panorama, load_squares
+from gsba.frames.track_pairs import load_squares, panorama_of
 from gsba.types import FrameSet
 
 
@@ -39,15 +39,16 @@ def load_erp(frames: FrameSet, f: int, gray: bool = False, width: int | None = N
         frames: panoramas.
         width: pixels across, even: wider frames are averaged down to it.
     """
-    kind = frames.format_of(f)
     import cv2
 
+    kind = frames.format_of(f)
     if not kind.panoramic:
         raise ValueError("load_erp needs equirectangular frames")
     if kind.fisheyes is not None:
         return load_joined(frames, f, gray, min(width or kind.width, kind.width))
     if kind.tracks is not None:
-        return load_panorama(frames, f, gray, min(width or kind.width, kind.width))
+        faces = load_squares(frames, f, gray)
+        return panorama_of(faces, min(width or kind.width, kind.width), kind.correction)
     erp = decode(frames.paths[f][0], (kind.width, kind.height), gray, at_least=width)
     if width is not None and width < erp.shape[1]:
         erp = cv2.resize(erp, (width, width // 2), interpolation=cv2.INTER_AREA)
@@ -95,11 +96,8 @@ def load_faces(frames: FrameSet, f: int, gray: bool = False, size: int | None = 
 
 
 def cut_views(frames: FrameSet, f: int, cutter: ViewCutter) -> list[np.ndarray]:
-    """Images (height, width, 3) uint8 RGB of each view of frame f.
-
-    Args:
-        frames: panoramas; raw pairs and equi-angular cube maps are cut in one step.
-    """
+    """Images (height, width, 3) uint8 RGB of each view of frame f. `frames`: panoramas; raw pairs
+    and equi-angular cube maps are cut in one step."""
     kind = frames.format_of(f)
     if kind.fisheyes is not None:
         return list(cutter.cut_raw(load_raw(frames, f)))

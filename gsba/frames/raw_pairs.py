@@ -196,10 +196,7 @@ def _calibrated(
     folder: Path, chosen: Sequence[Sequence[Path]], size: tuple[int, int], calibration: Path
 ) -> tuple[Rig, bool]:
     """Lenses of a calibration; a pair that pictures contradict is rescaled, and True (to estimate).
-
-    Args:
-        chosen: files of some frames, as for `decode_pair`.
-    """
+    `chosen`: files of some frames, as for `decode_pair`."""
     known, num = scaled_to_size(read_calibration(calibration), size, calibration), len(chosen[0])
     if len(known) != num:
         raise GsbaError(

@@ -118,12 +118,6 @@ def load_squares(frames: FrameSet, f: int, gray: bool = False) -> np.ndarray:
     return _decoded(frames.paths[f], kind.tracks, gray)
 
 
-def load_panorama(frames: FrameSet, f: int, gray: bool, width: int) -> np.ndarray:
-    """Panorama (width / 2, width[, 3]) uint8 of frame f, with the frames' correction."""
-    kind = frames.format_of(f)
-    return panorama_of(load_squares(frames, f, gray), width, kind.correction)
-
-
 def panorama_of(faces: np.ndarray, width: int, correction: tuple[float, ...] = ()) -> np.ndarray:
     """Panorama (width / 2, width[, 3]) uint8 of upright squares (6, S, S[, 3]) uint8."""
     faces = shrunk(faces, max(round(width / 4), 1))

@@ -13,12 +13,7 @@ import numpy as np
 from gsba.containers.insta360 import STANDARD_GRAVITY
 from gsba.geometry import median_direction, nearest_rotation, pose
 from gsba.imu.readings import Readings, Sensor
-from gsba.trajectory.clock import (
-    MIN_STEPS,
-    MIN_TURNS,
-    Clock,
-    simplest,
-)
+from gsba.trajectory.clock import MIN_STEPS, MIN_TURNS, Clock, simplest
 from gsba.trajectory.clock_search import LOSS_WIDTH_SIGMAS, ClockFit, Turns, merged, noise
 from gsba.types import Counts, GyroConstraints, Trajectory
 

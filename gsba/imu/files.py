@@ -162,11 +162,7 @@ def _name_and_unit(name: str) -> tuple[str, str]:
 
 
 def _checked(
-    path: Path,
-    times: np.ndarray,
-    rates: np.ndarray,
-    forces: np.ndarray | None,
-    where: list[str],
+    path: Path, times: np.ndarray, rates: np.ndarray, forces: np.ndarray | None, where: list[str]
 ) -> Readings:
     """Readings, checked to be usable; `where` names each."""
     if len(times) < _MIN_READINGS:

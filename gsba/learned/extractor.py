@@ -17,11 +17,8 @@ _SIZE_MULTIPLE_PX = 32  # of network inputs, which are halved several times
 def make_extractor(
     settings: FeatureSettings, weights: Mapping[str, Path]
 ) -> Callable[[], Extractor]:
-    """Factory of the extractor for each frame: SIFT, or a learned network.
-
-    Args:
-        weights: files of learned networks (`find_weights`).
-    """
+    """Factory of the extractor for each frame: SIFT, or a learned network; weights: files of
+    learned networks (`find_weights`)."""
     if settings.extractor == "sift":
         return functools.partial(SiftExtractor, settings)
     return functools.partial(LearnedExtractor, settings, weights["features"])

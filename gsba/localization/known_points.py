@@ -9,7 +9,7 @@ import numpy as np
 from factors import Block, PoseSystem, RobustLoss, tangent_basis
 from gsba.bundle.adjustment import MIN_NOISE
 from gsba.bundle.optimizer import SolverOptions, marginal_covariances, optimize
-from gsba.bundle.pose_variables import X
+from gsba.bundle.pose_variables import X, values_of
 from gsba.camera.projections import Projection
 from gsba.types.records import with_rows
 
@@ -219,9 +219,7 @@ def fit(
 ) -> PoseFit:
     """Minimise the robust residuals of sightings over poses (P, 4, 4) and cameras (C) with priors,
     in rounds of loss `scales`; many sightings may be false."""
-    values, graph = gtsam.Values(), gtsam.NonlinearFactorGraph()
-    for p, start in enumerate(starts):
-        values.insert(X(p), gtsam.Pose3(start))
+    values, graph = values_of(starts), gtsam.NonlinearFactorGraph()
     for c, (projection, prior) in enumerate(zip(projections, priors, strict=True)):
         values.insert(K(c), _no_step(projection))
         noise = gtsam.noiseModel.Diagonal.Sigmas(prior.sigmas)

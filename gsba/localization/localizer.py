@@ -247,8 +247,8 @@ class Localizer:
         usual = self.usual.of_camera(camera)
         evidence = self.surroundings.evidence(query, world_T_rig, usual)
         agreeing = with_rows(candidates, fitted.inliers[0])
-        given = world_T_rig, agreeing.points_world, agreeing.bearings, evidence
-        return frame, PlacedPose.of(*given)
+        points, bearings = agreeing.points_world, agreeing.bearings
+        return frame, PlacedPose.of(world_T_rig, points, bearings, evidence)
 
     def with_map_error(self, frame: LocalizedFrame) -> LocalizedFrame:
         """The frame with the uncertainty of the map around it, which its nearest keyframe has."""

@@ -26,7 +26,6 @@ logger = logging.getLogger(__name__)
 T = TypeVar("T")
 
 _LEVELS = 127  # of a component of a stored descriptor, to either side of zero
-_MIN_ROWS = 8  # keypoints without which a face has no descriptor
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +94,7 @@ def make_index(map_: RunMap) -> PlaceIndex:
         owners = cells_of(found.bearings.astype(np.float64), 1)
         for face in range(len(FACES)):
             own = found.descriptors[owners == face]
-            if len(own) >= _MIN_ROWS:
+            if len(own) >= 8:  # keypoints without which a face has no descriptor
                 faces[f, face], face_scales[f, face] = _quantised(aggregate(own, words))
     return PlaceIndex(words, panoramas, faces, scales, face_scales)
 

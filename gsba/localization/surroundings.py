@@ -128,7 +128,8 @@ def open_rates(
 
     def rates_of_camera(camera: int) -> tuple[FindingRates, FindingRates, int]:
         """Rates of a camera's panoramas, of photos by its frames, and pixels across faces."""
-        frames, rig = _some(np.flatnonzero(map_.frames.cameras == camera)), rigs[camera]
+        rows, rig = np.flatnonzero(map_.frames.cameras == camera), rigs[camera]
+        frames = rows[rows_across(len(rows), 16)].tolist()
         own = cubemap.rig_for(map_.frames.formats[camera], map_.settings.cubemap)
         stored = [query_of(map_.load_features(f), camera, own) for f in frames]
         as_stored = surroundings.rates(frames, stored)
@@ -152,12 +153,6 @@ def open_rates(
 
     path = index_path(map_.root).with_name("rates.npz")
     return load_or_make(map_, path, PictureRates, measure)
-
-
-def _some(frames: np.ndarray) -> list[int]:
-    """At most 16 of the frames (N,), evenly."""
-    chosen = rows_across(len(frames), 16)
-    return [int(f) for f in frames[chosen]]
 
 
 def is_look_alike(evidence: JoinEvidence) -> bool:

@@ -11,7 +11,6 @@ from gsba.similarity import Sim3
 from gsba.trajectory.steps import ray_depths
 from gsba.types import Keypoints, VerifiedPairs
 
-_MIN_SHARED_POINTS = 8  # points of a pair that either map must hold
 MIN_AGREEING = 3  # least number of pairs
 _REACH = 4  # steps of the map before or after a break that tell how fast the camera moves
 # Slowest and fastest motion over a break, in the median of these steps: other bays are elsewhere.
@@ -127,7 +126,7 @@ def _step_length(known: np.ndarray, depths: np.ndarray) -> float | None:
     """Length of a step in a map's unit, by points (m, 3) and depths (m,); None = uncertain."""
     logs = np.log(np.linalg.norm(known, axis=1) / depths)
     logs = logs[np.isfinite(logs)]
-    if len(logs) < _MIN_SHARED_POINTS:
+    if len(logs) < 8:  # points of a pair that either map must hold
         return None
     middle = float(np.median(logs))
     sigma = 1.25 * 1.4826 * float(np.median(np.abs(logs - middle))) / np.sqrt(len(logs))

@@ -99,10 +99,7 @@ class JoinTest:
         return meetings_of(self.known, matches, outside, f0_T_f1s)
 
     def _judged(
-        self,
-        proposal: Proposal,
-        groups: Sequence[np.ndarray],
-        known: Sequence[Proposal],
+        self, proposal: Proposal, groups: Sequence[np.ndarray], known: Sequence[Proposal]
     ) -> Judged | None:
         """The proposal tested by frames of both sides; None if it leads to a known one's place."""
         (f, g), move = proposal.frames, proposal.move
@@ -114,10 +111,7 @@ class JoinTest:
         return found
 
     def _settled(
-        self,
-        proposal: Proposal,
-        groups: Sequence[np.ndarray],
-        known: Sequence[Proposal],
+        self, proposal: Proposal, groups: Sequence[np.ndarray], known: Sequence[Proposal]
     ) -> Judged | None:
         """The proposal refined until it settles; None once it leads to a known one's place."""
         rows, inside = groups

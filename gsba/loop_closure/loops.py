@@ -11,7 +11,7 @@ from scipy.sparse import csr_matrix
 from scipy.spatial import KDTree
 
 from factors.threads import map_in_threads
-from gsba.bundle.pose_variables import X
+from gsba.bundle.pose_variables import X, values_of
 from gsba.config import RefineSettings
 from gsba.geometry import inverse, relative_steps, rotation_angle
 from gsba.loop_closure import join_evidence
@@ -43,9 +43,7 @@ def path(
 ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, gtsam.noiseModel.Base]:
     """A pose graph of the steps of poses (F, 4, 4), its first fixed, its values, and a loop's
     noise; steps `unseen` (F - 1,) bool without matches give way first."""
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    for f, world_T_rig in enumerate(world_T_rigs):
-        values.insert(X(f), gtsam.Pose3(world_T_rig))
+    graph, values = gtsam.NonlinearFactorGraph(), values_of(world_T_rigs)
     graph.add(gtsam.PriorFactorPose3(X(0), gtsam.Pose3(world_T_rigs[0]), _noise_model(1e-6, 1e-6)))
     steps = relative_steps(world_T_rigs)
     lengths = np.linalg.norm(steps[:, :3, 3], axis=1)

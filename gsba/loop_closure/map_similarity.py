@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsba.geometry import inverse, rotation_angle
+from gsba.geometry import inverse, rotation_angle, unit
 from gsba.loop_closure.loops import AGREE, AGREE_DEG
 from gsba.similarity import (
     Sim3,
@@ -218,13 +218,8 @@ def _residuals_of(meetings: list[Meeting], poses: np.ndarray) -> Callable[[Sim3]
 
     def residuals(move: Sim3) -> np.ndarray:
         there, back = move.points(own), move.points_back(theirs)
-        seen = _bearings(there, their_seers) - _bearings(theirs, their_seers)
-        sent = _bearings(back, own_seers) - _bearings(own, own_seers)
+        seen = unit(there - their_seers) - unit(theirs - their_seers)
+        sent = unit(back - own_seers) - unit(own - own_seers)
         return np.concatenate([seen, sent])
 
     return residuals
-
-
-def _bearings(points: np.ndarray, seers: np.ndarray) -> np.ndarray:
-    rays = points - seers
-    return rays / np.linalg.norm(rays, axis=1, keepdims=True)

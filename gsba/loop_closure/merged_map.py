@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from gsba.geometry import extent_of
 from gsba.similarity import Sim3
 from gsba.trajectory.joining import PLACES, SegmentAlignment
 from gsba.trajectory.judgement import StepChecks
@@ -50,7 +51,7 @@ def laid_out(positions: np.ndarray, components: np.ndarray, reach: float) -> np.
     map units, of a point of another."""
     offsets = np.zeros((len(components), 3))
     groups = [components == c for c in range(int(components.max()) + 1)]
-    extent = max(float(np.linalg.norm(np.ptp(positions[group], axis=0))) for group in groups)
+    extent = max(extent_of(positions[group]) for group in groups)
     for number, group in enumerate(groups[1:], 1):
         # maps lie four of their extents apart
         away = np.array([number * 4.0 * (extent + reach), 0, 0])

@@ -35,7 +35,6 @@ from gsba.types import FrameSet, rows_across
 logger = logging.getLogger(__name__)
 
 PICTURE_WIDTH = 512  # pixels across the pictures in which the outline is found
-_MAX_FRAMES = 20
 _MIN_FRAMES = 6  # fewer agree by chance
 _MIN_FIXED_CORRELATION, _MAX_MOVING_CORRELATION = 0.75, 0.5  # least correlation of fixed structure;
 # largest of moving structure
@@ -43,7 +42,6 @@ VEHICLE_SHARE = 1 / 3  # share of the picture from which the carrier is a vehicl
 # fill less
 _STRUCTURE_WIDTH_PX, _TURNED_STRUCTURE_WIDTH_PX = 256, 128  # width in pixels of compared pictures:
 # the camera's tilt, which remains when turns are undone, moves the carrier by a pixel of the latter
-_MIN_TURN_RAD = np.deg2rad(2.0)  # smaller turns are estimation noise
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +68,7 @@ def find_carrier(frames: FrameSet) -> Carrier:
     if not frames.format.panoramic:
         raise GsbaError("the carrier is detected in panoramas; these frames are cube faces")
     _require_enough(len(frames))
-    chosen = rows_across(len(frames), _MAX_FRAMES)
+    chosen = rows_across(len(frames), 20)
     with ThreadPoolExecutor(usable_cpus()) as pool:
         loaded = pool.map(partial(_load, frames), chosen.tolist())
         pictures = np.stack(list(track(loaded, "looking for the carrier", len(chosen))))
@@ -198,7 +196,7 @@ def _measure_turned(pictures: np.ndarray) -> tuple[np.ndarray, FixedStructure] |
     """Pictures rotated so that the carrier keeps its direction, and their structure; None = no
     turns, or those of the camera itself."""
     turns = find_turns(np.stack([band_of(picture) for picture in pictures]))
-    if np.ptp(turns) < _MIN_TURN_RAD:
+    if np.ptp(turns) < np.deg2rad(2.0):  # smaller ones are estimation noise
         return None
     back = -turns / (2 * np.pi) * pictures.shape[2]
     rolls = zip(pictures, back, strict=True)

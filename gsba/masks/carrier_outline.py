@@ -20,7 +20,6 @@ _MIN_CERTAIN_STRONG, _MIN_CERTAIN_WEAK = 0.75, 0.6  # least strong and weak corr
 _MIN_LIKELY_WEAK = 0.2  # least weak correlation of pixels joined to certain ones
 _SPILL_PX = 6  # pixels by which fixed structure exceeds the outline
 _MIN_CHANGE = 1.0  # grey levels, least change of a carrier without noise
-_NUM_ROUNDS = 2  # rounds of the graph cut and its colour models
 _DILATION_PX = 1  # pixels added: features on the carrier's blurred rim are useless
 
 
@@ -65,7 +64,7 @@ def outline_carrier(
     padded = around_sphere(labels, _PADDING_PX)
     nowhere, models = (0, 0, 0, 0), (np.zeros((1, 65)), np.zeros((1, 65)))
     cv2.setRNGSeed(0)
-    cv2.grabCut(smooth, padded, nowhere, *models, _NUM_ROUNDS, cv2.GC_INIT_WITH_MASK)
+    cv2.grabCut(smooth, padded, nowhere, *models, 2, cv2.GC_INIT_WITH_MASK)
     found = _parts_with(
         np.isin(
             padded[_PADDING_PX:-_PADDING_PX, _PADDING_PX:-_PADDING_PX], (cv2.GC_FGD, cv2.GC_PR_FGD)

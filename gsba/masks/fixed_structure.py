@@ -117,7 +117,6 @@ def _exchanges(num: int) -> Iterator[tuple[int, int]]:
 
 
 WIDTH = 256  # pixels across the pictures in which shifts are estimated
-_NUM_ROUNDS = 4
 _MIN_CHANGE = 4.0  # grey levels: more stable pixels have equal weights
 
 
@@ -146,7 +145,7 @@ def find_turns(bands: np.ndarray) -> np.ndarray:
     for reference in references:
         template, weights = even[reference], np.ones(even.shape[1:])
         shifts = np.zeros(len(bands))
-        for _ in range(_NUM_ROUNDS):
+        for _ in range(4):
             w, wt = (np.fft.rfft(x, axis=-1).conj() for x in (weights, weights * template))
             costs = np.fft.irfft((squares * w - 2 * spectra * wt).sum(axis=1), WIDTH, axis=-1)
             at = np.argmin(costs, axis=1)

@@ -31,7 +31,6 @@ MAX_PARALLAX_RAD = np.deg2rad(60.0)  # between two rays of a point
 T = TypeVar("T")
 FAR_DRIFT = 0.05  # largest relative drift that a loop closure may correct
 _CELLS_PER_SIDE = 8  # cells along a face's side
-_ROWS_AT_ONCE = 512  # of descriptors that are compared with all others
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,7 +144,7 @@ def mutual_nearest(
     other."""
     found, num = list[np.ndarray](), len(descriptors1)
     back, best = np.zeros(num, np.int64), np.full(num, -np.inf, np.float32)
-    for rows in slices(len(descriptors0), _ROWS_AT_ONCE):
+    for rows in slices(len(descriptors0), 512):  # compared at once with all others
         likes = descriptors0[rows] @ descriptors1.T
         found.append(likes.argmax(axis=1))
         top = likes.argmax(axis=0)

@@ -166,7 +166,7 @@ def unless_misguided(
     rows = np.flatnonzero(np.diff(guided.matches.pairs, axis=1)[:, 0] == 1)
     if not len(rows) or len(guided.missing(chosen)) <= _MIN_LOST_SHARE * len(chosen):
         return guided
-    tried = np.unique(np.linspace(0, len(rows) - 1, min(_NUM_TRIED_STEPS, len(rows))).astype(int))
+    tried = rows_across(len(rows), _NUM_TRIED_STEPS)
     known = guided.taken(rows[tried].tolist())
     free = match_anywhere(context, known.matches.pairs)
     ours, theirs = (image_steps(some, context.keypoints) for some in (known, free))
@@ -247,7 +247,7 @@ def check_clock(
         guided = VerifiedPairs.joined([guided, match_anywhere(context, lost)])
     steps = image_steps(guided, context.keypoints)
     misread.refuse_misread(coarse, steps, TwoViewLimits.of(settings))
-    estimate = clock.estimate_clock(timestamps, steps, trajectory, coarse.time_offset, 10.0)  # s
+    estimate = clock.estimate_clock(timestamps, steps, trajectory, coarse.time_offset)
     rate = clock.other_rate(timestamps, steps, trajectory, estimate)
     if rate is not None:
         raise GsbaError(
@@ -294,10 +294,7 @@ def match_anywhere(context: MatchContext, chosen: np.ndarray, rivals: bool = Tru
 
 def match_again(context: MatchContext, found: VerifiedPairs, steps: set[int]) -> VerifiedPairs:
     """Match steps again with all keypoints along the epipolar lines found, and verify them anew.
-
-    Args:
-        steps: first frames of the steps; each keeps the pose with more inliers.
-    """
+    `steps`: first frames of the steps; each keeps the pose with more inliers."""
     chosen = [
         p
         for p, (f0, f1) in enumerate(found.matches.pairs.tolist())

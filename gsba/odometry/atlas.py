@@ -6,6 +6,7 @@ from functools import cached_property
 
 import cv2
 import numpy as np
+from scipy.spatial import KDTree
 
 from factors.compiled import kernel_and_part
 from gsba.camera.rig import RIG_R_FACE, CubeRig, cells_of, owner_faces
@@ -223,7 +224,10 @@ def new_corners(
     if len(known):
         along = known @ atlas.cut_R_rig.T
         np.add.at(taken, cells_of(along, _PER_SIDE), 1)
-        _block(peaks, layout, along)
+        pixels = np.rint(layout.pixels(along, owner_faces(along).astype(np.int64)))
+        for u, v in pixels.astype(int):
+            top, left = max(v - _APART_PX, 0), max(u - _APART_PX, 0)
+            peaks[top : v + _APART_PX + 1, left : u + _APART_PX + 1] = False
     v, u = np.nonzero(peaks)
     order = np.argsort(-response[v, u], kind="stable")
     v, u = v[order], u[order]
@@ -236,25 +240,6 @@ def new_corners(
     rank = np.empty(len(cells), int)
     rank[ranked] = np.arange(len(cells)) - starts[cells[ranked]]
     kept = np.flatnonzero(rank < room[cells])  # features in a cell, including followed ones
-    kept = kept[_apart(np.stack([u, v], axis=1)[kept])]
+    close = KDTree(np.stack([u, v], axis=1)[kept]).query_pairs(_APART_PX, output_type="ndarray")
+    kept = np.delete(kept, close.max(axis=1))  # those near a stronger one
     return bearings[kept] @ atlas.cut_R_rig
-
-
-def _block(peaks: np.ndarray, layout: AtlasLayout, along: np.ndarray) -> None:
-    """Clear `peaks` around known features, bearings (M, 3) along the axes of the cut."""
-    faces = owner_faces(along).astype(np.int64)
-    for u, v in np.rint(layout.pixels(along, faces)).astype(int):
-        top, left = max(v - _APART_PX, 0), max(u - _APART_PX, 0)
-        peaks[top : v + _APART_PX + 1, left : u + _APART_PX + 1] = False
-
-
-def _apart(pixels: np.ndarray) -> np.ndarray:
-    """Rows of pixels (N, 2), in falling order, at least `_APART_PX` from all earlier ones."""
-    from scipy.spatial import KDTree
-
-    if len(pixels) < 2:
-        return np.arange(len(pixels))
-    pairs = KDTree(pixels).query_pairs(_APART_PX, output_type="ndarray")
-    out = np.zeros(len(pixels), bool)
-    out[pairs.max(axis=1)] = True
-    return np.flatnonzero(~out)

@@ -17,12 +17,7 @@ from gsba.loop_closure.map_similarity import Meeting, Proposal, propose
 from gsba.loop_closure.retrieval import global_descriptors
 from gsba.matching import recovery
 from gsba.odometry.places import KeyframePlaces, chosen_keyframes, described, make_places
-from gsba.odometry.pose_graph import (
-    Constraint,
-    close_loops,
-    covariances_of,
-    measure_steps,
-)
+from gsba.odometry.pose_graph import Constraint, close_loops, covariances_of, measure_steps
 from gsba.similarity import Sim3
 from gsba.store.shards import Workers
 
@@ -46,11 +41,13 @@ def find_loops(places: KeyframePlaces, unseen: np.ndarray) -> list[Constraint]:
     none = np.zeros(0, np.int64)  # the later place of each pair moves to the earlier one
     meetings = test.meetings(verified.matches, none, verified.f0_T_f1s)
     meetings = [found for found in meetings if len(found.own) >= _MIN_POINTS]
-    judged = [
-        one
-        for group in _meeting_by_meeting(meetings)
-        for one in _judged(group, places, unseen, test)
-    ]
+    judged, rest = list[Judged](), sorted(meetings, key=lambda m: -len(m.own))
+    while rest:  # pairs with their neighbours, around the pairs with the most points
+        best = rest[0]
+        near = [max(abs(m.f - best.f), abs(m.g - best.g)) <= _BESIDE for m in rest]
+        group = [m for m, beside in zip(rest, near, strict=True) if beside]
+        judged += _judged(group, places, unseen, test)
+        rest = [m for m, beside in zip(rest, near, strict=True) if not beside]
     confirmed = [one for one in judged if one.evidence.confirmed]
     kept = [one for one in confirmed if not _rivals(one, confirmed, test)]
     for one in judged:
@@ -96,17 +93,6 @@ def _join_test(places: KeyframePlaces) -> JoinTest:
 
     poses, depth, one = solved.world_T_rigs, solved.median_depth(), np.zeros_like(frames)
     return JoinTest(context, poses, known, depth, one, rates)
-
-
-def _meeting_by_meeting(meetings: list[Meeting]) -> list[list[Meeting]]:
-    """Pairs of places grouped with their neighbours, around the pairs with the most points."""
-    rest, groups = sorted(meetings, key=lambda m: -len(m.own)), list[list[Meeting]]()
-    while rest:
-        best = rest[0]
-        near = [max(abs(m.f - best.f), abs(m.g - best.g)) <= _BESIDE for m in rest]
-        groups.append([m for m, beside in zip(rest, near, strict=True) if beside])
-        rest = [m for m, beside in zip(rest, near, strict=True) if not beside]
-    return groups
 
 
 def _judged(
@@ -251,7 +237,7 @@ class TrackedKeyframes:
     solved: np.ndarray  # (K,) bool, keyframes of maps with points
     distances: np.ndarray  # (K,) float64, median distance of points, map units; positive
     features: Sequence[tuple[np.ndarray, np.ndarray]]  # (K) ids (N,) and bearings (N, 3), rig frame
-    pictures: Sequence[np.ndarray]  # (K) JPEG panoramas, see `gsba.odometry.places.compressed`
+    pictures: Sequence[np.ndarray]  # (K) JPEG panoramas, (n,) uint8 each
     timestamps: np.ndarray  # (K,) float64, seconds
     width: int  # pixels across the panoramas
     usable: np.ndarray | None  # (h, 2h) bool, pixels of the scene; None = all
@@ -269,38 +255,26 @@ class ClosedKeyframes:
     loops: np.ndarray  # (L, 2) int64, keyframes of loops within a map
     joins: np.ndarray  # (M, 2) int64, keyframes at which two maps were joined
 
-    @classmethod
-    def unchanged(cls, tracked: TrackedKeyframes) -> "ClosedKeyframes":
-        """Keyframes as they were tracked."""
-        num, none = len(tracked.maps), np.zeros((0, 2), np.int64)
-        poses, maps = tracked.world_T_keys.copy(), tracked.maps.copy()
-        return cls(poses, np.ones(num), maps, np.full((num, 6, 6), np.nan), none, none)
-
 
 def close(tracked: TrackedKeyframes, seed: int, workers: Workers) -> ClosedKeyframes:
     """Join the maps of a walk where they overlap, close loops, and estimate covariances."""
-    found = ClosedKeyframes.unchanged(tracked)
-    places = _places(tracked, seed, workers)
-    if places is None:
+    num, none = len(tracked.maps), np.zeros((0, 2), np.int64)
+    poses, maps = tracked.world_T_keys.copy(), tracked.maps.copy()
+    unknown = np.full((num, 6, 6), np.nan)
+    found = ClosedKeyframes(poses, np.ones(num), maps, unknown, none, none)
+    with_points = np.where(tracked.solved, tracked.maps, -1)
+    rows = chosen_keyframes(tracked.world_T_keys, with_points, tracked.distances)
+    if len(rows) < _MIN_PLACES:
         return found
-    given = tracked.features, tracked.world_T_keys, tracked.maps, tracked.distances
-    steps = measure_steps(*given)
+    features = described([tracked.pictures[row] for row in rows], tracked.width, tracked.usable)
+    at_places = tracked.world_T_keys[rows]
+    places = make_places(rows, tracked.maps[rows], at_places, features, seed, workers)
+    steps = measure_steps(tracked.features, tracked.world_T_keys, tracked.maps, tracked.distances)
     found = _joined(found, places, tracked)
     for number in np.unique(found.maps[tracked.solved]):
         keys = np.flatnonzero(tracked.solved & (found.maps == number))
         found = _closed(found, keys, places, steps)
     return found
-
-
-def _places(tracked: TrackedKeyframes, seed: int, workers: Workers) -> KeyframePlaces | None:
-    maps = np.where(tracked.solved, tracked.maps, -1)
-    rows = chosen_keyframes(tracked.world_T_keys, maps, tracked.distances)
-    if len(rows) < _MIN_PLACES:
-        return None
-    pictures = [tracked.pictures[row] for row in rows]
-    features = described(pictures, tracked.width, tracked.usable)
-    poses = tracked.world_T_keys[rows]
-    return make_places(rows, tracked.maps[rows], poses, features, seed, workers)
 
 
 def _joined(

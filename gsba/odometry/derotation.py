@@ -9,9 +9,7 @@ import numpy as np
 from gsba.camera.sphere import around_sphere, bearings_from_erp, erp_from_bearings, table
 
 _WIDTH = 128  # pixels across the panoramas that are compared
-_STEPS = 15
 PAD = 2  # pixels beyond seam and poles for interpolation
-_CONVERGED = np.deg2rad(0.05)
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +71,7 @@ def _aligned(one: Miniature, other: Miniature, start: np.ndarray) -> tuple[np.nd
     down = np.stack([-x * y, level**2, -z * y], axis=1) / level[:, None]
     gradient = by_longitude[:, None] / level[:, None] * east + by_height[:, None] * down
     jacobian = np.cross(rays, gradient)
-    for _ in range(_STEPS):
+    for _ in range(15):
         # The other picture, rotated by the estimate, is compared at the rays of the first.
         places = erp_from_bearings(rays @ rotation, _WIDTH, _WIDTH // 2) - 0.5
         maps = np.ascontiguousarray(places, np.float32).reshape(-1, _WIDTH, 2)
@@ -87,7 +85,7 @@ def _aligned(one: Miniature, other: Miniature, start: np.ndarray) -> tuple[np.nd
         step = np.linalg.solve(normal, weighted.T @ residuals)
         step *= min(1.0, np.deg2rad(15.0) / max(float(np.linalg.norm(step)), 1e-12))
         rotation = Rotation.from_rotvec(step).as_matrix() @ rotation
-        if np.linalg.norm(step) < _CONVERGED:
+        if np.linalg.norm(step) < np.deg2rad(0.05):
             break
     return rotation, cost
 

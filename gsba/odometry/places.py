@@ -18,10 +18,7 @@ from gsba.odometry.atlas import AtlasLayout, Cutter
 from gsba.store.shards import Workers
 from gsba.types import Features, Solution
 
-_JPEG_QUALITY = 90
 _HFOV = np.deg2rad(94.0)  # of faces: keypoints near a border are described by pixels beyond it
-_STRONGEST_PER_FACE = 100  # strongest of these, compared without any prediction
-_FAR_DRIFT = 0.03  # largest relative drift that a loop closure may correct
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,11 +40,6 @@ class KeyframePlaces:
         )
 
 
-def compressed(grey: np.ndarray) -> np.ndarray:
-    """A panorama (h, 2h) uint8 as JPEG, (n,) uint8: some tens of kilobytes."""
-    return np.asarray(cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1])
-
-
 def chosen_keyframes(
     world_T_rigs: np.ndarray, maps: np.ndarray, distances: np.ndarray
 ) -> np.ndarray:
@@ -66,7 +58,7 @@ def chosen_keyframes(
 def described(
     pictures: Sequence[np.ndarray], width: int, usable: np.ndarray | None
 ) -> list[Features]:
-    """Keypoints of keyframes' panoramas, see `compressed`, `width` pixels across; usable: (h, 2h)
+    """Keypoints of keyframes' panoramas, JPEG (n,) uint8, `width` pixels across; usable: (h, 2h)
     bool, pixels of the scene, None = all."""
     size = round(width / np.pi * np.tan(_HFOV / 2))
     rig = CubeRig(size, _HFOV)
@@ -99,11 +91,12 @@ def make_places(
     `described`."""
     context = MatchContext(
         SearchableFrames(features.__getitem__),
-        SearchableFrames(features.__getitem__, _STRONGEST_PER_FACE),
+        SearchableFrames(features.__getitem__, 100),  # strongest ones of a face, compared without
+        # any prediction
         gather(features),
         RefineSettings(seed=seed),
         workers,
-        far_drift=_FAR_DRIFT,
+        far_drift=0.03,  # largest relative drift that a loop closure may correct
     )
     start = Solution.without_points(world_T_rigs)
     found = match_along_epipolars(context, start)

@@ -10,7 +10,7 @@ import numpy as np
 from factors import tangent_basis
 from gsba.bundle import triangulate
 from gsba.bundle.pose_variables import X
-from gsba.geometry import adjoint, inverse, pose
+from gsba.geometry import adjoint, furthest, inverse, pose
 from gsba.odometry.resection import linearised
 from gsba.odometry.window import GATE, WindowObservations
 from gsba.similarity import Sim3
@@ -96,13 +96,11 @@ def covariances_of(
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for k, (world_T_key, scale) in enumerate(zip(world_T_keys, scales, strict=True)):
         values.insert(X(k), similarity3(Sim3.of(float(scale), world_T_key)))
-    away = np.linalg.norm(world_T_keys[:, :3, 3] - world_T_keys[0, :3, 3], axis=1)
-    far = int(np.argmax(away))
-    moving = away[far] > 0
-    sigmas = np.array([_HELD] * 6 + [1.0 if moving else _HELD])
+    far, distance = furthest(world_T_keys[:, :3, 3])
+    sigmas = np.array([_HELD] * 6 + [1.0 if distance > 0 else _HELD])
     noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
     graph.add(gtsam.PriorFactorSimilarity3(X(0), values.atSimilarity3(X(0)), noise))
-    if moving:
+    if distance > 0:
         graph.add(_fixed_distance(far, world_T_keys[[0, far]], float(scales[far])))
     for one in constraints:
         graph.add(factor_of(one))

@@ -23,11 +23,8 @@ class Described:
 
 
 def describe(layout: AtlasLayout, atlas: Atlas, usable: np.ndarray | None) -> Described:
-    """SIFT keypoints of an atlas, each in the face that owns it.
-
-    Args:
-        usable: (2 s, 3 s) bool, pixels of the scene; None = all.
-    """
+    """SIFT keypoints of an atlas, each in the face that owns it. `usable`: (2 s, 3 s) bool, pixels
+    of the scene; None = all."""
     allowed = layout.owned if usable is None else layout.owned & usable
     sift = cv2.SIFT.create(1500, 3, 0.02)
     found, descriptors = sift.detectAndCompute(atlas.image, allowed.astype(np.uint8) * 255)
@@ -41,11 +38,7 @@ def describe(layout: AtlasLayout, atlas: Atlas, usable: np.ndarray | None) -> De
 
 
 def placed(
-    key: Described,
-    frame: Described,
-    bearings: np.ndarray,
-    distances: np.ndarray,
-    seed: int,
+    key: Described, frame: Described, bearings: np.ndarray, distances: np.ndarray, seed: int
 ) -> np.ndarray | None:
     """key_T_rig (4, 4) of a frame, in the unit of the map, by keypoints of the keyframe and the
     frame; None if it is uncertain. Points of the keyframe are along unit bearings (P, 3), rig

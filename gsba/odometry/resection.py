@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import gtsam
 import numpy as np
 
 from factors import tangent_basis
@@ -14,7 +15,6 @@ _kernel, _part = kernel_and_part()
 _CONVERGED = 1e-6  # radians, and parts of the median distance
 _ANNEALED = (8.0, 4.0, 2.0, 1.0)  # factors on the scale of the loss in the first steps
 _GATE = 3.5  # standard deviations of an inlier
-_SAMPLE = 3  # bearings that determine a pose
 _MIN_WITNESSES = 20  # least number of witnesses: fewer may be of one moving object
 
 
@@ -48,7 +48,7 @@ def resect(
     # false matches lie anywhere within 6 degrees of their prediction
     chance = min((_GATE * sigma / np.deg2rad(6.0)) ** 2, 0.5)
     per_witness = 1 - (1 - chance) ** (len(bearings_rig) / max(num, 1))
-    needed = least_agreeing(num, per_witness, _SAMPLE, MAX_FALSE_POSES)
+    needed = least_agreeing(num, per_witness, 3, MAX_FALSE_POSES)  # 3 bearings give a pose
     significant = agreeing >= max(needed, _MIN_WITNESSES)
     spread = np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1])
     significant &= spread < 0.05 * distance  # of the position, in median distances of the points
@@ -75,7 +75,7 @@ def _fitted(
         damping = 1e-9 * np.diag([1.0] * 3 + [distance**-2] * 3) * num
         tangent = -np.linalg.solve(information + damping, gradient)
         limit = 0.5 * distance / max(float(np.linalg.norm(tangent[3:])), 1e-12)
-        world_T_rig = retracted(world_T_rig, tangent * min(1.0, limit))
+        world_T_rig = gtsam.Pose3(world_T_rig).retract(tangent * min(1.0, limit)).matrix()
         small = max(np.abs(tangent[:3]).max(), np.abs(tangent[3:]).max() / distance) < _CONVERGED
         if small and step >= len(_ANNEALED):
             break
@@ -97,13 +97,6 @@ def linearised(
     residuals, jacobians, distances = np.empty((num, 2)), np.empty((num, 2, 6)), np.empty(num)
     _linearise(points_world, bases, bearings_rig, world_T_rig, residuals, jacobians, distances)
     return residuals, jacobians, distances
-
-
-def retracted(world_T_rig: np.ndarray, tangent: np.ndarray) -> np.ndarray:
-    """A pose (4, 4) moved by a tangent (6,) [rotation, translation] on its right (GTSAM's)."""
-    import gtsam
-
-    return gtsam.Pose3(world_T_rig).retract(tangent).matrix()
 
 
 @_part

@@ -34,9 +34,7 @@ _NUM_VOTERS = 300  # keys of a frame that propose lengths
 _LENGTH_WIDTH, _NUM_LENGTHS = 0.15, 2  # of a length's logarithm, within which keys agree; tried
 _MAX_LOG_SCALE = np.log(8.0)  # of the units of two maps, whose first steps they are
 _NUM_STARTS, _NUM_FINAL = 12, 3  # hypotheses that are fitted to two frames; to all near the step
-_OTHER_SCALES = (-0.2, -0.1, 0.1, 0.2)  # of the best join, added to its logarithm
 NEAR = 3  # frames of either map beside the step
-_MIN_FITTED = 6  # places that a join is fitted to
 MIN_SCORE, MIN_LEAD = 16.0, 1.7  # that confirm a join; times that of any rival
 
 
@@ -113,7 +111,7 @@ def join(frames: Sequence[TourFrame], one: TourMap, other: TourMap) -> tuple[Joi
         final.append(joining.fitted(better, near[-1], 0.35, 0.8))
     if final and not (one.single or other.single):  # few places hold a scale: others are near
         best = max(final, key=lambda some: some.score)
-        for log in _OTHER_SCALES:
+        for log in (-0.2, -0.1, 0.1, 0.2):  # of the best join, added to its logarithm
             final.append(
                 joining.fitted(replace(best, log_scale=best.log_scale + log), near[-1], 0.35, 0.8)
             )
@@ -209,7 +207,7 @@ class Joining:
     def _adjusted(self, at: Join, places: Sequence[Places], gate_rad: float) -> Join:
         """Pose and scale by least squares of the places within a gate, Cauchy's loss."""
         near = [angles_between(self._predicted(at, some), some.found) < gate_rad for some in places]
-        if sum(map(np.count_nonzero, near)) < _MIN_FITTED:
+        if sum(map(np.count_nonzero, near)) < 6:  # places that a join is fitted to
             return at
         length = float(np.linalg.norm(at.g_T_f[:3, 3]))
         num = 6 if self.one.single or self.other.single else 7  # a single frame has no scale

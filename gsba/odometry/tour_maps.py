@@ -15,8 +15,8 @@ from factors.threads import map_in_threads
 from gsba.camera.rig import cells_of
 from gsba.geometry import angles_between, inverse, unit
 from gsba.log import track
-from gsba.odometry.tour_joins import Join, TourMap
-from gsba.odometry.tour_merging import all_joined, held
+from gsba.odometry.tour_joins import Join, TourMap, scaled
+from gsba.odometry.tour_merging import held
 from gsba.odometry.tour_steps import (
     CELLS_PER_SIDE,
     MAX_ALIKE_LOG,
@@ -41,8 +41,6 @@ MIN_END_RANK = 120.0  # of a step at an end, which one triple holds alone: in fl
 # steps below it were off by 1 to 7 degrees
 MAX_RIVAL_CELLS = 12  # of other steps or another ratio, from which the place repeats
 MAX_RIVALLED_SHARE = 0.25  # of frames with such rivals, above which no place is believed
-_PLACE_SIGMA_RAD = 1.5e-3  # noise of a place that a search has found
-_MAX_LOG_DEVIATION = 0.15  # of depths of a key by two steps, which agree
 _LOG_SIGMA, _DIRECTION_SIGMA_RAD = 0.02, 0.01  # of confirmed ratios and steps
 
 
@@ -76,15 +74,6 @@ class TourMatches:
     order_found: bool = False  # by likeness; False = that of the frames as they were given
 
 
-def match_tour(
-    frames: Sequence[TourFrame], names: tuple[str, ...], num_threads: int, kept: KeptSteps
-) -> TourMatches:
-    """Confirmed steps of a tour whose frames (F,), of these names, are in the order of the way."""
-    found = searched(frames, names, num_threads, kept)
-    joined = all_joined(frames, maps_of(frames, *found), num_threads)
-    return matches_of(frames, names, *found, joined)
-
-
 def searched(
     frames: Sequence[TourFrame], names: Sequence[str], num_threads: int, kept: KeptSteps
 ) -> tuple[list[Step | None], list[Triple | None]]:
@@ -99,7 +88,14 @@ def searched(
     steps = list(track(found, STEPS_SEARCH, num - 1))
 
     def triples(f: int) -> dict[tuple[int, int], list[Triple]]:
-        return triples_of(frames[f], frames[f + 1], frames[f + 2], steps[f], steps[f + 1])
+        """Triples of each hypothesis of a step and each of the next, most cells first."""
+        found = dict[tuple[int, int], list[Triple]]()
+        for i, one in enumerate(steps[f]):
+            for j, other in enumerate(steps[f + 1]):
+                logs = ratios(one, other, frames[f + 1].keys)
+                some = [triple(frames[f], frames[f + 2], one, other, log) for log in logs]
+                found[i, j] = sorted(some, key=lambda each: -each.cells)
+        return found
 
     chain, sure = confirmed(steps, list(map_in_threads(triples, num - 2, num_threads)))
     return [some[c] if some else None for some, c in zip(steps, chain, strict=True)], sure
@@ -109,11 +105,8 @@ def ratios(before: Step, after: Step, keys: np.ndarray) -> list[float]:
     """Logarithms of ratios of two steps' lengths that keypoints (N, 3) of the frame between them
     propose: those with most cells first, each without the keypoints of those before."""
     both = np.isfinite(before.depths1) & np.isfinite(after.depths0)
-    logs, cells = (
-        np.log(before.depths1[both] / after.depths0[both]),
-        cells_of(keys[both], CELLS_PER_SIDE),
-    )
-    found = agreed_logs(logs, cells, _RATIO_WIDTH, _NUM_RATIOS)
+    logs = np.log(before.depths1[both] / after.depths0[both])
+    found = agreed_logs(logs, cells_of(keys[both], CELLS_PER_SIDE), _RATIO_WIDTH, _NUM_RATIOS)
     return [log for log, _ in found if abs(log) < _MAX_LOG_RATIO]
 
 
@@ -123,9 +116,7 @@ def triple(
     """Three frames, with the places in the first and the third that confirm two steps and a
     ratio."""
     length = np.exp(log_ratio)
-    f2_T_f1 = after.f1_T_f0.copy()
-    f2_T_f1[:3, 3] *= length
-    f2_T_f0 = f2_T_f1 @ before.f1_T_f0
+    f2_T_f0 = scaled(after.f1_T_f0, length) @ before.f1_T_f0
     places2, cells2 = _confirming(first, third, before.depths0, f2_T_f0)
     places0, cells0 = _confirming(third, first, after.depths1 * length, inverse(f2_T_f0))
     return Triple(log_ratio, cells2 + cells0, places2, places0)
@@ -151,23 +142,6 @@ def _confirming(
     places[rows[good]] = found[good]
     balance = np.bincount(cells_of(one.keys[rows], CELLS_PER_SIDE), np.where(good, 1.0, -1.0))
     return places, int(np.count_nonzero(balance > 0))
-
-
-def triples_of(
-    first: TourFrame,
-    middle: TourFrame,
-    third: TourFrame,
-    before: Sequence[Step],
-    after: Sequence[Step],
-) -> dict[tuple[int, int], list[Triple]]:
-    """Triples of each hypothesis of the first step and each of the second, most cells first."""
-    found = dict[tuple[int, int], list[Triple]]()
-    for i, one in enumerate(before):
-        for j, other in enumerate(after):
-            logs = ratios(one, other, middle.keys)
-            some = [triple(first, third, one, other, log) for log in logs]
-            found[i, j] = sorted(some, key=lambda each: -each.cells)
-    return found
 
 
 def confirmed(
@@ -199,19 +173,13 @@ def confirmed(
             best, rival = _best_and_rival(steps[f : f + 2], left, pair)
             chosen[f] = best if _is_sure(best, rival, before and after) else None
     ranks = [some[c].rank if some else 0.0 for some, c in zip(steps, chain, strict=True)]
-    return chain, _without_weak_ends(chosen, ranks)
-
-
-def _without_weak_ends(chosen: list[Triple | None], ranks: Sequence[float]) -> list[Triple | None]:
-    """Triples (F - 2,) without those that hold a step of low rank (F - 1,) alone."""
-    left = list(chosen)
     while True:
-        held = [some is not None for some in left]
+        held = [some is not None for some in chosen]
         beside = zip([*held, False], [False, *held], ranks, strict=True)
         weak = [here != before and rank < MIN_END_RANK for here, before, rank in beside]
-        if not any(weak):
-            return left
-        left = [None if weak[f] or weak[f + 1] else some for f, some in enumerate(left)]
+        if not any(weak):  # no triple holds a step of low rank alone
+            return chain, chosen
+        chosen = [None if weak[f] or weak[f + 1] else some for f, some in enumerate(chosen)]
 
 
 def _is_sure(best: Triple | None, rival: int, steps_known: bool = False) -> bool:
@@ -233,8 +201,15 @@ def _best_and_rival(
     others = [(at, one) for at, some in found.items() for one in some if one is not best]
     if best is None:
         return None, max((one.cells for _, one in others), default=0)
-    rivals = [one.cells for at, one in others if not _alike(steps, pair, at, best, one)]
-    return best, max(rivals, default=0)
+    rivals = [0]
+    for at, one in others:
+        near = all(
+            alike_poses(some[a].f1_T_f0, some[b].f1_T_f0)
+            for some, a, b in zip(steps, pair, at, strict=True)
+        )
+        if not (near and abs(best.log_ratio - one.log_ratio) < MAX_ALIKE_LOG):
+            rivals.append(one.cells)
+    return best, max(rivals)
 
 
 def _best_chain(
@@ -255,21 +230,6 @@ def _best_chain(
     return chain[::-1]
 
 
-def _alike(
-    steps: Sequence[Sequence[Step]],
-    pair: tuple[int, int],
-    other_pair: tuple[int, int],
-    one: Triple,
-    other: Triple,
-) -> bool:
-    """True if two triples, of these hypotheses of both steps, are nearly the same."""
-    near = all(
-        alike_poses(found[a].f1_T_f0, found[b].f1_T_f0)
-        for found, a, b in zip(steps, pair, other_pair, strict=True)
-    )
-    return near and abs(one.log_ratio - other.log_ratio) < MAX_ALIKE_LOG
-
-
 def maps_of(
     frames: Sequence[TourFrame], steps: Sequence[Step | None], triples: Sequence[Triple | None]
 ) -> list[TourMap]:
@@ -284,9 +244,8 @@ def maps_of(
         before, length = triples[f - 2] if f > 1 and not last.single else None, 1.0
         if before is not None:
             length = np.linalg.norm(last.between(f - 2, f - 1)[:3, 3]) * np.exp(before.log_ratio)
-        moved = step.f1_T_f0.copy()
-        moved[:3, 3] *= length
-        poses = np.append(last.f_T_firsts, (moved @ last.f_T_firsts[-1])[None], axis=0)
+        moved = scaled(step.f1_T_f0, length) @ last.f_T_firsts[-1]
+        poses = np.append(last.f_T_firsts, moved[None], axis=0)
         known = _agreeing(last.depths[-1], step.depths0 * length)
         maps[-1] = TourMap(last.first, poses, [*last.depths[:-1], known, step.depths1 * length])
     return maps
@@ -296,7 +255,7 @@ def _agreeing(depths: np.ndarray, others: np.ndarray) -> np.ndarray:
     """Depths (N,) of two steps that agree, or of one where the other has none; NaN = none."""
     one, other = np.where(np.isfinite(depths), depths, others), others
     other = np.where(np.isfinite(other), other, one)
-    agree = np.abs(np.log(one / other)) < _MAX_LOG_DEVIATION
+    agree = np.abs(np.log(one / other)) < 0.15  # of depths of a key by two steps, which agree
     return np.where(agree, (one + other) / 2, np.nan)
 
 
@@ -327,7 +286,7 @@ def matches_of(
             seen = np.flatnonzero(np.isfinite(found[:, 0]))
             places = sum(map(len, rays[g])) + np.arange(len(seen))
             rays[g].append(found[seen])
-            sigmas[g].append(np.full(len(seen), _PLACE_SIGMA_RAD))
+            sigmas[g].append(np.full(len(seen), 1.5e-3))  # noise of a place that a search has found
             both.append(np.column_stack([seen, places] if f < g else [places, seen]))
         pairs.append((f0, f1))
         rows.append(np.concatenate(both).astype(np.int32))
@@ -348,9 +307,8 @@ def matches_of(
         poses.append(inverse(step.f1_T_f0))
     for f, found, before, after in tied:
         add(f - 1, f + 1, found.places2, found.places0)
-        first, second = inverse(before.f1_T_f0), inverse(after.f1_T_f0)
-        second[:3, 3] *= np.exp(found.log_ratio)
-        over = first @ second
+        second = scaled(inverse(after.f1_T_f0), np.exp(found.log_ratio))
+        over = inverse(before.f1_T_f0) @ second
         over[:3, 3] = unit(over[:3, 3])
         poses.append(over)
     for one, other, at in joined:

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -28,7 +27,14 @@ def all_joined(
 
     def decide(pairs: Sequence[tuple[TourMap, TourMap]]) -> list[Join | None]:
         new = [pair for pair in pairs if _seen(*pair) not in known]
-        found = map_in_threads(partial(_sure_join, frames, new), len(new), num_threads)
+
+        def sure_join(n: int) -> Join | None:
+            if new[n][0].single and new[n][1].single:
+                return None
+            best, rival = join(frames, *new[n])
+            return best if is_sure(best, rival) else None
+
+        found = map_in_threads(sure_join, len(new), num_threads)
         tried = track(found, "joining maps", len(new)) if new else found
         known.update((_seen(*pair), at) for pair, at in zip(new, tried, strict=True))
         return [known[_seen(*pair)] for pair in pairs]
@@ -89,17 +95,6 @@ def _seen(one: TourMap, other: TourMap) -> tuple[int, ...]:
     return first, one.last, other.first, last
 
 
-def _sure_join(
-    frames: Sequence[TourFrame], pairs: Sequence[tuple[TourMap, TourMap]], n: int
-) -> Join | None:
-    """The join of one of several pairs of maps; None if it is not sure."""
-    one, other = pairs[n]
-    if one.single and other.single:
-        return None
-    best, rival = join(frames, one, other)
-    return best if is_sure(best, rival) else None
-
-
 def _parts(one: TourMap, other: TourMap, cuts: Sequence[int]) -> list[tuple[TourMap, TourMap]]:
     """Both maps, one of them only as far as a frame at which it was joined itself."""
     before = max((cut for cut in cuts if one.first + 1 < cut <= one.last), default=None)
@@ -116,7 +111,7 @@ def _carried(one: TourMap, other: TourMap, part: TourMap, after: TourMap, at: Jo
     """The join of two maps by that of parts of them."""
     back = scaled(other.between(after.first, other.first), float(np.exp(at.log_scale)))
     g_T_f = back @ at.g_T_f @ one.between(one.last, part.last)
-    return Join(g_T_f, at.log_scale, at.score, at.places)
+    return replace(at, g_T_f=g_T_f)
 
 
 def _merged(frames: Sequence[TourFrame], one: TourMap, other: TourMap, at: Join) -> TourMap:

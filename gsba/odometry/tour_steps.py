@@ -12,12 +12,13 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from factors.threads import map_in_threads
 from gsba.camera.rig import CubeRig
 from gsba.camera.sphere import bearings_from_erp
 from gsba.config import FeatureSettings
 from gsba.features.detection import SiftExtractor, extract
 from gsba.frames import cubemap
-from gsba.frames.panorama import Greys
+from gsba.frames.panorama import load_grey
 from gsba.geometry import angles_between, inverse, pose, rotation_angle, unit
 from gsba.matching.guided_search import mutual_nearest
 from gsba.matching.verification import sampled_pose
@@ -28,7 +29,6 @@ from gsba.types.records import slices
 WIDTH = 1280  # pixels across the panoramas that are searched
 _FACES = CubeRig(448, np.deg2rad(95.0))  # on which keypoints are found
 _FEATURES = FeatureSettings(max_per_face=1200)
-_SAMPLE_RAD = np.deg2rad(0.375)  # between samples of a patch, at full resolution
 _LINE_STEP_DEG = 0.35  # along epipolar lines, and between lines beside them
 MIN_PARALLAX_RAD = np.deg2rad(3.0)  # of keypoints that count for a pose
 CELLS_PER_SIDE = 6  # of 15 degrees; keypoints of one surface agree together
@@ -88,7 +88,11 @@ def frame_of(grey: np.ndarray, masks: np.ndarray | None) -> TourFrame:
     faces = np.repeat(cubemap.cut(grey, _FACES)[..., None], 3, axis=3)
     found = extract(faces, masks, _FACES, SiftExtractor(_FEATURES))
     rays, descriptors = found.bearings_rig, unit(found.descriptors.astype(float)).astype(np.float32)
-    alike = _alikeness(rays, descriptors)
+    alike = np.full(len(rays), -1.0)
+    for some in slices(len(rays), _ROWS_AT_ONCE):
+        likes = descriptors[some] @ descriptors.T
+        likes[rays[some] @ rays.T > np.cos(np.deg2rad(3.0))] = -1
+        alike[some] = likes.max(axis=1, initial=-1)
     order = np.random.default_rng(0).permutation(len(rays))
     order = order[np.abs(rays[order, 1]) < 0.88]
     worse = 2.0 * (alike[order] >= 0.95)
@@ -102,20 +106,14 @@ def frame_of(grey: np.ndarray, masks: np.ndarray | None) -> TourFrame:
     return TourFrame(picture, half, rays, descriptors, alike, keys, sound, found.sigmas_rad[chosen])
 
 
-def read_frame(frames: FrameSet, frame: int) -> TourFrame:
-    """A frame of a run."""
-    grey, mask = Greys(frames, WIDTH, width=WIDTH)[frame]
-    return frame_of(grey, None if mask is None else cubemap.cut_mask(mask, _FACES))
+def read_stills(frames: FrameSet, num_threads: int = 1) -> list[TourFrame]:
+    """All frames of a run, with the keypoints that are searched."""
 
+    def read(f: int) -> TourFrame:
+        grey, mask = load_grey(frames, f, WIDTH)
+        return frame_of(grey, None if mask is None else cubemap.cut_mask(mask, _FACES))
 
-def _alikeness(rays: np.ndarray, descriptors: np.ndarray) -> np.ndarray:
-    """Largest cosine (K,) of each descriptor with that of a keypoint 3 degrees away or more."""
-    alike = np.full(len(rays), -1.0)
-    for some in slices(len(rays), _ROWS_AT_ONCE):
-        likes = descriptors[some] @ descriptors.T
-        likes[rays[some] @ rays.T > np.cos(np.deg2rad(3.0))] = -1
-        alike[some] = likes.max(axis=1, initial=-1)
-    return alike
+    return list(map_in_threads(read, len(frames), num_threads))
 
 
 def found_places(
@@ -135,7 +133,7 @@ def found_places(
     direction = np.ascontiguousarray(f1_T_f0[:3, 3])
     step = np.deg2rad(_LINE_STEP_DEG) * scale
     beside = int(beside_deg / _LINE_STEP_DEG / scale + 0.5)
-    sample = _SAMPLE_RAD * scale
+    sample = np.deg2rad(0.375) * scale  # between samples of a patch, at full resolution
     search_patches(*pictures, _PAD, rays, rotation, direction, beside, step, sample, scores, pixels)
     found = scores > 0
     height = len(pictures[1])
@@ -331,10 +329,7 @@ def step_of(
 ) -> Step:
     """A hypothesis with those of the places found in either frame (`found_places`) that fit it."""
     depths, rays, fitting = [], [], []
-    for frame, (rows, places), at in (
-        (one, found1, f1_T_f0),
-        (other, found0, inverse(f1_T_f0)),
-    ):
+    for frame, (rows, places), at in ((one, found1, f1_T_f0), (other, found0, inverse(f1_T_f0))):
         good, parallax, depth = fits(frame.keys[rows], places, at, 0.2)
         good &= parallax > MIN_PARALLAX_RAD
         depths.append(np.full(len(frame.keys), np.nan))

@@ -13,34 +13,14 @@ from itertools import product
 import numpy as np
 
 from factors.threads import map_in_threads
-from gsba.odometry.tour_joins import (
-    NEAR,
-    Join,
-    Joining,
-    TourMap,
-    alike,
-    scaled,
-)
-from gsba.odometry.tour_maps import (
-    KeptSteps,
-    TourMatches,
-    Triple,
-    maps_of,
-    match_tour,
-    matches_of,
-    searched,
-)
+from gsba.odometry.tour_joins import NEAR, Join, Joining, TourMap, alike, scaled
+from gsba.odometry.tour_maps import KeptSteps, TourMatches, Triple, maps_of, matches_of, searched
+from gsba.odometry.tour_merging import all_joined
 from gsba.odometry.tour_order import most_alike_path
-from gsba.odometry.tour_steps import Step, TourFrame, read_frame
-from gsba.types import FrameSet
+from gsba.odometry.tour_steps import Step, TourFrame
 
 _MIN_STEP_SCORE = 15.0  # of the places on both sides of a step, which do not hold it themselves
 _MIN_END_SCORE = 8.0  # of a step beyond which there is one frame
-
-
-def read_stills(frames: FrameSet, num_threads: int = 1) -> list[TourFrame]:
-    """All frames of a run, with the keypoints that are searched."""
-    return list(map_in_threads(lambda f: read_frame(frames, f), len(frames), num_threads))
 
 
 def match_stills(
@@ -53,7 +33,9 @@ def match_stills(
     """Confirmed steps of a tour, in the order given; by their likeness (F, F), if that is known
     since names are in no order, in another one, unless no step is confirmed there."""
     if likeness is None:
-        return match_tour(frames, given_names, num_threads, kept)
+        steps, sure = searched(frames, given_names, num_threads, kept)
+        joined = all_joined(frames, maps_of(frames, steps, sure), num_threads)
+        return matches_of(frames, given_names, steps, sure, joined)
     path = most_alike_path(likeness)
     given, frames = frames, [frames[f] for f in path]
     names = tuple(given_names[f] for f in path)
@@ -114,13 +96,8 @@ def _score_without(
     before = length(whole.first) if not one.single else after
     after = before if other.single else after
     at = Join(scaled(whole.between(f, f + 1), 1 / before), float(np.log(after / before)), 0.0, [])
-    pairs = list(
-        product(
-            range(max(f - NEAR + 1, whole.first), f + 1),
-            range(f + 1, min(f + NEAR, whole.last) + 1),
-        )
-    )
-    fitted = Joining(frames, one, other).fitted(
-        at, [p for p in pairs if p != (f, f + 1)], 0.35, 0.8
-    )
+    near = range(max(f - NEAR + 1, whole.first), f + 1)
+    beyond = range(f + 1, min(f + NEAR, whole.last) + 1)
+    pairs = [pair for pair in product(near, beyond) if pair != (f, f + 1)]
+    fitted = Joining(frames, one, other).fitted(at, pairs, 0.35, 0.8)
     return fitted.score if alike(at, fitted) else 0.0

@@ -32,6 +32,7 @@ from gsba.odometry.window import (
     median_turn,
     start_map,
 )
+from gsba.types.records import with_rows
 
 logger = logging.getLogger(__name__)
 
@@ -169,26 +170,23 @@ class Tracker:
         self.state.points[solved.ids] = points
         self.state.has_points = True
         for before, seen, where in self.state.pending:
-            self._pose_again(before, seen, where, key)
+            points = self.state.points[seen]
+            known = np.isfinite(points[:, 0])
+            record = self.state.records[before]
+            fit = resect(
+                points[known], where[known], world_T_key @ record.key_T_rig, self.state.sigma
+            )
+            if fit.significant:
+                record.key_T_rig = inverse(world_T_key) @ fit.world_T_rig
+                record.status = FrameStatus.TRACKED
+                record.inliers = int(np.count_nonzero(fit.inliers))
+                record.distance = self._distance(seen, fit.world_T_rig)
         last = self.state.records[-1]
         self.state.world_T_rig = self.state.keyframe_poses[last.keyframe] @ last.key_T_rig
         self._step(world_T_key @ solved.world_T_rigs[1], small)
         self.state.pending.clear()
         false = np.isin(ids, solved.outliers[:, 1])
         self._become_keyframe(frame, atlas, small, ids[~false], bearings[~false])
-
-    def _pose_again(self, frame: int, ids: np.ndarray, bearings: np.ndarray, key: Keyframe) -> None:
-        """Pose a frame before the start of the map from the points known by now."""
-        points = self.state.points[ids]
-        known = np.isfinite(points[:, 0])
-        record = self.state.records[frame]
-        start = key.world_T_rig @ record.key_T_rig
-        fit = resect(points[known], bearings[known], start, self.state.sigma)
-        if fit.significant:
-            record.key_T_rig = inverse(key.world_T_rig) @ fit.world_T_rig
-            record.status = FrameStatus.TRACKED
-            record.inliers = int(np.count_nonzero(fit.inliers))
-            record.distance = self._distance(ids, fit.world_T_rig)
 
     # A frame of a map that has points.
 
@@ -263,7 +261,11 @@ class Tracker:
         features.misses = np.where(fits, 0, features.misses + 1)
         known = np.isfinite(self.state.points[features.ids, 0])
         distance = self._distance(features.ids[fits & known], self.state.world_T_rig)
-        parallax = self._parallax(features, tried, fits, key)
+        parallax = 0.0
+        if fits.any():  # of features' rays in the keyframe and in the frame
+            key_R_rig = key.world_T_rig[:3, :3].T @ self.state.world_T_rig[:3, :3]
+            rays = tried.bearings[fits] @ key_R_rig.T
+            parallax = float(np.median(angles_between(features.bearings[fits], rays)))
         key.most_found = max(key.most_found, int(np.count_nonzero(fits)))
         share = np.count_nonzero(fits) / max(key.most_found, 1)
         few = np.count_nonzero(fit.inliers) < 60 and parallax > np.deg2rad(1.0)
@@ -273,7 +275,7 @@ class Tracker:
             self._become_keyframe(frame, tried.atlas, small, ids, bearings)
             return
         kept = known | (features.misses <= 4)  # consecutive frames
-        self.state.features = features.taken(kept)
+        self.state.features = with_rows(features, kept)
         number = int(np.count_nonzero(fit.inliers))
         key_T_rig = inverse(key.world_T_rig) @ self.state.world_T_rig
         self._record(FrameStatus.TRACKED, key_T_rig, distance, number)
@@ -295,16 +297,6 @@ class Tracker:
         off = angles_between(features.bearings[rows], rays)
         fits[rows] = np.minimum(across, off) < GATE * self.state.sigma
         return fits
-
-    def _parallax(
-        self, features: TrackedFeatures, tried: _Attempt, fits: np.ndarray, key: Keyframe
-    ) -> float:
-        """Median angle between features' rays in the keyframe and in the frame."""
-        if not fits.any():
-            return 0.0
-        key_R_rig = key.world_T_rig[:3, :3].T @ self.state.world_T_rig[:3, :3]
-        rays = tried.bearings[fits] @ key_R_rig.T
-        return float(np.median(angles_between(features.bearings[fits], rays)))
 
     # Keyframes.
 

@@ -58,12 +58,6 @@ class TrackedFeatures:
     # their last bearing and the distance of neighbouring points
     misses: np.ndarray  # (N,) int, frames since it was last found
 
-    def taken(self, rows: np.ndarray) -> "TrackedFeatures":
-        """The features of some rows."""
-        return TrackedFeatures(
-            self.ids[rows], self.bearings[rows], self.assumed_world[rows], self.misses[rows]
-        )
-
 
 @dataclass(slots=True)
 class TrackerState:

@@ -4,9 +4,11 @@ import logging
 import os
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from gsba import __version__
@@ -16,7 +18,6 @@ from gsba.geometry import inverse, quaternion_from_rotation, rotation_angle
 from gsba.log import GsbaError, event, track
 from gsba.odometry.closing import ClosedKeyframes, TrackedKeyframes, close
 from gsba.odometry.panoramas import SmallPanoramas
-from gsba.odometry.places import compressed
 from gsba.odometry.pose_graph import carried_covariances
 from gsba.odometry.tracker import Tracker
 from gsba.odometry.tracker_state import FrameStatus, TrackerState
@@ -65,7 +66,8 @@ def track_frames(panoramas: SmallPanoramas, seed: int, checkpoint: Path | None) 
         found.sharpness.append(sharpness(grey))
         found.rows.append(row)
         while len(state.keyframe_frames) > len(found.pictures):
-            found.pictures.append(compressed(grey))
+            picture = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, 90])[1]
+            found.pictures.append(np.asarray(picture))  # some tens of kilobytes
             _tell_keyframe(state, len(found.pictures) - 1)
         found.cpu_s += time.thread_time() - began
         if checkpoint is not None and (began := time.monotonic()) > due:
@@ -246,9 +248,7 @@ class Odometry:
 
 
 def track_panoramas(
-    panoramas: SmallPanoramas,
-    seed: int = 0,
-    checkpoint: Path | None = None,
+    panoramas: SmallPanoramas, seed: int = 0, checkpoint: Path | None = None
 ) -> Odometry:
     """Track a camera through a sequence, then join its maps and close its loops.
 
@@ -382,21 +382,15 @@ def write_chosen(found: Odometry, rows: np.ndarray, path: Path) -> None:
     A file that holds them already is not rewritten: frames extracted by it stay valid.
     """
     chosen = Trajectory(found.timestamps[rows], found.world_T_rigs[rows])
-    if path.is_file() and _holds(path, chosen):
-        return
+    if path.is_file():
+        with suppress(GsbaError):  # one that cannot be read is rewritten
+            written = read_trajectory(path)
+            same = np.array_equal(written.timestamps, chosen.timestamps)
+            poses = written.world_T_rigs, chosen.world_T_rigs
+            if same and np.allclose(*poses, rtol=0, atol=1e-12):  # to the file's precision
+                return
     path.parent.mkdir(parents=True, exist_ok=True)
     write_tum(path, chosen)
-
-
-def _holds(path: Path, trajectory: Trajectory) -> bool:
-    """True if a file has a trajectory's times and poses, to the precision of the file."""
-    try:
-        written = read_trajectory(path)
-    except GsbaError:
-        return False
-    return np.array_equal(written.timestamps, trajectory.timestamps) and np.allclose(
-        written.world_T_rigs, trajectory.world_T_rigs, rtol=0, atol=1e-12
-    )
 
 
 MAX_TURN_DEG = 40.0  # rotation between successive chosen frames: doorways and turns keep frames

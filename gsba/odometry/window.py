@@ -11,7 +11,7 @@ from gsba.bundle import optimize, pose_variables, triangulate
 from gsba.bundle.adjustment import poses_of, values_of
 from gsba.bundle.optimizer import SolverOptions
 from gsba.camera.rig import witnesses
-from gsba.geometry import angles_between, nearest_rotation
+from gsba.geometry import angles_between, extent_of, nearest_rotation
 from gsba.matching.verification import relative_pose
 from gsba.trajectory.limits import TwoViewLimits
 from gsba.types import Landmarks, Tracks
@@ -86,7 +86,7 @@ def adjust_window(
     )
     keys = [pose_variables.X(k) for k in range(len(world_T_rigs))]
     block = LandmarkBlock(keys, marks.points_world, [term], RobustLoss("cauchy", 2.0), 1)
-    extent = max(float(np.linalg.norm(np.ptp(world_T_rigs[:, :3, 3], axis=0))), 1e-9)
+    extent = max(extent_of(world_T_rigs[:, :3, 3]), 1e-9)
     spread = np.array([_HELD] * 3 + [_HELD * extent] * 3)
     noise = gtsam.noiseModel.Diagonal.Sigmas(spread)
     graph = gtsam.NonlinearFactorGraph()
@@ -108,7 +108,6 @@ def adjust_window(
 _MOVED, _MOVED_LITTLE = np.deg2rad([4.0, 1.2])  # parallax of the upper quarter of the features from
 # which initialisation is tried; the latter while features are being lost
 _MIN_POINTS = 40  # least number of independent points, in cells of 6 degrees
-_CELLS = 16
 _VERIFY = TwoViewLimits(max_error_deg=0.3)
 
 
@@ -149,7 +148,7 @@ def start_map(
     distances = np.linalg.norm(solved.points_world, axis=1)
     if len(distances) < _MIN_POINTS:
         return None
-    if witnesses(solved.points_world / distances[:, None], _CELLS) < _MIN_POINTS:
+    if witnesses(solved.points_world / distances[:, None], 16) < _MIN_POINTS:
         return None
     scale = 1 / float(np.median(distances))
     poses = solved.world_T_rigs.copy()

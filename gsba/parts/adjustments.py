@@ -11,15 +11,7 @@ from gsba.bundle.adjustment import DivisibleMap
 from gsba.bundle.optimizer import OptimizeResult, SolverOptions
 from gsba.memory import give_back_freed_memory, total_memory_bytes
 from gsba.parts.divided_system import divided_covariances, optimize_divided
-from gsba.parts.folder import (
-    At,
-    PartsWriter,
-    has_index,
-    keys_beside,
-    load,
-    remove_map,
-    serialized,
-)
+from gsba.parts.folder import At, PartsWriter, has_index, keys_beside, load, remove_map, serialized
 from gsba.parts.observations import NotStorableError, TermRows
 from gsba.store.records import save_record
 from gsba.store.shards import Workers, content_digest

@@ -310,10 +310,7 @@ def _places(nodes: np.ndarray, pairs: np.ndarray) -> np.ndarray:
 
 
 def optimize_divided(
-    folder: Path,
-    workers: Workers,
-    options: SolverOptions,
-    scratch: Path | None = None,
+    folder: Path, workers: Workers, options: SolverOptions, scratch: Path | None = None
 ) -> OptimizeResult:
     """Minimize the cost of a map in parts, from where an earlier call was stopped if there is one.
 

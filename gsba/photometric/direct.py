@@ -64,11 +64,8 @@ class PhotometricResult:
 
 
 def check(frames: FrameSet, settings: RefineSettings) -> None:
-    """If the family is selected, refuse frames that patches cannot be sampled from.
-
-    Raises:
-        GsbaError: cube faces, or panoramas of an odd height.
-    """
+    """If the family is selected, refuse frames that patches cannot be sampled from. Raises
+    GsbaError: cube faces, or panoramas of an odd height."""
     if len({(kind.width, kind.panoramic) for kind in frames.formats}) > 1 and (
         direct := settings.direct_families()
     ):
@@ -247,10 +244,7 @@ def joint(
 
 
 def make_block(
-    pixels: PatchPixels,
-    weights: np.ndarray,
-    num_threads: int,
-    noise: float = 1.0,
+    pixels: PatchPixels, weights: np.ndarray, num_threads: int, noise: float = 1.0
 ) -> PhotometricBlock:
     """The factor block of gathered patches, with the settings' noise times `noise`."""
     contrasts = pixels.templates.std(axis=1).astype(np.float64)
@@ -299,9 +293,7 @@ def _geometric_fits(landmarks: LandmarkBlock, values: gtsam.Values) -> np.ndarra
 
 
 def _frame_weights(
-    block: PhotometricBlock,
-    values: gtsam.Values,
-    growth: np.ndarray,
+    block: PhotometricBlock, values: gtsam.Values, growth: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Weight (F,) of each frame's pixels, and the median (F,) of its residuals in sigmas.
 
@@ -324,11 +316,7 @@ def _frame_weights(
 
 
 def _adjusted(
-    solved: Solution,
-    keypoints: Keypoints,
-    result: OptimizeResult,
-    accepted: bool,
-    num_threads: int,
+    solved: Solution, keypoints: Keypoints, result: OptimizeResult, accepted: bool, num_threads: int
 ) -> Solution:
     """The solution with the joint solve's poses, or the old one if not accepted.
 

@@ -57,10 +57,7 @@ def align(
 
 
 def align_to(
-    image: SphereImage,
-    mask: np.ndarray | None,
-    patches: PatchSet,
-    sightings: Sightings,
+    image: SphereImage, mask: np.ndarray | None, patches: PatchSet, sightings: Sightings
 ) -> None:
     """Align templates to one picture, where its mask (H, 2H) is True; results are written to the
     sightings."""

@@ -12,6 +12,7 @@ from gsba.camera.cameras import Cameras
 from gsba.camera.sphere import around_seam, bearings_from_erp, erp_from_bearings
 from gsba.frames.masks import load_usable
 from gsba.frames.pixels import load_erp
+from gsba.geometry import unit
 from gsba.types import Counts, FrameSet, Landmarks
 
 _MIN_GRADIENT = 2.0  # grey values per pixel, smallest in a patch
@@ -203,8 +204,7 @@ def views_of(table: PatchTable, world_T_rigs: np.ndarray, lenses: Cameras) -> Pa
     world_T_targets = world_T_rigs[table.targets]
     away = points - world_T_targets[:, :3, 3]
     local = np.einsum("oji,oj->oi", world_T_targets[:, :3, :3], away)
-    shown = lenses.seeing(local, table.targets)
-    shown /= np.linalg.norm(shown, axis=1, keepdims=True)
+    shown = unit(lenses.seeing(local, table.targets))
     return PatchViews(rig_T_hosts, lenses.views(shown, table.targets))
 
 

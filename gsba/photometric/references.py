@@ -26,10 +26,7 @@ def references(landmarks: Landmarks, world_T_rigs: np.ndarray) -> np.ndarray:
 
 
 def visible_frames(
-    landmarks: Landmarks,
-    world_T_rigs: np.ndarray,
-    rows: np.ndarray,
-    extended: np.ndarray,
+    landmarks: Landmarks, world_T_rigs: np.ndarray, rows: np.ndarray, extended: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Frames (O,) int64 in which points (O,) int64, by point, are searched, without their
     references.

@@ -14,7 +14,6 @@ MIN_STEP_SIGMAS = 3.0  # median length of a map's steps, in standard deviations;
 # rendered walks have 40 and more; a camera that turns by less in a step, and moves by less, stands
 MAX_STEP_DEVIATION = 0.5  # of a step from the one that far frames predict, part of its length: true
 # walks deviate by .006 at most, true positions of a turn by hand by .05
-MAX_CONTRADICTED_SHARE = 0.1  # of steps
 MIN_SHARE_AHEAD = 0.8  # of a vehicle's way: a tenth of it may go backwards
 
 
@@ -80,7 +79,7 @@ def require_motion(frames: FrameSet, result: Reconstruction) -> None:
         deviations = step_deviations(main)  # from those that frames further away predict
         tested = deviations[np.isfinite(deviations)]
         wrong = np.count_nonzero(tested > MAX_STEP_DEVIATION)
-        if wrong > MAX_CONTRADICTED_SHARE * len(tested):
+        if wrong > 0.1 * len(tested):  # of steps
             raise NoPositions(
                 f"the images determine no positions: {wrong} of {len(tested)} steps differ by more "
                 f"than {100 * MAX_STEP_DEVIATION:.0f} % from those that frames further away "

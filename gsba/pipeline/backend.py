@@ -148,11 +148,8 @@ def _doubtful_steps(state: State) -> np.ndarray:
 
 
 def merge_maps(state: State, parts: np.ndarray) -> State:
-    """Parts (F,) of the map joined where they meet, frames in none of them registered.
-
-    Raises:
-        NoPositions: without a trajectory, no three frames are in one part.
-    """
+    """Parts (F,) of the map joined where they meet, frames in none of them registered. Raises
+    NoPositions: without a trajectory, no three frames are in one part."""
     run, prior, trust, solution = state.run, state.prior, state.prior.trust, state.solution
 
     def compute() -> Registered:
@@ -303,9 +300,9 @@ def reconstruct(
             result,
             formats=frames.formats,
             vertical=_vertical(state, result),
+            lens_baseline=_baseline(state, world_scale(solution, result)),
+            origin=_origin(run, result),
         )
-        baseline = _baseline(state, world_scale(solution, result))
-        result = replace(result, lens_baseline=baseline, origin=_origin(run, result))
         return result if amended is None else amended(result)
 
     return run.stage("reconstruction", run.solving_key(), compute, Reconstruction)
@@ -363,8 +360,7 @@ def _reconstruct_rotations(state: State) -> Reconstruction:
         matches = correspondences.match_for_rotations(observed.context, poses)
         tied = connectivity.within(matches, parts)
         found = tracks.build([tied], np.diff(observed.keypoints.starts))
-        given = found, observed.keypoints, poses, prior.coarse, least, parts
-        result = rotation_only.refine(*given)
+        result = rotation_only.refine(found, observed.keypoints, poses, prior.coarse, least, parts)
         return replace(result, origin=_origin(run, result))
 
     key = [run.matching_key(), least]

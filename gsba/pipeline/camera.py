@@ -40,14 +40,7 @@ from gsba.pipeline.map import Map
 from gsba.pipeline.run import Run
 from gsba.pipeline.state import State
 from gsba.trajectory.conventions import quarter_turn
-from gsba.types import (
-    CoarsePoses,
-    Keypoints,
-    PoseSource,
-    Reconstruction,
-    Sighted,
-    Solution,
-)
+from gsba.types import CoarsePoses, Keypoints, PoseSource, Reconstruction, Sighted, Solution
 
 T = TypeVar("T")
 
@@ -371,9 +364,7 @@ def _better(coarse: CoarsePoses, map_: Map, camera: int) -> tuple[Rig, bool] | N
         return None
     found, turn = self_calibration.now(lenses), np.eye(3)
     rows = map_.lenses.frames_of(camera, len(coarse.sources))
-    own = replace(
-        coarse, world_T_rigs=coarse.world_T_rigs[rows], sources=coarse.sources[rows], segments=None
-    )
+    own = coarse.taken(rows)
     if (own.sources == PoseSource.SLAM).any():
         turn = quarter_turn(own, map_.solution.world_T_rigs[rows])
     off = self_calibration.apart(lenses, replace(lenses, fisheyes=None))

@@ -134,12 +134,6 @@ class FinishedRun:
         rows = np.flatnonzero(~np.isin(owners, list(names)))
         heads = tuple(f"{name}: " for name in names)
         origin = {what: path for what, path in self.origin.items() if not what.startswith(heads)}
-        coarse = replace(
-            self.coarse,
-            world_T_rigs=self.coarse.world_T_rigs[rows],
-            sources=self.coarse.sources[rows],
-            segments=None,
-        )
         frames, map_ = self.frames.taken(rows), _map_of(self.map, rows)
         used, _ = cameras_of(self.frames.camera_of_frame, rows)
         cameras = tuple(self.camera_settings[c] for c in used)
@@ -154,7 +148,7 @@ class FinishedRun:
             origin=origin,
             frames=frames,
             map=map_,
-            coarse=coarse,
+            coarse=self.coarse.taken(rows),
             result=_result_of(self.result, rows, _tied(map_, frames)),
             files=tuple(self.files[f] for f in rows),
         )

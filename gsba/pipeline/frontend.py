@@ -43,7 +43,6 @@ from gsba.types import (
     rows_across,
 )
 
-_DARK = 32  # of 255
 _NUM_STEPS = 3  # compared, spread over the walk
 _DRIFT_PER_FRAME = 0.13  # times frames over squared matches of a step: the drift of rendered walks
 # of 24 to 48 frames is 0.10 to 0.15 times it; a real one of 11 frames drifts eight times as much
@@ -307,7 +306,7 @@ def drop_implausible_steps(state: State) -> State:
 def _hindrance(run: Run) -> str:
     """What keeps frames from matching, as far as their pixels tell."""
     level = panorama.bright_level(run.greys)
-    if level < _DARK:
+    if level < 32:
         return (
             f"they are very dark (99 % of their pixels at or below {level} of 255): make them "
             "brighter; 12 bits in a 16-bit PNG must be scaled up to 16"

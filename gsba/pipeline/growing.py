@@ -61,14 +61,6 @@ def held_runs(roots: Sequence[Path]) -> Iterator[None]:
             os.close(lock)
 
 
-def refuse_existing(out: Path) -> None:
-    """Refuse a folder to write a new run to that exists and is not empty, or has no parent."""
-    if out.is_symlink() or (out.exists() and not (out.is_dir() and not any(out.iterdir()))):
-        raise GsbaError(f"{out} exists: choose another --out")
-    if not out.parent.is_dir():
-        raise GsbaError(f"{out.parent} is no folder: make it, or choose another --out")
-
-
 def forget_other_work(work: Path, origin: dict[str, Path], out: Path) -> None:
     """Delete what a call with other inputs has left half-written in `work`; a finished run whose
     renaming to `out` was interrupted is kept beside it."""
@@ -270,7 +262,14 @@ def merge_runs(
     place = _Place.of(None, out)
     with held_runs(roots):
         finished = [FinishedRun.load(root) for root in roots]
-        _refuse_common(finished)
+        known: dict[Path, FinishedRun] = {}
+        for run in finished:
+            for path in (path for what, path in run.origin.items() if what.endswith(": frames")):
+                if (other := known.setdefault(path.resolve(), run)) is not run:
+                    raise GsbaError(
+                        f"{other.root} and {run.root} both have recording {path}: take it out of "
+                        "one (gsba remove), or merge others"
+                    )
         refuse_fields(finished, len(JointCameras.of(finished).formats) > 1)
         origin = {what: path for run in finished for what, path in run.origin.items()}
         with place.store(origin, client, finished[0]) as work:
@@ -339,8 +338,12 @@ class _Place:
         if root is not None and (out is None or Path(out).resolve() == root.resolve()):
             return cls(root)
         assert out is not None
-        refuse_existing(Path(out))
-        return cls(Path(out))
+        out = Path(out)
+        if out.is_symlink() or (out.exists() and not (out.is_dir() and not any(out.iterdir()))):
+            raise GsbaError(f"{out} exists: choose another --out")
+        if not out.parent.is_dir():
+            raise GsbaError(f"{out.parent} is no folder: make it, or choose another --out")
+        return cls(out)
 
     @contextmanager
     def store(
@@ -398,19 +401,6 @@ def _refuse_known(run: FinishedRun, recordings: Sequence[Recording], names: Sequ
                 f"{run.root} has another recording named '{name}': give {path} a name of its own "
                 "(--recording PATH,name=NAME)"
             )
-
-
-def _refuse_common(runs: Sequence[FinishedRun]) -> None:
-    known: dict[Path, FinishedRun] = {}
-    for run in runs:
-        for what, path in run.origin.items():
-            if not what.endswith(": frames"):
-                continue
-            if (other := known.setdefault(path.resolve(), run)) is not run:
-                raise GsbaError(
-                    f"{other.root} and {run.root} both have recording {path}: take it out of one "
-                    "(gsba remove), or merge others"
-                )
 
 
 def _require_any_joined(maps: JointMaps, state: State) -> None:

@@ -274,7 +274,14 @@ def extract_video(
         tell_size(settings, None, track_sizes(video_file)[0][0], False)
         found = _follow(store, video_file, settings, by_odometry, calibration, name)
         if found.usable():
-            at = _choose_frames(store, found, settings, name)
+            rows = odometry.choose_frames(found, settings.odometry)
+            logger.info("%d of %d frames chosen by what they show", len(rows), len(found))
+            followed = store.root / CHOSEN.parent / name
+            files = "walk.tum", "keyframes.tum", "poses.csv", "odometry.json"
+            write_odometry(found, *(followed / file for file in files))
+            at = followed / CHOSEN.name
+            write_chosen(found, rows, at)
+            store.claim(followed)
             chosen = chosen.model_copy(update={"at": str(at), "sharpest": False})
         else:
             times = found.timestamps
@@ -312,17 +319,3 @@ def _follow(
     files = fingerprint([*files_of(video_file), calibration, masks.given])
     key = [odometry.WIDTH, seed, (start, end), masks.carrier, files]
     return store.stage(stage, key, compute, Odometry)
-
-
-def _choose_frames(store: RunStore, found: Odometry, settings: RefineSettings, name: str) -> Path:
-    """Write the odometry of a video to the run's folder, and the frames that are chosen by it to
-    the file that is returned."""
-    rows = odometry.choose_frames(found, settings.odometry)
-    logger.info("%d of %d frames chosen by what they show", len(rows), len(found))
-    folder = store.root / CHOSEN.parent / name
-    names = "walk.tum", "keyframes.tum", "poses.csv", "odometry.json"
-    write_odometry(found, *(folder / name for name in names))
-    at = folder / CHOSEN.name
-    write_chosen(found, rows, at)
-    store.claim(folder)
-    return at

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
@@ -32,7 +33,12 @@ class JointMaps:
     def of(cls, runs: Sequence[FinishedRun]) -> "JointMaps":
         """Lay the maps of runs back to back; GsbaError for runs of different features or faces,
         with recordings of one name, or with one recording twice."""
-        _check_settings(runs)
+        for run, name in product(runs[1:], ("features", "cubemap")):
+            if getattr(run.settings, name) != getattr(runs[0].settings, name):
+                raise GsbaError(
+                    f"{run.root} has other settings of [{name}] than {runs[0].root}: refine it "
+                    f"with --config {runs[0].root / 'config.toml'}"
+                )
         cameras = JointCameras.of(runs)
         frames = _frames_of(runs, cameras)
         starts = (0, *np.cumsum([len(run.frames) for run in runs]).tolist())
@@ -53,7 +59,13 @@ class JointMaps:
         rig = rig_for(frames.formats[0], runs[0].settings.cubemap)
         keypoints = on_faces(joined_keypoints(observed), rig)
         solution = _back_to_back(solutions, starts)
-        parts = _parts_of(runs)
+        parts, num_parts = list[np.ndarray](), 0
+        for run in runs:
+            own = run.result.components
+            own = np.zeros(len(run.frames), int) if own is None else own
+            own = np.unique(own, return_inverse=True)[1]
+            parts.append(num_parts + own)
+            num_parts += int(own.max()) + 1
         map_ = Map(
             solution,
             keypoints,
@@ -64,7 +76,7 @@ class JointMaps:
             cameras.found(runs, moves, solution, frames),
             frames.camera_of_frame,
         )
-        return cls(tuple(runs), moves, starts, frames, map_, parts, cameras)
+        return cls(tuple(runs), moves, starts, frames, map_, np.concatenate(parts), cameras)
 
     def rows(self, number: int) -> np.ndarray:
         """Frames (F',) int64 of a run."""
@@ -94,17 +106,6 @@ def joined_keypoints(parts: Sequence[Keypoints]) -> Keypoints:
         np.concatenate([part.colors for part in parts]),
         infos,
     )
-
-
-def _check_settings(runs: Sequence[FinishedRun]) -> None:
-    first = runs[0].settings
-    for run in runs[1:]:
-        for name in ("features", "cubemap"):
-            if getattr(run.settings, name) != getattr(first, name):
-                raise GsbaError(
-                    f"{run.root} has other settings of [{name}] than {runs[0].root}: refine it "
-                    f"with --config {runs[0].root / 'config.toml'}"
-                )
 
 
 def _frames_of(runs: Sequence[FinishedRun], cameras: JointCameras) -> FrameSet:
@@ -146,15 +147,3 @@ def _back_to_back(solutions: Sequence[Solution], starts: Sequence[int]) -> Solut
         Counts(sum(c.received for c in counts), sum(c.kept for c in counts), "tracks"),
     )
     return Solution(np.concatenate([one.world_T_rigs for one in solutions]), landmarks, 1.0, ())
-
-
-def _parts_of(runs: Sequence[FinishedRun]) -> np.ndarray:
-    """Part (F,) int64 of each frame: maps of runs."""
-    parts, begin = list[np.ndarray](), 0
-    for run in runs:
-        own = run.result.components
-        own = np.zeros(len(run.frames), np.int64) if own is None else own.astype(np.int64)
-        own = np.unique(own, return_inverse=True)[1]
-        parts.append(begin + own)
-        begin += int(own.max()) + 1
-    return np.concatenate(parts)

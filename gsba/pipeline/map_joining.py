@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsba.bundle.adjustment import ALIGNED_GATES
-from gsba.bundle.families import Families
 from gsba.bundle.lens_centres import baseline_of
 from gsba.bundle.readout import CameraEstimate
 from gsba.bundle.trajectory_prior import HeldPoses
@@ -19,12 +18,7 @@ from gsba.geometry import adjoint, inverse
 from gsba.localization.run_map import SAME_PLACE_RAD, SAME_PLACE_SIGMAS
 from gsba.log import GsbaError
 from gsba.loop_closure import connectivity, map_merging
-from gsba.loop_closure.map_similarity import (
-    Meeting,
-    meetings_of,
-    refined,
-    similarity_covariance,
-)
+from gsba.loop_closure.map_similarity import Meeting, meetings_of, refined, similarity_covariance
 from gsba.loop_closure.merged_map import Registered, carried
 from gsba.photometric.alignment import AlignedObservations
 from gsba.pipeline import backend, camera, frontend, inputs, patch_rounds
@@ -212,8 +206,7 @@ def hold(state: State, rows: np.ndarray) -> State:
     """The state with the poses of frames (H,) held where they are."""
     run = state.run
     held = HeldPoses(rows, state.solution.world_T_rigs[rows])
-    members = (*run.families.members, held)
-    families = Families(members, run.frames.names, run.frames.timestamps)
+    families = run.families.with_members((*run.families.members, held))
     return replace(state, run=replace(run, families=families))
 
 

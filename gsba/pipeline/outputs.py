@@ -30,22 +30,6 @@ from gsba.store.store import RunStore
 from gsba.trajectory.files import write_tum
 from gsba.types import CoarsePoses, Counts, FrameSet, Reconstruction, Trajectory
 
-_GAUGE = (
-    "Sim(3)-aligned to the initial poses of refined frames: their world and scale; "
-    "covariances hold the first pose and the distance to the frame furthest from it"
-)
-_FIRST_GAUGE = (
-    "Sim(3)-aligned to the trajectory of the first recording that has one: its world and scale; "
-    "covariances hold the first pose and the distance to the frame furthest from it"
-)
-_OWN_GAUGE = (
-    "no trajectory: the first frame's axes, and the median step of the start as the unit; "
-    "covariances hold the first pose and the distance to the frame furthest from it"
-)
-_FAMILIES_GAUGE = (
-    "families {names} fix the world or the scale; covariances hold the first pose and the distance "
-    "to the frame furthest from it"
-)
 CALIBRATION = "calibration.json"
 TRAJECTORIES = "trajectories"  # folder of a trajectory file for each of several recordings
 _OUTPUTS = (
@@ -89,7 +73,7 @@ def write(state: State, result: Reconstruction, cameras: Cameras) -> RunResult:
     frames, out, rows = world.straightened(run.frames), store.root, result.largest_map()
     main, shown = result.of_map(1), frames.taken(rows)
     write_tum(out / "trajectory.tum", Trajectory(shown.timestamps, main.world_T_rigs))
-    start = replace(coarse, world_T_rigs=coarse.world_T_rigs[rows], sources=coarse.sources[rows])
+    start = coarse.taken(rows)
     (out / "coarse.tum").unlink(missing_ok=True)
     if not prior.absent:
         write_tum(out / "coarse.tum", Trajectory(shown.timestamps, start.world_T_rigs))
@@ -253,10 +237,19 @@ def _gauge(run: Run, prior: Prior) -> str:
     """A sentence on what defines world and scale, and on the gauge of covariances."""
     fixing = run.families.fixing_gauge.members
     if fixing:
-        return _FAMILIES_GAUGE.format(names=", ".join(family.name for family in fixing))
-    if prior.of_recordings and not prior.absent:
-        return _FIRST_GAUGE
-    return _OWN_GAUGE if prior.absent else _GAUGE
+        names = ", ".join(family.name for family in fixing)
+        world = f"families {names} fix the world or the scale"
+    elif prior.absent:
+        world = (
+            "no trajectory: the first frame's axes, and the median step of the start as the unit"
+        )
+    elif prior.of_recordings:
+        first = "the first recording that has one"
+        world = f"Sim(3)-aligned to the trajectory of {first}: its world and scale"
+    else:
+        world = "Sim(3)-aligned to the initial poses of refined frames: their world and scale"
+    held = "the first pose and the distance to the frame furthest from it"
+    return f"{world}; covariances hold {held}"
 
 
 def _export(

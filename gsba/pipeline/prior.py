@@ -9,6 +9,7 @@ from gsba.bundle.gauge import Gauge
 from gsba.bundle.map_strength import MapStrength
 from gsba.bundle.trajectory_prior import LOSS_SIGMAS, GyroTurns, TrajectoryPrior
 from gsba.config import PriorSettings
+from gsba.geometry import extent_of
 from gsba.imu.alignment import Alignment
 from gsba.loop_closure.merged_map import Registered
 from gsba.trajectory.clock import ClockEstimate
@@ -81,7 +82,7 @@ class Prior:
         prior = TrajectoryPrior(believed, settings, false, trust.false_frames, first, noise)
         if self.turning is None:
             return (prior,)
-        extent = float(np.linalg.norm(np.ptp(believed[:, :3, 3], axis=0)))
+        extent = extent_of(believed[:, :3, 3])
         return prior, GyroTurns(self.turning, extent, LOSS_SIGMAS)
 
     def moved(self, gauge: Gauge) -> "Prior":

@@ -54,9 +54,6 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 T = TypeVar("T")
 
-_CHAIN_GATES = 60.0, 8.0  # gates in standard deviations, from the coarse trajectory
-
-
 __all__ = ["RunResult", "refine", "refine_each", "refine_recordings", "solve"]
 
 
@@ -466,7 +463,7 @@ def _map_all(state: State) -> State:
         return state
     # A chain of relative poses, then all points that neighbours share.
     state = backend.align_gauge(state, "gauge")
-    gates = _CHAIN_GATES
+    gates = 60.0, 8.0  # standard deviations, from the coarse trajectory
     chain = backend.adjust(state, "chain", gates)
     # Without steps less plausible than the trajectory's.
     state = frontend.drop_implausible_steps(chain)
@@ -475,7 +472,12 @@ def _map_all(state: State) -> State:
     state = frontend.match_known_points(state, "near", loops_closed=False)
     state = backend.adjust(state, "dense", rounds.dense)
     # One map, its loops closed, and the camera.
-    state = _merge_maps(state)
+    parts = backend.separate_parts(state)
+    if parts is not None:
+        state = backend.merge_maps(state, parts)
+        state = frontend.match_across(state, parts)
+        state = backend.adjust(state, "joined", rounds.loops)
+        state = frontend.match_along_epipolars(state, "adjacent2")
     state = frontend.close_loops(state)
     state = backend.align_gauge(state, "gauge_closed")
     state = backend.adjust(state, "closed", rounds.loops)
@@ -483,16 +485,6 @@ def _map_all(state: State) -> State:
     state = camera.find_camera(state)
     state = frontend.align_gyro_to_map(state, "imu_camera", with_noise=bool(state.map.lenses))
     return backend.measure_strength(state)
-
-
-def _merge_maps(state: State) -> State:
-    parts = backend.separate_parts(state)
-    if parts is None:
-        return state
-    state = backend.merge_maps(state, parts)
-    state = frontend.match_across(state, parts)
-    state = backend.adjust(state, "joined", state.run.settings.rounds.loops)
-    return frontend.match_along_epipolars(state, "adjacent2")
 
 
 def _add_keypoints_where_weak(state: State) -> State:

@@ -17,15 +17,9 @@ from gsba.loop_closure import connectivity
 from gsba.matching import recovery
 from gsba.matching.recovery import Recovered
 from gsba.odometry.tour_maps import TourMatches
-from gsba.odometry.tour_order import (
-    MIN_FRAMES,
-    Likeness,
-    in_given_order,
-    likeness,
-    may_lack_order,
-)
-from gsba.odometry.tour_steps import Step, TourFrame
-from gsba.odometry.tour_unordered import match_stills, read_stills
+from gsba.odometry.tour_order import MIN_FRAMES, Likeness, in_given_order, likeness, may_lack_order
+from gsba.odometry.tour_steps import Step, TourFrame, read_stills
+from gsba.odometry.tour_unordered import match_stills
 from gsba.pipeline import frontend
 from gsba.pipeline.run import Run
 from gsba.pipeline.state import ObservedFrames, State
@@ -35,7 +29,7 @@ from gsba.store.store import PerFrame, RunStore, digest, fingerprint
 from gsba.trajectory import judgement
 from gsba.trajectory.limits import TwoViewLimits
 from gsba.trajectory.steps import image_steps
-from gsba.types import Features, FrameSet, Matches
+from gsba.types import Features, FrameSet, Matches, rows_across
 from gsba.version import __version__
 
 logger = logging.getLogger(__name__)
@@ -73,8 +67,11 @@ def check_order(state: State, found: Recovered) -> State:
     run, frames = state.run, state.run.frames
     if not state.prior.absent or found.trust.turning_only:
         return state
-    lone = _lone_steps(found, frames.names)
-    state = replace(state, prior=replace(state.prior, lone_steps=lone))
+    # Steps across which no other frame beside them matches may lead to a place that looks alike.
+    nearest, further = _num_matches(found.neighbours.matches, len(frames))
+    lone = 1 + np.flatnonzero((nearest[1:-1] > 0) & (further[:-1] == 0) & (further[1:] == 0))
+    pairs = tuple(frames.names[f : f + 2] for f in lone.tolist())
+    state = replace(state, prior=replace(state.prior, lone_steps=pairs))
     if (
         len(frames) < (_MIN_TIMED if frames.timed else MIN_FRAMES)
         or run.store.root.absolute() in frames.paths[0][0].parents
@@ -83,7 +80,7 @@ def check_order(state: State, found: Recovered) -> State:
     ):
         return state
     num = min(len(frames), _FRAMES_IN_ORDER)
-    begins = np.unique(np.linspace(0, len(frames) - num, _NUM_PLACES).astype(int))
+    begins = rows_across(len(frames) - num + 1, _NUM_PLACES)
 
     def in_order(first: int) -> bool:
         some = read_stills(frames.taken(np.arange(first, first + num)), run.num_threads)
@@ -244,7 +241,7 @@ def _far_match_less(state: State, num: int) -> bool:
     far = np.array(
         [(f, f + gap) for gap in range(num // 3, 2 * num // 3) for f in range(num - gap)]
     )
-    far = far[np.unique(np.linspace(0, len(far) - 1, _NUM_FAR_PAIRS).astype(int))]
+    far = far[rows_across(len(far), _NUM_FAR_PAIRS)]
     near = np.column_stack([far[:, 0], far[:, 0] + 1])
     chosen, rows = np.unique(np.concatenate([near, far]), axis=0, return_inverse=True)
     context = state.observed.context.by_search()  # of far pairs a network would take seconds each
@@ -269,14 +266,6 @@ def _num_matches(matches: Matches, num: int) -> tuple[np.ndarray, np.ndarray]:
     near = gaps <= 2
     counts[gaps[near] - 1, matches.pairs[near, 0]] = np.diff(matches.offsets)[near]
     return counts[0, : num - 1], counts[1, : num - 2]
-
-
-def _lone_steps(found: Recovered, names: Sequence[str]) -> tuple[tuple[str, str], ...]:
-    """Frames of each step across which no other frame beside it matches: it may lead to a place
-    that only looks alike."""
-    nearest, further = _num_matches(found.neighbours.matches, len(names))
-    lone = 1 + np.flatnonzero((nearest[1:-1] > 0) & (further[:-1] == 0) & (further[1:] == 0))
-    return tuple((names[f], names[f + 1]) for f in lone.tolist())
 
 
 def _with_places(state: State, tour: TourMatches) -> tuple[ObservedFrames, Matches]:

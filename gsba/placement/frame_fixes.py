@@ -2,7 +2,6 @@
 
 import logging
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -97,7 +96,13 @@ def fixes_of_frames(
     if fixes.names is None:
         rows, geodetic, sigmas = _between(source, fixes, frames)
     else:
-        by_name = {name: g for g, name in enumerate(_names_in(frames, fixes.names))}
+        recordings = list(frames.recordings)
+        head = f"{recordings[0]}/" if recordings else ""
+        parts = [name.rpartition("/") for name in fixes.names]  # a table's names may have a folder
+        by_name = {
+            "".join(some) if some[0] in recordings else head + some[2]: g
+            for g, some in enumerate(parts)
+        }
         rows = np.array([f for f, name in enumerate(frames.names) if name in by_name], np.int64)
         chosen = [by_name[frames.names[f]] for f in rows]
         geodetic, sigmas = fixes.geodetic[chosen], fixes.sigmas[chosen]
@@ -106,14 +111,6 @@ def fixes_of_frames(
     times = frames.timestamps[rows] if frames.timed_frames[rows].all() else None
     origin[1] = (origin[1] + 180) % 360 - 180
     return FrameFixes(rows, local, sigmas, times, origin, correlation_s=60.0)  # see `FrameFixes`
-
-
-def _names_in(frames: FrameSet, names: Sequence[str]) -> list[str]:
-    """Names (G,) of a table, which may have a folder, as frames are named."""
-    recordings = list(frames.recordings)
-    head = f"{recordings[0]}/" if recordings else ""
-    parts = [name.rpartition("/") for name in names]
-    return ["".join(some) if some[0] in recordings else head + some[2] for some in parts]
 
 
 def _locked(source: str, fixes: GpsFixes) -> GpsFixes:

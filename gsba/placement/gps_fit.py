@@ -5,17 +5,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsba.bundle.gps_factors import MAX_DRIFT_SHARE, FrameFixes
+from gsba.geometry import extent_of
 from gsba.similarity import (
     NoSimilarityError,
     Sim3,
-    extent_of,
     level_similarity,
     robust_similarity,
     similarity,
 )
 
 _MAX_ROUNDS, _MAX_STEPS = 20, 20  # selections of inliers, and Gauss-Newton steps in each
-_MIN_STEP = 1e-10  # in units of the unknowns' own scale; a smaller one ends the fit
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,6 +137,6 @@ def _most_probable(
         step[0] = np.clip(step[0], -1, 1)
         fit = fit.moved(np.roll(step, -1), about=fit.points(centre[None])[0])
         reach = np.array([1.0, 1, 1, 1, *[max(float(np.ptp(chosen.positions)), 1e-9)] * 3])
-        if np.all(np.abs(step) <= _MIN_STEP * reach):
+        if np.all(np.abs(step) <= 1e-10 * reach):
             break
     return fit, information

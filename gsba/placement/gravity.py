@@ -14,7 +14,6 @@ from gsba.types import FACES, FrameSet, PoseStatus, Reconstruction, rows_across
 
 logger = logging.getLogger(__name__)
 
-_MAX_FRAMES = 24  # frames in which edges are detected
 _FACE_PX = 640
 _MIN_SPREAD = 0.1  # of the edges' directions around the vertical: 0 = all in one plane, 1 = even
 _MAX_SPREAD_DEG = 30.0  # of the rigs' up axes; above it, they have no common axis
@@ -64,7 +63,7 @@ def estimate_gravity(reconstruction: Reconstruction, frames: FrameSet) -> Gravit
     if spread > _MAX_SPREAD_DEG and forces is None and tags is None:
         logger.warning("the rigs have no common up axis (median deviation %.0f degrees)", spread)
         return None
-    chosen = good[rows_across(len(good), _MAX_FRAMES)]
+    chosen = good[rows_across(len(good), 24)]
     found = [_edge_normals(frames, int(f), reconstruction.world_T_rigs[f]) for f in chosen]
     normals, weights = (np.concatenate(part) for part in zip(*found, strict=True))
     start, most, source = by_rigs, 10.0, "the rigs' up axis"

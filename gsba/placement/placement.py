@@ -9,6 +9,7 @@ import numpy as np
 
 from gsba.bundle.gps_factors import MAX_DRIFT_SHARE, FrameFixes
 from gsba.config import GpsSettings, PlacementSettings
+from gsba.geometry import extent_of
 from gsba.log import GsbaError, brief
 from gsba.placement.frame_fixes import fixes_of_frames, read_fixes
 from gsba.placement.gps_fit import GpsFit, fit_fixes
@@ -19,7 +20,6 @@ from gsba.scans.search import Guess
 from gsba.scans.types import Scan, cloud_of
 from gsba.similarity import (
     Sim3,
-    extent_of,
     extents,
     naming,
     pose_similarity,
@@ -282,7 +282,15 @@ def _on_earth(
     )
     _require_determined(path, found, fixes)
     if scale is not None:
-        _require_one_scale(path, positions @ level.T, fixes, up_sigma, scale)
+        alone = fit_fixes(positions @ level.T, fixes, up_sigma)
+        ratio = abs(np.log(alone.similarity.scale / scale[0]))
+        if ratio > _MAX_SCALE_SIGMAS * np.hypot(alone.scale_sigma, scale[1] / scale[0]):
+            raise GsbaError(
+                f"{path}: its positions give {alone.similarity.scale:.4g} m per map unit (sigma "
+                f"{100 * alone.scale_sigma:.2g} %), the lenses {scale[0]:.4g} (sigma "
+                f"{100 * scale[1] / scale[0]:.2g} %): check --baseline and the positions, and pass "
+                "one of --gps and --scale lens"
+            )
     fit = dataclasses.replace(found.similarity, rotation=found.similarity.rotation @ level)
     sigmas = found.position_sigmas(positions @ level.T)
     grounds = {
@@ -318,12 +326,7 @@ def _on_earth(
 
 
 def _require_majority(
-    path: Path,
-    used: np.ndarray,
-    off: np.ndarray,
-    frames: FrameSet,
-    rows: np.ndarray,
-    advice: str,
+    path: Path, used: np.ndarray, off: np.ndarray, frames: FrameSet, rows: np.ndarray, advice: str
 ) -> None:
     """Raise GsbaError, naming them, unless most of a file's positions (rows of frames) agree."""
     if 2 * used.sum() > len(used):
@@ -337,25 +340,6 @@ def _require_majority(
         f"drift allow: those of frames {', '.join(names)}{more}; remove false positions, or check "
         f"that the file is of this recording and on the frames' clock; {advice}"
     )
-
-
-def _require_one_scale(
-    path: Path,
-    positions: np.ndarray,
-    fixes: FrameFixes,
-    up_sigma: float | None,
-    scale: tuple[float, float],
-) -> None:
-    """Raise GsbaError if the scale by GPS alone contradicts a known one, see `fit_fixes`."""
-    alone = fit_fixes(positions, fixes, up_sigma)
-    off = abs(np.log(alone.similarity.scale / scale[0]))
-    if off > _MAX_SCALE_SIGMAS * np.hypot(alone.scale_sigma, scale[1] / scale[0]):
-        raise GsbaError(
-            f"{path}: its positions give {alone.similarity.scale:.4g} m per map unit (sigma "
-            f"{100 * alone.scale_sigma:.2g} %), the lenses {scale[0]:.4g} (sigma "
-            f"{100 * scale[1] / scale[0]:.2g} %): check --baseline and the positions, and pass "
-            "one of --gps and --scale lens"
-        )
 
 
 def _require_determined(path: Path, found: GpsFit, fixes: FrameFixes) -> None:

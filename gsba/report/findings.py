@@ -10,6 +10,7 @@ import numpy as np
 from gsba.bundle.map_strength import scale_sigmas
 from gsba.bundle.readout import CameraEstimate
 from gsba.bundle.stitching import Stitching
+from gsba.geometry import unit
 from gsba.imu.alignment import Alignment
 from gsba.loop_closure.merged_map import Registered
 from gsba.trajectory.clock import ClockEstimate
@@ -18,8 +19,6 @@ from gsba.trajectory.judgement import StepChecks
 from gsba.types import CoarsePoses, FrameSet, PoseSource, PoseStatus, Reconstruction, RunStart
 
 logger = logging.getLogger(__name__)
-
-_MAX_NAMED_FRAMES = 5  # frames whose names a note lists
 
 
 def of_trajectory(
@@ -146,8 +145,7 @@ def clock_section(estimate: ClockEstimate) -> dict[str, Any]:
 def of_field(found: Stitching) -> dict[str, Any]:
     """Content of report.json on the stitching field."""
     field = found.field
-    rays = np.random.default_rng(0).normal(size=(2000, 3))
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    rays = unit(np.random.default_rng(0).normal(size=(2000, 3)))
     largest = np.linalg.norm(field.displacements(rays), axis=1).max()
     return {
         "taken": bool(field),
@@ -217,17 +215,14 @@ def of_frames(
 
 def named(names: Sequence[str], key: str, unit: str = "frames") -> str:
     """Names of a few frames or steps; of more, their number and the key in report.json."""
-    if len(names) <= _MAX_NAMED_FRAMES:
+    if len(names) <= 5:  # frames whose names a note lists
         return ", ".join(names)
     return f"{len(names)} {unit}, listed in report.json under {key}"
 
 
 def notes_on_gps(content: Mapping[str, Any], num_frames: int) -> list[str]:
-    """Notes on used and false fixes.
-
-    Args:
-        content: report of the family, see `gsba.bundle.gps_factors.GpsFactors.report`.
-    """
+    """Notes on used and false fixes; content: report of the family, see
+    `gsba.bundle.gps_factors.GpsFactors.report`."""
     if not content["taken"]:
         why = (
             "most of them are further from where the images put the frames than their noise and a "
@@ -254,9 +249,7 @@ def notes_on_gps(content: Mapping[str, Any], num_frames: int) -> list[str]:
 
 
 def of_gyro(
-    found: Alignment,
-    steps_used: float | None,
-    readout: CameraEstimate | None,
+    found: Alignment, steps_used: float | None, readout: CameraEstimate | None
 ) -> tuple[dict[str, Any], list[str]]:
     """Clock, bias and axes of a gyro, and the share of its steps that agree with the poses.
 

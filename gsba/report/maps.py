@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from gsba.geometry import extent_of
 from gsba.types import FrameSet, PoseStatus, Reconstruction, RunStart
 
 MIN_SHARE_IN_ONE_MAP = 0.9  # of a run's frames; a run with fewer in its largest map is partial
@@ -32,11 +33,8 @@ def summarize_maps(
     reconstruction: Reconstruction, frames: FrameSet, reasons: Sequence[str | None] = ()
 ) -> tuple[MapSummary, ...]:
     """Summaries of a reconstruction's maps, the largest first; frames in no map are left out.
-
-    Args:
-        reasons: reason why each map is not joined to a larger one, the largest map first; there may
-            be fewer reasons than maps.
-    """
+    `reasons`: reason why each map is not joined to a larger one, the largest map first; there may
+    be fewer reasons than maps."""
     found = []
     for number in range(1, reconstruction.num_maps + 1):
         rows = reconstruction.frames_of_map(number)
@@ -51,7 +49,7 @@ def summarize_maps(
                 int(np.count_nonzero(part.pose_statuses == PoseStatus.REFINED)),
                 len(rows) - len(first),
                 len(part.points_world),
-                float(np.linalg.norm(np.ptp(positions, axis=0))),
+                extent_of(positions),
                 tuple((frames.names[a], frames.names[b]) for a, b in zip(first, last, strict=True)),
                 (reasons[number - 1] or None) if number <= len(reasons) else None,
             )

@@ -39,11 +39,7 @@ _AXES = ("rx", "ry", "rz", "tx", "ty", "tz")  # of a pose covariance
 
 
 def source_name(pose: int, start: str) -> str:
-    """Name of the source of a frame's initial pose.
-
-    Args:
-        pose: a `PoseSource`.
-    """
+    """Name of the source of a frame's initial pose; pose: a `PoseSource`."""
     if pose in (PoseSource.SLAM, PoseSource.NONE):
         return start
     return PoseSource(pose).name.lower()
@@ -143,7 +139,10 @@ def build_report(
     Args:
         gauge: a sentence on the gauge of the refined map.
     """
-    quality = frame_quality(reconstruction)
+    quality, numbers = frame_quality(reconstruction), reconstruction.map_numbers()
+    rows, main = reconstruction.largest_map(), reconstruction.of_map(1)
+    shown, residuals = frames.taken(rows), np.degrees(angular_residuals(main))
+    lengths = np.bincount(main.observation_points, minlength=len(main.points_world))
     optional: dict[str, Any] = {"camera": found.camera, "gyro": found.gyro, "gps": found.gps}
     optional["recordings"] = found.recordings or None
     report = {
@@ -153,8 +152,22 @@ def build_report(
         "timed": frames.timed,
         "order_doubted": found.order_doubted,
         "lone_steps": found.lone_steps,
-        "summary": _summary(frames, coarse, reconstruction)
-        | {"seconds": stages.seconds_again + sum(stage.seconds for stage in stages.costs)},
+        "summary": {
+            "frames": len(frames),
+            "exported": len(shown),
+            "refined": np.count_nonzero(main.pose_statuses == PoseStatus.REFINED),
+            "maps": reconstruction.num_maps,
+            "frames_in_other_maps": np.count_nonzero(numbers > 1),
+            "frames_in_no_map": np.count_nonzero(numbers == 0),
+            "fetched": np.count_nonzero(shown.fetched),
+            "frames_fetched": np.count_nonzero(frames.fetched),
+            "points": len(main.points_world),
+            "observations": len(residuals),
+            "mean_track_length": lengths.mean() if len(lengths) else math.nan,
+            "median_residual_deg": np.median(residuals) if len(residuals) else math.nan,
+            "median_residual_deg_coarse": median_residual_deg(main, coarse.world_T_rigs[rows]),
+            "seconds": stages.seconds_again + sum(stage.seconds for stage in stages.costs),
+        },
         "maps": summarize_maps(reconstruction, frames, found.reasons),
         "gauge": gauge,
         "notes": found.notes,
@@ -185,33 +198,7 @@ def build_report(
         "versions": {name: _version(name) for name in _PACKAGES},
     }
     report = plain(report)
-    main, shown = reconstruction.of_map(1), frames.taken(reconstruction.largest_map())
     return report | {"verdict": plain(judge(report, main, shown).to_json())}
-
-
-def _summary(
-    frames: FrameSet, coarse: CoarsePoses, reconstruction: Reconstruction
-) -> dict[str, Any]:
-    """Counts of a run's frames, and counts and residuals of the exported map."""
-    rows, main = reconstruction.largest_map(), reconstruction.of_map(1)
-    residuals = np.degrees(angular_residuals(main))
-    lengths = np.bincount(main.observation_points, minlength=len(main.points_world))
-    numbers = reconstruction.map_numbers()
-    return {
-        "frames": len(frames),
-        "exported": len(rows),
-        "refined": np.count_nonzero(main.pose_statuses == PoseStatus.REFINED),
-        "maps": reconstruction.num_maps,
-        "frames_in_other_maps": np.count_nonzero(numbers > 1),
-        "frames_in_no_map": np.count_nonzero(numbers == 0),
-        "fetched": np.count_nonzero(frames.taken(rows).fetched),
-        "frames_fetched": np.count_nonzero(frames.fetched),
-        "points": len(lengths),
-        "observations": len(residuals),
-        "mean_track_length": lengths.mean() if len(lengths) else math.nan,
-        "median_residual_deg": np.median(residuals) if len(residuals) else math.nan,
-        "median_residual_deg_coarse": median_residual_deg(main, coarse.world_T_rigs[rows]),
-    }
 
 
 def write_poses(

@@ -16,6 +16,7 @@ from gsba.bundle.map_strength import (
     scale_changes,
     step_deviations,
 )
+from gsba.geometry import extent_of
 from gsba.odometry.tour_order import MIN_FRAMES
 from gsba.report.maps import MIN_SHARE_OF_A_MAP
 from gsba.types import FrameSet, PoseStatus, Reconstruction, RunStart
@@ -62,7 +63,7 @@ def measure(report: Mapping[str, Any], main: Reconstruction, shown: FrameSet) ->
         main: the exported map.
         shown: its frames.
     """
-    extent = float(np.linalg.norm(np.ptp(main.world_T_rigs[:, :3, 3], axis=0)))
+    extent = extent_of(main.world_T_rigs[:, :3, 3])
     known = len(main.points_world) > 0 and extent > 0
     width = max(kind.panorama_width for kind in shown.formats)
     shifts = neighbour_shifts(main) * _ERROR_RATIO * width / (2 * np.pi)

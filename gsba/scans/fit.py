@@ -12,7 +12,6 @@ from gsba.types.records import with_rows
 
 _MIN_STEP = 1e-6  # part of the cloud's size; a smaller step ends a round
 _FEW_STEPS, _MAX_STEPS = 3, 6  # Gauss-Newton steps at one width, at first and at the end
-_CELLS_PER_SIZE = (8, 4, 2, 1)  # cell edges, as divisors of the cloud's size, for the covariance
 LEAST_SIGMA = 0.1  # smallest sigma, part of the scan's spacing
 _MAX_NEAR_DISTANCE = 0.02  # of a point to a near surface, part of the cloud's size
 _MAX_LOG_CHANGE = 20.0  # of log parameters from their start: beyond, likelihoods are constant
@@ -144,7 +143,7 @@ def settle(start: Sim3, cloud: Cloud, scan: Scan, sigma: float) -> Fit:
     hessian = (jacobians * slopes[:, None]).T @ jacobians
     inverse = np.linalg.pinv(hessian, rcond=1e-14, hermitian=True)
     found = []
-    for part in _CELLS_PER_SIZE:
+    for part in (8, 4, 2, 1):  # cells along the size of the cloud
         cells = cells_of(carried, fit.scale * cloud.size / part)
         sums = np.zeros((cells.max() + 1, 7))
         np.add.at(sums, cells, gradients)

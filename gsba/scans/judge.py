@@ -14,7 +14,6 @@ SIGMAS = 3.0  # largest distance of an explained point from its surface, standar
 _MAX_GRID_CELLS = 400  # along the scan's extent
 _MAX_BEHIND = 1.0  # part of the cloud's size: surfaces so far behind a point contradict it
 _MIN_SINE = 0.15  # of the angle between a ray and a surface that it crosses
-_CELLS_PER_SIZE = (2, 4)  # cell edges, as divisors of the cloud's size, for the sign test
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +119,7 @@ def verdict(fit: Sim3, cloud: Cloud, scan: Scan, grid: CellGrid, noise: Noise) -
     logs = np.where(near, noise.logs(off, variances, reach), np.log(1 - noise.inliers))
     logs += _brightness_logs(cloud, scan, nearest, near)
     informed = near | hidden
-    cells = tuple(cells_of(cloud.points, cloud.size / part) for part in _CELLS_PER_SIZE)
+    cells = tuple(cells_of(cloud.points, cloud.size / part) for part in (2, 4))
     return ScanVerdict(explained, contradicted, informed, np.where(informed, logs, 0.0), cells)
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from gsba.geometry import rotation_angle
 from gsba.log import GsbaError
 from gsba.scans.fit import Fit, approach, noise_of, reach_of, settle
 from gsba.scans.judge import CellGrid, ScanVerdict, verdict
@@ -118,8 +119,7 @@ def register(cloud: Cloud, scan: Scan, guess: Guess | None = None) -> Registrati
                 )
     if found.rival is not None and found.doubt > _MAX_DOUBT / found.rivals:
         best = found.fit.similarity
-        cosine = (np.trace(best.rotation.T @ found.rival.rotation) - 1) / 2
-        turn = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+        turn = np.degrees(rotation_angle(best.rotation.T @ found.rival.rotation))
         raise NoPlacementError(
             "several placements explain the run about equally: the lead of the best over another, "
             f"rotated by {turn:.0f} deg at {found.rival.scale / best.scale:.3g} times the scale, "

@@ -16,7 +16,6 @@ NEIGHBOURS = 24  # of a scan's point, through which its plane is fitted
 MIN_POINTS = 300  # of a cloud that can be registered
 POINTS_AT_ONCE = 50_000
 _MAX_POINT_SIGMA = 0.02  # of a used point, part of the cloud's size
-_NUM_BINS = 30  # of a histogram
 
 
 @dataclass(frozen=True)
@@ -160,7 +159,7 @@ class Distances:
 
     def histogram(self, furthest: float) -> tuple[np.ndarray, np.ndarray]:
         """Counts (B + 1,), the last one of distances beyond `furthest`, and edges (B + 1,)."""
-        edges = np.linspace(0, furthest, _NUM_BINS + 1)
+        edges = np.linspace(0, furthest, 31)
         counts = np.histogram(self.values, edges)[0]
         return np.append(counts, np.sum(self.values > furthest)), edges
 

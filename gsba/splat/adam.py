@@ -1,6 +1,6 @@
 """Adam on the parameters of a splat (Kingma and Ba, 2015), a learning rate for each group."""
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -43,14 +43,6 @@ class Moments:
         """The moments with zeros appended for new Gaussians."""
         zeros = zeros_like(new)
         return Moments(concatenate([self.first, zeros]), concatenate([self.second, zeros]))
-
-    def without_opacity(self) -> "Moments":
-        """The moments with those of opacities reset to zero."""
-        zero = np.zeros_like(self.first.opacity_logits)
-        first, second = (
-            replace(part, opacity_logits=zero.copy()) for part in (self.first, self.second)
-        )
-        return Moments(first, second)
 
 
 def step(

@@ -79,10 +79,7 @@ def _capture_of_lenses(frames: FrameSet, which: np.ndarray, size: int, optics: O
 
 
 def splat_block(
-    gaussians: Gaussians,
-    captured: Captured,
-    near: float,
-    backend: Backend,
+    gaussians: Gaussians, captured: Captured, near: float, backend: Backend
 ) -> SplatBlock:
     """The block of captured frames, keys X(frame), against a fixed splat in the world of the poses;
     near: least z of a Gaussian, map units. Coarse to fine is one block after another."""

@@ -77,4 +77,8 @@ def reset_opacity(gaussians: Gaussians, moments: Moments) -> tuple[Gaussians, Mo
     """Make every Gaussian almost transparent, so that only necessary ones regain opacity."""
     highest = np.float32(np.log(0.01 / (1 - 0.01)))
     logits = np.minimum(gaussians.opacity_logits, highest)
-    return replace(gaussians, opacity_logits=logits), moments.without_opacity()
+    first, second = (
+        replace(part, opacity_logits=np.zeros_like(logits))
+        for part in (moments.first, moments.second)
+    )
+    return replace(gaussians, opacity_logits=logits), Moments(first, second)

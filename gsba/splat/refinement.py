@@ -143,11 +143,7 @@ class _Turns:
     """Inputs that are constant over all turns, and the faces of one size."""
 
     def __init__(
-        self,
-        keypoints: Keypoints,
-        solved: Solution,
-        context: AdjustmentContext,
-        split: Split,
+        self, keypoints: Keypoints, solved: Solution, context: AdjustmentContext, split: Split
     ) -> None:
         self.keypoints, self.solved, self.context = keypoints, solved, context
         self.settings, self.split = context.settings, split

@@ -123,11 +123,8 @@ def _masks_of_whole_pixels(masks: Images, shapes: Sequence[tuple[int, int]]) -> 
 
 
 def make_views(faces: Faces, world_T_rigs: np.ndarray) -> Views:
-    """Posed faces, without those that are masked altogether.
-
-    Args:
-        world_T_rigs: (W, 4, 4) poses of their frames.
-    """
+    """Posed faces, without those that are masked altogether; world_T_rigs: (W, 4, 4) poses of their
+    frames."""
     each, poses = len(faces.views), faces.poses(world_T_rigs)
     seen = [v for v, use in enumerate(faces.use) if use.any()]
     cameras = [view_camera(poses[v // each], faces.views[v % each]) for v in seen]
@@ -176,10 +173,7 @@ def place_points(
 def start_cloud(
     reconstruction: Reconstruction, world_T_rigs: np.ndarray, frames: np.ndarray, sh_degree: int
 ) -> Gaussians:
-    """Gaussians at the run's points, triangulated under any poses by one recipe.
-
-    Args:
-        reconstruction, world_T_rigs, frames: see `place_points`.
-    """
+    """Gaussians at the run's points, triangulated under any poses by one recipe; reconstruction,
+    world_T_rigs, frames: see `place_points`."""
     landmarks, known = place_points(reconstruction, world_T_rigs, frames, float(np.deg2rad(3.0)))
     return from_cloud(landmarks.points_world, reconstruction.point_colors[known], sh_degree)

@@ -24,14 +24,7 @@ from pydantic import BaseModel
 from gsba.disk import FullDiskError, link_or_copy, write_text
 from gsba.log import GsbaError, brief, event
 from gsba.memory import give_back_freed_memory, peak_memory_bytes, release_mapped_files
-from gsba.store.folder import (
-    MARKER,
-    STAGES,
-    claim,
-    is_run_folder,
-    open_run_folder,
-    refuse_foreign,
-)
+from gsba.store.folder import MARKER, STAGES, claim, is_run_folder, open_run_folder, refuse_foreign
 from gsba.store.records import (
     FORMAT,
     MIN_MAPPED_BYTES,
@@ -223,11 +216,7 @@ class RunStore:
         return frames
 
     def adopt(
-        self,
-        name: str,
-        files: Mapping[str, Path],
-        compute: Callable[[str], T],
-        returns: type[T],
+        self, name: str, files: Mapping[str, Path], compute: Callable[[str], T], returns: type[T]
     ) -> "PerFrame[T]":
         """Results of a per-frame stage that another run has stored in files (frame name -> file),
         as results of this one; computed where a file is missing."""

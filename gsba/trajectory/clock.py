@@ -55,14 +55,10 @@ class ClockEstimate:
 
 
 def estimate_clock(
-    timestamps: np.ndarray,
-    found: Steps,
-    trajectory: Trajectory,
-    offset: float,
-    reach_s: float,
+    timestamps: np.ndarray, found: Steps, trajectory: Trajectory, offset: float
 ) -> ClockEstimate:
     """Compare the given clock, by its offset to times (F,) of frames, with all others whose offset
-    differs by up to `reach_s`; all in seconds."""
+    differs by up to 10 s; all in seconds."""
     given = Clock(float(timestamps[0]), offset, 1.0)
     turns = merged(timestamps, found.f_T_nexts[:, :3, :3], found.verified)
     if len(turns) < MIN_STEPS:
@@ -76,11 +72,10 @@ def estimate_clock(
     others: list[np.ndarray] = []
     explained = fit.explained(best, noise(fit.residuals(best)))
     if fit.apart(best, start) > interval or explained < _SURE_EXPLAINED:
-        tried = [best, *(fit.refine(p) for p in fit.candidates(start, reach_s))]
+        tried = [best, *(fit.refine(p) for p in fit.candidates(start, 10.0))]
         sigma = min(noise(fit.residuals(p)) for p in tried)
         best, covariance = simplest(fit, min(tried, key=lambda p: fit.cost(p, sigma)))
         others = [p for p in tried if fit.apart(p, best) > interval]
-    start = np.array([given.offset, 1.0])
     degrees = [
         float(np.degrees(np.median(np.linalg.norm(fit.residuals(p), axis=1))))
         for p in (start, best)

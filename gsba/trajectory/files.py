@@ -100,11 +100,7 @@ def _read_tum(path: Path, rows: Sequence[tuple[int, str]]) -> Trajectory:
 
 
 def _tracked(
-    path: Path,
-    values: np.ndarray,
-    positions: np.ndarray,
-    turned: np.ndarray,
-    where: Sequence[str],
+    path: Path, values: np.ndarray, positions: np.ndarray, turned: np.ndarray, where: Sequence[str]
 ) -> np.ndarray:
     """Rows (M,) of N that have a pose, at least 2 unless N is less; others are logged."""
     known = np.isfinite(values).all(axis=1) & turned

@@ -41,7 +41,10 @@ def without_lost_frames(trajectory: Trajectory) -> Trajectory:
         if (poses[first] == np.eye(4)).all():
             lost[first : last + 1] = _lost_identity(trajectory, first, last, pace)
         elif last > first:
-            lost[first + 1 : last + 1] = _lost_repeat(trajectory, first, last, pace)
+            lost[first + 1 : last + 1] = last + 1 == len(poses) or (
+                # The steady speed is nearer to the pace than the sudden one.
+                _speed(trajectory, first, last + 1) * _speed(trajectory, last, last + 1) > pace**2
+            )
     if not lost.any() or np.count_nonzero(~lost) < 2:
         return trajectory
     _log.warning(
@@ -81,13 +84,6 @@ def _lost_identity(trajectory: Trajectory, first: int, last: int, pace: float) -
         turned = _turn(trajectory, first - 1, last + 1) / _turn(trajectory, last, last + 1)
         rows[-1] |= moved * turned < 1
     return rows
-
-
-def _lost_repeat(trajectory: Trajectory, first: int, last: int, pace: float) -> bool:
-    if last + 1 == len(trajectory.timestamps):
-        return True
-    steady, sudden = (_speed(trajectory, row, last + 1) for row in (first, last))
-    return steady * sudden > pace**2  # the steady one is nearer to the pace
 
 
 def split_restarts(trajectory: Trajectory) -> list[Trajectory]:

@@ -45,29 +45,13 @@ def image_steps(pairs: VerifiedPairs, keypoints: Keypoints) -> Steps:
             # The camera stands: an essential matrix determines its turn less well.
             f_T_nexts[f0, :3, :3] = turn
     short = verified & ~np.isfinite(sigmas)
-    if short.any():
-        _set_short_directions(f_T_nexts, sigmas, short, verified, pairs)
-    return Steps(f_T_nexts, verified, sigmas)
-
-
-def _set_short_directions(
-    f_T_nexts: np.ndarray,
-    sigmas: np.ndarray,
-    short: np.ndarray,
-    verified: np.ndarray,
-    pairs: VerifiedPairs,
-) -> None:
-    """Give short steps (F - 1,) bool the mean direction, and its spread, of pairs over them."""
+    if not short.any():
+        return Steps(f_T_nexts, verified, sigmas)
     gaps = np.diff(pairs.matches.pairs, axis=1)[:, 0]
-    start_R_f = np.concatenate([np.eye(3)[None], f_T_nexts[:, :3, :3]])
-    for f in range(1, len(start_R_f)):
-        start_R_f[f] = start_R_f[f - 1] @ start_R_f[f]
+    start_R_f = chained(np.ascontiguousarray(f_T_nexts[:, :3, :3]))
     for gap in np.unique(gaps[gaps > 1]):
-        sums, squares, counts = (
-            np.zeros((len(short), 3)),
-            np.zeros(len(short)),
-            np.zeros(len(short)),
-        )
+        # Short steps get the mean direction, and its spread, of pairs over them.
+        sums, (squares, counts) = np.zeros((num, 3)), np.zeros((2, num))
         for p in np.flatnonzero((gaps == gap) & np.isfinite(pairs.direction_sigmas)):
             first, last = pairs.matches.pairs[p]
             if verified[first:last].all():
@@ -81,6 +65,7 @@ def _set_short_directions(
         spread = 2 * (1 - lengths / counts[known])
         sigmas[known] = np.sqrt(squares[known] / counts[known] + spread)
         short = short & ~known
+    return Steps(f_T_nexts, verified, sigmas)
 
 
 def tracked_steps(coarse: CoarsePoses) -> np.ndarray:
@@ -201,10 +186,7 @@ def ray_depths(rays0: np.ndarray, rays1: np.ndarray, f0_T_f1: np.ndarray) -> np.
 
 
 def step_lengths(
-    slam_lengths: np.ndarray,
-    slam_sigmas: np.ndarray,
-    logs: np.ndarray,
-    sigmas: np.ndarray,
+    slam_lengths: np.ndarray, slam_sigmas: np.ndarray, logs: np.ndarray, sigmas: np.ndarray
 ) -> np.ndarray:
     """Lengths of steps that fit their measured ratios and, if consistent, the trajectory's lengths.
 
@@ -249,8 +231,8 @@ def step_lengths(
 
 
 def chained(steps: np.ndarray) -> np.ndarray:
-    """Poses (F, 4, 4) chained from steps (F - 1, 4, 4), the first the identity."""
-    poses = [np.eye(4)]
+    """Poses (F, 4, 4) or rotations (F, 3, 3) chained from steps, the first the identity."""
+    poses = [np.eye(steps.shape[1])]
     for step in steps:
         poses.append(poses[-1] @ step)
     return np.array(poses)

@@ -30,11 +30,8 @@ class Fisheye:
 
 @dataclass(frozen=True, slots=True)
 class PictureFormat:
-    """The pictures of one camera in one mode, and the calibration that they are read by.
-
-    Raises:
-        ValueError: a face that cannot be a file name; exported files carry it.
-    """
+    """The pictures of one camera in one mode, and the calibration that they are read by. Raises
+    ValueError: a face that cannot be a file name; exported files carry it."""
 
     layout: str  # "erp" (2:1 equirectangular), "fisheye" (one image per lens, read as a panorama),
     # "eac" (two tracks of an equi-angular cube map, read as a panorama or as faces) or "cube" (one
@@ -103,11 +100,7 @@ def _owner(name: str) -> str:
 @dataclass(frozen=True, slots=True)
 class FrameSet:
     """The captured frames on disk, without pixels: in time order, or in that in which stills are
-    most alike.
-
-    Raises:
-        ValueError: a name that cannot be a file name; exported files carry them.
-    """
+    most alike. Raises ValueError: a name that cannot be a file name; exported files carry them."""
 
     names: tuple[str, ...]  # (F,) unique, without folder or extension; RECORDING/NAME if the frames
     # are of several recordings, whose frames follow one another
@@ -170,11 +163,7 @@ class FrameSet:
 
     @property
     def format(self) -> PictureFormat:
-        """Format of the frames of a single camera.
-
-        Raises:
-            ValueError: there are several cameras.
-        """
+        """Format of the frames of a single camera. Raises ValueError: there are several cameras."""
         (only,) = self.formats
         return only
 

@@ -93,6 +93,11 @@ class CoarsePoses:
         """True if there is no trajectory."""
         return bool((self.sources == PoseSource.NONE).all())
 
+    def taken(self, rows: np.ndarray) -> "CoarsePoses":
+        """Poses of frames `rows` (F',), in one piece."""
+        poses, sources = self.world_T_rigs[rows], self.sources[rows]
+        return replace(self, world_T_rigs=poses, sources=sources, segments=None)
+
 
 @dataclass(frozen=True, slots=True)
 class GyroConstraints:
@@ -163,13 +168,9 @@ class Keypoints:
 
     def scaled_noise(self, factors: np.ndarray | float) -> "Keypoints":
         """Keypoints whose noise is `factors`, () or (N,), times as large."""
-        factors = np.asarray(factors)
-        infos = self.sqrt_infos
-        return replace(
-            self,
-            sigmas_rad=self.sigmas_rad * factors,
-            sqrt_infos=None if infos is None else infos / factors[..., None, None],
-        )
+        factors, infos = np.asarray(factors), self.sqrt_infos
+        infos = None if infos is None else infos / factors[..., None, None]
+        return replace(self, sigmas_rad=self.sigmas_rad * factors, sqrt_infos=infos)
 
     def at(self, rows: np.ndarray, starts: np.ndarray) -> "Keypoints":
         """Keypoints in rows (N',), which frames own as in `starts` (F' + 1,) int64."""
@@ -229,9 +230,8 @@ class VerifiedPairs:
     @classmethod
     def none(cls) -> "VerifiedPairs":
         """No pairs."""
-        none = np.zeros((0, 2), np.int32)
-        poses, sigmas = np.zeros((0, 4, 4)), np.zeros(0)
-        return cls(Matches.of_rows(none, ()), poses, sigmas, Counts(0, 0, "pairs"))
+        none = Matches.of_rows(np.zeros((0, 2), np.int32), ())
+        return cls(none, np.zeros((0, 4, 4)), np.zeros(0), Counts(0, 0, "pairs"))
 
     @classmethod
     def joined(cls, parts: Sequence["VerifiedPairs"]) -> "VerifiedPairs":
@@ -246,8 +246,7 @@ class VerifiedPairs:
     def taken(self, rows: Sequence[int]) -> "VerifiedPairs":
         """Pairs with these indices, in the given order."""
         chosen = np.asarray(rows, np.int64)
-        poses, sigmas = self.f0_T_f1s[chosen], self.direction_sigmas[chosen]
-        return VerifiedPairs(self.matches.taken(chosen), poses, sigmas, self.counts)
+        return replace(with_rows(self, chosen), matches=self.matches.taken(chosen))
 
     def frames(self) -> set[tuple[int, int]]:
         """Frames (f0, f1) of each pair."""

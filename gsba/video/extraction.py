@@ -13,7 +13,7 @@ import csv
 import json
 import logging
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, astuple, dataclass
 from itertools import groupby
@@ -29,6 +29,7 @@ from gsba.frames.times import read_times
 from gsba.log import GsbaError, track
 from gsba.store.records import RecordError, typed
 from gsba.store.store import digest, fingerprint
+from gsba.trajectory.association import nearest
 from gsba.trajectory.files import read_trajectory
 from gsba.types import Counts
 from gsba.version import __version__
@@ -50,7 +51,6 @@ logger = logging.getLogger(__name__)
 
 TIMES = "timestamps.csv"
 _JOURNAL = "extract.partial.csv"  # frames written so far; deleted when all are written
-_JPEG_QUALITY = 95
 _MAX_BLACK_LEVEL = 16  # grey value; 99 % of the pixels of a black image are at or below it
 
 
@@ -163,12 +163,8 @@ def _nearest_to(path: Path, times: np.ndarray, inside: np.ndarray) -> list[np.nd
     """Frame nearest to each time of a trajectory, if it is within half a frame interval."""
     entries = read_trajectory(path).timestamps
     interval = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
-    after = np.clip(np.searchsorted(times[inside], entries), 1, max(len(inside) - 1, 1))
-    after = np.minimum(after, len(inside) - 1)
-    before = np.maximum(after - 1, 0)
-    earlier = entries - times[inside[before]] <= times[inside[after]] - entries
-    nearest = inside[np.where(earlier, before, after)]
-    met = np.abs(times[nearest] - entries) <= 0.5 * interval + EXACT_S
+    rows = inside[nearest(times[inside], entries)]
+    met = np.abs(times[rows] - entries) <= 0.5 * interval + EXACT_S
     if not met.any():
         raise GsbaError(
             f"{path}: none of its times ({entries[0]:.3f} to {entries[-1]:.3f} s) is that of a "
@@ -176,7 +172,7 @@ def _nearest_to(path: Path, times: np.ndarray, inside: np.ndarray) -> list[np.nd
         )
     if not met.all():
         logger.warning("%s: %d of %d times have no frame", path, np.sum(~met), len(met))
-    return [np.array([index]) for index in np.unique(nearest[met])]
+    return [np.array([index]) for index in np.unique(rows[met])]
 
 
 def _check_end(video: Path, recording: VideoRecording, to_s: float | None) -> None:
@@ -207,8 +203,13 @@ def _extract(
     if before and todo and skip_standing:
         for _, pictures in shots(recording, [before[-1].index]):
             last = _small(pictures, recording.cube)
-    wanted = [int(index) for window in todo for index in window]
-    best = _best_of_each(shots(recording, wanted), todo, settings.sharpest)
+
+    def quality(shot: tuple[int, tuple[VideoPicture, ...]]) -> float:
+        return sum(sharpness(p.luma()) for p in shot[1]) if settings.sharpest else 0.0
+
+    window_of = {int(index): w for w, window in enumerate(todo) for index in window}
+    windows_of_shots = groupby(shots(recording, list(window_of)), lambda shot: window_of[shot[0]])
+    best = (max(window, key=quality) for _, window in windows_of_shots)
     for index, pictures in track(best, "extracting frames", len(todo)):
         if skip_standing:
             small = _small(pictures, recording.cube)
@@ -224,19 +225,6 @@ def _extract(
         with disk_errors(journal), journal.open("a", newline="", encoding="utf-8") as file:
             csv.writer(file).writerow(astuple(kept[-1]))
     return kept, standing
-
-
-def _best_of_each(
-    frames: Iterable[tuple[int, tuple[VideoPicture, ...]]],
-    windows: list[np.ndarray],
-    sharpest: bool,
-) -> Iterator[tuple[int, tuple[VideoPicture, ...]]]:
-    """Yield the sharpest, or only, decoded frame of each window, by the mean over its images."""
-    window_of = {int(index): w for w, window in enumerate(windows) for index in window}
-    for _, group in groupby(frames, key=lambda item: window_of[item[0]]):
-        yield max(
-            group, key=lambda item: sum(sharpness(p.luma()) for p in item[1]) if sharpest else 0.0
-        )
 
 
 def _small(pictures: tuple[VideoPicture, ...], cube: bool) -> np.ndarray:
@@ -255,7 +243,7 @@ def _encoded(picture: VideoPicture, width: int | None) -> bytes:
     if width is not None and width != pixels.shape[1]:
         height = width * pixels.shape[0] // pixels.shape[1]
         pixels = cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA)
-    return cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
+    return cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
 
 
 def _take_over(out: Path, key: str, replace: bool) -> Counts | None:

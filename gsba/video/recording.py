@@ -35,6 +35,7 @@ from gsba.frames.side_by_side import (
     two_circles,
 )
 from gsba.log import GsbaError
+from gsba.trajectory.association import nearest
 from gsba.types.records import spread_rows
 from gsba.video.colours import bgr, luma
 from gsba.video.timeline import (
@@ -354,10 +355,10 @@ def _of_two_tracks(
     front, back = read_timeline(tracks[0]), read_timeline(tracks[1])
     ahead = int(back.ticks[0]) * back.tick_s - int(front.ticks[0]) * front.tick_s
     ours, theirs = front.times, back.times + float(ahead)
-    nearest = _nearest(theirs, ours)
-    mutual = _nearest(ours, theirs)[nearest] == np.arange(len(ours))
+    paired = nearest(theirs, ours)
+    mutual = nearest(ours, theirs)[paired] == np.arange(len(ours))
     within = 0.5 * min(front.interval_s, back.interval_s) - EXACT_S
-    shown = mutual & (np.abs(theirs[nearest] - ours) < within)
+    shown = mutual & (np.abs(theirs[paired] - ours) < within)
     where = " and ".join(dict.fromkeys(str(track.path) for track in tracks))
     if not shown.any():
         raise GsbaError(
@@ -374,14 +375,7 @@ def _of_two_tracks(
             f"{kind} has ({len(ours) - num} {one}, {len(theirs) - num} {other})"
         )
     places, lines = ((slice(None), slice(None)),) * 2, (front, back)
-    return VideoRecording(tracks, lines, places, size[0], shown, nearest, tuple(notes), cube=cube)
-
-
-def _nearest(times: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Index of the ascending time that is nearest to each wanted one, the earlier of two."""
-    after = np.minimum(np.searchsorted(times, wanted), len(times) - 1)
-    before = np.maximum(after - 1, 0)
-    return np.where(np.abs(wanted - times[before]) <= np.abs(times[after] - wanted), before, after)
+    return VideoRecording(tracks, lines, places, size[0], shown, paired, tuple(notes), cube=cube)
 
 
 def _looks(track: Track, timeline: Timeline) -> Iterator[np.ndarray]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gsba.camera.views import View as Face
-from gsba.geometry import quaternion_from_rotation
+from gsba.geometry import extent_of, quaternion_from_rotation
 from gsba.log import GsbaError
 from gsba.report.report import frame_quality
 from gsba.types import PoseStatus
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 _BEFORE, _AFTER, _BAD = (217, 130, 43), (23, 105, 170), (192, 57, 43)  # colours of report.html
 _SEEN = (46, 125, 79)
 _RECORDINGS = (_AFTER, _BEFORE, _SEEN, (142, 79, 168), (160, 103, 47), (93, 125, 139))  # by turns
-_JPEG_QUALITY = 85
 
 
 class SceneView:
@@ -236,7 +235,7 @@ class SceneView:
             color=_AFTER,
             image=image,
             format="jpeg",
-            jpeg_quality=_JPEG_QUALITY,
+            jpeg_quality=85,
             wxyz=wxyz,
             position=position,
             cast_shadow=False,
@@ -266,7 +265,7 @@ class SceneView:
         """Camera position from which the whole path is visible, and the middle of the path."""
         positions = self.scale * self.scene.reconstruction.world_T_rigs[:, :3, 3]
         centre = (positions.min(axis=0) + positions.max(axis=0)) / 2
-        extent = max(float(np.linalg.norm(np.ptp(positions, axis=0))), 2 * self.size)
+        extent = max(extent_of(positions), 2 * self.size)
         up = self.scene.up
         level = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
         level /= np.linalg.norm(level)

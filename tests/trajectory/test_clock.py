@@ -50,7 +50,7 @@ def _case(
 
 
 def _estimate(steps: Steps, trajectory: Trajectory, offset: float = 0.0) -> ClockEstimate:
-    return clock.estimate_clock(TIMES, steps, trajectory, offset, 10.0)
+    return clock.estimate_clock(TIMES, steps, trajectory, offset)
 
 
 def _off(estimate: ClockEstimate, true: Clock) -> float:
@@ -134,7 +134,7 @@ def test_a_turn_that_repeats_leaves_several_clocks() -> None:
     steps = inverse(world_T_rigs[:-1]) @ world_T_rigs[1:]
     known = np.ones(len(steps), bool)
     trajectory = Trajectory(long + 2.5, poses)
-    found = clock.estimate_clock(TIMES, Steps(steps, known, known), trajectory, 0.0, 10.0)
+    found = clock.estimate_clock(TIMES, Steps(steps, known, known), trajectory, 0.0)
     assert found.verdict == "unclear" and "several clock offsets fit" in found.note
 
 

@@ -13,7 +13,6 @@ from gsba.types import CoarsePoses, Reconstruction, rows_across
 if TYPE_CHECKING:
     from gsba.odometry import Odometry
 
-_MAX_POINTS = 4000  # points of the cloud on the map
 _SPHERE_CELL_DEG = 5.0
 
 
@@ -31,7 +30,7 @@ def world_map(coarse: CoarsePoses, reconstruction: Reconstruction) -> dict[str, 
     axes, upright = viewing_axes(reconstruction.world_T_rigs)
     centre = np.median(positions, axis=0)
     num = len(reconstruction.points_world)
-    which = rows_across(num, _MAX_POINTS)
+    which = rows_across(num, 4000)  # points of the cloud on the map
     extent = float(np.ptp(positions, axis=0).max()) or 1.0
     points = (reconstruction.points_world[which] - centre) @ axes.T
     near = np.abs(points).max(axis=1, initial=0) < 3 * extent

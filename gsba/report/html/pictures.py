@@ -18,7 +18,6 @@ from gsba.types import FACES, FrameSet, Reconstruction, rows_across
 
 NUM_PICTURES = 6
 _WIDTH = 720  # pixels across an image
-_JPEG_QUALITY = 72
 _MAX_VECTORS = 350  # residuals in an image
 
 
@@ -38,8 +37,7 @@ def picture(frames: FrameSet, reconstruction: Reconstruction, f: int) -> dict[st
         degrees of longitude and latitude.
     """
     rows = np.flatnonzero(reconstruction.observation_frames == f)
-    if len(rows) > _MAX_VECTORS:
-        rows = rows[rows_across(len(rows), _MAX_VECTORS)]
+    rows = rows[rows_across(len(rows), _MAX_VECTORS)]
     bearings = reconstruction.observation_bearings[rows]
     residuals = np.degrees(residuals_of_rows(reconstruction, rows))
     level = np.maximum(np.hypot(bearings[:, 0], bearings[:, 2]), 0.05)
@@ -47,7 +45,7 @@ def picture(frames: FrameSet, reconstruction: Reconstruction, f: int) -> dict[st
     vectors = np.column_stack([places, residuals[:, 0] / level, residuals[:, 1]])
     return {
         "frame": f,
-        "jpeg": jpeg_text(small_panorama(frames, f, _WIDTH), [_JPEG_QUALITY]),
+        "jpeg": jpeg_text(small_panorama(frames, f, _WIDTH), [72]),
         "width": _WIDTH,
         "height": _WIDTH // 2,
         "vectors": vectors.round(5),
@@ -90,12 +88,8 @@ def small_panorama(frames: FrameSet, f: int, width: int) -> np.ndarray:
             out[own] = _nearest(image, scale * project(lens, bearings[own]))
         return out
     size = min(kind.width, width // 2)
-    faces, rig, owners = (
-        load_faces(frames, f, size=size),
-        CubeRig(size, np.pi / 2),
-        owner_faces(bearings),
-    )
-    for image, name in zip(faces, kind.faces, strict=True):
+    rig, owners = CubeRig(size, np.pi / 2), owner_faces(bearings)
+    for image, name in zip(load_faces(frames, f, size=size), kind.faces, strict=True):
         own = owners == FACES.index(name)
         out[own] = _nearest(image, rig.project(bearings[own], FACES.index(name)))
     return out
