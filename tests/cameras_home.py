@@ -9,8 +9,9 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from one_gallery import OVAL_FRAMES, OVAL_WIDTH, oval_settings
+from one_gallery import OVAL_FRAMES, OVAL_WIDTH
 from pixels import pixel_centres
+from tiny_run import exporting
 
 from gsba import Recording, refine_recordings
 from gsba.camera.calibration import calibration_json
@@ -152,7 +153,7 @@ def error_of(run: Path, home: Home) -> float:
     return evaluate(Trajectory(times, reconstruction.world_T_rigs), true).ate.rmse
 
 
-SMALL_EXPORT = oval_settings("colmap-flat", face_size=64)
+SMALL_EXPORT = exporting("colmap-flat", face_size=64)
 
 
 def make_single(home: Home, folder: Path) -> Path:
@@ -164,13 +165,13 @@ def make_single(home: Home, folder: Path) -> Path:
 
 def make_beside_faces(home: Home, folder: Path) -> Path:
     """A run of panoramas and, of the second recording, cube faces."""
-    out, settings = folder / "cube", oval_settings("colmap-flat", face_size=64)
+    out, settings = folder / "cube", exporting("colmap-flat", face_size=64)
     return refine_recordings([panoramas(home, 0, WIDTH), faces(home)], out, settings).out
 
 
 def make_beside_fisheyes(home: Home, folder: Path) -> Path:
     """A run of panoramas and, of the second recording, raw fisheyes."""
-    out, settings = folder / "fisheyes", oval_settings("colmap", face_size=64)
+    out, settings = folder / "fisheyes", exporting("colmap", face_size=64)
     return refine_recordings([panoramas(home, 0, WIDTH), fisheyes(home)], out, settings).out
 
 

@@ -41,6 +41,7 @@ class SolverState:
     version: int  # of the parts' landmarks
     at: At  # all variables
     damping: float  # of the next attempt
+    attempts: int  # before it, in all calls
 
 
 class DividedSystem:
@@ -68,10 +69,11 @@ class DividedSystem:
         self._folder, self._workers, self._loss = folder.absolute(), workers, loss
         self._scratch = scratch
         index = load_index(folder)
-        self.start = SolverState(0, index.start, np.nan)
+        self.start = SolverState(0, index.start, np.nan, 0)
         if (folder / _STATE).exists():
             self.start = load(folder / _STATE, SolverState)
         self._version = self._latest = self.start.version
+        self._attempts = self.start.attempts
         self._saved: int | None = self._version if self._version else None
         self.num_frames = len(index.start.poses)
         self._beside = index.start.beside.keys.tolist()
@@ -109,8 +111,10 @@ class DividedSystem:
         """See `gsba.bundle.optimizer.System`; steps (N, 6) of frames, then of other variables."""
         # Note where the solution stands, and delete older and rejected versions
         if self._saved != self._version:
-            save_record(self._folder / _STATE, SolverState(self._version, self._at, damping), {})
+            state = SolverState(self._version, self._at, damping, self._attempts)
+            save_record(self._folder / _STATE, state, {})
             self._saved = self._version
+        self._attempts += 1
         for path in self._folder.glob("part-*/*-[0-9]*.npz"):
             if not path.stem.endswith(f"-{self._version:06d}"):
                 path.unlink(missing_ok=True)
@@ -272,7 +276,7 @@ class DividedSystem:
 
     def finish(self, values: gtsam.Values) -> None:
         """Note that the solution ended at these values, with the landmarks of this version."""
-        state = SolverState(self._version, self._of(values), np.nan)
+        state = SolverState(self._version, self._of(values), np.nan, self._attempts)
         save_record(self._folder / _RESULT, state, {})
 
     @property
@@ -318,7 +322,7 @@ def optimize_divided(
 
     Args:
         folder: of the map, from `folder.PartsWriter`, on a disk that the workers share.
-        options: loss, damping, tolerances; `max_iterations` counts from where this call starts.
+        options: loss, damping, tolerances; `max_iterations` of all calls together.
         scratch: folder of the workers' own files, emptied after each pass; None = they have none.
 
     Raises:
@@ -328,7 +332,8 @@ def optimize_divided(
     system = DividedSystem(folder, workers, options.loss, scratch)
     start = system.start
     if np.isfinite(start.damping):
-        options = replace(options, lambda_initial=start.damping)
+        left = options.max_iterations - start.attempts
+        options = replace(options, lambda_initial=start.damping, max_iterations=left)
     values = start.at.values(range(system.num_frames))
     result = minimize(system, values, options)
     system.finish(result.values)

@@ -6,6 +6,7 @@ import signal
 import threading
 import zipfile
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -135,6 +136,18 @@ def test_a_call_goes_on_where_earlier_ones_were_stopped(divided, tmp_path: Path)
     np.testing.assert_array_equal(poses_of(found.values), divided)
     again = optimize_divided(tmp_path / "map", Threads(1), SETTINGS)  # from its last step
     np.testing.assert_array_equal(poses_of(again.values), divided)
+
+
+def test_the_iteration_limit_is_that_of_all_calls_together(tmp_path: Path) -> None:
+    few = replace(SETTINGS, max_iterations=3)
+    write(tmp_path / "map", 15)
+    write(tmp_path / "stopped", 15)
+    undisturbed = optimize_divided(tmp_path / "map", Threads(1), few)
+    assert undisturbed.reason == "iteration limit"
+    with pytest.raises(KeyboardInterrupt):
+        optimize_divided(tmp_path / "stopped", Failing(31, KeyboardInterrupt()), few)
+    found = optimize_divided(tmp_path / "stopped", Threads(1), few)
+    np.testing.assert_array_equal(poses_of(found.values), poses_of(undisturbed.values))
 
 
 def test_a_full_disk_ends_in_one_line_and_costs_nothing_else(

@@ -14,8 +14,8 @@ import pytest
 from accuracy import assert_as_accurate
 from command import run_gsba, succeed
 from growing_home import MAX_ERROR, NUM, SMALL_EXPORTS, GrowingHome
-from one_gallery import oval_settings
 from plain_records import frames_of
+from tiny_run import PLAIN
 from typer.testing import Result
 from waiting import until
 
@@ -249,7 +249,7 @@ def test_rigid_merging_keeps_both_maps_and_tells_how_sure_it_is(
 
 def test_runs_that_meet_nowhere_are_not_merged(home: GrowingHome, tmp_path: Path) -> None:
     other = tmp_path / "other"
-    refine(home.elsewhere, home.elsewhere_trajectory, other, oval_settings(rounds=0))
+    refine(home.elsewhere, home.elsewhere_trajectory, other, PLAIN)
     before, out = _content(home.run), tmp_path / "run"
     result = _gsba("merge", home.run, other, "--out", out)
     assert result.exit_code == 1 and not out.exists()

@@ -10,7 +10,7 @@ import pytest
 from accuracy import assert_as_accurate, predicted_error
 from cameras_home import NUM, SMALL, WIDTH, Home, beginning, error_of, panoramas
 from command import succeed
-from one_gallery import oval_settings
+from tiny_run import PLAIN
 
 from factors.sphere_field import SphereField, num_harmonics
 from gsba import Localizer, add_recordings, load_run, remove_recordings
@@ -105,9 +105,8 @@ def test_recordings_of_two_models_have_two_cameras(home: Home, tmp_path: Path) -
     first, second = (
         beginning(panoramas(home, n, WIDTH), num, tmp_path / f"recording{n}") for n in range(2)
     )
-    plain = oval_settings(rounds=0)
-    camera = plain.camera.model_copy(update={"name": "insta360-x3"})
-    refine_each([first], run, plain.model_copy(update={"camera": camera}))
+    camera = PLAIN.camera.model_copy(update={"name": "insta360-x3"})
+    refine_each([first], run, PLAIN.model_copy(update={"camera": camera}))
     call = f"{second.frames},trajectory={second.trajectory},camera=gopro-max"
     succeed("--quiet", "add", run, "--recording", call)
     frames: FrameSet = load_run(run)[1]

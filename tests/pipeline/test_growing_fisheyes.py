@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from accuracy import assert_as_accurate
 from cameras_home import NUM, Home, error_of, fisheyes
-from one_gallery import oval_settings
+from tiny_run import BARE
 
 from gsba import add_recordings, load_run, merge_runs
 from gsba.frames.scan import scan
@@ -37,7 +37,7 @@ def test_fixed_poses_of_a_run_of_several_cameras_stay(
 def raw(home: Home) -> Path:
     """A run of the second recording as raw fisheyes."""
     out = home.folder / "raw_run"
-    refine_each([fisheyes(home)], out, oval_settings())
+    refine_each([fisheyes(home)], out, BARE)
     return out
 
 

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from command import run_gsba
 from growing_home import MAX_ERROR, NUM, SMALL_EXPORTS, GrowingHome
-from one_gallery import OVAL_KEYPOINTS
 from tiny_run import LIGHT, computed_stages
 from typer.testing import Result
 
@@ -23,12 +22,7 @@ from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.types import Trajectory
 from gsba.view import load_scene
 
-SET = (
-    *LIGHT,
-    f"features.max_per_face={OVAL_KEYPOINTS}",
-    'export.formats=["colmap-flat", "tum"]',
-    "export.face_size=64",
-)
+SET = (*LIGHT, 'export.formats=["colmap-flat", "tum"]', "export.face_size=64")
 
 
 def _refine(out: Path, *arguments: object) -> Result:

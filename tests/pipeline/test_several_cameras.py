@@ -11,8 +11,7 @@ import pycolmap
 import pytest
 from accuracy import assert_as_accurate, predicted_error
 from cameras_home import NUM, SMALL, WIDTH, Home, error_of, faces, panoramas, read
-from one_gallery import oval_settings
-from tiny_run import SETTINGS
+from tiny_run import SETTINGS, exporting
 
 from gsba import RunResult, refine_recordings
 from gsba.config import RefineSettings
@@ -27,7 +26,7 @@ COARSER = 0.00083
 def sizes(two_sizes: Path, home: Home, tmp_path_factory: pytest.TempPathFactory) -> RunResult:
     """A recording at 512 pixels and one at 384, in several formats."""
     out = Path(shutil.copytree(two_sizes, tmp_path_factory.mktemp("several") / "sizes"))
-    settings = oval_settings("colmap", "colmap-erp", "nerfstudio", "metashape")
+    settings = exporting("colmap", "colmap-erp", "nerfstudio", "metashape")
     recordings = [panoramas(home, 0, WIDTH), panoramas(home, 1, SMALL)]
     return refine_recordings(recordings, out, settings)
 
@@ -92,7 +91,7 @@ def test_stitched_panoramas_and_cube_faces_make_one_map(
     model = pycolmap.Reconstruction(str(faces_run / "colmap-flat/sparse/0"))
     assert len(model.images) == 12 * NUM - 3  # 15 faces of three held-out frames beside 102 others
     with pytest.raises(GsbaError, match="needs panoramas"):
-        given = oval_settings("colmap-erp", images="panorama")
+        given = exporting("colmap-erp", images="panorama")
         recordings = [panoramas(home, 0, WIDTH), faces(home)]
         refine_recordings(recordings, shutil.copytree(faces_run, tmp_path / "run"), given)
 
