@@ -8,9 +8,9 @@ from gsba.geometry import furthest
 X = gtsam.symbol_shorthand.X
 
 
-def values_of(world_T_rigs: np.ndarray) -> gtsam.Values:
-    """Poses (F, 4, 4) under their keys."""
-    values = gtsam.Values()
+def values_of(world_T_rigs: np.ndarray, others: gtsam.Values | None = None) -> gtsam.Values:
+    """Poses (F, 4, 4) under their keys, and other variables; None = there are none."""
+    values = gtsam.Values() if others is None else gtsam.Values(others)
     for f, world_T_rig in enumerate(world_T_rigs):
         values.insert(X(f), gtsam.Pose3(world_T_rig))
     return values

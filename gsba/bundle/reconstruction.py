@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gsba.bundle.families import numbered
 from gsba.bundle.tracks import runs
 from gsba.disk import concatenated
 from gsba.geometry import angular_errors, furthest, moved_to
@@ -60,7 +61,7 @@ def assemble(
     targets = None
     if coarse is not None:
         known, targets = known & (coarse.sources == PoseSource.SLAM), coarse.world_T_rigs
-    groups = np.zeros(len(seen), np.int32) if components is None else components
+    groups = numbered(components, len(seen))
     placed, points_world, stretch = _placed(adjustment, targets, known, groups)
     scales = stretch[np.unique(groups, return_index=True)[1], 3]  # of each map
     points = landmarks.tracks.points

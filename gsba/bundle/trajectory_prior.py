@@ -55,11 +55,11 @@ class TrajectoryPrior(Family):
         """Priors of steps, of frames, and of the first pose."""
         world_T_rigs, held = self.world_T_rigs, not snapshot.gauge_held
         lengths = np.linalg.norm(np.diff(world_T_rigs[:, :3, 3], axis=0), axis=1)
-        typical = float(np.median(lengths[lengths > 0])) if (lengths > 0).any() else 1.0
+        typical = typical_length(lengths)
         extent = max(extent_of(world_T_rigs[:, :3, 3]), typical)
         graph = gtsam.NonlinearFactorGraph()
         settings, spread, lengths = self.settings, self.noise, np.maximum(lengths, typical)
-        steps = relative_steps(self.world_T_rigs)
+        steps = relative_steps(world_T_rigs)
         kept = np.ones(len(steps), bool) if self.false_steps is None else ~self.false_steps
         # steps in a gapless run drift alike
         runs = np.cumsum(np.diff(kept.astype(int), prepend=0) != 0)
@@ -77,11 +77,8 @@ class TrajectoryPrior(Family):
         # absolute priors, weaker where another family holds the gauge: they only hold frames that
         # nothing else does
         weaker = 1.0 if held else 10.0
-        model = self._robust(
-            weaker * np.deg2rad(30.0),
-            weaker * 0.3 * extent,  # part of the trajectory's extent
-        )
-        for f, world_T_rig in enumerate(self.world_T_rigs):
+        model = self._robust(weaker * np.deg2rad(30.0), weaker * 0.3 * extent)
+        for f, world_T_rig in enumerate(world_T_rigs):
             if self.false_frames is None or not self.false_frames[f]:
                 graph.add(gtsam.PriorFactorPose3(X(f), gtsam.Pose3(world_T_rig), model))
         sigma = 1e-6 if held else 1.0  # of the held first pose: radians, and part of the extent
@@ -98,6 +95,11 @@ class TrajectoryPrior(Family):
 
     def _loss(self) -> gtsam.noiseModel.mEstimator.Base:
         return gtsam.noiseModel.mEstimator.Cauchy.Create(LOSS_SIGMAS)
+
+
+def typical_length(lengths: np.ndarray) -> float:
+    """Median of the lengths (N,) of steps of a camera that moves; 1 if it never does."""
+    return float(np.median(lengths[lengths > 0])) if (lengths > 0).any() else 1.0
 
 
 def _step_covariance(f_T_next: np.ndarray, length: float, noise: StepNoise) -> np.ndarray:
