@@ -20,6 +20,7 @@ from gsba.types import (
     PoseStatus,
     Reconstruction,
     Solution,
+    Tracks,
 )
 from gsba.types.records import AT_ONCE
 
@@ -106,13 +107,18 @@ def _observations(
         bearings, origins = keypoints.bearings_rig[rows], keypoints.origins_of(rows)
         ends = landmarks.points_world[points][some.points]
         errors = angular_errors(moved_to(poses[some.frames], origins), ends, bearings)
-        lengths = np.maximum(np.bincount(some.points, minlength=some.num_points), 1)
-        seen = keypoints.colors[rows].T
-        sums = [np.bincount(some.points, color, some.num_points) for color in seen]
-        colors[points] = np.rint(np.stack(sums, axis=1) / lengths[:, None])
+        colors[points] = mean_colors(some, keypoints)
         moved = [] if origins is None else [scales[some.frames][:, None] * origins]
         yield (bearings, adjustment.noise * keypoints.sigmas_rad[rows], errors, *moved)
         release_mapped_files()
+
+
+def mean_colors(tracks: Tracks, keypoints: Keypoints) -> np.ndarray:
+    """Mean colours (J, 3) uint8, RGB, of the keypoints of each track."""
+    lengths = np.maximum(np.bincount(tracks.points, minlength=tracks.num_points), 1)
+    channels = keypoints.colors[keypoints.rows(tracks)].T
+    sums = [np.bincount(tracks.points, one, tracks.num_points) for one in channels]
+    return np.rint(np.column_stack(sums) / lengths[:, None]).astype(np.uint8)
 
 
 def world_scale(solved: Solution, result: Reconstruction) -> float:
