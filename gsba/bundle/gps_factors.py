@@ -22,6 +22,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from factors import RobustLoss
 from gsba.bundle.families import Family, MapSnapshot, digest_of, numbered
 from gsba.bundle.pose_variables import X, values_of
 from gsba.bundle.trajectory_prior import LOSS_SIGMAS
@@ -388,8 +389,7 @@ def factors(anchors: Anchors) -> gtsam.NonlinearFactorGraph:
     graph = gtsam.NonlinearFactorGraph()
     for a, frame in enumerate(anchors.frames.tolist()):
         noise = gtsam.noiseModel.Gaussian.Covariance(anchors.covariances[a])
-        loss = gtsam.noiseModel.mEstimator.Cauchy.Create(float(anchors.loss_scales[a]))
-        model = gtsam.noiseModel.Robust.Create(loss, noise)
+        model = RobustLoss("cauchy", float(anchors.loss_scales[a])).noise_model(noise)
         graph.add(gtsam.GPSFactor(X(frame), anchors.positions[a], model))
     return graph
 

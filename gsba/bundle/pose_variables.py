@@ -21,6 +21,12 @@ def poses_of(values: gtsam.Values, num_frames: int) -> np.ndarray:
     return np.array([values.atPose3(X(f)).matrix() for f in range(num_frames)])
 
 
+def pose_noise(rotation: float, translation: float) -> gtsam.noiseModel.Diagonal:
+    """Independent noise of a pose's tangent, the same along all axes: standard deviations of the
+    rotation, radians, and of the translation, map units."""
+    return gtsam.noiseModel.Diagonal.Sigmas(np.array([rotation] * 3 + [translation] * 3))
+
+
 def fixed_scale(
     world_T_rigs: np.ndarray, components: np.ndarray | None = None, sigma: float = 1e-6
 ) -> gtsam.NonlinearFactorGraph:
@@ -38,8 +44,7 @@ def fixed_scale(
             noise = gtsam.noiseModel.Isotropic.Sigma(1, sigma * distance)
             held.add(gtsam.RangeFactorPose3(X(first), X(int(rows[far])), distance, noise))
         if first > 0:
-            sigmas = np.array([sigma] * 3 + [sigma * max(distance, 1e-12)] * 3)
             fixed = gtsam.Pose3(world_T_rigs[first])
-            noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+            noise = pose_noise(sigma, sigma * max(distance, 1e-12))
             held.add(gtsam.PriorFactorPose3(X(first), fixed, noise))
     return held
