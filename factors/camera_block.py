@@ -23,8 +23,6 @@ from factors.elimination import Eliminated
 from factors.robust import RobustLoss
 from factors.threads import balanced_ranges, map_in_threads, run_in_threads
 
-_POLISH_TOLERANCE = 1e-6  # of a landmark's cost: further steps gain less than the others do
-
 
 class CameraBlock(Block):
     """All observations of a set of landmarks by a camera whose parts are variables.
@@ -123,7 +121,7 @@ class CameraBlock(Block):
         """Robust cost at `values`, `steps` from the linearization, landmarks moved along."""
         if self._at is None:
             raise RuntimeError("propose() needs linearize() before it")
-        self._trial = self._moved(values, steps, self.polish_steps, _POLISH_TOLERANCE)
+        self._trial = self._moved(values, steps, self.polish_steps, 1e-6)
         return float(self._trial[1].sum())
 
     def accept(self) -> None:
@@ -168,7 +166,8 @@ class CameraBlock(Block):
     def _moved(
         self, values: gtsam.Values, steps: np.ndarray | None, num_steps: int, tolerance: float
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Landmarks (J, 3) at their best with `values`, and their costs (J,)."""
+        """Landmarks (J, 3) at their best with `values`, and their costs (J,); the tolerance is
+        part of a landmark's cost: a step that gains less is the last one."""
         camera, poses = self.camera.rows(values), pose_rows(values, self.camera.poses)
         points, costs = np.empty_like(self._points), np.empty(len(self._points))
         own, shared = self._steps_of(steps)

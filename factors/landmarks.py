@@ -29,7 +29,6 @@ from factors.robust import RobustLoss
 from factors.schur_complement import SchurComplement, project_visits
 from factors.threads import balanced_ranges, map_in_threads, run_in_threads
 
-_POLISH_TOLERANCE = 1e-12  # part of a landmark's cost
 _MAX_VISITS_AT_ONCE = 1 << 17  # visits of landmarks that are eliminated together: 19 MB
 _MIN_THREAD_OBSERVATIONS = 1 << 14  # least observations that a thread accumulates on its own
 
@@ -173,7 +172,7 @@ class LandmarkBlock(Block):
     def polish(self, values: gtsam.Values, num_steps: int = 50) -> float:
         """Move the landmarks to their optimum at fixed poses; returns the robust cost."""
         poses = pose_rows(values, self.keys)
-        cost = self._move(poses, None, None, num_steps, _POLISH_TOLERANCE)
+        cost = self._move(poses, None, None, num_steps, 1e-12)
         self.accept()
         return cost
 
@@ -219,6 +218,7 @@ class LandmarkBlock(Block):
         num_steps: int,
         tolerance: float,
     ) -> float:
+        """Robust cost with landmarks moved on trial; the tolerance is part of a landmark's cost."""
         points, costs = np.empty_like(self._points), np.empty_like(self._point_costs)
         ranges = balanced_ranges(self._obs.offsets)
         substitute = steps is not None

@@ -251,7 +251,6 @@ class PatchPixels:
         if len(rows) == 0:
             return
         spans = patch_spans(self.table, self._world_T_rigs, self.table.planes, rows)
-        weights = np.column_stack([np.ones(len(self.table.grid)), self.table.grid])
         uv = pixels_of(weights @ spans, self.width)
         height = self.width // 2
         u, v = uv[..., 0], uv[..., 1]

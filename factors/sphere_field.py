@@ -13,9 +13,6 @@ import numpy as np
 from factors.bearing import tangent_basis
 from factors.compiled import kernel_and_part
 
-_MAX_STEPS = 20  # fixed-point steps that invert a field; each reduces the error by the field's
-# slope
-
 _kernel, _part = kernel_and_part()
 
 
@@ -81,7 +78,11 @@ class SphereField:
 
     def corrected(self, bearings: np.ndarray) -> np.ndarray:
         """True directions of observed unit bearings (..., 3), along the field's arcs."""
-        return _moved(bearings, self.displacements(bearings)) if self else bearings
+        if not self:
+            return bearings
+        tangents = self.displacements(bearings)
+        angles = np.linalg.norm(tangents, axis=-1, keepdims=True)
+        return np.cos(angles) * bearings + np.sinc(angles / np.pi) * tangents
 
     def observed(self, directions: np.ndarray) -> np.ndarray:
         """Observed bearings (..., 3) of true unit directions (..., 3): the inverse of
@@ -89,7 +90,7 @@ class SphereField:
         if not self:
             return directions
         found = directions
-        for _ in range(_MAX_STEPS):
+        for _ in range(20):  # fixed-point steps: each reduces the error by the field's slope
             off = directions - self.corrected(found)
             found = found + off
             found = found / np.linalg.norm(found, axis=-1, keepdims=True)
@@ -104,12 +105,6 @@ class SphereField:
             return roots
         there = tangent_basis(self.corrected(bearings))
         return roots @ (tangent_basis(bearings) @ np.swapaxes(there, 1, 2))
-
-
-def _moved(bearings: np.ndarray, tangents: np.ndarray) -> np.ndarray:
-    """Unit bearings moved along arcs."""
-    angles = np.linalg.norm(tangents, axis=-1, keepdims=True)
-    return np.cos(angles) * bearings + np.sinc(angles / np.pi) * tangents
 
 
 def _norms(degree: int) -> np.ndarray:

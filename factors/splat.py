@@ -116,8 +116,11 @@ class SplatBlock(Block):
         num = len(self.keys)
         diagonal, gradient, cost = np.zeros((num, 6, 6)), np.zeros((num, 6)), 0.0
         for f, pose in enumerate(pose_rows(values, self.keys)):
-            diagonal[f], gradient[f], part = self._frame_system(f, pose)
-            cost += part
+            residuals, jacobian, trust = self._residuals(f, pose, True)
+            squared, shares = residuals**2, trust / self.correlation
+            weighted = jacobian * (shares * self.loss.weights(squared))[:, None]
+            diagonal[f], gradient[f] = weighted.T @ jacobian, weighted.T @ residuals
+            cost += float(shares @ self.loss.rho(squared))
         return PoseSystem(diagonal, np.zeros((0, 6, 6)), gradient, {NAME: cost})
 
     def propose(self, values: gtsam.Values, steps: np.ndarray) -> float:
@@ -133,16 +136,6 @@ class SplatBlock(Block):
         """Whitened residuals (N,) of each frame's samples, 0 where a sample is not visible."""
         poses = pose_rows(values, self.keys)
         return [self._residuals(f, pose, False)[0] for f, pose in enumerate(poses)]
-
-    def _frame_system(self, f: int, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        """H (6, 6), gradient (6,) and cost of a frame at a pose row (12,)."""
-        residuals, jacobian, trust = self._residuals(f, pose, True)
-        squared = residuals**2
-        shares = trust / self.correlation
-        weights = shares * self.loss.weights(squared)
-        weighted = jacobian * weights[:, None]
-        cost = float(shares @ self.loss.rho(squared))
-        return weighted.T @ jacobian, weighted.T @ residuals, cost
 
     def _frame_cost(self, f: int, pose: np.ndarray) -> float:
         residuals, _, trust = self._residuals(f, pose, False)

@@ -29,17 +29,14 @@ def picture_of(path: Path, width: int, share: float) -> bytes:
     """
     if path.is_dir():
         folders = (path, *sorted(each for each in path.iterdir() if each.is_dir()))
-        images = next(filter(None, map(_images_in, folders)), None)
+        every = (sorted(filter(is_image, folder.iterdir())) for folder in folders)
+        images = next(filter(None, every), None)
         if images is None:
             raise GsbaError(f"{path} holds no images")
         path = images[int(share * (len(images) - 1))]
     if is_video(path):
         return _jpeg(picture_near(path, share), width)
     return _jpeg(decode(path, image_size(path), at_least=width)[..., ::-1], width)
-
-
-def _images_in(folder: Path) -> list[Path]:
-    return sorted(each for each in folder.iterdir() if is_image(each))
 
 
 def frame_of(run: Path, frame: int, width: int) -> bytes:

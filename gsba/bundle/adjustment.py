@@ -146,18 +146,16 @@ class AdjustmentContext:
     def terms(self, solved: Solution) -> Terms:
         """Terms of all families for an adjustment that starts from a solution. GsbaError: a family
         whose factors are about variables without a value."""
-        own, values = self.families.terms(solved, self.maps), values_of(solved.world_T_rigs)
-        values.insert(own.values)
-        return Terms(own.graph, own.blocks, values, own)
+        own = self.families.terms(solved, self.maps)
+        return Terms(own.graph, own.blocks, values_of(solved.world_T_rigs, own.values), own)
 
     def covariance_terms(self, solved: Solution, maps: np.ndarray | None) -> Terms:
         """Terms for covariances: the first pose and the extent of each map are held fixed; maps:
         (F,) map of each frame, None = there is one."""
         own = self.families.covariance_terms(solved, self.maps)
-        graph, values = gtsam.NonlinearFactorGraph(own.graph), values_of(solved.world_T_rigs)
+        graph = gtsam.NonlinearFactorGraph(own.graph)
         graph.push_back(pose_variables.fixed_scale(solved.world_T_rigs, maps))
-        values.insert(own.values)
-        return Terms(graph, own.blocks, values, own)
+        return Terms(graph, own.blocks, values_of(solved.world_T_rigs, own.values), own)
 
 
 @dataclass(frozen=True, slots=True)
@@ -277,10 +275,9 @@ def rescale_noise(
     """
     tracks, keypoints = sighted.tracks, sighted.keypoints
     poses = before.world_T_rigs
-    gate = 20.0  # gate in sigmas for observations whose noise is not known yet
     threads = settings.solver.threads()
-    how = gate, threads, scratch
-    placed = triangulation.place(tracks, keypoints, poses, *how)
+    # gate in sigmas for observations whose noise is not known yet
+    placed = triangulation.place(tracks, keypoints, poses, 20.0, threads, scratch)
     factors = np.ones(len(keypoints.faces))
     for group in (sighted.aligned, ~sighted.aligned):
         chosen = group[keypoints.rows(placed.tracks)]

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
+from gsba.bundle.families import numbered
 from gsba.geometry import furthest
 from gsba.types import JointErrors
 from gsba.types.records import slices
@@ -22,7 +23,7 @@ def added(
     """Covariances (F, 6, 6) of poses, [rotation rad, translation], rig frames, NaN = none, with the
     errors in common, in the same gauge: in each map of components (F,), None = there is one, the
     first pose and its distance to the furthest position are held."""
-    groups = np.zeros(len(world_T_rigs), int) if components is None else components
+    groups = numbered(components, len(world_T_rigs))
     known, num = np.isfinite(joint.draws).all(axis=(0, 2)), len(joint.draws)
     parts = [np.flatnonzero(known & (groups == group)) for group in np.unique(groups)]
     each, between = np.zeros_like(covariances), np.zeros_like(joint.neighbours)

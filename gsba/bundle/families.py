@@ -255,7 +255,7 @@ def digest_of(*parts: object) -> str:
 
 
 def numbered(maps: np.ndarray | None, num_frames: int) -> np.ndarray:
-    """Map (F,) int64 of each frame; None = there is one, map 0."""
+    """Map (F,) int64 of each frame, or its recording; None = there is one, number 0."""
     return np.zeros(num_frames, np.int64) if maps is None else np.asarray(maps, np.int64)
 
 

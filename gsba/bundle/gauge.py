@@ -93,14 +93,8 @@ def _moved(world_T_rigs: np.ndarray, maps: np.ndarray, moves: dict[int, Sim3]) -
     return poses
 
 
-def _values(poses: np.ndarray, own: gtsam.Values) -> gtsam.Values:
-    values = values_of(poses)
-    values.insert(own)
-    return values
-
-
 def _cost(terms: FamilyTerms, poses: np.ndarray, own: gtsam.Values) -> float:
-    values = _values(poses, own)
+    values = values_of(poses, own)
     cost = terms.graph.error(values)
     for block in terms.blocks:
         cost += sum(block.costs(values).values())
@@ -115,7 +109,7 @@ def _projected(
     A pose's tangent is [R^T w, R^T (w x p + v + s p)] where its map turns by w, moves by v and
     grows by s about the origin.
     """
-    values = _values(poses, own)
+    values = values_of(poses, own)
     dims, own_keys = values.dims(), list(own.keys())
     size = 7 * len(numbers) + sum(dims[key] for key in own_keys)
     place, basis = 7 * len(numbers), dict[int, tuple[int, np.ndarray]]()

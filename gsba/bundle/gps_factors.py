@@ -22,7 +22,8 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from gsba.bundle.families import Family, MapSnapshot, digest_of
+from factors import RobustLoss
+from gsba.bundle.families import Family, MapSnapshot, digest_of, numbered
 from gsba.bundle.pose_variables import X, values_of
 from gsba.bundle.trajectory_prior import LOSS_SIGMAS
 from gsba.geometry import extent_of
@@ -187,9 +188,8 @@ def anchor(
     Fixes outside of the gate are left out, see `FrameFixes.inliers`; the scale of the loss is as
     wide as the gate. maps: (F,) map of each frame; None = there is one.
     """
-    positions, of_fix = world_T_rigs[fixes.frames, :3, 3], np.zeros(len(fixes), np.int64)
-    if maps is not None:
-        of_fix = np.asarray(maps, np.int64)[fixes.frames]
+    positions = world_T_rigs[fixes.frames, :3, 3]
+    of_fix = numbered(maps, len(world_T_rigs))[fixes.frames]
     found, rows, wide = dict[int, Sim3](), [np.zeros(0, np.int64)], np.ones(len(fixes))
     for number in np.unique(of_fix).tolist():
         inside = np.flatnonzero(of_fix == number)
@@ -389,8 +389,7 @@ def factors(anchors: Anchors) -> gtsam.NonlinearFactorGraph:
     graph = gtsam.NonlinearFactorGraph()
     for a, frame in enumerate(anchors.frames.tolist()):
         noise = gtsam.noiseModel.Gaussian.Covariance(anchors.covariances[a])
-        loss = gtsam.noiseModel.mEstimator.Cauchy.Create(float(anchors.loss_scales[a]))
-        model = gtsam.noiseModel.Robust.Create(loss, noise)
+        model = RobustLoss("cauchy", float(anchors.loss_scales[a])).noise_model(noise)
         graph.add(gtsam.GPSFactor(X(frame), anchors.positions[a], model))
     return graph
 
@@ -407,8 +406,7 @@ def linear_factors(
         own.insert(E(a), np.zeros(3))
     for number in anchors.level_from_map:
         own.insert(S(number), np.zeros(7))
-    values = values_of(world_T_rigs)
-    values.insert(own)
+    values = values_of(world_T_rigs, own)
     for number, fit in anchors.level_from_map.items():
         chosen = np.flatnonzero(anchors.maps == number)
         fixes, middle = anchors.fixes.taken(chosen), anchors.positions[chosen].mean(axis=0)

@@ -13,7 +13,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from factors import bearing_residuals
-from gsba.bundle.trajectory_prior import StepNoise
+from gsba.bundle.families import numbered
+from gsba.bundle.trajectory_prior import StepNoise, typical_length
 from gsba.config import PriorSettings, RefineSettings
 from gsba.geometry import inverse, moved_to, pose, relative_steps, rotation_angle, step_covariances
 from gsba.types import Counts, JointErrors, Reconstruction
@@ -65,8 +66,7 @@ def measure(
     """
     covariances, joint = errors
     num, weak_frames, priors = len(world_T_rigs), settings.weak_frames, settings.priors
-    maps = np.zeros(num, np.int32) if components is None else components
-    walks = np.zeros(num, np.int64) if recordings is None else recordings
+    maps, walks = numbered(components, num), numbered(recordings, num)
     drift = np.array(
         [
             _drift(world_T_rigs[maps == m], joint.draws[:, maps == m], walks[maps == m])
@@ -81,9 +81,8 @@ def measure(
     reach = np.ones(2 * _WEAK_REACH + 1)
     weak = np.convolve(poor, reach)[_WEAK_REACH : _WEAK_REACH + num] > 0
     lengths = np.linalg.norm(np.diff(world_T_rigs[:, :3, 3], axis=0), axis=1)
-    typical = float(np.median(lengths[lengths > 0])) if (lengths > 0).any() else 1.0
     allowed = np.full((len(lengths), 6), np.deg2rad(priors.rotation_deg))
-    allowed[:, 3:] = priors.translation * np.maximum(lengths, typical)[:, None]
+    allowed[:, 3:] = priors.translation * np.maximum(lengths, typical_length(lengths))[:, None]
     found = step_covariances(world_T_rigs, covariances, joint.neighbours)
     found = found / allowed[:, :, None] / allowed[:, None, :]
     known = np.isfinite(found).all(axis=(1, 2))
@@ -104,8 +103,7 @@ def scale_sigmas(world_T_rigs: np.ndarray, draws: np.ndarray) -> np.ndarray:
     stretches = np.empty((len(draws), len(steps)))
     for some in slices(len(draws), _DRAWS_AT_ONCE):
         moved = np.einsum("fij,dfj->dfi", world_T_rigs[:, :3, :3], draws[some, :, 3:])
-        along = np.einsum("fi,dfi->df", steps / squares[:, None], np.diff(moved, axis=1))
-        stretches[some] = along
+        stretches[some] = np.einsum("fi,dfi->df", steps / squares[:, None], np.diff(moved, axis=1))
     return np.diff(stretches, axis=1).std(axis=0)
 
 

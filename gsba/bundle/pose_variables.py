@@ -8,9 +8,9 @@ from gsba.geometry import furthest
 X = gtsam.symbol_shorthand.X
 
 
-def values_of(world_T_rigs: np.ndarray) -> gtsam.Values:
-    """Poses (F, 4, 4) under their keys."""
-    values = gtsam.Values()
+def values_of(world_T_rigs: np.ndarray, others: gtsam.Values | None = None) -> gtsam.Values:
+    """Poses (F, 4, 4) under their keys, and other variables; None = there are none."""
+    values = gtsam.Values() if others is None else gtsam.Values(others)
     for f, world_T_rig in enumerate(world_T_rigs):
         values.insert(X(f), gtsam.Pose3(world_T_rig))
     return values
@@ -19,6 +19,12 @@ def values_of(world_T_rigs: np.ndarray) -> gtsam.Values:
 def poses_of(values: gtsam.Values, num_frames: int) -> np.ndarray:
     """Poses (F, 4, 4) of the first keys."""
     return np.array([values.atPose3(X(f)).matrix() for f in range(num_frames)])
+
+
+def pose_noise(rotation: float, translation: float) -> gtsam.noiseModel.Diagonal:
+    """Independent noise of a pose's tangent, the same along all axes: standard deviations of the
+    rotation, radians, and of the translation, map units."""
+    return gtsam.noiseModel.Diagonal.Sigmas(np.array([rotation] * 3 + [translation] * 3))
 
 
 def fixed_scale(
@@ -38,8 +44,7 @@ def fixed_scale(
             noise = gtsam.noiseModel.Isotropic.Sigma(1, sigma * distance)
             held.add(gtsam.RangeFactorPose3(X(first), X(int(rows[far])), distance, noise))
         if first > 0:
-            sigmas = np.array([sigma] * 3 + [sigma * max(distance, 1e-12)] * 3)
             fixed = gtsam.Pose3(world_T_rigs[first])
-            noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+            noise = pose_noise(sigma, sigma * max(distance, 1e-12))
             held.add(gtsam.PriorFactorPose3(X(first), fixed, noise))
     return held

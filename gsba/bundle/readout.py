@@ -26,7 +26,6 @@ from gsba.types import Counts, GyroConstraints, Tracks
 logger = logging.getLogger(__name__)
 
 _MIN_SIGMAS = 4.0  # least duration that is taken, in its standard deviations
-_ROTATION_SIGMA_RAD = np.deg2rad(0.12)  # rotation during a readout, standard deviation per axis
 _AXES = np.eye(3)[:2]
 
 
@@ -119,8 +118,8 @@ def own_sigmas(found: CameraEstimate, motion: np.ndarray) -> np.ndarray:
         return found.own_sigmas
     likely = found.readout_s * np.linalg.norm(motion[:, 3:], axis=1)
     move = max(0.3 * float(np.median(likely)), 1e-12)  # about that by the velocity
-    # from axes of their own, a stabiliser has removed rotations
-    turn = _ROTATION_SIGMA_RAD if found.lenses.axes is None else np.deg2rad(0.005)
+    # about each axis; from axes of their own, a stabiliser has removed rotations
+    turn = np.deg2rad(0.12 if found.lenses.axes is None else 0.005)
     return np.repeat([turn, move], 3)
 
 

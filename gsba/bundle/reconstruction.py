@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gsba.bundle.families import numbered
 from gsba.bundle.tracks import runs
 from gsba.disk import concatenated
 from gsba.geometry import angular_errors, furthest, moved_to
@@ -19,6 +20,7 @@ from gsba.types import (
     PoseStatus,
     Reconstruction,
     Solution,
+    Tracks,
 )
 from gsba.types.records import AT_ONCE
 
@@ -60,7 +62,7 @@ def assemble(
     targets = None
     if coarse is not None:
         known, targets = known & (coarse.sources == PoseSource.SLAM), coarse.world_T_rigs
-    groups = np.zeros(len(seen), np.int32) if components is None else components
+    groups = numbered(components, len(seen))
     placed, points_world, stretch = _placed(adjustment, targets, known, groups)
     scales = stretch[np.unique(groups, return_index=True)[1], 3]  # of each map
     points = landmarks.tracks.points
@@ -105,13 +107,18 @@ def _observations(
         bearings, origins = keypoints.bearings_rig[rows], keypoints.origins_of(rows)
         ends = landmarks.points_world[points][some.points]
         errors = angular_errors(moved_to(poses[some.frames], origins), ends, bearings)
-        lengths = np.maximum(np.bincount(some.points, minlength=some.num_points), 1)
-        seen = keypoints.colors[rows].T
-        sums = [np.bincount(some.points, color, some.num_points) for color in seen]
-        colors[points] = np.rint(np.stack(sums, axis=1) / lengths[:, None])
+        colors[points] = mean_colors(some, keypoints)
         moved = [] if origins is None else [scales[some.frames][:, None] * origins]
         yield (bearings, adjustment.noise * keypoints.sigmas_rad[rows], errors, *moved)
         release_mapped_files()
+
+
+def mean_colors(tracks: Tracks, keypoints: Keypoints) -> np.ndarray:
+    """Mean colours (J, 3) uint8, RGB, of the keypoints of each track."""
+    lengths = np.maximum(np.bincount(tracks.points, minlength=tracks.num_points), 1)
+    channels = keypoints.colors[keypoints.rows(tracks)].T
+    sums = [np.bincount(tracks.points, one, tracks.num_points) for one in channels]
+    return np.rint(np.column_stack(sums) / lengths[:, None]).astype(np.uint8)
 
 
 def world_scale(solved: Solution, result: Reconstruction) -> float:

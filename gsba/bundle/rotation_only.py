@@ -8,7 +8,7 @@ import numpy as np
 
 from factors import tangent_basis
 from gsba.bundle.reconstruction import assemble
-from gsba.geometry import pose
+from gsba.geometry import pose, unit
 from gsba.types import CoarsePoses, Keypoints, PoseStatus, Reconstruction, Solution, Tracks
 
 logger = logging.getLogger(__name__)
@@ -66,14 +66,13 @@ def solve(
         rays = np.einsum("oij,oj->oi", rotations[found.frames], bearings)
         pulls = ((weights / sigmas**2)[:, None] * rays).T  # towards the direction of each track
         sums = np.stack([np.bincount(found.points, p, found.num_points) for p in pulls], axis=1)
-        sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-12)
-        bases = tangent_basis(sums[found.points])
+        bases = tangent_basis(unit(sums)[found.points])
         residuals = np.einsum("oij,oj->oi", bases, rays) / sigmas[:, None]
         lengths = np.linalg.norm(residuals, axis=1)
         noise = max(float(np.median(lengths)) / 1.1774, 1e-9)  # of a Rayleigh distribution
         weights = 1 / (1 + (lengths / (2.0 * wide * noise)) ** 2)  # Cauchy
         system, gradient = _system(rotations, bearings, bases, residuals, sigmas, weights, found)
-        step = _solved(system, -gradient[3:, None])[:, 0]
+        step = _factored(system).solve(-gradient[3:])
         turns = Rotation.from_rotvec(np.concatenate([np.zeros(3), step]).reshape(num, 3))
         rotations = rotations @ turns.as_matrix()
         if np.abs(step).max() < 1e-9 and wide == 1:  # radians
@@ -82,10 +81,10 @@ def solve(
     covariances = np.zeros((num, 3, 3))
     if system is not None:
         size = system.shape[0]
-        blocks = np.empty((size // 3, 3, 3))
+        blocks, factored = np.empty((size // 3, 3, 3)), _factored(system)
         for first in range(0, size, _COLUMNS):
             last = min(first + _COLUMNS, size)
-            columns = _solved(system, np.eye(size, last - first, -first))
+            columns = factored.solve(np.eye(size, last - first, -first))
             for n in range(first // 3, last // 3):
                 blocks[n] = columns[3 * n : 3 * n + 3, 3 * n - first : 3 * n + 3 - first]
         covariances[1:] = noise**2 * blocks
@@ -109,16 +108,14 @@ def _system(
     from scipy.sparse import csr_matrix, diags
 
     num, count = len(rotations), len(bearings)
-    turned = np.cross(np.eye(3)[None], bearings[:, None, :])  # (O, axis, 3): a turn about each axis
-    jacobian = np.einsum("oij,ojl,okl->oik", bases, rotations[found.frames], turned)
-    jacobian *= (np.sqrt(weights) / sigmas)[:, None, None]
+    roots = np.sqrt(weights) / sigmas
+    jacobian = _jacobian(rotations, bearings, bases, found) * roots[:, None, None]
     columns = np.repeat(3 * found.frames[:, None] + np.arange(3), 2, axis=0)
     rows = np.repeat(np.arange(2 * count), 3)
     values = jacobian.reshape(-1)
     shape = (2 * count, 3 * num)
     whitened = csr_matrix((values, (rows, columns.reshape(-1))), shape=shape)
     # Each track's direction is eliminated: it is the mean of its rays.
-    roots = np.sqrt(weights) / sigmas
     member = 2 * np.repeat(found.points, 2) + np.tile([0, 1], count)
     gather = csr_matrix(
         (np.repeat(roots, 2), (member, np.arange(2 * count))),
@@ -130,6 +127,14 @@ def _system(
     system = (whitened.T @ whitened - explained).tocsc()[3:, 3:]
     right = (np.sqrt(weights)[:, None] * residuals).reshape(-1)
     return system, whitened.T @ right - shared.T @ (inverses * (gather @ right))
+
+
+def _jacobian(
+    rotations: np.ndarray, bearings: np.ndarray, bases: np.ndarray, found: Tracks
+) -> np.ndarray:
+    """Jacobian (O, 2, 3) of residuals by turns of their frames, radians; sigmas are left out."""
+    turned = np.cross(np.eye(3)[None], bearings[:, None, :])  # (O, axis, 3): a turn about each axis
+    return np.einsum("oij,ojl,okl->oik", bases, rotations[found.frames], turned)
 
 
 def _excess(
@@ -144,8 +149,7 @@ def _excess(
     The cluster-robust estimator of Liang and Zeger, Biometrika 1986, relative to the usual one.
     """
     found, bearings, bases, residuals, pulls = linearised
-    axes = np.cross(np.eye(3)[None], bearings[:, None, :])
-    jacobian = np.einsum("oij,ojl,okl->oik", bases, rotations[found.frames], axes)
+    jacobian = _jacobian(rotations, bearings, bases, found)
     gradients = np.einsum("oik,oi,o->ok", jacobian, residuals, pulls)
     information = np.einsum("oik,oil,o->okl", jacobian, jacobian, pulls / sigmas)
     octants = (bearings > 0) @ np.array([1, 2, 4])
@@ -160,9 +164,10 @@ def _excess(
     return np.maximum(alike / np.maximum(independent, 1e-300), 1.0)
 
 
-def _solved(system, right: np.ndarray) -> np.ndarray:
+def _factored(system):
+    """Factors of damped normal equations, for any number of right sides."""
     from scipy.sparse import identity
     from scipy.sparse.linalg import splu
 
     damping = 1e-9 * float(np.mean(system.diagonal())) + 1e-12
-    return splu((system + damping * identity(system.shape[0])).tocsc()).solve(right)
+    return splu((system + damping * identity(system.shape[0])).tocsc())

@@ -98,7 +98,7 @@ def _of_nominal(
 ) -> SelfCalibration:
     """Calibration of plain lenses of unknown make, where focal lengths are determined."""
     num = len(off)
-    pull = _pull(len(system.gradient), np.zeros(num))
+    pull = _pull(len(system.gradient), num)
     information = system.curvature * system.hessian + np.diag(pull)
     information += 1e-12 * np.trace(information) * np.eye(len(information))
     found, sigmas = _step([system], off), np.sqrt(np.diagonal(np.linalg.inv(information))[:num])
@@ -220,10 +220,11 @@ def now(lenses: Lenses) -> Rig:
     return lenses.fisheyes or lenses.reference_calibration
 
 
-def _pull(num: int, off: np.ndarray) -> np.ndarray:
-    """Prior information (num,) on lenses and centres, about their calibration."""
+def _pull(num: int, of_lenses: int) -> np.ndarray:
+    """Prior information (num,) on lenses and centres, about their calibration; of_lenses: number
+    of the lenses' parameters, which are the first ones."""
     pull = np.zeros(num)
-    pull[: len(off)] = spread(num_lenses_of(len(off))) ** -2
+    pull[:of_lenses] = spread(num_lenses_of(of_lenses)) ** -2
     return pull
 
 
@@ -231,7 +232,7 @@ def _step(systems: list[SharedModel], off: np.ndarray) -> np.ndarray:
     """Change (K + 3 (L - 1),) of lenses and centres that minimises the cost of the parts."""
     total = summed(systems)
     num = len(total.gradient)
-    pull, whole = _pull(num, off), np.zeros(num)
+    pull, whole = _pull(num, len(off)), np.zeros(num)
     whole[: len(off)] = off
     gradient = total.gradient + pull * whole
     return -np.linalg.solve(total.curvature * total.hessian + np.diag(pull), gradient)

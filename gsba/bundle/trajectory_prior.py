@@ -6,13 +6,15 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
+from factors import RobustLoss
 from gsba.bundle.families import Family, MapSnapshot, digest_of
-from gsba.bundle.pose_variables import X
+from gsba.bundle.pose_variables import X, pose_noise
 from gsba.config import PriorSettings
 from gsba.geometry import extent_of, relative_steps
 from gsba.types import GyroConstraints
 
 LOSS_SIGMAS = 2.0  # Cauchy scale: limits the pull of wrong measurements
+_LOSS = RobustLoss("cauchy", LOSS_SIGMAS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,11 +57,11 @@ class TrajectoryPrior(Family):
         """Priors of steps, of frames, and of the first pose."""
         world_T_rigs, held = self.world_T_rigs, not snapshot.gauge_held
         lengths = np.linalg.norm(np.diff(world_T_rigs[:, :3, 3], axis=0), axis=1)
-        typical = float(np.median(lengths[lengths > 0])) if (lengths > 0).any() else 1.0
+        typical = typical_length(lengths)
         extent = max(extent_of(world_T_rigs[:, :3, 3]), typical)
         graph = gtsam.NonlinearFactorGraph()
         settings, spread, lengths = self.settings, self.noise, np.maximum(lengths, typical)
-        steps = relative_steps(self.world_T_rigs)
+        steps = relative_steps(world_T_rigs)
         kept = np.ones(len(steps), bool) if self.false_steps is None else ~self.false_steps
         # steps in a gapless run drift alike
         runs = np.cumsum(np.diff(kept.astype(int), prepend=0) != 0)
@@ -68,36 +70,29 @@ class TrajectoryPrior(Family):
             length = float(lengths[k])
             if spread is None:
                 rotation, translation = np.deg2rad(settings.rotation_deg), settings.translation
-                of_step = self._robust(rotation, translation * length)
+                of_step = _LOSS.noise_model(pose_noise(rotation, translation * length))
             else:
                 covariance = in_a_row[k] * _step_covariance(steps[k], length, spread)
                 gaussian = gtsam.noiseModel.Gaussian.Covariance(covariance)
-                of_step = gtsam.noiseModel.Robust.Create(self._loss(), gaussian)
+                of_step = _LOSS.noise_model(gaussian)
             graph.add(gtsam.BetweenFactorPose3(X(k), X(k + 1), gtsam.Pose3(steps[k]), of_step))
         # absolute priors, weaker where another family holds the gauge: they only hold frames that
         # nothing else does
         weaker = 1.0 if held else 10.0
-        model = self._robust(
-            weaker * np.deg2rad(30.0),
-            weaker * 0.3 * extent,  # part of the trajectory's extent
-        )
-        for f, world_T_rig in enumerate(self.world_T_rigs):
+        model = _LOSS.noise_model(pose_noise(weaker * np.deg2rad(30.0), weaker * 0.3 * extent))
+        for f, world_T_rig in enumerate(world_T_rigs):
             if self.false_frames is None or not self.false_frames[f]:
                 graph.add(gtsam.PriorFactorPose3(X(f), gtsam.Pose3(world_T_rig), model))
         sigma = 1e-6 if held else 1.0  # of the held first pose: radians, and part of the extent
-        noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([sigma] * 3 + [sigma * extent] * 3))
+        noise = pose_noise(sigma, sigma * extent)
         fixed = gtsam.Pose3(world_T_rigs[0] if self.first is None else self.first)
         graph.add(gtsam.PriorFactorPose3(X(0), fixed, noise))
         return graph
 
-    def _robust(self, rotation: float, translation: float) -> gtsam.noiseModel.Base:
-        """Noise of a pose, radians and map units, under the loss."""
-        sigmas = np.array([rotation] * 3 + [translation] * 3)
-        gaussian = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
-        return gtsam.noiseModel.Robust.Create(self._loss(), gaussian)
 
-    def _loss(self) -> gtsam.noiseModel.mEstimator.Base:
-        return gtsam.noiseModel.mEstimator.Cauchy.Create(LOSS_SIGMAS)
+def typical_length(lengths: np.ndarray) -> float:
+    """Median of the lengths (N,) of steps of a camera that moves; 1 if it never does."""
+    return float(np.median(lengths[lengths > 0])) if (lengths > 0).any() else 1.0
 
 
 def _step_covariance(f_T_next: np.ndarray, length: float, noise: StepNoise) -> np.ndarray:
@@ -133,8 +128,7 @@ class HeldPoses(Family):
         """A prior on each pose."""
         positions = self.world_T_rigs[:, :3, 3]
         extent = max(extent_of(positions), 1e-12)
-        sigmas = np.array([_SIGMA] * 3 + [_SIGMA * extent] * 3)
-        noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+        noise = pose_noise(_SIGMA, _SIGMA * extent)
         graph = gtsam.NonlinearFactorGraph()
         for f, world_T_rig in zip(self.rows.tolist(), self.world_T_rigs, strict=True):
             graph.add(gtsam.PriorFactorPose3(X(f), gtsam.Pose3(world_T_rig), noise))
@@ -162,11 +156,9 @@ class GyroTurns(Family):
         """A relative prior for each step that was measured."""
         graph, turning = gtsam.NonlinearFactorGraph(), self.turning
         free = 1e4 * max(self.extent, 1e-9)  # no translation is measured
-        loss = gtsam.noiseModel.mEstimator.Cauchy.Create(self.loss_sigmas)
+        loss = RobustLoss("cauchy", self.loss_sigmas)
         for f in np.flatnonzero(np.isfinite(turning.step_sigmas)).tolist():
-            sigmas = np.array([turning.step_sigmas[f]] * 3 + [free] * 3)
-            gaussian = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
-            model = gtsam.noiseModel.Robust.Create(loss, gaussian)
+            model = loss.noise_model(pose_noise(turning.step_sigmas[f], free))
             step = gtsam.Pose3(gtsam.Rot3.Expmap(turning.steps[f]), np.zeros(3))
             graph.add(gtsam.BetweenFactorPose3(X(f), X(f + 1), step, model))
         return graph

@@ -171,7 +171,6 @@ def _gauss_newton_step(rays, centres, sigmas, lo, hi, point, gate):
 
 
 _MIN_TRACK_LENGTH = 2  # observations of a point: one ray has no depth
-_NONE = Counts(0, 0, "tracks")
 
 
 def triangulate(
@@ -242,7 +241,7 @@ def place(
 ) -> Landmarks:
     """As `triangulate`, the observations being the tracks' own keypoints; some tracks at a time. A
     folder on the disk takes the points of very many tracks; None = they are in memory."""
-    counts = [_NONE]
+    counts = list[Counts]()
 
     def placed(_: slice, __: slice, some: Tracks) -> Landmarks:
         rows = keypoints.rows(some)

@@ -20,14 +20,13 @@ from gsba.camera.calibration_formats import (
     numbers_of,
     of_projection,
 )
-from gsba.camera.fisheye import Rig, lens_names, rotation_of
+from gsba.camera.fisheye import Rig, lens_names, rotation_of, three
 from gsba.camera.lens import all_centres
 from gsba.camera.projections import FisheyeProjection, RadialProjection, projection_of_model
-from gsba.geometry import pose
+from gsba.geometry import pose, unit
 from gsba.log import GsbaError
 from gsba.types import Fisheye
 
-_SIDES = ("width", "height")
 _MODEL = "kannala-brandt: r = f (th + k1 th^3 + k2 th^5 + k3 th^7 + k4 th^9), corner origin"
 _EXPECTED_FORM = (
     "give lenses.front and lenses.back, or lenses.lens0, lenses.lens1 and so on, each with "
@@ -36,8 +35,8 @@ _EXPECTED_FORM = (
 )
 _MAX_FILE_BYTES = 1 << 18  # YAML takes a second for each hundred thousand
 _MAX_UNSEEN_ANGLE_RAD = np.deg2rad(95.0)  # of a direction from the nearest of more than two axes
-_DIRECTIONS = np.stack(np.meshgrid(*3 * [np.linspace(-1, 1, 12)]), axis=-1).reshape(-1, 3)
-_DIRECTIONS /= np.linalg.norm(_DIRECTIONS, axis=1, keepdims=True)  # (N, 3) float64, all around
+_DIRECTIONS = unit(np.stack(np.meshgrid(*3 * [np.linspace(-1, 1, 12)]), axis=-1).reshape(-1, 3))
+# (N, 3) float64, all around
 _MAX_AXIS_ANGLE_RAD = np.deg2rad(20.0)  # between a lens's axis and the rig's z axis
 
 
@@ -69,7 +68,7 @@ def read_calibration(path: Path) -> Rig:
                 "their poses"
             )
         middle = np.mean([lens.centre for lens in rig], axis=0)
-        return tuple(replace(lens, centre=_three(np.asarray(lens.centre) - middle)) for lens in rig)
+        return tuple(replace(lens, centre=three(np.asarray(lens.centre) - middle)) for lens in rig)
     except ValueError as error:
         raise GsbaError(f"{path}: {error}") from None
 
@@ -196,7 +195,8 @@ def _lens_of_entry(
     where = f"lenses.{name}"
     fields_of(tree, (), where)
     # A square picture may be given by its `size`.
-    sides = [side if tree.get(side) or "size" not in tree else "size" for side in _SIDES]
+    names = "width", "height"
+    sides = [side if tree.get(side) or "size" not in tree else "size" for side in names]
     width, height, f, cx, cy = (
         float(numbers_of(tree, field, where, 1)[0]) for field in (*sides, "f", "cx", "cy")
     )
@@ -212,8 +212,3 @@ def _lens_of_entry(
 
 def _one_line(error: Exception) -> str:
     return " ".join(str(error).split())
-
-
-def _three(vector: np.ndarray) -> tuple[float, float, float]:
-    x, y, z = (float(v) for v in vector)
-    return x, y, z

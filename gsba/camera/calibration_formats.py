@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from gsba.camera.fisheye import Pair
+from gsba.camera.fisheye import Pair, three
 from gsba.camera.projections import RadialProjection
 from gsba.geometry import inverse, pose, rotation_from_quaternion
 from gsba.log import GsbaError, brief
@@ -57,9 +57,7 @@ def lens_of(
     if rig_T_lens is not None:
         turn = Rotation.from_matrix(_checked_rigid(rig_T_lens)[:3, :3]).as_rotvec()
         place = rig_T_lens[:3, 3]
-    a, b, c = (float(v) for v in turn)
-    d, e, g = (float(v) for v in place)
-    return Fisheye(width, height, f, (x, y), (k1, k2, k3, k4), (a, b, c), (d, e, g))
+    return Fisheye(width, height, f, (x, y), (k1, k2, k3, k4), three(turn), three(place))
 
 
 def metres_of(unit: Any) -> float:
@@ -339,9 +337,8 @@ def _in_rig(pair: Pair, front_T_back: np.ndarray, path: Path) -> Pair:
     rig_R_front = np.stack([right, np.cross(ahead, right), ahead])
     turns = rig_R_front, rig_R_front @ front_T_back[:3, :3]
     places = np.zeros(3), rig_R_front @ front_T_back[:3, 3]
-    placed = []
-    for lens, turn, place in zip(pair, turns, places, strict=True):
-        a, b, c = (float(v) for v in Rotation.from_matrix(turn).as_rotvec())
-        x, y, z = (float(v) for v in place)
-        placed.append(replace(lens, rotation=(a, b, c), centre=(x, y, z)))
-    return placed[0], placed[1]
+    front, back = (
+        replace(lens, rotation=three(Rotation.from_matrix(turn).as_rotvec()), centre=three(place))
+        for lens, turn, place in zip(pair, turns, places, strict=True)
+    )
+    return front, back

@@ -92,29 +92,21 @@ class Cameras:
 
     def rays(self, directions: np.ndarray, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Directions and origins (N, 3) of rays, see `Lenses.rays`."""
-        seen, origins = self._by_camera(
-            frames, lambda lenses, rows: lenses.rays(directions[rows], frames[rows])
-        )
+        seen, origins = self._by_camera(directions, frames, Lenses.rays)
         return seen, origins
 
     def views(self, directions: np.ndarray, frames: np.ndarray) -> np.ndarray:
         """Transforms (N, 4, 4) of local views, see `Lenses.views`."""
-        return self._by_camera(
-            frames, lambda lenses, rows: (lenses.views(directions[rows], frames[rows]),)
-        )[0]
+        return self._by_camera(directions, frames, lambda one, *seen: (one.views(*seen),))[0]
 
     def seeing(self, points_rig: np.ndarray, frames: np.ndarray) -> np.ndarray:
         """Vectors (N, 3) along the directions in which pictures show points, see
         `Lenses.seeing`."""
-        return self._by_camera(
-            frames, lambda lenses, rows: (lenses.seeing(points_rig[rows], frames[rows]),)
-        )[0]
+        return self._by_camera(points_rig, frames, lambda one, *seen: (one.seeing(*seen),))[0]
 
     def blended(self, directions: np.ndarray, frames: np.ndarray) -> np.ndarray:
         """True (N,) where two lenses' pictures are blended, see `Lenses.blended`."""
-        return self._by_camera(
-            frames, lambda lenses, rows: (lenses.blended(directions[rows], frames[rows]),)
-        )[0]
+        return self._by_camera(directions, frames, lambda one, *seen: (one.blended(*seen),))[0]
 
     def seen(self, keypoints: Keypoints) -> Keypoints:
         """Keypoints as rays that start at their lens, at the pose of the frame's middle."""
@@ -137,15 +129,18 @@ class Cameras:
         return tracks.of_observations(~hidden)
 
     def _by_camera(
-        self, frames: np.ndarray, look: Callable[[Lenses, slice | np.ndarray], Sequence[np.ndarray]]
+        self,
+        vectors: np.ndarray,
+        frames: np.ndarray,
+        look: Callable[[Lenses, np.ndarray, np.ndarray], Sequence[np.ndarray]],
     ) -> Sequence[np.ndarray]:
-        """Arrays (N, ...) of items in frames (N,), made from the rows of each camera's items."""
+        """Arrays (N, ...) made of vectors (N, 3) in frames (N,) by each camera's lenses."""
         if not self.of_frame:
-            return look(self.lenses[0], slice(None))
+            return look(self.lenses[0], vectors, frames)
         cameras, wholes = np.array(self.of_frame)[frames], list[np.ndarray]()
         for number, lenses in enumerate(self.lenses):
             rows = np.flatnonzero(cameras == number)
-            parts = look(lenses, rows)
+            parts = look(lenses, vectors[rows], frames[rows])
             if not wholes:
                 wholes = [np.empty((len(frames), *part.shape[1:]), part.dtype) for part in parts]
             for whole, part in zip(wholes, parts, strict=True):

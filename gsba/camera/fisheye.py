@@ -81,17 +81,15 @@ def changed(lens: Fisheye, step: np.ndarray) -> Fisheye:
     own = projection_of(lens).stepped(step[:7])
     k1, k2, k3, k4 = own.radial
     bent = replace(lens, focal=own.focal, principal=own.principal, radial=(k1, k2, k3, k4))
-    return _with_rotation(bent, turn.as_rotvec())
+    return replace(bent, rotation=three(turn.as_rotvec()))
 
 
 def turned(rig: Rig, old_R_new: np.ndarray) -> Rig:
     """The lenses in a rig whose axes are rotated by old_R_new (3, 3) against the old ones."""
     from scipy.spatial.transform import Rotation
 
-    return tuple(
-        _with_rotation(lens, Rotation.from_matrix(old_R_new.T @ rotation_of(lens)).as_rotvec())
-        for lens in rig
-    )
+    turns = [Rotation.from_matrix(old_R_new.T @ rotation_of(lens)).as_rotvec() for lens in rig]
+    return tuple(replace(lens, rotation=three(t)) for lens, t in zip(rig, turns, strict=True))
 
 
 def difference(lens: Fisheye, before: Fisheye) -> np.ndarray:
@@ -127,6 +125,7 @@ def recalibrated(
     return out
 
 
-def _with_rotation(lens: Fisheye, rotation: np.ndarray) -> Fisheye:
-    a, b, c = (float(v) for v in rotation)
-    return replace(lens, rotation=(a, b, c))
+def three(vector: np.ndarray) -> tuple[float, float, float]:
+    """A vector (3,) as a `Fisheye` has it."""
+    x, y, z = (float(value) for value in vector)
+    return x, y, z

@@ -215,14 +215,12 @@ class Lenses:
         """Vectors (N, 3) along the directions in which a stitcher shows points (N, 3)."""
         origins = self.origins(points, frames, lens)
         vectors = points - origins
-        if self.reference_calibration is not None and self.fisheyes is not None:
-            lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
-            units = vectors / np.maximum(lengths, 1e-300)
-            return lengths * recalibrated(units, self.fisheyes, self.reference_calibration, lens)
-        if not self.inverse_stitch_radius:
+        if self.fisheyes is None and not self.inverse_stitch_radius:
             return vectors
-        lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
-        units, near = vectors / np.maximum(lengths, 1e-300), self.inverse_stitch_radius * origins
+        lengths, units = np.linalg.norm(vectors, axis=1, keepdims=True), unit(vectors)
+        if self.reference_calibration is not None and self.fisheyes is not None:
+            return lengths * recalibrated(units, self.fisheyes, self.reference_calibration, lens)
+        near = self.inverse_stitch_radius * origins
         along = np.sum(near * units, axis=1, keepdims=True)
         left = 1 + along**2 - np.sum(near**2, axis=1, keepdims=True)
         return lengths * (near + (np.sqrt(np.maximum(left, 0)) - along) * units)

@@ -16,6 +16,7 @@ from gsba.camera.pictures import Picture, cube_map, lens_picture, panorama
 from gsba.camera.sphere import around_sphere, erp_bands, erp_directions
 from gsba.camera.straighten import PAD
 from gsba.camera.views import FAR_DEPTH, depths_along, observed_points
+from gsba.geometry import unit
 from gsba.types import Reconstruction
 
 _DEPTH_GRID_WIDTH = 128  # width of the grid that depths are taken on
@@ -33,13 +34,11 @@ class Stitcher:
         depths = np.full(len(rays), FAR_DEPTH)
         if len(scene):
             # nearer points would lie beyond the rims at the seam
-            nearest = 12.0 * lenses.baseline / 2
-            depths = np.maximum(depths_along(rays, scene), nearest)
+            depths = np.maximum(depths_along(rays, scene), 6.0 * lenses.baseline)
         same, self._offsets = np.zeros(len(rays), int), []
         for lens in range(lenses.num_lenses):
             shown = self._lenses.seeing(depths[:, None] * rays, same, np.full(len(rays), lens))
-            shown /= np.linalg.norm(shown, axis=1, keepdims=True)
-            offsets = (shown - rays).reshape(grid.shape).astype(np.float32)
+            offsets = (unit(shown) - rays).reshape(grid.shape).astype(np.float32)
             self._offsets.append(around_sphere(offsets, PAD))
 
     def stitched(self, erp: np.ndarray) -> np.ndarray:
@@ -109,6 +108,5 @@ def seen_from_the_middle(reconstruction: Reconstruction) -> Reconstruction:
     """Observed points as bearings from the rig's centre, instead of as rays from lenses."""
     if reconstruction.observation_origins is None:
         return reconstruction
-    bearings = observed_points(reconstruction)
-    bearings /= np.linalg.norm(bearings, axis=1, keepdims=True)
+    bearings = unit(observed_points(reconstruction))
     return replace(reconstruction, observation_bearings=bearings, observation_origins=None)

@@ -9,6 +9,8 @@ from typing import ClassVar, Protocol, Self
 
 import numpy as np
 
+from gsba.geometry import unit
+
 _NUM_NEWTON_STEPS = 8  # enough for angles to converge in double precision
 _MIN_SLOPE = 0.1  # of the radius by the angle, in Newton's steps beyond a polynomial's own range
 
@@ -192,7 +194,7 @@ class PerspectiveProjection(RadialProjection):
             tangents = tangents - (reached - radii) / np.maximum(slope, _MIN_SLOPE)
         scale = np.divide(tangents, radii, out=np.ones_like(radii), where=radii > 0)
         rays = np.concatenate([scale[..., None] * away, np.ones_like(radii)[..., None]], axis=-1)
-        return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+        return unit(rays)
 
 
 PROJECTIONS: dict[str, Callable[..., RadialProjection]] = {  # by "model" in calibration files

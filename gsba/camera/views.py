@@ -89,6 +89,9 @@ def lens_views(lenses: Lenses, size: int) -> tuple[View, ...]:
             f"the camera has {lenses.num_lenses} lenses, and faces of one lens each are cut for "
             "two back to back: use --images cube, panorama or, of raw frames, fisheye"
         )
+    towards, along = _side_extents(lenses.band_rad)
+    short, long = 2 * int(size / 2 * towards), 2 * int(np.ceil(size / 2 * along))
+    tilt = np.pi / 4 + np.arctan(short / size)  # its edge meets the whole face's
     views = []
     for whole in cube_views(FACES, size):
         axis = whole.rig_R_view[:, 2]
@@ -97,9 +100,6 @@ def lens_views(lenses: Lenses, size: int) -> tuple[View, ...]:
             continue
         for lens, sign in (("front", 1.0), ("back", -1.0)):
             ahead = np.array([0, 0, sign])
-            towards, along = _side_extents(lenses.band_rad)
-            short, long = 2 * int(size / 2 * towards), 2 * int(np.ceil(size / 2 * along))
-            tilt = np.pi / 4 + np.arctan(short / size)  # its edge meets the whole face's
             forward = np.cos(tilt) * ahead + np.sin(tilt) * axis
             seamwards = np.cos(tilt) * axis - np.sin(tilt) * ahead
             if axis[0]:  # beside the lens, upright
@@ -173,8 +173,7 @@ def _seen_from_lenses(reconstruction: Reconstruction, lenses: Lenses) -> Reconst
     if lenses.readout_motion is not None:
         bearings, frames = reconstruction.observation_bearings, reconstruction.observation_frames
         starts = lenses.origins(bearings, frames)
-        rays = observed_points(reconstruction) - starts
-        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        rays = unit(observed_points(reconstruction) - starts)
         reconstruction = replace(
             reconstruction, observation_bearings=rays, observation_origins=starts
         )
@@ -206,8 +205,7 @@ def _shown_in_pictures(reconstruction: Reconstruction, lenses: Lenses) -> Recons
     if lenses.readout_motion is None:
         return reconstruction
     frames = reconstruction.observation_frames
-    shown = lenses.seeing(observed_points(reconstruction), frames)
-    shown /= np.linalg.norm(shown, axis=1, keepdims=True)
+    shown = unit(lenses.seeing(observed_points(reconstruction), frames))
     origins = lenses.origins(shown, frames)
     return replace(reconstruction, observation_bearings=shown, observation_origins=origins)
 

@@ -208,11 +208,8 @@ def _read(path: Path, file: BinaryIO, telemetry: bool) -> Insta360Trailer | None
             f"damaged: the trailer claims {size:,} of the file's {length:,} bytes"
         )
     wanted = {_Record.METADATA}
-    wanted |= (
-        {_Record.GYRO, _Record.EXPOSURES, _Record.GPS, _Record.BACK_EXPOSURES}
-        if telemetry
-        else set()
-    )
+    if telemetry:
+        wanted |= {_Record.GYRO, _Record.EXPOSURES, _Record.GPS, _Record.BACK_EXPOSURES}
     _find_records(file, start, length - _HEADER.size, wanted, contents)
     if not contents.records:
         raise GsbaError(f"{path}: its Insta360 trailer is damaged: no record can be read")
@@ -343,7 +340,8 @@ def _gyro(
         return None
     ranges = read_message(values.get(_Field.GYRO_RANGES, b""))[0]
     for is_raw in (False, True) if raw is False else (True, False):
-        rows = np.frombuffer(record, _RAW if is_raw else _SCALED, len(record) // _row(is_raw))
+        layout = _RAW if is_raw else _SCALED
+        rows = np.frombuffer(record, layout, len(record) // layout.itemsize)
         ticks, (forces, turns) = rows["time"], np.split(rows["values"], 2, axis=1)
         if is_raw:
             # A raw value of 32768 is zero, and 32768 more is the end of the range in the metadata:
@@ -376,7 +374,10 @@ def _gyro(
             continue
         if kept < len(rows):
             notes.append(f"gyro: {len(rows) - kept:,} of {len(rows):,} readings are damaged")
-        forces = forces[fine] * _force_unit(forces[fine], is_raw)
+        forces = forces[fine]
+        length = float(np.median(np.linalg.norm(forces, axis=1)))
+        if is_raw or length <= np.sqrt(STANDARD_GRAVITY):  # g: in m/s^2 they are far longer than 1
+            forces = forces * STANDARD_GRAVITY
         return _Ticks(ticks[fine], not is_raw, turns[fine].astype(np.float64), forces)
     notes.append(f"gyro: {len(record):,} bytes of an unknown layout")
     return None
@@ -390,17 +391,6 @@ def _near_others(ticks: np.ndarray) -> np.ndarray:
     step = float(np.median(abs(np.diff(ticks[sound]))))
     # Readings lie within four times their number times the median step.
     return sound & (abs(ticks - np.median(ticks[sound])) <= 4.0 * len(ticks) * step)
-
-
-def _row(is_raw: bool) -> int:
-    """Size of a reading in bytes."""
-    return (_RAW if is_raw else _SCALED).itemsize
-
-
-def _force_unit(forces: np.ndarray, is_raw: bool) -> float:
-    """Unit of accelerations (N, 3) in m/s^2: g, unless they are far longer than 1."""
-    length = float(np.median(np.linalg.norm(forces, axis=1)))
-    return 1.0 if length > np.sqrt(STANDARD_GRAVITY) and not is_raw else STANDARD_GRAVITY
 
 
 def _exposures(
@@ -457,20 +447,19 @@ def _real(values: Mapping[int, Any], key: int) -> float | None:
     return found if isinstance(found, float) and np.isfinite(found) else None
 
 
-def _size(values: Mapping[int, Any], key: int, across: int, down: int) -> tuple[int, int] | None:
-    """Width and height from two fields of a nested message; None = not stated."""
-    inner = read_message(values.get(key, b""))[0]
-    width, height = inner.get(across), inner.get(down)
+def _size(values: Mapping[int, Any], across: int, down: int) -> tuple[int, int] | None:
+    """Width and height from two fields; None = not stated."""
+    width, height = values.get(across), values.get(down)
     if not isinstance(width, int) or not isinstance(height, int):
         return None
     return (width, height) if 0 < width < 1 << 16 and 0 < height < 1 << 16 else None
 
 
 def _window(values: Mapping[int, Any]) -> SensorWindow | None:
-    source, size = _size(values, _Field.WINDOW, 1, 2), _size(values, _Field.WINDOW, 3, 4)
+    inner = read_message(values.get(_Field.WINDOW, b""))[0]
+    source, size = _size(inner, 1, 2), _size(inner, 3, 4)
     if source is None or size is None or size[0] > source[0] or size[1] > source[1]:
         return None
-    inner = read_message(values[_Field.WINDOW])[0]
     right, down = (found if isinstance(found := inner.get(key, 0), int) else 0 for key in (5, 6))
     if abs(right) > source[0] or abs(down) > source[1]:
         return None

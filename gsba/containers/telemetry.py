@@ -5,7 +5,6 @@ from typing import Any, Literal
 
 from gsba.log import GsbaError
 
-_EXTRA = "gsba[imu]"
 _PANIC = "PanicException"  # of libraries in Rust: not an Exception, and cannot be imported
 
 
@@ -25,7 +24,7 @@ def ask_telemetry_parser(
         from telemetry_parser import Parser  # type: ignore[import-not-found]
     except ImportError:
         raise GsbaError(
-            f"{path}: reading its {what} needs telemetry-parser: pip install '{_EXTRA}', or give "
+            f"{path}: reading its {what} needs telemetry-parser: pip install 'gsba[imu]', or give "
             f"{instead}"
         ) from None
     try:

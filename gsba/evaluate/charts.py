@@ -19,7 +19,6 @@ KINDS = {  # suffix -> metadata that a file must not hold
 }
 BEFORE, AFTER, TRUE = "#d9822b", "#1769aa", "#1b1c1e"  # colours of report.html
 ALONE = "#2e7d4f"  # colour of a trajectory file that is of no run
-_COLORS = (AFTER, ALONE, "#b3383f", "#7d4fa3", "#8a6d1c", "#258a99")
 _STYLE = {
     "axes.grid": True,
     "axes.spines.right": False,
@@ -67,7 +66,7 @@ def write(
 
 def colors() -> Iterator[str]:
     """Colours of lines, which repeat after the sixth."""
-    return cycle(_COLORS)
+    return cycle((AFTER, ALONE, "#b3383f", "#7d4fa3", "#8a6d1c", "#258a99"))
 
 
 def plain(name: str) -> str:

@@ -110,9 +110,7 @@ def evaluate(
     rows_t, scale = errors.true_rows, errors.fit.scale
     world_T_rigs, true_T_rigs = estimate.world_T_rigs[errors.rows], truth.world_T_rigs[rows_t]
     steps = np.flatnonzero(np.diff(rows_t) == 1)
-    step_translation, step_rotation = _step_errors(
-        world_T_rigs, true_T_rigs, steps, errors.fit.scale
-    )
+    step_translation, step_rotation = _step_errors(world_T_rigs, true_T_rigs, steps, scale)
     pair_errors = np.degrees(_pair_errors(world_T_rigs, true_T_rigs))
     num_truth = len(truth.timestamps)
     return TrajectoryErrors(

@@ -10,8 +10,9 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.spatial import KDTree
 
+from factors import RobustLoss
 from factors.threads import map_in_threads
-from gsba.bundle.pose_variables import X, values_of
+from gsba.bundle.pose_variables import X, pose_noise, values_of
 from gsba.config import RefineSettings
 from gsba.geometry import inverse, relative_steps, rotation_angle
 from gsba.loop_closure import join_evidence
@@ -44,16 +45,16 @@ def path(
     """A pose graph of the steps of poses (F, 4, 4), its first fixed, its values, and a loop's
     noise; steps `unseen` (F - 1,) bool without matches give way first."""
     graph, values = gtsam.NonlinearFactorGraph(), values_of(world_T_rigs)
-    graph.add(gtsam.PriorFactorPose3(X(0), gtsam.Pose3(world_T_rigs[0]), _noise_model(1e-6, 1e-6)))
+    graph.add(gtsam.PriorFactorPose3(X(0), gtsam.Pose3(world_T_rigs[0]), pose_noise(1e-6, 1e-6)))
     steps = relative_steps(world_T_rigs)
     lengths = np.linalg.norm(steps[:, :3, 3], axis=1)
     typical = float(np.median(lengths)) or 1.0
     for f, step in enumerate(steps):
-        noise = _noise_model(np.deg2rad(_STEP_SIGMA_DEG), _STEP_SIGMA_LENGTHS * typical)
+        noise = pose_noise(np.deg2rad(_STEP_SIGMA_DEG), _STEP_SIGMA_LENGTHS * typical)
         if unseen[f]:  # half a radian, and its length
-            noise = _noise_model(0.5, float(max(lengths[f], typical)))
+            noise = pose_noise(0.5, float(max(lengths[f], typical)))
         graph.add(gtsam.BetweenFactorPose3(X(f), X(f + 1), gtsam.Pose3(step), noise))
-    return graph, values, _noise_model(np.deg2rad(_LOOP_SIGMA_DEG), _LOOP_SIGMA_LENGTHS * typical)
+    return graph, values, pose_noise(np.deg2rad(_LOOP_SIGMA_DEG), _LOOP_SIGMA_LENGTHS * typical)
 
 
 def affordable(
@@ -85,10 +86,6 @@ def affordable(
     return np.asarray(solver.getWeights())[chain:] > 0.5
 
 
-def _noise_model(rotation: float, translation: float) -> gtsam.noiseModel.Base:
-    return gtsam.noiseModel.Diagonal.Sigmas(np.array([rotation] * 3 + [translation] * 3))
-
-
 @dataclass(frozen=True, slots=True)
 class Loop:
     """Two frames that observe the same map points, and their relative pose."""
@@ -104,8 +101,7 @@ def bend(solved: Solution, loops: list[Loop], unseen: np.ndarray) -> Solution:
     `unseen` (F - 1,) bool without matches give way first."""
     poses = solved.world_T_rigs
     graph, values, noise = path(poses, unseen)
-    cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(2.0)
-    robust = gtsam.noiseModel.Robust.Create(cauchy, noise)
+    robust = RobustLoss("cauchy", 2.0).noise_model(noise)
     for loop in loops:
         between = gtsam.Pose3(loop.f0_T_f1)
         graph.add(gtsam.BetweenFactorPose3(X(loop.f0), X(loop.f1), between, robust))

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from gsba.camera.sphere import around_seam
 from gsba.frames.files import image_header
 from gsba.frames.pixels import load_erp
 from gsba.types import FrameSet, rows_across
@@ -47,9 +48,8 @@ def find_borders(frames: FrameSet) -> Borders:
 
 def widened(places: np.ndarray, pixels: int) -> np.ndarray:
     """Places (h, 2h) bool and those within some pixels of them, over the seam, too."""
-    size, left, right = 2 * pixels + 1, pixels, -pixels
-    around = cv2.copyMakeBorder(places.astype(np.uint8), 0, 0, left, left, cv2.BORDER_WRAP)
-    return cv2.dilate(around, np.ones((size, size), np.uint8))[:, left:right] > 0
+    around, size = around_seam(places.astype(np.uint8), pixels), 2 * pixels + 1
+    return cv2.dilate(around, np.ones((size, size), np.uint8))[:, pixels:-pixels] > 0
 
 
 def black_areas(brightest: np.ndarray) -> np.ndarray:

@@ -144,6 +144,17 @@ def carrier_mask(carrier: Carrier, frames: FrameSet, frame: int) -> np.ndarray:
     return np.roll(full, round(carrier.turns[frame] / (2 * np.pi) * kind.width), axis=1)
 
 
+def marked(picture: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """A picture (h, 2h, 3) uint8 RGB in which masked places (h, 2h) bool are red, with an
+    outline."""
+    shown = picture.copy()
+    shown[places] = (shown[places] * 0.5 + np.array([128, 0, 60])).astype(np.uint8)
+    inside = places.astype(np.uint8)
+    outlines, _ = cv2.findContours(inside, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    cv2.drawContours(shown, outlines, -1, (255, 80, 160), 1)
+    return shown
+
+
 def write_carrier(
     carrier: Carrier, frames: FrameSet, out: Path, merge: bool = True, name: str = "carrier"
 ) -> list[Path]:
@@ -155,12 +166,7 @@ def write_carrier(
     """
     written = [out / f"{name}.png", out / f"{name}_check.jpg"]
     write_image(written[0], carrier_mask(carrier, frames, 0).astype(np.uint8) * 255)
-    shown = carrier.median.copy()
-    shown[~carrier.mask] = (shown[~carrier.mask] * 0.5 + np.array([128, 0, 60])).astype(np.uint8)
-    inside = (~carrier.mask).astype(np.uint8)
-    outlines, _ = cv2.findContours(inside, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-    cv2.drawContours(shown, outlines, -1, (255, 80, 160), 1)
-    write_image(written[1], shown, jpeg_quality=88)
+    write_image(written[1], marked(carrier.median, ~carrier.mask), jpeg_quality=88)
     for f, frame in enumerate(frames.names):
         own = load_mask(frames, f)
         if merge and (own is not None or carrier.turns.any()):

@@ -19,8 +19,6 @@ _MIN_CERTAIN_STRONG, _MIN_CERTAIN_WEAK = 0.75, 0.6  # least strong and weak corr
 # carrier has, see docs/masks.md
 _MIN_LIKELY_WEAK = 0.2  # least weak correlation of pixels joined to certain ones
 _SPILL_PX = 6  # pixels by which fixed structure exceeds the outline
-_MIN_CHANGE = 1.0  # grey levels, least change of a carrier without noise
-_DILATION_PX = 1  # pixels added: features on the carrier's blurred rim are useless
 
 
 def certain_places(structure: FixedStructure) -> np.ndarray:
@@ -51,7 +49,7 @@ def outline_carrier(
     rows = np.array_split(np.arange(len(median)), 8)  # little memory at a time
     parts = [np.abs(pictures[:, r].astype(np.int16) - median[r]).mean(axis=-1) for r in rows]
     change = np.concatenate([median_picture(part) for part in parts]).astype(np.float32)
-    own_change = max(float(np.median(change[core])), _MIN_CHANGE)
+    own_change = max(float(np.median(change[core])), 1.0)  # grey levels, at least
     moves = (_filtered_on_sphere(cv2.GaussianBlur, change, (0, 0), 1.0) > 3.0 * own_change) & ~core
     distance = _filtered_on_sphere(cv2.distanceTransform, ~likely, cv2.DIST_L2, 5)
     far = distance > 28  # pixels
@@ -73,10 +71,8 @@ def outline_carrier(
     )
     plain = _enclosed(found)
     found |= plain & ~_parts_with(plain, moves, least=0.5)
-    return (
-        _filtered_on_sphere(cv2.dilate, found, np.ones((3, 3), np.uint8), iterations=_DILATION_PX)
-        > 0
-    )
+    # one pixel more: features on the carrier's blurred rim are useless
+    return _filtered_on_sphere(cv2.dilate, found, np.ones((3, 3), np.uint8)) > 0
 
 
 def _shrunk(places: np.ndarray, pixels: int) -> np.ndarray:

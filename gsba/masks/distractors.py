@@ -108,7 +108,7 @@ class StaticScene:
             (min(_WIDTH_PX, kind.width) if kind.panoramic else panorama.width_for(kind, _WIDTH_PX))
             for kind in frames.formats
         )
-        self._known, self._rays = known, _rays(self.width)
+        self._known, self._rays = known, erp_directions(self.width).astype(np.float32)
         self._room = int(limit_mb * 2**20 / (1.5 * self.width**2))
         self._kept: dict[int, np.ndarray] = {}
         self._lock = threading.Lock()
@@ -254,10 +254,6 @@ class StaticScene:
         return uv, np.maximum(np.linalg.norm(local, axis=1), 1e-9)
 
 
-def _rays(width: int) -> np.ndarray:
-    return erp_directions(width).astype(np.float32)
-
-
 def _load(frames: FrameSet, frame: int, width: int) -> np.ndarray:
     """Small picture (h, w, C + 1) uint8: colours, or grey of cube faces, and the mask."""
     kind = frames.format_of(frame)
@@ -278,8 +274,8 @@ def _spread_out(cells: np.ndarray) -> np.ndarray:
     window = np.ones((2 * _REACH_CELLS + 1, 2 * _REACH_CELLS + 1), np.uint8)
 
     def widened(a: np.ndarray) -> np.ndarray:
-        ring = np.concatenate([a[:, -_REACH_CELLS:], a, a[:, :_REACH_CELLS]], axis=1)
-        return np.maximum(cv2.dilate(ring, window)[:, _REACH_CELLS:-_REACH_CELLS], _EMPTY_CELL)
+        spread = cv2.dilate(around_seam(a, _REACH_CELLS), window)
+        return np.maximum(spread[:, _REACH_CELLS:-_REACH_CELLS], _EMPTY_CELL)
 
     cells = widened(cells)
     while (cells <= _EMPTY_CELL).any():

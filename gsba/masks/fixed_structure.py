@@ -117,13 +117,10 @@ def _exchanges(num: int) -> Iterator[tuple[int, int]]:
 
 
 WIDTH = 256  # pixels across the pictures in which shifts are estimated
-_MIN_CHANGE = 4.0  # grey levels: more stable pixels have equal weights
 
 
 def band_of(picture: np.ndarray) -> np.ndarray:
     """The compared rows (r, WIDTH) float32 of a small picture (h, 2h, 3) uint8 RGB."""
-    import cv2
-
     small = cv2.resize(picture, (WIDTH, WIDTH // 2), interpolation=cv2.INTER_AREA)
     return cv2.cvtColor(small[int(0.7 * len(small)) :], cv2.COLOR_RGB2GRAY).astype(np.float32)
 
@@ -141,8 +138,7 @@ def find_turns(bands: np.ndarray) -> np.ndarray:
     spectra = np.fft.rfft(even, axis=-1)
     squares = np.fft.rfft(even**2, axis=-1)
     best, turns = 0.0, np.zeros(len(bands))
-    references = rows_across(len(bands), 3)
-    for reference in references:
+    for reference in rows_across(len(bands), 3):
         template, weights = even[reference], np.ones(even.shape[1:])
         shifts = np.zeros(len(bands))
         for _ in range(4):
@@ -159,7 +155,8 @@ def find_turns(bands: np.ndarray) -> np.ndarray:
             )
             median = median_picture(rolled)
             change = median_picture(np.abs(rolled - median))
-            template, weights = median, 1 / (change**2 + _MIN_CHANGE**2)
+            # pixels that change by less than four grey levels have about equal weights
+            template, weights = median, 1 / (change**2 + 4.0**2)
         if weights.sum() > best:
             best, turns = float(weights.sum()), 2 * np.pi / WIDTH * shifts
     turns = turns - turns[0]

@@ -17,7 +17,14 @@ from gsba.frames.masks import levels_of, load_mask, load_weights
 from gsba.frames.pixels import load_erp
 from gsba.log import GsbaError, track
 from gsba.masks.borders import Borders, find_borders, padded
-from gsba.masks.carrier import Carrier, carrier_mask, find_carrier, no_carrier, write_carrier
+from gsba.masks.carrier import (
+    Carrier,
+    carrier_mask,
+    find_carrier,
+    marked,
+    no_carrier,
+    write_carrier,
+)
 from gsba.masks.distractors import Distractors, KnownMasks, Look, StaticScene, distractor_weights
 from gsba.masks.segmentation import Segment, load_segmented, segmented
 from gsba.store.store import PerFrame, RunStore, fingerprint
@@ -166,12 +173,7 @@ def after(
                 shown = np.full((size[1], size[0], 3), 128, np.uint8)
             mask = load_mask(merged, int(row))
             assert mask is not None
-            out = _fit(mask, _CHECK_WIDTH_PX) == 0
-            shown[out] = (shown[out] * 0.5 + np.array([128, 0, 60])).astype(np.uint8)
-            outlines, _ = cv2.findContours(
-                out.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE
-            )
-            cv2.drawContours(shown, outlines, -1, (255, 80, 160), 1)
+            shown = marked(shown, _fit(mask, _CHECK_WIDTH_PX) == 0)
             place = (6, size[1] - 8)
             cv2.putText(shown, merged.names[row], place, cv2.FONT_HERSHEY_PLAIN, 1, (255, 255, 255))
             rows.append(shown)
@@ -197,7 +199,7 @@ def recut(store: RunStore, frames: FrameSet, cut: int) -> FrameSet:
     return replace(frames, mask_paths=(path,) * len(frames))
 
 
-def _carrier(store: RunStore, frames: FrameSet, required: bool, name: str = "carrier") -> Carrier:
+def _carrier(store: RunStore, frames: FrameSet, required: bool, name: str) -> Carrier:
     """The carrier as stage `name`, and its pictures in the run's folder if there is one."""
 
     def compute() -> Carrier:

@@ -87,8 +87,7 @@ def adjust_window(
     keys = [pose_variables.X(k) for k in range(len(world_T_rigs))]
     block = LandmarkBlock(keys, marks.points_world, [term], RobustLoss("cauchy", 2.0), 1)
     extent = max(extent_of(world_T_rigs[:, :3, 3]), 1e-9)
-    spread = np.array([_HELD] * 3 + [_HELD * extent] * 3)
-    noise = gtsam.noiseModel.Diagonal.Sigmas(spread)
+    noise = pose_variables.pose_noise(_HELD, _HELD * extent)
     graph = gtsam.NonlinearFactorGraph()
     for k in range(num_held):
         pose = gtsam.Pose3(world_T_rigs[k])

@@ -89,7 +89,6 @@ def fixes_of_frames(
         GsbaError: the source cannot be read, its receiver had no lock, or its times do not overlap
             with the frames'.
     """
-    settings = settings or GpsSettings()
     fixes = read_fixes(source, frames, settings)
     assert fixes is not None  # frames are known
     fixes = _locked(source, fixes)

@@ -14,8 +14,6 @@ from gsba.similarity import (
     similarity,
 )
 
-_MAX_ROUNDS, _MAX_STEPS = 20, 20  # selections of inliers, and Gauss-Newton steps in each
-
 
 @dataclass(frozen=True, slots=True)
 class GpsFit:
@@ -74,9 +72,9 @@ def fit_fixes(
     limits = fixes.tolerances(), MAX_DRIFT_SHARE
     fit, used = robust_similarity(positions, fixes.positions, solve, num, *limits)
     centre = positions[used].mean(axis=0)
-    free = tuple(range(7)) if up_sigma is None else (0, 3, 4, 5, 6)  # no tilt if up is known
+    free = list(range(7)) if up_sigma is None else [0, 3, 4, 5, 6]  # no tilt if up is known
     information = np.zeros((7, 7))
-    for _ in range(_MAX_ROUNDS):
+    for _ in range(20):  # selections of inliers
         fit, information = _most_probable(fit, positions, fixes, used, centre, free, scale)
         extent = fit.scale * extent_of(positions)
         before, (used, _) = used, fixes.inliers(_residuals(fit, positions, fixes), extent)
@@ -117,13 +115,13 @@ def _most_probable(
     fixes: FrameFixes,
     used: np.ndarray,
     centre: np.ndarray,
-    free: tuple[int, ...],
+    free: list[int],
     scale: tuple[float, float] | None,
 ) -> tuple[Sim3, np.ndarray]:
     """Similarity by Gauss-Newton over the inliers `used`, and its information (7, 7)."""
     chosen, some = fixes.taken(used), positions[used]
-    information, rows = np.zeros((7, 7)), list(free)
-    for _ in range(_MAX_STEPS):
+    information = np.zeros((7, 7))
+    for _ in range(20):  # Gauss-Newton steps
         columns = chosen.whitened(_columns(fit, some - centre)).reshape(-1, 7)
         off = chosen.whitened(chosen.positions - fit.points(some)).ravel()
         information, right = columns.T @ columns, columns.T @ off
@@ -131,9 +129,9 @@ def _most_probable(
             weight = (scale[0] / max(scale[1], 1e-9 * scale[0])) ** 2
             information[0, 0] += weight
             right[0] += weight * np.log(scale[0] / fit.scale)
-        inverse = np.linalg.pinv(information[np.ix_(rows, rows)], hermitian=True)
+        inverse = np.linalg.pinv(information[np.ix_(free, free)], hermitian=True)
         step = np.zeros(7)
-        step[rows] = inverse @ right[rows]
+        step[free] = inverse @ right[free]
         step[0] = np.clip(step[0], -1, 1)
         fit = fit.moved(np.roll(step, -1), about=fit.points(centre[None])[0])
         reach = np.array([1.0, 1, 1, 1, *[max(float(np.ptp(chosen.positions)), 1e-9)] * 3])

@@ -34,7 +34,7 @@ class Gravity:
     @property
     def turn_deg(self) -> float:
         """Angle between `up` and the rigs' up axis."""
-        return _degrees(self.up, self.by_rigs)
+        return degrees_off(self.up, self.by_rigs)
 
 
 def estimate_gravity(reconstruction: Reconstruction, frames: FrameSet) -> Gravity | None:
@@ -56,7 +56,7 @@ def estimate_gravity(reconstruction: Reconstruction, frames: FrameSet) -> Gravit
         return None
     ups = -reconstruction.world_T_rigs[good, :3, 1]
     by_rigs, forces = median_direction(ups), reconstruction.vertical
-    spread = float(np.degrees(np.median(np.arccos(np.clip(ups @ by_rigs, -1, 1)))))
+    spread = degrees_off(ups, by_rigs)
     if forces is not None and forces @ by_rigs < 0 and spread <= _MAX_SPREAD_DEG:
         forces = -forces  # its sign differs between makers
     tags = _up_by_tags(reconstruction, frames, good, spread) if forces is None else None
@@ -73,7 +73,7 @@ def estimate_gravity(reconstruction: Reconstruction, frames: FrameSet) -> Gravit
         start, most, source = tags, 4.0, "the GPano tags"
     up, num_edges = _level_axis(normals, weights, start)
     gravity = Gravity(up, by_rigs, spread, num_edges, forces, tags)
-    if (off := _degrees(up, start)) > most:
+    if (off := degrees_off(up, start)) > most:
         logger.warning(
             "vertical edges are not used: they deviate by %.1f degrees from %s", off, source
         )
@@ -112,7 +112,7 @@ def _up_by_tags(
         )
         ups = np.einsum("gij,gj->gi", reconstruction.world_T_rigs[good[known], :3, :3], ups)
         up = median_direction(ups)
-        found.append((float(np.degrees(np.median(np.arccos(np.clip(ups @ up, -1, 1))))), up))
+        found.append((degrees_off(ups, up), up))
     off, up = min(found, key=lambda one: one[0])
     return up if off < min(spread_deg, 4.0) else None  # above it, they contradict the poses
 
@@ -125,8 +125,9 @@ def _tilt_deg(frames: FrameSet, f: int) -> tuple[float, float]:
     return (np.nan, np.nan) if tags is None else tags.attitude_deg[1:]
 
 
-def _degrees(one: np.ndarray, other: np.ndarray) -> float:
-    return float(np.degrees(np.arccos(np.clip(one @ other, -1, 1))))
+def degrees_off(directions: np.ndarray, axis: np.ndarray) -> float:
+    """Angle of a unit vector (3,), or median angle of several (N, 3), to a unit axis (3,)."""
+    return float(np.degrees(np.median(np.arccos(np.clip(directions @ axis, -1, 1)))))
 
 
 def _edge_normals(

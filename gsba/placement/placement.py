@@ -172,7 +172,7 @@ def check(
 
 
 def _upright(reconstruction: Reconstruction, frames: FrameSet) -> Placement:
-    from gsba.placement.gravity import estimate_gravity
+    from gsba.placement.gravity import degrees_off, estimate_gravity
 
     gravity = estimate_gravity(reconstruction, frames)
     if gravity is None:
@@ -187,8 +187,7 @@ def _upright(reconstruction: Reconstruction, frames: FrameSet) -> Placement:
     }
     for name, up in (("accelerometer", gravity.by_forces), ("tags", gravity.by_tags)):
         if up is not None:
-            off = float(np.degrees(np.arccos(np.clip(gravity.up @ up, -1, 1))))
-            grounds[f"edges_to_{name}_deg"] = round(off, 4)
+            grounds[f"edges_to_{name}_deg"] = round(degrees_off(gravity.up, up), 4)
     rotation = _least_turn(gravity.up, _UP_WORLD)
     return Placement(Sim3(rotation=rotation), up="-y", grounds={"gravity": grounds})
 

@@ -10,10 +10,8 @@ from gsba.significance import MEDIAN_ABS_NORMAL
 from gsba.similarity import Sim3
 from gsba.types.records import with_rows
 
-_MIN_STEP = 1e-6  # part of the cloud's size; a smaller step ends a round
 _FEW_STEPS, _MAX_STEPS = 3, 6  # Gauss-Newton steps at one width, at first and at the end
 LEAST_SIGMA = 0.1  # smallest sigma, part of the scan's spacing
-_MAX_NEAR_DISTANCE = 0.02  # of a point to a near surface, part of the cloud's size
 _MAX_LOG_CHANGE = 20.0  # of log parameters from their start: beyond, likelihoods are constant
 _MIN_POINTS = 50  # with fewer, the noise cannot be estimated
 
@@ -75,8 +73,9 @@ def _own_variances(fit: Sim3, cloud: Cloud, scan: Scan, rows: np.ndarray) -> np.
 
 
 def reach_of(fit: Sim3, cloud: Cloud) -> float:
-    """Largest distance of a point that counts as near a surface, unit of the scan."""
-    return _MAX_NEAR_DISTANCE * cloud.size * fit.scale
+    """Largest distance of a point that counts as near a surface, unit of the scan: a fiftieth of
+    the cloud's size."""
+    return 0.02 * cloud.size * fit.scale
 
 
 def residuals_of(
@@ -155,7 +154,7 @@ def _settle(fit: Sim3, cloud: Cloud, scan: Scan, noise: Noise, most: int) -> Sim
     """Gauss-Newton steps at one noise, at most `most`, until they are negligible."""
     for _ in range(most):
         fit, moved = _step(fit, cloud, scan, noise)
-        if moved < _MIN_STEP * cloud.size * fit.scale:
+        if moved < 1e-6 * cloud.size * fit.scale:
             break
     return fit
 

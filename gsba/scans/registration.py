@@ -22,9 +22,7 @@ logger = logging.getLogger(__name__)
 _NUM_CANDIDATES = 16  # that are aligned to the scan
 _MAX_SCALE_RATIO = 1.2  # of fit to candidate: a larger change is a collapse
 _MIN_DISTANCE = 0.05  # of distinct fits, part of the cloud's size
-_MIN_SHARE = 0.25  # of explained points in the cloud
 _MAX_DOUBT = 0.01  # largest p value of the lead over all rivals
-_MAX_TWIN_LEAD = 0.05  # of the mirrored cloud's share: a room that is its own mirror image has none
 
 
 class NoPlacementError(GsbaError):
@@ -112,7 +110,8 @@ def register(cloud: Cloud, scan: Scan, guess: Guess | None = None) -> Registrati
             doubt = evidence.doubt(found.verdict)
             logger.debug("mirrored: %.3f explained, p = %.2g of its lead", evidence.share, doubt)
             lead = evidence.share - found.verdict.share
-            if lead > _MAX_TWIN_LEAD or (lead > 0 and doubt < _MAX_DOUBT):
+            # a room that is its own mirror image has no lead
+            if lead > 0.05 or (lead > 0 and doubt < _MAX_DOUBT):
                 raise NoPlacementError(
                     "the mirrored run fits better: the scan is of another building, or its world "
                     "is left-handed: change the sign of one of its axes"
@@ -154,7 +153,7 @@ def _check(found: Registration, reach: float) -> None:
             f"no placement explains the run: in the best, its points are {sigma:.3g} units (rms) "
             f"off the scan's surfaces, and {reach:.3g} are allowed: " + _ADVICE
         )
-    if evidence.share < _MIN_SHARE or evidence.agreement < 0.75:
+    if evidence.share < 0.25 or evidence.agreement < 0.75:
         raise NoPlacementError(
             f"no placement explains the run: in the best, {100 * evidence.share:.0f} % of its "
             f"points are on the scan's surfaces, and {100 * evidence.contradicted.mean():.0f} % "

@@ -34,9 +34,9 @@ class Guess:
         near = self.similarity
         return replace(self, similarity=replace(near, translation=near.translation - offset))
 
-    def allows(self, candidate: Sim3, turn_deg: float = 15.0) -> bool:
+    def allows(self, candidate: Sim3) -> bool:
         """True if a similarity agrees with the known scale, axis and rotation."""
-        least = np.cos(np.radians(turn_deg))
+        least = np.cos(np.radians(15.0))
         if self.scale is not None and not 1 / 1.1 < candidate.scale / self.scale < 1.1:
             return False
         if self.axis is not None and self.axis[1] @ candidate.rotation @ self.axis[0] < least:
@@ -161,23 +161,14 @@ def _by_axes(cloud: Cloud, scan: Scan, guess: Guess) -> Iterator[Sim3]:
         flips = (turn[range(3), axes] < 0).astype(int)
         x, y, z = (values[axes[j], flips[j], j] for j in range(3))
         sums = x[:, :, None, None] + y[:, None, :, None] + z[:, None, None, :]
-        numbers, *peaks = np.unravel_index(_largest(sums, 150), sums.shape)
+        highest = np.argsort(-sums.ravel(), kind="stable")[:150]
+        numbers, *peaks = np.unravel_index(highest, sums.shape)
         at = [shifts[axes[j], flips[j], j, numbers, peaks[j]] for j in range(3)]
         for n, shift in zip(numbers.tolist(), np.stack(at, axis=1), strict=True):
             fit = Sim3(float(scales[n]), rotation, of_scan.T @ shift - centres[n])
             if not guess.allows(fit):
                 break
             yield fit
-
-
-def _largest(values: np.ndarray, most: int) -> np.ndarray:
-    """Flat indices of the largest values, at most `most`, the largest first."""
-    flat = values.ravel()
-    if len(flat) <= most:
-        return np.argsort(-flat, kind="stable")
-    least = np.partition(flat, -most)[-most]
-    rows = np.flatnonzero(flat >= least)
-    return rows[np.argsort(-flat[rows], kind="stable")[:most]]
 
 
 def _peaks(correlated: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

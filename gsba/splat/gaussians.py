@@ -9,7 +9,6 @@ from gsba.disk import read_vertices, write_vertices
 from gsba.log import GsbaError
 
 SH_CONSTANT = 0.28209479177387814  # value of the harmonic of degree 0
-MAX_SH_DEGREE = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +68,7 @@ def zeros_like(gaussians: Gaussians) -> Gaussians:
 def from_cloud(
     points_world: np.ndarray,
     colors: np.ndarray,
-    sh_degree: int = MAX_SH_DEGREE,
+    sh_degree: int = 3,
     opacity: float = 0.1,
 ) -> Gaussians:
     """Round Gaussians at the points (N, 3) of a cloud, map units, with RGB colours (N, 3) uint8, as

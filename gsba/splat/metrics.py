@@ -29,10 +29,7 @@ def ssim(image: np.ndarray, truth: np.ndarray, use: np.ndarray | None = None) ->
     x, y = np.asarray(image, np.float64), np.asarray(truth, np.float64)
     if use is not None:
         x = np.where(use[..., None], x, y)
-    inner = (
-        slice(_WINDOW_RADIUS_PX, -_WINDOW_RADIUS_PX),
-        slice(_WINDOW_RADIUS_PX, -_WINDOW_RADIUS_PX),
-    )
+    inner = (slice(_WINDOW_RADIUS_PX, -_WINDOW_RADIUS_PX),) * 2
     values = similarity(x, y, _blur)[0][inner].mean(axis=-1)
     if use is not None:
         values = values[use[inner]]

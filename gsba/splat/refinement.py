@@ -26,7 +26,7 @@ from factors import LandmarkBlock
 from gsba.bundle import adjustment, triangulation
 from gsba.bundle.adjustment import AdjustmentContext
 from gsba.bundle.optimizer import OptimizeResult, optimize
-from gsba.bundle.reconstruction import MIN_OBSERVATIONS
+from gsba.bundle.reconstruction import MIN_OBSERVATIONS, mean_colors
 from gsba.camera.views import ONE_EYE, Optics
 from gsba.frames.held_out import HOLD_OUT_EVERY
 from gsba.splat.alignment import Captured, SplatGreys, capture, splat_block
@@ -118,10 +118,7 @@ def refine(
     turns = _Turns(keypoints, start, context, split)
     progress = load_checkpoint(checkpoint, key, _Progress, "the splat refinement starts anew")
     if progress is None:
-        points, rows = start.landmarks.tracks.points, keypoints.rows(start.landmarks.tracks)
-        lengths = np.bincount(points, minlength=len(start.landmarks.points_world))
-        sums = [np.bincount(points, keypoints.colors[rows, c], len(lengths)) for c in range(3)]
-        colors = np.rint(np.column_stack(sums) / np.maximum(lengths, 1)[:, None]).astype(np.uint8)
+        colors = mean_colors(start.landmarks.tracks, keypoints)
         cloud = from_cloud(start.landmarks.points_world, colors, _SH_DEGREE)
         first = begin(cloud, turns.training(0))
         progress = _Progress(0, -1, start.world_T_rigs, first, (), ())
@@ -188,16 +185,15 @@ class _Turns:
         costs = [self._point_costs(poses), self._point_costs(moved)]
         gains, savings = looks[1] - looks[0], costs[0] - costs[1]
         total, later = max(float(costs[0].sum()), 1e-12), float(costs[1].sum())
-        seen = self.solved.landmarks.tracks
-        unknowns = 6 * len(np.unique(seen.frames))
-        redundancy = 2 * len(seen) - 3 * seen.num_points - unknowns
+        tracks = self.solved.landmarks.tracks
+        unknowns = 6 * len(np.unique(tracks.frames))
+        redundancy = 2 * len(tracks) - 3 * tracks.num_points - unknowns
         growth = later / total
         chance = unknowns * min(total, later) / redundancy if redundancy > 0 else np.inf
         evidence = together(score(gains), score(savings, chance))
         after = self._placed(moved)
         accepted = evidence > _MIN_SIGMAS and growth <= _MAX_GROWTH
-        least = MIN_OBSERVATIONS
-        accepted &= replace(self.solved, landmarks=after).carries(self.solved, least)
+        accepted &= replace(self.solved, landmarks=after).carries(self.solved, MIN_OBSERVATIONS)
         turns = np.einsum("fji,fjk->fik", poses[:, :3, :3], moved[:, :3, :3])
         cosines = (np.trace(turns, axis1=1, axis2=2) - 1) / 2
         shifts = np.linalg.norm(moved[:, :3, 3] - poses[:, :3, 3], axis=1)
@@ -213,7 +209,6 @@ class _Turns:
             move.size, move.psnr_moved - move.psnr_stayed, move.psnr_sigma, move.growth,
             move.growth_sigma, move.evidence, "accepted" if move.accepted else "undone",
         )  # fmt: skip
-        tracks = self.solved.landmarks.tracks
         note = Round(
             self._gate(), self.solved.noise, len(tracks), tracks.num_points, len(after.tracks),
             accepted, result.history, result.reason,

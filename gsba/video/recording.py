@@ -9,7 +9,6 @@ rotation in which the camera stores them. GoPro's `.360` holds two tracks of a c
 their size: streams 0 and 5 of videos, 0 and 4 of time lapses.
 """
 
-import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import tee
@@ -127,9 +126,10 @@ def read_recording(video: Path) -> VideoRecording:
     """Recognise the layout of a video and read its times. GsbaError: the file is no video, holds
     neither panoramas nor a cube map nor two lenses, or its lenses or tracks do not match."""
     files = files_of(video)
-    size, *others = track_sizes(files[0])
-    if (cube := cube_tracks(files[0], [size, *others])) is not None:
-        width, height = [size, *others][cube[0]]
+    sizes = track_sizes(files[0])
+    size = sizes[0]
+    if (cube := cube_tracks(files[0], sizes)) is not None:
+        width, height = sizes[cube[0]]
         note = f"{video}: GoPro's equi-angular cube map, two tracks of {width}x{height}"
         tracks = Track(video, cube[0]), Track(video, cube[1])
         return _of_two_tracks(tracks, (width, height), note, cube=True)
@@ -143,14 +143,13 @@ def read_recording(video: Path) -> VideoRecording:
             )
         note = f"{files[0]}: raw, of the front lens; of the back one is {files[1]}"
         return _of_two_tracks((Track(files[0]), Track(files[1])), size, note)
-    if others:
-        sizes = [size, *others]
+    if len(sizes) > 1:
         # the two largest tracks, if they are square and equal, as in DJI's `.osv`
         largest = max(sizes, key=lambda size: size[0] * size[1])
         two = [n for n, size in enumerate(sizes) if size == largest]
         pair = two if len(two) == 2 and _is_nearly_square(largest) else list(range(len(sizes)))
         size = sizes[pair[0]]
-        _check_tracks(video, sizes if len(pair) > 2 else [sizes[n] for n in pair])
+        _check_tracks(video, [sizes[n] for n in pair])
         note = f"{video}: raw, two tracks of {size[0]}x{size[1]}: front lens, back lens"
         return _of_two_tracks((Track(video, pair[0]), Track(video, pair[1])), size, note)
     return _of_one_track(Track(video), size)
@@ -359,16 +358,16 @@ def _of_two_tracks(
     mutual = nearest(ours, theirs)[paired] == np.arange(len(ours))
     within = 0.5 * min(front.interval_s, back.interval_s) - EXACT_S
     shown = mutual & (np.abs(theirs[paired] - ours) < within)
-    where = " and ".join(dict.fromkeys(str(track.path) for track in tracks))
+    paths = dict.fromkeys(track.path for track in tracks)
+    where = " and ".join(map(str, paths))
     if not shown.any():
         raise GsbaError(
             f"{where}: the {'tracks' if cube else 'lenses'} share no times ({one} 0 to "
             f"{ours[-1]:.3f} s, {other} {theirs[0]:.3f} to {theirs[-1]:.3f} s): they are not of "
             "one recording; copy it again from the camera"
         )
-    paths = dict.fromkeys(track.path for track in tracks)
-    hdr = {path: _hdr_notes(path, read_claims(Track(path))) for path in paths}
-    notes, num = [note, *itertools.chain(*hdr.values())], int(shown.sum())
+    hdr = [line for path in paths for line in _hdr_notes(path, read_claims(Track(path)))]
+    notes, num = [note, *hdr], int(shown.sum())
     if num < max(len(ours), len(theirs)):
         notes.append(
             f"{where}: {len(ours) + len(theirs) - 2 * num} instants are left out, which only one "
