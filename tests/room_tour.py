@@ -36,7 +36,7 @@ def frames(room: int = 0) -> list[TourFrame]:
     """The stills with as few keypoints as these rooms need."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tour_steps, "_FEATURES", FeatureSettings(max_per_face=150))
-        patch.setattr(tour_steps, "_NUM_KEYS", 200)
+        patch.setattr(tour_steps, "_NUM_KEYS", 300)
         return [frame_of(picture, None) for picture in pictures(room)]
 
 

@@ -68,11 +68,7 @@ def in_given_order(alike: np.ndarray) -> bool:
     bay apart."""
     rng, num = np.random.default_rng(0), len(alike)
     gaps = np.abs(np.subtract.outer(np.arange(num), np.arange(num)))
-    nearness, ranks = np.exp(-gaps / _REACH), np.zeros(alike.shape)
-    first, second = np.triu_indices(num, 1)
-    # Pairs count by their ranks among all, as few pairs would outweigh the others.
-    ranks[first, second] = np.unique(alike[first, second], return_inverse=True)[1]
-    ranks = ranks + ranks.T
+    nearness, ranks = np.exp(-gaps / _REACH), _ranks(alike)
 
     def totals(order: np.ndarray) -> tuple[float, float]:
         return _total(alike, order), float(np.sum(nearness * ranks[np.ix_(order, order)]))
@@ -83,6 +79,14 @@ def in_given_order(alike: np.ndarray) -> bool:
     return bool(np.min(better) <= most * _NUM_RANDOM)
 
 
+def _ranks(alike: np.ndarray) -> np.ndarray:
+    """Ranks (F, F) of the likeness of pairs among all, as few pairs would outweigh the others."""
+    first, second = np.triu_indices(len(alike), 1)
+    ranks = np.zeros(alike.shape)
+    ranks[first, second] = np.unique(alike[first, second], return_inverse=True)[1]
+    return ranks + ranks.T
+
+
 def most_alike_path(alike: np.ndarray) -> np.ndarray:
     """Order (F,) int64 of frames in which neighbours are most alike (F, F), of paths made better
     from one start at each frame; of its two directions the one that begins with the smaller
@@ -91,27 +95,32 @@ def most_alike_path(alike: np.ndarray) -> np.ndarray:
     # A frame that is alike to none is between the ends, so that every change reverses a part.
     closed = np.zeros((num + 1, num + 1))
     closed[:num, :num] = alike
-    paths = list[list[int]]()
-    for f in range(num):
-        path, left = [f], np.ones(num, bool)
-        left[f] = False
-        while left.any():  # to the most similar frame that is left
-            path.append(int(np.where(left, alike[path[-1]], -1.0).argmax()))
-            left[path[-1]] = False
-        path = [num, *path, num]
-        while True:  # parts are reversed or moved while the path gains by that
-            changes = _changes(closed, np.array(path))
-            gain, better = max(changes, key=lambda change: change[0])
-            if gain <= _MIN_GAIN:
-                break
-            path = better
-        paths.append(path)
+    paths = [_improved(closed, [num, *_greedy(alike, f), num]) for f in range(num)]
     best = np.array(max(paths, key=lambda path: _total(closed, np.array(path)))[1:-1], np.int64)
     return best if best[0] < best[-1] else best[::-1].copy()
 
 
 def _total(alike: np.ndarray, order: np.ndarray) -> float:
     return float(alike[order[:-1], order[1:]].sum())
+
+
+def _greedy(alike: np.ndarray, first: int) -> list[int]:
+    """A path from a frame to the most similar one that is left, again and again."""
+    path, left = [first], np.ones(len(alike), bool)
+    left[first] = False
+    while left.any():
+        path.append(int(np.where(left, alike[path[-1]], -1.0).argmax()))
+        left[path[-1]] = False
+    return path
+
+
+def _improved(alike: np.ndarray, path: list[int]) -> list[int]:
+    """A path between fixed ends, parts of which are reversed or moved while it gains by that."""
+    while True:
+        best = max(_changes(alike, np.array(path)), key=lambda change: change[0])
+        if best[0] <= _MIN_GAIN:
+            return path
+        path = best[1]
 
 
 def _changes(alike: np.ndarray, path: np.ndarray) -> list[tuple[float, list[int]]]:

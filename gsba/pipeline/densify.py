@@ -50,35 +50,11 @@ def fetch_where_weak(
         if not len(rows):
             break
         logger.info(
-            "the map is weak in places: %d more frames of the video, round %d", len(rows), n + 1
+            "the map is weak in places: %d more frames of the video, round %d",
+            len(rows),
+            n + 1,
         )
-        folder = store.root / FOLDER / f"{n}"
-        at = folder.with_suffix(".tum")
-        if len(rows) == 1:  # a file of poses has two at least: one that is there already is with it
-            known = int(np.argmin(np.abs(walk.timestamps - frames.timestamps[0])))
-            rows = np.unique([known, *rows])
-        write_chosen(walk, rows, at)
-        asked = {"at": str(at), "sharpest": False, "every": None, "standing_deg": 0.0}
-        video.extract(video_file, folder, settings.video.model_copy(update=asked), replace=True)
-        store.claim(store.root / FOLDER)
-        before = (store.root / "frames").absolute()
-        like = [path.relative_to(before).parent for path in frames.paths[0]]
-        read = read_times(folder / "timestamps.csv")
-        found = {Path(row.name or "").stem: row.timestamp for row in read}
-        table = {name: time for name, time in found.items() if name not in frames.names}
-        new = {n: tuple((folder / part / f"{n}.jpg").absolute() for part in like) for n in table}
-        names, times = (*frames.names, *table), [*frames.timestamps.tolist(), *table.values()]
-        order = np.argsort(times, kind="stable")
-        paths = (*frames.paths, *new.values())
-        fetched = (*(frames.fetched or (False,) * len(frames)), *(True for _ in table))
-        frames = replace(
-            frames,
-            names=tuple(names[f] for f in order),
-            paths=tuple(paths[f] for f in order),
-            timestamps=np.array(times)[order],
-            mask_paths=(frames.mask_paths[0],) * len(order),
-            fetched=tuple(fetched[f] for f in order),
-        )
+        frames = _with_rows(store, video_file, walk, frames, settings, rows, n)
     return frames
 
 
@@ -119,3 +95,44 @@ def rows_between(walk: Odometry, times: np.ndarray, steps: np.ndarray, most: int
     if len(rows) > most:
         rows = [rows[n] for n in np.linspace(0, len(rows) - 1, max(most, 0)).astype(int)]
     return np.array(rows, np.int64)
+
+
+def _with_rows(
+    store: RunStore,
+    video_file: Path,
+    walk: Odometry,
+    frames: FrameSet,
+    settings: RefineSettings,
+    rows: np.ndarray,
+    number: int,
+) -> FrameSet:
+    """Frames, and rows (N,) of the odometry besides, extracted to a folder of their own."""
+    folder, before = store.root / FOLDER / f"{number}", store.root / "frames"
+    at = store.root / FOLDER / f"{number}.tum"
+    if len(rows) == 1:  # a file of poses has two at least: one that is there already goes with it
+        known = int(np.argmin(np.abs(walk.timestamps - frames.timestamps[0])))
+        rows = np.unique([known, *rows])
+    write_chosen(walk, rows, at)
+    asked = settings.video.model_copy(
+        update={"at": str(at), "sharpest": False, "every": None, "standing_deg": 0.0}
+    )
+    video.extract(video_file, folder, asked, replace=True)
+    store.claim(store.root / FOLDER)
+    like = [path.relative_to(before.absolute()).parent for path in frames.paths[0]]
+    found = {
+        Path(row.name or "").stem: row.timestamp for row in read_times(folder / "timestamps.csv")
+    }
+    table = {name: time for name, time in found.items() if name not in frames.names}
+    new = {n: tuple((folder / part / f"{n}.jpg").absolute() for part in like) for n in table}
+    names, times = (*frames.names, *table), [*frames.timestamps.tolist(), *table.values()]
+    order = np.argsort(times, kind="stable")
+    paths = (*frames.paths, *new.values())
+    fetched = (*(frames.fetched or (False,) * len(frames)), *(True for _ in table))
+    return replace(
+        frames,
+        names=tuple(names[f] for f in order),
+        paths=tuple(paths[f] for f in order),
+        timestamps=np.array(times)[order],
+        mask_paths=(frames.mask_paths[0],) * len(order),
+        fetched=tuple(fetched[f] for f in order),
+    )

@@ -337,13 +337,7 @@ def false_frames(
         for m in range(n - 1, max(n - 1 - 12, -1), -1):
             a, b = int(ours[m]), int(ours[n])
             agree = b == a + 1 and not wrong[a]
-            if not agree:
-                one, other = inverse(theirs[a]) @ theirs[b], inverse(images[a]) @ images[b]
-                turned = rotation_angle(one[:3, :3].T @ other[:3, :3])
-                off = np.linalg.norm(one[:3, 3] - other[:3, 3])
-                walked = np.sqrt(b - a)  # noise of steps accumulates like a random walk
-                largest = max(limits[1] * np.linalg.norm(other[:3, 3]), walked * noise[1])
-                agree = turned < max(limits[0], walked * noise[0]) and off < largest
+            agree = agree or _agree(theirs, images, a, b, limits, noise)
             gain = score[m] + 1 - (0 if agree else 1.5)
             if gain > score[n]:
                 score[n], back[n], broken[n] = gain, m, not agree
@@ -353,3 +347,21 @@ def false_frames(
         named[ours[n]] = broken[n]
         n = int(back[n])
     return named
+
+
+def _agree(
+    theirs: np.ndarray,
+    images: np.ndarray,
+    a: int,
+    b: int,
+    limits: tuple[float, float],
+    noise: Sequence[float],
+) -> bool:
+    """True if a trajectory's relative pose of two frames fits the steps of the images."""
+    one, other = inverse(theirs[a]) @ theirs[b], inverse(images[a]) @ images[b]
+    turned = rotation_angle(one[:3, :3].T @ other[:3, :3])
+    off, length = np.linalg.norm(one[:3, 3] - other[:3, 3]), np.linalg.norm(other[:3, 3])
+    walked = np.sqrt(b - a)  # noise of steps accumulates like a random walk
+    rotation = max(limits[0], walked * noise[0])
+    offset = max(limits[1] * length, walked * noise[1])
+    return bool(turned < rotation and off < offset)

@@ -134,7 +134,7 @@ class FrameSet:
         return np.flatnonzero(~np.array(self.fetched or (False,) * len(self), bool))
 
     def with_timed(self, timed: tuple[bool, ...]) -> "FrameSet":
-        """The same frames, with times or without, each (F,)."""
+        """The same frames; timed: (F,) True where a timestamp is a time."""
         differing = timed if len({*timed}) > 1 else ()
         return replace(self, timed=all(timed), timed_of_frame=differing)
 

@@ -47,7 +47,7 @@ def test_a_third_frame_confirms_the_true_ratio_and_no_other() -> None:
     positions = true_poses()[:3, :3, 3]
     lengths = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     true = np.log(lengths[1] / lengths[0])
-    assert before.num > 200
+    assert before.num > 300
     assert abs(ratios(before, after, frames()[1].keys)[0] - true) < 0.02
     first, third = frames()[0], frames()[2]
     right = triple(first, third, before, after, true)
