@@ -1,14 +1,18 @@
 """Errors by what a camera does to pixels: each effect alone, none, and all together.
 
-    python benchmarks/filmed.py --out WORK [--scenes gallery passage] [--seeds 0 1] \
-        [--effects ideal each all] [--peer] [--markdown FILE]
+    python benchmarks/filmed.py --out WORK [--scenes gallery passage] [--seeds 0 1]
+        [--effects ideal each all] [--starts trajectory none raw raw-none] [--peer]
+        [--markdown FILE]
 
 Walks through scenes of `gsba demo` are filmed by the camera of `filmed_camera.py`, with the motion
 of real hands where that recording is on the machine. `ideal` has no effect, `each` stands for every
-effect alone, `all` for all of them, `a+b` for these two, and `all-a` for all but one. Each film is
-refined from a trajectory with drift and without any, and with `--peer` by COLMAP's panorama mode.
-Films and rows are kept in WORK and used again while the code and the film stay the same. Errors are
-root mean squares, except the induced pixel error (median, of neighbouring frames).
+effect alone, `all` for those that one camera has, `a+b` for these two, `all+a` for one more, and
+`all-a` for all but one. Each film is refined from a trajectory with drift and without any, and with
+`--peer` by COLMAP's panorama mode. `--starts raw raw-none` refine the raw fisheyes of the same
+camera by their true calibration, from that trajectory and without any: they are 32 mm apart, and
+neither stabilised nor aligned at a seam. Films and rows are kept in WORK and used again while the
+code and the film stay the same. Errors are root mean squares, except the induced pixel error
+(median, of neighbouring frames).
 """
 
 import argparse
@@ -20,7 +24,16 @@ from typing import Any
 
 import numpy as np
 from common import code_digest, digest, kept_row, refine_command, run_row, write_table
-from filmed_camera import ALL, EFFECTS, HAND_MOTION, Camera, Hands, write_film
+from filmed_camera import (
+    ALL,
+    EFFECTS,
+    HAND_MOTION,
+    NOT_IN_ALL,
+    Camera,
+    Hands,
+    RawCamera,
+    write_film,
+)
 
 from gsba.demo.degrade import degrade
 from gsba.demo.gallery import build_gallery
@@ -37,6 +50,7 @@ FRAMES, WIDTH = 44, 1024
 TIMEOUT_S = 1800.0
 SCENES = ("gallery", "passage")
 STARTS = ("trajectory", "none")
+RAW_STARTS = ("raw", "raw-none")
 COLUMNS = (
     ("posed", "frames", 1.0, ".0f"),
     ("ate", "ATE 1e-3", 1e3, ".2f"),
@@ -62,15 +76,17 @@ def name_of(scene: str, seed: int, effects: frozenset[str]) -> str:
     return f"{scene}-{seed}-{name}{'' if HAND_MOTION.exists() else '-invented'}"
 
 
-def film_of(scene: str, seed: int, effects: frozenset[str], out: Path) -> Path:
-    """Folder of a film, made unless it is there."""
-    folder = out / "films" / name_of(scene, seed, effects)
+def film_of(scene: str, seed: int, effects: frozenset[str], out: Path, raw: bool = False) -> Path:
+    """Folder of a film, or of its raw fisheyes, made unless it is there."""
+    folder = out / "films" / (name_of(scene, seed, effects) + "-raw" * raw)
     if (folder / "slam.tum").exists():
         return folder
     print(f"filming {folder.name}", file=sys.stderr, flush=True)
     shutil.rmtree(folder, ignore_errors=True)
     built, walk = scene_of(scene, seed)
-    camera = Camera(built, Hands(walk, seed), effects, WIDTH, seed)
+    if raw:
+        effects = effects - {"stabilised", "flow"} | {"lenses"}
+    camera = (RawCamera if raw else Camera)(built, Hands(walk, seed), effects, WIDTH, seed)
     write_film(camera, folder)
     write_tum(folder / "slam.tum", degrade(camera.truth(), seed))
     return folder
@@ -81,7 +97,8 @@ def refined(film: Path, start: str, home: Path, sets: list[str]) -> dict[str, An
     truth = read_trajectory(film / "groundtruth.tum")
     run = home / "run"
     frames = film / "images"
-    key = {"film": digest(sorted(frames.iterdir())), "sets": sets}
+    files = sorted(path for path in frames.rglob("*") if path.is_file())
+    key = {"film": digest(files), "sets": sets}
     if start == "peer":
         key |= {"peer": "spherical-incremental"}
         script = Path(__file__).with_name("peer.py")
@@ -89,7 +106,9 @@ def refined(film: Path, start: str, home: Path, sets: list[str]) -> dict[str, An
         finish = partial(_outcome_of_peer, run, truth)
     else:
         key |= {"code": code_digest()}
-        options = [str(film / "slam.tum")] if start == "trajectory" else ["--no-trajectory"]
+        slam = start not in {"none", "raw-none"}
+        options = [str(film / "slam.tum")] if slam else ["--no-trajectory"]
+        options += ["--calibration", str(film / "calibration.json")] * (start in RAW_STARTS)
         options += [word for one in sets for word in ("--set", one)]
         command = refine_command(frames, run, options)
         finish = partial(_outcome, run, film, truth)
@@ -165,8 +184,13 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--scenes", nargs="+", choices=SCENES, default=["gallery"])
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
-    parser.add_argument("--effects", nargs="+", default=["ideal", "each", "all"])
-    parser.add_argument("--starts", nargs="+", choices=STARTS, default=list(STARTS))
+    parser.add_argument(
+        "--effects",
+        nargs="+",
+        default=["ideal", "each", "all"],
+        help=f"ideal, each, all, a+b, all-a; only all+a has these: {', '.join(NOT_IN_ALL)}",
+    )
+    parser.add_argument("--starts", nargs="+", choices=[*STARTS, *RAW_STARTS], default=list(STARTS))
     parser.add_argument("--peer", action="store_true")
     parser.add_argument("--set", action="append", default=[], dest="sets", metavar="KEY=VALUE")
     parser.add_argument("--markdown", type=Path)
@@ -181,7 +205,7 @@ def main() -> None:
             for start in [*options.starts, *(["peer"] if options.peer else [])]:
                 rows = []
                 for seed in options.seeds:
-                    film = film_of(scene, seed, effects, out)
+                    film = film_of(scene, seed, effects, out, start in RAW_STARTS)
                     home = out / "rows" / "-".join([film.name, start, *options.sets])
                     rows.append(refined(film, start, home, options.sets))
                 done = [row["errors"]["ate"] for row in rows if "errors" in row]

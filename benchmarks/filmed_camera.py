@@ -2,11 +2,12 @@
 
 Every effect of `EFFECTS` is switched by its name. Without any, the camera is ideal: one centre, one
 instant, grey-value noise of 2 and JPEG of quality 95, as `gsba demo` writes it. Images of the two
-lenses are processed on the grid of the panorama, which they are stitched in. Sensor and processing
-follow the order of a camera: optics, exposure, noise, mosaic, denoising in time, tone curve,
-sharpening, stitching, stabilisation, encoding.
+lenses are processed on the grid of the panorama, which they are stitched in, or of raw fisheyes
+(`RawCamera`). Sensor and processing follow the order of a camera: optics, exposure, noise, mosaic,
+denoising in time, tone curve, sharpening, stitching, stabilisation, encoding.
 """
 
+import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
@@ -16,12 +17,15 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from learned import turned
+from filmed_scene import furnished, seen
+from learned import sampled, turned
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from gsba.camera.sphere import bearings_from_erp
+from gsba.camera.calibration import calibration_json
+from gsba.camera.fisheye import three, unproject
+from gsba.camera.sphere import around_seam, bearings_from_erp, erp_from_bearings
 from gsba.demo.raycast import Scene, ranges
 from gsba.demo.render import EXPOSURE, Eye, render_eye
 from gsba.demo.two_lenses import KNOTS, STEPS_HZ, SWEEP, SWING_DEG, SWING_UNITS, TwoLenses
@@ -29,7 +33,7 @@ from gsba.demo.walk import JPEG_QUALITY, NOISE, write_depth
 from gsba.disk import write_image
 from gsba.geometry import pose
 from gsba.trajectory.files import write_tum
-from gsba.types import Trajectory
+from gsba.types import Fisheye, Trajectory
 
 HAND_MOTION = Path("../shared/data/real/hand_motion/floor_2_2025-10-28_run_2.txt")
 EFFECTS = {
@@ -48,8 +52,14 @@ EFFECTS = {
     "stabilised": "panoramas turned back to one heading, lenses turn below them",
     "hevc": "HEVC 4:2:0, 8 bit, 0.2 bits a pixel at 30 frames a second",
     "hevc10": "the same at 10 bit",
+    "door": "a door leaf that swings open in 15 % of the walk's time",
+    "curtain": "a cloth of 2.4 x 3 m that waves all the time",
+    "mirror": "a mirror of 2 x 1.2 m on a wall",
+    "flow": "lenses 32 mm apart, aligned at the seam by dense optical flow, half by each",
+    "vfr": "irregular times of frames, up to 0.2 s off, written to a millisecond",
 }
-ALL = frozenset(EFFECTS) - {"stabilised", "hevc10"}
+NOT_IN_ALL = "stabilised", "hevc10", "door", "curtain", "mirror", "flow", "vfr"
+ALL = frozenset(EFFECTS) - set(NOT_IN_ALL)
 BITS_PER_PIXEL = 100e6 / 30 / (5760 * 2880)  # of a 5.7K camera that writes 100 Mb/s
 GOP = 30  # frames from one intra-coded frame to the next one
 BURST = 3  # frames at 30 fps up to each kept one: history of the denoiser and of the encoder
@@ -58,6 +68,7 @@ BLUR_SAMPLES = 5
 ELECTRONS, READ_NOISE = 1200.0, 4.0  # signal at radiance 1, standard deviation
 SMOOTH_S = 0.5  # standard deviation of the filter that separates hands from the walk
 _MAX_RADIANCE = 5.0  # of a saturated pixel
+FLOW_BAND_DEG = 10.0  # from the seam: within it lenses are aligned by optical flow
 _MARGIN_DEG = 14.0  # each lens is rendered to this angle beyond the seam: filters see no border
 
 
@@ -138,22 +149,44 @@ class Camera:
         u, v = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.width // 2) + 0.5)
         return bearings_from_erp(np.stack([u, v], axis=-1), self.width, self.width // 2)
 
+    def rays_of(self, facing: float) -> np.ndarray:
+        """Unit rays (H, W, 3), rig frame, of the pixels of a lens's picture."""
+        return self.bearings
+
+    def projected(self, picture: np.ndarray, facing: float) -> np.ndarray:
+        """Picture (H, W, 3) of a lens, of one on a finer panorama's grid."""
+        size = self.width, self.width // 2
+        return cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+
+    @cached_property
+    def times(self) -> np.ndarray:
+        """Times (F,) of the frames, seconds."""
+        times = self.hands.walk.timestamps
+        if "vfr" not in self.effects:
+            return times
+        return times + np.random.default_rng([self.seed, 11]).uniform(-0.2, 0.2, len(times))
+
+    def scene_at(self, time: float) -> Scene:
+        """The scene, with what moves in it, at a time of the walk."""
+        walk = self.hands.walk.timestamps
+        passed = time - walk[0]
+        return furnished(self.scene, self.effects, passed / (walk[-1] - walk[0]), passed)
+
     @cached_property
     def metered(self) -> np.ndarray:
         """Mean radiance (F,) of the scene around each frame, relative to the walk's median."""
         small = [
             np.median(_linear(render_eye(self.scene, Eye(T[None, :3]), 128, 64)))
-            for T in self.hands.poses(self.hands.walk.timestamps)
+            for T in self.hands.poses(self.times)
         ]
         return np.array(small) / np.median(small)
 
     def truth(self) -> Trajectory:
-        """Poses of the panoramas, in the middle of exposure and readout."""
-        times = self.hands.walk.timestamps
-        poses = self.hands.poses(times)
+        """Poses of the panoramas, in the middle of exposure and readout, at the times written."""
+        poses = self.hands.poses(self.times)
         if "stabilised" in self.effects:
             poses[:, :3, :3] = self.heading()
-        return Trajectory(times, poses)
+        return Trajectory(np.round(self.times, 3), poses)
 
     def heading(self) -> np.ndarray:
         """Upright rotation (3, 3) of stabilised panoramas, another one than any frame's."""
@@ -164,7 +197,7 @@ class Camera:
         rng = np.random.default_rng([self.seed, 3])
         look = _Look(self, rng)
         bursts = BURST if self.effects & {"denoise", "hevc", "hevc10"} else 1
-        for f, time in enumerate(self.hands.walk.timestamps):
+        for f, time in enumerate(self.times):
             look.start_burst()
             burst = []
             for k in range(bursts):
@@ -172,13 +205,17 @@ class Camera:
                 samples = BLUR_SAMPLES if k == bursts - 1 else 2
                 recorded = [self.record(at, side, f, samples) for side in (1.0, -1.0)]
                 views = [look.processed(view, f) for view in recorded]
-                burst.append(self._stitched(views[0], views[1], at, rng))
+                picture = self.joined(views[0], views[1], at)
+                if "noise" not in self.effects:  # that of the ideal camera
+                    noise = rng.standard_normal(picture.shape, dtype=np.float32)
+                    picture = picture + self.grain * noise
+                burst.append(np.clip(picture, 0, 255))
             yield burst
 
     def record(self, time: float, facing: float, f: int, samples: int) -> View:
         """Radiance that one lens gathers: its rows, exposure, and people in front of it."""
         lens = TwoLenses()
-        baseline = lens.baseline if "lenses" in self.effects else 0.0
+        baseline = lens.baseline if self.effects & {"lenses", "flow"} else 0.0
         after = np.zeros(1)
         if "rows" in self.effects:
             after = lens.readout_s * np.linspace(-0.5, 0.5, KNOTS)
@@ -196,19 +233,19 @@ class Camera:
             least = -float(np.sin(np.radians(_MARGIN_DEG)))
             eye = Eye(eyes, facing, SWEEP, np.radians(lens.half_fov_deg), lens.bend, least)
             finer = self.rays * self.width
-            radiance = _linear(render_eye(self.scene, eye, finer, finer // 2))
-            size = self.width, self.width // 2
-            total = total + cv2.resize(radiance, size, interpolation=cv2.INTER_AREA)
+            scene, mirror = self.scene_at(time + e), "mirror" in self.effects
+            radiance = _linear(seen(scene, eye, finer, mirror))
+            total = total + self.projected(radiance, facing)
         radiance = np.asarray(total / len(exposures), np.float32)
         if "people" in self.effects:
-            self._add_people(radiance, time)
+            self._add_people(radiance, facing, time)
         return View(facing, radiance)
 
-    def _add_people(self, radiance: np.ndarray, time: float) -> None:
+    def _add_people(self, radiance: np.ndarray, facing: float, time: float) -> None:
         """Draw two people and a television, seen from the rig's middle at one instant."""
         world_T_rig = self.hands.poses(np.array([time]))[0]
-        rays = self.bearings.reshape(-1, 3) @ world_T_rig[:3, :3].T
-        origin, flat = world_T_rig[:3, 3], radiance.reshape(-1, 3)
+        rays = self.rays_of(facing).reshape(-1, 3) @ world_T_rig[:3, :3].T
+        origin, flat, scene = world_T_rig[:3, 3], radiance.reshape(-1, 3), self.scene_at(time)
         walk = self.hands.walk
         for k, (lead, tone) in enumerate(((5.0, (0.5, 0.2, 0.15)), (14.0, (0.12, 0.2, 0.4)))):
             span = walk.timestamps[-1] - walk.timestamps[0]
@@ -216,7 +253,7 @@ class Camera:
             centre = self.hands.walked(met) + np.array([0.45, 0.65, 0.35])
             distance, at = _ellipsoid(origin, rays, centre, np.array([0.24, 0.85, 0.2]))
             rows = np.flatnonzero(distance > 0)
-            free = ranges(self.scene, origin, rays[rows])
+            free = ranges(scene, origin, rays[rows])
             rows = rows[(free == 0) | (free > distance[rows])]
             stripes = 0.6 + 0.4 * np.sin(40 * at[rows, 1] + 9 * at[rows, 0] + k)
             flat[rows] = stripes[:, None] * np.array(tone, np.float32)
@@ -224,26 +261,107 @@ class Camera:
         distance = (screen[0] - origin[0]) / np.where(rays[:, 0] > 1e-6, rays[:, 0], np.inf)
         at = origin + distance[:, None] * rays - screen
         rows = np.flatnonzero((distance > 0) & (abs(at[:, 1]) < 0.55) & (abs(at[:, 2]) < 1.0))
-        free = ranges(self.scene, origin, rays[rows])
+        free = ranges(scene, origin, rays[rows])
         rows = rows[(free == 0) | (free > distance[rows] - 0.15)]
         rng = np.random.default_rng([self.seed, round(time * 4)])  # a new shot every 1/4 s
         shot = cv2.resize(rng.uniform(0, 1.5, (9, 16, 3)), (160, 90), interpolation=cv2.INTER_CUBIC)
         y = ((at[rows, 1] + 0.55) / 1.1 * 89).astype(int)
         flat[rows] = shot[y, ((at[rows, 2] + 1) / 2 * 159).astype(int)]
 
-    def _stitched(
-        self, front: np.ndarray, back: np.ndarray, time: float, rng: np.random.Generator
-    ) -> np.ndarray:
+    def joined(self, front: np.ndarray, back: np.ndarray, time: float) -> np.ndarray:
         """Panorama of both lenses, blended at the seam and turned to its heading."""
-        band = np.radians(TwoLenses().band_deg)
+        flow = "flow" in self.effects
+        band = np.radians(FLOW_BAND_DEG if flow else TwoLenses().band_deg)
         share = np.clip(0.5 + np.arcsin(self.bearings[..., 2]) / (2 * band), 0, 1)
+        if flow:
+            front, back = self._aligned(front, back, share)
         picture = back + share[..., None].astype(np.float32) * (front - back)
         if "stabilised" in self.effects:
             world_R_rig = self.hands.poses(np.array([time]))[0, :3, :3]
             picture = turned(picture, world_R_rig.T @ self.heading(), cv2.INTER_CUBIC)
-        if "noise" not in self.effects:  # that of the ideal camera
-            picture = picture + self.grain * rng.standard_normal(picture.shape, dtype=np.float32)
-        return np.clip(picture, 0, 255)
+        return picture
+
+    def _aligned(
+        self, front: np.ndarray, back: np.ndarray, share: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Both lenses' pictures, warped to where a lens at `share` of the way to the front one
+        sees what they have in common, by optical flow."""
+        size = self.width, self.width // 2
+        level_R_rig = Rotation.from_rotvec([np.pi / 2, 0, 0]).as_matrix()  # seam on the equator
+        padded = [
+            around_seam(turned(one, level_R_rig.T), 64).clip(0, 255).astype(np.uint8)
+            for one in (front, back)
+        ]
+        rows = round(size[1] * (90 - _MARGIN_DEG + 1) / 180)
+        first, second = (cv2.cvtColor(one, cv2.COLOR_RGB2GRAY)[rows:-rows] for one in padded)
+        finder = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+        found = finder.calc(first, second, np.zeros((*first.shape, 2), np.float32))
+        flow = np.zeros((size[1], self.width, 2), np.float32)
+        flow[rows:-rows] = found[:, 64:-64]
+        rays = self.bearings @ level_R_rig.T
+        shift, pixels = sampled(flow, rays, cv2.INTER_LINEAR), erp_from_bearings(rays, *size)
+        warped = []
+        for one, part in ((front, share - 1), (back, share)):
+            moved = bearings_from_erp(pixels + part[..., None] * shift, *size)
+            warped.append(sampled(one, moved @ level_R_rig, cv2.INTER_CUBIC))
+        return warped[0], warped[1]
+
+
+@dataclass(frozen=True)
+class RawCamera(Camera):
+    """The same camera before it stitches: its fisheyes side by side, the front one on the left.
+
+    Its lenses are apart, and nothing is stabilised or aligned at a seam.
+    """
+
+    rays: int = 2
+
+    @cached_property
+    def lenses(self) -> dict[float, Fisheye]:
+        """Both lenses, by where they face."""
+        lens, size = TwoLenses(), self.width // 2
+        limit = np.radians(lens.half_fov_deg)
+        focal = size / 2 / (limit * (1 + lens.bend[0] * limit**2 + lens.bend[1] * limit**4))
+        found = {}
+        for facing in (1.0, -1.0):  # rows are read along a lens's y, which is SWEEP
+            x, y, z = np.array([0, facing, 0]), np.array([*SWEEP, 0]), np.array([0, 0, facing])
+            turn = Rotation.from_matrix(np.stack([x, y, z], axis=1)).as_rotvec()
+            middle, bend = (size / 2, size / 2), (*lens.bend, 0.0, 0.0)
+            found[facing] = Fisheye(size, size, focal, middle, bend, three(turn))
+        return found
+
+    @cached_property
+    def grids(self) -> dict[tuple[float, int], np.ndarray]:
+        """Unit rays (H, W, 3) by where a lens faces, and by rays across a pixel."""
+        found = {}
+        for facing, lens in self.lenses.items():
+            for finer in (1, 2):
+                at = (np.arange(finer * lens.width) + 0.5) / finer
+                pixels = np.stack(np.meshgrid(at, at), axis=-1)
+                found[facing, finer] = unproject(lens, pixels)
+        return found
+
+    def rays_of(self, facing: float) -> np.ndarray:
+        """Unit rays (H, W, 3), rig frame, of the pixels of a lens's picture."""
+        return self.grids[facing, 1]
+
+    def projected(self, picture: np.ndarray, facing: float) -> np.ndarray:
+        """Fisheye (size, size, 3)."""
+        lens = self.lenses[facing]
+        seen = sampled(picture, self.grids[facing, 2], cv2.INTER_CUBIC)
+        fisheye = cv2.resize(seen, (lens.width, lens.height), interpolation=cv2.INTER_AREA)
+        return np.maximum(fisheye, 0)
+
+    def record(self, time: float, facing: float, f: int, samples: int) -> View:
+        """Radiance that one lens gathers, none beyond its circle."""
+        view = super().record(time, facing, f, samples)
+        limit = np.cos(np.radians(TwoLenses().half_fov_deg))
+        inside = facing * self.rays_of(facing)[..., 2:] > limit
+        return view._replace(radiance=view.radiance * inside)
+
+    def joined(self, front: np.ndarray, back: np.ndarray, time: float) -> np.ndarray:
+        """Both fisheyes beside each other."""
+        return np.concatenate([front, back], axis=1)
 
 
 class _Look:
@@ -251,7 +369,7 @@ class _Look:
 
     def __init__(self, camera: Camera, rng: np.random.Generator) -> None:
         self.effects, self.rng, self.metered = camera.effects, rng, camera.metered
-        self.ahead = camera.bearings[..., 2]
+        self.ahead = {facing: camera.rays_of(facing)[..., 2] for facing in (1.0, -1.0)}
         drift = rng.standard_normal((len(self.metered), 4))
         slow = gaussian_filter1d(drift, 3, axis=0, mode="wrap")
         self.drift = slow / slow.std(axis=0)  # (F, 4): exposure, red, green, blue
@@ -267,7 +385,7 @@ class _Look:
         if "flare" in on:
             light += _glare(light)
         if "colour" in on:
-            angle = np.arccos(np.clip(facing * self.ahead, -1, 1)).astype(np.float32)
+            angle = np.arccos(np.clip(facing * self.ahead[facing], -1, 1)).astype(np.float32)
             tint = np.array([1.03, 1.0, 0.97] if facing > 0 else [0.96, 0.98, 1.02], np.float32)
             light *= tint * (1 - 0.25 * (angle[..., None] / (np.pi / 2)) ** 2)
         if "wander" in on:
@@ -403,7 +521,8 @@ def _decode(path: Path, length: int) -> list[np.ndarray]:
 
 
 def write_film(camera: Camera, out: Path) -> None:
-    """Write `images/` with timestamps.csv, `groundtruth.tum` and `depth/` of a camera's film."""
+    """Write `images/` with timestamps.csv, `groundtruth.tum` and `depth/` of a camera's film; of a
+    raw one also `calibration.json`."""
     (out / "images").mkdir(parents=True)
     truth = camera.truth()
     compressed = bool(camera.effects & {"hevc", "hevc10"})
@@ -411,12 +530,20 @@ def write_film(camera: Camera, out: Path) -> None:
         kept = encoded(list(camera.frames()), "hevc10" in camera.effects, out)
     else:
         kept = (burst[-1] for burst in camera.frames())
+    sides: tuple[str, ...] = ("",)
+    if isinstance(camera, RawCamera):
+        sides, rig = ("front", "back"), (camera.lenses[1.0], camera.lenses[-1.0])
+        centre = np.array([0, 0, TwoLenses().baseline / 2])
+        (out / "calibration.json").write_text(json.dumps(calibration_json(rig, centre, "m", {})))
+    for side in sides:
+        (out / "images" / side).mkdir(exist_ok=True)
     rows = ["name,timestamp"]
     for f, picture in enumerate(kept):
         rgb = np.clip(picture + 0.5 * (picture.dtype != np.uint8), 0, 255)
         quality = 100 if compressed else JPEG_QUALITY
         name = f"{f:06d}.jpg"
-        write_image(out / "images" / name, rgb.astype(np.uint8), quality)
+        for side, part in zip(sides, np.split(rgb.astype(np.uint8), len(sides), 1), strict=True):
+            write_image(out / "images" / side / name, part, quality)
         rows.append(f"{name},{truth.timestamps[f]:.6f}")
     (out / "images" / "timestamps.csv").write_text("\n".join([*rows, ""]))
     write_tum(out / "groundtruth.tum", truth)

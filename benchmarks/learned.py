@@ -40,7 +40,12 @@ def turned(
     """The panorama (H, W, 3) of a camera turned by `rotation` (3, 3)."""
     height, width = panorama.shape[:2]
     pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1)
-    rays = bearings_from_erp(pixels, width, height) @ rotation.T
+    return sampled(panorama, bearings_from_erp(pixels, width, height) @ rotation.T, interpolation)
+
+
+def sampled(panorama: np.ndarray, rays: np.ndarray, interpolation: int) -> np.ndarray:
+    """The panorama's values (..., C) in directions rays (..., 3)."""
+    height, width = panorama.shape[:2]
     u, v = np.moveaxis(erp_from_bearings(rays, width, height), -1, 0)
     places = (u + 7.5).astype(np.float32), (v - 0.5).astype(np.float32)
     padded = around_seam(panorama, 8)
