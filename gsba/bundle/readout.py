@@ -26,6 +26,7 @@ from gsba.types import Counts, GyroConstraints, Tracks
 logger = logging.getLogger(__name__)
 
 _MIN_SIGMAS = 4.0  # least duration that is taken, in its standard deviations
+VANISHED = "it vanishes where each frame's own motion is adjusted beside it"
 _AXES = np.eye(3)[:2]
 
 
@@ -101,6 +102,20 @@ def estimate(rays: ObservedRays) -> CameraEstimate:
         found,
         lenses=replace(lenses, row_directions=sign * ways[best], readout_motion=readout_motion),
     )
+
+
+def without_vanished(found: CameraEstimate) -> CameraEstimate:
+    """The adjusted estimate, read at one instant if little is left of the duration that was taken.
+
+    Seams that optical flow has aligned look like motion along the velocity, until each frame moves
+    as it likes.
+    """
+    if found.lenses.readout_motion is None or not (
+        found.readout_s < _MIN_SIGMAS * found.readout_sigma
+    ):
+        return found
+    lenses = replace(found.lenses, row_directions=None, readout_motion=None)
+    return replace(found, lenses=lenses, own_sigmas=None, reason=VANISHED)
 
 
 def total_sigma(found: CameraEstimate, sigma: float) -> float:

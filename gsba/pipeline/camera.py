@@ -265,7 +265,8 @@ def take_parts_from_patches(state: State, sighted: Sighted, name: str, number: i
         lenses = one.lenses
         if not lenses:
             continue
-        if number == 0 and lenses.readout_motion is None:
+        vanished = one.estimate().reason == readout.VANISHED
+        if number == 0 and lenses.readout_motion is None and not vanished:
             given = f"readout_{name}", camera, readout.estimate, CameraEstimate
             read = _from_patches(state, sighted, *given)
             state = state.with_cameras(state.map.estimates().changed(camera, read))

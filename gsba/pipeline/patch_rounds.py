@@ -4,7 +4,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import replace
 
-from gsba.bundle import adjustment, map_strength, stitching
+from gsba.bundle import adjustment, map_strength, readout, stitching
 from gsba.bundle.reconstruction import MIN_OBSERVATIONS
 from gsba.bundle.stitching import Stitching
 from gsba.features.detection import traits_of
@@ -77,6 +77,10 @@ def _adjust_under_lenses(state: State, sighted: Sighted, number: int) -> State |
             return trial
         stage = f"{name}_{n}" if n else name
         solved, keypoints, found = camera.adjust_with_patches(trial, sighted, stage)
+        kept = found.with_each([readout.without_vanished(one) for one in found.each])
+        if any(one is not other for one, other in zip(kept.each, found.each, strict=True)):
+            trial, stage = trial.with_cameras(kept), f"{name}_instant"
+            solved, keypoints, found = camera.adjust_with_patches(trial, sighted, stage)
         better = carried(trial, sighted, solved, keypoints)
         if better is None:
             return state if n else None

@@ -86,6 +86,7 @@ _TITLES = {
     "align#": "align patches, round {0}",
     "aligned#": "adjust aligned patches, round {0}",
     "aligned#_+": "adjust aligned patches, round {0}, camera estimate {1}",
+    "aligned#_instant": "adjust aligned patches, rows read at one instant, round {0}",
     "readout_aligned#": "estimate the readout from patches, round {0}",
     "axes_aligned#": "test lens axes that turn, round {0}",
     "calibrated_aligned#": "calibrate raw lenses from patches, round {0}",

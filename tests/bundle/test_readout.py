@@ -122,3 +122,18 @@ def test_rows_of_stitched_pictures_are_known_to_three_per_cent() -> None:
     raw = replace(stitched, lenses=Lenses(reference_calibration=(FISHEYE, FISHEYE)))
     assert readout.total_sigma(stitched, 1e-4) == pytest.approx(np.hypot(1e-4, 0.03 * 0.012))
     assert readout.total_sigma(raw, 1e-4) == 1e-4
+
+
+def test_a_duration_that_vanishes_beside_frames_own_motion_is_dropped() -> None:
+    """Seams that optical flow has aligned have shown one of 28 standard deviations."""
+    swept = replace(LENSES, row_directions=SWEEPS, readout_motion=0.05 * TWISTS)
+    false = CameraEstimate(swept, 0.05 * READOUT_S, 0.002 * READOUT_S)
+    world, shown = seen_through(LENSES, 0)
+    start = Solution.without_points(world.world_T_rigs)
+    _, found = solved_with(world, shown, false, start, problem_of(world))
+    assert abs(found.readout_s) < 0.004 * READOUT_S
+    kept = readout.without_vanished(found)
+    assert kept.reason == readout.VANISHED
+    assert kept.lenses.readout_motion is None and kept.lenses.row_directions is None
+    true = replace(found, readout_s=0.05 * READOUT_S)
+    assert readout.without_vanished(true) is true
