@@ -233,6 +233,8 @@ def _resected(result: Reconstruction, frame: int, rows: np.ndarray) -> np.ndarra
         step = np.linalg.lstsq(weighted.T @ jacobian, -gradient, rcond=None)[0]
         turn = Rotation.from_rotvec(step[:3]).as_matrix()
         world_T_rig = world_T_rig @ pose(turn, step[3:])
+        if gradient @ -step < 1e-4:  # by which the cost falls, of squared standard deviations
+            break
     return world_T_rig
 
 
