@@ -334,3 +334,11 @@ def test_long_steps_back_and_forth_are_doubted_on_both_sides_of_the_frame(
     doubted = depths > 0.3 and not turned and shown
     np.testing.assert_array_equal(np.flatnonzero(found), [there - 1, there] if doubted else [])
     assert judgement.long_steps(poses, 1 / depths).all() == (depths > 0.3)
+
+
+def test_a_camera_that_stands_does_not_go_back() -> None:
+    poses = np.tile(np.eye(4), (NUM_FRAMES, 1, 1))
+    stands = slice(NUM_FRAMES // 2, NUM_FRAMES // 2 + 4)
+    poses[:, 2, 3] = np.arange(NUM_FRAMES)
+    poses[stands, 2, 3] = stands.start + 1e-3 * np.array([0.0, -1.0, 1.0, -1.0])
+    assert not judgement.back_and_forth(poses, np.ones(NUM_FRAMES - 1, bool), 1.0).any()
