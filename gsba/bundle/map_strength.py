@@ -233,6 +233,8 @@ def _resected(result: Reconstruction, frame: int, rows: np.ndarray) -> np.ndarra
         step = np.linalg.lstsq(weighted.T @ jacobian, -gradient, rcond=None)[0]
         turn = Rotation.from_rotvec(step[:3]).as_matrix()
         world_T_rig = world_T_rig @ pose(turn, step[3:])
+        if gradient @ -step < 1e-4:  # by which the cost falls, of squared standard deviations
+            break
     return world_T_rig
 
 
@@ -274,7 +276,7 @@ _SIGMAS = 2.0  # standard errors of the median that count as uncertainty
 def scale_changes(result: Reconstruction, recordings: np.ndarray) -> np.ndarray:
     """Largest relative change (F - 1,) of scale that may hide at each step: the median difference
     of distances by both sides, and two standard errors of it by their scatter. inf = too few points
-    are seen by both sides; NaN = a side has one frame, of recordings (F,)."""
+    are seen by both sides; NaN = a side is at one place, of recordings (F,)."""
     found = np.full(max(len(result.world_T_rigs) - 1, 0), np.nan)
     observed = result.observations_by_frame()
     for step, first, end in _sides(result.world_T_rigs[:, :3, 3], recordings):
@@ -286,9 +288,10 @@ def scale_changes(result: Reconstruction, recordings: np.ndarray) -> np.ndarray:
 
 
 def _sides(positions: np.ndarray, recordings: np.ndarray) -> Iterator[tuple[int, int, int]]:
-    """Steps with two frames and more on both sides: step, first before, end behind."""
+    """Steps with two places and more on both sides: step, first before, end behind."""
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
-    walked = steps[steps > _STANDING_RATIO * np.sqrt(np.mean(steps**2))] if len(steps) else steps
+    least = _STANDING_RATIO * np.sqrt(np.mean(steps**2)) if len(steps) else 0.0
+    walked = steps[steps > least]
     if not len(walked):
         return
     along = np.concatenate([[0.0], np.cumsum(steps)])
@@ -299,7 +302,10 @@ def _sides(positions: np.ndarray, recordings: np.ndarray) -> Iterator[tuple[int,
         end = min(
             int(np.searchsorted(along, along[step + 1] + reach, side="right")), int(own[-1]) + 1
         )
-        if recordings[step] == recordings[step + 1] and step - first >= 1 and end - step >= 3:
+        if recordings[step] == recordings[step + 1] and all(
+            np.ptp(positions[side], axis=0).max(initial=0.0) > least
+            for side in (slice(first, step + 1), slice(step + 1, end))
+        ):
             yield step, first, end
 
 

@@ -144,6 +144,7 @@ MAX_HELD_SHARE = 0.5  # of the steps, by the start alone
 MAX_DOUBTED_SHARE = 0.25  # of the steps, by a start that images contradict elsewhere
 MAX_UNMATCHED_SHARE = 0.25  # of a run's steps, where frames are missing and no start is given
 MAX_RESIDUAL_RATIO = 3.0  # of a frame, in the median one's: right maps have up to 1.9
+MIN_OBSERVATIONS_SHARE = 0.1  # of a frame, of the median one's: right maps have .29 and more
 MAX_FALSE_SHARE = 0.1  # of the start's steps; above it the others are in doubt, too
 _MAX_NAMED_FRAMES = 6  # of a reason, in a line of text
 _LOOK_AROUND = "gsba view RUN"
@@ -238,6 +239,7 @@ class _Tests:
             return
         yield from self._unrefined()
         yield from self._misfitting()
+        yield from self._loosely_held()
         yield from self._held()
         yield from self._shown_by_two_frames()
         yield from self._loosely_scaled()
@@ -320,6 +322,20 @@ class _Tests:
             cause = (
                 f"points fit up to {max(ratios[name] for name in frames):.2g} times worse than in "
                 "other frames: a mirrored or edited picture fits in a wrong place"
+            )
+            remedy = "look at these pictures, or leave these frames out of the training"
+            yield Reason(Level.LOOK, frames, cause, remedy, True, _WITHOUT_DOUBTED)
+
+    def _loosely_held(self) -> Iterator[Reason]:
+        """Frames with far fewer observations than others of their recording."""
+        found, unrefined = set[str](), {self.names[f] for f in self.figures.unrefined}
+        for rows in self._recordings().values():
+            seen = {row["name"]: row.get("observations") or 0 for row in rows}
+            least = MIN_OBSERVATIONS_SHARE * np.median([one for one in seen.values() if one] or [0])
+            found |= {name for name, num in seen.items() if num < least} - unrefined
+        if frames := tuple(name for name in self.names if name in found):
+            cause = (
+                "few points hold the pose, a tenth of those of other frames: a wrong one fits, too"
             )
             remedy = "look at these pictures, or leave these frames out of the training"
             yield Reason(Level.LOOK, frames, cause, remedy, True, _WITHOUT_DOUBTED)

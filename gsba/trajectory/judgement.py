@@ -234,7 +234,10 @@ def back_and_forth(world_T_rigs: np.ndarray, shown: np.ndarray, depth: float) ->
     far = -0.5 * lengths[:-1] * lengths[1:]
     back = np.sum(steps[:-1] * steps[1:], axis=1) < far
     back &= np.sum(at_rig[:-1] * at_rig[1:], axis=1) < far
-    back &= np.maximum(lengths[:-1], lengths[1:]) > _LONG_STEP_DEPTHS * depth
+    longer = np.maximum(lengths[:-1], lengths[1:])
+    # A camera that stands has steps of noise, in any direction.
+    back &= np.minimum(lengths[:-1], lengths[1:]) > 0.1 * longer
+    back &= longer > _LONG_STEP_DEPTHS * depth
     back &= shown[:-1] & shown[1:]
     found[:-1] |= back
     found[1:] |= back
@@ -265,8 +268,10 @@ def _from_images_alone(
     lengths = slam_lengths
     if found.directed.any():
         unknown = np.full(len(slam), np.inf)
-        lengths = step_lengths(slam_lengths, unknown, logs, sigmas)
+        lengths = step_lengths(slam_lengths, unknown, logs, sigmas) * found.paces
     chosen = _replaced(slam, found, lengths, found.verified)
+    open_ = found.verified & ~found.directed
+    chosen[open_, :3, 3] *= np.broadcast_to(found.paces, len(slam))[open_, None]
     start = _chain(coarse.world_T_rigs, chosen, coarse.sources == PoseSource.SLAM)
     return _without_priors(start, found, lengths)
 

@@ -21,6 +21,8 @@ class Steps:
     verified: np.ndarray  # (F - 1,) bool: estimated from images
     direction_sigmas: np.ndarray  # (F - 1,) float64, radians, of the directions; infinite = the
     # camera may have turned only
+    paces: np.ndarray | float = 1.0  # (F - 1,) parts of a usual step, by their parallax, of steps
+    # too short to have a direction of their own; 1 = others
 
     @property
     def directed(self) -> np.ndarray:
@@ -33,7 +35,7 @@ def image_steps(pairs: VerifiedPairs, keypoints: Keypoints) -> Steps:
     step too short to have a direction takes that of the closest pairs over it."""
     num = max(len(keypoints.starts) - 2, 0)
     f_T_nexts = np.tile(np.eye(4), (num, 1, 1))
-    verified, sigmas = np.zeros(num, bool), np.full(num, np.inf)
+    verified, sigmas, parallaxes = np.zeros(num, bool), np.full(num, np.inf), np.zeros(num)
     for p, (f0, f1) in enumerate(pairs.matches.pairs):
         if f1 - f0 != 1:
             continue
@@ -41,12 +43,15 @@ def image_steps(pairs: VerifiedPairs, keypoints: Keypoints) -> Steps:
         rays0, bearings1 = keypoints.matched(pairs.matches.pairs[p], pairs.matches.of(p))
         f_T_nexts[f0], verified[f0], sigmas[f0] = f0_T_f1, True, pairs.direction_sigmas[p]
         turn = nearest_rotation(rays0.T @ bearings1)
-        if np.median(np.linalg.norm(rays0 - bearings1 @ turn.T, axis=1)) < np.deg2rad(0.1):
+        parallaxes[f0] = np.median(np.linalg.norm(rays0 - bearings1 @ turn.T, axis=1))
+        if parallaxes[f0] < np.deg2rad(0.1):
             # The camera stands: an essential matrix determines its turn less well.
             f_T_nexts[f0, :3, :3] = turn
-    short = verified & ~np.isfinite(sigmas)
+    short, moving, paces = verified & ~np.isfinite(sigmas), np.isfinite(sigmas), np.ones(num)
     if not short.any():
         return Steps(f_T_nexts, verified, sigmas)
+    if moving.any():
+        paces[short] = np.minimum(parallaxes[short] / np.median(parallaxes[moving]), 1)
     gaps = np.diff(pairs.matches.pairs, axis=1)[:, 0]
     start_R_f = chained(np.ascontiguousarray(f_T_nexts[:, :3, :3]))
     for gap in np.unique(gaps[gaps > 1]):
@@ -65,7 +70,7 @@ def image_steps(pairs: VerifiedPairs, keypoints: Keypoints) -> Steps:
         spread = 2 * (1 - lengths / counts[known])
         sigmas[known] = np.sqrt(squares[known] / counts[known] + spread)
         short = short & ~known
-    return Steps(f_T_nexts, verified, sigmas)
+    return Steps(f_T_nexts, verified, sigmas, paces)
 
 
 def tracked_steps(coarse: CoarsePoses) -> np.ndarray:

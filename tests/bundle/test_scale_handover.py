@@ -67,6 +67,17 @@ def test_a_camera_that_stands_for_long_loses_no_scale() -> None:
     assert np.nanmax(changes) < 0.01
 
 
+@pytest.mark.parametrize("ahead", [True, False])
+def test_where_a_walk_starts_or_ends_standing_there_is_no_scale_to_lose(ahead: bool) -> None:
+    shaken = 1e-3 * np.array([0.0, 1.0, -1.0, 1.0, -1.0])
+    along = np.concatenate([shaken, np.arange(1, 10) * 0.7])
+    along = along if ahead else along.max() - along[::-1]
+    changes = scale_changes(_corridor(along), ONE)
+    stands = np.arange(6) if ahead else NUM - 2 - np.arange(6)
+    assert np.flatnonzero(np.isnan(changes)).tolist() == sorted([*stands[:5], NUM - 2 - stands[0]])
+    assert np.nanmax(changes) < 0.01
+
+
 def test_recordings_are_judged_each_by_itself() -> None:
     changes = scale_changes(_corridor(np.arange(NUM) * 0.7), (np.arange(NUM) > DOOR).astype(int))
     assert np.flatnonzero(np.isnan(changes)).tolist() == [0, 6, 7, 8, NUM - 2]

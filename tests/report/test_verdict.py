@@ -114,6 +114,16 @@ def test_a_frame_whose_points_fit_far_worse_is_to_be_looked_at() -> None:
     assert _verdict(GOOD, names, frames=rows).level == Level.GOOD
 
 
+def test_a_frame_that_few_points_hold_is_to_be_looked_at() -> None:
+    rows = [{"name": name, "observations": 700} for name in NAMES]
+    rows[0]["observations"] = 200
+    assert _verdict(GOOD, frames=rows).level == Level.GOOD
+    rows[0]["observations"] = 22  # of a frame that was off by half of the walk
+    (reason,) = _verdict(GOOD, frames=rows).reasons
+    assert (reason.level, reason.frames, reason.leave_out) == (Level.LOOK, ("000",), True)
+    assert not _verdict(replace(GOOD, unrefined=(0,)), frames=rows).reasons[1:]
+
+
 def test_a_doubted_order_is_told_first() -> None:
     found = _verdict(replace(GOOD, exported=NUM - 1), NAMES[1:], timed=True, order_doubted=True)
     assert found.level == Level.LOOK

@@ -20,17 +20,22 @@ VERIFY, PRIORS = TwoViewLimits(), PriorSettings()
 TRUTH = loop_walk(NUM_FRAMES)
 
 
-def _seen(missing: tuple[int, ...] = ()) -> tuple[VerifiedPairs, Keypoints]:
+def _seen(
+    missing: tuple[int, ...] = (), truth: np.ndarray = TRUTH
+) -> tuple[VerifiedPairs, Keypoints]:
     """All neighbours but some verified; every frame sees every point."""
     rng = np.random.default_rng(1)
     points = rng.uniform(5, 8, (NUM_POINTS, 1)) * unit(rng.normal(size=(NUM_POINTS, 3)))
     bearings = np.concatenate(
-        [with_noise(bearings_of(points, world_T_rig), 3e-4, rng) for world_T_rig in TRUTH]
+        [with_noise(bearings_of(points, world_T_rig), 3e-4, rng) for world_T_rig in truth]
     )
     keypoints = keypoints_of(np.arange(NUM_FRAMES + 1) * NUM_POINTS, bearings, RIG.focal)
     steps = [f for f in range(NUM_FRAMES - 1) if f not in missing]
-    f0_T_f1s = (inverse(TRUTH[:-1]) @ TRUTH[1:])[steps]
-    f0_T_f1s[:, :3, 3] = unit(f0_T_f1s[:, :3, 3])
+    f0_T_f1s = (inverse(truth[:-1]) @ truth[1:])[steps]
+    lengths = np.linalg.norm(f0_T_f1s[:, :3, 3], axis=1)
+    moved = lengths > 1e-9
+    f0_T_f1s[:, :3, 3] /= np.where(moved, lengths, 1.0)[:, None]
+    sigmas = np.where(moved, 0.0, np.inf)
     rows = np.tile(np.arange(NUM_POINTS, dtype=np.int32)[:, None], (len(steps), 2))
     matches = Matches(
         np.array([(f, f + 1) for f in steps], np.int32),
@@ -38,7 +43,7 @@ def _seen(missing: tuple[int, ...] = ()) -> tuple[VerifiedPairs, Keypoints]:
         rows,
     )
     counts = Counts(NUM_FRAMES - 1, len(steps), "pairs")
-    return VerifiedPairs(matches, f0_T_f1s, np.zeros(len(steps)), counts), keypoints
+    return VerifiedPairs(matches, f0_T_f1s, sigmas, counts), keypoints
 
 
 def _judge(
@@ -334,3 +339,29 @@ def test_long_steps_back_and_forth_are_doubted_on_both_sides_of_the_frame(
     doubted = depths > 0.3 and not turned and shown
     np.testing.assert_array_equal(np.flatnonzero(found), [there - 1, there] if doubted else [])
     assert judgement.long_steps(poses, 1 / depths).all() == (depths > 0.3)
+
+
+@pytest.mark.parametrize("first", [0, 9])
+def test_images_alone_start_where_a_camera_stands_from_one_place(first: int) -> None:
+    truth, stands = TRUTH.copy(), slice(first, first + 8)
+    truth[stands, :3, 3] = truth[first, :3, 3]
+    pairs, keypoints = _seen(truth=truth)
+    found = image_steps(pairs, keypoints)
+    assert np.isinf(found.direction_sigmas[first : first + 7]).all()
+    nowhere = np.tile(np.eye(4), (NUM_FRAMES, 1, 1))
+    nowhere[:, 0, 3] = np.arange(NUM_FRAMES)  # one unit a step
+    coarse = CoarsePoses(nowhere, np.full(NUM_FRAMES, PoseSource.NONE, np.uint8), 0.0)
+    logs, sigmas = length_ratios(pairs, found, keypoints)
+    trust = judgement.check_steps(coarse, found, logs, sigmas, VERIFY, PRIORS)
+    lengths = np.linalg.norm(np.diff(trust.world_T_rigs[:, :3, 3], axis=0), axis=1)
+    standing = np.zeros(NUM_FRAMES - 1, bool)
+    standing[first : first + 7] = True
+    assert lengths[standing].max() < 0.02 * np.median(lengths[~standing])
+
+
+def test_a_camera_that_stands_does_not_go_back() -> None:
+    poses = np.tile(np.eye(4), (NUM_FRAMES, 1, 1))
+    stands = slice(NUM_FRAMES // 2, NUM_FRAMES // 2 + 4)
+    poses[:, 2, 3] = np.arange(NUM_FRAMES)
+    poses[stands, 2, 3] = stands.start + 1e-3 * np.array([0.0, -1.0, 1.0, -1.0])
+    assert not judgement.back_and_forth(poses, np.ones(NUM_FRAMES - 1, bool), 1.0).any()
