@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from growing_home import FIRST
 from one_gallery import OVAL_FRAMES, OVAL_WIDTH
 from pixels import pixel_centres
 from tiny_run import exporting
@@ -21,7 +22,6 @@ from gsba.camera.sphere import around_sphere, erp_from_bearings
 from gsba.demo import DemoWalk
 from gsba.evaluate.trajectory import evaluate
 from gsba.frames.cubemap import cut
-from gsba.pipeline.refine import refine_each
 from gsba.store.finished import load_run
 from gsba.trajectory.files import read_trajectory, write_tum
 from gsba.types import FACES, Fisheye, Trajectory
@@ -146,7 +146,8 @@ def error_of(run: Path, home: Home) -> float:
     """Error of a run of some of the recordings, all in one map."""
     reconstruction, frames = load_run(run)
     assert reconstruction.num_maps == 1
-    halves = [0 if name.startswith("stitched0") else NUM for name in frames.recordings]
+    first_half = "stitched0", FIRST
+    halves = [0 if name.startswith(first_half) else NUM for name in frames.recordings]
     rows = np.concatenate([first + np.arange(NUM) for first in halves])
     times = np.arange(float(len(rows)))
     true = Trajectory(times, home.truth.world_T_rigs[rows])
@@ -154,13 +155,6 @@ def error_of(run: Path, home: Home) -> float:
 
 
 SMALL_EXPORT = exporting("colmap-flat", face_size=64)
-
-
-def make_single(home: Home, folder: Path) -> Path:
-    """A run of the first recording as panoramas."""
-    out = folder / "single"
-    refine_each([panoramas(home, 0, WIDTH)], out, SMALL_EXPORT)
-    return out
 
 
 def make_beside_faces(home: Home, folder: Path) -> Path:

@@ -21,7 +21,6 @@ from cameras_home import (
     make_beside_faces,
     make_beside_fisheyes,
     make_home,
-    make_single,
     make_two_sizes,
 )
 from growing_home import GrowingHome, make_growing_home
@@ -99,9 +98,9 @@ def home(oval: DemoWalk, made_once: MadeOnce) -> Home:
 
 
 @pytest.fixture(scope="session")
-def single_run(home: Home, made_once: MadeOnce) -> Path:
+def single_run(growing_home: GrowingHome) -> Path:
     """A finished run of the first recording; tests only read it."""
-    return made_once("single", lambda folder: make_single(home, folder))
+    return growing_home.run
 
 
 @pytest.fixture(scope="session")

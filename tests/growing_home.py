@@ -24,6 +24,7 @@ MAX_ERROR = 0.0015  # of a map of both recordings: an eighteenth of a pixel, two
 SCALES = 1.0, 1.7  # of the trajectories
 WORLD = pose(Rotation.from_rotvec([0.4, -2.0, 0.7]).as_matrix(), np.array([5.0, -3.0, 8.0]))
 CLOCKS = 100.0, 3.5  # seconds at the first frames
+FIRST = "ground"  # recording
 SMALL_EXPORTS = exporting("colmap-flat", "tum", face_size=64)
 
 
@@ -55,7 +56,7 @@ def make_growing_home(folder: Path, walk: DemoWalk) -> GrowingHome:
     slam, truth = read_trajectory(walk.slam_path), read_trajectory(walk.truth_path)
     images = sorted(walk.frames_dir.glob("*.jpg"))
     folders, files, truths = [], [], []
-    for n, name in enumerate(("ground", "upper")):
+    for n, name in enumerate((FIRST, "upper")):
         times = CLOCKS[n] + 0.5 * np.arange(NUM)
         poses = Sim3.of(SCALES[n], WORLD if n else np.eye(4)).poses(slam.world_T_rigs[n::2])
         folders.append(_recording(folder / name, images[n::2], times))

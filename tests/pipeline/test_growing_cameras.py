@@ -10,6 +10,7 @@ import pytest
 from accuracy import assert_as_accurate, predicted_error
 from cameras_home import NUM, SMALL, WIDTH, Home, beginning, error_of, panoramas
 from command import succeed
+from growing_home import FIRST
 from tiny_run import PLAIN
 
 from factors.sphere_field import SphereField, num_harmonics
@@ -48,10 +49,10 @@ def grown(single_run: Path, home: Home) -> Path:
 
 
 def test_a_run_grows_by_a_camera_of_its_own(grown: Path, sizes: Path, home: Home) -> None:
-    assert _widths(grown) == {"stitched0at512": WIDTH, "stitched1at384": SMALL}
+    assert _widths(grown) == {FIRST: WIDTH, "stitched1at384": SMALL}
     assert_as_accurate(grown, error_of(grown, home), sizes, 1.25)
     cameras = json.loads((grown / "report.json").read_text())["cameras"]
-    assert [one["recordings"] for one in cameras] == [["stitched0at512"], ["stitched1at384"]]
+    assert [one["recordings"] for one in cameras] == [[FIRST], ["stitched1at384"]]
     path = Path(panoramas(home, 1, SMALL).frames) / "000003.jpg"
     found, own = Localizer(grown).localize(path), load_run(grown)[0].world_T_rigs[NUM + 3]
     assert found.found and np.linalg.norm(found.world_T_rig[:3, 3] - own[:3, 3]) < 0.02
