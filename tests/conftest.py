@@ -5,6 +5,7 @@ import hashlib
 import logging
 import os
 import pickle
+import shutil
 from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
@@ -98,9 +99,9 @@ def home(oval: DemoWalk, made_once: MadeOnce) -> Home:
 
 
 @pytest.fixture(scope="session")
-def single_run(growing_home: GrowingHome) -> Path:
-    """A finished run of the first recording; tests only read it."""
-    return growing_home.run
+def single_run(growing_home: GrowingHome, made_once: MadeOnce) -> Path:
+    """A finished run of the first recording, its own copy: a run is held while it grows."""
+    return made_once("single", lambda to: Path(shutil.copytree(growing_home.run, to / "run")))
 
 
 @pytest.fixture(scope="session")
