@@ -12,6 +12,7 @@ from gsba.types import FrameSet, Reconstruction
 
 MIN_STEP_SIGMAS = 3.0  # median length of a map's steps, in standard deviations; maps of real and
 # rendered walks have 40 and more; a camera that turns by less in a step, and moves by less, stands
+_WALKED_SIGMAS = 20.0  # of a tenth of the steps, where somebody walks who stands in most of them
 MAX_STEP_DEVIATION = 0.5  # of a step from the one that far frames predict, part of its length: true
 # walks deviate by .006 at most, true positions of a turn by hand by .05
 MIN_SHARE_AHEAD = 0.8  # of a vehicle's way: a tenth of it may go backwards
@@ -75,7 +76,9 @@ def require_motion(frames: FrameSet, result: Reconstruction) -> None:
             "and more of a vehicle's do; nothing is written: give more frames per second, --masks "
             "of the vehicle, or a trajectory"
         )
-    if not len(sigmas) or np.median(sigmas) >= MIN_STEP_SIGMAS:
+    vehicle = share >= VEHICLE_SHARE
+    walked = not vehicle and len(sigmas) and np.quantile(sigmas, 0.9) >= _WALKED_SIGMAS
+    if walked or not len(sigmas) or np.median(sigmas) >= MIN_STEP_SIGMAS:
         deviations = step_deviations(main)  # from those that frames further away predict
         tested = deviations[np.isfinite(deviations)]
         wrong = np.count_nonzero(tested > MAX_STEP_DEVIATION)
@@ -87,7 +90,6 @@ def require_motion(frames: FrameSet, result: Reconstruction) -> None:
                 "walk, the camera's calibration, or a trajectory"
             )
         return
-    vehicle = share >= VEHICLE_SHARE
     cause = where if vehicle else "the camera hardly moves, or little matches"
     refusal = GsbaError if vehicle else NoPositions
     raise refusal(

@@ -76,6 +76,24 @@ def test_where_the_camera_stands_says_nothing_of_where_it_walks() -> None:
     assert len(step_sigmas(turning)) == NUM - 1
 
 
+def test_a_walk_of_few_steps_is_one_though_the_camera_mostly_turns_on_the_spot(
+    tmp_path: Path,
+) -> None:
+    result, angles = _result(2.0), np.deg2rad(5 * np.arange(NUM))
+    poses = result.world_T_rigs.copy()
+    poses[:, 0, 3] = np.maximum(poses[:, 0, 3] - poses[-3, 0, 3], 0)  # the last two steps walk
+    poses[:, 0, 0] = poses[:, 2, 2] = np.cos(angles)
+    poses[:, 0, 2], poses[:, 2, 0] = np.sin(angles), -np.sin(angles)
+    mostly = replace(result, world_T_rigs=poses)
+    assert np.median(step_sigmas(mostly)) < MIN_STEP_SIGMAS
+    require_motion(_frames(tmp_path, 4), mostly)
+    with pytest.raises(GsbaError, match="50 % of the picture turn with the camera, as a vehicle"):
+        require_motion(_frames(tmp_path, 16), mostly)
+    poses[-2:, 0, 3] = 0
+    with pytest.raises(NoPositions, match="hardly moves"):
+        require_motion(_frames(tmp_path, 4), mostly)
+
+
 def _driven(turn_deg: float, backwards: int) -> Reconstruction:
     """Steps ahead of a camera that turns at each, the last few back again."""
     result, poses = _result(1.0), [np.eye(4)]
