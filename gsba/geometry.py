@@ -121,6 +121,19 @@ def extent_of(positions: np.ndarray) -> float:
     return float(np.linalg.norm(np.ptp(positions, axis=0)))
 
 
+def standing_length(lengths: np.ndarray) -> float:
+    """A tenth of the rms of steps' lengths (N,): shorter ones are of a camera that stands, and mere
+    noise."""
+    return 0.1 * float(np.sqrt(np.mean(lengths**2))) if len(lengths) else 0.0
+
+
+def typical_length(lengths: np.ndarray) -> float:
+    """Median of the lengths (N,) of steps in which the camera does not stand; 1 if it never
+    moves."""
+    walked = lengths[lengths > standing_length(lengths)]
+    return float(np.median(walked)) if len(walked) else 1.0
+
+
 def furthest(positions: np.ndarray) -> tuple[int, float]:
     """Row of the position, of (N, 3), that is furthest from the first, and its distance."""
     distances = np.linalg.norm(positions - positions[0], axis=1)

@@ -14,6 +14,8 @@ from gsba.geometry import (
     quaternion_from_rotation,
     rotation_angle,
     rotation_from_quaternion,
+    standing_length,
+    typical_length,
 )
 from gsba.similarity import NoSimilarityError, Sim3, pose_similarity, residuals_of, similarity
 from gsba.types import FACES
@@ -221,3 +223,11 @@ def test_every_bearing_has_an_owner_that_sees_it(rng: np.random.Generator) -> No
     pixels = rig.project(bearings, owners)
     assert (np.abs(pixels - 160) <= 160 + 1e-9).all()
     assert len(np.unique(owners)) == 6
+
+
+def test_a_camera_that_mostly_stands_has_the_typical_length_of_its_walked_steps() -> None:
+    shaken = np.full(30, 2e-3)
+    assert typical_length(np.append(shaken, [0.9, 1.0, 1.1])) == 1.0
+    assert typical_length(np.array([0.3, 0.5, 0.9])) == 0.5
+    assert typical_length(np.zeros(4)) == typical_length(np.zeros(0)) == 1.0
+    assert (shaken < standing_length(np.append(shaken, np.ones(3)))).all()

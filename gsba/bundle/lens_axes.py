@@ -22,7 +22,7 @@ from gsba.bundle.shared_parameters import (
     validated,
 )
 from gsba.camera.lens import Lenses
-from gsba.geometry import unit
+from gsba.geometry import standing_length, unit
 from gsba.types import Counts
 
 logger = logging.getLogger(__name__)
@@ -138,8 +138,7 @@ def _headings(world_T_rigs: np.ndarray) -> np.ndarray:
     before, after = np.maximum(np.arange(num) - 1, 0), np.minimum(np.arange(num) + 1, num - 1)
     moved = world_T_rigs[after, :3, 3] - world_T_rigs[before, :3, 3]
     lengths = np.linalg.norm(moved, axis=1)
-    # shorter steps are of a frame that stands
-    going = np.flatnonzero(lengths > 0.1 * np.median(lengths))
+    going = np.flatnonzero(lengths > standing_length(lengths))
     if not len(going):
         return np.tile([0.0, 0, 1], (num, 1))
     nearest = going[np.abs(np.arange(num)[:, None] - going).argmin(axis=1)]

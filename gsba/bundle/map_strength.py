@@ -14,9 +14,18 @@ from scipy.spatial.transform import Rotation
 
 from factors import bearing_residuals
 from gsba.bundle.families import numbered
-from gsba.bundle.trajectory_prior import StepNoise, typical_length
+from gsba.bundle.trajectory_prior import StepNoise
 from gsba.config import PriorSettings, RefineSettings
-from gsba.geometry import inverse, moved_to, pose, relative_steps, rotation_angle, step_covariances
+from gsba.geometry import (
+    inverse,
+    moved_to,
+    pose,
+    relative_steps,
+    rotation_angle,
+    standing_length,
+    step_covariances,
+    typical_length,
+)
 from gsba.types import Counts, JointErrors, Reconstruction
 from gsba.types.records import slices, spread_rows
 
@@ -185,7 +194,6 @@ def _noise(
 
 
 _NEAR_FRAMES = 3  # frames to either side that do not count as far
-_STANDING_RATIO = 0.1  # of the rms step: shorter ones are of a camera that stands, and mere noise
 
 
 def step_deviations(result: Reconstruction) -> np.ndarray:
@@ -211,7 +219,7 @@ def step_deviations(result: Reconstruction) -> np.ndarray:
             predicted[f] = _resected(result, f, rows)
     steps = [relative_steps(some)[:, :3, 3] for some in (poses, predicted)]
     lengths = np.linalg.norm(steps, axis=2)
-    least = _STANDING_RATIO * np.sqrt(np.mean(lengths[0] ** 2))
+    least = standing_length(lengths[0])
     off = np.linalg.norm(steps[0] - steps[1], axis=1) / np.maximum(lengths.max(axis=0), least)
     return np.where(known[1:] & known[:-1], off, np.nan)
 
@@ -290,12 +298,9 @@ def scale_changes(result: Reconstruction, recordings: np.ndarray) -> np.ndarray:
 def _sides(positions: np.ndarray, recordings: np.ndarray) -> Iterator[tuple[int, int, int]]:
     """Steps with two places and more on both sides: step, first before, end behind."""
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
-    least = _STANDING_RATIO * np.sqrt(np.mean(steps**2)) if len(steps) else 0.0
-    walked = steps[steps > least]
-    if not len(walked):
-        return
+    least = standing_length(steps)
     along = np.concatenate([[0.0], np.cumsum(steps)])
-    reach = 6.0 * float(np.median(walked)) * (1 + 1e-9)  # a side is six usual steps long
+    reach = 6.0 * typical_length(steps) * (1 + 1e-9)  # a side is six usual steps long
     for step in range(len(steps)):
         own = np.flatnonzero(recordings == recordings[step])
         first = max(int(np.searchsorted(along, along[step] - reach)), int(own[0]))

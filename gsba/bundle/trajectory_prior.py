@@ -10,7 +10,7 @@ from factors import RobustLoss
 from gsba.bundle.families import Family, MapSnapshot, digest_of
 from gsba.bundle.pose_variables import X, pose_noise
 from gsba.config import PriorSettings
-from gsba.geometry import extent_of, relative_steps
+from gsba.geometry import extent_of, relative_steps, typical_length
 from gsba.types import GyroConstraints
 
 LOSS_SIGMAS = 2.0  # Cauchy scale: limits the pull of wrong measurements
@@ -88,11 +88,6 @@ class TrajectoryPrior(Family):
         fixed = gtsam.Pose3(world_T_rigs[0] if self.first is None else self.first)
         graph.add(gtsam.PriorFactorPose3(X(0), fixed, noise))
         return graph
-
-
-def typical_length(lengths: np.ndarray) -> float:
-    """Median of the lengths (N,) of steps of a camera that moves; 1 if it never does."""
-    return float(np.median(lengths[lengths > 0])) if (lengths > 0).any() else 1.0
 
 
 def _step_covariance(f_T_next: np.ndarray, length: float, noise: StepNoise) -> np.ndarray:

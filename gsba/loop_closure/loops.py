@@ -14,7 +14,7 @@ from factors import RobustLoss
 from factors.threads import map_in_threads
 from gsba.bundle.pose_variables import X, pose_noise, values_of
 from gsba.config import RefineSettings
-from gsba.geometry import inverse, relative_steps, rotation_angle
+from gsba.geometry import inverse, relative_steps, rotation_angle, typical_length
 from gsba.loop_closure import join_evidence
 from gsba.loop_closure.join_evidence import LOCAL, Places, around
 from gsba.loop_closure.retrieval import global_descriptors
@@ -48,7 +48,7 @@ def path(
     graph.add(gtsam.PriorFactorPose3(X(0), gtsam.Pose3(world_T_rigs[0]), pose_noise(1e-6, 1e-6)))
     steps = relative_steps(world_T_rigs)
     lengths = np.linalg.norm(steps[:, :3, 3], axis=1)
-    typical = float(np.median(lengths)) or 1.0
+    typical = typical_length(lengths)
     for f, step in enumerate(steps):
         noise = pose_noise(np.deg2rad(_STEP_SIGMA_DEG), _STEP_SIGMA_LENGTHS * typical)
         if unseen[f]:  # half a radian, and its length

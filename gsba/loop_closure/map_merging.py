@@ -10,7 +10,7 @@ from itertools import combinations
 
 import numpy as np
 
-from gsba.geometry import angles_between, inverse, unit
+from gsba.geometry import angles_between, inverse, typical_length, unit
 from gsba.loop_closure import join_evidence, loops
 from gsba.loop_closure.break_crossing import Breaks, agreed, crossing
 from gsba.loop_closure.connectivity import MIN_MAP_FRAMES, by_size
@@ -492,7 +492,7 @@ class _Joining:
         """True if a frame is within reach of its neighbours in time."""
         inside = np.flatnonzero(self.components == self.current)
         lengths = np.linalg.norm(np.diff(self.poses[inside, :3, 3], axis=0), axis=1)
-        pace = float(np.median(lengths / np.diff(self.times[inside])))
+        pace = typical_length(lengths / np.diff(self.times[inside]))
         after = int(np.searchsorted(inside, f))
         for n in (after - 1, after):
             if 0 <= n < len(inside):

@@ -4,7 +4,7 @@ import numpy as np
 
 from gsba.bundle.map_strength import step_deviations
 from gsba.frames.masks import load_mask
-from gsba.geometry import relative_steps, rotation_angle, step_covariances, unit
+from gsba.geometry import relative_steps, rotation_angle, step_covariances, typical_length, unit
 from gsba.log import GsbaError
 from gsba.masks.borders import find_borders
 from gsba.masks.carrier import VEHICLE_SHARE
@@ -124,12 +124,12 @@ def share_ahead(result: Reconstruction) -> float:
     """Share of a map's way that adds up if each step is seen from the camera, at most 1.
 
     A vehicle goes where it faces. Steps from false matches go to and fro: of n of them, about one
-    over the root of n adds up. No step counts for more than the median one, as false ones are of
+    over the root of n adds up. No step counts for more than the typical one, as false ones are of
     any length. 1 for a map without steps.
     """
     steps = relative_steps(result.world_T_rigs)[:, :3, 3]
     lengths = np.linalg.norm(steps, axis=1)
-    weights = np.minimum(lengths, np.median(lengths)) if len(lengths) else lengths
+    weights = np.minimum(lengths, typical_length(lengths))
     if not weights.sum() > 0:
         return 1.0
     return float(np.linalg.norm(weights @ unit(steps)) / weights.sum())

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from gsba.geometry import typical_length
 from gsba.similarity import Sim3
 from gsba.types import CoarsePoses
 
@@ -54,8 +55,8 @@ def _by_pace(before: int, poses: np.ndarray, segments: np.ndarray) -> Sim3:
     paces = []
     for rows in (segments == segments[before], segments == segments[before + 1]):
         lengths = np.linalg.norm(np.diff(poses[rows, :3, 3], axis=0), axis=1)
-        paces.append(float(np.median(lengths)) if (lengths > 0).any() else 1.0)
-    scale = paces[0] / paces[1] if min(paces) > 0 else 1.0
+        paces.append(typical_length(lengths))
+    scale = paces[0] / paces[1]
     rotation = poses[before, :3, :3] @ poses[before + 1, :3, :3].T
     alone = before == 0 or segments[before - 1] != segments[before]
     step = np.zeros(3) if alone else poses[before, :3, 3] - poses[before - 1, :3, 3]

@@ -8,7 +8,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsba.config import PriorSettings
-from gsba.geometry import inverse, nearest_rotation, pose, relative_steps, rotation_angle
+from gsba.geometry import (
+    inverse,
+    nearest_rotation,
+    pose,
+    relative_steps,
+    rotation_angle,
+    typical_length,
+)
 from gsba.trajectory.limits import TwoViewLimits
 from gsba.trajectory.steps import Steps, chained, step_errors, step_lengths, tracked_steps
 from gsba.trajectory.turning import Turn
@@ -160,7 +167,8 @@ def implausible_steps(
         for poses in (coarse.world_T_rigs, world_T_rigs)
     )
     judged = tracked_steps(coarse) & ~(trust.unseen_steps & trust.false_steps)  # those are guesses
-    judged &= (found > 0) & (slam > np.median(slam) / max_ratio)  # standing still measures nothing
+    # standing still measures nothing
+    judged &= (found > 0) & (slam > typical_length(slam) / max_ratio)
     rows, wrong = np.flatnonzero(judged), np.zeros(len(slam), bool)
     if len(rows) < 6:
         return wrong
@@ -216,7 +224,7 @@ def unusual_paces(
         around = np.arange(max(step - _STEPS_AROUND, 0), min(step + _STEPS_AROUND + 1, len(speeds)))
         around = around[usual[around] & (recordings[around] == recordings[step])]
         if len(around):
-            speed = float(np.median(speeds[around]))
+            speed = typical_length(speeds[around])
             near = around[np.argsort(np.abs(around - step), kind="stable")][:4]
             back = velocities[step] @ velocities[near].sum(axis=0) < 0
             unusual[step] = back or not slowest * speed < speeds[step] < fastest * speed
@@ -298,8 +306,7 @@ def leaps(world_T_rigs: np.ndarray, timestamps: np.ndarray) -> np.ndarray:
     world."""
     lengths = np.linalg.norm(np.diff(world_T_rigs[:, :3, 3], axis=0), axis=1)
     speeds = lengths / np.diff(timestamps)
-    moving = speeds[speeds > 0]
-    return speeds > 4.0 * np.median(moving) if len(moving) else np.zeros(len(speeds), bool)
+    return speeds > 4.0 * typical_length(speeds) if speeds.any() else np.zeros(len(speeds), bool)
 
 
 def _chain(world_T_rigs: np.ndarray, chosen: np.ndarray, own: np.ndarray) -> np.ndarray:
