@@ -269,6 +269,8 @@ class _Tests:
             command = ""  # the next map is in doubt, too
         elif command:
             remedy = f"export the next map; {remedy}"
+        if unmatched and not self.report.get("recordings"):  # neighbours over a pause are none
+            remedy += "; if the way has no gap there, give even times (--timestamps FILE)"
         yield Reason(level, out, cause, remedy, command=command)
 
     def _in_unknown_order(self) -> Iterator[Reason]:
