@@ -258,7 +258,8 @@ class _Tests:
         level = Level.REFUSED if exported < MIN_SHARE_OF_A_MAP * num else Level.LOOK
         cause = f"no matches tie {len(out)} of {num} frames to the exported map"
         remedy = "film the way between without a pause next time, and slowly through doors"
-        command = "gsba export RUN --to colmap --map 2" if len(self.report["maps"]) > 1 else ""
+        several = len(self.report["maps"]) > 1
+        command = "gsba export RUN --to colmap --map 2" if several else ""
         unmatched = self.figures.unmatched_steps
         if unmatched > MAX_UNMATCHED_SHARE * (num - 1):
             doubt = (
@@ -269,7 +270,8 @@ class _Tests:
             command = ""  # the next map is in doubt, too
         elif command:
             remedy = f"export the next map; {remedy}"
-        if unmatched and not self.report.get("recordings"):  # neighbours over a pause are none
+        # neighbours over a pause are not compared
+        if unmatched and several and not self.report.get("recordings"):
             remedy += "; if the way has no gap there, give even times (--timestamps FILE)"
         yield Reason(level, out, cause, remedy, command=command)
 
