@@ -297,8 +297,14 @@ class _Joining:
     def _next_in_time(
         self, rows: np.ndarray, inside: np.ndarray, max_intervals: float
     ) -> list[tuple[int, int]]:
-        """Neighbours in time of one recording, one of a part and one of the map."""
-        near = pairs.without_pause(self.times, max_intervals)
+        """Neighbours in time of one recording, one of a part and one of the map; frames between
+        that are in no map, as dark ones, count as missing."""
+        mapped = np.bincount(self.parts)[self.parts] >= MIN_MAP_FRAMES
+        mapped[rows] = mapped[inside] = True
+        near = np.flatnonzero(mapped)
+        near = np.column_stack([near[:-1], near[1:]])
+        usual = np.median(np.diff(self.times))
+        near = near[np.diff(self.times[near], axis=1)[:, 0] <= max_intervals * usual]
         near = near[self.recordings[near[:, 0]] == self.recordings[near[:, 1]]]
         near = np.concatenate([near, near[:, ::-1]])
         near = near[np.isin(near[:, 0], rows) & np.isin(near[:, 1], inside)]

@@ -260,7 +260,8 @@ class _Tests:
         level = Level.REFUSED if exported < MIN_SHARE_OF_A_MAP * num else Level.LOOK
         cause = f"no matches tie {len(out)} of {num} frames to the exported map"
         remedy = "film the way between without a pause next time, and slowly through doors"
-        command = "gsba export RUN --to colmap --map 2" if len(self.report["maps"]) > 1 else ""
+        several = len(self.report["maps"]) > 1
+        command = "gsba export RUN --to colmap --map 2" if several else ""
         unmatched = self.figures.unmatched_steps
         if unmatched > MAX_UNMATCHED_SHARE * (num - 1):
             doubt = (
@@ -271,6 +272,9 @@ class _Tests:
             command = ""  # the next map is in doubt, too
         elif command:
             remedy = f"export the next map; {remedy}"
+        # neighbours over a pause are not compared
+        if unmatched and several and not self.report.get("recordings"):
+            remedy += "; if the way has no gap there, give even times (--timestamps FILE)"
         yield Reason(level, out, cause, remedy, command=command)
 
     def _in_unknown_order(self) -> Iterator[Reason]:

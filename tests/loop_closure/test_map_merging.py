@@ -157,6 +157,17 @@ def test_pairs_over_a_pause_join_what_the_surroundings_confirm(
         assert _errors(found)[0] < 0.05
 
 
+def test_maps_are_joined_over_a_frame_that_shows_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A dark picture between two maps counts as a missing frame."""
+    context, whole, late = scene()
+    monkeypatch.setattr(map_merging._Joining, "_meetings", lambda *_: [])
+    monkeypatch.setattr(map_merging._Joining, "_register", lambda *_: False)
+    dark = (HALF,)
+    solved = _without_map(torn(whole, late, SCALE, MOVE), dark)
+    found = map_merging.merge(context, solved, _halves(dark), NOBODY, NOBODY, TIMES)
+    np.testing.assert_array_equal(np.flatnonzero(found.components), dark)
+
+
 @pytest.mark.parametrize("held", [False, True])
 def test_a_join_a_bay_off_is_left_for_one_at_the_usual_pace(
     held: bool, monkeypatch: pytest.MonkeyPatch

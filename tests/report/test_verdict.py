@@ -215,6 +215,15 @@ def test_a_part_of_frames_far_apart_is_not_to_train_on(unmatched: int, level: st
     assert _verdict(replace(GOOD, unmatched_steps=unmatched)).level == Level.GOOD
 
 
+@pytest.mark.parametrize(("unmatched", "advised"), [(0, False), (1, True)])
+def test_where_times_have_a_pause_and_the_way_has_none_even_times_help(
+    unmatched: int, advised: bool
+) -> None:
+    """Stills thinned out where the camera stood: neighbours over a pause are not compared."""
+    (reason,) = _verdict(replace(GOOD, exported=19, unmatched_steps=unmatched), NAMES[:19]).reasons
+    assert ("give even times (--timestamps FILE)" in reason.remedy) == advised
+
+
 def test_the_worst_reason_is_the_first_and_gives_the_level() -> None:
     figures = replace(GOOD, held_steps=(3,), position_error=0.3, unrefined=(2,))
     found = _verdict(figures)
