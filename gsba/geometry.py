@@ -122,9 +122,9 @@ def extent_of(positions: np.ndarray) -> float:
 
 
 def standing_length(lengths: np.ndarray) -> float:
-    """A tenth of the rms of steps' lengths (N,): shorter ones are of a camera that stands, and mere
-    noise."""
-    return 0.1 * float(np.sqrt(np.mean(lengths**2))) if len(lengths) else 0.0
+    """A tenth of the length that nine tenths of the steps (N,) have at most, so that a few false
+    ones do not count: shorter ones are of a camera that stands, and mere noise."""
+    return 0.1 * float(np.quantile(lengths, 0.9, method="lower")) if len(lengths) else 0.0
 
 
 def typical_length(lengths: np.ndarray) -> float:

@@ -226,8 +226,9 @@ def test_every_bearing_has_an_owner_that_sees_it(rng: np.random.Generator) -> No
 
 
 def test_a_camera_that_mostly_stands_has_the_typical_length_of_its_walked_steps() -> None:
-    shaken = np.full(30, 2e-3)
-    assert typical_length(np.append(shaken, [0.9, 1.0, 1.1])) == 1.0
+    shaken = np.full(20, 2e-3)
+    assert typical_length(np.append(shaken, [0.8, 0.9, 1.0, 1.1, 1.2])) == 1.0
+    assert typical_length(np.append(shaken, [0.8, 0.9, 1.0, 1.1, 900.0])) == 1.0
     assert typical_length(np.array([0.3, 0.5, 0.9])) == 0.5
     assert typical_length(np.zeros(4)) == typical_length(np.zeros(0)) == 1.0
-    assert (shaken < standing_length(np.append(shaken, np.ones(3)))).all()
+    assert (shaken < standing_length(np.append(shaken, np.ones(4)))).all()

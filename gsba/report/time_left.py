@@ -32,10 +32,10 @@ PHASES = (
     r"|(adjacent|wide)_(lenses|stitched|raw\d+)|imu_camera|strength",
     r".*_closer",
     r"everywhere\d+|refined\d+|again_.*",
-    r"\w*align(ed)?1(_\d+)?|stitching1|settled_aligned2",
-    r"\w*align(ed)?2(_\d+)?|stitching2|settled_aligned3",
-    r"\w*align(ed)?3(_\d+)?|stitching3|settled_aligned4",
-    r"\w*align(ed)?4(_\d+)?|stitching4|settled_aligned5",
+    r"\w*align(ed)?1(_\w+)?|stitching1|settled_aligned2",
+    r"\w*align(ed)?2(_\w+)?|stitching2|settled_aligned3",
+    r"\w*align(ed)?3(_\w+)?|stitching3|settled_aligned4",
+    r"\w*align(ed)?4(_\w+)?|stitching4|settled_aligned5",
     r"imu_final|camera|reconstruction|lenses|map|export-.*",
 )
 FEATURES, CAMERA, WEAK, KNOWN, FIRST_PATCHES, LAST_PATCHES = 1, 5, 6, 7, 8, 11  # of phases
