@@ -144,7 +144,7 @@ MAX_HELD_SHARE = 0.5  # of the steps, by the start alone
 MAX_DOUBTED_SHARE = 0.25  # of the steps, by a start that images contradict elsewhere
 MAX_UNMATCHED_SHARE = 0.25  # of a run's steps, where frames are missing and no start is given
 MAX_RESIDUAL_RATIO = 3.0  # of a frame, in the median one's: right maps have up to 1.9
-MIN_OBSERVATIONS_SHARE = 0.1  # of a frame, of the median one's: right maps have .29 and more
+MIN_OBSERVATIONS_SHARE = 0.05  # of a frame, of the median one's: right maps have .09 and more
 MAX_FALSE_SHARE = 0.1  # of the start's steps; above it the others are in doubt, too
 _MAX_NAMED_FRAMES = 6  # of a reason, in a line of text
 _LOOK_AROUND = "gsba view RUN"
@@ -338,9 +338,7 @@ class _Tests:
             least = MIN_OBSERVATIONS_SHARE * np.median([one for one in seen.values() if one] or [0])
             found |= {name for name, num in seen.items() if num < least} - unrefined
         if frames := tuple(name for name in self.names if name in found):
-            cause = (
-                "few points hold the pose, a tenth of those of other frames: a wrong one fits, too"
-            )
+            cause = "few points hold the pose, a twentieth of other frames': a wrong one fits, too"
             remedy = "look at these pictures, or leave these frames out of the training"
             yield Reason(Level.LOOK, frames, cause, remedy, True, _WITHOUT_DOUBTED)
 
