@@ -301,10 +301,8 @@ class _Joining:
         that are in no map, as dark ones, count as missing."""
         mapped = np.bincount(self.parts)[self.parts] >= MIN_MAP_FRAMES
         mapped[rows] = mapped[inside] = True
-        near = np.flatnonzero(mapped)
-        near = np.column_stack([near[:-1], near[1:]])
-        usual = np.median(np.diff(self.times))
-        near = near[np.diff(self.times[near], axis=1)[:, 0] <= max_intervals * usual]
+        shown = np.flatnonzero(mapped)
+        near = shown[pairs.without_pause(self.times[shown], max_intervals)]
         near = near[self.recordings[near[:, 0]] == self.recordings[near[:, 1]]]
         near = np.concatenate([near, near[:, ::-1]])
         near = near[np.isin(near[:, 0], rows) & np.isin(near[:, 1], inside)]

@@ -278,8 +278,8 @@ def _from_images_alone(
         unknown = np.full(len(slam), np.inf)
         lengths = step_lengths(slam_lengths, unknown, logs, sigmas) * found.paces
     chosen = _replaced(slam, found, lengths, found.verified)
-    open_ = found.verified & ~found.directed
-    chosen[open_, :3, 3] *= np.broadcast_to(found.paces, len(slam))[open_, None]
+    undirected = found.verified & ~found.directed
+    chosen[undirected, :3, 3] *= np.broadcast_to(found.paces, len(slam))[undirected, None]
     start = _chain(coarse.world_T_rigs, chosen, coarse.sources == PoseSource.SLAM)
     return _without_priors(start, found, lengths)
 
