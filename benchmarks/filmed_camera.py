@@ -309,9 +309,9 @@ class Camera:
 
 @dataclass(frozen=True)
 class RawCamera(Camera):
-    """The same camera before it stitches: its fisheyes side by side, the front one on the left.
+    """A camera that writes raw fisheye images, side by side: the front lens on the left.
 
-    Its lenses are apart, and nothing is stabilised or aligned at a seam.
+    Lenses are 32 mm apart; nothing is stitched, stabilised or aligned at a seam.
     """
 
     rays: int = 2

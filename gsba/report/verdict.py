@@ -316,11 +316,7 @@ class _Tests:
 
     def _misfitting(self) -> Iterator[Reason]:
         """Frames whose points fit much worse than those of others of their recording."""
-        ratios = dict[str, float]()
-        for rows in self._recordings().values():
-            found = {row["name"]: row.get("median_residual_deg") or 0.0 for row in rows}
-            usual = float(np.median([one for one in found.values() if one] or [math.inf]))
-            ratios |= {name: one / usual for name, one in found.items()}
+        ratios = self._parts_of_usual("median_residual_deg")
         frames = tuple(name for name in self.names if ratios[name] > MAX_RESIDUAL_RATIO)
         if frames:
             cause = (
@@ -332,15 +328,22 @@ class _Tests:
 
     def _loosely_held(self) -> Iterator[Reason]:
         """Frames with far fewer observations than others of their recording."""
-        found, unrefined = set[str](), {self.names[f] for f in self.figures.unrefined}
-        for rows in self._recordings().values():
-            seen = {row["name"]: row.get("observations") or 0 for row in rows}
-            least = MIN_OBSERVATIONS_SHARE * np.median([one for one in seen.values() if one] or [0])
-            found |= {name for name, num in seen.items() if num < least} - unrefined
-        if frames := tuple(name for name in self.names if name in found):
+        parts = self._parts_of_usual("observations")
+        few = {name for name, part in parts.items() if 0 < part < MIN_OBSERVATIONS_SHARE}
+        few -= {self.names[f] for f in self.figures.unrefined}
+        if frames := tuple(name for name in self.names if name in few):
             cause = "few points hold the pose, a twentieth of other frames': a wrong one fits, too"
             remedy = "look at these pictures, or leave these frames out of the training"
             yield Reason(Level.LOOK, frames, cause, remedy, True, _WITHOUT_DOUBTED)
+
+    def _parts_of_usual(self, key: str) -> dict[str, float]:
+        """A figure of each frame over the median one of its recording, by name; 0 = not known."""
+        found = dict[str, float]()
+        for rows in self._recordings().values():
+            figures = {row["name"]: row.get(key) or 0.0 for row in rows}
+            usual = float(np.median([one for one in figures.values() if one] or [math.inf]))
+            found |= {name: one / usual for name, one in figures.items()}
+        return found
 
     def _recordings(self) -> dict[str, list[Mapping[str, Any]]]:
         """Rows of the report's frames by the name of their recording, "" = the only one."""

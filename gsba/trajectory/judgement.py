@@ -276,10 +276,11 @@ def _from_images_alone(
     lengths = slam_lengths
     if found.directed.any():
         unknown = np.full(len(slam), np.inf)
-        lengths = step_lengths(slam_lengths, unknown, logs, sigmas) * found.paces
+        lengths = step_lengths(slam_lengths, unknown, logs, sigmas)
+    paces, slam = np.broadcast_to(found.paces, len(slam)), slam.copy()
+    slam[:, :3, 3] *= paces[:, None]
+    lengths = lengths * paces
     chosen = _replaced(slam, found, lengths, found.verified)
-    undirected = found.verified & ~found.directed
-    chosen[undirected, :3, 3] *= np.broadcast_to(found.paces, len(slam))[undirected, None]
     start = _chain(coarse.world_T_rigs, chosen, coarse.sources == PoseSource.SLAM)
     return _without_priors(start, found, lengths)
 

@@ -134,7 +134,7 @@ class FrameSet:
         return np.flatnonzero(~np.array(self.fetched or (False,) * len(self), bool))
 
     def with_timed(self, timed: tuple[bool, ...]) -> "FrameSet":
-        """The same frames; timed: (F,) True where a timestamp is a time."""
+        """These frames with `timed` (F,): True for times in seconds, False for mere numbers."""
         differing = timed if len({*timed}) > 1 else ()
         return replace(self, timed=all(timed), timed_of_frame=differing)
 
