@@ -322,7 +322,12 @@ class _Joining:
                 later[later > last][:_BREAK_REACH_FRAMES],
             )
             chosen = np.array(
-                [(a, b) for a in ends[0] for b in ends[1] if b - a <= _BREAK_REACH_FRAMES]
+                [
+                    (a, b)
+                    for before, a in enumerate(ends[0][::-1], 1)
+                    for after, b in enumerate(ends[1])
+                    if before + after <= _BREAK_REACH_FRAMES
+                ]
             )
             found = recovery.match_anywhere(self.context, chosen)
             given = found, self.context.keypoints, self.poses, self.known, rows

@@ -157,12 +157,15 @@ def test_pairs_over_a_pause_join_what_the_surroundings_confirm(
         assert _errors(found)[0] < 0.05
 
 
-def test_maps_are_joined_over_a_frame_that_shows_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A dark picture between two maps counts as a missing frame."""
+@pytest.mark.parametrize("num_dark", [1, 4])
+def test_maps_are_joined_over_frames_that_show_nothing(
+    num_dark: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Dark pictures between two maps count as missing frames."""
     context, whole, late = scene()
     monkeypatch.setattr(map_merging._Joining, "_meetings", lambda *_: [])
     monkeypatch.setattr(map_merging._Joining, "_register", lambda *_: False)
-    dark = (HALF,)
+    dark = tuple(range(HALF, HALF + num_dark))
     solved = _without_map(torn(whole, late, SCALE, MOVE), dark)
     found = map_merging.merge(context, solved, _halves(dark), NOBODY, NOBODY, TIMES)
     np.testing.assert_array_equal(np.flatnonzero(found.components), dark)
