@@ -14,6 +14,7 @@ from gsba.bundle import (
     lens_centres,
     readout,
     residual_correlation,
+    seam_band,
     self_calibration,
     stitching,
 )
@@ -109,7 +110,7 @@ def _find_lenses(state: State, sought: Sequence[int], prefix: str) -> State:
         map_ = map_.changed(camera, axes=guesses.get(camera))
     trial = replace(trial, map=replace(map_, solution=trial.solution))
     apart = [c for c in left if c not in raw and not _in_one_place(map_, c)]  # as no radius shows
-    trial = _with_stitch_radii(trial, apart, prefix)
+    trial = _with_stitch_radii(_with_seam_bands(trial, apart, prefix), apart, prefix)
     return _calibrate_raw(trial, [camera for camera in left if camera in raw])
 
 
@@ -117,6 +118,14 @@ def _in_one_place(map_: Map, camera: int) -> bool:
     """True if the lenses of a camera are kept for their rows alone."""
     centres = map_.cameras[camera].centres
     return centres is not None and bool(centres.reason)
+
+
+def _with_seam_bands(state: State, stitched: Sequence[int], prefix: str) -> State:
+    """The state without what panoramas of cameras show from between the lenses."""
+    for camera in stitched:
+        lenses = _from_features(state, f"{prefix}seam", camera, seam_band.widened, Lenses)
+        state = _with_lenses(state, {camera: lenses})
+    return state
 
 
 def _with_stitch_radii(start: State, stitched: Sequence[int], prefix: str) -> State:
@@ -168,8 +177,7 @@ def _on_trial(
     trial, raw = state, _raw_cameras(run)
     for camera in sought:
         own = run.settings_of(camera)
-        # pixels near the seam are blended of both lenses
-        yaws, band = own.lens_yaws_deg, float(np.deg2rad(4.0))
+        yaws = own.lens_yaws_deg
         if camera in raw:
             fisheyes = run.frames.formats[camera].fisheyes
             assert fisheyes is not None
@@ -181,7 +189,7 @@ def _on_trial(
             given = f"{prefix}axes", camera, lens_axes.guess, LensAxes
             guesses[camera] = _from_features(trial, *given)
             lenses = guesses[camera].lenses
-        trial = _through(trial, camera, replace(lenses, band_rad=band))
+        trial = _through(trial, camera, replace(lenses, band_rad=seam_band.NARROWEST))
     return trial, guesses
 
 

@@ -67,6 +67,7 @@ _TITLES = {
     "axes": "choose lens axes",
     "lenses+": "estimate lens centres, round {0}",
     "lensed+": "adjust under two lenses, round {0}",
+    "seam": "measure the band blended at the seam",
     "stitch_radius": "estimate the stitching radius",
     "stitched": "adjust under a stitching radius",
     "stitch_radius_tried": "judge the stitching radius on trial",

@@ -71,6 +71,7 @@ def of_camera(
         content["gain_of_axes"] = axes.gains
         if centres.lenses.axes is not None:
             notes.append("the lenses rotate relative to the panoramas: a stabiliser was on")
+    content["seam_band_deg"] = np.rad2deg(centres.lenses.band_rad)
     inverse_stitch_radius = centres.lenses.inverse_stitch_radius
     if radius is not None:
         deviation = radius.sigma

@@ -28,7 +28,7 @@ PHASES = (
     r"chain2?|adjacent|near|dense",
     r"registered|across\w*|similarities|joined|adjacent2|loops2?|places|gauge_closed|closed"
     r"|imu_closed",
-    r"axes|lens(es|ed)\d+|stitch(ed|_radius(_tried)?)|settled(_far)?(_readout)?|(re)?calibrated\d*(_readout)?"
+    r"axes|lens(es|ed)\d+|seam|stitch(ed|_radius(_tried)?)|settled(_far)?(_readout)?|(re)?calibrated\d*(_readout)?"
     r"|(adjacent|wide)_(lenses|stitched|raw\d+)|imu_camera|strength",
     r".*_closer",
     r"everywhere\d+|refined\d+|again_.*",

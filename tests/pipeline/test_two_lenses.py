@@ -98,6 +98,7 @@ def test_a_camera_of_two_lenses_is_found_and_gives_the_scale(
     report, errors = _refine(walk, tmp_path / "two", baseline_mm=50.0)
     camera = report["camera"]
     assert camera["taken"] and camera["reason"] == "" and not camera["readout"]["taken"]
+    assert camera["seam_band_deg"] == pytest.approx(4.0)  # no pixel shows both lenses
     assert errors.scale * camera["baseline"] == pytest.approx(BASELINE, rel=0.02)
     assert camera["metres_per_unit"] == pytest.approx(errors.scale, rel=0.02)  # 1 unit = 1 m here
     assert any(note.startswith("one map unit is") for note in report["notes"])
