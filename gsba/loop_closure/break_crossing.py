@@ -47,14 +47,30 @@ def crossing(
     return found
 
 
-def agreed(proposals: list[Proposal], poses: np.ndarray, depth: float) -> Proposal | None:
+def agreed(
+    proposals: list[Proposal],
+    poses: np.ndarray,
+    depth: float,
+    nearest: tuple[int, int] | None = None,
+) -> Proposal | None:
     """The proposal that most others agree with, of several the one with most matches; None without
-    a majority. Poses (F, 4, 4) are each frame's in its own map; `depth`, its median, in map
-    units."""
+    a majority.
+
+    Args:
+        proposals: one of each pair of frames.
+        poses: (F, 4, 4), each frame's in its own map.
+        depth: its median, map units.
+        nearest: frames next to one another, which share most: one more pair that agrees with them
+            suffices. Frames further apart may show other bays of a hall.
+    """
     counts = [sum(alike(one, other, poses, depth) for other in proposals) for one in proposals]
-    if max(counts, default=0) < max(MIN_AGREEING, len(proposals) // 2 + 1):
-        return None
-    return proposals[max(range(len(counts)), key=lambda n: (counts[n], proposals[n].support))]
+    enough = [
+        count > len(proposals) // 2 and count >= MIN_AGREEING - (one.frames == nearest)
+        for one, count in zip(proposals, counts, strict=True)
+    ]
+    chosen = np.flatnonzero(enough).tolist()
+    best = max(chosen, key=lambda n: (counts[n], proposals[n].support), default=None)
+    return None if best is None else proposals[best]
 
 
 @dataclass(frozen=True, slots=True)

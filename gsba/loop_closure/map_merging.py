@@ -107,8 +107,8 @@ class _Joining:
         self.min_testable = min_testable  # frames of a map that joins can be tested by
         self.recordings = recordings
         # Steps over which bays of a hall may be taken for one another.
-        self.wide = long_steps(solved.world_T_rigs, self.depth) & ~ties
-        self.wide |= over_missing_frames(timestamps, recordings)
+        self.missing = over_missing_frames(timestamps, recordings)
+        self.wide = self.missing | (long_steps(solved.world_T_rigs, self.depth) & ~ties)
         self.moves = [Sim3()] * num  # of each frame, from its part to the map
         self.components = np.full(num, -1)
         self.met, self.alone = np.zeros(num, bool), np.zeros(num, bool)
@@ -331,7 +331,10 @@ class _Joining:
             )
             found = recovery.match_anywhere(self.context, chosen)
             given = found, self.context.keypoints, self.poses, self.known, rows
-            best = agreed(crossing(*given), self.poses, self.depth)
+            proposals = crossing(*given), self.poses, self.depth
+            best, by_two = agreed(*proposals), False
+            if best is None and abs(outer - inner) == 1 and not self.missing[last]:
+                best, by_two = agreed(*proposals, (outer, inner)), True
             if best is None or (self._is_held_by_trajectory(rows) and not self._plausible(best)):
                 continue
             own, theirs = ends if outer < inner else ends[::-1]
@@ -342,7 +345,8 @@ class _Joining:
             judged = self._at_pace(Judged(best, evidence), rows, inside)
             evidence, move = judged.evidence, judged.proposal.move
             here = Breaks([(outer, inner)], rows, inside, self.poses, self.times)
-            if evidence.likely or (not evidence.doubted and here.continued_by(move)):
+            likely = evidence.likely and not by_two
+            if likely or (not evidence.doubted and here.continued_by(move)):
                 return move
             self.reasons[part] = f"not certain: {evidence}"
         return None

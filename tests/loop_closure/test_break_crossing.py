@@ -18,6 +18,10 @@ OUTSIDE = np.arange(HALF, NUM)
 CHOSEN = np.array([(HALF - 1, HALF), (HALF - 2, HALF), (HALF - 1, HALF + 1), (HALF - 2, HALF + 1)])
 
 
+def _moved_by(move: Sim3, units: float) -> Sim3:
+    return replace(move, translation=move.translation + np.array([units, 0, 0]))
+
+
 def _proposals(stretch: float = 1.0) -> tuple[list[Proposal], Solution]:
     """Of pairs over the break, points of the second map `stretch` times as far as they are."""
     context, whole, late = scene()
@@ -61,6 +65,22 @@ def test_too_few_pairs_or_none_that_agree_join_nothing() -> None:
 
     apart = [scaled(one, 1.3**n) for n, one in enumerate(proposals)]
     assert agreed(apart, *given) is None
+
+
+def test_one_more_pair_suffices_beside_frames_next_to_one_another() -> None:
+    """Half of the pairs show another bay of a hall."""
+    proposals, parts = _proposals()
+    given = parts.world_T_rigs, parts.median_depth()
+    near, other = ((HALF, HALF - 1), (HALF, HALF - 2))
+    one, two = (next(p for p in proposals if p.frames == frames) for frames in (near, other))
+    bay = replace(one, frames=(HALF + 1, HALF - 2), move=_moved_by(one.move, 1.0))
+    assert agreed([one, two, bay], *given, near) is one
+    assert agreed([one, two, bay], *given) is None
+    assert agreed([one, two, bay], *given, (HALF + 1, HALF - 1)) is None
+    assert agreed([one, bay], *given, near) is None
+    assert (
+        agreed([one, two, bay, replace(bay, move=_moved_by(one.move, 2.0))], *given, near) is None
+    )
 
 
 BEFORE, TIMES = np.arange(HALF), np.arange(NUM, dtype=float)

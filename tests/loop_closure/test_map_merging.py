@@ -157,6 +157,35 @@ def test_pairs_over_a_pause_join_what_the_surroundings_confirm(
         assert _errors(found)[0] < 0.05
 
 
+@pytest.mark.parametrize(
+    ("what", "joined"), [("walks on", True), ("missing", False), ("carried", False)]
+)
+def test_two_pairs_join_frames_next_to_one_another_where_the_camera_walks_on(
+    what: str, joined: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Frames further apart show other bays, as halls do."""
+    truth = TRUTH.copy()
+    if what == "carried":
+        truth[HALF:] = np.roll(truth[HALF:], -5, axis=0)
+    context, whole, late = scene_of(truth)
+    crossing, step = map_merging.crossing, TRUTH[HALF, :3, 3] - TRUTH[HALF - 1, :3, 3]
+
+    def crossed(*given) -> list[Proposal]:
+        one, two = crossing(*given)[:2]
+        moved = replace(one.move, translation=one.move.translation + 3 * step)
+        return [one, two, replace(one, frames=(HALF + 1, HALF - 2), move=moved)]
+
+    likely = JoinEvidence(0.5, 0.1, 200, 0.6, 0.08)
+    assert likely.likely and not likely.doubted
+    weigh = join_evidence.weigh
+    monkeypatch.setattr(join_evidence, "weigh", lambda *given: (likely, weigh(*given)[1]))
+    monkeypatch.setattr(map_merging, "crossing", crossed)
+    monkeypatch.setattr(map_merging._Joining, "_meetings", lambda *_: [])
+    times = TIMES + (1.0 if what == "missing" else 0.0) * (np.arange(NUM) >= HALF)
+    given = torn(whole, late, SCALE, MOVE), _halves(), NOBODY, ~BREAK, times
+    assert map_merging.merge(context, *given).components.any() != joined
+
+
 @pytest.mark.parametrize("num_dark", [1, 4])
 def test_maps_are_joined_over_frames_that_show_nothing(
     num_dark: int, monkeypatch: pytest.MonkeyPatch
