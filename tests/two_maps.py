@@ -30,10 +30,13 @@ def scene(strange: bool = False) -> tuple[MatchContext, Solution, np.ndarray]:
 
 
 def scene_of(
-    truth: np.ndarray, shown: np.ndarray = EVERYTHING, strange: bool = False
+    truth: np.ndarray,
+    shown: np.ndarray = EVERYTHING,
+    strange: bool = False,
+    halves: bool = True,
 ) -> tuple[MatchContext, Solution, np.ndarray]:
-    """Once around, mapped in two halves; `strange`: the second half looks like nothing else;
-    `shown`: (F,) share of the points in reach that each frame shows.
+    """Once around, mapped in two halves or at once; `strange`: the second half looks like nothing
+    else; `shown`: (F,) share of the points in reach that each frame shows.
 
     Returns the map in one world, and the point that each of its landmarks is.
     """
@@ -48,7 +51,7 @@ def scene_of(
         late = int(f >= HALF)
         bearings = with_noise(bearings_of(points[seen], world_T_rig), 3e-4, rng)
         frames.append(features_of(bearings, looks[late if strange else 0][seen]))
-        own = 2 * seen + late
+        own = 2 * seen + (late if halves else 0)
         rows.append(np.column_stack([own, np.full(len(seen), f), np.arange(len(seen))]))
     table = np.concatenate(rows)
     table = table[np.lexsort((table[:, 1], table[:, 0]))].astype(np.int32)

@@ -15,6 +15,7 @@ from accuracy import assert_as_accurate
 from command import run_gsba, succeed
 from growing_home import MAX_ERROR, NUM, SMALL_EXPORTS, GrowingHome
 from plain_records import frames_of
+from refusals import refused
 from tiny_run import PLAIN
 from typer.testing import Result
 from waiting import until
@@ -24,7 +25,6 @@ from gsba.disk import hold_folder
 from gsba.export import ExportFormat
 from gsba.frames.recordings import combine
 from gsba.localization import Localizer
-from gsba.log import GsbaError
 from gsba.pipeline.finished_run import KeptMap
 from gsba.pipeline.growing import complete
 from gsba.similarity import Sim3
@@ -189,8 +189,7 @@ def test_a_killed_call_leaves_the_run_and_goes_on(
     assert again == (grown / "trajectory.tum").read_bytes()
     assert _content(tmp_path / "run-before") == before
     assert {path.name for path in tmp_path.iterdir()} == {"run", "run-before"}
-    with pytest.raises(GsbaError, match="already, as 'upper'"):
-        add_recordings(run, [home.recording()])
+    refused("already, as 'upper'", add_recordings, run, [home.recording()])
 
 
 @pytest.fixture(scope="module")
