@@ -5,14 +5,12 @@ from functools import cache
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from synthetic import bearings_of, features_of, loop_walk, unit, with_noise
+from synthetic import bearings_of, context_of, features_of, loop_walk, unit, with_noise
 
 from gsba.config import PairSettings, RefineSettings
-from gsba.features import detection
 from gsba.geometry import pose
-from gsba.matching.guided_search import MatchContext, SearchableFrames
+from gsba.matching.guided_search import MatchContext
 from gsba.similarity import Sim3
-from gsba.store.shards import Threads
 from gsba.types import Counts, Landmarks, Solution, Tracks
 
 NUM, POINTS, HALF = 40, 1500, 20
@@ -58,9 +56,7 @@ def scene_of(
     kept, renumbered = np.unique(table[:, 0], return_inverse=True)
     own = Tracks(renumbered.astype(np.int32), table[:, 1], table[:, 2], len(kept))
     landmarks = Landmarks(points[kept // 2], own, Counts(len(kept), len(kept), "tracks"))
-    among = SearchableFrames(frames.__getitem__)
-    context = MatchContext(among, among, detection.gather(frames), SETTINGS, Threads(1))
-    return context, Solution(truth, landmarks, 1.0, ()), kept % 2 == 1
+    return context_of(frames, SETTINGS), Solution(truth, landmarks, 1.0, ()), kept % 2 == 1
 
 
 def torn(solved: Solution, late: np.ndarray, scale: float, move: np.ndarray) -> Solution:
