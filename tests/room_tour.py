@@ -25,9 +25,10 @@ def true_poses() -> np.ndarray:
     return pose(turns, POSITIONS)
 
 
-def pictures(room: int = 0) -> list[np.ndarray]:
-    """Panoramas (h, 2h) uint8 of the stills; rooms differ in the paint of their walls."""
-    return [_seen(_walls(room), one) for one in true_poses()]
+@cache
+def picture(n: int, room: int = 0) -> np.ndarray:
+    """Panorama (h, 2h) uint8 of a still, not to be changed; rooms differ in their walls' paint."""
+    return _seen(_walls(room), true_poses()[n])
 
 
 @cache
@@ -36,7 +37,7 @@ def still(n: int, room: int = 0) -> TourFrame:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tour_steps, "_FEATURES", FeatureSettings(max_per_face=150))
         patch.setattr(tour_steps, "_NUM_KEYS", 200)
-        return frame_of(_seen(_walls(room), true_poses()[n]), None)
+        return frame_of(picture(n, room), None)
 
 
 def frames() -> list[TourFrame]:
