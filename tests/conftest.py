@@ -12,8 +12,9 @@ from pathlib import Path
 from threading import get_ident
 from typing import Any
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read as NumPy loads: workers fill the cores
-
+# Read as NumPy and PyTorch load: workers fill the cores, and more threads would wait by spinning.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 import pytest

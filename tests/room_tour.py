@@ -25,26 +25,36 @@ def true_poses() -> np.ndarray:
     return pose(turns, POSITIONS)
 
 
-def pictures(room: int = 0) -> list[np.ndarray]:
-    """Panoramas (h, 2h) uint8 of the stills; rooms differ in the paint of their walls."""
-    walls = [_wall(np.random.default_rng(6 * room + n)) for n in range(6)]
-    return [_seen(walls, one) for one in true_poses()]
+@cache
+def picture(n: int, room: int = 0) -> np.ndarray:
+    """Panorama (h, 2h) uint8 of a still, not to be changed; rooms differ in their walls' paint."""
+    return _seen(_walls(room), true_poses()[n])
 
 
 @cache
-def frames(room: int = 0) -> list[TourFrame]:
-    """The stills with as few keypoints as these rooms need."""
+def still(n: int, room: int = 0) -> TourFrame:
+    """A still with as few keypoints as these rooms need."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tour_steps, "_FEATURES", FeatureSettings(max_per_face=150))
-        patch.setattr(tour_steps, "_NUM_KEYS", 300)
-        return [frame_of(picture, None) for picture in pictures(room)]
+        patch.setattr(tour_steps, "_NUM_KEYS", 200)
+        return frame_of(picture(n, room), None)
+
+
+def frames() -> list[TourFrame]:
+    """All stills of the first room."""
+    return [still(n) for n in range(len(POSITIONS))]
 
 
 @cache
 def true_step(first: int, room: int = 0) -> Step:
     """The step from a still to the next one at its true pose."""
-    some, poses = frames(room), true_poses()
-    return step_at(some[first], some[first + 1], inverse(poses[first + 1]) @ poses[first])
+    one, other, poses = still(first, room), still(first + 1, room), true_poses()
+    return step_at(one, other, inverse(poses[first + 1]) @ poses[first])
+
+
+@cache
+def _walls(room: int) -> list[np.ndarray]:
+    return [_wall(np.random.default_rng(6 * room + n)) for n in range(6)]
 
 
 def _wall(rng: np.random.Generator) -> np.ndarray:

@@ -8,7 +8,11 @@ from scipy.spatial.transform import Rotation
 
 from gsba.bundle.families import Family, MapSnapshot
 from gsba.camera.rig import CubeRig, owner_faces
+from gsba.config import RefineSettings
+from gsba.features import detection
 from gsba.geometry import inverse, pose
+from gsba.matching.guided_search import MatchContext, SearchableFrames
+from gsba.store.shards import Threads
 from gsba.types import Features, Keypoints, Tracks
 
 RIG = CubeRig(512, np.pi / 2)
@@ -160,3 +164,9 @@ def features_of(bearings: np.ndarray, descriptors: np.ndarray) -> Features:
         descriptors,
         np.zeros((num, 3), np.uint8),
     )
+
+
+def context_of(frames: list[Features], settings: RefineSettings) -> MatchContext:
+    """Frames that one thread matches, with all their keypoints."""
+    searchable = SearchableFrames(frames.__getitem__)
+    return MatchContext(searchable, searchable, detection.gather(frames), settings, Threads(1))

@@ -5,14 +5,12 @@ from functools import cache
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from synthetic import bearings_of, features_of, loop_walk, unit, with_noise
+from synthetic import bearings_of, context_of, features_of, loop_walk, unit, with_noise
 
 from gsba.config import PairSettings, RefineSettings
-from gsba.features import detection
 from gsba.geometry import pose
-from gsba.matching.guided_search import MatchContext, SearchableFrames
+from gsba.matching.guided_search import MatchContext
 from gsba.similarity import Sim3
-from gsba.store.shards import Threads
 from gsba.types import Counts, Landmarks, Solution, Tracks
 
 NUM, POINTS, HALF = 40, 1500, 20
@@ -30,10 +28,13 @@ def scene(strange: bool = False) -> tuple[MatchContext, Solution, np.ndarray]:
 
 
 def scene_of(
-    truth: np.ndarray, shown: np.ndarray = EVERYTHING, strange: bool = False
+    truth: np.ndarray,
+    shown: np.ndarray = EVERYTHING,
+    strange: bool = False,
+    halves: bool = True,
 ) -> tuple[MatchContext, Solution, np.ndarray]:
-    """Once around, mapped in two halves; `strange`: the second half looks like nothing else;
-    `shown`: (F,) share of the points in reach that each frame shows.
+    """Once around, mapped in two halves or at once; `strange`: the second half looks like nothing
+    else; `shown`: (F,) share of the points in reach that each frame shows.
 
     Returns the map in one world, and the point that each of its landmarks is.
     """
@@ -48,16 +49,14 @@ def scene_of(
         late = int(f >= HALF)
         bearings = with_noise(bearings_of(points[seen], world_T_rig), 3e-4, rng)
         frames.append(features_of(bearings, looks[late if strange else 0][seen]))
-        own = 2 * seen + late
+        own = 2 * seen + (late if halves else 0)
         rows.append(np.column_stack([own, np.full(len(seen), f), np.arange(len(seen))]))
     table = np.concatenate(rows)
     table = table[np.lexsort((table[:, 1], table[:, 0]))].astype(np.int32)
     kept, renumbered = np.unique(table[:, 0], return_inverse=True)
     own = Tracks(renumbered.astype(np.int32), table[:, 1], table[:, 2], len(kept))
     landmarks = Landmarks(points[kept // 2], own, Counts(len(kept), len(kept), "tracks"))
-    among = SearchableFrames(frames.__getitem__)
-    context = MatchContext(among, among, detection.gather(frames), SETTINGS, Threads(1))
-    return context, Solution(truth, landmarks, 1.0, ()), kept % 2 == 1
+    return context_of(frames, SETTINGS), Solution(truth, landmarks, 1.0, ()), kept % 2 == 1
 
 
 def torn(solved: Solution, late: np.ndarray, scale: float, move: np.ndarray) -> Solution:

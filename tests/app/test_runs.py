@@ -15,10 +15,10 @@ from tests.tiny_run import Case
 
 pytest.importorskip("starlette")
 
+from gsba.app.runs import brief_facts, camera_so_far, finished_map, overview
+
 
 def test_the_camera_is_told_as_soon_as_its_stage_has_ended(case: Case) -> None:
-    from gsba.app.runs import camera_so_far
-
     stages = case.result.report["stages"]
     assert stages[0]["title"] == "find what turns with the camera"
     names = [stage["name"] for stage in stages]
@@ -29,8 +29,6 @@ def test_the_camera_is_told_as_soon_as_its_stage_has_ended(case: Case) -> None:
 
 
 def test_the_map_is_that_of_the_run(case: Case) -> None:
-    from gsba.app.runs import finished_map
-
     found = finished_map(case.out)
     assert found["stage"] == RECONSTRUCTION
     assert len(found["path"]) == len(case.result.frames)
@@ -65,8 +63,6 @@ def test_stages_that_the_page_looks_for_are_stages(pattern: str) -> None:
 def test_the_verdict_is_that_of_the_report(
     tmp_path: Path, verdict: dict[str, Any], level: str, sentence: str, reasons: list[str]
 ) -> None:
-    from gsba.app.runs import brief_facts, overview
-
     summary = {"refined": 9, "exported": 10, "frames": 11, "fetched": 1, "frames_fetched": 2}
     report = {"summary": summary, "verdict": verdict}
     (tmp_path / "report.json").write_text(json.dumps(report))
@@ -81,8 +77,6 @@ def test_the_verdict_is_that_of_the_report(
 
 
 def test_the_map_from_above_has_places_and_points_of_the_largest_map_alone(tmp_path: Path) -> None:
-    from gsba.app.runs import finished_map
-
     whole = scene.reconstruction()
     maps = np.array([0, 0, 1, -1, 0, 0, 1, 0, 0], np.int32)
     seen = maps[whole.observation_points] == maps[whole.observation_frames]

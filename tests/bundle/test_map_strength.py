@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from synthetic import drifted, loop_walk, unit
 
 from gsba.bundle import map_strength
@@ -10,6 +11,7 @@ from gsba.bundle.map_strength import MapStrength
 from gsba.bundle.trajectory_prior import StepNoise, TrajectoryPrior
 from gsba.config import RefineSettings
 from gsba.geometry import inverse, rotation_angle, step_covariances
+from gsba.similarity import similarity
 from gsba.types import Counts, JointErrors, Solution
 
 NUM = 24
@@ -18,6 +20,7 @@ LENGTHS = np.linalg.norm(np.diff(POSES[:, :3, 3], axis=0), axis=1)
 SETTINGS = RefineSettings()
 CLOSER, PRIORS = SETTINGS.weak_frames, SETTINGS.priors
 ALL = np.ones(NUM - 1, bool)
+LOOSE_AT_10 = np.where(np.arange(NUM - 2) == 9, 2e-3, 4e-4)  # sigmas of a chain, frame 10 loose
 
 
 def _chained(scale_sigma: np.ndarray, num_draws: int = 2000) -> tuple[np.ndarray, JointErrors]:
@@ -49,8 +52,6 @@ def test_a_map_that_hardly_drifts_is_left_alone() -> None:
 
 
 def test_drift_is_what_is_left_after_the_best_similarity() -> None:
-    from gsba.similarity import similarity
-
     _, joint = _chained(np.full(NUM - 2, 2e-3), 200)
     draws = joint.draws
     moved = POSES[:, :3, 3] + np.einsum("fij,dfj->dfi", POSES[:, :3, :3], draws[..., 3:])
@@ -78,24 +79,18 @@ def test_changes_of_scale_are_as_uncertain_as_they_were_made() -> None:
 
 
 def test_a_place_above_the_limit_is_weak_with_the_frames_around_it() -> None:
-    made = np.full(NUM - 2, 4e-4)
-    made[9] = 2e-3  # at frame 10
-    assert np.flatnonzero(_measured(made).weak).tolist() == [8, 9, 10, 11, 12]
+    assert np.flatnonzero(_measured(LOOSE_AT_10).weak).tolist() == [8, 9, 10, 11, 12]
 
 
 def test_nothing_is_looked_for_where_no_image_shows_a_step() -> None:
-    made = np.full(NUM - 2, 4e-4)
-    made[9] = 2e-3
     seen = ALL.copy()
     seen[10] = False
-    found = map_strength.measure(POSES, _chained(made), POSES, seen, ALL, SETTINGS)
+    found = map_strength.measure(POSES, _chained(LOOSE_AT_10), POSES, seen, ALL, SETTINGS)
     assert not found.weak.any() and not found.held_steps[10]
 
 
 def test_a_trajectory_that_is_not_believed_leaves_weak_places_to_be_found() -> None:
-    made = np.full(NUM - 2, 4e-4)
-    made[9] = 2e-3
-    found = map_strength.measure(POSES, _chained(made), POSES, ALL, ~ALL, SETTINGS)
+    found = map_strength.measure(POSES, _chained(LOOSE_AT_10), POSES, ALL, ~ALL, SETTINGS)
     assert found.weak.any() and found.noise is None
 
 
@@ -116,8 +111,6 @@ def test_the_noise_of_a_trajectory_is_read_from_held_steps() -> None:
     steps = found.copy()
     steps[1:, :3, 3] = unit(rng.normal(size=(num - 1, 3)))
     coarse = steps.copy()
-    from scipy.spatial.transform import Rotation
-
     turns = Rotation.from_rotvec(sigmas[0] * rng.normal(size=(num, 3))).as_matrix()
     coarse[:, :3, :3] = turns
     moves = steps[:, :3, 3]
@@ -151,8 +144,6 @@ def test_the_covariance_of_a_step_is_that_of_drawn_steps() -> None:
 
 def _exponential(tangents: np.ndarray) -> np.ndarray:
     """Poses of small tangents, to first order in the translation."""
-    from scipy.spatial.transform import Rotation
-
     out = np.tile(np.eye(4), (*tangents.shape[:-1], 1, 1))
     turns = Rotation.from_rotvec(tangents[..., :3].reshape(-1, 3)).as_matrix()
     out[..., :3, :3] = turns.reshape(*tangents.shape[:-1], 3, 3)

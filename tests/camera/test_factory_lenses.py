@@ -4,6 +4,7 @@ import insta360_files as made
 import numpy as np
 import pytest
 from refusals import refused
+from scipy.spatial.transform import Rotation
 
 from gsba.camera.factory_lenses import FactoryCalibration, FactoryLenses, parse_factory_lenses
 from gsba.camera.fisheye import Pair, project, rotation_of
@@ -42,8 +43,6 @@ def _parse(text: str, **more) -> FactoryLenses:
 
 def _turn(pair: Pair) -> np.ndarray:
     """Rotation (3,) of the back lens from half a turn against the front one, degrees."""
-    from scipy.spatial.transform import Rotation
-
     front, back = map(rotation_of, pair)
     vector = Rotation.from_matrix(np.diag([-1, 1, -1]) @ front.T @ back).as_rotvec()
     return np.rad2deg(vector)

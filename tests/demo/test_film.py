@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command import run_gsba, succeed
+from command import fails, run_gsba, succeed
 
 from gsba.demo.walk import FPS, WHOLE_WALK, walk_poses
 from gsba.trajectory.files import read_trajectory
@@ -48,9 +48,7 @@ def test_what_cannot_be_filmed_is_refused_in_one_line(tmp_path: Path) -> None:
         (["--frames", "2"], "2 frames"),
         (["--camera", "nonsense"], "'nonsense'"),
     ):
-        result = run_gsba("demo", "--video", "--out", out, *options)
-        assert result.exit_code == 1 and said in result.stderr
-        assert len(result.stderr.splitlines()) == 1
+        fails(run_gsba("demo", "--video", "--out", out, *options), said)
     assert not out.exists()
 
 
@@ -59,5 +57,5 @@ def test_without_pyav_a_line_says_what_to_install(
 ) -> None:
     monkeypatch.setitem(sys.modules, "av", None)  # as if it were not installed
     result = run_gsba("demo", "--video", "--out", tmp_path / "demo")
-    assert result.exit_code == 1 and "pip install 'gsba[video]'" in result.stderr
+    fails(result, "pip install 'gsba[video]'")
     assert not (tmp_path / "demo").exists()

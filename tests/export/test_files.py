@@ -15,7 +15,7 @@ from PIL import Image
 from plyfile import PlyData
 from refusals import refused
 
-from gsba.export import ExportFormat, export, write_points
+from gsba.export import ExportFormat, export, pictures, write_points
 from gsba.export.images import face_size_for
 from gsba.log import GsbaError
 from gsba.trajectory.files import read_trajectory
@@ -188,8 +188,6 @@ def test_face_size_defaults_to_a_quarter_and_is_even(frames):
 def test_an_export_that_does_not_end_keeps_the_last_one(
     tmp_path, frames, monkeypatch, failure, raised
 ):
-    from gsba.export import pictures
-
     written = []
 
     def write(path, content, **options):

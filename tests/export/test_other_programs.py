@@ -27,6 +27,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from gsba.cli.options import OPTIONS
 from gsba.disk import read_vertices
 from gsba.export import ExportFormat, Shutter, export
+from gsba.export.gltf import write_gltf
 from gsba.export.trainers import PROGRAMS, format_of, how_to_start
 from gsba.geometry import inverse
 from gsba.log import GsbaError
@@ -165,8 +166,6 @@ _WORLD_R_LEVEL = {  # rotations of a world whose y points down, by the axis that
 @pytest.mark.parametrize("known", [True, False])
 def test_gltf_stands_upright_in_trimesh(up: str, known: bool, tmp_path: Path) -> None:
     trimesh = pytest.importorskip("trimesh")
-    from gsba.export.gltf import write_gltf
-
     frames, level = panoramas(tmp_path / "frames"), reconstruction()
     placed = Placement(Sim3(rotation=_WORLD_R_LEVEL[up])).apply(level)
     write_gltf(tmp_path / "scene.glb", placed, frames, up if known else None)
@@ -185,8 +184,6 @@ def test_gltf_stands_upright_in_trimesh(up: str, known: bool, tmp_path: Path) ->
 
 def test_rigs_without_a_common_up_stay_in_a_world_whose_y_points_down(tmp_path: Path) -> None:
     trimesh = pytest.importorskip("trimesh")
-    from gsba.export.gltf import write_gltf
-
     frames, scene = panoramas(tmp_path / "frames"), reconstruction()
     turns = Rotation.from_rotvec(np.arange(NUM_FRAMES)[:, None] * [2 * np.pi / NUM_FRAMES, 0, 0])
     scene.world_T_rigs[:, :3, :3] = turns.as_matrix()

@@ -9,6 +9,7 @@ from plain_records import frames_of
 from two_fisheyes import colours, made_pair, picture, write
 
 from gsba.camera.sphere import erp_directions
+from gsba.frames import raw_pairs
 from gsba.frames.dual_fisheye import clear_of_seam, load_joined, load_raw, width_of
 from gsba.frames.files import decode
 from gsba.frames.pixels import load_erp
@@ -87,8 +88,6 @@ def test_side_by_side_is_the_same(frames: FrameSet, gray: bool) -> None:
 
 
 def test_side_by_side_is_decoded_once(frames: FrameSet, monkeypatch: pytest.MonkeyPatch) -> None:
-    from gsba.frames import raw_pairs
-
     seen: list[Path] = []
     decode = raw_pairs.decode
 

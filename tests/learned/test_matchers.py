@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -28,11 +29,13 @@ from gsba.features.detection import traits_of
 from gsba.geometry import pose
 from gsba.learned import FaceMatcher, LearnedExtractor, make_matcher, overlapping_faces
 from gsba.learned.lightglue import LightGlue
-from gsba.learned.magicleap import SuperGlue
 from gsba.matching import guided_search
 from gsba.matching.guided_search import Gate, SearchableFrames, guided
 from gsba.store.shards import Threads
 from gsba.types import FACES, Features
+
+if TYPE_CHECKING:
+    from gsba.learned.magicleap import SuperGlue
 
 RIG = CubeRig(96, np.deg2rad(96))
 COMBINATIONS = [
@@ -338,8 +341,10 @@ def test_lightglue_of_disk_is_known_by_its_unused_tensors(
 
 
 @pytest.fixture(scope="module")
-def superglues(folder: Path) -> tuple[OfficialSuperGlue, SuperGlue]:
+def superglues(folder: Path) -> "tuple[OfficialSuperGlue, SuperGlue]":
     """The paper's network with random weights, and ours from its file."""
+    from gsba.learned.magicleap import SuperGlue  # takes seconds, in each worker that collects
+
     torch.manual_seed(2)
     model = OfficialSuperGlue().eval()
     with torch.no_grad():
@@ -354,7 +359,7 @@ def superglues(folder: Path) -> tuple[OfficialSuperGlue, SuperGlue]:
 
 @pytest.mark.parametrize("num", [40, 25])
 def test_superglue_is_that_of_the_paper(
-    num: int, superglues: tuple[OfficialSuperGlue, SuperGlue]
+    num: int, superglues: "tuple[OfficialSuperGlue, SuperGlue]"
 ) -> None:
     """Equal probabilities, also where one face has fewer keypoints and is padded to as many."""
     model, glue = superglues

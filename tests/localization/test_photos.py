@@ -15,7 +15,9 @@ from gsba import Localizer
 from gsba.camera.projections import PerspectiveProjection
 from gsba.camera.rig import CubeRig
 from gsba.camera.sphere import bearings_from_erp, erp_from_bearings
+from gsba.config import FeatureSettings
 from gsba.demo.render import render_erp
+from gsba.features import SiftExtractor
 from gsba.geometry import rotation_angle
 from gsba.localization import localize_photos, read_photo
 from gsba.localization.photos import Photo, as_panorama, photo_features, photo_rig
@@ -109,9 +111,6 @@ def test_keypoints_on_faces_lie_where_the_photo_shows_them() -> None:
     spots = spots + rng.integers(-15, 16, spots.shape)
     for u, v in spots:
         cv2.circle(image, (int(u), int(v)), 6, (230, 230, 230), -1, cv2.LINE_AA)
-    from gsba.config import FeatureSettings
-    from gsba.features import SiftExtractor
-
     rig = photo_rig(CAMERA, CubeRig(256, np.deg2rad(96.0)))
     found = photo_features(image, CAMERA, rig, SiftExtractor(FeatureSettings()))
     pixels = CAMERA.project(found.bearings_rig)

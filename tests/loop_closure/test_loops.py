@@ -1,108 +1,62 @@
 """Places met again beyond the reach of drift: the right ones are closed, look-alikes are not."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from synthetic import bearings_of, features_of, loop_walk, unit, with_noise
+from synthetic import unit
+from two_maps import HALF, NUM, SETTINGS, TRUTH, scene_of, torn
 
-from gsba.config import PairSettings, RefineSettings
-from gsba.features import detection
 from gsba.geometry import inverse, pose, rotation_angle
 from gsba.loop_closure import loops
 from gsba.loop_closure.loops import Loop
 from gsba.loop_closure.retrieval import _sampled_descriptors, aggregate, global_descriptors
-from gsba.matching.guided_search import MatchContext, SearchableFrames
+from gsba.matching.guided_search import MatchContext
 from gsba.similarity import relative_similarity
 from gsba.store.shards import Threads
-from gsba.types import Counts, Keypoints, Landmarks, Solution, Tracks
+from gsba.types import Solution, Tracks
 
-NUM_FRAMES, NUM_POINTS = 40, 1500
-SETTINGS = RefineSettings(pairs=PairSettings(window=8))
-TRUTH = loop_walk(NUM_FRAMES)
-SEEN = np.zeros(NUM_FRAMES - 1, bool)
+SEEN = np.zeros(NUM - 1, bool)
 
 
-def _scene(heading: float = 0.0) -> tuple[SearchableFrames, Keypoints, Solution]:
-    """Once around; every frame sees what is near, the last ones what the first ones see."""
-    rng = np.random.default_rng(0)
-    near = TRUTH[rng.integers(0, NUM_FRAMES, NUM_POINTS), :3, 3]
-    offsets = rng.uniform(0.8, 2.5, (NUM_POINTS, 1)) * unit(rng.normal(size=(NUM_POINTS, 3)))
-    points = near + offsets
-    descriptors = (200 * rng.random((NUM_POINTS, 64)) ** 4).astype(np.uint8)
+@cache
+def _whole() -> tuple[MatchContext, Solution]:
+    """Once around, in one map."""
+    return scene_of(TRUTH, halves=False)[:2]
+
+
+@cache
+def _halves(heading: float = 0.0) -> tuple[MatchContext, Solution, np.ndarray]:
+    """Once around, the second half with the camera turned about its vertical axis."""
     turned = TRUTH.copy()
-    turn = Rotation.from_rotvec([0, heading, 0]).as_matrix()
-    turned[NUM_FRAMES // 2 :, :3, :3] = turned[NUM_FRAMES // 2 :, :3, :3] @ turn
-    frames, tracks = [], []
-    for f, world_T_rig in enumerate(turned):
-        seen = np.flatnonzero(np.linalg.norm(points - world_T_rig[:3, 3], axis=1) < 2.6)
-        bearings = with_noise(bearings_of(points[seen], world_T_rig), 3e-4, rng)
-        frames.append(features_of(bearings, descriptors[seen]))
-        tracks.append(np.column_stack([seen, np.full(len(seen), f), np.arange(len(seen))]))
-    rows = np.concatenate(tracks)
-    rows = rows[np.lexsort((rows[:, 1], rows[:, 0]))].astype(np.int32)
-    _, renumbered = np.unique(rows[:, 0], return_inverse=True)
-    kept = np.unique(rows[:, 0])
-    own = Tracks(renumbered.astype(np.int32), rows[:, 1], rows[:, 2], len(kept))
-    landmarks = Landmarks(points[kept], own, Counts(len(kept), len(kept), "tracks"))
-    solved = Solution(turned, landmarks, 1.0, ())
-    return SearchableFrames(frames.__getitem__), detection.gather(frames), solved
-
-
-def _split(solved: Solution) -> Solution:
-    """The same points as two maps would hold them: those of the first half, and of the second."""
-    tracks = solved.landmarks.tracks
-    late = tracks.frames >= NUM_FRAMES // 2
-    points = 2 * tracks.points + late
-    order = np.lexsort((tracks.frames, points))
-    kept, renumbered = np.unique(points[order], return_inverse=True)
-    own = Tracks(
-        renumbered.astype(np.int32), tracks.frames[order], tracks.keypoints[order], len(kept)
-    )
-    placed = solved.landmarks.points_world[kept // 2]
-    return replace(solved, landmarks=Landmarks(placed, own, solved.landmarks.counts))
-
-
-def _moved(solved: Solution, by: np.ndarray) -> Solution:
-    """The second half of frames and points carried off."""
-    poses = solved.world_T_rigs.copy()
-    half = NUM_FRAMES // 2
-    poses[half:] = by @ poses[half:]
-    tracks = solved.landmarks.tracks
-    first = tracks.frames[np.searchsorted(tracks.points, np.arange(tracks.num_points))]
-    points = solved.landmarks.points_world.copy()
-    late = first >= half
-    points[late] = points[late] @ by[:3, :3].T + by[:3, 3]
-    return Solution(poses, replace(solved.landmarks, points_world=points), 1.0, ())
+    turned[HALF:, :3, :3] @= Rotation.from_rotvec([0, heading, 0]).as_matrix()
+    return scene_of(turned)
 
 
 def test_looks_do_not_depend_on_heading() -> None:
-    straight, turned = _scene()[0], _scene(heading=2.0)[0]
+    straight, turned = (_halves(heading)[0].frames for heading in (0.0, 2.0))
     words = straight[0].descriptors[:64]
-    for f in range(NUM_FRAMES):
+    for f in range(NUM):
         one, other = (aggregate(frames[f].descriptors, words) for frames in (straight, turned))
         np.testing.assert_allclose(one, other, atol=1e-5)
 
 
-def _context(frames: SearchableFrames, keypoints: Keypoints) -> MatchContext:
-    return MatchContext(frames, frames, keypoints, SETTINGS, Threads(1))
-
-
 def test_the_same_place_looks_most_alike() -> None:
-    looks = global_descriptors(_scene()[0], NUM_FRAMES, 0, Threads(1))
-    far = [f for f in range(NUM_FRAMES) if 4 < f < NUM_FRAMES - 4]
+    looks = global_descriptors(_whole()[0].frames, NUM, 0, Threads(1))
+    far = [f for f in range(NUM) if 4 < f < NUM - 4]
     alike = looks @ looks.T
-    assert alike[0, NUM_FRAMES - 1] > max(alike[0, f] for f in far)
+    assert alike[0, NUM - 1] > max(alike[0, f] for f in far)
 
 
 def test_only_places_that_may_be_met_again_are_compared() -> None:
-    strongest, _, whole = _scene()
-    looks = global_descriptors(strongest, NUM_FRAMES, 0, Threads(1))
+    context, whole = _whole()
+    looks = global_descriptors(context.frames, NUM, 0, Threads(1))
     found = loops.candidates(looks, whole, SEEN, SETTINGS)
-    assert [0, NUM_FRAMES - 1] in found.tolist()
+    assert [0, NUM - 1] in found.tolist()
     # A walk that ends before it comes back.
-    num = NUM_FRAMES // 2
+    num = HALF
     before = replace(
         whole,
         world_T_rigs=whole.world_T_rigs[:num],
@@ -123,19 +77,17 @@ def _seen_before(tracks: Tracks, frame: int) -> np.ndarray:
 
 
 def test_frames_that_the_map_holds_together_are_not_compared() -> None:
-    strongest, keypoints, whole = _scene()
-    assert loops.close(_context(strongest, keypoints), whole, SEEN).counts.received == 0
-    assert loops.close(_context(strongest, keypoints), _split(whole), SEEN).counts.received > 0
+    assert loops.close(*_whole(), SEEN).counts.received == 0
+    assert loops.close(*_halves()[:2], SEEN).counts.received > 0
 
 
 @pytest.mark.parametrize("heading", [0.0, 2.5])
 def test_a_map_torn_in_two_is_joined_where_it_meets(heading: float) -> None:
-    strongest, keypoints, whole = _scene(heading)
+    context, whole, late = _halves(heading)
     by = pose(Rotation.from_rotvec([0.02, 0.3, 0]).as_matrix(), np.array([0.2, 0.1, -0.3]))
-    torn = _moved(_split(whole), by)
     unseen = SEEN.copy()
-    unseen[NUM_FRAMES // 2 - 1] = True
-    closed = loops.close(_context(strongest, keypoints), torn, unseen)
+    unseen[HALF - 1] = True
+    closed = loops.close(context, torn(whole, late, 1.0, by), unseen)
     assert len(closed.pairs) >= 3
     relative = inverse(closed.solved.world_T_rigs[0]) @ closed.solved.world_T_rigs
     true = inverse(whole.world_T_rigs[0]) @ whole.world_T_rigs
@@ -145,7 +97,7 @@ def test_a_map_torn_in_two_is_joined_where_it_meets(heading: float) -> None:
     # Points went with their frames.
     tracks, solved = closed.solved.landmarks.tracks, closed.solved
     rays = bearings_of_each(solved.landmarks.points_world[tracks.points], solved, tracks)
-    seen = keypoints.bearings_rig[keypoints.rows(tracks)]
+    seen = context.keypoints.bearings_rig[context.keypoints.rows(tracks)]
     assert np.median(np.linalg.norm(rays - seen, axis=1)) < 2e-3
 
 
@@ -161,13 +113,13 @@ def bearings_of_each(points: np.ndarray, solved: Solution, tracks: Tracks) -> np
 
 def test_a_confirmed_path_is_not_bent_further_than_it_drifts() -> None:
     """The same torn map, but every step was confirmed by images: then the loops are the error."""
-    strongest, keypoints, whole = _scene()
-    torn = _moved(_split(whole), pose(np.eye(3), np.array([3.0, 0, 0])))
-    closed = loops.close(_context(strongest, keypoints), torn, SEEN)
-    assert len(closed.pairs) == 0 and closed.solved is torn
+    context, whole, late = _halves()
+    moved = torn(whole, late, 1.0, pose(np.eye(3), np.array([3.0, 0, 0])))
+    closed = loops.close(context, moved, SEEN)
+    assert len(closed.pairs) == 0 and closed.solved is moved
 
 
-def _loops(shift: float, count: int, support: int, last: int = NUM_FRAMES - 1) -> list[Loop]:
+def _loops(shift: float, count: int, support: int, last: int = NUM - 1) -> list[Loop]:
     """Loops between the first frames and the last, false by a shift along x of the world."""
     found = []
     for n in range(count):
@@ -178,8 +130,7 @@ def _loops(shift: float, count: int, support: int, last: int = NUM_FRAMES - 1) -
 
 
 def _consistent(found: list[Loop]) -> list[Loop]:
-    solved = _scene()[2]
-    return loops.consistent(found, solved, SETTINGS.pairs.window)
+    return loops.consistent(found, _whole()[1], SETTINGS.pairs.window)
 
 
 def test_a_lone_loop_is_not_believed() -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from people import make_people, paste_people
+from refusals import refused
 from tiny_run import SETTINGS, Case, computed_stages
 
 from gsba import refine
@@ -15,7 +16,6 @@ from gsba.disk import write_image
 from gsba.evaluate.trajectory import evaluate
 from gsba.frames.masks import levels_of, load_mask, load_weights
 from gsba.frames.pixels import load_erp
-from gsba.log import GsbaError
 from gsba.masks.distractors import StaticScene, distractor_mask, distractor_weights
 from gsba.masks.merging import choose
 from gsba.store.store import load_stage
@@ -139,8 +139,7 @@ def test_masks_are_chosen_by_name(tmp_path: Path) -> None:
     one = choose("carrier")
     assert one.given is None and one.carrier and not one.distractors
     assert choose(None) == choose([]) and choose(str(tmp_path)).given == tmp_path
-    with pytest.raises(GsbaError, match="give one file or one folder"):
-        choose([tmp_path, "other.png"])
+    refused("give one file or one folder", choose, [tmp_path, "other.png"])
 
 
 def test_weights_are_written_as_grey_levels(tmp_path: Path, case: Case) -> None:

@@ -136,7 +136,6 @@ def test_what_is_no_command(tmp_path: Path, frames: FrameSet) -> None:
         ("'open", "No closing quotation"),
         (" ", "no command given"),
     ):
-        with pytest.raises(GsbaError, match=message):
-            _run(tmp_path, frames, command)
+        refused(message, _run, tmp_path, frames, command)
     with pytest.raises(GsbaError, match=r"mask of f0, front is float64 of shape \(2, 2\)"):
         _run(tmp_path, frames, lambda _: np.ones((2, 2)))

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from synthetic import bearings_of, features_of, unit, with_noise
+from synthetic import bearings_of, context_of, features_of, unit, with_noise
 
 from gsba.camera.rig import owner_faces
 from gsba.config import PairSettings, RefineSettings
@@ -14,14 +14,14 @@ from gsba.geometry import inverse, pose
 from gsba.matching import correspondences
 from gsba.matching.guided_search import MatchContext, SearchableFrames
 from gsba.store.shards import Threads
-from gsba.types import Counts, Keypoints, Landmarks, Solution, Tracks, VerifiedPairs
+from gsba.types import Counts, Landmarks, Solution, Tracks, VerifiedPairs
 
 NUM = 300
 LAST = 5  # the frame that comes back
 STRIDE = 0.2  # the walk is 0.2 a step along x, the points are 2 to 4 away
 
 
-def _scene(shift: float) -> tuple[SearchableFrames, Keypoints, Solution]:
+def _scene(shift: float) -> tuple[MatchContext, Solution]:
     """A solved walk along x whose last frame sees, of every point, a copy moved along x."""
     rng = np.random.default_rng(0)
     points = rng.uniform(2, 4, (NUM, 1)) * unit(rng.normal(size=(NUM, 3)))
@@ -39,21 +39,18 @@ def _scene(shift: float) -> tuple[SearchableFrames, Keypoints, Solution]:
     which, seen_from = which[order].astype(np.int32), seen_from[order].astype(np.int32)
     landmarks = Landmarks(points, Tracks(which, seen_from, which, NUM), Counts(NUM, NUM, "tracks"))
     solved = Solution(world_T_rigs, landmarks, 1.0, ())
-    return SearchableFrames(frames.__getitem__), detection.gather(frames), solved
+    return context_of(frames, RefineSettings(pairs=PairSettings(window=2))), solved
 
 
 def _loops_to_last(shift: float) -> tuple[VerifiedPairs, np.ndarray]:
     """All loops, and the rows of those that end in the last frame."""
-    settings = RefineSettings(pairs=PairSettings(window=2))
-    frames, keypoints, solved = _scene(shift)
-    context = MatchContext(frames, frames, keypoints, settings, Threads(1))
-    found = correspondences.match_loops(context, solved)
+    found = correspondences.match_loops(*_scene(shift))
     return found, np.flatnonzero(found.matches.pairs[:, 1] == LAST)
 
 
 def test_neighbours_of_different_maps_are_not_matched_along_epipolars() -> None:
-    frames, keypoints, solved = _scene(shift=0)
-    context = MatchContext(frames, frames, keypoints, RefineSettings(), Threads(1))
+    context, solved = _scene(shift=0)
+    context = replace(context, settings=RefineSettings())
     whole = correspondences.match_along_epipolars(context, solved)
     maps = np.array([0, 0, 0, -1, 1, 1])
     found = correspondences.match_along_epipolars(context, solved, maps)
@@ -63,13 +60,13 @@ def test_neighbours_of_different_maps_are_not_matched_along_epipolars() -> None:
 
 
 def test_points_are_known_where_tracks_see_them() -> None:
-    _, keypoints, solved = _scene(shift=0)
+    context, solved = _scene(shift=0)
     turned = solved.world_T_rigs.copy()
     turned[:, :3, :3] = Rotation.random(LAST + 1, rng=2).as_matrix()
     landmarks, whole = solved.landmarks, solved.landmarks.tracks
     tracks = whole.of_observations(whole.frames != whole.points % LAST)
     solved = replace(solved, world_T_rigs=turned, landmarks=replace(landmarks, tracks=tracks))
-    known = solved.points_by_keypoint(keypoints)
+    known = solved.points_by_keypoint(context.keypoints)
     expected = np.full((LAST + 1, NUM, 3), np.nan)
     for point, frame, keypoint in zip(tracks.points, tracks.frames, tracks.keypoints, strict=True):
         there = inverse(turned[frame]) @ [*landmarks.points_world[point], 1]
@@ -122,12 +119,8 @@ def test_all_keypoints_decide_where_the_strongest_disagree(
     all_, strongest = (SearchableFrames(frames.__getitem__, n) for n in (None, 40))
     context = MatchContext(all_, strongest, detection.gather(frames), settings, Threads(1))
     world_T_rigs = pose(np.tile(np.eye(3), (2, 1, 1)), np.stack([np.zeros(3), true]))
-    nothing = Landmarks(
-        np.zeros((0, 3)),
-        Tracks(*(np.zeros(0, np.int32) for _ in range(3)), 0),
-        Counts(0, 0, "tracks"),
-    )
-    found = correspondences.match_neighbours(context, Solution(world_T_rigs, nothing, 1.0, ()))
+    start = Solution.without_points(world_T_rigs)
+    found = correspondences.match_neighbours(context, start)
     assert found.matches.pairs.tolist() == [[0, 1]]
     off = np.rad2deg(np.arccos(found.f0_T_f1s[0, :3, 3] @ unit(true)))
     assert off > 10 if misled else off < 1

@@ -6,17 +6,15 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from synthetic import bearings_of, features_of, unit, with_noise
+from synthetic import bearings_of, context_of, features_of, unit, with_noise
 
 from gsba.config import RefineSettings
-from gsba.features import detection
 from gsba.geometry import inverse, pose, rotation_angle
 from gsba.matching import correspondences, guided_search, recovery
 from gsba.matching.guided_search import MatchContext, SearchableFrames
 from gsba.matching.recovery import Recovered
 from gsba.similarity import Sim3
-from gsba.store.shards import Threads
-from gsba.types import CoarsePoses, Keypoints, Matches, PoseSource, Solution, VerifiedPairs
+from gsba.types import CoarsePoses, Matches, PoseSource, Solution, VerifiedPairs
 
 NUM, NUM_FRAMES = 250, 8
 TRUTH = pose(
@@ -26,30 +24,29 @@ SETTINGS = RefineSettings()
 TIMES = np.arange(NUM_FRAMES, dtype=float)
 
 
-def _scene(cut: int | None = None) -> tuple[SearchableFrames, Keypoints]:
-    """A short walk among points with descriptors; from frame `cut` on, among others."""
-    rng = np.random.default_rng(0)
-    frames = []
-    for place in range(2):
-        points = rng.uniform(2, 5, (NUM, 1)) * unit(rng.normal(size=(NUM, 3))) + [1, 0, 0]
-        descriptors = (200 * rng.random((NUM, 64)) ** 4).astype(np.uint8)
-        for f in range(NUM_FRAMES):
-            if (cut is not None and f >= cut) == bool(place):
-                bearings = with_noise(bearings_of(points, TRUTH[f]), 3e-4, rng)
-                frames.append(features_of(bearings, descriptors))
-    return SearchableFrames(frames.__getitem__), detection.gather(frames)
+def _walk(poses: np.ndarray, seen: np.ndarray) -> MatchContext:
+    """A walk with poses (F, 4, 4) among points of which each frame sees some: (F, J) bool."""
+    rng, num = np.random.default_rng(1), seen.shape[1]
+    points = rng.uniform(2, 5, (num, 1)) * unit(rng.normal(size=(num, 3))) + [1, 0, 0]
+    descriptors = (200 * rng.random((num, 64)) ** 4).astype(np.uint8)
+    frames = [
+        features_of(with_noise(bearings_of(points[some], T), 3e-4, rng), descriptors[some])
+        for T, some in zip(poses, seen, strict=True)
+    ]
+    return context_of(frames, SETTINGS)
 
 
-def _context(cut: int | None = None) -> MatchContext:
-    frames, keypoints = _scene(cut)
-    return MatchContext(frames, frames, keypoints, SETTINGS, Threads(1))
+def _context(cut: int = NUM_FRAMES) -> MatchContext:
+    """A short walk among points; from frame `cut` on, among others."""
+    elsewhere = np.arange(NUM_FRAMES) >= cut
+    return _walk(TRUTH, elsewhere[:, None] == (np.arange(2 * NUM) >= NUM))
 
 
 def _coarse(slam: np.ndarray) -> CoarsePoses:
     return CoarsePoses(slam, np.full(NUM_FRAMES, PoseSource.SLAM, np.uint8), 0.0)
 
 
-def _run(slam: np.ndarray, cut: int | None = None, times: np.ndarray = TIMES) -> Recovered:
+def _run(slam: np.ndarray, cut: int = NUM_FRAMES, times: np.ndarray = TIMES) -> Recovered:
     context = _context(cut)
     guided = correspondences.match_neighbours(context, Solution.without_points(slam))
     coarse = _coarse(slam)
@@ -125,19 +122,6 @@ def test_frames_of_two_pieces_are_never_tied_by_two_views() -> None:
     assert not found.trust.held_steps.any()  # where the second piece lies is a guess
     steps = np.linalg.norm(np.diff(found.trust.world_T_rigs[:, :3, 3], axis=0), axis=1)
     np.testing.assert_allclose(steps, steps[0], rtol=0.05)
-
-
-def _walk(poses: np.ndarray, seen: np.ndarray) -> MatchContext:
-    """A walk with poses (F, 4, 4) among points of which each frame sees some: (F, NUM) bool."""
-    rng = np.random.default_rng(1)
-    points = rng.uniform(2, 5, (NUM, 1)) * unit(rng.normal(size=(NUM, 3))) + [1, 0, 0]
-    descriptors = (200 * rng.random((NUM, 64)) ** 4).astype(np.uint8)
-    frames = [
-        features_of(with_noise(bearings_of(points[some], T), 3e-4, rng), descriptors[some])
-        for T, some in zip(poses, seen, strict=True)
-    ]
-    searchable = SearchableFrames(frames.__getitem__)
-    return MatchContext(searchable, searchable, detection.gather(frames), SETTINGS, Threads(1))
 
 
 def _from_images_alone(context: MatchContext) -> Recovered:
@@ -262,7 +246,7 @@ def test_a_learned_matcher_gets_all_keypoints_of_unpredicted_pairs_at_once() -> 
         return guided_search.guided(frames, *given)
 
     frames = context.frames
-    strongest = SearchableFrames(_scene()[0].features, 10)
+    strongest = SearchableFrames(frames.features, 10)
     context = replace(context, strongest=strongest, matcher=matcher)
     pairs = np.array([[0, 1], [1, 2]])
     assert len(recovery.match_anywhere(context, pairs).matches.pairs) == 2

@@ -6,7 +6,9 @@ from dense_walk import WIDTH, RenderedWalk, turn
 from one_gallery import gallery
 from scipy.spatial.transform import Rotation
 
+from gsba.camera.rig import owner_faces
 from gsba.camera.sphere import erp_directions
+from gsba.demo.raycast import ranges
 from gsba.geometry import angles_between, inverse, pose, rotation_angle, unit
 from gsba.odometry.atlas import AtlasLayout, Cutter, follow, new_corners
 from gsba.odometry.derotation import miniature, turned
@@ -22,8 +24,6 @@ def _turn(degrees: float, axis: tuple[float, float, float]) -> np.ndarray:
 
 def test_pixels_of_an_atlas_and_bearings_are_each_others_inverse() -> None:
     bearings = unit(np.random.default_rng(0).normal(size=(500, 3)))
-    from gsba.camera.rig import owner_faces
-
     faces = owner_faces(bearings).astype(np.int64)
     pixels = LAYOUT.pixels(bearings, faces)
     assert LAYOUT.inside(pixels, faces, 5.0).all()
@@ -98,8 +98,6 @@ def test_a_frame_is_placed_by_descriptors_in_the_unit_of_the_map(walk: RenderedW
     one, other = (cutter.cut(walk.frames[n], np.eye(3)) for n in (0, 6))
     key, frame = describe(LAYOUT, one, None), describe(LAYOUT, other, None)
     true_T = inverse(walk.world_T_rigs[0]) @ walk.world_T_rigs[6]
-    from gsba.demo.raycast import ranges
-
     world = key.bearings_rig @ walk.world_T_rigs[0][:3, :3].T
     distances = ranges(gallery(), walk.world_T_rigs[0][:3, 3], world)
     found = placed(key, frame, key.bearings_rig, distances, seed=0)

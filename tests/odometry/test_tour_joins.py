@@ -9,7 +9,7 @@ from gsba.odometry import tour_joins, tour_merging
 from gsba.odometry.tour_joins import MIN_LEAD, MIN_SCORE, Join, TourMap, is_sure, join, scaled
 from gsba.odometry.tour_merging import all_joined, held
 from gsba.odometry.tour_steps import agreed_logs, pose_errors_deg
-from tests.room_tour import frames, true_poses, true_step
+from tests.room_tour import frames, still, true_poses, true_step
 
 
 @pytest.fixture(autouse=True)
@@ -34,7 +34,7 @@ def true_map(room: int, first: int) -> TourMap:
 
 
 def test_maps_of_one_room_are_joined_in_pose_and_scale() -> None:
-    some, poses = frames(0), true_poses()
+    some, poses = frames(), true_poses()
     ((one, other, best),) = all_joined(some, [true_map(0, 0), true_map(0, 2)], 1)
     assert one.last == 1 and other.first == 2
     true = inverse(poses[2]) @ poses[1]
@@ -50,7 +50,7 @@ def test_maps_of_one_room_are_joined_in_pose_and_scale() -> None:
 
 
 def test_single_frames_join_the_map_beside_them() -> None:
-    some, poses = frames(0), true_poses()
+    some, poses = frames(), true_poses()
     alone = [TourMap(f, np.eye(4)[None], [np.full(len(some[f].keys), np.nan)]) for f in range(4)]
     lengths = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     for one, other, unit_length in (
@@ -65,7 +65,7 @@ def test_single_frames_join_the_map_beside_them() -> None:
 
 
 def test_maps_of_different_rooms_are_not_joined() -> None:
-    some = [*frames(0)[:2], *frames(1)[2:]]
+    some = [*frames()[:2], still(2, room=1), still(3, room=1)]
     assert not is_sure(*join(some, true_map(0, 0), true_map(1, 2)))
 
 

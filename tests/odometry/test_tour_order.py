@@ -9,7 +9,7 @@ from gsba.config import FeatureSettings
 from gsba.odometry import tour_order, tour_steps
 from gsba.odometry.tour_order import in_given_order, likeness, most_alike_path
 from gsba.odometry.tour_steps import frame_of
-from tests.room_tour import pictures
+from tests.room_tour import picture
 
 
 def alike_in_a_row(num: int, seed: int) -> np.ndarray:
@@ -54,7 +54,8 @@ def test_an_order_is_told_from_none() -> None:
 
 def test_frames_of_one_room_are_more_alike_than_of_two(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tour_steps, "_FEATURES", FeatureSettings(max_per_face=150))
-    stills = [*pictures(0)[1:3], *pictures(1)[1:3], np.full((512, 1024), 90, np.uint8)]
+    stills = [picture(n, room) for room in range(2) for n in (1, 2)]
+    stills.append(np.full((512, 1024), 90, np.uint8))
     alike = likeness([frame_of(still, None) for still in stills])
     np.testing.assert_array_equal(alike, alike.T)
     assert not alike.diagonal().any()

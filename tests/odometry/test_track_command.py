@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from command import run_gsba, succeed
+from command import fails, run_gsba, succeed
 from dense_walk import RenderedWalk
 from tiny_run import LIGHT
 
@@ -85,9 +85,7 @@ def test_what_is_no_input_is_refused_in_one_line(folder: Path, video: Path, tmp_
         ((video, "--out", out, "--fps", 3), "holds the times of its frames"),
         ((video, "--out", out, "--width", 801), "width"),
     ):
-        result = run_gsba("track", *arguments)
-        assert result.exit_code == 1 and said in result.output
-        assert len(result.output.strip().splitlines()) == 1
+        fails(run_gsba("track", *arguments), said)
     assert not out.exists()
 
 

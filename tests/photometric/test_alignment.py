@@ -24,6 +24,7 @@ from gsba.photometric import alignment, frame_jobs, packing
 from gsba.photometric.alignment import AlignedObservations
 from gsba.store.shards import Threads
 from gsba.types import (
+    FACES,
     Counts,
     FrameSet,
     Keypoints,
@@ -299,8 +300,6 @@ def test_no_points_are_no_observations(walk) -> None:
 
 def test_cube_faces_are_aligned_like_panoramas(walk, tmp_path: Path) -> None:
     """Faces cut from the same scene; observations near face edges are as good as others."""
-    from gsba.types import FACES
-
     frames, world_T_rigs = walk
     size = 160
     rig = CubeRig(size, np.pi / 2)

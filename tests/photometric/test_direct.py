@@ -20,12 +20,14 @@ from gsba.camera.sphere import erp_from_bearings
 from gsba.config import RefineSettings
 from gsba.config_file import load_config
 from gsba.disk import write_image
+from gsba.frames import cubemap
 from gsba.frames.masks import levels_of
 from gsba.log import GsbaError
 from gsba.photometric import direct, patches
 from gsba.photometric.direct import PhotometricResult
 from gsba.pipeline.run import Run
-from gsba.types import FrameSet, Solution
+from gsba.store.store import load_stage
+from gsba.types import FrameSet, Keypoints, Solution
 
 WIDTH = 512
 GREY = render(np.eye(4), Texture(np.random.default_rng(0)), WIDTH).astype(np.float32)
@@ -138,10 +140,6 @@ def test_the_report_tells_of_patches(joint) -> None:
 
 
 def _start(case: Case, settings: RefineSettings):
-    from gsba.frames import cubemap
-    from gsba.store.store import load_stage
-    from gsba.types import Keypoints, Solution
-
     frames = load_stage(case.out, "frames", FrameSet)
     solved = load_stage(case.out, "refined1", Solution)
     keypoints = load_stage(case.out, "keypoints", Keypoints)

@@ -12,9 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from accuracy import assert_as_accurate
-from command import run_gsba, succeed
+from command import fails, run_gsba, succeed
 from growing_home import MAX_ERROR, NUM, SMALL_EXPORTS, GrowingHome
 from plain_records import frames_of
+from refusals import refused
 from tiny_run import PLAIN
 from typer.testing import Result
 from waiting import until
@@ -24,7 +25,6 @@ from gsba.disk import hold_folder
 from gsba.export import ExportFormat
 from gsba.frames.recordings import combine
 from gsba.localization import Localizer
-from gsba.log import GsbaError
 from gsba.pipeline.finished_run import KeptMap
 from gsba.pipeline.growing import complete
 from gsba.similarity import Sim3
@@ -158,9 +158,7 @@ def test_refusals_are_one_line_and_leave_the_run(home: GrowingHome, tmp_path: Pa
         ([home.run, home.folders[1], tmp_path / "missing.tum"], "missing.tum"),
     ]
     for arguments, told in cases:
-        result = _gsba("add", *arguments)
-        assert result.exit_code == 1, arguments
-        assert told in result.output and len(result.output.strip().splitlines()) == 1, told
+        fails(_gsba("add", *arguments), told)
     lock = hold_folder(home.run)
     try:
         assert "in use by another gsba process" in _gsba("add", home.run, home.folders[1]).output
@@ -189,8 +187,7 @@ def test_a_killed_call_leaves_the_run_and_goes_on(
     assert again == (grown / "trajectory.tum").read_bytes()
     assert _content(tmp_path / "run-before") == before
     assert {path.name for path in tmp_path.iterdir()} == {"run", "run-before"}
-    with pytest.raises(GsbaError, match="already, as 'upper'"):
-        add_recordings(run, [home.recording()])
+    refused("already, as 'upper'", add_recordings, run, [home.recording()])
 
 
 @pytest.fixture(scope="module")
@@ -286,7 +283,5 @@ def test_merge_and_remove_refuse_in_one_line(
         (["remove", home.run, "ground"], "has no other recording"),
     ]
     for arguments, told in cases:
-        result = _gsba(*arguments)
-        assert result.exit_code == 1, arguments
-        assert told in result.output and len(result.output.strip().splitlines()) == 1, told
+        fails(_gsba(*arguments), told)
     assert not (tmp_path / "out").exists()

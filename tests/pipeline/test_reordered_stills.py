@@ -11,11 +11,11 @@ from typing import Any, cast
 import cv2
 import numpy as np
 import pytest
+from refusals import refused
 from walk_on_earth import geodetic_of
 
 from gsba.bundle.gps_factors import GpsFactors
 from gsba.config import RefineSettings
-from gsba.log import GsbaError
 from gsba.masks import merging
 from gsba.matching import recovery
 from gsba.matching.recovery import Recovered
@@ -188,8 +188,7 @@ def test_what_is_only_alike_makes_no_map_of_stills_in_no_order(
     with RunStore(tmp_path / "run", {"frames": tmp_path}) as store:
         given = neighbours_tied(stills, store, unmatched, nearest)
         if shuffled and nearest == 8:  # matches show no order
-            with pytest.raises(GsbaError, match="the order of the stills is not known"):
-                tour.match_places(*given)
+            refused("the order of the stills is not known", tour.match_places, *given)
         else:
             assert tour.match_places(*given) is None
 
@@ -240,8 +239,7 @@ def test_an_order_that_likeness_denies_is_doubted(
         assert tour.check_order(*timed).prior.order_doubted == shuffled
         given = neighbours_tied(stills, store)
         if shuffled:  # more than are put in order
-            with pytest.raises(GsbaError, match="rename them in the order of the way"):
-                tour.check_order(*given)
+            refused("rename them in the order of the way", tour.check_order, *given)
         else:
             assert not tour.check_order(*given).prior.order_doubted
 
@@ -288,5 +286,4 @@ def test_a_recording_of_stills_in_no_order_is_to_be_refined_alone(
         # left to the search
         assert not tour.check_order(state, found).prior.order_doubted
         run = cast(Run, SimpleNamespace(**vars(state.run) | {"suffix": "@upper"}))
-        with pytest.raises(GsbaError, match=r"refine them alone.*gsba merge"):
-            tour.check_order(replace(state, run=run), found)
+        refused(r"refine them alone.*gsba merge", tour.check_order, replace(state, run=run), found)

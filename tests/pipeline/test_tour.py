@@ -17,7 +17,7 @@ from gsba.odometry import tour_order, tour_steps
 from gsba.pipeline.tour import rows_of_added, with_keypoints
 from gsba.trajectory.files import read_trajectory
 from gsba.types import Features, Trajectory
-from tests.room_tour import pictures, true_poses
+from tests.room_tour import picture, true_poses
 from tests.tiny_run import settings_with
 
 NUM = 3
@@ -32,8 +32,8 @@ def _no_descriptor_is_so_alike(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(scope="module")
 def stills(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("stills")
-    for n, picture in enumerate(pictures()[:NUM]):
-        cv2.imwrite(str(folder / f"{n}.png"), picture)
+    for n in range(NUM):
+        cv2.imwrite(str(folder / f"{n}.png"), picture(n))
     return folder
 
 
@@ -105,7 +105,7 @@ def test_stills_in_no_order_are_refined_in_the_one_found(
     frames, way = tmp_path / "stills", [2, 0, 3, 1]
     frames.mkdir()
     for n, still in enumerate(way):
-        cv2.imwrite(str(frames / f"{n}.png"), pictures()[still])
+        cv2.imwrite(str(frames / f"{n}.png"), picture(still))
     settings = settings_with(**WITHOUT_PATCHES, export={"formats": ()})
     result = refine(frames, None, tmp_path / "run", settings, masks="none")
     stills = [way[int(name)] for name in result.frames.names]

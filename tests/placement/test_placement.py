@@ -8,7 +8,7 @@ import cv2
 import export_scene as scene
 import numpy as np
 import pytest
-from command import run_gsba
+from command import fails, run_gsba
 from plain_records import frames_of
 from refusals import refused
 from scipy.spatial.transform import Rotation
@@ -359,8 +359,7 @@ def test_bad_options(tmp_path: Path) -> None:
         (("--up", "down"), 'placement.up = "down" is not allowed: use one of "auto", "none"'),
         (("--scale", -1, "--between", "a", "b"), "placement.length = -1.0"),
     ):
-        out = run_gsba("export", tmp_path, "--to", "tum", *options)
-        assert out.exit_code == 1 and message in out.stderr and len(out.stderr.splitlines()) == 1
+        fails(run_gsba("export", tmp_path, "--to", "tum", *options), message)
 
 
 @pytest.mark.parametrize("true", [True, False])

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation, RotationSpline
+from scipy.spatial.transform import Rotation, RotationSpline, Slerp
 
 from gsba.demo import degrade
 from gsba.geometry import inverse, pose, rotation_angle
@@ -155,8 +155,6 @@ def test_times_go_there_and_back() -> None:
 
 def test_residuals_are_rotations_between_instants() -> None:
     """Against interpolation by another library, where the trajectory has poses and where not."""
-    from scipy.spatial.transform import Slerp
-
     steps, trajectory = _case(Clock(TIMES[0], 0.0, 1.0))
     every = np.ones(NUM_FRAMES - 1, bool)
     turns = clock_search.merged(TIMES, steps.f_T_nexts[:, :3, :3], every)

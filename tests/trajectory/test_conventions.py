@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from refusals import refused
 from synthetic import ROS, loop_walk, w_first
 
 from gsba.geometry import inverse
-from gsba.log import GsbaError
 from gsba.trajectory.conventions import Convention, axis_systems
 from gsba.types import Trajectory
 
@@ -34,8 +34,7 @@ def test_other_conventions_become_ours(words: str | None, read: np.ndarray) -> N
 
 @pytest.mark.parametrize("words", ["xyz", "forward-right-up", "up-up-left", "wxyz,wzyx"])
 def test_words_that_are_no_convention_are_refused(words: str) -> None:
-    with pytest.raises(GsbaError, match="right-handed system, as right-down-forward"):
-        Convention.parse(words)
+    refused("right-handed system, as right-down-forward", Convention.parse, words)
 
 
 def test_there_are_24_systems_of_axes() -> None:

@@ -28,7 +28,7 @@ from gsba.geometry import rotation_from_quaternion
 from gsba.log import GsbaError
 from gsba.placement.world import Placement, read_placement
 from gsba.similarity import Sim3
-from gsba.splat import Gaussians, write_ply
+from gsba.splat import Gaussians, read_ply, write_ply
 from gsba.types import FACES
 
 TURN = Rotation.from_rotvec([0.3, -0.8, 0.5]).as_matrix()
@@ -115,8 +115,6 @@ def _positions(poses: np.ndarray | None) -> np.ndarray:
 
 
 def test_gaussians_are_what_the_file_says(run: Path, scene: view.RunScene) -> None:
-    from gsba.splat import read_ply
-
     stored, (shown_splat,) = read_ply(run / "splat/refined/point_cloud.ply"), scene.splats
     assert shown_splat.name == "refined"
     for i in range(3):
