@@ -112,7 +112,8 @@ class JointCameras:
             inside = self.in_run(camera, number)
             assert inside is not None
             known, scale = runs[number].map.cameras[inside], moves[number].scale
-            found, centres, radius = estimate(camera, known, scale), known.centres, known.radius
+            found, centres = estimate(camera, known, scale), known.centres
+            radius = known.stitch_radius
             if centres is not None:
                 lenses = Lenses() if found is None else found.lenses
                 covariance, centre = centres.covariance * scale**2, scale * centres.found

@@ -25,7 +25,7 @@ class FoundCamera:
 
     centres: LensCentres | None = None  # of the lenses that see it; None = not looked for
     axes: LensAxes | None = None  # where these look; None = not looked for
-    radius: StitchRadius | None = None  # what panoramas are stitched for; None = not looked for
+    stitch_radius: StitchRadius | None = None  # of panoramas; None = not looked for
     calibrated: SelfCalibration | None = None  # of raw pairs; None = not looked for
     readout: CameraEstimate | None = None  # how lenses are read; None = not looked for
 

@@ -221,7 +221,7 @@ def _of_camera(
         found.centres,
         found.readout,
         found.axes,
-        found.radius,
+        found.stitch_radius,
         known,
         world_scale(state.solution, result),
         run.settings_of(number),
