@@ -70,12 +70,6 @@ class Map:
         cameras = (FoundCamera(),) * len(frames.formats)
         return cls(solution, keypoints, weights, cameras=cameras, of_frame=frames.camera_of_frame)
 
-    @property
-    def only(self) -> FoundCamera:
-        """The only camera; ValueError if there are several."""
-        (found,) = self.cameras
-        return found
-
     def changed(self, camera: int, **changes: object) -> "Map":
         """The map with one camera changed."""
         cameras = list(self.cameras)
