@@ -29,15 +29,6 @@ _AXES = RIG_R_FACE[:, :, :2]  # (6, 3, 2), right and down of each face
 _AXIS_OF, _SIGN_OF = np.abs(_AXES).argmax(axis=1), _AXES.sum(axis=1)  # (6, 2) each
 
 
-@dataclass(frozen=True, slots=True)
-class Taps:
-    """The pixels of two tracks that show directions: one each, or two where lenses are blended."""
-
-    tracks: np.ndarray  # (...) int, 0 or 1
-    pixels: np.ndarray  # (..., 2, 2) float64, of both taps in that track, corner origin
-    weights: np.ndarray  # (..., 2) float64, in [0, 1], of sum 1
-
-
 def is_equiangular(width: int, height: int) -> bool:
     """True if one of two tracks can have this size, pixels."""
     extra = width - 3 * height
@@ -69,22 +60,6 @@ def square_directions(pixels: np.ndarray, face: int, size: int) -> np.ndarray:
     across = np.tan((pixels / size - 0.5) * (np.pi / 2))
     local = np.concatenate([across, np.ones_like(across[..., :1])], axis=-1)
     return local @ RIG_R_FACE[face].T
-
-
-def taps(directions: np.ndarray, width: int, height: int) -> Taps:
-    """The pixels by which two tracks of a size, pixels, show directions (..., 3), rig frame."""
-    faces, pixels = square_pixels(directions, height)
-    track, slot, turns = np.moveaxis(np.array(_STORED)[faces], -1, 0)
-    u, v = pixels[..., 0], pixels[..., 1]
-    stored_u = np.select([turns == 0, turns > 0], [u, height - v], v)
-    stored_v = np.select([turns == 0, turns > 0], [v, u], height - u)
-    overlap = overlap_of(width, height)
-    share = np.where(slot == 1, 1.0, _left_share(stored_u, height, overlap))
-    starts = np.array([0, height + overlap, 2 * height + overlap])[slot]
-    of_left = np.stack([starts + stored_u, stored_v], axis=-1)
-    of_right = of_left + np.where(slot == 1, 0, overlap)[..., None] * [1, 0]
-    both = np.stack([of_left, of_right], axis=-2)
-    return Taps(track, both, np.stack([share, 1 - share], axis=-1))
 
 
 def squares(tracks: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
