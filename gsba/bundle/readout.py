@@ -199,11 +199,6 @@ class CameraEstimates:
     each: tuple[CameraEstimate, ...]  # (C,)
     of_frame: tuple[int, ...] = ()  # (F,) as in `Cameras`
 
-    @classmethod
-    def of(cls, cameras: Cameras) -> "CameraEstimates":
-        """Cameras of which lenses alone are known."""
-        return cls(tuple(CameraEstimate(lenses) for lenses in cameras.lenses), cameras.of_frame)
-
     @property
     def cameras(self) -> Cameras:
         """The lenses of each camera."""
