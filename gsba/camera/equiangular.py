@@ -6,6 +6,9 @@ square is as high as its track, and equal steps in it are equal angles from its 
 half of the front and half of the back lens: their middle columns stand twice, once from each lens,
 so that they are wider than high. A track is 3 S + 2 overlap wide: its size gives the overlap.
 
+Flat squares, pinhole faces of 90 degrees, are looked up in the same way: equal steps in them are
+equal steps of x / z.
+
 Source of the layout: P. Bourke, paulbourke.net/panorama/gopromax2sphere (2021). The turns, the
 overlap and the angles were checked on frames of a MAX at 3K and panoramas made of them.
 """
